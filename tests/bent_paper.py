@@ -17,7 +17,7 @@ from synthetic_photos import noisy_design, some_design
 from patchproof.base.color import linear_from_srgb
 from patchproof.base.geometry import look_at
 from patchproof.channel.printer import load_printer
-from patchproof.evidence.surface import Promised, Surface, promised_of, surface_of
+from patchproof.evidence.surface import PromisedColors, Surface, promised_of, surface_of
 from patchproof.sheets.content import png_base64
 from patchproof.sheets.manifest import Manifest, design_sha256
 from patchproof.sheets.piece import lay_out_piece, marker_image
@@ -30,7 +30,7 @@ Place = Callable[[np.ndarray], np.ndarray]
 
 
 @cache
-def sheet(bends: bool, design: str) -> tuple[Surface, Promised, np.ndarray]:
+def sheet(bends: bool, design: str) -> tuple[Surface, PromisedColors, np.ndarray]:
     """The surface, how it was promised to look, and the printed page's linear light at `PAGE_PER_MM`."""
     piece = lay_out_piece((SIDE_MM, SIDE_MM), MARKER_MM, "TESTSHEET0", "design", bends)
     codes = {

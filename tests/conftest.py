@@ -36,7 +36,7 @@ def one_core():
     """What takes all free cores where nothing is said takes one: the others have tests of their own."""
     with pytest.MonkeyPatch.context() as patch:
         for module in ("base.workers", "app.cli.console"):  # the latter has a name of its own for it
-            patch.setattr(f"patchproof.{module}.free_cores", lambda: 1)
+            patch.setattr(f"patchproof.{module}.available_cores", lambda: 1)
         yield
 
 
@@ -52,9 +52,9 @@ def data() -> Path:
 @pytest.fixture
 def a_small_search(monkeypatch):
     """For a place: few points, few places, short drafts. For tests of files, not of choices."""
-    monkeypatch.setattr("patchproof.scene.places._POOL", 12)
+    monkeypatch.setattr("patchproof.scene.candidate_places._POOL", 12)
     for name, count in (("PLACES", 3), ("PASSES", 0), ("HELD_OUT_VIEWS", 4)):
-        monkeypatch.setattr(f"patchproof.optimizer.places.{name}", count)
+        monkeypatch.setattr(f"patchproof.optimizer.place_search.{name}", count)
 
 
 @pytest.fixture(scope="session")

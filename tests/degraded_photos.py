@@ -20,7 +20,7 @@ from scipy.sparse import csc_array
 
 from patchproof.base.color import srgb_from_linear
 from patchproof.base.geometry import look_at, view_angles
-from patchproof.evidence.surface import Promised, Surface
+from patchproof.evidence.surface import PromisedColors, Surface
 
 SIZE = (1200, 900)
 FOCAL_35MM = 36
@@ -242,7 +242,7 @@ KINDS: dict[str, Callable[[Draw], Draw]] = {
 }
 
 
-def take(kind: str, seed: int) -> tuple[Degraded, Surface, Promised]:
+def take(kind: str, seed: int) -> tuple[Degraded, Surface, PromisedColors]:
     """One photograph of that kind, and what it is measured against."""
     number = list(KINDS).index(kind)
     draw = KINDS[kind](fresh(np.random.default_rng([seed, number])))

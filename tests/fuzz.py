@@ -75,11 +75,11 @@ def largest_photo(rng: Rng, folder: Path) -> Read:
 
 def measured(path: Path) -> None:
     """As `verify` measures a photograph; what it is rejected for is refused here, so that it can be seen in counts."""
-    from patchproof.evidence.batch import Item, _measured
+    from patchproof.evidence.batch import PhotoItem, _measured
     from patchproof.evidence.grouping import group
 
     group(path.parent)
-    entry = _measured(small_task(), Item(path, path.name, with_pictures=True)).entry
+    entry = _measured(small_task(), PhotoItem(path, path.name, with_pictures=True)).entry
     assert (entry.status == "rejected") <= bool(entry.remark.advice)
     if entry.code not in (None, "too_few_markers"):
         raise Refused("a photograph", entry.code, entry.remark.advice)
@@ -103,7 +103,7 @@ def manifests() -> list[dict]:
     """A sheet with a promise and settings, and one in tiles."""
     from synthetic_photos import CONDITION, make_manifest, some_design
 
-    from patchproof.sheets.content import PrintedPiece
+    from patchproof.sheets.content import SheetContent
     from patchproof.sheets.manifest import dump_manifest
     from patchproof.sheets.piece import lay_out_piece
     from patchproof.sheets.template import load_template
@@ -121,7 +121,7 @@ def manifests() -> list[dict]:
     promised = promise(claims) | {"controls": {"gray": control}}
     piece = lay_out_piece((300.0, 300.0), 20.0, "FUZZFUZZ00", "design")
     with tempfile.TemporaryDirectory() as folder:
-        content = PrintedPiece(piece, "FUZZFUZZ00", "design", some_design(), settings=settings)
+        content = SheetContent(piece, "FUZZFUZZ00", "design", some_design(), settings=settings)
         tiled = write_sheet(Path(folder) / "a.pdf", load_template("a4_tiles"), content)
     own = json.loads(dump_manifest(make_manifest(promised)))
     return [own | {"settings": settings}, json.loads(dump_manifest(tiled))]
@@ -155,7 +155,7 @@ def network():
 def verified(folder: Path, manifest, journal: Path | None = None) -> None:
     """A verification of the honest photograph in the folder, ledger and all."""
     from patchproof.channel.printer import identity_printer
-    from patchproof.evidence.run import gather_evidence
+    from patchproof.evidence.gather import gather_evidence
     from patchproof.evidence.task import Options
 
     photos = folder / "photos"
@@ -243,9 +243,9 @@ def small_problem():
 
 
 def checkpoint(rng: Rng, folder: Path) -> Read:
-    from patchproof.optimizer.checkpoint import CHECKPOINT, resumed
+    from patchproof.optimizer.checkpoint import CHECKPOINT_FILE, load_checkpoint
 
-    data, problem = (finished_run() / CHECKPOINT).read_bytes(), small_problem()
+    data, problem = (finished_run() / CHECKPOINT_FILE).read_bytes(), small_problem()
     size = int.from_bytes(data[:8], "little")
     if rng.random() < 0.3:
         data = mutated(rng, data)
@@ -258,13 +258,13 @@ def checkpoint(rng: Rng, folder: Path) -> Read:
             head = changed(rng, head)
         text = json.dumps(head).encode()
         data = len(text).to_bytes(8, "little") + text + data[8 + size :]
-    (folder / CHECKPOINT).write_bytes(data)
-    return lambda: resumed(folder, problem)
+    (folder / CHECKPOINT_FILE).write_bytes(data)
+    return lambda: load_checkpoint(folder, problem)
 
 
 def other_tensors(rng: Rng, folder: Path) -> Read:
     """A checkpoint with whole tensors of other shapes, types and values."""
-    from patchproof.optimizer.checkpoint import CHECKPOINT, resumed
+    from patchproof.optimizer.checkpoint import CHECKPOINT_FILE, load_checkpoint
 
     problem = small_problem()
     names = ["design", "best", *(f"{kind}{n}" for kind in ("mean", "square") for n in range(4))]
@@ -279,8 +279,8 @@ def other_tensors(rng: Rng, folder: Path) -> Read:
         for name in names
     }
     note = {"number": 1, "best_loss": "0x1p0", "sheet_id": problem.scene.sheet_id}
-    (folder / CHECKPOINT).write_bytes(safetensors_bytes(tensors, {"state": json.dumps(note)}))
-    return lambda: resumed(folder, problem)
+    (folder / CHECKPOINT_FILE).write_bytes(safetensors_bytes(tensors, {"state": json.dumps(note)}))
+    return lambda: load_checkpoint(folder, problem)
 
 
 PLACE = {
@@ -415,7 +415,7 @@ def labels_csv(rng: Rng, folder: Path) -> Read:
 
 
 def faces_txt(rng: Rng, folder: Path) -> Read:
-    from patchproof.scene.texture import _read_faces
+    from patchproof.scene.canvas import _read_faces
 
     (folder / "faces.txt").write_bytes(broken_lines(rng, FACES))
     return lambda: _read_faces(folder / "faces.txt", 12)
@@ -549,7 +549,7 @@ def onnx_file(rng: Rng, folder: Path) -> Read:
 def mask(rng: Rng, folder: Path) -> Read:
     from patchproof.base.settings import BackgroundSettings
     from patchproof.scene.backgrounds import load_backgrounds
-    from patchproof.scene.texture import _read_mask
+    from patchproof.scene.canvas import _read_mask
 
     pictures = folder / "pictures"
     pictures.mkdir()
@@ -675,8 +675,8 @@ def page() -> bytes:
 def pdf(rng: Rng, folder: Path) -> Read:
     import pikepdf
 
-    from patchproof.sheets.raster import attached_manifest, page_pixels
-    from patchproof.sheets.shop import shop_lines
+    from patchproof.sheets.pdf_raster import attached_manifest, rasterize_page
+    from patchproof.sheets.print_advice import pdf_advice
 
     path = folder / "s.pdf"
     data = page()
@@ -701,7 +701,7 @@ def pdf(rng: Rng, folder: Path) -> Read:
             opened.save(buffer)
         data = buffer.getvalue()
     path.write_bytes(mutated(rng, data) if rng.random() < 0.6 else data)
-    reads = [lambda: attached_manifest(path), lambda: shop_lines(path), lambda: page_pixels(path, 1, 20.0)]
+    reads = [lambda: attached_manifest(path), lambda: pdf_advice(path), lambda: rasterize_page(path, 1, 20.0)]
     return reads[rng.integers(3)]
 
 
@@ -713,12 +713,12 @@ def long_path(rng: Rng, folder: Path) -> Read:
     from patchproof.channel.printer import load_printer
     from patchproof.mesh.load_mesh import load_mesh
     from patchproof.photo.read import list_photos
-    from patchproof.scene.image_scene import label_rows
+    from patchproof.scene.image_scene import read_labels
     from patchproof.sheets.manifest import load_manifest
-    from patchproof.sheets.raster import attached_manifest, page_pixels
+    from patchproof.sheets.pdf_raster import attached_manifest, rasterize_page
 
     name = str(rng.choice(["x" * 300, "a\0b", "d/" * 2500, "ä" * 200, "\udcff" * 200, "."]))
-    readers = [load_manifest, list_photos, attached_manifest, page_pixels, label_rows, pp.load_run, pp.load_scene]
+    readers = [load_manifest, list_photos, attached_manifest, rasterize_page, read_labels, pp.load_run, pp.load_scene]
     readers += [
         lambda p: load_printer(f"{p}.npz"),
         lambda p: load_camera(f"{p}.json"),

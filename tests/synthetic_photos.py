@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from patchproof.base.color import LIGHT_OF_CODE, srgb_from_linear
+from patchproof.base.color import LINEAR_FROM_CODE, srgb_from_linear
 from patchproof.base.geometry import intrinsics, look_at, plane_homography
 from patchproof.sheets.content import png_base64
 from patchproof.sheets.manifest import Manifest, design_sha256
@@ -103,7 +103,7 @@ def page_raster(manifest: Manifest, only_piece: bool) -> np.ndarray:
     """The page as float32 linear light at 10 px/mm; `only_piece` leaves the rest of the page white paper out (gray)."""
     page = np.ones((round(PAGE_MM[1] * PX_PER_MM), round(PAGE_MM[0] * PX_PER_MM), 3), np.float32)
     printed = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_1000)
-    design = LIGHT_OF_CODE.astype(np.float32)[manifest.design.pixels()]
+    design = LINEAR_FROM_CODE.astype(np.float32)[manifest.design.pixels()]
     _paste(page, cv2.resize(design, (1400, 1400), interpolation=cv2.INTER_NEAREST), *DESIGN_MM[:2])
     for marker in manifest.markers:
         (x, y), side = marker.corners_mm[0], round(MARKER_MM * PX_PER_MM)

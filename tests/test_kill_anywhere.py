@@ -194,10 +194,10 @@ def killed(base: Path, job: str, rng: np.random.Generator) -> Iterator[str]:
 
 def kills(base: Path, count: int, seed: int = 0, job: str | None = None) -> Iterator[str]:
     """Kill so many times, one job after the other; a line for each."""
-    from patchproof.base.workers import threads
+    from patchproof.base.workers import use_threads
 
     rng, jobs = np.random.default_rng(seed), [job] if job else JOBS
-    with warnings.catch_warnings(), threads(1):  # of the fake network, by every fork; which has no other threads
+    with warnings.catch_warnings(), use_threads(1):  # of the fake network, by every fork; which has no other threads
         warnings.simplefilter("ignore")
         for module in LATE.split():  # once, and not in every fork
             importlib.import_module(module)

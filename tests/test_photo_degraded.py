@@ -22,8 +22,8 @@ from degraded_photos import KINDS, take
 
 from patchproof.base.geometry import rect_corners
 from patchproof.evidence import measure as measuring
-from patchproof.evidence.camera import view_of
-from patchproof.evidence.placed import Placed, place
+from patchproof.evidence.camera import pinhole_photo
+from patchproof.evidence.locate import LocatedSheet, place
 from patchproof.evidence.ranges import promised_ranges
 from patchproof.evidence.results import PhotoEntry
 from patchproof.photo.read import read_photo
@@ -60,9 +60,9 @@ def outcome(kind: str, seed: int, folder) -> Outcome:
     truth, surface, promised = take(kind, seed)
     (folder / "a.jpg").write_bytes(truth.jpeg)
     with patch.object(measuring, "place", wraps=place) as placing:
-        returned: list[Placed | None] = []
+        returned: list[LocatedSheet | None] = []
         placing.side_effect = lambda *args: returned.append(place(*args)) or returned[-1]
-        view = view_of(read_photo(folder / "a.jpg"), None)
+        view = pinhole_photo(read_photo(folder / "a.jpg"), None)
         entry = measuring.measure(view, "a.jpg", surface, promised, promised_ranges(())).entry
     geometry, pose, off = entry.geometry, entry.pose, {}
     if geometry is not None and returned[-1] is not None:
@@ -75,7 +75,7 @@ def outcome(kind: str, seed: int, folder) -> Outcome:
     return Outcome(entry, off)
 
 
-def _corner_error_mm(placed: Placed, true_px: np.ndarray) -> float:
+def _corner_error_mm(placed: LocatedSheet, true_px: np.ndarray) -> float:
     """The farthest that the model's page points at the true pixels lie from the design's corners."""
     mm, steps = CORNERS.copy(), 0.05 * np.eye(2)
 

@@ -17,9 +17,9 @@ from test_imports import MAY_IMPORT
 from patchlab.bench.run import BENCHES
 from patchlab.study.record import hits_of
 from patchlab.study.study import load_study
-from patchproof.base.claims import student_mean
+from patchproof.base.intervals import student_mean
 from patchproof.base.settings import SceneSettings
-from patchproof.base.validation import read_toml, validated
+from patchproof.base.validation import read_toml, validate_model
 from patchproof.optimizer.problem import FIGURE_SCALE, FIGURED
 from patchproof.optimizer.run import load_run
 
@@ -72,7 +72,7 @@ def test_commands(here, monkeypatch, capsys):
 
 def test_every_scene_is_one_and_every_option_exists(capsys):
     for toml in blocks("toml"):
-        validated(SceneSettings, tomllib.loads(toml), "README.md")
+        validate_model(SceneSettings, tomllib.loads(toml), "README.md")
     for line in "".join(blocks("console")).splitlines():
         _, *arguments = shlex.split(line)
         command(*arguments[: 2 if arguments[0] in {"calibrate"} else 1], "--help")
@@ -90,7 +90,7 @@ def test_every_scene_is_one_and_every_option_exists(capsys):
 )
 def test_the_studies_that_are_quoted_can_be_run_again(folder, name, count):
     study, path = load_study(name), README.parent / "src/patchlab/results" / folder / f"{name}.toml"
-    settings = validated(study.settings, read_toml(path), name)
+    settings = validate_model(study.settings, read_toml(path), name)
     assert len({cell.name for cell in study.cells(settings, path.parent)}) == count
 
 

@@ -9,15 +9,15 @@ from pathlib import Path
 
 from patchlab.study.study import Cell, Study
 from patchproof.base import input as bounds
-from patchproof.base.claims import rate
 from patchproof.base.errors import Refused
-from patchproof.base.validation import Strict
+from patchproof.base.intervals import rate
+from patchproof.base.validation import StrictModel
 from patchproof.photo import limits
 from patchproof.photo.rejection import PhotoRejected
 from patchproof.report.tables import Drawing, Table
 
 
-class ToySettings(Strict):
+class ToySettings(StrictModel):
     numbers: tuple[int, ...]
     pause_s: float = 0.0
     die_in: str | None = None  # a folder; a cell's worker dies while the file named after the cell is there
@@ -101,6 +101,6 @@ def given_up(seconds):
     """What a limit of 0.2 s makes of that, in whichever process this is."""
     bounds.SECONDS = 0.2
     try:
-        return limits.limited(spin, seconds)
+        return limits.run_limited(spin, seconds)
     except PhotoRejected as cannot:
         return cannot.code

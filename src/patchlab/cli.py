@@ -13,7 +13,7 @@ from patchproof.app.cli.console import (
     Jobs,
     Overwrite,
     Resume,
-    carried_out,
+    as_command,
     names_of,
     progress,
     run_command_line,
@@ -44,7 +44,7 @@ def harden(
     """Change labeled images so that classifiers recognize them better, and attack them."""
     from patchlab.harden.folder import HardenSettings, harden_images
     from patchlab.study.study import Work
-    from patchproof.base.validation import validated
+    from patchproof.base.validation import validate_model
 
     given = {
         "images": str(images),
@@ -62,7 +62,7 @@ def harden(
     }
     with progress() as bar:
         work = Work(resume, overwrite, jobs or 1, cluster, lambda done, total: bar("harden", done, total))
-        finished = harden_images(validated(HardenSettings, given, "the options"), out, work)
+        finished = harden_images(validate_model(HardenSettings, given, "the options"), out, work)
     say_study(finished)
     say(f"images: {out}, tables: {out / 'harden.html'}")
     raise typer.Exit(0 if finished.results else 1)
@@ -148,9 +148,9 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Studies and benchmarks that produce the figures which patchproof's documents quote.",
 )
-app.command(cls=ListsStudies)(carried_out(study))
+app.command(cls=ListsStudies)(as_command(study))
 for _verb in (bench, harden, table, keys):
-    app.command()(carried_out(_verb))
+    app.command()(as_command(_verb))
 app.callback()(version_option)
 
 

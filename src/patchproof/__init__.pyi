@@ -18,9 +18,9 @@ from .classifier.network import Classifier as Classifier
 from .evidence.results import Report as Report
 from .optimizer.evaluate import Evaluation as Evaluation
 from .optimizer.evaluate import evaluate as evaluate
-from .optimizer.given import import_patch as import_patch
-from .optimizer.places import Place as Place
-from .optimizer.places import choose_place as choose_place
+from .optimizer.imported_design import import_patch as import_patch
+from .optimizer.place_search import Place as Place
+from .optimizer.place_search import choose_place as choose_place
 from .optimizer.promise import PromiseOptions as PromiseOptions
 from .optimizer.run import Run as Run
 from .optimizer.run import load_run as load_run
@@ -29,7 +29,7 @@ from .photo.rejection import PhotoRejected as PhotoRejected
 from .render.photograph import photograph as photograph
 from .render.stage import Stage as Stage
 from .render.stage import set_stage as set_stage
-from .reprints.hung_sheet import Hanging as Hanging
+from .reprints.mounted_sheet import ReprintSetup as ReprintSetup
 from .reprints.reprint import Reprint as Reprint
 from .reprints.reprint import reprint as reprint
 from .reprints.run_sheet import sheet as sheet

@@ -12,13 +12,13 @@ import trimesh
 from browser import Browser
 from console import command
 
-from patchproof.app.begin.guess import footing, guess_up, label_of, length_of
+from patchproof.app.begin.guess import footing, guess_label, guess_length_mm, guess_up
 from patchproof.app.begin.new import new_scene
 from patchproof.app.begin.preview import OBJECT, PAGE, _lying, preview_scene
 from patchproof.app.begin.sides import (
-    NO_SURFACE,
+    NO_SURFACE_RGB,
     PICTURE_PX,
-    RAMP,
+    RAMP_RGB,
     gap_colors,
     ramp,
     round_length,
@@ -29,7 +29,7 @@ from patchproof.app.begin.sides import (
 from patchproof.base.errors import Refused
 from patchproof.base.settings import load_scene_settings
 from patchproof.render.stage import set_stage
-from patchproof.scene.fitting import largest
+from patchproof.scene.fitting import largest_fitting_size
 from patchproof.scene.placement import gap_limit_mm
 from patchproof.scene.scene import load_scene, make_scene
 from patchproof.sheets.blank import blank_page
@@ -74,8 +74,8 @@ def test_six_sides_are_at_one_scale_with_ground_and_bar(views):
 
 def test_the_piece_has_the_color_of_its_gap_whatever_the_light(views):
     middle = views["front"].picture[PICTURE_PX // 2, PICTURE_PX // 2]
-    assert np.abs(middle.astype(int) - RAMP[0]).max() <= 2
-    assert not (np.abs(views["back"].picture.astype(int) - RAMP[0]).max(-1) < 30).any()
+    assert np.abs(middle.astype(int) - RAMP_RGB[0]).max() <= 2
+    assert not (np.abs(views["back"].picture.astype(int) - RAMP_RGB[0]).max(-1) < 30).any()
 
 
 def test_gaps_are_drawn_where_they_are():
@@ -83,11 +83,11 @@ def test_gaps_are_drawn_where_they_are():
     assert half.gaps_mm.shape == (65, 65) and np.nanmax(half.gaps_mm) == half.gap_mm == pytest.approx(0, abs=1e-9)
     over = box(offset_mm=[120, 0]).placement  # from 75 to 165 mm, the object ends at 150: a sixth has nothing under it
     colors = gap_colors(over)
-    nothing = (colors == NO_SURFACE).all(-1)
+    nothing = (colors == NO_SURFACE_RGB).all(-1)
     assert nothing.mean() == pytest.approx(over.overhang_share) == pytest.approx(1 / 6, abs=0.02)
     assert nothing[:, -5:].all() and not nothing[:, :50].any()  # on the right as one faces it
     assert gap_limit_mm(over.size_mm) == pytest.approx(0.15 * 90)
-    assert (ramp(np.array([-1.0, 0, 1, 7])) == np.array([RAMP[0], RAMP[0], RAMP[-1], RAMP[-1]])).all()
+    assert (ramp(np.array([-1.0, 0, 1, 7])) == np.array([RAMP_RGB[0], RAMP_RGB[0], RAMP_RGB[-1], RAMP_RGB[-1]])).all()
 
 
 @pytest.mark.parametrize(("most", "length"), [(100, 100), (99, 50), (21, 20), (1.99, 1), (0.5, 0.5)])
@@ -171,20 +171,20 @@ def test_a_piece_that_is_refused_is_said_beside_the_bare_object(tmp_path, few_tu
     ("said", "label"), [("mug", "coffee mug"), ("Coffee_Mug", "coffee mug"), ("cup", "cup"), ("dustcart", LABELS[2])]
 )
 def test_labels_are_found_by_their_words(said, label):
-    assert label_of(LABELS, said, "thing.glb") in (label, label.split(",")[0])
+    assert guess_label(LABELS, said, "thing.glb") in (label, label.split(",")[0])
 
 
 def test_words_of_several_labels_or_none_are_refused():
     with pytest.raises(Refused, match='"truck", which is in 2: choose "garbage truck", "tow truck"'):
-        label_of(LABELS, "truck", "thing.glb")
+        guess_label(LABELS, "truck", "thing.glb")
     with pytest.raises(Refused, match='did you mean "cup"'):
-        label_of(LABELS, "cupp", "thing.glb")
+        guess_label(LABELS, "cupp", "thing.glb")
 
 
 def test_a_file_is_called_what_it_shows_or_a_label_is_asked_for():
-    assert label_of(LABELS, None, "/a/b/mug_mujoco.v2.glb") == "coffee mug"
+    assert guess_label(LABELS, None, "/a/b/mug_mujoco.v2.glb") == "coffee mug"
     with pytest.raises(Refused, match='got "gz truck", which no label of the network is: add --label'):
-        label_of(LABELS, None, "gz_truck_3.glb")
+        guess_label(LABELS, None, "gz_truck_3.glb")
 
 
 @pytest.fixture(scope="module")
@@ -202,7 +202,7 @@ def bottles(tmp_path_factory):
 
 def test_gltf_is_y_up_and_in_meters_by_its_standard(bottles):
     up = guess_up(bottles / "bottle.glb")
-    assert (up.axis, up.odd) == ("y", None) and length_of(bottles / "bottle.glb") == 250
+    assert (up.axis, up.odd) == ("y", None) and guess_length_mm(bottles / "bottle.glb") == 250
     odd = guess_up(bottles / "lying.glb")
     assert odd.axis == "y" and re.search(r'stands on 1\d% of its footprint so, with "z" on 7[789]%', odd.odd)
 
@@ -216,13 +216,13 @@ def test_a_habit_gives_way_to_how_the_object_stands(bottles):
 @pytest.mark.parametrize("suffix", ["obj", "stl", "ply"])
 def test_a_file_without_units_asks_for_a_length(bottles, suffix):
     with pytest.raises(Refused, match="no units: add --length-mm"):
-        length_of(bottles / f"bottle.{suffix}")
+        guess_length_mm(bottles / f"bottle.{suffix}")
 
 
 def test_a_file_without_units_says_how_long_it_is_in_its_own(tmp_path):
     trimesh.creation.box((300, 200, 100)).export(tmp_path / "carton.stl")
     with pytest.raises(Refused, match="longest extent: 300 if it is in mm"):
-        length_of(tmp_path / "carton.stl")
+        guess_length_mm(tmp_path / "carton.stl")
 
 
 @pytest.fixture(scope="module")
@@ -266,9 +266,9 @@ def test_a_side_is_preferred_to_a_top_that_is_not_twice_as_large(tmp_path):
 
 def test_a_name_that_is_no_label_is_answered_with_the_labels_where_they_are_few():
     with pytest.raises(Refused, match='add --label with what it is to be recognized as: "lamp", "vase"'):
-        label_of(("lamp", "vase"), None, "lantern.glb")
+        guess_label(("lamp", "vase"), None, "lantern.glb")
     with pytest.raises(Refused, match=r"recognized as[.]$"):
-        label_of([f"thing {i}" for i in range(21)], None, "lantern.glb")
+        guess_label([f"thing {i}" for i in range(21)], None, "lantern.glb")
 
 
 def test_photographs_beside_two_blanks_ask_which_one_hangs_there(tmp_path):
@@ -282,9 +282,9 @@ def test_photographs_beside_two_blanks_ask_which_one_hangs_there(tmp_path):
 def test_a_length_that_makes_no_sense_is_refused(tmp_path):
     trimesh.creation.box((31, 1, 1)).export(tmp_path / "hall.glb")
     trimesh.creation.box((30, 1, 1)).export(tmp_path / "yard.glb")
-    assert length_of(tmp_path / "yard.glb") == 30_000
+    assert guess_length_mm(tmp_path / "yard.glb") == 30_000
     with pytest.raises(Refused, match=r"of 5 mm to 30 m, got 3\.1e\+04 mm by the file's units: add --length-mm"):
-        length_of(tmp_path / "hall.glb")
+        guess_length_mm(tmp_path / "hall.glb")
 
 
 def test_a_box_stands_on_all_of_its_footprint():
@@ -293,10 +293,10 @@ def test_a_box_stands_on_all_of_its_footprint():
 
 
 def test_the_largest_piece_is_found_between_those_that_fit():
-    assert largest((100, 50), lambda size: size[0] <= 80, 20) == pytest.approx((79, 39), abs=1.5)
-    assert largest((100, 50), lambda size: True, 20) == (100, 50)
-    assert largest((100, 50), lambda size: False, 20) is None
-    assert largest((100, 50), lambda size: True, 51) is None
+    assert largest_fitting_size((100, 50), lambda size: size[0] <= 80, 20) == pytest.approx((79, 39), abs=1.5)
+    assert largest_fitting_size((100, 50), lambda size: True, 20) == (100, 50)
+    assert largest_fitting_size((100, 50), lambda size: False, 20) is None
+    assert largest_fitting_size((100, 50), lambda size: True, 51) is None
 
 
 def test_a_new_scene_loads_and_says_what_was_guessed(bottles, standing):

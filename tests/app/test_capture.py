@@ -32,14 +32,14 @@ from patchproof.app.capture import app as app_module
 from patchproof.app.capture import serve
 from patchproof.app.capture.album import CONTROLS, MOST_BYTES, Album, UploadRefused
 from patchproof.app.capture.app import capture_app
-from patchproof.app.capture.gathered import Gathered
-from patchproof.app.capture.views import map_views
+from patchproof.app.capture.collection import PhotoCollection
+from patchproof.app.capture.view_map import map_views
 from patchproof.app.verify import options_of
 from patchproof.app.verify import verify as verify_photos
 from patchproof.base import input
 from patchproof.base.errors import Refused
 from patchproof.base.workers import open_workers
-from patchproof.evidence.results import Geometry, PhotoEntry, Pose
+from patchproof.evidence.results import CameraPose, Geometry, PhotoEntry
 from patchproof.sheets.manifest import ConditionClaim, dump_manifest, load_manifest
 from test_verify_run import NET, promise, shot
 
@@ -126,7 +126,7 @@ class Client:
 def gathered_in(folder: Path, sheet: Path):
     manifest = load_manifest(sheet)
     with open_workers(1) as workers:
-        with closing(Gathered(Album(folder), manifest, options_of(sheet, manifest, [NET]), workers)) as gathered:
+        with closing(PhotoCollection(Album(folder), manifest, options_of(sheet, manifest, [NET]), workers)) as gathered:
             gathered.measure(gathered.album.photos())
             yield gathered
 
@@ -362,7 +362,7 @@ def entry(azimuth_deg: float | None, px_per_mm: float) -> PhotoEntry:
     geometry = Geometry(
         residual_mm=0, px_per_mm=px_per_mm, tilt_deg=20, contrast=0.8, blur_px=1, corner_uncertainty_mm=0.1
     )
-    pose = Pose(azimuth_uncertainty_deg=1, azimuth_deg=azimuth_deg)
+    pose = CameraPose(azimuth_uncertainty_deg=1, azimuth_deg=azimuth_deg)
     return PhotoEntry(file="a", status="measured", photo_px=(1200, 900), geometry=geometry, pose=pose)
 
 

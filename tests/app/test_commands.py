@@ -19,7 +19,7 @@ from safetensors import torch as safetensors_torch
 from patchlab.study.study import STUDIES, load_study, run_study
 from patchproof.app.cli import console
 from patchproof.base.errors import Refused
-from patchproof.base.validation import validated
+from patchproof.base.validation import validate_model
 from patchproof.base.version import __version__
 from patchproof.optimizer import run as run_module
 from patchproof.optimizer.promise import PromiseOptions
@@ -28,7 +28,7 @@ from patchproof.optimizer.run import optimize as optimize_scene
 from patchproof.reprints.run_sheet import sheet_of_several
 from patchproof.scene.scene import load_scene
 from patchproof.sheets.manifest import load_manifest
-from patchproof.sheets.raster import page_count
+from patchproof.sheets.pdf_raster import page_count
 from patchproof.sheets.template import template_names
 
 
@@ -67,7 +67,7 @@ def test_templates_are_listed_with_what_they_are(capsys):
 def test_the_example_of_a_study_is_a_config_of_it(name, capsys):
     assert lab_command("study", name, "--example") == 0
     text = capsys.readouterr().out
-    settings = validated(load_study(name).settings, tomllib.loads(text), "the example")
+    settings = validate_model(load_study(name).settings, tomllib.loads(text), "the example")
     assert settings.model_dump(exclude_defaults=True).keys() <= tomllib.loads(text).keys()
     keys = re.findall(r"^(?:# )?\[*(\w+)(?: =|\b[\].])", text, re.MULTILINE)
     assert set(type(settings).model_fields) <= set(keys)
@@ -79,7 +79,7 @@ def test_a_study_prints_its_keys_and_asks_for_a_config(capsys):
 
 
 def test_efforts_are_steps_and_views(tmp_path, scene_file, capsys, monkeypatch):
-    monkeypatch.setattr(run_module, "THOROUGH", (3, 12))
+    monkeypatch.setattr(run_module, "THOROUGH_EFFORT", (3, 12))
     run = tmp_path / "run"
     assert command("optimize", scene_file, "--out", run, "--draft", "--thorough") == 2 and not run.exists()
     assert "opposite of --draft" in capsys.readouterr().err

@@ -15,7 +15,7 @@ from patchproof.base import geometry
 from patchproof.base.packaged import packaged_path
 from patchproof.optimizer import run as run_module
 from patchproof.sheets.manifest import load_manifest
-from patchproof.sheets.raster import attached_manifest
+from patchproof.sheets.pdf_raster import attached_manifest
 
 PHOTOS = 6
 # libraries of the demo and of `verify`, which a process of both imports once
@@ -134,7 +134,7 @@ def again(journey, controls, tmp_path_factory):
     folder, sheet = tmp_path_factory.mktemp("again"), journey / "sheet.json"
     with_run = ("--run", journey / "run", "--controls", controls, "--out", folder / "report")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("patchproof.reprints.retake.DRAWS", 6)
+        patch.setattr("patchproof.reprints.photo_forecast.DRAWS", 6)
         assert command("verify", journey / "photos", "--sheet", sheet, *with_run) == 0
     return json.loads((folder / "report" / "report.json").read_text())
 
@@ -176,13 +176,13 @@ def test_another_runs_forecasts_are_refused(journey, tmp_path, capsys):
 def test_the_promise_predicts_the_photographs_it_is_a_promise_of(journey, report):
     """The conditions of these very photographs, rendered as for a promise: none is judged otherwise."""
     from patchproof.optimizer.problem import set_problem
-    from patchproof.optimizer.promise import shown_with_controls
+    from patchproof.optimizer.promise import pictures_with_controls
     from patchproof.optimizer.responses import responses
     from patchproof.optimizer.run import load_run
 
     run = load_run(journey / "run")
     problem = set_problem(run.scene)
-    shown = shown_with_controls(problem, run.design, ())
+    shown = pictures_with_controls(problem, run.design, ())
     answers = responses(problem, shown, run.scene.draw("reprint", PHOTOS))["design"]
     seen = [photo["predictions"]["builtin"] for photo in report["photos"]]
     differ = answers.recognized[0] != np.array([one["recognized"] for one in seen])
@@ -196,7 +196,7 @@ def test_distance_and_angle_come_from_the_focal_length_in_exif(journey, report):
     middle.
     """
     from patchproof.optimizer.run import load_run
-    from patchproof.scene.conditions import of_fields
+    from patchproof.scene.conditions import conditions_from_fields
 
     scene = load_run(journey / "run").scene
     truth = json.loads((journey / "photos" / "truth.json").read_text())
@@ -204,7 +204,7 @@ def test_distance_and_angle_come_from_the_focal_length_in_exif(journey, report):
         if photo["status"] != "measured":
             continue
         drawn = truth[photo["file"]]["conditions"]
-        conditions = of_fields({k: np.array([v]) for k, v in drawn.items() if k != "print_scale"})
+        conditions = conditions_from_fields({k: np.array([v]) for k, v in drawn.items() if k != "print_scale"})
         pose = scene.camera_from_world(conditions)[0] @ scene.placement.world_from_piece
         azimuth, _, distance = geometry.view_angles(pose, np.array(scene.placement.size_mm) / 2)
         assert photo["azimuth_deg"] == pytest.approx(azimuth, abs=2)

@@ -14,14 +14,14 @@ import patchproof
 from patchlab.keys import HEAD, documents
 from patchproof.app.keys import DOCUMENTS, keys_page, meanings, tables
 from patchproof.base.errors import Refused
-from patchproof.base.validation import Strict
+from patchproof.base.validation import StrictModel
 from patchproof.sheets.template import QrCode
 
 ROOT = Path(__file__).resolve().parents[2]
 EVERY = {**DOCUMENTS, **documents()}
 
 
-def models() -> set[type[Strict]]:
+def models() -> set[type[StrictModel]]:
     return {model for _, settings in EVERY.values() for _, model in tables(settings)}
 
 
@@ -43,7 +43,7 @@ def test_every_key_says_what_it_means():
         for model in models()
         for key, field in model.model_fields.items()
         if key not in meanings(model)
-        and not (isinstance(field.annotation, type) and issubclass(field.annotation, Strict))  # has its own table
+        and not (isinstance(field.annotation, type) and issubclass(field.annotation, StrictModel))  # has its own table
     ]
     assert not silent, "add a comment at the end of the line, or above it"
 

@@ -21,14 +21,14 @@ from patchproof.app.plan.plan import Plan, marker_plan, measured_plan, plan_geom
 from patchproof.app.plan.terms import Setup, scene_terms
 from patchproof.base.errors import Refused
 from patchproof.base.settings import SceneSettings
-from patchproof.base.validation import validated
+from patchproof.base.validation import validate_model
 from patchproof.channel.effects import EFFECTS, RECORD_OF
 from patchproof.optimizer import loop
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import set_problem
-from patchproof.scene.bent_scene import other_surface
+from patchproof.scene.bent_scene import placement_with_other_bend
 from patchproof.scene.conditions import draw
-from patchproof.scene.flat import Picture
+from patchproof.scene.flat import BasePicture
 from patchproof.scene.paper_light import PaperLight
 from patchproof.scene.photo_scene import BasePhoto, PhotoScene
 from patchproof.scene.scene import build_scene, load_scene
@@ -49,7 +49,7 @@ def scene_with(tmp_path, **changes):
     for key, value in changes.items():
         table, name = key.split("__")
         data.setdefault(table, {})[name] = value
-    return build_scene(validated(SceneSettings, data, "test"), tmp_path)
+    return build_scene(validate_model(SceneSettings, data, "test"), tmp_path)
 
 
 STRAIGHT = {
@@ -190,13 +190,13 @@ def test_bent_pieces_are_weighed_against_cards(tmp_path):
     settings = {"object__mesh": "primitive:mug", "patch__side": "-x", "patch__width_mm": 50, "patch__height_mm": 40}
     settings |= {"camera__photo_px": [800, 600], "view__distance_mm": [350, 400]}
     bent = scene_with(tmp_path, **settings, patch__bend=True)
-    card, sentence = other_surface(bent)
+    card, sentence = placement_with_other_bend(bent)
     assert card.is_flat and not bent.placement.is_flat and sentence.startswith("bend = false would be a card")
     errors, _ = errors_of(bent, card)
     (name,) = (name for name in errors if name.endswith("not a card"))
     assert errors[name].codes_mean > 0.1 and errors[name].verdict in {"keep", "can go"}
     flat = scene_with(tmp_path, **settings)
-    other, sentence = other_surface(flat)
+    other, sentence = placement_with_other_bend(flat)
     assert not other.is_flat and f"bend = true would be a {other.family}" in sentence
     problem = set_problem(flat)
     assert not scene_terms(problem, problem.subject.start(), other)[-1].modeled
@@ -204,7 +204,7 @@ def test_bent_pieces_are_weighed_against_cards(tmp_path):
 
 def test_a_refused_bend_is_said_in_its_own_sentence(tmp_path):
     wide = {"patch__width_mm": 150, "patch__height_mm": 150}  # beyond the carton's rounded edges
-    other, sentence = other_surface(scene_with(tmp_path, **wide))
+    other, sentence = placement_with_other_bend(scene_with(tmp_path, **wide))
     assert other is None and sentence.startswith("bend = true is refused. Expected ")
 
 
@@ -234,9 +234,10 @@ def photo_scene(tmp_path, blur_px: float, noise: float) -> PhotoScene:
     light = PaperLight(np.array([[0.5, -0.2, 0, 0, 0, 0]] * 3), 0.0, noise)
     where = np.array([[1.0, 0, 50], [0, 1, 25], [0, 0, 1]])
     photos = [
-        BasePhoto(str(i), Picture(np.full((150, 200, 3), 90 + i, np.uint8)), where, light, blur_px) for i in range(2)
+        BasePhoto(str(i), BasePicture(np.full((150, 200, 3), 90 + i, np.uint8)), where, light, blur_px)
+        for i in range(2)
     ]
-    return PhotoScene(validated(SceneSettings, tables, "test"), tmp_path, 0, "A" * 10, piece, tuple(photos))
+    return PhotoScene(validate_model(SceneSettings, tables, "test"), tmp_path, 0, "A" * 10, piece, tuple(photos))
 
 
 def test_photographs_have_light_blur_and_noise_of_their_own(tmp_path):

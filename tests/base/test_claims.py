@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom, multinomial
 
-from patchproof.base.claims import (
+from patchproof.base.intervals import (
     independent_difference,
     mcnemar_p,
     paired_difference,

@@ -7,12 +7,12 @@ import torch
 from patchproof.base.color import (
     LUMINANCE,
     ciede2000,
-    clamped,
-    codes_of,
+    clamp_to_unit,
+    codes_from_srgb,
     lab_from_linear,
     lab_from_srgb,
     linear_from_srgb,
-    photo_codes_of,
+    photo_codes_from_srgb,
     srgb_from_linear,
 )
 
@@ -132,20 +132,22 @@ def test_single_precision_is_good_enough():
 
 def test_codes_are_the_nearest_and_the_two_ways_differ_in_halves_alone():
     halves = np.array([-1.0, 0.5 / 255, 1.5 / 255, 126.5 / 255, 254.5 / 255, 2.0])
-    assert codes_of(halves).tolist() == [0, 0, 2, 126, 254, 255]
-    assert photo_codes_of(halves).tolist() == [0, 1, 2, 127, 255, 255]
+    assert codes_from_srgb(halves).tolist() == [0, 0, 2, 126, 254, 255]
+    assert photo_codes_from_srgb(halves).tolist() == [0, 1, 2, 127, 255, 255]
     values = np.random.default_rng(0).random((64, 64, 3))
-    assert np.array_equal(codes_of(values), photo_codes_of(values))
-    assert np.array_equal(codes_of(torch.tensor(values)).numpy(), codes_of(values))
+    assert np.array_equal(codes_from_srgb(values), photo_codes_from_srgb(values))
+    assert np.array_equal(codes_from_srgb(torch.tensor(values)).numpy(), codes_from_srgb(values))
     every = np.arange(256)
-    assert np.array_equal(codes_of(every / 255), every) and np.array_equal(photo_codes_of(every / 255), every)
+    assert np.array_equal(codes_from_srgb(every / 255), every) and np.array_equal(
+        photo_codes_from_srgb(every / 255), every
+    )
 
 
 @pytest.mark.parametrize("kind", [torch.float16, torch.float32, torch.float64])
 def test_clamped_values_have_a_gradient_at_black_and_white(kind):
     values = torch.tensor([-0.1, 0.0, 0.3, 1.0, 1.1], dtype=kind, requires_grad=True)
-    clipped = clamped(values)
+    clipped = clamp_to_unit(values)
     assert clipped.dtype == kind and torch.equal(clipped, torch.tensor([0, 0, 0.3, 1, 1], dtype=kind))
     clipped.sum().backward()
     assert values.grad is not None and values.grad.tolist() == [0, 1, 1, 1, 0]  # torch's own: 0 at both ends since 2.14
-    assert clamped(np.array([-0.1, 0.5, 1.1])).tolist() == [0, 0.5, 1]
+    assert clamp_to_unit(np.array([-0.1, 0.5, 1.1])).tolist() == [0, 0.5, 1]

@@ -9,7 +9,7 @@ from patchproof.base.geometry import (
     intrinsics,
     local_scale,
     look_at,
-    normalized,
+    normalize_homography,
     orbit,
     plane_homography,
     plane_pose,
@@ -126,11 +126,11 @@ def test_fit_of_an_inverse_is_the_inverse_of_the_fit():
     source = page_points(12)
     target = apply_homography(plane_homography(K, camera(), WORLD_FROM_PAGE), source)
     there, back = fit_homography(source, target), fit_homography(target, source)
-    np.testing.assert_allclose(normalized(there @ back), np.eye(3), atol=1e-8)
+    np.testing.assert_allclose(normalize_homography(there @ back), np.eye(3), atol=1e-8)
 
 
 def test_normalized_where_the_last_entry_vanishes():
-    homography = normalized(np.array([[0, 0, 3.0], [0, 4, 0], [5, 0, 0]]))
+    homography = normalize_homography(np.array([[0, 0, 3.0], [0, 4, 0], [5, 0, 0]]))
     assert np.isfinite(homography).all() and np.linalg.norm(homography) == pytest.approx(1)
 
 

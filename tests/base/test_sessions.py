@@ -6,12 +6,19 @@ import numpy as np
 import pytest
 from scipy.stats import betabinom
 
-from patchproof.base.claims import wilson
-from patchproof.base.sessions import TAIL, Spread, difference_in_sessions, evenly, in_sessions, spread_of
+from patchproof.base.intervals import wilson
+from patchproof.base.sessions import (
+    TAIL,
+    RatePosterior,
+    count_by_session,
+    rate_posterior,
+    session_difference,
+    split_evenly,
+)
 
 
 def alone(recognized: int, n: int):
-    return spread_of([1] * recognized + [0] * (n - recognized), [1] * n)
+    return rate_posterior([1] * recognized + [0] * (n - recognized), [1] * n)
 
 
 def drawn(rng, rate: float, correlation: float, photos: int, sessions: int) -> np.ndarray:
@@ -36,13 +43,13 @@ def test_photographs_on_their_own_are_the_beta_binomial_of_jeffreys_prior(recogn
 def test_chances_of_a_session_are_the_librarys(rate, correlation, photos):
     strength = 1 / correlation - 1
     expected = betabinom.pmf(np.arange(photos + 1), photos, rate * strength, (1 - rate) * strength)
-    spread = Spread(np.array([rate]), np.array([correlation]), np.ones(1))
+    spread = RatePosterior(np.array([rate]), np.array([correlation]), np.ones(1))
     np.testing.assert_allclose(spread.chances([photos]), expected, atol=1e-8)
 
 
 def test_one_session_allows_for_more_than_the_same_photographs_in_many():
-    spread = spread_of(drawn(np.random.default_rng(0), 0.8, 0.15, 6, 100), [6] * 100)
-    widths = [np.ptp(spread.counts(evenly(40, sessions))) for sessions in (1, 2, 4, 8, 40)]
+    spread = rate_posterior(drawn(np.random.default_rng(0), 0.8, 0.15, 6, 100), [6] * 100)
+    widths = [np.ptp(spread.counts(split_evenly(40, sessions))) for sessions in (1, 2, 4, 8, 40)]
     assert widths == sorted(widths, reverse=True) and widths[0] > 1.5 * widths[-1]
     middle, (low, high) = spread.correlation
     assert low < 0.15 < high and low < middle < high
@@ -53,7 +60,7 @@ def test_intervals_hold_for_new_sessions(correlation):
     """As many sessions as a promise has; of each, one new session and four of ten photographs."""
     rng, inside, within, trials = np.random.default_rng(1), 0, 0, 150
     for rate in rng.beta(2, 1, trials):
-        spread = spread_of(drawn(rng, rate, correlation, 6, 100), [6] * 100)
+        spread = rate_posterior(drawn(rng, rate, correlation, 6, 100), [6] * 100)
         for photos in ((40,), (10,) * 4):
             low, high = spread.counts(photos)
             inside += low <= sum(drawn(rng, rate, correlation, n, 1)[0] for n in photos) <= high
@@ -62,7 +69,10 @@ def test_intervals_hold_for_new_sessions(correlation):
 
 
 def test_the_least_rate_is_wrong_no_more_often_than_it_says():
-    rng, spread = np.random.default_rng(2), spread_of(drawn(np.random.default_rng(3), 0.85, 0.08, 6, 100), [6] * 100)
+    rng, spread = (
+        np.random.default_rng(2),
+        rate_posterior(drawn(np.random.default_rng(3), 0.85, 0.08, 6, 100), [6] * 100),
+    )
     for photos in ((40,), (10,) * 4):
         counts = sum(drawn(rng, 0.65, 0.08, n, 4000) for n in photos)
         wrong = np.mean([spread.least_rate(int(count), photos, TAIL) > 0.65 for count in counts])
@@ -75,12 +85,12 @@ def test_differences_are_wider_where_sessions_differ():
     rng = np.random.default_rng(4)
     good = np.repeat(rng.random(50) < 0.5, 4)  # in half of the sessions the design does it, in the others nothing
     none = np.zeros(200, bool)
-    value, (low, high) = difference_in_sessions(good, none, 4)
-    (_, (near, far)), half = difference_in_sessions(good, none, 1), 1.96 * good.std() / 50**0.5
+    value, (low, high) = session_difference(good, none, 4)
+    (_, (near, far)), half = session_difference(good, none, 1), 1.96 * good.std() / 50**0.5
     assert low < near and high > far and value - low == pytest.approx(half, rel=0.1)
-    assert difference_in_sessions(none, none, 4) == difference_in_sessions(none, none, 1)
+    assert session_difference(none, none, 4) == session_difference(none, none, 1)
 
 
 def test_sessions_are_cut_in_order_and_dealt_evenly():
-    assert in_sessions([True, True, False, True, False], 2) == ([2, 1, 0], [2, 2, 1])
-    assert evenly(11, 4) == (3, 3, 3, 2) and evenly(3, 4) == (1, 1, 1, 0)
+    assert count_by_session([True, True, False, True, False], 2) == ([2, 1, 0], [2, 2, 1])
+    assert split_evenly(11, 4) == (3, 3, 3, 2) and split_evenly(3, 4) == (1, 1, 1, 0)

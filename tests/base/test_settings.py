@@ -10,8 +10,8 @@ from patchproof.base import packaged
 from patchproof.base.errors import Refused
 from patchproof.base.goal import Goal
 from patchproof.base.packaged import packaged_path
-from patchproof.base.settings import SceneSettings, identifying, load_scene_settings
-from patchproof.base.validation import Strict, expand, nearest, validated
+from patchproof.base.settings import SceneSettings, identity_settings, load_scene_settings
+from patchproof.base.validation import StrictModel, expand_path, spelling_hint, validate_model
 from patchproof.sheets.manifest import Target
 
 SCENE = """
@@ -64,10 +64,10 @@ def test_an_unknown_key_names_the_nearest(tmp_path):
 
 
 def test_an_unknown_key_inside_lists_and_optional_tables_is_refused_too():
-    class Inner(Strict):
+    class Inner(StrictModel):
         width: int = 0
 
-    class Outer(Strict):
+    class Outer(StrictModel):
         rows: tuple[Inner, ...] = ()
         named: dict[str, Inner] | None = None
         maybe: Inner | None = None
@@ -75,7 +75,7 @@ def test_an_unknown_key_inside_lists_and_optional_tables_is_refused_too():
     wrong = {"widht": 1}
     for data in ({"rows": [wrong]}, {"named": {"a": wrong}}, {"maybe": wrong}):
         with pytest.raises(Refused, match='widht": did you mean "width"'):
-            validated(Outer, data, "file")
+            validate_model(Outer, data, "file")
 
 
 def test_a_missing_key_is_named(tmp_path):
@@ -173,18 +173,18 @@ def test_files_that_are_no_toml(tmp_path):
 def test_expand_paths_and_names(tmp_path, monkeypatch):
     monkeypatch.setenv("PP_TEST_DIR", "/data")
     absolute = str(tmp_path / "x" / "car.glb")
-    assert expand("car.glb", tmp_path / "x") == absolute and expand(absolute, Path("/elsewhere")) == absolute
-    assert expand("${PP_TEST_DIR}/car.glb", tmp_path) == "/data/car.glb"
-    assert expand("file:${PP_TEST_DIR}/net.onnx", tmp_path) == "file:/data/net.onnx"
-    assert expand("file:net.onnx", tmp_path) == f"file:{tmp_path / 'net.onnx'}"
-    assert expand("timm:vit@w.safetensors", tmp_path) == f"timm:vit@{tmp_path / 'w.safetensors'}"
-    assert expand("torchvision:vgg11@/data/w.safetensors", tmp_path) == "torchvision:vgg11@/data/w.safetensors"
+    assert expand_path("car.glb", tmp_path / "x") == absolute and expand_path(absolute, Path("/elsewhere")) == absolute
+    assert expand_path("${PP_TEST_DIR}/car.glb", tmp_path) == "/data/car.glb"
+    assert expand_path("file:${PP_TEST_DIR}/net.onnx", tmp_path) == "file:/data/net.onnx"
+    assert expand_path("file:net.onnx", tmp_path) == f"file:{tmp_path / 'net.onnx'}"
+    assert expand_path("timm:vit@w.safetensors", tmp_path) == f"timm:vit@{tmp_path / 'w.safetensors'}"
+    assert expand_path("torchvision:vgg11@/data/w.safetensors", tmp_path) == "torchvision:vgg11@/data/w.safetensors"
     kept = ("timm:hf-hub:timm/vit@main", "timm:vit@w.pth", "torchvision:resnet50", "timm:vit")
     for name in ("builtin", "primitive:mug", *kept, "module:a.b"):
-        assert expand(name, tmp_path) == name
+        assert expand_path(name, tmp_path) == name
     monkeypatch.delenv("PP_TEST_DIR")
     with pytest.raises(Refused, match="the environment variable PP_TEST_DIR, got none"):
-        expand("${PP_TEST_DIR}/car.glb", tmp_path)
+        expand_path("${PP_TEST_DIR}/car.glb", tmp_path)
 
 
 def test_settings_keep_variables_unexpanded(tmp_path):
@@ -198,14 +198,14 @@ def test_refused_is_one_sentence_whatever_it_is_given():
 
 
 def test_nearest():
-    assert nearest("coatet", ["coated", "news"]) == 'did you mean "coated"'
-    assert nearest("zzz", ["coated", "news"]) == "use one of: coated, news"
+    assert spelling_hint("coatet", ["coated", "news"]) == 'did you mean "coated"'
+    assert spelling_hint("zzz", ["coated", "news"]) == "use one of: coated, news"
 
 
 def test_values_in_messages_are_short():
     data = {"object": {"mesh": "m", "length_mm": "9" * 500 + "x"}, "patch": {}, "target": {}}
     with pytest.raises(Refused) as error:
-        validated(SceneSettings, data, "scene")
+        validate_model(SceneSettings, data, "scene")
     assert len(str(error.value)) < 300
 
 
@@ -232,7 +232,7 @@ def test_numbers_stay_numbers(tmp_path):
 def test_only_what_differs_from_a_default_names_a_sheet(tmp_path):
     plain, spelled = (load_scene_settings(scene(tmp_path, extra=text)) for text in ("", "[optimize]\nsteps = 240"))
     other = load_scene_settings(scene(tmp_path, extra="[optimize]\nsteps = 241"))
-    assert identifying(plain) == identifying(spelled) != identifying(other)
+    assert identity_settings(plain) == identity_settings(spelled) != identity_settings(other)
 
 
 def test_settings_change_through_a_door_that_checks(tmp_path):
@@ -251,5 +251,5 @@ def test_a_goal_that_is_none_is_refused_wherever_it_stands(tmp_path):
     with pytest.raises(Refused, match="goal"):
         load_scene_settings(scene(tmp_path, ('label = "jeep"', 'label = "jeep"\ngoal = "assits"')))
     with pytest.raises(Refused, match="goal"):
-        validated(Target, {"label": "jeep", "indices": [1], "goal": "confuse"}, "sheet.json")
+        validate_model(Target, {"label": "jeep", "indices": [1], "goal": "confuse"}, "sheet.json")
     assert [(str(goal), goal.sign) for goal in Goal] == [("assist", 1), ("deceive", -1)]

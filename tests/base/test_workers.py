@@ -19,7 +19,7 @@ import toy_studies as toy
 from patchlab.study.study import Work, carry_out
 from patchproof.base import workers as processes
 from patchproof.base.errors import Refused
-from patchproof.base.workers import can_fork, free_cores, open_workers, result_of, sharing, threads
+from patchproof.base.workers import available_cores, can_fork, fork_workers, open_workers, result_of, use_threads
 
 forks = pytest.mark.skipif(not can_fork(), reason="processes are forked on Linux without a GPU")
 
@@ -84,15 +84,15 @@ def test_a_share_has_what_its_function_refers_to_also_after_a_worker_died(tmp_pa
         net.zero_grad()
         net(torch.tensor(weights * i)).sum().backward()
         nested = None
-        with sharing(lambda n: os.getpid(), 2) as (inner, share):  # a share of a share stays where it is
+        with fork_workers(lambda n: os.getpid(), 2) as (inner, share):  # a share of a share stays where it is
             nested = inner.map(share, range(2)) == [os.getpid()] * 2
         return i * int(nested), float(net.weight.grad.sum()), torch.get_num_threads(), os.getpid()
 
-    with sharing(answer, 2) as (crew, share):
+    with fork_workers(answer, 2) as (crew, share):
         answers = crew.map(share, range(6))
     assert [a[:3] for a in answers] == [(i, 6.0 * i, 1) for i in range(6)]
     assert os.getpid() not in {a[3] for a in answers} and not (tmp_path / "2").exists()
-    with sharing(answer, 1) as (crew, share):
+    with fork_workers(answer, 1) as (crew, share):
         assert [a[3] for a in crew.map(share, range(2))] == [os.getpid()] * 2
 
 
@@ -104,7 +104,7 @@ def test_items_in_turn_go_to_the_process_that_had_the_one_so_many_before(tmp_pat
         had.setdefault(i % 3, []).append(i)
         return os.getpid(), len(had[i % 3])
 
-    with sharing(before, 3, in_turn=True) as (crew, share):
+    with fork_workers(before, 3, in_turn=True) as (crew, share):
         answers = [answer for _ in range(4) for answer in crew.map(share, range(6))]
     assert len({pid for pid, _ in answers}) == 3
     assert [times for _, times in answers] == [at // 3 + 1 for at in range(24)]
@@ -120,7 +120,10 @@ def test_a_share_begins_where_torch_and_opencv_already_have_threads():
         picture = np.zeros((2000, 2000, 3), np.uint8)
         cv2.GaussianBlur(picture, (0, 0), 3)
         (torch.rand(512, 512) @ torch.rand(512, 512)).sum()
-        with sharing(lambda i: float(cv2.GaussianBlur(picture, (0, 0), 3).max() + torch.ones(i).sum()), 2) as (crew, f):
+        with fork_workers(lambda i: float(cv2.GaussianBlur(picture, (0, 0), 3).max() + torch.ones(i).sum()), 2) as (
+            crew,
+            f,
+        ):
             assert crew.map(f, range(4)) == [0.0, 1.0, 2.0, 3.0]
         assert (torch.get_num_threads(), cv2.getNumThreads()) == (2, 2)
     finally:
@@ -131,8 +134,8 @@ def test_a_share_begins_where_torch_and_opencv_already_have_threads():
 def test_a_system_that_cannot_fork_works_here_on_as_many_threads(monkeypatch):
     monkeypatch.setattr(processes, "can_fork", lambda: False)
     before = torch.get_num_threads()
-    with threads(1):
-        with sharing(lambda i: (os.getpid(), torch.get_num_threads()), 2) as (crew, share):
+    with use_threads(1):
+        with fork_workers(lambda i: (os.getpid(), torch.get_num_threads()), 2) as (crew, share):
             assert crew.map(share, range(2)) == [(os.getpid(), 2)] * 2
         assert torch.get_num_threads() == 1
     assert torch.get_num_threads() == before
@@ -167,13 +170,13 @@ def alive(pid: int) -> bool:
 
 
 def test_free_cores_are_those_of_affinity_and_quota(monkeypatch, tmp_path):
-    assert 1 <= free_cores() <= (os.cpu_count() or 1)
+    assert 1 <= available_cores() <= (os.cpu_count() or 1)
     if hasattr(os, "sched_getaffinity"):
         monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(8)))
         for text, cores in (("max 100000", 8), ("250000 100000", 2), ("50000 100000", 1), ("1600000 100000", 8)):
             (tmp_path / "cpu.max").write_text(text + "\n")
             monkeypatch.setattr(processes, "_QUOTA", tmp_path / "cpu.max")
-            assert free_cores() == cores
+            assert available_cores() == cores
 
 
 def test_jobs_and_a_cluster_exclude_each_other():

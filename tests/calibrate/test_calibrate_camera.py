@@ -13,16 +13,16 @@ import pytest
 from PIL import Image
 
 from patchproof.base.errors import Refused
-from patchproof.calibrate.boards import View, corner_places_mm, see_boards
+from patchproof.calibrate.boards import BoardView, corner_positions_mm, find_boards
 from patchproof.calibrate.camera import calibrate_camera, solve
-from patchproof.calibrate.ladder import compared, simplest
+from patchproof.calibrate.ladder import compare_rungs, simplest_rung
 from patchproof.channel.lens import load_camera
 from patchproof.sheets.board import board_sheet, load_board
-from patchproof.sheets.raster import page_pixels
+from patchproof.sheets.pdf_raster import rasterize_page
 
 SIZE = (1600, 1200)
 BOARD = load_board("charuco_a4")
-PLACES = corner_places_mm(BOARD)
+PLACES = corner_positions_mm(BOARD)
 NONE = np.zeros(5)
 
 
@@ -51,7 +51,7 @@ def views(seed, count, bends=NONE, tilt=(10, 40), noise_px=0.04):
         seen = ((px > 5) & (px < np.array(SIZE) - 5)).all(1)
         if seen.sum() >= 12:
             noisy = px + rng.normal(0, noise_px, px.shape)
-            made.append(View(f"{len(made):02d}.jpg", np.flatnonzero(seen), PLACES[seen], noisy[seen], SIZE))
+            made.append(BoardView(f"{len(made):02d}.jpg", np.flatnonzero(seen), PLACES[seen], noisy[seen], SIZE))
     return made
 
 
@@ -94,12 +94,12 @@ def test_the_lowest_rung_within_one_standard_error_of_the_paired_difference_is_c
     best = np.array([0.4, 0.10, 0.09, 0.11])
     # worse by 0.01 on average, ± 0.0174 and ± 0.00174: the standard errors of four are 0.0174 / √3 = 0.01005 and 0.001
     near, far = best + 0.01 + np.array([1, -1, 1, -1]) * 0.0174, best + 0.01 + np.array([1, -1, 1, -1]) * 0.00174
-    rungs = compared(["pinhole", "k1", "k1 k2"], np.array([best + 0.1, near, best]))
-    assert simplest(rungs) == 1 and rungs[1].worse_by == pytest.approx(0.01)
+    rungs = compare_rungs(["pinhole", "k1", "k1 k2"], np.array([best + 0.1, near, best]))
+    assert simplest_rung(rungs) == 1 and rungs[1].worse_by == pytest.approx(0.01)
     assert rungs[1].standard_error == pytest.approx(0.0174 / np.sqrt(3)) and rungs[2].worse_by == 0
-    assert simplest(compared(["pinhole", "k1", "k1 k2"], np.array([best + 0.1, far, best]))) == 2
-    lost = compared(["pinhole", "k1"], np.array([np.full(4, np.inf), best]))
-    assert simplest(lost) == 1 and np.isinf(lost[0].error)
+    assert simplest_rung(compare_rungs(["pinhole", "k1", "k1 k2"], np.array([best + 0.1, far, best]))) == 2
+    lost = compare_rungs(["pinhole", "k1"], np.array([np.full(4, np.inf), best]))
+    assert simplest_rung(lost) == 1 and np.isinf(lost[0].error)
 
 
 def test_stated_deviations_are_those_between_repeated_calibrations(pinholes):
@@ -126,7 +126,7 @@ def test_five_photographs_are_too_few():
 def test_a_moved_photograph_and_a_wrong_corner_are_left_out():
     shown = views(5, 10)
     rng = np.random.default_rng(0)
-    shown[3] = View(
+    shown[3] = BoardView(
         "moved.jpg", shown[3].ids, shown[3].board_mm, shown[3].px + rng.normal(0, 3, shown[3].px.shape), SIZE
     )
     shown[5].px[4] += 7
@@ -138,12 +138,12 @@ def test_a_moved_photograph_and_a_wrong_corner_are_left_out():
 
 def test_size_of_the_print_does_not_matter_but_its_proportions_do():
     def printed(scale):
-        return [View(v.file, v.ids, v.board_mm * scale, v.px, v.size_px) for v in views(2, 10)]
+        return [BoardView(v.file, v.ids, v.board_mm * scale, v.px, v.size_px) for v in views(2, 10)]
 
     assert solved(printed(0.5)).fit.numbers[:2] == pytest.approx(1300, rel=0.003)
     with pytest.raises(Refused, match=r"px that it leaves over: glue .* --ruler-mm"):
         solved(printed([0.98, 1.0]))
-    stretched = corner_places_mm(BOARD, (97.0, 98.0))
+    stretched = corner_positions_mm(BOARD, (97.0, 98.0))
     assert stretched == pytest.approx(PLACES * [0.97, 0.98])
 
 
@@ -152,7 +152,7 @@ def photos(tmp_path_factory):
     """Seven JPEGs of the printed page through a known lens, one without a board, one of another size."""
     folder = tmp_path_factory.mktemp("boards")
     board_sheet("charuco_a4", folder / "board.pdf")
-    page = page_pixels(folder / "board.pdf", 1, 127).astype(np.float32) / 255  # 5 px per mm
+    page = rasterize_page(folder / "board.pdf", 1, 127).astype(np.float32) / 255  # 5 px per mm
     size, fine, camera, bends = (640, 480), 3, matrix(560.0, (316.0, 244.0)), np.array([-0.12, 0, 0, 0, 0])
     x, y = np.meshgrid(*((np.arange(side * fine) + 0.5) / fine for side in size))
     straight = cv2.undistortPoints(np.stack([x.ravel(), y.ravel()], 1).reshape(-1, 1, 2), camera, bends).reshape(-1, 2)
@@ -197,6 +197,6 @@ def test_photographs_give_a_camera_file_that_scenes_can_read(photos, tmp_path):
 def test_a_folder_without_boards_is_refused(tmp_path):
     Image.fromarray(np.full((480, 640, 3), 90, np.uint8)).save(tmp_path / "a.png")
     with pytest.raises(Refused, match="Expected photographs of the board"):
-        see_boards(tmp_path, BOARD)
+        find_boards(tmp_path, BOARD)
     with pytest.raises(Refused, match=r"ends in \.json"):
         calibrate_camera(tmp_path, "charuco_a4", tmp_path / "camera.txt")

@@ -33,12 +33,12 @@ from patchproof.calibrate.color_ladder import (
     distinct,
     fit_affine,
     fit_white_black,
-    kinds_of_maps,
+    map_kinds,
 )
-from patchproof.calibrate.printer_files import shown_colors
-from patchproof.channel.camera import encoded
+from patchproof.calibrate.printer_files import printer_output
+from patchproof.channel.camera import encode_light
 from patchproof.channel.lens import Camera, load_camera
-from patchproof.channel.printer import load_printer, vary
+from patchproof.channel.printer import load_printer, vary_print
 from patchproof.channel.tone import codes_of_light, light_of_codes
 from patchproof.photo.read import Photo, read_photo
 from patchproof.photo.rejection import PhotoRejected
@@ -65,7 +65,7 @@ def chart(count: int) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def priors():
-    return {name: partial(shown_colors, load_printer(name)) for name in ("coated", "uncoated")}
+    return {name: partial(printer_output, load_printer(name)) for name in ("coated", "uncoated")}
 
 
 # ------------------------------------------------------------------------------------------------ the ladder
@@ -85,7 +85,7 @@ def test_each_rung_finds_a_printer_of_its_own_kind_and_none_above_it_is_taken(pr
     sent = chart(72)
     for name, show in kinds.items():
         seen = np.clip(show(sent) + rng.normal(0, 0.003, sent.shape), 0, 1)
-        choice = choose(kinds_of_maps(priors), sent, seen)
+        choice = choose(map_kinds(priors), sent, seen)
         assert choice.chosen.name == name, choice.rungs
         assert difference(choice.predict(UNSEEN), show(UNSEEN)).mean() < (1.0 if name == "spline" else 0.5)
 
@@ -115,7 +115,7 @@ def test_corners_are_never_held_out_and_every_other_color_is_once(priors):
         return lambda colors: colors
 
     sent = chart(48)
-    free = kinds_of_maps({})
+    free = map_kinds({})
     choice = choose([replace(free[0], fit=spy)], sent, sent)
     corners = np.isin(distinct(sent, sent)[0], (0.0, 1.0)).all(1)
     assert choice.held_out == (~corners).sum() == 34
@@ -127,16 +127,16 @@ def test_corners_are_never_held_out_and_every_other_color_is_once(priors):
 @pytest.mark.parametrize("count", [6, 12])
 def test_few_swatches_leave_rungs_with_nothing_to_fit(priors, count):
     sent = chart(count)
-    choice = choose(kinds_of_maps(priors), sent, shown(draw_inkjet(1), sent))
+    choice = choose(map_kinds(priors), sent, shown(draw_inkjet(1), sent))
     assert choice.chosen.name in {"identity", "white_black", "prior"}
     assert "spline" in choice.left_out and "affine" in choice.left_out
 
 
 def test_splines_start_at_24_colors(priors):
     sent = np.vstack([chart(14), np.random.default_rng(4).random((10, 3))])
-    names = {rung.name for rung in choose(kinds_of_maps(priors), sent, sent).rungs}
+    names = {rung.name for rung in choose(map_kinds(priors), sent, sent).rungs}
     assert "spline" in names
-    names = {rung.name for rung in choose(kinds_of_maps(priors), sent[:-1], sent[:-1]).rungs}
+    names = {rung.name for rung in choose(map_kinds(priors), sent[:-1], sent[:-1]).rungs}
     assert "spline" not in names and "prior+affine" in names
 
 
@@ -153,7 +153,7 @@ def test_colors_that_are_nearly_gray_hold_no_free_map(priors):
     off = {}
     for share in (1.0, 0.2, 0.1, 0.0):
         sent = grayed(share)
-        choice = choose(kinds_of_maps(priors), sent, np.clip(shown(printer, sent) + noise, 0, 1))
+        choice = choose(map_kinds(priors), sent, np.clip(shown(printer, sent) + noise, 0, 1))
         free = {rung.name for rung in choice.rungs} & {"affine", "spline", "prior+affine+spline"}
         assert bool(free) == (choice.width >= FLAT) == (share >= 0.2)
         off[share] = difference(choice.predict(UNSEEN), shown(printer, UNSEEN)).mean()
@@ -192,7 +192,7 @@ def test_the_simplest_within_one_standard_error_wins_by_hand():
     sent = chart(48)
     off = np.zeros_like(sent)
     off[:, 0] = 0.1 * sent[:, 0] * (1 - sent[:, 0])
-    free = kinds_of_maps({})
+    free = map_kinds({})
     near = replace(free[2], name="true", fit=lambda a, b: lambda c: c + np.array([0.1, 0, 0]) * (c * (1 - c)))
     assert choose([free[0], near], sent, sent + off).chosen.name == "true"
     noise = np.random.default_rng(0).normal(0, 0.05, sent.shape)
@@ -283,10 +283,10 @@ def test_a_printer_is_calibrated_stored_and_loaded(shots, tmp_path, capsys):
     assert ended.value.code == 0 and "chosen" in told.out and "appearance" in told.out and "bad.jpg" in told.err
     mine = load_printer(str(tmp_path / "mine.npz"))
     assert mine.method == "measured" and mine.provenance["chosen"] == "spline"
-    assert [row["rung"] for row in mine.provenance["ladder"]] == [rung.name for rung in kinds_of_maps({"x": None})]
+    assert [row["rung"] for row in mine.provenance["ladder"]] == [rung.name for rung in map_kinds({"x": None})]
     assert len(mine.provenance["photographs"]) == 2 and "no camera file" in mine.provenance["model_of"]
     np.testing.assert_allclose(mine.lut[-1, -1, -1], 1, atol=1e-6)
-    assert difference(shown_colors(mine, UNSEEN), shown(printer, UNSEEN)).mean() < 2
+    assert difference(printer_output(mine, UNSEEN), shown(printer, UNSEEN)).mean() < 2
     with pytest.raises(Refused, match="which exists"):
         cli.app(command, standalone_mode=False)
 
@@ -322,9 +322,9 @@ def test_readings_are_combined_without_the_one_that_is_off():
 
 
 def test_print_to_print_variation_is_found():
-    light = torch.tensor(linear_from_srgb(shown_colors(load_printer("coated"), chart(72))))
+    light = torch.tensor(linear_from_srgb(printer_output(load_printer("coated"), chart(72))))
     draws = np.random.default_rng(5).uniform(-1, 1, (12, 3)) * [0.04, 0.05, 0.004]
-    prints = [vary(light, torch.tensor(draw)).numpy() for draw in draws]
+    prints = [vary_print(light, torch.tensor(draw)).numpy() for draw in draws]
     found = print_variation(prints)
     expected = draws.std(0, ddof=1)
     got = [found[key] for key in ("dot_gain_sd", "density_sd", "black_lift_sd")]
@@ -353,7 +353,7 @@ def printer_errors(seed: int, swatches: int, camera: Camera) -> tuple[float, flo
         light = read_chart(shot.photo, manifest, known).light
         usable = np.isfinite(light).all(1)
         sent = np.array([s.srgb for s in manifest.chart])[usable]
-        choice = choose(kinds_of_maps(priors), sent, srgb_from_linear(light[usable]))
+        choice = choose(map_kinds(priors), sent, srgb_from_linear(light[usable]))
         errors.append(float(difference(bench_printer.relative(choice.predict, colors), truth).mean()))
     return errors[0], errors[1]
 
@@ -363,7 +363,7 @@ def test_tone_curves_close_and_a_camera_without_one_is_srgb():
     light = torch.tensor(light_of_codes(codes, camera))
     np.testing.assert_allclose(codes_of_light(light, camera), codes, atol=1e-9)
     np.testing.assert_allclose(light_of_codes(codes, load_camera("phone")), linear_from_srgb(codes))
-    np.testing.assert_allclose(encoded(torch.tensor([2.0, -1.0]), camera), [1, 0])
+    np.testing.assert_allclose(encode_light(torch.tensor([2.0, -1.0]), camera), [1, 0])
     middle = torch.linspace(0.05, 0.95, 7, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda x: codes_of_light(x, camera), middle)
 
@@ -467,7 +467,7 @@ def test_an_rgb_profile_is_baked_with_both_intents(tmp_path):
     for perceptual, word in ((False, "relative"), (True, "perceptual")):
         printer = icc.bake(path, "rgb", "none", "test", perceptual)
         assert printer.provenance["profile_colors"] == "RGB" and printer.provenance["intents"].startswith(word)
-        assert difference(shown_colors(printer, UNSEEN), UNSEEN).mean() < 0.3  # what it prints is sRGB, in 8 bits
+        assert difference(printer_output(printer, UNSEEN), UNSEEN).mean() < 0.3  # what it prints is sRGB, in 8 bits
 
 
 def test_damaged_profiles_never_end_in_anything_but_a_sentence(tmp_path):

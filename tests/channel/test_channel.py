@@ -10,18 +10,18 @@ from tolerances import BY_TABLE, CODE
 
 from patchproof.base.color import linear_from_srgb
 from patchproof.base.settings import SceneSettings
-from patchproof.base.validation import validated
+from patchproof.base.validation import validate_model
 from patchproof.channel.camera import (
     _streaks,
-    blurred,
-    compressed,
+    add_noise,
+    compress_jpeg,
     develop,
-    encoded,
-    encoded_by_table,
+    encode_light,
+    encode_light_by_table,
     gains,
+    gaussian_blur,
     is_pointwise,
-    moved,
-    noisy,
+    motion_blur,
 )
 from patchproof.channel.lens import load_camera
 from patchproof.scene.conditions import draw
@@ -35,14 +35,14 @@ def sensor(n, **camera):
         "target": {"label": 0, "models": ["builtin"]},
         "camera": quiet | camera,
     }
-    return draw(validated(SceneSettings, settings, "test"), "promise", n, 0).sensor
+    return draw(validate_model(SceneSettings, settings, "test"), "promise", n, 0).sensor
 
 
 def test_codes_by_table_are_those_of_the_curve():
     light = torch.cat([torch.linspace(-0.5, 1.5, 100_001), 2.0 ** torch.linspace(-30, 0, 10_001)]).double()[:, None]
     for camera in (None, load_camera("phone")):
-        quick = encoded_by_table(light.float().expand(-1, 3), camera)
-        off = (quick.double() - encoded(light, camera)).abs()
+        quick = encode_light_by_table(light.float().expand(-1, 3), camera)
+        off = (quick.double() - encode_light(light, camera)).abs()
         assert quick.shape == (len(light), 3) and float(off.max()) < BY_TABLE < CODE / 70
 
 
@@ -70,7 +70,7 @@ def test_white_balance_keeps_green_and_moves_red_and_blue():
 def test_blur_spreads_a_point_by_its_sigma_and_keeps_its_light(sigma):
     point = torch.zeros(1, 1, 31, 31)
     point[0, 0, 15, 15] = 1
-    spread = blurred(point, torch.tensor([sigma]))[0, 0]
+    spread = gaussian_blur(point, torch.tensor([sigma]))[0, 0]
     x = torch.arange(31.0) - 15
     assert float(spread.sum()) == pytest.approx(1, abs=1e-4)
     assert float((spread.sum(0) * x**2).sum()) ** 0.5 == pytest.approx(sigma, rel=0.03)
@@ -78,14 +78,14 @@ def test_blur_spreads_a_point_by_its_sigma_and_keeps_its_light(sigma):
 
 def test_blur_too_small_to_be_seen_costs_nothing():
     picture = torch.rand(2, 3, 9, 9)
-    assert blurred(picture, torch.tensor([0.0, 0.3])) is picture
+    assert gaussian_blur(picture, torch.tensor([0.0, 0.3])) is picture
 
 
 @pytest.mark.parametrize("length, angle", [(6.0, 0.0), (6.0, 90.0), (7.0, 30.0), (3.0, 135.0)])
 def test_motion_spreads_a_point_along_its_line_only_and_keeps_its_light(length, angle):
     point = torch.zeros(1, 1, 31, 31, dtype=torch.float64)
     point[0, 0, 15, 15] = 1
-    streak = moved(point, torch.tensor([length], dtype=torch.float64), [angle])[0, 0]
+    streak = motion_blur(point, torch.tensor([length], dtype=torch.float64), [angle])[0, 0]
     x = torch.arange(31.0, dtype=torch.float64) - 15
     assert float(streak.sum()) == pytest.approx(1, abs=1e-9)
     moments = torch.stack([(streak.sum(0) * x * x).sum(), (streak.sum(1) * x * x).sum()])
@@ -102,7 +102,7 @@ def test_motion_spreads_a_point_along_its_line_only_and_keeps_its_light(length, 
 def test_motion_is_the_mean_of_shifted_pictures():
     """A slow twin for a whole number of pixels: a line of 4 px, of which the ends count half."""
     picture = torch.rand(1, 3, 20, 20, dtype=torch.float64)
-    seen = moved(picture, torch.tensor([4.0], dtype=torch.float64), [0.0])[..., 4:-4]
+    seen = motion_blur(picture, torch.tensor([4.0], dtype=torch.float64), [0.0])[..., 4:-4]
     weights = {-2: 1, -1: 2, 0: 2, 1: 2, 2: 1}
     true = sum(w / 8 * picture.roll(shift, -1) for shift, w in weights.items())[..., 4:-4]
     torch.testing.assert_close(seen, true, atol=0.01, rtol=0)
@@ -111,12 +111,12 @@ def test_motion_is_the_mean_of_shifted_pictures():
 def test_motion_is_each_pictures_own_and_too_short_a_one_costs_nothing():
     pictures = torch.rand(3, 3, 24, 24)
     lengths, angles = torch.tensor([0.0, 3.0, 9.0]), [10.0, 20.0, 30.0]
-    together = moved(pictures, lengths, angles)
+    together = motion_blur(pictures, lengths, angles)
     torch.testing.assert_close(together[0], pictures[0])
     for i in (1, 2):
-        alone = moved(pictures[i : i + 1], lengths[i : i + 1], angles[i : i + 1])[0]
+        alone = motion_blur(pictures[i : i + 1], lengths[i : i + 1], angles[i : i + 1])[0]
         torch.testing.assert_close(together[i], alone, atol=0.01, rtol=0)  # the line is cut into other steps
-    assert moved(pictures, torch.tensor([0.0, 1.0, 1.3]), angles) is pictures
+    assert motion_blur(pictures, torch.tensor([0.0, 1.0, 1.3]), angles) is pictures
 
 
 def test_only_what_treats_pixels_alone_is_pointwise():
@@ -131,21 +131,21 @@ def test_only_what_treats_pixels_alone_is_pointwise():
 def test_terms_that_are_off_change_no_bit():
     linear = torch.rand(3, 3, 16, 16)
     drawn = sensor(3, exposure_ev=[-0.5, 0.5], blur_px=[0, 2], noise=[0, 0.02])
-    spread = blurred(linear, torch.as_tensor(drawn.blur_px).float())
-    assert moved(linear, torch.zeros(3), [0.0] * 3) is linear
-    exposed = noisy(
+    spread = gaussian_blur(linear, torch.as_tensor(drawn.blur_px).float())
+    assert motion_blur(linear, torch.zeros(3), [0.0] * 3) is linear
+    exposed = add_noise(
         spread * gains(drawn, linear)[:, :, None, None], torch.as_tensor(drawn.noise).float(), drawn.noise_seed
     )
-    assert torch.equal(develop(linear, drawn, 1.0, jpeg=False), encoded(exposed))
+    assert torch.equal(develop(linear, drawn, 1.0, jpeg=False), encode_light(exposed))
 
 
 def test_noise_has_the_stated_variance_and_is_each_views_own():
     flat = torch.full((2, 3, 200, 200), 0.5)
-    seen = noisy(flat, torch.tensor([0.02, 0.02]), [5, 6])
+    seen = add_noise(flat, torch.tensor([0.02, 0.02]), [5, 6])
     expected = 0.02 * (0.5 + 0.25**2) ** 0.5
     assert float((seen - flat).std()) == pytest.approx(expected, rel=0.02)
     assert not torch.equal(seen[0], seen[1])
-    assert torch.equal(noisy(flat[:1], torch.tensor([0.02]), [6])[0], seen[1])
+    assert torch.equal(add_noise(flat[:1], torch.tensor([0.02]), [6])[0], seen[1])
 
 
 def test_noise_shrinks_with_the_picture_as_averaging_shrinks_it():
@@ -164,7 +164,7 @@ def test_jpeg_is_near_a_real_encoder_and_carries_gradients():
 
     y, x = torch.meshgrid(torch.arange(50.0), torch.arange(70.0), indexing="ij")
     picture = torch.stack([torch.sin(x / 5), torch.cos(y / 6), torch.sin((x + y) / 7)])[None] / 2.2 + 0.5
-    ours = compressed(picture.requires_grad_(), torch.tensor([75.0]))
+    ours = compress_jpeg(picture.requires_grad_(), torch.tensor([75.0]))
     assert ours.shape == picture.shape
     (gradient,) = torch.autograd.grad(ours.sum(), picture)
     assert bool((gradient != 0).any())
@@ -191,7 +191,7 @@ def test_blur_and_motion_are_kornias_to_the_bit(shape, colors_side_by_side):
     sigmas, lengths, angles = (torch.linspace(*ends, len(photos)) for ends in ((0.02, 2), (1.5, 6), (0, 70)))
     size, sigmas_yx = 2 * int(3 * float(sigmas.max()) + 0.5) + 1, sigmas.clamp_min(0.05)[:, None].expand(-1, 2)
     theirs = gaussian_blur2d(photos, (size, size), sigmas_yx, border_type="replicate")
-    assert torch.equal(blurred(photos, sigmas), theirs)
+    assert torch.equal(gaussian_blur(photos, sigmas), theirs)
     assert torch.equal(
-        moved(photos, lengths, angles), filter2d(photos, _streaks(lengths, angles), border_type="replicate")
+        motion_blur(photos, lengths, angles), filter2d(photos, _streaks(lengths, angles), border_type="replicate")
     )

@@ -14,12 +14,29 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from patchlab.validation import ablation
 from patchproof.app.plan.terms import PRINTER, Setup, scene_terms
 from patchproof.base.settings import CameraSettings, LightSettings, PrinterSettings
-from patchproof.channel.effects import EFFECT, EFFECTS, FIELDS, RECORD_OF, RECORDS, Effect, Light, Pose, Sensor
+from patchproof.channel.effects import (
+    EFFECT_BY_NAME,
+    EFFECTS,
+    FIELDS,
+    RECORD_OF,
+    RECORDS,
+    Light,
+    Pose,
+    Sensor,
+    ViewEffect,
+)
 from patchproof.optimizer.problem import set_problem
 from patchproof.render import photograph
-from patchproof.render.photograph import expose, windows_of
-from patchproof.render.views import see
-from patchproof.scene.conditions import Conditions, draw, fields_of, of_fields, sampled, without
+from patchproof.render.photograph import affected_windows, expose
+from patchproof.render.views import render_views
+from patchproof.scene.conditions import (
+    Conditions,
+    conditions_from_fields,
+    draw,
+    fields_of,
+    sample_fields,
+    without_effect,
+)
 from test_conditions import EVERYTHING, STREAMS
 from test_optimize import scene_with
 
@@ -34,7 +51,7 @@ DIGESTS = {
 SWITCHED = [effect for effect in EFFECTS if effect.switch]
 # Those without which a step takes fewer operations.
 SLOWS = {"motion blur", "blur", "noise", "JPEG"}
-MADE_UP = Effect("smell", {"smell": "light.ambient", "sweetness": (0.0, 1.0)})
+MADE_UP = ViewEffect("smell", {"smell": "light.ambient", "sweetness": (0.0, 1.0)})
 # Settings of light, print and camera that are no ranges of an effect.
 NO_RANGES = {"printer.profile", "camera.photo_px", "camera.file"}
 
@@ -54,8 +71,8 @@ def test_draws_are_those_of_all_runs_before(stream):
 @pytest.mark.parametrize("stream", STREAMS)
 @pytest.mark.parametrize("place", [0, len(EFFECTS) // 2, len(EFFECTS)])
 def test_an_effect_more_moves_no_other_draw(stream, place):
-    before = sampled(EFFECTS, EVERYTHING, stream, 20, 5, 3)
-    after = sampled((*EFFECTS[:place], MADE_UP, *EFFECTS[place:]), EVERYTHING, stream, 20, 5, 3)
+    before = sample_fields(EFFECTS, EVERYTHING, stream, 20, 5, 3)
+    after = sample_fields((*EFFECTS[:place], MADE_UP, *EFFECTS[place:]), EVERYTHING, stream, 20, 5, 3)
     low, high = EVERYTHING.light.ambient
     smell, sweetness = after.pop("smell"), after.pop("sweetness")
     assert (low <= smell).all() and (smell <= high).all() and np.ptp(smell) > 0.5 * (high - low)
@@ -65,8 +82,8 @@ def test_an_effect_more_moves_no_other_draw(stream, place):
 
 def test_a_new_effects_draws_depend_on_index_stream_seed_and_name_alone():
     def smell(name="smell", stream="train", seed=5, start=0):
-        effect = Effect(name, MADE_UP.columns)
-        return sampled([effect], EVERYTHING, stream, 20 - start, seed, start)["smell"]
+        effect = ViewEffect(name, MADE_UP.columns)
+        return sample_fields([effect], EVERYTHING, stream, 20 - start, seed, start)["smell"]
 
     np.testing.assert_array_equal(smell(start=7), smell()[7:])
     for other in (smell("taste"), smell(stream="select"), smell(seed=6)):
@@ -76,7 +93,9 @@ def test_a_new_effects_draws_depend_on_index_stream_seed_and_name_alone():
 def test_every_field_has_one_effect_and_no_two_share_a_column():
     assert sorted(FIELDS) == sorted(RECORD_OF) and len(set(FIELDS)) == len(FIELDS)
     assert set(FIELDS) == {part.name for kind in RECORDS.values() for part in fields(kind)}
-    assert len(EFFECT) == len(EFFECTS) and all(len({RECORD_OF[name] for name in e.fields}) == 1 for e in EFFECTS)
+    assert len(EFFECT_BY_NAME) == len(EFFECTS) and all(
+        len({RECORD_OF[name] for name in e.fields}) == 1 for e in EFFECTS
+    )
     taken = [e.first + i for e in EFFECTS if e.first is not None for i in range(len(e.columns))]
     assert len(set(taken)) == len(taken) and max(taken) == 48
 
@@ -160,7 +179,7 @@ def photographed(problem, conditions, shown) -> tuple[int, torch.Tensor]:
             return func(*args, **(kwargs or {}))
 
     with torch.no_grad(), Counter():
-        pictures = expose(see(problem.stage, shown, conditions, problem.scene.settings.camera.photo_px), shown)
+        pictures = expose(render_views(problem.stage, shown, conditions, problem.scene.settings.camera.photo_px), shown)
     return Counter.count, pictures
 
 
@@ -170,9 +189,9 @@ def test_the_short_way_to_small_pictures_knows_every_effect(problem, effect, mon
     shown = problem.subject.shown(problem.subject.start())
     conditions = problem.scene.draw("select", 4)
     for other in SWITCHED:
-        if other not in (effect, EFFECT["ambient light"]):
-            conditions = without(conditions, other, lambda azimuth_deg, elevation_deg: np.ones(4)) or conditions
-    views = see(problem.stage, shown, conditions, (96, 96))
+        if other not in (effect, EFFECT_BY_NAME["ambient light"]):
+            conditions = without_effect(conditions, other, lambda azimuth_deg, elevation_deg: np.ones(4)) or conditions
+    views = render_views(problem.stage, shown, conditions, (96, 96))
     cut = torch.zeros(4 * 96 * 96, dtype=torch.bool)
     cut[views.on_piece.pixel], cut[views.on_piece.back_pixel] = views.on_piece.share[:, 0] < 1 - FLOAT32, True
     cut[views.outlines.pixel] = True
@@ -191,7 +210,7 @@ def test_what_is_not_given_is_off_and_one_row_stands_for_all():
     for effect in SWITCHED:
         record = getattr(conditions, RECORD_OF[effect.fields[0]])
         assert (effect.off(record, lambda *angles: np.ones(3)) is None) == (effect.name != "ambient light")
-    again = fields_of(of_fields(fields_of(conditions)))
+    again = fields_of(conditions_from_fields(fields_of(conditions)))
     assert all(values.tobytes() == again[name].tobytes() for name, values in fields_of(conditions).items())
     with pytest.raises(ValueError, match=r"fields of one record have \[2, 3\] rows"):
         Sensor(noise=np.zeros(2), blur_px=np.zeros(3))
@@ -202,12 +221,12 @@ def test_windows_hold_all_that_a_design_changes(problem, effect):
     """Outside of them pictures are the same to the bit, whatever hangs there; they are no larger than it takes."""
     conditions = problem.scene.draw("select", 6)
     for other in SWITCHED:
-        if other not in (effect, EFFECT["ambient light"]):
-            conditions = without(conditions, other, lambda azimuth_deg, elevation_deg: np.ones(6)) or conditions
+        if other not in (effect, EFFECT_BY_NAME["ambient light"]):
+            conditions = without_effect(conditions, other, lambda azimuth_deg, elevation_deg: np.ones(6)) or conditions
     designs = [torch.full_like(problem.subject.start(), value) for value in (0.0, 1.0)]
     black, white = (problem.subject.shown(design) for design in designs)
-    views = see(problem.stage, black, conditions, (96, 96))
-    windows = windows_of(views)
+    views = render_views(problem.stage, black, conditions, (96, 96))
+    windows = affected_windows(views)
     if effect.name == "JPEG":
         assert windows is None
         return

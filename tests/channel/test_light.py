@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from patchproof.base.settings import SceneSettings
-from patchproof.base.validation import validated
+from patchproof.base.validation import validate_model
 from patchproof.channel.light import Lighting, irradiance, lighting_of
 from patchproof.scene.conditions import draw
 
@@ -18,7 +18,7 @@ def drawn(n):
         "patch": {"width_mm": 9, "height_mm": 9},
         "target": {"label": 0, "models": ["builtin"]},
     }
-    return draw(validated(SceneSettings, settings, "test"), "promise", n, 0).light
+    return draw(validate_model(SceneSettings, settings, "test"), "promise", n, 0).light
 
 
 def test_paper_facing_the_light_is_white_and_facing_away_gets_the_ambient_part():

@@ -23,7 +23,7 @@ from patchproof.channel.printer import (
     identity_printer,
     load_printer,
     node_colors,
-    vary,
+    vary_print,
 )
 
 DATA = os.environ.get("PATCHPROOF_DATA")
@@ -269,37 +269,37 @@ def test_broken_files_are_refused_in_one_sentence(tmp_path, break_it):
 
 def test_no_change_leaves_colors_and_paper_stays_white():
     light = torch.rand(2, 5, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
-    torch.testing.assert_close(vary(light, torch.zeros(3)), light)
+    torch.testing.assert_close(vary_print(light, torch.zeros(3)), light)
     draws = torch.rand(4, 3, generator=torch.Generator().manual_seed(2))
-    torch.testing.assert_close(vary(torch.ones(4, 3), draws), torch.ones(4, 3))
+    torch.testing.assert_close(vary_print(torch.ones(4, 3), draws), torch.ones(4, 3))
 
 
 def test_variation_has_the_size_of_print_to_print_differences():
     seen = colors_of(load_printer("coated").apply(image(random_8bit())))
     draws = torch.rand(64, 1, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64) * 2 - 1
     draws *= torch.tensor([PrinterSettings().dot_gain[1], PrinterSettings().density[1], PrinterSettings().black[1]])
-    varied = lab_from_linear(vary(torch.tensor(linear_from_srgb(seen)), draws).numpy())
+    varied = lab_from_linear(vary_print(torch.tensor(linear_from_srgb(seen)), draws).numpy())
     error = ciede2000(varied, lab_from_srgb(seen)[None])
     assert 0.5 < error.mean() < 2 and error.max() < 6
 
 
 def test_variation_by_hand():
     half_covered = torch.full((3, 3), 0.5)
-    gained, dense, lifted = vary(half_covered, torch.diag(torch.tensor([0.04, 0.05, 0.004]))).mean(1).tolist()
+    gained, dense, lifted = vary_print(half_covered, torch.diag(torch.tensor([0.04, 0.05, 0.004]))).mean(1).tolist()
     assert gained == pytest.approx(0.46)  # coverage 50 % grows by the dot gain of 4 points
     assert dense == pytest.approx(0.5**1.05) and lifted == pytest.approx(0.502)
 
 
 def test_each_row_has_its_own_draw():
     light, draws = torch.rand(6, 3), torch.rand(6, 3)
-    rows = torch.stack([vary(light[i], draws[i]) for i in range(6)])
-    torch.testing.assert_close(vary(light, draws), rows)
+    rows = torch.stack([vary_print(light[i], draws[i]) for i in range(6)])
+    torch.testing.assert_close(vary_print(light, draws), rows)
 
 
 def test_variation_has_finite_true_gradients():
     light = torch.tensor([[0.05, 0.4, 0.9]], dtype=torch.float64, requires_grad=True)
     draw = torch.tensor([[0.1, 0.9, 0.7]], dtype=torch.float64)
-    assert torch.autograd.gradcheck(lambda x: vary(x, draw), (light,))
+    assert torch.autograd.gradcheck(lambda x: vary_print(x, draw), (light,))
     ends = torch.tensor([0.0, 1.0])[:, None].expand(2, 3).clone().requires_grad_(True)
-    vary(ends, torch.tensor([-0.04, -0.05, 0.004])).sum().backward()
+    vary_print(ends, torch.tensor([-0.04, -0.05, 0.004])).sum().backward()
     assert torch.isfinite(ends.grad).all()

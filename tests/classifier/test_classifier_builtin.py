@@ -13,7 +13,7 @@ from patchlab.training.fit import Seconds
 from patchlab.training.pictures import HELD_OUT, Pictures, augmented, pictures, reduced
 from patchproof.base.errors import Refused
 from patchproof.classifier import find_labels, load_classifier
-from patchproof.classifier.builtin import HERE, INPUT_PX, load_builtin
+from patchproof.classifier.builtin import INPUT_PX, WEIGHTS_FOLDER, load_builtin
 from patchproof.mesh import primitives
 
 FRESH = 7_000_000  # renders that neither training nor its held-out set has seen
@@ -21,7 +21,7 @@ FRESH = 7_000_000  # renders that neither training nor its held-out set has seen
 
 @pytest.fixture(scope="module")
 def builtin():
-    return load_classifier("builtin", HERE)  # warnings are errors: its self-checks have no doubts
+    return load_classifier("builtin", WEIGHTS_FOLDER)  # warnings are errors: its self-checks have no doubts
 
 
 @pytest.fixture(scope="module")
@@ -33,14 +33,14 @@ def fresh() -> Pictures:
 
 def test_it_names_the_primitives_and_is_small(builtin):
     assert builtin.input_px == INPUT_PX == 96
-    assert [find_labels(builtin.labels, name)[0] for name in primitives.names()] == list(range(12))
-    assert (HERE / "builtin.safetensors").stat().st_size < 3_000_000
+    assert [find_labels(builtin.labels, name)[0] for name in primitives.primitive_names()] == list(range(12))
+    assert (WEIGHTS_FOLDER / "builtin.safetensors").stat().st_size < 3_000_000
     assert not any(parameter.requires_grad for parameter in builtin.network.parameters())
 
 
 def test_it_knows_fresh_renders_about_as_well_as_its_card_says(builtin, fresh):
     images, labels, _ = fresh
-    card = json.loads((HERE / "builtin.json").read_text())
+    card = json.loads((WEIGHTS_FOLDER / "builtin.json").read_text())
     assert card["held_out_accuracy"] >= 0.9
     with torch.no_grad():
         logits = builtin.logits(images.float() / 255)
@@ -63,8 +63,8 @@ def test_pictures_are_repeatable_and_follow_the_seed(fresh, monkeypatch):
     assert torch.equal(labels.bincount(), torch.full((12,), 4))
     assert boxes.shape == (48, 4) and bool((boxes[:, 2:] > boxes[:, :2]).all())
     assert (images.float().std((1, 2, 3)) > 1).all()  # none is blank
-    names = primitives.names()[:3]
-    monkeypatch.setattr(primitives, "names", lambda: names)
+    names = primitives.primitive_names()[:3]
+    monkeypatch.setattr(primitives, "primitive_names", lambda: names)
     monkeypatch.setattr(rendered, "VIEWS_PER_SHAPE", 1)
     first, again, other = (pictures(1, seed, INPUT_PX).images for seed in (3, 3, 4))
     assert len(first) == 3 and torch.equal(first, again)

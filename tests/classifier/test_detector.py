@@ -19,14 +19,14 @@ from patchlab.training import train_detector
 from patchproof.base.errors import Refused
 from patchproof.base.geometry import intrinsics, project
 from patchproof.base.goal import Goal
-from patchproof.channel.boxes import MOST_POINTS, box_of, outermost
-from patchproof.classifier.builtin_detector import HERE, INPUT_PX
-from patchproof.classifier.detector import NOTHING, Detector, iou
+from patchproof.channel.object_box import MOST_POINTS, hull_points, project_box
+from patchproof.classifier.average_precision import average_precision, find_detections, suppress_overlaps
+from patchproof.classifier.builtin_detector import INPUT_PX, WEIGHTS_FOLDER
+from patchproof.classifier.detector import NO_BOX_LOGIT, Detector, iou
 from patchproof.classifier.load import load_classifier
-from patchproof.classifier.precision import average_precision, findings, unsuppressed
-from patchproof.optimizer.goals import target_loss
+from patchproof.optimizer.losses import target_loss
 from patchproof.render.stage import set_stage
-from patchproof.render.views import see
+from patchproof.render.views import render_views
 
 FOUR = [0.25, 0.25, 0.75, 0.75]
 
@@ -47,7 +47,7 @@ def test_the_best_candidate_on_the_object_is_what_counts():
     # the first one's overlap is 16 / 64, the others' 1 and 3 / 4
     assert made.logits(photo, box).tolist() == [[2.0, -2.0]]
     assert made.logits(photo).tolist() == [[3.0, 9.0]]  # nobody knows where: anywhere
-    assert made.logits(photo, np.array([[0.9, 0.9, 1.0, 1.0]])).tolist() == [[NOTHING, NOTHING]]
+    assert made.logits(photo, np.array([[0.9, 0.9, 1.0, 1.0]])).tolist() == [[NO_BOX_LOGIT, NO_BOX_LOGIT]]
     logits = made.logits(photo, box)
     assert made.confidence(logits, (0,)).item() == pytest.approx(1 / (1 + math.exp(-2)))
     assert made.confidence(logits, (0, 1)).item() == made.confidence(logits, (0,)).item()  # the best, not the sum
@@ -62,10 +62,10 @@ def test_half_an_overlap_is_the_last_that_counts(share, counts):
 
 @pytest.mark.parametrize(("score", "counts"), [(0.7, True), (0.75, False)])
 def test_the_score_from_which_on_boxes_count_is_the_scene_s(score, counts):
-    made = detector(([2, 2, 6, 6], [1.0, 0.0])).at_score(score)  # a score of 0.731
+    made = detector(([2, 2, 6, 6], [1.0, 0.0])).with_least_score(score)  # a score of 0.731
     assert made.recognized(made.logits(torch.rand(1, 3, 8, 8), np.array([FOUR])), (0,)).item() is counts
     plain = pp.Classifier("plain", None, 8, ("a",), lambda x: x)
-    assert plain.at_score(score) is plain
+    assert plain.with_least_score(score) is plain
 
 
 def test_losses_fall_where_the_goal_is_reached_and_keep_their_gradient():
@@ -107,7 +107,7 @@ def test_a_box_holds_every_pixel_of_the_object_and_no_more():
     scene = pp.make_scene(settings, trimesh.creation.box((3, 2, 1)))
     stage, conditions = set_stage(scene), scene.draw("evaluate", 6)
     for i, box in enumerate(scene.boxes(conditions)):
-        seen = see(stage, None, conditions[[i]], (200, 200))
+        seen = render_views(stage, None, conditions[[i]], (200, 200))
         rows, columns = np.divmod(seen.on_object.pixel.numpy(), 200)
         drawn = np.array([columns.min(), rows.min(), columns.max() + 1, rows.max() + 1])
         assert np.abs(box * 200 - drawn).max() <= 1.0
@@ -115,25 +115,25 @@ def test_a_box_holds_every_pixel_of_the_object_and_no_more():
 
 def test_many_points_and_few_give_the_same_box():
     sphere = trimesh.creation.icosphere(5).vertices * 100.0
-    few = outermost(np.asarray(sphere))
+    few = hull_points(np.asarray(sphere))
     assert len(sphere) > 10_000 and len(few) <= MOST_POINTS
     pose = np.eye(4)
     pose[:3, :3], pose[2, 3] = Rotation.from_euler("xyz", (0.3, 0.8, -0.5)).as_matrix(), 600
     size = (400, 400)
-    whole, thinned = (box_of(points, pose, intrinsics(40, size), size) for points in (sphere, few))
+    whole, thinned = (project_box(points, pose, intrinsics(40, size), size) for points in (sphere, few))
     assert np.abs(whole - thinned).max() < 0.01 * (whole[2] - whole[0])
-    assert len(outermost(np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]))) == 3  # flat meshes have no hull
+    assert len(hull_points(np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]))) == 3  # flat meshes have no hull
 
 
 def test_boxes_are_clipped_and_nothing_in_view_has_none():
     points, size = np.array([[-50.0, -50, 0], [50, 50, 0]]), (100, 80)
     pose = np.eye(4)
     pose[2, 3] = 10.0
-    np.testing.assert_array_equal(box_of(points, pose, intrinsics(60, size), size), [0, 0, 100, 80])
+    np.testing.assert_array_equal(project_box(points, pose, intrinsics(60, size), size), [0, 0, 100, 80])
     pose[2, 3] = -10.0  # behind the camera
-    np.testing.assert_array_equal(box_of(points, pose, intrinsics(60, size), size), 0)
+    np.testing.assert_array_equal(project_box(points, pose, intrinsics(60, size), size), 0)
     pose[:3, 3] = 1000, 0, 10
-    np.testing.assert_array_equal(box_of(points, pose, intrinsics(60, size), size), 0)
+    np.testing.assert_array_equal(project_box(points, pose, intrinsics(60, size), size), 0)
     assert project(intrinsics(60, size), pose, points).shape == (2, 2)
 
 
@@ -151,13 +151,13 @@ def test_average_precision_by_hand():
             [[*here, -9.0], [*away, -9.0]],
         ]
     )
-    assert unsuppressed(rows[0, :, :4], rows[0, :, 4]).tolist() == [0]
-    found = findings(rows, [0], torch.tensor([here] * 3), [True, True, False])
+    assert suppress_overlaps(rows[0, :, :4], rows[0, :, 4]).tolist() == [0]
+    found = find_detections(rows, [0], torch.tensor([here] * 3), [True, True, False])
     assert [right for _, right in found] == [True, False, True]
     assert average_precision(found, 2) == pytest.approx((1 + 2 / 3) / 2)
     assert average_precision(found, 3) == pytest.approx((1 + 2 / 3) / 3)
     assert average_precision([], 3) == 0
-    assert not any(right for _, right in findings(rows, [0], torch.tensor([here] * 3), [False] * 3))
+    assert not any(right for _, right in find_detections(rows, [0], torch.tensor([here] * 3), [False] * 3))
 
 
 def test_suppression_agrees_with_opencv_s():
@@ -168,7 +168,7 @@ def test_suppression_agrees_with_opencv_s():
     scores = 1 / (1 + np.exp(-logits))
     as_opencv = np.concatenate([corners, boxes[:, 2:] - corners], 1)
     theirs = cv2.dnn.NMSBoxes(as_opencv.tolist(), scores.tolist(), 1 / (1 + math.exp(4.6)), 0.5)
-    assert unsuppressed(torch.tensor(boxes), torch.tensor(logits)).tolist() == list(np.ravel(theirs))
+    assert suppress_overlaps(torch.tensor(boxes), torch.tensor(logits)).tolist() == list(np.ravel(theirs))
 
 
 class Found(torch.nn.Module):
@@ -183,8 +183,8 @@ def test_findings_of_any_number_become_candidates_with_gradients():
     made = pp.detector_of(Found(), 8, ["none", "cat"])
     photos = torch.full((2, 3, 8, 8), 0.75).requires_grad_()
     logits = made.logits(photos, np.array([FOUR, [0, 0, 0.2, 0.2]]))
-    assert logits[0].tolist() == [NOTHING, pytest.approx(math.log(3))]
-    assert logits[1].tolist() == [NOTHING, NOTHING]
+    assert logits[0].tolist() == [NO_BOX_LOGIT, pytest.approx(math.log(3))]
+    assert logits[1].tolist() == [NO_BOX_LOGIT, NO_BOX_LOGIT]
     (gradient,) = torch.autograd.grad(logits.sum(), photos)
     assert gradient[0].sum().item() == pytest.approx(1 / 0.75 + 1 / 0.25) and not gradient[1].any()
 
@@ -197,13 +197,13 @@ class Blind(torch.nn.Module):
 
 def test_a_detector_that_finds_nothing_is_doubted_aloud():
     with pytest.warns(UserWarning, match="finds nothing in smooth pictures"):
-        load_classifier(pp.detector_of(Blind(), 8, ["cat"]), HERE)
+        load_classifier(pp.detector_of(Blind(), 8, ["cat"]), WEIGHTS_FOLDER)
 
 
 def test_a_detector_with_another_number_of_labels_is_refused():
     made = Detector("made", None, 8, ("cat", "dog", "owl"), candidates(([0, 0, 8, 8], [3.0, 9.0])))
     with pytest.raises(Refused, match="3 logits for each picture, as there are labels"):
-        load_classifier(made, HERE)
+        load_classifier(made, WEIGHTS_FOLDER)
 
 
 # ------------------------------------------------------------------------------------------------ the one that ships
@@ -211,7 +211,7 @@ def test_a_detector_with_another_number_of_labels_is_refused():
 
 @pytest.fixture(scope="module")
 def packaged_path():
-    return load_classifier("builtin-detector", HERE)
+    return load_classifier("builtin-detector", WEIGHTS_FOLDER)
 
 
 @pytest.fixture(scope="module")
@@ -222,8 +222,8 @@ def fresh():
 
 
 def test_it_is_small_and_finds_fresh_objects_about_as_well_as_its_card_says(shipped, fresh):
-    card = json.loads((HERE / "builtin_detector.json").read_text())
-    assert card["held_out_ap50"] >= 0.8 and (HERE / "builtin_detector.safetensors").stat().st_size < 5_000_000
+    card = json.loads((WEIGHTS_FOLDER / "builtin_detector.json").read_text())
+    assert card["held_out_ap50"] >= 0.8 and (WEIGHTS_FOLDER / "builtin_detector.safetensors").stat().st_size < 5_000_000
     found = train_detector.precision(train_detector.found_by_class(shipped.network, fresh), fresh)
     assert shipped.least_score == card["least_score"]
     assert found.mean() > card["held_out_ap50"] - 0.15  # four views of one shape are alike
@@ -260,7 +260,7 @@ def test_crops_are_opencv_s(two_stage):
 
 def test_detectors_carry_a_run_from_scene_to_verdict(tmp_path, two_stage, monkeypatch):
     monkeypatch.setattr("patchproof.optimizer.loop.SELECT_VIEWS", 2)
-    monkeypatch.setattr("patchproof.reprints.retake.DRAWS", 2)
+    monkeypatch.setattr("patchproof.reprints.photo_forecast.DRAWS", 2)
     names = ["builtin-detector", "module:two_stage.rcnn"]
     scene = pp.make_scene(
         {
@@ -287,7 +287,7 @@ def test_detectors_carry_a_run_from_scene_to_verdict(tmp_path, two_stage, monkey
     for name in names:
         found = evaluated[name].ap50
         assert set(found) >= {"design", "bare"} and 0 <= found["design"] <= 1
-        network = load_classifier(name, HERE).at_score(0.4)
+        network = load_classifier(name, WEIGHTS_FOLDER).with_least_score(0.4)
         for photo, box in zip(report.photos, truth, strict=True):
             answer = photo.predictions[name]
             pixels = torch.tensor(np.asarray(Image.open(tmp_path / "photos" / photo.file).convert("RGB")))
@@ -315,4 +315,4 @@ def test_an_exported_detector_says_so_in_its_json(tmp_path, kind, refused):
     made, photo = load_classifier("file:net.onnx", tmp_path), torch.rand(1, 3, 8, 8)
     assert isinstance(made, Detector)
     torch.testing.assert_close(made.logits(photo, np.array([FOUR])), photo.mean((2, 3))[:, ::2])
-    assert made.logits(photo, np.array([[0, 0, 0.2, 0.2]])).tolist() == [[NOTHING, NOTHING]]
+    assert made.logits(photo, np.array([[0, 0, 0.2, 0.2]])).tolist() == [[NO_BOX_LOGIT, NO_BOX_LOGIT]]

@@ -18,7 +18,7 @@ import patchproof as pp
 from patchproof.app.begin.new import _model
 from patchproof.base.errors import Refused
 from patchproof.classifier import load_classifier, zoo
-from patchproof.reprints.hung_sheet import Hanging
+from patchproof.reprints.mounted_sheet import ReprintSetup
 
 pytestmark = pytest.mark.filterwarnings("ignore:the network")  # doubts: weights are noise
 
@@ -45,7 +45,9 @@ def judged(folder, model, label) -> tuple[pp.Run, pp.Report]:
         run = pp.optimize(pp.load_scene(folder / "scene.toml"), folder / "run", promise=pp.PromiseOptions(8))
     assert np.ptp(run.design) > 0  # gradients came through all of it
     pp.sheet(run, folder / "sheet.pdf")
-    how = Hanging(path_traced=find_spec("mitsuba") is not None)  # by a renderer that is not ours where it is installed
+    how = ReprintSetup(
+        path_traced=find_spec("mitsuba") is not None
+    )  # by a renderer that is not ours where it is installed
     pp.reprint(folder / "sheet.pdf", run, 3, folder / "photos", how)
     report = pp.verify(folder / "photos", folder / "sheet.json", folder / "report", ledger_photos=0)
     assert report.summary.photos == 3 and report.summary.verdict in ("kept", "broken", "cannot_tell")

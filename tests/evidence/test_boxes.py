@@ -13,7 +13,7 @@ from PIL import Image
 import patchproof as pp
 from patchproof.base.errors import Refused
 from patchproof.classifier.detector import iou
-from patchproof.evidence.boxes import box_in, given_boxes, in_square
+from patchproof.evidence.boxes import box_in_square, box_of_photo, load_boxes
 
 
 def coco(path, *boxes, categories=("truck", "patch"), images=("a/p1.jpg", "b/p2.jpg", "b/p1.jpg")):
@@ -30,18 +30,18 @@ def coco(path, *boxes, categories=("truck", "patch"), images=("a/p1.jpg", "b/p2.
 def test_boxes_are_found_by_name_or_by_a_last_part_that_is_alone(tmp_path):
     one, two, three = [1, 2, 10, 20], [3, 4, 5, 6], [0, 0, 9, 9]
     path = coco(tmp_path / "c.json", (1, 1, one), (1, 2, [0, 0, 1, 1]), (2, 1, two), (3, 1, three))
-    boxes = given_boxes(path, "truck")
-    assert box_in(boxes, "a/p1.jpg") == (1, 2, 11, 22) and box_in(boxes, "b/p1.jpg") == (0, 0, 9, 9)
-    assert box_in(boxes, "p2.jpg") == box_in(boxes, "elsewhere/p2.jpg") == (3, 4, 8, 10)
-    assert box_in(boxes, "p1.jpg") is None, "two photographs are called so"
+    boxes = load_boxes(path, "truck")
+    assert box_of_photo(boxes, "a/p1.jpg") == (1, 2, 11, 22) and box_of_photo(boxes, "b/p1.jpg") == (0, 0, 9, 9)
+    assert box_of_photo(boxes, "p2.jpg") == box_of_photo(boxes, "elsewhere/p2.jpg") == (3, 4, 8, 10)
+    assert box_of_photo(boxes, "p1.jpg") is None, "two photographs are called so"
     only = coco(tmp_path / "d.json", (1, 1, one), categories=("thing",))
-    assert given_boxes(only, "truck") == {"a/p1.jpg": (1, 2, 11, 22), "p1.jpg": (1, 2, 11, 22)}
+    assert load_boxes(only, "truck") == {"a/p1.jpg": (1, 2, 11, 22), "p1.jpg": (1, 2, 11, 22)}
 
 
 def test_shares_are_of_the_centered_square():
-    assert in_square((10, 0, 30, 30), (40, 30)) == pytest.approx((5 / 30, 0, 25 / 30, 1))
-    assert in_square((0, 5, 20, 20), (40, 30)) == pytest.approx((0, 5 / 30, 0.5, 20 / 30)), "cut off at its border"
-    assert in_square((0, 5, 5, 20), (40, 30)) == (0, 0, 0, 0), "outside, which nothing that is found overlaps"
+    assert box_in_square((10, 0, 30, 30), (40, 30)) == pytest.approx((5 / 30, 0, 25 / 30, 1))
+    assert box_in_square((0, 5, 20, 20), (40, 30)) == pytest.approx((0, 5 / 30, 0.5, 20 / 30)), "cut off at its border"
+    assert box_in_square((0, 5, 5, 20), (40, 30)) == (0, 0, 0, 0), "outside, which nothing that is found overlaps"
 
 
 @pytest.mark.parametrize(
@@ -55,7 +55,7 @@ def test_shares_are_of_the_centered_square():
 )
 def test_what_is_not_one_box_a_photograph_is_refused(tmp_path, boxes, categories, message):
     with pytest.raises(Refused, match=message):
-        given_boxes(coco(tmp_path / "c.json", *boxes, categories=categories), "truck")
+        load_boxes(coco(tmp_path / "c.json", *boxes, categories=categories), "truck")
 
 
 @pytest.fixture(scope="module")
@@ -99,7 +99,7 @@ def test_drawn_boxes_judge_as_the_sheet_s_own_do_which_are_where_the_object_is(j
         journey, "drawn", capture=pp.CaptureInfo(boxes=journey.photos / "coco.json")
     )  # the truth, as `reprint` wrote it
     assert answers(drawn) == pytest.approx(answers(alone), abs=0.02) and drawn.origin.options["boxes"] == "coco.json"
-    told, true = (given_boxes(f / "coco.json", "box truck") for f in (journey.folder / "alone", journey.photos))
+    told, true = (load_boxes(f / "coco.json", "box truck") for f in (journey.folder / "alone", journey.photos))
     sizes = {image["file_name"]: image for image in json.loads((journey.photos / "coco.json").read_text())["images"]}
     assert len(told) == len(true) == 3
     for name, box in true.items():

@@ -10,11 +10,11 @@ from PIL import Image
 from synthetic_photos import DESIGN_MM, save, view
 
 from patchproof.base.errors import Refused
-from patchproof.evidence.copies import without_copies
+from patchproof.evidence.copies import reject_copies
 from patchproof.evidence.measure import MeasuredPhoto
 from patchproof.evidence.results import Geometry, PhotoEntry
 from patchproof.photo.quality import FrameLight
-from patchproof.photo.read import not_looked_at, read_photo
+from patchproof.photo.read import list_skipped_files, read_photo
 from patchproof.report.words import remarks, verdict_lines
 from patchproof.report.write import photos_csv
 from test_verify_run import shot, verified
@@ -54,28 +54,28 @@ def seen(name, azimuth=10.0, distance=550.0, elevation=5.0, roll=0.0, light=0.8,
 def test_two_shots_of_a_hand_held_camera_are_one_and_another_view_is_none(same, other):
     first = seen("a")
     for how, counted in ((same, False), (other, True)):
-        both = without_copies([first, seen("b", **how)], (0, 0), DESIGN_MM)
+        both = reject_copies([first, seen("b", **how)], (0, 0), DESIGN_MM)
         assert both[0] is first and both[1].counted == counted
         assert both[1].entry.code == (None if counted else "copy")
-    elsewhere = without_copies([first, seen("b", **same)], (0, 1), DESIGN_MM)  # in another place and its light
+    elsewhere = reject_copies([first, seen("b", **same)], (0, 1), DESIGN_MM)  # in another place and its light
     assert elsewhere[1].counted
 
 
 def test_rolled_paper_is_known_by_its_figures_and_equal_bytes_wherever_they_lie():
     rolled = [seen("a", flat=False), seen("b", azimuth=10.5, flat=False), seen("c", azimuth=20, flat=False)]
-    assert [photo.counted for photo in without_copies(rolled, (0, 0, 0), DESIGN_MM)] == [True, False, True]
+    assert [photo.counted for photo in reject_copies(rolled, (0, 0, 0), DESIGN_MM)] == [True, False, True]
     files = [seen("a", sha256="f" * 64), seen("b", azimuth=30, sha256="f" * 64), seen("c", azimuth=30, sha256="e" * 64)]
-    kept = without_copies(files, (0, 1, 1), DESIGN_MM)
+    kept = reject_copies(files, (0, 1, 1), DESIGN_MM)
     assert [photo.counted for photo in kept] == [True, False, True] and "a" in kept[1].entry.remark.advice
     nothing = MeasuredPhoto(PhotoEntry(file="d", status="rejected"), False)
-    assert without_copies([nothing, nothing], (0, 0), DESIGN_MM) == [nothing, nothing]
+    assert reject_copies([nothing, nothing], (0, 0), DESIGN_MM) == [nothing, nothing]
 
 
 def test_no_two_of_many_drawn_views_are_taken_for_one():
     """Ten sessions of 40 in one light, from the default ranges."""
     rng, low, high = np.random.default_rng(0), (-60, 440, 2, -5), (60, 800, 27, 5)
     photos = [seen(str(i), *rng.uniform(low, high), aside=rng.uniform(-20, 20)) for i in range(400)]
-    kept = without_copies(photos, [i // 40 for i in range(400)], DESIGN_MM)
+    kept = reject_copies(photos, [i // 40 for i in range(400)], DESIGN_MM)
     assert all(photo.counted for photo in kept)
 
 
@@ -144,7 +144,7 @@ def test_a_folder_of_raw_files_alone_is_refused_with_their_names(tmp_path):
     (tmp_path / "a.cr3").write_bytes(b"x")
     with pytest.raises(Refused, match=r"got none; raw files.*a\.cr3"):
         verified(tmp_path)
-    assert not_looked_at(tmp_path / "nowhere") == []
+    assert list_skipped_files(tmp_path / "nowhere") == []
 
 
 def test_codes_of_photographs_come_with_names_and_advice():

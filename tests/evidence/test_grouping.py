@@ -6,7 +6,7 @@ import pytest
 from PIL import Image
 
 from patchproof.base.errors import Refused
-from patchproof.evidence.grouping import FOLDERS, GUESS, TIMES, group
+from patchproof.evidence.grouping import BY_FOLDERS, BY_GUESS, BY_TIMES, group
 
 
 def photo(path, taken=None, camera="A"):
@@ -23,7 +23,7 @@ def test_folders_in_the_folder_are_sessions_and_controls_are_none(tmp_path):
         photo(tmp_path / name)
     (tmp_path / "empty").mkdir()
     grouping = group(tmp_path, without=tmp_path / "gray")
-    assert (grouping.names, grouping.session, grouping.known_from) == (("hall", "yard"), (0, 1, 1), FOLDERS)
+    assert (grouping.names, grouping.session, grouping.known_from) == (("hall", "yard"), (0, 1, 1), BY_FOLDERS)
     assert [grouping.file(i) for i in range(3)] == ["hall/1.jpg", "yard/1.jpg", "yard/2.jpg"]
     photo(tmp_path / "loose.jpg")
     assert group(tmp_path, tmp_path / "gray").names == ("", "hall", "yard")
@@ -35,7 +35,7 @@ def test_a_pause_of_more_than_half_an_hour_begins_another_session(tmp_path, seco
     photo(tmp_path / "b.jpg", "2026:05:01 10:00:00")
     photo(tmp_path / "a.jpg", second)
     grouping = group(tmp_path)
-    assert len(grouping.names) == sessions and grouping.known_from == TIMES
+    assert len(grouping.names) == sessions and grouping.known_from == BY_TIMES
     assert grouping.session == ((1, 0) if sessions == 2 else (0, 0))  # in the order of names; numbered by time
 
 
@@ -50,12 +50,12 @@ def test_another_camera_is_another_session(tmp_path):
 def test_photographs_that_do_not_all_say_their_time_are_taken_as_one_session(tmp_path, taken):
     photo(tmp_path / "a.jpg", "2026:05:01 10:00:00")
     photo(tmp_path / "b.jpg", taken)
-    assert group(tmp_path).known_from == GUESS and group(tmp_path).session == (0, 0)
+    assert group(tmp_path).known_from == BY_GUESS and group(tmp_path).session == (0, 0)
 
 
 def test_files_that_are_no_pictures_are_a_guess_and_no_photographs_are_refused(tmp_path):
     (tmp_path / "a.jpg").write_bytes(b"no picture")
-    assert group(tmp_path).known_from == GUESS
+    assert group(tmp_path).known_from == BY_GUESS
     (tmp_path / "a.jpg").rename(tmp_path / "a.txt")
     with pytest.raises(Refused, match=r"photographs .*got none"):
         group(tmp_path)

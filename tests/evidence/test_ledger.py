@@ -15,11 +15,19 @@ from patchproof.base.color import ciede2000, lab_from_linear, linear_from_srgb
 from patchproof.channel.printer import identity_printer, load_printer
 from patchproof.classifier import Classifier
 from patchproof.evidence.classify import square_of
+from patchproof.evidence.gather import gather_evidence
 from patchproof.evidence.ledger import _ledger, shapley
 from patchproof.evidence.print_fit import LEAST_CELLS, fit_print
-from patchproof.evidence.reproject import Reference, Shot, deblurred, light_fit, shot_of, square_with, squares_with
-from patchproof.evidence.run import gather_evidence
-from patchproof.evidence.surface import Promised, piece_picture, promised_of, surface_of
+from patchproof.evidence.reproject import (
+    PhotoSquare,
+    Reference,
+    deblurred,
+    light_fit,
+    photo_square,
+    reprojected_square,
+    reprojected_squares,
+)
+from patchproof.evidence.surface import PromisedColors, piece_picture, promised_of, surface_of
 from patchproof.evidence.task import Options
 from patchproof.photo.pattern_light import pattern_light
 from patchproof.photo.quality import FrameLight
@@ -138,8 +146,8 @@ def test_a_veil_is_no_lighter_than_the_darkest_place(darkest, ink, seen_ink):
     square = np.full((40, 40, 3), 150, np.uint8)
     square[:20] = darkest
     light = FrameLight(np.full(3, 0.8), np.full(3, ink), 0.8 - ink, 0.0)
-    shot = Shot("a.jpg", square, np.eye(3), light, 0.3, 0.0, np.zeros((16, 16, 3)), 1.0)
-    promised = Promised(np.ones((1, 1, 3)), np.full(3, 0.02))
+    shot = PhotoSquare("a.jpg", square, np.eye(3), light, 0.3, 0.0, np.zeros((16, 16, 3)), 1.0)
+    promised = PromisedColors(np.ones((1, 1, 3)), np.full(3, 0.02))
     fit = light_fit(shot, promised)
     assert fit.apply(light.paper) == pytest.approx(np.ones(3))
     assert fit.apply(light.ink) == pytest.approx(np.full(3, seen_ink), abs=1e-6)
@@ -194,7 +202,7 @@ def evidence(folder, faded=False, light=0.75, **look):
         taken = dict(blur_px=0.3, noise=0.002, jpeg=95, light=light, seed=i) | look
         save(photograph(raster(faded), homography, SIZE, **taken), folder / f"{i}.png")
     with pytest.MonkeyPatch.context() as patch:  # what controls would have cost is not asked here
-        patch.setattr("patchproof.evidence.run.estimate_effect", lambda *_: None)
+        patch.setattr("patchproof.evidence.gather.estimate_effect", lambda *_: None)
         return gather_evidence(folder, sheet(), Options([NET], identity_printer()))
 
 
@@ -256,9 +264,9 @@ def test_a_photograph_whose_markers_lie_elsewhere_than_its_homography_says_is_le
     geometry = photo.entry.geometry
     rest = geometry.blur_px, photo.light, surface, 96
     homography = np.array(geometry.homography_px_from_mm)
-    assert shot_of("a", srgb, homography, *rest) is not None
+    assert photo_square("a", srgb, homography, *rest) is not None
     turned = homography @ np.array([[1, 0.2, 0], [0, 1.3, -20], [0, 0, 1.0]])
-    assert shot_of("a", srgb, turned, *rest) is None
+    assert photo_square("a", srgb, turned, *rest) is None
 
 
 def test_the_piece_is_drawn_as_the_page_shows_it():
@@ -281,10 +289,12 @@ def test_a_piece_put_into_a_photograph_is_what_a_photograph_of_it_shows():
     )
     photo = measured(taken, manifest=sheet())
     geometry, promised = photo.entry.geometry, promised_of(sheet(True), surface, identity_printer())
-    shot = shot_of("a", taken, np.array(geometry.homography_px_from_mm), geometry.blur_px, photo.light, surface, 240)
+    shot = photo_square(
+        "a", taken, np.array(geometry.homography_px_from_mm), geometry.blur_px, photo.light, surface, 240
+    )
     drawn, fit = piece_picture(surface, promised.design), light_fit(shot, promised)
-    put = squares_with(shot, {(): drawn}, surface.rect_mm, fit, fit, Reference(0.5, 0.3, 0.0))
-    assert np.array_equal(put[True, True], square_with(shot, drawn, surface.rect_mm, fit))
+    put = reprojected_squares(shot, {(): drawn}, surface.rect_mm, fit, fit, Reference(0.5, 0.3, 0.0))
+    assert np.array_equal(put[True, True], reprojected_square(shot, drawn, surface.rect_mm, fit))
     for on, expected in ((True, other), (False, promised_one)):
         off = np.abs(put[on, on] - square_of(expected)[0] / 255).mean()
         assert off < 0.009  # the print that was taken is 0.036 off and more

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from patchproof.base.geometry import apply_homography, intrinsics, look_at, normalized, plane_homography
+from patchproof.base.geometry import apply_homography, intrinsics, look_at, normalize_homography, plane_homography
 from patchproof.channel import lens
-from patchproof.evidence.camera import _turned, view_of
-from patchproof.photo.ratio import x_over_y
+from patchproof.evidence.camera import _turned, pinhole_photo
+from patchproof.photo.print_ratio import x_over_y
 from patchproof.photo.read import Photo
 from patchproof.photo.rectify import fit_page
 
@@ -57,7 +57,7 @@ def test_a_lens_is_taken_out_and_the_homography_is_the_pinhole_s():
     for px, py in camera.distort_points(dots, size_px):
         picture[(x - px) ** 2 + (y - py) ** 2 < 64] = 10
     assert np.abs(camera.distort_points(dots, size_px) - dots).max() > 3
-    view = view_of(Photo(picture, None), camera)
+    view = pinhole_photo(Photo(picture, None), camera)
     dark = 255.0 - view.srgb[..., 0]
     dark[dark < 60] = 0
     for px, py in dots:
@@ -77,7 +77,7 @@ def test_a_turned_camera_bends_turned_points():
 
 def test_a_picture_of_another_shape_is_another_camera_s():
     photo = Photo(np.zeros((500, 800, 3), np.uint8), 700.0)
-    view = view_of(photo, PHONE)
+    view = pinhole_photo(photo, PHONE)
     assert not view.calibrated and view.matrix_px[0, 0] == 700.0
-    assert view_of(replace(photo, focal_px=None), None).matrix_px is None
-    assert normalized(view.matrix_px)[0, 2] == 400
+    assert pinhole_photo(replace(photo, focal_px=None), None).matrix_px is None
+    assert normalize_homography(view.matrix_px)[0, 2] == 400

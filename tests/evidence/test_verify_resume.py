@@ -19,9 +19,9 @@ from patchproof.base.errors import Refused, WorkerDied
 from patchproof.base.workers import can_fork
 from patchproof.channel.printer import identity_printer
 from patchproof.classifier import Classifier
-from patchproof.evidence import batch, measure, placed
+from patchproof.evidence import batch, locate, measure
+from patchproof.evidence.gather import gather_evidence
 from patchproof.evidence.journal import Journal, file_sha256
-from patchproof.evidence.run import gather_evidence
 from patchproof.evidence.task import Options, task_of
 from patchproof.photo.read import read_photo
 from patchproof.sheets.manifest import dump_manifest
@@ -152,7 +152,7 @@ class Deadly:
 
 def test_a_photograph_that_ends_its_process_each_time_is_rejected_and_the_others_go_on(folder):
     task = task_of(make_manifest(promise()), Options([NET], identity_printer()), None)
-    items = [batch.Item(path, path.name) for path in sorted(folder.iterdir())]
+    items = [batch.PhotoItem(path, path.name) for path in sorted(folder.iterdir())]
     photos = batch.measure_all(task, items, None, Deadly(), None, lambda *_: None, lambda *_: None)
     codes = {photo.entry.file: (photo.entry.status, photo.entry.code) for photo in photos}
     assert codes.pop("b2.jpg") == ("rejected", "unreadable") and codes.pop("a.JPG") == ("rejected", "unreadable")
@@ -166,9 +166,9 @@ def test_a_figure_that_is_no_number_costs_one_photograph(folder, monkeypatch):
         names.append(name)
         return measure.measure(view, name, *rest)
 
-    blur_px = placed.blur_px
+    blur_px = locate.blur_px
     monkeypatch.setattr(batch, "measure", wrong)
-    monkeypatch.setattr(placed, "blur_px", lambda m: float("nan") if names[-1] == "b3.jpg" else blur_px(m))
+    monkeypatch.setattr(locate, "blur_px", lambda m: float("nan") if names[-1] == "b3.jpg" else blur_px(m))
     options = Options([NET], identity_printer(), ledger_photos=0)
     found = gather_evidence(folder, make_manifest(promise()), options).photos
     assert [p.file for p in found if p.status == "rejected"] == ["a.JPG", "b3.jpg"]

@@ -20,20 +20,20 @@ from synthetic_photos import (
     view,
 )
 
-from patchproof.base.claims import wilson
 from patchproof.base.color import ciede2000, lab_from_linear, linear_from_srgb, srgb_from_linear
 from patchproof.base.compute import Compute
 from patchproof.base.errors import Refused
+from patchproof.base.intervals import wilson
 from patchproof.channel.printer import identity_printer, load_printer
 from patchproof.classifier import Classifier
 from patchproof.evidence.appearance import _fitted_by_others, cells_fit
-from patchproof.evidence.camera import view_of
+from patchproof.evidence.camera import pinhole_photo
+from patchproof.evidence.gather import gather_evidence
 from patchproof.evidence.measure import measure
 from patchproof.evidence.ranges import promised_ranges
-from patchproof.evidence.run import gather_evidence
 from patchproof.evidence.surface import promised_of, surface_of
 from patchproof.evidence.task import Options
-from patchproof.photo.quality import FrameLight, shows_nothing
+from patchproof.photo.quality import FrameLight, is_featureless
 from patchproof.photo.read import Photo
 
 
@@ -67,7 +67,9 @@ def measured(srgb, conditions=(), focal_px=None, scan_dpi=None, manifest=None):
     manifest = manifest or make_manifest()
     surface = surface_of(manifest)
     promised = promised_of(manifest, surface, identity_printer())
-    return measure(view_of(Photo(srgb, focal_px), None), "a", surface, promised, promised_ranges(conditions), scan_dpi)
+    return measure(
+        pinhole_photo(Photo(srgb, focal_px), None), "a", surface, promised, promised_ranges(conditions), scan_dpi
+    )
 
 
 def test_a_good_photo_is_measured_and_its_pose_is_right():
@@ -376,7 +378,7 @@ def test_controls_that_show_nothing_never_count_and_are_named(few, tmp_path):
 def test_two_tones_show_something_from_a_code_or_two_on(contrast, nothing):
     picture = np.full((240, 320, 3), 90, np.uint8)
     picture[:, 160:] += contrast
-    assert shows_nothing(picture) is nothing
+    assert is_featureless(picture) is nothing
 
 
 def test_only_scans_have_no_rate(tmp_path):

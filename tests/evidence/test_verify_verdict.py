@@ -8,8 +8,8 @@ from synthetic_photos import make_manifest
 
 from patchproof.base.goal import Goal
 from patchproof.evidence.ranges import matched_rate, promised_ranges, promised_side_px
-from patchproof.evidence.results import Geometry, PhotoEntry, Pose
-from patchproof.evidence.verdict import asked_rate, compare, effect_of, judge, kept_chance
+from patchproof.evidence.results import CameraPose, Geometry, PhotoEntry
+from patchproof.evidence.verdict import compare, effect_of, judge, kept_chance, required_rate
 from patchproof.sheets.manifest import ConditionClaim, Promise
 
 
@@ -87,7 +87,7 @@ def test_deceive_is_the_mirror_image_of_assist():
     for k in range(41):
         mirrored = promise_of(0.1, 1.0, "deceive")
         assert word(k, (40,), promise_of(0.9)) == word(40 - k, (40,), mirrored)
-    assert asked_rate(promise_of(0.1, 0.2, "deceive")) == pytest.approx(0.2)
+    assert required_rate(promise_of(0.1, 0.2, "deceive")) == pytest.approx(0.2)
 
 
 def test_fewer_than_five_or_too_many_without_markers_cannot_tell():
@@ -173,7 +173,9 @@ def test_an_azimuth_leaves_the_range_only_where_it_is_sure_to():
         for a in (-30, 30)
     ]
     ranges = promised_ranges(claims)
-    at = [entry(px_per_mm=1, tilt_deg=1, pose=Pose(azimuth_deg=40, azimuth_uncertainty_deg=u)) for u in (3.9, 4.1)]
+    at = [
+        entry(px_per_mm=1, tilt_deg=1, pose=CameraPose(azimuth_deg=40, azimuth_uncertainty_deg=u)) for u in (3.9, 4.1)
+    ]
     assert ranges.violated(at[0], True).code == "out_of_range"
     assert ranges.violated(at[1], True) is None
 

@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from patchproof.app.cli import app
 from patchproof.report.words import promise_lines
-from patchproof.sheets.content import PrintedPiece
+from patchproof.sheets.content import SheetContent
 from patchproof.sheets.manifest import Promise
 from patchproof.sheets.piece import lay_out_piece
 
@@ -62,7 +62,7 @@ def test_the_page_says_so_in_its_first_line():
     piece = lay_out_piece((100, 100), 10, "A" * 10, "design")
     design = np.full((8, 8, 3), 128, np.uint8)
     kinds = [
-        PrintedPiece(piece, "A" * 10, "design", design, promise_of(0.5, {"bare": ends})).words["kind"]
+        SheetContent(piece, "A" * 10, "design", design, promise_of(0.5, {"bare": ends})).words["kind"]
         for ends in ((0.4, 0.05, 0.2), (0.5, -0.1, 0.1), (0.6, -0.2, -0.05))
     ]
     assert kinds == ["design", "design, no better than bare", "design, worse than bare"]

@@ -6,11 +6,11 @@ import pytest
 from typer.testing import CliRunner
 
 from patchproof.app.cli import app
-from patchproof.base.claims import wilson
-from patchproof.base.settings import SceneSettings, behind
+from patchproof.base.intervals import wilson
+from patchproof.base.settings import SceneSettings, background_summary
+from patchproof.evidence.benefit import benefit_of
 from patchproof.evidence.results import Control
-from patchproof.evidence.verdict import EACH, judge, next_step, photos_line, sessions_needed
-from patchproof.evidence.worth import worth_of
+from patchproof.evidence.verdict import PHOTOS_PER_SESSION, judge, next_step, photos_line, sessions_needed
 from patchproof.report.words import headline_of, promise_lines, verdict_lines
 from patchproof.report.write import render
 from test_report import some_report
@@ -30,7 +30,7 @@ def summary_of(recognized, photos, promise, controls=()):
         verdict=verdict.verdict,
         reason=verdict.reason,
         prediction_interval=verdict.prediction_interval,
-        worth=worth_of(rate, wilson(recognized, photos), controls, promise),
+        worth=benefit_of(rate, wilson(recognized, photos), controls, promise),
     )
 
 
@@ -101,26 +101,28 @@ def test_photographed_controls_come_before_simulated_ones_and_the_bare_object_be
         return Control(name, recognized, 40, (0, 1), 0, 0.5 - recognized / 40, (low, low + 0.4), None, low > 0)
 
     interval = wilson(20, 40)
-    assert worth_of(0.5, interval, [beside("bare", 4)], HARMFUL).word == "helps"
-    worth = worth_of(0.5, interval, [beside("gray", 22), beside("bare", 18)], HELPFUL)
+    assert benefit_of(0.5, interval, [beside("bare", 4)], HARMFUL).word == "helps"
+    worth = benefit_of(0.5, interval, [beside("gray", 22), beside("bare", 18)], HELPFUL)
     assert (worth.control, worth.word, worth.photographed) == ("bare", "not_shown", True)
-    assert worth_of(0.5, interval, [Control("bare", 0, 0, (0, 1))], HELPFUL).photographed is False
-    assert worth_of(0.5, interval, (), promise_of(0.9).changed(controls={})) is None
+    assert benefit_of(0.5, interval, [Control("bare", 0, 0, (0, 1))], HELPFUL).photographed is False
+    assert benefit_of(0.5, interval, (), promise_of(0.9).changed(controls={})) is None
 
 
 @pytest.mark.parametrize(("high", "word"), [(0.099, "no_better"), (0.101, "not_shown")])
 def test_a_gain_of_ten_points_that_is_not_ruled_out_is_not_shown(high, word):
     control = Control("bare", 20, 40, (0, 1), 0, 0.0, (-0.1, high), None, False)
-    assert worth_of(0.5, (0.3, 0.7), [control], HELPFUL).word == word
+    assert benefit_of(0.5, (0.3, 0.7), [control], HELPFUL).word == word
 
 
 def test_who_cannot_tell_is_told_how_many_photographs_the_plan_asks_for():
     promise = promise_of(0.85, 0.2, correlation=0.1)
     needed = sessions_needed(promise)
-    assert needed and f"{EACH} photographs in each of {needed} places" in next_step(promise, (6,))
-    assert f"So far: 6 of {EACH * needed}, in 1 place of {needed}." in next_step(promise, (6,))
+    assert needed and f"{PHOTOS_PER_SESSION} photographs in each of {needed} places" in next_step(promise, (6,))
+    assert f"So far: 6 of {PHOTOS_PER_SESSION * needed}, in 1 place of {needed}." in next_step(promise, (6,))
     assert next_step(promise, ()) == photos_line(needed) and "So far" not in photos_line(needed)
-    assert "new" in next_step(promise, (EACH,) * needed) and "So far" not in next_step(promise, (EACH,) * needed)
+    assert "new" in next_step(promise, (PHOTOS_PER_SESSION,) * needed) and "So far" not in next_step(
+        promise, (PHOTOS_PER_SESSION,) * needed
+    )
     assert "gains more" in next_step(promise_of(0.3, 0.28, correlation=0.2), (40,))
     assert "markers" in next_step(promise, (20,), 3) and "markers" not in next_step(promise, (20,), 2)
     report = some_report().changed(summary=some_report().summary.changed(next_step="Take 10."))
@@ -135,11 +137,15 @@ def test_what_stood_behind_the_object_is_said_and_a_plain_color_loudly():
     }
 
     def said(background):
-        return behind(SceneSettings.model_validate(scene | {"background": background}).model_dump(mode="json"))
+        return background_summary(
+            SceneSettings.model_validate(scene | {"background": background}).model_dump(mode="json")
+        )
 
     assert said({}) == "procedural rooms" and said({"images": "a/yards"}) == "pictures (yards)"
     assert said({"color": (0.5, 0.5, 0.5)}).startswith("ONE PLAIN COLOR")
-    assert behind({"object": {"photos": "x"}}) == "the scene's own pictures" and behind({}) == ""
+    assert (
+        background_summary({"object": {"photos": "x"}}) == "the scene's own pictures" and background_summary({}) == ""
+    )
     plain = said({"color": (0.5, 0.5, 0.5)})
     report = some_report().changed(summary=some_report().summary.changed(background=plain))
     assert any("ONE PLAIN COLOR" in line for line in verdict_lines(report))

@@ -17,7 +17,7 @@ from patchlab.bench import measure, run
 from patchlab.bench.chart import Chart, Check, Point, all_checks, pareto, points_table
 from patchlab.bench.render import resolution_chart
 from patchlab.bench.world import demo_problem
-from patchproof.base.claims import Estimate
+from patchproof.base.intervals import Estimate
 
 
 def point(setting="a", cost=1.0, error=1.0, default=False):

@@ -11,7 +11,7 @@ from patchlab.bench import effort, evidence, train
 from patchlab.bench.chart import Chart, Point, all_checks
 from patchlab.bench.paper import PIECE_MM, corners_mm, drawn_sheet
 from patchlab.bench.world import demo_problem
-from patchproof.base.claims import Estimate
+from patchproof.base.intervals import Estimate
 from patchproof.base.settings import OptimizeSettings
 from patchproof.optimizer import expectation, loop
 
@@ -58,8 +58,8 @@ def test_views_are_counted_as_the_loop_sees_them(problem, monkeypatch):
     monkeypatch.setattr(expectation, "score", lambda *a: seen.append(len(a[1])) or score(*a))
     monkeypatch.setattr(loop, "SELECT_AFTER", 6)
     monkeypatch.setattr(loop, "SELECT_VIEWS", 8)
-    train.trained(problem.trained_by(OptimizeSettings(views=3, steps=2)), [2])
-    assert sum(seen) == loop.views_seen(OptimizeSettings(views=3, steps=2))
+    train.trained(problem.with_training(OptimizeSettings(views=3, steps=2)), [2])
+    assert sum(seen) == loop.views_per_network(OptimizeSettings(views=3, steps=2))
 
 
 def test_training_charts_have_one_default_and_its_real_settings(monkeypatch):
@@ -72,7 +72,9 @@ def test_training_charts_have_one_default_and_its_real_settings(monkeypatch):
     charts = train.charts(True, quiet)
     for chart, name in ((next(charts), f"{usual.views}"), (next(charts), f"{usual.optimizer} {usual.step_size:g}")):
         (default,) = (p for points in chart.series.values() for p in points if p.default)
-        assert default.setting == name and default.cost == loop.views_seen(usual.changed(steps=120 // usual.views))
+        assert default.setting == name and default.cost == loop.views_per_network(
+            usual.changed(steps=120 // usual.views)
+        )
     (*_, last) = chart.series.values()
     assert [p.error.value for p in last] == pytest.approx([*train.QUICK_ADAM, *train.QUICK_SIGN])
 

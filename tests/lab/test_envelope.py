@@ -25,8 +25,8 @@ from patchlab.validation.envelope.world import (
     recognized,
 )
 from patchproof.base import geometry
-from patchproof.base.claims import Estimate, paired_difference
 from patchproof.base.errors import Refused
+from patchproof.base.intervals import Estimate, paired_difference
 from patchproof.optimizer.run import optimize
 from patchproof.render.photograph import photograph
 from patchproof.report.images import drawn as drawing_of

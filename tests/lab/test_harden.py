@@ -18,7 +18,7 @@ from patchlab.harden.folder import HardenSettings, harden_images, tables, too_st
 from patchlab.harden.harden import harden, moved, squares
 from patchlab.study.study import Cell, Result, Work, run_study
 from patchproof.base.errors import Refused
-from patchproof.base.validation import validated
+from patchproof.base.validation import validate_model
 from patchproof.classifier.network import Classifier
 from patchproof.photo.read import read_photo
 
@@ -94,7 +94,7 @@ def folder(tmp_path):
 
 def options(folder, **changed):
     given = {"images": str(folder), "labels": str(folder / "labels.csv"), "models": [FAKE], "steps": 3}
-    return validated(HardenSettings, given | {"attack_epsilons": [0.01]} | changed, "test")
+    return validate_model(HardenSettings, given | {"attack_epsilons": [0.01]} | changed, "test")
 
 
 def test_the_command_keeps_names_and_sizes_and_writes_a_table(folder, tmp_path, capsys):

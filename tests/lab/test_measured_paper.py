@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from patchlab.study.study import STUDIES
-from patchproof.base.claims import wilson
-from patchproof.base.validation import read_toml, validated
+from patchproof.base.intervals import wilson
+from patchproof.base.validation import read_toml, validate_model
 
 NOTES = Path(__file__).resolve().parents[2] / "src/patchlab/results"
 PAGE = " ".join((NOTES / "measured.md").read_text(encoding="utf-8").split())
@@ -114,4 +114,4 @@ def test_rates_of_the_car_are_the_stored_ones():
 )
 def test_configs_are_read(name, config):
     study = import_module(STUDIES[name]).STUDY
-    assert validated(study.settings, read_toml(NOTES / f"paper/{config}.toml"), name)
+    assert validate_model(study.settings, read_toml(NOTES / f"paper/{config}.toml"), name)

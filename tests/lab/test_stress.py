@@ -27,7 +27,7 @@ from patchlab.study.study import run_study
 from patchproof.base.errors import Refused
 from patchproof.base.goal import Goal
 from patchproof.base.settings import SceneSettings
-from patchproof.base.validation import validated
+from patchproof.base.validation import validate_model
 from patchproof.channel.effects import FIELDS
 from patchproof.optimizer import loop, run
 from patchproof.optimizer.pixels import as_pixels
@@ -59,7 +59,7 @@ def toml(path, **tables):
 
 def problem_with(tmp_path, **tables):
     data = SCENE | {name: SCENE[name] | values for name, values in tables.items()}
-    return set_problem(build_scene(validated(SceneSettings, data, "test"), tmp_path))
+    return set_problem(build_scene(validate_model(SceneSettings, data, "test"), tmp_path))
 
 
 @pytest.fixture(autouse=True)
@@ -224,5 +224,5 @@ def test_settings_that_will_not_do_are_refused(tmp_path):
     with pytest.raises(Refused, match="scenes with a mesh"):
         mesh_cells(GridSettings(scenes=("flat.toml",)), tmp_path)
     with pytest.raises(Refused, match="different names"):
-        validated(GridSettings, {"scenes": ["a/s.toml", "b/s.toml"]}, "test")
+        validate_model(GridSettings, {"scenes": ["a/s.toml", "b/s.toml"]}, "test")
     assert len(Axis("x", (0.0, 1.0, 2.0))) == 2

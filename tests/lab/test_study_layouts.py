@@ -8,7 +8,7 @@ import pytest
 from patchlab.study.study import run_study
 from patchlab.validation.layouts import Layout, laid_out
 from patchproof.optimizer import loop
-from patchproof.scene.patch_scene import needs_patch
+from patchproof.scene.patch_scene import require_patch
 from patchproof.scene.scene import make_scene
 from patchproof.sheets.piece import marker_image
 
@@ -23,7 +23,7 @@ SCENE = {
 
 @pytest.fixture(scope="module")
 def scene():
-    return needs_patch(make_scene(SCENE))
+    return require_patch(make_scene(SCENE))
 
 
 def reserved(scene, **layout) -> np.ndarray:

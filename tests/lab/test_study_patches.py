@@ -17,10 +17,10 @@ from patchlab.study.claims import clustered, clustered_mean
 from patchlab.study.grid import scene_values
 from patchlab.study.record import bits
 from patchlab.study.study import Cell, Result, run_study
-from patchproof.base.claims import LEAST_CLUSTERS
 from patchproof.base.errors import Refused
 from patchproof.base.geometry import local_scale
-from patchproof.base.validation import read_toml, validated
+from patchproof.base.intervals import MIN_CLUSTERS
+from patchproof.base.validation import read_toml, validate_model
 from patchproof.optimizer import loop
 from patchproof.optimizer.problem import set_problem
 from patchproof.scene.scene import load_scene
@@ -46,8 +46,8 @@ def test_the_cluster_interval_is_that_of_the_mean_and_repeats():
 
 
 def test_few_clusters_have_no_interval():
-    values = [0.1] * LEAST_CLUSTERS
-    assert clustered(values).low == pytest.approx(0.1) and clustered(values).n == LEAST_CLUSTERS
+    values = [0.1] * MIN_CLUSTERS
+    assert clustered(values).low == pytest.approx(0.1) and clustered(values).n == MIN_CLUSTERS
     assert clustered(values[1:]) == pytest.approx(0.1) and clustered([]) is None
     with pytest.raises(ValueError, match="at least 5 clusters, got 4"):
         clustered_mean(values[1:])
@@ -191,7 +191,7 @@ def test_gain_and_harm_of_a_2d_patch(scene_file, short_loop, tmp_path):
 
 def test_classes_are_those_of_the_table_that_have_images_and_of_the_scenes(scene_file, tmp_path):
     config = two_classes(tmp_path, scene_file)
-    settings = validated(patch2d.Patch2dSettings, read_toml(config), "study.toml")
+    settings = validate_model(patch2d.Patch2dSettings, read_toml(config), "study.toml")
     renders = [scene_values(file, tmp_path) for file in settings.renders]
     classes = classes_of(settings.images, settings.labels, renders, tmp_path)
     assert [one.label for one in classes] == ["mug", 2, "carton"]
@@ -206,7 +206,7 @@ def test_classes_are_those_of_the_table_that_have_images_and_of_the_scenes(scene
 
 def test_a_2d_patch_has_its_size_in_the_networks_pixels_and_no_frame(scene_file, tmp_path):
     config = two_classes(tmp_path, scene_file)
-    settings = validated(patch2d.Patch2dSettings, read_toml(config), "study.toml")
+    settings = validate_model(patch2d.Patch2dSettings, read_toml(config), "study.toml")
     (tmp_path / "work").mkdir()
     classifier = patch2d.load_classifier("builtin", tmp_path)
     one = ImageClass("mug")

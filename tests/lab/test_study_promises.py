@@ -9,10 +9,10 @@ from PIL import Image
 from patchlab.study.study import Cell, Result, run_study
 from patchlab.validation import promises
 from patchproof.base.errors import Refused
-from patchproof.base.sessions import spread_of
+from patchproof.base.sessions import rate_posterior
 from patchproof.optimizer import loop, run
-from patchproof.optimizer.promise import PER_SESSION
-from patchproof.reprints import retake
+from patchproof.optimizer.promise import VIEWS_PER_SESSION
+from patchproof.reprints import photo_forecast
 from test_optimize import SCENE
 
 
@@ -31,7 +31,7 @@ def result(scene, *sessions, hits=320, n=400):
 
 
 def test_an_interval_holds_up_to_its_ends_and_not_beyond():
-    low, high = spread_of([1] * 320 + [0] * 80, [1] * 400).counts([40])
+    low, high = rate_posterior([1] * 320 + [0] * 80, [1] * 400).counts([40])
     sessions = promises.counted(result("a", *((hits, 40) for hits in (low - 1, low, high, high + 1)), (0, 0)))
     assert [session.held() for session in sessions] == [False, True, True, False]
     assert sessions[0].interval() == (low, high) == sessions[0].interval(alone=True)
@@ -59,7 +59,7 @@ def small_study(study, tmp_path, monkeypatch, sessions, more=""):
     """A finished study of that name: one cell, sessions of five photographs by our own renderer."""
     monkeypatch.setattr(run, "PROMISE_VIEWS", 8)
     monkeypatch.setattr(loop, "SELECT_VIEWS", 4)
-    monkeypatch.setattr(retake, "DRAWS", 2)
+    monkeypatch.setattr(photo_forecast, "DRAWS", 2)
     data = {key: dict(value) for key, value in SCENE.items()} | {"camera": {"photo_px": [440, 330]}}
     data |= {"background": {"color": [0.5, 0.5, 0.5]}, "optimize": data["optimize"] | {"steps": 2, "views": 2}}
     lines = [
@@ -78,7 +78,7 @@ def small_study(study, tmp_path, monkeypatch, sessions, more=""):
 def test_a_cell_goes_from_the_scene_to_the_count(tmp_path, monkeypatch):
     finished = small_study("promises", tmp_path, monkeypatch, 2, "elsewhere = 6\nrendered = 2\n")
     (one,) = finished.results
-    assert len(one.answers["promised"]) == 8 and one.answers["per_session"] == PER_SESSION
+    assert len(one.answers["promised"]) == 8 and one.answers["per_session"] == VIEWS_PER_SESSION
     assert len(one.answers["elsewhere"]) == 6 and [n for _, n in one.answers["rendered"]] == [5, 5]
     judged = [judged for _, judged in one.answers["sessions"]]
     assert len(judged) == 2 and all(recognized <= judged <= 5 for recognized, judged in one.answers["sessions"])

@@ -20,9 +20,9 @@ from patchlab.validation import real
 from patchlab.validation.board_fit import BoardFit, edge_of, fit_board, white_noise
 from patchlab.validation.known_boards import BoardSettings, Pose, find_pose
 from patchproof.base.errors import Refused
-from patchproof.base.validation import validated
+from patchproof.base.validation import validate_model
 from patchproof.photo.rejection import PhotoRejected
-from patchproof.sheets.markers import cells_of
+from patchproof.sheets.markers import marker_cells
 
 FINER, SIZE = 8, (320, 240)
 BLUR_PX, BLACK, NOISE = 0.9, (0.05, 0.04, 0.03), 0.008
@@ -30,7 +30,7 @@ CORNERS = np.array([[42, 20], [283, 33], [296, 214], [30, 205]], float)  # px, o
 
 
 def grid(**values) -> BoardSettings:
-    return validated(
+    return validate_model(
         BoardSettings, {"photos": ["x"], "kind": "grid", "rows": 3, "columns": 4, "gap": 0.25} | values, "the test"
     )
 
@@ -117,7 +117,7 @@ def residual(srgb, fit) -> float:
 
 def test_the_wrong_print_leaves_much():
     (srgb, _), (pose, fit) = photograph(), fitted()
-    others = cells_of("DICT_6X6_250", range(100, 100 + len(pose.prints)))
+    others = marker_cells("DICT_6X6_250", range(100, 100 + len(pose.prints)))
     wrong = [replace(printed, cells=cells) for printed, cells in zip(pose.prints, others, strict=True)]
     assert residual(srgb, fit) < 4
     assert residual(srgb, fit_board(srgb, replace(pose, prints=tuple(wrong)))) > 40
@@ -190,7 +190,7 @@ def test_medians_by_hand():
 
 
 def test_real_photographs(data):
-    board = validated(
+    board = validate_model(
         BoardSettings, {"photos": ["x"], "kind": "grid", "rows": 5, "columns": 4, "gap": 0.13}, "the test"
     )
     srgb = real.read_photo(data / "markers" / "grid_6x6" / "aruco_data_0.jpg").srgb

@@ -16,9 +16,9 @@ from patchlab.study.grid import short_name
 from patchlab.study.record import Record
 from patchlab.study.study import Cell, Result, run_study
 from patchlab.study.trained import TrainedSettings, trained_cells, verdict
-from patchproof.base.claims import Estimate
 from patchproof.base.errors import Refused
-from patchproof.base.validation import validated
+from patchproof.base.intervals import Estimate
+from patchproof.base.validation import validate_model
 from patchproof.optimizer import loop, run
 from patchproof.optimizer.evaluate import evaluate
 from patchproof.optimizer.problem import set_problem
@@ -147,7 +147,9 @@ def test_a_family_is_left_out_as_a_whole_and_gains_count_objects_and_seeds(tmp_p
 def test_every_network_is_in_one_family():
     for families in ({"a": (RED,)}, {"a": (RED, BLUE), "b": (BLUE,)}, {"a": (RED, BLUE, "builtin")}):
         with pytest.raises(Refused, match="families in which each of networks is once"):
-            validated(transfer.TransferSettings, {"scenes": ["a"], "networks": [RED, BLUE], "families": families}, "x")
+            validate_model(
+                transfer.TransferSettings, {"scenes": ["a"], "networks": [RED, BLUE], "families": families}, "x"
+            )
 
 
 def test_a_study_finds_what_optimize_and_evaluate_find_and_no_gain_of_a_design_that_did_not_move(tmp_path):
@@ -252,7 +254,7 @@ def test_names_must_differ_and_ways_be_words():
     with pytest.raises(Refused, match="different names"):
         settings.changed(networks=("file:a/net.onnx", "file:b/net.onnx"))
     with pytest.raises(Refused, match=r"ways\.a b"):
-        validated(TrainedSettings, {"scenes": ["a"], "networks": ["b"], "ways": {"a b": {}}}, "config")
+        validate_model(TrainedSettings, {"scenes": ["a"], "networks": ["b"], "ways": {"a b": {}}}, "config")
 
 
 def test_pairs_are_those_of_seeds_that_both_have():

@@ -13,7 +13,7 @@ from PIL import Image
 from patchproof.base.color import linear_from_srgb
 from patchproof.base.errors import Refused
 from patchproof.mesh.load_mesh import load_mesh
-from patchproof.mesh.mesh import Material, Part, from_parts
+from patchproof.mesh.mesh import Material, MeshPart, mesh_from_parts
 
 DATA = os.environ.get("PATCHPROOF_DATA")
 needs_data = pytest.mark.skipif(not DATA, reason="PATCHPROOF_DATA is unset: no meshes from outside")
@@ -98,21 +98,23 @@ def test_unused_and_far_vertices_do_not_count(tmp_path):
 
 def test_faces_stay_outward_when_parts_are_closed():
     gray = Material("m", (0.5, 0.5, 0.5))
-    mesh = from_parts([Part(CUBE, CUBE_FACES, gray)], 10)
+    mesh = mesh_from_parts([MeshPart(CUBE, CUBE_FACES, gray)], 10)
     assert signed_volume(mesh) == pytest.approx(1000)
     np.testing.assert_allclose(mesh.corner_normal[:, 0], face_normals(mesh), atol=1e-6)
 
 
 @pytest.mark.parametrize("scale", [1e-200, 1e-30, 1.0, 1e30, 1e300])
 def test_any_unit_will_do(scale):
-    mesh = from_parts([Part(CUBE * scale, CUBE_FACES, Material("m", (1, 1, 1)))], 10)
+    mesh = mesh_from_parts([MeshPart(CUBE * scale, CUBE_FACES, Material("m", (1, 1, 1)))], 10)
     assert signed_volume(mesh) == pytest.approx(1000) and len(mesh.faces) == 12
 
 
 @pytest.mark.parametrize("mirror", [1, -1])
 def test_transforms_apply_and_a_mirror_keeps_faces_outward(tmp_path, mirror):
     corners = CUBE[CUBE_FACES].reshape(-1, 3)
-    normal = np.repeat(face_normals(from_parts([Part(CUBE, CUBE_FACES, Material("", (1, 1, 1)))], 1)), 3, axis=0)
+    normal = np.repeat(
+        face_normals(mesh_from_parts([MeshPart(CUBE, CUBE_FACES, Material("", (1, 1, 1)))], 1)), 3, axis=0
+    )
     nodes = [
         {"children": [1], "scale": [mirror, 1, 2], "translation": [5, 6, 7]},
         {"mesh": 0, "rotation": [0, 0, np.sqrt(0.5), np.sqrt(0.5)]},
@@ -403,7 +405,7 @@ def test_flat_objects_are_allowed_and_points_are_not(tmp_path):
 def test_indices_that_name_no_vertex(tmp_path):
     refused(write(tmp_path, "a.obj", TRIANGLE + "f 1 2 9\n"))
     with pytest.raises(Refused, match="vertices 0 to 2, got 3"):
-        from_parts([Part(np.eye(3), np.array([[0, 1, 3]]), Material("", (1, 1, 1)))], 1)
+        mesh_from_parts([MeshPart(np.eye(3), np.array([[0, 1, 3]]), Material("", (1, 1, 1)))], 1)
 
 
 def test_relative_indices_between_vertices_are_refused_not_misread(tmp_path):
@@ -427,7 +429,7 @@ def test_hundreds_of_thousands_of_faces_take_no_loop(tmp_path):
     corner = (np.arange(n)[:, None] * (n + 1) + np.arange(n)).ravel()
     faces = np.concatenate([corner[:, None] + [0, 1, n + 1], corner[:, None] + [1, n + 2, n + 1]])
     start = time.perf_counter()
-    mesh = from_parts([Part(np.stack([u, v, 0 * u], -1).reshape(-1, 3), faces, Material("", (1, 1, 1)))], 1)
+    mesh = mesh_from_parts([MeshPart(np.stack([u, v, 0 * u], -1).reshape(-1, 3), faces, Material("", (1, 1, 1)))], 1)
     assert len(mesh.faces) == 2 * n * n
     assert time.perf_counter() - start < 4  # 0.2 s when nothing else runs; a loop over 320,000 faces takes tens
 

@@ -7,7 +7,7 @@ from patchproof.base.errors import Refused
 from patchproof.mesh import primitives, solids
 from patchproof.mesh.load_mesh import load_mesh
 
-ALL_PARTS = [(name, seed) for name in primitives.names() for seed in range(4)]
+ALL_PARTS = [(name, seed) for name in primitives.primitive_names() for seed in range(4)]
 
 
 def corners_of(part):
@@ -93,7 +93,7 @@ def test_a_flat_side_shows_its_texture_upright_once():
     assert at[(1, 2, 1)] == (0, 0) and at[(1, 0, -1)] == (1, 1) and at[(1, 2, -1)] == (1, 0)
 
 
-@pytest.mark.parametrize("name", primitives.names())
+@pytest.mark.parametrize("name", primitives.primitive_names())
 def test_builds_are_repeatable_varied_and_centered(name):
     first, again, other = primitives.build(name, 3), primitives.build(name, 3), primitives.build(name, 4)
     np.testing.assert_array_equal(first.vertices, again.vertices)
@@ -119,7 +119,7 @@ def test_some_objects_have_a_flat_side_for_a_card(name, seed):
 
 
 def test_names_are_twelve_and_an_unknown_one_is_refused_with_the_nearest():
-    assert len(primitives.names()) == 12 == len(set(primitives.names()))
+    assert len(primitives.primitive_names()) == 12 == len(set(primitives.primitive_names()))
     with pytest.raises(Refused, match='"boxtruck": did you mean "box_truck"'):
         primitives.build("boxtruck")
 

@@ -15,19 +15,19 @@ from patchproof.base.errors import Refused
 from patchproof.base.settings import PatchSettings
 from patchproof.mesh import unwrap as unwrapping
 from patchproof.mesh.load_mesh import load_mesh
-from patchproof.mesh.mesh import Material, Part, from_parts
-from patchproof.mesh.texels import coverage
-from patchproof.mesh.unwrap import has_place, unwrap
+from patchproof.mesh.mesh import Material, MeshPart, mesh_from_parts
+from patchproof.mesh.unwrap import has_usable_uv, unwrap
+from patchproof.mesh.uv_coverage import coverage
 from patchproof.render.photograph import photograph
 from patchproof.render.stage import set_stage
+from patchproof.scene.canvas import texture_canvas
 from patchproof.scene.scene import make_scene
-from patchproof.scene.texture import texture_canvas
 
 SOUP = np.random.default_rng(0).normal(size=(90, 3))
 
 
 def soup():
-    return from_parts([Part(SOUP, np.arange(90).reshape(-1, 3), Material("m", (0.5, 0.5, 0.5)))], 300)
+    return mesh_from_parts([MeshPart(SOUP, np.arange(90).reshape(-1, 3), Material("m", (0.5, 0.5, 0.5)))], 300)
 
 
 def mesh_of(name, data=None):
@@ -77,7 +77,7 @@ def test_every_face_has_a_place_of_its_own(data, name):
 def test_a_finely_divided_sphere_comes_apart_evenly():
     """xatlas by itself crashes here: neighbors so nearly coplanar that it makes one chart of the whole sphere."""
     sphere = trimesh.creation.icosphere(6)
-    mesh = from_parts([Part(sphere.vertices, sphere.faces, Material("m", (0.5, 0.5, 0.5)))], 300)
+    mesh = mesh_from_parts([MeshPart(sphere.vertices, sphere.faces, Material("m", (0.5, 0.5, 0.5)))], 300)
     corners, size = atlas(mesh, 256)
     assert len(corners) == 81920 and coverage(corners, size).max() == 1
     density = areas(corners) / areas(mesh.vertices[mesh.faces])
@@ -136,13 +136,13 @@ def test_only_faces_without_coordinates_are_unwrapped():
     paint = np.random.default_rng(2).integers(0, 256, (8, 8, 3), dtype=np.uint8)
     near = SOUP[:, :2] - SOUP[:, :2].min() + 0.1
     parts = [
-        Part(SOUP, np.arange(90).reshape(-1, 3), Material("painted", (1, 1, 1), paint), near),
-        Part(SOUP + 9, np.arange(90).reshape(-1, 3), Material("bare", (0.25, 0.5, 0.0))),
-        Part(SOUP + 18, np.arange(30).reshape(-1, 3), Material("absurd", (1, 1, 1), paint), near * 1e9),
+        MeshPart(SOUP, np.arange(90).reshape(-1, 3), Material("painted", (1, 1, 1), paint), near),
+        MeshPart(SOUP + 9, np.arange(90).reshape(-1, 3), Material("bare", (0.25, 0.5, 0.0))),
+        MeshPart(SOUP + 18, np.arange(30).reshape(-1, 3), Material("absurd", (1, 1, 1), paint), near * 1e9),
     ]
-    mesh = from_parts(parts, 300)
-    assert np.array_equal(has_place(mesh), np.arange(70) < 30)
-    assert not has_place(replace(mesh, corner_uv=mesh.corner_uv * np.float32("nan"))).any()
+    mesh = mesh_from_parts(parts, 300)
+    assert np.array_equal(has_usable_uv(mesh), np.arange(70) < 30)
+    assert not has_usable_uv(replace(mesh, corner_uv=mesh.corner_uv * np.float32("nan"))).any()
     canvas = texture_canvas(mesh, PatchSettings(kind="texture"), Path("."), 64)
     assert canvas.names == ("painted", "unwrapped") and "40 of 70" in canvas.warnings[0]
     assert np.array_equal(canvas.mesh.corner_uv[:30], mesh.corner_uv[:30])
@@ -159,7 +159,9 @@ def test_only_faces_without_coordinates_are_unwrapped():
     ],
 )
 def test_needles_and_specks_do_not_blow_up_the_atlas(thin):
-    mesh = from_parts([Part(np.array(thin, float), np.arange(len(thin)).reshape(-1, 3), Material("m", (1, 1, 1)))], 300)
+    mesh = mesh_from_parts(
+        [MeshPart(np.array(thin, float), np.arange(len(thin)).reshape(-1, 3), Material("m", (1, 1, 1)))], 300
+    )
     canvas = texture_canvas(mesh, PatchSettings(kind="texture"), Path("."), 128)
     assert max(canvas.start_srgb[0].shape) < 4 * 128 and (canvas.start_srgb[0] == 255).all()
     assert np.isfinite(canvas.mesh.corner_uv).all()

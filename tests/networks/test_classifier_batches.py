@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from patchproof.networks.batches import InBatches, fastest, few_on_cpu
+from patchproof.networks.batches import BatchedNetwork, cpu_batch_size, tune_batches
 
 
 class Flattens(torch.nn.Module):
@@ -26,9 +26,9 @@ def test_batches_are_cut_and_filled_up():
         return photos.mean((2, 3))
 
     photos = torch.rand(7, 3, 2, 2)
-    assert torch.equal(InBatches(network, 3)(photos), photos.mean((2, 3)))
+    assert torch.equal(BatchedNetwork(network, 3)(photos), photos.mean((2, 3)))
     assert seen == [3, 3, 3]
-    assert torch.equal(InBatches(network)(photos), photos.mean((2, 3)))
+    assert torch.equal(BatchedNetwork(network)(photos), photos.mean((2, 3)))
     assert seen[3:] == [7]
 
 
@@ -36,8 +36,8 @@ def test_batches_are_cut_and_filled_up():
 def test_the_fastest_order_is_the_one_that_the_network_takes(view, order):
     network = Flattens(view)
     pictures = torch.rand(5, 3, 128, 128)
-    laid = fastest(network, pictures[:2])
-    assert laid.order is order and laid.most == few_on_cpu(128) == 12
+    laid = tune_batches(network, pictures[:2])
+    assert laid.order is order and laid.most == cpu_batch_size(128) == 12
     given, plain = (pictures.clone().requires_grad_() for _ in range(2))
     (gradient,) = torch.autograd.grad(laid(given).square().sum(), given)
     (expected,) = torch.autograd.grad(network(plain).square().sum(), plain)
@@ -47,6 +47,6 @@ def test_the_fastest_order_is_the_one_that_the_network_takes(view, order):
 
 def test_few_pictures_at_a_time_on_a_cpu_but_as_many_as_a_network_takes():
     pictures = torch.rand(2, 3, 224, 224)
-    assert fastest(Flattens(False), pictures).most == 4
-    assert fastest(InBatches(Flattens(False), 8), pictures).most == 8
-    assert few_on_cpu(64) == 49 and few_on_cpu(1024) == 1
+    assert tune_batches(Flattens(False), pictures).most == 4
+    assert tune_batches(BatchedNetwork(Flattens(False), 8), pictures).most == 8
+    assert cpu_batch_size(64) == 49 and cpu_batch_size(1024) == 1

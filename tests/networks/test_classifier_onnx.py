@@ -15,10 +15,10 @@ from patchproof.base.errors import Refused
 from patchproof.classifier import load_classifier
 from patchproof.classifier.builtin import load_builtin
 from patchproof.classifier.custom import classifier_of
-from patchproof.classifier.network_file import EXPORT, load_network
-from patchproof.evidence.run import gather_evidence
+from patchproof.classifier.network_file import EXPORT_ADVICE, load_network
+from patchproof.evidence.gather import gather_evidence
 from patchproof.networks import windows
-from patchproof.networks.batches import fastest
+from patchproof.networks.batches import tune_batches
 from patchproof.networks.onnx_file import read_onnx
 from patchproof.networks.onnx_operators import OPERATORS, Operator
 from patchproof.networks.windows import Windows
@@ -77,7 +77,7 @@ def test_logits_and_gradients_are_torchs(make, batch, tmp_path):
 def test_the_command_of_the_refusal_writes_such_a_file_with_weights_beside_it(tmp_path, monkeypatch):
     pytest.importorskip("onnxscript", reason="torch's newer exporter needs onnxscript")
     monkeypatch.chdir(tmp_path)
-    code, _, _ = EXPORT.removeprefix("export it with ").partition(", S pixels")
+    code, _, _ = EXPORT_ADVICE.removeprefix("export it with ").partition(", S pixels")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # torch warns of itself
         exec(code.replace("NAME", "net"), {"torch": torch, "network": seeded(ViT()), "S": 16})
@@ -115,8 +115,11 @@ def test_a_file_is_cut_where_its_module_is(tmp_path, monkeypatch):
     """Gradients in windows are the whole network's there, and are computed there only."""
     monkeypatch.setattr(windows, "FIXED", 0)  # the network is small
     pictures = torch.rand(2, 3, 96, 96)
-    network, of_module = load_network(written(tmp_path, ResNet(), side=96)).network, fastest(seeded(ResNet()), pictures)
-    assert fastest(network, pictures).cut and of_module.cut and network.cut.stride == of_module.cut.stride
+    network, of_module = (
+        load_network(written(tmp_path, ResNet(), side=96)).network,
+        tune_batches(seeded(ResNet()), pictures),
+    )
+    assert tune_batches(network, pictures).cut and of_module.cut and network.cut.stride == of_module.cut.stride
     px = np.array([[40, 30, 50, 44], [0, 0, 9, 9], [80, 85, 96, 96]])
     photos, gradients = torch.rand(3, 3, 96, 96), []
     for asked in (None, Windows(px)):

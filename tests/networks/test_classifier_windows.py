@@ -13,13 +13,13 @@ from patchproof.classifier.builtin import load_builtin
 from patchproof.classifier.custom import classifier_of
 from patchproof.classifier.network import Classifier, _in_square, center_square
 from patchproof.networks import cuts, windows
-from patchproof.networks.batches import fastest
+from patchproof.networks.batches import tune_batches
 from patchproof.networks.graph import Program
-from patchproof.networks.steps import Step, Value, mark_spent
+from patchproof.networks.steps import Step, ValueRef, mark_last_uses
 from patchproof.networks.windows import Windows
 from patchproof.optimizer.loop import best_design
 from patchproof.optimizer.problem import set_problem
-from patchproof.optimizer.promise import CONTROLS, shown_with_controls
+from patchproof.optimizer.promise import CONTROLS, pictures_with_controls
 from patchproof.optimizer.responses import responses
 from test_optimize import scene_with, toml
 
@@ -40,19 +40,19 @@ def program(*lines, sizes=(None, 3, None, None)) -> Program:
 
     def value(argument):
         if isinstance(argument, torch.Tensor):
-            return Value(next(number for number, weight in enumerate(weights) if weight is argument))
+            return ValueRef(next(number for number, weight in enumerate(weights) if weight is argument))
         if isinstance(argument, tuple):
-            return Value(len(weights) + 1 + argument[0])
+            return ValueRef(len(weights) + 1 + argument[0])
         if isinstance(argument, list):
             return [value(item) for item in argument]
-        return Value(len(weights)) if argument == "x" else argument
+        return ValueRef(len(weights)) if argument == "x" else argument
 
     steps = [
         Step(compute, [value(argument) for argument in arguments], {}, [len(weights) + 1 + number], False, [])
         for number, (compute, arguments) in enumerate(lines)
     ]
     output = len(weights) + len(steps)
-    mark_spent(steps, {*range(len(weights) + 1), output})
+    mark_last_uses(steps, {*range(len(weights) + 1), output})
     return Program(weights, steps, output, list(sizes))
 
 
@@ -172,13 +172,13 @@ def test_cuts_lie_where_one_value_is_left():
 @pytest.mark.parametrize("less", [2, 3])
 def test_a_cut_that_reaches_less_far_than_it_should_is_not_taken(monkeypatch, less):
     network, photos = plain(), pictures(2)
-    cut = cuts.cut_of(network, photos)
+    cut = cuts.find_cut(network, photos)
     assert cut is not None and cuts._holds(network, cut, photos)
     narrow = replace(cut, low=cut.low + 2 * less, high=cut.high - 2 * less)
     monkeypatch.setattr(cuts, "STEP_PX", 4)  # rounding up hides a pixel or two
     assert cuts._holds(network, cut, photos) and not cuts._holds(network, narrow, photos)
     monkeypatch.setattr(cuts, "_cuts", lambda *_: [narrow])
-    assert cuts.cut_of(network, photos) is None
+    assert cuts.find_cut(network, photos) is None
 
 
 def squeezes() -> Program:
@@ -247,7 +247,7 @@ def depends_without_gradient() -> Program:
 def test_answers_that_depend_on_all_of_a_picture_without_a_gradient_are_not_shared(monkeypatch):
     torch.manual_seed(0)
     network, photos, asked = depends_without_gradient(), pictures(), np.array([[60, 50, 70, 60]] * 3)
-    laid, other = fastest(network, photos), photos.clone()
+    laid, other = tune_batches(network, photos), photos.clone()
     other[..., 50:60, 60:70] = 0
     with torch.no_grad():
         kept = {}
@@ -255,14 +255,14 @@ def test_answers_that_depend_on_all_of_a_picture_without_a_gradient_are_not_shar
             torch.testing.assert_close(laid(each, Windows(asked, kept)), network(each))
     assert laid.cut is None
     monkeypatch.setattr(cuts, "_alike", lambda *_: True)
-    assert cuts.cut_of(network, photos[:2]), "nothing else would have seen it"
+    assert cuts.find_cut(network, photos[:2]), "nothing else would have seen it"
 
 
 @pytest.mark.parametrize("made", [squeezes, of_one_size, with_places, pictures_again, swallows_nan])
 def test_programs_that_cannot_be_cut_give_their_whole_gradient(made):
     torch.manual_seed(0)
     network, photos, asked = made(), pictures(), np.array([[60, 50, 70, 60]] * 3)
-    laid, plainly = fastest(network, photos), gradient(network, photos)
+    laid, plainly = tune_batches(network, photos), gradient(network, photos)
     assert torch.equal(gradient(lambda x: laid(x, Windows(asked)), photos), gradient(laid, photos))
     torch.testing.assert_close(gradient(laid, photos), plainly)
 
@@ -312,7 +312,7 @@ class Slices(Written):
 @pytest.mark.parametrize(("side", "is_cut"), [(96, True), (120, False), (100, False)])
 def test_sides_that_strides_do_not_divide_are_left_whole(side, is_cut):
     photos = torch.rand(2, 3, side, side)
-    assert (cuts.cut_of(plain(), photos) is not None) == is_cut
+    assert (cuts.find_cut(plain(), photos) is not None) == is_cut
 
 
 def asked_of(network, monkeypatch):
@@ -325,7 +325,7 @@ def asked_of(network, monkeypatch):
 
 @pytest.mark.parametrize(("side", "used"), [(20, True), (56, True), (57, False), (SIZE, False)])
 def test_windows_that_would_save_nothing_are_computed_as_ever(monkeypatch, side, used):
-    laid, photos, asked = fastest(plain(), pictures()), pictures(), np.array([[0, 0, side, side]] * 3)
+    laid, photos, asked = tune_batches(plain(), pictures()), pictures(), np.array([[0, 0, side, side]] * 3)
     calls = asked_of(laid, monkeypatch)
     torch.testing.assert_close(
         gradient(lambda x: laid(x, Windows(asked)), photos)[..., :side, :side],
@@ -336,7 +336,7 @@ def test_windows_that_would_save_nothing_are_computed_as_ever(monkeypatch, side,
 
 @pytest.mark.parametrize(("side", "used"), [(20, True), (57, True), (88, True), (89, False), (SIZE, False)])
 def test_answers_are_shared_up_to_larger_windows(monkeypatch, side, used):
-    laid, first, asked = fastest(plain(), pictures()), pictures(), np.array([[0, 0, side, side]] * 3)
+    laid, first, asked = tune_batches(plain(), pictures()), pictures(), np.array([[0, 0, side, side]] * 3)
     other, calls = torch.rand_like(first), asked_of(laid, monkeypatch)
     other[..., side:], other[..., side:, :] = first[..., side:], first[..., side:, :]
     with torch.no_grad():
@@ -351,20 +351,20 @@ def test_a_gradient_of_zero_proves_nothing():
     layers = convolution("x", 3, 8, 2), convolution((0,), 8, 8, 2)
     for scale in (1, 0):
         network = program(*layers, mean, (linear, [of, scale * weight, bias]))
-        assert (cuts.cut_of(network, pictures(2)) is not None) == bool(scale)
+        assert (cuts.find_cut(network, pictures(2)) is not None) == bool(scale)
 
 
 def test_a_network_too_small_to_save_anything_is_not_cut(monkeypatch):
     photos = pictures(2)
-    assert cuts.cut_of(plain(), photos)
+    assert cuts.find_cut(plain(), photos)
     monkeypatch.undo()
-    assert cuts.cut_of(plain(), photos) is None
+    assert cuts.find_cut(plain(), photos) is None
     larger = torch.rand(2, 3, 4 * SIZE, 4 * SIZE)
-    assert cuts.cut_of(plain(), larger)
+    assert cuts.find_cut(plain(), larger)
 
 
 def test_batches_take_their_own_windows(monkeypatch):
-    laid, photos = fastest(plain(), pictures()), pictures(7)
+    laid, photos = tune_batches(plain(), pictures()), pictures(7)
     monkeypatch.setattr(laid, "most", 3)
     asked = np.array([[10 * i, 5 * i, 10 * i + 20, 5 * i + 30] for i in range(7)])
     torch.manual_seed(0)
@@ -383,7 +383,7 @@ def test_photographs_of_any_size_have_windows(photo_px):
     reaches out of the square, one lies outside.
     """
     torch.manual_seed(0)
-    laid, (height, width) = fastest(plain(), pictures()), photo_px
+    laid, (height, width) = tune_batches(plain(), pictures()), photo_px
     classifier = Classifier("plain", None, SIZE, tuple("abcde"), laid)
     asked = np.array([[40, 30, 61, 48], [width - 20, 50, width, 70], [0, 0, 3, height]])
     photos = torch.rand(3, 3, height, width)
@@ -434,7 +434,7 @@ def test_pictures_that_differ_in_windows_share_the_rest(made, seed):
 
 
 def test_batches_keep_their_own_first_pictures(monkeypatch):
-    laid, first = fastest(plain(), pictures()), pictures(7)
+    laid, first = tune_batches(plain(), pictures()), pictures(7)
     monkeypatch.setattr(laid, "most", 3)
     asked = np.array([[10 * i, 5 * i, 10 * i + 20, 5 * i + 30] for i in range(7)])
     other = first.clone()
@@ -450,8 +450,8 @@ def test_batches_keep_their_own_first_pictures(monkeypatch):
 
 def test_nothing_is_sought_before_it_is_asked_for(monkeypatch):
     asked = []
-    monkeypatch.setattr(cuts, "cut_of", lambda *_: asked.append(1))
-    laid = fastest(plain(), pictures())
+    monkeypatch.setattr(cuts, "find_cut", lambda *_: asked.append(1))
+    laid = tune_batches(plain(), pictures())
     laid(pictures())
     assert not asked
     for _ in range(2):
@@ -471,7 +471,7 @@ def test_training_asks_in_windows_and_finds_the_same_design(tmp_path, monkeypatc
     asked = asked_of(problem.classifiers[0].network, monkeypatch)
     designs = [best_design(problem)]
     assert asked or jobs > 1  # other processes count for themselves
-    monkeypatch.setattr("patchproof.optimizer.expectation.windows_of", lambda views: None)
+    monkeypatch.setattr("patchproof.optimizer.expectation.affected_windows", lambda views: None)
     designs.append(best_design(problem))
     assert len(np.unique(designs[0])) > 10 and np.abs(designs[0].astype(int) - designs[1]).max() <= 1
 
@@ -484,11 +484,11 @@ def test_a_promise_shares_what_its_views_have_in_common(tmp_path, monkeypatch):
     network = classifier_of(plain(), SIZE, ["red", *"bcde"])
     scene = scene_with(tmp_path, target__models=["python:network"], view__azimuth_deg=[-170, 170])
     problem = set_problem(scene, models=[network])
-    shown = shown_with_controls(problem, np.full((*problem.patch.design_px[::-1], 3), 200, np.uint8), CONTROLS)
+    shown = pictures_with_controls(problem, np.full((*problem.patch.design_px[::-1], 3), 200, np.uint8), CONTROLS)
     conditions, calls = scene.draw("promise", 8), asked_of(problem.classifiers[0].network, monkeypatch)
     shared = responses(problem, shown, conditions)
     assert len(calls) == 2 * len(shown) and all(windows.kept for _, _, windows in calls)
-    monkeypatch.setattr("patchproof.optimizer.responses.windows_of", lambda views: None)
+    monkeypatch.setattr("patchproof.optimizer.responses.affected_windows", lambda views: None)
     whole = responses(problem, shown, conditions)
     for kind in shown:
         np.testing.assert_allclose(shared[kind].confidence, whole[kind].confidence, atol=1e-6)
@@ -500,7 +500,7 @@ def test_modules_in_memory_are_cut_where_torch_can_follow_them(made):
     network = seeded(made()).eval().requires_grad_(False)
     side = 96
     photos, asked = torch.rand(3, 3, side, side), np.array([[40, 30, 50, 44], [0, 0, 9, 9], [80, 85, 96, 96]])
-    laid = fastest(network, photos)
+    laid = tune_batches(network, photos)
     assert laid.cut is not None
     whole, parts = gradient(laid, photos), gradient(lambda x: laid(x, Windows(asked)), photos)
     for one, same, (left, top, right, bottom) in zip(parts, whole, asked.tolist(), strict=True):
@@ -512,7 +512,7 @@ def test_modules_in_memory_are_cut_where_torch_can_follow_them(made):
 def test_modules_that_torch_cannot_follow_are_computed_whole(made):
     network = made().eval().requires_grad_(False)
     photos, asked = torch.rand(3, 3, 16, 16), np.array([[4, 4, 6, 6]] * 3)
-    laid = fastest(network, photos)
+    laid = tune_batches(network, photos)
     assert laid.cut is None
     assert torch.isfinite(gradient(lambda x: laid(x, Windows(asked)), photos)).all()
 
@@ -533,7 +533,7 @@ def test_a_file_s_steps_are_weighed_on_rectangles_too():
     assert places(photos).shape == (3, 5)
     with pytest.raises(ValueError, match="absurd size"):
         places.first(6, photos[..., :64, :64])
-    laid, asked = fastest(places, photos), np.array([[50, 50, 60, 60]] * 3)
+    laid, asked = tune_batches(places, photos), np.array([[50, 50, 60, 60]] * 3)
     torch.testing.assert_close(gradient(lambda x: laid(x, Windows(asked)), photos), gradient(places, photos))
 
 

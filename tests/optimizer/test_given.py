@@ -17,17 +17,17 @@ from patchproof.app.compare import compare as compare_runs
 from patchproof.base.errors import Refused
 from patchproof.base.geometry import apply_homography, rect_corners
 from patchproof.channel.printer import load_printer
-from patchproof.optimizer import given
+from patchproof.optimizer import imported_design
 from patchproof.optimizer import run as run_module
-from patchproof.optimizer.given import fit, import_folder, import_patch
+from patchproof.optimizer.imported_design import fit, import_folder, import_patch
 from patchproof.optimizer.promise import PromiseOptions
 from patchproof.optimizer.run import load_run
 from patchproof.report.coco import PATCH
 from patchproof.reprints.run_sheet import sheet as sheet_of
 from patchproof.sheets.manifest import load_manifest
 from patchproof.sheets.markers import DICTIONARY
+from patchproof.sheets.pdf_raster import attached_manifest
 from patchproof.sheets.piece import marker_image
-from patchproof.sheets.raster import attached_manifest
 from test_optimize import scene_with, toml
 
 RNG = np.random.default_rng(0)
@@ -178,7 +178,7 @@ def test_pictures_are_read_like_photographs(tmp_path, kind):
         picture = np.where(clear[..., 3:] == 255, picture, np.uint8(255))
     else:
         cv2.imwrite(str(path), picture[..., ::-1].astype(np.uint16) * 257)
-    assert (given._read(path)[2] == picture).all()
+    assert (imported_design._read(path)[2] == picture).all()
 
 
 def test_gamut_is_the_printers_own_table(tmp_path):
@@ -206,12 +206,12 @@ def with_markers(scene, count: int, ours: bool = False) -> np.ndarray:
 
 def test_a_picture_of_markers_is_refused_and_a_single_one_said(tmp_path):
     piece = (scene := scene_with(tmp_path)).piece
-    (note,) = given._marker_notes(with_markers(scene, 1), piece)
+    (note,) = imported_design._marker_notes(with_markers(scene, 1), piece)
     assert note.startswith("the detector takes a part of it for marker ")
     for ours in (False, True):
         with pytest.raises(Refused, match="one that shows markers of its own"):
-            list(given._marker_notes(with_markers(scene, 2, ours), piece))
-    assert not list(given._marker_notes(with_markers(scene, 0), piece))
+            list(imported_design._marker_notes(with_markers(scene, 2, ours), piece))
+    assert not list(imported_design._marker_notes(with_markers(scene, 0), piece))
 
 
 @pytest.mark.parametrize(
@@ -301,7 +301,7 @@ def test_a_folder_goes_on_where_it_was_stopped(several, tmp_path, monkeypatch):
     pictures, scene = several / "pictures", several / "scene.toml"
     with pytest.raises(Refused, match="add --overwrite"):
         import_folder(pictures, scene, several / "runs", promise=PromiseOptions(views=8))
-    monkeypatch.setattr(given, "import_patch", lambda *_, **__: pytest.fail("imported again"))
+    monkeypatch.setattr(imported_design, "import_patch", lambda *_, **__: pytest.fail("imported again"))
     kept = import_folder(pictures, scene, several / "runs", promise=PromiseOptions(views=8), resume=True)
     assert [run.folder.name for run in kept] == ["blue", "gray", "red"]
     (tmp_path / "alike").mkdir()

@@ -14,17 +14,17 @@ import torch
 import trimesh
 from PIL import Image
 
-from patchproof.base.claims import wilson
 from patchproof.base.compute import Compute
 from patchproof.base.errors import Refused
 from patchproof.base.goal import Goal
+from patchproof.base.intervals import wilson
 from patchproof.base.settings import SceneSettings
-from patchproof.base.validation import validated
-from patchproof.base.workers import Workers, can_fork, threads
+from patchproof.base.validation import validate_model
+from patchproof.base.workers import Workers, can_fork, use_threads
 from patchproof.classifier.network import Classifier
 from patchproof.optimizer import loop, run, training_views
-from patchproof.optimizer.goals import target_loss, total_variation
-from patchproof.optimizer.loop import start, step_on, steps
+from patchproof.optimizer.loop import start, steps, take_step
+from patchproof.optimizer.losses import target_loss, total_variation
 from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.problem import set_problem
 from patchproof.optimizer.promise import CONTROLS, PromiseOptions, make_promise
@@ -52,7 +52,7 @@ def scene_with(tmp_path, **changes):
     for key, value in changes.items():
         table, name = key.split("__")
         data.setdefault(table, {})[name] = value
-    return build_scene(validated(SceneSettings, data, "test"), tmp_path)
+    return build_scene(validate_model(SceneSettings, data, "test"), tmp_path)
 
 
 def toml(path, **changes):
@@ -178,20 +178,20 @@ def test_networks_that_answer_nan_or_infinity_are_refused_and_large_answers_are_
     """Unseen, one such step would have ended every later one, and a NaN counts as the largest logit."""
     problem = set_problem(scene_with(tmp_path, camera__photo_px=[96, 96]))
     begin, drawn = start(problem), problem.scene.draw("promise", 2)
-    assert math.isfinite(step_on(spoiled(problem, lambda logits: 1e30 * logits), begin, drawn).loss)
+    assert math.isfinite(take_step(spoiled(problem, lambda logits: 1e30 * logits), begin, drawn).loss)
     for spoil in (lambda logits: logits * torch.nan, lambda logits: logits * 1e30 * 1e30):
         with pytest.raises(Refused, match="finite logits, got NaN or infinity from the network"):
-            step_on(spoiled(problem, spoil), begin, drawn)
+            take_step(spoiled(problem, spoil), begin, drawn)
         with pytest.raises(Refused, match="finite logits"):
             responses(spoiled(problem, spoil), {"design": problem.subject.shown(begin.design)}, drawn)
     with pytest.raises(Refused, match="finite gradients, got nan in step 1"):
-        step_on(spoiled(problem, lambda logits: logits + (logits - logits.detach()).sqrt()), begin, drawn)
+        take_step(spoiled(problem, lambda logits: logits + (logits - logits.detach()).sqrt()), begin, drawn)
 
 
 def test_the_penalty_moves_the_design_and_is_not_taken_for_a_gradient_of_the_networks(tmp_path):
     problem = set_problem(scene_with(tmp_path, optimize__tv=1.0, target__models=["module:fake_networks.corner"]))
     noisy = replace(start(problem), design=torch.rand_like(start(problem).design))
-    step = step_on(problem, noisy, problem.scene.draw("promise", 2))
+    step = take_step(problem, noisy, problem.scene.draw("promise", 2))
     assert step.gradient == 0 and not torch.equal(step.state.design, noisy.design)
 
 
@@ -204,7 +204,7 @@ def test_steps_whose_views_show_no_patch_change_nothing(tmp_path):
     shown = problem.subject.shown(start(problem).design.requires_grad_())
     seen = problem.see(shown, behind, problem.training_px)
     assert len(seen.piece.pixel) == 0
-    step = step_on(problem, start(problem), behind)
+    step = take_step(problem, start(problem), behind)
     assert step.gradient == 0 and torch.equal(step.state.design, start(problem).design)
 
 
@@ -373,7 +373,7 @@ def test_the_number_of_processes_changes_no_byte(tmp_path, few_views, a_small_se
     monkeypatch.setattr(training_views, "MIN_POSES", 5)
     scene = toml(tmp_path / "scene.toml", optimize__steps=2, optimize__views=5, patch__place="auto")
     files = ("design.png", "steps.jsonl", "views.png", "place.json", "run.json")
-    with threads(1):
+    with use_threads(1):
         for jobs, kept_px in ((2, training_views.CACHE_PX), (1, 0)):
             monkeypatch.setattr(training_views, "CACHE_PX", kept_px)
             optimize_scene(scene, tmp_path / str(jobs), compute=Compute(jobs=jobs), promise=BESIDE_BARE)
@@ -419,8 +419,8 @@ def test_only_views_that_fit_are_kept(tmp_path, monkeypatch):
 def test_an_odd_view_counts_as_much_as_those_that_are_seen_together(tmp_path):
     problem = set_problem(scene_with(tmp_path))
     begin, drawn = start(problem), problem.scene.draw("train", 3)
-    alone = [step_on(problem, begin, drawn[i : i + 1]).loss for i in range(3)]
-    assert len(set(alone)) == 3 and step_on(problem, begin, drawn).loss == pytest.approx(np.mean(alone), rel=1e-5)
+    alone = [take_step(problem, begin, drawn[i : i + 1]).loss for i in range(3)]
+    assert len(set(alone)) == 3 and take_step(problem, begin, drawn).loss == pytest.approx(np.mean(alone), rel=1e-5)
 
 
 def test_controls_beside_some_views_are_those_of_these_views_and_the_design_keeps_its_order(tmp_path):
@@ -459,10 +459,10 @@ def test_texels_are_to_the_byte_those_of_one_thread_before_processes_share_views
     box.visual = trimesh.visual.TextureVisuals(uv, image=picture)
     box.export(tmp_path / "box.glb")
     scene = scene_with(tmp_path, object__mesh=str(tmp_path / "box.glb"), object__length_mm=300)
-    with threads(2):
+    with use_threads(2):
         shared = set_problem(scene, jobs=2).stage.object_surface.texels(reduced=True, fixed=True)
         on_two = set_problem(scene).stage.object_surface.texels(reduced=True, fixed=True)
-    with threads(1):
+    with use_threads(1):
         alone = set_problem(scene).stage.object_surface.texels(reduced=True, fixed=True)
     assert torch.equal(shared, alone) and len(alone) > 150**2
     assert (on_two - alone).abs().max() < 1e-6, "two threads round otherwise, by no more"

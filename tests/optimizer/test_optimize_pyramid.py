@@ -3,14 +3,14 @@
 import pytest
 import torch
 
-from patchproof.optimizer.pyramid import FEWEST, joined, level_count, levels
+from patchproof.optimizer.pyramid import MIN_COARSEST_BLOCKS, joined, level_count, levels
 
 
 @pytest.mark.parametrize(("size", "count"), [((1, 5), 1), ((8, 8), 1), ((15, 40), 1), ((16, 16), 2), ((64, 80), 4)])
 def test_the_coarsest_level_has_eight_blocks_or_more(size, count):
     found = levels(torch.rand(3, *size))
     assert level_count(size) == len(found) == count
-    assert min(found[-1].shape[1:]) >= min(FEWEST, *size)
+    assert min(found[-1].shape[1:]) >= min(MIN_COARSEST_BLOCKS, *size)
 
 
 def test_levels_are_the_means_of_blocks_also_where_the_edge_cuts_them():

@@ -17,15 +17,15 @@ from patchproof.app.plan.lines import geometry_lines, measured_lines
 from patchproof.app.plan.plan import measured_plan, plan_geometry
 from patchproof.base.errors import Refused
 from patchproof.base.settings import SceneSettings
-from patchproof.base.validation import validated
+from patchproof.base.validation import validate_model
 from patchproof.classifier.load import load_classifier
-from patchproof.optimizer import place_files, places, run
+from patchproof.optimizer import place_files, place_search, run
 from patchproof.optimizer.place_files import read_place, save_place
-from patchproof.optimizer.places import choose_place, default_passes, place_lines
-from patchproof.scene.interface import Scene, needs_piece
-from patchproof.scene.patch_scene import needs_patch
+from patchproof.optimizer.place_search import choose_place, default_run_passes, place_lines
+from patchproof.scene.candidate_places import MIN_DISTANCE_SHARE, PlaceFinder
+from patchproof.scene.interface import Scene, require_piece
+from patchproof.scene.patch_scene import require_patch
 from patchproof.scene.placement import WARN_OVERHANG_SHARE
-from patchproof.scene.places import APART, Ground
 
 PLATE = (300, 300, 20)  # mm: its front fills the pictures
 STRAIGHT = {"azimuth_deg": [-5, 5], "elevation_deg": [-5, 5], "distance_mm": [300, 330], "look_at_jitter": 0}
@@ -54,7 +54,7 @@ def open_scene(base=".", mesh=None, seed=0, **changes):
 @pytest.fixture(autouse=True)
 def few_views_for_the_size_of_markers_and_few_points(monkeypatch):
     monkeypatch.setattr("patchproof.scene.patch_scene.SCALE_VIEWS", 32)
-    monkeypatch.setattr("patchproof.scene.places._POOL", 32)
+    monkeypatch.setattr("patchproof.scene.candidate_places._POOL", 32)
 
 
 @pytest.fixture
@@ -91,7 +91,7 @@ def searched():
     doubting, network.passes = network.passes, 0  # whether the network can be trusted is asked first
     with pytest.MonkeyPatch.context() as patch:
         for name, count in (("PASSES", 200), ("PLACES", 12), ("TURNED", 2), ("HELD_OUT_VIEWS", 8)):
-            patch.setattr(places, name, count)
+            patch.setattr(place_search, name, count)
         place = choose_place(open_scene(), models=[classifier])
     return place, network.passes - doubting
 
@@ -108,7 +108,7 @@ def test_the_place_is_where_the_network_looks():
 
 def test_another_side_is_chosen_where_the_views_show_it_better(monkeypatch):
     for name, count in (("PASSES", 120), ("PLACES", 8), ("TURNED", 1), ("HELD_OUT_VIEWS", 8)):
-        monkeypatch.setattr(places, name, count)
+        monkeypatch.setattr(place_search, name, count)
     scene = open_scene(mesh=trimesh.creation.box((300, 300, 300)), view__azimuth_deg=[65, 75])
     assert choose_place(scene).at[0] == 150  # azimuth 90 faces +x where 0 faces +z
 
@@ -119,8 +119,8 @@ def test_what_is_to_be_kept_free_is_kept_free(tmp_path):
     middles = mesh.triangles_center
     forbidden = np.flatnonzero((middles[:, 2] > 9) & (middles[:, 0] < 0) & (middles[:, 1] > 0))
     (tmp_path / "free.txt").write_text("\n".join(map(str, forbidden)))
-    everywhere = Ground(open_scene(mesh=mesh, **SHARP)).spots(100)
-    rest = Ground(open_scene(tmp_path, mesh, patch__search={"keep_off_faces": "free.txt"}, **SHARP)).spots(100)
+    everywhere = PlaceFinder(open_scene(mesh=mesh, **SHARP)).spots(100)
+    rest = PlaceFinder(open_scene(tmp_path, mesh, patch__search={"keep_off_faces": "free.txt"}, **SHARP)).spots(100)
     assert covers(everywhere, mesh, forbidden) and not covers(rest, mesh, forbidden) and len(rest) > 5
 
 
@@ -134,34 +134,34 @@ def covers(spots, mesh, faces):
 
 
 def test_places_fit_are_apart_the_same_for_the_same_seed_and_no_farther_off_than_asked(monkeypatch):
-    monkeypatch.setattr("patchproof.scene.places._SAMPLES_APART", 1 / 8)
+    monkeypatch.setattr("patchproof.scene.candidate_places._SAMPLES_APART", 1 / 8)
     ball, small = trimesh.creation.icosphere(3, 150), SHARP | {"patch__width_mm": 30, "patch__height_mm": 30}
     scene = open_scene(mesh=ball, **small)
-    spots = Ground(scene).spots(12)
+    spots = PlaceFinder(scene).spots(12)
     assert 3 < len(spots) <= 12
     for spot in spots:
         assert spot.placement.overhang_share <= WARN_OVERHANG_SHARE and not spot.placement.warnings
     middles = np.array([spot.placement.center_mm for spot in spots])
     distances = np.linalg.norm(middles[:, None] - middles, axis=2) + 1e9 * np.eye(len(spots))
-    assert distances.min() > APART * 30 / 2
-    assert [spot.at for spot in Ground(scene).spots(12)] == [spot.at for spot in spots]
-    other = Ground(open_scene(mesh=ball, seed=1, **small)).spots(12)
+    assert distances.min() > MIN_DISTANCE_SHARE * 30 / 2
+    assert [spot.at for spot in PlaceFinder(scene).spots(12)] == [spot.at for spot in spots]
+    other = PlaceFinder(open_scene(mesh=ball, seed=1, **small)).spots(12)
     assert [spot.at for spot in other] != [spot.at for spot in spots]
     least = min(spot.placement.gap_mm for spot in spots)
     with pytest.raises(Refused, match=r"Expected a place for a piece of .* mm that views face, got none"):
-        Ground(open_scene(mesh=ball, patch__search={"gap_mm": least / 2}, **small)).spots(12)
+        PlaceFinder(open_scene(mesh=ball, patch__search={"gap_mm": least / 2}, **small)).spots(12)
 
 
 def test_a_piece_that_fits_only_in_one_spot_finds_it():
     """A face hardly larger than the piece: points elsewhere on it move to where the piece does not overhang."""
-    size = Ground(open_scene(**SHARP)).size_mm
-    ground = Ground(open_scene(mesh=trimesh.creation.box((size[0] + 4, size[1] + 4, 300)), **SHARP))
+    size = PlaceFinder(open_scene(**SHARP)).size_mm
+    ground = PlaceFinder(open_scene(mesh=trimesh.creation.box((size[0] + 4, size[1] + 4, 300)), **SHARP))
     moved = [ground._first(frame) for frame in ground._tried]  # before middles of sides take their places
     assert [spot for spot in moved if spot is not None and np.abs(spot.at[:2]).max() < 4]
 
 
 def test_upright_means_no_turns():
-    free, upright = Ground(open_scene()), Ground(open_scene(patch__search={"upright": True}))
+    free, upright = PlaceFinder(open_scene()), PlaceFinder(open_scene(patch__search={"upright": True}))
     (spot, *_) = free.spots(1)
     assert [turn.spin_deg for turn in free.turned(spot)] == [45] and not upright.turned(spot)
 
@@ -188,23 +188,31 @@ def test_with_front_left_out_views_face_the_patch_as_before():
 
 def test_the_search_counts_its_passes_and_keeps_to_a_quarter_of_a_run():
     place, passes = searched()
-    assert place.passes == passes and place.run_share == place.passes / default_passes()
-    assert 200 - 3 * 2 * places.DRAFT_VIEWS < place.passes <= 200
-    screens = (places.PLACES + 3 * places.TURNED) * 2 * places.SCREEN_VIEWS + places.SCREEN_VIEWS
-    drafts = places.DRAFTS * (18 * 2 * places.DRAFT_VIEWS + places.HELD_OUT_VIEWS) + places.HELD_OUT_VIEWS
-    assert screens + drafts <= places.PASSES <= default_passes() / 4
-    assert default_passes() == 240 * 4 * 2 + 4 * 64 + 200 + 4 * 100
+    assert place.passes == passes and place.run_share == place.passes / default_run_passes()
+    assert 200 - 3 * 2 * place_search.DRAFT_VIEWS < place.passes <= 200
+    screens = (
+        place_search.PLACES + 3 * place_search.TURNED
+    ) * 2 * place_search.SCREEN_VIEWS + place_search.SCREEN_VIEWS
+    drafts = (
+        place_search.DRAFTS * (18 * 2 * place_search.DRAFT_VIEWS + place_search.HELD_OUT_VIEWS)
+        + place_search.HELD_OUT_VIEWS
+    )
+    assert screens + drafts <= place_search.PASSES <= default_run_passes() / 4
+    assert default_run_passes() == 240 * 4 * 2 + 4 * 64 + 200 + 4 * 100
 
 
 def test_a_single_place_needs_no_runner_up(monkeypatch, a_small_search):
-    monkeypatch.setattr(places, "PLACES", 1)
+    monkeypatch.setattr(place_search, "PLACES", 1)
     place = choose_place(open_scene(patch__search={"upright": True}))
     assert place.lead is None and len(place.candidates) == 1
     assert "the only place" in place_lines(place)[1]
 
 
 def test_how_sure_the_choice_is_follows_from_the_paired_interval():
-    sure, unsure = places._lead(np.array([0.5, 0.6, 0.7, 0.6])), places._lead(np.array([0.5, -0.6, 0.7, -0.4]))
+    sure, unsure = (
+        place_search._lead(np.array([0.5, 0.6, 0.7, 0.6])),
+        place_search._lead(np.array([0.5, -0.6, 0.7, -0.4])),
+    )
     assert sure.sure and sure.value == pytest.approx(0.6) and sure.interval[0] > 0.4
     assert not unsure.sure and unsure.interval[0] < 0
 
@@ -231,7 +239,7 @@ def test_what_cannot_be_searched_is_refused_in_one_sentence(changes, sentence):
 
 def test_a_scene_without_a_place_says_so_and_one_with_it_needs_no_search():
     scene = open_scene()
-    for needs in (needs_piece, needs_patch, Scene.own_texture):
+    for needs in (require_piece, require_patch, Scene.object_canvas):
         with pytest.raises(Refused, match=r'Expected a scene whose piece has its place, got patch.place = "auto"'):
             needs(scene)
     with pytest.raises(Refused, match=r'Expected a scene with patch.place = "auto", got a mesh of 12 faces'):
@@ -259,11 +267,11 @@ def test_a_run_keeps_its_place_and_neither_loads_nor_resumes_by_searching(tmp_pa
     first = pp.optimize(path, out)
     place = read_place(out)
     assert first.scene.settings.patch.at_mm == place.at and (out / "place.png").stat().st_size > 500
-    monkeypatch.setattr(places, "choose_place", no_search)
+    monkeypatch.setattr(place_search, "choose_place", no_search)
     loaded = pp.load_run(out)
     np.testing.assert_array_equal(loaded.scene.placement.world_from_piece, first.scene.placement.world_from_piece)
     details = json.loads((out / "run.json").read_text())
-    again = pp.make_scene(validated(SceneSettings, details["settings"], "run"), base=tmp_path)
+    again = pp.make_scene(validate_model(SceneSettings, details["settings"], "run"), base=tmp_path)
     assert loaded.scene.sheet_id == first.scene.sheet_id == again.sheet_id, "its settings are a scene with that place"
     design = (out / "design.png").read_bytes()
     (out / "run.json").unlink()
@@ -278,13 +286,13 @@ def test_a_run_keeps_its_place_and_neither_loads_nor_resumes_by_searching(tmp_pa
 
 def test_the_picture_shows_the_places_and_the_chosen_outline(tmp_path):
     scene = open_scene()
-    spots = Ground(scene).spots(3)
+    spots = PlaceFinder(scene).spots(3)
     laid = [spot.placement for spot in spots]
     candidates = tuple(
-        places.Candidate(at=s.at, spin_deg=0, family=p.family, gap_mm=0, overhang_share=0, gray=0, outlook=0)
+        place_search.Candidate(at=s.at, spin_deg=0, family=p.family, gap_mm=0, overhang_share=0, gray=0, outlook=0)
         for s, p in zip(spots, laid, strict=True)
     )
-    place = places.Place(
+    place = place_search.Place(
         sheet_id=scene.sheet_id,
         front="+z",
         at=spots[0].at,
@@ -311,7 +319,7 @@ def test_plan_reports_the_search(tmp_path, monkeypatch, a_small_run):
 
 def test_middles_of_sides_that_views_face_are_places_however_the_piece_stands_there():
     scene = open_scene()
-    spots = Ground(scene).spots(12)
+    spots = PlaceFinder(scene).spots(12)
     named = [spot for spot in spots if isinstance(spot.at, str)]
     assert spots[: len(named)] == tuple(named) and scene.settings.patch.side in [spot.at for spot in named]
     hung = scene.at(named[0].at, 0.0)

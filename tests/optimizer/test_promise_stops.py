@@ -8,24 +8,24 @@ from itertools import product
 import numpy as np
 import pytest
 
-from patchproof.base.claims import student_mean
 from patchproof.base.errors import Refused
-from patchproof.base.sessions import difference_in_sessions, spread_of
+from patchproof.base.intervals import student_mean
+from patchproof.base.sessions import rate_posterior, session_difference
 from patchproof.base.settings import SceneSettings
-from patchproof.base.validation import validated
-from patchproof.evidence.verdict import EACH, MOST_PHOTOS, sessions_needed
+from patchproof.base.validation import validate_model
+from patchproof.evidence.verdict import MOST_PHOTOS, PHOTOS_PER_SESSION, sessions_needed
 from patchproof.optimizer import promise, run
 from patchproof.optimizer.problem import set_problem
 from patchproof.optimizer.promise import (
     CONTROL_VIEWS,
-    PER_SESSION,
     SETTLED,
+    VIEWS_PER_SESSION,
     PromiseOptions,
     _looks,
     control_claims,
     make_promise,
 )
-from patchproof.optimizer.responses import Answers
+from patchproof.optimizer.responses import Responses
 from patchproof.optimizer.run import promise_run
 from test_optimize import scene_with
 from test_verify_verdict import promise_of
@@ -37,11 +37,11 @@ def promised(tmp_path):
     problem = set_problem(scene_with(tmp_path, target__label="blue"))
     blue = np.zeros((*problem.subject.printed_px[::-1], 3), np.uint8)
     blue[..., 2] = 255
-    conditions = problem.scene.draw("promise", 40, per_session=PER_SESSION)
+    conditions = problem.scene.draw("promise", 40, per_session=VIEWS_PER_SESSION)
 
     def make(half_width=None, told=None):
         advance = (lambda *count: None) if told is None else (lambda *count: told.append(count))
-        return make_promise(problem, blue, conditions, ("bare",), advance, PER_SESSION, half_width)
+        return make_promise(problem, blue, conditions, ("bare",), advance, VIEWS_PER_SESSION, half_width)
 
     return make
 
@@ -76,7 +76,7 @@ def test_a_control_is_left_out_once_it_is_known_to_differ(promised, monkeypatch)
 
 def test_a_control_that_was_left_out_is_compared_where_both_were_shown():
     design, control = (np.array([hits], bool) for hits in ([1, 1, 0, 0], [0, 1]))
-    answers = {kind: Answers(hits, 1.0 * hits, 0.0 * hits) for kind, hits in (("design", design), ("bare", control))}
+    answers = {kind: Responses(hits, 1.0 * hits, 0.0 * hits) for kind, hits in (("design", design), ("bare", control))}
     claim = control_claims(answers, 0)["bare"]
     assert (claim.n, claim.rate, claim.difference) == (2, 0.5, 0.5)
 
@@ -98,7 +98,7 @@ def test_the_key_changes_no_sheet_and_has_a_least_value(tmp_path):
     assert scene.sheet_id == scene_with(tmp_path).sheet_id, "what a promise costs is not printed"
     settings = scene.settings.model_dump() | {"promise": {"half_width": 0.004}}
     with pytest.raises(Refused, match="half_width"):
-        validated(SceneSettings, settings, "scene")
+        validate_model(SceneSettings, settings, "scene")
 
 
 def held(runs, rate, correlation, looks, half_width=0.05, seed=3):
@@ -106,9 +106,9 @@ def held(runs, rate, correlation, looks, half_width=0.05, seed=3):
     rng, right, views = np.random.default_rng(seed), 0, 0
     for _ in range(runs):
         sessions = rng.beta(rate * (1 / correlation - 1), (1 - rate) * (1 / correlation - 1), 100)
-        counts = rng.binomial(PER_SESSION, sessions)
+        counts = rng.binomial(VIEWS_PER_SESSION, sessions)
         for last in looks:
-            low, high = interval(tuple(np.sort(counts[: last // PER_SESSION])))
+            low, high = interval(tuple(np.sort(counts[: last // VIEWS_PER_SESSION])))
             if high - low <= 2 * half_width:
                 break
         right, views = right + (low <= rate <= high), views + last
@@ -116,7 +116,7 @@ def held(runs, rate, correlation, looks, half_width=0.05, seed=3):
 
 
 def test_stopping_leaves_the_interval_its_level():
-    share, views = held(120, 0.9, 0.3, _looks(400, PER_SESSION)[1:])
+    share, views = held(120, 0.9, 0.3, _looks(400, VIEWS_PER_SESSION)[1:])
     assert share >= 0.92 and views < 360
 
 
@@ -131,7 +131,7 @@ def told_apart(runs, gain, correlation, looks, rate=0.8, seed=3):
         design, control = (rng.random((100, CONTROL_VIEWS)) < each[:, None] for each in (own, worse))
         for last in looks:
             so_far = design[:last].ravel(), control[:last].ravel()
-            difference, (low, high) = difference_in_sessions(*so_far, CONTROL_VIEWS)
+            difference, (low, high) = session_difference(*so_far, CONTROL_VIEWS)
             if abs(difference) >= SETTLED * (high - low) / 2:
                 break
         right, other, sessions = right + (low <= gain <= high), other + (low > 0 or high < 0), sessions + last
@@ -144,14 +144,14 @@ def places_asked(rate, correlation, control, half_width=0.04, runs=30):
     like = promise_of(rate, control)
     for _ in range(runs):
         sessions = rng.beta(rate * (1 / correlation - 1), (1 - rate) * (1 / correlation - 1), 100)
-        counts = rng.binomial(PER_SESSION, sessions)
+        counts = rng.binomial(VIEWS_PER_SESSION, sessions)
         last = next(n for n in LOOKS if np.ptp(interval(tuple(np.sort(counts[:n])))) <= 2 * half_width or n == 100)
         pair = []
         for some in (counts[:last], counts):
-            hits = (np.arange(PER_SESSION) < some[:, None]).ravel()
+            hits = (np.arange(VIEWS_PER_SESSION) < some[:, None]).ravel()
             rows = [like.conditions[0].changed(recognized=bool(hit)) for hit in hits]
-            made = like.changed(n=len(hits), rate=hits.mean(), per_session=PER_SESSION, conditions=rows)
-            pair.append(sessions_needed(made) or MOST_PHOTOS // EACH + 1)
+            made = like.changed(n=len(hits), rate=hits.mean(), per_session=VIEWS_PER_SESSION, conditions=rows)
+            pair.append(sessions_needed(made) or MOST_PHOTOS // PHOTOS_PER_SESSION + 1)
         asked.append(pair)
     return np.array(asked)
 
@@ -168,14 +168,14 @@ def test_leaving_controls_out_leaves_their_difference_its_level():
 
 @cache
 def interval(counts):
-    return spread_of(counts, (PER_SESSION,) * len(counts)).rate
+    return rate_posterior(counts, (VIEWS_PER_SESSION,) * len(counts)).rate
 
 
 if __name__ == "__main__":  # the figures beside `promise._looks`
     cases = (0.85, 0.1), (0.9, 0.3), (0.92, 0.1), (0.95, 0.1), (0.95, 0.3), (0.97, 0.3), (0.98, 0.1), (0.99, 0.05)
     for rate, correlation in cases:
         told = [f"rate {rate}, correlation {correlation}:"]
-        for looks in ([400], _looks(400, PER_SESSION)[1:], [160, 240, 320, 400]):
+        for looks in ([400], _looks(400, VIEWS_PER_SESSION)[1:], [160, 240, 320, 400]):
             share, views = held(1000, rate, correlation, looks, 0.04)
             told.append(f"looks after {looks}: {share:.1%} held, {views:.0f} views;")
         print(*told, flush=True)

@@ -10,7 +10,7 @@ from console import command
 from PIL import Image
 
 from patchproof.mesh.export import write_glb
-from patchproof.mesh.mesh import Material, Part, from_parts
+from patchproof.mesh.mesh import Material, MeshPart, mesh_from_parts
 from patchproof.optimizer import loop, run
 from patchproof.optimizer.evaluate import evaluate as evaluate_run
 from patchproof.optimizer.pixels import from_pixels
@@ -86,8 +86,8 @@ def boxes():
             side = abs(normal[:, axis]) > 0.5
             uv[side] = (corners[side][:, others] / box.extents[others]) + 0.5
         faces = np.arange(len(corners)).reshape(-1, 3)
-        parts.append(Part(corners + np.array([0, low, 0]), faces, Material(name, (1.0, 1.0, 1.0), texture), uv))
-    return from_parts(parts, 300)
+        parts.append(MeshPart(corners + np.array([0, low, 0]), faces, Material(name, (1.0, 1.0, 1.0), texture), uv))
+    return mesh_from_parts(parts, 300)
 
 
 def scene_file(folder, kind, mesh="boxes.glb", **changes):

@@ -9,8 +9,8 @@ from synthetic_photos import CUT_MM, PAGE_IDS, PIECE_IDS, make_manifest, page_ra
 
 from patchproof.base.geometry import apply_homography
 from patchproof.photo import detect
-from patchproof.photo.complete import complete, find_sheet
-from patchproof.photo.detect import find_markers, is_mirrored, possible
+from patchproof.photo.detect import find_markers, is_mirrored, is_plausible_quad
+from patchproof.photo.known_page import complete_markers, find_sheet
 
 IDS = frozenset(PIECE_IDS)
 
@@ -67,7 +67,7 @@ def test_blurred_far_and_oblique_markers_are_completed_from_the_others(manifest,
     homography = view(60, 5, 550, 4)
     photo = photograph(piece, homography, blur_px=1.2, noise=0.005, jpeg=88, light=0.3)
     found = find_markers(photo, IDS)
-    more = complete(photo, found, corners_mm(manifest))
+    more = complete_markers(photo, found, corners_mm(manifest))
     assert 1 <= len(found.markers) < 8 and len(more.markers) == 8
     assert np.median(corner_errors(more, manifest, homography)) < 0.3
 
@@ -78,7 +78,7 @@ def test_no_marker_is_completed_where_another_one_is_printed(manifest, piece):
     swapped = corners_mm(manifest)
     swapped[300] = swapped.pop(103)  # the manifest claims another code at that place
     without = detect.MarkersInView({i: b for i, b in found.markers.items() if i != 103}, (), ())
-    assert 300 not in complete(photo, without, swapped).markers
+    assert 300 not in complete_markers(photo, without, swapped).markers
 
 
 def test_dark_photographs_are_read(piece):
@@ -130,11 +130,11 @@ def test_a_flipped_photo_is_known_as_mirrored(piece):
 
 def test_quadrilaterals_that_no_square_can_make_are_impossible():
     square = np.array([[0, 0], [10, 0], [10, 10], [0, 10.0]])
-    assert possible(square) and possible(square + 0.3)
-    assert not possible(square[::-1])  # counter-clockwise: seen from behind
-    assert not possible(square[[0, 2, 1, 3]])  # crossed
-    assert not possible(np.array([[0, 0], [10, 0], [2, 2], [0, 10.0]]))  # dented
-    assert not possible(np.full((4, 2), np.nan))
+    assert is_plausible_quad(square) and is_plausible_quad(square + 0.3)
+    assert not is_plausible_quad(square[::-1])  # counter-clockwise: seen from behind
+    assert not is_plausible_quad(square[[0, 2, 1, 3]])  # crossed
+    assert not is_plausible_quad(np.array([[0, 0], [10, 0], [2, 2], [0, 10.0]]))  # dented
+    assert not is_plausible_quad(np.full((4, 2), np.nan))
 
 
 def test_a_covered_stretch_of_a_border_does_not_move_it(manifest, piece):

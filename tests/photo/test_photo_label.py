@@ -8,17 +8,17 @@ import pytest
 from synthetic_photos import some_design
 
 from patchproof.channel.printer import identity_printer
-from patchproof.evidence.camera import view_of
+from patchproof.evidence.camera import pinhole_photo
 from patchproof.evidence.measure import measure
 from patchproof.evidence.ranges import promised_ranges
 from patchproof.evidence.surface import promised_of, surface_of
-from patchproof.photo.label import Label, label_of, parsed, read_label
+from patchproof.photo.page_code import PageCode, manifest_page_code, parse_page_code, read_page_code
 from patchproof.photo.read import Photo
 from patchproof.sheets.blank import blank_sheet
-from patchproof.sheets.content import PrintedPiece
+from patchproof.sheets.content import SheetContent
+from patchproof.sheets.multi_design import write_several
+from patchproof.sheets.pdf_raster import rasterize_page
 from patchproof.sheets.piece import lay_out_piece
-from patchproof.sheets.raster import page_pixels
-from patchproof.sheets.several import write_several
 from patchproof.sheets.template import load_template
 from patchproof.sheets.write import write_sheet
 
@@ -27,7 +27,7 @@ DPI = 100
 
 def sheet(path, seed=0, identity="A1B2C3D4E5", kind="design"):
     design = some_design(seed)  # a smooth one: in hard squares the detector looks for markers
-    content = PrintedPiece(lay_out_piece((136, 136), 16.0, identity, kind), identity, kind, design)
+    content = SheetContent(lay_out_piece((136, 136), 16.0, identity, kind), identity, kind, design)
     return write_sheet(path, load_template("a4"), content)
 
 
@@ -38,14 +38,14 @@ def pages(tmp_path_factory):
     made = {}
     for name, seed, identity in (("ours", 0, "A1B2C3D4E5"), ("design", 1, "A1B2C3D4E5"), ("sheet", 0, "Z9Y8X7W6V5")):
         manifest = sheet(folder / f"{name}.pdf", seed, identity)
-        made[name] = manifest, page_pixels(folder / f"{name}.pdf", 1, DPI)
+        made[name] = manifest, rasterize_page(folder / f"{name}.pdf", 1, DPI)
     return made
 
 
 def verified(manifest, srgb, scan_dpi=None):
     surface = surface_of(manifest)
     promised = promised_of(manifest, surface, identity_printer())
-    return measure(view_of(Photo(srgb, None), None), "a", surface, promised, promised_ranges(()), scan_dpi)
+    return measure(pinhole_photo(Photo(srgb, None), None), "a", surface, promised, promised_ranges(()), scan_dpi)
 
 
 def oblique(page):
@@ -62,16 +62,20 @@ def oblique(page):
 
 def test_every_page_carries_what_its_manifest_says(pages, tmp_path):
     for manifest, page in pages.values():
-        assert read_label(page) == label_of(manifest)
+        assert read_page_code(page) == manifest_page_code(manifest)
     blank = blank_sheet("blank_a4", tmp_path / "blank.pdf")
-    assert read_label(page_pixels(tmp_path / "blank.pdf", 1, DPI)) == label_of(blank) == Label(blank.sheet_id, "blank")
+    assert (
+        read_page_code(rasterize_page(tmp_path / "blank.pdf", 1, DPI))
+        == manifest_page_code(blank)
+        == PageCode(blank.sheet_id, "blank")
+    )
 
 
 @pytest.mark.parametrize(
     "text", ["", "patchproof:", "https://example.org", "patchproof:short:00", "x patchproof:A1B2C3D4E5:0"]
 )
 def test_other_codes_are_none_of_ours(text):
-    assert parsed(text) is None
+    assert parse_page_code(text) is None
 
 
 @pytest.mark.parametrize(("look", "scan_dpi"), [(lambda page: (page * 0.8).astype(np.uint8), DPI), (oblique, None)])
@@ -112,12 +116,12 @@ def test_a_page_of_several_designs_is_each_ones_own_and_nobody_elses(tmp_path):
 
     def page(name, *designs):
         each = [
-            PrintedPiece(lay_out_piece((64, 64), 8, identity, "design"), identity, "design", pixels, None, {})
+            SheetContent(lay_out_piece((64, 64), 8, identity, "design"), identity, "design", pixels, None, {})
             for identity, pixels in designs
         ]
         manifests = write_several(tmp_path / f"{name}.pdf", template, each)
-        looks[name] = (page_pixels(tmp_path / f"{name}.pdf", 1, DPI) * 0.8).astype(np.uint8)
-        assert {label_of(manifest) for manifest in manifests} == {read_label(looks[name])}
+        looks[name] = (rasterize_page(tmp_path / f"{name}.pdf", 1, DPI) * 0.8).astype(np.uint8)
+        assert {manifest_page_code(manifest) for manifest in manifests} == {read_page_code(looks[name])}
         return manifests
 
     ids, designs = ("A1B2C3D4E5", "B1B2C3D4E5", "C1B2C3D4E5"), [some_design(seed) for seed in range(4)]

@@ -19,18 +19,18 @@ from watch import peak_bytes
 from patchproof.base import input as bounds
 from patchproof.base.errors import Refused
 from patchproof.calibrate import boards
-from patchproof.calibrate.boards import View, find_corners, see_boards
-from patchproof.evidence.batch import Item, _measured
-from patchproof.evidence.camera import view_of
+from patchproof.calibrate.boards import BoardView, find_boards, find_corners
+from patchproof.evidence.batch import PhotoItem, _measured
+from patchproof.evidence.camera import pinhole_photo
 from patchproof.evidence.measure import measure
 from patchproof.evidence.ranges import promised_ranges
-from patchproof.photo import detect, label, limits, read
-from patchproof.photo.label import read_label
-from patchproof.photo.limits import finder_lines_in, limited, limited_memory, squares_in
+from patchproof.photo import detect, limits, page_code, read
+from patchproof.photo.limits import finder_lines_in, limited_memory, run_limited, squares_in
+from patchproof.photo.page_code import read_page_code
 from patchproof.photo.read import read_photo
 from patchproof.photo.rejection import PhotoRejected
 from patchproof.sheets.board import load_board
-from patchproof.sheets.markers import printed_markers
+from patchproof.sheets.markers import aruco_dictionary
 
 needs_timer = pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="there are no such timers on Windows")
 needs_linux = pytest.mark.skipif(not Path("/proc/self/statm").is_file(), reason="memory is limited on Linux alone")
@@ -45,10 +45,10 @@ def squares(side: int) -> np.ndarray:
 @needs_timer
 def test_work_is_interrupted_after_its_time_and_not_before(monkeypatch):
     monkeypatch.setattr(bounds, "SECONDS", 0.2)
-    assert limited(toy.spin, 0.1) == 0.1
+    assert run_limited(toy.spin, 0.1) == 0.1
     before = time.process_time()
     with pytest.raises(PhotoRejected) as caught:
-        limited(toy.spin, 5.0)
+        run_limited(toy.spin, 5.0)
     assert time.process_time() - before < 1
     assert (caught.value.code, caught.value.threshold) == ("too_costly", 0.2) and "0.2 s" in caught.value.advice
     assert signal.getsignal(signal.SIGPROF) == signal.SIG_DFL and signal.getitimer(signal.ITIMER_PROF) == (0, 0)
@@ -68,16 +68,16 @@ def test_a_library_that_swallows_what_interrupts_it_is_interrupted_again(monkeyp
         toy.spin(5.0)
 
     with pytest.raises(PhotoRejected, match="too_costly"):
-        limited(stubborn)
+        run_limited(stubborn)
 
 
 @needs_timer
 def test_inside_a_limit_there_is_one_and_in_other_threads_none(monkeypatch):
     monkeypatch.setattr(bounds, "SECONDS", 0.2)
     with pytest.raises(PhotoRejected):
-        limited(lambda: [limited(toy.spin, 0.1) for _ in range(20)])
+        run_limited(lambda: [run_limited(toy.spin, 0.1) for _ in range(20)])
     results = []
-    thread = threading.Thread(target=lambda: results.append(limited(toy.spin, 0.3)))
+    thread = threading.Thread(target=lambda: results.append(run_limited(toy.spin, 0.3)))
     thread.start()
     thread.join()
     assert results == [0.3]
@@ -87,7 +87,7 @@ def test_inside_a_limit_there_is_one_and_in_other_threads_none(monkeypatch):
 def test_a_photograph_that_takes_too_long_is_rejected_with_advice(tmp_path, monkeypatch):
     monkeypatch.setattr(bounds, "SECONDS", 0.2)
     monkeypatch.setattr("patchproof.evidence.batch.read_photo", lambda path: toy.spin(5.0))
-    entry = _measured(small_task(), Item(tmp_path / "a.jpg", "a.jpg")).entry
+    entry = _measured(small_task(), PhotoItem(tmp_path / "a.jpg", "a.jpg")).entry
     assert (entry.status, entry.code, entry.remark.threshold) == ("rejected", "too_costly", 0.2)
     assert "save it smaller" in entry.remark.advice
 
@@ -96,10 +96,10 @@ def test_a_photograph_that_takes_too_long_is_rejected_with_advice(tmp_path, monk
 def test_a_photograph_of_a_board_that_takes_too_long_is_left_out(tmp_path, monkeypatch):
     for name in "ab":
         Image.new("RGB", (40, 40)).save(tmp_path / f"{name}.png")
-    view = View("b.png", np.zeros(0, int), np.zeros((0, 2)), np.zeros((0, 2)), (40, 40))
+    view = BoardView("b.png", np.zeros(0, int), np.zeros((0, 2)), np.zeros((0, 2)), (40, 40))
     monkeypatch.setattr(bounds, "SECONDS", 0.2)
     monkeypatch.setattr(boards, "_view", lambda path, *_: (view, None) if path.stem == "b" else toy.spin(5.0))
-    views, left, _ = see_boards(tmp_path, load_board("charuco_a4"))
+    views, left, _ = find_boards(tmp_path, load_board("charuco_a4"))
     assert views == [view] and "0.2 s of processor time" in left["a.png"]
 
 
@@ -125,7 +125,7 @@ def test_a_photograph_of_any_size_is_measured_in_a_gigabyte(kind, size, tmp_path
     picture = Image.open(io.BytesIO(truth.jpeg))
     picture.resize(size).save(tmp_path / "a.jpg", exif=picture.getexif())
     before = peak_bytes(reset=True)
-    view = view_of(read_photo(tmp_path / "a.jpg"), None)
+    view = pinhole_photo(read_photo(tmp_path / "a.jpg"), None)
     entry = measure(view, "a.jpg", surface, promised, promised_ranges(())).entry
     assert peak_bytes() - before < limits.MOST_BYTES / 8
     assert entry.status == "measured" and entry.photo_px == ((2250, 1687) if size[0] > 2400 else size)
@@ -143,7 +143,7 @@ def test_squares_are_counted_and_too_many_are_not_looked_into(monkeypatch):
     """1200 / 24 a side. The detector would take 8 s to look into them, and nothing could interrupt it; nor 49 of them
     where 0.1 s is left.
     """
-    picture, printed = squares(1200), printed_markers(detect.DICTIONARY)
+    picture, printed = squares(1200), aruco_dictionary(detect.DICTIONARY)
     count = squares_in(picture)
     assert 2300 <= count <= 2600
     monkeypatch.setattr(detect, "MOST_SQUARES", count - 1)
@@ -167,7 +167,7 @@ def test_squares_are_counted_from_the_size_on_that_the_detector_looks_into():
     assert squares_in(picture) == 0 and squares_in(picture, 29.76) > 3600
     before = time.process_time()
     with pytest.raises(PhotoRejected, match="squares that could be markers"):
-        list(detect._detect(picture, printed_markers(detect.DICTIONARY), 992))
+        list(detect._detect(picture, aruco_dictionary(detect.DICTIONARY), 992))
     assert time.process_time() - before < 2
 
 
@@ -177,7 +177,7 @@ def test_a_board_among_too_many_squares_is_left_out(tmp_path, monkeypatch):
     monkeypatch.setattr(detect, "MOST_SQUARES", 10)
     board = load_board("charuco_a4")
     with pytest.raises(Refused, match="photographs of the board"):
-        see_boards(tmp_path, board)
+        find_boards(tmp_path, board)
     with pytest.raises(PhotoRejected, match="squares that could be markers"):
         find_corners(np.repeat(squares(1200)[..., None], 3, 2), board)
 
@@ -189,9 +189,9 @@ def test_no_code_is_looked_for_in_a_picture_full_of_lines_like_a_finders():
     assert finder_lines_in(picture) == pytest.approx(picture.size / len(row), rel=0.2) and squares_in(picture) == 0
     assert finder_lines_in(np.ascontiguousarray(picture.T)) < 1000
     picture = np.tile(picture, (2, 2))
-    assert finder_lines_in(picture) > label._MOST_LINES
+    assert finder_lines_in(picture) > page_code._MOST_LINES
     before = time.process_time()
-    assert read_label(np.repeat(picture[..., None], 3, 2)) is None
+    assert read_page_code(np.repeat(picture[..., None], 3, 2)) is None
     assert time.process_time() - before < 2
 
 
@@ -200,7 +200,7 @@ def test_no_code_is_looked_for_in_a_picture_full_of_finder_patterns():
     y, x = np.mgrid[:600, :600]
     distance = np.maximum(abs(y % 20 - 7), abs(x % 20 - 7)) // 2
     picture = np.where((distance == 2) | (distance > 3), 255, 0).astype(np.uint8)
-    assert squares_in(picture) > label._MOST_SQUARES
+    assert squares_in(picture) > page_code._MOST_SQUARES
     before = time.process_time()
-    assert read_label(np.repeat(picture[..., None], 3, 2)) is None
+    assert read_page_code(np.repeat(picture[..., None], 3, 2)) is None
     assert time.process_time() - before < 2

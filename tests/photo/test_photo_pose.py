@@ -7,9 +7,9 @@ import pytest
 from bent_paper import CENTER, MARKER_MM, SIDE_MM, Place, camera, flat, folded, rolled
 
 from patchproof.base.geometry import look_at, view_angles
-from patchproof.photo.pose import bent_stance, flat_stance, turn_rad
+from patchproof.photo.pose import bent_sheet_position, flat_sheet_position, turn_rad
 from patchproof.photo.rectify import fit_page
-from patchproof.photo.unroll import explain
+from patchproof.photo.unroll import fit_shape
 from patchproof.sheets.piece import lay_out_piece
 
 SIZE = np.array([1200, 900])
@@ -39,7 +39,7 @@ def corners_px(place: Place, camera_from_page: np.ndarray, middle_px=SIZE / 2, n
 )
 def test_perspective_confirms_a_focal_length_contradicts_it_or_cannot_tell(azimuth, longer, agrees):
     fit = fit_page(corners_px(flat, camera(azimuth, 3, 450)), markers_mm())
-    stance = flat_stance(fit, MATRIX @ np.diag([longer, longer, 1.0]), 0.03, MIDDLE_MM)
+    stance = flat_sheet_position(fit, MATRIX @ np.diag([longer, longer, 1.0]), 0.03, MIDDLE_MM)
     assert stance.agrees is agrees
 
 
@@ -47,8 +47,8 @@ def test_perspective_confirms_a_focal_length_contradicts_it_or_cannot_tell(azimu
 @pytest.mark.parametrize(("longer", "agrees"), [(1.0, True), (0.5, False)])
 def test_so_does_the_bend_of_paper(radius_mm, longer, agrees):
     corners, matrix = corners_px(rolled(radius_mm, 0.0), camera(25, 5, 450)), MATRIX @ np.diag([longer, longer, 1.0])
-    shape = explain(corners, markers_mm(), tuple(SIZE), matrix[0, 0], 0.03).shape
-    assert bent_stance(shape, matrix, 0.03, MIDDLE_MM).agrees is agrees
+    shape = fit_shape(corners, markers_mm(), tuple(SIZE), matrix[0, 0], 0.03).shape
+    assert bent_sheet_position(shape, matrix, 0.03, MIDDLE_MM).agrees is agrees
 
 
 def test_crops_without_a_trace_are_contradicted_or_within_what_is_stated():
@@ -63,11 +63,11 @@ def test_crops_without_a_trace_are_contradicted_or_within_what_is_stated():
         where = look_at([0, 0, 0], [*toward, 1.0], 0, (0, -1, 0)).T @ where
         fit = fit_page(corners_px(flat, where, SIZE / 2 - start, 0.045, seed=seed), markers_mm())
         matrix = np.array([[FOCAL * share, 0, size[0] / 2], [0, FOCAL * share, size[1] / 2], [0, 0, 1.0]])
-        stance, true = flat_stance(fit, matrix, 0.03, MIDDLE_MM), view_angles(where, (0, 0))
+        stance, true = flat_sheet_position(fit, matrix, 0.03, MIDDLE_MM), view_angles(where, (0, 0))
         if stance.agrees is not False:
             off = abs(stance.azimuth_deg - true[0]), abs(stance.distance_mm - true[2])
             ratios.append(np.divide(off, [stance.azimuth_uncertainty_deg, stance.distance_uncertainty_mm]))
-            whole = flat_stance(fit, matrix, 0.03, MIDDLE_MM, whole=True)
+            whole = flat_sheet_position(fit, matrix, 0.03, MIDDLE_MM, whole=True)
             blind.append(off[0] / whole.azimuth_uncertainty_deg)
     ratios = np.array(ratios)
     assert len(ratios) > 40 and ratios.max() <= 3 and 0.8 <= np.mean(ratios[:, 0] <= 1) < 1
@@ -76,9 +76,9 @@ def test_crops_without_a_trace_are_contradicted_or_within_what_is_stated():
 
 def test_where_perspective_cannot_tell_only_a_known_camera_gives_a_distance():
     fit = fit_page(corners_px(flat, camera(2, 3, 450), noise_px=0.045), markers_mm())
-    stance = flat_stance(fit, MATRIX, 0.03, MIDDLE_MM)
+    stance = flat_sheet_position(fit, MATRIX, 0.03, MIDDLE_MM)
     assert stance.agrees is None and np.isinf(stance.distance_uncertainty_mm) and stance.azimuth_uncertainty_deg > 7
-    known = flat_stance(fit, MATRIX, 0.0025, MIDDLE_MM, whole=True)
+    known = flat_sheet_position(fit, MATRIX, 0.0025, MIDDLE_MM, whole=True)
     assert known.distance_uncertainty_mm < 5 and known.azimuth_uncertainty_deg < 7
 
 
@@ -87,9 +87,9 @@ def test_where_perspective_cannot_tell_only_a_known_camera_gives_a_distance():
 def test_a_fold_between_markers_that_looks_like_a_roll_turns_the_middle_within_what_is_stated(at_mm, along):
     """By 10°: a cylinder explains it, and its middle is turned by 3 to 5°, which the corners claim to know to 0.4°."""
     where = camera(23, 8, 590)
-    shape = explain(corners_px(folded(10, at_mm, along), where), markers_mm(), tuple(SIZE), FOCAL, 0.03).shape
+    shape = fit_shape(corners_px(folded(10, at_mm, along), where), markers_mm(), tuple(SIZE), FOCAL, 0.03).shape
     stance, blind = (
-        bent_stance(shape, MATRIX, 0.03, MIDDLE_MM, turn, whole=True) for turn in (turn_rad(0.0, shape), 0.0)
+        bent_sheet_position(shape, MATRIX, 0.03, MIDDLE_MM, turn, whole=True) for turn in (turn_rad(0.0, shape), 0.0)
     )
     assert shape.radius_mm is not None and 0.03 < shape.hidden_turn_rad < 0.12
     off = abs(stance.azimuth_deg - view_angles(where, (0, 0))[0])
@@ -100,5 +100,5 @@ def test_a_fold_between_markers_that_looks_like_a_roll_turns_the_middle_within_w
 
 def test_markers_over_the_middle_leave_no_turn_hidden_and_what_they_miss_adds_one():
     corners = corners_px(rolled(150, 0.0), camera(25, 5, 450), bends=True)
-    assert explain(corners, markers_mm(True), tuple(SIZE), FOCAL, 0.03).shape.hidden_turn_rad < 0.01
+    assert fit_shape(corners, markers_mm(True), tuple(SIZE), FOCAL, 0.03).shape.hidden_turn_rad < 0.01
     assert turn_rad(0.0, None) == 0 and np.degrees(turn_rad(0.002, None)) == pytest.approx(5.7, abs=0.1)

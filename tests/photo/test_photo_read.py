@@ -152,7 +152,7 @@ def test_opencv_reads_a_jpeg_as_pillow_does(tmp_path, monkeypatch, subsampling, 
 
 def test_too_many_pixels_are_refused_before_they_are_decoded(tmp_path, monkeypatch):
     Image.fromarray(UPRIGHT).save(tmp_path / "a.png")
-    monkeypatch.setattr(read, "LARGEST_PX", 1000)
+    monkeypatch.setattr(read, "MAX_IMAGE_PX", 1000)
     with pytest.raises(PhotoRejected) as caught:
         read_photo(tmp_path / "a.png")
     assert (caught.value.figure, caught.value.threshold) == (2400, 1000)

@@ -8,9 +8,9 @@ from synthetic_photos import DESIGN_MM, PIECE_IDS, make_manifest, page_raster, p
 
 from patchproof.base.geometry import apply_homography, intrinsics, plane_pose, rect_corners, view_angles
 from patchproof.photo.colorfit import affine12, white_black
-from patchproof.photo.complete import complete
 from patchproof.photo.detect import find_markers
-from patchproof.photo.pose import flat_stance
+from patchproof.photo.known_page import complete_markers
+from patchproof.photo.pose import flat_sheet_position
 from patchproof.photo.quality import frame_light
 from patchproof.photo.rectify import corner_uncertainty_mm, fit_page, noise_and_bend, rectify
 from patchproof.photo.rejection import PhotoRejected
@@ -116,7 +116,7 @@ def test_a_sheet_too_small_to_tell_left_from_right_says_so(ids, good_mm, bad_mm)
             noisy = noisy_corners(view(10, 3, distance), 0.045, seed)
             fit = fit_page({i: noisy[i] for i in ids}, marker_corners())
             azimuths.append(view_angles(plane_pose(fit.px_from_mm, matrix), center)[0])
-            stated.append(flat_stance(fit, matrix, 0.0, center, whole=True).azimuth_uncertainty_deg)
+            stated.append(flat_sheet_position(fit, matrix, 0.0, center, whole=True).azimuth_uncertainty_deg)
         azimuths, stated = np.array(azimuths), np.array(stated)
         assert np.mean(np.abs(azimuths - 10) <= stated) >= 0.75
         assert (azimuths > 0).all() == tells
@@ -130,7 +130,7 @@ def test_the_stated_uncertainty_covers_the_truth_in_photographs():
         true = view(rng.uniform(-60, 60), rng.uniform(-25, 25), rng.uniform(350, 750), rng.uniform(-20, 20), (900, 700))
         look = dict(blur_px=rng.uniform(0, 1), noise=rng.uniform(0, 0.01), jpeg=int(rng.integers(65, 96)), seed=seed)
         photo = photograph(piece, true, (900, 700), light=rng.uniform(0.4, 0.95), **look)
-        found = complete(photo, find_markers(photo, frozenset(PIECE_IDS)), marker_corners())
+        found = complete_markers(photo, find_markers(photo, frozenset(PIECE_IDS)), marker_corners())
         fit = fit_page({i: b.corners_px for i, b in found.markers.items()}, marker_corners())
         ratios.append(worst_error_mm(fit.px_from_mm, true) / corner_uncertainty_mm(fit, DESIGN_MM))
     # over 200 views of two kinds of pieces 95 to 97 %; six views allow for a miss, but never a wild one

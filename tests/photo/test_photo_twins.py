@@ -11,21 +11,21 @@ from synthetic_photos import PIECE_IDS, make_manifest, page_raster, photograph, 
 from patchproof.channel.printer import identity_printer
 from patchproof.classifier import center_square
 from patchproof.evidence import appearance
-from patchproof.evidence.camera import view_of
+from patchproof.evidence.camera import pinhole_photo
 from patchproof.evidence.classify import squares_of
 from patchproof.evidence.measure import identify, measure
 from patchproof.evidence.ranges import promised_ranges
 from patchproof.evidence.surface import promised_of, surface_of
-from patchproof.photo import colorfit, complete, detect, edges
-from patchproof.photo.complete import find_sheet
-from patchproof.photo.detect import LIGHT, find_markers, luminance, refine
+from patchproof.photo import colorfit, detect, edges, known_page
+from patchproof.photo.detect import LINEAR_FLOAT32_FROM_CODE, find_markers, luminance, refine
 from patchproof.photo.edges import fit_borders
+from patchproof.photo.known_page import find_sheet
 from patchproof.photo.limits import edges_in, squares_in
 from patchproof.photo.quality import CLIPPED_CODE
 from patchproof.photo.read import Photo
 from patchproof.photo.registration import _vagueness
 from patchproof.photo.rejection import PhotoRejected
-from patchproof.sheets.markers import cells_of
+from patchproof.sheets.markers import marker_cells
 
 IDS = frozenset(PIECE_IDS)
 
@@ -54,7 +54,7 @@ def test_borders_do_not_depend_on_the_light_far_from_them_nor_on_other_markers(p
     photo = photograph(piece, view(25, 10, 400, 8), blur_px=0.7, noise=0.01)
     rough = find_markers(photo, IDS).corners_px
     ids = sorted(rough)
-    quads, cells = np.array([rough[i] for i in ids]) + 0.8, cells_of(detect.DICTIONARY, ids)
+    quads, cells = np.array([rough[i] for i in ids]) + 0.8, marker_cells(detect.DICTIONARY, ids)
     together, whole = refine(photo, quads, cells), fit_borders(luminance(photo), quads, cells)
     alone = [refine(photo, quads[[i]], cells[[i]])[0] for i in range(len(ids))]
     assert len(ids) == 8 and all(b.fitted for b in whole)
@@ -86,15 +86,15 @@ def test_a_sheet_too_small_for_the_first_levels_is_found_and_one_too_small_for_a
 def test_markers_that_are_predicted_are_completed_as_without_the_first_look(piece, surface, monkeypatch, moved_px):
     """Blurred and far away, where the detector misses some; with predictions that are up to half a module off."""
     photo = photograph(piece, view(30, 0, 560, 10), blur_px=1.5, noise=0.004)
-    predicted = complete._predicted
+    predicted = known_page._predicted
 
     def off(*given):
         quads = predicted(*given)
         return quads and {i: quad + np.array([moved_px, -moved_px]) for i, quad in quads.items()}
 
-    monkeypatch.setattr(complete, "_predicted", off)
+    monkeypatch.setattr(known_page, "_predicted", off)
     looked = find_sheet(photo, IDS, surface.corners_mm).corners_px
-    monkeypatch.setattr(complete, "_HOPELESS", -2)
+    monkeypatch.setattr(known_page, "_HOPELESS", -2)
     fitted = find_sheet(photo, IDS, surface.corners_mm).corners_px
     assert looked.keys() == fitted.keys() and len(looked) >= 6
 
@@ -126,14 +126,14 @@ def test_light_is_averaged_and_clipped_pixels_are_counted(step):
     blocks = srgb[: height * step, : width * step].reshape(height, step, width, step, 3)
     clipped = (blocks.max(-1) >= CLIPPED_CODE).mean((1, 3))
     means = appearance._reduced_light(srgb, step)
-    np.testing.assert_allclose(means[..., :3], LIGHT[blocks].mean((1, 3)), atol=1e-5)
+    np.testing.assert_allclose(means[..., :3], LINEAR_FLOAT32_FROM_CODE[blocks].mean((1, 3)), atol=1e-5)
     np.testing.assert_allclose(means[..., 3], clipped, atol=1e-6)
 
 
 def test_colors_are_those_of_all_pixels(piece, surface, monkeypatch):
     manifest = make_manifest()
     photo = photograph(piece, view(20, 5, 300, size_px=(1600, 1200)), (1600, 1200), blur_px=0.6, noise=0.005)
-    photo = view_of(Photo(photo, None), None)
+    photo = pinhole_photo(Photo(photo, None), None)
 
     def color():
         promised = promised_of(manifest, surface, identity_printer())
@@ -201,5 +201,5 @@ def test_how_vague_cells_are_and_how_well_codes_agree_are_numpy_s_own(piece):
     centers = np.mgrid[1:6, 1:6].reshape(2, -1) * 10 + 5
     light = edges.sample(luminance(srgb), centers.T[:, ::-1].astype(float))
     expected = np.corrcoef(light, code[1:-1, 1:-1].ravel())[0, 1]
-    assert complete._agreement(srgb, quad, code) == pytest.approx(expected, abs=1e-5)
-    assert complete._agreement(np.full_like(srgb, 9), quad, code) == -1
+    assert known_page._agreement(srgb, quad, code) == pytest.approx(expected, abs=1e-5)
+    assert known_page._agreement(np.full_like(srgb, 9), quad, code) == -1

@@ -20,9 +20,9 @@ from synthetic_photos import (
 
 from patchproof.base.geometry import apply_homography, intrinsics, look_at, rect_corners
 from patchproof.evidence.surface import surface_of, with_markers
-from patchproof.photo.pose import bent_stance
+from patchproof.photo.pose import bent_sheet_position
 from patchproof.photo.registration import register
-from patchproof.photo.unroll import explain, unroll
+from patchproof.photo.unroll import fit_shape, unroll
 from test_verify_run import measured
 
 SIZE = (1200, 900)
@@ -118,8 +118,8 @@ def test_the_unrolled_picture_shows_the_design_where_its_homography_says():
 def test_rolled_paper_says_where_the_camera_stood_by_its_own_middle(azimuth, radius_mm):
     """By the homography of the unrolled sheet, 10°, 25° and 40° at a radius of 100 mm were 18°, 41° and 57°."""
     corners = {i: rolled_px(mm, 1 / radius_mm, pose(azimuth)) for i, mm in markers_mm().items()}
-    shape = explain(corners, markers_mm(), SIZE, MATRIX[0, 0], 0.03).shape
-    stance = bent_stance(shape, MATRIX, 0.03, CENTER)
+    shape = fit_shape(corners, markers_mm(), SIZE, MATRIX[0, 0], 0.03).shape
+    stance = bent_sheet_position(shape, MATRIX, 0.03, CENTER)
     # exact corners, not where straight borders would meet: the correction for that is what remains
     assert stance.azimuth_deg == pytest.approx(azimuth, abs=0.6) and stance.azimuth_uncertainty_deg > 0.3
     assert stance.distance_mm == pytest.approx(450, rel=0.02) and stance.agrees is not False

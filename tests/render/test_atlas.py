@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from patchproof.render.atlas import MOST_TAPS, atlas_layout, atlas_table, sampled
-from patchproof.render.texture import footprint, layout, look_up, texel_table
+from patchproof.render.atlas import MOST_TAPS, atlas_layout, atlas_table, sample_atlas
+from patchproof.render.texture import footprint, look_up, texel_layout, texel_table
 
 # Places in an atlas are float32 shares of its sides: of 1,100 texels a ten-thousandth of one.
 PLACED = 2e-4
@@ -31,8 +31,8 @@ def fragments(n=4000):
 def test_what_is_seen_in_an_atlas_is_what_footprints_see(taps):
     own, at = textures(), fragments()
     where = atlas_layout(SIZES)
-    seen = sampled(where, atlas_table(own, where), *at, taps)
-    told = look_up(footprint(layout(list(SIZES), wrap=True), *at, taps), texel_table(own, wrap=True))
+    seen = sample_atlas(where, atlas_table(own, where), *at, taps)
+    told = look_up(footprint(texel_layout(list(SIZES), wrap=True), *at, taps), texel_table(own, wrap=True))
     if taps == 1:
         assert torch.equal(seen, told)
     torch.testing.assert_close(seen, told, atol=PLACED, rtol=0)
@@ -42,18 +42,18 @@ def test_no_texture_is_seen_in_another():
     colors = torch.rand(len(SIZES), 3, generator=torch.Generator().manual_seed(2))
     own = [color.expand(height, width, 3) for color, (width, height) in zip(colors, SIZES, strict=True)]
     where, (texture, *at) = atlas_layout(SIZES), fragments(20_000)
-    seen = sampled(where, atlas_table(own, where), texture, *at, MOST_TAPS)
+    seen = sample_atlas(where, atlas_table(own, where), texture, *at, MOST_TAPS)
     torch.testing.assert_close(seen, colors[texture], atol=1e-6, rtol=0)
 
 
 def test_each_fragment_sees_to_the_bit_what_it_would_alone():
     where, at = atlas_layout(SIZES), fragments(600)
     table = atlas_table(textures(), where)
-    whole = sampled(where, table, *at, 3)
+    whole = sample_atlas(where, table, *at, 3)
     for size in (1, 7, 50):
-        parts = [sampled(where, table, *(v[k : k + size] for v in at), 3) for k in range(0, 600, size)]
+        parts = [sample_atlas(where, table, *(v[k : k + size] for v in at), 3) for k in range(0, 600, size)]
         assert torch.equal(torch.cat(parts), whole)
-    assert sampled(where, table, *(v[:0] for v in at), 3).shape == (0, 3)
+    assert sample_atlas(where, table, *(v[:0] for v in at), 3).shape == (0, 3)
 
 
 @pytest.mark.parametrize(

@@ -13,15 +13,15 @@ from torch.nn.functional import avg_pool2d
 
 from patchproof.base import geometry
 from patchproof.base.color import srgb_from_linear
-from patchproof.mesh.mesh import Material, Part, from_parts
+from patchproof.mesh.mesh import Material, MeshPart, mesh_from_parts
 from patchproof.render import outlines as module
-from patchproof.render.edges import edges_of
+from patchproof.render.edges import find_edges
 from patchproof.render.fragments import Cameras
-from patchproof.render.outlines import outlines
+from patchproof.render.outlines import find_outlines
 from patchproof.render.photograph import shade
 from patchproof.render.raster import rasterize
 from patchproof.render.stage import set_stage
-from patchproof.render.views import see
+from patchproof.render.views import render_views
 from test_views import WHITE, box_scene, posed, scene_of
 
 SIDE = 96
@@ -42,7 +42,7 @@ def ball(finer):
 
 
 def part(shape, gray=0.8, texture=None):
-    return Part(shape.vertices, shape.faces, Material("m", (gray,) * 3, texture))
+    return MeshPart(shape.vertices, shape.faces, Material("m", (gray,) * 3, texture))
 
 
 def board(width_mm, height_mm, x_mm=0.0, gray=0.8, texture=None):
@@ -55,7 +55,7 @@ def drawn(parts, side=SIDE, eyes=EYES, roll_deg=0.0):
     """Of views, N×side×side: the jagged picture, lit from the first eye on black, and the smooth one; the outlines."""
     parts = parts if isinstance(parts, list) else [part(parts)]
     size = np.ptp(np.concatenate([p.vertices for p in parts]), axis=0).max()
-    mesh = from_parts(parts, float(size))
+    mesh = mesh_from_parts(parts, float(size))
     poses = np.stack([geometry.look_at(eye, np.zeros(3), roll_deg) for eye in eyes])
     matrix = np.stack([geometry.intrinsics(40.0, (side, side))] * len(poses))
     views = Cameras(torch.tensor(poses), torch.tensor(matrix), (side, side))
@@ -68,7 +68,7 @@ def drawn(parts, side=SIDE, eyes=EYES, roll_deg=0.0):
     image = torch.zeros(len(nearest), 3)
     image[seen.pixel] = (light * gray).float()[seen.face][:, None]
     none = torch.zeros_like(nearest, dtype=torch.bool)
-    found = outlines(edges_of(mesh), vertices, views, torch.tensor(eyes), nearest, none, 1.0)
+    found = find_outlines(find_edges(mesh), vertices, views, torch.tensor(eyes), nearest, none, 1.0)
     smooth = found.smooth(image, by_code=False)
     jagged, smooth = (p[:, 0].view(len(eyes), side, side) for p in (image, smooth))
     return jagged, smooth, found
@@ -100,7 +100,7 @@ def test_light_is_averaged_in_photographs_and_code_values_in_what_stands_for_a_r
 ):
     scene = box_scene(tmp_path, ("[800, 600]", photo_px))
     stage, conditions = set_stage(scene), posed(scene, 2, azimuth_deg=[25, -40], elevation_deg=[15, 30])
-    bare = lambda side: see(stage, None, conditions, (side, side))  # noqa: E731
+    bare = lambda side: render_views(stage, None, conditions, (side, side))  # noqa: E731
     reference = avg_pool2d(averaged(shade(bare(8 * SIDE), None)), 8)
     views = bare(SIDE)
     jagged = views.bare.view(2, SIDE, SIDE, 3).permute(0, 3, 1, 2)
@@ -151,7 +151,7 @@ def test_no_outline_lies_between_pixels_that_the_piece_covers(tmp_path):
     """A card on a ball seen from the side: the ball's outline behind it is hidden."""
     trimesh.creation.icosphere(4, 150).export(tmp_path / "ball.ply")
     scene = scene_of(tmp_path, ("primitive:carton", "ball.ply"), ("_mm = 90", "_mm = 164"))
-    seen = see(set_stage(scene), WHITE, posed(scene, 2, azimuth_deg=[0, 60]), (SIDE, SIDE))
+    seen = render_views(set_stage(scene), WHITE, posed(scene, 2, azimuth_deg=[0, 60]), (SIDE, SIDE))
     whole = torch.zeros(2 * SIDE * SIDE, dtype=torch.bool)
     whole[seen.piece.pixel] = seen.piece.share[:, 0] > 0.999
     mixed = whole[seen.outlines.pixel].index_select(0, seen.outlines.of) & whole[seen.outlines.source]

@@ -9,8 +9,8 @@ import pytest
 import torch
 from tolerances import FLOAT32
 
-from patchproof.render.pixels import PHOTOGRAPHED
-from patchproof.render.texture import footprint, layout, look_up, texel_table
+from patchproof.render.pixels import PHOTO_SAMPLING
+from patchproof.render.texture import footprint, look_up, texel_layout, texel_table
 
 
 def look(texture, uv, dx, dy, wrap=False, taps=4, blocks=False):
@@ -18,7 +18,7 @@ def look(texture, uv, dx, dy, wrap=False, taps=4, blocks=False):
 
 
 def seen_at(texture, uv, dx, dy, wrap=False, taps=4, blocks=False):
-    where, n = layout([(texture.shape[1], texture.shape[0])], wrap), len(uv)
+    where, n = texel_layout([(texture.shape[1], texture.shape[0])], wrap), len(uv)
     return footprint(where, torch.zeros(n, dtype=torch.long), uv, dx.expand(n, 2), dy.expand(n, 2), taps, blocks=blocks)
 
 
@@ -91,7 +91,7 @@ def test_blocks_are_averaged_exactly_where_the_pixel_is_upright(size):
         shares.append((torch.minimum(high, edge + 1) - torch.maximum(low, edge)).clamp_min(0) / size[axis])
     expected = torch.einsum("px,py,yxc->pc", *shares, texture)
     per = torch.tensor([[size[0] / 30, 0.0]]), torch.tensor([[0.0, size[1] / 20]])
-    seen = look(texture, middle / torch.tensor([30, 20]), *per, taps=PHOTOGRAPHED.piece_taps, blocks=True)
+    seen = look(texture, middle / torch.tensor([30, 20]), *per, taps=PHOTO_SAMPLING.piece_taps, blocks=True)
     torch.testing.assert_close(seen, expected, atol=1e-5, rtol=0)
 
 
@@ -136,7 +136,7 @@ def test_one_texel_and_large_textures():
 
 def test_several_textures_of_different_sizes_do_not_mix():
     textures = [torch.full((4, 4, 3), 0.1), torch.full((32, 16, 3), 0.5), torch.full((1, 1, 3), 0.9)]
-    where = layout([(4, 4), (16, 32), (1, 1)], wrap=True)
+    where = texel_layout([(4, 4), (16, 32), (1, 1)], wrap=True)
     texture = torch.tensor([0, 1, 2]).repeat(20)
     derivative = torch.rand(60, 2, generator=torch.Generator().manual_seed(1)) * 0.6
     seen = footprint(where, texture, torch.rand(60, 2) * 9 - 4, derivative, derivative.flip(1), 4)
@@ -205,7 +205,7 @@ def test_a_footprint_is_the_mean_of_16_by_16_samples(scale, tilt_deg):
         for texture, least in zip(pictures(), (33, 45 if longest <= 16 else 37), strict=True):
             if not as_blocks and least == 33 and 0.5 < scale <= 1:
                 least = 25
-            seen = look(texture, uv, dx, dy, wrap=True, taps=PHOTOGRAPHED.piece_taps, blocks=as_blocks)
+            seen = look(texture, uv, dx, dy, wrap=True, taps=PHOTO_SAMPLING.piece_taps, blocks=as_blocks)
             assert loss_db(seen, sampled(texture, samples).view(256, 300, 3).mean(0)) > least
 
 

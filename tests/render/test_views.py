@@ -20,11 +20,11 @@ from patchproof.base.errors import Refused
 from patchproof.optimizer.problem import FIGURED, set_problem
 from patchproof.photo.detect import find_markers
 from patchproof.render import photograph as photograph_module
-from patchproof.render.photograph import expose, photograph, shade, windows_of
-from patchproof.render.pixels import PHOTOGRAPHED, ObjectTextures, PiecePicture
+from patchproof.render.photograph import affected_windows, expose, photograph, shade
+from patchproof.render.pixels import PHOTO_SAMPLING, ObjectTextures, PiecePicture
 from patchproof.render.stage import set_stage
 from patchproof.render.texture import look_up, texel_table
-from patchproof.render.views import apart, relit, see, seen_again
+from patchproof.render.views import relight, relight_and_replace_background, render_views, split_views
 from patchproof.scene.conditions import draw, with_values
 from patchproof.scene.scene import load_scene
 from patchproof.sheets.piece import marker_image
@@ -87,7 +87,7 @@ def test_the_shares_sum_up_to_the_projected_area(tmp_path, pixels):
     stage, conditions = set_stage(scene), posed(scene, 4, **POSES)
     focal = scene.matrix_px((1, 1))[0, 0]
     side = round(pixels * (700 - 150) / focal / scene.piece.size_mm[0])
-    seen = see(stage, WHITE, conditions, (side, side))
+    seen = render_views(stage, WHITE, conditions, (side, side))
     corners = outline(scene, conditions, (side, side))
     shortest = np.linalg.norm(corners - np.roll(corners, 1, 1), axis=2).min(1)
     error = shares(seen, 4, side).sum((1, 2)) / area(corners) - 1
@@ -97,7 +97,7 @@ def test_the_shares_sum_up_to_the_projected_area(tmp_path, pixels):
 def test_pixels_inside_are_whole_and_those_outside_are_none(tmp_path):
     scene = box_scene(tmp_path)
     conditions = posed(scene, 4, **POSES)
-    share = shares(see(set_stage(scene), WHITE, conditions, (160, 160)), 4, 160)
+    share = shares(render_views(set_stage(scene), WHITE, conditions, (160, 160)), 4, 160)
     y, x = np.mgrid[:160, :160] + 0.5
     for corners, one in zip(outline(scene, conditions, (160, 160)), share, strict=True):
         polygon = corners.astype(np.float32)
@@ -120,7 +120,7 @@ def test_another_principal_point_moves_the_picture(tmp_path):
     for cx, cy in ((400, 300), (403, 298), (400.25, 299.5)):
         scene = box_scene(tmp_path, camera_file(tmp_path, cx=cx, cy=cy))
         conditions, stage = posed(scene, azimuth_deg=20, roll_deg=5), set_stage(scene)
-        seen.append(see(stage, WHITE, conditions, (800, 600)))
+        seen.append(render_views(stage, WHITE, conditions, (800, 600)))
         pictures.append(shade(seen[-1], WHITE))
     torch.testing.assert_close(pictures[1][:, :, :-2, 3:], pictures[0][:, :, 2:, :-3], atol=1e-3, rtol=0)
     middles = []
@@ -134,13 +134,13 @@ def test_what_the_object_hides_does_not_shine_through(tmp_path):
     """A cube from behind shows nothing of the piece; a ball from the side the back of what overhangs, and no print."""
     scene = box_scene(tmp_path)
     stage, conditions = set_stage(scene), posed(scene, 3, azimuth_deg=[180, 150, 120], elevation_deg=[0, 30, -30])
-    seen = see(stage, WHITE, conditions, (128, 128))
+    seen = render_views(stage, WHITE, conditions, (128, 128))
     assert len(seen.piece.pixel) == len(seen.piece.back_pixel) == 0
     assert torch.equal(expose(seen, WHITE), photograph(stage, None, conditions, (128, 128)))
     trimesh.creation.icosphere(4, 150).export(tmp_path / "box.ply")
     ball = scene_of(tmp_path, ("primitive:carton", "box.ply"))
     conditions = posed(ball, 2, azimuth_deg=[110, 180])
-    seen = see(set_stage(ball), WHITE, conditions, (128, 128))
+    seen = render_views(set_stage(ball), WHITE, conditions, (128, 128))
     assert len(seen.piece.pixel) == 0
     back = seen.piece.back_share[seen.piece.back_pixel < 128 * 128].sum()
     assert 0 < float(back) == float(seen.piece.back_share.sum())  # the ball hides all of it at 180°
@@ -165,12 +165,12 @@ def test_views_seen_together_come_apart_as_if_each_had_been_seen_alone(tmp_path,
     trimesh.creation.icosphere(2, 150).export(tmp_path / "ball.ply")
     scene = scene_of(tmp_path, ("primitive:carton", "ball.ply"), ("_mm = 90", "_mm = 150"))
     conditions = posed(scene, 5, azimuth_deg=[-60, -20, 110, 180, 30], distance_mm=900)
-    stage, look = set_stage(scene), replace(PHOTOGRAPHED, taps=taps)
-    together = see(stage, WHITE, conditions, (64, 64), look)
+    stage, look = set_stage(scene), replace(PHOTO_SAMPLING, taps=taps)
+    together = render_views(stage, WHITE, conditions, (64, 64), look)
     assert len(together.on_piece.back_pixel)
     for sizes in ([1] * 5, [2, 2, 1], [1, 4]):
-        for part, last in zip(apart(together, sizes), np.cumsum(sizes), strict=True):
-            alone = see(stage, WHITE, conditions[last - len(part.conditions) : last], (64, 64), look)
+        for part, last in zip(split_views(together, sizes), np.cumsum(sizes), strict=True):
+            alone = render_views(stage, WHITE, conditions[last - len(part.conditions) : last], (64, 64), look)
             for name in ("background", "light", "object", "piece", "outlines"):
                 assert the_same(getattr(part, name), getattr(alone, name)), name
 
@@ -184,11 +184,11 @@ def test_views_lit_anew_are_views_seen_anew(tmp_path):
     elsewhere = replace(there, pose=replace(there.pose, background=other.pose.background))
     for shown in (piece, None, textures):
         laid_out = textures if shown is textures else piece
-        seen = see(stage, laid_out, poses, (96, 96))
+        seen = render_views(stage, laid_out, poses, (96, 96))
         before = expose(seen, shown)
-        for again, anew in ((relit(seen, other), there), (seen_again(seen, other), elsewhere)):
+        for again, anew in ((relight(seen, other), there), (relight_and_replace_background(seen, other), elsewhere)):
             pictures = expose(again, shown)
-            assert torch.equal(pictures, expose(see(stage, laid_out, anew, (96, 96)), shown))
+            assert torch.equal(pictures, expose(render_views(stage, laid_out, anew, (96, 96)), shown))
             assert not torch.equal(pictures, before)
         assert torch.equal(expose(seen, shown), before)
 
@@ -197,11 +197,13 @@ def test_the_back_of_a_piece_lies_in_its_window_too(tmp_path):
     """A bare object has none: pictures with and without a piece are alike everywhere else."""
     trimesh.creation.icosphere(2, 150).export(tmp_path / "ball.ply")
     scene = scene_of(tmp_path, ("primitive:carton", "ball.ply"), ("_mm = 90", "_mm = 150"))
-    seen = see(set_stage(scene), WHITE, posed(scene, 3, azimuth_deg=[110, 100, -60], distance_mm=900), (96, 96))
+    seen = render_views(
+        set_stage(scene), WHITE, posed(scene, 3, azimuth_deg=[110, 100, -60], distance_mm=900), (96, 96)
+    )
     assert len(seen.on_piece.back_pixel)
     differ = (expose(seen, WHITE) != expose(seen, None)).any(1)
     assert differ.flatten(1).any(1).all()
-    for view, (left, top, right, bottom) in zip(differ, windows_of(seen).tolist(), strict=True):
+    for view, (left, top, right, bottom) in zip(differ, affected_windows(seen).tolist(), strict=True):
         view[top:bottom, left:right] = False
     assert not differ.any()
 
@@ -210,8 +212,8 @@ def test_where_it_is_not_known_what_a_design_changes_there_are_no_windows(tmp_pa
     lens = ("photo_px = [800, 600]", 'photo_px = [1600, 1200]\nfile = "phone"')
     for scene, known in ((scene_of(tmp_path), True), (scene_of(tmp_path, lens), False)):
         stage, drawn = set_stage(scene), posed(scene, 2, azimuth_deg=[0, 180])
-        assert windows_of(see(stage, None, drawn, (96, 96))) is None, "textures change the object"
-        windows = windows_of(see(stage, piece_of(scene), drawn, (96, 96)))
+        assert affected_windows(render_views(stage, None, drawn, (96, 96))) is None, "textures change the object"
+        windows = affected_windows(render_views(stage, piece_of(scene), drawn, (96, 96)))
         assert (windows is not None) == known
         if known:
             assert windows[1].tolist() == [0, 0, 1, 1], "from behind nothing is seen of it"
@@ -231,11 +233,11 @@ def test_the_short_cut_is_the_long_way(tmp_path, monkeypatch):
     scene = scene_of(tmp_path)
     stage, piece = set_stage(scene), piece_of(scene)
     conditions = with_values(scene.draw("promise", 3), azimuth_deg=np.array([10.0, 160.0, -30.0]))
-    seen = see(stage, piece, conditions, (192, 192))
+    seen = render_views(stage, piece, conditions, (192, 192))
     part, cut = seen.piece, torch.zeros(3 * 192 * 192, dtype=torch.bool)
     for pixel, share in ((part.pixel, part.share), (part.back_pixel, part.back_share)):
         cut[pixel] = share[:, 0] < 1 - FLOAT32
-    for outlined in (seen, see(stage, None, conditions, (192, 192))):
+    for outlined in (seen, render_views(stage, None, conditions, (192, 192))):
         cut[outlined.outlines.pixel] = True
     whole = ~cut.view(3, 1, 192, 192).expand(3, 3, 192, 192)
     for shown in (None, piece):
@@ -252,7 +254,7 @@ def test_edges_in_small_pictures_are_those_of_reduced_photographs(tmp_path):
     scene = box_scene(tmp_path, ("[800, 600]", "[1600, 1200]"), ("[0.5, 0.5, 0.5]", "[0.9, 0.9, 0.9]"))
     stage, black = set_stage(scene), PiecePicture.of(torch.zeros(64, 64, 3))
     conditions = posed(scene, 2, azimuth_deg=[20, -40], roll_deg=[10, 45], blur_px=0, noise=0)
-    share = shares(see(stage, black, conditions, (192, 192)), 2, 192)
+    share = shares(render_views(stage, black, conditions, (192, 192)), 2, 192)
     edge = torch.tensor((share > 0.02) & (share < 0.98))[:, None].expand(2, 3, 192, 192)
     small = photograph(stage, black, conditions, (192, 192))
     reduced = avg_pool2d(photograph(stage, black, conditions, (768, 768), jpeg=False), 4)
@@ -316,7 +318,7 @@ def test_a_camera_inside_the_object_is_refused_in_one_sentence(tmp_path):
     with pytest.raises(
         Refused, match=r"got 1 of 2 views inside its bounding box or within 1\.5 mm of it: raise view\.distance_mm\.$"
     ):
-        see(set_stage(scene), WHITE, posed(scene, 2, distance_mm=[700, 100]), (64, 64))
+        render_views(set_stage(scene), WHITE, posed(scene, 2, distance_mm=[700, 100]), (64, 64))
 
 
 def test_a_piece_seen_edge_on_is_not_there(tmp_path):
@@ -326,7 +328,7 @@ def test_a_piece_seen_edge_on_is_not_there(tmp_path):
     at = np.degrees(np.arccos(plane_mm / 700)) + np.array([0, 1e-7, -1e-7, -0.01, 0.01])
     conditions = posed(scene, 5, azimuth_deg=at)
     srgb = WHITE.srgb.clone().requires_grad_()
-    seen = see(set_stage(scene), WHITE, conditions, (128, 128))
+    seen = render_views(set_stage(scene), WHITE, conditions, (128, 128))
     picture = expose(seen, PiecePicture.of(srgb))
     assert bool(torch.isfinite(picture).all()) and bool(torch.isfinite(seen.piece.share).all())
     assert shares(seen, 5, 128)[:3].sum() < 0.5
@@ -337,7 +339,7 @@ def test_a_piece_seen_edge_on_is_not_there(tmp_path):
 def gradient_of(scene, size_px=128, **pose):
     """The gradient of a picture's sum to a 64×64 noise design, and the pixels that the piece covers."""
     noise = torch.rand(64, 64, 3, generator=torch.Generator().manual_seed(0)).requires_grad_()
-    seen = see(set_stage(scene), WHITE, posed(scene, 1, **pose), (size_px, size_px))
+    seen = render_views(set_stage(scene), WHITE, posed(scene, 1, **pose), (size_px, size_px))
     (gradient,) = torch.autograd.grad(expose(seen, PiecePicture.of(noise)).sum(), noise)
     assert bool(torch.isfinite(gradient).all())
     return gradient, float(seen.piece.share.sum())
@@ -374,7 +376,7 @@ def test_pictures_change_as_little_as_the_pose_does(tmp_path, share):
     srgb = torch.rand(256, 256, 3, generator=torch.Generator().manual_seed(0))
     noise = PiecePicture.of(srgb)
     a, b = (
-        shade(see(stage, noise, posed(stage.scene, 48, distance_mm=far * k, azimuth_deg=30), (96, 96)), noise)
+        shade(render_views(stage, noise, posed(stage.scene, 48, distance_mm=far * k, azimuth_deg=30), (96, 96)), noise)
         for k in (1, 1 + share)
     )
     assert float((a - b).abs().mean()) < 0.3 * share
@@ -418,7 +420,7 @@ def test_a_bent_piece_is_hidden_where_the_mug_is_in_front(tmp_path, side, family
     conditions = posed(scene, 5, azimuth_deg=[0, 60, 90, 120, 180], elevation_deg=[40, 10, 5, 0, 20], distance_mm=260)
     v, u = torch.meshgrid(*((torch.arange(256) + 0.5) / 256,) * 2, indexing="ij")
     where = PiecePicture.of(torch.stack([u, v, u], -1))
-    seen = see(set_stage(scene), where, conditions, (128, 128))
+    seen = render_views(set_stage(scene), where, conditions, (128, 128))
     at = look_up(seen.piece.texels, texel_table([where.srgb], False))[:, :2].numpy() * scene.placement.size_mm
     poses = scene.camera_from_world(conditions)[seen.piece.view.numpy()]
     eyes = -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
@@ -449,7 +451,9 @@ def test_more_taps_of_an_object_s_texture_bring_views_nearer_to_reduced_photogra
     reduced = avg_pool2d(photograph(stage, None, conditions, (768, 768), jpeg=False), 4)
     off = {}
     for taps in (1, 2, 4):
-        view = expose(see(stage, None, conditions, (192, 192), replace(PHOTOGRAPHED, taps=taps)), None, jpeg=False)
+        view = expose(
+            render_views(stage, None, conditions, (192, 192), replace(PHOTO_SAMPLING, taps=taps)), None, jpeg=False
+        )
         off[taps] = float(((view - reduced) ** 2).mean().sqrt())
     assert off[4] < off[2] < 0.8 * off[1], off
     problem = set_problem(scene)
@@ -473,8 +477,8 @@ def test_figures_look_at_a_piece_in_fewer_taps_than_photographs_and_see_nearly_t
     generator = torch.Generator().manual_seed(2)
     shown = PiecePicture.of(torch.rand(400, 400, 3, generator=generator))  # finer than any print: the worst case
     conditions, side = problem.scene.draw("promise", 2), (problem.figure_px,) * 2
-    looks = FIGURED, replace(FIGURED, piece_taps=PHOTOGRAPHED.piece_taps)
-    few, many = (see(problem.stage, shown, conditions, side, look) for look in looks)
+    looks = FIGURED, replace(FIGURED, piece_taps=PHOTO_SAMPLING.piece_taps)
+    few, many = (render_views(problem.stage, shown, conditions, side, look) for look in looks)
     of_few, of_many = (sum(group.weight.numel() for group in views.on_piece.texels.groups) for views in (few, many))
     assert of_few < 0.6 * of_many
     own = problem.see(shown, conditions, problem.figure_px).on_piece.texels

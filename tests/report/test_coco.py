@@ -6,17 +6,17 @@ import json
 
 import numpy as np
 
-from patchproof.report.coco import PATCH, Labeled, coco_json, cut_off
+from patchproof.report.coco import PATCH, LabeledPhoto, clip_polygon, coco_json
 
 
 def annotations(outline, name: str = PATCH) -> list[dict]:
-    photo = Labeled("a.jpg", (100, 80), {name: np.array(outline, float)})
+    photo = LabeledPhoto("a.jpg", (100, 80), {name: np.array(outline, float)})
     return json.loads(coco_json([photo], "cup", "test"))["annotations"]
 
 
 def test_a_polygon_is_cut_off_at_the_borders():
     """A diamond about the corner (0, 0): a quarter of it, the triangle (0, 0), (40, 0), (0, 40), is left."""
-    inside = cut_off(np.array([[-40.0, 0], [0, -40], [40, 0], [0, 40]]), (100, 80))
+    inside = clip_polygon(np.array([[-40.0, 0], [0, -40], [40, 0], [0, 40]]), (100, 80))
     assert {tuple(point) for point in inside.tolist()} == {(0, 0), (40, 0), (0, 40)}
     (found,) = annotations([[-40, 0], [0, -40], [40, 0], [0, 40]])
     assert found["bbox"] == [0, 0, 40, 40] and found["area"] == 800 and found["iscrowd"] == 0

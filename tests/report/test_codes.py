@@ -8,8 +8,8 @@ from synthetic_photos import PIECE_IDS, make_manifest, view
 
 from patchproof.base.geometry import intrinsics
 from patchproof.evidence import measure
-from patchproof.evidence.camera import FOCAL_ERROR, View
-from patchproof.evidence.placed import Placed, pose_of
+from patchproof.evidence.camera import FOCAL_ERROR, PinholePhoto
+from patchproof.evidence.locate import LocatedSheet, camera_pose
 from patchproof.evidence.results import Geometry, Scale
 from patchproof.evidence.surface import surface_of
 from patchproof.photo.detect import MarkersInView
@@ -79,8 +79,8 @@ def test_a_piece_that_is_made_to_bend_is_not_to_be_pressed_flat(monkeypatch):
 def test_a_marker_off_the_plane_and_a_corner_that_is_not_seen_are_said():
     borders = Borders(np.zeros((4, 2)), 1.0, 4.0, True)
     found = MarkersInView(dict.fromkeys(PIECE_IDS, borders), (), ())
-    for odd_mm, code in ((0.55, None), (0.57, "curled")):
-        fit = PageFit(np.eye(3), np.eye(8), 0.05, PIECE_IDS[1:], odd_mm=odd_mm)
+    for outlier_mm, code in ((0.55, None), (0.57, "curled")):
+        fit = PageFit(np.eye(3), np.eye(8), 0.05, PIECE_IDS[1:], outlier_mm=outlier_mm)
         trouble = measure._trouble(Geometry(**GOOD), fit, found, SURFACE)
         assert (trouble and trouble.code) == code
     fit = PageFit(np.eye(3), np.eye(8), 0.05, PIECE_IDS)
@@ -99,10 +99,10 @@ def test_a_print_more_than_one_percent_off_is_scale_off(scale, code):
 def test_an_azimuth_that_corners_cannot_tell_is_not_measured():
     """The same sheet from 10° to the right: at 1.5 m the corners know it to 1°, at 8 m neither it nor how far it is."""
     matrix = intrinsics(40, (1200, 900))
-    seen = View(np.zeros((900, 1200, 3), np.uint8), matrix, True, FOCAL_ERROR / 1.96)
+    seen = PinholePhoto(np.zeros((900, 1200, 3), np.uint8), matrix, True, FOCAL_ERROR / 1.96)
     for distance, tells in ((1500, True), (12000, False)):
         corners = noisy_corners(view(10, 3, distance), 0.045)
-        pose, _ = pose_of(seen, Placed(seen.srgb, fit_page(corners, marker_corners()), None), SURFACE)
+        pose, _ = camera_pose(seen, LocatedSheet(seen.srgb, fit_page(corners, marker_corners()), None), SURFACE)
         assert (pose.azimuth_deg is not None) == tells == (pose.azimuth_uncertainty_deg < 10)
         if tells:
             assert pose.azimuth_deg == pytest.approx(10, abs=2) and pose.distance_mm == pytest.approx(1500, rel=0.01)

@@ -18,8 +18,17 @@ import numpy as np
 import pytest
 from synthetic_photos import make_manifest
 
-from patchproof.base.claims import Estimate
-from patchproof.evidence.results import KEYS, Control, LedgerShare, Origin, PhotoEntry, Prediction, Report, Summary
+from patchproof.base.intervals import Estimate
+from patchproof.evidence.results import (
+    PHOTO_KEYS,
+    Control,
+    LedgerShare,
+    Origin,
+    PhotoEntry,
+    Prediction,
+    Report,
+    Summary,
+)
 from patchproof.report.images import delta_map, save_pictures
 from patchproof.report.tables import Drawing, Results, Table, write_results
 from patchproof.report.write import photos_csv, write_report
@@ -148,7 +157,7 @@ def test_csv_has_a_row_for_each_photograph_and_all_of_its_figures(shown):
         and rows[3]["code"] == "unreadable"
     )
     assert rows[0]["net label"] == "<b>bright</b>" and float(rows[0]["net confidence"]) == 0.8
-    names = set(KEYS) - {"homography_px_from_mm", "predictions"}
+    names = set(PHOTO_KEYS) - {"homography_px_from_mm", "predictions"}
     assert (
         names <= rows[0].keys()
         and {f"homography_px_from_mm_{i}{j}" for i in range(3) for j in range(3)} <= rows[0].keys()

@@ -30,14 +30,14 @@ from patchproof.optimizer.problem import set_problem
 from patchproof.optimizer.run import Run, load_run
 from patchproof.render.photograph import photograph
 from patchproof.render.stage import set_stage
-from patchproof.reprints.hung_sheet import HungSheet, sent_pixels, take_photo
+from patchproof.reprints.mounted_sheet import MountedSheet, sent_pixels, take_photo
 from patchproof.reprints.run_sheet import sheet as sheet_of
 from patchproof.scene.conditions import draw, with_values
 from patchproof.scene.patch_scene import PatchScene
 from patchproof.scene.placement import place_card
 from patchproof.scene.scene import build_scene
 from patchproof.sheets.manifest import Manifest, load_manifest
-from patchproof.sheets.rects import grown
+from patchproof.sheets.rects import grow_rect
 
 PHOTO_PX = (800, 600)
 PHOTOS, REPRINTS = 6, 3
@@ -138,7 +138,7 @@ def shoot(world: PatchScene, pdf: Path | None, conditions, folder: Path) -> None
     stage, piece = set_stage(world), None
     if pdf is not None:
         manifest = load_manifest(pdf.with_suffix(".json"))
-        piece = HungSheet(stage, manifest, sent_pixels(pdf, manifest, world), load_printer("coated")).piece
+        piece = MountedSheet(stage, manifest, sent_pixels(pdf, manifest, world), load_printer("coated")).piece
     for i in range(len(conditions)):
         (folder / f"photo_{i}.jpg").write_bytes(take_photo(stage, piece, conditions[i : i + 1]))
 
@@ -166,7 +166,7 @@ def design_pixels(homography, scene, size_px) -> np.ndarray:
     import cv2
 
     mask = np.zeros(size_px[::-1], np.uint8)
-    rects = [(grown((0, 0, *scene.piece.size_mm), -3), 1), *((grown(r, 3), 0) for r in scene.piece.reserved_mm)]
+    rects = [(grow_rect((0, 0, *scene.piece.size_mm), -3), 1), *((grow_rect(r, 3), 0) for r in scene.piece.reserved_mm)]
     for rect, value in rects:
         corners = apply_homography(homography, rect_corners(rect)) - 0.5
         cv2.fillConvexPoly(mask, np.round(corners).astype(np.int32), value)

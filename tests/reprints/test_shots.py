@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from patchproof.base.goal import Goal
-from patchproof.evidence.verdict import EACH, KEPT, compare, kept_chance
-from patchproof.reprints.shots import fewest, paired_power, plan_shots, unpaired_power
+from patchproof.evidence.verdict import MIN_KEPT_CHANCE, PHOTOS_PER_SESSION, compare, kept_chance
+from patchproof.reprints.shot_plan import fewest_photos, paired_power, plan_shots, unpaired_power
 from test_verify_verdict import promise_of
 
 
@@ -27,7 +27,11 @@ def test_power_is_what_the_judge_finds_in_simulation(rates, n):
 def test_the_plan_s_sessions_are_enough_and_one_less_is_not():
     promise = promise_of(0.85, 0.2, correlation=0.1)
     sessions = plan_shots(promise).sessions
-    assert kept_chance(promise, (EACH,) * sessions) >= KEPT > kept_chance(promise, (EACH,) * (sessions - 1))
+    assert (
+        kept_chance(promise, (PHOTOS_PER_SESSION,) * sessions)
+        >= MIN_KEPT_CHANCE
+        > kept_chance(promise, (PHOTOS_PER_SESSION,) * (sessions - 1))
+    )
     assert plan_shots(promise_of(0.3, 0.28, correlation=0.2)).sessions is None
     ways = plan_shots(promise).ways
     assert [way.chance for way in ways[:4]] == sorted(way.chance for way in ways[:4])
@@ -39,4 +43,4 @@ def test_the_hardest_control_decides_and_small_differences_cannot_be_shown():
     assert plan.control == "bare" and 5 <= plan.unpaired <= plan.paired < 40
     assert plan_shots(promise_of(0.5, 0.5)).paired is None
     assert plan_shots(promise_of(0.1, 0.8, goal="deceive")).control == "bare"
-    assert fewest(lambda n: n >= 9) == 9 and fewest(lambda n: False) is None
+    assert fewest_photos(lambda n: n >= 9) == 9 and fewest_photos(lambda n: False) is None

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from patchproof.base.sessions import in_sessions, spread_of
+from patchproof.base.sessions import count_by_session, rate_posterior
 from patchproof.base.settings import BackgroundSettings
 from patchproof.scene import patterns
-from patchproof.scene import rooms as module
-from patchproof.scene.backgrounds import ENOUGH, FEW, RARE, ROOMS, load_backgrounds
-from patchproof.scene.rooms import PLACE_PX, place
+from patchproof.scene import procedural_places as module
+from patchproof.scene.backgrounds import ENOUGH_FILES, FEW_PICTURES, ROOMS, VIEWS_PER_FILE, load_backgrounds
+from patchproof.scene.procedural_places import PLACE_PX, procedural_place
 from patchproof.scene.scene import make_scene
 
 STREAMS = ("train", "select", "promise", "evaluate")
@@ -33,7 +33,7 @@ def shown(backgrounds, stream):
     return set(real), {p for p in pictures if isinstance(p, int)}, len(real) / len(pictures)
 
 
-@pytest.mark.parametrize("count", [1, 4, FEW, 200])
+@pytest.mark.parametrize("count", [1, 4, FEW_PICTURES, 200])
 def test_no_place_is_in_two_parts_and_every_part_has_enough(tmp_path, count):
     backgrounds = folder_of(tmp_path, count)
     parts = {stream: shown(backgrounds, stream) for stream in STREAMS}
@@ -41,12 +41,16 @@ def test_no_place_is_in_two_parts_and_every_part_has_enough(tmp_path, count):
     made = [number for _, own, _ in parts.values() for number in own]
     assert sorted(files) == list(range(count)) and len(set(made)) == len(made)
     for stream, (own, rooms, _) in parts.items():
-        enough = ENOUGH if stream in ("train", "select") else RARE
-        assert rooms <= set(ROOMS[stream]) and bool(rooms) == (len(own) < enough) and len(own) + len(rooms) >= ENOUGH
+        enough = ENOUGH_FILES if stream in ("train", "select") else VIEWS_PER_FILE
+        assert (
+            rooms <= set(ROOMS[stream]) and bool(rooms) == (len(own) < enough) and len(own) + len(rooms) >= ENOUGH_FILES
+        )
     assert shown(backgrounds, "reprint") == parts["evaluate"]
-    assert bool(backgrounds.notes) == (count < FEW)
-    if count == FEW:  # three of them: in training as often as four procedural ones each, else one view in fifty each
-        assert parts["promise"][2] == pytest.approx(3 / RARE, abs=1e-3)
+    assert bool(backgrounds.notes) == (count < FEW_PICTURES)
+    if (
+        count == FEW_PICTURES
+    ):  # three of them: in training as often as four procedural ones each, else one view in fifty each
+        assert parts["promise"][2] == pytest.approx(3 / VIEWS_PER_FILE, abs=1e-3)
         assert parts["train"][2] == pytest.approx(16 / (16 + len(ROOMS["train"])), abs=1e-3)
     if count == 200:
         assert len(parts["promise"][0]) == 60
@@ -60,11 +64,11 @@ def test_a_promise_knows_another_place_for_every_session_and_says_which_share_on
         chosen = backgrounds.chosen("promise", np.random.default_rng(0).random(100))
         assert len(np.unique(chosen)) >= least
     hits = [True] * 4 + [False] * 4 + [True, True, False, False] * 2
-    assert in_sessions(hits, 4, (0, 1, 1, 3)) == ([4, 2, 2], [4, 8, 4])
-    assert in_sessions(hits, 4) == ([4, 0, 2, 2], [4, 4, 4, 4])
+    assert count_by_session(hits, 4, (0, 1, 1, 3)) == ([4, 2, 2], [4, 8, 4])
+    assert count_by_session(hits, 4) == ([4, 0, 2, 2], [4, 4, 4, 4])
     # sessions of one place say less of the rate than as many of places of their own
     hits = [True] * 4 + [False] * 4
-    together, apart = (spread_of(*in_sessions(hits * 20, 4, places)).rate for places in ((0, 1) * 20, ()))
+    together, apart = (rate_posterior(*count_by_session(hits * 20, 4, places)).rate for places in ((0, 1) * 20, ()))
     assert np.ptp(together) > 2 * np.ptp(apart)
 
 
@@ -80,10 +84,10 @@ def test_without_any_word_places_are_procedural_and_always_the_same():
     backgrounds = load_backgrounds(BackgroundSettings(), None)
     assert all(isinstance(each, int) for each in backgrounds.pictures) and not backgrounds.notes
     for number in (0, 1):
-        picture = place(number)
+        picture = procedural_place(number)
         assert picture.shape == (PLACE_PX, PLACE_PX, 3) and picture.dtype == np.uint8 and picture.std() > 1
-        assert np.array_equal(picture, place(number))
-    assert not np.array_equal(place(0), place(2))
+        assert np.array_equal(picture, procedural_place(number))
+    assert not np.array_equal(procedural_place(0), procedural_place(2))
 
 
 def test_a_session_s_photographs_share_print_light_camera_and_place_and_nothing_else():

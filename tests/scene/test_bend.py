@@ -9,10 +9,10 @@ import pytest
 
 from patchproof.base.errors import Refused
 from patchproof.base.settings import PatchSettings
-from patchproof.mesh.exponential import Smooth, exponential_map, stretch_at
+from patchproof.mesh.exponential_map import SmoothSurface, exponential_map, grid_stretch
 from patchproof.mesh.load_mesh import load_mesh
-from patchproof.mesh.mesh import Material, Part, from_parts
-from patchproof.mesh.surface import Chart, crop, edge_points, heights, net
+from patchproof.mesh.mesh import Material, MeshPart, mesh_from_parts
+from patchproof.mesh.surface_chart import SurfaceChart, edge_points, piece_grid, surface_heights, triangles_near
 from patchproof.scene.bend import STRETCH_LIMIT, place_bent
 from patchproof.scene.placement import LIFT_MM, patch_frame
 
@@ -20,9 +20,9 @@ from patchproof.scene.placement import LIFT_MM, patch_frame
 def made(*meshes, y_up=True):
     """One mesh of trimesh's, in millimeters; trimesh's axis of revolution is z."""
     turn = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]) if y_up else np.eye(3)
-    parts = [Part(m.vertices @ turn.T, m.faces, Material("one", (1, 1, 1))) for m in meshes]
+    parts = [MeshPart(m.vertices @ turn.T, m.faces, Material("one", (1, 1, 1))) for m in meshes]
     size = np.ptp(np.concatenate([part.vertices for part in parts]), axis=0).max()
-    return from_parts(parts, float(size))
+    return mesh_from_parts(parts, float(size))
 
 
 @pytest.fixture(scope="module")
@@ -208,7 +208,7 @@ def test_a_piece_beyond_the_surface_is_refused(can):
 def test_a_chart_takes_points_there_and_back(curvature):
     rng = np.random.default_rng(0)
     axes = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-    chart = Chart(rng.normal(size=3), axes * np.linalg.det(axes), curvature, np.array([0.6, 0.8]))
+    chart = SurfaceChart(rng.normal(size=3), axes * np.linalg.det(axes), curvature, np.array([0.6, 0.8]))
     sth = rng.uniform(-40, 40, (50, 3))
     np.testing.assert_allclose(chart.local(chart.world(*sth.T)), sth, atol=1e-9)
 
@@ -218,10 +218,10 @@ def test_heights_equal_a_slow_twin(curvature):
     """The twin solves every pair of line and triangle as a 3×3 system, also for triangles around the axis."""
     rng = np.random.default_rng(1)
     triangles = rng.uniform(-60, 60, (40, 1, 3)) + rng.uniform(-50, 50, (40, 3, 3))
-    chart = Chart(np.array([3.0, 4, 5]), np.eye(3), curvature, np.array([0.8, 0.6]))
+    chart = SurfaceChart(np.array([3.0, 4, 5]), np.eye(3), curvature, np.array([0.8, 0.6]))
     window = (-25.0, 20.0)
-    found = heights(chart, triangles, (80, 50), 9, window)
-    for height, (s, t) in zip(found, net((80, 50), 9) @ [[0.8, 0.6], [-0.6, 0.8]], strict=True):
+    found = surface_heights(chart, triangles, (80, 50), 9, window)
+    for height, (s, t) in zip(found, piece_grid((80, 50), 9) @ [[0.8, 0.6], [-0.6, 0.8]], strict=True):
         point = chart.world(*np.array([[s], [t], [0.0]]))[0]
         normal = chart.world(*np.array([[s], [t], [1.0]]))[0] - point
         best = -np.inf
@@ -242,10 +242,10 @@ def test_edge_points_are_no_farther_apart_than_asked():
 def test_the_exponential_map_keeps_distances_from_the_middle():
     """Lengths along each geodesic, summed in space, equal the sheet's; the surface is a bumpy cylinder."""
     rng = np.random.default_rng(2)
-    chart = Chart(np.zeros(3), np.eye(3), 0.02, np.array([1.0, 0]))
+    chart = SurfaceChart(np.zeros(3), np.eye(3), 0.02, np.array([1.0, 0]))
     coefficients = np.triu(rng.normal(size=(5, 5)))[::-1].copy()
     coefficients[1, 0] = coefficients[0, 1] = 0  # level at the middle
-    surface = Smooth(chart, coefficients, 30.0)
+    surface = SmoothSurface(chart, coefficients, 30.0)
     ends = rng.normal(size=(20, 2))
     ends *= 20 / np.linalg.norm(ends, axis=1, keepdims=True)
     shares = np.linspace(0, 1, 201)
@@ -265,11 +265,11 @@ def test_the_exponential_map_keeps_distances_from_the_middle():
 
 def test_stretch_is_the_largest_in_any_direction():
     """On a plane whose grid is laid 1 % too long along a diagonal."""
-    chart = Chart(np.zeros(3), np.eye(3), 0.0, np.array([1.0, 0]))
-    flat = Smooth(chart, np.zeros((1, 1)), 1.0)
-    laid = net((40, 30), 5) @ (np.eye(2) + 0.01 * np.full((2, 2), 0.5))
-    assert stretch_at(flat, net((40, 30), 5), (40, 30), 5).max() == pytest.approx(0, abs=1e-12)
-    assert stretch_at(flat, laid, (40, 30), 5).max() == pytest.approx(0.01, rel=1e-6)
+    chart = SurfaceChart(np.zeros(3), np.eye(3), 0.0, np.array([1.0, 0]))
+    flat = SmoothSurface(chart, np.zeros((1, 1)), 1.0)
+    laid = piece_grid((40, 30), 5) @ (np.eye(2) + 0.01 * np.full((2, 2), 0.5))
+    assert grid_stretch(flat, piece_grid((40, 30), 5), (40, 30), 5).max() == pytest.approx(0, abs=1e-12)
+    assert grid_stretch(flat, laid, (40, 30), 5).max() == pytest.approx(0.01, rel=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -296,7 +296,7 @@ def _highest_over(mesh, piece) -> float:
     """How far the object reaches through the paper at most, in mm, looking out of 300 random points of it."""
     rng = np.random.default_rng(0)
     corners = piece.vertices_mm[piece.faces]
-    triangles = crop(mesh.vertices[mesh.faces], piece.center_mm, float(np.hypot(*piece.size_mm)) / 2 + 3)
+    triangles = triangles_near(mesh.vertices[mesh.faces], piece.center_mm, float(np.hypot(*piece.size_mm)) / 2 + 3)
     low, high = triangles.min(1) - 3, triangles.max(1) + 3
     worst = -np.inf
     for face in rng.integers(len(corners), size=300):

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from patchproof.base.settings import SceneSettings
-from patchproof.base.validation import validated
+from patchproof.base.validation import validate_model
 from patchproof.scene.conditions import draw, fields_of
 
-SETTINGS = validated(
+SETTINGS = validate_model(
     SceneSettings,
     {
         "object": {"mesh": "primitive:carton", "length_mm": 300},

@@ -12,7 +12,7 @@ from patchproof.base.errors import Refused
 from patchproof.base.geometry import apply_homography, rect_corners
 from patchproof.base.settings import SceneSettings
 from patchproof.scene import flat
-from patchproof.scene.image_scene import ERASED_AREA, FEW, erase
+from patchproof.scene.image_scene import ERASED_AREA, FEW_IMAGES, erase
 from patchproof.scene.scene import build_scene
 
 PHOTO = (320, 240)
@@ -70,10 +70,10 @@ def test_another_template_is_the_scene_made_for_it(tmp_path):
 
 
 def test_what_is_promised_was_not_optimized_on(tmp_path):
-    scene = build_scene(settings_of("cup", background={"erasing": 0}), folder_of(tmp_path, 2 * FEW), 0)
+    scene = build_scene(settings_of("cup", background={"erasing": 0}), folder_of(tmp_path, 2 * FEW_IMAGES), 0)
     seen = {s: numbers(scene.pictures(scene.draw(s, 128), (24, 24))) for s in ("train", "select", "promise", "reprint")}
     assert seen["train"] == seen["select"] and seen["promise"] == seen["reprint"]
-    assert not seen["train"] & seen["promise"] and len(seen["train"] | seen["promise"]) == FEW
+    assert not seen["train"] & seen["promise"] and len(seen["train"] | seen["promise"]) == FEW_IMAGES
     assert all("unreadable" in warning for warning in scene.warnings)
     few = build_scene(settings_of("cup"), folder_of_few(tmp_path), 0)
     assert few.warnings[0] == "the promise is made on 2 images, and says little of others: give 20 or more"
@@ -121,7 +121,7 @@ def test_paper_is_white_and_clean(tmp_path):
     conditions = scene.draw("train", 3)
     light = scene.piece_light(conditions)
     assert light.shape == (3, 3, 6) and (light @ [1, 0.3, -0.7, 0.09, -0.21, 0.49] == 1).all()
-    assert not np.any(scene.own_blur_and_noise(conditions))
+    assert not np.any(scene.picture_blur_and_noise(conditions))
     assert scene.design_px(96)[0] > scene.design_px(96)[1] >= 32
 
 

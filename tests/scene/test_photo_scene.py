@@ -10,21 +10,21 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from patchproof.base.color import LIGHT_OF_CODE, srgb_from_linear
+from patchproof.base.color import LINEAR_FROM_CODE, srgb_from_linear
 from patchproof.base.errors import Refused
 from patchproof.base.geometry import apply_homography, intrinsics, look_at, plane_homography, rect_corners
 from patchproof.base.packaged import packaged_path
-from patchproof.base.settings import SceneSettings, identifying
+from patchproof.base.settings import SceneSettings, identity_settings
 from patchproof.photo.rejection import PhotoRejected
 from patchproof.scene import flat
 from patchproof.scene.conditions import with_values
 from patchproof.scene.paper_light import paper_light, quadratic_terms
-from patchproof.scene.photo_scene import _digest, see
+from patchproof.scene.photo_scene import _digest, measure_photo
 from patchproof.scene.scene import build_scene
 from patchproof.sheets.blank import blank_sheet
 from patchproof.sheets.manifest import Manifest, dump_manifest
+from patchproof.sheets.pdf_raster import rasterize_piece
 from patchproof.sheets.piece import lay_out_piece, sheet_id
-from patchproof.sheets.raster import piece_pixels
 
 SIZE = (800, 600)
 FINE = 3  # samples per pixel and axis
@@ -99,7 +99,7 @@ def photograph(raster, px_from_piece, size_mm, light, blur, seed) -> np.ndarray:
 def world(tmp_path_factory) -> World:
     folder = tmp_path_factory.mktemp("photos")
     manifest = blank_sheet("blank_a4", folder / "BLANK.pdf")
-    raster = LIGHT_OF_CODE.astype(np.float32)[piece_pixels(folder / "BLANK.pdf", manifest, DPI)]
+    raster = LINEAR_FROM_CODE.astype(np.float32)[rasterize_piece(folder / "BLANK.pdf", manifest, DPI)]
     size_mm, truth = np.array(manifest.cut_mm[2:]), {}
     (folder / "photos").mkdir()
     for i, (*pose, blur, exposure) in enumerate(VIEWS):
@@ -140,7 +140,7 @@ def test_geometry_light_blur_and_noise_are_recovered(world, scene):
     found = zip(
         scene.piece_homographies(conditions, SIZE),
         scene.piece_light(conditions),
-        *scene.own_blur_and_noise(conditions),
+        *scene.picture_blur_and_noise(conditions),
         world.truth.values(),
         strict=True,
     )
@@ -163,7 +163,7 @@ def test_the_piece_is_the_blank_s_with_ids_of_its_own(world, scene):
     assert all("unreadable" in warning for warning in scene.warnings)
     # the id follows from the settings with the blank's size filled in, as a run keeps them, and from the photographs
     digest = _digest(scene.base / scene.settings.object.photos)
-    known = identifying(scene.settings) | {"blank": world.manifest.sheet_id, "photos": digest}
+    known = identity_settings(scene.settings) | {"blank": world.manifest.sheet_id, "photos": digest}
     assert sheet_id(known, 0) == scene.sheet_id != sheet_id(known, 1)
 
 
@@ -212,10 +212,10 @@ def test_picture_and_homography_move_alike(scene, size_px):
         x, y = apply_homography(photo.photo_from_piece, middle[None])[0]
         rows, columns = np.mgrid[: SIZE[1], : SIZE[0]] + 0.5
         picture[:] = 255 * np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / 2 / 5**2)[..., None]
-        dotted.append(replace(photo, picture=flat.Picture(np.round(picture).astype(np.uint8))))
+        dotted.append(replace(photo, picture=flat.BasePicture(np.round(picture).astype(np.uint8))))
     scene = replace(scene, photos=tuple(dotted))
     conditions = scene.draw("evaluate", 12)
-    assert np.ptp(scene.own_blur_and_noise(conditions)[0]) > 0.1 and np.ptp(conditions.pose.roll_deg) > 4
+    assert np.ptp(scene.picture_blur_and_noise(conditions)[0]) > 0.1 and np.ptp(conditions.pose.roll_deg) > 4
     pictures = scene.pictures(conditions, size_px)
     for picture, where in zip(pictures, scene.piece_homographies(conditions, size_px), strict=True):
         weight = picture[..., 0].astype(float)
@@ -230,7 +230,7 @@ def test_zoom_takes_the_blur_along(scene):
     background = conditions.pose.background.copy()
     background[:, 1] = 0
     small = with_values(conditions, background=background)
-    assert scene.own_blur_and_noise(small)[0] == pytest.approx(scene.own_blur_and_noise(conditions)[0] * low)
+    assert scene.picture_blur_and_noise(small)[0] == pytest.approx(scene.picture_blur_and_noise(conditions)[0] * low)
 
 
 def test_photographs_of_another_size_and_shape_agree_in_their_square(world, tmp_path):
@@ -239,7 +239,7 @@ def test_photographs_of_another_size_and_shape_agree_in_their_square(world, tmp_
     pixels = np.asarray(Image.open(world.folder / "photos" / name))[:, 160:640]  # 480 × 600
     Image.fromarray(pixels).resize((960, 1200), Image.Resampling.BICUBIC).save(tmp_path / "tall.png", compress_level=1)
     piece = lay_out_piece((162.0, 162.0), 19.0, "A1B2C3D4E5", "design")
-    seen = see(tmp_path / "tall.png", world.manifest, piece, (640, 480))
+    seen = measure_photo(tmp_path / "tall.png", world.manifest, piece, (640, 480))
     # (x - 160, y) in 480 × 600 has its square from y = 60 on; 480 px of it become 480
     expected = np.array([[1, 0, -160 + 80], [0, 1, -60], [0, 0, 1.0]]) @ where
     corners = rect_corners((0, 0, *piece.size_mm))
@@ -356,5 +356,5 @@ def test_each_unusable_photograph_has_its_code(world, tmp_path):
     for code, (pixels, manifest) in cases.items():
         save(pixels, tmp_path / "photo.png")
         with pytest.raises(PhotoRejected) as caught:
-            see(tmp_path / "photo.png", manifest, piece, SIZE)
+            measure_photo(tmp_path / "photo.png", manifest, piece, SIZE)
         assert caught.value.code == code, caught.value

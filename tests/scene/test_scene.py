@@ -15,10 +15,10 @@ from patchproof.render.designs import PrintedPiece
 from patchproof.render.photograph import expose, photograph
 from patchproof.render.pixels import PiecePicture
 from patchproof.render.stage import set_stage
-from patchproof.render.views import see
+from patchproof.render.views import render_views
 from patchproof.scene.conditions import with_values
 from patchproof.scene.scene import load_scene
-from patchproof.sheets.markers import MODULES
+from patchproof.sheets.markers import MARKER_MODULES
 from patchproof.sheets.piece import marker_image, with_ids
 
 QUIET = """
@@ -52,7 +52,7 @@ def test_markers_follow_from_the_views(tmp_path):
     """Twice the distance needs markers twice as large, until they would leave the design too little."""
     near = scene_of(tmp_path, SCENE.replace("[500, 900]", "[400, 450]"))
     far = scene_of(tmp_path, SCENE.replace("[500, 900]", "[4000, 9000]"))
-    assert near.piece.module_mm * MODULES < far.piece.module_mm * MODULES
+    assert near.piece.module_mm * MARKER_MODULES < far.piece.module_mm * MARKER_MODULES
     assert near.unreadable_share <= 0.05 < far.unreadable_share
     assert far.piece.marker_mm == pytest.approx(19.5)  # 0.29 × 90 = 26.1 mm for a corner; (26.1 - 1) × 7/9 = 19.52
     assert any("markers of 19.5 mm, the largest that fit, will be unreadable" in warning for warning in far.warnings)
@@ -112,7 +112,7 @@ def test_a_photograph_shows_the_piece_where_the_homography_says(tmp_path):
     stage, conditions = set_stage(scene), scene.draw("promise", 5)
     piece = PiecePicture.of(torch.ones(64, 64, 3))
     for size in ((800, 600), (300, 300)):
-        seen = see(stage, piece, conditions, size)
+        seen = render_views(stage, piece, conditions, size)
         homographies = scene.piece_homographies(conditions, size)
         width, height = size
         for i in range(5):
@@ -153,7 +153,7 @@ def test_a_patch_turned_away_is_not_seen(tmp_path):
     """But for the back of what stands out beside the carton's ridge."""
     scene = scene_of(tmp_path, SCENE.replace("_mm = 90", "_mm = 134"))
     stage, conditions = set_stage(scene), with_values(scene.draw("promise", 2), azimuth_deg=np.array([180.0, 165.0]))
-    seen = see(stage, piece_of(scene), conditions, (96, 96))
+    seen = render_views(stage, piece_of(scene), conditions, (96, 96))
     assert len(seen.piece.pixel) == 0 < len(seen.piece.back_pixel)
 
 
@@ -161,7 +161,7 @@ def test_views_seen_once_can_be_shaded_with_another_design(tmp_path, scene_file)
     scene = load_scene(scene_file)
     stage, conditions, piece = set_stage(scene), scene.draw("train", 3), piece_of(scene)
     dark = PiecePicture.of(piece.srgb * 0.3)
-    seen = see(stage, piece, conditions, (96, 96))
+    seen = render_views(stage, piece, conditions, (96, 96))
     torch.testing.assert_close(expose(seen, dark), photograph(stage, dark, conditions, (96, 96)))
     assert not torch.equal(expose(seen, dark), expose(seen, piece))
 

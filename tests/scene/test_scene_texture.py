@@ -13,9 +13,9 @@ from patchproof.base.color import linear_from_srgb
 from patchproof.base.errors import Refused
 from patchproof.base.settings import PatchSettings
 from patchproof.mesh.load_mesh import load_mesh
-from patchproof.mesh.mesh import Material, Part, from_parts
-from patchproof.mesh.texels import coverage, face_counts
-from patchproof.scene.texture import texture_canvas
+from patchproof.mesh.mesh import Material, MeshPart, mesh_from_parts
+from patchproof.mesh.uv_coverage import coverage, texels_per_face
+from patchproof.scene.canvas import texture_canvas
 
 HERE = Path(".")
 WHOLE = PatchSettings(kind="texture")
@@ -23,12 +23,12 @@ PAINT = np.random.default_rng(0).integers(0, 256, (16, 16, 3), dtype=np.uint8)
 PAINTED = Material("paint", (1.0, 1.0, 1.0), PAINT)
 
 
-def square(x: float, uv=((0, 1), (1, 1), (1, 0), (0, 0)), material=None, colors=None) -> Part:
+def square(x: float, uv=((0, 1), (1, 1), (1, 0), (0, 0)), material=None, colors=None) -> MeshPart:
     """A 1×1 square at x, seen from +z, its texture upright."""
     corners = np.array([[x, 0, 0], [x + 1, 0, 0], [x + 1, 1, 0], [x, 1, 0]], float)
     faces = np.array([[0, 1, 2], [0, 2, 3]])
     material = material or PAINTED
-    return Part(corners, faces, material, None if uv is None else np.asarray(uv, float), None, colors)
+    return MeshPart(corners, faces, material, None if uv is None else np.asarray(uv, float), None, colors)
 
 
 def cell(column: int, row: int, cells: int = 4) -> np.ndarray:
@@ -90,17 +90,17 @@ def test_faces_that_share_edges_cover_each_center_once():
     assert (coverage(corners + np.array([1000, -7]), (32, 32)) == 1).all()  # wrapped round
     assert (coverage(corners * 3, (32, 32)) == 9).all()  # three turns each way
     mask = rng.random((32, 32)) < 0.4
-    inside, centers = face_counts(corners, mask)
+    inside, centers = texels_per_face(corners, mask)
     assert centers.sum() == 32 * 32 and inside.sum() == mask.sum()
     assert np.array_equal(inside[::50], [(coverage(face[None], (32, 32)) * mask).sum() for face in corners[::50]])
-    assert np.array_equal(face_counts(corners * 3, mask)[0].sum(), 9 * mask.sum())
+    assert np.array_equal(texels_per_face(corners * 3, mask)[0].sum(), 9 * mask.sum())
 
 
 # ------------------------------------------------------------------------------------------------ what may change
 
 
 def test_a_whole_texture_may_change_where_faces_show_it():
-    mesh = from_parts([square(0, cell(1, 1))], 100)
+    mesh = mesh_from_parts([square(0, cell(1, 1))], 100)
     canvas = texture_canvas(mesh, WHOLE, HERE)
     expected = np.zeros((16, 16), bool)
     expected[2:9, 2:9] = True  # texels 4 to 7, one more all round, and a second one where its center is just within
@@ -128,7 +128,7 @@ def test_the_mask_holds_every_texel_that_a_look_up_in_a_named_face_reads(data, t
 
 def test_material_names_choose_faces():
     red, blue = Material("red", (1.0, 0, 0)), Material("blue", (0, 0, 1.0))
-    mesh = from_parts([square(0, material=red), square(1, material=blue)], 100)
+    mesh = mesh_from_parts([square(0, material=red), square(1, material=blue)], 100)
     canvas = texture_canvas(mesh, masked(materials=("blue",)), HERE, 8)
     assert [mask.sum() for mask in canvas.mask] == [0, 64] and canvas.start_srgb[0].shape == (1, 1, 3)
     with pytest.raises(Refused, match=r'name of a material, got "blu": did you mean "blue"'):
@@ -141,7 +141,7 @@ def test_an_image_chooses_texels_at_any_size(tmp_path):
     Image.fromarray(half).save(tmp_path / "mask.png")
     deep = np.where(half, 40000, 600).astype(np.uint16)  # 600 of 65535 is black, 600 clipped at 255 would be white
     Image.fromarray(deep).save(tmp_path / "deep.png")
-    mesh = from_parts([square(0)], 100)
+    mesh = mesh_from_parts([square(0)], 100)
     for name in ("mask.png", "deep.png"):
         canvas = texture_canvas(mesh, masked(mask=name, start="gray"), tmp_path)
         assert canvas.mask[0][:, 8:].all() and not canvas.mask[0][:, :8].any()
@@ -153,7 +153,9 @@ def test_an_image_chooses_texels_at_any_size(tmp_path):
 def test_a_mask_of_another_size_than_its_texture_is_said(tmp_path, size, said):
     Image.fromarray(np.full(size[::-1], 255, np.uint8)).save(tmp_path / "mask.png")
     gray = Material("gray", (1.0, 1.0, 1.0), np.full((256, 128, 3), 60, np.uint8))
-    warnings = texture_canvas(from_parts([square(0, material=gray)], 100), masked(mask="mask.png"), tmp_path).warnings
+    warnings = texture_canvas(
+        mesh_from_parts([square(0, material=gray)], 100), masked(mask="mask.png"), tmp_path
+    ).warnings
     assert len(warnings) == said
     if said:
         assert warnings[0].startswith(
@@ -166,13 +168,13 @@ def test_a_mask_of_a_whole_multiple_of_the_texels_chooses_what_was_drawn(tmp_pat
     drawn[320:640, 320:640] = 255
     Image.fromarray(drawn).save(tmp_path / "mask.png")
     material = Material("m", (1.0, 1.0, 1.0), np.full((96, 96, 3), 60, np.uint8))
-    mesh = from_parts([square(0, material=material)], 100)
+    mesh = mesh_from_parts([square(0, material=material)], 100)
     (mask,) = texture_canvas(mesh, masked(mask="mask.png"), tmp_path).mask
     assert mask[32:64, 32:64].all() and mask.sum() == 32 * 32
 
 
 def test_unusable_masks_are_refused(tmp_path):
-    mesh = from_parts([square(0, cell(0, 0))], 100)
+    mesh = mesh_from_parts([square(0, cell(0, 0))], 100)
 
     def refuses(match, **keys):
         with pytest.raises(Refused, match=match):
@@ -193,7 +195,7 @@ def test_unusable_masks_are_refused(tmp_path):
         refuses(r"a face number or a range a-b from 0 to 1, got .* of faces.txt", faces="faces.txt")
     (tmp_path / "faces.txt").write_text("# nothing\n")
     refuses("one per line, got none", faces="faces.txt")
-    bare = from_parts([square(0, None)], 100)
+    bare = mesh_from_parts([square(0, None)], 100)
     Image.fromarray(elsewhere).save(tmp_path / "mask.png")
     with pytest.raises(Refused, match="texture coordinates for a mask, got none: name materials or faces"):
         texture_canvas(bare, masked(mask="mask.png"), tmp_path)
@@ -201,7 +203,9 @@ def test_unusable_masks_are_refused(tmp_path):
 
 def test_base_colors_move_into_the_textures_and_the_look_stays():
     base = (0.3, 1.0, 0.7)
-    mesh = from_parts([square(0, material=Material("m", base, PAINT)), square(1, material=Material("n", base))], 100)
+    mesh = mesh_from_parts(
+        [square(0, material=Material("m", base, PAINT)), square(1, material=Material("n", base))], 100
+    )
     canvas = texture_canvas(mesh, WHOLE, HERE, 32)
     assert [texture.shape for texture in canvas.start_srgb] == [(16, 16, 3), (32, 32, 3)]
     assert all(material.base_color_linear == (1, 1, 1) for material in canvas.mesh.materials)
@@ -218,19 +222,19 @@ def test_base_colors_move_into_the_textures_and_the_look_stays():
 
 
 def test_shared_texels_are_measured_and_said():
-    apart = from_parts([square(i, cell(i, 0)) for i in range(4)], 100)
+    apart = mesh_from_parts([square(i, cell(i, 0)) for i in range(4)], 100)
     assert texture_canvas(apart, WHOLE, HERE).warnings == ()
     mirrored = square(1, cell(0, 0)[[1, 0, 3, 2]])
-    mesh = from_parts([square(0, cell(0, 0)), mirrored, square(2, cell(2, 0)), square(3, cell(3, 0))], 100)
+    mesh = mesh_from_parts([square(0, cell(0, 0)), mirrored, square(2, cell(2, 0)), square(3, cell(3, 0))], 100)
     (warning,) = texture_canvas(mesh, WHOLE, HERE).warnings
     assert warning.startswith("50% of the surface") and "another place" in warning
-    tiled = from_parts([square(0, cell(0, 0, 1) * 3)], 100)
+    tiled = mesh_from_parts([square(0, cell(0, 0, 1) * 3)], 100)
     assert texture_canvas(tiled, WHOLE, HERE).warnings[0].startswith("100%")
 
 
 def test_doubts_are_about_what_an_image_lets_change(tmp_path):
     uv = [cell(0, 0), cell(0, 0), cell(2, 0), cell(3, 0)]
-    mesh = from_parts([square(i, corners) for i, corners in enumerate(uv)], 100)
+    mesh = mesh_from_parts([square(i, corners) for i, corners in enumerate(uv)], 100)
     left = np.zeros((4, 4), np.uint8)
     for name, columns, warns in (("a.png", [0, 2], "67% of"), ("b.png", [2, 3], None)):
         picture = left.copy()
@@ -242,12 +246,14 @@ def test_doubts_are_about_what_an_image_lets_change(tmp_path):
 
 def test_a_front_and_a_back_are_one_place():
     front = square(0)
-    mesh = from_parts([front, replace(front, faces=front.faces[:, ::-1])], 100)
+    mesh = mesh_from_parts([front, replace(front, faces=front.faces[:, ::-1])], 100)
     assert texture_canvas(mesh, WHOLE, HERE).warnings == ()
 
 
 def test_faces_that_change_unnamed_are_said(tmp_path):
-    mesh = from_parts([square(0, cell(0, 0)), square(1, cell(0, 0)), square(2, cell(2, 0)), square(3, cell(3, 0))], 100)
+    mesh = mesh_from_parts(
+        [square(0, cell(0, 0)), square(1, cell(0, 0)), square(2, cell(2, 0)), square(3, cell(3, 0))], 100
+    )
     (tmp_path / "faces.txt").write_text("0-1")
     warnings = texture_canvas(mesh, masked(faces="faces.txt"), tmp_path).warnings
     assert any(warning.startswith("25% of the surface changes too") for warning in warnings)
@@ -256,15 +262,15 @@ def test_faces_that_change_unnamed_are_said(tmp_path):
 def test_a_palette_is_told_from_a_fine_mesh():
     """A swatch per square is a palette; thousands of faces smaller than a texel that cover a texture are not."""
     swatches = [square(i, np.tile(cell(i % 4, i // 4).mean(0), (4, 1))) for i in range(8)]
-    (warning,) = texture_canvas(from_parts(swatches, 100), WHOLE, HERE).warnings
+    (warning,) = texture_canvas(mesh_from_parts(swatches, 100), WHOLE, HERE).warnings
     assert warning.startswith("100% of the surface") and "palette" in warning
     n = 40  # 3200 faces on 256 texels
     x, y = np.meshgrid(np.arange(n + 1), np.arange(n + 1))
     points = np.stack([x, y, 0 * x], -1).reshape(-1, 3) / n
     corner = (np.arange(n)[:, None] * (n + 1) + np.arange(n)).reshape(-1, 1)
     faces = (corner[:, :, None] + np.array([[0, 1, n + 2], [0, n + 2, n + 1]])).reshape(-1, 3)
-    fine = Part(points, faces, Material("m", (1, 1, 1), PAINT), points[:, :2] * [1, -1] + [0, 1])
-    assert texture_canvas(from_parts([fine], 100), WHOLE, HERE).warnings == ()
+    fine = MeshPart(points, faces, Material("m", (1, 1, 1), PAINT), points[:, :2] * [1, -1] + [0, 1])
+    assert texture_canvas(mesh_from_parts([fine], 100), WHOLE, HERE).warnings == ()
 
 
 @pytest.mark.parametrize(
@@ -286,7 +292,7 @@ def test_doubts_about_real_meshes(data, name, says):
 
 
 def test_vertex_colors_over_a_texture_are_said():
-    mesh = from_parts([square(0, colors=np.full((4, 3), 0.5))], 100)
+    mesh = mesh_from_parts([square(0, colors=np.full((4, 3), 0.5))], 100)
     canvas = texture_canvas(mesh, WHOLE, HERE)
     assert "vertex colors go on multiplying" in canvas.warnings[0]
     assert (canvas.mesh.corner_color_linear == 0.5).all()

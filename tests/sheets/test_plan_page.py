@@ -11,19 +11,19 @@ from conftest import SCENE
 
 from patchproof.base.errors import Refused
 from patchproof.base.settings import load_scene_settings
-from patchproof.reprints.hung import hang
+from patchproof.reprints.plan_view import hang
 from patchproof.reprints.run_sheet import _wrapped
-from patchproof.reprints.shots import shot_sections
+from patchproof.reprints.shot_plan import shot_sections
 from patchproof.scene.placement import patch_frame
-from patchproof.scene.tape import tapes
-from patchproof.sheets.plan_page import Hung, PlanPage, edges_mm, lay_out_plan, wrapped
+from patchproof.scene.tape_measure import tapes
+from patchproof.sheets.plan_page import PlacementPicture, PlanPage, edge_distances_mm, lay_out_plan, wrap_text
 from patchproof.sheets.template import load_template
 from test_scene import scene_of
 from test_worth_shown import promise_with
 
 A4 = load_template("a4")
 OUTLINE = ((-20.0, -45.0), (60.0, -45.0), (60.0, 15.0), (-20.0, 15.0))
-HUNG = Hung(np.full((60, 100, 3), 200, np.uint8), (-110, -66, 220, 132), (-100, -60, 200, 120), OUTLINE)
+HUNG = PlacementPicture(np.full((60, 100, 3), 200, np.uint8), (-110, -66, 220, 132), (-100, -60, 200, 120), OUTLINE)
 
 
 def boxed(tmp_path, **patch):
@@ -41,7 +41,7 @@ def test_edges_of_a_piece_on_a_box(tmp_path, spin):
     width, height = scene.piece.size_mm if spin == 0 else scene.piece.size_mm[::-1]
     found = hang(scene, A4)
     # the side is 400 × 240: its middle lies 200 and 120 from the edges, the piece's 30 right of it and 20 up
-    assert edges_mm(found) == pytest.approx(
+    assert edge_distances_mm(found) == pytest.approx(
         {
             "left": 230 - width / 2,
             "right": 170 - width / 2,
@@ -64,14 +64,14 @@ def test_edges_of_a_real_mesh_add_up_to_what_another_reader_measures(tmp_path, d
     extents = trimesh.load(path, force="mesh").extents
     text = SCENE.replace("primitive:carton", str(path)).replace("length_mm = 300", "length_mm = 480")
     found = hang(scene_of(tmp_path, text.replace('"+z"', '"+x"').replace("[500, 900]", "[700, 900]")), A4)
-    edges, (xs, ys) = edges_mm(found), zip(*found.outline_mm, strict=True)
+    edges, (xs, ys) = edge_distances_mm(found), zip(*found.outline_mm, strict=True)
     scaled = sorted(extents * 480 / extents.max())
     wide, high = (edges["left"] + edges["right"] + np.ptp(xs), edges["top"] + edges["bottom"] + np.ptp(ys))
     assert min(abs(side - wide) for side in scaled) < 0.5 and min(abs(side - high) for side in scaled) < 0.5
 
 
 def test_chains_run_from_edge_to_edge_at_the_picture_s_scale():
-    assert edges_mm(HUNG) == {"left": 80, "right": 40, "top": 15, "bottom": 45}
+    assert edge_distances_mm(HUNG) == {"left": 80, "right": 40, "top": 15, "bottom": 45}
     page = lay_out_plan(PlanPage(HUNG, (("Where the piece goes", ("Here.",)),)), A4, "A1B2C3D4E5")
     words = [line.text for line in page.layout.texts]
     for word in ("80 mm from left edge", "80 mm piece", "40 mm from right edge", "15 mm", "60 mm", "45 mm"):
@@ -88,7 +88,7 @@ def test_words_that_do_not_fit_the_page_are_refused():
     lay_out_plan(PlanPage(None, (("A", ("word " * 100,)),)), A4, "A1B2C3D4E5")
     with pytest.raises(Refused, match="within the margins"):
         lay_out_plan(PlanPage(None, (("A", ("word " * 9000,)),)), A4, "A1B2C3D4E5")
-    assert wrapped("one two three", 2.6, 8.0) == ["one", "two", "three"]
+    assert wrap_text("one two three", 2.6, 8.0) == ["one", "two", "three"]
 
 
 def standing(tmp_path, mesh, width, height, bend, **patch):

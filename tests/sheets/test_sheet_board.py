@@ -9,7 +9,7 @@ from patchproof.base.packaged import packaged_path
 from patchproof.sheets.blank import blank_page, blank_sheet
 from patchproof.sheets.board import board_sheet, is_board, load_board
 from patchproof.sheets.manifest import load_manifest
-from patchproof.sheets.raster import attached_manifest, page_pixels
+from patchproof.sheets.pdf_raster import attached_manifest, rasterize_page
 
 FILE = packaged_path("print_templates", "charuco_a4.toml")
 
@@ -32,7 +32,7 @@ def test_opencv_s_own_board_detector_reads_the_page(board):
     # a board as anybody would make it: size, squares, markers, dictionary; OpenCV's own ids and pattern
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_1000)
     detector = cv2.aruco.CharucoDetector(cv2.aruco.CharucoBoard((7, 10), 24.0, 18.0, dictionary))
-    gray = cv2.cvtColor(page_pixels(board[0], 1, 150), cv2.COLOR_RGB2GRAY)
+    gray = cv2.cvtColor(rasterize_page(board[0], 1, 150), cv2.COLOR_RGB2GRAY)
     corners, ids, quads, names = detector.detectBoard(gray)
     ids, corners = np.asarray(ids).reshape(-1), np.asarray(corners).reshape(-1, 2)
     assert ids.tolist() == list(range(54)) and sorted(np.asarray(names).reshape(-1)) == list(range(35))
@@ -55,7 +55,9 @@ def test_its_manifest_gives_the_board_back_and_equal_templates_equal_bytes(board
     assert manifest.design is None and manifest.promise is None and manifest.kind == "board"
     assert load_manifest(path.with_suffix(".json")) == attached_manifest(path) == manifest
     assert load_board("charuco_a4") == load_board(path.with_suffix(".json"))
-    assert cv2.QRCodeDetector().detectAndDecode(page_pixels(path, 1, 150))[0] == f"patchproof:{manifest.sheet_id}:board"
+    assert (
+        cv2.QRCodeDetector().detectAndDecode(rasterize_page(path, 1, 150))[0] == f"patchproof:{manifest.sheet_id}:board"
+    )
     board_sheet(FILE, tmp_path / "again.pdf")
     assert (tmp_path / "again.pdf").read_bytes() == path.read_bytes()
 

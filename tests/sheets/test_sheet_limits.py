@@ -13,9 +13,9 @@ import pytest
 
 from patchproof.base import input as bounds
 from patchproof.base.errors import Refused
-from patchproof.sheets import raster
+from patchproof.sheets import pdf_raster
 from patchproof.sheets.blank import blank_sheet
-from patchproof.sheets.raster import page_pixels
+from patchproof.sheets.pdf_raster import rasterize_page
 
 needs_timer = pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="there are no such timers on Windows")
 
@@ -23,12 +23,12 @@ needs_timer = pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="there
 def test_a_page_of_too_many_pixels_is_refused_before_memory_is_taken(tmp_path, monkeypatch):
     page = tmp_path / "s.pdf"
     blank_sheet("blank_a4", page)
-    width, height = page_pixels(page, 1, 30).shape[1::-1]
-    monkeypatch.setattr(raster, "MOST_PX", width * height)
-    assert page_pixels(page, 1, 30).shape == (height, width, 3)
-    monkeypatch.setattr(raster, "MOST_PX", width * height - 1)
+    width, height = rasterize_page(page, 1, 30).shape[1::-1]
+    monkeypatch.setattr(pdf_raster, "MOST_PX", width * height)
+    assert rasterize_page(page, 1, 30).shape == (height, width, 3)
+    monkeypatch.setattr(pdf_raster, "MOST_PX", width * height - 1)
     with pytest.raises(Refused, match=rf"million in all, got {width} × {height}: lower"):
-        page_pixels(page, 1, 30)
+        rasterize_page(page, 1, 30)
 
 
 def forms_in_forms(path: Path, levels: int) -> None:
@@ -50,15 +50,15 @@ def test_a_page_that_takes_too_long_is_refused_and_left_behind(tmp_path, monkeyp
     """Five levels take 1 s, and nothing interrupts PDFium; the next page waits for it."""
     monkeypatch.setattr(bounds, "SECONDS", 0.3)
     forms_in_forms(tmp_path / "few.pdf", 3)
-    blue = page_pixels(tmp_path / "few.pdf", 1, 72)
+    blue = rasterize_page(tmp_path / "few.pdf", 1, 72)
     assert (blue[150, 50] == [0, 0, 255]).all()
     forms_in_forms(tmp_path / "many.pdf", 5)
     before = time.process_time()
     with pytest.raises(Refused, match=r"a page that is soon drawn, got .*, which takes more than 0\.3 s of processor"):
-        page_pixels(tmp_path / "many.pdf", 1, 72)
+        rasterize_page(tmp_path / "many.pdf", 1, 72)
     assert time.process_time() - before < 0.7
     monkeypatch.setattr(bounds, "SECONDS", 10.0)
-    assert (page_pixels(tmp_path / "few.pdf", 1, 72) == blue).all()
+    assert (rasterize_page(tmp_path / "few.pdf", 1, 72) == blue).all()
 
 
 @needs_timer
@@ -66,7 +66,7 @@ def test_a_process_that_has_left_a_page_behind_ends_as_any_other(tmp_path):
     """What is drawn ten thousand million times is not waited for."""
     forms_in_forms(tmp_path / "endless.pdf", 10)
     code = (
-        "import sys; from patchproof.base import input; from patchproof.sheets.raster import page_pixels;"
+        "import sys; from patchproof.base import input; from patchproof.sheets.pdf_raster import page_pixels;"
         "from patchproof.base.validation import Refused; input.SECONDS = 0.2\n"
         "try: page_pixels(sys.argv[1])\nexcept Refused: sys.exit(7)"
     )

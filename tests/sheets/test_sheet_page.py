@@ -7,11 +7,11 @@ import pytest
 
 from patchproof.base.errors import Refused
 from patchproof.base.packaged import packaged_path
-from patchproof.sheets.content import PrintedPiece
+from patchproof.sheets.content import SheetContent
 from patchproof.sheets.layout import Box, prove_apart
 from patchproof.sheets.page import largest_piece_mm, lay_out_page, qr_rects_mm
-from patchproof.sheets.piece import KINDS, lay_out_piece, marker_rect, marker_size_mm
-from patchproof.sheets.rects import holds, meet
+from patchproof.sheets.piece import SHEET_KINDS, lay_out_piece, marker_rect, marker_size_mm
+from patchproof.sheets.rects import rect_contains, rects_overlap
 from patchproof.sheets.template import TextLine, load_template
 
 ID = "WWWWWWWWWW"  # the widest id there can be
@@ -21,7 +21,7 @@ PAGE, MARGIN = (210.0, 297.0), 7.0
 
 def page_of(template, piece_mm, needed_mm=20.0, kind="design", bends=False):
     piece = lay_out_piece(piece_mm, marker_size_mm(needed_mm, piece_mm), ID, kind, bends)
-    return lay_out_page(template, PrintedPiece(piece, ID, kind, WHITE))
+    return lay_out_page(template, SheetContent(piece, ID, kind, WHITE))
 
 
 @pytest.mark.parametrize("piece_mm", [(110, 110), (40, 40), (60, 140), (140, 50), (166.6, 179.6), (39, 39)])
@@ -37,8 +37,8 @@ def test_a4_holds_small_large_and_oblong_pieces(piece_mm, kind, bends):
     assert np.array(page.cuts_mm[0][:2]) == pytest.approx(corner, abs=1e-3)
     assert len({m.id for m in page.markers}) == len(page.markers)
     own, others = page.markers[:-4], page.markers[-4:]
-    assert all(holds(page.cuts_mm[0], marker_rect(m)) for m in own)
-    assert not any(meet(page.cuts_mm[0], marker_rect(m)) for m in others)
+    assert all(rect_contains(page.cuts_mm[0], marker_rect(m)) for m in own)
+    assert not any(rects_overlap(page.cuts_mm[0], marker_rect(m)) for m in others)
     assert len(own) >= 4 + 4 * (bends and min(piece_mm) >= 110)
 
 
@@ -52,7 +52,7 @@ def test_a_piece_says_its_top_its_sheet_and_its_name_in_the_scissors_millimeter(
     for label, name in (("mug", "DESIGN · MUG"), (None, "DESIGN"), (404, "DESIGN · 404"), ("m" * 99, "DESIGN · MM")):
         piece = lay_out_piece(piece_mm, marker_size_mm(20.0, piece_mm), ID, "design")
         settings = {} if label is None else {"target": {"label": label}}
-        page = lay_out_page(template, PrintedPiece(piece, ID, "design", WHITE, settings=settings))
+        page = lay_out_page(template, SheetContent(piece, ID, "design", WHITE, settings=settings))
         x, y, w, h = page.cuts_mm[0]
         own = [line for line in page.texts if x < line.at_mm[0] < x + w and y < line.at_mm[1] < y + h]
         top, sheet, last = own
@@ -70,7 +70,7 @@ def test_a_piece_says_its_top_its_sheet_and_its_name_in_the_scissors_millimeter(
 
 def test_kinds_share_no_marker_even_with_the_page_s_own():
     template = load_template("a4")
-    ids = [m.id for kind in KINDS for m in page_of(template, (120, 120), kind=kind, bends=True).markers]
+    ids = [m.id for kind in SHEET_KINDS for m in page_of(template, (120, 120), kind=kind, bends=True).markers]
     assert len(ids) == len(set(ids)) == 6 * 12
 
 

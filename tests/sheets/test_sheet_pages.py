@@ -15,23 +15,23 @@ from patchproof.base.errors import Refused
 from patchproof.base.geometry import apply_homography, rect_corners
 from patchproof.base.packaged import packaged_path
 from patchproof.base.validation import read_toml
-from patchproof.evidence.camera import view_of
+from patchproof.evidence.camera import pinhole_photo
 from patchproof.evidence.measure import measure
 from patchproof.evidence.ranges import promised_ranges
 from patchproof.evidence.surface import surface_of
-from patchproof.photo.label import label_of, read_label
+from patchproof.photo.page_code import manifest_page_code, read_page_code
 from patchproof.photo.read import Photo
 from patchproof.sheets.blank import chart_sheet
 from patchproof.sheets.board import board_sheet, is_board
-from patchproof.sheets.content import PrintedPiece
+from patchproof.sheets.content import SheetContent
 from patchproof.sheets.layout import Box, prove_apart
 from patchproof.sheets.manifest import load_manifest
+from patchproof.sheets.multi_design import write_several
 from patchproof.sheets.page import largest_piece_mm
+from patchproof.sheets.pdf_raster import attached_manifest, rasterize_page, rasterize_piece
 from patchproof.sheets.piece import lay_out_piece, marker_image
 from patchproof.sheets.plan_page import PlanPage
-from patchproof.sheets.raster import attached_manifest, page_pixels, piece_pixels
-from patchproof.sheets.several import write_several
-from patchproof.sheets.shop import check_sheet
+from patchproof.sheets.print_advice import sheet_advice
 from patchproof.sheets.template import load_template, template_names
 from patchproof.sheets.tiles import plan_tiles, refuse_larger_than_page
 from patchproof.sheets.write import write_sheet
@@ -53,7 +53,7 @@ def write(path, name, piece_mm=None, marker_mm=None, design=DESIGN, **more):
         return chart_sheet(template, path)
     piece_mm = piece_mm or ((350, 350) if template.tiles else (90, 90))
     piece = lay_out_piece(piece_mm, marker_mm or (20 if template.tiles else 8), ID, "design", bends=True)
-    return write_sheet(path, template, PrintedPiece(piece, ID, "design", design), **more)
+    return write_sheet(path, template, SheetContent(piece, ID, "design", design), **more)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -71,7 +71,7 @@ def test_every_page_has_its_markers_within_a_tenth_of_a_millimeter_its_code_and_
             for image in page.obj.Resources.get("/XObject", {}).values():
                 assert image.ColorSpace[0] == "/ICCBased"
     for number in range(1, count + 1):
-        pixels = page_pixels(path, number, DPI)
+        pixels = rasterize_page(path, number, DPI)
         found = detect(pixels)
         expected = [marker for marker in manifest.markers if marker.page == number]
         assert set(found) == {marker.id for marker in expected} and expected
@@ -79,7 +79,7 @@ def test_every_page_has_its_markers_within_a_tenth_of_a_millimeter_its_code_and_
             assert np.abs(found[marker.id] / PX_PER_MM - np.array(marker.corners_mm)).max() < 0.1
         assert_nothing_lies_over(pixels, manifest, number, margin)
         if number == 1:
-            assert read_label(pixels) == label_of(manifest)
+            assert read_page_code(pixels) == manifest_page_code(manifest)
     assert attached_manifest(path) == load_manifest(path.with_suffix(".json")) == manifest
 
 
@@ -127,7 +127,7 @@ def test_charts_have_the_colors_that_they_promise(tmp_path):
     for name, count in (("chart_a4", 96), ("chart_letter", 96), ("chart48_a4", 48)):
         manifest = write(tmp_path / f"{name}.pdf", name)
         assert len(manifest.chart) == count and manifest.kind == "chart"
-        pixels = page_pixels(tmp_path / f"{name}.pdf", 1, 50)
+        pixels = rasterize_page(tmp_path / f"{name}.pdf", 1, 50)
         for swatch in manifest.chart:
             x, y, w, h = (v * 50 / 25.4 for v in swatch.rect_mm)
             assert np.array_equal(pixels[int(y + h / 2), int(x + w / 2)], np.rint(np.array(swatch.srgb) * 255))
@@ -161,8 +161,8 @@ def test_a_600_mm_patch_rebuilds_from_scans_of_its_tiles_within_half_a_millimete
     surface, origin, errors = surface_of(manifest), np.array(manifest.design.rect_mm[:2]), []
     assert len(manifest.tiles) >= 12 and len(surface.piece_ids) == 8
     for tile in manifest.tiles:
-        scan, truth = scanned(page_pixels(path, tile.page, SCAN_DPI), tile.page)
-        measured = measure(view_of(Photo(scan, None), None), "scan", surface, None, promised_ranges(()), SCAN_DPI)
+        scan, truth = scanned(rasterize_page(path, tile.page, SCAN_DPI), tile.page)
+        measured = measure(pinhole_photo(Photo(scan, None), None), "scan", surface, None, promised_ranges(()), SCAN_DPI)
         entry = measured.entry
         assert entry.status == "measured" and not measured.counted
         assert (entry.scale.scale_x, entry.scale.scale_y) == pytest.approx((1, 1), abs=0.002)
@@ -175,7 +175,7 @@ def test_a_600_mm_patch_rebuilds_from_scans_of_its_tiles_within_half_a_millimete
 
 def test_assembled_tiles_are_the_design_and_all_its_markers(tiled):
     path, manifest = tiled
-    pixels = piece_pixels(path, manifest, 50)
+    pixels = rasterize_piece(path, manifest, 50)
     scale = pixels.shape[1] / manifest.cut_mm[2]
     found, surface = detect(pixels), surface_of(manifest)
     assert set(found) == surface.piece_ids
@@ -187,7 +187,7 @@ def test_assembled_tiles_are_the_design_and_all_its_markers(tiled):
     rows = ((y - manifest.cut_mm[1] + at * h) * scale).astype(int)
     free = ~marker_image(PIECE, (120, 120))[1]
     assert np.abs(pixels[np.ix_(rows, columns)].astype(int) - DESIGN)[free].mean() < 4 and free.mean() > 0.8
-    measured = measure(view_of(Photo(pixels, None), None), "p", surface, None, promised_ranges(()))
+    measured = measure(pinhole_photo(Photo(pixels, None), None), "p", surface, None, promised_ranges(()))
     assert measured.counted and measured.entry.markers_found == 8  # glued together it is no page check
 
 
@@ -195,14 +195,14 @@ def test_a_blank_piece_in_tiles_is_put_together_as_one_with_a_design_is(tmp_path
     pixels = {}
     for name, design in (("blank", None), ("white", np.full((8, 8, 3), 255, np.uint8))):
         path = tmp_path / f"{name}.pdf"
-        pixels[name] = piece_pixels(path, write(path, "a4_tiles", design=design), 50)
+        pixels[name] = rasterize_piece(path, write(path, "a4_tiles", design=design), 50)
     np.testing.assert_array_equal(pixels["blank"], pixels["white"])
 
 
 def test_a_scan_of_the_first_page_is_a_page_check(tiled):
     path, manifest = tiled
-    page = page_pixels(path, 1, 75)
-    measured = measure(view_of(Photo(page, None), None), "p", surface_of(manifest), None, promised_ranges(()))
+    page = rasterize_page(path, 1, 75)
+    measured = measure(pinhole_photo(Photo(page, None), None), "p", surface_of(manifest), None, promised_ranges(()))
     assert measured.entry.code is None and not measured.counted
 
 
@@ -248,20 +248,20 @@ def test_a_piece_with_more_markers_than_ids_is_refused_before_it_is_optimized():
 
 def test_copies_are_pages_of_the_same(tmp_path):
     write(tmp_path / "s.pdf", "label_102x152", copies=3)
-    pages = [page_pixels(tmp_path / "s.pdf", n, 50) for n in (1, 2, 3)]
+    pages = [rasterize_page(tmp_path / "s.pdf", n, 50) for n in (1, 2, 3)]
     assert np.array_equal(pages[0], pages[1]) and np.array_equal(pages[0], pages[2])
 
 
 def designs(*ids, piece_mm=(84, 84)):
     return [
-        PrintedPiece(lay_out_piece(piece_mm, 8, i, "design"), i, "design", np.roll(DESIGN, n), None, {})
+        SheetContent(lay_out_piece(piece_mm, 8, i, "design"), i, "design", np.roll(DESIGN, n), None, {})
         for n, i in enumerate(ids)
     ]
 
 
 def test_several_designs_share_a_page_each_with_a_manifest_of_its_own(tmp_path):
     manifests = write_several(tmp_path / "s.pdf", load_template("a3"), designs(ID, "B1B2C3D4E5", "C1B2C3D4E5"))
-    found = detect(page_pixels(tmp_path / "s.pdf", 1, DPI))
+    found = detect(rasterize_page(tmp_path / "s.pdf", 1, DPI))
     for number, manifest in enumerate(manifests, 1):
         assert load_manifest(tmp_path / f"s_{number}.json") == manifest
         assert attached_manifest(tmp_path / "s.pdf", manifest.sheet_id) == manifest
@@ -270,7 +270,7 @@ def test_several_designs_share_a_page_each_with_a_manifest_of_its_own(tmp_path):
         assert manifest.design.rect_mm == manifest.cut_mm
         for marker in manifest.markers:
             assert np.abs(found[marker.id] / PX_PER_MM - np.array(marker.corners_mm)).max() < 0.1
-        assert len(piece_pixels(tmp_path / "s.pdf", manifest, 50)) > 100
+        assert len(rasterize_piece(tmp_path / "s.pdf", manifest, 50)) > 100
     cuts = [Box(f"piece {i}", m.cut_mm) for i, m in enumerate(manifests)]
     prove_apart(tuple(cuts), manifests[0].page_mm, 7.0)
 
@@ -285,7 +285,7 @@ def test_each_of_several_designs_has_a_plan_that_names_its_sheet(tmp_path):
         assert f"plan of sheet {manifest.sheet_id}" in text and word in text
         assert (
             f"Page {manifest.plan_page} is for people, on any paper: where the piece of sheet {manifest.sheet_id}"
-            in (" ".join(check_sheet(manifest)))
+            in (" ".join(sheet_advice(manifest)))
         )
     only = write_several(tmp_path / "t.pdf", load_template("a4"), both, [None, plans[1]])
     assert [manifest.plan_page for manifest in only] == [None, 2]
@@ -308,7 +308,7 @@ def test_the_longest_words_fit_every_page(tmp_path, name, bent):
     size = (777.7, 888.8) if template.tiles else (round(widest - 1.1, 1), round(highest - 1.1, 1))
     piece = lay_out_piece(size, 20 if template.tiles else 12.3, "W" * 10, "design", bends=bent)
     settings = {"target": {"label": "W" * 60}}
-    content = PrintedPiece(piece, "W" * 10, "design", DESIGN, promise, settings, bent)
+    content = SheetContent(piece, "W" * 10, "design", DESIGN, promise, settings, bent)
     write_sheet(tmp_path / "s.pdf", template, content, PlanPage(None, (("Here", ("First.",)),)))
     words = words_on(tmp_path / "s.pdf", 1)
     assert ("Wrap the piece smoothly round" in words) == (bent and template.plan_page and not template.tiles)
@@ -348,7 +348,7 @@ def test_what_cannot_be_printed_is_refused_in_one_sentence(tmp_path):
 
 def test_check_says_of_each_kind_of_page_what_is_cut(tmp_path, tiled):
     def told(manifest):
-        return " ".join(check_sheet(manifest))
+        return " ".join(sheet_advice(manifest))
 
     chart = told(chart_sheet(load_template("chart_a4"), tmp_path / "c.pdf"))
     assert "Cut nothing" in chart and "piece" not in chart and "7.0 mm from its edge" in chart

@@ -10,7 +10,7 @@ import pytest
 from patchproof.base.color import linear_from_srgb, srgb_from_linear
 from patchproof.base.errors import Refused
 from patchproof.sheets.piece import (
-    KINDS,
+    SHEET_KINDS,
     black_runs,
     control_design,
     hash_order,
@@ -19,8 +19,8 @@ from patchproof.sheets.piece import (
     marker_image,
     marker_rects_mm,
     marker_size_mm,
-    on_paper,
     sheet_id,
+    whiten_marker_pixels,
     with_ids,
 )
 
@@ -49,7 +49,7 @@ def test_marker_ids_never_change_and_grow_by_appending():
 
 
 def test_kinds_of_one_sheet_share_no_id():
-    ids = [i for kind in KINDS for i in marker_ids(ID, kind, 166)]
+    ids = [i for kind in SHEET_KINDS for i in marker_ids(ID, kind, 166)]
     assert len(ids) == len(set(ids)) == 6 * 166
     assert 0 <= min(ids) and max(ids) < 1000
 
@@ -246,12 +246,14 @@ def test_hand_numbers_of_reserved_pixels():
 def test_on_paper_whitens_what_is_reserved_alone_and_once():
     piece, design = lay_out_piece((70, 100), 9, ID, "design"), photo_like_design()
     before = design.copy()
-    printed = on_paper(design, piece)
+    printed = whiten_marker_pixels(design, piece)
     _, reserved = marker_image(piece, (70, 100))
     assert printed.dtype == np.uint8 and (printed[reserved] == 255).all()
     assert np.array_equal(printed[~reserved], design[~reserved]) and np.array_equal(design, before)
-    assert np.array_equal(on_paper(printed, piece), printed)
-    assert np.array_equal(on_paper(design, with_ids(piece, ID, "mean")), printed)  # whatever the markers' ids
+    assert np.array_equal(whiten_marker_pixels(printed, piece), printed)
+    assert np.array_equal(
+        whiten_marker_pixels(design, with_ids(piece, ID, "mean")), printed
+    )  # whatever the markers' ids
 
 
 def photo_like_design():
@@ -307,20 +309,20 @@ def test_noise_control_is_uniform_and_follows_the_sheet_id():
 
 
 @pytest.mark.parametrize("size", [(1, 1), (5, 3), (17, 100)])
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", SHEET_KINDS)
 def test_controls_have_the_design_s_size_however_small(size, kind):
     design = np.arange(size[0] * size[1] * 3, dtype=np.uint8).reshape(*size, 3)
     control = control_design(kind, design, ID)
     assert control.shape == design.shape and control.dtype == np.uint8
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", SHEET_KINDS)
 def test_controls_of_a_piece_are_white_where_its_markers_lie(kind):
     piece, design = lay_out_piece((70, 100), 9, ID, "design"), photo_like_design()
     _, reserved = marker_image(piece, (70, 100))
     control = control_design(kind, design, ID, piece)
     assert control.dtype == np.uint8 and (control[reserved] == 255).all()
-    assert np.array_equal(on_paper(control, piece), control)
+    assert np.array_equal(whiten_marker_pixels(control, piece), control)
     if kind not in ("mean", "shuffled"):  # elsewhere it is what it is without a piece
         assert np.array_equal(control[~reserved], control_design(kind, design, ID)[~reserved])
     # what the design has under the markers shows in no control

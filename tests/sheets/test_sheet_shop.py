@@ -9,7 +9,7 @@ from pikepdf import Array, Name
 from PIL import Image
 
 from patchproof.base.errors import Refused
-from patchproof.sheets.shop import shop_lines
+from patchproof.sheets.print_advice import pdf_advice
 from test_photo_label import sheet
 
 
@@ -66,21 +66,21 @@ def boxless(pdf):
     ],
 )
 def test_every_fault_is_found_in_the_file(pdf_path, tmp_path, spoil, problem):
-    assert not any("PROBLEM" in line for line in shop_lines(pdf_path))
+    assert not any("PROBLEM" in line for line in pdf_advice(pdf_path))
     with pikepdf.open(pdf_path) as pdf:
         spoil(pdf)
         pdf.save(tmp_path / "spoiled.pdf")
-    (line,) = (line for line in shop_lines(tmp_path / "spoiled.pdf") if "PROBLEM" in line)
+    (line,) = (line for line in pdf_advice(tmp_path / "spoiled.pdf") if "PROBLEM" in line)
 
     assert re.search(problem, line)
 
 
 def test_resolution_is_that_of_the_drawn_size(pdf_path):
-    (line,) = (line for line in shop_lines(pdf_path) if "ppi" in line)
+    (line,) = (line for line in pdf_advice(pdf_path) if "ppi" in line)
     assert "140 × 140 pixels on 136.0 × 136.0 mm, 26 ppi; lossless" in line  # 140 / 136 × 25.4 = 26.1
 
 
 def test_what_is_no_pdf_is_refused(tmp_path):
     (tmp_path / "a.pdf").write_text("no")
     with pytest.raises(Refused, match="Expected a PDF of a sheet"):
-        shop_lines(tmp_path / "a.pdf")
+        pdf_advice(tmp_path / "a.pdf")

@@ -14,13 +14,13 @@ from PIL import Image, ImageCms
 
 from patchproof.base.color import linear_from_srgb
 from patchproof.base.errors import Refused
-from patchproof.sheets.content import PrintedPiece
+from patchproof.sheets.content import SheetContent
 from patchproof.sheets.manifest import dump_manifest, load_manifest
 from patchproof.sheets.pdf import srgb_profile
+from patchproof.sheets.pdf_raster import attached_manifest, rasterize_page, rasterize_piece
 from patchproof.sheets.piece import control_design, lay_out_piece, marker_image
 from patchproof.sheets.piece_words import piece_words
-from patchproof.sheets.raster import attached_manifest, page_pixels, piece_pixels
-from patchproof.sheets.shop import check_sheet, shop_lines
+from patchproof.sheets.print_advice import pdf_advice, sheet_advice
 from patchproof.sheets.template import load_template
 from patchproof.sheets.write import write_sheet
 
@@ -38,7 +38,7 @@ def write(path, piece_mm=(162, 162), marker_mm=19.0, kind="design", design="samp
     if isinstance(design, str):
         design = control_design(kind, sample_design(), ID)
     settings = {"patch": {"width_mm": piece_mm[0], "height_mm": piece_mm[1]}, "seed": 0}
-    content = PrintedPiece(lay_out_piece(piece_mm, marker_mm, ID, kind, bends), ID, kind, design, settings=settings)
+    content = SheetContent(lay_out_piece(piece_mm, marker_mm, ID, kind, bends), ID, kind, design, settings=settings)
     return write_sheet(path, load_template("a4"), content)
 
 
@@ -51,7 +51,7 @@ def reserved_px(manifest):
 def words_px(piece, manifest, shape):
     """Which pixels of a picture of the piece may have its words: the outer millimeter of three corners."""
     mask, scale = np.zeros(shape[:2], bool), shape[1] / piece.size_mm[0]
-    for box in piece_words(PrintedPiece(piece, manifest.sheet_id, manifest.kind, None), (0.0, 0.0)).boxes:
+    for box in piece_words(SheetContent(piece, manifest.sheet_id, manifest.kind, None), (0.0, 0.0)).boxes:
         x, y, w, h = box.rect_mm
         assert min(y, piece.size_mm[1] - y - h) == pytest.approx(0.139)
         (left, top), (right, bottom) = ((int(v * scale) for v in p) for p in ((x, y), (x + w, y + h)))
@@ -67,7 +67,7 @@ def sheet(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def page(sheet):
-    return page_pixels(sheet[0], 1, DPI)
+    return rasterize_page(sheet[0], 1, DPI)
 
 
 def detect(pixels):
@@ -90,7 +90,7 @@ def detect(pixels):
 )
 def test_opencv_finds_every_marker_within_a_tenth_of_a_millimeter(tmp_path, piece_mm, marker_mm, bends, count):
     manifest = write(tmp_path / "s.pdf", piece_mm, marker_mm, bends=bends)
-    found = detect(page_pixels(tmp_path / "s.pdf", 1, DPI))
+    found = detect(rasterize_page(tmp_path / "s.pdf", 1, DPI))
     assert set(found) == {marker.id for marker in manifest.markers}
     assert len(manifest.markers) == count + 4
     for marker in manifest.markers:
@@ -111,7 +111,7 @@ def test_qr_code_can_be_read(page, sheet):
 
 
 def test_rulers_measure_100_mm_on_the_page(sheet):
-    template, pixels = load_template("a4"), page_pixels(sheet[0], 1, 600)
+    template, pixels = load_template("a4"), rasterize_page(sheet[0], 1, 600)
     scale = 600 / 25.4
 
     def ends(strip):
@@ -253,7 +253,7 @@ def test_marker_image_agrees_with_the_pdf(tmp_path, marker_mm, mean, most):
     gray = np.full((168, 168, 3), 128, np.uint8)  # 2 px/mm
     manifest = write(path, (84, 84), marker_mm, design=gray, bends=True)
     image, reserved = marker_image(lay_out_piece((84, 84), marker_mm, ID, "design", bends=True), (168, 168))
-    fine = piece_pixels(path, manifest, 16 * 25.4)
+    fine = rasterize_piece(path, manifest, 16 * 25.4)
     assert fine.shape == (168 * 8, 168 * 8, 3)
     linear = linear_from_srgb(fine / 255).reshape(168, 8, 168, 8, 3).mean((1, 3))
     difference = np.abs(linear - linear_from_srgb(image.astype(float)))
@@ -269,7 +269,7 @@ def test_marker_image_agrees_with_the_pdf(tmp_path, marker_mm, mean, most):
 
 def test_piece_pixels_end_at_the_cut_line(sheet, tmp_path):
     path, manifest = sheet
-    pixels = piece_pixels(path, manifest, 200)
+    pixels = rasterize_piece(path, manifest, 200)
     height, width = pixels.shape[:2]
     assert (width, height) == (round(162 / 25.4 * 200),) * 2
     found = detect(pixels)
@@ -278,7 +278,7 @@ def test_piece_pixels_end_at_the_cut_line(sheet, tmp_path):
         assert np.abs(mm - np.array(marker.corners_mm)).max() < 0.1
     # no ink of the dashed line, which lies outside: a blank piece is white all round
     # (PDFium counts coverage in 1/256: one code value of it may show)
-    blank = piece_pixels(tmp_path / "b.pdf", write(tmp_path / "b.pdf", kind="blank", design=None), 200)
+    blank = rasterize_piece(tmp_path / "b.pdf", write(tmp_path / "b.pdf", kind="blank", design=None), 200)
     blank[words_px(lay_out_piece((162, 162), 19.0, ID, "blank"), manifest, blank.shape)] = 255
     assert min(blank[:7].min(), blank[-7:].min(), blank[:, :7].min(), blank[:, -7:].min()) >= 254
     # and the design's outermost texels, 13 px wide, reach up to it
@@ -300,15 +300,15 @@ def test_blank_sheet_has_no_design_and_white_in_its_middle(tmp_path):
     path = tmp_path / "blank.pdf"
     manifest = write(path, kind="blank", design=None)
     assert manifest.design is None and manifest.kind == "blank"
-    pixels = piece_pixels(path, manifest, 100)
+    pixels = rasterize_piece(path, manifest, 100)
     low = int(27 / 25.4 * 100)  # corners of 25.4 mm are the markers'
     assert (pixels[low:-low, 1:-1] == 255).all() and (pixels[1:-1, low:-low] == 255).all()
-    assert cv2.QRCodeDetector().detectAndDecode(page_pixels(path, 1, DPI))[0] == f"patchproof:{ID}:blank"
-    assert any("no design" in line for line in check_sheet(manifest))
+    assert cv2.QRCodeDetector().detectAndDecode(rasterize_page(path, 1, DPI))[0] == f"patchproof:{ID}:blank"
+    assert any("no design" in line for line in sheet_advice(manifest))
 
 
 def test_check_sheet_tells_the_print_shop(sheet):
-    lines = check_sheet(sheet[1]) + shop_lines(sheet[0])
+    lines = sheet_advice(sheet[1]) + pdf_advice(sheet[0])
     text = " ".join(lines)
     for word in (
         "210 × 297 mm",
@@ -366,15 +366,15 @@ def test_read_only_folder_is_refused(tmp_path):
 def test_what_is_no_sheet_is_refused(tmp_path, sheet):
     broken = tmp_path / "broken.pdf"
     broken.write_bytes(b"%PDF-1.7\nnot really")
-    for read in (page_pixels, attached_manifest):
+    for read in (rasterize_page, attached_manifest):
         with pytest.raises(Refused, match="cannot be read"):
             read(broken)
         with pytest.raises(Refused, match="no file at"):
             read(tmp_path / "none.pdf")
     with pytest.raises(Refused, match="a page from 1 to 1"):
-        page_pixels(sheet[0], 2)
+        rasterize_page(sheet[0], 2)
     with pytest.raises(Refused, match="at most 20000 pixels"):
-        page_pixels(sheet[0], 1, 3000)
+        rasterize_page(sheet[0], 1, 3000)
     plain = tmp_path / "plain.pdf"
     with pikepdf.new() as pdf:
         pdf.add_blank_page()
@@ -413,7 +413,7 @@ def test_a_manifest_of_another_form_is_refused_by_its_key(tmp_path, sheet):
 
 def test_the_package_imports_without_heavy_libraries():
     code = (
-        "import sys; from patchproof.sheets import chart, page, pdf, piece, raster, template, write; "
+        "import sys; from patchproof.sheets import chart, page, pdf, piece, pdf_raster, template, write; "
         "print([m for m in ('torch', 'scipy', 'cv2', 'reportlab', 'pikepdf', 'pypdfium2') if m in sys.modules])"
     )
     run = subprocess.run(

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from patchproof.base.claims import Estimate
+from patchproof.base.intervals import Estimate
 from patchproof.report.tables import Table, Value
 
 Progress = Callable[[str, int, int], None]

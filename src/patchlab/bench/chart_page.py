@@ -10,12 +10,12 @@ import math
 import cv2
 import numpy as np
 
-from patchproof.base.color import codes_of
-from patchproof.reprints.page_photos import PX_PER_MM, Shows, page_light
+from patchproof.base.color import codes_from_srgb
+from patchproof.reprints.page_photos import PX_PER_MM, PrintFunction, page_light
 from patchproof.sheets.chart import chart_colors
 from patchproof.sheets.manifest import Manifest
-from patchproof.sheets.markers import DICTIONARY, cells_of
-from patchproof.sheets.piece import hash_order, marker_at, printed
+from patchproof.sheets.markers import DICTIONARY, marker_cells
+from patchproof.sheets.piece import hash_order, manifest_marker, square_marker
 
 PAGE_MM = (210.0, 148.0)
 MARKER_MM, _MARKERS_MM = 14.0, ((8.0, 8.0), (188.0, 8.0), (188.0, 126.0), (8.0, 126.0))
@@ -34,7 +34,7 @@ def chart_manifest(count: int) -> Manifest:
         {"rect_mm": (*cell, side - _GAP_MM, side - _GAP_MM), "srgb": colors[index], "page": 1}
         for cell, index in zip(cells, order, strict=True)
     ]
-    markers = [printed(marker_at(7 + i, at, MARKER_MM)) for i, at in enumerate(_MARKERS_MM)]
+    markers = [manifest_marker(square_marker(7 + i, at, MARKER_MM)) for i, at in enumerate(_MARKERS_MM)]
     head = {
         "version": 2,
         "sheet_id": "CHART00000",
@@ -47,11 +47,11 @@ def chart_manifest(count: int) -> Manifest:
     return Manifest.model_validate(head | where | {"markers": markers, "chart": swatches})
 
 
-def printed_page(manifest: Manifest, shows: Shows) -> np.ndarray:
+def printed_page(manifest: Manifest, shows: PrintFunction) -> np.ndarray:
     """The page as light H×W×3 at `PX_PER_MM`, with some writing beside the chart, as sheets have."""
     width, height = (round(side * PX_PER_MM) for side in manifest.page_mm)
     page = np.full((height, width, 3), 255, np.uint8)
-    for marker, code in zip(manifest.markers, cells_of(DICTIONARY, [m.id for m in manifest.markers]), strict=True):
+    for marker, code in zip(manifest.markers, marker_cells(DICTIONARY, [m.id for m in manifest.markers]), strict=True):
         side = round(MARKER_MM * PX_PER_MM)
         _fill(
             page, (*marker.corners_mm[0], MARKER_MM, MARKER_MM), 255 * cv2.resize(code, (side, side), interpolation=0)
@@ -60,7 +60,7 @@ def printed_page(manifest: Manifest, shows: Shows) -> np.ndarray:
         where = (30 * PX_PER_MM, at * PX_PER_MM)
         cv2.putText(page, f"{line} what stands beside a chart is not white paper", where, 0, 0.9, (0, 0, 0), 2)
     for swatch in manifest.chart:
-        _fill(page, swatch.rect_mm, codes_of(np.array(swatch.srgb)))
+        _fill(page, swatch.rect_mm, codes_from_srgb(np.array(swatch.srgb)))
     return page_light(page, shows)
 
 

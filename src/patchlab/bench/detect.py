@@ -17,12 +17,12 @@ from patchlab.bench.measure import clocked
 from patchlab.bench.paper import DESIGN_MM, Sheet, corners_mm, drawn_sheet, photographed
 from patchlab.study.claims import median
 from patchproof.base.geometry import apply_homography, rect_corners
-from patchproof.photo.complete import find_sheet
-from patchproof.photo.detect import COARSEST_PX, levels, look, whole
+from patchproof.photo.detect import COARSEST_PX, full_region, pyramid_levels, search_level
+from patchproof.photo.known_page import find_sheet
 from patchproof.photo.rectify import fit_page
 from patchproof.photo.rejection import PhotoRejected
 from patchproof.report.tables import Table
-from patchproof.sheets.markers import DICTIONARY, printed_markers
+from patchproof.sheets.markers import DICTIONARY, aruco_dictionary
 
 SIZES_PX = ((1600, 1200), (2400, 1800), (4000, 3000))
 COARSEST = (500, COARSEST_PX, 2000)
@@ -92,8 +92,8 @@ def find_fitted(srgb: np.ndarray, coarsest_px: int) -> Corners:
 def find_plain(srgb: np.ndarray, coarsest_px: int) -> Corners:
     """Corners as OpenCV refines them on the level that first shows each marker."""
     quads: dict[int, list[np.ndarray]] = {}
-    for level in levels(srgb, whole(srgb), coarsest_px):
-        look(srgb, whole(srgb), level, printed_markers(DICTIONARY), quads)
+    for level in pyramid_levels(srgb, full_region(srgb), coarsest_px):
+        search_level(srgb, full_region(srgb), level, aruco_dictionary(DICTIONARY), quads)
         if corners_mm().keys() <= quads.keys():
             break
     return {i: quads[i][0] for i in quads if i in corners_mm()}

@@ -18,15 +18,15 @@ from typing import Any
 from patchlab.bench.chart import Chart, Point, Progress
 from patchlab.bench.measure import clocked
 from patchproof.app.demo import SCENE
-from patchproof.base.claims import Estimate, rate
+from patchproof.base.intervals import Estimate, rate
 from patchproof.base.settings import OptimizeSettings, SceneSettings
-from patchproof.base.validation import validated
-from patchproof.base.workers import threads
+from patchproof.base.validation import validate_model
+from patchproof.base.workers import use_threads
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import set_problem
 from patchproof.optimizer.promise import PromiseOptions
 from patchproof.optimizer.responses import responses
-from patchproof.optimizer.run import DRAFT, THOROUGH, Run
+from patchproof.optimizer.run import DRAFT_EFFORT, THOROUGH_EFFORT, Run
 from patchproof.optimizer.run import optimize as optimize_scene
 from patchproof.report.tables import Table
 from patchproof.scene.interface import Scene
@@ -42,8 +42,8 @@ OBJECTS = {
 }
 DEFAULT = "default"
 # By name the steps, and the views of the promise (None: as many as the scene's half width needs).
-EFFORTS = {"draft": DRAFT, DEFAULT: (OptimizeSettings().steps, None), "thorough": THOROUGH}
-QUICK_EFFORTS = {"draft": DRAFT, DEFAULT: (2 * DRAFT[0], 2 * DRAFT[1])}
+EFFORTS = {"draft": DRAFT_EFFORT, DEFAULT: (OptimizeSettings().steps, None), "thorough": THOROUGH_EFFORT}
+QUICK_EFFORTS = {"draft": DRAFT_EFFORT, DEFAULT: (2 * DRAFT_EFFORT[0], 2 * DRAFT_EFFORT[1])}
 
 
 def charts(quick: bool, progress: Progress) -> Iterator[Chart]:
@@ -90,11 +90,11 @@ def _scene(label: str, steps: int) -> Scene:
     settings["patch"] |= {"offset_mm": [0, off_mm], "width_mm": size_mm, "height_mm": size_mm}
     settings["target"]["label"] = label
     settings["optimize"]["steps"] = steps
-    return build_scene(validated(SceneSettings, settings, label), Path())
+    return build_scene(validate_model(SceneSettings, settings, label), Path())
 
 
 def _timed_run(scene: Scene, views: int | None) -> tuple[Run, float]:
-    with TemporaryDirectory() as folder, threads(1):
+    with TemporaryDirectory() as folder, use_threads(1):
         run, ms = clocked(
             lambda: optimize_scene(scene, Path(folder) / "run", promise=PromiseOptions(views)), perf_counter
         )

@@ -25,10 +25,10 @@ from patchlab.bench.paper import (
 )
 from patchlab.study.claims import median
 from patchproof.base.geometry import apply_homography, fit_homography
-from patchproof.photo.complete import find_sheet
+from patchproof.photo.known_page import find_sheet
 from patchproof.photo.rectify import fit_page
-from patchproof.photo.shapes import rolled, through_lens
-from patchproof.photo.unroll import explain
+from patchproof.photo.shapes import fit_cylinder, fit_radial_lens
+from patchproof.photo.unroll import fit_shape
 from patchproof.sheets.markers import DICTIONARY
 
 WRONG_PX = 4.0  # by which a marker is moved that was glued on again
@@ -70,17 +70,17 @@ def _plain(corners_px: Corners) -> ToPx:
 
 
 def _lens(corners_px: Corners) -> ToPx:
-    return through_lens(*_all_corners(corners_px), SIZE_PX).px
+    return fit_radial_lens(*_all_corners(corners_px), SIZE_PX).px
 
 
 def _cylinder(corners_px: Corners) -> ToPx:
-    shape = rolled(*_all_corners(corners_px), SIZE_PX, None)
+    shape = fit_cylinder(*_all_corners(corners_px), SIZE_PX, None)
     return plane(corners_px) if shape is None else shape.px
 
 
 def what_pays(corners_px: Corners) -> ToPx:
     """As photographs are measured: a plane, unless a cylinder or a lens explains the corners far better."""
-    explained = explain(corners_px, corners_mm(), SIZE_PX)
+    explained = fit_shape(corners_px, corners_mm(), SIZE_PX)
     return plane(corners_px) if explained is None else explained.shape.px
 
 

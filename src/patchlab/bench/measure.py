@@ -21,7 +21,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from patchlab.study.claims import median
-from patchproof.base.claims import Estimate
+from patchproof.base.intervals import Estimate
 from patchproof.base.progress import Advance, no_advance
 
 Name = TypeVar("Name", bound=Hashable)

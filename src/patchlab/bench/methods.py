@@ -28,11 +28,11 @@ from torch.nn import functional as F
 from patchlab.paper.patch3d import design_shares
 from patchproof.base.errors import Refused
 from patchproof.classifier.network import Classifier
-from patchproof.optimizer.loop import best_design, views_seen
+from patchproof.optimizer.loop import best_design, views_per_network
 from patchproof.optimizer.problem import Problem
-from patchproof.optimizer.responses import in_parts
+from patchproof.optimizer.responses import in_chunks
 from patchproof.render.photograph import expose
-from patchproof.scene.patch_scene import needs_patch
+from patchproof.scene.patch_scene import require_patch
 
 SIGN_STEP = 0.01  # as the paper has it
 # Best of 0.02, 0.05 and 0.1 for `flat` and, of 255 code values, 5 (ART's default), 13 and 25 for `art`: mean rates of
@@ -145,7 +145,7 @@ class _OfCodes(torch.nn.Module):
 
 def budget(problem: Problem) -> int:
     """Passes that each method may use: those of our training and selection."""
-    return views_seen(problem.scene.settings.optimize)
+    return views_per_network(problem.scene.settings.optimize)
 
 
 def bare_photos(problem: Problem) -> Tensor:
@@ -156,13 +156,13 @@ def bare_photos(problem: Problem) -> Tensor:
     count = passes // -(-passes // PHOTOS)
     conditions = problem.scene.draw("train", count)
     with torch.no_grad():
-        parts = [expose(problem.see(None, part, problem.training_px), None) for part in in_parts(conditions)]
+        parts = [expose(problem.see(None, part, problem.training_px), None) for part in in_chunks(conditions)]
     return torch.cat(parts)
 
 
 def pasted_shares(problem: Problem) -> tuple[float, float]:
     """The range of the design's longer side, over the photograph's."""
-    low, high = np.quantile(design_shares(needs_patch(problem.scene, "a printed patch on a mesh")), _SHARES)
+    low, high = np.quantile(design_shares(require_patch(problem.scene, "a printed patch on a mesh")), _SHARES)
     return min(float(low), 1.0), min(float(high), 1.0)
 
 

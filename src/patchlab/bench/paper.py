@@ -16,9 +16,9 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from patchproof.base.color import photo_codes_of, srgb_from_linear
+from patchproof.base.color import photo_codes_from_srgb, srgb_from_linear
 from patchproof.base.geometry import intrinsics, look_at, rect_corners
-from patchproof.sheets.markers import DICTIONARY, printed_markers
+from patchproof.sheets.markers import DICTIONARY, aruco_dictionary
 
 Kind = Literal["flat", "lens", "rolled"]
 PIECE_MM, MARKER_MM = 140.0, 14.0
@@ -127,7 +127,7 @@ def _raster(rng: np.random.Generator) -> np.ndarray:
     raster[y : y + height, x : x + width] = cv2.resize(design, (width, height), interpolation=cv2.INTER_LINEAR)
     for marker_id, corners in corners_mm().items():
         column, row = np.round(corners[0] * _RASTER_PX_PER_MM).astype(int)
-        code = cv2.aruco.generateImageMarker(printed_markers(DICTIONARY), marker_id, marker_px) / 255
+        code = cv2.aruco.generateImageMarker(aruco_dictionary(DICTIONARY), marker_id, marker_px) / 255
         raster[row : row + marker_px, column : column + marker_px] = 0.03 + 0.92 * code
     return raster
 
@@ -136,6 +136,6 @@ def _developed(light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """uint8 H×W×3: the light H×W with drawn exposure, blur, noise and JPEG."""
     light = cv2.GaussianBlur(rng.uniform(0.3, 0.9) * light, (0, 0), rng.uniform(0.3, 1.2))
     light += rng.normal(0, rng.uniform(0, 0.01), light.shape).astype(np.float32)
-    codes = photo_codes_of(srgb_from_linear(light.clip(0, 1)))
+    codes = photo_codes_from_srgb(srgb_from_linear(light.clip(0, 1)))
     jpeg = cv2.imencode(".jpg", codes, [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(60, 96))])[1]
     return np.repeat(np.asarray(cv2.imdecode(jpeg, cv2.IMREAD_GRAYSCALE))[..., None], 3, 2)

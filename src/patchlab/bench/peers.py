@@ -33,9 +33,9 @@ from patchlab.study.record import gain_of, hardest, rate_of, recorded
 from patchlab.study.study import Cell, Result, Study
 from patchproof.app.demo import demo_scene
 from patchproof.base.errors import Refused
-from patchproof.base.workers import threads
+from patchproof.base.workers import use_threads
 from patchproof.optimizer.pixels import from_pixels
-from patchproof.optimizer.promise import shown_with_controls
+from patchproof.optimizer.promise import pictures_with_controls
 from patchproof.optimizer.responses import responses
 from patchproof.report.images import png
 from patchproof.report.tables import Drawing, Table
@@ -77,7 +77,7 @@ def run(settings: PeersSettings, base: Path, cell: Cell) -> dict[str, Any]:
     problem = problem_of(base, cell.values)
     made = {name: clocked(partial(METHODS[name], problem)) for name in settings.methods}
     pixels = {name: design.pixels for name, (design, _) in made.items()}
-    controls = shown_with_controls(problem, pixels["ours"], CONTROLS)
+    controls = pictures_with_controls(problem, pixels["ours"], CONTROLS)
     things = {name: controls[name] for name in CONTROLS}
     things |= {name: problem.subject.shown(from_pixels(each, problem.device)) for name, each in pixels.items()}
     conditions = problem.scene.draw("evaluate", settings.n)
@@ -176,7 +176,7 @@ def charts(quick: bool, progress: Progress) -> Iterator[Chart]:
         for cell in cells(settings, base):
             if quick:
                 cell = replace(cell, values=with_tables(dict(cell.values), {"optimize": {"steps": _QUICK_STEPS}}))
-            with threads(1):
+            with use_threads(1):
                 results.append(Result(cell, run(settings, base, cell), base))
             progress("cells", len(results), len(settings.seeds))
         yield peers_chart(settings, results)

@@ -19,13 +19,13 @@ from patchlab.bench.chart import Chart, Check, Point, Progress
 from patchlab.bench.chart_page import chart_manifest, printed_page
 from patchlab.bench.inkjets import DRIVERS, draw_inkjet
 from patchlab.study.claims import mean, median
-from patchproof.base.claims import rate, student_mean
 from patchproof.base.color import linear_from_srgb, srgb_from_linear
+from patchproof.base.intervals import rate, student_mean
 from patchproof.calibrate.chart import known_printers
 from patchproof.calibrate.chart_photo import read_chart
-from patchproof.calibrate.color_ladder import Map, choose, difference, distinct, kinds_of_maps
+from patchproof.calibrate.color_ladder import ColorMap, choose, difference, distinct, map_kinds
 from patchproof.report.tables import Table
-from patchproof.reprints.page_photos import Shot, Shows, photograph_page
+from patchproof.reprints.page_photos import PrintFunction, Shot, photograph_page
 
 SWATCHES = (6, 48, 96)
 TARGETS = {48: 2.5, 96: 1.8}
@@ -119,7 +119,7 @@ def try_printer(seed: int, swatches: int) -> Trial:
     light = read_chart(shot.photo, manifest).light
     usable = np.isfinite(light).all(1)
     sent, shown = np.array([s.srgb for s in manifest.chart])[usable], srgb_from_linear(light[usable])
-    kinds = kinds_of_maps(priors)
+    kinds = map_kinds(priors)
     choice = choose(kinds, sent, shown)
     truth, errors = shown_by(shows, shot, held_out_colors()), {}
     for kind in (kind for kind in kinds if kind.name not in choice.left_out):
@@ -128,13 +128,13 @@ def try_printer(seed: int, swatches: int) -> Trial:
     return Trial(driver, swatches, errors, choice.seconds, choice.chosen.name)
 
 
-def relative(predict: Map, colors: np.ndarray) -> np.ndarray:
+def relative(predict: ColorMap, colors: np.ndarray) -> np.ndarray:
     """What a map shows of colors N×3, white being paper, as in the printer's table."""
     light = linear_from_srgb(np.clip(predict(np.vstack([colors, np.ones((1, 3))])), 0, 1.2))
     return srgb_from_linear(np.clip(light[:-1] / light[-1], 0, 1))
 
 
-def drawn_printer(seed: int) -> tuple[str, Shows, dict]:
+def drawn_printer(seed: int) -> tuple[str, PrintFunction, dict]:
     """A printer's kind, what it shows, and the priors that a calibration may have: never the printer itself."""
     priors, kinds = known_printers(), len(DRIVERS) + 1
     if seed % kinds < len(DRIVERS):
@@ -145,7 +145,7 @@ def drawn_printer(seed: int) -> tuple[str, Shows, dict]:
     return "the other profile", lambda colors: linear_from_srgb(own(colors)), priors
 
 
-def shown_by(shows: Shows, shot: Shot, colors: np.ndarray) -> np.ndarray:
+def shown_by(shows: PrintFunction, shot: Shot, colors: np.ndarray) -> np.ndarray:
     """sRGB N×3 that a camera shows of colors on the true print under even light, which clips at its exposure."""
     white = np.ones((1, 3))
     light = np.clip(shows(np.vstack([colors, white])) / shows(white) * shot.paper, 0, 1)

@@ -14,7 +14,7 @@ from torch import Tensor
 from patchlab.bench.chart import Chart, Point, Progress
 from patchlab.bench.measure import ratio, timed
 from patchlab.bench.world import design_for_demo
-from patchproof.base.claims import student_mean
+from patchproof.base.intervals import student_mean
 from patchproof.base.output import image_pixels
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import Problem
@@ -22,7 +22,7 @@ from patchproof.optimizer.responses import ask
 from patchproof.render.photograph import expose
 from patchproof.render.pixels import PiecePicture
 from patchproof.report.tables import Table
-from patchproof.reprints.hung_sheet import take_photo
+from patchproof.reprints.mounted_sheet import take_photo
 from patchproof.scene.conditions import Conditions
 
 SIDES_PX = (96, 128, 192, 224, 384)  # and the default's

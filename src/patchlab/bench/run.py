@@ -15,7 +15,7 @@ from patchlab.bench.draw import drawing
 from patchlab.bench.measure import describe, machine
 from patchproof.base.errors import Refused
 from patchproof.base.output import new_folder
-from patchproof.base.validation import nearest
+from patchproof.base.validation import spelling_hint
 from patchproof.report.tables import Results, write_results
 
 Bench = Callable[[bool, Progress], Iterator[Chart]]
@@ -33,7 +33,7 @@ def run_bench(
 ) -> list[Results]:
     """Run one benchmark, or `all`, into the folder `out`; returns what was written."""
     if name not in ("all", *BENCHES):
-        raise Refused("the name of a benchmark", f'"{name}"', nearest(name, ("all", *BENCHES)))
+        raise Refused("the name of a benchmark", f'"{name}"', spelling_hint(name, ("all", *BENCHES)))
     written = []
     with new_folder(out, _OWN, overwrite) as folder:
         for bench in BENCHES if name == "all" else (name,):

@@ -17,7 +17,7 @@ from patchlab.bench.chart import Chart, Point, Progress
 from patchlab.bench.world import demo_problem
 from patchlab.study.claims import paired_means
 from patchproof.base.settings import OptimizeSettings
-from patchproof.optimizer.loop import SELECT_AFTER, SELECT_VIEWS, State, selects, steps, views_seen
+from patchproof.optimizer.loop import SELECT_AFTER, SELECT_VIEWS, State, is_selection_step, steps, views_per_network
 from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.problem import Problem
 from patchproof.optimizer.responses import responses
@@ -60,7 +60,7 @@ def runs_chart(name: str, title: str, runs: Mapping[str, OptimizeSettings], loss
     series: dict[int, list[Point]] = {end: [] for end in sorted({end for _, _, end in columns})}
     table = np.array([losses[run, end] for _, run, end in columns]).T
     for (setting, run, end), loss in zip(columns, paired_means(table), strict=True):
-        cost = views_seen(run.changed(steps=end // run.views))
+        cost = views_per_network(run.changed(steps=end // run.views))
         series[end].append(Point(setting, cost, loss, run == USUAL and end == effort.views))
     return Chart(
         name=name,
@@ -77,7 +77,7 @@ def runs_chart(name: str, title: str, runs: Mapping[str, OptimizeSettings], loss
 def ends_of(run: OptimizeSettings, effort: Effort) -> list[int]:
     """Training views after which a run is charted: there the design was tried on the selection set."""
     whole = run.changed(steps=effort.views // run.views)
-    return [end for end in (effort.views // 2, effort.views) if selects(whole, end // run.views)]
+    return [end for end in (effort.views // 2, effort.views) if is_selection_step(whole, end // run.views)]
 
 
 def trained_losses(
@@ -89,7 +89,7 @@ def trained_losses(
         for i, run in enumerate(runs):
             ends = ends_of(run, effort)
             numbers = [end // run.views for end in ends]
-            designs = trained(problem.trained_by(run.changed(steps=numbers[-1]), seed), numbers)
+            designs = trained(problem.with_training(run.changed(steps=numbers[-1]), seed), numbers)
             shown |= {(run, end, seed): problem.subject.shown(d) for end, d in zip(ends, designs, strict=True)}
             progress("training", seed * len(runs) + i + 1, effort.seeds * len(runs))
     answers = responses(problem, shown, problem.scene.draw("evaluate", effort.judged), problem.training_px)

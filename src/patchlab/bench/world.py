@@ -22,7 +22,7 @@ from patchproof.scene.scene import load_scene
 
 def design_for_demo(count: int, progress: Progress) -> tuple[Problem, Tensor]:
     """The demo's problem, and the best design 3×h×w of `count` steps of its optimization."""
-    problem = demo_problem().trained_by(OptimizeSettings(steps=count))
+    problem = demo_problem().with_training(OptimizeSettings(steps=count))
     state = start(problem)
     for step in steps(problem, state):
         state = step.state

@@ -27,10 +27,10 @@ from patchlab.harden.labeled import in_blocks, labeled_files, read_large_enough
 from patchlab.study.claims import clustered
 from patchlab.study.grid import Count, Names, short_name
 from patchlab.study.study import HERE, Cell, Finished, Result, Study, Work, carry_out
-from patchproof.base.claims import difference, rate
 from patchproof.base.errors import Refused
-from patchproof.base.output import image_bytes, write_whole
-from patchproof.base.validation import Positive, Share, Strict, expand
+from patchproof.base.intervals import estimate_difference, rate
+from patchproof.base.output import image_bytes, write_atomically
+from patchproof.base.validation import Positive, Share, StrictModel, expand_path
 from patchproof.classifier.labels import find_labels
 from patchproof.classifier.load import load_classifier
 from patchproof.classifier.network import Classifier
@@ -43,7 +43,7 @@ CLEAN: Condition = ("clean", 0.0)
 _RANKS = {"clean": 0, "fgsm": 1, "pgd": 2}
 
 
-class HardenSettings(Strict):
+class HardenSettings(StrictModel):
     """Every method with every ε, for each network alone or for all of them together."""
 
     images: str  # a folder of images
@@ -65,20 +65,20 @@ class HardenSettings(Strict):
 def harden_images(settings: HardenSettings, out: str | Path, work: Work = HERE) -> Finished:
     """Harden into the folder `out`: PNGs and labels.csv, which is again a labeled folder of images, and the tables."""
     out, base = Path(out), Path.cwd()
-    if out.resolve() == Path(expand(settings.images, base)).resolve():
+    if out.resolve() == Path(expand_path(settings.images, base)).resolve():
         raise Refused("another folder for hardened images than the originals'", str(out), "choose another --out")
     # PNGs beside the tables are this command's own only where its JSON says so
     own = (*STUDY.own_files, "labels.csv", "*.png") if (out / "harden.json").is_file() else STUDY.own_files
     finished = carry_out(replace(STUDY, own_files=own), settings, base, out, work)
     lines = [f'{photo["png"]},"{photo["label"]}"\n' for photo in _photos(finished.results, _variants(settings)[0])]
-    write_whole(out / "labels.csv", lambda path: path.write_text("file,label\n" + "".join(lines), "utf-8"))
+    write_atomically(out / "labels.csv", lambda path: path.write_text("file,label\n" + "".join(lines), "utf-8"))
     return finished
 
 
 def cells(settings: HardenSettings, base: Path) -> list[Cell]:
     """Originals by network, and every variant, in blocks of photographs; networks and labels are checked here."""
-    folder = Path(expand(settings.images, base))
-    rows = labeled_files(folder, Path(expand(settings.labels, base)))
+    folder = Path(expand_path(settings.images, base))
+    rows = labeled_files(folder, Path(expand_path(settings.labels, base)))
     names = tuple(dict.fromkeys((*settings.models, *settings.judges)))
     for name in names:
         _truth(name, base, [label for _, _, label in rows])
@@ -98,7 +98,7 @@ def cells(settings: HardenSettings, base: Path) -> list[Cell]:
 
 def run(settings: HardenSettings, base: Path, cell: Cell) -> dict[str, Any]:
     """One block: hardened if it has a variant, then judged."""
-    values, folder = cell.values, Path(expand(settings.images, base))
+    values, folder = cell.values, Path(expand_path(settings.images, base))
     photos, originals, unread = [], [], []
     for photo in values["photos"]:
         try:
@@ -182,7 +182,7 @@ def _accuracy_rows(
     start = (short_name(name), "itself" if variant["models"] == [name] else group, *how)
     return [
         (
-            *(*start, words, rate(old), rate(new), difference(new, old)),
+            *(*start, words, rate(old), rate(new), estimate_difference(new, old)),
             clustered([float(np.mean([new[i] - old[i] for i in rows])) for rows in classes if rows]),
             ", ".join(word for word, survivors in left.items() if too_strong(condition, survivors)),
         )

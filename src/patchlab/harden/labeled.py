@@ -17,7 +17,7 @@ from patchproof.base.errors import Refused
 from patchproof.base.input import is_file, readable_formats
 from patchproof.photo.read import read_photo
 from patchproof.photo.rejection import PhotoRejected
-from patchproof.scene.image_scene import label_rows
+from patchproof.scene.image_scene import read_labels
 
 BLOCK_PHOTOS, BLOCK_PX = 8, 4_000_000  # of photographs hardened together: some 200 MB with gradients
 SMALLEST_PX = 8  # of a photograph's shorter side
@@ -26,7 +26,7 @@ _HEADS = {"file", "filename", "file_name", "image", "name"}
 
 def labeled_files(folder: Path, table: Path) -> list[tuple[str, str, str]]:
     """(file, its PNG's name, label) of every line; two files of one stem keep their suffixes in the PNG's name."""
-    rows = label_rows(table)
+    rows = read_labels(table)
     if rows and rows[0][0].casefold() in _HEADS and not is_file(folder / rows[0][0]):
         rows = rows[1:]
     missing = [file for file, _ in rows if not is_file(folder / file)]

@@ -24,7 +24,7 @@ from patchlab.study.record import Record
 from patchlab.study.study import Cell, Result, Study
 from patchlab.study.trained import TrainedSettings, Way, Word, answers_and_sheet, tested_in, trained_cells, trained_on
 from patchproof.optimizer.loop import best_design
-from patchproof.optimizer.promise import shown_with_controls
+from patchproof.optimizer.promise import pictures_with_controls
 from patchproof.report.tables import Drawing, Table
 
 CONTROLS = ("bare", "gray", "noise", "shuffled")
@@ -51,7 +51,7 @@ def run(settings: DeceiveSettings, base: Path, cell: Cell) -> dict[str, Any]:
     """Train against one network, show design and controls to all."""
     problem = problem_of(base, cell.values)
     design = best_design(trained_on(problem, cell))
-    things = shown_with_controls(problem, design, CONTROLS)
+    things = pictures_with_controls(problem, design, CONTROLS)
     suffix, content = problem.subject.file(design)
     sheet = sides(problem, _SHEET_VIEWS), _SHEET_PX
     return answers_and_sheet(problem, cell.name, things, settings.n, sheet) | {f"{cell.name}.{suffix}": content}

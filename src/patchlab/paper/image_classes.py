@@ -32,22 +32,22 @@ from patchproof.base.settings import (
     TargetSettings,
     ViewSettings,
 )
-from patchproof.base.validation import Positive, PositiveRange, Range, Share, Strict, expand
+from patchproof.base.validation import Positive, PositiveRange, Range, Share, StrictModel, expand_path
 from patchproof.classifier.network import Classifier
 from patchproof.optimizer.pixels import as_pixels
-from patchproof.optimizer.responses import in_parts
+from patchproof.optimizer.responses import in_chunks
 from patchproof.render.photograph import shade
 from patchproof.render.stage import Stage, set_stage
-from patchproof.render.views import see
+from patchproof.render.views import render_views
 from patchproof.report.images import png
-from patchproof.scene.image_scene import ImageScene, build, label_rows, largest_share
+from patchproof.scene.image_scene import ImageScene, build, largest_share, read_labels
 from patchproof.scene.interface import SceneSource
 from patchproof.sheets.piece import Piece
 
 _RENDER_PX = 384
 
 
-class PastedSettings(Strict):
+class PastedSettings(StrictModel):
     """Images by class, and how a patch lies in them."""
 
     images: str | None = None  # a folder of images
@@ -85,7 +85,7 @@ def classes_of(images: str | None, table: str | None, scenes: Sequence[Values], 
     """Every class that there are images of: a folder's by its CSV of labels, then one per scene to render."""
     classes = []
     if images is not None and table is not None:
-        for label in labels_of(Path(expand(images, base)), Path(expand(table, base))):
+        for label in labels_of(Path(expand_path(images, base)), Path(expand_path(table, base))):
             classes.append(ImageClass(int(label) if label.isdecimal() else label))
     for values in scenes:
         if values["scene"]["object"]["mesh"] is None:
@@ -98,7 +98,7 @@ def classes_of(images: str | None, table: str | None, scenes: Sequence[Values], 
 
 def labels_of(folder: Path, table: Path) -> list[str]:
     """The different labels, in small letters, of the images in `folder` that the CSV `table` names."""
-    found = list(dict.fromkeys(label for name, label in label_rows(table) if is_file(folder / name)))
+    found = list(dict.fromkeys(label for name, label in read_labels(table) if is_file(folder / name)))
     if not found:
         raise Refused(f"the images that {table.name} names in {folder}", "none of them", "copy them there")
     return found
@@ -152,9 +152,9 @@ def _render_class(label: str | int, values: Values, base: Path, seed: int, n: in
 def write_renders(stage: Stage, n: int, side_px: int, folder: Path) -> list[str]:
     """Write n square renders of the stage's bare object as PNGs; their names in `folder`."""
     names = []
-    for part in in_parts(stage.scene.draw("train", n)):
+    for part in in_chunks(stage.scene.draw("train", n)):
         with torch.no_grad():
-            light = shade(see(stage, None, part, (side_px, side_px)), None)
+            light = shade(render_views(stage, None, part, (side_px, side_px)), None)
         for picture in srgb_from_linear(light.clamp(0, 1)):
             names.append(f"{stage.scene.sheet_id}_{len(names):04d}.png")
             (folder / names[-1]).write_bytes(png(as_pixels(picture)))

@@ -7,7 +7,7 @@ network's own size. Out: recognition with and without it, paired on the same ima
 each other class by *its* labels, with how often the patch has it called the target: an assistive patch must not become
 an adversarial one. Gray and noise of the same size are the controls.
 
-Unlike a printed piece this patch has no frame of markers. With fewer than `SPLIT_FROM` images of a class it is measured
+Unlike a printed piece this patch has no frame of markers. With fewer than `MIN_IMAGES_TO_SPLIT` images of a class it is measured
 on those it was made with, and the table says so.
 Sources: Pestana et al., supplement, algorithm 2; Brown et al., Adversarial Patch, 2017; Zhong et al., Random Erasing,
 AAAI 2020.
@@ -32,9 +32,9 @@ from patchlab.study.grid import Count, Names, Seeds, cell_of, grouped, of_values
 from patchlab.study.pictures import contact_sheet, enlarged, photographs
 from patchlab.study.record import hits_of, recorded
 from patchlab.study.study import Cell, Result, Study
-from patchproof.base.claims import difference, rate
 from patchproof.base.errors import Refused
-from patchproof.base.validation import expand, nearest
+from patchproof.base.intervals import estimate_difference, rate
+from patchproof.base.validation import expand_path, spelling_hint
 from patchproof.channel.printer import load_printer
 from patchproof.classifier.labels import find_labels
 from patchproof.classifier.load import load_classifier
@@ -44,10 +44,10 @@ from patchproof.optimizer.patch import Patch
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import Problem
 from patchproof.optimizer.responses import responses
-from patchproof.render.photograph import Shown
+from patchproof.render.photograph import Appearance
 from patchproof.render.stage import set_stage
 from patchproof.report.tables import Drawing, Table
-from patchproof.scene.image_scene import SPLIT_FROM, ImageScene
+from patchproof.scene.image_scene import MIN_IMAGES_TO_SPLIT, ImageScene
 from patchproof.scene.interface import Scene
 
 KINDS = ("bare", "gray", "noise", "patch")
@@ -71,7 +71,9 @@ def cells(settings: Patch2dSettings, base: Path) -> list[Cell]:
     targets = settings.targets or tuple(dict.fromkeys(known))
     for target in targets:
         if target not in known:
-            raise Refused("a target that there are images of", f'"{target}"', nearest(str(target), map(str, known)))
+            raise Refused(
+                "a target that there are images of", f'"{target}"', spelling_hint(str(target), map(str, known))
+            )
     cells = []
     for seed, (i, target), network in itertools.product(settings.seeds, enumerate(targets), settings.networks):
         name = short_name(network)
@@ -83,7 +85,7 @@ def cells(settings: Patch2dSettings, base: Path) -> list[Cell]:
 def run(settings: Patch2dSettings, base: Path, cell: Cell) -> dict[str, Any]:
     """One patch, and every class with and without it."""
     values, seed = cell.values, cell.values["seed"]
-    classifier = load_classifier(expand(values["networks"][0], base), base)
+    classifier = load_classifier(expand_path(values["networks"][0], base), base)
     classes = classes_of(settings.images, settings.labels, values["renders"], base)
     target = [each.label for each in classes].index(values["target"])
     with tempfile.TemporaryDirectory() as folder:
@@ -108,9 +110,9 @@ def flat_problem(
     return Problem(scene, stage, printer, (classifier,), (_indices(classifier, images_of),), subject, None)
 
 
-def shown_by_kind(problem: Problem, design: np.ndarray) -> dict[str, Shown]:
+def shown_by_kind(problem: Problem, design: np.ndarray) -> dict[str, Appearance]:
     """What is pasted, by `KINDS`; controls have no markers of their own."""
-    shown: dict[str, Shown] = {"bare": None}
+    shown: dict[str, Appearance] = {"bare": None}
     with torch.no_grad():
         for kind in KINDS[1:]:
             pixels = design if kind == "patch" else problem.subject.control(kind, design)
@@ -124,7 +126,7 @@ def _on(problem: Problem, scene: Scene) -> Problem:
 
 
 def _answers(
-    problem: Problem, images_of: ImageClass, scene: ImageScene, shown: Mapping[str, Shown], n: int
+    problem: Problem, images_of: ImageClass, scene: ImageScene, shown: Mapping[str, Appearance], n: int
 ) -> dict[str, Any]:
     """Per kind and condition: recognized by the class's own labels, and called the patch's target."""
     (classifier,), (target,) = problem.classifiers, problem.indices
@@ -142,7 +144,7 @@ def _indices(classifier: Classifier, images_of: ImageClass) -> tuple[int, ...]:
     return find_labels(classifier.labels, images_of.label, images_of.accept)
 
 
-def _picture(problem: Problem, scenes: Sequence[ImageScene], design: np.ndarray, shown: Shown) -> bytes:
+def _picture(problem: Problem, scenes: Sequence[ImageScene], design: np.ndarray, shown: Appearance) -> bytes:
     """Side by side: the patch, an image of its class with it, and up to three of other classes."""
     worlds = (problem, *(_on(problem, scene) for scene in scenes if scene is not problem.scene))[:4]
     tiles = [photographs(world, shown, world.scene.draw("evaluate", 1), _TILE_PX)[0] for world in worlds]
@@ -162,8 +164,8 @@ def _gains(results: Sequence[Result]) -> Table:
     for (_, network), group in _by_target(results).items():
         own = [_target(result) for result in group]
         hits = {kind: _hits(own, kind, OWN) for kind in KINDS}
-        start = (own[0]["name"], network, own[0]["images"], own[0]["images"] >= SPLIT_FROM)
-        gains = (difference(hits["patch"], hits[control]) for control in ("bare", "gray"))
+        start = (own[0]["name"], network, own[0]["images"], own[0]["images"] >= MIN_IMAGES_TO_SPLIT)
+        gains = (estimate_difference(hits["patch"], hits[control]) for control in ("bare", "gray"))
         rows.append((*start, *(rate(hits[kind]) for kind in KINDS), *gains))
     about = (
         "Recognition of images of the patch's own class, seeds together. Where images are not held out, these are the"
@@ -184,9 +186,9 @@ def _harm(results: Sequence[Result]) -> Table:
             own = {kind: _hits(of_class, kind, OWN) for kind in KINDS}
             called, usual = (_hits(of_class, kind, TARGET) for kind in ("patch", "bare"))
             rates = (rate(own[kind]) for kind in ("bare", "gray", "patch"))
-            harm = (difference(own["patch"], own[control]) for control in ("bare", "gray"))
+            harm = (estimate_difference(own["patch"], own[control]) for control in ("bare", "gray"))
             start = (_target(group[0])["name"], network, other["name"])
-            rows.append((*start, *rates, *harm, rate(called), difference(called, usual)))
+            rows.append((*start, *rates, *harm, rate(called), estimate_difference(called, usual)))
     about = (
         "Images of another class with the same patch. Recognized means its own labels; a negative difference is harm."
         " Called the target: the patch has made an adversarial example of it."

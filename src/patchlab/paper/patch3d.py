@@ -33,23 +33,23 @@ from patchlab.study.grid import Count, GridSettings, Seeds, by_scene, grid_cells
 from patchlab.study.pictures import contact_sheet, enlarged, photographs
 from patchlab.study.record import Record, hits_of, recorded
 from patchlab.study.study import Cell, Result, Study
-from patchproof.base.claims import difference, rate
 from patchproof.base.errors import Refused
+from patchproof.base.intervals import estimate_difference, rate
 from patchproof.base.settings import ObjectSettings, PatchSettings, SceneSettings, ViewSettings
 from patchproof.base.validation import Range, Share
-from patchproof.optimizer.loop import best_design, views_seen
+from patchproof.optimizer.loop import best_design, views_per_network
 from patchproof.optimizer.patch import Patch
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import Problem
-from patchproof.optimizer.promise import shown_with_controls
+from patchproof.optimizer.promise import pictures_with_controls
 from patchproof.optimizer.responses import responses
-from patchproof.render.photograph import Shown
+from patchproof.render.photograph import Appearance
 from patchproof.render.stage import set_stage
 from patchproof.report.images import png
 from patchproof.report.tables import Drawing, Table
 from patchproof.scene.image_scene import build, largest_share
 from patchproof.scene.interface import SceneSource
-from patchproof.scene.patch_scene import PatchScene, needs_patch
+from patchproof.scene.patch_scene import PatchScene, require_patch
 
 KINDS = ("bare", "gray", "noise", "2d", "3d")
 HARD = 0.2  # clean rate up to which an object counts as misread
@@ -98,7 +98,9 @@ def run(settings: Patch3dSettings, base: Path, cell: Cell) -> dict[str, Any]:
         "in_images": recorded(responses(twin, things_of(twin, designs), in_images)),
         "azimuth_deg": conditions.pose.azimuth_deg.tolist(),
         "azimuth_range_deg": problem.scene.settings.view.azimuth_deg,
-        "passes": {name: views_seen(world.scene.settings.optimize) for name, world in (("3d", problem), ("2d", twin))},
+        "passes": {
+            name: views_per_network(world.scene.settings.optimize) for name, world in (("3d", problem), ("2d", twin))
+        },
         "share": twin.scene.settings.view.patch_share,
         "warnings": list(problem.scene.warnings),
         f"{cell.name}.png": picture_of(problem, twin, designs),
@@ -109,7 +111,7 @@ def run(settings: Patch3dSettings, base: Path, cell: Cell) -> dict[str, Any]:
 
 def flat_twin(problem: Problem, settings: Patch3dSettings, folder: Path) -> Problem:
     """The same patch as a classic 2D one: its scene is made of renders that are written to `folder`."""
-    scene = needs_patch(problem.scene, "a printed patch on a mesh")
+    scene = require_patch(problem.scene, "a printed patch on a mesh")
     names = write_renders(problem.stage, settings.renders, problem.training_px, folder)
     write_labels([(name, scene.settings.target.label) for name in names], folder)
     flat = build(SceneSource(flat_settings(scene, settings), folder, scene.seed))
@@ -140,9 +142,9 @@ def design_shares(scene: PatchScene, views: int = 256) -> np.ndarray:
     return scales * max(scene.piece.size_mm) / min(photo_px)
 
 
-def things_of(problem: Problem, designs: Mapping[str, np.ndarray]) -> dict[str, Shown]:
+def things_of(problem: Problem, designs: Mapping[str, np.ndarray]) -> dict[str, Appearance]:
     """What hangs on the object, by `KINDS`."""
-    things = shown_with_controls(problem, designs["3d"], KINDS[:3])
+    things = pictures_with_controls(problem, designs["3d"], KINDS[:3])
     things |= {"2d": problem.subject.shown(from_pixels(designs["2d"], problem.device)), "3d": things["design"]}
     return {kind: things[kind] for kind in KINDS}
 
@@ -210,7 +212,7 @@ def _by_view(settings: Patch3dSettings, results: Sequence[Result]) -> Table:
                 hits = zip(hits_of(result.answers["hits"][kind][0]), result.answers["azimuth_deg"], strict=True)
                 group[kind] += [hit for hit, azimuth in hits if low <= azimuth <= high]
     rows = tuple(
-        (*key, *(rate(group[kind]) for kind in KINDS), difference(group["3d"], group["2d"]))
+        (*key, *(rate(group[kind]) for kind in KINDS), estimate_difference(group["3d"], group["2d"]))
         for key, group in groups.items()
     )
     about = "All objects and seeds; a view is a range of the camera's azimuth, right of the patch's side positive."

@@ -10,9 +10,9 @@ import numpy as np
 import torch
 
 from patchproof.base.color import srgb_from_linear
-from patchproof.channel.effects import EFFECT, Light, Pose, Sensor
+from patchproof.channel.effects import EFFECT_BY_NAME, Light, Pose, Sensor
 from patchproof.optimizer.problem import Problem
-from patchproof.render.photograph import Shown, shade
+from patchproof.render.photograph import Appearance, shade
 from patchproof.scene.conditions import Conditions, with_values
 
 
@@ -44,10 +44,10 @@ def three_views(problem: Problem, lights: int) -> Conditions:
     """
     poses = sides(problem, 3)[np.repeat(np.arange(3), lights)]
     drawn = problem.scene.draw("evaluate", 3 * lights)
-    return with_values(drawn, **{name: getattr(poses.pose, name) for name in EFFECT["viewpoint"].fields})
+    return with_values(drawn, **{name: getattr(poses.pose, name) for name in EFFECT_BY_NAME["viewpoint"].fields})
 
 
-def mean_color(problem: Problem, shown: Shown, views: int, side_px: int) -> tuple[int, int, int]:
+def mean_color(problem: Problem, shown: Appearance, views: int, side_px: int) -> tuple[int, int, int]:
     """sRGB codes of the mean light of the object's pixels, its outlines apart, over a full turn in even white light."""
     turned = problem.see(shown, from_sides(problem, np.arange(views) * 360 / views), side_px)
     with torch.no_grad():

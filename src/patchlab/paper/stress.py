@@ -42,10 +42,10 @@ from patchlab.study.grid import Count, GridSettings, problem_of, who
 from patchlab.study.pictures import contact_sheet, photographs
 from patchlab.study.record import bits, hits_of
 from patchlab.study.study import Cell, Result, Study
-from patchproof.base.claims import difference, paired_difference, rate
-from patchproof.base.validation import Share, Strict
+from patchproof.base.intervals import estimate_difference, paired_difference, rate
+from patchproof.base.validation import Share, StrictModel
 from patchproof.optimizer.problem import Problem
-from patchproof.optimizer.responses import Answers, ask, in_parts, joined
+from patchproof.optimizer.responses import Responses, ask, in_chunks, joined
 from patchproof.report.tables import Drawing, Table
 from patchproof.scene.conditions import Conditions, fields_of, with_values
 
@@ -57,7 +57,7 @@ _PARTS = ("typical", "worst pose", "worst light", "worst occlusion")
 _MEASURING = 3_000_001  # added to a seed: the evaluate stream's draws that measure what was chosen
 
 
-class OcclusionSettings(Strict):
+class OcclusionSettings(StrictModel):
     """A black square, everywhere in the picture."""
 
     share: Annotated[Share, Field(gt=0)] = 0.3  # its side, as a share of the picture's
@@ -65,7 +65,7 @@ class OcclusionSettings(Strict):
     n: Count = 32  # draws at each place
 
 
-class SearchSettings(Strict):
+class SearchSettings(StrictModel):
     """A search from coarse to fine."""
 
     tries: Count = 48  # poses (or lights) in each round
@@ -161,10 +161,10 @@ def occluded(problem: Problem, settings: OcclusionSettings, seed: int) -> tuple[
 Box = tuple[int, int, int, int]  # first column and row, and those after the last
 
 
-def _under(problem: Problem, conditions: Conditions, boxes: Sequence[Box | None]) -> dict[Box | None, Answers]:
+def _under(problem: Problem, conditions: Conditions, boxes: Sequence[Box | None]) -> dict[Box | None, Responses]:
     """The answers to the clean object under each box."""
     parts = []
-    for part in in_parts(conditions):
+    for part in in_chunks(conditions):
         pictures = _photographs(problem, part)
         around = problem.boxes(part)
         parts.append({box: ask(problem, _blackened(pictures, box), around) for box in boxes})
@@ -236,7 +236,15 @@ def tables(settings: StressSettings, results: Sequence[Result]) -> tuple[Table, 
 def _worst_rows(result: Result) -> Iterator[tuple]:
     def row(test: str, where: str, worst: str, usual: str, confidence: float | None) -> tuple:
         there, anywhere = hits_of(worst), hits_of(usual)
-        return (*who(result), test, where, rate(there), rate(anywhere), difference(there, anywhere), confidence)
+        return (
+            *who(result),
+            test,
+            where,
+            rate(there),
+            rate(anywhere),
+            estimate_difference(there, anywhere),
+            confidence,
+        )
 
     for test in ("pose", "light"):
         of_test = result.answers[test]
@@ -258,7 +266,7 @@ def _map_rows(result: Result, map_: Mapping[str, Any]) -> Iterator[tuple]:
         for j, hits in enumerate(map(hits_of, column)):
             place = (pose, poses[i], poses[i + 1], light, lights[j], lights[j + 1])
             alone, effect = hits_of(map_["alone"][i][j]), "no effect" if (i, j) in empty else "seen"
-            beside = rate(alone), difference(hits, alone), effect
+            beside = rate(alone), estimate_difference(hits, alone), effect
             yield (*who(result), *place, rate(hits), *beside, map_["confidence"][i][j])
 
 

@@ -23,13 +23,13 @@ from patchlab.study.study import Cell
 from patchproof.base.errors import Refused
 from patchproof.base.goal import Goal
 from patchproof.base.settings import SceneSettings
-from patchproof.base.validation import Strict
-from patchproof.channel.effects import EFFECT, EFFECTS
+from patchproof.base.validation import StrictModel
+from patchproof.channel.effects import EFFECT_BY_NAME, EFFECTS
 from patchproof.optimizer.problem import Problem
-from patchproof.optimizer.responses import Answers, ask, in_parts, joined, responses
+from patchproof.optimizer.responses import Responses, ask, in_chunks, joined, responses
 from patchproof.render.photograph import expose
 from patchproof.report.tables import Drawing
-from patchproof.scene.conditions import Conditions, fields_of, of_fields, with_values
+from patchproof.scene.conditions import Conditions, conditions_from_fields, fields_of, with_values
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -37,13 +37,13 @@ if TYPE_CHECKING:
 PoseAxis = Literal["azimuth_deg", "elevation_deg", "distance_mm", "roll_deg"]
 LightAxis = Literal["ambient", "directional", "light_azimuth_deg", "light_elevation_deg", "exposure_ev"]
 # What of a draw is the pose and the light; the rest is background, print and camera.
-POSE = EFFECT["viewpoint"].fields
+POSE = EFFECT_BY_NAME["viewpoint"].fields
 _LIGHT = ("ambient light", "directional light", "exposure")
-LIGHT = tuple(name for effect in _LIGHT for name in EFFECT[effect].fields)
+LIGHT = tuple(name for effect in _LIGHT for name in EFFECT_BY_NAME[effect].fields)
 WORST_SHARE = 0.1
 
 
-class MapSettings(Strict):
+class MapSettings(StrictModel):
     """A map's axes, each cut into equal cells of the scene's own range."""
 
     pose: PoseAxis = "azimuth_deg"  # the axis across
@@ -109,7 +109,7 @@ def in_cells(conditions: Conditions, axes: tuple[Axis, Axis], places: Sequence[P
     """`conditions` moved into cells, an equal share of the rows into each, in order; no draw serves two cells."""
     n = len(conditions) // len(places)
     parts = [fields_of(in_cell(conditions[i * n : (i + 1) * n], axes, place)) for i, place in enumerate(places)]
-    return of_fields({name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
+    return conditions_from_fields({name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
 
 
 def each_before_all(tried: Conditions, rest: Conditions, names: Sequence[str]) -> Conditions:
@@ -119,16 +119,16 @@ def each_before_all(tried: Conditions, rest: Conditions, names: Sequence[str]) -
     return with_values(rest[rows], **{name: fields[name].repeat(len(rest), 0) for name in names})
 
 
-def clean(problem: Problem, conditions: Conditions, side_px: int | None = None) -> Answers:
+def clean(problem: Problem, conditions: Conditions, side_px: int | None = None) -> Responses:
     """The networks' answers to the clean object (bare, or with its own texture)."""
     return responses(problem, {"clean": None}, conditions, side_px)["clean"]
 
 
-def with_and_without(problem: Problem, conditions: Conditions) -> tuple[Answers, Answers]:
+def with_and_without(problem: Problem, conditions: Conditions) -> tuple[Responses, Responses]:
     """The networks' answers to the clean object, and to the background alone through the same camera."""
-    parts: list[dict[str, Answers]] = []
+    parts: list[dict[str, Responses]] = []
     with torch.no_grad():
-        for part in in_parts(conditions):
+        for part in in_chunks(conditions):
             views = problem.see(None, part, problem.figure_px)
             shown = {"clean": views, "alone": replace(views, object=None)}
             parts.append({name: ask(problem, expose(each, None), problem.boxes(part)) for name, each in shown.items()})

@@ -39,11 +39,11 @@ from patchlab.study.trained import (
     trained_on,
     verdict,
 )
-from patchproof.base.claims import rate
+from patchproof.base.intervals import rate
 from patchproof.optimizer.loop import best_design
-from patchproof.optimizer.promise import shown_with_controls
+from patchproof.optimizer.promise import pictures_with_controls
 from patchproof.optimizer.responses import responses
-from patchproof.render.photograph import Shown
+from patchproof.render.photograph import Appearance
 from patchproof.report.tables import Drawing, Table
 
 if TYPE_CHECKING:
@@ -94,10 +94,10 @@ def run(settings: TransferSettings, base: Path, cell: Cell) -> dict[str, Any]:
     """Train where the cell says so, and test."""
     problem = problem_of(base, cell.values)
     answers: dict[str, Any] = {}
-    things: dict[str, Shown] = {"design": None}
+    things: dict[str, Appearance] = {"design": None}
     if cell.values["trained"]:
         design = best_design(trained_on(problem, cell))
-        things = shown_with_controls(problem, design, ())
+        things = pictures_with_controls(problem, design, ())
         suffix, content = problem.subject.file(design)
         answers[f"{cell.name}.{suffix}"] = content
     answers |= answers_and_sheet(problem, cell.name, things, settings.n, (sides(problem, 3), _SHEET_PX))

@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 from patchproof.base.errors import Refused
-from patchproof.base.validation import nearest
+from patchproof.base.validation import spelling_hint
 
 _PAGE = Path(__file__).with_name("measured.md")
 
@@ -20,5 +20,7 @@ def figures_page(name: str | None = None) -> str:
     found = [section for section in sections if name.lower() in section.partition("\n")[0].lower()]
     if not found:
         headings = [section.partition("\n")[0].removeprefix("## ") for section in sections]
-        raise Refused(f"a word of one of the headings {', '.join(headings)}", f'"{name}"', nearest(name, headings))
+        raise Refused(
+            f"a word of one of the headings {', '.join(headings)}", f'"{name}"', spelling_hint(name, headings)
+        )
     return "".join(found)

@@ -1,4 +1,4 @@
-"""Estimates that tables of studies and benchmarks state besides `patchproof.base.claims`: of means, medians, clusters.
+"""Estimates that tables of studies and benchmarks state besides `patchproof.base.intervals`: of means, medians, clusters.
 
 Source: Morey, Tutorials in Quantitative Methods for Psychology 4 (2008) 61-64 (several settings on the same seeds).
 """
@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.stats import binom, t
 
-from patchproof.base.claims import CONFIDENCE, LEAST_CLUSTERS, Estimate, resampled_means, student_mean
+from patchproof.base.intervals import CONFIDENCE, MIN_CLUSTERS, Estimate, resampled_means, student_mean
 
 _ENDS = (1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2  # of an interval, as shares of a distribution
 
@@ -43,7 +43,7 @@ def clustered(values: Sequence[float]) -> Estimate | float | None:
     """The mean of one figure per cluster as a table says it, n the number of clusters: without an interval where they
     are too few for one, None of nothing.
     """
-    if len(values) < LEAST_CLUSTERS:
+    if len(values) < MIN_CLUSTERS:
         return statistics.fmean(values) if values else None
     value, (low, high) = clustered_mean(values)
     return Estimate(value, low, high, len(values))
@@ -55,8 +55,8 @@ def clustered_mean(values: Sequence[float]) -> tuple[float, tuple[float, float]]
     interval. Needs LEAST_CLUSTERS: of fewer it would claim far too much (of one, certainty), and of ten it covers
     about nine times in ten.
     """
-    if len(values) < LEAST_CLUSTERS:
-        raise ValueError(f"expected at least {LEAST_CLUSTERS} clusters, got {len(values)}")
+    if len(values) < MIN_CLUSTERS:
+        raise ValueError(f"expected at least {MIN_CLUSTERS} clusters, got {len(values)}")
     means = resampled_means(np.asarray(values, float), 10_000)
     low, high = np.quantile(means, _ENDS)
     return float(np.mean(values)), (float(low), float(high))

@@ -18,7 +18,7 @@ from pydantic import Field, model_validator
 
 from patchlab.study.study import Cell, Result
 from patchproof.base.settings import SceneSettings
-from patchproof.base.validation import Strict, expand, read_toml, validated
+from patchproof.base.validation import StrictModel, expand_path, read_toml, validate_model
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.scene.interface import Scene
 from patchproof.scene.scene import build_scene
@@ -31,7 +31,7 @@ Seeds = Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)]
 Key = TypeVar("Key", bound=Hashable)
 
 
-class GridSettings(Strict):
+class GridSettings(StrictModel):
     """Every scene file with every network and seed; paths are relative to the config's folder."""
 
     scenes: Names  # scene files
@@ -55,7 +55,7 @@ def short_name(name: str) -> str:
 
 def scene_values(file: str, base: Path, tables: Tables | None = None, where: str = "") -> Values:
     """The values of a cell that say its scene: name, file, and all settings with keys of some tables changed."""
-    path = Path(expand(file, base))
+    path = Path(expand_path(file, base))
     scene = _changed(read_toml(path), tables or {}, path.name + where)
     return {"name": short_name(file), "file": file, "scene": scene}
 
@@ -97,14 +97,14 @@ def grid_cells(
 
 def scene_of(base: Path, values: Mapping[str, Any]) -> Scene:
     """The scene that a cell's values hold, its paths relative to the scene file's folder."""
-    settings = validated(SceneSettings, values["scene"], values["file"])
+    settings = validate_model(SceneSettings, values["scene"], values["file"])
     return build_scene(settings, _folder(base, values), values["seed"])
 
 
 def networks_at(base: Path, values: Mapping[str, Any]) -> tuple[str, ...]:
     """The values' networks, their paths relative to the config or, where it names none, to the scene."""
     folder = _folder(base, values) if values["of_scene"] else base
-    return tuple(expand(name, folder) for name in values["networks"])
+    return tuple(expand_path(name, folder) for name in values["networks"])
 
 
 def problem_of(base: Path, values: Mapping[str, Any]) -> Problem:
@@ -135,8 +135,8 @@ who = of_values("name", "network", "seed")  # scene, network and seed, as tables
 
 def _changed(data: Mapping[str, Any], tables: Tables, where: str) -> dict[str, Any]:
     whole = {**data, **{name: {**data.get(name, {}), **keys} for name, keys in tables.items()}}
-    return validated(SceneSettings, whole, where).model_dump(mode="json")
+    return validate_model(SceneSettings, whole, where).model_dump(mode="json")
 
 
 def _folder(base: Path, values: Mapping[str, Any]) -> Path:
-    return Path(expand(values["file"], base)).resolve().parent
+    return Path(expand_path(values["file"], base)).resolve().parent

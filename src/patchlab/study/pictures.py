@@ -14,12 +14,12 @@ from torch import Tensor
 
 from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.problem import Problem
-from patchproof.render.photograph import Shown, expose
+from patchproof.render.photograph import Appearance, expose
 from patchproof.report.images import png
 from patchproof.scene.conditions import Conditions
 
 
-def photographs(problem: Problem, shown: Shown, conditions: Conditions, side_px: int) -> Tensor:
+def photographs(problem: Problem, shown: Appearance, conditions: Conditions, side_px: int) -> Tensor:
     """N×3×S×S square photographs of one thing; None is the bare object."""
     with torch.no_grad():
         return expose(problem.see(shown, conditions, side_px), shown)

@@ -14,14 +14,14 @@ import numpy as np
 
 from patchlab.study.claims import mean
 from patchlab.study.study import Result
-from patchproof.base.claims import Estimate, difference, rate
 from patchproof.base.geometry import apply_homography
 from patchproof.base.goal import Goal
+from patchproof.base.intervals import Estimate, estimate_difference, rate
 from patchproof.evidence.results import Geometry
-from patchproof.optimizer.responses import Answers
+from patchproof.optimizer.responses import Responses
 
 
-def recorded(answers: Mapping[str, Answers]) -> dict[str, Any]:
+def recorded(answers: Mapping[str, Responses]) -> dict[str, Any]:
     """Hits and confidences as JSON values, each per shown thing and network."""
     return {
         "hits": {thing: [bits(row) for row in answer.recognized] for thing, answer in answers.items()},
@@ -94,7 +94,7 @@ class Record:
         shared = [key for key in self._cells if key in other._cells]
         pairs = zip(self.confidences(network, shared), other.confidences(network, shared), strict=True)
         return (
-            difference(self.hits(network, shared), other.hits(network, shared)),
+            estimate_difference(self.hits(network, shared), other.hits(network, shared)),
             mean([own - others for own, others in pairs]),
         )
 

@@ -26,9 +26,9 @@ from typing import Any
 
 from patchproof.base.errors import Refused
 from patchproof.base.input import read_json
-from patchproof.base.output import check_folder, make_folder, write_whole
-from patchproof.base.validation import Strict, nearest, read_toml, validated
-from patchproof.base.workers import open_workers, result_of, threads
+from patchproof.base.output import check_folder, make_folder, write_atomically
+from patchproof.base.validation import StrictModel, read_toml, spelling_hint, validate_model
+from patchproof.base.workers import open_workers, result_of, use_threads
 from patchproof.report.tables import Drawing, Results, Table, write_json, write_results
 
 # by name the module whose STUDY it is; the first line of its docstring says what it is about
@@ -91,7 +91,7 @@ class Study:
     """
 
     name: str
-    settings: type[Strict]
+    settings: type[StrictModel]
     cells: Callable[[Any, Path], Sequence[Cell]]
     run: Callable[[Any, Path, Cell], dict[str, Any]]
     tables: Callable[[Any, Sequence[Result]], Sequence[Table]]
@@ -117,7 +117,7 @@ class Finished:
 def load_study(name: str) -> Study:
     """The study of that name; refused with the nearest one where there is none."""
     if name not in STUDIES:
-        raise Refused("the name of a study", f'"{name}"', nearest(name, STUDIES))
+        raise Refused("the name of a study", f'"{name}"', spelling_hint(name, STUDIES))
     return import_module(STUDIES[name]).STUDY
 
 
@@ -147,11 +147,11 @@ HERE = Work()  # in this process, into a new folder
 def run_study(name: str, config: str | Path, out: str | Path, work: Work = HERE) -> Finished:
     """Run the study that the TOML file describes into the folder `out`."""
     study = load_study(name)
-    settings = validated(study.settings, read_toml(config), str(config))
+    settings = validate_model(study.settings, read_toml(config), str(config))
     return carry_out(study, settings, Path(config).resolve().parent, out, work)
 
 
-def carry_out(study: Study, settings: Strict, base: Path, out: str | Path, work: Work = HERE) -> Finished:
+def carry_out(study: Study, settings: StrictModel, base: Path, out: str | Path, work: Work = HERE) -> Finished:
     """Run a study with settings at hand."""
     out = Path(out)
     if not work.resume:
@@ -205,7 +205,7 @@ def _own(study: Study) -> tuple[str, ...]:
     return (f"{study.name}.json", f"{study.name}.html", f"{study.name}_*", "cells", ".*.part", *study.own_files)
 
 
-def _begin(study: Study, settings: Strict, out: Path, resume: bool) -> None:
+def _begin(study: Study, settings: StrictModel, out: Path, resume: bool) -> None:
     """The study's settings in `out`, which must be the same where one goes on."""
     path, asked = out / f"{study.name}.json", settings.model_dump(mode="json")
     if resume and path.is_file():
@@ -240,10 +240,12 @@ def _kept(out: Path, cell: Cell) -> dict[str, Any] | None:
 Outcome = tuple[dict[str, Any], dict[str, bytes], str | None]  # (JSON values, bytes, None), or why there are none
 
 
-def _run_cell(run: Callable[[Any, Path, Cell], dict[str, Any]], settings: Strict, base: Path, cell: Cell) -> Outcome:
+def _run_cell(
+    run: Callable[[Any, Path, Cell], dict[str, Any]], settings: StrictModel, base: Path, cell: Cell
+) -> Outcome:
     """What a cell gave; errors do not travel, since not every one survives it."""
     try:
-        with threads(1):
+        with use_threads(1):
             answers = run(settings, base, cell)
         files = {key: value for key, value in answers.items() if isinstance(value, bytes)}
         return _through_json({key: value for key, value in answers.items() if key not in files}), files, None
@@ -268,7 +270,7 @@ def _keep(study: Study, out: Path, cell: Cell, values: dict, files: dict[str, by
     names = {key: (Path(study.files) / key).as_posix() for key in files}
     for key, name in names.items():
         make_folder((out / name).parent)
-        write_whole(out / name, lambda path, key=key: path.write_bytes(files[key]))
+        write_atomically(out / name, lambda path, key=key: path.write_bytes(files[key]))
     kept = {"cell": dict(cell.values), "found": values | names, "files": list(names.values())}
     write_json(out / "cells" / f"{cell.name}.json", kept)
     return values | names

@@ -17,10 +17,10 @@ from patchlab.study.grid import GridSettings, Names, Tables, cell_of, scene_valu
 from patchlab.study.pictures import contact_sheet, photographs
 from patchlab.study.record import recorded
 from patchlab.study.study import Cell, Result
-from patchproof.base.claims import Estimate
+from patchproof.base.intervals import Estimate
 from patchproof.optimizer.problem import Problem
 from patchproof.optimizer.responses import responses
-from patchproof.render.photograph import Shown
+from patchproof.render.photograph import Appearance
 from patchproof.scene.conditions import Conditions
 
 Way = dict[str, dict[str, Any]]  # tables of a scene file with the keys that change
@@ -67,7 +67,7 @@ def trained_on(problem: Problem, cell: Cell) -> Problem:
 
 
 def answers_and_sheet(
-    problem: Problem, name: str, things: Mapping[str, Shown], n: int, sheet: tuple[Conditions, int]
+    problem: Problem, name: str, things: Mapping[str, Appearance], n: int, sheet: tuple[Conditions, int]
 ) -> dict[str, Any]:
     """What all networks say of `things` under n unseen conditions, and a cell's contact sheet: views and their side."""
     answers = recorded(responses(problem, things, problem.scene.draw("evaluate", n)))

@@ -23,7 +23,7 @@ HELD_OUT = "renders of other shapes, textures, backgrounds and conditions of the
 
 def class_names() -> list[str]:
     """The labels of the procedural objects, as people write them."""
-    return [name.replace("_", " ") for name in primitives.names()]
+    return [name.replace("_", " ") for name in primitives.primitive_names()]
 
 
 def stored(network: nn.Module, path: Path) -> int:

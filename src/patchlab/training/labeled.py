@@ -19,10 +19,10 @@ from torch import Tensor
 from patchlab.harden.labeled import write_labels
 from patchlab.training.card import class_names
 from patchlab.training.pictures import HELD_OUT, dressed, views_of
-from patchproof.base.color import codes_of
+from patchproof.base.color import codes_from_srgb
 from patchproof.base.output import check_folder, make_folder
 from patchproof.base.settings import SceneSettings
-from patchproof.base.validation import read_toml, validated
+from patchproof.base.validation import read_toml, validate_model
 from patchproof.mesh import primitives
 from patchproof.render.photograph import photograph
 from patchproof.render.stage import set_stage
@@ -47,7 +47,7 @@ def main() -> None:
 
 def procedural(each: int, size_px: int, seed: int) -> Iterator[tuple[str, Tensor]]:
     """(label, uint8 3×S×S) of `each` shapes of every object that the built-in networks know."""
-    for number, (label, name) in enumerate(zip(class_names(), primitives.names(), strict=True)):
+    for number, (label, name) in enumerate(zip(class_names(), primitives.primitive_names(), strict=True)):
         for i in range(each):
             rng = np.random.default_rng([seed, number, i])
             yield label, views_of(dressed(primitives.build(name, seed + i), rng), 1, rng, size_px)[0][0]
@@ -56,13 +56,13 @@ def procedural(each: int, size_px: int, seed: int) -> Iterator[tuple[str, Tensor
 def of_scenes(files: list[Path], each: int, size_px: int, seed: int) -> Iterator[tuple[str, Tensor]]:
     """(label, uint8 3×S×S) of `each` views of every scene's bare object."""
     for file in files:
-        settings = validated(SceneSettings, read_toml(file), str(file))
+        settings = validate_model(SceneSettings, read_toml(file), str(file))
         scene = build_scene(settings, file.resolve().parent, seed)
         stage = set_stage(scene)
         for i in range(each):
             with torch.no_grad():
                 seen = photograph(stage, None, scene.draw("evaluate", 1, seed, i), (size_px, size_px))
-            yield str(settings.target.label), codes_of(seen)[0]
+            yield str(settings.target.label), codes_from_srgb(seen)[0]
 
 
 def write_labeled(out: Path, renders: Iterator[tuple[str, Tensor]]) -> int:

@@ -16,9 +16,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from patchproof.base.color import codes_of
+from patchproof.base.color import codes_from_srgb
 from patchproof.base.settings import SceneSettings
-from patchproof.base.validation import validated
+from patchproof.base.validation import validate_model
 from patchproof.classifier.network import center_square
 from patchproof.mesh import primitives
 from patchproof.mesh.mesh import Mesh
@@ -45,7 +45,7 @@ class Pictures(NamedTuple):
 def pictures(per_class: int, seed: int, size_px: int) -> Pictures:
     """Every shape is seen from VIEWS_PER_SHAPE drawn conditions."""
     images, labels, boxes = [], [], []
-    for label, name in enumerate(primitives.names()):
+    for label, name in enumerate(primitives.primitive_names()):
         for shape in range(-(-per_class // VIEWS_PER_SHAPE)):
             rng = np.random.default_rng([seed, label, shape])
             seen, around = _views(name, seed + shape, rng, size_px)
@@ -71,7 +71,9 @@ def kept(folder: Path, per_class: int, seed: int, size_px: int) -> Pictures:
 def reduced(shown: Pictures, size_px: int) -> Pictures:
     """The same pictures, smaller."""
     parts = shown.images.split(1024)
-    return shown._replace(images=torch.cat([codes_of(center_square(part.float() / 255, size_px)) for part in parts]))
+    return shown._replace(
+        images=torch.cat([codes_from_srgb(center_square(part.float() / 255, size_px)) for part in parts])
+    )
 
 
 def _views(name: str, seed: int, rng: np.random.Generator, size_px: int) -> tuple[Tensor, Tensor]:
@@ -94,7 +96,7 @@ def views_of(mesh: Mesh, count: int, rng: np.random.Generator, size_px: int) -> 
     seen = [center_square(photograph(stage, None, conditions[half:], (2 * size_px, 2 * size_px)), size_px)]
     if half:
         seen.insert(0, photograph(stage, None, conditions[:half], (size_px, size_px)))
-    return codes_of(torch.cat(seen)), torch.as_tensor(scene.boxes(conditions), dtype=torch.float32)
+    return codes_from_srgb(torch.cat(seen)), torch.as_tensor(scene.boxes(conditions), dtype=torch.float32)
 
 
 def _settings(rng: np.random.Generator, photo_px: int) -> SceneSettings:
@@ -103,7 +105,7 @@ def _settings(rng: np.random.Generator, photo_px: int) -> SceneSettings:
     share = np.exp(rng.uniform(np.log(0.3), np.log(0.85)))
     distance = LENGTH_MM / (2 * np.tan(np.radians(fov_deg) / 2) * share)
     nearest = max(0.85 * distance, 1.05 * LENGTH_MM)  # nearer than that, the camera could be in the object
-    return validated(
+    return validate_model(
         SceneSettings,
         {
             "object": {"mesh": "primitive:mug", "length_mm": LENGTH_MM},
@@ -138,11 +140,11 @@ def dressed(mesh: Mesh, rng: np.random.Generator) -> Mesh:
     for material in mesh.materials:
         if kind == "worn":
             worn = np.clip(0.8 + 0.25 * (patterns.texture(rng).mean(2, keepdims=True) - 0.5), 0, 1).repeat(3, 2)
-            material = dataclasses.replace(material, texture_srgb=codes_of(worn))
+            material = dataclasses.replace(material, texture_srgb=codes_from_srgb(worn))
         if kind == "drawn" or (kind == "mixed" and rng.random() < 0.4):
             plain = rng.random() < 0.4
             color = tuple(rng.uniform(0.02, 0.9, 3)) if plain else (1.0, 1.0, 1.0)
-            drawn = None if plain else codes_of(patterns.texture(rng))
+            drawn = None if plain else codes_from_srgb(patterns.texture(rng))
             material = dataclasses.replace(material, base_color_linear=color, texture_srgb=drawn)
         materials.append(material)
     return dataclasses.replace(mesh, materials=tuple(materials))

@@ -53,7 +53,7 @@ def train(shown: Pictures, recipe: Recipe) -> fit.Epochs:
 
 def untrained(recipe: Recipe) -> torch.nn.Module:
     """The recipe's network: N×3×S×S sRGB in [0, 1] → N×K logits."""
-    classes = len(primitives.names())
+    classes = len(primitives.primitive_names())
     if not recipe.network:
         return SmallNetwork(classes, batch_norm=True)
     made = pkgutil.resolve_name(recipe.network)(num_classes=classes, **json.loads(recipe.settings))

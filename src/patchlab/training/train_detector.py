@@ -23,9 +23,9 @@ from torch import Tensor
 from patchlab.training import fit
 from patchlab.training.card import by_class, stored, write_card
 from patchlab.training.pictures import Pictures, augmented
+from patchproof.classifier.average_precision import Detection, average_precision, find_detections
 from patchproof.classifier.builtin_detector import INPUT_PX, SmallDetector, centers_px
 from patchproof.classifier.detector import iou
-from patchproof.classifier.precision import Finding, average_precision, findings
 from patchproof.mesh import primitives
 
 
@@ -46,7 +46,7 @@ def train(shown: Pictures, recipe: Recipe) -> fit.Epochs:
         images, labels, boxes = with_mosaics(images, shown.labels[rows], boxes, recipe.mosaics, rng)
         return loss_of(network(images.contiguous(memory_format=torch.channels_last)), labels, boxes * INPUT_PX)
 
-    return fit.epochs(lambda: SmallDetector(len(primitives.names()), batch_norm=True), shown, recipe, learn)
+    return fit.epochs(lambda: SmallDetector(len(primitives.primitive_names()), batch_norm=True), shown, recipe, learn)
 
 
 def with_mosaics(
@@ -111,14 +111,14 @@ def _overlaps(own: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
 
 
 @torch.no_grad()
-def found_by_class(network: torch.nn.Module, shown: Pictures) -> list[list[Finding]]:
+def found_by_class(network: torch.nn.Module, shown: Pictures) -> list[list[Detection]]:
     """All that is found of each class in pictures with one object each."""
     was_training = network.training
     network.eval()
     candidates = torch.cat([network(batch.float() / 255) for batch in shown.images.split(256)])
     network.train(was_training)
-    boxes_px, labels = shown.boxes * INPUT_PX, range(len(primitives.names()))
-    return [findings(candidates, [label], boxes_px, (shown.labels == label).tolist()) for label in labels]
+    boxes_px, labels = shown.boxes * INPUT_PX, range(len(primitives.primitive_names()))
+    return [find_detections(candidates, [label], boxes_px, (shown.labels == label).tolist()) for label in labels]
 
 
 def scored(network: torch.nn.Module, shown: Pictures) -> np.ndarray:
@@ -126,7 +126,7 @@ def scored(network: torch.nn.Module, shown: Pictures) -> np.ndarray:
     return precision(found_by_class(network, shown), shown)
 
 
-def precision(found: Sequence[Sequence[Finding]], shown: Pictures) -> np.ndarray:
+def precision(found: Sequence[Sequence[Detection]], shown: Pictures) -> np.ndarray:
     """AP50 of each class."""
     counts = shown.labels.bincount(minlength=len(found)).tolist()
     return np.array([average_precision(each, count) for each, count in zip(found, counts, strict=True)])
@@ -149,7 +149,7 @@ def write(out: Path, trained: torch.nn.Module, recipe: Recipe, held_out: Picture
     print(f"held-out AP50 {figures['held_out_ap50']:.3f}: {figures['held_out_ap50_by_class']}")
 
 
-def best_score(found: Iterable[Finding], objects: int) -> float:
+def best_score(found: Iterable[Detection], objects: int) -> float:
     """The score, in twentieths, from which on findings have the highest F1, of so many objects."""
 
     def f1(score: float) -> float:

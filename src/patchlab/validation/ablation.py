@@ -29,25 +29,25 @@ from patchlab.study.grid import GridSettings, Names, Values, grid_cells, grouped
 from patchlab.study.record import hits_of, recorded
 from patchlab.study.study import Cell, Result, Study
 from patchproof.app.plan.terms import PRINTER, Setup, effect_terms, scene_terms
-from patchproof.base.claims import Estimate
 from patchproof.base.errors import Refused
-from patchproof.base.sessions import in_sessions, spread_of
+from patchproof.base.intervals import Estimate
+from patchproof.base.sessions import count_by_session, rate_posterior
 from patchproof.base.settings import SceneSettings
-from patchproof.base.validation import validated
-from patchproof.channel.effects import EFFECT
+from patchproof.base.validation import validate_model
+from patchproof.channel.effects import EFFECT_BY_NAME
 from patchproof.channel.printer import identity_printer
 from patchproof.optimizer.loop import best_design
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import Problem
-from patchproof.optimizer.promise import PER_SESSION
+from patchproof.optimizer.promise import VIEWS_PER_SESSION
 from patchproof.optimizer.responses import ask, joined, responses
-from patchproof.render.photograph import Shown
+from patchproof.render.photograph import Appearance
 from patchproof.render.pixels import PiecePicture
-from patchproof.render.views import Views, seen_again
+from patchproof.render.views import Views, relight_and_replace_background
 from patchproof.report.tables import Table
 from patchproof.reprints.path_traced import photograph_traced
 from patchproof.scene.conditions import Conditions, draw
-from patchproof.scene.conditions import without as drawn_without
+from patchproof.scene.conditions import without_effect as drawn_without
 
 ALL = "all"
 # What goes together, because alone it is too little to tell.
@@ -81,16 +81,16 @@ class Without(Problem):
 
     changes: tuple[Callable[[Setup], Setup | None], ...] = ()
 
-    def see(self, shown: Shown, conditions: Conditions, side_px: int) -> Views:
+    def see(self, shown: Appearance, conditions: Conditions, side_px: int) -> Views:
         """Views in which what is left out is as in the simpler model."""
         setup = self._simpler(shown, conditions)
         return Problem.see(replace(self, stage=setup.stage), shown, setup.conditions, side_px)
 
     def see_again(self, views: Views, conditions: Conditions) -> Views:
         """As in `Problem`, and without what is left out, too."""
-        return seen_again(views, self._simpler(self.laid_out, conditions).conditions)
+        return relight_and_replace_background(views, self._simpler(self.laid_out, conditions).conditions)
 
-    def _simpler(self, shown: Shown, conditions: Conditions) -> Setup:
+    def _simpler(self, shown: Appearance, conditions: Conditions) -> Setup:
         setup = Setup(self.stage, shown, conditions)
         for change in self.changes:
             setup = change(setup) or setup
@@ -110,7 +110,7 @@ def without(problem: Problem, effect: str) -> Problem:
         raise Refused(f"a scene with {effect} in it", "one where it is off", f"give {terms[names[0]].key} a range")
     subject = problem.subject
     if PRINTER in on:
-        subject = subject.printed_by(identity_printer())
+        subject = subject.with_printer(identity_printer())
     changes = tuple(terms[name].change for name in on if name != PRINTER)
     return Without(**vars(replace(problem, subject=subject)), changes=changes)
 
@@ -127,10 +127,13 @@ def cells(settings: AblationSettings, base: Path) -> list[Cell]:
 
 def _is_on(values: Values, effect: str) -> bool:
     """Whether the scene has one of the effects joined by " + "; one that is no row of `EFFECTS` counts as on."""
-    scene = validated(SceneSettings, values["scene"], values["file"])
+    scene = validate_model(SceneSettings, values["scene"], values["file"])
     drawn = draw(scene, "select", 64, 0)
-    names = [name for name in effect.split(" + ") if name in EFFECT]
-    on = [drawn_without(drawn, EFFECT[name], lambda azimuth, _: np.ones(azimuth.shape)) is not None for name in names]
+    names = [name for name in effect.split(" + ") if name in EFFECT_BY_NAME]
+    on = [
+        drawn_without(drawn, EFFECT_BY_NAME[name], lambda azimuth, _: np.ones(azimuth.shape)) is not None
+        for name in names
+    ]
     return any(on) or len(on) < len(effect.split(" + "))
 
 
@@ -140,7 +143,7 @@ def run(settings: AblationSettings, base: Path, cell: Cell) -> dict[str, Any]:
     simpler = problem if effect == ALL else without(problem, effect)
     design = best_design(simpler)
     shown = problem.subject.shown(from_pixels(design, problem.device))
-    conditions = problem.scene.draw("evaluate", settings.n, per_session=PER_SESSION)
+    conditions = problem.scene.draw("evaluate", settings.n, per_session=VIEWS_PER_SESSION)
     answers = {"modeled": responses(problem, {"design": shown}, conditions)}
     if effect != ALL:
         as_trained = simpler.subject.shown(from_pixels(design, problem.device))
@@ -192,7 +195,7 @@ def _design_row(result: Result) -> tuple:
 def _promised(result: Result) -> Estimate:
     """The rate in the world without the effect, with its interval over sessions as a promise has it."""
     hits = hits_of(result.answers["promised"]["hits"]["design"][0])
-    return Estimate(float(np.mean(hits)), *spread_of(*in_sessions(hits, PER_SESSION)).rate, len(hits))
+    return Estimate(float(np.mean(hits)), *rate_posterior(*count_by_session(hits, VIEWS_PER_SESSION)).rate, len(hits))
 
 
 def _missed(results: Sequence[Result]) -> tuple:

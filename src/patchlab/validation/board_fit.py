@@ -22,9 +22,9 @@ import numpy as np
 import torch
 
 from patchlab.validation.known_boards import Pose, Printed, moved, paper_share
-from patchproof.base.color import LIGHT_OF_CODE, LUMINANCE, codes_of
-from patchproof.channel.camera import READ_SHARE, SMALLEST_BLUR_PX, blurred, encoded
-from patchproof.photo.detect import LIGHT
+from patchproof.base.color import LINEAR_FROM_CODE, LUMINANCE, codes_from_srgb
+from patchproof.channel.camera import READ_SHARE, SMALLEST_BLUR_PX, encode_light, gaussian_blur
+from patchproof.photo.detect import LINEAR_FLOAT32_FROM_CODE
 from patchproof.photo.quality import CLIPPED_CODE
 from patchproof.photo.rejection import PhotoRejected
 from patchproof.scene.paper_light import quadratic_terms
@@ -58,12 +58,12 @@ class BoardFit:
     def rendered(self) -> np.ndarray:
         """uint8 H×W×3 sRGB: print, light, blur and tone of our channel; what lies around the board is paper."""
         lit = self.light * (self.black + (1 - self.black) * self.share[..., None])
-        seen = encoded(blurred(_tensor(lit), torch.tensor([self.blur_px])))
-        return codes_of(seen)[0].permute(1, 2, 0).numpy()
+        seen = encode_light(gaussian_blur(_tensor(lit), torch.tensor([self.blur_px])))
+        return codes_from_srgb(seen)[0].permute(1, 2, 0).numpy()
 
     def paper_seen(self, srgb: np.ndarray) -> np.ndarray:
         """H×W: what share of each pixel of an uint8 picture looks like paper, by this light and this black."""
-        relative = LIGHT[srgb] / np.maximum(self.light, 1e-4)
+        relative = LINEAR_FLOAT32_FROM_CODE[srgb] / np.maximum(self.light, 1e-4)
         return ((relative - self.black) / (1 - self.black)) @ np.array(LUMINANCE)
 
 
@@ -79,7 +79,10 @@ def fit_board(srgb: np.ndarray, pose: Pose) -> BoardFit:
         raise PhotoRejected("clipped", lost, _MOST_CLIPPED, f"{lost:.0%} of the board is overexposed")
     known = np.random.default_rng(0).permutation(known)[:_MOST_PIXELS]  # fixed: the same figures each time
     places = _places(srgb.shape)
-    terms, light = _quadratic(places, srgb.shape)[known], LIGHT[srgb].reshape(-1, 3)[known].astype(float)
+    terms, light = (
+        _quadratic(places, srgb.shape)[known],
+        LINEAR_FLOAT32_FROM_CODE[srgb].reshape(-1, 3)[known].astype(float),
+    )
     bend, prints, share = np.zeros((10, 2)), pose.prints, paper_share(pose.prints, srgb.shape)
     shade, blur = _best_blur(share, known, terms, light, _Shade(np.zeros((3, 6)), np.full(3, 0.03)), None)
     for _ in range(_ROUNDS):
@@ -168,7 +171,7 @@ def _cubic(at: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 
 def _soft(share: np.ndarray, blur_px: float) -> np.ndarray:
     """H×W as the channel's blur leaves it."""
-    return blurred(_tensor(share[..., None]), torch.tensor([blur_px]))[0, 0].numpy()
+    return gaussian_blur(_tensor(share[..., None]), torch.tensor([blur_px]))[0, 0].numpy()
 
 
 def _tensor(picture: np.ndarray) -> torch.Tensor:
@@ -238,10 +241,10 @@ def white_noise(fit: BoardFit, srgb: np.ndarray) -> tuple[float | None, float | 
     flat = flat_white(fit, srgb)
     if flat.sum() < 100:
         return None, None
-    light, mask = LIGHT[srgb], np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
+    light, mask = LINEAR_FLOAT32_FROM_CODE[srgb], np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
     detail = np.abs(cv2.filter2D(light, -1, mask))[flat].mean(0) * np.sqrt(np.pi / 2) / 6
     paper = fit.light[flat].mean(0)
-    step = np.interp(paper, LIGHT_OF_CODE[:-1], np.diff(LIGHT_OF_CODE))
+    step = np.interp(paper, LINEAR_FROM_CODE[:-1], np.diff(LINEAR_FROM_CODE))
     variance = np.maximum(detail**2 - step**2 / 12, 0) / (paper + READ_SHARE**2)
     left = light[flat] / fit.light[flat] - 1
     return float(np.sqrt(variance.mean())), float(np.sqrt((left**2).mean()))

@@ -25,13 +25,13 @@ from patchlab.study.claims import clustered_median
 from patchlab.study.record import corner_error_mm
 from patchlab.study.study import Cell, Result, Study
 from patchlab.validation.hung import hang_piece
-from patchproof.base.claims import Estimate, rate
 from patchproof.base.errors import Refused
 from patchproof.base.geometry import apply_homography, local_scale, rect_corners
+from patchproof.base.intervals import Estimate, rate
 from patchproof.base.output import image_pixels
-from patchproof.base.resample import sixteenths
-from patchproof.base.validation import Share, Strict
-from patchproof.evidence.camera import view_of
+from patchproof.base.resample import to_sixteenths
+from patchproof.base.validation import Share, StrictModel
+from patchproof.evidence.camera import pinhole_photo
 from patchproof.evidence.measure import measure
 from patchproof.evidence.ranges import promised_ranges
 from patchproof.evidence.surface import surface_of
@@ -39,11 +39,11 @@ from patchproof.photo.read import Photo
 from patchproof.render.photograph import photograph
 from patchproof.render.stage import set_stage
 from patchproof.report.tables import Table
-from patchproof.reprints.hung_sheet import HungSheet, jpeg_of
+from patchproof.reprints.mounted_sheet import MountedSheet, jpeg_of
 from patchproof.scene.conditions import Conditions
-from patchproof.scene.patch_scene import PatchScene, needs_patch
+from patchproof.scene.patch_scene import PatchScene, require_patch
 from patchproof.scene.scene import load_scene
-from patchproof.sheets.content import PrintedPiece
+from patchproof.sheets.content import SheetContent
 from patchproof.sheets.piece import control_design
 
 MEASURABLE_TILT_DEG, MEASURABLE_BLUR_PX = 70.0, 1.5  # beyond these the bounds on errors are not claimed
@@ -68,7 +68,7 @@ _LABELS = {
 }
 
 
-class DetectionSettings(Strict):
+class DetectionSettings(StrictModel):
     """What is photographed, and how often."""
 
     scene: str  # a scene file of one object with a patch
@@ -91,7 +91,7 @@ def run(settings: DetectionSettings, base: Path, cell: Cell) -> dict[str, Any]:
     truth = sheet.px_from_page(conditions)
     srgb, hidden = _photographed(sheet, conditions, truth, rng, rng.random() < settings.hidden)
     photo = Photo(srgb, float(scene.matrix_px(scene.settings.camera.photo_px)[0, 0]))
-    entry = measure(view_of(photo, None), "photo.jpg", surface, None, promised_ranges(())).entry
+    entry = measure(pinhole_photo(photo, None), "photo.jpg", surface, None, promised_ranges(())).entry
     geometry = entry.geometry
     px_per_mm, tilt_deg = local_scale(truth, surface.center_mm)
     answers = {
@@ -117,7 +117,7 @@ def run(settings: DetectionSettings, base: Path, cell: Cell) -> dict[str, Any]:
     return answers | {"error_mm": corner_error_mm(geometry, corners, true_px), "error_px": errors_px}
 
 
-def _photographed(sheet: HungSheet, conditions: Conditions, truth, rng, hide: bool) -> tuple[np.ndarray, float]:
+def _photographed(sheet: MountedSheet, conditions: Conditions, truth, rng, hide: bool) -> tuple[np.ndarray, float]:
     """uint8 pixels as read back from the JPEG, and the share of the piece behind a card, where one hides it."""
     photo_px, share = sheet.scene.settings.camera.photo_px, 0.0
     with torch.no_grad():
@@ -132,15 +132,15 @@ def _photographed(sheet: HungSheet, conditions: Conditions, truth, rng, hide: bo
 
 
 @lru_cache(maxsize=1)
-def _hung(scene_path: str, seed: int) -> tuple[HungSheet, PatchScene]:
+def _hung(scene_path: str, seed: int) -> tuple[MountedSheet, PatchScene]:
     """The scene's sheet with noise on it, hung up in the scene."""
-    scene = needs_patch(load_scene(scene_path, seed), "a scene of an object with a flat patch")
+    scene = require_patch(load_scene(scene_path, seed), "a scene of an object with a flat patch")
     if not scene.is_flat:
         raise Refused("a scene of an object with a flat patch", "another one", "name a mesh and leave bend out")
     piece = scene.piece
     blank = np.zeros((240, round(240 * piece.size_mm[0] / piece.size_mm[1]), 3), np.uint8)
     noise = control_design("noise", blank, scene.sheet_id, piece)
-    return hang_piece(set_stage(scene), PrintedPiece(piece, scene.sheet_id, "design", noise)), scene
+    return hang_piece(set_stage(scene), SheetContent(piece, scene.sheet_id, "design", noise)), scene
 
 
 def _card(rng: np.random.Generator, piece_px: np.ndarray) -> np.ndarray:
@@ -156,7 +156,7 @@ def _card(rng: np.random.Generator, piece_px: np.ndarray) -> np.ndarray:
 def _filled(quad: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
     """H×W float32 in [0, 1]: what share of each pixel, about, lies in the quad."""
     mask = np.zeros((size_px[1], size_px[0]), np.uint8)
-    cv2.fillConvexPoly(mask, sixteenths(quad), 255, cv2.LINE_AA, 4)
+    cv2.fillConvexPoly(mask, to_sixteenths(quad), 255, cv2.LINE_AA, 4)
     return mask.astype(np.float32) / 255
 
 

@@ -28,7 +28,7 @@ from patchlab.validation.photographed import (
     recorded_spread,
     take_photos,
 )
-from patchproof.base.claims import rate, wilson
+from patchproof.base.intervals import rate, wilson
 from patchproof.evidence.forecast import forecast_of
 from patchproof.report.tables import Drawing, Table
 
@@ -41,7 +41,7 @@ class ForecastsSettings(SessionsSettings):
 
 def run(settings: ForecastsSettings, base: Path, cell: Cell) -> dict[str, Any]:
     """Forecasts, estimates and what was photographed, by session."""
-    from patchproof.reprints.retake import retaker
+    from patchproof.reprints.photo_forecast import photo_forecaster
     from patchproof.sheets.manifest import load_manifest
 
     with tempfile.TemporaryDirectory() as temporary:
@@ -50,7 +50,7 @@ def run(settings: ForecastsSettings, base: Path, cell: Cell) -> dict[str, Any]:
         photos, controls = take_photos(settings, cell, made, folder), None
         if settings.control is not None:
             controls = take_photos(settings, cell, made, folder, settings.control)
-        forecast, sessions = retaker(made, load_manifest(folder / "sheet.json")), []
+        forecast, sessions = photo_forecaster(made, load_manifest(folder / "sheet.json")), []
         for own in sorted(photos.iterdir()):
             if own.is_dir():
                 beside = None if controls is None else controls / own.name

@@ -7,23 +7,23 @@ from tempfile import TemporaryDirectory
 
 from patchproof.optimizer.run import Run
 from patchproof.render.stage import Stage, set_stage
-from patchproof.reprints.hung_sheet import AS_MADE, HungSheet, sent_pixels
+from patchproof.reprints.mounted_sheet import DEFAULT_SETUP, MountedSheet, sent_pixels
 from patchproof.reprints.run_sheet import content_of
-from patchproof.sheets.content import PrintedPiece
+from patchproof.sheets.content import SheetContent
 from patchproof.sheets.template import load_template
 from patchproof.sheets.write import write_sheet
 
 
-def hang_own(run: Run, control: str | None = None) -> HungSheet:
+def hang_own(run: Run, control: str | None = None) -> MountedSheet:
     """The sheet that the run makes, or that of a printed control, without the page that says how to photograph it."""
     return hang_piece(set_stage(run.scene), content_of(run, None, control)[0])
 
 
-def hang_piece(stage: Stage, content: PrintedPiece) -> HungSheet:
+def hang_piece(stage: Stage, content: SheetContent) -> MountedSheet:
     """A sheet of the stage's scene with any content in its piece."""
     template = load_template(stage.scene.settings.sheet.template)
     with TemporaryDirectory() as folder:
         pdf = Path(folder) / "sheet.pdf"
         manifest = write_sheet(pdf, template, content)
         sent = sent_pixels(pdf, manifest, stage.scene)
-    return HungSheet(stage, manifest, sent, AS_MADE.printer_for(stage.scene))
+    return MountedSheet(stage, manifest, sent, DEFAULT_SETUP.printer_for(stage.scene))

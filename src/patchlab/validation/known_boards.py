@@ -18,12 +18,12 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from patchproof.base.geometry import apply_homography, fit_homography, rect_corners
-from patchproof.base.resample import between_indices, sixteenths
-from patchproof.base.validation import NotNegative, Strict
+from patchproof.base.resample import index_homography, to_sixteenths
+from patchproof.base.validation import NotNegative, StrictModel
 from patchproof.photo.detect import find_markers
-from patchproof.photo.rectify import fit_page, part_around
+from patchproof.photo.rectify import fit_page, region_around
 from patchproof.photo.rejection import PhotoRejected
-from patchproof.sheets.markers import board_squares, cells_of, marker_corner
+from patchproof.sheets.markers import board_squares, marker_cells, marker_corner
 
 LEAST_MARKERS = 4  # of a grid or a ChArUco board: two are met by planes that are far off
 # Of a module: how far corners may lie off the plane, root mean square. In 25 photographs of flat boards they were off
@@ -34,7 +34,7 @@ _QUIET = 1 / 8  # of a loose marker's side: the paper around it that has to be w
 UNIT = rect_corners((0, 0, 1, 1))
 
 
-class BoardSettings(Strict):
+class BoardSettings(StrictModel):
     """Photographs, and the board that each of them shows."""
 
     photos: Annotated[tuple[str, ...], Field(min_length=1)]  # files, or folders of them
@@ -103,7 +103,7 @@ class Pose:
         filled = np.zeros(shape[:2], np.uint8)
         for printed in self.prints:
             for quad in printed.area_px:
-                cv2.fillConvexPoly(filled, sixteenths(quad), 1, cv2.LINE_8, 4)
+                cv2.fillConvexPoly(filled, to_sixteenths(quad), 1, cv2.LINE_8, 4)
         return filled > 0
 
 
@@ -146,7 +146,7 @@ def _on_board(board: BoardSettings, px_from_board: np.ndarray, found: set[int]) 
     grown, half = 1 + board.gap, board.gap / 2
     clear = {at for number, at in zip(board.names, board.places, strict=True) if number in found}
     prints = []
-    for at, modules in zip(board.places, cells_of(board.dictionary, board.names), strict=True):
+    for at, modules in zip(board.places, marker_cells(board.dictionary, board.names), strict=True):
         x, y = marker_corner(at, grown, 1)
         area = _area(board, px_from_board, at, (x - half, y - half, grown)) if at in clear else []
         prints.append(_printed(modules, px_from_board, (x, y, 1), area))
@@ -176,7 +176,7 @@ def _printed(cells: np.ndarray, px_from_board: np.ndarray, square: tuple[float, 
 
 def _loose(board: BoardSettings, corners_px: Mapping[int, np.ndarray]) -> tuple[Printed, ...]:
     ids, prints = sorted(corners_px), []
-    for number, cells in zip(ids, cells_of(board.dictionary, ids), strict=True):
+    for number, cells in zip(ids, marker_cells(board.dictionary, ids), strict=True):
         px_from_unit = fit_homography(UNIT, corners_px[number])
         area = apply_homography(px_from_unit, rect_corners((-_QUIET, -_QUIET, 1 + 2 * _QUIET, 1 + 2 * _QUIET)))
         prints.append(Printed(cells, px_from_unit, area[None]))
@@ -196,11 +196,11 @@ def paper_share(prints: Sequence[Printed], shape: tuple[int, ...]) -> np.ndarray
     """H×W float32: how much of each pixel is paper, from 8 × 8 samples; around the prints all is paper."""
     share = np.ones(shape[:2], np.float32)
     for printed in prints:
-        box = part_around(printed.corners_px, 1, shape)
+        box = region_around(printed.corners_px, 1, shape)
         top, left, n = box[0].start, box[1].start, len(printed.cells)
         size = box[1].stop - left, box[0].stop - top
         to_fine = np.array([[_FINE, 0, -_FINE * left], [0, _FINE, -_FINE * top], [0, 0, 1.0]])
-        matrix = between_indices(to_fine @ printed.px_from_unit @ np.diag([1 / n, 1 / n, 1]))
+        matrix = index_homography(to_fine @ printed.px_from_unit @ np.diag([1 / n, 1 / n, 1]))
         ink = (1 - printed.cells).astype(np.float32)
         fine = cv2.warpPerspective(ink, matrix, (size[0] * _FINE, size[1] * _FINE), flags=cv2.INTER_NEAREST)
         share[box] -= cv2.resize(fine, size, interpolation=cv2.INTER_AREA)

@@ -32,32 +32,32 @@ from patchlab.study.grid import (
 from patchlab.study.record import Record, corner_error_mm, gain_of, hardest, recorded
 from patchlab.study.study import Cell, Result, Study
 from patchlab.validation.hung import hang_piece
-from patchproof.base.claims import Estimate, rate
 from patchproof.base.geometry import apply_homography, rect_corners
+from patchproof.base.intervals import Estimate, rate
 from patchproof.base.output import image_pixels
-from patchproof.base.validation import Positive, Strict
-from patchproof.evidence.camera import view_of
+from patchproof.base.validation import Positive, StrictModel
+from patchproof.evidence.camera import pinhole_photo
 from patchproof.evidence.measure import measure
 from patchproof.evidence.ranges import promised_ranges
 from patchproof.evidence.surface import promised_of, surface_of
 from patchproof.optimizer.loop import best_design
-from patchproof.optimizer.places import choose_place
+from patchproof.optimizer.place_search import choose_place
 from patchproof.optimizer.problem import Problem, set_problem
-from patchproof.optimizer.promise import CONTROLS, shown_with_controls
+from patchproof.optimizer.promise import CONTROLS, pictures_with_controls
 from patchproof.optimizer.responses import responses
 from patchproof.photo.read import Photo
 from patchproof.report.tables import Drawing, Table, Value
-from patchproof.scene.open_scene import OpenScene
-from patchproof.scene.patch_scene import PatchScene, needs_patch
-from patchproof.sheets.content import PrintedPiece
+from patchproof.scene.open_scene import UnplacedScene
+from patchproof.scene.patch_scene import PatchScene, require_patch
+from patchproof.sheets.content import SheetContent
 from patchproof.sheets.piece import SCISSORS_MM, Piece, lay_out_piece
-from patchproof.sheets.rects import RectMm, grown
+from patchproof.sheets.rects import RectMm, grow_rect
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-class Layout(Strict):
+class Layout(StrictModel):
     """One way to lay out a piece."""
 
     markers: Literal[4, 8] = 4  # in the corners; or in the middle of each side, too
@@ -97,7 +97,7 @@ class LaidOut(Piece):
         """The white round each marker; the four sides of a frame."""
         if not self.framed:
             wider = (self.quiet - 1) * self.module_mm
-            rects = (grown(rect, wider) for rect in super().reserved_mm)
+            rects = (grow_rect(rect, wider) for rect in super().reserved_mm)
             return tuple(_within(rect, self.size_mm) for rect in rects)
         (width, height), frame = self.size_mm, self.marker_mm + 2 * self.module_mm + SCISSORS_MM
         sides = ((0.0, 0.0, width, frame), (0.0, height - frame, width, frame))
@@ -131,11 +131,11 @@ def cells(settings: LayoutsSettings, base: Path) -> list[Cell]:
 def run(settings: LayoutsSettings, base: Path, cell: Cell) -> dict[str, Any]:
     """Train, at a place that is searched where the scene asks for it; show and photograph."""
     problem = _problem(base, cell)
-    scene = laid_out(needs_patch(problem.scene), Layout(**cell.values["how"]))
+    scene = laid_out(require_patch(problem.scene), Layout(**cell.values["how"]))
     patch = replace(problem.patch, scene=scene)
     problem = replace(problem, scene=scene, stage=replace(problem.stage, scene=scene), subject=patch)
     design = best_design(problem)
-    shown = shown_with_controls(problem, design, CONTROLS)
+    shown = pictures_with_controls(problem, design, CONTROLS)
     answers = responses(problem, shown, scene.draw("evaluate", settings.n))
     return (
         recorded(answers) | {"free": _free_share(scene.piece)} | _photographed(problem, scene, design, settings.photos)
@@ -144,7 +144,7 @@ def run(settings: LayoutsSettings, base: Path, cell: Cell) -> dict[str, Any]:
 
 def _problem(base: Path, cell: Cell) -> Problem:
     scene, networks = scene_of(base, cell.values), networks_at(base, cell.values)
-    if isinstance(scene, OpenScene):
+    if isinstance(scene, UnplacedScene):
         place = choose_place(scene, models=networks)
         scene = scene.at(place.at, place.spin_deg)
     return set_problem(scene, models=networks)
@@ -161,7 +161,7 @@ def _free_share(piece: Piece) -> float:
 
 def _photographed(problem: Problem, scene: PatchScene, design: np.ndarray, count: int) -> dict[str, Any]:
     """What `verify` makes of photographs of the design's sheet, and how far it is off, by photograph."""
-    sheet = hang_piece(problem.stage, PrintedPiece(scene.piece, scene.sheet_id, "design", design))
+    sheet = hang_piece(problem.stage, SheetContent(scene.piece, scene.sheet_id, "design", design))
     manifest = sheet.manifest
     surface = surface_of(manifest)
     promised, drawn = promised_of(manifest, surface, sheet.printer), scene.draw("reprint", count)
@@ -169,7 +169,7 @@ def _photographed(problem: Problem, scene: PatchScene, design: np.ndarray, count
     for i in range(count):
         conditions = drawn[i : i + 1]
         photo = Photo(image_pixels(sheet.photograph(conditions)), float(scene.matrix_px(scene.photo_px)[0, 0]))
-        entry = measure(view_of(photo, None), "photo.jpg", surface, promised, promised_ranges(())).entry
+        entry = measure(pinhole_photo(photo, None), "photo.jpg", surface, promised, promised_ranges(())).entry
         geometry, error = entry.geometry, None
         if geometry is not None and scene.is_flat:
             corners = rect_corners(manifest.cut_mm)

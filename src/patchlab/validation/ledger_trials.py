@@ -26,24 +26,24 @@ from torch import Tensor
 from patchlab.bench.inkjets import draw_inkjet
 from patchlab.study.study import Cell, Result, Study
 from patchlab.validation.hung import hang_own
-from patchproof.base.claims import rate
 from patchproof.base.color import linear_from_srgb, srgb_from_linear
+from patchproof.base.intervals import rate
 from patchproof.base.output import image_pixels
-from patchproof.base.validation import Strict
+from patchproof.base.validation import StrictModel
 from patchproof.channel.printer import Printer, load_printer
 from patchproof.classifier.load import load_classifier
 from patchproof.classifier.network import Classifier
 from patchproof.evidence.batch import MEASURABLE_CODES
 from patchproof.evidence.classify import target_indices
+from patchproof.evidence.gather import gather_evidence
 from patchproof.evidence.ledger import LEAST_PHOTOS
-from patchproof.evidence.run import gather_evidence
 from patchproof.evidence.task import Options
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.run import load_run
 from patchproof.render.photograph import expose
-from patchproof.render.views import Views, see
+from patchproof.render.views import Views, render_views
 from patchproof.report.tables import Table
-from patchproof.reprints.hung_sheet import HungSheet, jpeg_of
+from patchproof.reprints.mounted_sheet import MountedSheet, jpeg_of
 from patchproof.scene.conditions import Conditions, with_values
 from patchproof.scene.interface import PieceScene
 
@@ -54,7 +54,7 @@ Printed = Callable[[Tensor], Tensor]  # sRGB as sent, 1×3×H×W, to what is see
 _FADED = 0.2  # of the density that dyes may keep
 
 
-class LedgerSettings(Strict):
+class LedgerSettings(StrictModel):
     """Whose designs are photographed, and how often."""
 
     runs: Annotated[tuple[str, ...], Field(min_length=1)]  # folders of finished runs
@@ -95,7 +95,7 @@ def run(settings: LedgerSettings, base: Path, cell: Cell) -> dict[str, Any]:
 class _Hall:
     """A run's sheet, ready to be photographed, and what judges its photographs."""
 
-    sheet: HungSheet
+    sheet: MountedSheet
     model: Classifier
     indices: tuple[int, ...]
     sign: int  # of what the patch should add to confidence
@@ -112,7 +112,9 @@ class _Hall:
     def views(self, conditions: Conditions) -> list[Views]:
         """What is rasterized once for all that is done to print, light and camera."""
         each = range(len(conditions))
-        return [see(self.sheet.stage, self.sheet.piece, conditions[i : i + 1], self.scene.photo_px) for i in each]
+        return [
+            render_views(self.sheet.stage, self.sheet.piece, conditions[i : i + 1], self.scene.photo_px) for i in each
+        ]
 
     def take(self, views: Sequence[Views], conditions: Conditions, printed: Printed | None = None) -> list[bytes]:
         """A JPEG file for each condition of the piece as `printed` shows it (by default as promised)."""

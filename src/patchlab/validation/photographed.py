@@ -27,12 +27,12 @@ from patchlab.study.grid import (
 )
 from patchlab.study.record import bits, hits_of
 from patchlab.study.study import Cell, Result
-from patchproof.base.sessions import Spread, in_sessions, spread_of
-from patchproof.base.validation import expand
+from patchproof.base.sessions import RatePosterior, count_by_session, rate_posterior
+from patchproof.base.validation import expand_path
 from patchproof.optimizer.promise import PromiseOptions
 
 if TYPE_CHECKING:
-    from patchproof.evidence.reproject import Shot
+    from patchproof.evidence.reproject import PhotoSquare
     from patchproof.evidence.results import Report
     from patchproof.optimizer.run import Run
 
@@ -61,7 +61,7 @@ def cells(settings: SessionsSettings, base: Path) -> list[Cell]:
 
 def printed_run(base: Path, cell: Cell, folder: Path) -> Run:
     """The cell's design in folder/run, its sheet in folder/sheet.pdf."""
-    from patchproof.optimizer.given import import_patch
+    from patchproof.optimizer.imported_design import import_patch
     from patchproof.optimizer.run import optimize
     from patchproof.reprints.run_sheet import sheet as sheet_of
 
@@ -71,7 +71,9 @@ def printed_run(base: Path, cell: Cell, folder: Path) -> Run:
     if (picture := cell.values.get("picture")) is None:
         made = optimize(scene, folder / "run", promise=PromiseOptions(controls=("bare",)))
     else:
-        made = import_patch(expand(picture, base), scene, folder / "run", promise=PromiseOptions(controls=("bare",)))
+        made = import_patch(
+            expand_path(picture, base), scene, folder / "run", promise=PromiseOptions(controls=("bare",))
+        )
     sheet_of(made, folder / "sheet.pdf")
     return made
 
@@ -80,11 +82,11 @@ def take_photos(settings: SessionsSettings, cell: Cell, made: Run, folder: Path,
     """The folder with sessions of photographs of folder/sheet.pdf, or of a control in its place and under the same
     conditions.
     """
-    from patchproof.reprints.hung_sheet import Hanging
+    from patchproof.reprints.mounted_sheet import ReprintSetup
     from patchproof.reprints.reprint import reprint
 
     out, n = folder / ("photos" if control is None else control), settings.sessions * settings.photos
-    how = Hanging(path_traced=settings.path_traced, control=control)
+    how = ReprintSetup(path_traced=settings.path_traced, control=control)
     # cells that shared a seed's draws would be one case
     seed = zlib.crc32(cell.name.encode())
     reprint(folder / "sheet.pdf", made, n, out, how, sessions=settings.sessions, seed=seed)
@@ -96,12 +98,12 @@ def judged(
     folder: Path,
     base: Path,
     cell: Cell,
-    forecast: Callable[[Shot], float | None] | None = None,
+    forecast: Callable[[PhotoSquare], float | None] | None = None,
     **options: Any,
 ) -> Report:
     """What `verify` finds in photographs of folder/sheet.pdf, without its files; `options` are some of `Options`."""
     from patchproof.app.verify import options_of
-    from patchproof.evidence.run import gather_evidence
+    from patchproof.evidence.gather import gather_evidence
     from patchproof.sheets.manifest import load_manifest
 
     sheet, networks = folder / "sheet.json", networks_at(base, cell.values)
@@ -117,7 +119,7 @@ def recorded_promise(made: Run) -> dict[str, Any]:
     return {"promised": hits, "per_session": promise.per_session, "places": list(promise.places)}
 
 
-def recorded_spread(result: Result) -> Spread:
+def recorded_spread(result: Result) -> RatePosterior:
     """What that promise says of photographs to come."""
     answers = result.answers
-    return spread_of(*in_sessions(hits_of(answers["promised"]), answers["per_session"], answers["places"]))
+    return rate_posterior(*count_by_session(hits_of(answers["promised"]), answers["per_session"], answers["places"]))

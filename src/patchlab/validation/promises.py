@@ -36,12 +36,12 @@ from patchlab.validation.photographed import (
     recorded_spread,
     take_photos,
 )
-from patchproof.base.claims import rate
 from patchproof.base.errors import Refused
-from patchproof.base.sessions import TAIL, Spread, in_sessions, spread_of
-from patchproof.base.validation import nearest
+from patchproof.base.intervals import rate
+from patchproof.base.sessions import TAIL, RatePosterior, count_by_session, rate_posterior
+from patchproof.base.validation import spelling_hint
 from patchproof.optimizer.problem import set_problem
-from patchproof.optimizer.promise import shown_with_controls
+from patchproof.optimizer.promise import pictures_with_controls
 from patchproof.optimizer.responses import responses
 from patchproof.report.tables import Drawing, Table
 
@@ -70,7 +70,7 @@ def promise_cells(settings: PromisesSettings, base: Path) -> list[Cell]:
         return optimized
     names = {cell.values["name"] for cell in optimized}
     for name in settings.pictures.keys() - names:
-        raise Refused("pictures of the config's scenes", f'"{name}"', nearest(name, names))
+        raise Refused("pictures of the config's scenes", f'"{name}"', spelling_hint(name, names))
     return [
         Cell(f"{short_name(f'/{picture}')}.{cell.name}", {**cell.values, "picture": picture})
         for cell in optimized
@@ -94,11 +94,11 @@ def _without_paper(settings: PromisesSettings, made: Run) -> dict[str, Any]:
     if not settings.rendered and not settings.elsewhere:
         return {}
     problem, scene, kept = set_problem(made.scene), made.scene, {}
-    show = partial(responses, problem, shown_with_controls(problem, made.design, ()))
+    show = partial(responses, problem, pictures_with_controls(problem, made.design, ()))
     if settings.rendered:
         views = scene.draw("reprint", settings.rendered * settings.photos, per_session=settings.photos)
         hits = show(views)["design"].recognized[0]
-        kept["rendered"] = list(zip(*in_sessions(hits, settings.photos), strict=True))
+        kept["rendered"] = list(zip(*count_by_session(hits, settings.photos), strict=True))
     if settings.elsewhere:
         kept["elsewhere"] = bits(show(scene.draw("evaluate", settings.elsewhere))["design"].recognized[0])
     return kept
@@ -124,8 +124,8 @@ class Counted:
     recognized: int
     judged: int
     rate: float
-    spread: Spread
-    alone: Spread  # as if every condition were drawn anew
+    spread: RatePosterior
+    alone: RatePosterior  # as if every condition were drawn anew
 
     @property
     def share(self) -> float:
@@ -145,7 +145,7 @@ class Counted:
 def counted(result: Result, sessions: str = "sessions") -> list[Counted]:
     """A run's sessions, or those of "rendered" views, in which anything could be judged."""
     hits = hits_of(result.answers["promised"])
-    about = sum(hits) / len(hits), recorded_spread(result), spread_of(*in_sessions(hits, 1))
+    about = sum(hits) / len(hits), recorded_spread(result), rate_posterior(*count_by_session(hits, 1))
     return [Counted(recognized, judged, *about) for recognized, judged in result.answers[sessions] if judged]
 
 

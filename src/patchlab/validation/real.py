@@ -30,13 +30,13 @@ from patchproof.base.color import LUMINANCE, linear_from_srgb
 from patchproof.base.geometry import rect_corners
 from patchproof.base.output import image_bytes, image_pixels
 from patchproof.base.settings import CameraSettings, PrinterSettings
-from patchproof.base.validation import Strict, expand
+from patchproof.base.validation import StrictModel, expand_path
 from patchproof.channel.printer import load_printer
 from patchproof.classifier.load import load_classifier
 from patchproof.classifier.network import Classifier
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.photo.read import list_photos, read_photo
-from patchproof.photo.rectify import part_around
+from patchproof.photo.rectify import region_around
 from patchproof.photo.rejection import PhotoRejected
 from patchproof.report.images import png
 from patchproof.report.tables import Drawing, Table
@@ -67,7 +67,7 @@ _FIGURES = {
 }
 
 
-class RealSettings(Strict):
+class RealSettings(StrictModel):
     """Whose photographs, of which boards, and the networks that look at them."""
 
     boards: Annotated[dict[str, BoardSettings], Field(min_length=1)]  # by a name for camera and board
@@ -79,7 +79,7 @@ def cells(settings: RealSettings, base: Path) -> list[Cell]:
     photos = []
     for name, board in settings.boards.items():
         for text in board.photos:
-            path = Path(expand(text, base))
+            path = Path(expand_path(text, base))
             files = [text] if path.is_file() else [f"{text}/{file.name}" for file in list_photos(path)]
             photos += [{"board": name, "photo": file} for file in files]
     return [Cell(f"photo_{i:03d}", values) for i, values in enumerate(photos)]
@@ -88,7 +88,7 @@ def cells(settings: RealSettings, base: Path) -> list[Cell]:
 def run(settings: RealSettings, base: Path, cell: Cell) -> dict[str, Any]:
     """The figures of one photograph, the changes by network, and a picture; or why it was left out."""
     try:
-        srgb = read_photo(expand(cell.values["photo"], base)).srgb
+        srgb = read_photo(expand_path(cell.values["photo"], base)).srgb
         pose = find_pose(srgb, settings.boards[cell.values["board"]])
         fit = fit_board(srgb, pose)
     except PhotoRejected as cannot:
@@ -156,7 +156,7 @@ def _picture(srgb: np.ndarray, pasted: np.ndarray, fit: BoardFit) -> bytes:
     """Photograph, rendering in its place, and their difference about gray, side by side, cut out around the board."""
     rows, columns = np.nonzero(fit.mask)
     corners = rect_corners((columns.min(), rows.min(), np.ptp(columns) + 1, np.ptp(rows) + 1))
-    box = part_around(corners, _MARGIN_PX, srgb.shape)
+    box = region_around(corners, _MARGIN_PX, srgb.shape)
     difference = np.clip(128 + _AMPLIFIED * (srgb.astype(float) - pasted), 0, 255).astype(np.uint8)
     return png(np.concatenate([_panel(picture[box]) for picture in (srgb, pasted, difference)], 1))
 

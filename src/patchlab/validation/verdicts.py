@@ -18,10 +18,10 @@ from pydantic import Field
 from patchlab.study.grid import Count
 from patchlab.study.study import Cell, Result, Study
 from patchproof.base.goal import Goal
-from patchproof.base.sessions import Spread, evenly
-from patchproof.base.validation import Positive, Share, Strict
+from patchproof.base.sessions import RatePosterior, split_evenly
+from patchproof.base.validation import Positive, Share, StrictModel
 from patchproof.evidence.verdict import judge
-from patchproof.optimizer.promise import PER_SESSION, PROMISE_VIEWS
+from patchproof.optimizer.promise import PROMISE_VIEWS, VIEWS_PER_SESSION
 from patchproof.report.tables import Drawing, Table
 from patchproof.sheets.manifest import ConditionClaim, ControlClaim, ModelClaim, Promise, Target
 
@@ -32,7 +32,7 @@ _WORDS = ("kept", "cannot_tell", "broken")
 _STEPS = 26  # of true rates in the figure
 
 
-class VerdictsSettings(Strict):
+class VerdictsSettings(StrictModel):
     """One promise as it might be made, and photographs as they might be taken."""
 
     rate: Share = 0.85  # that is promised
@@ -55,7 +55,7 @@ def run(settings: VerdictsSettings, base: Path, cell: Cell) -> dict[str, Any]:
     rng, words = np.random.default_rng(0), {}
     promises = [_promise(settings, cell.values["correlation"], rng) for _ in range(settings.promises)]
     for sessions in settings.sessions:
-        parts = evenly(settings.photos, sessions)
+        parts = split_evenly(settings.photos, sessions)
         rows = [[judge(k, parts, promise).verdict for k in range(settings.photos + 1)] for promise in promises]
         words[str(sessions)] = [
             [float(np.mean([word == each for each in of_count])) for word in _WORDS]
@@ -66,9 +66,9 @@ def run(settings: VerdictsSettings, base: Path, cell: Cell) -> dict[str, Any]:
 
 def _promise(settings: VerdictsSettings, correlation: float, rng: np.random.Generator) -> Promise:
     strength = 1 / correlation - 1
-    sessions = PROMISE_VIEWS // PER_SESSION
+    sessions = PROMISE_VIEWS // VIEWS_PER_SESSION
     own = rng.beta(settings.rate * strength, (1 - settings.rate) * strength, (sessions, 1))
-    hits = (rng.random((sessions, PER_SESSION)) < own).ravel()
+    hits = (rng.random((sessions, VIEWS_PER_SESSION)) < own).ravel()
     rate, whole = float(hits.mean()), (0.0, 1.0)
     beside = ControlClaim(
         n=len(hits), rate=settings.control, interval=whole, confidence=0, difference=0, difference_interval=(-1, 1)
@@ -80,7 +80,7 @@ def _promise(settings: VerdictsSettings, correlation: float, rng: np.random.Gene
         rate=rate,
         interval=whole,
         n=len(hits),
-        per_session=PER_SESSION,
+        per_session=VIEWS_PER_SESSION,
         controls={"bare": beside},
         conditions=tuple(ConditionClaim(recognized=bool(hit), **unknown) for hit in hits),
     )
@@ -88,8 +88,8 @@ def _promise(settings: VerdictsSettings, correlation: float, rng: np.random.Gene
 
 def _chances(settings: VerdictsSettings, result: Result, sessions: int, rate: float) -> np.ndarray:
     """The chance of each of `_WORDS` at a true rate."""
-    at = Spread(np.array([rate]), np.array([result.cell.values["correlation"]]), np.ones(1))
-    return at.chances(evenly(settings.photos, sessions)) @ np.array(result.answers[str(sessions)])
+    at = RatePosterior(np.array([rate]), np.array([result.cell.values["correlation"]]), np.ones(1))
+    return at.chances(split_evenly(settings.photos, sessions)) @ np.array(result.answers[str(sessions)])
 
 
 def tables(settings: VerdictsSettings, results: Sequence[Result]) -> tuple[Table, ...]:

@@ -16,27 +16,27 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from patchproof.base.claims import difference, rate
 from patchproof.base.compute import Compute
 from patchproof.base.errors import Refused
+from patchproof.base.intervals import estimate_difference, rate
 from patchproof.base.output import new_folder
 from patchproof.base.progress import Progress, no_progress
-from patchproof.base.validation import listed
+from patchproof.base.validation import summarize_names
 from patchproof.base.workers import open_workers
 from patchproof.classifier.network import Classifier
-from patchproof.optimizer.evaluate import answers_of, forget, refuse_unnamed
+from patchproof.optimizer.evaluate import forget, refuse_networks_in_memory, run_responses
 from patchproof.optimizer.promise import CONTROLS, PROMISE_VIEWS
-from patchproof.optimizer.responses import Answers
+from patchproof.optimizer.responses import Responses
 from patchproof.optimizer.run import Run, load_run
 from patchproof.report.tables import Drawing, Results, Table, Value, write_results
-from patchproof.scene.interface import Scene, needs_piece
+from patchproof.scene.interface import Scene, require_piece
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 OWN = ("designs.html", "designs.json", "designs_*.csv", "designs_*.png")
 _HEAD = ("design", "made", "network", "rate", "best control", "minus it", "minus the best design")
-Shown = Mapping[str, Answers]  # what networks answered to a design and its controls
+AnswersByKind = Mapping[str, Responses]  # what networks answered to a design and its controls
 
 
 def compare(
@@ -61,14 +61,14 @@ def compare(
     Raises Refused for runs of different scenes.
     """
     networks, loaded = None if models is None else tuple(models), _loaded(runs, models is None)
-    refuse_unnamed(networks, compute)
+    refuse_networks_in_memory(networks, compute)
     scene, total, before = next(iter(loaded.values())).scene, n * (len(loaded) + 2), 0
     judges = networks or scene.settings.target.models
     names = tuple(each.name if isinstance(each, Classifier) else each for each in judges)
     seed = scene.seed if seed is None else seed
     with new_folder(out, OWN, overwrite) as folder, open_workers(compute.jobs, compute.cluster) as workers:
 
-        def ask(name: str, start: int) -> Shown:
+        def ask(name: str, start: int) -> AnswersByKind:
             nonlocal before
             run, done = loaded[name], before
             conditions = run.scene.draw("evaluate", n, seed, start)
@@ -76,7 +76,7 @@ def compare(
             def advance(count: int, _: int) -> None:
                 progress("evaluate", done + count, total)
 
-            answers, _ = answers_of(run.folder.resolve(), conditions, workers, networks, compute.device, advance)
+            answers, _ = run_responses(run.folder.resolve(), conditions, workers, networks, compute.device, advance)
             before += n
             return answers
 
@@ -107,7 +107,7 @@ def _loaded(runs: Sequence[str | Path], with_networks: bool) -> dict[str, Run]:
     paths = [Path(run).resolve() for run in runs]
     if len(set(paths)) < max(len(paths), 2):
         raise Refused(
-            "two runs or more to compare, each once", listed([str(run) for run in runs]) or "none", "name them"
+            "two runs or more to compare, each once", summarize_names([str(run) for run in runs]) or "none", "name them"
         )
     alike = len({path.name for path in paths}) < len(paths)
     loaded = {str(path) if alike else path.name: load_run(path) for path in paths}
@@ -121,14 +121,14 @@ def _loaded(runs: Sequence[str | Path], with_networks: bool) -> dict[str, Run]:
 
 def _views_of(scene: Scene, with_networks: bool) -> tuple[Any, ...]:
     """All that views of the scene depend on but its piece, and what is asked of networks."""
-    needs_piece(scene)
+    require_piece(scene)
     settings = scene.settings.model_dump(mode="json", exclude={"patch", "optimize", "sheet"})
     if not with_networks:
         del settings["target"]["models"]
-    return settings, scene.base.resolve(), scene.given_glb
+    return settings, scene.base.resolve(), scene.mesh_glb
 
 
-def _reached(answers: Mapping[str, Shown], scene: Scene, name: str) -> tuple[float, float]:
+def _reached(answers: Mapping[str, AnswersByKind], scene: Scene, name: str) -> tuple[float, float]:
     """How far a design reaches its goal before the first network: by rate, then by confidence."""
     design, sign = answers[name]["design"], scene.settings.target.goal.sign
     return sign * float(design.recognized[0].mean()), sign * float(design.confidence[0].mean())
@@ -138,8 +138,8 @@ def _tables(
     runs: Mapping[str, Run],
     networks: Sequence[str],
     order: Sequence[str],
-    all_views: Mapping[str, Shown],
-    fresh: Mapping[str, Shown],
+    all_views: Mapping[str, AnswersByKind],
+    fresh: Mapping[str, AnswersByKind],
 ) -> list[Table]:
     best = order[0]
     n = all_views[best]["design"].recognized.shape[1]
@@ -162,13 +162,13 @@ def _tables(
 
 
 def _row(
-    runs: Mapping[str, Run], answers: Mapping[str, Shown], name: str, best: str, network: str, i: int
+    runs: Mapping[str, Run], answers: Mapping[str, AnswersByKind], name: str, best: str, network: str, i: int
 ) -> tuple[Value, ...]:
     hits = {kind: answer.recognized[i].tolist() for kind, answer in answers[name].items()}
     sign = runs[name].promise.target.goal.sign
     control = max(CONTROLS, key=lambda kind: sign * sum(hits[kind]))
-    lead = None if name == best else difference(hits["design"], answers[best]["design"].recognized[i].tolist())
-    gain = difference(hits["design"], hits[control])
+    lead = None if name == best else estimate_difference(hits["design"], answers[best]["design"].recognized[i].tolist())
+    gain = estimate_difference(hits["design"], hits[control])
     return name, _made(runs[name]), network, rate(hits["design"]), control, gain, lead
 
 
@@ -177,7 +177,7 @@ def _made(run: Run) -> str:
     return "here" if run.details.get("imported") is None else "elsewhere"
 
 
-def _drawing(runs: Mapping[str, Run], answers: Mapping[str, Shown]) -> Drawing:
+def _drawing(runs: Mapping[str, Run], answers: Mapping[str, AnswersByKind]) -> Drawing:
     """Each design's picture beside its rate and its best control's."""
 
     def draw(figure: Figure) -> None:

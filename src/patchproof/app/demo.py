@@ -13,7 +13,7 @@ from patchproof.app.verify import verify
 from patchproof.base.compute import Compute
 from patchproof.base.output import new_folder
 from patchproof.base.progress import Progress, no_progress
-from patchproof.base.settings import behind
+from patchproof.base.settings import background_summary
 from patchproof.optimizer.run import optimize
 from patchproof.report.words import promise_lines, verdict_lines
 from patchproof.reprints.reprint import reprint
@@ -79,7 +79,7 @@ def run_demo(
         judged = verify(photos, folder / "sheet.json", report, compute=compute, progress=progress)
     return [
         "Hard conditions on purpose (far, dim, oblique, cluttered): bare object and controls are often misread.",
-        *promise_lines(run.promise, behind(run.scene.settings.model_dump())),
+        *promise_lines(run.promise, background_summary(run.scene.settings.model_dump())),
         *verdict_lines(judged),
         *(f"{out}/{name}" for name in ("run/design.png", "sheet.pdf", "sheet.json", "photos/", "report/report.html")),
     ]

@@ -21,7 +21,7 @@ from pydantic.fields import FieldInfo
 
 from patchproof.base.errors import Refused
 from patchproof.base.settings import SceneSettings
-from patchproof.base.validation import Strict, models_in, nearest, ordered
+from patchproof.base.validation import StrictModel, check_ordered, models_in, spelling_hint
 from patchproof.sheets.board import BoardTemplate
 from patchproof.sheets.template import Template
 
@@ -35,7 +35,7 @@ _UNITS = {"mm": "mm", "deg": "°", "px": "px", "ev": "stops"}
 _WORDS = {str: "text", int: "integer", float: "number", bool: "true or false"}
 
 
-Documents = Mapping[str, tuple[str, type[Strict]]]  # by name what a file of settings is for, and its settings
+Documents = Mapping[str, tuple[str, type[StrictModel]]]  # by name what a file of settings is for, and its settings
 DOCUMENTS: Documents = {
     "scene": ("A scene file: `patchproof optimize`, `plan`.", SceneSettings),
     "template": ("A page template: `patchproof sheet --template FILE.toml`.", Template),
@@ -49,7 +49,7 @@ def keys_page(documents: Documents, name: str | None = None, head: str = HEAD) -
         where: dict[type[BaseModel], str] = {}
         return "\n".join([head, *(_document(name, *documents[name], where) for name in documents)])
     if name not in documents:
-        raise Refused(f"one of {', '.join(documents)}", f'"{name}"', nearest(name, documents))
+        raise Refused(f"one of {', '.join(documents)}", f'"{name}"', spelling_hint(name, documents))
     return _document(name, *documents[name], {})
 
 
@@ -58,7 +58,7 @@ def meanings(model: type[BaseModel]) -> dict[str, str]:
     """By key the comment that says what it means; a key without one is missing."""
     texts = {}
     for owner in reversed(model.__mro__):
-        if not issubclass(owner, Strict) or owner is Strict:
+        if not issubclass(owner, StrictModel) or owner is StrictModel:
             continue
         source = inspect.getsource(owner)
         lines = source.splitlines()
@@ -73,7 +73,7 @@ def meanings(model: type[BaseModel]) -> dict[str, str]:
     return texts
 
 
-def _document(name: str, about: str, settings: type[Strict], where: dict[type[BaseModel], str]) -> str:
+def _document(name: str, about: str, settings: type[StrictModel], where: dict[type[BaseModel], str]) -> str:
     """One file's tables; those in `where` are told there."""
     lines = [f"## {name}", "", about, ""]
     for path, model in tables(settings):
@@ -119,7 +119,7 @@ def default_text(field: FieldInfo) -> str:
 
 def toml_text(value: Any) -> str:
     """A value as TOML writes it, four digits of numbers."""
-    if isinstance(value, Strict):
+    if isinstance(value, StrictModel):
         value = value.model_dump(exclude_defaults=True)
     if isinstance(value, Mapping):
         return "{" + ", ".join(f"{key} = {toml_text(inner)}" for key, inner in value.items()) + "}"
@@ -144,12 +144,12 @@ def _kind(hint: Any, checks: tuple[Any, ...] = (), plural: str = "") -> str:
     if origin is tuple and inner[-1] is Ellipsis:
         least = max((value for name, value in _bounds(checks) if name == "min_length"), default=0)
         return f"list of {_kind(inner[0], plural='s')}{ {0: '', 1: ', not empty'}.get(least, f', {least} or more') }"
-    if origin is tuple and AfterValidator(ordered) in checks:
+    if origin is tuple and AfterValidator(check_ordered) in checks:
         return f"[low, high]{_range((*get_args(inner[0])[1:], *checks))}"
     if origin is tuple:
         kinds = {_kind(member, plural="s") for member in inner}
         return f"[{len(inner)} {kinds.pop() if len(kinds) == 1 else 'numbers'}]"
-    word = "table" if isinstance(hint, type) and issubclass(hint, Strict) else _WORDS.get(hint, "value")
+    word = "table" if isinstance(hint, type) and issubclass(hint, StrictModel) else _WORDS.get(hint, "value")
     return word + plural + _range(checks)
 
 

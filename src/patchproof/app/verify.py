@@ -21,19 +21,19 @@ from patchproof.base.compute import Compute
 from patchproof.base.errors import Refused
 from patchproof.base.geometry import apply_homography, rect_corners
 from patchproof.base.input import is_file
-from patchproof.base.output import check_folder, write_pictures, write_whole
+from patchproof.base.output import check_folder, write_atomically, write_pictures
 from patchproof.base.progress import Progress, no_progress
-from patchproof.channel.cameras import camera_of
+from patchproof.channel.cameras import load_optional_camera
 from patchproof.channel.printer import load_printer
 from patchproof.classifier.load import load_classifier
 from patchproof.classifier.network import Classifier
-from patchproof.evidence.batch import WITH_PICTURES
-from patchproof.evidence.boxes import from_square, given_boxes
+from patchproof.evidence.batch import MAX_PICTURED_PHOTOS
+from patchproof.evidence.boxes import box_corners_px, load_boxes
+from patchproof.evidence.gather import gather_evidence
 from patchproof.evidence.journal import file_sha256
 from patchproof.evidence.results import Origin, Report
-from patchproof.evidence.run import gather_evidence
 from patchproof.evidence.task import LEDGER_PHOTOS, Options
-from patchproof.report.coco import PATCH, Labeled, coco_json
+from patchproof.report.coco import PATCH, LabeledPhoto, coco_json
 from patchproof.report.images import save_pictures, stem_of
 from patchproof.report.page import versions_of
 from patchproof.report.write import write_report
@@ -119,12 +119,12 @@ def verify(
         if manifest.promise is None or not any(model.LOOKS_AT_BOXES for model in options.models):
             got = "none that judges these photographs"
             raise Refused("a detector, which alone looks at boxes", got, "leave boxes out")
-        options = replace(options, boxes=given_boxes(boxes, manifest.promise.target.label))
+        options = replace(options, boxes=load_boxes(boxes, manifest.promise.target.label))
     forecast = None
     if run is not None:
-        from patchproof.reprints.retake import retaker  # brings scene, renderer and optimizer in
+        from patchproof.reprints.photo_forecast import photo_forecaster  # brings scene, renderer and optimizer in
 
-        forecast = retaker(run, manifest)
+        forecast = photo_forecaster(run, manifest)
     report = gather_evidence(
         photos,
         manifest,
@@ -141,13 +141,13 @@ def verify(
     given |= {"boxes": boxes and Path(boxes).name, "ledger_photos": ledger_photos}
     hashes = {"manifest": file_sha256(Path(sheet)), **{f"network {each.name}": each.sha256 for each in options.models}}
     report = report.changed(origin=Origin(options=given, sha256=hashes, versions=versions_of(_LIBRARIES)))
-    shown = {stem_of(photo.file) for photo in report.photos[:WITH_PICTURES]}
+    shown = {stem_of(photo.file) for photo in report.photos[:MAX_PICTURED_PHOTOS]}
     for path in list((out / "pictures").glob("*")):  # those of photographs that this report does not show
         if path.name.rsplit(".", 2)[0] not in shown:
             path.unlink()
     ledger = report.ledger and report.ledger.model_dump()
     write_report(report.model_dump(mode="json"), manifest.model_dump(mode="json"), out, ledger)
-    write_whole(out / "coco.json", _boxes(report, manifest, options.camera))
+    write_atomically(out / "coco.json", _boxes(report, manifest, options.camera))
     return report
 
 
@@ -165,8 +165,8 @@ def _boxes(report: Report, manifest: Manifest, camera: Camera | None) -> str:
         known = px_from_mm is not None and not bends and entry.status != "rejected"
         outlines = {PATCH: apply_homography(np.array(px_from_mm), corners)} if known else {}
         if entry.box is not None and not bends:
-            outlines[label] = from_square(entry.box, entry.photo_px)
-        photos.append(Labeled(entry.file, entry.photo_px, outlines))
+            outlines[label] = box_corners_px(entry.box, entry.photo_px)
+        photos.append(LabeledPhoto(entry.file, entry.photo_px, outlines))
     return coco_json(photos, label, f"photographs of sheet {manifest.sheet_id}")
 
 
@@ -180,9 +180,11 @@ def options_of(
     base, promise = Path(sheet).resolve().parent, manifest.promise
     least_score = None if promise is None else promise.models[0].least_score
     return Options(
-        models=[load_classifier(network, base).at_score(least_score) for network in _networks(manifest, models)],
+        models=[
+            load_classifier(network, base).with_least_score(least_score) for network in _networks(manifest, models)
+        ],
         printer=load_printer((manifest.settings.get("printer") or {}).get("profile", "coated"), base),
-        camera=camera_of(camera),
+        camera=load_optional_camera(camera),
     )
 
 

@@ -16,13 +16,13 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-Values = TypeVar("Values")  # what comes in, an array or a tensor, comes out
+ArrayOrTensor = TypeVar("ArrayOrTensor")  # what comes in, an array or a tensor, comes out
 LUMINANCE = (0.2126390, 0.7151687, 0.0721923)  # Y of sRGB's linear primaries, D65
 _XYZ_FROM_LINEAR = ((0.4123908, 0.3575843, 0.1804808), LUMINANCE, (0.0193308, 0.1191948, 0.9505322))
 _WHITE_D65 = (0.9504559, 1.0, 1.0890578)  # the matrix's own row sums, so that sRGB white is exactly L* 100, a* b* 0
 
 
-def linear_from_srgb(srgb: Values) -> Values:
+def linear_from_srgb(srgb: ArrayOrTensor) -> ArrayOrTensor:
     """Light from sRGB code values, per value; odd-symmetric below 0 so that it can be inverted and differentiated."""
     xp = _library(srgb)
     size = xp.abs(srgb)
@@ -31,7 +31,7 @@ def linear_from_srgb(srgb: Values) -> Values:
     return xp.sign(srgb) * xp.where(size <= 0.04045, size / 12.92, curved)
 
 
-def srgb_from_linear(linear: Values) -> Values:
+def srgb_from_linear(linear: ArrayOrTensor) -> ArrayOrTensor:
     """The sRGB code values of light, per value; the exact inverse of `linear_from_srgb`."""
     xp = _library(linear)
     size = xp.abs(linear)
@@ -39,7 +39,7 @@ def srgb_from_linear(linear: Values) -> Values:
     return xp.sign(linear) * xp.where(size <= 0.0031308, 12.92 * size, curved)
 
 
-def clamped(values):
+def clamp_to_unit(values):
     """Values clipped to [0, 1], with a gradient of 1 at 0 and 1 themselves: `torch.clamp` has had 0 there since 2.14,
     and a pixel of full black or white would never move again.
     """
@@ -49,14 +49,14 @@ def clamped(values):
     return values.clamp(0, 1)
 
 
-def codes_of(srgb):
+def codes_from_srgb(srgb):
     """The nearest uint8 code values of sRGB, clipped to [0, 1]; halves go to even codes."""
     xp = _library(srgb)
     codes = xp.round(xp.clip(srgb, 0, 1) * 255)
     return codes.astype(np.uint8) if xp is np else codes.byte()
 
 
-def photo_codes_of(srgb: np.ndarray) -> np.ndarray:
+def photo_codes_from_srgb(srgb: np.ndarray) -> np.ndarray:
     """The same with halves up, as photographs have always been rounded here: they keep their bytes."""
     return (np.clip(srgb, 0, 1) * 255 + 0.5).astype(np.uint8)
 
@@ -129,4 +129,4 @@ def _at_least(xp, array, floor: float):
     return np.maximum(array, floor) if xp is np else array.clamp_min(floor)
 
 
-LIGHT_OF_CODE = linear_from_srgb(np.arange(256) / 255)  # of 8-bit code values
+LINEAR_FROM_CODE = linear_from_srgb(np.arange(256) / 255)  # of 8-bit code values

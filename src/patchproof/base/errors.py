@@ -31,7 +31,7 @@ class Refused(PatchproofError, ValueError):
         expected, got, do = (part if len(part) < 2000 else f"{part[:1000]} ..." for part in self._parts)
         super().__init__(" ".join(f"Expected {expected}, got {got}: {do.rstrip('.')}.".split()))
 
-    def advised(self, advice: str) -> Refused:
+    def with_advice(self, advice: str) -> Refused:
         """A copy of this error with `advice` appended to what to do."""
         expected, got, do = self._parts
         return Refused(expected, got, f"{do.rstrip('.')}{advice}")

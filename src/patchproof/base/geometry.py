@@ -76,13 +76,13 @@ def intrinsics(fov_deg: float, size_px: tuple[int, int]) -> np.ndarray:
 def project(matrix_px, camera_from_world, points_mm) -> np.ndarray:
     """Pixels N×2 of world points N×3; points behind the camera give NaN."""
     points = np.asarray(points_mm, float)
-    camera = carried(camera_from_world, points)
+    camera = transform_points(camera_from_world, points)
     camera = np.where(camera[:, 2:] > 0, camera, np.nan)
     image = camera @ np.asarray(matrix_px).T
     return image[:, :2] / image[:, 2:]
 
 
-def carried(frame, points_mm) -> np.ndarray:
+def transform_points(frame, points_mm) -> np.ndarray:
     """Points N×3 by a pose 4×4."""
     return np.asarray(points_mm, float) @ frame[:3, :3].T + frame[:3, 3]
 
@@ -97,10 +97,10 @@ def plane_homography(matrix_px, camera_from_world, world_from_plane) -> np.ndarr
     poses N×4×4, N×3×3.
     """
     pose = camera_from_world @ world_from_plane
-    return normalized(matrix_px @ pose[..., :3, [0, 1, 3]])
+    return normalize_homography(matrix_px @ pose[..., :3, [0, 1, 3]])
 
 
-def scaled_about(middle, scale: float) -> np.ndarray:
+def scaling_about(middle, scale: float) -> np.ndarray:
     """(D+1)×(D+1): everything `scale` times as far from `middle` (D values)."""
     middle = np.asarray(middle, float)
     matrix = np.eye(len(middle) + 1)
@@ -109,7 +109,7 @@ def scaled_about(middle, scale: float) -> np.ndarray:
     return matrix
 
 
-def normalized(homography) -> np.ndarray:
+def normalize_homography(homography) -> np.ndarray:
     """The same homography (or each of N×3×3) with its last entry 1, or with unit norm where that entry vanishes."""
     homography = np.asarray(homography, float)
     last, largest = homography[..., 2, 2], np.abs(homography).max((-2, -1))
@@ -133,7 +133,7 @@ def fit_homography(source, target) -> np.ndarray:
     a1 = np.hstack([a, ones])
     rows = np.vstack([np.hstack([a1, zeros, -b[:, :1] * a1]), np.hstack([zeros, a1, -b[:, 1:] * a1])])
     homography = np.linalg.svd(rows)[2][-1].reshape(3, 3)
-    return normalized(np.linalg.inv(to_b) @ homography @ to_a)
+    return normalize_homography(np.linalg.inv(to_b) @ homography @ to_a)
 
 
 def local_scale(homography, point) -> tuple[float, float]:
@@ -187,7 +187,7 @@ def rect_corners(rect) -> np.ndarray:
     return np.array([[x, y], [x + w, y], [x + w, y + h], [x, y + h]], float)
 
 
-def turned_extent(size, degrees: float) -> np.ndarray:
+def rotated_extent(size, degrees: float) -> np.ndarray:
     """Width and height of what encloses a turned rectangle."""
     c, s = abs(np.cos(np.radians(degrees))), abs(np.sin(np.radians(degrees)))
     return np.array([c * size[0] + s * size[1], s * size[0] + c * size[1]])

@@ -32,12 +32,12 @@ _AGAIN_S = 0.5  # should a library swallow the first interruption
 _LOOK_S = 0.1
 
 Arguments = ParamSpec("Arguments")
-Result = TypeVar("Result")
+ReturnType = TypeVar("ReturnType")
 
 # an allow-list, because Pillow also opens formats that start other programs (EPS) or hold no photograph
-FORMATS = ("JPEG", "MPO", "PNG", "TIFF", "WEBP", "BMP", "GIF", "AVIF", "HEIF")
-LARGEST_PX = 120_000_000  # 360 MB as pixels; the largest phone sensors in common use give 50 to 108 million
-LARGEST_JSON = 16 << 20  # bytes; a manifest has 0.3 million, and lists of nothing take 25 times their text in memory
+IMAGE_FORMATS = ("JPEG", "MPO", "PNG", "TIFF", "WEBP", "BMP", "GIF", "AVIF", "HEIF")
+MAX_IMAGE_PX = 120_000_000  # 360 MB as pixels; the largest phone sensors in common use give 50 to 108 million
+MAX_JSON_BYTES = 16 << 20  # bytes; a manifest has 0.3 million, and lists of nothing take 25 times their text in memory
 
 
 def is_file(path: str | Path) -> bool:
@@ -56,15 +56,15 @@ def read_json(path: str | Path, expected: str, do: str, missing: str = "check th
     if not is_file(path):
         raise Refused(expected, f"no file at {path}", missing)
     try:
-        if path.stat().st_size > LARGEST_JSON:
-            raise ValueError(f"more than {LARGEST_JSON >> 20} MiB")
+        if path.stat().st_size > MAX_JSON_BYTES:
+            raise ValueError(f"more than {MAX_JSON_BYTES >> 20} MiB")
         return json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:  # RecursionError: thousands of lists in each other
         raise Refused(expected, f"{path} that cannot be read ({error})", do) from error
 
 
 @contextmanager
-def opened_picture(source: Path | bytes, expected: str, do: str) -> Iterator[Image]:
+def open_image(source: Path | bytes, expected: str, do: str) -> Iterator[Image]:
     """A Pillow image of a file, or of a file's bytes; what fails in decoding it is refused with `do`."""
     from PIL import Image
 
@@ -72,7 +72,7 @@ def opened_picture(source: Path | bytes, expected: str, do: str) -> Iterator[Ima
     try:
         opened = io.BytesIO(source) if isinstance(source, bytes) else source
         with Image.open(opened, formats=readable_formats()) as image:
-            if image.width * image.height > LARGEST_PX:
+            if image.width * image.height > MAX_IMAGE_PX:
                 raise ValueError(f"{image.width} × {image.height} pixels")
             yield image
     except Refused:
@@ -83,18 +83,20 @@ def opened_picture(source: Path | bytes, expected: str, do: str) -> Iterator[Ima
 
 
 def readable_formats() -> list[str]:
-    """Those of `FORMATS` that this Pillow reads."""
+    """Those of `IMAGE_FORMATS` that this Pillow reads."""
     from PIL import Image
 
     Image.init()
-    return [name for name in FORMATS if name in Image.OPEN]
+    return [name for name in IMAGE_FORMATS if name in Image.OPEN]
 
 
 class _Expired(BaseException):
     """The time is over; no `except Exception` on the way may think otherwise."""
 
 
-def within_time(work: Callable[Arguments, Result], *arguments: Arguments.args, **keywords: Arguments.kwargs) -> Result:
+def within_time(
+    work: Callable[Arguments, ReturnType], *arguments: Arguments.args, **keywords: Arguments.kwargs
+) -> ReturnType:
     """What `work` returns; `TimeLimitExceeded` when it takes too long."""
     if not has_timer() or signal.getitimer(signal.ITIMER_PROF)[0] > 0:
         return work(*arguments, **keywords)
@@ -120,11 +122,11 @@ def within_time(work: Callable[Arguments, Result], *arguments: Arguments.args, *
         signal.signal(signal.SIGPROF, before)
 
 
-def left_behind(work: Callable[[], Result]) -> Result:
+def left_behind(work: Callable[[], ReturnType]) -> ReturnType:
     """What `work` returns, done in a thread that an interruption leaves to itself: for libraries that take what time
     they like, and whose results nobody else uses.
     """
-    done: list[Result] = []
+    done: list[ReturnType] = []
     failed: list[BaseException] = []
 
     def run() -> None:

@@ -85,7 +85,7 @@ def make_folder(path: Path) -> None:
         raise Refused("a folder that can be made", f"{path} ({error.strerror})", "choose another --out") from error
 
 
-def write_whole(path: Path, content: str | bytes | Callable[[Path], Any]) -> None:
+def write_atomically(path: Path, content: str | bytes | Callable[[Path], Any]) -> None:
     """Put the content, or what a function fills a file with, beside `path` and move it there: a reader sees the old
     file or the new one, whole.
     """
@@ -103,7 +103,7 @@ def write_whole(path: Path, content: str | bytes | Callable[[Path], Any]) -> Non
         part.unlink(missing_ok=True)
 
 
-def write_together(contents: dict[Path, bytes]) -> None:
+def write_files_atomically(contents: dict[Path, bytes]) -> None:
     """Write several files, all beside their places first: a full disk leaves what was there before."""
     waiting = {path: path.with_name(f".{path.name}.{os.getpid()}.part") for path in contents}
     path = next(iter(contents))

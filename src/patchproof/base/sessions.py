@@ -1,7 +1,7 @@
 """Sessions: photographs that share a print, a lamp, a camera and a place are alike, and count for less than their
 number.
 
-In: how many photographs of each of some sessions were recognized. Out: a `Spread`, everything that these counts say of
+In: how many photographs of each of some sessions were recognized. Out: a `RatePosterior`, everything that these counts say of
 the rate and of how much sessions differ (the correlation of two photographs of one session); from it the rate's
 interval, the counts that photographs of new sessions will show, and what rates such counts allow.
 
@@ -21,7 +21,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from patchproof.base.claims import CONFIDENCE, paired_difference, student_mean
+from patchproof.base.intervals import CONFIDENCE, paired_difference, student_mean
 
 TAIL = (1 - CONFIDENCE) / 2
 _RATES, _CORRELATIONS = 240, 36
@@ -31,7 +31,7 @@ _INDEPENDENT = 1e-7  # a correlation that is none
 
 
 @dataclass(frozen=True, eq=False)
-class Spread:
+class RatePosterior:
     """A posterior over points of a grid: P rates, P correlations within a session, P weights that sum to 1."""
 
     rates: np.ndarray
@@ -76,13 +76,13 @@ class Spread:
         return tuple(values), tuple(np.bincount(which, self.weights))
 
 
-def spread_of(recognized: Sequence[int], photos: Sequence[int]) -> Spread:
+def rate_posterior(recognized: Sequence[int], photos: Sequence[int]) -> RatePosterior:
     """What the counts of some sessions say; of none, what was believed before."""
     return _spread_of(tuple(map(int, recognized)), tuple(map(int, photos)))
 
 
 @lru_cache(maxsize=32)
-def _spread_of(recognized: tuple[int, ...], photos: tuple[int, ...]) -> Spread:
+def _spread_of(recognized: tuple[int, ...], photos: tuple[int, ...]) -> RatePosterior:
     from scipy.special import betaln
 
     rates, correlations = _grid() if max(photos, default=0) > 1 else (_grid()[0], np.array([_INDEPENDENT]))
@@ -93,18 +93,18 @@ def _spread_of(recognized: tuple[int, ...], photos: tuple[int, ...]) -> Spread:
         log += often * (betaln(alpha + k, beta + n - k) - before)
     weights = np.exp(log - log.max())
     kept = weights > _NEGLIGIBLE
-    return Spread(rate[kept], correlation[kept], weights[kept] / weights[kept].sum())
+    return RatePosterior(rate[kept], correlation[kept], weights[kept] / weights[kept].sum())
 
 
 @lru_cache(maxsize=32)
-def _chances_of(spread: Spread, photos: tuple[int, ...]) -> np.ndarray:
+def _chances_of(spread: RatePosterior, photos: tuple[int, ...]) -> np.ndarray:
     """`Spread.chances`, once for all counts that are judged by it."""
     chances = spread.weights @ _chances(spread.rates, spread.correlations, photos)
     chances.flags.writeable = False
     return chances
 
 
-def in_sessions(
+def count_by_session(
     hits: Sequence[bool] | np.ndarray, each: int, places: Sequence[int] = ()
 ) -> tuple[list[int], list[int]]:
     """(recognized, photographs) of sessions of `each` photographs in a row; the last may have fewer. Sessions whose
@@ -121,7 +121,7 @@ def _parts(values: Sequence[bool] | np.ndarray, each: int) -> list[Sequence[bool
     return [values[first : first + each] for first in range(0, len(values), each)]
 
 
-def difference_in_sessions(
+def session_difference(
     a: Sequence[bool] | np.ndarray, b: Sequence[bool] | np.ndarray, each: int
 ) -> tuple[float, tuple[float, float]]:
     """Rate of `a` minus rate of `b` on the same conditions, sessions of `each` in a row; the wider of Newcombe's paired
@@ -137,7 +137,7 @@ def difference_in_sessions(
     return difference, (low, high)
 
 
-def evenly(photos: int, sessions: int) -> tuple[int, ...]:
+def split_evenly(photos: int, sessions: int) -> tuple[int, ...]:
     """So many photographs spread over so many sessions, as evenly as they go."""
     return tuple(photos // sessions + (i < photos % sessions) for i in range(sessions))
 

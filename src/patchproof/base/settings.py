@@ -23,15 +23,15 @@ from patchproof.base.validation import (
     Share,
     ShareRange,
     Side,
-    Strict,
-    ordered,
+    StrictModel,
+    check_ordered,
     read_toml,
-    validated,
+    validate_model,
     within,
 )
 
 
-class ObjectSettings(Strict):
+class ObjectSettings(StrictModel):
     """The thing that the patch hangs on: a mesh (a file or `primitive:NAME`), photographs of it with a blank sheet on
     it, or a folder of labeled images.
     """
@@ -56,7 +56,7 @@ class ObjectSettings(Strict):
         return self
 
 
-class SearchSettings(Strict):
+class SearchSettings(StrictModel):
     """Where and how the piece may lie with `place = "auto"`; it never overhangs the object by more than 2 %."""
 
     upright: bool = False  # never turned in its plane
@@ -65,7 +65,7 @@ class SearchSettings(Strict):
     gap_mm: Positive | None = None  # largest distance from piece to surface; 15 % of the piece's shorter edge
 
 
-class PatchSettings(Strict):
+class PatchSettings(StrictModel):
     """What is optimized. A patch has a size and a place; `offset_mm` is [right, up] as one faces the side. A texture
     covers the object's own UV map or vertices, `masked` only what mask, materials or faces name.
     """
@@ -121,13 +121,13 @@ class PatchSettings(Strict):
         return self
 
 
-class SheetSettings(Strict):
+class SheetSettings(StrictModel):
     """The page that the piece is printed on."""
 
     template: str = "a4"  # a shipped template's name, or a TOML file
 
 
-class TargetSettings(Strict):
+class TargetSettings(StrictModel):
     """What the classifiers should see, and which classifiers."""
 
     label: str | int  # an index, or a name in the first network's list
@@ -137,7 +137,7 @@ class TargetSettings(Strict):
     least_score: Share | None = None  # from which on a detector's box counts; by default its own, or 0.5
 
 
-class ViewSettings(Strict):
+class ViewSettings(StrictModel):
     """Where the camera may be."""
 
     look_at: Literal["object", "patch"] = "object"  # whose middle the camera looks at
@@ -152,7 +152,7 @@ class ViewSettings(Strict):
     patch_share: ShareRange = (0.1, 0.3)  # piece's longer side over the picture's shorter side, in a folder of images
 
 
-class LightSettings(Strict):
+class LightSettings(StrictModel):
     """Ambient and directional light; 1 is the light in which white paper is sRGB white at exposure 0."""
 
     ambient: NotNegativeRange = (0.3, 0.7)  # light from everywhere
@@ -164,7 +164,7 @@ class LightSettings(Strict):
     elevation_deg: Annotated[Range, within(-90, 90)] = (10.0, 80.0)  # of the directional light above the horizontal
 
 
-class BackgroundSettings(Strict):
+class BackgroundSettings(StrictModel):
     """What is behind the object; procedural places where nothing is given."""
 
     # A folder of photographs, each for one of training, selection, promise and evaluation; a picture: the known place.
@@ -179,7 +179,7 @@ class BackgroundSettings(Strict):
         return self
 
 
-class PrinterSettings(Strict):
+class PrinterSettings(StrictModel):
     """The printer's appearance model (a name in calibration/printers, or a file), and how prints differ from it."""
 
     profile: str = "coated"  # coated, uncoated, or a file that `calibrate printer` wrote
@@ -191,7 +191,7 @@ class PrinterSettings(Strict):
     scale: Annotated[PositiveRange, within(0.5, 2)] = (1.0, 1.0)  # size over the sheet's own
 
 
-class CameraSettings(Strict):
+class CameraSettings(StrictModel):
     """What the camera does; blur and noise are meant at `photo_px`."""
 
     # Width and height of a whole photograph.
@@ -206,11 +206,11 @@ class CameraSettings(Strict):
     motion_px: NotNegativeRange = (0.0, 0.0)  # length of a straight motion blur at photo_px
     file: str | None = None  # a calibrated camera: intrinsics and lens distortion in place of fov_deg
     jpeg: Annotated[
-        tuple[Annotated[int, Field(ge=1, le=100)], Annotated[int, Field(ge=1, le=100)]], AfterValidator(ordered)
+        tuple[Annotated[int, Field(ge=1, le=100)], Annotated[int, Field(ge=1, le=100)]], AfterValidator(check_ordered)
     ] = (60, 95)  # quality of the file
 
 
-class OptimizeSettings(Strict):
+class OptimizeSettings(StrictModel):
     """The loop: `views` conditions in each of `steps` steps."""
 
     steps: Annotated[int, Field(ge=1)] = 240  # of the loop
@@ -226,7 +226,7 @@ class OptimizeSettings(Strict):
     gamut: NotNegative = 1.0  # loss for colors that the printer misses, per 100 ΔE00
 
 
-class PromiseSettings(Strict):
+class PromiseSettings(StrictModel):
     """How well a promise has to be known; no part of what is printed."""
 
     # Of the rate's interval: half or three quarters of 400 views are taken where it is no wider after them and every
@@ -234,7 +234,7 @@ class PromiseSettings(Strict):
     half_width: Annotated[Share, Field(ge=0.005)] = 0.04
 
 
-class SceneSettings(Strict):
+class SceneSettings(StrictModel):
     """A whole scene file."""
 
     object: ObjectSettings
@@ -264,7 +264,7 @@ class SceneSettings(Strict):
         return self
 
 
-def behind(settings: Mapping[str, Any]) -> str:
+def background_summary(settings: Mapping[str, Any]) -> str:
     """What stood behind the object, in words, of a scene's settings as plain data; "" where they do not say."""
     if (settings.get("object") or {}).get("mesh") is None:
         return "the scene's own pictures" if "object" in settings else ""
@@ -277,9 +277,9 @@ def behind(settings: Mapping[str, Any]) -> str:
 
 def load_scene_settings(path: str | Path) -> SceneSettings:
     """A scene file's settings as written, `${VAR}` unexpanded: a run must not depend on where its files lie."""
-    return validated(SceneSettings, read_toml(path), str(path))
+    return validate_model(SceneSettings, read_toml(path), str(path))
 
 
-def identifying(settings: Strict) -> dict[str, Any]:
+def identity_settings(settings: StrictModel) -> dict[str, Any]:
     """What a sheet id is made of: settings that differ from their defaults, so that a key more changes no sheet."""
     return settings.model_dump(mode="json", exclude={"promise"}, exclude_defaults=True)

@@ -28,7 +28,7 @@ def _finite(value: float) -> float:
     return value
 
 
-def ordered(pair: tuple[float, float]) -> tuple[float, float]:
+def check_ordered(pair: tuple[float, float]) -> tuple[float, float]:
     """A range as it is, when its low end is not above its high one."""
     if pair[0] > pair[1]:
         raise ValueError(f"must be [low, high] with low <= high, not [{pair[0]:g}, {pair[1]:g}]")
@@ -39,15 +39,15 @@ Finite = Annotated[float, AfterValidator(_finite)]
 Positive = Annotated[Finite, Field(gt=0)]
 NotNegative = Annotated[Finite, Field(ge=0)]
 Share = Annotated[Finite, Field(ge=0, le=1)]
-Range = Annotated[tuple[Finite, Finite], AfterValidator(ordered)]
-ShareRange = Annotated[tuple[Share, Share], AfterValidator(ordered)]
-NotNegativeRange = Annotated[tuple[NotNegative, NotNegative], AfterValidator(ordered)]
-PositiveRange = Annotated[tuple[Positive, Positive], AfterValidator(ordered)]
+Range = Annotated[tuple[Finite, Finite], AfterValidator(check_ordered)]
+ShareRange = Annotated[tuple[Share, Share], AfterValidator(check_ordered)]
+NotNegativeRange = Annotated[tuple[NotNegative, NotNegative], AfterValidator(check_ordered)]
+PositiveRange = Annotated[tuple[Positive, Positive], AfterValidator(check_ordered)]
 Side = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
 Model = TypeVar("Model", bound=BaseModel)
 
 
-class Strict(BaseModel):
+class StrictModel(BaseModel):
     """Frozen settings that know all their keys."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -59,8 +59,10 @@ class Strict(BaseModel):
         tables = {name: getattr(self, name) for name in type(self).model_fields}
         for name, value in values.items():
             table = tables.get(name)
-            tables[name] = table.changed(**value) if isinstance(table, Strict) and isinstance(value, dict) else value
-        return validated(type(self), tables, type(self).__name__)
+            tables[name] = (
+                table.changed(**value) if isinstance(table, StrictModel) and isinstance(value, dict) else value
+            )
+        return validate_model(type(self), tables, type(self).__name__)
 
 
 def read_toml(path: str | Path) -> dict[str, Any]:
@@ -74,7 +76,7 @@ def read_toml(path: str | Path) -> dict[str, Any]:
         raise Refused("a TOML file", f"{path} that cannot be read ({error})", "mend that line") from error
 
 
-def validated(model: type[Model], data: Any, where: str) -> Model:
+def validate_model(model: type[Model], data: Any, where: str) -> Model:
     """`data` as `model`; the first thing wrong with it is refused by its key, with the nearest known key."""
     try:
         return model.model_validate(data)
@@ -88,7 +90,7 @@ def validated(model: type[Model], data: Any, where: str) -> Model:
 NETWORK_FILE = re.compile(r"(file:|clip:[^@:]+@|(?:torchvision|timm):[^@:]+@(?=.+\.safetensors$))(.*)", re.DOTALL)
 
 
-def expand(text: str, base: Path) -> str:
+def expand_path(text: str, base: Path) -> str:
     """A path or model name with `${VAR}` expanded and, where it names a file, relative to `base`."""
 
     def variable(match: re.Match) -> str:
@@ -104,14 +106,14 @@ def expand(text: str, base: Path) -> str:
     return text if by_prefix or text in ("builtin", "builtin-detector") else str(base / text)
 
 
-def nearest(word: str, known: Iterable[str]) -> str:
+def spelling_hint(word: str, known: Iterable[str]) -> str:
     """`(did you mean "x"?)` where a known word is near, else the known words."""
     known = list(known)
     near = difflib.get_close_matches(word, known, 1, 0.5)
     return f'did you mean "{near[0]}"' if near else f"use one of: {', '.join(known)}"
 
 
-def listed(names: Sequence[str]) -> str:
+def summarize_names(names: Sequence[str]) -> str:
     """The first three names, and how many more there are."""
     return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
@@ -130,7 +132,7 @@ def _inside(low: float, high: float, pair: tuple[float, float]) -> tuple[float, 
 def _explain(model: type[BaseModel], error: ErrorDetails, where: str) -> Refused:
     key = ".".join(str(part) for part in error["loc"])
     if error["type"] == "extra_forbidden":
-        hint = nearest(str(error["loc"][-1]), _keys_at(model, error["loc"][:-1]))
+        hint = spelling_hint(str(error["loc"][-1]), _keys_at(model, error["loc"][:-1]))
         return Refused(f"only known keys in {where}", f'"{key}"', hint)
     if error["type"] == "missing":
         return Refused(f'the key "{key}" in {where}', "none", f"add {key}")

@@ -6,7 +6,7 @@ alone, so that only the item that kills its worker is given up.
 
 Other processes work on one thread each, which keeps them from fighting over the machine; with one thread here, too,
 the results are the same wherever they were made. Local processes are forked where that is safe: they start in
-milliseconds, and `sharing` gives them all that this process has loaded. Elsewhere they are spawned and import anew, and
+milliseconds, and `fork_workers` gives them all that this process has loaded. Elsewhere they are spawned and import anew, and
 what shares data stays in this process. A cluster's machines need this package and see the same files at the same paths.
 """
 
@@ -128,7 +128,7 @@ def open_workers(jobs: int = 1, cluster: str | None = None, apart: bool = False)
         forks = can_fork() and not apart
         start = partial(_processes, jobs, forks)
         workers = Workers(start, 2 * jobs, not forks) if jobs > 1 or apart else Workers(_Here, 1)
-        with threads(1) if forks and jobs > 1 else nullcontext(), closing(workers):
+        with use_threads(1) if forks and jobs > 1 else nullcontext(), closing(workers):
             yield workers
         return
     if jobs > 1:
@@ -138,7 +138,7 @@ def open_workers(jobs: int = 1, cluster: str | None = None, apart: bool = False)
 
 
 @contextmanager
-def sharing(
+def fork_workers(
     function: Callable[[Any], Any], jobs: int, in_turn: bool = False
 ) -> Iterator[tuple[Workers, Callable[[Any], Any]]]:
     """`jobs` forked processes that have a function with everything that it refers to, as it is now, and what to call in
@@ -148,11 +148,11 @@ def sharing(
     """
     alone = jobs == 1 or _function is not None
     if alone or not can_fork():
-        with nullcontext() if alone else threads(jobs):
+        with nullcontext() if alone else use_threads(jobs):
             yield Workers(_Here, 1), function
         return
     start = partial(_InTurn if in_turn else _processes, jobs, True, function)
-    with threads(1), closing(Workers(start, 2 * jobs)) as workers:
+    with use_threads(1), closing(Workers(start, 2 * jobs)) as workers:
         yield workers, _shared
 
 
@@ -170,7 +170,7 @@ def keep_freed_memory() -> None:
         library.mallopt(-1, 1 << 28)  # M_TRIM_THRESHOLD: without it limits of memory would be nobody's
 
 
-def free_cores() -> int:
+def available_cores() -> int:
     """How many cores this process may use, by its affinity and its container's quota."""
     cores = len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
     quota, period = _QUOTA.read_text("ascii").split() if _QUOTA.is_file() else ("max", "1")
@@ -191,7 +191,7 @@ def result_of(future: Future) -> Any:
 
 
 @contextmanager
-def threads(count: int) -> Iterator[None]:
+def use_threads(count: int) -> Iterator[None]:
     """torch and OpenCV compute on so many threads inside, and as before afterwards."""
     import cv2
     import torch
@@ -219,7 +219,7 @@ class _Here(Executor):
 
 
 def _on_a_thread(function, item):
-    with threads(1):
+    with use_threads(1):
         return function(item)
 
 
@@ -247,7 +247,7 @@ class _InTurn(Executor):
 
 class _Quietly(futures.ProcessPoolExecutor):
     """Forked from a process with other threads, of which Python warns. Those of torch and OpenCV have ended or rest
-    by then (`threads`): a child that wakes them waits forever.
+    by then (`use_threads`): a child that wakes them waits forever.
     """
 
     def submit(self, fn, /, *args, **kwargs) -> Future:

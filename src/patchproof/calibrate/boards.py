@@ -1,6 +1,6 @@
 """Photographs of a ChArUco board become corners: where on the board, where in the picture.
 
-In: a folder of photographs and a printed board. Out: one `View` for each photograph that shows enough of the board,
+In: a folder of photographs and a printed board. Out: one `BoardView` for each photograph that shows enough of the board,
 and a reason for each of the others. All views come from one camera in one state: the picture size, the way it was
 held, and the focal length that most photographs share; a phone that switched lenses between two photographs would
 otherwise be calibrated as the mean of both. Corners are saddle points, symmetric under half a turn, so neither blur
@@ -16,23 +16,23 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from patchproof.base.color import photo_codes_of
+from patchproof.base.color import photo_codes_from_srgb
 from patchproof.base.errors import Refused
 from patchproof.base.input import readable_formats
 from patchproof.base.progress import Advance, no_advance
-from patchproof.photo.detect import detected, detector_settings, luminance
-from patchproof.photo.limits import limited
+from patchproof.photo.detect import detect_markers, detector_settings, luminance
+from patchproof.photo.limits import run_limited
 from patchproof.photo.read import list_photos, read_photo
 from patchproof.photo.rejection import PhotoRejected
 from patchproof.sheets.board import Board
-from patchproof.sheets.markers import DICTIONARY, printed_markers
+from patchproof.sheets.markers import DICTIONARY, aruco_dictionary
 
-FEWEST_CORNERS = 12  # of one photograph: a pose takes six numbers, twelve corners give twenty-four
+MIN_CORNERS = 12  # of one photograph: a pose takes six numbers, twelve corners give twenty-four
 _ORIENTATION, _MAKE, _MODEL = 0x0112, 0x010F, 0x0110
 
 
 @dataclass(frozen=True)
-class View:
+class BoardView:
     """One photograph's corners: `ids` N of the board's, `board_mm` N×2 as printed, `px` N×2 of `size_px` (w, h)."""
 
     file: str
@@ -41,26 +41,26 @@ class View:
     px: np.ndarray
     size_px: tuple[int, int]
 
-    def only(self, keep: np.ndarray) -> View:
+    def only(self, keep: np.ndarray) -> BoardView:
         """The view with these of its corners."""
         return replace(self, ids=self.ids[keep], board_mm=self.board_mm[keep], px=self.px[keep])
 
 
-def see_boards(
+def find_boards(
     photos: str | Path,
     board: Board,
     ruler_mm: tuple[float, float] | None = None,
     advance: Advance = no_advance,
-) -> tuple[list[View], dict[str, str], str]:
+) -> tuple[list[BoardView], dict[str, str], str]:
     """(views, reasons by the names of photographs left out, what the files call the camera) of a folder's pictures.
 
     `ruler_mm` are the printed rulers (x, y) as measured.
     """
     paths, views, left, states = list_photos(photos), [], {}, []
-    places = corner_places_mm(board, ruler_mm)
+    places = corner_positions_mm(board, ruler_mm)
     for number, path in enumerate(paths, 1):
         try:
-            view, focal_px = limited(_view, path, board, places)
+            view, focal_px = run_limited(_view, path, board, places)
             views.append(view)
             states.append((view.size_px, _tags(path), focal_px and round(focal_px)))
         except PhotoRejected as cannot:
@@ -75,21 +75,21 @@ def see_boards(
     return [view for view, state in pairs if state == common], left, common[1][1]
 
 
-def corner_places_mm(board: Board, ruler_mm: tuple[float, float] | None = None) -> np.ndarray:
+def corner_positions_mm(board: Board, ruler_mm: tuple[float, float] | None = None) -> np.ndarray:
     """Inner corners M×2 by id, from the board's top-left corner; scaled as the rulers came out of the printer."""
     column, row = np.meshgrid(np.arange(1, board.grid.columns), np.arange(1, board.grid.rows))
     nominal = np.column_stack([column.ravel(), row.ravel()]) * board.grid.square_mm
     return nominal if ruler_mm is None else nominal * (np.array(ruler_mm) / board.ruler_mm)
 
 
-def _view(path: Path, board: Board, places_mm: np.ndarray) -> tuple[View, float | None]:
+def _view(path: Path, board: Board, places_mm: np.ndarray) -> tuple[BoardView, float | None]:
     photo = read_photo(path)
     ids, px, markers = find_corners(photo.srgb, board)
-    if len(ids) < FEWEST_CORNERS or np.linalg.matrix_rank(places_mm[ids] - places_mm[ids].mean(0)) < 2:
-        advice = f"{markers} markers and {len(ids)} corners of the board were read, {FEWEST_CORNERS} corners are needed"
-        raise PhotoRejected("too_few_markers", len(ids), FEWEST_CORNERS, f"{advice}: show more of it, sharp")
+    if len(ids) < MIN_CORNERS or np.linalg.matrix_rank(places_mm[ids] - places_mm[ids].mean(0)) < 2:
+        advice = f"{markers} markers and {len(ids)} corners of the board were read, {MIN_CORNERS} corners are needed"
+        raise PhotoRejected("too_few_markers", len(ids), MIN_CORNERS, f"{advice}: show more of it, sharp")
     height, width = photo.srgb.shape[:2]
-    return View(path.name, ids, places_mm[ids], px, (width, height)), photo.focal_px
+    return BoardView(path.name, ids, places_mm[ids], px, (width, height)), photo.focal_px
 
 
 def find_corners(srgb: np.ndarray, board: Board) -> tuple[np.ndarray, np.ndarray, int]:
@@ -97,9 +97,9 @@ def find_corners(srgb: np.ndarray, board: Board) -> tuple[np.ndarray, np.ndarray
 
     Markers are looked for in linear light, where blurred paper does not grow over ink; corners need no such care.
     """
-    dictionary = printed_markers(DICTIONARY)
-    light = photo_codes_of(luminance(srgb))
-    quads, names = detected(light, dictionary, detector_settings())
+    dictionary = aruco_dictionary(DICTIONARY)
+    light = photo_codes_from_srgb(luminance(srgb))
+    quads, names = detect_markers(light, dictionary, detector_settings())
     none = np.zeros(0, int), np.zeros((0, 2)), len(quads)
     if names is None:
         return none

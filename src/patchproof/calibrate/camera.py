@@ -1,6 +1,6 @@
 """A camera from photographs of a board: which are used, the lens they pay for, and a file that scenes can read.
 
-In: photographs and a board. Out: `Calibrated`, and three files: NAME.json in the form of calibration/cameras,
+In: photographs and a board. Out: `CameraCalibration`, and three files: NAME.json in the form of calibration/cameras,
 NAME.fit.json with all figures (the ladder, deviations, every photograph), NAME.residuals.png. What the photographs
 cannot tell is refused: too few of them, boards that all face the same way (a plane's picture then hardly depends on
 the focal length), a focal length known to no better than 1 %. The print's size does not matter, its proportions do:
@@ -23,11 +23,11 @@ from typing import Any
 import numpy as np
 
 from patchproof.base.errors import Refused
-from patchproof.base.output import check_file, write_together
+from patchproof.base.output import check_file, write_files_atomically
 from patchproof.base.progress import Advance, Progress, no_advance, no_progress
-from patchproof.calibrate.boards import FEWEST_CORNERS, View, see_boards
+from patchproof.calibrate.boards import MIN_CORNERS, BoardView, find_boards
 from patchproof.calibrate.ladder import Rung
-from patchproof.calibrate.lens_ladder import NUMBERS, Fit, climb, fit_rung
+from patchproof.calibrate.lens_ladder import PARAMETERS, LensFit, choose_lens_model, fit_rung
 from patchproof.channel.lens import Camera, check_camera
 from patchproof.sheets.board import Board, load_board
 
@@ -41,13 +41,13 @@ _ODD_PHOTO, _ODD_CORNER, _ODD_PX = 3.0, 5.0, 0.5  # times the median error, and 
 
 
 @dataclass(frozen=True)
-class Calibrated:
+class CameraCalibration:
     """A camera, the ladder with the fit it comes from, the views used, why photographs were left out, and the board."""
 
     camera: Camera
     rungs: tuple[Rung, ...]
-    fit: Fit
-    views: tuple[View, ...]
+    fit: LensFit
+    views: tuple[BoardView, ...]
     left: Mapping[str, str]
     board: Board
 
@@ -66,7 +66,7 @@ def calibrate_camera(
     ruler_mm: tuple[float, float] | None = None,
     overwrite: bool = False,
     progress: Progress = no_progress,
-) -> Calibrated:
+) -> CameraCalibration:
     """Calibrate and write the three files; `board` is a template or BOARD.json, `ruler_mm` its rulers as measured."""
     out = Path(out)
     if out.suffix.lower() != ".json":
@@ -75,36 +75,38 @@ def calibrate_camera(
     for path in (out, figures, picture):
         check_file(path, overwrite)
     printed = load_board(board)
-    views, left, camera = see_boards(photos, printed, ruler_mm, partial(progress, "find corners"))
+    views, left, camera = find_boards(photos, printed, ruler_mm, partial(progress, "find corners"))
     result = solve(views, left, printed, out.stem, camera, partial(progress, "lens models"))
     residuals = _residual_picture(result.views, result.rungs, result.fit)
-    write_together({figures: _text(_fit_figures(result)), picture: residuals, out: _text(result.camera.model_dump())})
+    write_files_atomically(
+        {figures: _text(_fit_figures(result)), picture: residuals, out: _text(result.camera.model_dump())}
+    )
     return result
 
 
 def solve(
-    views: Sequence[View],
+    views: Sequence[BoardView],
     left: Mapping[str, str],
     board: Board,
     name: str,
     camera: str = "",
     advance: Advance = no_advance,
-) -> Calibrated:
+) -> CameraCalibration:
     """The camera that took these views; refused where they cannot tell. `camera` is what it calls itself."""
     _enough(views, left)
     views, odd = _without_odd(views)
     left = {**left, **odd}
     _enough(views, left)
     size_px = views[0].size_px
-    rungs, fit = climb(views, lambda fit: _is_usable(fit, size_px), advance)
+    rungs, fit = choose_lens_model(views, lambda fit: _is_usable(fit, size_px), advance)
     _refuse_blind(fit)
     about = f"{len(views)} photographs of board {board.sheet_id}" + (f", camera {camera}" if camera else "")
     made = _camera(fit, name, size_px, about, _uncertainty(fit))
     check_camera(made, "this calibration")
-    return Calibrated(made, rungs, fit, tuple(views), left, board)
+    return CameraCalibration(made, rungs, fit, tuple(views), left, board)
 
 
-def _fit_figures(result: Calibrated) -> dict:
+def _fit_figures(result: CameraCalibration) -> dict:
     """All figures as plain data; lengths in px of `image_px`, null where a rung found no fit."""
     fit = result.fit
     figure = lambda value: round(value, 5) if np.isfinite(value) else None  # noqa: E731
@@ -133,7 +135,7 @@ def _fit_figures(result: Calibrated) -> dict:
         ],
         "numbers": {
             n: {"value": float(v), "standard_deviation": float(s)}
-            for n, v, s in zip(NUMBERS, fit.numbers, fit.sd, strict=True)
+            for n, v, s in zip(PARAMETERS, fit.numbers, fit.sd, strict=True)
         },
         "rms_px": figure(fit.rms_px),
         "coverage": round(result.coverage, 3),
@@ -141,7 +143,7 @@ def _fit_figures(result: Calibrated) -> dict:
     }
 
 
-def calibration_lines(result: Calibrated) -> list[str]:
+def calibration_lines(result: CameraCalibration) -> list[str]:
     """What a user wants to know of it, in a few lines."""
     fit, camera = result.fit, result.camera
     steps = ", ".join(f"{rung.name} {rung.error:.3f}" for rung in result.rungs if np.isfinite(rung.error))
@@ -162,17 +164,17 @@ def calibration_lines(result: Calibrated) -> list[str]:
     return lines
 
 
-def _enough(views: Sequence[View], left: Mapping[str, str]) -> None:
+def _enough(views: Sequence[BoardView], left: Mapping[str, str]) -> None:
     if len(views) < FEWEST_PHOTOS:
         why = f" ({': '.join(next(iter(left.items())))})" if left else ""
         raise Refused(
-            f"at least {FEWEST_PHOTOS} photographs that show {FEWEST_CORNERS} corners of the board",
+            f"at least {FEWEST_PHOTOS} photographs that show {MIN_CORNERS} corners of the board",
             f"{len(views)} of {len(views) + len(left)}{why}",
             "take 15 or more, sharp, from different sides",
         )
 
 
-def _without_odd(views: Sequence[View]) -> tuple[list[View], dict[str, str]]:
+def _without_odd(views: Sequence[BoardView]) -> tuple[list[BoardView], dict[str, str]]:
     """Views without the photographs, then without the corners, that lie far off: moved, of a bent board, occluded."""
     kept, odd = list(views), {}
     while len(kept) >= FEWEST_PHOTOS and (fit := fit_rung(kept, _TRIAL_RUNG)) is not None:
@@ -189,12 +191,12 @@ def _without_odd(views: Sequence[View]) -> tuple[list[View], dict[str, str]]:
             break
         kept = [view.only(error < farthest / 2) for view, error in zip(kept, errors, strict=True)]
         few = "too few of its corners agree with the others: show more of the board, sharp"
-        odd |= {view.file: few for view in kept if len(view.ids) < FEWEST_CORNERS}
-        kept = [view for view in kept if len(view.ids) >= FEWEST_CORNERS]
+        odd |= {view.file: few for view in kept if len(view.ids) < MIN_CORNERS}
+        kept = [view for view in kept if len(view.ids) >= MIN_CORNERS]
     return kept, odd
 
 
-def _refuse_blind(fit: Fit) -> None:
+def _refuse_blind(fit: LensFit) -> None:
     """Refuse views from which the focal length cannot be told."""
     turns = np.degrees(np.arccos(np.clip(fit.normals @ fit.normals.T, -1, 1))).max()
     share = max(fit.sd[0] / fit.numbers[0], fit.sd[1] / fit.numbers[1])
@@ -213,7 +215,7 @@ def _refuse_blind(fit: Fit) -> None:
         )
 
 
-def _is_usable(fit: Fit, size_px: tuple[int, int]) -> bool:
+def _is_usable(fit: LensFit, size_px: tuple[int, int]) -> bool:
     """Whether the lens can be undone all over the picture."""
     try:
         check_camera(_camera(fit, "trial", size_px, "", ""), "a trial")
@@ -222,18 +224,18 @@ def _is_usable(fit: Fit, size_px: tuple[int, int]) -> bool:
     return True
 
 
-def _camera(fit: Fit, name: str, size_px: tuple[int, int], instrument: str, uncertainty: str) -> Camera:
+def _camera(fit: LensFit, name: str, size_px: tuple[int, int], instrument: str, uncertainty: str) -> Camera:
     about = {"instrument": instrument, "uncertainty": uncertainty, "when": date.today().isoformat()}
-    numbers = {n: round(float(v), 6) for n, v in zip(NUMBERS, fit.numbers, strict=True)}
+    numbers = {n: round(float(v), 6) for n, v in zip(PARAMETERS, fit.numbers, strict=True)}
     return Camera.model_validate({"name": name, "method": "measured", "image_px": size_px} | about | numbers)
 
 
-def _uncertainty(fit: Fit) -> str:
-    parts = ", ".join(f"{n} {s:.2g}" for n, s in zip(NUMBERS, fit.sd, strict=True) if s > 0)
+def _uncertainty(fit: LensFit) -> str:
+    parts = ", ".join(f"{n} {s:.2g}" for n, s in zip(PARAMETERS, fit.sd, strict=True) if s > 0)
     return f"standard deviations {parts}; {fit.rms_px:.2g} px rms are left; a board that is not flat is not in it"
 
 
-def _residual_picture(views: Sequence[View], rungs: Sequence[Rung], fit: Fit) -> bytes:
+def _residual_picture(views: Sequence[BoardView], rungs: Sequence[Rung], fit: LensFit) -> bytes:
     """A PNG of three panels: residuals over the picture, RMS of each photograph, held-out error of each rung."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

@@ -27,12 +27,12 @@ from patchproof.base.errors import Refused
 from patchproof.base.input import is_file, is_folder
 from patchproof.base.progress import Advance, no_advance
 from patchproof.calibrate.chart_photo import ChartPhoto, chart_rows, read_chart
-from patchproof.calibrate.color_ladder import WIDE, Choice, Map, choose, difference, kinds_of_maps
-from patchproof.calibrate.printer_files import printer_from_table, shown_colors
+from patchproof.calibrate.color_ladder import WELL_SPREAD_WIDTH, ColorMap, MapChoice, choose, difference, map_kinds
+from patchproof.calibrate.printer_files import printer_from_table, printer_output
 from patchproof.channel.lens import Camera
-from patchproof.channel.printer import Printer, load_printer, node_colors, vary
-from patchproof.photo.limits import limited
-from patchproof.photo.read import pictures_in, read_photo
+from patchproof.channel.printer import Printer, load_printer, node_colors, vary_print
+from patchproof.photo.limits import run_limited
+from patchproof.photo.read import list_images, read_photo
 from patchproof.photo.rejection import PhotoRejected
 from patchproof.sheets.manifest import Manifest
 
@@ -42,7 +42,7 @@ STRANGE_PHOTO = 5.0  # ΔE00 from its print's other photographs: more than any l
 
 
 @dataclass(frozen=True)
-class Reading:
+class PhotoReading:
     """One photograph that could be read: its file, which print it shows (from 0), and the chart in it."""
 
     path: Path
@@ -51,11 +51,11 @@ class Reading:
 
 
 @dataclass(frozen=True)
-class Calibration:
+class PrinterCalibration:
     """The printer, how its model was chosen, and what one should know of the photographs."""
 
     printer: Printer
-    choice: Choice
+    choice: MapChoice
     warnings: tuple[str, ...]
 
 
@@ -65,7 +65,7 @@ def calibrate_chart(
     name: str,
     camera: Camera | None = None,
     advance: Advance = no_advance,
-) -> Calibration:
+) -> PrinterCalibration:
     """The printer that these photographs show; each inner list holds those of one print."""
     readings, warnings = _read_all(prints, manifest, camera, advance)
     by_print = [
@@ -78,7 +78,7 @@ def calibrate_chart(
     if known.sum() < LEAST_SWATCHES:
         do = "photograph the whole chart from closer, sharp and not too light"
         raise Refused(f"at least {LEAST_SWATCHES} readable swatches", f"{known.sum()}", do)
-    choice = choose(kinds_of_maps(known_printers()), sent[known], srgb_from_linear(light[known]))
+    choice = choose(map_kinds(known_printers()), sent[known], srgb_from_linear(light[known]))
     agreement = _agreement(readings, by_print)
     warnings += [
         f"{reading.path.name} differs from the other photographs of its print by ΔE00 {error:.1f}: glare, or another "
@@ -86,7 +86,7 @@ def calibrate_chart(
         for reading, error in zip(readings, agreement, strict=True)
         if error is not None and error > STRANGE_PHOTO
     ]
-    if choice.width < WIDE:
+    if choice.width < WELL_SPREAD_WIDTH:
         warnings.append(
             f"the {choice.colors} readable swatches hardly spread over the color cube ({choice.width:.2f} in their "
             f"thinnest direction, whole charts 0.3): the errors stated are of colors like these, others are a guess"
@@ -105,14 +105,14 @@ def calibrate_chart(
         "photographs": [_row(reading, error) for reading, error in zip(readings, agreement, strict=True)],
         "uncertainty": f"mean ΔE00 {choice.chosen.error:.2f} of {choice.held_out} held-out colors of the chart",
     }
-    return Calibration(printer_of(name, choice.predict, provenance), choice, tuple(warnings))
+    return PrinterCalibration(printer_of(name, choice.predict, provenance), choice, tuple(warnings))
 
 
 def prints_of(paths: Sequence[Path]) -> list[list[Path]]:
     """Photographs by print: each folder holds those of one print; single files are all of one."""
     singles, prints = [path for path in paths if not is_folder(path)], []
     for folder in (path for path in paths if is_folder(path)):
-        prints.append(pictures_in(folder))
+        prints.append(list_images(folder))
         if not prints[-1]:
             raise Refused("a folder with photographs of one print", f"none in {folder}", "name the photographs")
     for path in singles:
@@ -129,12 +129,12 @@ def model_of(camera: Camera | None) -> str:
     return f"appearance: printer and camera tone together, as this camera shows the print ({why})"
 
 
-def known_printers() -> dict[str, Map]:
+def known_printers() -> dict[str, ColorMap]:
     """The shipped printers as maps of N×3 sRGB."""
-    return {name: partial(shown_colors, load_printer(name)) for name in PRIORS}
+    return {name: partial(printer_output, load_printer(name)) for name in PRIORS}
 
 
-def printer_of(name: str, predict: Map, provenance: Mapping[str, Any]) -> Printer:
+def printer_of(name: str, predict: ColorMap, provenance: Mapping[str, Any]) -> Printer:
     """The table of a fitted map, scaled per channel so that white is bare paper."""
     nodes = node_colors()
     light = linear_from_srgb(np.clip(predict(nodes.reshape(-1, 3)), 0, 1.2))
@@ -159,7 +159,7 @@ _PRINT_CHANGE = (0.04, 0.05, 0.004)  # dot gain, density and black differ by abo
 def print_variation(prints: Sequence[np.ndarray]) -> dict[str, Any] | None:
     """What N×3 light of several prints differs by, as standard deviations; None of a single print.
 
-    Each print is explained by `vary`'s three numbers from the mean of all; the swatches' ΔE00 from that mean stands
+    Each print is explained by `vary_print`'s three numbers from the mean of all; the swatches' ΔE00 from that mean stands
     beside them. Two prints give a rough figure, and it holds what photographs differ by, too.
     """
     if len(prints) < 2:
@@ -173,7 +173,7 @@ def print_variation(prints: Sequence[np.ndarray]) -> dict[str, Any] | None:
         target = srgb_from_linear(light[known])
 
         def rest(change: np.ndarray, target: np.ndarray = target) -> np.ndarray:
-            return (srgb_from_linear(vary(middle, torch.tensor(change)).numpy()) - target).ravel()
+            return (srgb_from_linear(vary_print(middle, torch.tensor(change)).numpy()) - target).ravel()
 
         changes.append(least_squares(rest, np.zeros(3), x_scale=_PRINT_CHANGE).x)
         away.append(difference(target, srgb_from_linear(mean[known])).mean())
@@ -182,7 +182,7 @@ def print_variation(prints: Sequence[np.ndarray]) -> dict[str, Any] | None:
     return {"prints": len(prints), **{key: round(float(value), 4) for key, value in figures.items()}}
 
 
-def ladder_table(choice: Choice) -> list[dict[str, Any]]:
+def ladder_table(choice: MapChoice) -> list[dict[str, Any]]:
     """Each rung's figures as stored; those that had too few colors have none."""
     figures = {"delta_e00": "error", "worse_by": "worse_by", "standard_error": "standard_error"}
     rows: list[dict[str, Any]] = [
@@ -193,7 +193,7 @@ def ladder_table(choice: Choice) -> list[dict[str, Any]]:
     return rows + [{"rung": name, "delta_e00": None, "reason": reason} for name in choice.left_out]
 
 
-def summary_lines(calibration: Calibration) -> list[str]:
+def summary_lines(calibration: PrinterCalibration) -> list[str]:
     """The choice with every rung's figure, for the terminal."""
     choice, provenance = calibration.choice, calibration.printer.provenance
     lines = [f"{provenance['source']}; {provenance['model_of']}"]
@@ -213,7 +213,7 @@ def summary_lines(calibration: Calibration) -> list[str]:
 
 def _read_all(
     prints: Sequence[Sequence[Path]], manifest: Manifest, camera: Camera | None, advance: Advance
-) -> tuple[list[Reading], list[str]]:
+) -> tuple[list[PhotoReading], list[str]]:
     """All photographs that can be read, and what is wrong with the others; refused where none is left."""
     if not manifest.chart:
         raise Refused("a sheet with a chart", f"sheet {manifest.sheet_id} without", "name the page's own JSON")
@@ -221,8 +221,8 @@ def _read_all(
     for number, paths in enumerate(prints):
         for path in paths:
             try:
-                photo = limited(lambda path: read_chart(read_photo(path), manifest, camera), path)
-                readings.append(Reading(path, number, photo))
+                photo = run_limited(lambda path: read_chart(read_photo(path), manifest, camera), path)
+                readings.append(PhotoReading(path, number, photo))
             except PhotoRejected as cannot:
                 warnings.append(f"{path.name} is left out ({cannot})")
             advance(len(readings) + len(warnings), total)
@@ -232,7 +232,7 @@ def _read_all(
     return readings, warnings
 
 
-def _agreement(readings: Sequence[Reading], by_print: Sequence[np.ndarray]) -> list[float | None]:
+def _agreement(readings: Sequence[PhotoReading], by_print: Sequence[np.ndarray]) -> list[float | None]:
     """Mean ΔE00 of each photograph from its print; None where it is the only one."""
     numbers = [reading.of_print for reading in readings]
     means = dict(zip(sorted(set(numbers)), by_print, strict=True))
@@ -261,7 +261,7 @@ def _duplicates(sent: np.ndarray, light: np.ndarray) -> float | None:
     return round(float(difference(*(srgb_from_linear(light[pairs[:, i]]) for i in (0, 1))).mean()), 3)
 
 
-def _row(reading: Reading, error: float | None) -> dict[str, Any]:
+def _row(reading: PhotoReading, error: float | None) -> dict[str, Any]:
     return {
         "file": reading.path.name,
         "sha256": hashlib.sha256(reading.path.read_bytes()).hexdigest(),

@@ -17,14 +17,14 @@ import numpy as np
 from patchproof.base.geometry import apply_homography, local_scale, rect_corners
 from patchproof.channel.lens import Camera
 from patchproof.channel.tone import light_of_codes
-from patchproof.photo.complete import complete
 from patchproof.photo.detect import MarkersInView, find_markers, is_mirrored
+from patchproof.photo.known_page import complete_markers
 from patchproof.photo.quality import CLIPPED_CODE, blur_px
 from patchproof.photo.read import Photo
 from patchproof.photo.rectify import fit_page
 from patchproof.photo.rejection import PhotoRejected
 from patchproof.sheets.manifest import Manifest, Marker
-from patchproof.sheets.rects import RectMm, holds
+from patchproof.sheets.rects import RectMm, rect_contains
 
 LEAST_CORE_PX = 4.0  # a swatch's side between blurred borders
 MOST_CLIPPED = 0.05  # share of the white paper at full white: beyond it nobody knows how light it was
@@ -106,9 +106,9 @@ def _find_page(srgb: np.ndarray, manifest: Manifest) -> _Page:
     numbers = [page for page in pages if chart_rows(manifest, page)] or pages[:1]
     number = max(sorted(set(numbers)), key=numbers.count)
     corners_mm = {marker.id: np.array(marker.corners_mm) for marker in markers if marker.page == number}
-    detected = complete(srgb, detected, corners_mm, dictionary)
+    detected = complete_markers(srgb, detected, corners_mm, dictionary)
     corners_px = {i: borders.corners_px for i, borders in detected.markers.items() if i in corners_mm}
-    beside = {i: px for i, px in corners_px.items() if not holds(manifest.cut_mm, _around(corners_mm[i]))}
+    beside = {i: px for i, px in corners_px.items() if not rect_contains(manifest.cut_mm, _around(corners_mm[i]))}
     fit = fit_page(beside if len(beside) > 1 else corners_px, corners_mm)
     together = fit_page(corners_px, corners_mm)
     if set(beside) <= set(together.inlier_ids):
@@ -151,7 +151,7 @@ def _bare_places(manifest: Manifest, page: _Page, shape) -> np.ndarray:
     corner = np.stack(np.meshgrid(*steps), -1).reshape(-1, 2)
     printed = [swatch.rect_mm for swatch in manifest.chart if swatch.page == page.number]
     printed += [_around(marker.corners_mm) for marker in manifest.markers if marker.page == page.number]
-    if chart_rows(manifest, page.number) and any(not holds(manifest.cut_mm, rect) for rect in rows):
+    if chart_rows(manifest, page.number) and any(not rect_contains(manifest.cut_mm, rect) for rect in rows):
         printed.append(manifest.cut_mm)
     bare = np.ones(len(corner), bool)
     for x, y, w, h in printed:

@@ -1,6 +1,6 @@
 """Maps from colors to colors, from none to free, and the choice among them by colors that they did not see.
 
-In: N×3 sRGB colors sent and seen, and known printers as priors. Out: `Choice`: the map, and every rung's figure. Each
+In: N×3 sRGB colors sent and seen, and known printers as priors. Out: `MapChoice`: the map, and every rung's figure. Each
 map is tried on colors that it was not fitted to (ten folds; the corners of the RGB cube always stay in training, since
 a color outside of those seen is a guess), and `ladder` chooses by ΔE00. Too few colors to hold any out, or colors that
 are all nearly gray, leave only maps with nothing to fit, or paper and black: held-out grays tell nothing of others.
@@ -22,36 +22,36 @@ from functools import partial
 import numpy as np
 
 from patchproof.base.color import ciede2000, lab_from_srgb, linear_from_srgb, srgb_from_linear
-from patchproof.calibrate.ladder import Rung, compared, simplest
+from patchproof.calibrate.ladder import Rung, compare_rungs, simplest_rung
 
 Colors = np.ndarray  # N×3 sRGB in [0, 1]
-Map = Callable[[Colors], Colors]
+ColorMap = Callable[[Colors], Colors]
 
 FOLDS = 10
 LEAST_HELD_OUT = 6  # with fewer, a mean says nothing of a rung
 # Rms distance of the colors from their flattest plane; charts have 0.30 and more. With the chart's colors drawn towards
 # gray, held-out errors said 1.0 to 1.5 where others were off by up to 3 at 0.13, 4 at 0.06, 14 at 0.03, 35 at 0.001.
-WIDE, FLAT = 0.15, 0.05
+WELL_SPREAD_WIDTH, FLAT = 0.15, 0.05
 SMOOTHING = 1e-3  # of splines: from 1e-4 to 1e-2 held-out errors differ by less than 0.05
 _LAB_SCALE = 60.0  # CIELAB units that count as much as the whole range of one sRGB channel
 
 
 @dataclass(frozen=True)
-class Kind:
+class MapKind:
     """A kind of map: how to fit it, and the fewest distinct colors that takes."""
 
     name: str
-    fit: Callable[[Colors, Colors], Map]
+    fit: Callable[[Colors, Colors], ColorMap]
     least: int
     endpoints: bool = False  # nothing is fitted, or paper and black only
 
 
 @dataclass(frozen=True)
-class Choice:
+class MapChoice:
     """The kind of map that was chosen, fitted to all colors; `rungs` in ΔE00 of all that were tried, simplest first."""
 
     chosen: Rung
-    predict: Map
+    predict: ColorMap
     rungs: tuple[Rung, ...]
     seconds: dict[str, float]  # of one fit
     colors: int
@@ -60,22 +60,22 @@ class Choice:
     width: float  # of the colors: rms distance from their flattest plane
 
 
-def kinds_of_maps(priors: Mapping[str, Map]) -> tuple[Kind, ...]:
+def map_kinds(priors: Mapping[str, ColorMap]) -> tuple[MapKind, ...]:
     """All kinds, simplest first; those of priors are left out where there are none."""
     free = (
-        Kind("identity", lambda sent, shown: lambda colors: colors, 0, True),
-        Kind("white_black", fit_white_black, 2, True),
-        Kind("affine", fit_affine, 12),
+        MapKind("identity", lambda sent, shown: lambda colors: colors, 0, True),
+        MapKind("white_black", fit_white_black, 2, True),
+        MapKind("affine", fit_affine, 12),
     )
     known = (
-        Kind("prior", partial(_best, priors), 0, True),
-        Kind("prior+affine", partial(fit_prior_affine, priors), 12),
-        Kind("prior+affine+spline", partial(fit_prior_spline, priors), 24),
+        MapKind("prior", partial(_best, priors), 0, True),
+        MapKind("prior+affine", partial(fit_prior_affine, priors), 12),
+        MapKind("prior+affine+spline", partial(fit_prior_spline, priors), 24),
     )
-    return free + (known if priors else ()) + (Kind("spline", fit_spline, 24),)
+    return free + (known if priors else ()) + (MapKind("spline", fit_spline, 24),)
 
 
-def choose(kinds: Sequence[Kind], sent: Colors, shown: Colors) -> Choice:
+def choose(kinds: Sequence[MapKind], sent: Colors, shown: Colors) -> MapChoice:
     """The simplest kind that is no worse than the best; colors sent twice are averaged first."""
     sent, shown = distinct(sent, shown)
     corners, width = np.isin(sent, (0.0, 1.0)).all(1), color_width(sent)
@@ -86,11 +86,11 @@ def choose(kinds: Sequence[Kind], sent: Colors, shown: Colors) -> Choice:
         tried, folds = [kind for kind in tried if kind.endpoints], [np.flatnonzero(~ends if not ends.all() else ends)]
     names = [kind.name for kind in tried]
     errors, seconds = zip(*(_held_out(kind, sent, shown, folds) for kind in tried), strict=True)
-    rungs = compared(names, np.array(errors))
-    chosen = simplest(rungs)
+    rungs = compare_rungs(names, np.array(errors))
+    chosen = simplest_rung(rungs)
     left_out = tuple(kind.name for kind in kinds if kind not in tried)
     fitted, times = tried[chosen].fit(sent, shown), dict(zip(names, seconds, strict=True))
-    return Choice(rungs[chosen], fitted, rungs, times, len(sent), len(errors[0]), left_out, width)
+    return MapChoice(rungs[chosen], fitted, rungs, times, len(sent), len(errors[0]), left_out, width)
 
 
 def color_width(colors: Colors) -> float:
@@ -111,7 +111,7 @@ def difference(shown: Colors, expected: Colors) -> np.ndarray:
     return ciede2000(lab_from_srgb(np.clip(shown, 0, 1)), lab_from_srgb(np.clip(expected, 0, 1)))
 
 
-def fit_white_black(sent: Colors, shown: Colors) -> Map:
+def fit_white_black(sent: Colors, shown: Colors) -> ColorMap:
     """Per channel an affine map in light: white stays, and the darkest color sent becomes the one shown."""
     light, lit = linear_from_srgb(sent), linear_from_srgb(shown)
     dark = light.sum(1).argmin()
@@ -119,13 +119,13 @@ def fit_white_black(sent: Colors, shown: Colors) -> Map:
     return lambda colors: srgb_from_linear(lift + (1 - lift) * linear_from_srgb(colors))
 
 
-def fit_affine(sent: Colors, shown: Colors) -> Map:
+def fit_affine(sent: Colors, shown: Colors) -> ColorMap:
     """Least squares in sRGB's code values: 12 numbers. In light it was twice as far off (ΔE00 8 instead of 5)."""
     matrix = np.linalg.lstsq(_with_ones(sent), shown, rcond=None)[0]
     return lambda colors: _with_ones(colors) @ matrix
 
 
-def fit_spline(sent: Colors, shown: Colors) -> Map:
+def fit_spline(sent: Colors, shown: Colors) -> ColorMap:
     """A thin-plate spline with an affine part."""
     from scipy.interpolate import RBFInterpolator
 
@@ -133,21 +133,21 @@ def fit_spline(sent: Colors, shown: Colors) -> Map:
     return lambda colors: spline(_features(colors))
 
 
-def fit_prior_affine(priors: Mapping[str, Map], sent: Colors, shown: Colors) -> Map:
+def fit_prior_affine(priors: Mapping[str, ColorMap], sent: Colors, shown: Colors) -> ColorMap:
     """An affine map after the prior for which that leaves least."""
     fits = {name: fit_affine(prior(sent), shown) for name, prior in priors.items()}
     best = min(fits, key=lambda name: difference(fits[name](priors[name](sent)), shown).mean())
     return lambda colors: fits[best](priors[best](colors))
 
 
-def fit_prior_spline(priors: Mapping[str, Map], sent: Colors, shown: Colors) -> Map:
+def fit_prior_spline(priors: Mapping[str, ColorMap], sent: Colors, shown: Colors) -> ColorMap:
     """The corrected prior, and a spline of what it leaves."""
     start = fit_prior_affine(priors, sent, shown)
     rest = fit_spline(sent, shown - start(sent))
     return lambda colors: start(colors) + rest(colors)
 
 
-def _best(priors: Mapping[str, Map], sent: Colors, shown: Colors) -> Map:
+def _best(priors: Mapping[str, ColorMap], sent: Colors, shown: Colors) -> ColorMap:
     """The prior that shows these colors best."""
     return min(priors.values(), key=lambda prior: difference(prior(sent), shown).mean())
 
@@ -166,7 +166,7 @@ def _folds(held_out: np.ndarray) -> list[np.ndarray]:
     return [fold for fold in np.array_split(mixed, FOLDS) if len(fold)]
 
 
-def _held_out(kind: Kind, sent: Colors, shown: Colors, folds: list[np.ndarray]) -> tuple[np.ndarray, float]:
+def _held_out(kind: MapKind, sent: Colors, shown: Colors, folds: list[np.ndarray]) -> tuple[np.ndarray, float]:
     """ΔE00 of each held-out color, fold by fold, and the mean seconds of a fit."""
     errors, begin = [], time.perf_counter()
     for fold in folds:

@@ -18,10 +18,10 @@ from typing import Any
 
 import numpy as np
 
-from patchproof.base.color import ciede2000, codes_of, lab_from_srgb
+from patchproof.base.color import ciede2000, codes_from_srgb, lab_from_srgb
 from patchproof.base.errors import Refused
 from patchproof.base.input import is_file
-from patchproof.calibrate.printer_files import printer_from_table, shown_colors
+from patchproof.calibrate.printer_files import printer_from_table, printer_output
 from patchproof.channel.printer import NODES_8BIT, Printer, node_colors
 
 MAX_BYTES = 32 * 2**20  # the largest printer profiles in use are a few MB
@@ -37,7 +37,7 @@ def bake(profile_path: Path, name: str, licence: str, source: str, perceptual: b
     """The printer of a profile; `licence` and `source` go into provenance, `perceptual` is the intent towards paper."""
     data = _profile_bytes(profile_path)
     show, profile = _chain(data, profile_path.name, perceptual)
-    nodes = codes_of(node_colors())
+    nodes = codes_from_srgb(node_colors())
     lut = show(nodes)
     white = lut[-1, -1, -1]
     if white.min() < 250:  # relative to its medium, paper is white by definition, up to a profile's own rounding
@@ -129,6 +129,6 @@ def _table_error(printer: Printer, show: Callable[[np.ndarray], np.ndarray]) -> 
     """How far the interpolated table is from the chain itself on random colors."""
     sent = np.random.default_rng(0).integers(0, 256, (_CHECKED_COLORS, 3), dtype=np.uint8)
     exact = lab_from_srgb(show(sent) / 255)
-    error = ciede2000(exact, lab_from_srgb(shown_colors(printer, sent / 255)))
+    error = ciede2000(exact, lab_from_srgb(printer_output(printer, sent / 255)))
     figures = {"mean": error.mean(), "p95": np.percentile(error, 95), "max": error.max()}
     return {"colors": _CHECKED_COLORS, **{key: round(float(value), 3) for key, value in figures.items()}}

@@ -28,7 +28,7 @@ class Rung:
     standard_error: float
 
 
-def compared(names: Sequence[str], errors: np.ndarray) -> tuple[Rung, ...]:
+def compare_rungs(names: Sequence[str], errors: np.ndarray) -> tuple[Rung, ...]:
     """The rungs of errors models × items, at least one of them finite; rows that are not finite had no fit."""
     means = np.where(np.isfinite(errors).all(1), errors.mean(1), np.inf)
     worse = errors[np.isfinite(means)] - errors[means.argmin()]
@@ -39,6 +39,6 @@ def compared(names: Sequence[str], errors: np.ndarray) -> tuple[Rung, ...]:
     return tuple(Rung(*row) for row in rows)
 
 
-def simplest(rungs: Sequence[Rung]) -> int:
+def simplest_rung(rungs: Sequence[Rung]) -> int:
     """Which rung to stand on."""
     return next(i for i, rung in enumerate(rungs) if np.isfinite(rung.error) and rung.worse_by <= rung.standard_error)

@@ -20,11 +20,11 @@ import numpy as np
 
 from patchproof.base.errors import Refused
 from patchproof.base.progress import Advance, no_advance
-from patchproof.calibrate.boards import View
-from patchproof.calibrate.ladder import Rung, compared, simplest
+from patchproof.calibrate.boards import BoardView
+from patchproof.calibrate.ladder import Rung, compare_rungs, simplest_rung
 
 FOLDS = 5
-NUMBERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 _NO_K3, _NO_P = cv2.CALIB_FIX_K3, cv2.CALIB_ZERO_TANGENT_DIST
 RUNGS = {
     "pinhole": _NO_P | _NO_K3 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K1,
@@ -38,7 +38,7 @@ _STOP = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 60, 1e-10)
 
 
 @dataclass(frozen=True)
-class Fit:
+class LensFit:
     """One rung fitted to some views: `numbers` and their standard deviations `sd` as in NUMBERS, and each view's pose
     (rotation and translation vectors) and residuals N×2 px.
     """
@@ -70,11 +70,11 @@ class Fit:
         return np.array([cv2.Rodrigues(rotation)[0][:, 2] for rotation, _ in self.poses])
 
 
-def climb(
-    views: Sequence[View],
-    usable: Callable[[Fit], bool] = lambda fit: True,
+def choose_lens_model(
+    views: Sequence[BoardView],
+    usable: Callable[[LensFit], bool] = lambda fit: True,
     advance: Advance = no_advance,
-) -> tuple[tuple[Rung, ...], Fit]:
+) -> tuple[tuple[Rung, ...], LensFit]:
     """All rungs, their errors the photographs' RMS in px, and the chosen one's fit to all photographs.
 
     A rung whose fit is not `usable` is passed over.
@@ -90,16 +90,16 @@ def climb(
     if not np.isfinite(errors).all(1).any():
         do = "photograph the board, glued to something flat, from more directions"
         raise Refused("photographs of a board that a lens model fits", "none that does", do)
-    rungs = compared(list(RUNGS), errors)
-    return rungs, fits[rungs[simplest(rungs)].name]
+    rungs = compare_rungs(list(RUNGS), errors)
+    return rungs, fits[rungs[simplest_rung(rungs)].name]
 
 
-def fit_rung(views: Sequence[View], name: str, start: Fit | None = None) -> Fit | None:
+def fit_rung(views: Sequence[BoardView], name: str, start: LensFit | None = None) -> LensFit | None:
     """One rung on all of these views, from a lower rung's numbers where given; None where OpenCV finds no fit."""
     flags, matrix, bends = RUNGS[name], np.eye(3), np.zeros(5)
     if start is not None:
         flags |= cv2.CALIB_USE_INTRINSIC_GUESS
-        matrix, bends = matrix_and_bends(start.numbers)
+        matrix, bends = matrix_and_distortion(start.numbers)
     boards = [_flat(view) for view in views]
     pictures = [view.px.astype(np.float32) for view in views]
     try:
@@ -116,16 +116,16 @@ def fit_rung(views: Sequence[View], name: str, start: Fit | None = None) -> Fit 
         (np.asarray(r, float).reshape(3), np.asarray(t, float).reshape(3)) for r, t in zip(turns, moves, strict=True)
     )
     residuals = tuple(_residual(view, numbers, pose) for view, pose in zip(views, poses, strict=True))
-    return Fit(name, numbers, np.where(np.arange(9) < FREE[name], sd, 0.0), poses, residuals)
+    return LensFit(name, numbers, np.where(np.arange(9) < FREE[name], sd, 0.0), poses, residuals)
 
 
-def matrix_and_bends(numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def matrix_and_distortion(numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """OpenCV's 3×3 matrix and k1 k2 p1 p2 k3."""
     fx, fy, cx, cy = numbers[:4]
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), numbers[4:].copy()
 
 
-def _held_out(views: Sequence[View], folds: list[np.ndarray], whole: Fit) -> tuple[np.ndarray, np.ndarray]:
+def _held_out(views: Sequence[BoardView], folds: list[np.ndarray], whole: LensFit) -> tuple[np.ndarray, np.ndarray]:
     """RMS px of every view under the fit without its fold, and the numbers' standard deviations from those fits.
 
     Those are the delete-a-group jackknife's.
@@ -143,17 +143,17 @@ def _held_out(views: Sequence[View], folds: list[np.ndarray], whole: Fit) -> tup
     return errors, np.sqrt((count - 1) / count * ((np.array(numbers) - np.mean(numbers, 0)) ** 2).sum(0))
 
 
-def _pose(view: View, numbers: np.ndarray, near) -> tuple[np.ndarray, np.ndarray]:
+def _pose(view: BoardView, numbers: np.ndarray, near) -> tuple[np.ndarray, np.ndarray]:
     """The board's pose of least reprojection error near another one: a plane has a mirrored twin far from it."""
     turn, move = (vector.reshape(3, 1).copy() for vector in near)
-    turn, move = cv2.solvePnPRefineLM(_flat(view), view.px, *matrix_and_bends(numbers), turn, move)
+    turn, move = cv2.solvePnPRefineLM(_flat(view), view.px, *matrix_and_distortion(numbers), turn, move)
     return turn.reshape(3), move.reshape(3)
 
 
-def _residual(view: View, numbers: np.ndarray, pose) -> np.ndarray:
-    (turn, move), (matrix, bends) = pose, matrix_and_bends(numbers)
+def _residual(view: BoardView, numbers: np.ndarray, pose) -> np.ndarray:
+    (turn, move), (matrix, bends) = pose, matrix_and_distortion(numbers)
     return view.px - cv2.projectPoints(_flat(view).astype(float), turn, move, matrix, bends)[0].reshape(-1, 2)
 
 
-def _flat(view: View) -> np.ndarray:
+def _flat(view: BoardView) -> np.ndarray:
     return np.column_stack([view.board_mm, np.zeros(len(view.board_mm))]).astype(np.float32)

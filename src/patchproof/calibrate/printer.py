@@ -11,7 +11,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from patchproof.base.errors import Refused
-from patchproof.base.output import check_file, write_together
+from patchproof.base.output import check_file, write_files_atomically
 from patchproof.base.progress import Progress, no_progress
 from patchproof.calibrate.chart import calibrate_chart, prints_of, summary_lines
 from patchproof.calibrate.icc import bake
@@ -64,5 +64,7 @@ def _new_file(out: Path, overwrite: bool) -> Path:
 def _written(printer: Printer, out: Path) -> str:
     with TemporaryDirectory() as folder:
         made = save_printer(printer, Path(folder))
-        write_together({out.with_suffix(suffix): made.with_suffix(suffix).read_bytes() for suffix in (".npz", ".json")})
+        write_files_atomically(
+            {out.with_suffix(suffix): made.with_suffix(suffix).read_bytes() for suffix in (".npz", ".json")}
+        )
     return f"written: {out}, {out.with_suffix('.json').name}"

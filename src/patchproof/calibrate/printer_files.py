@@ -23,7 +23,7 @@ def printer_from_table(
     return Printer(name, method, torch.tensor(lut, dtype=torch.float32), distances, paper, provenance)
 
 
-def shown_colors(printer: Printer, colors: np.ndarray) -> np.ndarray:
+def printer_output(printer: Printer, colors: np.ndarray) -> np.ndarray:
     """N×3 sRGB that a printer shows of N×3 sent."""
     return printer.apply(torch.tensor(np.asarray(colors, float).T[None, :, :, None]))[0, :, :, 0].T.numpy()
 

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from patchproof.base.color import clamped
+from patchproof.base.color import clamp_to_unit
 from patchproof.channel.effects import Sensor
 from patchproof.channel.tone import codes_of_light
 
@@ -46,11 +46,11 @@ def develop(linear: Tensor, sensor: Sensor, scale: float, jpeg: bool = True, cam
     def on(values) -> Tensor:
         return torch.as_tensor(values).to(linear)
 
-    light = blurred(linear, on(sensor.blur_px * scale))
-    light = moved(light, on(sensor.motion_px * scale), sensor.motion_deg)
+    light = gaussian_blur(linear, on(sensor.blur_px * scale))
+    light = motion_blur(light, on(sensor.motion_px * scale), sensor.motion_deg)
     light = light * gains(sensor, linear)[:, :, None, None]
-    picture = encoded(noisy(light, on(sensor.noise * scale), sensor.noise_seed), camera)
-    return compressed(picture, on(sensor.jpeg)) if _is_stored(sensor, scale, jpeg) else picture
+    picture = encode_light(add_noise(light, on(sensor.noise * scale), sensor.noise_seed), camera)
+    return compress_jpeg(picture, on(sensor.jpeg)) if _is_stored(sensor, scale, jpeg) else picture
 
 
 def is_pointwise(sensor: Sensor, scale: float, jpeg: bool) -> bool:
@@ -83,13 +83,13 @@ def gains(sensor: Sensor, like: Tensor) -> Tensor:
     return torch.as_tensor(2 ** sensor.exposure_ev[:, None] * sensor.white_balance).to(like)
 
 
-def encoded(linear: Tensor, camera: Camera | None = None) -> Tensor:
+def encode_light(linear: Tensor, camera: Camera | None = None) -> Tensor:
     """Clipped light as code values in [0, 1]."""
-    return codes_of_light(clamped(linear), camera)
+    return codes_of_light(clamp_to_unit(linear), camera)
 
 
-def encoded_by_table(linear: Tensor, camera: Camera | None = None) -> Tensor:
-    """`encoded` within 1/100 of an 8-bit step in a seventh of the time, not differentiable."""
+def encode_light_by_table(linear: Tensor, camera: Camera | None = None) -> Tensor:
+    """`encode_light` within 1/100 of an 8-bit step in a seventh of the time, not differentiable."""
     index = (linear * _TABLE_STEPS).add_(0.5).clamp_(0, _TABLE_STEPS).int()
     # pyright cannot know that frozen models have a hash
     table = _code_table(camera, linear.device)  # pyright: ignore[reportArgumentType]
@@ -98,10 +98,10 @@ def encoded_by_table(linear: Tensor, camera: Camera | None = None) -> Tensor:
 
 @lru_cache(maxsize=4)
 def _code_table(camera: Camera | None, device: torch.device) -> Tensor:
-    return encoded(torch.linspace(0, 1, _TABLE_STEPS + 1, dtype=torch.float64, device=device), camera).float()
+    return encode_light(torch.linspace(0, 1, _TABLE_STEPS + 1, dtype=torch.float64, device=device), camera).float()
 
 
-def blurred(linear: Tensor, sigma_px: Tensor) -> Tensor:
+def gaussian_blur(linear: Tensor, sigma_px: Tensor) -> Tensor:
     """Gaussian blur with one sigma per picture; nothing where all are too small to be seen."""
     from kornia.filters import get_gaussian_kernel1d
 
@@ -114,7 +114,7 @@ def blurred(linear: Tensor, sigma_px: Tensor) -> Tensor:
     return _filtered(linear, kernels[:, None], kernels[:, :, None])
 
 
-def moved(linear: Tensor, length_px: Tensor, angle_deg) -> Tensor:
+def motion_blur(linear: Tensor, length_px: Tensor, angle_deg) -> Tensor:
     """Blur of an even, straight motion, one length and angle (counter-clockwise from x) per picture.
 
     Nothing where all are too short to be seen; length 0 leaves a picture as it was.
@@ -154,7 +154,7 @@ def _streaks(length_px: Tensor, angle_deg: Tensor) -> Tensor:
     return tent_y.mT @ tent_x / steps
 
 
-def noisy(linear: Tensor, noise: Tensor, seeds) -> Tensor:
+def add_noise(linear: Tensor, noise: Tensor, seeds) -> Tensor:
     """Shot and read noise in linear light (EMVA 1288: variance linear in the signal); each picture has its own seed."""
     if float(noise.max()) < SMALLEST_NOISE:
         return linear
@@ -165,10 +165,10 @@ def noisy(linear: Tensor, noise: Tensor, seeds) -> Tensor:
     return linear + deviation * grain
 
 
-def compressed(picture: Tensor, quality: Tensor) -> Tensor:
+def compress_jpeg(picture: Tensor, quality: Tensor) -> Tensor:
     """Differentiable JPEG of sRGB pictures; sizes need not be multiples of 16."""
     from kornia.enhance import jpeg_codec_differentiable
 
     height, width = picture.shape[-2:]
     padded = torch.nn.functional.pad(picture, (0, -width % 16, 0, -height % 16), mode="replicate")
-    return clamped(jpeg_codec_differentiable(padded, quality)[..., :height, :width])
+    return clamp_to_unit(jpeg_codec_differentiable(padded, quality)[..., :height, :width])

@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from patchproof.channel.lens import Camera
 
 
-def camera_of(
+def load_optional_camera(
     name_or_file: str | Path | None, base: Path | None = None, photo_px: tuple[int, int] | None = None
 ) -> Camera | None:
     """The camera of that name or file, as `lens.load_camera` reads it; None where none is named."""

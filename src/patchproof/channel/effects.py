@@ -27,12 +27,12 @@ _LEAST_COSINE = 0.2  # the sun is made five times as strong at most where it has
 # Settings of one number; the range is ± what this makes of it.
 _ENDS: dict[str, Callable[[float], float]] = {"view.look_at_jitter": float, "camera.white_balance": np.log1p}
 
-Facing = Callable[[np.ndarray, np.ndarray], np.ndarray]
+FacingCosine = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """N cosines, 0 from behind, between the patch's normal and directions (azimuths, elevations)."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Rows:
+class Draws:
     """N draws: every field has N rows. A field of one row is repeated; other numbers of rows are a ValueError."""
 
     def __post_init__(self):
@@ -58,7 +58,7 @@ def off(value: Any = 0.0) -> Any:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Pose(Rows):
+class Pose(Draws):
     """What a view has to be rasterized for: camera, background, and the size of the print. Angles are relative to the
     scene's front, offsets are shares of the object's length.
     """
@@ -73,7 +73,7 @@ class Pose(Rows):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Light(Rows):
+class Light(Draws):
     """The light that falls on the object (see `channel.light`)."""
 
     ambient: np.ndarray = off()
@@ -83,7 +83,7 @@ class Light(Rows):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Print(Rows):
+class Print(Draws):
     """What one print has that the printer's table does not say (see `channel.printer`)."""
 
     dot_gain: np.ndarray = off()  # these three as in `channel.printer.vary`
@@ -92,7 +92,7 @@ class Print(Rows):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Sensor(Rows):
+class Sensor(Draws):
     """What camera and file make of the light (see `channel.camera`); lengths at the photograph's full size."""
 
     exposure_ev: np.ndarray = off()
@@ -105,12 +105,12 @@ class Sensor(Rows):
     motion_deg: np.ndarray = off()  # in [0, 180), counter-clockwise from the picture's x
 
 
-RECORDS: dict[str, type[Rows]] = {"pose": Pose, "light": Light, "print": Print, "sensor": Sensor}
+RECORDS: dict[str, type[Draws]] = {"pose": Pose, "light": Light, "print": Print, "sensor": Sensor}
 RECORD_OF = {part.name: record for record, kind in RECORDS.items() for part in fields(kind)}
 
 
 @dataclass(frozen=True)
-class Effect:
+class ViewEffect:
     """One thing that views differ by. `columns` are the numbers it takes, each with its range or the setting
     "table.name" that has it; they fill the fields of the same names, or are `made` into the fields `into`. `first` is
     where they stand in the draws that the oldest effects share; some of those draws are nobody's.
@@ -127,7 +127,7 @@ class Effect:
     made: Callable[..., np.ndarray | tuple[np.ndarray, ...]] = lambda *columns: columns
     anew: tuple[str, ...] | Literal["all"] = ()
     switch: bool = True
-    instead: Callable[[Any, Facing], Rows] | None = None
+    instead: Callable[[Any, FacingCosine], Draws] | None = None
     whole: bool = False  # whether it takes whole photographs to be seen as it is
 
     @property
@@ -159,7 +159,7 @@ class Effect:
         values = self.made(*columns) if columns else number
         return dict(zip(self.fields, values if isinstance(values, tuple) else (values,), strict=True))
 
-    def off(self, record: Rows, facing: Facing) -> Rows | None:
+    def off(self, record: Draws, facing: FacingCosine) -> Draws | None:
         """The record without the effect; None where it is off in all views."""
         strength = self.fields[0]
         drawn, at_rest = getattr(record, strength), record.__dataclass_fields__[strength].metadata["off"]
@@ -178,13 +178,13 @@ def _gains(red: np.ndarray, blue: np.ndarray) -> np.ndarray:
     return np.exp(np.stack([red, np.zeros_like(red), blue], 1))
 
 
-def _even_for_sun(light: Light, facing: Facing) -> Light:
+def _even_for_sun(light: Light, facing: FacingCosine) -> Light:
     """As much even light as the sun gives to the middle of the patch."""
     on_patch = light.directional * facing(light.light_azimuth_deg, light.light_elevation_deg)
     return replace(light, ambient=light.ambient + on_patch, directional=np.zeros_like(on_patch))
 
 
-def _sun_alone(light: Light, facing: Facing) -> Light:
+def _sun_alone(light: Light, facing: FacingCosine) -> Light:
     """As strong on the patch as ambient light and sun were."""
     cosine = facing(light.light_azimuth_deg, light.light_elevation_deg)
     sun = (light.ambient + light.directional * cosine) / np.maximum(cosine, _LEAST_COSINE)
@@ -197,24 +197,26 @@ _JITTER = dict.fromkeys("xyz", "view.look_at_jitter")
 _BALANCE: dict[str, str] = dict.fromkeys(("red", "blue"), "camera.white_balance")
 _SUN = {"light_azimuth_deg": "light.azimuth_deg", "light_elevation_deg": "light.elevation_deg"}
 
-EFFECTS: tuple[Effect, ...] = (
-    Effect("viewpoint", _VIEW | _JITTER, 0, (*_VIEW, "look_at_offset"), _view, anew="all", switch=False),
-    Effect("background", _PLACE, 11, ("background",), lambda *place: np.column_stack(place), ("x", "y"), False),
-    Effect("directional light", {"directional": "light.directional"} | _SUN, 8, instead=_even_for_sun),
-    Effect("ambient light", {"ambient": "light.ambient"}, 7, instead=_sun_alone),
-    Effect("dot gain", {"dot_gain": "printer.dot_gain"}, 22),
-    Effect("ink density", {"density": "printer.density"}, 23),
-    Effect("printed black", {"black": "printer.black"}, 24),
-    Effect("print scale", {"printed_scale": "printer.scale"}, 48),
-    Effect("exposure", {"exposure_ev": "camera.exposure_ev"}, 16, anew="all"),
-    Effect("white balance", _BALANCE, 17, ("white_balance",), _gains),
-    Effect("motion blur", {"motion_px": "camera.motion_px", "motion_deg": (0.0, 180.0)}, 40, anew="all", whole=True),
-    Effect("blur", {"blur_px": "camera.blur_px"}, 19, anew="all", whole=True),
-    Effect("noise", {"noise": "camera.noise"}, 20, anew="all", whole=True),
-    Effect("grain", {}, 25, ("noise_seed",), switch=False),
-    Effect("JPEG", {"jpeg": "camera.jpeg"}, 21, made=lambda quality: quality.round().astype(np.int64), whole=True),
+EFFECTS: tuple[ViewEffect, ...] = (
+    ViewEffect("viewpoint", _VIEW | _JITTER, 0, (*_VIEW, "look_at_offset"), _view, anew="all", switch=False),
+    ViewEffect("background", _PLACE, 11, ("background",), lambda *place: np.column_stack(place), ("x", "y"), False),
+    ViewEffect("directional light", {"directional": "light.directional"} | _SUN, 8, instead=_even_for_sun),
+    ViewEffect("ambient light", {"ambient": "light.ambient"}, 7, instead=_sun_alone),
+    ViewEffect("dot gain", {"dot_gain": "printer.dot_gain"}, 22),
+    ViewEffect("ink density", {"density": "printer.density"}, 23),
+    ViewEffect("printed black", {"black": "printer.black"}, 24),
+    ViewEffect("print scale", {"printed_scale": "printer.scale"}, 48),
+    ViewEffect("exposure", {"exposure_ev": "camera.exposure_ev"}, 16, anew="all"),
+    ViewEffect("white balance", _BALANCE, 17, ("white_balance",), _gains),
+    ViewEffect(
+        "motion blur", {"motion_px": "camera.motion_px", "motion_deg": (0.0, 180.0)}, 40, anew="all", whole=True
+    ),
+    ViewEffect("blur", {"blur_px": "camera.blur_px"}, 19, anew="all", whole=True),
+    ViewEffect("noise", {"noise": "camera.noise"}, 20, anew="all", whole=True),
+    ViewEffect("grain", {}, 25, ("noise_seed",), switch=False),
+    ViewEffect("JPEG", {"jpeg": "camera.jpeg"}, 21, made=lambda quality: quality.round().astype(np.int64), whole=True),
 )
-EFFECT = {effect.name: effect for effect in EFFECTS}
+EFFECT_BY_NAME = {effect.name: effect for effect in EFFECTS}
 
 # Fields in the order in which files have them: as they were drawn when all effects shared one sequence.
 _DRAWN = sorted(EFFECTS, key=lambda effect: (np.inf if effect.first is None else effect.first, len(effect.columns)))

@@ -25,8 +25,8 @@ from pydantic import Field
 from patchproof.base.errors import Refused
 from patchproof.base.input import is_file, read_json
 from patchproof.base.packaged import packaged_path
-from patchproof.base.validation import Finite, Positive, Share, Strict, nearest, validated
-from patchproof.channel.frame import Frame
+from patchproof.base.validation import Finite, Positive, Share, StrictModel, spelling_hint, validate_model
+from patchproof.channel.render_frame import Frame
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -36,7 +36,7 @@ _ITERATIONS = 100
 _CLOSED_PX = 1e-6  # at the file's own size: as far as distorting an undistorted point may miss the point
 
 
-class Camera(Strict):
+class Camera(StrictModel):
     """A camera file; lengths in pixels of a picture of `image_px` (width, height), centers at .5."""
 
     name: str
@@ -119,7 +119,7 @@ class Camera(Strict):
 def load_camera(name_or_file: str | Path, base: Path | None = None, photo_px: tuple[int, int] | None = None) -> Camera:
     """A shipped camera by name, or a JSON file relative to `base`; refused where it cannot have taken `photo_px`."""
     path = _path(name_or_file, base)
-    camera = validated(Camera, read_json(path, "a camera file (JSON)", "calibrate again"), str(path))
+    camera = validate_model(Camera, read_json(path, "a camera file (JSON)", "calibrate again"), str(path))
     check_camera(camera, str(path))
     width, height = camera.image_px
     if photo_px is not None and not camera.fits(photo_px):
@@ -206,7 +206,7 @@ def _path(name_or_file: str | Path, base: Path | None) -> Path:
         return path
     known = sorted(file.stem for file in packaged_path("calibration", "cameras").glob("*.json"))
     if (name := str(name_or_file)) not in known:
-        raise Refused("a camera's name or file", f'"{name_or_file}"', nearest(name_or_file, known))
+        raise Refused("a camera's name or file", f'"{name_or_file}"', spelling_hint(name, known))
     return packaged_path("calibration", "cameras", f"{name}.json")
 
 

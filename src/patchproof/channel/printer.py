@@ -4,7 +4,7 @@ In: sRGB as sent, N×3×H×W in [0, 1]. Out: sRGB as seen by an eye adapted to t
 so that light and camera are applied once, elsewhere. A second table holds how far each color is out of gamut (ΔE00 of
 the round trip). A printer is a name, two tables and where they come from; on disk NAME.npz and NAME.json.
 Out-of-gamut inks (offset cyan and green lie outside sRGB) are clipped to [0, 1] when the table is made: cameras that
-deliver sRGB clip them too. Print-to-print variation is a small function on top, `vary`.
+deliver sRGB clip them too. Print-to-print variation is a small function on top, `vary_print`.
 Left out on purpose: halftone dots (below what a camera resolves beyond 0.2 mm per pixel) and ink spread.
 """
 
@@ -22,11 +22,11 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from patchproof.base.color import clamped
+from patchproof.base.color import clamp_to_unit
 from patchproof.base.errors import Refused
 from patchproof.base.input import is_file, read_json
 from patchproof.base.packaged import packaged_path
-from patchproof.base.validation import Finite, Strict, nearest, validated
+from patchproof.base.validation import Finite, StrictModel, spelling_hint, validate_model
 
 # 8-bit values that exist, so that a table baked by an 8-bit engine is exact at its nodes: 0, 8, ..., 248, 255
 NODES_8BIT = (*range(0, 249, 8), 255)
@@ -35,14 +35,14 @@ Method = Literal["measured", "icc", "assumed"]
 GAMUT_STEPS = 8  # the gamut table is stored in eighths of a ΔE00, up to 31.9
 
 
-class Paper(Strict):
+class Paper(StrictModel):
     """The sheet under the media-relative table; null where unknown."""
 
     white_lab: tuple[Finite, Finite, Finite] | None = None  # D50, absolute
     black_L: Finite | None = None  # L* of printed sRGB black, paper white at 100
 
 
-class PrinterHead(Strict):
+class PrinterHead(StrictModel):
     """NAME.json of a printer, without its tables."""
 
     name: str
@@ -92,7 +92,7 @@ def identity_printer() -> Printer:
     return Printer("identity", "assumed", lut, torch.zeros(lut.shape[:3]), Paper(black_L=0.0), note)
 
 
-def vary(seen_linear: Tensor, change: Tensor) -> Tensor:
+def vary_print(seen_linear: Tensor, change: Tensor) -> Tensor:
     """Light `... × 3` of colors as seen, as of another print of the same file; channels last, unlike an image.
 
     `change` `... × 3` broadcasts against it: dot gain g, ink density d, black b; 0 changes nothing. Bare paper stays 1.
@@ -102,7 +102,7 @@ def vary(seen_linear: Tensor, change: Tensor) -> Tensor:
     gain, density, black = change.to(seen_linear).split(1, -1)
     light = seen_linear * (1 - 4 * gain * (1 - seen_linear))
     light = light * light.clamp_min(1e-3) ** density  # the floor keeps the slope finite at black
-    return clamped(light + black * (1 - light))
+    return clamp_to_unit(light + black * (1 - light))
 
 
 def load_printer(name_or_file: str, base: Path | None = None) -> Printer:
@@ -117,7 +117,9 @@ def load_printer(name_or_file: str, base: Path | None = None) -> Printer:
         return _read((base or Path()) / name_or_file)
     known = sorted(path.stem for path in packaged_path("calibration", "printers").glob("*.npz"))
     if name_or_file not in known:
-        raise Refused("a printer's name or file", f'"{name_or_file}"', nearest(name_or_file, [*known, "identity"]))
+        raise Refused(
+            "a printer's name or file", f'"{name_or_file}"', spelling_hint(name_or_file, [*known, "identity"])
+        )
     return _read(packaged_path("calibration", "printers", f"{name_or_file}.npz"))
 
 
@@ -126,7 +128,7 @@ def _read(path: Path) -> Printer:
     for file in (tables, text):
         if not is_file(file):
             raise Refused(f"{expected} beside it", f"no file at {file}", "check the path")
-    head = validated(PrinterHead, read_json(text, expected, "calibrate again"), str(text))
+    head = validate_model(PrinterHead, read_json(text, expected, "calibrate again"), str(text))
     try:
         with zipfile.ZipFile(tables) as archive:
             lut = _array(archive, "lut", (SIZE, SIZE, SIZE, 3), (np.uint8, np.uint16))
@@ -163,7 +165,7 @@ def _bordered(table: Tensor) -> Tensor:
 
 def _look_up(table: Tensor, srgb: Tensor) -> Tensor:
     colors = srgb if srgb.dtype == torch.float64 else srgb.float()  # half precision cannot address 33 nodes finely
-    levels = 255 * clamped(colors)
+    levels = 255 * clamp_to_unit(colors)
     position = torch.where(levels <= 248, levels / 8, 31 + (levels - 248) / 7)  # the last step is 7 wide
     grid = (2 * (position + 1) / (SIZE + 1) - 1).movedim(1, -1).flip(-1)  # grid_sample wants (x, y, z) = (b, g, r)
     sample = torch.nn.functional.grid_sample

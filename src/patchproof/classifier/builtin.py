@@ -23,10 +23,10 @@ from patchproof.classifier.network import Classifier
 INPUT_PX = 96
 WIDTHS = (16, 32, 64, 96, 160)  # channels after each halving of the picture: 48, 24, 12, 6, 3 pixels
 MEAN, DEVIATION = 0.45, 0.27  # of sRGB photographs, roughly; the first layer learns the rest
-HERE = Path(__file__).parent
+WEIGHTS_FOLDER = Path(__file__).parent
 
 
-class Halvings(nn.Module):
+class Backbone(nn.Module):
     """Five halvings, each a strided convolution and, but for the first, a residual one."""
 
     def __init__(self, batch_norm: bool):
@@ -45,7 +45,7 @@ class Halvings(nn.Module):
         return sizes
 
 
-class SmallNetwork(Halvings):
+class SmallNetwork(Backbone):
     """Halvings, then the mean and a line."""
 
     def __init__(self, classes: int, batch_norm: bool = False):
@@ -57,14 +57,14 @@ class SmallNetwork(Halvings):
         return self.classify(self.features(photos_srgb)[-1].mean((2, 3)))
 
 
-def load_builtin(folder: Path = HERE) -> Classifier:
+def load_builtin(folder: Path = WEIGHTS_FOLDER) -> Classifier:
     """The network from `builtin.safetensors` with the labels of `builtin.json`."""
-    sha256, card, network = stored_network(SmallNetwork, "builtin", folder)
+    sha256, card, network = load_stored_network(SmallNetwork, "builtin", folder)
     return Classifier("builtin", sha256, INPUT_PX, tuple(card["labels"]), network)
 
 
-def stored_network(
-    kind: Callable[[int], nn.Module], name: str, folder: Path = HERE
+def load_stored_network(
+    kind: Callable[[int], nn.Module], name: str, folder: Path = WEIGHTS_FOLDER
 ) -> tuple[str, dict[str, Any], nn.Module]:
     """SHA-256 of the weights NAME.safetensors, what NAME.json says, and the network of this kind with them."""
     from safetensors.torch import load

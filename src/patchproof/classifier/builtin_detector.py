@@ -13,7 +13,7 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from patchproof.classifier.builtin import HERE, WIDTHS, Halvings, conv, stored_network
+from patchproof.classifier.builtin import WEIGHTS_FOLDER, WIDTHS, Backbone, conv, load_stored_network
 from patchproof.classifier.detector import Detector
 
 INPUT_PX, CELL_PX = 128, 16
@@ -21,7 +21,7 @@ HEAD = 96  # channels
 NEAR, FAR = -2.0, 2.5  # logarithms of the nearest and the farthest side, in cells: 2 and 195 pixels
 
 
-class SmallDetector(Halvings):
+class SmallDetector(Backbone):
     """The built-in classifier's five halvings; cells of 16 pixels look at themselves and at those of 32 around."""
 
     def __init__(self, classes: int, batch_norm: bool = False):
@@ -54,7 +54,7 @@ def _boxes(sides: Tensor) -> Tensor:
     return torch.cat([centers - distances[..., :2], centers + distances[..., 2:]], -1)
 
 
-def load_builtin_detector(folder: Path = HERE) -> Detector:
+def load_builtin_detector(folder: Path = WEIGHTS_FOLDER) -> Detector:
     """The detector from `builtin_detector.safetensors` with the labels of `builtin_detector.json`."""
-    sha256, card, network = stored_network(SmallDetector, "builtin_detector", folder)
+    sha256, card, network = load_stored_network(SmallDetector, "builtin_detector", folder)
     return Detector("builtin-detector", sha256, INPUT_PX, tuple(card["labels"]), network, card["least_score"])

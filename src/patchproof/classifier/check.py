@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from patchproof.base.errors import Refused
-from patchproof.classifier.network import NOTHING, Classifier
+from patchproof.classifier.network import NO_BOX_LOGIT, Classifier
 
 # Logits differ by rounding when the batch does: 1e-6 of their spread in float32 here, 1e-3 with TF32. A dropout or a
 # BatchNorm in training mode moves them by more than a hundredth.
@@ -36,11 +36,11 @@ def check_network(classifier: Classifier, device: torch.device | str = "cpu") ->
     except Refused:
         raise
     except Exception as error:  # it is the user's program: whatever it raises is about it
-        reason = f"{type(error).__name__}: {first_line(error)}"
+        reason = f"{type(error).__name__}: {error_summary(error)}"
         got = f"{name}, which fails on 3×3×{classifier.input_px}×{classifier.input_px} ({reason})"
         raise Refused("a network that takes N×3×S×S pictures", got, "check input_px and the export") from error
     _check_outputs(logits, len(classifier.labels), name)
-    if classifier.LOOKS_AT_BOXES and float(logits.max()) <= NOTHING:
+    if classifier.LOOKS_AT_BOXES and float(logits.max()) <= NO_BOX_LOGIT:
         warnings.warn(f"{name} finds nothing in smooth pictures: its gradients were not tried", stacklevel=2)
         return
     spread = float(logits.max() - logits.min())
@@ -99,6 +99,6 @@ def smooth_pictures(size_px: int) -> Tensor:
     return torch.nn.functional.interpolate(coarse, (size_px, size_px), mode="bilinear", align_corners=False)
 
 
-def first_line(error: Exception) -> str:
+def error_summary(error: Exception) -> str:
     """The first line of its message, shortened."""
     return (str(error).strip().splitlines() or [""])[0][:200]

@@ -21,7 +21,7 @@ from patchproof.classifier.custom import classifier_of
 from patchproof.classifier.labels import nearest_names
 from patchproof.classifier.network import Classifier
 from patchproof.classifier.network_file import read_card
-from patchproof.classifier.zoo import Normalized, downloaded, library, own_weights, put_into
+from patchproof.classifier.zoo import Normalized, downloaded, library, load_weights, read_weights
 
 
 class Prompted(nn.Module):
@@ -55,7 +55,7 @@ def load_clip(name: str) -> Classifier:
         network = downloaded(f"clip:{model}", lambda: open_clip.create_model(known, **options))
     else:
         network = open_clip.create_model(known)
-        put_into(network, own_weights(path), f"clip:{known}", "check the model's name")
+        load_weights(network, read_weights(path), f"clip:{known}", "check the model's name")
     view, size = network.visual.preprocess_cfg, network.visual.image_size
     side_px = int(size if isinstance(size, int) else min(size))
     if side_px != card.input_px:

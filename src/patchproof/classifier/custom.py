@@ -19,9 +19,9 @@ from torch import Tensor
 
 from patchproof.base.errors import Refused
 from patchproof.classifier.detector import Detector
-from patchproof.classifier.network import NOTHING, Classifier, weights_sha256
+from patchproof.classifier.network import NO_BOX_LOGIT, Classifier, weights_sha256
 
-MOST_FOUND = 1000  # boxes in a picture, of networks that find any number
+MAX_DETECTIONS = 1000  # boxes in a picture, of networks that find any number
 
 
 def load_custom(dotted: str, base: Path) -> Classifier:
@@ -115,13 +115,13 @@ class AsCandidates(torch.nn.Module):
         return torch.stack(rows)
 
     def _rows(self, boxes: Tensor, labels: Tensor, scores: Tensor) -> Tensor:
-        """`MOST_FOUND`×(4+K), the surest first; what is left over lies nowhere and shows nothing."""
-        surest = scores.argsort(descending=True)[:MOST_FOUND]
-        nothing = scores.new_full((MOST_FOUND, self.labels), NOTHING)
+        """`MAX_DETECTIONS`×(4+K), the surest first; what is left over lies nowhere and shows nothing."""
+        surest = scores.argsort(descending=True)[:MAX_DETECTIONS]
+        nothing = scores.new_full((MAX_DETECTIONS, self.labels), NO_BOX_LOGIT)
         logits = torch.logit(scores[surest].clamp(1e-6, 1 - 1e-6))
         rows = torch.arange(len(surest), device=scores.device)
         nothing = nothing.index_put((rows, labels[surest]), logits)
-        return torch.cat([torch.nn.functional.pad(boxes[surest], (0, 0, 0, MOST_FOUND - len(surest))), nothing], 1)
+        return torch.cat([torch.nn.functional.pad(boxes[surest], (0, 0, 0, MAX_DETECTIONS - len(surest))), nothing], 1)
 
 
 def _factory(dotted: str, base: Path):

@@ -2,7 +2,7 @@
 
 In: what a network finds in the photographs' centered squares: candidate boxes with a score for each label, before
 suppression of those that overlap. Out: per photograph and label the logit of the best candidate that lies on the
-object (intersection over union of at least `LEAST_IOU` with its box), so that rates, losses, controls and promises of
+object (intersection over union of at least `MIN_IOU` with its box), so that rates, losses, controls and promises of
 detectors are written in the words of classifiers: the object is recognized where that score reaches `least_score`,
 confidence is the score. Where the object's box is not known, any candidate in the square counts.
 Left out on purpose: suppression. It leaves the best candidate of an object, which alone decides here.
@@ -17,10 +17,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from patchproof.classifier.network import NOTHING, Classifier, Odds
+from patchproof.classifier.network import NO_BOX_LOGIT, Classifier, Odds
 from patchproof.networks.windows import Windows
 
-LEAST_IOU = 0.5  # as in PASCAL VOC's and COCO's AP50
+MIN_IOU = 0.5  # as in PASCAL VOC's and COCO's AP50
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Detector(Classifier):
         logits = candidates[..., 4:]
         if boxes is not None:
             overlap = iou(candidates[..., :4].detach(), torch.as_tensor(boxes).to(squares) * self.input_px)
-            logits = logits.masked_fill((overlap < LEAST_IOU)[..., None], NOTHING)
+            logits = logits.masked_fill((overlap < MIN_IOU)[..., None], NO_BOX_LOGIT)
         return logits.amax(1)
 
 

@@ -21,12 +21,12 @@ from pathlib import Path
 import torch
 
 from patchproof.base.errors import Refused
-from patchproof.base.validation import expand
+from patchproof.base.validation import expand_path
 from patchproof.classifier.builtin import load_builtin
 from patchproof.classifier.check import check_network, smooth_pictures
 from patchproof.classifier.custom import labeled_module, load_custom
 from patchproof.classifier.network import Classifier, freeze
-from patchproof.networks.batches import fastest
+from patchproof.networks.batches import tune_batches
 
 
 def load_classifier(
@@ -48,7 +48,7 @@ def load_classifier(
         name = labeled_module(name, "python:network")
     if isinstance(name, Classifier):
         return _trusted(name, device)
-    kind, _, rest = expand(name, Path(base)).partition(":")
+    kind, _, rest = expand_path(name, Path(base)).partition(":")
     if name == "builtin":
         classifier = load_builtin()
     elif name == "builtin-detector":
@@ -72,10 +72,10 @@ def load_classifier(
     elif kind == "python":
         raise Refused("the network itself, which was given in Python", name, "give it again: models=[...]")
     else:
-        from patchproof.classifier.network_file import EXPORT
+        from patchproof.classifier.network_file import EXPORT_ADVICE
 
         known = "builtin, builtin-detector, torchvision:NAME, timm:NAME, clip:NAME@FILE, file:NAME.onnx"
-        words = {".onnx": f'write "file:{name}"', ".pt2": EXPORT}
+        words = {".onnx": f'write "file:{name}"', ".pt2": EXPORT_ADVICE}
         do = words.get(Path(name).suffix, "write one of these")
         raise Refused(f"a model named {known} or module:package.factory", f'"{name}"', do)
     return _trusted(replace(classifier, name=name), device)
@@ -88,7 +88,7 @@ def _trusted(classifier: Classifier, device: torch.device | str) -> Classifier:
         freeze(classifier.network).to(device)
     check_network(classifier, device)
     pictures = smooth_pictures(classifier.input_px).to(device)
-    return replace(classifier, network=fastest(classifier.network, pictures))
+    return replace(classifier, network=tune_batches(classifier.network, pictures))
 
 
 def use_full_precision(device: torch.device | str) -> None:

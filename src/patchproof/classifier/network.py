@@ -18,17 +18,17 @@ import torch
 from torch import Tensor
 
 from patchproof.base.errors import Refused
-from patchproof.networks.batches import InBatches
+from patchproof.networks.batches import BatchedNetwork
 from patchproof.networks.windows import Windows
 
-NOTHING = -20.0  # the logit where no candidate of a detector lies on the object: a score of 2e-9
+NO_BOX_LOGIT = -20.0  # the logit where no candidate of a detector lies on the object: a score of 2e-9
 
 
 class Odds(NamedTuple):
     """The logarithms of N confidences and of what they lack to 1; float64, so that 1 - 1e-9 is not 1."""
 
     log_confidence: Tensor
-    log_rest: Tensor
+    log_complement: Tensor
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Classifier:
     KIND: ClassVar[str] = "classifier"
     LOOKS_AT_BOXES: ClassVar[bool] = False  # whether it matters where the object lies
 
-    def at_score(self, least_score: float | None) -> Classifier:
+    def with_least_score(self, least_score: float | None) -> Classifier:
         """The network with that score in place of its own, if there is one and it needs any."""
         return self if None in (least_score, self.least_score) else replace(self, least_score=least_score)
 
@@ -96,7 +96,7 @@ class Classifier:
 
     def _asked(self, squares: Tensor, windows: Windows | None) -> Tensor:
         """What the network itself says."""
-        if windows is not None and isinstance(self.network, InBatches):
+        if windows is not None and isinstance(self.network, BatchedNetwork):
             return self.network(squares, windows)
         return self.network(squares)
 

@@ -7,7 +7,7 @@ One that was exported for one number of pictures is called with as many.
 Nothing of the file is executed: protobuf.py reads its fields, onnx_file.py the graph from them, and graph.py computes
 its operators, which are on the list in onnx_operators.py. The library onnx is not called.
 
-`EXPORT` is how to make one. What an exporter writes into NAME.onnx.data belongs to NAME.onnx.
+`EXPORT_ADVICE` is how to make one. What an exporter writes into NAME.onnx.data belongs to NAME.onnx.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from patchproof.base.errors import Refused
 from patchproof.base.input import is_file, read_json
 from patchproof.classifier.detector import Detector
 from patchproof.classifier.network import Classifier
-from patchproof.networks.batches import InBatches
+from patchproof.networks.batches import BatchedNetwork
 from patchproof.networks.bounds import UnsupportedNetwork
 from patchproof.networks.onnx_file import read_onnx
 
 MAX_BYTES = 4 << 30  # larger than any classifier here has been
-EXPORT = (
+EXPORT_ADVICE = (
     'export it with torch.onnx.export(network.eval(), (torch.rand(2, 3, S, S),), "NAME.onnx", '
     'dynamic_shapes=({0: torch.export.Dim("n")},), dynamo=True), S pixels a side, and lay NAME.json beside it'
 )
@@ -34,7 +34,7 @@ EXPORT = (
 def load_network(path: Path) -> Classifier:
     """The ONNX file and its card as a Classifier; files of other kinds are refused by their name."""
     if path.suffix != ".onnx":
-        raise Refused("a network as an ONNX file, file:NAME.onnx", f"{path}", EXPORT)
+        raise Refused("a network as an ONNX file, file:NAME.onnx", f"{path}", EXPORT_ADVICE)
     stored = network_bytes(path)  # once, so that what is hashed is what is loaded
     card = read_card(path.with_suffix(".json"))
     digest = hashlib.sha256(stored)
@@ -45,7 +45,7 @@ def load_network(path: Path) -> Classifier:
         return data
 
     try:
-        network = InBatches(*read_onnx(stored, beside))
+        network = BatchedNetwork(*read_onnx(stored, beside))
     except UnsupportedNetwork as error:
         do = "export it in evaluation mode, without custom operators and control flow, opset 13 or later"
         raise Refused("an ONNX file of plain tensors and operators", f"{path} with {error}", do) from error

@@ -28,8 +28,8 @@ from torch import Tensor, nn
 
 from patchproof.base.errors import Refused
 from patchproof.base.input import is_file
-from patchproof.classifier.check import first_line
-from patchproof.classifier.custom import MOST_FOUND, classifier_of, detector_of
+from patchproof.classifier.check import error_summary
+from patchproof.classifier.custom import MAX_DETECTIONS, classifier_of, detector_of
 from patchproof.classifier.detector import Detector
 from patchproof.classifier.labels import nearest_names
 from patchproof.classifier.network import Classifier
@@ -75,7 +75,7 @@ def load_torchvision(name: str) -> Classifier:
 
 
 # of torchvision's detectors by what their constructors call it: as many candidates as there are, none suppressed
-_RAW = {"score_thresh": 1e-3, "nms_thresh": 1.0, "detections_per_img": MOST_FOUND}
+_RAW = {"score_thresh": 1e-3, "nms_thresh": 1.0, "detections_per_img": MAX_DETECTIONS}
 
 
 def _detector(models: Any, name: str) -> Detector:
@@ -121,7 +121,7 @@ def _timm_labels(timm: Any, network: Any, name: str) -> list[str]:
 
 
 @dataclass(frozen=True)
-class Own:
+class LocalWeights:
     """Weights of a local file."""
 
     path: Path
@@ -130,13 +130,13 @@ class Own:
     card: Card | None  # input size and labels, where they are not the published ones
 
 
-def _own_weights(name: str) -> tuple[str, Own | None]:
+def _own_weights(name: str) -> tuple[str, LocalWeights | None]:
     """The model's name, and the weights of the file that is named with it."""
     name, at, file = name.partition("@") if not name.startswith("hf-hub:") else (name, "", "")  # there @ is a revision
-    return name, own_weights(Path(file)) if at else None
+    return name, read_weights(Path(file)) if at else None
 
 
-def own_weights(path: Path) -> Own:
+def read_weights(path: Path) -> LocalWeights:
     """Those of a file NAME.safetensors, with the card beside it where there is one."""
     from safetensors import SafetensorError
     from safetensors.torch import load
@@ -148,10 +148,10 @@ def own_weights(path: Path) -> Own:
     try:
         tensors = load(stored)
     except (SafetensorError, KeyError, ValueError, RuntimeError) as error:
-        got = f"{path} that cannot be read ({first_line(error)})"
+        got = f"{path} that cannot be read ({error_summary(error)})"
         raise Refused("weights in safetensors", got, "save it again") from error
     card = path.with_suffix(".json")
-    return Own(path, tensors, hashlib.sha256(stored).hexdigest(), read_card(card) if is_file(card) else None)
+    return LocalWeights(path, tensors, hashlib.sha256(stored).hexdigest(), read_card(card) if is_file(card) else None)
 
 
 # heads that only training uses, and a counter of its steps
@@ -159,18 +159,24 @@ _UNUSED = re.compile(r"(aux\d?|AuxLogits)\..*|.*\.num_batches_tracked")
 
 
 def _with(
-    own: Own | None, network: Any, mean: Sequence[float], std: Sequence[float], side_px: int, labels: Any, name: str
+    own: LocalWeights | None,
+    network: Any,
+    mean: Sequence[float],
+    std: Sequence[float],
+    side_px: int,
+    labels: Any,
+    name: str,
 ) -> Classifier:
     """The network as a Classifier, the file's weights in it where there is one."""
     classifier = classifier_of(Normalized(network, mean, std), side_px, labels, name)
     if own is None:
         return classifier
     do = "check the name, and write the labels of a network with others into NAME.json beside it"
-    put_into(network, own, f"{name} for {len(labels)} labels", do)
+    load_weights(network, own, f"{name} for {len(labels)} labels", do)
     return replace(classifier, sha256=own.sha256)
 
 
-def put_into(network: Any, own: Own, name: str, do: str) -> None:
+def load_weights(network: Any, own: LocalWeights, name: str, do: str) -> None:
     """The file's weights into a network of that name; refused, with what to `do`, where they are another's."""
     wanted = {key: tensor.shape for key, tensor in network.state_dict().items() if not _UNUSED.fullmatch(key)}
     given = {key: tensor.shape for key, tensor in own.tensors.items() if not _UNUSED.fullmatch(key)}
@@ -200,7 +206,7 @@ def downloaded(name: str, load: Callable[[], Any]) -> Any:
     try:
         return load()
     except Exception as error:  # each library raises its own for no network, no weights and no space
-        got = f"{type(error).__name__} ({first_line(error)})"
+        got = f"{type(error).__name__} ({error_summary(error)})"
         raise Refused(f"the published weights of {name}", got, "check the name and the way to the internet") from error
 
 

@@ -16,14 +16,14 @@ from functools import partial
 import cv2
 import numpy as np
 
-from patchproof.base.color import ciede2000, lab_from_linear, photo_codes_of, srgb_from_linear
+from patchproof.base.color import ciede2000, lab_from_linear, photo_codes_from_srgb, srgb_from_linear
 from patchproof.base.geometry import rect_corners
 from patchproof.evidence.results import Color, Geometry
-from patchproof.evidence.surface import Promised, Surface
+from patchproof.evidence.surface import PromisedColors, Surface
 from patchproof.photo.colorfit import ColorFit, affine12, white_black
-from patchproof.photo.detect import LIGHT
+from patchproof.photo.detect import LINEAR_FLOAT32_FROM_CODE
 from patchproof.photo.quality import CLIPPED_CODE, FrameLight
-from patchproof.photo.rectify import averaged, crop, flattened, least_px_per_mm, rectified_px
+from patchproof.photo.rectify import crop_around, least_px_per_mm, oversample_flat, rectified_px, resize_by_area
 
 _CELLS = (6, 48)  # least and most along the design's shorter side
 MOST_CLIPPED = 0.5  # share of the design at full white, where color is unknown
@@ -31,7 +31,7 @@ _MOST_CLIPPED_PAPER = 0.2
 _PICTURE_PX = 192
 _SAMPLES = 8  # along a cell that are looked at, each the mean of the photograph's pixels there
 _STRIP_PX = 100_000  # 1.6 MB as light: caches hold it
-_LIGHT = np.repeat(LIGHT[None, :, None], 3, 2)
+_LIGHT = np.repeat(LINEAR_FLOAT32_FROM_CODE[None, :, None], 3, 2)
 _ANCHORS = 8  # cells for each time that paper and ink count
 _GLOSS = 0.15  # linear light, paper = 1
 
@@ -40,7 +40,7 @@ def appearance(
     srgb: np.ndarray,
     px_from_mm: np.ndarray,
     surface: Surface,
-    promised: Promised,
+    promised: PromisedColors,
     light: FrameLight,
     geometry: Geometry,
     with_pictures: bool = True,
@@ -51,12 +51,12 @@ def appearance(
     cells_per_mm, picture_per_mm = _cells_per_mm(surface, geometry), _PICTURE_PX / max(surface.rect_mm[2:])
     spare = least_px_per_mm(px_from_mm, surface.rect_mm) / max(_SAMPLES * cells_per_mm, picture_per_mm)
     step = max(1, int(spare))
-    part, px_from_mm = crop(srgb, px_from_mm, rect_corners(surface.rect_mm), 4 * step)
+    part, px_from_mm = crop_around(srgb, px_from_mm, rect_corners(surface.rect_mm), 4 * step)
     linear = _reduced_light(part, step)
     px_from_mm = np.diag([1 / step, 1 / step, 1.0]) @ px_from_mm
     size = rectified_px(surface.rect_mm, cells_per_mm)
-    flat = flattened(linear, px_from_mm, surface.rect_mm, size)
-    *lit, clipped = cv2.split(averaged(flat, size))
+    flat = oversample_flat(linear, px_from_mm, surface.rect_mm, size)
+    *lit, clipped = cv2.split(resize_by_area(flat, size))
     lit, clipped = np.dstack(lit).astype(float), clipped > 0.05
     blur_mm = geometry.blur_px / geometry.px_per_mm
     expected = coarse(promised.design, lit.shape[:2], blur_mm * promised.design.shape[1] / surface.rect_mm[2])
@@ -81,12 +81,12 @@ def appearance(
     )
     if not with_pictures:
         return color, {}
-    seen = averaged(flat, rectified_px(surface.rect_mm, picture_per_mm))[..., :3]
+    seen = resize_by_area(flat, rectified_px(surface.rect_mm, picture_per_mm))[..., :3]
     fitted = fit.apply(seen)
     pictures = {
-        "seen": photo_codes_of(srgb_from_linear(seen)),
-        "fitted": photo_codes_of(srgb_from_linear(fitted)),
-        "promised": photo_codes_of(srgb_from_linear(coarse(promised.design, fitted.shape[:2], 0.0))),
+        "seen": photo_codes_from_srgb(srgb_from_linear(seen)),
+        "fitted": photo_codes_from_srgb(srgb_from_linear(fitted)),
+        "promised": photo_codes_from_srgb(srgb_from_linear(coarse(promised.design, fitted.shape[:2], 0.0))),
         "delta_e00": np.where(usable, delta, np.nan).astype(np.float32),
     }
     return color, pictures
@@ -155,4 +155,4 @@ def coarse(design: np.ndarray, shape: tuple[int, ...], blur_design_px: float) ->
     """The promised light blurred and averaged to `shape` cells."""
     if blur_design_px > 0.3:
         design = cv2.GaussianBlur(design, (0, 0), float(blur_design_px), borderType=cv2.BORDER_REPLICATE)
-    return averaged(design, (shape[1], shape[0])).astype(float)
+    return resize_by_area(design, (shape[1], shape[0])).astype(float)

@@ -1,6 +1,6 @@
 """Each photograph of a folder, on its own: measured (over processes), classified, kept in the journal and let go.
 
-In: `Item`s, a `Task` (all that a photograph is measured against), the networks, open workers. Out: a `MeasuredPhoto`
+In: `PhotoItem`s, a `Task` (all that a photograph is measured against), the networks, open workers. Out: a `MeasuredPhoto`
 for each, in order, however they finished, without its pictures and squares. A file that cannot be read, cannot be
 measured or ends its process each time becomes a rejected entry; the others go on. Of a control's photographs only what
 the networks see counts, since a bare object carries no marker; one that shows nothing at all is rejected.
@@ -21,25 +21,25 @@ from pydantic import Field, ValidationError
 
 from patchproof.base.errors import WorkerDied
 from patchproof.base.geometry import apply_homography, rect_corners
-from patchproof.base.resample import reduced_size, sixteenths
-from patchproof.base.validation import Finite, Share, Strict
+from patchproof.base.resample import downscaled_size, to_sixteenths
+from patchproof.base.validation import Finite, Share, StrictModel
 from patchproof.base.workers import Workers, result_of
-from patchproof.evidence.boxes import in_square
-from patchproof.evidence.camera import view_of
-from patchproof.evidence.classify import Box, Judges, square_of, squares_of
+from patchproof.evidence.boxes import box_in_square
+from patchproof.evidence.camera import pinhole_photo
+from patchproof.evidence.classify import BoxEdges, Judges, square_of, squares_of
 from patchproof.evidence.journal import Journal, file_sha256
 from patchproof.evidence.measure import MeasuredPhoto, measure
-from patchproof.evidence.reproject import Shot, shot_of
+from patchproof.evidence.reproject import PhotoSquare, photo_square
 from patchproof.evidence.results import PhotoEntry, Remark
 from patchproof.evidence.surface import Surface
 from patchproof.evidence.task import Task
-from patchproof.photo.exif import of_a_camera
-from patchproof.photo.limits import limited
-from patchproof.photo.quality import FrameLight, shows_nothing
+from patchproof.photo.exif import has_camera_shape
+from patchproof.photo.limits import run_limited
+from patchproof.photo.quality import FrameLight, is_featureless
 from patchproof.photo.read import read_photo
 from patchproof.photo.rejection import PhotoRejected
 
-WITH_PICTURES = 120  # photographs shown with pictures; the rest is listed. Keeps the page below some 15 MB
+MAX_PICTURED_PHOTOS = 120  # photographs shown with pictures; the rest is listed. Keeps the page below some 15 MB
 _THUMBNAIL_PX = 560  # longer side: enough for a phone's width at twice its density, some 40 kB as JPEG
 _DESIGN_COLOR, _MARKER_COLOR = (255, 64, 129), (0, 200, 140)
 _DIED = "measuring it ended its process each time, for want of memory: save it smaller"
@@ -49,11 +49,11 @@ MEASURABLE_CODES = (None, "clipped", "blurred", "too_small", "cropped")
 _PART = "it is a crop or a screenshot by its shape, its name or EXIF: it counts, but use the camera's own file"
 
 # linear light of paper and ink; `frame_light` can give no more, and less than none of a print lighter than its paper
-Light = Annotated[Finite, Field(ge=-4, le=4)]
+LightLevel = Annotated[Finite, Field(ge=-4, le=4)]
 
 
 @dataclass(frozen=True)
-class Item:
+class PhotoItem:
     """A photograph to look at, its name in the report, the control that it shows (None: the patch), whether pictures of
     it are wanted, and the box that somebody drew round the object.
     """
@@ -62,7 +62,7 @@ class Item:
     file: str
     control: str | None = None
     with_pictures: bool = False
-    box_px: Box | None = None
+    box_px: BoxEdges | None = None
 
     @property
     def name(self) -> str:
@@ -72,7 +72,7 @@ class Item:
 
 def measure_all(
     task: Task,
-    items: Sequence[Item],
+    items: Sequence[PhotoItem],
     judges: Judges | None,
     workers: Workers,
     journal: Journal | None,
@@ -107,14 +107,14 @@ def measure_all(
     return [photos[number] for number in range(len(items))]
 
 
-class _Light(Strict):
-    paper: tuple[Light, Light, Light]
-    ink: tuple[Light, Light, Light]
+class _Light(StrictModel):
+    paper: tuple[LightLevel, LightLevel, LightLevel]
+    ink: tuple[LightLevel, LightLevel, LightLevel]
     contrast: Finite
     clipped: Share
 
 
-class _Kept(Strict):
+class _Kept(StrictModel):
     """A photograph's result in the journal."""
 
     entry: PhotoEntry
@@ -136,7 +136,7 @@ def _serialized(measured: MeasuredPhoto, pictures: bool) -> dict[str, Any]:
     return {"entry": entry, "counted": measured.counted, "light": light, "pictures": pictures}
 
 
-def _parsed(kept: Mapping[str, Any], item: Item, judges: Judges | None) -> MeasuredPhoto | None:
+def _parsed(kept: Mapping[str, Any], item: PhotoItem, judges: Judges | None) -> MeasuredPhoto | None:
     """What the journal has of the photograph; None where it is of another, or not what this run needs."""
     try:
         result = _Kept.model_validate(kept)
@@ -147,9 +147,9 @@ def _parsed(kept: Mapping[str, Any], item: Item, judges: Judges | None) -> Measu
     return result.photo if whole and (result.pictures or not item.with_pictures) else None
 
 
-def _measured(task: Task, item: Item) -> MeasuredPhoto:
+def _measured(task: Task, item: PhotoItem) -> MeasuredPhoto:
     try:
-        return limited(_measure, task, item)
+        return run_limited(_measure, task, item)
     except PhotoRejected as cannot:
         return _rejected(item, Remark.of(cannot))
     except (ArithmeticError, ValueError, TypeError, LookupError, MemoryError, cv2.error) as error:
@@ -158,20 +158,20 @@ def _measured(task: Task, item: Item) -> MeasuredPhoto:
         return _rejected(item, Remark(code="unreadable", advice=advice))
 
 
-def _measure(task: Task, item: Item) -> MeasuredPhoto:
+def _measure(task: Task, item: PhotoItem) -> MeasuredPhoto:
     photo = read_photo(item.path)
     squares, size_px = squares_of(photo.srgb, task.sizes_px), photo.srgb.shape[1::-1]
-    box = None if item.box_px is None else in_square(item.box_px, size_px)
+    box = None if item.box_px is None else box_in_square(item.box_px, size_px)
     if item.control is not None:
-        if shows_nothing(square_of(photo.srgb)[0]):
+        if is_featureless(square_of(photo.srgb)[0]):
             return _rejected(item, Remark(code="empty", advice=_EMPTY))
         return MeasuredPhoto(PhotoEntry(file=item.file, status="judged", box=box), True, squares=squares)
-    view = view_of(photo, task.camera)
+    view = pinhole_photo(photo, task.camera)
     wanted = task.scan_dpi, item.with_pictures
     measured = measure(view, item.file, task.surface, task.promised, task.ranges, *wanted)
     entry, pictures = measured.entry, {}
     # a crop or a screenshot: EXIF or its name says so, or cameras and the promise have other shapes
-    if measured.counted and entry.code is None and (photo.part or not of_a_camera(size_px, task.photo_px)):
+    if measured.counted and entry.code is None and (photo.part or not has_camera_shape(size_px, task.photo_px)):
         entry = entry.changed(remark=Remark(code="cropped", advice=_PART))
     if item.with_pictures:
         px_from_mm = entry.geometry and entry.geometry.homography_px_from_mm
@@ -182,7 +182,7 @@ def _measure(task: Task, item: Item) -> MeasuredPhoto:
 def _thumbnail(srgb: np.ndarray, px_from_mm: ArrayLike | None, surface: Surface) -> np.ndarray:
     """The photograph reduced, with the outline of the design and of the piece's markers where they are known to lie."""
     shrink = min(1.0, _THUMBNAIL_PX / max(srgb.shape[:2]))
-    size = reduced_size(srgb.shape[1::-1], _THUMBNAIL_PX)
+    size = downscaled_size(srgb.shape[1::-1], _THUMBNAIL_PX)
     # four pixels for each of it: all of 12 megapixels took a tenth of the whole measurement's time
     few = cv2.resize(srgb, (2 * size[0], 2 * size[1]), interpolation=cv2.INTER_NEAREST)
     small = cv2.resize(few, size, interpolation=cv2.INTER_AREA)
@@ -191,16 +191,16 @@ def _thumbnail(srgb: np.ndarray, px_from_mm: ArrayLike | None, surface: Surface)
     small_from_mm = np.diag([shrink, shrink, 1.0]) @ np.asarray(px_from_mm)
     markers = [(surface.corners_mm[marker_id], _MARKER_COLOR, 1) for marker_id in sorted(surface.piece_ids)]
     for corners_mm, color, width in (*markers, (rect_corners(surface.rect_mm), _DESIGN_COLOR, 2)):
-        points = sixteenths(apply_homography(small_from_mm, corners_mm))
+        points = to_sixteenths(apply_homography(small_from_mm, corners_mm))
         cv2.polylines(small, [points], True, color, width, cv2.LINE_AA, 4)
     return small
 
 
-def _rejected(item: Item, remark: Remark) -> MeasuredPhoto:
+def _rejected(item: PhotoItem, remark: Remark) -> MeasuredPhoto:
     return MeasuredPhoto(PhotoEntry(file=item.file, status="rejected", remark=remark), False)
 
 
-def shot_again(task: Task, size_px: int, item: tuple[Path, MeasuredPhoto]) -> Shot | None:
+def reread_square(task: Task, size_px: int, item: tuple[Path, MeasuredPhoto]) -> PhotoSquare | None:
     """What it takes to put other pieces into a photograph, which is read again for it: only few are, and none waits.
 
     None where that cannot be done: it does not count, or its sheet is not flat or not to be believed.
@@ -212,12 +212,12 @@ def shot_again(task: Task, size_px: int, item: tuple[Path, MeasuredPhoto]) -> Sh
         return None
     px_from_mm, blur_px = np.array(geometry.homography_px_from_mm), geometry.blur_px
 
-    def shot() -> Shot | None:
-        view = view_of(read_photo(path), task.camera)
-        shot = shot_of(entry.file, view.srgb, px_from_mm, blur_px, light, task.surface, size_px, view.matrix_px)
+    def shot() -> PhotoSquare | None:
+        view = pinhole_photo(read_photo(path), task.camera)
+        shot = photo_square(entry.file, view.srgb, px_from_mm, blur_px, light, task.surface, size_px, view.matrix_px)
         return shot and replace(shot, box=measured.entry.box)
 
     try:
-        return limited(shot)
+        return run_limited(shot)
     except (PhotoRejected, ArithmeticError, ValueError, LookupError, MemoryError, cv2.error):
         return None  # read before, so this is a file that went away: the ledger does without

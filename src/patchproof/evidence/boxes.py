@@ -17,8 +17,8 @@ from pydantic import BaseModel
 from patchproof.base.errors import Refused
 from patchproof.base.geometry import rect_corners
 from patchproof.base.input import read_json
-from patchproof.base.validation import Finite, Positive, nearest, validated
-from patchproof.evidence.classify import Box
+from patchproof.base.validation import Finite, Positive, spelling_hint, validate_model
+from patchproof.evidence.classify import BoxEdges
 
 
 class _Image(BaseModel):
@@ -43,18 +43,20 @@ class _Coco(BaseModel):
     annotations: tuple[_Annotation, ...]
 
 
-def given_boxes(path: str | Path, label: str) -> dict[str, Box]:
+def load_boxes(path: str | Path, label: str) -> dict[str, BoxEdges]:
     """(left, top, right, bottom) by a photograph's name in the file, and by its last part where no other has it, of the
     category `label`, or of the only one; refused where a photograph has more than one.
     """
     do = "export it again, one box a photograph"
-    coco = validated(_Coco, read_json(path, "boxes as COCO JSON", do), str(path))
+    coco = validate_model(_Coco, read_json(path, "boxes as COCO JSON", do), str(path))
     ours = [category.id for category in coco.categories if category.name == label]
     if not ours and len(coco.categories) == 1:
         ours = [coco.categories[0].id]
     if not ours:
         known = [category.name for category in coco.categories]
-        raise Refused(f'a category "{label}" of boxes in {path}', ", ".join(known) or "none", nearest(label, known))
+        raise Refused(
+            f'a category "{label}" of boxes in {path}', ", ".join(known) or "none", spelling_hint(label, known)
+        )
     drawn = [annotation for annotation in coco.annotations if annotation.category_id in ours]
     names, often = {image.id: image.file_name for image in coco.images}, Counter(each.image_id for each in drawn)
     for image_id, count in often.items():
@@ -68,12 +70,12 @@ def given_boxes(path: str | Path, label: str) -> dict[str, Box]:
     return {last[name]: box for name, box in boxes.items() if alone[last[name]] == 1} | boxes
 
 
-def box_in(boxes: Mapping[str, Box], name: str) -> Box | None:
+def box_of_photo(boxes: Mapping[str, BoxEdges], name: str) -> BoxEdges | None:
     """The box of the photograph of that name, or else of its last part."""
     return boxes.get(name, boxes.get(PurePosixPath(name).name))
 
 
-def in_square(box_px: Box, size_px: tuple[int, int]) -> Box:
+def box_in_square(box_px: BoxEdges, size_px: tuple[int, int]) -> BoxEdges:
     """The box as shares of the centered square of a photograph of `size_px`; all zeros, which nothing overlaps, where
     none of it lies in there.
     """
@@ -85,8 +87,8 @@ def in_square(box_px: Box, size_px: tuple[int, int]) -> Box:
     return (x0, y0, x1, y1) if x1 > x0 and y1 > y0 else (0.0, 0.0, 0.0, 0.0)
 
 
-def from_square(box: Box, size_px: tuple[int, int]) -> np.ndarray:
-    """The corners 4×2 in pixels of a box that `in_square` gave."""
+def box_corners_px(box: BoxEdges, size_px: tuple[int, int]) -> np.ndarray:
+    """The corners 4×2 in pixels of a box that `box_in_square` gave."""
     (width, height), side = size_px, min(size_px)
     x0, y0, x1, y1 = box
     return side * rect_corners((x0, y0, x1 - x0, y1 - y0)) + ((width - side) / 2, (height - side) / 2)

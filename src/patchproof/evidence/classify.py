@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from patchproof.classifier import Classifier
 
 _STRIP_ROWS = 32  # of a photograph as float: of these few pixels of a square are made, and caches hold them
-Box = tuple[float, float, float, float]  # left, top, right, bottom as shares of the photograph's centered square
+BoxEdges = tuple[float, float, float, float]  # left, top, right, bottom as shares of the photograph's centered square
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Judges:
     indices: dict[str, tuple[int, ...]]
     primary: Classifier
 
-    def predictions(self, squares: Mapping[int, np.ndarray], box: Box | None) -> dict[str, Prediction]:
+    def predictions(self, squares: Mapping[int, np.ndarray], box: BoxEdges | None) -> dict[str, Prediction]:
         """What every network says of one photograph with the object in `box`, by name."""
         models = {model.name: model for model in self.models}
         return {n: predict(m, self.indices[n], squares[m.input_px], box) for n, m in models.items()}
@@ -57,7 +57,7 @@ def judges_of(models: Sequence[Classifier], manifest: Manifest) -> Judges | None
     return Judges(models, indices, primary)
 
 
-def boxes_of(box: Box | None, n: int = 1) -> np.ndarray | None:
+def boxes_of(box: BoxEdges | None, n: int = 1) -> np.ndarray | None:
     """The object's box in n pictures that all show it there, as networks take it."""
     return None if box is None else np.tile(np.array(box), (n, 1))
 
@@ -123,7 +123,7 @@ def target_indices(model: Classifier, promise: Promise, settings: Mapping[str, A
     return find_labels(model.labels, wanted.get("label", target.label), wanted.get("accept", ()))
 
 
-def predict(model: Classifier, indices: tuple[int, ...], square: np.ndarray, box: Box | None) -> Prediction:
+def predict(model: Classifier, indices: tuple[int, ...], square: np.ndarray, box: BoxEdges | None) -> Prediction:
     """What the network makes of one square of its size, float32 3×S×S, with the object in `box`."""
     import torch
 

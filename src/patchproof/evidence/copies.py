@@ -19,7 +19,7 @@ from patchproof.evidence.measure import MeasuredPhoto
 from patchproof.evidence.results import PhotoEntry, Remark
 from patchproof.sheets.manifest import Rect
 
-COPY = "copy"
+COPY_CODE = "copy"
 # What two shots of one view differ by at most. Of 800 views drawn from the default ranges, in sessions of 40, none is
 # taken for another (2 are with a SHAPE of 0.02).
 SCALE, TILT, LIGHT = 0.02, 0.02, 0.05  # of pixels per mm, the tilt's cosine, the light of white paper
@@ -27,7 +27,7 @@ AIM = 0.01  # of the picture's longer side
 SHAPE = 0.01  # of the design's longer side, by which its corners lie elsewhere about its middle
 
 
-def without_copies(photos: Sequence[MeasuredPhoto], session: Sequence[int], rect_mm: Rect) -> list[MeasuredPhoto]:
+def reject_copies(photos: Sequence[MeasuredPhoto], session: Sequence[int], rect_mm: Rect) -> list[MeasuredPhoto]:
     """The photographs, of which all but the first of each kind are rejected; the design lies at `rect_mm`."""
     first_of: dict[str, PhotoEntry] = {}
     views: dict[int, list[tuple[np.ndarray, PhotoEntry]]] = {}
@@ -43,7 +43,7 @@ def without_copies(photos: Sequence[MeasuredPhoto], session: Sequence[int], rect
             first_of |= {} if entry.sha256 is None else {entry.sha256: entry}
             views.setdefault(number, []).extend([] if view is None else [(view, entry)])
         else:
-            remark = Remark(code=COPY, advice=advice.format(same.file))
+            remark = Remark(code=COPY_CODE, advice=advice.format(same.file))
             photo = replace(photo, entry=entry.changed(status="rejected", remark=remark), counted=False)
         kept.append(photo)
     return kept

@@ -14,8 +14,8 @@ from datetime import datetime
 from pathlib import Path
 
 from patchproof.base.input import is_folder, readable_formats
-from patchproof.photo.limits import limited
-from patchproof.photo.read import list_photos, pictures_in, printable
+from patchproof.photo.limits import run_limited
+from patchproof.photo.read import list_images, list_photos, printable_name
 
 PAUSE_MINUTES = 30.0
 _EXIF_IFD, _TAKEN, _MODEL = 0x8769, 0x9003, 0x0110
@@ -33,11 +33,11 @@ class Grouping:
     def file(self, number: int) -> str:
         """A photograph's name in reports: its file's, after that of its folder where folders are sessions."""
         folder, path = self.names[self.session[number]], self.paths[number]
-        name, parent = printable(path.name), printable(path.parent.name)
-        return f"{folder}/{name}" if parent == folder and self.known_from == FOLDERS else name
+        name, parent = printable_name(path.name), printable_name(path.parent.name)
+        return f"{folder}/{name}" if parent == folder and self.known_from == BY_FOLDERS else name
 
 
-FOLDERS, TIMES, GUESS = "folders", "cameras and times", "nothing said so: taken as one"
+BY_FOLDERS, BY_TIMES, BY_GUESS = "folders", "cameras and times", "nothing said so: taken as one"
 
 
 def group(folder: str | Path, without: Path | None = None) -> Grouping:
@@ -47,19 +47,19 @@ def group(folder: str | Path, without: Path | None = None) -> Grouping:
     folder, left_out = Path(folder), None if without is None else without.resolve()
     inside = sorted(folder.iterdir()) if is_folder(folder) else []
     inside = [p for p in inside if p.is_dir() and not p.name.startswith(".") and p.resolve() != left_out]
-    parts = {printable(p.name): paths for p in inside if (paths := pictures_in(p))}
+    parts = {printable_name(p.name): paths for p in inside if (paths := list_images(p))}
     if not parts:
         return _by_time(list_photos(folder))
-    if loose := pictures_in(folder):
+    if loose := list_images(folder):
         parts = {"": loose} | parts
     pairs = [(path, number) for number, paths in enumerate(parts.values()) for path in paths]
-    return Grouping(tuple(p for p, _ in pairs), tuple(n for _, n in pairs), tuple(parts), FOLDERS)
+    return Grouping(tuple(p for p, _ in pairs), tuple(n for _, n in pairs), tuple(parts), BY_FOLDERS)
 
 
 def _by_time(paths: Sequence[Path]) -> Grouping:
     taken = [words for path in paths if (words := _taken(path)) is not None]
     if len(taken) < len(paths):
-        return Grouping(tuple(paths), (0,) * len(paths), ("",), GUESS)
+        return Grouping(tuple(paths), (0,) * len(paths), ("",), BY_GUESS)
     session, names, last = [0] * len(paths), [], {}
     for (when, camera), number in sorted(zip(taken, range(len(paths)), strict=True)):
         before, own = last.get(camera, (None, len(names)))
@@ -67,13 +67,13 @@ def _by_time(paths: Sequence[Path]) -> Grouping:
             own = len(names)
             names.append(f"{when:%Y-%m-%d %H:%M} {camera}".strip())
         session[number], last[camera] = own, (when, own)
-    return Grouping(tuple(paths), tuple(session), tuple(names), TIMES)
+    return Grouping(tuple(paths), tuple(session), tuple(names), BY_TIMES)
 
 
 def _taken(path: Path) -> tuple[datetime, str] | None:
     """When a photograph was taken and by which camera, as its file says; None where it does not."""
     try:
-        when, camera = limited(_labels, path)
+        when, camera = run_limited(_labels, path)
         return datetime.strptime(when.strip("\0 "), "%Y:%m:%d %H:%M:%S"), " ".join(camera.split())[:40]
     except Exception:  # a file that cannot be read is a photograph that will be rejected, and says no time
         return None

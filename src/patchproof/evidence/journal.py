@@ -18,9 +18,9 @@ from typing import TYPE_CHECKING, Any, TextIO
 import cv2
 import numpy as np
 
-from patchproof.base.input import LARGEST_JSON
-from patchproof.base.output import make_folder, write_whole
-from patchproof.base.validation import Strict, validated
+from patchproof.base.input import MAX_JSON_BYTES
+from patchproof.base.output import make_folder, write_atomically
+from patchproof.base.validation import StrictModel, validate_model
 from patchproof.base.version import __version__
 from patchproof.photo.limits import MOST_BYTES
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from patchproof.sheets.manifest import Manifest
 
 
-class _Line(Strict):
+class _Line(StrictModel):
     file: str
     sha256: str | None
     key: str
@@ -43,7 +43,7 @@ class Journal:
         make_folder(path.parent)
         lines = [line for line in _lines(path) if line.key == key] if resume else []
         self._key, self._kept = key, {line.file: line for line in lines}
-        write_whole(path, "".join(json.dumps(line.model_dump()) + "\n" for line in self._kept.values()))
+        write_atomically(path, "".join(json.dumps(line.model_dump()) + "\n" for line in self._kept.values()))
         self._file: TextIO = open(path, "a", encoding="utf-8")
 
     def find(self, name: str, photo: Path) -> Any:
@@ -96,6 +96,6 @@ def file_sha256(path: Path) -> str | None:
 def _lines(path: Path) -> Iterator[_Line]:
     """The lines that are whole, and of this layout; none where there is no file."""
     with suppress(FileNotFoundError), open(path, encoding="utf-8", errors="replace") as file:
-        while text := file.readline(LARGEST_JSON):  # a part of a longer one is none
+        while text := file.readline(MAX_JSON_BYTES):  # a part of a longer one is none
             with suppress(ValueError, RecursionError):  # cut short by a kill; what is not JSON, or another's
-                yield validated(_Line, json.loads(text), str(path))
+                yield validate_model(_Line, json.loads(text), str(path))

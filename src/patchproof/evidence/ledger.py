@@ -2,7 +2,7 @@
 
     ideal → gamut → print → light and camera → blur and noise → photo
 
-In: `Shot`s of judged photographs, the manifest, the promise's primary network. Out: a `Ledger`: shares in confidence
+In: `PhotoSquare`s of judged photographs, the manifest, the promise's primary network. Out: a `Ledger`: shares in confidence
 (for a goal of deceiving, confidence gained), mean over photographs, with bootstrap intervals over photographs. Each
 photograph is classified with its piece re-projected under all combinations of four effects on or off (`reproject`),
 and each effect gets its mean cost over all orders of switching them on (Shapley, A Value for n-Person Games, 1953):
@@ -28,29 +28,29 @@ from typing import Any
 
 import numpy as np
 
-from patchproof.base.claims import LEAST_CLUSTERS, resampled_means
 from patchproof.base.color import linear_from_srgb
-from patchproof.base.resample import reduced
-from patchproof.evidence.classify import Box, Judges, boxes_of
-from patchproof.evidence.reproject import Reference, Shot, Switches, print_and_lights, squares_with
+from patchproof.base.intervals import MIN_CLUSTERS, resampled_means
+from patchproof.base.resample import downscale
+from patchproof.evidence.classify import BoxEdges, Judges, boxes_of
+from patchproof.evidence.reproject import PhotoSquare, Reference, Switches, fit_print_and_lights, reprojected_squares
 from patchproof.evidence.results import Ledger, LedgerShare
-from patchproof.evidence.surface import DESIGN_PX, Promised, Surface, piece_picture, with_markers
+from patchproof.evidence.surface import DESIGN_PX, PromisedColors, Surface, piece_picture, with_markers
 from patchproof.sheets.manifest import Manifest
 
-Values = Mapping[Switches, float]  # confidence by what is switched on
+ConfidenceBySwitches = Mapping[Switches, float]  # confidence by what is switched on
 
 GAMUT, PRINT, LIGHT, BLUR, PHOTO = "gamut", "print", "light_and_camera", "blur_and_noise", "photo"
 PRINT_AND_LIGHT = "print_light_and_camera"
-LEAST_PHOTOS = LEAST_CLUSTERS
+LEAST_PHOTOS = MIN_CLUSTERS
 LEAST_SHARE = 0.05  # a culprit costs at least as much
 _RESAMPLES = 2000
 
 
 def ledger_of(
-    shots: Sequence[Shot],
+    shots: Sequence[PhotoSquare],
     manifest: Manifest,
     surface: Surface,
-    promised: Promised,
+    promised: PromisedColors,
     judges: Judges,
     confidence: Mapping[str, float],
 ) -> Ledger | None:
@@ -61,20 +61,20 @@ def ledger_of(
     claims = [(c.contrast, c.blur_px) for c in conditions if c.contrast is not None and c.blur_px is not None]
     if not claims:
         return None
-    printed, undo, print_lights = print_and_lights(shots, promised)
+    printed, undo, print_lights = fit_print_and_lights(shots, promised)
     looks = _looks(manifest.design.pixels(), surface, promised, printed)
     camera = manifest.settings.get("camera", {})
     values = []
     references = _references(claims, shots, camera, promised)
     for shot, fit, print_light, reference in zip(shots, undo, print_lights, references, strict=True):
-        squares = squares_with(shot, looks, surface.rect_mm, fit, print_light, reference)
+        squares = reprojected_squares(shot, looks, surface.rect_mm, fit, print_light, reference)
         values.append(_confidences(squares, judges, shot.box))
     steps = (GAMUT, PRINT, LIGHT, BLUR) if printed is not None else (GAMUT, PRINT_AND_LIGHT, BLUR)
     own = np.array([confidence[shot.file] for shot in shots])
     return _ledger(steps, values, own, manifest.promise.target.goal.sign)
 
 
-def shapley(values: Values) -> np.ndarray:
+def shapley(values: ConfidenceBySwitches) -> np.ndarray:
     """Mean cost of switching each of k players on, over all orders; `values` has all 2^k combinations."""
     k = len(next(iter(values)))
     cost = np.zeros(k)
@@ -86,7 +86,7 @@ def shapley(values: Values) -> np.ndarray:
     return cost
 
 
-def _ledger(steps: Sequence[str], values: Sequence[Values], photo: np.ndarray, sign: float) -> Ledger:
+def _ledger(steps: Sequence[str], values: Sequence[ConfidenceBySwitches], photo: np.ndarray, sign: float) -> Ledger:
     """The ledger of `values` by photograph, whose own confidences are `photo` (n)."""
     parts = np.array([[*shapley(v), v[(True,) * len(steps)] - own] for v, own in zip(values, photo, strict=True)])
     parts, names = sign * parts, (*steps, PHOTO)
@@ -118,9 +118,9 @@ def _culprit(names: Sequence[str], means: np.ndarray, resampled: np.ndarray | No
     return names[top] if clear and names[top] != PHOTO else None
 
 
-def _looks(sent_srgb: np.ndarray, surface: Surface, promised: Promised, printed) -> dict[Switches, np.ndarray]:
+def _looks(sent_srgb: np.ndarray, surface: Surface, promised: PromisedColors, printed) -> dict[Switches, np.ndarray]:
     """The piece's light by (gamut, print), or by (gamut,) alone where the print is not known."""
-    design = reduced(linear_from_srgb(sent_srgb / 255.0).astype(np.float32), DESIGN_PX)
+    design = downscale(linear_from_srgb(sent_srgb / 255.0).astype(np.float32), DESIGN_PX)
     sent = piece_picture(surface, with_markers(design, surface, np.zeros(3)))
     looks = {False: sent, True: piece_picture(surface, promised.design)}
     if printed is None:
@@ -129,7 +129,10 @@ def _looks(sent_srgb: np.ndarray, surface: Surface, promised: Promised, printed)
 
 
 def _references(
-    claims: Sequence[tuple[float, float]], shots: Sequence[Shot], camera: Mapping[str, Any], promised: Promised
+    claims: Sequence[tuple[float, float]],
+    shots: Sequence[PhotoSquare],
+    camera: Mapping[str, Any],
+    promised: PromisedColors,
 ) -> list[Reference]:
     """One of the promise's conditions (contrast, blur_px) for each photograph, spread evenly over their contrasts.
 
@@ -149,7 +152,7 @@ def _references(
     return references
 
 
-def _confidences(squares: Mapping[Switches, np.ndarray], judges: Judges, box: Box | None) -> Values:
+def _confidences(squares: Mapping[Switches, np.ndarray], judges: Judges, box: BoxEdges | None) -> ConfidenceBySwitches:
     """Target confidence by combination, of squares with the object in `box`."""
     import torch
 

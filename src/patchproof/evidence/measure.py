@@ -1,6 +1,6 @@
 """One photograph against the printed surface: where it was taken from, how sharp, how far its colors are off.
 
-In: a `View`, the `Surface`, its `Promised` look, and what the promise covered. Out: a `PhotoEntry` and pictures for
+In: a `PinholePhoto`, the `Surface`, its `PromisedColors` look, and what the promise covered. Out: a `PhotoEntry` and pictures for
 the report. Every figure that can be had is filled in even where a later step fails. A photograph is `rejected` only
 for reasons that do not depend on the view (plus: outside of the promised ranges); where the sheet is identified but
 geometry or color cannot be trusted it is `judged`: recognition still counts, since far and oblique views fail first
@@ -16,14 +16,14 @@ import numpy as np
 
 from patchproof.base.geometry import MM_PER_INCH, apply_homography, rect_corners
 from patchproof.evidence.appearance import MOST_CLIPPED, appearance
-from patchproof.evidence.camera import View
-from patchproof.evidence.placed import MOST_SHIFT, Placed, geometry_of, object_box, place, pose_of
+from patchproof.evidence.camera import PinholePhoto
+from patchproof.evidence.locate import MOST_SHIFT, LocatedSheet, camera_pose, geometry_of, object_box, place
 from patchproof.evidence.ranges import PromisedRanges
 from patchproof.evidence.results import Geometry, PhotoEntry, Remark, Scale
-from patchproof.evidence.surface import Promised, Surface
-from patchproof.photo.complete import complete, find_sheet
+from patchproof.evidence.surface import PromisedColors, Surface
 from patchproof.photo.detect import MarkersInView, find_markers, is_mirrored
-from patchproof.photo.label import read_label, refuse_other_page
+from patchproof.photo.known_page import complete_markers, find_sheet
+from patchproof.photo.page_code import read_page_code, refuse_other_page
 from patchproof.photo.quality import FrameLight, frame_light
 from patchproof.photo.rectify import PageFit
 from patchproof.photo.rejection import PhotoRejected
@@ -72,10 +72,10 @@ class MeasuredPhoto:
 
 
 def measure(
-    view: View,
+    view: PinholePhoto,
     name: str,
     surface: Surface,
-    promised: Promised | None,
+    promised: PromisedColors | None,
     ranges: PromisedRanges,
     scan_dpi: float | None = None,
     with_pictures: bool = True,
@@ -95,7 +95,7 @@ def measure(
     light = frame_light(view.srgb, detected.markers.values())
     fit = placed.fit
     geometry, corners = geometry_of(placed, detected, light, surface, promised)
-    pose, focal = pose_of(view, placed, surface)
+    pose, focal = camera_pose(view, placed, surface)
     geometry = geometry.changed(focal=focal)
     entry = partial(entry, geometry=geometry, pose=pose, box=object_box(view, placed, surface))
     page_check = _is_uncut(placed, detected, surface)
@@ -137,7 +137,7 @@ def identify(srgb: np.ndarray, surface: Surface) -> tuple[MarkersInView, Surface
         if is_mirrored(srgb, surface.all_ids, surface.dictionary):
             advice = "the photo is mirrored: switch off the camera's mirror setting and save it again"
             raise PhotoRejected("mirrored", None, None, advice)
-        label = read_label(srgb)
+        label = read_page_code(srgb)
         if detected.foreign or (label is not None and label != surface.label):
             which = "another sheet" if label is None else f"sheet {label.sheet_id} ({label.printed})"
             advice = f"this shows {which}: name that sheet's JSON, or leave the photo out"
@@ -151,7 +151,7 @@ def identify(srgb: np.ndarray, surface: Surface) -> tuple[MarkersInView, Surface
     surface = _page_in_view(detected, surface)
     ours = {i: borders for i, borders in detected.markers.items() if i in surface.corners_mm}
     detected = MarkersInView(ours, detected.foreign, detected.doubled)
-    return complete(srgb, detected, surface.corners_mm, surface.dictionary), surface
+    return complete_markers(srgb, detected, surface.corners_mm, surface.dictionary), surface
 
 
 def _page_in_view(detected: MarkersInView, surface: Surface) -> Surface:
@@ -161,7 +161,7 @@ def _page_in_view(detected: MarkersInView, surface: Surface) -> Surface:
     return surface.pages[int(np.argmax(hidden))] if any(hidden) else surface
 
 
-def _is_uncut(placed: Placed, detected: MarkersInView, surface: Surface) -> bool:
+def _is_uncut(placed: LocatedSheet, detected: MarkersInView, surface: Surface) -> bool:
     """Whether markers of the page are about where an uncut one has them; it may be curled beyond the piece."""
     if set(placed.fit.inlier_ids) & surface.page_ids or not detected.markers.keys() & surface.piece_ids:
         return True
@@ -204,7 +204,7 @@ def _trouble(
         (agreeing < least, "too_few_markers", agreeing, least, _FEW_AGREE),
         (bent, "curled", residual, most_residual, curled),
         (bend > most_bend, "curled", bend, most_bend, curled),
-        (fit.odd_mm > MOST_ODD * side_mm, "curled", fit.odd_mm, MOST_ODD * side_mm, curled),
+        (fit.outlier_mm > MOST_ODD * side_mm, "curled", fit.outlier_mm, MOST_ODD * side_mm, curled),
         (uncertain and markers < 3, "too_few_markers", markers, 3, _FEW),
         (uncertain, "too_small", uncertainty, most_uncertain, unsure),
         (shift > most_shift, "curled", shift, most_shift, _SHIFTED),

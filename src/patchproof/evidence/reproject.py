@@ -1,6 +1,6 @@
 """The digital piece put back into its photograph, with each effect of print, light and camera switched on or off.
 
-In: a `Shot` (the centered square of a photograph as a network nearly sees it, and what was measured in it), the piece
+In: a `PhotoSquare` (the centered square of a photograph as a network nearly sees it, and what was measured in it), the piece
 as it could have been printed, and a `Reference`: light and blur of one of the promise's own conditions. Out: the
 square with the whole piece replaced. Light and blur fall on the surroundings, too: there they are undone as
 far as noise allows (Wiener's filter for the known blur). Work is done at three times the network's size at most: finer
@@ -22,20 +22,20 @@ import numpy as np
 
 from patchproof.base.color import LUMINANCE, srgb_from_linear
 from patchproof.base.geometry import apply_homography, rect_corners
-from patchproof.base.resample import between_indices
+from patchproof.base.resample import index_homography
 from patchproof.evidence.appearance import cells_fit
-from patchproof.evidence.classify import Box, square_of
+from patchproof.evidence.classify import BoxEdges, square_of
 from patchproof.evidence.print_fit import fit_print
-from patchproof.evidence.surface import Promised, Surface
-from patchproof.photo.colorfit import ColorFit, inverse, white_black
-from patchproof.photo.detect import LIGHT
+from patchproof.evidence.surface import PromisedColors, Surface
+from patchproof.photo.colorfit import ColorFit, invert_affine, white_black
+from patchproof.photo.detect import LINEAR_FLOAT32_FROM_CODE
 from patchproof.photo.pattern_light import pattern_light
 from patchproof.photo.quality import CLIPPED_CODE, FrameLight
-from patchproof.photo.rectify import part_around, rectify
+from patchproof.photo.rectify import rectify, region_around
 from patchproof.sheets.manifest import Rect
 
 Switches = tuple[bool, ...]  # which effects are on
-FINER = 3  # times the network's input size
+MAX_OVERSAMPLING = 3  # times the network's input size
 _READ_SHARE_SQUARE = 1 / 16  # of noise at white, as the camera model has it
 _CELLS = 16  # of the design, along its shorter side, in which its colors are read
 _NOT_BLURRED_PX = 0.1
@@ -46,7 +46,7 @@ _SUPERSAMPLE = 2
 
 
 @dataclass(frozen=True)
-class Shot:
+class PhotoSquare:
     """One photograph: `square` uint8 W×W×3, millimeters to its pixels, blur in its pixels, noise in linear light.
 
     `cells` h×w×3 are the design's linear light as photographed, NaN where clipped; `scale` is W over the photograph's
@@ -63,7 +63,7 @@ class Shot:
     cells: np.ndarray
     scale: float
     matrix_px: np.ndarray | None = None
-    box: Box | None = None
+    box: BoxEdges | None = None
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class Reference:
     noise: float
 
 
-def shot_of(
+def photo_square(
     file: str,
     srgb: np.ndarray,
     px_from_mm: np.ndarray,
@@ -84,13 +84,13 @@ def shot_of(
     surface: Surface,
     size_px: int,
     matrix_px: np.ndarray | None = None,
-) -> Shot | None:
+) -> PhotoSquare | None:
     """What is kept of an uint8 photograph to put other pieces into it, for a network of that input size.
 
     None where the markers do not lie where the homography says: few blurred corners can turn it far away.
     """
     square, (left, top) = square_of(srgb)
-    work = min(len(square), FINER * size_px)
+    work = min(len(square), MAX_OVERSAMPLING * size_px)
     scale = work / len(square)
     if scale < 1:
         square = cv2.resize(square, (work, work), interpolation=cv2.INTER_AREA)
@@ -103,13 +103,15 @@ def shot_of(
         light, blur_px = replace(light, paper=unmixed.paper, ink=unmixed.ink), unmixed.blur_px
     square, matrix = np.ascontiguousarray(square), None if matrix_px is None else to_square @ matrix_px
     cells = _cells(square, to_square @ px_from_mm, surface)
-    return Shot(file, square, to_square @ px_from_mm, light, blur_px * scale, noise_of(square), cells, scale, matrix)
+    return PhotoSquare(
+        file, square, to_square @ px_from_mm, light, blur_px * scale, noise_of(square), cells, scale, matrix
+    )
 
 
 def _cells(square: np.ndarray, px_from_mm: np.ndarray, surface: Surface) -> np.ndarray:
     """The design's coarse colors in linear light, NaN where one is clipped."""
     cells_per_mm = _CELLS / min(surface.rect_mm[2:])
-    cells = rectify(LIGHT[square], px_from_mm, surface.rect_mm, cells_per_mm).astype(float)
+    cells = rectify(LINEAR_FLOAT32_FROM_CODE[square], px_from_mm, surface.rect_mm, cells_per_mm).astype(float)
     full = (square.max(-1, keepdims=True) >= CLIPPED_CODE).astype(np.float32)
     clipped = rectify(full, px_from_mm, surface.rect_mm, cells_per_mm).reshape(cells.shape[:2]) > 0.05
     return np.where(clipped[..., None], np.nan, cells)
@@ -121,13 +123,13 @@ def noise_of(srgb: np.ndarray) -> float:
     Immerkaer, Fast Noise Variance Estimation, CVIU 64 (1996) 300-302, with a low quantile in place of the mean: a
     fifth of most photographs is smooth, and texture would count as noise.
     """
-    luminance = (LIGHT[srgb] @ np.array(LUMINANCE, np.float32)).astype(np.float32)
+    luminance = (LINEAR_FLOAT32_FROM_CODE[srgb] @ np.array(LUMINANCE, np.float32)).astype(np.float32)
     mask = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)  # of white noise, it makes 6 times as much
     detail = np.abs(cv2.filter2D(luminance, -1, mask)[1:-1, 1:-1])
     return float(np.quantile(detail, 0.2) / 0.2533 / 6)
 
 
-def light_fit(shot: Shot, promised: Promised) -> ColorFit:
+def light_fit(shot: PhotoSquare, promised: PromisedColors) -> ColorFit:
     """From photographed to media-relative light by paper white and what veil of stray light lies over the photograph.
 
     A veil lifts all of it alike: it is no lighter than the darkest place, nor than makes marker black what was
@@ -135,13 +137,15 @@ def light_fit(shot: Shot, promised: Promised) -> ColorFit:
     """
     paper, ink = shot.light.paper, shot.light.ink
     # means, since noise that is cut off at zero lifts dark ink as it lifts them
-    darkest = np.quantile(cv2.blur(LIGHT[shot.square], (_PATCH, _PATCH)).reshape(-1, 3), _DARKEST, axis=0)
+    darkest = np.quantile(
+        cv2.blur(LINEAR_FLOAT32_FROM_CODE[shot.square], (_PATCH, _PATCH)).reshape(-1, 3), _DARKEST, axis=0
+    )
     veil = np.clip((ink - paper * promised.ink) / (1 - promised.ink), 0, darkest)
     return white_black(paper, veil + (paper - veil) * promised.ink, promised.ink)
 
 
-def print_and_lights(
-    shots: Sequence[Shot], promised: Promised
+def fit_print_and_lights(
+    shots: Sequence[PhotoSquare], promised: PromisedColors
 ) -> tuple[Callable[[np.ndarray], np.ndarray] | None, list[ColorFit], list[ColorFit]]:
     """What one print in several photographs makes of promised light, the light alone of each, and its print and light:
     together where the design's colors are too few or too alike to tell the print (None).
@@ -153,7 +157,7 @@ def print_and_lights(
     return printed, lights, lights if printed is not None else [design_fit(shot, promised) for shot in shots]
 
 
-def design_fit(shot: Shot, promised: Promised) -> ColorFit:
+def design_fit(shot: PhotoSquare, promised: PromisedColors) -> ColorFit:
     """Print, light and camera together, from the design's own coarse colors; paper and ink where these do not do."""
     height, width = shot.cells.shape[:2]
     expected = cv2.resize(promised.design, (width, height), interpolation=cv2.INTER_AREA).astype(float)
@@ -163,8 +167,8 @@ def design_fit(shot: Shot, promised: Promised) -> ColorFit:
     return light_fit(shot, promised) if fit.name == "white_black" else fit
 
 
-def squares_with(
-    shot: Shot,
+def reprojected_squares(
+    shot: PhotoSquare,
     looks: Mapping[Switches, np.ndarray],
     rect_mm: Rect,
     undo: ColorFit,
@@ -177,13 +181,13 @@ def squares_with(
     photographed light to media-relative; the inverse of `print_light` is what the photograph's light makes of a look.
     """
     box = _box(shot, rect_mm)
-    photo = LIGHT[shot.square]
+    photo = LINEAR_FLOAT32_FROM_CODE[shot.square]
     around = {}
     for blur, picture in ((True, photo), (False, deblurred(photo, shot.blur_px, reference.blur_px, shot.noise))):
         around[True, blur] = picture
         around[False, blur] = np.clip(reference.white * undo.apply(picture), 0, 1).astype(np.float32)
     coded = {key: srgb_from_linear(picture) for key, picture in around.items()}
-    lit = {True: inverse(print_light.matrix), False: np.column_stack([np.eye(3) * reference.white, np.zeros(3)])}
+    lit = {True: invert_affine(print_light.matrix), False: np.column_stack([np.eye(3) * reference.white, np.zeros(3)])}
     out = {}
     for switches, look in looks.items():
         sharp = _layer(look, shot.px_from_mm, rect_mm, box)
@@ -196,21 +200,21 @@ def squares_with(
     return out
 
 
-def square_with(shot: Shot, look: np.ndarray, rect_mm: Rect, light: ColorFit) -> np.ndarray:
-    """The float32 sRGB square W×W×3 with a piece of this look (as in `squares_with`) under the photograph's own light
+def reprojected_square(shot: PhotoSquare, look: np.ndarray, rect_mm: Rect, light: ColorFit) -> np.ndarray:
+    """The float32 sRGB square W×W×3 with a piece of this look (as in `reprojected_squares`) under the photograph's own light
     and blur, which the inverse of `light` and `shot` know.
     """
-    box, photo = _box(shot, rect_mm), LIGHT[shot.square]
+    box, photo = _box(shot, rect_mm), LINEAR_FLOAT32_FROM_CODE[shot.square]
     layer = _blurred(_layer(look, shot.px_from_mm, rect_mm, box), shot.blur_px)
     picture = srgb_from_linear(photo)
-    picture[box] = srgb_from_linear(_covered(layer, inverse(light.matrix), photo[box], shot.noise))
+    picture[box] = srgb_from_linear(_covered(layer, invert_affine(light.matrix), photo[box], shot.noise))
     return picture
 
 
-def _box(shot: Shot, rect_mm: Rect) -> tuple[slice, slice]:
+def _box(shot: PhotoSquare, rect_mm: Rect) -> tuple[slice, slice]:
     """The part of the square that a piece there reaches, with what blur carries over."""
     corners_px = apply_homography(shot.px_from_mm, rect_corners(rect_mm))
-    return part_around(corners_px, 3 + int(4 * max(shot.blur_px, 2.0)), shot.square.shape)
+    return region_around(corners_px, 3 + int(4 * max(shot.blur_px, 2.0)), shot.square.shape)
 
 
 def _covered(
@@ -260,7 +264,7 @@ def _layer(look: np.ndarray, px_from_mm: np.ndarray, rect_mm, box: tuple[slice, 
     look = _no_finer_than(look, px_from_mm, rect_mm)
     mm_from_texel = np.array([[w / look.shape[1], 0, x], [0, h / look.shape[0], y], [0, 0, 1.0]])
     to_fine = np.array([[finer, 0, -finer * left], [0, finer, -finer * top], [0, 0, 1]])
-    matrix = between_indices(to_fine @ px_from_mm @ mm_from_texel)
+    matrix = index_homography(to_fine @ px_from_mm @ mm_from_texel)
     # one texel of margin repeats the rim, so that interpolation does not darken it; the share cuts it off again
     size = (width * finer, height * finer)
     color = cv2.warpPerspective(look, matrix, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)

@@ -12,21 +12,21 @@ from typing import Any, Literal
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from patchproof.base.goal import Goal
-from patchproof.base.validation import Finite, Strict
+from patchproof.base.validation import Finite, StrictModel
 from patchproof.photo.rejection import PhotoRejected
 
 Status = Literal["judged", "measured", "rejected"]
-Word = Literal["kept", "broken", "cannot_tell"]
-WorthWord = Literal["helps", "no_better", "worse", "not_shown"]
+VerdictWord = Literal["kept", "broken", "cannot_tell"]
+BenefitWord = Literal["helps", "no_better", "worse", "not_shown"]
 Effect = Literal["shown", "not_shown", "not_tested"]
 Required = Literal["kept", "helps"]  # of a verification that scripts go on from
 Row = tuple[Finite, Finite, Finite]
 # where the focal length is from: a camera file; EXIF, which the sheet's own perspective confirms, is too weak to check
 # (so that there is no distance), or contradicts; EXIF of a picture of another size or shape, which is not used; nowhere
-Focal = Literal["calibrated", "confirmed", "unchecked", "contradicted", "cropped", "unknown"]
+FocalSource = Literal["calibrated", "confirmed", "unchecked", "contradicted", "cropped", "unknown"]
 
 
-class Prediction(Strict):
+class Prediction(StrictModel):
     """What one network makes of one photograph; `target_confidence` sums over the accepted labels."""
 
     label: str
@@ -35,7 +35,7 @@ class Prediction(Strict):
     recognized: bool
 
 
-class Geometry(Strict):
+class Geometry(StrictModel):
     """Where the sheet lies in a photograph, how sure that is, and how sharp and bright the print's markers came out."""
 
     residual_mm: Finite
@@ -49,10 +49,10 @@ class Geometry(Strict):
     tilt_uncertainty_deg: Finite | None = None  # 95 %, as all uncertainties are
     bend_mm: Finite = 0.0  # the part of the residual that is no noise: of paper that no plane and no cylinder explains
     design_shift_mm: Finite | None = None  # of the design's own cells, 90 % point; null where it shows no texture
-    focal: Focal = "unknown"
+    focal: FocalSource = "unknown"
 
 
-class Pose(Strict):
+class CameraPose(StrictModel):
     """What a camera of known focal length says besides; null where it cannot tell."""
 
     azimuth_uncertainty_deg: Finite  # 95 %, from the corners and the focal length
@@ -62,14 +62,14 @@ class Pose(Strict):
     scale_x_over_y: Finite | None = None  # the print's proportions alone, from a calibrated camera
 
 
-class Scale(Strict):
+class Scale(StrictModel):
     """Printed length over intended length along the page."""
 
     scale_x: Finite
     scale_y: Finite
 
 
-class Color(Strict):
+class Color(StrictModel):
     """The design's color against its promise after a fit; no difference where too much of it is clipped."""
 
     color_fit: str
@@ -79,7 +79,7 @@ class Color(Strict):
     delta_e00_p95: Finite | None = None
 
 
-class Remark(Strict):
+class Remark(StrictModel):
     """What to do about a photograph; where something is wrong with it, its code, the figure that decided, its limit."""
 
     advice: str
@@ -93,9 +93,9 @@ class Remark(Strict):
         return cls(code=cannot.code, figure=cannot.figure, threshold=cannot.threshold, advice=cannot.advice)
 
 
-_PARTS = {"geometry": Geometry, "pose": Pose, "scale": Scale, "color": Color, "remark": Remark}
+_PARTS = {"geometry": Geometry, "pose": CameraPose, "scale": Scale, "color": Color, "remark": Remark}
 # one photograph in report.json, in this order
-KEYS = """
+PHOTO_KEYS = """
     file status sha256 photo_px code figure threshold advice markers_found residual_mm px_per_mm scale_x scale_y
     scale_x_over_y tilt_deg tilt_uncertainty_deg azimuth_deg azimuth_uncertainty_deg distance_mm
     distance_uncertainty_mm focal contrast blur_px corner_uncertainty_mm bend_mm design_shift_mm
@@ -103,7 +103,7 @@ KEYS = """
     predictions""".split()
 
 
-class PhotoEntry(Strict):
+class PhotoEntry(StrictModel):
     """One photograph in the parts that were measured; a rejected one is not counted.
 
     As JSON the figures of all parts lie side by side, null where a part is not there.
@@ -115,7 +115,7 @@ class PhotoEntry(Strict):
     photo_px: tuple[int, int] | None = None  # width and height, upright
     markers_found: int = 0
     geometry: Geometry | None = None
-    pose: Pose | None = None
+    pose: CameraPose | None = None
     scale: Scale | None = None
     color: Color | None = None
     remark: Remark | None = None
@@ -146,24 +146,24 @@ class PhotoEntry(Strict):
     def _side_by_side(self, plain: SerializerFunctionWrapHandler) -> dict[str, Any]:
         parts = plain(self)
         figures = parts | {key: value for name in _PARTS for key, value in (parts[name] or {}).items()}
-        return {key: figures.get(key) for key in KEYS}
+        return {key: figures.get(key) for key in PHOTO_KEYS}
 
 
-class ModelRate(Strict):
+class ModelRate(StrictModel):
     """One network's rate over the judged photographs."""
 
     rate: Finite | None
     interval: tuple[Finite, Finite] | None
 
 
-class LedgerShare(Strict):
+class LedgerShare(StrictModel):
     """One step's share of the loss between promise and photograph."""
 
     share: Finite
     interval: tuple[Finite, Finite] | None
 
 
-class Ledger(Strict):
+class Ledger(StrictModel):
     """Shares by step in their order, mean confidence of the ideal pictures and of the photographs, and their number.
 
     `culprit` is the step that clearly costs the most, None where none does.
@@ -176,7 +176,7 @@ class Ledger(Strict):
     photos: int
 
 
-class EstimatedControl(Strict):
+class EstimatedControl(StrictModel):
     """A control put into photographs of the patch: its rate there, and the patch's own minus that, with 95 %."""
 
     name: str
@@ -185,7 +185,7 @@ class EstimatedControl(Strict):
     difference_interval: tuple[Finite, Finite]
 
 
-class Estimated(Strict):
+class EffectEstimate(StrictModel):
     """The effect as estimated from so many photographs. Where the design itself was put back, a share `agree` of them
     kept its answer; too few of them leave no controls.
     """
@@ -195,7 +195,7 @@ class Estimated(Strict):
     controls: tuple[EstimatedControl, ...] = ()
 
 
-class Forecast(Strict):
+class Forecast(StrictModel):
     """What was to be expected of so many photographs at their own measured views, and what they showed: counts, and
     Brier scores of the chances and of the promised rate in their place.
     """
@@ -208,7 +208,7 @@ class Forecast(Strict):
     brier_promise: Finite
 
 
-class SessionCount(Strict):
+class SessionCount(StrictModel):
     """One session's judged photographs, and how many of them were recognized."""
 
     name: str
@@ -216,10 +216,10 @@ class SessionCount(Strict):
     judged: int
 
 
-class Worth(Strict):
+class Benefit(StrictModel):
     """What the patch is worth beside the control that decided it, whose rate is the promise's unless `photographed`."""
 
-    word: WorthWord
+    word: BenefitWord
     goal: Goal
     control: str
     control_rate: Finite
@@ -228,7 +228,7 @@ class Worth(Strict):
     photographed: bool
 
 
-class Summary(Strict):
+class Summary(StrictModel):
     """All photographs together, for the promise's primary model. The rate's interval knows how much sessions differ,
     and `sessions_known_from` says how sessions were told apart; `left_out` names what was not looked at.
     """
@@ -239,21 +239,21 @@ class Summary(Strict):
     rate: Finite | None
     interval: tuple[Finite, Finite] | None
     prediction_interval: tuple[int, int] | None
-    verdict: Word
+    verdict: VerdictWord
     effect: Effect
     matched_rate: Finite | None
     ledger: dict[str, LedgerShare] | None = None
     culprit: str | None = None
     reason: str = ""  # for the verdict, in a sentence
     next_step: str = ""  # what to do where photographs cannot tell
-    worth: Worth | None = None  # beside its controls; null where there is nothing to compare
+    worth: Benefit | None = None  # beside its controls; null where there is nothing to compare
     left_out: tuple[str, ...] = ()
     background: str = ""  # what stood behind the object when the promise was made
     draft_views: int = 0  # of a promise that is a draft: from how many views
     models: dict[str, ModelRate] = Field(default_factory=dict)
     sessions: tuple[SessionCount, ...] = ()
     sessions_known_from: str = ""
-    estimated: Estimated | None = None
+    estimated: EffectEstimate | None = None
     forecast: Forecast | None = None
 
     def meets(self, required: Required) -> bool:
@@ -281,7 +281,7 @@ class Control:
     shown: bool | None = None
 
 
-class Origin(Strict):
+class Origin(StrictModel):
     """What a report rests on besides the photographs: options as given, SHA-256 by name, versions by library."""
 
     options: dict[str, Any] = Field(default_factory=dict)
@@ -289,7 +289,7 @@ class Origin(Strict):
     versions: dict[str, str] = Field(default_factory=dict)
 
 
-class Report(Strict):
+class Report(StrictModel):
     """A whole report.json; beside it the ledger, for its chart."""
 
     sheet_id: str

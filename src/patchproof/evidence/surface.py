@@ -1,6 +1,6 @@
 """What a manifest says about the printed surface, as the judge needs it: where things lie, how they should look.
 
-In: a manifest and a printer model. Out: `Surface` (millimeters) and `Promised` (media-relative linear light: paper is
+In: a manifest and a printer model. Out: `Surface` (millimeters) and `PromisedColors` (media-relative linear light: paper is
 1). Only the page that carries the design counts. A piece in tiles is one surface when assembled, in the millimeters of
 the design's page; each of its pages is another, by which scans and photographs of it are known.
 """
@@ -16,11 +16,11 @@ import numpy as np
 from patchproof.base.color import linear_from_srgb
 from patchproof.base.errors import Refused
 from patchproof.base.geometry import rect_corners
-from patchproof.base.resample import reduced
-from patchproof.photo.label import Label, label_of
+from patchproof.base.resample import downscale
+from patchproof.photo.page_code import PageCode, manifest_page_code
 from patchproof.sheets.manifest import Manifest, Rect
-from patchproof.sheets.markers import MODULES
-from patchproof.sheets.piece import Piece, marker_at, marker_image, marker_rect
+from patchproof.sheets.markers import MARKER_MODULES
+from patchproof.sheets.piece import Piece, marker_image, marker_rect, square_marker
 
 if TYPE_CHECKING:
     from patchproof.channel.printer import Printer
@@ -39,7 +39,7 @@ class Surface:
     corners_mm: dict[int, np.ndarray]
     piece_ids: frozenset[int]
     rect_mm: Rect
-    label: Label  # what the page's code says
+    label: PageCode  # what the page's code says
     page_mm: tuple[float, float] | None  # None where the code lies on another page than the design
     pages: tuple[Surface, ...] = ()  # of a piece in tiles: each uncut page, which carries no piece ids
     bent: bool = False  # whether the piece was made to follow a curved surface
@@ -64,7 +64,7 @@ class Surface:
 
 
 @dataclass(frozen=True)
-class Promised:
+class PromisedColors:
     """Linear light as the printer model has it: the design with what markers lie on it H×W×3, marker ink (3,)."""
 
     design: np.ndarray
@@ -89,7 +89,7 @@ def surface_of(manifest: Manifest) -> Surface:
 
 def _assembled(manifest: Manifest) -> Surface:
     """The piece glued together, in the millimeters of the design's page (the first tile's without a design)."""
-    to_page = {tile.page: np.linalg.inv(manifest.page_from_home(tile.page))[:2] for tile in manifest.tiles}
+    to_page = {tile.page: np.linalg.inv(manifest.page_from_design_page(tile.page))[:2] for tile in manifest.tiles}
     cuts, corners = {tile.page: tile.cut_mm for tile in manifest.tiles}, _corners_by_page(manifest)
     piece, pages = {}, []
     for number, cut in cuts.items():
@@ -111,7 +111,7 @@ def _surface(manifest: Manifest, corners, piece_ids, rect_mm, pages=()) -> Surfa
         corners_mm=corners,
         piece_ids=piece_ids,
         rect_mm=rect_mm,
-        label=label_of(manifest),
+        label=manifest_page_code(manifest),
         page_mm=None if manifest.tiles else manifest.page_mm,
         pages=pages,
         bent=(manifest.settings.get("patch") or {}).get("bend") is True,
@@ -120,12 +120,12 @@ def _surface(manifest: Manifest, corners, piece_ids, rect_mm, pages=()) -> Surfa
     )
 
 
-def promised_of(manifest: Manifest, surface: Surface, printer: Printer) -> Promised | None:
+def promised_of(manifest: Manifest, surface: Surface, printer: Printer) -> PromisedColors | None:
     """How design and ink should look; None on pages without a design."""
-    return None if manifest.design is None else look_of(manifest.design.pixels(), surface, printer)
+    return None if manifest.design is None else printed_colors(manifest.design.pixels(), surface, printer)
 
 
-def look_of(pixels: np.ndarray, surface: Surface, printer: Printer) -> Promised:
+def printed_colors(pixels: np.ndarray, surface: Surface, printer: Printer) -> PromisedColors:
     """How a design of uint8 pixels H×W×3 in this one's place should look, and its ink."""
     import torch
 
@@ -135,7 +135,7 @@ def look_of(pixels: np.ndarray, surface: Surface, printer: Printer) -> Promised:
             return linear_from_srgb(printer.apply(tensor)[0].numpy().transpose(1, 2, 0).astype(float))
 
     design, ink = printed(pixels / 255.0).astype(np.float32), printed(np.zeros((1, 1, 3)))[0, 0]
-    return Promised(reduced(with_markers(design, surface, ink), DESIGN_PX), ink)
+    return PromisedColors(downscale(with_markers(design, surface, ink), DESIGN_PX), ink)
 
 
 def with_markers(design: np.ndarray, surface: Surface, ink: np.ndarray) -> np.ndarray:
@@ -147,8 +147,8 @@ def with_markers(design: np.ndarray, surface: Surface, ink: np.ndarray) -> np.nd
     finer = max(1, DESIGN_PX // max(design.shape))  # a design of few pixels: markers' modules are smaller
     design = design.repeat(finer, 0).repeat(finer, 1)
     x, y, *size_mm = surface.rect_mm
-    markers = tuple(marker_at(i, tuple(c[0] - (x, y)), float(c[1, 0] - c[0, 0])) for i, c in on_it.items())
-    piece = Piece((size_mm[0], size_mm[1]), markers, marker_rect(markers[0])[2] / MODULES)
+    markers = tuple(square_marker(i, tuple(c[0] - (x, y)), float(c[1, 0] - c[0, 0])) for i, c in on_it.items())
+    piece = Piece((size_mm[0], size_mm[1]), markers, marker_rect(markers[0])[2] / MARKER_MODULES)
     image, reserved = marker_image(piece, (design.shape[1], design.shape[0]))
     light = (ink + linear_from_srgb(image) * (1 - ink)).astype(np.float32)
     return np.where(reserved[..., None], light, design)

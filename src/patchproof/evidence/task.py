@@ -10,9 +10,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from patchproof.evidence.classify import Box, Judges
+from patchproof.evidence.classify import BoxEdges, Judges
 from patchproof.evidence.ranges import PromisedRanges, promised_ranges, promised_side_px
-from patchproof.evidence.surface import Promised, Surface, promised_of, surface_of
+from patchproof.evidence.surface import PromisedColors, Surface, promised_of, surface_of
 from patchproof.sheets.manifest import Manifest
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ class Options:
     `camera` replaces the EXIF focal length and takes out the lens. `ruler_mm` are the printed rulers (x, y) as somebody
     measured them. `controls` is a folder of photographs of controls. `ledger_photos` of the photographs at most, spread
     evenly, go into the gap ledger (0: no ledger). `boxes` are those that somebody drew round the object, by photograph
-    (`boxes.given_boxes`).
+    (`boxes.load_boxes`).
     """
 
     models: Sequence[Classifier]
@@ -41,7 +41,7 @@ class Options:
     ruler_mm: tuple[float, float] | None = None
     controls: str | Path | None = None
     ledger_photos: int = LEDGER_PHOTOS
-    boxes: Mapping[str, Box] = field(default_factory=dict)
+    boxes: Mapping[str, BoxEdges] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Task:
     """All that one photograph is measured against; small enough to be sent to another process."""
 
     surface: Surface
-    promised: Promised | None
+    promised: PromisedColors | None
     ranges: PromisedRanges
     sizes_px: tuple[int, ...]  # of the networks' squares
     scan_dpi: float | None

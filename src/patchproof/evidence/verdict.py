@@ -18,18 +18,18 @@ from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from patchproof.base.claims import CONFIDENCE, independent_difference, mcnemar_p, paired_difference, wilson
 from patchproof.base.goal import Goal
+from patchproof.base.intervals import CONFIDENCE, independent_difference, mcnemar_p, paired_difference, wilson
 from patchproof.base.sessions import TAIL
-from patchproof.evidence.results import Control, Effect, Word
+from patchproof.evidence.results import Control, Effect, VerdictWord
 from patchproof.sheets.manifest import Promise
 
 LEAST_JUDGED = 5
 MOST_WITHOUT_MARKERS = 0.10
 SLACK = 0.20  # how far below the promised rate the photographs may leave the true one
 LEAST_PAIRS = 6  # fewer pairs can never reach 5 % in McNemar's test; the unpaired interval is used then
-EACH = 10  # photographs of a session, where their number is asked for
-KEPT = 0.80  # chance of `kept` that is enough
+PHOTOS_PER_SESSION = 10  # photographs of a session, where their number is asked for
+MIN_KEPT_CHANCE = 0.80  # chance of `kept` that is enough
 MOST_PHOTOS = 150  # nobody takes more
 LEAST_PAIRED = 0.5  # of either folder's photographs: a few names that happen to be equal are no pairs
 
@@ -38,7 +38,7 @@ LEAST_PAIRED = 0.5  # of either folder's photographs: a few names that happen to
 class Verdict:
     """The word, the counts that the promise allows, and one sentence with the figures that decided it."""
 
-    verdict: Word
+    verdict: VerdictWord
     prediction_interval: tuple[int, int] | None
     reason: str
 
@@ -64,13 +64,13 @@ def judge(recognized: int, photos: Sequence[int], promise: Promise, without_mark
     if goal.sign * (recognized - (low if goal.sign > 0 else high)) < 0:
         return Verdict("broken", (low, high), f"{counts}; {allowed}.")
     ends = spread.least_rate if goal.sign > 0 else spread.most_rate
-    proved, asked = ends(recognized, photos, TAIL), asked_rate(promise)
+    proved, asked = ends(recognized, photos, TAIL), required_rate(promise)
     side = "at least" if goal.sign > 0 else "at most"
     counts = f"{counts}; {allowed}. They prove a rate of {side} {proved:.0%}, and {side} {asked:.0%} is asked for"
     return Verdict("kept" if goal.sign * (proved - asked) >= 0 else "cannot_tell", (low, high), f"{counts}.")
 
 
-def asked_rate(promise: Promise) -> float:
+def required_rate(promise: Promise) -> float:
     """The rate that photographs have to prove: the promise's with its slack, and no worse than the best control's."""
     sign = promise.target.goal.sign
     controls = (sign * control.rate for control in promise.controls.values())
@@ -87,11 +87,11 @@ def kept_chance(promise: Promise, photos: Sequence[int]) -> float:
 
 
 def sessions_needed(promise: Promise) -> int | None:
-    """In how many places `EACH` photographs prove the promise, where it holds, with a chance of `KEPT`; None where that
+    """In how many places `PHOTOS_PER_SESSION` photographs prove the promise, where it holds, with a chance of `MIN_KEPT_CHANCE`; None where that
     takes more than `MOST_PHOTOS`.
     """
-    counts = range(1, MOST_PHOTOS // EACH + 1)
-    return next((s for s in counts if kept_chance(promise, (EACH,) * s) >= KEPT), None)
+    counts = range(1, MOST_PHOTOS // PHOTOS_PER_SESSION + 1)
+    return next((s for s in counts if kept_chance(promise, (PHOTOS_PER_SESSION,) * s) >= MIN_KEPT_CHANCE), None)
 
 
 def next_step(promise: Promise, photos: Sequence[int], without_markers: int = 0) -> str:
@@ -105,13 +105,13 @@ def photos_line(sessions: int | None, photos: Sequence[int] = ()) -> str:
     """How many photographs to take: for `sessions_needed`, beside `photos` judged so far in each session."""
     if sessions is None:
         return f"No {MOST_PHOTOS} photographs are likely to prove this promise: make a design that gains more."
-    if sum(photos) >= EACH * sessions and len(photos) >= sessions:
-        return f"Take {EACH * sessions} more, {EACH} in each of {places(sessions)} that are new."
+    if sum(photos) >= PHOTOS_PER_SESSION * sessions and len(photos) >= sessions:
+        return f"Take {PHOTOS_PER_SESSION * sessions} more, {PHOTOS_PER_SESSION} in each of {places(sessions)} that are new."
     needed = (
-        f"Take at least {EACH} photographs in each of {places(sessions)}, with other light in each, and keep "
+        f"Take at least {PHOTOS_PER_SESSION} photographs in each of {places(sessions)}, with other light in each, and keep "
         "those of each place in a folder of their own."
     )
-    so_far = f" So far: {sum(photos)} of {EACH * sessions}, in {places(len(photos))} of {sessions}."
+    so_far = f" So far: {sum(photos)} of {PHOTOS_PER_SESSION * sessions}, in {places(len(photos))} of {sessions}."
     return needed + so_far if photos else needed
 
 

@@ -15,13 +15,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from patchproof.base.color import codes_of
-from patchproof.mesh.mesh import Mesh, Part
+from patchproof.base.color import codes_from_srgb
+from patchproof.mesh.mesh import Mesh, MeshPart
 
 _M_FROM_MM = 1e-3
 
 
-def write_glb(mesh: Mesh, textures: Sequence[np.ndarray], path: str | Path, piece: Part | None = None) -> None:
+def write_glb(mesh: Mesh, textures: Sequence[np.ndarray], path: str | Path, piece: MeshPart | None = None) -> None:
     """Write `mesh` with `textures` (uint8 H×W×3, one per material, in place of the material's own) to a .glb file;
     `piece` hangs on it, with a texture of its own.
 
@@ -65,5 +65,5 @@ def _textured(vertices_mm, faces, normals, uv: np.ndarray, name: str, texture: n
     visual = TextureVisuals(uv=np.column_stack([uv[:, 0], 1 - uv[:, 1]]), material=material)
     if np.any(np.asarray(color) != 1):
         # trimesh writes bytes, whatever it is given
-        visual.vertex_attributes["color"] = codes_of(np.insert(np.asarray(color), 3, 1.0, axis=1))
+        visual.vertex_attributes["color"] = codes_from_srgb(np.insert(np.asarray(color), 3, 1.0, axis=1))
     return trimesh.Trimesh(vertices_mm * _M_FROM_MM, faces, vertex_normals=normals, visual=visual, process=False)

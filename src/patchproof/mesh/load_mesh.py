@@ -16,8 +16,8 @@ from typing import Literal
 import numpy as np
 
 from patchproof.base.errors import Refused
-from patchproof.base.resample import reduced
-from patchproof.mesh.mesh import Material, Mesh, Part, from_parts
+from patchproof.base.resample import downscale
+from patchproof.mesh.mesh import Material, Mesh, MeshPart, mesh_from_parts
 
 GIVEN = "python:"
 
@@ -26,7 +26,7 @@ LARGEST_TEXTURE_PX = 4096
 _Y_UP_FROM_Z_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 
 
-def load_mesh(path: str | Path, length_mm: float, up: Literal["y", "z"] = "z", given_glb: bytes | None = None) -> Mesh:
+def load_mesh(path: str | Path, length_mm: float, up: Literal["y", "z"] = "z", mesh_glb: bytes | None = None) -> Mesh:
     """The mesh of a file, of `primitive:NAME`, or of the GLB given for `python:NAME`, with its longest extent
     `length_mm`.
 
@@ -42,23 +42,23 @@ def load_mesh(path: str | Path, length_mm: float, up: Literal["y", "z"] = "z", g
 
     with TemporaryDirectory() as folder:
         if str(path).startswith(GIVEN):
-            if given_glb is None:
+            if mesh_glb is None:
                 raise Refused("a mesh beside the settings", f"{path} alone", "give it: make_scene(settings, mesh=...)")
             path = Path(folder) / "given.glb"
-            path.write_bytes(given_glb)
+            path.write_bytes(mesh_glb)
         parts, warnings = read_parts(Path(path), _Y_UP_FROM_Z_UP if up == "z" else np.eye(3))
     parts, reduced = _within_limit(parts)
-    return from_parts(parts, length_mm, (*warnings, *reduced))
+    return mesh_from_parts(parts, length_mm, (*warnings, *reduced))
 
 
-def _within_limit(parts: Sequence[Part]) -> tuple[list[Part], list[str]]:
+def _within_limit(parts: Sequence[MeshPart]) -> tuple[list[MeshPart], list[str]]:
     """The parts with textures of at most LARGEST_TEXTURE_PX a side, and warnings about those that were larger."""
     kept: dict[Material, Material] = {}
     warnings = []
     for material in dict.fromkeys(part.material for part in parts):
         texture = material.texture_srgb
         if texture is not None and max(texture.shape[:2]) > LARGEST_TEXTURE_PX:
-            small = reduced(texture, LARGEST_TEXTURE_PX)
+            small = downscale(texture, LARGEST_TEXTURE_PX)
             kept[material] = replace(material, texture_srgb=small)
             before, after = (f"{pixels.shape[1]} × {pixels.shape[0]}" for pixels in (texture, small))
             warnings.append(f"the texture of {before} of {material.name} is reduced to {after}")

@@ -27,8 +27,8 @@ class Material:
 
 
 @dataclass(frozen=True)
-class Part:
-    """Triangles of one material: what `from_parts` joins. Arrays are per vertex; None where there is none."""
+class MeshPart:
+    """Triangles of one material: what `mesh_from_parts` joins. Arrays are per vertex; None where there is none."""
 
     vertices: np.ndarray  # V×3, any unit, world axes (y up)
     faces: np.ndarray  # F×3 integers, counter-clockwise seen from outside
@@ -57,7 +57,7 @@ class Mesh:
         return self.vertices.min(0), self.vertices.max(0)
 
 
-def from_parts(parts: Sequence[Part], length_mm: float, warnings: Sequence[str] = ()) -> Mesh:
+def mesh_from_parts(parts: Sequence[MeshPart], length_mm: float, warnings: Sequence[str] = ()) -> Mesh:
     """One mesh of several parts, centered, its longest extent `length_mm`; parts may share a Material object.
 
     Faces with NaN or infinite corners and faces without area are left out with a warning; refused where none is left.
@@ -97,7 +97,7 @@ def from_parts(parts: Sequence[Part], length_mm: float, warnings: Sequence[str] 
     )
 
 
-def _joined(parts: Sequence[Part]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _joined(parts: Sequence[MeshPart]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """All vertices, all faces into them, and the part that each face belongs to."""
     for part in parts:
         if len(part.faces) and (part.faces.min() < 0 or part.faces.max() >= len(part.vertices)):
@@ -120,7 +120,7 @@ def _face_normals(unit: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.n
     return cross / np.where(has_area, doubled_area, 1.0)[:, None], has_area
 
 
-def _corners(part: Part, face_normals: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _corners(part: MeshPart, face_normals: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(uv F×3×2, normals F×3×3, colors F×3×3) of a part's corners, float32."""
     count = len(part.faces)
     uv = np.zeros((count, 3, 2), np.float32)
@@ -145,11 +145,11 @@ def normal_transform(rotation: np.ndarray) -> np.ndarray:
     return -cofactors if np.linalg.det(rotation) < 0 else cofactors
 
 
-def topology_warnings(parts: Sequence[Part]) -> list[str]:
+def topology_warnings(parts: Sequence[MeshPart]) -> list[str]:
     """Loose triangles, and edges of more than two faces, with vertices at equal places taken as one."""
     loose = crowded = edges = 0
     for part in parts:
-        corners = places_of(part.vertices)[part.faces]
+        corners = position_numbers(part.vertices)[part.faces]
         pairs = np.sort(np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]), axis=1)
         count = np.unique(pairs[:, 0] * (len(part.vertices) + 1) + pairs[:, 1], return_counts=True)[1]
         loose += np.count_nonzero(count == 1)
@@ -163,7 +163,7 @@ def topology_warnings(parts: Sequence[Part]) -> list[str]:
     return warnings
 
 
-def places_of(vertices: np.ndarray) -> np.ndarray:
+def position_numbers(vertices: np.ndarray) -> np.ndarray:
     """V: one number for all vertices V×3 at the same place."""
     order = np.lexsort(vertices.T)
     new = np.r_[False, (np.diff(vertices[order], axis=0) != 0).any(1)]

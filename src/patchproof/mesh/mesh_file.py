@@ -23,10 +23,10 @@ import numpy as np
 
 from patchproof.base.color import linear_from_srgb
 from patchproof.base.errors import Refused
-from patchproof.base.input import FORMATS as PICTURES
-from patchproof.base.input import LARGEST_PX, is_file
+from patchproof.base.input import IMAGE_FORMATS as PICTURES
+from patchproof.base.input import MAX_IMAGE_PX, is_file
 from patchproof.mesh.assets import MOST_BYTES, Assets
-from patchproof.mesh.mesh import Material, Part, normal_transform, topology_warnings
+from patchproof.mesh.mesh import Material, MeshPart, normal_transform, topology_warnings
 
 FORMATS = (".obj", ".glb", ".gltf", ".ply", ".stl")
 MOST_FACES = 20_000_000  # a scan of a building has fewer
@@ -34,7 +34,7 @@ GRAY_LINEAR = (0.21404114, 0.21404114, 0.21404114)  # sRGB 0.5: what an object w
 WHITE = (1.0, 1.0, 1.0)
 
 
-def read_parts(path: Path, world_from_file: np.ndarray) -> tuple[list[Part], list[str]]:
+def read_parts(path: Path, world_from_file: np.ndarray) -> tuple[list[MeshPart], list[str]]:
     """Every placed piece of geometry with faces, vertices and normals turned by `world_from_file` 3×3, and warnings."""
     if not is_file(path):
         raise Refused("a mesh file", f"no file at {path}", "check the path")
@@ -85,7 +85,7 @@ class _Reader:
         if any(m.get("alphaMode", "OPAQUE") != "OPAQUE" for m in self.header.get("materials", ())):
             self.warnings.append("transparent materials are drawn opaque")
 
-    def parts(self, world_from_file: np.ndarray) -> list[Part]:
+    def parts(self, world_from_file: np.ndarray) -> list[MeshPart]:
         """All that has faces, each as often as it is placed."""
         placed = [(world, raw, recipe) for world, raw, recipe in self.placed() if np.size(raw.get("faces", ()))]
         if sum(len(raw["faces"]) for _, raw, _ in placed) > MOST_FACES:
@@ -115,7 +115,7 @@ class _Reader:
             places = [graph[node] for node in nodes]
         return [(np.asarray(world, float), geometry[name], recipes.get(name, {})) for world, name in places]
 
-    def part(self, raw: dict[str, Any], primitive: dict, transform: np.ndarray) -> Part:
+    def part(self, raw: dict[str, Any], primitive: dict, transform: np.ndarray) -> MeshPart:
         """The part of a geometry, carried by `transform` 3×4."""
         from trimesh.geometry import triangulate_quads
 
@@ -136,11 +136,11 @@ class _Reader:
             self.warnings.append("vertex colors are left out where there is a texture")
             colors = None
         if colors is None or len(colors) == len(vertices):
-            return Part(placed, faces, material, uv, normals, colors)
+            return MeshPart(placed, faces, material, uv, normals, colors)
         corners = faces.reshape(-1)  # one color per face: give every face corners of its own
         uv, normals = (None if array is None else array[corners] for array in (uv, normals))
         own = np.arange(len(corners)).reshape(-1, 3)
-        return Part(placed[corners], own, material, uv, normals, np.repeat(colors, 3, axis=0))
+        return MeshPart(placed[corners], own, material, uv, normals, np.repeat(colors, 3, axis=0))
 
     def refuse_missing(self) -> None:
         """Refuse a missing or broken texture; a missing MTL is warned about."""
@@ -236,7 +236,7 @@ class _Reader:
         """An image as uint8 H×W×3; 16 bits are cut to 8, alpha is dropped."""
         if id(image) not in self.textures:
             try:
-                if image.format not in PICTURES or image.width * image.height > LARGEST_PX:
+                if image.format not in PICTURES or image.width * image.height > MAX_IMAGE_PX:
                     raise ValueError(f"{image.format} of {image.width} × {image.height} pixels")
                 if image.mode.startswith("I"):  # Pillow would clip 16 bits at 255 instead of scaling them
                     pixels = np.repeat((np.asarray(image) >> 8).clip(0, 255).astype(np.uint8)[..., None], 3, axis=2)

@@ -10,12 +10,12 @@ from __future__ import annotations
 import numpy as np
 
 from patchproof.base.errors import Refused
-from patchproof.base.validation import nearest
-from patchproof.mesh.mesh import Mesh, Part, from_parts
-from patchproof.mesh.solids import box, lathe, moved, prism, tube, turned
+from patchproof.base.validation import spelling_hint
+from patchproof.mesh.mesh import Mesh, MeshPart, mesh_from_parts
+from patchproof.mesh.solids import box, lathe, prism, rotate_part, translate_part, tube
 
 
-def names() -> tuple[str, ...]:
+def primitive_names() -> tuple[str, ...]:
     """The objects' names, as in `primitive:NAME`."""
     return tuple(_OBJECTS)
 
@@ -23,7 +23,7 @@ def names() -> tuple[str, ...]:
 def build(name: str, seed: int = 0) -> Mesh:
     """One object; the same name and seed give the same arrays."""
     made = parts(name, seed)
-    return from_parts(made, _longest(made))
+    return mesh_from_parts(made, _longest(made))
 
 
 def longest_mm(name: str) -> float:
@@ -31,15 +31,15 @@ def longest_mm(name: str) -> float:
     return float(round(_longest(parts(name))))
 
 
-def _longest(made: list[Part]) -> float:
+def _longest(made: list[MeshPart]) -> float:
     return float(np.ptp(np.concatenate([part.vertices for part in made]), axis=0).max())
 
 
-def parts(name: str, seed: int = 0) -> list[Part]:
+def parts(name: str, seed: int = 0) -> list[MeshPart]:
     """The closed parts of one object in millimeters, standing on y = 0; three vertices of its own for every face."""
     if name not in _OBJECTS:
-        raise Refused("the name of a primitive", f'"{name}"', nearest(name, _OBJECTS))
-    return _OBJECTS[name](np.random.default_rng([names().index(name), seed]))
+        raise Refused("the name of a primitive", f'"{name}"', spelling_hint(name, _OBJECTS))
+    return _OBJECTS[name](np.random.default_rng([primitive_names().index(name), seed]))
 
 
 WHITE, BLACK, STEEL, WOOD = (0.92, 0.92, 0.9), (0.1, 0.1, 0.11), (0.66, 0.67, 0.7), (0.65, 0.46, 0.28)
@@ -57,7 +57,7 @@ def _arc(center, radius, start_deg: float, end_deg: float, n: int) -> np.ndarray
     return np.stack([center[0] + radius[0] * np.cos(angle), center[1] + radius[1] * np.sin(angle)], 1)
 
 
-def _mug(rng) -> list[Part]:
+def _mug(rng) -> list[MeshPart]:
     h, r, wall, foot = rng.uniform(80, 110), rng.uniform(36, 46), rng.uniform(3, 5), rng.uniform(0.8, 1.0)
     color = _paint(rng)
     outer = [(0, 0), (r * foot * 0.92, 0), (r * foot, h * 0.04), (r * (0.5 + foot / 2), h * 0.4), (r, h * 0.8), (r, h)]
@@ -67,7 +67,7 @@ def _mug(rng) -> list[Part]:
     return [body, tube([(0, y, z) for z, y in bow], thick, "handle", paint)]
 
 
-def _bottle(rng) -> list[Part]:
+def _bottle(rng) -> list[MeshPart]:
     h, r = rng.uniform(230, 310), rng.uniform(32, 42)
     neck, shoulder, cap = r * rng.uniform(0.3, 0.42), h * rng.uniform(0.52, 0.66), h * rng.uniform(0.05, 0.09)
     glasses = ((0.12, 0.3, 0.16), (0.34, 0.18, 0.08), (0.6, 0.75, 0.75), (0.15, 0.25, 0.5), (0.75, 0.2, 0.15))
@@ -81,7 +81,7 @@ def _bottle(rng) -> list[Part]:
     return [body, band, lid]
 
 
-def _traffic_cone(rng) -> list[Part]:
+def _traffic_cone(rng) -> list[MeshPart]:
     h, base = rng.uniform(450, 750), rng.uniform(0.52, 0.62)
     foot, top = rng.uniform(0.19, 0.23), rng.uniform(0.03, 0.05)
     orange = _paint(rng, ((0.95, 0.4, 0.08), (0.9, 0.25, 0.1), (0.93, 0.55, 0.1)))
@@ -99,7 +99,7 @@ def _traffic_cone(rng) -> list[Part]:
     return made
 
 
-def _street_sign(rng) -> list[Part]:
+def _street_sign(rng) -> list[MeshPart]:
     h, size = rng.uniform(1500, 2000), rng.uniform(760, 900)
     # corners, first corner's angle, reach of a corner in halves of the size
     shapes = ((3, 90, 1.25), (3, -90, 1.25), (4, 45, 1.41), (4, 0, 1.2), (8, 22.5, 1.08), (32, 0, 1.0))
@@ -107,10 +107,10 @@ def _street_sign(rng) -> list[Part]:
     colors = (*PAINTS[:4], WHITE)
     face = _paint(rng, colors)
 
-    def plate(scale: float, x0: float, x1: float, name: str, srgb) -> Part:
+    def plate(scale: float, x0: float, x1: float, name: str, srgb) -> MeshPart:
         angle = np.radians(turn) + np.arange(sides) * 2 * np.pi / sides
         outline = np.stack([-np.cos(angle), np.sin(angle)], 1) * size / 2 * reach * scale
-        return moved(prism(outline, x0, x1, name, srgb), (0, h - size / 2, 0))
+        return translate_part(prism(outline, x0, x1, name, srgb), (0, h - size / 2, 0))
 
     path = [(-22, 0, 0), (-22, h * 0.5, 0), (-22, h - size * 0.3, 0)]
     post = tube(path, rng.uniform(24, 34), "post", _paint(rng, (STEEL, WOOD)))
@@ -122,7 +122,7 @@ def _street_sign(rng) -> list[Part]:
     return made
 
 
-def _box_truck(rng) -> list[Part]:
+def _box_truck(rng) -> list[MeshPart]:
     w, tall = rng.uniform(2000, 2400), rng.uniform(2100, 2600)
     cab, cargo = rng.uniform(1500, 1900), rng.uniform(3600, 5000)
     wheel, floor = rng.uniform(400, 480), rng.uniform(560, 680)
@@ -144,13 +144,13 @@ def _box_truck(rng) -> list[Part]:
         made.append(box((w * 0.12, 130, 40), (x * 0.78, floor + 20, front), "lamp", (0.95, 0.93, 0.8)))
         for z in (-cargo * 0.3, front - cab * 0.55):
             profile = [(0, 0), (wheel * 0.96, 0), (wheel, 40), (wheel, 220), (wheel * 0.96, 260), (0, 260)]
-            tire = turned(lathe(profile, "tire", BLACK), 2, -90)
-            hub = turned(lathe([(0, -12), (wheel * 0.5, -12), (wheel * 0.5, 272), (0, 272)], "hub", STEEL), 2, -90)
-            made += [moved(part, (x * 0.96 - 130, wheel, z)) for part in (tire, hub)]
+            tire = rotate_part(lathe(profile, "tire", BLACK), 2, -90)
+            hub = rotate_part(lathe([(0, -12), (wheel * 0.5, -12), (wheel * 0.5, 272), (0, 272)], "hub", STEEL), 2, -90)
+            made += [translate_part(part, (x * 0.96 - 130, wheel, z)) for part in (tire, hub)]
     return made
 
 
-def _chair(rng) -> list[Part]:
+def _chair(rng) -> list[MeshPart]:
     w, d, seat, back = rng.uniform(400, 480), rng.uniform(390, 460), rng.uniform(420, 470), rng.uniform(380, 500)
     leg, color = rng.uniform(28, 45), _paint(rng, (WOOD, WOOD, *PAINTS))
     frame = color if rng.random() < 0.6 else _paint(rng, (STEEL, BLACK, WOOD))
@@ -169,7 +169,7 @@ def _chair(rng) -> list[Part]:
     return made
 
 
-def _table_lamp(rng) -> list[Part]:
+def _table_lamp(rng) -> list[MeshPart]:
     h, shade, foot = rng.uniform(420, 560), rng.uniform(125, 165), rng.uniform(70, 95)
     top, low, belly = shade * rng.uniform(0.5, 0.85), h * rng.uniform(0.54, 0.62), rng.uniform(10, 55)
     metal = _paint(rng, (*PAINTS, STEEL, WOOD))
@@ -181,7 +181,7 @@ def _table_lamp(rng) -> list[Part]:
     return [base, lathe(profile, "shade", cover)]
 
 
-def _carton(rng) -> list[Part]:
+def _carton(rng) -> list[MeshPart]:
     x, z, y = rng.uniform(180, 320), rng.uniform(320, 460), rng.uniform(220, 380)
     card = _paint(rng, ((0.72, 0.55, 0.37), (0.66, 0.49, 0.32), (0.8, 0.68, 0.5)))
     made = [box((x, y, z), (0, 0, 0), "body", card)]
@@ -194,15 +194,15 @@ def _carton(rng) -> list[Part]:
         made.append(box((x - 8, 1, z - 8), (0, y - 0.5, 0), "inside", card * 0.35))
         for s in (-1, 1):
             flap = box((x / 2, 4, z), (s * x / 4, 0, 0), "flap", card)
-            made.append(moved(turned(flap, 2, s * rng.uniform(-50, 45)), (s * x / 2, y, 0)))
+            made.append(translate_part(rotate_part(flap, 2, s * rng.uniform(-50, 45)), (s * x / 2, y, 0)))
             short = box((x, 4, x / 2), (0, 0, s * x / 4), "flap", card)
-            made.append(moved(turned(short, 0, s * rng.uniform(-45, 50)), (0, y, s * z / 2)))
+            made.append(translate_part(rotate_part(short, 0, s * rng.uniform(-45, 50)), (0, y, s * z / 2)))
     if rng.random() < 0.5:  # an address label on the small side
         made.append(box((x * 0.5, y * 0.3, 0.8), (0, y * rng.uniform(0.15, 0.5), z / 2), "label", WHITE))
     return made
 
 
-def _mailbox(rng) -> list[Part]:
+def _mailbox(rng) -> list[MeshPart]:
     x, z, y = rng.uniform(420, 520), rng.uniform(460, 580), rng.uniform(620, 780)
     leg, bow, paint = rng.uniform(100, 220), rng.uniform(0.3, 0.5), _paint(rng, PAINTS[:4])
     arch = _arc((0, leg + y), (z / 2, z * bow), 0, 180, 13)
@@ -215,7 +215,7 @@ def _mailbox(rng) -> list[Part]:
     return [*made, handle, slot, card]
 
 
-def _umbrella(rng) -> list[Part]:
+def _umbrella(rng) -> list[MeshPart]:
     reach, h = rng.uniform(450, 560), rng.uniform(820, 940)
     dome, ribs, color = reach * rng.uniform(0.4, 0.62), 8, _paint(rng)
     outer = [(reach * np.sin(t), h - dome + dome * np.cos(t)) for t in np.linspace(np.pi / 2, 0, 9)[:-1]]
@@ -226,7 +226,7 @@ def _umbrella(rng) -> list[Part]:
     return [canopy, steel, tube(hook, 14, "handle", _paint(rng, (WOOD, BLACK, *PAINTS)))]
 
 
-def _watering_can(rng) -> list[Part]:
+def _watering_can(rng) -> list[MeshPart]:
     h, r, taper = rng.uniform(190, 260), rng.uniform(85, 115), rng.uniform(0.75, 1.0)
     color = _paint(rng, (*PAINTS, STEEL))
     wall = 4
@@ -237,12 +237,12 @@ def _watering_can(rng) -> list[Part]:
     spout = tube([(0, y, z) for y, z in path], [26, 20, 15, 12], "spout", color)
     side = [(0, 0), (13, 0), (rng.uniform(30, 42), 40), (0, 46)]
     rose = lathe(side, "rose", color if rng.random() < 0.5 else _paint(rng))
-    rose = moved(turned(rose, 0, rng.uniform(35, 60)), (0, h * rise - 8, r + reach - 8))
+    rose = translate_part(rotate_part(rose, 0, rng.uniform(35, 60)), (0, h * rise - 8, r + reach - 8))
     bow = _arc((-r * taper * 0.75, h * 0.72), (rng.uniform(75, 105), h * rng.uniform(0.4, 0.55)), 60, 260, 15)
     return [body, spout, rose, tube([(0, y, z) for z, y in bow], rng.uniform(8, 12), "handle", color)]
 
 
-def _hammer(rng) -> list[Part]:
+def _hammer(rng) -> list[MeshPart]:
     h, r = rng.uniform(290, 360), rng.uniform(13, 17)
     grip, steel = _paint(rng, (WOOD, WOOD, *PAINTS)), _paint(rng, (STEEL, STEEL, BLACK))
     shaft = [(r * 0.95, 0), (r * 1.15, 12), (r, h * 0.3), (r * 0.72, h * 0.55), (r * 0.7, h)]
@@ -250,7 +250,7 @@ def _hammer(rng) -> list[Part]:
     head, face, reach = h - r * 1.1, rng.uniform(15, 19), rng.uniform(48, 62)
     profile = [(0, -22), (r, -22), (r * 1.15, 0), (face * 0.75, 18), (face * 0.75, reach - 20)]
     profile += [(face, reach - 14), (face, reach), (0, reach)]
-    made = [handle, moved(turned(lathe(profile, "head", steel), 0, 90), (0, head, 0))]
+    made = [handle, translate_part(rotate_part(lathe(profile, "head", steel), 0, 90), (0, head, 0))]
     drop, back = rng.uniform(20, 45), reach * rng.uniform(1.1, 1.4)
     for side in (-1, 1):
         bow = [(side * (4 + 9 * t), head + 4 - drop * t * t, -10 - back * t) for t in np.linspace(0, 1, 7)]

@@ -16,13 +16,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from patchproof.base.color import linear_from_srgb
-from patchproof.mesh.mesh import Material, Part
+from patchproof.mesh.mesh import Material, MeshPart
 
 AROUND = 24  # corners of a round cross-section: 15° each, below the crease, so that sides shade smoothly
 CREASE_DEG = 40.0
 
 
-def skin(rings: Sequence[np.ndarray], name: str, srgb: Sequence[float], planar: bool = False) -> Part:
+def skin(rings: Sequence[np.ndarray], name: str, srgb: Sequence[float], planar: bool = False) -> MeshPart:
     """The closed surface over rings K×3, counter-clockwise about the way they go; 1×3 at both ends closes it."""
     grid = np.stack([np.broadcast_to(ring, (max(map(len, rings)), 3)) for ring in rings])
     rows, columns = grid.shape[:2]
@@ -42,10 +42,10 @@ def skin(rings: Sequence[np.ndarray], name: str, srgb: Sequence[float], planar: 
     red, green, blue = linear_from_srgb(np.clip(np.asarray(srgb, float), 0, 1)).tolist()
     material = Material(name, (red, green, blue))
     faces = np.arange(3 * len(corners)).reshape(-1, 3)
-    return Part(corners.reshape(-1, 3), faces, material, uv.reshape(-1, 2), normals.reshape(-1, 3))
+    return MeshPart(corners.reshape(-1, 3), faces, material, uv.reshape(-1, 2), normals.reshape(-1, 3))
 
 
-def lathe(profile: Sequence[tuple[float, float]], name: str, srgb, around: int = AROUND) -> Part:
+def lathe(profile: Sequence[tuple[float, float]], name: str, srgb, around: int = AROUND) -> MeshPart:
     """A profile of (radius, height) turned about y; starts and ends at radius 0, the outside on its right hand."""
     angle = np.arange(around) * 2 * np.pi / around
     circle = np.stack([np.cos(angle), 0 * angle, -np.sin(angle)], 1)
@@ -53,7 +53,7 @@ def lathe(profile: Sequence[tuple[float, float]], name: str, srgb, around: int =
     return skin([(circle if r > 0 else circle[:1]) * r + up * y for r, y in profile], name, srgb)
 
 
-def tube(points: Sequence[Sequence[float]], radius: ArrayLike, name: str, srgb, around: int = 12) -> Part:
+def tube(points: Sequence[Sequence[float]], radius: ArrayLike, name: str, srgb, around: int = 12) -> MeshPart:
     """A round tube along N×3 points, flat ends; `radius` is one figure or one per point."""
     path = np.asarray(points, float)
     radii = np.broadcast_to(np.asarray(radius, float), len(path))
@@ -68,7 +68,7 @@ def tube(points: Sequence[Sequence[float]], radius: ArrayLike, name: str, srgb, 
     return skin([*rings, path[-1:]], name, srgb)
 
 
-def prism(outline: ArrayLike, x0: float, x1: float, name: str, srgb) -> Part:
+def prism(outline: ArrayLike, x0: float, x1: float, name: str, srgb) -> MeshPart:
     """An outline of (z, y) in either direction, star-shaped about its middle, from x0 to x1."""
     z, y = np.asarray(outline, float).T
     if np.sum(z * np.roll(y, -1) - y * np.roll(z, -1)) > 0:  # seen from +x, z runs to the left
@@ -81,19 +81,19 @@ def prism(outline: ArrayLike, x0: float, x1: float, name: str, srgb) -> Part:
     return skin([at(x0, *middle), at(x0, z, y), at(x1, z, y), at(x1, *middle)], name, srgb, planar=True)
 
 
-def box(size: tuple[float, float, float], at: tuple[float, float, float], name: str, srgb) -> Part:
+def box(size: tuple[float, float, float], at: tuple[float, float, float], name: str, srgb) -> MeshPart:
     """A box of (x, y, z) extents; `at` is the middle of its *bottom*."""
     dx, dy, dz = size
     outline = [(-dz / 2, 0), (-dz / 2, dy), (dz / 2, dy), (dz / 2, 0)]
-    return moved(prism(outline, -dx / 2, dx / 2, name, srgb), at)
+    return translate_part(prism(outline, -dx / 2, dx / 2, name, srgb), at)
 
 
-def moved(part: Part, by: Sequence[float]) -> Part:
+def translate_part(part: MeshPart, by: Sequence[float]) -> MeshPart:
     """The part, shifted."""
     return replace(part, vertices=part.vertices + np.asarray(by, float))
 
 
-def turned(part: Part, axis: int, degrees: float) -> Part:
+def rotate_part(part: MeshPart, axis: int, degrees: float) -> MeshPart:
     """The part, turned about a world axis (0 x, 1 y, 2 z) through the origin, counter-clockwise seen from its tip."""
     c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     matrix = np.eye(3)

@@ -15,10 +15,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from patchproof.base.color import codes_of, linear_from_srgb, srgb_from_linear
+from patchproof.base.color import codes_from_srgb, linear_from_srgb, srgb_from_linear
 from patchproof.base.errors import Refused
-from patchproof.mesh.mesh import Material, Mesh, places_of
-from patchproof.mesh.texels import coverage, face_counts, spans
+from patchproof.mesh.mesh import Material, Mesh, position_numbers
+from patchproof.mesh.uv_coverage import coverage, spans, texels_per_face
 
 PADDING_TEXELS = 2  # between charts; measured, 3 stay free: rims of 1.5 texels on either side do not meet
 # float32 coordinates further out are coarser than a tenth of a texel of a 1024² texture
@@ -28,7 +28,7 @@ _FLAT_COSINE, _TURNED_COSINE = 1 - 2e-4, 0.7
 _ATTEMPTS = 3
 
 
-def has_place(mesh: Mesh) -> np.ndarray:
+def has_usable_uv(mesh: Mesh) -> np.ndarray:
     """Which faces F have texture coordinates to paint on.
 
     All three corners at (0, 0) is what a mesh without coordinates gets; NaN or absurdly far ones mean nothing. Vertex
@@ -73,7 +73,7 @@ def _atlas(vertices: np.ndarray, faces: np.ndarray, texels: int) -> tuple[np.nda
     part = _directions(points, own)
     uv, size = _packed(points, own, part, texels)
     for _ in range(_ATTEMPTS - 1):
-        overlapping = face_counts(uv * size, coverage(uv * size, size) > 1)[0] > 0
+        overlapping = texels_per_face(uv * size, coverage(uv * size, size) > 1)[0] > 0
         if not overlapping.any():
             break
         part[overlapping] = part.max() + 1  # xatlas lets a chart fold over itself now and then: cut the folds out
@@ -117,7 +117,7 @@ def _directions(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
     normal = np.cross(points[faces[:, 1]] - points[faces[:, 0]], points[faces[:, 2]] - points[faces[:, 0]])
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
-    place = places_of(points.astype(np.float32))[faces]
+    place = position_numbers(points.astype(np.float32))[faces]
     edge = np.sort(np.concatenate([place[:, [0, 1]], place[:, [1, 2]], place[:, [2, 0]]]), axis=1)
     order = np.lexsort(edge.T)
     same = (np.diff(edge[order], axis=0) == 0).all(1)
@@ -161,7 +161,7 @@ def _baked(corners: np.ndarray, colors_linear: np.ndarray, size: tuple[int, int]
             light[row, column] = (weight[..., None] * colors_linear[face]).sum(1)
             empty[row, column] = False
     y, x = np.asarray(distance_transform_edt(empty, return_distances=False, return_indices=True))
-    return codes_of(srgb_from_linear(light[y, x].clip(0, 1)))
+    return codes_from_srgb(srgb_from_linear(light[y, x].clip(0, 1)))
 
 
 def _barycentric(corners: np.ndarray, points: np.ndarray) -> np.ndarray:

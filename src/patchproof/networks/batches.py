@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 CPU_BATCH_PIXELS = 4 * 224**2  # 2 to 8 pictures of 224 px cost the same each, 12 a third more
 
 
-class InBatches(torch.nn.Module):
+class BatchedNetwork(torch.nn.Module):
     """`network` for any N, though itself it may take one number of pictures, `size`, only: short batches repeat their
     last. At most `most` go at a time, None for all.
     """
@@ -35,7 +35,7 @@ class InBatches(torch.nn.Module):
         self.network, self.size, self.most, self.order = network, size, size, torch.contiguous_format
         self.tried: Tensor | None = None  # on a CPU, two of the pictures that the order was tried with
 
-    def train(self, mode: bool = True) -> InBatches:
+    def train(self, mode: bool = True) -> BatchedNetwork:
         """Nothing to switch: networks come as they are to be used."""
         return self
 
@@ -62,19 +62,19 @@ class InBatches(torch.nn.Module):
         """Where its first layers can be told from the others, found when it is first asked for."""
         if self.tried is None or not worth_cutting(self, self.tried):
             return None
-        from patchproof.networks.cuts import cut_of  # which follows a network step by step: small ones do without
+        from patchproof.networks.cuts import find_cut  # which follows a network step by step: small ones do without
 
-        return cut_of(self.network, self.tried)
+        return find_cut(self.network, self.tried)
 
 
-def fastest(network: Callable[[Tensor], Tensor], pictures: Tensor) -> InBatches:
+def tune_batches(network: Callable[[Tensor], Tensor], pictures: Tensor) -> BatchedNetwork:
     """`network` in the batches and the order that suit the device; `pictures` N×3×S×S are tried for it.
 
     A network may hold a view that takes one order only; such a network is left as it was.
     """
-    batches = network if isinstance(network, InBatches) else InBatches(network)
+    batches = network if isinstance(network, BatchedNetwork) else BatchedNetwork(network)
     if pictures.device.type == "cpu":
-        batches.most = batches.size or few_on_cpu(pictures.shape[-1])
+        batches.most = batches.size or cpu_batch_size(pictures.shape[-1])
     batches.tried = pictures[:2] if pictures.device.type == "cpu" else None
     batches.order = torch.channels_last
     try:
@@ -85,6 +85,6 @@ def fastest(network: Callable[[Tensor], Tensor], pictures: Tensor) -> InBatches:
     return batches
 
 
-def few_on_cpu(input_px: int) -> int:
+def cpu_batch_size(input_px: int) -> int:
     """How many pictures of that side a CPU takes at a time."""
     return max(1, CPU_BATCH_PIXELS // input_px**2)

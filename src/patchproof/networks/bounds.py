@@ -16,7 +16,7 @@ class UnsupportedNetwork(PatchproofError):
     """Something in the file that is not allowed; the text follows "the file with"."""
 
 
-def quoted(value: Any) -> str:
+def quote(value: Any) -> str:
     """Whatever stands in the file, short and on one line."""
     text = repr(value)
     return text if len(text) <= 80 else f"{text[:77]}..."
@@ -25,5 +25,5 @@ def quoted(value: Any) -> str:
 def whole(value: Any, low: int, high: int) -> int:
     """A whole number from `low` to `high`, and not one in disguise."""
     if type(value) is not int or not low <= value <= high:
-        raise UnsupportedNetwork(f"{quoted(value)} for a whole number from {low} to {high}")
+        raise UnsupportedNetwork(f"{quote(value)} for a whole number from {low} to {high}")
     return value

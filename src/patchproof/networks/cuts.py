@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from patchproof.networks.graph import Program, compute
-from patchproof.networks.traced import traced
+from patchproof.networks.tracing import trace_module
 from patchproof.networks.windows import Windows, numbers_saved
 
 STRIDES = (2, 4, 8)  # of deeper values a pixel reaches most
@@ -125,13 +125,13 @@ def _joined(parts: list[Tensor]) -> Tensor:
     return torch.stack(parts).contiguous(memory_format=torch.channels_last)
 
 
-def cut_of(network: Callable[[Tensor], Tensor], pictures: Tensor) -> Cut | None:
+def find_cut(network: Callable[[Tensor], Tensor], pictures: Tensor) -> Cut | None:
     """Where cutting a network saves most with typical windows, proved with two pictures 2×3×S×S; None where that fails,
     or saves nothing.
     """
     if not isinstance(network, torch.nn.Module):
         return None
-    program = network if isinstance(network, Program) else traced(network)
+    program = network if isinstance(network, Program) else trace_module(network)
     if program is None:
         return None
     size_px = pictures.shape[-1]

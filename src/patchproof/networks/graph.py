@@ -16,10 +16,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from patchproof.networks.bounds import MAX_DIMENSIONS, quoted
-from patchproof.networks.made import MadeTensors
-from patchproof.networks.rewritten import rewritten
-from patchproof.networks.steps import Here, Step, Value
+from patchproof.networks.bounds import MAX_DIMENSIONS, quote
+from patchproof.networks.rewrites import rewrite_steps
+from patchproof.networks.steps import InputDevice, Step, ValueRef
+from patchproof.networks.tensor_observer import TensorObserver
 
 MAX_VALUE = 1 << 30  # numbers in one value, for each picture: VGG's at the largest input_px
 MAX_SPLIT = 1 << 16  # along a dimension of what is split into several tensors
@@ -34,7 +34,7 @@ class Program(torch.nn.Module):
         super().__init__()
         for number, weight in enumerate(weights):
             self.register_buffer(f"w{number}", weight)
-        self.steps, self.output, self.sizes = rewritten(steps, weights), output, sizes
+        self.steps, self.output, self.sizes = rewrite_steps(steps, weights), output, sizes
         self.photos = len(weights)  # the number of the pictures, after those of the weights
         self.weighed: set[tuple[torch.Size, int]] = set()
 
@@ -63,7 +63,7 @@ class Program(torch.nn.Module):
         with torch.inference_mode(False), torch.no_grad():
             weights = [weight.to("meta") for weight in self.buffers()]
             photos = torch.empty(shape, device="meta")
-            with MadeTensors(partial(_refuse_absurd, MAX_VALUE * len(photos)), _WEIGHED):
+            with TensorObserver(partial(_refuse_absurd, MAX_VALUE * len(photos)), _WEIGHED):
                 compute(self.steps[:count], dict(enumerate([*weights, photos])), photos)
         self.weighed.add((shape, count))
 
@@ -128,14 +128,14 @@ _WEIGHED: dict[Callable[..., Any], Callable[..., Any]] = {
 
 def _filled(argument: Any, values: dict[int, Any], photos: Tensor) -> Any:
     """An argument with the values that it names."""
-    if type(argument) is Value:
+    if type(argument) is ValueRef:
         return values[argument.number]
     if type(argument) is list:
         return [_filled(item, values, photos) for item in argument]
-    return photos.device if argument is Here else argument
+    return photos.device if argument is InputDevice else argument
 
 
 def _refuse_absurd(limit: int, tensor: Tensor) -> None:
     """Also what an operator makes on its way (einsum, paddings)."""
     if tensor.numel() > limit or tensor.dim() > MAX_DIMENSIONS:
-        raise ValueError(f"it makes a tensor of an absurd size, {quoted(tuple(tensor.shape))}")
+        raise ValueError(f"it makes a tensor of an absurd size, {quote(tuple(tensor.shape))}")

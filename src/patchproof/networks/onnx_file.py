@@ -25,15 +25,15 @@ from patchproof.networks.bounds import (
     MAX_LIST,
     MAX_NUMBERS,
     UnsupportedNetwork,
-    quoted,
+    quote,
     whole,
 )
 from patchproof.networks.graph import Program
+from patchproof.networks.onnx_aten import AtenCalls, aten_calls
 from patchproof.networks.onnx_operators import DTYPES, OPERATORS
-from patchproof.networks.onnx_plain import Way, way_through
 from patchproof.networks.onnx_shapes import MAX_SIZES
 from patchproof.networks.protobuf import BYTES, FLOAT, INT, NEVER, TEXT, Schema, read_message
-from patchproof.networks.steps import Here, Step, Value, mark_spent
+from patchproof.networks.steps import InputDevice, Step, ValueRef, mark_last_uses
 
 OPSETS = (13, 28)
 MAX_SCALARS = 8  # fractions that stay on the CPU: a Resize has as many in its list of factors
@@ -96,8 +96,8 @@ def read_onnx(stored: bytes, beside: Callable[[], bytes]) -> tuple[Program, int 
     model = read_message(stored, _MODEL)
     versions = [opset.get("version", 0) for opset in model.get("opset", []) if opset.get("domain", "") in _STANDARD]
     if len(versions) != 1 or not OPSETS[0] <= versions[0] <= OPSETS[1]:
-        raise UnsupportedNetwork(f"opset {quoted(versions)[1:-1]}, not one from {OPSETS[0]} to {OPSETS[1]}")
-    return _Reader(model["graph"], _Weights(beside)).read()
+        raise UnsupportedNetwork(f"opset {quote(versions)[1:-1]}, not one from {OPSETS[0]} to {OPSETS[1]}")
+    return _GraphReader(model["graph"], _Weights(beside)).read()
 
 
 _STANDARD = ("", "ai.onnx")
@@ -114,7 +114,7 @@ class _Weights:
         sizes = [whole(size, 0, MAX_NUMBERS) for size in content.get("dims", [])]
         dtype = DTYPES.get(content.get("data_type", 0))
         if dtype is None or len(sizes) > MAX_DIMENSIONS:
-            raise UnsupportedNetwork(f"{quoted(content.get('name'))} of a type that is not supported")
+            raise UnsupportedNetwork(f"{quote(content.get('name'))} of a type that is not supported")
         if "ints" in content or "longs" in content:
             values = torch.tensor(content.get("ints") or content["longs"], dtype=torch.int64).to(dtype)
             if dtype.is_floating_point:
@@ -123,7 +123,7 @@ class _Weights:
             values = _from_bytes(self._bytes(content), dtype)
         if values.numel() != math.prod(sizes):
             raise UnsupportedNetwork(
-                f"{values.numel()} numbers in {quoted(content.get('name'))} of the shape {quoted(sizes)}"
+                f"{values.numel()} numbers in {quote(content.get('name'))} of the shape {quote(sizes)}"
             )
         return values.reshape(sizes)
 
@@ -154,7 +154,7 @@ def _from_bytes(stored: Any, dtype: torch.dtype) -> Tensor:
     return values != 0 if dtype == torch.bool else values.view(dtype)
 
 
-class _Reader:
+class _GraphReader:
     """The names of one file, each of them once, and what they stand for from then on: a number, or a small constant."""
 
     def __init__(self, graph: dict[str, Any], weights: _Weights):
@@ -162,7 +162,7 @@ class _Reader:
         self.weights: list[Tensor] = []
         self.count = 0  # of values with a number
         self.of_four = set[int]()  # numbers of those with four dimensions, as far as that is known
-        self.values: dict[str, Value | Tensor | None] = {"": None}  # an input that is left out
+        self.values: dict[str, ValueRef | Tensor | None] = {"": None}  # an input that is left out
         self.tensor = weights.tensor
 
     def read(self) -> tuple[Program, int | None]:
@@ -181,9 +181,9 @@ class _Reader:
         self._new(given[0]["name"])
         steps = [step for node in self.nodes for step in self._steps(node)]
         outputs = [self._known(place["name"]) for place in self.graph["output"]]
-        if len(outputs) != 1 or not isinstance(outputs[0], Value):
+        if len(outputs) != 1 or not isinstance(outputs[0], ValueRef):
             raise UnsupportedNetwork(f"{len(outputs)} outputs, not one of N×K")
-        mark_spent(steps, {*range(len(self.weights) + 1), outputs[0].number})
+        mark_last_uses(steps, {*range(len(self.weights) + 1), outputs[0].number})
         return Program(self.weights, steps, outputs[0].number, sizes), batch
 
     def _constant(self, name: str, value: Any) -> None:
@@ -191,30 +191,30 @@ class _Reader:
         tensor = value if isinstance(value, Tensor) else torch.tensor(value)
         if tensor.numel() > (MAX_SCALARS if tensor.is_floating_point() else MAX_SIZES):
             self.weights.append(tensor)
-            self._name(name, Value(len(self.weights) - 1))
+            self._name(name, ValueRef(len(self.weights) - 1))
         else:
             self._name(name, tensor)
 
-    def _name(self, name: str, value: Value | Tensor | None) -> None:
+    def _name(self, name: str, value: ValueRef | Tensor | None) -> None:
         if name in self.values:
-            raise UnsupportedNetwork(f"{quoted(name)} twice, or no name")
+            raise UnsupportedNetwork(f"{quote(name)} twice, or no name")
         self.values[name] = value
 
     def _new(self, name: str) -> int:
-        self._name(name, Value(self.count))
+        self._name(name, ValueRef(self.count))
         self.count += 1
         return self.count - 1
 
-    def _known(self, name: str) -> Value | Tensor | None:
+    def _known(self, name: str) -> ValueRef | Tensor | None:
         if name not in self.values:
-            raise UnsupportedNetwork(f"{quoted(name)} before it is computed")
+            raise UnsupportedNetwork(f"{quote(name)} before it is computed")
         return self.values[name]
 
     def _steps(self, node: dict[str, Any]) -> list[Step]:
         """What computes a node: nothing where it is a constant or another name for one."""
         name, domain, outputs = node["op_type"], node.get("domain", ""), node["output"]
         if domain not in _STANDARD or name not in (*OPERATORS, "Constant", "Identity"):
-            raise UnsupportedNetwork(f"the operator {quoted(f'{domain}.{name}'.lstrip('.'))}")
+            raise UnsupportedNetwork(f"the operator {quote(f'{domain}.{name}'.lstrip('.'))}")
         several = name == "Split"
         if len(outputs) != 1 and not several:
             raise UnsupportedNetwork(f"{len(outputs)} results of {name}, where only the first is supported")
@@ -227,15 +227,15 @@ class _Reader:
         if several and len(inputs) == 1:
             attributes.setdefault("num_outputs", len(outputs))
         operator.check(inputs, attributes)
-        if way := way_through(name, inputs, attributes, self.of_four):
+        if way := aten_calls(name, inputs, attributes, self.of_four):
             return self._along(way, name, inputs[0], outputs[0])
-        return [Step(operator, [Here, *inputs], attributes, [self._new(word) for word in outputs], several, [])]
+        return [Step(operator, [InputDevice, *inputs], attributes, [self._new(word) for word in outputs], several, [])]
 
-    def _along(self, way: Way, name: str, value: Any, output: str) -> list[Step]:
+    def _along(self, way: AtenCalls, name: str, value: Any, output: str) -> list[Step]:
         steps, known = [], name == "Conv" or value.number in self.of_four
         for compute, others in way:
             steps.append(Step(compute, [value, *others], {}, [self.count], False, []))
-            value, self.count = Value(self.count), self.count + 1
+            value, self.count = ValueRef(self.count), self.count + 1
         self._name(output, value)
         self.of_four |= {value.number} if known else set()
         return steps
@@ -250,7 +250,7 @@ class _Reader:
         """A plain number, word or list of numbers, or a tensor."""
         contents = {kind: content for kind, content in attribute.items() if kind != "name"}
         if len(contents) != 1:
-            raise UnsupportedNetwork(f"the attribute {quoted(attribute.get('name'))} of {len(contents)} kinds")
+            raise UnsupportedNetwork(f"the attribute {quote(attribute.get('name'))} of {len(contents)} kinds")
         ((kind, content),) = contents.items()
         if kind == "t":
             return self.tensor(content)

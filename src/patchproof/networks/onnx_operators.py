@@ -250,7 +250,7 @@ _TABLE: dict[str, Callable[..., Any]] = {
     "Pad": shapes.pad,
     "Resize": shapes.resize,
     "Shape": lambda x, /, *, start=0, end=None: torch.tensor(x.shape[start:end], dtype=torch.int64),
-    "Range": shapes.counted,
+    "Range": shapes.arange,
     "ConstantOfShape": lambda shape, *, value=None: (torch.zeros(1) if value is None else value).expand(numbers(shape)),
 }
 OPERATORS = {name: Operator(name, compute) for name, compute in _TABLE.items()}

@@ -90,7 +90,7 @@ def in_torchs_order(sides: list[tuple[int, int]]) -> list[int]:
     return [pad for side in reversed(sides) for pad in side]
 
 
-def counted(start, limit, delta, *, device):
+def arange(start, limit, delta, *, device):
     """From, up to and by."""
     first, end, step = (numbers(number)[0] for number in (start, limit, delta))
     few = math.ceil((end - first) / step) <= MAX_SIZES

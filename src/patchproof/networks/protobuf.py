@@ -27,10 +27,10 @@ Schema = dict[int, tuple[str, Any, bool]]
 
 def read_message(stored: bytes, schema: Schema) -> dict[str, Any]:
     """The fields of a message by their names; a list where there may be several, absent where there is none."""
-    return _Reader().message(memoryview(stored), schema)
+    return _MessageReader().message(memoryview(stored), schema)
 
 
-class _Reader:
+class _MessageReader:
     """How many fields have been met."""
 
     def __init__(self):

@@ -8,13 +8,13 @@ from typing import Any
 
 
 @dataclass(frozen=True)
-class Value:
+class ValueRef:
     """In an argument: the value with that number."""
 
     number: int
 
 
-class Here:
+class InputDevice:
     """In an argument, the class itself: the device that the pictures are on."""
 
 
@@ -30,19 +30,19 @@ class Step:
     spent: list[int]
 
 
-def mark_spent(steps: list[Step], kept: set[int]) -> None:
+def mark_last_uses(steps: list[Step], kept: set[int]) -> None:
     """Write into each step which values it is the last to need."""
     needed = set(kept)
     for step in reversed(steps):
-        used = {*step.results, *numbers_in(step.arguments), *numbers_in(step.keywords.values())}
+        used = {*step.results, *value_numbers(step.arguments), *value_numbers(step.keywords.values())}
         step.spent.extend(used - needed)
         needed |= used
 
 
-def numbers_in(arguments: Iterable[Any]) -> Iterator[int]:
+def value_numbers(arguments: Iterable[Any]) -> Iterator[int]:
     """Of the values that arguments name."""
     for argument in arguments:
-        if type(argument) is Value:
+        if type(argument) is ValueRef:
             yield argument.number
         elif type(argument) is list:
-            yield from numbers_in(argument)
+            yield from value_numbers(argument)

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from patchproof.networks.made import MadeTensors
+from patchproof.networks.tensor_observer import TensorObserver
 
 # What rectangles save, in numbers that are made, is about LARGEST less their share of the picture, times all those of
 # the first steps, less FIXED: with windows of 0.2 to 0.6 of the side, MobileNetV2 saves nothing any more from a share
@@ -41,6 +41,6 @@ def numbers_saved(made: float, share: float, answers_alone: bool = False) -> flo
 def worth_cutting(network: Callable[[Tensor], Tensor], pictures: Tensor) -> bool:
     """Whether windows could save anything of a network, by all that it makes of such pictures N×3×S×S."""
     numbers: list[int] = []
-    with torch.no_grad(), MadeTensors(lambda tensor: numbers.append(tensor.numel())):
+    with torch.no_grad(), TensorObserver(lambda tensor: numbers.append(tensor.numel())):
         network(pictures)
     return numbers_saved(sum(numbers) / len(pictures), 0.0) > 0

@@ -15,12 +15,12 @@ from pydantic import Field
 
 from patchproof.base.errors import Refused
 from patchproof.base.input import is_file
-from patchproof.base.output import write_whole
-from patchproof.base.validation import Strict
+from patchproof.base.output import write_atomically
+from patchproof.base.validation import StrictModel
 from patchproof.optimizer.loop import State, start
 from patchproof.optimizer.problem import Problem
 
-CHECKPOINT = "checkpoint.safetensors"
+CHECKPOINT_FILE = "checkpoint.safetensors"
 
 
 def save_checkpoint(state: State, problem: Problem, out: Path) -> None:
@@ -35,12 +35,12 @@ def save_checkpoint(state: State, problem: Problem, out: Path) -> None:
     note = {"number": state.number, "best_loss": state.best_loss.hex(), "sheet_id": problem.scene.sheet_id}
     # one key: safetensors writes several in an order of its own
     metadata = {"state": json.dumps(note)}
-    write_whole(out / CHECKPOINT, lambda path: save_file(tensors, path, metadata=metadata))
+    write_atomically(out / CHECKPOINT_FILE, lambda path: save_file(tensors, path, metadata=metadata))
 
 
-def resumed(out: Path, problem: Problem) -> State:
+def load_checkpoint(out: Path, problem: Problem) -> State:
     """The checkpoint's state, or the start where there is none; refused where it belongs to another scene or seed."""
-    path, begin = out / CHECKPOINT, start(problem)
+    path, begin = out / CHECKPOINT_FILE, start(problem)
     if not is_file(path):
         return begin
     from safetensors import SafetensorError, safe_open
@@ -62,7 +62,7 @@ def resumed(out: Path, problem: Problem) -> State:
         raise Refused("a checkpoint", got, "start anew in another folder") from error
 
 
-class _Note(Strict):
+class _Note(StrictModel):
     number: Annotated[int, Field(ge=0)]
     best_loss: str
     sheet_id: str

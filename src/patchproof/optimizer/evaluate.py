@@ -17,22 +17,22 @@ import torch
 from patchproof.base.compute import Compute
 from patchproof.base.errors import Refused
 from patchproof.base.input import is_file
-from patchproof.base.output import write_whole
+from patchproof.base.output import write_atomically
 from patchproof.base.progress import Advance, Progress, no_advance, no_progress
-from patchproof.base.validation import Strict
+from patchproof.base.validation import StrictModel
 from patchproof.base.workers import Workers, open_workers
+from patchproof.classifier.average_precision import Detection, average_precision, find_detections
 from patchproof.classifier.network import Classifier, center_square
-from patchproof.classifier.precision import Finding, average_precision, findings
 from patchproof.optimizer.problem import Problem, set_problem
-from patchproof.optimizer.promise import CONTROLS, PROMISE_VIEWS, control_claims, model_claims, shown_with_controls
-from patchproof.optimizer.responses import AT_A_TIME, Answers, in_parts, joined, responses
+from patchproof.optimizer.promise import CONTROLS, PROMISE_VIEWS, control_claims, model_claims, pictures_with_controls
+from patchproof.optimizer.responses import CHUNK_VIEWS, Responses, in_chunks, joined, responses
 from patchproof.optimizer.run import Run, load_run
-from patchproof.render.photograph import Shown, expose
+from patchproof.render.photograph import Appearance, expose
 from patchproof.scene.conditions import Conditions
 from patchproof.sheets.manifest import ControlClaim, ModelClaim
 
-Networks = tuple[str | Classifier, ...] | None
-Found = dict[str, dict[str, list[Finding]]]  # by detector and what is shown
+NetworkChoice = tuple[str | Classifier, ...] | None
+DetectionsByKind = dict[str, dict[str, list[Detection]]]  # by detector and what is shown
 
 
 class ModelEvaluation(ModelClaim):
@@ -44,7 +44,7 @@ class ModelEvaluation(ModelClaim):
     ap50: dict[str, float] | None = None
 
 
-class Evaluation(Strict):
+class Evaluation(StrictModel):
     """A run evaluated under `n` fresh conditions of a seed, by network name."""
 
     n: int
@@ -83,14 +83,14 @@ def evaluate(
     Raises Refused for a folder without a finished run, or one that was evaluated before.
     """
     folder, networks = Path(run_folder).resolve(), None if models is None else tuple(models)
-    refuse_unnamed(networks, compute)
+    refuse_networks_in_memory(networks, compute)
     if is_file(folder / "evaluate.json") and not overwrite:
         do = "add --overwrite, or rename it to keep it"
         raise Refused("a run that was not evaluated yet", f"{folder / 'evaluate.json'}, which exists", do)
     with open_workers(compute.jobs, compute.cluster) as workers:
         run, problem = _opened(folder, networks, compute.device)
         conditions, advance = run.scene.draw("evaluate", n, seed), partial(progress, "evaluate")
-        answers, shown = answers_of(folder, conditions, workers, networks, compute.device, advance)
+        answers, shown = run_responses(folder, conditions, workers, networks, compute.device, advance)
     forget()
     evaluated = {}
     for i, claim in enumerate(model_claims(problem, answers["design"])):
@@ -100,11 +100,11 @@ def evaluate(
         controls = control_claims(answers, i)
         evaluated[claim.name] = ModelEvaluation(**claim.model_dump(), controls=controls, ap50=ap50)
     result = Evaluation(n=n, seed=run.scene.seed if seed is None else seed, models=evaluated)
-    write_whole(run.folder / "evaluate.json", result.to_json())
+    write_atomically(run.folder / "evaluate.json", result.to_json())
     return result
 
 
-def refuse_unnamed(networks: Networks, compute: Compute) -> None:
+def refuse_networks_in_memory(networks: NetworkChoice, compute: Compute) -> None:
     """Refuse networks in memory where other processes do the work."""
     if (compute.jobs > 1 or compute.cluster is not None) and any(
         isinstance(network, Classifier) for network in networks or ()
@@ -114,46 +114,48 @@ def refuse_unnamed(networks: Networks, compute: Compute) -> None:
         )
 
 
-def answers_of(
+def run_responses(
     folder: Path,
     conditions: Conditions,
     workers: Workers,
-    networks: Networks = None,
+    networks: NetworkChoice = None,
     device: str = "cpu",
     advance: Advance = no_advance,
-) -> tuple[dict[str, Answers], list[Found]]:
+) -> tuple[dict[str, Responses], list[DetectionsByKind]]:
     """What the networks answer to the design of the run in an absolute folder, and to its controls, under the
     conditions; and what detectors find, some conditions at a time.
     """
     show, n = partial(_show, folder, networks, device), len(conditions)
-    shown = workers.map(show, in_parts(conditions), lambda done, _: advance(min(done * AT_A_TIME, n), n))
+    shown = workers.map(show, in_chunks(conditions), lambda done, _: advance(min(done * CHUNK_VIEWS, n), n))
     return joined([answers for answers, _ in shown]), [found for _, found in shown]
 
 
 def forget() -> None:
-    """Let go of the run that `answers_of` has open in this process."""
+    """Let go of the run that `run_responses` has open in this process."""
     _opened.cache_clear()
 
 
 @lru_cache(maxsize=1)
-def _opened(folder: Path, models: Networks, device: str) -> tuple[Run, Problem]:
+def _opened(folder: Path, models: NetworkChoice, device: str) -> tuple[Run, Problem]:
     """A run and its problem, once in each process."""
     run = load_run(folder)
     return run, set_problem(run.scene, device, models)
 
 
-def _show(folder: Path, models: Networks, device: str, conditions: Conditions) -> tuple[dict[str, Answers], Found]:
+def _show(
+    folder: Path, models: NetworkChoice, device: str, conditions: Conditions
+) -> tuple[dict[str, Responses], DetectionsByKind]:
     run, problem = _opened(folder, models, device)
-    shown = shown_with_controls(problem, run.design, CONTROLS)
+    shown = pictures_with_controls(problem, run.design, CONTROLS)
     return responses(problem, shown, conditions), _found(problem, shown, conditions)
 
 
-def _found(problem: Problem, shown: Mapping[str, Shown], conditions: Conditions) -> Found:
+def _found(problem: Problem, shown: Mapping[str, Appearance], conditions: Conditions) -> DetectionsByKind:
     """All that detectors find under the target's labels, where it is known where the object lies."""
     boxes = problem.boxes(conditions)
     if boxes is None:
         return {}
-    found: Found = {}
+    found: DetectionsByKind = {}
     with torch.no_grad():
         views = problem.see(shown["design"], conditions, problem.figure_px)
         pictures = {kind: expose(views, thing) for kind, thing in shown.items()}
@@ -162,7 +164,9 @@ def _found(problem: Problem, shown: Mapping[str, Shown], conditions: Conditions)
                 continue
             boxes_px, shows = torch.as_tensor(boxes * network.input_px), [True] * len(boxes)
             found[network.name] = {
-                kind: findings(network.network(center_square(photos, network.input_px)), indices, boxes_px, shows)
+                kind: find_detections(
+                    network.network(center_square(photos, network.input_px)), indices, boxes_px, shows
+                )
                 for kind, photos in pictures.items()
             }
     return found

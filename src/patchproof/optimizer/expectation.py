@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from patchproof.base.workers import sharing
+from patchproof.base.workers import fork_workers
 from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.problem import Problem
 from patchproof.optimizer.training_views import (
@@ -30,7 +30,7 @@ from patchproof.optimizer.training_views import (
     training_conditions,
     training_views,
 )
-from patchproof.render.photograph import expose, windows_of
+from patchproof.render.photograph import affected_windows, expose
 from patchproof.render.views import Views
 from patchproof.scene.conditions import Conditions
 
@@ -123,7 +123,7 @@ def expectation(problem: Problem, selection: Conditions) -> Iterator[Expectation
             loss, _, rate = score(problem, expose(views, problem.subject.showing(printed)), views.conditions)
         return float(loss), rate
 
-    with sharing(answer, problem.jobs, in_turn=True) as (workers, share):
+    with fork_workers(answer, problem.jobs, in_turn=True) as (workers, share):
         yield Expectation(problem, conditions, len(selection), lambda tasks: workers.map(share, tasks))
 
 
@@ -175,7 +175,7 @@ def _views_answer(problem: Problem, printed: Tensor, views: Views, pictures: boo
     """Photograph what is printed in these views, ask the networks, and derive their mean loss."""
     printed = printed.detach().requires_grad_()
     photos = expose(views, problem.subject.showing(printed))
-    loss, confidence, rate = score(problem, photos, views.conditions, windows_of(views))
+    loss, confidence, rate = score(problem, photos, views.conditions, affected_windows(views))
     (gradient,) = torch.autograd.grad(loss, printed)
     kept = photos.detach().cpu().numpy() if pictures else None
     return _ViewsAnswer(len(photos), float(loss.detach()), confidence, rate, gradient.cpu().numpy(), kept)

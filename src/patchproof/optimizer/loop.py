@@ -1,6 +1,6 @@
 """The loop: draw conditions, ask for the gradient, descend, select.
 
-In: a `Problem` and, to go on, a `State`. Out: a generator of `Step`s; saving, progress and plots are its caller's
+In: a `Problem` and, to go on, a `State`. Out: a generator of `TrainingStep`s; saving, progress and plots are its caller's
 business. The design starts at mid-gray. Adam on every level of the gradient's pyramid, or signed steps as in FGSM and
 PGD (Goodfellow et al. 2015, Madry et al. 2018), always clipped to [0, 1]. Every 240 views the design is tried on a
 fixed selection set, and the best one is kept: a design that suited its last views only is not what gets printed. The
@@ -47,7 +47,7 @@ class State:
 
 
 @dataclass(frozen=True)
-class Step:
+class TrainingStep:
     """What one step did. Rates and confidence are over this step's training views; `select_*` where the design was
     tried.
     """
@@ -62,7 +62,7 @@ class Step:
     pictures: Tensor | None = field(default=None, repr=False)
 
 
-def steps(problem: Problem, state: State | None = None) -> Iterator[Step]:
+def steps(problem: Problem, state: State | None = None) -> Iterator[TrainingStep]:
     """The steps from `state` (or from the start) to the last one that the scene's settings ask for."""
     state = start(problem) if state is None else state
     settings = problem.scene.settings.optimize
@@ -71,7 +71,7 @@ def steps(problem: Problem, state: State | None = None) -> Iterator[Step]:
             last = state.number + 1 == settings.steps
             answer = expected.gradient(state.design, state.number, pictures=last)
             step = _descend(problem, state, answer)
-            if selects(settings, step.state.number):
+            if is_selection_step(settings, step.state.number):
                 step = _select(step, *expected.selection(step.state.design))
             state = step.state
             yield step
@@ -84,7 +84,7 @@ def start(problem: Problem) -> State:
     return State(0, design, zeros, zeros, design)
 
 
-def step_on(problem: Problem, state: State, conditions: Conditions) -> Step:
+def take_step(problem: Problem, state: State, conditions: Conditions) -> TrainingStep:
     """One step on these conditions, in this process."""
     views = [training_views(problem, rows) for _, rows in task_conditions(conditions)]
     return _descend(problem, state, gradient_in_views(problem, state.design, views))
@@ -94,7 +94,7 @@ def draft(problem: Problem, conditions: Conditions, views: int) -> Tensor:
     """The design after a step on every `views` rows of the conditions, untried on the selection set."""
     state = start(problem)
     for first in range(0, len(conditions), views):
-        state = step_on(problem, state, conditions[first : first + views]).state
+        state = take_step(problem, state, conditions[first : first + views]).state
     return state.design
 
 
@@ -106,12 +106,12 @@ def best_design(problem: Problem) -> np.ndarray:
     return problem.subject.pixels(state.best)
 
 
-def selects(settings: OptimizeSettings, number: int) -> bool:
+def is_selection_step(settings: OptimizeSettings, number: int) -> bool:
     """Whether the design is tried on the selection set after step `number`, counted from 1."""
     return _ends(settings, number, SELECT_AFTER)
 
 
-def saves(settings: OptimizeSettings, number: int) -> bool:
+def is_save_step(settings: OptimizeSettings, number: int) -> bool:
     """Whether the state after step `number` is worth keeping."""
     return _ends(settings, number, SAVE_AFTER)
 
@@ -121,13 +121,13 @@ def _ends(settings: OptimizeSettings, number: int, views: int) -> bool:
     return done > before or number == settings.steps
 
 
-def views_seen(settings: OptimizeSettings) -> int:
+def views_per_network(settings: OptimizeSettings) -> int:
     """Views that each network sees in training and selection."""
-    selections = sum(selects(settings, number) for number in range(1, settings.steps + 1))
+    selections = sum(is_selection_step(settings, number) for number in range(1, settings.steps + 1))
     return settings.steps * settings.views + selections * SELECT_VIEWS
 
 
-def _descend(problem: Problem, state: State, answer: Answer) -> Step:
+def _descend(problem: Problem, state: State, answer: Answer) -> TrainingStep:
     """One step down the answer's gradient and that of what the settings charge a design for."""
     largest, gradient = float(answer.gradient.abs().max()), answer.gradient
     if not math.isfinite(largest):  # one such step would turn the design into nothing for good
@@ -139,7 +139,7 @@ def _descend(problem: Problem, state: State, answer: Answer) -> Step:
         gradient = gradient + torch.autograd.grad(penalty, design)[0]
         penalty = float(penalty.detach())
     moved = _update(problem, state, gradient)
-    return Step(moved, answer.loss + penalty, answer.confidence, answer.rate, largest, pictures=answer.pictures)
+    return TrainingStep(moved, answer.loss + penalty, answer.confidence, answer.rate, largest, pictures=answer.pictures)
 
 
 def _update(problem: Problem, state: State, gradient: Tensor) -> State:
@@ -160,7 +160,7 @@ def _update(problem: Problem, state: State, gradient: Tensor) -> State:
     return replace(state, number=number, design=design, mean=mean, square=square)
 
 
-def _select(step: Step, loss: float, rate: float) -> Step:
+def _select(step: TrainingStep, loss: float, rate: float) -> TrainingStep:
     """Keep the step's design if it is the best so far on the selection set."""
     state = step.state
     if loss < state.best_loss:

@@ -20,13 +20,13 @@ from torch import Tensor
 from patchproof.base.output import image_bytes
 from patchproof.channel.printer import Printer
 from patchproof.optimizer import pyramid
-from patchproof.optimizer.goals import total_variation
+from patchproof.optimizer.losses import total_variation
 from patchproof.optimizer.pixels import as_pixels
 from patchproof.optimizer.subject import DESIGN_FILE, Grid, read_png, write_png
 from patchproof.render.designs import PrintedPiece
 from patchproof.render.pixels import PiecePicture
-from patchproof.scene.interface import PieceScene, Scene, needs_piece
-from patchproof.sheets.piece import control_design, on_paper
+from patchproof.scene.interface import PieceScene, Scene, require_piece
+from patchproof.sheets.piece import control_design, whiten_marker_pixels
 
 # A design's pixels are printed as blocks of at least this density. Coarser pictures are smoothed by some PDF readers
 # and not by others, and markers, drawn on the same grid, would be lost.
@@ -43,7 +43,7 @@ class Patch:
     printer: Printer
     design_px: tuple[int, int]
     device: torch.device
-    LOOK: ClassVar[str] = "printer"
+    STAGE_NAME: ClassVar[str] = "printer"
 
     def start(self) -> Tensor:
         """A mid-gray design."""
@@ -74,7 +74,7 @@ class Patch:
     def pixels(self, design: Tensor) -> np.ndarray:
         """The uint8 H×W×3 that goes to the printer."""
         block = self.printed_px[0] // design.shape[2]
-        return on_paper(as_pixels(design).repeat(block, 0).repeat(block, 1), self.scene.piece)
+        return whiten_marker_pixels(as_pixels(design).repeat(block, 0).repeat(block, 1), self.scene.piece)
 
     def control(self, kind: str, pixels: np.ndarray) -> np.ndarray:
         """What the control sheet of this kind prints in place of the design's pixels."""
@@ -92,7 +92,7 @@ class Patch:
         """The piece with these texels."""
         return PiecePicture(printed, self.design_px)
 
-    def printed_by(self, printer: Printer) -> Patch:
+    def with_printer(self, printer: Printer) -> Patch:
         """The same patch as another printer prints it."""
         return replace(self, printer=printer)
 
@@ -126,7 +126,7 @@ class Patch:
 
 def subject_of(scene: Scene, printer: Printer, network_px: int, device: torch.device) -> Patch:
     """As in `subject`: the design of the scene's piece, no finer than networks can see it."""
-    hung = needs_piece(scene)
+    hung = require_piece(scene)
     return Patch(hung, printer, hung.design_px(network_px), device)
 
 

@@ -6,12 +6,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from patchproof.base.color import codes_of
+from patchproof.base.color import codes_from_srgb
 
 
 def as_pixels(design_srgb: Tensor) -> np.ndarray:
     """A picture 3×h×w in [0, 1] as uint8 h×w×3."""
-    return codes_of(design_srgb.detach()).permute(1, 2, 0).cpu().numpy()
+    return codes_from_srgb(design_srgb.detach()).permute(1, 2, 0).cpu().numpy()
 
 
 def from_pixels(pixels: np.ndarray, device: torch.device | str = "cpu") -> Tensor:
@@ -21,7 +21,7 @@ def from_pixels(pixels: np.ndarray, device: torch.device | str = "cpu") -> Tenso
 
 def side_by_side(pictures: Tensor, columns: int = 4) -> np.ndarray:
     """Pictures N×3×h×w in rows of so many, as one of uint8 H×W×3; white where there are none left."""
-    pixels = codes_of(pictures).permute(0, 2, 3, 1).cpu().numpy()
+    pixels = codes_from_srgb(pictures).permute(0, 2, 3, 1).cpu().numpy()
     rows = -(-len(pixels) // columns)
     count, height, width, _ = pixels.shape
     blank = np.full((rows * columns - count, height, width, 3), 255, np.uint8)

@@ -16,23 +16,23 @@ import torch
 from PIL import Image, ImageDraw, ImageFont
 
 from patchproof.base import geometry
-from patchproof.base.color import photo_codes_of, srgb_from_linear
+from patchproof.base.color import photo_codes_from_srgb, srgb_from_linear
 from patchproof.base.errors import Refused
 from patchproof.base.input import is_file, read_json
-from patchproof.base.output import write_whole
+from patchproof.base.output import write_atomically
 from patchproof.base.settings import BackgroundSettings
-from patchproof.base.validation import validated
+from patchproof.base.validation import validate_model
 from patchproof.channel.effects import Light, Pose
-from patchproof.optimizer.places import Candidate, Place
+from patchproof.optimizer.place_search import Candidate, Place
 from patchproof.render.photograph import shade
 from patchproof.render.raster import rasterize
 from patchproof.render.stage import Stage, set_stage
-from patchproof.render.views import cameras, near_mm, see
+from patchproof.render.views import cameras, near_mm, render_views
 from patchproof.scene.backgrounds import load_backgrounds
 from patchproof.scene.conditions import Conditions
-from patchproof.scene.open_scene import OpenScene
+from patchproof.scene.open_scene import UnplacedScene
 from patchproof.scene.patch_scene import PatchScene
-from patchproof.scene.placement import patch_frame, side_frame, spun
+from patchproof.scene.placement import patch_frame, side_frame, spun_axes
 
 _RECORD, _PICTURE = "place.json", "place.png"
 _DIRECTIONS, _SIDE_PX = 4, 420
@@ -45,18 +45,18 @@ _CHOSEN = (230, 0, 90)
 
 def save_place(place: Place, scene: PatchScene, folder: Path) -> None:
     """Write both files; `scene` has the piece at the place."""
-    write_whole(folder / _RECORD, place.model_dump_json(indent=1) + "\n")
+    write_atomically(folder / _RECORD, place.model_dump_json(indent=1) + "\n")
     picture = _picture(place, scene)
-    write_whole(folder / _PICTURE, lambda path: picture.save(path, "PNG"))
+    write_atomically(folder / _PICTURE, lambda path: picture.save(path, "PNG"))
 
 
-def read_place(folder: Path, scene: OpenScene | None = None) -> Place | None:
+def read_place(folder: Path, scene: UnplacedScene | None = None) -> Place | None:
     """The place that a search left in a run's folder; None without one, refused where it is not of that `scene`."""
     path = folder / _RECORD
     if not is_file(path):
         return None
     record = read_json(path, "the record of a search", "start anew in another folder")
-    place = validated(Place, record, str(path))
+    place = validate_model(Place, record, str(path))
     if scene is not None and place.sheet_id != scene.sheet_id:
         do = "resume with the same scene file and seed, or start anew in another folder"
         raise Refused("the place of this scene and seed", f"one of another in {folder}", do)
@@ -67,8 +67,8 @@ def _picture(place: Place, scene: PatchScene) -> Image.Image:
     scene, conditions = _plain(scene)
     stage, size, poses = set_stage(scene), (_SIDE_PX, _SIDE_PX), scene.camera_from_world(conditions)
     with torch.no_grad():
-        light = shade(see(stage, None, conditions, size), None)
-    pictures = photo_codes_of(srgb_from_linear(light.clamp(0, 1)).permute(0, 2, 3, 1).numpy())
+        light = shade(render_views(stage, None, conditions, size), None)
+    pictures = photo_codes_from_srgb(srgb_from_linear(light.clamp(0, 1)).permute(0, 2, 3, 1).numpy())
     panels = []
     for pose, picture in zip(poses, pictures, strict=True):
         panel, depth = Image.fromarray(picture), _depth(stage, scene, pose)
@@ -114,7 +114,7 @@ def _dots(place: Place, scene: PatchScene) -> Iterator[tuple[int, Candidate, np.
     for rank, candidate in reversed([*enumerate(place.candidates)]):
         at = candidate.at
         frame = side_frame(scene.mesh, at) if isinstance(at, str) else patch_frame(scene.mesh, patch.changed(at_mm=at))
-        right, up = spun(frame, candidate.spin_deg)
+        right, up = spun_axes(frame, candidate.spin_deg)
         signs = np.array([(-1, 1), (1, 1), (1, -1), (-1, -1)])
         yield rank, candidate, frame.origin_mm + half_mm * signs @ np.stack([right, up])
 

@@ -17,19 +17,19 @@ from torch import Tensor
 
 from patchproof.base.errors import Refused
 from patchproof.base.settings import OptimizeSettings
-from patchproof.base.workers import threads
+from patchproof.base.workers import use_threads
 from patchproof.channel.printer import Printer, load_printer
 from patchproof.classifier.labels import find_labels
 from patchproof.classifier.load import load_classifier
 from patchproof.classifier.network import Classifier
-from patchproof.networks.batches import InBatches
-from patchproof.optimizer.goals import Loss, target_loss
+from patchproof.networks.batches import BatchedNetwork
+from patchproof.optimizer.losses import Loss, target_loss
 from patchproof.optimizer.patch import Patch
 from patchproof.optimizer.subject import Subject, subject_of
-from patchproof.render.pixels import PHOTOGRAPHED, Look, Shown
+from patchproof.render.pixels import PHOTO_SAMPLING, Appearance, TextureSampling
 from patchproof.render.stage import Stage, set_stage
 from patchproof.render.surfaces import piece_surface
-from patchproof.render.views import Views, see, seen_again
+from patchproof.render.views import Views, relight_and_replace_background, render_views
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.interface import Scene
 from patchproof.scene.patch_scene import PatchScene
@@ -39,7 +39,7 @@ from patchproof.scene.patch_scene import PatchScene
 # leaves them as sharp; of a piece four taps leave confidences within 0.004 (root mean square) of those of eight, and
 # their mean within 0.0004. Training's views are of the network's own side, but for small networks.
 FIGURE_SCALE, LEAST_PX, SMALL_PX = 1.4, 128, 192
-TRAINED, FIGURED = Look(taps=1, side=1.0, piece_taps=8), Look(taps=2, side=0.8, piece_taps=4)
+TRAINED, FIGURED = TextureSampling(taps=1, side=1.0, piece_taps=8), TextureSampling(taps=2, side=0.8, piece_taps=4)
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +52,7 @@ class Problem:
     classifiers: tuple[Classifier, ...]
     indices: tuple[tuple[int, ...], ...]
     subject: Subject
-    own_loss: Loss | None  # in place of the goal's
+    custom_loss: Loss | None  # in place of the goal's
     jobs: int = 1  # processes that share the views
 
     @property
@@ -71,25 +71,25 @@ class Problem:
 
     def losses(self, classifier: Classifier, logits: Tensor, indices: Sequence[int]) -> Tensor:
         """N losses to descend on, of what a network answers."""
-        if self.own_loss is not None:
-            return self.own_loss(logits, indices)
+        if self.custom_loss is not None:
+            return self.custom_loss(logits, indices)
         return target_loss(classifier.odds(logits, indices), self.scene.settings.target.goal)
 
     def boxes(self, conditions: Conditions) -> np.ndarray | None:
         """Where the object lies in these views (`Scene.boxes`), if one of the networks asks for it."""
         return self.scene.boxes(conditions) if any(c.LOOKS_AT_BOXES for c in self.classifiers) else None
 
-    def see(self, shown: Shown, conditions: Conditions, side_px: int) -> Views:
+    def see(self, shown: Appearance, conditions: Conditions, side_px: int) -> Views:
         """Square views of these conditions, for what is shown now and any other design in its place."""
-        look = TRAINED if side_px < self.figure_px else FIGURED if side_px == self.figure_px else PHOTOGRAPHED
-        return see(self.stage, shown, conditions, (side_px, side_px), look)
+        look = TRAINED if side_px < self.figure_px else FIGURED if side_px == self.figure_px else PHOTO_SAMPLING
+        return render_views(self.stage, shown, conditions, (side_px, side_px), look)
 
     def see_again(self, views: Views, conditions: Conditions) -> Views:
         """Views that were seen, under conditions of the same poses."""
-        return seen_again(views, conditions)
+        return relight_and_replace_background(views, conditions)
 
     @cached_property
-    def laid_out(self) -> Shown:
+    def laid_out(self) -> Appearance:
         """What is seen before anything is known of a design: any takes its place in the same views."""
         with torch.no_grad():
             return self.subject.shown(self.subject.start())
@@ -99,7 +99,7 @@ class Problem:
         classifiers, indices = (tuple(each[i] for i in chosen) for each in (self.classifiers, self.indices))
         return replace(self, classifiers=classifiers, indices=indices)
 
-    def trained_by(self, optimize: OptimizeSettings, seed: int | None = None) -> Problem:
+    def with_training(self, optimize: OptimizeSettings, seed: int | None = None) -> Problem:
         """The same with these settings of the loop, and another seed of its draws."""
         settings = self.scene.settings.changed(optimize=optimize)
         scene = replace(self.scene, settings=settings, seed=self.scene.seed if seed is None else seed)
@@ -143,7 +143,7 @@ def set_problem(
     settings = scene.settings
     names, least_score = models or settings.target.models, settings.target.least_score
     names = [scene.given_models.get(name, name) if isinstance(name, str) else name for name in names]
-    classifiers = tuple(load_classifier(name, scene.base, device).at_score(least_score) for name in names)
+    classifiers = tuple(load_classifier(name, scene.base, device).with_least_score(least_score) for name in names)
     accept = settings.target.accept
     indices = tuple(find_labels(c.labels, settings.target.label, accept) for c in classifiers)
     printer = load_printer(settings.printer.profile, scene.base)
@@ -151,11 +151,13 @@ def set_problem(
     subject = subject_of(scene, printer, max(classifier.input_px for classifier in classifiers), stage.device)
     jobs = jobs if stage.device.type == "cpu" else 1
     if jobs > 1:
-        with threads(1):  # here, for all processes to be forked, and as one of them would: two threads round otherwise
+        with use_threads(
+            1
+        ):  # here, for all processes to be forked, and as one of them would: two threads round otherwise
             if stage.object is not None:
                 stage.object.texels(reduced=True, fixed=scene.HAS_PIECE)
             for network in (classifier.network for classifier in classifiers if scene.HAS_PIECE):
-                if isinstance(network, InBatches):
+                if isinstance(network, BatchedNetwork):
                     _ = network.cut  # found when it is asked for
     return Problem(scene, stage, printer, classifiers, indices, subject, loss, jobs)
 

@@ -23,18 +23,18 @@ from patchproof.base import geometry
 from patchproof.base.color import linear_from_srgb
 from patchproof.base.errors import Refused
 from patchproof.base.progress import Advance, no_advance
-from patchproof.base.sessions import difference_in_sessions, in_sessions, spread_of
+from patchproof.base.sessions import count_by_session, rate_posterior, session_difference
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import Problem
-from patchproof.optimizer.responses import Answers, asking, joined
-from patchproof.render.pixels import Shown
+from patchproof.optimizer.responses import Responses, joined, open_responses
+from patchproof.render.pixels import Appearance
 from patchproof.scene.conditions import Conditions
-from patchproof.scene.interface import PieceScene, needs_piece
+from patchproof.scene.interface import PieceScene, require_piece
 from patchproof.scene.patch_scene import PatchScene
 from patchproof.sheets.manifest import ConditionClaim, ControlClaim, ModelClaim, Promise, Target
 
 # Many short sessions: how much they differ is known from their number, not from their length.
-PROMISE_VIEWS, PER_SESSION = 400, 4
+PROMISE_VIEWS, VIEWS_PER_SESSION = 400, 4
 CONTROL_VIEWS = 2  # of each session: of one, differences would be known to ± 6 to 10 points in place of 5 to 8
 CONTROLS = ("bare", "mean", "gray", "noise")
 # Of a difference, in half widths of its interval: the least that settles it before the end. Of 3,000 simulated controls
@@ -56,8 +56,8 @@ class PromiseOptions:
     controls: tuple[str, ...] = CONTROLS
 
     def __post_init__(self):
-        if self.views is not None and self.views < 2 * PER_SESSION:
-            expected = f"a promise of {2 * PER_SESSION} views, two sessions, at least"
+        if self.views is not None and self.views < 2 * VIEWS_PER_SESSION:
+            expected = f"a promise of {2 * VIEWS_PER_SESSION} views, two sessions, at least"
             raise Refused(expected, f"{self.views}", "promise of more")
 
 
@@ -75,7 +75,7 @@ def make_promise(
     it stops after half or three quarters of the sessions, if the rate's interval is at most twice as wide there and
     every control's difference is settled; else it goes on without those that are.
     """
-    shown = shown_with_controls(problem, design, controls)
+    shown = pictures_with_controls(problem, design, controls)
     compared = _until_known(problem, shown, conditions, per_session, half_width, advance)
     answers = compared["design"]
     conditions = conditions[: answers.recognized.shape[1]]
@@ -98,18 +98,18 @@ def make_promise(
 
 def _until_known(
     problem: Problem,
-    shown: Mapping[str, Shown],
+    shown: Mapping[str, Appearance],
     conditions: Conditions,
     per_session: int,
     half_width: float | None,
     advance: Advance,
-) -> dict[str, Answers]:
+) -> dict[str, Responses]:
     """The answers to the design and, until their differences are settled, to the controls; all of them without a
     `half_width`.
     """
-    compared: dict[str, Answers] = {}
+    compared: dict[str, Responses] = {}
     unsettled, looks = list(shown), [0, len(conditions)] if half_width is None else _looks(len(conditions), per_session)
-    with asking(problem, shown, conditions) as asked:
+    with open_responses(problem, shown, conditions) as asked:
         for first, last in pairwise(looks):
             rows, beside = np.arange(first, last), _with_controls(last - first, per_session)
             answers = asked(unsettled, rows, beside, lambda done, _, n=first: advance(n + done, len(conditions)))
@@ -120,8 +120,8 @@ def _until_known(
             settled = {kind for kind, claim in claims.items() if _settled(claim, half_width)}
             unsettled = [kind for kind in unsettled if kind not in settled]
             places = _places(conditions[:last], per_session)
-            counts = in_sessions(compared["design"].recognized[0], per_session, places)
-            if unsettled == ["design"] and np.ptp(spread_of(*counts).rate) <= 2 * half_width:
+            counts = count_by_session(compared["design"].recognized[0], per_session, places)
+            if unsettled == ["design"] and np.ptp(rate_posterior(*counts).rate) <= 2 * half_width:
                 advance(last, last)  # a bar that stays at half would look broken
                 break
     return compared
@@ -132,7 +132,7 @@ def _with_controls(n: int, per_session: int) -> np.ndarray:
     return np.arange(n) % per_session < CONTROL_VIEWS
 
 
-def _beside_controls(compared: Mapping[str, Answers], per_session: int) -> dict[str, ControlClaim]:
+def _beside_controls(compared: Mapping[str, Responses], per_session: int) -> dict[str, ControlClaim]:
     """The claims of the primary network; the design has seen all conditions."""
     design = compared["design"]
     paired = design.at(np.flatnonzero(_with_controls(design.recognized.shape[1], per_session)))
@@ -157,10 +157,10 @@ def _looks(total: int, per_session: int) -> list[int]:
     return [0, *sorted({min(total, math.ceil(sessions * part) * per_session) for part in (0.5, 0.75, 1)})]
 
 
-def fewest_passes() -> int:
+def min_promise_passes() -> int:
     """Pictures that a network sees in a promise that stops as early as it may."""
-    views = _looks(PROMISE_VIEWS, PER_SESSION)[1]
-    return views + len(CONTROLS) * int(_with_controls(views, PER_SESSION).sum())
+    views = _looks(PROMISE_VIEWS, VIEWS_PER_SESSION)[1]
+    return views + len(CONTROLS) * int(_with_controls(views, VIEWS_PER_SESSION).sum())
 
 
 def _outermost_mm(problem: Problem) -> tuple[tuple[float, float, float], ...]:
@@ -168,7 +168,7 @@ def _outermost_mm(problem: Problem) -> tuple[tuple[float, float, float], ...]:
     scene = problem.scene
     if not isinstance(scene, PatchScene) or not any(c.LOOKS_AT_BOXES for c in problem.classifiers):
         return ()
-    points = geometry.carried(np.linalg.inv(scene.placement.world_from_piece), scene.outermost_mm)
+    points = geometry.transform_points(np.linalg.inv(scene.placement.world_from_piece), scene.outermost_mm)
     return tuple((round(x, 3), round(y, 3), round(z, 3)) for x, y, z in points.tolist())
 
 
@@ -179,7 +179,7 @@ def _places(conditions: Conditions, per_session: int) -> tuple[int, ...]:
     return tuple(map(int, first[which])) if 1 < len(places) < len(chosen) else ()
 
 
-def shown_with_controls(problem: Problem, design: np.ndarray, controls: Sequence[str]) -> dict[str, Shown]:
+def pictures_with_controls(problem: Problem, design: np.ndarray, controls: Sequence[str]) -> dict[str, Appearance]:
     """What shows under "design" and under each control's name."""
     subject, shown = problem.subject, {}
     with torch.no_grad():
@@ -190,7 +190,7 @@ def shown_with_controls(problem: Problem, design: np.ndarray, controls: Sequence
 
 
 def model_claims(
-    problem: Problem, design: Answers, per_session: int = 1, places: Sequence[int] = ()
+    problem: Problem, design: Responses, per_session: int = 1, places: Sequence[int] = ()
 ) -> tuple[ModelClaim, ...]:
     """Each network's rate and confidence of the design; intervals are over sessions, those of one place together."""
     rows = zip(problem.classifiers, design.recognized, design.confidence, strict=True)
@@ -199,7 +199,7 @@ def model_claims(
             name=classifier.name,
             sha256=classifier.sha256,
             rate=float(recognized.mean()),
-            interval=spread_of(*in_sessions(recognized, per_session, places)).rate,
+            interval=rate_posterior(*count_by_session(recognized, per_session, places)).rate,
             confidence=float(confidence.mean()),
             least_score=classifier.least_score,
         )
@@ -207,16 +207,16 @@ def model_claims(
     )
 
 
-def control_claims(answers: Mapping[str, Answers], model: int, per_session: int = 1) -> dict[str, ControlClaim]:
+def control_claims(answers: Mapping[str, Responses], model: int, per_session: int = 1) -> dict[str, ControlClaim]:
     """Each control beside the design on the same conditions, of which it may have seen only the first; one network."""
     design, claims = answers["design"].recognized[model], {}
     for kind in (kind for kind in CONTROLS if kind in answers):
         recognized = answers[kind].recognized[model]
-        difference, interval = difference_in_sessions(design[: len(recognized)], recognized, per_session)
+        difference, interval = session_difference(design[: len(recognized)], recognized, per_session)
         claims[kind] = ControlClaim(
             n=len(recognized),
             rate=float(recognized.mean()),
-            interval=spread_of(*in_sessions(recognized, per_session)).rate,
+            interval=rate_posterior(*count_by_session(recognized, per_session)).rate,
             confidence=float(answers[kind].confidence[model].mean()),
             difference=difference,
             difference_interval=interval,
@@ -230,7 +230,7 @@ def _condition_claims(problem: Problem, conditions: Conditions, recognized: np.n
     names = ("px_per_mm", "tilt_deg", "azimuth_deg", "contrast")
     shows: dict[str, np.ndarray] = dict.fromkeys(names, np.full(n, np.nan))
     if problem.scene.HAS_PIECE:
-        scene = needs_piece(problem.scene)
+        scene = require_piece(problem.scene)
         scale, tilt = scene.scales_and_tilts(conditions, scene.photo_px).T
         azimuth = scene.piece_azimuth_deg(conditions)
         values = scale, tilt, azimuth, _contrasts(problem, scene, conditions)

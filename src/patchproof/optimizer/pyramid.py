@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
-FEWEST = 8  # blocks along the shorter side of the coarsest level
+MIN_COARSEST_BLOCKS = 8  # blocks along the shorter side of the coarsest level
 
 
 def levels(gradient: Tensor, mask: Tensor | None = None) -> tuple[Tensor, ...]:
@@ -35,7 +35,7 @@ def levels(gradient: Tensor, mask: Tensor | None = None) -> tuple[Tensor, ...]:
 
 def level_count(size_px: Sequence[int]) -> int:
     """How many levels a picture of that size has, its own among them."""
-    return 1 + max(0, int(math.log2(max(1, min(size_px)) / FEWEST)))
+    return 1 + max(0, int(math.log2(max(1, min(size_px)) / MIN_COARSEST_BLOCKS)))
 
 
 def joined(updates: Sequence[Tensor]) -> Tensor:

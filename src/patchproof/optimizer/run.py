@@ -27,18 +27,18 @@ from pydantic import BaseModel, Field
 from patchproof.base.compute import Compute
 from patchproof.base.errors import Refused
 from patchproof.base.input import is_file, read_json
-from patchproof.base.output import check_folder, make_folder, write_whole
+from patchproof.base.output import check_folder, make_folder, write_atomically
 from patchproof.base.progress import Advance, Progress, no_progress
 from patchproof.base.settings import SceneSettings
-from patchproof.base.validation import validated
+from patchproof.base.validation import validate_model
 from patchproof.base.version import __version__
 from patchproof.classifier.network import Classifier
-from patchproof.optimizer.checkpoint import CHECKPOINT, resumed, save_checkpoint
-from patchproof.optimizer.goals import Loss
-from patchproof.optimizer.loop import SELECT_AFTER, State, saves, start, steps
+from patchproof.optimizer.checkpoint import CHECKPOINT_FILE, load_checkpoint, save_checkpoint
+from patchproof.optimizer.loop import SELECT_AFTER, State, is_save_step, start, steps
+from patchproof.optimizer.losses import Loss
 from patchproof.optimizer.pixels import side_by_side
 from patchproof.optimizer.problem import Problem, set_problem
-from patchproof.optimizer.promise import PER_SESSION, PROMISE_VIEWS, PromiseOptions, make_promise
+from patchproof.optimizer.promise import PROMISE_VIEWS, VIEWS_PER_SESSION, PromiseOptions, make_promise
 from patchproof.optimizer.subject import DESIGN_FILE, MASK_FILE, OBJECT_FILE, TEXTURE_FILES, read_design, write_png
 from patchproof.scene.interface import Scene
 from patchproof.scene.patch_scene import PatchScene
@@ -48,11 +48,11 @@ from patchproof.sheets.manifest import Promise
 _LOG, RUN_FILE, _VIEWS = ("steps.jsonl", "run.json", "views.png")
 _GIVEN = "given.glb"  # the mesh of a scene that was made in Python
 _RESULTS = (DESIGN_FILE, OBJECT_FILE, TEXTURE_FILES, MASK_FILE)
-OWN = (CHECKPOINT, _LOG, RUN_FILE, _VIEWS, _GIVEN, "place.*", *_RESULTS, "evaluate.json", ".*.part")
+RUN_FILE_PATTERNS = (CHECKPOINT_FILE, _LOG, RUN_FILE, _VIEWS, _GIVEN, "place.*", *_RESULTS, "evaluate.json", ".*.part")
 
 # Steps and promised views of a first look, whose interval is some four times as wide, and of a print that counts: three
 # times the default's steps, in half as wide an interval (`bench effort`).
-DRAFT, THOROUGH = (40, 40), (720, 1600)
+DRAFT_EFFORT, THOROUGH_EFFORT = (40, 40), (720, 1600)
 LEAST_MOVE = 1.5 / 255  # a design that moved by less is printed as it began
 
 
@@ -100,7 +100,9 @@ def optimize(
     """
     out, compute = Path(out), compute.without("optimize", cluster=True)
     if not resume:
-        check_folder(out, OWN, overwrite, unfinished=is_file(out / CHECKPOINT) and not is_file(out / RUN_FILE))
+        check_folder(
+            out, RUN_FILE_PATTERNS, overwrite, unfinished=is_file(out / CHECKPOINT_FILE) and not is_file(out / RUN_FILE)
+        )
     scene = scene if isinstance(scene, Scene) else load_scene(scene, seed)
     keep_place = None
     if not scene.HAS_PLACE:
@@ -108,12 +110,14 @@ def optimize(
         scene, keep_place = _placed(scene, out, resume, searching)
     problem = set_problem(scene, compute.device, models, loss, compute.jobs)
     if not resume:
-        for path in (path for name in OWN[:-1] for path in out.glob(name)):  # all that the new one needs is read
+        for path in (
+            path for name in RUN_FILE_PATTERNS[:-1] for path in out.glob(name)
+        ):  # all that the new one needs is read
             path.unlink()
     make_folder(out)
     if keep_place is not None:
         keep_place()
-    state = resumed(out, problem) if resume else start(problem)
+    state = load_checkpoint(out, problem) if resume else start(problem)
     design = _loop(problem, state, out, partial(progress, "optimize"))
     return finish_run(problem, design, out, promise, progress)
 
@@ -126,10 +130,10 @@ def _placed(
     Nothing of the search is imported for a scene that gives a place itself.
     """
     from patchproof.optimizer.place_files import read_place, save_place
-    from patchproof.optimizer.places import choose_place
-    from patchproof.scene.open_scene import needs_open
+    from patchproof.optimizer.place_search import choose_place
+    from patchproof.scene.open_scene import require_unplaced
 
-    scene = needs_open(scene)
+    scene = require_unplaced(scene)
     place = (read_place(out, scene) if resume else None) or choose_place(scene, **searching)
     placed = scene.at(place.at, place.spin_deg)
     return placed, lambda: save_place(place, placed, out)
@@ -149,10 +153,10 @@ def finish_run(
     scene = problem.scene
     problem.subject.save(design, out)
     promise = promise_of(problem, design, options, partial(progress, "promise"))
-    if scene.given_glb is not None:
-        write_whole(out / _GIVEN, scene.given_glb)
+    if scene.mesh_glb is not None:
+        write_atomically(out / _GIVEN, scene.mesh_glb)
     details = _details(problem, promise, out) | ({} if imported is None else {"imported": dict(imported)})
-    write_whole(out / RUN_FILE, json.dumps(details, indent=1) + "\n")
+    write_atomically(out / RUN_FILE, json.dumps(details, indent=1) + "\n")
     return Run(out, scene, design, promise, details)
 
 
@@ -173,7 +177,7 @@ def promise_run(
     problem = set_problem(run.scene, compute.device, jobs=compute.jobs)
     promise = promise_of(problem, run.design, options, partial(progress, "promise"))
     details = run.details | {"promise": promise.model_dump(mode="json")}
-    write_whole(run.folder / RUN_FILE, json.dumps(details, indent=1) + "\n")
+    write_atomically(run.folder / RUN_FILE, json.dumps(details, indent=1) + "\n")
     return replace(run, promise=promise, details=details)
 
 
@@ -181,11 +185,11 @@ def load_run(folder: str | Path) -> Run:
     """A finished run; refused where it is none, or not finished."""
     folder = Path(folder)
     if not is_file(folder / RUN_FILE):
-        begun = is_file(folder / CHECKPOINT)
+        begun = is_file(folder / CHECKPOINT_FILE)
         do = "finish it with --resume" if begun else "name the folder that optimize wrote"
         raise Refused("a finished run", f"{'an unfinished one' if begun else 'none'} at {folder}", do)
     details = read_json(folder / RUN_FILE, "a finished run", "optimize again")
-    record = validated(_Record, details, str(folder / RUN_FILE))
+    record = validate_model(_Record, details, str(folder / RUN_FILE))
     settings, promise = record.settings, record.promise
     try:
         base = (folder / record.scene_folder).resolve()
@@ -221,7 +225,9 @@ def _loop(problem: Problem, state: State, out: Path, advance: Advance) -> np.nda
     """Run the remaining steps, leaving log, checkpoint and views; the best design's pixels."""
     settings, largest, path = problem.scene.settings.optimize, None, out / _LOG
     # without the lines after the step that it goes on from
-    write_whole(path, b"".join(path.read_bytes().splitlines(keepends=True)[: state.number] if is_file(path) else []))
+    write_atomically(
+        path, b"".join(path.read_bytes().splitlines(keepends=True)[: state.number] if is_file(path) else [])
+    )
     with open(path, "a", encoding="utf-8") as log:
         for step in steps(problem, state):
             state = step.state
@@ -232,7 +238,9 @@ def _loop(problem: Problem, state: State, out: Path, advance: Advance) -> np.nda
             log.flush()
             if state.number == settings.steps and step.pictures is not None:
                 write_png(out / _VIEWS, side_by_side(step.pictures))
-            if saves(settings, state.number):  # after the views, which a run that goes on from the last step lacks
+            if is_save_step(
+                settings, state.number
+            ):  # after the views, which a run that goes on from the last step lacks
                 save_checkpoint(state, problem, out)
             largest = max(step.gradient, largest or 0.0)
             advance(state.number, settings.steps)
@@ -254,8 +262,8 @@ def promise_of(problem: Problem, design: np.ndarray, options: PromiseOptions, ad
     """The promise of a finished design."""
     most = options.views or PROMISE_VIEWS
     enough = None if options.views else problem.scene.settings.promise.half_width
-    conditions = problem.scene.draw("promise", most, per_session=PER_SESSION)
-    promise = make_promise(problem, design, conditions, options.controls, advance, PER_SESSION, enough)
+    conditions = problem.scene.draw("promise", most, per_session=VIEWS_PER_SESSION)
+    promise = make_promise(problem, design, conditions, options.controls, advance, VIEWS_PER_SESSION, enough)
     return promise.changed(draft=most < PROMISE_VIEWS)
 
 

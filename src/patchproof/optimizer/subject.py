@@ -19,10 +19,10 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from patchproof.base.input import opened_picture
-from patchproof.base.output import write_whole
+from patchproof.base.input import open_image
+from patchproof.base.output import write_atomically
 from patchproof.channel.printer import Printer
-from patchproof.render.pixels import Shown
+from patchproof.render.pixels import Appearance
 from patchproof.scene.interface import Scene
 
 DESIGN_FILE, OBJECT_FILE, TEXTURE_FILES, MASK_FILE = "design.png", "object.glb", "texture_*.png", "mask.png"
@@ -44,7 +44,7 @@ class Grid:
 class Subject(Protocol):
     """What the loop, the promise and studies ask of what is optimized; what is not printed is shown as it is."""
 
-    LOOK: ClassVar[str]  # what turns a design into what is shown
+    STAGE_NAME: ClassVar[str]  # what turns a design into what is shown
 
     def start(self) -> Tensor:
         """The design before the first step."""
@@ -74,7 +74,7 @@ class Subject(Protocol):
         """What the control of this kind has in place of the design's pixels."""
         ...
 
-    def shown(self, design: Tensor, kind: str = "design") -> Shown:
+    def shown(self, design: Tensor, kind: str = "design") -> Appearance:
         """What photographs show of a design, or of a control with the markers of its own sheet; differentiable."""
         ...
 
@@ -82,11 +82,11 @@ class Subject(Protocol):
         """What all pictures of an optimized design have in common, so that a step makes it once; differentiable."""
         return design
 
-    def showing(self, printed: Tensor) -> Shown:
+    def showing(self, printed: Tensor) -> Appearance:
         """What photographs show of that; differentiable."""
         return self.shown(printed)
 
-    def printed_by(self, printer: Printer) -> Self:
+    def with_printer(self, printer: Printer) -> Self:
         """The same subject as another printer prints it."""
         return self
 
@@ -120,10 +120,10 @@ def _module_of(scene: Scene) -> ModuleType:
 
 def write_png(path: Path, pixels: np.ndarray) -> None:
     """Replace a picture by uint8 pixels."""
-    write_whole(path, lambda part: Image.fromarray(pixels).save(part, "PNG"))
+    write_atomically(path, lambda part: Image.fromarray(pixels).save(part, "PNG"))
 
 
 def read_png(path: Path) -> np.ndarray:
     """uint8 H×W×3 of a picture file that a run wrote."""
-    with opened_picture(path, "a picture of this run", "optimize again") as image:
+    with open_image(path, "a picture of this run", "optimize again") as image:
         return np.asarray(image.convert("RGB"))

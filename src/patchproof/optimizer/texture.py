@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from patchproof.base.errors import Refused
-from patchproof.base.output import write_whole
+from patchproof.base.output import write_atomically
 from patchproof.channel.printer import Printer
 from patchproof.mesh.export import write_glb
 from patchproof.optimizer import pyramid
@@ -29,8 +29,8 @@ from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.subject import MASK_FILE, OBJECT_FILE, TEXTURE_FILES, Grid, Subject, read_png, write_png
 from patchproof.render.designs import LearnedTextures
 from patchproof.render.pixels import ObjectTextures
+from patchproof.scene.canvas import Canvas
 from patchproof.scene.interface import Scene
-from patchproof.scene.texture import Canvas
 from patchproof.sheets.piece import CELLS, control_design
 
 
@@ -40,7 +40,7 @@ class Texture(Subject):
 
     # Larger steps suit the networks that train and no other: of a letter box for three networks, a fourth recognized
     # 60 % as it came, 60, 70, 76 % with steps of 0.1, 0.03, 0.015 (96 views), 81 % with twice as many of 0.015.
-    LOOK: ClassVar[str] = "textures"
+    STAGE_NAME: ClassVar[str] = "textures"
     scene: Scene
     canvas: Canvas
     device: torch.device
@@ -127,7 +127,7 @@ class Texture(Subject):
         was free to change.
         """
         textures, masks = self.surface.textures(pixels), self.canvas.mask
-        write_whole(folder / OBJECT_FILE, lambda path: write_glb(self.canvas.mesh, textures, path))
+        write_atomically(folder / OBJECT_FILE, lambda path: write_glb(self.canvas.mesh, textures, path))
         for i, texture in enumerate(textures):
             write_png(folder / TEXTURE_FILES.replace("*", f"{i}"), texture)
         width = max(mask.shape[1] for mask in masks)
@@ -165,12 +165,12 @@ class Texture(Subject):
 
 def subject_of(scene: Scene, printer: Printer, network_px: int, device: torch.device) -> Texture:
     """As in `subject`: the scene's own texture, whatever printer and networks there are."""
-    return Texture(scene, scene.own_texture(), device)
+    return Texture(scene, scene.object_canvas(), device)
 
 
 def read_design(scene: Scene, folder: Path) -> np.ndarray:
     """As in `subject`: the changeable texels of the textures."""
-    canvas = scene.own_texture()
+    canvas = scene.object_canvas()
     textures = [read_png(folder / TEXTURE_FILES.replace("*", f"{i}")) for i in range(len(canvas.mask))]
     for texture, mask in zip(textures, canvas.mask, strict=True):
         if texture.shape[:2] != mask.shape:

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from patchproof.optimizer.problem import Problem
-from patchproof.render.views import Views, apart
+from patchproof.render.views import Views, split_views
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.interface import Scene
 
@@ -87,4 +87,4 @@ class ViewCache:
         poses = range(pose, self._poses, step)[:STEPS_AHEAD]
         rows = np.concatenate([np.arange(first, first + count) for first in poses])
         together = training_views(self._problem, self._conditions[rows])
-        self._ahead |= zip(poses, apart(together, [count] * len(poses)), strict=True)
+        self._ahead |= zip(poses, split_views(together, [count] * len(poses)), strict=True)

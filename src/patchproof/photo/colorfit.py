@@ -59,10 +59,10 @@ def affine12(photographed: np.ndarray, promised: np.ndarray) -> ColorFit | None:
                 break
     if np.linalg.cond(seen_from_promised[:, :3]) > 50:  # no camera mixes its channels so far
         return None
-    return ColorFit("affine12", inverse(seen_from_promised))
+    return ColorFit("affine12", invert_affine(seen_from_promised))
 
 
-def inverse(matrix: np.ndarray) -> np.ndarray:
+def invert_affine(matrix: np.ndarray) -> np.ndarray:
     """The 3×4 affine map that undoes another."""
     back = np.linalg.inv(matrix[:, :3])
     return np.column_stack([back, -back @ matrix[:, 3]])

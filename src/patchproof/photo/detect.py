@@ -18,16 +18,16 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from patchproof.base.color import LIGHT_OF_CODE, LUMINANCE
+from patchproof.base.color import LINEAR_FROM_CODE, LUMINANCE
 from patchproof.base.input import seconds_left
-from patchproof.base.resample import reduced
+from patchproof.base.resample import downscale
 from patchproof.photo.edges import Borders, fit_borders
 from patchproof.photo.limits import squares_in
-from patchproof.photo.rectify import part_around
+from patchproof.photo.rectify import region_around
 from patchproof.photo.rejection import PhotoRejected
-from patchproof.sheets.markers import DICTIONARY, cells_of, printed_markers
+from patchproof.sheets.markers import DICTIONARY, aruco_dictionary, marker_cells
 
-LIGHT = LIGHT_OF_CODE.astype(np.float32)
+LINEAR_FLOAT32_FROM_CODE = LINEAR_FROM_CODE.astype(np.float32)
 COARSEST_PX = 1000  # a level's longer side; halves are taken until it is no longer than this
 UPSCALE_BELOW_PX = 4_000_000
 LARGEST_LEVEL_PX = 25_000_000  # of what one level looks at: a second of work and 0.3 GB; sharper pictures are halved
@@ -43,7 +43,7 @@ SMALLEST_MARKER_PX = 9.0  # side at its level: 7 modules of 1.3 px are the least
 # take twice the time: markers that one misses are found where the others say that they lie, or at a finer level.
 _REDUCED_WINDOW_PX = 5
 
-Box = tuple[slice, slice]
+ImageRegion = tuple[slice, slice]
 """Rows and columns of a part of the photograph."""
 
 
@@ -82,10 +82,10 @@ def find_markers(
     """All markers of `expected` and `also` in the picture; the search ends when all of `expected` are found, or all of
     a set in `or_all_of`.
     """
-    printed = printed_markers(dictionary)
+    printed = aruco_dictionary(dictionary)
     detections: dict[int, list[np.ndarray]] = {}
-    for level in levels(srgb, whole(srgb)):
-        look(srgb, whole(srgb), level, printed, detections)
+    for level in pyramid_levels(srgb, full_region(srgb)):
+        search_level(srgb, full_region(srgb), level, printed, detections)
         if any(wanted <= detections.keys() for wanted in (expected, *or_all_of)):
             break
     return fitted(srgb, detections, set(expected) | set(also), dictionary)
@@ -102,19 +102,19 @@ def fitted(
     borders, known = {} if borders is None else borders, sorted(detections.keys() & ours)
     if new := [marker_id for marker_id in known if marker_id not in borders]:
         rough = np.array([detections[marker_id][0] for marker_id in new])
-        borders |= zip(new, refine(srgb, rough, cells_of(dictionary, new)), strict=True)
-    markers = {i: borders[i] for i in known if possible(borders[i].corners_px)}
+        borders |= zip(new, refine(srgb, rough, marker_cells(dictionary, new)), strict=True)
+    markers = {i: borders[i] for i in known if is_plausible_quad(borders[i].corners_px)}
     foreign = tuple(sorted(detections.keys() - set(known)))
     return MarkersInView(markers, foreign, tuple(i for i in known if len(detections[i]) > 1))
 
 
 def is_mirrored(srgb: np.ndarray, expected: Set[int], dictionary: str = DICTIONARY) -> bool:
     """Whether the sheet shows up when the picture is flipped: selfie cameras and scans through the back do that."""
-    mirrored = np.ascontiguousarray(reduced(srgb, MIRROR_PX)[:, ::-1])
+    mirrored = np.ascontiguousarray(downscale(srgb, MIRROR_PX)[:, ::-1])
     return bool(find_markers(mirrored, expected, frozenset(), dictionary).markers)
 
 
-def possible(corners: np.ndarray) -> bool:
+def is_plausible_quad(corners: np.ndarray) -> bool:
     """Whether a flat square can look like this: convex, clockwise, no side more than 12 times another."""
     sides = np.roll(corners, -1, axis=0) - corners
     following = np.roll(sides, -1, axis=0)
@@ -123,12 +123,12 @@ def possible(corners: np.ndarray) -> bool:
     return bool(np.isfinite(corners).all() and (turns > 0).all() and lengths.max() < 12 * lengths.min())
 
 
-def whole(srgb: np.ndarray) -> Box:
+def full_region(srgb: np.ndarray) -> ImageRegion:
     """The box of all of the photograph."""
     return slice(0, srgb.shape[0]), slice(0, srgb.shape[1])
 
 
-def levels(srgb: np.ndarray, box: Box, coarsest_px: int = COARSEST_PX) -> Iterator[Level]:
+def pyramid_levels(srgb: np.ndarray, box: ImageRegion, coarsest_px: int = COARSEST_PX) -> Iterator[Level]:
     """Half sizes in linear light up to the full one, then the fallbacks for a part of the photograph."""
     halvings = max(0, int(np.ceil(np.log2(max(srgb.shape[:2]) / coarsest_px))))
     smaller = [srgb]  # halves of halves differ from what they stand for by a code value, and all take less than one
@@ -148,7 +148,9 @@ def levels(srgb: np.ndarray, box: Box, coarsest_px: int = COARSEST_PX) -> Iterat
         yield from (Level(2.0, picture) for picture in (light_picture, *codes))
 
 
-def look(srgb: np.ndarray, box: Box, level: Level, printed, detections: dict[int, list[np.ndarray]]) -> None:
+def search_level(
+    srgb: np.ndarray, box: ImageRegion, level: Level, printed, detections: dict[int, list[np.ndarray]]
+) -> None:
     """Add to `detections` the corners, in the full photograph's pixels, of what one level shows of a part of it."""
     part = srgb[box]
     height, width = part.shape[:2]
@@ -179,7 +181,7 @@ def light_picture(srgb: np.ndarray) -> np.ndarray:
     step = max(1, max(srgb.shape) // 500)
     bright = max(float(np.percentile(luminance(np.ascontiguousarray(srgb[::step, ::step])), 99.9)), 1e-3)
     picture = np.empty(srgb.shape[:2], np.uint8)
-    for rows in strips(srgb):
+    for rows in row_strips(srgb):
         cv2.convertScaleAbs(luminance(srgb[rows]), picture[rows], alpha=255 / bright)
     return picture
 
@@ -214,17 +216,17 @@ def _detect(
     settings.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     settings.relativeCornerRefinmentWinSize = 0.3
     settings.minMarkerPerimeterRate = min(0.03 * whole_px, 4 * SMALLEST_MARKER_PX) / max(picture.shape)
-    corners, ids = detected(picture, printed, settings)
+    corners, ids = detect_markers(picture, printed, settings)
     if ids is None:
         return
     for marker_id, quad in zip(np.asarray(ids).reshape(-1), corners, strict=True):
         # the detector counts from pixel centers: its 0 is our .5
         quad = np.asarray(quad, float).reshape(4, 2) + 0.5
-        if possible(quad):
+        if is_plausible_quad(quad):
             yield int(marker_id), quad
 
 
-def detected(picture: np.ndarray, printed, settings: cv2.aruco.DetectorParameters):
+def detect_markers(picture: np.ndarray, printed, settings: cv2.aruco.DetectorParameters):
     """OpenCV's (corners, ids or None) of one uint8 gray picture; `PhotoRejected("too_costly")` where it shows so much
     that looks like markers that the detector would not end in time.
     """
@@ -238,27 +240,27 @@ def detected(picture: np.ndarray, printed, settings: cv2.aruco.DetectorParameter
 
 def refine(srgb: np.ndarray, rough: np.ndarray, cells: np.ndarray) -> list[Borders]:
     """Fit borders in the photograph, of which only what lies round the markers is turned into light."""
-    box = part_around(rough.reshape(-1, 2), _FAR_PX, srgb.shape)
+    box = region_around(rough.reshape(-1, 2), _FAR_PX, srgb.shape)
     low = np.array([box[1].start, box[0].start])
     part, quads = srgb[box], rough - low
     light = np.zeros(part.shape[:2], np.float32)  # pages of it that nobody looks at take no memory
     for quad in quads:
-        around = part_around(quad, _FAR_PX + _FAR * np.ptp(quad, axis=0).max(), part.shape)
+        around = region_around(quad, _FAR_PX + _FAR * np.ptp(quad, axis=0).max(), part.shape)
         light[around] = luminance(np.ascontiguousarray(part[around]))
     return [replace(b, corners_px=b.corners_px + low) for b in fit_borders(light, quads, cells)]
 
 
 def luminance(srgb: np.ndarray) -> np.ndarray:
     """Linear luminance H×W float32 of uint8 sRGB."""
-    table = np.repeat(LIGHT[None, :, None], 3, 2)
+    table = np.repeat(LINEAR_FLOAT32_FROM_CODE[None, :, None], 3, 2)
     weights = np.array([LUMINANCE], np.float32)
     out = np.empty(srgb.shape[:2], np.float32)
-    for rows in strips(srgb):  # the table makes 12 bytes of each pixel
+    for rows in row_strips(srgb):  # the table makes 12 bytes of each pixel
         cv2.transform(cv2.LUT(srgb[rows], table), weights, out[rows])
     return out
 
 
-def strips(srgb: np.ndarray) -> Iterator[slice]:
+def row_strips(srgb: np.ndarray) -> Iterator[slice]:
     """Slices of rows of a million pixels or so; the last may pass the end."""
     rows = max(1, 1_000_000 // srgb.shape[1])
     return (slice(y, y + rows) for y in range(0, len(srgb), rows))

@@ -103,10 +103,10 @@ def _fit_round(luminance, corners, behind, reach_px, settled_px):
     d, a, sigma, black, white = (fit[:, i].reshape(-1, 4) for i in range(5))
     ends = [middle + sign * half + (d + sign * a)[..., None] * normal for sign in (-1, 1)]
     fitted = (white - black > 0.01).all(1) & (np.abs(d) < outward).all(1) & np.isfinite(fit).reshape(-1, 20).all(1)
-    return meet(*ends), fitted, sigma
+    return intersect_borders(*ends), fitted, sigma
 
 
-def meet(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+def intersect_borders(start: np.ndarray, end: np.ndarray) -> np.ndarray:
     """Corners M×4×2 where each border meets the one before it."""
     p, u = start, end - start
     q, v = np.roll(start, 1, axis=1), np.roll(u, 1, axis=1)

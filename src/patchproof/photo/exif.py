@@ -59,7 +59,7 @@ def is_part(image, name: str) -> bool:
     return other or bool(_SCREEN.search(name) or _SCREEN.search(comment))
 
 
-def of_a_camera(size_px: tuple[int, int], also_px: tuple[int, int] | None) -> bool:
+def has_camera_shape(size_px: tuple[int, int], also_px: tuple[int, int] | None) -> bool:
     """Whether cameras take pictures of that shape (their sensors', what they cut from it, a square), or it is the shape
     of `also_px`.
     """

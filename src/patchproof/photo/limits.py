@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 from patchproof.base.errors import TimeLimitExceeded
-from patchproof.base.input import Arguments, Result, has_timer, within_time
+from patchproof.base.input import Arguments, ReturnType, has_timer, within_time
 from patchproof.photo.rejection import PhotoRejected
 
 MOST_BYTES = 1_000_000_000  # 119 megapixels take 0.5 GB while they are read
@@ -25,7 +25,9 @@ _SPARSE = 4  # rows of which one is looked at
 _NOISY = 4  # times the edges that so many squares have
 
 
-def limited(work: Callable[Arguments, Result], *arguments: Arguments.args, **keywords: Arguments.kwargs) -> Result:
+def run_limited(
+    work: Callable[Arguments, ReturnType], *arguments: Arguments.args, **keywords: Arguments.kwargs
+) -> ReturnType:
     """What `work` returns; `PhotoRejected("too_costly")` when it takes longer than `within_time` allows."""
     try:
         return within_time(work, *arguments, **keywords)

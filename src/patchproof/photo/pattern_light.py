@@ -18,7 +18,7 @@ from patchproof.base.color import linear_from_srgb
 from patchproof.base.geometry import apply_homography, local_scale
 from patchproof.photo.edges import sample
 from patchproof.photo.quality import CLIPPED_CODE
-from patchproof.sheets.markers import cells_of
+from patchproof.sheets.markers import marker_cells
 
 _FINE = 8  # samples per module of the blurred pattern
 _LEAST_SAMPLES = 30
@@ -44,7 +44,7 @@ def pattern_light(
     """Paper, ink and blur of an uint8 photograph whose borders show `blur_px`; None where too few cells are in it."""
     ids = sorted(corners_mm)
     markers, lights = [], []
-    for cells, corners in zip(cells_of(dictionary, ids), (corners_mm[i] for i in ids), strict=True):
+    for cells, corners in zip(marker_cells(dictionary, ids), (corners_mm[i] for i in ids), strict=True):
         module_px = local_scale(px_from_mm, corners.mean(0))[0] * np.linalg.norm(corners[1] - corners[0]) / len(cells)
         points = apply_homography(px_from_mm, _centers_mm(corners, len(cells)))
         usable = ((points > 1) & (points < [srgb.shape[1] - 1, srgb.shape[0] - 1])).all(1)

@@ -1,7 +1,7 @@
 """Where the camera stood, as a point of the sheet has it, and how sure that is: of flat paper and of rolled.
 
 In: a homography or a `Shape` with its covariance, a pinhole matrix whose focal length is known to `focal_spread` of its
-logarithm (one standard deviation). Out: `Stance`, and whether a flat sheet's own perspective agrees with the matrix.
+logarithm (one standard deviation). Out: `CameraPosition`, and whether a flat sheet's own perspective agrees with the matrix.
 A small or far sheet looks almost the same from either side of its normal: the azimuth's sign goes first. Spreads are
 those of the figures one standard deviation off along each axis of the parameters' covariance; tilt, which is never
 negative, is drawn.
@@ -22,8 +22,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from patchproof.base.geometry import plane_pose, scaled_about, view_angles
-from patchproof.photo.ratio import cosine, gradient, log_ratio
+from patchproof.base.geometry import plane_pose, scaling_about, view_angles
+from patchproof.photo.print_ratio import cosine, gradient, log_ratio
 from patchproof.photo.rectify import PageFit, root_of
 from patchproof.photo.shapes import Project, Shape
 
@@ -43,7 +43,7 @@ _BEND_TURNS = 50.0
 
 
 @dataclass(frozen=True)
-class Stance:
+class CameraPosition:
     """Azimuth and distance, each with its 95 % uncertainty (infinite: not known), and whether perspective agrees with
     the focal length: None where it tells too little.
     """
@@ -62,9 +62,9 @@ def turn_rad(bend: float, shape: Shape | None) -> float:
     return float(np.hypot(_BEND_TURNS * bend, 0.0 if shape is None else _HIDDEN_TURN * shape.hidden_turn_rad))
 
 
-def flat_stance(
+def flat_sheet_position(
     fit: PageFit, matrix_px: np.ndarray, focal_spread: float, point_mm, turn: float = 0.0, whole: bool = False
-) -> Stance:
+) -> CameraPosition:
     """Of flat paper seen by that camera, with its `turn_rad`; `whole`: the matrix is known to be this picture's."""
     agrees, told = _agreement(fit, matrix_px, focal_spread)
     entries = np.append(fit.px_from_mm.ravel()[:8], 0.0)
@@ -81,16 +81,16 @@ def flat_stance(
     )
 
 
-def bent_stance(
+def bent_sheet_position(
     shape: Shape, matrix_px: np.ndarray, focal_spread: float, point_mm, turn: float = 0.0, whole: bool = False
-) -> Stance:
+) -> CameraPosition:
     """Of paper that a cylinder or a lens explains, by the tangent plane at the point."""
     if shape.unit is not None:
         scale = np.append(shape.unit, 1.0)
         homography = np.append(shape.parameters[:8], 1.0) * scale
         covariance = shape.covariance[:8, :8] * np.outer(shape.unit, shape.unit)
         fit = PageFit(homography.reshape(3, 3), covariance, 0.0, ())
-        return flat_stance(fit, matrix_px, focal_spread, point_mm, turn, whole)
+        return flat_sheet_position(fit, matrix_px, focal_spread, point_mm, turn, whole)
     tangent = shape.tangent
     assert tangent is not None  # a shape is one or the other
 
@@ -148,18 +148,18 @@ def root_of_scaled(covariance: np.ndarray) -> np.ndarray:
     return spread[:, None] * root_of(covariance / np.outer(spread, spread))
 
 
-def _stance(figures, parameters, root, agrees, whole) -> Stance:
+def _stance(figures, parameters, root, agrees, whole) -> CameraPosition:
     apart = np.array([figures(parameters + axis) - figures(parameters - axis) for axis in root.T]) / 2
     apart[:, 0] = (apart[:, 0] + 90) % 180 - 90  # half of an angle's difference
     azimuth, distance = figures(parameters)
     spread = 1.96 * np.hypot(np.linalg.norm(apart, axis=0), [np.degrees(_PAPER), _PAPER * distance])
     if agrees is None and not whole:
         spread = np.hypot(spread, [_CROPPED_DEG, np.inf])
-    return Stance(float(azimuth), float(spread[0]), float(distance), float(spread[1]), agrees)
+    return CameraPosition(float(azimuth), float(spread[0]), float(distance), float(spread[1]), agrees)
 
 
 def _longer(matrix_px: np.ndarray, log_focal: float) -> np.ndarray:
-    return matrix_px @ scaled_about([0.0, 0.0], float(np.exp(log_focal)))
+    return matrix_px @ scaling_about([0.0, 0.0], float(np.exp(log_focal)))
 
 
 def _agreement(fit: PageFit, matrix_px: np.ndarray, focal_spread: float) -> tuple[bool | None, float]:

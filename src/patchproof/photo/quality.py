@@ -34,7 +34,7 @@ class FrameLight:
     clipped: float  # share of paper samples with a channel at full white
 
 
-def shows_nothing(srgb: np.ndarray) -> bool:
+def is_featureless(srgb: np.ndarray) -> bool:
     """Whether a uint8 picture H×W×3 is one tone or noise, by the mean colors of 8 × 8 cells of it. Noise is known from
     neighboring pixels, which in pictures of anything are much alike.
     """

@@ -22,10 +22,10 @@ import cv2
 import numpy as np
 
 from patchproof.base.errors import Refused
-from patchproof.base.input import LARGEST_PX, is_file, is_folder, readable_formats
-from patchproof.base.validation import listed
+from patchproof.base.input import MAX_IMAGE_PX, is_file, is_folder, readable_formats
+from patchproof.base.validation import summarize_names
 from patchproof.photo.exif import EXIF_SPREAD, focal_of, is_part
-from patchproof.photo.limits import MOST_BYTES, limited, limited_memory
+from patchproof.photo.limits import MOST_BYTES, limited_memory, run_limited
 from patchproof.photo.rejection import PhotoRejected
 
 SUFFIXES = frozenset(".jpg .jpeg .jpe .png .tif .tiff .webp .bmp .gif .mpo .avif .heic .heif".split())
@@ -72,7 +72,7 @@ def read_photo(path: str | Path) -> Photo:
     _allow_heic(path)
     try:
         with limited_memory():
-            srgb, orientation, focal, part = limited(_stored, path)
+            srgb, orientation, focal, part = run_limited(_stored, path)
             # of the picture as Pillow had it nothing is left by now
             return Photo(np.ascontiguousarray(_UPRIGHT.get(orientation, np.asarray)(srgb)), *focal, part)
     except PhotoRejected:
@@ -96,8 +96,8 @@ def _stored(path: Path) -> tuple[np.ndarray, int, tuple[float | None, float, boo
         warnings.simplefilter("ignore")
         with Image.open(path, formats=readable_formats()) as image:
             pixels = image.width * image.height
-            if pixels > LARGEST_PX:
-                raise _too_large(f"{pixels / 1e6:.0f} megapixels are too many: save it smaller", pixels, LARGEST_PX)
+            if pixels > MAX_IMAGE_PX:
+                raise _too_large(f"{pixels / 1e6:.0f} megapixels are too many: save it smaller", pixels, MAX_IMAGE_PX)
             step = 2 if pixels > WHOLE_PX and min(image.size) > 1 else 1
             (focal_px, spread, dropped), orientation = focal_of(image), image.getexif().get(_ORIENTATION, 1)
             focal, part = (focal_px and focal_px / step, spread, dropped), is_part(image, path.name)
@@ -111,20 +111,20 @@ def list_photos(folder: str | Path) -> list[Path]:
         return [folder]
     if not is_folder(folder):
         raise Refused("a folder of photographs", f"no folder at {folder}", "check the path")
-    paths = pictures_in(folder)
+    paths = list_images(folder)
     if not paths:
         expected = f"photographs ({', '.join(sorted(SUFFIXES)[:6])}, ...) in {folder}"
-        raise Refused(expected, "; ".join(["none", *not_looked_at(folder)]), "copy the photographs there")
+        raise Refused(expected, "; ".join(["none", *list_skipped_files(folder)]), "copy the photographs there")
     return paths
 
 
-def pictures_in(folder: Path) -> list[Path]:
+def list_images(folder: Path) -> list[Path]:
     """The files of a folder that are pictures by their suffix, none hidden, in the order of their names."""
     files = (p for p in folder.iterdir() if is_file(p) and not p.name.startswith("."))
     return sorted((p for p in files if p.suffix.lower() in SUFFIXES), key=lambda p: p.name)
 
 
-def not_looked_at(folder: Path, without: Path | None = None) -> list[str]:
+def list_skipped_files(folder: Path, without: Path | None = None) -> list[str]:
     """What lies in a folder and the folders in it that looks like evidence and is not read, in a sentence for each
     kind: videos and raw files without a picture of the same name, and pictures in folders deeper than that. The folder
     `without` is left out.
@@ -137,17 +137,17 @@ def not_looked_at(folder: Path, without: Path | None = None) -> list[str]:
         if len(inside.parts) > 1:
             folders.clear()
             if stems:
-                lost.setdefault(_TOO_DEEP, []).append(printable(str(inside)))
+                lost.setdefault(_TOO_DEEP, []).append(printable_name(str(inside)))
             continue
         folders[:] = sorted(f for f in folders if not f.startswith(".") and Path(parent, f).resolve() != without)
         for path in paths:
             kinds = (kind for suffixes, kind in _OTHERS if path.suffix.lower() in suffixes.split())
             if path.stem not in stems and (kind := next(kinds, None)):
-                lost.setdefault(kind, []).append(printable(str(inside / path)))
-    return [f"{kind}: {listed(names)}" for kind, names in lost.items()]
+                lost.setdefault(kind, []).append(printable_name(str(inside / path)))
+    return [f"{kind}: {summarize_names(names)}" for kind, names in lost.items()]
 
 
-def printable(name: str) -> str:
+def printable_name(name: str) -> str:
     """A file's name as text that can be written; what of its bytes is none is spelled out."""
     return name.encode("utf-8", "backslashreplace").decode()
 

@@ -21,8 +21,8 @@ import cv2
 import numpy as np
 from scipy.special import fdtri, stdtrit
 
-from patchproof.base.geometry import apply_homography, fit_homography, normalized, rect_corners
-from patchproof.base.resample import between_indices
+from patchproof.base.geometry import apply_homography, fit_homography, normalize_homography, rect_corners
+from patchproof.base.resample import index_homography
 from patchproof.photo.rejection import PhotoRejected
 
 # px per coordinate: what fitted corners of noisy JPEGs of flat pages still miss (measured 0.03 to 0.05)
@@ -38,7 +38,7 @@ _LARGEST_PIXELS = 3000  # of one side of a finely sampled patch before it is ave
 class PageFit:
     """`px_from_mm` 3×3, the 8×8 covariance of its first entries, what the corners that agree miss, and their ids.
 
-    `bend_mm` is the part of the residual that is no noise of the corners, `odd_mm` what the worst of the markers misses
+    `bend_mm` is the part of the residual that is no noise of the corners, `outlier_mm` what the worst of the markers misses
     that do not agree.
     """
 
@@ -47,7 +47,7 @@ class PageFit:
     residual_mm: float
     inlier_ids: tuple[int, ...]
     bend_mm: float = 0.0
-    odd_mm: float = 0.0
+    outlier_mm: float = 0.0
 
 
 def fit_page(corners_px: Mapping[int, np.ndarray], corners_mm: Mapping[int, np.ndarray]) -> PageFit:
@@ -112,7 +112,7 @@ def rectify(pixels: np.ndarray, px_from_mm: np.ndarray, rect_mm, px_per_mm: floa
     `pixels` is H×W×C, uint8 or float32 (pass linear light to measure); outside of the photo its rim is repeated.
     """
     size = rectified_px(rect_mm, px_per_mm)
-    return averaged(flattened(pixels, px_from_mm, rect_mm, size), size)
+    return resize_by_area(oversample_flat(pixels, px_from_mm, rect_mm, size), size)
 
 
 def rectified_px(rect_mm, px_per_mm: float) -> tuple[int, int]:
@@ -120,7 +120,7 @@ def rectified_px(rect_mm, px_per_mm: float) -> tuple[int, int]:
     return max(1, round(rect_mm[2] * px_per_mm)), max(1, round(rect_mm[3] * px_per_mm))
 
 
-def flattened(pixels: np.ndarray, px_from_mm: np.ndarray, rect_mm, size: tuple[int, int]) -> np.ndarray:
+def oversample_flat(pixels: np.ndarray, px_from_mm: np.ndarray, rect_mm, size: tuple[int, int]) -> np.ndarray:
     """The rectangle as seen from straight above, so many times as wide and high as `size` that samples are as dense as
     the photograph's own pixels.
     """
@@ -129,14 +129,14 @@ def flattened(pixels: np.ndarray, px_from_mm: np.ndarray, rect_mm, size: tuple[i
     fine = max(1, int(np.ceil(finest * width_mm / size[0])))
     fine = max(1, min(fine, _LARGEST_PIXELS // max(size)))
     grid = size[0] * fine, size[1] * fine
-    part, px_from_mm = crop(pixels, px_from_mm, rect_corners(rect_mm), 2)
+    part, px_from_mm = crop_around(pixels, px_from_mm, rect_corners(rect_mm), 2)
     step_x, step_y = width_mm / grid[0], height_mm / grid[1]
-    index_from_grid = between_indices(px_from_mm @ np.array([[step_x, 0, x], [0, step_y, y], [0, 0, 1]]))
+    index_from_grid = index_homography(px_from_mm @ np.array([[step_x, 0, x], [0, step_y, y], [0, 0, 1]]))
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     return cv2.warpPerspective(part, index_from_grid, grid, None, flags, cv2.BORDER_REPLICATE)
 
 
-def averaged(pixels: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+def resize_by_area(pixels: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """Means over area at a width and height; between pixels where these are larger."""
     if pixels.shape[1::-1] == size:
         return pixels
@@ -149,14 +149,14 @@ def least_px_per_mm(px_from_mm: np.ndarray, rect_mm) -> float:
     return float(1 / max(np.linalg.norm(j, 2) for j in _mm_from_px(px_from_mm, rect_corners(rect_mm))))
 
 
-def crop(pixels: np.ndarray, px_from_mm: np.ndarray, points_mm, margin_px: int) -> tuple[np.ndarray, np.ndarray]:
+def crop_around(pixels: np.ndarray, px_from_mm: np.ndarray, points_mm, margin_px: int) -> tuple[np.ndarray, np.ndarray]:
     """The part of a photo that shows the page's points N×2 and a margin about them, and the homography to it."""
-    rows, columns = part_around(apply_homography(px_from_mm, points_mm), margin_px, pixels.shape[:2])
+    rows, columns = region_around(apply_homography(px_from_mm, points_mm), margin_px, pixels.shape[:2])
     shift = np.array([[1, 0, -columns.start], [0, 1, -rows.start], [0, 0, 1.0]])
     return np.ascontiguousarray(pixels[rows, columns]), shift @ px_from_mm
 
 
-def part_around(points_px: np.ndarray, margin_px: float, shape: tuple[int, ...]) -> tuple[slice, slice]:
+def region_around(points_px: np.ndarray, margin_px: float, shape: tuple[int, ...]) -> tuple[slice, slice]:
     """Rows and columns of a picture H×W that hold points N×2 (x, y) and a margin about them; at least a pixel."""
     limit = np.array([shape[1], shape[0]])
     low = np.clip(np.floor(points_px.min(0) - margin_px).astype(int), 0, limit - 1)
@@ -198,7 +198,7 @@ def _gauss_newton(homography, mm, px) -> np.ndarray:
         homography = homography + np.append(step, 0).reshape(3, 3)
         if np.abs(jacobian @ step).max() < 1e-7:
             break
-    return normalized(homography)
+    return normalize_homography(homography)
 
 
 def _jacobian(homography, mm) -> np.ndarray:

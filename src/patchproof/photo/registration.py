@@ -19,7 +19,7 @@ import numpy as np
 from patchproof.base.color import LUMINANCE
 from patchproof.base.geometry import rect_corners
 from patchproof.photo.detect import luminance
-from patchproof.photo.rectify import averaged, crop, rectify
+from patchproof.photo.rectify import crop_around, rectify, resize_by_area
 
 _CELLS = 8  # along the rectangle's shorter side
 _FINEST_PX = 256  # of the shorter side: shifts are found to a tenth of such a pixel
@@ -47,12 +47,12 @@ def register(
     """Shifts of the cells of an uint8 photograph; `design` H×W×3 is linear light over the rectangle."""
     x, y, w, h = rect_mm
     finer = min(px_per_mm, _FINEST_PX / min(w, h))
-    part, to_part = crop(srgb, px_from_mm, rect_corners(rect_mm), 4)
+    part, to_part = crop_around(srgb, px_from_mm, rect_corners(rect_mm), 4)
     light = rectify(luminance(part)[..., None], to_part, rect_mm, finer)
     height, width = light.shape[:2]
     light = light.reshape(height, width)
     printed = _blurred(design @ np.array(LUMINANCE, np.float32), blur_px / px_per_mm * design.shape[1] / w)
-    printed = averaged(printed, (width, height))
+    printed = resize_by_area(printed, (width, height))
     size = max(8, round(min(width, height) / _CELLS))
     reach = max(3, round(_SEARCH * size))
     around = cv2.copyMakeBorder(light, reach, reach, reach, reach, cv2.BORDER_REPLICATE)

@@ -55,7 +55,7 @@ class Shape:
         return self.project(self.parameters, np.asarray(mm, float))
 
 
-def rolled(flat, mm, px, size, focal_px, focal_spread=UNKNOWN_FOCAL, floor_px=CORNER_NOISE_PX) -> Shape | None:
+def fit_cylinder(flat, mm, px, size, focal_px, focal_spread=UNKNOWN_FOCAL, floor_px=CORNER_NOISE_PX) -> Shape | None:
     """Paper round a cylinder, the best of the fits from `_starts`."""
     center, reach = mm.mean(0), np.ptp(mm, axis=0).max() / 2
     middle = np.array(size) / 2
@@ -152,7 +152,7 @@ def _starts(flat, mm, px, camera, center, reach) -> list[tuple[float, float]]:
     return starts
 
 
-def through_lens(flat, mm, px, size) -> Shape:
+def fit_radial_lens(flat, mm, px, size) -> Shape:
     """A plane seen through a lens that bends about the picture's middle by one radial term."""
     middle, half = np.array(size) / 2, np.hypot(*size) / 2
 

@@ -1,6 +1,6 @@
 """Sheets that are no plane in the photograph: curled paper is unrolled, a lens's bending taken out, where that pays.
 
-In: marker corners in pixels and page millimeters, and the flat fit's word that they do not agree. Out: `Unrolled`: a
+In: marker corners in pixels and page millimeters, and the flat fit's word that they do not agree. Out: `UnrolledSheet`: a
 picture in which the sheet is flat, with its homography, so that whatever measures flat sheets measures this one. Two
 explanations are tried against the plane: paper rolled round a cylinder of any radius and direction, seen by a pinhole
 camera (nine parameters, the focal length held as near the file's own as that is known), and a plane seen through a lens
@@ -17,19 +17,19 @@ import cv2
 import numpy as np
 
 from patchproof.base.geometry import apply_homography, fit_homography, rect_corners
-from patchproof.photo.detect import strips
-from patchproof.photo.edges import GRID, REACH, border_frame, meet
+from patchproof.photo.detect import row_strips
+from patchproof.photo.edges import GRID, REACH, border_frame, intersect_borders
 from patchproof.photo.rectify import (
     CORNER_NOISE_PX,
     PageFit,
     bend_mm,
     common_corners,
     largest_shift_mm,
-    part_around,
+    region_around,
     rms_length_mm,
     root_of,
 )
-from patchproof.photo.shapes import UNKNOWN_FOCAL, Shape, rms, rolled, through_lens
+from patchproof.photo.shapes import UNKNOWN_FOCAL, Shape, fit_cylinder, fit_radial_lens, rms
 
 FLAT_PX = 0.15  # rms per coordinate up to which a plane needs no better explanation: three times the corners' own noise
 PAYS = 0.5  # of the plane's residual
@@ -38,7 +38,7 @@ _MENDED = 0.3  # of what is mended where straight lines were fitted to bent bord
 
 
 @dataclass(frozen=True)
-class Unrolled:
+class UnrolledSheet:
     """`srgb` shows the sheet flat, `fit` is its homography there, `shape` what any page point is there."""
 
     srgb: np.ndarray
@@ -62,7 +62,7 @@ class Explained:
     shape: Shape
 
 
-def explain(
+def fit_shape(
     corners_px: Mapping[int, np.ndarray],
     corners_mm: Mapping[int, np.ndarray],
     size_px: tuple[int, int],
@@ -93,12 +93,12 @@ def unroll(
     rect_mm,
     focal_px: float | None = None,
     focal_spread: float = UNKNOWN_FOCAL,
-) -> Unrolled | None:
+) -> UnrolledSheet | None:
     """The piece (a rectangle x, y, width, height on the page) made flat; None where a plane explains it as well.
 
     The uncertainty is that of its corners; the focal length is known to `focal_spread` of its logarithm.
     """
-    explained = explain(corners_px, corners_mm, (srgb.shape[1], srgb.shape[0]), focal_px, focal_spread)
+    explained = fit_shape(corners_px, corners_mm, (srgb.shape[1], srgb.shape[0]), focal_px, focal_spread)
     if explained is None:
         return None
     flat, mm, px, best = explained.flat, explained.mm, explained.px, explained.shape
@@ -111,13 +111,13 @@ def unroll(
     left = best.px(mm) - px
     length = rms_length_mm(_mm_from_px(best.px, mm), left)
     fit = PageFit(straight, np.zeros((8, 8)), length, ids, bend_mm(best.bend_px, left, length))
-    return Unrolled(picture, fit, _uncertainty_mm(best, rect_corners(rect_mm)), best)
+    return UnrolledSheet(picture, fit, _uncertainty_mm(best, rect_corners(rect_mm)), best)
 
 
 def _best(flat, mm, px, size, focal_px, focal_spread, floor_px=CORNER_NOISE_PX) -> Shape:
     """The explanation that leaves least."""
-    paper = rolled(flat, mm, px, size, focal_px, focal_spread, floor_px)
-    lens = through_lens(flat, mm, px, size)
+    paper = fit_cylinder(flat, mm, px, size, focal_px, focal_spread, floor_px)
+    lens = fit_radial_lens(flat, mm, px, size)
     return lens if paper is None or lens.rms_px < paper.rms_px else paper
 
 
@@ -133,7 +133,7 @@ def _chord_shift(shape: Shape, mm: np.ndarray) -> np.ndarray:
     off = np.einsum("mksi,mki->mks", bent - middle[:, :, None], normal)
     offset, slope = off.mean(2), (off * s).sum(2) / (s * s).sum()
     ends = [middle + sign * half + (offset + sign * slope)[..., None] * normal for sign in (-1, 1)]
-    return (meet(*ends) - corners).reshape(-1, 2)
+    return (intersect_borders(*ends) - corners).reshape(-1, 2)
 
 
 def _uncertainty_mm(shape: Shape, corners: np.ndarray) -> float:
@@ -157,10 +157,10 @@ def _mm_from_px(project: Callable[[np.ndarray], np.ndarray], mm: np.ndarray) -> 
 
 def _straightened(srgb, project, px_from_mm, sheet_mm, margin_px: float) -> np.ndarray:
     """The photograph with the sheet's part resampled as if it were flat."""
-    rows, columns = part_around(apply_homography(px_from_mm, rect_corners(sheet_mm)), margin_px, srgb.shape)
+    rows, columns = region_around(apply_homography(px_from_mm, rect_corners(sheet_mm)), margin_px, srgb.shape)
     left, top, width, height = sheet_mm
     picture = srgb.copy()
-    for strip in strips(srgb[rows]):  # of all of a large picture the coordinates would take gigabytes
+    for strip in row_strips(srgb[rows]):  # of all of a large picture the coordinates would take gigabytes
         box = slice(rows.start + strip.start, min(rows.start + strip.stop, rows.stop)), columns
         y, x = np.mgrid[box] + 0.5
         mm = apply_homography(np.linalg.inv(px_from_mm), np.column_stack([x.ravel(), y.ravel()]))

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from patchproof.render.texture import Layout, centered, footprint, in_order, look_up, mip_levels, tap_grids
+from patchproof.render.texture import TexelLayout, footprint, group_by_grid, look_up, mip_levels, tap_grids, tap_offsets
 
 MOST_TAPS = 4  # along a footprint's shorter side
 # A grid of MOST_TAPS by twice as many, a texel apart, reaches 6 texels from its middle; where halving has lost a row of
@@ -24,7 +24,7 @@ MOST_TAPS = 4  # along a footprint's shorter side
 _MARGIN = 10
 
 
-def atlas_layout(sizes: Sequence[tuple[int, int]], device: torch.device | str = "cpu") -> Layout:
+def atlas_layout(sizes: Sequence[tuple[int, int]], device: torch.device | str = "cpu") -> TexelLayout:
     """The layout for textures of (width, height) sizes: the finest level on the left, the others below each other on
     its right, and textures on shelves, the highest first.
     """
@@ -43,7 +43,7 @@ def atlas_layout(sizes: Sequence[tuple[int, int]], device: torch.device | str = 
             x, y = (x + w + 2 * _MARGIN, y) if level == 0 else (x, y + h + 2 * _MARGIN)
         corner, shelf = (corner[0] + width, corner[1]), max(shelf, height)
     levels = torch.tensor([len(chain) for chain in chains], device=device)
-    return Layout(torch.tensor(table, device=device).flatten(0, 1), levels, True, pitch)
+    return TexelLayout(torch.tensor(table, device=device).flatten(0, 1), levels, True, pitch)
 
 
 def _block(chain: list[tuple[int, int]]) -> tuple[int, int]:
@@ -52,7 +52,7 @@ def _block(chain: list[tuple[int, int]]) -> tuple[int, int]:
     return width + max((w for w, _ in smaller), default=0), max(height, sum(h for _, h in smaller))
 
 
-def atlas_table(textures: Sequence[Tensor], where: Layout) -> Tensor:
+def atlas_table(textures: Sequence[Tensor], where: TexelLayout) -> Tensor:
     """The T×3 texels of all mip levels of H×W×3 textures."""
     assert where.pitch is not None
     places = where.places.view(len(textures), -1, 3).tolist()
@@ -68,8 +68,8 @@ def atlas_table(textures: Sequence[Tensor], where: Layout) -> Tensor:
     return table.flatten(0, 1)
 
 
-def sampled(
-    where: Layout, texels: Tensor, texture: Tensor, uv: Tensor, uv_dx: Tensor, uv_dy: Tensor, taps: int
+def sample_atlas(
+    where: TexelLayout, texels: Tensor, texture: Tensor, uv: Tensor, uv_dx: Tensor, uv_dy: Tensor, taps: int
 ) -> Tensor:
     """The P×3 that fragments see in an atlas; arguments as `texture.footprint` has them, with `taps` up to MOST_TAPS.
     A single tap is found by its texels' numbers, in as much time.
@@ -79,13 +79,13 @@ def sampled(
         return look_up(footprint(where, texture, uv, uv_dx, uv_dy, taps), texels)
     picture = texels.view(1, -1, where.pitch, 3).permute(0, 3, 1, 2)
     places, counts = _placed(where, picture.shape[2], texture, uv, uv_dx, uv_dy, taps)
-    order, grids = in_order(*counts)
+    order, grids = group_by_grid(*counts)
     places = torch.stack([values.index_select(0, order) for values in places]).view(3, 2, 1, 1, -1)
     seen = texels.new_empty(len(order), 3)
     for columns, rows, begin, end in grids:
         middle, right, down = places[..., begin:end]
-        across = right * centered(columns, texels.device)[:, None]
-        at = middle + across + down * centered(rows, texels.device)[:, None, None]
+        across = right * tap_offsets(columns, texels.device)[:, None]
+        at = middle + across + down * tap_offsets(rows, texels.device)[:, None, None]
         taken = F.grid_sample(picture, at.flatten(1, 2).permute(1, 2, 0)[None], align_corners=False)[0]
         # one after the other: `mean` rounds as the number of fragments has it
         seen[begin:end] = reduce(torch.add, taken.unbind(1)).T / (columns * rows)
@@ -93,7 +93,7 @@ def sampled(
 
 
 def _placed(
-    where: Layout, height: int, texture: Tensor, uv: Tensor, uv_dx: Tensor, uv_dy: Tensor, taps: int
+    where: TexelLayout, height: int, texture: Tensor, uv: Tensor, uv_dx: Tensor, uv_dy: Tensor, taps: int
 ) -> tuple[list[Tensor], tuple[Tensor, Tensor]]:
     """The middle (x, y) of each of P grids, the steps (x, y) to the right and down between its taps, all as the look-up
     has them, in half widths and heights of the picture from its own middle; and how many taps go across and down.

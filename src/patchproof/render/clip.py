@@ -12,7 +12,7 @@ from torch import Tensor
 GUARD_PX = 1 << 16  # faces are cut here, so that products of coordinates stay below 2^53 and float64 holds them exactly
 
 
-def clipped(corners: Tensor, near: float) -> tuple[Tensor, Tensor]:
+def clip_triangles(corners: Tensor, near: float) -> tuple[Tensor, Tensor]:
     """The parts before the near plane and within the guard band of T×3×3 faces: triangles in pixels, and whose."""
     owner = corners.isfinite().all(-1).all(-1).nonzero()[:, 0]
     corners = corners[owner]

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from patchproof.mesh.mesh import Mesh, places_of
+from patchproof.mesh.mesh import Mesh, position_numbers
 
 CREASE_DEG = 10.0  # of normals: light changes by a sixth at most below it
 _COLOR_STEP = 0.02  # of linear light
@@ -34,9 +34,9 @@ class Edges:
     planes: Tensor
 
 
-def edges_of(mesh: Mesh, device: torch.device | str = "cpu") -> Edges:
+def find_edges(mesh: Mesh, device: torch.device | str = "cpu") -> Edges:
     """The edges of a mesh on a device."""
-    place = places_of(mesh.vertices)[mesh.faces]
+    place = position_numbers(mesh.vertices)[mesh.faces]
     first, second = place.ravel(), place[:, [1, 2, 0]].ravel()
     key = np.minimum(first, second) * (len(mesh.vertices) + 1) + np.maximum(first, second)
     order = np.argsort(key, kind="stable")

@@ -18,7 +18,7 @@ from torch import Tensor
 from patchproof.base.color import linear_from_srgb, srgb_from_linear
 from patchproof.render.edges import Edges
 from patchproof.render.fragments import Cameras
-from patchproof.render.raster import CHUNK, homogeneous, ramp, ranked
+from patchproof.render.raster import CHUNK, homogeneous, index_ranges, ranked
 
 # In pixels at an edge's depth: so much farther than both of its pixels see it is hidden, and where one of them sees so
 # much farther than a crease, another edge is what ends the surface there.
@@ -79,7 +79,7 @@ class _Mixed(torch.autograd.Function):
 
 
 @torch.no_grad()
-def outlines(
+def find_outlines(
     edges: Edges,
     vertices: Tensor,
     cameras: Cameras,
@@ -172,7 +172,7 @@ def _crossings(
     a, b = torch.where(turned, b, a), torch.where(turned, a, b)
     first, end = ((point[along] - 0.5).ceil().clamp(0, size_px[along]).long() for point in (a, b))
     owner = torch.repeat_interleave(end - first)
-    line = ramp(end - first, first, owner)
+    line = index_ranges(end - first, first, owner)
     a, b = a.index_select(1, owner), b.index_select(1, owner)
     per_line = (b - a) / (b[along] - a[along])
     at = a + (line + 0.5 - a[along]) * per_line

@@ -1,7 +1,7 @@
 """`photograph`: what the camera of each drawn condition makes of the scene with the piece in it.
 
 In: a stage, what is shown (the piece's picture, the object's textures, or nothing new) and conditions. Out: N×3×H×W
-sRGB. The work has three parts that can be kept apart: `see` (see `views`), `shade` (light and composite; the only part
+sRGB. The work has three parts that can be kept apart: `render_views` (see `views`), `shade` (light and composite; the only part
 through which gradients reach what is shown) and the camera (`expose`).
 """
 
@@ -15,19 +15,19 @@ from patchproof.base.color import linear_from_srgb, srgb_from_linear
 from patchproof.channel.camera import (
     SMALLEST_BLUR_PX,
     SMALLEST_NOISE,
-    blurred,
+    add_noise,
     develop,
-    encoded,
+    encode_light,
+    gaussian_blur,
     is_pointwise,
-    noisy,
     reach_px,
 )
-from patchproof.channel.printer import vary
-from patchproof.render.pixels import ObjectTextures, PiecePicture, Shown
+from patchproof.channel.printer import vary_print
+from patchproof.render.pixels import Appearance, ObjectTextures, PiecePicture
 from patchproof.render.stage import Stage
 from patchproof.render.surfaces import light_texels
 from patchproof.render.texture import look_up
-from patchproof.render.views import Views, see
+from patchproof.render.views import Views, render_views
 from patchproof.scene.conditions import Conditions
 
 PAPER_BACK_LINEAR = 0.8  # plain white card seen from behind
@@ -35,7 +35,7 @@ PAPER_BACK_LINEAR = 0.8  # plain white card seen from behind
 
 def photograph(
     stage: Stage,
-    shown: Shown | Tensor | np.ndarray,
+    shown: Appearance | Tensor | np.ndarray,
     conditions: Conditions,
     size_px: tuple[int, int],
     jpeg: bool = True,
@@ -50,10 +50,10 @@ def photograph(
         shown = torch.tensor(shown, dtype=torch.float32, device=stage.device).permute(2, 0, 1) / 255
     if isinstance(shown, Tensor):
         shown = stage.look.shown(shown)
-    return expose(see(stage, shown, conditions, size_px), shown, jpeg)
+    return expose(render_views(stage, shown, conditions, size_px), shown, jpeg)
 
 
-def shade(views: Views, shown: Shown) -> Tensor:
+def shade(views: Views, shown: Appearance) -> Tensor:
     """N×3×H×W linear light before lens and sensor; differentiable in what is shown."""
     if isinstance(shown, ObjectTextures):
         return _smooth(views, views.object_light(light_texels(shown.srgb, views.reduced)), views.reduced)
@@ -68,7 +68,7 @@ def shade(views: Views, shown: Shown) -> Tensor:
     return _smooth(views, _blend(image, piece.pixel, piece.share, light, views.reduced), views.reduced)
 
 
-def expose(views: Views, shown: Shown, jpeg: bool = True) -> Tensor:
+def expose(views: Views, shown: Appearance, jpeg: bool = True) -> Tensor:
     """The photographs of what was seen."""
     camera, sensor, scale = views.stage.camera, views.conditions.sensor, _scale(views)
     bends = camera is not None and camera.bends
@@ -83,14 +83,14 @@ def expose(views: Views, shown: Shown, jpeg: bool = True) -> Tensor:
     if shown is not None:
         # where each pixel is developed alone, only the piece's own pixels differ from the bare object's photograph
         piece, pixels = views.on_piece, views.frame_px[0] * views.frame_px[1]
-        back = encoded(PAPER_BACK_LINEAR * views.exposure(piece.back_pixel // pixels), camera)
+        back = encode_light(PAPER_BACK_LINEAR * views.exposure(piece.back_pixel // pixels), camera)
         image = _blend(image, piece.back_pixel, piece.back_share, back, False)
         light = _piece_light(views, shown) * views.exposure(piece.view)
-        image = _blend(image, piece.pixel, piece.share, encoded(light, camera), False)
+        image = _blend(image, piece.pixel, piece.share, encode_light(light, camera), False)
     return _smooth(views, image, by_code=False)
 
 
-def windows_of(views: Views) -> np.ndarray | None:
+def affected_windows(views: Views) -> np.ndarray | None:
     """N×4 pixels (left, top, right, bottom) outside of which `expose` makes the same of any design in these views; None
     where that is not known: of textures, through a lens that bends, and where photographs have blur of their own.
     """
@@ -125,7 +125,7 @@ def _piece_light(views: Views, picture: PiecePicture) -> Tensor:
     if views.reduced:
         reflectance = linear_from_srgb(reflectance)
     change = torch.as_tensor(np.stack([drawn.dot_gain, drawn.density, drawn.black], 1)).to(reflectance)
-    return vary(reflectance, change.index_select(0, piece.view)) * views.piece_white
+    return vary_print(reflectance, change.index_select(0, piece.view)) * views.piece_white
 
 
 def _pasted(views: Views, image: Tensor, light: Tensor, blur_px: np.ndarray, noise: np.ndarray) -> Tensor:
@@ -133,11 +133,11 @@ def _pasted(views: Views, image: Tensor, light: Tensor, blur_px: np.ndarray, noi
     piece = views.on_piece
     values = torch.cat([light, light.new_ones(len(light), 1)], 1) * piece.share
     layer = _as_pictures(views, torch.zeros(len(image), 4).to(image).index_copy(0, piece.pixel, values))
-    layer = blurred(layer, torch.as_tensor(blur_px).to(image))
+    layer = gaussian_blur(layer, torch.as_tensor(blur_px).to(image))
     share = layer[:, 3:]
     whole = _as_pictures(views, image) * (1 - share) + layer[:, :3]
     seeds = views.conditions.sensor.noise_seed + _OTHER_GRAIN
-    return torch.lerp(whole, noisy(whole, torch.as_tensor(noise).to(image), seeds), share)
+    return torch.lerp(whole, add_noise(whole, torch.as_tensor(noise).to(image), seeds), share)
 
 
 _OTHER_GRAIN = 1 << 40  # the photograph's own grain is not that of the camera that photographs it again
@@ -145,7 +145,7 @@ _OTHER_GRAIN = 1 << 40  # the photograph's own grain is not that of the camera t
 
 def _own_blur_and_noise(views: Views) -> tuple[np.ndarray, np.ndarray] | None:
     """What the scene's photographs have of their own, N at this size; None where neither shows."""
-    blur_px, noise = (own * _scale(views) for own in views.stage.scene.own_blur_and_noise(views.conditions))
+    blur_px, noise = (own * _scale(views) for own in views.stage.scene.picture_blur_and_noise(views.conditions))
     return (blur_px, noise) if blur_px.max() >= SMALLEST_BLUR_PX or noise.max() >= SMALLEST_NOISE else None
 
 

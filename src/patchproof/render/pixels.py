@@ -15,16 +15,16 @@ import torch
 from torch import Tensor
 
 from patchproof.base.color import linear_from_srgb
-from patchproof.render.atlas import sampled
+from patchproof.render.atlas import sample_atlas
 from patchproof.render.fragments import Fragments
 from patchproof.render.surfaces import ObjectSurface, PieceSurface
-from patchproof.render.texture import Footprint, footprint, layout, texel_table
+from patchproof.render.texture import Footprint, footprint, texel_layout, texel_table
 
 LEAST_SHARE = 1 / 512  # of a pixel: less moves no 8-bit value
 
 
 @dataclass(frozen=True)
-class Look:
+class TextureSampling:
     """How pixels look at textures: each over `side` of its own width and height, in so many `taps` along its
     footprint's shorter side at the object's, and in so many `piece_taps` at the printed piece.
     """
@@ -37,7 +37,7 @@ class Look:
 # Four taps leave an object's own texture within 0.003 of the confidence that a network has with eight (60 photographs
 # of a textured car), one within 0.073. At pieces eight leave 38 dB and more against 16×16 samples per pixel for
 # optimized designs 20 to 200 px wide, four 30.
-PHOTOGRAPHED = Look(taps=4, side=1.0, piece_taps=8)
+PHOTO_SAMPLING = TextureSampling(taps=4, side=1.0, piece_taps=8)
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class ObjectTextures:
     srgb: tuple[Tensor, ...]
 
 
-Shown = PiecePicture | ObjectTextures | None
+Appearance = PiecePicture | ObjectTextures | None
 
 
 @dataclass(frozen=True)
@@ -141,7 +141,7 @@ def piece_pixels(
     piece: PiecePicture,
     fragments: Fragments,
     hidden: Tensor | None,
-    look: Look = PHOTOGRAPHED,
+    look: TextureSampling = PHOTO_SAMPLING,
     white_coefficients: Tensor | None = None,
 ) -> PiecePixels:
     """What the piece's own fragments look at, and their share of each pixel."""
@@ -184,11 +184,16 @@ def _boxes(pixel: Tensor, shape: tuple[int, int, int]) -> np.ndarray:
 
 def _piece_footprint(piece: PiecePicture, at: Tensor, at_dx: Tensor, at_dy: Tensor, taps: int) -> Footprint:
     """Which texels of the piece's picture are seen; `at` P×2 from 0 to 1 across the piece."""
-    where, texture = layout([piece.size_px], wrap=False, device=at.device), at.new_zeros(len(at), dtype=torch.long)
+    where, texture = (
+        texel_layout([piece.size_px], wrap=False, device=at.device),
+        at.new_zeros(len(at), dtype=torch.long),
+    )
     return footprint(where, texture, at, at_dx, at_dy, taps=taps, blocks=True)
 
 
-def object_pixels(surface: ObjectSurface, fragments: Fragments, look: Look, fixed: Tensor | None) -> ObjectPixels:
+def object_pixels(
+    surface: ObjectSurface, fragments: Fragments, look: TextureSampling, fixed: Tensor | None
+) -> ObjectPixels:
     """The object's fragments, with its textures in their color where they are `fixed` (`ObjectSurface.texels`); faces
     seen from behind turn their normal round.
     """
@@ -199,7 +204,7 @@ def object_pixels(surface: ObjectSurface, fragments: Fragments, look: Look, fixe
     if fixed is None:
         texels = footprint(surface.layout, *where)
     else:
-        color = sampled(surface.atlas, fixed, *where) * color
+        color = sample_atlas(surface.atlas, fixed, *where) * color
     return ObjectPixels(
         fragments.pixel,
         fragments.view,

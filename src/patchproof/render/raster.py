@@ -24,7 +24,7 @@ from torch import Tensor
 
 from patchproof.base.errors import Refused
 from patchproof.base.geometry import cross, dot
-from patchproof.render.clip import GUARD_PX, clipped
+from patchproof.render.clip import GUARD_PX, clip_triangles
 from patchproof.render.fragments import Cameras, Fragments, columns
 
 SUBPIXELS = 256  # corners snap to this fraction of a pixel
@@ -141,7 +141,7 @@ def _triangles(points: Tensor, snapped: Tensor, index: list[Tensor], size_px: tu
     torn = torn.nonzero()[:, 0]
     if len(torn):
         whole = torch.stack([points.index_select(1, i.index_select(0, torn)).T for i in index], 1)
-        triangles, of = clipped(whole, near)
+        triangles, of = clip_triangles(whole, near)
         cut = _packed(*triangles.unbind(-1)).unbind(1)
         owner = torch.cat([owner, torn[of]])
         corners = [torch.cat(pair) for pair in zip(corners, cut, strict=True)]
@@ -200,7 +200,7 @@ def _spans(trapezoids: list[Tensor], owners: list[Tensor], width: int) -> tuple[
     """Of each row of the trapezoids: pixel count, first pixel, 1/z there, its change per pixel, and the face key."""
     first, count, *edges = trapezoids
     owner = torch.repeat_interleave(count)
-    row = ramp(count, first, owner)
+    row = index_ranges(count, first, owner)
     y = row.double()
     n, k, d, *short = (t.index_select(0, owner) for t in edges)
     x0, x1 = (n.addcmul_(k, y).div_(d).ceil_().clamp_(0, width) for n, k, d in ((n, k, d), short))
@@ -213,7 +213,7 @@ def _spans(trapezoids: list[Tensor], owners: list[Tensor], width: int) -> tuple[
     return length, first_pixel + row * width + x.long(), inverse, a, face_key
 
 
-def ramp(count: Tensor, first: Tensor, owner: Tensor) -> Tensor:
+def index_ranges(count: Tensor, first: Tensor, owner: Tensor) -> Tensor:
     """first, first + 1, ... for each owner, `count` of them."""
     shift = first - count.cumsum(0) + count
     return torch.arange(len(owner), device=owner.device).add_(shift.index_select(0, owner))
@@ -224,7 +224,7 @@ def _fill(nearest: Tensor, length: Tensor, pixel: Tensor, inverse: Tensor, slope
     for part in _chunks(length):
         count, first = length[part], pixel[part]
         owner = torch.repeat_interleave(count)
-        step = ramp(count, torch.zeros_like(count), owner)
+        step = index_ranges(count, torch.zeros_like(count), owner)
         value = inverse[part].index_select(0, owner).addcmul_(slope[part].index_select(0, owner), step)
         # bits of positive floats order like the numbers; beyond its horizon a face is far away
         key = value.clamp_min_(1e-30).view(torch.int64).bitwise_and_(~_FACE_MASK)

@@ -15,8 +15,8 @@ import torch
 from patchproof.channel.printer import load_printer
 from patchproof.render.designs import LearnedTextures, PrintedPiece
 from patchproof.render.surfaces import ObjectSurface, PieceSurface, object_surface, piece_surface
-from patchproof.scene.interface import Scene, needs_piece
-from patchproof.scene.mesh_scene import needs_mesh
+from patchproof.scene.interface import Scene, require_piece
+from patchproof.scene.mesh_scene import require_mesh
 
 if TYPE_CHECKING:
     from patchproof.channel.lens import Camera
@@ -40,8 +40,8 @@ class Stage:
     def look(self) -> PrintedPiece | LearnedTextures:
         """What designs look like here: as the scene's printer prints them, or as textures."""
         if not self.scene.HAS_PIECE:
-            return LearnedTextures(self.scene.own_texture(), self.device)
-        scene = needs_piece(self.scene)
+            return LearnedTextures(self.scene.object_canvas(), self.device)
+        scene = require_piece(self.scene)
         printer = load_printer(scene.settings.printer.profile, scene.base)
         return PrintedPiece(scene.piece, scene.sheet_id, printer, self.device)
 
@@ -63,5 +63,5 @@ class Stage:
 def set_stage(scene: Scene, device: torch.device | str = "cpu") -> Stage:
     """Move a scene's mesh, textures and piece to a device."""
     device = torch.device(device)
-    surface = object_surface(needs_mesh(scene).mesh, device) if scene.HAS_OBJECT else None
-    return Stage(scene, device, surface, piece_surface(needs_piece(scene), device) if scene.HAS_PIECE else None)
+    surface = object_surface(require_mesh(scene).mesh, device) if scene.HAS_OBJECT else None
+    return Stage(scene, device, surface, piece_surface(require_piece(scene), device) if scene.HAS_PIECE else None)

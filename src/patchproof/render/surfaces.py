@@ -17,8 +17,8 @@ from torch import Tensor
 from patchproof.base.color import linear_from_srgb
 from patchproof.mesh.mesh import Mesh
 from patchproof.render.atlas import atlas_layout, atlas_table
-from patchproof.render.edges import Edges, edges_of
-from patchproof.render.texture import Layout, layout, texel_table
+from patchproof.render.edges import Edges, find_edges
+from patchproof.render.texture import TexelLayout, texel_layout, texel_table
 from patchproof.scene.interface import PieceScene
 
 # Of the piece's sides: half a pixel beyond the edge is enough down to a piece of 7 pixels, or 75° of tilt at 25.
@@ -55,12 +55,12 @@ class ObjectSurface:
         return self.corners[..., :2].contiguous()
 
     @cached_property
-    def layout(self) -> Layout:
+    def layout(self) -> TexelLayout:
         """Where the texels of textures lie that may change."""
-        return layout(self._sizes_px, wrap=True, device=self.material.device)
+        return texel_layout(self._sizes_px, wrap=True, device=self.material.device)
 
     @cached_property
-    def atlas(self) -> Layout:
+    def atlas(self) -> TexelLayout:
         """Where those of fixed textures lie."""
         return atlas_layout(self._sizes_px, self.material.device)
 
@@ -79,7 +79,7 @@ class ObjectSurface:
         return {}
 
 
-def light_texels(textures_srgb: Sequence[Tensor], reduced: bool, atlas: Layout | None = None) -> Tensor:
+def light_texels(textures_srgb: Sequence[Tensor], reduced: bool, atlas: TexelLayout | None = None) -> Tensor:
     """The T×3 linear light of textures that repeat, their mip levels averaged as light or, `reduced`, as code values;
     differentiable, but in an `atlas`.
     """
@@ -99,7 +99,7 @@ def object_surface(mesh: Mesh, device: torch.device) -> ObjectSurface:
     arrays = mesh.vertices, mesh.faces, corners, mesh.face_material
     vertices, faces, corners, material = (torch.as_tensor(np.ascontiguousarray(a), device=device) for a in arrays)
     textures = tuple(texture.to(device) for texture in textures)
-    return ObjectSurface(vertices, faces, corners, material, textures, edges_of(mesh, device))
+    return ObjectSurface(vertices, faces, corners, material, textures, find_edges(mesh, device))
 
 
 def piece_surface(scene: PieceScene, device: torch.device) -> PieceSurface:

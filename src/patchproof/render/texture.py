@@ -24,7 +24,7 @@ from torch.nn import functional as F
 
 
 @dataclass(frozen=True)
-class Layout:
+class TexelLayout:
     """Where the mip levels of K textures lie in one T×3 table of texels.
 
     `places` (K·L)×3 has each level's width, height and first texel, `levels` K how many of the L a texture has.
@@ -46,7 +46,7 @@ class Layout:
 
 
 @dataclass(frozen=True)
-class Group:
+class TapGroup:
     """Fragments G with as many taps each: the `texel` and `weight` G×J they see."""
 
     fragment: Tensor | None  # None: all of them, in order
@@ -58,7 +58,7 @@ class Group:
 class Footprint:
     """What P fragments see."""
 
-    groups: tuple[Group, ...]
+    groups: tuple[TapGroup, ...]
     fragments: int
 
     def part(self, first: int, last: int) -> Footprint:
@@ -66,15 +66,15 @@ class Footprint:
         groups = []
         for group in self.groups:
             if group.fragment is None:
-                groups.append(Group(None, group.texel[first:last], group.weight[first:last]))
+                groups.append(TapGroup(None, group.texel[first:last], group.weight[first:last]))
                 continue
             low, high = torch.searchsorted(group.fragment, group.fragment.new_tensor([first, last])).tolist()
             if low < high:
-                groups.append(Group(group.fragment[low:high] - first, group.texel[low:high], group.weight[low:high]))
+                groups.append(TapGroup(group.fragment[low:high] - first, group.texel[low:high], group.weight[low:high]))
         return Footprint(tuple(groups), last - first)
 
 
-def layout(sizes: list[tuple[int, int]], wrap: bool, device: torch.device | str = "cpu") -> Layout:
+def texel_layout(sizes: list[tuple[int, int]], wrap: bool, device: torch.device | str = "cpu") -> TexelLayout:
     """The layout for textures of (width, height) sizes; `wrap` repeats them, else the border texel goes on."""
     depth = max(max(size).bit_length() for size in sizes)
     table, offset = [], 0
@@ -87,11 +87,11 @@ def layout(sizes: list[tuple[int, int]], wrap: bool, device: torch.device | str 
                 offset += (w + 1) * (h + 1)
         table.append(levels)
     levels = torch.tensor([max(size).bit_length() for size in sizes], device=device)
-    return Layout(torch.tensor(table, device=device).flatten(0, 1), levels, wrap)
+    return TexelLayout(torch.tensor(table, device=device).flatten(0, 1), levels, wrap)
 
 
 def texel_table(textures: list[Tensor], wrap: bool) -> Tensor:
-    """The T×3 texels of all mip levels of H×W×3 textures, in the order of `layout`; differentiable."""
+    """The T×3 texels of all mip levels of H×W×3 textures, in the order of `texel_layout`; differentiable."""
     parts, edge = [], 0 if wrap else -1
     for level in chain.from_iterable(map(mip_levels, textures)):
         padded = torch.cat([level, level[:, edge, None]], 1)
@@ -131,7 +131,7 @@ def _halved(level: Tensor) -> Tensor:
 
 
 def footprint(
-    where: Layout,
+    where: TexelLayout,
     texture: Tensor,
     uv: Tensor,
     uv_dx: Tensor,
@@ -151,13 +151,13 @@ def footprint(
     size, offset = where.place(texture, level)
     at = (uv * size - 0.5, uv_dx * size, uv_dy * size, size, offset)
     if counts is None:
-        return Footprint((Group(None, *_taps(*at, 1, 1, where, blocks)),), len(uv))
-    order, grids = in_order(*counts)
+        return Footprint((TapGroup(None, *_taps(*at, 1, 1, where, blocks)),), len(uv))
+    order, grids = group_by_grid(*counts)
     groups = []
     for columns, rows, first, last in grids:
         fragment = order[first:last]
         center, dx, dy, level_size, corner = (values.index_select(0, fragment) for values in at)
-        groups.append(Group(fragment, *_taps(center, dx, dy, level_size, corner, columns, rows, where, blocks)))
+        groups.append(TapGroup(fragment, *_taps(center, dx, dy, level_size, corner, columns, rows, where, blocks)))
     return Footprint(tuple(groups), len(uv))
 
 
@@ -174,7 +174,7 @@ def tap_grids(across: Tensor, down: Tensor, levels: Tensor, taps: int) -> tuple[
     return level, (across, down)
 
 
-def in_order(across: Tensor, down: Tensor) -> tuple[Tensor, list[tuple[int, int, int, int]]]:
+def group_by_grid(across: Tensor, down: Tensor) -> tuple[Tensor, list[tuple[int, int, int, int]]]:
     """Footprints in the order of their grids, those of one grid as they came, and of each grid columns, rows, and where
     in that order its first and the one after its last are.
     """
@@ -208,7 +208,7 @@ def _taps(
     offset: Tensor,
     columns: int,
     rows: int,
-    where: Layout,
+    where: TexelLayout,
     blocks: bool,
 ) -> tuple[Tensor, Tensor]:
     """Texels and weights G×(4·rows·columns) of a grid of taps round `center` G×2, in texels of one level.
@@ -217,8 +217,8 @@ def _taps(
     and blocks are parallel, else over the upright box of the same extent (root of summed squares).
     """
     step_x, step_y = step_x / columns, step_y / rows
-    at = center[:, :, None, None] + step_x[:, :, None, None] * centered(columns, center.device)
-    at = at + step_y[:, :, None, None] * centered(rows, center.device)[:, None]
+    at = center[:, :, None, None] + step_x[:, :, None, None] * tap_offsets(columns, center.device)
+    at = at + step_y[:, :, None, None] * tap_offsets(rows, center.device)[:, None]
     size = size[:, :, None, None]
     if where.wrap:
         at = at - (at / size).floor() * size
@@ -246,7 +246,7 @@ def _taps(
 
 
 @lru_cache
-def centered(count: int, device: torch.device) -> Tensor:
+def tap_offsets(count: int, device: torch.device) -> Tensor:
     """Where so many taps stand, one apart round 0."""
     return torch.arange(count, device=device) - (count - 1) / 2
 

@@ -1,11 +1,11 @@
-"""`see`: everything about a batch of views that what is optimized does not change.
+"""`render_views`: everything about a batch of views that what is optimized does not change.
 
 In: a stage, conditions and a picture's size. Out: `Views`: for each pixel what lies behind the piece, and for each
 pixel of the piece how much of it the piece covers, which texels it looks at and what light falls there. Rasterizing
-happens here and nowhere else: views that were seen can be lit, printed and photographed anew (`relit`) at a fraction of
+happens here and nowhere else: views that were seen can be lit, printed and photographed anew (`relight`) at a fraction of
 the cost, and shaded with any number of designs.
 
-Each pixel takes one sample; outlines are smoothed from their edges (see `outlines`), those of the piece from its own
+Each pixel takes one sample; outlines are smoothed from their edges (see `find_outlines`), those of the piece from its own
 millimeters (see `pixels`). Left out on purpose: transparency.
 """
 
@@ -21,22 +21,22 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from patchproof.base.color import LIGHT_OF_CODE
+from patchproof.base.color import LINEAR_FROM_CODE
 from patchproof.base.geometry import camera_centers
-from patchproof.channel.camera import encoded, encoded_by_table, gains
-from patchproof.channel.frame import Frame
+from patchproof.channel.camera import encode_light, encode_light_by_table, gains
 from patchproof.channel.light import Lighting, irradiance, lighting_of
+from patchproof.channel.render_frame import Frame
 from patchproof.render.fragments import Cameras
-from patchproof.render.outlines import Outlines, outlines
+from patchproof.render.outlines import Outlines, find_outlines
 from patchproof.render.pixels import (
     LEAST_SHARE,
-    PHOTOGRAPHED,
-    Look,
+    PHOTO_SAMPLING,
+    Appearance,
     ObjectPixels,
     ObjectTextures,
     PiecePicture,
     PiecePixels,
-    Shown,
+    TextureSampling,
     object_pixels,
     piece_pixels,
 )
@@ -44,8 +44,8 @@ from patchproof.render.raster import rasterize
 from patchproof.render.stage import Stage
 from patchproof.render.texture import look_up
 from patchproof.scene.conditions import Conditions
-from patchproof.scene.interface import needs_piece
-from patchproof.scene.mesh_scene import MeshScene, needs_mesh
+from patchproof.scene.interface import require_piece
+from patchproof.scene.mesh_scene import MeshScene, require_mesh
 
 NEAR_SHARE = 1e-3  # of the object's length
 
@@ -116,7 +116,7 @@ class Views:
     @cached_property
     def _behind(self) -> Tensor:
         """The background's light before exposure, N·H·W × 3."""
-        tables = np.broadcast_to(LIGHT_OF_CODE[:, None], (len(self.background), 256, 3))
+        tables = np.broadcast_to(LINEAR_FROM_CODE[:, None], (len(self.background), 256, 3))
         return _looked_up(self.background, tables, self.stage.device)
 
     @cached_property
@@ -124,12 +124,12 @@ class Views:
         """The bare object, its outlines jagged, as a camera without blur and noise shows it, N·H·W × 3 sRGB."""
         camera = self.stage.camera
         # the background has 256 codes per view and channel, which are exposed as a table
-        light = torch.tensor(LIGHT_OF_CODE)[:, None] * self._gains[:, None].cpu().double()
-        image = _looked_up(self.background, encoded(light, camera).numpy(), self.stage.device)
+        light = torch.tensor(LINEAR_FROM_CODE)[:, None] * self._gains[:, None].cpu().double()
+        image = _looked_up(self.background, encode_light(light, camera).numpy(), self.stage.device)
         if self.object is None:
             return image
         color = self._object_color() * self.exposure(self.object.view)
-        return image.index_copy_(0, self.object.pixel, encoded_by_table(color, camera))
+        return image.index_copy_(0, self.object.pixel, encode_light_by_table(color, camera))
 
     def exposure(self, view: Tensor) -> Tensor:
         """The camera's factors of the light in views P, P×3."""
@@ -146,8 +146,12 @@ class Views:
         return self._irradiance(self.on_piece) if white is None else white
 
 
-def see(
-    stage: Stage, shown: Shown, conditions: Conditions, size_px: tuple[int, int], look: Look = PHOTOGRAPHED
+def render_views(
+    stage: Stage,
+    shown: Appearance,
+    conditions: Conditions,
+    size_px: tuple[int, int],
+    look: TextureSampling = PHOTO_SAMPLING,
 ) -> Views:
     """The views of `conditions`, with nothing on the object unless a piece is `shown`. Any picture of the same size can
     be shown in them; the object behind it is seen, too.
@@ -155,7 +159,7 @@ def see(
     piece = shown if isinstance(shown, PiecePicture) else None
     if not stage.scene.HAS_OBJECT:
         return _see_pictures(stage, piece, conditions, size_px)
-    scene, surface = needs_mesh(stage.scene), stage.object_surface
+    scene, surface = require_mesh(stage.scene), stage.object_surface
     frame = lens_frame(stage, scene, size_px)
     poses = scene.camera_from_world(conditions)
     light = _light(scene, stage.device, conditions)
@@ -165,13 +169,13 @@ def see(
     fragments = rasterize(surface.vertices, surface.faces, placed, near)
     nearest = torch.full((math.prod(fragments.shape),), torch.inf, device=stage.device)
     nearest[fragments.pixel] = fragments.depth
-    look, parts, fixed = replace(look, taps=PHOTOGRAPHED.taps) if scene.LEARNED else look, None, None
+    look, parts, fixed = replace(look, taps=PHOTO_SAMPLING.taps) if scene.LEARNS_TEXTURE else look, None, None
     if piece is not None:
         printed = cameras(poses @ scene.printed_from_sheet(conditions), matrices, frame.size_px, stage)
         own = rasterize(stage.piece_surface.vertices, stage.piece_surface.faces, printed, near)
         hidden = nearest.index_select(0, own.pixel) < own.depth
         parts = piece_pixels(stage.piece_surface, piece, own, hidden, look)
-    if not scene.LEARNED and not isinstance(shown, ObjectTextures):
+    if not scene.LEARNS_TEXTURE and not isinstance(shown, ObjectTextures):
         fixed = surface.texels(_reduced(stage, size_px), fixed=True)
     return Views(
         stage,
@@ -182,7 +186,7 @@ def see(
         backgrounds(scene, conditions, size_px, frame),
         object_pixels(surface, fragments, look, fixed),
         parts,
-        outlines(surface.edges, surface.vertices, placed, eye, nearest, _covered(parts, nearest), near),
+        find_outlines(surface.edges, surface.vertices, placed, eye, nearest, _covered(parts, nearest), near),
     )
 
 
@@ -199,27 +203,27 @@ def _covered(piece: PiecePixels | None, nearest: Tensor) -> Tensor:
     return covered
 
 
-def relit(views: Views, conditions: Conditions) -> Views:
+def relight(views: Views, conditions: Conditions) -> Views:
     """The same views under other light, with another print and camera; poses and backgrounds stay."""
     conditions, light = replace(conditions, pose=views.conditions.pose), views.light
     if light is not None:
-        light = _light(needs_mesh(views.stage.scene), views.stage.device, conditions)
+        light = _light(require_mesh(views.stage.scene), views.stage.device, conditions)
     return replace(views, conditions=conditions, light=light)
 
 
-def seen_again(views: Views, conditions: Conditions) -> Views:
-    """`relit`, and with the object before the conditions' own backgrounds."""
+def relight_and_replace_background(views: Views, conditions: Conditions) -> Views:
+    """`relight`, and with the object before the conditions' own backgrounds."""
     behind = views.conditions.pose.background
-    views = relit(views, conditions)
+    views = relight(views, conditions)
     if np.array_equal(behind, conditions.pose.background):
         return views
     pose = replace(views.conditions.pose, background=conditions.pose.background)
-    conditions, scene = replace(conditions, pose=pose), needs_mesh(views.stage.scene)
+    conditions, scene = replace(conditions, pose=pose), require_mesh(views.stage.scene)
     frame = lens_frame(views.stage, scene, views.size_px)
     return replace(views, conditions=conditions, background=backgrounds(scene, conditions, views.size_px, frame))
 
 
-def apart(views: Views, sizes: Sequence[int]) -> list[Views]:
+def split_views(views: Views, sizes: Sequence[int]) -> list[Views]:
     """Views that were seen together, so many at a time, each to the bit as if it had been seen without the others."""
     pixels, parts = views.frame_px[0] * views.frame_px[1], []
     for first, last in pairwise(accumulate(sizes, initial=0)):
@@ -227,7 +231,7 @@ def apart(views: Views, sizes: Sequence[int]) -> list[Views]:
         whole = {"object": views.object, "piece": views.piece, "outlines": views.outlines}
         seen = {name: None if part is None else part.part(numbers, pixels) for name, part in whole.items()}
         own = replace(views, conditions=views.conditions[some], background=views.background[some], **seen)
-        parts.append(relit(own, own.conditions))
+        parts.append(relight(own, own.conditions))
     return parts
 
 
@@ -250,7 +254,7 @@ def _see_pictures(stage: Stage, piece: PiecePicture | None, conditions: Conditio
     """Views of a scene made of pictures: the piece's homography takes the place of camera and mesh."""
     parts, pictures = None, stage.scene.pictures(conditions, size_px)
     if piece is not None:
-        scene, surface = needs_piece(stage.scene), stage.piece_surface
+        scene, surface = require_piece(stage.scene), stage.piece_surface
         homographies = scene.piece_homographies(conditions, size_px)
         flat = cameras(np.broadcast_to(np.eye(4), (len(homographies), 4, 4)), homographies, size_px, stage)
         fragments = rasterize(surface.vertices, surface.faces, flat, 1e-9)

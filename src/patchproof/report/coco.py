@@ -21,7 +21,7 @@ _LEAST_PX = 1.0  # of a box's sides: less of a thing is not seen
 
 
 @dataclass(frozen=True, eq=False)
-class Labeled:
+class LabeledPhoto:
     """A photograph: its file, (width, height), and outlines N×2 in its pixels by category; those with NaN (a part is
     behind the camera) are left out.
     """
@@ -31,7 +31,7 @@ class Labeled:
     outlines: Mapping[str, np.ndarray] = field(default_factory=dict)
 
 
-def coco_json(photos: Sequence[Labeled], label: str, about: str) -> str:
+def coco_json(photos: Sequence[LabeledPhoto], label: str, about: str) -> str:
     """The file's text; `label` is the object's category."""
     categories = {label: 1, PATCH: 2} if label != PATCH else {PATCH: 1}
     annotations = []
@@ -58,7 +58,7 @@ def _annotation(outline: np.ndarray, size_px: tuple[int, int], is_outline: bool)
     """Box, area and, of more than a box, the polygon of what lies in the picture; None where that is nothing."""
     if not np.isfinite(outline).all():
         return None
-    inside = cut_off(outline, size_px)
+    inside = clip_polygon(outline, size_px)
     if not len(inside) or np.ptp(inside, axis=0).min() < _LEAST_PX:
         return None
     (x, y), (width, height) = inside.min(0).tolist(), np.ptp(inside, axis=0).tolist()
@@ -71,7 +71,7 @@ def _annotation(outline: np.ndarray, size_px: tuple[int, int], is_outline: bool)
     return {"bbox": box, "area": round(area, 2), "iscrowd": 0, "segmentation": [polygon]}
 
 
-def cut_off(outline: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
+def clip_polygon(outline: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
     """The part M×2 of a polygon N×2 that lies in the picture (Sutherland and Hodgman 1974); M is 0 where none does."""
     points = np.asarray(outline, float)
     for axis, sign, border in ((0, 1, 0), (1, 1, 0), (0, -1, size_px[0]), (1, -1, size_px[1])):

@@ -7,7 +7,7 @@ from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from patchproof.base.claims import Estimate
+from patchproof.base.intervals import Estimate
 
 
 def page(template: str, folder: Path = Path(__file__).parent, **values: object) -> str:

@@ -16,8 +16,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from patchproof.base.claims import Estimate
-from patchproof.base.output import write_whole
+from patchproof.base.intervals import Estimate
+from patchproof.base.output import write_atomically
 from patchproof.report.images import data_uri, drawn
 from patchproof.report.page import page, versions_of
 
@@ -74,9 +74,9 @@ def write_results(folder: Path, results: Results) -> None:
     bare = {"dpi": 130, "metadata": {"Software": None}}  # without date or version
     pictures = [(figure, drawn(figure.draw, figure.size_in, "png", **bare)) for figure in results.figures]
     for table in results.tables:
-        write_whole(folder / f"{results.name}_{table.name}.csv", csv_text(table))
+        write_atomically(folder / f"{results.name}_{table.name}.csv", csv_text(table))
     for figure, content in pictures:
-        write_whole(folder / f"{results.name}_{figure.name}.png", content)
+        write_atomically(folder / f"{results.name}_{figure.name}.png", content)
     text = page(
         "results.html.j2",
         results=results,
@@ -85,7 +85,7 @@ def write_results(folder: Path, results: Results) -> None:
         versions=versions,
         shown=shown,
     )
-    write_whole(folder / f"{results.name}.html", text)
+    write_atomically(folder / f"{results.name}.html", text)
     data = {
         results.kind: results.name,
         "settings": results.settings,
@@ -99,7 +99,7 @@ def write_results(folder: Path, results: Results) -> None:
 
 def write_json(path: Path, data: Mapping[str, Any]) -> None:
     """The data as a JSON file, written whole."""
-    write_whole(path, json.dumps(data, indent=1, allow_nan=False) + "\n")
+    write_atomically(path, json.dumps(data, indent=1, allow_nan=False) + "\n")
 
 
 def csv_text(table: Table) -> str:

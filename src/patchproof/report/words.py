@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from patchproof.base.validation import listed
+from patchproof.base.validation import summarize_names
 
 VERDICTS = {"kept": "Promise kept", "broken": "Promise broken", "cannot_tell": "Promise neither broken nor proved"}
 _CONTROLS = {
@@ -36,7 +36,7 @@ def headline_of(summary: Mapping[str, Any]) -> str:
     }[worth["word"]]
 
 
-def worth_sentence(summary: Mapping[str, Any]) -> str:
+def benefit_sentence(summary: Mapping[str, Any]) -> str:
     """The figures behind the headline."""
     worth = summary["worth"]
     if worth is None:
@@ -62,11 +62,11 @@ def remarks(photos: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, int, st
     for photo in photos:
         if photo["code"]:
             alike.setdefault((photo["code"], photo["advice"]), []).append(photo["file"])
-    rows = ((code, advice, len(files), listed(files)) for (code, advice), files in alike.items())
+    rows = ((code, advice, len(files), summarize_names(files)) for (code, advice), files in alike.items())
     return sorted(rows, key=lambda row: (-row[2], row[:2]))
 
 
-def meaning_of(model: Mapping[str, Any]) -> str:
+def recognition_meaning(model: Mapping[str, Any]) -> str:
     """What it means that this network of a promise recognizes the object; of a classifier that is plain."""
     if model["least_score"] is None:
         return ""
@@ -79,7 +79,7 @@ def meaning_of(model: Mapping[str, Any]) -> str:
 def promise_lines(promise: Any, background: str = "") -> list[str]:
     """The promised rate, what stood behind the object, and how it compares with each control."""
     (low, high), target, (first, *others) = promise.interval, promise.target, promise.models
-    meaning = meaning_of(first.model_dump())
+    meaning = recognition_meaning(first.model_dump())
     return [
         promise.headline,
         f'promise ({target.goal} "{target.label}"): recognized in {promise.rate:.1%} of {promise.n} unseen conditions '
@@ -118,7 +118,7 @@ def verdict_lines(report: Any) -> list[str]:
     """What the patch is worth, the verdict, and the counts behind them."""
     summary = report.summary
     plain = summary.model_dump()
-    lines = [f"{headline_of(plain)}. {worth_sentence(plain)}"]
+    lines = [f"{headline_of(plain)}. {benefit_sentence(plain)}"]
     lines.append(f"verdict: {summary.verdict} (effect: {summary.effect}). {summary.reason}".strip())
     lines += [summary.next_step] if summary.next_step else []
     if summary.background:

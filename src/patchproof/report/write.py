@@ -15,11 +15,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from patchproof.base.output import make_folder, write_whole
+from patchproof.base.output import make_folder, write_atomically
 from patchproof.report.images import DELTA_TOP, data_uri, saved_pictures
 from patchproof.report.page import page
 from patchproof.report.plots import ledger_plot, recognition_plot, scale_plot
-from patchproof.report.words import VERDICTS, headline_of, meaning_of, remarks, worth_sentence
+from patchproof.report.words import VERDICTS, benefit_sentence, headline_of, recognition_meaning, remarks
 
 _EFFECTS = {
     "shown": "The patch itself makes the difference: it did better than every control.",
@@ -42,9 +42,9 @@ def write_report(
     out = Path(out_dir)
     make_folder(out)
     pictures = {photo["file"]: saved_pictures(out / "pictures", photo["file"]) for photo in report["photos"]}
-    write_whole(out / "report.json", json.dumps(report, indent=1, allow_nan=False) + "\n")
-    write_whole(out / "report.csv", photos_csv(report["photos"]))
-    write_whole(out / "report.html", render(report, manifest, pictures, ledger))
+    write_atomically(out / "report.json", json.dumps(report, indent=1, allow_nan=False) + "\n")
+    write_atomically(out / "report.csv", photos_csv(report["photos"]))
+    write_atomically(out / "report.html", render(report, manifest, pictures, ledger))
     return out / "report.html"
 
 
@@ -70,8 +70,8 @@ def render(
         promise=promise,
         primary=primary,
         headline=headline_of(summary),
-        worth=worth_sentence(summary),
-        meaning=meaning_of(promise["models"][0]) if promise else "",
+        worth=benefit_sentence(summary),
+        meaning=recognition_meaning(promise["models"][0]) if promise else "",
         word=(summary["worth"] or {}).get("word", "not_shown"),
         verdict=VERDICTS[summary["verdict"]],
         effect=_EFFECTS["estimated" if estimated else summary["effect"]],

@@ -17,19 +17,19 @@ import numpy as np
 import torch
 
 from patchproof.base import geometry
-from patchproof.base.color import linear_from_srgb, photo_codes_of
+from patchproof.base.color import linear_from_srgb, photo_codes_from_srgb
 from patchproof.base.geometry import MM_PER_INCH
 from patchproof.base.output import image_bytes, image_pixels, new_folder
-from patchproof.base.resample import between_indices
+from patchproof.base.resample import index_homography
 from patchproof.channel.camera import develop
 from patchproof.channel.effects import Sensor
 from patchproof.channel.lens import Camera
 from patchproof.channel.printer import load_printer
 from patchproof.photo.read import Photo
-from patchproof.reprints.hung_sheet import Hanging
-from patchproof.sheets.raster import page_count, page_pixels
+from patchproof.reprints.mounted_sheet import ReprintSetup
+from patchproof.sheets.pdf_raster import page_count, rasterize_page
 
-Shows = Callable[[np.ndarray], np.ndarray]  # N×3 sRGB sent → N×3 light of the print
+PrintFunction = Callable[[np.ndarray], np.ndarray]  # N×3 sRGB sent → N×3 light of the print
 
 PX_PER_MM = 8
 PHOTO_PX = (1600, 1200)
@@ -58,7 +58,7 @@ class Shot:
         return Photo(image_pixels(self.file), None)
 
 
-def page_light(page: np.ndarray, shows: Shows) -> np.ndarray:
+def page_light(page: np.ndarray, shows: PrintFunction) -> np.ndarray:
     """A page's uint8 H×W×3 as the light of its print, of bare paper 1; a tall page is turned as photographs lie."""
     page = np.rot90(page) if page.shape[0] > page.shape[1] else page
     white = shows(np.ones((1, 3)))
@@ -68,7 +68,13 @@ def page_light(page: np.ndarray, shows: Shows) -> np.ndarray:
 
 
 def reprint_pages(
-    pdf_path: str | Path, n: int, out: str | Path, how: Hanging, *, seed: int | None = None, overwrite: bool = False
+    pdf_path: str | Path,
+    n: int,
+    out: str | Path,
+    how: ReprintSetup,
+    *,
+    seed: int | None = None,
+    overwrite: bool = False,
 ) -> None:
     """Write n photographs of the pages of a PDF, in turn, lying flat: of pages that belong to no run, as blank ones,
     charts and boards. `how` names their printer (without a name: coated) and the print's size.
@@ -82,7 +88,7 @@ def reprint_pages(
     with new_folder(out, ("photo_*.jpg",), overwrite) as folder:
         pages = []
         for number in range(page_count(pdf_path)):
-            light = page_light(page_pixels(pdf_path, number + 1, PX_PER_MM * MM_PER_INCH), shows)
+            light = page_light(rasterize_page(pdf_path, number + 1, PX_PER_MM * MM_PER_INCH), shows)
             pages.append(cv2.resize(light, None, fx=how.print_scale[0], fy=how.print_scale[1]))
         for i in range(n):
             shot = photograph_page(pages[i % len(pages)], (seed or 0) + i)
@@ -116,7 +122,7 @@ def photograph_page(page: np.ndarray, seed: int, camera: Camera | None = None) -
     )
     picture = torch.tensor(raw.transpose(2, 0, 1)[None], dtype=torch.float32)
     codes = develop(picture, sensor, 1.0, jpeg=False, camera=camera)[0].permute(1, 2, 0).numpy().astype(float)
-    file = image_bytes(photo_codes_of(codes), "JPEG", {"quality": int(sensor.jpeg[0])})
+    file = image_bytes(photo_codes_from_srgb(codes), "JPEG", {"quality": int(sensor.jpeg[0])})
     return Shot(file, at_middle * exposure * white_balance)
 
 
@@ -157,5 +163,5 @@ def _warped(page: np.ndarray, px_from_mm: np.ndarray) -> np.ndarray:
     """The page in the picture's pixels before a gray table, averaged over pixels."""
     finer = PX_PER_MM / np.sqrt(np.linalg.det((px_from_mm / px_from_mm[2, 2])[:2, :2]))
     soft = cv2.GaussianBlur(page, (0, 0), 0.35 * float(finer))  # a pixel's own width, before it is sampled once
-    matrix = between_indices(px_from_mm @ np.diag([1 / PX_PER_MM, 1 / PX_PER_MM, 1]))
+    matrix = index_homography(px_from_mm @ np.diag([1 / PX_PER_MM, 1 / PX_PER_MM, 1]))
     return cv2.warpPerspective(soft, matrix, PHOTO_PX, flags=cv2.INTER_LINEAR, borderValue=(0.3, 0.28, 0.25))

@@ -24,21 +24,21 @@ import torch
 from torch import Tensor
 
 from patchproof.base import geometry
-from patchproof.base.color import LIGHT_OF_CODE, linear_from_srgb
+from patchproof.base.color import LINEAR_FROM_CODE, linear_from_srgb
 from patchproof.base.errors import Refused
 from patchproof.channel.camera import develop
 from patchproof.channel.effects import Light, Print
-from patchproof.channel.frame import Frame
-from patchproof.channel.printer import vary
+from patchproof.channel.printer import vary_print
+from patchproof.channel.render_frame import Frame
 from patchproof.mesh.mesh import Mesh
 from patchproof.render.photograph import PAPER_BACK_LINEAR
 from patchproof.render.pixels import PiecePicture
 from patchproof.render.stage import Stage
 from patchproof.render.views import backgrounds, lens_frame
 from patchproof.scene.conditions import Conditions
-from patchproof.scene.interface import needs_piece
-from patchproof.scene.mesh_scene import MeshScene, needs_mesh
-from patchproof.scene.patch_scene import needs_patch
+from patchproof.scene.interface import require_piece
+from patchproof.scene.mesh_scene import MeshScene, require_mesh
+from patchproof.scene.patch_scene import require_patch
 
 PAPER_REFLECTANCE = 0.85  # of white paper, whose light is 1
 LIGHT_RADIUS_DEG = (0.5, 8.0)  # of the directional light as the piece sees it: from about the sun to a window
@@ -98,7 +98,7 @@ def traced_light(stage: Stage, piece: PiecePicture | None, conditions: Condition
     for i in range(PASSES):  # seeds of one view are its own
         seed = (int(conditions.sensor.noise_seed[0]) * PASSES + i) % 2**32
         total = total + np.array(mi.render(traced, spp=PASS_SAMPLES, seed=seed), np.float64) / PASSES
-    whole = LIGHT_OF_CODE[backgrounds(scene, conditions, photo_px, frame)[0]]
+    whole = LINEAR_FROM_CODE[backgrounds(scene, conditions, photo_px, frame)[0]]
     inside = whole[top : top + height, left : left + width]
     inside *= 1 - total[..., 3:].clip(0, 1)
     inside += total[..., :3] / PAPER_REFLECTANCE
@@ -128,7 +128,7 @@ def mitsuba() -> ModuleType:
 
 def _traceable(stage: Stage) -> MeshScene:
     """The stage's scene; refused where Mitsuba cannot show it."""
-    scene = needs_mesh(stage.scene, "a scene with a mesh to trace paths in", "leave --path-traced out")
+    scene = require_mesh(stage.scene, "a scene with a mesh to trace paths in", "leave --path-traced out")
     matrix = scene.matrix_px(scene.settings.camera.photo_px)
     if abs(matrix[0, 0] / matrix[1, 1] - 1) > _SQUARE:
         raise Refused("a camera with square pixels", f"fx / fy = {matrix[0, 0] / matrix[1, 1]:.5f}", "set fy to fx")
@@ -137,7 +137,7 @@ def _traceable(stage: Stage) -> MeshScene:
 
 def _box(scene: MeshScene, conditions: Conditions, frame: Frame, aperture_mm: float) -> tuple[int, int, int, int]:
     """The part of the frame that shows anything but background: left, top, width and height, 1 at least."""
-    points = [scene.mesh.vertices, needs_piece(scene).paper()[0]] if scene.HAS_PIECE else [scene.mesh.vertices]
+    points = [scene.mesh.vertices, require_piece(scene).paper()[0]] if scene.HAS_PIECE else [scene.mesh.vertices]
     px = geometry.project(frame.matrix_px, scene.camera_from_world(conditions)[0], np.concatenate(points))
     if not np.isfinite(px).all():  # some of it lies behind the camera
         return 0, 0, *frame.size_px
@@ -206,8 +206,8 @@ def _lights(mi: ModuleType, scene: MeshScene, light: Light, radius_deg: float) -
 
 def _piece(mi: ModuleType, scene: MeshScene, picture: PiecePicture, conditions: Conditions):
     """The printed piece as large as it came out of the printer, plain paper on its back."""
-    placement = needs_patch(scene).placement
-    scale = geometry.scaled_about(scene.middle_mm, conditions.pose.printed_scale[0])
+    placement = require_patch(scene).placement
+    scale = geometry.scaling_about(scene.middle_mm, conditions.pose.printed_scale[0])
     vertices = placement.vertices_mm @ scale[:3, :3].T + scale[:3, 3]
     printed = _printed(picture, conditions.print)
     front = _diffuse(_texture(mi, printed, "clamp"))
@@ -220,7 +220,7 @@ def _piece(mi: ModuleType, scene: MeshScene, picture: PiecePicture, conditions: 
 def _printed(picture: PiecePicture, drawn: Print) -> np.ndarray:
     """H×W×3 light of this print under white light, beside the sheet that light is measured by."""
     change = torch.tensor([drawn.dot_gain[0], drawn.density[0], drawn.black[0]]).to(picture.srgb)
-    return vary(linear_from_srgb(picture.srgb), change).numpy()
+    return vary_print(linear_from_srgb(picture.srgb), change).numpy()
 
 
 def _object(mi: ModuleType, mesh: Mesh) -> list:
@@ -238,7 +238,7 @@ def _object(mi: ModuleType, mesh: Mesh) -> list:
                 raise Refused(
                     "objects whose textures are not colored by corners, too", material.name, "bake the colors in"
                 )
-            color = _texture(mi, LIGHT_OF_CODE[material.texture_srgb] * colors[0], "repeat")
+            color = _texture(mi, LINEAR_FROM_CODE[material.texture_srgb] * colors[0], "repeat")
         corners = mesh.vertices[mesh.faces[faces]].reshape(-1, 3)
         normals, uv = mesh.corner_normal[faces].reshape(-1, 3), mesh.corner_uv[faces].reshape(-1, 2)
         bsdf = {"type": "twosided", "both": _diffuse(color)}

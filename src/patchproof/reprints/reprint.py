@@ -20,14 +20,14 @@ from patchproof.base.compute import Compute
 from patchproof.base.errors import Refused
 from patchproof.base.output import make_folder, new_folder
 from patchproof.base.progress import Progress, no_progress
-from patchproof.base.workers import Workers, open_workers, result_of, sharing
+from patchproof.base.workers import Workers, fork_workers, open_workers, result_of
 from patchproof.optimizer.run import Run, load_run
-from patchproof.report.coco import Labeled, coco_json
-from patchproof.reprints.hung_sheet import AS_MADE, Hanging, HungSheet, PhotoTruth, hang, sheet_scene
+from patchproof.report.coco import LabeledPhoto, coco_json
+from patchproof.reprints.mounted_sheet import DEFAULT_SETUP, MountedSheet, PhotoTruth, ReprintSetup, hang, sheet_scene
 from patchproof.reprints.run_sheet import sheet as sheet_of
 from patchproof.scene.conditions import Conditions
 
-OWN = ("photo_*.jpg", "session_*", "scan_*.jpg", "truth.json", "coco.json")
+REPRINT_FILES = ("photo_*.jpg", "session_*", "scan_*.jpg", "truth.json", "coco.json")
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ def reprint(
     run: Run,
     n: int,
     out: str | Path,
-    how: Hanging = AS_MADE,
+    how: ReprintSetup = DEFAULT_SETUP,
     *,
     sessions: int = 1,
     seed: int | None = None,
@@ -82,15 +82,15 @@ def reprint(
             names = [f"session_{i // each + 1:02d}/{name}" for i, name in enumerate(names)]
         there = partial(_take_there, Path(pdf).resolve(), run.folder.resolve(), how)
         jobs, cluster = compute.jobs, compute.cluster
-        opened = sharing(sheet.photograph, jobs) if cluster is None else _by_name(there, jobs, cluster)
-        with new_folder(out, OWN, overwrite) as folder, opened as (workers, take):
+        opened = fork_workers(sheet.photograph, jobs) if cluster is None else _by_name(there, jobs, cluster)
+        with new_folder(out, REPRINT_FILES, overwrite) as folder, opened as (workers, take):
             for i, photo in workers.completed(take, views):
                 make_folder((folder / names[i]).parent)
                 (folder / names[i]).write_bytes(result_of(photo))
                 done += 1
                 progress("photograph", done, n)
             label, size_px = str(sheet.scene.settings.target.label), sheet.scene.photo_px
-            photos = [Labeled(name, size_px, sheet.outlines(v)) for name, v in zip(names, views, strict=True)]
+            photos = [LabeledPhoto(name, size_px, sheet.outlines(v)) for name, v in zip(names, views, strict=True)]
             text = coco_json(photos, label, f"simulated photographs of sheet {sheet.manifest.sheet_id}")
             (folder / "coco.json").write_text(text, encoding="utf-8")
             truth = dict(zip(names, map(sheet.truth, views), strict=True))
@@ -119,12 +119,12 @@ def _hung_pdf(pdf_path: str | Path, run: Run, control: str | None, out: Path) ->
         yield Path(folder) / "control.pdf"
 
 
-def _take_there(pdf: Path, run_folder: Path, how: Hanging, conditions: Conditions) -> bytes:
+def _take_there(pdf: Path, run_folder: Path, how: ReprintSetup, conditions: Conditions) -> bytes:
     return _hung_there(pdf, run_folder, how).photograph(conditions)
 
 
 @lru_cache(maxsize=1)
-def _hung_there(pdf: Path, run_folder: Path, how: Hanging) -> HungSheet:
+def _hung_there(pdf: Path, run_folder: Path, how: ReprintSetup) -> MountedSheet:
     """The sheet as another process hangs it up for itself."""
     return hang(pdf, load_run(run_folder), how)
 

@@ -13,16 +13,16 @@ from dataclasses import replace
 from pathlib import Path
 
 from patchproof.optimizer.run import Run
-from patchproof.reprints.hung import hang
-from patchproof.reprints.shots import shot_sections
-from patchproof.scene.interface import PieceScene, needs_piece
-from patchproof.scene.patch_scene import PatchScene, needs_patch
-from patchproof.sheets.content import PrintedPiece
+from patchproof.reprints.plan_view import hang
+from patchproof.reprints.shot_plan import shot_sections
+from patchproof.scene.interface import PieceScene, require_piece
+from patchproof.scene.patch_scene import PatchScene, require_patch
+from patchproof.sheets.content import SheetContent
 from patchproof.sheets.manifest import Manifest
+from patchproof.sheets.multi_design import write_several
 from patchproof.sheets.piece import control_design, with_ids
-from patchproof.sheets.plan_page import Hung, PlanPage, edges_mm
+from patchproof.sheets.plan_page import PlacementPicture, PlanPage, edge_distances_mm
 from patchproof.sheets.rects import size_text
-from patchproof.sheets.several import write_several
 from patchproof.sheets.template import Template, load_template
 from patchproof.sheets.write import write_sheet
 
@@ -60,9 +60,9 @@ def sheet_of_several(
     return write_several(pdf_path, page, [content for content, _ in made], plans)
 
 
-def content_of(run: Run, template: str | None, control: str | None) -> tuple[PrintedPiece, PieceScene]:
+def content_of(run: Run, template: str | None, control: str | None) -> tuple[SheetContent, PieceScene]:
     """The run's design (or a control) in its piece on that template, with the promise made for that piece."""
-    own = needs_piece(run.scene)
+    own = require_piece(run.scene)
     scene = own if template is None else own.with_template(template)
     settings = scene.settings.model_dump(mode="json") | {"seed": scene.seed, "printer_model": run.details["printer"]}
     if (imported := run.details.get("imported")) is not None:
@@ -71,17 +71,17 @@ def content_of(run: Run, template: str | None, control: str | None) -> tuple[Pri
     if control is not None:
         piece = with_ids(piece, scene.sheet_id, control)
         design = control_design(control, run.design, scene.sheet_id, piece)
-        return PrintedPiece(piece, scene.sheet_id, control, design, settings=settings, bent=bent), scene
-    return PrintedPiece(piece, scene.sheet_id, "design", run.design, run.promise, settings, bent), scene
+        return SheetContent(piece, scene.sheet_id, control, design, settings=settings, bent=bent), scene
+    return SheetContent(piece, scene.sheet_id, "design", run.design, run.promise, settings, bent), scene
 
 
-def plan_of(scene: PieceScene, template: Template, content: PrintedPiece) -> PlanPage | None:
+def plan_of(scene: PieceScene, template: Template, content: SheetContent) -> PlanPage | None:
     """Where the piece goes, whose design it is if not ours and, for a promise, how to photograph it; None where none of
     it can be said.
     """
     hung, sections, imported = None, [], content.settings.get("imported")
     if scene.HAS_OBJECT:
-        patch, own = needs_patch(scene), scene.settings.patch
+        patch, own = require_patch(scene), scene.settings.patch
         hung = hang(patch, template)
         facing = f"the object's {own.side} side" if own.at_mm is None else "the place where the piece goes"
         placed = [
@@ -103,8 +103,8 @@ def plan_of(scene: PieceScene, template: Template, content: PrintedPiece) -> Pla
     return PlanPage(hung, tuple(sections)) if sections else None
 
 
-def _edges(hung: Hung) -> str:
-    edges = ", ".join(f"{name} {mm:.0f} mm" for name, mm in edges_mm(hung).items())
+def _edges(hung: PlacementPicture) -> str:
+    edges = ", ".join(f"{name} {mm:.0f} mm" for name, mm in edge_distances_mm(hung).items())
     return f"From the piece's cut edge to the outermost edges of that side: {edges}."
 
 

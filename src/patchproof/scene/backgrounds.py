@@ -21,16 +21,16 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from patchproof.base.color import codes_of
+from patchproof.base.color import codes_from_srgb
 from patchproof.base.errors import Refused
-from patchproof.base.input import is_file, is_folder, opened_picture
-from patchproof.base.resample import between_indices, halvings
+from patchproof.base.input import is_file, is_folder, open_image
+from patchproof.base.resample import halving_pyramid, index_homography
 from patchproof.base.settings import BackgroundSettings
-from patchproof.base.validation import expand
-from patchproof.scene.rooms import place
+from patchproof.base.validation import expand_path
+from patchproof.scene.procedural_places import procedural_place
 
 SMALLEST_CROP = 0.6  # of the largest crop that fits
-FEW = 10  # files of which the scene is told that they are few
+FEW_PICTURES = 10  # files of which the scene is told that they are few
 # The procedural places of each part, by number.
 ROOMS = {
     "train": range(24),
@@ -38,9 +38,9 @@ ROOMS = {
     "promise": range(10_000, 20_000),
     "evaluate": range(20_000, 30_000),
 }
-ENOUGH = 24  # files that need no procedural places beside them, of a part that learns or selects
-OFTEN = 4  # where a file is seen as often as so many procedural places
-RARE = 50  # elsewhere a file is seen in one view of so many, lest a rate hang on two or three
+ENOUGH_FILES = 24  # files that need no procedural places beside them, of a part that learns or selects
+FILE_WEIGHT = 4  # where a file is seen as often as so many procedural places
+VIEWS_PER_FILE = 50  # elsewhere a file is seen in one view of so many, lest a rate hang on two or three
 # whose the files are, in the order of a hash of their names, again and again
 _DEALT = ("train", "promise", "evaluate", "select", "train", "promise", "train", "evaluate", "promise", "train")
 _KEPT = 192  # procedural places at a time, with their halvings 0.3 MB each; drawing one takes 12 ms
@@ -84,7 +84,7 @@ class Backgrounds:
         if isinstance(picture, int):
             return _place_levels(picture)
         if number not in self._reduced:
-            self._reduced[number] = halvings(picture)
+            self._reduced[number] = halving_pyramid(picture)
         return self._reduced[number]
 
     def picture(self, choice: np.ndarray, photo_px: tuple[int, int], size_px: tuple[int, int]) -> np.ndarray:
@@ -105,7 +105,7 @@ class Backgrounds:
         shrunk = levels[level]
         sx, sy = shrunk.shape[1] / width, shrunk.shape[0] / height
         scale_x, scale_y = crop_w * sx / size_px[0], crop_h * sy / size_px[1]
-        matrix = between_indices(np.array([[scale_x, 0, x0 * sx], [0, scale_y, y0 * sy], [0, 0, 1.0]]))
+        matrix = index_homography(np.array([[scale_x, 0, x0 * sx], [0, scale_y, y0 * sy], [0, 0, 1.0]]))
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         picture = cv2.warpAffine(shrunk, matrix[:2], size_px, flags=flags, borderMode=cv2.BORDER_REPLICATE)
         return picture[:, ::-1] if choice[4] < 0.5 else picture
@@ -113,16 +113,16 @@ class Backgrounds:
 
 @lru_cache(maxsize=_KEPT)
 def _place_levels(number: int) -> list[np.ndarray]:
-    return halvings(place(number))
+    return halving_pyramid(procedural_place(number))
 
 
 def load_backgrounds(settings: BackgroundSettings, base: Path) -> Backgrounds:
     """The scene's backgrounds; refused where the folder is missing, empty, or holds a picture that cannot be read."""
     if settings.color is not None:
-        return Backgrounds((codes_of(np.array(settings.color)).reshape(1, 1, 3),))
+        return Backgrounds((codes_from_srgb(np.array(settings.color)).reshape(1, 1, 3),))
     if settings.images is None:
         return _in_parts([])
-    folder = Path(expand(settings.images, base))
+    folder = Path(expand_path(settings.images, base))
     if is_file(folder):
         return Backgrounds((_read(folder),))
     files = sorted(p for p in folder.iterdir() if p.suffix.lower() in _SUFFIXES) if is_folder(folder) else []
@@ -141,15 +141,15 @@ def _in_parts(files: Sequence[Path]) -> Backgrounds:
     for name, rooms in ROOMS.items():
         own = [file for i, file in enumerate(files) if _DEALT[i % len(_DEALT)] == name]
         if name in ("train", "select"):
-            share = 1.0 if len(own) >= ENOUGH else OFTEN * len(own) / (OFTEN * len(own) + len(rooms))
+            share = 1.0 if len(own) >= ENOUGH_FILES else FILE_WEIGHT * len(own) / (FILE_WEIGHT * len(own) + len(rooms))
         else:
-            share = min(1.0, len(own) / RARE)
+            share = min(1.0, len(own) / VIEWS_PER_FILE)
         parts[name] = _Part(len(pictures), len(own), len(rooms) if share < 1 else 0, share)
         pictures += [*map(_read, own), *(rooms if share < 1 else ())]
     notes = ()
-    if 0 < len(files) < FEW:
+    if 0 < len(files) < FEW_PICTURES:
         notes = (
-            f"only {len(files)} pictures in background.images: procedural places stand in for real ones; with {FEW} or "
+            f"only {len(files)} pictures in background.images: procedural places stand in for real ones; with {FEW_PICTURES} or "
             "more, training and promise know different ones",
         )
     return Backgrounds(tuple(pictures), parts | {"reprint": parts["evaluate"]}, notes)
@@ -158,5 +158,5 @@ def _in_parts(files: Sequence[Path]) -> Backgrounds:
 def _read(file: Path) -> np.ndarray:
     from PIL import ImageOps
 
-    with opened_picture(file, "a background picture", "remove or replace it") as image:
+    with open_image(file, "a background picture", "remove or replace it") as image:
         return np.asarray(ImageOps.exif_transpose(image).convert("RGB"))

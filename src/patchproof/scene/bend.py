@@ -15,20 +15,27 @@ from dataclasses import replace
 import numpy as np
 
 from patchproof.base.errors import Refused
-from patchproof.mesh.exponential import Smooth, exponential_map, stretch_at
+from patchproof.mesh.exponential_map import SmoothSurface, exponential_map, grid_stretch
 from patchproof.mesh.mesh import Mesh
-from patchproof.mesh.surface import Chart, crop, edge_points, heights, net, surface_at
+from patchproof.mesh.surface_chart import (
+    SurfaceChart,
+    edge_points,
+    piece_grid,
+    surface_heights,
+    surface_point,
+    triangles_near,
+)
 from patchproof.scene.placement import (
     GRID,
     LIFT_MM,
-    Frame,
-    Lay,
     Placement,
+    PlacementMethod,
+    SurfaceFrame,
     lay_card,
+    piece_pose,
     place_card,
-    pose_of,
     refuse_larger_than_side,
-    spun,
+    spun_axes,
 )
 
 # Mean gap, as a share of the shorter edge, up to which a simpler family lies on the surface: 0.6 mm on 60 mm.
@@ -45,19 +52,19 @@ _PIECE_NET = 33  # vertices of a bent piece along each edge; odd, so that one is
 _DEGREE = 4
 
 
-def lay_for(bend: bool) -> Lay:
+def placement_method(bend: bool) -> PlacementMethod:
     """How a piece is laid on a surface: bent along it, or as a flat card."""
     return place_bent if bend else place_card
 
 
-def place_bent(mesh: Mesh, frame: Frame, size_mm: tuple[float, float], spin_deg: float) -> Placement:
+def place_bent(mesh: Mesh, frame: SurfaceFrame, size_mm: tuple[float, float], spin_deg: float) -> Placement:
     """Lay a piece of `size_mm` along the surface, its middle where the frame's normal meets it and its up along the
     frame's; spin turns it clockwise as one faces it. Refused, in one sentence, where paper cannot follow.
     """
     triangles, axes = mesh.vertices[mesh.faces], np.stack([frame.right, frame.up, frame.normal])
-    middle = surface_at(triangles, frame.origin_mm, axes)
+    middle = surface_point(triangles, frame.origin_mm, axes)
     # paper ends half a diagonal from its middle, and nothing farther than that from its chart is under it
-    near = crop(triangles, middle, float(np.hypot(*size_mm)))
+    near = triangles_near(triangles, middle, float(np.hypot(*size_mm)))
     reach = float(np.hypot(*size_mm)) / 2
     tangent, bends = _tangent(near, _facing(frame, frame.normal, middle), size_mm)
     close_mm = CLOSE_SHARE * min(size_mm)
@@ -68,7 +75,7 @@ def place_bent(mesh: Mesh, frame: Frame, size_mm: tuple[float, float], spin_deg:
         refuse_larger_than_side(size_mm, spin_deg, extent)
         return replace(card, reason=f"the surface is flat: a card stands {card.gap_mean_mm:.2f} mm off it on average")
     chart = _cylinder(near, tangent, bends, size_mm, spin_deg)
-    rolled = _laid(Smooth(chart, np.zeros((1, 1)), 1.0), near, frame, size_mm, spin_deg)
+    rolled = _laid(SmoothSurface(chart, np.zeros((1, 1)), 1.0), near, frame, size_mm, spin_deg)
     _refuse_overhang(rolled)
     if rolled.gap_mean_mm <= close_mm:
         radius_mm = 1 / max(abs(chart.curvature), 1e-6)
@@ -89,7 +96,7 @@ def place_bent(mesh: Mesh, frame: Frame, size_mm: tuple[float, float], spin_deg:
     return replace(laid, reason=reason)
 
 
-def curled(card: Placement, radius_mm: float) -> Placement:
+def curl_card(card: Placement, radius_mm: float) -> Placement:
     """A flat card whose left and right edges curl off the object, on a cylinder that touches it along its middle.
 
     Nothing is fitted to the surface, and nothing is refused: this is what badly glued paper does.
@@ -97,7 +104,7 @@ def curled(card: Placement, radius_mm: float) -> Placement:
     if not card.is_flat:
         raise Refused("a flat card to curl", f"a piece on a {card.family}", "leave out bend")
     across, into = card.world_from_piece[:3, [0, 2]].T
-    points, width = net(card.size_mm, _PIECE_NET) * [1, -1] + np.array(card.size_mm) / 2, card.size_mm[0]
+    points, width = piece_grid(card.size_mm, _PIECE_NET) * [1, -1] + np.array(card.size_mm) / 2, card.size_mm[0]
     scale = float(np.linalg.norm(across))  # a print may be larger than its millimeters say
     turn = (points[:, :1] - width / 2) * scale / radius_mm
     flat = np.concatenate([width / 2 + radius_mm / scale * np.sin(turn), points[:, 1:]], 1)
@@ -114,38 +121,38 @@ def curled(card: Placement, radius_mm: float) -> Placement:
     )
 
 
-def _facing(frame: Frame, normal: np.ndarray, origin_mm: np.ndarray) -> Frame:
+def _facing(frame: SurfaceFrame, normal: np.ndarray, origin_mm: np.ndarray) -> SurfaceFrame:
     """The frame turned to a normal, its up kept as well as it can be."""
     up = frame.up - (frame.up @ normal) * normal
     if np.linalg.norm(up) < 0.2:  # up is the normal, almost: right is what is left to go by
         up = np.cross(normal, frame.right)
     up /= np.linalg.norm(up)
-    return Frame(np.cross(up, normal), up, normal, origin_mm, frame.extent_mm)
+    return SurfaceFrame(np.cross(up, normal), up, normal, origin_mm, frame.extent_mm)
 
 
-def _chart(frame: Frame, across: np.ndarray, curvature: float, spin_deg: float) -> Chart:
+def _chart(frame: SurfaceFrame, across: np.ndarray, curvature: float, spin_deg: float) -> SurfaceChart:
     """A cylinder that touches the frame's plane at its origin, curved along `across` (a unit vector in that plane)."""
     axes = np.stack([across, np.cross(frame.normal, across), frame.normal])
-    return Chart(frame.origin_mm, axes, curvature, axes[:2] @ spun(frame, spin_deg)[0])
+    return SurfaceChart(frame.origin_mm, axes, curvature, axes[:2] @ spun_axes(frame, spin_deg)[0])
 
 
-def _under(chart: Chart, near: np.ndarray, size_mm, n: int) -> np.ndarray:
+def _under(chart: SurfaceChart, near: np.ndarray, size_mm, n: int) -> np.ndarray:
     """Heights of the surface over the piece's net, NaN where there is none; refused where that is most of it."""
     reach = float(np.hypot(*size_mm)) / 2
-    h = heights(chart, near, size_mm, n, (-reach, reach))
+    h = surface_heights(chart, near, size_mm, n, (-reach, reach))
     if np.isfinite(h).mean() < 0.5:
         raise Refused("a patch that lies on the object", "a surface under less than half of it", _DO)
     return h
 
 
-def _sampled(chart: Chart, near: np.ndarray, size_mm) -> tuple[np.ndarray, np.ndarray]:
+def _sampled(chart: SurfaceChart, near: np.ndarray, size_mm) -> tuple[np.ndarray, np.ndarray]:
     """(s, t) and heights of the surface where there is any."""
     h = _under(chart, near, size_mm, _FIT_NET)
     hit = np.isfinite(h)
-    return (net(size_mm, _FIT_NET) @ chart.turn)[hit], h[hit]
+    return (piece_grid(size_mm, _FIT_NET) @ chart.turn)[hit], h[hit]
 
 
-def _tangent(near: np.ndarray, frame: Frame, size_mm) -> tuple[Frame, np.ndarray]:
+def _tangent(near: np.ndarray, frame: SurfaceFrame, size_mm) -> tuple[SurfaceFrame, np.ndarray]:
     """The frame turned to the surface at its origin, and the curvature matrix 2×2 there along right and up (positive
     where the surface bulges outwards): from a quadratic fitted to the inner half of what lies under the piece.
     """
@@ -160,7 +167,7 @@ def _tangent(near: np.ndarray, frame: Frame, size_mm) -> tuple[Frame, np.ndarray
     return frame, bends
 
 
-def _cylinder(near: np.ndarray, tangent: Frame, bends: np.ndarray, size_mm, spin_deg: float) -> Chart:
+def _cylinder(near: np.ndarray, tangent: SurfaceFrame, bends: np.ndarray, size_mm, spin_deg: float) -> SurfaceChart:
     """The cylinder that fits the surface under the piece best; its normal goes through the tangent frame's origin."""
     values, directions = np.linalg.eigh(bends)
     most = int(np.abs(values).argmax())
@@ -173,18 +180,20 @@ def _cylinder(near: np.ndarray, tangent: Frame, bends: np.ndarray, size_mm, spin
     return chart
 
 
-def _fitted(chart: Chart, points_mm: np.ndarray, tangent: Frame, size_mm, spin_deg: float) -> Chart:
+def _fitted(
+    chart: SurfaceChart, points_mm: np.ndarray, tangent: SurfaceFrame, size_mm, spin_deg: float
+) -> SurfaceChart:
     """The chart turned (3 angles), moved along its normal and curved anew, so that points are near height 0."""
     from scipy.optimize import least_squares
     from scipy.spatial.transform import Rotation
 
     unit = float(np.hypot(*size_mm)) / 2  # millimeters and 1/mm are scaled to about 1
 
-    def moved(x: np.ndarray) -> Chart:
+    def moved(x: np.ndarray) -> SurfaceChart:
         axes = Rotation.from_rotvec(x[:3] @ chart.axes).apply(chart.axes)
         facing = _facing(tangent, axes[2], tangent.origin_mm)
         origin = tangent.origin_mm + x[3] * unit * axes[2]
-        return Chart(origin, axes, x[4] / unit, axes[:2] @ spun(facing, spin_deg)[0])
+        return SurfaceChart(origin, axes, x[4] / unit, axes[:2] @ spun_axes(facing, spin_deg)[0])
 
     start = np.array([0, 0, 0, 0, chart.curvature * unit])
     # dents and bumps weigh less than what the paper will lie on
@@ -194,7 +203,7 @@ def _fitted(chart: Chart, points_mm: np.ndarray, tangent: Frame, size_mm, spin_d
     return moved(fit.x)
 
 
-def _smooth(chart: Chart, near: np.ndarray, size_mm) -> Smooth:
+def _smooth(chart: SurfaceChart, near: np.ndarray, size_mm) -> SmoothSurface:
     """The chart with a polynomial fitted to the surface's heights over it."""
     st, h = _sampled(chart, near, size_mm)
     s, t = st.T
@@ -206,32 +215,32 @@ def _smooth(chart: Chart, near: np.ndarray, size_mm) -> Smooth:
     off = h - basis @ fit
     _refuse_gap(float(off.max() - off.mean()), size_mm)  # a poor fit may be too wild to walk on
     coefficients[tuple(np.transpose(powers))] = fit
-    return Smooth(chart, coefficients, scale)
+    return SmoothSurface(chart, coefficients, scale)
 
 
-def _laid(surface: Smooth, near: np.ndarray, frame: Frame, size_mm, spin_deg: float) -> Placement:
+def _laid(surface: SmoothSurface, near: np.ndarray, frame: SurfaceFrame, size_mm, spin_deg: float) -> Placement:
     """The piece on a smooth surface, lifted until it is LIFT_MM clear of the triangles under it."""
     under = _under(surface.chart, near, size_mm, GRID)
     faces = _grid_faces(_PIECE_NET)
     surface = surface.lifted(_top(surface, near, under, size_mm) + LIFT_MM)
     _, st = _spread(surface, frame, size_mm, spin_deg)
-    paper = heights(surface.chart, surface.points_and_normals(*st.T)[0][faces], size_mm, GRID)
-    at = net(size_mm, GRID) @ surface.chart.turn
+    paper = surface_heights(surface.chart, surface.points_and_normals(*st.T)[0][faces], size_mm, GRID)
+    at = piece_grid(size_mm, GRID) @ surface.chart.turn
     # flat cells dip below a round surface
     surface = surface.lifted(max(0.0, float(np.nanmax(surface.height(*at.T) - paper))))
     pose, st = _spread(surface, frame, size_mm, spin_deg)
     vertices, normals = surface.points_and_normals(*st.T)
-    paper = heights(surface.chart, vertices[faces], size_mm, GRID)
+    paper = surface_heights(surface.chart, vertices[faces], size_mm, GRID)
     # a cell's chords end short of a round surface's edge
     clear = np.where(np.isfinite(paper), paper, surface.height(*at.T)) - under
     gaps = clear[np.isfinite(clear) & np.isfinite(paper)] - LIFT_MM
-    stretches = stretch_at(surface, st, size_mm, _PIECE_NET)
+    stretches = grid_stretch(surface, st, size_mm, _PIECE_NET)
     return Placement(
         family="exponential",
         size_mm=tuple(size_mm),
         vertices_mm=vertices,
         faces=faces,
-        piece_mm=net(size_mm, _PIECE_NET) * [1, -1] + np.array(size_mm) / 2,
+        piece_mm=piece_grid(size_mm, _PIECE_NET) * [1, -1] + np.array(size_mm) / 2,
         normals=normals,
         world_from_piece=pose,
         gap_mm=float(gaps.max()),
@@ -244,25 +253,25 @@ def _laid(surface: Smooth, near: np.ndarray, frame: Frame, size_mm, spin_deg: fl
     )
 
 
-def _top(surface: Smooth, near: np.ndarray, under: np.ndarray, size_mm) -> float:
+def _top(surface: SmoothSurface, near: np.ndarray, under: np.ndarray, size_mm) -> float:
     """How far the highest point under the piece stands over the surface; ridges lie along edges, and nets miss them."""
     ridges = surface.chart.local(edge_points(near, float(np.hypot(*size_mm)) / GRID))
     inside = (np.abs(ridges[:, :2] @ surface.chart.turn.T) <= np.array(size_mm) / 2).all(1)
     inside &= np.abs(ridges[:, 2]) <= np.hypot(*size_mm) / 2
     peaks = ridges[inside, 2] - surface.height(*ridges[inside, :2].T)
-    sampled = under - surface.height(*(net(size_mm, GRID) @ surface.chart.turn).T)
+    sampled = under - surface.height(*(piece_grid(size_mm, GRID) @ surface.chart.turn).T)
     return float(max(np.nanmax(sampled), peaks.max(initial=-np.inf)))
 
 
-def _spread(surface: Smooth, frame: Frame, size_mm, spin_deg: float) -> tuple[np.ndarray, np.ndarray]:
+def _spread(surface: SmoothSurface, frame: SurfaceFrame, size_mm, spin_deg: float) -> tuple[np.ndarray, np.ndarray]:
     """4×4 world from piece of the plane tangent at its middle, (s, t) of its net; refused where geodesics run away."""
     middle, normal = (a[0] for a in surface.points_and_normals(np.zeros(1), np.zeros(1)))
-    right, up = spun(_facing(frame, normal, middle), spin_deg)
+    right, up = spun_axes(_facing(frame, normal, middle), spin_deg)
     with np.errstate(all="ignore"):
-        st = exponential_map(surface, net(size_mm, _PIECE_NET), right, up)
+        st = exponential_map(surface, piece_grid(size_mm, _PIECE_NET), right, up)
     if not (np.abs(st) < 2 * np.hypot(*size_mm)).all():
         raise Refused("a surface that paper can follow", "one that folds under the piece", _DO)
-    return pose_of(right, up, normal, middle, size_mm), st
+    return piece_pose(right, up, normal, middle, size_mm), st
 
 
 def _grid_faces(n: int) -> np.ndarray:
@@ -271,7 +280,7 @@ def _grid_faces(n: int) -> np.ndarray:
     return np.concatenate([corner + np.array([0, n, n + 1]), corner + np.array([0, n + 1, 1])])
 
 
-def _refuse_overlap(chart: Chart, size_mm) -> None:
+def _refuse_overlap(chart: SurfaceChart, size_mm) -> None:
     around = 2 * np.pi / max(abs(chart.curvature), 1e-9)
     wrapped = float(np.abs(chart.turn[:, 0]) @ np.array(size_mm))
     if wrapped > around:

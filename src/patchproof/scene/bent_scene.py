@@ -6,21 +6,21 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from patchproof.base.errors import Refused
-from patchproof.scene.bend import lay_for, place_bent
+from patchproof.scene.bend import place_bent, placement_method
 from patchproof.scene.interface import Scene, SceneSource
 from patchproof.scene.mesh_scene import load_bare
 from patchproof.scene.patch_scene import PatchScene
-from patchproof.scene.placement import Lay, Placement, patch_frame
-from patchproof.scene.tape import Tape, tapes
+from patchproof.scene.placement import Placement, PlacementMethod, patch_frame
+from patchproof.scene.tape_measure import TapeMeasurement, tapes
 
 
 @dataclass(frozen=True)
 class BentScene(PatchScene):
     """An object with a piece that bends with it; where the surface is flat, that is a card, too."""
 
-    LAY: ClassVar[Lay] = staticmethod(place_bent)
+    LAY: ClassVar[PlacementMethod] = staticmethod(place_bent)
 
-    def tapes(self) -> tuple[Tape, ...]:
+    def tapes(self) -> tuple[TapeMeasurement, ...]:
         """As in `PatchScene.tapes`."""
         facing = patch_frame(self.mesh, self.settings.patch).normal
         return () if self.placement.is_flat else tapes(self.mesh, self.placement, facing)
@@ -31,7 +31,7 @@ def build(source: SceneSource) -> BentScene:
     return BentScene.on(load_bare(source))
 
 
-def other_surface(scene: Scene) -> tuple[Placement | None, str | None]:
+def placement_with_other_bend(scene: Scene) -> tuple[Placement | None, str | None]:
     """(where a scene's piece would lie with `patch.bend` the other way round, what that would be like in a sentence).
 
     No placement where it is refused or would be the same card; no sentence where there is no surface to lie on.
@@ -39,7 +39,7 @@ def other_surface(scene: Scene) -> tuple[Placement | None, str | None]:
     if not isinstance(scene, PatchScene):
         return None, None
     patch, placement = scene.settings.patch, scene.placement
-    lay, flag = lay_for(not patch.bend), str(not patch.bend).lower()
+    lay, flag = placement_method(not patch.bend), str(not patch.bend).lower()
     try:
         other = lay(scene.mesh, patch_frame(scene.mesh, patch), scene.piece.size_mm, patch.spin_deg)
     except Refused as refused:

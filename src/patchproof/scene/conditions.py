@@ -26,13 +26,13 @@ from patchproof.channel.effects import (
     FIELDS,
     RECORD_OF,
     RECORDS,
-    Effect,
-    Facing,
+    Draws,
+    FacingCosine,
     Light,
     Pose,
     Print,
-    Rows,
     Sensor,
+    ViewEffect,
 )
 
 Stream = Literal["train", "select", "promise", "reprint", "evaluate"]
@@ -44,7 +44,7 @@ _PRINT_DIMENSIONS = 6
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Conditions(Rows):
+class Conditions(Draws):
     """N draws of everything that views differ by; what is not given is off."""
 
     pose: Pose
@@ -57,11 +57,11 @@ def draw(
     settings: SceneSettings, stream: Stream, n: int, seed: int, start: int = 0, per_session: int = 1, salt: str = ""
 ) -> Conditions:
     """Draws `start` to `start + n` of a stream; `per_session` in a row are one session; another `salt`, other draws."""
-    return of_fields(sampled(EFFECTS, settings, stream, n, seed, start, per_session, salt))
+    return conditions_from_fields(sample_fields(EFFECTS, settings, stream, n, seed, start, per_session, salt))
 
 
-def sampled(
-    effects: Sequence[Effect],
+def sample_fields(
+    effects: Sequence[ViewEffect],
     settings: SceneSettings,
     stream: Stream,
     n: int,
@@ -103,7 +103,7 @@ def fields_of(conditions: Conditions) -> dict[str, np.ndarray]:
     return {name: getattr(getattr(conditions, RECORD_OF[name]), name) for name in FIELDS}
 
 
-def of_fields(values: Mapping[str, np.ndarray]) -> Conditions:
+def conditions_from_fields(values: Mapping[str, np.ndarray]) -> Conditions:
     """The conditions with these fields, in whatever records they are."""
     fields: dict[str, Any] = {record: {} for record in RECORDS}
     for name, value in values.items():
@@ -118,10 +118,10 @@ def with_values(conditions: Conditions, **values: ArrayLike) -> Conditions:
     for name, value in values.items():
         drawn = fields[name]
         fields[name] = np.broadcast_to(np.asarray(value, drawn.dtype), drawn.shape).copy()
-    return of_fields(fields)
+    return conditions_from_fields(fields)
 
 
-def without(conditions: Conditions, effect: Effect, facing: Facing) -> Conditions | None:
+def without_effect(conditions: Conditions, effect: ViewEffect, facing: FacingCosine) -> Conditions | None:
     """`conditions` with the effect off in all views; None where it is off already."""
     name = RECORD_OF[effect.fields[0]]
     record = effect.off(getattr(conditions, name), facing)

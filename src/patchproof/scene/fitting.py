@@ -18,19 +18,27 @@ from patchproof.base.errors import Refused
 from patchproof.base.settings import PatchSettings
 from patchproof.base.validation import Side
 from patchproof.mesh.mesh import Mesh
-from patchproof.scene.placement import WARN_OVERHANG_SHARE, Frame, Lay, Placement, gap_limit_mm, patch_frame, side_frame
+from patchproof.scene.placement import (
+    WARN_OVERHANG_SHARE,
+    Placement,
+    PlacementMethod,
+    SurfaceFrame,
+    gap_limit_mm,
+    patch_frame,
+    side_frame,
+)
 
 _STEP_SHARE = 0.25  # of the piece's shorter side between places that are tried
 _TRIES_FLAT, _TRIES_BENT = 120, 6  # one takes some 5 and 200 ms
 _HALVINGS = 5  # to 3 % of the piece that was asked for
 
 
-def laid_well(
+def place_if_close(
     mesh: Mesh,
-    frame: Frame,
+    frame: SurfaceFrame,
     size_mm: tuple[float, float],
     spin_deg: float,
-    lay: Lay,
+    lay: PlacementMethod,
     gap_mm: float | None = None,
     overhang_share: float = WARN_OVERHANG_SHARE,
 ) -> Placement | None:
@@ -45,25 +53,25 @@ def laid_well(
     return laid if laid.gap_mm <= most_mm and laid.overhang_share <= overhang_share else None
 
 
-def advice(mesh: Mesh, patch: PatchSettings, lay: Lay, least_mm: float) -> str:
+def placement_advice(mesh: Mesh, patch: PatchSettings, lay: PlacementMethod, least_mm: float) -> str:
     """What would lie well instead of a piece that was refused, laid as that was, as the keys of a scene file say it;
     empty where nothing was found. Places are tried on the same side from the nearest on, then in the middles of the
     others.
     """
     frame, size_mm, how = patch_frame(mesh, patch), patch.size_mm, (patch.spin_deg, lay)
     width, height = np.minimum(size_mm, frame.extent_mm).tolist()
-    smaller = largest((width, height), lambda trial: laid_well(mesh, frame, trial, *how), least_mm)
+    smaller = largest_fitting_size((width, height), lambda trial: place_if_close(mesh, frame, trial, *how), least_mm)
     place = _nearest(mesh, patch, lay)
     found = [f"{smaller[0]:g} × {smaller[1]:g} mm lies well there"] if smaller is not None else []
     found += [f"{size_mm[0]:g} × {size_mm[1]:g} mm lies well with {place}"] if place is not None else []
     return "".join(f"; {text}" for text in found)
 
 
-def _nearest(mesh: Mesh, patch: PatchSettings, lay: Lay) -> str | None:
+def _nearest(mesh: Mesh, patch: PatchSettings, lay: PlacementMethod) -> str | None:
     """The nearest place where the piece lies well, as a scene file's key says it."""
 
-    def fits(frame: Frame) -> bool:
-        return laid_well(mesh, frame, patch.size_mm, patch.spin_deg, lay) is not None
+    def fits(frame: SurfaceFrame) -> bool:
+        return place_if_close(mesh, frame, patch.size_mm, patch.spin_deg, lay) is not None
 
     middle = patch_frame(mesh, patch.changed(offset_mm=(0.0, 0.0)))
     step = max(1.0, round(_STEP_SHARE * min(patch.size_mm)))
@@ -78,7 +86,7 @@ def _nearest(mesh: Mesh, patch: PatchSettings, lay: Lay) -> str | None:
     return None if side is None else f'side = "{side}"'
 
 
-def largest(
+def largest_fitting_size(
     size_mm: tuple[float, float], fits: Callable[[tuple[float, float]], object], least_mm: float
 ) -> tuple[float, float] | None:
     """The largest piece of this shape that fits, in whole millimeters; None where none of `least_mm` or more does."""

@@ -18,8 +18,8 @@ import cv2
 import numpy as np
 
 from patchproof.base.errors import Refused
-from patchproof.base.geometry import rect_corners, scaled_about
-from patchproof.base.resample import between_indices, halvings
+from patchproof.base.geometry import rect_corners, scaling_about
+from patchproof.base.resample import halving_pyramid, index_homography
 from patchproof.base.settings import SceneSettings
 from patchproof.scene.conditions import Conditions, Stream
 from patchproof.scene.interface import PX_PER_MODULE, READABLE_SHARE, PieceScene
@@ -29,7 +29,7 @@ VIEWS_TRIED = 256  # for figures over a scene's views
 
 
 @dataclass(frozen=True)
-class FlatScene(PieceScene):
+class PictureScene(PieceScene):
     """A scene without a mesh; N is the number of conditions."""
 
     OMITTED = (
@@ -88,7 +88,7 @@ class FlatScene(PieceScene):
 
 
 @dataclass(frozen=True)
-class Picture:
+class BasePicture:
     """A base picture, uint8 H×W×3 sRGB, no larger than the photograph that it becomes."""
 
     srgb: np.ndarray
@@ -96,10 +96,10 @@ class Picture:
     @cached_property
     def levels(self) -> tuple[np.ndarray, ...]:
         """The picture and its halvings, so that a small view does not read megapixels."""
-        return tuple(halvings(self.srgb))
+        return tuple(halving_pyramid(self.srgb))
 
 
-def picture_for(srgb: np.ndarray, photo_px: tuple[int, int]) -> tuple[Picture, np.ndarray]:
+def picture_for(srgb: np.ndarray, photo_px: tuple[int, int]) -> tuple[BasePicture, np.ndarray]:
     """The picture, reduced where its shorter side is longer than the photograph's, and `photo_from_picture` 3×3 (from
     pixels of `srgb`).
     """
@@ -109,7 +109,7 @@ def picture_for(srgb: np.ndarray, photo_px: tuple[int, int]) -> tuple[Picture, n
     if scale < 1:
         size = (max(1, round(width * scale)), max(1, round(height * scale)))
         srgb = cv2.resize(srgb, size, interpolation=cv2.INTER_AREA)
-    return Picture(srgb), photo_from(size, photo_px) @ np.diag([size[0] / width, size[1] / height, 1.0])
+    return BasePicture(srgb), photo_from(size, photo_px) @ np.diag([size[0] / width, size[1] / height, 1.0])
 
 
 def photo_from(picture_px: tuple[int, int], photo_px: tuple[int, int]) -> np.ndarray:
@@ -129,10 +129,10 @@ def size_from_photo(photo_px: tuple[int, int], size_px: tuple[int, int]) -> np.n
 def prints(piece: Piece, conditions: Conditions) -> np.ndarray:
     """N×3×3 from the sheet's millimeters to those of a print of another size about the same middle."""
     middle = np.array(piece.size_mm) / 2
-    return np.stack([scaled_about(middle, scale) for scale in conditions.pose.printed_scale])
+    return np.stack([scaling_about(middle, scale) for scale in conditions.pose.printed_scale])
 
 
-def turned(roll_deg: float, zoom: float, shift_px, about_px) -> np.ndarray:
+def similarity_matrix(roll_deg: float, zoom: float, shift_px, about_px) -> np.ndarray:
     """3×3 similarity of a picture whose camera turns clockwise by roll: what it shows turns the other way."""
     c, s = zoom * np.cos(np.radians(roll_deg)), zoom * np.sin(np.radians(roll_deg))
     turn = np.array([[c, s], [-s, c]])
@@ -141,8 +141,8 @@ def turned(roll_deg: float, zoom: float, shift_px, about_px) -> np.ndarray:
     return matrix
 
 
-def show(
-    picture: Picture, view_from_photo: np.ndarray, photo_px: tuple[int, int], size_px: tuple[int, int]
+def warp_picture(
+    picture: BasePicture, view_from_photo: np.ndarray, photo_px: tuple[int, int], size_px: tuple[int, int]
 ) -> np.ndarray:
     """The picture as uint8 H×W×3 in a view: carried by `view_from_photo` (both in the photograph's pixels), reduced
     by area, mirrored at its edge.
@@ -158,7 +158,7 @@ def show(
             break
         shrunk = level
     to_level = np.diag([width / shrunk.shape[1], height / shrunk.shape[0], 1.0])
-    index_from_size = between_indices(np.linalg.inv(whole @ to_level))
+    index_from_size = index_homography(np.linalg.inv(whole @ to_level))
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     view = cv2.warpAffine(shrunk, index_from_size[:2], size, flags=flags, borderMode=cv2.BORDER_REFLECT)
     return view if fine == 1 else cv2.resize(view, size_px, interpolation=cv2.INTER_AREA)

@@ -23,32 +23,32 @@ from typing import Self
 import numpy as np
 
 from patchproof.base.errors import Refused
-from patchproof.base.geometry import turned_extent
+from patchproof.base.geometry import rotated_extent
 from patchproof.base.input import is_file
 from patchproof.base.settings import SceneSettings
-from patchproof.base.validation import expand
+from patchproof.base.validation import expand_path
 from patchproof.photo.read import read_photo
 from patchproof.photo.rejection import PhotoRejected
 from patchproof.scene import flat
 from patchproof.scene.conditions import Conditions, Stream
 from patchproof.scene.interface import PX_PER_MODULE, READABLE_SHARE, SceneSource
-from patchproof.sheets.markers import MODULES
+from patchproof.sheets.markers import MARKER_MODULES
 from patchproof.sheets.piece import Piece, lay_out_piece, marker_size_mm
 from patchproof.sheets.template import load_template
 from patchproof.sheets.tiles import refuse_larger_than_page
 
-SPLIT_FROM = 2
-FEW = 20  # images, of which half say little of others
+MIN_IMAGES_TO_SPLIT = 2
+FEW_IMAGES = 20  # images, of which half say little of others
 _OPTIMIZED_ON = {"train", "select"}
 ERASED_AREA, ERASED_ASPECT = (0.02, 0.33), (0.3, 3.3)  # shares of the centered square; height over width
 _ERASED_CELLS = 224  # random values per side of the centered square: one a pixel at networks' usual size
 
 
 @dataclass(frozen=True)
-class ImageScene(flat.FlatScene):
+class ImageScene(flat.PictureScene):
     """A scene whose base pictures are images of the target's class, in an order that their names decide."""
 
-    images: tuple[flat.Picture, ...]
+    images: tuple[flat.BasePicture, ...]
 
     def description(self) -> str:
         """How many images there are."""
@@ -63,7 +63,7 @@ class ImageScene(flat.FlatScene):
         """
         drawn = super().draw(stream, n, seed, start, per_session)
         background = drawn.pose.background.copy()
-        if len(self.images) >= SPLIT_FROM:
+        if len(self.images) >= MIN_IMAGES_TO_SPLIT:
             middle = (len(self.images) // 2) / len(self.images)
             low, high = (0.0, middle) if stream in _OPTIMIZED_ON else (middle, 1.0)
             background[:, 0] = low + (high - low) * background[:, 0]
@@ -78,15 +78,15 @@ class ImageScene(flat.FlatScene):
         piece_mm, scales = np.array(self.piece.size_mm), px_per_mm(self.settings, self.piece, conditions)
         matrices = []
         for scale, roll, place in zip(scales, pose.roll_deg, pose.background[:, 2:4], strict=True):
-            room = side - turned_extent(piece_mm * scale, roll)
+            room = side - rotated_extent(piece_mm * scale, roll)
             middle = (photo - side) / 2 + side / 2 + (place - 0.5) * room
-            matrices.append(to_size @ flat.turned(roll, scale, middle - piece_mm / 2, piece_mm / 2))
+            matrices.append(to_size @ flat.similarity_matrix(roll, scale, middle - piece_mm / 2, piece_mm / 2))
         return np.stack(matrices) @ flat.prints(self.piece, conditions)
 
     def pictures(self, conditions: Conditions, size_px: tuple[int, int]) -> np.ndarray:
         """N×H×W×3 uint8 sRGB: the images, some with a box of random values."""
         chosen = flat.pick(conditions.pose.background[:, 0], len(self.images))
-        shown = [flat.show(self.images[i], np.eye(3), self.photo_px, size_px) for i in chosen]
+        shown = [flat.warp_picture(self.images[i], np.eye(3), self.photo_px, size_px) for i in chosen]
         for picture, chance in zip(shown, conditions.pose.background[:, 4], strict=True):
             if chance < self.settings.background.erasing:
                 erase(picture, int(chance * 2**53))  # its own digits: a view kept for other lights keeps its box
@@ -112,11 +112,13 @@ def build(source: SceneSource) -> ImageScene:
     identity = source.sheet_id({})
     piece = _piece(settings, identity)
     warnings = [f"{name} is left out: it cannot be read" for name in unread]
-    if len(images) < SPLIT_FROM:
+    if len(images) < MIN_IMAGES_TO_SPLIT:
         warnings.append("the promise is made on the same image that the patch is optimized on")
-    elif len(images) < FEW:
+    elif len(images) < FEW_IMAGES:
         promised = len(images) - len(images) // 2
-        warnings.append(f"the promise is made on {promised} images, and says little of others: give {FEW} or more")
+        warnings.append(
+            f"the promise is made on {promised} images, and says little of others: give {FEW_IMAGES} or more"
+        )
     return ImageScene(settings, base, source.seed, identity, piece, images, notes=tuple(warnings))
 
 
@@ -129,7 +131,7 @@ def px_per_mm(settings: SceneSettings, piece: Piece, conditions: Conditions) -> 
 
 def largest_share(roll_deg: tuple[float, float]) -> float:
     """The largest `view.patch_share` at which the piece fits into the square at all angles (in whole thousandths)."""
-    widest = max(turned_extent(np.ones(2), roll)[0] for roll in np.linspace(*roll_deg))  # of a turned square of side 1
+    widest = max(rotated_extent(np.ones(2), roll)[0] for roll in np.linspace(*roll_deg))  # of a turned square of side 1
     return int(1000 / widest) / 1000
 
 
@@ -161,8 +163,10 @@ def _erased_box(rng: np.random.Generator) -> tuple[float, float, float, float]:
 
 def _files_of_class(settings: SceneSettings, base: Path) -> list[Path]:
     """The files whose label is the target's, in an order that depends on nothing but their names."""
-    folder, table = (Path(expand(text, base)) for text in (settings.object.images or "", settings.object.labels or ""))
-    rows = label_rows(table)
+    folder, table = (
+        Path(expand_path(text, base)) for text in (settings.object.images or "", settings.object.labels or "")
+    )
+    rows = read_labels(table)
     target = settings.target
     wanted = {str(label).strip().casefold() for label in (target.label, *target.accept)}
     names = [name for name, label in rows if wanted & {label, *(part.strip() for part in label.split(","))}]
@@ -183,7 +187,7 @@ def _files_of_class(settings: SceneSettings, base: Path) -> list[Path]:
     return [folder / name for name in sorted(set(names), key=lambda name: hashlib.sha256(name.encode()).digest())]
 
 
-def label_rows(table: Path) -> list[tuple[str, str]]:
+def read_labels(table: Path) -> list[tuple[str, str]]:
     """(file name, label in small letters) of each line; commas after the first belong to the label."""
     if not is_file(table):
         raise Refused("a CSV of file names and labels (object.labels)", f"no file at {table}", "check the path")
@@ -198,7 +202,7 @@ def label_rows(table: Path) -> list[tuple[str, str]]:
     return [(row[0].strip(), ",".join(row[1:]).strip().casefold()) for row in rows]
 
 
-def _read_all(files: list[Path], photo_px: tuple[int, int]) -> tuple[tuple[flat.Picture, ...], list[str]]:
+def _read_all(files: list[Path], photo_px: tuple[int, int]) -> tuple[tuple[flat.BasePicture, ...], list[str]]:
     images, unread = [], []
     for path in files:
         try:
@@ -225,7 +229,7 @@ def _piece(settings: SceneSettings, identity: str) -> Piece:
             f"lower it to {largest:g}",
         )
     smallest = low * (high / low) ** (1 - READABLE_SHARE)
-    needed_mm = MODULES * PX_PER_MODULE * max(size_mm) / (smallest * min(settings.camera.photo_px))
+    needed_mm = MARKER_MODULES * PX_PER_MODULE * max(size_mm) / (smallest * min(settings.camera.photo_px))
     piece = lay_out_piece(size_mm, marker_size_mm(needed_mm, size_mm), identity, "design")
     refuse_larger_than_page(load_template(template), piece)
     return piece

@@ -3,7 +3,7 @@
 A scene is a mesh with a piece on it (`PatchScene`; bent: `BentScene`), one whose piece has no place yet (`OpenScene`),
 one with a texture of its own that may change (`TextureScene`), or pictures: photographs of the object (`PhotoScene`) or
 a folder of images (`ImageScene`). Each has a module of its own, whose `build` makes it of a `SceneSource`; `scene`
-knows which. Who needs a piece asks `needs_piece`, which refuses where there is none. N is the number of conditions.
+knows which. Who needs a piece asks `require_piece`, which refuses where there is none. N is the number of conditions.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ import numpy as np
 
 from patchproof.base.errors import Refused
 from patchproof.base.geometry import apply_homography, local_scales
-from patchproof.base.settings import SceneSettings, identifying
-from patchproof.channel.effects import Effect
+from patchproof.base.settings import SceneSettings, identity_settings
+from patchproof.channel.effects import ViewEffect
 from patchproof.scene.conditions import Conditions, Stream, draw
 from patchproof.sheets.piece import Piece, sheet_id
 
 if TYPE_CHECKING:
     from patchproof.channel.lens import Camera
-    from patchproof.scene.texture import Canvas
+    from patchproof.scene.canvas import Canvas
 
 SCALE_VIEWS = 1024  # for quantiles over the views; as many as the marker rule looks at
 PX_PER_MODULE = 2.5  # a marker is read from about here on: 45 of 48 at 2.7 px with a blur of 0.7 px
@@ -42,16 +42,16 @@ class SceneSource:
     settings: SceneSettings
     base: Path
     seed: int
-    printed_id: str | None = None
-    given_glb: bytes | None = None
+    printed_sheet_id: str | None = None
+    mesh_glb: bytes | None = None
 
     def sheet_id(self, known: Mapping[str, str]) -> str:
         """The one that it was printed with, else that of its settings, seed and of what is `known` beside them."""
-        return self.printed_id or sheet_id(identifying(self.settings) | dict(known), self.seed)
+        return self.printed_sheet_id or sheet_id(identity_settings(self.settings) | dict(known), self.seed)
 
 
 @dataclass(frozen=True)
-class Part:
+class SceneTerm:
     """What a scene itself models and a simpler one would not: its name, the settings key that governs it, if any,
     and whether it needs whole photographs to be seen as it is.
     """
@@ -72,14 +72,14 @@ class Scene(ABC):
     notes: tuple[str, ...] = field(default=(), kw_only=True)  # warnings of what was read
     known: Mapping[str, str] = field(default_factory=dict, kw_only=True)  # beside settings, what the sheet id tells
     camera: Camera | None = field(default=None, kw_only=True)  # a calibrated one
-    given_glb: bytes | None = field(default=None, kw_only=True)  # the mesh, where it was given in Python
+    mesh_glb: bytes | None = field(default=None, kw_only=True)  # the mesh, where it was given in Python
     given_models: Mapping[str, Any] = field(default_factory=dict, kw_only=True)  # networks given in Python, by name
 
     HAS_OBJECT: ClassVar[bool] = False  # a surface of its own before what is behind it
     HAS_PIECE: ClassVar[bool] = False
     HAS_PLACE: ClassVar[bool] = True  # for what is optimized; False where it has to be searched for
     EFFECT_TABLES: ClassVar[tuple[str, ...]] = ("printer", "camera")  # of the settings, whose effects show in it
-    PARTS: ClassVar[tuple[Part, ...]] = ()
+    TERMS: ClassVar[tuple[SceneTerm, ...]] = ()
     OMITTED: ClassVar[tuple[str, ...]] = ()  # what is not modeled
 
     @abstractmethod
@@ -147,28 +147,28 @@ class Scene(ABC):
 
     def _identified(self, settings: SceneSettings, known: Mapping[str, str]) -> Self:
         """The scene with the sheet id of these settings and of what else is known."""
-        identity = sheet_id(identifying(settings) | dict(known), self.seed)
+        identity = sheet_id(identity_settings(settings) | dict(known), self.seed)
         return replace(self, settings=settings, known=known, sheet_id=identity)._laid_out()
 
     def _laid_out(self) -> Self:
         """The scene with its piece laid out for its page and sheet id."""
         return self
 
-    def models(self, effect: Effect) -> bool:
+    def models(self, effect: ViewEffect) -> bool:
         """Whether an effect shows in the scene's photographs where its settings turn it on."""
         return effect.keys[0].partition(".")[0] in self.EFFECT_TABLES
 
-    def without(self, part: Part) -> Self | None:
-        """The scene without one of its `PARTS`; None where it has nothing of it."""
+    def without(self, part: SceneTerm) -> Self | None:
+        """The scene without one of its `TERMS`; None where it has nothing of it."""
         raise ValueError(f"{self.description()} without {part.name}")
 
-    def own_blur_and_noise(self, conditions: Conditions) -> tuple[np.ndarray, np.ndarray]:
+    def picture_blur_and_noise(self, conditions: Conditions) -> tuple[np.ndarray, np.ndarray]:
         """N Gaussian sigmas of the base pictures' own blur, in pixels of the whole photograph, and N standard
         deviations of their noise at white, in its linear light.
         """
         return np.zeros(len(conditions)), np.zeros(len(conditions))
 
-    def own_texture(self) -> Canvas:
+    def object_canvas(self) -> Canvas:
         """The object's own texture, where that is what may change; refused of any other scene."""
         refuse_without_place(self)
         raise Refused("a scene of the object's own texture", "one of a patch", 'set patch.kind = "texture"')
@@ -231,7 +231,7 @@ class PieceScene(Scene):
         """Whether piece and lens are flat, so that photographs are homographies of the sheet."""
         return True
 
-    def printed_at(self, scale: tuple[float, float]) -> PieceScene:
+    def with_print_scale(self, scale: tuple[float, float]) -> PieceScene:
         """The scene with a piece printed larger or smaller along x and y, hung up at the same middle; piece millimeters
         stay the sheet's own.
         """
@@ -275,7 +275,7 @@ class PieceScene(Scene):
         return {"piece_mm": piece.size_mm, "marker_mm": piece.marker_mm, "unreadable_share": self.unreadable_share}
 
 
-def needs_piece(scene: Scene, do: str = "take object.glb and textures from the run") -> PieceScene:
+def require_piece(scene: Scene, do: str = "take object.glb and textures from the run") -> PieceScene:
     """The scene as one with a printed piece; refused where there is only the object's own texture."""
     if isinstance(scene, PieceScene):
         return scene

@@ -15,16 +15,16 @@ import numpy as np
 
 from patchproof.base import geometry
 from patchproof.base.errors import Refused
-from patchproof.base.validation import expand
-from patchproof.channel.boxes import box_of, outermost
-from patchproof.channel.cameras import camera_of
+from patchproof.base.validation import expand_path
+from patchproof.channel.cameras import load_optional_camera
 from patchproof.channel.effects import Pose
+from patchproof.channel.object_box import hull_points, project_box
 from patchproof.mesh.load_mesh import load_mesh
 from patchproof.mesh.mesh import Mesh
 from patchproof.scene.backgrounds import Backgrounds, load_backgrounds
 from patchproof.scene.conditions import Conditions, Stream
-from patchproof.scene.interface import SCALE_VIEWS, Part, Scene, SceneSource
-from patchproof.scene.placement import Frame, view_frame
+from patchproof.scene.interface import SCALE_VIEWS, Scene, SceneSource, SceneTerm
+from patchproof.scene.placement import SurfaceFrame, view_frame
 
 CLEARANCE = 5e-3  # of the object's length between it and a camera: what is nearer than the near plane would vanish
 
@@ -34,12 +34,12 @@ class MeshScene(Scene):
     """An object with a mesh before its backgrounds; by itself, with nothing on it."""
 
     mesh: Mesh
-    frame: Frame  # from which azimuths count, of cameras and lights
+    frame: SurfaceFrame  # from which azimuths count, of cameras and lights
     backgrounds: Backgrounds
 
     HAS_OBJECT = True
-    LEARNED: ClassVar[bool] = False  # whether the object's own texture is what changes
-    PARTS = (Part("lens distortion", "camera.file"),)
+    LEARNS_TEXTURE: ClassVar[bool] = False  # whether the object's own texture is what changes
+    TERMS = (SceneTerm("lens distortion", "camera.file"),)
     OMITTED = (
         "cast shadows: a 10 mm ledge along the top of a 110 mm patch takes 4 % of its light, 9 % at the 95 % point",
         "(computed for the default ranges, see channel/light); interreflection; "
@@ -88,7 +88,7 @@ class MeshScene(Scene):
         """The focal length of whole photographs."""
         return float(self.matrix_px(self.photo_px)[0, 0])
 
-    def without(self, part: Part) -> Self | None:
+    def without(self, part: SceneTerm) -> Self | None:
         """The scene without its lens's distortion; None where there is none."""
         if self.camera is None or not self.camera.bends:
             return None
@@ -105,7 +105,7 @@ class MeshScene(Scene):
     def printed_from_sheet(self, conditions: Conditions) -> np.ndarray:
         """N×4×4: all about the piece's middle is scaled as it is printed, which keeps a card in its plane."""
         middle_mm = self.middle_mm
-        return np.stack([geometry.scaled_about(middle_mm, scale) for scale in conditions.pose.printed_scale])
+        return np.stack([geometry.scaling_about(middle_mm, scale) for scale in conditions.pose.printed_scale])
 
     def matrix_px(self, size_px: tuple[int, int]) -> np.ndarray:
         """3×3 pinhole matrix of the scene's camera for a picture of this size."""
@@ -123,12 +123,15 @@ class MeshScene(Scene):
         side_px = min(self.photo_px)
         size_px = side_px, side_px
         matrix_px, poses = self.matrix_px(size_px), self.camera_from_world(conditions)
-        return np.stack([box_of(self.outermost_mm, pose, matrix_px, size_px, self.camera) for pose in poses]) / side_px
+        return (
+            np.stack([project_box(self.outermost_mm, pose, matrix_px, size_px, self.camera) for pose in poses])
+            / side_px
+        )
 
     @cached_property
     def outermost_mm(self) -> np.ndarray:
         """P×3 points of the mesh that its box in any view depends on."""
-        return outermost(self.mesh.vertices)
+        return hull_points(self.mesh.vertices)
 
     def cosines(self, azimuth_deg: np.ndarray, elevation_deg: np.ndarray) -> np.ndarray:
         """N cosines between the normal and directions, 0 from behind."""
@@ -146,7 +149,7 @@ class MeshScene(Scene):
         return self.matrix_px(size_px)[0, 0] / self.draw("select", SCALE_VIEWS, 0).pose.distance_mm
 
 
-def needs_mesh(scene: Scene, expected: str = "a scene with a mesh", do: str = "name object.mesh") -> MeshScene:
+def require_mesh(scene: Scene, expected: str = "a scene with a mesh", do: str = "name object.mesh") -> MeshScene:
     """The scene as one with a mesh; refused of pictures."""
     if isinstance(scene, MeshScene):
         return scene
@@ -155,13 +158,13 @@ def needs_mesh(scene: Scene, expected: str = "a scene with a mesh", do: str = "n
 
 def load_bare(source: SceneSource) -> MeshScene:
     """The object of a scene's settings, with nothing on it."""
-    settings, base, given_glb = source.settings, source.base, source.given_glb
+    settings, base, mesh_glb = source.settings, source.base, source.mesh_glb
     settings_object, camera = settings.object, settings.camera
     if settings_object.mesh is None or settings_object.length_mm is None:
         raise ValueError("a scene with a mesh names it")
-    mesh = load_mesh(expand(settings_object.mesh, base), settings_object.length_mm, settings_object.up, given_glb)
+    mesh = load_mesh(expand_path(settings_object.mesh, base), settings_object.length_mm, settings_object.up, mesh_glb)
     backgrounds = load_backgrounds(settings.background, base)
-    known = {} if given_glb is None else {"mesh": hashlib.sha256(given_glb).hexdigest()}
+    known = {} if mesh_glb is None else {"mesh": hashlib.sha256(mesh_glb).hexdigest()}
     return MeshScene(
         settings,
         base,
@@ -172,8 +175,8 @@ def load_bare(source: SceneSource) -> MeshScene:
         backgrounds,
         notes=(*mesh.warnings, *backgrounds.notes),
         known=known,
-        camera=camera_of(camera.file, base, camera.photo_px),
-        given_glb=given_glb,
+        camera=load_optional_camera(camera.file, base, camera.photo_px),
+        mesh_glb=mesh_glb,
     )
 
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from patchproof.base.color import LIGHT_OF_CODE
+from patchproof.base.color import LINEAR_FROM_CODE
 from patchproof.base.geometry import apply_homography, local_scale, rect_corners
 from patchproof.photo.quality import CLIPPED_CODE
 from patchproof.photo.rejection import PhotoRejected
@@ -46,7 +46,7 @@ def paper_light(srgb: np.ndarray, px_from_piece: np.ndarray, piece: Piece, blur_
     if clipped.mean() > _MOST_CLIPPED:
         raise PhotoRejected("clipped", float(clipped.mean()), _MOST_CLIPPED, "the paper is overexposed: expose less")
     codes, mm = codes[~clipped], mm[~clipped]
-    light, terms = LIGHT_OF_CODE[codes], quadratic_terms(mm, piece.size_mm)
+    light, terms = LINEAR_FROM_CODE[codes], quadratic_terms(mm, piece.size_mm)
     coefficients, weight = _robust_fit(terms, light)
     left = light - terms @ coefficients.T
     white = light.mean(0)
@@ -116,6 +116,6 @@ def _noise(left: np.ndarray, white: np.ndarray) -> float:
 
     Shot noise has a variance in proportion to the light (EMVA 1288), hence the division.
     """
-    step = np.interp(white, LIGHT_OF_CODE[:-1], np.diff(LIGHT_OF_CODE))
+    step = np.interp(white, LINEAR_FROM_CODE[:-1], np.diff(LINEAR_FROM_CODE))
     variance = (left**2).mean(0) - step**2 / 12
     return float(np.sqrt(np.maximum(variance / np.maximum(white, 1e-3), 0).mean()))

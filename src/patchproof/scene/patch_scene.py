@@ -15,7 +15,7 @@ from patchproof.base import geometry
 from patchproof.base.errors import Refused
 from patchproof.base.validation import Side
 from patchproof.scene.conditions import Conditions
-from patchproof.scene.fitting import advice
+from patchproof.scene.fitting import placement_advice
 from patchproof.scene.interface import (
     PX_PER_MODULE,
     READABLE_SHARE,
@@ -26,16 +26,16 @@ from patchproof.scene.interface import (
     refuse_without_place,
 )
 from patchproof.scene.mesh_scene import MeshScene, camera_poses, load_bare
-from patchproof.scene.placement import Lay, Placement, patch_frame, place_card
-from patchproof.sheets.markers import MODULES
+from patchproof.scene.placement import Placement, PlacementMethod, patch_frame, place_card
+from patchproof.sheets.markers import MARKER_MODULES
 from patchproof.sheets.piece import Piece, lay_out_piece, marker_size_mm, smallest_piece_mm
 from patchproof.sheets.template import load_template
 from patchproof.sheets.tiles import refuse_larger_than_page
 
 if TYPE_CHECKING:
-    from patchproof.scene.tape import Tape
+    from patchproof.scene.tape_measure import TapeMeasurement
 
-At = tuple[float, float, float] | Side  # a point of the scene in millimeters, or the middle of a side
+PiecePosition = tuple[float, float, float] | Side  # a point of the scene in millimeters, or the middle of a side
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class PatchScene(PieceScene, MeshScene):
     placement: Placement
     unreadable: float
     EFFECT_TABLES = ("light", "printer", "camera")
-    LAY: ClassVar[Lay] = staticmethod(place_card)  # how the piece lies on the surface
+    LAY: ClassVar[PlacementMethod] = staticmethod(place_card)  # how the piece lies on the surface
 
     @classmethod
     def on(cls, bare: MeshScene) -> Self:
@@ -113,7 +113,7 @@ class PatchScene(PieceScene, MeshScene):
         poses = self.camera_from_world(conditions) @ self.placement.world_from_piece
         return np.array([geometry.view_angles(pose, middle)[0] for pose in poses])
 
-    def tapes(self) -> tuple[Tape, ...]:
+    def tapes(self) -> tuple[TapeMeasurement, ...]:
         """What a tape measure says beside the piece, as one faces its side; of a card, whose edges do, nothing."""
         return ()
 
@@ -122,8 +122,8 @@ class PatchScene(PieceScene, MeshScene):
         light = conditions.light
         return light.ambient + light.directional * self.cosines(light.light_azimuth_deg, light.light_elevation_deg)
 
-    def printed_at(self, scale: tuple[float, float]) -> Self:
-        """As in `PieceScene.printed_at`."""
+    def with_print_scale(self, scale: tuple[float, float]) -> Self:
+        """As in `PieceScene.with_print_scale`."""
         if scale == (1.0, 1.0):
             return self
         placement, by = self.placement, np.array(scale)
@@ -140,7 +140,7 @@ def build(source: SceneSource) -> PatchScene:
     return PatchScene.on(load_bare(source))
 
 
-def needs_patch(scene: Scene, expected: str = "a scene with a patch on a mesh") -> PatchScene:
+def require_patch(scene: Scene, expected: str = "a scene with a patch on a mesh") -> PatchScene:
     """The scene as one with a piece that lies on a mesh; refused of any other."""
     if isinstance(scene, PatchScene):
         return scene
@@ -148,17 +148,17 @@ def needs_patch(scene: Scene, expected: str = "a scene with a patch on a mesh") 
     raise Refused(expected, scene.description(), 'name object.mesh, and leave patch.kind out or "patch"')
 
 
-def _hang(scene: MeshScene, lay: Lay) -> tuple[Piece, Placement, float, tuple[str, ...]]:
+def _hang(scene: MeshScene, lay: PlacementMethod) -> tuple[Piece, Placement, float, tuple[str, ...]]:
     """The piece with markers as large as views need, its placement, the share of views that ask for larger, notes."""
     settings, mesh, patch = scene.settings, scene.mesh, scene.settings.patch
     try:
         placement = lay(mesh, patch_frame(mesh, patch), patch.size_mm, patch.spin_deg)
     except Refused as refused:
-        raise refused.advised(advice(mesh, patch, lay, smallest_piece_mm())) from refused
+        raise refused.with_advice(placement_advice(mesh, patch, lay, smallest_piece_mm())) from refused
     scales = _smallest_scales(scene, placement)
     if not len(scales):
         raise Refused("views from which the patch can be seen", "none", "turn azimuth_deg towards the patch")
-    needed_mm = float(MODULES * PX_PER_MODULE / np.quantile(scales, 1 - READABLE_SHARE))
+    needed_mm = float(MARKER_MODULES * PX_PER_MODULE / np.quantile(scales, 1 - READABLE_SHARE))
     marker_mm = marker_size_mm(needed_mm, patch.size_mm)
     piece = lay_out_piece(patch.size_mm, marker_mm, scene.sheet_id, "design", patch.bend)
     refuse_larger_than_page(load_template(settings.sheet.template), piece)  # before hours of optimizing

@@ -13,10 +13,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from patchproof.base.color import codes_of
+from patchproof.base.color import codes_from_srgb
 
 _SQUARE_PX = 4  # whose corners are asked for their nearest point first; with 8 textures took up to half as long again
-Picture = Callable[[], np.ndarray]  # drawn, but not made yet: of what nobody sees, nothing else is needed
+PictureMaker = Callable[[], np.ndarray]  # drawn, but not made yet: of what nobody sees, nothing else is needed
 
 
 def texture(rng: np.random.Generator, px: int = 64) -> np.ndarray:
@@ -24,7 +24,7 @@ def texture(rng: np.random.Generator, px: int = 64) -> np.ndarray:
     return drawn_texture(rng, px)()
 
 
-def drawn_texture(rng: np.random.Generator, px: int) -> Picture:
+def drawn_texture(rng: np.random.Generator, px: int) -> PictureMaker:
     """The same when it is called; all that is random in it is drawn now."""
     blend = _PATTERNS[int(rng.choice(len(_PATTERNS), p=_SHARES))](rng, px)
     first, second, uneven = color(rng), color(rng), rng.random() < 0.5
@@ -63,7 +63,7 @@ def background(rng: np.random.Generator, px: int = 128) -> np.ndarray:
         picture[covered] = stuff[covered] if stuff.ndim == 3 else stuff
     picture = picture * (1 + rng.uniform(0, 0.8) * (_gradient(rng, px).mean(2, keepdims=True) - 0.5))  # uneven light
     blur_px = float(rng.choice([0.3, 0.6, 1.0, 2.0, 3.0], p=[0.35, 0.25, 0.2, 0.1, 0.1]))
-    return codes_of(cv2.GaussianBlur(picture, (0, 0), blur_px))
+    return codes_from_srgb(cv2.GaussianBlur(picture, (0, 0), blur_px))
 
 
 def color(rng: np.random.Generator) -> np.ndarray:
@@ -72,7 +72,7 @@ def color(rng: np.random.Generator) -> np.ndarray:
     return strong.mean() + (strong - strong.mean()) * rng.uniform(0, 1) ** 1.5
 
 
-def natural(rng: np.random.Generator, px: int) -> Picture:
+def natural(rng: np.random.Generator, px: int) -> PictureMaker:
     """P×P in [0, 1]: noise with amplitude 1/f^a, the mean and spread of a photograph."""
     squeeze = np.exp(rng.normal(0, 0.4))  # grass and water have a direction
     noise, steepness = rng.normal(size=(px, px)), rng.uniform(0.5, 1.6)
@@ -87,7 +87,7 @@ def natural(rng: np.random.Generator, px: int) -> Picture:
     return made
 
 
-def _clouds(rng: np.random.Generator, px: int) -> Picture:
+def _clouds(rng: np.random.Generator, px: int) -> PictureMaker:
     import cv2
 
     steepness, octaves = rng.uniform(0.4, 0.9), [rng.random((2 ** (octave + 1) + 1,) * 2) for octave in range(5)]
@@ -101,7 +101,7 @@ def _clouds(rng: np.random.Generator, px: int) -> Picture:
     return made
 
 
-def _cells(rng: np.random.Generator, px: int) -> Picture:
+def _cells(rng: np.random.Generator, px: int) -> PictureMaker:
     """Gravel, leaves, a crowd: each pixel has the shade of its nearest of some points."""
     points = rng.random((int(np.exp(rng.uniform(np.log(8), np.log(800)))), 2)) * px
     shades, darker = rng.random(len(points)), rng.uniform(0, 1)
@@ -130,7 +130,7 @@ def _nearest(points: np.ndarray, px: int) -> np.ndarray:
     return index
 
 
-def _bricks(rng: np.random.Generator, px: int) -> Picture:
+def _bricks(rng: np.random.Generator, px: int) -> PictureMaker:
     """Rows of bricks or slabs, each of its own shade, with joints."""
     high, wide, shift = rng.uniform(4, 18), rng.uniform(6, 40), rng.choice([0.5, 0.0, 0.33])
     shade, strength, joints = rng.random((px, px)), rng.uniform(0.1, 0.8), rng.uniform(0.5, 2, 2)
@@ -145,7 +145,7 @@ def _bricks(rng: np.random.Generator, px: int) -> Picture:
     return made
 
 
-def _stripes(rng: np.random.Generator, px: int) -> Picture:
+def _stripes(rng: np.random.Generator, px: int) -> PictureMaker:
     turn, waves, least = rng.uniform(0, np.pi), rng.uniform(1.5, 14), rng.uniform(-0.8, 0.8)
 
     def made() -> np.ndarray:
@@ -155,7 +155,7 @@ def _stripes(rng: np.random.Generator, px: int) -> Picture:
     return made
 
 
-def _checks(rng: np.random.Generator, px: int) -> Picture:
+def _checks(rng: np.random.Generator, px: int) -> PictureMaker:
     waves = rng.uniform(1.5, 14)
 
     def made() -> np.ndarray:
@@ -165,12 +165,12 @@ def _checks(rng: np.random.Generator, px: int) -> Picture:
     return made
 
 
-def _grain(rng: np.random.Generator, px: int) -> Picture:
+def _grain(rng: np.random.Generator, px: int) -> PictureMaker:
     grain = rng.random((px, px))
     return lambda: grain
 
 
-def _plain(rng: np.random.Generator, px: int) -> Picture:
+def _plain(rng: np.random.Generator, px: int) -> PictureMaker:
     return lambda: np.zeros((px, px))
 
 

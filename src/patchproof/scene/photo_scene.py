@@ -26,17 +26,17 @@ import numpy as np
 from patchproof.base.errors import Refused
 from patchproof.base.input import is_file, is_folder
 from patchproof.base.settings import SceneSettings
-from patchproof.base.validation import expand
-from patchproof.photo.complete import complete
+from patchproof.base.validation import expand_path
 from patchproof.photo.detect import find_markers
-from patchproof.photo.limits import limited
+from patchproof.photo.known_page import complete_markers
+from patchproof.photo.limits import run_limited
 from patchproof.photo.quality import blur_px
 from patchproof.photo.read import SUFFIXES, read_photo
 from patchproof.photo.rectify import PageFit, corner_uncertainty_mm, fit_page
 from patchproof.photo.rejection import PhotoRejected
 from patchproof.scene import flat
 from patchproof.scene.conditions import Conditions
-from patchproof.scene.interface import Part, SceneSource
+from patchproof.scene.interface import SceneSource, SceneTerm
 from patchproof.scene.paper_light import PaperLight, paper_light
 from patchproof.sheets.blank import blank_piece
 from patchproof.sheets.manifest import Manifest, load_manifest
@@ -57,23 +57,23 @@ class BasePhoto:
     """One usable photograph: homography to its pixels at the scene's `photo_px`, and what was measured on its paper."""
 
     name: str
-    picture: flat.Picture
+    picture: flat.BasePicture
     photo_from_piece: np.ndarray
     light: PaperLight
     blur_px: float
 
 
-EVEN_LIGHT = Part("uneven light on paper")
-OWN_BLUR = Part("photographs' own blur", whole=True)
-OWN_NOISE = Part("photographs' own noise", whole=True)
+EVEN_LIGHT = SceneTerm("uneven light on paper")
+OWN_BLUR = SceneTerm("photographs' own blur", whole=True)
+OWN_NOISE = SceneTerm("photographs' own noise", whole=True)
 
 
 @dataclass(frozen=True)
-class PhotoScene(flat.FlatScene):
+class PhotoScene(flat.PictureScene):
     """A scene whose base pictures are photographs of the object with a blank sheet on it."""
 
     photos: tuple[BasePhoto, ...]
-    PARTS = (EVEN_LIGHT, OWN_BLUR, OWN_NOISE)
+    TERMS = (EVEN_LIGHT, OWN_BLUR, OWN_NOISE)
 
     def description(self) -> str:
         """How many photographs there are."""
@@ -83,7 +83,7 @@ class PhotoScene(flat.FlatScene):
         refuse_larger_than_page(load_template(self.settings.sheet.template), self.piece)
         return replace(self, piece=with_ids(self.piece, self.sheet_id, "design"))
 
-    def without(self, part: Part) -> Self | None:
+    def without(self, part: SceneTerm) -> Self | None:
         """The scene with photographs that light their paper evenly, or without their own blur or noise."""
         photos, even = self.photos, [1.0, 0, 0, 0, 0, 0]
         if part == EVEN_LIGHT:
@@ -107,14 +107,14 @@ class PhotoScene(flat.FlatScene):
     def pictures(self, conditions: Conditions, size_px: tuple[int, int]) -> np.ndarray:
         """N×H×W×3 uint8 sRGB: the photographs, turned, zoomed and shifted, with the blank sheet still on them."""
         views = zip(self._chosen(conditions), self._view_from_photo(conditions), strict=True)
-        return np.stack([flat.show(photo.picture, matrix, self.photo_px, size_px) for photo, matrix in views])
+        return np.stack([flat.warp_picture(photo.picture, matrix, self.photo_px, size_px) for photo, matrix in views])
 
     def piece_light(self, conditions: Conditions) -> np.ndarray:
         """N×3×6 coefficients as in `FlatScene.piece_light`, in light of the photograph: 1 is its full white."""
         return np.stack([photo.light.coefficients for photo in self._chosen(conditions)])
 
-    def own_blur_and_noise(self, conditions: Conditions) -> tuple[np.ndarray, np.ndarray]:
-        """As in `Scene.own_blur_and_noise`; zoom enlarges the blur with the picture."""
+    def picture_blur_and_noise(self, conditions: Conditions) -> tuple[np.ndarray, np.ndarray]:
+        """As in `Scene.picture_blur_and_noise`; zoom enlarges the blur with the picture."""
         chosen = self._chosen(conditions)
         blur_px = np.array([photo.blur_px for photo in chosen]) * self._zoom(conditions)
         return blur_px, np.array([photo.light.noise for photo in chosen])
@@ -130,7 +130,7 @@ class PhotoScene(flat.FlatScene):
         middle, side = np.array(self.photo_px) / 2, min(self.photo_px)
         shifts = conditions.pose.look_at_offset[:, :2] * side
         views = zip(conditions.pose.roll_deg, self._zoom(conditions), shifts, strict=True)
-        return [flat.turned(roll, zoom, shift, middle) for roll, zoom, shift in views]
+        return [flat.similarity_matrix(roll, zoom, shift, middle) for roll, zoom, shift in views]
 
 
 def build(source: SceneSource) -> PhotoScene:
@@ -143,10 +143,10 @@ def build(source: SceneSource) -> PhotoScene:
     photos, sheet = settings.object.photos, settings.object.sheet
     if photos is None or sheet is None:
         raise ValueError("a scene of photographs names them and their sheet")
-    manifest = load_manifest(expand(sheet, base))
+    manifest = load_manifest(expand_path(sheet, base))
     blank = blank_piece(manifest)
     settings = _with_size(settings, blank.size_mm)
-    folder = Path(expand(photos, base))
+    folder = Path(expand_path(photos, base))
     known = {"blank": manifest.sheet_id, "photos": _digest(folder)}
     identity = replace(source, settings=settings).sheet_id(known)
     piece = with_ids(blank, identity, "design")
@@ -161,7 +161,7 @@ def build(source: SceneSource) -> PhotoScene:
     return PhotoScene(settings, base, source.seed, identity, piece, base_photos, notes=tuple(warnings), known=known)
 
 
-def see(path: Path, manifest: Manifest, piece: Piece, photo_px: tuple[int, int]) -> BasePhoto:
+def measure_photo(path: Path, manifest: Manifest, piece: Piece, photo_px: tuple[int, int]) -> BasePhoto:
     """What one photograph of the blank sheet says; `PhotoRejected` where it cannot be used."""
     srgb = read_photo(path).srgb
     fit, blur = _locate(srgb, manifest, min(piece.size_mm))
@@ -196,7 +196,7 @@ def _see_all(folder: Path, manifest: Manifest, piece: Piece, photo_px) -> tuple[
     files, photos, skipped = _files(folder), [], {}
     for path in files:
         try:
-            photos.append(limited(see, path, manifest, piece, photo_px))
+            photos.append(run_limited(measure_photo, path, manifest, piece, photo_px))
         except PhotoRejected as cannot:
             skipped[path.name] = cannot.code
     if len(photos) < LEAST_PHOTOS:
@@ -226,7 +226,7 @@ def _locate(srgb: np.ndarray, manifest: Manifest, side_mm: float) -> tuple[PageF
         if found.foreign:
             raise PhotoRejected("wrong_sheet", len(found.foreign), 0, "these are the markers of another sheet")
         raise PhotoRejected("too_few_markers", 0, 3, "no marker of the piece is readable")
-    found = complete(srgb, found, on_piece)
+    found = complete_markers(srgb, found, on_piece)
     borders = [b for i, b in found.markers.items() if b.fitted and i in on_piece]
     if len(borders) < 3:
         raise PhotoRejected("too_few_markers", len(borders), 3, "show the whole piece, sharp and well lit")

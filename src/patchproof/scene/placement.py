@@ -13,11 +13,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from patchproof.base.errors import Refused
-from patchproof.base.geometry import turned_extent
+from patchproof.base.geometry import rotated_extent
 from patchproof.base.settings import PatchSettings, SceneSettings
 from patchproof.base.validation import Side
 from patchproof.mesh.mesh import Mesh
-from patchproof.mesh.surface import Chart, heights
+from patchproof.mesh.surface_chart import SurfaceChart, surface_heights
 
 GRID = 65  # heights are sampled on this many points along each edge of the card
 LIFT_MM = 0.15  # the paper's own thickness, which also keeps it clear of the surface in the z-buffer
@@ -94,7 +94,7 @@ class Placement:
 
 
 @dataclass(frozen=True)
-class Frame:
+class SurfaceFrame:
     """Axes of the place a patch faces: unit vectors in the world, and the point the patch is centered at."""
 
     right: np.ndarray
@@ -105,10 +105,10 @@ class Frame:
 
 
 # lays a piece of that size and spin (degrees) on a mesh at a frame's origin; refuses in one sentence
-Lay = Callable[[Mesh, Frame, tuple[float, float], float], Placement]
+PlacementMethod = Callable[[Mesh, SurfaceFrame, tuple[float, float], float], Placement]
 
 
-def patch_frame(mesh: Mesh, patch: PatchSettings) -> Frame:
+def patch_frame(mesh: Mesh, patch: PatchSettings) -> SurfaceFrame:
     """The frame of the patch's side, or of the surface point nearest to `at_mm`."""
     if patch.at_mm is None:
         frame = side_frame(mesh, patch.side)
@@ -118,7 +118,7 @@ def patch_frame(mesh: Mesh, patch: PatchSettings) -> Frame:
     return replace(frame, origin_mm=origin)
 
 
-def view_frame(mesh: Mesh, settings: SceneSettings) -> Frame:
+def view_frame(mesh: Mesh, settings: SceneSettings) -> SurfaceFrame:
     """The frame from which azimuths count, of cameras and lights: the patch's own, or that of `view.front`. A piece
     that is still to be placed is seen as on its side.
     """
@@ -126,7 +126,7 @@ def view_frame(mesh: Mesh, settings: SceneSettings) -> Frame:
     return patch_frame(mesh, settings.patch) if front == "patch" else side_frame(mesh, front)
 
 
-def side_frame(mesh: Mesh, side: Side) -> Frame:
+def side_frame(mesh: Mesh, side: Side) -> SurfaceFrame:
     """The frame in the middle of a side of the object's bounding box."""
     low, high = mesh.ends_mm
     up, normal = (np.array(v, float) for v in _SIDES[side])
@@ -134,7 +134,7 @@ def side_frame(mesh: Mesh, side: Side) -> Frame:
     return _frame(mesh, np.cross(up, normal), up, normal, middle)
 
 
-def surface_frame(mesh: Mesh, point_mm: np.ndarray, normal: np.ndarray) -> Frame:
+def surface_frame(mesh: Mesh, point_mm: np.ndarray, normal: np.ndarray) -> SurfaceFrame:
     """The frame at a point of the surface with that unit normal, as level as it can be."""
     level = np.array([0.0, 1, 0]) if abs(normal[1]) < 0.99 else np.array([0.0, 0, -1])
     right = np.cross(level, normal)
@@ -142,12 +142,12 @@ def surface_frame(mesh: Mesh, point_mm: np.ndarray, normal: np.ndarray) -> Frame
     return _frame(mesh, right, np.cross(normal, right), normal, point_mm)
 
 
-def _frame(mesh: Mesh, right: np.ndarray, up: np.ndarray, normal: np.ndarray, origin_mm: np.ndarray) -> Frame:
+def _frame(mesh: Mesh, right: np.ndarray, up: np.ndarray, normal: np.ndarray, origin_mm: np.ndarray) -> SurfaceFrame:
     wide, high = np.ptp(mesh.vertices @ np.stack([right, up], 1), axis=0).tolist()
-    return Frame(right, up, normal, origin_mm, (wide, high))
+    return SurfaceFrame(right, up, normal, origin_mm, (wide, high))
 
 
-def place_card(mesh: Mesh, frame: Frame, size_mm: tuple[float, float], spin_deg: float) -> Placement:
+def place_card(mesh: Mesh, frame: SurfaceFrame, size_mm: tuple[float, float], spin_deg: float) -> Placement:
     """Lay a card of `size_mm` on the surface, its middle at the frame's origin; spin turns it clockwise as one faces
     it. Refused where it is larger than the object's side.
     """
@@ -155,12 +155,14 @@ def place_card(mesh: Mesh, frame: Frame, size_mm: tuple[float, float], spin_deg:
     return lay_card(mesh.vertices[mesh.faces], frame, size_mm, spin_deg)
 
 
-def lay_card(triangles: np.ndarray, frame: Frame, size_mm, spin_deg: float, reach_mm: float = np.inf) -> Placement:
+def lay_card(
+    triangles: np.ndarray, frame: SurfaceFrame, size_mm, spin_deg: float, reach_mm: float = np.inf
+) -> Placement:
     """`place_card` of any size on triangles F×3×3; surface over `reach_mm` from the frame's plane does not count."""
     width, height = size_mm
-    right, up = spun(frame, spin_deg)
-    chart = Chart(frame.origin_mm, np.stack([right, up, frame.normal]), 0.0, np.array([1.0, 0.0]))
-    surface = heights(chart, triangles, size_mm, GRID, (-reach_mm, reach_mm))
+    right, up = spun_axes(frame, spin_deg)
+    chart = SurfaceChart(frame.origin_mm, np.stack([right, up, frame.normal]), 0.0, np.array([1.0, 0.0]))
+    surface = surface_heights(chart, triangles, size_mm, GRID, (-reach_mm, reach_mm))
     hit = np.isfinite(surface)
     if not hit.any():
         raise Refused("a patch that lies on the object", "no surface under it", "change offset_mm or at_mm")
@@ -169,7 +171,7 @@ def lay_card(triangles: np.ndarray, frame: Frame, size_mm, spin_deg: float, reac
     inside = (np.abs(peaks) <= [width / 2, height / 2, reach_mm]).all(1)
     top = max(surface[hit].max(), peaks[inside, 2].max(initial=-np.inf))
     gaps = top - surface[hit]
-    pose = pose_of(right, up, frame.normal, frame.origin_mm + frame.normal * (top + LIFT_MM), size_mm)
+    pose = piece_pose(right, up, frame.normal, frame.origin_mm + frame.normal * (top + LIFT_MM), size_mm)
     corners = np.array([[0, 0], [width, 0], [width, height], [0, height]], float)
     gap_mm = float(gaps.max())
     return Placement(
@@ -190,7 +192,7 @@ def lay_card(triangles: np.ndarray, frame: Frame, size_mm, spin_deg: float, reac
     )
 
 
-def pose_of(right: np.ndarray, up: np.ndarray, normal: np.ndarray, middle_mm: np.ndarray, size_mm) -> np.ndarray:
+def piece_pose(right: np.ndarray, up: np.ndarray, normal: np.ndarray, middle_mm: np.ndarray, size_mm) -> np.ndarray:
     """4×4 world from piece of a piece with its middle there."""
     pose = np.eye(4)
     pose[:3, :3] = np.stack([right, -up, -normal], 1)
@@ -198,7 +200,7 @@ def pose_of(right: np.ndarray, up: np.ndarray, normal: np.ndarray, middle_mm: np
     return pose
 
 
-def spun(frame: Frame, spin_deg: float) -> tuple[np.ndarray, np.ndarray]:
+def spun_axes(frame: SurfaceFrame, spin_deg: float) -> tuple[np.ndarray, np.ndarray]:
     """The piece's right and up in the world."""
     c, s = np.cos(np.radians(spin_deg)), np.sin(np.radians(spin_deg))
     return c * frame.right - s * frame.up, s * frame.right + c * frame.up
@@ -206,7 +208,7 @@ def spun(frame: Frame, spin_deg: float) -> tuple[np.ndarray, np.ndarray]:
 
 def refuse_larger_than_side(size_mm: tuple[float, float], spin_deg: float, extent_mm) -> None:
     """A card may not reach beyond the object's outline; 0.5 % of slack for rounded figures."""
-    across, along = turned_extent(size_mm, spin_deg)
+    across, along = rotated_extent(size_mm, spin_deg)
     if across > 1.005 * extent_mm[0] or along > 1.005 * extent_mm[1]:
         expected = f"a piece no larger than the object's side ({extent_mm[0]:.0f} × {extent_mm[1]:.0f} mm)"
         got = f"{across:.0f} × {along:.0f} mm"

@@ -17,7 +17,7 @@ import numpy as np
 
 from patchproof.base.output import write_pictures
 from patchproof.base.settings import SceneSettings, load_scene_settings
-from patchproof.base.validation import validated
+from patchproof.base.validation import validate_model
 from patchproof.scene.interface import Scene, SceneSource
 
 if TYPE_CHECKING:
@@ -54,9 +54,9 @@ def make_scene(
     models: dict[str, Any] = {}
     if not isinstance(settings, SceneSettings):
         named, given_mesh, models = _named(settings, Path(base))
-        settings, mesh = validated(SceneSettings, named, "the scene's settings"), mesh or given_mesh
+        settings, mesh = validate_model(SceneSettings, named, "the scene's settings"), mesh or given_mesh
     glb: Any = None if mesh is None else mesh.export(file_type="glb")
-    scene = build_scene(settings, Path(base), seed, given_glb=glb)
+    scene = build_scene(settings, Path(base), seed, mesh_glb=glb)
     return replace(scene, given_models=models) if models else scene
 
 
@@ -95,13 +95,13 @@ def build_scene(
     settings: SceneSettings,
     base: Path,
     seed: int | None = None,
-    printed_id: str | None = None,
-    given_glb: bytes | None = None,
+    printed_sheet_id: str | None = None,
+    mesh_glb: bytes | None = None,
 ) -> Scene:
-    """The scene of settings whose paths are relative to `base`; `printed_id` is the sheet id of its print, if any."""
+    """The scene of settings whose paths are relative to `base`; `printed_sheet_id` is the sheet id of its print, if any."""
     seed = settings.optimize.seed if seed is None else seed
     module = import_module(f"patchproof.scene.{module_of(settings)}")
-    return module.build(SceneSource(settings, base, seed, printed_id, given_glb))
+    return module.build(SceneSource(settings, base, seed, printed_sheet_id, mesh_glb))
 
 
 def module_of(settings: SceneSettings) -> str:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from patchproof.scene.canvas import Canvas, texture_canvas
 from patchproof.scene.interface import SceneSource
 from patchproof.scene.mesh_scene import MeshScene, load_bare
-from patchproof.scene.texture import Canvas, texture_canvas
 
 
 @dataclass(frozen=True)
@@ -14,10 +14,10 @@ class TextureScene(MeshScene):
     """An object some of whose own texels may change."""
 
     canvas: Canvas
-    LEARNED = True
+    LEARNS_TEXTURE = True
 
-    def own_texture(self) -> Canvas:
-        """As in `Scene.own_texture`."""
+    def object_canvas(self) -> Canvas:
+        """As in `Scene.object_canvas`."""
         return self.canvas
 
 

@@ -14,9 +14,9 @@ from pathlib import Path
 
 from patchproof.base.errors import Refused
 from patchproof.sheets.board import board_sheet, is_board
-from patchproof.sheets.content import PrintedPiece
+from patchproof.sheets.content import SheetContent
 from patchproof.sheets.manifest import Manifest
-from patchproof.sheets.markers import MODULES
+from patchproof.sheets.markers import MARKER_MODULES
 from patchproof.sheets.page import lay_out_parts
 from patchproof.sheets.piece import (
     Piece,
@@ -27,7 +27,7 @@ from patchproof.sheets.piece import (
     moved_marker,
     page_id,
 )
-from patchproof.sheets.rects import holds
+from patchproof.sheets.rects import rect_contains
 from patchproof.sheets.template import Template, load_template, template_names
 from patchproof.sheets.write import write_page, write_sheet
 
@@ -55,7 +55,7 @@ def blank_sheet(template: str | Path, pdf_path: str | Path) -> Manifest:
     identity = page_id(page)
     piece = lay_out_piece(page.blank.piece_mm, page.blank.marker_mm, identity, BLANK)
     settings = {BLANK: page.blank.model_dump(mode="json")}
-    return write_sheet(pdf_path, page, PrintedPiece(piece, identity, BLANK, None, settings=settings))
+    return write_sheet(pdf_path, page, SheetContent(piece, identity, BLANK, None, settings=settings))
 
 
 def chart_sheet(template: Template, pdf_path: str | Path) -> Manifest:
@@ -77,7 +77,7 @@ def blank_piece(manifest: Manifest) -> Piece:
         raise Refused("the manifest of a blank sheet", got, "name the JSON beside BLANK.pdf")
     x, y, width, height = manifest.cut_mm
     markers = [PieceMarker(m.id, m.corners_mm) for m in manifest.markers if m.page == 1]
-    inside = [moved_marker(m, (-x, -y)) for m in markers if holds(manifest.cut_mm, marker_rect(m))]
+    inside = [moved_marker(m, (-x, -y)) for m in markers if rect_contains(manifest.cut_mm, marker_rect(m))]
     if not inside:
         raise Refused("markers within the blank's cut line", "none", "name the JSON beside BLANK.pdf")
-    return Piece((width, height), tuple(inside), round(marker_rect(inside[0])[2] / MODULES, 6))
+    return Piece((width, height), tuple(inside), round(marker_rect(inside[0])[2] / MARKER_MODULES, 6))

@@ -12,12 +12,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from patchproof.base.errors import Refused
-from patchproof.base.validation import validated
+from patchproof.base.validation import validate_model
 from patchproof.sheets.layout import Box, PageLayout
 from patchproof.sheets.manifest import Manifest, load_manifest
-from patchproof.sheets.markers import DICTIONARY, MODULES, board_squares, marker_corner
+from patchproof.sheets.markers import DICTIONARY, MARKER_MODULES, board_squares, marker_corner
 from patchproof.sheets.page import furnished
-from patchproof.sheets.piece import marker_at, page_id
+from patchproof.sheets.piece import page_id, square_marker
 from patchproof.sheets.rects import RectMm
 from patchproof.sheets.template import BoardGrid, BoardTemplate, template_data, template_names
 from patchproof.sheets.write import write_page
@@ -53,7 +53,7 @@ def load_board(name_or_file: str | Path) -> Board:
     manifest = load_manifest(name_or_file)
     if manifest.kind != KIND:
         raise Refused("the manifest of a board", f'one of kind "{manifest.kind}"', "name the JSON beside BOARD.pdf")
-    grid = validated(BoardGrid, manifest.settings.get(KIND), "the board's manifest")
+    grid = validate_model(BoardGrid, manifest.settings.get(KIND), "the board's manifest")
     return Board(manifest.sheet_id, grid, manifest.ruler_mm)
 
 
@@ -62,14 +62,14 @@ def _load(template: str | Path) -> BoardTemplate:
     if KIND not in data:
         do = f"use one of: {', '.join(template_names(KIND))}"
         raise Refused("a template with a [board] table", f"{template}", do)
-    return validated(BoardTemplate, data, str(path))
+    return validate_model(BoardTemplate, data, str(path))
 
 
 def _lay_out(template: BoardTemplate, identity: str) -> PageLayout:
     grid = template.board
     inset = (grid.square_mm - grid.marker_mm) / 2
-    if inset < grid.marker_mm / MODULES - 1e-6:
-        most = grid.square_mm * MODULES / (MODULES + 2)
+    if inset < grid.marker_mm / MARKER_MODULES - 1e-6:
+        most = grid.square_mm * MARKER_MODULES / (MARKER_MODULES + 2)
         raise Refused(
             f"board.marker_mm of at most {most:.3g}, which leaves a module of white round it",
             f"{grid.marker_mm:g} in squares of {grid.square_mm:g} mm",
@@ -84,7 +84,7 @@ def _lay_out(template: BoardTemplate, identity: str) -> PageLayout:
     words |= {"square": f"{grid.square_mm:g}", "marker": f"{grid.marker_mm:g}"}
     page = PageLayout(
         page_mm=template.page_mm,
-        markers=tuple(marker_at(i, corner, grid.marker_mm) for i, corner in enumerate(corners)),
+        markers=tuple(square_marker(i, corner, grid.marker_mm) for i, corner in enumerate(corners)),
         boxes=(Box("board", _rect(grid)),),
         squares_mm=tuple((x + column * side, y + row * side, side, side) for row, column in black),
     )

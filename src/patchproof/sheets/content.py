@@ -15,13 +15,13 @@ from patchproof.base.errors import Refused
 from patchproof.base.output import image_bytes
 from patchproof.sheets.layout import PageLayout
 from patchproof.sheets.manifest import Design, Manifest, Promise, Swatch, design_sha256
-from patchproof.sheets.piece import Piece, on_paper, printed
+from patchproof.sheets.piece import Piece, manifest_marker, whiten_marker_pixels
 from patchproof.sheets.rects import RectMm, size_text
 from patchproof.sheets.template import BoardTemplate, Template
 
 
 @dataclass(frozen=True, eq=False)
-class PrintedPiece:
+class SheetContent:
     """A piece and what belongs to it; `design_srgb8` is uint8 H×W×3, or None for white paper. Other pixels are refused,
     and those that the markers need become white.
 
@@ -42,7 +42,7 @@ class PrintedPiece:
             return
         if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] != 3 or not pixels.size:
             raise Refused("a design of uint8 H×W×3 pixels", f"{pixels.dtype} {pixels.shape}", "convert it to 8-bit RGB")
-        object.__setattr__(self, "design_srgb8", on_paper(pixels, self.piece))
+        object.__setattr__(self, "design_srgb8", whiten_marker_pixels(pixels, self.piece))
 
     @property
     def code(self) -> str:
@@ -96,7 +96,7 @@ def page_manifest(
         kind=kind,
         page_mm=page.page_mm,
         design=None,
-        markers=tuple(printed(marker) for marker in page.markers),
+        markers=tuple(manifest_marker(marker) for marker in page.markers),
         chart=tuple(Swatch(rect_mm=rect, srgb=srgb, page=1) for rect, srgb in page.swatches),
         cut_mm=cut_mm,
         ruler_mm=(template.ruler.length_mm, template.ruler.length_mm),

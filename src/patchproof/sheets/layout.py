@@ -12,7 +12,7 @@ from itertools import combinations
 
 from patchproof.base.errors import Refused
 from patchproof.sheets.piece import PieceMarker
-from patchproof.sheets.rects import PointMm, RectMm, SwatchRect, grown, holds, meet
+from patchproof.sheets.rects import PointMm, RectMm, SwatchRect, grow_rect, rect_contains, rects_overlap
 from patchproof.sheets.template import Rulers, TextLine
 
 TICK_MM = 0.15
@@ -73,16 +73,16 @@ class PageLayout:
 
 def prove_apart(boxes: tuple[Box, ...], page_mm: tuple[float, float], margin_mm: float) -> None:
     """Refuse a page on which two parts overlap, a part leaves the one that holds it, or anything lies in the margin."""
-    within = grown((0.0, 0.0, *page_mm), -margin_mm)
+    within = grow_rect((0.0, 0.0, *page_mm), -margin_mm)
     by_name = {box.name: box.rect_mm for box in boxes}
     for box in boxes:
-        if not holds(by_name[box.inside] if box.inside else within, box.rect_mm, SLACK_MM):
+        if not rect_contains(by_name[box.inside] if box.inside else within, box.rect_mm, SLACK_MM):
             place, (x, y, w, h) = box.inside or f"the margins of {margin_mm:g} mm", box.rect_mm
             where = f"x {x:.1f} to {x + w:.1f}, y {y:.1f} to {y + h:.1f} mm"
             raise Refused(f"{box.name} within {place}", where, "move or shrink it in the template")
     for a, b in combinations(boxes, 2):
         related = a.name == b.inside or b.name == a.inside
-        if not related and meet(a.rect_mm, b.rect_mm, SLACK_MM):
+        if not related and rects_overlap(a.rect_mm, b.rect_mm, SLACK_MM):
             raise Refused("parts that lie apart", f"{a.name} over {b.name}", "move one of them in the template")
 
 

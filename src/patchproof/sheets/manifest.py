@@ -19,9 +19,9 @@ from pydantic import Field, create_model, field_validator, model_validator
 
 from patchproof.base.errors import Refused
 from patchproof.base.goal import Goal
-from patchproof.base.input import opened_picture, read_json
-from patchproof.base.sessions import Spread, in_sessions, spread_of
-from patchproof.base.validation import Finite, NotNegativeRange, Share, Strict, validated
+from patchproof.base.input import open_image, read_json
+from patchproof.base.sessions import RatePosterior, count_by_session, rate_posterior
+from patchproof.base.validation import Finite, NotNegativeRange, Share, StrictModel, validate_model
 
 Mm = Annotated[Finite, Field(ge=-1e5, le=1e5)]
 SizeMm = Annotated[Finite, Field(ge=0.1, le=1e5)]
@@ -29,20 +29,20 @@ Point = tuple[Mm, Mm]
 Rect = tuple[Mm, Mm, SizeMm, SizeMm]
 Interval = tuple[Share, Share]
 SignedInterval = tuple[Finite, Finite]
-Worth = Literal["better", "no better", "worse"]
+Comparison = Literal["better", "no better", "worse"]
 PAGE_CODE = "^patchproof:([0-9A-Z]{10}):([0-9a-z]+)$"  # what a page's QR code says
 _LEAST_MARKER_MM = 1.0
 Page = Annotated[int, Field(ge=1, le=1000)]
-Side = Annotated[int, Field(ge=1, le=2048)]  # designs have up to 512 pixels
+DesignSidePx = Annotated[int, Field(ge=1, le=2048)]  # designs have up to 512 pixels
 Count = Annotated[int, Field(ge=1, le=1_000_000)]
 
 
-class Design(Strict):
+class Design(StrictModel):
     """The printed pixels and where they lie."""
 
     sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
     rect_mm: Rect
-    size_px: tuple[Side, Side]
+    size_px: tuple[DesignSidePx, DesignSidePx]
     page: Page
     png: str
 
@@ -53,7 +53,7 @@ class Design(Strict):
             png = base64.b64decode(self.png, validate=True)
         except ValueError as error:
             raise Refused(expected, "none that can be read", do) from error
-        with opened_picture(png, expected, do) as image:
+        with open_image(png, expected, do) as image:
             if image.size != self.size_px:
                 raise ValueError(f"{image.width} × {image.height} pixels")
             pixels = np.asarray(image.convert("RGB"))
@@ -62,7 +62,7 @@ class Design(Strict):
         return pixels
 
 
-class Marker(Strict):
+class Marker(StrictModel):
     """One ArUco marker: outer corners of its black square, clockwise from the top-left of the code."""
 
     dictionary: Annotated[str, Field(pattern="^DICT_(4X4|5X5|6X6|7X7)_(50|100|250|1000)$")]
@@ -81,7 +81,7 @@ class Marker(Strict):
         return self
 
 
-class Swatch(Strict):
+class Swatch(StrictModel):
     """One patch of known sRGB color."""
 
     rect_mm: Rect
@@ -89,7 +89,7 @@ class Swatch(Strict):
     page: Page
 
 
-class Tile(Strict):
+class Tile(StrictModel):
     """One page of a piece larger than the page. The piece's markers on it are those within `cut_mm`; the others lie in
     its trimmed margin and on its flaps, and serve to check the page alone.
     """
@@ -106,7 +106,7 @@ class Tile(Strict):
         return self
 
 
-class Target(Strict):
+class Target(StrictModel):
     """What should be recognized; `indices` are the labels that count, the target's first."""
 
     label: str
@@ -114,7 +114,7 @@ class Target(Strict):
     goal: Goal
 
 
-class ModelClaim(Strict):
+class ModelClaim(StrictModel):
     """One network's promised rate. Its name is as written; SHA-256 of its file where there is one; of a detector the
     score from which on its boxes count.
     """
@@ -127,7 +127,7 @@ class ModelClaim(Strict):
     least_score: Share | None = None
 
 
-class ControlClaim(Strict):
+class ControlClaim(StrictModel):
     """A control on `n` of the same conditions; `difference` is the design's rate there minus the control's."""
 
     n: Count
@@ -138,7 +138,7 @@ class ControlClaim(Strict):
     difference_interval: SignedInterval
 
 
-class ConditionClaim(Strict):
+class ConditionClaim(StrictModel):
     """What a photograph can show of one promised condition, and whether it was recognized."""
 
     px_per_mm: Annotated[Finite, Field(ge=0, le=1e4)] | None
@@ -149,7 +149,7 @@ class ConditionClaim(Strict):
     recognized: bool
 
 
-class Promise(Strict):
+class Promise(StrictModel):
     """The predicted rate of the primary (first) model, made before printing: of `n` conditions, `per_session` in a row
     of one session. `places` has a number for each session's place where some share one. A `draft` was made of few
     conditions, to try things out. `outermost_mm` are the object's outermost points in the piece's frame, where a
@@ -180,11 +180,11 @@ class Promise(Strict):
         return -(-self.n // self.per_session)
 
     @cached_property
-    def spread(self) -> Spread:
+    def spread(self) -> RatePosterior:
         """What its conditions say of photographs to come."""
         hits = [condition.recognized for condition in self.conditions]
         places = self.places if len(self.places) == self.sessions else ()
-        return spread_of(*in_sessions(hits, self.per_session, places))
+        return rate_posterior(*count_by_session(hits, self.per_session, places))
 
     @property
     def best_control(self) -> str:
@@ -192,7 +192,7 @@ class Promise(Strict):
         return max(self.controls, key=lambda name: self.target.goal.sign * self.controls[name].rate)
 
     @property
-    def worth(self) -> Worth:
+    def worth(self) -> Comparison:
         """The design beside its best control: "better" or "worse" where the interval of their difference says so."""
         ends = [self.target.goal.sign * end for end in self.controls[self.best_control].difference_interval]
         return "better" if min(ends) > 0 else "worse" if max(ends) < 0 else "no better"
@@ -229,7 +229,7 @@ _Used = _table(
 )
 
 
-class Manifest(Strict):
+class Manifest(StrictModel):
     """A whole SHEET.json; `design` is null on pages that carry none, `promise` on pages that promise nothing."""
 
     version: Literal[2]
@@ -259,7 +259,7 @@ class Manifest(Strict):
             raise ValueError("make the sheet again: design.rect_mm is not cut_mm, and a design fills its piece")
         return self
 
-    def page_from_home(self, page: int) -> np.ndarray:
+    def page_from_design_page(self, page: int) -> np.ndarray:
         """3×3 from the millimeters that a piece of tiles has, those of the design's page (the first tile's without a
         design), to another tile's; pages without a tile keep their own.
         """
@@ -283,4 +283,4 @@ def load_manifest(path: str | Path) -> Manifest:
     """A SHEET.json; refused in one sentence where it is missing, broken, or not one."""
     beside = "name the JSON that was written beside the PDF"
     data = read_json(path, "a manifest (SHEET.json)", "make the sheet again", beside)
-    return validated(Manifest, data, str(path))
+    return validate_model(Manifest, data, str(path))

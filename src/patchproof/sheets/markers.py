@@ -13,21 +13,21 @@ import numpy as np
 from patchproof.sheets.rects import PointMm
 
 DICTIONARY = "DICT_5X5_1000"
-MODULES = 7  # a 5×5 code and its black border
+MARKER_MODULES = 7  # a 5×5 code and its black border
 
 
-def printed_markers(dictionary: str):
+def aruco_dictionary(dictionary: str):
     """OpenCV's dictionary of that name."""
     import cv2
 
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
 
 
-def cells_of(dictionary: str, ids: Iterable[int]) -> np.ndarray:
+def marker_cells(dictionary: str, ids: Iterable[int]) -> np.ndarray:
     """The printed modules M×n×n of marker ids, rim included: 1 = paper, 0 = ink."""
     import cv2
 
-    printed = printed_markers(dictionary)
+    printed = aruco_dictionary(dictionary)
     side = printed.markerSize + 2
     cells = [cv2.aruco.generateImageMarker(printed, int(i), side) for i in ids]
     return np.array(cells).reshape(-1, side, side).astype(float) / 255

@@ -13,19 +13,19 @@ from dataclasses import replace
 
 from patchproof.base.errors import Refused
 from patchproof.sheets.chart import chart_swatches
-from patchproof.sheets.content import PrintedPiece
+from patchproof.sheets.content import SheetContent
 from patchproof.sheets.layout import Box, PageLayout, Parts, prove_apart, quiet_box, ruler_parts, text_box
-from patchproof.sheets.markers import MODULES
+from patchproof.sheets.markers import MARKER_MODULES
 from patchproof.sheets.piece import (
     Piece,
     black_runs,
-    marker_at,
     marker_ids,
     marker_rect,
     moved_marker,
+    square_marker,
 )
 from patchproof.sheets.piece_words import piece_words
-from patchproof.sheets.rects import PointMm, RectMm, grown, moved, rounded, size_text
+from patchproof.sheets.rects import PointMm, RectMm, grow_rect, rounded, shift_rect, size_text
 from patchproof.sheets.template import BoardTemplate, Template, TextLine, template_names
 
 CUT_LINE_MM = 0.2  # drawn wholly outside the cut, so that no ink of it stays on the piece
@@ -50,7 +50,7 @@ def largest_piece_mm(template: Template) -> tuple[float, float]:
     return w - 2 * CUT_LINE_MM, h - 2 * CUT_LINE_MM
 
 
-def lay_out_page(template: Template, content: PrintedPiece) -> PageLayout:
+def lay_out_page(template: Template, content: SheetContent) -> PageLayout:
     """The page of one piece; refused where that is too large."""
     placed, fixed = place_pieces(template, [content.piece]), len(content.piece.markers)
     ids = marker_ids(content.sheet_id, content.kind, fixed + len(template.marker.corners_mm))[fixed:]
@@ -68,8 +68,8 @@ def lay_out_parts(
 ) -> PageLayout:
     """A page with any number of pieces at their top-left corners; `ids` are for the page's own markers."""
     size = template.marker.size_mm
-    own = [marker_at(i, at, size) for i, at in zip(ids, template.marker.corners_mm, strict=True)]
-    quiet = [quiet_box(marker_rect(m), size / MODULES, template.page_mm, template.margin_mm) for m in own]
+    own = [square_marker(i, at, size) for i, at in zip(ids, template.marker.corners_mm, strict=True)]
+    quiet = [quiet_box(marker_rect(m), size / MARKER_MODULES, template.page_mm, template.margin_mm) for m in own]
     chart = [(rounded(rect), srgb) for rect, srgb in chart_swatches(template.chart)]
     page = PageLayout(
         page_mm=template.page_mm,
@@ -155,8 +155,8 @@ def piece_name(number: int) -> str:
 def _piece_boxes(piece: Piece, corner: PointMm, number: int) -> list[Box]:
     """The piece, and in it its markers with their quiet zones."""
     name = piece_name(number)
-    quiet = [grown(moved(marker_rect(marker), corner), piece.module_mm) for marker in piece.markers]
-    cut = Box(name, grown((*corner, *piece.size_mm), CUT_LINE_MM))
+    quiet = [grow_rect(shift_rect(marker_rect(marker), corner), piece.module_mm) for marker in piece.markers]
+    cut = Box(name, grow_rect((*corner, *piece.size_mm), CUT_LINE_MM))
     return [cut, *(Box(f"{name} marker {i}", rect, name) for i, rect in enumerate(quiet, 1))]
 
 

@@ -21,7 +21,7 @@ from patchproof.base.geometry import MM_PER_INCH
 from patchproof.sheets.layout import PageLayout, font_name
 from patchproof.sheets.page import CUT_LINE_MM
 from patchproof.sheets.piece import marker_rects_mm
-from patchproof.sheets.rects import RectMm, Srgb, grown
+from patchproof.sheets.rects import RectMm, Srgb, grow_rect
 
 if TYPE_CHECKING:
     from reportlab.pdfgen.canvas import Canvas
@@ -38,7 +38,7 @@ def numbered(name: str, index: int) -> str:
 
 
 @dataclass(frozen=True)
-class Printed:
+class PdfPage:
     """A page and its pictures: (rectangle in mm, uint8 H×W×3 sRGB). Those of `windowed` show in the window alone."""
 
     layout: PageLayout
@@ -57,7 +57,7 @@ def srgb_profile() -> bytes:
     return bytes(profile)
 
 
-def _drawn(pages: Sequence[Printed], title: str) -> bytes:
+def _drawn(pages: Sequence[PdfPage], title: str) -> bytes:
     from reportlab import rl_config
     from reportlab.pdfgen.canvas import Canvas
 
@@ -82,7 +82,7 @@ def _drawn(pages: Sequence[Printed], title: str) -> bytes:
     return buffer.getvalue()
 
 
-def _draw(canvas: Canvas, page: Printed) -> None:
+def _draw(canvas: Canvas, page: PdfPage) -> None:
     layout, height = page.layout, page.layout.page_mm[1]
     _draw_parts(canvas, page.pictures, layout.swatches, layout.markers, height)
     for rects in (layout.qr_mm, layout.squares_mm):
@@ -103,7 +103,7 @@ def _draw(canvas: Canvas, page: Printed) -> None:
         canvas.line(x0, height - y0, x1, height - y1)
     canvas.setStrokeGray(0.45)
     for rect in layout.cuts_mm:
-        x, y, w, h = grown(rect, CUT_LINE_MM / 2)  # just outside of what is cut out
+        x, y, w, h = grow_rect(rect, CUT_LINE_MM / 2)  # just outside of what is cut out
         canvas.setLineWidth(CUT_LINE_MM)
         canvas.setDash(2.0, 1.5)
         canvas.rect(x, height - y - h, w, h)
@@ -134,7 +134,7 @@ def _fill(canvas: Canvas, rects: Any, srgb: Srgb, height: float) -> None:
     canvas.drawPath(path, stroke=0, fill=1)
 
 
-def pages_pdf(pages: Sequence[Printed], title: str, attachments: dict[str, str]) -> bytes:
+def pages_pdf(pages: Sequence[PdfPage], title: str, attachments: dict[str, str]) -> bytes:
     """The finished PDF of pages of any sizes, with manifests attached by their names; color spaces, attachments and
     plain metadata are what reportlab cannot write.
     """

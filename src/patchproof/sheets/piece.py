@@ -21,15 +21,15 @@ from typing import Any
 
 import numpy as np
 
-from patchproof.base.color import codes_of, linear_from_srgb, srgb_from_linear
+from patchproof.base.color import codes_from_srgb, linear_from_srgb, srgb_from_linear
 from patchproof.base.errors import Refused
-from patchproof.base.settings import identifying
-from patchproof.base.validation import Strict, nearest
+from patchproof.base.settings import identity_settings
+from patchproof.base.validation import StrictModel, spelling_hint
 from patchproof.sheets.manifest import Marker
-from patchproof.sheets.markers import DICTIONARY, MODULES, cells_of
-from patchproof.sheets.rects import PointMm, RectMm, grown
+from patchproof.sheets.markers import DICTIONARY, MARKER_MODULES, marker_cells
+from patchproof.sheets.rects import PointMm, RectMm, grow_rect
 
-KINDS = ("design", "mean", "gray", "noise", "shuffled", "blank")
+SHEET_KINDS = ("design", "mean", "gray", "noise", "shuffled", "blank")
 SCISSORS_MM = 1.0
 SMALLEST_MARKER_MM = 8.0
 LARGEST_CORNER = 0.29  # of the piece's shorter side, white and all: four leave two thirds of a square to the design
@@ -57,12 +57,12 @@ class Piece:
     @property
     def marker_mm(self) -> float:
         """Side of a marker's black square."""
-        return self.module_mm * MODULES
+        return self.module_mm * MARKER_MODULES
 
     @property
     def reserved_mm(self) -> tuple[RectMm, ...]:
         """What belongs to each marker: its quiet zone, and what slivers it would leave at the cut line."""
-        return tuple(_to_the_cut(grown(marker_rect(m), self.module_mm), self.size_mm) for m in self.markers)
+        return tuple(_to_the_cut(grow_rect(marker_rect(m), self.module_mm), self.size_mm) for m in self.markers)
 
 
 def sheet_id(settings: dict[str, Any], seed: int) -> str:
@@ -72,17 +72,17 @@ def sheet_id(settings: dict[str, Any], seed: int) -> str:
     return "".join("0123456789ABCDEFGHIJKLMNOPQRSTUVWXYZ"[number // 36**i % 36] for i in range(10))
 
 
-def page_id(template: Strict) -> str:
+def page_id(template: StrictModel) -> str:
     """The sheet id of a page that shows nothing but its template: equal templates give equal pages."""
-    return sheet_id({"template": identifying(template)}, 0)
+    return sheet_id({"template": identity_settings(template)}, 0)
 
 
 def marker_ids(sheet_id: str, kind: str, count: int) -> list[int]:
     """The first `count` marker ids of one kind of sheet; no two kinds of one sheet id share any."""
-    block = 1000 // len(KINDS)
+    block = 1000 // len(SHEET_KINDS)
     if count > block:
         raise Refused(f"at most {block} markers on one sheet", f"{count}", "use larger or fewer tiles")
-    start = KINDS.index(_known(kind)) * block
+    start = SHEET_KINDS.index(_known(kind)) * block
     return list(hash_order(sheet_id, 1000)[start : start + count])
 
 
@@ -103,7 +103,7 @@ def marker_size_mm(needed_mm: float, piece_mm: tuple[float, float]) -> float:
             f"{piece_mm[0]:g} × {piece_mm[1]:g} mm",
             "make the patch larger",
         )
-    fitting = (LARGEST_CORNER * min(piece_mm) - SCISSORS_MM) * MODULES / (MODULES + 2)
+    fitting = (LARGEST_CORNER * min(piece_mm) - SCISSORS_MM) * MARKER_MODULES / (MARKER_MODULES + 2)
     return wanted if fitting >= wanted else math.floor(fitting * 10 + 1e-6) / 10
 
 
@@ -116,14 +116,14 @@ def lay_out_piece(
     piece_mm: tuple[float, float], marker_mm: float, sheet_id: str, kind: str, bends: bool = False
 ) -> Piece:
     """The piece of that size, with a marker in each corner and as many along its sides as it needs."""
-    module = marker_mm / MODULES
+    module = marker_mm / MARKER_MODULES
     edge = SCISSORS_MM + module
     (left, right), (top, bottom) = ((edge, side - edge - marker_mm) for side in piece_mm)
     places = [(left, top), (right, top), (right, bottom), (left, bottom)]
     xs, ys = (_between(edge, side - edge - marker_mm, marker_mm, bends) for side in piece_mm)
     places += [(x, y) for x in xs for y in (top, bottom)] + [(x, y) for y in ys for x in (right, left)]
     ids = marker_ids(sheet_id, kind, len(places))
-    markers = tuple(marker_at(id_, place, marker_mm) for id_, place in zip(ids, places, strict=True))
+    markers = tuple(square_marker(id_, place, marker_mm) for id_, place in zip(ids, places, strict=True))
     return Piece(piece_mm, markers, module)
 
 
@@ -136,7 +136,7 @@ def _between(first: float, last: float, marker_mm: float, bends: bool) -> list[f
 
 def _corner_mm(marker_mm: float) -> float:
     """How much of a side a corner marker takes, white and all."""
-    return marker_mm * (MODULES + 2) / MODULES + SCISSORS_MM
+    return marker_mm * (MARKER_MODULES + 2) / MARKER_MODULES + SCISSORS_MM
 
 
 def _to_the_cut(rect: RectMm, size_mm: tuple[float, float]) -> RectMm:
@@ -153,7 +153,7 @@ def with_ids(piece: Piece, sheet_id: str, kind: str) -> Piece:
     return replace(piece, markers=markers)
 
 
-def marker_at(id_: int, corner_mm: PointMm, size_mm: float) -> PieceMarker:
+def square_marker(id_: int, corner_mm: PointMm, size_mm: float) -> PieceMarker:
     """A marker with its top-left corner there."""
     (x, y), side = map(float, corner_mm), float(size_mm)
     return PieceMarker(id_, ((x, y), (x + side, y), (x + side, y + side), (x, y + side)))
@@ -165,7 +165,7 @@ def moved_marker(marker: PieceMarker, by: PointMm) -> PieceMarker:
     return PieceMarker(marker.id, (a, b, c, d))
 
 
-def printed(marker: PieceMarker, page: int = 1) -> Marker:
+def manifest_marker(marker: PieceMarker, page: int = 1) -> Marker:
     """The marker as the manifest carries it."""
     return Marker(dictionary=DICTIONARY, id=marker.id, corners_mm=marker.corners_mm, page=page)
 
@@ -179,7 +179,7 @@ def marker_rect(marker: PieceMarker) -> RectMm:
 def marker_rects_mm(marker: PieceMarker) -> list[RectMm]:
     """The marker's black as rectangles that touch but never overlap: one for each run of black modules in a row."""
     x, y, side, _ = marker_rect(marker)
-    return black_runs(_marker_modules(marker.id), (x, y), side / MODULES)
+    return black_runs(_marker_modules(marker.id), (x, y), side / MARKER_MODULES)
 
 
 def black_runs(dark: np.ndarray, corner_mm: PointMm, module_mm: float) -> list[RectMm]:
@@ -213,7 +213,7 @@ def marker_image(piece: Piece, design_px: tuple[int, int]) -> tuple[np.ndarray, 
     return np.repeat(gray[..., None], 3, 2), reserved
 
 
-def on_paper(design: np.ndarray, piece: Piece) -> np.ndarray:
+def whiten_marker_pixels(design: np.ndarray, piece: Piece) -> np.ndarray:
     """A uint8 H×W×3 design as it goes to the printer: white where the markers' own pixels are."""
     _, reserved = marker_image(piece, (design.shape[1], design.shape[0]))
     return np.where(reserved[..., None], np.uint8(255), design)
@@ -231,7 +231,7 @@ def control_design(kind: str, design: np.ndarray, sheet_id: str, piece: Piece | 
     free = np.ones((height, width), bool) if piece is None else ~marker_image(piece, (width, height))[1]
     if _known(kind) == "mean":
         mean = linear_from_srgb(design[free] / 255).mean(0)
-        control = np.broadcast_to(codes_of(srgb_from_linear(mean)), design.shape)
+        control = np.broadcast_to(codes_from_srgb(srgb_from_linear(mean)), design.shape)
     elif kind == "noise":
         control = _noise(height, width, sheet_id)
     elif kind == "shuffled":
@@ -242,8 +242,8 @@ def control_design(kind: str, design: np.ndarray, sheet_id: str, piece: Piece | 
 
 
 def _known(kind: str) -> str:
-    if kind not in KINDS:
-        raise Refused("a kind of sheet", f'"{kind}"', nearest(kind, KINDS))
+    if kind not in SHEET_KINDS:
+        raise Refused("a kind of sheet", f'"{kind}"', spelling_hint(kind, SHEET_KINDS))
     return kind
 
 
@@ -275,7 +275,7 @@ def _shuffled(design: np.ndarray, free: np.ndarray, sheet_id: str) -> np.ndarray
 @lru_cache(maxsize=256)
 def _marker_modules(id_: int) -> np.ndarray:
     """7×7, True where the marker is black."""
-    return cells_of(DICTIONARY, [id_])[0] == 0
+    return marker_cells(DICTIONARY, [id_])[0] == 0
 
 
 def _cover(coverage: np.ndarray, box: tuple[float, float, float, float]) -> None:

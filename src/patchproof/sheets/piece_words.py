@@ -8,7 +8,7 @@ distance; higher ones would reach into the markers' white, half of which is wort
 
 from __future__ import annotations
 
-from patchproof.sheets.content import PrintedPiece
+from patchproof.sheets.content import SheetContent
 from patchproof.sheets.layout import CAP_HEIGHT, Box, Line, Parts, text_width_mm
 from patchproof.sheets.piece import SCISSORS_MM
 from patchproof.sheets.rects import PointMm, RectMm
@@ -20,7 +20,7 @@ _ASIDE_MM = 0.4  # from the sides of the white: between 8 mm markers' ten of the
 _ARROW_MM = 0.9  # with the space behind it
 
 
-def piece_words(content: PrintedPiece, corner: PointMm, holder: str = "piece") -> Parts:
+def piece_words(content: SheetContent, corner: PointMm, holder: str = "piece") -> Parts:
     """An arrow and "TOP" over the top-left marker, the sheet's id over the top-right one, and under the bottom-left one
     as much of the name as fits; `holder` is the part of the page that they lie in.
     """

@@ -13,7 +13,7 @@ import numpy as np
 
 from patchproof.base.errors import Refused
 from patchproof.sheets.layout import CAP_HEIGHT, DESCENT, Box, Line, PageLayout, prove_apart, text_box, text_width_mm
-from patchproof.sheets.pdf import Printed
+from patchproof.sheets.pdf import PdfPage
 from patchproof.sheets.rects import PointMm, RectMm
 from patchproof.sheets.template import Template, TextLine
 
@@ -23,7 +23,7 @@ HEADING_MM, TEXT_MM, LEADING = 3.2, 2.6, 1.45
 
 
 @dataclass(frozen=True)
-class Span:
+class DimensionSpan:
     """A part of a dimension chain: between two places along one axis of the picture, so many millimeters."""
 
     ends_mm: tuple[float, float]
@@ -32,7 +32,7 @@ class Span:
 
 
 @dataclass(frozen=True)
-class Hung:
+class PlacementPicture:
     """The piece on the object, seen straight from its side; millimeters x right, y down."""
 
     picture: np.ndarray  # uint8 H×W×3
@@ -41,18 +41,20 @@ class Hung:
     outline_mm: tuple[PointMm, ...]  # the piece's cut line
     seams_mm: tuple[tuple[PointMm, PointMm], ...] = ()  # thin lines
     names_mm: tuple[tuple[PointMm, str], ...] = ()
-    measured: tuple[tuple[Span, ...], tuple[Span, ...]] | None = None  # across and down, in place of edge to edge
+    measured: tuple[tuple[DimensionSpan, ...], tuple[DimensionSpan, ...]] | None = (
+        None  # across and down, in place of edge to edge
+    )
 
 
 @dataclass(frozen=True)
 class PlanPage:
     """A picture, where there is one, and sections of (heading, lines)."""
 
-    hung: Hung | None
+    hung: PlacementPicture | None
     sections: tuple[tuple[str, tuple[str, ...]], ...]
 
 
-def lay_out_plan(plan: PlanPage, template: Template, sheet_id: str) -> Printed:
+def lay_out_plan(plan: PlanPage, template: Template, sheet_id: str) -> PdfPage:
     """The page, of the template's size, proved apart and within its margins."""
     (width, height), margin = template.page_mm, template.margin_mm
     texts = [TextLine(at_mm=(margin, margin + 5.4), size_mm=5.2, text="patchproof", bold=True)]
@@ -67,7 +69,7 @@ def lay_out_plan(plan: PlanPage, template: Template, sheet_id: str) -> Printed:
         texts.append(TextLine(at_mm=(margin, top + HEADING_MM), size_mm=HEADING_MM, text=heading, bold=True))
         top += HEADING_MM * LEADING + 1.2
         for paragraph in paragraphs:
-            for line in wrapped(paragraph, TEXT_MM, width - 2 * margin):
+            for line in wrap_text(paragraph, TEXT_MM, width - 2 * margin):
                 texts.append(TextLine(at_mm=(margin, top + TEXT_MM), size_mm=TEXT_MM, text=line))
                 top += TEXT_MM * LEADING
             top += 0.9
@@ -79,10 +81,10 @@ def lay_out_plan(plan: PlanPage, template: Template, sheet_id: str) -> Printed:
         boxes=(*boxes, *(text_box(line) for line in texts)),
     )
     prove_apart(layout.boxes, template.page_mm, margin)
-    return Printed(layout, pictures)
+    return PdfPage(layout, pictures)
 
 
-def wrapped(text: str, size_mm: float, width_mm: float) -> list[str]:
+def wrap_text(text: str, size_mm: float, width_mm: float) -> list[str]:
     """The text in lines no longer than the width."""
     lines = [""]
     for word in text.split():
@@ -94,7 +96,7 @@ def wrapped(text: str, size_mm: float, width_mm: float) -> list[str]:
     return lines
 
 
-def _drawing(hung: Hung, room: RectMm):
+def _drawing(hung: PlacementPicture, room: RectMm):
     """(lines, labels, pictures, box): the picture with outline and dimension chains, scaled into the room."""
     x, y, w, h = room
     left, up, wide, high = hung.picture_mm
@@ -122,14 +124,14 @@ def _drawing(hung: Hung, room: RectMm):
     return lines, labels, ((shown, hung.picture),), Box("picture of the object", box)
 
 
-def edges_mm(hung: Hung) -> dict[str, float]:
+def edge_distances_mm(hung: PlacementPicture) -> dict[str, float]:
     """From the piece's outermost points to the edges of the object's side; negative where the piece goes beyond."""
     xs, ys = zip(*hung.outline_mm, strict=True)
     x, y, w, h = hung.object_mm
     return {"left": min(xs) - x, "right": x + w - max(xs), "top": min(ys) - y, "bottom": y + h - max(ys)}
 
 
-def _edge_to_edge(hung: Hung) -> tuple[tuple[Span, ...], tuple[Span, ...]]:
+def _edge_to_edge(hung: PlacementPicture) -> tuple[tuple[DimensionSpan, ...], tuple[DimensionSpan, ...]]:
     """From edge to edge of the object's side, across and down."""
     (xs, ys), (x, y, w, h) = zip(*hung.outline_mm, strict=True), hung.object_mm
     across, down = (x, min(xs), max(xs), x + w), (y, min(ys), max(ys), y + h)
@@ -137,11 +139,11 @@ def _edge_to_edge(hung: Hung) -> tuple[tuple[Span, ...], tuple[Span, ...]]:
     return _spans(across, names[0]), _spans(down, names[1])
 
 
-def _spans(stops: tuple[float, ...], names: tuple[str, ...]) -> tuple[Span, ...]:
-    return tuple(Span((a, b), b - a, name) for a, b, name in zip(stops, stops[1:], names, strict=False))
+def _spans(stops: tuple[float, ...], names: tuple[str, ...]) -> tuple[DimensionSpan, ...]:
+    return tuple(DimensionSpan((a, b), b - a, name) for a, b, name in zip(stops, stops[1:], names, strict=False))
 
 
-def _chain_above(spans: tuple[Span, ...], at, shown: RectMm) -> tuple[list[Line], list[TextLine]]:
+def _chain_above(spans: tuple[DimensionSpan, ...], at, shown: RectMm) -> tuple[list[Line], list[TextLine]]:
     row, lines, labels = shown[1] - 2.0, [], []
     for i, span in enumerate(spans):
         start, end = (at((x, 0))[0] for x in span.ends_mm)
@@ -154,7 +156,7 @@ def _chain_above(spans: tuple[Span, ...], at, shown: RectMm) -> tuple[list[Line]
     return lines, labels
 
 
-def _chain_beside(spans: tuple[Span, ...], at, shown: RectMm) -> tuple[list[Line], list[TextLine]]:
+def _chain_beside(spans: tuple[DimensionSpan, ...], at, shown: RectMm) -> tuple[list[Line], list[TextLine]]:
     column = shown[0] + shown[2] + 2.0
     lines, labels, free = [], [], shown[1]
     for span in spans:

@@ -16,78 +16,87 @@ from pydantic import Field
 
 from patchproof.base.errors import Refused
 from patchproof.base.packaged import packaged_path
-from patchproof.base.validation import Finite, NotNegative, Positive, Share, Strict, nearest, read_toml, validated
+from patchproof.base.validation import (
+    Finite,
+    NotNegative,
+    Positive,
+    Share,
+    StrictModel,
+    read_toml,
+    spelling_hint,
+    validate_model,
+)
 
-Point = tuple[Finite, Finite]
-Rect = tuple[Finite, Finite, Positive, Positive]
+PagePoint = tuple[Finite, Finite]
+PageRect = tuple[Finite, Finite, Positive, Positive]
 PaperMm = Annotated[Positive, Field(le=2000)]  # a side of the largest paper, A0 and more
 
 
-class PieceZone(Strict):
+class PieceZone(StrictModel):
     """Where on the page the piece may lie."""
 
-    zone_mm: Rect  # [x, y, width, height]; the piece lies in its middle
+    zone_mm: PageRect  # [x, y, width, height]; the piece lies in its middle
 
 
-class ChartGrid(Strict):
+class ChartGrid(StrictModel):
     """The color chart's grid; 48 swatches are the fewest that a printer model can be fitted to."""
 
-    corner_mm: Point  # its top-left corner
+    corner_mm: PagePoint  # its top-left corner
     columns: Annotated[int, Field(ge=4, le=40)]  # swatches side by side
     rows: Annotated[int, Field(ge=2, le=40)]  # swatches one above the other
     swatch_mm: Annotated[Positive, Field(ge=4)]  # side; below 4 a phone's photograph of a whole page has too few pixels
     gap_mm: NotNegative  # between swatches
 
 
-class Rulers(Strict):
+class Rulers(StrictModel):
     """A ruler to the right and one downwards, from their zero ticks."""
 
     length_mm: PaperMm  # of both
-    x_start_mm: Point  # zero tick of the ruler to the right
-    y_start_mm: Point  # zero tick of the ruler downwards
+    x_start_mm: PagePoint  # zero tick of the ruler to the right
+    y_start_mm: PagePoint  # zero tick of the ruler downwards
 
 
-class QrCode(Strict):
+class QrCode(StrictModel):
     """The QR code's black square; its quiet zone of 4 modules lies outside."""
 
-    corner_mm: Point  # its top-left corner
+    corner_mm: PagePoint  # its top-left corner
     size_mm: Positive  # its side, without the quiet zone
 
 
-class PageMarkers(Strict):
+class PageMarkers(StrictModel):
     """The page's own markers by the top-left corners of their black squares; fewer than two would be a poor fix."""
 
     size_mm: Annotated[Positive, Field(ge=8)]  # side of a black square
-    corners_mm: Annotated[tuple[Point, ...], Field(min_length=2)]  # top-left, one per marker
+    corners_mm: Annotated[tuple[PagePoint, ...], Field(min_length=2)]  # top-left, one per marker
 
 
-class BlankPiece(Strict):
+class BlankPiece(StrictModel):
     """The piece of a page that is printed without a design, before there is a scene."""
 
     piece_mm: tuple[Positive, Positive]  # width and height, as of the design that will take its place
     marker_mm: Annotated[Positive, Field(ge=8)]  # smaller ones are lost in photographs
 
 
-class TileGrid(Strict):
+class TileGrid(StrictModel):
     """The pages of a piece larger than the page; each tile's markers lie to the left, the right and below its part."""
 
     # [x, y, width, height]: a tile's part of the piece at its largest; what is printed of it starts at the corner.
-    zone_mm: Rect
+    zone_mm: PageRect
     overlap_mm: Annotated[Positive, Field(ge=8)]  # the flap that the next tile is glued on; it holds a marker
     marker_mm: Annotated[Positive, Field(ge=5)]  # for scans and photographs of single pages
 
 
-class TextLine(Strict):
+class TextLine(StrictModel):
     """One line of text; {sheet_id}, {kind}, {design}, {piece} and {fix} are filled in; gray 0 is black."""
 
-    at_mm: Point  # left end of its baseline
+    at_mm: PagePoint  # left end of its baseline
     size_mm: Positive  # of the letters
     text: str  # what it says
     bold: bool = False  # in the bold font
     gray: Share = 0.0  # 0 is black, 1 white
 
 
-class Template(Strict):
+class Template(StrictModel):
     """A whole template file."""
 
     page_mm: tuple[PaperMm, PaperMm]  # width, height of the paper
@@ -103,17 +112,17 @@ class Template(Strict):
     text: tuple[TextLine, ...] = ()  # all that is written
 
 
-class BoardGrid(Strict):
+class BoardGrid(StrictModel):
     """A ChArUco board's pattern; its first square, top-left, is black."""
 
-    corner_mm: Point  # its top-left corner
+    corner_mm: PagePoint  # its top-left corner
     columns: Annotated[int, Field(ge=4, le=40)]  # squares side by side
     rows: Annotated[int, Field(ge=4, le=40)]  # squares one above the other
     square_mm: Annotated[Positive, Field(ge=8)]  # side of a square
     marker_mm: Annotated[Positive, Field(ge=6)]  # side of a marker, at least a module less than the square
 
 
-class BoardTemplate(Strict):
+class BoardTemplate(StrictModel):
     """A whole template file of a board page."""
 
     page_mm: tuple[PaperMm, PaperMm]  # width, height of the paper
@@ -127,7 +136,7 @@ class BoardTemplate(Strict):
 def load_template(name_or_file: str | Path) -> Template:
     """The shipped template of that name, or the one in that file; an unknown name is refused with the nearest."""
     path, data = template_data(name_or_file)
-    template = validated(Template, data, str(path))
+    template = validate_model(Template, data, str(path))
     swatches = template.chart.columns * template.chart.rows
     if swatches < 48:
         raise Refused(f"at least 48 swatches in the chart of {path}", f"{swatches}", "add columns or rows")
@@ -140,12 +149,12 @@ def template_data(name_or_file: str | Path) -> tuple[Path, dict[str, Any]]:
     if path.suffix != ".toml":
         names = template_names()
         if str(path) not in names:
-            raise Refused("a print template's name or a .toml file", f'"{path}"', nearest(str(path), names))
+            raise Refused("a print template's name or a .toml file", f'"{path}"', spelling_hint(str(path), names))
         path = packaged_path("print_templates", f"{path}.toml")
     return path, read_toml(path)
 
 
-def template_lines() -> list[str]:
+def template_summaries() -> list[str]:
     """Each shipped template's name and what its first comment says it is."""
     names = template_names()
     files = [packaged_path("print_templates", f"{name}.toml") for name in names]

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 from patchproof.base.errors import Refused
-from patchproof.sheets.content import PrintedPiece
+from patchproof.sheets.content import SheetContent
 from patchproof.sheets.layout import (
     Box,
     Line,
@@ -31,12 +31,20 @@ from patchproof.sheets.layout import (
     text_width_mm,
 )
 from patchproof.sheets.manifest import Manifest, Tile
-from patchproof.sheets.markers import MODULES
+from patchproof.sheets.markers import MARKER_MODULES
 from patchproof.sheets.page import CUT_LINE_MM, MOST_TILES, lay_out_parts, piece_zone_mm, place_pieces
-from patchproof.sheets.pdf import Printed
-from patchproof.sheets.piece import Piece, PieceMarker, marker_at, marker_ids, marker_rect, moved_marker, printed
+from patchproof.sheets.pdf import PdfPage
+from patchproof.sheets.piece import (
+    Piece,
+    PieceMarker,
+    manifest_marker,
+    marker_ids,
+    marker_rect,
+    moved_marker,
+    square_marker,
+)
 from patchproof.sheets.piece_words import piece_words
-from patchproof.sheets.rects import PointMm, RectMm, grown, holds, meet, moved, size_text
+from patchproof.sheets.rects import PointMm, RectMm, grow_rect, rect_contains, rects_overlap, shift_rect, size_text
 from patchproof.sheets.template import Template, TextLine, TileGrid, template_names
 
 BLEED_MM = 1.0  # of the piece's picture on a flap
@@ -97,7 +105,7 @@ def plan_tiles(template: Template, piece: Piece) -> list[TilePlan]:
     ]
 
 
-def tile_pages(template: Template, grid: TileGrid, content: PrintedPiece) -> tuple[list[Printed], Manifest]:
+def tile_pages(template: Template, grid: TileGrid, content: SheetContent) -> tuple[list[PdfPage], Manifest]:
     """Page 1 and the tiles' pages, proved apart each; `grid` is the template's own."""
     piece, sheet_id = content.piece, content.sheet_id
     tiles, fixed = plan_tiles(template, piece), len(piece.markers)
@@ -111,17 +119,17 @@ def tile_pages(template: Template, grid: TileGrid, content: PrintedPiece) -> tup
         for i, tile in enumerate(tiles)
     ]
     # pale: so light that names can be read on it, and that nobody cuts it out
-    pages = [Printed(first, tuple((rect, 255 - (255 - design) // 3) for rect, design in content.pictures(small)))]
+    pages = [PdfPage(first, tuple((rect, 255 - (255 - design) // 3) for rect, design in content.pictures(small)))]
     markers, entries, cut_mm = [], [], (0.0, 0.0, *piece.size_mm)
     for number, (tile, page) in enumerate(zip(tiles, layouts, strict=True), FIRST_TILE_PAGE):
         by = dx, dy = tile.page_from_piece_mm
-        pages.append(Printed(page, windowed=content.pictures(moved(cut_mm, by))))
-        markers += [printed(marker, number) for marker in _shown_markers(tile, piece)]
+        pages.append(PdfPage(page, windowed=content.pictures(shift_rect(cut_mm, by))))
+        markers += [manifest_marker(marker, number) for marker in _shown_markers(tile, piece)]
         shift = (1.0, 0.0, round(dx, 6)), (0.0, 1.0, round(dy, 6))
         entries.append(Tile(page=number, page_from_design_mm=shift, cut_mm=tile.page_rect_mm))
     for number, page in enumerate((first, *layouts), FIRST_TILE_PAGE - 1):
-        markers += [printed(marker, number) for marker in page.markers]
-    whole = moved(cut_mm, tiles[0].page_from_piece_mm)
+        markers += [manifest_marker(marker, number) for marker in page.markers]
+    whole = shift_rect(cut_mm, tiles[0].page_from_piece_mm)
     manifest = content.manifest(first, template, whole, FIRST_TILE_PAGE)
     return pages, manifest.changed(markers=tuple(markers), tiles=tuple(entries))
 
@@ -135,22 +143,22 @@ def refuse_larger_than_page(template: Template, piece: Piece) -> None:
 
 
 def _lay_out_tile(
-    template: Template, grid: TileGrid, content: PrintedPiece, tile: TilePlan, ids: Sequence[int]
+    template: Template, grid: TileGrid, content: SheetContent, tile: TilePlan, ids: Sequence[int]
 ) -> PageLayout:
     """One tile's page, proved apart and within the margins; its own markers are the layout's, the piece's lie in
     the window.
     """
     by, part, page_mm, margin_mm = tile.page_from_piece_mm, tile.page_rect_mm, template.page_mm, template.margin_mm
     window, cut = tile.extended(BLEED_MM), tile.extended(grid.overlap_mm)
-    own = [marker_at(i, at, grid.marker_mm) for i, at in zip(ids, _places(grid, part), strict=True)]
-    quiet = [quiet_box(marker_rect(marker), grid.marker_mm / MODULES, page_mm, margin_mm) for marker in own]
+    own = [square_marker(i, at, grid.marker_mm) for i, at in zip(ids, _places(grid, part), strict=True)]
+    quiet = [quiet_box(marker_rect(marker), grid.marker_mm / MARKER_MODULES, page_mm, margin_mm) for marker in own]
     texts, own_words = _words(template, grid, tile, content.sheet_id), _within(window, piece_words(content, by))
     boxes = [Box(f"tile marker {i}", rect) for i, rect in enumerate(quiet, 1)] + [text_box(line) for line in texts]
     markers = [moved_marker(marker, by) for marker in content.piece.markers]
     boxes = (
-        Box("tile", grown(cut, CUT_LINE_MM)),
+        Box("tile", grow_rect(cut, CUT_LINE_MM)),
         Box("its picture", window, "tile"),
-        *(Box(box.name, box.rect_mm, "tile" if meet(cut, box.rect_mm) else None) for box in boxes),
+        *(Box(box.name, box.rect_mm, "tile" if rects_overlap(cut, box.rect_mm) else None) for box in boxes),
     )
     prove_apart(boxes, page_mm, margin_mm)
     return PageLayout(
@@ -160,20 +168,20 @@ def _lay_out_tile(
         ticks=own_words.lines,
         texts=(*texts, *own_words.texts),
         boxes=boxes,
-        window=Window(window, tuple(m for m in markers if meet(grown(window, 1e-6), marker_rect(m)))),
+        window=Window(window, tuple(m for m in markers if rects_overlap(grow_rect(window, 1e-6), marker_rect(m)))),
     )
 
 
 def _within(window: RectMm, words: Parts) -> Parts:
     """The piece's words that the window shows: whole ones, since a corner's marker and its white are never cut."""
-    lines = (line for line in words.lines if holds(window, (*line.ends_mm[:2], 0.0, 0.0)))
-    shown = (text for text, box in zip(words.texts, words.boxes, strict=True) if holds(window, box.rect_mm))
+    lines = (line for line in words.lines if rect_contains(window, (*line.ends_mm[:2], 0.0, 0.0)))
+    shown = (text for text, box in zip(words.texts, words.boxes, strict=True) if rect_contains(window, box.rect_mm))
     return Parts(tuple(lines), tuple(shown))
 
 
 def _tile_map(piece: Piece, tiles: Sequence[TilePlan], zone_mm: RectMm) -> tuple[Parts, RectMm]:
     """The assembled piece drawn small in a zone: outline, seams and names, and where its picture goes."""
-    x, y, w, h = grown(zone_mm, -6.0)
+    x, y, w, h = grow_rect(zone_mm, -6.0)
     scale = min(w / piece.size_mm[0], h / piece.size_mm[1])
     x, y = x + (w - scale * piece.size_mm[0]) / 2, y + (h - scale * piece.size_mm[1]) / 2
 
@@ -237,7 +245,7 @@ def _free(at: float, blocked: list[tuple[float, float]]) -> float:
 def _places(grid: TileGrid, part: RectMm) -> list[PointMm]:
     """Corners of a tile's own markers: left and right, above and below, and under the part at the right."""
     size, (x, y, w, h) = grid.marker_mm, part
-    module = size / MODULES
+    module = size / MARKER_MODULES
     aside = BLEED_MM + module  # from the part's edge: the picture that runs on, and a quiet zone
     left = x - CUT_LINE_MM - module - size
     return [

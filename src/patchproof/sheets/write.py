@@ -12,13 +12,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from patchproof.base.errors import Refused
-from patchproof.base.output import write_together
-from patchproof.base.validation import Strict
-from patchproof.sheets.content import PrintedPiece, page_manifest
+from patchproof.base.output import write_files_atomically
+from patchproof.base.validation import StrictModel
+from patchproof.sheets.content import SheetContent, page_manifest
 from patchproof.sheets.layout import PageLayout
 from patchproof.sheets.manifest import Manifest, dump_manifest
 from patchproof.sheets.page import lay_out_page
-from patchproof.sheets.pdf import ATTACHMENT, Printed, numbered, pages_pdf
+from patchproof.sheets.pdf import ATTACHMENT, PdfPage, numbered, pages_pdf
 from patchproof.sheets.piece import page_id
 from patchproof.sheets.plan_page import PlanPage, lay_out_plan
 from patchproof.sheets.rects import RectMm
@@ -27,7 +27,7 @@ from patchproof.sheets.tiles import tile_pages
 
 
 def write_sheet(
-    pdf_path: str | Path, template: Template, content: PrintedPiece, plan: PlanPage | None = None, copies: int = 1
+    pdf_path: str | Path, template: Template, content: SheetContent, plan: PlanPage | None = None, copies: int = 1
 ) -> Manifest:
     """Write SHEET.pdf and SHEET.json beside it.
 
@@ -36,7 +36,7 @@ def write_sheet(
     pdf_path = pdf_name(pdf_path)
     if template.tiles is None:
         page = lay_out_page(template, content)
-        pages = [Printed(page, content.pictures(page.cuts_mm[0]))] * copies
+        pages = [PdfPage(page, content.pictures(page.cuts_mm[0]))] * copies
         manifest = content.manifest(page, template, page.cuts_mm[0])
     elif copies > 1:
         raise Refused("one copy of a piece in tiles", f"{copies}", "print the file more than once")
@@ -50,13 +50,18 @@ def write_sheet(
 
 
 def write_page(
-    pdf_path: str | Path, page: PageLayout, template: Template | BoardTemplate, cut_mm: RectMm, kind: str, grid: Strict
+    pdf_path: str | Path,
+    page: PageLayout,
+    template: Template | BoardTemplate,
+    cut_mm: RectMm,
+    kind: str,
+    grid: StrictModel,
 ) -> Manifest:
     """Write a page without a piece, and its manifest beside it, in which `grid` is kept under the page's kind."""
     pdf_path = pdf_name(pdf_path)
     settings = {kind: grid.model_dump(mode="json")}
     manifest = page_manifest(page, template, cut_mm, page_id(template), kind, settings)
-    save_sheets(pdf_path, [Printed(page)], {pdf_path.with_suffix(".json"): manifest})
+    save_sheets(pdf_path, [PdfPage(page)], {pdf_path.with_suffix(".json"): manifest})
     return manifest
 
 
@@ -75,10 +80,10 @@ def manifest_paths(pdf_path: Path, designs: int) -> list[Path]:
     return [pdf_path.with_name(numbered(f"{pdf_path.stem}.json", i)) for i in range(designs)]
 
 
-def save_sheets(pdf_path: Path, pages: Sequence[Printed], manifests: dict[Path, Manifest]) -> None:
+def save_sheets(pdf_path: Path, pages: Sequence[PdfPage], manifests: dict[Path, Manifest]) -> None:
     """Write the PDF and its manifests, which it carries too: one as sheet.json, several as sheet_1.json..."""
     texts, first = [dump_manifest(manifest) for manifest in manifests.values()], next(iter(manifests.values()))
     names = [ATTACHMENT] if len(texts) == 1 else [numbered(ATTACHMENT, i) for i in range(len(texts))]
     title = f"patchproof sheet {' '.join(m.sheet_id for m in manifests.values())} {first.kind}"
     pdf = pages_pdf(pages, title, dict(zip(names, texts, strict=True)))
-    write_together({pdf_path: pdf} | dict(zip(manifests, map(str.encode, texts), strict=True)))
+    write_files_atomically({pdf_path: pdf} | dict(zip(manifests, map(str.encode, texts), strict=True)))

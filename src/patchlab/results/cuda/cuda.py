@@ -19,7 +19,7 @@ import numpy as np
 import torch
 
 import patchproof as pp
-from patchproof.base.workers import free_cores, keep_freed_memory
+from patchproof.base.workers import available_cores, keep_freed_memory
 from patchproof.optimizer import loop
 from patchproof.optimizer.expectation import gradient_in_views
 from patchproof.optimizer.pixels import as_pixels, from_pixels
@@ -41,7 +41,7 @@ def seconds(work: Callable[[], object]) -> float:
     return time.perf_counter() - start
 
 
-def run(problem: Problem) -> tuple[list[float], loop.Step]:
+def run(problem: Problem) -> tuple[list[float], loop.TrainingStep]:
     """A run's seconds by step, and its last step."""
     running, done = loop.steps(problem), []
     times = [seconds(lambda: done.append(next(running))) for _ in range(STEPS)]
@@ -52,7 +52,7 @@ def measured(name: str) -> Iterator[dict]:
     """The lines of one scene."""
     scene = pp.load_scene(f"{name}.toml")
     scene = replace(scene, settings=scene.settings.changed(optimize={"steps": STEPS}))
-    cpu, gpu = (set_problem(scene, device, jobs=free_cores()) for device in ("cpu", GPU))
+    cpu, gpu = (set_problem(scene, device, jobs=available_cores()) for device in ("cpu", GPU))
 
     def line(quantity: str, on_cpu: float | None, on_gpu: float) -> dict:
         shown = ["" if value is None else f"{value:.6g}" for value in (on_cpu, on_gpu)]

@@ -13,13 +13,13 @@ from dataclasses import replace
 import torch
 from torch import Tensor, nn
 
+from patchproof.classifier.average_precision import suppress_overlaps
 from patchproof.classifier.builtin import INPUT_PX as CROP_PX
 from patchproof.classifier.builtin import load_builtin
 from patchproof.classifier.builtin_detector import INPUT_PX as PROPOSED_PX
 from patchproof.classifier.builtin_detector import load_builtin_detector
 from patchproof.classifier.custom import detector_of
 from patchproof.classifier.detector import Detector
-from patchproof.classifier.precision import unsuppressed
 
 PROPOSALS = 8  # of each picture
 LEAST_SCORE = 0.25  # of best F1 on 120 renders of shapes that neither network has seen: AP50 0.885 there
@@ -48,7 +48,7 @@ class TwoStage(nn.Module):
     def _proposed(self, boxes: Tensor, anything: Tensor) -> Tensor:
         """Indices of the surest candidates that do not overlap; then of the surest of all, to fill up."""
         surest = anything.argsort(descending=True)
-        return torch.cat([unsuppressed(boxes, anything), surest])[:PROPOSALS]
+        return torch.cat([suppress_overlaps(boxes, anything), surest])[:PROPOSALS]
 
 
 def crops(photos: Tensor, boxes: Tensor) -> Tensor:

@@ -24,8 +24,8 @@ from torch import Tensor
 
 from patchlab.harden.attacks import cross_entropy, even_loss, margin, right
 from patchlab.harden.harden import harden, squares
-from patchproof.base.claims import wilson
-from patchproof.base.validation import expand
+from patchproof.base.intervals import wilson
+from patchproof.base.validation import expand_path
 from patchproof.classifier.labels import find_labels
 from patchproof.classifier.load import load_classifier
 from patchproof.photo.read import read_photo
@@ -97,7 +97,7 @@ class Before:
 
 def measured(name: str, folders: list[Path]) -> dict:
     """Everything of one network."""
-    classifier = load_classifier(expand(name, Path.cwd()), Path.cwd())
+    classifier = load_classifier(expand_path(name, Path.cwd()), Path.cwd())
     rows = [(folder, row) for folder in folders for row in csv.DictReader((folder / "labels.csv").open())]
     words = [row["label"] for _, row in rows]
     labels = [find_labels(classifier.labels, int(w) if w.isdigit() else w)[0] for w in words]

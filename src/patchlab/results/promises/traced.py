@@ -13,7 +13,7 @@ import torch
 
 import patchproof as pp
 from patchlab.results.rows import write_rows
-from patchproof.base.claims import student_mean
+from patchproof.base.intervals import student_mean
 from patchproof.optimizer.loop import best_design
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import set_problem

@@ -21,7 +21,13 @@ from patchproof.base.workers import keep_freed_memory
 from patchproof.classifier.network import Classifier
 from patchproof.optimizer.loop import best_design
 from patchproof.optimizer.problem import set_problem
-from patchproof.optimizer.promise import CONTROLS, PER_SESSION, PROMISE_VIEWS, _with_controls, shown_with_controls
+from patchproof.optimizer.promise import (
+    CONTROLS,
+    PROMISE_VIEWS,
+    VIEWS_PER_SESSION,
+    _with_controls,
+    pictures_with_controls,
+)
 from patchproof.optimizer.responses import responses
 
 ROUNDS = 3
@@ -37,9 +43,9 @@ def rounded(self, squares, windows):
 def measured(path: str) -> list[dict]:
     """The lines of one scene."""
     problem = set_problem(pp.load_scene(path))
-    shown = shown_with_controls(problem, best_design(problem), CONTROLS)
-    conditions = problem.scene.draw("promise", PROMISE_VIEWS, per_session=PER_SESSION)
-    beside = _with_controls(PROMISE_VIEWS, PER_SESSION)
+    shown = pictures_with_controls(problem, best_design(problem), CONTROLS)
+    conditions = problem.scene.draw("promise", PROMISE_VIEWS, per_session=VIEWS_PER_SESSION)
+    beside = _with_controls(PROMISE_VIEWS, VIEWS_PER_SESSION)
 
     def told(way):
         Classifier._asked = way

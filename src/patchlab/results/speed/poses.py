@@ -14,7 +14,7 @@ import patchproof as pp
 from patchlab.bench.effort import _scene
 from patchlab.results.rows import write_rows
 from patchproof.base.workers import keep_freed_memory
-from patchproof.optimizer.loop import start, step_on
+from patchproof.optimizer.loop import start, take_step
 from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.problem import set_problem
 from patchproof.optimizer.responses import responses
@@ -32,7 +32,7 @@ def measured(label: str, seed: int) -> dict:
     for name, conditions in (("each", drawn), ("again", again), ("kept", kept)):
         state = start(problem)
         for first in range(0, 960, 4):
-            state = step_on(problem, state, conditions[first : first + 4]).state
+            state = take_step(problem, state, conditions[first : first + 4]).state
         shown[name] = problem.subject.shown(from_pixels(as_pixels(state.design), problem.device))
     row = {"object": label, "seed": seed}
     for name, answer in responses(problem, shown, scene.draw("evaluate", JUDGED)).items():

@@ -86,7 +86,9 @@ def measured(name: str, scene: str, processes: int) -> dict:
     def steps() -> float:
         torch.set_num_threads(1)
         timed = [clocked(partial(next, running), perf_counter) for _ in range(STEPS)]
-        return statistics.mean(ms for step, ms in timed if not loop.selects(scene.settings.optimize, step.state.number))
+        return statistics.mean(
+            ms for step, ms in timed if not loop.is_selection_step(scene.settings.optimize, step.state.number)
+        )
 
     rounds = in_turn({"pass": passes, "step": steps}, ROUNDS - 1)
     running.close()

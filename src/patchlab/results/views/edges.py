@@ -12,11 +12,11 @@ from torch.nn.functional import avg_pool2d
 
 import patchproof as pp
 from patchlab.results.rows import write_rows
-from patchproof.base.claims import student_mean
+from patchproof.base.intervals import student_mean
 from patchproof.channel.camera import develop
 from patchproof.optimizer.problem import set_problem
 from patchproof.render.photograph import expose, shade
-from patchproof.render.views import see
+from patchproof.render.views import render_views
 
 N, SEED, SAMPLES = 60, 78, 3
 NETWORK = "file:${PATCHPROOF_DATA}/models/mobilenet_v1_0.75_192.onnx"
@@ -29,8 +29,8 @@ def measured(name: str) -> dict:
     classifier, sure = problem.classifiers[0], []
     for one in (conditions[i : i + 1] for i in range(N)):
         with torch.no_grad():
-            views = see(problem.stage, None, one, size_px)
-            light = shade(see(problem.stage, None, one, tuple(SAMPLES * side for side in size_px)), None)
+            views = render_views(problem.stage, None, one, size_px)
+            light = shade(render_views(problem.stage, None, one, tuple(SAMPLES * side for side in size_px)), None)
             pictures = [
                 expose(replace(views, outlines=None), None, jpeg=False),
                 expose(views, None, jpeg=False),

@@ -10,11 +10,11 @@ from dataclasses import replace
 
 import patchproof as pp
 from patchlab.results.rows import write_rows
-from patchproof.base.claims import student_mean
+from patchproof.base.intervals import student_mean
 from patchproof.optimizer import problem as problems
 from patchproof.optimizer.loop import best_design
 from patchproof.optimizer.pixels import from_pixels
-from patchproof.optimizer.responses import in_a_row, responses
+from patchproof.optimizer.responses import concatenate_responses, responses
 
 N, SEED = 120, 81
 LOOKS = [
@@ -33,7 +33,7 @@ def measured(name: str) -> list[dict]:
     conditions = problem.scene.draw("evaluate", N, SEED)
     photo_px = min(problem.scene.settings.camera.photo_px)
     each = [responses(problem, shown, conditions[i : i + 1], photo_px) for i in range(N)]
-    photographs, rows = {thing: in_a_row([answers[thing] for answers in each]) for thing in shown}, []
+    photographs, rows = {thing: concatenate_responses([answers[thing] for answers in each]) for thing in shown}, []
     for scale, side, taps in LOOKS:
         problems.FIGURE_SCALE, problems.FIGURED = scale, replace(problems.FIGURED, taps=taps, side=side)
         views = responses(problem, shown, conditions)

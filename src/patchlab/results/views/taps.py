@@ -14,9 +14,9 @@ import patchproof as pp
 from patchlab.results.rows import write_rows
 from patchproof.optimizer import problem as problems
 from patchproof.optimizer.loop import best_design
-from patchproof.optimizer.promise import shown_with_controls
+from patchproof.optimizer.promise import pictures_with_controls
 from patchproof.optimizer.responses import responses
-from patchproof.render.pixels import PHOTOGRAPHED
+from patchproof.render.pixels import PHOTO_SAMPLING
 
 N, TAPS = 200, (6, 4, 3, 2)
 
@@ -24,12 +24,12 @@ N, TAPS = 200, (6, 4, 3, 2)
 def measured(name: str) -> list[dict]:
     """The lines of one scene."""
     problem, look, told = problems.set_problem(pp.load_scene(f"{name}.toml")), problems.FIGURED, {}
-    shown = shown_with_controls(problem, best_design(problem), ())
+    shown = pictures_with_controls(problem, best_design(problem), ())
     conditions = problem.scene.draw("promise", N, per_session=4)
-    for taps in (PHOTOGRAPHED.piece_taps, *TAPS):
+    for taps in (PHOTO_SAMPLING.piece_taps, *TAPS):
         problems.FIGURED = replace(look, piece_taps=taps)
         told[taps] = responses(problem, shown, conditions)["design"]
-    problems.FIGURED, rows, many = look, [], told[PHOTOGRAPHED.piece_taps]
+    problems.FIGURED, rows, many = look, [], told[PHOTO_SAMPLING.piece_taps]
     for taps in TAPS:
         off, other = (told[taps].confidence - many.confidence)[0], told[taps].recognized != many.recognized
         figures = {"mean": off.mean(), "rms": np.sqrt((off**2).mean())}

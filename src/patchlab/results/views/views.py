@@ -9,11 +9,11 @@ import sys
 
 import patchproof as pp
 from patchlab.results.rows import write_rows
-from patchproof.base.claims import student_mean
+from patchproof.base.intervals import student_mean
 from patchproof.optimizer.loop import best_design
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import set_problem
-from patchproof.optimizer.responses import in_a_row, responses
+from patchproof.optimizer.responses import concatenate_responses, responses
 
 N, SEED = 200, 79
 
@@ -29,7 +29,7 @@ def measured(name: str) -> list[dict]:
     photographs = [responses(problem, shown, conditions[i : i + 1], photo_px) for i in range(N)]
     rows = []
     for thing in shown:
-        view, photograph = views[thing], in_a_row([each[thing] for each in photographs])
+        view, photograph = views[thing], concatenate_responses([each[thing] for each in photographs])
         confidence = student_mean(view.confidence[0] - photograph.confidence[0])
         rate = student_mean(view.recognized[0].astype(float) - photograph.recognized[0])
         row = {"scene": name, "shown": thing, "n": N, "view_px": problem.figure_px, "photo_px": photo_px}

@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from patchproof.scene.bend import curled
+from patchproof.scene.bend import curl_card
 from patchproof.scene.conditions import Conditions, with_values
 from patchproof.scene.interface import Scene
-from patchproof.scene.patch_scene import needs_patch
+from patchproof.scene.patch_scene import require_patch
 
 Point = Mapping[str, float]
 """Values by axis; what is not named is as drawn, or as the run has it."""
@@ -44,13 +44,13 @@ class Axis:
 
 def _distances(scene: Scene) -> tuple[float, float]:
     """From the scene's closest to where a marker's module is two thirds of a pixel."""
-    patch, nearest = needs_patch(scene), scene.settings.view.distance_mm[0]
+    patch, nearest = require_patch(scene), scene.settings.view.distance_mm[0]
     far = 1.5 * patch.focal_px * patch.piece.module_mm
     return nearest, max(far, 2 * nearest)
 
 
 def _radii(scene: Scene) -> tuple[float, float]:
-    width, _ = needs_patch(scene).placement.size_mm
+    width, _ = require_patch(scene).placement.size_mm
     return 8 * width, 0.35 * width
 
 
@@ -94,7 +94,7 @@ def possible(scene: Scene, name: str) -> bool:
     """Whether this scene can be photographed at other values of the axis."""
     if not scene.HAS_OBJECT:
         return not AXES[name].needs_mesh
-    return name != "curl" or needs_patch(scene).placement.is_flat
+    return name != "curl" or require_patch(scene).placement.is_flat
 
 
 def conditions_at(scene: Scene, conditions: Conditions, point: Point) -> Conditions:
@@ -117,10 +117,10 @@ def placed_at(scene: Scene, point: Point) -> Scene:
     if not {"size", "curl", "gap"} & point.keys():
         return scene
     size = point.get("size", 1.0)
-    scene = needs_patch(scene).printed_at((size, size))
+    scene = require_patch(scene).with_print_scale((size, size))
     placement = scene.placement
     if "curl" in point:
-        placement = curled(placement, point["curl"])
+        placement = curl_card(placement, point["curl"])
     if "gap" in point:
         off, frame = point["gap"] * placement.normal, placement.world_from_piece.copy()
         frame[:3, 3] += off

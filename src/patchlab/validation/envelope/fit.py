@@ -21,7 +21,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from patchproof.base.claims import wilson
+from patchproof.base.intervals import wilson
 
 DRAWS = 200
 TOLERANCE = 0.1  # in log-likelihood: curves this near to the best are as good as it

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from patchlab.validation.envelope.fit import BEYOND, Break
-from patchproof.base.claims import Estimate, paired_difference
+from patchproof.base.intervals import Estimate, paired_difference
 
 CONTROLS = ("bare", "gray")  # of the promise's the bare object and the markers alone; a noise design needs its own draw
 

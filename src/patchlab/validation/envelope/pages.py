@@ -18,8 +18,8 @@ from patchlab.study.figures import EMPTY, number_grid
 from patchlab.validation.envelope.axes import AXES
 from patchlab.validation.envelope.fit import BEYOND, LEAST_LOST, NOT_MONOTONE
 from patchlab.validation.envelope.gains import CONTROLS, gains_of, has_effect
-from patchproof.base.claims import Estimate, rate
 from patchproof.base.goal import Goal
+from patchproof.base.intervals import Estimate, rate
 from patchproof.report.tables import Drawing, Table, Value
 
 if TYPE_CHECKING:

@@ -27,16 +27,16 @@ from patchlab.validation.envelope.gains import gain_break
 from patchlab.validation.envelope.pages import figures, found_and_measured, gains_in, tables
 from patchlab.validation.envelope.world import measured, open_world, recognized
 from patchproof.base.errors import Refused
-from patchproof.base.validation import Finite, Strict, nearest
+from patchproof.base.validation import Finite, StrictModel, spelling_hint
 from patchproof.optimizer.run import load_run
-from patchproof.scene.interface import needs_piece
+from patchproof.scene.interface import require_piece
 
 _SEED = 1_000_000  # the study's seeds begin here, far from those of scenes: Sobol points are what runs are selected on
 Count = Annotated[int, Field(ge=1, le=4096)]
 Points = Annotated[int, Field(ge=3, le=33)]
 
 
-class Sweep(Strict):
+class Sweep(StrictModel):
     """One axis from an easy to a hard value; ends left out are those that suit the scene."""
 
     axis: str  # such as tilt, distance, blur; an unknown one is refused with all names
@@ -45,7 +45,7 @@ class Sweep(Strict):
     points: Points | None = None  # values; by default the study's
 
 
-class Map(Strict):
+class Map(StrictModel):
     """Two axes against each other, each from its easy to its hard end."""
 
     x: str  # the axis across
@@ -53,7 +53,7 @@ class Map(Strict):
     points: Points = 4  # values of each axis
 
 
-class EnvelopeSettings(Strict):
+class EnvelopeSettings(StrictModel):
     """Whose envelope, and how finely. Beside a control that reaches 55 %, a gain of 20 points is shown by 32 conditions
     and one of 10 by 96, where 3 % of them go the other way.
     """
@@ -72,7 +72,7 @@ class EnvelopeSettings(Strict):
 
 def cells(settings: EnvelopeSettings, base: Path) -> Sequence[Cell]:
     """A cell per sweep and per map; refused where the scene has no such axis."""
-    scene = needs_piece(load_run(base / settings.run).scene, "name the run of a printed patch")
+    scene = require_piece(load_run(base / settings.run).scene, "name the run of a printed patch")
     able = [name for name in AXES if possible(scene, name)]
     sweeps = settings.sweeps
     if sweeps is None:
@@ -82,7 +82,7 @@ def cells(settings: EnvelopeSettings, base: Path) -> Sequence[Cell]:
         maps = tuple(Map(x=x, y=y) for x, y in MAPS if x in able and y in able)
     for name in [sweep.axis for sweep in sweeps] + [name for pair in maps for name in (pair.x, pair.y)]:
         if name not in able:
-            raise Refused("an axis along which this scene can be varied", f'"{name}"', nearest(name, able))
+            raise Refused("an axis along which this scene can be varied", f'"{name}"', spelling_hint(name, able))
     if any(pair.x == pair.y for pair in maps):
         raise Refused("two different axes for a map", "one twice", "name another")
     return [

@@ -13,7 +13,7 @@ import numpy as np
 from patchproof.render.stage import Stage
 from patchproof.scene.backgrounds import Backgrounds
 from patchproof.scene.conditions import Conditions
-from patchproof.scene.patch_scene import PatchScene, needs_patch
+from patchproof.scene.patch_scene import PatchScene, require_patch
 
 _MARGIN_SHARE, _MARGIN_PX, _BLOCK = 0.25, 32, 16  # of a window round the piece; blocks of JPEG stay where they are
 
@@ -33,7 +33,7 @@ def window(stage: Stage, conditions: Conditions) -> Frame:
     everything = Frame(stage, whole_px)
     if not stage.scene.HAS_OBJECT or stage.camera is not None:
         return everything
-    scene = needs_patch(stage.scene)
+    scene = require_patch(stage.scene)
     edge = np.linspace(0, 1, 9)
     grid = np.stack(np.meshgrid(edge, edge), -1).reshape(-1, 2) * scene.placement.size_mm
     points = scene.piece_px(conditions, grid)

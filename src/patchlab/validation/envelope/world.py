@@ -27,22 +27,22 @@ from patchlab.validation.hung import hang_own
 from patchproof.base import geometry
 from patchproof.base.output import image_pixels
 from patchproof.channel.printer import Printer, load_printer
-from patchproof.evidence.camera import View
+from patchproof.evidence.camera import PinholePhoto
 from patchproof.evidence.measure import measure
 from patchproof.evidence.ranges import PromisedRanges
 from patchproof.evidence.surface import Surface, surface_of
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import Problem, set_problem
-from patchproof.optimizer.responses import AT_A_TIME, ask
+from patchproof.optimizer.responses import CHUNK_VIEWS, ask
 from patchproof.optimizer.run import Run, load_run
 from patchproof.render.photograph import expose
 from patchproof.render.pixels import PiecePicture
 from patchproof.render.stage import Stage, set_stage
-from patchproof.render.views import Views, relit, see
-from patchproof.reprints.hung_sheet import HungSheet, jpeg_of
+from patchproof.render.views import Views, relight, render_views
+from patchproof.reprints.mounted_sheet import MountedSheet, jpeg_of
 from patchproof.scene.conditions import Conditions
-from patchproof.scene.interface import Scene, needs_piece
-from patchproof.scene.mesh_scene import needs_mesh
+from patchproof.scene.interface import Scene, require_piece
+from patchproof.scene.mesh_scene import require_mesh
 
 _TAPE_SRGB = 0.45  # what hides a corner
 
@@ -53,8 +53,8 @@ class World:
 
     run: Run
     problem: Problem
-    sheet: HungSheet
-    gray: HungSheet
+    sheet: MountedSheet
+    gray: MountedSheet
     surface: Surface
     other: Printer
 
@@ -77,7 +77,7 @@ class Measurement:
 def open_world(folder: Path, other_printer: str | None) -> World:
     """A run's world; `other_printer` None stands for uncoated paper, or coated where the run has uncoated."""
     run = load_run(folder)
-    needs_piece(run.scene, "name the run of a printed patch")
+    require_piece(run.scene, "name the run of a printed patch")
     profile = run.scene.settings.printer.profile
     other = other_printer or ("coated" if profile == "uncoated" else "uncoated")
     sheet, printer = hang_own(run), load_printer(other, run.scene.base)
@@ -122,7 +122,7 @@ def recognized(world: World, points: Sequence[Point], conditions: Conditions) ->
     with torch.inference_mode():
         for first in range(4):  # the corner that is hidden first; each goes with a quarter of the conditions
             every = np.arange(first, len(conditions), 4)
-            size = 1 if as_file else AT_A_TIME
+            size = 1 if as_file else CHUNK_VIEWS
             for rows in (every[i : i + size] for i in range(0, len(every), size)):
                 boxes = first_network.boxes(conditions[rows])
                 views = _Views(world, conditions[rows], first, lambda point, _: Frame(stages.at(point), (side, side)))
@@ -191,9 +191,9 @@ class _Views:
             if self._kept is None or _geometry(self._kept[0]) != _geometry(point):
                 frame = self._frame_of(point, conditions)
                 self._origin_px = frame.origin_px
-                views = see(frame.stage, piece_at(self._world, {}, 0), conditions, frame.size_px)
+                views = render_views(frame.stage, piece_at(self._world, {}, 0), conditions, frame.size_px)
             else:
-                views = relit(self._kept[1], conditions)
+                views = relight(self._kept[1], conditions)
             self._kept = point, views
         return self._kept[1]
 
@@ -203,14 +203,14 @@ def _measurement(world: World, scene: Scene, conditions: Conditions, srgb: np.nd
     whole_px = world.scene.settings.camera.photo_px
     matrix_px = None
     if scene.HAS_OBJECT:  # of pictures nobody knows the focal length
-        matrix_px = needs_mesh(scene).matrix_px(whole_px).copy()
+        matrix_px = require_mesh(scene).matrix_px(whole_px).copy()
         matrix_px[:2, 2] -= origin_px
-    view = View(srgb, matrix_px, calibrated=False)
+    view = PinholePhoto(srgb, matrix_px, calibrated=False)
     entry = measure(view, "photo", world.surface, None, PromisedRanges({})).entry
     error_mm = None
     if entry.status == "measured" and entry.geometry:
         corners = geometry.rect_corners(world.surface.rect_mm)
-        true_px = needs_piece(scene).piece_px(conditions, corners - world.sheet.manifest.cut_mm[:2]) - origin_px
+        true_px = require_piece(scene).piece_px(conditions, corners - world.sheet.manifest.cut_mm[:2]) - origin_px
         error_mm = corner_error_mm(entry.geometry, corners, true_px)
     return Measurement(entry.status, entry.code, error_mm)
 

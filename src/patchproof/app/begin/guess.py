@@ -1,7 +1,7 @@
 """What a file tells of an object before anybody says it: which axis is up, how long it is, what it is called, and
 where a piece goes on it.
 
-In: a mesh file, and names of files. Out: `Up`, a length in millimeters, a label, and `Hang`: the largest piece that
+In: a mesh file, and names of files. Out: `UpGuess`, a length in millimeters, a label, and `PieceGuess`: the largest piece that
 lies well in the middle of one of its sides. Each guess carries the words for the comment beside it in the scene file.
 Where there is no telling, a length is refused, since everything in a scene is in millimeters; so is a label.
 Left out on purpose: other places than middles, which the search for a place knows better.
@@ -27,14 +27,14 @@ from patchproof.base.validation import Side
 from patchproof.classifier.labels import find_labels, find_words
 from patchproof.mesh.load_mesh import load_mesh
 from patchproof.mesh.mesh import Mesh
-from patchproof.scene.bend import lay_for
-from patchproof.scene.fitting import laid_well, largest
-from patchproof.scene.placement import Frame, side_frame
+from patchproof.scene.bend import placement_method
+from patchproof.scene.fitting import largest_fitting_size, place_if_close
+from patchproof.scene.placement import SurfaceFrame, side_frame
 from patchproof.sheets.piece import smallest_piece_mm
 
 _GLTF = (".glb", ".gltf")
-Axis = Literal["y", "z"]
-_HABIT: dict[str, Axis] = {".obj": "y", ".stl": "z", ".ply": "z"}
+UpAxis = Literal["y", "z"]
+_HABIT: dict[str, UpAxis] = {".obj": "y", ".stl": "z", ".ply": "z"}
 _MM_PER_M = 1000.0
 _SENSIBLE_MM = (5.0, 30_000.0)  # what people hang paper on
 _FOOT = 0.005  # of the object's height: what is no higher touches the ground
@@ -51,27 +51,27 @@ _TRIED: tuple[Side, ...] = ("+z", "+x", "-x", "-z", "+y")
 
 
 @dataclass(frozen=True)
-class Up:
+class UpGuess:
     """The axis of the file that points up, why, and whether that is odd."""
 
-    axis: Axis
+    axis: UpAxis
     reason: str
     odd: str | None = None
 
 
-def guess_up(path: Path) -> Up:
+def guess_up(path: Path) -> UpGuess:
     """The axis by the format's standard or habit; one that the object hardly stands on is odd, and of a mere habit the
     other one is taken then.
     """
     kind, name = path.suffix.lower(), path.suffix[1:].upper()
-    axis: Axis = "y" if kind in _GLTF else _HABIT.get(kind, "z")
-    odd = lies_oddly(load_mesh(path, 100.0, axis).vertices, axis)
+    axis: UpAxis = "y" if kind in _GLTF else _HABIT.get(kind, "z")
+    odd = lying_hint(load_mesh(path, 100.0, axis).vertices, axis)
     if odd is not None and kind not in _GLTF:
-        return Up(other_axis(axis), f"as it stands: {name} files say nothing")
-    return Up(axis, "glTF's standard" if kind in _GLTF else f"the habit of {name} files", odd)
+        return UpGuess(other_axis(axis), f"as it stands: {name} files say nothing")
+    return UpGuess(axis, "glTF's standard" if kind in _GLTF else f"the habit of {name} files", odd)
 
 
-def lies_oddly(vertices: np.ndarray, up: Axis) -> str | None:
+def lying_hint(vertices: np.ndarray, up: UpAxis) -> str | None:
     """Words for an object (y up here, its file's `up` taken for that) that would stand clearly better with the file's
     other axis up; None for any other.
     """
@@ -83,7 +83,7 @@ def lies_oddly(vertices: np.ndarray, up: Axis) -> str | None:
     return f'it stands on {stands:.0%} of its footprint so, with "{other_axis(up)}" on {would:.0%}'
 
 
-def other_axis(up: Axis) -> Axis:
+def other_axis(up: UpAxis) -> UpAxis:
     """The other one of those that point up in files."""
     return "z" if up == "y" else "y"
 
@@ -100,7 +100,7 @@ def footing(vertices: np.ndarray) -> float:
         return 0.0
 
 
-def length_of(path: Path) -> float:
+def guess_length_mm(path: Path) -> float:
     """The longest extent by the file's own units; refused where it has none, or none that make sense."""
     do = "add --length-mm with the object's longest extent"
     if path.suffix.lower() not in _GLTF:
@@ -123,7 +123,7 @@ def file_length(path: Path) -> float:
     return float(np.ptp(corners, axis=0).max()) if len(corners) else 0.0
 
 
-def label_of(labels: Sequence[str], said: str | None, path: str) -> str | int:
+def guess_label(labels: Sequence[str], said: str | None, path: str) -> str | int:
     """The label as a scene file writes it: what was said, found by its words, or what the file is called."""
     if said is not None:
         return _written(labels, find_words(labels, said))
@@ -150,7 +150,7 @@ def _written(labels: Sequence[str], index: int) -> str | int:
 
 
 @dataclass(frozen=True)
-class Hang:
+class PieceGuess:
     """Where the piece goes: a side's middle, or wherever the search finds; how large it is, and whether it bends."""
 
     side: Side | None
@@ -170,7 +170,7 @@ class Hang:
         return f"{'bent, ' if self.bend else ''}{where}"
 
 
-def place_for(mesh: Mesh, length_mm: float) -> Hang:
+def guess_piece(mesh: Mesh, length_mm: float) -> PieceGuess:
     """The largest piece that lies well in the middle of a side; where none does, the least, to be searched for."""
     sides: dict[Side, tuple[float, float]] = {side: _wanted(side_frame(mesh, side)) for side in _TRIED}
     flat = [hang for side, size in sides.items() if (hang := _on_side(mesh, side, size, False))]
@@ -183,17 +183,19 @@ def place_for(mesh: Mesh, length_mm: float) -> Hang:
     if least > length_mm:
         do = "check --length-mm: markers of 8 mm need that much"
         raise Refused(f"an object with room for a piece of {least:g} mm", f"one of {length_mm:g} mm", do)
-    return Hang(None, (least, least), False)
+    return PieceGuess(None, (least, least), False)
 
 
-def _wanted(frame: Frame) -> tuple[float, float]:
+def _wanted(frame: SurfaceFrame) -> tuple[float, float]:
     """The largest piece that a side is asked for."""
     width, height = (_SIDE_SHARE * extent for extent in frame.extent_mm)
     return min(width, _LONGER * height, _LARGEST_MM[0]), min(height, _LONGER * width, _LARGEST_MM[1])
 
 
-def _on_side(mesh: Mesh, side: Side, size_mm: tuple[float, float], bend: bool) -> Hang | None:
+def _on_side(mesh: Mesh, side: Side, size_mm: tuple[float, float], bend: bool) -> PieceGuess | None:
     """The largest piece of that shape that lies well in the middle of a side."""
-    frame, lay = side_frame(mesh, side), lay_for(bend)
-    found = largest(size_mm, lambda trial: laid_well(mesh, frame, trial, 0.0, lay), smallest_piece_mm())
-    return None if found is None else Hang(side, found, bend)
+    frame, lay = side_frame(mesh, side), placement_method(bend)
+    found = largest_fitting_size(
+        size_mm, lambda trial: place_if_close(mesh, frame, trial, 0.0, lay), smallest_piece_mm()
+    )
+    return None if found is None else PieceGuess(side, found, bend)

@@ -14,20 +14,20 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
-from patchproof.app.begin.guess import Axis, Up, guess_up, label_of, length_of, other_axis, place_for
+from patchproof.app.begin.guess import UpAxis, UpGuess, guess_label, guess_length_mm, guess_piece, guess_up, other_axis
 from patchproof.app.begin.sides import SIDE_NAMES
 from patchproof.base.errors import Refused
 from patchproof.base.input import is_file, is_folder
-from patchproof.base.output import check_file, write_whole
+from patchproof.base.output import check_file, write_atomically
 from patchproof.base.settings import SceneSettings
-from patchproof.base.validation import NETWORK_FILE, validated
+from patchproof.base.validation import NETWORK_FILE, validate_model
 from patchproof.classifier.labels import find_labels
 from patchproof.classifier.load import load_classifier
 from patchproof.mesh.load_mesh import load_mesh
 from patchproof.mesh.primitives import longest_mm
-from patchproof.scene.image_scene import label_rows
-from patchproof.scene.open_scene import OpenScene
-from patchproof.scene.places import Ground
+from patchproof.scene.candidate_places import PlaceFinder
+from patchproof.scene.image_scene import read_labels
+from patchproof.scene.open_scene import UnplacedScene
 from patchproof.scene.scene import build_scene
 from patchproof.sheets.manifest import load_manifest
 
@@ -41,7 +41,7 @@ def new_scene(
     *,
     label: str | None = None,
     length_mm: float | None = None,
-    up: Axis | None = None,
+    up: UpAxis | None = None,
     models: Sequence[str] = ("builtin",),
     overwrite: bool = False,
 ) -> list[str]:
@@ -58,23 +58,23 @@ def new_scene(
         raise Refused("a mesh with --length-mm or --up", f"the folder {thing}", do)
     else:
         text, lines = _of_folder(Path(thing), base, label, models)
-    scene = build_scene(validated(SceneSettings, tomllib.loads(text), "the new scene"), base)
-    if isinstance(scene, OpenScene):
-        Ground(scene).spots(1)  # refused where it has no place
-    write_whole(out, text)
+    scene = build_scene(validate_model(SceneSettings, tomllib.loads(text), "the new scene"), base)
+    if isinstance(scene, UnplacedScene):
+        PlaceFinder(scene).spots(1)  # refused where it has no place
+    write_atomically(out, text)
     return [*lines, *(f"warning: {warning}" for warning in scene.warnings)]
 
 
 def _of_mesh(
-    thing: str, base: Path, label: str | None, length_mm: float | None, axis: Axis | None, models
+    thing: str, base: Path, label: str | None, length_mm: float | None, axis: UpAxis | None, models
 ) -> tuple[str, list[str]]:
-    named = label_of(_labels(models, base), label, thing)
+    named = guess_label(_labels(models, base), label, thing)
     path, primitive, said = Path(thing), thing.startswith("primitive:"), "as given"
-    up = Up("y", "primitives are") if primitive else Up(axis, said) if axis else guess_up(path)
+    up = UpGuess("y", "primitives are") if primitive else UpGuess(axis, said) if axis else guess_up(path)
     if length_mm is None:
         said = "the primitive's own" if primitive else "by the file's units, meters: measure it"
-        length_mm = longest_mm(thing.partition(":")[2]) if primitive else length_of(path)
-    hang = place_for(load_mesh(thing, length_mm, up.axis), length_mm)
+        length_mm = longest_mm(thing.partition(":")[2]) if primitive else guess_length_mm(path)
+    hang = guess_piece(load_mesh(thing, length_mm, up.axis), length_mm)
     near, far = (float(f"{times * length_mm:.2g}") for times in (NEAR, FAR))
     azimuth, elevation = "of the camera about the vertical; 0 faces the piece", "above the horizontal"
     if hang.side == "+y":
@@ -119,7 +119,7 @@ def _of_mesh(
     ]
 
 
-def _turned(up: Up) -> list[str]:
+def _turned(up: UpGuess) -> list[str]:
     """The other axis as a comment beside the one of an object that may lie."""
     if up.odd is None:
         return []
@@ -127,7 +127,7 @@ def _turned(up: Up) -> list[str]:
     return [_line(other, f"in its place if the preview shows it lying: {up.odd}"), f"# Best of all {_again(up)}."]
 
 
-def _again(up: Up) -> str:
+def _again(up: UpGuess) -> str:
     return f"write the scene again with --up {other_axis(up.axis)}: sides and sizes change with it"
 
 
@@ -142,17 +142,17 @@ def _of_folder(folder: Path, base: Path, label: str | None, models) -> tuple[str
         do = "lay the one that hangs there into the folder, the others elsewhere"
         raise Refused("one blank sheet's JSON", ", ".join(path.name for path in manifests), do)
     if not tables:
-        named = label_of(_labels(models, base), label, folder.resolve().name)
+        named = guess_label(_labels(models, base), label, folder.resolve().name)
         sheet = _line(f"sheet = {_quoted(_path(manifests[0], base))}", "of the blank that hangs on the object there")
         lines = ["[object]", f"photos = {_quoted(_path(folder, base))}", sheet, "", _line("[patch]", "as the blank's")]
         text = "\n".join([*_HEAD, *lines, "", *_target(named, models, base), ""])
         said = f"photographs: {folder}, with the blank of {manifests[0].name}"
         return text, [said, f'label: "{named}" ({models[0]})']
     table = next((path for path in tables if path.stem == "labels"), tables[0])
-    counts = Counter(named for name, named in label_rows(table) if is_file(folder / name))
+    counts = Counter(named for name, named in read_labels(table) if is_file(folder / name))
     if not counts:
         raise Refused(f"images that {table.name} names in {folder}", "none", "write their file names there")
-    named = label_of(_labels(models, base), label or counts.most_common(1)[0][0], folder.name)
+    named = guess_label(_labels(models, base), label or counts.most_common(1)[0][0], folder.name)
     lines = ["[object]", f"images = {_quoted(_path(folder, base))}", f"labels = {_quoted(_path(table, base))}", ""]
     lines += ["[patch]", *_size(100, 100), "", *_target(named, models, base), "", "[view]"]
     lines += [_line("patch_share = [0.2, 0.3]", "the piece's longer side over the picture's shorter one"), ""]

@@ -17,29 +17,29 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from patchproof.app.begin.guess import lies_oddly, other_axis
+from patchproof.app.begin.guess import lying_hint, other_axis
+from patchproof.app.begin.sample_views import SampleView, looks
 from patchproof.app.begin.sides import SIDE_NAMES, gap_colors, ramp, side_of, side_views, turntable
-from patchproof.app.begin.views import Look, looks
-from patchproof.base.color import codes_of
+from patchproof.base.color import codes_from_srgb
 from patchproof.base.errors import Refused
-from patchproof.base.output import image_bytes, new_folder, write_whole
-from patchproof.base.resample import reduced
+from patchproof.base.output import image_bytes, new_folder, write_atomically
+from patchproof.base.resample import downscale
 from patchproof.base.settings import SceneSettings, load_scene_settings
 from patchproof.classifier.labels import find_labels
 from patchproof.classifier.load import load_classifier
 from patchproof.mesh.export import write_glb
-from patchproof.mesh.mesh import Material, Part
+from patchproof.mesh.mesh import Material, MeshPart
 from patchproof.render.stage import Stage, set_stage
 from patchproof.report.images import base64_uri, data_uri, jpeg, png
 from patchproof.report.page import page
 from patchproof.scene.bend import STRETCH_LIMIT
+from patchproof.scene.canvas import whole_colors
 from patchproof.scene.interface import Scene
-from patchproof.scene.mesh_scene import MeshScene, needs_mesh
-from patchproof.scene.open_scene import OpenScene
+from patchproof.scene.mesh_scene import MeshScene, require_mesh
+from patchproof.scene.open_scene import UnplacedScene
 from patchproof.scene.patch_scene import PatchScene
 from patchproof.scene.placement import gap_limit_mm
 from patchproof.scene.scene import build_scene
-from patchproof.scene.texture import whole_colors
 from patchproof.scene.texture_scene import TextureScene
 
 PAGE, OBJECT = "preview.html", "preview.glb"
@@ -93,7 +93,7 @@ def preview_scene(scene_path: str | Path, out: str | Path, *, overwrite: bool = 
             looks=[(look, data_uri(jpeg(look.picture))) for look in seen],
             summaries=summaries,
         )
-        write_whole(folder / PAGE, text)
+        write_atomically(folder / PAGE, text)
     lines = (*(f"{name}: {text}" for name, text in facts), *summaries)
     return Preview(Path(out) / PAGE, lines, warnings, " ".join(problems) or None)
 
@@ -101,7 +101,7 @@ def preview_scene(scene_path: str | Path, out: str | Path, *, overwrite: bool = 
 def _lying(scene: Scene, settings: SceneSettings) -> tuple[str, ...]:
     """What to do about an object that would stand better with its file's other axis up."""
     up, name = settings.object.up, settings.object.mesh or ""
-    if not isinstance(scene, MeshScene) or ":" in name or (odd := lies_oddly(scene.mesh.vertices, up)) is None:
+    if not isinstance(scene, MeshScene) or ":" in name or (odd := lying_hint(scene.mesh.vertices, up)) is None:
         return ()
     return (f'the object may lie: {odd}. If it does, write up = "{other_axis(up)}" in [object]',)
 
@@ -116,7 +116,7 @@ def _scene(settings: SceneSettings, base: Path) -> tuple[Scene, str | None]:
         patch = {"place": "auto", "at_mm": None, "offset_mm": (0.0, 0.0), "spin_deg": 0.0}
         view = {"look_at": "object", "front": "patch"}
         return build_scene(settings.changed(patch=patch, view=view), base), str(refused)
-    if not isinstance(scene, OpenScene):
+    if not isinstance(scene, UnplacedScene):
         return scene, None
     try:
         placed = scene.at(settings.patch.side, 0.0)
@@ -160,7 +160,7 @@ def _facts(scene: Scene, settings: SceneSettings) -> list[tuple[str, str]]:
         readable = f"unreadable in {scene.unreadable_share:.0%} of views"
         facts.append(("markers", f"{scene.piece.marker_mm:.1f} mm, {readable}"))
     else:
-        facts.append(("piece", "not placed" if isinstance(scene, OpenScene) else f"{size}: {lies['reason']}"))
+        facts.append(("piece", "not placed" if isinstance(scene, UnplacedScene) else f"{size}: {lies['reason']}"))
     if isinstance(scene, TextureScene):
         for name, mask in zip(scene.canvas.names, scene.canvas.mask, strict=True):
             if mask.any():
@@ -173,7 +173,7 @@ def _facts(scene: Scene, settings: SceneSettings) -> list[tuple[str, str]]:
     return facts
 
 
-def _answers(settings: SceneSettings, seen: Sequence[Look]) -> list[str]:
+def _answers(settings: SceneSettings, seen: Sequence[SampleView]) -> list[str]:
     """How often each network recognizes the bare object."""
     lines = []
     for number, first in enumerate(seen[0].answers):
@@ -203,14 +203,14 @@ def _maps(scene: PatchScene) -> list[dict[str, str]]:
 
 def _write_object(stage: Stage, design: np.ndarray | None, path: Path) -> None:
     """The object as a GLB file, with the piece that shows `design` where a scene has one."""
-    scene = needs_mesh(stage.scene)
+    scene = require_mesh(stage.scene)
     mesh = whole_colors(scene.mesh, np.zeros(len(scene.mesh.faces), bool))
-    textures = [reduced(m.texture_srgb, _TEXTURE_PX) for m in mesh.materials if m.texture_srgb is not None]
+    textures = [downscale(m.texture_srgb, _TEXTURE_PX) for m in mesh.materials if m.texture_srgb is not None]
     piece = None
     if isinstance(scene, PatchScene):
         laid, material = scene.placement, Material("piece", (1.0, 1.0, 1.0), design)
-        piece = Part(laid.vertices_mm, laid.faces, material, laid.piece_mm / laid.size_mm, laid.normals)
-    write_whole(path, lambda part: write_glb(mesh, textures, part, piece))
+        piece = MeshPart(laid.vertices_mm, laid.faces, material, laid.piece_mm / laid.size_mm, laid.normals)
+    write_atomically(path, lambda part: write_glb(mesh, textures, part, piece))
 
 
 def _gray_design(stage: Stage) -> np.ndarray | None:
@@ -219,4 +219,4 @@ def _gray_design(stage: Stage) -> np.ndarray | None:
         return None
     size_mm = stage.scene.piece.size_mm
     width, height = (max(8, round(side * _DESIGN_PX / max(size_mm))) for side in size_mm)
-    return codes_of(stage.look.shown(torch.full((3, height, width), 0.5)).srgb).cpu().numpy()
+    return codes_from_srgb(stage.look.shown(torch.full((3, height, width), 0.5)).srgb).cpu().numpy()

@@ -17,10 +17,10 @@ import numpy as np
 from patchproof.base.geometry import UP, orbit
 from patchproof.base.validation import Side
 from patchproof.render.stage import Stage
-from patchproof.reprints.hung import straight_picture
-from patchproof.scene.mesh_scene import MeshScene, needs_mesh
+from patchproof.reprints.plan_view import plan_picture
+from patchproof.scene.mesh_scene import MeshScene, require_mesh
 from patchproof.scene.patch_scene import PatchScene
-from patchproof.scene.placement import Frame, Placement, gap_limit_mm, side_frame
+from patchproof.scene.placement import Placement, SurfaceFrame, gap_limit_mm, side_frame
 
 SIDE_NAMES: dict[Side, str] = {"+z": "front", "-z": "back", "-x": "left", "+x": "right", "+y": "top", "-y": "bottom"}
 PICTURE_PX = 320  # along the longer side: 24 from all around take 0.8 s, at 400 px 1.1 s of a preview's 4.5
@@ -29,8 +29,8 @@ _STEP_DEG = 15
 _ABOVE_DEG, _STEEPEST_DEG = 20.0, 55.0
 _BAR_SHARE = 0.35  # of the picture's width at most
 # five colors of viridis, legible to the color-blind; and one that is none of them
-RAMP = ((68, 1, 84), (59, 82, 139), (33, 145, 140), (94, 201, 98), (253, 231, 37))
-NO_SURFACE = (230, 0, 90)
+RAMP_RGB = ((68, 1, 84), (59, 82, 139), (33, 145, 140), (94, 201, 98), (253, 231, 37))
+NO_SURFACE_RGB = (230, 0, 90)
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class SideView:
 
 def side_views(stage: Stage) -> tuple[SideView, ...]:
     """All six of a stage's object, front first, the piece colored by its gap."""
-    scene = needs_mesh(stage.scene)
+    scene = require_mesh(stage.scene)
     half_mm = _ROOM * float(np.abs(_points_mm(scene)).max())
     bar_mm = round_length(2 * half_mm * _BAR_SHARE)
     bar_px = bar_mm / (2 * half_mm) * PICTURE_PX
@@ -66,7 +66,7 @@ def turntable(stage: Stage, on_piece: np.ndarray | None) -> dict[int, np.ndarray
     180 down to -165, so that what faces the camera moves to the right from one to the next; `on_piece` (uint8 h×w×3) is
     shown on the piece of a scene that has one.
     """
-    scene = needs_mesh(stage.scene)
+    scene = require_mesh(stage.scene)
     x, y, z = scene.normal
     front = np.array([x, 0.0, z]) if np.hypot(x, z) > 1e-3 else np.array([0.0, 0.0, 1.0])
     slope_deg = float(np.degrees(np.arcsin(np.clip(y, -1, 1))))
@@ -75,7 +75,7 @@ def turntable(stage: Stage, on_piece: np.ndarray | None) -> dict[int, np.ndarray
     frames = {azimuth: _upright(orbit(azimuth, elevation_deg, front), scene.frame) for azimuth in ring}
     points = _points_mm(scene)
     half_mm = _ROOM * np.max([np.abs(points @ np.stack([f.right, f.up], 1)).max(0) for f in frames.values()], axis=0)
-    return {azimuth: straight_picture(stage, frame, half_mm, PICTURE_PX, on_piece) for azimuth, frame in frames.items()}
+    return {azimuth: plan_picture(stage, frame, half_mm, PICTURE_PX, on_piece) for azimuth, frame in frames.items()}
 
 
 def side_of(direction: np.ndarray) -> Side:
@@ -91,16 +91,16 @@ def round_length(most_mm: float) -> float:
 
 
 def gap_colors(placement: Placement) -> np.ndarray:
-    """uint8 N×N×3 over the piece: 0 to `gap_limit_mm` from dark to light, `NO_SURFACE` where nothing is under it."""
+    """uint8 N×N×3 over the piece: 0 to `gap_limit_mm` from dark to light, `NO_SURFACE_RGB` where nothing is under it."""
     colors = ramp(placement.gaps_mm / gap_limit_mm(placement.size_mm))
-    colors[np.isnan(placement.gaps_mm)] = NO_SURFACE
+    colors[np.isnan(placement.gaps_mm)] = NO_SURFACE_RGB
     return colors
 
 
 def ramp(shares: np.ndarray) -> np.ndarray:
     """uint8 ...×3: colors of shares in [0, 1]; beyond, those of the ends."""
-    stops = np.linspace(0, 1, len(RAMP))
-    channels = [np.interp(np.nan_to_num(shares), stops, column) for column in np.array(RAMP, float).T]
+    stops = np.linspace(0, 1, len(RAMP_RGB))
+    channels = [np.interp(np.nan_to_num(shares), stops, column) for column in np.array(RAMP_RGB, float).T]
     return np.stack(channels, -1).round().astype(np.uint8)
 
 
@@ -110,16 +110,16 @@ def _points_mm(scene: MeshScene) -> np.ndarray:
     return np.concatenate([own, scene.placement.vertices_mm]) if isinstance(scene, PatchScene) else own
 
 
-def _upright(toward: np.ndarray, like: Frame) -> Frame:
+def _upright(toward: np.ndarray, like: SurfaceFrame) -> SurfaceFrame:
     """The upright frame that faces a direction."""
     right = np.cross(UP, toward)
     right /= np.linalg.norm(right)
-    return Frame(right, np.cross(toward, right), toward, like.origin_mm, like.extent_mm)
+    return SurfaceFrame(right, np.cross(toward, right), toward, like.origin_mm, like.extent_mm)
 
 
 def _picture(stage: Stage, side: Side, half_mm: float) -> np.ndarray:
-    scene, colors = needs_mesh(stage.scene), None
+    scene, colors = require_mesh(stage.scene), None
     frame = side_frame(scene.mesh, side)
     if isinstance(scene, PatchScene) and (scene.placement.normals @ frame.normal).max() > 1e-6:
         colors = gap_colors(scene.placement)
-    return straight_picture(stage, frame, np.array([half_mm, half_mm]), PICTURE_PX, colors)
+    return plan_picture(stage, frame, np.array([half_mm, half_mm]), PICTURE_PX, colors)

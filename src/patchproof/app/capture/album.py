@@ -19,13 +19,13 @@ from typing import Any
 
 from patchproof.base.errors import Refused
 from patchproof.base.output import check_folder, make_folder
-from patchproof.photo.read import pictures_in
+from patchproof.photo.read import list_images
 
-CONTROLS_FOLDER, JOURNAL, ADDRESS = "controls", "photos.jsonl", ".capture.json"
+CONTROLS_FOLDER, JOURNAL_FILE, ADDRESS_FILE = "controls", "photos.jsonl", ".capture.json"
 CONTROLS = ("bare", "mean", "gray", "noise", "shuffled", "blank")
 MOST_BYTES = 40_000_000  # phones' largest JPEGs, of 108 and 200 megapixels, have some 30
 MOST_PHOTOS = 1000
-_OWN = ("session_*", CONTROLS_FOLDER, JOURNAL, ADDRESS)
+_OWN = ("session_*", CONTROLS_FOLDER, JOURNAL_FILE, ADDRESS_FILE)
 _HEAD = 12  # bytes that tell a kind
 _HEIF = (b"heic", b"heix", b"heim", b"heis", b"mif1", b"msf1")
 _NUMBERED = re.compile(r"\.?photo_(\d{4,})\.")
@@ -64,7 +64,7 @@ class Album:
         """Every photograph, those of controls last."""
         shown = [self.folder / CONTROLS_FOLDER / name for name in CONTROLS]
         folders = [self.folder / name for name in self.sessions] + [path for path in shown if path.is_dir()]
-        return [photo for folder in folders for photo in pictures_in(folder)]
+        return [photo for folder in folders for photo in list_images(folder)]
 
     def know(self, photo: Path, sha256: str | None) -> None:
         """The photograph has these bytes."""
@@ -74,7 +74,7 @@ class Album:
     def new_session(self) -> str:
         """A new session; the last one again where it has no photograph yet."""
         last = self.sessions[-1]
-        if pictures_in(self.folder / last):
+        if list_images(self.folder / last):
             last = f"session_{int(last.rpartition('_')[2]) + 1:02d}"
             make_folder(self.folder / last)
         return last

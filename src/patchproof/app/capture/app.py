@@ -23,7 +23,7 @@ from starlette.responses import HTMLResponse, JSONResponse, Response
 from starlette.routing import Route
 
 from patchproof.app.capture.album import MOST_BYTES, UploadRefused, refuse_size
-from patchproof.app.capture.gathered import Gathered
+from patchproof.app.capture.collection import PhotoCollection
 from patchproof.app.capture.state import answer_of, state_of
 from patchproof.evidence.verdict import sessions_needed
 from patchproof.report.page import page
@@ -41,7 +41,7 @@ _HEADERS = {
 }
 
 
-def capture_app(gathered: Gathered, token: str) -> ASGIApp:
+def capture_app(gathered: PhotoCollection, token: str) -> ASGIApp:
     """The application for what is gathered; it answers whoever knows the token."""
     desk = _Desk(gathered)
     routes = [
@@ -81,7 +81,7 @@ class _Guard:
 class _Desk:
     """What the routes share."""
 
-    def __init__(self, gathered: Gathered):
+    def __init__(self, gathered: PhotoCollection):
         self._gathered, promise = gathered, gathered.manifest.promise
         self._planned = None if promise is None else sessions_needed(promise)
         self._state = state_of(gathered, self._planned)

@@ -19,14 +19,14 @@ from typing import Annotated
 
 from pydantic import Field
 
-from patchproof.app.capture.album import ADDRESS, Album
-from patchproof.app.capture.gathered import Gathered, ready
+from patchproof.app.capture.album import ADDRESS_FILE, Album
+from patchproof.app.capture.collection import PhotoCollection, ready
 from patchproof.app.verify import options_of
 from patchproof.base.errors import Refused
 from patchproof.base.input import read_json
-from patchproof.base.output import write_whole
+from patchproof.base.output import write_atomically
 from patchproof.base.progress import Progress, no_progress
-from patchproof.base.validation import Strict, validated
+from patchproof.base.validation import StrictModel, validate_model
 from patchproof.base.workers import open_workers
 from patchproof.evidence.results import Report
 from patchproof.sheets.manifest import load_manifest
@@ -35,7 +35,7 @@ _NOWHERE = ("192.0.2.1", 9)  # reserved for documentation: a datagram socket tha
 _CONNECTIONS = 64
 
 
-class _Address(Strict):
+class _Address(StrictModel):
     token: Annotated[str, Field(pattern="^[A-Za-z0-9_-]{22,64}$")]
     port: Annotated[int, Field(ge=0, le=65535)]
 
@@ -75,12 +75,12 @@ def serve_capture(
     album = Album(Path(out))
     with open_workers(1, apart=True) as workers:
         workers.map(ready, [None])
-        with closing(Gathered(album, manifest, options, workers, forecast)) as gathered:
+        with closing(PhotoCollection(album, manifest, options, workers, forecast)) as gathered:
             gathered.measure(album.photos(), partial(progress, "measure"))
             kept = _kept_address(album.folder)
             with _listening(_host(lan), kept.port) as listener:
                 host, port = listener.getsockname()
-                write_whole(album.folder / ADDRESS, kept.changed(port=port).write)
+                write_atomically(album.folder / ADDRESS_FILE, kept.changed(port=port).write)
                 on_address(f"http://{host}:{port}/{kept.token}/")
                 config = uvicorn.Config(
                     capture_app(gathered, kept.token),
@@ -135,6 +135,6 @@ def _own_address() -> str:
 def _kept_address(folder: Path) -> _Address:
     """Token and port of last time; new ones where there are none."""
     try:
-        return validated(_Address, read_json(folder / ADDRESS, "an address", "remove it"), ADDRESS)
+        return validate_model(_Address, read_json(folder / ADDRESS_FILE, "an address", "remove it"), ADDRESS_FILE)
     except Refused:
         return _Address(token=secrets.token_urlsafe(24), port=0)

@@ -13,21 +13,21 @@ from typing import Any
 import numpy as np
 
 from patchproof.app.capture.album import CONTROLS
-from patchproof.app.capture.gathered import Gathered
-from patchproof.app.capture.views import map_views
+from patchproof.app.capture.collection import PhotoCollection
+from patchproof.app.capture.view_map import map_views
 from patchproof.base.output import image_bytes
 from patchproof.evidence.results import PhotoEntry
-from patchproof.evidence.verdict import EACH, photos_line
+from patchproof.evidence.verdict import PHOTOS_PER_SESSION, photos_line
 from patchproof.report.images import data_uri
-from patchproof.report.words import VERDICTS, headline_of, worth_sentence
+from patchproof.report.words import VERDICTS, benefit_sentence, headline_of
 
 _LATEST = 12  # photographs with advice
 _USUAL_SESSIONS = 4  # where no number of them would do
 _PREVIEW = {"quality": 80}
 
 
-def state_of(gathered: Gathered, sessions: int | None) -> dict[str, Any]:
-    """All that the page shows but single answers; `sessions` of `EACH` photographs are planned."""
+def state_of(gathered: PhotoCollection, sessions: int | None) -> dict[str, Any]:
+    """All that the page shows but single answers; `sessions` of `PHOTOS_PER_SESSION` photographs are planned."""
     report = gathered.report()
     summary, plain, promise = report.summary, report.summary.model_dump(), gathered.manifest.promise
     counts = {row["name"]: row for row in plain["sessions"]}
@@ -38,25 +38,25 @@ def state_of(gathered: Gathered, sessions: int | None) -> dict[str, Any]:
         "verdict": summary.verdict,
         "headline": VERDICTS[summary.verdict],
         "reason": summary.reason,
-        "effect": f"{headline_of(plain)}. {worth_sentence(plain)}",
+        "effect": f"{headline_of(plain)}. {benefit_sentence(plain)}",
         "photos": summary.photos,
         "judged": summary.judged,
         "recognized": sum(row["recognized"] for row in rows),
         "interval": summary.interval,
         "prediction_interval": summary.prediction_interval,
         "sessions": rows,
-        "each": EACH,
+        "each": PHOTOS_PER_SESSION,
         "plan": summary.next_step or (photos_line(sessions) if promise is not None else ""),
         "controls": [
             {"name": control.name, "photos": control.n, "recognized": control.recognized} for control in report.controls
         ],
         "controls_known": [name for name in CONTROLS if name in promised] or CONTROLS,
-        "map": _map(gathered, EACH * (sessions or _USUAL_SESSIONS)),
+        "map": _map(gathered, PHOTOS_PER_SESSION * (sessions or _USUAL_SESSIONS)),
         "latest": [answer_of(gathered, path) for path in names[-_LATEST:][::-1]],
     }
 
 
-def answer_of(gathered: Gathered, path: Path, picture: np.ndarray | None = None) -> dict[str, Any]:
+def answer_of(gathered: PhotoCollection, path: Path, picture: np.ndarray | None = None) -> dict[str, Any]:
     """What one measured photograph says, and what to do; `picture` (uint8 H×W×3) goes along as a data URI."""
     photo, promise, answer, prediction = gathered.photos[path], gathered.manifest.promise, "not counted", None
     entry = photo.entry
@@ -89,7 +89,7 @@ def _view(entry: PhotoEntry) -> str:
     return ", ".join(parts)
 
 
-def _map(gathered: Gathered, wanted: int) -> dict[str, Any] | None:
+def _map(gathered: PhotoCollection, wanted: int) -> dict[str, Any] | None:
     """The map with its rows' and columns' names: degrees, and the piece's share of the picture's shorter side."""
     promise, side_px, photos = gathered.manifest.promise, gathered.side_px, gathered.photos
     counted = [photo.entry for path, photo in photos.items() if photo.counted and gathered.control_of(path) is None]

@@ -11,7 +11,7 @@ import typer
 from patchproof.app.cli.begin import keys, new, plan, preview
 from patchproof.app.cli.calibrate import camera, printer
 from patchproof.app.cli.capture import capture
-from patchproof.app.cli.console import carried_out, run_command_line, version_option
+from patchproof.app.cli.console import as_command, run_command_line, version_option
 from patchproof.app.cli.designs import evaluate, import_picture
 from patchproof.app.cli.journey import demo, optimize, promise, reprint, sheet, verify
 
@@ -23,13 +23,13 @@ app = typer.Typer(
 _calibrate = typer.Typer(no_args_is_help=True, help="Models of a printer or a camera, from photographs and profiles.")
 
 for _verb in (demo, new, preview, plan, optimize):
-    app.command()(carried_out(_verb))
-app.command("import")(carried_out(import_picture))
+    app.command()(as_command(_verb))
+app.command("import")(as_command(import_picture))
 for _verb in (promise, evaluate, sheet, reprint, capture, verify):
-    app.command()(carried_out(_verb))
+    app.command()(as_command(_verb))
 app.add_typer(_calibrate, name="calibrate")
 for _verb in (printer, camera):
-    _calibrate.command()(carried_out(_verb))
+    _calibrate.command()(as_command(_verb))
 app.command()(keys)
 app.callback()(version_option)
 

@@ -64,7 +64,7 @@ def plan(
     """What is modeled, what is not, and why: first how the piece lies, then what is measured."""
     from patchproof.app.plan.lines import geometry_lines, measured_lines
     from patchproof.app.plan.plan import measured_plan, plan_geometry
-    from patchproof.base.output import check_file, write_whole
+    from patchproof.base.output import check_file, write_atomically
 
     if out is not None:
         check_file(out, overwrite)
@@ -77,7 +77,7 @@ def plan(
         planned = measured_plan(geometry, problem, timing=not no_timing, progress=bar)
     say(*measured_lines(planned))
     if out is not None:
-        write_whole(out, planned.model_dump_json(indent=1) + "\n")
+        write_atomically(out, planned.model_dump_json(indent=1) + "\n")
 
 
 def keys(

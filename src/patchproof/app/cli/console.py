@@ -21,7 +21,7 @@ import typer
 from patchproof.base.errors import Refused
 from patchproof.base.output import disk_is_full
 from patchproof.base.version import __version__
-from patchproof.base.workers import can_fork, free_cores, keep_freed_memory, threads
+from patchproof.base.workers import available_cores, can_fork, keep_freed_memory, use_threads
 
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace this command's earlier output.")]
 Device = Annotated[str, typer.Option(help="cpu or cuda.")]
@@ -78,7 +78,7 @@ def _line_now_and_then() -> Callable[[str, int, int], None]:
     return advance
 
 
-def carried_out(verb: Callable[..., None]) -> Callable[..., None]:
+def as_command(verb: Callable[..., None]) -> Callable[..., None]:
     """A verb on the cores that are free (`jobs`), which, stopped by Ctrl-C, says what is kept and how to go on, and
     exits with 130.
     """
@@ -103,8 +103,8 @@ def _on_free_cores(given: dict[str, Any]) -> AbstractContextManager[None]:
         return nullcontext()
     by_processes = can_fork() and given.get("device", "cpu") == "cpu"
     if given["jobs"] is None:
-        given["jobs"] = free_cores() if by_processes and given.get("cluster") is None else 1
-    return threads(1) if by_processes else nullcontext()
+        given["jobs"] = available_cores() if by_processes and given.get("cluster") is None else 1
+    return use_threads(1) if by_processes else nullcontext()
 
 
 def _stopped(given: dict[str, Any]) -> str:

@@ -36,15 +36,15 @@ def import_picture(
     jobs: Jobs = None,
 ) -> None:
     """Make a run of a picture that was made elsewhere: its promise, as of a design of ours."""
-    from patchproof.base.settings import behind
-    from patchproof.optimizer.given import import_folder, import_patch
+    from patchproof.base.settings import background_summary
+    from patchproof.optimizer.imported_design import import_folder, import_patch
     from patchproof.optimizer.promise import PromiseOptions
-    from patchproof.optimizer.run import DRAFT
+    from patchproof.optimizer.run import DRAFT_EFFORT
     from patchproof.report.words import imported_lines, promise_lines
     from patchproof.scene.scene import load_scene
 
     with progress() as bar:
-        loaded, views = load_scene(scene, seed), promise or (DRAFT[1] if draft else None)
+        loaded, views = load_scene(scene, seed), promise or (DRAFT_EFFORT[1] if draft else None)
         warn(loaded.warnings)
         options: dict[str, Any] = {"promise": PromiseOptions(views), "compute": Compute(device, jobs or 1)}
         options |= {"overwrite": overwrite, "progress": bar}
@@ -54,7 +54,7 @@ def import_picture(
             runs = [import_patch(picture, loaded, out, **options)]
     for run in runs:
         say(*imported_lines(run.details["imported"]))
-        say(*promise_lines(run.promise, behind(run.scene.settings.model_dump())), f"run: {run.folder}")
+        say(*promise_lines(run.promise, background_summary(run.scene.settings.model_dump())), f"run: {run.folder}")
 
 
 def evaluate(

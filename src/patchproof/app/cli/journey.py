@@ -24,8 +24,8 @@ from patchproof.app.cli.console import (
 )
 from patchproof.base.compute import Compute
 
-Control = Literal["mean", "gray", "noise", "shuffled", "blank"]  # that can be printed
-Shown = Literal["bare", "mean", "gray", "noise"]  # that can hang on the object in place of the design
+PrintableControl = Literal["mean", "gray", "noise", "shuffled", "blank"]  # that can be printed
+PhotographedControl = Literal["bare", "mean", "gray", "noise"]  # that can hang on the object in place of the design
 
 
 def demo(
@@ -62,9 +62,9 @@ def optimize(
     ] = None,
 ) -> None:
     """Optimize the patch of a scene and promise its rate."""
-    from patchproof.base.settings import behind
+    from patchproof.base.settings import background_summary
     from patchproof.optimizer.promise import PromiseOptions
-    from patchproof.optimizer.run import DRAFT, THOROUGH
+    from patchproof.optimizer.run import DRAFT_EFFORT, THOROUGH_EFFORT
     from patchproof.optimizer.run import optimize as optimize_scene
     from patchproof.report.words import promise_lines
     from patchproof.scene.scene import load_scene
@@ -72,7 +72,7 @@ def optimize(
     if draft and thorough:
         raise typer.BadParameter("is the opposite of --draft; leave one out", param_hint="--thorough")
     if draft or thorough:
-        effort = DRAFT if draft else THOROUGH
+        effort = DRAFT_EFFORT if draft else THOROUGH_EFFORT
         steps, promise = steps or effort[0], promise or effort[1]
     with progress() as bar:
         loaded = load_scene(scene, seed, steps)
@@ -87,10 +87,10 @@ def optimize(
             progress=bar,
         )
     warn(tuple(text for text in run.scene.warnings if text not in loaded.warnings))  # of the place that was found
-    say(*promise_lines(run.promise, behind(run.scene.settings.model_dump())))
+    say(*promise_lines(run.promise, background_summary(run.scene.settings.model_dump())))
     if (out / "place.json").is_file():  # what searches a place is loaded where one was searched for
         from patchproof.optimizer.place_files import read_place
-        from patchproof.optimizer.places import place_lines
+        from patchproof.optimizer.place_search import place_lines
 
         if (place := read_place(out)) is not None:
             say(*place_lines(place))
@@ -107,13 +107,13 @@ def promise(
     jobs: Jobs = None,
 ) -> None:
     """Promise a finished run's rate anew: the full promise of a draft, or one of more views."""
-    from patchproof.base.settings import behind
+    from patchproof.base.settings import background_summary
     from patchproof.optimizer.run import promise_run
     from patchproof.report.words import promise_lines
 
     with progress() as bar:
         made = promise_run(run, views=n, compute=Compute(device, jobs or 1), progress=bar)
-    say(*promise_lines(made.promise, behind(made.scene.settings.model_dump())))
+    say(*promise_lines(made.promise, background_summary(made.scene.settings.model_dump())))
     if made.scene.settings.patch.kind == "patch":
         say(f"next: patchproof sheet {run} --out sheet.pdf (a page that was written before has the former promise)")
 
@@ -125,7 +125,9 @@ def sheet(
         typer.Argument(metavar="[RUN]...", help="Finished runs, on one page; none for blank, chart and board pages."),
     ] = None,
     template: Annotated[str | None, typer.Option(help="A template's name or file.")] = None,
-    control: Annotated[Control | None, typer.Option(help="The sheet of a control in place of the design's.")] = None,
+    control: Annotated[
+        PrintableControl | None, typer.Option(help="The sheet of a control in place of the design's.")
+    ] = None,
     copies: Annotated[int, typer.Option(min=1, max=1000, help="Pages of the same, for label rolls.")] = 1,
     check: Annotated[bool, typer.Option("--check", help="Say what a print shop needs to know.")] = False,
     templates: Annotated[bool, typer.Option("--list", help="Say which templates there are.")] = False,
@@ -133,14 +135,14 @@ def sheet(
 ) -> None:
     """Write the page: design, markers, chart and rulers at true size."""
     from patchproof.base.output import check_file
-    from patchproof.base.settings import behind
+    from patchproof.base.settings import background_summary
     from patchproof.sheets.blank import blank_page
-    from patchproof.sheets.shop import check_sheet, shop_lines
-    from patchproof.sheets.template import template_lines
+    from patchproof.sheets.print_advice import pdf_advice, sheet_advice
+    from patchproof.sheets.template import template_summaries
     from patchproof.sheets.write import manifest_paths
 
     if templates:
-        return say(*template_lines())
+        return say(*template_summaries())
     if out is None:
         raise typer.BadParameter("name the PDF to write", param_hint="--out")
     runs = runs or []
@@ -163,11 +165,11 @@ def sheet(
             manifests = [sheet_of(first, out, template=template, control=control, copies=copies)]
     for manifest, path in zip(manifests, paths, strict=True):
         if manifest.promise is not None:
-            say(manifest.promise.headline, f"promised before {behind(manifest.settings)}")
+            say(manifest.promise.headline, f"promised before {background_summary(manifest.settings)}")
         say(f"sheet {manifest.sheet_id} ({manifest.kind}): {out}, {path.name}")
     if check:
-        lines = (line for manifest in manifests for line in check_sheet(manifest))
-        say(*dict.fromkeys(lines), *shop_lines(out))  # what holds for several designs is said once
+        lines = (line for manifest in manifests for line in sheet_advice(manifest))
+        say(*dict.fromkeys(lines), *pdf_advice(out))  # what holds for several designs is said once
 
 
 def reprint(
@@ -183,7 +185,9 @@ def reprint(
     seed: Seed = None,
     printer: Annotated[str | None, typer.Option(help="Another printer than the scene's: a name or a file.")] = None,
     print_scale: Annotated[str, typer.Option(help="Size of the print, 0.97 or 0.97x0.98 (x, y).")] = "1",
-    control: Annotated[Shown | None, typer.Option(help="Photograph a control in place of the design.")] = None,
+    control: Annotated[
+        PhotographedControl | None, typer.Option(help="Photograph a control in place of the design.")
+    ] = None,
     scan_dpi: Annotated[float | None, typer.Option(min=30, max=1200, help="Scan the uncut page flat instead.")] = None,
     path_traced: Annotated[
         bool, typer.Option("--path-traced", help="Render with Mitsuba 3 in place of our renderer (slow).")
@@ -194,7 +198,7 @@ def reprint(
 ) -> None:
     """Print the PDF in simulation, put it back on the object, and photograph it."""
     from patchproof.optimizer.run import load_run
-    from patchproof.reprints.hung_sheet import Hanging
+    from patchproof.reprints.mounted_sheet import ReprintSetup
     from patchproof.reprints.page_photos import reprint_pages
     from patchproof.reprints.reprint import reprint as reprint_sheet
     from patchproof.reprints.scan import scan
@@ -204,7 +208,7 @@ def reprint(
         raise typer.BadParameter("a scan is of the PDF itself; leave --control out", param_hint="--scan-dpi")
     if path_traced and scan_dpi is not None:
         raise typer.BadParameter("is of the piece on its object; leave --scan-dpi out", param_hint="--path-traced")
-    how = Hanging(printer, scale, control, path_traced)
+    how = ReprintSetup(printer, scale, control, path_traced)
     if run is None:
         if scan_dpi is not None or control is not None or path_traced or sessions > 1:
             only = "scans, controls, sessions and path tracing are of a run's sheet; name the run"

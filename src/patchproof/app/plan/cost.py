@@ -15,20 +15,20 @@ import torch
 from torch import Tensor
 
 from patchproof.base.progress import Advance, no_advance
-from patchproof.base.validation import Strict
+from patchproof.base.validation import StrictModel
 from patchproof.optimizer.problem import Problem
 from patchproof.optimizer.training_views import new_pose_share
-from patchproof.render.photograph import expose, windows_of
-from patchproof.render.pixels import Shown
+from patchproof.render.photograph import affected_windows, expose
+from patchproof.render.pixels import Appearance
 from patchproof.render.raster import rasterize
 from patchproof.render.views import Views, cameras, near_mm
 from patchproof.scene.conditions import Conditions
-from patchproof.scene.mesh_scene import needs_mesh
+from patchproof.scene.mesh_scene import require_mesh
 
 REPEATS = 5
 
 
-class Part(Strict):
+class StepPart(StrictModel):
     """Milliseconds of a part of a step and their share of it."""
 
     name: str
@@ -36,14 +36,14 @@ class Part(Strict):
     share: float
 
 
-class Cost(Strict):
+class Cost(StrictModel):
     """One step of `views` views of `side_px`."""
 
     views: int
     side_px: int
     threads: int
     ms: float
-    parts: tuple[Part, ...]
+    parts: tuple[StepPart, ...]
 
 
 def measure_cost(problem: Problem, design: Tensor, advance: Advance = no_advance) -> Cost:
@@ -54,7 +54,7 @@ def measure_cost(problem: Problem, design: Tensor, advance: Advance = no_advance
         advance(number + 1, REPEATS + 1)
     median = {name: statistics.median(row[name] for row in rows[1:]) for name in rows[0]}
     total = sum(median.values())
-    parts = tuple(Part(name=name, ms=ms, share=ms / total) for name, ms in median.items())
+    parts = tuple(StepPart(name=name, ms=ms, share=ms / total) for name, ms in median.items())
     return Cost(views=views, side_px=problem.training_px, threads=threads, ms=total, parts=parts)
 
 
@@ -66,10 +66,10 @@ def _step_ms(problem: Problem, design: Tensor, conditions: Conditions) -> dict[s
     parts = {name: ms * share for name, ms in parts.items()}
     clock = _Clock(problem.device)
     shown = problem.subject.shown(design)
-    parts[problem.subject.LOOK] = clock.lap()
+    parts[problem.subject.STAGE_NAME] = clock.lap()
     pictures = expose(views, shown)
     parts["light, piece and camera"] = clock.lap()
-    leaf, boxes, windows = pictures.detach().requires_grad_(), problem.boxes(conditions), windows_of(views)
+    leaf, boxes, windows = pictures.detach().requires_grad_(), problem.boxes(conditions), affected_windows(views)
     losses = [
         problem.losses(classifier, classifier.logits(leaf, boxes, windows), indices).mean()
         for classifier, indices in zip(problem.classifiers, problem.indices, strict=True)
@@ -84,7 +84,7 @@ def _step_ms(problem: Problem, design: Tensor, conditions: Conditions) -> dict[s
     return parts
 
 
-def _see_ms(problem: Problem, shown: Shown, conditions: Conditions) -> tuple[dict[str, float], Views]:
+def _see_ms(problem: Problem, shown: Appearance, conditions: Conditions) -> tuple[dict[str, float], Views]:
     """(milliseconds of the parts of `see`, the views)."""
     side_px = problem.training_px
     problem.see(None, conditions, 16)  # brings the places behind the object into memory, which a run does once
@@ -94,7 +94,7 @@ def _see_ms(problem: Problem, shown: Shown, conditions: Conditions) -> tuple[dic
     problem.see(None, conditions, side_px)
     parts = {"see: background": clock.lap()}
     if problem.scene.HAS_OBJECT:
-        scene = needs_mesh(problem.scene)
+        scene = require_mesh(problem.scene)
         poses, surface = scene.camera_from_world(conditions), problem.stage.object_surface
         matrices = np.broadcast_to(scene.matrix_px((side_px, side_px)), (len(poses), 3, 3))
         rasterize(

@@ -19,20 +19,20 @@ from torch import Tensor
 from patchproof.app.plan.terms import Setup, Term, scene_terms
 from patchproof.base.output import image_bytes, image_pixels
 from patchproof.base.progress import Advance, no_advance
-from patchproof.base.validation import Strict
+from patchproof.base.validation import StrictModel
 from patchproof.classifier.network import center_square
 from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.problem import Problem
 from patchproof.render.photograph import expose
-from patchproof.render.pixels import Shown
-from patchproof.render.views import Views, relit, see
+from patchproof.render.pixels import Appearance
+from patchproof.render.views import Views, relight, render_views
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.placement import Placement
 
 _PIXELS_AT_ONCE = 1 << 21  # about 300 MB of pictures and what is between them
 
 
-class TermError(Strict):
+class TermError(StrictModel):
     """The error that a term leaves where it is left out; of one that is not modeled, the error that it leaves now.
 
     `codes_mean` and `codes_p95` are absolute differences of 8-bit code values over the picture that the classifier
@@ -49,7 +49,7 @@ class TermError(Strict):
     in_training: bool | None = None  # whether training's smaller views show it
 
 
-class Terms(Strict):
+class Terms(StrictModel):
     """All terms, over `views` views in which the design has a mean `confidence`. Those can go whose changes, added up
     from the smallest on, stay under `threshold`; `together` is the change when they are left out at once.
     """
@@ -153,18 +153,18 @@ def _squares(
     size_px, stack = (side_px, side_px), []
     for rows in _chunks(len(base.conditions), side_px):
         known, parts = base.conditions[rows], []
-        views = see(base.stage, base.shown, known, size_px)
+        views = render_views(base.stage, base.shown, known, size_px)
         for setup in (base, *setups):
             conditions = setup.conditions[rows]
             same = setup.stage is base.stage and (conditions.pose.printed_scale == known.pose.printed_scale).all()
-            seen = relit(views, conditions) if same else see(setup.stage, setup.shown, conditions, size_px)
+            seen = relight(views, conditions) if same else render_views(setup.stage, setup.shown, conditions, size_px)
             parts.append(_pictures(problem, seen, setup.shown))
         stack.append(torch.stack(parts))
         add_views(len(known))
     return torch.cat(stack, 1)
 
 
-def _pictures(problem: Problem, views: Views, shown: Shown) -> Tensor:
+def _pictures(problem: Problem, views: Views, shown: Appearance) -> Tensor:
     """A whole photograph goes through a real JPEG file, a training view as training exposes it."""
     pictures, quality = expose(views, shown, jpeg=views.reduced), views.conditions.sensor.jpeg
     if not views.reduced and quality.any():

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from patchproof.app.plan.errors import TermError
-from patchproof.app.plan.plan import Geometry, Markers, Plan, Resolution, Surface
-from patchproof.optimizer.places import place_lines
+from patchproof.app.plan.plan import GeometryPlan, Markers, Plan, Resolution, SurfacePlan
+from patchproof.optimizer.place_search import place_lines
 from patchproof.scene.interface import PX_PER_MODULE, READABLE_SHARE
 
 
-def geometry_lines(plan: Geometry) -> list[str]:
+def geometry_lines(plan: GeometryPlan) -> list[str]:
     """What a plan knows before it has measured anything."""
     lines = [f"{plan.scene}: {plan.target}, {plan.kind}, seen by {', '.join(plan.models)}"]
     if plan.place is not None:
@@ -36,7 +36,7 @@ def measured_lines(plan: Plan) -> list[str]:
     return lines
 
 
-def _surface_lines(surface: Surface) -> list[str]:
+def _surface_lines(surface: SurfacePlan) -> list[str]:
     width, height = surface.size_mm
     lines = [f"  {surface.family}, {width:.0f} × {height:.0f} mm: {surface.reason}"]
     if surface.gap_mm is not None and surface.overhang_share is not None and surface.stretch is not None:

@@ -26,20 +26,20 @@ from torch import Tensor
 
 from patchproof.app.plan.cost import Cost, measure_cost
 from patchproof.app.plan.errors import Terms, measure_terms
-from patchproof.base.claims import wilson
 from patchproof.base.compute import Compute
+from patchproof.base.intervals import wilson
 from patchproof.base.progress import Progress, no_progress
-from patchproof.base.validation import Strict
+from patchproof.base.validation import StrictModel
 from patchproof.optimizer.loop import SELECT_VIEWS, start, steps
 from patchproof.optimizer.pixels import as_pixels, from_pixels
-from patchproof.optimizer.places import Place, choose_place
+from patchproof.optimizer.place_search import Place, choose_place
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.optimizer.promise import PROMISE_VIEWS
-from patchproof.scene.bent_scene import other_surface
-from patchproof.scene.interface import PX_PER_MODULE, READABLE_SHARE, PieceScene, needs_piece
-from patchproof.scene.open_scene import OpenScene
+from patchproof.scene.bent_scene import placement_with_other_bend
+from patchproof.scene.interface import PX_PER_MODULE, READABLE_SHARE, PieceScene, require_piece
+from patchproof.scene.open_scene import UnplacedScene
 from patchproof.scene.scene import load_scene
-from patchproof.sheets.markers import MODULES
+from patchproof.sheets.markers import MARKER_MODULES
 from patchproof.sheets.piece import SMALLEST_MARKER_MM
 
 TERM_VIEWS = 16
@@ -47,7 +47,7 @@ DRAFT_VIEWS = 120  # that the draft is trained on
 _NEXT = 4  # times as many samples
 
 
-class Surface(Strict):
+class SurfacePlan(StrictModel):
     """Where the piece lies. `other` is what `patch.bend` the other way round would do."""
 
     family: str
@@ -60,7 +60,7 @@ class Surface(Strict):
     other: str | None = None
 
 
-class Resolution(Strict):
+class Resolution(StrictModel):
     """Pixels per millimeter at the 5 % and 95 % points of the views, and the design's own; null where unknown."""
 
     network_px: int
@@ -75,7 +75,7 @@ class Resolution(Strict):
     texels_per_px: float  # along a side, in the closest view
 
 
-class Markers(Strict):
+class Markers(StrictModel):
     """Markers needed by the rule (PX_PER_MODULE in READABLE_SHARE of the views) and printed."""
 
     needed_mm: float
@@ -83,14 +83,14 @@ class Markers(Strict):
     unreadable_share: float
 
 
-class Draft(Strict):
+class Draft(StrictModel):
     """The design that terms are measured with: the loop's own after `steps` steps, and the rate it has there."""
 
     steps: int
     rate: float
 
 
-class Sample(Strict):
+class Sample(StrictModel):
     """Half the width of a 95 % interval, of a mean confidence or a rate in [0, 1], from `n` and from `next_n`."""
 
     name: str
@@ -100,7 +100,7 @@ class Sample(Strict):
     next_half_width: float
 
 
-class Geometry(Strict):
+class GeometryPlan(StrictModel):
     """What needs no design: known in seconds, unless a place is searched for."""
 
     scene: str
@@ -108,13 +108,13 @@ class Geometry(Strict):
     target: str
     models: tuple[str, ...]
     place: Place | None  # the search for it, where the scene asks for one
-    surface: Surface
+    surface: SurfacePlan
     resolution: Resolution
     markers: Markers | None
     warnings: tuple[str, ...]
 
 
-class Plan(Geometry):
+class Plan(GeometryPlan):
     """Everything that `plan` found out."""
 
     draft: Draft
@@ -129,30 +129,30 @@ def plan_geometry(
     *,
     device: str = "cpu",
     progress: Progress = no_progress,
-) -> tuple[Geometry, Problem]:
+) -> tuple[GeometryPlan, Problem]:
     """How the piece of a scene lies and what views show of it, and the problem that a plan goes on with."""
     scene, place = load_scene(scene_path), None
-    if isinstance(scene, OpenScene):
+    if isinstance(scene, UnplacedScene):
         place = choose_place(scene, compute=Compute(device), progress=progress)
         scene = scene.at(place.at, place.spin_deg)
     problem, target = set_problem(scene, device), scene.settings.target
-    _, sentence = other_surface(scene)
-    geometry = Geometry(
+    _, sentence = placement_with_other_bend(scene)
+    geometry = GeometryPlan(
         scene=Path(scene_path).name,
         kind=scene.description(),
         target=f"{target.goal} {target.label}",
         models=tuple(classifier.name for classifier in problem.classifiers),
         place=place,
-        surface=Surface(**scene.lies(), other=sentence),
+        surface=SurfacePlan(**scene.lies(), other=sentence),
         resolution=resolution_plan(problem),
-        markers=marker_plan(needs_piece(scene)) if scene.HAS_PIECE else None,
+        markers=marker_plan(require_piece(scene)) if scene.HAS_PIECE else None,
         warnings=scene.warnings,
     )
     return geometry, problem
 
 
 def measured_plan(
-    geometry: Geometry,
+    geometry: GeometryPlan,
     problem: Problem,
     *,
     timing: bool = True,
@@ -161,7 +161,7 @@ def measured_plan(
 ) -> Plan:
     """The rest of a plan: a draft of the design, the terms and the cost."""
     scene = problem.scene
-    other, _ = other_surface(scene)
+    other, _ = placement_with_other_bend(scene)
     design, draft = _draft(problem, progress)
     conditions = scene.draw("select", views)
     terms = measure_terms(problem, design, conditions, SELECT_VIEWS, other, partial(progress, "terms"))
@@ -198,7 +198,7 @@ def marker_plan(scene: PieceScene) -> Markers:
     """The marker rule on this scene's views."""
     px_per_mm = np.quantile(scene.px_per_mm(scene.photo_px, shorter=True), 1 - READABLE_SHARE)
     return Markers(
-        needed_mm=max(MODULES * PX_PER_MODULE / float(px_per_mm), SMALLEST_MARKER_MM),
+        needed_mm=max(MARKER_MODULES * PX_PER_MODULE / float(px_per_mm), SMALLEST_MARKER_MM),
         printed_mm=scene.piece.marker_mm,
         unreadable_share=scene.unreadable_share,
     )
@@ -225,7 +225,7 @@ def _draft(problem: Problem, progress: Callable[[str, int, int], None]) -> tuple
     settings = problem.scene.settings.optimize
     count = min(settings.steps, math.ceil(DRAFT_VIEWS / settings.views))
     state, rate = start(problem), None
-    for step in steps(problem.trained_by(settings.changed(steps=count)), state):
+    for step in steps(problem.with_training(settings.changed(steps=count)), state):
         state, rate = step.state, step.select_rate
         progress("draft", state.number, count)
     assert rate is not None  # the last step ends with a selection

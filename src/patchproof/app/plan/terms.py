@@ -13,15 +13,15 @@ from functools import partial
 
 from torch import Tensor
 
-from patchproof.channel.effects import EFFECT, EFFECTS, Effect
+from patchproof.channel.effects import EFFECT_BY_NAME, EFFECTS, ViewEffect
 from patchproof.channel.printer import identity_printer
 from patchproof.optimizer.problem import Problem
-from patchproof.render.pixels import Shown
+from patchproof.render.pixels import Appearance
 from patchproof.render.stage import Stage, set_stage
-from patchproof.scene.conditions import Conditions, without
-from patchproof.scene.interface import Part
-from patchproof.scene.mesh_scene import needs_mesh
-from patchproof.scene.patch_scene import needs_patch
+from patchproof.scene.conditions import Conditions, without_effect
+from patchproof.scene.interface import SceneTerm
+from patchproof.scene.mesh_scene import require_mesh
+from patchproof.scene.patch_scene import require_patch
 from patchproof.scene.placement import Placement
 
 PRINTER = "printer's colors"
@@ -32,7 +32,7 @@ class Setup:
     """Everything that pictures are made of."""
 
     stage: Stage
-    shown: Shown
+    shown: Appearance
     conditions: Conditions
 
 
@@ -54,16 +54,16 @@ def scene_terms(problem: Problem, design: Tensor, other_surface: Placement | Non
     """The terms that a problem's kind of scene has."""
     scene = problem.scene
     effects = {
-        table: tuple(term for term in effect_terms(table) if scene.models(EFFECT[term.name]))
+        table: tuple(term for term in effect_terms(table) if scene.models(EFFECT_BY_NAME[term.name]))
         for table in ("light", "printer", "camera")
     }
-    own = {part: Term(part.name, part.key, partial(_without_part, part=part), whole=part.whole) for part in scene.PARTS}
+    own = {part: Term(part.name, part.key, partial(_without_part, part=part), whole=part.whole) for part in scene.TERMS}
     terms = (*effects["light"], *(term for term in own.values() if not term.key))
     if scene.HAS_PIECE:
         terms = (*terms, Term(PRINTER, "printer.profile", partial(_without_printer, problem, design)))
     terms = (*terms, *effects["printer"], *effects["camera"], *(term for term in own.values() if term.key))
     if other_surface is not None:
-        lies, change = needs_patch(scene).placement, partial(_on_surface, placement=other_surface)
+        lies, change = require_patch(scene).placement, partial(_on_surface, placement=other_surface)
         name = "bent piece" if lies.is_flat else f"{lies.family}, not a card"
         terms = (*terms, Term(name, "patch.bend", change, modeled=not lies.is_flat))
     return terms
@@ -78,24 +78,24 @@ def effect_terms(table: str) -> tuple[Term, ...]:
     )
 
 
-def _without(setup: Setup, effect: Effect) -> Setup | None:
-    facing = lambda *angles: needs_mesh(setup.stage.scene).cosines(*angles)  # noqa: E731
-    conditions = without(setup.conditions, effect, facing)
+def _without(setup: Setup, effect: ViewEffect) -> Setup | None:
+    facing = lambda *angles: require_mesh(setup.stage.scene).cosines(*angles)  # noqa: E731
+    conditions = without_effect(setup.conditions, effect, facing)
     return None if conditions is None else replace(setup, conditions=conditions)
 
 
 def _without_printer(problem: Problem, design: Tensor, setup: Setup) -> Setup | None:
     if problem.printer.name == "identity":
         return None
-    return replace(setup, shown=problem.subject.printed_by(identity_printer()).shown(design))
+    return replace(setup, shown=problem.subject.with_printer(identity_printer()).shown(design))
 
 
-def _without_part(setup: Setup, part: Part) -> Setup | None:
+def _without_part(setup: Setup, part: SceneTerm) -> Setup | None:
     scene = setup.stage.scene.without(part)
     return None if scene is None else replace(setup, stage=replace(setup.stage, scene=scene))
 
 
 def _on_surface(setup: Setup, placement: Placement) -> Setup:
-    scene = replace(needs_patch(setup.stage.scene), placement=placement)
+    scene = replace(require_patch(setup.stage.scene), placement=placement)
     piece = set_stage(scene, setup.stage.device).piece
     return replace(setup, stage=replace(setup.stage, scene=scene, piece=piece))

@@ -1,0 +1,142 @@
+"""Where the piece goes on the object: a picture of the object's side, and millimeters to its edges.
+
+In: a scene with a mesh and its piece. Out: a `PlacementPicture` for the sheet's last page, with millimeters to the object's edges
+or, of bent paper, along its surface. The picture is rendered by the project's
+own rasterizer from so far away that it is a plan: at 60 times the object's length perspective moves nothing by more
+than 1 % of the object's depth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from patchproof.base.color import photo_codes_from_srgb, srgb_from_linear
+from patchproof.base.geometry import rect_border, rect_corners
+from patchproof.base.settings import BackgroundSettings
+from patchproof.channel.effects import Light, Pose
+from patchproof.render.photograph import shade
+from patchproof.render.pixels import PiecePicture
+from patchproof.render.stage import Stage, set_stage
+from patchproof.render.views import relight, render_views
+from patchproof.scene.backgrounds import load_backgrounds
+from patchproof.scene.conditions import Conditions
+from patchproof.scene.mesh_scene import require_mesh
+from patchproof.scene.patch_scene import PatchScene
+from patchproof.scene.placement import SurfaceFrame, patch_frame
+from patchproof.sheets.plan_page import DimensionSpan, PlacementPicture
+from patchproof.sheets.template import Template
+from patchproof.sheets.tiles import plan_tiles
+
+if TYPE_CHECKING:
+    from patchproof.scene.tape_measure import TapeMeasurement
+
+AWAY = 60.0  # of the object's length
+PICTURE_PX = 600  # along the longer side
+ROOM = 1.06  # of the object's extent
+
+
+def hang(scene: PatchScene, template: Template) -> PlacementPicture:
+    """The object seen straight from the piece's side, with the piece's outline and, in tiles, its seams."""
+    # cameras may count their angles from another side
+    scene = replace(scene, frame=patch_frame(scene.mesh, scene.settings.patch))
+    frame, placement = scene.frame, scene.placement
+    axes = np.stack([frame.right, -frame.up])  # millimeters right and down, from the middle of the object
+
+    def flat(points: np.ndarray) -> np.ndarray:
+        return np.asarray(points) @ axes.T
+
+    low, high = flat(scene.mesh.vertices).min(0), flat(scene.mesh.vertices).max(0)
+    outline = flat(placement.world(rect_border((0, 0, *placement.size_mm), 16)))  # bent paper has bent edges
+    half = np.maximum(np.abs([low, high, outline.min(0), outline.max(0)]).max(0) * ROOM, 1.0)
+    seams, names = [], []
+    for tile in plan_tiles(template, scene.piece):
+        corners = flat(placement.world(rect_corners(tile.part_mm)))
+        seams += [(tuple(corners[1]), tuple(corners[2])), (tuple(corners[2]), tuple(corners[3]))]
+        names.append((tuple(corners.mean(0)), tile.name))
+    measured = None
+    if not placement.is_flat:
+        laid_out = scene.tapes()
+        measured = _spans(laid_out, flat)
+        for tape in laid_out:
+            start, end = flat(tape.points_mm[[0, -1]])
+            seams.append((tuple(start), tuple(end)))
+    return PlacementPicture(
+        picture=plan_picture(set_stage(scene), scene.frame, half),
+        picture_mm=(-half[0], -half[1], 2 * half[0], 2 * half[1]),
+        object_mm=(*low, *(high - low)),
+        outline_mm=tuple(map(tuple, outline)),
+        seams_mm=tuple(seams),
+        names_mm=tuple(names),
+        measured=measured,
+    )
+
+
+def _spans(
+    laid_out: Sequence[TapeMeasurement], flat: Callable[[np.ndarray], np.ndarray]
+) -> tuple[tuple[DimensionSpan, ...], tuple[DimensionSpan, ...]]:
+    """The tapes that run across the picture, from the left, and those that run down, from the top."""
+    spans: tuple[list[DimensionSpan], list[DimensionSpan]] = ([], [])
+    for tape in laid_out:
+        start, end = flat(tape.points_mm[[0, -1]])
+        axis = int(np.abs(end - start).argmax())
+        ends = sorted((float(start[axis]), float(end[axis])))
+        spans[axis].append(DimensionSpan((ends[0], ends[1]), tape.length_mm, tape.end))
+    across, down = (tuple(sorted(each, key=lambda span: span.ends_mm)) for each in spans)
+    return across, down
+
+
+def plan_picture(
+    stage: Stage,
+    frame: SurfaceFrame,
+    half_mm: np.ndarray,
+    picture_px: int = PICTURE_PX,
+    on_piece: np.ndarray | None = None,
+) -> np.ndarray:
+    """uint8 H×W×3: the object of a stage in even light on white, seen along a frame's normal, spanning ± half_mm.
+
+    `on_piece`: uint8 h×w×3 colors over the piece of a scene that has one; they are shown as they are, without light.
+    """
+    scene = require_mesh(stage.scene)
+    distance = AWAY * scene.length_mm
+    px_per_mm = picture_px / (2 * half_mm.max())
+    width, height = (int(v) for v in np.maximum(np.rint(2 * half_mm * px_per_mm), 16))
+    fov = float(np.degrees(2 * np.arctan(half_mm.min() / distance)))
+    view = {"fov_deg": fov, "look_at": "object"}
+    settings = scene.settings.changed(view=view, camera={"photo_px": (width, height), "file": None})
+    white = load_backgrounds(BackgroundSettings(color=(1.0, 1.0, 1.0)), Path())
+    plain = replace(stage, scene=replace(scene, settings=settings, frame=frame, backgrounds=white, camera=None))
+    shown = None if on_piece is None else PiecePicture.of(torch.tensor(on_piece, dtype=torch.float32) / 255)
+    with torch.no_grad():
+        views = render_views(plain, shown, _even(distance, 0.55, 0.45), (width, height))
+        light = _by_rows(shade(views, None))
+        if shown is not None:
+            covered = views.on_piece.pixel[views.on_piece.share[:, 0] > 0]
+            if len(covered):
+                light[covered] = _by_rows(shade(relight(views, _even(distance, 1.0, 0.0)), shown))[covered]
+    picture = srgb_from_linear(light.clamp(0, 1)).reshape(height, width, 3).cpu().numpy()
+    return photo_codes_from_srgb(picture)
+
+
+def _by_rows(pictures: Tensor) -> Tensor:
+    """1×3×H×W as H·W × 3."""
+    return pictures[0].permute(1, 2, 0).reshape(-1, 3)
+
+
+def _even(distance_mm: float, ambient: float, directional: float) -> Conditions:
+    """One view straight from the front, lit from everywhere and from the upper left."""
+    return Conditions(
+        pose=Pose(distance_mm=np.array([distance_mm])),
+        light=Light(
+            ambient=np.array([ambient]),
+            directional=np.array([directional]),
+            light_azimuth_deg=np.array([-30.0]),
+            light_elevation_deg=np.array([45.0]),
+        ),
+    )

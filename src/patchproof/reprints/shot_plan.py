@@ -1,0 +1,182 @@
+"""The shot plan: how many photographs, in how many places, from where and of which controls, so that the verdict will
+not be `cannot_tell`.
+
+In: a promise and the scene's ranges. Out: counts, and sentences for the sheet's last page. Photographs of one session
+are alike, so that a few in each of several places say more than many in one: for some ways to take them, what the
+promise allows for and the chance that they will prove it. An effect needs as many pairs of design and control that
+McNemar's exact test, or Newcombe's interval where photographs are not paired, finds it with 90 % power. Design and
+control are taken to be recognized independently at their promised rates, which asks for more photographs than pairs of
+one view need. Assumed: the promise holds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from patchproof.base.intervals import CONFIDENCE, independent_difference
+from patchproof.base.sessions import split_evenly
+from patchproof.base.settings import SceneSettings, background_summary
+from patchproof.evidence.verdict import MOST_PHOTOS, kept_chance, photos_line, places, required_rate, sessions_needed
+from patchproof.optimizer.promise import PROMISE_VIEWS
+from patchproof.sheets.manifest import Promise
+
+POWER = 0.90
+WAYS = ((40, 1), (40, 2), (40, 4), (40, 8), (80, 8))  # photographs, sessions
+STEADY = 12  # so many counts in a row must do: floors of intervals are whole photographs, so that some n just miss
+
+
+@dataclass(frozen=True)
+class ShotOption:
+    """Photographs in some sessions, the counts that the promise allows for, and the chance that they prove it."""
+
+    photos: int
+    sessions: int
+    allowed: tuple[int, int]
+    chance: float
+
+
+@dataclass(frozen=True)
+class ShotPlan:
+    """Ways to take photographs, sessions of `EACH` that a verdict needs (None: more than 150 photographs), the best
+    control, and photographs for an effect with and without pairs (None likewise).
+    """
+
+    ways: tuple[ShotOption, ...]
+    sessions: int | None
+    control: str
+    paired: int | None
+    unpaired: int | None
+
+
+def plan_shots(promise: Promise) -> ShotPlan:
+    """The counts for a promise; the control that is hardest to beat decides."""
+    best = promise.best_control
+    better, worse = (promise.rate, promise.controls[best].rate)[:: promise.target.goal.sign]
+    parts = [(way, split_evenly(*way)) for way in WAYS]
+    return ShotPlan(
+        ways=tuple(ShotOption(*way, promise.spread.counts(p), kept_chance(promise, p)) for way, p in parts),
+        sessions=sessions_needed(promise),
+        control=best,
+        paired=fewest_photos(lambda n: paired_power(better, worse, n) >= POWER),
+        unpaired=fewest_photos(lambda n: unpaired_power(better, worse, n) >= POWER),
+    )
+
+
+def fewest_photos(enough: Callable[[int], bool]) -> int | None:
+    """The smallest n from 5 to 150 from which on n photographs are enough; None where there is none."""
+    run = 0
+    for n in range(5, MOST_PHOTOS + STEADY):
+        run = run + 1 if enough(n) else 0
+        if run == STEADY:
+            return n - STEADY + 1
+    return None
+
+
+def paired_power(better: float, worse: float, n: int) -> float:
+    """Chance that McNemar's exact test on n independent pairs shows the better rate to be better."""
+    from scipy.stats import binom
+
+    only_better, only_worse = better * (1 - worse), worse * (1 - better)
+    differing = only_better + only_worse
+    if differing <= 0:
+        return 0.0
+    counts = np.arange(1, n + 1)
+    # more pairs in favor than this are significant, both tails
+    insignificant = binom.isf((1 - CONFIDENCE) / 2, counts, 0.5)
+    return float(binom.pmf(counts, n, differing) @ binom.sf(insignificant, counts, only_better / differing))
+
+
+def unpaired_power(better: float, worse: float, n: int) -> float:
+    """Chance that Newcombe's interval of n photographs each lies above zero."""
+    from scipy.stats import binom
+
+    counts = np.arange(n + 1)
+    chances = binom.pmf(counts, n, better), binom.pmf(counts, n, worse)
+    power, most = 0.0, -1
+    for a in counts:
+        # the more of the better, the more of the worse may be recognized: the border only ever moves up
+        while most < n and independent_difference(int(a), n, most + 1, n)[1][0] > 0:
+            most += 1
+        power += float(chances[0][a] * chances[1][: most + 1].sum())
+    return power
+
+
+def shot_sections(promise: Promise, settings: SceneSettings) -> tuple[tuple[str, tuple[str, ...]], ...]:
+    """What to photograph, as (heading, lines)."""
+    plan = plan_shots(promise)
+    worth = promise.headline.removeprefix(promise.hint)
+    what = f"{promise.hint or 'The design is '}{worth} Promised before {background_summary(settings.model_dump())}."
+    return (("How many photographs", (what, *_how_many(promise, plan))), ("From where", _from_where(settings)))
+
+
+def _how_many(promise: Promise, plan: ShotPlan) -> tuple[str, ...]:
+    control = promise.controls[plan.control]
+    lines = [
+        f"Promised: {promise.rate:.0%} recognized as {promise.target.label}, of {promise.n} views in "
+        f"{promise.sessions} sessions, each with a place, light, camera and print of its own; the best control "
+        f"({plan.control}) {control.rate:.0%}."
+    ]
+    lines.append(
+        f"A verdict asks the photographs to prove a rate of {required_rate(promise):.0%}. What they will show if the "
+        "promise holds, and the chance that it is enough: "
+        + "; ".join(
+            f"{way.photos} in {places(way.sessions)}: {way.allowed[0]} to {way.allowed[1]} ({way.chance:.0%})"
+            for way in plan.ways
+        )
+        + "."
+    )
+    lines.append(photos_line(plan.sessions))
+    if promise.n < PROMISE_VIEWS and not promise.draft:
+        lines.append(
+            f"A promise of {PROMISE_VIEWS} views (patchproof promise RUN --n {PROMISE_VIEWS}, then this page again) "
+            "knows better how much places differ, and often asks for fewer of them."
+        )
+    if plan.paired is None and plan.unpaired is None:
+        lines.append(
+            f"No {MOST_PHOTOS} photographs would show that the patch beats {plan.control}: it is not promised to, or "
+            "by too little."
+        )
+        return tuple(lines)
+    wanted = plan.paired if plan.paired is not None else plan.unpaired
+    kind = "bare object (without any marker)" if plan.control == "bare" else f"{plan.control} control"
+    lines.append(
+        f"To show that the patch makes the difference (90 % power): {wanted} pairs, each view once with the piece and "
+        f"once with the {kind} in the same place and light, saved under equal file names in a folder of its own."
+    )
+    if plan.unpaired is not None:
+        lines.append(f"Without pairs: {plan.unpaired} of each.")
+    lines.append(
+        "Print the other controls (mean, gray, noise) too, if you can: the effect is shown only where the patch beats "
+        "every control that you photograph."
+    )
+    return tuple(lines)
+
+
+def _from_where(settings: SceneSettings) -> tuple[str, ...]:
+    if settings.object.mesh is None:
+        return ("As the scene's own photographs were taken: the same places, distances and light.",)
+    view, low = settings.view, settings.light.ambient
+    target = "object" if view.look_at == "object" else "piece"
+    front = (
+        "the place of the piece" if settings.patch.at_mm is not None else f"the piece's side ({settings.patch.side})"
+    )
+    if view.front != "patch":
+        front = f"the object's {view.front} side"
+    return (
+        f"Spread over all of these, not the best ones: {_degrees(view.azimuth_deg)} to the left (-) and right (+) of "
+        f"facing {front}, {_degrees(view.elevation_deg)} above it, "
+        f"{view.distance_mm[0] / 10:.0f} to {view.distance_mm[1] / 10:.0f} cm from the middle of the {target}, the "
+        f"camera turned by {_degrees(view.roll_deg)}.",
+        f"The {target} belongs in the middle of the picture, the whole piece in view; classifiers see the picture's "
+        "centered square.",
+        "Light as it comes, without flash, shine or filters; views outside of these ranges are not counted."
+        if low[0] < 1
+        else "Bright light, without flash, shine or filters; views outside of these ranges are not counted.",
+    )
+
+
+def _degrees(bounds: tuple[float, float]) -> str:
+    return f"{bounds[0]:g}° to {bounds[1]:g}°"

@@ -1,0 +1,195 @@
+"""The way back: a sheet's PDF as pixels on an exact millimeter grid, and the manifest that it carries.
+
+In: a PDF and a resolution. Out: uint8 H×W×3 sRGB. The page is rendered by PDFium, which did not write it. PDFium
+stretches a page to a whole number of pixels (0.2 mm across A4 at 150 dpi), so the part wanted is first made a page of
+its own whose size is a whole number of pixels; then pixel and millimeter differ by a scale alone.
+Left out on purpose: pages at the same time. PDFium is not thread-safe; render in processes.
+"""
+
+from __future__ import annotations
+
+import atexit
+import ctypes
+import json
+import math
+import os
+import threading
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from patchproof.base.errors import Refused, TimeLimitExceeded
+from patchproof.base.geometry import MM_PER_INCH
+from patchproof.base.input import MAX_JSON_BYTES, ReturnType, is_file, left_behind, within_time
+from patchproof.base.validation import validate_model
+from patchproof.sheets.manifest import Manifest
+from patchproof.sheets.pdf import ATTACHMENT, POINTS_PER_MM, numbered
+
+LARGEST_PX = 20_000  # along a side,
+MOST_PX = 160_000_000  # and in all: 0.5 GB, A2 at 600 dpi
+_AT_WORK = threading.Lock()  # of PDFium, which may have been left behind with a page
+
+
+def rasterize_page(pdf_path: str | Path, number: int = 1, dpi: float = 150.0) -> np.ndarray:
+    """A page (from 1) with pixel = mm × dpi / 25.4; the last row and column may pass the page's edge."""
+    import pypdfium2.raw as pdfium
+
+    def pixels(page) -> np.ndarray:
+        sides = pdfium.FPDF_GetPageWidthF(page), pdfium.FPDF_GetPageHeightF(page)
+        width, height = (math.ceil(side / 72 * dpi - 1e-3) for side in sides)
+        return _render(page, (0.0, 0.0, width * 72 / dpi, height * 72 / dpi), (width, height))
+
+    return _of_page(pdf_path, number, pixels)
+
+
+def page_count(pdf_path: str | Path) -> int:
+    """How many pages a PDF has."""
+    import pypdfium2.raw as pdfium
+
+    return _within_time(pdf_path, pdfium.FPDF_GetPageCount)
+
+
+def rasterize_piece(pdf_path: str | Path, manifest: Manifest, dpi: float) -> np.ndarray:
+    """The piece alone: its cut line is exactly the picture's border, so that pixel = mm × width_px / width_mm.
+
+    The number of pixels is the nearest whole one, so each axis' resolution differs from `dpi` by at most half a pixel.
+    """
+    width, height = (max(round(side / MM_PER_INCH * dpi), 1) for side in manifest.cut_mm[2:])
+    _refuse_size((width, height))
+    if not manifest.tiles:
+        page = manifest.design.page if manifest.design else 1
+        return _part_pixels(pdf_path, page, manifest.cut_mm, (width, height))
+    pixels = np.full((height, width, 3), 255, np.uint8)
+    px_per_mm = np.array([width, height]) / manifest.cut_mm[2:]
+    for tile in manifest.tiles:
+        start_mm = np.array(tile.cut_mm[:2]) - np.array(tile.page_from_design_mm)[:, 2]  # in piece millimeters
+        # whole pixels that begin on the tile; its picture runs on far enough on its flaps to fill the last one
+        first = np.ceil(start_mm * px_per_mm - 1e-6).astype(int)
+        last = np.ceil((start_mm + tile.cut_mm[2:]) * px_per_mm - 1e-6).astype(int).clip(max=[width, height])
+        corner = np.array(tile.cut_mm[:2]) + first / px_per_mm - start_mm
+        wide, high = (last - first).tolist()
+        rect = (*corner, wide / px_per_mm[0], high / px_per_mm[1])
+        pixels[first[1] : last[1], first[0] : last[0]] = _part_pixels(pdf_path, tile.page, rect, (wide, high))
+    return pixels
+
+
+def _part_pixels(pdf_path: str | Path, number: int, rect_mm: tuple, size_px: tuple[int, int]) -> np.ndarray:
+    rect_points = tuple(float(v) * POINTS_PER_MM for v in rect_mm)
+    return _of_page(pdf_path, number, lambda page: _render(page, rect_points, size_px))
+
+
+def attached_manifest(pdf_path: str | Path, sheet_id: str | None = None) -> Manifest:
+    """The manifest inside a sheet's PDF; of several designs' page that of `sheet_id`, else the first."""
+    import pikepdf
+
+    _existing(pdf_path)
+    try:
+        with pikepdf.open(pdf_path) as pdf:
+            names = sorted(set(pdf.attachments) & {ATTACHMENT, *(numbered(ATTACHMENT, i) for i in range(99))})
+            texts = [json.loads(_unpacked(pdf.attachments[name].get_file().obj)) for name in names]
+    except pikepdf.PdfError as error:
+        raise _unreadable(pdf_path) from error
+    except Exception as error:  # objects of other kinds than they should be fail in many ways
+        raise Refused(f"a PDF with {ATTACHMENT} attached", f"{pdf_path} without", "make the sheet again") from error
+    if not texts:
+        raise Refused(f"a PDF with {ATTACHMENT} attached", f"{pdf_path} without", "make the sheet again")
+    manifests = [
+        validate_model(Manifest, data, f"{name} of {pdf_path}") for name, data in zip(names, texts, strict=True)
+    ]
+    return next((manifest for manifest in manifests if manifest.sheet_id == sheet_id), manifests[0])
+
+
+def _unpacked(stream) -> bytes:
+    """An attachment's bytes, as far as a manifest may be long: pikepdf's own reading has no bound."""
+    packing = stream.get("/Filter")
+    if packing is None:
+        return stream.read_raw_bytes()
+    if str(packing) != "/FlateDecode":
+        raise ValueError(f"packed by {packing}")
+    return zlib.decompressobj().decompress(stream.read_raw_bytes(), MAX_JSON_BYTES)
+
+
+def _existing(pdf_path: str | Path) -> None:
+    if not is_file(pdf_path):
+        raise Refused("a PDF of a sheet", f"no file at {pdf_path}", "check the path")
+
+
+def _unreadable(pdf_path: str | Path) -> Refused:
+    return Refused("a PDF of a sheet", f"{pdf_path}, which cannot be read", "make the sheet again")
+
+
+def _within_time(pdf_path: str | Path, work: Callable[[Any], ReturnType]) -> ReturnType:
+    """What `work` makes of PDFium's handle of a file; refused where that takes too long: a few lines may draw forms in
+    forms a million times. PDFium's own calls alone: the package's objects are closed at the end of the process, which a
+    page that is still being drawn does not survive.
+    """
+    import pypdfium2.raw as pdfium
+
+    def done() -> ReturnType:
+        with _AT_WORK:
+            pdf = pdfium.FPDF_LoadDocument(os.fsencode(pdf_path), None)
+            if not pdf:
+                raise _unreadable(pdf_path)
+            try:
+                return work(pdf)
+            finally:
+                pdfium.FPDF_CloseDocument(pdf)
+
+    _existing(pdf_path)
+    try:
+        return within_time(left_behind, done)
+    except TimeLimitExceeded as over:
+        from pypdfium2._library_scope import destroy_lib
+
+        atexit.unregister(destroy_lib)  # the library is still at work, and is not to be taken down
+        raise Refused("a page that is soon drawn", f"{pdf_path}, which takes {over}", "make the sheet again") from None
+
+
+def _of_page(pdf_path: str | Path, number: int, work: Callable[[Any], np.ndarray]) -> np.ndarray:
+    import pypdfium2.raw as pdfium
+
+    def done(pdf) -> np.ndarray:
+        pages = pdfium.FPDF_GetPageCount(pdf)
+        if not 1 <= number <= pages:
+            raise Refused(f"a page from 1 to {pages} of {pdf_path}", f"{number}", "ask for another page")
+        page = pdfium.FPDF_LoadPage(pdf, number - 1)
+        if not page:
+            raise _unreadable(pdf_path)
+        try:
+            return work(page)
+        finally:
+            pdfium.FPDF_ClosePage(page)
+
+    return _within_time(pdf_path, done)
+
+
+def _render(page, rect_points: tuple[float, ...], size_px: tuple[int, int]) -> np.ndarray:
+    """The rectangle (x, y, width, height from the page's top-left, in points) as exactly that many pixels."""
+    import pypdfium2.raw as pdfium
+
+    _refuse_size(size_px)
+    left, bottom, right, top = (ctypes.c_float() for _ in range(4))
+    if not pdfium.FPDFPage_GetMediaBox(page, left, bottom, right, top):
+        top.value = pdfium.FPDF_GetPageHeightF(page)
+    x, y, w, h = rect_points
+    box = (left.value + x, top.value - y - h, left.value + x + w, top.value - y)
+    pdfium.FPDFPage_SetMediaBox(page, *box)
+    pdfium.FPDFPage_SetCropBox(page, *box)
+    width, height = size_px
+    pixels = np.full((height, width, 3), 255, np.uint8)
+    bitmap = pdfium.FPDFBitmap_CreateEx(width, height, pdfium.FPDFBitmap_BGR, pixels.ctypes.data, 3 * width)
+    pdfium.FPDF_RenderPageBitmap(
+        bitmap, page, 0, 0, width, height, 0, pdfium.FPDF_ANNOT | pdfium.FPDF_REVERSE_BYTE_ORDER
+    )
+    pdfium.FPDFBitmap_Destroy(bitmap)
+    return pixels
+
+
+def _refuse_size(size_px: tuple[int, int]) -> None:
+    width, height = size_px
+    if not 1 <= min(size_px) <= max(size_px) <= LARGEST_PX or width * height > MOST_PX:
+        most = f"at most {LARGEST_PX} pixels along a side, one at least, and {MOST_PX / 1e6:g} million in all"
+        raise Refused(most, f"{width} × {height}", "lower the resolution")

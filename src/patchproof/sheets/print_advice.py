@@ -1,0 +1,197 @@
+"""What whoever prints and cuts a sheet needs to know: from its manifest, and from the PDF itself.
+
+In: a manifest; SHEET.pdf. Out: sentences; those that begin with "PROBLEM" name what would not print as it should. The
+PDF is opened by pikepdf and every statement is looked up in it: page size and boxes, the wish not to be scaled, fonts,
+images with their resolution, compression and color space. Left out on purpose: total ink and separations, which an RGB
+file leaves to the printer, as it should; and PDF/X, which asks for one intended press.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from patchproof.base.errors import Refused
+from patchproof.base.geometry import MM_PER_INCH
+from patchproof.sheets.manifest import Manifest
+
+_MM = MM_PER_INCH / 72
+_LOSSLESS = {"/FlateDecode", "/LZWDecode", "/RunLengthDecode", "/ASCII85Decode", "/ASCIIHexDecode"}
+
+
+def sheet_advice(manifest: Manifest) -> list[str]:
+    """What whoever prints this sheet should know of what is on it, in sentences; `pdf_advice` reads the PDF."""
+    width, height = manifest.page_mm
+    lines = [
+        f"Print the {width:g} × {height:g} mm page at 100 %; markers, swatches and cut line stay "
+        f"{_nearest_ink_mm(manifest):.1f} mm from its edge.",
+        "Use matte white paper of 160 g/m² or more, color, best quality.",
+        f"After printing both rulers must measure {manifest.ruler_mm[0]:g} and {manifest.ruler_mm[1]:g} mm.",
+    ]
+    if manifest.kind == "board":
+        return [*lines, "Glue the uncut page to something flat and stiff."]
+    if manifest.kind == "chart":
+        return [*lines, "Cut nothing: lay the page flat, and photograph all of it in even light without shine."]
+    lines += _cutting(manifest)
+    if manifest.plan_page is not None:
+        whose = "" if manifest.page_code is None else f" of sheet {manifest.sheet_id}"
+        page = f"Page {manifest.plan_page} is for people, on any paper"
+        lines.append(f"{page}: where the piece{whose} goes and how to photograph it.")
+    if manifest.design is None:
+        lines.append("The piece carries no design: between its markers it stays white paper.")
+    return lines
+
+
+def _cutting(manifest: Manifest) -> Iterator[str]:
+    """What is cut out of which page."""
+    size = f"{manifest.cut_mm[2]:.1f} × {manifest.cut_mm[3]:.1f} mm"
+    if manifest.tiles:
+        pages = [tile.page for tile in manifest.tiles]
+        yield (
+            f"Cut the {len(pages)} tiles of pages {min(pages)} to {max(pages)} along the dashed lines, flaps and all, "
+            f"and glue them to one piece of {size} as page 1 shows; page 1 stays whole."
+        )
+    elif manifest.page_code is not None:
+        x, y = manifest.cut_mm[:2]
+        yield (
+            f"Cut each piece of the page along its own dashed line; that of sheet {manifest.sheet_id} is the one of "
+            f"{size} whose corner lies {x:.0f} mm from the left and {y:.0f} mm from the top."
+        )
+    else:
+        yield f"Cut the piece of {size} along the dashed line."
+
+
+def _nearest_ink_mm(manifest: Manifest) -> float:
+    """From the page's edge to the nearest marker, swatch or cut line."""
+    width, height = manifest.page_mm
+    rects = [tile.cut_mm for tile in manifest.tiles] or [manifest.cut_mm]
+    rects = [*rects, *(swatch.rect_mm for swatch in manifest.chart)]
+    points = [point for marker in manifest.markers for point in marker.corners_mm]
+    points += [(x + dx, y + dy) for x, y, w, h in rects for dx, dy in ((0, 0), (w, h))]
+    return min(min(x, y, width - x, height - y) for x, y in points)
+
+
+def pdf_advice(pdf_path: str | Path) -> list[str]:
+    """The sentences for the PDF at that path."""
+    import pikepdf
+
+    try:
+        with pikepdf.open(pdf_path) as pdf:
+            lines = [*_pages(pdf), _scaling(pdf), *_fonts(pdf), *_images(pdf), _vector_color(pdf)]
+    except Exception as error:  # objects of other kinds than they should be fail in many ways
+        raise Refused("a PDF of a sheet", f"{pdf_path}, which cannot be read", "make the sheet again") from error
+    return [
+        *lines,
+        "Total ink is not limited in the file: it is RGB, so the printer's own profile decides; black is RGB 0 0 0.",
+        "Order: single-sided, full color, best quality, sRGB to your printer's profile, relative colorimetric intent.",
+        "Switch off scaling, sharpening and all automatic color or photo enhancement; no lamination, no gloss.",
+    ]
+
+
+def _pages(pdf) -> Iterator[str]:
+    sizes = [_size(page.mediabox) for page in pdf.pages]
+    count = "1 page" if len(sizes) == 1 else f"{len(sizes)} pages"
+    yield f"PDF {pdf.pdf_version}, {count} of {' and '.join(sorted(set(sizes)))} mm, true size (1:1)."
+    for number, page in enumerate(pdf.pages, 1):
+        boxes = [page.obj.get(f"/{name}Box") for name in ("Trim", "Bleed")]
+        if None in boxes:
+            yield f"PROBLEM: page {number} has no trim and bleed box."
+        elif any([float(v) for v in box] != [float(v) for v in page.mediabox] for box in boxes):
+            yield f"PROBLEM: trim and bleed box of page {number} are not the page: it would be cut elsewhere."
+        if "/UserUnit" in page.obj and float(page.obj.UserUnit) != 1:
+            yield f"PROBLEM: page {number} has a UserUnit, which many printers ignore."
+    yield "Trim box and bleed box are given; no ink reaches the edge, so no bleed and no crop marks are needed."
+
+
+def _scaling(pdf) -> str:
+    wish = pdf.Root.get("/ViewerPreferences", {}).get("/PrintScaling")
+    if wish == "/None":
+        return "The file asks viewers not to scale it (PrintScaling None); still check that 100 % is set."
+    return "PROBLEM: the file does not ask viewers to leave its size alone (PrintScaling None is missing)."
+
+
+def _fonts(pdf) -> Iterator[str]:
+    names: dict[str, bool] = {}
+    for page in pdf.pages:
+        for font in page.resources.get("/Font", {}).values():
+            names[str(font.get("/BaseFont", "?")).lstrip("/").split("+")[-1]] = _embedded(font)
+    loose = sorted(name for name, embedded in names.items() if not embedded)
+    if loose:
+        yield f"PROBLEM: fonts that are not embedded: {', '.join(loose)}."
+    elif names:
+        yield f"All fonts are embedded ({', '.join(sorted(names))})."
+
+
+def _embedded(font) -> bool:
+    inner = font.DescendantFonts[0] if "/DescendantFonts" in font else font
+    descriptor = inner.get("/FontDescriptor", {})
+    return any(f"/FontFile{kind}" in descriptor for kind in ("", "2", "3"))
+
+
+def _images(pdf) -> Iterator[str]:
+    for number, page in enumerate(pdf.pages, 1):
+        resources = page.resources.get("/XObject", {})
+        for name, (width_mm, height_mm) in _placed(page):
+            image = resources.get(name)
+            if image is None or image.get("/Subtype") != "/Image":
+                continue
+            ppi = min(int(image.Width) / width_mm, int(image.Height) / height_mm) * MM_PER_INCH
+            yield (
+                f"Page {number}: an image of {int(image.Width)} × {int(image.Height)} pixels on {width_mm:.1f} × "
+                f"{height_mm:.1f} mm, {ppi:.0f} ppi; {_packing(image)}; {_color(image.get('/ColorSpace'))}; "
+                "its pixels are meant as they are, so do not resample or sharpen."
+            )
+
+
+def _placed(page) -> Iterator[tuple[str, tuple[float, float]]]:
+    """Every drawn XObject's name and its width and height in mm, from the matrices in force."""
+    import pikepdf
+
+    matrix, saved = pikepdf.Matrix(), []
+    for operands, operator in pikepdf.parse_content_stream(page):
+        word = str(operator)
+        if word == "q":
+            saved.append(matrix)
+        elif word == "Q":
+            matrix = saved.pop()
+        elif word == "cm":
+            matrix = pikepdf.Matrix(*(float(v) for v in operands)) @ matrix
+        elif word == "Do":
+            yield str(operands[0]), (_MM * math.hypot(matrix.a, matrix.b), _MM * math.hypot(matrix.c, matrix.d))
+
+
+def _packing(image) -> str:
+    names = {str(name) for name in image.Filter.wrap_in_array()} if "/Filter" in image else set()
+    return "lossless" if names <= _LOSSLESS else f"PROBLEM: lossy ({', '.join(sorted(names - _LOSSLESS))})"
+
+
+def _color(space: Any) -> str:
+    if space is None or str(space.wrap_in_array()[0]) != "/ICCBased":
+        return "PROBLEM: no ICC profile"
+    return f"ICC profile {_profile_name(space[1])}"
+
+
+def _vector_color(pdf) -> str:
+    spaces = [page.resources.get("/ColorSpace", {}).get("/DefaultRGB") for page in pdf.pages]
+    if any(space is None for space in spaces):
+        return "PROBLEM: words, markers and swatches are device RGB without a profile."
+    names = sorted({_profile_name(space[1]) for space in spaces})
+    return f"Words, markers and swatches are vector, RGB with the ICC profile {', '.join(names)} (DefaultRGB)."
+
+
+def _profile_name(stream) -> str:
+    from PIL import ImageCms
+
+    try:
+        profile = ImageCms.ImageCmsProfile(io.BytesIO(stream.read_bytes()))
+        return ImageCms.getProfileDescription(profile).strip()
+    except (ImageCms.PyCMSError, OSError):
+        return "PROBLEM: broken"
+
+
+def _size(box) -> str:
+    x0, y0, x1, y1 = (float(v) for v in box)
+    return f"{round((x1 - x0) * _MM, 1):g} × {round((y1 - y0) * _MM, 1):g}"
