@@ -144,9 +144,9 @@ def test_a_system_that_cannot_fork_works_here_on_as_many_threads(monkeypatch):
 @forks
 def test_children_end_when_their_parent_is_killed(tmp_path):
     code = (
-        "import os, sys, time\nfrom patchproof.base.workers import sharing\n"
+        "import os, sys, time\nfrom patchproof.base.workers import fork_workers\n"
         "def f(i):\n    open(sys.argv[1] + '/' + str(os.getpid()), 'w').close()\n    time.sleep(60)\n"
-        "with sharing(f, 2) as (crew, share):\n    crew.map(share, range(2))\n"
+        "with fork_workers(f, 2) as (crew, share):\n    crew.map(share, range(2))\n"
     )
     parent = subprocess.Popen([sys.executable, "-c", code, str(tmp_path)])
     until = time.monotonic() + 60

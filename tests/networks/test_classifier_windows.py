@@ -557,7 +557,7 @@ import patchproof as pp
 from patchproof.networks import windows
 from patchproof.optimizer import loop
 from patchproof.optimizer.problem import set_problem
-from patchproof.optimizer.promise import CONTROLS, shown_with_controls
+from patchproof.optimizer.promise import CONTROLS, pictures_with_controls
 from patchproof.optimizer.responses import responses
 problem = set_problem(pp.load_scene({str(scene)!r}))
 windows.FIXED = 0  # the network is small

@@ -66,9 +66,9 @@ def test_a_process_that_has_left_a_page_behind_ends_as_any_other(tmp_path):
     """What is drawn ten thousand million times is not waited for."""
     forms_in_forms(tmp_path / "endless.pdf", 10)
     code = (
-        "import sys; from patchproof.base import input; from patchproof.sheets.pdf_raster import page_pixels;"
-        "from patchproof.base.validation import Refused; input.SECONDS = 0.2\n"
-        "try: page_pixels(sys.argv[1])\nexcept Refused: sys.exit(7)"
+        "import sys; from patchproof.base import input; from patchproof.sheets.pdf_raster import rasterize_page;"
+        "from patchproof.base.errors import Refused; input.SECONDS = 0.2\n"
+        "try: rasterize_page(sys.argv[1])\nexcept Refused: sys.exit(7)"
     )
     command = [sys.executable, "-c", code, str(tmp_path / "endless.pdf")]
     done = subprocess.run(command, capture_output=True, check=False, timeout=60)

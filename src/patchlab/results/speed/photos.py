@@ -18,7 +18,7 @@ TIMED = """
 import json, sys, time
 from pathlib import Path
 import cv2, torch
-from patchproof.evidence.batch import Item, _measured
+from patchproof.evidence.batch import PhotoItem, _measured
 from patchproof.evidence.classify import judges_of
 from patchproof.evidence.task import task_of
 from patchproof.app.verify import options_of
@@ -31,7 +31,7 @@ sheet = Path(sys.argv[1]) / "sheet.json"
 manifest = load_manifest(sheet)
 options = options_of(sheet, manifest)
 task = task_of(manifest, options, judges_of(options.models, manifest))
-items = [Item(path, path.name, with_pictures=True) for path in sorted(Path(sys.argv[1]).glob("photos/*/*.jpg"))]
+items = [PhotoItem(path, path.name, with_pictures=True) for path in sorted(Path(sys.argv[1]).glob("photos/*/*.jpg"))]
 rows = []
 for item in 2 * items:
     begin = time.process_time()
