@@ -12,6 +12,7 @@ from typing import Any, Literal
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from patchproof.base.goal import Goal
+from patchproof.base.notebook import notebook_html, rate_text
 from patchproof.base.validation import Finite, StrictModel
 from patchproof.photo.rejection import PhotoRejected
 
@@ -298,3 +299,14 @@ class Report(StrictModel):
     controls: tuple[Control, ...] = ()
     origin: Origin = Origin()
     ledger: Ledger | None = Field(None, exclude=True)
+
+    def _repr_html_(self) -> str:
+        """The verdict in a notebook."""
+        summary = self.summary
+        rows = {"photographs": f"{summary.photos}, judged {summary.judged}, measured {summary.measured}"}
+        if summary.rate is not None and summary.interval is not None:
+            rows["recognized"] = rate_text(summary.rate, summary.interval)
+        if summary.prediction_interval is not None:
+            rows["promised"] = "{} to {} of {}".format(*summary.prediction_interval, summary.judged)
+        rows |= {"reason": summary.reason, "next": summary.next_step or ""}
+        return notebook_html(f"verdict: {summary.verdict}", {key: text for key, text in rows.items() if text})

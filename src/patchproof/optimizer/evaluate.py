@@ -17,6 +17,7 @@ import torch
 from patchproof.base.compute import Compute
 from patchproof.base.errors import Refused
 from patchproof.base.input import is_file
+from patchproof.base.notebook import notebook_html, rate_text
 from patchproof.base.output import write_atomically
 from patchproof.base.progress import Advance, Progress, no_advance, no_progress
 from patchproof.base.validation import StrictModel
@@ -50,6 +51,14 @@ class Evaluation(StrictModel):
     n: int
     seed: int
     models: dict[str, ModelEvaluation]
+
+    def _repr_html_(self) -> str:
+        """The rates in a notebook."""
+        rows = {}
+        for name, each in self.models.items():
+            rows |= {name: rate_text(each.rate, each.interval)}
+            rows |= {f"{name}, {kind}": rate_text(claim.rate, claim.interval) for kind, claim in each.controls.items()}
+        return notebook_html(f"recognized in {self.n} fresh conditions", rows)
 
     def to_json(self) -> str:
         """Return the text of evaluate.json."""

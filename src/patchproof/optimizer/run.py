@@ -27,6 +27,7 @@ from pydantic import BaseModel, Field
 from patchproof.base.compute import Compute
 from patchproof.base.errors import Refused
 from patchproof.base.input import is_file, read_json
+from patchproof.base.notebook import notebook_html
 from patchproof.base.output import check_folder, make_folder, write_atomically
 from patchproof.base.progress import Advance, Progress, no_progress
 from patchproof.base.settings import SceneSettings
@@ -65,6 +66,11 @@ class Run:
     design: np.ndarray  # uint8 h×w×3; of a texture run 1×M×3, as in `optimize.texture.Texture`
     promise: Promise
     details: dict[str, Any]
+
+    def _repr_html_(self) -> str:
+        """The promise and the design in a notebook; a texture is not one picture."""
+        picture = self.design if self.scene.HAS_PIECE else None
+        return notebook_html(self.promise.headline, {"run": str(self.folder), **self.promise.figures()}, picture)
 
 
 def optimize(
