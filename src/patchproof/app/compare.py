@@ -52,13 +52,15 @@ def compare(
 ) -> Results:
     """Compare the designs of several runs under the same conditions, and the two best of them under as many fresh ones.
 
-    runs: folders of finished runs of one scene, two or more.
-    out: folder for designs.html, designs.json and the tables.
-    models, compute, overwrite, progress: as in `evaluate`.
-    n: conditions for each comparison.
-    seed: of the conditions, in place of the first run's.
+    Args:
+        runs: folders of finished runs of one scene, two or more.
+        out: folder for designs.html, designs.json and the tables.
+        models, compute, overwrite, progress: as in `evaluate`.
+        n: conditions for each comparison.
+        seed: of the conditions, in place of the first run's.
 
-    Raises Refused for runs of different scenes.
+    Raises:
+        Refused: for runs of different scenes.
     """
     networks, loaded = None if models is None else tuple(models), _loaded(runs, models is None)
     refuse_networks_in_memory(networks, compute)

@@ -52,10 +52,11 @@ _LIBRARIES = ("patchproof", "numpy", "opencv-contrib-python-headless", "torch", 
 class CaptureInfo:
     """What is known about how the photographs were taken.
 
-    camera: a camera file's name or path, which replaces the EXIF focal length and takes the lens's distortion out.
-    scan_dpi: resolution of flat scans of the uncut page; None for photographs.
-    ruler_mm: lengths (x, y) of the two printed 100 mm rulers as measured on the print, in millimeters.
-    boxes: COCO JSON with the object's box in photographs, for detectors, where the sheet does not tell it.
+    Attributes:
+        camera: a camera file's name or path, which replaces the EXIF focal length and takes the lens's distortion out.
+        scan_dpi: resolution of flat scans of the uncut page; None for photographs.
+        ruler_mm: lengths (x, y) of the two printed 100 mm rulers as measured on the print, in millimeters.
+        boxes: COCO JSON with the object's box in photographs, for detectors, where the sheet does not tell it.
     """
 
     camera: str | Path | None = None
@@ -81,27 +82,32 @@ def verify(
 ) -> Report:
     """Measure photographs of a print, judge them against the promise of its sheet, and write the report.
 
-    photos: a folder of photographs, or of folders, one a session; one photograph; or uint8 H×W×3 sRGB arrays of one
-        session, which are kept as PNG files in `out`.
-    sheet: the manifest, SHEET.json; its folder is where its models and printers are looked up.
-    out: folder for the report, new or empty.
-    models: networks besides the sheet's first: names, or classifiers in memory. Code (`module:`) that the sheet names
-        runs only where it is one of them.
-    controls: folder with a folder of photographs for each control ("bare", "mean", ...).
-    capture: camera, scan resolution, measured rulers, the object's boxes.
-    run: the run that the sheet was made from; each photograph then gets a forecast at its measured view.
-    ledger_photos: photographs at most in the gap ledger and the estimated effect, 0 for neither; each costs 16
-        classifications.
-    compute: processes or cluster; photographs are judged on the CPU, and another device is refused.
-    resume: keep what an earlier call finished, and measure only photographs that are new or differ.
-    overwrite: delete an earlier report in `out` first.
-    progress: called with the stage "verify" (photographs).
+    Args:
+        photos: a folder of photographs, or of folders, one a session; one photograph; or uint8 H×W×3 sRGB arrays of one
+            session, which are kept as PNG files in `out`.
+        sheet: the manifest, SHEET.json; its folder is where its models and printers are looked up.
+        out: folder for the report, new or empty.
+        models: networks besides the sheet's first: names, or classifiers in memory. Code (`module:`) that the sheet
+            names runs only where it is one of them.
+        controls: folder with a folder of photographs for each control ("bare", "mean", ...).
+        capture: camera, scan resolution, measured rulers, the object's boxes.
+        run: the run that the sheet was made from; each photograph then gets a forecast at its measured view.
+        ledger_photos: photographs at most in the gap ledger and the estimated effect, 0 for neither; each costs 16
+            classifications.
+        compute: processes or cluster; photographs are judged on the CPU, and another device is refused.
+        resume: keep what an earlier call finished, and measure only photographs that are new or differ.
+        overwrite: delete an earlier report in `out` first.
+        progress: called with the stage "verify" (photographs).
 
-    Raises Refused for a sheet, network or folder that cannot be used. Photographs that cannot be measured or judged are
-    listed in the report with the code of their `PhotoRejected`.
+    Raises:
+        Refused: for a sheet, network or folder that cannot be used. Photographs that cannot be measured or judged are
+        listed in the report with the code of their `PhotoRejected`.
 
+    Examples:
+        ```python
         report = pp.verify("photos", "sheet.json", "report", compute=pp.Compute(jobs=4))
         print(report.summary.verdict, report.summary.rate)
+        ```
     """
     out, manifest, compute = Path(out), load_manifest(sheet), compute.without("verify", device=True)
     _check_out(out, resume, overwrite)

@@ -14,9 +14,10 @@ from patchproof.base.errors import Refused
 class Compute:
     """Where work runs. Results do not depend on `jobs` where one process works on one thread, too.
 
-    device: torch device of scene and networks, "cpu" or "cuda"; photographs are judged on the CPU only.
-    jobs: processes on this machine that share the work, 1 or more.
-    cluster: address of a dask scheduler whose workers do the work in place of this machine's; None for no cluster.
+    Attributes:
+        device: torch device of scene and networks, "cpu" or "cuda"; photographs are judged on the CPU only.
+        jobs: processes on this machine that share the work, 1 or more.
+        cluster: address of a dask scheduler whose workers do the work in place of this machine's; None for no cluster.
     """
 
     device: str = "cpu"

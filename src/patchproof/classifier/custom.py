@@ -54,13 +54,16 @@ def classifier_of(
 ) -> Classifier:
     """Make a Classifier of a network in memory.
 
-    network: takes N×3×S×S sRGB in [0, 1], its normalization inside, and returns N×K logits. A torch module is put into
-        evaluation mode; scripted modules, `ExportedProgram.module()` and plain functions are taken as they are.
-    input_px: S, the side of the square that it takes, in pixels.
-    labels: names of its K classes, in the order of its outputs.
-    name: what runs and reports call it, "python:" and a word.
+    Args:
+        network: takes N×3×S×S sRGB in [0, 1], its normalization inside, and returns N×K logits. A torch module is put
+            into evaluation mode; scripted modules, `ExportedProgram.module()` and plain functions are taken as they
+            are.
+        input_px: S, the side of the square that it takes, in pixels.
+        labels: names of its K classes, in the order of its outputs.
+        name: what runs and reports call it, "python:" and a word.
 
-    Raises Refused for what cannot be called with a batch of pictures.
+    Raises:
+        Refused: for what cannot be called with a batch of pictures.
     """
     _check_callable(network)
     labels = tuple(map(str, labels))

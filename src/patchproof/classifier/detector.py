@@ -10,7 +10,7 @@ Left out on purpose: suppression. It leaves the best candidate of an object, whi
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence  # noqa: F401 (Callable: of the annotations of the inherited __init__)
 from dataclasses import dataclass
 
 import numpy as np

@@ -34,15 +34,20 @@ def load_classifier(
 ) -> Classifier:
     """Load a classifier or detector, check that it can be used, and make it as fast as it goes.
 
-    name: a name as in scene files (see the module's list), a classifier in memory, or a torch module with the
-        attributes `input_px` and `labels`.
-    base: folder that file names are relative to.
-    device: where its tensors go.
+    Args:
+        name: a name as in scene files (see the module's list), a classifier in memory, or a torch module with the
+            attributes `input_px` and `labels`.
+        base: folder that file names are relative to.
+        device: where its tensors go.
 
-    Raises Refused where it is missing, or where its answers cannot be used (`classifier.check`).
+    Raises:
+        Refused: where it is missing, or where its answers cannot be used (`classifier.check`).
 
+    Examples:
+        ```python
         network = pp.load_classifier("file:net.onnx")
         logits = network.logits(photos)  # N×3×H×W sRGB in [0, 1] -> N×K
+        ```
     """
     if isinstance(name, torch.nn.Module):
         name = labeled_module(name, "python:network")

@@ -81,15 +81,17 @@ def evaluate(
 ) -> Evaluation:
     """Evaluate a run's design and controls under fresh conditions, and write the result to RUN/evaluate.json.
 
-    run_folder: a finished run.
-    models: networks in place of the run's: names, or classifiers in memory, which other processes cannot load.
-    n: conditions, 1 or more.
-    seed: of the conditions, in place of the scene's.
-    compute: device, and processes or cluster.
-    overwrite: replace an earlier evaluate.json.
-    progress: called with the stage "evaluate" (views).
+    Args:
+        run_folder: a finished run.
+        models: networks in place of the run's: names, or classifiers in memory, which other processes cannot load.
+        n: conditions, 1 or more.
+        seed: of the conditions, in place of the scene's.
+        compute: device, and processes or cluster.
+        overwrite: replace an earlier evaluate.json.
+        progress: called with the stage "evaluate" (views).
 
-    Raises Refused for a folder without a finished run, or one that was evaluated before.
+    Raises:
+        Refused: for a folder without a finished run, or one that was evaluated before.
     """
     folder, networks = Path(run_folder).resolve(), None if models is None else tuple(models)
     refuse_networks_in_memory(networks, compute)

@@ -85,13 +85,15 @@ def import_patch(
 ) -> Run:
     """Make a run of a picture that was made elsewhere, and promise its rate.
 
-    picture: a file, or uint8 H×W×3 sRGB; its proportions are the piece's within 2 %.
-    scene: a scene with a printed piece, or the path of a scene file.
-    out: the run's folder, new or empty.
-    models, seed, promise, compute, overwrite: as in `optimize`.
-    progress: called with the stage "promise" (views).
+    Args:
+        picture: a file, or uint8 H×W×3 sRGB; its proportions are the piece's within 2 %.
+        scene: a scene with a printed piece, or the path of a scene file.
+        out: the run's folder, new or empty.
+        models, seed, promise, compute, overwrite: as in `optimize`.
+        progress: called with the stage "promise" (views).
 
-    Raises Refused where the picture does not fit the piece, or where the piece's markers could not be read beside it.
+    Raises:
+        Refused: where the picture does not fit the piece, or where the piece's markers could not be read beside it.
     """
     out, compute = Path(out), compute.without("import_patch", cluster=True)
     check_folder(out, RUN_FILE_PATTERNS, overwrite)
@@ -182,8 +184,7 @@ def _other_shape(width: int, height: int, scene: PieceScene) -> str:
 
 
 def _with_piece(scene: str | Path | Scene, seed: int | None) -> PieceScene:
-    loaded = scene if isinstance(scene, Scene) else load_scene(scene, seed)
-    return require_piece(loaded, 'leave patch.kind out, or "patch"')
+    return require_piece(scene_of(scene, seed), 'leave patch.kind out, or "patch"')
 
 
 def _read(picture: str | Path | np.ndarray) -> tuple[str, str, np.ndarray]:

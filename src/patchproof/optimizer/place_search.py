@@ -112,12 +112,14 @@ def choose_place(
 ) -> Place:
     """Search the object of a scene with `patch.place = "auto"` for the best place of the piece.
 
-    scene: loaded by `load_scene` or `make_scene`; `scene.at(place.at, place.spin_deg)` has the piece there.
-    models, loss: networks and loss in place of the scene's, as in `optimize`.
-    compute: device and processes; refuses a cluster.
-    progress: called with the stage "place" (passes of the networks).
+    Args:
+        scene: loaded by `load_scene` or `make_scene`; `scene.at(place.at, place.spin_deg)` has the piece there.
+        models, loss: networks and loss in place of the scene's, as in `optimize`.
+        compute: device and processes; refuses a cluster.
+        progress: called with the stage "place" (passes of the networks).
 
-    Raises Refused where the piece fits nowhere on the object.
+    Raises:
+        Refused: where the piece fits nowhere on the object.
     """
     scene, compute, advance = (
         require_unplaced(scene),

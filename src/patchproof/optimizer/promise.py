@@ -47,9 +47,10 @@ SETTLED = 1.25
 class PromiseOptions:
     """How a finished design's rate is promised.
 
-    views: photographs simulated for the promise, 8 or more; fewer than 400 make it a draft. None: up to 400, as many as
-        the scene's `promise.half_width` needs.
-    controls: what the design is compared with, one at least: "bare", "mean", "gray", "noise".
+    Attributes:
+        views: photographs simulated for the promise, 8 or more; fewer than 400 make it a draft. None: up to 400, as
+            many as the scene's `promise.half_width` needs.
+        controls: what the design is compared with, one at least: "bare", "mean", "gray", "noise".
     """
 
     views: int | None = None

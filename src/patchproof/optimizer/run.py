@@ -88,28 +88,34 @@ def optimize(
 ) -> Run:
     """Optimize the patch of a scene, promise its rate, and write both into a folder.
 
-    scene: a scene, or the path of a scene file.
-    out: the run's folder, new or empty.
-    models: networks in place of the scene's: names as in scene files, or classifiers in memory.
-    loss: `loss(logits N×K, indices) -> N` to descend on, in place of the goal's.
-    seed: of all random draws, in place of the scene's `optimize.seed`.
-    promise: how many views the promise takes, and its controls.
-    compute: device and processes; refuses a cluster.
-    resume: continue from the folder's checkpoint, at the place that was chosen there.
-    overwrite: delete an earlier run in the folder first.
-    progress: called with the stages "place" (where the scene searches one), "optimize" (steps) and "promise" (views).
+    Args:
+        scene: a scene, or the path of a scene file.
+        out: the run's folder, new or empty.
+        models: networks in place of the scene's: names as in scene files, or classifiers in memory.
+        loss: `loss(logits N×K, indices) -> N` to descend on, in place of the goal's.
+        seed: of all random draws, in place of the scene file's `optimize.seed`; a scene in memory has its own.
+        promise: how many views the promise takes, and its controls.
+        compute: device and processes; refuses a cluster.
+        resume: continue from the folder's checkpoint, at the place that was chosen there.
+        overwrite: delete an earlier run in the folder first.
+        progress: called with the stages "place" (where the scene searches one), "optimize" (steps) and "promise"
+            (views).
 
-    Raises Refused for a scene, network or folder that cannot be used. Method: Pestana et al., section 3.
+    Raises:
+        Refused: for a scene, network or folder that cannot be used. Method: Pestana et al., section 3.
 
+    Examples:
+        ```python
         run = pp.optimize("scene.toml", "run", compute=pp.Compute(jobs=2))
         print(run.promise.rate, run.promise.interval)
+        ```
     """
     out, compute = Path(out), compute.without("optimize", cluster=True)
     if not resume:
         check_folder(
             out, RUN_FILE_PATTERNS, overwrite, unfinished=is_file(out / CHECKPOINT_FILE) and not is_file(out / RUN_FILE)
         )
-    scene = scene if isinstance(scene, Scene) else load_scene(scene, seed)
+    scene = scene_of(scene, seed)
     keep_place = None
     if not scene.HAS_PLACE:
         searching = {"models": models, "loss": loss, "compute": compute, "progress": progress}
@@ -126,6 +132,15 @@ def optimize(
     state = load_checkpoint(out, problem) if resume else start(problem)
     design = _loop(problem, state, out, partial(progress, "optimize"))
     return finish_run(problem, design, out, promise, progress)
+
+
+def scene_of(scene: str | Path | Scene, seed: int | None) -> Scene:
+    """Return a scene, or load that of a file with `seed` in place of the file's; a scene in memory keeps its own."""
+    if not isinstance(scene, Scene):
+        return load_scene(scene, seed)
+    if seed not in (None, scene.seed):
+        raise Refused(f"the seed of the scene in memory, {scene.seed}", f"{seed}", "leave seed out, or name a file")
+    return scene
 
 
 def _placed(

@@ -48,9 +48,10 @@ _FULL_FRAME_DIAGONAL_MM = 43.2666  # of 36 × 24 mm, to which EXIF's 35 mm focal
 class PhotoTruth:
     """What is known of a simulated photograph.
 
-    homography_px_from_mm: 3×3 from page millimeters to pixels; None where the piece is bent or absent.
-    marker_corners_px: 4×2 pixels (x right, y down) by marker id.
-    conditions: drawn values by name, as in `truth.json`; of a scan its `scan_dpi` and `print_scale`.
+    Attributes:
+        homography_px_from_mm: 3×3 from page millimeters to pixels; None where the piece is bent or absent.
+        marker_corners_px: 4×2 pixels (x right, y down) by marker id.
+        conditions: drawn values by name, as in `truth.json`; of a scan its `scan_dpi` and `print_scale`.
     """
 
     homography_px_from_mm: np.ndarray | None

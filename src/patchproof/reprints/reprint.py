@@ -53,18 +53,20 @@ def reprint(
 ) -> Reprint:
     """Print a sheet in simulation, hang the piece on its object, and photograph it.
 
-    pdf_path: the sheet's PDF, its manifest beside it.
-    run: the run that the sheet was made from.
-    n: photographs in all, 1 or more.
-    out: folder for the JPEG files, `truth.json` and `coco.json`; one folder a session inside, if there are several.
-    how: printer, print scale, a control in place of the design, and the renderer.
-    sessions: places to photograph in, 1 to n, each with a light and camera of its own.
-    seed: of the conditions, in place of the scene's.
-    compute: processes or cluster; the renderer runs on the CPU, and another device is refused.
-    overwrite: delete earlier photographs in `out` first.
-    progress: called with the stage "photograph".
+    Args:
+        pdf_path: the sheet's PDF, its manifest beside it.
+        run: the run that the sheet was made from.
+        n: photographs in all, 1 or more.
+        out: folder for the JPEG files, `truth.json` and `coco.json`; one folder a session inside, if there are several.
+        how: printer, print scale, a control in place of the design, and the renderer.
+        sessions: places to photograph in, 1 to n, each with a light and camera of its own.
+        seed: of the conditions, in place of the scene's.
+        compute: processes or cluster; the renderer runs on the CPU, and another device is refused.
+        overwrite: delete earlier photographs in `out` first.
+        progress: called with the stage "photograph".
 
-    Raises Refused where the PDF is not of this run.
+    Raises:
+        Refused: where the PDF is not of this run.
     """
     compute = compute.without("reprint", device=True)
     if not 1 <= sessions <= n:

@@ -32,13 +32,15 @@ def sheet(
 ) -> Manifest:
     """Write the page of a run's design as a PDF at true size, and its manifest beside it.
 
-    run: a run with a printed piece.
-    pdf_path: SHEET.pdf; the manifest is SHEET.json.
-    template: a template's name or file, in place of the scene's.
-    control: print this in place of the design: "mean", "gray", "noise", "shuffled" or "blank".
-    copies: pages with the same content, for label rolls.
+    Args:
+        run: a run with a printed piece.
+        pdf_path: SHEET.pdf; the manifest is SHEET.json.
+        template: a template's name or file, in place of the scene's.
+        control: print this in place of the design: "mean", "gray", "noise", "shuffled" or "blank".
+        copies: pages with the same content, for label rolls.
 
-    Raises Refused where the piece does not fit the page.
+    Raises:
+        Refused: where the piece does not fit the page.
     """
     content, scene = content_of(run, template, control)
     page = load_template(scene.settings.sheet.template)

@@ -41,15 +41,18 @@ def make_scene(
 ) -> Scene:
     """Make a scene of settings in Python.
 
-    settings: `SceneSettings`, or a dictionary like a scene file's. Where a scene file names something, the dictionary
-        may hold it: a Path for any path, a trimesh mesh as `object.mesh`, classifiers (or torch modules with `input_px`
-        and `labels`) in `target.models`, and lists of uint8 H×W×3 sRGB arrays as `object.photos`, `object.images` or
-        `background.images`; arrays are written as PNG files into a folder of `base` that is named after their bytes.
-    mesh: the object, where `object.mesh` is "python:" and a word.
-    base: folder that paths in the settings are relative to.
-    seed: of all random draws, in place of `optimize.seed`.
+    Args:
+        settings: `SceneSettings`, or a dictionary like a scene file's. Where a scene file names something, the
+            dictionary may hold it: a Path for any path, a trimesh mesh as `object.mesh`, classifiers (or torch modules
+            with `input_px` and `labels`) in `target.models`, and lists of uint8 H×W×3 sRGB arrays as `object.photos`,
+            `object.images` or `background.images`; arrays are written as PNG files into a folder of `base` that is
+            named after their bytes.
+        mesh: the object, where `object.mesh` is "python:" and a word.
+        base: folder that paths in the settings are relative to.
+        seed: of all random draws, in place of `optimize.seed`.
 
-    Raises Refused for settings that contradict each other, and files that cannot be read.
+    Raises:
+        Refused: for settings that contradict each other, and files that cannot be read.
     """
     models: dict[str, Any] = {}
     if not isinstance(settings, SceneSettings):
