@@ -34,12 +34,11 @@ from patchproof.classifier.network import Classifier
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.optimizer.promise import PROMISE_VIEWS, PromiseOptions
-from patchproof.optimizer.run import RUN_FILE_PATTERNS, Run, finish_run, load_run
+from patchproof.optimizer.run import RUN_FILE_PATTERNS, Run, finish_run, load_run, scene_of
 from patchproof.photo.detect import find_markers
 from patchproof.photo.read import list_photos, printable_name, read_photo
 from patchproof.photo.rejection import PhotoRejected
 from patchproof.scene.interface import PieceScene, Scene, require_piece
-from patchproof.scene.scene import load_scene
 from patchproof.sheets.manifest import design_sha256
 from patchproof.sheets.piece import Piece, marker_image
 
