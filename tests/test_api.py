@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
+import html
+import pickle
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 import trimesh
+from PIL import Image
 
 import patchproof as pp
+import patchproof.base.errors
+from patchproof.app.capture.album import UploadRefused
+from patchproof.base.errors import TimeLimitExceeded, WorkerDied
+from patchproof.networks.bounds import UnsupportedNetwork
+from patchproof.optimizer.problem import set_problem
 from patchproof.optimizer.promise import PROMISE_VIEWS
 
 SETTINGS = {
@@ -118,3 +128,96 @@ def test_a_photograph_shows_pixels_as_it_shows_the_design_they_are_of():
     with torch.no_grad():
         pictures = [pp.photograph(stage, shown, conditions, (72, 72)) for shown in (pixels, design, None)]
     assert torch.equal(pictures[0], pictures[1]) and not torch.equal(pictures[0], pictures[2])
+
+
+def test_a_dictionary_may_hold_the_objects_that_a_scene_file_names(tmp_path):
+    pictures = [np.full((80, 90, 3), 40 * i, np.uint8) for i in range(6)]
+    mesh = trimesh.creation.box(extents=(0.3, 0.2, 0.2))
+    module = network().network
+    module.input_px, module.labels = 32, ("box", "cup", "tin")
+    tables = {
+        "object": {"mesh": mesh, "length_mm": 300},
+        "target": {"label": "box", "models": [module, network(1)]},
+        "background": {"images": pictures},
+        "printer": {"profile": Path("coated")},
+    }
+    made = pp.make_scene(SETTINGS | tables, base=tmp_path)
+    assert (
+        made.settings.target.models == ("python:network0", "python:net1") and made.settings.object.mesh == "python:mesh"
+    )
+    folder = tmp_path / made.settings.background.images
+    assert (
+        np.array_equal(np.asarray(Image.open(folder / "photo_0002.png")), pictures[1])
+        and len(list(folder.iterdir())) == 6
+    )
+    assert pp.make_scene(SETTINGS | tables, base=tmp_path).sheet_id == made.sheet_id
+    assert [judge.labels for judge in set_problem(made).classifiers] == [("box", "cup", "tin")] * 2
+    with pytest.raises(pp.Refused, match=r"float64 \(8, 8, 3\) at index 1"):
+        pp.make_scene(SETTINGS | {"background": {"images": [pictures[0], np.zeros((8, 8, 3))]}}, mesh, tmp_path)
+
+
+def test_photographs_may_be_arrays(run, tmp_path):
+    pp.sheet(run, tmp_path / "sheet.pdf")
+    photos = [np.full((120, 160, 3), 90 + i, np.uint8) for i in range(2)]
+    report = pp.verify(photos, tmp_path / "sheet.json", tmp_path / "report", models=[network()])
+    assert [photo.file for photo in report.photos] == ["photo_0001.png", "photo_0002.png"]
+    assert {photo.code for photo in report.photos} == {"too_few_markers"}
+    with pytest.raises(pp.Refused, match="an empty list"):
+        pp.verify([], tmp_path / "sheet.json", tmp_path / "report", overwrite=True, models=[network()])
+
+
+def test_a_scene_in_memory_keeps_its_seed(tmp_path):
+    with pytest.raises(pp.Refused, match="the scene in memory, 0, got 7"):
+        pp.optimize(scene(), tmp_path / "run", seed=7)
+
+
+@pytest.mark.parametrize(
+    ("verb", "compute", "got"),
+    [("optimize", pp.Compute(cluster="tcp://a:1"), "tcp://a:1"), ("verify", pp.Compute("cuda"), '"cuda"')],
+)
+def test_what_a_verb_cannot_use_is_refused_by_name(verb, compute, got, run, tmp_path):
+    pp.sheet(run, tmp_path / "sheet.pdf")
+    arguments = (
+        (scene(), tmp_path / "out") if verb == "optimize" else (tmp_path, tmp_path / "sheet.json", tmp_path / "out")
+    )
+    with pytest.raises(pp.Refused, match=f"{verb}.*{got}"):
+        getattr(pp, verb)(*arguments, compute=compute)
+
+
+def test_networks_as_python_has_them():
+    layers = network().network
+    pictures = (torch.rand(2, 3, 32, 32),)
+    exported = torch.export.export(layers, pictures, dynamic_shapes=({0: torch.export.Dim("n", min=1, max=64)},))
+    expected = network().logits(pictures[0])
+    for each in (exported.module(), torch.jit.trace(layers, pictures), lambda photos: layers(photos)):
+        judge = pp.load_classifier(pp.classifier_of(each, 32, ("box", "cup", "tin")))
+        assert torch.allclose(judge.logits(pictures[0]), expected, atol=1e-6)
+    for what, got in (
+        (exported, r"an ExportedProgram: call its \.module"),
+        (torch.nn.Linear, "a type"),
+        ("net.pt", "a str"),
+    ):
+        with pytest.raises(pp.Refused, match=got):
+            pp.classifier_of(what, 32, ("box", "cup", "tin"))
+
+
+def test_errors_are_one_tree_and_cross_processes():
+    errors = [
+        pp.Refused("a", "b", "c"),
+        WorkerDied("a", "b", "c"),
+        UploadRefused(404, "a", "b", "c"),
+        pp.PhotoRejected("blurred", 1.0, 2.0, "hold still"),
+        UnsupportedNetwork("a thing"),
+        TimeLimitExceeded(3.0),
+    ]
+    for error in errors:
+        again = pickle.loads(pickle.dumps(error))
+        assert isinstance(error, pp.PatchproofError) and type(again) is type(error) and str(again) == str(error)
+    assert pickle.loads(pickle.dumps(errors[2])).status == 404
+    tree = patchproof.base.errors.__doc__
+    assert all(type(error).__name__ in tree for error in errors)
+
+
+def test_results_show_themselves_in_a_notebook(run):
+    assert f"{run.promise.rate:.1%}" in run.promise._repr_html_() and "data:image/png" in run._repr_html_()
+    assert html.escape(run.promise.headline) in run._repr_html_()

@@ -11,18 +11,49 @@ from pathlib import Path
 
 import pytest
 
+import patchproof
+
 ROOT = Path(__file__).parents[1]
 
 RIGHT = """
+import numpy as np
+import torch
 import patchproof as pp
 
-scene = pp.load_scene("scene.toml")
-stage = pp.set_stage(scene)
-pictures = pp.photograph(stage, None, scene.draw("evaluate", 4), (96, 96))
-run: pp.Run = pp.optimize(scene, "run")
-rate: float = run.promise.rate
-report = pp.verify("photos", "sheet.json", "report")
+def progress(stage: str, done: int, total: int) -> None:
+    print(pp.__version__, stage, done, total)
+
+report_progress: pp.Progress = progress
+compute, promise = pp.Compute(jobs=2), pp.PromiseOptions(views=40, controls=("bare",))
+scene: pp.Scene = pp.load_scene("scene.toml")
+made = pp.make_scene(pp.SceneSettings.model_validate({}), base=".")
+conditions: pp.Conditions = scene.draw("evaluate", 4)
+stage: pp.Stage = pp.set_stage(scene)
+pictures: torch.Tensor = pp.photograph(stage, None, conditions, (96, 96))
+classifier: pp.Classifier = pp.classifier_of(lambda photos: photos.mean((2, 3)), 32, ["a", "b", "c"])
+detector: pp.Detector = pp.detector_of(torch.nn.Identity(), 32, ["a"])
+printer: pp.Printer = pp.load_printer("coated")
+place: pp.Place = pp.choose_place(made, models=[pp.load_classifier("file:net.onnx")], progress=report_progress)
+try:
+    run: pp.Run = pp.optimize(scene, "run", promise=promise, compute=compute, progress=report_progress)
+except pp.Refused as error:
+    raise SystemExit(str(error))
+except pp.PatchproofError:
+    raise
+run = pp.import_patch(np.zeros((64, 64, 3), np.uint8), scene, "imported", models=[classifier, detector])
+said: pp.Promise = pp.load_run("run").promise
+rate: float = said.rate
+manifest: pp.Manifest = pp.sheet(run, "sheet.pdf")
+manifest = pp.load_manifest("sheet.json")
+taken: pp.Reprint = pp.reprint("sheet.pdf", run, 6, "photos", pp.ReprintSetup(printer="uncoated"), compute=compute)
+corners: dict[int, np.ndarray] = next(iter(taken.photos.values())).marker_corners_px
+evaluation: pp.Evaluation = pp.evaluate("run", n=8)
+share: float = evaluation.models["builtin"].controls["bare"].rate
+compared = pp.compare(["run", "imported"], "compared")
+report: pp.Report = pp.verify("photos", "sheet.json", "report", capture=pp.CaptureInfo(ruler_mm=(97.1, 97.3)))
 verdict: str = report.summary.verdict
+goal: pp.Goal = scene.settings.target.goal
+rejected: type[pp.PhotoRejected] = pp.PhotoRejected
 """
 WRONG = """
 import patchproof as pp
@@ -53,6 +84,7 @@ def errors(tmp_path_factory) -> dict[str, list[int]]:
 
 def test_a_users_script_is_understood(errors):
     assert errors["right.py"] == []
+    assert not {name for name in patchproof.__all__ if f"pp.{name}" not in RIGHT}
 
 
 def test_three_mistakes_are_three_errors(errors):
