@@ -99,7 +99,7 @@ def spin(seconds):
 
 def given_up(seconds):
     """What a limit of 0.2 s makes of that, in whichever process this is."""
-    bounds.SECONDS = 0.2
+    bounds.TIME_LIMIT_S = 0.2
     try:
         return limits.run_limited(spin, seconds)
     except PhotoRejected as cannot:

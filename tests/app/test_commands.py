@@ -114,7 +114,7 @@ def test_a_stopped_run_says_what_is_kept_and_a_second_try_how_to_go_on(tmp_path,
     again = f"patchproof optimize {scene_file} --out {out} --resume"
     assert capsys.readouterr().err.splitlines()[-1] == f"Stopped: {out} keeps what was finished. Go on with: {again}"
     assert command("optimize", scene_file, "--out", out) == 1
-    assert "which is unfinished: go on with --resume" in capsys.readouterr().err
+    assert "which is unfinished: continue with --resume" in capsys.readouterr().err
     monkeypatch.setattr("patchproof.optimizer.evaluate.evaluate", stop)
     assert command("evaluate", out) == 130 and capsys.readouterr().err == "Stopped: nothing was written.\n"
 
@@ -123,7 +123,7 @@ def test_an_unfinished_study_is_gone_on_with(tmp_path):
     (tmp_path / "out" / "cells").mkdir(parents=True)
     (tmp_path / "out" / "stress.json").write_text("{}")
     (tmp_path / "stress.toml").write_text('scenes = ["scene.toml"]')
-    with pytest.raises(Refused, match="which is unfinished: go on with --resume, or start anew with --overwrite"):
+    with pytest.raises(Refused, match="which is unfinished: continue with --resume, or start again with --overwrite"):
         run_study("stress", tmp_path / "stress.toml", tmp_path / "out")
 
 

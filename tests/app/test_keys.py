@@ -73,12 +73,12 @@ def test_meanings_stand_beside_fields_or_above_them():
     "row",
     [
         "| `length_mm` | number, > 0 | mm | none | a mesh's longest extent |",
-        '| `up` | `"y"`, `"z"` |  | `"z"` | the mesh file\'s axis that points up |',
+        '| `up` | `"y"`, `"z"` |  | `"z"` | the axis of the mesh file that points up |',
         "| `elevation_deg` | [low, high], -89 to 89 | ° | `[2, 27]` | of the camera above the horizontal |",
         "| `white_balance` | number, 0 to 0.5 |  | `0.05` | largest error of the red and of the blue gain |",
         "| `photo_px` | [2 integers, 64 to 20000] | px | `[1600, 1200]` | Width and height of a whole photograph. |",
         "| `corners_mm` | list of [2 numbers], 2 or more | mm | required | top-left, one per marker |",
-        "| `swatch_mm` | number, ≥ 4 | mm | required | side; below 4 a phone's photograph of a whole page has too few "
+        "| `swatch_mm` | number, ≥ 4 | mm | required | side; below 4 a phone's photograph of the page has too few "
         "pixels |",
         "| `views` | table of [low, high] |  | `{}` | Azimuths in degrees by name; without any, thirds of each scene's "
         "own range. |",

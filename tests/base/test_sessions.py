@@ -29,13 +29,15 @@ def drawn(rng, rate: float, correlation: float, photos: int, sessions: int) -> n
 @pytest.mark.parametrize("recognized", [0, 3, 200, 320, 399, 400])
 def test_photographs_on_their_own_are_the_beta_binomial_of_jeffreys_prior(recognized):
     expected = betabinom(20, recognized + 0.5, 400 - recognized + 0.5)
-    spread = alone(recognized, 400)
-    np.testing.assert_allclose(spread.chances([1] * 20), expected.pmf(np.arange(21)), atol=2e-4)
-    np.testing.assert_allclose(spread.chances([20]), spread.chances([1] * 20), atol=1e-6)
-    assert spread.chances([20]) is spread.chances((20,)) and not spread.chances([20]).flags.writeable  # once for all
-    assert spread.counts([20]) == tuple(expected.ppf([TAIL, 1 - TAIL]))
-    assert spread.correlation[0] < 1e-6 and spread.rate[0] <= recognized / 400 <= spread.rate[1]
-    np.testing.assert_allclose(spread.rate, wilson(recognized, 400), atol=0.01)
+    posterior = alone(recognized, 400)
+    np.testing.assert_allclose(posterior.chances([1] * 20), expected.pmf(np.arange(21)), atol=2e-4)
+    np.testing.assert_allclose(posterior.chances([20]), posterior.chances([1] * 20), atol=1e-6)
+    assert posterior.chances([20]) is posterior.chances((20,))  # computed once
+    assert not posterior.chances([20]).flags.writeable
+    assert posterior.count_interval([20]) == tuple(expected.ppf([TAIL, 1 - TAIL]))
+    low, high = posterior.rate_interval
+    assert posterior.correlation[0] < 1e-6 and low <= recognized / 400 <= high
+    np.testing.assert_allclose(posterior.rate_interval, wilson(recognized, 400), atol=0.01)
 
 
 @pytest.mark.parametrize("photos", [1, 4, 100, 1000])
@@ -43,15 +45,15 @@ def test_photographs_on_their_own_are_the_beta_binomial_of_jeffreys_prior(recogn
 def test_chances_of_a_session_are_the_librarys(rate, correlation, photos):
     strength = 1 / correlation - 1
     expected = betabinom.pmf(np.arange(photos + 1), photos, rate * strength, (1 - rate) * strength)
-    spread = RatePosterior(np.array([rate]), np.array([correlation]), np.ones(1))
-    np.testing.assert_allclose(spread.chances([photos]), expected, atol=1e-8)
+    posterior = RatePosterior(np.array([rate]), np.array([correlation]), np.ones(1))
+    np.testing.assert_allclose(posterior.chances([photos]), expected, atol=1e-8)
 
 
 def test_one_session_allows_for_more_than_the_same_photographs_in_many():
-    spread = rate_posterior(drawn(np.random.default_rng(0), 0.8, 0.15, 6, 100), [6] * 100)
-    widths = [np.ptp(spread.counts(split_evenly(40, sessions))) for sessions in (1, 2, 4, 8, 40)]
+    posterior = rate_posterior(drawn(np.random.default_rng(0), 0.8, 0.15, 6, 100), [6] * 100)
+    widths = [np.ptp(posterior.count_interval(split_evenly(40, sessions))) for sessions in (1, 2, 4, 8, 40)]
     assert widths == sorted(widths, reverse=True) and widths[0] > 1.5 * widths[-1]
-    middle, (low, high) = spread.correlation
+    middle, (low, high) = posterior.correlation
     assert low < 0.15 < high and low < middle < high
 
 
@@ -60,25 +62,25 @@ def test_intervals_hold_for_new_sessions(correlation):
     """As many sessions as a promise has; of each, one new session and four of ten photographs."""
     rng, inside, within, trials = np.random.default_rng(1), 0, 0, 150
     for rate in rng.beta(2, 1, trials):
-        spread = rate_posterior(drawn(rng, rate, correlation, 6, 100), [6] * 100)
+        posterior = rate_posterior(drawn(rng, rate, correlation, 6, 100), [6] * 100)
         for photos in ((40,), (10,) * 4):
-            low, high = spread.counts(photos)
+            low, high = posterior.count_interval(photos)
             inside += low <= sum(drawn(rng, rate, correlation, n, 1)[0] for n in photos) <= high
-        within += spread.rate[0] <= rate <= spread.rate[1]
+        within += posterior.rate_interval[0] <= rate <= posterior.rate_interval[1]
     assert 0.93 < inside / (2 * trials) < 0.995 and 0.91 < within / trials < 0.99
 
 
 def test_the_least_rate_is_wrong_no_more_often_than_it_says():
-    rng, spread = (
+    rng, posterior = (
         np.random.default_rng(2),
         rate_posterior(drawn(np.random.default_rng(3), 0.85, 0.08, 6, 100), [6] * 100),
     )
     for photos in ((40,), (10,) * 4):
         counts = sum(drawn(rng, 0.65, 0.08, n, 4000) for n in photos)
-        wrong = np.mean([spread.least_rate(int(count), photos, TAIL) > 0.65 for count in counts])
+        wrong = np.mean([posterior.least_rate(int(count), photos, TAIL) > 0.65 for count in counts])
         assert 0.004 < wrong < 0.055
-    assert spread.least_rate(0, (40,), TAIL) < 0.01 and spread.most_rate(40, (40,), TAIL) > 0.99
-    assert spread.most_rate(10, (40,), TAIL) == pytest.approx(1 - spread.least_rate(30, (40,), TAIL))
+    assert posterior.least_rate(0, (40,), TAIL) < 0.01 and posterior.most_rate(40, (40,), TAIL) > 0.99
+    assert posterior.most_rate(10, (40,), TAIL) == pytest.approx(1 - posterior.least_rate(30, (40,), TAIL))
 
 
 def test_differences_are_wider_where_sessions_differ():

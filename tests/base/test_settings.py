@@ -93,7 +93,7 @@ def test_a_missing_key_is_named(tmp_path):
         ('mesh = "primitive:mug"\nlength_mm = 100', 'photos = "p"', "object takes sheet together with photos"),
         ('mesh = "primitive:mug"\nlength_mm = 100', 'images = "p"', "object takes labels together with images"),
         ("height_mm = 30\n", "", "patch takes width_mm and height_mm together"),
-        ("width_mm = 40\nheight_mm = 30\n", "", r"got others: add patch\.width_mm and patch\.height_mm\.$"),
+        ("width_mm = 40\nheight_mm = 30\n", "", r"got a contradiction: add patch\.width_mm and patch\.height_mm\.$"),
         ("height_mm = 30", "height_mm = 30\nepsilon = 0.1", "epsilon with textures only"),
         ("height_mm = 30", 'height_mm = 30\nkind = "masked"', "one of mask, materials or faces"),
         ("height_mm = 30", 'height_mm = 30\nmask = "m.png"', 'mask with kind = "masked" only'),

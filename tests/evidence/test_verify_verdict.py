@@ -39,7 +39,7 @@ def word(recognized: int, photos: tuple[int, ...], promise: Promise, without: in
 
 
 def test_the_rule_at_both_ends_of_the_interval():
-    low, high = prediction = promise_of(0.9).spread.counts((40,))
+    low, high = prediction = promise_of(0.9).posterior.count_interval((40,))
     assert prediction == judge(36, (40,), promise_of(0.9)).prediction_interval and low < 36 < high
     assert word(low - 1, (40,), promise_of(0.9)) == "broken"
     assert word(low, (40,), promise_of(0.9)) == "cannot_tell"  # allowed for, and no proof
@@ -73,7 +73,7 @@ def test_the_chance_of_kept_is_that_of_all_counts_which_are_called_so(goal, rate
     for photos in ((40,), (10,) * 4, (5,)):
         promise = promise_of(rate, control, goal, correlation=0.1)
         words = [word(count, photos, promise) == "kept" for count in range(sum(photos) + 1)]
-        assert kept_chance(promise, photos) == pytest.approx(promise.spread.chances(photos) @ words, abs=1e-12)
+        assert kept_chance(promise, photos) == pytest.approx(promise.posterior.chances(photos) @ words, abs=1e-12)
 
 
 def test_photographs_in_one_place_prove_less():

@@ -248,7 +248,7 @@ def test_the_promise_counts_what_was_recognized(tmp_path):
     assert promise.n == 24 and len(promise.conditions) == 24
     assert promise.rate == sum(c.recognized for c in promise.conditions) / 24
     np.testing.assert_allclose(promise.interval, wilson(round(promise.rate * 24), 24), atol=0.04)
-    assert promise.spread.rate == promise.interval
+    assert promise.posterior.rate_interval == promise.interval
     assert set(promise.controls) == set(CONTROLS)
     for claim in promise.controls.values():
         assert claim.difference == pytest.approx(promise.rate - claim.rate)

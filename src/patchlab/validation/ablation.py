@@ -195,7 +195,8 @@ def _design_row(result: Result) -> tuple:
 def _promised(result: Result) -> Estimate:
     """The rate in the world without the effect, with its interval over sessions as a promise has it."""
     hits = hits_of(result.answers["promised"]["hits"]["design"][0])
-    return Estimate(float(np.mean(hits)), *rate_posterior(*count_by_session(hits, VIEWS_PER_SESSION)).rate, len(hits))
+    posterior = rate_posterior(*count_by_session(hits, VIEWS_PER_SESSION))
+    return Estimate(float(np.mean(hits)), *posterior.rate_interval, len(hits))
 
 
 def _missed(results: Sequence[Result]) -> tuple:

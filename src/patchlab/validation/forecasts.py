@@ -106,7 +106,7 @@ def _forecast_row(group: Sequence[Result]) -> tuple:
                 continue
             own, answers = zip(*session["forecast"], strict=True)
             forecast, n = forecast_of(own, answers, level), len(own)
-            low, high = spread.counts((n,))
+            low, high = spread.count_interval((n,))
             held.append(forecast.interval[0] <= forecast.recognized <= forecast.interval[1])
             held_promise.append(low <= forecast.recognized <= high)
             widths.append(np.ptp(forecast.interval) / n)

@@ -134,7 +134,7 @@ class Counted:
 
     def interval(self, alone: bool = False) -> tuple[int, int]:
         """Counts that the promise allows for, or would if photographs were independent."""
-        return self.alone.counts((1,) * self.judged) if alone else self.spread.counts((self.judged,))
+        return self.alone.count_interval((1,) * self.judged) if alone else self.spread.count_interval((self.judged,))
 
     def held(self, alone: bool = False) -> bool:
         """Whether the count lies in that interval."""
@@ -208,7 +208,7 @@ def _each(results: Sequence[Result]) -> Table:
 def _elsewhere(settings: PromisesSettings, results: Sequence[Result]) -> Table:
     rows = []
     for result in results:
-        values, (low, high) = result.cell.values, recorded_spread(result).rate
+        values, (low, high) = result.cell.values, recorded_spread(result).rate_interval
         shown, promised = rate(hits_of(result.answers["elsewhere"])), hits_of(result.answers["promised"])
         within = shown is not None and low <= shown.value <= high
         about = (values["name"], values["network"], values["seed"])

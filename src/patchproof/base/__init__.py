@@ -1,1 +1,1 @@
-"""Errors, strict settings, rates and sessions, color, geometry, files and workers: what every room stands on."""
+"""Errors, validated settings, intervals and sessions, color, geometry, files, workers: every room imports from here."""

@@ -1,8 +1,8 @@
-"""Color maths: sRGB ↔ linear light ↔ CIELAB, and the color difference CIEDE2000.
+"""Color conversions: sRGB ↔ linear light ↔ CIELAB, and the color difference CIEDE2000.
 
-In and out: numpy arrays or torch tensors with the channels in the *last* axis (`... × 3`), or any shape where a
+In and out: numpy arrays or torch tensors with the channels in the *last* axis (`... × 3`), or of any shape where a
 function works per value. `*_srgb` is display-encoded in [0, 1], `*_linear` is light relative to sRGB white. CIELAB is
-D65, 2°. The same code serves both libraries, so that the loss while training and the figure in the report are one
+D65, 2°. The same code serves both libraries, so that the loss in training and the figure in the report share one
 formula.
 
 Sources: IEC 61966-2-1 (sRGB); CIE 15:2004 (CIELAB); Sharma, Wu, Dalal, Color Res. Appl. 30 (2005) 21-30 (CIEDE2000).
@@ -16,14 +16,14 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-ArrayOrTensor = TypeVar("ArrayOrTensor")  # what comes in, an array or a tensor, comes out
+ArrayOrTensor = TypeVar("ArrayOrTensor")  # a function returns the kind that it was given
 LUMINANCE = (0.2126390, 0.7151687, 0.0721923)  # Y of sRGB's linear primaries, D65
 _XYZ_FROM_LINEAR = ((0.4123908, 0.3575843, 0.1804808), LUMINANCE, (0.0193308, 0.1191948, 0.9505322))
 _WHITE_D65 = (0.9504559, 1.0, 1.0890578)  # the matrix's own row sums, so that sRGB white is exactly L* 100, a* b* 0
 
 
 def linear_from_srgb(srgb: ArrayOrTensor) -> ArrayOrTensor:
-    """Light from sRGB code values, per value; odd-symmetric below 0 so that it can be inverted and differentiated."""
+    """Convert sRGB to linear light, per value; odd-symmetric about 0, so it has an inverse and a derivative there."""
     xp = _library(srgb)
     size = xp.abs(srgb)
     # the maximum keeps the unused branch of `where` from giving NaN gradients
@@ -32,7 +32,7 @@ def linear_from_srgb(srgb: ArrayOrTensor) -> ArrayOrTensor:
 
 
 def srgb_from_linear(linear: ArrayOrTensor) -> ArrayOrTensor:
-    """The sRGB code values of light, per value; the exact inverse of `linear_from_srgb`."""
+    """Convert linear light to sRGB, per value; the exact inverse of `linear_from_srgb`."""
     xp = _library(linear)
     size = xp.abs(linear)
     curved = 1.055 * _at_least(xp, size, 0.0031308) ** (1 / 2.4) - 0.055
@@ -40,8 +40,8 @@ def srgb_from_linear(linear: ArrayOrTensor) -> ArrayOrTensor:
 
 
 def clamp_to_unit(values):
-    """Values clipped to [0, 1], with a gradient of 1 at 0 and 1 themselves: `torch.clamp` has had 0 there since 2.14,
-    and a pixel of full black or white would never move again.
+    """Clip values to [0, 1] with a gradient of 1 at 0 and 1 themselves. `torch.clamp` has gradient 0 there since 2.14,
+    and a fully black or white pixel could never change again.
     """
     xp = _library(values)
     if xp is np or values.requires_grad:
@@ -50,24 +50,24 @@ def clamp_to_unit(values):
 
 
 def codes_from_srgb(srgb):
-    """The nearest uint8 code values of sRGB, clipped to [0, 1]; halves go to even codes."""
+    """Round sRGB, clipped to [0, 1], to uint8 code values; halves go to even codes."""
     xp = _library(srgb)
     codes = xp.round(xp.clip(srgb, 0, 1) * 255)
     return codes.astype(np.uint8) if xp is np else codes.byte()
 
 
 def photo_codes_from_srgb(srgb: np.ndarray) -> np.ndarray:
-    """The same with halves up, as photographs have always been rounded here: they keep their bytes."""
+    """Round sRGB, clipped to [0, 1], to the uint8 code values of a photograph; halves go up."""
     return (np.clip(srgb, 0, 1) * 255 + 0.5).astype(np.uint8)
 
 
 def lab_from_srgb(srgb):
-    """CIELAB (D65, L* 0..100) of `... × 3` sRGB values."""
+    """Convert `... × 3` sRGB values to CIELAB (D65, L* 0..100)."""
     return lab_from_linear(linear_from_srgb(srgb))
 
 
 def lab_from_linear(linear):
-    """CIELAB (D65) of `... × 3` linear sRGB; light below 0 follows CIELAB's straight part."""
+    """Convert `... × 3` linear sRGB to CIELAB (D65); light below 0 follows CIELAB's straight part."""
     xp = _library(linear)
     r, g, b = linear[..., 0], linear[..., 1], linear[..., 2]
     f = []
@@ -79,9 +79,9 @@ def lab_from_linear(linear):
 
 
 def ciede2000(lab_a, lab_b):
-    """ΔE00 between two `... × 3` CIELAB arrays; eqs. 2-22 of Sharma et al., same symbols."""
+    """Return ΔE00 between two `... × 3` CIELAB arrays, by eqs. 2-22 and in the symbols of Sharma et al."""
     xp = _library(lab_a)
-    tiny = 1e-12  # inside square roots: a finite gradient (0) where two colors are equal
+    tiny = 1e-12  # inside square roots, so that the gradient is finite (0) where two colors are equal
     L1, a1, b1 = lab_a[..., 0], lab_a[..., 1], lab_a[..., 2]
     L2, a2, b2 = lab_b[..., 0], lab_b[..., 1], lab_b[..., 2]
     C_bar = (xp.sqrt(a1**2 + b1**2 + tiny) + xp.sqrt(a2**2 + b2**2 + tiny)) / 2
@@ -115,13 +115,13 @@ def ciede2000(lab_a, lab_b):
 
 
 def _hue(xp, b, a):
-    """Hue angle in [0, 2π); 0 of gray, where the angle's gradient is NaN in some releases of torch."""
+    """Hue angle in [0, 2π); 0 for gray, where the gradient of arctan2 is NaN in some releases of torch."""
     angle = xp.arctan2(b, a + ((a == 0) & (b == 0)))
     return xp.where(angle < 0, angle + 2 * math.pi, angle)
 
 
 def _library(array: Any) -> Any:
-    """The library that made the array; torch is looked up, never imported, so that photographs need no torch."""
+    """The array's library; torch is looked up and never imported, so that work on photographs needs no torch."""
     return sys.modules["torch"] if type(array).__module__.partition(".")[0] == "torch" else np
 
 
@@ -129,4 +129,4 @@ def _at_least(xp, array, floor: float):
     return np.maximum(array, floor) if xp is np else array.clamp_min(floor)
 
 
-LINEAR_FROM_CODE = linear_from_srgb(np.arange(256) / 255)  # of 8-bit code values
+LINEAR_FROM_CODE = linear_from_srgb(np.arange(256) / 255)  # linear light by 8-bit code value

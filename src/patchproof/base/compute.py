@@ -1,6 +1,6 @@
-"""Where work runs: the device, the processes on this machine, or a cluster; shared by all verbs.
+"""The choice of device, local processes or cluster, shared by all verbs.
 
-In: what somebody asks for. Out: `Compute`, whose fields a verb either uses or refuses by name.
+In: a user's choice. Out: `Compute`, whose fields a verb either uses or refuses by name.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from patchproof.base.errors import Refused
 
 @dataclass(frozen=True)
 class Compute:
-    """Where work runs. Results do not depend on `jobs` where one process works on one thread, too.
+    """The device and processes that work runs on. Results do not depend on `jobs` if one job uses one thread, too.
 
     Attributes:
         device: torch device of scene and networks, "cpu" or "cuda"; photographs are judged on the CPU only.
@@ -25,7 +25,7 @@ class Compute:
     cluster: str | None = None
 
     def without(self, verb: str, *, device: bool = False, cluster: bool = False) -> Compute:
-        """This object, refused where it asks `verb` for a device or cluster that the verb cannot use."""
+        """Return this object; refused if it names a device or cluster that `verb`, by the keywords, cannot use."""
         if device and self.device != "cpu":
             raise Refused(f'device = "cpu" for {verb}', f'"{self.device}"', "leave device out of Compute")
         if cluster and self.cluster is not None:

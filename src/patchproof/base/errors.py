@@ -27,12 +27,12 @@ class Refused(PatchproofError, ValueError):
 
     def __init__(self, expected: str, got: str, do: str):
         self._parts = expected, got, do
-        # what stands in a hostile file may be of any length
+        # a hostile file may put text of any length here
         expected, got, do = (part if len(part) < 2000 else f"{part[:1000]} ..." for part in self._parts)
         super().__init__(" ".join(f"Expected {expected}, got {got}: {do.rstrip('.')}.".split()))
 
     def with_advice(self, advice: str) -> Refused:
-        """A copy of this error with `advice` appended to what to do."""
+        """A copy of this error with `advice` appended to the instruction."""
         expected, got, do = self._parts
         return Refused(expected, got, f"{do.rstrip('.')}{advice}")
 
@@ -46,7 +46,7 @@ class WorkerDied(Refused):
 
 
 class TimeLimitExceeded(PatchproofError):
-    """The work has taken its limit of `seconds` of processor time."""
+    """The work has reached its limit of `seconds` of processor time."""
 
     def __init__(self, seconds: float):
         super().__init__(f"more than {seconds:g} s of processor time")

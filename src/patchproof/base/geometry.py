@@ -2,11 +2,10 @@
 
 Frames. World: millimeters, right-handed, y up, origin at the center of the object's bounding box. Camera: x right, y
 down, z forward. Page and piece: millimeters, x right, y down. Image: pixels, pixel centers at .5. `camera_from_world`
-is 4×4 and `camera_from_world @ [X, 1]` is the point as the camera sees it; names say frame to frame, right to left.
+is 4×4, and `camera_from_world @ [X, 1]` is the point in camera coordinates; such names read from right to left.
 Left out on purpose: lens distortion. It is applied only where a camera file has it.
 
-Source of the homography's meaning and the normalized DLT: Hartley and Zisserman, Multiple View Geometry, 2nd ed., 4.1
-and 8.1.
+Source of homographies and of the normalized DLT: Hartley and Zisserman, Multiple View Geometry, 2nd ed., 4.1 and 8.1.
 """
 
 from __future__ import annotations
@@ -28,18 +27,18 @@ Numbers = TypeVar("Numbers", "np.ndarray", "Tensor")
 
 
 def cross(a: Sequence[Numbers], b: Sequence[Numbers]) -> list[Numbers]:
-    """Cross products of N vectors each, one coordinate at a time: NumPy's own takes four times as long."""
+    """Cross products of N vectors, given and returned by coordinate; `np.cross` takes four times as long."""
     return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 
 
 def dot(a: Sequence[Numbers], b: Sequence[Numbers]) -> Numbers:
-    """Inner products, likewise."""
+    """Inner products of N vectors, given by coordinate."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def orbit(azimuth_deg: ArrayLike, elevation_deg: ArrayLike, forward: ArrayLike, up: ArrayLike = UP) -> np.ndarray:
-    """Unit direction(s) from the object to a camera: azimuth turns about `up` from `forward`, to the right of whoever
-    faces the side when positive. Arrays give N×3.
+    """Unit direction (3,) from the object to a camera, N×3 for arrays of angles. Azimuth turns about `up` from
+    `forward`; positive is to the right of a viewer who faces the side.
     """
     forward, up = _unit(forward), _unit(up)
     right = np.cross(up, forward)  # the viewer who faces the side has this on the right hand
@@ -49,14 +48,13 @@ def orbit(azimuth_deg: ArrayLike, elevation_deg: ArrayLike, forward: ArrayLike, 
 
 
 def look_at(eye_mm: ArrayLike, target_mm: ArrayLike, roll_deg: ArrayLike = 0.0, up: ArrayLike = UP) -> np.ndarray:
-    """`camera_from_world` 4×4 of a camera at `eye_mm` that looks at `target_mm`, turned clockwise by roll.
-
-    Arrays, N×3 and N, give N×4×4.
+    """`camera_from_world` 4×4 of a camera at `eye_mm` that looks at `target_mm`, turned clockwise by `roll_deg`; N×4×4
+    for arrays N×3 and N.
     """
     eye, target, roll = np.asarray(eye_mm, float), np.asarray(target_mm, float), np.radians(roll_deg)[..., None]
     z = _unit(target - eye)
     side = np.cross(z, _unit(up))
-    # straight up or down: any right hand will do, take world x
+    # looking straight up or down any right direction will do: take world x
     side = np.where(np.linalg.norm(side, axis=-1, keepdims=True) < 1e-9, np.cross(z, [0.0, 0.0, 1.0]), side)
     x = _unit(side)
     y = np.cross(z, x)  # down
@@ -67,14 +65,14 @@ def look_at(eye_mm: ArrayLike, target_mm: ArrayLike, roll_deg: ArrayLike = 0.0, 
 
 
 def intrinsics(fov_deg: float, size_px: tuple[int, int]) -> np.ndarray:
-    """Pinhole matrix 3×3 for a picture of (width, height) pixels whose *shorter* side spans `fov_deg`."""
+    """Pinhole matrix 3×3 of a picture of (width, height) pixels whose *shorter* side spans `fov_deg`."""
     width, height = size_px
     focal_px = min(width, height) / 2 / np.tan(np.radians(fov_deg) / 2)
     return np.array([[focal_px, 0, width / 2], [0, focal_px, height / 2], [0, 0, 1.0]])
 
 
 def project(matrix_px, camera_from_world, points_mm) -> np.ndarray:
-    """Pixels N×2 of world points N×3; points behind the camera give NaN."""
+    """Project world points N×3 to pixels N×2; points behind the camera give NaN."""
     points = np.asarray(points_mm, float)
     camera = transform_points(camera_from_world, points)
     camera = np.where(camera[:, 2:] > 0, camera, np.nan)
@@ -82,26 +80,26 @@ def project(matrix_px, camera_from_world, points_mm) -> np.ndarray:
     return image[:, :2] / image[:, 2:]
 
 
-def transform_points(frame, points_mm) -> np.ndarray:
-    """Points N×3 by a pose 4×4."""
-    return np.asarray(points_mm, float) @ frame[:3, :3].T + frame[:3, 3]
+def transform_points(matrix, points_mm) -> np.ndarray:
+    """Transform points N×3 by a rigid or affine matrix 4×4."""
+    return np.asarray(points_mm, float) @ matrix[:3, :3].T + matrix[:3, 3]
 
 
 def camera_centers(poses) -> np.ndarray:
-    """Where cameras of `camera_from_world` N×4×4 stand in the world, N×3."""
+    """World positions N×3 of cameras with `camera_from_world` N×4×4."""
     return -(poses[:, :3, :3].transpose(0, 2, 1) @ poses[:, :3, 3:])[..., 0]
 
 
 def plane_homography(matrix_px, camera_from_world, world_from_plane) -> np.ndarray:
-    """3×3 from plane millimeters (x, y, 1) to pixels; `world_from_plane` 4×4 has the plane's x, y axes and origin. Of
-    poses N×4×4, N×3×3.
+    """Homography 3×3 from plane millimeters to pixels; `world_from_plane` 4×4 has the plane's x, y axes and origin. For
+    poses N×4×4 it is N×3×3.
     """
     pose = camera_from_world @ world_from_plane
     return normalize_homography(matrix_px @ pose[..., :3, [0, 1, 3]])
 
 
 def scaling_about(middle, scale: float) -> np.ndarray:
-    """(D+1)×(D+1): everything `scale` times as far from `middle` (D values)."""
+    """Matrix (D+1)×(D+1) that scales about `middle` (D values)."""
     middle = np.asarray(middle, float)
     matrix = np.eye(len(middle) + 1)
     matrix[:-1, :-1] *= scale
@@ -110,7 +108,7 @@ def scaling_about(middle, scale: float) -> np.ndarray:
 
 
 def normalize_homography(homography) -> np.ndarray:
-    """The same homography (or each of N×3×3) with its last entry 1, or with unit norm where that entry vanishes."""
+    """Divide a homography, or each of N×3×3, by its last entry, or by its norm where that entry vanishes."""
     homography = np.asarray(homography, float)
     last, largest = homography[..., 2, 2], np.abs(homography).max((-2, -1))
     scale = np.where(np.abs(last) > 1e-12 * largest, last, np.linalg.norm(homography, axis=(-2, -1)))
@@ -118,14 +116,14 @@ def normalize_homography(homography) -> np.ndarray:
 
 
 def apply_homography(homography, points) -> np.ndarray:
-    """Points N×2 carried by the homography."""
+    """Map points N×2 by a homography."""
     points = np.asarray(points, float)
     mapped = points @ homography[:, :2].T + homography[:, 2]
     return mapped[:, :2] / mapped[:, 2:]
 
 
 def fit_homography(source, target) -> np.ndarray:
-    """Least-squares homography source → target from N ≥ 4 point pairs (normalized DLT); no outliers are expected."""
+    """Fit a homography source → target to N ≥ 4 point pairs by least squares (normalized DLT), without outliers."""
     source, target = np.asarray(source, float), np.asarray(target, float)
     to_a, to_b = _conditioner(source), _conditioner(target)
     a, b = apply_homography(to_a, source), apply_homography(to_b, target)
@@ -139,24 +137,24 @@ def fit_homography(source, target) -> np.ndarray:
 def local_scale(homography, point) -> tuple[float, float]:
     """(px_per_mm, tilt_deg) of a page→image homography at a page point, from the singular values of its derivative.
 
-    px_per_mm is their geometric mean; tilt is arccos of their ratio: exact for a far camera, approximate near by.
+    px_per_mm is their geometric mean; tilt is arccos of their ratio: exact for a distant camera, else approximate.
     """
     px_per_mm, tilt_deg = local_scales(np.asarray(homography)[None], point)[0].tolist()
     return px_per_mm, tilt_deg
 
 
 def local_scales(homographies: np.ndarray, point) -> np.ndarray:
-    """N×2: `local_scale` of homographies N×3×3."""
+    """`local_scale` of homographies N×3×3, as N×2."""
     x, y = point
-    at = homographies @ np.array([x, y, 1.0])
-    pixel, w = at[:, :2] / at[:, 2:], at[:, 2, None, None]
+    image = homographies @ np.array([x, y, 1.0])
+    pixel, w = image[:, :2] / image[:, 2:], image[:, 2, None, None]
     jacobians = (homographies[:, :2, :2] - pixel[:, :, None] * homographies[:, None, 2, :2]) / w
     large, small = np.linalg.svd(jacobians, compute_uv=False).T
     return np.stack([np.sqrt(large * small), np.degrees(np.arccos(np.clip(small / large, 0, 1)))], 1)
 
 
 def plane_pose(homography, matrix_px) -> np.ndarray:
-    """`camera_from_plane` 4×4 of a page→image homography and a pinhole matrix, with the page in front of the camera."""
+    """`camera_from_plane` 4×4 from a page→image homography and a pinhole matrix, with the page in front."""
     columns = np.linalg.inv(matrix_px) @ homography
     columns /= np.linalg.norm(columns[:, :2], axis=0).mean()
     if columns[2, 2] < 0:
@@ -169,9 +167,9 @@ def plane_pose(homography, matrix_px) -> np.ndarray:
 
 
 def view_angles(camera_from_plane, point) -> tuple[float, float, float]:
-    """(azimuth_deg, elevation_deg, distance_mm) of the camera as a page point sees it.
+    """(azimuth_deg, elevation_deg, distance_mm) of the camera, seen from a page point.
 
-    Azimuth is positive when the camera stands to the right of the page's normal, elevation when it stands above.
+    Azimuth is positive where the camera is to the right of the page's normal, elevation where it is above.
     """
     rotation, translation = camera_from_plane[:3, :3], camera_from_plane[:3, 3]
     camera_in_plane = -rotation.T @ translation
@@ -188,13 +186,13 @@ def rect_corners(rect) -> np.ndarray:
 
 
 def rotated_extent(size, degrees: float) -> np.ndarray:
-    """Width and height of what encloses a turned rectangle."""
+    """Width and height of the bounding box of a rectangle that is rotated by `degrees`."""
     c, s = abs(np.cos(np.radians(degrees))), abs(np.sin(np.radians(degrees)))
     return np.array([c * size[0] + s * size[1], s * size[0] + c * size[1]])
 
 
 def rect_border(rect, steps: int) -> np.ndarray:
-    """Points N×2 along the border of [x, y, width, height] from its top-left corner, `steps` to a side."""
+    """Points N×2 along the border of [x, y, width, height] from its top-left corner, `steps` on each side."""
     corners, shares = rect_corners(rect), np.linspace(0, 1, steps, endpoint=False)[:, None]
     return np.concatenate([a + shares * (b - a) for a, b in zip(corners, np.roll(corners, -1, 0), strict=True)])
 

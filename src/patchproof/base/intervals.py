@@ -1,10 +1,10 @@
-"""Intervals and promises: what a count of recognized images allows one to claim.
+"""Confidence intervals of rates, of means, and of differences between rates.
 
-In: counts and figures. Out: intervals and `Estimate`s for tables; all at 95 % unless told otherwise.
-A rate from n images gets a Wilson interval; what photographs of new sessions may show is said by `sessions`.
-Differences on the same conditions are paired (Newcombe 1998b, method 10); on different ones Newcombe 1998a, method 10,
-applies.
-Left out on purpose: corrections for looking more than once. `optimizer.promise` looks so that none is needed.
+In: counts and figures. Out: intervals and `Estimate`s for tables, at 95 % unless another confidence is passed.
+A rate from n images gets Wilson's interval; `sessions` predicts what photographs of new sessions will show.
+Differences on the same conditions are paired (Newcombe 1998b, method 10); those on different conditions follow Newcombe
+1998a, method 10.
+Left out on purpose: corrections for repeated looks at the data. `optimizer.promise` looks in a way that needs none.
 
 Sources: Wilson, JASA 22 (1927); Newcombe, Statistics in Medicine 17 (1998) 873-890 (independent) and 2635-2650
 (paired).
@@ -29,7 +29,7 @@ _TAIL = (1 - CONFIDENCE) / 2
 
 @dataclass(frozen=True)
 class Estimate:
-    """A figure with its 95 % interval and the number of trials behind it; in a CSV four columns."""
+    """A figure, its 95 % interval and the number of trials it is based on: four columns of a CSV file."""
 
     value: float
     low: float
@@ -38,12 +38,12 @@ class Estimate:
 
 
 def rate(hits: Sequence[bool]) -> Estimate | None:
-    """The share of hits with Wilson's interval; None of nothing."""
+    """Return the share of `hits` that are true, with Wilson's interval; None if `hits` is empty."""
     return Estimate(sum(hits) / len(hits), *wilson(sum(hits), len(hits)), len(hits)) if hits else None
 
 
 def estimate_difference(a: list[bool], b: list[bool]) -> Estimate | None:
-    """Rate of `a` minus rate of `b` on the same conditions with Newcombe's paired interval; None of nothing."""
+    """Return rate(a) - rate(b) on the same conditions, with Newcombe's paired interval; None if `a` is empty."""
     if not a:
         return None
     value, (low, high) = paired_difference(a, b)
@@ -51,7 +51,7 @@ def estimate_difference(a: list[bool], b: list[bool]) -> Estimate | None:
 
 
 def student_mean(values: Sequence[float] | np.ndarray) -> Estimate:
-    """The mean of two values or more with Student's interval."""
+    """Return the mean of at least two values, with Student's interval."""
     from scipy.stats import t
 
     n, value = len(values), statistics.fmean(values)
@@ -60,19 +60,19 @@ def student_mean(values: Sequence[float] | np.ndarray) -> Estimate:
 
 
 def wilson(successes: int, n: int, confidence: float = CONFIDENCE) -> tuple[float, float]:
-    """Wilson's interval of a rate; (0, 1) when nothing was seen."""
+    """Return Wilson's interval (low, high) of a rate; (0, 1) if n is 0."""
     if n == 0:
         return 0.0, 1.0
     z = _z(confidence)
     rate = successes / n
     center = (rate + z * z / (2 * n)) / (1 + z * z / n)
     half = z * math.sqrt(rate * (1 - rate) / n + z * z / (4 * n * n)) / (1 + z * z / n)
-    # at 0 and n the formula gives exactly 0 and 1 but for rounding
+    # at 0 and n successes the formula gives 0 and 1 up to rounding
     return (0.0 if successes == 0 else center - half), (1.0 if successes == n else center + half)
 
 
 def paired_difference(a: list[bool], b: list[bool]) -> tuple[float, tuple[float, float]]:
-    """Rate of `a` minus rate of `b` on the same n ≥ 1 conditions, with Newcombe's paired interval (method 10)."""
+    """Return rate(a) - rate(b) on the same n ≥ 1 conditions, and Newcombe's paired interval (method 10)."""
     n = len(a)
     if n == 0 or n != len(b):
         raise ValueError(f"expected two equally long lists, got {n} and {len(b)} results")
@@ -93,7 +93,7 @@ def paired_difference(a: list[bool], b: list[bool]) -> tuple[float, tuple[float,
 
 
 def independent_difference(successes_a: int, n_a: int, successes_b: int, n_b: int) -> tuple[float, tuple[float, float]]:
-    """Rate of a minus rate of b on different images, with Newcombe's interval of two Wilson scores."""
+    """Return rate a - rate b on different images, and Newcombe's interval from two Wilson scores."""
     rates = successes_a / max(n_a, 1), successes_b / max(n_b, 1)
     return rates_difference(rates[0], wilson(successes_a, n_a), rates[1], wilson(successes_b, n_b))
 
@@ -101,7 +101,7 @@ def independent_difference(successes_a: int, n_a: int, successes_b: int, n_b: in
 def rates_difference(
     rate_a: float, interval_a: tuple[float, float], rate_b: float, interval_b: tuple[float, float]
 ) -> tuple[float, tuple[float, float]]:
-    """Rate a minus rate b on different images, with the interval that theirs make (Newcombe's method 10)."""
+    """Return rate_a - rate_b on different images, and its interval from the two rates' own (Newcombe's method 10)."""
     (low_a, high_a), (low_b, high_b) = interval_a, interval_b
     difference = rate_a - rate_b
     low = difference - math.hypot(rate_a - low_a, high_b - rate_b)
@@ -109,14 +109,14 @@ def rates_difference(
 
 
 def resampled_means(values: np.ndarray, draws: int) -> np.ndarray:
-    """Means (`draws` × ...) of bootstrap resamples of the n × ... values, the same ones each time."""
+    """Return the means (`draws` × ...) of bootstrap resamples of n × ... values, drawn with a fixed seed."""
     import numpy as np
 
     return values[np.random.default_rng(0).integers(0, len(values), (draws, len(values)))].mean(1)
 
 
 def mcnemar_p(a: list[bool], b: list[bool]) -> float:
-    """Exact two-sided McNemar p-value that the pairs `a`, `b` have the same rate (1 when no pair differs)."""
+    """Return the exact two-sided McNemar p-value of equal rates in the pairs (a, b); 1 if no pair differs."""
     from scipy.stats import binomtest
 
     only_a = sum(x and not y for x, y in zip(a, b, strict=True))

@@ -9,10 +9,9 @@ from patchproof.base.errors import Refused
 
 
 def packaged_path(folder: Literal["calibration", "print_templates"], *parts: str) -> Path:
-    """A file of the data that travels with the program: inside the installed package, else in the checkout."""
+    """Path of a data file: inside the installed package, or at the top of the checkout in an editable install."""
     package = Path(__file__).resolve().parents[1]
-    # an editable install keeps these folders at the top of the checkout, two levels up
     roots = [root for root in (package / folder, package.parents[1] / folder) if root.is_dir()]
     if not roots:
-        raise Refused(f"the folder {folder} beside the program", "none", "install patchproof again")
+        raise Refused(f"the folder {folder} in {package}", "no such folder", "install patchproof again")
     return roots[0].joinpath(*parts)

@@ -1,7 +1,7 @@
-"""How long work says how far it is.
+"""Progress callbacks of long work.
 
-In: nothing. Out: the type of the `progress` parameter that every long public function takes, and its default, which is
-silent. Work below a public function is told to `advance` within the stage that its caller named.
+In: nothing. Out: the type of the `progress` parameter of every long public function, and its default, which reports
+nothing. Functions below a public one take an `advance` callback, for the stage that their caller named.
 """
 
 from __future__ import annotations

@@ -1,14 +1,14 @@
-"""Sessions: photographs that share a print, a lamp, a camera and a place are alike, and count for less than their
-number.
+"""Recognition rates from photographs taken in sessions, and predictions for new sessions.
 
-In: how many photographs of each of some sessions were recognized. Out: a `RatePosterior`, everything that these counts say of
-the rate and of how much sessions differ (the correlation of two photographs of one session); from it the rate's
-interval, the counts that photographs of new sessions will show, and what rates such counts allow.
+Photographs of one session share a print, a lamp, a camera and a place, so they are correlated and carry less evidence
+than as many independent ones. In: how many photographs of each session were recognized. Out: a `RatePosterior` of the
+rate and of the correlation of two photographs of a session; from it the rate's interval, the counts that photographs of
+new sessions will show, and the rates that are compatible with such counts.
 
-A session's own rate is Beta-distributed about the rate of all, so that its count is beta-binomial (Williams, Biometrics
-31 (1975) 949-952, with the intraclass correlation ρ = 1 / (α + β + 1)). Both are uncertain: predictions are means over
-a grid of the posterior, with Jeffreys' prior of the rate and a flat one of √ρ. Sessions of one photograph each say
-nothing of ρ, which then is 0, as if every photograph were taken on its own.
+A session's own rate is Beta-distributed about the overall rate, so that its count is beta-binomial (Williams,
+Biometrics 31 (1975) 949-952, with the intraclass correlation ρ = 1 / (α + β + 1)). Both are uncertain: predictions are
+means over a grid of the posterior, with Jeffreys' prior of the rate and a flat prior of √ρ. Sessions of one photograph
+each tell nothing about ρ, which then is 0, as if every photograph were independent.
 Left out on purpose: a rate that depends on the pose, which all sessions share.
 """
 
@@ -25,9 +25,9 @@ from patchproof.base.intervals import CONFIDENCE, paired_difference, student_mea
 
 TAIL = (1 - CONFIDENCE) / 2
 _RATES, _CORRELATIONS = 240, 36
-_MOST_CORRELATION = 0.95
-_NEGLIGIBLE = 1e-6  # of the heaviest point of the posterior
-_INDEPENDENT = 1e-7  # a correlation that is none
+_MAX_CORRELATION = 0.95
+_NEGLIGIBLE = 1e-6  # weight, as a share of the posterior's heaviest point
+_INDEPENDENT = 1e-7  # the correlation of independent photographs, which must not be 0 exactly
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,8 +39,8 @@ class RatePosterior:
     weights: np.ndarray
 
     @property
-    def rate(self) -> tuple[float, float]:
-        """The rate's 95 % interval, over sessions; it reaches 0 or 1 where the grid ends."""
+    def rate_interval(self) -> tuple[float, float]:
+        """The rate's 95 % interval, over sessions; an end beyond the grid is 0 or 1."""
         low, high = (_quantile(self.rates, self.weights, share) for share in (TAIL, 1 - TAIL))
         first, last = _grid()[0][[0, -1]]
         return (low if low > first else 0.0), (high if high < last else 1.0)
@@ -52,101 +52,101 @@ class RatePosterior:
         return middle, (low, high)
 
     def chances(self, photos: Sequence[int]) -> np.ndarray:
-        """The chance of every count from 0 to all, recognized of so many photographs in each of some new sessions."""
+        """The chance of each count 0 to n of recognized photographs in new sessions of `photos` photographs each."""
         return _chances_of(self, tuple(photos))
 
-    def counts(self, photos: Sequence[int]) -> tuple[int, int]:
-        """The 95 % interval of those counts."""
-        below = np.cumsum(self.chances(photos))
-        return int(np.searchsorted(below, TAIL)), int(np.searchsorted(below, 1 - TAIL))
+    def count_interval(self, photos: Sequence[int]) -> tuple[int, int]:
+        """The 95 % interval of the count of recognized photographs in new sessions of `photos` photographs each."""
+        cumulative = np.cumsum(self.chances(photos))
+        return int(np.searchsorted(cumulative, TAIL)), int(np.searchsorted(cumulative, 1 - TAIL))
 
     def least_rate(self, recognized: int, photos: Sequence[int], tail: float) -> float:
-        """The smallest rate at which so many are recognized, or more, with a chance of `tail`; of what was seen itself
-        half counts (mid-p). Sessions differ as much as the posterior says.
+        """The smallest rate at which `recognized` photographs or more are recognized with a chance of `tail`; the
+        observed count itself counts half (mid-p). Sessions differ as much as the posterior says.
         """
         return _least_rates(*self._marginal(), tuple(sorted(photos)), tail)[recognized]
 
     def most_rate(self, recognized: int, photos: Sequence[int], tail: float) -> float:
-        """The largest rate at which so many are recognized, or fewer, with a chance of `tail`."""
+        """The largest rate at which `recognized` photographs or fewer are recognized with a chance of `tail`."""
         return 1 - self.least_rate(sum(photos) - recognized, photos, tail)
 
     def _marginal(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """The correlations without the rates: values and weights."""
-        values, which = np.unique(self.correlations, return_inverse=True)
-        return tuple(values), tuple(np.bincount(which, self.weights))
+        """The marginal posterior of the correlation: values and weights."""
+        values, inverse = np.unique(self.correlations, return_inverse=True)
+        return tuple(values), tuple(np.bincount(inverse, self.weights))
 
 
 def rate_posterior(recognized: Sequence[int], photos: Sequence[int]) -> RatePosterior:
-    """What the counts of some sessions say; of none, what was believed before."""
-    return _spread_of(tuple(map(int, recognized)), tuple(map(int, photos)))
+    """The posterior given `recognized` of `photos` photographs in each session; the prior for no sessions."""
+    return _rate_posterior(tuple(map(int, recognized)), tuple(map(int, photos)))
 
 
 @lru_cache(maxsize=32)
-def _spread_of(recognized: tuple[int, ...], photos: tuple[int, ...]) -> RatePosterior:
+def _rate_posterior(recognized: tuple[int, ...], photos: tuple[int, ...]) -> RatePosterior:
     from scipy.special import betaln
 
     rates, correlations = _grid() if max(photos, default=0) > 1 else (_grid()[0], np.array([_INDEPENDENT]))
     rate, correlation = (part.ravel() for part in np.meshgrid(rates, correlations, indexing="ij"))
     alpha, beta = _shapes(rate, correlation)
-    log, before = np.zeros(len(rate)), betaln(alpha, beta)
-    for (k, n), often in Counter(zip(recognized, photos, strict=True)).items():
-        log += often * (betaln(alpha + k, beta + n - k) - before)
+    log, prior_beta = np.zeros(len(rate)), betaln(alpha, beta)
+    for (k, n), sessions in Counter(zip(recognized, photos, strict=True)).items():
+        log += sessions * (betaln(alpha + k, beta + n - k) - prior_beta)
     weights = np.exp(log - log.max())
-    kept = weights > _NEGLIGIBLE
-    return RatePosterior(rate[kept], correlation[kept], weights[kept] / weights[kept].sum())
+    heavy = weights > _NEGLIGIBLE
+    return RatePosterior(rate[heavy], correlation[heavy], weights[heavy] / weights[heavy].sum())
 
 
 @lru_cache(maxsize=32)
-def _chances_of(spread: RatePosterior, photos: tuple[int, ...]) -> np.ndarray:
-    """`Spread.chances`, once for all counts that are judged by it."""
-    chances = spread.weights @ _chances(spread.rates, spread.correlations, photos)
+def _chances_of(posterior: RatePosterior, photos: tuple[int, ...]) -> np.ndarray:
+    """`RatePosterior.chances`, cached because many counts are judged by the same chances."""
+    chances = posterior.weights @ _chances(posterior.rates, posterior.correlations, photos)
     chances.flags.writeable = False
     return chances
 
 
 def count_by_session(
-    hits: Sequence[bool] | np.ndarray, each: int, places: Sequence[int] = ()
+    hits: Sequence[bool] | np.ndarray, per_session: int, places: Sequence[int] = ()
 ) -> tuple[list[int], list[int]]:
-    """(recognized, photographs) of sessions of `each` photographs in a row; the last may have fewer. Sessions whose
-    `places`, if given, are the same count as one, since the place is most of what sessions differ by.
+    """(recognized, photographs) of sessions of `per_session` successive photographs; the last may have fewer. Sessions
+    with the same number in `places` count as one, because sessions differ mostly by their place.
     """
-    parts = _parts(hits, each)
-    together: dict[int, list[bool]] = {}
-    for place, part in zip(places or range(len(parts)), parts, strict=True):
-        together.setdefault(place, []).extend(map(bool, part))
-    return list(map(sum, together.values())), list(map(len, together.values()))
+    sessions = _split(hits, per_session)
+    by_place: dict[int, list[bool]] = {}
+    for place, session in zip(places or range(len(sessions)), sessions, strict=True):
+        by_place.setdefault(place, []).extend(map(bool, session))
+    return list(map(sum, by_place.values())), list(map(len, by_place.values()))
 
 
-def _parts(values: Sequence[bool] | np.ndarray, each: int) -> list[Sequence[bool] | np.ndarray]:
-    return [values[first : first + each] for first in range(0, len(values), each)]
+def _split(values: Sequence[bool] | np.ndarray, per_session: int) -> list[Sequence[bool] | np.ndarray]:
+    return [values[first : first + per_session] for first in range(0, len(values), per_session)]
 
 
 def session_difference(
-    a: Sequence[bool] | np.ndarray, b: Sequence[bool] | np.ndarray, each: int
+    a: Sequence[bool] | np.ndarray, b: Sequence[bool] | np.ndarray, per_session: int
 ) -> tuple[float, tuple[float, float]]:
-    """Rate of `a` minus rate of `b` on the same conditions, sessions of `each` in a row; the wider of Newcombe's paired
-    interval over conditions and Student's over sessions, which is none where all sessions agree.
+    """Return rate(a) - rate(b) on the same conditions in sessions of `per_session` successive ones, and the wider of
+    two intervals: Newcombe's paired one over conditions, and Student's over sessions (of width 0 if all agree).
     """
     difference, (low, high) = paired_difference(list(map(bool, a)), list(map(bool, b)))
-    parts = zip(_parts(a, each), _parts(b, each), strict=True)
-    of_sessions = [float(np.mean(ours) - np.mean(theirs)) for ours, theirs in parts]
-    if each > 1 and len(of_sessions) > 1:
-        over = student_mean(of_sessions)
-        half = over.high - over.value
+    pairs = zip(_split(a, per_session), _split(b, per_session), strict=True)
+    differences = [float(np.mean(part_a) - np.mean(part_b)) for part_a, part_b in pairs]
+    if per_session > 1 and len(differences) > 1:
+        mean = student_mean(differences)
+        half = mean.high - mean.value
         low, high = max(-1.0, min(low, difference - half)), min(1.0, max(high, difference + half))
     return difference, (low, high)
 
 
 def split_evenly(photos: int, sessions: int) -> tuple[int, ...]:
-    """So many photographs spread over so many sessions, as evenly as they go."""
+    """Distribute photographs over sessions as evenly as possible: the number in each session."""
     return tuple(photos // sessions + (i < photos % sessions) for i in range(sessions))
 
 
 def _grid() -> tuple[np.ndarray, np.ndarray]:
-    """Rates evenly in the angle in which Jeffreys' prior is flat; correlations evenly in their root."""
+    """Rates at even steps of the angle in which Jeffreys' prior is flat, and correlations at even steps of √ρ."""
     angles = (np.arange(_RATES) + 0.5) / _RATES * np.pi / 2
     roots = (np.arange(_CORRELATIONS) + 0.5) / _CORRELATIONS
-    return np.sin(angles) ** 2, _MOST_CORRELATION * roots**2
+    return np.sin(angles) ** 2, _MAX_CORRELATION * roots**2
 
 
 def _shapes(rate: np.ndarray, correlation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -155,21 +155,19 @@ def _shapes(rate: np.ndarray, correlation: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def _chances(rates: np.ndarray, correlations: np.ndarray, photos: Sequence[int]) -> np.ndarray:
-    """P×(n + 1): the chance of every count at P points. Sessions multiply as Fourier transforms."""
+    """The chances P×(n + 1) of every count at P points; the sum over sessions is a product of Fourier transforms."""
     from scipy.fft import next_fast_len
 
     alpha, beta = _shapes(rates, correlations)
     counts, transform = sum(photos) + 1, np.ones(1)
-    length = next_fast_len(counts, real=True)  # of 151, a prime, a transform takes five times as long as of 160
-    for n, often in Counter(photos).items():
-        transform = transform * np.fft.rfft(_beta_binomial(n, alpha, beta), length) ** often
+    length = next_fast_len(counts, real=True)  # a transform of 151, a prime, takes five times as long as one of 160
+    for n, sessions in Counter(photos).items():
+        transform = transform * np.fft.rfft(_beta_binomial(n, alpha, beta), length) ** sessions
     return np.clip(np.fft.irfft(transform, length)[:, :counts], 0, 1)
 
 
 def _beta_binomial(n: int, alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:
-    """P×(n + 1): the chances of 0 to n, from the ratio of each to the one before; SciPy's take 17 times as long at
-    n = 100.
-    """
+    """The chances P×(n + 1) of 0 to n by the ratios of successive ones; SciPy takes 17 times as long at n = 100."""
     k, log = np.arange(n), np.zeros((len(alpha), n + 1))
     ratios = (n - k) / (k + 1) * (alpha[:, None] + k) / (beta[:, None] + n - 1 - k)
     np.cumsum(np.log(ratios), axis=1, out=log[:, 1:])
@@ -181,13 +179,13 @@ def _beta_binomial(n: int, alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:
 def _least_rates(
     correlations: tuple[float, ...], weights: tuple[float, ...], photos: tuple[int, ...], tail: float
 ) -> tuple[float, ...]:
-    """`Spread.least_rate` of every count."""
+    """`RatePosterior.least_rate` of every count."""
     rates = _grid()[0]
     rate, correlation = (part.ravel() for part in np.meshgrid(rates, correlations, indexing="ij"))
     chances = _chances(rate, correlation, photos).reshape(len(rates), len(correlations), -1)
     chances = np.einsum("rcn,c->rn", chances, np.array(weights))
-    as_many = chances[:, ::-1].cumsum(1)[:, ::-1] - chances / 2
-    return tuple(float(np.interp(tail, more, rates, left=0.0, right=1.0)) for more in as_many.T)
+    at_least = chances[:, ::-1].cumsum(1)[:, ::-1] - chances / 2
+    return tuple(float(np.interp(tail, tails, rates, left=0.0, right=1.0)) for tails in at_least.T)
 
 
 def _quantile(values: np.ndarray, weights: np.ndarray, share: float) -> float:

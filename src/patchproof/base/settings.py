@@ -1,7 +1,7 @@
-"""The settings of a scene file: what is photographed, with what on it, under which ranges, and how it is optimized.
+"""Settings of a scene file: the object, its patch, the ranges of all conditions, and the optimization.
 
-In: a TOML file whose keys are the fields below. Out: `SceneSettings`, frozen and checked. Every default has its reason
-beside it where one was measured.
+In: a TOML file whose keys are the fields below. Out: `SceneSettings`, frozen and checked. Where a default was measured,
+its reason stands beside it.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ from patchproof.base.validation import (
 
 
 class ObjectSettings(StrictModel):
-    """The thing that the patch hangs on: a mesh (a file or `primitive:NAME`), photographs of it with a blank sheet on
+    """The object that carries the patch: a mesh (a file or `primitive:NAME`), photographs of it with a blank sheet on
     it, or a folder of labeled images.
     """
 
     mesh: str | None = None  # a file (OBJ, GLB, glTF, PLY, STL) or primitive:NAME
     length_mm: Positive | None = None  # a mesh's longest extent
-    up: Literal["y", "z"] = "z"  # the mesh file's axis that points up
+    up: Literal["y", "z"] = "z"  # the axis of the mesh file that points up
     photos: str | None = None  # a folder of photographs of the object with a blank sheet on it
     sheet: str | None = None  # the blank sheet's manifest
     images: str | None = None  # a folder of labeled images
@@ -47,51 +47,52 @@ class ObjectSettings(StrictModel):
     @model_validator(mode="after")
     def _one_kind(self):
         pairs = {"mesh": "length_mm", "photos": "sheet", "images": "labels"}
-        given = [name for name in pairs if getattr(self, name) is not None]
-        if len(given) != 1:
+        kinds = [name for name in pairs if getattr(self, name) is not None]
+        if len(kinds) != 1:
             raise ValueError("takes one of mesh, photos or images")
-        for name, other in pairs.items():
-            if (name in given) != (getattr(self, other) is not None):
-                raise ValueError(f"takes {other} together with {name}")
+        for name, companion in pairs.items():
+            if (name in kinds) != (getattr(self, companion) is not None):
+                raise ValueError(f"takes {companion} together with {name}")
         return self
 
 
 class SearchSettings(StrictModel):
-    """Where and how the piece may lie with `place = "auto"`; it never overhangs the object by more than 2 %."""
+    """Where the piece may be placed with `place = "auto"`; it never overhangs the object by more than 2 %."""
 
-    upright: bool = False  # never turned in its plane
-    keep_off: tuple[str, ...] = ()  # names of materials that the piece may not lie on
-    keep_off_faces: str | None = None  # a text file of numbers of the faces that the piece may not lie on
+    upright: bool = False  # never rotate the piece in its plane
+    keep_off: tuple[str, ...] = ()  # names of materials that the piece may not cover
+    keep_off_faces: str | None = None  # a text file with the numbers of the faces that the piece may not cover
     gap_mm: Positive | None = None  # largest distance from piece to surface; 15 % of the piece's shorter edge
 
 
 class PatchSettings(StrictModel):
-    """What is optimized. A patch has a size and a place; `offset_mm` is [right, up] as one faces the side. A texture
-    covers the object's own UV map or vertices, `masked` only what mask, materials or faces name.
+    """The design to optimize. A patch has a size and a place; `offset_mm` is [right, up] for a viewer who faces the
+    side. A texture covers the object's own UV map or vertices, `masked` only the part that mask, materials or faces
+    select.
     """
 
-    width_mm: Positive | None = None  # of the piece that is cut out; the design fills it, but for its markers
-    height_mm: Positive | None = None  # likewise
+    width_mm: Positive | None = None  # of the piece that is cut out; the design fills it, except for its markers
+    height_mm: Positive | None = None  # of the piece that is cut out
     kind: Literal["patch", "texture", "masked"] = "patch"  # a printed piece, or the object's own texture
-    # As side, offset_mm, at_mm and spin_deg say, or the one on the object where drafts of the design reach most.
+    # "given": set by side, offset_mm, at_mm and spin_deg; "auto": the place where drafts of the design do best.
     place: Literal["given", "auto"] = "given"
     search: SearchSettings = SearchSettings()
-    side: Side = "+x"  # of the object, that the patch hangs on; with place = "auto" the one that azimuth 0 faces
-    offset_mm: tuple[Finite, Finite] = (0.0, 0.0)  # [right, up] from the side's middle as one faces it
+    side: Side = "+x"  # the object's side that carries the patch; with place = "auto" the one that azimuth 0 faces
+    offset_mm: tuple[Finite, Finite] = (0.0, 0.0)  # [right, up] from the side's middle for a viewer who faces it
     at_mm: tuple[Finite, Finite, Finite] | None = None  # a point in the scene instead of a side's middle
-    spin_deg: Finite = 0.0  # turn of the patch in its plane, clockwise
-    bend: bool = False  # follow the surface instead of standing off it as a flat card
+    spin_deg: Finite = 0.0  # rotation of the patch in its plane, clockwise
+    bend: bool = False  # bend the patch with the surface; otherwise it is a flat card
     mask: str | None = None  # an image over the UV map, white where the texture may change
     materials: tuple[str, ...] = ()  # names of the mesh's materials whose texture may change
-    faces: str | None = None  # a text file of numbers of the faces whose texture may change
-    start: Literal["original", "gray"] = "original"  # what a texture is optimized from
+    faces: str | None = None  # a text file with the numbers of the faces whose texture may change
+    start: Literal["original", "gray"] = "original"  # the texture from which the optimization starts
     epsilon: Annotated[Share, Field(gt=0)] | None = None  # largest change of a texel from its start, in sRGB
 
     @property
     def size_mm(self) -> tuple[float, float]:
-        """Width and height of the piece; a ValueError of textures and of patches as large as a blank's."""
+        """Width and height of the piece; raises a ValueError if the settings have none (textures, blank sheets)."""
         if self.width_mm is None or self.height_mm is None:
-            raise ValueError("no size of the patch is given")
+            raise ValueError("patch.width_mm and patch.height_mm are not set")
         return self.width_mm, self.height_mm
 
     @model_validator(mode="after")
@@ -104,7 +105,7 @@ class PatchSettings(StrictModel):
         if self.kind != "masked" and masks:
             raise ValueError(f'takes {masks[0]} with kind = "masked" only')
         if self.kind == "patch" and self.epsilon is not None:
-            raise ValueError("takes epsilon with textures only: a patch starts from nothing")
+            raise ValueError("takes epsilon with textures only: a patch has no original to stay near")
         if self.kind != "patch" and self.bend:
             raise ValueError("takes bend with patches only")
         return self
@@ -128,71 +129,71 @@ class SheetSettings(StrictModel):
 
 
 class TargetSettings(StrictModel):
-    """What the classifiers should see, and which classifiers."""
+    """The label to recognize, and the networks."""
 
     label: str | int  # an index, or a name in the first network's list
-    models: Annotated[tuple[str, ...], Field(min_length=1)]  # trained against together; the first one decides
+    models: Annotated[tuple[str, ...], Field(min_length=1)]  # optimized for together; the first one is judged
     accept: tuple[str | int, ...] = ()  # labels that count as recognized, too
     goal: Goal = Goal.assist  # raise the label's rate, or lower it
-    least_score: Share | None = None  # from which on a detector's box counts; by default its own, or 0.5
+    least_score: Share | None = None  # smallest score of a detector's box that counts; by default its own, or 0.5
 
 
 class ViewSettings(StrictModel):
-    """Where the camera may be."""
+    """Ranges of the camera's position and direction."""
 
-    look_at: Literal["object", "patch"] = "object"  # whose middle the camera looks at
-    look_at_jitter: Share = 0.05  # how far it looks past that, as a share of the object's length
-    front: Literal["patch"] | Side = "patch"  # what azimuth 0 faces, of cameras and lights: the patch or a side
+    look_at: Literal["object", "patch"] = "object"  # the camera looks at the middle of this
+    look_at_jitter: Share = 0.05  # largest miss of that middle, as a share of the object's length
+    front: Literal["patch"] | Side = "patch"  # the patch or side that cameras and lights at azimuth 0 face
     azimuth_deg: Range = (-60.0, 60.0)  # of the camera about the vertical
     elevation_deg: Annotated[Range, within(-89, 89)] = (2.0, 27.0)  # of the camera above the horizontal
     distance_mm: PositiveRange = (440.0, 800.0)  # from the camera's center to what it looks at
     roll_deg: Range = (-5.0, 5.0)  # of the camera about its axis
     fov_deg: Annotated[Positive, Field(lt=170)] = 50.0  # field of view across the picture's shorter side
     zoom: PositiveRange = (0.9, 1.1)  # of a photographed scene's pictures about their middle
-    patch_share: ShareRange = (0.1, 0.3)  # piece's longer side over the picture's shorter side, in a folder of images
+    patch_share: ShareRange = (0.1, 0.3)  # the piece's longer side over a picture's shorter side, in folders of images
 
 
 class LightSettings(StrictModel):
-    """Ambient and directional light; 1 is the light in which white paper is sRGB white at exposure 0."""
+    """Ambient and directional light; in light 1 white paper is sRGB white at exposure 0."""
 
-    ambient: NotNegativeRange = (0.3, 0.7)  # light from everywhere
-    # A lamp is this, too: half a meter away, its fall-off moved rates promised to 9 pairs of scene and network by -0.2
-    # points [-0.9, 0.6], by 2.5 at most. With even light in place of the lamp they were up to 13 points off.
+    ambient: NotNegativeRange = (0.3, 0.7)  # light from all directions
+    # This models a lamp, too: the fall-off of one half a meter away moved the rates promised to 9 pairs of scene and
+    # network by -0.2 points [-0.9, 0.6], by 2.5 at most. Even light in place of the lamp put them up to 13 points off.
     directional: NotNegativeRange = (0.2, 0.8)  # light from one side, of the sun or a lamp, on a surface that faces it
-    # Where it may come from, seen from the scene's front: from behind, nothing on a patch there could be seen.
+    # Its direction seen from the scene's front: light from behind would leave a patch there dark.
     azimuth_deg: Range = (-90.0, 90.0)  # of the directional light about the vertical
     elevation_deg: Annotated[Range, within(-90, 90)] = (10.0, 80.0)  # of the directional light above the horizontal
 
 
 class BackgroundSettings(StrictModel):
-    """What is behind the object; procedural places where nothing is given."""
+    """The background of the object: pictures, a color, or by default procedural rooms."""
 
-    # A folder of photographs, each for one of training, selection, promise and evaluation; a picture: the known place.
+    # A folder of photographs, divided among training, selection, promise and evaluation; or a picture of a known place.
     images: str | None = None
     color: tuple[Share, Share, Share] | None = None  # sRGB
-    erasing: Share = 0.5  # chance that a random box is erased in training, in a folder of images
+    erasing: Share = 0.5  # chance that a random box is erased in training, in folders of images
 
     @model_validator(mode="after")
-    def _one_of_them(self):
+    def _one_background(self):
         if self.images is not None and self.color is not None:
             raise ValueError("takes images or color, not both")
         return self
 
 
 class PrinterSettings(StrictModel):
-    """The printer's appearance model (a name in calibration/printers, or a file), and how prints differ from it."""
+    """The printer's appearance model (a name in calibration/printers, or a file), and how prints vary about it."""
 
     profile: str = "coated"  # coated, uncoated, or a file that `calibrate printer` wrote
-    # One print to the next, ΔE00 1 to 3 together. Assumed, from the size of the tolerances of ISO 12647-2. Free.
+    # From print to print, ΔE00 1 to 3 together. Assumed, from the tolerances of ISO 12647-2; it costs no time.
     dot_gain: Annotated[Range, within(-0.25, 0.25)] = (-0.04, 0.04)  # added tone value at 50 %
     density: Annotated[Range, within(-0.9, 3)] = (-0.05, 0.05)  # added ink, as a share of the ink's own
     black: Annotated[Range, within(-0.1, 0.5)] = (-0.004, 0.004)  # added light of printed black; paper is 1
     # Off: sheets ask for 100 % and are measured. 0.97 to 1.03 moved the demo's confidence by 0.01, 0.94 by 0.05.
-    scale: Annotated[PositiveRange, within(0.5, 2)] = (1.0, 1.0)  # size over the sheet's own
+    scale: Annotated[PositiveRange, within(0.5, 2)] = (1.0, 1.0)  # printed size over the intended one
 
 
 class CameraSettings(StrictModel):
-    """What the camera does; blur and noise are meant at `photo_px`."""
+    """The camera's effects; blur and noise are stated for photographs of `photo_px`."""
 
     # Width and height of a whole photograph.
     photo_px: tuple[Annotated[int, Field(ge=64, le=20000)], Annotated[int, Field(ge=64, le=20000)]] = (1600, 1200)
@@ -200,37 +201,38 @@ class CameraSettings(StrictModel):
     white_balance: Annotated[Share, Field(le=0.5)] = 0.05  # largest error of the red and of the blue gain
     blur_px: NotNegativeRange = (0.0, 1.0)  # standard deviation of a Gaussian at photo_px
     noise: ShareRange = (0.0, 0.01)  # standard deviation at white, at photo_px
-    # Off: cameras are held still. In a hand at night, 2 to 12 px took 3.4 points [1.5, 5.2] of rates promised without
-    # it, in 5 of 9 pairs of scene and network more than the promise's interval; designs that knew it had 1.5 [0.0, 3.1]
-    # more.
+    # Off: cameras are held still. Handheld at night, 2 to 12 px took 3.4 points [1.5, 5.2] off rates promised without
+    # it, more than the promise's interval in 5 of 9 pairs of scene and network; designs optimized with it regained 1.5
+    # [0.0, 3.1].
     motion_px: NotNegativeRange = (0.0, 0.0)  # length of a straight motion blur at photo_px
-    file: str | None = None  # a calibrated camera: intrinsics and lens distortion in place of fov_deg
+    file: str | None = None  # a calibrated camera's file: intrinsics and lens distortion in place of fov_deg
     jpeg: Annotated[
         tuple[Annotated[int, Field(ge=1, le=100)], Annotated[int, Field(ge=1, le=100)]], AfterValidator(check_ordered)
-    ] = (60, 95)  # quality of the file
+    ] = (60, 95)  # JPEG quality of the photograph's file
 
 
 class OptimizeSettings(StrictModel):
-    """The loop: `views` conditions in each of `steps` steps."""
+    """The optimization loop: `views` conditions in each of `steps` steps."""
 
-    steps: Annotated[int, Field(ge=1)] = 240  # of the loop
-    # Many small steps: as many views, 12 at a time, got less far in 3 scenes.
+    steps: Annotated[int, Field(ge=1)] = 240  # number of steps
+    # Many small steps: the same number of views, 12 in a step, gave lower rates in 3 scenes.
     views: Annotated[int, Field(ge=1)] = 4  # conditions in each step
-    seed: Annotated[int, Field(ge=0)] = 0  # of everything that is drawn
-    optimizer: Literal["adam", "sign"] = "adam"  # or the signed steps of FGSM and PGD
+    seed: Annotated[int, Field(ge=0)] = 0  # of all random draws
+    optimizer: Literal["adam", "sign"] = "adam"  # Adam, or the signed steps of FGSM and PGD
     # With 0.0075, 0.015, 0.03 and 0.05 designs of six pairs of object and network were recognized in 73, 74, 71 and
     # 69 % of unseen views; a step that decays over the run did no better.
     step_size: Annotated[Positive, Field(le=1)] = 0.015  # of sRGB's range
-    tv: NotNegative = 0.0  # loss for the design's total variation
-    # At 0, 0.1, 1 and 10 (one scene) 83, 80, 58 and 5 % of the pixels were over ΔE00 2 off, confidences within 0.02.
-    gamut: NotNegative = 1.0  # loss for colors that the printer misses, per 100 ΔE00
+    tv: NotNegative = 0.0  # weight of the design's total variation in the loss
+    # At 0, 0.1, 1 and 10 (one scene) 83, 80, 58 and 5 % of the pixels missed by more than ΔE00 2, with confidences
+    # within 0.02 of each other.
+    gamut: NotNegative = 1.0  # weight of colors that the printer misses in the loss, per 100 ΔE00
 
 
 class PromiseSettings(StrictModel):
-    """How well a promise has to be known; no part of what is printed."""
+    """The precision of the promise; it does not change what is printed."""
 
-    # Of the rate's interval: half or three quarters of 400 views are taken where it is no wider after them and every
-    # control's difference is settled, and all of a number that is asked for.
+    # Half the width of the rate's interval: of 400 views, rendering stops at half or three quarters if the interval is
+    # as narrow and every control's difference is settled. A number of views that is asked for is rendered in full.
     half_width: Annotated[Share, Field(ge=0.005)] = 0.04
 
 
@@ -250,14 +252,14 @@ class SceneSettings(StrictModel):
     promise: PromiseSettings = PromiseSettings()
 
     @model_validator(mode="after")
-    def _has_its_parts(self):
+    def _tables_agree(self):
         if self.patch.kind != "patch" and self.object.mesh is None:
             raise ValueError(f'name object.mesh, or leave out patch.kind = "{self.patch.kind}": only a mesh has one')
         if self.patch.place == "auto" and self.object.mesh is None:
             raise ValueError('name object.mesh, or leave out patch.place = "auto": only a mesh has other places')
         if self.patch.place == "auto" and (self.view.look_at != "object" or self.view.front != "patch"):
             raise ValueError(
-                'leave out view.look_at and view.front with patch.place = "auto": places share the views of patch.side'
+                'leave out view.look_at and view.front with patch.place = "auto": views then refer to patch.side'
             )
         if self.patch.kind == "patch" and self.object.photos is None and self.patch.width_mm is None:
             raise ValueError("add patch.width_mm and patch.height_mm")
@@ -265,7 +267,7 @@ class SceneSettings(StrictModel):
 
 
 def background_summary(settings: Mapping[str, Any]) -> str:
-    """What stood behind the object, in words, of a scene's settings as plain data; "" where they do not say."""
+    """Describe the background in words, from a scene's settings as plain data; "" if they hold none."""
     if (settings.get("object") or {}).get("mesh") is None:
         return "the scene's own pictures" if "object" in settings else ""
     background = settings.get("background") or {}
@@ -276,10 +278,12 @@ def background_summary(settings: Mapping[str, Any]) -> str:
 
 
 def load_scene_settings(path: str | Path) -> SceneSettings:
-    """A scene file's settings as written, `${VAR}` unexpanded: a run must not depend on where its files lie."""
+    """Load a scene file's settings with `${VAR}` unexpanded, so that a run does not depend on where its files lie."""
     return validate_model(SceneSettings, read_toml(path), str(path))
 
 
 def identity_settings(settings: StrictModel) -> dict[str, Any]:
-    """What a sheet id is made of: settings that differ from their defaults, so that a key more changes no sheet."""
+    """The settings that a sheet id is computed from: those that differ from their defaults, so that a new key with a
+    default changes no sheet id.
+    """
     return settings.model_dump(mode="json", exclude={"promise"}, exclude_defaults=True)

@@ -1,7 +1,7 @@
 """Read and validate settings: TOML files or dictionaries into frozen pydantic models.
 
-In: a TOML file or a dictionary, and a model of it; `${VAR}` in paths is expanded. Out: frozen settings with every value
-checked: an unknown key is refused with the nearest known one, a NaN or a reversed range with the value.
+In: a TOML file or a dictionary, and a model of it. Out: frozen settings with every value checked: an unknown key is
+refused with the nearest known one, a NaN or a reversed range with the value. `expand_path` expands `${VAR}` in paths.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def _finite(value: float) -> float:
 
 
 def check_ordered(pair: tuple[float, float]) -> tuple[float, float]:
-    """A range as it is, when its low end is not above its high one."""
+    """Return the range (low, high) unchanged; a ValueError if low is above high."""
     if pair[0] > pair[1]:
         raise ValueError(f"must be [low, high] with low <= high, not [{pair[0]:g}, {pair[1]:g}]")
     return pair
@@ -48,12 +48,12 @@ Model = TypeVar("Model", bound=BaseModel)
 
 
 class StrictModel(BaseModel):
-    """Frozen settings that know all their keys."""
+    """Base of frozen settings that refuse unknown keys."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     def changed(self, **values: Any) -> Self:
-        """These settings with other values, checked like a file's; a dictionary changes single keys of a table:
+        """A copy with some values replaced, checked as a file is. A dictionary replaces single keys of a table:
         `scene.changed(optimize={"steps": 10})`.
         """
         tables = {name: getattr(self, name) for name in type(self).model_fields}
@@ -66,36 +66,36 @@ class StrictModel(BaseModel):
 
 
 def read_toml(path: str | Path) -> dict[str, Any]:
-    """A TOML file as a dictionary; refused where it is missing, not text, or not TOML."""
+    """Read a TOML file as a dictionary; refused if it is missing, not text, or not TOML."""
     path = Path(path)
-    if not os.path.isfile(path):  # of a path that no system takes, 300 letters or a NUL, this is false, too
+    if not os.path.isfile(path):  # False, too, for a path that no system accepts (300 letters, a NUL)
         raise Refused("a TOML file", f"no file at {path}", "check the path")
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
-        raise Refused("a TOML file", f"{path} that cannot be read ({error})", "mend that line") from error
+        raise Refused("a TOML file", f"{path} that cannot be read ({error})", "correct that line") from error
 
 
-def validate_model(model: type[Model], data: Any, where: str) -> Model:
-    """`data` as `model`; the first thing wrong with it is refused by its key, with the nearest known key."""
+def validate_model(model: type[Model], data: Any, source: str) -> Model:
+    """Validate `data` as a `model`; its first error is refused by key, an unknown key with the nearest known one."""
     try:
         return model.model_validate(data)
     except ValidationError as error:
-        # a misspelt key is also a missing one: the spelling says more
+        # a misspelled key is also a missing one, and its spelling is the more useful message
         first = min(error.errors(), key=lambda error: error["type"] != "extra_forbidden")
-        raise _explain(model, first, where) from error
+        raise _explain(model, first, source) from error
 
 
-# a network's name up to the file in it, and that file
+# a network's name: the part up to its file, and the file
 NETWORK_FILE = re.compile(r"(file:|clip:[^@:]+@|(?:torchvision|timm):[^@:]+@(?=.+\.safetensors$))(.*)", re.DOTALL)
 
 
 def expand_path(text: str, base: Path) -> str:
-    """A path or model name with `${VAR}` expanded and, where it names a file, relative to `base`."""
+    """Expand `${VAR}` in a path or a network's name; a relative file is taken relative to `base`."""
 
     def variable(match: re.Match) -> str:
         if match[1] not in os.environ:
-            raise Refused(f"the environment variable {match[1]}", "none", f"set {match[1]} or write the path out")
+            raise Refused(f"the environment variable {match[1]}", "none", f"set {match[1]} or write the full path")
         return os.environ[match[1]]
 
     text = re.sub(r"\$\{(\w+)\}", variable, text)
@@ -106,56 +106,56 @@ def expand_path(text: str, base: Path) -> str:
     return text if by_prefix or text in ("builtin", "builtin-detector") else str(base / text)
 
 
-def spelling_hint(word: str, known: Iterable[str]) -> str:
-    """`(did you mean "x"?)` where a known word is near, else the known words."""
-    known = list(known)
-    near = difflib.get_close_matches(word, known, 1, 0.5)
-    return f'did you mean "{near[0]}"' if near else f"use one of: {', '.join(known)}"
+def spelling_hint(word: str, known_words: Iterable[str]) -> str:
+    """'did you mean "x"' for the most similar known word, else 'use one of: ...'."""
+    known_words = list(known_words)
+    similar = difflib.get_close_matches(word, known_words, 1, 0.5)
+    return f'did you mean "{similar[0]}"' if similar else f"use one of: {', '.join(known_words)}"
 
 
 def summarize_names(names: Sequence[str]) -> str:
-    """The first three names, and how many more there are."""
+    """The first three names, and the number of further ones: 'a, b, c and 4 more'."""
     return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
 def within(low: float, high: float) -> AfterValidator:
-    """The check that a range lies in [low, high]."""
-    return AfterValidator(partial(_inside, low, high))
+    """A validator of a range: both ends must lie in [low, high]."""
+    return AfterValidator(partial(_check_within, low, high))
 
 
-def _inside(low: float, high: float, pair: tuple[float, float]) -> tuple[float, float]:
+def _check_within(low: float, high: float, pair: tuple[float, float]) -> tuple[float, float]:
     if pair[0] < low or pair[1] > high:
         raise ValueError(f"must lie within [{low:g}, {high:g}]")
     return pair
 
 
-def _explain(model: type[BaseModel], error: ErrorDetails, where: str) -> Refused:
+def _explain(model: type[BaseModel], error: ErrorDetails, source: str) -> Refused:
     key = ".".join(str(part) for part in error["loc"])
     if error["type"] == "extra_forbidden":
         hint = spelling_hint(str(error["loc"][-1]), _keys_at(model, error["loc"][:-1]))
-        return Refused(f"only known keys in {where}", f'"{key}"', hint)
+        return Refused(f"only known keys in {source}", f'"{key}"', hint)
     if error["type"] == "missing":
-        return Refused(f'the key "{key}" in {where}', "none", f"add {key}")
+        return Refused(f'the key "{key}" in {source}', "none", f"add {key}")
     value = str(error.get("input"))
     value = value if len(value) < 80 else value[:77] + "..."
     reason = error["msg"].removeprefix("Value error, ").rstrip(".")
     reason = reason[0].lower() + reason[1:]
-    if not key:  # tables that do not go together
-        return Refused(f"settings in {where} that go together", "others", reason)
+    if not key:  # tables that contradict each other
+        return Refused(f"settings in {source} that agree with each other", "a contradiction", reason)
     do = f"{key} {reason}" if reason.startswith(("must", "takes")) else reason
-    return Refused(f'a usable "{key}" in {where}', value, do)
+    return Refused(f'a usable "{key}" in {source}', value, do)
 
 
 def _keys_at(model: Any, location: tuple) -> Iterable[str]:
-    """The known keys of the table at a location, through lists, dictionaries and optional tables."""
+    """The known keys of the table at a location; lists, dictionaries and optional tables are looked through."""
     for part in location:
-        if part in model.model_fields:  # else an index or a dictionary's own key
+        if part in model.model_fields:  # otherwise it is an index or a key of a dictionary
             model = next(models_in(model.model_fields[part].annotation), model)
     return model.model_fields
 
 
 def models_in(hint: Any) -> Iterator[type[BaseModel]]:
-    """The tables that a type speaks of."""
+    """The models within a type hint: the model itself, or those in its arguments."""
     if isinstance(hint, type) and issubclass(hint, BaseModel):
         yield hint
     for inner in get_args(hint):

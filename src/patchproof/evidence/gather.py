@@ -165,8 +165,8 @@ def report_of(
         counts = sum(recognized.values()), [session.judged for session in sessions if session.judged]
         verdict = judge(*counts, promise, without)
         if recognized:
-            spread = promise.spread
-            interval = spread.least_rate(*counts, TAIL), spread.most_rate(*counts, TAIL)
+            posterior = promise.posterior
+            interval = posterior.least_rate(*counts, TAIL), posterior.most_rate(*counts, TAIL)
         measured = (entry for entry in counted if entry.status == "measured")
         matched = matched_rate(measured, promise.conditions, promised_side_px(manifest))
         expected = [entry for entry in counted if entry.forecast is not None and entry.file in recognized]

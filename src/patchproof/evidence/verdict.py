@@ -50,8 +50,8 @@ def judge(recognized: int, photos: Sequence[int], promise: Promise, without_mark
     judged, goal = sum(photos), promise.target.goal
     if judged == 0:
         return Verdict("cannot_tell", None, "No photograph could be judged.")
-    spread = promise.spread
-    low, high = spread.counts(photos)
+    posterior = promise.posterior
+    low, high = posterior.count_interval(photos)
     sessions = "one session" if len(photos) == 1 else f"{len(photos)} sessions"
     allowed = f"the promise allows for {low} to {high} in {sessions}"
     lost = _lost(judged, without_markers)
@@ -63,7 +63,7 @@ def judge(recognized: int, photos: Sequence[int], promise: Promise, without_mark
     counts = f"{recognized} of {judged} photographs were recognized"
     if goal.sign * (recognized - (low if goal.sign > 0 else high)) < 0:
         return Verdict("broken", (low, high), f"{counts}; {allowed}.")
-    ends = spread.least_rate if goal.sign > 0 else spread.most_rate
+    ends = posterior.least_rate if goal.sign > 0 else posterior.most_rate
     proved, asked = ends(recognized, photos, TAIL), required_rate(promise)
     side = "at least" if goal.sign > 0 else "at most"
     counts = f"{counts}; {allowed}. They prove a rate of {side} {proved:.0%}, and {side} {asked:.0%} is asked for"
@@ -79,7 +79,7 @@ def required_rate(promise: Promise) -> float:
 
 def kept_chance(promise: Promise, photos: Sequence[int]) -> float:
     """The chance that the promise is called kept by photographs, so many in each session, where it holds."""
-    chances = promise.spread.chances(photos)
+    chances = promise.posterior.chances(photos)
     # from the worst to the best: once kept, kept from there on
     counts = range(len(chances))[:: promise.target.goal.sign]
     first = bisect_left(counts, True, key=lambda count: judge(count, photos, promise).verdict == "kept")

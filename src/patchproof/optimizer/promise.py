@@ -122,7 +122,7 @@ def _until_known(
             unsettled = [kind for kind in unsettled if kind not in settled]
             places = _places(conditions[:last], per_session)
             counts = count_by_session(compared["design"].recognized[0], per_session, places)
-            if unsettled == ["design"] and np.ptp(rate_posterior(*counts).rate) <= 2 * half_width:
+            if unsettled == ["design"] and np.ptp(rate_posterior(*counts).rate_interval) <= 2 * half_width:
                 advance(last, last)  # a bar that stays at half would look broken
                 break
     return compared
@@ -200,7 +200,7 @@ def model_claims(
             name=classifier.name,
             sha256=classifier.sha256,
             rate=float(recognized.mean()),
-            interval=rate_posterior(*count_by_session(recognized, per_session, places)).rate,
+            interval=rate_posterior(*count_by_session(recognized, per_session, places)).rate_interval,
             confidence=float(confidence.mean()),
             least_score=classifier.least_score,
         )
@@ -217,7 +217,7 @@ def control_claims(answers: Mapping[str, Responses], model: int, per_session: in
         claims[kind] = ControlClaim(
             n=len(recognized),
             rate=float(recognized.mean()),
-            interval=rate_posterior(*count_by_session(recognized, per_session)).rate,
+            interval=rate_posterior(*count_by_session(recognized, per_session)).rate_interval,
             confidence=float(answers[kind].confidence[model].mean()),
             difference=difference,
             difference_interval=interval,

@@ -57,7 +57,7 @@ def plan_shots(promise: Promise) -> ShotPlan:
     better, worse = (promise.rate, promise.controls[best].rate)[:: promise.target.goal.sign]
     parts = [(way, split_evenly(*way)) for way in WAYS]
     return ShotPlan(
-        ways=tuple(ShotOption(*way, promise.spread.counts(p), kept_chance(promise, p)) for way, p in parts),
+        ways=tuple(ShotOption(*way, promise.posterior.count_interval(p), kept_chance(promise, p)) for way, p in parts),
         sessions=sessions_needed(promise),
         control=best,
         paired=fewest_photos(lambda n: paired_power(better, worse, n) >= POWER),
@@ -107,8 +107,9 @@ def unpaired_power(better: float, worse: float, n: int) -> float:
 def shot_sections(promise: Promise, settings: SceneSettings) -> tuple[tuple[str, tuple[str, ...]], ...]:
     """What to photograph, as (heading, lines)."""
     plan = plan_shots(promise)
-    worth = promise.headline.removeprefix(promise.hint)
-    what = f"{promise.hint or 'The design is '}{worth} Promised before {background_summary(settings.model_dump())}."
+    worth = promise.headline.removeprefix(promise.draft_prefix)
+    background = background_summary(settings.model_dump())
+    what = f"{promise.draft_prefix or 'The design is '}{worth} Promised before {background}."
     return (("How many photographs", (what, *_how_many(promise, plan))), ("From where", _from_where(settings)))
 
 

@@ -73,7 +73,7 @@ def serve_capture(
     options = options_of(sheet, manifest, models, camera)
     forecast = None if run is None else (Path(run).resolve(), Path(sheet).resolve())
     album = Album(Path(out))
-    with open_workers(1, apart=True) as workers:
+    with open_workers(1, spawn=True) as workers:
         workers.map(ready, [None])
         with closing(PhotoCollection(album, manifest, options, workers, forecast)) as gathered:
             gathered.measure(album.photos(), partial(progress, "measure"))

@@ -97,7 +97,7 @@ def optimize(
     say(f"run: {out}")
     if run.scene.settings.patch.kind == "patch":
         say(f"next: patchproof sheet {out} --out sheet.pdf")
-    raise typer.Exit(1 if require == "better" and run.promise.worth != "better" else 0)
+    raise typer.Exit(1 if require == "better" and run.promise.comparison != "better" else 0)
 
 
 def promise(
