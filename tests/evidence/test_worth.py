@@ -52,7 +52,7 @@ def test_the_headline_compares_the_views_that_both_were_shown_in():
 )
 def test_the_hardest_control_decides_and_its_interval_says_the_word(controls, goal, best, worth):
     promise = promise_of(0.5, controls, goal)
-    assert (promise.best_control, promise.worth) == (best, worth)
+    assert (promise.best_control, promise.comparison) == (best, worth)
     first = promise_lines(promise)[0]
     assert first.startswith(f"{worth} than its best control ({best}): 50.0%")
     assert ("before printing it" in first) == (worth != "better")

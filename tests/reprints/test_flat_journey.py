@@ -294,7 +294,7 @@ def test_another_page_keeps_the_piece_and_its_promise_or_is_refused(photos, tmp_
     [
         (("--template", "a4"), "Expected a template with a [blank] table"),
         ((), "Expected a run, or the template of a blank page, got neither"),
-        (("--template", "blank_a4", "--control", "mean"), "Expected the run whose mean control belongs on the page"),
+        (("--template", "blank_a4", "--control", "mean"), "Expected a run, whose mean control to print"),
     ],
 )
 def test_pages_that_need_a_run_are_refused_without_one(tmp_path, capsys, arguments, sentence):

@@ -207,7 +207,7 @@ def test_markers_are_as_large_as_views_need_and_pictures_hold(tmp_path):
     assert small.unreadable_share > 0.5 and "unreadable" in small.warnings[-1]
     whole = build_scene(settings_of(view={"patch_share": (0.1, 1.0), "roll_deg": (0, 0)}), folder, 0)
     assert whole.piece.size_mm == small.piece.size_mm == (60, 40)  # up to the whole square the piece stays as asked
-    with pytest.raises(Refused, match=r"at least 39 mm, beside 8 mm markers, got 60 × 38\.9 mm"):
+    with pytest.raises(Refused, match=r"at least 39 mm, which has room for 8 mm markers, got 60 × 38\.9 mm"):
         build_scene(settings_of(patch={"width_mm": 60, "height_mm": 38.9}), folder, 0)
     with pytest.raises(Refused, match=r"at most 166\.6 × 179\.6 mm on this page, got 170 × 40 mm"):
         build_scene(settings_of(patch={"width_mm": 170, "height_mm": 40}), folder, 0)

@@ -76,7 +76,11 @@ def test_another_template_is_the_scene_made_for_it_and_nothing_is_loaded_again(t
         ("length_mm = 300", "length_mm = nan", r"length_mm.*nan.*finite"),
         ("[-40, 40]", "[40, -40]", r"low <= high"),
         ("width_mm = 90", "width_mm = 900", r"Expected a piece no larger"),
-        ("height_mm = 90", "height_mm = 38.9", r"piece of at least 39 mm, beside 8 mm markers, got 90 × 38\.9 mm"),
+        (
+            "height_mm = 90",
+            "height_mm = 38.9",
+            r"piece of at least 39 mm, which has room for 8 mm markers, got 90 × 38\.9 mm",
+        ),
         (
             "height_mm = 90",
             'height_mm = 120\n[sheet]\ntemplate = "label_102x152"',

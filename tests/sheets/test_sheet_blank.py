@@ -68,7 +68,8 @@ def test_the_same_template_gives_the_same_bytes_and_another_one_another_id(blank
 
 def test_a_template_for_designs_is_refused(tmp_path):
     with pytest.raises(
-        Refused, match=r"Expected a template with a \[blank\] table.*got a4: use one of: blank_a4, blank_letter"
+        Refused,
+        match=r"Expected a template with a \[blank\] table.*got a4 without one: use one of: blank_a4, blank_letter",
     ):
         blank_sheet("a4", tmp_path / "b.pdf")
     with pytest.raises(Refused, match="marker_mm"):
@@ -76,7 +77,7 @@ def test_a_template_for_designs_is_refused(tmp_path):
 
 
 def test_a_sheet_with_a_design_or_without_markers_is_no_blank(blank):
-    with pytest.raises(Refused, match='got one of kind "mean"'):
+    with pytest.raises(Refused, match='got a manifest of kind "mean"'):
         blank_piece(blank[1].model_copy(update={"kind": "mean"}))
-    with pytest.raises(Refused, match="Expected markers within the blank's cut line, got none: name the JSON"):
+    with pytest.raises(Refused, match="Expected markers within the blank sheet's cut line, got none: name the JSON"):
         blank_piece(blank[1].model_copy(update={"markers": blank[1].markers[4:]}))

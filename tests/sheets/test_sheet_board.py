@@ -77,7 +77,7 @@ def test_what_is_no_board_is_refused(tmp_path):
     ("old", "new", "reason"),
     [
         ("marker_mm = 18.0", "marker_mm = 19.0", "board.marker_mm of at most 18.7"),
-        ("square_mm = 24.0", "square_mm = 25.0", "parts that lie apart"),
+        ("square_mm = 24.0", "square_mm = 25.0", "parts that do not overlap"),
         ("columns = 7", "columns = 8", "board within the margins"),
         ("rows = 10", "rows = 12", "board within the margins"),
         ("rows = 10", "rows = 3", "board.rows"),

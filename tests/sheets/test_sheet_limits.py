@@ -24,10 +24,10 @@ def test_a_page_of_too_many_pixels_is_refused_before_memory_is_taken(tmp_path, m
     page = tmp_path / "s.pdf"
     blank_sheet("blank_a4", page)
     width, height = rasterize_page(page, 1, 30).shape[1::-1]
-    monkeypatch.setattr(pdf_raster, "MOST_PX", width * height)
+    monkeypatch.setattr(pdf_raster, "MAX_PAGE_PX", width * height)
     assert rasterize_page(page, 1, 30).shape == (height, width, 3)
-    monkeypatch.setattr(pdf_raster, "MOST_PX", width * height - 1)
-    with pytest.raises(Refused, match=rf"million in all, got {width} × {height}: lower"):
+    monkeypatch.setattr(pdf_raster, "MAX_PAGE_PX", width * height - 1)
+    with pytest.raises(Refused, match=rf"million in total, got {width} × {height}: lower"):
         rasterize_page(page, 1, 30)
 
 
@@ -48,16 +48,18 @@ def forms_in_forms(path: Path, levels: int) -> None:
 @needs_timer
 def test_a_page_that_takes_too_long_is_refused_and_left_behind(tmp_path, monkeypatch):
     """Five levels take 1 s, and nothing interrupts PDFium; the next page waits for it."""
-    monkeypatch.setattr(bounds, "SECONDS", 0.3)
+    monkeypatch.setattr(bounds, "TIME_LIMIT_S", 0.3)
     forms_in_forms(tmp_path / "few.pdf", 3)
     blue = rasterize_page(tmp_path / "few.pdf", 1, 72)
     assert (blue[150, 50] == [0, 0, 255]).all()
     forms_in_forms(tmp_path / "many.pdf", 5)
     before = time.process_time()
-    with pytest.raises(Refused, match=r"a page that is soon drawn, got .*, which takes more than 0\.3 s of processor"):
+    with pytest.raises(
+        Refused, match=r"a page that can be drawn in time, got .*, which takes more than 0\.3 s of processor"
+    ):
         rasterize_page(tmp_path / "many.pdf", 1, 72)
     assert time.process_time() - before < 0.7
-    monkeypatch.setattr(bounds, "SECONDS", 10.0)
+    monkeypatch.setattr(bounds, "TIME_LIMIT_S", 10.0)
     assert (rasterize_page(tmp_path / "few.pdf", 1, 72) == blue).all()
 
 
@@ -67,7 +69,7 @@ def test_a_process_that_has_left_a_page_behind_ends_as_any_other(tmp_path):
     forms_in_forms(tmp_path / "endless.pdf", 10)
     code = (
         "import sys; from patchproof.base import input; from patchproof.sheets.pdf_raster import rasterize_page;"
-        "from patchproof.base.errors import Refused; input.SECONDS = 0.2\n"
+        "from patchproof.base.errors import Refused; input.TIME_LIMIT_S = 0.2\n"
         "try: rasterize_page(sys.argv[1])\nexcept Refused: sys.exit(7)"
     )
     command = [sys.executable, "-c", code, str(tmp_path / "endless.pdf")]

@@ -24,7 +24,7 @@ from patchproof.photo.read import Photo
 from patchproof.sheets.blank import chart_sheet
 from patchproof.sheets.board import board_sheet, is_board
 from patchproof.sheets.content import SheetContent
-from patchproof.sheets.layout import Box, prove_apart
+from patchproof.sheets.layout import Box, check_layout
 from patchproof.sheets.manifest import load_manifest
 from patchproof.sheets.multi_design import write_several
 from patchproof.sheets.page import largest_piece_mm
@@ -230,7 +230,9 @@ def test_markers_too_large_for_tiles_are_refused():
     """Corners of 136 × 9/7 + 1 = 175.9 mm go on tiles of 177 mm, those of 137 mm markers are 177.1 mm wide."""
     template = load_template("a4_tiles")
     assert plan_tiles(template, lay_out_piece((700, 700), 136, ID, "design"))
-    with pytest.raises(Refused, match="can be cut into tiles without cutting a marker, got markers of 137 mm on tiles"):
+    with pytest.raises(
+        Refused, match="can be divided into tiles without cutting a marker, got markers of 137 mm on tiles"
+    ):
         plan_tiles(template, lay_out_piece((700, 700), 137, ID, "design"))
 
 
@@ -272,7 +274,7 @@ def test_several_designs_share_a_page_each_with_a_manifest_of_its_own(tmp_path):
             assert np.abs(found[marker.id] / PX_PER_MM - np.array(marker.corners_mm)).max() < 0.1
         assert len(rasterize_piece(tmp_path / "s.pdf", manifest, 50)) > 100
     cuts = [Box(f"piece {i}", m.cut_mm) for i, m in enumerate(manifests)]
-    prove_apart(tuple(cuts), manifests[0].page_mm, 7.0)
+    check_layout(tuple(cuts), manifests[0].page_mm, 7.0)
 
 
 def test_each_of_several_designs_has_a_plan_that_names_its_sheet(tmp_path):
@@ -328,11 +330,11 @@ def test_what_cannot_be_printed_is_refused_in_one_sentence(tmp_path):
     path = tmp_path / "s.pdf"
     with pytest.raises(Refused, match=r"a piece of at most .* one with tiles \(.*a4_tiles"):
         write(path, "letter", (300, 300))
-    with pytest.raises(Refused, match="at most 30 tiles, for which there are marker ids"):
+    with pytest.raises(Refused, match="at most 30 tiles, limited by the number of marker ids"):
         write(path, "a4_tiles", (2000, 2000), 30)
     with pytest.raises(Refused, match=r'"lettre".*did you mean "letter"'):
         write(path, "lettre")
-    with pytest.raises(Refused, match="a chart alone"):
+    with pytest.raises(Refused, match="a template with a chart only"):
         largest_piece_mm(load_template("chart_a4"))
     with pytest.raises(Refused, match="twice: use --copies"):
         write_several(path, load_template("a3"), designs(ID, ID))

@@ -159,7 +159,7 @@ def test_marker_size_is_what_is_needed_else_what_leaves_the_design_its_share_els
         with pytest.raises(Refused) as refusal:
             marker_size_mm(8, size)
         got = f"{size[0]:g} × {size[1]:g} mm"
-        told = f"Expected a piece of at least 39 mm, beside 8 mm markers, got {got}: make the patch larger."
+        told = f"Expected a piece of at least 39 mm, which has room for 8 mm markers, got {got}: make the patch larger."
         assert str(refusal.value) == told
 
 

@@ -45,7 +45,7 @@ def benefit_of(
     row = min(unbeaten or rows, key=lambda row: (bool(unbeaten) and row[0] != "bare", gains(row)))
     (low, high), (name, control_rate, difference, ends) = gains(row), row
     word: BenefitWord = "helps" if low > 0 else "worse" if high < 0 else "no_better"
-    if word == "no_better" and promise.controls and promise.worth == "better" and high >= LITTLE:
+    if word == "no_better" and promise.controls and promise.comparison == "better" and high >= LITTLE:
         word = "not_shown"
     return Benefit(
         word=word,

@@ -74,7 +74,7 @@ def hang(scene: PatchScene, template: Template) -> PlacementPicture:
         outline_mm=tuple(map(tuple, outline)),
         seams_mm=tuple(seams),
         names_mm=tuple(names),
-        measured=measured,
+        dimension_chains=measured,
     )
 
 

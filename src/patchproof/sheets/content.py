@@ -1,6 +1,6 @@
-"""What a sheet carries: the piece with its design, and the manifest that says where everything lies.
+"""The content of a sheet: a piece with its design and promise.
 
-In: a piece, the design's pixels, the promise. Out: the words and the code of its page, and a `Manifest`.
+In: a piece, the design's pixels, the promise. Out: the texts and the QR code of its page, and its `Manifest`.
 """
 
 from __future__ import annotations
@@ -22,10 +22,8 @@ from patchproof.sheets.template import BoardTemplate, Template
 
 @dataclass(frozen=True, eq=False)
 class SheetContent:
-    """A piece and what belongs to it; `design_srgb8` is uint8 H×W×3, or None for white paper. Other pixels are refused,
-    and those that the markers need become white.
-
-    `kind` is "design", or the control that it is.
+    """A piece and its design. `design_srgb8` is uint8 H×W×3, or None for white paper; other arrays are refused, and
+    pixels that belong to the markers become white. `kind` is "design", or the name of a control.
     """
 
     piece: Piece
@@ -34,7 +32,7 @@ class SheetContent:
     design_srgb8: np.ndarray | None
     promise: Promise | None = None
     settings: dict[str, Any] = field(default_factory=dict)
-    bent: bool = False  # goes round the object
+    bent: bool = False  # it is wrapped around the object
 
     def __post_init__(self):
         pixels = self.design_srgb8
@@ -46,33 +44,33 @@ class SheetContent:
 
     @property
     def code(self) -> str:
-        """What the QR code says: the sheet's id and 16 digits of the design's SHA-256, or the kind without one."""
+        """The QR code's text: the sheet's id, and 16 digits of the design's SHA-256 or the kind if there is none."""
         content = self.kind if self.design_srgb8 is None else design_sha256(self.design_srgb8)[:16]
         return f"patchproof:{self.sheet_id}:{content}"
 
     @property
     def name(self) -> str:
-        """What the piece is, for whoever finds it: its kind and the target's label."""
+        """A name for people: the kind and the target's label."""
         label = (self.settings.get("target") or {}).get("label")
         return self.kind if label is None else f"{self.kind} · {label}"
 
     @property
     def words(self) -> dict[str, str]:
-        """What a template's words stand for on its page."""
+        """Values of the placeholders in a template's text."""
         size, kind = size_text(self.piece.size_mm), self.kind
-        if self.promise is not None and self.promise.worth != "better":
-            kind = f"{kind}, {self.promise.worth} than {self.promise.best_control}"
+        if self.promise is not None and self.promise.comparison != "better":
+            kind = f"{kind}, {self.promise.comparison} than {self.promise.best_control}"
         if self.promise is not None and self.promise.draft:
             kind = f"draft {kind}"
         fix = "Wrap the piece smoothly round the object" if self.bent else "Fix the piece flat on the object"
         return {"sheet_id": self.sheet_id, "kind": kind, "design": size, "piece": size, "fix": fix}
 
     def pictures(self, rect_mm: RectMm) -> tuple[tuple[RectMm, np.ndarray], ...]:
-        """The design in that rectangle, or nothing."""
+        """The design at `rect_mm` as the pictures of a page; none for white paper."""
         return () if self.design_srgb8 is None else ((rect_mm, self.design_srgb8),)
 
     def manifest(self, page: PageLayout, template: Template, cut_mm: RectMm, design_page: int = 1) -> Manifest:
-        """The manifest of its page, and of its design within the cut line."""
+        """The manifest of the page, with the design within the cut line."""
         manifest = page_manifest(page, template, cut_mm, self.sheet_id, self.kind, self.settings)
         design, pixels = None, self.design_srgb8
         if pixels is not None:
@@ -89,7 +87,7 @@ def page_manifest(
     kind: str,
     settings: dict[str, Any],
 ) -> Manifest:
-    """The manifest of a sheet's one page, without a design."""
+    """The manifest of a page without a design."""
     return Manifest(
         version=2,
         sheet_id=sheet_id,
@@ -106,5 +104,5 @@ def page_manifest(
 
 
 def png_base64(pixels: np.ndarray) -> str:
-    """uint8 H×W×3 pixels as a PNG in base64."""
+    """Encode uint8 H×W×3 pixels as a PNG in base64."""
     return base64.b64encode(image_bytes(pixels, "PNG", {"optimize": True})).decode()

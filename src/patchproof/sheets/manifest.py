@@ -1,8 +1,8 @@
 """SHEET.json: the exact geometry of a printed sheet and the promise that was made before printing.
 
 Millimeters from the page's top-left corner, x right, y down; pages count from 1; rates in [0, 1]; unknown figures null.
-The manifest is all that the judge gets to see of the design's making, so it carries the design's own pixels (PNG,
-base64) beside their SHA-256, which is taken over the raw RGB bytes, row by row.
+Verification knows of a design only its manifest, which therefore holds the design's pixels (PNG, base64) and their
+SHA-256 over the raw RGB bytes, row by row.
 """
 
 from __future__ import annotations
@@ -31,35 +31,36 @@ Rect = tuple[Mm, Mm, SizeMm, SizeMm]
 Interval = tuple[Share, Share]
 SignedInterval = tuple[Finite, Finite]
 Comparison = Literal["better", "no better", "worse"]
-PAGE_CODE = "^patchproof:([0-9A-Z]{10}):([0-9a-z]+)$"  # what a page's QR code says
-_LEAST_MARKER_MM = 1.0
-Page = Annotated[int, Field(ge=1, le=1000)]
+PAGE_CODE_PATTERN = "^patchproof:([0-9A-Z]{10}):([0-9a-z]+)$"  # text of a page's QR code
+_MIN_MARKER_MM = 1.0
+PageNumber = Annotated[int, Field(ge=1, le=1000)]
 DesignSidePx = Annotated[int, Field(ge=1, le=2048)]  # designs have up to 512 pixels
 Count = Annotated[int, Field(ge=1, le=1_000_000)]
 
 
 class Design(StrictModel):
-    """The printed pixels and where they lie."""
+    """The printed pixels and their place."""
 
     sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
     rect_mm: Rect
     size_px: tuple[DesignSidePx, DesignSidePx]
-    page: Page
+    page: PageNumber
     png: str
 
     def pixels(self) -> np.ndarray:
-        """The design as uint8 H×W×3 sRGB; refused where it is not the one that the hash names."""
+        """Decode the design to uint8 H×W×3 sRGB; refused if its hash is not `sha256`."""
         expected, do = "the design's pixels in the manifest", "make the sheet again"
         try:
             png = base64.b64decode(self.png, validate=True)
         except ValueError as error:
-            raise Refused(expected, "none that can be read", do) from error
+            raise Refused(expected, f"text that is not base64 ({error})", do) from error
         with open_image(png, expected, do) as image:
             if image.size != self.size_px:
                 raise ValueError(f"{image.width} × {image.height} pixels")
             pixels = np.asarray(image.convert("RGB"))
-        if design_sha256(pixels) != self.sha256:
-            raise Refused("the design that the manifest names", "other pixels", do)
+        if (found := design_sha256(pixels)) != self.sha256:
+            got = f"pixels with SHA-256 {found[:16]}..."
+            raise Refused(f"the design with SHA-256 {self.sha256[:16]}... in the manifest", got, do)
         return pixels
 
 
@@ -69,46 +70,46 @@ class Marker(StrictModel):
     dictionary: Annotated[str, Field(pattern="^DICT_(4X4|5X5|6X6|7X7)_(50|100|250|1000)$")]
     id: Annotated[int, Field(ge=0)]
     corners_mm: tuple[Point, Point, Point, Point]
-    page: Page
+    page: PageNumber
 
     @model_validator(mode="after")
-    def _possible(self) -> Marker:
+    def _is_plausible(self) -> Marker:
         if self.id >= int(self.dictionary.rpartition("_")[2]):
-            raise ValueError(f"marker {self.id} is not one of {self.dictionary}")
+            raise ValueError(f"marker {self.id} is not in {self.dictionary}")
         for i in range(4):  # twice the area of each corner's triangle, y down
             (ax, ay), (bx, by), (cx, cy) = (self.corners_mm[(i + j) % 4] for j in range(3))
-            if (bx - ax) * (cy - by) - (by - ay) * (cx - bx) < _LEAST_MARKER_MM**2:
-                raise ValueError(f"marker {self.id} must run clockwise round more than {_LEAST_MARKER_MM:g} mm")
+            if (bx - ax) * (cy - by) - (by - ay) * (cx - bx) < _MIN_MARKER_MM**2:
+                raise ValueError(f"marker {self.id} must have clockwise corners and sides over {_MIN_MARKER_MM:g} mm")
         return self
 
 
 class Swatch(StrictModel):
-    """One patch of known sRGB color."""
+    """One swatch of known sRGB color."""
 
     rect_mm: Rect
     srgb: tuple[Share, Share, Share]
-    page: Page
+    page: PageNumber
 
 
 class Tile(StrictModel):
-    """One page of a piece larger than the page. The piece's markers on it are those within `cut_mm`; the others lie in
-    its trimmed margin and on its flaps, and serve to check the page alone.
+    """One page of a piece larger than the page. The piece's own markers lie within `cut_mm`; other markers lie in the
+    trimmed margin and on the flaps, and are for checks of single pages.
     """
 
-    page: Page
+    page: PageNumber
     page_from_design_mm: tuple[tuple[Mm, Mm, Mm], tuple[Mm, Mm, Mm]]
-    cut_mm: Rect  # on the page: what shows of it when the piece is assembled
+    cut_mm: Rect  # on the page: the part that is visible when the piece is assembled
 
     @model_validator(mode="after")
     def _invertible(self) -> Tile:
         (a, b, _), (c, d, _) = self.page_from_design_mm
         if not 0.5 < a * d - b * c < 2:  # both are millimeters
-            raise ValueError("must have page_from_design_mm that turns and shifts")
+            raise ValueError(f"must have page_from_design_mm of determinant 1, not {a * d - b * c:g}")
         return self
 
 
 class Target(StrictModel):
-    """What should be recognized; `indices` are the labels that count, the target's first."""
+    """The label to recognize; `indices` are all labels that count, the target's first."""
 
     label: str
     indices: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)]
@@ -116,8 +117,8 @@ class Target(StrictModel):
 
 
 class ModelClaim(StrictModel):
-    """One network's promised rate. Its name is as written; SHA-256 of its file where there is one; of a detector the
-    score from which on its boxes count.
+    """One network's promised rate. `name` is that of the scene file, `sha256` that of the network's file if it has one,
+    `least_score` a detector's smallest score that counts.
     """
 
     name: str
@@ -129,7 +130,7 @@ class ModelClaim(StrictModel):
 
 
 class ControlClaim(StrictModel):
-    """A control on `n` of the same conditions; `difference` is the design's rate there minus the control's."""
+    """A control's rate on `n` of the same conditions; `difference` is the design's rate there minus the control's."""
 
     n: Count
     rate: Share
@@ -140,7 +141,7 @@ class ControlClaim(StrictModel):
 
 
 class ConditionClaim(StrictModel):
-    """What a photograph can show of one promised condition, and whether it was recognized."""
+    """The observable figures of one promised condition, and whether the design was recognized under it."""
 
     px_per_mm: Annotated[Finite, Field(ge=0, le=1e4)] | None
     tilt_deg: Annotated[Finite, Field(ge=0, le=180)] | None
@@ -151,10 +152,10 @@ class ConditionClaim(StrictModel):
 
 
 class Promise(StrictModel):
-    """The predicted rate of the primary (first) model, made before printing: of `n` conditions, `per_session` in a row
-    of one session. `places` has a number for each session's place where some share one. A `draft` was made of few
-    conditions, to try things out. `outermost_mm` are the object's outermost points in the piece's frame, where a
-    detector's boxes are compared with it.
+    """The rate of the primary (first) model, predicted before printing from `n` conditions, of which `per_session`
+    successive ones form a session. `places` numbers each session's place if some share one. A `draft` is a preview from
+    few conditions. `outermost_mm` are the object's outermost points in the piece's frame, for comparing a detector's
+    boxes with the object.
     """
 
     target: Target
@@ -170,50 +171,50 @@ class Promise(StrictModel):
     conditions: tuple[ConditionClaim, ...]
 
     @model_validator(mode="after")
-    def _says_all_conditions(self) -> Promise:
+    def _lists_all_conditions(self) -> Promise:
         if len(self.conditions) != self.n:
-            raise ValueError(f"must say all of its {self.n} conditions, not {len(self.conditions)}")
+            raise ValueError(f"must list all of its {self.n} conditions, not {len(self.conditions)}")
         return self
 
     @property
     def sessions(self) -> int:
-        """How many sessions it was made of."""
+        """The number of sessions among the conditions."""
         return -(-self.n // self.per_session)
 
     @cached_property
-    def spread(self) -> RatePosterior:
-        """What its conditions say of photographs to come."""
+    def posterior(self) -> RatePosterior:
+        """The posterior of the rate given the conditions, which predicts new photographs."""
         hits = [condition.recognized for condition in self.conditions]
         places = self.places if len(self.places) == self.sessions else ()
         return rate_posterior(*count_by_session(hits, self.per_session, places))
 
     @property
     def best_control(self) -> str:
-        """The control that is hardest to beat."""
+        """The name of the control that is hardest to beat."""
         return max(self.controls, key=lambda name: self.target.goal.sign * self.controls[name].rate)
 
     @property
-    def worth(self) -> Comparison:
-        """The design beside its best control: "better" or "worse" where the interval of their difference says so."""
+    def comparison(self) -> Comparison:
+        """The design's rate compared with the best control's; "no better" if their difference's interval holds 0."""
         ends = [self.target.goal.sign * end for end in self.controls[self.best_control].difference_interval]
         return "better" if min(ends) > 0 else "worse" if max(ends) < 0 else "no better"
 
     @property
-    def hint(self) -> str:
-        """How a draft's sentences begin."""
+    def draft_prefix(self) -> str:
+        """The beginning of sentences about a draft; "" for a full promise."""
         return f"Draft of {self.n} views, no more than a hint: " if self.draft else ""
 
     @property
     def headline(self) -> str:
-        """What the design is worth, in a sentence; the rates are those of the views that both were shown in."""
+        """A sentence that compares the design with its best control in the views that were rendered of both."""
         control = self.controls[self.best_control]
         low, high = (100 * end for end in control.difference_interval)
-        advice = "" if self.worth == "better" else " Try another place, size or seed before printing it."
+        advice = "" if self.comparison == "better" else " Try another place, size or seed before printing it."
         rate = control.rate + control.difference
         shared = "" if abs(rate - self.rate) < 5e-4 else " in the same views"
         points = f"{100 * control.difference:+.1f} points [{low:+.1f}, {high:+.1f}]"
         return (
-            f"{self.hint}{self.worth} than its best control ({self.best_control}): {rate:.1%} beside "
+            f"{self.draft_prefix}{self.comparison} than its best control ({self.best_control}): {rate:.1%} beside "
             f"{control.rate:.1%} recognized{shared}, {points}.{advice}"
         )
 
@@ -228,10 +229,10 @@ class Promise(StrictModel):
         return notebook_html(self.headline, self.figures())
 
 
-_table: Any = create_model  # its types leave unions out
-# What is read of a manifest's settings when its sheet is judged; other keys may say anything.
-_Used = _table(
-    "_Used",
+_table: Any = create_model  # the stub of create_model lacks unions
+# The settings that verification reads; other keys may hold anything.
+_VerifiedSettings = _table(
+    "_VerifiedSettings",
     printer=(_table("_Printer", profile=(str, "")) | None, None),
     camera=(_table("_Camera", noise=(NotNegativeRange, ()), photo_px=(tuple[Count, Count] | None, None)), None),
     target=(_table("_Target", label=(str | int, ""), accept=(tuple[str | int, ...], ())), None),
@@ -241,7 +242,7 @@ _Used = _table(
 
 
 class Manifest(StrictModel):
-    """A whole SHEET.json; `design` is null on pages that carry none, `promise` on pages that promise nothing."""
+    """A whole SHEET.json; `design` and `promise` are null on pages without one."""
 
     version: Literal[2]
     sheet_id: Annotated[str, Field(pattern="^[0-9A-Z]{10}$")]
@@ -252,8 +253,8 @@ class Manifest(StrictModel):
     chart: tuple[Swatch, ...]
     cut_mm: Rect
     ruler_mm: tuple[SizeMm, SizeMm]
-    page_code: Annotated[str, Field(pattern=PAGE_CODE)] | None = None  # of a page that several designs share
-    plan_page: Page | None = None  # the page for people: where the piece goes, and how to photograph it
+    page_code: Annotated[str, Field(pattern=PAGE_CODE_PATTERN)] | None = None  # of a page that several designs share
+    plan_page: PageNumber | None = None  # the page for people: the place of the piece, and how to photograph it
     tiles: tuple[Tile, ...] = ()
     promise: Promise | None
     settings: dict[str, Any]
@@ -261,7 +262,7 @@ class Manifest(StrictModel):
     @field_validator("settings")
     @classmethod
     def _usable(cls, settings: dict[str, Any]) -> dict[str, Any]:
-        _Used.model_validate(settings)
+        _VerifiedSettings.model_validate(settings)
         return settings
 
     @model_validator(mode="after")
@@ -271,13 +272,13 @@ class Manifest(StrictModel):
         return self
 
     def page_from_design_page(self, page: int) -> np.ndarray:
-        """3×3 from the millimeters that a piece of tiles has, those of the design's page (the first tile's without a
-        design), to another tile's; pages without a tile keep their own.
+        """Map 3×3 from millimeters of the design's page (without a design: the first tile's) to those of another
+        tile's page; the identity for pages without a tile.
         """
-        square = {tile.page: np.vstack([np.array(tile.page_from_design_mm), [0, 0, 1]]) for tile in self.tiles}
-        if page not in square:
+        maps = {tile.page: np.vstack([np.array(tile.page_from_design_mm), [0, 0, 1]]) for tile in self.tiles}
+        if page not in maps:
             return np.eye(3)
-        return square[page] @ np.linalg.inv(square[self.design.page if self.design else self.tiles[0].page])
+        return maps[page] @ np.linalg.inv(maps[self.design.page if self.design else self.tiles[0].page])
 
 
 def design_sha256(pixels: np.ndarray) -> str:
@@ -286,12 +287,12 @@ def design_sha256(pixels: np.ndarray) -> str:
 
 
 def dump_manifest(manifest: Manifest) -> str:
-    """Its JSON text: the same manifest gives the same bytes."""
+    """Format a manifest as JSON; equal manifests give equal bytes."""
     return json.dumps(manifest.model_dump(), indent=1, allow_nan=False) + "\n"
 
 
 def load_manifest(path: str | Path) -> Manifest:
-    """A SHEET.json; refused in one sentence where it is missing, broken, or not one."""
-    beside = "name the JSON that was written beside the PDF"
-    data = read_json(path, "a manifest (SHEET.json)", "make the sheet again", beside)
+    """Load a SHEET.json; refused if it is missing, damaged, or not a manifest."""
+    missing = "name the JSON that was written beside the PDF"
+    data = read_json(path, "a manifest (SHEET.json)", "make the sheet again", missing)
     return validate_model(Manifest, data, str(path))

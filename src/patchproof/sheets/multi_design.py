@@ -1,11 +1,11 @@
-"""Several designs on one page, each with its own piece, markers and manifest.
+"""Write a page with several designs, each with its own piece, markers and manifest.
 
-In: what `write_sheet` takes, once for each design. Out: SHEET.pdf and SHEET_1.json, SHEET_2.json... in the order of the
-designs, all of which the PDF carries; behind the page follows each design's plan, where it has one. The page has an id
-of its own and one code for all of them: a code that lists three designs or more is too fine to be read at 150 dpi.
-Pieces keep the marker ids that they were promised with. Ids come from 1000 by hash, so two sheets may share one; the
-page's own markers avoid all of them, and in a design's manifest the others' markers stand among the page's where no
-other has their id, so that a photograph of the uncut page is known as one.
+In: the contents that `write_sheet` takes, one for each design. Out: SHEET.pdf and SHEET_1.json, SHEET_2.json... in the
+order of the designs, all of them attached to the PDF, in which each design's plan follows the page. The page has an id
+of its own and one QR code for all designs: a code that lists three or more is too fine to be read at 150 dpi.
+Pieces keep the marker ids with which they were promised. These are 1000 ids ordered by hash, so two sheets may share
+one; the page's own markers avoid all of them. A design's manifest lists the other designs' markers with those of the
+page if their id is unique on it, so that a photograph of the uncut page can be recognized.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from patchproof.sheets.layout import PageLayout
 from patchproof.sheets.manifest import Manifest, design_sha256
 from patchproof.sheets.page import lay_out_parts, piece_name, place_pieces
 from patchproof.sheets.pdf import PdfPage
-from patchproof.sheets.piece import hash_order, moved_marker, sheet_id
+from patchproof.sheets.piece import hash_order, move_marker, sheet_id
 from patchproof.sheets.piece_words import piece_words
 from patchproof.sheets.plan_page import PlanPage, lay_out_plan
 from patchproof.sheets.rects import PointMm, size_text
 from patchproof.sheets.template import Template
-from patchproof.sheets.write import manifest_paths, pdf_name, save_sheets
+from patchproof.sheets.write import check_pdf_path, manifest_paths, save_sheets
 
 
 def write_several(
@@ -37,26 +37,26 @@ def write_several(
     designs: Sequence[SheetContent],
     plans: Sequence[PlanPage | None] = (),
 ) -> list[Manifest]:
-    """Write the page and a manifest for each design, and behind it the `plans` in the designs' order; refused where two
-    designs are the same sheet.
+    """Write a page with at least two designs and a manifest for each; `plans`, in the order of the designs, become
+    further pages. Refused if two designs belong to the same sheet.
     """
-    pdf_path = pdf_name(pdf_path)
+    pdf_path = check_pdf_path(pdf_path)
     if template.tiles is not None:
         raise Refused("a template of one page for several designs", "one with tiles", "make a sheet of each")
-    same = [key for key, count in Counter((d.sheet_id, d.kind) for d in designs).items() if count > 1]
+    repeated = [key for key, count in Counter((d.sheet_id, d.kind) for d in designs).items() if count > 1]
     if len(designs) < 2:
         raise Refused("several designs", f"{len(designs)}", "use write_sheet for one")
-    if same:
-        raise Refused("designs of different runs", f"sheet {same[0][0]} twice", "use --copies for more of the same")
-    placed = place_pieces(template, [design.piece for design in designs])
+    if repeated:
+        raise Refused("designs of different runs", f"sheet {repeated[0][0]} twice", "use --copies to repeat a design")
+    pieces = place_pieces(template, [design.piece for design in designs])
     identity = sheet_id({"sheets": [[design.sheet_id, design.kind] for design in designs]}, 0)
     code = _page_code(identity, designs)
-    named = [piece_words(design, placed[i][1], piece_name(i)) for i, design in enumerate(designs)]
+    labels = [piece_words(design, pieces[i][1], piece_name(i)) for i, design in enumerate(designs)]
     sizes = " and ".join(sorted({size_text(design.piece.size_mm) for design in designs}))
     fix = "Put each piece on its object as its own plan page shows"
     words = {"sheet_id": identity, "kind": f"{len(designs)} designs", "design": sizes, "piece": sizes, "fix": fix}
-    page = lay_out_parts(template, placed, _page_ids(designs, template), code, words, named)
-    manifests = [_manifest(template, page, design, placed[i][1], i, code) for i, design in enumerate(designs)]
+    page = lay_out_parts(template, pieces, _page_ids(designs, template), code, words, labels)
+    manifests = [_manifest(template, page, design, pieces[i][1], i, code) for i, design in enumerate(designs)]
     pages = [PdfPage(page, tuple(chain(*map(SheetContent.pictures, designs, page.cuts_mm))))]
     for i, plan in enumerate(plans):
         if plan is not None:
@@ -68,14 +68,14 @@ def write_several(
 
 
 def _page_ids(designs: Sequence[SheetContent], template: Template) -> list[int]:
-    """Ids for the page's own markers that no piece has."""
+    """Ids for the page's own markers that no piece uses."""
     used = {marker.id for design in designs for marker in design.piece.markers}
     order = hash_order(" ".join(design.sheet_id for design in designs), 1000)
     return [i for i in order if i not in used][: len(template.marker.corners_mm)]
 
 
 def _page_code(identity: str, designs: Sequence[SheetContent]) -> str:
-    """The page's id, and 16 digits of a SHA-256 over those of its designs."""
+    """The text of the page's QR code: its id, and 16 digits of a SHA-256 over those of its designs."""
     hashes = [design_sha256(design.design_srgb8) for design in designs if design.design_srgb8 is not None]
     return f"patchproof:{identity}:{hashlib.sha256(''.join(hashes).encode()).hexdigest()[:16]}"
 
@@ -83,9 +83,9 @@ def _page_code(identity: str, designs: Sequence[SheetContent]) -> str:
 def _manifest(
     template: Template, page: PageLayout, design: SheetContent, corner: PointMm, index: int, code: str
 ) -> Manifest:
-    """One design's: its own piece first, then everything else on the page whose id cannot be mistaken."""
-    own = [moved_marker(marker, corner) for marker in design.piece.markers]
+    """One design's manifest: the markers of its piece, then all others on the page whose id is unique."""
+    piece_markers = [move_marker(marker, corner) for marker in design.piece.markers]
     counts = Counter(marker.id for marker in page.markers)
-    others = [marker for marker in page.markers if counts[marker.id] == 1 and marker not in own]
-    own_page = replace(page, markers=(*own, *others))
-    return design.manifest(own_page, template, page.cuts_mm[index]).changed(page_code=code)
+    others = [marker for marker in page.markers if counts[marker.id] == 1 and marker not in piece_markers]
+    design_page = replace(page, markers=(*piece_markers, *others))
+    return design.manifest(design_page, template, page.cuts_mm[index]).changed(page_code=code)

@@ -1,11 +1,11 @@
-"""Ink: page layouts and designs become the bytes of a PDF at true size.
+"""Draw page layouts and designs as the bytes of a PDF at true size.
 
 Each marker, and the QR code, is one path of black runs that touch, and a swatch one path of two halves: readers snap
-a lone rectangle to whole pixels but antialias a path of several, which keeps marker corners within hundredths of a
-millimeter. The design is embedded losslessly, pixel for pixel, without interpolation. All colors are sRGB and say
-so: the design's color space is ICCBased, and the page's DefaultRGB gives vector colors the same one. PrintScaling
-None asks viewers not to scale. Nothing depends on time, place or hash order: equal input gives equal bytes. PDF
-points (1/72 inch, y up) and their conversion exist here alone.
+a single rectangle to whole pixels but antialias a path of several, which keeps marker corners within hundredths of a
+millimeter. The design is embedded losslessly, pixel for pixel, without interpolation. All colors are declared as sRGB:
+the design's color space is ICCBased, and the page's DefaultRGB gives vector colors the same one. PrintScaling None asks
+viewers not to scale. Nothing depends on time, machine or hash order: equal input gives equal bytes. Only this module
+and `pdf_raster` know PDF points (1/72 inch, y up).
 """
 
 from __future__ import annotations
@@ -28,26 +28,26 @@ if TYPE_CHECKING:
 
 POINTS_PER_MM = 72 / MM_PER_INCH
 ATTACHMENT = "sheet.json"
-_ATTACHED = "geometry and promise of this sheet"
+_DESCRIPTION = "geometry and promise of this sheet"
 
 
-def numbered(name: str, index: int) -> str:
-    """sheet.json as sheet_1.json, the first of several."""
+def numbered_name(name: str, index: int) -> str:
+    """The name of file `index`, from 0, of several: sheet_1.json for sheet.json and 0."""
     stem, dot, suffix = name.rpartition(".")
     return f"{stem}_{index + 1}{dot}{suffix}"
 
 
 @dataclass(frozen=True)
 class PdfPage:
-    """A page and its pictures: (rectangle in mm, uint8 H×W×3 sRGB). Those of `windowed` show in the window alone."""
+    """A page and its pictures (rectangle in mm, uint8 H×W×3 sRGB); `window_pictures` are clipped at the window."""
 
     layout: PageLayout
     pictures: tuple[tuple[RectMm, np.ndarray], ...] = ()
-    windowed: tuple[tuple[RectMm, np.ndarray], ...] = ()
+    window_pictures: tuple[tuple[RectMm, np.ndarray], ...] = ()
 
 
 def srgb_profile() -> bytes:
-    """An ICC profile of sRGB without the day it was made."""
+    """An ICC profile of sRGB with a fixed date."""
     from PIL import ImageCms
 
     profile = bytearray(ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes())
@@ -57,12 +57,12 @@ def srgb_profile() -> bytes:
     return bytes(profile)
 
 
-def _drawn(pages: Sequence[PdfPage], title: str) -> bytes:
+def _draw_pages(pages: Sequence[PdfPage], title: str) -> bytes:
     from reportlab import rl_config
     from reportlab.pdfgen.canvas import Canvas
 
     buffer = io.BytesIO()
-    before, rl_config.useA85 = rl_config.useA85, 0  # ASCII85 would make the image a quarter larger
+    use_a85, rl_config.useA85 = rl_config.useA85, 0  # ASCII85 would make images a quarter larger
     try:
         canvas = Canvas(buffer, invariant=1, pdfVersion=(1, 7), pageCompression=1, lang="en")
         canvas.setTitle(title)
@@ -72,29 +72,28 @@ def _drawn(pages: Sequence[PdfPage], title: str) -> bytes:
             canvas.setPageSize((width, height))
             canvas.setTrimBox((0, 0, width, height))
             canvas.setBleedBox((0, 0, width, height))
-            # from here on millimeters with y up
-            canvas.scale(POINTS_PER_MM, POINTS_PER_MM)
-            _draw(canvas, page)
+            canvas.scale(POINTS_PER_MM, POINTS_PER_MM)  # from here on millimeters, y up
+            _draw_page(canvas, page)
             canvas.showPage()
         canvas.save()
     finally:
-        rl_config.useA85 = before
+        rl_config.useA85 = use_a85
     return buffer.getvalue()
 
 
-def _draw(canvas: Canvas, page: PdfPage) -> None:
+def _draw_page(canvas: Canvas, page: PdfPage) -> None:
     layout, height = page.layout, page.layout.page_mm[1]
     _draw_parts(canvas, page.pictures, layout.swatches, layout.markers, height)
     for rects in (layout.qr_mm, layout.squares_mm):
         if rects:
-            _fill(canvas, rects, (0.0, 0.0, 0.0), height)
+            _fill_rects(canvas, rects, (0.0, 0.0, 0.0), height)
     if layout.window is not None:
         x, y, w, h = layout.window.rect_mm
         canvas.saveState()
         path = canvas.beginPath()
         path.rect(x, height - y - h, w, h)
         canvas.clipPath(path, stroke=0, fill=0)
-        _draw_parts(canvas, page.windowed, (), layout.window.markers, height)
+        _draw_parts(canvas, page.window_pictures, (), layout.window.markers, height)
         canvas.restoreState()
     canvas.setStrokeGray(0)
     for line in layout.ticks:
@@ -103,7 +102,7 @@ def _draw(canvas: Canvas, page: PdfPage) -> None:
         canvas.line(x0, height - y0, x1, height - y1)
     canvas.setStrokeGray(0.45)
     for rect in layout.cuts_mm:
-        x, y, w, h = grow_rect(rect, CUT_LINE_MM / 2)  # just outside of what is cut out
+        x, y, w, h = grow_rect(rect, CUT_LINE_MM / 2)  # just outside of the cut
         canvas.setLineWidth(CUT_LINE_MM)
         canvas.setDash(2.0, 1.5)
         canvas.rect(x, height - y - h, w, h)
@@ -121,12 +120,12 @@ def _draw_parts(canvas: Canvas, pictures, swatches, markers, height: float) -> N
     for (x, y, w, h), pixels in pictures:
         canvas.drawImage(ImageReader(Image.fromarray(pixels)), x, height - y - h, w, h, mask=None)
     for (x, y, w, h), srgb in swatches:
-        _fill(canvas, [(x, y, w / 2, h), (x + w / 2, y, w / 2, h)], srgb, height)
+        _fill_rects(canvas, [(x, y, w / 2, h), (x + w / 2, y, w / 2, h)], srgb, height)
     for marker in markers:
-        _fill(canvas, marker_rects_mm(marker), (0.0, 0.0, 0.0), height)
+        _fill_rects(canvas, marker_rects_mm(marker), (0.0, 0.0, 0.0), height)
 
 
-def _fill(canvas: Canvas, rects: Any, srgb: Srgb, height: float) -> None:
+def _fill_rects(canvas: Canvas, rects: Any, srgb: Srgb, height: float) -> None:
     path = canvas.beginPath()
     for x, y, w, h in rects:
         path.rect(x, height - y - h, w, h)
@@ -135,13 +134,13 @@ def _fill(canvas: Canvas, rects: Any, srgb: Srgb, height: float) -> None:
 
 
 def pages_pdf(pages: Sequence[PdfPage], title: str, attachments: dict[str, str]) -> bytes:
-    """The finished PDF of pages of any sizes, with manifests attached by their names; color spaces, attachments and
-    plain metadata are what reportlab cannot write.
+    """Make the PDF of pages of any sizes, with the texts of `attachments` (by file name) attached. pikepdf adds the
+    color spaces, attachments and minimal metadata, which reportlab cannot write.
     """
     import pikepdf
     from pikepdf import Array, Name
 
-    with pikepdf.open(io.BytesIO(_drawn(pages, title))) as pdf:
+    with pikepdf.open(io.BytesIO(_draw_pages(pages, title))) as pdf:
         icc = pdf.make_stream(srgb_profile(), N=3, Alternate=Name.DeviceRGB)
         space = pdf.make_indirect(Array([Name.ICCBased, icc]))
         for page in pdf.pages:
@@ -150,9 +149,9 @@ def pages_pdf(pages: Sequence[PdfPage], title: str, attachments: dict[str, str])
             for image in resources.get("/XObject", {}).values():
                 image.ColorSpace = space
         for name, text in attachments.items():
-            about = {"filename": name, "mime_type": "application/json", "description": _ATTACHED}
-            attached: Any = pikepdf.AttachedFileSpec  # its stub lacks the relationship
-            pdf.attachments[name] = attached(pdf, text.encode(), relationship=Name.Data, **about)
+            about = {"filename": name, "mime_type": "application/json", "description": _DESCRIPTION}
+            file_spec: Any = pikepdf.AttachedFileSpec  # its stub lacks the relationship
+            pdf.attachments[name] = file_spec(pdf, text.encode(), relationship=Name.Data, **about)
         for key in {"/CreationDate", "/ModDate", "/Author", "/Subject", "/Keywords", "/Creator"} & set(pdf.docinfo):
             del pdf.docinfo[key]
         _drop_unused_font(pdf)
@@ -162,14 +161,14 @@ def pages_pdf(pages: Sequence[PdfPage], title: str, attachments: dict[str, str])
 
 
 def _drop_unused_font(pdf: Any) -> None:
-    """Take out Helvetica, which reportlab selects at the top of every page: unused, but not embedded either."""
+    """Remove Helvetica, which reportlab selects at the top of every page without using or embedding it."""
     import pikepdf
 
     fonts = pdf.pages[0].obj.Resources.Font  # one dictionary that all pages share
-    loose = [name for name, font in fonts.items() if "/FontDescriptor" not in font]
+    not_embedded = [name for name, font in fonts.items() if "/FontDescriptor" not in font]
     for page in pdf.pages:
         content = pikepdf.parse_content_stream(page)
-        content = [i for i in content if str(i.operator) != "Tf" or str(i.operands[0]) not in loose]
+        content = [i for i in content if str(i.operator) != "Tf" or str(i.operands[0]) not in not_embedded]
         page.Contents = pdf.make_stream(pikepdf.unparse_content_stream(content))
-    for name in loose:
+    for name in not_embedded:
         del fonts[name]

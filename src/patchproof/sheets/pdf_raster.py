@@ -1,9 +1,9 @@
-"""The way back: a sheet's PDF as pixels on an exact millimeter grid, and the manifest that it carries.
+"""Render a sheet's PDF to pixels on an exact millimeter grid, and read the manifest that is attached to it.
 
 In: a PDF and a resolution. Out: uint8 H×W×3 sRGB. The page is rendered by PDFium, which did not write it. PDFium
-stretches a page to a whole number of pixels (0.2 mm across A4 at 150 dpi), so the part wanted is first made a page of
-its own whose size is a whole number of pixels; then pixel and millimeter differ by a scale alone.
-Left out on purpose: pages at the same time. PDFium is not thread-safe; render in processes.
+stretches a page to a whole number of pixels (0.2 mm across A4 at 150 dpi), so the requested part is first made a page
+whose size is a whole number of pixels; then pixels are millimeters times a scale.
+Left out on purpose: rendering pages in parallel. PDFium is not thread-safe; render in several processes.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ import numpy as np
 
 from patchproof.base.errors import Refused, TimeLimitExceeded
 from patchproof.base.geometry import MM_PER_INCH
-from patchproof.base.input import MAX_JSON_BYTES, ReturnType, is_file, left_behind, within_time
+from patchproof.base.input import MAX_JSON_BYTES, ReturnType, is_file, run_in_daemon_thread, run_within_time
 from patchproof.base.validation import validate_model
 from patchproof.sheets.manifest import Manifest
-from patchproof.sheets.pdf import ATTACHMENT, POINTS_PER_MM, numbered
+from patchproof.sheets.pdf import ATTACHMENT, POINTS_PER_MM, numbered_name
 
-LARGEST_PX = 20_000  # along a side,
-MOST_PX = 160_000_000  # and in all: 0.5 GB, A2 at 600 dpi
-_AT_WORK = threading.Lock()  # of PDFium, which may have been left behind with a page
+MAX_SIDE_PX = 20_000
+MAX_PAGE_PX = 160_000_000  # 0.5 GB, A2 at 600 dpi
+_PDFIUM_LOCK = threading.Lock()  # an abandoned thread may still be rendering
 
 
 def rasterize_page(pdf_path: str | Path, number: int = 1, dpi: float = 150.0) -> np.ndarray:
-    """A page (from 1) with pixel = mm × dpi / 25.4; the last row and column may pass the page's edge."""
+    """Render page `number` (from 1) with pixel = mm × dpi / 25.4; the last row and column may exceed the page."""
     import pypdfium2.raw as pdfium
 
     def pixels(page) -> np.ndarray:
@@ -42,20 +42,20 @@ def rasterize_page(pdf_path: str | Path, number: int = 1, dpi: float = 150.0) ->
         width, height = (math.ceil(side / 72 * dpi - 1e-3) for side in sides)
         return _render(page, (0.0, 0.0, width * 72 / dpi, height * 72 / dpi), (width, height))
 
-    return _of_page(pdf_path, number, pixels)
+    return _call_with_page(pdf_path, number, pixels)
 
 
 def page_count(pdf_path: str | Path) -> int:
-    """How many pages a PDF has."""
+    """The number of pages of a PDF."""
     import pypdfium2.raw as pdfium
 
-    return _within_time(pdf_path, pdfium.FPDF_GetPageCount)
+    return _call_with_pdf(pdf_path, pdfium.FPDF_GetPageCount)
 
 
 def rasterize_piece(pdf_path: str | Path, manifest: Manifest, dpi: float) -> np.ndarray:
-    """The piece alone: its cut line is exactly the picture's border, so that pixel = mm × width_px / width_mm.
+    """Render the piece only: its cut line is exactly the picture's border, so that pixel = mm × width_px / width_mm.
 
-    The number of pixels is the nearest whole one, so each axis' resolution differs from `dpi` by at most half a pixel.
+    The numbers of pixels are rounded, so width and height differ from those at `dpi` by at most half a pixel.
     """
     width, height = (max(round(side / MM_PER_INCH * dpi), 1) for side in manifest.cut_mm[2:])
     _refuse_size((width, height))
@@ -66,7 +66,7 @@ def rasterize_piece(pdf_path: str | Path, manifest: Manifest, dpi: float) -> np.
     px_per_mm = np.array([width, height]) / manifest.cut_mm[2:]
     for tile in manifest.tiles:
         start_mm = np.array(tile.cut_mm[:2]) - np.array(tile.page_from_design_mm)[:, 2]  # in piece millimeters
-        # whole pixels that begin on the tile; its picture runs on far enough on its flaps to fill the last one
+        # whole pixels that begin on the tile; its picture extends far enough over the flaps to fill the last one
         first = np.ceil(start_mm * px_per_mm - 1e-6).astype(int)
         last = np.ceil((start_mm + tile.cut_mm[2:]) * px_per_mm - 1e-6).astype(int).clip(max=[width, height])
         corner = np.array(tile.cut_mm[:2]) + first / px_per_mm - start_mm
@@ -78,41 +78,42 @@ def rasterize_piece(pdf_path: str | Path, manifest: Manifest, dpi: float) -> np.
 
 def _part_pixels(pdf_path: str | Path, number: int, rect_mm: tuple, size_px: tuple[int, int]) -> np.ndarray:
     rect_points = tuple(float(v) * POINTS_PER_MM for v in rect_mm)
-    return _of_page(pdf_path, number, lambda page: _render(page, rect_points, size_px))
+    return _call_with_page(pdf_path, number, lambda page: _render(page, rect_points, size_px))
 
 
 def attached_manifest(pdf_path: str | Path, sheet_id: str | None = None) -> Manifest:
-    """The manifest inside a sheet's PDF; of several designs' page that of `sheet_id`, else the first."""
+    """Read the manifest attached to a sheet's PDF; on a page of several designs that of `sheet_id`, else the first."""
     import pikepdf
 
-    _existing(pdf_path)
+    _check_exists(pdf_path)
     try:
         with pikepdf.open(pdf_path) as pdf:
-            names = sorted(set(pdf.attachments) & {ATTACHMENT, *(numbered(ATTACHMENT, i) for i in range(99))})
-            texts = [json.loads(_unpacked(pdf.attachments[name].get_file().obj)) for name in names]
+            names = sorted(set(pdf.attachments) & {ATTACHMENT, *(numbered_name(ATTACHMENT, i) for i in range(99))})
+            texts = [json.loads(_decompress(pdf.attachments[name].get_file().obj)) for name in names]
     except pikepdf.PdfError as error:
         raise _unreadable(pdf_path) from error
-    except Exception as error:  # objects of other kinds than they should be fail in many ways
-        raise Refused(f"a PDF with {ATTACHMENT} attached", f"{pdf_path} without", "make the sheet again") from error
+    except Exception as error:  # objects of unexpected types fail in many ways
+        got = f"{pdf_path} with one that cannot be read"
+        raise Refused(f"a PDF with {ATTACHMENT} attached", got, "make the sheet again") from error
     if not texts:
-        raise Refused(f"a PDF with {ATTACHMENT} attached", f"{pdf_path} without", "make the sheet again")
+        raise Refused(f"a PDF with {ATTACHMENT} attached", f"{pdf_path} without one", "make the sheet again")
     manifests = [
         validate_model(Manifest, data, f"{name} of {pdf_path}") for name, data in zip(names, texts, strict=True)
     ]
     return next((manifest for manifest in manifests if manifest.sheet_id == sheet_id), manifests[0])
 
 
-def _unpacked(stream) -> bytes:
-    """An attachment's bytes, as far as a manifest may be long: pikepdf's own reading has no bound."""
-    packing = stream.get("/Filter")
-    if packing is None:
+def _decompress(stream) -> bytes:
+    """An attachment's bytes, up to the largest size of a manifest: pikepdf's own decompression has no limit."""
+    compression = stream.get("/Filter")
+    if compression is None:
         return stream.read_raw_bytes()
-    if str(packing) != "/FlateDecode":
-        raise ValueError(f"packed by {packing}")
+    if str(compression) != "/FlateDecode":
+        raise ValueError(f"compressed by {compression}")
     return zlib.decompressobj().decompress(stream.read_raw_bytes(), MAX_JSON_BYTES)
 
 
-def _existing(pdf_path: str | Path) -> None:
+def _check_exists(pdf_path: str | Path) -> None:
     if not is_file(pdf_path):
         raise Refused("a PDF of a sheet", f"no file at {pdf_path}", "check the path")
 
@@ -121,15 +122,15 @@ def _unreadable(pdf_path: str | Path) -> Refused:
     return Refused("a PDF of a sheet", f"{pdf_path}, which cannot be read", "make the sheet again")
 
 
-def _within_time(pdf_path: str | Path, work: Callable[[Any], ReturnType]) -> ReturnType:
-    """What `work` makes of PDFium's handle of a file; refused where that takes too long: a few lines may draw forms in
-    forms a million times. PDFium's own calls alone: the package's objects are closed at the end of the process, which a
-    page that is still being drawn does not survive.
+def _call_with_pdf(pdf_path: str | Path, work: Callable[[Any], ReturnType]) -> ReturnType:
+    """Call `work` with PDFium's handle of a file; refused if that takes too long, because a few lines may draw nested
+    forms a million times. Only PDFium's raw calls are used: objects of pypdfium2 are closed at the end of the process,
+    which crashes while a page is still being rendered.
     """
     import pypdfium2.raw as pdfium
 
-    def done() -> ReturnType:
-        with _AT_WORK:
+    def call() -> ReturnType:
+        with _PDFIUM_LOCK:
             pdf = pdfium.FPDF_LoadDocument(os.fsencode(pdf_path), None)
             if not pdf:
                 raise _unreadable(pdf_path)
@@ -138,20 +139,21 @@ def _within_time(pdf_path: str | Path, work: Callable[[Any], ReturnType]) -> Ret
             finally:
                 pdfium.FPDF_CloseDocument(pdf)
 
-    _existing(pdf_path)
+    _check_exists(pdf_path)
     try:
-        return within_time(left_behind, done)
-    except TimeLimitExceeded as over:
+        return run_within_time(run_in_daemon_thread, call)
+    except TimeLimitExceeded as error:
         from pypdfium2._library_scope import destroy_lib
 
-        atexit.unregister(destroy_lib)  # the library is still at work, and is not to be taken down
-        raise Refused("a page that is soon drawn", f"{pdf_path}, which takes {over}", "make the sheet again") from None
+        atexit.unregister(destroy_lib)  # the library is still working and must not be unloaded
+        expected = "a page that can be drawn in time"
+        raise Refused(expected, f"{pdf_path}, which takes {error}", "make the sheet again") from None
 
 
-def _of_page(pdf_path: str | Path, number: int, work: Callable[[Any], np.ndarray]) -> np.ndarray:
+def _call_with_page(pdf_path: str | Path, number: int, work: Callable[[Any], np.ndarray]) -> np.ndarray:
     import pypdfium2.raw as pdfium
 
-    def done(pdf) -> np.ndarray:
+    def call(pdf) -> np.ndarray:
         pages = pdfium.FPDF_GetPageCount(pdf)
         if not 1 <= number <= pages:
             raise Refused(f"a page from 1 to {pages} of {pdf_path}", f"{number}", "ask for another page")
@@ -163,11 +165,11 @@ def _of_page(pdf_path: str | Path, number: int, work: Callable[[Any], np.ndarray
         finally:
             pdfium.FPDF_ClosePage(page)
 
-    return _within_time(pdf_path, done)
+    return _call_with_pdf(pdf_path, call)
 
 
 def _render(page, rect_points: tuple[float, ...], size_px: tuple[int, int]) -> np.ndarray:
-    """The rectangle (x, y, width, height from the page's top-left, in points) as exactly that many pixels."""
+    """Render the rectangle (x, y, width, height from the page's top-left, in points) to exactly `size_px` pixels."""
     import pypdfium2.raw as pdfium
 
     _refuse_size(size_px)
@@ -190,6 +192,6 @@ def _render(page, rect_points: tuple[float, ...], size_px: tuple[int, int]) -> n
 
 def _refuse_size(size_px: tuple[int, int]) -> None:
     width, height = size_px
-    if not 1 <= min(size_px) <= max(size_px) <= LARGEST_PX or width * height > MOST_PX:
-        most = f"at most {LARGEST_PX} pixels along a side, one at least, and {MOST_PX / 1e6:g} million in all"
-        raise Refused(most, f"{width} × {height}", "lower the resolution")
+    if not 1 <= min(size_px) <= max(size_px) <= MAX_SIDE_PX or width * height > MAX_PAGE_PX:
+        expected = f"1 to {MAX_SIDE_PX} pixels along a side, and at most {MAX_PAGE_PX / 1e6:g} million in total"
+        raise Refused(expected, f"{width} × {height}", "lower the resolution")

@@ -1,28 +1,28 @@
-"""What a piece that has been cut out says of itself: which way is up, of which sheet it is, and what it shows.
+"""The texts on a cut piece: its top, its sheet's id and its name.
 
-In: a piece with what belongs to it, and where its top-left corner lies. Out: words and an arrow in the outer millimeter
-of its corner markers' white, which nothing else needs: markers keep their module of white, the design all its pixels.
-Words may be cut off with it, and so nothing that is measured depends on them. Capitals of 0.7 mm are legible at reading
-distance; higher ones would reach into the markers' white, half of which is worth 0.1 mm of a measured corner.
+In: a sheet's content, and the piece's top-left corner. Out: texts and an arrow in the outer millimeter of the corner
+markers' white, so that markers keep their module of white and the design its pixels. They may be lost in cutting, and
+no measurement depends on them. Capitals of 0.7 mm are legible at reading distance; higher ones would reach into the
+markers' quiet zones, and losing half of a quiet zone costs 0.1 mm of a measured corner.
 """
 
 from __future__ import annotations
 
 from patchproof.sheets.content import SheetContent
-from patchproof.sheets.layout import CAP_HEIGHT, Box, Line, Parts, text_width_mm
+from patchproof.sheets.layout import CAP_HEIGHT, Box, Line, PageParts, text_width_mm
 from patchproof.sheets.piece import SCISSORS_MM
 from patchproof.sheets.rects import PointMm, RectMm
 from patchproof.sheets.template import TextLine
 
-SIZE_MM = 0.95  # of the letters
+SIZE_MM = 0.95  # font size
 _CAPS_MM = SIZE_MM * CAP_HEIGHT
-_ASIDE_MM = 0.4  # from the sides of the white: between 8 mm markers' ten of the widest letters still fit
-_ARROW_MM = 0.9  # with the space behind it
+_INSET_MM = 0.4  # from the sides of the white: ten of the widest letters still fit beside an 8 mm marker
+_ARROW_MM = 0.9  # width of the arrow and the space after it
 
 
-def piece_words(content: SheetContent, corner: PointMm, holder: str = "piece") -> Parts:
-    """An arrow and "TOP" over the top-left marker, the sheet's id over the top-right one, and under the bottom-left one
-    as much of the name as fits; `holder` is the part of the page that they lie in.
+def piece_words(content: SheetContent, corner: PointMm, holder: str = "piece") -> PageParts:
+    """An arrow and "TOP" above the top-left marker, the sheet's id above the top-right one, and as much of the name as
+    fits below the bottom-left one; `holder` is the name of the part of the page that contains them.
     """
     top_left, top_right, _, bottom_left = content.piece.reserved_mm[:4]
     lines, texts, boxes = [], [], []
@@ -31,19 +31,18 @@ def piece_words(content: SheetContent, corner: PointMm, holder: str = "piece") -
         (top_right, content.sheet_id, False),
         (bottom_left, content.name.upper(), False),
     ):
-        room = rect[2] - 2 * _ASIDE_MM - (_ARROW_MM if arrow else 0)
-        text = _fitting(text, room)
-        left, top = corner[0] + rect[0] + _ASIDE_MM, corner[1] + _top_of(rect)
+        text = _shorten(text, rect[2] - 2 * _INSET_MM - (_ARROW_MM if arrow else 0))
+        left, top = corner[0] + rect[0] + _INSET_MM, corner[1] + _text_top(rect)
         if arrow:
             lines += _arrow(left, top)
         start, width = left + (_ARROW_MM if arrow else 0), text_width_mm(text, SIZE_MM, True)
         texts.append(TextLine(at_mm=(start, top + _CAPS_MM), size_mm=SIZE_MM, text=text, bold=True, gray=0.2))
         boxes.append(Box(f'words "{text}" of {holder}', (left, top, start + width - left, _CAPS_MM), holder))
-    return Parts(tuple(lines), tuple(texts), tuple(boxes))
+    return PageParts(tuple(lines), tuple(texts), tuple(boxes))
 
 
-def _top_of(rect: RectMm) -> float:
-    """Where capitals begin in the white at the cut line: in the middle of its outer millimeter."""
+def _text_top(rect: RectMm) -> float:
+    """The top of capitals in the middle of the outer millimeter of the white at the cut line."""
     inset = (SCISSORS_MM - _CAPS_MM) / 2
     return inset if rect[1] < SCISSORS_MM else rect[1] + rect[3] - inset - _CAPS_MM
 
@@ -56,8 +55,8 @@ def _arrow(left: float, top: float) -> list[Line]:
     return [Line((*end, middle, tip), 0.2) for end in ends]
 
 
-def _fitting(text: str, width_mm: float) -> str:
-    """As much of the text as goes into the width."""
+def _shorten(text: str, width_mm: float) -> str:
+    """As much of the text as fits into the width, with an ellipsis if it is cut."""
     if text_width_mm(text, SIZE_MM, True) <= width_mm:
         return text
     while text and text_width_mm(f"{text}…", SIZE_MM, True) > width_mm:

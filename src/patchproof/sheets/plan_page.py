@@ -1,8 +1,8 @@
-"""The last page: where the piece goes on the object, and how to photograph it so that the photographs can tell.
+"""The plan, a sheet's last page: the place of the piece on the object, and how to photograph it.
 
 In: a `PlanPage`: a picture of the object with its millimeters, the piece's outline on it, and paragraphs. Out: the
-page. Dimension chains above and beside the picture run from edge to edge of the object's side, or say what was measured
-along its surface. The picture is passed in; this module knows paper only.
+page. Dimension chains above and beside the picture run from edge to edge of the object's side, or state lengths along
+its surface. The picture is passed in; this module draws on paper only.
 """
 
 from __future__ import annotations
@@ -12,28 +12,28 @@ from dataclasses import dataclass
 import numpy as np
 
 from patchproof.base.errors import Refused
-from patchproof.sheets.layout import CAP_HEIGHT, DESCENT, Box, Line, PageLayout, prove_apart, text_box, text_width_mm
+from patchproof.sheets.layout import CAP_HEIGHT, DESCENT, Box, Line, PageLayout, check_layout, text_box, text_width_mm
 from patchproof.sheets.pdf import PdfPage
 from patchproof.sheets.rects import PointMm, RectMm
 from patchproof.sheets.template import Template, TextLine
 
 PICTURE_SHARE = 0.42  # of the page's height at most
-ABOVE_MM, BESIDE_MM = 13.0, 22.0  # for the dimension chains
+ABOVE_MM, BESIDE_MM = 13.0, 22.0  # space for the dimension chains
 HEADING_MM, TEXT_MM, LEADING = 3.2, 2.6, 1.45
 
 
 @dataclass(frozen=True)
 class DimensionSpan:
-    """A part of a dimension chain: between two places along one axis of the picture, so many millimeters."""
+    """A part of a dimension chain: two ends along one axis of the picture, and the length between them."""
 
     ends_mm: tuple[float, float]
-    length_mm: float  # along the surface it is longer than between its ends
+    length_mm: float  # along the surface, where it may be longer than the distance of the ends
     name: str
 
 
 @dataclass(frozen=True)
 class PlacementPicture:
-    """The piece on the object, seen straight from its side; millimeters x right, y down."""
+    """A picture of the piece on the object, seen straight from its side; millimeters, x right, y down."""
 
     picture: np.ndarray  # uint8 H×W×3
     picture_mm: RectMm
@@ -41,27 +41,26 @@ class PlacementPicture:
     outline_mm: tuple[PointMm, ...]  # the piece's cut line
     seams_mm: tuple[tuple[PointMm, PointMm], ...] = ()  # thin lines
     names_mm: tuple[tuple[PointMm, str], ...] = ()
-    measured: tuple[tuple[DimensionSpan, ...], tuple[DimensionSpan, ...]] | None = (
-        None  # across and down, in place of edge to edge
-    )
+    # across and down, in place of chains from edge to edge
+    dimension_chains: tuple[tuple[DimensionSpan, ...], tuple[DimensionSpan, ...]] | None = None
 
 
 @dataclass(frozen=True)
 class PlanPage:
-    """A picture, where there is one, and sections of (heading, lines)."""
+    """The content of a plan: a picture or none, and sections of (heading, paragraphs)."""
 
-    hung: PlacementPicture | None
+    placement: PlacementPicture | None
     sections: tuple[tuple[str, tuple[str, ...]], ...]
 
 
 def lay_out_plan(plan: PlanPage, template: Template, sheet_id: str) -> PdfPage:
-    """The page, of the template's size, proved apart and within its margins."""
+    """Lay out the plan on a page of the template's size."""
     (width, height), margin = template.page_mm, template.margin_mm
     texts = [TextLine(at_mm=(margin, margin + 5.4), size_mm=5.2, text="patchproof", bold=True)]
     texts.append(TextLine(at_mm=(margin + 39, margin + 5.4), size_mm=2.7, text=f"plan of sheet {sheet_id}", gray=0.35))
     lines, labels, boxes, pictures, top = [], [], [], (), margin + 10.0
-    if plan.hung is not None:
-        drawing = _drawing(plan.hung, (margin, top, width - 2 * margin, PICTURE_SHARE * height))
+    if plan.placement is not None:
+        drawing = _drawing(plan.placement, (margin, top, width - 2 * margin, PICTURE_SHARE * height))
         lines, labels, pictures, box = drawing
         boxes.append(box)
         top = box.rect_mm[1] + box.rect_mm[3] + 3.0
@@ -80,12 +79,12 @@ def lay_out_plan(plan: PlanPage, template: Template, sheet_id: str) -> PdfPage:
         texts=(*texts, *labels),
         boxes=(*boxes, *(text_box(line) for line in texts)),
     )
-    prove_apart(layout.boxes, template.page_mm, margin)
+    check_layout(layout.boxes, template.page_mm, margin)
     return PdfPage(layout, pictures)
 
 
 def wrap_text(text: str, size_mm: float, width_mm: float) -> list[str]:
-    """The text in lines no longer than the width."""
+    """Break a text into lines no longer than `width_mm`."""
     lines = [""]
     for word in text.split():
         longer = f"{lines[-1]} {word}".strip()
@@ -96,44 +95,45 @@ def wrap_text(text: str, size_mm: float, width_mm: float) -> list[str]:
     return lines
 
 
-def _drawing(hung: PlacementPicture, room: RectMm):
-    """(lines, labels, pictures, box): the picture with outline and dimension chains, scaled into the room."""
-    x, y, w, h = room
-    left, up, wide, high = hung.picture_mm
+def _drawing(placement: PlacementPicture, area: RectMm):
+    """(lines, labels, pictures, box) of the picture with outline and dimension chains, scaled into the area."""
+    x, y, w, h = area
+    left, up, wide, high = placement.picture_mm
     scale = min((w - BESIDE_MM) / wide, (h - ABOVE_MM) / high)
     if not scale > 0:
-        raise Refused("a picture of the object", f"one of {wide:g} × {high:g} mm", "leave the plan out")
+        raise Refused("a picture of the object", f"a picture of {wide:g} × {high:g} mm", "leave the plan out")
     corner = (x + (w - BESIDE_MM - scale * wide) / 2, y + ABOVE_MM)
 
-    def at(point: PointMm) -> PointMm:
+    def to_page(point: PointMm) -> PointMm:
         return corner[0] + (point[0] - left) * scale, corner[1] + (point[1] - up) * scale
 
-    closed = zip(hung.outline_mm, (*hung.outline_mm[1:], hung.outline_mm[0]), strict=True)
-    lines = [Line((*at(a), *at(b)), 0.5) for a, b in closed] + [Line((*at(a), *at(b)), 0.25) for a, b in hung.seams_mm]
+    sides = zip(placement.outline_mm, (*placement.outline_mm[1:], placement.outline_mm[0]), strict=True)
+    lines = [Line((*to_page(a), *to_page(b)), 0.5) for a, b in sides]
+    lines += [Line((*to_page(a), *to_page(b)), 0.25) for a, b in placement.seams_mm]
     labels = []
-    for point, name in hung.names_mm:
-        cx, cy = at(point)
+    for point, name in placement.names_mm:
+        cx, cy = to_page(point)
         labels.append(
             TextLine(at_mm=(cx - text_width_mm(name, 2.8, True) / 2, cy + 1.0), size_mm=2.8, text=name, bold=True)
         )
-    shown = (*corner, scale * wide, scale * high)
-    across, down = hung.measured or _edge_to_edge(hung)
-    for more_lines, more_labels in (_chain_above(across, at, shown), _chain_beside(down, at, shown)):
+    rect = (*corner, scale * wide, scale * high)
+    across, down = placement.dimension_chains or _edge_chains(placement)
+    for more_lines, more_labels in (_chain_above(across, to_page, rect), _chain_beside(down, to_page, rect)):
         lines, labels = lines + more_lines, labels + more_labels
     box = (x, y, w, ABOVE_MM + scale * high)
-    return lines, labels, ((shown, hung.picture),), Box("picture of the object", box)
+    return lines, labels, ((rect, placement.picture),), Box("picture of the object", box)
 
 
-def edge_distances_mm(hung: PlacementPicture) -> dict[str, float]:
-    """From the piece's outermost points to the edges of the object's side; negative where the piece goes beyond."""
-    xs, ys = zip(*hung.outline_mm, strict=True)
-    x, y, w, h = hung.object_mm
+def edge_distances_mm(placement: PlacementPicture) -> dict[str, float]:
+    """Distances from the piece to the edges of the object's side; negative where the piece overhangs."""
+    xs, ys = zip(*placement.outline_mm, strict=True)
+    x, y, w, h = placement.object_mm
     return {"left": min(xs) - x, "right": x + w - max(xs), "top": min(ys) - y, "bottom": y + h - max(ys)}
 
 
-def _edge_to_edge(hung: PlacementPicture) -> tuple[tuple[DimensionSpan, ...], tuple[DimensionSpan, ...]]:
-    """From edge to edge of the object's side, across and down."""
-    (xs, ys), (x, y, w, h) = zip(*hung.outline_mm, strict=True), hung.object_mm
+def _edge_chains(placement: PlacementPicture) -> tuple[tuple[DimensionSpan, ...], tuple[DimensionSpan, ...]]:
+    """Dimension chains from edge to edge of the object's side, across and down."""
+    (xs, ys), (x, y, w, h) = zip(*placement.outline_mm, strict=True), placement.object_mm
     across, down = (x, min(xs), max(xs), x + w), (y, min(ys), max(ys), y + h)
     names = ("from left edge", "piece", "from right edge"), ("from top", "piece", "from bottom")
     return _spans(across, names[0]), _spans(down, names[1])
@@ -143,24 +143,24 @@ def _spans(stops: tuple[float, ...], names: tuple[str, ...]) -> tuple[DimensionS
     return tuple(DimensionSpan((a, b), b - a, name) for a, b, name in zip(stops, stops[1:], names, strict=False))
 
 
-def _chain_above(spans: tuple[DimensionSpan, ...], at, shown: RectMm) -> tuple[list[Line], list[TextLine]]:
-    row, lines, labels = shown[1] - 2.0, [], []
+def _chain_above(spans: tuple[DimensionSpan, ...], to_page, rect: RectMm) -> tuple[list[Line], list[TextLine]]:
+    row, lines, labels = rect[1] - 2.0, [], []
     for i, span in enumerate(spans):
-        start, end = (at((x, 0))[0] for x in span.ends_mm)
+        start, end = (to_page((x, 0))[0] for x in span.ends_mm)
         lines += [Line((start, row, end, row), 0.2), *(Line((s, row - 1, s, row + 1), 0.2) for s in (start, end))]
         text = f"{span.length_mm:.0f} mm {span.name}"
-        # a row for each, so that narrow parts cannot write over their neighbors
+        # each label has its own row, so that those of narrow parts do not overlap
         middle = (start + end) / 2 - text_width_mm(text, 2.3, False) / 2
-        middle = min(max(middle, shown[0]), shown[0] + shown[2] + BESIDE_MM - text_width_mm(text, 2.3, False))
+        middle = min(max(middle, rect[0]), rect[0] + rect[2] + BESIDE_MM - text_width_mm(text, 2.3, False))
         labels.append(TextLine(at_mm=(middle, row - 1.6 - (len(spans) - 1 - i) * 3.1), size_mm=2.3, text=text))
     return lines, labels
 
 
-def _chain_beside(spans: tuple[DimensionSpan, ...], at, shown: RectMm) -> tuple[list[Line], list[TextLine]]:
-    column = shown[0] + shown[2] + 2.0
-    lines, labels, free = [], [], shown[1]
+def _chain_beside(spans: tuple[DimensionSpan, ...], to_page, rect: RectMm) -> tuple[list[Line], list[TextLine]]:
+    column = rect[0] + rect[2] + 2.0
+    lines, labels, free = [], [], rect[1]
     for span in spans:
-        start, end = (at((0, y))[1] for y in span.ends_mm)
+        start, end = (to_page((0, y))[1] for y in span.ends_mm)
         lines += [
             Line((column, start, column, end), 0.2),
             *(Line((column - 1, s, column + 1, s), 0.2) for s in (start, end)),

@@ -1,9 +1,9 @@
-"""What whoever prints and cuts a sheet needs to know: from its manifest, and from the PDF itself.
+"""Advice for printing and cutting a sheet, from its manifest and from the PDF.
 
-In: a manifest; SHEET.pdf. Out: sentences; those that begin with "PROBLEM" name what would not print as it should. The
-PDF is opened by pikepdf and every statement is looked up in it: page size and boxes, the wish not to be scaled, fonts,
+In: a manifest; SHEET.pdf. Out: sentences; those that begin with "PROBLEM" name something that would print wrongly. The
+PDF is opened by pikepdf, and every statement is checked in it: page size and boxes, the request not to scale, fonts,
 images with their resolution, compression and color space. Left out on purpose: total ink and separations, which an RGB
-file leaves to the printer, as it should; and PDF/X, which asks for one intended press.
+file rightly leaves to the printer; and PDF/X, which is made for one intended press.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _LOSSLESS = {"/FlateDecode", "/LZWDecode", "/RunLengthDecode", "/ASCII85Decode",
 
 
 def sheet_advice(manifest: Manifest) -> list[str]:
-    """What whoever prints this sheet should know of what is on it, in sentences; `pdf_advice` reads the PDF."""
+    """Sentences for whoever prints and cuts this sheet, from its manifest; `pdf_advice` adds those about the PDF."""
     width, height = manifest.page_mm
     lines = [
         f"Print the {width:g} × {height:g} mm page at 100 %; markers, swatches and cut line stay "
@@ -35,7 +35,7 @@ def sheet_advice(manifest: Manifest) -> list[str]:
         return [*lines, "Glue the uncut page to something flat and stiff."]
     if manifest.kind == "chart":
         return [*lines, "Cut nothing: lay the page flat, and photograph all of it in even light without shine."]
-    lines += _cutting(manifest)
+    lines += _cutting_lines(manifest)
     if manifest.plan_page is not None:
         whose = "" if manifest.page_code is None else f" of sheet {manifest.sheet_id}"
         page = f"Page {manifest.plan_page} is for people, on any paper"
@@ -45,8 +45,8 @@ def sheet_advice(manifest: Manifest) -> list[str]:
     return lines
 
 
-def _cutting(manifest: Manifest) -> Iterator[str]:
-    """What is cut out of which page."""
+def _cutting_lines(manifest: Manifest) -> Iterator[str]:
+    """A sentence about the pieces to cut out."""
     size = f"{manifest.cut_mm[2]:.1f} × {manifest.cut_mm[3]:.1f} mm"
     if manifest.tiles:
         pages = [tile.page for tile in manifest.tiles]
@@ -65,7 +65,7 @@ def _cutting(manifest: Manifest) -> Iterator[str]:
 
 
 def _nearest_ink_mm(manifest: Manifest) -> float:
-    """From the page's edge to the nearest marker, swatch or cut line."""
+    """The distance from the page's edge to the nearest marker, swatch or cut line."""
     width, height = manifest.page_mm
     rects = [tile.cut_mm for tile in manifest.tiles] or [manifest.cut_mm]
     rects = [*rects, *(swatch.rect_mm for swatch in manifest.chart)]
@@ -75,13 +75,13 @@ def _nearest_ink_mm(manifest: Manifest) -> float:
 
 
 def pdf_advice(pdf_path: str | Path) -> list[str]:
-    """The sentences for the PDF at that path."""
+    """Sentences for whoever prints the PDF, from its pages, fonts, images and colors."""
     import pikepdf
 
     try:
         with pikepdf.open(pdf_path) as pdf:
-            lines = [*_pages(pdf), _scaling(pdf), *_fonts(pdf), *_images(pdf), _vector_color(pdf)]
-    except Exception as error:  # objects of other kinds than they should be fail in many ways
+            lines = [*_page_lines(pdf), _scaling_line(pdf), *_font_lines(pdf), *_image_lines(pdf), _color_line(pdf)]
+    except Exception as error:  # objects of unexpected types fail in many ways
         raise Refused("a PDF of a sheet", f"{pdf_path}, which cannot be read", "make the sheet again") from error
     return [
         *lines,
@@ -91,7 +91,7 @@ def pdf_advice(pdf_path: str | Path) -> list[str]:
     ]
 
 
-def _pages(pdf) -> Iterator[str]:
+def _page_lines(pdf) -> Iterator[str]:
     sizes = [_size(page.mediabox) for page in pdf.pages]
     count = "1 page" if len(sizes) == 1 else f"{len(sizes)} pages"
     yield f"PDF {pdf.pdf_version}, {count} of {' and '.join(sorted(set(sizes)))} mm, true size (1:1)."
@@ -100,54 +100,53 @@ def _pages(pdf) -> Iterator[str]:
         if None in boxes:
             yield f"PROBLEM: page {number} has no trim and bleed box."
         elif any([float(v) for v in box] != [float(v) for v in page.mediabox] for box in boxes):
-            yield f"PROBLEM: trim and bleed box of page {number} are not the page: it would be cut elsewhere."
+            yield f"PROBLEM: trim and bleed box of page {number} differ from the page: it would be cut elsewhere."
         if "/UserUnit" in page.obj and float(page.obj.UserUnit) != 1:
             yield f"PROBLEM: page {number} has a UserUnit, which many printers ignore."
     yield "Trim box and bleed box are given; no ink reaches the edge, so no bleed and no crop marks are needed."
 
 
-def _scaling(pdf) -> str:
-    wish = pdf.Root.get("/ViewerPreferences", {}).get("/PrintScaling")
-    if wish == "/None":
+def _scaling_line(pdf) -> str:
+    if pdf.Root.get("/ViewerPreferences", {}).get("/PrintScaling") == "/None":
         return "The file asks viewers not to scale it (PrintScaling None); still check that 100 % is set."
-    return "PROBLEM: the file does not ask viewers to leave its size alone (PrintScaling None is missing)."
+    return "PROBLEM: the file does not ask viewers not to scale it (PrintScaling None is missing)."
 
 
-def _fonts(pdf) -> Iterator[str]:
+def _font_lines(pdf) -> Iterator[str]:
     names: dict[str, bool] = {}
     for page in pdf.pages:
         for font in page.resources.get("/Font", {}).values():
-            names[str(font.get("/BaseFont", "?")).lstrip("/").split("+")[-1]] = _embedded(font)
-    loose = sorted(name for name, embedded in names.items() if not embedded)
-    if loose:
-        yield f"PROBLEM: fonts that are not embedded: {', '.join(loose)}."
+            names[str(font.get("/BaseFont", "?")).lstrip("/").split("+")[-1]] = _is_embedded(font)
+    missing = sorted(name for name, embedded in names.items() if not embedded)
+    if missing:
+        yield f"PROBLEM: fonts that are not embedded: {', '.join(missing)}."
     elif names:
         yield f"All fonts are embedded ({', '.join(sorted(names))})."
 
 
-def _embedded(font) -> bool:
+def _is_embedded(font) -> bool:
     inner = font.DescendantFonts[0] if "/DescendantFonts" in font else font
     descriptor = inner.get("/FontDescriptor", {})
     return any(f"/FontFile{kind}" in descriptor for kind in ("", "2", "3"))
 
 
-def _images(pdf) -> Iterator[str]:
+def _image_lines(pdf) -> Iterator[str]:
     for number, page in enumerate(pdf.pages, 1):
         resources = page.resources.get("/XObject", {})
-        for name, (width_mm, height_mm) in _placed(page):
+        for name, (width_mm, height_mm) in _drawn_objects(page):
             image = resources.get(name)
             if image is None or image.get("/Subtype") != "/Image":
                 continue
             ppi = min(int(image.Width) / width_mm, int(image.Height) / height_mm) * MM_PER_INCH
             yield (
                 f"Page {number}: an image of {int(image.Width)} × {int(image.Height)} pixels on {width_mm:.1f} × "
-                f"{height_mm:.1f} mm, {ppi:.0f} ppi; {_packing(image)}; {_color(image.get('/ColorSpace'))}; "
-                "its pixels are meant as they are, so do not resample or sharpen."
+                f"{height_mm:.1f} mm, {ppi:.0f} ppi; {_compression(image)}; {_profile(image.get('/ColorSpace'))}; "
+                "its pixels must stay as they are, so do not resample or sharpen."
             )
 
 
-def _placed(page) -> Iterator[tuple[str, tuple[float, float]]]:
-    """Every drawn XObject's name and its width and height in mm, from the matrices in force."""
+def _drawn_objects(page) -> Iterator[tuple[str, tuple[float, float]]]:
+    """The name of every drawn XObject and its (width, height) in mm, by the current transformation matrix."""
     import pikepdf
 
     matrix, saved = pikepdf.Matrix(), []
@@ -163,23 +162,23 @@ def _placed(page) -> Iterator[tuple[str, tuple[float, float]]]:
             yield str(operands[0]), (_MM * math.hypot(matrix.a, matrix.b), _MM * math.hypot(matrix.c, matrix.d))
 
 
-def _packing(image) -> str:
+def _compression(image) -> str:
     names = {str(name) for name in image.Filter.wrap_in_array()} if "/Filter" in image else set()
     return "lossless" if names <= _LOSSLESS else f"PROBLEM: lossy ({', '.join(sorted(names - _LOSSLESS))})"
 
 
-def _color(space: Any) -> str:
+def _profile(space: Any) -> str:
     if space is None or str(space.wrap_in_array()[0]) != "/ICCBased":
         return "PROBLEM: no ICC profile"
     return f"ICC profile {_profile_name(space[1])}"
 
 
-def _vector_color(pdf) -> str:
+def _color_line(pdf) -> str:
     spaces = [page.resources.get("/ColorSpace", {}).get("/DefaultRGB") for page in pdf.pages]
     if any(space is None for space in spaces):
-        return "PROBLEM: words, markers and swatches are device RGB without a profile."
+        return "PROBLEM: texts, markers and swatches are device RGB without a profile."
     names = sorted({_profile_name(space[1]) for space in spaces})
-    return f"Words, markers and swatches are vector, RGB with the ICC profile {', '.join(names)} (DefaultRGB)."
+    return f"Texts, markers and swatches are vector graphics, RGB with the ICC profile {', '.join(names)} (DefaultRGB)."
 
 
 def _profile_name(stream) -> str:

@@ -1,9 +1,8 @@
 """Print templates: pages as data, all in millimeters.
 
-In: the name of a shipped template ("a4") or a TOML file of one's own. Out: a frozen `Template`, or `BoardTemplate`,
-every key known and every number checked. A template says where things lie and how large they are; what they show (ids,
-colors, the design) comes from elsewhere. Whether its parts lie apart and inside the margins is proved by
-`page.furnished`, with the piece on it.
+In: the name of a shipped template ("a4") or a user's TOML file. Out: a frozen `Template`, or `BoardTemplate`, every key
+known and every number checked. A template sets the places and sizes of things; their content (ids, colors, the design)
+comes from elsewhere. `page.add_template_parts` checks the page with its piece for overlaps and margins.
 Left out on purpose: expressions, inheritance and includes. A page is short enough to be written out.
 """
 
@@ -33,27 +32,27 @@ PaperMm = Annotated[Positive, Field(le=2000)]  # a side of the largest paper, A0
 
 
 class PieceZone(StrictModel):
-    """Where on the page the piece may lie."""
+    """The zone of the page for the piece."""
 
-    zone_mm: PageRect  # [x, y, width, height]; the piece lies in its middle
+    zone_mm: PageRect  # [x, y, width, height]; the piece is centered in it
 
 
 class ChartGrid(StrictModel):
-    """The color chart's grid; 48 swatches are the fewest that a printer model can be fitted to."""
+    """The color chart's grid; a printer model needs at least 48 swatches."""
 
     corner_mm: PagePoint  # its top-left corner
     columns: Annotated[int, Field(ge=4, le=40)]  # swatches side by side
     rows: Annotated[int, Field(ge=2, le=40)]  # swatches one above the other
-    swatch_mm: Annotated[Positive, Field(ge=4)]  # side; below 4 a phone's photograph of a whole page has too few pixels
+    swatch_mm: Annotated[Positive, Field(ge=4)]  # side; below 4 a phone's photograph of the page has too few pixels
     gap_mm: NotNegative  # between swatches
 
 
 class Rulers(StrictModel):
-    """A ruler to the right and one downwards, from their zero ticks."""
+    """A ruler along x and one along y, by their zero ticks."""
 
     length_mm: PaperMm  # of both
-    x_start_mm: PagePoint  # zero tick of the ruler to the right
-    y_start_mm: PagePoint  # zero tick of the ruler downwards
+    x_start_mm: PagePoint  # zero tick of the ruler along x
+    y_start_mm: PagePoint  # zero tick of the ruler along y
 
 
 class QrCode(StrictModel):
@@ -64,7 +63,7 @@ class QrCode(StrictModel):
 
 
 class PageMarkers(StrictModel):
-    """The page's own markers by the top-left corners of their black squares; fewer than two would be a poor fix."""
+    """The page's own markers by the top-left corners of their black squares; one alone would locate the page badly."""
 
     size_mm: Annotated[Positive, Field(ge=8)]  # side of a black square
     corners_mm: Annotated[tuple[PagePoint, ...], Field(min_length=2)]  # top-left, one per marker
@@ -73,25 +72,25 @@ class PageMarkers(StrictModel):
 class BlankPiece(StrictModel):
     """The piece of a page that is printed without a design, before there is a scene."""
 
-    piece_mm: tuple[Positive, Positive]  # width and height, as of the design that will take its place
-    marker_mm: Annotated[Positive, Field(ge=8)]  # smaller ones are lost in photographs
+    piece_mm: tuple[Positive, Positive]  # width and height of the piece, and of the design to come
+    marker_mm: Annotated[Positive, Field(ge=8)]  # side of a marker; smaller ones are lost in photographs
 
 
 class TileGrid(StrictModel):
-    """The pages of a piece larger than the page; each tile's markers lie to the left, the right and below its part."""
+    """The pages of a piece larger than the page; each tile has markers to the left and right of its part and below."""
 
-    # [x, y, width, height]: a tile's part of the piece at its largest; what is printed of it starts at the corner.
+    # [x, y, width, height]: the largest part of the piece on a tile; smaller parts start at its corner.
     zone_mm: PageRect
-    overlap_mm: Annotated[Positive, Field(ge=8)]  # the flap that the next tile is glued on; it holds a marker
+    overlap_mm: Annotated[Positive, Field(ge=8)]  # width of the flap that the next tile is glued on, with a marker
     marker_mm: Annotated[Positive, Field(ge=5)]  # for scans and photographs of single pages
 
 
 class TextLine(StrictModel):
-    """One line of text; {sheet_id}, {kind}, {design}, {piece} and {fix} are filled in; gray 0 is black."""
+    """One line of text; {sheet_id}, {kind}, {design}, {piece} and {fix} are replaced by their values."""
 
     at_mm: PagePoint  # left end of its baseline
-    size_mm: Positive  # of the letters
-    text: str  # what it says
+    size_mm: Positive  # font size
+    text: str  # the line, with placeholders
     bold: bool = False  # in the bold font
     gray: Share = 0.0  # 0 is black, 1 white
 
@@ -101,15 +100,15 @@ class Template(StrictModel):
 
     page_mm: tuple[PaperMm, PaperMm]  # width, height of the paper
     margin_mm: NotNegative  # nothing is printed nearer to the edge; home printers need 3 to 6
-    piece: PieceZone | None = None  # none on a page that is a chart alone
+    piece: PieceZone | None = None  # none on a page with a chart only
     chart: ChartGrid  # at least 48 swatches
     ruler: Rulers
     qr: QrCode  # names sheet and design
-    marker: PageMarkers  # beside those of the piece
+    marker: PageMarkers  # in addition to those of the piece
     blank: BlankPiece | None = None  # on a page that is made without a run
     tiles: TileGrid | None = None  # on templates for a piece larger than the page
-    plan_page: bool = False  # a last page that says where the piece goes and how to photograph it
-    text: tuple[TextLine, ...] = ()  # all that is written
+    plan_page: bool = False  # add a last page that shows the place of the piece and how to photograph it
+    text: tuple[TextLine, ...] = ()  # all texts
 
 
 class BoardGrid(StrictModel):
@@ -119,7 +118,7 @@ class BoardGrid(StrictModel):
     columns: Annotated[int, Field(ge=4, le=40)]  # squares side by side
     rows: Annotated[int, Field(ge=4, le=40)]  # squares one above the other
     square_mm: Annotated[Positive, Field(ge=8)]  # side of a square
-    marker_mm: Annotated[Positive, Field(ge=6)]  # side of a marker, at least a module less than the square
+    marker_mm: Annotated[Positive, Field(ge=6)]  # side of a marker; a module of white must remain on each side
 
 
 class BoardTemplate(StrictModel):
@@ -130,11 +129,11 @@ class BoardTemplate(StrictModel):
     board: BoardGrid
     ruler: Rulers
     qr: QrCode  # names sheet and board
-    text: tuple[TextLine, ...] = ()  # also {columns}, {rows}, {square}, {marker} and {dictionary} are filled in
+    text: tuple[TextLine, ...] = ()  # placeholders: {sheet_id}, {columns}, {rows}, {square}, {marker}, {dictionary}
 
 
 def load_template(name_or_file: str | Path) -> Template:
-    """The shipped template of that name, or the one in that file; an unknown name is refused with the nearest."""
+    """Load a shipped template by name, or a TOML file; an unknown name is refused with the nearest one."""
     path, data = template_data(name_or_file)
     template = validate_model(Template, data, str(path))
     swatches = template.chart.columns * template.chart.rows
@@ -144,7 +143,7 @@ def load_template(name_or_file: str | Path) -> Template:
 
 
 def template_data(name_or_file: str | Path) -> tuple[Path, dict[str, Any]]:
-    """A template's file and what it holds, unchecked: its tables tell what kind of page it is."""
+    """A template's path and its unchecked data, whose tables tell the kind of page."""
     path = Path(name_or_file)
     if path.suffix != ".toml":
         names = template_names()
@@ -155,7 +154,7 @@ def template_data(name_or_file: str | Path) -> tuple[Path, dict[str, Any]]:
 
 
 def template_summaries() -> list[str]:
-    """Each shipped template's name and what its first comment says it is."""
+    """A line for each shipped template: its name and the first sentence of its first comment."""
     names = template_names()
     files = [packaged_path("print_templates", f"{name}.toml") for name in names]
     heads = [file.read_text(encoding="utf-8").partition("\n")[0].lstrip("# ") for file in files]
@@ -164,6 +163,6 @@ def template_summaries() -> list[str]:
 
 
 def template_names(table: str | None = None) -> list[str]:
-    """The shipped templates' names; with `table`, of those that have it."""
+    """The names of the shipped templates, with `table` only of those that have this table."""
     paths = packaged_path("print_templates").glob("*.toml")
     return sorted(path.stem for path in paths if table is None or table in read_toml(path))

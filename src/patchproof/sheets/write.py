@@ -1,9 +1,9 @@
-"""SHEET.pdf and SHEET.json: both complete, or neither.
+"""Write SHEET.pdf and SHEET.json: both complete, or neither.
 
-In: a piece with its design and promise, and a template. Out: two files with the same stem, and the manifest, of
-which the PDF carries the same bytes as an attachment. They are written beside their places first and moved there
-last, so that a full disk or a crash leaves what was there before.
-Left out on purpose: asking before overwriting, which is the command line's business.
+In: a piece with its design and promise, and a template. Out: two files with the same stem; the manifest is also
+attached to the PDF, with the same bytes. Both are first written beside their places and then moved there, so that a
+full disk or a crash leaves the old files.
+Left out on purpose: asking before overwriting, which the command line does.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from patchproof.sheets.content import SheetContent, page_manifest
 from patchproof.sheets.layout import PageLayout
 from patchproof.sheets.manifest import Manifest, dump_manifest
 from patchproof.sheets.page import lay_out_page
-from patchproof.sheets.pdf import ATTACHMENT, PdfPage, numbered, pages_pdf
+from patchproof.sheets.pdf import ATTACHMENT, PdfPage, numbered_name, pages_pdf
 from patchproof.sheets.piece import page_id
 from patchproof.sheets.plan_page import PlanPage, lay_out_plan
 from patchproof.sheets.rects import RectMm
@@ -29,17 +29,16 @@ from patchproof.sheets.tiles import tile_pages
 def write_sheet(
     pdf_path: str | Path, template: Template, content: SheetContent, plan: PlanPage | None = None, copies: int = 1
 ) -> Manifest:
-    """Write SHEET.pdf and SHEET.json beside it.
-
-    A template with tiles makes a page for each. `plan` becomes the last page; `copies` repeats the page with the piece.
+    """Write SHEET.pdf and SHEET.json beside it. `plan` becomes the last page; `copies` repeats the page with the piece,
+    and is refused for a template with tiles, which has a page for each tile.
     """
-    pdf_path = pdf_name(pdf_path)
+    pdf_path = check_pdf_path(pdf_path)
     if template.tiles is None:
         page = lay_out_page(template, content)
         pages = [PdfPage(page, content.pictures(page.cuts_mm[0]))] * copies
         manifest = content.manifest(page, template, page.cuts_mm[0])
     elif copies > 1:
-        raise Refused("one copy of a piece in tiles", f"{copies}", "print the file more than once")
+        raise Refused("one copy of a piece in tiles", f"{copies} copies", "print the file several times")
     else:
         pages, manifest = tile_pages(template, template.tiles, content)
     if plan is not None:
@@ -57,16 +56,16 @@ def write_page(
     kind: str,
     grid: StrictModel,
 ) -> Manifest:
-    """Write a page without a piece, and its manifest beside it, in which `grid` is kept under the page's kind."""
-    pdf_path = pdf_name(pdf_path)
+    """Write a page without a piece, and its manifest beside it; `grid` becomes the manifest's setting `kind`."""
+    pdf_path = check_pdf_path(pdf_path)
     settings = {kind: grid.model_dump(mode="json")}
     manifest = page_manifest(page, template, cut_mm, page_id(template), kind, settings)
     save_sheets(pdf_path, [PdfPage(page)], {pdf_path.with_suffix(".json"): manifest})
     return manifest
 
 
-def pdf_name(path: str | Path) -> Path:
-    """The path; refused where it does not end in .pdf."""
+def check_pdf_path(path: str | Path) -> Path:
+    """Return the path; refused if it does not end in .pdf."""
     path = Path(path)
     if path.suffix.lower() != ".pdf":
         raise Refused("a file name that ends in .pdf", f'"{path}"', "name the sheet SHEET.pdf")
@@ -74,16 +73,16 @@ def pdf_name(path: str | Path) -> Path:
 
 
 def manifest_paths(pdf_path: Path, designs: int) -> list[Path]:
-    """Where the manifests lie: SHEET.json, or SHEET_1.json and so on beside a page of several designs."""
+    """Paths of the manifests: SHEET.json, or SHEET_1.json and so on for a page of several designs."""
     if designs < 2:
         return [pdf_path.with_suffix(".json")]
-    return [pdf_path.with_name(numbered(f"{pdf_path.stem}.json", i)) for i in range(designs)]
+    return [pdf_path.with_name(numbered_name(f"{pdf_path.stem}.json", i)) for i in range(designs)]
 
 
 def save_sheets(pdf_path: Path, pages: Sequence[PdfPage], manifests: dict[Path, Manifest]) -> None:
-    """Write the PDF and its manifests, which it carries too: one as sheet.json, several as sheet_1.json..."""
+    """Write the PDF and its manifests, which are attached to it: one as sheet.json, several as sheet_1.json..."""
     texts, first = [dump_manifest(manifest) for manifest in manifests.values()], next(iter(manifests.values()))
-    names = [ATTACHMENT] if len(texts) == 1 else [numbered(ATTACHMENT, i) for i in range(len(texts))]
+    names = [ATTACHMENT] if len(texts) == 1 else [numbered_name(ATTACHMENT, i) for i in range(len(texts))]
     title = f"patchproof sheet {' '.join(m.sheet_id for m in manifests.values())} {first.kind}"
     pdf = pages_pdf(pages, title, dict(zip(names, texts, strict=True)))
     write_files_atomically({pdf_path: pdf} | dict(zip(manifests, map(str.encode, texts), strict=True)))

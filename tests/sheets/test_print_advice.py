@@ -10,7 +10,7 @@ from PIL import Image
 
 from patchproof.base.errors import Refused
 from patchproof.sheets.print_advice import pdf_advice
-from test_photo_label import sheet
+from test_photo_page_code import sheet
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +61,7 @@ def boxless(pdf):
         (untagged, "no ICC profile"),
         (no_default, "device RGB without a profile"),
         (scaled, "PrintScaling None is missing"),
-        (trimmed, "are not the page"),
+        (trimmed, "differ from the page"),
         (boxless, "no trim and bleed box"),
     ],
 )
