@@ -91,7 +91,7 @@ def test_a_room_is_allowed_nothing_that_it_does_not_use(tool):
 
 
 def test_paper_and_photographs_need_no_torch():
-    modules = ("sheets.write", "sheets.raster", "photo.read", "photo.detect", "photo.rectify")
+    modules = ("sheets.write", "sheets.pdf_raster", "photo.read", "photo.detect", "photo.rectify")
     code = f"import sys; {'; '.join(f'import patchproof.{name}' for name in modules)}; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 

@@ -137,7 +137,7 @@ def test_a_crop_and_a_screenshot_are_known_by_exif_and_name(tmp_path, size, tags
     for key, value in tags.items():
         exif.get_ifd(0x8769)[key] = value
     Image.new("RGB", size).save(tmp_path / name, exif=exif)
-    assert read_photo(tmp_path / name).part == part
+    assert read_photo(tmp_path / name).is_crop == part
 
 
 def test_a_folder_of_raw_files_alone_is_refused_with_their_names(tmp_path):

@@ -12,7 +12,7 @@ from synthetic_photos import make_manifest
 
 from patchproof.base.errors import Refused
 from patchproof.photo.read import read_photo
-from patchproof.photo.rejection import CODES, PhotoRejected
+from patchproof.photo.rejection import REJECTION_CODES, PhotoRejected
 from patchproof.sheets.manifest import dump_manifest, load_manifest
 
 PHOTOS, MANIFESTS, SECONDS = 120, 60, 5.0
@@ -29,7 +29,7 @@ def test_damaged_photographs_give_a_picture_or_a_code(tmp_path):
             photo = read_photo(path)
             assert photo.srgb.dtype == np.uint8 and photo.srgb.ndim == 3 and photo.srgb.shape[2] == 3
         except PhotoRejected as cannot:
-            assert cannot.code in CODES and cannot.advice
+            assert cannot.code in REJECTION_CODES and cannot.advice
             refused += 1
         assert time.monotonic() - begin < SECONDS
     assert refused > PHOTOS / 4  # or the files were not damaged

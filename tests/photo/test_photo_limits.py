@@ -25,7 +25,7 @@ from patchproof.evidence.camera import pinhole_photo
 from patchproof.evidence.measure import measure
 from patchproof.evidence.ranges import promised_ranges
 from patchproof.photo import detect, limits, page_code, read
-from patchproof.photo.limits import finder_lines_in, limited_memory, run_limited, squares_in
+from patchproof.photo.limits import count_finder_lines, count_squares, limit_memory, run_limited
 from patchproof.photo.page_code import read_page_code
 from patchproof.photo.read import read_photo
 from patchproof.photo.rejection import PhotoRejected
@@ -44,7 +44,7 @@ def squares(side: int) -> np.ndarray:
 
 @needs_timer
 def test_work_is_interrupted_after_its_time_and_not_before(monkeypatch):
-    monkeypatch.setattr(bounds, "SECONDS", 0.2)
+    monkeypatch.setattr(bounds, "TIME_LIMIT_S", 0.2)
     assert run_limited(toy.spin, 0.1) == 0.1
     before = time.process_time()
     with pytest.raises(PhotoRejected) as caught:
@@ -56,8 +56,8 @@ def test_work_is_interrupted_after_its_time_and_not_before(monkeypatch):
 
 @needs_timer
 def test_a_library_that_swallows_what_interrupts_it_is_interrupted_again(monkeypatch):
-    monkeypatch.setattr(bounds, "SECONDS", 0.1)
-    monkeypatch.setattr(bounds, "_AGAIN_S", 0.1)
+    monkeypatch.setattr(bounds, "TIME_LIMIT_S", 0.1)
+    monkeypatch.setattr(bounds, "_REPEAT_S", 0.1)
 
     def stubborn():
         for _ in range(2):
@@ -73,7 +73,7 @@ def test_a_library_that_swallows_what_interrupts_it_is_interrupted_again(monkeyp
 
 @needs_timer
 def test_inside_a_limit_there_is_one_and_in_other_threads_none(monkeypatch):
-    monkeypatch.setattr(bounds, "SECONDS", 0.2)
+    monkeypatch.setattr(bounds, "TIME_LIMIT_S", 0.2)
     with pytest.raises(PhotoRejected):
         run_limited(lambda: [run_limited(toy.spin, 0.1) for _ in range(20)])
     results = []
@@ -85,7 +85,7 @@ def test_inside_a_limit_there_is_one_and_in_other_threads_none(monkeypatch):
 
 @needs_timer
 def test_a_photograph_that_takes_too_long_is_rejected_with_advice(tmp_path, monkeypatch):
-    monkeypatch.setattr(bounds, "SECONDS", 0.2)
+    monkeypatch.setattr(bounds, "TIME_LIMIT_S", 0.2)
     monkeypatch.setattr("patchproof.evidence.batch.read_photo", lambda path: toy.spin(5.0))
     entry = _measured(small_task(), PhotoItem(tmp_path / "a.jpg", "a.jpg")).entry
     assert (entry.status, entry.code, entry.remark.threshold) == ("rejected", "too_costly", 0.2)
@@ -97,7 +97,7 @@ def test_a_photograph_of_a_board_that_takes_too_long_is_left_out(tmp_path, monke
     for name in "ab":
         Image.new("RGB", (40, 40)).save(tmp_path / f"{name}.png")
     view = BoardView("b.png", np.zeros(0, int), np.zeros((0, 2)), np.zeros((0, 2)), (40, 40))
-    monkeypatch.setattr(bounds, "SECONDS", 0.2)
+    monkeypatch.setattr(bounds, "TIME_LIMIT_S", 0.2)
     monkeypatch.setattr(boards, "_view", lambda path, *_: (view, None) if path.stem == "b" else toy.spin(5.0))
     views, left, _ = find_boards(tmp_path, load_board("charuco_a4"))
     assert views == [view] and "0.2 s of processor time" in left["a.png"]
@@ -105,13 +105,13 @@ def test_a_photograph_of_a_board_that_takes_too_long_is_left_out(tmp_path, monke
 
 @needs_linux
 def test_memory_is_limited_while_a_photograph_is_read(tmp_path, monkeypatch):
-    with limited_memory():
+    with limit_memory():
         np.empty(limits.MOST_BYTES // 2, np.uint8)
         with pytest.raises(MemoryError):
             np.empty(limits.MOST_BYTES + 2**28, np.uint8)
     np.empty(limits.MOST_BYTES + 2**28, np.uint8)
     Image.new("RGB", (40, 40)).save(tmp_path / "a.png")
-    monkeypatch.setattr(read, "_pixels", lambda image, step: np.empty(limits.MOST_BYTES + 2**28, np.uint8))
+    monkeypatch.setattr(read, "_decode_pixels", lambda image, step: np.empty(limits.MOST_BYTES + 2**28, np.uint8))
     with pytest.raises(PhotoRejected, match="too_costly: the picture takes too much memory: save it smaller"):
         read_photo(tmp_path / "a.png")
 
@@ -144,7 +144,7 @@ def test_squares_are_counted_and_too_many_are_not_looked_into(monkeypatch):
     where 0.1 s is left.
     """
     picture, printed = squares(1200), aruco_dictionary(detect.DICTIONARY)
-    count = squares_in(picture)
+    count = count_squares(picture)
     assert 2300 <= count <= 2600
     monkeypatch.setattr(detect, "MOST_SQUARES", count - 1)
     before = time.process_time()
@@ -153,8 +153,8 @@ def test_squares_are_counted_and_too_many_are_not_looked_into(monkeypatch):
     assert (caught.value.code, caught.value.figure, caught.value.threshold) == ("too_costly", count, count - 1)
     assert time.process_time() - before < 2
     few = np.pad(squares(168), (0, 1032), constant_values=255)
-    assert 45 <= squares_in(few) <= 55 and list(detect._detect(few, printed, 1200)) == []
-    monkeypatch.setattr(detect, "seconds_left", lambda: 0.1)
+    assert 45 <= count_squares(few) <= 55 and list(detect._detect(few, printed, 1200)) == []
+    monkeypatch.setattr(detect, "remaining_seconds", lambda: 0.1)
     with pytest.raises(PhotoRejected) as caught:
         list(detect._detect(few, printed, 1200))
     assert caught.value.threshold == 25
@@ -164,7 +164,7 @@ def test_squares_are_counted_from_the_size_on_that_the_detector_looks_into():
     """One of 34 px about in each of 62 × 62 places of a megapixel picture: 14 s."""
     y, x = np.mgrid[:992, :992] % 16
     picture = np.where((abs(y - 8) < 5) & (abs(x - 8) < 5), 0, 255).astype(np.uint8)
-    assert squares_in(picture) == 0 and squares_in(picture, 29.76) > 3600
+    assert count_squares(picture) == 0 and count_squares(picture, 29.76) > 3600
     before = time.process_time()
     with pytest.raises(PhotoRejected, match="squares that could be markers"):
         list(detect._detect(picture, aruco_dictionary(detect.DICTIONARY), 992))
@@ -186,10 +186,12 @@ def test_no_code_is_looked_for_in_a_picture_full_of_lines_like_a_finders():
     """Rows of 1:1:3:1:1 alone: of 2000 px a side, the other detector takes more than 40 s."""
     row = np.repeat([0, 255, 0, 255, 0, 255], np.array([1, 1, 3, 1, 1, 6]) * 2).astype(np.uint8)
     picture = np.tile(row, (1000, 1000 // len(row)))
-    assert finder_lines_in(picture) == pytest.approx(picture.size / len(row), rel=0.2) and squares_in(picture) == 0
-    assert finder_lines_in(np.ascontiguousarray(picture.T)) < 1000
+    assert (
+        count_finder_lines(picture) == pytest.approx(picture.size / len(row), rel=0.2) and count_squares(picture) == 0
+    )
+    assert count_finder_lines(np.ascontiguousarray(picture.T)) < 1000
     picture = np.tile(picture, (2, 2))
-    assert finder_lines_in(picture) > page_code._MOST_LINES
+    assert count_finder_lines(picture) > page_code._MAX_LINES
     before = time.process_time()
     assert read_page_code(np.repeat(picture[..., None], 3, 2)) is None
     assert time.process_time() - before < 2
@@ -200,7 +202,7 @@ def test_no_code_is_looked_for_in_a_picture_full_of_finder_patterns():
     y, x = np.mgrid[:600, :600]
     distance = np.maximum(abs(y % 20 - 7), abs(x % 20 - 7)) // 2
     picture = np.where((distance == 2) | (distance > 3), 255, 0).astype(np.uint8)
-    assert squares_in(picture) > page_code._MOST_SQUARES
+    assert count_squares(picture) > page_code._MAX_SQUARES
     before = time.process_time()
     assert read_page_code(np.repeat(picture[..., None], 3, 2)) is None
     assert time.process_time() - before < 2

@@ -39,8 +39,8 @@ def corners_px(place: Place, camera_from_page: np.ndarray, middle_px=SIZE / 2, n
 )
 def test_perspective_confirms_a_focal_length_contradicts_it_or_cannot_tell(azimuth, longer, agrees):
     fit = fit_page(corners_px(flat, camera(azimuth, 3, 450)), markers_mm())
-    stance = flat_sheet_position(fit, MATRIX @ np.diag([longer, longer, 1.0]), 0.03, MIDDLE_MM)
-    assert stance.agrees is agrees
+    position = flat_sheet_position(fit, MATRIX @ np.diag([longer, longer, 1.0]), 0.03, MIDDLE_MM)
+    assert position.focal_agrees is agrees
 
 
 @pytest.mark.parametrize("radius_mm", [-100.0, 100.0])
@@ -48,7 +48,7 @@ def test_perspective_confirms_a_focal_length_contradicts_it_or_cannot_tell(azimu
 def test_so_does_the_bend_of_paper(radius_mm, longer, agrees):
     corners, matrix = corners_px(rolled(radius_mm, 0.0), camera(25, 5, 450)), MATRIX @ np.diag([longer, longer, 1.0])
     shape = fit_shape(corners, markers_mm(), tuple(SIZE), matrix[0, 0], 0.03).shape
-    assert bent_sheet_position(shape, matrix, 0.03, MIDDLE_MM).agrees is agrees
+    assert bent_sheet_position(shape, matrix, 0.03, MIDDLE_MM).focal_agrees is agrees
 
 
 def test_crops_without_a_trace_are_contradicted_or_within_what_is_stated():
@@ -63,11 +63,11 @@ def test_crops_without_a_trace_are_contradicted_or_within_what_is_stated():
         where = look_at([0, 0, 0], [*toward, 1.0], 0, (0, -1, 0)).T @ where
         fit = fit_page(corners_px(flat, where, SIZE / 2 - start, 0.045, seed=seed), markers_mm())
         matrix = np.array([[FOCAL * share, 0, size[0] / 2], [0, FOCAL * share, size[1] / 2], [0, 0, 1.0]])
-        stance, true = flat_sheet_position(fit, matrix, 0.03, MIDDLE_MM), view_angles(where, (0, 0))
-        if stance.agrees is not False:
-            off = abs(stance.azimuth_deg - true[0]), abs(stance.distance_mm - true[2])
-            ratios.append(np.divide(off, [stance.azimuth_uncertainty_deg, stance.distance_uncertainty_mm]))
-            whole = flat_sheet_position(fit, matrix, 0.03, MIDDLE_MM, whole=True)
+        position, true = flat_sheet_position(fit, matrix, 0.03, MIDDLE_MM), view_angles(where, (0, 0))
+        if position.focal_agrees is not False:
+            off = abs(position.azimuth_deg - true[0]), abs(position.distance_mm - true[2])
+            ratios.append(np.divide(off, [position.azimuth_uncertainty_deg, position.distance_uncertainty_mm]))
+            whole = flat_sheet_position(fit, matrix, 0.03, MIDDLE_MM, matrix_is_known=True)
             blind.append(off[0] / whole.azimuth_uncertainty_deg)
     ratios = np.array(ratios)
     assert len(ratios) > 40 and ratios.max() <= 3 and 0.8 <= np.mean(ratios[:, 0] <= 1) < 1
@@ -76,9 +76,13 @@ def test_crops_without_a_trace_are_contradicted_or_within_what_is_stated():
 
 def test_where_perspective_cannot_tell_only_a_known_camera_gives_a_distance():
     fit = fit_page(corners_px(flat, camera(2, 3, 450), noise_px=0.045), markers_mm())
-    stance = flat_sheet_position(fit, MATRIX, 0.03, MIDDLE_MM)
-    assert stance.agrees is None and np.isinf(stance.distance_uncertainty_mm) and stance.azimuth_uncertainty_deg > 7
-    known = flat_sheet_position(fit, MATRIX, 0.0025, MIDDLE_MM, whole=True)
+    position = flat_sheet_position(fit, MATRIX, 0.03, MIDDLE_MM)
+    assert (
+        position.focal_agrees is None
+        and np.isinf(position.distance_uncertainty_mm)
+        and position.azimuth_uncertainty_deg > 7
+    )
+    known = flat_sheet_position(fit, MATRIX, 0.0025, MIDDLE_MM, matrix_is_known=True)
     assert known.distance_uncertainty_mm < 5 and known.azimuth_uncertainty_deg < 7
 
 
@@ -88,12 +92,13 @@ def test_a_fold_between_markers_that_looks_like_a_roll_turns_the_middle_within_w
     """By 10°: a cylinder explains it, and its middle is turned by 3 to 5°, which the corners claim to know to 0.4°."""
     where = camera(23, 8, 590)
     shape = fit_shape(corners_px(folded(10, at_mm, along), where), markers_mm(), tuple(SIZE), FOCAL, 0.03).shape
-    stance, blind = (
-        bent_sheet_position(shape, MATRIX, 0.03, MIDDLE_MM, turn, whole=True) for turn in (turn_rad(0.0, shape), 0.0)
+    position, blind = (
+        bent_sheet_position(shape, MATRIX, 0.03, MIDDLE_MM, turn, matrix_is_known=True)
+        for turn in (turn_rad(0.0, shape), 0.0)
     )
     assert shape.radius_mm is not None and 0.03 < shape.hidden_turn_rad < 0.12
-    off = abs(stance.azimuth_deg - view_angles(where, (0, 0))[0])
-    assert off <= 3 * stance.azimuth_uncertainty_deg
+    off = abs(position.azimuth_deg - view_angles(where, (0, 0))[0])
+    assert off <= 3 * position.azimuth_uncertainty_deg
     if along == 0:
         assert off > 3 * blind.azimuth_uncertainty_deg
 

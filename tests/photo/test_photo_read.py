@@ -76,7 +76,7 @@ def test_a_focal_length_of_another_picture_is_not_used(tmp_path, size, tags, spr
         (exif if key == 0x0131 else details)[key] = value
     Image.new("RGB", size).save(tmp_path / "a.jpg", exif=exif)
     photo = read_photo(tmp_path / "a.jpg")
-    assert photo.cropped == cropped and (photo.focal_px is None) == cropped
+    assert photo.focal_rejected == cropped and (photo.focal_px is None) == cropped
     if spread is not None:
         assert photo.focal_spread == spread and photo.focal_px == pytest.approx(26 / 43.2666 * math.hypot(*size))
 
@@ -141,9 +141,9 @@ def test_opencv_reads_a_jpeg_as_pillow_does(tmp_path, monkeypatch, subsampling, 
     (tmp_path / "more.jpg").write_bytes((tmp_path / "a.jpg").read_bytes() + b"a film of a second")
     with Image.open(tmp_path / "a.jpg") as image:
         expected = np.asarray(image)
-        assert read._whole_jpeg(image) is not None
+        assert read._decode_jpeg(image) is not None
     with Image.open(tmp_path / "more.jpg") as image:
-        assert read._whole_jpeg(image) is None
+        assert read._decode_jpeg(image) is None
     for name in ("a", "more"):
         assert np.array_equal(read_photo(tmp_path / f"{name}.jpg").srgb, expected)
     monkeypatch.setattr(read.cv2, "imdecode", lambda *_: None)

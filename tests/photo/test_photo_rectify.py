@@ -116,7 +116,7 @@ def test_a_sheet_too_small_to_tell_left_from_right_says_so(ids, good_mm, bad_mm)
             noisy = noisy_corners(view(10, 3, distance), 0.045, seed)
             fit = fit_page({i: noisy[i] for i in ids}, marker_corners())
             azimuths.append(view_angles(plane_pose(fit.px_from_mm, matrix), center)[0])
-            stated.append(flat_sheet_position(fit, matrix, 0.0, center, whole=True).azimuth_uncertainty_deg)
+            stated.append(flat_sheet_position(fit, matrix, 0.0, center, matrix_is_known=True).azimuth_uncertainty_deg)
         azimuths, stated = np.array(azimuths), np.array(stated)
         assert np.mean(np.abs(azimuths - 10) <= stated) >= 0.75
         assert (azimuths > 0).all() == tells

@@ -17,13 +17,13 @@ from patchproof.evidence.measure import identify, measure
 from patchproof.evidence.ranges import promised_ranges
 from patchproof.evidence.surface import promised_of, surface_of
 from patchproof.photo import colorfit, detect, edges, known_page
-from patchproof.photo.detect import LINEAR_FLOAT32_FROM_CODE, find_markers, luminance, refine
+from patchproof.photo.detect import LINEAR_FLOAT32_FROM_CODE, find_markers, fit_marker_borders, luminance
 from patchproof.photo.edges import fit_borders
 from patchproof.photo.known_page import find_sheet
-from patchproof.photo.limits import edges_in, squares_in
+from patchproof.photo.limits import count_edges, count_squares
 from patchproof.photo.quality import CLIPPED_CODE
 from patchproof.photo.read import Photo
-from patchproof.photo.registration import _vagueness
+from patchproof.photo.registration import _shift_per_error
 from patchproof.photo.rejection import PhotoRejected
 from patchproof.sheets.markers import marker_cells
 
@@ -55,8 +55,8 @@ def test_borders_do_not_depend_on_the_light_far_from_them_nor_on_other_markers(p
     rough = find_markers(photo, IDS).corners_px
     ids = sorted(rough)
     quads, cells = np.array([rough[i] for i in ids]) + 0.8, marker_cells(detect.DICTIONARY, ids)
-    together, whole = refine(photo, quads, cells), fit_borders(luminance(photo), quads, cells)
-    alone = [refine(photo, quads[[i]], cells[[i]])[0] for i in range(len(ids))]
+    together, whole = fit_marker_borders(photo, quads, cells), fit_borders(luminance(photo), quads, cells)
+    alone = [fit_marker_borders(photo, quads[[i]], cells[[i]])[0] for i in range(len(ids))]
     assert len(ids) == 8 and all(b.fitted for b in whole)
     for borders in (whole, alone):
         for one, other in zip(together, borders, strict=True):
@@ -86,15 +86,15 @@ def test_a_sheet_too_small_for_the_first_levels_is_found_and_one_too_small_for_a
 def test_markers_that_are_predicted_are_completed_as_without_the_first_look(piece, surface, monkeypatch, moved_px):
     """Blurred and far away, where the detector misses some; with predictions that are up to half a module off."""
     photo = photograph(piece, view(30, 0, 560, 10), blur_px=1.5, noise=0.004)
-    predicted = known_page._predicted
+    predicted = known_page._predict_corners
 
     def off(*given):
         quads = predicted(*given)
         return quads and {i: quad + np.array([moved_px, -moved_px]) for i, quad in quads.items()}
 
-    monkeypatch.setattr(known_page, "_predicted", off)
+    monkeypatch.setattr(known_page, "_predict_corners", off)
     looked = find_sheet(photo, IDS, surface.corners_mm).corners_px
-    monkeypatch.setattr(known_page, "_HOPELESS", -2)
+    monkeypatch.setattr(known_page, "_MIN_TRIAL_CORRELATION", -2)
     fitted = find_sheet(photo, IDS, surface.corners_mm).corners_px
     assert looked.keys() == fitted.keys() and len(looked) >= 6
 
@@ -104,8 +104,8 @@ def test_outlines_have_no_more_points_than_pixels_have_edges():
     for share in np.linspace(0, 1, 40):
         mask = (rng.random((23, 31)) < share).astype(np.uint8)
         outlines, _ = cv2.findContours(mask, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
-        assert sum(map(len, outlines)) <= edges_in(mask)
-    assert edges_in(np.ones((3, 4), np.uint8)) == 14
+        assert sum(map(len, outlines)) <= count_edges(mask)
+    assert count_edges(np.ones((3, 4), np.uint8)) == 14
 
 
 def test_squares_among_noise_are_counted_as_without_taking_its_specks_off():
@@ -114,8 +114,10 @@ def test_squares_among_noise_are_counted_as_without_taking_its_specks_off():
         0, 6, y.shape
     )
     picture = np.clip(picture, 0, 255).astype(np.uint8)
-    count = squares_in(picture)
-    assert count > 60 and squares_in(picture, most=10) == count and squares_in(picture, most=20_000) == 0
+    count = count_squares(picture)
+    assert (
+        count > 60 and count_squares(picture, max_count=10) == count and count_squares(picture, max_count=20_000) == 0
+    )
 
 
 @pytest.mark.parametrize("step", [1, 3])
@@ -155,7 +157,7 @@ def test_a_reduced_picture_seen_through_one_window_gives_the_markers_of_three(
     photo = photograph(piece, view(azimuth_deg, 5, distance_mm, size_px=(1600, 1200)), (1600, 1200), **sensor)
     one = find_sheet(photo, IDS, surface.corners_mm).corners_px
     inner = detect._detect
-    monkeypatch.setattr(detect, "_detect", lambda picture, printed, whole_px, _: inner(picture, printed, whole_px))
+    monkeypatch.setattr(detect, "_detect", lambda picture, aruco, full_px, _: inner(picture, aruco, full_px))
     three = find_sheet(photo, IDS, surface.corners_mm).corners_px
     assert one.keys() == three.keys() == IDS
     for marker_id, corners in one.items():
@@ -165,7 +167,7 @@ def test_a_reduced_picture_seen_through_one_window_gives_the_markers_of_three(
 def test_a_first_round_that_only_nears_the_borders_leaves_them_where_they_were(piece, surface, monkeypatch):
     photo = photograph(piece, view(25, 10, 400, 8), blur_px=0.7, noise=0.01)
     nearing = find_sheet(photo, IDS, surface.corners_mm).corners_px
-    monkeypatch.setattr(edges, "_SETTLED_PX", (1e-3, 1e-3))
+    monkeypatch.setattr(edges, "_CONVERGED_PX", (1e-3, 1e-3))
     settled = find_sheet(photo, IDS, surface.corners_mm).corners_px
     assert nearing.keys() == settled.keys() == IDS
     assert max(np.abs(nearing[i] - settled[i]).max() for i in IDS) < 2e-3
@@ -178,7 +180,7 @@ def test_a_color_map_that_stops_where_it_settles_is_that_of_all_turns(monkeypatc
     seen += rng.standard_t(2, seen.shape) * 0.01
     seen[:300] += 0.3  # gloss
     stopped = colorfit.affine12(seen, promised)
-    monkeypatch.setattr(colorfit, "_SETTLED", 0)
+    monkeypatch.setattr(colorfit, "_CONVERGED", 0)
     turned = colorfit.affine12(seen, promised)
     assert stopped is not None and turned is not None
     np.testing.assert_allclose(stopped.apply(seen), turned.apply(seen), atol=5e-4)
@@ -189,7 +191,7 @@ def test_how_vague_cells_are_and_how_well_codes_agree_are_numpy_s_own(piece):
     cells = rng.random((5, 30, 30), np.float32)
     cells[0] = 0.5
     cells[1] = np.linspace(0, 1, 30)  # texture along one side alone
-    vague = _vagueness(cells)
+    vague = _shift_per_error(cells)
     assert np.isinf(vague[:2]).all()
     for cell, figure in zip(cells[2:], vague[2:], strict=True):
         slopes = np.stack([slope.ravel() for slope in np.gradient(cell[5:-5, 5:-5])])
@@ -201,5 +203,5 @@ def test_how_vague_cells_are_and_how_well_codes_agree_are_numpy_s_own(piece):
     centers = np.mgrid[1:6, 1:6].reshape(2, -1) * 10 + 5
     light = edges.sample(luminance(srgb), centers.T[:, ::-1].astype(float))
     expected = np.corrcoef(light, code[1:-1, 1:-1].ravel())[0, 1]
-    assert known_page._agreement(srgb, quad, code) == pytest.approx(expected, abs=1e-5)
-    assert known_page._agreement(np.full_like(srgb, 9), quad, code) == -1
+    assert known_page._correlation(srgb, quad, code) == pytest.approx(expected, abs=1e-5)
+    assert known_page._correlation(np.full_like(srgb, 9), quad, code) == -1

@@ -119,10 +119,10 @@ def test_rolled_paper_says_where_the_camera_stood_by_its_own_middle(azimuth, rad
     """By the homography of the unrolled sheet, 10°, 25° and 40° at a radius of 100 mm were 18°, 41° and 57°."""
     corners = {i: rolled_px(mm, 1 / radius_mm, pose(azimuth)) for i, mm in markers_mm().items()}
     shape = fit_shape(corners, markers_mm(), SIZE, MATRIX[0, 0], 0.03).shape
-    stance = bent_sheet_position(shape, MATRIX, 0.03, CENTER)
+    position = bent_sheet_position(shape, MATRIX, 0.03, CENTER)
     # exact corners, not where straight borders would meet: the correction for that is what remains
-    assert stance.azimuth_deg == pytest.approx(azimuth, abs=0.6) and stance.azimuth_uncertainty_deg > 0.3
-    assert stance.distance_mm == pytest.approx(450, rel=0.02) and stance.agrees is not False
+    assert position.azimuth_deg == pytest.approx(azimuth, abs=0.6) and position.azimuth_uncertainty_deg > 0.3
+    assert position.distance_mm == pytest.approx(450, rel=0.02) and position.focal_agrees is not False
 
 
 def test_the_designs_own_pixels_say_where_it_lies():

@@ -171,7 +171,7 @@ def _measure(task: Task, item: PhotoItem) -> MeasuredPhoto:
     measured = measure(view, item.file, task.surface, task.promised, task.ranges, *wanted)
     entry, pictures = measured.entry, {}
     # a crop or a screenshot: EXIF or its name says so, or cameras and the promise have other shapes
-    if measured.counted and entry.code is None and (photo.part or not has_camera_shape(size_px, task.photo_px)):
+    if measured.counted and entry.code is None and (photo.is_crop or not has_camera_shape(size_px, task.photo_px)):
         entry = entry.changed(remark=Remark(code="cropped", advice=_PART))
     if item.with_pictures:
         px_from_mm = entry.geometry and entry.geometry.homography_px_from_mm

@@ -47,7 +47,7 @@ def pinhole_photo(photo: Photo, camera: Camera | None) -> PinholePhoto:
                 return PinholePhoto(_straightened(photo.srgb, held, matrix), matrix, True, FOCAL_ERROR / 1.96)
     focal = photo.focal_px
     matrix = None if focal is None else np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
-    return PinholePhoto(photo.srgb, matrix, False, photo.focal_spread, photo.cropped)
+    return PinholePhoto(photo.srgb, matrix, False, photo.focal_spread, photo.focal_rejected)
 
 
 def _turned(camera: Camera) -> Camera:

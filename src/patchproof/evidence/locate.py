@@ -194,7 +194,7 @@ def camera_pose(view: PinholePhoto, placed: LocatedSheet, surface: Surface) -> t
     else:
         stance = bent_sheet_position(placed.unrolled.shape, *camera)
     # a camera file is what stretched prints are measured by, which perspective cannot tell from a wrong focal length
-    if stance.agrees is False and not view.calibrated:
+    if stance.focal_agrees is False and not view.calibrated:
         return None, "contradicted"
     ratio, angle, length = None, stance.azimuth_uncertainty_deg, stance.distance_uncertainty_mm
     if view.calibrated and placed.unrolled is None:
@@ -208,4 +208,4 @@ def camera_pose(view: PinholePhoto, placed: LocatedSheet, surface: Surface) -> t
         distance_uncertainty_mm=None if far else length,
         scale_x_over_y=ratio,
     )
-    return pose, "calibrated" if view.calibrated else "confirmed" if stance.agrees else "unchecked"
+    return pose, "calibrated" if view.calibrated else "confirmed" if stance.focal_agrees else "unchecked"

@@ -1,1 +1,1 @@
-"""Photographs of a sheet: read them upright, find its markers, and turn pixels into millimeters. Needs no torch."""
+"""Photographs of a sheet: read them upright, find its markers, and map pixels to millimeters. Needs no torch."""

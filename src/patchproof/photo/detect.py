@@ -1,13 +1,13 @@
-"""Find the printed markers in a photograph, coarse to fine.
+"""Find the printed markers in a photograph, from coarse to fine.
 
-In: uint8 sRGB pixels and the ids that the sheet carries. Out: `MarkersInView`: corners in photo pixels (centers at .5,
-clockwise from the code's top-left) with what their borders show of blur, the ids of the same dictionary
-that are not the sheet's, and ids seen at two places. The detector looks at linear light: in code values blurred paper
-grows over ink, and at a blur of 0.3 modules it read 5 of 48 markers where linear light read 45. The pyramid starts
-below 1000 px and stops at the level where every expected id has been found; only if some are missing are code values
-tried, local contrast (CLAHE) where the photo is dark, and twice the size where there are less than 4 megapixels to
-look at. Corners of all levels are then fitted in the full photograph (`edges`). Where the page's millimeters are known
-`complete.find_sheet` needs fewer levels. Only OpenCV's class API is used, so 4.11 to 5.x will do.
+In: uint8 sRGB pixels and the ids of the sheet. Out: `MarkersInView`: corners in photo pixels (centers at .5, clockwise
+from the code's top-left) with the blur of their borders, ids of the same dictionary that are not the sheet's, and ids
+found at two places. The detector gets linear light: in code values blurred paper spreads over ink, and at a blur of 0.3
+modules it read 5 of 48 markers where it read 45 in linear light. The pyramid starts below 1000 px and stops at the
+level where every expected id has been found; only if some are missing it tries code values, local contrast (CLAHE) in
+dark photos, and twice the size where less than 4 megapixels are searched. Corners of all levels are then fitted in the
+full photograph (`edges`). If the page's millimeters are known, `known_page.find_sheet` needs fewer levels. Only
+OpenCV's class API is used, so 4.11 to 5.x will do.
 """
 
 from __future__ import annotations
@@ -19,28 +19,28 @@ import cv2
 import numpy as np
 
 from patchproof.base.color import LINEAR_FROM_CODE, LUMINANCE
-from patchproof.base.input import seconds_left
+from patchproof.base.input import remaining_seconds
 from patchproof.base.resample import downscale
 from patchproof.photo.edges import Borders, fit_borders
-from patchproof.photo.limits import squares_in
+from patchproof.photo.limits import count_squares
 from patchproof.photo.rectify import region_around
 from patchproof.photo.rejection import PhotoRejected
 from patchproof.sheets.markers import DICTIONARY, aruco_dictionary, marker_cells
 
 LINEAR_FLOAT32_FROM_CODE = LINEAR_FROM_CODE.astype(np.float32)
-COARSEST_PX = 1000  # a level's longer side; halves are taken until it is no longer than this
+COARSEST_PX = 1000  # longer side of the coarsest level at most
 UPSCALE_BELOW_PX = 4_000_000
-LARGEST_LEVEL_PX = 25_000_000  # of what one level looks at: a second of work and 0.3 GB; sharper pictures are halved
+LARGEST_LEVEL_PX = 25_000_000  # searched in one level: a second of work and 0.3 GB; larger pictures are halved
 MOST_SQUARES = 2000  # photographs have some hundreds at most
-_SQUARE_S = 0.004  # that it takes to look into one, which nothing interrupts
-MIRROR_PX = 3000  # longer side of the picture in which a mirrored sheet is looked for
-DARK = 70  # median code value below which local contrast helps; in light photos it hurts sharp markers
-# how far beyond a marker's rough corners its borders are looked for, at most: `edges` may move them by 1 px and 0.6
-# modules, a seventh of the marker each, and looks 10 px farther
-_FAR_PX, _FAR = 16.0, 0.2
-SMALLEST_MARKER_PX = 9.0  # side at its level: 7 modules of 1.3 px are the least that has been read
-# A reduced picture is looked at through one window of the detector's threshold, a full one through its three, which
-# take twice the time: markers that one misses are found where the others say that they lie, or at a finer level.
+_SQUARE_S = 0.004  # to examine one, which cannot be interrupted
+MIRROR_PX = 3000  # longer side of the picture that is searched for a mirrored sheet
+DARK_CODE = 70  # median code value below which local contrast helps; in bright photos it hurts sharp markers
+# Margin of light about a marker's rough corners: `edges` may move borders by 1 px and 0.6 modules (of 7 in a marker),
+# and samples 10 px farther.
+_MARGIN_PX, _MARGIN_SHARE = 16.0, 0.2
+SMALLEST_MARKER_PX = 9.0  # side at its level: 7 modules of 1.3 px are the smallest that has been read
+# A reduced picture is searched with one window of the detector's threshold, a full one with all three, which takes
+# twice the time: markers missed with one are found at their predicted places, or at a finer level.
 _REDUCED_WINDOW_PX = 5
 
 ImageRegion = tuple[slice, slice]
@@ -49,7 +49,7 @@ ImageRegion = tuple[slice, slice]
 
 @dataclass(frozen=True)
 class MarkersInView:
-    """`markers` by id; `foreign` ids of the same dictionary; `doubled` ids of ours that lie at two places."""
+    """A sheet's markers by id; `foreign` ids of the same dictionary; `doubled` ids of the sheet found in two places."""
 
     markers: dict[int, Borders]
     foreign: tuple[int, ...]
@@ -57,19 +57,19 @@ class MarkersInView:
 
     @property
     def corners_px(self) -> dict[int, np.ndarray]:
-        """Corners 4×2 by id."""
+        """Corners 4×2 px by id."""
         return {marker_id: borders.corners_px for marker_id, borders in self.markers.items()}
 
 
 @dataclass(frozen=True)
 class Level:
-    """One look at a photograph: its pixels' `scale`, what of them the detector gets (uint8 gray from sRGB), and all of
-    it averaged down, where that scale has half a picture's pixels or fewer along each side.
+    """A level of the search: the scale of its pixels, the conversion of uint8 sRGB to the detector's uint8 gray, and
+    the reduced photograph, for scales below 1.
     """
 
     scale: float
-    picture: Callable[[np.ndarray], np.ndarray]
-    small: np.ndarray | None = None
+    to_gray: Callable[[np.ndarray], np.ndarray]
+    reduced: np.ndarray | None = None
 
 
 def find_markers(
@@ -79,105 +79,106 @@ def find_markers(
     dictionary: str = DICTIONARY,
     or_all_of: Sequence[Set[int]] = (),
 ) -> MarkersInView:
-    """All markers of `expected` and `also` in the picture; the search ends when all of `expected` are found, or all of
-    a set in `or_all_of`.
+    """Find the markers of `expected` and `also` in a uint8 photograph; the search ends when all of `expected`, or all
+    of one set in `or_all_of`, are found.
     """
-    printed = aruco_dictionary(dictionary)
+    aruco = aruco_dictionary(dictionary)
     detections: dict[int, list[np.ndarray]] = {}
     for level in pyramid_levels(srgb, full_region(srgb)):
-        search_level(srgb, full_region(srgb), level, printed, detections)
-        if any(wanted <= detections.keys() for wanted in (expected, *or_all_of)):
+        search_level(srgb, full_region(srgb), level, aruco, detections)
+        if any(ids <= detections.keys() for ids in (expected, *or_all_of)):
             break
-    return fitted(srgb, detections, set(expected) | set(also), dictionary)
+    return fit_detections(srgb, detections, set(expected) | set(also), dictionary)
 
 
-def fitted(
+def fit_detections(
     srgb: np.ndarray,
     detections: dict[int, list[np.ndarray]],
-    ours: Set[int],
+    sheet_ids: Set[int],
     dictionary: str,
     borders: dict[int, Borders] | None = None,
 ) -> MarkersInView:
-    """`detections` with borders fitted in the full photograph; those in `borders` are, and the others are added."""
-    borders, known = {} if borders is None else borders, sorted(detections.keys() & ours)
-    if new := [marker_id for marker_id in known if marker_id not in borders]:
+    """Fit the borders of `detections` in the full photograph; `borders` is a cache by id, which is extended."""
+    borders, ids = {} if borders is None else borders, sorted(detections.keys() & sheet_ids)
+    if new := [marker_id for marker_id in ids if marker_id not in borders]:
         rough = np.array([detections[marker_id][0] for marker_id in new])
-        borders |= zip(new, refine(srgb, rough, marker_cells(dictionary, new)), strict=True)
-    markers = {i: borders[i] for i in known if is_plausible_quad(borders[i].corners_px)}
-    foreign = tuple(sorted(detections.keys() - set(known)))
-    return MarkersInView(markers, foreign, tuple(i for i in known if len(detections[i]) > 1))
+        borders |= zip(new, fit_marker_borders(srgb, rough, marker_cells(dictionary, new)), strict=True)
+    markers = {i: borders[i] for i in ids if is_plausible_quad(borders[i].corners_px)}
+    foreign = tuple(sorted(detections.keys() - set(ids)))
+    return MarkersInView(markers, foreign, tuple(i for i in ids if len(detections[i]) > 1))
 
 
 def is_mirrored(srgb: np.ndarray, expected: Set[int], dictionary: str = DICTIONARY) -> bool:
-    """Whether the sheet shows up when the picture is flipped: selfie cameras and scans through the back do that."""
+    """True if the flipped picture shows the sheet: selfie cameras and scans through the back mirror it."""
     mirrored = np.ascontiguousarray(downscale(srgb, MIRROR_PX)[:, ::-1])
     return bool(find_markers(mirrored, expected, frozenset(), dictionary).markers)
 
 
 def is_plausible_quad(corners: np.ndarray) -> bool:
-    """Whether a flat square can look like this: convex, clockwise, no side more than 12 times another."""
+    """True if a flat square can look like this: convex, clockwise, no side more than 12 times another."""
     sides = np.roll(corners, -1, axis=0) - corners
-    following = np.roll(sides, -1, axis=0)
-    turns = sides[:, 0] * following[:, 1] - sides[:, 1] * following[:, 0]
+    next_sides = np.roll(sides, -1, axis=0)
+    turns = sides[:, 0] * next_sides[:, 1] - sides[:, 1] * next_sides[:, 0]
     lengths = np.linalg.norm(sides, axis=1)
     return bool(np.isfinite(corners).all() and (turns > 0).all() and lengths.max() < 12 * lengths.min())
 
 
 def full_region(srgb: np.ndarray) -> ImageRegion:
-    """The box of all of the photograph."""
+    """The region of the whole photograph."""
     return slice(0, srgb.shape[0]), slice(0, srgb.shape[1])
 
 
-def pyramid_levels(srgb: np.ndarray, box: ImageRegion, coarsest_px: int = COARSEST_PX) -> Iterator[Level]:
-    """Half sizes in linear light up to the full one, then the fallbacks for a part of the photograph."""
+def pyramid_levels(srgb: np.ndarray, region: ImageRegion, coarsest_px: int = COARSEST_PX) -> Iterator[Level]:
+    """Yield half sizes in linear light up to the full size, then the fallbacks for a region of the photograph."""
     halvings = max(0, int(np.ceil(np.log2(max(srgb.shape[:2]) / coarsest_px))))
-    smaller = [srgb]  # halves of halves differ from what they stand for by a code value, and all take less than one
+    reduced = [srgb]  # repeated halving differs from direct reduction by a code value, and takes less time in total
     for n in range(1, halvings + 1):
-        even = not any(side % 2 for side in smaller[-1].shape[:2])
-        smaller.append(cv2.resize(smaller[-1] if even else srgb, _scaled(srgb, 0.5**n), interpolation=cv2.INTER_AREA))
+        even = not any(side % 2 for side in reduced[-1].shape[:2])
+        size = _scaled_size(srgb, 0.5**n)
+        reduced.append(cv2.resize(reduced[-1] if even else srgb, size, interpolation=cv2.INTER_AREA))
     for n in range(halvings, 0, -1):
-        yield Level(0.5**n, light_picture, smaller[n])
+        yield Level(0.5**n, light_picture, reduced[n])
     yield Level(1.0, light_picture)
     yield Level(1.0, code_picture)
-    codes = [code_picture]
-    part, sparse = srgb[box], max(1, max(srgb.shape) // 512)
-    if float(np.median(code_picture(np.ascontiguousarray(part[::sparse, ::sparse])))) < DARK:
-        codes = [contrast_picture]
+    codes = code_picture
+    part, step = srgb[region], max(1, max(srgb.shape) // 512)
+    if float(np.median(code_picture(np.ascontiguousarray(part[::step, ::step])))) < DARK_CODE:
+        codes = contrast_picture
         yield Level(1.0, contrast_picture)
     if part.shape[0] * part.shape[1] < UPSCALE_BELOW_PX:
-        yield from (Level(2.0, picture) for picture in (light_picture, *codes))
+        yield from (Level(2.0, to_gray) for to_gray in (light_picture, codes))
 
 
 def search_level(
-    srgb: np.ndarray, box: ImageRegion, level: Level, printed, detections: dict[int, list[np.ndarray]]
+    srgb: np.ndarray, region: ImageRegion, level: Level, aruco, detections: dict[int, list[np.ndarray]]
 ) -> None:
-    """Add to `detections` the corners, in the full photograph's pixels, of what one level shows of a part of it."""
-    part = srgb[box]
+    """Search a region of the photograph at one level; corners, in full pixels, are added to `detections` by id."""
+    part = srgb[region]
     height, width = part.shape[:2]
     if width * height * level.scale**2 > LARGEST_LEVEL_PX:
         return
-    size = _scaled(part, level.scale)
+    size = _scaled_size(part, level.scale)
     if level.scale < 1:
-        known = level.small is not None and part.shape == srgb.shape
-        part = level.small if known else cv2.resize(part, size, interpolation=cv2.INTER_AREA)
-    picture = level.picture(np.ascontiguousarray(part))
+        is_full = level.reduced is not None and part.shape == srgb.shape
+        part = level.reduced if is_full else cv2.resize(part, size, interpolation=cv2.INTER_AREA)
+    picture = level.to_gray(np.ascontiguousarray(part))
     if level.scale > 1:
         picture = cv2.resize(picture, size, interpolation=cv2.INTER_CUBIC)
-    to_full, start = np.array([width / size[0], height / size[1]]), [box[1].start, box[0].start]
-    for marker_id, quad in _detect(picture, printed, level.scale * max(srgb.shape), level.scale < 1):
+    to_full, start = np.array([width / size[0], height / size[1]]), [region[1].start, region[0].start]
+    for marker_id, quad in _detect(picture, aruco, level.scale * max(srgb.shape), level.scale < 1):
         corners, others = quad * to_full + start, detections.setdefault(marker_id, [])
-        apart = 0.5 * np.linalg.norm(corners[2] - corners[0])  # nearer, it is the same marker as at another level
-        if all(np.linalg.norm(corners.mean(0) - other.mean(0)) > apart for other in others):
+        min_distance = 0.5 * np.linalg.norm(corners[2] - corners[0])  # nearer, it is the marker of another level
+        if all(np.linalg.norm(corners.mean(0) - other.mean(0)) > min_distance for other in others):
             others.append(corners)
 
 
-def _scaled(srgb: np.ndarray, scale: float) -> tuple[int, int]:
+def _scaled_size(srgb: np.ndarray, scale: float) -> tuple[int, int]:
     """Width and height at another scale."""
     return max(1, round(srgb.shape[1] * scale)), max(1, round(srgb.shape[0] * scale))
 
 
 def light_picture(srgb: np.ndarray) -> np.ndarray:
-    """Linear light scaled so that all but the brightest thousandth (lamps, glare) fits."""
+    """Linear light as uint8, scaled so that all but the brightest thousandth (lamps, glare) fits."""
     step = max(1, max(srgb.shape) // 500)
     bright = max(float(np.percentile(luminance(np.ascontiguousarray(srgb[::step, ::step])), 99.9)), 1e-3)
     picture = np.empty(srgb.shape[:2], np.uint8)
@@ -192,12 +193,14 @@ def code_picture(srgb: np.ndarray) -> np.ndarray:
 
 
 def contrast_picture(srgb: np.ndarray) -> np.ndarray:
-    """Gray code values with their contrast evened out by region."""
+    """Gray code values with locally equalized contrast (CLAHE)."""
     return cv2.createCLAHE(3.0, (8, 8)).apply(code_picture(srgb))
 
 
 def detector_settings() -> cv2.aruco.DetectorParameters:
-    """Chosen on warped pages of known geometry: of 48 markers blurred by 0.3 modules the defaults find 37, these 46."""
+    """Parameters of the detector, chosen on warped pages of known geometry: of 48 markers blurred by 0.3 modules the
+    defaults find 37, these 46.
+    """
     settings = cv2.aruco.DetectorParameters()
     settings.perspectiveRemovePixelPerCell = 8
     settings.perspectiveRemoveIgnoredMarginPerCell = 0.3
@@ -205,62 +208,62 @@ def detector_settings() -> cv2.aruco.DetectorParameters:
     return settings
 
 
-def _detect(
-    picture: np.ndarray, printed, whole_px: float, is_reduced: bool = False
-) -> Iterator[tuple[int, np.ndarray]]:
-    """Ids and corners of one gray picture, part of one whose longer side has `whole_px` pixels."""
+def _detect(picture: np.ndarray, aruco, full_px: float, is_reduced: bool = False) -> Iterator[tuple[int, np.ndarray]]:
+    """Ids and corners in a gray picture, which is part of one whose longer side has `full_px` pixels."""
     settings = detector_settings()
     if is_reduced:
         settings.adaptiveThreshWinSizeMin = settings.adaptiveThreshWinSizeMax = _REDUCED_WINDOW_PX
     settings.minDistanceToBorder = 0
     settings.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     settings.relativeCornerRefinmentWinSize = 0.3
-    settings.minMarkerPerimeterRate = min(0.03 * whole_px, 4 * SMALLEST_MARKER_PX) / max(picture.shape)
-    corners, ids = detect_markers(picture, printed, settings)
+    settings.minMarkerPerimeterRate = min(0.03 * full_px, 4 * SMALLEST_MARKER_PX) / max(picture.shape)
+    corners, ids = detect_markers(picture, aruco, settings)
     if ids is None:
         return
     for marker_id, quad in zip(np.asarray(ids).reshape(-1), corners, strict=True):
-        # the detector counts from pixel centers: its 0 is our .5
+        # in the detector's coordinates pixel centers lie at whole numbers: its 0 is our .5
         quad = np.asarray(quad, float).reshape(4, 2) + 0.5
         if is_plausible_quad(quad):
             yield int(marker_id), quad
 
 
-def detect_markers(picture: np.ndarray, printed, settings: cv2.aruco.DetectorParameters):
-    """OpenCV's (corners, ids or None) of one uint8 gray picture; `PhotoRejected("too_costly")` where it shows so much
-    that looks like markers that the detector would not end in time.
+def detect_markers(picture: np.ndarray, aruco, settings: cv2.aruco.DetectorParameters):
+    """OpenCV's (corners, ids or None) of one uint8 gray picture; raises `PhotoRejected("too_costly")` if it shows so
+    many possible markers that the detector would not end in time.
     """
-    most = int(min(MOST_SQUARES, seconds_left() / _SQUARE_S))
-    squares = squares_in(picture, settings.minMarkerPerimeterRate * max(picture.shape), most)
-    if squares > most:
+    max_squares = int(min(MOST_SQUARES, remaining_seconds() / _SQUARE_S))
+    squares = count_squares(picture, settings.minMarkerPerimeterRate * max(picture.shape), max_squares)
+    if squares > max_squares:
         advice = f"it shows {squares} squares that could be markers: photograph less of that pattern"
-        raise PhotoRejected("too_costly", squares, most, advice)
-    return cv2.aruco.ArucoDetector(printed, settings).detectMarkers(picture)[:2]
+        raise PhotoRejected("too_costly", squares, max_squares, advice)
+    return cv2.aruco.ArucoDetector(aruco, settings).detectMarkers(picture)[:2]
 
 
-def refine(srgb: np.ndarray, rough: np.ndarray, cells: np.ndarray) -> list[Borders]:
-    """Fit borders in the photograph, of which only what lies round the markers is turned into light."""
-    box = region_around(rough.reshape(-1, 2), _FAR_PX, srgb.shape)
-    low = np.array([box[1].start, box[0].start])
-    part, quads = srgb[box], rough - low
-    light = np.zeros(part.shape[:2], np.float32)  # pages of it that nobody looks at take no memory
+def fit_marker_borders(srgb: np.ndarray, rough: np.ndarray, cells: np.ndarray) -> list[Borders]:
+    """Fit the borders of markers with rough corners M×4×2 in the photograph, of which only the regions about the
+    markers are converted to light.
+    """
+    region = region_around(rough.reshape(-1, 2), _MARGIN_PX, srgb.shape)
+    low = np.array([region[1].start, region[0].start])
+    part, quads = srgb[region], rough - low
+    light = np.zeros(part.shape[:2], np.float32)  # memory pages that are never touched take no memory
     for quad in quads:
-        around = region_around(quad, _FAR_PX + _FAR * np.ptp(quad, axis=0).max(), part.shape)
+        around = region_around(quad, _MARGIN_PX + _MARGIN_SHARE * np.ptp(quad, axis=0).max(), part.shape)
         light[around] = luminance(np.ascontiguousarray(part[around]))
     return [replace(b, corners_px=b.corners_px + low) for b in fit_borders(light, quads, cells)]
 
 
 def luminance(srgb: np.ndarray) -> np.ndarray:
-    """Linear luminance H×W float32 of uint8 sRGB."""
+    """Linear luminance H×W float32 of uint8 sRGB H×W×3."""
     table = np.repeat(LINEAR_FLOAT32_FROM_CODE[None, :, None], 3, 2)
     weights = np.array([LUMINANCE], np.float32)
     out = np.empty(srgb.shape[:2], np.float32)
-    for rows in row_strips(srgb):  # the table makes 12 bytes of each pixel
+    for rows in row_strips(srgb):  # in strips, because the table makes 12 bytes of each pixel
         cv2.transform(cv2.LUT(srgb[rows], table), weights, out[rows])
     return out
 
 
 def row_strips(srgb: np.ndarray) -> Iterator[slice]:
-    """Slices of rows of a million pixels or so; the last may pass the end."""
+    """Slices of rows with about a million pixels each; the last may exceed the picture."""
     rows = max(1, 1_000_000 // srgb.shape[1])
     return (slice(y, y + rows) for y in range(0, len(srgb), rows))

@@ -1,11 +1,11 @@
-"""The focal length that a file's EXIF data states, and whether it is still this picture's.
+"""Read the focal length from a photograph's EXIF data, unless the picture was changed since it was taken.
 
-In: an open Pillow image. Out: the focal length in pixels, its spread, whether it was thrown away. EXIF gives the length
-on film of 36×24 mm, by the diagonal: of a picture that was cropped or zoomed digitally, neither that nor the principal
-point in the middle is true. So none is taken where EXIF has another size than the picture, a digital zoom, or where the
-picture has a shape that no sensor has. What an editor saved, and 16:9, which cameras cut from 4:3 or 3:2, is believed
-less. A crop that keeps the shape and mends EXIF leaves no trace here; the sheet's perspective may still contradict it.
-`is_part` is stricter: a picture that was made smaller as a whole, or zoomed by its camera, is still a photograph.
+In: an open Pillow image. Out: the focal length in pixels, its spread, and whether one was rejected. EXIF gives the
+35 mm equivalent, by the diagonal: if a picture was cropped or zoomed digitally, neither that nor the principal point in
+the middle is true. So it is rejected if EXIF has another size than the picture or a digital zoom, or if no sensor has
+the picture's shape. Pictures saved by an editor, and 16:9, which cameras cut from 4:3 or 3:2, get a larger spread. A
+crop that keeps the shape and updates EXIF leaves no trace here; the sheet's perspective may still contradict it.
+`is_crop` has other rules: a picture that was downscaled, or zoomed by its camera, is still a whole photograph.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import math
 import re
 
 _DIAGONAL_35MM = 43.2666  # mm, of the 36×24 mm frame that FocalLengthIn35mmFilm refers to
-EXIF_SPREAD = 0.03  # of its logarithm: whole millimeters of 26 (0.011), and lenses that are not quite what is written
+EXIF_SPREAD = 0.03  # of its logarithm: rounding to whole millimeters at 26 mm (0.011), and tolerances of lenses
 LOOSE_SPREAD = 0.1
 _SENSOR_SHAPES, _CUT_SHAPES = (4 / 3, 3 / 2), (16 / 9,)
 _SAME_SHAPE = 0.01
@@ -22,12 +22,12 @@ _EDITORS = re.compile(
     r"photoshop|lightroom|gimp|snapseed|darktable|affinity|paint|pixelmator|capture one|luminar", re.I
 )
 _EXIF_IFD, _FOCAL_35MM, _WIDTH, _HEIGHT, _ZOOM, _SOFTWARE = 0x8769, 0xA405, 0xA002, 0xA003, 0xA404, 0x0131
-_COMMENT = 0x9286  # in which phones and desktops of one maker name their screenshots
+_COMMENT = 0x9286  # marks screenshots of phones and desktops of one maker
 _SCREEN = re.compile(r"screen.?shot", re.I)
 
 
-def focal_of(image) -> tuple[float | None, float, bool]:
-    """(focal length in pixels or None, standard deviation of its logarithm, whether EXIF has one that was dropped)."""
+def read_focal(image) -> tuple[float | None, float, bool]:
+    """(focal length in pixels or None, standard deviation of its logarithm, True if EXIF has one that was rejected)."""
     try:
         exif = image.getexif()
         details = exif.get_ifd(_EXIF_IFD)
@@ -42,33 +42,31 @@ def focal_of(image) -> tuple[float | None, float, bool]:
     if resized or (zoom is not None and zoom > 1.01) or not _has_shape(long, short, _SENSOR_SHAPES + _CUT_SHAPES):
         return None, EXIF_SPREAD, True
     edited = bool(_EDITORS.search(str(exif.get(_SOFTWARE, ""))))
-    loose = edited or not _has_shape(long, short, _SENSOR_SHAPES)
-    return focal_35mm / _DIAGONAL_35MM * math.hypot(long, short), LOOSE_SPREAD if loose else EXIF_SPREAD, False
+    uncertain = edited or not _has_shape(long, short, _SENSOR_SHAPES)
+    return focal_35mm / _DIAGONAL_35MM * math.hypot(long, short), LOOSE_SPREAD if uncertain else EXIF_SPREAD, False
 
 
-def is_part(image, name: str) -> bool:
-    """Whether EXIF says that this was of another shape, or it or the file's name says that it is a screenshot."""
+def is_crop(image, name: str) -> bool:
+    """True if EXIF states another shape than the picture's, or EXIF or the file's name declares a screenshot."""
     try:
         details = image.getexif().get_ifd(_EXIF_IFD)
     except (TypeError, ValueError, ZeroDivisionError, KeyError, SyntaxError, OSError):
         details = {}
     stated = [side for key in (_WIDTH, _HEIGHT) if (side := _number(details.get(key))) is not None]
-    other = len(stated) == 2 and not _has_shape(max(image.size), min(image.size), (max(stated) / min(stated),))
+    reshaped = len(stated) == 2 and not _has_shape(max(image.size), min(image.size), (max(stated) / min(stated),))
     comment = details.get(_COMMENT, "")
     comment = comment.decode("latin-1").replace("\0", "") if isinstance(comment, bytes) else str(comment)
-    return other or bool(_SCREEN.search(name) or _SCREEN.search(comment))
+    return reshaped or bool(_SCREEN.search(name) or _SCREEN.search(comment))
 
 
 def has_camera_shape(size_px: tuple[int, int], also_px: tuple[int, int] | None) -> bool:
-    """Whether cameras take pictures of that shape (their sensors', what they cut from it, a square), or it is the shape
-    of `also_px`.
-    """
+    """True if cameras take pictures of this shape (4:3, 3:2, 16:9, square), or if it is the shape of `also_px`."""
     also = () if also_px is None else (max(also_px) / min(also_px),)
     return _has_shape(max(size_px), min(size_px), (*_SENSOR_SHAPES, *_CUT_SHAPES, 1.0, *also))
 
 
 def _has_shape(long: int, short: int, shapes: tuple[float, ...]) -> bool:
-    """Within a percent, and a pixel of small pictures."""
+    """True if the sides have one of the ratios, to within a percent, or a pixel in small pictures."""
     return any(abs(long - shape * short) <= max(_SAME_SHAPE * long, 1 + shape) for shape in shapes)
 
 

@@ -1,10 +1,10 @@
-"""All markers of a known page: those that the detector sees, and those it missed, where the others say they must be.
+"""Find all markers of a known page: those that the detector finds, and others at the places that these predict.
 
-In: the photograph and where every marker lies on the page. Out: `MarkersInView`. After each level of the detector a
-homography from the markers found predicts the corners of the rest; where cells are about the printed ones, borders are
-fitted from there, and a marker counts when these fit near the prediction and its cells are the printed ones. That needs
-no contours, so it still works for small, blurred or partly covered markers, and it spares the finer levels, which cost
-most; they then look only where markers are still missing. Prediction never identifies a sheet by itself.
+In: the photograph and the place of every marker on the page. Out: `MarkersInView`. After each level of the detector a
+homography from the markers found so far predicts the corners of the missing ones; where the cells resemble the printed
+ones, borders are fitted from there, and a marker counts if these lie near the prediction and its cells match. This
+needs no contours, so it works for small, blurred or partly covered markers, and it avoids the finer levels, which cost
+most; they search only where markers are still missing. Prediction never identifies a sheet by itself.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from patchproof.photo.detect import (
     COARSEST_PX,
     ImageRegion,
     MarkersInView,
-    fitted,
+    fit_detections,
+    fit_marker_borders,
     full_region,
     is_plausible_quad,
     luminance,
     pyramid_levels,
-    refine,
     search_level,
 )
 from patchproof.photo.edges import Borders, sample
@@ -32,13 +32,13 @@ from patchproof.photo.rectify import fit_page, region_around
 from patchproof.photo.rejection import PhotoRejected
 from patchproof.sheets.markers import DICTIONARY, aruco_dictionary, marker_cells
 
-# of light with printed cells; wrong codes of the dictionary stay below 0.6, blur lowers it to 0.8
+# of the light with the printed cells; wrong codes of the dictionary stay below 0.6, blur lowers it to 0.8
 LEAST_CORRELATION = 0.7
-# what a marker has at least at one of the places round its predicted one, which is half a module off at most: borders,
-# which cost most, are not fitted to less
-_HOPELESS = 0.5
-_AROUND = tuple((x, y) for x in (-0.4, 0.0, 0.4) for y in (-0.4, 0.0, 0.4))
-# px of a marker's side, 4 per module: the detector reads nearly all of those (0.99), so one that is missing is covered
+# at one of the offsets (in modules) about the predicted place, which is at most half a module off: with less, borders
+# are not fitted, because that costs most
+_MIN_TRIAL_CORRELATION = 0.5
+_TRIAL_OFFSETS = tuple((x, y) for x in (-0.4, 0.0, 0.4) for y in (-0.4, 0.0, 0.4))
+# px of a marker's side, 4 per module: the detector reads 0.99 of these, so one that is missing must be covered
 READABLE_PX = 28.0
 
 
@@ -49,90 +49,88 @@ def find_sheet(
     dictionary: str = DICTIONARY,
     coarsest_px: int = COARSEST_PX,
 ) -> MarkersInView:
-    """The markers of `corners_mm` (page mm by id) that are in the picture.
+    """Find the markers of `corners_mm` (page mm by id) in a uint8 photograph.
 
-    The search ends when every one of `expected` is found, or shown to be out of the picture or covered, and none or
-    several are at two places.
+    The search ends when each of `expected` is found, out of the picture or covered, unless a finer level could decide
+    about a single foreign marker or one at two places.
     """
-    printed = aruco_dictionary(dictionary)
+    aruco = aruco_dictionary(dictionary)
     detections: dict[int, list[np.ndarray]] = {}
     borders: dict[int, Borders] = {}
-    box, view = full_region(srgb), MarkersInView({}, (), ())
-    for level in pyramid_levels(srgb, box, coarsest_px):
-        before, foreign = sum(map(len, detections.values())), view.foreign
-        search_level(srgb, box, level, printed, detections)
-        if sum(map(len, detections.values())) != before:
-            detected = fitted(srgb, detections, set(corners_mm), dictionary, borders)
+    region, view = full_region(srgb), MarkersInView({}, (), ())
+    for level in pyramid_levels(srgb, region, coarsest_px):
+        count, foreign = sum(map(len, detections.values())), view.foreign
+        search_level(srgb, region, level, aruco, detections)
+        if sum(map(len, detections.values())) != count:
+            detected = fit_detections(srgb, detections, set(corners_mm), dictionary, borders)
             view = complete_markers(srgb, detected, corners_mm, dictionary)
-        wanted = expected - view.markers.keys()
-        if wanted and view.markers:
-            wanted, box = _still_wanted(srgb, wanted, view, corners_mm, level.scale)
-        # one marker at two places, or of another sheet, is clutter, or the first that is read of a second print: a
-        # finer level tells
+        missing = expected - view.markers.keys()
+        if missing and view.markers:
+            missing, region = _findable(srgb, missing, view, corners_mm, level.scale)
+        # one marker at two places, or of another sheet, is either clutter or the first one read of a second print,
+        # which a finer level can tell
         unclear = len(view.doubled) == 1 or (len(view.foreign) == 1 and view.foreign != foreign)
-        if not wanted and not unclear:
+        if not missing and not unclear:
             break
     return view
 
 
-def _still_wanted(
-    srgb, wanted: Set[int], view: MarkersInView, corners_mm, scale: float
-) -> tuple[Set[int], ImageRegion]:
-    """Which of the missing markers a finer level could still show, and the part of the picture to look at for them."""
+def _findable(srgb, missing: Set[int], view: MarkersInView, corners_mm, scale: float) -> tuple[Set[int], ImageRegion]:
+    """The missing markers that a finer level could still find, and the region to search."""
     quads = None
-    if sum(b.fitted for b in view.markers.values()) >= 2:  # one marker says too little about where the others are
-        quads = _predicted(srgb, view, wanted, corners_mm)
+    if sum(b.fitted for b in view.markers.values()) >= 2:  # one marker predicts the others' places badly
+        quads = _predict_corners(srgb, view, missing, corners_mm)
     if quads is not None:
-        wanted = {i for i, quad in quads.items() if _side_px(quad) * scale < READABLE_PX}
-    if quads is None or not wanted:
-        return wanted, full_region(srgb)
-    margin = 2 * max(_side_px(quads[i]) for i in wanted)
-    return wanted, region_around(np.concatenate([quads[i] for i in wanted]), margin, srgb.shape)
+        missing = {i for i, quad in quads.items() if _side_px(quad) * scale < READABLE_PX}
+    if quads is None or not missing:
+        return missing, full_region(srgb)
+    margin = 2 * max(_side_px(quads[i]) for i in missing)
+    return missing, region_around(np.concatenate([quads[i] for i in missing]), margin, srgb.shape)
 
 
 def complete_markers(
     srgb: np.ndarray, view: MarkersInView, corners_mm: Mapping[int, np.ndarray], dictionary: str = DICTIONARY
 ) -> MarkersInView:
-    """`view` with all markers of `corners_mm` that verify at their predicted places; bad fits are replaced."""
+    """Add to `view` all markers of `corners_mm` that are confirmed at their predicted places, and replace bad fits."""
     for _ in range(3):  # each round's markers predict farther ones better
-        more = _round(srgb, view, corners_mm, dictionary)
-        if not more:
+        confirmed = _confirm_markers(srgb, view, corners_mm, dictionary)
+        if not confirmed:
             break
-        view = MarkersInView(dict(sorted((view.markers | more).items())), view.foreign, view.doubled)
+        view = MarkersInView(dict(sorted((view.markers | confirmed).items())), view.foreign, view.doubled)
     return view
 
 
-def _round(srgb, view: MarkersInView, corners_mm, dictionary: str) -> dict[int, Borders]:
-    """Markers that are not fitted yet and verify at the places that the fitted ones predict."""
-    unsure = {i for i in corners_mm if i not in view.markers or not view.markers[i].fitted}
-    predicted = _predicted(srgb, view, unsure, corners_mm)
+def _confirm_markers(srgb, view: MarkersInView, corners_mm, dictionary: str) -> dict[int, Borders]:
+    """Markers that are not fitted yet and are confirmed at the places that the fitted ones predict."""
+    missing = {i for i in corners_mm if i not in view.markers or not view.markers[i].fitted}
+    predicted = _predict_corners(srgb, view, missing, corners_mm)
     if not predicted:
         return {}
     ids = sorted(predicted)
     codes = dict(zip(ids, marker_cells(dictionary, ids), strict=True))
-    ids = [i for i in ids if _agreement(srgb, predicted[i], codes[i], _AROUND) > _HOPELESS]
+    ids = [i for i in ids if _correlation(srgb, predicted[i], codes[i], _TRIAL_OFFSETS) > _MIN_TRIAL_CORRELATION]
     if not ids:
         return {}
     cells = np.array([codes[i] for i in ids])
-    borders = refine(srgb, np.array([predicted[i] for i in ids]), cells)
+    borders = fit_marker_borders(srgb, np.array([predicted[i] for i in ids]), cells)
     return {
         i: b
         for i, b, code in zip(ids, borders, cells, strict=True)
-        if b.fitted and _near(b, predicted[i]) and _agreement(srgb, b.corners_px, code) > LEAST_CORRELATION
+        if b.fitted and _is_near(b, predicted[i]) and _correlation(srgb, b.corners_px, code) > LEAST_CORRELATION
     }
 
 
-def _predicted(srgb, view: MarkersInView, missing: Set[int], corners_mm) -> dict[int, np.ndarray] | None:
-    """Where the fitted markers say that missing ones lie in the picture, by id; None where they cannot tell."""
+def _predict_corners(srgb, view: MarkersInView, missing: Set[int], corners_mm) -> dict[int, np.ndarray] | None:
+    """Corners of missing markers in the picture, by id, from the fitted ones; None if these determine no homography."""
     try:
         px_from_mm = fit_page({i: b.corners_px for i, b in view.markers.items() if b.fitted}, corners_mm).px_from_mm
     except (PhotoRejected, np.linalg.LinAlgError):
         return None
     quads = {i: apply_homography(px_from_mm, corners_mm[i]) for i in missing}
-    return {i: quad for i, quad in quads.items() if is_plausible_quad(quad) and _inside(quad, srgb)}
+    return {i: quad for i, quad in quads.items() if is_plausible_quad(quad) and _is_in_picture(quad, srgb)}
 
 
-def _inside(quad: np.ndarray, srgb: np.ndarray) -> bool:
+def _is_in_picture(quad: np.ndarray, srgb: np.ndarray) -> bool:
     limit = [srgb.shape[1] - 2, srgb.shape[0] - 2]
     return bool((quad > 2).all() and (quad < limit).all() and _side_px(quad) >= 10)
 
@@ -141,22 +139,22 @@ def _side_px(quad: np.ndarray) -> float:
     return float(np.sqrt(abs(cv2.contourArea(quad.astype(np.float32)))))
 
 
-def _near(borders: Borders, quad: np.ndarray) -> bool:
+def _is_near(borders: Borders, quad: np.ndarray) -> bool:
     return bool(np.linalg.norm(borders.corners_px - quad, axis=1).max() < max(0.5 * borders.module_px, 1.0))
 
 
-def _agreement(srgb: np.ndarray, corners_px: np.ndarray, code: np.ndarray, moved=((0.0, 0.0),)) -> float:
-    """Correlation of the cells' light with the printed pattern, at the best of places `moved` by so many modules."""
+def _correlation(srgb: np.ndarray, corners_px: np.ndarray, code: np.ndarray, offsets=((0.0, 0.0),)) -> float:
+    """Correlation of the cells' light with the printed pattern, at the best of several offsets in modules."""
     n = len(code)
     square = np.array([[0, 0], [n, 0], [n, n], [0, n]], np.float32)
     to_px = cv2.getPerspectiveTransform(square, corners_px.astype(np.float32))
-    rows, columns = np.mgrid[1 : n - 1, 1 : n - 1] + 0.5  # without the rim
+    rows, columns = np.mgrid[1 : n - 1, 1 : n - 1] + 0.5  # without the black border
     inner = np.column_stack([columns.ravel(), rows.ravel()])
-    centers = apply_homography(to_px, (np.array(moved)[:, None] + inner).reshape(-1, 2))
-    box = region_around(centers, 1, srgb.shape)
-    light = luminance(np.ascontiguousarray(srgb[box]))
-    cells = sample(light, centers - [box[1].start, box[0].start]).reshape(len(moved), -1)
-    shown, printed = cells[cells.std(1) > 1e-6], code[1:-1, 1:-1].ravel()
-    shown, printed = shown - shown.mean(1, keepdims=True), printed - printed.mean()
-    correlation = shown @ printed / (np.linalg.norm(shown, axis=1) * np.linalg.norm(printed))
+    centers = apply_homography(to_px, (np.array(offsets)[:, None] + inner).reshape(-1, 2))
+    region = region_around(centers, 1, srgb.shape)
+    light = luminance(np.ascontiguousarray(srgb[region]))
+    cells = sample(light, centers - [region[1].start, region[0].start]).reshape(len(offsets), -1)
+    values, printed = cells[cells.std(1) > 1e-6], code[1:-1, 1:-1].ravel()
+    values, printed = values - values.mean(1, keepdims=True), printed - printed.mean()
+    correlation = values @ printed / (np.linalg.norm(values, axis=1) * np.linalg.norm(printed))
     return float(correlation.max(initial=-1.0))

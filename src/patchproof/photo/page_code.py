@@ -1,8 +1,9 @@
-"""What a page says of itself: the QR code beside the piece, read in a photograph or scan.
+"""Read a page's QR code, which lies beside the piece, in a photograph or scan.
 
-In: pixels. Out: a `PageCode` (sheet id, and the design's SHA-256 in short, or the kind of a sheet without a design), or
-None where no code of ours can be read. Marker ids tell sheets apart, too, but two designs of one scene and seed share
-them, and only the code says which of the two was printed. It lies outside of the cut: a piece on an object has none.
+In: pixels. Out: a `PageCode` (the sheet id, and 16 digits of the design's SHA-256 or the kind of a sheet without a
+design), or None if no code of a sheet can be read. Marker ids identify sheets, too, but two designs of one scene and
+seed share them, and only the code tells which of the two was printed. It lies outside of the cut line, so a piece on an
+object has none.
 """
 
 from __future__ import annotations
@@ -14,69 +15,69 @@ import cv2
 import numpy as np
 
 from patchproof.base.resample import downscale
-from patchproof.photo.limits import finder_lines_in, squares_in
+from patchproof.photo.limits import count_finder_lines, count_squares
 from patchproof.photo.rectify import rectify
 from patchproof.photo.rejection import PhotoRejected
-from patchproof.sheets.manifest import PAGE_CODE, Manifest
+from patchproof.sheets.manifest import PAGE_CODE_PATTERN, Manifest
 
-_LARGEST_PX = 2000  # of a whole photograph's longer side: a code that needs more is too far away to be of use
-_MOST_SQUARES = 1000  # of 900 finder patterns, three squares each, one detector makes codes for 10 s; pages have 300
-_MOST_LINES = 100_000  # the other takes 1.6 s for so many, and 5.7 s for twice as many; photographs have some thousands
-_PAGE_PX_PER_MM = 8.0  # of the page seen from above: 6.6 px for a module of the A4 template
+_LARGEST_PX = 2000  # of a whole photograph's longer side: a code that needs more is too far away to be useful
+_MAX_SQUARES = 1000  # with 900 finder patterns of three squares one detector takes 10 s; pages have 300 squares
+_MAX_LINES = 100_000  # for these the other takes 1.6 s, for twice as many 5.7 s; photographs have some thousands
+_PAGE_PX_PER_MM = 8.0  # of the rectified page: 6.6 px for a module of the A4 template
 
 
 @dataclass(frozen=True)
 class PageCode:
-    """`printed` is 16 digits of the design's SHA-256, or the kind of a sheet without one; a page of several designs has
-    an id of its own and digits of all their hashes.
+    """The content of a page's QR code; `content` is 16 digits of the design's SHA-256, or the kind of a sheet without
+    a design. A page of several designs has an id of its own, and digits of a hash over theirs.
     """
 
     sheet_id: str
-    printed: str
+    content: str
 
 
 def manifest_page_code(manifest: Manifest) -> PageCode:
-    """What the code on this manifest's page says."""
+    """The code on the page of a manifest."""
     if manifest.page_code is not None:
         return PageCode(*manifest.page_code.split(":")[1:])
     return PageCode(manifest.sheet_id, manifest.design.sha256[:16] if manifest.design else manifest.kind)
 
 
 def parse_page_code(text: str) -> PageCode | None:
-    """The label in a code's text; None where the code is not ours."""
-    match = re.match(PAGE_CODE, text)
+    """Parse the text of a QR code; None if it is not that of a sheet."""
+    match = re.match(PAGE_CODE_PATTERN, text)
     return PageCode(match[1], match[2]) if match else None
 
 
 def read_page_code(srgb: np.ndarray) -> PageCode | None:
-    """The code that a picture shows; a detector that it would keep busy for long is not asked."""
+    """Read the code in a uint8 picture; None without one. A detector that would take too long is skipped."""
     gray = cv2.cvtColor(downscale(srgb, _LARGEST_PX), cv2.COLOR_RGB2GRAY)
-    # of 7 oblique pages of either size they read 6 and 1 (A4), 5 and 7 (labels): neither is enough
-    for detector, count, most in (
-        (cv2.QRCodeDetectorAruco, squares_in, _MOST_SQUARES),
-        (cv2.QRCodeDetector, finder_lines_in, _MOST_LINES),
+    # of 7 oblique pages of A4 they read 6 and 1, of 7 labels 5 and 7: neither detector is enough
+    for detector, count, max_count in (
+        (cv2.QRCodeDetectorAruco, count_squares, _MAX_SQUARES),
+        (cv2.QRCodeDetector, count_finder_lines, _MAX_LINES),
     ):
-        if count(gray) > most:
+        if count(gray) > max_count:
             continue
         try:
-            label = parse_page_code(detector().detectAndDecode(gray)[0])
-        except cv2.error:  # some quadrangles that are no code make its decoder stumble
+            code = parse_page_code(detector().detectAndDecode(gray)[0])
+        except cv2.error:  # some quadrangles that are no code make the decoder fail
             continue
-        if label is not None:
-            return label
+        if code is not None:
+            return code
     return None
 
 
-def refuse_other_page(srgb: np.ndarray, px_from_mm: np.ndarray, page_mm: tuple[float, float], label: PageCode) -> None:
-    """`PhotoRejected("wrong_sheet")` where the page under this homography carries another code than `label`."""
+def refuse_other_page(srgb: np.ndarray, px_from_mm: np.ndarray, page_mm: tuple[float, float], code: PageCode) -> None:
+    """Raise `PhotoRejected("wrong_sheet")` if the page under this homography has a code other than `code`."""
     scale = min(_PAGE_PX_PER_MM, _LARGEST_PX / max(page_mm))
-    read = read_page_code(rectify(srgb, px_from_mm, (0.0, 0.0, *page_mm), scale))
-    if read is None or read == label:
+    found = read_page_code(rectify(srgb, px_from_mm, (0.0, 0.0, *page_mm), scale))
+    if found is None or found == code:
         return
-    advice = f"its code says sheet {read.sheet_id}, the JSON is of {label.sheet_id}: name that sheet's JSON"
-    if read.sheet_id == label.sheet_id:
+    advice = f"its code says sheet {found.sheet_id}, the JSON is of {code.sheet_id}: name that sheet's JSON"
+    if found.sheet_id == code.sheet_id:
         advice = (
-            f"it is sheet {read.sheet_id} with another design: its code says {read.printed}, the JSON {label.printed}; "
-            "name the JSON that was written with this PDF"
+            f"it is sheet {found.sheet_id} with another design: its code says {found.content}, the JSON "
+            f"{code.content}; name the JSON that was written with this PDF"
         )
     raise PhotoRejected("wrong_sheet", None, None, advice)

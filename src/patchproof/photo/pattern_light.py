@@ -1,9 +1,9 @@
-"""The light of paper and ink from whole markers, for photographs too blurred to show either one unmixed.
+"""Measure the light of paper and ink from whole markers, for photographs too blurred to show either one unmixed.
 
 In: a photograph, its homography, the printed markers. Out: `PatternLight`. The printed cells are blurred as the
 photograph is, and every channel's linear light is regressed on them at the cells' centers:
-light = ink + (paper - ink) · pattern. At a blur of half a module no place shows pure paper or ink, and reading either
-one beside a border is off by a quarter of the contrast; the regression stays unbiased as long as the blur is known.
+light = ink + (paper - ink) · pattern. At a blur of half a module no place shows pure paper or ink, and samples beside a
+border are off by a quarter of the contrast; the regression is unbiased as long as the blur is known.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from patchproof.photo.edges import sample
 from patchproof.photo.quality import CLIPPED_CODE
 from patchproof.sheets.markers import marker_cells
 
-_FINE = 8  # samples per module of the blurred pattern
-_LEAST_SAMPLES = 30
-_BLURS = np.linspace(0.8, 1.5, 15)  # times the blur that borders show, which falls 10 % short at half a module
+_OVERSAMPLING = 8  # samples per module of the blurred pattern
+_MIN_SAMPLES = 30
+_BLUR_FACTORS = np.linspace(0.8, 1.5, 15)  # of the blur from borders, which is 10 % too low at half a module
 
 
 @dataclass(frozen=True)
 class PatternLight:
-    """Linear light (3,) of paper and ink, and the Gaussian blur in pixels that explains the cells best.
+    """Linear light (3,) of paper and ink, and the Gaussian blur in pixels that fits the cells best.
 
-    `agreement` is the correlation of the cells' light with what is printed there; 1 where the homography is right.
+    `agreement` is the correlation of the cells' light with the printed cells, near 1 if the homography is right.
     """
 
     paper: np.ndarray
@@ -41,7 +41,7 @@ class PatternLight:
 def pattern_light(
     srgb: np.ndarray, px_from_mm: np.ndarray, corners_mm: Mapping[int, np.ndarray], dictionary: str, blur_px: float
 ) -> PatternLight | None:
-    """Paper, ink and blur of an uint8 photograph whose borders show `blur_px`; None where too few cells are in it."""
+    """Fit paper, ink and blur to a uint8 photograph, given the blur from borders; None if it shows too few cells."""
     ids = sorted(corners_mm)
     markers, lights = [], []
     for cells, corners in zip(marker_cells(dictionary, ids), (corners_mm[i] for i in ids), strict=True):
@@ -53,22 +53,22 @@ def pattern_light(
         markers.append((cells, module_px, usable))
         lights.append(linear_from_srgb(values[usable] / 255.0))
     light = np.concatenate(lights)
-    if len(light) < _LEAST_SAMPLES:
+    if len(light) < _MIN_SAMPLES:
         return None
     fits = []
-    for blur in blur_px * _BLURS:
-        pattern = np.concatenate([_blurred(cells, blur / module)[usable] for cells, module, usable in markers])
+    for blur in blur_px * _BLUR_FACTORS:
+        pattern = np.concatenate([_blur_cells(cells, blur / module)[usable] for cells, module, usable in markers])
         if pattern.std() > 0.02:
             agreement = float(np.corrcoef(pattern, light.mean(1))[0, 1])
-            fits.append((*_regressed(pattern, light), blur, agreement))
+            fits.append((*_regress(pattern, light), blur, agreement))
     if not fits:
         return None
     _, paper, ink, blur, agreement = min(fits, key=lambda fit: fit[0])
     return PatternLight(np.minimum(paper, 1.2), np.maximum(ink, 0), float(blur), agreement)
 
 
-def _regressed(pattern: np.ndarray, light: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """Median error, paper and ink; robust, since a glare or a thumb may cover a marker."""
+def _regress(pattern: np.ndarray, light: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+    """Median error, paper and ink by robust regression, since a glare or a thumb may cover a marker."""
     rows, weight, error = np.column_stack([1 - pattern, pattern]), np.ones(len(pattern)), np.zeros(len(pattern))
     ink = paper = np.zeros(3)
     for _ in range(4):
@@ -79,18 +79,18 @@ def _regressed(pattern: np.ndarray, light: np.ndarray) -> tuple[float, np.ndarra
 
 
 def _centers_mm(corners: np.ndarray, modules: int) -> np.ndarray:
-    """Centers of a marker's modules, row by row."""
+    """The centers of a marker's modules, row by row."""
     across, down = (corners[1] - corners[0]) / modules, (corners[3] - corners[0]) / modules
     rows, columns = np.mgrid[0:modules, 0:modules] + 0.5
     return corners[0] + columns.reshape(-1, 1) * across + rows.reshape(-1, 1) * down
 
 
-def _blurred(cells: np.ndarray, sigma_modules: float) -> np.ndarray:
-    """The cells at their centers, row by row, as a blur leaves them; paper lies around."""
-    fine = np.kron(np.pad(cells, 2, constant_values=1.0), np.ones((_FINE, _FINE)))
+def _blur_cells(cells: np.ndarray, sigma_modules: float) -> np.ndarray:
+    """The blurred pattern at the cells' centers, row by row, with paper around the marker."""
+    step, half = _OVERSAMPLING, _OVERSAMPLING // 2
+    fine = np.kron(np.pad(cells, 2, constant_values=1.0), np.ones((step, step)))
     if sigma_modules > 0.05:
-        fine = cv2.GaussianBlur(fine, (0, 0), sigma_modules * _FINE, borderType=cv2.BORDER_REPLICATE)
-    half = _FINE // 2
-    # an even number of samples has no middle one: the four around it are averaged
-    middle = (fine[half - 1 :: _FINE, half - 1 :: _FINE] + fine[half::_FINE, half::_FINE]) / 2
+        fine = cv2.GaussianBlur(fine, (0, 0), sigma_modules * step, borderType=cv2.BORDER_REPLICATE)
+    # an even number of samples has no middle one: average two beside it, on the diagonal
+    middle = (fine[half - 1 :: step, half - 1 :: step] + fine[half::step, half::step]) / 2
     return middle[2:-2, 2:-2].ravel()

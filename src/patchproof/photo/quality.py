@@ -1,8 +1,7 @@
-"""What a photograph lets one see: anything at all, the blur of markers' borders, the light of paper and ink beside
-them, clipping.
+"""Measure a photograph's quality: empty or not, the blur of markers' borders, the light of paper and ink, clipping.
 
-In: a photograph and its fitted markers. Out: `FrameLight`. Paper and ink are read half a module outside and inside of
-every border and corrected for what the blur mixed between them, per channel in linear light.
+In: a photograph and its fitted markers. Out: `FrameLight`. Paper and ink are sampled half a module outside and inside
+of every border and corrected for their mixture by the blur, per channel in linear light.
 """
 
 from __future__ import annotations
@@ -19,9 +18,9 @@ from patchproof.photo.edges import Borders, border_frame, sample
 
 CLIPPED_CODE = 253  # JPEG and sharpening move full white by a code or two
 _ALONG = 16
-_CELLS = 8  # along each side, whose mean colors are compared
-_LEAST_CODES = 1.0  # standard deviation of those means: lens caps, black frames and burnt-out ones stay below
-_NOISES = 2.0  # times what pixels' noise alone lets the means differ
+_CELLS = 8  # along each side; their mean colors are compared
+_MIN_DEVIATION_CODES = 1.0  # standard deviation of the means: covered lenses, black and burnt-out frames have less
+_MIN_DEVIATION_NOISES = 2.0  # in units of the deviation that pixel noise alone gives the means
 
 
 @dataclass(frozen=True)
@@ -35,34 +34,34 @@ class FrameLight:
 
 
 def is_featureless(srgb: np.ndarray) -> bool:
-    """Whether a uint8 picture H×W×3 is one tone or noise, by the mean colors of 8 × 8 cells of it. Noise is known from
-    neighboring pixels, which in pictures of anything are much alike.
+    """True if a uint8 picture H×W×3 is one tone or noise, by the mean colors of its 8 × 8 cells. Noise is estimated
+    from neighboring pixels, which are similar in pictures of real things.
     """
     means = cv2.resize(srgb, (_CELLS, _CELLS), interpolation=cv2.INTER_AREA).reshape(-1, 3)
     steps = np.diff(srgb[:: max(1, len(srgb) // 200)].astype(np.int16), axis=1).astype(float)
     noise = np.sqrt((steps**2).mean() / 2) if steps.size else 0.0
     pixels = srgb.shape[0] * srgb.shape[1] / _CELLS**2
-    return float(means.std(0).max()) < max(_LEAST_CODES, _NOISES * noise / np.sqrt(pixels))
+    return float(means.std(0).max()) < max(_MIN_DEVIATION_CODES, _MIN_DEVIATION_NOISES * noise / np.sqrt(pixels))
 
 
 def blur_px(markers: Iterable[Borders]) -> float:
-    """Gaussian sigma of the borders in photo pixels: the median over fitted markers, else over all."""
-    return float(np.median([b.blur_px for b in _surest(markers)]))
+    """The Gaussian sigma of the borders in photo pixels: the median over the fitted markers, or over all if none is."""
+    return float(np.median([b.blur_px for b in _fitted_or_all(markers)]))
 
 
 def frame_light(srgb: np.ndarray, markers: Iterable[Borders]) -> FrameLight:
-    """Paper and ink around at least one marker of an uint8 sRGB photograph."""
-    sure = _surest(markers)
-    corners = np.stack([b.corners_px for b in sure])
-    module = np.array([b.module_px for b in sure])[:, None, None, None]
+    """Measure paper and ink at the borders of at least one marker in a uint8 sRGB photograph."""
+    markers = _fitted_or_all(markers)
+    corners = np.stack([b.corners_px for b in markers])
+    module = np.array([b.module_px for b in markers])[:, None, None, None]
     middle, half, normal = border_frame(corners)
     s = np.linspace(-0.8, 0.8, _ALONG)[:, None]
     border = middle[:, :, None] + s * half[:, :, None]
     outside, inside = (sample(srgb, border + sign * 0.5 * module * normal[:, :, None]) for sign in (1, -1))
     clipped = float((outside >= CLIPPED_CODE).any(-1).mean())
     light_out, light_in = (np.median(linear_from_srgb(v / 255.0), axis=(0, 1, 2)) for v in (outside, inside))
-    # a step blurred by sigma leaves Φ(±m/2σ) of paper at half a module m to either side
-    blur = np.median([b.blur_px / max(b.module_px, 1e-6) for b in sure])
+    # half a module m to either side of a step blurred by sigma the share of paper is Φ(±m/2σ)
+    blur = np.median([b.blur_px / max(b.module_px, 1e-6) for b in markers])
     share = float(ndtr(0.5 / max(blur, 1e-3)))
     span = (light_out - light_in) / max(2 * share - 1, 0.3)
     ink = np.maximum(light_in - (1 - share) * span, 0)
@@ -70,7 +69,7 @@ def frame_light(srgb: np.ndarray, markers: Iterable[Borders]) -> FrameLight:
     return FrameLight(paper, ink, float(np.dot(LUMINANCE, paper - ink)), clipped)
 
 
-def _surest(markers: Iterable[Borders]) -> list[Borders]:
-    """The fitted ones, or all where none is."""
+def _fitted_or_all(markers: Iterable[Borders]) -> list[Borders]:
+    """The fitted markers, or all if none is fitted."""
     markers = list(markers)
     return [b for b in markers if b.fitted] or markers

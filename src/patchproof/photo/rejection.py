@@ -1,13 +1,13 @@
-"""Why a photograph cannot be judged or measured: a code, the figure that decided it, its threshold, and what to do.
+"""The error of a photograph that cannot be measured or judged: a code, the deciding figure, its threshold, and advice.
 
-The codes are those of report.json. A `PhotoRejected` never stops a batch: the photograph is listed with it.
+The codes are those of report.json. A `PhotoRejected` never stops a batch: the report lists the photograph with it.
 """
 
 from __future__ import annotations
 
 from patchproof.base.errors import PatchproofError
 
-CODES = (
+REJECTION_CODES = (
     "unreadable",
     "too_costly",
     "empty",
@@ -28,11 +28,11 @@ CODES = (
 
 
 class PhotoRejected(PatchproofError, ValueError):
-    """Evidence too weak; `figure` and `threshold` are in the unit of what the code names, None if not measured."""
+    """A rejected photograph; `figure` and `threshold` are in the unit of the code's quantity, None if not measured."""
 
     def __init__(self, code: str, figure: float | None, threshold: float | None, advice: str):
-        if code not in CODES:
-            raise ValueError(f"expected one of {', '.join(CODES)}, got {code!r}")
+        if code not in REJECTION_CODES:
+            raise ValueError(f"expected one of {', '.join(REJECTION_CODES)}, got {code!r}")
         super().__init__(f"{code}: {advice}")
         self.code, self.figure, self.threshold, self.advice = code, figure, threshold, advice
 

@@ -1,11 +1,11 @@
-"""Sheets that are no plane in the photograph: curled paper is unrolled, a lens's bending taken out, where that pays.
+"""Flatten curled paper or a lens's distortion in a photograph, if that explains the markers better than a plane.
 
-In: marker corners in pixels and page millimeters, and the flat fit's word that they do not agree. Out: `UnrolledSheet`: a
-picture in which the sheet is flat, with its homography, so that whatever measures flat sheets measures this one. Two
-explanations are tried against the plane: paper rolled round a cylinder of any radius and direction, seen by a pinhole
-camera (nine parameters, the focal length held as near the file's own as that is known), and a plane seen through a lens
-with one radial term. One is believed where it leaves less than half of the plane's residual; what it leaves that is no
-noise is still refused as `curled` where it matters.
+In: marker corners in pixels and page millimeters that fit no plane. Out: `UnrolledSheet`: a picture in which the sheet
+is flat, with its homography, so that it can be measured like flat sheets. Two models are compared with the plane: paper
+on a cylinder of any radius and direction, seen by a pinhole camera (nine parameters, the focal length held near the
+file's within its uncertainty), and a plane seen through a lens with one radial term. A model is accepted if its
+residual is less than half of the plane's; a photograph with too much residual beyond noise is still rejected as
+`curled`.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 
 from patchproof.base.geometry import apply_homography, fit_homography, rect_corners
 from patchproof.photo.detect import row_strips
-from patchproof.photo.edges import GRID, REACH, border_frame, intersect_borders
+from patchproof.photo.edges import BORDER_SHARE, RECT_GRID, border_frame, intersect_borders
 from patchproof.photo.rectify import (
     CORNER_NOISE_PX,
     PageFit,
@@ -31,15 +31,15 @@ from patchproof.photo.rectify import (
 )
 from patchproof.photo.shapes import UNKNOWN_FOCAL, Shape, fit_cylinder, fit_radial_lens, rms
 
-FLAT_PX = 0.15  # rms per coordinate up to which a plane needs no better explanation: three times the corners' own noise
-PAYS = 0.5  # of the plane's residual
+MAX_FLAT_RMS_PX = 0.15  # per coordinate, up to which a sheet counts as flat: three times the corners' noise
+MAX_RESIDUAL_SHARE = 0.5  # of the plane's residual, for a model to be accepted
 LEAST_MARKERS = 4
-_MENDED = 0.3  # of what is mended where straight lines were fitted to bent borders may still be wrong
+_CORRECTION_ERROR = 0.3  # of the correction for bent borders that were fitted as straight lines
 
 
 @dataclass(frozen=True)
 class UnrolledSheet:
-    """`srgb` shows the sheet flat, `fit` is its homography there, `shape` what any page point is there."""
+    """A photograph `srgb` with the sheet flattened, the sheet's homography `fit` in it, and the original `shape`."""
 
     srgb: np.ndarray
     fit: PageFit
@@ -48,17 +48,17 @@ class UnrolledSheet:
 
     @property
     def radius_mm(self) -> float | None:
-        """The shape's."""
+        """The radius of the shape; see `Shape`."""
         return self.shape.radius_mm
 
 
 @dataclass(frozen=True)
-class Explained:
-    """What a better explanation than a plane was found from, corners mended, and the explanation."""
+class ShapeFit:
+    """A shape and the corners that it was fitted to."""
 
-    flat: np.ndarray  # 3×3 homography of the corners as they were
+    flat: np.ndarray  # 3×3 homography of the uncorrected corners
     mm: np.ndarray
-    px: np.ndarray
+    px: np.ndarray  # corrected for bent borders
     shape: Shape
 
 
@@ -68,22 +68,22 @@ def fit_shape(
     size_px: tuple[int, int],
     focal_px: float | None = None,
     focal_spread: float = UNKNOWN_FOCAL,
-) -> Explained | None:
-    """A cylinder or a lens that explains the corners in a picture of this size; None where a plane does as well."""
+) -> ShapeFit | None:
+    """Fit a cylinder or a lens to the corners in a picture of this size; None if a plane fits as well."""
     ids, px, mm = common_corners(corners_px, corners_mm)
     if len(ids) < LEAST_MARKERS:
         return None
     flat = fit_homography(mm, px)
-    plain = rms(apply_homography(flat, mm) - px)
-    if not plain > FLAT_PX:
+    flat_rms = rms(apply_homography(flat, mm) - px)
+    if not flat_rms > MAX_FLAT_RMS_PX:
         return None
-    best = _best(flat, mm, px, size_px, focal_px, focal_spread)
-    if best.rms_px > PAYS * plain:
+    best = _best_shape(flat, mm, px, size_px, focal_px, focal_spread)
+    if best.rms_px > MAX_RESIDUAL_SHARE * flat_rms:
         return None
-    # the borders were fitted as straight lines, which on strongly bent paper misses the corners where they meet
+    # the borders were fitted as straight lines, which on strongly bent paper meet beside the corners
     shift = _chord_shift(best, mm)
-    px, floor = px - shift, float(np.hypot(CORNER_NOISE_PX, _MENDED * rms(shift)))
-    return Explained(flat, mm, px, _best(flat, mm, px, size_px, focal_px, focal_spread, floor))
+    px, floor = px - shift, float(np.hypot(CORNER_NOISE_PX, _CORRECTION_ERROR * rms(shift)))
+    return ShapeFit(flat, mm, px, _best_shape(flat, mm, px, size_px, focal_px, focal_spread, floor))
 
 
 def unroll(
@@ -94,80 +94,80 @@ def unroll(
     focal_px: float | None = None,
     focal_spread: float = UNKNOWN_FOCAL,
 ) -> UnrolledSheet | None:
-    """The piece (a rectangle x, y, width, height on the page) made flat; None where a plane explains it as well.
+    """Flatten the piece (a rectangle x, y, width, height on the page) in the photograph; None if a plane fits as well.
 
-    The uncertainty is that of its corners; the focal length is known to `focal_spread` of its logarithm.
+    The uncertainty is that of the piece's corners; `focal_spread` is the spread of the focal length's logarithm.
     """
-    explained = fit_shape(corners_px, corners_mm, (srgb.shape[1], srgb.shape[0]), focal_px, focal_spread)
-    if explained is None:
+    shape_fit = fit_shape(corners_px, corners_mm, (srgb.shape[1], srgb.shape[0]), focal_px, focal_spread)
+    if shape_fit is None:
         return None
-    flat, mm, px, best = explained.flat, explained.mm, explained.px, explained.shape
-    grid = rect_mm[:2] + np.multiply(rect_mm[2:], GRID)
-    straight = fit_homography(grid, best.px(grid))
-    error = np.linalg.norm(apply_homography(flat, mm) - px, axis=1).max()  # what is moved lies this near, about
-    picture = _straightened(srgb, best.px, straight, rect_mm, margin_px=error)
-    # the covariance of the homography alone says nothing about the bend: `uncertainty_mm` has it all
+    flat, mm, px, shape = shape_fit.flat, shape_fit.mm, shape_fit.px, shape_fit.shape
+    grid = rect_mm[:2] + np.multiply(rect_mm[2:], RECT_GRID)
+    px_from_mm = fit_homography(grid, shape.px(grid))
+    margin = np.linalg.norm(apply_homography(flat, mm) - px, axis=1).max()  # pixels move about that far
+    picture = _flatten(srgb, shape.px, px_from_mm, rect_mm, margin_px=margin)
+    # the homography's covariance would not cover the bend, so it is 0 and `uncertainty_mm` covers everything
     ids = common_corners(corners_px, corners_mm)[0]
-    left = best.px(mm) - px
-    length = rms_length_mm(_mm_from_px(best.px, mm), left)
-    fit = PageFit(straight, np.zeros((8, 8)), length, ids, bend_mm(best.bend_px, left, length))
-    return UnrolledSheet(picture, fit, _uncertainty_mm(best, rect_corners(rect_mm)), best)
+    residual = shape.px(mm) - px
+    length = rms_length_mm(_mm_by_px(shape.px, mm), residual)
+    fit = PageFit(px_from_mm, np.zeros((8, 8)), length, ids, bend_mm(shape.bend_px, residual, length))
+    return UnrolledSheet(picture, fit, _uncertainty_mm(shape, rect_corners(rect_mm)), shape)
 
 
-def _best(flat, mm, px, size, focal_px, focal_spread, floor_px=CORNER_NOISE_PX) -> Shape:
-    """The explanation that leaves least."""
+def _best_shape(flat, mm, px, size, focal_px, focal_spread, floor_px=CORNER_NOISE_PX) -> Shape:
+    """The shape with the smaller residual."""
     paper = fit_cylinder(flat, mm, px, size, focal_px, focal_spread, floor_px)
     lens = fit_radial_lens(flat, mm, px, size)
     return lens if paper is None or lens.rms_px < paper.rms_px else paper
 
 
 def _chord_shift(shape: Shape, mm: np.ndarray) -> np.ndarray:
-    """How far corners where straight lines along a marker's bent borders meet lie from the marker's own, N×2 px."""
+    """The shift N×2 px from a marker's corners to the intersections of straight lines along its bent borders."""
     quads = mm.reshape(-1, 4, 2)
     corners = shape.px(mm).reshape(-1, 4, 2)
-    s = np.linspace(-REACH, REACH, 9)
+    s = np.linspace(-BORDER_SHARE, BORDER_SHARE, 9)
     along = (1 + s[:, None]) / 2
     points = quads[:, :, None] * (1 - along) + np.roll(quads, -1, axis=1)[:, :, None] * along
     bent = shape.px(points.reshape(-1, 2)).reshape(*quads.shape[:2], len(s), 2)
     middle, half, normal = border_frame(corners)
-    off = np.einsum("mksi,mki->mks", bent - middle[:, :, None], normal)
-    offset, slope = off.mean(2), (off * s).sum(2) / (s * s).sum()
+    distance = np.einsum("mksi,mki->mks", bent - middle[:, :, None], normal)
+    offset, slope = distance.mean(2), (distance * s).sum(2) / (s * s).sum()
     ends = [middle + sign * half + (offset + sign * slope)[..., None] * normal for sign in (-1, 1)]
     return (intersect_borders(*ends) - corners).reshape(-1, 2)
 
 
 def _uncertainty_mm(shape: Shape, corners: np.ndarray) -> float:
-    """Of the first-order spread."""
-    here, rows = shape.px(corners), []
+    """The uncertainty of the corners, by first-order propagation of the shape's covariance."""
+    px, rows = shape.px(corners), []
     spread = np.sqrt(np.maximum(np.diag(shape.covariance), 1e-30))
     for i, sigma in enumerate(spread):
         step = np.zeros(len(spread))
         step[i] = 0.1 * sigma
-        rows.append((shape.project(shape.parameters + step, corners) - here).ravel() / (0.1 * sigma))
+        rows.append((shape.project(shape.parameters + step, corners) - px).ravel() / (0.1 * sigma))
     root = spread[:, None] * root_of(shape.covariance / np.outer(spread, spread))
-    return largest_shift_mm(root, np.array(rows), _mm_from_px(shape.px, corners))
+    return largest_shift_mm(root, np.array(rows), _mm_by_px(shape.px, corners))
 
 
-def _mm_from_px(project: Callable[[np.ndarray], np.ndarray], mm: np.ndarray) -> np.ndarray:
-    """N×2×2 derivatives of page millimeters by pixels, by central differences over a tenth of a millimeter."""
+def _mm_by_px(project: Callable[[np.ndarray], np.ndarray], mm: np.ndarray) -> np.ndarray:
+    """Derivatives N×2×2 of page millimeters by pixels, by central differences over a tenth of a millimeter."""
     steps = 0.05 * np.eye(2)
     columns = [(project(mm + step) - project(mm - step)) / 0.1 for step in steps]
     return np.linalg.inv(np.stack(columns, -1))
 
 
-def _straightened(srgb, project, px_from_mm, sheet_mm, margin_px: float) -> np.ndarray:
-    """The photograph with the sheet's part resampled as if it were flat."""
-    rows, columns = region_around(apply_homography(px_from_mm, rect_corners(sheet_mm)), margin_px, srgb.shape)
-    left, top, width, height = sheet_mm
+def _flatten(srgb, project, px_from_mm, rect_mm, margin_px: float) -> np.ndarray:
+    """The photograph with the rectangle of the page resampled as if the sheet were flat."""
+    rows, columns = region_around(apply_homography(px_from_mm, rect_corners(rect_mm)), margin_px, srgb.shape)
+    left, top, width, height = rect_mm
     picture = srgb.copy()
-    for strip in row_strips(srgb[rows]):  # of all of a large picture the coordinates would take gigabytes
-        box = slice(rows.start + strip.start, min(rows.start + strip.stop, rows.stop)), columns
-        y, x = np.mgrid[box] + 0.5
+    for strip in row_strips(srgb[rows]):  # in strips, because coordinates of a whole large picture take gigabytes
+        region = slice(rows.start + strip.start, min(rows.start + strip.stop, rows.stop)), columns
+        y, x = np.mgrid[region] + 0.5
         mm = apply_homography(np.linalg.inv(px_from_mm), np.column_stack([x.ravel(), y.ravel()]))
-        on_sheet = ((mm >= [left, top]) & (mm <= [left + width, top + height])).all(1)
-        where = on_sheet.reshape(x.shape)
+        inside = ((mm >= [left, top]) & (mm <= [left + width, top + height])).all(1)
+        mask = inside.reshape(x.shape)
         source = np.full((*x.shape, 2), -1, np.float32)
-        source[where] = project(mm[on_sheet]) - 0.5
+        source[mask] = project(mm[inside]) - 0.5
         part = cv2.remap(srgb, source[..., 0], source[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        picture[box][where] = part[where]
+        picture[region][mask] = part[mask]
     return picture
