@@ -37,7 +37,7 @@ def test_the_fastest_order_is_the_one_that_the_network_takes(view, order):
     network = Flattens(view)
     pictures = torch.rand(5, 3, 128, 128)
     laid = tune_batches(network, pictures[:2])
-    assert laid.order is order and laid.most == cpu_batch_size(128) == 12
+    assert laid.memory_format is order and laid.max_pictures == cpu_batch_size(128) == 12
     given, plain = (pictures.clone().requires_grad_() for _ in range(2))
     (gradient,) = torch.autograd.grad(laid(given).square().sum(), given)
     (expected,) = torch.autograd.grad(network(plain).square().sum(), plain)
@@ -47,6 +47,6 @@ def test_the_fastest_order_is_the_one_that_the_network_takes(view, order):
 
 def test_few_pictures_at_a_time_on_a_cpu_but_as_many_as_a_network_takes():
     pictures = torch.rand(2, 3, 224, 224)
-    assert tune_batches(Flattens(False), pictures).most == 4
-    assert tune_batches(BatchedNetwork(Flattens(False), 8), pictures).most == 8
+    assert tune_batches(Flattens(False), pictures).max_pictures == 4
+    assert tune_batches(BatchedNetwork(Flattens(False), 8), pictures).max_pictures == 8
     assert cpu_batch_size(64) == 49 and cpu_batch_size(1024) == 1

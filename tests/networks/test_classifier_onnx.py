@@ -113,7 +113,7 @@ def test_pictures_may_come_in_either_order(make, order, tmp_path):
 
 def test_a_file_is_cut_where_its_module_is(tmp_path, monkeypatch):
     """Gradients in windows are the whole network's there, and are computed there only."""
-    monkeypatch.setattr(windows, "FIXED", 0)  # the network is small
+    monkeypatch.setattr(windows, "CUT_COST", 0)  # the network is small
     pictures = torch.rand(2, 3, 96, 96)
     network, of_module = (
         load_network(written(tmp_path, ResNet(), side=96)).network,

@@ -29,7 +29,7 @@ SIZE = 128
 
 @pytest.fixture(autouse=True)
 def small_networks_save_too(monkeypatch):
-    monkeypatch.setattr(windows, "FIXED", 0)
+    monkeypatch.setattr(windows, "CUT_COST", 0)
 
 
 def program(*lines, sizes=(None, 3, None, None)) -> Program:
@@ -161,7 +161,7 @@ def test_how_far_a_pixel_reaches_is_what_kernels_and_strides_say():
         (5, 4, -5, 5),
         (6, 4, -5, 5),
     ]
-    assert found[4].made == 4 * 16 * (SIZE // 2) ** 2
+    assert found[4].numbers == 4 * 16 * (SIZE // 2) ** 2
 
 
 def test_cuts_lie_where_one_value_is_left():
@@ -173,10 +173,10 @@ def test_cuts_lie_where_one_value_is_left():
 def test_a_cut_that_reaches_less_far_than_it_should_is_not_taken(monkeypatch, less):
     network, photos = plain(), pictures(2)
     cut = cuts.find_cut(network, photos)
-    assert cut is not None and cuts._holds(network, cut, photos)
+    assert cut is not None and cuts._is_correct(network, cut, photos)
     narrow = replace(cut, low=cut.low + 2 * less, high=cut.high - 2 * less)
     monkeypatch.setattr(cuts, "STEP_PX", 4)  # rounding up hides a pixel or two
-    assert cuts._holds(network, cut, photos) and not cuts._holds(network, narrow, photos)
+    assert cuts._is_correct(network, cut, photos) and not cuts._is_correct(network, narrow, photos)
     monkeypatch.setattr(cuts, "_cuts", lambda *_: [narrow])
     assert cuts.find_cut(network, photos) is None
 
@@ -254,7 +254,7 @@ def test_answers_that_depend_on_all_of_a_picture_without_a_gradient_are_not_shar
         for each in (photos, other):
             torch.testing.assert_close(laid(each, Windows(asked, kept)), network(each))
     assert laid.cut is None
-    monkeypatch.setattr(cuts, "_alike", lambda *_: True)
+    monkeypatch.setattr(cuts, "_are_close", lambda *_: True)
     assert cuts.find_cut(network, photos[:2]), "nothing else would have seen it"
 
 
@@ -365,7 +365,7 @@ def test_a_network_too_small_to_save_anything_is_not_cut(monkeypatch):
 
 def test_batches_take_their_own_windows(monkeypatch):
     laid, photos = tune_batches(plain(), pictures()), pictures(7)
-    monkeypatch.setattr(laid, "most", 3)
+    monkeypatch.setattr(laid, "max_pictures", 3)
     asked = np.array([[10 * i, 5 * i, 10 * i + 20, 5 * i + 30] for i in range(7)])
     torch.manual_seed(0)
     whole, parts = gradient(laid, photos), gradient(lambda x: laid(x, Windows(asked)), photos)
@@ -435,7 +435,7 @@ def test_pictures_that_differ_in_windows_share_the_rest(made, seed):
 
 def test_batches_keep_their_own_first_pictures(monkeypatch):
     laid, first = tune_batches(plain(), pictures()), pictures(7)
-    monkeypatch.setattr(laid, "most", 3)
+    monkeypatch.setattr(laid, "max_pictures", 3)
     asked = np.array([[10 * i, 5 * i, 10 * i + 20, 5 * i + 30] for i in range(7)])
     other = first.clone()
     for picture, (left, top, right, bottom) in zip(other, asked.tolist(), strict=True):
@@ -487,7 +487,7 @@ def test_a_promise_shares_what_its_views_have_in_common(tmp_path, monkeypatch):
     shown = pictures_with_controls(problem, np.full((*problem.patch.design_px[::-1], 3), 200, np.uint8), CONTROLS)
     conditions, calls = scene.draw("promise", 8), asked_of(problem.classifiers[0].network, monkeypatch)
     shared = responses(problem, shown, conditions)
-    assert len(calls) == 2 * len(shown) and all(windows.kept for _, _, windows in calls)
+    assert len(calls) == 2 * len(shown) and all(windows.cache for _, _, windows in calls)
     monkeypatch.setattr("patchproof.optimizer.responses.affected_windows", lambda views: None)
     whole = responses(problem, shown, conditions)
     for kind in shown:
@@ -560,7 +560,7 @@ from patchproof.optimizer.problem import set_problem
 from patchproof.optimizer.promise import CONTROLS, pictures_with_controls
 from patchproof.optimizer.responses import responses
 problem = set_problem(pp.load_scene({str(scene)!r}))
-windows.FIXED = 0  # the network is small
+windows.CUT_COST = 0  # the network is small
 network, photos = problem.classifiers[0].network, torch.rand(2, 3, 96, 96).requires_grad_()
 network(photos, windows.Windows(np.array([[40, 40, 50, 50]] * 2))).sum().backward()
 assert network.cut and not photos.grad[..., 0].any()

@@ -42,7 +42,7 @@ PHOTOS, KERNEL = _meta(2, 6, 17, 16), _meta(8, 6, 3, 5)
     ],
 )
 def test_programs_are_weighed_by_the_sizes_that_torch_would_say(operator, arguments):
-    ours, torchs = graph._WEIGHED[operator](*arguments), operator(*arguments)
+    ours, torchs = graph._SHAPE_ONLY[operator](*arguments), operator(*arguments)
     assert (ours.shape, ours.dtype, ours.stride()) == (torchs.shape, torchs.dtype, torchs.stride())
 
 

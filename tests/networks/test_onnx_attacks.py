@@ -147,8 +147,8 @@ HOSTILE: dict[str, tuple[Callable[[], ModelProto | bytes], str]] = {
     # weights
     "two gigabytes claimed": (lambda: sized(1 << 29), r"108 numbers in 'W' of the shape \[536870912\]"),
     "sizes whose product wraps": (lambda: sized(1 << 31, 1 << 31, 1 << 31), "108 numbers in 'W'"),
-    "a size past counting": (lambda: sized(1 << 40), "1099511627776 for a whole number from 0 to"),
-    "a negative size": (lambda: sized(-4, 3, 3, 3), "-4 for a whole number from 0"),
+    "a size past counting": (lambda: sized(1 << 40), "1099511627776 instead of a whole number from 0 to"),
+    "a negative size": (lambda: sized(-4, 3, 3, 3), "-4 instead of a whole number from 0"),
     "a hundred dimensions": (lambda: sized(*[1] * 100), "'W' of a type that is not supported"),
     "text for a weight": (lambda: changed(lambda m: setattr(weight(m), "data_type", 8)), "of a type that is not"),
     "a type of no number": (lambda: changed(lambda m: setattr(weight(m), "data_type", 99)), "of a type that is not"),
@@ -185,14 +185,14 @@ HOSTILE: dict[str, tuple[Callable[[], ModelProto | bytes], str]] = {
         lambda: changed(lambda m: setattr(m.graph.input[0].type.tensor_type, "elem_type", 2)),
         "an input that is not float32",
     ),
-    "a batch of a billion": (lambda: batch(10**9), "1000000000 for a whole number from 1 to 65536"),
-    "a batch of none": (lambda: batch(0), "0 for a whole number from 1"),
-    "a negative batch": (lambda: batch(-1), "-1 for a whole number from 1"),
+    "a batch of a billion": (lambda: batch(10**9), "1000000000 instead of a whole number from 1 to 65536"),
+    "a batch of none": (lambda: batch(0), "0 instead of a whole number from 1"),
+    "a negative batch": (lambda: batch(-1), "-1 instead of a whole number from 1"),
     "more operators than any network has": (lambda: longest(small(), 1 << 15), "more than 32768 items of node"),
     # attributes
     "an attribute of Python's": (
         lambda: changed(lambda m: node(m).attribute.append(helper.make_attribute("__class__", 1))),
-        "other inputs or attributes than are supported",
+        "unsupported inputs or attributes",
     ),
     "the device": (
         lambda: changed(lambda m: node(m).attribute.append(helper.make_attribute("device", "cuda:7"))),
@@ -243,7 +243,7 @@ HOSTILE: dict[str, tuple[Callable[[], ModelProto | bytes], str]] = {
     "a picture past memory": (lambda: ending(SCALE.format("99999.0") + 'nearest_mode="floor">(z, , s)'), "absurd size"),
     "sizes from what is seen": (
         lambda: ending("p = ReduceMax<keepdims=0>(z) q = Cast<to=7>(p) y = Reshape(z, q)"),
-        "sizes in it follow from what the pictures show",
+        "sizes in it depend on the pictures",
     ),
     "dimensions without end": (lambda: ending(f"y = Unsqueeze(z, {list(range(40))})"), "more than 12 dimensions"),
     # bytes
@@ -263,7 +263,7 @@ HOSTILE: dict[str, tuple[Callable[[], ModelProto | bytes], str]] = {
     "a name of a megabyte": (lambda: wire(7, wire(1, wire(4, b"x" * 1_000_000))), "op_type of more than 65536 bytes"),
     "a name that is no text": (lambda: wire(7, wire(1, wire(4, b"\xff\xfe"))), r"\(UnicodeDecodeError\)"),
     "two graphs": (lambda: small().SerializeToString() + wire(7, b""), "graph twice"),
-    "a number for a graph": (lambda: b"\x38\x01", "graph of another kind"),
+    "a number for a graph": (lambda: b"\x38\x01", "graph of an unexpected wire type"),
 }
 
 
@@ -278,9 +278,9 @@ def test_hostile_files_are_refused_in_one_sentence(name, watch, tmp_path):
     ("entries", "sentence"),
     [
         ({"location": "/etc/passwd"}, None),  # the place is not looked at: what is read lies beside the file
-        ({"location": "x", "offset": "-1"}, "-1 for a whole number from 0 to 432"),
-        ({"location": "x", "offset": "433"}, "433 for a whole number from 0 to 432"),
-        ({"location": "x", "length": str(1 << 40)}, "for a whole number from 0 to 432"),
+        ({"location": "x", "offset": "-1"}, "-1 instead of a whole number from 0 to 432"),
+        ({"location": "x", "offset": "433"}, "433 instead of a whole number from 0 to 432"),
+        ({"location": "x", "length": str(1 << 40)}, "instead of a whole number from 0 to 432"),
         ({"location": "x", "offset": "4"}, "107 numbers in 'W'"),
         ({"location": "x", "length": "9" * 5000}, r"\(ValueError\)"),
     ],

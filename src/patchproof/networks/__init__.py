@@ -1,1 +1,1 @@
-"""Files of networks read without executing anything in them, and forms of a network that compute faster."""
+"""Read files of networks without executing anything in them, and rewrite networks so that they compute faster."""

@@ -1,4 +1,4 @@
-"""How much a file of a network may ask for, and the refusal of what goes beyond it."""
+"""Limits on what a network's file may ask for, and the error for what exceeds them."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ from patchproof.base.errors import PatchproofError
 MAX_NUMBERS = 1 << 31  # along one side of a weight
 MAX_DIMENSIONS = 12
 MAX_LIST = 1 << 10  # numbers in one attribute
-MAX_BATCH = 4096  # pictures, of a network that takes one number of them only
+MAX_BATCH = 4096  # pictures, for a network that takes a fixed number of them
 
 
 class UnsupportedNetwork(PatchproofError):
-    """Something in the file that is not allowed; the text follows "the file with"."""
+    """The file has something that is not allowed; the text completes "the file with …"."""
 
 
 def quote(value: Any) -> str:
-    """Whatever stands in the file, short and on one line."""
+    """The repr of a value from the file, cut to 80 characters."""
     text = repr(value)
     return text if len(text) <= 80 else f"{text[:77]}..."
 
 
-def whole(value: Any, low: int, high: int) -> int:
-    """A whole number from `low` to `high`, and not one in disguise."""
+def checked_integer(value: Any, low: int, high: int) -> int:
+    """Return `value` if it is an int from `low` to `high`; booleans and floats are refused."""
     if type(value) is not int or not low <= value <= high:
-        raise UnsupportedNetwork(f"{quote(value)} for a whole number from {low} to {high}")
+        raise UnsupportedNetwork(f"{quote(value)} instead of a whole number from {low} to {high}")
     return value

@@ -1,9 +1,8 @@
-"""A program's graph, computed one operator after the other.
+"""A network's graph, computed one operator after the other.
 
-In: weights, steps and the sizes of the input, as onnx_file.py reads them. Out: a Program, N×3×S×S →
-N×K. Values have numbers and no names; the only functions called are the operators of the steps. Before pictures of a
-new shape are computed, the steps of a file are tried on tensors without memory: there a value of absurd size, a wrong
-input are refused.
+In: weights, steps and the sizes of the input, as onnx_file.py reads them. Out: a Program, N×3×S×S → N×K. Values have
+numbers and no names; the only functions called are the operators of the steps. Before pictures of a new shape are
+computed, a file's steps run once on tensors without memory, to refuse values of absurd size and wrong inputs.
 """
 
 from __future__ import annotations
@@ -22,12 +21,12 @@ from patchproof.networks.steps import InputDevice, Step, ValueRef
 from patchproof.networks.tensor_observer import TensorObserver
 
 MAX_VALUE = 1 << 30  # numbers in one value, for each picture: VGG's at the largest input_px
-MAX_SPLIT = 1 << 16  # along a dimension of what is split into several tensors
+MAX_SPLIT = 1 << 16  # size of a dimension that is split into several tensors
 
 
 class Program(torch.nn.Module):
-    """The graph as a function of pictures; weights are buffers, so that they move with the module. One without `sizes`
-    is of the user's own code, of which nothing is tried.
+    """A graph as a function of pictures; weights are buffers, so that they move with the module. A program without
+    `sizes` comes from the user's own code, which needs no dry run.
     """
 
     def __init__(self, weights: list[Tensor], steps: list[Step], output: int, sizes: list[int | None] | None):
@@ -36,98 +35,98 @@ class Program(torch.nn.Module):
             self.register_buffer(f"w{number}", weight)
         self.steps, self.output, self.sizes = rewrite_steps(steps, weights), output, sizes
         self.photos = len(weights)  # the number of the pictures, after those of the weights
-        self.weighed: set[tuple[torch.Size, int]] = set()
+        self.tested: set[tuple[torch.Size, int]] = set()
 
     def forward(self, photos: Tensor) -> Tensor:
         """N×3×S×S → N×K."""
         return self.first(len(self.steps), photos)[self.output]
 
     def first(self, count: int, photos: Tensor) -> dict[int, Any]:
-        """The values that so many steps leave of pictures; of a part of them, pictures may be of another size."""
-        self.weigh(count, photos.shape)
+        """The values that remain after the first `count` steps; short of all steps, pictures may have another size."""
+        self.dry_run(count, photos.shape)
         values = self.values(self.photos, photos)
         compute(self.steps[:count], values, photos)
         return values
 
     def values(self, number: int, value: Tensor) -> dict[int, Any]:
-        """The weights, and what has been computed of pictures: the value with that number."""
+        """The weights by number, and one value that was computed from pictures."""
         return dict(enumerate(self.buffers())) | {number: value}
 
-    def weigh(self, count: int, shape: torch.Size) -> None:
-        """Refuse, before memory is taken, pictures of other sizes and values of absurd ones in so many steps."""
-        if self.sizes is None or (shape, count) in self.weighed:
+    def dry_run(self, count: int, shape: torch.Size) -> None:
+        """Refuse pictures of wrong size, and absurdly large values in the first `count` steps, before they exist."""
+        if self.sizes is None or (shape, count) in self.tested:
             return
-        other = any(size not in (None, got) for size, got in zip(self.sizes, shape, strict=True))
-        if other and count == len(self.steps):
+        differs = any(size not in (None, got) for size, got in zip(self.sizes, shape, strict=True))
+        if differs and count == len(self.steps):
             raise ValueError(f"it takes {'×'.join(str(size or 'N') for size in self.sizes)}")
         with torch.inference_mode(False), torch.no_grad():
             weights = [weight.to("meta") for weight in self.buffers()]
             photos = torch.empty(shape, device="meta")
-            with TensorObserver(partial(_refuse_absurd, MAX_VALUE * len(photos)), _WEIGHED):
+            with TensorObserver(partial(_refuse_absurd, MAX_VALUE * len(photos)), _SHAPE_ONLY):
                 compute(self.steps[:count], dict(enumerate([*weights, photos])), photos)
-        self.weighed.add((shape, count))
+        self.tested.add((shape, count))
 
 
 def compute(steps: Sequence[Step], values: dict[int, Any], like: Tensor) -> None:
-    """Put the steps' results among the values that they name, on the device of `like`; drop what is spent."""
+    """Add the steps' results to `values`, on the device of `like`; delete each value after its last use."""
     for step in steps:
         arguments = [_filled(argument, values, like) for argument in step.arguments]
         keywords = {name: _filled(argument, values, like) for name, argument in step.keywords.items()}
-        if step.several and like.is_meta:
+        if step.returns_sequence and like.is_meta:
             tensors = [argument for argument in arguments if isinstance(argument, Tensor)]
             if any(size > MAX_SPLIT for tensor in tensors for size in tensor.shape):
                 raise ValueError("it splits a tensor of an absurd size")
         results = step.compute(*arguments, **keywords)
-        for number, result in zip(step.results, results if step.several else [results], strict=True):
+        for number, result in zip(step.results, results if step.returns_sequence else [results], strict=True):
             values[number] = result
-        for number in step.spent:  # memory is used again while it is in the cache
+        for number in step.last_uses:  # so that memory is reused while it is in the cache
             del values[number]
 
 
-def _like_first(compute: Callable[..., Any]) -> Callable[..., Any]:
-    """`compute` where its result has the shape of its first argument."""
+def _shape_of_first(compute: Callable[..., Any]) -> Callable[..., Any]:
+    """`compute` without computing, where the result has the shape of the first argument."""
 
-    def weighed(first: Any, *others: Any, **keywords: Any) -> Any:
+    def result_shape(first: Any, *others: Any, **keywords: Any) -> Any:
         tensors = [first, *(other for other in others if isinstance(other, Tensor))]
         if all(isinstance(tensor, Tensor) and tensor.dtype == torch.float32 for tensor in tensors):
             if np.broadcast_shapes(*(tensor.shape for tensor in tensors)) == first.shape:
                 return first.new_empty_strided(first.shape, first.stride())
         return compute(first, *others, **keywords)
 
-    return weighed
+    return result_shape
 
 
-def _convolution(photos: Tensor, weight: Tensor, bias, stride, pad, apart, transposed: bool, *others: Any) -> Tensor:
-    """Sizes by the formula of torch.nn.Conv2d's documentation."""
-    sizes = (photos.shape[2:], weight.shape[2:], stride, pad, apart)
+def _convolution(photos: Tensor, weight: Tensor, bias, stride, pad, dilation, transposed: bool, *others: Any) -> Tensor:
+    """An empty result with sizes by the formula of torch.nn.Conv2d's documentation."""
+    sizes = (photos.shape[2:], weight.shape[2:], stride, pad, dilation)
     if transposed or not all(len(pair) == 2 for pair in sizes):
-        return _ATEN.convolution.default(photos, weight, bias, stride, pad, apart, transposed, *others)
+        return _ATEN.convolution.default(photos, weight, bias, stride, pad, dilation, transposed, *others)
     pairs = zip(*sizes, strict=True)
     rows, columns = ((size + 2 * p - a * (kernel - 1) - 1) // s + 1 for size, kernel, s, p, a in pairs)
     return photos.new_empty(photos.shape[0], weight.shape[0], rows, columns)
 
 
-def _mean(values: Tensor, over: list[int] | None, keep: bool = False, **_: Any) -> Tensor:
-    gone = {dimension % values.dim() for dimension in over or range(values.dim())}
-    sizes = (1 if at in gone else size for at, size in enumerate(values.shape) if keep or at not in gone)
+def _mean(values: Tensor, dims: list[int] | None, keep: bool = False, **_: Any) -> Tensor:
+    reduced = {dimension % values.dim() for dimension in dims or range(values.dim())}
+    sizes = (1 if axis in reduced else size for axis, size in enumerate(values.shape) if keep or axis not in reduced)
     return values.new_empty(tuple(sizes))
 
 
-# On tensors without memory torch computes these in Python, for which it imports its compiler and SymPy: two seconds.
+# For tensors without memory torch computes these in Python and imports its compiler and SymPy: two seconds.
 _ATEN = torch.ops.aten
-_PLAIN = (
+_ELEMENTWISE = (
     *(operator.Tensor for operator in (_ATEN.add, _ATEN.sub, _ATEN.mul, _ATEN.div)),
     *(operator.default for operator in (_ATEN.relu, _ATEN.relu_, _ATEN.hardtanh, _ATEN.hardtanh_, _ATEN.hardswish)),
 )
-_WEIGHED: dict[Callable[..., Any], Callable[..., Any]] = {
-    **{operator: _like_first(operator) for operator in _PLAIN},
+_SHAPE_ONLY: dict[Callable[..., Any], Callable[..., Any]] = {
+    **{operator: _shape_of_first(operator) for operator in _ELEMENTWISE},
     _ATEN.convolution.default: _convolution,
     _ATEN.mean.dim: _mean,
 }
 
 
 def _filled(argument: Any, values: dict[int, Any], photos: Tensor) -> Any:
-    """An argument with the values that it names."""
+    """The argument with values in place of their numbers."""
     if type(argument) is ValueRef:
         return values[argument.number]
     if type(argument) is list:
@@ -136,6 +135,6 @@ def _filled(argument: Any, values: dict[int, Any], photos: Tensor) -> Any:
 
 
 def _refuse_absurd(limit: int, tensor: Tensor) -> None:
-    """Also what an operator makes on its way (einsum, paddings)."""
+    """Refuse a tensor of absurd size, also one inside an operator (einsum, padding)."""
     if tensor.numel() > limit or tensor.dim() > MAX_DIMENSIONS:
         raise ValueError(f"it makes a tensor of an absurd size, {quote(tuple(tensor.shape))}")

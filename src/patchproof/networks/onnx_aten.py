@@ -1,8 +1,8 @@
-"""ONNX's operators that ATen has, too: as its steps they take part in what rewritten.py saves.
+"""ONNX operators that ATen has too; as ATen operators they take part in the rewrites of rewrites.py.
 
 In: a node's name, its inputs and attributes, and the numbers of values that are known to have four dimensions. Out:
-operators of ATen that its first input goes through, one after the other; none where onnx_operators.py has to compute
-it. Without them MobileNetV2 took 1.46 times as long for its answers and 1.85 times with gradients (torch 2.13, one
+ATen operators that the first input passes through one after the other; none where onnx_operators.py has to compute the
+node. Without them MobileNetV2 took 1.46 times as long for its answers and 1.85 times with gradients (torch 2.13, one
 core, November 2026).
 """
 
@@ -21,7 +21,7 @@ AtenCalls = list[tuple[Callable[..., Any], list[Any]]]  # operators, each with i
 
 
 def aten_calls(name: str, inputs: Sequence[Any], attributes: dict[str, Any], of_four: Collection[int]) -> AtenCalls:
-    """The operators; `of_four` are weights and pictures, N×C×H×W."""
+    """The operators for a node; `of_four` holds the numbers of weights and pictures, N×C×H×W."""
     numbers = [item.number if type(item) is ValueRef else None for item in inputs]
     if name == "Conv" and numbers[1] in of_four and not isinstance(inputs[-1], Tensor):
         return _conv(*inputs[1:], **attributes)
@@ -48,7 +48,7 @@ def _conv(
 
 
 def _clip(low=None, high=None) -> AtenCalls:
-    """Where both limits are known; of torch's two kinds of clamp this one's gradient ends at them, as ReLU6's does."""
+    """A hardtanh if both limits are known; unlike torch.clamp, its gradient is 0 at the limits, as ReLU6's is."""
     known = (end for end in (low, high) if isinstance(end, Tensor) and end.is_floating_point() and not end.dim())
     limits = [float(end) for end in known]
     return [(_ATEN.hardtanh.default, limits)] if len(limits) == 2 and limits[0] <= limits[1] else []

@@ -1,10 +1,10 @@
-"""`file:NAME.onnx`: an ONNX file that nobody vouches for, read without onnx.
+"""`file:NAME.onnx`: read an untrusted ONNX file without the library onnx.
 
-In: its bytes, and a way to those of NAME.onnx.data, where exporters put large weights. Out: a Program of numbered
-steps (graph.py), and how many pictures it takes; UnsupportedNetwork is raised for anything else in it. Nothing of the
-file is executed, and no text of it becomes a path: where a weight's "location" points is not looked at.
+In: its bytes, and a function that reads NAME.onnx.data, where exporters put large weights. Out: a Program of numbered
+steps (graph.py), and how many pictures it takes; anything unsupported raises UnsupportedNetwork. Nothing of the file is
+executed, and no text of it becomes a path: the path in a weight's "location" is not followed.
 Left out on purpose: subgraphs (If, Loop), functions of the file, operators of other domains, sparse and quantized
-weights, opsets before 13, of which onnx.version_converter makes newer ones.
+weights, opsets before 13, which onnx.version_converter converts to newer ones.
 
 Source: github.com/onnx/onnx, onnx.proto (IR version 13).
 """
@@ -25,32 +25,32 @@ from patchproof.networks.bounds import (
     MAX_LIST,
     MAX_NUMBERS,
     UnsupportedNetwork,
+    checked_integer,
     quote,
-    whole,
 )
 from patchproof.networks.graph import Program
 from patchproof.networks.onnx_aten import AtenCalls, aten_calls
 from patchproof.networks.onnx_operators import DTYPES, OPERATORS
 from patchproof.networks.onnx_shapes import MAX_SIZES
-from patchproof.networks.protobuf import BYTES, FLOAT, INT, NEVER, TEXT, Schema, read_message
+from patchproof.networks.protobuf import BYTES, FLOAT, INT, TEXT, UNSUPPORTED, Schema, read_message
 from patchproof.networks.steps import InputDevice, Step, ValueRef, mark_last_uses
 
 OPSETS = (13, 28)
-MAX_SCALARS = 8  # fractions that stay on the CPU: a Resize has as many in its list of factors
+MAX_SCALARS = 8  # floats that stay on the CPU; a Resize has up to eight factors
 
 _ENTRY: Schema = {1: ("key", TEXT, False), 2: ("value", TEXT, False)}
 _TENSOR: Schema = {
     1: ("dims", INT, True),
     2: ("data_type", INT, False),
-    3: ("segment", NEVER, False),
+    3: ("segment", UNSUPPORTED, False),
     4: ("floats", BYTES, True),
     5: ("ints", INT, True),
-    6: ("strings", NEVER, False),
+    6: ("strings", UNSUPPORTED, False),
     7: ("longs", INT, True),
     8: ("name", TEXT, False),
     9: ("raw", BYTES, False),
     10: ("doubles", BYTES, True),
-    11: ("unsigned", NEVER, False),
+    11: ("unsigned", UNSUPPORTED, False),
     13: ("external", _ENTRY, True),
     14: ("place", INT, False),
 }
@@ -60,10 +60,10 @@ _ATTRIBUTE: Schema = {
     3: ("i", INT, False),
     4: ("s", TEXT, False),
     5: ("t", _TENSOR, False),
-    6: ("a graph within the graph", NEVER, False),
+    6: ("a graph within the graph", UNSUPPORTED, False),
     7: ("floats", FLOAT, True),
     8: ("ints", INT, True),
-    **{number: ("an attribute of an unusual kind", NEVER, True) for number in (9, 10, 11, 14, 15, 21, 22, 23)},
+    **{number: ("an attribute of an unusual kind", UNSUPPORTED, True) for number in (9, 10, 11, 14, 15, 21, 22, 23)},
 }
 _NODE: Schema = {
     1: ("input", TEXT, True),
@@ -71,7 +71,7 @@ _NODE: Schema = {
     4: ("op_type", TEXT, False),
     5: ("attribute", _ATTRIBUTE, True),
     7: ("domain", TEXT, False),
-    8: ("overload", NEVER, False),
+    8: ("overload", UNSUPPORTED, False),
 }
 _SIZE: Schema = {1: ("value", INT, False), 2: ("symbol", TEXT, False)}
 _TYPE: Schema = {1: ("tensor", {1: ("kind", INT, False), 2: ("shape", {1: ("dim", _SIZE, True)}, False)}, False)}
@@ -81,18 +81,18 @@ _GRAPH: Schema = {
     5: ("initializer", _TENSOR, True),
     11: ("input", _PLACE, True),
     12: ("output", {1: ("name", TEXT, False)}, True),
-    15: ("sparse weights", NEVER, True),
+    15: ("sparse weights", UNSUPPORTED, True),
 }
 _MODEL: Schema = {
     7: ("graph", _GRAPH, False),
     8: ("opset", {1: ("domain", TEXT, False), 2: ("version", INT, False)}, True),
-    20: ("training steps", NEVER, True),
-    25: ("functions of its own", NEVER, True),
+    20: ("training steps", UNSUPPORTED, True),
+    25: ("functions of its own", UNSUPPORTED, True),
 }
 
 
 def read_onnx(stored: bytes, beside: Callable[[], bytes]) -> tuple[Program, int | None]:
-    """The network, and how many pictures it takes, None for any number; `beside` reads NAME.onnx.data, once at most."""
+    """The network, and the number of pictures it takes (None: any). `beside` reads NAME.onnx.data, at most once."""
     model = read_message(stored, _MODEL)
     versions = [opset.get("version", 0) for opset in model.get("opset", []) if opset.get("domain", "") in _STANDARD]
     if len(versions) != 1 or not OPSETS[0] <= versions[0] <= OPSETS[1]:
@@ -104,14 +104,14 @@ _STANDARD = ("", "ai.onnx")
 
 
 class _Weights:
-    """Tensors from what describes them; of the bytes in the other file each is taken once at most."""
+    """Reads tensors from their descriptions; each byte of the other file belongs to one tensor at most."""
 
     def __init__(self, beside: Callable[[], bytes]):
-        self.beside, self.data, self.taken, self.locations = beside, b"", 0, set()
+        self.beside, self.data, self.used_bytes, self.locations = beside, b"", 0, set()
 
     def tensor(self, content: dict[str, Any]) -> Tensor:
-        """A tensor of its own memory."""
-        sizes = [whole(size, 0, MAX_NUMBERS) for size in content.get("dims", [])]
+        """Return the described tensor in memory of its own."""
+        sizes = [checked_integer(size, 0, MAX_NUMBERS) for size in content.get("dims", [])]
         dtype = DTYPES.get(content.get("data_type", 0))
         if dtype is None or len(sizes) > MAX_DIMENSIONS:
             raise UnsupportedNetwork(f"{quote(content.get('name'))} of a type that is not supported")
@@ -136,17 +136,17 @@ class _Weights:
         if len(self.locations) > 1:
             raise UnsupportedNetwork("weights in more than one other file")
         self.data = self.data or self.beside()
-        offset = whole(int(where.get("offset", 0)), 0, len(self.data))
-        size = whole(int(where.get("length", len(self.data))), 0, len(self.data))
+        offset = checked_integer(int(where.get("offset", 0)), 0, len(self.data))
+        size = checked_integer(int(where.get("length", len(self.data))), 0, len(self.data))
         part = memoryview(self.data)[offset : offset + size]
-        self.taken += len(part)
-        if self.taken > len(self.data):
+        self.used_bytes += len(part)
+        if self.used_bytes > len(self.data):
             raise UnsupportedNetwork("weights that overlap")
         return part
 
 
 def _from_bytes(stored: Any, dtype: torch.dtype) -> Tensor:
-    """Little-endian numbers, copied: torch's own memory is aligned for vector units."""
+    """Convert little-endian numbers; copied, since torch's own memory is aligned for vector units."""
     if len(stored) % dtype.itemsize:
         raise UnsupportedNetwork("weights that end within a number")
     values = torch.empty(len(stored), dtype=torch.uint8)
@@ -155,30 +155,30 @@ def _from_bytes(stored: Any, dtype: torch.dtype) -> Tensor:
 
 
 class _GraphReader:
-    """The names of one file, each of them once, and what they stand for from then on: a number, or a small constant."""
+    """Turns one file's graph into steps; a name is defined once, as a numbered value or a small constant."""
 
     def __init__(self, graph: dict[str, Any], weights: _Weights):
         self.graph, self.nodes = graph, graph.get("node", [])
         self.weights: list[Tensor] = []
-        self.count = 0  # of values with a number
-        self.of_four = set[int]()  # numbers of those with four dimensions, as far as that is known
-        self.values: dict[str, ValueRef | Tensor | None] = {"": None}  # an input that is left out
+        self.count = 0  # numbered values so far
+        self.of_four = set[int]()  # numbers of values known to have four dimensions
+        self.values: dict[str, ValueRef | Tensor | None] = {"": None}  # an omitted input
         self.tensor = weights.tensor
 
     def read(self) -> tuple[Program, int | None]:
-        """See read_onnx."""
+        """Return the program and its batch size, see `read_onnx`."""
         for initializer in self.graph.get("initializer", []):
             self._constant(initializer.get("name", ""), self.tensor(initializer))
-        given = [place for place in self.graph["input"] if place["name"] not in self.values]
+        inputs = [place for place in self.graph["input"] if place["name"] not in self.values]
         for node in self.nodes:
             if node["op_type"] == "Constant":
                 self._constant(node["output"][0], self._attribute(node["attribute"][0]))
-        if len(given) != 1:
-            raise UnsupportedNetwork(f"{len(given)} inputs, not one of N×3×S×S")
-        batch, sizes = _shape(given[0]["type"]["tensor"])
+        if len(inputs) != 1:
+            raise UnsupportedNetwork(f"{len(inputs)} inputs, not one of N×3×S×S")
+        batch, sizes = _shape(inputs[0]["type"]["tensor"])
         self.count = len(self.weights)
         self.of_four = {number for number, weight in enumerate(self.weights) if weight.dim() == 4}
-        self._new(given[0]["name"])
+        self._new(inputs[0]["name"])
         steps = [step for node in self.nodes for step in self._steps(node)]
         outputs = [self._known(place["name"]) for place in self.graph["output"]]
         if len(outputs) != 1 or not isinstance(outputs[0], ValueRef):
@@ -187,7 +187,7 @@ class _GraphReader:
         return Program(self.weights, steps, outputs[0].number, sizes), batch
 
     def _constant(self, name: str, value: Any) -> None:
-        """A weight has a number and moves with the network; lists of sizes and factors stay on the CPU."""
+        """Number a weight, so that it moves with the network; keep short lists of sizes and factors on the CPU."""
         tensor = value if isinstance(value, Tensor) else torch.tensor(value)
         if tensor.numel() > (MAX_SCALARS if tensor.is_floating_point() else MAX_SIZES):
             self.weights.append(tensor)
@@ -211,12 +211,12 @@ class _GraphReader:
         return self.values[name]
 
     def _steps(self, node: dict[str, Any]) -> list[Step]:
-        """What computes a node: nothing where it is a constant or another name for one."""
+        """The steps that compute a node; none for a constant or an alias."""
         name, domain, outputs = node["op_type"], node.get("domain", ""), node["output"]
         if domain not in _STANDARD or name not in (*OPERATORS, "Constant", "Identity"):
             raise UnsupportedNetwork(f"the operator {quote(f'{domain}.{name}'.lstrip('.'))}")
-        several = name == "Split"
-        if len(outputs) != 1 and not several:
+        is_split = name == "Split"  # the operator of several results
+        if len(outputs) != 1 and not is_split:
             raise UnsupportedNetwork(f"{len(outputs)} results of {name}, where only the first is supported")
         inputs = [self._known(word) for word in node.get("input", [])]
         if name == "Identity":
@@ -224,20 +224,21 @@ class _GraphReader:
         if name in ("Constant", "Identity"):
             return []
         operator, attributes = OPERATORS[name], self._attributes(node)
-        if several and len(inputs) == 1:
+        if is_split and len(inputs) == 1:
             attributes.setdefault("num_outputs", len(outputs))
         operator.check(inputs, attributes)
-        if way := aten_calls(name, inputs, attributes, self.of_four):
-            return self._along(way, name, inputs[0], outputs[0])
-        return [Step(operator, [InputDevice, *inputs], attributes, [self._new(word) for word in outputs], several, [])]
+        if calls := aten_calls(name, inputs, attributes, self.of_four):
+            return self._aten_steps(calls, name, inputs[0], outputs[0])
+        results = [self._new(word) for word in outputs]
+        return [Step(operator, [InputDevice, *inputs], attributes, results, is_split, [])]
 
-    def _along(self, way: AtenCalls, name: str, value: Any, output: str) -> list[Step]:
-        steps, known = [], name == "Conv" or value.number in self.of_four
-        for compute, others in way:
+    def _aten_steps(self, calls: AtenCalls, name: str, value: Any, output: str) -> list[Step]:
+        steps, is_four = [], name == "Conv" or value.number in self.of_four
+        for compute, others in calls:
             steps.append(Step(compute, [value, *others], {}, [self.count], False, []))
             value, self.count = ValueRef(self.count), self.count + 1
         self._name(output, value)
-        self.of_four |= {value.number} if known else set()
+        self.of_four |= {value.number} if is_four else set()
         return steps
 
     def _attributes(self, node: dict[str, Any]) -> dict[str, Any]:
@@ -260,12 +261,12 @@ class _GraphReader:
 
 
 def _shape(tensor: dict[str, Any]) -> tuple[int | None, list[int | None]]:
-    """The batch, and the input's sizes; None where any is allowed."""
+    """The batch size and the input's sizes; None where any size is allowed."""
     if tensor["kind"] != 1:
         raise UnsupportedNetwork("an input that is not float32")
     sizes = [size.get("value") for size in tensor["shape"].get("dim", [])]
     if len(sizes) != 4:
         raise UnsupportedNetwork(f"an input of {len(sizes)} dimensions, not N×3×S×S")
-    fixed = [None if size is None else whole(size, 1, 1 << 16) for size in sizes]
-    batch = None if fixed[0] is None else whole(fixed[0], 1, MAX_BATCH)
+    fixed = [None if size is None else checked_integer(size, 1, 1 << 16) for size in sizes]
+    batch = None if fixed[0] is None else checked_integer(fixed[0], 1, MAX_BATCH)
     return batch, [None, *fixed[1:]]

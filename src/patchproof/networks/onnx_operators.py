@@ -1,11 +1,11 @@
-"""What an ONNX file may compute: the standard's operators of image classifiers, written with torch.
+"""The operators that an ONNX file may use: those of image classifiers, written with torch.
 
 In: a name as the file writes it. Out: a function of tensors. None of them reads or writes anything but its tensors or
-draws random numbers, and a name that is not in the table leads nowhere. In a signature inputs before `/` are data,
-those after it sizes or axes, and these and what follows `*` may be attributes of that name. Data are sent to the
-pictures' device, which has no memory when graph.py tries the steps. Only for the operators in `_ON_SIZES`, whose
-results their inputs bound, a few numbers on the CPU stay there: so sizes can be reckoned with.
-To allow one more, add a line to `_TABLE`, of what torch computes alike (test_classifier_onnx.py holds it against onnx).
+draws random numbers, and a name that is not in the table is refused. In a signature, inputs before `/` are data, inputs
+after it are sizes or axes; these and what follows `*` may be attributes of that name. Data are sent to the pictures'
+device, which has no memory during the dry run in graph.py. Only for the operators in `_ON_SIZES`, whose results are no
+larger than their inputs allow, a few numbers stay on the CPU, so that sizes can be computed.
+To allow one more, add a line to `_TABLE` with the same in torch (test_classifier_onnx.py compares it with onnx).
 Left out on purpose: control flow, sequences, text, random numbers, quantized and recurrent networks, boxes.
 
 Source: onnx.ai/onnx/operators, opsets 13 to 28; where two differ, both forms are read.
@@ -48,29 +48,27 @@ _ON_SIZES = frozenset(
 
 
 class Operator:
-    """A line of the table, as a function of the pictures' device and its inputs."""
+    """A line of the table, as a function of the pictures' device and the operator's inputs."""
 
     def __init__(self, name: str, compute: Callable[..., Any]):
         self.compute, self.on_sizes, self.signature = compute, name in _ON_SIZES, inspect.signature(compute)
         kinds = [parameter.kind for parameter in self.signature.parameters.values()]
-        many = inspect.Parameter.VAR_POSITIONAL in kinds
-        self.data = None if many else kinds.count(inspect.Parameter.POSITIONAL_ONLY)
-        self.makes = "device" in self.signature.parameters
+        variadic = inspect.Parameter.VAR_POSITIONAL in kinds
+        self.data = None if variadic else kinds.count(inspect.Parameter.POSITIONAL_ONLY)
+        self.needs_device = "device" in self.signature.parameters
 
     def check(self, inputs: Sequence[Any], attributes: dict[str, Any]) -> None:
-        """Raise UnsupportedNetwork for inputs or attributes that the operator does not take; what they hold is the
-        operator's own to check.
-        """
+        """Raise UnsupportedNetwork for inputs or attributes that the operator does not take."""
         if "device" in attributes:
             raise UnsupportedNetwork("an attribute 'device'")
         try:
-            self.signature.bind(*inputs, **attributes, **({"device": None} if self.makes else {}))
+            self.signature.bind(*inputs, **attributes, **({"device": None} if self.needs_device else {}))
         except TypeError as error:
-            raise UnsupportedNetwork(f"other inputs or attributes than are supported ({error})") from error
+            raise UnsupportedNetwork(f"unsupported inputs or attributes ({error})") from error
 
     def __call__(self, device: torch.device, *inputs: Any, **attributes: Any) -> Any:
-        """Its result, a tensor or a tuple of them; inputs that are left out are None."""
-        if self.makes:
+        """Return the result, a tensor or a tuple of them; omitted inputs are None."""
+        if self.needs_device:
             attributes["device"] = device
         data, rest = inputs[: self.data], inputs[len(inputs) if self.data is None else self.data :]
         if self.on_sizes and all(x is None or (x.device.type == "cpu" and x.numel() <= MAX_SIZES) for x in data):
@@ -82,24 +80,26 @@ class Operator:
 # --- windows and products ---
 
 
-def _padded(x: Tensor, pads: Sequence[int] | None, most: Sequence[float], fill: float) -> tuple[Tensor, list[int]]:
-    """The input and the padding that is left to torch, which pads alike before and after, pools by half a window."""
+def _pad_unevenly(
+    x: Tensor, pads: Sequence[int] | None, limits: Sequence[float], fill: float
+) -> tuple[Tensor, list[int]]:
+    """The input and the padding left for torch, which pads both ends alike and pools by half a window at most."""
     n = x.dim() - 2
     before, after = list(pads or [0] * n)[:n], list(pads or [0] * n)[-n:]
-    if before == after and all(pad <= limit for pad, limit in zip(before, most, strict=True)):
+    if before == after and all(pad <= limit for pad, limit in zip(before, limits, strict=True)):
         return x, before
     return F.pad(x, shapes.in_torchs_order(list(zip(before, after, strict=True))), value=fill), [0] * n
 
 
 def _check_auto_pad(auto_pad: str) -> None:
     if auto_pad not in ("NOTSET", "VALID"):
-        raise ValueError("paddings that follow from the size (auto_pad)")
+        raise ValueError("paddings that depend on the size (auto_pad)")
 
 
 def _conv(x, w, b=None, /, *, auto_pad="NOTSET", dilations=None, group=1, kernel_shape=None, pads=None, strides=None):
     _check_auto_pad(auto_pad)
     ones = [1] * (x.dim() - 2)
-    x, padding = _padded(x, pads, [math.inf] * len(ones), 0.0)
+    x, padding = _pad_unevenly(x, pads, [math.inf] * len(ones), 0.0)
     return torch.convolution(x, w, b, strides or ones, padding, dilations or ones, False, [0] * len(ones), group)
 
 
@@ -107,7 +107,7 @@ def _max_pool(
     x, /, *, kernel_shape, auto_pad="NOTSET", ceil_mode=0, dilations=None, pads=None, storage_order=0, strides=None
 ):
     _check_auto_pad(auto_pad)
-    x, padding = _padded(x, pads, [size // 2 for size in kernel_shape], -math.inf)
+    x, padding = _pad_unevenly(x, pads, [size // 2 for size in kernel_shape], -math.inf)
     return F.max_pool2d(x, kernel_shape, strides or [1, 1], padding, dilations or [1, 1], bool(ceil_mode))
 
 
@@ -115,9 +115,9 @@ def _average_pool(
     x, /, *, kernel_shape, auto_pad="NOTSET", ceil_mode=0, count_include_pad=0, dilations=None, pads=None, strides=None
 ):
     _check_auto_pad(auto_pad)
-    padded, padding = _padded(x, pads, [size // 2 for size in kernel_shape], 0.0)
+    padded, padding = _pad_unevenly(x, pads, [size // 2 for size in kernel_shape], 0.0)
     if set(dilations or [1]) != {1} or (padded is not x and (ceil_mode or not count_include_pad)):
-        raise ValueError("an AveragePool with holes, or with other paddings before and after")
+        raise ValueError("an AveragePool with dilations, or with different paddings before and after")
     return F.avg_pool2d(padded, kernel_shape, strides or [1, 1], padding, bool(ceil_mode), bool(count_include_pad))
 
 
@@ -136,8 +136,8 @@ def _batch_norm(x, scale, b, mean, var, /, *, epsilon=1e-5, momentum=0.9, traini
 
 
 def _group_norm(x, scale, b, /, *, num_groups, epsilon=1e-5, stash_type=1):
-    each = x.shape[1] // len(scale)  # before opset 21 there is one for each group
-    return F.group_norm(x, num_groups, scale.repeat_interleave(each), b.repeat_interleave(each), epsilon)
+    repeats = x.shape[1] // len(scale)  # before opset 21, there is one scale for each group
+    return F.group_norm(x, num_groups, scale.repeat_interleave(repeats), b.repeat_interleave(repeats), epsilon)
 
 
 def _dropout(x, /, ratio=None, training_mode=None, *, seed=None):
@@ -149,44 +149,44 @@ def _dropout(x, /, ratio=None, training_mode=None, *, seed=None):
 # --- activations and arithmetic ---
 
 
-def _one(compute: Callable[[Tensor], Tensor]) -> Callable[..., Tensor]:
+def _unary(compute: Callable[[Tensor], Tensor]) -> Callable[..., Tensor]:
     return lambda x, /: compute(x)
 
 
-def _two(compute: Callable[[Tensor, Tensor], Tensor]) -> Callable[..., Tensor]:
+def _binary(compute: Callable[[Tensor, Tensor], Tensor]) -> Callable[..., Tensor]:
     return lambda a, b, /: compute(a, b)
 
 
-def _several(compute: Callable[[Tensor, Tensor], Tensor]) -> Callable[..., Tensor]:
+def _variadic(compute: Callable[[Tensor, Tensor], Tensor]) -> Callable[..., Tensor]:
     return lambda *tensors: functools.reduce(compute, tensors)
 
 
-def _along(compute: Callable[..., Tensor]) -> Callable[..., Tensor]:
-    """A sum or an extreme along axes, along all of them where none are given."""
+def _reduction(compute: Callable[..., Tensor]) -> Callable[..., Tensor]:
+    """A sum or an extreme along `axes`, by default along all."""
 
     def computed(x, /, axes=None, *, keepdims=1, noop_with_empty_axes=0):
-        along = numbers(axes)
-        if not along and noop_with_empty_axes:
+        dims = numbers(axes)
+        if not dims and noop_with_empty_axes:
             return x
-        return compute(x, along or list(range(x.dim())), keepdim=bool(keepdims))
+        return compute(x, dims or list(range(x.dim())), keepdim=bool(keepdims))
 
     return computed
 
 
-def _product(x: Tensor, along: list[int], keepdim: bool) -> Tensor:
-    for axis in along:
+def _product(x: Tensor, dims: list[int], keepdim: bool) -> Tensor:
+    for axis in dims:
         x = x.prod(axis, keepdim=True)
-    return x if keepdim else x.squeeze(along)
+    return x if keepdim else x.squeeze(dims)
 
 
 _TABLE: dict[str, Callable[..., Any]] = {
     # of one input
-    **{name: _one(getattr(torch, name.lower())) for name in "Abs Ceil Cos Erf Exp Floor Log Neg Reciprocal".split()},
-    **{name: _one(getattr(torch, name.lower())) for name in "IsNaN Relu Sigmoid Sign Sin Sqrt Tanh".split()},
-    **{name: _one(getattr(F, name.lower())) for name in ("HardSwish", "Mish", "Softplus")},
-    "Not": _one(torch.logical_not),
-    "GlobalAveragePool": _one(lambda x: x.mean(tuple(range(2, x.dim())), keepdim=True)),
-    "GlobalMaxPool": _one(lambda x: x.amax(tuple(range(2, x.dim())), keepdim=True)),
+    **{name: _unary(getattr(torch, name.lower())) for name in "Abs Ceil Cos Erf Exp Floor Log Neg Reciprocal".split()},
+    **{name: _unary(getattr(torch, name.lower())) for name in "IsNaN Relu Sigmoid Sign Sin Sqrt Tanh".split()},
+    **{name: _unary(getattr(F, name.lower())) for name in ("HardSwish", "Mish", "Softplus")},
+    "Not": _unary(torch.logical_not),
+    "GlobalAveragePool": _unary(lambda x: x.mean(tuple(range(2, x.dim())), keepdim=True)),
+    "GlobalMaxPool": _unary(lambda x: x.amax(tuple(range(2, x.dim())), keepdim=True)),
     "Elu": lambda x, /, *, alpha=1.0: F.elu(x, alpha),
     "LeakyRelu": lambda x, /, *, alpha=0.01: F.leaky_relu(x, alpha),
     "HardSigmoid": lambda x, /, *, alpha=0.2, beta=0.5: (alpha * x + beta).clamp(0, 1),
@@ -195,32 +195,32 @@ _TABLE: dict[str, Callable[..., Any]] = {
     "LogSoftmax": lambda x, /, *, axis=-1: x.log_softmax(axis),
     "Cast": lambda x, /, *, to, saturate=1: x.to(DTYPES[to]),
     # of two or more
-    **{name: _two(getattr(torch, name.lower())) for name in ("Add", "Sub", "Mul", "MatMul")},
-    "Div": _two(lambda a, b: a / b if a.is_floating_point() else torch.div(a, b, rounding_mode="trunc")),
+    **{name: _binary(getattr(torch, name.lower())) for name in ("Add", "Sub", "Mul", "MatMul")},
+    "Div": _binary(lambda a, b: a / b if a.is_floating_point() else torch.div(a, b, rounding_mode="trunc")),
     "Mod": lambda a, b, /, *, fmod=0: torch.fmod(a, b) if fmod else torch.remainder(a, b),
-    "Pow": _two(lambda x, y: torch.pow(x, y).to(x.dtype)),
-    "PRelu": _two(lambda x, slope: torch.where(x < 0, slope * x, x)),
-    "Equal": _two(torch.eq),
-    "Greater": _two(torch.gt),
-    "GreaterOrEqual": _two(torch.ge),
-    "Less": _two(torch.lt),
-    "LessOrEqual": _two(torch.le),
-    "And": _two(torch.logical_and),
-    "Or": _two(torch.logical_or),
+    "Pow": _binary(lambda x, y: torch.pow(x, y).to(x.dtype)),
+    "PRelu": _binary(lambda x, slope: torch.where(x < 0, slope * x, x)),
+    "Equal": _binary(torch.eq),
+    "Greater": _binary(torch.gt),
+    "GreaterOrEqual": _binary(torch.ge),
+    "Less": _binary(torch.lt),
+    "LessOrEqual": _binary(torch.le),
+    "And": _binary(torch.logical_and),
+    "Or": _binary(torch.logical_or),
     "Where": lambda condition, x, y, /: torch.where(condition, x, y),
     "Clip": lambda x, low=None, high=None, /: x if low is None and high is None else torch.clamp(x, low, high),
-    "Max": _several(torch.maximum),
-    "Min": _several(torch.minimum),
-    "Sum": _several(torch.add),
+    "Max": _variadic(torch.maximum),
+    "Min": _variadic(torch.minimum),
+    "Sum": _variadic(torch.add),
     "Gemm": _gemm,
     "Einsum": lambda *tensors, equation: torch.einsum(equation, *tensors),
     # along axes
-    "ReduceMean": _along(torch.mean),
-    "ReduceSum": _along(torch.sum),
-    "ReduceMax": _along(torch.amax),
-    "ReduceMin": _along(torch.amin),
-    "ReduceProd": _along(_product),
-    "ReduceL2": _along(lambda x, along, keepdim: torch.linalg.vector_norm(x, 2, along, keepdim)),
+    "ReduceMean": _reduction(torch.mean),
+    "ReduceSum": _reduction(torch.sum),
+    "ReduceMax": _reduction(torch.amax),
+    "ReduceMin": _reduction(torch.amin),
+    "ReduceProd": _reduction(_product),
+    "ReduceL2": _reduction(lambda x, along, keepdim: torch.linalg.vector_norm(x, 2, along, keepdim)),
     # windows and norms
     "Conv": _conv,
     "MaxPool": _max_pool,
@@ -242,7 +242,7 @@ _TABLE: dict[str, Callable[..., Any]] = {
     "Transpose": lambda x, /, *, perm=None: x.permute(perm or list(reversed(range(x.dim())))),
     "Concat": lambda *tensors, axis: torch.cat(tensors, axis),
     "Split": shapes.split,
-    "Slice": shapes.cut,
+    "Slice": shapes.slice_along,
     "Gather": shapes.gather,
     "ScatterND": shapes.scatter_nd,
     "Expand": lambda x, /, shape: x.expand(torch.broadcast_shapes(x.shape, numbers(shape))),

@@ -1,7 +1,7 @@
-"""ONNX's operators that cut, join and reshape, written with torch; see onnx_operators.py for the table and its rules.
+"""ONNX operators that slice, join and reshape, written with torch; see onnx_operators.py for the table and its rules.
 
 In: data before `/`, sizes and axes after it, as an attribute's list or as a tensor. Out: tensors. Sizes must follow
-from sizes and constants alone: on tensors without memory nothing else has any.
+from sizes and constants alone, since tensors without memory have no values.
 """
 
 from __future__ import annotations
@@ -15,70 +15,70 @@ from torch.nn import functional as F
 
 from patchproof.networks.bounds import MAX_DIMENSIONS
 
-MAX_SIZES = 64  # numbers on the CPU in one value: three of them, each against each, are 262 thousand
+MAX_SIZES = 64  # numbers on the CPU in one value: an outer product of three such values has 262 thousand
 
 
 def numbers(values: Any) -> list[Any]:
-    """Sizes, axes or factors; none where they are left out."""
+    """A list of sizes, axes or factors; empty if they are omitted."""
     if isinstance(values, Tensor):
         if values.is_meta:
-            raise ValueError("sizes in it follow from what the pictures show, or from a list that is too long")
+            raise ValueError("sizes in it depend on the pictures' content, or on a list that is too long")
         return values.reshape(-1).tolist()
     return values or []
 
 
 def reshape(x, /, shape, *, allowzero=0):
-    """A zero stands for the size that was there."""
+    """Reshape; a zero keeps the size of that dimension unless `allowzero`."""
     return x.reshape([size if size or allowzero else x.shape[i] for i, size in enumerate(numbers(shape))])
 
 
 def unsqueeze(x, /, axes):
-    """With dimensions of size 1, counted as they are afterwards."""
-    places = numbers(axes)
-    if x.dim() + len(places) > MAX_DIMENSIONS:
+    """Insert dimensions of size 1; `axes` count in the result."""
+    positions = numbers(axes)
+    if x.dim() + len(positions) > MAX_DIMENSIONS:
         raise ValueError(f"a tensor of more than {MAX_DIMENSIONS} dimensions")
-    for place in sorted(axis % (x.dim() + len(places)) for axis in places):
-        x = x.unsqueeze(place)
+    for position in sorted(axis % (x.dim() + len(positions)) for axis in positions):
+        x = x.unsqueeze(position)
     return x
 
 
 def split(x, /, split=None, *, axis=0, num_outputs=None):
-    """Pieces of those sizes, or so many equal ones."""
+    """Split into parts of the sizes in `split`, or into `num_outputs` equal ones."""
     return x.split(numbers(split) or math.ceil(x.shape[axis] / num_outputs), axis)
 
 
-def cut(x, /, starts, ends, axes=None, steps=None):
-    """Python's slices, along some axes, also backward."""
+def slice_along(x, /, starts, ends, axes=None, steps=None):
+    """Slice along some axes, as Python does, also backward."""
     starts, ends = numbers(starts), numbers(ends)
     axes, steps = numbers(axes) or range(len(starts)), numbers(steps) or [1] * len(starts)
     for axis, start, end, step in zip(axes, starts, ends, steps, strict=True):
-        taken = range(*slice(start, end, step).indices(x.shape[axis]))
-        forward = taken if step > 0 else taken[::-1]
-        chosen = slice(forward.start, forward.stop, forward.step) if taken else slice(0, 0)
-        x = x[(*[slice(None)] * (axis % x.dim()), chosen)]
+        indices = range(*slice(start, end, step).indices(x.shape[axis]))
+        forward = indices if step > 0 else indices[::-1]
+        selection = slice(forward.start, forward.stop, forward.step) if indices else slice(0, 0)
+        x = x[(*[slice(None)] * (axis % x.dim()), selection)]
         x = x if step > 0 else x.flip(axis)
     return x
 
 
 def gather(x, indices, /, *, axis=0):
-    """Along an axis, what a tensor of places of any shape asks for."""
+    """Pick entries along an axis by indices of any shape."""
     axis = axis % x.dim()
-    places = torch.where(indices < 0, indices + x.shape[axis], indices)
-    return x.index_select(axis, places.reshape(-1)).reshape(x.shape[:axis] + indices.shape + x.shape[axis + 1 :])
+    positions = torch.where(indices < 0, indices + x.shape[axis], indices)
+    return x.index_select(axis, positions.reshape(-1)).reshape(x.shape[:axis] + indices.shape + x.shape[axis + 1 :])
 
 
 def scatter_nd(x, indices, updates, /, *, reduction="none"):
-    """Other values in those places."""
+    """Put `updates` in the places that `indices` name."""
     if reduction != "none":
         raise ValueError("a ScatterND that adds")
     return x.index_put(tuple(indices.unbind(-1)), updates)
 
 
 def pad(x, /, pads, value=None, axes=None, *, mode="constant"):
-    """More on all sides, or less where a number is negative."""
-    pads, given = numbers(pads), numbers(axes) or range(x.dim())
+    """Pad both ends of each axis; a negative number crops."""
+    pads, listed_axes = numbers(pads), numbers(axes) or range(x.dim())
     sides = [(0, 0)] * x.dim()
-    for axis, *side in zip(given, pads[: len(given)], pads[len(given) :], strict=True):
+    for axis, *side in zip(listed_axes, pads[: len(listed_axes)], pads[len(listed_axes) :], strict=True):
         sides[axis] = (side[0], side[1])
     first = next((axis for axis, side in enumerate(sides) if any(side)), x.dim())
     kind = {"constant": "constant", "reflect": "reflect", "edge": "replicate"}[mode]
@@ -86,12 +86,12 @@ def pad(x, /, pads, value=None, axes=None, *, mode="constant"):
 
 
 def in_torchs_order(sides: list[tuple[int, int]]) -> list[int]:
-    """Paddings before and after of each dimension, the last dimension first."""
+    """Flatten paddings (before, after) of each dimension, the last dimension first."""
     return [pad for side in reversed(sides) for pad in side]
 
 
 def arange(start, limit, delta, *, device):
-    """From, up to and by."""
+    """torch.arange(start, limit, delta)."""
     first, end, step = (numbers(number)[0] for number in (start, limit, delta))
     few = math.ceil((end - first) / step) <= MAX_SIZES
     return torch.arange(first, end, step, dtype=start.dtype, device="cpu" if few else device)
@@ -101,7 +101,7 @@ _RESIZED = {
     ("nearest", "asymmetric", "floor"): "nearest",
     ("nearest", "half_pixel", "round_prefer_floor"): "nearest-exact",
     ("linear", "half_pixel"): "bilinear",
-    ("linear", "pytorch_half_pixel"): "bilinear",  # differs where one pixel is left
+    ("linear", "pytorch_half_pixel"): "bilinear",  # differs where the result is one pixel
     ("linear", "align_corners"): "bilinear",
     ("cubic", "half_pixel"): "bicubic",
     ("cubic", "pytorch_half_pixel"): "bicubic",
@@ -113,12 +113,12 @@ def resize(
     x, /, roi=None, scales=None, sizes=None, *, mode="nearest", coordinate_transformation_mode="half_pixel",
     nearest_mode="round_prefer_floor", cubic_coeff_a=-0.75, extrapolation_value=0.0
 ):  # fmt: skip
-    """Pictures of another size, by factors or sizes for all four dimensions."""
+    """Resize pictures by factors or sizes for all four dimensions."""
     corners = coordinate_transformation_mode
     kind = _RESIZED.get((mode, corners, nearest_mode) if mode == "nearest" else (mode, corners))
     factors, target = numbers(scales), numbers(sizes)
-    same = factors[:2] == [1, 1] if factors else target[:2] == list(x.shape[:2])
-    if kind is None or not same or cubic_coeff_a != -0.75:
-        raise ValueError(f"a Resize of another kind ({mode}, {corners})")
+    keeps_batch = factors[:2] == [1, 1] if factors else target[:2] == list(x.shape[:2])
+    if kind is None or not keeps_batch or cubic_coeff_a != -0.75:
+        raise ValueError(f"a Resize of an unsupported kind ({mode}, {corners})")
     options: dict[str, Any] = {} if mode == "nearest" else {"align_corners": corners == "align_corners"}
     return F.interpolate(x, target[2:] or None, factors[2:] or None, kind, **options)

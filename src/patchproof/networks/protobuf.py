@@ -1,8 +1,8 @@
-"""A protobuf message as plain tables, of the fields that a schema names.
+"""Read the fields of a protobuf message that a schema names, into plain dictionaries.
 
-In: bytes, from anyone. Out: names, numbers and views of the bytes, or UnsupportedNetwork. Messages lie in each other
-as deep as the schema does and no deeper, all fields are counted before they are kept, and bytes are not copied:
-Google's own reader makes 810 MB of a hostile file of 10 MB. What the schema does not name is passed over.
+In: untrusted bytes. Out: names, numbers and views of the bytes, or UnsupportedNetwork. Messages are nested as deep as
+the schema and no deeper, all fields are counted before they are kept, and bytes are not copied: Google's own reader
+makes 810 MB of a hostile file of 10 MB. Fields that the schema does not name are skipped.
 
 Source: protobuf.dev/programming-guides/encoding.
 """
@@ -16,22 +16,22 @@ import numpy as np
 
 from patchproof.networks.bounds import UnsupportedNetwork
 
-MAX_FIELDS = 1 << 19  # in a file: Swin's, which computes all its sizes, has 57 thousand
+MAX_FIELDS = 1 << 19  # in a file; Swin's, which computes all its sizes, has 57 thousand
 MAX_ITEMS = 1 << 15  # of one kind in a message
-MAX_TEXT = 1 << 16  # names are paths through modules
+MAX_TEXT = 1 << 16  # bytes of a name, which is a path through modules
 
-INT, FLOAT, TEXT, BYTES, NEVER = "int", "float", "text", "bytes", "never"
-# by a field's number: its name, its kind (a schema for a message), and whether there may be several
+INT, FLOAT, TEXT, BYTES, UNSUPPORTED = "int", "float", "text", "bytes", "never"
+# by a field's number: its name, its kind (a schema for a message), and whether it may be repeated
 Schema = dict[int, tuple[str, Any, bool]]
 
 
 def read_message(stored: bytes, schema: Schema) -> dict[str, Any]:
-    """The fields of a message by their names; a list where there may be several, absent where there is none."""
+    """The fields of a message by name; repeated fields are lists, absent fields have no entry."""
     return _MessageReader().message(memoryview(stored), schema)
 
 
 class _MessageReader:
-    """How many fields have been met."""
+    """Reads nested messages and counts the fields of all of them."""
 
     def __init__(self):
         self.count = 0
@@ -41,8 +41,8 @@ class _MessageReader:
         for number, content in self._fields(data):
             if number not in schema:
                 continue
-            name, kind, several = schema[number]
-            if several:
+            name, kind, repeated = schema[number]
+            if repeated:
                 items = table.setdefault(name, [])
                 items.extend(self._values(content, kind, name))
                 if isinstance(kind, dict) and len(items) > MAX_ITEMS:
@@ -54,46 +54,46 @@ class _MessageReader:
         return table
 
     def _fields(self, data: memoryview) -> Iterator[tuple[int, int | memoryview]]:
-        """Each field's number and its content: an int, or the bytes that hold it."""
-        at = 0
-        while at < len(data):
-            key, at = self._varint(data, at)
+        """Yield each field's number and its content: an int, or the bytes that hold it."""
+        position = 0
+        while position < len(data):
+            key, position = self._varint(data, position)
             wire = key & 7
             if wire == 0:
-                content, at = self._varint(data, at)
+                content, position = self._varint(data, position)
             elif wire in (1, 2, 5):
-                size, at = self._varint(data, at) if wire == 2 else (8 if wire == 1 else 4, at)
-                content = data[at : at + size]
+                size, position = self._varint(data, position) if wire == 2 else (8 if wire == 1 else 4, position)
+                content = data[position : position + size]
                 if len(content) < size:
                     raise UnsupportedNetwork("a field that ends after the file does")
-                at += size
+                position += size
             else:
                 raise UnsupportedNetwork(f"a field of wire type {wire}")
             yield key >> 3, content
 
-    def _varint(self, data: memoryview, at: int) -> tuple[int, int]:
-        """A number from 0 to 2^64 - 1 and the place behind it."""
+    def _varint(self, data: memoryview, position: int) -> tuple[int, int]:
+        """A number from 0 to 2^64 - 1 and the position behind it."""
         self.count += 1
         if self.count > 2 * MAX_FIELDS:  # a field has a key and a size
             raise UnsupportedNetwork(f"more than {MAX_FIELDS} fields")
         number = 0
         for shift in range(0, 64, 7):
-            byte = data[at]  # IndexError past the end
-            at += 1
+            byte = data[position]  # IndexError past the end
+            position += 1
             number |= (byte & 127) << shift
             if byte < 128:
-                return number & (1 << 64) - 1, at
+                return number & (1 << 64) - 1, position
         raise UnsupportedNetwork("a number of more than 64 bits")
 
     def _values(self, content: int | memoryview, kind: Any, name: str) -> list[Any]:
-        """What a field holds; several where numbers are packed into one."""
+        """The values in a field; several where numbers are packed into one."""
         if isinstance(content, int):
             if kind == INT:
                 return [_signed(content)]
         elif kind == INT:
-            numbers, at = [], 0
-            while at < len(content):
-                number, at = self._varint(content, at)
+            numbers, position = [], 0
+            while position < len(content):
+                number, position = self._varint(content, position)
                 numbers.append(_signed(number))
             return numbers
         elif kind == FLOAT:
@@ -108,7 +108,8 @@ class _MessageReader:
             return [content]
         elif isinstance(kind, dict):
             return [self.message(content, kind)]
-        raise UnsupportedNetwork(f"{name}, which is not supported" if kind == NEVER else f"{name} of another kind")
+        reason = f"{name}, which is not supported" if kind == UNSUPPORTED else f"{name} of an unexpected wire type"
+        raise UnsupportedNetwork(reason)
 
 
 def _signed(number: int) -> int:

@@ -1,4 +1,4 @@
-"""A program as numbered steps: what onnx_file.py makes of a file, or traced.py of a module, and graph.py computes."""
+"""A program as numbered steps: made by onnx_file.py from a file or by tracing.py from a module, run by graph.py."""
 
 from __future__ import annotations
 
@@ -9,38 +9,38 @@ from typing import Any
 
 @dataclass(frozen=True)
 class ValueRef:
-    """In an argument: the value with that number."""
+    """An argument that stands for the value with this number."""
 
     number: int
 
 
 class InputDevice:
-    """In an argument, the class itself: the device that the pictures are on."""
+    """As an argument, the class itself stands for the device that the pictures are on."""
 
 
 @dataclass(frozen=True)
 class Step:
-    """One operator, where its results go, and which values nobody needs afterwards."""
+    """One operator, the numbers of its results, and the values that no later step needs."""
 
     compute: Callable[..., Any]
     arguments: list[Any]
     keywords: dict[str, Any]
     results: list[int]
-    several: bool  # the operator returns a sequence
-    spent: list[int]
+    returns_sequence: bool  # of several tensors
+    last_uses: list[int]
 
 
-def mark_last_uses(steps: list[Step], kept: set[int]) -> None:
-    """Write into each step which values it is the last to need."""
-    needed = set(kept)
+def mark_last_uses(steps: list[Step], outputs: set[int]) -> None:
+    """Write into each step's `last_uses` the values that no later step needs."""
+    needed = set(outputs)
     for step in reversed(steps):
         used = {*step.results, *value_numbers(step.arguments), *value_numbers(step.keywords.values())}
-        step.spent.extend(used - needed)
+        step.last_uses.extend(used - needed)
         needed |= used
 
 
 def value_numbers(arguments: Iterable[Any]) -> Iterator[int]:
-    """Of the values that arguments name."""
+    """The numbers of the values that arguments refer to."""
     for argument in arguments:
         if type(argument) is ValueRef:
             yield argument.number

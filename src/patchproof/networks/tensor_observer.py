@@ -1,4 +1,4 @@
-"""Looking at every tensor that operators make, also on their way."""
+"""Observe every tensor that operators create, also inside other operators."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 
 class TensorObserver(TorchDispatchMode):
-    """While it is entered, `look` sees each tensor that an operator, or what stands in `instead` of it, makes."""
+    """A context that calls `look` with each tensor that an operator, or its stand-in from `instead`, creates."""
 
     def __init__(self, look: Callable[[Tensor], None], instead: Mapping[Any, Callable[..., Any]] | None = None):
         super().__init__()
@@ -18,7 +18,7 @@ class TensorObserver(TorchDispatchMode):
 
     @classmethod
     def _should_skip_dynamo(cls) -> bool:
-        """Nothing here is compiled; to be told so, torch would import its compiler."""
+        """Answer without torch's own check, which would import its compiler; nothing here is compiled."""
         return False
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):

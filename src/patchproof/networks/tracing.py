@@ -1,8 +1,8 @@
-"""A torch module as numbered steps, where torch.fx can follow it: each module of torch.nn in it is a step.
+"""Trace a torch module into numbered steps, where torch.fx can: each module of torch.nn in it is a step.
 
-In: a module in memory, in evaluation mode. Out: a Program of the same, or None where its way depends on the pictures or
-steps cannot hold its arguments. torch.fx follows what a module does with one input: whoever uses its steps has to try
-whether they compute the same.
+In: a module in memory, in evaluation mode. Out: a Program that computes the same, or None where control flow depends on
+the pictures or steps cannot hold its arguments. torch.fx follows what a module does with one input: callers have to
+check that the steps compute the same.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from patchproof.networks.steps import Step, ValueRef, mark_last_uses, value_numb
 
 
 def trace_module(network: torch.nn.Module) -> Program | None:
-    """The module's steps for N×3×S×S."""
+    """The module's steps for N×3×S×S; None if it cannot be traced."""
     try:
         return _program(network, list(Tracer().trace(network).nodes))
-    except Exception:  # it is the user's code, and was not written to be followed
+    except Exception:  # it is the user's code, and torch.fx raises whatever it meets
         return None
 
 
@@ -36,7 +36,7 @@ def _program(network: torch.nn.Module, nodes: list[Node]) -> Program:
     def step(node: Node) -> Step:
         arguments = [_argument(argument, numbers) for argument in node.args]
         if node.target is operator.getitem and type(arguments[1]) is list:
-            raise TypeError("a list of places means another thing than a tuple")
+            raise TypeError("indexing by a list differs from indexing by a tuple")
         keywords = {name: _argument(argument, numbers) for name, argument in node.kwargs.items()}
         target: Any = node.target
         if node.op == "call_module":
@@ -45,14 +45,14 @@ def _program(network: torch.nn.Module, nodes: list[Node]) -> Program:
             target = getattr(torch.Tensor, target)
         return Step(target, arguments, keywords, [numbers[node]], False, [])
 
-    steps, made = [step(node) for node in computed], _argument(output.args[0], numbers).number
-    mark_last_uses(steps, {*range(len(weights) + 1), made})
+    steps, output_number = [step(node) for node in computed], _argument(output.args[0], numbers).number
+    mark_last_uses(steps, {*range(len(weights) + 1), output_number})
     tensors: list[Any] = [reduce(getattr, str(node.target).split("."), network) for node in weights]
-    return Program([tensor.detach() for tensor in tensors], steps, made, None)
+    return Program([tensor.detach() for tensor in tensors], steps, output_number, None)
 
 
 def _argument(argument: Any, numbers: dict[Node, int]) -> Any:
-    """The same with values in place of nodes."""
+    """The argument with values in place of nodes."""
     if isinstance(argument, Node):
         return ValueRef(numbers[argument])
     if isinstance(argument, (list, tuple)):
@@ -61,5 +61,5 @@ def _argument(argument: Any, numbers: dict[Node, int]) -> Any:
     named: list[Node] = []
     map_arg(argument, named.append)
     if named:
-        raise TypeError("steps name values in lists only")
+        raise TypeError("steps hold values in lists only")
     return argument
