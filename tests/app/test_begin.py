@@ -175,7 +175,7 @@ def test_labels_are_found_by_their_words(said, label):
 
 
 def test_words_of_several_labels_or_none_are_refused():
-    with pytest.raises(Refused, match='"truck", which is in 2: choose "garbage truck", "tow truck"'):
+    with pytest.raises(Refused, match='"truck", which is in 2 labels: choose "garbage truck", "tow truck"'):
         guess_label(LABELS, "truck", "thing.glb")
     with pytest.raises(Refused, match='did you mean "cup"'):
         guess_label(LABELS, "cupp", "thing.glb")

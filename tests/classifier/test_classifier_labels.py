@@ -54,8 +54,8 @@ def test_labels_by_index_name_case_and_underscore():
 @pytest.mark.parametrize(
     ("label", "sentence"),
     [
-        ("crane", '"crane", which is in 2: use the index 1 \\("crane"\\) or 2'),
-        ("maillot", 'which is in 2: use the index 4 \\("maillot"\\) or 5 \\("maillot, tank suit"\\)'),
+        ("crane", '"crane", which is in 2 labels: use the index 1 \\("crane"\\) or 2'),
+        ("maillot", 'which is in 2 labels: use the index 4 \\("maillot"\\) or 5 \\("maillot, tank suit"\\)'),
         ("land rover", 'did you mean "landrover"'),
         ("truck", '"truck": did you mean "box truck"'),
         ("zzz", "use an index below 7 or one of its 7 labels"),

@@ -44,14 +44,14 @@ def test_a_good_network_passes_without_a_word():
 
 
 FAULTS = {
-    "Expected 4 logits for each picture.*\\(3, 3\\) for 3 from the network it": lambda x: GOOD(x)[:, :3],
-    "list for 3 from": lambda x: list(GOOD(x)),
+    "Expected 4 logits for each picture.*\\(3, 3\\) for 3 pictures from the network it": lambda x: GOOD(x)[:, :3],
+    "list for 3 pictures from": lambda x: list(GOOD(x)),
     "probabilities from the network it.*leave its last softmax out": lambda x: GOOD(x).softmax(1),
     "the same logits for the same pictures": lambda x: GOOD(x) + torch.rand(4),
     "do not depend on the rest of the batch": lambda x: GOOD(x - x.mean(0)) if len(x) > 1 else GOOD(x),
     "tells pictures apart": lambda x: GOOD(x * 0 + 0.5) + 1e-9 * GOOD(x),
-    "a gradient from the logits to the pixels, got the network it with none": lambda x: GOOD(x.detach()),
-    "with a zero or infinite one": lambda x: GOOD((x * 255).round() / 255),
+    "a gradient from the logits to the pixels, got none from the network it": lambda x: GOOD(x.detach()),
+    "a zero or infinite one from": lambda x: GOOD((x * 255).round() / 255),
     "Expected finite logits": lambda x: GOOD(x).log(),
     "which fails on 3×3×16×16": lambda x: GOOD(x[:, :2]),
 }
@@ -233,10 +233,10 @@ def test_own_code_beside_the_scene_gives_a_network_or_a_classifier(tmp_path):
 @pytest.mark.parametrize(
     ("name", "sentence"),
     [
-        ("own_networks_b.nothing", "return a torch.nn.Module with input_px"),
-        ("own_networks_b.fails", r"OSError \(no weights here\): mend the factory"),
+        ("own_networks_b.nothing", "an object of type object: give it input_px"),
+        ("own_networks_b.fails", r"OSError \(no weights here\): fix the factory"),
         ("own_networks_b.absent", "a function absent in own_networks_b, got none"),
-        ("not_there.factory", "an import that fails.*lay it beside the scene file"),
+        ("not_there.factory", "an import that fails.*put it beside the scene file"),
         ("own_networks_b", "name a module and a function in it"),
         ("os.path;x.y", "name a module and a function in it"),
     ],

@@ -69,7 +69,7 @@ def test_what_does_not_fit_is_refused(tiny, tmp_path):
         "tiny@w.pt": "prompts, as clip:MODEL@WEIGHTS",
         "tinny@w.safetensors": r'a model of open_clip, got "tinny".*"tiny"',
         "tiny@v.safetensors": r"a JSON file, got no file at .*v\.json",
-        "ViT-B-32@w.safetensors": r"weights of clip:ViT-B-32, got .*w\.safetensors with another",
+        "ViT-B-32@w.safetensors": r"weights of clip:ViT-B-32, got .*w\.safetensors, where",
     }.items():
         with pytest.raises(Refused, match=sentence):
             load_classifier(f"clip:{name}", tmp_path)

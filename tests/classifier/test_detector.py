@@ -202,7 +202,7 @@ def test_a_detector_that_finds_nothing_is_doubted_aloud():
 
 def test_a_detector_with_another_number_of_labels_is_refused():
     made = Detector("made", None, 8, ("cat", "dog", "owl"), candidates(([0, 0, 8, 8], [3.0, 9.0])))
-    with pytest.raises(Refused, match="3 logits for each picture, as there are labels"):
+    with pytest.raises(Refused, match="3 logits for each picture, one a label"):
         load_classifier(made, WEIGHTS_FOLDER)
 
 

@@ -154,5 +154,5 @@ def test_a_model_of_the_hub_needs_a_way_to_it(tmp_path, monkeypatch):
     monkeypatch.setattr(zoo.socket, "create_connection", nowhere)
     monkeypatch.setattr(zoo, "getproxies", dict)
     monkeypatch.setenv("HF_HOME", str(tmp_path))
-    with pytest.raises(Refused, match=r"published weights of timm:hf-hub:timm/none, got \w+ .*the way to the internet"):
+    with pytest.raises(Refused, match=r"published weights of timm:hf-hub:timm/none, got \w+ .*the internet connection"):
         load_classifier("timm:hf-hub:timm/none", tmp_path)

@@ -11,7 +11,7 @@ from small_networks import ConvNeXt, ResNet, ViT, seeded
 
 from patchproof.classifier.builtin import load_builtin
 from patchproof.classifier.custom import classifier_of
-from patchproof.classifier.network import Classifier, _in_square, center_square
+from patchproof.classifier.network import Classifier, _windows_in_square, center_square
 from patchproof.networks import cuts, windows
 from patchproof.networks.batches import tune_batches
 from patchproof.networks.graph import Program
@@ -403,7 +403,7 @@ def test_squares_differ_in_their_windows_only(photo_px):
     for photo, (left, top, right, bottom) in zip(photos, asked.tolist(), strict=True):
         photo[:, top:bottom, left:right] = 1
     for square, (left, top, right, bottom) in zip(
-        center_square(photos, 64), _in_square(asked, photo_px, 64).tolist(), strict=True
+        center_square(photos, 64), _windows_in_square(asked, photo_px, 64).tolist(), strict=True
     ):
         assert right - left <= 64 * 12 / min(photo_px) + 4
         square[:, top:bottom, left:right] = 0

@@ -153,7 +153,7 @@ def best_score(found: Iterable[Detection], objects: int) -> float:
     """The score, in twentieths, from which on findings have the highest F1, of so many objects."""
 
     def f1(score: float) -> float:
-        right = [finding.right for finding in known if 1 / (1 + np.exp(-finding.logit)) >= score]
+        right = [finding.is_hit for finding in known if 1 / (1 + np.exp(-finding.logit)) >= score]
         return 2 * sum(right) / (len(right) + objects)
 
     known = list(found)

@@ -1,4 +1,4 @@
-"""Any network as `photo -> logits`; see load.py for the names and network.py for what a classifier is."""
+"""Any network as `photo -> logits`: load.py lists the model names, network.py defines a classifier."""
 
 from patchproof.classifier.labels import find_labels
 from patchproof.classifier.load import load_classifier

@@ -22,12 +22,12 @@ from patchproof.classifier.network import Classifier
 
 INPUT_PX = 96
 WIDTHS = (16, 32, 64, 96, 160)  # channels after each halving of the picture: 48, 24, 12, 6, 3 pixels
-MEAN, DEVIATION = 0.45, 0.27  # of sRGB photographs, roughly; the first layer learns the rest
+MEAN, DEVIATION = 0.45, 0.27  # roughly those of sRGB photographs; the first layer learns the rest
 WEIGHTS_FOLDER = Path(__file__).parent
 
 
 class Backbone(nn.Module):
-    """Five halvings, each a strided convolution and, but for the first, a residual one."""
+    """Five strided convolutions, each of which halves the picture; a residual one follows each but the first."""
 
     def __init__(self, batch_norm: bool):
         super().__init__()
@@ -36,7 +36,7 @@ class Backbone(nn.Module):
         self.refine = nn.ModuleList(conv(width, width, 1, batch_norm) for width in WIDTHS[1:])
 
     def features(self, photos_srgb: Tensor) -> list[Tensor]:
-        """What each halving but the first makes of N×3×S×S sRGB in [0, 1]."""
+        """The feature maps after each halving but the first, of N×3×S×S sRGB in [0, 1]."""
         x, sizes = torch.relu(self.halve[0]((photos_srgb - MEAN) / DEVIATION)), []
         for halve, refine in zip(self.halve[1:], self.refine, strict=True):
             x = torch.relu(halve(x))
@@ -46,7 +46,7 @@ class Backbone(nn.Module):
 
 
 class SmallNetwork(Backbone):
-    """Halvings, then the mean and a line."""
+    """The backbone, the mean over pixels, and a linear layer."""
 
     def __init__(self, classes: int, batch_norm: bool = False):
         super().__init__(batch_norm)
@@ -66,20 +66,21 @@ def load_builtin(folder: Path = WEIGHTS_FOLDER) -> Classifier:
 def load_stored_network(
     kind: Callable[[int], nn.Module], name: str, folder: Path = WEIGHTS_FOLDER
 ) -> tuple[str, dict[str, Any], nn.Module]:
-    """SHA-256 of the weights NAME.safetensors, what NAME.json says, and the network of this kind with them."""
+    """SHA-256 of the weights NAME.safetensors, the contents of NAME.json, and the network of this `kind` with them."""
     from safetensors.torch import load
 
-    weights, card = folder / f"{name}.safetensors", folder / f"{name}.json"
-    if not weights.is_file() or not card.is_file():
-        raise Refused("the built-in network's weights beside the program", "none", "install patchproof again")
+    weights, card_path = folder / f"{name}.safetensors", folder / f"{name}.json"
+    if not weights.is_file() or not card_path.is_file():
+        got = f"no {name}.safetensors with {name}.json in {folder}"
+        raise Refused("the built-in network's weights", got, "install patchproof again")
     stored = weights.read_bytes()
-    card_says = json.loads(card.read_text(encoding="utf-8"))
-    network = kind(len(card_says["labels"]))
+    card = json.loads(card_path.read_text(encoding="utf-8"))
+    network = kind(len(card["labels"]))
     network.load_state_dict({key: tensor.float() for key, tensor in load(stored).items()})
-    return hashlib.sha256(stored).hexdigest(), card_says, network.eval()
+    return hashlib.sha256(stored).hexdigest(), card, network.eval()
 
 
 def conv(before: int, after: int, stride: int, batch_norm: bool) -> nn.Module:
-    """A 3×3 convolution, with its norm while it is trained."""
+    """A 3×3 convolution, with BatchNorm while it is trained."""
     plain = nn.Conv2d(before, after, 3, stride, padding=1, bias=not batch_norm)
     return nn.Sequential(plain, nn.BatchNorm2d(after)) if batch_norm else plain

@@ -1,9 +1,9 @@
 """The small detector that comes with the package: the twelve procedural objects, in boxes, 128×128 pixels.
 
 It is trained on the renders that the built-in classifier learned from (training/train_detector.py; the recipe and the
-accuracy are in builtin_detector.json), so that the whole journey runs before a detector, offline. Every cell of an 8×8
-grid names the object that it lies on and tells how far its four sides are (Tian et al., FCOS, ICCV 2019), from features
-of two sizes (Lin et al., feature pyramids, CVPR 2017).
+accuracy are in builtin_detector.json), so that all verbs also run with a detector, offline. Every cell of an 8×8 grid
+predicts the label of the object that it lies on and the distances to its four sides (Tian et al., FCOS, ICCV 2019),
+from features of two sizes (Lin et al., feature pyramids, CVPR 2017).
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ from patchproof.classifier.builtin import WEIGHTS_FOLDER, WIDTHS, Backbone, conv
 from patchproof.classifier.detector import Detector
 
 INPUT_PX, CELL_PX = 128, 16
-HEAD = 96  # channels
-NEAR, FAR = -2.0, 2.5  # logarithms of the nearest and the farthest side, in cells: 2 and 195 pixels
+HEAD_CHANNELS = 96  # channels
+MIN_LOG_SIDE, MAX_LOG_SIDE = -2.0, 2.5  # logarithms of distances in cells: 2 and 195 pixels
 
 
 class SmallDetector(Backbone):
-    """The built-in classifier's five halvings; cells of 16 pixels look at themselves and at those of 32 around."""
+    """The backbone with a head whose cells of 16 pixels also see the cells of 32 pixels around them."""
 
     def __init__(self, classes: int, batch_norm: bool = False):
         super().__init__(batch_norm)
-        self.join = nn.ModuleList(conv(width, HEAD, 1, batch_norm) for width in WIDTHS[-2:])
-        self.head = nn.ModuleList(conv(HEAD, HEAD, 1, batch_norm) for _ in range(2))
-        self.name, self.sides = nn.Conv2d(HEAD, classes, 1), nn.Conv2d(HEAD, 4, 1)
+        self.join = nn.ModuleList(conv(width, HEAD_CHANNELS, 1, batch_norm) for width in WIDTHS[-2:])
+        self.head = nn.ModuleList(conv(HEAD_CHANNELS, HEAD_CHANNELS, 1, batch_norm) for _ in range(2))
+        self.name, self.sides = nn.Conv2d(HEAD_CHANNELS, classes, 1), nn.Conv2d(HEAD_CHANNELS, 4, 1)
         self.name.bias = nn.Parameter(torch.full((classes,), -4.0))  # most cells show no object: Lin et al., ICCV 2017
 
     def forward(self, photos_srgb: Tensor) -> Tensor:
@@ -42,15 +42,15 @@ class SmallDetector(Backbone):
 
 
 def centers_px(rows: int, columns: int) -> Tensor:
-    """The middles of all cells, row by row, A×2 (x, y)."""
+    """The centers of all cells, row by row, A×2 (x, y)."""
     y, x = torch.meshgrid(torch.arange(rows), torch.arange(columns), indexing="ij")
     return (torch.stack([x, y], -1).reshape(-1, 2) + 0.5) * CELL_PX
 
 
 def _boxes(sides: Tensor) -> Tensor:
-    """N×A×4 from the logarithms N×4×h×w of the distances to the four sides."""
+    """Boxes N×A×4 from the logarithms N×4×h×w of the distances to the four sides."""
     centers = centers_px(*sides.shape[-2:]).to(sides)
-    distances = sides.clamp(NEAR, FAR).exp().flatten(2).mT * CELL_PX
+    distances = sides.clamp(MIN_LOG_SIDE, MAX_LOG_SIDE).exp().flatten(2).mT * CELL_PX
     return torch.cat([centers - distances[..., :2], centers + distances[..., 2:]], -1)
 
 

@@ -1,8 +1,8 @@
-"""A network doubted before it is used: what would make every later figure wrong, found on three made-up pictures.
+"""Test a network before it is used, on three synthetic pictures, for faults that would falsify every later figure.
 
-In: a Classifier. Out: nothing when all is well; refused where the network cannot be used (wrong outputs, probabilities
-instead of logits, chance or the batch in its answers, no gradient, not for pictures in [0, 1]); a warning where it may
-be right but looks odd. The idea is auto-attack's: a tool should distrust its own instrument.
+In: a Classifier. Out: nothing if all is well; refused if the network cannot be used (wrong outputs, probabilities
+instead of logits, answers that depend on chance or on the batch, no gradient, not for pictures in [0, 1]); a warning if
+it may be right but looks odd. The idea is auto-attack's: a tool should distrust its own instrument.
 
 Source: Croce et al., "Flags", github.com/fra31/auto-attack, checks.py.
 """
@@ -19,52 +19,54 @@ from patchproof.classifier.network import NO_BOX_LOGIT, Classifier
 
 # Logits differ by rounding when the batch does: 1e-6 of their spread in float32 here, 1e-3 with TF32. A dropout or a
 # BatchNorm in training mode moves them by more than a hundredth.
-SAME = 5e-3
-CONSTANT = 1e-6  # of the spread: even networks without training tell these pictures apart by more
-HARDLY = 1e-3  # trained ones differ by a tenth
+MAX_DIFFERENCE = 5e-3  # of the spread
+MIN_VARIATION = 1e-6  # of the spread: even untrained networks vary more between these pictures
+USUAL_VARIATION = 1e-3  # trained networks vary by a tenth
 
 
 def check_network(classifier: Classifier, device: torch.device | str = "cpu") -> None:
-    """Refuse a network that cannot be trusted; see the module's head."""
+    """Refuse a network whose answers or gradients cannot be trusted; warn of one that looks odd."""
     photos = smooth_pictures(classifier.input_px).to(device)
     name = f"the network {classifier.name}"
     try:
         with torch.no_grad():
             logits, again, alone, swapped = (
-                classifier.answer(batch) for batch in (photos, photos.clone(), photos[1:2], photos.flip(1))
+                classifier.square_logits(batch) for batch in (photos, photos.clone(), photos[1:2], photos.flip(1))
             )
     except Refused:
         raise
-    except Exception as error:  # it is the user's program: whatever it raises is about it
+    except Exception as error:  # the network is the user's program and may raise anything
         reason = f"{type(error).__name__}: {error_summary(error)}"
         got = f"{name}, which fails on 3×3×{classifier.input_px}×{classifier.input_px} ({reason})"
         raise Refused("a network that takes N×3×S×S pictures", got, "check input_px and the export") from error
     _check_outputs(logits, len(classifier.labels), name)
     if classifier.LOOKS_AT_BOXES and float(logits.max()) <= NO_BOX_LOGIT:
-        warnings.warn(f"{name} finds nothing in smooth pictures: its gradients were not tried", stacklevel=2)
+        warnings.warn(f"{name} finds nothing in smooth pictures: its gradients were not tested", stacklevel=2)
         return
     spread = float(logits.max() - logits.min())
-    if float((logits - again).abs().max()) > SAME * spread:
-        raise Refused("the same logits for the same pictures", f"others the second time from {name}", _EVAL)
-    if float((logits[1:2] - alone).abs().max()) > SAME * spread:
-        raise Refused("logits that do not depend on the rest of the batch", f"others in company from {name}", _EVAL)
-    if float((logits - logits.mean(0)).abs().max()) <= CONSTANT * spread:
+    if float((logits - again).abs().max()) > MAX_DIFFERENCE * spread:
+        got = f"different logits on a second call from {name}"
+        raise Refused("the same logits for the same pictures", got, _EVAL_ADVICE)
+    if float((logits[1:2] - alone).abs().max()) > MAX_DIFFERENCE * spread:
+        got = f"different logits in a larger batch from {name}"
+        raise Refused("logits that do not depend on the rest of the batch", got, _EVAL_ADVICE)
+    if float((logits - logits.mean(0)).abs().max()) <= MIN_VARIATION * spread:
         do = "let it take sRGB in [0, 1], with its normalization inside"
         raise Refused("a network that tells pictures apart", f"{name}, whose logits are the same for all", do)
     _check_gradient(classifier, photos, name)
-    for doubt in _doubts(logits, swapped, spread):
-        warnings.warn(f"{name} {doubt}", stacklevel=2)
+    for oddity in _oddities(logits, swapped, spread):
+        warnings.warn(f"{name} {oddity}", stacklevel=2)
 
 
-_EVAL = "export it in evaluation mode, so that dropout and batch statistics are frozen"
+_EVAL_ADVICE = "export it in evaluation mode, so that dropout and batch statistics are frozen"
 
 
 def _check_outputs(logits: Tensor, classes: int, name: str) -> None:
-    """Shape, finite values, and no softmax at the end."""
+    """Check shape, finite values, and that there is no softmax at the end."""
     if not isinstance(logits, Tensor) or logits.shape != (3, classes):
         got = tuple(logits.shape) if isinstance(logits, Tensor) else type(logits).__name__
         do = "give it as many labels as it has outputs"
-        raise Refused(f"{classes} logits for each picture, as there are labels", f"{got} for 3 from {name}", do)
+        raise Refused(f"{classes} logits for each picture, one a label", f"{got} for 3 pictures from {name}", do)
     if not torch.isfinite(logits).all():
         raise Refused("finite logits", f"NaN or infinity from {name}", "check its weights and its number format")
     if logits.min() >= 0 and logits.max() <= 1 and ((logits.sum(1) - 1).abs() < 1e-3).all():
@@ -72,33 +74,33 @@ def _check_outputs(logits: Tensor, classes: int, name: str) -> None:
 
 
 def _check_gradient(classifier: Classifier, photos: Tensor, name: str) -> None:
-    """The best logit's gradient reaches the pixels, finite and not zero."""
+    """Check that the best logit's gradient at the pixels is finite and not zero."""
     photos = photos.clone().requires_grad_(True)
-    best = classifier.answer(photos).max(1).values.sum()
+    best = classifier.square_logits(photos).max(1).values.sum()
     gradient = torch.autograd.grad(best, photos, allow_unused=True)[0] if best.requires_grad else None
     if gradient is None or not torch.isfinite(gradient).all() or not (gradient.abs().amax((1, 2, 3)) > 0).all():
-        got = f"{name} with " + ("none" if gradient is None else "a zero or infinite one")
+        got = f"{'none' if gradient is None else 'a zero or infinite one'} from {name}"
         raise Refused("a gradient from the logits to the pixels", got, "use a network of differentiable operations")
 
 
-def _doubts(logits: Tensor, swapped: Tensor, spread: float) -> list[str]:
-    """What is odd but can be right."""
-    doubts = []
-    if float((logits - logits.mean(0)).abs().max()) <= HARDLY * spread:
-        doubts.append("hardly tells pictures apart: does it take sRGB in [0, 1], with its normalization inside?")
-    elif float((logits - swapped).abs().max()) <= HARDLY * spread:
-        doubts.append("gives the same logits when red and blue are swapped: it may not see color")
+def _oddities(logits: Tensor, swapped: Tensor, spread: float) -> list[str]:
+    """Texts for warnings about outputs that are odd but can be right."""
+    oddities = []
+    if float((logits - logits.mean(0)).abs().max()) <= USUAL_VARIATION * spread:
+        oddities.append("hardly tells pictures apart: does it take sRGB in [0, 1], with its normalization inside?")
+    elif float((logits - swapped).abs().max()) <= USUAL_VARIATION * spread:
+        oddities.append("gives the same logits when red and blue are swapped: it may not see color")
     if (torch.softmax(logits.double(), 1).amax(1) > 1 - 1e-6).all():
-        doubts.append("is certain of pictures that show nothing: its gradients may be too small to optimize with")
-    return doubts
+        oddities.append("is certain of pictures that show nothing: its gradients may be too small to optimize with")
+    return oddities
 
 
 def smooth_pictures(size_px: int) -> Tensor:
-    """Three smooth colored pictures in [0, 1], 3×3×S×S, the same every time."""
+    """Three smooth colored pictures in [0, 1], 3×3×S×S, identical on every call."""
     coarse = torch.rand(3, 3, 6, 6, generator=torch.Generator().manual_seed(0))
     return torch.nn.functional.interpolate(coarse, (size_px, size_px), mode="bilinear", align_corners=False)
 
 
 def error_summary(error: Exception) -> str:
-    """The first line of its message, shortened."""
+    """The first line of an error's message, at most 200 characters."""
     return (str(error).strip().splitlines() or [""])[0][:200]

@@ -1,9 +1,9 @@
 """`clip:MODEL@FILE`: a network of pictures and text, whose labels are prompts.
 
-In: a model that open_clip knows, with its weights in FILE.safetensors, or MODEL/PRETRAINED with those published under
-that name and prompts in FILE.json; either way FILE.json is a network's card, whose labels are the prompts. Out: a
-classifier as any other: a logit is the cosine between picture and prompt, times the network's own scale. Prompts are
-read once, by the network's other half, which is let go then.
+In: a model that open_clip knows, with its weights in FILE.safetensors, or MODEL/PRETRAINED with the weights published
+under that name and prompts in FILE.json; either way FILE.json is a network's card, whose labels are the prompts. Out: a
+classifier like any other: a logit is the cosine between picture and prompt, times the network's own scale. The text
+half of the network encodes the prompts once and is not kept.
 Left out on purpose: means over several prompts of a label (write the one that counts), networks that write captions.
 
 Source: Radford et al., Learning Transferable Visual Models From Natural Language Supervision, ICML 2021, section 3.1.
@@ -21,11 +21,11 @@ from patchproof.classifier.custom import classifier_of
 from patchproof.classifier.labels import nearest_names
 from patchproof.classifier.network import Classifier
 from patchproof.classifier.network_file import read_card
-from patchproof.classifier.zoo import Normalized, downloaded, library, load_weights, read_weights
+from patchproof.classifier.zoo import Normalized, download, import_library, load_weights, read_weights
 
 
 class Prompted(nn.Module):
-    """The half that sees pictures, beside K prompts as unit vectors K×E; `scale` is that of their cosines."""
+    """The image half of a CLIP model, with K prompts as unit vectors K×E; `scale` multiplies the cosines."""
 
     def __init__(self, sees: nn.Module, prompts: Tensor, scale: Tensor):
         super().__init__()
@@ -39,8 +39,8 @@ class Prompted(nn.Module):
 
 
 def load_clip(name: str) -> Classifier:
-    """The network and prompts that `name`, MODEL@FILE, says."""
-    open_clip = library("open_clip", "clip", "clip")
+    """The classifier that `name`, MODEL@FILE, stands for."""
+    open_clip = import_library("open_clip", "clip", "clip")
     model, _, file = name.rpartition("@")
     path, (known, _, published) = Path(file), model.partition("/")
     if not model or path.suffix not in (".safetensors", ".json"):
@@ -52,7 +52,7 @@ def load_clip(name: str) -> Classifier:
     card = read_card(path.with_suffix(".json"))
     if path.suffix == ".json":
         options = {"pretrained": published or None, "require_pretrained": True}
-        network = downloaded(f"clip:{model}", lambda: open_clip.create_model(known, **options))
+        network = download(f"clip:{model}", lambda: open_clip.create_model(known, **options))
     else:
         network = open_clip.create_model(known)
         load_weights(network, read_weights(path), f"clip:{known}", "check the model's name")

@@ -2,8 +2,8 @@
 
 The factory is called without arguments and returns a Classifier, or a torch.nn.Module with two attributes: `input_px`
 (the side of the square it takes) and `labels` (its classes' names in the order of its outputs). The module takes
-N×3×S×S sRGB in [0, 1], its normalization inside, and returns N×K logits; one with `kind = "detector"` returns boxes,
-as `detector_of` has it. The import looks beside the scene file too.
+N×3×S×S sRGB in [0, 1], its normalization inside, and returns N×K logits; one with `kind = "detector"` returns boxes as
+`detector_of` describes them. Modules beside the scene file are found, too.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from patchproof.base.errors import Refused
 from patchproof.classifier.detector import Detector
 from patchproof.classifier.network import NO_BOX_LOGIT, Classifier, weights_sha256
 
-MAX_DETECTIONS = 1000  # boxes in a picture, of networks that find any number
+MAX_DETECTIONS = 1000  # boxes in a picture, for networks that find any number of them
 
 
 def load_custom(dotted: str, base: Path) -> Classifier:
-    """What `package.factory()` returns, as a Classifier."""
+    """Call `package.factory()` and return the result as a Classifier."""
     name, factory = f"module:{dotted}", _factory(dotted, base)
     try:
-        made = factory()
-    except Exception as error:  # the user's code: whatever it raises is about it
-        raise Refused(f"a network from {name}", f"{type(error).__name__} ({error})", "mend the factory") from error
-    return made if isinstance(made, Classifier) else labeled_module(made, name)
+        network = factory()
+    except Exception as error:  # the user's code may raise anything
+        raise Refused(f"a network from {name}", f"{type(error).__name__} ({error})", "fix the factory") from error
+    return network if isinstance(network, Classifier) else labeled_module(network, name)
 
 
 def labeled_module(module: object, name: str) -> Classifier:
@@ -44,7 +44,8 @@ def labeled_module(module: object, name: str) -> Classifier:
         or isinstance(labels, str)
     ):
         do = "give it input_px (an int) and labels (a list of names), or wrap it with classifier_of"
-        raise Refused(f"a torch.nn.Module with input_px and labels as {name}", f"a {type(module).__name__}", do)
+        got = f"an object of type {type(module).__name__}"
+        raise Refused(f"a torch.nn.Module with input_px and labels as {name}", got, do)
     make = detector_of if getattr(module, "kind", "") == Detector.KIND else classifier_of
     return make(module, input_px, labels, name)
 
@@ -83,13 +84,13 @@ def detector_of(
 
 
 def _check_callable(network: object) -> None:
-    """Refuse what is no network: an ExportedProgram, a path, a list of weights."""
+    """Refuse an ExportedProgram, a path, a list of weights, and anything else that cannot be called."""
     if callable(network) and not isinstance(network, type | torch.export.ExportedProgram):
         return
     exported = isinstance(network, torch.export.ExportedProgram)
     do = "call its .module() first" if exported else "give the module itself, or load a file with load_classifier"
-    what = "an ExportedProgram" if exported else f"a {type(network).__name__}"
-    raise Refused("a network that can be called with a batch of pictures", what, do)
+    got = "an ExportedProgram" if exported else f"an object of type {type(network).__name__}"
+    raise Refused("a network that can be called with a batch of pictures", got, do)
 
 
 def _in_evaluation_mode(network: Callable[[Tensor], Tensor]) -> Callable[[Tensor], Tensor]:
@@ -103,7 +104,7 @@ def _in_evaluation_mode(network: Callable[[Tensor], Tensor]) -> Callable[[Tensor
 
 
 class AsCandidates(torch.nn.Module):
-    """A detector's findings as candidates, however it gives them."""
+    """Turns a detector's output of either kind into candidates N×A×(4+K)."""
 
     def __init__(self, network: Callable[[Tensor], Any], labels: int):
         super().__init__()
@@ -111,20 +112,21 @@ class AsCandidates(torch.nn.Module):
 
     def forward(self, photos: Tensor) -> Tensor:
         """N×3×S×S → N×A×(4+K)."""
-        found = self.network(photos)
-        if isinstance(found, Tensor):
-            return found
-        rows = [self._rows(each["boxes"], each["labels"], each["scores"]) for each in found]
+        output = self.network(photos)
+        if isinstance(output, Tensor):
+            return output
+        rows = [self._rows(each["boxes"], each["labels"], each["scores"]) for each in output]
         return torch.stack(rows)
 
     def _rows(self, boxes: Tensor, labels: Tensor, scores: Tensor) -> Tensor:
-        """`MAX_DETECTIONS`×(4+K), the surest first; what is left over lies nowhere and shows nothing."""
+        """`MAX_DETECTIONS`×(4+K) of one picture, the surest first; unused rows have an empty box and no score."""
         surest = scores.argsort(descending=True)[:MAX_DETECTIONS]
-        nothing = scores.new_full((MAX_DETECTIONS, self.labels), NO_BOX_LOGIT)
+        all_logits = scores.new_full((MAX_DETECTIONS, self.labels), NO_BOX_LOGIT)
         logits = torch.logit(scores[surest].clamp(1e-6, 1 - 1e-6))
         rows = torch.arange(len(surest), device=scores.device)
-        nothing = nothing.index_put((rows, labels[surest]), logits)
-        return torch.cat([torch.nn.functional.pad(boxes[surest], (0, 0, 0, MAX_DETECTIONS - len(surest))), nothing], 1)
+        all_logits = all_logits.index_put((rows, labels[surest]), logits)
+        all_boxes = torch.nn.functional.pad(boxes[surest], (0, 0, 0, MAX_DETECTIONS - len(surest)))
+        return torch.cat([all_boxes, all_logits], 1)
 
 
 def _factory(dotted: str, base: Path):
@@ -135,7 +137,7 @@ def _factory(dotted: str, base: Path):
     try:
         module = importlib.import_module(module_name)
     except Exception as error:  # SyntaxError and the like in the user's module too
-        do = "install it, or lay it beside the scene file"
+        do = "install it, or put it beside the scene file"
         raise Refused(f"the module {module_name} of module:{dotted}", f"an import that fails ({error})", do) from error
     finally:
         sys.path.pop()

@@ -1,10 +1,10 @@
-"""A detector as the rest of the project sees it: photographs and the object's box in, logits out, as of a classifier.
+"""A detector with the interface of a classifier: photographs and the object's box in, logits out.
 
 In: what a network finds in the photographs' centered squares: candidate boxes with a score for each label, before
-suppression of those that overlap. Out: per photograph and label the logit of the best candidate that lies on the
-object (intersection over union of at least `MIN_IOU` with its box), so that rates, losses, controls and promises of
-detectors are written in the words of classifiers: the object is recognized where that score reaches `least_score`,
-confidence is the score. Where the object's box is not known, any candidate in the square counts.
+overlapping ones are suppressed. Out: per photograph and label the logit of the best candidate that lies on the object
+(intersection over union of at least `MIN_IOU` with its box), so that rates, losses, controls and promises are defined
+for detectors as for classifiers: the object is recognized where that score reaches `least_score`, and confidence is the
+score. Where the object's box is not known, any candidate in the square counts.
 Left out on purpose: suppression. It leaves the best candidate of an object, which alone decides here.
 """
 
@@ -39,7 +39,7 @@ class Detector(Classifier):
         return torch.sigmoid(logits.double())
 
     def odds(self, logits: Tensor, indices: Sequence[int]) -> Odds:
-        """The logarithms of the best score of the labels in `indices`, and of what is left to 1."""
+        """The logarithms of the best score among the labels in `indices`, and of 1 minus that score."""
         best = logits[:, list(indices)].amax(1).double()
         return Odds(torch.nn.functional.logsigmoid(best), torch.nn.functional.logsigmoid(-best))
 
@@ -51,9 +51,9 @@ class Detector(Classifier):
         """N bool: the object was found under one of these labels with a sufficient score."""
         return self.confidence(logits, indices) >= self.least_score
 
-    def answer(self, squares: Tensor, boxes: np.ndarray | None = None, windows: Windows | None = None) -> Tensor:
-        """N×K logits of the best candidates on the object, whose box is known as shares of the square."""
-        candidates = self._asked(squares, windows)
+    def square_logits(self, squares: Tensor, boxes: np.ndarray | None = None, windows: Windows | None = None) -> Tensor:
+        """N×K logits of the best candidates on the object; `boxes` N×4 are shares of the square."""
+        candidates = self._call_network(squares, windows)
         logits = candidates[..., 4:]
         if boxes is not None:
             overlap = iou(candidates[..., :4].detach(), torch.as_tensor(boxes).to(squares) * self.input_px)
@@ -62,7 +62,7 @@ class Detector(Classifier):
 
 
 def iou(boxes: Tensor, truth: Tensor) -> Tensor:
-    """N×A intersections over unions of boxes N×A×4 with one box each, N×4."""
+    """N×A intersections over unions of boxes N×A×4 with one true box each, N×4."""
     truth = truth[:, None]
     low, high = torch.maximum(boxes[..., :2], truth[..., :2]), torch.minimum(boxes[..., 2:], truth[..., 2:])
     shared = (high - low).clamp_min(0).prod(-1)

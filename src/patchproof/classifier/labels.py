@@ -1,8 +1,8 @@
-"""From the words of a scene file to a network's output indices.
+"""Find a network's output indices from the words of a scene file.
 
 A label is an index, or any comma-separated name of an entry: "jeep" is in "jeep, landrover". Case does not matter and
-an underscore is a space. The whole entry counts as a name too. A name in several entries is refused with the indices
-it could be, an absent one with the nearest names.
+an underscore is a space. The whole entry counts as a name too. A name that is in several entries is refused with their
+indices, an absent one with the nearest names.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ def find_labels(labels: Sequence[str], label: str | int, accept: Sequence[str | 
 
 
 def find_words(labels: Sequence[str], text: str, whole: bool = False) -> int:
-    """The index of the label with these words: "mug" is "coffee mug", whose last word it is. `whole`: nothing but a
-    label's own name or last words will do. Refused where several or none have them.
+    """The index of the label with these words: "mug" finds "coffee mug", whose last word it is. With `whole`, the words
+    must be a label's whole name or its last words. Refused where several labels or none match.
     """
     words, names = _folded(text).split(), [[_folded(name).split() for name in (e, *e.split(","))] for e in labels]
     ranks = (
@@ -29,13 +29,13 @@ def find_words(labels: Sequence[str], text: str, whole: bool = False) -> int:
         lambda name: not whole and set(words) <= set(name),
     )
     for rank in ranks:
-        matches = [i for i, own in enumerate(names) if words and any(map(rank, own))]
+        matches = [i for i, entry_names in enumerate(names) if words and any(map(rank, entry_names))]
         if len(matches) == 1:
             return matches[0]
         if matches:
             shown = ", ".join(f'"{labels[i].split(",")[0]}"' for i in matches[:6])
             more = ", ..." if len(matches) > 6 else ""
-            raise Refused("words of one label", f'"{text}", which is in {len(matches)}', f"choose {shown}{more}")
+            raise Refused("words of one label", f'"{text}", which is in {len(matches)} labels', f"choose {shown}{more}")
     raise Refused("a label that the network knows", f'"{text}"', _nearest(labels, text))
 
 
@@ -49,7 +49,7 @@ def _find(labels: Sequence[str], label: str | int) -> int:
         return matches[0]
     if matches:
         do = "use the index " + " or ".join(f'{i} ("{labels[i]}")' for i in matches)
-        raise Refused("a label that names one class", f'"{label}", which is in {len(matches)}', do)
+        raise Refused("a label that names one class", f'"{label}", which is in {len(matches)} labels', do)
     raise Refused("a label that the network knows", f'"{label}"', _nearest(labels, label))
 
 
@@ -64,7 +64,7 @@ def _nearest(labels: Sequence[str], label: str) -> str:
 
 
 def nearest_names(word: str, names: Sequence[str], otherwise: str) -> str:
-    """What to do about a name that is not there: up to three near ones, or else `otherwise`."""
+    """Advice about an unknown name: up to three similar names, or else the text `otherwise`."""
     by_folded = {_folded(name): name for name in names}
     near = difflib.get_close_matches(_folded(word), by_folded, 3, 0.6)
     return "did you mean " + " or ".join(f'"{by_folded[name]}"' for name in near) if near else otherwise

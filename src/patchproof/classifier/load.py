@@ -1,16 +1,16 @@
-"""From a model's name to a classifier that has been doubted and found usable.
+"""Load a classifier by its name and check that it can be used.
 
     builtin                the small network that comes with the package (builtin.py)
     builtin-detector       the small detector that comes with it (builtin_detector.py)
     file:NAME.onnx         an ONNX file with NAME.json beside it (network_file.py)
-    torchvision:NAME       a torchvision or timm model; its weights are downloaded because it was named (zoo.py),
-    timm:NAME              or with @FILE.safetensors behind the name read from that file
+    torchvision:NAME       a torchvision or timm model with its published weights, which are downloaded (zoo.py);
+    timm:NAME              with @FILE.safetensors behind the name, weights are read from that file
     clip:NAME@FILE         a network of pictures and text, whose labels are the prompts of a file (clip.py)
     module:package.factory the user's own code, which is imported and called (custom.py)
     python:...             a Classifier given in Python beside the scene (custom.classifier_of)
 
 Paths are relative to the scene file's folder and may hold `${VAR}`. Networks come frozen: evaluation mode, no weight
-gradients. Several names are simply several classifiers.
+gradients. Several names give several classifiers.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def load_classifier(
     if isinstance(name, torch.nn.Module):
         name = labeled_module(name, "python:network")
     if isinstance(name, Classifier):
-        return _trusted(name, device)
+        return _prepare(name, device)
     kind, _, rest = expand_path(name, Path(base)).partition(":")
     if name == "builtin":
         classifier = load_builtin()
@@ -83,11 +83,11 @@ def load_classifier(
         words = {".onnx": f'write "file:{name}"', ".pt2": EXPORT_ADVICE}
         do = words.get(Path(name).suffix, "write one of these")
         raise Refused(f"a model named {known} or module:package.factory", f'"{name}"', do)
-    return _trusted(replace(classifier, name=name), device)
+    return _prepare(replace(classifier, name=name), device)
 
 
-def _trusted(classifier: Classifier, device: torch.device | str) -> Classifier:
-    """The classifier on the device, frozen, doubted, and as fast as it can be called."""
+def _prepare(classifier: Classifier, device: torch.device | str) -> Classifier:
+    """Freeze the classifier, check it, and choose the batches in which it computes fastest on the device."""
     use_full_precision(device)
     if isinstance(classifier.network, torch.nn.Module):
         freeze(classifier.network).to(device)
@@ -97,7 +97,7 @@ def _trusted(classifier: Classifier, device: torch.device | str) -> Classifier:
 
 
 def use_full_precision(device: torch.device | str) -> None:
-    """Have cuDNN convolve in float32 on a GPU, so that networks answer there as on a CPU: its own default, TF32, keeps
+    """Let cuDNN convolve in float32 on a GPU, so that networks answer there as on a CPU: its own default, TF32, keeps
     10 bits of 23, with which a MobileNetV2's gradient at a design was off by 9 %.
     """
     if torch.device(device).type == "cuda":

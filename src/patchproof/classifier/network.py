@@ -1,8 +1,8 @@
-"""The classifier as the rest of the project sees it: photographs in, logits out, and what counts as recognized.
+"""The classifier as the rest of the project sees it: photographs in, logits out, and a rule for "recognized".
 
-In: N×3×H×W sRGB in [0, 1] of any size. Out: N×K logits. Normalization belongs to the network, cropping and resizing to
-the centered square belongs here: one function for training, promise, reprint and verification, so that none of them
-sees anything else. Recognized means that the top-1 label is among the target's indices; of a detector, see detector.py.
+In: N×3×H×W sRGB in [0, 1] of any size. Out: N×K logits. Normalization belongs to the network; cropping and resizing to
+the centered square belong here, in one function for training, promise, reprint and verification, so that all of them
+see the same. Recognized means that the top-1 label is among the target's indices; for detectors see detector.py.
 Left out on purpose: labels' meaning (labels.py), loading (load.py), ensembles (a tuple of classifiers is one).
 """
 
@@ -25,7 +25,7 @@ NO_BOX_LOGIT = -20.0  # the logit where no candidate of a detector lies on the o
 
 
 class Odds(NamedTuple):
-    """The logarithms of N confidences and of what they lack to 1; float64, so that 1 - 1e-9 is not 1."""
+    """The logarithms of N confidences and of 1 minus each; float64, so that 1 - 1e-9 is not 1."""
 
     log_confidence: Tensor
     log_complement: Tensor
@@ -36,17 +36,17 @@ class Classifier:
     """A frozen network with its labels; `network` takes N×3×S×S sRGB in [0, 1], S = `input_px`, gives N×K logits."""
 
     name: str  # as written in the scene file
-    sha256: str | None  # of the weights or the file; None where nothing can be hashed
+    sha256: str | None  # of the weights or the file; None if there is nothing to hash
     input_px: int
     labels: tuple[str, ...]
     network: Callable[[Tensor], Tensor]
-    least_score: float | None = None  # from which on a detector's boxes count; a classifier needs none
+    least_score: float | None = None  # from which a detector's boxes count; a classifier needs none
 
     KIND: ClassVar[str] = "classifier"
-    LOOKS_AT_BOXES: ClassVar[bool] = False  # whether it matters where the object lies
+    LOOKS_AT_BOXES: ClassVar[bool] = False  # whether the object's box matters
 
     def with_least_score(self, least_score: float | None) -> Classifier:
-        """The network with that score in place of its own, if there is one and it needs any."""
+        """A copy with that `least_score`; the classifier itself if the score is None or it needs none."""
         return self if None in (least_score, self.least_score) else replace(self, least_score=least_score)
 
     def logits(
@@ -54,18 +54,20 @@ class Classifier:
         photos_srgb: Tensor,
         boxes: np.ndarray | None = None,
         windows: np.ndarray | None = None,
-        kept: dict[Any, Any] | None = None,
+        cache: dict[Any, Any] | None = None,
     ) -> Tensor:
-        """N×K logits of the photographs' centered squares; refused where they are no numbers, which would pass for an
-        answer: the largest of a row with NaN is the NaN. `boxes` N×4 tell where the object lies, as shares of the
-        square's side (left, top, right, bottom); only a detector looks at them. Outside of `windows`, N×4 pixels in
-        the same order, the photographs' gradient is not asked for, and may be 0; or, with `kept`, they show what the
-        first did that it went with, and no gradient is asked for.
+        """N×K logits of the photographs' centered squares. Refused if any is not finite, since the largest of a row
+        with NaN is the NaN and would pass for an answer.
+
+        `boxes` N×4 are the object's boxes as shares of the square's side (left, top, right, bottom); only detectors use
+        them. With `windows`, N×4 pixels in that order, the gradient at the photographs may be 0 outside of them. With
+        `cache` as well, no gradient is computed: outside of the windows, the photographs equal the first ones that were
+        passed with this cache.
         """
-        squares, asked = center_square(photos_srgb, self.input_px), None
+        squares, square_windows = center_square(photos_srgb, self.input_px), None
         if windows is not None:
-            asked = Windows(_in_square(windows, photos_srgb.shape[-2:], self.input_px), kept)
-        logits = self.answer(squares, boxes, asked)
+            square_windows = Windows(_windows_in_square(windows, photos_srgb.shape[-2:], self.input_px), cache)
+        logits = self.square_logits(squares, boxes, square_windows)
         if not bool(torch.isfinite(logits).all()):
             do = "check its weights and its number format"
             raise Refused("finite logits", f"NaN or infinity from the network {self.name}", do)
@@ -76,7 +78,7 @@ class Classifier:
         return torch.softmax(logits.double(), 1)
 
     def odds(self, logits: Tensor, indices: Sequence[int]) -> Odds:
-        """Of the summed softmax of the labels in `indices`."""
+        """Logarithms of the summed softmax of the labels in `indices` and of all others."""
         log_p = torch.log_softmax(logits.double(), 1)
         chosen = torch.zeros(logits.shape[1], dtype=torch.bool, device=logits.device)
         chosen[list(indices)] = True
@@ -90,12 +92,12 @@ class Classifier:
         """N bool: the largest logit is one of `indices`."""
         return torch.isin(logits.argmax(1), torch.tensor(list(indices), device=logits.device))
 
-    def answer(self, squares: Tensor, boxes: np.ndarray | None = None, windows: Windows | None = None) -> Tensor:
-        """N×K logits of squares of the network's own size, unchecked."""
-        return self._asked(squares, windows)
+    def square_logits(self, squares: Tensor, boxes: np.ndarray | None = None, windows: Windows | None = None) -> Tensor:
+        """N×K logits of squares of the network's input size, not checked for NaN."""
+        return self._call_network(squares, windows)
 
-    def _asked(self, squares: Tensor, windows: Windows | None) -> Tensor:
-        """What the network itself says."""
+    def _call_network(self, squares: Tensor, windows: Windows | None) -> Tensor:
+        """The network's own output for squares N×3×S×S."""
         if windows is not None and isinstance(self.network, BatchedNetwork):
             return self.network(squares, windows)
         return self.network(squares)
@@ -117,7 +119,7 @@ def center_square(photos_srgb: Tensor, size_px: int) -> Tensor:
     return torch.nn.functional.interpolate(square, size, mode="bilinear", align_corners=False, antialias=True)
 
 
-def _in_square(windows: np.ndarray, photo_px: Sequence[int], size_px: int) -> np.ndarray:
+def _windows_in_square(windows: np.ndarray, photo_px: Sequence[int], size_px: int) -> np.ndarray:
     """The pixels of centered squares that depend on those in windows of photographs, both N×4."""
     side = min(photo_px)
     corner, ratio = (np.array(photo_px[::-1]) - side) // 2, side / size_px

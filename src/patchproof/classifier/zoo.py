@@ -1,11 +1,12 @@
 """`torchvision:NAME` and `timm:NAME`: published networks with their published weights, or with those of a file.
 
 The weights are downloaded by these libraries, and only because the scene file names the model; `timm:hf-hub:ORG/NAME`
-is one of the hub's. With `NAME@FILE.safetensors` they are the file's, read as numbers, never as a pickle; a network
-trained for other labels says these, and its input size, in FILE.json beside it. The libraries are not needed otherwise:
-where one is missing, the sentence says what to install. Input size, labels and the mean and standard deviation that the
-weights were trained with are the library's own figures; normalization is put inside the network.
-Their resize-then-crop is left out on purpose: here every network sees the whole centered square.
+is a model of the Hugging Face hub. With `NAME@FILE.safetensors` the weights are read from the file as numbers, never as
+a pickle; for a network trained with other labels, FILE.json beside it holds them and the input size. The libraries are
+not needed otherwise: where one is missing, the message says what to install. Input size, labels, and the mean and
+standard deviation that the weights were trained with are the library's own figures; normalization is put inside the
+network.
+Left out on purpose: the libraries' resize-then-crop. Here every network sees the whole centered square.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ from patchproof.classifier.network_file import Card, network_bytes, read_card
 
 
 class Normalized(nn.Module):
-    """A network that wants (x - mean) / std, as one that takes sRGB in [0, 1]."""
+    """Wraps a network that takes (x - mean) / std as one that takes sRGB in [0, 1]."""
 
     def __init__(self, network: nn.Module, mean: Sequence[float], std: Sequence[float]):
         super().__init__()
@@ -51,67 +52,67 @@ class Normalized(nn.Module):
 
 
 def load_torchvision(name: str) -> Classifier:
-    """A torchvision classification or detection model with its default weights; a classifier's may be a file's."""
-    models = library("torchvision", "torchvision").models
+    """A torchvision classifier or detector with its default weights, or a classifier with those of a file."""
+    models = import_library("torchvision", "torchvision").models
     if name in models.list_models(module=models.detection):
         return _detector(models, name)
-    name, own = _own_weights(name)
+    name, local = _split_weights(name)
     known = models.list_models(module=models)  # segmentation, detection and video have modules of their own
     if name not in known:
         do = nearest_names(name, known, "choose one of torchvision.models.list_models()")
         raise Refused("a torchvision classifier or detector", f'"{name}"', do)
     weights = models.get_model_weights(name).DEFAULT
     view = weights.transforms()
-    side_px, labels = (own and own.card and own.card[:2]) or (int(view.crop_size[0]), weights.meta["categories"])
-    if own is None:
-        network = downloaded(f"torchvision:{name}", lambda: models.get_model(name, weights=weights))
+    side_px, labels = (local and local.card and local.card[:2]) or (int(view.crop_size[0]), weights.meta["categories"])
+    if local is None:
+        network = download(f"torchvision:{name}", lambda: models.get_model(name, weights=weights))
     else:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of how it begins, before the file's weights are in it
+            warnings.simplefilter("ignore")  # about the initial weights, which the file's replace
             network = models.get_model(name, weights=None, num_classes=len(labels))
         if hasattr(network, "transform_input"):  # Inception's published weights are for another normalization
             network.transform_input = True
-    return _with(own, network, view.mean, view.std, side_px, labels, f"torchvision:{name}")
+    return _make_classifier(local, network, view.mean, view.std, side_px, labels, f"torchvision:{name}")
 
 
-# of torchvision's detectors by what their constructors call it: as many candidates as there are, none suppressed
-_RAW = {"score_thresh": 1e-3, "nms_thresh": 1.0, "detections_per_img": MAX_DETECTIONS}
+# arguments of torchvision's detectors with which they return all candidates, none suppressed
+_UNSUPPRESSED = {"score_thresh": 1e-3, "nms_thresh": 1.0, "detections_per_img": MAX_DETECTIONS}
 
 
 def _detector(models: Any, name: str) -> Detector:
     """A torchvision detector with its default weights, before suppression."""
     weights = models.get_model_weights(name).DEFAULT
-    raw = {f"box_{key}": value for key, value in _RAW.items()} if "rcnn" in name else _RAW
-    network = downloaded(f"torchvision:{name}", lambda: models.get_model(name, weights=weights, **raw))
+    raw = {f"box_{key}": value for key, value in _UNSUPPRESSED.items()} if "rcnn" in name else _UNSUPPRESSED
+    network = download(f"torchvision:{name}", lambda: models.get_model(name, weights=weights, **raw))
     view = network.transform
     input_px = view.fixed_size[0] if getattr(view, "fixed_size", None) else view.min_size[0]
     return detector_of(network, int(input_px), weights.meta["categories"], f"torchvision:{name}")
 
 
 def load_timm(name: str) -> Classifier:
-    """A timm model with its pretrained weights or a file's, where its labels are known."""
-    timm = library("timm", "timm")
-    name, own = _own_weights(name)
-    if not (timm.is_model(name) or (name.startswith("hf-hub:") and own is None)):
+    """A timm model with its pretrained weights or those of a file, if its labels are known."""
+    timm = import_library("timm", "timm")
+    name, local = _split_weights(name)
+    if not (timm.is_model(name) or (name.startswith("hf-hub:") and local is None)):
         do = nearest_names(name, timm.list_models(), "choose one of timm.list_models()")
         raise Refused("a timm model", f'"{name}"', do)
-    if own is None:
-        with _offline_at_once():
-            network = downloaded(f"timm:{name}", lambda: timm.create_model(name, pretrained=True))
+    if local is None:
+        with _offline_if_unreachable():
+            network = download(f"timm:{name}", lambda: timm.create_model(name, pretrained=True))
     else:
-        network = timm.create_model(name, **({"num_classes": len(own.card[1])} if own.card else {}))
+        network = timm.create_model(name, **({"num_classes": len(local.card[1])} if local.card else {}))
     view = timm.data.resolve_model_data_config(network)
-    own_card = own and own.card and own.card[:2]
-    side_px, labels = own_card or (int(view["input_size"][-1]), _timm_labels(timm, network, name))
-    return _with(own, network, view["mean"], view["std"], side_px, labels, f"timm:{name}")
+    card = local and local.card and local.card[:2]
+    side_px, labels = card or (int(view["input_size"][-1]), _timm_labels(timm, network, name))
+    return _make_classifier(local, network, view["mean"], view["std"], side_px, labels, f"timm:{name}")
 
 
 def _timm_labels(timm: Any, network: Any, name: str) -> list[str]:
-    """Those of the model's own list, or of the ImageNet subset that timm takes it for."""
-    own = network.pretrained_cfg.get("label_names")
-    if own and len(own) == network.num_classes:
+    """The labels in the model's own list, or of the ImageNet subset that timm infers."""
+    own_labels = network.pretrained_cfg.get("label_names")
+    if own_labels and len(own_labels) == network.num_classes:
         described = network.pretrained_cfg.get("label_descriptions") or {}
-        return [str(described.get(label, label)) for label in own]
+        return [str(described.get(label, label)) for label in own_labels]
     subset = timm.data.infer_imagenet_subset(network)
     if not subset:
         do = "use one trained on ImageNet, or write a module:package.factory with its labels"
@@ -127,17 +128,19 @@ class LocalWeights:
     path: Path
     tensors: dict[str, Tensor]
     sha256: str
-    card: Card | None  # input size and labels, where they are not the published ones
+    card: Card | None  # input size and labels, if they are not the published ones
 
 
-def _own_weights(name: str) -> tuple[str, LocalWeights | None]:
-    """The model's name, and the weights of the file that is named with it."""
-    name, at, file = name.partition("@") if not name.startswith("hf-hub:") else (name, "", "")  # there @ is a revision
-    return name, read_weights(Path(file)) if at else None
+def _split_weights(name: str) -> tuple[str, LocalWeights | None]:
+    """Split NAME@FILE.safetensors into the model's name and the file's weights, None without a file."""
+    if name.startswith("hf-hub:"):  # there @ is followed by a revision
+        return name, None
+    name, separator, file = name.partition("@")
+    return name, read_weights(Path(file)) if separator else None
 
 
 def read_weights(path: Path) -> LocalWeights:
-    """Those of a file NAME.safetensors, with the card beside it where there is one."""
+    """Read NAME.safetensors and the card beside it, if there is one."""
     from safetensors import SafetensorError
     from safetensors.torch import load
 
@@ -154,12 +157,12 @@ def read_weights(path: Path) -> LocalWeights:
     return LocalWeights(path, tensors, hashlib.sha256(stored).hexdigest(), read_card(card) if is_file(card) else None)
 
 
-# heads that only training uses, and a counter of its steps
+# heads and a step counter that only training uses
 _UNUSED = re.compile(r"(aux\d?|AuxLogits)\..*|.*\.num_batches_tracked")
 
 
-def _with(
-    own: LocalWeights | None,
+def _make_classifier(
+    local: LocalWeights | None,
     network: Any,
     mean: Sequence[float],
     std: Sequence[float],
@@ -167,31 +170,33 @@ def _with(
     labels: Any,
     name: str,
 ) -> Classifier:
-    """The network as a Classifier, the file's weights in it where there is one."""
+    """The network as a Classifier, with the file's weights if there are any."""
     classifier = classifier_of(Normalized(network, mean, std), side_px, labels, name)
-    if own is None:
+    if local is None:
         return classifier
     do = "check the name, and write the labels of a network with others into NAME.json beside it"
-    load_weights(network, own, f"{name} for {len(labels)} labels", do)
-    return replace(classifier, sha256=own.sha256)
+    load_weights(network, local, f"{name} for {len(labels)} labels", do)
+    return replace(classifier, sha256=local.sha256)
 
 
-def load_weights(network: Any, own: LocalWeights, name: str, do: str) -> None:
-    """The file's weights into a network of that name; refused, with what to `do`, where they are another's."""
+def load_weights(network: Any, local: LocalWeights, name: str, advice: str) -> None:
+    """Load the file's weights into a network called `name`; refused, with the `advice`, where they do not fit it."""
     wanted = {key: tensor.shape for key, tensor in network.state_dict().items() if not _UNUSED.fullmatch(key)}
-    given = {key: tensor.shape for key, tensor in own.tensors.items() if not _UNUSED.fullmatch(key)}
-    if wrong := sorted(wanted.items() ^ given.items()):
-        raise Refused(f"weights of {name}", f"{own.path} with another {wrong[0][0]}", do)
-    network.load_state_dict({key: own.tensors[key] for key in wanted}, strict=False)
+    found = {key: tensor.shape for key, tensor in local.tensors.items() if not _UNUSED.fullmatch(key)}
+    if wrong := sorted(wanted.items() ^ found.items()):
+        key = wrong[0][0]
+        have, want = (tuple(shapes[key]) if key in shapes else "absent" for shapes in (found, wanted))
+        raise Refused(f"weights of {name}", f"{local.path}, where {key} is {have} instead of {want}", advice)
+    network.load_state_dict({key: local.tensors[key] for key in wanted}, strict=False)
 
 
 @contextmanager
-def _offline_at_once() -> Iterator[None]:
-    """Where timm's hub cannot be reached, only what was downloaded before is used; it would retry for over a minute."""
+def _offline_if_unreachable() -> Iterator[None]:
+    """Use only earlier downloads where timm's hub cannot be reached; timm itself would retry for over a minute."""
     constants: Any = importlib.import_module("huggingface_hub.constants")
     hub, before = urlsplit(constants.ENDPOINT), constants.HF_HUB_OFFLINE
     try:
-        if not getproxies():  # else the way there is the proxy's to know
+        if not getproxies():  # a proxy resolves the host itself
             socket.create_connection((hub.hostname, hub.port or 443), timeout=5).close()
     except OSError:
         constants.HF_HUB_OFFLINE = True
@@ -201,24 +206,24 @@ def _offline_at_once() -> Iterator[None]:
         constants.HF_HUB_OFFLINE = before
 
 
-def downloaded(name: str, load: Callable[[], Any]) -> Any:
-    """What `load` gives; refused in a sentence where it fails."""
+def download(name: str, load: Callable[[], Any]) -> Any:
+    """Call `load`, which downloads published weights; refused in a sentence where it fails."""
     try:
         return load()
-    except Exception as error:  # each library raises its own for no network, no weights and no space
+    except Exception as error:  # libraries raise errors of their own without network, weights or disk space
         got = f"{type(error).__name__} ({error_summary(error)})"
-        raise Refused(f"the published weights of {name}", got, "check the name and the way to the internet") from error
+        raise Refused(f"the published weights of {name}", got, "check the name and the internet connection") from error
 
 
-def library(name: str, kind: str, extra: str = "models") -> Any:
-    """The library that models named `kind`:NAME need, of that extra."""
+def import_library(name: str, kind: str, extra: str = "models") -> Any:
+    """Import the library that models named `kind`:NAME need; `extra` is the extra of this package that installs it."""
     try:
         return importlib.import_module(name)
     except Exception as error:  # a build for another torch raises RuntimeError, not ImportError
-        got = f"one that cannot be imported ({error})"
+        got = f"an import that fails ({error})"
         # a CPU torch with the registry's torchvision, built for CUDA: "torchvision::nms does not exist"
         do = "remove torchvision and install it from where torch is from: PyTorch's CPU index has CPU builds of both"
         if isinstance(error, ModuleNotFoundError) and error.name == name:
             beside = "beside a CPU torch after torchvision from PyTorch's CPU index"
-            got, do = "none", f'run pip install "patchproof[{extra}]", {beside}'
+            got, do = "no such module", f'run pip install "patchproof[{extra}]", {beside}'
         raise Refused(f"the library {name} for {kind}:NAME", got, do) from error

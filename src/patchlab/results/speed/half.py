@@ -31,7 +31,7 @@ from patchproof.optimizer.promise import (
 from patchproof.optimizer.responses import responses
 
 ROUNDS = 3
-asked = Classifier._asked
+asked = Classifier._call_network
 
 
 def rounded(self, squares, windows):
@@ -48,11 +48,11 @@ def measured(path: str) -> list[dict]:
     beside = _with_controls(PROMISE_VIEWS, VIEWS_PER_SESSION)
 
     def told(way):
-        Classifier._asked = way
+        Classifier._call_network = way
         return clocked(lambda: responses(problem, shown, conditions, beside=beside))
 
     rounds, rows = in_turn({way: partial(told, way) for way in (asked, rounded)}, ROUNDS), []
-    Classifier._asked, (wholes, halves) = asked, rounds.values()
+    Classifier._call_network, (wholes, halves) = asked, rounds.values()
     share = statistics.median(half_ms / ms for (_, ms), (_, half_ms) in zip(wholes, halves, strict=True))
     for thing in ("design", "bare"):
         whole, half = wholes[-1][0][thing], halves[-1][0][thing]
