@@ -14,7 +14,7 @@ from PIL import Image
 
 from patchproof.base.errors import Refused
 from patchproof.calibrate.boards import BoardView, corner_positions_mm, find_boards
-from patchproof.calibrate.camera import calibrate_camera, solve
+from patchproof.calibrate.camera import calibrate_camera, fit_camera
 from patchproof.calibrate.ladder import compare_rungs, simplest_rung
 from patchproof.channel.lens import load_camera
 from patchproof.sheets.board import board_sheet, load_board
@@ -56,7 +56,7 @@ def views(seed, count, bends=NONE, tilt=(10, 40), noise_px=0.04):
 
 
 def solved(shown, **more):
-    return solve(shown, {}, BOARD, "mine", **more)
+    return fit_camera(shown, {}, BOARD, "mine", **more)
 
 
 @pytest.fixture(scope="module")
@@ -131,7 +131,7 @@ def test_a_moved_photograph_and_a_wrong_corner_are_left_out():
     )
     shown[5].px[4] += 7
     found = solved(shown)
-    assert list(found.left) == ["moved.jpg"] and "moved" in found.left["moved.jpg"]
+    assert list(found.left_out) == ["moved.jpg"] and "moved" in found.left_out["moved.jpg"]
     assert sum(len(v.ids) for v in found.views) == sum(len(v.ids) for v in shown) - len(shown[3].ids) - 1
     assert found.fit.numbers[:2] == pytest.approx(1300, rel=0.003)
 
@@ -141,7 +141,7 @@ def test_size_of_the_print_does_not_matter_but_its_proportions_do():
         return [BoardView(v.file, v.ids, v.board_mm * scale, v.px, v.size_px) for v in views(2, 10)]
 
     assert solved(printed(0.5)).fit.numbers[:2] == pytest.approx(1300, rel=0.003)
-    with pytest.raises(Refused, match=r"px that it leaves over: glue .* --ruler-mm"):
+    with pytest.raises(Refused, match=r"px rms: glue .* --ruler-mm"):
         solved(printed([0.98, 1.0]))
     stretched = corner_positions_mm(BOARD, (97.0, 98.0))
     assert stretched == pytest.approx(PLACES * [0.97, 0.98])

@@ -23,14 +23,14 @@ from patchproof.base.color import linear_from_srgb, srgb_from_linear
 from patchproof.base.errors import Refused
 from patchproof.calibrate import chart as chart_module
 from patchproof.calibrate import icc
-from patchproof.calibrate.chart import calibrate_chart, combine, print_variation, printer_of, prints_of
+from patchproof.calibrate.chart import calibrate_chart, combine_light, print_variation, printer_of, prints_of
 from patchproof.calibrate.chart_photo import read_chart
 from patchproof.calibrate.color_ladder import (
-    FLAT,
-    choose,
+    MIN_WIDTH,
+    average_repeats,
+    choose_map,
+    color_difference,
     color_width,
-    difference,
-    distinct,
     fit_affine,
     fit_white_black,
     map_kinds,
@@ -85,9 +85,9 @@ def test_each_rung_finds_a_printer_of_its_own_kind_and_none_above_it_is_taken(pr
     sent = chart(72)
     for name, show in kinds.items():
         seen = np.clip(show(sent) + rng.normal(0, 0.003, sent.shape), 0, 1)
-        choice = choose(map_kinds(priors), sent, seen)
+        choice = choose_map(map_kinds(priors), sent, seen)
         assert choice.chosen.name == name, choice.rungs
-        assert difference(choice.predict(UNSEEN), show(UNSEEN)).mean() < (1.0 if name == "spline" else 0.5)
+        assert color_difference(choice.predict(UNSEEN), show(UNSEEN)).mean() < (1.0 if name == "spline" else 0.5)
 
 
 def test_affine_and_paper_with_black_by_hand():
@@ -102,7 +102,7 @@ def test_affine_and_paper_with_black_by_hand():
 
 def test_a_color_sent_twice_counts_once_with_the_mean_of_its_light():
     sent, light = np.array([[0.5] * 3, [1.0] * 3, [0.5] * 3]), np.array([[0.2] * 3, [1.0] * 3, [0.4] * 3])
-    colors, seen = distinct(sent, srgb_from_linear(light))
+    colors, seen = average_repeats(sent, srgb_from_linear(light))
     np.testing.assert_allclose(colors[:, 0], [0.5, 1])
     np.testing.assert_allclose(linear_from_srgb(seen)[:, 0], [0.3, 1])
 
@@ -116,8 +116,8 @@ def test_corners_are_never_held_out_and_every_other_color_is_once(priors):
 
     sent = chart(48)
     free = map_kinds({})
-    choice = choose([replace(free[0], fit=spy)], sent, sent)
-    corners = np.isin(distinct(sent, sent)[0], (0.0, 1.0)).all(1)
+    choice = choose_map([replace(free[0], fit=spy)], sent, sent)
+    corners = np.isin(average_repeats(sent, sent)[0], (0.0, 1.0)).all(1)
     assert choice.held_out == (~corners).sum() == 34
     for training in seen_in_training:
         assert np.isin(training, (0.0, 1.0)).all(1).sum() == 8
@@ -127,16 +127,16 @@ def test_corners_are_never_held_out_and_every_other_color_is_once(priors):
 @pytest.mark.parametrize("count", [6, 12])
 def test_few_swatches_leave_rungs_with_nothing_to_fit(priors, count):
     sent = chart(count)
-    choice = choose(map_kinds(priors), sent, shown(draw_inkjet(1), sent))
+    choice = choose_map(map_kinds(priors), sent, shown(draw_inkjet(1), sent))
     assert choice.chosen.name in {"identity", "white_black", "prior"}
     assert "spline" in choice.left_out and "affine" in choice.left_out
 
 
 def test_splines_start_at_24_colors(priors):
     sent = np.vstack([chart(14), np.random.default_rng(4).random((10, 3))])
-    names = {rung.name for rung in choose(map_kinds(priors), sent, sent).rungs}
+    names = {rung.name for rung in choose_map(map_kinds(priors), sent, sent).rungs}
     assert "spline" in names
-    names = {rung.name for rung in choose(map_kinds(priors), sent[:-1], sent[:-1]).rungs}
+    names = {rung.name for rung in choose_map(map_kinds(priors), sent[:-1], sent[:-1]).rungs}
     assert "spline" not in names and "prior+affine" in names
 
 
@@ -153,10 +153,10 @@ def test_colors_that_are_nearly_gray_hold_no_free_map(priors):
     off = {}
     for share in (1.0, 0.2, 0.1, 0.0):
         sent = grayed(share)
-        choice = choose(map_kinds(priors), sent, np.clip(shown(printer, sent) + noise, 0, 1))
+        choice = choose_map(map_kinds(priors), sent, np.clip(shown(printer, sent) + noise, 0, 1))
         free = {rung.name for rung in choice.rungs} & {"affine", "spline", "prior+affine+spline"}
-        assert bool(free) == (choice.width >= FLAT) == (share >= 0.2)
-        off[share] = difference(choice.predict(UNSEEN), shown(printer, UNSEEN)).mean()
+        assert bool(free) == (choice.width >= MIN_WIDTH) == (share >= 0.2)
+        off[share] = color_difference(choice.predict(UNSEEN), shown(printer, UNSEEN)).mean()
     assert off[1.0] < 1.5 < off[0.2] < 6 and max(off.values()) < 12
 
 
@@ -194,9 +194,9 @@ def test_the_simplest_within_one_standard_error_wins_by_hand():
     off[:, 0] = 0.1 * sent[:, 0] * (1 - sent[:, 0])
     free = map_kinds({})
     near = replace(free[2], name="true", fit=lambda a, b: lambda c: c + np.array([0.1, 0, 0]) * (c * (1 - c)))
-    assert choose([free[0], near], sent, sent + off).chosen.name == "true"
+    assert choose_map([free[0], near], sent, sent + off).chosen.name == "true"
     noise = np.random.default_rng(0).normal(0, 0.05, sent.shape)
-    faint = choose([free[0], near], sent, np.clip(sent + 0.5 * off + noise, 0, 1))
+    faint = choose_map([free[0], near], sent, np.clip(sent + 0.5 * off + noise, 0, 1))
     assert faint.chosen.name == "identity" and faint.rungs[0].worse_by <= faint.rungs[0].standard_error
 
 
@@ -222,7 +222,7 @@ def test_swatches_are_read_relative_to_paper_under_uneven_light(shots, readings)
     sent = np.array([swatch.srgb for swatch in manifest.chart])
     for shot, read in zip(both, readings, strict=True):
         assert np.isfinite(read.light).all() and read.unevenness > 1.05
-        error = difference(srgb_from_linear(read.light), shown(printer, sent))
+        error = color_difference(srgb_from_linear(read.light), shown(printer, sent))
         assert error.mean() < 1.2 and error.max() < 4
         np.testing.assert_allclose(read.paper, shot.paper, rtol=0.06)
 
@@ -237,7 +237,7 @@ def test_a_chart_page_is_rehearsed_without_a_printer(tmp_path):
     uncoated = load_printer("uncoated").apply(torch.cat([sent, torch.ones_like(sent[:, :, :1])], 2))[0, :, :, 0].T
     light = linear_from_srgb(uncoated.numpy())
     read_well = np.isfinite(read.light).all(1)
-    error = difference(srgb_from_linear(read.light), srgb_from_linear(light[:-1] / light[-1]))[read_well]
+    error = color_difference(srgb_from_linear(read.light), srgb_from_linear(light[:-1] / light[-1]))[read_well]
     assert read_well.sum() >= 40 and error.mean() < 1.5
     with pytest.raises(typer.BadParameter, match="of a run's sheet"):
         cli.app([*rehearsed, "--sessions", "2", "--out", str(tmp_path / "other")], standalone_mode=False)
@@ -251,7 +251,7 @@ def test_without_the_flat_field_the_same_photograph_would_be_far_off(shots, read
     falling = np.linspace(1, 0.6, shot.photo.srgb.shape[1])[:, None]
     darker = (srgb_from_linear(linear_from_srgb(shot.photo.srgb / 255) * falling) * 255 + 0.5).astype(np.uint8)
     before, after = readings[0], read_chart(Photo(darker, None), manifest)
-    error = difference(srgb_from_linear(after.light), srgb_from_linear(before.light))
+    error = color_difference(srgb_from_linear(after.light), srgb_from_linear(before.light))
     assert error.mean() < 0.5 and after.paper[1] < 0.9 * before.paper[1]
 
 
@@ -286,7 +286,7 @@ def test_a_printer_is_calibrated_stored_and_loaded(shots, tmp_path, capsys):
     assert [row["rung"] for row in mine.provenance["ladder"]] == [rung.name for rung in map_kinds({"x": None})]
     assert len(mine.provenance["photographs"]) == 2 and "no camera file" in mine.provenance["model_of"]
     np.testing.assert_allclose(mine.lut[-1, -1, -1], 1, atol=1e-6)
-    assert difference(printer_output(mine, UNSEEN), shown(printer, UNSEEN)).mean() < 2
+    assert color_difference(printer_output(mine, UNSEEN), shown(printer, UNSEEN)).mean() < 2
     with pytest.raises(Refused, match="which exists"):
         cli.app(command, standalone_mode=False)
 
@@ -317,8 +317,8 @@ def test_readings_are_combined_without_the_one_that_is_off():
     good = np.full((4, 3), 0.4)
     glare, gap = good + np.array([[0.5], [0], [0], [0]]), good.copy()
     gap[3] = np.nan
-    np.testing.assert_allclose(combine([good, glare, good, gap]), good)
-    assert np.isnan(combine([gap, gap])[3]).all()
+    np.testing.assert_allclose(combine_light([good, glare, good, gap]), good)
+    assert np.isnan(combine_light([gap, gap])[3]).all()
 
 
 def test_print_to_print_variation_is_found():
@@ -353,8 +353,8 @@ def printer_errors(seed: int, swatches: int, camera: Camera) -> tuple[float, flo
         light = read_chart(shot.photo, manifest, known).light
         usable = np.isfinite(light).all(1)
         sent = np.array([s.srgb for s in manifest.chart])[usable]
-        choice = choose(map_kinds(priors), sent, srgb_from_linear(light[usable]))
-        errors.append(float(difference(bench_printer.relative(choice.predict, colors), truth).mean()))
+        choice = choose_map(map_kinds(priors), sent, srgb_from_linear(light[usable]))
+        errors.append(float(color_difference(bench_printer.relative(choice.predict, colors), truth).mean()))
     return errors[0], errors[1]
 
 
@@ -430,7 +430,7 @@ def test_a_printer_is_never_its_own_prior():
         driver, shows, priors = bench_printer.drawn_printer(seed)
         assert driver == "the other profile" and len(priors) == 1
         prior = next(iter(priors.values()))
-        assert difference(prior(UNSEEN), shown(shows, UNSEEN)).mean() > 3
+        assert color_difference(prior(UNSEEN), shown(shows, UNSEEN)).mean() > 3
 
 
 # ------------------------------------------------------------------------------------------------ simulated printers
@@ -467,7 +467,9 @@ def test_an_rgb_profile_is_baked_with_both_intents(tmp_path):
     for perceptual, word in ((False, "relative"), (True, "perceptual")):
         printer = icc.bake(path, "rgb", "none", "test", perceptual)
         assert printer.provenance["profile_colors"] == "RGB" and printer.provenance["intents"].startswith(word)
-        assert difference(printer_output(printer, UNSEEN), UNSEEN).mean() < 0.3  # what it prints is sRGB, in 8 bits
+        assert (
+            color_difference(printer_output(printer, UNSEEN), UNSEEN).mean() < 0.3
+        )  # sRGB, in 8 bits
 
 
 def test_damaged_profiles_never_end_in_anything_but_a_sentence(tmp_path):

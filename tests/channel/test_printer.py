@@ -174,7 +174,7 @@ def refused_profile(path, *words):
 def test_profiles_that_are_none(tmp_path):
     refused_profile(tmp_path / "none.icc", "no file at")
     (tmp_path / "a.icc").write_text("hello " * 100)
-    refused_profile(tmp_path / "a.icc", "which is none")
+    refused_profile(tmp_path / "a.icc", "which does not begin with a profile's header")
     with open(tmp_path / "big.icc", "wb") as file:
         file.truncate(100 * 2**20)  # sparse: takes no room
     refused_profile(tmp_path / "big.icc", "at most 32 MB, got 100 MB")

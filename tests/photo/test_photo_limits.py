@@ -98,7 +98,7 @@ def test_a_photograph_of_a_board_that_takes_too_long_is_left_out(tmp_path, monke
         Image.new("RGB", (40, 40)).save(tmp_path / f"{name}.png")
     view = BoardView("b.png", np.zeros(0, int), np.zeros((0, 2)), np.zeros((0, 2)), (40, 40))
     monkeypatch.setattr(bounds, "TIME_LIMIT_S", 0.2)
-    monkeypatch.setattr(boards, "_view", lambda path, *_: (view, None) if path.stem == "b" else toy.spin(5.0))
+    monkeypatch.setattr(boards, "_read_view", lambda path, *_: (view, None) if path.stem == "b" else toy.spin(5.0))
     views, left, _ = find_boards(tmp_path, load_board("charuco_a4"))
     assert views == [view] and "0.2 s of processor time" in left["a.png"]
 

@@ -23,7 +23,7 @@ from patchproof.base.color import linear_from_srgb, srgb_from_linear
 from patchproof.base.intervals import rate, student_mean
 from patchproof.calibrate.chart import known_printers
 from patchproof.calibrate.chart_photo import read_chart
-from patchproof.calibrate.color_ladder import ColorMap, choose, difference, distinct, map_kinds
+from patchproof.calibrate.color_ladder import ColorMap, average_repeats, choose_map, color_difference, map_kinds
 from patchproof.report.tables import Table
 from patchproof.reprints.page_photos import PrintFunction, Shot, photograph_page
 
@@ -120,11 +120,11 @@ def try_printer(seed: int, swatches: int) -> Trial:
     usable = np.isfinite(light).all(1)
     sent, shown = np.array([s.srgb for s in manifest.chart])[usable], srgb_from_linear(light[usable])
     kinds = map_kinds(priors)
-    choice = choose(kinds, sent, shown)
+    choice = choose_map(kinds, sent, shown)
     truth, errors = shown_by(shows, shot, held_out_colors()), {}
     for kind in (kind for kind in kinds if kind.name not in choice.left_out):
-        predicted = relative(kind.fit(*distinct(sent, shown)), held_out_colors())
-        errors[kind.name] = float(difference(predicted, truth).mean())
+        predicted = relative(kind.fit(*average_repeats(sent, shown)), held_out_colors())
+        errors[kind.name] = float(color_difference(predicted, truth).mean())
     return Trial(driver, swatches, errors, choice.seconds, choice.chosen.name)
 
 

@@ -1,10 +1,10 @@
-"""Photographs of a ChArUco board become corners: where on the board, where in the picture.
+"""Find the corners of a ChArUco board in photographs: their positions on the board and in the picture.
 
-In: a folder of photographs and a printed board. Out: one `BoardView` for each photograph that shows enough of the board,
-and a reason for each of the others. All views come from one camera in one state: the picture size, the way it was
-held, and the focal length that most photographs share; a phone that switched lenses between two photographs would
-otherwise be calibrated as the mean of both. Corners are saddle points, symmetric under half a turn, so neither blur
-nor the tone curve shifts them. Pixel centers are at .5.
+In: a folder of photographs and a printed board. Out: one `BoardView` for each photograph that shows enough of the
+board, and a reason for each of the others. All views come from one camera in one state: the picture size, orientation
+and focal length that most photographs share; otherwise a phone that switched lenses between two photographs would be
+calibrated as the mean of both. Corners are saddle points, symmetric under half a turn, so neither blur nor the tone
+curve shifts them. Pixel centers are at .5.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from patchproof.photo.rejection import PhotoRejected
 from patchproof.sheets.board import Board
 from patchproof.sheets.markers import DICTIONARY, aruco_dictionary
 
-MIN_CORNERS = 12  # of one photograph: a pose takes six numbers, twelve corners give twenty-four
+MIN_CORNERS = 12  # in one photograph: a pose has six unknowns, twelve corners give twenty-four numbers
 _ORIENTATION, _MAKE, _MODEL = 0x0112, 0x010F, 0x0110
 
 
 @dataclass(frozen=True)
 class BoardView:
-    """One photograph's corners: `ids` N of the board's, `board_mm` N×2 as printed, `px` N×2 of `size_px` (w, h)."""
+    """One photograph's corners: `ids` N on the board, `board_mm` N×2 as printed, `px` N×2 of `size_px` (w, h)."""
 
     file: str
     ids: np.ndarray
@@ -41,8 +41,8 @@ class BoardView:
     px: np.ndarray
     size_px: tuple[int, int]
 
-    def only(self, keep: np.ndarray) -> BoardView:
-        """The view with these of its corners."""
+    def select(self, keep: np.ndarray) -> BoardView:
+        """A copy with the corners in the mask `keep` only."""
         return replace(self, ids=self.ids[keep], board_mm=self.board_mm[keep], px=self.px[keep])
 
 
@@ -52,50 +52,50 @@ def find_boards(
     ruler_mm: tuple[float, float] | None = None,
     advance: Advance = no_advance,
 ) -> tuple[list[BoardView], dict[str, str], str]:
-    """(views, reasons by the names of photographs left out, what the files call the camera) of a folder's pictures.
+    """Read a folder's photographs: (views, reasons by the names of photographs left out, the camera's name).
 
     `ruler_mm` are the printed rulers (x, y) as measured.
     """
-    paths, views, left, states = list_photos(photos), [], {}, []
-    places = corner_positions_mm(board, ruler_mm)
+    paths, views, left_out, states = list_photos(photos), [], {}, []
+    positions_mm = corner_positions_mm(board, ruler_mm)
     for number, path in enumerate(paths, 1):
         try:
-            view, focal_px = run_limited(_view, path, board, places)
+            view, focal_px = run_limited(_read_view, path, board, positions_mm)
             views.append(view)
-            states.append((view.size_px, _tags(path), focal_px and round(focal_px)))
-        except PhotoRejected as cannot:
-            left[path.name] = cannot.advice
+            states.append((view.size_px, _camera_tags(path), focal_px and round(focal_px)))
+        except PhotoRejected as rejection:
+            left_out[path.name] = rejection.advice
         advance(number, len(paths))
     if not views:
-        got = f"{len(paths)} without it"
+        got = f"{len(paths)} photographs that do not show it"
         raise Refused(f"photographs of the board {board.sheet_id}", got, "name the board with --board")
     common = Counter(states).most_common(1)[0][0]
     pairs = list(zip(views, states, strict=True))
-    left |= {view.file: _other_state(state, common) for view, state in pairs if state != common}
-    return [view for view, state in pairs if state == common], left, common[1][1]
+    left_out |= {view.file: _other_state(state, common) for view, state in pairs if state != common}
+    return [view for view, state in pairs if state == common], left_out, common[1][1]
 
 
 def corner_positions_mm(board: Board, ruler_mm: tuple[float, float] | None = None) -> np.ndarray:
-    """Inner corners M×2 by id, from the board's top-left corner; scaled as the rulers came out of the printer."""
+    """Inner corners M×2 by id, from the board's top-left corner, scaled to the rulers as measured."""
     column, row = np.meshgrid(np.arange(1, board.grid.columns), np.arange(1, board.grid.rows))
     nominal = np.column_stack([column.ravel(), row.ravel()]) * board.grid.square_mm
     return nominal if ruler_mm is None else nominal * (np.array(ruler_mm) / board.ruler_mm)
 
 
-def _view(path: Path, board: Board, places_mm: np.ndarray) -> tuple[BoardView, float | None]:
+def _read_view(path: Path, board: Board, positions_mm: np.ndarray) -> tuple[BoardView, float | None]:
     photo = read_photo(path)
     ids, px, markers = find_corners(photo.srgb, board)
-    if len(ids) < MIN_CORNERS or np.linalg.matrix_rank(places_mm[ids] - places_mm[ids].mean(0)) < 2:
+    if len(ids) < MIN_CORNERS or np.linalg.matrix_rank(positions_mm[ids] - positions_mm[ids].mean(0)) < 2:
         advice = f"{markers} markers and {len(ids)} corners of the board were read, {MIN_CORNERS} corners are needed"
         raise PhotoRejected("too_few_markers", len(ids), MIN_CORNERS, f"{advice}: show more of it, sharp")
     height, width = photo.srgb.shape[:2]
-    return BoardView(path.name, ids, places_mm[ids], px, (width, height)), photo.focal_px
+    return BoardView(path.name, ids, positions_mm[ids], px, (width, height)), photo.focal_px
 
 
 def find_corners(srgb: np.ndarray, board: Board) -> tuple[np.ndarray, np.ndarray, int]:
-    """(ids N, pixels N×2, number of markers) of the board's inner corners in a picture.
+    """Find the board's inner corners in a picture: (ids N, pixels N×2, number of markers).
 
-    Markers are looked for in linear light, where blurred paper does not grow over ink; corners need no such care.
+    Markers are searched for in linear light, where blurred paper does not grow over ink; corners need no such care.
     """
     dictionary = aruco_dictionary(DICTIONARY)
     light = photo_codes_from_srgb(luminance(srgb))
@@ -113,7 +113,7 @@ def find_corners(srgb: np.ndarray, board: Board) -> tuple[np.ndarray, np.ndarray
     return np.asarray(ids).reshape(-1), np.asarray(corners, float).reshape(-1, 2) + 0.5, len(quads)
 
 
-def _tags(path: Path) -> tuple[int, str]:
+def _camera_tags(path: Path) -> tuple[int, str]:
     """(EXIF orientation, maker and model) as the file has them."""
     from PIL import Image
 
@@ -122,18 +122,18 @@ def _tags(path: Path) -> tuple[int, str]:
             exif = image.getexif()
             words = [str(exif.get(tag, "")).strip("\0 ") for tag in (_MAKE, _MODEL)]
             return int(exif.get(_ORIENTATION, 1)), " ".join(word for word in words if word)
-    except Exception:  # the picture has been read; its labels are a bonus
+    except Exception:  # the picture has been read; its tags are optional
         return 1, ""
 
 
 def _other_state(state, common) -> str:
-    """In what a photograph's camera differs from most."""
-    (size, (turned, camera), focal), (most_size, (_, most_camera), _) = state, common
+    """Describe the first difference of a photograph's camera state from the most common one."""
+    (size, (orientation, camera), focal), (most_size, (_, most_camera), _) = state, common
     if size != most_size:
-        got, most = f"{size[0]} × {size[1]} px", f"{most_size[0]} × {most_size[1]}"
-        return f"{got} where most have {most}: hold the camera one way and keep its picture size"
+        got, most_size_px = f"{size[0]} × {size[1]} px", f"{most_size[0]} × {most_size[1]}"
+        return f"{got} where most have {most_size_px}: hold the camera one way and keep its picture size"
     if camera != most_camera:
         return f"taken with another camera ({camera or 'unnamed'}): calibrate one camera at a time"
-    if turned != common[1][0]:
+    if orientation != common[1][0]:
         return "the camera was held another way round: the picture's middle is elsewhere then"
     return f"another focal length ({focal or 'unknown'} px): keep the zoom and the lens"

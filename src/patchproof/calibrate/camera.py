@@ -1,12 +1,12 @@
-"""A camera from photographs of a board: which are used, the lens they pay for, and a file that scenes can read.
+"""Calibrate a camera from photographs of a board: choose photographs and lens model, write a file that scenes can read.
 
 In: photographs and a board. Out: `CameraCalibration`, and three files: NAME.json in the form of calibration/cameras,
-NAME.fit.json with all figures (the ladder, deviations, every photograph), NAME.residuals.png. What the photographs
-cannot tell is refused: too few of them, boards that all face the same way (a plane's picture then hardly depends on
-the focal length), a focal length known to no better than 1 %. The print's size does not matter, its proportions do:
-rulers that differ are typed in. In the picture arrows show a pattern where a lens term is missing, and point every way
-where none is; a photograph that stands out was moved or shows a bent board.
-Left out on purpose: fisheye lenses, and how flat the board is: that shows as a residual, no more.
+NAME.fit.json with all figures (the ladder, deviations, every photograph), NAME.residuals.png. Photographs that cannot
+determine a camera are refused: too few of them, boards that all face the same way (a plane's picture then hardly
+depends on the focal length), a focal length known to no better than 1 %. The print's size does not matter, its
+proportions do: rulers that differ are typed in. In the picture, arrows show a pattern where a lens term is missing, and
+point every way where none is; a photograph that stands out was moved or shows a bent board.
+Left out on purpose: fisheye lenses, and how flat the board is, which shows in the residuals only.
 """
 
 from __future__ import annotations
@@ -31,29 +31,29 @@ from patchproof.calibrate.lens_ladder import PARAMETERS, LensFit, choose_lens_mo
 from patchproof.channel.lens import Camera, check_camera
 from patchproof.sheets.board import Board, load_board
 
-FEWEST_PHOTOS = 6
-LEAST_TURN_DEG = 10.0  # between the two boards that differ most; 20 to 45° of tilt are asked for
-MOST_FOCAL_SHARE = 0.01  # one standard deviation of the focal length
-WELL_COVERED = 0.75  # of the half diagonal; a lens bends most beyond
-_TRIAL_RUNG = "k1 k2"  # bends enough for any lens of the ladder to show which photographs are odd
-_MISFIT = 1.0  # px rms, of a picture of 2 megapixels or less; sharp photographs of flat boards leave 0.05 to 0.3
-_ODD_PHOTO, _ODD_CORNER, _ODD_PX = 3.0, 5.0, 0.5  # times the median error, and never below this
+MIN_PHOTOS = 6
+MIN_TURN_DEG = 10.0  # between the two boards that differ most; users are asked for tilts of 20 to 45°
+MAX_FOCAL_SHARE = 0.01  # one standard deviation of the focal length
+GOOD_COVERAGE = 0.75  # of the half diagonal; distortion is largest beyond it
+_TRIAL_RUNG = "k1 k2"  # models any lens of the ladder well enough to find odd photographs
+_MAX_RMS_PX = 1.0  # rms for a picture of 2 megapixels or less; sharp photographs of flat boards have 0.05 to 0.3
+_ODD_PHOTO_RATIO, _ODD_CORNER_RATIO, _ODD_PX = 3.0, 5.0, 0.5  # ratios to the median error, above _ODD_PX
 
 
 @dataclass(frozen=True)
 class CameraCalibration:
-    """A camera, the ladder with the fit it comes from, the views used, why photographs were left out, and the board."""
+    """A camera, the ladder with its fit, the views used, reasons for photographs left out, and the board."""
 
     camera: Camera
     rungs: tuple[Rung, ...]
     fit: LensFit
     views: tuple[BoardView, ...]
-    left: Mapping[str, str]
+    left_out: Mapping[str, str]
     board: Board
 
     @property
     def coverage(self) -> float:
-        """How far the corners reach towards the picture's corners, as a share of its half diagonal."""
+        """The distance of the outermost corner from the picture's middle, as a share of the half diagonal."""
         middle = np.array(self.views[0].size_px) / 2
         return max(float(np.linalg.norm(v.px - middle, axis=1).max()) for v in self.views) / float(np.hypot(*middle))
 
@@ -74,9 +74,9 @@ def calibrate_camera(
     figures, picture = out.with_suffix(".fit.json"), out.with_suffix(".residuals.png")
     for path in (out, figures, picture):
         check_file(path, overwrite)
-    printed = load_board(board)
-    views, left, camera = find_boards(photos, printed, ruler_mm, partial(progress, "find corners"))
-    result = solve(views, left, printed, out.stem, camera, partial(progress, "lens models"))
+    template = load_board(board)
+    views, left_out, camera = find_boards(photos, template, ruler_mm, partial(progress, "find corners"))
+    result = fit_camera(views, left_out, template, out.stem, camera, partial(progress, "lens models"))
     residuals = _residual_picture(result.views, result.rungs, result.fit)
     write_files_atomically(
         {figures: _text(_fit_figures(result)), picture: residuals, out: _text(result.camera.model_dump())}
@@ -84,26 +84,26 @@ def calibrate_camera(
     return result
 
 
-def solve(
+def fit_camera(
     views: Sequence[BoardView],
-    left: Mapping[str, str],
+    left_out: Mapping[str, str],
     board: Board,
     name: str,
     camera: str = "",
     advance: Advance = no_advance,
 ) -> CameraCalibration:
-    """The camera that took these views; refused where they cannot tell. `camera` is what it calls itself."""
-    _enough(views, left)
+    """Fit the camera that took these views; refused where they cannot determine it. `camera` is its name in files."""
+    _refuse_too_few(views, left_out)
     views, odd = _without_odd(views)
-    left = {**left, **odd}
-    _enough(views, left)
+    left_out = {**left_out, **odd}
+    _refuse_too_few(views, left_out)
     size_px = views[0].size_px
     rungs, fit = choose_lens_model(views, lambda fit: _is_usable(fit, size_px), advance)
-    _refuse_blind(fit)
+    _refuse_undetermined(fit)
     about = f"{len(views)} photographs of board {board.sheet_id}" + (f", camera {camera}" if camera else "")
-    made = _camera(fit, name, size_px, about, _uncertainty(fit))
-    check_camera(made, "this calibration")
-    return CameraCalibration(made, rungs, fit, tuple(views), left, board)
+    fitted = _camera(fit, name, size_px, about, _uncertainty(fit))
+    check_camera(fitted, "this calibration")
+    return CameraCalibration(fitted, rungs, fit, tuple(views), left_out, board)
 
 
 def _fit_figures(result: CameraCalibration) -> dict:
@@ -120,7 +120,7 @@ def _fit_figures(result: CameraCalibration) -> dict:
         }
         for view, rms, tilt in zip(result.views, fit.photo_rms_px, fit.tilts_deg, strict=True)
     ]
-    photos += [{"file": file, "status": "left out", "reason": reason} for file, reason in result.left.items()]
+    photos += [{"file": file, "status": "left out", "reason": reason} for file, reason in result.left_out.items()]
     return {
         "board": result.board.sheet_id,
         "rung": fit.rung,
@@ -144,7 +144,7 @@ def _fit_figures(result: CameraCalibration) -> dict:
 
 
 def calibration_lines(result: CameraCalibration) -> list[str]:
-    """What a user wants to know of it, in a few lines."""
+    """The result in a few lines for the terminal."""
     fit, camera = result.fit, result.camera
     steps = ", ".join(f"{rung.name} {rung.error:.3f}" for rung in result.rungs if np.isfinite(rung.error))
     lines = [
@@ -155,8 +155,8 @@ def calibration_lines(result: CameraCalibration) -> list[str]:
         f"{len(result.views)} photographs leave {fit.rms_px:.3f} px rms; tilts {fit.tilts_deg.min():.0f} to "
         f"{fit.tilts_deg.max():.0f}°",
     ]
-    lines += [f"left out: {file}: {reason}" for file, reason in result.left.items()]
-    if result.coverage < WELL_COVERED:
+    lines += [f"left out: {file}: {reason}" for file, reason in result.left_out.items()]
+    if result.coverage < GOOD_COVERAGE:
         lines.append(
             f"warning: the board's corners reach {result.coverage:.0%} of the way to the picture's corners; "
             "beyond, distortion is a guess: photograph the board there, too"
@@ -164,59 +164,59 @@ def calibration_lines(result: CameraCalibration) -> list[str]:
     return lines
 
 
-def _enough(views: Sequence[BoardView], left: Mapping[str, str]) -> None:
-    if len(views) < FEWEST_PHOTOS:
-        why = f" ({': '.join(next(iter(left.items())))})" if left else ""
+def _refuse_too_few(views: Sequence[BoardView], left_out: Mapping[str, str]) -> None:
+    if len(views) < MIN_PHOTOS:
+        why = f" ({': '.join(next(iter(left_out.items())))})" if left_out else ""
         raise Refused(
-            f"at least {FEWEST_PHOTOS} photographs that show {MIN_CORNERS} corners of the board",
-            f"{len(views)} of {len(views) + len(left)}{why}",
+            f"at least {MIN_PHOTOS} photographs that show {MIN_CORNERS} corners of the board",
+            f"{len(views)} of {len(views) + len(left_out)}{why}",
             "take 15 or more, sharp, from different sides",
         )
 
 
 def _without_odd(views: Sequence[BoardView]) -> tuple[list[BoardView], dict[str, str]]:
-    """Views without the photographs, then without the corners, that lie far off: moved, of a bent board, occluded."""
+    """Views without photographs, then without corners, that fit badly: moved, of a bent board, occluded."""
     kept, odd = list(views), {}
-    while len(kept) >= FEWEST_PHOTOS and (fit := fit_rung(kept, _TRIAL_RUNG)) is not None:
+    while len(kept) >= MIN_PHOTOS and (fit := fit_rung(kept, _TRIAL_RUNG)) is not None:
         errors = [np.linalg.norm(residual, axis=1) for residual in fit.residuals_px]
         typical = np.array([np.median(error) for error in errors])
-        usual, worst = float(np.median(typical)), int(typical.argmax())
-        if typical[worst] > max(_ODD_PHOTO * usual, _ODD_PX):
-            # the worst alone: an odd photograph drags the others along until it is gone, and so does a corner
-            miss = f"its corners miss by {typical[worst]:.2f} px where most miss by {usual:.2f}"
+        typical_px, worst = float(np.median(typical)), int(typical.argmax())
+        if typical[worst] > max(_ODD_PHOTO_RATIO * typical_px, _ODD_PX):
+            # only the worst is dropped, since an odd photograph spoils the others' fit, as does an odd corner
+            miss = f"its corners miss by {typical[worst]:.2f} px where most miss by {typical_px:.2f}"
             odd[kept.pop(worst).file] = f"{miss}: moved, or a bent board"
             continue
         farthest = max(float(error.max()) for error in errors)
-        if farthest <= max(_ODD_CORNER * usual, _ODD_PX):
+        if farthest <= max(_ODD_CORNER_RATIO * typical_px, _ODD_PX):
             break
-        kept = [view.only(error < farthest / 2) for view, error in zip(kept, errors, strict=True)]
-        few = "too few of its corners agree with the others: show more of the board, sharp"
-        odd |= {view.file: few for view in kept if len(view.ids) < MIN_CORNERS}
+        kept = [view.select(error < farthest / 2) for view, error in zip(kept, errors, strict=True)]
+        reason = "too few of its corners agree with the others: show more of the board, sharp"
+        odd |= {view.file: reason for view in kept if len(view.ids) < MIN_CORNERS}
         kept = [view for view in kept if len(view.ids) >= MIN_CORNERS]
     return kept, odd
 
 
-def _refuse_blind(fit: LensFit) -> None:
-    """Refuse views from which the focal length cannot be told."""
+def _refuse_undetermined(fit: LensFit) -> None:
+    """Refuse views that do not determine the focal length."""
     turns = np.degrees(np.arccos(np.clip(fit.normals @ fit.normals.T, -1, 1))).max()
     share = max(fit.sd[0] / fit.numbers[0], fit.sd[1] / fit.numbers[1])
-    if fit.rms_px > _MISFIT * max(1.0, float(np.hypot(*fit.numbers[2:4])) / 1000):
+    if fit.rms_px > _MAX_RMS_PX * max(1.0, float(np.hypot(*fit.numbers[2:4])) / 1000):
         raise Refused(
             "photographs of a flat board that a lens model explains",
-            f"{fit.rms_px:.1f} px that it leaves over",
+            f"residuals of {fit.rms_px:.1f} px rms",
             "glue the board to something flat, measure both of its rulers and type them in with --ruler-mm",
         )
-    if turns < LEAST_TURN_DEG or share > MOST_FOCAL_SHARE:
+    if turns < MIN_TURN_DEG or share > MAX_FOCAL_SHARE:
         raise Refused(
-            f"boards turned against each other by {LEAST_TURN_DEG:g}° and more, and a focal length known to "
-            f"{MOST_FOCAL_SHARE:.0%}",
-            f"{turns:.0f}° and {share:.1%}",
+            f"boards turned against each other by {MIN_TURN_DEG:g}° and more, and a focal length known to "
+            f"{MAX_FOCAL_SHARE:.0%}",
+            f"{turns:.0f}° and a focal length known to {share:.1%}",
             "photograph the board from 20 to 45° aside, from all sides",
         )
 
 
 def _is_usable(fit: LensFit, size_px: tuple[int, int]) -> bool:
-    """Whether the lens can be undone all over the picture."""
+    """True if the lens can be undone all over the picture."""
     try:
         check_camera(_camera(fit, "trial", size_px, "", ""), "a trial")
     except Refused:

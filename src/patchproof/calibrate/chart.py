@@ -1,13 +1,13 @@
-"""A printer from photographs of its printed chart.
+"""Calibrate a printer from photographs of its printed chart.
 
 In: photographs of one or several prints of a page with a chart, its manifest, the camera if it is known. Out: a
-`Printer` whose provenance holds every rung of the ladder, every photograph and what they disagree by. Light relative to
-paper is averaged over the photographs of a print (their median from three on), then over prints; what prints differ by
-is told in the terms of `channel.printer.vary`.
+`Printer` whose provenance holds every rung of the ladder, every photograph and how much they disagree. Light relative
+to paper is averaged over the photographs of a print (their median from three on), then over prints; differences between
+prints are given as the parameters of `channel.printer.vary_print`.
 
 Without the camera's tone curve the table is an *appearance* model: what this camera showed of this printer, decoded as
-sRGB. Both curves are one product in a photograph, and nothing on the page tells them apart. With it, light is the
-page's own, and the table is the printer's. Either is what the paper shows under the light it was photographed in.
+sRGB. Both curves are one product in a photograph, and nothing on the page separates them. With it, light is the page's
+own, and the table is the printer's. Either describes the paper under the light it was photographed in.
 """
 
 from __future__ import annotations
@@ -27,7 +27,14 @@ from patchproof.base.errors import Refused
 from patchproof.base.input import is_file, is_folder
 from patchproof.base.progress import Advance, no_advance
 from patchproof.calibrate.chart_photo import ChartPhoto, chart_rows, read_chart
-from patchproof.calibrate.color_ladder import WELL_SPREAD_WIDTH, ColorMap, MapChoice, choose, difference, map_kinds
+from patchproof.calibrate.color_ladder import (
+    WELL_SPREAD_WIDTH,
+    ColorMap,
+    MapChoice,
+    choose_map,
+    color_difference,
+    map_kinds,
+)
 from patchproof.calibrate.printer_files import printer_from_table, printer_output
 from patchproof.channel.lens import Camera
 from patchproof.channel.printer import Printer, load_printer, node_colors, vary_print
@@ -37,22 +44,22 @@ from patchproof.photo.rejection import PhotoRejected
 from patchproof.sheets.manifest import Manifest
 
 PRIORS = ("coated", "uncoated")
-LEAST_SWATCHES = 4  # paper, black and two more
-STRANGE_PHOTO = 5.0  # ΔE00 from its print's other photographs: more than any light or camera explains
+MIN_SWATCHES = 4  # paper, black and two others
+MAX_PHOTO_DELTA_E00 = 5.0  # from its print's other photographs: more than light or camera can explain
 
 
 @dataclass(frozen=True)
 class PhotoReading:
-    """One photograph that could be read: its file, which print it shows (from 0), and the chart in it."""
+    """One photograph that could be read: its file, the number of its print (from 0), and the chart in it."""
 
     path: Path
-    of_print: int
+    print_number: int
     chart: ChartPhoto
 
 
 @dataclass(frozen=True)
 class PrinterCalibration:
-    """The printer, how its model was chosen, and what one should know of the photographs."""
+    """The printer, the choice of its model, and warnings about the photographs."""
 
     printer: Printer
     choice: MapChoice
@@ -66,30 +73,30 @@ def calibrate_chart(
     camera: Camera | None = None,
     advance: Advance = no_advance,
 ) -> PrinterCalibration:
-    """The printer that these photographs show; each inner list holds those of one print."""
+    """Calibrate the printer from photographs; each inner list holds those of one print."""
     readings, warnings = _read_all(prints, manifest, camera, advance)
     by_print = [
-        combine([reading.chart.light for reading in readings if reading.of_print == i])
-        for i in sorted({reading.of_print for reading in readings})
+        combine_light([reading.chart.light for reading in readings if reading.print_number == i])
+        for i in sorted({reading.print_number for reading in readings})
     ]
-    light = combine(by_print, robust=False)
+    light = combine_light(by_print, robust=False)
     sent = np.array([swatch.srgb for swatch in manifest.chart])
-    known = np.all(np.isfinite(light), axis=1)
-    if known.sum() < LEAST_SWATCHES:
-        do = "photograph the whole chart from closer, sharp and not too light"
-        raise Refused(f"at least {LEAST_SWATCHES} readable swatches", f"{known.sum()}", do)
-    choice = choose(map_kinds(known_printers()), sent[known], srgb_from_linear(light[known]))
+    usable = np.all(np.isfinite(light), axis=1)
+    if usable.sum() < MIN_SWATCHES:
+        do = "photograph the whole chart from closer, sharp and not overexposed"
+        raise Refused(f"at least {MIN_SWATCHES} readable swatches", f"{usable.sum()}", do)
+    choice = choose_map(map_kinds(known_printers()), sent[usable], srgb_from_linear(light[usable]))
     agreement = _agreement(readings, by_print)
     warnings += [
         f"{reading.path.name} differs from the other photographs of its print by ΔE00 {error:.1f}: glare, or another "
         "print?"
         for reading, error in zip(readings, agreement, strict=True)
-        if error is not None and error > STRANGE_PHOTO
+        if error is not None and error > MAX_PHOTO_DELTA_E00
     ]
     if choice.width < WELL_SPREAD_WIDTH:
         warnings.append(
             f"the {choice.colors} readable swatches hardly spread over the color cube ({choice.width:.2f} in their "
-            f"thinnest direction, whole charts 0.3): the errors stated are of colors like these, others are a guess"
+            f"thinnest direction, whole charts 0.3): errors are stated for colors like these, others are a guess"
         )
     provenance = {
         "source": f"{len(readings)} photographs of {len(by_print)} print{'s' if len(by_print) > 1 else ''} of a chart",
@@ -99,8 +106,8 @@ def calibrate_chart(
         "relative_to": "paper: sRGB white is seen as bare paper",
         "chosen": choice.chosen.name,
         "ladder": ladder_table(choice),
-        "swatches": {"colors": choice.colors, "held_out": choice.held_out, "unreadable": _unreadable(manifest, known)},
-        "delta_e00_of_duplicates": _duplicates(sent[known], light[known]),
+        "swatches": {"colors": choice.colors, "held_out": choice.held_out, "unreadable": _unreadable(manifest, usable)},
+        "delta_e00_of_duplicates": _duplicates(sent[usable], light[usable]),
         "print_to_print": print_variation(by_print),
         "photographs": [_row(reading, error) for reading, error in zip(readings, agreement, strict=True)],
         "uncertainty": f"mean ΔE00 {choice.chosen.error:.2f} of {choice.held_out} held-out colors of the chart",
@@ -109,7 +116,7 @@ def calibrate_chart(
 
 
 def prints_of(paths: Sequence[Path]) -> list[list[Path]]:
-    """Photographs by print: each folder holds those of one print; single files are all of one."""
+    """Group photographs by print: each folder holds those of one print; single files all show one."""
     singles, prints = [path for path in paths if not is_folder(path)], []
     for folder in (path for path in paths if is_folder(path)):
         prints.append(list_images(folder))
@@ -122,7 +129,7 @@ def prints_of(paths: Sequence[Path]) -> list[list[Path]]:
 
 
 def model_of(camera: Camera | None) -> str:
-    """What a table from this camera's photographs describes."""
+    """Text that says whether a table from this camera's photographs describes the printer or its appearance."""
     if camera is not None and camera.tone_light is not None:
         return "printer: the camera's tone curve is taken out"
     why = "no camera file" if camera is None else f"no tone_light in the camera file {camera.name}"
@@ -140,12 +147,12 @@ def printer_of(name: str, predict: ColorMap, provenance: Mapping[str, Any]) -> P
     light = linear_from_srgb(np.clip(predict(nodes.reshape(-1, 3)), 0, 1.2))
     white = np.maximum(light[-1], 0.1)
     lut = srgb_from_linear(np.clip(light / white, 0, 1)).reshape(nodes.shape)
-    gamut = difference(nodes.reshape(-1, 3), lut.reshape(-1, 3)).reshape(nodes.shape[:3])
+    gamut = color_difference(nodes.reshape(-1, 3), lut.reshape(-1, 3)).reshape(nodes.shape[:3])
     return printer_from_table(name, "measured", lut, gamut, None, dict(provenance))
 
 
-def combine(readings: Sequence[np.ndarray], robust: bool = True) -> np.ndarray:
-    """The N×3 light of several readings, NaN where none could be read; from three on their median, if robust."""
+def combine_light(readings: Sequence[np.ndarray], robust: bool = True) -> np.ndarray:
+    """Average several readings of light N×3, NaN where none could be read; the median from three on, if `robust`."""
     stack = np.stack(readings)
     missing = np.isnan(stack).all(0)
     stack = np.where(missing, 0.0, stack)
@@ -153,37 +160,37 @@ def combine(readings: Sequence[np.ndarray], robust: bool = True) -> np.ndarray:
     return np.where(missing, np.nan, middle)
 
 
-_PRINT_CHANGE = (0.04, 0.05, 0.004)  # dot gain, density and black differ by about as much from print to print
+_PRINT_CHANGE = (0.04, 0.05, 0.004)  # typical differences of dot gain, density and black between prints
 
 
 def print_variation(prints: Sequence[np.ndarray]) -> dict[str, Any] | None:
-    """What N×3 light of several prints differs by, as standard deviations; None of a single print.
+    """Standard deviations between the light N×3 of several prints; None for a single print.
 
-    Each print is explained by `vary_print`'s three numbers from the mean of all; the swatches' ΔE00 from that mean stands
-    beside them. Two prints give a rough figure, and it holds what photographs differ by, too.
+    Each print is described by `vary_print`'s three numbers relative to the mean of all; the swatches' ΔE00 from that
+    mean is given too. Two prints give a rough figure, and differences between photographs are included.
     """
     if len(prints) < 2:
         return None
     from scipy.optimize import least_squares
 
-    mean = combine(prints, robust=False)
+    mean = combine_light(prints, robust=False)
     known = np.isfinite(np.stack(prints)).all((0, 2))
-    middle, changes, away = torch.tensor(mean[known].clip(0, 1)), [], []
+    middle, changes, distances = torch.tensor(mean[known].clip(0, 1)), [], []
     for light in prints:
         target = srgb_from_linear(light[known])
 
-        def rest(change: np.ndarray, target: np.ndarray = target) -> np.ndarray:
+        def residuals(change: np.ndarray, target: np.ndarray = target) -> np.ndarray:
             return (srgb_from_linear(vary_print(middle, torch.tensor(change)).numpy()) - target).ravel()
 
-        changes.append(least_squares(rest, np.zeros(3), x_scale=_PRINT_CHANGE).x)
-        away.append(difference(target, srgb_from_linear(mean[known])).mean())
+        changes.append(least_squares(residuals, np.zeros(3), x_scale=_PRINT_CHANGE).x)
+        distances.append(color_difference(target, srgb_from_linear(mean[known])).mean())
     gain, density, lift = np.std(changes, axis=0, ddof=1)
-    figures = {"delta_e00": np.mean(away), "dot_gain_sd": gain, "density_sd": density, "black_lift_sd": lift}
+    figures = {"delta_e00": np.mean(distances), "dot_gain_sd": gain, "density_sd": density, "black_lift_sd": lift}
     return {"prints": len(prints), **{key: round(float(value), 4) for key, value in figures.items()}}
 
 
 def ladder_table(choice: MapChoice) -> list[dict[str, Any]]:
-    """Each rung's figures as stored; those that had too few colors have none."""
+    """Each rung's figures as stored; rungs that had too few colors have a reason instead."""
     figures = {"delta_e00": "error", "worse_by": "worse_by", "standard_error": "standard_error"}
     rows: list[dict[str, Any]] = [
         {"rung": rung.name} | {key: round(getattr(rung, name), 3) for key, name in figures.items()}
@@ -205,16 +212,16 @@ def summary_lines(calibration: PrinterCalibration) -> list[str]:
             figure = f"ΔE00 {row['delta_e00']:5.2f}  (+{row['worse_by']:.2f} ± {row['standard_error']:.2f})"
         lines.append(f"  {row['rung']:20s} {figure}{mark}")
     lines.append(f"held out: {choice.held_out} of {choice.colors} colors in turn")
-    varied = provenance["print_to_print"]
-    if varied is not None:
-        lines.append(f"prints differ from their mean by ΔE00 {varied['delta_e00']:.2f} ({varied['prints']} prints)")
+    spread = provenance["print_to_print"]
+    if spread is not None:
+        lines.append(f"prints differ from their mean by ΔE00 {spread['delta_e00']:.2f} ({spread['prints']} prints)")
     return lines
 
 
 def _read_all(
     prints: Sequence[Sequence[Path]], manifest: Manifest, camera: Camera | None, advance: Advance
 ) -> tuple[list[PhotoReading], list[str]]:
-    """All photographs that can be read, and what is wrong with the others; refused where none is left."""
+    """All photographs that can be read, and warnings about the others; refused if none can be read."""
     if not manifest.chart:
         raise Refused("a sheet with a chart", f"sheet {manifest.sheet_id} without", "name the page's own JSON")
     readings, warnings, total = [], [], sum(map(len, prints))
@@ -223,8 +230,8 @@ def _read_all(
             try:
                 photo = run_limited(lambda path: read_chart(read_photo(path), manifest, camera), path)
                 readings.append(PhotoReading(path, number, photo))
-            except PhotoRejected as cannot:
-                warnings.append(f"{path.name} is left out ({cannot})")
+            except PhotoRejected as rejection:
+                warnings.append(f"{path.name} is left out ({rejection})")
             advance(len(readings) + len(warnings), total)
     if not readings:
         first = warnings[0] if warnings else "none given"
@@ -233,39 +240,39 @@ def _read_all(
 
 
 def _agreement(readings: Sequence[PhotoReading], by_print: Sequence[np.ndarray]) -> list[float | None]:
-    """Mean ΔE00 of each photograph from its print; None where it is the only one."""
-    numbers = [reading.of_print for reading in readings]
+    """Mean ΔE00 of each photograph from its print; None for a print's only photograph."""
+    numbers = [reading.print_number for reading in readings]
     means = dict(zip(sorted(set(numbers)), by_print, strict=True))
     errors = []
     for reading in readings:
         known = np.isfinite(reading.chart.light).all(1)
-        alone = numbers.count(reading.of_print) == 1 or not known.any()
-        own, mean = (srgb_from_linear(light[known]) for light in (reading.chart.light, means[reading.of_print]))
-        errors.append(None if alone else float(difference(own, mean).mean()))
+        alone = numbers.count(reading.print_number) == 1 or not known.any()
+        pair = (srgb_from_linear(light[known]) for light in (reading.chart.light, means[reading.print_number]))
+        errors.append(None if alone else float(color_difference(*pair).mean()))
     return errors
 
 
 def _unreadable(manifest: Manifest, known: np.ndarray) -> int:
-    """Swatches of charts in view that no photograph shows well enough; those of the piece are not the chart's."""
+    """Count the swatches of charts in view that no photograph shows well enough; the piece's own do not count."""
     pages = {swatch.page for swatch, readable in zip(manifest.chart, known.tolist(), strict=True) if readable}
     return sum(not known[row] for page in pages for row in chart_rows(manifest, page))
 
 
 def _duplicates(sent: np.ndarray, light: np.ndarray) -> float | None:
-    """Mean ΔE00 between swatches of the same color at different places: what reading is worth."""
+    """Mean ΔE00 between swatches of the same color at different places: the error of reading."""
     colors, index = np.unique(sent, axis=0, return_inverse=True)
     pairs = [np.flatnonzero(index.reshape(-1) == i)[:2] for i in range(len(colors))]
     pairs = np.array([pair for pair in pairs if len(pair) == 2])
     if not len(pairs):
         return None
-    return round(float(difference(*(srgb_from_linear(light[pairs[:, i]]) for i in (0, 1))).mean()), 3)
+    return round(float(color_difference(*(srgb_from_linear(light[pairs[:, i]]) for i in (0, 1))).mean()), 3)
 
 
 def _row(reading: PhotoReading, error: float | None) -> dict[str, Any]:
     return {
         "file": reading.path.name,
         "sha256": hashlib.sha256(reading.path.read_bytes()).hexdigest(),
-        "print": reading.of_print + 1,
+        "print": reading.print_number + 1,
         "paper": [round(value, 3) for value in reading.chart.paper],
         "unevenness": round(reading.chart.unevenness, 2),
         "paper_misfit": round(reading.chart.misfit, 4),

@@ -1,10 +1,10 @@
-"""The printed chart in one photograph: the light of each swatch relative to the bare paper at the same place.
+"""Read the printed chart in one photograph: the light of each swatch relative to bare paper at the same place.
 
 In: a photograph, the sheet's manifest, the camera if it is known. Out: `ChartPhoto`. The page is found by its markers;
-swatches are read in their unblurred cores, in linear light. What falls on the page differs from place to place, so
-white paper around the chart and the chart's own white swatches are read, too, and a smooth surface through them says
-how light the paper would be under each swatch: dividing by it takes out gradients, vignetting, exposure and white
-balance at once. Text and lines on the paper are outliers of that surface and are left out by themselves.
+swatches are read in their unblurred cores, in linear light. Illumination differs from place to place, so white paper
+around the chart and the chart's own white swatches are read, too, and a smooth surface through them gives the light of
+bare paper under each swatch: dividing by it cancels gradients, vignetting, exposure and white balance at once. Text and
+lines on the paper are outliers of that surface, and the robust fit ignores them.
 Left out on purpose: lens distortion (a swatch's core is far from its border), and gloss: photograph it without shine.
 """
 
@@ -26,23 +26,24 @@ from patchproof.photo.rejection import PhotoRejected
 from patchproof.sheets.manifest import Manifest, Marker
 from patchproof.sheets.rects import RectMm, rect_contains
 
-LEAST_CORE_PX = 4.0  # a swatch's side between blurred borders
-MOST_CLIPPED = 0.05  # share of the white paper at full white: beyond it nobody knows how light it was
-_CORE = 0.2  # of a swatch's side that is left out on each side, at least
+MIN_CORE_PX = 4.0  # a swatch's side between blurred borders
+MAX_CLIPPED_SHARE = 0.05  # share of white paper at full white; beyond it, its light is unknown
+_CORE_MARGIN = 0.2  # of a swatch's side: the least margin on each side
 _SAMPLES = 15  # along each side of a core
-_REACH_MM = 60.0  # how far around the chart paper is looked at
-_PITCH_MM, _PLACE_MM = 2.5, 2.0  # between places of bare paper, and the side of each
-_CLEAR_MM = 1.0  # between such a place and anything printed, and as much again as the blur
-_TERMS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))  # powers of x and y in the logarithm of the paper's light
-_PLACES_PER_TERM = 5
+_SEARCH_MM = 60.0  # bare paper is searched for within this distance of the chart
+_PITCH_MM, _PATCH_MM = 2.5, 2.0  # distance between patches of bare paper, and the side of each
+_CLEARANCE_MM = 1.0  # between a patch and anything printed; twice the blur is added
+_POWERS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))  # of x and y in the logarithm of the paper's light
+_PATCHES_PER_TERM = 5
 
 
 @dataclass(frozen=True)
 class ChartPhoto:
     """`light` N×3 relative to paper, one row per swatch of the manifest's chart, NaN where it could not be read.
 
-    `paper` is the light of bare paper under the chart (1 = the camera's full white), `unevenness` how much lighter its
-    lightest swatch lay than its darkest, `misfit` what bare paper still differs from the smooth surface, as a share.
+    `paper` is the light of bare paper under the chart (1 = the camera's full white), `unevenness` the ratio of that
+    light under the lightest and the darkest place, `misfit` the rms deviation of bare paper from the smooth surface, as
+    a share.
     """
 
     light: np.ndarray
@@ -63,7 +64,7 @@ class _Page:
 
 
 def read_chart(photo: Photo, manifest: Manifest, camera: Camera | None = None) -> ChartPhoto:
-    """The chart's swatches; `PhotoRejected` where there is none, or none that can be trusted."""
+    """Read the chart's swatches; raises `PhotoRejected` where there is none, or none that can be trusted."""
     page = _find_page(photo.srgb, manifest)
     rows = chart_rows(manifest, page.number)
     cores, readable = [], []
@@ -75,28 +76,28 @@ def read_chart(photo: Photo, manifest: Manifest, camera: Camera | None = None) -
     if not readable:
         advice = "come closer to the chart, hold still and show all of it"
         raise PhotoRejected("too_small", page.px_per_mm, None, advice)
-    places = _bare_places(manifest, page, photo.srgb.shape)
+    patches = _bare_patches(manifest, page, photo.srgb.shape)
     whites = [core for core, row in zip(cores, readable, strict=True) if min(manifest.chart[row].srgb) == 1]
-    places = np.concatenate([places, np.reshape(whites, (-1, 4))])
-    paper_at, misfit = _paper(photo.srgb, page, places, camera)
+    patches = np.concatenate([patches, np.reshape(whites, (-1, 4))])
+    paper_light_at, misfit = _paper(photo.srgb, page, patches, camera)
     light = np.full((len(manifest.chart), 3), np.nan)
-    under = paper_at(np.array([[x + w / 2, y + h / 2] for x, y, w, h in cores]))
-    for row, core, paper in zip(readable, cores, under, strict=True):
+    paper_light = paper_light_at(np.array([[x + w / 2, y + h / 2] for x, y, w, h in cores]))
+    for row, core, paper in zip(readable, cores, paper_light, strict=True):
         codes = _codes(photo.srgb, page, core)
-        if (codes >= CLIPPED_CODE).any(-1).mean() <= MOST_CLIPPED:
+        if (codes >= CLIPPED_CODE).any(-1).mean() <= MAX_CLIPPED_SHARE:
             light[row] = light_of_codes(codes / 255, camera).mean(0) / paper
-    level = under.mean(1)
-    red, green, blue = np.median(under, 0).tolist()
+    level = paper_light.mean(1)
+    red, green, blue = np.median(paper_light, 0).tolist()
     return ChartPhoto(light, (red, green, blue), float(level.max() / level.min()), misfit, page.px_per_mm)
 
 
 def chart_rows(manifest: Manifest, page: int) -> list[int]:
-    """Which swatches make up a page's chart."""
+    """Indices of the swatches of a page's chart."""
     return [i for i, swatch in enumerate(manifest.chart) if swatch.page == page]
 
 
 def _find_page(srgb: np.ndarray, manifest: Manifest) -> _Page:
-    """The page that is in view, from the markers beside the chart; those of the piece help where it is uncut."""
+    """Find the page in view by the markers beside the chart; the piece's markers help where it is not cut out."""
     dictionary = manifest.markers[0].dictionary
     markers = [marker for marker in manifest.markers if marker.dictionary == dictionary]
     detected = find_markers(srgb, {marker.id for marker in markers}, dictionary=dictionary)
@@ -108,7 +109,8 @@ def _find_page(srgb: np.ndarray, manifest: Manifest) -> _Page:
     corners_mm = {marker.id: np.array(marker.corners_mm) for marker in markers if marker.page == number}
     detected = complete_markers(srgb, detected, corners_mm, dictionary)
     corners_px = {i: borders.corners_px for i, borders in detected.markers.items() if i in corners_mm}
-    beside = {i: px for i, px in corners_px.items() if not rect_contains(manifest.cut_mm, _around(corners_mm[i]))}
+    rects_mm = {i: _bounding_rect(corners_mm[i]) for i in corners_px}
+    beside = {i: px for i, px in corners_px.items() if not rect_contains(manifest.cut_mm, rects_mm[i])}
     fit = fit_page(beside if len(beside) > 1 else corners_px, corners_mm)
     together = fit_page(corners_px, corners_mm)
     if set(beside) <= set(together.inlier_ids):
@@ -130,67 +132,67 @@ def _no_sheet(srgb: np.ndarray, detected: MarkersInView, markers: list[Marker], 
 
 
 def _core(rect: RectMm, page: _Page, shape) -> RectMm | None:
-    """The part of a swatch that blur leaves alone; None where there is none or it lies out of the picture."""
+    """The part of a swatch that blur does not reach; None where there is none or it lies outside the picture."""
     x, y, w, h = rect
     quad = apply_homography(page.px_from_mm, rect_corners(rect))
     sides = np.linalg.norm(np.roll(quad, -1, axis=0) - quad, axis=1)
     sides = np.array([min(sides[0], sides[2]), min(sides[1], sides[3])])
-    edge = np.maximum(_CORE, (0.75 + 1.5 * page.blur_px) / sides)
-    if (sides * (1 - 2 * edge) < LEAST_CORE_PX).any() or not _in_picture(quad, shape):
+    edge = np.maximum(_CORE_MARGIN, (0.75 + 1.5 * page.blur_px) / sides)
+    if (sides * (1 - 2 * edge) < MIN_CORE_PX).any() or not _in_picture(quad, shape):
         return None
     return x + w * edge[0], y + h * edge[1], w * (1 - 2 * edge[0]), h * (1 - 2 * edge[1])
 
 
-def _bare_places(manifest: Manifest, page: _Page, shape) -> np.ndarray:
+def _bare_patches(manifest: Manifest, page: _Page, shape) -> np.ndarray:
     """Small squares K×4 mm around the chart on which nothing is printed, as far as the manifest knows."""
     rows = np.array([manifest.chart[i].rect_mm for i in chart_rows(manifest, page.number)])
-    clear = _CLEAR_MM + 2 * page.blur_px / page.px_per_mm
-    low = np.maximum(rows[:, :2].min(0) - _REACH_MM, clear)
-    high = np.minimum((rows[:, :2] + rows[:, 2:]).max(0) + _REACH_MM, np.array(manifest.page_mm) - clear) - _PLACE_MM
+    clear = _CLEARANCE_MM + 2 * page.blur_px / page.px_per_mm
+    low = np.maximum(rows[:, :2].min(0) - _SEARCH_MM, clear)
+    high = np.minimum((rows[:, :2] + rows[:, 2:]).max(0) + _SEARCH_MM, np.array(manifest.page_mm) - clear) - _PATCH_MM
     steps = [np.arange(a, b + 1e-9, _PITCH_MM) if b > a else np.array([a]) for a, b in zip(low, high, strict=True)]
     corner = np.stack(np.meshgrid(*steps), -1).reshape(-1, 2)
     printed = [swatch.rect_mm for swatch in manifest.chart if swatch.page == page.number]
-    printed += [_around(marker.corners_mm) for marker in manifest.markers if marker.page == page.number]
+    printed += [_bounding_rect(marker.corners_mm) for marker in manifest.markers if marker.page == page.number]
     if chart_rows(manifest, page.number) and any(not rect_contains(manifest.cut_mm, rect) for rect in rows):
         printed.append(manifest.cut_mm)
     bare = np.ones(len(corner), bool)
     for x, y, w, h in printed:
-        apart = (corner >= np.array([x + w, y + h]) + clear) | (corner + _PLACE_MM <= np.array([x, y]) - clear)
-        bare &= apart.any(1)
-    squares = np.column_stack([corner, np.full((len(corner), 2), _PLACE_MM)])[bare]
+        is_clear = (corner >= np.array([x + w, y + h]) + clear) | (corner + _PATCH_MM <= np.array([x, y]) - clear)
+        bare &= is_clear.any(1)
+    squares = np.column_stack([corner, np.full((len(corner), 2), _PATCH_MM)])[bare]
     inside = [_in_picture(apply_homography(page.px_from_mm, rect_corners(square)), shape) for square in squares]
     return squares[np.array(inside, bool)]
 
 
-def _paper(srgb: np.ndarray, page: _Page, places: np.ndarray, camera: Camera | None):
-    """(places N×2 mm → the light of bare paper there, misfit): exp of a polynomial per channel, fitted robustly."""
-    if not len(places):
+def _paper(srgb: np.ndarray, page: _Page, patches: np.ndarray, camera: Camera | None):
+    """(function points N×2 mm → light of bare paper, misfit): exp of a polynomial per channel, fitted robustly."""
+    if not len(patches):
         raise PhotoRejected("too_small", 0, 1, "no bare paper is in view: show the white paper around the chart")
-    codes = _codes(srgb, page, places.T, 5)
+    codes = _codes(srgb, page, patches.T, 5)
     clipped = float(np.median((codes >= CLIPPED_CODE).any(-1).mean(1)))
-    if clipped > MOST_CLIPPED:
+    if clipped > MAX_CLIPPED_SHARE:
         raise PhotoRejected(
-            "clipped", clipped, MOST_CLIPPED, "the paper is overexposed: lower the exposure by one step"
+            "clipped", clipped, MAX_CLIPPED_SHARE, "the paper is overexposed: lower the exposure by one step"
         )
     light = np.log(np.maximum(light_of_codes(codes / 255, camera).mean(1), 1e-4))
-    centers = places[:, :2] + places[:, 2:] / 2
+    centers = patches[:, :2] + patches[:, 2:] / 2
     middle, reach = centers.mean(0), max(float(np.ptp(centers, 0).max()), 1.0) / 2
-    count = next(n for n in (6, 3, 1) if len(places) >= _PLACES_PER_TERM * n or n == 1)
+    count = next(n for n in (6, 3, 1) if len(patches) >= _PATCHES_PER_TERM * n or n == 1)
 
-    def rows(at: np.ndarray) -> np.ndarray:
-        x, y = ((at - middle) / reach).T
-        return np.stack([x**i * y**j for i, j in _TERMS[:count]], 1)
+    def powers(points_mm: np.ndarray) -> np.ndarray:
+        x, y = ((points_mm - middle) / reach).T
+        return np.stack([x**i * y**j for i, j in _POWERS[:count]], 1)
 
-    known = rows(centers)
-    weight, error, surface = np.ones(len(places)), np.zeros(len(places)), np.zeros((count, 3))
+    patch_powers = powers(centers)
+    weight, error, surface = np.ones(len(patches)), np.zeros(len(patches)), np.zeros((count, 3))
     for _ in range(30):
         root = np.sqrt(weight)[:, None]
-        surface = np.linalg.lstsq(known * root, light * root, rcond=None)[0]
-        error = np.abs(light - known @ surface).max(1)
+        surface = np.linalg.lstsq(patch_powers * root, light * root, rcond=None)[0]
+        error = np.abs(light - patch_powers @ surface).max(1)
         spread = max(1.4826 * float(np.median(error)), 2e-3)
-        weight = np.maximum(1 - (error / (4.7 * spread)) ** 2, 0) ** 2  # Tukey's: print lets go of the paper
+        weight = np.maximum(1 - (error / (4.7 * spread)) ** 2, 0) ** 2  # Tukey's biweight: none for printed patches
     misfit = float(np.sqrt((weight * error**2).sum() / weight.sum()))
-    return lambda at: np.exp(rows(at) @ surface), misfit
+    return lambda points_mm: np.exp(powers(points_mm) @ surface), misfit
 
 
 def _codes(srgb: np.ndarray, page: _Page, rect, samples: int = _SAMPLES) -> np.ndarray:
@@ -200,13 +202,13 @@ def _codes(srgb: np.ndarray, page: _Page, rect, samples: int = _SAMPLES) -> np.n
     """
     x, y, w, h = (np.asarray(value, float)[..., None, None] for value in rect)
     step = (np.arange(samples) + 0.5) / samples
-    at = np.stack(np.broadcast_arrays(x + w * step, y + h * step[:, None]), -1)
-    px = np.floor(apply_homography(page.px_from_mm, at.reshape(-1, 2))).astype(int)
+    points_mm = np.stack(np.broadcast_arrays(x + w * step, y + h * step[:, None]), -1)
+    px = np.floor(apply_homography(page.px_from_mm, points_mm.reshape(-1, 2))).astype(int)
     column, line = np.clip(px, 0, [srgb.shape[1] - 1, srgb.shape[0] - 1]).T
-    return srgb[line, column].reshape(*at.shape[:-3], samples**2, 3)
+    return srgb[line, column].reshape(*points_mm.shape[:-3], samples**2, 3)
 
 
-def _around(corners) -> RectMm:
+def _bounding_rect(corners) -> RectMm:
     (x0, y0), (x1, y1) = np.min(corners, 0), np.max(corners, 0)
     return x0, y0, x1 - x0, y1 - y0
 

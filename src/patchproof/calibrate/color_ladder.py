@@ -1,13 +1,14 @@
-"""Maps from colors to colors, from none to free, and the choice among them by colors that they did not see.
+"""Maps from colors to colors, from identity to splines, and the choice among them by held-out colors.
 
-In: N×3 sRGB colors sent and seen, and known printers as priors. Out: `MapChoice`: the map, and every rung's figure. Each
-map is tried on colors that it was not fitted to (ten folds; the corners of the RGB cube always stay in training, since
-a color outside of those seen is a guess), and `ladder` chooses by ΔE00. Too few colors to hold any out, or colors that
-are all nearly gray, leave only maps with nothing to fit, or paper and black: held-out grays tell nothing of others.
+In: N×3 sRGB colors sent and seen, and known printers as priors. Out: `MapChoice`: the map, and every rung's figure.
+Each map is tested on colors that it was not fitted to (ten folds; the corners of the RGB cube always stay in training,
+since predicting a color outside of those seen would be a guess), and `ladder` chooses by ΔE00. Where there are too few
+colors to hold any out, or all are nearly gray, only maps that fit nothing or paper and black remain: held-out grays do
+not test other colors.
 
 The splines see each color as sRGB and as CIELAB together: drivers work in either, and in one of them a printer is close
-to straight. With 48 swatches that took ΔE00 3.2 to 2.3 where the driver looks for nearest colors, and cost 0.2 where it
-only mixes inks.
+to straight. With 48 swatches that reduced ΔE00 from 3.2 to 2.3 where the driver looks for nearest colors, and cost 0.2
+where it only mixes inks.
 
 Source: Duchon, Splines minimizing rotation-invariant semi-norms in Sobolev spaces, 1977.
 """
@@ -28,27 +29,27 @@ Colors = np.ndarray  # N×3 sRGB in [0, 1]
 ColorMap = Callable[[Colors], Colors]
 
 FOLDS = 10
-LEAST_HELD_OUT = 6  # with fewer, a mean says nothing of a rung
-# Rms distance of the colors from their flattest plane; charts have 0.30 and more. With the chart's colors drawn towards
-# gray, held-out errors said 1.0 to 1.5 where others were off by up to 3 at 0.13, 4 at 0.06, 14 at 0.03, 35 at 0.001.
-WELL_SPREAD_WIDTH, FLAT = 0.15, 0.05
-SMOOTHING = 1e-3  # of splines: from 1e-4 to 1e-2 held-out errors differ by less than 0.05
+MIN_HELD_OUT = 6  # with fewer, a rung's mean error is meaningless
+# Rms distance of the colors from their nearest plane; charts have 0.30 and more. Of charts with colors drawn towards
+# gray, held-out errors were 1.0 to 1.5, other colors' up to 3 at 0.13, 4 at 0.06, 14 at 0.03, 35 at 0.001.
+WELL_SPREAD_WIDTH, MIN_WIDTH = 0.15, 0.05
+SMOOTHING = 1e-3  # of splines: held-out errors differ by less than 0.05 from 1e-4 to 1e-2
 _LAB_SCALE = 60.0  # CIELAB units that count as much as the whole range of one sRGB channel
 
 
 @dataclass(frozen=True)
 class MapKind:
-    """A kind of map: how to fit it, and the fewest distinct colors that takes."""
+    """A kind of map: how to fit it, and the fewest distinct colors that this takes."""
 
     name: str
     fit: Callable[[Colors, Colors], ColorMap]
-    least: int
-    endpoints: bool = False  # nothing is fitted, or paper and black only
+    min_colors: int
+    endpoints_only: bool = False  # fits nothing, or paper and black only
 
 
 @dataclass(frozen=True)
 class MapChoice:
-    """The kind of map that was chosen, fitted to all colors; `rungs` in ΔE00 of all that were tried, simplest first."""
+    """The chosen kind of map, fitted to all colors; `rungs` are all kinds tried, in ΔE00, simplest first."""
 
     chosen: Rung
     predict: ColorMap
@@ -56,100 +57,101 @@ class MapChoice:
     seconds: dict[str, float]  # of one fit
     colors: int
     held_out: int
-    left_out: tuple[str, ...]  # kinds that would have needed more colors, or more colorful ones
-    width: float  # of the colors: rms distance from their flattest plane
+    left_out: tuple[str, ...]  # kinds that need more colors, or more colorful ones
+    width: float  # of the colors: rms distance from their nearest plane
 
 
 def map_kinds(priors: Mapping[str, ColorMap]) -> tuple[MapKind, ...]:
-    """All kinds, simplest first; those of priors are left out where there are none."""
+    """All kinds, simplest first; without priors, the kinds that need them are left out."""
     free = (
-        MapKind("identity", lambda sent, shown: lambda colors: colors, 0, True),
+        MapKind("identity", lambda sent, seen: lambda colors: colors, 0, True),
         MapKind("white_black", fit_white_black, 2, True),
         MapKind("affine", fit_affine, 12),
     )
     known = (
-        MapKind("prior", partial(_best, priors), 0, True),
+        MapKind("prior", partial(_best_prior, priors), 0, True),
         MapKind("prior+affine", partial(fit_prior_affine, priors), 12),
         MapKind("prior+affine+spline", partial(fit_prior_spline, priors), 24),
     )
     return free + (known if priors else ()) + (MapKind("spline", fit_spline, 24),)
 
 
-def choose(kinds: Sequence[MapKind], sent: Colors, shown: Colors) -> MapChoice:
-    """The simplest kind that is no worse than the best; colors sent twice are averaged first."""
-    sent, shown = distinct(sent, shown)
+def choose_map(kinds: Sequence[MapKind], sent: Colors, seen: Colors) -> MapChoice:
+    """Choose the simplest kind that is no worse than the best; repeated colors are averaged first."""
+    sent, seen = average_repeats(sent, seen)
     corners, width = np.isin(sent, (0.0, 1.0)).all(1), color_width(sent)
-    tried = [kind for kind in kinds if len(sent) >= kind.least and (kind.endpoints or width >= FLAT)]
+    tried = [kind for kind in kinds if len(sent) >= kind.min_colors and (kind.endpoints_only or width >= MIN_WIDTH)]
     folds = _folds(np.flatnonzero(~corners))
-    if (~corners).sum() < LEAST_HELD_OUT:
+    if (~corners).sum() < MIN_HELD_OUT:
         ends = (sent == 1).all(1) | (sent.sum(1) == sent.sum(1).min())
-        tried, folds = [kind for kind in tried if kind.endpoints], [np.flatnonzero(~ends if not ends.all() else ends)]
+        tried = [kind for kind in tried if kind.endpoints_only]
+        folds = [np.flatnonzero(~ends if not ends.all() else ends)]
     names = [kind.name for kind in tried]
-    errors, seconds = zip(*(_held_out(kind, sent, shown, folds) for kind in tried), strict=True)
+    errors, seconds = zip(*(_held_out(kind, sent, seen, folds) for kind in tried), strict=True)
     rungs = compare_rungs(names, np.array(errors))
     chosen = simplest_rung(rungs)
     left_out = tuple(kind.name for kind in kinds if kind not in tried)
-    fitted, times = tried[chosen].fit(sent, shown), dict(zip(names, seconds, strict=True))
+    fitted, times = tried[chosen].fit(sent, seen), dict(zip(names, seconds, strict=True))
     return MapChoice(rungs[chosen], fitted, rungs, times, len(sent), len(errors[0]), left_out, width)
 
 
 def color_width(colors: Colors) -> float:
-    """Rms distance of N×3 colors from the plane that they lie nearest to: 0 of grays, 0.29 of the whole cube."""
+    """Rms distance of N×3 colors from their nearest plane: 0 for grays, 0.29 for the whole cube."""
     return float(np.linalg.svd(colors - colors.mean(0), compute_uv=False)[-1] / np.sqrt(len(colors)))
 
 
-def distinct(sent: Colors, shown: Colors) -> tuple[Colors, Colors]:
-    """Each color sent once, with the mean light of how it was shown."""
+def average_repeats(sent: Colors, seen: Colors) -> tuple[Colors, Colors]:
+    """Each distinct color sent, with the mean light of how it was seen."""
     colors, index = np.unique(np.asarray(sent, float), axis=0, return_inverse=True)
-    light, index = linear_from_srgb(np.asarray(shown, float)), index.reshape(-1)
+    light, index = linear_from_srgb(np.asarray(seen, float)), index.reshape(-1)
     total = np.stack([np.bincount(index, light[:, c]) for c in range(3)], 1)
     return colors, srgb_from_linear(total / np.bincount(index)[:, None])
 
 
-def difference(shown: Colors, expected: Colors) -> np.ndarray:
-    """ΔE00 N of sRGB colors; what lies outside of [0, 1] counts as clipped."""
-    return ciede2000(lab_from_srgb(np.clip(shown, 0, 1)), lab_from_srgb(np.clip(expected, 0, 1)))
+def color_difference(seen: Colors, expected: Colors) -> np.ndarray:
+    """ΔE00 N of sRGB colors N×3; values outside of [0, 1] are clipped."""
+    return ciede2000(lab_from_srgb(np.clip(seen, 0, 1)), lab_from_srgb(np.clip(expected, 0, 1)))
 
 
-def fit_white_black(sent: Colors, shown: Colors) -> ColorMap:
-    """Per channel an affine map in light: white stays, and the darkest color sent becomes the one shown."""
-    light, lit = linear_from_srgb(sent), linear_from_srgb(shown)
+def fit_white_black(sent: Colors, seen: Colors) -> ColorMap:
+    """Fit an affine map in light per channel: white stays, and the darkest color sent becomes the one seen."""
+    light, lit = linear_from_srgb(sent), linear_from_srgb(seen)
     dark = light.sum(1).argmin()
     lift = np.clip((lit[dark] - light[dark]) / np.maximum(1 - light[dark], 1e-6), 0, 0.99)
     return lambda colors: srgb_from_linear(lift + (1 - lift) * linear_from_srgb(colors))
 
 
-def fit_affine(sent: Colors, shown: Colors) -> ColorMap:
-    """Least squares in sRGB's code values: 12 numbers. In light it was twice as far off (ΔE00 8 instead of 5)."""
-    matrix = np.linalg.lstsq(_with_ones(sent), shown, rcond=None)[0]
+def fit_affine(sent: Colors, seen: Colors) -> ColorMap:
+    """Fit 12 numbers by least squares in sRGB's code values. In light it was twice as far off (ΔE00 8 instead of 5)."""
+    matrix = np.linalg.lstsq(_with_ones(sent), seen, rcond=None)[0]
     return lambda colors: _with_ones(colors) @ matrix
 
 
-def fit_spline(sent: Colors, shown: Colors) -> ColorMap:
-    """A thin-plate spline with an affine part."""
+def fit_spline(sent: Colors, seen: Colors) -> ColorMap:
+    """Fit a thin-plate spline with an affine part."""
     from scipy.interpolate import RBFInterpolator
 
-    spline = RBFInterpolator(_features(sent), shown, kernel="thin_plate_spline", smoothing=SMOOTHING, degree=1)
+    spline = RBFInterpolator(_features(sent), seen, kernel="thin_plate_spline", smoothing=SMOOTHING, degree=1)
     return lambda colors: spline(_features(colors))
 
 
-def fit_prior_affine(priors: Mapping[str, ColorMap], sent: Colors, shown: Colors) -> ColorMap:
-    """An affine map after the prior for which that leaves least."""
-    fits = {name: fit_affine(prior(sent), shown) for name, prior in priors.items()}
-    best = min(fits, key=lambda name: difference(fits[name](priors[name](sent)), shown).mean())
+def fit_prior_affine(priors: Mapping[str, ColorMap], sent: Colors, seen: Colors) -> ColorMap:
+    """Fit an affine map after each prior; the one with the smallest error."""
+    fits = {name: fit_affine(prior(sent), seen) for name, prior in priors.items()}
+    best = min(fits, key=lambda name: color_difference(fits[name](priors[name](sent)), seen).mean())
     return lambda colors: fits[best](priors[best](colors))
 
 
-def fit_prior_spline(priors: Mapping[str, ColorMap], sent: Colors, shown: Colors) -> ColorMap:
-    """The corrected prior, and a spline of what it leaves."""
-    start = fit_prior_affine(priors, sent, shown)
-    rest = fit_spline(sent, shown - start(sent))
-    return lambda colors: start(colors) + rest(colors)
+def fit_prior_spline(priors: Mapping[str, ColorMap], sent: Colors, seen: Colors) -> ColorMap:
+    """Fit the best prior with its affine map, and a spline to the residuals."""
+    start = fit_prior_affine(priors, sent, seen)
+    residual_map = fit_spline(sent, seen - start(sent))
+    return lambda colors: start(colors) + residual_map(colors)
 
 
-def _best(priors: Mapping[str, ColorMap], sent: Colors, shown: Colors) -> ColorMap:
-    """The prior that shows these colors best."""
-    return min(priors.values(), key=lambda prior: difference(prior(sent), shown).mean())
+def _best_prior(priors: Mapping[str, ColorMap], sent: Colors, seen: Colors) -> ColorMap:
+    """The prior that predicts these colors best."""
+    return min(priors.values(), key=lambda prior: color_difference(prior(sent), seen).mean())
 
 
 def _features(colors: Colors) -> np.ndarray:
@@ -161,15 +163,15 @@ def _with_ones(colors: Colors) -> np.ndarray:
 
 
 def _folds(held_out: np.ndarray) -> list[np.ndarray]:
-    """Indices of up to ten folds, mixed by a fixed seed."""
+    """Indices of up to ten folds, shuffled by a fixed seed."""
     mixed = np.random.default_rng(0).permutation(held_out)
     return [fold for fold in np.array_split(mixed, FOLDS) if len(fold)]
 
 
-def _held_out(kind: MapKind, sent: Colors, shown: Colors, folds: list[np.ndarray]) -> tuple[np.ndarray, float]:
+def _held_out(kind: MapKind, sent: Colors, seen: Colors, folds: list[np.ndarray]) -> tuple[np.ndarray, float]:
     """ΔE00 of each held-out color, fold by fold, and the mean seconds of a fit."""
     errors, begin = [], time.perf_counter()
     for fold in folds:
         train = np.setdiff1d(np.arange(len(sent)), fold)
-        errors.append(difference(kind.fit(sent[train], shown[train])(sent[fold]), shown[fold]))
+        errors.append(color_difference(kind.fit(sent[train], seen[train])(sent[fold]), seen[fold]))
     return np.concatenate(errors), (time.perf_counter() - begin) / len(folds)

@@ -1,7 +1,7 @@
 """A printer from an ICC output profile.
 
-In: an RGB or CMYK profile of class `prtr`. Out: a `Printer` whose table follows the chain sRGB → printer → sRGB. The
-way to the printer takes the intent that the driver is set to, relative colorimetric or perceptual; the way back is
+In: an RGB or CMYK profile of class `prtr`. Out: a `Printer` whose table follows the chain sRGB → printer → sRGB.
+Towards the printer it uses the intent that the driver is set to, relative colorimetric or perceptual; back from it
 always relative colorimetric: bare paper is 1, and an eye's or camera's adaptation to it is not applied twice.
 LittleCMS (through Pillow) works in 8 bits here; without NOOPTIMIZE it replaces the chain by a coarse one (ΔE00 up to 5
 on coated, 14 on uncoated paper). A bake measures its table against the exact chain and keeps the figures.
@@ -24,7 +24,7 @@ from patchproof.base.input import is_file
 from patchproof.calibrate.printer_files import printer_from_table, printer_output
 from patchproof.channel.printer import NODES_8BIT, Printer, node_colors
 
-MAX_BYTES = 32 * 2**20  # the largest printer profiles in use are a few MB
+MAX_PROFILE_BYTES = 32 * 2**20  # the largest printer profiles in use are a few MB
 _D50 = np.array([0.9642, 1.0, 0.8249])  # the profile connection space's white, ICC.1
 _CHECKED_COLORS = 10_000
 _INTENTS = {
@@ -40,7 +40,7 @@ def bake(profile_path: Path, name: str, licence: str, source: str, perceptual: b
     nodes = codes_from_srgb(node_colors())
     lut = show(nodes)
     white = lut[-1, -1, -1]
-    if white.min() < 250:  # relative to its medium, paper is white by definition, up to a profile's own rounding
+    if white.min() < 250:  # relative to its medium, paper is white by definition, up to the profile's rounding
         got = f"sRGB white printed as {white.tolist()}"
         raise Refused("a profile that leaves white paper bare", got, "use another one")
     gamut = ciede2000(lab_from_srgb(nodes / 255), lab_from_srgb(lut / 255))
@@ -63,15 +63,15 @@ def bake(profile_path: Path, name: str, licence: str, source: str, perceptual: b
 
 
 def _profile_bytes(path: Path) -> bytes:
-    """The file, refused where it is missing, too large, or shorter than its own header says."""
+    """Read the file; refused where it is missing, too large, or shorter than its own header says."""
     if not is_file(path):
         raise Refused("an ICC profile", f"no file at {path}", "check the path")
-    if path.stat().st_size > MAX_BYTES:
+    if path.stat().st_size > MAX_PROFILE_BYTES:
         got = f"{path.stat().st_size / 2**20:.0f} MB in {path.name}"
-        raise Refused(f"an ICC profile of at most {MAX_BYTES // 2**20} MB", got, "check that it is a profile")
+        raise Refused(f"an ICC profile of at most {MAX_PROFILE_BYTES // 2**20} MB", got, "check that it is a profile")
     data = path.read_bytes()
     if len(data) < 128 or data[36:40] != b"acsp":  # ICC.1, 7.2: the header and its signature
-        raise Refused("an ICC profile", f"{path.name}, which is none", "check the file")
+        raise Refused("an ICC profile", f"{path.name}, which does not begin with a profile's header", "check the file")
     if int.from_bytes(data[:4], "big") > len(data):
         got = f"{len(data)} of {int.from_bytes(data[:4], 'big')} bytes of {path.name}"
         raise Refused("a whole ICC profile", got, "copy the file again")
@@ -79,14 +79,14 @@ def _profile_bytes(path: Path) -> bytes:
 
 
 def _chain(data: bytes, file_name: str, perceptual: bool) -> tuple[Callable[[np.ndarray], np.ndarray], Any]:
-    """(uint8 ... × 3 sRGB sent → uint8 sRGB seen, the profile's description) by LittleCMS."""
+    """(function uint8 ...×3 sRGB sent → uint8 sRGB seen, the profile's description) by LittleCMS."""
     from PIL import Image, ImageCms
 
     try:
         profile = ImageCms.ImageCmsProfile(io.BytesIO(data))
         tags: Any = profile.profile
         kind, colors = tags.device_class.strip(), tags.xcolor_space.strip()
-        _description(tags)  # damage shows where a tag is read
+        _description(tags)  # reading tags shows damage
         _paper_white(tags)
     except (OSError, ImageCms.PyCMSError, ValueError, TypeError, AttributeError) as error:
         got = f"{file_name} ({' '.join(str(error).split())[:100]})"
@@ -95,13 +95,13 @@ def _chain(data: bytes, file_name: str, perceptual: bool) -> tuple[Callable[[np.
         got = f"class {kind} with {colors} in {file_name}"
         raise Refused("a printer's profile (class prtr, RGB or CMYK)", got, "use the profile of your printer and paper")
     relative, flags = ImageCms.Intent.RELATIVE_COLORIMETRIC, ImageCms.Flags
-    there = ImageCms.Intent.PERCEPTUAL if perceptual else relative
+    to_printer = ImageCms.Intent.PERCEPTUAL if perceptual else relative
     srgb = ImageCms.createProfile("sRGB")
-    exact = flags.SOFTPROOFING | flags.NOOPTIMIZE | flags.NOCACHE
+    exact_flags = flags.SOFTPROOFING | flags.NOOPTIMIZE | flags.NOCACHE
     try:
-        chain = ImageCms.buildProofTransform(srgb, srgb, profile, "RGB", "RGB", there, relative, flags=exact)
+        chain = ImageCms.buildProofTransform(srgb, srgb, profile, "RGB", "RGB", to_printer, relative, flags=exact_flags)
     except (ImageCms.PyCMSError, ValueError, TypeError) as error:
-        got = f"{file_name} without them ({' '.join(str(error).split())[:100]})"
+        got = f"{file_name} without these tables ({' '.join(str(error).split())[:100]})"
         raise Refused("a profile with tables to and from the printer", got, "use another one") from error
 
     def show(srgb_8bit: np.ndarray) -> np.ndarray:
@@ -126,7 +126,7 @@ def _paper_white(profile) -> tuple[float, float, float] | None:
 
 
 def _table_error(printer: Printer, show: Callable[[np.ndarray], np.ndarray]) -> dict[str, float]:
-    """How far the interpolated table is from the chain itself on random colors."""
+    """ΔE00 between the interpolated table and the chain itself on random colors."""
     sent = np.random.default_rng(0).integers(0, 256, (_CHECKED_COLORS, 3), dtype=np.uint8)
     exact = lab_from_srgb(show(sent) / 255)
     error = ciede2000(exact, lab_from_srgb(printer_output(printer, sent / 255)))

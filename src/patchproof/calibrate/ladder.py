@@ -1,6 +1,6 @@
-"""The rule for climbing a ladder of models: the simplest one whose held-out error is no worse than the best one's.
+"""Choose from a ladder of models the simplest one whose held-out error is no worse than the best one's.
 
-In: what each model misses of every item that it was not fitted to, simplest model first. No worse means within one
+In: each model's error on every item while that item was held out, simplest model first. No worse means within one
 standard error (Breiman's rule), and that is the standard error of the *paired* difference from the best, item by item:
 items that are hard for every model say nothing about which one is better.
 
@@ -18,7 +18,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Rung:
-    """A model's mean held-out error, by how much that is worse than the best model's, and the standard error of that
+    """A model's mean held-out error, its difference from the best model's error, and the standard error of that
     difference; infinite where there was no fit.
     """
 
@@ -29,7 +29,7 @@ class Rung:
 
 
 def compare_rungs(names: Sequence[str], errors: np.ndarray) -> tuple[Rung, ...]:
-    """The rungs of errors models × items, at least one of them finite; rows that are not finite had no fit."""
+    """The rungs of errors models × items, at least one row of them finite; rows that are not finite had no fit."""
     means = np.where(np.isfinite(errors).all(1), errors.mean(1), np.inf)
     worse = errors[np.isfinite(means)] - errors[means.argmin()]
     by, spread = np.full((2, len(means)), np.inf)
@@ -40,5 +40,5 @@ def compare_rungs(names: Sequence[str], errors: np.ndarray) -> tuple[Rung, ...]:
 
 
 def simplest_rung(rungs: Sequence[Rung]) -> int:
-    """Which rung to stand on."""
+    """The index of the rung to use."""
     return next(i for i, rung in enumerate(rungs) if np.isfinite(rung.error) and rung.worse_by <= rung.standard_error)

@@ -1,9 +1,9 @@
-"""Which lens model the photographs of a board pay for: a ladder, climbed by held-out reprojection error.
+"""Choose the lens model that photographs of a board support, by held-out reprojection error.
 
 In: corners of several photographs. Out: every rung's error on photographs that it was not fitted to, the rung that
 `ladder` chooses, and its fit to all. The rungs are pinhole, k1, k1 k2, those with tangential terms p1 p2, and with k3
-on top: a term that buys less than chance is left out. A held-out photograph gives its pose, six numbers, and nothing
-else. Of 25 made-up cameras without distortion 24 stay at the pinhole, of 25 with k1 alone 19 at k1.
+on top: a term that helps no more than chance is left out. For a held-out photograph only its pose, six numbers, is
+fitted. Of 25 simulated cameras without distortion 24 stay at the pinhole, of 25 with k1 alone 19 at k1.
 OpenCV fits (Zhang's method); the standard deviations are its own or those between the folds, whichever are larger:
 photographs share a bent board, and corners of one photograph are not independent.
 
@@ -26,20 +26,21 @@ from patchproof.calibrate.ladder import Rung, compare_rungs, simplest_rung
 FOLDS = 5
 PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 _NO_K3, _NO_P = cv2.CALIB_FIX_K3, cv2.CALIB_ZERO_TANGENT_DIST
-RUNGS = {
+RUNG_FLAGS = {
     "pinhole": _NO_P | _NO_K3 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K1,
     "k1": _NO_P | _NO_K3 | cv2.CALIB_FIX_K2,
     "k1 k2": _NO_P | _NO_K3,
     "k1 k2 p1 p2": _NO_K3,
     "k1 k2 p1 p2 k3": 0,
 }
-FREE = {"pinhole": 4, "k1": 5, "k1 k2": 6, "k1 k2 p1 p2": 8, "k1 k2 p1 p2 k3": 9}  # of NUMBERS, from the first
+# how many of PARAMETERS each rung fits
+FREE_PARAMETERS = {"pinhole": 4, "k1": 5, "k1 k2": 6, "k1 k2 p1 p2": 8, "k1 k2 p1 p2 k3": 9}
 _STOP = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 60, 1e-10)
 
 
 @dataclass(frozen=True)
 class LensFit:
-    """One rung fitted to some views: `numbers` and their standard deviations `sd` as in NUMBERS, and each view's pose
+    """One rung fitted to some views: `numbers` and standard deviations `sd` as in PARAMETERS, and each view's pose
     (rotation and translation vectors) and residuals N×2 px.
     """
 
@@ -56,18 +57,18 @@ class LensFit:
 
     @property
     def photo_rms_px(self) -> list[float]:
-        """The same of each view alone."""
+        """Root mean square of the residuals' lengths in each view."""
         return [float(np.sqrt((residual**2).sum(1).mean())) for residual in self.residuals_px]
 
     @property
     def tilts_deg(self) -> np.ndarray:
-        """How far each board is turned away from facing the camera."""
+        """The angle by which each board is turned away from facing the camera."""
         return np.degrees(np.arccos(np.clip(np.abs(self.normals[:, 2]), 0, 1)))
 
     @property
     def normals(self) -> np.ndarray:
-        """Unit normals of the boards as the camera sees them."""
-        return np.array([cv2.Rodrigues(rotation)[0][:, 2] for rotation, _ in self.poses])
+        """Unit normals of the boards in the camera's frame."""
+        return np.array([cv2.Rodrigues(rvec)[0][:, 2] for rvec, _ in self.poses])
 
 
 def choose_lens_model(
@@ -75,48 +76,48 @@ def choose_lens_model(
     usable: Callable[[LensFit], bool] = lambda fit: True,
     advance: Advance = no_advance,
 ) -> tuple[tuple[Rung, ...], LensFit]:
-    """All rungs, their errors the photographs' RMS in px, and the chosen one's fit to all photographs.
+    """All rungs, with errors as the photographs' RMS in px, and the chosen rung's fit to all photographs.
 
     A rung whose fit is not `usable` is passed over.
     """
     folds = [np.arange(len(views)) % min(FOLDS, len(views)) == k for k in range(min(FOLDS, len(views)))]
-    errors, fits, start = np.full((len(RUNGS), len(views)), np.inf), {}, None
-    for number, name in enumerate(RUNGS):
+    errors, fits, start = np.full((len(RUNG_FLAGS), len(views)), np.inf), {}, None
+    for number, name in enumerate(RUNG_FLAGS):
         fit = fit_rung(views, name, start)
         if fit is not None and usable(fit):
             errors[number], spread = _held_out(views, folds, fit)
             start = fits[name] = replace(fit, sd=np.maximum(fit.sd, spread))
-        advance(number + 1, len(RUNGS))
+        advance(number + 1, len(RUNG_FLAGS))
     if not np.isfinite(errors).all(1).any():
         do = "photograph the board, glued to something flat, from more directions"
-        raise Refused("photographs of a board that a lens model fits", "none that does", do)
-    rungs = compare_rungs(list(RUNGS), errors)
+        raise Refused("photographs of a board that a lens model fits", f"{len(views)} that none fits", do)
+    rungs = compare_rungs(list(RUNG_FLAGS), errors)
     return rungs, fits[rungs[simplest_rung(rungs)].name]
 
 
 def fit_rung(views: Sequence[BoardView], name: str, start: LensFit | None = None) -> LensFit | None:
-    """One rung on all of these views, from a lower rung's numbers where given; None where OpenCV finds no fit."""
-    flags, matrix, bends = RUNGS[name], np.eye(3), np.zeros(5)
+    """Fit one rung to all of these views, starting from a lower rung's `start`; None where OpenCV finds no fit."""
+    flags, matrix, distortion = RUNG_FLAGS[name], np.eye(3), np.zeros(5)
     if start is not None:
         flags |= cv2.CALIB_USE_INTRINSIC_GUESS
-        matrix, bends = matrix_and_distortion(start.numbers)
-    boards = [_flat(view) for view in views]
+        matrix, distortion = matrix_and_distortion(start.numbers)
+    boards = [_board_points(view) for view in views]
     pictures = [view.px.astype(np.float32) for view in views]
     try:
-        _, matrix, bends, turns, moves, sd, _, _ = cv2.calibrateCameraExtended(
-            boards, pictures, views[0].size_px, matrix, bends, flags=flags, criteria=_STOP
+        _, matrix, distortion, rvecs, tvecs, sd, _, _ = cv2.calibrateCameraExtended(
+            boards, pictures, views[0].size_px, matrix, distortion, flags=flags, criteria=_STOP
         )
     except cv2.error:
         return None
-    bends, sd = np.asarray(bends).reshape(-1)[:5], np.asarray(sd).reshape(-1)[:9]
-    numbers = np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *bends])
+    distortion, sd = np.asarray(distortion).reshape(-1)[:5], np.asarray(sd).reshape(-1)[:9]
+    numbers = np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *distortion])
     if not (np.isfinite(numbers).all() and np.isfinite(sd).all() and (numbers[:2] > 0).all()):
         return None
     poses = tuple(
-        (np.asarray(r, float).reshape(3), np.asarray(t, float).reshape(3)) for r, t in zip(turns, moves, strict=True)
+        (np.asarray(r, float).reshape(3), np.asarray(t, float).reshape(3)) for r, t in zip(rvecs, tvecs, strict=True)
     )
     residuals = tuple(_residual(view, numbers, pose) for view, pose in zip(views, poses, strict=True))
-    return LensFit(name, numbers, np.where(np.arange(9) < FREE[name], sd, 0.0), poses, residuals)
+    return LensFit(name, numbers, np.where(np.arange(9) < FREE_PARAMETERS[name], sd, 0.0), poses, residuals)
 
 
 def matrix_and_distortion(numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -125,35 +126,35 @@ def matrix_and_distortion(numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), numbers[4:].copy()
 
 
-def _held_out(views: Sequence[BoardView], folds: list[np.ndarray], whole: LensFit) -> tuple[np.ndarray, np.ndarray]:
-    """RMS px of every view under the fit without its fold, and the numbers' standard deviations from those fits.
-
-    Those are the delete-a-group jackknife's.
+def _held_out(views: Sequence[BoardView], folds: list[np.ndarray], full: LensFit) -> tuple[np.ndarray, np.ndarray]:
+    """RMS px of every view under the fit without its fold, and the numbers' standard deviations (delete-a-group
+    jackknife).
     """
     errors, numbers = np.full(len(views), np.inf), []
     for fold in folds:
-        fit = fit_rung([v for v, out in zip(views, fold, strict=True) if not out], whole.rung, whole)
+        fit = fit_rung([v for v, held in zip(views, fold, strict=True) if not held], full.rung, full)
         if fit is None:
             return errors, np.zeros(9)
         numbers.append(fit.numbers)
         for i in np.flatnonzero(fold).tolist():
-            pose = _pose(views[i], fit.numbers, whole.poses[i])
+            pose = _refine_pose(views[i], fit.numbers, full.poses[i])
             errors[i] = np.sqrt((_residual(views[i], fit.numbers, pose) ** 2).sum(1).mean())
     count = len(folds)
     return errors, np.sqrt((count - 1) / count * ((np.array(numbers) - np.mean(numbers, 0)) ** 2).sum(0))
 
 
-def _pose(view: BoardView, numbers: np.ndarray, near) -> tuple[np.ndarray, np.ndarray]:
-    """The board's pose of least reprojection error near another one: a plane has a mirrored twin far from it."""
-    turn, move = (vector.reshape(3, 1).copy() for vector in near)
-    turn, move = cv2.solvePnPRefineLM(_flat(view), view.px, *matrix_and_distortion(numbers), turn, move)
-    return turn.reshape(3), move.reshape(3)
+def _refine_pose(view: BoardView, numbers: np.ndarray, start_pose) -> tuple[np.ndarray, np.ndarray]:
+    """The board's pose of least reprojection error near another one; far from it, a plane has a mirrored twin."""
+    rvec, tvec = (vector.reshape(3, 1).copy() for vector in start_pose)
+    rvec, tvec = cv2.solvePnPRefineLM(_board_points(view), view.px, *matrix_and_distortion(numbers), rvec, tvec)
+    return rvec.reshape(3), tvec.reshape(3)
 
 
 def _residual(view: BoardView, numbers: np.ndarray, pose) -> np.ndarray:
-    (turn, move), (matrix, bends) = pose, matrix_and_distortion(numbers)
-    return view.px - cv2.projectPoints(_flat(view).astype(float), turn, move, matrix, bends)[0].reshape(-1, 2)
+    (rvec, tvec), (matrix, distortion) = pose, matrix_and_distortion(numbers)
+    points = _board_points(view).astype(float)
+    return view.px - cv2.projectPoints(points, rvec, tvec, matrix, distortion)[0].reshape(-1, 2)
 
 
-def _flat(view: BoardView) -> np.ndarray:
+def _board_points(view: BoardView) -> np.ndarray:
     return np.column_stack([view.board_mm, np.zeros(len(view.board_mm))]).astype(np.float32)

@@ -1,6 +1,6 @@
-"""`calibrate printer`: a profile or photographs in, NAME.npz and NAME.json out, with what to tell the user.
+"""`calibrate printer`: make NAME.npz and NAME.json from a profile or photographs, and summarize them.
 
-Nothing is written before the printer is complete, and what exists is replaced only on request.
+Nothing is written before the printer is complete, and existing files are replaced only on request.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def printer_from_icc(
         f"{printer.provenance['profile']} ({printer.provenance['profile_colors']}), {printer.provenance['intents']}",
         f"table against LittleCMS on {error['colors']:,} random colors: "
         f"ΔE00 mean {error['mean']}, p95 {error['p95']}, max {error['max']}",
-        _written(printer, out),
+        _write_files(printer, out),
     ]
 
 
@@ -44,15 +44,15 @@ def printer_from_chart(
     overwrite: bool = False,
     progress: Progress = no_progress,
 ) -> tuple[list[str], tuple[str, ...]]:
-    """Write the printer that photographs of a chart show; returns the summary and warnings."""
+    """Write the printer measured from photographs of a chart; returns the summary and warnings."""
     out = _new_file(out, overwrite)
-    known = None if camera is None else load_camera(camera)
-    result = calibrate_chart(prints_of(photos), load_manifest(sheet), out.stem, known, partial(progress, "chart"))
-    return [*summary_lines(result), _written(result.printer, out)], result.warnings
+    lens = None if camera is None else load_camera(camera)
+    result = calibrate_chart(prints_of(photos), load_manifest(sheet), out.stem, lens, partial(progress, "chart"))
+    return [*summary_lines(result), _write_files(result.printer, out)], result.warnings
 
 
 def _new_file(out: Path, overwrite: bool) -> Path:
-    """`out` as NAME.npz; refused where either file exists, or the name is that of something else."""
+    """`out` as NAME.npz; refused where either file exists, or the suffix is of another kind of file."""
     if out.suffix.lower() not in {"", ".npz", ".json"}:
         raise Refused("a printer file, NAME.npz", f"{out.name}", "choose another --out")
     out = out.with_suffix(".npz")
@@ -61,10 +61,10 @@ def _new_file(out: Path, overwrite: bool) -> Path:
     return out
 
 
-def _written(printer: Printer, out: Path) -> str:
+def _write_files(printer: Printer, out: Path) -> str:
     with TemporaryDirectory() as folder:
-        made = save_printer(printer, Path(folder))
+        path = save_printer(printer, Path(folder))
         write_files_atomically(
-            {out.with_suffix(suffix): made.with_suffix(suffix).read_bytes() for suffix in (".npz", ".json")}
+            {out.with_suffix(suffix): path.with_suffix(suffix).read_bytes() for suffix in (".npz", ".json")}
         )
     return f"written: {out}, {out.with_suffix('.json').name}"
