@@ -53,7 +53,7 @@ def data() -> Path:
 def a_small_search(monkeypatch):
     """For a place: few points, few places, short drafts. For tests of files, not of choices."""
     monkeypatch.setattr("patchproof.scene.candidate_places._POOL", 12)
-    for name, count in (("PLACES", 3), ("PASSES", 0), ("HELD_OUT_VIEWS", 4)):
+    for name, count in (("SCREENED_PLACES", 3), ("MAX_PASSES", 0), ("HELD_OUT_VIEWS", 4)):
         monkeypatch.setattr(f"patchproof.optimizer.place_search.{name}", count)
 
 

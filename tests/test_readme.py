@@ -20,7 +20,7 @@ from patchlab.study.study import load_study
 from patchproof.base.intervals import student_mean
 from patchproof.base.settings import SceneSettings
 from patchproof.base.validation import read_toml, validate_model
-from patchproof.optimizer.problem import FIGURE_SCALE, FIGURED
+from patchproof.optimizer.problem import FIGURE_SCALE, FIGURE_SAMPLING
 from patchproof.optimizer.run import load_run
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -431,7 +431,7 @@ def test_figures_of_views_are_the_stored_ones():
 
 
 def test_figures_of_fewer_taps_at_a_piece_are_the_stored_ones():
-    rows = [row for row in rows_of("views/taps.csv") if int(row["taps"]) == FIGURED.piece_taps]
+    rows = [row for row in rows_of("views/taps.csv") if int(row["taps"]) == FIGURE_SAMPLING.piece_taps]
     assert [row["scene"] for row in rows] == ["suv", "postbox", "carton", "truck"]
     assert max(abs(float(row["mean"])) for row in rows) < 0.0004 and max(float(row["rms"]) for row in rows) < 0.004
     for told in ([f"{float(row['mean']):+.4f}" for row in rows], [f"{float(row['rms']):.3f}" for row in rows]):
@@ -445,7 +445,7 @@ def test_looks_of_views_are_the_stored_ones():
         if row["shown"] == "design":
             off.setdefault((row["times"], row["width"], row["taps"]), []).append(f"{float(row['off']):+.3f}")
     told = [look for look, each in off.items() if f"| {' | '.join([*look, *each])} |" in page]
-    chosen = str(FIGURE_SCALE), str(FIGURED.side), str(FIGURED.taps)
+    chosen = str(FIGURE_SCALE), str(FIGURE_SAMPLING.side), str(FIGURE_SAMPLING.taps)
     assert len(told) == 9 and f"| {' | '.join([f'**{value}**' for value in chosen] + off[chosen])} |" in page
 
 

@@ -467,9 +467,7 @@ def test_an_rgb_profile_is_baked_with_both_intents(tmp_path):
     for perceptual, word in ((False, "relative"), (True, "perceptual")):
         printer = icc.bake(path, "rgb", "none", "test", perceptual)
         assert printer.provenance["profile_colors"] == "RGB" and printer.provenance["intents"].startswith(word)
-        assert (
-            color_difference(printer_output(printer, UNSEEN), UNSEEN).mean() < 0.3
-        )  # sRGB, in 8 bits
+        assert color_difference(printer_output(printer, UNSEEN), UNSEEN).mean() < 0.3  # sRGB, in 8 bits
 
 
 def test_damaged_profiles_never_end_in_anything_but_a_sentence(tmp_path):

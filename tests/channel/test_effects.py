@@ -133,7 +133,7 @@ def problem(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def setup(problem):
-    return Setup(problem.stage, problem.subject.shown(problem.subject.start()), problem.scene.draw("select", 4))
+    return Setup(problem.stage, problem.subject.appearance(problem.subject.start()), problem.scene.draw("select", 4))
 
 
 @pytest.fixture(scope="module")
@@ -186,7 +186,7 @@ def photographed(problem, conditions, shown) -> tuple[int, torch.Tensor]:
 @pytest.mark.parametrize("effect", SWITCHED, ids=lambda effect: effect.name)
 def test_the_short_way_to_small_pictures_knows_every_effect(problem, effect, monkeypatch):
     """Where each pixel is developed alone, only the piece's are developed anew; alone, each effect looks the same."""
-    shown = problem.subject.shown(problem.subject.start())
+    shown = problem.subject.appearance(problem.subject.start())
     conditions = problem.scene.draw("select", 4)
     for other in SWITCHED:
         if other not in (effect, EFFECT_BY_NAME["ambient light"]):
@@ -224,7 +224,7 @@ def test_windows_hold_all_that_a_design_changes(problem, effect):
         if other not in (effect, EFFECT_BY_NAME["ambient light"]):
             conditions = without_effect(conditions, other, lambda azimuth_deg, elevation_deg: np.ones(6)) or conditions
     designs = [torch.full_like(problem.subject.start(), value) for value in (0.0, 1.0)]
-    black, white = (problem.subject.shown(design) for design in designs)
+    black, white = (problem.subject.appearance(design) for design in designs)
     views = render_views(problem.stage, black, conditions, (96, 96))
     windows = affected_windows(views)
     if effect.name == "JPEG":

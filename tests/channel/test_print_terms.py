@@ -41,7 +41,7 @@ def test_print_terms_let_gradients_pass(tmp_path):
     problem = set_problem(scene)
     design = torch.tensor(np.random.default_rng(4).random(tuple(problem.subject.start().shape)), dtype=torch.float32)
     design.requires_grad_()
-    shown = problem.subject.shown(design)
+    shown = problem.subject.appearance(design)
     pictures = expose(problem.see(shown, scene.draw("train", 2), 192), shown, jpeg=False)
     (gradient,) = torch.autograd.grad(pictures.mean(), design)
     free = ~torch.tensor(marker_image(problem.patch.scene.piece, problem.patch.design_px)[1])
@@ -53,7 +53,7 @@ def test_the_plan_names_each_print_term_and_takes_it_out(tmp_path):
     names = {"dot gain", "ink density", "printed black", "print scale"}
     for tables, off in (({"printer__scale": [0.95, 1]}, set()), ({}, {"print scale"})):
         problem = set_problem(scene_with(tmp_path, **tables))
-        shown = problem.subject.shown(problem.subject.start())
+        shown = problem.subject.appearance(problem.subject.start())
         setup = Setup(problem.stage, shown, problem.scene.draw("select", 4))
         terms = {t.name: t for t in scene_terms(problem, problem.subject.start(), None) if t.name in names}
         assert set(terms) == names

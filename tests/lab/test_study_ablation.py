@@ -24,7 +24,7 @@ def problem(tmp_path_factory):
 
 
 def seen(problem):
-    return problem.see(problem.subject.shown(problem.subject.start()), problem.scene.draw("train", 4), 96)
+    return problem.see(problem.subject.appearance(problem.subject.start()), problem.scene.draw("train", 4), 96)
 
 
 def test_views_are_seen_without_the_effect_and_otherwise_alike(problem):
@@ -41,14 +41,14 @@ def test_without_the_printer_colors_are_shown_as_they_are_sent(problem):
     subject = without(problem, PRINTER).subject
     green = torch.tensor([0.0, 1.0, 0.0])
     design = green[:, None, None].expand_as(subject.start())
-    srgb = subject.shown(design).srgb
+    srgb = subject.appearance(design).srgb
     middle = srgb[srgb.shape[0] // 2, srgb.shape[1] // 2]
     assert middle.tolist() == pytest.approx(green.tolist(), abs=1e-3)
     assert load_printer("coated").apply(design[None])[0, :, 5, 5].tolist() != pytest.approx(green.tolist(), abs=0.1)
 
 
 def test_views_without_it_are_looked_at_in_the_same_way(problem):
-    drawn, shown = problem.scene.draw("evaluate", 2), problem.subject.shown(problem.subject.start())
+    drawn, shown = problem.scene.draw("evaluate", 2), problem.subject.appearance(problem.subject.start())
     less = without(problem, "noise")
     for side_px in (problem.training_px, problem.figure_px):
         by_hand = problem.see(shown, with_values(drawn, noise=0.0), side_px)

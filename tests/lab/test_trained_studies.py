@@ -205,7 +205,7 @@ def test_the_mean_color_of_an_object_of_one_color_is_that_color(tmp_path):
     written(tmp_path, "carton")
     problem = set_problem(load_scene(tmp_path / "texture.toml"))
     design = torch.tensor([200, 100, 30]).view(3, 1, 1) / 255 * torch.ones_like(problem.subject.start())
-    assert mean_color(problem, problem.subject.shown(design), 4, 64) == (200, 100, 30)
+    assert mean_color(problem, problem.subject.appearance(design), 4, 64) == (200, 100, 30)
 
 
 def test_fixed_views_keep_their_pose_and_change_their_light(tmp_path):

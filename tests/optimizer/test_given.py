@@ -19,7 +19,7 @@ from patchproof.base.geometry import apply_homography, rect_corners
 from patchproof.channel.printer import load_printer
 from patchproof.optimizer import imported_design
 from patchproof.optimizer import run as run_module
-from patchproof.optimizer.imported_design import fit, import_folder, import_patch
+from patchproof.optimizer.imported_design import fit_to_piece, import_folder, import_patch
 from patchproof.optimizer.promise import PromiseOptions
 from patchproof.optimizer.run import load_run
 from patchproof.report.coco import PATCH
@@ -137,7 +137,7 @@ def _sides(a: list[float], b: list[float]) -> list[tuple[float, float, float, fl
 @pytest.mark.parametrize(("width", "height"), [(102, 100), (32, 32), (1024, 1024)])
 def test_the_last_pictures_that_fit(tmp_path, width, height):
     picture = noise(width, height)
-    assert fit(picture, scene_with(tmp_path)) is picture
+    assert fit_to_piece(picture, scene_with(tmp_path)) is picture
 
 
 @pytest.mark.parametrize(
@@ -154,14 +154,14 @@ def test_the_last_pictures_that_fit(tmp_path, width, height):
 )
 def test_the_first_pictures_that_do_not(tmp_path, width, height, sentence):
     with pytest.raises(Refused, match=sentence):
-        fit(noise(width, height), scene_with(tmp_path))
+        fit_to_piece(noise(width, height), scene_with(tmp_path))
 
 
 def test_a_picture_made_smaller_keeps_its_light(tmp_path):
     """Black and white columns: half the light is code 188, half the code values would be 128."""
     columns = np.zeros((2048, 2048, 3), np.uint8)
     columns[:, ::2] = 255
-    smaller = fit(columns, scene_with(tmp_path))
+    smaller = fit_to_piece(columns, scene_with(tmp_path))
     assert smaller.shape == (1024, 1024, 3) and (smaller == 188).all()
 
 
@@ -178,7 +178,7 @@ def test_pictures_are_read_like_photographs(tmp_path, kind):
         picture = np.where(clear[..., 3:] == 255, picture, np.uint8(255))
     else:
         cv2.imwrite(str(path), picture[..., ::-1].astype(np.uint16) * 257)
-    assert (imported_design._read(path)[2] == picture).all()
+    assert (imported_design._read_picture(path)[2] == picture).all()
 
 
 def test_gamut_is_the_printers_own_table(tmp_path):

@@ -109,7 +109,7 @@ def test_the_gradient_through_printer_scene_and_camera_is_a_difference_of_losses
     conditions = problem.scene.draw("train", 4)
 
     def loss(design):
-        pictures = photograph(problem.stage, problem.subject.shown(design), conditions, (32, 32))
+        pictures = photograph(problem.stage, problem.subject.appearance(design), conditions, (32, 32))
         network = problem.classifiers[0]
         return problem.losses(network, network.logits(pictures), (0,)).mean()
 
@@ -183,7 +183,7 @@ def test_networks_that_answer_nan_or_infinity_are_refused_and_large_answers_are_
         with pytest.raises(Refused, match="finite logits, got NaN or infinity from the network"):
             take_step(spoiled(problem, spoil), begin, drawn)
         with pytest.raises(Refused, match="finite logits"):
-            responses(spoiled(problem, spoil), {"design": problem.subject.shown(begin.design)}, drawn)
+            responses(spoiled(problem, spoil), {"design": problem.subject.appearance(begin.design)}, drawn)
     with pytest.raises(Refused, match="finite gradients, got nan in step 1"):
         take_step(spoiled(problem, lambda logits: logits + (logits - logits.detach()).sqrt()), begin, drawn)
 
@@ -201,7 +201,7 @@ def test_steps_whose_views_show_no_patch_change_nothing(tmp_path):
     problem = set_problem(scene)
     behind = scene.draw("train", 4)
     behind = with_values(behind, azimuth_deg=180.0)
-    shown = problem.subject.shown(start(problem).design.requires_grad_())
+    shown = problem.subject.appearance(start(problem).design.requires_grad_())
     seen = problem.see(shown, behind, problem.training_px)
     assert len(seen.piece.pixel) == 0
     step = take_step(problem, start(problem), behind)
@@ -292,8 +292,8 @@ def test_the_same_seed_gives_the_same_bytes_and_another_does_not(tmp_path, few_v
     ("models", "step_size", "says"),
     [
         ("red_against_blue", 0.005, None),
-        ("red_against_blue", 0.00125, "it began as: give it more optimize.steps or a larger optimize.step_size"),
-        ("corner", 0.1, "it began as: no network's answer depends on it"),
+        ("red_against_blue", 0.00125, "its start: give it more optimize.steps or a larger optimize.step_size"),
+        ("corner", 0.1, "its start: no network's answer depends on it"),
     ],
 )
 def test_a_design_that_never_moved_is_said_to_be_none(tmp_path, few_views, models, step_size, says):
@@ -304,7 +304,7 @@ def test_a_design_that_never_moved_is_said_to_be_none(tmp_path, few_views, model
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         promise = optimize_scene(scene, tmp_path / "run", promise=PromiseOptions(controls=("gray",))).promise
-    told = [str(one.message) for one in caught if "began as" in str(one.message)]
+    told = [str(one.message) for one in caught if "its start" in str(one.message)]
     assert told == [] if says is None else says in told[0]
     low, high = promise.controls["gray"].difference_interval
     assert says is None or low <= 0 <= high
@@ -426,8 +426,8 @@ def test_an_odd_view_counts_as_much_as_those_that_are_seen_together(tmp_path):
 def test_controls_beside_some_views_are_those_of_these_views_and_the_design_keeps_its_order(tmp_path):
     problem = set_problem(scene_with(tmp_path))
     drawn, beside = problem.scene.draw("promise", 7), np.array([0, 1, 0, 0, 1, 1, 0], bool)
-    shown = {"design": problem.subject.shown(start(problem).design), "bare": None}
-    whole, part = responses(problem, shown, drawn), responses(problem, shown, drawn, beside=beside)
+    shown = {"design": problem.subject.appearance(start(problem).design), "bare": None}
+    whole, part = responses(problem, shown, drawn), responses(problem, shown, drawn, control_mask=beside)
     np.testing.assert_allclose(part["design"].loss, whole["design"].loss, rtol=1e-4)
     np.testing.assert_allclose(part["bare"].loss, whole["bare"].loss[:, beside], rtol=1e-4)
     assert len(np.unique(whole["design"].loss)) == 7
@@ -444,8 +444,8 @@ def test_a_session_is_seen_by_one_process_but_for_the_last_ones(tmp_path, monkey
     monkeypatch.setattr(Workers, "map", kept)
     problem = set_problem(scene_with(tmp_path, camera__photo_px=[96, 96]))
     drawn, beside = problem.scene.draw("promise", 32, per_session=4), np.arange(32) % 4 < 2
-    shown = {"design": problem.subject.shown(start(problem).design), "bare": None}
-    responses(problem, shown, drawn, beside=beside, advance=lambda *count: counts.append(count))
+    shown = {"design": problem.subject.appearance(start(problem).design), "bare": None}
+    responses(problem, shown, drawn, control_mask=beside, advance=lambda *count: counts.append(count))
     rows = [np.concatenate([part.rows for part in task]) for task in tasks]
     assert sorted(np.concatenate(rows)) == list(range(32)) and [len(each) for each in rows] == [8, 8, 8, 4, 4]
     assert all(len({*each // 4}) == 2 for each in rows), "two sessions each"

@@ -90,7 +90,7 @@ def searched():
     load_classifier(classifier, Path())
     doubting, network.passes = network.passes, 0  # whether the network can be trusted is asked first
     with pytest.MonkeyPatch.context() as patch:
-        for name, count in (("PASSES", 200), ("PLACES", 12), ("TURNED", 2), ("HELD_OUT_VIEWS", 8)):
+        for name, count in (("MAX_PASSES", 200), ("SCREENED_PLACES", 12), ("TURNED_PLACES", 2), ("HELD_OUT_VIEWS", 8)):
             patch.setattr(place_search, name, count)
         place = choose_place(open_scene(), models=[classifier])
     return place, network.passes - doubting
@@ -107,7 +107,7 @@ def test_the_place_is_where_the_network_looks():
 
 
 def test_another_side_is_chosen_where_the_views_show_it_better(monkeypatch):
-    for name, count in (("PASSES", 120), ("PLACES", 8), ("TURNED", 1), ("HELD_OUT_VIEWS", 8)):
+    for name, count in (("MAX_PASSES", 120), ("SCREENED_PLACES", 8), ("TURNED_PLACES", 1), ("HELD_OUT_VIEWS", 8)):
         monkeypatch.setattr(place_search, name, count)
     scene = open_scene(mesh=trimesh.creation.box((300, 300, 300)), view__azimuth_deg=[65, 75])
     assert choose_place(scene).at[0] == 150  # azimuth 90 faces +x where 0 faces +z
@@ -191,18 +191,18 @@ def test_the_search_counts_its_passes_and_keeps_to_a_quarter_of_a_run():
     assert place.passes == passes and place.run_share == place.passes / default_run_passes()
     assert 200 - 3 * 2 * place_search.DRAFT_VIEWS < place.passes <= 200
     screens = (
-        place_search.PLACES + 3 * place_search.TURNED
+        place_search.SCREENED_PLACES + 3 * place_search.TURNED_PLACES
     ) * 2 * place_search.SCREEN_VIEWS + place_search.SCREEN_VIEWS
     drafts = (
-        place_search.DRAFTS * (18 * 2 * place_search.DRAFT_VIEWS + place_search.HELD_OUT_VIEWS)
+        place_search.DRAFTED_PLACES * (18 * 2 * place_search.DRAFT_VIEWS + place_search.HELD_OUT_VIEWS)
         + place_search.HELD_OUT_VIEWS
     )
-    assert screens + drafts <= place_search.PASSES <= default_run_passes() / 4
+    assert screens + drafts <= place_search.MAX_PASSES <= default_run_passes() / 4
     assert default_run_passes() == 240 * 4 * 2 + 4 * 64 + 200 + 4 * 100
 
 
 def test_a_single_place_needs_no_runner_up(monkeypatch, a_small_search):
-    monkeypatch.setattr(place_search, "PLACES", 1)
+    monkeypatch.setattr(place_search, "SCREENED_PLACES", 1)
     place = choose_place(open_scene(patch__search={"upright": True}))
     assert place.lead is None and len(place.candidates) == 1
     assert "the only place" in place_lines(place)[1]
@@ -277,7 +277,7 @@ def test_a_run_keeps_its_place_and_neither_loads_nor_resumes_by_searching(tmp_pa
     (out / "run.json").unlink()
     again = pp.optimize(path, out, resume=True)
     assert again.scene.sheet_id == first.scene.sheet_id and (out / "design.png").read_bytes() == design
-    with pytest.raises(Refused, match="Expected the place of this scene and seed, got one of another"):
+    with pytest.raises(Refused, match="Expected the place of this scene and seed, got a place of sheet"):
         pp.optimize(scene_file(tmp_path, width_mm=50), out, resume=True)
     (out / "place.json").write_text("{")
     with pytest.raises(Refused, match="Expected the record of a search"):

@@ -21,7 +21,7 @@ from patchproof.optimizer.promise import (
     SETTLED,
     VIEWS_PER_SESSION,
     PromiseOptions,
-    _looks,
+    _look_positions,
     control_claims,
     make_promise,
 )
@@ -116,7 +116,7 @@ def held(runs, rate, correlation, looks, half_width=0.05, seed=3):
 
 
 def test_stopping_leaves_the_interval_its_level():
-    share, views = held(120, 0.9, 0.3, _looks(400, VIEWS_PER_SESSION)[1:])
+    share, views = held(120, 0.9, 0.3, _look_positions(400, VIEWS_PER_SESSION)[1:])
     assert share >= 0.92 and views < 360
 
 
@@ -175,7 +175,7 @@ if __name__ == "__main__":  # the figures beside `promise._looks`
     cases = (0.85, 0.1), (0.9, 0.3), (0.92, 0.1), (0.95, 0.1), (0.95, 0.3), (0.97, 0.3), (0.98, 0.1), (0.99, 0.05)
     for rate, correlation in cases:
         told = [f"rate {rate}, correlation {correlation}:"]
-        for looks in ([400], _looks(400, VIEWS_PER_SESSION)[1:], [160, 240, 320, 400]):
+        for looks in ([400], _look_positions(400, VIEWS_PER_SESSION)[1:], [160, 240, 320, 400]):
             share, views = held(1000, rate, correlation, looks, 0.04)
             told.append(f"looks after {looks}: {share:.1%} held, {views:.0f} views;")
         print(*told, flush=True)

@@ -135,11 +135,11 @@ def test_gray_is_where_a_gray_start_starts_and_the_original_elsewhere(tmp_path):
     problem = set_problem(load_scene(scene_file(tmp_path, "masked")))
     design = problem.subject.start()
     assert design.shape == (3, 1, 32 * 32) and torch.equal(design, torch.full_like(design, 128 / 255))
-    shown = problem.subject.shown(design).srgb
+    shown = problem.subject.appearance(design).srgb
     both, paint = given(problem.scene.canvas)
     assert torch.equal(shown[1 - paint], torch.tensor(both[1 - paint], dtype=torch.float32) / 255)
     problem = set_problem(load_scene(scene_file(tmp_path, "texture")))
-    for texture, was in zip(problem.subject.shown(problem.subject.start()).srgb, both, strict=True):
+    for texture, was in zip(problem.subject.appearance(problem.subject.start()).srgb, both, strict=True):
         assert torch.equal(texture, torch.tensor(was, dtype=torch.float32) / 255)
 
 
@@ -147,7 +147,7 @@ def test_the_ball_holds_whatever_a_step_asks_for(tmp_path):
     problem = set_problem(load_scene(scene_file(tmp_path, "texture")))
     begun = problem.subject.pixels(problem.subject.start()).astype(int)
     for step in (-1.0, -0.099, 0.0999, 1.0):
-        clipped = problem.subject.clipped(problem.subject.start() + step)
+        clipped = problem.subject.clip(problem.subject.start() + step)
         difference = problem.subject.pixels(clipped) - begun
         assert abs(difference).max() == 25 and (np.sign(difference) == np.sign(step)).all()
 
@@ -161,7 +161,7 @@ def test_the_gradient_of_a_texture_is_a_difference_of_pictures(tmp_path):
 
     def value(design):
         return (
-            weight * photograph(problem.stage, problem.subject.shown(design), conditions, (96, 96), jpeg=False)
+            weight * photograph(problem.stage, problem.subject.appearance(design), conditions, (96, 96), jpeg=False)
         ).sum()
 
     design = problem.subject.start().requires_grad_()
@@ -210,7 +210,7 @@ def test_the_object_in_the_file_is_the_object_that_was_optimized(tmp_path):
     """object.glb read back and photographed bare, against the run's textures shown on the scene's own mesh."""
     finished = optimize_scene(scene_file(tmp_path, "masked"), tmp_path / "run", promise=BESIDE_BARE)
     problem = set_problem(finished.scene)
-    shown = problem.subject.shown(from_pixels(finished.design))
+    shown = problem.subject.appearance(from_pixels(finished.design))
     scene = load_scene(scene_file(tmp_path, "texture", tmp_path / "run" / "object.glb"))
     conditions = finished.scene.draw("promise", 4)
     read_back = photograph(set_stage(scene), None, conditions, (96, 96))

@@ -17,7 +17,7 @@ from torch.nn.functional import avg_pool2d
 
 from patchproof.base import geometry
 from patchproof.base.errors import Refused
-from patchproof.optimizer.problem import FIGURED, set_problem
+from patchproof.optimizer.problem import FIGURE_SAMPLING, set_problem
 from patchproof.photo.detect import find_markers
 from patchproof.render import photograph as photograph_module
 from patchproof.render.photograph import affected_windows, expose, photograph, shade
@@ -477,7 +477,7 @@ def test_figures_look_at_a_piece_in_fewer_taps_than_photographs_and_see_nearly_t
     generator = torch.Generator().manual_seed(2)
     shown = PiecePicture.of(torch.rand(400, 400, 3, generator=generator))  # finer than any print: the worst case
     conditions, side = problem.scene.draw("promise", 2), (problem.figure_px,) * 2
-    looks = FIGURED, replace(FIGURED, piece_taps=PHOTO_SAMPLING.piece_taps)
+    looks = FIGURE_SAMPLING, replace(FIGURE_SAMPLING, piece_taps=PHOTO_SAMPLING.piece_taps)
     few, many = (render_views(problem.stage, shown, conditions, side, look) for look in looks)
     of_few, of_many = (sum(group.weight.numel() for group in views.on_piece.texels.groups) for views in (few, many))
     assert of_few < 0.6 * of_many

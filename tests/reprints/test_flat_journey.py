@@ -185,7 +185,7 @@ def true_homography(journey: Journey, i: int) -> np.ndarray:
 def composites(journey: Journey, design: np.ndarray) -> np.ndarray:
     """N×H×W×3 sRGB: a design pasted into every photograph as it was taken."""
     problem, scene = set_problem(journey.run.scene), journey.run.scene
-    shown = problem.subject.shown(from_pixels(design, "cpu"))
+    shown = problem.subject.appearance(from_pixels(design, "cpu"))
     conditions = as_taken(scene, PHOTOS)
     with torch.no_grad():
         parts = [photograph(problem.stage, shown, conditions[i : i + 1], PHOTO_PX, jpeg=False) for i in range(PHOTOS)]

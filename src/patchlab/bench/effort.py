@@ -104,7 +104,7 @@ def _timed_run(scene: Scene, views: int | None) -> tuple[Run, float]:
 def _missed(runs: dict[str, Run], judged: int) -> dict[str, Estimate]:
     """By name the share of the same fresh views in which each run's design is not recognized."""
     problem = set_problem(next(iter(runs.values())).scene)
-    shown = {name: problem.subject.shown(from_pixels(run.design), "design") for name, run in runs.items()}
+    shown = {name: problem.subject.appearance(from_pixels(run.design), "design") for name, run in runs.items()}
     answers = responses(problem, shown, problem.scene.draw("evaluate", judged))
     missed = {name: rate([not hit for hit in answer.recognized[0]]) for name, answer in answers.items()}
     return {name: estimate for name, estimate in missed.items() if estimate is not None}

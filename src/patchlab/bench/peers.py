@@ -79,7 +79,7 @@ def run(settings: PeersSettings, base: Path, cell: Cell) -> dict[str, Any]:
     pixels = {name: design.pixels for name, (design, _) in made.items()}
     controls = pictures_with_controls(problem, pixels["ours"], CONTROLS)
     things = {name: controls[name] for name in CONTROLS}
-    things |= {name: problem.subject.shown(from_pixels(each, problem.device)) for name, each in pixels.items()}
+    things |= {name: problem.subject.appearance(from_pixels(each, problem.device)) for name, each in pixels.items()}
     conditions = problem.scene.draw("evaluate", settings.n)
     view = conditions[problem.scene.facing(conditions)][:1]
     hung = [photographs(problem, things[name], view, _TILE_PX)[0] for name in pixels]

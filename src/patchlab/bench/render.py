@@ -18,7 +18,7 @@ from patchproof.base.intervals import student_mean
 from patchproof.base.output import image_pixels
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import Problem
-from patchproof.optimizer.responses import ask
+from patchproof.optimizer.responses import ask_networks
 from patchproof.render.photograph import expose
 from patchproof.render.pixels import PiecePicture
 from patchproof.report.tables import Table
@@ -36,18 +36,18 @@ def charts(quick: bool, progress: Progress) -> Iterator[Chart]:
 
 def resolution_chart(problem: Problem, trained: Tensor, views: int, rounds: int, progress: Progress) -> Chart:
     """Sides at which views are rendered against whole photographs of the same conditions, JPEG files and all."""
-    shown = problem.patch.shown(trained)
+    shown = problem.patch.appearance(trained)
     conditions, (classifier,), (indices,) = problem.scene.draw("select", views), problem.classifiers, problem.indices
 
     def pictures(side: int, picture: PiecePicture, part: Conditions) -> Tensor:
         return expose(problem.see(picture, part, side), picture)
 
     def confidence(photos: Tensor) -> np.ndarray:
-        return ask(problem, photos, None).confidence[0]
+        return ask_networks(problem, photos, None).confidence[0]
 
     def step(side: int) -> None:
         design = trained.clone().requires_grad_()
-        logits = classifier.logits(pictures(side, problem.patch.shown(design), conditions[:8]))
+        logits = classifier.logits(pictures(side, problem.patch.appearance(design), conditions[:8]))
         torch.autograd.grad(problem.losses(classifier, logits, indices).mean(), design)
 
     sides, truth = sorted({*SIDES_PX, problem.training_px}), []

@@ -116,7 +116,7 @@ def shown_by_kind(problem: Problem, design: np.ndarray) -> dict[str, Appearance]
     with torch.no_grad():
         for kind in KINDS[1:]:
             pixels = design if kind == "patch" else problem.subject.control(kind, design)
-            shown[kind] = problem.subject.shown(from_pixels(pixels))
+            shown[kind] = problem.subject.appearance(from_pixels(pixels))
     return shown
 
 

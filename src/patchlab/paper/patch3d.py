@@ -145,7 +145,7 @@ def design_shares(scene: PatchScene, views: int = 256) -> np.ndarray:
 def things_of(problem: Problem, designs: Mapping[str, np.ndarray]) -> dict[str, Appearance]:
     """What hangs on the object, by `KINDS`."""
     things = pictures_with_controls(problem, designs["3d"], KINDS[:3])
-    things |= {"2d": problem.subject.shown(from_pixels(designs["2d"], problem.device)), "3d": things["design"]}
+    things |= {"2d": problem.subject.appearance(from_pixels(designs["2d"], problem.device)), "3d": things["design"]}
     return {kind: things[kind] for kind in KINDS}
 
 
@@ -155,7 +155,7 @@ def picture_of(problem: Problem, twin: Problem, designs: Mapping[str, np.ndarray
     for kind, worlds in (("2d", (twin, problem)), ("3d", (problem,))):
         tiles.append(enlarged(designs[kind], _TILE_PX))
         for world in worlds:
-            shown = world.subject.shown(from_pixels(designs[kind], world.device))
+            shown = world.subject.appearance(from_pixels(designs[kind], world.device))
             tiles.append(photographs(world, shown, world.scene.draw("evaluate", 1), _TILE_PX)[0])
     return contact_sheet([tiles])
 

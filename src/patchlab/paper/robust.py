@@ -66,7 +66,7 @@ def run(settings: RobustSettings, base: Path, cell: Cell) -> dict[str, Any]:
     subject = problem.subject
     design = best_design(trained_on(problem, cell))
     pixels = (subject.start(), from_pixels(design, problem.device))
-    things = {kind: subject.shown(each) for kind, each in zip(_KINDS, pixels, strict=True)}
+    things = {kind: subject.appearance(each) for kind, each in zip(_KINDS, pixels, strict=True)}
     suffix, content = subject.file(design)
     return {
         **answers_and_sheet(problem, cell.name, things, settings.n, (sides(problem, _SIDES), _SHEET_PX)),

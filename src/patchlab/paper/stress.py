@@ -45,7 +45,7 @@ from patchlab.study.study import Cell, Result, Study
 from patchproof.base.intervals import estimate_difference, paired_difference, rate
 from patchproof.base.validation import Share, StrictModel
 from patchproof.optimizer.problem import Problem
-from patchproof.optimizer.responses import Responses, ask, in_chunks, joined
+from patchproof.optimizer.responses import Responses, ask_networks, in_chunks, merge_responses
 from patchproof.report.tables import Drawing, Table
 from patchproof.scene.conditions import Conditions, fields_of, with_values
 
@@ -167,8 +167,8 @@ def _under(problem: Problem, conditions: Conditions, boxes: Sequence[Box | None]
     for part in in_chunks(conditions):
         pictures = _photographs(problem, part)
         around = problem.boxes(part)
-        parts.append({box: ask(problem, _blackened(pictures, box), around) for box in boxes})
-    return joined(parts)
+        parts.append({box: ask_networks(problem, _blackened(pictures, box), around) for box in boxes})
+    return merge_responses(parts)
 
 
 def _blackened(pictures: Tensor, box: Box | None) -> Tensor:

@@ -26,7 +26,7 @@ from patchproof.base.settings import SceneSettings
 from patchproof.base.validation import StrictModel
 from patchproof.channel.effects import EFFECT_BY_NAME, EFFECTS
 from patchproof.optimizer.problem import Problem
-from patchproof.optimizer.responses import Responses, ask, in_chunks, joined, responses
+from patchproof.optimizer.responses import Responses, ask_networks, in_chunks, merge_responses, responses
 from patchproof.render.photograph import expose
 from patchproof.report.tables import Drawing
 from patchproof.scene.conditions import Conditions, conditions_from_fields, fields_of, with_values
@@ -131,8 +131,10 @@ def with_and_without(problem: Problem, conditions: Conditions) -> tuple[Response
         for part in in_chunks(conditions):
             views = problem.see(None, part, problem.figure_px)
             shown = {"clean": views, "alone": replace(views, object=None)}
-            parts.append({name: ask(problem, expose(each, None), problem.boxes(part)) for name, each in shown.items()})
-    answers = joined(parts)
+            parts.append(
+                {name: ask_networks(problem, expose(each, None), problem.boxes(part)) for name, each in shown.items()}
+            )
+    answers = merge_responses(parts)
     return answers["clean"], answers["alone"]
 
 

@@ -63,7 +63,7 @@ def trained_cells(
 
 def trained_on(problem: Problem, cell: Cell) -> Problem:
     """The same problem before the networks that train."""
-    return problem.before([cell.values["networks"].index(name) for name in cell.values["trained"]])
+    return problem.with_classifiers([cell.values["networks"].index(name) for name in cell.values["trained"]])
 
 
 def answers_and_sheet(

@@ -40,7 +40,7 @@ from patchproof.optimizer.loop import best_design
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import Problem
 from patchproof.optimizer.promise import VIEWS_PER_SESSION
-from patchproof.optimizer.responses import ask, joined, responses
+from patchproof.optimizer.responses import ask_networks, merge_responses, responses
 from patchproof.render.photograph import Appearance
 from patchproof.render.pixels import PiecePicture
 from patchproof.render.views import Views, relight_and_replace_background
@@ -59,8 +59,8 @@ def _default_effects() -> tuple[str, ...]:
     """All effects that `plan` can switch off, in its order."""
     printed = (PRINTER, *(term.name for term in effect_terms("printer")))
     names = (*(term.name for term in effect_terms("light")), *printed, *(term.name for term in effect_terms("camera")))
-    joined = {name: group for group in _TOGETHER for name in group.split(" + ")}
-    return tuple(dict.fromkeys(joined.get(name, name) for name in names if name != _UNSEEN))
+    merge_responses = {name: group for group in _TOGETHER for name in group.split(" + ")}
+    return tuple(dict.fromkeys(merge_responses.get(name, name) for name in names if name != _UNSEEN))
 
 
 EFFECTS = _default_effects()
@@ -81,14 +81,14 @@ class Without(Problem):
 
     changes: tuple[Callable[[Setup], Setup | None], ...] = ()
 
-    def see(self, shown: Appearance, conditions: Conditions, side_px: int) -> Views:
+    def see(self, appearance: Appearance, conditions: Conditions, side_px: int) -> Views:
         """Views in which what is left out is as in the simpler model."""
-        setup = self._simpler(shown, conditions)
-        return Problem.see(replace(self, stage=setup.stage), shown, setup.conditions, side_px)
+        setup = self._simpler(appearance, conditions)
+        return Problem.see(replace(self, stage=setup.stage), appearance, setup.conditions, side_px)
 
     def see_again(self, views: Views, conditions: Conditions) -> Views:
         """As in `Problem`, and without what is left out, too."""
-        return relight_and_replace_background(views, self._simpler(self.laid_out, conditions).conditions)
+        return relight_and_replace_background(views, self._simpler(self.start_appearance, conditions).conditions)
 
     def _simpler(self, shown: Appearance, conditions: Conditions) -> Setup:
         setup = Setup(self.stage, shown, conditions)
@@ -104,7 +104,7 @@ def without(problem: Problem, effect: str) -> Problem:
     unknown = [name for name in names if name not in terms]
     if unknown:
         raise Refused("an effect that this kind of scene has", f'"{unknown[0]}"', "choose of " + ", ".join(terms))
-    setup = Setup(problem.stage, problem.subject.shown(problem.subject.start()), problem.scene.draw("select", 64))
+    setup = Setup(problem.stage, problem.subject.appearance(problem.subject.start()), problem.scene.draw("select", 64))
     on = [name for name in names if terms[name].change(setup) is not None]
     if not on:
         raise Refused(f"a scene with {effect} in it", "one where it is off", f"give {terms[names[0]].key} a range")
@@ -142,19 +142,19 @@ def run(settings: AblationSettings, base: Path, cell: Cell) -> dict[str, Any]:
     problem, effect = problem_of(base, cell.values), cell.values["effect"]
     simpler = problem if effect == ALL else without(problem, effect)
     design = best_design(simpler)
-    shown = problem.subject.shown(from_pixels(design, problem.device))
+    shown = problem.subject.appearance(from_pixels(design, problem.device))
     conditions = problem.scene.draw("evaluate", settings.n, per_session=VIEWS_PER_SESSION)
     answers = {"modeled": responses(problem, {"design": shown}, conditions)}
     if effect != ALL:
-        as_trained = simpler.subject.shown(from_pixels(design, problem.device))
+        as_trained = simpler.subject.appearance(from_pixels(design, problem.device))
         answers["promised"] = responses(simpler, {"design": as_trained}, conditions)
     if settings.photos:
         drawn = problem.scene.draw("reprint", settings.photos)
         piece = shown if isinstance(shown, PiecePicture) else None
         alone = [drawn[i : i + 1] for i in range(len(drawn))]
         photos = (photograph_traced(problem.stage, piece, each) for each in alone)
-        asked = (ask(problem, photo, problem.boxes(each)) for photo, each in zip(photos, alone, strict=True))
-        answers["path_traced"] = joined([{"design": answer} for answer in asked])
+        asked = (ask_networks(problem, photo, problem.boxes(each)) for photo, each in zip(photos, alone, strict=True))
+        answers["path_traced"] = merge_responses([{"design": answer} for answer in asked])
     return {world: recorded(some) for world, some in answers.items()}
 
 

@@ -24,7 +24,7 @@ from patchproof.base.progress import Progress, no_progress
 from patchproof.base.validation import summarize_names
 from patchproof.base.workers import open_workers
 from patchproof.classifier.network import Classifier
-from patchproof.optimizer.evaluate import forget, refuse_networks_in_memory, run_responses
+from patchproof.optimizer.evaluate import close_run, refuse_networks_in_memory, run_responses
 from patchproof.optimizer.promise import CONTROLS, PROMISE_VIEWS
 from patchproof.optimizer.responses import Responses
 from patchproof.optimizer.run import Run, load_run
@@ -87,7 +87,7 @@ def compare(
             order = sorted(loaded, key=partial(_reached, chosen_by, scene))[::-1]
             fresh = {name: ask(name, n) for name in order[:2]}
         finally:
-            forget()
+            close_run()
         results = Results(
             kind="comparison",
             name="designs",

@@ -1,7 +1,7 @@
-"""The checkpoint: all that the next step depends on, replaced whole.
+"""The checkpoint: everything that the next step depends on, replaced as a whole.
 
-In: a `State` and its problem. Out: `checkpoint.safetensors` in the run's folder, and the state read back. Tensors are
-compared with those of the problem's own start before memory is taken for them.
+In: a `State` and its problem. Out: `checkpoint.safetensors` in the run's folder, and the state read back. Sizes of
+tensors are compared with the problem's start before memory is taken for them.
 """
 
 from __future__ import annotations
@@ -31,35 +31,39 @@ def save_checkpoint(state: State, problem: Problem, out: Path) -> None:
     tensors |= {f"mean{level}": one for level, one in enumerate(state.mean)}
     tensors |= {f"square{level}": one for level, one in enumerate(state.square)}
     tensors = {name: tensor.cpu().contiguous().clone() for name, tensor in tensors.items()}
-    # the loss as text keeps every bit; the sheet id tells whose checkpoint this is
+    # text keeps every bit of the loss; the sheet id identifies scene and seed
     note = {"number": state.number, "best_loss": state.best_loss.hex(), "sheet_id": problem.scene.sheet_id}
-    # one key: safetensors writes several in an order of its own
+    # a single key, since safetensors writes several in undefined order
     metadata = {"state": json.dumps(note)}
     write_atomically(out / CHECKPOINT_FILE, lambda path: save_file(tensors, path, metadata=metadata))
 
 
 def load_checkpoint(out: Path, problem: Problem) -> State:
-    """The checkpoint's state, or the start where there is none; refused where it belongs to another scene or seed."""
-    path, begin = out / CHECKPOINT_FILE, start(problem)
+    """The checkpoint's state, or the start where there is no checkpoint; refused where scene or seed differ."""
+    path, start_state = out / CHECKPOINT_FILE, start(problem)
     if not is_file(path):
-        return begin
+        return start_state
     from safetensors import SafetensorError, safe_open
 
     try:
         with safe_open(path, framework="pt", device=str(problem.device)) as file:
             note = _Note.model_validate_json((file.metadata() or {})["state"])
             if note.sheet_id != problem.scene.sheet_id:
-                do = "resume with the same scene file and seed, or start anew in another folder"
-                raise Refused("the checkpoint of this scene and seed", f"one of another in {out}", do)
-            design, best = _tensor(file, "design", begin.design), _tensor(file, "best", begin.design)
-            mean = tuple(_tensor(file, f"mean{n}", level) for n, level in enumerate(begin.mean))
-            square = tuple(_tensor(file, f"square{n}", level) for n, level in enumerate(begin.square))
+                do = "resume with the same scene file and seed, or start in another folder"
+                raise Refused(
+                    "the checkpoint of this scene and seed",
+                    f"a checkpoint of sheet {note.sheet_id} in {out}, not {problem.scene.sheet_id}",
+                    do,
+                )
+            design, best = _tensor(file, "design", start_state.design), _tensor(file, "best", start_state.design)
+            mean = tuple(_tensor(file, f"mean{n}", level) for n, level in enumerate(start_state.mean))
+            square = tuple(_tensor(file, f"square{n}", level) for n, level in enumerate(start_state.square))
         return State(note.number, design, mean, square, best, float.fromhex(note.best_loss))
     except Refused:
         raise
     except (SafetensorError, OSError, LookupError, ValueError, ArithmeticError) as error:
         got = f"{path} that cannot be read ({str(error)[:100]})"
-        raise Refused("a checkpoint", got, "start anew in another folder") from error
+        raise Refused("a checkpoint", got, "start in another folder") from error
 
 
 class _Note(StrictModel):
@@ -68,11 +72,11 @@ class _Note(StrictModel):
     sheet_id: str
 
 
-def _tensor(file: Any, name: str, like: torch.Tensor) -> torch.Tensor:
-    """The tensor of that name, if it is as large as another, and all numbers."""
-    if file.get_slice(name).get_shape() != list(like.shape):
-        raise ValueError(f"{name} of another size")
+def _tensor(file: Any, name: str, start: torch.Tensor) -> torch.Tensor:
+    """The tensor of that name; refused unless it has the size and type of `like` and is finite."""
+    if file.get_slice(name).get_shape() != list(start.shape):
+        raise ValueError(f"{name} of another size than the scene's design")
     tensor = file.get_tensor(name)
-    if tensor.dtype != like.dtype or not bool(torch.isfinite(tensor).all()):
-        raise ValueError(f"{name} with other values")
-    return tensor.clone()  # the file's own memory is mapped, and Windows does not replace a file that is
+    if tensor.dtype != start.dtype or not bool(torch.isfinite(tensor).all()):
+        raise ValueError(f"{name} of type {tensor.dtype} or with infinite values")
+    return tensor.clone()  # the file's memory is mapped, and Windows does not replace mapped files

@@ -1,8 +1,8 @@
-"""Evaluate a run again: fresh conditions, its controls, and networks it was not optimized with.
+"""Evaluate a run on fresh conditions, with its controls, also with networks it was not optimized for.
 
-In: a run. Out: RUN/evaluate.json with, per network, rate, confidence and paired differences to each control, of a
+In: a run. Out: RUN/evaluate.json with, per network, rate, confidence and paired differences to each control, for a
 detector also its average precision. Conditions come from the evaluate stream, which neither training nor the promise
-has seen. They are seen a few at a time, by this process or by others, each of which opens the run for itself.
+uses. They are evaluated a few at a time, by this process or by others, each of which opens the run for itself.
 """
 
 from __future__ import annotations
@@ -26,19 +26,19 @@ from patchproof.classifier.average_precision import Detection, average_precision
 from patchproof.classifier.network import Classifier, center_square
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.optimizer.promise import CONTROLS, PROMISE_VIEWS, control_claims, model_claims, pictures_with_controls
-from patchproof.optimizer.responses import CHUNK_VIEWS, Responses, in_chunks, joined, responses
+from patchproof.optimizer.responses import CHUNK_VIEWS, Responses, in_chunks, merge_responses, responses
 from patchproof.optimizer.run import Run, load_run
 from patchproof.render.photograph import Appearance, expose
 from patchproof.scene.conditions import Conditions
 from patchproof.sheets.manifest import ControlClaim, ModelClaim
 
 NetworkChoice = tuple[str | Classifier, ...] | None
-DetectionsByKind = dict[str, dict[str, list[Detection]]]  # by detector and what is shown
+DetectionsByKind = dict[str, dict[str, list[Detection]]]  # by detector, and by "design" or control
 
 
 class ModelEvaluation(ModelClaim):
-    """One network's rate and confidence of the design, its controls by kind, and a detector's average precision (at an
-    overlap of 0.5) by what is shown: "design" or a control.
+    """One network's rate and confidence for the design, its controls by kind, and a detector's average precision (at an
+    overlap of 0.5) for "design" and each control.
     """
 
     controls: dict[str, ControlClaim]
@@ -64,7 +64,7 @@ class Evaluation(StrictModel):
         """Return the text of evaluate.json."""
         models = {name: each.model_dump(exclude={"name"}) for name, each in self.models.items()}
         for each in models.values():
-            if each["ap50"] is None:  # of networks that are no detectors
+            if each["ap50"] is None:  # of classifiers
                 del each["ap50"]
         return json.dumps({"n": self.n, "seed": self.seed, "models": models}, indent=1) + "\n"
 
@@ -99,30 +99,28 @@ def evaluate(
         do = "add --overwrite, or rename it to keep it"
         raise Refused("a run that was not evaluated yet", f"{folder / 'evaluate.json'}, which exists", do)
     with open_workers(compute.jobs, compute.cluster) as workers:
-        run, problem = _opened(folder, networks, compute.device)
+        run, problem = _open_run(folder, networks, compute.device)
         conditions, advance = run.scene.draw("evaluate", n, seed), partial(progress, "evaluate")
-        answers, shown = run_responses(folder, conditions, workers, networks, compute.device, advance)
-    forget()
-    evaluated = {}
-    for i, claim in enumerate(model_claims(problem, answers["design"])):
+        responses_by_kind, detections = run_responses(folder, conditions, workers, networks, compute.device, advance)
+    close_run()
+    evaluations = {}
+    for i, claim in enumerate(model_claims(problem, responses_by_kind["design"])):
         ap50 = None
-        if found := [part[claim.name] for part in shown if claim.name in part]:
-            ap50 = {kind: average_precision([f for part in found for f in part[kind]], n) for kind in found[0]}
-        controls = control_claims(answers, i)
-        evaluated[claim.name] = ModelEvaluation(**claim.model_dump(), controls=controls, ap50=ap50)
-    result = Evaluation(n=n, seed=run.scene.seed if seed is None else seed, models=evaluated)
+        if parts := [part[claim.name] for part in detections if claim.name in part]:
+            ap50 = {kind: average_precision([f for part in parts for f in part[kind]], n) for kind in parts[0]}
+        controls = control_claims(responses_by_kind, i)
+        evaluations[claim.name] = ModelEvaluation(**claim.model_dump(), controls=controls, ap50=ap50)
+    result = Evaluation(n=n, seed=run.scene.seed if seed is None else seed, models=evaluations)
     write_atomically(run.folder / "evaluate.json", result.to_json())
     return result
 
 
 def refuse_networks_in_memory(networks: NetworkChoice, compute: Compute) -> None:
     """Refuse networks in memory where other processes do the work."""
-    if (compute.jobs > 1 or compute.cluster is not None) and any(
-        isinstance(network, Classifier) for network in networks or ()
-    ):
-        raise Refused(
-            "networks that other processes load by name", "one in memory", "leave jobs and cluster out of Compute"
-        )
+    in_memory = [network.name for network in networks or () if isinstance(network, Classifier)]
+    if in_memory and (compute.jobs > 1 or compute.cluster is not None):
+        got = f"{in_memory[0]}, a network in memory"
+        raise Refused("networks that other processes load by name", got, "leave jobs and cluster out of Compute")
 
 
 def run_responses(
@@ -133,51 +131,51 @@ def run_responses(
     device: str = "cpu",
     advance: Advance = no_advance,
 ) -> tuple[dict[str, Responses], list[DetectionsByKind]]:
-    """What the networks answer to the design of the run in an absolute folder, and to its controls, under the
-    conditions; and what detectors find, some conditions at a time.
+    """The networks' responses to the design of the run in an absolute folder, and to its controls, under the
+    conditions; and the detections of detectors, one dictionary per chunk of conditions.
     """
-    show, n = partial(_show, folder, networks, device), len(conditions)
-    shown = workers.map(show, in_chunks(conditions), lambda done, _: advance(min(done * CHUNK_VIEWS, n), n))
-    return joined([answers for answers, _ in shown]), [found for _, found in shown]
+    respond, n = partial(_chunk_responses, folder, networks, device), len(conditions)
+    chunks = workers.map(respond, in_chunks(conditions), lambda done, _: advance(min(done * CHUNK_VIEWS, n), n))
+    return merge_responses([by_kind for by_kind, _ in chunks]), [detections for _, detections in chunks]
 
 
-def forget() -> None:
-    """Let go of the run that `run_responses` has open in this process."""
-    _opened.cache_clear()
+def close_run() -> None:
+    """Drop the run that `run_responses` keeps open in this process."""
+    _open_run.cache_clear()
 
 
 @lru_cache(maxsize=1)
-def _opened(folder: Path, models: NetworkChoice, device: str) -> tuple[Run, Problem]:
-    """A run and its problem, once in each process."""
+def _open_run(folder: Path, models: NetworkChoice, device: str) -> tuple[Run, Problem]:
+    """The run and its problem, loaded once in each process."""
     run = load_run(folder)
     return run, set_problem(run.scene, device, models)
 
 
-def _show(
+def _chunk_responses(
     folder: Path, models: NetworkChoice, device: str, conditions: Conditions
 ) -> tuple[dict[str, Responses], DetectionsByKind]:
-    run, problem = _opened(folder, models, device)
-    shown = pictures_with_controls(problem, run.design, CONTROLS)
-    return responses(problem, shown, conditions), _found(problem, shown, conditions)
+    run, problem = _open_run(folder, models, device)
+    appearances = pictures_with_controls(problem, run.design, CONTROLS)
+    return responses(problem, appearances, conditions), _detections(problem, appearances, conditions)
 
 
-def _found(problem: Problem, shown: Mapping[str, Appearance], conditions: Conditions) -> DetectionsByKind:
-    """All that detectors find under the target's labels, where it is known where the object lies."""
+def _detections(problem: Problem, appearances: Mapping[str, Appearance], conditions: Conditions) -> DetectionsByKind:
+    """All detections under the target's labels; empty where the object's box is not known."""
     boxes = problem.boxes(conditions)
     if boxes is None:
         return {}
-    found: DetectionsByKind = {}
+    detections: DetectionsByKind = {}
     with torch.no_grad():
-        views = problem.see(shown["design"], conditions, problem.figure_px)
-        pictures = {kind: expose(views, thing) for kind, thing in shown.items()}
+        views = problem.see(appearances["design"], conditions, problem.figure_px)
+        pictures = {kind: expose(views, appearance) for kind, appearance in appearances.items()}
         for network, indices in zip(problem.classifiers, problem.indices, strict=True):
             if not network.LOOKS_AT_BOXES:
                 continue
             boxes_px, shows = torch.as_tensor(boxes * network.input_px), [True] * len(boxes)
-            found[network.name] = {
+            detections[network.name] = {
                 kind: find_detections(
                     network.network(center_square(photos, network.input_px)), indices, boxes_px, shows
                 )
                 for kind, photos in pictures.items()
             }
-    return found
+    return detections

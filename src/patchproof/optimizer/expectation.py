@@ -1,9 +1,9 @@
 """Expectation over transformations: the mean loss of a design over drawn conditions, and its gradient.
 
-In: a `Problem` and its conditions. Out: `Expectation`, one object that answers for a design whatever the number of
-processes behind it. The design is printed once for all views of a step; each process photographs some of the views,
-asks the networks, and sends back the gradient at what is printed. These are added in the views' order, so that the
-number of processes changes no byte, and go back through the printer here.
+In: a `Problem` and its conditions. Out: `Expectation`, one interface to any number of processes. The design is printed
+once for all views of a step; each process photographs some of the views, runs the networks, and sends back the gradient
+at the print. These gradients are added in the views' order, so that the number of processes changes no byte, and are
+propagated back through the printer here.
 
 Source: Athalye et al. 2018, "Synthesizing robust adversarial examples", eq. 2 and 3.
 """
@@ -39,8 +39,8 @@ SELECT_CHUNK = 4  # selection views that a process renders together
 
 @dataclass(frozen=True)
 class Answer:
-    """Means over a step's views, and the gradient 3×h×w of their mean loss at the design; what the settings charge a
-    design for is not in it.
+    """Means over a step's views, and the gradient 3×h×w of their mean loss at the design; the subject's penalty is not
+    included.
     """
 
     gradient: Tensor
@@ -51,7 +51,7 @@ class Answer:
 
 
 class _ViewsAnswer(NamedTuple):
-    """What some of a step's views say of what is printed: means over them, and the gradient at its texels."""
+    """Means over some of a step's views, and the gradient at the printed texels."""
 
     views: int
     loss: float
@@ -62,7 +62,7 @@ class _ViewsAnswer(NamedTuple):
 
 
 class _TrainTask(NamedTuple):
-    """Texels as printed, and views to train in: their first pose, their conditions, whether to send pictures back."""
+    """Printed texels and training views: their first pose, their conditions, and whether to send pictures back."""
 
     printed: np.ndarray
     pose: int
@@ -71,14 +71,14 @@ class _TrainTask(NamedTuple):
 
 
 class _SelectTask(NamedTuple):
-    """Texels as printed, and the first of some selection views."""
+    """Printed texels, and the number of the first of some selection views."""
 
     printed: np.ndarray
     first: int
 
 
 class Expectation:
-    """Answers for designs, in the views of a run's steps and in the fixed ones of its selection set."""
+    """Evaluates designs in the views of a run's steps and in the fixed views of its selection set."""
 
     def __init__(self, problem: Problem, conditions: Conditions, selection_views: int, ask: Callable[[list], list]):
         self._problem, self._conditions, self._selection_views = problem, conditions, selection_views
@@ -90,17 +90,17 @@ class Expectation:
         tasks = task_conditions(self._conditions[step * views : (step + 1) * views])
 
         def ask(printed: Tensor) -> list[_ViewsAnswer]:
-            sent = printed.cpu().numpy()
+            texels = printed.cpu().numpy()
             poses = [(step * views + row) % self._poses for row, _ in tasks]
-            return self._ask([_TrainTask(sent, p, rows, pictures) for p, (_, rows) in zip(poses, tasks, strict=True)])
+            return self._ask([_TrainTask(texels, p, rows, pictures) for p, (_, rows) in zip(poses, tasks, strict=True)])
 
         return _mean_answer(self._problem, design, ask)
 
     def selection(self, design: Tensor) -> tuple[float, float]:
-        """Mean loss and rate of a design, in the 8-bit pixels that would go to the printer, in the selection views."""
+        """Mean loss and rate of a design in the selection views, rounded to the 8-bit pixels that go to the printer."""
         pixels = from_pixels(as_pixels(design), self._problem.device)
-        sent = self._problem.subject.printed(pixels).cpu().numpy()
-        answers = self._ask([_SelectTask(sent, first) for first in range(0, self._selection_views, SELECT_CHUNK)])
+        texels = self._problem.subject.print_design(pixels).cpu().numpy()
+        answers = self._ask([_SelectTask(texels, first) for first in range(0, self._selection_views, SELECT_CHUNK)])
         loss, rate = (sum(values) / len(values) for values in zip(*answers, strict=True))
         return loss, rate
 
@@ -111,16 +111,18 @@ def expectation(problem: Problem, selection: Conditions) -> Iterator[Expectation
     conditions of its selection set.
     """
     conditions = training_conditions(problem.scene)
-    cache = ViewCache(problem, conditions)  # each process keeps the views that it has rendered
-    selected = lru_cache(lambda first: training_views(problem, selection[first : first + SELECT_CHUNK]))
+    cache = ViewCache(problem, conditions)  # each process keeps the views it has rendered
+    selection_views = lru_cache(lambda first: training_views(problem, selection[first : first + SELECT_CHUNK]))
 
     def answer(task: _TrainTask | _SelectTask) -> _ViewsAnswer | tuple[float, float]:
         printed = torch.as_tensor(task.printed, device=problem.device)
         if isinstance(task, _TrainTask):
             return _views_answer(problem, printed, cache.views(task.pose, task.conditions), task.pictures)
-        views = selected(task.first)
+        views = selection_views(task.first)
         with torch.no_grad():
-            loss, _, rate = score(problem, expose(views, problem.subject.showing(printed)), views.conditions)
+            loss, _, rate = score(
+                problem, expose(views, problem.subject.appearance_of_print(printed)), views.conditions
+            )
         return float(loss), rate
 
     with fork_workers(answer, problem.jobs, in_turn=True) as (workers, share):
@@ -135,8 +137,8 @@ def gradient_in_views(problem: Problem, design: Tensor, views: Sequence[Views]) 
 def score(
     problem: Problem, pictures: Tensor, conditions: Conditions, windows: np.ndarray | None = None
 ) -> tuple[Tensor, float, float]:
-    """Mean loss over classifiers and pictures N×3×H×W of these conditions; mean confidence and rate of the same.
-    Outside of `windows`, N×4 pixels (left, top, right, bottom), the pictures' gradient is not asked for.
+    """Mean loss, confidence and rate over classifiers and pictures N×3×H×W of these conditions. Outside of `windows`,
+    N×4 pixels (left, top, right, bottom), the pictures' gradient is not needed.
     """
     losses, confidence, rate, boxes = [], 0.0, 0.0, problem.boxes(conditions)
     for classifier, indices in zip(problem.classifiers, problem.indices, strict=True):
@@ -149,18 +151,18 @@ def score(
 
 
 def _mean_answer(problem: Problem, design: Tensor, ask: Callable[[Tensor], Sequence[_ViewsAnswer]]) -> Answer:
-    """Print the design once, ask views of it, and take their mean gradient back through the printer."""
+    """Print the design once, get the answers of views, and propagate their mean gradient back through the printer."""
     design = design.detach().requires_grad_()
-    printed = problem.subject.printed(design)
+    printed = problem.subject.print_design(design)
     answers = ask(printed.detach())
     shares = [answer.views / sum(each.views for each in answers) for answer in answers]
 
     def mean(values):
         return sum(share * value for share, value in zip(shares, values, strict=True))
 
-    at_printed = torch.as_tensor(mean(answer.gradient for answer in answers), device=problem.device)
-    # a product to derive, since torch imports SymPy when it is handed a gradient to begin with (networks/cuts.py)
-    (gradient,) = torch.autograd.grad((printed * at_printed).sum(), design)
+    print_gradient = torch.as_tensor(mean(answer.gradient for answer in answers), device=problem.device)
+    # differentiating a product, since torch imports SymPy for grad_outputs (networks/cuts.py)
+    (gradient,) = torch.autograd.grad((printed * print_gradient).sum(), design)
     pictures = [torch.as_tensor(answer.pictures) for answer in answers if answer.pictures is not None]
     return Answer(
         gradient,
@@ -172,10 +174,10 @@ def _mean_answer(problem: Problem, design: Tensor, ask: Callable[[Tensor], Seque
 
 
 def _views_answer(problem: Problem, printed: Tensor, views: Views, pictures: bool = False) -> _ViewsAnswer:
-    """Photograph what is printed in these views, ask the networks, and derive their mean loss."""
+    """Photograph the print in these views, run the networks, and differentiate their mean loss."""
     printed = printed.detach().requires_grad_()
-    photos = expose(views, problem.subject.showing(printed))
+    photos = expose(views, problem.subject.appearance_of_print(printed))
     loss, confidence, rate = score(problem, photos, views.conditions, affected_windows(views))
     (gradient,) = torch.autograd.grad(loss, printed)
-    kept = photos.detach().cpu().numpy() if pictures else None
-    return _ViewsAnswer(len(photos), float(loss.detach()), confidence, rate, gradient.cpu().numpy(), kept)
+    sent_pictures = photos.detach().cpu().numpy() if pictures else None
+    return _ViewsAnswer(len(photos), float(loss.detach()), confidence, rate, gradient.cpu().numpy(), sent_pictures)

@@ -1,12 +1,12 @@
-"""The loop: draw conditions, ask for the gradient, descend, select.
+"""The loop: draw conditions, compute the gradient, descend, select.
 
-In: a `Problem` and, to go on, a `State`. Out: a generator of `TrainingStep`s; saving, progress and plots are its caller's
-business. The design starts at mid-gray. Adam on every level of the gradient's pyramid, or signed steps as in FGSM and
+In: a `Problem` and, to resume, a `State`. Out: a generator of `TrainingStep`s; saving, progress and plots are left to
+its caller. The design starts at mid-gray. Adam on every level of the gradient's pyramid, or signed steps as in FGSM and
 PGD (Goodfellow et al. 2015, Madry et al. 2018), always clipped to [0, 1]. Every 240 views the design is tried on a
-fixed selection set, and the best one is kept: a design that suited its last views only is not what gets printed. The
-promise set is never touched here.
+fixed selection set, and the best one is kept, so that a design that suited only its last views is not printed. The
+promise set is never used here.
 
-A step depends on the state and its own number alone, so that a run that was stopped goes on to the same bytes.
+A step depends only on the state and its own number, so that a resumed run gives the same bytes.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from patchproof.optimizer.problem import Problem
 from patchproof.optimizer.training_views import task_conditions, training_views
 from patchproof.scene.conditions import Conditions
 
-# Training views. Tried twice as often, 28 of 30 runs kept their last design all the same, and two one that was better
-# by 0.00 and 0.02 of loss; steps four times as large as the default's lost 0.01.
+# Training views. When designs were tried twice as often, 28 of 30 runs still kept their last design, and two kept one
+# with 0.00 and 0.02 less loss; at four times the default's step size, 0.01 was lost.
 SELECT_AFTER = 240
-SAVE_AFTER = 120  # training views that a kill may lose
+SAVE_AFTER = 120  # training views that a kill can lose
 SELECT_VIEWS = 64
 _BETAS, _EPSILON = (0.9, 0.999), 1e-8  # Adam's own defaults
 
@@ -48,15 +48,15 @@ class State:
 
 @dataclass(frozen=True)
 class TrainingStep:
-    """What one step did. Rates and confidence are over this step's training views; `select_*` where the design was
-    tried.
+    """The result of one step. Rates and confidence are over this step's training views; `select_*` only where the
+    design was tried on the selection set.
     """
 
     state: State
     loss: float
     confidence: float
     rate: float
-    gradient: float  # the classifiers' largest, penalties apart; 0 means that they no longer tell designs apart
+    gradient: float  # the classifiers' largest, without penalties; 0 means that they no longer distinguish designs
     select_loss: float | None = None
     select_rate: float | None = None
     pictures: Tensor | None = field(default=None, repr=False)
@@ -80,7 +80,7 @@ def steps(problem: Problem, state: State | None = None) -> Iterator[TrainingStep
 def start(problem: Problem) -> State:
     """The state before the first step."""
     design = problem.subject.start()
-    zeros = tuple(torch.zeros_like(level) for level in problem.subject.levels(design))
+    zeros = tuple(torch.zeros_like(level) for level in problem.subject.gradient_levels(design))
     return State(0, design, zeros, zeros, design)
 
 
@@ -91,7 +91,7 @@ def take_step(problem: Problem, state: State, conditions: Conditions) -> Trainin
 
 
 def draft(problem: Problem, conditions: Conditions, views: int) -> Tensor:
-    """The design after a step on every `views` rows of the conditions, untried on the selection set."""
+    """The design after a step on every `views` rows of the conditions, not tried on the selection set."""
     state = start(problem)
     for first in range(0, len(conditions), views):
         state = take_step(problem, state, conditions[first : first + views]).state
@@ -99,7 +99,7 @@ def draft(problem: Problem, conditions: Conditions, views: int) -> Tensor:
 
 
 def best_design(problem: Problem) -> np.ndarray:
-    """Run the whole loop; the pixels of the design that the selection set liked best."""
+    """Run the whole loop; the pixels of the design that was best on the selection set."""
     state = start(problem)
     for step in steps(problem, state):
         state = step.state
@@ -107,12 +107,12 @@ def best_design(problem: Problem) -> np.ndarray:
 
 
 def is_selection_step(settings: OptimizeSettings, number: int) -> bool:
-    """Whether the design is tried on the selection set after step `number`, counted from 1."""
+    """True if the design is tried on the selection set after step `number`, counted from 1."""
     return _ends(settings, number, SELECT_AFTER)
 
 
 def is_save_step(settings: OptimizeSettings, number: int) -> bool:
-    """Whether the state after step `number` is worth keeping."""
+    """True if the state after step `number` should be saved."""
     return _ends(settings, number, SAVE_AFTER)
 
 
@@ -122,15 +122,15 @@ def _ends(settings: OptimizeSettings, number: int, views: int) -> bool:
 
 
 def views_per_network(settings: OptimizeSettings) -> int:
-    """Views that each network sees in training and selection."""
+    """The number of views that each network sees in training and selection."""
     selections = sum(is_selection_step(settings, number) for number in range(1, settings.steps + 1))
     return settings.steps * settings.views + selections * SELECT_VIEWS
 
 
 def _descend(problem: Problem, state: State, answer: Answer) -> TrainingStep:
-    """One step down the answer's gradient and that of what the settings charge a design for."""
+    """One step down the gradient of the answer's loss and of the subject's penalty."""
     largest, gradient = float(answer.gradient.abs().max()), answer.gradient
-    if not math.isfinite(largest):  # one such step would turn the design into nothing for good
+    if not math.isfinite(largest):  # a step with it would make the design NaN
         do = "check its number format: some pictures lead it to infinity"
         raise Refused("finite gradients", f"{largest} in step {state.number + 1} from the networks", do)
     design = state.design.detach().requires_grad_()
@@ -138,25 +138,32 @@ def _descend(problem: Problem, state: State, answer: Answer) -> TrainingStep:
     if isinstance(penalty, Tensor):
         gradient = gradient + torch.autograd.grad(penalty, design)[0]
         penalty = float(penalty.detach())
-    moved = _update(problem, state, gradient)
-    return TrainingStep(moved, answer.loss + penalty, answer.confidence, answer.rate, largest, pictures=answer.pictures)
+    state_after = _update(problem, state, gradient)
+    return TrainingStep(
+        state_after, answer.loss + penalty, answer.confidence, answer.rate, largest, pictures=answer.pictures
+    )
 
 
 def _update(problem: Problem, state: State, gradient: Tensor) -> State:
-    """One update of the design, clipped to what it may become."""
-    clipped, settings = problem.subject.clipped, problem.scene.settings.optimize
+    """One update of the design, clipped to the allowed designs."""
+    clipped, settings = problem.subject.clip, problem.scene.settings.optimize
     number, step_size = state.number + 1, settings.step_size
     if settings.optimizer == "sign":
         design = clipped(state.design - step_size * gradient.sign())
         return replace(state, number=number, design=design)
-    levels = problem.subject.levels(gradient)
-    mean = tuple(torch.lerp(now, old, _BETAS[0]) for now, old in zip(levels, state.mean, strict=True))
-    square = tuple(torch.lerp(now**2, old, _BETAS[1]) for now, old in zip(levels, state.square, strict=True))
+    levels = problem.subject.gradient_levels(gradient)
+    mean = tuple(
+        torch.lerp(gradient_level, moment, _BETAS[0]) for gradient_level, moment in zip(levels, state.mean, strict=True)
+    )
+    square = tuple(
+        torch.lerp(gradient_level**2, moment, _BETAS[1])
+        for gradient_level, moment in zip(levels, state.square, strict=True)
+    )
     updates = [
         (m / (1 - _BETAS[0] ** number)) / ((v / (1 - _BETAS[1] ** number)).sqrt() + _EPSILON)
         for m, v in zip(mean, square, strict=True)
     ]
-    design = clipped(state.design - step_size * problem.subject.joined(updates))
+    design = clipped(state.design - step_size * problem.subject.combine_levels(updates))
     return replace(state, number=number, design=design, mean=mean, square=square)
 
 

@@ -1,6 +1,6 @@
-"""What the optimizer wants, as losses to descend on.
+"""The losses that the optimizer descends on.
 
-In: logits and label indices, or a design. Out: scalars. Goals add. The target term is the cross-entropy of the *summed*
+In: logits and label indices, or a design. Out: scalars, which add. The target term is the cross-entropy of the *summed*
 probability of all accepted labels, the quantity that is reported as confidence; for `deceive`, of its complement.
 
 The paper's printed update Θ + α∇L raises the loss (Pestana et al., Algorithm 1); recognition needs the descent done
@@ -20,9 +20,7 @@ Loss = Callable[[Tensor, Sequence[int]], Tensor]  # (logits N×K, label indices)
 
 
 def target_loss(odds: Odds, goal: Goal) -> Tensor:
-    """N losses: -log of the confidence (`assist`) or of what it lacks to 1 (`deceive`), in float64 so that none
-    saturates.
-    """
+    """N losses: -log of the confidence (`assist`) or of 1 minus it (`deceive`), in float64 so that none saturates."""
     return -(odds.log_confidence if goal.sign > 0 else odds.log_complement)
 
 

@@ -1,7 +1,7 @@
-"""A patch as the thing that is optimized: a design in its printed piece.
+"""A printed patch as the subject of optimization: a design in its piece.
 
-In: a scene with a piece, and its printer. Out: `Patch`: where a design starts, what may become of it, what it costs,
-and the pixels that go to the printer. How the whole piece looks on paper stands in `render.designs`.
+In: a scene with a piece, and its printer. Out: `Patch`: the first design, the allowed designs, their penalty, and the
+pixels that go to the printer. `render.designs` draws the whole piece on paper.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from patchproof.render.pixels import PiecePicture
 from patchproof.scene.interface import PieceScene, Scene, require_piece
 from patchproof.sheets.piece import control_design, whiten_marker_pixels
 
-# A design's pixels are printed as blocks of at least this density. Coarser pictures are smoothed by some PDF readers
-# and not by others, and markers, drawn on the same grid, would be lost.
+# A design's pixels are printed as blocks of at least this density. Some PDF readers smooth coarser pictures, and
+# markers, drawn on the same grid, would be lost.
 PRINTED_PX_PER_MM = 2.0
 
 
@@ -50,24 +50,24 @@ class Patch:
         width, height = self.design_px
         return torch.full((3, height, width), 0.5, device=self.device)
 
-    def clipped(self, design: Tensor) -> Tensor:
+    def clip(self, design: Tensor) -> Tensor:
         """The nearest design in [0, 1]."""
         return design.clamp(0, 1)
 
-    def levels(self, gradient: Tensor) -> tuple[Tensor, ...]:
+    def gradient_levels(self, gradient: Tensor) -> tuple[Tensor, ...]:
         """The gradient's pyramid."""
-        return pyramid.levels(gradient)
+        return pyramid.build_pyramid(gradient)
 
-    def joined(self, updates: Sequence[Tensor]) -> Tensor:
-        """The update of a design that the pyramid's own add up to."""
-        return pyramid.joined(updates)
+    def combine_levels(self, updates: Sequence[Tensor]) -> Tensor:
+        """Combine the updates of the pyramid's levels into one update of the design."""
+        return pyramid.collapse_pyramid(updates)
 
     def penalty(self, design: Tensor) -> Tensor | float:
-        """What the scene's settings charge a design for: total variation, colors that the printer misses."""
+        """The penalty of a design by the scene's settings: total variation, colors that the printer misses."""
         settings = self.scene.settings.optimize
         cost = settings.tv * total_variation(design) if settings.tv else 0.0
         if settings.gamut:
-            # ΔE00 / 100: one unit of loss for black in place of white
+            # ΔE00 / 100: black in place of white costs one unit of loss
             cost = cost + settings.gamut * self.printer.gamut_distance(design[None]).mean() / 100
         return cost
 
@@ -77,23 +77,23 @@ class Patch:
         return whiten_marker_pixels(as_pixels(design).repeat(block, 0).repeat(block, 1), self.scene.piece)
 
     def control(self, kind: str, pixels: np.ndarray) -> np.ndarray:
-        """What the control sheet of this kind prints in place of the design's pixels."""
+        """The pixels that the control sheet of this kind prints in place of the design's."""
         return control_design(kind, pixels, self.scene.sheet_id, self.scene.piece)
 
-    def shown(self, design: Tensor, kind: str = "design") -> PiecePicture:
+    def appearance(self, design: Tensor, kind: str = "design") -> PiecePicture:
         """The printed piece with a design of any grid (the optimized one, or as printed); differentiable."""
         return self._printed.shown(design, kind)
 
-    def printed(self, design: Tensor) -> Tensor:
-        """The printed piece's texels T×3, of an optimized design; differentiable."""
-        return self.shown(design).codes
+    def print_design(self, design: Tensor) -> Tensor:
+        """The printed piece's texels T×3 for an optimized design; differentiable."""
+        return self.appearance(design).codes
 
-    def showing(self, printed: Tensor) -> PiecePicture:
+    def appearance_of_print(self, printed: Tensor) -> PiecePicture:
         """The piece with these texels."""
         return PiecePicture(printed, self.design_px)
 
     def with_printer(self, printer: Printer) -> Patch:
-        """The same patch as another printer prints it."""
+        """This patch with another printer."""
         return replace(self, printer=printer)
 
     def save(self, pixels: np.ndarray, folder: Path) -> None:
@@ -106,7 +106,7 @@ class Patch:
 
     @property
     def grid(self) -> Grid:
-        """How fine designs are."""
+        """The resolution of designs."""
         (width, height), (printed, _) = self.design_px, self.printed_px
         width_mm = self.scene.piece.size_mm[0]
         return Grid(self.design_px, self.printed_px, printed / width_mm, width * height, width / width_mm)
@@ -125,11 +125,11 @@ class Patch:
 
 
 def subject_of(scene: Scene, printer: Printer, network_px: int, device: torch.device) -> Patch:
-    """As in `subject`: the design of the scene's piece, no finer than networks can see it."""
-    hung = require_piece(scene)
-    return Patch(hung, printer, hung.design_px(network_px), device)
+    """Implements `subject.subject_of`: the design of the scene's piece, no finer than networks can see it."""
+    piece_scene = require_piece(scene)
+    return Patch(piece_scene, printer, piece_scene.design_px(network_px), device)
 
 
 def read_design(scene: Scene, folder: Path) -> np.ndarray:
-    """As in `subject`: `design.png`."""
+    """Implements `subject.read_design`: reads `design.png`."""
     return read_png(folder / DESIGN_FILE)

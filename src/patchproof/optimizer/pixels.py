@@ -1,4 +1,4 @@
-"""Between designs as tensors and designs as 8-bit pixels."""
+"""Convert between designs as tensors and designs as 8-bit pixels."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def from_pixels(pixels: np.ndarray, device: torch.device | str = "cpu") -> Tenso
 
 
 def side_by_side(pictures: Tensor, columns: int = 4) -> np.ndarray:
-    """Pictures N×3×h×w in rows of so many, as one of uint8 H×W×3; white where there are none left."""
+    """Pictures N×3×h×w in rows of `columns`, as one picture uint8 H×W×3; empty places are white."""
     pixels = codes_from_srgb(pictures).permute(0, 2, 3, 1).cpu().numpy()
     rows = -(-len(pixels) // columns)
     count, height, width, _ = pixels.shape

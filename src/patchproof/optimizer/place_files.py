@@ -1,8 +1,8 @@
-"""What a run keeps of the search for its place: `place.json`, and `place.png` for the eye.
+"""Files of a search for a place: `place.json`, and `place.png` to look at.
 
 In: a `Place` and the scene with the piece there. Out: both files, and the place read back. The picture shows the object
 from four directions across the scene's azimuths, each place as a small square from yellow (the best) to purple (the
-worst), those that were drafted with their rank, and the chosen piece's outline at its size.
+worst), the drafted ones with their rank, and the chosen piece's outline at its size.
 """
 
 from __future__ import annotations
@@ -34,37 +34,41 @@ from patchproof.scene.open_scene import UnplacedScene
 from patchproof.scene.patch_scene import PatchScene
 from patchproof.scene.placement import patch_frame, side_frame, spun_axes
 
-_RECORD, _PICTURE = "place.json", "place.png"
+_RECORD_FILE, _PICTURE_FILE = "place.json", "place.png"
 _DIRECTIONS, _SIDE_PX = 4, 420
-_ROOM = 1.05  # of the object's diagonal
-_DOT = 0.3  # of the piece's size
-_IN_FRONT_MM = 2.0  # a middle that lies no deeper than that below the surface is seen
-_COLORS = np.array([(253, 231, 37), (33, 145, 140), (68, 1, 84)], float)  # of viridis: legible to the color-blind
-_CHOSEN = (230, 0, 90)
+_MARGIN = 1.05  # times the object's diagonal
+_SQUARE_SHARE = 0.3  # a square's side, of the piece's
+_IN_FRONT_MM = 2.0  # a square's middle at most this deep behind the surface is visible
+_COLORS = np.array([(253, 231, 37), (33, 145, 140), (68, 1, 84)], float)  # of viridis, legible to the color-blind
+_CHOSEN_COLOR = (230, 0, 90)
 
 
 def save_place(place: Place, scene: PatchScene, folder: Path) -> None:
     """Write both files; `scene` has the piece at the place."""
-    write_atomically(folder / _RECORD, place.model_dump_json(indent=1) + "\n")
+    write_atomically(folder / _RECORD_FILE, place.model_dump_json(indent=1) + "\n")
     picture = _picture(place, scene)
-    write_atomically(folder / _PICTURE, lambda path: picture.save(path, "PNG"))
+    write_atomically(folder / _PICTURE_FILE, lambda path: picture.save(path, "PNG"))
 
 
 def read_place(folder: Path, scene: UnplacedScene | None = None) -> Place | None:
-    """The place that a search left in a run's folder; None without one, refused where it is not of that `scene`."""
-    path = folder / _RECORD
+    """The place in a run's folder; None if there is none, refused if it was searched in another `scene`."""
+    path = folder / _RECORD_FILE
     if not is_file(path):
         return None
-    record = read_json(path, "the record of a search", "start anew in another folder")
+    record = read_json(path, "the record of a search", "start in another folder")
     place = validate_model(Place, record, str(path))
     if scene is not None and place.sheet_id != scene.sheet_id:
-        do = "resume with the same scene file and seed, or start anew in another folder"
-        raise Refused("the place of this scene and seed", f"one of another in {folder}", do)
+        do = "resume with the same scene file and seed, or start in another folder"
+        raise Refused(
+            "the place of this scene and seed",
+            f"a place of sheet {place.sheet_id} in {folder}, not {scene.sheet_id}",
+            do,
+        )
     return place
 
 
 def _picture(place: Place, scene: PatchScene) -> Image.Image:
-    scene, conditions = _plain(scene)
+    scene, conditions = _even_scene(scene)
     stage, size, poses = set_stage(scene), (_SIDE_PX, _SIDE_PX), scene.camera_from_world(conditions)
     with torch.no_grad():
         light = shade(render_views(stage, None, conditions, size), None)
@@ -73,8 +77,8 @@ def _picture(place: Place, scene: PatchScene) -> Image.Image:
     for pose, picture in zip(poses, pictures, strict=True):
         panel, depth = Image.fromarray(picture), _depth(stage, scene, pose)
         draw = ImageDraw.Draw(panel)
-        for rank, candidate, corners in _dots(place, scene):
-            if _seen(scene, pose, depth, corners):
+        for rank, candidate, corners in _squares(place, scene):
+            if _is_visible(scene, pose, depth, corners):
                 color = _color(rank / max(len(place.candidates) - 1, 1))
                 quad = geometry.project(scene.matrix_px(size), pose, corners)
                 draw.polygon([*map(tuple, quad)], color, (0, 0, 0))
@@ -85,32 +89,32 @@ def _picture(place: Place, scene: PatchScene) -> Image.Image:
         border = geometry.rect_border((0, 0, *scene.placement.size_mm), 16)  # bent paper has bent edges
         outline = scene.placement.world(np.concatenate([border, border[:1]]))
         if scene.placement.normal @ (geometry.camera_centers(pose[None])[0] - scene.placement.center_mm) > 0:
-            draw.line([*map(tuple, geometry.project(scene.matrix_px(size), pose, outline))], _CHOSEN, 4, "curve")
+            draw.line([*map(tuple, geometry.project(scene.matrix_px(size), pose, outline))], _CHOSEN_COLOR, 4, "curve")
         panels.append(np.asarray(panel))
     return Image.fromarray(np.concatenate(panels, 1))
 
 
-def _plain(scene: PatchScene) -> tuple[PatchScene, Conditions]:
-    """The scene in even light on white, all of the object in its pictures, and the directions it is seen from."""
+def _even_scene(scene: PatchScene) -> tuple[PatchScene, Conditions]:
+    """The scene in even light on white, zoomed to the whole object, and the directions it is seen from."""
     view = scene.settings.view
     distance = sum(view.distance_mm) / 2
-    half = float(np.linalg.norm(np.ptp(scene.mesh.vertices, axis=0))) / 2 * _ROOM
+    half = float(np.linalg.norm(np.ptp(scene.mesh.vertices, axis=0))) / 2 * _MARGIN
     fov = float(np.degrees(2 * np.arctan(half / distance)))
     settings = scene.settings.changed(view={"fov_deg": fov}, camera={"photo_px": (_SIDE_PX, _SIDE_PX), "file": None})
     white = load_backgrounds(BackgroundSettings(color=(1.0, 1.0, 1.0)), Path())
-    (low, high), every = view.azimuth_deg, np.ones(_DIRECTIONS)
+    (low, high), ones = view.azimuth_deg, np.ones(_DIRECTIONS)
     pose = Pose(
         azimuth_deg=low + (high - low) * (np.arange(_DIRECTIONS) + 0.5) / _DIRECTIONS,
-        elevation_deg=every * sum(view.elevation_deg) / 2,
-        distance_mm=every * distance,
+        elevation_deg=ones * sum(view.elevation_deg) / 2,
+        distance_mm=ones * distance,
     )
-    light = Light(ambient=every * 0.55, directional=every * 0.45, light_elevation_deg=every * 45)
+    light = Light(ambient=ones * 0.55, directional=ones * 0.45, light_elevation_deg=ones * 45)
     return replace(scene, settings=settings, backgrounds=white, camera=None), Conditions(pose=pose, light=light)
 
 
-def _dots(place: Place, scene: PatchScene) -> Iterator[tuple[int, Candidate, np.ndarray]]:
+def _squares(place: Place, scene: PatchScene) -> Iterator[tuple[int, Candidate, np.ndarray]]:
     """(rank from 0, candidate, 4×3 corners of its small square in the world), the worst first."""
-    half_mm, patch = _DOT / 2 * min(scene.placement.size_mm), scene.settings.patch
+    half_mm, patch = _SQUARE_SHARE / 2 * min(scene.placement.size_mm), scene.settings.patch
     for rank, candidate in reversed([*enumerate(place.candidates)]):
         at = candidate.at
         frame = side_frame(scene.mesh, at) if isinstance(at, str) else patch_frame(scene.mesh, patch.changed(at_mm=at))
@@ -119,8 +123,8 @@ def _dots(place: Place, scene: PatchScene) -> Iterator[tuple[int, Candidate, np.
         yield rank, candidate, frame.origin_mm + half_mm * signs @ np.stack([right, up])
 
 
-def _seen(scene: PatchScene, pose: np.ndarray, depth: np.ndarray, corners: np.ndarray) -> bool:
-    """Whether the middle of a square faces the camera and nothing stands before it."""
+def _is_visible(scene: PatchScene, pose: np.ndarray, depth: np.ndarray, corners: np.ndarray) -> bool:
+    """True if the middle of a square faces the camera and nothing is in front of it."""
     middle, normal = corners.mean(0), np.cross(corners[0] - corners[1], corners[2] - corners[1])
     if normal @ (geometry.camera_centers(pose[None])[0] - middle) <= 0:
         return False
@@ -130,10 +134,10 @@ def _seen(scene: PatchScene, pose: np.ndarray, depth: np.ndarray, corners: np.nd
 
 
 def _depth(stage: Stage, scene: PatchScene, pose: np.ndarray) -> np.ndarray:
-    """H×W distances of the object from the camera along its axis, infinite where there is none."""
+    """H×W distances of the object from the camera along its axis, infinite beside the object."""
     surface, size = stage.object_surface, (_SIDE_PX, _SIDE_PX)
-    placed = cameras(pose[None], scene.matrix_px(size)[None], size, stage)
-    fragments = rasterize(surface.vertices, surface.faces, placed, near_mm(scene))
+    frames = cameras(pose[None], scene.matrix_px(size)[None], size, stage)
+    fragments = rasterize(surface.vertices, surface.faces, frames, near_mm(scene))
     depth = np.full(_SIDE_PX * _SIDE_PX, np.inf)
     depth[fragments.pixel.numpy()] = fragments.depth.numpy()
     return depth.reshape(_SIDE_PX, _SIDE_PX)

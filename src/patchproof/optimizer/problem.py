@@ -1,7 +1,7 @@
-"""What is optimized: one subject (a patch, or the object's texture) on one stage, before one or more classifiers.
+"""The optimization problem: one subject (a patch, or the object's texture) on one stage, with one or more classifiers.
 
 In: a scene, the names of its classifiers and its printer. Out: `Problem`, from which the loop, the promise and
-`evaluate` take the pictures that each design gives.
+`evaluate` get pictures of a design.
 """
 
 from __future__ import annotations
@@ -34,12 +34,13 @@ from patchproof.scene.conditions import Conditions
 from patchproof.scene.interface import Scene
 from patchproof.scene.patch_scene import PatchScene
 
-# Figures come from views of so many times the largest input's side, which a network reduces as it does photographs, and
-# no less than so many pixels, since each of them takes one sample. Averaging textures over eight tenths of a pixel
-# leaves them as sharp; of a piece four taps leave confidences within 0.004 (root mean square) of those of eight, and
-# their mean within 0.0004. Training's views are of the network's own side, but for small networks.
-FIGURE_SCALE, LEAST_PX, SMALL_PX = 1.4, 128, 192
-TRAINED, FIGURED = TextureSampling(taps=1, side=1.0, piece_taps=8), TextureSampling(taps=2, side=0.8, piece_taps=4)
+# Figures come from views of FIGURE_SCALE times the largest input's side, which a network reduces like photographs,
+# and of MIN_FIGURE_PX at least, since each pixel takes one sample. Averaging textures over 0.8 of a pixel keeps them
+# sharp; for a piece four taps give confidences within 0.004 (root mean square) of those with eight, and means within
+# 0.0004. Training views have the network's own side, except for networks below MIN_TRAINING_PX.
+FIGURE_SCALE, MIN_FIGURE_PX, MIN_TRAINING_PX = 1.4, 128, 192
+TRAINING_SAMPLING = TextureSampling(taps=1, side=1.0, piece_taps=8)
+FIGURE_SAMPLING = TextureSampling(taps=2, side=0.8, piece_taps=4)
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,74 +59,75 @@ class Problem:
     @property
     def training_px(self) -> int:
         """The side at which views are rendered for training and selection."""
-        return self.figure_px if self.network_px < SMALL_PX else min(self.network_px, self._photo_px)
+        return self.figure_px if self.network_px < MIN_TRAINING_PX else min(self.network_px, self._photo_px)
 
     @property
     def figure_px(self) -> int:
         """The side at which views are rendered for figures that people will read."""
-        return min(max(math.ceil(FIGURE_SCALE * self.network_px), LEAST_PX), self._photo_px)
+        return min(max(math.ceil(FIGURE_SCALE * self.network_px), MIN_FIGURE_PX), self._photo_px)
 
     @property
     def _photo_px(self) -> int:
         return min(self.scene.settings.camera.photo_px)
 
     def losses(self, classifier: Classifier, logits: Tensor, indices: Sequence[int]) -> Tensor:
-        """N losses to descend on, of what a network answers."""
+        """N losses to descend on, from a network's logits."""
         if self.custom_loss is not None:
             return self.custom_loss(logits, indices)
         return target_loss(classifier.odds(logits, indices), self.scene.settings.target.goal)
 
     def boxes(self, conditions: Conditions) -> np.ndarray | None:
-        """Where the object lies in these views (`Scene.boxes`), if one of the networks asks for it."""
+        """The object's boxes in these views (`Scene.boxes`), if one of the networks uses them."""
         return self.scene.boxes(conditions) if any(c.LOOKS_AT_BOXES for c in self.classifiers) else None
 
-    def see(self, shown: Appearance, conditions: Conditions, side_px: int) -> Views:
-        """Square views of these conditions, for what is shown now and any other design in its place."""
-        look = TRAINED if side_px < self.figure_px else FIGURED if side_px == self.figure_px else PHOTO_SAMPLING
-        return render_views(self.stage, shown, conditions, (side_px, side_px), look)
+    def see(self, appearance: Appearance, conditions: Conditions, side_px: int) -> Views:
+        """Square views of these conditions, for this appearance and any other design in its place."""
+        sampling = TRAINING_SAMPLING if side_px < self.figure_px else PHOTO_SAMPLING
+        sampling = FIGURE_SAMPLING if side_px == self.figure_px else sampling
+        return render_views(self.stage, appearance, conditions, (side_px, side_px), sampling)
 
     def see_again(self, views: Views, conditions: Conditions) -> Views:
-        """Views that were seen, under conditions of the same poses."""
+        """Views under other conditions of the same poses."""
         return relight_and_replace_background(views, conditions)
 
     @cached_property
-    def laid_out(self) -> Appearance:
-        """What is seen before anything is known of a design: any takes its place in the same views."""
+    def start_appearance(self) -> Appearance:
+        """The first design's appearance; in views rendered with it, any other design can be shown."""
         with torch.no_grad():
-            return self.subject.shown(self.subject.start())
+            return self.subject.appearance(self.subject.start())
 
-    def before(self, chosen: Sequence[int]) -> Problem:
-        """The same before some of its networks, by number."""
-        classifiers, indices = (tuple(each[i] for i in chosen) for each in (self.classifiers, self.indices))
+    def with_classifiers(self, numbers: Sequence[int]) -> Problem:
+        """A copy with the classifiers of these numbers only."""
+        classifiers, indices = (tuple(each[i] for i in numbers) for each in (self.classifiers, self.indices))
         return replace(self, classifiers=classifiers, indices=indices)
 
     def with_training(self, optimize: OptimizeSettings, seed: int | None = None) -> Problem:
-        """The same with these settings of the loop, and another seed of its draws."""
+        """A copy with these settings of the loop, and another seed of its draws."""
         settings = self.scene.settings.changed(optimize=optimize)
         scene = replace(self.scene, settings=settings, seed=self.scene.seed if seed is None else seed)
         return replace(self, scene=scene)
 
-    def hung(self, scene: PatchScene) -> Problem:
-        """The same with the piece at another place, as `scene` has it; the object's tensors are shared."""
+    def with_piece_at(self, scene: PatchScene) -> Problem:
+        """A copy with the piece where `scene` has it; the object's tensors are shared."""
         stage = replace(self.stage, scene=scene, piece=piece_surface(scene, self.device))
         subject = Patch(scene, self.printer, scene.design_px(self.network_px), self.device)
         return replace(self, scene=scene, stage=stage, subject=subject)
 
     @property
     def patch(self) -> Patch:
-        """What is optimized, as a printed patch; refused of textures."""
+        """The subject as a printed patch; refused for textures."""
         if isinstance(self.subject, Patch):
             return self.subject
         raise Refused("a printed patch", "the object's own texture", 'leave patch.kind out, or "patch"')
 
     @property
     def network_px(self) -> int:
-        """The largest input size."""
+        """The largest input size of the classifiers."""
         return max(classifier.input_px for classifier in self.classifiers)
 
     @property
     def device(self) -> torch.device:
-        """Where the tensors are."""
+        """The device of the tensors."""
         return self.stage.device
 
 
@@ -136,8 +138,8 @@ def set_problem(
     loss: Loss | None = None,
     jobs: int = 1,
 ) -> Problem:
-    """The problem that a scene states; `models` replaces the scene's own classifiers, `loss` that of its goal. `jobs`
-    processes share its views, on a GPU none do.
+    """The problem of a scene; `models` replaces the scene's classifiers, `loss` that of its goal. `jobs` processes
+    share its views on a CPU, one does on a GPU.
     """
     _check_device(device)
     settings = scene.settings
@@ -151,14 +153,12 @@ def set_problem(
     subject = subject_of(scene, printer, max(classifier.input_px for classifier in classifiers), stage.device)
     jobs = jobs if stage.device.type == "cpu" else 1
     if jobs > 1:
-        with use_threads(
-            1
-        ):  # here, for all processes to be forked, and as one of them would: two threads round otherwise
+        with use_threads(1):  # before forking, on one thread like the forked processes, since two round differently
             if stage.object is not None:
                 stage.object.texels(reduced=True, fixed=scene.HAS_PIECE)
             for network in (classifier.network for classifier in classifiers if scene.HAS_PIECE):
                 if isinstance(network, BatchedNetwork):
-                    _ = network.cut  # found when it is asked for
+                    _ = network.cut  # computed on access
     return Problem(scene, stage, printer, classifiers, indices, subject, loss, jobs)
 
 

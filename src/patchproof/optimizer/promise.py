@@ -1,12 +1,11 @@
-"""The promise: what rate the finished design will reach on conditions that nobody has looked at yet, beside its
-controls.
+"""The promise: the rate that the finished design will reach under conditions not used so far, beside its controls.
 
 In: a `Problem`, the design's pixels, and conditions in sessions: a few photographs each that share print, light, camera
 and place. Out: the manifest's `Promise`. Controls are shown in some of each session's conditions, so that differences
 are paired: the bare object, and a mean-color, a gray and a noise design in the same printed markers. The set is drawn
-after the design is frozen. Where not all of it is asked for, a control is left out as soon as its difference is
-settled, and the promise stops as soon as none is left and the rate's interval is as narrow as asked: both are looked at
-after half and three quarters.
+after the design is frozen. If a half width is given instead of a number of views, a control is left out as soon as its
+difference is settled, and the promise stops as soon as none is left and the rate's interval is narrow enough; both are
+checked after half and three quarters of the views.
 """
 
 from __future__ import annotations
@@ -26,20 +25,20 @@ from patchproof.base.progress import Advance, no_advance
 from patchproof.base.sessions import count_by_session, rate_posterior, session_difference
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import Problem
-from patchproof.optimizer.responses import Responses, joined, open_responses
+from patchproof.optimizer.responses import Responses, merge_responses, open_responses
 from patchproof.render.pixels import Appearance
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.interface import PieceScene, require_piece
 from patchproof.scene.patch_scene import PatchScene
 from patchproof.sheets.manifest import ConditionClaim, ControlClaim, ModelClaim, Promise, Target
 
-# Many short sessions: how much they differ is known from their number, not from their length.
+# Many short sessions: the spread between them is estimated from their number, not from their length.
 PROMISE_VIEWS, VIEWS_PER_SESSION = 400, 4
-CONTROL_VIEWS = 2  # of each session: of one, differences would be known to ± 6 to 10 points in place of 5 to 8
+CONTROL_VIEWS = 2  # of each session; with one, differences would be known to ± 6 to 10 points in place of 5 to 8
 CONTROLS = ("bare", "mean", "gray", "noise")
-# Of a difference, in half widths of its interval: the least that settles it before the end. Of 3,000 simulated controls
-# as good as a design of 80 and 95 %, 6.0 and 4.0 % were told from it, and 5.2 and 3.9 % if all were shown to the end;
-# intervals of real differences held in 95.7 to 97.1 % (`python tests/optimizer/test_promise_stops.py`).
+# The least difference that is settled early, in half widths of its interval. Of 3,000 simulated controls as good as a
+# design of 80 and 95 %, 6.0 and 4.0 % were called different, 5.2 and 3.9 % if all were shown to the end; intervals of
+# real differences held in 95.7 to 97.1 % (`python tests/optimizer/test_promise_stops.py`).
 SETTLED = 1.25
 
 
@@ -59,7 +58,7 @@ class PromiseOptions:
     def __post_init__(self):
         if self.views is not None and self.views < 2 * VIEWS_PER_SESSION:
             expected = f"a promise of {2 * VIEWS_PER_SESSION} views, two sessions, at least"
-            raise Refused(expected, f"{self.views}", "promise of more")
+            raise Refused(expected, f"{self.views} views", "ask for more")
 
 
 def make_promise(
@@ -74,14 +73,14 @@ def make_promise(
     """Show the design in all conditions, `per_session` in a row of one session, and the controls in the first
     `CONTROL_VIEWS` of each; rate, interval and controls are those of the primary (first) network. With a `half_width`
     it stops after half or three quarters of the sessions, if the rate's interval is at most twice as wide there and
-    every control's difference is settled; else it goes on without those that are.
+    every control's difference is settled; else it continues without the settled controls.
     """
-    shown = pictures_with_controls(problem, design, controls)
-    compared = _until_known(problem, shown, conditions, per_session, half_width, advance)
-    answers = compared["design"]
-    conditions = conditions[: answers.recognized.shape[1]]
-    places = _places(conditions, per_session)
-    models = model_claims(problem, answers, per_session, places)
+    appearances = pictures_with_controls(problem, design, controls)
+    by_kind = _responses_until_settled(problem, appearances, conditions, per_session, half_width, advance)
+    design_responses = by_kind["design"]
+    conditions = conditions[: design_responses.recognized.shape[1]]
+    places = _place_numbers(conditions, per_session)
+    models = model_claims(problem, design_responses, per_session, places)
     target = problem.scene.settings.target
     return Promise(
         target=Target(label=str(target.label), indices=problem.indices[0], goal=target.goal),
@@ -91,81 +90,80 @@ def make_promise(
         n=len(conditions),
         per_session=per_session,
         places=places,
-        controls=_beside_controls(compared, per_session),
-        conditions=_condition_claims(problem, conditions, answers.recognized[0]),
+        controls=_paired_claims(by_kind, per_session),
+        conditions=_condition_claims(problem, conditions, design_responses.recognized[0]),
         outermost_mm=_outermost_mm(problem),
     )
 
 
-def _until_known(
+def _responses_until_settled(
     problem: Problem,
-    shown: Mapping[str, Appearance],
+    appearances: Mapping[str, Appearance],
     conditions: Conditions,
     per_session: int,
     half_width: float | None,
     advance: Advance,
 ) -> dict[str, Responses]:
-    """The answers to the design and, until their differences are settled, to the controls; all of them without a
-    `half_width`.
-    """
-    compared: dict[str, Responses] = {}
-    unsettled, looks = list(shown), [0, len(conditions)] if half_width is None else _looks(len(conditions), per_session)
-    with open_responses(problem, shown, conditions) as asked:
+    """The responses to the design, and to each control until its difference is settled (never without `half_width`)."""
+    by_kind: dict[str, Responses] = {}
+    unsettled, n = list(appearances), len(conditions)
+    looks = [0, n] if half_width is None else _look_positions(n, per_session)
+    with open_responses(problem, appearances, conditions) as respond:
         for first, last in pairwise(looks):
-            rows, beside = np.arange(first, last), _with_controls(last - first, per_session)
-            answers = asked(unsettled, rows, beside, lambda done, _, n=first: advance(n + done, len(conditions)))
-            compared = joined([compared, answers]) if compared else answers
-            if half_width is None or last == len(conditions):
+            rows, mask = np.arange(first, last), _control_mask(last - first, per_session)
+            answers = respond(unsettled, rows, mask, lambda done, _, first=first: advance(first + done, n))
+            by_kind = merge_responses([by_kind, answers]) if by_kind else answers
+            if half_width is None or last == n:
                 break
-            claims = _beside_controls(compared, per_session)
-            settled = {kind for kind, claim in claims.items() if _settled(claim, half_width)}
+            claims = _paired_claims(by_kind, per_session)
+            settled = {kind for kind, claim in claims.items() if _is_settled(claim, half_width)}
             unsettled = [kind for kind in unsettled if kind not in settled]
-            places = _places(conditions[:last], per_session)
-            counts = count_by_session(compared["design"].recognized[0], per_session, places)
+            places = _place_numbers(conditions[:last], per_session)
+            counts = count_by_session(by_kind["design"].recognized[0], per_session, places)
             if unsettled == ["design"] and np.ptp(rate_posterior(*counts).rate_interval) <= 2 * half_width:
-                advance(last, last)  # a bar that stays at half would look broken
+                advance(last, last)  # a progress bar that stays at half would look broken
                 break
-    return compared
+    return by_kind
 
 
-def _with_controls(n: int, per_session: int) -> np.ndarray:
-    """Which of n conditions, sessions in a row, the controls are shown in."""
+def _control_mask(n: int, per_session: int) -> np.ndarray:
+    """A mask of the conditions, of n in sessions in a row, that controls are shown in."""
     return np.arange(n) % per_session < CONTROL_VIEWS
 
 
-def _beside_controls(compared: Mapping[str, Responses], per_session: int) -> dict[str, ControlClaim]:
-    """The claims of the primary network; the design has seen all conditions."""
-    design = compared["design"]
-    paired = design.at(np.flatnonzero(_with_controls(design.recognized.shape[1], per_session)))
-    return control_claims({**compared, "design": paired}, 0, min(CONTROL_VIEWS, per_session))
+def _paired_claims(by_kind: Mapping[str, Responses], per_session: int) -> dict[str, ControlClaim]:
+    """The control claims of the primary network, for the conditions that design and controls share."""
+    design = by_kind["design"]
+    paired = design.select(np.flatnonzero(_control_mask(design.recognized.shape[1], per_session)))
+    return control_claims({**by_kind, "design": paired}, 0, min(CONTROL_VIEWS, per_session))
 
 
-def _settled(claim: ControlClaim, half_width: float) -> bool:
-    """Whether a control's difference is known as well as the rate has to be, or so surely not zero that looking before
-    the end leaves its interval what it says.
+def _is_settled(claim: ControlClaim, half_width: float) -> bool:
+    """True if a control's difference is known as well as the rate has to be, or is so clearly not zero that an early
+    look does not invalidate its interval.
     """
     half = np.ptp(claim.difference_interval) / 2
     return bool(half <= half_width or abs(claim.difference) >= SETTLED * half)
 
 
-def _looks(total: int, per_session: int) -> list[int]:
-    """Where the parts of a promise begin and end that may stop between them. Of 1,000 simulated promises each, of rates
-    from 85 to 99 % to ± 4 points, the intervals of those that looked so held in 93.5 to 97.1 %, of full ones in 94.4 to
-    96.4 %; a first look after two fifths, then one every fifth, saved 1 to 20 % more views, but held in 91.9 % of one
-    kind (`python tests/optimizer/test_promise_stops.py`).
+def _look_positions(total: int, per_session: int) -> list[int]:
+    """The view counts at which a promise may stop, after a 0. Of 1,000 simulated promises each, of rates from 85 to
+    99 % to ± 4 points, the intervals of those that stopped early held in 93.5 to 97.1 %, of full ones in 94.4 to
+    96.4 %; a first look after two fifths, then one every fifth, saved 1 to 20 % more views, but held in 91.9 % in one
+    case (`python tests/optimizer/test_promise_stops.py`).
     """
     sessions = math.ceil(total / per_session)
     return [0, *sorted({min(total, math.ceil(sessions * part) * per_session) for part in (0.5, 0.75, 1)})]
 
 
 def min_promise_passes() -> int:
-    """Pictures that a network sees in a promise that stops as early as it may."""
-    views = _looks(PROMISE_VIEWS, VIEWS_PER_SESSION)[1]
-    return views + len(CONTROLS) * int(_with_controls(views, VIEWS_PER_SESSION).sum())
+    """The pictures that a network sees in a promise that stops at its first look."""
+    views = _look_positions(PROMISE_VIEWS, VIEWS_PER_SESSION)[1]
+    return views + len(CONTROLS) * int(_control_mask(views, VIEWS_PER_SESSION).sum())
 
 
 def _outermost_mm(problem: Problem) -> tuple[tuple[float, float, float], ...]:
-    """The object's outermost points in the frame of its piece, where a network asks for its box in photographs."""
+    """The object's outermost points in the frame of its piece, if a network uses its box in photographs."""
     scene = problem.scene
     if not isinstance(scene, PatchScene) or not any(c.LOOKS_AT_BOXES for c in problem.classifiers):
         return ()
@@ -173,27 +171,28 @@ def _outermost_mm(problem: Problem) -> tuple[tuple[float, float, float], ...]:
     return tuple((round(x, 3), round(y, 3), round(z, 3)) for x, y, z in points.tolist())
 
 
-def _places(conditions: Conditions, per_session: int) -> tuple[int, ...]:
-    """A number for each session's place, as they come; none where all are others, or the one place is known."""
+def _place_numbers(conditions: Conditions, per_session: int) -> tuple[int, ...]:
+    """A number for each session's place, in order; empty if all are different, or if there is only one place."""
     chosen = conditions.pose.background[::per_session, 0]
     places, first, which = np.unique(chosen, return_index=True, return_inverse=True)
     return tuple(map(int, first[which])) if 1 < len(places) < len(chosen) else ()
 
 
 def pictures_with_controls(problem: Problem, design: np.ndarray, controls: Sequence[str]) -> dict[str, Appearance]:
-    """What shows under "design" and under each control's name."""
-    subject, shown = problem.subject, {}
+    """The appearance of the design, and of each control by its name (None for "bare")."""
+    subject, appearances = problem.subject, {}
     with torch.no_grad():
         for kind in ("design", *controls):
             pixels = design if kind in ("design", "bare") else subject.control(kind, design)
-            shown[kind] = None if kind == "bare" else subject.shown(from_pixels(pixels, problem.device), kind)
-    return shown
+            design_srgb = from_pixels(pixels, problem.device)
+            appearances[kind] = None if kind == "bare" else subject.appearance(design_srgb, kind)
+    return appearances
 
 
 def model_claims(
     problem: Problem, design: Responses, per_session: int = 1, places: Sequence[int] = ()
 ) -> tuple[ModelClaim, ...]:
-    """Each network's rate and confidence of the design; intervals are over sessions, those of one place together."""
+    """Each network's rate and confidence for the design; intervals are over sessions, those at one place together."""
     rows = zip(problem.classifiers, design.recognized, design.confidence, strict=True)
     return tuple(
         ModelClaim(
@@ -208,17 +207,17 @@ def model_claims(
     )
 
 
-def control_claims(answers: Mapping[str, Responses], model: int, per_session: int = 1) -> dict[str, ControlClaim]:
-    """Each control beside the design on the same conditions, of which it may have seen only the first; one network."""
-    design, claims = answers["design"].recognized[model], {}
-    for kind in (kind for kind in CONTROLS if kind in answers):
-        recognized = answers[kind].recognized[model]
+def control_claims(by_kind: Mapping[str, Responses], model: int, per_session: int = 1) -> dict[str, ControlClaim]:
+    """One network's claim for each control, paired with the design; a control may cover only the first conditions."""
+    design, claims = by_kind["design"].recognized[model], {}
+    for kind in (kind for kind in CONTROLS if kind in by_kind):
+        recognized = by_kind[kind].recognized[model]
         difference, interval = session_difference(design[: len(recognized)], recognized, per_session)
         claims[kind] = ControlClaim(
             n=len(recognized),
             rate=float(recognized.mean()),
             interval=rate_posterior(*count_by_session(recognized, per_session)).rate_interval,
-            confidence=float(answers[kind].confidence[model].mean()),
+            confidence=float(by_kind[kind].confidence[model].mean()),
             difference=difference,
             difference_interval=interval,
         )
@@ -226,20 +225,22 @@ def control_claims(answers: Mapping[str, Responses], model: int, per_session: in
 
 
 def _condition_claims(problem: Problem, conditions: Conditions, recognized: np.ndarray) -> tuple[ConditionClaim, ...]:
-    """What a photograph could show of each condition; null where the patch's face is turned away or there is none."""
+    """The measurable properties of each condition; None where the patch's face is turned away or there is no piece."""
     n = len(conditions)
     names = ("px_per_mm", "tilt_deg", "azimuth_deg", "contrast")
-    shows: dict[str, np.ndarray] = dict.fromkeys(names, np.full(n, np.nan))
+    properties: dict[str, np.ndarray] = dict.fromkeys(names, np.full(n, np.nan))
     if problem.scene.HAS_PIECE:
         scene = require_piece(problem.scene)
         scale, tilt = scene.scales_and_tilts(conditions, scene.photo_px).T
         azimuth = scene.piece_azimuth_deg(conditions)
         values = scale, tilt, azimuth, _contrasts(problem, scene, conditions)
-        away = np.abs(azimuth) >= 90  # unknown angles are of photographs that show it
-        shows = {name: np.where(away, np.nan, value) for name, value in zip(shows, values, strict=True)}
+        turned_away = np.abs(azimuth) >= 90  # NaN, an unknown angle, counts as facing the camera
+        properties = {
+            name: np.where(turned_away, np.nan, value) for name, value in zip(properties, values, strict=True)
+        }
     return tuple(
         ConditionClaim(
-            **{name: _rounded(value[i]) for name, value in shows.items()},
+            **{name: _rounded(value[i]) for name, value in properties.items()},
             blur_px=_rounded(conditions.sensor.blur_px[i]),
             recognized=bool(recognized[i]),
         )

@@ -1,10 +1,10 @@
-"""Coarse to fine: a step that moves large parts of a design as readily as single pixels.
+"""Coarse to fine: a gradient pyramid, with which a step moves large parts of a design as readily as single pixels.
 
-In: the gradient at a picture C×H×W, and which of its pixels may change. Out: its means over blocks of 1, 2, 4 … pixels,
-each level of which the optimizer scales on its own, and the sum of the scaled levels as one update. The gradient of a
-pixel is mostly that of the few views it was drawn from; the mean over a block shares it with every view, so that color
-and large shapes, which count in small and blurred views, come first. Laplacian pyramid normalization of DeepDream
-(Mordvintsev et al., TensorFlow tutorial, 2015) scales levels likewise, by their spread instead of Adam's.
+In: the gradient at a picture C×H×W, and a mask of the pixels that may change. Out: its means over blocks of 1, 2, 4 …
+pixels, each level of which the optimizer scales on its own, and the sum of the scaled levels as one update. The
+gradient of a pixel is mostly that of the few views it was drawn from; the mean over a block shares it with every view,
+so that color and large shapes, which count in small and blurred views, come first. Laplacian pyramid normalization of
+DeepDream (Mordvintsev et al., TensorFlow tutorial, 2015) scales levels likewise, by their spread instead of Adam's.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from torch.nn.functional import avg_pool2d, interpolate
 MIN_COARSEST_BLOCKS = 8  # blocks along the shorter side of the coarsest level
 
 
-def levels(gradient: Tensor, mask: Tensor | None = None) -> tuple[Tensor, ...]:
-    """C×H×W → C×⌈H/2ˡ⌉×⌈W/2ˡ⌉ for l = 0, 1, …: means over those of a block's pixels that are there and in the mask.
+def build_pyramid(gradient: Tensor, mask: Tensor | None = None) -> tuple[Tensor, ...]:
+    """C×H×W → C×⌈H/2ˡ⌉×⌈W/2ˡ⌉ for l = 0, 1, …: means over the pixels of a block that lie in picture and mask.
 
     `mask` is H×W, 1 where the picture may change; the gradient is 0 elsewhere.
     """
@@ -34,11 +34,11 @@ def levels(gradient: Tensor, mask: Tensor | None = None) -> tuple[Tensor, ...]:
 
 
 def level_count(size_px: Sequence[int]) -> int:
-    """How many levels a picture of that size has, its own among them."""
+    """The number of levels for a picture of that size, the full size included."""
     return 1 + max(0, int(math.log2(max(1, min(size_px)) / MIN_COARSEST_BLOCKS)))
 
 
-def joined(updates: Sequence[Tensor]) -> Tensor:
+def collapse_pyramid(updates: Sequence[Tensor]) -> Tensor:
     """The levels' sum at the finest's size; divided by √count, so that independent levels add up to one step."""
     finest, total = updates[0], updates[0]
     for level, update in enumerate(updates[1:], 1):

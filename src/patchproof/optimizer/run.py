@@ -1,10 +1,10 @@
-"""A run's folder: what an optimization leaves behind, written so that a kill at any moment loses 120 views at most.
+"""A run's folder: the results of an optimization, written so that a kill at any moment loses 120 views at most.
 
 In: a scene file. Out: RUN/ with `design.png`, `run.json` (settings, versions, seeds, threads, promise), `steps.jsonl`
 (one flushed line per step), `views.png` and `checkpoint.safetensors` (replaced atomically); where the place was
-searched for also `place.json` and `place.png`, while run.json has it like one that was given. A design that was made
-elsewhere (`given`) is finished here, too. Nothing in it depends on the time of day, so that the same seed gives the
-same bytes on one machine with one thread count and device.
+searched for also `place.json` and `place.png`, while run.json holds the place as if the scene had given it. Imported
+designs (`imported_design`) are finished here, too. Nothing in the folder depends on the time of day, so that a seed
+always gives the same bytes on one machine with one thread count and device.
 """
 
 from __future__ import annotations
@@ -46,15 +46,16 @@ from patchproof.scene.patch_scene import PatchScene
 from patchproof.scene.scene import build_scene, load_scene
 from patchproof.sheets.manifest import Promise
 
-_LOG, RUN_FILE, _VIEWS = ("steps.jsonl", "run.json", "views.png")
-_GIVEN = "given.glb"  # the mesh of a scene that was made in Python
-_RESULTS = (DESIGN_FILE, OBJECT_FILE, TEXTURE_FILES, MASK_FILE)
-RUN_FILE_PATTERNS = (CHECKPOINT_FILE, _LOG, RUN_FILE, _VIEWS, _GIVEN, "place.*", *_RESULTS, "evaluate.json", ".*.part")
+_LOG_FILE, RUN_FILE, _VIEWS_FILE = ("steps.jsonl", "run.json", "views.png")
+_MESH_FILE = "given.glb"  # the mesh of a scene that was made in Python
+_DESIGN_FILES = (DESIGN_FILE, OBJECT_FILE, TEXTURE_FILES, MASK_FILE)
+_STEP_FILES = (CHECKPOINT_FILE, _LOG_FILE, RUN_FILE, _VIEWS_FILE, _MESH_FILE, "place.*")
+RUN_FILE_PATTERNS = (*_STEP_FILES, *_DESIGN_FILES, "evaluate.json", ".*.part")
 
-# Steps and promised views of a first look, whose interval is some four times as wide, and of a print that counts: three
-# times the default's steps, in half as wide an interval (`bench effort`).
+# (steps, promised views) of a first look, whose interval is some four times as wide, and of a print that counts, with
+# three times the default's steps and an interval half as wide (`bench effort`).
 DRAFT_EFFORT, THOROUGH_EFFORT = (40, 40), (720, 1600)
-LEAST_MOVE = 1.5 / 255  # a design that moved by less is printed as it began
+MIN_DESIGN_CHANGE = 1.5 / 255  # a design that moved by less is printed as its start
 
 
 @dataclass(frozen=True)
@@ -112,25 +113,23 @@ def optimize(
     """
     out, compute = Path(out), compute.without("optimize", cluster=True)
     if not resume:
-        check_folder(
-            out, RUN_FILE_PATTERNS, overwrite, unfinished=is_file(out / CHECKPOINT_FILE) and not is_file(out / RUN_FILE)
-        )
+        unfinished = is_file(out / CHECKPOINT_FILE) and not is_file(out / RUN_FILE)
+        check_folder(out, RUN_FILE_PATTERNS, overwrite, unfinished=unfinished)
     scene = scene_of(scene, seed)
-    keep_place = None
+    save_place = None
     if not scene.HAS_PLACE:
-        searching = {"models": models, "loss": loss, "compute": compute, "progress": progress}
-        scene, keep_place = _placed(scene, out, resume, searching)
+        search_options = {"models": models, "loss": loss, "compute": compute, "progress": progress}
+        scene, save_place = _choose_place(scene, out, resume, search_options)
     problem = set_problem(scene, compute.device, models, loss, compute.jobs)
     if not resume:
-        for path in (
-            path for name in RUN_FILE_PATTERNS[:-1] for path in out.glob(name)
-        ):  # all that the new one needs is read
-            path.unlink()
+        for pattern in RUN_FILE_PATTERNS[:-1]:  # everything that the new run needs has been read
+            for path in out.glob(pattern):
+                path.unlink()
     make_folder(out)
-    if keep_place is not None:
-        keep_place()
+    if save_place is not None:
+        save_place()
     state = load_checkpoint(out, problem) if resume else start(problem)
-    design = _loop(problem, state, out, partial(progress, "optimize"))
+    design = _run_steps(problem, state, out, partial(progress, "optimize"))
     return finish_run(problem, design, out, promise, progress)
 
 
@@ -143,21 +142,21 @@ def scene_of(scene: str | Path | Scene, seed: int | None) -> Scene:
     return scene
 
 
-def _placed(
-    scene: Scene, out: Path, resume: bool, searching: Mapping[str, Any]
+def _choose_place(
+    scene: Scene, out: Path, resume: bool, search_options: Mapping[str, Any]
 ) -> tuple[PatchScene, Callable[[], None]]:
-    """A scene whose piece has no place, at the one that a search chooses or chose; and what keeps that in the folder.
+    """The scene with the piece at the place that a search chooses or chose, and a function that saves the place.
 
-    Nothing of the search is imported for a scene that gives a place itself.
+    The search is imported only here, for scenes that give no place.
     """
     from patchproof.optimizer.place_files import read_place, save_place
     from patchproof.optimizer.place_search import choose_place
     from patchproof.scene.open_scene import require_unplaced
 
     scene = require_unplaced(scene)
-    place = (read_place(out, scene) if resume else None) or choose_place(scene, **searching)
-    placed = scene.at(place.at, place.spin_deg)
-    return placed, lambda: save_place(place, placed, out)
+    place = (read_place(out, scene) if resume else None) or choose_place(scene, **search_options)
+    placed_scene = scene.at(place.at, place.spin_deg)
+    return placed_scene, lambda: save_place(place, placed_scene, out)
 
 
 def finish_run(
@@ -168,14 +167,12 @@ def finish_run(
     progress: Progress,
     imported: Mapping[str, Any] | None = None,
 ) -> Run:
-    """Promise a design's rate and write what its run keeps into a folder; `imported` says where a design comes from
-    that was not optimized here.
-    """
+    """Promise a design's rate and write the run's files into a folder; `imported` is an imported design's origin."""
     scene = problem.scene
     problem.subject.save(design, out)
     promise = promise_of(problem, design, options, partial(progress, "promise"))
     if scene.mesh_glb is not None:
-        write_atomically(out / _GIVEN, scene.mesh_glb)
+        write_atomically(out / _MESH_FILE, scene.mesh_glb)
     details = _details(problem, promise, out) | ({} if imported is None else {"imported": dict(imported)})
     write_atomically(out / RUN_FILE, json.dumps(details, indent=1) + "\n")
     return Run(out, scene, design, promise, details)
@@ -203,7 +200,7 @@ def promise_run(
 
 
 def load_run(folder: str | Path) -> Run:
-    """A finished run; refused where it is none, or not finished."""
+    """Load a finished run; refused if the folder holds none, or an unfinished one."""
     folder = Path(folder)
     if not is_file(folder / RUN_FILE):
         begun = is_file(folder / CHECKPOINT_FILE)
@@ -214,7 +211,7 @@ def load_run(folder: str | Path) -> Run:
     settings, promise = record.settings, record.promise
     try:
         base = (folder / record.scene_folder).resolve()
-        glb = (folder / _GIVEN).read_bytes() if is_file(folder / _GIVEN) else None
+        glb = (folder / _MESH_FILE).read_bytes() if is_file(folder / _MESH_FILE) else None
         scene = build_scene(settings, base, record.seed, record.sheet_id, glb)
         if record.imported is not None:
             scene = replace(scene, known={**scene.known, "design": record.imported.sha256})
@@ -231,7 +228,7 @@ class _Imported(BaseModel):
 
 
 class _Record(BaseModel):
-    """What is read of run.json."""
+    """The parts of run.json that are read."""
 
     settings: SceneSettings
     promise: Promise
@@ -242,13 +239,12 @@ class _Record(BaseModel):
     imported: _Imported | None = None
 
 
-def _loop(problem: Problem, state: State, out: Path, advance: Advance) -> np.ndarray:
-    """Run the remaining steps, leaving log, checkpoint and views; the best design's pixels."""
-    settings, largest, path = problem.scene.settings.optimize, None, out / _LOG
-    # without the lines after the step that it goes on from
-    write_atomically(
-        path, b"".join(path.read_bytes().splitlines(keepends=True)[: state.number] if is_file(path) else [])
-    )
+def _run_steps(problem: Problem, state: State, out: Path, advance: Advance) -> np.ndarray:
+    """Run the remaining steps, writing log, checkpoint and views; the best design's pixels."""
+    settings, largest_gradient, path = problem.scene.settings.optimize, None, out / _LOG_FILE
+    # without the lines after the step from which the run resumes
+    lines = path.read_bytes().splitlines(keepends=True)[: state.number] if is_file(path) else []
+    write_atomically(path, b"".join(lines))
     with open(path, "a", encoding="utf-8") as log:
         for step in steps(problem, state):
             state = step.state
@@ -258,39 +254,37 @@ def _loop(problem: Problem, state: State, out: Path, advance: Advance) -> np.nda
             log.write(json.dumps(line) + "\n")
             log.flush()
             if state.number == settings.steps and step.pictures is not None:
-                write_png(out / _VIEWS, side_by_side(step.pictures))
-            if is_save_step(
-                settings, state.number
-            ):  # after the views, which a run that goes on from the last step lacks
+                write_png(out / _VIEWS_FILE, side_by_side(step.pictures))
+            if is_save_step(settings, state.number):  # after the views, which a resumed last step would not write
                 save_checkpoint(state, problem, out)
-            largest = max(step.gradient, largest or 0.0)
+            largest_gradient = max(step.gradient, largest_gradient or 0.0)
             advance(state.number, settings.steps)
-    _doubt(float((state.best - start(problem).design).abs().max()), largest)
+    _warn_if_unchanged(float((state.best - start(problem).design).abs().max()), largest_gradient)
     return problem.subject.pixels(state.best)
 
 
-def _doubt(moved: float, gradient: float | None) -> None:
-    """Warn of a design that is none; `moved` is its largest change, `gradient` the largest of all steps."""
-    if moved > LEAST_MOVE or gradient is None:
+def _warn_if_unchanged(change: float, gradient: float | None) -> None:
+    """Warn if the design never moved from its start; `change` is its largest change, `gradient` that of all steps."""
+    if change > MIN_DESIGN_CHANGE or gradient is None:
         return
     why = "give it more optimize.steps or a larger optimize.step_size"
     if gradient == 0:
         why = "no network's answer depends on it: do the views show it, and is it large enough in them?"
-    warnings.warn(f"the design is still what it began as: {why}", stacklevel=3)
+    warnings.warn(f"the design did not change from its start: {why}", stacklevel=3)
 
 
 def promise_of(problem: Problem, design: np.ndarray, options: PromiseOptions, advance: Advance) -> Promise:
-    """The promise of a finished design."""
-    most = options.views or PROMISE_VIEWS
-    enough = None if options.views else problem.scene.settings.promise.half_width
-    conditions = problem.scene.draw("promise", most, per_session=VIEWS_PER_SESSION)
-    promise = make_promise(problem, design, conditions, options.controls, advance, VIEWS_PER_SESSION, enough)
-    return promise.changed(draft=most < PROMISE_VIEWS)
+    """The promise of a finished design; a draft if `options.views` are fewer than usual."""
+    views = options.views or PROMISE_VIEWS
+    half_width = None if options.views else problem.scene.settings.promise.half_width
+    conditions = problem.scene.draw("promise", views, per_session=VIEWS_PER_SESSION)
+    promise = make_promise(problem, design, conditions, options.controls, advance, VIEWS_PER_SESSION, half_width)
+    return promise.changed(draft=views < PROMISE_VIEWS)
 
 
 def _details(problem: Problem, promise: Promise, out: Path) -> dict[str, Any]:
     scene = problem.scene
-    packages = ("torch", "numpy", "kornia", "trimesh")  # those that pixels depend on
+    packages = ("torch", "numpy", "kornia", "trimesh")  # those that results depend on
     return {
         "sheet_id": scene.sheet_id,
         "seed": scene.seed,

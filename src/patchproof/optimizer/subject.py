@@ -1,8 +1,8 @@
-"""What may be optimized: a design, of a printed piece or of the object's own texture.
+"""The subject of optimization: the design of a printed piece, or the object's own texture.
 
-In: a scene. Out: a `Subject`, which says where a design starts, what may become of it, what it costs, how it looks and
-what files a run keeps of it. A design is a float tensor 3×h×w in [0, 1], its `pixels` are uint8 h×w×3. Patches and
-textures have a module each, of which a scene loads its own.
+In: a scene. Out: a `Subject`, which gives the first design, the allowed designs, their penalty and appearance, and the
+files a run stores. A design is a float tensor 3×h×w in [0, 1], its `pixels` are uint8 h×w×3. Patches and textures have
+a module each; a scene loads the one it needs.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ DESIGN_FILE, OBJECT_FILE, TEXTURE_FILES, MASK_FILE = "design.png", "object.glb",
 
 @dataclass(frozen=True)
 class Grid:
-    """How fine a design is: its pixels, as optimized and as printed (None of textures, which keep their own sizes and
-    are not printed), and how many there are, in all and per millimeter of a side.
+    """The resolution of a design: its pixels as optimized and as printed (None for textures, which keep their own sizes
+    and are not printed), and their number, in all and per millimeter of a side.
     """
 
     design_px: tuple[int, int] | None
@@ -42,61 +42,61 @@ class Grid:
 
 
 class Subject(Protocol):
-    """What the loop, the promise and studies ask of what is optimized; what is not printed is shown as it is."""
+    """The interface of a patch or texture to the loop, the promise and studies."""
 
-    STAGE_NAME: ClassVar[str]  # what turns a design into what is shown
+    STAGE_NAME: ClassVar[str]  # the stage that turns a design into its appearance, in timings
 
     def start(self) -> Tensor:
         """The design before the first step."""
         ...
 
-    def clipped(self, design: Tensor) -> Tensor:
+    def clip(self, design: Tensor) -> Tensor:
         """The nearest design that is allowed."""
         ...
 
-    def levels(self, gradient: Tensor) -> tuple[Tensor, ...]:
+    def gradient_levels(self, gradient: Tensor) -> tuple[Tensor, ...]:
         """The gradient's pyramid."""
         ...
 
-    def joined(self, updates: Sequence[Tensor]) -> Tensor:
-        """The update of a design that the pyramid's own add up to."""
+    def combine_levels(self, updates: Sequence[Tensor]) -> Tensor:
+        """Combine the updates of the pyramid's levels into one update of the design."""
         ...
 
     def penalty(self, design: Tensor) -> Tensor | float:
-        """What the scene's settings charge a design for."""
+        """The penalty of a design by the scene's settings."""
         ...
 
     def pixels(self, design: Tensor) -> np.ndarray:
-        """What is printed or stored of a design."""
+        """The pixels of a design that are printed or stored."""
         ...
 
     def control(self, kind: str, pixels: np.ndarray) -> np.ndarray:
-        """What the control of this kind has in place of the design's pixels."""
+        """The pixels of the control of this kind, in place of the design's."""
         ...
 
-    def shown(self, design: Tensor, kind: str = "design") -> Appearance:
-        """What photographs show of a design, or of a control with the markers of its own sheet; differentiable."""
+    def appearance(self, design: Tensor, kind: str = "design") -> Appearance:
+        """The appearance of a design, or of a control with the markers of its own sheet; differentiable."""
         ...
 
-    def printed(self, design: Tensor) -> Tensor:
-        """What all pictures of an optimized design have in common, so that a step makes it once; differentiable."""
+    def print_design(self, design: Tensor) -> Tensor:
+        """The print that all pictures of a design share, made once a step; differentiable. A texture is not printed."""
         return design
 
-    def showing(self, printed: Tensor) -> Appearance:
-        """What photographs show of that; differentiable."""
-        return self.shown(printed)
+    def appearance_of_print(self, printed: Tensor) -> Appearance:
+        """The appearance of a print; differentiable."""
+        return self.appearance(printed)
 
     def with_printer(self, printer: Printer) -> Self:
-        """The same subject as another printer prints it."""
+        """This subject with another printer."""
         return self
 
     @property
     def grid(self) -> Grid:
-        """How fine designs are."""
+        """The resolution of designs."""
         ...
 
     def save(self, pixels: np.ndarray, folder: Path) -> None:
-        """Write the files that a run keeps of its design; earlier ones are replaced only by complete ones."""
+        """Write the design's files into a run's folder; earlier ones are replaced only by complete ones."""
         ...
 
     def file(self, pixels: np.ndarray) -> tuple[str, bytes]:
@@ -105,12 +105,12 @@ class Subject(Protocol):
 
 
 def subject_of(scene: Scene, printer: Printer, network_px: int, device: torch.device) -> Subject:
-    """What a scene leaves open, before networks whose largest input has that side."""
+    """The subject that a scene leaves open, for networks whose largest input has side `network_px`."""
     return _module_of(scene).subject_of(scene, printer, network_px, device)
 
 
 def read_design(scene: Scene, folder: Path) -> np.ndarray:
-    """The pixels that `Subject.save` wrote, to the bit; refused where they are not of this scene."""
+    """Read the pixels that `Subject.save` wrote, to the bit; refused where they do not fit the scene."""
     return _module_of(scene).read_design(scene, folder)
 
 

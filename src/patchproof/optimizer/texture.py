@@ -1,8 +1,8 @@
-"""The object's own texture as the thing that is optimized, whole or under a mask.
+"""The object's own texture as the subject of optimization, whole or under a mask.
 
-In: a scene with a canvas (which texels may change, and from what start). Out: `Texture`: its design is the list of
-those texels, 3×1×M, so that the loop treats it like any picture and no other texel can change. With `epsilon` every
-texel stays within that distance of its start. Nothing is printed, hence no printer and no gamut.
+In: a scene with a canvas (which texels may change, and their start). Out: `Texture`: its design is the list of those
+texels, 3×1×M, so that the loop treats it like any picture and no other texel can change. With `epsilon` every texel
+stays within that distance of its start. Nothing is printed, hence no printer and no gamut.
 
 Source: Pestana et al., algorithms "Full Texture" and "Masked Textures and 3D Patches".
 """
@@ -38,8 +38,8 @@ from patchproof.sheets.piece import CELLS, control_design
 class Texture(Subject):
     """Designs are 3×1×M in [0, 1]: the texels that may change, texture by texture, by rows."""
 
-    # Larger steps suit the networks that train and no other: of a letter box for three networks, a fourth recognized
-    # 60 % as it came, 60, 70, 76 % with steps of 0.1, 0.03, 0.015 (96 views), 81 % with twice as many of 0.015.
+    # Larger steps suit only the networks that train: a fourth network recognized a letter box made for three in 60 % of
+    # views as it came, 60, 70, 76 % with steps of 0.1, 0.03, 0.015 (96 views), 81 % with twice as many of 0.015.
     STAGE_NAME: ClassVar[str] = "textures"
     scene: Scene
     canvas: Canvas
@@ -49,35 +49,35 @@ class Texture(Subject):
         """The texels that the canvas starts from."""
         return from_pixels(self.surface.texels(self.canvas.start_srgb), self.device)
 
-    def clipped(self, design: Tensor) -> Tensor:
-        """The nearest design within the ball round the start."""
+    def clip(self, design: Tensor) -> Tensor:
+        """The nearest design within `epsilon` of the start."""
         epsilon = self.scene.settings.patch.epsilon
         if epsilon is None:
             return design.clamp(0, 1)
-        # whole code values: rounding to 8 bits must not leave the ball
+        # whole code values, so that rounding to 8 bits stays within epsilon
         reach = np.floor(epsilon * 255 + 1e-6) / 255
         return torch.minimum(torch.maximum(design, self._start - reach), self._start + reach).clamp(0, 1)
 
-    def levels(self, gradient: Tensor) -> tuple[Tensor, ...]:
+    def gradient_levels(self, gradient: Tensor) -> tuple[Tensor, ...]:
         """The gradient's pyramids, texture by texture."""
         return tuple(
             level
             for image, mask in zip(self.surface.images(gradient), self.surface.masks, strict=True)
-            for level in pyramid.levels(image, mask)
+            for level in pyramid.build_pyramid(image, mask)
         )
 
-    def joined(self, updates: Sequence[Tensor]) -> Tensor:
-        """The update of a design that the pyramids' own add up to."""
+    def combine_levels(self, updates: Sequence[Tensor]) -> Tensor:
+        """Combine the updates of the pyramids' levels into one update of the design."""
         parts, first = [], 0
         for mask in self.surface.masks:
             count = pyramid.level_count(mask.shape)
-            whole = pyramid.joined(updates[first : first + count])
+            whole = pyramid.collapse_pyramid(updates[first : first + count])
             parts.append(whole[:, mask])
             first += count
         return torch.cat(parts, 1)[:, None]
 
     def penalty(self, design: Tensor) -> Tensor | float:
-        """Total variation within the changed texels of each row or column of the textures, where settings ask."""
+        """Total variation of neighboring texels that may both change, if the scene asks for it."""
         weight = self.scene.settings.optimize.tv
         if not weight:
             return 0.0
@@ -90,12 +90,12 @@ class Texture(Subject):
         return weight * torch.stack(changes).mean() if changes else 0.0
 
     def pixels(self, design: Tensor) -> np.ndarray:
-        """uint8 1×M×3: what the textures store."""
+        """uint8 1×M×3, as the textures store them."""
         return as_pixels(design)
 
     def control(self, kind: str, pixels: np.ndarray) -> np.ndarray:
-        """The same texels in one mean color, gray, or noise of 16 cells along each texture's shorter side; or
-        "shuffled": the design's own, such cells in another order.
+        """The texels of a control: one mean color, gray, or noise of 16 cells along each texture's shorter side;
+        "shuffled": the design's own, with such cells in another order.
         """
         if kind == "shuffled":
             return self._shuffled(pixels)
@@ -118,13 +118,13 @@ class Texture(Subject):
             first += len(rows)
         return result
 
-    def shown(self, design: Tensor, kind: str = "design") -> ObjectTextures:
+    def appearance(self, design: Tensor, kind: str = "design") -> ObjectTextures:
         """The object's textures with a design; differentiable."""
         return self.surface.shown(design)
 
     def save(self, pixels: np.ndarray, folder: Path) -> None:
-        """Write the object with its new textures, each of them, and below each other the masks, white where a texture
-        was free to change.
+        """Write the object with its new textures, each texture, and the masks one below the other, white where texels
+        may change.
         """
         textures, masks = self.surface.textures(pixels), self.canvas.mask
         write_atomically(folder / OBJECT_FILE, lambda path: write_glb(self.canvas.mesh, textures, path))
@@ -143,7 +143,7 @@ class Texture(Subject):
 
     @property
     def grid(self) -> Grid:
-        """How fine the textures are, per millimeter of the surface on average."""
+        """The resolution of the textures, per millimeter of the surface on average."""
         mesh, masks = self.canvas.mesh, self.canvas.mask
         sizes = np.array([mask.shape[1::-1] for mask in masks])
         uv = mesh.corner_uv.astype(float) * sizes[mesh.face_material][:, None]
@@ -164,12 +164,12 @@ class Texture(Subject):
 
 
 def subject_of(scene: Scene, printer: Printer, network_px: int, device: torch.device) -> Texture:
-    """As in `subject`: the scene's own texture, whatever printer and networks there are."""
+    """Implements `subject.subject_of`: the scene's own texture, for any printer and networks."""
     return Texture(scene, scene.object_canvas(), device)
 
 
 def read_design(scene: Scene, folder: Path) -> np.ndarray:
-    """As in `subject`: the changeable texels of the textures."""
+    """Implements `subject.read_design`: reads the changeable texels of the textures."""
     canvas = scene.object_canvas()
     textures = [read_png(folder / TEXTURE_FILES.replace("*", f"{i}")) for i in range(len(canvas.mask))]
     for texture, mask in zip(textures, canvas.mask, strict=True):

@@ -1,8 +1,8 @@
 """The views that a run is trained in.
 
-In: a scene's draws. Out: `training_conditions`, whose poses come round several times, each time before another
-background, under other light, with another print and camera; and `ViewCache`, which renders them once and then only
-lights them anew, as far as memory allows.
+In: a scene's draws. Out: `training_conditions`, in which each pose occurs several times, each time with another
+background, light, print and camera; and `ViewCache`, which renders poses once and only relights them later, as far as
+memory allows.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ from patchproof.render.views import Views, split_views
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.interface import Scene
 
-VIEWS_PER_TASK = 2  # of a step, that one process renders: one at a time, rendering took 1.4 times as long
-STEPS_AHEAD = 4  # whose views a process renders together: alone, rendering took 1.4 times as long
-# A run has this many poses, or a quarter as many as views if that is more. Over 18 pairs of object and seed the loss
-# was 0.7 % [-0.2, 1.5] higher than with a pose to each view, and as many views were recognized. With a background to
-# each pose, too, it was 2 %; with one pose for four steps in a row, 25 to 33 %.
+VIEWS_PER_TASK = 2  # views of a step that one process renders together; one by one took 1.4 times as long
+STEPS_AHEAD = 4  # steps whose views a process renders together; one by one took 1.4 times as long
+# A run has this many poses, or a quarter as many as views if that is more. Over 18 pairs of object and seed, the loss
+# was 0.7 % [-0.2, 1.5] higher than with one pose for each view, and as many views were recognized. With one background
+# for each pose, too, it was 2 % higher; with one pose for four steps in a row, 25 to 33 %.
 MIN_POSES, VIEWS_PER_POSE = 240, 4
-CACHE_PX = 240 * 224**2  # of the views that a process keeps, with 20 to 60 bytes to a pixel
+CACHE_PX = 240 * 224**2  # of the views that a process keeps, at 20 to 60 bytes a pixel
 
 
 def training_conditions(scene: Scene) -> Conditions:
-    """The conditions of all of a run's views. Poses come round again, what lies behind an object does not."""
+    """The conditions of all of a run's views. Poses repeat, backgrounds do not."""
     settings = scene.settings.optimize
     conditions = scene.draw("train", settings.steps * settings.views)
     pose = conditions.pose[np.arange(len(conditions)) % pose_count(scene)]
@@ -37,7 +37,7 @@ def training_conditions(scene: Scene) -> Conditions:
 
 
 def pose_count(scene: Scene) -> int:
-    """The number of poses in a run, those of whole steps; pictures, which are all of one view, have one each."""
+    """The number of poses in a run, a multiple of a step's views; scenes of pictures have one pose per view."""
     settings = scene.settings.optimize
     views = settings.steps * settings.views
     if not scene.HAS_OBJECT:
@@ -58,28 +58,28 @@ def task_conditions(conditions: Conditions) -> list[tuple[int, Conditions]]:
 
 def training_views(problem: Problem, conditions: Conditions) -> Views:
     """Views of these conditions at the training's size, in which any design can be shown."""
-    return problem.see(problem.laid_out, conditions, problem.training_px)
+    return problem.see(problem.start_appearance, conditions, problem.training_px)
 
 
 class ViewCache:
-    """The training views that one process has rendered: the first that fit, and those of its next steps, which it
-    renders together.
+    """The training views that one process has rendered: as many as fit are kept, and the next steps' are rendered
+    together.
     """
 
     def __init__(self, problem: Problem, conditions: Conditions):
         self._problem, self._conditions = problem, conditions
         self._poses = min(pose_count(problem.scene), len(conditions))
-        self._kept, self._ahead = dict[int, Views](), dict[int, Views]()
-        comes_round = new_pose_share(problem.scene) < 1
-        self._capacity = CACHE_PX // (VIEWS_PER_TASK * problem.training_px**2) if comes_round else 0
+        self._stored, self._ahead = dict[int, Views](), dict[int, Views]()
+        repeats = new_pose_share(problem.scene) < 1
+        self._capacity = CACHE_PX // (VIEWS_PER_TASK * problem.training_px**2) if repeats else 0
 
     def views(self, pose: int, conditions: Conditions) -> Views:
         """The views of a task's conditions, whose poses begin with the run's pose number `pose`."""
-        if pose not in self._kept and pose not in self._ahead:
+        if pose not in self._stored and pose not in self._ahead:
             self._render_ahead(pose, len(conditions))
-        views = self._kept.get(pose) or self._ahead.pop(pose)
-        if len(self._kept) < self._capacity:
-            self._kept[pose] = views
+        views = self._stored.get(pose) or self._ahead.pop(pose)
+        if len(self._stored) < self._capacity:
+            self._stored[pose] = views
         return self._problem.see_again(views, conditions)
 
     def _render_ahead(self, pose: int, count: int) -> None:

@@ -27,7 +27,7 @@ from patchproof.base.errors import Refused
 from patchproof.evidence.reproject import PhotoSquare
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.optimizer.promise import pictures_with_controls
-from patchproof.optimizer.responses import ask
+from patchproof.optimizer.responses import ask_networks
 from patchproof.optimizer.run import Run, load_run
 from patchproof.render.photograph import expose
 from patchproof.render.pixels import Appearance
@@ -87,7 +87,7 @@ def photo_forecaster(run: str | Path | Run, manifest: Manifest) -> Callable[[Pho
         views = retake(problem, scene, shown, shot, manifest)
         with torch.no_grad():
             pictures = expose(views, shown)
-        hits = ask(problem, pictures, views.stage.scene.boxes(views.conditions)).recognized[0]
+        hits = ask_networks(problem, pictures, views.stage.scene.boxes(views.conditions)).recognized[0]
         return float((hits.sum() + usual) / (len(hits) + 1))
 
     return chance

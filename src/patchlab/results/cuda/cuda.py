@@ -63,7 +63,7 @@ def measured(name: str) -> Iterator[dict]:
         views, design = training_views(problem, drawn), problem.subject.start()
         design = design + 0.2 * torch.arange(design.numel()).sin().reshape(design.shape).to(design)
         answers.append(gradient_in_views(problem, design, [views]))
-        pictures.append(expose(views, problem.subject.shown(design)).detach().cpu())
+        pictures.append(expose(views, problem.subject.appearance(design)).detach().cpu())
     yield line("largest difference of a pixel", None, float((pictures[0] - pictures[1]).abs().max()))
     one, other = (answer.gradient.cpu() for answer in answers)
     yield line("relative difference of the gradient", None, float((one - other).norm() / one.norm()))
@@ -77,7 +77,7 @@ def measured(name: str) -> Iterator[dict]:
     pixels, unseen, told = as_pixels(runs[0][1].state.design), scene.draw("evaluate", VIEWS), []
     times = []
     for problem in (cpu, gpu):
-        shown = {"design": problem.subject.shown(from_pixels(pixels, problem.device))}
+        shown = {"design": problem.subject.appearance(from_pixels(pixels, problem.device))}
         times.append(seconds(lambda p=problem, s=shown: told.append(responses(p, s, unseen)["design"])))
     yield line(f"seconds of {VIEWS} views", *times)
     yield line(f"answers alike of {VIEWS}", None, int((told[0].recognized == told[1].recognized).sum()))

@@ -30,7 +30,7 @@ def measured(name: str) -> list[dict]:
     design = from_pixels(best_design(problem), problem.device)
     conditions, size_px = problem.scene.draw("evaluate", N, SEED), problem.scene.settings.camera.photo_px
     classifier, rows = problem.classifiers[0], []
-    for thing, shown in (("design", problem.subject.shown(design, "design")), ("bare", None)):
+    for thing, shown in (("design", problem.subject.appearance(design, "design")), ("bare", None)):
         answers = []  # N × (ours, traced) × (confidence, recognized)
         for one in (conditions[i : i + 1] for i in range(N)):
             with torch.no_grad():

@@ -25,7 +25,7 @@ from patchproof.optimizer.promise import (
     CONTROLS,
     PROMISE_VIEWS,
     VIEWS_PER_SESSION,
-    _with_controls,
+    _control_mask,
     pictures_with_controls,
 )
 from patchproof.optimizer.responses import responses
@@ -45,11 +45,11 @@ def measured(path: str) -> list[dict]:
     problem = set_problem(pp.load_scene(path))
     shown = pictures_with_controls(problem, best_design(problem), CONTROLS)
     conditions = problem.scene.draw("promise", PROMISE_VIEWS, per_session=VIEWS_PER_SESSION)
-    beside = _with_controls(PROMISE_VIEWS, VIEWS_PER_SESSION)
+    control_mask = _control_mask(PROMISE_VIEWS, VIEWS_PER_SESSION)
 
     def told(way):
         Classifier._call_network = way
-        return clocked(lambda: responses(problem, shown, conditions, beside=beside))
+        return clocked(lambda: responses(problem, shown, conditions, control_mask=control_mask))
 
     rounds, rows = in_turn({way: partial(told, way) for way in (asked, rounded)}, ROUNDS), []
     Classifier._call_network, (wholes, halves) = asked, rounds.values()

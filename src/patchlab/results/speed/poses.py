@@ -33,7 +33,7 @@ def measured(label: str, seed: int) -> dict:
         state = start(problem)
         for first in range(0, 960, 4):
             state = take_step(problem, state, conditions[first : first + 4]).state
-        shown[name] = problem.subject.shown(from_pixels(as_pixels(state.design), problem.device))
+        shown[name] = problem.subject.appearance(from_pixels(as_pixels(state.design), problem.device))
     row = {"object": label, "seed": seed}
     for name, answer in responses(problem, shown, scene.draw("evaluate", JUDGED)).items():
         row |= {f"{name}_loss": round(float(answer.loss.mean()), 4), f"{name}_rate": round(answer.recognized.mean(), 4)}

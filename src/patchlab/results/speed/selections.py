@@ -41,7 +41,7 @@ def measured(goal: str, optimizer: str, label: str, seed: int) -> dict:
     row |= dict.fromkeys(("all_loss", "all_rate", "half_loss", "half_rate"), "")
     if best["all"] != best["half"]:
         designs = {name: from_pixels(as_pixels(tried[at].state.design), problem.device) for name, at in best.items()}
-        shown = {name: problem.subject.shown(design) for name, design in designs.items()}
+        shown = {name: problem.subject.appearance(design) for name, design in designs.items()}
         for name, answer in responses(problem, shown, scene.draw("evaluate", JUDGED)).items():
             row |= {f"{name}_loss": round(float(answer.loss.mean()), 4)}
             row |= {f"{name}_rate": round(float(answer.recognized.mean()), 4)}

@@ -29,13 +29,13 @@ def measured(name: str) -> list[dict]:
     """The lines of one scene."""
     problem = problems.set_problem(pp.load_scene(f"{name}.toml"))
     design = from_pixels(best_design(problem), problem.device)
-    shown = {"design": problem.subject.shown(design, "design"), "bare": None}
+    shown = {"design": problem.subject.appearance(design, "design"), "bare": None}
     conditions = problem.scene.draw("evaluate", N, SEED)
     photo_px = min(problem.scene.settings.camera.photo_px)
     each = [responses(problem, shown, conditions[i : i + 1], photo_px) for i in range(N)]
     photographs, rows = {thing: concatenate_responses([answers[thing] for answers in each]) for thing in shown}, []
     for scale, side, taps in LOOKS:
-        problems.FIGURE_SCALE, problems.FIGURED = scale, replace(problems.FIGURED, taps=taps, side=side)
+        problems.FIGURE_SCALE, problems.FIGURE_SAMPLING = scale, replace(problems.FIGURE_SAMPLING, taps=taps, side=side)
         views = responses(problem, shown, conditions)
         for thing in shown:
             off = student_mean(views[thing].confidence[0] - photographs[thing].confidence[0])

@@ -23,13 +23,13 @@ N, TAPS = 200, (6, 4, 3, 2)
 
 def measured(name: str) -> list[dict]:
     """The lines of one scene."""
-    problem, look, told = problems.set_problem(pp.load_scene(f"{name}.toml")), problems.FIGURED, {}
+    problem, look, told = problems.set_problem(pp.load_scene(f"{name}.toml")), problems.FIGURE_SAMPLING, {}
     shown = pictures_with_controls(problem, best_design(problem), ())
     conditions = problem.scene.draw("promise", N, per_session=4)
     for taps in (PHOTO_SAMPLING.piece_taps, *TAPS):
-        problems.FIGURED = replace(look, piece_taps=taps)
+        problems.FIGURE_SAMPLING = replace(look, piece_taps=taps)
         told[taps] = responses(problem, shown, conditions)["design"]
-    problems.FIGURED, rows, many = look, [], told[PHOTO_SAMPLING.piece_taps]
+    problems.FIGURE_SAMPLING, rows, many = look, [], told[PHOTO_SAMPLING.piece_taps]
     for taps in TAPS:
         off, other = (told[taps].confidence - many.confidence)[0], told[taps].recognized != many.recognized
         figures = {"mean": off.mean(), "rms": np.sqrt((off**2).mean())}

@@ -22,7 +22,7 @@ def measured(name: str) -> list[dict]:
     """The lines of one scene."""
     problem = set_problem(pp.load_scene(f"{name}.toml"))
     design = from_pixels(best_design(problem), problem.device)
-    shown = {"design": problem.subject.shown(design, "design"), "bare": None}
+    shown = {"design": problem.subject.appearance(design, "design"), "bare": None}
     conditions = problem.scene.draw("evaluate", N, SEED)
     photo_px = min(problem.scene.settings.camera.photo_px)
     views = responses(problem, shown, conditions)

@@ -33,7 +33,7 @@ from patchproof.evidence.ranges import PromisedRanges
 from patchproof.evidence.surface import Surface, surface_of
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import Problem, set_problem
-from patchproof.optimizer.responses import CHUNK_VIEWS, ask
+from patchproof.optimizer.responses import CHUNK_VIEWS, ask_networks
 from patchproof.optimizer.run import Run, load_run
 from patchproof.render.photograph import expose
 from patchproof.render.pixels import PiecePicture
@@ -118,7 +118,7 @@ def recognized(world: World, points: Sequence[Point], conditions: Conditions) ->
     out = {kind: np.zeros((len(points), len(conditions)), bool) for kind in ("design", *CONTROLS)}
     as_file = any("jpeg" in point for point in points)
     side = min(world.scene.settings.camera.photo_px) if as_file else world.problem.figure_px
-    stages, first_network = _Stages(world), world.problem.before([0])
+    stages, first_network = _Stages(world), world.problem.with_classifiers([0])
     with torch.inference_mode():
         for first in range(4):  # the corner that is hidden first; each goes with a quarter of the conditions
             every = np.arange(first, len(conditions), 4)
@@ -129,7 +129,7 @@ def recognized(world: World, points: Sequence[Point], conditions: Conditions) ->
                 for i, kind in product(_by_cost(points), out):
                     file = views.file(points[i], kind)[0] if as_file else None
                     pictures = views.at(points[i], kind) if file is None else from_pixels(file)[None]
-                    out[kind][i, rows] = ask(first_network, pictures, boxes).recognized
+                    out[kind][i, rows] = ask_networks(first_network, pictures, boxes).recognized
     return out
 
 

@@ -61,11 +61,11 @@ def measure_cost(problem: Problem, design: Tensor, advance: Advance = no_advance
 def _step_ms(problem: Problem, design: Tensor, conditions: Conditions) -> dict[str, float]:
     """Milliseconds of each part of one step, in the order of the loop."""
     design = design.clone().requires_grad_()
-    parts, views = _see_ms(problem, problem.subject.shown(design.detach()), conditions)
+    parts, views = _see_ms(problem, problem.subject.appearance(design.detach()), conditions)
     share = new_pose_share(problem.scene)
     parts = {name: ms * share for name, ms in parts.items()}
     clock = _Clock(problem.device)
-    shown = problem.subject.shown(design)
+    shown = problem.subject.appearance(design)
     parts[problem.subject.STAGE_NAME] = clock.lap()
     pictures = expose(views, shown)
     parts["light, piece and camera"] = clock.lap()

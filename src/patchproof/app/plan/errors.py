@@ -72,7 +72,7 @@ def measure_terms(
     """The errors of all terms over `conditions`. The threshold is the standard error that the mean confidence has over
     `selection_views` views: a smaller change decides about no design.
     """
-    base = Setup(problem.stage, problem.subject.shown(design), conditions)
+    base = Setup(problem.stage, problem.subject.appearance(design), conditions)
     terms = scene_terms(problem, design, other_surface)
     changed = {term.name: setup for term in terms if (setup := term.change(base)) is not None}
     on = [term for term in terms if term.name in changed]

@@ -87,7 +87,7 @@ def _without(setup: Setup, effect: ViewEffect) -> Setup | None:
 def _without_printer(problem: Problem, design: Tensor, setup: Setup) -> Setup | None:
     if problem.printer.name == "identity":
         return None
-    return replace(setup, shown=problem.subject.with_printer(identity_printer()).shown(design))
+    return replace(setup, shown=problem.subject.with_printer(identity_printer()).appearance(design))
 
 
 def _without_part(setup: Setup, part: SceneTerm) -> Setup | None:
