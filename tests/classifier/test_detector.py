@@ -210,7 +210,7 @@ def test_a_detector_with_another_number_of_labels_is_refused():
 
 
 @pytest.fixture(scope="module")
-def packaged_path():
+def shipped():
     return load_classifier("builtin-detector", WEIGHTS_FOLDER)
 
 

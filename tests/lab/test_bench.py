@@ -110,6 +110,6 @@ def test_the_default_is_among_the_sides_of_training_s_views(monkeypatch):
     monkeypatch.setattr("patchlab.bench.render.SIDES_PX", (96,))
     problem = demo_problem()
     drawn = problem.subject.start()
-    chart = resolution_chart(problem, drawn, views=2, rounds=1, on_stage=lambda *_: None)
+    chart = resolution_chart(problem, drawn, views=2, rounds=1, progress=lambda *_: None)
     (points,) = chart.series.values()
     assert [point.setting for point in points if point.default] == [f"{problem.training_px} px"]

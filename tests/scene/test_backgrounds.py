@@ -130,7 +130,7 @@ def test_promises_of_another_scene_meet_other_draws_and_evaluations_the_same():
 
 @pytest.fixture(scope="module")
 def places():
-    return [module.place(number) for number in range(0, 12, 2)]
+    return [module.procedural_place(number) for number in range(0, 12, 2)]
 
 
 def test_textures_that_nobody_sees_are_drawn_as_if_they_were_made(monkeypatch, places):
@@ -141,7 +141,7 @@ def test_textures_that_nobody_sees_are_drawn_as_if_they_were_made(monkeypatch, p
         return lambda: picture
 
     monkeypatch.setattr(module, "drawn_texture", at_once)
-    assert all(np.array_equal(module.place(2 * i), place) for i, place in enumerate(places))
+    assert all(np.array_equal(module.procedural_place(2 * i), place) for i, place in enumerate(places))
     for seed in range(60):  # every pattern
         rng = np.random.default_rng(seed)
         later = patterns.drawn_texture(rng, 32)
@@ -151,7 +151,7 @@ def test_textures_that_nobody_sees_are_drawn_as_if_they_were_made(monkeypatch, p
 
 def test_rays_that_pass_a_box_by_are_those_that_would_not_meet_it(monkeypatch, places):
     monkeypatch.setattr(module, "_passing", lambda aim, ends: np.arange(aim.shape[1]))
-    assert all(np.array_equal(module.place(2 * i), place) for i, place in enumerate(places))
+    assert all(np.array_equal(module.procedural_place(2 * i), place) for i, place in enumerate(places))
 
 
 @pytest.mark.parametrize("count", [1, 2, 9, 80, 800])
