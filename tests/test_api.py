@@ -194,8 +194,8 @@ def test_networks_as_python_has_them():
         assert torch.allclose(judge.logits(pictures[0]), expected, atol=1e-6)
     for what, got in (
         (exported, r"an ExportedProgram: call its \.module"),
-        (torch.nn.Linear, "a type"),
-        ("net.pt", "a str"),
+        (torch.nn.Linear, "type type"),
+        ("net.pt", "type str"),
     ):
         with pytest.raises(pp.Refused, match=got):
             pp.classifier_of(what, 32, ("box", "cup", "tin"))

@@ -20,7 +20,7 @@ from patchlab.study.study import load_study
 from patchproof.base.intervals import student_mean
 from patchproof.base.settings import SceneSettings
 from patchproof.base.validation import read_toml, validate_model
-from patchproof.optimizer.problem import FIGURE_SCALE, FIGURE_SAMPLING
+from patchproof.optimizer.problem import FIGURE_SAMPLING, FIGURE_SCALE
 from patchproof.optimizer.run import load_run
 
 ROOT = Path(__file__).resolve().parents[1]
