@@ -113,11 +113,11 @@ def find_outlines(
         target += [pixel, beside]
         source += [beside, pixel]
         share += [(_cut_off(distance, slope) / counts).float() for distance in (place, 1 - place)]
-    pixel, view_of = ranked(torch.cat(target), len(nearest_mm))
+    pixel, index = ranked(torch.cat(target), len(nearest_mm))
     shares = torch.cat(share)
-    total = shares.new_zeros(len(pixel)).index_add_(0, view_of, shares)
-    shares = shares / total.clamp_min(1).index_select(0, view_of)
-    return Outlines(pixel, (1 - total).clamp_min(0)[:, None], view_of, torch.cat(source), shares[:, None])
+    total = shares.new_zeros(len(pixel)).index_add_(0, index, shares)
+    shares = shares / total.clamp_min(1).index_select(0, index)
+    return Outlines(pixel, (1 - total).clamp_min(0)[:, None], index, torch.cat(source), shares[:, None])
 
 
 def _cut_off(distance: Tensor, slope: Tensor) -> Tensor:

@@ -47,7 +47,7 @@ from patchproof.scene.conditions import Conditions
 from patchproof.scene.interface import require_piece
 from patchproof.scene.mesh_scene import MeshScene, require_mesh
 
-NEAR_SHARE = 1e-3  # of the near plane's distance, of the object's length
+NEAR_SHARE = 1e-3  # the near plane's distance as a share of the object's length
 
 
 @dataclass(frozen=True)

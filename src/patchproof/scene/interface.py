@@ -81,7 +81,7 @@ class Scene(ABC):
     HAS_PLACE: ClassVar[bool] = True  # for the design; False if the place has to be searched for
     EFFECT_TABLES: ClassVar[tuple[str, ...]] = ("printer", "camera")  # of the settings: their effects show here
     TERMS: ClassVar[tuple[SceneTerm, ...]] = ()
-    OMITTED: ClassVar[tuple[str, ...]] = ()  # names of what is not modeled
+    OMITTED: ClassVar[tuple[str, ...]] = ()  # effects that are not modeled
 
     @abstractmethod
     def description(self) -> str:
@@ -157,9 +157,9 @@ class Scene(ABC):
         """True if an effect shows in the scene's photographs when its settings turn it on."""
         return effect.keys[0].partition(".")[0] in self.EFFECT_TABLES
 
-    def without(self, part: SceneTerm) -> Self | None:
+    def without(self, term: SceneTerm) -> Self | None:
         """Return the scene without one of its `TERMS`; None if it has nothing of it."""
-        raise ValueError(f"{self.description()} without {part.name}")
+        raise ValueError(f"{self.description()} without {term.name}")
 
     def picture_blur_and_noise(self, conditions: Conditions) -> tuple[np.ndarray, np.ndarray]:
         """Return N Gaussian sigmas of the base pictures' blur, in pixels of the whole photograph, and N standard

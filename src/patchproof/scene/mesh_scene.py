@@ -89,7 +89,7 @@ class MeshScene(Scene):
         """The focal length of whole photographs."""
         return float(self.matrix_px(self.photo_px)[0, 0])
 
-    def without(self, part: SceneTerm) -> Self | None:
+    def without(self, term: SceneTerm) -> Self | None:
         """Return the scene without its lens's distortion; None if there is none."""
         if self.camera is None or not self.camera.has_distortion:
             return None
@@ -154,7 +154,7 @@ def require_mesh(scene: Scene, expected: str = "a scene with a mesh", do: str = 
     """Return the scene as one with a mesh; refused for scenes made of pictures."""
     if isinstance(scene, MeshScene):
         return scene
-    raise Refused(expected, f"a scene of {scene.description()}", do)
+    raise Refused(expected, "a scene of pictures", do)
 
 
 def load_bare(source: SceneSource) -> MeshScene:

@@ -94,14 +94,14 @@ class PhotoScene(PictureScene):
         refuse_larger_than_page(load_template(self.settings.sheet.template), self.piece)
         return replace(self, piece=with_ids(self.piece, self.sheet_id, "design"))
 
-    def without(self, part: SceneTerm) -> Self | None:
+    def without(self, term: SceneTerm) -> Self | None:
         """Return the scene with photographs that light their paper evenly, or without their own blur or noise."""
         photos, even = self.photos, [1.0, 0, 0, 0, 0, 0]
-        if part == EVEN_LIGHT:
+        if term == EVEN_LIGHT:
             lights = [replace(photo.light, coefficients=photo.light.coefficients * even) for photo in photos]
-        elif part == OWN_NOISE and any(photo.light.noise for photo in photos):
+        elif term == OWN_NOISE and any(photo.light.noise for photo in photos):
             lights = [replace(photo.light, noise=0.0) for photo in photos]
-        elif part == OWN_BLUR and any(photo.blur_px for photo in photos):
+        elif term == OWN_BLUR and any(photo.blur_px for photo in photos):
             return replace(self, photos=tuple(replace(photo, blur_px=0.0) for photo in photos))
         else:
             return None
