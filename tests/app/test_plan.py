@@ -28,9 +28,9 @@ from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import set_problem
 from patchproof.scene.bent_scene import placement_with_other_bend
 from patchproof.scene.conditions import draw
-from patchproof.scene.flat import BasePicture
 from patchproof.scene.paper_light import PaperLight
 from patchproof.scene.photo_scene import BasePhoto, PhotoScene
+from patchproof.scene.picture_scene import BasePicture
 from patchproof.scene.scene import build_scene, load_scene
 from patchproof.sheets.piece import lay_out_piece
 from test_conditions import SETTINGS
@@ -122,8 +122,8 @@ def test_terms_that_are_off_are_named_with_the_key_that_turns_them_on(plan):
     off = {error.name: error.key for error in plan.terms.errors if error.verdict == "off"}
     drawn = draw(SETTINGS, "select", 4, 0)  # of the defaults
     assert off.pop("lens distortion") == "camera.file"
-    switched = [(effect, getattr(drawn, RECORD_OF[effect.fields[0]])) for effect in EFFECTS if effect.switch]
-    assert off == {e.name: e.keys[0] for e, record in switched if e.off(record, lambda *at: np.ones(4)) is None}
+    switched = [(effect, getattr(drawn, RECORD_OF[effect.fields[0]])) for effect in EFFECTS if effect.can_be_off]
+    assert off == {e.name: e.keys[0] for e, record in switched if e.switch_off(record, lambda *at: np.ones(4)) is None}
     off |= {"lens distortion": "camera.file"}
     assert set(off) >= {"motion blur", "print scale"}
     (line,) = (line for line in plan_lines(plan) if line.startswith("  off: "))

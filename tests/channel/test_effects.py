@@ -48,7 +48,7 @@ DIGESTS = {
     "reprint": "feadc83558f6a783",
     "evaluate": "1cd6de75e116662e",
 }
-SWITCHED = [effect for effect in EFFECTS if effect.switch]
+SWITCHED = [effect for effect in EFFECTS if effect.can_be_off]
 # Those without which a step takes fewer operations.
 SLOWS = {"motion blur", "blur", "noise", "JPEG"}
 MADE_UP = ViewEffect("smell", {"smell": "light.ambient", "sweetness": (0.0, 1.0)})
@@ -162,7 +162,7 @@ def test_an_effect_that_is_switched_off_is_off_and_the_rest_of_its_table_stays(p
     before, after = fields_of(setup.conditions), fields_of(less.conditions)
     moved = {name for name in FIELDS if not np.array_equal(before[name], after[name])}
     # light that is left out is made up for by other light
-    others = {"ambient", "directional"} if effect.instead else set()
+    others = {"ambient", "directional"} if effect.replacement else set()
     assert effect.fields[0] in moved <= {effect.fields[0]} | others
     less_count, plain = photographed(problem, less.conditions, setup.shown)
     assert (less_count < whole[0]) == (effect.name in SLOWS) and not torch.equal(whole[1], plain)
@@ -209,7 +209,7 @@ def test_what_is_not_given_is_off_and_one_row_stands_for_all():
     assert conditions[1:].pose.distance_mm.tolist() == [600, 700] and len(conditions[[0]]) == 1
     for effect in SWITCHED:
         record = getattr(conditions, RECORD_OF[effect.fields[0]])
-        assert (effect.off(record, lambda *angles: np.ones(3)) is None) == (effect.name != "ambient light")
+        assert (effect.switch_off(record, lambda *angles: np.ones(3)) is None) == (effect.name != "ambient light")
     again = fields_of(conditions_from_fields(fields_of(conditions)))
     assert all(values.tobytes() == again[name].tobytes() for name, values in fields_of(conditions).items())
     with pytest.raises(ValueError, match=r"fields of one record have \[2, 3\] rows"):

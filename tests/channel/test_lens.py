@@ -96,9 +96,9 @@ def test_points_of_the_square_are_those_of_the_whole_picture():
 def test_no_distortion_changes_nothing():
     one, pictures = camera(), torch.rand(2, 3, 30, 40)
     frame = one.pinhole_frame((40, 30))
-    assert frame.size_px == (40, 30) and not one.bends
+    assert frame.size_px == (40, 30) and not one.has_distortion
     np.testing.assert_array_equal(frame.matrix_px, one.matrix_px((40, 30)))
-    assert one.distorted(pictures, (40, 30)) is pictures
+    assert one.distort_pictures(pictures, (40, 30)) is pictures
 
 
 @pytest.mark.parametrize("terms", [BARREL, CUSHION])
@@ -110,7 +110,7 @@ def test_a_picture_is_bent_as_its_points_are(terms, size_px):
     width, height = frame.size_px
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     ramp = torch.tensor(np.stack([x - frame.left, y - frame.top])[None])
-    seen = one.distorted(ramp, size_px)[0].permute(1, 2, 0).reshape(-1, 2).numpy()
+    seen = one.distort_pictures(ramp, size_px)[0].permute(1, 2, 0).reshape(-1, 2).numpy()
     assert len(seen) == size_px[0] * size_px[1]
     x, y = np.meshgrid(np.arange(size_px[0]) + 0.5, np.arange(size_px[1]) + 0.5)
     came_from = one.undistort_points(np.stack([x.ravel(), y.ravel()], 1), size_px)
@@ -136,16 +136,16 @@ def test_gradients_reach_what_was_rendered():
     one = camera(**BARREL)
     width, height = one.pinhole_frame((8, 6)).size_px
     pictures = torch.rand(1, 2, height, width, dtype=torch.float64).requires_grad_()
-    assert torch.autograd.gradcheck(lambda p: one.distorted(p, (8, 6)), pictures)
+    assert torch.autograd.gradcheck(lambda p: one.distort_pictures(p, (8, 6)), pictures)
 
 
 def test_batches_equal_single_pictures():
     one = camera(**BARREL)
     width, height = one.pinhole_frame((40, 30)).size_px
     pictures = torch.rand(3, 3, height, width)
-    together = one.distorted(pictures, (40, 30))
+    together = one.distort_pictures(pictures, (40, 30))
     for i in range(3):
-        assert torch.equal(one.distorted(pictures[i : i + 1], (40, 30))[0], together[i])
+        assert torch.equal(one.distort_pictures(pictures[i : i + 1], (40, 30))[0], together[i])
 
 
 @pytest.mark.parametrize("path", sorted(packaged_path("calibration", "cameras").glob("*.json")), ids=lambda p: p.stem)

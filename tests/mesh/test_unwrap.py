@@ -86,7 +86,7 @@ def test_a_finely_divided_sphere_comes_apart_evenly():
 
 
 def test_faces_that_xatlas_folds_over_others_are_cut_out(monkeypatch):
-    packed, calls = unwrapping._packed, []
+    packed, calls = unwrapping._pack, []
 
     def folded_once(points, faces, part, texels):
         uv, size = packed(points, faces, part, texels)
@@ -95,7 +95,7 @@ def test_faces_that_xatlas_folds_over_others_are_cut_out(monkeypatch):
             uv[7] = uv[3]
         return uv, size
 
-    monkeypatch.setattr(unwrapping, "_packed", folded_once)
+    monkeypatch.setattr(unwrapping, "_pack", folded_once)
     corners, size = atlas(soup(), 256)
     assert coverage(corners, size).max() == 1 and list(np.flatnonzero(calls[1])) == [3, 7]
 
@@ -178,7 +178,7 @@ def test_without_xatlas_textures_of_such_meshes_are_refused_and_all_else_works(m
     }
     scene = make_scene(settings, box)
     assert photograph(set_stage(scene), None, scene.draw("train", 1), (64, 64)).std() > 0.01
-    with pytest.raises(Refused, match=r'the package xatlas.*got none: pip install "patchproof\[textures\]"'):
+    with pytest.raises(Refused, match=r'the package xatlas.*got no such package: pip install "patchproof\[textures\]"'):
         make_scene(settings | {"patch": {"kind": "texture"}}, box)
     mug = settings["object"] | {"mesh": "primitive:mug"}  # which has texture coordinates
     warnings = make_scene(settings | {"object": mug, "patch": {"kind": "texture"}}).canvas.warnings

@@ -221,7 +221,7 @@ def test_a_picture_of_markers_is_refused_and_a_single_one_said(tmp_path):
         ("text.png", {}, "text.png is not a picture of a known kind: save it as JPEG or PNG"),
         ("wide.png", {}, "with the proportions of the piece"),
         ("good.png", {"patch__place": "auto"}, 'got patch.place = "auto"'),
-        ("good.png", {"patch__kind": "texture"}, "got one of the object's own texture: leave patch.kind out"),
+        ("good.png", {"patch__kind": "texture"}, "got a run of the object's own texture: leave patch.kind out"),
     ],
 )
 def test_what_cannot_be_imported_is_one_sentence_and_leaves_nothing(tmp_path, capsys, picture, changes, sentence):

@@ -119,8 +119,10 @@ def test_what_is_to_be_kept_free_is_kept_free(tmp_path):
     middles = mesh.triangles_center
     forbidden = np.flatnonzero((middles[:, 2] > 9) & (middles[:, 0] < 0) & (middles[:, 1] > 0))
     (tmp_path / "free.txt").write_text("\n".join(map(str, forbidden)))
-    everywhere = PlaceFinder(open_scene(mesh=mesh, **SHARP)).spots(100)
-    rest = PlaceFinder(open_scene(tmp_path, mesh, patch__search={"keep_off_faces": "free.txt"}, **SHARP)).spots(100)
+    everywhere = PlaceFinder(open_scene(mesh=mesh, **SHARP)).candidates(100)
+    rest = PlaceFinder(open_scene(tmp_path, mesh, patch__search={"keep_off_faces": "free.txt"}, **SHARP)).candidates(
+        100
+    )
     assert covers(everywhere, mesh, forbidden) and not covers(rest, mesh, forbidden) and len(rest) > 5
 
 
@@ -134,36 +136,38 @@ def covers(spots, mesh, faces):
 
 
 def test_places_fit_are_apart_the_same_for_the_same_seed_and_no_farther_off_than_asked(monkeypatch):
-    monkeypatch.setattr("patchproof.scene.candidate_places._SAMPLES_APART", 1 / 8)
+    monkeypatch.setattr("patchproof.scene.candidate_places._SAMPLE_DISTANCE_SHARE", 1 / 8)
     ball, small = trimesh.creation.icosphere(3, 150), SHARP | {"patch__width_mm": 30, "patch__height_mm": 30}
     scene = open_scene(mesh=ball, **small)
-    spots = PlaceFinder(scene).spots(12)
+    spots = PlaceFinder(scene).candidates(12)
     assert 3 < len(spots) <= 12
     for spot in spots:
         assert spot.placement.overhang_share <= WARN_OVERHANG_SHARE and not spot.placement.warnings
     middles = np.array([spot.placement.center_mm for spot in spots])
     distances = np.linalg.norm(middles[:, None] - middles, axis=2) + 1e9 * np.eye(len(spots))
     assert distances.min() > MIN_DISTANCE_SHARE * 30 / 2
-    assert [spot.at for spot in PlaceFinder(scene).spots(12)] == [spot.at for spot in spots]
-    other = PlaceFinder(open_scene(mesh=ball, seed=1, **small)).spots(12)
+    assert [spot.at for spot in PlaceFinder(scene).candidates(12)] == [spot.at for spot in spots]
+    other = PlaceFinder(open_scene(mesh=ball, seed=1, **small)).candidates(12)
     assert [spot.at for spot in other] != [spot.at for spot in spots]
     least = min(spot.placement.gap_mm for spot in spots)
-    with pytest.raises(Refused, match=r"Expected a place for a piece of .* mm that views face, got none"):
-        PlaceFinder(open_scene(mesh=ball, patch__search={"gap_mm": least / 2}, **small)).spots(12)
+    with pytest.raises(
+        Refused, match=r"a place for a piece of .* that views face, got \d+ places at which it does not"
+    ):
+        PlaceFinder(open_scene(mesh=ball, patch__search={"gap_mm": least / 2}, **small)).candidates(12)
 
 
 def test_a_piece_that_fits_only_in_one_spot_finds_it():
     """A face hardly larger than the piece: points elsewhere on it move to where the piece does not overhang."""
     size = PlaceFinder(open_scene(**SHARP)).size_mm
     ground = PlaceFinder(open_scene(mesh=trimesh.creation.box((size[0] + 4, size[1] + 4, 300)), **SHARP))
-    moved = [ground._first(frame) for frame in ground._tried]  # before middles of sides take their places
+    moved = [ground._upright_first(frame) for frame in ground._frames_to_try]  # not middles of sides
     assert [spot for spot in moved if spot is not None and np.abs(spot.at[:2]).max() < 4]
 
 
 def test_upright_means_no_turns():
     free, upright = PlaceFinder(open_scene()), PlaceFinder(open_scene(patch__search={"upright": True}))
-    (spot, *_) = free.spots(1)
-    assert [turn.spin_deg for turn in free.turned(spot)] == [45] and not upright.turned(spot)
+    (spot, *_) = free.candidates(1)
+    assert [turn.spin_deg for turn in free.other_spins(spot)] == [45] and not upright.other_spins(spot)
 
 
 def test_views_do_not_turn_with_the_place():
@@ -173,11 +177,11 @@ def test_views_do_not_turn_with_the_place():
     conditions = scene.draw("train", 4)
     poses = scene.camera_from_world(conditions)
     for at_mm in ((150, 0, 0), (0, 150, 0), (20, 30, 150)):
-        hung = scene.at(at_mm, 45)
+        hung = scene.with_piece_at(at_mm, 45)
         np.testing.assert_array_equal(hung.camera_from_world(conditions), poses)
         np.testing.assert_array_equal(hung.frame.normal, [0, 0, 1])  # lights count from here, too
         assert hung.settings.patch.place == "given" and hung.settings.view.front == "+z"
-    np.testing.assert_allclose(scene.at((150, 0, 0), 0).placement.normal, [1, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(scene.with_piece_at((150, 0, 0), 0).placement.normal, [1, 0, 0], atol=1e-12)
 
 
 def test_with_front_left_out_views_face_the_patch_as_before():
@@ -240,10 +244,10 @@ def test_what_cannot_be_searched_is_refused_in_one_sentence(changes, sentence):
 def test_a_scene_without_a_place_says_so_and_one_with_it_needs_no_search():
     scene = open_scene()
     for needs in (require_piece, require_patch, Scene.object_canvas):
-        with pytest.raises(Refused, match=r'Expected a scene whose piece has its place, got patch.place = "auto"'):
+        with pytest.raises(Refused, match=r'Expected a scene whose piece has a place, got patch.place = "auto"'):
             needs(scene)
     with pytest.raises(Refused, match=r'Expected a scene with patch.place = "auto", got a mesh of 12 faces'):
-        choose_place(scene.at((0, 0, 10), 0))
+        choose_place(scene.with_piece_at((0, 0, 10), 0))
 
 
 def scene_file(folder, **patch):
@@ -286,7 +290,7 @@ def test_a_run_keeps_its_place_and_neither_loads_nor_resumes_by_searching(tmp_pa
 
 def test_the_picture_shows_the_places_and_the_chosen_outline(tmp_path):
     scene = open_scene()
-    spots = PlaceFinder(scene).spots(3)
+    spots = PlaceFinder(scene).candidates(3)
     laid = [spot.placement for spot in spots]
     candidates = tuple(
         place_search.Candidate(at=s.at, spin_deg=0, family=p.family, gap_mm=0, overhang_share=0, gray=0, outlook=0)
@@ -302,9 +306,9 @@ def test_the_picture_shows_the_places_and_the_chosen_outline(tmp_path):
         run_share=0,
         candidates=candidates,
     )
-    save_place(place, scene.at(place.at, 0), tmp_path)
+    save_place(place, scene.with_piece_at(place.at, 0), tmp_path)
     assert read_place(tmp_path, scene) == place
-    picture = place_files._picture(place, scene.at(place.at, 0)).getcolors(1 << 20)
+    picture = place_files._picture(place, scene.with_piece_at(place.at, 0)).getcolors(1 << 20)
     shown = {color for _, color in picture}
     assert {(253, 231, 37), (33, 145, 140), (68, 1, 84), (230, 0, 90)} <= shown
 
@@ -319,9 +323,9 @@ def test_plan_reports_the_search(tmp_path, monkeypatch, a_small_run):
 
 def test_middles_of_sides_that_views_face_are_places_however_the_piece_stands_there():
     scene = open_scene()
-    spots = PlaceFinder(scene).spots(12)
+    spots = PlaceFinder(scene).candidates(12)
     named = [spot for spot in spots if isinstance(spot.at, str)]
     assert spots[: len(named)] == tuple(named) and scene.settings.patch.side in [spot.at for spot in named]
-    hung = scene.at(named[0].at, 0.0)
+    hung = scene.with_piece_at(named[0].at, 0.0)
     assert hung.settings.patch.side == named[0].at and hung.settings.view.front == scene.settings.patch.side
     np.testing.assert_allclose(hung.placement.center_mm, named[0].placement.center_mm)

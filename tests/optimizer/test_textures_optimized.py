@@ -182,7 +182,7 @@ def test_a_texture_run_is_read_back_evaluated_and_refused_a_sheet(tmp_path, caps
     assert result.n == 4 and (tmp_path / "run" / "evaluate.json").is_file()
     assert command("sheet", tmp_path / "run", "--out", tmp_path / "sheet.pdf") == 1
     error = capsys.readouterr().err.strip().splitlines()[-1]
-    assert error.startswith("Expected a run of a patch, got one of the object's own texture:")
+    assert error.startswith("Expected a run of a patch, got a run of the object's own texture:")
     assert not (tmp_path / "sheet.pdf").exists()
 
 

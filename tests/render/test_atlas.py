@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from patchproof.render.atlas import MOST_TAPS, atlas_layout, atlas_table, sample_atlas
+from patchproof.render.atlas import MAX_TAPS, atlas_layout, atlas_table, sample_atlas
 from patchproof.render.texture import footprint, look_up, texel_layout, texel_table
 
 # Places in an atlas are float32 shares of its sides: of 1,100 texels a ten-thousandth of one.
@@ -27,7 +27,7 @@ def fragments(n=4000):
     return torch.randint(len(SIZES), (n,), generator=generator), uv, dx, dy
 
 
-@pytest.mark.parametrize("taps", [1, 2, 3, MOST_TAPS])
+@pytest.mark.parametrize("taps", [1, 2, 3, MAX_TAPS])
 def test_what_is_seen_in_an_atlas_is_what_footprints_see(taps):
     own, at = textures(), fragments()
     where = atlas_layout(SIZES)
@@ -42,7 +42,7 @@ def test_no_texture_is_seen_in_another():
     colors = torch.rand(len(SIZES), 3, generator=torch.Generator().manual_seed(2))
     own = [color.expand(height, width, 3) for color, (width, height) in zip(colors, SIZES, strict=True)]
     where, (texture, *at) = atlas_layout(SIZES), fragments(20_000)
-    seen = sample_atlas(where, atlas_table(own, where), texture, *at, MOST_TAPS)
+    seen = sample_atlas(where, atlas_table(own, where), texture, *at, MAX_TAPS)
     torch.testing.assert_close(seen, colors[texture], atol=1e-6, rtol=0)
 
 

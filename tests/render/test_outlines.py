@@ -154,7 +154,7 @@ def test_no_outline_lies_between_pixels_that_the_piece_covers(tmp_path):
     seen = render_views(set_stage(scene), WHITE, posed(scene, 2, azimuth_deg=[0, 60]), (SIDE, SIDE))
     whole = torch.zeros(2 * SIDE * SIDE, dtype=torch.bool)
     whole[seen.piece.pixel] = seen.piece.share[:, 0] > 0.999
-    mixed = whole[seen.outlines.pixel].index_select(0, seen.outlines.of) & whole[seen.outlines.source]
+    mixed = whole[seen.outlines.pixel].index_select(0, seen.outlines.target) & whole[seen.outlines.source]
     assert len(seen.outlines.pixel) > 100 and not mixed.any()
 
 
@@ -165,7 +165,9 @@ def test_outlines_are_the_same_alone_and_in_any_company(monkeypatch):
         _, _, alone = drawn(torus(), eyes=[eye])
         own, source = (which // SIDE**2 == view for which in (together.pixel, together.source))
         assert torch.equal(together.pixel[own] - view * SIDE**2, alone.pixel)
-        assert torch.equal(together.own[own], alone.own) and torch.equal(together.share[source], alone.share)
+        assert torch.equal(together.remaining[own], alone.remaining) and torch.equal(
+            together.share[source], alone.share
+        )
     monkeypatch.setattr(module, "CHUNK", 1)
     for name, part_of in vars(drawn(torus())[2]).items():
         assert torch.equal(part_of, getattr(together, name))
@@ -175,7 +177,7 @@ def test_outlines_are_the_same_alone_and_in_any_company(monkeypatch):
 def test_gradients_pass_outlines_as_finite_differences_do(by_code):
     """Along 20 random directions, in float64: where outlines mix, where they take from, and where there are none."""
     shares, generator = drawn(torus(), eyes=EYES[:1])[2], torch.Generator().manual_seed(0)
-    wide = replace(shares, own=shares.own.double(), share=shares.share.double())
+    wide = replace(shares, remaining=shares.remaining.double(), share=shares.share.double())
     image, wanted = 0.1 + 0.9 * torch.rand(2, SIDE * SIDE, 3, generator=generator, dtype=torch.float64)
     image.requires_grad_()
     (gradient,) = torch.autograd.grad((wide.smooth(image, by_code) * wanted).sum(), image)
@@ -202,4 +204,4 @@ def test_edges_that_reach_behind_the_camera_are_cut():
     jagged, smooth, found = drawn(beam, eyes=[outside, inside])
     reference = finer(beam, eyes=[outside])
     assert rms(smooth[:1] - reference) < 0.25 * rms(jagged[:1] - reference) and bool(torch.isfinite(smooth).all())
-    assert (found.own >= 0).all() and (found.share >= 0).all()
+    assert (found.remaining >= 0).all() and (found.share >= 0).all()

@@ -10,7 +10,7 @@ from patchproof.base.sessions import count_by_session, rate_posterior
 from patchproof.base.settings import BackgroundSettings
 from patchproof.scene import patterns
 from patchproof.scene import procedural_places as module
-from patchproof.scene.backgrounds import ENOUGH_FILES, FEW_PICTURES, ROOMS, VIEWS_PER_FILE, load_backgrounds
+from patchproof.scene.backgrounds import ENOUGH_FILES, FEW_PICTURES, PLACE_NUMBERS, VIEWS_PER_FILE, load_backgrounds
 from patchproof.scene.procedural_places import PLACE_PX, procedural_place
 from patchproof.scene.scene import make_scene
 
@@ -27,7 +27,7 @@ def folder_of(tmp_path, count):
 
 def shown(backgrounds, stream):
     """The numbers of files, and of procedural places, that a stream may show, and the share of views with files."""
-    chosen = backgrounds.chosen(stream, (np.arange(40_000) + 0.5) / 40_000)
+    chosen = backgrounds.choose_for_stream(stream, (np.arange(40_000) + 0.5) / 40_000)
     pictures = [backgrounds.pictures[int(each * len(backgrounds.pictures))] for each in chosen]
     real = [int(p[0, 0, 0]) for p in pictures if not isinstance(p, int)]
     return set(real), {p for p in pictures if isinstance(p, int)}, len(real) / len(pictures)
@@ -43,7 +43,9 @@ def test_no_place_is_in_two_parts_and_every_part_has_enough(tmp_path, count):
     for stream, (own, rooms, _) in parts.items():
         enough = ENOUGH_FILES if stream in ("train", "select") else VIEWS_PER_FILE
         assert (
-            rooms <= set(ROOMS[stream]) and bool(rooms) == (len(own) < enough) and len(own) + len(rooms) >= ENOUGH_FILES
+            rooms <= set(PLACE_NUMBERS[stream])
+            and bool(rooms) == (len(own) < enough)
+            and len(own) + len(rooms) >= ENOUGH_FILES
         )
     assert shown(backgrounds, "reprint") == parts["evaluate"]
     assert bool(backgrounds.notes) == (count < FEW_PICTURES)
@@ -51,7 +53,7 @@ def test_no_place_is_in_two_parts_and_every_part_has_enough(tmp_path, count):
         count == FEW_PICTURES
     ):  # three of them: in training as often as four procedural ones each, else one view in fifty each
         assert parts["promise"][2] == pytest.approx(3 / VIEWS_PER_FILE, abs=1e-3)
-        assert parts["train"][2] == pytest.approx(16 / (16 + len(ROOMS["train"])), abs=1e-3)
+        assert parts["train"][2] == pytest.approx(16 / (16 + len(PLACE_NUMBERS["train"])), abs=1e-3)
     if count == 200:
         assert len(parts["promise"][0]) == 60
         assert {stream for stream in STREAMS if parts[stream][1]} == {"select", "evaluate"}
@@ -61,7 +63,7 @@ def test_a_promise_knows_another_place_for_every_session_and_says_which_share_on
     for count, least in ((0, 98), (10, 93)):
         (tmp_path / str(count)).mkdir()
         backgrounds = folder_of(tmp_path / str(count), count) if count else load_backgrounds(BackgroundSettings(), None)
-        chosen = backgrounds.chosen("promise", np.random.default_rng(0).random(100))
+        chosen = backgrounds.choose_for_stream("promise", np.random.default_rng(0).random(100))
         assert len(np.unique(chosen)) >= least
     hits = [True] * 4 + [False] * 4 + [True, True, False, False] * 2
     assert count_by_session(hits, 4, (0, 1, 1, 3)) == ([4, 2, 2], [4, 8, 4])
@@ -77,7 +79,7 @@ def test_a_picture_that_is_named_and_a_color_are_known_places(tmp_path):
     for settings in ({"images": "places/001.png"}, {"color": (0.2, 0.2, 0.2)}):
         backgrounds = load_backgrounds(BackgroundSettings(**settings), tmp_path)
         assert len(backgrounds.pictures) == 1 and not backgrounds.notes
-        assert all((backgrounds.chosen(stream, np.array([0.1, 0.9])) == 0.5).all() for stream in STREAMS)
+        assert all((backgrounds.choose_for_stream(stream, np.array([0.1, 0.9])) == 0.5).all() for stream in STREAMS)
 
 
 def test_without_any_word_places_are_procedural_and_always_the_same():
@@ -150,7 +152,7 @@ def test_textures_that_nobody_sees_are_drawn_as_if_they_were_made(monkeypatch, p
 
 
 def test_rays_that_pass_a_box_by_are_those_that_would_not_meet_it(monkeypatch, places):
-    monkeypatch.setattr(module, "_passing", lambda aim, ends: np.arange(aim.shape[1]))
+    monkeypatch.setattr(module, "_candidate_rays", lambda aim, ends: np.arange(aim.shape[1]))
     assert all(np.array_equal(module.procedural_place(2 * i), place) for i, place in enumerate(places))
 
 

@@ -11,8 +11,8 @@ from PIL import Image
 from patchproof.base.errors import Refused
 from patchproof.base.geometry import apply_homography, rect_corners
 from patchproof.base.settings import SceneSettings
-from patchproof.scene import flat
 from patchproof.scene.image_scene import ERASED_AREA, FEW_IMAGES, erase
+from patchproof.scene.picture_scene import pick_indices
 from patchproof.scene.scene import build_scene
 
 PHOTO = (320, 240)
@@ -185,7 +185,7 @@ def test_damaged_images_are_left_out(tmp_path):
         ({"view": {"patch_share": (0.0, 0.3)}}, r"patch_share above 0, got 0"),
         (
             {"view": {"patch_share": (0.3, 0.9)}},
-            r"fits into the picture's centered square.*got \d+%.*lower it to 0\.\d",
+            r"fits into the picture's centered square.*got 0\.\d+, which is \d+%.*lower it to 0\.\d",
         ),
         ({"object": {"images": "images", "labels": "none.csv"}}, r"no file at .*none.csv"),
         ({"object": {"images": "other", "labels": "labels.csv"}}, r"got 3 missing \(0.png\)"),
@@ -219,5 +219,5 @@ def test_a_line_without_a_label_is_refused(tmp_path):
 
 
 def test_pick_covers_every_picture():
-    assert flat.pick(np.array([0.0, 0.49, 0.5, 0.999999999]), 2).tolist() == [0, 0, 1, 1]
-    assert flat.pick(np.array([1 - 1e-17]), 3).tolist() == [2]
+    assert pick_indices(np.array([0.0, 0.49, 0.5, 0.999999999]), 2).tolist() == [0, 0, 1, 1]
+    assert pick_indices(np.array([1 - 1e-17]), 3).tolist() == [2]

@@ -16,10 +16,10 @@ from patchproof.base.geometry import apply_homography, intrinsics, look_at, plan
 from patchproof.base.packaged import packaged_path
 from patchproof.base.settings import SceneSettings, identity_settings
 from patchproof.photo.rejection import PhotoRejected
-from patchproof.scene import flat
 from patchproof.scene.conditions import with_values
 from patchproof.scene.paper_light import paper_light, quadratic_terms
 from patchproof.scene.photo_scene import _digest, measure_photo
+from patchproof.scene.picture_scene import BasePicture
 from patchproof.scene.scene import build_scene
 from patchproof.sheets.blank import blank_sheet
 from patchproof.sheets.manifest import Manifest, dump_manifest
@@ -212,7 +212,7 @@ def test_picture_and_homography_move_alike(scene, size_px):
         x, y = apply_homography(photo.photo_from_piece, middle[None])[0]
         rows, columns = np.mgrid[: SIZE[1], : SIZE[0]] + 0.5
         picture[:] = 255 * np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / 2 / 5**2)[..., None]
-        dotted.append(replace(photo, picture=flat.BasePicture(np.round(picture).astype(np.uint8))))
+        dotted.append(replace(photo, picture=BasePicture(np.round(picture).astype(np.uint8))))
     scene = replace(scene, photos=tuple(dotted))
     conditions = scene.draw("evaluate", 12)
     assert np.ptp(scene.picture_blur_and_noise(conditions)[0]) > 0.1 and np.ptp(conditions.pose.roll_deg) > 4
@@ -295,9 +295,7 @@ def test_photographs_that_cannot_be_used_are_named(world, tmp_path):
         build_scene(settings_of(world, object=object_), tmp_path, 0)
     (tmp_path / "sessions").mkdir()
     (tmp_path / "mixed").rename(tmp_path / "sessions" / "first")
-    with pytest.raises(
-        Refused, match=r"0 usable of 0 in .*; 7 more in folders there, which are not looked into: lay all"
-    ):
+    with pytest.raises(Refused, match=r"0 usable of 0 in .*; 7 more in subfolders, which are not searched"):
         build_scene(settings_of(world, object={"photos": "sessions", "sheet": "BLANK.json"}), tmp_path, 0)
 
 

@@ -175,7 +175,7 @@ def test_the_gradient_reaches_the_texels_that_were_seen_and_no_other(scene_file)
     scene = load_scene(scene_file)
     stage, conditions = set_stage(scene), scene.draw("train", 2)
     design = torch.full((3, 120, 120), 0.5, requires_grad=True)
-    shown = PrintedPiece(scene.piece, scene.sheet_id, identity_printer(), torch.device("cpu")).shown(design)
+    shown = PrintedPiece(scene.piece, scene.sheet_id, identity_printer(), torch.device("cpu")).appearance(design)
     (gradient,) = torch.autograd.grad(photograph(stage, shown, conditions, (96, 96)).sum(), design)
     _, reserved = marker_image(scene.piece, (120, 120))
     touched = (gradient.abs().sum(0) > 0).numpy()
@@ -190,7 +190,7 @@ def test_a_printed_piece_shows_the_markers_of_its_kind_whatever_the_design_has_t
     printed = PrintedPiece(scene.piece, scene.sheet_id, identity_printer(), torch.device("cpu"))
     image, reserved = marker_image(with_ids(scene.piece, scene.sheet_id, kind), (120, 96))
     for design in (torch.rand(3, 96, 120, generator=torch.Generator().manual_seed(0)), torch.zeros(3, 96, 120)):
-        shown = printed.shown(design, kind).srgb.numpy()
+        shown = printed.appearance(design, kind).srgb.numpy()
         assert np.abs(shown[reserved] - image[reserved]).max() < 1e-6
         assert np.abs(shown - design.permute(1, 2, 0).numpy())[~reserved].max() < 1e-6
 

@@ -185,8 +185,8 @@ def test_unusable_masks_are_refused(tmp_path):
     elsewhere[8:12] = 255
     Image.fromarray(elsewhere).save(tmp_path / "elsewhere.png")
     (tmp_path / "text.png").write_text("no picture")
-    refuses("white where the texture may change, got none in black.png", mask="black.png")
-    refuses("white on some face", mask="elsewhere.png")
+    refuses("white where the texture may change, got no lighter gray than 127 of 255 in black.png", mask="black.png")
+    refuses("a mask that covers a face, got a mask that covers none of 2 faces", mask="elsewhere.png")
     refuses("text.png that cannot be read", mask="text.png")
     refuses("no file at", mask="none.png")
     refuses("no file at", faces="none.txt")
@@ -194,10 +194,10 @@ def test_unusable_masks_are_refused(tmp_path):
         (tmp_path / "faces.txt").write_text(text)
         refuses(r"a face number or a range a-b from 0 to 1, got .* of faces.txt", faces="faces.txt")
     (tmp_path / "faces.txt").write_text("# nothing\n")
-    refuses("one per line, got none", faces="faces.txt")
+    refuses("one per line, got no number in faces.txt", faces="faces.txt")
     bare = mesh_from_parts([square(0, None)], 100)
     Image.fromarray(elsewhere).save(tmp_path / "mask.png")
-    with pytest.raises(Refused, match="texture coordinates for a mask, got none: name materials or faces"):
+    with pytest.raises(Refused, match="coordinates for a mask, got 2 faces without any: name materials or faces"):
         texture_canvas(bare, masked(mask="mask.png"), tmp_path)
 
 

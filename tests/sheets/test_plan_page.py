@@ -15,7 +15,7 @@ from patchproof.reprints.plan_view import hang
 from patchproof.reprints.run_sheet import _wrapped
 from patchproof.reprints.shot_plan import shot_sections
 from patchproof.scene.placement import patch_frame
-from patchproof.scene.tape_measure import tapes
+from patchproof.scene.tape_measure import measure_tapes
 from patchproof.sheets.plan_page import PlacementPicture, PlanPage, edge_distances_mm, lay_out_plan, wrap_text
 from patchproof.sheets.template import load_template
 from test_scene import scene_of
@@ -101,7 +101,7 @@ def standing(tmp_path, mesh, width, height, bend, **patch):
 
 
 def measured(scene):
-    found = tapes(scene.mesh, scene.placement, patch_frame(scene.mesh, scene.settings.patch).normal)
+    found = measure_tapes(scene.mesh, scene.placement, patch_frame(scene.mesh, scene.settings.patch).normal)
     return {tape.edge: (tape.length_mm, tape.end) for tape in found}
 
 

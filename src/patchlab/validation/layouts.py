@@ -47,8 +47,8 @@ from patchproof.optimizer.promise import CONTROLS, pictures_with_controls
 from patchproof.optimizer.responses import responses
 from patchproof.photo.read import Photo
 from patchproof.report.tables import Drawing, Table, Value
-from patchproof.scene.open_scene import UnplacedScene
 from patchproof.scene.patch_scene import PatchScene, require_patch
+from patchproof.scene.unplaced_scene import UnplacedScene
 from patchproof.sheets.content import SheetContent
 from patchproof.sheets.piece import SCISSORS_MM, Piece, lay_out_piece
 from patchproof.sheets.rects import RectMm, grow_rect
@@ -146,7 +146,7 @@ def _problem(base: Path, cell: Cell) -> Problem:
     scene, networks = scene_of(base, cell.values), networks_at(base, cell.values)
     if isinstance(scene, UnplacedScene):
         place = choose_place(scene, models=networks)
-        scene = scene.at(place.at, place.spin_deg)
+        scene = scene.with_piece_at(place.at, place.spin_deg)
     return set_problem(scene, models=networks)
 
 

@@ -162,7 +162,7 @@ def _boxes(report: Report, manifest: Manifest, camera: Camera | None) -> str:
     were asked and it is known, the object's box, too: what of it lies in the middle square.
     """
     corners, photos = rect_corners(manifest.cut_mm), []
-    bends = camera is not None and camera.bends  # then places are those in the picture made straight
+    bends = camera is not None and camera.has_distortion  # then places are those in the picture made straight
     label = "object" if manifest.promise is None else manifest.promise.target.label
     for entry in report.photos:
         if entry.photo_px is None:

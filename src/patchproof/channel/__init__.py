@@ -1,1 +1,1 @@
-"""What the world does to colors: printer, light and camera, differentiable where optimizing needs it."""
+"""The effects of printer, light and camera on colors, differentiable where optimizing needs it."""

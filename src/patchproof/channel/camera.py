@@ -1,13 +1,13 @@
 """The camera: linear light at the lens becomes a display-encoded picture.
 
-In: N×3×H×W linear light and a `Sensor`. Out: N×3×H×W sRGB in [0, 1], differentiable. Order:
-blur (optics, focus, straight motion), exposure and white balance, shot and read noise, clipping, tone curve
-(sRGB's, or that of a calibrated camera). The lens's distortion has its own module.
+In: N×3×H×W linear light and a `Sensor`. Out: N×3×H×W sRGB in [0, 1], differentiable. Order: blur (optics, focus,
+straight motion), exposure and white balance, shot and read noise, clipping, tone curve (sRGB's, or that of a calibrated
+camera). The lens's distortion has its own module.
 
-Blur, motion, noise and JPEG are meant at the photograph's full size. A picture rendered `scale` times as large as the
-photograph gets what is left of them after averaging: they shrink with `scale`; what falls under the threshold of
-visibility is skipped, since it would cost time and show nothing. At full size the photograph is stored as a real JPEG
-by whoever writes it.
+Blur, motion, noise and JPEG are given for the photograph's full size. A picture rendered at `scale` times that size
+gets the part of them that remains after averaging: they shrink with `scale`, and effects below the threshold of
+visibility are skipped, because they would cost time and change nothing. At full size the photograph is stored as a real
+JPEG by the code that writes the file.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from patchproof.channel.tone import codes_of_light
 if TYPE_CHECKING:
     from patchproof.channel.lens import Camera
 
-# A blur below this sigma (pixels) is lost in a pixel's own averaging and in what resampling adds.
+# A blur below this sigma (pixels) is hidden by a pixel's averaging and by the blur of resampling.
 SMALLEST_BLUR_PX = 0.4
 SMALLEST_MOTION_PX = SMALLEST_BLUR_PX * 12**0.5  # the length of an even streak of that sigma
 # Noise below one 8-bit step moved no rate and no mean confidence by more than 0.001 (40 photographs).
@@ -34,33 +34,34 @@ SMALLEST_NOISE = 1 / 255
 SMALLEST_JPEG_SCALE = 0.5
 # Read noise is this share of the noise at white; shot noise makes up the rest (variance = noise² (x + READ_SHARE²)).
 READ_SHARE = 0.25
-_TABLE_STEPS = 1 << 18  # of light
+_TABLE_STEPS = 1 << 18  # of light in `encode_light_by_table`
 
 
 def develop(linear: Tensor, sensor: Sensor, scale: float, jpeg: bool = True, camera: Camera | None = None) -> Tensor:
-    """The picture that a camera makes, with the tone curve of `camera` if it has one; one row of `sensor` per picture.
+    """Return the pictures that a camera makes of linear light, one row of `sensor` per picture. The tone curve is that
+    of `camera` if it has one, else sRGB's.
 
-    `scale` is the pictures' size over the photograph's. `jpeg=False` leaves JPEG to the writer of a real file.
+    `scale` is the pictures' size divided by the photograph's. `jpeg=False` leaves JPEG to the writer of a real file.
     """
 
-    def on(values) -> Tensor:
+    def tensor(values) -> Tensor:
         return torch.as_tensor(values).to(linear)
 
-    light = gaussian_blur(linear, on(sensor.blur_px * scale))
-    light = motion_blur(light, on(sensor.motion_px * scale), sensor.motion_deg)
+    light = gaussian_blur(linear, tensor(sensor.blur_px * scale))
+    light = motion_blur(light, tensor(sensor.motion_px * scale), sensor.motion_deg)
     light = light * gains(sensor, linear)[:, :, None, None]
-    picture = encode_light(add_noise(light, on(sensor.noise * scale), sensor.noise_seed), camera)
-    return compress_jpeg(picture, on(sensor.jpeg)) if _is_stored(sensor, scale, jpeg) else picture
+    picture = encode_light(add_noise(light, tensor(sensor.noise * scale), sensor.noise_seed), camera)
+    return compress_jpeg(picture, tensor(sensor.jpeg)) if _has_jpeg(sensor, scale, jpeg) else picture
 
 
 def is_pointwise(sensor: Sensor, scale: float, jpeg: bool) -> bool:
-    """Whether `develop` treats every pixel alone, so that a changed part can be developed without the rest."""
+    """True if `develop` treats every pixel alone, so that a changed region can be developed without the rest."""
     return reach_px(sensor, scale, jpeg) == 0 and bool((sensor.noise * scale).max() < SMALLEST_NOISE)
 
 
 def reach_px(sensor: Sensor, scale: float, jpeg: bool = True) -> int | None:
-    """How many pixels far `develop` carries light; None where JPEG shares it out in blocks."""
-    if _is_stored(sensor, scale, jpeg):
+    """Return how many pixels far `develop` spreads light; None if JPEG spreads it within its blocks."""
+    if _has_jpeg(sensor, scale, jpeg):
         return None
     blur_px, motion_px = float(sensor.blur_px.max()) * scale, float(sensor.motion_px.max()) * scale
     return _blur_reach(blur_px) + _motion_reach(motion_px)
@@ -74,22 +75,22 @@ def _motion_reach(length_px: float) -> int:
     return 0 if length_px < SMALLEST_MOTION_PX else int(length_px / 2) + 1
 
 
-def _is_stored(sensor: Sensor, scale: float, jpeg: bool) -> bool:
+def _has_jpeg(sensor: Sensor, scale: float, jpeg: bool) -> bool:
     return bool(jpeg and scale >= SMALLEST_JPEG_SCALE and sensor.jpeg.any())
 
 
 def gains(sensor: Sensor, like: Tensor) -> Tensor:
-    """Exposure and white balance: N×3 factors of the light."""
+    """Return exposure and white balance as N×3 factors of the light."""
     return torch.as_tensor(2 ** sensor.exposure_ev[:, None] * sensor.white_balance).to(like)
 
 
 def encode_light(linear: Tensor, camera: Camera | None = None) -> Tensor:
-    """Clipped light as code values in [0, 1]."""
+    """Return clipped light as code values in [0, 1]."""
     return codes_of_light(clamp_to_unit(linear), camera)
 
 
 def encode_light_by_table(linear: Tensor, camera: Camera | None = None) -> Tensor:
-    """`encode_light` within 1/100 of an 8-bit step in a seventh of the time, not differentiable."""
+    """Encode light by a table, within 1/100 of an 8-bit step, in a seventh of the time; not differentiable."""
     index = (linear * _TABLE_STEPS).add_(0.5).clamp_(0, _TABLE_STEPS).int()
     # pyright cannot know that frozen models have a hash
     table = _code_table(camera, linear.device)  # pyright: ignore[reportArgumentType]
@@ -102,22 +103,22 @@ def _code_table(camera: Camera | None, device: torch.device) -> Tensor:
 
 
 def gaussian_blur(linear: Tensor, sigma_px: Tensor) -> Tensor:
-    """Gaussian blur with one sigma per picture; nothing where all are too small to be seen."""
+    """Blur pictures by Gaussians, one sigma per picture; if all sigmas are too small to be seen, return the input."""
     from kornia.filters import get_gaussian_kernel1d
 
     reach = _blur_reach(float(sigma_px.max()))
     if reach == 0:
         return linear
     taps = 2 * reach + 1
-    kernels = get_gaussian_kernel1d(taps, sigma_px.clamp_min(0.05)[:, None])  # 0.05 px leaves a picture as it was
+    kernels = get_gaussian_kernel1d(taps, sigma_px.clamp_min(0.05)[:, None])  # 0.05 px leaves a picture unchanged
     kernels = torch.where(kernels > 1e-30, kernels, 0.0)  # numbers near the smallest took seven times as long
     return _filtered(linear, kernels[:, None], kernels[:, :, None])
 
 
 def motion_blur(linear: Tensor, length_px: Tensor, angle_deg) -> Tensor:
-    """Blur of an even, straight motion, one length and angle (counter-clockwise from x) per picture.
+    """Blur pictures by an even, straight motion, with one length and angle (counter-clockwise from x) per picture.
 
-    Nothing where all are too short to be seen; length 0 leaves a picture as it was.
+    If all lengths are too short to be seen, return the input; length 0 leaves a picture unchanged.
     """
     if _motion_reach(float(length_px.max())) == 0:
         return linear
@@ -125,9 +126,9 @@ def motion_blur(linear: Tensor, length_px: Tensor, angle_deg) -> Tensor:
 
 
 def _filtered(pictures: Tensor, *kernels: Tensor) -> Tensor:
-    """Pictures N×C×H×W correlated with kernels N×h×w of odd sides, one after the other, edges repeated; as kornia's
-    `filter2d` has it to the bit. In this order of memory a photograph of 1600 × 1200 px takes a seventh of its time,
-    gradients a fifth.
+    """Correlate pictures N×C×H×W with kernels N×h×w of odd sides, one after the other, edges repeated: the same bits as
+    kornia's `filter2d`. In this memory order a photograph of 1600 × 1200 px takes a seventh of its time, gradients a
+    fifth.
     """
     count, channels, *_ = pictures.shape
     below, right = (sum(kernel.shape[axis] // 2 for kernel in kernels) for axis in (1, 2))
@@ -140,9 +141,9 @@ def _filtered(pictures: Tensor, *kernels: Tensor) -> Tensor:
 
 
 def _streaks(length_px: Tensor, angle_deg: Tensor) -> Tensor:
-    """N×k×k kernels of sum 1: points along a line, each shared out bilinearly between four pixels.
+    """Return N×k×k motion kernels of sum 1: points along a line, each shared out bilinearly between four pixels.
 
-    kornia's own motion kernels have one odd length for the whole batch and, turned, jump from pixel to pixel.
+    kornia's motion kernels have one odd length for the whole batch and jump from pixel to pixel when they are rotated.
     """
     reach = _motion_reach(float(length_px.max()))
     pixels = torch.arange(-reach, reach + 1).to(length_px)
@@ -150,15 +151,15 @@ def _streaks(length_px: Tensor, angle_deg: Tensor) -> Tensor:
     along = length_px[:, None] * ((torch.arange(steps).to(length_px) + 0.5) / steps - 0.5)
     angle = torch.deg2rad(angle_deg)[:, None]
     x, y = along * torch.cos(angle), -along * torch.sin(angle)  # rows run down
-    tent_x, tent_y = ((1 - (pixels - at[..., None]).abs()).clamp_min(0) for at in (x, y))
+    tent_x, tent_y = ((1 - (pixels - center[..., None]).abs()).clamp_min(0) for center in (x, y))
     return tent_y.mT @ tent_x / steps
 
 
 def add_noise(linear: Tensor, noise: Tensor, seeds) -> Tensor:
-    """Shot and read noise in linear light (EMVA 1288: variance linear in the signal); each picture has its own seed."""
+    """Add shot and read noise to linear light (EMVA 1288: variance linear in the signal); one seed per picture."""
     if float(noise.max()) < SMALLEST_NOISE:
         return linear
-    # made on the CPU whatever the device, so that a GPU sees the same noise
+    # drawn on the CPU for every device, so that a GPU gets the same noise
     generators = (torch.Generator().manual_seed(int(seed)) for seed in seeds)
     grain = torch.stack([torch.randn(linear.shape[1:], generator=generator) for generator in generators]).to(linear)
     deviation = noise[:, None, None, None] * (linear.detach().clamp_min(0) + READ_SHARE**2).sqrt()
@@ -166,7 +167,7 @@ def add_noise(linear: Tensor, noise: Tensor, seeds) -> Tensor:
 
 
 def compress_jpeg(picture: Tensor, quality: Tensor) -> Tensor:
-    """Differentiable JPEG of sRGB pictures; sizes need not be multiples of 16."""
+    """Apply a differentiable JPEG to sRGB pictures; sizes need not be multiples of 16."""
     from kornia.enhance import jpeg_codec_differentiable
 
     height, width = picture.shape[-2:]

@@ -1,4 +1,4 @@
-"""Calibrated cameras, where there is one: what knows lenses (`lens`) is loaded with the first camera file."""
+"""Load a calibrated camera only if one is named: `lens` is imported with the first camera file."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 def load_optional_camera(
     name_or_file: str | Path | None, base: Path | None = None, photo_px: tuple[int, int] | None = None
 ) -> Camera | None:
-    """The camera of that name or file, as `lens.load_camera` reads it; None where none is named."""
+    """Return the camera of that name or file, as `lens.load_camera` reads it; None if no camera is named."""
     if name_or_file is None:
         return None
     from patchproof.channel.lens import load_camera  # most photographs are of cameras that nobody calibrated

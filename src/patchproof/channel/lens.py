@@ -1,13 +1,13 @@
-"""A calibrated camera: where its pixels look, and how its lens bends straight lines.
+"""A calibrated camera: the direction that each pixel looks in, and the lens's distortion of straight lines.
 
-In: a camera file (JSON: intrinsics at `image_px`, Brown-Conrady distortion k1 k2 p1 p2 k3 as OpenCV defines it, where
-the numbers come from). Out: pinhole matrices for any size, points and pictures with the lens's distortion. Pixel
+In: a camera file (JSON: intrinsics at `image_px`, Brown-Conrady distortion k1 k2 p1 p2 k3 as OpenCV defines it, and the
+source of the numbers). Out: pinhole matrices for any size, points and pictures with the lens's distortion. Pixel
 centers are at .5 here: OpenCV's calibration has its principal point (cx, cy) half a pixel lower.
 
-A picture is rendered by a pinhole, a little larger than needed (`pinhole_frame`), and resampled once where the lens
-bends it (`distorted`). That bilinear sample is what distortion costs in accuracy: a blur of up to 1/4 px² of variance,
+A picture is rendered by a pinhole, a little larger than needed (`pinhole_frame`), and resampled once to bend it
+(`distort_pictures`). That bilinear sample is the cost of distortion in accuracy: a blur of up to 1/4 px² of variance,
 1/6 in the mean; a camera without distortion skips it and costs nothing. Left out on purpose: fisheye and rational
-models, chromatic aberration, and lenses that bend so far that a direction would be seen twice: those are refused.
+models, and chromatic aberration. Lenses that bend so far that one direction would be seen twice are refused.
 
 Source: Brown, Close-Range Camera Calibration, 1971; OpenCV's documentation of calib3d.
 """
@@ -33,16 +33,16 @@ if TYPE_CHECKING:
 
 ASPECT_TOLERANCE = 0.002  # sizes are whole pixels: 1600 × 1067 is a picture of a camera of 6000 × 4000
 _ITERATIONS = 100
-_CLOSED_PX = 1e-6  # at the file's own size: as far as distorting an undistorted point may miss the point
+_MAX_ERROR_PX = 1e-6  # at `image_px`: distance between a point and the same point undistorted and distorted again
 
 
 class Camera(StrictModel):
-    """A camera file; lengths in pixels of a picture of `image_px` (width, height), centers at .5."""
+    """A camera file; lengths are pixels of a picture of `image_px` (width, height), pixel centers at .5."""
 
     name: str
     method: Literal["measured", "assumed"]
     when: str  # the day of the measurement
-    instrument: str  # with what it was measured, or what it was assumed from
+    instrument: str  # the instrument of the measurement, or the basis of the assumption
     uncertainty: str
     image_px: tuple[Annotated[int, Field(ge=64, le=20000)], Annotated[int, Field(ge=64, le=20000)]]
     fx: Positive
@@ -57,53 +57,53 @@ class Camera(StrictModel):
     tone_light: Annotated[tuple[Share, ...], Field(min_length=5, max_length=4096)] | None = None  # see `tone`
 
     @property
-    def bends(self) -> bool:
-        """Whether there is any distortion."""
+    def has_distortion(self) -> bool:
+        """True if the lens has any distortion."""
         return any((self.k1, self.k2, self.p1, self.p2, self.k3))
 
     def fits(self, photo_px: tuple[int, int]) -> bool:
-        """Whether photographs of this size can be the camera's, held as it was when it was measured."""
+        """True if photographs of this size can be the camera's, held as it was when it was measured."""
         (width, height), (across, down) = self.image_px, photo_px
         return abs(across * height / (down * width) - 1) <= ASPECT_TOLERANCE
 
     def matrix_px(self, size_px: tuple[int, int]) -> np.ndarray:
-        """3×3 pinhole matrix for a picture of this size: the whole photograph or, where square, its centered square."""
+        """Return the 3×3 pinhole matrix for the whole photograph at this size or, if square, its centered square."""
         width, height = self.image_px
-        shown = (min(width, height),) * 2 if size_px[0] == size_px[1] else (width, height)
-        sx, sy = size_px[0] / shown[0], size_px[1] / shown[1]
-        cx, cy = self.cx - (width - shown[0]) / 2, self.cy - (height - shown[1]) / 2
+        covered = (min(width, height),) * 2 if size_px[0] == size_px[1] else (width, height)
+        sx, sy = size_px[0] / covered[0], size_px[1] / covered[1]
+        cx, cy = self.cx - (width - covered[0]) / 2, self.cy - (height - covered[1]) / 2
         return np.array([[self.fx * sx, 0, cx * sx], [0, self.fy * sy, cy * sy], [0, 0, 1.0]])
 
     def distort_points(self, points_px: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
-        """Where the lens puts pixels N×2 of the pinhole picture of this size."""
+        """Return the points N×2 at which the lens shows pixels N×2 of the pinhole picture of this size."""
         matrix = self.matrix_px(size_px)
-        return _from_unit(matrix, _bent(self, _to_unit(matrix, points_px)))
+        return _from_unit(matrix, _distort(self, _to_unit(matrix, points_px)))
 
     def undistort_points(self, points_px: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
-        """The pinhole picture's pixels N×2 that the lens puts at these of the photograph."""
+        """Return the pinhole picture's pixels N×2 that the lens shows at pixels N×2 of the photograph."""
         matrix = self.matrix_px(size_px)
-        return _from_unit(matrix, _straight(self, _to_unit(matrix, points_px)))
+        return _from_unit(matrix, _undistort(self, _to_unit(matrix, points_px)))
 
     def pinhole_frame(self, size_px: tuple[int, int]) -> Frame:
-        """What to render so that `distorted` reads nothing from outside; with no distortion, the picture itself."""
+        """Return the frame that `distort_pictures` reads from; without distortion, the picture itself."""
         matrix = self.matrix_px(size_px)
-        if not self.bends:
+        if not self.has_distortion:
             return Frame(size_px, matrix, 0, 0, 0, 0)
         edge = self.undistort_points(_edge_px(size_px), size_px)
-        # a bilinear sample reads no padding where it lies between the centers of the outermost pixels
+        # a bilinear sample between the centers of the outermost pixels reads no padding
         left, top = (max(0, math.ceil(0.5 - low)) for low in edge.min(0))
         right, bottom = (max(0, math.ceil(high + 0.5 - size)) for high, size in zip(edge.max(0), size_px, strict=True))
         matrix = matrix + np.array([[0, 0, left], [0, 0, top], [0, 0, 0]])
         return Frame((size_px[0] + left + right, size_px[1] + top + bottom), matrix, left, top, right, bottom)
 
-    def distorted(self, pictures: Tensor, size_px: tuple[int, int]) -> Tensor:
-        """N×C×H×W pictures of `size_px` as the lens makes them, from pinhole pictures of `pinhole_frame(...).size_px`.
+    def distort_pictures(self, pictures: Tensor, size_px: tuple[int, int]) -> Tensor:
+        """Bend pinhole pictures N×C×H×W of `pinhole_frame(...).size_px` as the lens does, to pictures of `size_px`.
 
-        Differentiable; linear light should come in, as it does through a lens.
+        Differentiable. The input should be linear light, which is what passes through a lens.
         """
         import torch
 
-        if not self.bends:
+        if not self.has_distortion:
             return pictures
         # pyright cannot know that frozen models have a hash
         grid = torch.as_tensor(_sampling_grid(self, size_px)).to(pictures)  # pyright: ignore[reportArgumentType]
@@ -117,7 +117,7 @@ class Camera(StrictModel):
 
 
 def load_camera(name_or_file: str | Path, base: Path | None = None, photo_px: tuple[int, int] | None = None) -> Camera:
-    """A shipped camera by name, or a JSON file relative to `base`; refused where it cannot have taken `photo_px`."""
+    """Load a shipped camera by name, or a JSON file relative to `base`; refused if it cannot have taken `photo_px`."""
     path = _path(name_or_file, base)
     camera = validate_model(Camera, read_json(path, "a camera file (JSON)", "calibrate again"), str(path))
     check_camera(camera, str(path))
@@ -132,7 +132,7 @@ def load_camera(name_or_file: str | Path, base: Path | None = None, photo_px: tu
 
 
 def check_camera(camera: Camera, where: str) -> None:
-    """Refuse a middle outside the picture, a tone curve that does not grow, or distortion that cannot be undone."""
+    """Refuse a principal point outside the picture, a tone curve that falls, and irreversible distortion."""
     (width, height), light = camera.image_px, camera.tone_light
     if not (0 < camera.cx < width and 0 < camera.cy < height):
         raise Refused(
@@ -146,12 +146,12 @@ def check_camera(camera: Camera, where: str) -> None:
             f"{len(light)} values from {light[0]:g} to {light[-1]:g} that do not",
             "give the light at evenly spaced code values, or leave it out for sRGB's curve",
         )
-    _refuse_folded(camera, where)
+    _refuse_irreversible(camera, where)
 
 
 @lru_cache(maxsize=4)
 def _sampling_grid(camera: Camera, size_px: tuple[int, int]) -> np.ndarray:
-    """1×H×W×2 in [-1, 1] across the pinhole picture, whose borders are at ±1."""
+    """Return 1×H×W×2 source coordinates in the pinhole picture, whose borders are at ±1."""
     width, height = size_px
     frame = camera.pinhole_frame(size_px)
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
@@ -160,21 +160,21 @@ def _sampling_grid(camera: Camera, size_px: tuple[int, int]) -> np.ndarray:
     return (2 * source / frame.size_px - 1).reshape(1, height, width, 2)
 
 
-def _bent(camera: Camera, points: np.ndarray) -> np.ndarray:
-    """Points N×2 at distance 1 from the lens, moved as it moves them."""
+def _distort(camera: Camera, points: np.ndarray) -> np.ndarray:
+    """Distort points N×2 of the plane at distance 1 from the lens."""
     x, y = points.T
     r2 = x * x + y * y
     radial = 1 + r2 * (camera.k1 + r2 * (camera.k2 + r2 * camera.k3))
-    bent_x = x * radial + 2 * camera.p1 * x * y + camera.p2 * (r2 + 2 * x * x)
-    bent_y = y * radial + camera.p1 * (r2 + 2 * y * y) + 2 * camera.p2 * x * y
-    return np.stack([bent_x, bent_y], 1)
+    distorted_x = x * radial + 2 * camera.p1 * x * y + camera.p2 * (r2 + 2 * x * x)
+    distorted_y = y * radial + camera.p1 * (r2 + 2 * y * y) + 2 * camera.p2 * x * y
+    return np.stack([distorted_x, distorted_y], 1)
 
 
-def _straight(camera: Camera, points: np.ndarray) -> np.ndarray:
-    """The inverse of `_bent` by fixed-point iteration: it converges where neighbors move less than their distance."""
+def _undistort(camera: Camera, points: np.ndarray) -> np.ndarray:
+    """Invert `_distort` by fixed-point iteration, which converges where neighbors move less than their distance."""
     straight = points
     for _ in range(_ITERATIONS):
-        change = points - _bent(camera, straight)
+        change = points - _distort(camera, straight)
         straight = straight + change
         if np.abs(change).max(initial=0) < 1e-12:
             break
@@ -190,7 +190,7 @@ def _from_unit(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def _edge_px(size_px: tuple[int, int]) -> np.ndarray:
-    """The centers of the pixels along the picture's edge."""
+    """Return the centers of the pixels along the picture's edge."""
     width, height = size_px
     x, y = np.arange(width) + 0.5, np.arange(height) + 0.5
     sides = [(x, 0.5), (x, height - 0.5), (0.5, y), (width - 0.5, y)]
@@ -204,21 +204,21 @@ def _path(name_or_file: str | Path, base: Path | None) -> Path:
         if not is_file(path):
             raise Refused("a camera file (JSON)", f"no file at {path}", "check the path")
         return path
-    known = sorted(file.stem for file in packaged_path("calibration", "cameras").glob("*.json"))
-    if (name := str(name_or_file)) not in known:
-        raise Refused("a camera's name or file", f'"{name_or_file}"', spelling_hint(name, known))
+    shipped = sorted(file.stem for file in packaged_path("calibration", "cameras").glob("*.json"))
+    if (name := str(name_or_file)) not in shipped:
+        raise Refused("a camera's name or file", f'"{name_or_file}"', spelling_hint(name, shipped))
     return packaged_path("calibration", "cameras", f"{name}.json")
 
 
-def _refuse_folded(camera: Camera, where: str) -> None:
-    """Where undistorting closes, neighbors keep their order and stay within twice their distance: no direction is seen
-    twice.
+def _refuse_irreversible(camera: Camera, where: str) -> None:
+    """Refuse distortion that cannot be undone. Where undistorting closes, neighbors keep their order and stay within
+    twice their distance, so that no direction is seen twice.
     """
     x, y = np.meshgrid(*(np.linspace(0.5, side - 0.5, 65) for side in camera.image_px))
     points = _to_unit(camera.matrix_px(camera.image_px), np.stack([x.ravel(), y.ravel()], 1))
     with np.errstate(over="ignore", invalid="ignore"):
-        missed_px = np.abs((_bent(camera, _straight(camera, points)) - points) * [camera.fx, camera.fy]).max()
-    if not missed_px < _CLOSED_PX:  # nor where it is not a number
+        error_px = np.abs((_distort(camera, _undistort(camera, points)) - points) * [camera.fx, camera.fy]).max()
+    if not error_px < _MAX_ERROR_PX:  # true also for NaN
         raise Refused(
             f"distortion that can be undone in the whole picture in {where}",
             f"k1 k2 k3 = {camera.k1:g} {camera.k2:g} {camera.k3:g}, p1 p2 = {camera.p1:g} {camera.p2:g}",

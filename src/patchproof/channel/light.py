@@ -6,9 +6,9 @@ paper as sRGB white at exposure 0. All light is white: the camera has the white 
 Left out on purpose: cast shadows and interreflection; an object's own shadow on the patch is not predicted. What that
 costs, computed for the default ranges: a ledge 10 mm high along the top of a patch 110 mm wide shades 28 % of it in the
 mean view and takes 4 % of its light (9 % at the 95 % point); a card 5 mm off its object darkens a strip of the object 9
-mm wide by a third where the light comes from 60 degrees, and nothing on itself. A lamp's fall-off,
-ambient light that differs by direction and highlights on paper are left out, too: together they took 0.5 points [-0.1,
-1.0] of the rates promised for glossy paper half a meter from a lamp, in 9 pairs of scene and network.
+mm wide by a third when the light comes from 60 degrees, and nothing on itself. A lamp's fall-off, ambient light that
+differs by direction, and highlights on paper are left out, too: together they took 0.5 points [-0.1, 1.0] of the rates
+promised for glossy paper half a meter from a lamp, in 9 pairs of scene and network.
 
 Source: Lambert.
 """
@@ -27,7 +27,7 @@ from patchproof.channel.effects import Light
 
 @dataclass(frozen=True)
 class Lighting:
-    """The light of N views: `ambient` and `directional` N, the unit directions `toward` the light N×3."""
+    """The light of N views: `ambient` and `directional` N, and unit directions `toward` the light N×3."""
 
     ambient: Tensor
     directional: Tensor
@@ -35,17 +35,17 @@ class Lighting:
 
 
 def lighting_of(light: Light, forward, up, device: torch.device | str = "cpu") -> Lighting:
-    """The light of N views on a patch whose side faces `forward`."""
+    """Return the light of N views on a patch whose printed side faces `forward`."""
 
-    def on(values) -> Tensor:
+    def tensor(values) -> Tensor:
         return torch.as_tensor(np.asarray(values), dtype=torch.float32, device=device)
 
     toward = geometry.orbit(light.light_azimuth_deg, light.light_elevation_deg, forward, up)
-    return Lighting(on(light.ambient), on(light.directional), on(toward))
+    return Lighting(tensor(light.ambient), tensor(light.directional), tensor(toward))
 
 
 def irradiance(normal: Tensor, view: Tensor, light: Lighting) -> Tensor:
-    """Light on P fragments with unit `normal` P×3, each in one of the views (`view` P)."""
-    # over three columns, torch's own sum takes half as long again
+    """Return the light on P fragments with unit `normal` P×3, each in one of the views (`view` P)."""
+    # torch's own sum over three columns takes half as long again
     cosine = geometry.dot(normal.unbind(-1), light.toward.index_select(0, view).unbind(-1)).clamp_min(0)
     return light.ambient.index_select(0, view) + light.directional.index_select(0, view) * cosine

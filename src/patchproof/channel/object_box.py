@@ -1,8 +1,8 @@
-"""Where an object lies in a picture: the box around it, which a detector's boxes are compared with.
+"""The box around the object in a picture, with which a detector's boxes are compared.
 
-In: the object's outermost points, a camera. Out: (left, top, right, bottom) in pixels, clipped to the picture. The
-whole object counts, with what a piece or another of its parts hides, so that the box does not depend on what is shown.
-Left out on purpose: what stands in front of the object.
+In: the object's outermost points and a camera. Out: (left, top, right, bottom) in pixels, clipped to the picture. The
+whole object counts, including what a piece or another of its parts hides: the box does not depend on the design. Left
+out on purpose: things that stand in front of the object.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from patchproof.base.geometry import project
 if TYPE_CHECKING:
     from patchproof.channel.lens import Camera
 
-MOST_POINTS = 500  # of a ball: their box lacks 0.3 % of its size
+MOST_POINTS = 500  # the box around this many points of a ball is 0.3 % too small
 
 
 def hull_points(vertices_mm: np.ndarray) -> np.ndarray:
-    """The vertices P×3 of a mesh's convex hull, which alone make its box in any view; of more than `MOST_POINTS` those
-    that lie farthest out in as many directions, spread evenly.
+    """Return the vertices P×3 of a mesh's convex hull, which suffice for its box in any view. Of a hull with more than
+    `MOST_POINTS` vertices, return those that lie farthest out in that many evenly spread directions.
     """
     from scipy.spatial import ConvexHull, QhullError
 
@@ -32,8 +32,8 @@ def hull_points(vertices_mm: np.ndarray) -> np.ndarray:
         pass
     if len(points) <= MOST_POINTS:
         return points
-    turn, height = np.arange(MOST_POINTS) * np.pi * (3 - 5**0.5), np.linspace(-1, 1, MOST_POINTS)
-    directions = np.stack([np.cos(turn), np.sin(turn), height], 1)
+    azimuth, height = np.arange(MOST_POINTS) * np.pi * (3 - 5**0.5), np.linspace(-1, 1, MOST_POINTS)
+    directions = np.stack([np.cos(azimuth), np.sin(azimuth), height], 1)
     directions[:, :2] *= np.sqrt(1 - height**2)[:, None]
     return points[np.unique((points @ directions.T).argmax(0))]
 
@@ -45,14 +45,14 @@ def project_box(
     size_px: tuple[int, int],
     camera: Camera | None = None,
 ) -> np.ndarray:
-    """The box (4,) of world points P×3 in a picture of `size_px`, through a calibrated lens where there is one. Points
-    behind the camera do not count; all zeros where nothing is seen.
+    """Return the box (4,) around world points P×3 in a picture of `size_px`, seen through a calibrated lens if one is
+    given. Points behind the camera do not count; the box is all zeros if no point is in the picture.
     """
     points_px = project(matrix_px, camera_from_world, points_mm)
     points_px = points_px[np.isfinite(points_px[:, 0])]
-    if camera is not None and camera.bends:
-        middle = np.array(size_px) / 2  # far outside the picture a lens's polynomial means nothing
-        points_px = camera.distort_points(np.clip(points_px, -middle, 3 * middle), size_px)
+    if camera is not None and camera.has_distortion:
+        half_size = np.array(size_px) / 2  # far outside the picture a lens's polynomial means nothing
+        points_px = camera.distort_points(np.clip(points_px, -half_size, 3 * half_size), size_px)
     if not len(points_px):
         return np.zeros(4)
     low, high = points_px.min(0), points_px.max(0)

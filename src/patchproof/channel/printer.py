@@ -1,11 +1,11 @@
-"""What a printer makes of sRGB: a table from the colors sent to the colors seen on paper, differentiable.
+"""The printer: a table from the sRGB colors that are sent to the colors seen on paper, differentiable.
 
 In: sRGB as sent, N×3×H×W in [0, 1]. Out: sRGB as seen by an eye adapted to the paper (media-relative: bare paper is 1),
 so that light and camera are applied once, elsewhere. A second table holds how far each color is out of gamut (ΔE00 of
-the round trip). A printer is a name, two tables and where they come from; on disk NAME.npz and NAME.json.
-Out-of-gamut inks (offset cyan and green lie outside sRGB) are clipped to [0, 1] when the table is made: cameras that
-deliver sRGB clip them too. Print-to-print variation is a small function on top, `vary_print`.
-Left out on purpose: halftone dots (below what a camera resolves beyond 0.2 mm per pixel) and ink spread.
+the round trip). A printer is a name, two tables and their provenance; on disk NAME.npz and NAME.json. Out-of-gamut inks
+(offset cyan and green lie outside sRGB) are clipped to [0, 1] when the table is made: cameras that deliver sRGB clip
+them too. Print-to-print variation is a small function on top, `vary_print`. Left out on purpose: halftone dots (below
+what a camera resolves beyond 0.2 mm per pixel) and ink spread.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ GAMUT_STEPS = 8  # the gamut table is stored in eighths of a ΔE00, up to 31.9
 
 
 class Paper(StrictModel):
-    """The sheet under the media-relative table; null where unknown."""
+    """The paper under the media-relative table; None for unknown values."""
 
     white_lab: tuple[Finite, Finite, Finite] | None = None  # D50, absolute
-    black_L: Finite | None = None  # L* of printed sRGB black, paper white at 100
+    black_L: Finite | None = None  # L* of printed sRGB black, with paper white at 100
 
 
 class PrinterHead(StrictModel):
-    """NAME.json of a printer, without its tables."""
+    """The contents of a printer's NAME.json: everything but its tables."""
 
     name: str
     method: Method
@@ -53,7 +53,7 @@ class PrinterHead(StrictModel):
 
 @dataclass(frozen=True, eq=False)
 class Printer:
-    """Tables on the nodes `NODES_8BIT` of red, green, blue (in this order); `provenance` says where they come from."""
+    """Tables at the nodes `NODES_8BIT` of red, green, blue (in this order); `provenance` says where they come from."""
 
     name: str
     method: Method
@@ -63,11 +63,11 @@ class Printer:
     provenance: dict[str, Any] = field(default_factory=dict)
 
     def apply(self, srgb: Tensor) -> Tensor:
-        """Seen sRGB N×3×H×W of sent sRGB; values outside [0, 1] are clamped. Trilinear."""
+        """Return the sRGB N×3×H×W that is seen when this sRGB is sent; values outside [0, 1] are clamped. Trilinear."""
         return _look_up(self._colors, srgb)
 
     def gamut_distance(self, srgb: Tensor) -> Tensor:
-        """N×1×H×W: ΔE00 by which the printer misses each color; differentiable, and so a penalty."""
+        """Return N×1×H×W: the ΔE00 by which the printer misses each color; differentiable, for use as a penalty."""
         return _look_up(self._distances, srgb)
 
     @cached_property
@@ -80,24 +80,25 @@ class Printer:
 
 
 def node_colors() -> np.ndarray:
-    """float64 33×33×33×3: the sRGB colors at which the tables are known, red slowest."""
+    """Return float64 33×33×33×3: the sRGB colors at which the tables are known, red slowest."""
     nodes = np.array(NODES_8BIT) / 255
     return np.stack(np.meshgrid(nodes, nodes, nodes, indexing="ij"), -1)
 
 
 def identity_printer() -> Printer:
-    """A printer that shows what it is sent."""
+    """Return an ideal printer, which shows the colors that it is sent."""
     lut = torch.tensor(node_colors(), dtype=torch.float32)
     note = {"source": "none: an ideal printer, for comparison"}
     return Printer("identity", "assumed", lut, torch.zeros(lut.shape[:3]), Paper(black_L=0.0), note)
 
 
 def vary_print(seen_linear: Tensor, change: Tensor) -> Tensor:
-    """Light `... × 3` of colors as seen, as of another print of the same file; channels last, unlike an image.
+    """Return the light `... × 3` of another print of the same file, given that of this one; channels last, unlike an
+    image.
 
     `change` `... × 3` broadcasts against it: dot gain g, ink density d, black b; 0 changes nothing. Bare paper stays 1.
-    With reflectance R: coverage 1 - R (Murray-Davies) grows by 4·g·R·(1 - R); density makes R^(1+d); the surface's own
-    light makes b + (1 - b)·R.
+    With reflectance R: coverage 1 - R (Murray-Davies) grows by 4·g·R·(1 - R); density makes R^(1+d); light from the
+    surface itself makes b + (1 - b)·R.
     """
     gain, density, black = change.to(seen_linear).split(1, -1)
     light = seen_linear * (1 - 4 * gain * (1 - seen_linear))
@@ -106,19 +107,19 @@ def vary_print(seen_linear: Tensor, change: Tensor) -> Tensor:
 
 
 def load_printer(name_or_file: str, base: Path | None = None) -> Printer:
-    """A shipped printer by name, `identity`, or a NAME.npz or NAME.json file, relative to `base`."""
+    """Load a shipped printer by name, `identity`, or a NAME.npz or NAME.json file relative to `base`."""
     if name_or_file == "identity":
         return identity_printer()
     suffix = Path(name_or_file).suffix.lower()
     if suffix in {".icc", ".icm"}:
-        do = "bake the profile into one with patchproof calibrate printer"
-        raise Refused("a printer model (.npz)", f"the ICC profile {name_or_file}", do)
+        remedy = "bake the profile into one with patchproof calibrate printer"
+        raise Refused("a printer model (.npz)", f"the ICC profile {name_or_file}", remedy)
     if suffix in {".npz", ".json"} or len(Path(name_or_file).parts) > 1:
         return _read((base or Path()) / name_or_file)
-    known = sorted(path.stem for path in packaged_path("calibration", "printers").glob("*.npz"))
-    if name_or_file not in known:
+    shipped = sorted(path.stem for path in packaged_path("calibration", "printers").glob("*.npz"))
+    if name_or_file not in shipped:
         raise Refused(
-            "a printer's name or file", f'"{name_or_file}"', spelling_hint(name_or_file, [*known, "identity"])
+            "a printer's name or file", f'"{name_or_file}"', spelling_hint(name_or_file, [*shipped, "identity"])
         )
     return _read(packaged_path("calibration", "printers", f"{name_or_file}.npz"))
 
@@ -142,22 +143,22 @@ def _read(path: Path) -> Printer:
 
 
 def _array(archive: zipfile.ZipFile, name: str, shape: tuple[int, ...], kinds: tuple[type, ...]) -> np.ndarray:
-    """An array of an .npz: no more is unpacked than its shape and type say, and these have to be the ones wanted."""
+    """Read an array of an .npz, which must have one shape and type: no more bytes than these are unpacked."""
     with archive.open(f"{name}.npy") as member:
         if np.lib.format.read_magic(member) != (1, 0):
-            raise ValueError(f"{name} in another format")
+            raise ValueError(f"{name} in an unknown .npy format")
         stored, by_columns, kind = np.lib.format.read_array_header_1_0(member)
         if stored != shape or by_columns or kind not in kinds:
-            raise ValueError(f"the table {name} {stored} {kind}")
+            raise ValueError(f"the table {name} is {stored} {kind}")
         content = member.read(math.prod(shape) * kind.itemsize + 1)
-    return np.frombuffer(content, kind).reshape(shape)  # other lengths do not fit it
+    return np.frombuffer(content, kind).reshape(shape)  # raises for any other length
 
 
 def _bordered(table: Tensor) -> Tensor:
-    """1×C×35×35×35 with a layer of linear continuation all round.
+    """Return 1×C×35×35×35: the table with one layer of linear continuation on all sides.
 
     grid_sample's gradient is zero on the outermost nodes, where pure black and white lie: a saturated pixel would never
-    move again. One layer further out, the border is out of reach.
+    move again. With one more layer the border is out of reach.
     """
     bordered = np.pad(table.numpy(), [(1, 1)] * 3 + [(0, 0)], mode="reflect", reflect_type="odd")
     return torch.from_numpy(bordered).permute(3, 0, 1, 2)[None].contiguous()
@@ -169,5 +170,5 @@ def _look_up(table: Tensor, srgb: Tensor) -> Tensor:
     position = torch.where(levels <= 248, levels / 8, 31 + (levels - 248) / 7)  # the last step is 7 wide
     grid = (2 * (position + 1) / (SIZE + 1) - 1).movedim(1, -1).flip(-1)  # grid_sample wants (x, y, z) = (b, g, r)
     sample = torch.nn.functional.grid_sample
-    looked_up = sample(table.to(colors), grid[None], mode="bilinear", padding_mode="border", align_corners=True)
-    return looked_up[0].movedim(0, 1).to(srgb.dtype)
+    values = sample(table.to(colors), grid[None], mode="bilinear", padding_mode="border", align_corners=True)
+    return values[0].movedim(0, 1).to(srgb.dtype)

@@ -1,4 +1,4 @@
-"""The frame that a camera's picture is rendered in before its lens bends it; without anything of lenses."""
+"""The frame in which a picture is rendered before the lens bends it; needs nothing of lenses."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Frame:
-    """The pinhole picture to render before the lens bends it, and how far it reaches beyond each of its sides."""
+    """A pinhole picture to render before the lens bends it, and how many pixels it extends beyond each side."""
 
     size_px: tuple[int, int]
     matrix_px: np.ndarray

@@ -1,8 +1,8 @@
-"""A camera's tone curve: how the light it saw became the code values it wrote, the same for all three channels.
+"""A camera's tone curve: from the light it saw to the code values it wrote, the same for all three channels.
 
 In: a `Camera`; its `tone_light` is the light at evenly spaced code values from 0 to 1, straight in between. Out: light
-of codes and codes of light, both in [0, 1]; a camera without one encodes as sRGB does. Left out on purpose: curves that
-differ between channels, and pictures that a phone tone-maps from place to place.
+of codes and codes of light, both in [0, 1]; a camera without a curve encodes as sRGB does. Left out on purpose: curves
+that differ between channels, and pictures that a phone tone-maps differently from region to region.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ if TYPE_CHECKING:
 
 
 def light_of_codes(codes: np.ndarray, camera: Camera | None) -> np.ndarray:
-    """Linear light of the code values that a camera wrote."""
+    """Return the linear light of the code values that a camera wrote."""
     if camera is None or camera.tone_light is None:
         return linear_from_srgb(codes)
     return np.interp(codes, np.linspace(0, 1, len(camera.tone_light)), camera.tone_light)
 
 
 def codes_of_light(linear: Tensor, camera: Camera | None) -> Tensor:
-    """The code values that a camera writes for linear light in [0, 1]; differentiable."""
+    """Return the code values that a camera writes for linear light in [0, 1]; differentiable."""
     if camera is None or camera.tone_light is None:
         return srgb_from_linear(linear)
     light = torch.as_tensor(camera.tone_light).to(linear)

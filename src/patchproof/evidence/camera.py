@@ -59,7 +59,7 @@ def _turned(camera: Camera) -> Camera:
 
 def _straightened(srgb: np.ndarray, camera: Camera, matrix: np.ndarray) -> np.ndarray:
     """The picture through a pinhole of the same matrix."""
-    if not camera.bends:
+    if not camera.has_distortion:
         return srgb
     index = matrix.copy()
     index[:2, 2] -= 0.5  # OpenCV counts from pixel centers

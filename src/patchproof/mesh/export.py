@@ -1,9 +1,9 @@
-"""The object with its textures, and the piece on it where there is one, as one GLB file that other programs open.
+"""Export the object with its textures, and the piece on it if there is one, as one GLB file for other programs.
 
-In: a mesh, one uint8 sRGB texture per material, and the piece as a textured part. Out: glTF 2.0, in meters as
-its specification wants (the mesh is in millimeters), y up, textures as lossless PNG inside, repeating. trimesh writes
-it; nothing in it depends on the time, so the same textures give the same bytes. Surfaces are matte, and seen from both
-sides as the renderer here sees them. Left out on purpose: lights and cameras. Material names are kept and may repeat;
+In: a mesh, one uint8 sRGB texture per material, and the piece as a textured part. Out: glTF 2.0, in meters as its
+specification wants (the mesh is in millimeters), y up, textures as lossless PNG inside, repeating. trimesh writes it;
+nothing in it depends on the time, so the same textures give the same bytes. Surfaces are matte and visible from both
+sides, as in the renderer here. Left out on purpose: lights and cameras. Material names are kept and may repeat;
 geometries are numbered.
 """
 
@@ -22,8 +22,8 @@ _M_FROM_MM = 1e-3
 
 
 def write_glb(mesh: Mesh, textures: Sequence[np.ndarray], path: str | Path, piece: MeshPart | None = None) -> None:
-    """Write `mesh` with `textures` (uint8 H×W×3, one per material, in place of the material's own) to a .glb file;
-    `piece` hangs on it, with a texture of its own.
+    """Write `mesh` with `textures` (uint8 H×W×3, one per material, in place of the material's own) to a .glb file, with
+    `piece` on it, if given, in a texture of its own.
 
     Textures stand for the whole color: base colors are not written; corner colors other than 1 are, in 8 bits of light.
     """
@@ -44,7 +44,7 @@ def write_glb(mesh: Mesh, textures: Sequence[np.ndarray], path: str | Path, piec
 
 
 def _geometry(mesh: Mesh, faces: np.ndarray, name: str, texture: np.ndarray):
-    """Some faces as a trimesh, corners that agree in everything made one vertex."""
+    """Return some faces as a trimesh in which corners with equal values are one vertex."""
     arrays = mesh.vertices[mesh.faces], mesh.corner_normal, mesh.corner_uv, mesh.corner_color_linear
     corners = np.concatenate([array[faces].reshape(3 * len(faces), -1).astype(float) for array in arrays], axis=1)
     corners, index = np.unique(corners, axis=0, return_inverse=True)
@@ -53,7 +53,7 @@ def _geometry(mesh: Mesh, faces: np.ndarray, name: str, texture: np.ndarray):
 
 
 def _textured(vertices_mm, faces, normals, uv: np.ndarray, name: str, texture: np.ndarray, color: ArrayLike = 1.0):
-    """A trimesh with a matte texture over coordinates V×2 with v down, which corner colors V×3 multiply."""
+    """Return a trimesh with a matte texture over coordinates V×2 with v down, multiplied by corner colors V×3."""
     import trimesh
     from PIL import Image
     from trimesh.visual import TextureVisuals
@@ -64,6 +64,6 @@ def _textured(vertices_mm, faces, normals, uv: np.ndarray, name: str, texture: n
     )
     visual = TextureVisuals(uv=np.column_stack([uv[:, 0], 1 - uv[:, 1]]), material=material)
     if np.any(np.asarray(color) != 1):
-        # trimesh writes bytes, whatever it is given
+        # trimesh always writes bytes
         visual.vertex_attributes["color"] = codes_from_srgb(np.insert(np.asarray(color), 3, 1.0, axis=1))
     return trimesh.Trimesh(vertices_mm * _M_FROM_MM, faces, vertex_normals=normals, visual=visual, process=False)

@@ -1,8 +1,8 @@
-"""A mesh by its name: a file's (`mesh_file`), a procedural object's (`primitives`), or one given in Python.
+"""Load a mesh by its name: a file (`mesh_file`), a procedural object (`primitives`), or a mesh given in Python.
 
 In: a path, `primitive:NAME` or `python:NAME`, and the object's longest extent. Out: a `Mesh` in the scene's frame.
 Textures larger than any photograph shows are reduced. A mesh in memory goes through GLB and the reader of files, so
-that it is what its run's folder will hold.
+that it equals what its run's folder will hold.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ from patchproof.base.errors import Refused
 from patchproof.base.resample import downscale
 from patchproof.mesh.mesh import Material, Mesh, MeshPart, mesh_from_parts
 
-GIVEN = "python:"
+PYTHON_PREFIX = "python:"
 
-# Larger textures are reduced: 8192 × 8192 took 4 GB and 5 s to set up, and no photograph of an object shows as much.
+# Larger textures are reduced: 8192 × 8192 took 4 GB and 5 s to set up, more detail than any photograph shows.
 LARGEST_TEXTURE_PX = 4096
 _Y_UP_FROM_Z_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 
 
 def load_mesh(path: str | Path, length_mm: float, up: Literal["y", "z"] = "z", mesh_glb: bytes | None = None) -> Mesh:
-    """The mesh of a file, of `primitive:NAME`, or of the GLB given for `python:NAME`, with its longest extent
+    """Load the mesh of a file, of `primitive:NAME`, or of the GLB given for `python:NAME`, with its longest extent
     `length_mm`.
 
-    `up = "z"` turns (x, y, z) into (x, z, -y); primitives are y up already. Refused where nothing usable is left or a
+    `up = "z"` turns (x, y, z) into (x, z, -y); primitives are y up already. Refused if nothing can be drawn or a
     texture that the file names is missing.
     """
     if str(path).startswith("primitive:"):
@@ -41,25 +41,25 @@ def load_mesh(path: str | Path, length_mm: float, up: Literal["y", "z"] = "z", m
     from patchproof.mesh.mesh_file import read_parts
 
     with TemporaryDirectory() as folder:
-        if str(path).startswith(GIVEN):
+        if str(path).startswith(PYTHON_PREFIX):
             if mesh_glb is None:
-                raise Refused("a mesh beside the settings", f"{path} alone", "give it: make_scene(settings, mesh=...)")
+                raise Refused("a mesh for python:", f"{path} without one", "pass it: make_scene(settings, mesh=...)")
             path = Path(folder) / "given.glb"
             path.write_bytes(mesh_glb)
         parts, warnings = read_parts(Path(path), _Y_UP_FROM_Z_UP if up == "z" else np.eye(3))
-    parts, reduced = _within_limit(parts)
-    return mesh_from_parts(parts, length_mm, (*warnings, *reduced))
+    parts, reductions = _reduce_textures(parts)
+    return mesh_from_parts(parts, length_mm, (*warnings, *reductions))
 
 
-def _within_limit(parts: Sequence[MeshPart]) -> tuple[list[MeshPart], list[str]]:
-    """The parts with textures of at most LARGEST_TEXTURE_PX a side, and warnings about those that were larger."""
-    kept: dict[Material, Material] = {}
+def _reduce_textures(parts: Sequence[MeshPart]) -> tuple[list[MeshPart], list[str]]:
+    """Reduce textures to at most LARGEST_TEXTURE_PX a side; return the parts and warnings about larger textures."""
+    reduced_materials: dict[Material, Material] = {}
     warnings = []
     for material in dict.fromkeys(part.material for part in parts):
         texture = material.texture_srgb
         if texture is not None and max(texture.shape[:2]) > LARGEST_TEXTURE_PX:
             small = downscale(texture, LARGEST_TEXTURE_PX)
-            kept[material] = replace(material, texture_srgb=small)
-            before, after = (f"{pixels.shape[1]} × {pixels.shape[0]}" for pixels in (texture, small))
-            warnings.append(f"the texture of {before} of {material.name} is reduced to {after}")
-    return [replace(part, material=kept.get(part.material, part.material)) for part in parts], warnings
+            reduced_materials[material] = replace(material, texture_srgb=small)
+            old_size, new_size = (f"{pixels.shape[1]} × {pixels.shape[0]}" for pixels in (texture, small))
+            warnings.append(f"the texture of {old_size} of {material.name} is reduced to {new_size}")
+    return [replace(part, material=reduced_materials.get(part.material, part.material)) for part in parts], warnings

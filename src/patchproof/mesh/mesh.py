@@ -1,9 +1,9 @@
-"""Meshes: what the object looks like, in millimeters.
+"""Triangle meshes of objects, in millimeters.
 
-In: parts, read by `load_mesh` or made by code. Out: one triangle list in the scene's frame
-with per-corner texture coordinates, normals and colors, and warnings that say what was assumed.
-Faces that cannot be drawn (NaN corners, no area) are left out; size and center are those of the faces that are drawn.
-Left out on purpose: closed surfaces. A renderer needs no inside, so open, non-manifold and loose triangles will do.
+In: parts, read by `load_mesh` or made by code. Out: one triangle list in the scene's frame with per-corner texture
+coordinates, normals and colors, and warnings that state assumptions. Faces that cannot be drawn (NaN corners, no area)
+are left out; size and center are those of the faces that are drawn. Left out on purpose: closed surfaces. A renderer
+needs no inside, so open, non-manifold and loose triangles will do.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from patchproof.base.errors import Refused
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """A base color in linear light and, where there is one, a texture as uint8 H×W×3 sRGB; they multiply as light."""
+    """A base color in linear light and, if there is one, a texture as uint8 H×W×3 sRGB; the two multiply as light."""
 
     name: str
     base_color_linear: tuple[float, float, float]
@@ -28,7 +28,7 @@ class Material:
 
 @dataclass(frozen=True)
 class MeshPart:
-    """Triangles of one material: what `mesh_from_parts` joins. Arrays are per vertex; None where there is none."""
+    """Triangles of one material, which `mesh_from_parts` joins. Arrays are per vertex; None for no values."""
 
     vertices: np.ndarray  # V×3, any unit, world axes (y up)
     faces: np.ndarray  # F×3 integers, counter-clockwise seen from outside
@@ -45,60 +45,61 @@ class Mesh:
     vertices: np.ndarray  # float64 V×3: mm, right-handed, y up, origin at the bounding box's center
     faces: np.ndarray  # int64 F×3, counter-clockwise seen from outside
     corner_uv: np.ndarray  # float32 F×3×2: u right, v down from the texture's top-left (wraps); 0 where none
-    corner_normal: np.ndarray  # float32 F×3×3 unit: the file's where it has them, else the face's own
+    corner_normal: np.ndarray  # float32 F×3×3 unit: the file's if it has them, else the face's
     corner_color_linear: np.ndarray  # float32 F×3×3; 1 where none
     face_material: np.ndarray  # int64 F, into materials
     materials: tuple[Material, ...]
-    warnings: tuple[str, ...] = ()  # what was assumed or left out
+    warnings: tuple[str, ...] = ()  # of assumptions, and of faces that are left out
 
     @cached_property
     def ends_mm(self) -> tuple[np.ndarray, np.ndarray]:
-        """The bounding box's lowest and highest corner."""
+        """The lowest and highest corner of the bounding box."""
         return self.vertices.min(0), self.vertices.max(0)
 
 
 def mesh_from_parts(parts: Sequence[MeshPart], length_mm: float, warnings: Sequence[str] = ()) -> Mesh:
-    """One mesh of several parts, centered, its longest extent `length_mm`; parts may share a Material object.
+    """Join several parts into one centered mesh with the longest extent `length_mm`; parts may share a Material object.
 
-    Faces with NaN or infinite corners and faces without area are left out with a warning; refused where none is left.
+    Faces with NaN or infinite corners and faces without area are left out with a warning; refused if none remains.
     """
-    vertices, faces, owner = _joined(parts)
+    vertices, faces, owner = _join(parts)
     finite = np.all(np.isfinite(vertices), axis=1)
-    whole = finite[faces].all(1)
+    has_finite_corners = finite[faces].all(1)
     # everything is first divided by the largest coordinate, so that neither 1e-200 nor 1e300 over- or underflows
-    size = np.abs(vertices[faces[whole]]).max(initial=0.0)
+    size = np.abs(vertices[faces[has_finite_corners]]).max(initial=0.0)
     unit = np.where(finite[:, None], vertices, 0.0) / (size or 1.0)
     normals, has_area = _face_normals(unit, faces)
-    keep = whole & has_area
-    if not keep.any():
-        got = "only NaN or infinite vertices" if len(faces) and not whole.any() else f"{len(faces)} faces without any"
+    drawn = has_finite_corners & has_area
+    if not drawn.any():
+        corners_are_nan = len(faces) > 0 and not has_finite_corners.any()
+        got = f"{len(faces)} faces " + ("with NaN or infinite corners" if corners_are_nan else "without area")
         raise Refused("a mesh whose faces have an area", got, "export the object again")
     warnings = list(warnings)
-    if not whole.all():
-        warnings.append(f"{np.count_nonzero(~whole)} faces with NaN or infinite corners are left out")
-    if np.any(whole & ~has_area):
-        warnings.append(f"{np.count_nonzero(whole & ~has_area)} faces without area are left out")
-    corners = [_corners(part, normals[owner == i]) for i, part in enumerate(parts)]
-    uv, corner_normals, colors = (np.concatenate(array)[keep] for array in zip(*corners, strict=True))
-    used, kept_faces = np.unique(faces[keep], return_inverse=True)
-    placed = unit[used]
-    low, high = placed.min(0), placed.max(0)
+    if not has_finite_corners.all():
+        warnings.append(f"{np.count_nonzero(~has_finite_corners)} faces with NaN or infinite corners are left out")
+    if np.any(has_finite_corners & ~has_area):
+        warnings.append(f"{np.count_nonzero(has_finite_corners & ~has_area)} faces without area are left out")
+    corners = [_corner_arrays(part, normals[owner == i]) for i, part in enumerate(parts)]
+    uv, corner_normals, colors = (np.concatenate(array)[drawn] for array in zip(*corners, strict=True))
+    used_vertices, drawn_faces = np.unique(faces[drawn], return_inverse=True)
+    drawn_points = unit[used_vertices]
+    low, high = drawn_points.min(0), drawn_points.max(0)
     materials = tuple(dict.fromkeys(part.material for part in parts))
     index = np.array([materials.index(part.material) for part in parts])
     return Mesh(
-        vertices=(placed - (low + high) / 2) * (length_mm / (high - low).max()),
-        faces=kept_faces.reshape(-1, 3),
+        vertices=(drawn_points - (low + high) / 2) * (length_mm / (high - low).max()),
+        faces=drawn_faces.reshape(-1, 3),
         corner_uv=uv,
         corner_normal=corner_normals,
         corner_color_linear=colors,
-        face_material=index[owner[keep]],
+        face_material=index[owner[drawn]],
         materials=materials,
         warnings=tuple(warnings),
     )
 
 
-def _joined(parts: Sequence[MeshPart]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """All vertices, all faces into them, and the part that each face belongs to."""
+def _join(parts: Sequence[MeshPart]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return all vertices, all faces as indices into them, and the part that each face belongs to."""
     for part in parts:
         if len(part.faces) and (part.faces.min() < 0 or part.faces.max() >= len(part.vertices)):
             last = len(part.vertices) - 1
@@ -110,7 +111,7 @@ def _joined(parts: Sequence[MeshPart]) -> tuple[np.ndarray, np.ndarray, np.ndarr
 
 
 def _face_normals(unit: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Unit normals F×3, and whether the face has an area, for coordinates within [-1, 1]."""
+    """Return unit normals F×3, and which faces have an area, for coordinates within [-1, 1]."""
     a, b, c = (unit[faces[:, i]] for i in range(3))
     cross = np.cross(b - a, c - a)
     doubled_area = np.linalg.norm(cross, axis=1)
@@ -120,8 +121,8 @@ def _face_normals(unit: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.n
     return cross / np.where(has_area, doubled_area, 1.0)[:, None], has_area
 
 
-def _corners(part: MeshPart, face_normals: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(uv F×3×2, normals F×3×3, colors F×3×3) of a part's corners, float32."""
+def _corner_arrays(part: MeshPart, face_normals: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return (uv F×3×2, normals F×3×3, colors F×3×3) of a part's corners, float32."""
     count = len(part.faces)
     uv = np.zeros((count, 3, 2), np.float32)
     if part.uv is not None:
@@ -139,14 +140,14 @@ def _corners(part: MeshPart, face_normals: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def normal_transform(rotation: np.ndarray) -> np.ndarray:
-    """What carries normals: the inverse transpose up to a positive factor, as cofactors, so that flattening works."""
+    """Return the matrix for normals: the inverse transpose up to a factor, as cofactors, so that flattening works."""
     a, b, c = rotation
     cofactors = np.array([np.cross(b, c), np.cross(c, a), np.cross(a, b)])
     return -cofactors if np.linalg.det(rotation) < 0 else cofactors
 
 
 def topology_warnings(parts: Sequence[MeshPart]) -> list[str]:
-    """Loose triangles, and edges of more than two faces, with vertices at equal places taken as one."""
+    """Warn of loose triangles and of edges of more than two faces; vertices at equal positions count as one."""
     loose = crowded = edges = 0
     for part in parts:
         corners = position_numbers(part.vertices)[part.faces]
@@ -156,7 +157,7 @@ def topology_warnings(parts: Sequence[MeshPart]) -> list[str]:
         crowded += np.count_nonzero(count > 2)
         edges += len(count)
     warnings = []
-    if edges > 5 and loose > 0.9 * edges:  # more than two triangles, hardly an edge shared
+    if edges > 5 and loose > 0.9 * edges:  # more than two triangles that share hardly an edge
         warnings.append("the mesh is a soup of loose triangles; each is drawn as it is")
     if crowded:
         warnings.append(f"{crowded} edges belong to more than two faces (not a manifold); faces are drawn as they are")
@@ -164,9 +165,9 @@ def topology_warnings(parts: Sequence[MeshPart]) -> list[str]:
 
 
 def position_numbers(vertices: np.ndarray) -> np.ndarray:
-    """V: one number for all vertices V×3 at the same place."""
+    """Return V: the same number for all vertices V×3 at the same position."""
     order = np.lexsort(vertices.T)
-    new = np.r_[False, (np.diff(vertices[order], axis=0) != 0).any(1)]
-    places = np.empty(len(vertices), np.int64)
-    places[order] = new.cumsum()
-    return places
+    is_new = np.r_[False, (np.diff(vertices[order], axis=0) != 0).any(1)]
+    numbers = np.empty(len(vertices), np.int64)
+    numbers[order] = is_new.cumsum()
+    return numbers

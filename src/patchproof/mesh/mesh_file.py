@@ -1,14 +1,15 @@
-"""Mesh files: OBJ (with MTL), GLB, glTF, PLY and STL turned into parts, and what had to be assumed on the way.
+"""Read mesh files: OBJ (with MTL), GLB, glTF, PLY and STL as parts, with warnings about assumptions.
 
 In: a file and the rotation into the world's axes. Out: parts with the scene graph's transforms applied, and warnings.
-Colors: a glTF base color and COLOR_0 are linear light, as its specification says; an OBJ's Kd and the vertex colors
-of OBJ and PLY are taken as sRGB, as their exporters write them. Vertex colors multiply the material in glTF; elsewhere
-they stand for a missing texture. A texture's alpha is dropped: what it would let shine through is drawn opaque.
-Refused: a file that cannot be parsed, and a texture that the file names but that is missing or broken.
-Left out on purpose: metal, roughness, emission, normal maps, transparency, skins and animation.
+Colors: a glTF base color and COLOR_0 are linear light, as its specification says; an OBJ's Kd and the vertex colors of
+OBJ and PLY are taken as sRGB, as their exporters write them. Vertex colors multiply the material in glTF; elsewhere
+they stand for a missing texture. A texture's alpha is dropped: transparent texels are drawn opaque. Refused: a file
+that cannot be parsed, and a texture that the file names but that is missing or broken. Left out on purpose: metal,
+roughness, emission, normal maps, transparency, skins and animation.
 
-trimesh parses. Its loaders are called below its `Trimesh` class, which would round colors to 8 bits and make up
-normals that the file does not have; they keep silent about missing files and invent a 2×2 image; both are looked for.
+trimesh parses. Its loaders are called below its `Trimesh` class, which would round colors to 8 bits and invent normals
+that the file does not have. The loaders do not report missing files and invent a 2×2 image for them; both are checked
+here.
 """
 
 from __future__ import annotations
@@ -30,33 +31,33 @@ from patchproof.mesh.mesh import Material, MeshPart, normal_transform, topology_
 
 FORMATS = (".obj", ".glb", ".gltf", ".ply", ".stl")
 MOST_FACES = 20_000_000  # a scan of a building has fewer
-GRAY_LINEAR = (0.21404114, 0.21404114, 0.21404114)  # sRGB 0.5: what an object without color is taken to be
+GRAY_LINEAR = (0.21404114, 0.21404114, 0.21404114)  # sRGB 0.5, for an object without color
 WHITE = (1.0, 1.0, 1.0)
 
 
 def read_parts(path: Path, world_from_file: np.ndarray) -> tuple[list[MeshPart], list[str]]:
-    """Every placed piece of geometry with faces, vertices and normals turned by `world_from_file` 3×3, and warnings."""
+    """Read every placed geometry with faces, its vertices and normals turned by `world_from_file` 3×3; warnings."""
     if not is_file(path):
         raise Refused("a mesh file", f"no file at {path}", "check the path")
     if path.suffix.lower() not in FORMATS:
         raise Refused(f"a mesh file ({', '.join(FORMATS)})", path.name, "export the mesh in one of these formats")
-    reader = _Reader(path)
+    reader = _MeshFileReader(path)
     try:
         reader.load()
         parts = reader.parts(world_from_file)
         if not parts:
-            raise Refused("a mesh with faces", f"none in {path.name}", "export the object as triangles")
+            raise Refused("a mesh with faces", f"no face in {path.name}", "export the object as triangles")
         return parts, [*dict.fromkeys(reader.warnings), *topology_warnings(parts)]
     except Refused:
         raise
-    except Exception as error:  # the parsers raise whatever they stumble over, and so do odd arrays and graphs
+    except Exception as error:  # parsers, arrays of odd shapes and broken graphs raise many types of error
         reader.refuse_missing()
         got = f"{path.name} that cannot be read ({f'{type(error).__name__}: {error}'[:120]})"
         raise Refused(f"a mesh as {path.suffix[1:].upper()}", got, "export it again") from error
 
 
-class _Reader:
-    """One file while it is read: what trimesh found in it, materials already made, and the warnings so far."""
+class _MeshFileReader:
+    """The state of reading one file: trimesh's result, the materials made so far, and the warnings."""
 
     def __init__(self, path: Path):
         self.path, self.assets, self.warnings = path, Assets(path), []
@@ -68,7 +69,7 @@ class _Reader:
         self.loaded: dict[str, Any] = {}
 
     def load(self) -> None:
-        """Let trimesh parse the file, and refuse what the file names but is not there."""
+        """Let trimesh parse the file, and refuse it if files that it names are missing."""
         from trimesh.exchange.load import mesh_loaders
 
         if self.is_gltf:
@@ -79,44 +80,45 @@ class _Reader:
             python_warnings.simplefilter("ignore")  # about numpy's parsers, not about the mesh
             self.loaded = mesh_loaders[self.kind](file, file_type=self.kind, resolver=self.assets)
         self.refuse_missing()
-        used = set(self.header.get("extensionsUsed", ())) | set(self.header.get("extensionsRequired", ()))
-        for name in sorted(used & {"KHR_texture_transform", "KHR_draco_mesh_compression", "EXT_meshopt_compression"}):
+        names = set(self.header.get("extensionsUsed", ())) | set(self.header.get("extensionsRequired", ()))
+        for name in sorted(names & {"KHR_texture_transform", "KHR_draco_mesh_compression", "EXT_meshopt_compression"}):
             self.warnings.append(f"the glTF extension {name} is not read; textures or shapes may be wrong")
         if any(m.get("alphaMode", "OPAQUE") != "OPAQUE" for m in self.header.get("materials", ())):
             self.warnings.append("transparent materials are drawn opaque")
 
     def parts(self, world_from_file: np.ndarray) -> list[MeshPart]:
-        """All that has faces, each as often as it is placed."""
-        placed = [(world, raw, recipe) for world, raw, recipe in self.placed() if np.size(raw.get("faces", ()))]
-        if sum(len(raw["faces"]) for _, raw, _ in placed) > MOST_FACES:
-            got = f"more in {self.path.name}, some of them placed many times"
+        """Return each geometry that has faces, once for every time it is placed."""
+        placements = [placement for placement in self.placements() if np.size(placement[1].get("faces", ()))]
+        faces = sum(len(raw["faces"]) for _, raw, _ in placements)
+        if faces > MOST_FACES:
+            got = f"{faces} faces in {self.path.name}, counted as often as they are placed"
             raise Refused(f"a mesh of at most {MOST_FACES // 10**6} million faces", got, "export a coarser one")
         return [
-            self.part(raw, recipe, world_from_file @ world[:3])
-            for world, raw, recipe in placed
+            self.part(raw, primitive, world_from_file @ world[:3])
+            for world, raw, primitive in placements
             if np.size(raw["vertices"])
         ]
 
-    def placed(self) -> list[tuple[np.ndarray, dict, dict]]:
-        """(world_from_part 4×4, trimesh's arrays, the glTF primitive) of each placed geometry."""
+    def placements(self) -> list[tuple[np.ndarray, dict, dict]]:
+        """Return (world_from_part 4×4, trimesh's arrays, the glTF primitive) of each placed geometry."""
         from trimesh.scene.transforms import SceneGraph
 
         geometry = self.loaded.get("geometry", {"": self.loaded})
         primitives = [p for m in self.header.get("meshes", ()) for p in m["primitives"]]
         # trimesh keeps the primitives' order and leaves out fans and loops (modes 2, 3, 6)
-        recipes = dict(zip(geometry, (p for p in primitives if p.get("mode", 4) in (0, 1, 4, 5)), strict=False))
-        places = [(np.eye(4), name) for name in geometry]
+        primitive_of = dict(zip(geometry, (p for p in primitives if p.get("mode", 4) in (0, 1, 4, 5)), strict=False))
+        placements = [(np.eye(4), name) for name in geometry]
         if self.is_gltf:
             graph = SceneGraph(base_frame=self.loaded.get("base_frame", "world"))
             for edge in self.loaded.get("graph", ()):
                 graph.update(**edge)
-            # in the loader's order: the graph's own is that of a set, another one in every process
+            # in the loader's order: the graph's own order is that of a set and differs between processes
             nodes = dict.fromkeys(edge["frame_to"] for edge in self.loaded.get("graph", ()) if edge.get("geometry"))
-            places = [graph[node] for node in nodes]
-        return [(np.asarray(world, float), geometry[name], recipes.get(name, {})) for world, name in places]
+            placements = [graph[node] for node in nodes]
+        return [(np.asarray(world, float), geometry[name], primitive_of.get(name, {})) for world, name in placements]
 
     def part(self, raw: dict[str, Any], primitive: dict, transform: np.ndarray) -> MeshPart:
-        """The part of a geometry, carried by `transform` 3×4."""
+        """Return the part of a geometry, transformed by `transform` 3×4."""
         from trimesh.geometry import triangulate_quads
 
         faces = triangulate_quads(raw["faces"])
@@ -125,7 +127,7 @@ class _Reader:
         if np.linalg.det(rotation) < 0:  # a mirror turns triangles inside out
             faces = faces[:, ::-1]
         with np.errstate(invalid="ignore", over="ignore"):
-            placed = vertices @ rotation.T + transform[:, 3]
+            world_vertices = vertices @ rotation.T + transform[:, 3]
             normals = raw.get("vertex_normals")
             usable = normals is not None and np.shape(normals) == vertices.shape
             normals = np.asarray(normals, float) @ normal_transform(rotation).T if usable else None
@@ -136,24 +138,24 @@ class _Reader:
             self.warnings.append("vertex colors are left out where there is a texture")
             colors = None
         if colors is None or len(colors) == len(vertices):
-            return MeshPart(placed, faces, material, uv, normals, colors)
+            return MeshPart(world_vertices, faces, material, uv, normals, colors)
         corners = faces.reshape(-1)  # one color per face: give every face corners of its own
         uv, normals = (None if array is None else array[corners] for array in (uv, normals))
-        own = np.arange(len(corners)).reshape(-1, 3)
-        return MeshPart(placed[corners], own, material, uv, normals, np.repeat(colors, 3, axis=0))
+        corner_faces = np.arange(len(corners)).reshape(-1, 3)
+        return MeshPart(world_vertices[corners], corner_faces, material, uv, normals, np.repeat(colors, 3, axis=0))
 
     def refuse_missing(self) -> None:
-        """Refuse a missing or broken texture; a missing MTL is warned about."""
+        """Refuse a missing or broken texture; warn about a missing MTL."""
         for name in dict.fromkeys(self.assets.missing):
             if not name.lower().endswith(".mtl"):
-                do = f"put it into {self.path.parent}"
-                raise Refused(f"the file {name}, which {self.path.name} names", "none", do)
+                remedy = f"put it into {self.path.parent}"
+                raise Refused(f"the file {name}, which {self.path.name} names", "no such file", remedy)
             self.warnings.append(f"the material file {name} is missing")
         for name in self.assets.broken:
-            raise Refused(f"the texture {name} of {self.path.name}", "no picture that can be read", "export it again")
+            raise Refused(f"the texture {name} of {self.path.name}", "a file that is no image", "export it again")
 
     def _uv(self, visual, count: int) -> np.ndarray | None:
-        """Coordinates with v down, or None; trimesh's run up, whatever the file's do."""
+        """Return coordinates with v down, or None; trimesh's v runs up in every format."""
         uv = getattr(visual, "uv", None)
         if uv is None or len(uv) != count:
             return None
@@ -164,7 +166,7 @@ class _Reader:
         return np.where(finite[:, None], np.column_stack([u, 1 - v]), 0.0)
 
     def _corner_colors(self, raw: dict, vertex_count: int, face_count: int) -> np.ndarray | None:
-        """Linear colors per vertex, or per face, or None."""
+        """Return linear colors per vertex, or per face, or None."""
         colors = raw.get("vertex_colors")
         if colors is None:
             colors = getattr(raw.get("visual"), "vertex_attributes", {}).get("color")
@@ -186,10 +188,10 @@ class _Reader:
         return np.where(broken[:, None], GRAY_LINEAR, linear)
 
     def _material(self, visual, primitive: dict, has_uv: bool, has_colors: bool) -> Material:
-        """The material of a geometry, made once for all that share it."""
+        """Return the material of a geometry, made once for all that share it."""
         source = getattr(visual, "material", None)
         image = getattr(source, "baseColorTexture", None) if self.is_gltf else getattr(source, "image", None)
-        if image is not None and image.format is None:  # trimesh's own invention: a read image knows its format
+        if image is not None and image.format is None:  # invented by trimesh: an image from a file knows its format
             image = None
         key = (id(source), id(image), has_uv, has_colors)
         if key not in self.materials:
@@ -217,14 +219,14 @@ class _Reader:
         return Material(name, (red, green, blue), texture)
 
     def _gltf_base_color(self, source, primitive: dict, has_texture: bool) -> tuple[float, float, float]:
-        """The factor as the file has it; trimesh's is rounded to 8 bits, and serves for old extensions only."""
+        """Return the factor that the file has; trimesh's is rounded to 8 bits and serves for old extensions only."""
         material = self.header["materials"][primitive["material"]] if "material" in primitive else {}
         metal_rough = material.get("pbrMetallicRoughness", {})
-        named = metal_rough.get("baseColorTexture")
-        if named is not None and not has_texture and getattr(source, "baseColorTexture", None) is None:
+        texture_entry = metal_rough.get("baseColorTexture")
+        if texture_entry is not None and not has_texture and getattr(source, "baseColorTexture", None) is None:
             expected = f"the texture of {source.name!s} in {self.path.name} as PNG, JPEG or WebP"
-            raise Refused(expected, "none or a broken one", "export it again")
-        if named is not None and named.get("texCoord", 0) != 0:
+            raise Refused(expected, "a missing or broken image", "export it again")
+        if texture_entry is not None and texture_entry.get("texCoord", 0) != 0:
             self.warnings.append("a texture asks for its second set of coordinates; the first is used")
         factor = metal_rough.get("baseColorFactor")
         if factor is None:
@@ -233,7 +235,7 @@ class _Reader:
         return red, green, blue
 
     def _texture(self, image) -> np.ndarray:
-        """An image as uint8 H×W×3; 16 bits are cut to 8, alpha is dropped."""
+        """Return an image as uint8 H×W×3; 16 bits are cut to 8, alpha is dropped."""
         if id(image) not in self.textures:
             try:
                 if image.format not in PICTURES or image.width * image.height > MAX_IMAGE_PX:
@@ -243,14 +245,14 @@ class _Reader:
                 else:
                     pixels = np.asarray(image.convert("RGB"))
             except Exception as error:
-                got = f"a broken one ({str(error)[:80]})"
+                got = f"a broken image ({str(error)[:80]})"
                 raise Refused(f"a texture of {self.path.name} that can be read", got, "export it again") from error
             self.textures[id(image)] = pixels
         return self.textures[id(image)]
 
 
 def _gltf_header(path: Path) -> dict:
-    """The JSON of a GLB or glTF file. trimesh reads another file, model.gltf, where a .gltf is no JSON."""
+    """Return the JSON of a GLB or glTF file. If a .gltf is no JSON, trimesh reads another file, model.gltf, instead."""
     text = path.read_bytes()
     if path.suffix.lower() == ".glb":
         if text[:4] != b"glTF":
@@ -259,23 +261,25 @@ def _gltf_header(path: Path) -> dict:
     header = json.loads(text)
     if not isinstance(header, dict):
         raise ValueError("its JSON is no object")
-    # trimesh takes memory for both before it looks into the file
-    copied = sum(abs(view["byteLength"]) for view in header.get("bufferViews", ()))
-    made_up = sum(abs(accessor["count"]) for accessor in header.get("accessors", ()) if "bufferView" not in accessor)
-    if copied > MOST_BYTES or made_up > MOST_FACES:
-        raise ValueError(f"it asks for {copied} bytes and {made_up} zeros")
+    # trimesh allocates memory for both before it reads the file's contents
+    data_bytes = sum(abs(view["byteLength"]) for view in header.get("bufferViews", ()))
+    zeros = sum(abs(accessor["count"]) for accessor in header.get("accessors", ()) if "bufferView" not in accessor)
+    if data_bytes > MOST_BYTES or zeros > MOST_FACES:
+        raise ValueError(f"it asks for {data_bytes} bytes and {zeros} zeros in memory")
     return header
 
 
 def _check_obj(path: Path):
-    """Two things that trimesh reads wrongly without a word: short faces, and indices relative to where they stand."""
+    """Refuse two things that trimesh misreads without a warning: faces with fewer than three corners, and indices
+    relative to a vertex list that goes on after them.
+    """
     text = path.read_bytes().replace(b"\\\n", b" ")
     short = re.search(rb"^f(?:[ \t]+\S+){0,2}[ \t]*\r?$", text, re.MULTILINE)
     if short:
         line = text.count(b"\n", 0, short.start()) + 1
-        got = f"{len(short[0].split()) - 1} in line {line} of {path.name}"
+        got = f"a face with {len(short[0].split()) - 1} in line {line} of {path.name}"
         raise Refused("faces with at least three corners", got, "the file may be cut short, export it again")
     relative = re.search(rb"^f[^\n]*[ \t/]-\d", text, re.MULTILINE)
     if relative and re.search(rb"^v[tn]?[ \t]", text[relative.end() :], re.MULTILINE):
-        got = f"some in {path.name} that stand before further vertices"
+        got = f"relative indices in {path.name} that stand before further vertices"
         raise Refused("relative indices after the last vertex", got, "export with absolute indices")

@@ -1,4 +1,4 @@
-"""Twelve procedural objects for demos, tests and the built-in network's training; nothing here is measured.
+"""Twelve procedural objects for demos, tests and the built-in network's training; none of them is measured.
 
 In: a name and a seed (proportions, part sizes, colors). Out: a Mesh in the object's natural size, y up, made of closed
 parts that may run into one another, each with its own color and with texture coordinates (see solids.py), so that any
@@ -16,27 +16,27 @@ from patchproof.mesh.solids import box, lathe, prism, rotate_part, translate_par
 
 
 def primitive_names() -> tuple[str, ...]:
-    """The objects' names, as in `primitive:NAME`."""
+    """Return the objects' names, which `primitive:NAME` takes."""
     return tuple(_OBJECTS)
 
 
 def build(name: str, seed: int = 0) -> Mesh:
-    """One object; the same name and seed give the same arrays."""
-    made = parts(name, seed)
-    return mesh_from_parts(made, _longest(made))
+    """Make one object; the same name and seed give the same arrays."""
+    object_parts = parts(name, seed)
+    return mesh_from_parts(object_parts, _longest_extent(object_parts))
 
 
 def longest_mm(name: str) -> float:
-    """The longest extent of one object as it is made, in whole millimeters."""
-    return float(round(_longest(parts(name))))
+    """Return the longest extent of one object with seed 0, in whole millimeters."""
+    return float(round(_longest_extent(parts(name))))
 
 
-def _longest(made: list[MeshPart]) -> float:
-    return float(np.ptp(np.concatenate([part.vertices for part in made]), axis=0).max())
+def _longest_extent(object_parts: list[MeshPart]) -> float:
+    return float(np.ptp(np.concatenate([part.vertices for part in object_parts]), axis=0).max())
 
 
 def parts(name: str, seed: int = 0) -> list[MeshPart]:
-    """The closed parts of one object in millimeters, standing on y = 0; three vertices of its own for every face."""
+    """Return one object's closed parts in millimeters, on y = 0; every face has three vertices of its own."""
     if name not in _OBJECTS:
         raise Refused("the name of a primitive", f'"{name}"', spelling_hint(name, _OBJECTS))
     return _OBJECTS[name](np.random.default_rng([primitive_names().index(name), seed]))
@@ -52,7 +52,7 @@ def _paint(rng, choices=PAINTS) -> np.ndarray:
 
 
 def _arc(center, radius, start_deg: float, end_deg: float, n: int) -> np.ndarray:
-    """n points (a, b) on an ellipse of radii (a, b)."""
+    """Return n points (a, b) on an ellipse of radii (a, b)."""
     angle = np.radians(np.linspace(start_deg, end_deg, n))
     return np.stack([center[0] + radius[0] * np.cos(angle), center[1] + radius[1] * np.sin(angle)], 1)
 
@@ -91,12 +91,12 @@ def _traffic_cone(rng) -> list[MeshPart]:
         return h * (foot + (top - foot) * share) + more
 
     cone = lathe([(0, thick / 2), (radius(0), thick / 2), (radius(1), h), (0, h)], "cone", orange)
-    made = [box((h * base, thick, h * base), (0, 0, 0), "base", orange if rng.random() < 0.5 else BLACK), cone]
+    solids = [box((h * base, thick, h * base), (0, 0, 0), "base", orange if rng.random() < 0.5 else BLACK), cone]
     for low in (0.35, 0.68)[: rng.integers(1, 3)]:
         high, grow = low + rng.uniform(0.12, 0.22), h * 0.004
         y0, y1 = thick / 2 + low * (h - thick / 2), thick / 2 + high * (h - thick / 2)
-        made.append(lathe([(0, y0), (radius(low, grow), y0), (radius(high, grow), y1), (0, y1)], "stripe", WHITE))
-    return made
+        solids.append(lathe([(0, y0), (radius(low, grow), y0), (radius(high, grow), y1), (0, y1)], "stripe", WHITE))
+    return solids
 
 
 def _street_sign(rng) -> list[MeshPart]:
@@ -114,12 +114,12 @@ def _street_sign(rng) -> list[MeshPart]:
 
     path = [(-22, 0, 0), (-22, h * 0.5, 0), (-22, h - size * 0.3, 0)]
     post = tube(path, rng.uniform(24, 34), "post", _paint(rng, (STEEL, WOOD)))
-    made = [post, plate(1, 0, 14, "rim", WHITE if rng.random() < 0.7 else BLACK), plate(0.9, 1, 16, "face", face)]
+    solids = [post, plate(1, 0, 14, "rim", WHITE if rng.random() < 0.7 else BLACK), plate(0.9, 1, 16, "face", face)]
     if rng.random() < 0.6:  # a bar or a disc instead of lettering
         mark = WHITE if face.mean() < 0.6 else BLACK
         bar = (size * rng.uniform(0.1, 0.2), size * rng.uniform(0.4, 0.6))[:: 1 if rng.random() < 0.5 else -1]
-        made.append(box((2, *bar), (17, h - size / 2 - bar[0] / 2, 0), "mark", mark))
-    return made
+        solids.append(box((2, *bar), (17, h - size / 2 - bar[0] / 2, 0), "mark", mark))
+    return solids
 
 
 def _box_truck(rng) -> list[MeshPart]:
@@ -131,42 +131,42 @@ def _box_truck(rng) -> list[MeshPart]:
     nose, sill, back = front - rng.uniform(150, 500), floor + (roof - floor) * 0.5, cargo / 2 + 90
     low = floor - 120
     side = [(back, low), (back, roof), (nose, roof), (front - 60, sill), (front, floor + 50), (front, low)]
-    slope, ahead = np.array([(nose, roof - 60), (front - 60, sill + 40)]), np.array([25, 0])
-    made = [
+    slope, offset = np.array([(nose, roof - 60), (front - 60, sill + 40)]), np.array([25, 0])
+    solids = [
         box((w, tall, cargo), (0, floor, 0), "cargo", _paint(rng, (WHITE, WHITE, *PAINTS))),
         prism(side, -w * 0.46, w * 0.46, "cab", paint),
-        prism(np.concatenate([slope + ahead, slope[::-1] - 2 * ahead]), -w * 0.4, w * 0.4, "windshield", glass),
+        prism(np.concatenate([slope + offset, slope[::-1] - 2 * offset]), -w * 0.4, w * 0.4, "windshield", glass),
         box((w * 0.5, 180, cargo + cab * 0.9), (0, floor - 200, cab * 0.45), "frame", BLACK),
         box((w * 0.96, 200, 120), (0, floor - 260, front), "bumper", _paint(rng, (STEEL, BLACK))),
     ]
     for x in (-w * 0.46, w * 0.46):
-        made.append(box((20, (roof - sill) * 0.75, cab * 0.36), (x, sill + 60, back + cab * 0.4), "window", glass))
-        made.append(box((w * 0.12, 130, 40), (x * 0.78, floor + 20, front), "lamp", (0.95, 0.93, 0.8)))
+        solids.append(box((20, (roof - sill) * 0.75, cab * 0.36), (x, sill + 60, back + cab * 0.4), "window", glass))
+        solids.append(box((w * 0.12, 130, 40), (x * 0.78, floor + 20, front), "lamp", (0.95, 0.93, 0.8)))
         for z in (-cargo * 0.3, front - cab * 0.55):
             profile = [(0, 0), (wheel * 0.96, 0), (wheel, 40), (wheel, 220), (wheel * 0.96, 260), (0, 260)]
             tire = rotate_part(lathe(profile, "tire", BLACK), 2, -90)
             hub = rotate_part(lathe([(0, -12), (wheel * 0.5, -12), (wheel * 0.5, 272), (0, 272)], "hub", STEEL), 2, -90)
-            made += [translate_part(part, (x * 0.96 - 130, wheel, z)) for part in (tire, hub)]
-    return made
+            solids += [translate_part(part, (x * 0.96 - 130, wheel, z)) for part in (tire, hub)]
+    return solids
 
 
 def _chair(rng) -> list[MeshPart]:
     w, d, seat, back = rng.uniform(400, 480), rng.uniform(390, 460), rng.uniform(420, 470), rng.uniform(380, 500)
     leg, color = rng.uniform(28, 45), _paint(rng, (WOOD, WOOD, *PAINTS))
     frame = color if rng.random() < 0.6 else _paint(rng, (STEEL, BLACK, WOOD))
-    made = [box((d, 40, w), (0, seat - 40, 0), "seat", color)]
+    solids = [box((d, 40, w), (0, seat - 40, 0), "seat", color)]
     for z in (-w / 2 + leg / 2, w / 2 - leg / 2):
-        made.append(box((leg, seat - 20, leg), (d / 2 - leg / 2, 0, z), "leg", frame))
-        made.append(box((leg, seat + back, leg), (-d / 2 + leg / 2, 0, z), "leg", frame))
+        solids.append(box((leg, seat - 20, leg), (d / 2 - leg / 2, 0, z), "leg", frame))
+        solids.append(box((leg, seat + back, leg), (-d / 2 + leg / 2, 0, z), "leg", frame))
     slats = int(rng.integers(1, 5))
     pitch = back * 0.8 / slats
     slat = (leg * 0.6, pitch * (0.62 if slats > 1 else 1), w - leg)
     for i in range(slats):
-        made.append(box(slat, (-d / 2 + leg / 2, seat + back * 0.17 + i * pitch, 0), "back", color))
+        solids.append(box(slat, (-d / 2 + leg / 2, seat + back * 0.17 + i * pitch, 0), "back", color))
     if rng.random() < 0.5:
         rail = (d - leg, leg * 0.6, leg * 0.6)
-        made += [box(rail, (0, seat * 0.4, z), "rail", frame) for z in (leg / 2 - w / 2, w / 2 - leg / 2)]
-    return made
+        solids += [box(rail, (0, seat * 0.4, z), "rail", frame) for z in (leg / 2 - w / 2, w / 2 - leg / 2)]
+    return solids
 
 
 def _table_lamp(rng) -> list[MeshPart]:
@@ -184,35 +184,35 @@ def _table_lamp(rng) -> list[MeshPart]:
 def _carton(rng) -> list[MeshPart]:
     x, z, y = rng.uniform(180, 320), rng.uniform(320, 460), rng.uniform(220, 380)
     card = _paint(rng, ((0.72, 0.55, 0.37), (0.66, 0.49, 0.32), (0.8, 0.68, 0.5)))
-    made = [box((x, y, z), (0, 0, 0), "body", card)]
+    solids = [box((x, y, z), (0, 0, 0), "body", card)]
     wide = rng.uniform(40, 60)
     if rng.random() < 0.5:  # closed and taped
         tape = _paint(rng, ((0.82, 0.72, 0.52), (0.6, 0.42, 0.22), (0.9, 0.88, 0.8)))
-        made.append(box((wide, 0.8, z + 1.2), (0, y - 0.2, 0), "tape", tape))
-        made += [box((wide, 70, 0.8), (0, y - 70, s * (z / 2 + 0.2)), "tape", tape) for s in (-1, 1)]
+        solids.append(box((wide, 0.8, z + 1.2), (0, y - 0.2, 0), "tape", tape))
+        solids += [box((wide, 70, 0.8), (0, y - 70, s * (z / 2 + 0.2)), "tape", tape) for s in (-1, 1)]
     else:  # flaps folded out
-        made.append(box((x - 8, 1, z - 8), (0, y - 0.5, 0), "inside", card * 0.35))
+        solids.append(box((x - 8, 1, z - 8), (0, y - 0.5, 0), "inside", card * 0.35))
         for s in (-1, 1):
             flap = box((x / 2, 4, z), (s * x / 4, 0, 0), "flap", card)
-            made.append(translate_part(rotate_part(flap, 2, s * rng.uniform(-50, 45)), (s * x / 2, y, 0)))
+            solids.append(translate_part(rotate_part(flap, 2, s * rng.uniform(-50, 45)), (s * x / 2, y, 0)))
             short = box((x, 4, x / 2), (0, 0, s * x / 4), "flap", card)
-            made.append(translate_part(rotate_part(short, 0, s * rng.uniform(-45, 50)), (0, y, s * z / 2)))
+            solids.append(translate_part(rotate_part(short, 0, s * rng.uniform(-45, 50)), (0, y, s * z / 2)))
     if rng.random() < 0.5:  # an address label on the small side
-        made.append(box((x * 0.5, y * 0.3, 0.8), (0, y * rng.uniform(0.15, 0.5), z / 2), "label", WHITE))
-    return made
+        solids.append(box((x * 0.5, y * 0.3, 0.8), (0, y * rng.uniform(0.15, 0.5), z / 2), "label", WHITE))
+    return solids
 
 
 def _mailbox(rng) -> list[MeshPart]:
     x, z, y = rng.uniform(420, 520), rng.uniform(460, 580), rng.uniform(620, 780)
     leg, bow, paint = rng.uniform(100, 220), rng.uniform(0.3, 0.5), _paint(rng, PAINTS[:4])
     arch = _arc((0, leg + y), (z / 2, z * bow), 0, 180, 13)
-    made = [prism([(-z / 2, leg), (z / 2, leg), *arch], -x / 2, x / 2, "body", paint)]
+    solids = [prism([(-z / 2, leg), (z / 2, leg), *arch], -x / 2, x / 2, "body", paint)]
     for a, b in ((-1, -1), (-1, 1), (1, -1), (1, 1)):
-        made.append(box((50, leg + 5, 50), (a * (x / 2 - 30), 0, b * (z / 2 - 30)), "leg", paint * 0.8))
+        solids.append(box((50, leg + 5, 50), (a * (x / 2 - 30), 0, b * (z / 2 - 30)), "leg", paint * 0.8))
     handle = box((x * 0.7, 30, 50), (0, leg + y * 0.98, z / 2 + 5), "handle", _paint(rng, (STEEL, BLACK)))
     slot = box((x * 0.8, y * rng.uniform(0.14, 0.22), 12), (0, leg + y * 0.74, z / 2), "slot", BLACK)
     card = box((x * rng.uniform(0.4, 0.7), y * rng.uniform(0.15, 0.3), 8), (0, leg + y * 0.35, z / 2), "card", WHITE)
-    return [*made, handle, slot, card]
+    return [*solids, handle, slot, card]
 
 
 def _umbrella(rng) -> list[MeshPart]:
@@ -250,12 +250,12 @@ def _hammer(rng) -> list[MeshPart]:
     head, face, reach = h - r * 1.1, rng.uniform(15, 19), rng.uniform(48, 62)
     profile = [(0, -22), (r, -22), (r * 1.15, 0), (face * 0.75, 18), (face * 0.75, reach - 20)]
     profile += [(face, reach - 14), (face, reach), (0, reach)]
-    made = [handle, translate_part(rotate_part(lathe(profile, "head", steel), 0, 90), (0, head, 0))]
+    solids = [handle, translate_part(rotate_part(lathe(profile, "head", steel), 0, 90), (0, head, 0))]
     drop, back = rng.uniform(20, 45), reach * rng.uniform(1.1, 1.4)
     for side in (-1, 1):
         bow = [(side * (4 + 9 * t), head + 4 - drop * t * t, -10 - back * t) for t in np.linspace(0, 1, 7)]
-        made.append(tube(bow, np.linspace(11, 3.5, 7), "claw", steel))
-    return made
+        solids.append(tube(bow, np.linspace(11, 3.5, 7), "claw", steel))
+    return solids
 
 
 _MAKERS = (

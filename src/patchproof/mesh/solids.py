@@ -1,10 +1,10 @@
 """Closed solids from rings of points: lathe, tube, prism and box, as mesh parts with normals and texture coordinates.
 
-In: millimeters, y up, and an sRGB color. Out: parts wound counter-clockwise seen from outside, three vertices of their
-own for every face, so that normals and texture coordinates may jump between faces. Sides that bend by less than the
+In: millimeters, y up, and an sRGB color. Out: parts wound counter-clockwise seen from outside, every face with three
+vertices of its own, so that normals and texture coordinates may jump between faces. Sides that bend by less than the
 crease angle shade smoothly. Texture coordinates are cylindrical on lathe and tube (caps: the disc inscribed in the
-texture) and planar on prism and box (each face direction sees the texture upright, once over the part).
-Left out on purpose: booleans; parts may run into one another and the z-buffer sorts them out.
+texture) and planar on prism and box (each face direction sees the texture upright, once over the part). Left out on
+purpose: booleans; parts may run into one another, and the z-buffer resolves that.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ CREASE_DEG = 40.0
 
 
 def skin(rings: Sequence[np.ndarray], name: str, srgb: Sequence[float], planar: bool = False) -> MeshPart:
-    """The closed surface over rings K×3, counter-clockwise about the way they go; 1×3 at both ends closes it."""
+    """Join rings K×3, counter-clockwise about their direction, to a surface; 1×3 at both ends closes it."""
     grid = np.stack([np.broadcast_to(ring, (max(map(len, rings)), 3)) for ring in rings])
     rows, columns = grid.shape[:2]
     v = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(grid, axis=0), axis=2).mean(1))])
@@ -46,7 +46,7 @@ def skin(rings: Sequence[np.ndarray], name: str, srgb: Sequence[float], planar: 
 
 
 def lathe(profile: Sequence[tuple[float, float]], name: str, srgb, around: int = AROUND) -> MeshPart:
-    """A profile of (radius, height) turned about y; starts and ends at radius 0, the outside on its right hand."""
+    """Turn a profile of (radius, height) about y; it starts and ends at radius 0, with the outside on its right."""
     angle = np.arange(around) * 2 * np.pi / around
     circle = np.stack([np.cos(angle), 0 * angle, -np.sin(angle)], 1)
     up = np.array([0.0, 1.0, 0.0])
@@ -54,7 +54,7 @@ def lathe(profile: Sequence[tuple[float, float]], name: str, srgb, around: int =
 
 
 def tube(points: Sequence[Sequence[float]], radius: ArrayLike, name: str, srgb, around: int = 12) -> MeshPart:
-    """A round tube along N×3 points, flat ends; `radius` is one figure or one per point."""
+    """Return a round tube along N×3 points with flat ends; `radius` is one number or one per point."""
     path = np.asarray(points, float)
     radii = np.broadcast_to(np.asarray(radius, float), len(path))
     along = np.gradient(path, axis=0)
@@ -62,39 +62,39 @@ def tube(points: Sequence[Sequence[float]], radius: ArrayLike, name: str, srgb, 
     angle = np.arange(around)[:, None] * 2 * np.pi / around
     rings, e1 = [path[:1]], np.cross(along[0], np.eye(3)[np.abs(along[0]).argmin()])
     for point, direction, r in zip(path, along, radii, strict=True):
-        e1 = e1 - direction * (e1 @ direction)  # carried along without twist
+        e1 = e1 - direction * (e1 @ direction)  # parallel transport, without twist
         e1 = e1 / np.linalg.norm(e1)
         rings.append(point + r * (np.cos(angle) * e1 + np.sin(angle) * np.cross(direction, e1)))
     return skin([*rings, path[-1:]], name, srgb)
 
 
 def prism(outline: ArrayLike, x0: float, x1: float, name: str, srgb) -> MeshPart:
-    """An outline of (z, y) in either direction, star-shaped about its middle, from x0 to x1."""
+    """Extend an outline of (z, y), in either direction and star-shaped about its middle, from x0 to x1."""
     z, y = np.asarray(outline, float).T
     if np.sum(z * np.roll(y, -1) - y * np.roll(z, -1)) > 0:  # seen from +x, z runs to the left
         z, y = z[::-1], y[::-1]
 
-    def at(x: float, z, y) -> np.ndarray:
+    def ring(x: float, z, y) -> np.ndarray:
         return np.stack([np.full_like(z, x), y, z], 1)
 
     middle = z.mean(keepdims=True), y.mean(keepdims=True)
-    return skin([at(x0, *middle), at(x0, z, y), at(x1, z, y), at(x1, *middle)], name, srgb, planar=True)
+    return skin([ring(x0, *middle), ring(x0, z, y), ring(x1, z, y), ring(x1, *middle)], name, srgb, planar=True)
 
 
-def box(size: tuple[float, float, float], at: tuple[float, float, float], name: str, srgb) -> MeshPart:
-    """A box of (x, y, z) extents; `at` is the middle of its *bottom*."""
+def box(size: tuple[float, float, float], bottom_middle: tuple[float, float, float], name: str, srgb) -> MeshPart:
+    """Return a box of (x, y, z) extents; `bottom_middle` is where it stands."""
     dx, dy, dz = size
     outline = [(-dz / 2, 0), (-dz / 2, dy), (dz / 2, dy), (dz / 2, 0)]
-    return translate_part(prism(outline, -dx / 2, dx / 2, name, srgb), at)
+    return translate_part(prism(outline, -dx / 2, dx / 2, name, srgb), bottom_middle)
 
 
-def translate_part(part: MeshPart, by: Sequence[float]) -> MeshPart:
-    """The part, shifted."""
-    return replace(part, vertices=part.vertices + np.asarray(by, float))
+def translate_part(part: MeshPart, offset: Sequence[float]) -> MeshPart:
+    """Return the part, shifted."""
+    return replace(part, vertices=part.vertices + np.asarray(offset, float))
 
 
 def rotate_part(part: MeshPart, axis: int, degrees: float) -> MeshPart:
-    """The part, turned about a world axis (0 x, 1 y, 2 z) through the origin, counter-clockwise seen from its tip."""
+    """Return the part, turned about the world's axis 0 (x), 1 or 2, counter-clockwise seen from its tip."""
     c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     matrix = np.eye(3)
     i, j = (axis + 1) % 3, (axis + 2) % 3
@@ -104,7 +104,7 @@ def rotate_part(part: MeshPart, axis: int, degrees: float) -> MeshPart:
 
 
 def _pole_uv(rings, row: int, column: int) -> tuple[float, float]:
-    """Texture coordinates on a cap: the cap's disc inscribed in the texture."""
+    """Return texture coordinates on a cap: the cap's disc is inscribed in the texture."""
     if len(rings[row]) == 1:
         return 0.5, 0.5
     angle = 2 * np.pi * column / len(rings[row])
@@ -112,15 +112,15 @@ def _pole_uv(rings, row: int, column: int) -> tuple[float, float]:
 
 
 def _corner_normals(corners: np.ndarray) -> np.ndarray:
-    """F×3×3 unit normals: weighted by angle over the faces at a point that bend less than the crease from here."""
+    """Return F×3×3 unit normals: means, by angle, over the faces at a point that bend less than the crease."""
     from scipy.sparse import csr_matrix
 
     unit = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     unit /= np.linalg.norm(unit, axis=1, keepdims=True)
     scale = np.ptp(corners.reshape(-1, 3), axis=0).max()
     point = np.unique(np.round(corners.reshape(-1, 3) / scale, 7), axis=0, return_inverse=True)[1].reshape(-1)
-    at = csr_matrix((np.ones(len(point)), (np.arange(len(point)), point)))
-    first, second = (at @ at.T).nonzero()
+    at_point = csr_matrix((np.ones(len(point)), (np.arange(len(point)), point)))
+    first, second = (at_point @ at_point.T).nonzero()
     near = (unit[first // 3] * unit[second // 3]).sum(1) > np.cos(np.radians(CREASE_DEG))
     edge = np.roll(corners, -1, 1) - corners
     edge /= np.linalg.norm(edge, axis=2, keepdims=True)
@@ -131,7 +131,7 @@ def _corner_normals(corners: np.ndarray) -> np.ndarray:
 
 
 def _planar_uv(corners: np.ndarray) -> np.ndarray:
-    """F×3×2: each face sees the texture along the axis nearest to its normal, upright from outside, once per part."""
+    """Return F×3×2: faces see the texture along the axis nearest to their normal, upright, once per part."""
     low, extent = corners.min((0, 1)), np.ptp(corners, axis=(0, 1))
     x, y, z = np.moveaxis((corners - low) / extent, 2, 0)
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

@@ -1,8 +1,8 @@
-"""The surface under a piece, seen from a chart: a plane or a cylinder laid beside it.
+"""The surface under a piece, described over a chart: a plane or a cylinder beside it.
 
-In: triangles (world mm) and a `SurfaceChart`. Out: heights of the surface over a net of piece points, cast along the chart's
-normals, and the place where a line meets the surface. The cast is exact for flat triangles, also where the chart is
-curved: each triangle visits the net points of its box on the chart, and each visit is one line-triangle intersection
+In: triangles (world mm) and a `SurfaceChart`. Out: heights of the surface over a grid of piece points, cast along the
+chart's normals, and the point where a line meets the surface. The cast is exact for flat triangles, also over a curved
+chart: each triangle visits the grid points of its box on the chart, and each visit is one line-triangle intersection
 (Möller and Trumbore, 1997). Triangles need not be joined, closed or oriented.
 """
 
@@ -20,10 +20,10 @@ _CHUNK = 500_000  # line-triangle pairs held at a time, about 150 MB
 
 @dataclass(frozen=True)
 class SurfaceChart:
-    """A cylinder beside the surface, in millimeters along it: s across its axis, t along it, h outwards.
+    """A cylinder beside the surface, with coordinates in millimeters: s across its axis, t along it, h outwards.
 
     `axes` 3×3 are rows across, along, normal at the origin (right-handed); `curvature` 1/mm is that of the cylinder, 0
-    for a plane and negative where it bulges away from the normal. `right` is the piece's own right in (s, t).
+    for a plane and negative where it bulges away from the normal. `right` is the piece's right in (s, t).
     """
 
     origin_mm: np.ndarray
@@ -33,11 +33,11 @@ class SurfaceChart:
 
     @property
     def turn(self) -> np.ndarray:
-        """2×2 rows: the piece's right and up in (s, t)."""
+        """The 2×2 rows of the piece's right and up in (s, t)."""
         return np.array([self.right, [-self.right[1], self.right[0]]])
 
     def local(self, points_mm: np.ndarray) -> np.ndarray:
-        """(s, t, h) of world points ...×3; s lies within half a turn of the origin."""
+        """Return the (s, t, h) of world points ...×3; s lies within half a turn of the origin."""
         x, t, z = np.moveaxis((points_mm - self.origin_mm) @ self.axes.T, -1, 0)
         k = self.curvature
         if k == 0:
@@ -48,7 +48,7 @@ class SurfaceChart:
         return np.stack([np.arctan2(k * x, 1 + k * z) / k, t, h], -1)
 
     def cartesian(self, s: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Points ...×3 at height 0 and unit normals, both along `axes` from the origin."""
+        """Return points ...×3 at height 0 and unit normals, both along `axes` from the origin."""
         k = self.curvature
         angle = k * np.asarray(s, float)
         normal = np.stack([np.sin(angle), np.zeros_like(angle), np.cos(angle)], -1)
@@ -57,13 +57,13 @@ class SurfaceChart:
         return np.stack([x, np.broadcast_to(t, x.shape), z], -1), normal
 
     def world(self, s: np.ndarray, t: np.ndarray, h: np.ndarray) -> np.ndarray:
-        """World points ...×3 of chart coordinates."""
+        """Return the world points ...×3 of chart coordinates."""
         point, normal = self.cartesian(s, t)
         return (point + np.asarray(h)[..., None] * normal) @ self.axes + self.origin_mm
 
 
 def piece_grid(size_mm: tuple[float, float], n: int) -> np.ndarray:
-    """n·n×2 piece points by rows from the top: millimeters right and up from the piece's middle."""
+    """Return n·n×2 piece points by rows from the top: millimeters right and up from the piece's middle."""
     width, height = size_mm
     across, along = np.meshgrid(np.linspace(-width / 2, width / 2, n), np.linspace(height / 2, -height / 2, n))
     return np.stack([across.ravel(), along.ravel()], 1)
@@ -72,30 +72,30 @@ def piece_grid(size_mm: tuple[float, float], n: int) -> np.ndarray:
 def surface_heights(
     chart: SurfaceChart, triangles: np.ndarray, size_mm, n: int, window=(-np.inf, np.inf)
 ) -> np.ndarray:
-    """The highest surface h within `window` over each of the piece's `piece_grid` points n·n; NaN where there is none."""
+    """Return the highest surface h within `window` over n·n points of the piece; NaN where there is none."""
     points, normals = chart.cartesian(*(piece_grid(size_mm, n) @ chart.turn).T)
     corners = (triangles - chart.origin_mm) @ chart.axes.T
-    owner, low, across, cells = _visits(chart, triangles, size_mm, n)
+    triangle, low, across, cells = _visits(chart, triangles, size_mm, n)
     highest = np.full(n * n, -np.inf)
-    for part in np.array_split(np.arange(len(owner)), max(1, int(cells.sum() // _CHUNK))):
+    for part in np.array_split(np.arange(len(triangle)), max(1, int(cells.sum() // _CHUNK))):
         k = np.arange(cells[part].sum()) - np.repeat(np.cumsum(cells[part]) - cells[part], cells[part])
         row = np.repeat(part, cells[part])
         index = (low[row, 1] + k // across[row]) * n + low[row, 0] + k % across[row]
-        h, hit = _cast(points[index], normals[index], corners[owner[row]])
-        # what lies beyond the axis is the far side's
+        h, hit = _cast(points[index], normals[index], corners[triangle[row]])
+        # a hit beyond the axis belongs to the far side
         hit &= (h >= window[0]) & (h <= window[1]) & (1 + chart.curvature * h > 0)
         np.maximum.at(highest, index[hit], h[hit])
     return np.where(np.isfinite(highest), highest, np.nan)
 
 
 def triangles_near(triangles: np.ndarray, center_mm: np.ndarray, reach_mm: float) -> np.ndarray:
-    """The triangles whose box comes within `reach_mm` of a point along each axis."""
+    """Return the triangles whose box comes within `reach_mm` of a point along each axis."""
     low, high = triangles.min(1) - center_mm, triangles.max(1) - center_mm
     return triangles[((low <= reach_mm) & (high >= -reach_mm)).all(1)]
 
 
 def edge_points(triangles: np.ndarray, step_mm: float) -> np.ndarray:
-    """Points P×3 along all edges, corners included, at most `step_mm` apart."""
+    """Return points P×3 along all edges, corners included, at most `step_mm` apart."""
     start, along = triangles.reshape(-1, 3), (np.roll(triangles, -1, 1) - triangles).reshape(-1, 3)
     count = np.maximum(np.ceil(np.linalg.norm(along, axis=1) / step_mm), 1).astype(np.int64)
     edge = np.repeat(np.arange(len(count)), count)
@@ -104,7 +104,7 @@ def edge_points(triangles: np.ndarray, step_mm: float) -> np.ndarray:
 
 
 def surface_point(triangles: np.ndarray, origin_mm: np.ndarray, axes: np.ndarray) -> np.ndarray:
-    """Where the line through `origin_mm` along the last of `axes` meets the nearest surface; refused if it misses."""
+    """Return where the line through `origin_mm` along the last of `axes` first meets triangles; refused if never."""
     corners = (triangles - origin_mm) @ axes.T
     near = corners[((corners.min(1) <= 0) & (corners.max(1) >= 0))[:, :2].all(1)]
     h, hit = _cast(np.zeros((1, 3)), np.array([[0.0, 0, 1]]), near)
@@ -114,28 +114,28 @@ def surface_point(triangles: np.ndarray, origin_mm: np.ndarray, axes: np.ndarray
 
 
 def _visits(chart: SurfaceChart, triangles: np.ndarray, size_mm, n: int):
-    """Which net points each triangle may lie over: (triangle, first column and row, columns, points) of every box."""
+    """Return the grid points under triangles' boxes: (triangle, first column and row, columns, points) each."""
     local = chart.local(triangles)[..., :2]
-    shifts, holds = [0.0], np.zeros(len(triangles), bool)
+    shifts, surrounds_axis = [0.0], np.zeros(len(triangles), bool)
     if chart.curvature:
         around = 2 * np.pi / abs(chart.curvature)
         local[..., 0] -= around * np.round((local[..., 0] - local[:, :1, 0]) / around)
-        # seen from the axis a triangle spans less than half a turn, unless it holds the axis
-        holds = np.ptp(local[..., 0], axis=1) > around / 2
-        local[holds, :2, 0] = [-around, around]
+        # seen from the axis a triangle spans less than half a turn, unless it surrounds the axis
+        surrounds_axis = np.ptp(local[..., 0], axis=1) > around / 2
+        local[surrounds_axis, :2, 0] = [-around, around]
         shifts = [-around, 0.0, around]
     box = np.stack([local.min(1), local.max(1)], 1)  # F×2×2: low and high (s, t)
     middle, half = box.mean(1), np.ptp(box, axis=1) / 2 + 1e-9
     step = np.array(size_mm) / (n - 1)
     rows = []
     for shift in shifts:
-        at = (middle + np.array([shift, 0])) @ chart.turn.T * [1, -1] + np.array(size_mm) / 2
+        center = (middle + np.array([shift, 0])) @ chart.turn.T * [1, -1] + np.array(size_mm) / 2
         reach = half @ np.abs(chart.turn).T
-        low = np.clip(np.ceil((at - reach) / step), 0, n).astype(np.int64)
-        high = np.clip(np.floor((at + reach) / step), -1, n - 1).astype(np.int64)
+        low = np.clip(np.ceil((center - reach) / step), 0, n).astype(np.int64)
+        high = np.clip(np.floor((center + reach) / step), -1, n - 1).astype(np.int64)
         visits = (low <= high).all(1)
-        if shift:  # what covers all of the circumference does so unshifted
-            visits &= ~holds
+        if shift:  # a triangle around the axis covers all of the circumference without a shift
+            visits &= ~surrounds_axis
         owner = np.flatnonzero(visits)
         rows.append((owner, low[owner], (high - low + 1)[owner]))
     owner, low, counts = (np.concatenate(column) for column in zip(*rows, strict=True))
@@ -143,16 +143,16 @@ def _visits(chart: SurfaceChart, triangles: np.ndarray, size_mm, n: int):
 
 
 def _cast(points: np.ndarray, directions: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """How far along its direction each line meets its triangle, and whether it does; edges belong to both sides,
-    with 1e-6 of a triangle to spare, which closes the cracks of float32 files.
+    """Return how far along its direction each line meets its triangle, and whether it does. Edges belong to both sides
+    with a tolerance of 1e-6 of a triangle, which closes the cracks of float32 files.
     """
     a, edges = corners[:, 0], corners[:, 1:] - corners[:, :1]
-    along, away, edge_b, edge_c = ([*vectors.T] for vectors in (directions, points - a, edges[:, 0], edges[:, 1]))
+    along, offsets, edge_b, edge_c = ([*vectors.T] for vectors in (directions, points - a, edges[:, 0], edges[:, 1]))
     p = cross(along, edge_c)
     det = dot(edge_b, p)
     # a triangle seen edge-on covers nothing; its neighbors have its edges
     flat = np.abs(det) <= 1e-12 * np.sqrt(dot(edge_b, edge_b) * dot(edge_c, edge_c))
     det = np.where(flat, 1.0, det)
-    q = cross(away, edge_b)
-    b, c = dot(away, p) / det, dot(along, q) / det
+    q = cross(offsets, edge_b)
+    b, c = dot(offsets, p) / det, dot(along, q) / det
     return dot(edge_c, q) / det, ~flat & (b >= -1e-6) & (c >= -1e-6) & (b + c <= 1 + 1e-6)

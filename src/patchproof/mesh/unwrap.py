@@ -1,12 +1,11 @@
-"""Texture coordinates for faces that have none: a place of its own in one new texture for every face.
+"""Texture coordinates for faces that have none: every face gets its own area in one new texture.
 
 In: a mesh and the faces to unwrap. Out: the same mesh, faces in the same order, with those faces on a new material
-whose texture starts as what they looked like (base color, vertex colors, the texel they pointed at), so that a vertex
-texture and a UV texture are one thing from here on: texels, as fine as asked for rather than as fine as the mesh.
+whose texture starts as their present appearance (base color, vertex colors, the texel they pointed at). From here on a
+vertex texture and a UV texture are the same thing: texels, at the resolution that is asked for instead of the mesh's.
 xatlas cuts and packs (charts at even density, 2 texels apart); the texels between charts take the nearest chart's
-color, so that mip levels mix nothing foreign in. Same mesh, same bytes.
-Seconds for most meshes; a rough scan of 80,000 faces took 80.
-Left out on purpose: seams placed by hand, and one atlas over several textures.
+color, so that mip levels mix in no foreign colors. The same mesh gives the same bytes. Most meshes take seconds; a
+rough scan of 80,000 faces took 80. Left out on purpose: seams placed by hand, and one atlas over several textures.
 """
 
 from __future__ import annotations
@@ -20,8 +19,8 @@ from patchproof.base.errors import Refused
 from patchproof.mesh.mesh import Material, Mesh, position_numbers
 from patchproof.mesh.uv_coverage import coverage, spans, texels_per_face
 
-PADDING_TEXELS = 2  # between charts; measured, 3 stay free: rims of 1.5 texels on either side do not meet
-# float32 coordinates further out are coarser than a tenth of a texel of a 1024² texture
+PADDING_TEXELS = 2  # between charts; in effect 3 stay free, so that rims of 1.5 texels on either side do not meet
+# beyond this, float32 coordinates are coarser than a tenth of a texel of a 1024² texture
 _FARTHEST_UV = 1000.0
 # neighbors that xatlas takes for coplanar have a cosine within 1e-4 of 1; a chart 45 degrees off its mean is not flat
 _FLAT_COSINE, _TURNED_COSINE = 1 - 2e-4, 0.7
@@ -29,10 +28,10 @@ _ATTEMPTS = 3
 
 
 def has_usable_uv(mesh: Mesh) -> np.ndarray:
-    """Which faces F have texture coordinates to paint on.
+    """Return which faces F have texture coordinates to paint on.
 
     All three corners at (0, 0) is what a mesh without coordinates gets; NaN or absurdly far ones mean nothing. Vertex
-    colors without a texture need a texture made for them, whatever their coordinates.
+    colors without a texture need a new texture, whatever their coordinates.
     """
     uv = mesh.corner_uv
     with np.errstate(invalid="ignore"):
@@ -42,55 +41,57 @@ def has_usable_uv(mesh: Mesh) -> np.ndarray:
 
 
 def unwrap(mesh: Mesh, faces: np.ndarray, texels: int) -> Mesh:
-    """`mesh` with the chosen `faces` (bool F) on a material of their own, its texture about `texels` wide and high.
+    """Put the chosen `faces` (bool F) on a material of their own, whose texture is about `texels` wide and high.
 
     Their corner colors are 1 afterwards: the texture holds everything. Materials left without faces are dropped.
     """
-    uv, size = _atlas(mesh.vertices, mesh.faces[faces], texels)
+    uv, size = _make_atlas(mesh.vertices, mesh.faces[faces], texels)
     owners = np.unique(mesh.face_material[faces])
     name = mesh.materials[owners[0]].name if len(owners) == 1 else "unwrapped"
-    texture = _baked(uv * size, _corner_look(mesh, faces), size)
+    texture = _bake(uv * size, _corner_colors(mesh, faces), size)
     corner_uv, corner_color = mesh.corner_uv.copy(), mesh.corner_color_linear.copy()
     corner_uv[faces], corner_color[faces] = uv, 1.0
     index = np.where(faces, len(mesh.materials), mesh.face_material)
-    kept, face_material = np.unique(index, return_inverse=True)
+    used_materials, face_material = np.unique(index, return_inverse=True)
     materials = (*mesh.materials, Material(name, (1.0, 1.0, 1.0), texture))
     return replace(
         mesh,
         corner_uv=corner_uv,
         corner_color_linear=corner_color,
         face_material=face_material.reshape(-1),
-        materials=tuple(materials[i] for i in kept),
+        materials=tuple(materials[i] for i in used_materials),
     )
 
 
-def _atlas(vertices: np.ndarray, faces: np.ndarray, texels: int) -> tuple[np.ndarray, tuple[int, int]]:
-    """(uv F×3×2 with v down, (width, height) of the atlas); specks under 1e-7 of the object share the corner texel."""
-    used, own = np.unique(faces, return_inverse=True)
-    points, own = vertices[used], own.reshape(-1, 3)
-    # xatlas takes edges under 1e-4 for none, in any unit: at a length of 1000 that is 1e-7 of the object
+def _make_atlas(vertices: np.ndarray, faces: np.ndarray, texels: int) -> tuple[np.ndarray, tuple[int, int]]:
+    """Return (uv F×3×2, v down, (width, height) of the atlas); specks under 1e-7 of the object share a texel."""
+    used_vertices, local_faces = np.unique(faces, return_inverse=True)
+    points, local_faces = vertices[used_vertices], local_faces.reshape(-1, 3)
+    # xatlas ignores edges under 1e-4 in any unit: at a length of 1000 that is 1e-7 of the object
     points = (points - points.min(0)) * (1000 / np.ptp(points, axis=0).max())
-    part = _directions(points, own)
-    uv, size = _packed(points, own, part, texels)
+    group = _direction_groups(points, local_faces)
+    uv, size = _pack(points, local_faces, group, texels)
     for _ in range(_ATTEMPTS - 1):
         overlapping = texels_per_face(uv * size, coverage(uv * size, size) > 1)[0] > 0
         if not overlapping.any():
             break
-        part[overlapping] = part.max() + 1  # xatlas lets a chart fold over itself now and then: cut the folds out
-        uv, size = _packed(points, own, part, texels)
+        group[overlapping] = group.max() + 1  # xatlas lets a chart fold over itself now and then: cut the folds out
+        uv, size = _pack(points, local_faces, group, texels)
     return uv.astype(np.float32), size
 
 
-def _packed(points: np.ndarray, faces: np.ndarray, part: np.ndarray, texels: int) -> tuple[np.ndarray, tuple[int, int]]:
-    """(uv F×3×2, (width, height)) of one atlas in which no chart spans two of the parts F."""
+def _pack(points: np.ndarray, faces: np.ndarray, group: np.ndarray, texels: int) -> tuple[np.ndarray, tuple[int, int]]:
+    """Return (uv F×3×2, (width, height)) of one atlas in which no chart spans two of the groups F."""
     try:
         import xatlas
     except ModuleNotFoundError as error:
-        do = 'pip install "patchproof[textures]", or give the mesh texture coordinates'
-        raise Refused("the package xatlas, to unwrap a mesh without texture coordinates", "none", do) from error
+        remedy = 'pip install "patchproof[textures]", or give the mesh texture coordinates'
+        raise Refused(
+            "the package xatlas, to unwrap a mesh without texture coordinates", "no such package", remedy
+        ) from error
     atlas, packing = xatlas.Atlas(), xatlas.PackOptions()
-    for index in np.unique(part):
-        atlas.add_mesh(points.astype(np.float32), faces[part == index].astype(np.uint32))
+    for index in np.unique(group):
+        atlas.add_mesh(points.astype(np.float32), faces[group == index].astype(np.uint32))
     packing.resolution, packing.padding, packing.bilinear = texels, PADDING_TEXELS, True
     packing.max_chart_size = 2 * texels  # else a single needle makes a strip half a million texels long
     packing.rotate_charts = False  # its quarter turns swap the axes, which mirrors the chart
@@ -98,19 +99,20 @@ def _packed(points: np.ndarray, faces: np.ndarray, part: np.ndarray, texels: int
     if not atlas.width or not atlas.height:
         raise Refused("a surface that can be unwrapped", f"{len(faces)} faces that cannot", "unwrap it by hand")
     uv, width, height = np.zeros((len(faces), 3, 2)), int(atlas.width), int(atlas.height)
-    for order, index in enumerate(np.unique(part)):
+    for order, index in enumerate(np.unique(group)):
         _, corners, points_uv = atlas[order]
-        uv[part == index] = points_uv[corners]
+        uv[group == index] = points_uv[corners]
     # a margin of half a padding, because textures wrap: the left rim has the right one for a neighbor
     padded = width + PADDING_TEXELS, height + PADDING_TEXELS
     return (uv * [width, height] + PADDING_TEXELS / 2) / padded, padded
 
 
-def _directions(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """What xatlas must get as separate meshes: 0, or on fine smooth surfaces 1 to 27, where a face's normal points.
+def _direction_groups(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Return the groups of faces that xatlas must get as separate meshes: 0, or on fine smooth surfaces 1 to 27, by the
+    direction of a face's normal.
 
     xatlas joins neighbors whose normals are within 0.8 degrees into one flat chart, however far that leads: a finely
-    divided sphere becomes one chart without a rim, on which it crashes. Cut by direction, no piece turns that far.
+    divided sphere becomes one chart without a rim, on which it crashes. Cut by direction, no group turns that far.
     """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
@@ -131,27 +133,27 @@ def _directions(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return np.where(turns[chart], 1 + np.rint(1.3 * normal + 1).astype(int) @ [1, 3, 9], 0)
 
 
-def _corner_look(mesh: Mesh, faces: np.ndarray) -> np.ndarray:
-    """Linear color F×3×3 that the corners of the chosen faces have now."""
-    look = mesh.corner_color_linear[faces].astype(float)
+def _corner_colors(mesh: Mesh, faces: np.ndarray) -> np.ndarray:
+    """Return the present linear color F×3×3 of the chosen faces' corners."""
+    color = mesh.corner_color_linear[faces].astype(float)
     owner, uv = mesh.face_material[faces], np.nan_to_num(mesh.corner_uv[faces], nan=0.0, posinf=0.0, neginf=0.0)
     for index in np.unique(owner):
-        material, own = mesh.materials[index], owner == index
-        look[own] *= material.base_color_linear
+        material, of_material = mesh.materials[index], owner == index
+        color[of_material] *= material.base_color_linear
         if material.texture_srgb is not None:
             height, width, _ = material.texture_srgb.shape
-            x, y = (np.floor(uv[own] * [width, height]).astype(np.int64) % [width, height]).transpose(2, 0, 1)
-            look[own] *= linear_from_srgb(material.texture_srgb[y, x] / 255)
-    return look
+            x, y = (np.floor(uv[of_material] * [width, height]).astype(np.int64) % [width, height]).transpose(2, 0, 1)
+            color[of_material] *= linear_from_srgb(material.texture_srgb[y, x] / 255)
+    return color
 
 
-def _baked(corners: np.ndarray, colors_linear: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """uint8 sRGB texture of corner colors F×3×3 at `corners` F×3×2 texels; what no face covers takes the nearest."""
+def _bake(corners: np.ndarray, colors_linear: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Paint corner colors F×3×3 at `corners` F×3×2 into a uint8 sRGB texture; the rest takes the nearest color."""
     from scipy.ndimage import distance_transform_edt
 
     width, height = size
     light, empty = np.zeros((height, width, 3)), np.ones((height, width), bool)
-    for grow in (1.0, 0.0):  # rims first, so that a face's own texels are its own
+    for grow in (1.0, 0.0):  # rims first, so that a face keeps the texels inside it
         for face, row, start, stop in spans(corners, grow):
             length = stop - start
             column = np.arange(length.sum()) - np.repeat(np.cumsum(length) - length - start, length)
@@ -165,7 +167,7 @@ def _baked(corners: np.ndarray, colors_linear: np.ndarray, size: tuple[int, int]
 
 
 def _barycentric(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Weights N×3 of points in triangles N×3×2, pulled into the triangle."""
+    """Return the weights N×3 of points in triangles N×3×2; points outside are moved onto the triangle."""
     a, b, c = corners.transpose(1, 0, 2)
     (ux, uy), (vx, vy), (px, py) = (b - a).T, (c - a).T, (points - a).T
     area = ux * vy - uy * vx

@@ -96,7 +96,7 @@ def import_patch(
     out, compute = Path(out), compute.without("import_patch", cluster=True)
     check_folder(out, RUN_FILE_PATTERNS, overwrite)
     (file, sha256, pixels), scene = _read_picture(picture), _load_piece_scene(scene, seed)
-    fitted, scene = fit_to_piece(pixels, scene), scene.of_design(sha256)
+    fitted, scene = fit_to_piece(pixels, scene), scene.for_design(sha256)
     problem = set_problem(scene, compute.device, models, jobs=compute.jobs)
     problem = replace(problem, subject=replace(problem.patch, design_px=fitted.shape[1::-1]))
     design = problem.patch.pixels(from_pixels(fitted, problem.device))

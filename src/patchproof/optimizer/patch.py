@@ -82,7 +82,7 @@ class Patch:
 
     def appearance(self, design: Tensor, kind: str = "design") -> PiecePicture:
         """The printed piece with a design of any grid (the optimized one, or as printed); differentiable."""
-        return self._printed.shown(design, kind)
+        return self._printed.appearance(design, kind)
 
     def print_design(self, design: Tensor) -> Tensor:
         """The printed piece's texels T×3 for an optimized design; differentiable."""

@@ -30,9 +30,9 @@ from patchproof.render.stage import Stage, set_stage
 from patchproof.render.views import cameras, near_mm, render_views
 from patchproof.scene.backgrounds import load_backgrounds
 from patchproof.scene.conditions import Conditions
-from patchproof.scene.open_scene import UnplacedScene
 from patchproof.scene.patch_scene import PatchScene
 from patchproof.scene.placement import patch_frame, side_frame, spun_axes
+from patchproof.scene.unplaced_scene import UnplacedScene
 
 _RECORD_FILE, _PICTURE_FILE = "place.json", "place.png"
 _DIRECTIONS, _SIDE_PX = 4, 420

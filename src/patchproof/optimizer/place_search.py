@@ -39,8 +39,8 @@ from patchproof.render.pixels import Appearance
 from patchproof.scene.candidate_places import MIN_DISTANCE_SHARE, CandidatePlace, PlaceFinder
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.interface import Scene
-from patchproof.scene.open_scene import UnplacedScene, require_unplaced
 from patchproof.scene.patch_scene import PiecePosition
+from patchproof.scene.unplaced_scene import UnplacedScene, require_unplaced
 
 MAX_PASSES = 608  # pictures that go through a network; pictures with a gradient count twice
 SCREENED_PLACES, SCREEN_VIEWS = 24, 4  # 192 passes, and 4 for the bare object
@@ -113,7 +113,7 @@ def choose_place(
     """Search the object of a scene with `patch.place = "auto"` for the best place of the piece.
 
     Args:
-        scene: loaded by `load_scene` or `make_scene`; `scene.at(place.at, place.spin_deg)` has the piece there.
+        scene: loaded by `load_scene` or `make_scene`; `scene.with_piece_at(place.at, place.spin_deg)` places it.
         models, loss: networks and loss in place of the scene's, as in `optimize`.
         compute: device and processes; refuses a cluster.
         progress: called with the stage "place" (passes of the networks).
@@ -124,9 +124,9 @@ def choose_place(
     scene, compute = require_unplaced(scene), compute.without("choose_place", cluster=True)
     advance = partial(progress, "place")
     search, finder = _Search(scene, (models, loss, compute.device, compute.jobs), advance), PlaceFinder(scene)
-    trials = search.screen(finder.spots(SCREENED_PLACES))
+    trials = search.screen(finder.candidates(SCREENED_PLACES))
     leaders = sorted(trials, key=lambda trial: trial.outlook)[:TURNED_PLACES]
-    trials += search.screen([turn for leader in leaders for turn in finder.turned(leader.spot)])
+    trials += search.screen([turn for leader in leaders for turn in finder.other_spins(leader.spot)])
     trials.sort(key=lambda trial: trial.outlook)
     finalists = _finalists(trials, min(finder.size_mm))
     drafts = search.draft_at(finalists)
@@ -204,7 +204,7 @@ class _Search:
         problems, refusal = [], None
         for spot in spots:
             try:
-                scene = self._scene.at(spot.at, spot.spin_deg)
+                scene = self._scene.with_piece_at(spot.at, spot.spin_deg)
             except Refused as refused:
                 refusal = refused
                 continue

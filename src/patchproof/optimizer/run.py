@@ -151,11 +151,11 @@ def _choose_place(
     """
     from patchproof.optimizer.place_files import read_place, save_place
     from patchproof.optimizer.place_search import choose_place
-    from patchproof.scene.open_scene import require_unplaced
+    from patchproof.scene.unplaced_scene import require_unplaced
 
     scene = require_unplaced(scene)
     place = (read_place(out, scene) if resume else None) or choose_place(scene, **search_options)
-    placed_scene = scene.at(place.at, place.spin_deg)
+    placed_scene = scene.with_piece_at(place.at, place.spin_deg)
     return placed_scene, lambda: save_place(place, placed_scene, out)
 
 

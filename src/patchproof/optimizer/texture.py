@@ -120,7 +120,7 @@ class Texture(Subject):
 
     def appearance(self, design: Tensor, kind: str = "design") -> ObjectTextures:
         """The object's textures with a design; differentiable."""
-        return self.surface.shown(design)
+        return self.surface.appearance(design)
 
     def save(self, pixels: np.ndarray, folder: Path) -> None:
         """Write the object with its new textures, each texture, and the masks one below the other, white where texels

@@ -1,1 +1,1 @@
-"""From a scene and drawn conditions to pictures: rasterize, sample textures, shade, photograph."""
+"""Make pictures of a scene under drawn conditions: rasterize, sample textures, shade, photograph."""

@@ -1,9 +1,9 @@
-"""Textures that nothing changes, read at once: no numbers of texels are kept, as what is learned needs them.
+"""Look up fixed textures at once. Unlike textures that are optimized, they need no lists of texels.
 
-In: textures H×W×3 that repeat, and per fragment what `texture.footprint` takes. Out: the P×3 that they see, in the
-same taps. All mip levels lie in one picture, each with a margin that goes on as the texture does and is wider than
-footprints reach, so that taps need not be wrapped and the library's own look-up takes them all: in half of the time in
-views, in three quarters in photographs.
+In: textures H×W×3 that repeat, and per fragment the arguments of `texture.footprint`. Out: the P×3 that fragments see,
+with the same taps. All mip levels lie in one picture, each with a margin that continues the texture and is wider than
+footprints reach, so that taps need not be wrapped and the library's own look-up takes all of them: in half of the time
+in views, in three quarters in photographs.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from torch.nn import functional as F
 
 from patchproof.render.texture import TexelLayout, footprint, group_by_grid, look_up, mip_levels, tap_grids, tap_offsets
 
-MOST_TAPS = 4  # along a footprint's shorter side
-# A grid of MOST_TAPS by twice as many, a texel apart, reaches 6 texels from its middle; where halving has lost a row of
-# three, 9; and a tap one texel more.
+MAX_TAPS = 4  # along a footprint's shorter side
+# A grid of MAX_TAPS by twice as many, a texel apart, reaches 6 texels from its middle, or 9 if halving has dropped a
+# row of three; a tap reaches one texel more.
 _MARGIN = 10
 
 
 def atlas_layout(sizes: Sequence[tuple[int, int]], device: torch.device | str = "cpu") -> TexelLayout:
-    """The layout for textures of (width, height) sizes: the finest level on the left, the others below each other on
-    its right, and textures on shelves, the highest first.
+    """Return the layout for textures of (width, height) sizes: the finest level on the left, the others below each
+    other on its right, and textures on shelves, the highest first.
     """
     chains = [[(max(w >> k, 1), max(h >> k, 1)) for k in range(max(w, h).bit_length())] for w, h in sizes]
     blocks = [_block(chain) for chain in chains]
@@ -47,20 +47,20 @@ def atlas_layout(sizes: Sequence[tuple[int, int]], device: torch.device | str = 
 
 
 def _block(chain: list[tuple[int, int]]) -> tuple[int, int]:
-    """Width and height that a texture's levels take."""
+    """Return the width and height that a texture's levels take."""
     (width, height), *smaller = [(w + 2 * _MARGIN, h + 2 * _MARGIN) for w, h in chain]
     return width + max((w for w, _ in smaller), default=0), max(height, sum(h for _, h in smaller))
 
 
-def atlas_table(textures: Sequence[Tensor], where: TexelLayout) -> Tensor:
-    """The T×3 texels of all mip levels of H×W×3 textures."""
-    assert where.pitch is not None
-    places = where.places.view(len(textures), -1, 3).tolist()
-    lowest = max((first // where.pitch) + height for rows in places for _, height, first in rows)
-    table = textures[0].new_zeros(lowest + _MARGIN, where.pitch, 3)
+def atlas_table(textures: Sequence[Tensor], layout: TexelLayout) -> Tensor:
+    """Return the T×3 texels of all mip levels of H×W×3 textures."""
+    assert layout.pitch is not None
+    places = layout.places.view(len(textures), -1, 3).tolist()
+    lowest = max((first // layout.pitch) + height for rows in places for _, height, first in rows)
+    table = textures[0].new_zeros(lowest + _MARGIN, layout.pitch, 3)
     for texture, rows in zip(textures, places, strict=True):
         for level, (width, height, first) in zip(mip_levels(texture), rows, strict=False):
-            y, x = (corner - _MARGIN for corner in divmod(first, where.pitch))
+            y, x = (corner - _MARGIN for corner in divmod(first, layout.pitch))
             down, across = (
                 torch.arange(-_MARGIN, side + _MARGIN, device=table.device) % side for side in (height, width)
             )
@@ -69,39 +69,39 @@ def atlas_table(textures: Sequence[Tensor], where: TexelLayout) -> Tensor:
 
 
 def sample_atlas(
-    where: TexelLayout, texels: Tensor, texture: Tensor, uv: Tensor, uv_dx: Tensor, uv_dy: Tensor, taps: int
+    layout: TexelLayout, texels: Tensor, texture: Tensor, uv: Tensor, uv_dx: Tensor, uv_dy: Tensor, taps: int
 ) -> Tensor:
-    """The P×3 that fragments see in an atlas; arguments as `texture.footprint` has them, with `taps` up to MOST_TAPS.
-    A single tap is found by its texels' numbers, in as much time.
+    """Return the P×3 that fragments see in an atlas. The arguments are those of `texture.footprint`, with `taps` up to
+    MAX_TAPS. A single tap is looked up by its texels' numbers, which takes as long.
     """
-    assert where.pitch is not None and taps <= MOST_TAPS
+    assert layout.pitch is not None and taps <= MAX_TAPS
     if taps == 1:
-        return look_up(footprint(where, texture, uv, uv_dx, uv_dy, taps), texels)
-    picture = texels.view(1, -1, where.pitch, 3).permute(0, 3, 1, 2)
-    places, counts = _placed(where, picture.shape[2], texture, uv, uv_dx, uv_dy, taps)
+        return look_up(footprint(layout, texture, uv, uv_dx, uv_dy, taps), texels)
+    picture = texels.view(1, -1, layout.pitch, 3).permute(0, 3, 1, 2)
+    places, counts = _place_grids(layout, picture.shape[2], texture, uv, uv_dx, uv_dy, taps)
     order, grids = group_by_grid(*counts)
     places = torch.stack([values.index_select(0, order) for values in places]).view(3, 2, 1, 1, -1)
-    seen = texels.new_empty(len(order), 3)
+    colors = texels.new_empty(len(order), 3)
     for columns, rows, begin, end in grids:
         middle, right, down = places[..., begin:end]
         across = right * tap_offsets(columns, texels.device)[:, None]
-        at = middle + across + down * tap_offsets(rows, texels.device)[:, None, None]
-        taken = F.grid_sample(picture, at.flatten(1, 2).permute(1, 2, 0)[None], align_corners=False)[0]
-        # one after the other: `mean` rounds as the number of fragments has it
-        seen[begin:end] = reduce(torch.add, taken.unbind(1)).T / (columns * rows)
-    return torch.empty_like(seen).index_copy_(0, order, seen)
+        points = middle + across + down * tap_offsets(rows, texels.device)[:, None, None]
+        tap_colors = F.grid_sample(picture, points.flatten(1, 2).permute(1, 2, 0)[None], align_corners=False)[0]
+        # added one after the other, because the rounding of `mean` depends on the number of fragments
+        colors[begin:end] = reduce(torch.add, tap_colors.unbind(1)).T / (columns * rows)
+    return torch.empty_like(colors).index_copy_(0, order, colors)
 
 
-def _placed(
-    where: TexelLayout, height: int, texture: Tensor, uv: Tensor, uv_dx: Tensor, uv_dy: Tensor, taps: int
+def _place_grids(
+    layout: TexelLayout, height: int, texture: Tensor, uv: Tensor, uv_dx: Tensor, uv_dy: Tensor, taps: int
 ) -> tuple[list[Tensor], tuple[Tensor, Tensor]]:
-    """The middle (x, y) of each of P grids, the steps (x, y) to the right and down between its taps, all as the look-up
-    has them, in half widths and heights of the picture from its own middle; and how many taps go across and down.
+    """Return each of P grids' middle (x, y) and steps (x, y) to the right and down between its taps, in half widths and
+    heights of the picture from its middle, which the look-up takes; and the numbers of taps across and down.
     """
-    assert where.pitch is not None
-    *sizes, first = where.places.T.contiguous()
-    corners, whole = (first % where.pitch, first // where.pitch), (where.pitch, height)
-    finest, levels = texture * (len(first) // len(where.levels)), where.levels.index_select(0, texture)
+    assert layout.pitch is not None
+    *sizes, first = layout.places.T.contiguous()
+    corners, picture_px = (first % layout.pitch, first // layout.pitch), (layout.pitch, height)
+    finest, levels = texture * (len(first) // len(layout.levels)), layout.levels.index_select(0, texture)
     sides = [(right.contiguous(), down.contiguous()) for right, down in zip(uv_dx.T, uv_dy.T, strict=True)]
     extents = (size.float().index_select(0, finest) for size in sizes)
     x, y = ([side * extent for side in pair] for pair, extent in zip(sides, extents, strict=True))
@@ -111,8 +111,8 @@ def _placed(
     middles, steps = [], []
     for axis in range(2):
         size, corner = (table[axis].float().index_select(0, finest + level) for table in (sizes, corners))
-        at = uv[:, axis] * size - 0.5
-        middles.append((at - (at / size).floor() * size + corner + 0.5) * (2 / whole[axis]) - 1)
-        per_texel = (size * (2 / whole[axis])).masked_fill(size == 1, 0)  # of one color, where taps may reach far
+        position = uv[:, axis] * size - 0.5
+        middles.append((position - (position / size).floor() * size + corner + 0.5) * (2 / picture_px[axis]) - 1)
+        per_texel = (size * (2 / picture_px[axis])).masked_fill(size == 1, 0)  # one texel: one color everywhere
         steps.append([side * per_texel / count for side, count in zip(sides[axis], counts, strict=True)])
     return [*middles, *chain.from_iterable(zip(*steps, strict=True))], counts

@@ -1,8 +1,8 @@
-"""What a design looks like where it hangs: in its printed piece, or as texels of the object's own textures.
+"""Render designs as they look on the object: in a printed piece, or as texels of the object's own textures.
 
 In: a design, a float tensor in [0, 1]: 3×h×w of any grid for a piece, 3×1×M (the texels that may change, texture by
-texture, by rows) for textures. Out: what `photograph` shows, differentiable in the design. The piece is shown whole,
-with its printed markers, because that is what will hang there.
+texture, by rows) for textures. Out: an `Appearance` for `photograph`, differentiable in the design. The piece is shown
+whole, with its printed markers, because that is what will hang there.
 """
 
 from __future__ import annotations
@@ -26,29 +26,29 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class PrintedPiece:
-    """A piece as this printer prints it."""
+    """A piece as a printer prints it."""
 
     piece: Piece
     sheet_id: str
     printer: Printer
     device: torch.device
 
-    def shown(self, design: Tensor, kind: str = "design") -> PiecePicture:
-        """The printed piece with a design 3×h×w, on the design's own grid, and the markers of that kind of sheet."""
+    def appearance(self, design: Tensor, kind: str = "design") -> PiecePicture:
+        """Return the printed piece with a design 3×h×w, on the design's grid, and the markers of that kind of sheet."""
         height, width = design.shape[1:]
         markers, reserved = self._markers(kind, (width, height))
         return PiecePicture.of(torch.where(reserved, markers, self._printed(design)))
 
     @lru_cache(maxsize=8)  # noqa: B019 - it lives as long as its stage
     def _markers(self, kind: str, design_px: tuple[int, int]) -> tuple[Tensor, Tensor]:
-        """A kind of sheet's markers as printed, H×W×3, and where they and their white lie, bool H×W×1."""
-        # a control has its own marker ids, as they will be printed
+        """Return the printed markers of a kind of sheet, H×W×3, and the mask of them and their white, bool H×W×1."""
+        # a control's markers have their own ids, like those that will be printed
         image, reserved = marker_image(with_ids(self.piece, self.sheet_id, kind), design_px)
         sent = torch.tensor(image, device=self.device).permute(2, 0, 1)
         return self._printed(sent), torch.tensor(reserved, device=self.device)[..., None]
 
     def _printed(self, srgb: Tensor) -> Tensor:
-        """3×H×W as sent, H×W×3 as it looks on paper."""
+        """Print 3×H×W as sent; return H×W×3 as it looks on paper."""
         return self.printer.apply(srgb[None])[0].permute(1, 2, 0)
 
 
@@ -59,18 +59,18 @@ class LearnedTextures:
     canvas: Canvas
     device: torch.device
 
-    def shown(self, design: Tensor, kind: str = "design") -> ObjectTextures:
-        """The object's textures with the texels 3×1×M of a design; of any kind."""
+    def appearance(self, design: Tensor, kind: str = "design") -> ObjectTextures:
+        """Return the object's textures with the texels 3×1×M of a design; `kind` has no effect."""
         return ObjectTextures(tuple(self.filled(design)))
 
     def filled(self, design: Tensor) -> list[Tensor]:
-        """H×W×3 per material."""
+        """Return the textures with a design's texels, H×W×3 per material."""
         parts = design[:, 0].T.split(self._counts)
-        filled = zip(self._originals, self.masks, parts, strict=True)
-        return [original.masked_scatter(mask[..., None], part) for original, mask, part in filled]
+        rows = zip(self._originals, self.masks, parts, strict=True)
+        return [original.masked_scatter(mask[..., None], part) for original, mask, part in rows]
 
     def images(self, design: Tensor) -> list[Tensor]:
-        """3×H×W per material, 0 where nothing may change."""
+        """Return a design's texels as 3×H×W per material, 0 where nothing may change."""
         parts = design[:, 0].split(self._counts, 1)
         return [
             part.new_zeros(3, *mask.shape).masked_scatter(mask, part)
@@ -78,12 +78,12 @@ class LearnedTextures:
         ]
 
     def texels(self, textures: Sequence[np.ndarray]) -> np.ndarray:
-        """uint8 1×M×3: the changeable texels of uint8 textures."""
+        """Return the changeable texels of uint8 textures as uint8 1×M×3."""
         masks = self.canvas.mask
         return np.concatenate([texture[mask] for texture, mask in zip(textures, masks, strict=True)])[None]
 
     def textures(self, pixels: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Whole uint8 textures with a design's pixels 1×M×3 in them."""
+        """Return whole uint8 textures with a design's pixels 1×M×3 in them."""
         textures = tuple(original.copy() for original in self._textures_srgb8)
         parts = np.split(pixels[0], np.cumsum(self._counts)[:-1])
         for texture, mask, part in zip(textures, self.canvas.mask, parts, strict=True):
@@ -92,7 +92,7 @@ class LearnedTextures:
 
     @cached_property
     def masks(self) -> tuple[Tensor, ...]:
-        """Where each texture may change, bool H×W."""
+        """Masks of each texture's changeable texels, bool H×W."""
         return tuple(torch.as_tensor(mask, device=self.device) for mask in self.canvas.mask)
 
     @property

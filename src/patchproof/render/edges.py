@@ -1,9 +1,9 @@
-"""The object's edges at which what is seen may change abruptly, found once per mesh.
+"""The object's edges at which its appearance may change abruptly, found once per mesh.
 
 In: a mesh. Out: `Edges`: those that show in every view (rims, and creases or changes of color between faces of which
-one has no texture) and those that show where one of their faces is turned away, told by the planes of both. Corners at
-one place are one. Left out on purpose: creases between two textured faces. A texture goes on smoothly across most of
-them, and mixing neighboring pixels would only blur it: a textured car was farther from 3×3 samples with them.
+one has no texture) and those that show when one of their faces is turned away, which the planes of both tell. Corners
+at one position are one. Left out on purpose: creases between two textured faces. A texture continues smoothly across
+most of them, and mixing neighboring pixels would only blur it: a textured car was farther from 3×3 samples with them.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from torch import Tensor
 
 from patchproof.mesh.mesh import Mesh, position_numbers
 
-CREASE_DEG = 10.0  # of normals: light changes by a sixth at most below it
+CREASE_DEG = 10.0  # between normals: below it light changes by a sixth at most
 _COLOR_STEP = 0.02  # of linear light
 
 
 @dataclass(frozen=True)
 class Edges:
-    """`ends` E×2 vertices and `faces` E×2 (one face twice at a rim); `always` E: seen whichever way they face;
+    """Edges of a mesh: `ends` E×2 vertices and `faces` E×2 (one face twice at a rim); `always` E: seen from every side;
     `reversed` E: both faces run along it the same way, so that their fronts disagree. `planes` F×4 float64: a face's
     outside is where (x, y, z, 1) times its plane is positive.
     """
@@ -35,7 +35,7 @@ class Edges:
 
 
 def find_edges(mesh: Mesh, device: torch.device | str = "cpu") -> Edges:
-    """The edges of a mesh on a device."""
+    """Find the edges of a mesh and put them on a device."""
     place = position_numbers(mesh.vertices)[mesh.faces]
     first, second = place.ravel(), place[:, [1, 2, 0]].ravel()
     key = np.minimum(first, second) * (len(mesh.vertices) + 1) + np.maximum(first, second)
@@ -43,12 +43,12 @@ def find_edges(mesh: Mesh, device: torch.device | str = "cpu") -> Edges:
     starts = np.flatnonzero(np.r_[True, np.diff(key[order]) != 0])
     count = np.diff(np.r_[starts, len(order)])
     one, other = order[starts[count == 2]], order[starts[count == 2] + 1]
-    # a rim has one face, and where more than two meet, each is taken for one
+    # a rim has one face; an edge of more than two faces counts as a rim of each
     rim = order[np.repeat(count != 2, count)]
     same_way = first[one] == first[other]
-    always = np.r_[_sharp(mesh, one, other, same_way), np.ones(len(rim), bool)]
+    always = np.r_[_has_jump(mesh, one, other, same_way), np.ones(len(rim), bool)]
     one, other = np.r_[one, rim], np.r_[other, rim]
-    ends = np.stack([mesh.faces.ravel()[one], mesh.faces.ravel()[_next(one)]], 1)
+    ends = np.stack([mesh.faces.ravel()[one], mesh.faces.ravel()[_next_corner(one)]], 1)
     a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
     normal = np.cross(b - a, c - a)
     planes = np.concatenate([normal, -(normal * a).sum(1, keepdims=True)], 1)
@@ -56,22 +56,22 @@ def find_edges(mesh: Mesh, device: torch.device | str = "cpu") -> Edges:
     return Edges(*(torch.as_tensor(array, device=device) for array in arrays))
 
 
-def _next(corner: np.ndarray) -> np.ndarray:
-    """The corner after each in its face."""
+def _next_corner(corner: np.ndarray) -> np.ndarray:
+    """Return the next corner of the same face."""
     return corner // 3 * 3 + (corner + 1) % 3
 
 
-def _sharp(mesh: Mesh, one: np.ndarray, other: np.ndarray, same_way: np.ndarray) -> np.ndarray:
-    """Whether what is seen steps between two faces where their normals or colors do."""
+def _has_jump(mesh: Mesh, one: np.ndarray, other: np.ndarray, same_way: np.ndarray) -> np.ndarray:
+    """Return at which edges the appearance jumps because the normals or colors of their two faces do."""
     textured = np.array([material.texture_srgb is not None for material in mesh.materials])
     base = np.array([material.base_color_linear for material in mesh.materials])
     color = (mesh.corner_color_linear * base[mesh.face_material][:, None]).reshape(-1, 3)
     normal, faces = mesh.corner_normal.reshape(-1, 3), (one // 3, other // 3)
-    sharp = np.zeros(len(one), bool)
+    jumps = np.zeros(len(one), bool)
     # two faces that agree on their front run along an edge in opposite directions
-    beside = (np.where(same_way, other, _next(other)), np.where(same_way, _next(other), other))
-    for near, far in zip((one, _next(one)), beside, strict=True):
+    other_corners = (np.where(same_way, other, _next_corner(other)), np.where(same_way, _next_corner(other), other))
+    for near, far in zip((one, _next_corner(one)), other_corners, strict=True):
         cosine = np.where(same_way, -1, 1) * (normal[near] * normal[far]).sum(1)
-        sharp |= (cosine < np.cos(np.radians(CREASE_DEG))) | (np.abs(color[near] - color[far]).max(1) > _COLOR_STEP)
-    both = [textured[mesh.face_material[face]] for face in faces]
-    return (sharp | (both[0] != both[1])) & ~(both[0] & both[1])
+        jumps |= (cosine < np.cos(np.radians(CREASE_DEG))) | (np.abs(color[near] - color[far]).max(1) > _COLOR_STEP)
+    textured_sides = [textured[mesh.face_material[face]] for face in faces]
+    return (jumps | (textured_sides[0] != textured_sides[1])) & ~(textured_sides[0] & textured_sides[1])

@@ -1,4 +1,4 @@
-"""What goes into rasterizing and what comes out: `Cameras`, `Fragments`."""
+"""The input and output of rasterizing: `Cameras`, `Fragments`."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ class Cameras:
     def __len__(self) -> int:
         return len(self.camera_from_world)
 
-    def __getitem__(self, some: slice) -> Cameras:
-        return Cameras(self.camera_from_world[some], self.matrix_px[some], self.size_px)
+    def __getitem__(self, rows: slice) -> Cameras:
+        return Cameras(self.camera_from_world[rows], self.matrix_px[rows], self.size_px)
 
 
 @dataclass(frozen=True)
 class Fragments:
-    """What P covered pixels see. `pixel` is (view·H + y)·W + x, ascending; `view` and `face` are indices.
+    """P covered pixels and the faces they see. `pixel` is (view·H + y)·W + x, ascending; `view` and `face` are indices.
 
-    `barycentric` P×3 and `depth` P (camera z, mm) are float32. `front` tells whether the face shows its outside.
-    `rank` P (into Q) and `slopes` 6×Q are what the derivatives of the barycentrics are computed from when asked for.
+    `barycentric` P×3 and `depth` P (camera z, mm) are float32. `front` tells if the face shows its outside. The
+    derivatives of the barycentrics are computed on request from `rank` P (into Q) and `slopes` 6×Q.
     """
 
     pixel: Tensor
@@ -53,7 +53,7 @@ class Fragments:
 
     @cached_property
     def corner(self) -> Tensor:
-        """P×3: where the corners of each fragment's face lie in a list of all faces' corners."""
+        """P×3: the indices of the corners of each fragment's face in a list of all faces' corners."""
         return torch.add(self.face[:, None] * 3, torch.arange(3, device=self.face.device))
 
     @cached_property
@@ -75,14 +75,14 @@ class Fragments:
         return columns(-(first + second), first, second)
 
     def where(self, keep: Tensor) -> Fragments:
-        """The fragments where `keep` (P, bool) is true."""
+        """Return the fragments for which `keep` (P, bool) is true."""
         index = keep.nonzero()[:, 0]
         names = ("pixel", "face", "barycentric", "depth", "front", "rank")
         return replace(self, **{name: getattr(self, name).index_select(0, index) for name in names})
 
 
 def columns(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
-    """P×3 float32; `torch.stack` takes four times as long for columns this narrow."""
+    """Return P×3 float32; `torch.stack` takes four times as long for columns this narrow."""
     out = torch.empty(len(a), 3, device=a.device)
     out[:, 0], out[:, 1], out[:, 2] = a, b, c
     return out

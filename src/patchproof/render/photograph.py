@@ -1,8 +1,8 @@
-"""`photograph`: what the camera of each drawn condition makes of the scene with the piece in it.
+"""Photograph a scene: `photograph` returns the camera's picture of each drawn condition, with the design in it.
 
-In: a stage, what is shown (the piece's picture, the object's textures, or nothing new) and conditions. Out: N×3×H×W
-sRGB. The work has three parts that can be kept apart: `render_views` (see `views`), `shade` (light and composite; the only part
-through which gradients reach what is shown) and the camera (`expose`).
+In: a stage, an appearance (the piece's picture, the object's textures, or None for the bare object) and conditions.
+Out: N×3×H×W sRGB. The work has three parts that can be run alone: `render_views` (see `views`), `shade` (light and
+composite; the only part through which gradients reach the design) and the camera (`expose`).
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from patchproof.render.texture import look_up
 from patchproof.render.views import Views, render_views
 from patchproof.scene.conditions import Conditions
 
-PAPER_BACK_LINEAR = 0.8  # plain white card seen from behind
+PAPER_BACK_LINEAR = 0.8  # reflectance of plain white card, for a piece seen from behind
 
 
 def photograph(
@@ -40,122 +40,123 @@ def photograph(
     size_px: tuple[int, int],
     jpeg: bool = True,
 ) -> Tensor:
-    """N×3×H×W sRGB pictures of `size_px`; `shown=None` is the bare object.
+    """Return N×3×H×W sRGB pictures of `size_px`; `shown=None` is the bare object.
 
-    A design may be shown as it is: a float tensor in [0, 1] (3×h×w of any grid for a piece, 3×1×M for textures), in
-    which the pictures are differentiable, or its uint8 pixels h×w×3. A square size shows the photograph's centered
-    square. `jpeg` as in `channel.camera.develop`.
+    `shown` may also be a design: a float tensor in [0, 1] (3×h×w of any grid for a piece, 3×1×M for textures), in which
+    the pictures are differentiable, or its uint8 pixels h×w×3. A square size gives the photograph's centered square.
+    `jpeg` has the meaning that it has in `channel.camera.develop`.
     """
     if isinstance(shown, np.ndarray):
         shown = torch.tensor(shown, dtype=torch.float32, device=stage.device).permute(2, 0, 1) / 255
     if isinstance(shown, Tensor):
-        shown = stage.look.shown(shown)
+        shown = stage.design_renderer.appearance(shown)
     return expose(render_views(stage, shown, conditions, size_px), shown, jpeg)
 
 
-def shade(views: Views, shown: Appearance) -> Tensor:
-    """N×3×H×W linear light before lens and sensor; differentiable in what is shown."""
-    if isinstance(shown, ObjectTextures):
-        return _smooth(views, views.object_light(light_texels(shown.srgb, views.reduced)), views.reduced)
+def shade(views: Views, appearance: Appearance) -> Tensor:
+    """Return N×3×H×W linear light before lens and sensor; differentiable in the design."""
+    if isinstance(appearance, ObjectTextures):
+        return _smooth(views, views.object_light(light_texels(appearance.srgb, views.reduced)), views.reduced)
     image = views.bare
-    if shown is None:
+    if appearance is None:
         return _smooth(views, image, views.reduced)
-    piece, own = views.on_piece, _own_blur_and_noise(views)
+    piece, blur_and_noise = views.on_piece, _picture_blur_and_noise(views)
     image = _blend(image, piece.back_pixel, piece.back_share, image.new_full((1, 3), PAPER_BACK_LINEAR), views.reduced)
-    light = _piece_light(views, shown)
-    if own is not None:
-        return _pasted(views, image, light, *own)
+    light = _piece_light(views, appearance)
+    if blur_and_noise is not None:
+        return _paste_piece(views, image, light, *blur_and_noise)
     return _smooth(views, _blend(image, piece.pixel, piece.share, light, views.reduced), views.reduced)
 
 
-def expose(views: Views, shown: Appearance, jpeg: bool = True) -> Tensor:
-    """The photographs of what was seen."""
+def expose(views: Views, appearance: Appearance, jpeg: bool = True) -> Tensor:
+    """Return the photographs of rendered views."""
     camera, sensor, scale = views.stage.camera, views.conditions.sensor, _scale(views)
-    bends = camera is not None and camera.bends
-    own = shown is not None and _own_blur_and_noise(views) is not None
-    alone = views.reduced and is_pointwise(sensor, scale, jpeg)
-    if bends or own or isinstance(shown, ObjectTextures) or not alone:
-        light = shade(views, shown)
+    has_distortion = camera is not None and camera.has_distortion
+    has_blur_or_noise = appearance is not None and _picture_blur_and_noise(views) is not None
+    is_local = views.reduced and is_pointwise(sensor, scale, jpeg)
+    if has_distortion or has_blur_or_noise or isinstance(appearance, ObjectTextures) or not is_local:
+        light = shade(views, appearance)
         if camera is not None:
-            light = camera.distorted(light, views.size_px)
+            light = camera.distort_pictures(light, views.size_px)
         return develop(light, sensor, scale, jpeg, camera)
     image = views.bare_exposed
-    if shown is not None:
-        # where each pixel is developed alone, only the piece's own pixels differ from the bare object's photograph
+    if appearance is not None:
+        # if each pixel is developed alone, only the piece's pixels differ from the bare object's photograph
         piece, pixels = views.on_piece, views.frame_px[0] * views.frame_px[1]
         back = encode_light(PAPER_BACK_LINEAR * views.exposure(piece.back_pixel // pixels), camera)
         image = _blend(image, piece.back_pixel, piece.back_share, back, False)
-        light = _piece_light(views, shown) * views.exposure(piece.view)
+        light = _piece_light(views, appearance) * views.exposure(piece.view)
         image = _blend(image, piece.pixel, piece.share, encode_light(light, camera), False)
     return _smooth(views, image, by_code=False)
 
 
 def affected_windows(views: Views) -> np.ndarray | None:
-    """N×4 pixels (left, top, right, bottom) outside of which `expose` makes the same of any design in these views; None
-    where that is not known: of textures, through a lens that bends, and where photographs have blur of their own.
+    """Return N×4 pixels (left, top, right, bottom) outside of which `expose` gives the same for every design in these
+    views. None if that is unknown: for textures, through a lens with distortion, and if photographs have blur of their
+    own.
     """
     camera, scale = views.stage.camera, _scale(views)
     reach = reach_px(views.conditions.sensor, scale)
-    bends = views.frame_px != views.size_px or (camera is not None and camera.bends)
-    if views.piece is None or bends or reach is None or _own_blur_and_noise(views) is not None:
+    has_distortion = views.frame_px != views.size_px or (camera is not None and camera.has_distortion)
+    if views.piece is None or has_distortion or reach is None or _picture_blur_and_noise(views) is not None:
         return None
     width, height = views.size_px
-    return (views.piece.box_px + (reach + _SMOOTHED_PX) * np.array([-1, -1, 1, 1])).clip(0, [width, height] * 2)
+    return (views.piece.box_px + (reach + _OUTLINE_REACH_PX) * np.array([-1, -1, 1, 1])).clip(0, [width, height] * 2)
 
 
-_SMOOTHED_PX = 1  # outlines mix neighbors
+_OUTLINE_REACH_PX = 1  # outlines mix neighboring pixels
 
 
 def _blend(image: Tensor, pixel: Tensor, share: Tensor, value: Tensor, by_code: bool) -> Tensor:
-    """`image` with the share of each pixel replaced by `value`; of light `by_code`, averaged as code values."""
-    if not len(pixel) and not value.requires_grad:  # a design that no view shows has a gradient, too: zero
+    """Return `image` with the share of each pixel replaced by `value`; light `by_code` is averaged as code values."""
+    if not len(pixel) and not value.requires_grad:  # a design that no view shows has a gradient of zero
         return image
-    before, value = image.index_select(0, pixel), value.expand(len(pixel), 3)
+    old, value = image.index_select(0, pixel), value.expand(len(pixel), 3)
     if by_code:
-        mixed = linear_from_srgb(torch.lerp(srgb_from_linear(before), srgb_from_linear(value), share))
+        mixed = linear_from_srgb(torch.lerp(srgb_from_linear(old), srgb_from_linear(value), share))
     else:
-        mixed = torch.lerp(before, value, share)
+        mixed = torch.lerp(old, value, share)
     return image.index_copy(0, pixel, mixed)
 
 
 def _piece_light(views: Views, picture: PiecePicture) -> Tensor:
-    """The light P×3 that the piece's pixels send to the camera."""
-    drawn, piece = views.conditions.print, views.on_piece
+    """Return the light P×3 that the piece's pixels send to the camera."""
+    variation, piece = views.conditions.print, views.on_piece
     reflectance = look_up(piece.texels, picture.codes if views.reduced else picture.light)
     if views.reduced:
         reflectance = linear_from_srgb(reflectance)
-    change = torch.as_tensor(np.stack([drawn.dot_gain, drawn.density, drawn.black], 1)).to(reflectance)
+    change = torch.as_tensor(np.stack([variation.dot_gain, variation.density, variation.black], 1)).to(reflectance)
     return vary_print(reflectance, change.index_select(0, piece.view)) * views.piece_white
 
 
-def _pasted(views: Views, image: Tensor, light: Tensor, blur_px: np.ndarray, noise: np.ndarray) -> Tensor:
-    """The piece put into photographs with their own blur and noise, which the photographs around it have already."""
+def _paste_piece(views: Views, image: Tensor, light: Tensor, blur_px: np.ndarray, noise: np.ndarray) -> Tensor:
+    """Put the piece into photographs with blur and noise of their own, which the photographs around it have already."""
     piece = views.on_piece
     values = torch.cat([light, light.new_ones(len(light), 1)], 1) * piece.share
     layer = _as_pictures(views, torch.zeros(len(image), 4).to(image).index_copy(0, piece.pixel, values))
     layer = gaussian_blur(layer, torch.as_tensor(blur_px).to(image))
     share = layer[:, 3:]
-    whole = _as_pictures(views, image) * (1 - share) + layer[:, :3]
-    seeds = views.conditions.sensor.noise_seed + _OTHER_GRAIN
-    return torch.lerp(whole, add_noise(whole, torch.as_tensor(noise).to(image), seeds), share)
+    pictures = _as_pictures(views, image) * (1 - share) + layer[:, :3]
+    seeds = views.conditions.sensor.noise_seed + _PICTURE_GRAIN_SEED
+    return torch.lerp(pictures, add_noise(pictures, torch.as_tensor(noise).to(image), seeds), share)
 
 
-_OTHER_GRAIN = 1 << 40  # the photograph's own grain is not that of the camera that photographs it again
+_PICTURE_GRAIN_SEED = 1 << 40  # added to the seed: the base photograph's grain is not that of the simulated camera
 
 
-def _own_blur_and_noise(views: Views) -> tuple[np.ndarray, np.ndarray] | None:
-    """What the scene's photographs have of their own, N at this size; None where neither shows."""
-    blur_px, noise = (own * _scale(views) for own in views.stage.scene.picture_blur_and_noise(views.conditions))
+def _picture_blur_and_noise(views: Views) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the blur and noise of the scene's own photographs, N each at this size; None if neither shows."""
+    blur_px, noise = (values * _scale(views) for values in views.stage.scene.picture_blur_and_noise(views.conditions))
     return (blur_px, noise) if blur_px.max() >= SMALLEST_BLUR_PX or noise.max() >= SMALLEST_NOISE else None
 
 
 def _scale(views: Views) -> float:
-    """The pictures' size over the photograph's."""
+    """Return the pictures' size divided by the photograph's."""
     return min(views.size_px) / min(views.stage.scene.settings.camera.photo_px)
 
 
 def _smooth(views: Views, image: Tensor, by_code: bool) -> Tensor:
-    """Pixels by rows as pictures with smooth outlines, mixed as they are or, light `by_code`, as code values."""
+    """Turn pixels by rows into pictures with smooth outlines, mixed as they are or, light `by_code`, as code values."""
     return _as_pictures(views, image if views.outlines is None else views.outlines.smooth(image, by_code))
 
 

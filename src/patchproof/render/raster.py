@@ -1,17 +1,17 @@
-"""A z-buffer rasterizer in plain torch: which face does each pixel center see, and where on that face.
+"""A z-buffer rasterizer in plain torch: find the face that each pixel center sees, and the point on that face.
 
 In: faces in world millimeters and a batch of pinhole cameras. Out: `Fragments`, one per covered pixel, with
-perspective-correct barycentrics, camera depth and what texture filtering needs. Visibility is hard and carries no
-gradient: shape is never optimized.
+perspective-correct barycentrics, camera depth and the derivatives for texture filtering. Visibility is hard and carries
+no gradient: shape is never optimized.
 
-Triangles are split into two trapezoids, those into row spans, spans into fragments, and depth is settled by one integer
-maximum per pixel, so that work follows what is covered. Coverage is exact: corners are snapped to 1/256 pixel, and a
-span reaches from its left edge's first pixel center to that of its right edge, each found from integers that float64
-holds exactly and in one canonical direction of the edge. Hence two triangles that share an edge never both take a pixel
-and never leave one out; a center on an edge belongs to what lies right of it or, on level edges, below (the top-left
-rule of Pineda, 1988). Depth and barycentrics come from the unsnapped face in 2D homogeneous form (Olano and Greer,
-1997), which stays well-defined for faces that reach behind the camera; such faces are cut at the near plane, not
-dropped. Where depths are equal to 24 bits the lower face index wins. Left out on purpose: transparency.
+Triangles are split into two trapezoids, those into row spans, spans into fragments, and depth is resolved by one
+integer maximum per pixel, so that work grows with the covered area. Coverage is exact: corners are snapped to 1/256
+pixel, and a span reaches from its left edge's first pixel center to that of its right edge, each found from integers
+that float64 holds exactly and in one canonical direction of the edge. Hence two triangles that share an edge never both
+take a pixel and never leave one out; a center on an edge belongs to the face on its right or, on level edges, below it
+(the top-left rule of Pineda, 1988). Depth and barycentrics come from the unsnapped face in 2D homogeneous form (Olano
+and Greer, 1997), which stays well-defined for faces that reach behind the camera; such faces are cut at the near plane,
+not dropped. If depths are equal to 24 bits, the lower face index wins. Left out on purpose: transparency.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ from patchproof.render.fragments import Cameras, Fragments, columns
 
 SUBPIXELS = 256  # corners snap to this fraction of a pixel
 # Faces, rows or fragments held at a time. Sixteen views of 20k faces took 1.9 times as long with 2^20, whose
-# temporaries leave the cache; beside the result some 100 MB are held.
+# temporaries do not fit the cache; the temporaries take about 100 MB.
 CHUNK = 1 << 18
-_FACE_BITS = 29  # a key is a float64 of 1/z whose lower bits give way to the face; 23 of the mantissa are left
+_FACE_BITS = 29  # a key is a float64 of 1/z whose lower bits hold the face; 23 bits of the mantissa remain
 _FACE_MASK = (1 << _FACE_BITS) - 1
 _X_BITS = 26  # a snapped corner is one integer, y above x, both from -2^25 up
 _X_MASK, _OFFSET = (1 << _X_BITS) - 1, 1 << (_X_BITS - 1)
@@ -39,27 +39,27 @@ _X_MASK, _OFFSET = (1 << _X_BITS) - 1, 1 << (_X_BITS - 1)
 
 @torch.no_grad()
 def rasterize(vertices: Tensor, faces: Tensor, cameras: Cameras, near_mm: float) -> Fragments:
-    """The nearest face at every pixel center of every camera.
+    """Find the nearest face at every pixel center of every camera.
 
     `vertices` V×3 (world mm), `faces` F×3 (counter-clockwise seen from outside). Faces nearer than `near_mm` are cut
-    there; faces with a corner that is no finite number are not drawn. Refused beyond 2^29 - 1 faces.
+    there; faces with a corner that is not finite are not drawn. Refused beyond 2^29 - 1 faces.
     """
     if len(faces) > _FACE_MASK:
         raise Refused(f"at most {_FACE_MASK} faces", str(len(faces)), "render the mesh in parts")
     width, height = cameras.size_px
     shape, vertices = (len(cameras), height, width), vertices.double()
-    at_once = max(1, CHUNK // max(len(vertices), len(faces), 1))
-    groups = range(0, len(cameras), at_once)
+    views_at_once = max(1, CHUNK // max(len(vertices), len(faces), 1))
+    groups = range(0, len(cameras), views_at_once)
     nearest = torch.zeros(math.prod(shape), dtype=torch.int64, device=faces.device)
     for view in groups:
-        keys = nearest[view * height * width : (view + at_once) * height * width]
-        _settle(keys, homogeneous(vertices, cameras[view : view + at_once]), faces, cameras.size_px, near_mm)
-    fragments = _allocated(nearest, shape)
+        keys = nearest[view * height * width : (view + views_at_once) * height * width]
+        _write_keys(keys, homogeneous(vertices, cameras[view : view + views_at_once]), faces, cameras.size_px, near_mm)
+    fragments = _allocate(nearest, shape)
     del nearest
     slopes = [fragments.slopes]
     for view in groups:
-        points = homogeneous(vertices, cameras[view : view + at_once])
-        ends = fragments.pixel.new_tensor([view, view + at_once]) * (height * width)
+        points = homogeneous(vertices, cameras[view : view + views_at_once])
+        ends = fragments.pixel.new_tensor([view, view + views_at_once]) * (height * width)
         first, last = torch.searchsorted(fragments.pixel, ends).tolist()
         for start in range(first, last, CHUNK):
             part = slice(start, min(start + CHUNK, last))
@@ -69,24 +69,22 @@ def rasterize(vertices: Tensor, faces: Tensor, cameras: Cameras, near_mm: float)
 
 
 def homogeneous(vertices: Tensor, cameras: Cameras) -> Tensor:
-    """3×N×V homogeneous pixel coordinates (x·z, y·z, z); written out, because a matrix product rounds as its size has
-    it.
-    """
+    """Return 3×N×V homogeneous pixels (x·z, y·z, z), written out: a matrix product's rounding depends on its size."""
     x, y, z = vertices.T
     matrix = cameras.matrix_px.double() @ cameras.camera_from_world.double()[:, :3]  # K [R t]
     m = matrix.transpose(0, 1)[..., None]
     return m[:, :, 0] * x + m[:, :, 1] * y + m[:, :, 2] * z + m[:, :, 3]
 
 
-def _settle(nearest: Tensor, points: Tensor, faces: Tensor, size_px: tuple[int, int], near: float) -> None:
-    """Leave in `nearest` the greatest key at each of N·H·W pixels, 0 where nothing is seen."""
+def _write_keys(nearest: Tensor, points: Tensor, faces: Tensor, size_px: tuple[int, int], near: float) -> None:
+    """Write into `nearest` the greatest key at each of N·H·W pixels, 0 for a pixel without a face."""
     width, height = size_px
-    snapped = _snapped(points.flatten(1), near)
+    snapped = _snap(points.flatten(1), near)
     for start in range(0, len(faces), CHUNK):
         block = faces[start : start + CHUNK]
         index = _corner_index(points, block)
         owner, corners = _triangles(points.flatten(1), snapped, index, size_px, near)
-        (_, _, plane), _ = _planes(_taken(points, [i.index_select(0, owner) for i in index]), near)
+        (_, _, plane), _ = _planes(_take_corners(points, [i.index_select(0, owner) for i in index]), near)
         first_pixel = owner // len(block) * (height * width)
         face_key = _FACE_MASK - start - owner % len(block)  # the lower face has the greater key
         trapezoids = _trapezoids(corners, height)
@@ -96,54 +94,54 @@ def _settle(nearest: Tensor, points: Tensor, faces: Tensor, size_px: tuple[int, 
 
 
 def _corner_index(points: Tensor, faces: Tensor) -> list[Tensor]:
-    """Where each face's first, second and third corner lies among N·V points; N·F each."""
+    """Return the indices of each face's first, second and third corner among N·V points; N·F each."""
     _, views, count = points.shape
     offset = torch.arange(views, device=faces.device)[:, None] * count
     return [(offset + column).flatten() for column in faces.unbind(1)]
 
 
-def _taken(points: Tensor, index: list[Tensor]) -> list[list[Tensor]]:
-    """(x·z, y·z, z) of the three corners of faces. One axis at a time: torch is several times slower on all three."""
+def _take_corners(points: Tensor, index: list[Tensor]) -> list[list[Tensor]]:
+    """Return (x·z, y·z, z) of faces' three corners, one axis at a time: torch is several times slower on all."""
     return [[axis.index_select(0, i) for axis in points.flatten(1)] for i in index]
 
 
-def _snapped(points: Tensor, near: float) -> Tensor:
-    """N·V corners on the 1/256 pixel grid, each one integer; -1 where a face must be cut or left out."""
+def _snap(points: Tensor, near: float) -> Tensor:
+    """Return N·V corners on the 1/256 pixel grid, each one integer; -1 if a face must be cut or left out."""
     x, y, z = points
     plain = (z > near) & (torch.maximum(x.abs(), y.abs()) < GUARD_PX * z)
-    return _packed(x / z, y / z).masked_fill_(~plain, -1)
+    return _pack(x / z, y / z).masked_fill_(~plain, -1)
 
 
-def _packed(x: Tensor, y: Tensor) -> Tensor:
+def _pack(x: Tensor, y: Tensor) -> Tensor:
     x, y = (x * SUBPIXELS).round_(), (y * SUBPIXELS).round_()
     return (y * (1 << _X_BITS) + x + ((_OFFSET << _X_BITS) + _OFFSET)).nan_to_num_(0, 0, 0).long()  # below 2^53: exact
 
 
-def _unpacked(corner: Tensor) -> tuple[Tensor, Tensor]:
+def _unpack(corner: Tensor) -> tuple[Tensor, Tensor]:
     return (corner & _X_MASK) - _OFFSET, (corner >> _X_BITS) - _OFFSET
 
 
 def _center(snapped: Tensor, limit: int) -> Tensor:
-    """The first pixel whose center is at or after a snapped coordinate, within 0..limit."""
+    """Return the first pixel whose center is at or after a snapped coordinate, within 0..limit."""
     return (snapped + (SUBPIXELS // 2 - 1)).bitwise_right_shift_(8).clamp_(0, limit)  # 2^8 = SUBPIXELS
 
 
 def _triangles(points: Tensor, snapped: Tensor, index: list[Tensor], size_px: tuple[int, int], near: float):
-    """Snapped triangles that may hold a pixel center, and whose of the N·F faces they are; the cut ones come last."""
+    """Return snapped triangles that may hold a pixel center, and their faces among N·F; cut ones come last."""
     a, b, c = corners = [snapped.index_select(0, i) for i in index]
     holds = a >= 0
-    for axis, limit in zip(zip(*(_unpacked(corner) for corner in corners), strict=True), size_px, strict=True):
+    for axis, limit in zip(zip(*(_unpack(corner) for corner in corners), strict=True), size_px, strict=True):
         low, high = _extent(*axis)
         holds &= _center(low, limit) < _center(high, limit)
-    torn = torch.minimum(torch.minimum(a, b), c) < 0
-    owner = (holds & ~torn).nonzero()[:, 0]
+    to_clip = torch.minimum(torch.minimum(a, b), c) < 0
+    owner = (holds & ~to_clip).nonzero()[:, 0]
     corners = [corner.index_select(0, owner) for corner in corners]
-    torn = torn.nonzero()[:, 0]
-    if len(torn):
-        whole = torch.stack([points.index_select(1, i.index_select(0, torn)).T for i in index], 1)
-        triangles, of = clip_triangles(whole, near)
-        cut = _packed(*triangles.unbind(-1)).unbind(1)
-        owner = torch.cat([owner, torn[of]])
+    to_clip = to_clip.nonzero()[:, 0]
+    if len(to_clip):
+        unclipped = torch.stack([points.index_select(1, i.index_select(0, to_clip)).T for i in index], 1)
+        triangles, parent = clip_triangles(unclipped, near)
+        cut = _pack(*triangles.unbind(-1)).unbind(1)
+        owner = torch.cat([owner, to_clip[parent]])
         corners = [torch.cat(pair) for pair in zip(corners, cut, strict=True)]
     return owner, corners
 
@@ -153,11 +151,11 @@ def _extent(a: Tensor, b: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _planes(corners: list[list[Tensor]], near: float) -> tuple[list[list[Tensor]], Tensor]:
-    """Planes e with e · (x, y, 1) = b/z for the second and third barycentric b and for their sum 1, and the signed
-    volume, negative from outside.
+    """Return planes e with e · (x, y, 1) = b/z for the second and third barycentric b and for their sum 1, and the
+    signed volume, negative from outside.
 
-    Where a face's horizon passes within 1/25 pixel of it, it is seen edge-on: a snap may turn it over, and its planes
-    say nothing. It is drawn flat at its mean 1/z.
+    A face whose horizon passes within 1/25 pixel of it is seen edge-on: snapping may turn it over, and its planes are
+    useless. It is drawn flat at its mean 1/z.
     """
     a, b, c = corners
     total = cross([q - p for p, q in zip(a, b, strict=True)], [q - p for p, q in zip(a, c, strict=True)])
@@ -176,10 +174,10 @@ def _planes(corners: list[list[Tensor]], near: float) -> tuple[list[list[Tensor]
 
 
 def _trapezoids(corners: list[Tensor], height: int) -> list[Tensor]:
-    """The upper and the lower part of each triangle: first row, row count, its long and its short edge."""
+    """Return the upper and the lower part of each triangle: first row, row count, its long and its short edge."""
     a, b, c = corners
     top, bottom = _extent(a, b, c)
-    top, middle, bottom = (_unpacked(corner) for corner in (top, a + b + c - top - bottom, bottom))
+    top, middle, bottom = (_unpack(corner) for corner in (top, a + b + c - top - bottom, bottom))
     rows = [_center(corner[1], height) for corner in (top, middle, bottom)]
     short = [torch.cat(pair) for pair in zip(_edge(top, middle), _edge(middle, bottom), strict=True)]
     first, count = torch.cat(rows[:2]), torch.cat([rows[1] - rows[0], rows[2] - rows[1]])
@@ -187,7 +185,7 @@ def _trapezoids(corners: list[Tensor], height: int) -> list[Tensor]:
 
 
 def _edge(upper: tuple[Tensor, Tensor], lower: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-    """(n, k, d): in row y the first pixel center right of the edge, or on it, is pixel ceil((n + k y) / d).
+    """Return (n, k, d): in row y the first pixel center right of the edge, or on it, is pixel ceil((n + k y) / d).
 
     All are integers below 2^53, so that the float64 quotient has the right ceiling.
     """
@@ -197,7 +195,7 @@ def _edge(upper: tuple[Tensor, Tensor], lower: tuple[Tensor, Tensor]) -> tuple[T
 
 
 def _spans(trapezoids: list[Tensor], owners: list[Tensor], width: int) -> tuple[Tensor, ...]:
-    """Of each row of the trapezoids: pixel count, first pixel, 1/z there, its change per pixel, and the face key."""
+    """Return for each row of trapezoids: pixel count, first pixel, 1/z there, its change per pixel, face key."""
     first, count, *edges = trapezoids
     owner = torch.repeat_interleave(count)
     row = index_ranges(count, first, owner)
@@ -214,26 +212,26 @@ def _spans(trapezoids: list[Tensor], owners: list[Tensor], width: int) -> tuple[
 
 
 def index_ranges(count: Tensor, first: Tensor, owner: Tensor) -> Tensor:
-    """first, first + 1, ... for each owner, `count` of them."""
+    """Return first, first + 1, ... for each owner, `count` of them."""
     shift = first - count.cumsum(0) + count
     return torch.arange(len(owner), device=owner.device).add_(shift.index_select(0, owner))
 
 
 def _fill(nearest: Tensor, length: Tensor, pixel: Tensor, inverse: Tensor, slope: Tensor, face_key: Tensor) -> None:
-    """Settle the nearest face of every pixel of these spans."""
+    """Write the nearest face of every pixel of these spans."""
     for part in _chunks(length):
         count, first = length[part], pixel[part]
         owner = torch.repeat_interleave(count)
         step = index_ranges(count, torch.zeros_like(count), owner)
         value = inverse[part].index_select(0, owner).addcmul_(slope[part].index_select(0, owner), step)
-        # bits of positive floats order like the numbers; beyond its horizon a face is far away
+        # the bits of positive floats order like the numbers; beyond its horizon a face counts as far away
         key = value.clamp_min_(1e-30).view(torch.int64).bitwise_and_(~_FACE_MASK)
         key.bitwise_or_(face_key[part].index_select(0, owner))
         nearest.scatter_reduce_(0, step.add_(first.index_select(0, owner)), key, "amax")
 
 
-def _allocated(nearest: Tensor, shape: tuple[int, int, int]) -> Fragments:
-    """Fragments that know their pixels and faces, with room for the rest: joining pieces would need it twice."""
+def _allocate(nearest: Tensor, shape: tuple[int, int, int]) -> Fragments:
+    """Return fragments with their pixels and faces, and memory for the rest: joining pieces would need it twice."""
     pixel = nearest.nonzero()[:, 0]
     face = nearest.index_select(0, pixel).bitwise_and_(_FACE_MASK).neg_().add_(_FACE_MASK)
     depth, front = (torch.empty_like(pixel, dtype=dtype) for dtype in (torch.float32, torch.bool))
@@ -243,18 +241,18 @@ def _allocated(nearest: Tensor, shape: tuple[int, int, int]) -> Fragments:
 
 
 def _resolve(fragments: Fragments, part: slice, points: Tensor, faces: Tensor, view0: int, near: float) -> Tensor:
-    """Fill in one part of the fragments, all within the views of `points`; returns the slopes of the faces seen."""
+    """Fill in one part of the fragments, all within the views of `points`; return the slopes of the faces seen."""
     _, height, width = fragments.shape
-    at = fragments.pixel[part].double()
-    row = (at / width).floor_()
+    position = fragments.pixel[part].double()
+    row = (position / width).floor_()
     view = (row / height).floor_()
-    x, y = at.sub_(row, alpha=width).add_(0.5), row.sub_(view, alpha=height).add_(0.5)
+    x, y = position.sub_(row, alpha=width).add_(0.5), row.sub_(view, alpha=height).add_(0.5)
     pair = view.long().sub_(view0).mul_(len(faces)).add_(fragments.face[part])
     owner, rank = ranked(pair, points.shape[1] * len(faces))
-    corners = _taken(points, [i.index_select(0, owner) for i in _corner_index(points, faces)])
+    corners = _take_corners(points, [i.index_select(0, owner) for i in _corner_index(points, faces)])
     planes, volume = _planes(corners, near)
     second, third, inverse = (_at_center(plane, rank, x, y) for plane in planes)
-    # a center may lie up to 1/362 pixel outside of the unsnapped face, which near its horizon is far away
+    # a center may lie up to 1/362 pixel outside the unsnapped face, where the plane may be far away near its horizon
     deepest = torch.stack([corner[2].max() for corner in corners]).max()
     z = inverse.clamp_min_(0.5 / deepest).clamp_max_(1 / near).reciprocal_()
     second, third = second.mul_(z), third.mul_(z)
@@ -266,7 +264,7 @@ def _resolve(fragments: Fragments, part: slice, points: Tensor, faces: Tensor, v
 
 
 def ranked(values: Tensor, limit: int) -> tuple[Tensor, Tensor]:
-    """The distinct values below `limit`, ascending, and where each value lies among them; `unique` would sort."""
+    """Return the distinct values below `limit`, ascending, and each value's index among them; `unique` would sort."""
     present = torch.zeros(limit, dtype=torch.bool, device=values.device).index_fill_(0, values, True)
     distinct = present.nonzero()[:, 0]
     rank = torch.empty(limit, dtype=torch.int64, device=values.device)
@@ -280,10 +278,10 @@ def _at_center(plane: list[Tensor], rank: Tensor, x: Tensor, y: Tensor) -> Tenso
 
 
 def _chunks(sizes: Tensor):
-    """Slices over `sizes` whose sums stay below CHUNK, or hold one item."""
+    """Yield slices over `sizes` whose sums stay below CHUNK, or that hold one item."""
     ends = sizes.cumsum(0)
     start, done = 0, 0
-    if len(sizes) and int(ends[-1]) <= CHUNK:  # one question to the device, not two for each slice
+    if len(sizes) and int(ends[-1]) <= CHUNK:  # one synchronization with the device, not two for each slice
         yield slice(0, len(sizes))
         return
     while start < len(sizes):

@@ -1,7 +1,7 @@
 """A stage: a scene's tensors on one device, set up once and photographed many times.
 
-In: a scene of any kind. Out: `Stage`: the piece as a surface of millimeters, for scenes with a mesh the object with its
-textures, and how a design looks there. Scenes made of pictures have no object.
+In: a scene of any kind. Out: `Stage`: the piece as a surface of millimeters; for scenes with a mesh, the object with
+its textures; and the rendering of designs. Scenes made of pictures have no object.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Stage:
-    """A scene on `device`; `object` is None for scenes made of pictures, `piece` where nothing hangs on the object."""
+    """A scene on `device`; `object` is None for scenes made of pictures, `piece` if nothing hangs on the object."""
 
     scene: Scene
     device: torch.device
@@ -33,12 +33,12 @@ class Stage:
 
     @property
     def camera(self) -> Camera | None:
-        """The scene's calibrated one."""
+        """The scene's calibrated camera, if any."""
         return self.scene.camera
 
     @cached_property
-    def look(self) -> PrintedPiece | LearnedTextures:
-        """What designs look like here: as the scene's printer prints them, or as textures."""
+    def design_renderer(self) -> PrintedPiece | LearnedTextures:
+        """Renders designs as they look here: as the scene's printer prints them, or as textures."""
         if not self.scene.HAS_PIECE:
             return LearnedTextures(self.scene.object_canvas(), self.device)
         scene = require_piece(self.scene)
@@ -47,14 +47,14 @@ class Stage:
 
     @property
     def object_surface(self) -> ObjectSurface:
-        """The object's surface; a ValueError where there is none."""
+        """The object's surface; a ValueError if there is none."""
         if self.object is None:
             raise ValueError("a scene made of pictures has no object's surface")
         return self.object
 
     @property
     def piece_surface(self) -> PieceSurface:
-        """The piece's surface; a ValueError where nothing hangs on the object."""
+        """The piece's surface; a ValueError if nothing hangs on the object."""
         if self.piece is None:
             raise ValueError("nothing hangs on the object")
         return self.piece

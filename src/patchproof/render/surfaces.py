@@ -21,7 +21,7 @@ from patchproof.render.edges import Edges, find_edges
 from patchproof.render.texture import TexelLayout, texel_layout, texel_table
 from patchproof.scene.interface import PieceScene
 
-# Of the piece's sides: half a pixel beyond the edge is enough down to a piece of 7 pixels, or 75° of tilt at 25.
+# A share of the piece's sides: half a pixel, the need, down to pieces of 7 pixels, or of 25 pixels at 75° of tilt.
 MARGIN_SHARE = 0.1
 
 
@@ -38,7 +38,7 @@ class PieceSurface:
 
 @dataclass(frozen=True)
 class ObjectSurface:
-    """The object: faces over `vertices`, and per face corner F×3×8 what is interpolated on it: uv, color (vertex color
+    """The object: faces over `vertices`, and per face corner F×3×8 the values to interpolate: uv, color (vertex color
     times base color, linear) and normal.
     """
 
@@ -51,17 +51,17 @@ class ObjectSurface:
 
     @cached_property
     def corner_uv(self) -> Tensor:
-        """Texture coordinates alone, F×3×2."""
+        """The texture coordinates alone, F×3×2."""
         return self.corners[..., :2].contiguous()
 
     @cached_property
     def layout(self) -> TexelLayout:
-        """Where the texels of textures lie that may change."""
+        """The positions of the texels of textures that may change."""
         return texel_layout(self._sizes_px, wrap=True, device=self.material.device)
 
     @cached_property
     def atlas(self) -> TexelLayout:
-        """Where those of fixed textures lie."""
+        """The positions of the texels of fixed textures."""
         return atlas_layout(self._sizes_px, self.material.device)
 
     @property
@@ -69,7 +69,7 @@ class ObjectSurface:
         return [(texture.shape[1], texture.shape[0]) for texture in self.textures_srgb]
 
     def texels(self, reduced: bool, fixed: bool) -> Tensor:
-        """The `light_texels` of its own textures: `fixed` in their atlas, else where others may take their place."""
+        """Return the `light_texels` of its textures: in their atlas if `fixed`, else in the changeable layout."""
         if (reduced, fixed) not in self._tables:
             self._tables[reduced, fixed] = light_texels(self.textures_srgb, reduced, self.atlas if fixed else None)
         return self._tables[reduced, fixed]
@@ -80,17 +80,17 @@ class ObjectSurface:
 
 
 def light_texels(textures_srgb: Sequence[Tensor], reduced: bool, atlas: TexelLayout | None = None) -> Tensor:
-    """The T×3 linear light of textures that repeat, their mip levels averaged as light or, `reduced`, as code values;
-    differentiable, but in an `atlas`.
+    """Return the T×3 linear light of textures that repeat, their mip levels averaged as light or, `reduced`, as code
+    values; differentiable except in an `atlas`.
     """
-    table = partial(texel_table, wrap=True) if atlas is None else partial(atlas_table, where=atlas)
+    table = partial(texel_table, wrap=True) if atlas is None else partial(atlas_table, layout=atlas)
     if reduced:
         return linear_from_srgb(table(list(textures_srgb)))
     return table([linear_from_srgb(texture) for texture in textures_srgb])
 
 
 def object_surface(mesh: Mesh, device: torch.device) -> ObjectSurface:
-    """The mesh with its textures."""
+    """Return the surface of a mesh with its textures."""
     base = np.array([material.base_color_linear for material in mesh.materials], np.float32)
     srgb = [material.texture_srgb for material in mesh.materials]
     textures = (torch.ones(1, 1, 3) if t is None else torch.tensor(t, dtype=torch.float32) / 255 for t in srgb)
@@ -103,14 +103,14 @@ def object_surface(mesh: Mesh, device: torch.device) -> ObjectSurface:
 
 
 def piece_surface(scene: PieceScene, device: torch.device) -> PieceSurface:
-    """A scene's piece, gone on straight beyond its border on all sides."""
+    """Return the surface of a scene's piece, continued straight beyond its border on all sides."""
     vertices, normals, piece_mm = scene.paper()
     width_mm, height_mm = piece_mm.max(0).tolist()
     size_mm = width_mm, height_mm
     columns, rows = (len(np.unique(piece_mm[:, i])) for i in range(2))
     grid = np.concatenate([vertices, normals, piece_mm], 1).reshape(rows, columns, 8)
     for axis, (side, count) in enumerate(zip(size_mm[::-1], (rows, columns), strict=True)):
-        grid = _longer(grid, axis, MARGIN_SHARE * side / (side / (count - 1)))
+        grid = _extend_grid(grid, axis, MARGIN_SHARE * side / (side / (count - 1)))
     rows, columns = grid.shape[:2]
     corner = np.arange(rows * columns).reshape(rows, columns)
     a, b, c, d = corner[:-1, :-1], corner[:-1, 1:], corner[1:, 1:], corner[1:, :-1]
@@ -121,8 +121,8 @@ def piece_surface(scene: PieceScene, device: torch.device) -> PieceSurface:
     return PieceSurface(flat[:, :3].contiguous(), faces, at_corners[..., 6:], at_corners[..., 3:6], size_mm)
 
 
-def _longer(grid: np.ndarray, axis: int, steps: float) -> np.ndarray:
-    """The grid with one more row (or column) at either end, `steps` of its spacing away in a straight line."""
+def _extend_grid(grid: np.ndarray, axis: int, steps: float) -> np.ndarray:
+    """Return the grid with one more row (or column) at either end, `steps` of its spacing away in a straight line."""
     grid = np.moveaxis(grid, axis, 0)
     before, after = grid[0] + steps * (grid[0] - grid[1]), grid[-1] + steps * (grid[-1] - grid[-2])
     return np.moveaxis(np.concatenate([before[None], grid, after[None]]), 0, axis)

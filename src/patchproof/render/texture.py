@@ -1,14 +1,14 @@
-"""Textures with mip levels: where each fragment looks (`Footprint`) and what it sees there (`look_up`).
+"""Textures with mip levels: the texels that each fragment looks at (`Footprint`) and their color (`look_up`).
 
 In: textures H×W×3 and, per fragment, uv (textures, v down from the top-left) with its screen derivatives. Out: P×3. A
 footprint depends on the view alone, so one footprint serves every content that the texture takes while it is optimized;
 `look_up` is the only step that backpropagates, and its gradient reaches each texel that was seen and no other.
 
 A pixel sees the mean over its footprint, the parallelogram that its sides span on the texture. `footprint` takes it
-over a grid of bilinear taps no more than a texel apart, as many along each side as that is long, so that work follows
-the texels seen. Mip levels of exact box averages bound their number. The usual trilinear look-up along the longer side
-(Feline, McCormack et al., 1999) left an optimized design 20 to 30 dB from 16×16 samples per pixel, this 33 to 57. Left
-out on purpose: weights other than the pixel's own square.
+over a grid of bilinear taps no more than a texel apart, with a number along each side that grows with its length, so
+that work grows with the texels seen. Mip levels of exact box averages limit the number. The usual trilinear look-up
+along the longer side (Feline, McCormack et al., 1999) left an optimized design 20 to 30 dB from 16×16 samples per
+pixel, this one 33 to 57. Left out on purpose: weights other than the pixel's own square.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from torch.nn import functional as F
 
 @dataclass(frozen=True)
 class TexelLayout:
-    """Where the mip levels of K textures lie in one T×3 table of texels.
+    """The positions of the mip levels of K textures in one T×3 table of texels.
 
-    `places` (K·L)×3 has each level's width, height and first texel, `levels` K how many of the L a texture has.
+    `places` (K·L)×3 has each level's width, height and first texel; `levels` K has how many of the L a texture has.
 
-    Each level has one more row and column than its size, for bilinear taps to read beyond the last texel: the first
-    ones again where textures repeat (`wrap`), else the last ones. Its rows follow each other, or lie `pitch` texels
-    apart where the table is one picture (atlas.py).
+    Each level has one more row and column than its size, for bilinear taps that read beyond the last texel: the first
+    ones again if textures repeat (`wrap`), else the last ones. Its rows follow each other, or lie `pitch` texels apart
+    if the table is one picture (atlas.py).
     """
 
     places: Tensor
@@ -40,14 +40,14 @@ class TexelLayout:
     pitch: int | None = None
 
     def place(self, texture: Tensor, level: Tensor | int) -> tuple[Tensor, Tensor]:
-        """(width and height P×2 float, first texel P) of levels of textures."""
+        """Return (width and height P×2 float, first texel P) of levels of textures."""
         place = self.places.index_select(0, texture * (len(self.places) // len(self.levels)) + level)
         return place[:, :2].float(), place[:, 2]
 
 
 @dataclass(frozen=True)
 class TapGroup:
-    """Fragments G with as many taps each: the `texel` and `weight` G×J they see."""
+    """G fragments with as many taps each: the `texel` and `weight` G×J that they see."""
 
     fragment: Tensor | None  # None: all of them, in order
     texel: Tensor
@@ -56,13 +56,13 @@ class TapGroup:
 
 @dataclass(frozen=True)
 class Footprint:
-    """What P fragments see."""
+    """The texels that P fragments see, with weights."""
 
     groups: tuple[TapGroup, ...]
     fragments: int
 
     def part(self, first: int, last: int) -> Footprint:
-        """What the fragments from `first` up to `last` see."""
+        """Return the footprint of the fragments from `first` up to `last`."""
         groups = []
         for group in self.groups:
             if group.fragment is None:
@@ -75,7 +75,7 @@ class Footprint:
 
 
 def texel_layout(sizes: list[tuple[int, int]], wrap: bool, device: torch.device | str = "cpu") -> TexelLayout:
-    """The layout for textures of (width, height) sizes; `wrap` repeats them, else the border texel goes on."""
+    """Return the layout for textures of (width, height) sizes; `wrap` repeats them, else the border texel continues."""
     depth = max(max(size).bit_length() for size in sizes)
     table, offset = [], 0
     for width, height in sizes:
@@ -91,7 +91,7 @@ def texel_layout(sizes: list[tuple[int, int]], wrap: bool, device: torch.device 
 
 
 def texel_table(textures: list[Tensor], wrap: bool) -> Tensor:
-    """The T×3 texels of all mip levels of H×W×3 textures, in the order of `texel_layout`; differentiable."""
+    """Return the T×3 texels of all mip levels of H×W×3 textures, in the order of `texel_layout`; differentiable."""
     parts, edge = [], 0 if wrap else -1
     for level in chain.from_iterable(map(mip_levels, textures)):
         padded = torch.cat([level, level[:, edge, None]], 1)
@@ -100,22 +100,22 @@ def texel_table(textures: list[Tensor], wrap: bool) -> Tensor:
 
 
 def mip_levels(texture: Tensor) -> Iterator[Tensor]:
-    """A texture H×W×3, its half, and so on to one texel."""
+    """Yield a texture H×W×3, its half, and so on down to one texel."""
     yield texture
     for _ in range(max(texture.shape[:2]).bit_length() - 1):
-        texture = _smaller(texture)
+        texture = _half_size(texture)
         yield texture
 
 
-def _smaller(level: Tensor) -> Tensor:
-    """Half the rows and columns of H×W×3."""
+def _half_size(level: Tensor) -> Tensor:
+    """Return H×W×3 with half the rows and columns."""
     if level.shape[0] % 2 or level.shape[1] % 2:
-        return _halved(_halved(level).transpose(0, 1)).transpose(0, 1)
-    return F.avg_pool2d(level.permute(2, 0, 1)[None], 2)[0].permute(1, 2, 0)  # the same by a tenth of the operations
+        return _half_rows(_half_rows(level).transpose(0, 1)).transpose(0, 1)
+    return F.avg_pool2d(level.permute(2, 0, 1)[None], 2)[0].permute(1, 2, 0)  # the same, with a tenth of the operations
 
 
-def _halved(level: Tensor) -> Tensor:
-    """Half the rows (rounded down, at least one), each the average of exactly what it covers.
+def _half_rows(level: Tensor) -> Tensor:
+    """Return half the rows (rounded down, at least one), each the average of exactly the rows that it covers.
 
     Of 2m + 1 rows, row i of m covers two and 1/m; weights of Guthe and Heckbert, Non-Power-of-Two Mipmapping (2005).
     Averages over whole rows instead would stretch a texture by up to half a row at either end.
@@ -131,7 +131,7 @@ def _halved(level: Tensor) -> Tensor:
 
 
 def footprint(
-    where: TexelLayout,
+    layout: TexelLayout,
     texture: Tensor,
     uv: Tensor,
     uv_dx: Tensor,
@@ -139,51 +139,52 @@ def footprint(
     taps: int,
     blocks: bool = False,
 ) -> Footprint:
-    """What P fragments of `texture` (P, index into the layout) see; `uv_dx`, `uv_dy` P×2: uv change per pixel.
+    """Return the footprint of P fragments of `texture` (P, index into the layout); `uv_dx`, `uv_dy` P×2: uv change per
+    pixel.
 
-    At most `taps` along the footprint's shorter side and twice as many along the longer one; where `taps` is 1 one in
-    all, for up to two texels, which is how far it reaches. Texels are points to interpolate between, or `blocks` of one
-    color, as printed pixels are.
+    There are at most `taps` along the footprint's shorter side and twice as many along the longer one; if `taps` is 1,
+    a single tap for up to two texels, which is as far as it reaches. Texels are points to interpolate between, or
+    `blocks` of one color, as printed pixels are.
     """
-    size, _ = where.place(texture, 0)
+    size, _ = layout.place(texture, 0)
     spans = _length(uv_dx * size), _length(uv_dy * size)
-    level, counts = tap_grids(*spans, where.levels.index_select(0, texture), taps)
-    size, offset = where.place(texture, level)
-    at = (uv * size - 0.5, uv_dx * size, uv_dy * size, size, offset)
+    level, counts = tap_grids(*spans, layout.levels.index_select(0, texture), taps)
+    size, offset = layout.place(texture, level)
+    tap_arguments = (uv * size - 0.5, uv_dx * size, uv_dy * size, size, offset)
     if counts is None:
-        return Footprint((TapGroup(None, *_taps(*at, 1, 1, where, blocks)),), len(uv))
+        return Footprint((TapGroup(None, *_taps(*tap_arguments, 1, 1, layout, blocks)),), len(uv))
     order, grids = group_by_grid(*counts)
     groups = []
     for columns, rows, first, last in grids:
         fragment = order[first:last]
-        center, dx, dy, level_size, corner = (values.index_select(0, fragment) for values in at)
-        groups.append(TapGroup(fragment, *_taps(center, dx, dy, level_size, corner, columns, rows, where, blocks)))
+        center, dx, dy, level_size, corner = (values.index_select(0, fragment) for values in tap_arguments)
+        groups.append(TapGroup(fragment, *_taps(center, dx, dy, level_size, corner, columns, rows, layout, blocks)))
     return Footprint(tuple(groups), len(uv))
 
 
 def tap_grids(across: Tensor, down: Tensor, levels: Tensor, taps: int) -> tuple[Tensor, tuple[Tensor, Tensor] | None]:
-    """The mip level that each of P footprints is seen on, and how many taps it takes across and down; None: one in all.
-    Footprints are so many texels of the finest of their texture's `levels` wide and high.
+    """Return the mip level for each of P footprints, and the numbers of taps across and down; None for a single tap.
+    `across` and `down` are the footprints' sizes in texels of the finest of their texture's `levels`.
     """
-    most = 2 * taps if taps > 1 else 1
-    level = _levels(torch.minimum(across, down), torch.maximum(across, down), taps, most).minimum(levels - 1)
-    if most == 1:
+    max_taps = 2 * taps if taps > 1 else 1
+    level = _levels(torch.minimum(across, down), torch.maximum(across, down), taps, max_taps).minimum(levels - 1)
+    if max_taps == 1:
         return level, None
     texel_span = torch.exp2(-level.float())
-    across, down = ((side * texel_span).ceil().clamp(1, most).short() for side in (across, down))
+    across, down = ((side * texel_span).ceil().clamp(1, max_taps).short() for side in (across, down))
     return level, (across, down)
 
 
 def group_by_grid(across: Tensor, down: Tensor) -> tuple[Tensor, list[tuple[int, int, int, int]]]:
-    """Footprints in the order of their grids, those of one grid as they came, and of each grid columns, rows, and where
-    in that order its first and the one after its last are.
+    """Sort footprints by their grids, keeping the order within a grid. Return that order and, for each grid, its
+    columns and rows, and the first index and the end of its footprints in that order.
     """
-    many = 1 << 7
-    found, order = (across * many + down).sort(stable=True)
-    keys, sizes = found.unique_consecutive(return_counts=True)
+    base = 1 << 7
+    sorted_keys, order = (across * base + down).sort(stable=True)
+    keys, sizes = sorted_keys.unique_consecutive(return_counts=True)
     grids, first = [], 0
     for key, size in torch.stack([keys, sizes]).T.tolist():
-        grids.append((*divmod(key, many), first, first + size))
+        grids.append((*divmod(key, base), first, first + size))
         first += size
     return order, grids
 
@@ -193,10 +194,10 @@ def _length(vectors: Tensor) -> Tensor:
     return (x * x + y * y).sqrt()
 
 
-def _levels(shorter: Tensor, longer: Tensor, taps: int, most: int) -> Tensor:
-    """The finest level on which the taps are no more than a texel apart, a single one alone for no more than two."""
-    each = 2 if most == 1 else 1
-    coarse = torch.maximum((shorter / (each * taps)).log2(), (longer / (each * most)).log2()).ceil()
+def _levels(shorter: Tensor, longer: Tensor, taps: int, max_taps: int) -> Tensor:
+    """Return the finest level on which taps are at most a texel apart; a single tap may cover two texels."""
+    reach = 2 if max_taps == 1 else 1
+    coarse = torch.maximum((shorter / (reach * taps)).log2(), (longer / (reach * max_taps)).log2()).ceil()
     return coarse.clamp_min(0).long()
 
 
@@ -208,30 +209,32 @@ def _taps(
     offset: Tensor,
     columns: int,
     rows: int,
-    where: TexelLayout,
+    layout: TexelLayout,
     blocks: bool,
 ) -> tuple[Tensor, Tensor]:
-    """Texels and weights G×(4·rows·columns) of a grid of taps round `center` G×2, in texels of one level.
+    """Return texels and weights G×(4·rows·columns) of a grid of taps round `center` G×2, in texels of one level.
 
-    Between points, a tap is bilinear. Of blocks it takes the mean over its own cell of the grid: exactly, where cell
-    and blocks are parallel, else over the upright box of the same extent (root of summed squares).
+    Between points, a tap is bilinear. Of blocks it takes the mean over its own cell of the grid: exactly, if cell and
+    blocks are parallel, else over the upright box of the same extent (root of summed squares).
     """
     step_x, step_y = step_x / columns, step_y / rows
-    at = center[:, :, None, None] + step_x[:, :, None, None] * tap_offsets(columns, center.device)
-    at = at + step_y[:, :, None, None] * tap_offsets(rows, center.device)[:, None]
+    position = center[:, :, None, None] + step_x[:, :, None, None] * tap_offsets(columns, center.device)
+    position = position + step_y[:, :, None, None] * tap_offsets(rows, center.device)[:, None]
     size = size[:, :, None, None]
-    if where.wrap:
-        at = at - (at / size).floor() * size
-        low = torch.minimum(at.floor(), size - 1)  # rounding may leave a wrapped place at the size itself
+    if layout.wrap:
+        position = position - (position / size).floor() * size
+        low = torch.minimum(position.floor(), size - 1)  # rounding may leave a wrapped place at the size itself
     else:
-        at = torch.clamp(at, torch.zeros_like(size), size - 1)
-        low = at.floor()
-    share = at.sub_(low)
+        position = torch.clamp(position, torch.zeros_like(size), size - 1)
+        low = position.floor()
+    share = position.sub_(low)
     if blocks:
         per_cell = 1 / (step_x * step_x + step_y * step_y).sqrt().clamp(1e-6, 1)[:, :, None, None]
         share = torch.addcmul(0.5 - 0.5 * per_cell, share, per_cell).clamp_(0, 1)
     x, y = share.unbind(1)
-    stride = size[:, 0].int() + 1 if where.pitch is None else torch.full_like(size[:, 0], where.pitch, dtype=torch.int)
+    stride = (
+        size[:, 0].int() + 1 if layout.pitch is None else torch.full_like(size[:, 0], layout.pitch, dtype=torch.int)
+    )
     texel = torch.empty(len(center), 4, rows, columns, dtype=torch.int, device=center.device)
     low = low.int()
     first = torch.add(low[:, 1] * stride, low[:, 0] + offset[:, None, None].int(), out=texel[:, 0])
@@ -247,18 +250,18 @@ def _taps(
 
 @lru_cache
 def tap_offsets(count: int, device: torch.device) -> Tensor:
-    """Where so many taps stand, one apart round 0."""
+    """Return the offsets of `count` taps, one apart round 0."""
     return torch.arange(count, device=device) - (count - 1) / 2
 
 
 def look_up(footprint: Footprint, texels: Tensor) -> Tensor:
-    """The P×3 that footprints see in a T×3 table; differentiable in `texels`."""
+    """Return the P×3 that footprints see in a T×3 table; differentiable in `texels`."""
     return _LookUp.apply(texels, footprint)
 
 
 class _LookUp(torch.autograd.Function):
-    """A weighted gather. The library's own backward of the same sum took six times longer, adding rows of three instead
-    of one channel at a time four times (2 cores, 45k × 64).
+    """A weighted gather. The library's own backward of this sum took six times longer, adding rows of three instead of
+    one channel at a time four times (2 cores, 45k × 64).
     """
 
     @staticmethod
@@ -279,7 +282,7 @@ class _LookUp(torch.autograd.Function):
         out = gradient.new_zeros(3, ctx.texels)
         for group in ctx.footprint.groups:
             weight, texel = group.weight.to(gradient.dtype), group.texel.flatten().long()
-            own = gradient if group.fragment is None else gradient[group.fragment]
-            for channel, part in zip(out, own.unbind(1), strict=True):
+            of_group = gradient if group.fragment is None else gradient[group.fragment]
+            for channel, part in zip(out, of_group.unbind(1), strict=True):
                 channel.scatter_add_(0, texel, (weight * part[:, None]).flatten())
         return out.T, None

@@ -1,11 +1,11 @@
-"""`render_views`: everything about a batch of views that what is optimized does not change.
+"""Render everything about a batch of views that does not depend on the design.
 
-In: a stage, conditions and a picture's size. Out: `Views`: for each pixel what lies behind the piece, and for each
-pixel of the piece how much of it the piece covers, which texels it looks at and what light falls there. Rasterizing
-happens here and nowhere else: views that were seen can be lit, printed and photographed anew (`relight`) at a fraction of
-the cost, and shaded with any number of designs.
+In: a stage, conditions and a picture's size. Out: `Views`: for each pixel the light behind the piece, and for each
+pixel of the piece its share of the pixel, the texels it looks at and the light that falls there. Rasterizing happens
+here and nowhere else: rendered views can be lit, printed and photographed again (`relight`) at a fraction of the cost,
+and shaded with any number of designs.
 
-Each pixel takes one sample; outlines are smoothed from their edges (see `find_outlines`), those of the piece from its own
+Each pixel takes one sample; outlines are smoothed along edges (see `find_outlines`), those of the piece in its own
 millimeters (see `pixels`). Left out on purpose: transparency.
 """
 
@@ -29,7 +29,7 @@ from patchproof.channel.render_frame import Frame
 from patchproof.render.fragments import Cameras
 from patchproof.render.outlines import Outlines, find_outlines
 from patchproof.render.pixels import (
-    LEAST_SHARE,
+    MIN_SHARE,
     PHOTO_SAMPLING,
     Appearance,
     ObjectPixels,
@@ -47,18 +47,18 @@ from patchproof.scene.conditions import Conditions
 from patchproof.scene.interface import require_piece
 from patchproof.scene.mesh_scene import MeshScene, require_mesh
 
-NEAR_SHARE = 1e-3  # of the object's length
+NEAR_SHARE = 1e-3  # the near plane's distance as a share of the object's length
 
 
 @dataclass(frozen=True)
 class Views:
-    """A batch of views of `size_px`, rendered at `frame_px` (larger where a lens will bend the picture)."""
+    """A batch of views of `size_px`, rendered at `frame_px` (larger if a lens will bend the picture)."""
 
     stage: Stage
     conditions: Conditions
     size_px: tuple[int, int]
     frame_px: tuple[int, int]
-    light: Lighting | None  # None where pictures bring their own
+    light: Lighting | None  # None for pictures, which bring their own
     background: np.ndarray  # uint8 N×H×W×3 sRGB
     object: ObjectPixels | None
     piece: PiecePixels | None
@@ -66,41 +66,41 @@ class Views:
 
     @property
     def reduced(self) -> bool:
-        """Whether these views stand for larger photographs that were reduced.
+        """True if these views stand for larger photographs that were reduced.
 
-        A sensor averages light, but what reduces a photograph averages its code values, and a fine pattern of strong
-        colors is darker that way. Textures of smaller pictures are therefore averaged as code values: at twice a
-        network's size, 40 photographs had 0.04 less confidence than promised that way, 0.09 when light was averaged.
+        A sensor averages light, but reducing a photograph averages its code values, and a fine pattern of strong colors
+        is darker that way. Textures of smaller pictures are therefore averaged as code values: at twice a network's
+        size, 40 photographs had 0.04 less confidence than promised that way, 0.09 when light was averaged.
         """
         return _reduced(self.stage, self.size_px)
 
     @property
     def on_object(self) -> ObjectPixels:
-        """The object's pixels; a ValueError where a scene is made of pictures."""
+        """The object's pixels; a ValueError if the scene is made of pictures."""
         if self.object is None:
             raise ValueError("pictures have no object to look up")
         return self.object
 
     @property
     def on_piece(self) -> PiecePixels:
-        """The piece's pixels; a ValueError where nothing was seen on the object."""
+        """The piece's pixels; a ValueError if the views were rendered without a piece."""
         if self.piece is None:
-            raise ValueError("these views were seen without a piece")
+            raise ValueError("these views were rendered without a piece")
         return self.piece
 
     @cached_property
     def bare(self) -> Tensor:
-        """The lit object without the piece, its outlines jagged, N·H·W × 3."""
+        """The light of the object without the piece, its outlines jagged, N·H·W × 3."""
         return self._behind if self.object is None else self.object_light()
 
     def object_light(self, texels: Tensor | None = None) -> Tensor:
-        """The same with these texels in place of its own; differentiable. Only views that were seen for textures can
-        show others.
+        """Return the light of the bare object with these texels in place of its own; differentiable. Only views that
+        were rendered for textures can show others.
         """
         return self._behind.index_copy(0, self.on_object.pixel, self._object_color(texels))
 
     def _object_color(self, texels: Tensor | None = None) -> Tensor:
-        """The light P×3 of the object's fragments."""
+        """Return the light P×3 of the object's fragments."""
         pixels, reflected = self.on_object, self.on_object.color
         if pixels.texels is not None:
             table = self.stage.object_surface.texels(self.reduced, fixed=False) if texels is None else texels
@@ -108,7 +108,7 @@ class Views:
         return reflected * self._irradiance(pixels)
 
     def _irradiance(self, pixels: ObjectPixels | PiecePixels) -> Tensor:
-        """The light P×1 that falls on pixels."""
+        """Return the light P×1 that falls on pixels."""
         if self.light is None:
             raise ValueError("pictures bring their own light")
         return irradiance(pixels.normal, pixels.view, self.light)[:, None]
@@ -117,22 +117,22 @@ class Views:
     def _behind(self) -> Tensor:
         """The background's light before exposure, N·H·W × 3."""
         tables = np.broadcast_to(LINEAR_FROM_CODE[:, None], (len(self.background), 256, 3))
-        return _looked_up(self.background, tables, self.stage.device)
+        return _look_up_codes(self.background, tables, self.stage.device)
 
     @cached_property
     def bare_exposed(self) -> Tensor:
-        """The bare object, its outlines jagged, as a camera without blur and noise shows it, N·H·W × 3 sRGB."""
+        """The bare object, its outlines jagged, in a camera without blur and noise, N·H·W × 3 sRGB."""
         camera = self.stage.camera
         # the background has 256 codes per view and channel, which are exposed as a table
         light = torch.tensor(LINEAR_FROM_CODE)[:, None] * self._gains[:, None].cpu().double()
-        image = _looked_up(self.background, encode_light(light, camera).numpy(), self.stage.device)
+        image = _look_up_codes(self.background, encode_light(light, camera).numpy(), self.stage.device)
         if self.object is None:
             return image
         color = self._object_color() * self.exposure(self.object.view)
         return image.index_copy_(0, self.object.pixel, encode_light_by_table(color, camera))
 
     def exposure(self, view: Tensor) -> Tensor:
-        """The camera's factors of the light in views P, P×3."""
+        """Return the camera's factors of the light in views P, P×3."""
         return self._gains.index_select(0, view)
 
     @cached_property
@@ -148,34 +148,34 @@ class Views:
 
 def render_views(
     stage: Stage,
-    shown: Appearance,
+    appearance: Appearance,
     conditions: Conditions,
     size_px: tuple[int, int],
     look: TextureSampling = PHOTO_SAMPLING,
 ) -> Views:
-    """The views of `conditions`, with nothing on the object unless a piece is `shown`. Any picture of the same size can
-    be shown in them; the object behind it is seen, too.
+    """Render the views of `conditions`, with nothing on the object unless `appearance` is a piece. Any picture of the
+    same size can be shown in them; the object behind it is rendered, too.
     """
-    piece = shown if isinstance(shown, PiecePicture) else None
+    piece = appearance if isinstance(appearance, PiecePicture) else None
     if not stage.scene.HAS_OBJECT:
-        return _see_pictures(stage, piece, conditions, size_px)
+        return _render_flat(stage, piece, conditions, size_px)
     scene, surface = require_mesh(stage.scene), stage.object_surface
     frame = lens_frame(stage, scene, size_px)
     poses = scene.camera_from_world(conditions)
     light = _light(scene, stage.device, conditions)
     eye = torch.as_tensor(camera_centers(poses), device=stage.device)
     matrices, near = np.broadcast_to(frame.matrix_px, (len(poses), 3, 3)), near_mm(scene)
-    placed = cameras(poses, matrices, frame.size_px, stage)
-    fragments = rasterize(surface.vertices, surface.faces, placed, near)
+    view_cameras = cameras(poses, matrices, frame.size_px, stage)
+    fragments = rasterize(surface.vertices, surface.faces, view_cameras, near)
     nearest = torch.full((math.prod(fragments.shape),), torch.inf, device=stage.device)
     nearest[fragments.pixel] = fragments.depth
-    look, parts, fixed = replace(look, taps=PHOTO_SAMPLING.taps) if scene.LEARNS_TEXTURE else look, None, None
+    look, piece_parts, fixed = replace(look, taps=PHOTO_SAMPLING.taps) if scene.LEARNS_TEXTURE else look, None, None
     if piece is not None:
-        printed = cameras(poses @ scene.printed_from_sheet(conditions), matrices, frame.size_px, stage)
-        own = rasterize(stage.piece_surface.vertices, stage.piece_surface.faces, printed, near)
-        hidden = nearest.index_select(0, own.pixel) < own.depth
-        parts = piece_pixels(stage.piece_surface, piece, own, hidden, look)
-    if not scene.LEARNS_TEXTURE and not isinstance(shown, ObjectTextures):
+        print_cameras = cameras(poses @ scene.printed_from_sheet(conditions), matrices, frame.size_px, stage)
+        piece_fragments = rasterize(stage.piece_surface.vertices, stage.piece_surface.faces, print_cameras, near)
+        hidden = nearest.index_select(0, piece_fragments.pixel) < piece_fragments.depth
+        piece_parts = piece_pixels(stage.piece_surface, piece, piece_fragments, hidden, look)
+    if not scene.LEARNS_TEXTURE and not isinstance(appearance, ObjectTextures):
         fixed = surface.texels(_reduced(stage, size_px), fixed=True)
     return Views(
         stage,
@@ -185,8 +185,8 @@ def render_views(
         light,
         backgrounds(scene, conditions, size_px, frame),
         object_pixels(surface, fragments, look, fixed),
-        parts,
-        find_outlines(surface.edges, surface.vertices, placed, eye, nearest, _covered(parts, nearest), near),
+        piece_parts,
+        find_outlines(surface.edges, surface.vertices, view_cameras, eye, nearest, _covers(piece_parts, nearest), near),
     )
 
 
@@ -194,17 +194,17 @@ def _reduced(stage: Stage, size_px: tuple[int, int]) -> bool:
     return min(size_px) < min(stage.scene.settings.camera.photo_px)
 
 
-def _covered(piece: PiecePixels | None, nearest: Tensor) -> Tensor:
-    """Which of N·H·W pixels the piece covers wholly."""
+def _covers(piece: PiecePixels | None, nearest: Tensor) -> Tensor:
+    """Return which of N·H·W pixels the piece covers wholly."""
     covered = torch.zeros_like(nearest, dtype=torch.bool)
     if piece is not None:
         for pixel, share in ((piece.pixel, piece.share), (piece.back_pixel, piece.back_share)):
-            covered[pixel] = share[:, 0] > 1 - LEAST_SHARE
+            covered[pixel] = share[:, 0] > 1 - MIN_SHARE
     return covered
 
 
 def relight(views: Views, conditions: Conditions) -> Views:
-    """The same views under other light, with another print and camera; poses and backgrounds stay."""
+    """Return the views under other light, with another print and camera; poses and backgrounds stay."""
     conditions, light = replace(conditions, pose=views.conditions.pose), views.light
     if light is not None:
         light = _light(require_mesh(views.stage.scene), views.stage.device, conditions)
@@ -212,10 +212,10 @@ def relight(views: Views, conditions: Conditions) -> Views:
 
 
 def relight_and_replace_background(views: Views, conditions: Conditions) -> Views:
-    """`relight`, and with the object before the conditions' own backgrounds."""
-    behind = views.conditions.pose.background
+    """Return the views under the conditions' light, print, camera and backgrounds; poses stay."""
+    old_background = views.conditions.pose.background
     views = relight(views, conditions)
-    if np.array_equal(behind, conditions.pose.background):
+    if np.array_equal(old_background, conditions.pose.background):
         return views
     pose = replace(views.conditions.pose, background=conditions.pose.background)
     conditions, scene = replace(conditions, pose=pose), require_mesh(views.stage.scene)
@@ -224,25 +224,25 @@ def relight_and_replace_background(views: Views, conditions: Conditions) -> View
 
 
 def split_views(views: Views, sizes: Sequence[int]) -> list[Views]:
-    """Views that were seen together, so many at a time, each to the bit as if it had been seen without the others."""
+    """Split views into batches of these sizes, each equal to the bit to a batch that was rendered alone."""
     pixels, parts = views.frame_px[0] * views.frame_px[1], []
     for first, last in pairwise(accumulate(sizes, initial=0)):
-        some, numbers = slice(first, last), range(first, last)
-        whole = {"object": views.object, "piece": views.piece, "outlines": views.outlines}
-        seen = {name: None if part is None else part.part(numbers, pixels) for name, part in whole.items()}
-        own = replace(views, conditions=views.conditions[some], background=views.background[some], **seen)
-        parts.append(relight(own, own.conditions))
+        rows, numbers = slice(first, last), range(first, last)
+        pixel_fields = {"object": views.object, "piece": views.piece, "outlines": views.outlines}
+        selected = {name: None if part is None else part.part(numbers, pixels) for name, part in pixel_fields.items()}
+        batch = replace(views, conditions=views.conditions[rows], background=views.background[rows], **selected)
+        parts.append(relight(batch, batch.conditions))
     return parts
 
 
 def cameras(poses: np.ndarray, matrices: np.ndarray, size_px: tuple[int, int], stage: Stage) -> Cameras:
-    """Cameras N×4×4 with matrices N×3×3 on a stage's device."""
+    """Return cameras N×4×4 with matrices N×3×3 on a stage's device."""
     poses_on, matrices_on = (torch.as_tensor(part.copy(), device=stage.device) for part in (poses, matrices))
     return Cameras(poses_on, matrices_on, size_px)
 
 
 def near_mm(scene: MeshScene) -> float:
-    """What is nearer to a camera is cut."""
+    """Return the distance from a camera within which everything is cut."""
     return NEAR_SHARE * scene.length_mm
 
 
@@ -250,35 +250,35 @@ def _light(scene: MeshScene, device: torch.device, conditions: Conditions) -> Li
     return lighting_of(conditions.light, scene.frame.normal, scene.frame.up, device)
 
 
-def _see_pictures(stage: Stage, piece: PiecePicture | None, conditions: Conditions, size_px: tuple[int, int]) -> Views:
-    """Views of a scene made of pictures: the piece's homography takes the place of camera and mesh."""
+def _render_flat(stage: Stage, piece: PiecePicture | None, conditions: Conditions, size_px: tuple[int, int]) -> Views:
+    """Render views of a scene made of pictures: the piece's homography takes the place of camera and mesh."""
     parts, pictures = None, stage.scene.pictures(conditions, size_px)
     if piece is not None:
         scene, surface = require_piece(stage.scene), stage.piece_surface
         homographies = scene.piece_homographies(conditions, size_px)
-        flat = cameras(np.broadcast_to(np.eye(4), (len(homographies), 4, 4)), homographies, size_px, stage)
-        fragments = rasterize(surface.vertices, surface.faces, flat, 1e-9)
+        flat_cameras = cameras(np.broadcast_to(np.eye(4), (len(homographies), 4, 4)), homographies, size_px, stage)
+        fragments = rasterize(surface.vertices, surface.faces, flat_cameras, 1e-9)
         coefficients = torch.as_tensor(scene.piece_light(conditions), dtype=torch.float32, device=stage.device)
         parts = piece_pixels(surface, piece, fragments, None, white_coefficients=coefficients)
     return Views(stage, conditions, size_px, size_px, None, pictures, None, parts, None)
 
 
 def lens_frame(stage: Stage, scene: MeshScene, size_px: tuple[int, int]) -> Frame:
-    """The frame to render for pictures of `size_px`, with what a calibrated lens will bring into them."""
+    """Return the frame to render for pictures of `size_px`, with the margin that a calibrated lens needs."""
     if stage.camera is None:
         return Frame(size_px, scene.matrix_px(size_px), 0, 0, 0, 0)
     return stage.camera.pinhole_frame(size_px)
 
 
 def backgrounds(scene: MeshScene, conditions: Conditions, size_px: tuple[int, int], frame: Frame) -> np.ndarray:
-    """What lies behind N views, uint8 N×H×W×3 before exposure; its edge goes on in a lens's margin."""
+    """Return the backgrounds of N views, uint8 N×H×W×3 before exposure; their edges continue into a lens's margin."""
     pictures = scene.pictures(conditions, size_px)
     margin = ((0, 0), (frame.top, frame.bottom), (frame.left, frame.right), (0, 0))
     return np.pad(pictures, margin, mode="edge") if frame.size_px != size_px else pictures
 
 
-def _looked_up(codes: np.ndarray, tables: np.ndarray, device: torch.device) -> Tensor:
-    """uint8 pictures N×H×W×3 through tables N×256×3, pixels by rows."""
+def _look_up_codes(codes: np.ndarray, tables: np.ndarray, device: torch.device) -> Tensor:
+    """Look up uint8 pictures N×H×W×3 in tables N×256×3; return pixels by rows."""
     import cv2
 
     pictures = np.empty(codes.shape, np.float32)

@@ -74,7 +74,7 @@ def photograph_traced(
     """1×3×H×W sRGB: the photograph of one view, without JPEG; `piece=None` is the bare object."""
     light = traced_light(stage, piece, conditions, draw_optics(conditions) if optics is None else optics)
     if stage.camera is not None:
-        light = stage.camera.distorted(light, stage.scene.settings.camera.photo_px)
+        light = stage.camera.distort_pictures(light, stage.scene.settings.camera.photo_px)
     return develop(light, conditions.sensor, 1.0, jpeg=False, camera=stage.camera)
 
 

@@ -62,7 +62,7 @@ def hang(scene: PatchScene, template: Template) -> PlacementPicture:
         names.append((tuple(corners.mean(0)), tile.name))
     measured = None
     if not placement.is_flat:
-        laid_out = scene.tapes()
+        laid_out = scene.tape_measurements()
         measured = _spans(laid_out, flat)
         for tape in laid_out:
             start, end = flat(tape.points_mm[[0, -1]])

@@ -88,7 +88,7 @@ def plan_of(scene: PieceScene, template: Template, content: SheetContent) -> Pla
         facing = f"the object's {own.side} side" if own.at_mm is None else "the place where the piece goes"
         placed = [
             f"Seen as you face {facing}. {_edges(hung) if patch.placement.is_flat else _wrapped(patch)}",
-            f"The piece is {size_text(scene.piece.size_mm)} mm; {scene.lies()['reason']}.",
+            f"The piece is {size_text(scene.piece.size_mm)} mm; {scene.placement_summary()['reason']}.",
         ]
         if template.tiles is not None:
             placed.append(
@@ -112,7 +112,7 @@ def _edges(hung: PlacementPicture) -> str:
 
 def _wrapped(scene: PatchScene) -> str:
     """How bent paper goes on the object, and what a tape measure says beside it."""
-    laid_out = scene.tapes()
+    laid_out = scene.tape_measurements()
     text = "Wrap the piece round the object from its middle outwards, its top edge up, without folds or air under it."
     if not laid_out:
         return text

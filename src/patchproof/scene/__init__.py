@@ -1,1 +1,1 @@
-"""What is photographed: the object, where the piece sits on it, and the conditions it is seen under."""
+"""Scenes to photograph: the object, the place of the piece on it, and the conditions of the views."""

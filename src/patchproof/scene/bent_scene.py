@@ -11,30 +11,30 @@ from patchproof.scene.interface import Scene, SceneSource
 from patchproof.scene.mesh_scene import load_bare
 from patchproof.scene.patch_scene import PatchScene
 from patchproof.scene.placement import Placement, PlacementMethod, patch_frame
-from patchproof.scene.tape_measure import TapeMeasurement, tapes
+from patchproof.scene.tape_measure import TapeMeasurement, measure_tapes
 
 
 @dataclass(frozen=True)
 class BentScene(PatchScene):
-    """An object with a piece that bends with it; where the surface is flat, that is a card, too."""
+    """An object with a piece that bends along its surface; on a flat surface, that is a card, too."""
 
     LAY: ClassVar[PlacementMethod] = staticmethod(place_bent)
 
-    def tapes(self) -> tuple[TapeMeasurement, ...]:
-        """As in `PatchScene.tapes`."""
+    def tape_measurements(self) -> tuple[TapeMeasurement, ...]:
+        """Implement `PatchScene.tape_measurements`."""
         facing = patch_frame(self.mesh, self.settings.patch).normal
-        return () if self.placement.is_flat else tapes(self.mesh, self.placement, facing)
+        return () if self.placement.is_flat else measure_tapes(self.mesh, self.placement, facing)
 
 
 def build(source: SceneSource) -> BentScene:
-    """The scene of settings that give a piece of paper its place."""
-    return BentScene.on(load_bare(source))
+    """Build the scene of settings that give a piece of bent paper its place."""
+    return BentScene.from_bare(load_bare(source))
 
 
 def placement_with_other_bend(scene: Scene) -> tuple[Placement | None, str | None]:
-    """(where a scene's piece would lie with `patch.bend` the other way round, what that would be like in a sentence).
+    """Return (the piece's placement with `patch.bend` the other way round, a sentence that compares it).
 
-    No placement where it is refused or would be the same card; no sentence where there is no surface to lie on.
+    The placement is None if it is refused or would be the same card; both are None if there is no surface to lie on.
     """
     if not isinstance(scene, PatchScene):
         return None, None

@@ -1,11 +1,11 @@
-"""What of an object's own texture may change: a canvas of textures, masks and the mesh that shows them.
+"""The canvas: an object's textures, masks of the texels that may change, and the mesh that shows them.
 
 In: a mesh and the `[patch]` table of kind "texture" (everything) or "masked" (an image over UV space, material names,
 or a file of face numbers). Out: a `Canvas`. Each material carries one texture that is its whole color: base colors are
 multiplied in (to 8-bit rounding the object looks as before), so that a texel reaches every color that paint can have.
-Faces without texture coordinates are unwrapped first (see `unwrap`). Warned about: texels that show at several places,
-palettes, vertex colors that go on multiplying, and faces that change although nobody named them.
-Left out on purpose: making texture coordinates better than they are; textures keep their own sizes.
+Faces without texture coordinates are unwrapped first (see `unwrap`). Warnings tell of texels that show at several
+places, palettes, vertex colors that go on multiplying, and faces that change although nobody named them. Left out on
+purpose: improving poor texture coordinates; textures keep their own sizes.
 """
 
 from __future__ import annotations
@@ -24,91 +24,89 @@ from patchproof.mesh.mesh import Material, Mesh, position_numbers
 from patchproof.mesh.unwrap import has_usable_uv, unwrap
 from patchproof.mesh.uv_coverage import coverage, texels_per_face
 
-TEXELS = 1024  # side of a texture that has to be made: 0.7 mm per texel over a cube of 300 mm
-GUTTER_TEXELS = 1.5  # every texel that a face touches and one more: what bilinear look-ups within the face can read
+TEXELS = 1024  # side of a new texture: 0.7 mm per texel over a cube of 300 mm
+GUTTER_TEXELS = 1.5  # every texel that a face touches and one more, for bilinear look-ups within the face
 GRAY = 128  # sRGB 0.5
-_WORTH_SAYING = 0.05  # share of the surface
+_WARNING_SHARE = 0.05  # share of the surface
 # a texel that stands for this many times its even share of the surface belongs to a palette, not to a picture
-_PALETTE = 16
+_PALETTE_FACTOR = 16
 
 
 @dataclass(frozen=True)
 class Canvas:
-    """The object as it is rendered, and which of its texels may change from what start."""
+    """The object as it is rendered, its textures at the start, and the texels that may change."""
 
-    mesh: Mesh  # every material with a texture and base color 1: the bare object
+    mesh: Mesh  # the bare object; every material has a texture and base color 1
     start_srgb: tuple[np.ndarray, ...]  # uint8 H×W×3 per material
     mask: tuple[np.ndarray, ...]  # bool H×W per material: may change
     warnings: tuple[str, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The materials' names as in the mesh file; they may repeat."""
+        """The materials' names in the mesh file; they may repeat."""
         return tuple(material.name for material in self.mesh.materials)
 
 
 def texture_canvas(mesh: Mesh, patch: PatchSettings, base: Path, texels: int = TEXELS) -> Canvas:
-    """The canvas of `mesh` for patch kinds "texture" and "masked"; files are relative to `base`.
+    """Return the canvas of `mesh` for patch kinds "texture" and "masked"; files are relative to `base`.
 
-    `texels` is the side of textures that have to be made. A mask image is stretched over the UV square of each
-    material, gray 128 and lighter may change; it cannot reach faces without texture coordinates. Face numbers are those
-    of `mesh.faces`. A face may change together with a rim of GUTTER_TEXELS around it.
+    `texels` is the side of new textures. A mask image is stretched over the UV square of each material, gray 128 and
+    lighter may change; it cannot reach faces without texture coordinates. Face numbers are those of `mesh.faces`. A
+    face may change together with a rim of GUTTER_TEXELS around it.
     """
-    chosen, placed = _chosen(mesh, patch, base), has_usable_uv(mesh)
+    chosen_faces, has_uv = _select_patch_faces(mesh, patch, base), has_usable_uv(mesh)
     if patch.mask is not None:
-        chosen = chosen & placed
-        if not chosen.any():
-            raise Refused("a mesh with texture coordinates for a mask", "none", "name materials or faces instead")
+        chosen_faces = chosen_faces & has_uv
+        if not chosen_faces.any():
+            got = f"{len(has_uv)} faces without any"
+            raise Refused("a mesh with texture coordinates for a mask", got, "name materials or faces instead")
     warnings = []
-    missing = chosen & ~placed
-    if missing.any():
-        mesh = unwrap(mesh, missing, texels)
+    without_uv = chosen_faces & ~has_uv
+    if without_uv.any():
+        mesh = unwrap(mesh, without_uv, texels)
         warnings.append(
-            f"{np.count_nonzero(missing)} of {len(missing)} faces have no texture coordinates of use: they are"
+            f"{np.count_nonzero(without_uv)} of {len(without_uv)} faces have no texture coordinates of use: they are"
             " unwrapped (xatlas) and keep their colors"
         )
-    mesh = whole_colors(mesh, chosen, texels)
-    masks = _masks(mesh, chosen)
+    mesh = bake_base_colors(mesh, chosen_faces, texels)
+    masks = _masks(mesh, chosen_faces)
     if patch.mask is not None:
         image = _read_mask(Path(expand_path(patch.mask, base)))
-        warnings += _other_size(image, masks)
-        masks = tuple(mask & _stretched(image, mask.shape) for mask in masks)
+        warnings += _size_warnings(image, masks)
+        masks = tuple(mask & _stretch(image, mask.shape) for mask in masks)
     if not any(mask.any() for mask in masks):
-        raise Refused("a mask that is white on some face", "none of that", "compare it with the texture coordinates")
+        got = f"a mask that covers none of {np.count_nonzero(chosen_faces)} faces"
+        raise Refused("a mask that covers a face", got, "compare it with the texture coordinates")
     start = tuple(_texture(mesh, i) for i in range(len(masks)))
     if patch.start == "gray":
         start = tuple(np.where(mask[..., None], np.uint8(GRAY), old) for mask, old in zip(masks, start, strict=True))
-    return Canvas(mesh, start, masks, (*warnings, *_doubts(mesh, chosen, masks)))
+    return Canvas(mesh, start, masks, (*warnings, *_texel_warnings(mesh, chosen_faces, masks)))
 
 
-def _chosen(mesh: Mesh, patch: PatchSettings, base: Path) -> np.ndarray:
-    """Which faces F the settings name."""
+def _select_patch_faces(mesh: Mesh, patch: PatchSettings, base: Path) -> np.ndarray:
+    """Return the faces F that the settings name."""
     if patch.materials or patch.faces is not None:
         return select_faces(mesh, patch.materials, patch.faces, base)
     return np.ones(len(mesh.faces), bool)
 
 
 def select_faces(mesh: Mesh, materials: tuple[str, ...], faces: str | None, base: Path) -> np.ndarray:
-    """Which faces F have a material of these names, or their number in that text file, whose path is relative to
-    `base`.
-    """
+    """Return which faces F have one of these materials or a number in the text file `faces`, relative to `base`."""
     names = [material.name for material in mesh.materials]
     for name in materials:
         if name not in names:
             raise Refused("the name of a material", f'"{name}"', spelling_hint(name, dict.fromkeys(names)))
-    chosen = np.isin(mesh.face_material, [i for i, name in enumerate(names) if name in materials])
+    chosen_faces = np.isin(mesh.face_material, [i for i, name in enumerate(names) if name in materials])
     if faces is not None:
-        chosen |= _read_faces(Path(expand_path(faces, base)), len(chosen))
-    return chosen
+        chosen_faces |= _read_faces(Path(expand_path(faces, base)), len(chosen_faces))
+    return chosen_faces
 
 
 def _read_faces(path: Path, count: int) -> np.ndarray:
-    """Which of `count` faces a text file names: one number, or a range a-b with both ends, per line; # starts a
-    comment.
-    """
+    """Return which of `count` faces a text file names: per line a number or a range a-b with both ends; # comments."""
     if not is_file(path):
         raise Refused("a file of face numbers", f"no file at {path}", "check the path")
-    chosen = np.zeros(count, bool)
+    chosen_faces = np.zeros(count, bool)
     for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
         words = line.partition("#")[0].split("-")
         if not "".join(words).strip() and len(words) == 1:
@@ -119,27 +117,28 @@ def _read_faces(path: Path, count: int) -> np.ndarray:
             ends = []
         if len(ends) not in (1, 2) or not 0 <= ends[0] <= ends[-1] < count:
             got = f'"{line.strip()[:40]}" in line {number} of {path.name}'
-            raise Refused(f"a face number or a range a-b from 0 to {count - 1}", got, "mend that line")
-        chosen[ends[0] : ends[-1] + 1] = True
-    if not chosen.any():
-        raise Refused("face numbers, one per line", f"none in {path.name}", "name some, or leave the file out")
-    return chosen
+            raise Refused(f"a face number or a range a-b from 0 to {count - 1}", got, "correct that line")
+        chosen_faces[ends[0] : ends[-1] + 1] = True
+    if not chosen_faces.any():
+        raise Refused("face numbers, one per line", f"no number in {path.name}", "add some, or leave the file out")
+    return chosen_faces
 
 
 def _read_mask(path: Path) -> np.ndarray:
-    """The gray values of a mask as float H×W in 0..255."""
+    """Return the gray values of a mask as float H×W in 0..255."""
     if not is_file(path):
         raise Refused("a mask image", f"no file at {path}", "check the path")
     with open_image(path, "a mask image", "save it as PNG") as image:
-        deep = image.mode.startswith("I")  # 16 bits: Pillow would clip them at 255 instead of scaling them
-        gray = np.asarray(image, float) / 257 if deep else np.asarray(image.convert("L"), float)
+        is_16_bit = image.mode.startswith("I")  # 16 bits: Pillow would clip them at 255 instead of scaling them
+        gray = np.asarray(image, float) / 257 if is_16_bit else np.asarray(image.convert("L"), float)
     if gray.max() < 128:
-        raise Refused("a mask with white where the texture may change", f"none in {path.name}", "paint it white there")
+        got = f"no lighter gray than {gray.max():.0f} of 255 in {path.name}"
+        raise Refused("a mask with white where the texture may change", got, "paint it white there")
     return gray
 
 
-def _other_size(gray: np.ndarray, masks: tuple[np.ndarray, ...]) -> list[str]:
-    """A sentence where a mask is of another size than a texture that it is laid over."""
+def _size_warnings(gray: np.ndarray, masks: tuple[np.ndarray, ...]) -> list[str]:
+    """Return a sentence if a mask is of another size than a texture that it is laid over."""
     sizes = dict.fromkeys(f"{m.shape[1]} × {m.shape[0]}" for m in masks if m.any() and m.shape != gray.shape)
     if not sizes:
         return []
@@ -149,40 +148,38 @@ def _other_size(gray: np.ndarray, masks: tuple[np.ndarray, ...]) -> list[str]:
     ]
 
 
-def _stretched(gray: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """A mask over H×W texels, averaged where it is finer: where it is light."""
+def _stretch(gray: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Return where a mask, stretched over H×W texels (averaged if it is finer), is light."""
     from PIL import Image
 
     image, (height, width) = Image.fromarray(gray.astype(np.float32)), shape
     return np.asarray(image.resize((width, height), Image.Resampling.BOX)) >= 128
 
 
-def whole_colors(mesh: Mesh, chosen: np.ndarray, texels: int = TEXELS) -> Mesh:
-    """`mesh` with each material's color in its texture; one-colored ones get `texels`² where the `chosen` of its faces
-    F may change.
-    """
+def bake_base_colors(mesh: Mesh, chosen_faces: np.ndarray, texels: int = TEXELS) -> Mesh:
+    """Put each material's color into its texture; single colors get `texels`² where `chosen_faces` F are."""
 
-    def whole(index: int, material: Material) -> Material:
+    def with_base_color(index: int, material: Material) -> Material:
         table = codes_from_srgb(srgb_from_linear((LINEAR_FROM_CODE[:, None] * material.base_color_linear).clip(0, 1)))
         texture = np.full((1, 1, 3), 255, np.uint8) if material.texture_srgb is None else material.texture_srgb
         texture = np.stack([table[texture[..., channel], channel] for channel in range(3)], axis=-1)
-        if texture.shape[:2] == (1, 1) and (chosen & (mesh.face_material == index)).any():
+        if texture.shape[:2] == (1, 1) and (chosen_faces & (mesh.face_material == index)).any():
             texture = np.tile(texture, (texels, texels, 1))
         return Material(material.name, (1.0, 1.0, 1.0), texture)
 
-    return replace(mesh, materials=tuple(whole(i, material) for i, material in enumerate(mesh.materials)))
+    return replace(mesh, materials=tuple(with_base_color(i, material) for i, material in enumerate(mesh.materials)))
 
 
-def _masks(mesh: Mesh, chosen: np.ndarray) -> tuple[np.ndarray, ...]:
-    """The texels of each material that chosen faces can show."""
+def _masks(mesh: Mesh, chosen_faces: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Return the texels of each material that chosen faces can show."""
     return tuple(
-        coverage(_corners(mesh, chosen & (mesh.face_material == i)), _size(mesh, i), GUTTER_TEXELS) > 0
+        coverage(_corners(mesh, chosen_faces & (mesh.face_material == i)), _size(mesh, i), GUTTER_TEXELS) > 0
         for i in range(len(mesh.materials))
     )
 
 
 def _corners(mesh: Mesh, faces: np.ndarray) -> np.ndarray:
-    """Corners F×3×2 in texels of faces of one material."""
+    """Return corners F×3×2 in texels of faces of one material."""
     index = mesh.face_material[faces][:1]
     return mesh.corner_uv[faces].astype(float) * (_size(mesh, index[0]) if len(index) else 1)
 
@@ -196,62 +193,63 @@ def _size(mesh: Mesh, index: int) -> tuple[int, int]:
     return width, height
 
 
-def _doubts(mesh: Mesh, chosen: np.ndarray, masks: tuple[np.ndarray, ...]) -> list[str]:
-    """What the user should know about the texels that may change."""
-    repeated, palette, unnamed = _shares(mesh, chosen, masks)
-    doubts = []
-    if palette > _WORTH_SAYING:
-        doubts.append(
+def _texel_warnings(mesh: Mesh, chosen_faces: np.ndarray, masks: tuple[np.ndarray, ...]) -> list[str]:
+    """Return warnings about the texels that may change."""
+    repeated, palette, unnamed = _shares(mesh, chosen_faces, masks)
+    warnings = []
+    if palette > _WARNING_SHARE:
+        warnings.append(
             f"{palette:.0%} of the surface that may change takes its color from a few texels (a palette texture): each"
-            " such part stays of one color, and one texel recolors all of them; unwrap the object anew for a pattern"
+            " such part keeps a single color, and one texel recolors several; unwrap the object again for a pattern"
         )
-    if repeated > _WORTH_SAYING:
-        doubts.append(
+    if repeated > _WARNING_SHARE:
+        warnings.append(
             f"{repeated:.0%} of the surface that may change shows texels that show at another place too (mirrored or"
-            " tiled): both places get the same pattern and cannot differ; unwrap the object anew if they should"
+            " tiled): both places get the same pattern and cannot differ; unwrap the object again if they should"
         )
     if unnamed > 0.01:
-        doubts.append(f"{unnamed:.0%} of the surface changes too, although not named: it shows the same texels")
-    if (mesh.corner_color_linear[chosen] != 1).any():
-        doubts.append("vertex colors go on multiplying the texture: where they are dark, it stays dark")
-    return doubts
+        warnings.append(f"{unnamed:.0%} of the surface changes too, although not named: it shows the same texels")
+    if (mesh.corner_color_linear[chosen_faces] != 1).any():
+        warnings.append("vertex colors go on multiplying the texture: where they are dark, it stays dark")
+    return warnings
 
 
-def _shares(mesh: Mesh, chosen: np.ndarray, masks: tuple[np.ndarray, ...]) -> tuple[float, float, float]:
-    """Shares of the surface: (repeated and palette, of what may change; changing although not chosen, of all).
+def _shares(mesh: Mesh, chosen_faces: np.ndarray, masks: tuple[np.ndarray, ...]) -> tuple[float, float, float]:
+    """Return shares of the surface: (repeated and palette, of the part that may change; changing although not chosen,
+    of all).
 
-    Of faces that lie on one another (a front and a back, as some programs export) one stands for all: they show
-    one place.
+    Of faces that lie on one another (a front and a back, as some programs export) one stands for all: they show one
+    place.
     """
-    area, single, placed = _areas(mesh), _first_of_its_place(mesh), has_usable_uv(mesh)
-    may, repeated, palette, unnamed = np.zeros((4, len(area)))  # shares of each face
+    area, first_of_place, has_uv = _areas(mesh), _is_first_at_place(mesh), has_usable_uv(mesh)
+    changeable, repeated, palette, unnamed = np.zeros((4, len(area)))  # shares of each face
     for index, mask in enumerate(masks):
-        mine = placed & (mesh.face_material == index)
-        corners, size = _corners(mesh, mine), _size(mesh, index)
+        faces = has_uv & (mesh.face_material == index)
+        corners, size = _corners(mesh, faces), _size(mesh, index)
         inside, centers = texels_per_face(corners, mask)
-        several = coverage(_corners(mesh, mine & single), size) > 1
-        own = coverage(_corners(mesh, mine & chosen), size) > 0
+        several = coverage(_corners(mesh, faces & first_of_place), size) > 1
+        of_chosen = coverage(_corners(mesh, faces & chosen_faces), size) > 0
         x, y = (np.floor(corners.mean(1)).astype(np.int64) % size).T
-        may[mine] = np.where(centers > 0, inside / np.maximum(centers, 1), mask[y, x])
-        repeated[mine] = texels_per_face(corners, several & mask)[0] / np.maximum(centers, 1)
-        palette[mine] = may[mine] * _in_palette(y * size[0] + x, size, area[mine], centers == 0)
-        unnamed[mine] = texels_per_face(corners, own & mask)[0] / np.maximum(centers, 1)
-    changing = max(float(area[chosen] @ may[chosen]), 1e-300)
+        changeable[faces] = np.where(centers > 0, inside / np.maximum(centers, 1), mask[y, x])
+        repeated[faces] = texels_per_face(corners, several & mask)[0] / np.maximum(centers, 1)
+        palette[faces] = changeable[faces] * _in_palette(y * size[0] + x, size, area[faces], centers == 0)
+        unnamed[faces] = texels_per_face(corners, of_chosen & mask)[0] / np.maximum(centers, 1)
+    changing = max(float(area[chosen_faces] @ changeable[chosen_faces]), 1e-300)
     return (
-        float(area[chosen] @ repeated[chosen]) / changing,
-        float(area[chosen] @ palette[chosen]) / changing,
-        float(area[~chosen] @ unnamed[~chosen] / area.sum()),
+        float(area[chosen_faces] @ repeated[chosen_faces]) / changing,
+        float(area[chosen_faces] @ palette[chosen_faces]) / changing,
+        float(area[~chosen_faces] @ unnamed[~chosen_faces] / area.sum()),
     )
 
 
 def _in_palette(texel: np.ndarray, size: tuple[int, int], area: np.ndarray, small: np.ndarray) -> np.ndarray:
-    """Which faces are smaller than a texel in UV while that texel paints far more than its share of the surface."""
+    """Return the faces smaller than a texel in UV whose texel paints far more than its share of the surface."""
     painted = np.bincount(texel, np.where(small, area, 0.0))
-    return small & (painted[texel] > _PALETTE * area.sum() / (size[0] * size[1]))
+    return small & (painted[texel] > _PALETTE_FACTOR * area.sum() / (size[0] * size[1]))
 
 
-def _first_of_its_place(mesh: Mesh) -> np.ndarray:
-    """Whether no face before this one has the same three corners in space."""
+def _is_first_at_place(mesh: Mesh) -> np.ndarray:
+    """Return the faces for which no earlier face has the same three corners in space."""
     first = np.unique(np.sort(position_numbers(mesh.vertices)[mesh.faces], axis=1), axis=0, return_index=True)[1]
     return np.isin(np.arange(len(mesh.faces)), first)
 

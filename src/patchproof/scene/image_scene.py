@@ -1,12 +1,13 @@
 """A scene of images: a piece at a random place, size and angle in pictures of its class, the classic 2D patch.
 
 In: a folder of images and a CSV of file names and labels. Out: `ImageScene`. Only images of the target's class are
-used: an assistive patch helps them, a deceptive one hides them. The whole printed piece lies inside of the centered
+used: an assistive patch helps them, a deceptive one hides them. The whole printed piece lies inside the centered
 square, turned by `view.roll_deg`, as large as `view.patch_share` says. In training, a random box of the picture below
-it may be erased, so that the patch does not lean on one feature. White paper is sRGB white, and nothing else is
-modeled: what is promised holds for a patch pasted into such images, not for a print in the world.
+it may be erased, so that the patch does not depend on one feature. White paper is sRGB white, and nothing else is
+modeled: the promise holds for a patch pasted into such images, not for a print in the world.
 
-Training and selection see one half of the images, promise, reprint and evaluation the other; of a single one, the same.
+Training and selection see one half of the images; promise, reprint and evaluation the other. A single image is used for
+all.
 
 Sources: Brown et al., Adversarial Patch, 2017 (here also with the assistive goal); Zhong et al., Random Erasing Data
 Augmentation, AAAI 2020, algorithm 1.
@@ -29,84 +30,94 @@ from patchproof.base.settings import SceneSettings
 from patchproof.base.validation import expand_path
 from patchproof.photo.read import read_photo
 from patchproof.photo.rejection import PhotoRejected
-from patchproof.scene import flat
 from patchproof.scene.conditions import Conditions, Stream
 from patchproof.scene.interface import PX_PER_MODULE, READABLE_SHARE, SceneSource
+from patchproof.scene.picture_scene import (
+    BasePicture,
+    PictureScene,
+    pick_indices,
+    picture_for,
+    print_scalings,
+    refuse_bending,
+    similarity_matrix,
+    size_from_photo,
+    warp_picture,
+)
 from patchproof.sheets.markers import MARKER_MODULES
 from patchproof.sheets.piece import Piece, lay_out_piece, marker_size_mm
 from patchproof.sheets.template import load_template
 from patchproof.sheets.tiles import refuse_larger_than_page
 
 MIN_IMAGES_TO_SPLIT = 2
-FEW_IMAGES = 20  # images, of which half say little of others
+FEW_IMAGES = 20  # half of fewer images say little about other images
 _OPTIMIZED_ON = {"train", "select"}
 ERASED_AREA, ERASED_ASPECT = (0.02, 0.33), (0.3, 3.3)  # shares of the centered square; height over width
 _ERASED_CELLS = 224  # random values per side of the centered square: one a pixel at networks' usual size
 
 
 @dataclass(frozen=True)
-class ImageScene(flat.PictureScene):
+class ImageScene(PictureScene):
     """A scene whose base pictures are images of the target's class, in an order that their names decide."""
 
-    images: tuple[flat.BasePicture, ...]
+    images: tuple[BasePicture, ...]
 
     def description(self) -> str:
-        """How many images there are."""
+        """Return how many images there are."""
         return f"{len(self.images)} images"
 
     def _laid_out(self) -> Self:
         return replace(self, piece=_piece(self.settings, self.sheet_id))
 
     def draw(self, stream: Stream, n: int, seed: int | None = None, start: int = 0, per_session: int = 1) -> Conditions:
-        """Draws of one of the scene's streams: `background[:, 0]` stays in that stream's half of the images, and
-        `background[:, 4]` is 1, which erases nothing, in all but training.
+        """Draw from one of the scene's streams. `background[:, 0]` stays in that stream's half of the images, and
+        `background[:, 4]` is 1, which erases nothing, in all streams but training.
         """
-        drawn = super().draw(stream, n, seed, start, per_session)
-        background = drawn.pose.background.copy()
+        conditions = super().draw(stream, n, seed, start, per_session)
+        background = conditions.pose.background.copy()
         if len(self.images) >= MIN_IMAGES_TO_SPLIT:
             middle = (len(self.images) // 2) / len(self.images)
             low, high = (0.0, middle) if stream in _OPTIMIZED_ON else (middle, 1.0)
             background[:, 0] = low + (high - low) * background[:, 0]
         if stream != "train":
             background[:, 4] = 1.0
-        return replace(drawn, pose=replace(drawn.pose, background=background))
+        return replace(conditions, pose=replace(conditions.pose, background=background))
 
     def piece_homographies(self, conditions: Conditions, size_px: tuple[int, int]) -> np.ndarray:
-        """N×3×3 from piece millimeters to pixels."""
-        to_size = flat.size_from_photo(self.photo_px, size_px)
+        """Return N×3×3 from piece millimeters to pixels."""
+        to_size = size_from_photo(self.photo_px, size_px)
         side, photo, pose = min(self.photo_px), np.array(self.photo_px), conditions.pose
         piece_mm, scales = np.array(self.piece.size_mm), px_per_mm(self.settings, self.piece, conditions)
         matrices = []
         for scale, roll, place in zip(scales, pose.roll_deg, pose.background[:, 2:4], strict=True):
-            room = side - rotated_extent(piece_mm * scale, roll)
-            middle = (photo - side) / 2 + side / 2 + (place - 0.5) * room
-            matrices.append(to_size @ flat.similarity_matrix(roll, scale, middle - piece_mm / 2, piece_mm / 2))
-        return np.stack(matrices) @ flat.prints(self.piece, conditions)
+            free_px = side - rotated_extent(piece_mm * scale, roll)
+            middle = (photo - side) / 2 + side / 2 + (place - 0.5) * free_px
+            matrices.append(to_size @ similarity_matrix(roll, scale, middle - piece_mm / 2, piece_mm / 2))
+        return np.stack(matrices) @ print_scalings(self.piece, conditions)
 
     def pictures(self, conditions: Conditions, size_px: tuple[int, int]) -> np.ndarray:
-        """N×H×W×3 uint8 sRGB: the images, some with a box of random values."""
-        chosen = flat.pick(conditions.pose.background[:, 0], len(self.images))
-        shown = [flat.warp_picture(self.images[i], np.eye(3), self.photo_px, size_px) for i in chosen]
-        for picture, chance in zip(shown, conditions.pose.background[:, 4], strict=True):
+        """Return N×H×W×3 uint8 sRGB: the images, some with a box of random values."""
+        indices = pick_indices(conditions.pose.background[:, 0], len(self.images))
+        pictures = [warp_picture(self.images[i], np.eye(3), self.photo_px, size_px) for i in indices]
+        for picture, chance in zip(pictures, conditions.pose.background[:, 4], strict=True):
             if chance < self.settings.background.erasing:
-                erase(picture, int(chance * 2**53))  # its own digits: a view kept for other lights keeps its box
-        return np.stack(shown)
+                erase(picture, int(chance * 2**53))  # its digits: a view in other light has the same box
+        return np.stack(pictures)
 
     def piece_light(self, conditions: Conditions) -> np.ndarray:
-        """N×3×6 as in `FlatScene.piece_light`: 1 everywhere."""
+        """Return N×3×6 (see `PieceScene.piece_light`): 1 everywhere."""
         light = np.zeros((len(conditions), 3, 6))
         light[..., 0] = 1
         return light
 
 
 def build(source: SceneSource) -> ImageScene:
-    """The scene of a folder of images and their labels; images that cannot be read are warned about.
+    """Build the scene of a folder of images and their labels; warn about images that cannot be read.
 
-    The target's label counts as an image's where it is the CSV's own text, one of its comma-separated names, or the
-    same index, whatever the case; so do the labels in `target.accept`.
+    An image counts as the target's if its label in the CSV, or one of the comma-separated names in it, equals the
+    target's name, its index, or a label in `target.accept`; case does not matter.
     """
     settings, base = source.settings, source.base
-    flat.refuse_bending(settings)
+    refuse_bending(settings)
     files = _files_of_class(settings, base)
     images, unread = _read_all(files, settings.camera.photo_px)
     identity = source.sheet_id({})
@@ -123,21 +134,21 @@ def build(source: SceneSource) -> ImageScene:
 
 
 def px_per_mm(settings: SceneSettings, piece: Piece, conditions: Conditions) -> np.ndarray:
-    """N scales at `photo_px`: the piece's longer side takes the drawn share of the picture's shorter one."""
+    """Return N scales at `photo_px`: the piece's longer side takes the drawn share of the picture's shorter one."""
     low, high = settings.view.patch_share
     shares = low * (high / low) ** conditions.pose.background[:, 1]
     return shares * min(settings.camera.photo_px) / max(piece.size_mm)
 
 
 def largest_share(roll_deg: tuple[float, float]) -> float:
-    """The largest `view.patch_share` at which the piece fits into the square at all angles (in whole thousandths)."""
+    """Return the largest `view.patch_share` that fits into the square at all angles, in whole thousandths."""
     widest = max(rotated_extent(np.ones(2), roll)[0] for roll in np.linspace(*roll_deg))  # of a turned square of side 1
     return int(1000 / widest) / 1000
 
 
 def erase(picture: np.ndarray, seed: int) -> None:
-    """Random Erasing of a uint8 H×W×3 picture in place: a box of its centered square takes random values, the same box
-    and values at every size, and in photograph and square.
+    """Apply Random Erasing to a uint8 H×W×3 picture in place: a box of its centered square takes random values, the
+    same box and values at every size, and in photograph and square.
     """
     rng = np.random.default_rng(seed)
     box = _erased_box(rng)
@@ -152,7 +163,7 @@ def erase(picture: np.ndarray, seed: int) -> None:
 
 
 def _erased_box(rng: np.random.Generator) -> tuple[float, float, float, float]:
-    """x, y, width, height in shares of the square; boxes that do not fit are drawn again, as in the paper."""
+    """Return x, y, width, height in shares of the square; boxes that do not fit are drawn again, as in the paper."""
     while True:
         area, aspect = rng.uniform(*ERASED_AREA), rng.uniform(*ERASED_ASPECT)
         height, width = np.sqrt(area * aspect), np.sqrt(area / aspect)
@@ -162,33 +173,33 @@ def _erased_box(rng: np.random.Generator) -> tuple[float, float, float, float]:
 
 
 def _files_of_class(settings: SceneSettings, base: Path) -> list[Path]:
-    """The files whose label is the target's, in an order that depends on nothing but their names."""
+    """Return the files with the target's label, in an order that depends on nothing but their names."""
     folder, table = (
         Path(expand_path(text, base)) for text in (settings.object.images or "", settings.object.labels or "")
     )
     rows = read_labels(table)
     target = settings.target
-    wanted = {str(label).strip().casefold() for label in (target.label, *target.accept)}
-    names = [name for name, label in rows if wanted & {label, *(part.strip() for part in label.split(","))}]
-    if not names:
-        seen = ", ".join(sorted({label for _, label in rows})[:5])
+    labels = {str(label).strip().casefold() for label in (target.label, *target.accept)}
+    file_names = [name for name, label in rows if labels & {label, *(part.strip() for part in label.split(","))}]
+    if not file_names:
+        others = ", ".join(sorted({label for _, label in rows})[:5])
         raise Refused(
             f'images labeled "{target.label}" in {table}',
-            f"{len(rows)} images with other labels ({seen} ...)",
-            "name the target as the file does: by the same name or index",
+            f"{len(rows)} images with other labels ({others} ...)",
+            "give the target the name or index that it has in this file",
         )
-    missing = [name for name in names if not is_file(folder / name)]
+    missing = [name for name in file_names if not is_file(folder / name)]
     if missing:
         raise Refused(
             f"the images that {table.name} names in {folder}",
             f"{len(missing)} missing ({missing[0]})",
             "copy them there",
         )
-    return [folder / name for name in sorted(set(names), key=lambda name: hashlib.sha256(name.encode()).digest())]
+    return [folder / name for name in sorted(set(file_names), key=lambda name: hashlib.sha256(name.encode()).digest())]
 
 
 def read_labels(table: Path) -> list[tuple[str, str]]:
-    """(file name, label in small letters) of each line; commas after the first belong to the label."""
+    """Return (file name, label in small letters) of each line; commas after the first belong to the label."""
     if not is_file(table):
         raise Refused("a CSV of file names and labels (object.labels)", f"no file at {table}", "check the path")
     try:
@@ -202,30 +213,30 @@ def read_labels(table: Path) -> list[tuple[str, str]]:
     return [(row[0].strip(), ",".join(row[1:]).strip().casefold()) for row in rows]
 
 
-def _read_all(files: list[Path], photo_px: tuple[int, int]) -> tuple[tuple[flat.BasePicture, ...], list[str]]:
+def _read_all(files: list[Path], photo_px: tuple[int, int]) -> tuple[tuple[BasePicture, ...], list[str]]:
     images, unread = [], []
     for path in files:
         try:
-            images.append(flat.picture_for(read_photo(path).srgb, photo_px)[0])
+            images.append(picture_for(read_photo(path).srgb, photo_px)[0])
         except PhotoRejected:
             unread.append(path.name)
     if not images:
         raise Refused(
-            "an image that can be read", f"none of {len(files)} in {files[0].parent}", "save them as JPEG or PNG"
+            "an image that can be read", f"{len(files)} unreadable in {files[0].parent}", "save them as JPEG or PNG"
         )
     return tuple(images), unread
 
 
 def _piece(settings: SceneSettings, identity: str) -> Piece:
-    """The printed piece; its markers are as large as the views need them."""
+    """Lay out the printed piece with markers as large as the views need them."""
     (low, high), size_mm, template = settings.view.patch_share, settings.patch.size_mm, settings.sheet.template
     if low <= 0:
-        raise Refused("view.patch_share above 0", f"{low:g}", "give a share that can be seen")
+        raise Refused("view.patch_share above 0", f"{low:g}", "give a share between 0 and 1")
     largest = largest_share(settings.view.roll_deg)
     if high > largest:
         raise Refused(
             "a piece that fits into the picture's centered square at the largest view.patch_share",
-            f"{high / largest:.0%} of it",
+            f"{high:g}, which is {high / largest:.0%} of what fits",
             f"lower it to {largest:g}",
         )
     smallest = low * (high / low) ** (1 - READABLE_SHARE)

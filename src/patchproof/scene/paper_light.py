@@ -1,11 +1,11 @@
-"""The light on a piece of paper, measured where the paper is white.
+"""Measure the light on a piece of paper where the paper is white.
 
 In: a photograph of a blank piece, its homography and its blur. Out: `PaperLight`: per channel a quadratic in piece
-coordinates of the linear light that white paper shows, what it leaves unexplained, and the paper's grain. Pixels count
-that lie on white paper and far enough from ink and cut line for blur to bring nothing over; clipped ones do not. The
-fit is robust: least median of squares finds the light that most of the paper agrees on, Tukey's weights let a
-highlight or a shadow's edge go. A quadratic, because a lamp's fall-off over a flat piece is smooth: twice the piece's
-size above its middle a bare lamp is met within 1 %, above its edge within 4 %.
+coordinates of the linear light that white paper shows, the unexplained remainder, and the paper's grain. Pixels count
+if they lie on white paper, far enough from ink and cut line that blur brings nothing over; clipped pixels do not. The
+fit is robust: least median of squares finds the light that most of the paper agrees on, and Tukey's weights ignore a
+highlight or a shadow's edge. A quadratic, because a lamp's fall-off over a flat piece is smooth: for a bare lamp twice
+the piece's size above its middle the error is within 1 %, above its edge within 4 %.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from patchproof.photo.rejection import PhotoRejected
 from patchproof.sheets.piece import Piece, marker_rect
 
 _CUT_SLACK_MM = 1.0  # scissors do not follow the line
-_MOST_CLIPPED = 0.5  # share of the white paper
-_LEAST_PIXELS = 200
-_MOST_PIXELS = 20_000  # more would cost time and change no digit
+_MAX_CLIPPED = 0.5  # of the white paper
+_MIN_PIXELS = 200
+_MAX_PIXELS = 20_000  # more would cost time and change no digit
 
 
 @dataclass(frozen=True)
 class PaperLight:
-    """`coefficients` 3×6 of [1, u, v, u², uv, v²]; `unevenness` is the root mean square of what they and noise
-    leave, as a share of the light; `noise` the standard deviation at white in linear light.
+    """The light on paper: `coefficients` 3×6 of [1, u, v, u², uv, v²]; `unevenness` is the root mean square of the
+    remainder without noise, as a share of the light; `noise` the standard deviation at white in linear light.
     """
 
     coefficients: np.ndarray
@@ -38,45 +38,45 @@ class PaperLight:
 
 
 def paper_light(srgb: np.ndarray, px_from_piece: np.ndarray, piece: Piece, blur_px: float) -> PaperLight:
-    """The light on a blank piece in a uint8 photograph; `PhotoRejected` where it shows too little white paper."""
+    """Measure the light on a blank piece in a uint8 photograph; `PhotoRejected` if it shows too little white paper."""
     codes, mm = _white_pixels(srgb, px_from_piece, piece, blur_px)
-    if len(codes) < _LEAST_PIXELS:
-        raise PhotoRejected("too_small", len(codes), _LEAST_PIXELS, "come closer: too little white paper is in view")
+    if len(codes) < _MIN_PIXELS:
+        raise PhotoRejected("too_small", len(codes), _MIN_PIXELS, "come closer: too little white paper is in view")
     clipped = (codes >= CLIPPED_CODE).any(1)
-    if clipped.mean() > _MOST_CLIPPED:
-        raise PhotoRejected("clipped", float(clipped.mean()), _MOST_CLIPPED, "the paper is overexposed: expose less")
+    if clipped.mean() > _MAX_CLIPPED:
+        raise PhotoRejected("clipped", float(clipped.mean()), _MAX_CLIPPED, "the paper is overexposed: expose less")
     codes, mm = codes[~clipped], mm[~clipped]
     light, terms = LINEAR_FROM_CODE[codes], quadratic_terms(mm, piece.size_mm)
     coefficients, weight = _robust_fit(terms, light)
-    left = light - terms @ coefficients.T
+    residual = light - terms @ coefficients.T
     white = light.mean(0)
-    noise = _noise(left[weight > 0], white)
-    unevenness = ((left**2).mean(0).sum() - noise**2 * white.sum()) / (white**2).sum()
+    noise = _noise(residual[weight > 0], white)
+    unevenness = ((residual**2).mean(0).sum() - noise**2 * white.sum()) / (white**2).sum()
     return PaperLight(coefficients, float(np.sqrt(max(unevenness, 0))), noise)
 
 
 def quadratic_terms(mm: np.ndarray, size_mm: tuple[float, float]) -> np.ndarray:
-    """N×6 rows [1, u, v, u², uv, v²] of piece points."""
+    """Return N×6 rows [1, u, v, u², uv, v²] of piece points."""
     u, v = (2 * mm / np.array(size_mm) - 1).T
     return np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], 1)
 
 
 def _white_pixels(srgb, px_from_piece, piece: Piece, blur_px: float) -> tuple[np.ndarray, np.ndarray]:
-    """Codes N×3 and piece millimeters N×2 of pixels that see nothing but white paper."""
-    whole = (0.0, 0.0, *piece.size_mm)
-    quad = apply_homography(px_from_piece, rect_corners(whole))
+    """Return codes N×3 and piece millimeters N×2 of pixels that see nothing but white paper."""
+    piece_rect = (0.0, 0.0, *piece.size_mm)
+    corners_px = apply_homography(px_from_piece, rect_corners(piece_rect))
     limit = np.array([srgb.shape[1], srgb.shape[0]])
-    low = np.clip(np.floor(quad.min(0)).astype(int), 0, limit)
-    high = np.clip(np.ceil(quad.max(0)).astype(int), low, limit)
-    every = max(1, int(np.sqrt(np.prod(high - low) / (4 * _MOST_PIXELS))))  # about a quarter of it is clear paper
-    columns, rows = np.meshgrid(np.arange(low[0], high[0], every), np.arange(low[1], high[1], every))
+    low = np.clip(np.floor(corners_px.min(0)).astype(int), 0, limit)
+    high = np.clip(np.ceil(corners_px.max(0)).astype(int), low, limit)
+    stride = max(1, int(np.sqrt(np.prod(high - low) / (4 * _MAX_PIXELS))))  # about a quarter of the box is clear paper
+    columns, rows = np.meshgrid(np.arange(low[0], high[0], stride), np.arange(low[1], high[1], stride))
     mm = apply_homography(np.linalg.inv(px_from_piece), np.column_stack([columns.ravel(), rows.ravel()]) + 0.5)
-    scales = [local_scale(px_from_piece, corner) for corner in rect_corners(whole)]
+    scales = [local_scale(px_from_piece, corner) for corner in rect_corners(piece_rect)]
     px_per_mm = min(mean * np.sqrt(np.cos(np.radians(tilt))) for mean, tilt in scales)
-    clear_mm = (1 + 3 * blur_px) / max(px_per_mm, 1e-6)
-    white = _inside(mm, whole, -clear_mm - _CUT_SLACK_MM)
+    margin_mm = (1 + 3 * blur_px) / max(px_per_mm, 1e-6)
+    white = _inside(mm, piece_rect, -margin_mm - _CUT_SLACK_MM)
     for rect in map(marker_rect, piece.markers):
-        white &= ~_inside(mm, rect, clear_mm)
+        white &= ~_inside(mm, rect, margin_mm)
     return srgb[rows.ravel()[white], columns.ravel()[white]], mm[white]
 
 
@@ -87,7 +87,7 @@ def _inside(mm: np.ndarray, rect, grown_mm: float) -> np.ndarray:
 
 
 def _robust_fit(terms: np.ndarray, light: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Coefficients 3×6 and the pixels' weights, which all channels share."""
+    """Return coefficients 3×6 and the pixels' weights, which all channels share."""
     error = np.abs(light.mean(1) - terms @ _start(terms, light.mean(1)))
     coefficients, weight = np.zeros((3, 6)), np.ones(len(terms))
     for _ in range(20):
@@ -100,22 +100,22 @@ def _robust_fit(terms: np.ndarray, light: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def _start(terms: np.ndarray, light: np.ndarray) -> np.ndarray:
-    """Six coefficients of least median error among fits to a few pixels each, which a third of bad ones cannot spoil.
+    """Return six coefficients of least median error among fits to a few pixels each, robust to a third of bad pixels.
 
     Of 500 dozens drawn from pixels of which a third are bad, four are expected to be all good.
     """
     rng = np.random.default_rng(0)  # fixed: the same photograph must give the same bytes
     dozens = rng.integers(0, len(light), (500, 12))
-    fits = np.einsum("kpn,kn->kp", np.linalg.pinv(terms[dozens]), light[dozens])
-    some = rng.integers(0, len(light), 1000)
-    return fits[np.median(np.abs(fits @ terms[some].T - light[some]), axis=1).argmin()]
+    candidates = np.einsum("kpn,kn->kp", np.linalg.pinv(terms[dozens]), light[dozens])
+    sample = rng.integers(0, len(light), 1000)
+    return candidates[np.median(np.abs(candidates @ terms[sample].T - light[sample]), axis=1).argmin()]
 
 
-def _noise(left: np.ndarray, white: np.ndarray) -> float:
-    """Standard deviation at white of residuals N×3 (without outliers) around `white`, less what rounding to codes adds.
+def _noise(residual: np.ndarray, white: np.ndarray) -> float:
+    """Return the standard deviation at white of residuals N×3 (without outliers) around `white`, less that of rounding.
 
     Shot noise has a variance in proportion to the light (EMVA 1288), hence the division.
     """
     step = np.interp(white, LINEAR_FROM_CODE[:-1], np.diff(LINEAR_FROM_CODE))
-    variance = (left**2).mean(0) - step**2 / 12
+    variance = (residual**2).mean(0) - step**2 / 12
     return float(np.sqrt(np.maximum(variance / np.maximum(white, 1e-3), 0).mean()))

@@ -1,7 +1,7 @@
 """A mesh with a piece on it, by itself a flat card (bent: see `bent_scene`).
 
 In: settings. Out: a `PatchScene`, which knows its sheet id (a hash of settings and seed, fixed before optimizing), the
-layout of the printed piece (the design and its markers, whose size follows from the views) and where the piece lies.
+layout of the printed piece (the design and its markers, whose size follows from the views) and the piece's placement.
 """
 
 from __future__ import annotations
@@ -48,26 +48,26 @@ class PatchScene(PieceScene, MeshScene):
     LAY: ClassVar[PlacementMethod] = staticmethod(place_card)  # how the piece lies on the surface
 
     @classmethod
-    def on(cls, bare: MeshScene) -> Self:
-        """The bare object with its piece at the settings' place; refused where it cannot lie there."""
-        piece, placement, unreadable, notes = _hang(bare, cls.LAY)
-        own = {"piece": piece, "placement": placement, "unreadable": unreadable, "notes": notes}
-        return cls(**vars(bare) | own)
+    def from_bare(cls, bare: MeshScene) -> Self:
+        """Return the bare object with its piece at the settings' place; refused if it cannot lie there."""
+        piece, placement, unreadable, notes = _place_piece(bare, cls.LAY)
+        fields = {"piece": piece, "placement": placement, "unreadable": unreadable, "notes": notes}
+        return cls(**vars(bare) | fields)
 
-    def lies(self) -> dict[str, Any]:
-        """As in `Scene.lies`."""
+    def placement_summary(self) -> dict[str, Any]:
+        """Implement `Scene.placement_summary`."""
         names = ("size_mm", "family", "reason", "gap_mm", "gap_mean_mm", "overhang_share", "stretch")
         return {name: getattr(self.placement, name) for name in names}
 
     def record(self) -> dict[str, Any]:
-        """What run.json says of the piece and how well it fits."""
-        fits = self.lies()
-        del fits["size_mm"]  # it is there as piece_mm
-        return super().record() | fits
+        """Return run.json's record of the piece and how well it fits."""
+        fit = self.placement_summary()
+        del fit["size_mm"]  # the record has it as piece_mm
+        return super().record() | fit
 
     @property
     def unreadable_share(self) -> float:
-        """The share of the views in which a module of the piece's markers is under `PX_PER_MODULE`."""
+        """The share of views in which a module of the piece's markers is under `PX_PER_MODULE`."""
         return self.unreadable
 
     @property
@@ -77,79 +77,79 @@ class PatchScene(PieceScene, MeshScene):
 
     @property
     def normal(self) -> np.ndarray:
-        """Where the piece's middle faces."""
+        """The direction that the piece's middle faces."""
         return self.placement.normal
 
     @property
     def is_flat(self) -> bool:
-        """Whether piece and lens are flat, so that photographs are homographies of the sheet."""
-        return self.placement.is_flat and not (self.camera is not None and self.camera.bends)
+        """True if piece and lens are flat, so that photographs are homographies of the sheet."""
+        return self.placement.is_flat and not (self.camera is not None and self.camera.has_distortion)
 
     def _laid_out(self) -> Self:
-        return self.on(self)
+        return self.from_bare(self)
 
     def piece_homographies(self, conditions: Conditions, size_px: tuple[int, int]) -> np.ndarray:
-        """N×3×3 from piece millimeters to pixels of the pinhole picture; of a bent piece, its tangent plane's."""
+        """Implement `PieceScene.piece_homographies`."""
         poses, plane = self.camera_from_print(conditions), self.placement.world_from_piece
         return geometry.plane_homography(self.matrix_px(size_px), poses, plane)
 
     def piece_px(self, conditions: Conditions, piece_mm: np.ndarray) -> np.ndarray:
-        """As in `PieceScene.piece_px`."""
+        """Implement `PieceScene.piece_px`."""
         pose, world = self.camera_from_print(conditions)[0], self.placement.world(piece_mm)
         points = geometry.project(self.matrix_px(self.photo_px), pose, world)
         return points if self.camera is None else self.camera.distort_points(points, self.photo_px)
 
     def paper(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """As in `PieceScene.paper`."""
-        laid, by_rows = self.placement, [0, 1, 3, 2]
-        if not laid.is_flat:
-            return laid.vertices_mm, laid.normals, laid.piece_mm
-        corners_mm = geometry.rect_corners((0, 0, *laid.size_mm))[by_rows]  # a card's run clockwise
-        return laid.vertices_mm[by_rows], np.broadcast_to(laid.normal, (4, 3)), corners_mm
+        """Implement `PieceScene.paper`."""
+        placement, by_rows = self.placement, [0, 1, 3, 2]
+        if not placement.is_flat:
+            return placement.vertices_mm, placement.normals, placement.piece_mm
+        corners_mm = geometry.rect_corners((0, 0, *placement.size_mm))[by_rows]  # a card's corners run clockwise
+        return placement.vertices_mm[by_rows], np.broadcast_to(placement.normal, (4, 3)), corners_mm
 
     def piece_azimuth_deg(self, conditions: Conditions) -> np.ndarray:
-        """N angles of the camera to the right of the piece's middle, beyond 90 where its face is turned away."""
+        """Return N angles of the camera to the right of the piece's middle, beyond 90 if its face is turned away."""
         middle = np.array(self.placement.size_mm) / 2
         poses = self.camera_from_world(conditions) @ self.placement.world_from_piece
         return np.array([geometry.view_angles(pose, middle)[0] for pose in poses])
 
-    def tapes(self) -> tuple[TapeMeasurement, ...]:
-        """What a tape measure says beside the piece, as one faces its side; of a card, whose edges do, nothing."""
+    def tape_measurements(self) -> tuple[TapeMeasurement, ...]:
+        """Return tape measurements beside the piece, as one faces its side; none for a card, whose edges do."""
         return ()
 
     def white_light(self, conditions: Conditions) -> np.ndarray:
-        """N: the light on white paper at the piece's middle."""
+        """Return N: the light on white paper at the piece's middle."""
         light = conditions.light
         return light.ambient + light.directional * self.cosines(light.light_azimuth_deg, light.light_elevation_deg)
 
     def with_print_scale(self, scale: tuple[float, float]) -> Self:
-        """As in `PieceScene.with_print_scale`."""
+        """Implement `PieceScene.with_print_scale`."""
         if scale == (1.0, 1.0):
             return self
-        placement, by = self.placement, np.array(scale)
-        middle, about = np.array(placement.size_mm) / 2, np.eye(4)
-        about[[0, 1], [0, 1]] = by
-        about[:2, 3] = middle - by * middle
-        vertices = placement.world(middle + (placement.piece_mm - middle) * by)
-        frame = placement.world_from_piece @ about
+        placement, factors = self.placement, np.array(scale)
+        middle, scaling = np.array(placement.size_mm) / 2, np.eye(4)
+        scaling[[0, 1], [0, 1]] = factors
+        scaling[:2, 3] = middle - factors * middle
+        vertices = placement.world(middle + (placement.piece_mm - middle) * factors)
+        frame = placement.world_from_piece @ scaling
         return replace(self, placement=replace(placement, vertices_mm=vertices, world_from_piece=frame))
 
 
 def build(source: SceneSource) -> PatchScene:
-    """The scene of settings that give a flat card its place."""
-    return PatchScene.on(load_bare(source))
+    """Build the scene of settings that give a flat card its place."""
+    return PatchScene.from_bare(load_bare(source))
 
 
 def require_patch(scene: Scene, expected: str = "a scene with a patch on a mesh") -> PatchScene:
-    """The scene as one with a piece that lies on a mesh; refused of any other."""
+    """Return the scene as one with a piece that lies on a mesh; refused for any other."""
     if isinstance(scene, PatchScene):
         return scene
     refuse_without_place(scene)
     raise Refused(expected, scene.description(), 'name object.mesh, and leave patch.kind out or "patch"')
 
 
-def _hang(scene: MeshScene, lay: PlacementMethod) -> tuple[Piece, Placement, float, tuple[str, ...]]:
-    """The piece with markers as large as views need, its placement, the share of views that ask for larger, notes."""
+def _place_piece(scene: MeshScene, lay: PlacementMethod) -> tuple[Piece, Placement, float, tuple[str, ...]]:
+    """Return the piece, its markers as large as views need, its placement, the share of unreadable views, notes."""
     settings, mesh, patch = scene.settings, scene.mesh, scene.settings.patch
     try:
         placement = lay(mesh, patch_frame(mesh, patch), patch.size_mm, patch.spin_deg)
@@ -157,7 +157,8 @@ def _hang(scene: MeshScene, lay: PlacementMethod) -> tuple[Piece, Placement, flo
         raise refused.with_advice(placement_advice(mesh, patch, lay, smallest_piece_mm())) from refused
     scales = _smallest_scales(scene, placement)
     if not len(scales):
-        raise Refused("views from which the patch can be seen", "none", "turn azimuth_deg towards the patch")
+        got = f"{SCALE_VIEWS} views from behind it"
+        raise Refused("views from which the patch can be seen", got, "turn azimuth_deg towards the patch")
     needed_mm = float(MARKER_MODULES * PX_PER_MODULE / np.quantile(scales, 1 - READABLE_SHARE))
     marker_mm = marker_size_mm(needed_mm, patch.size_mm)
     piece = lay_out_piece(patch.size_mm, marker_mm, scene.sheet_id, "design", patch.bend)
@@ -174,7 +175,7 @@ def _hang(scene: MeshScene, lay: PlacementMethod) -> tuple[Piece, Placement, flo
 
 
 def _smallest_scales(scene: MeshScene, card: Placement) -> np.ndarray:
-    """px per mm at the card's middle, along the foreshortened direction, over views that face it."""
+    """Return px per mm at the card's middle, along the foreshortened direction, over views that face it."""
     conditions = scene.draw("select", SCALE_VIEWS, 0)
     center_mm, matrix = card.center_mm, scene.matrix_px(scene.photo_px)
     poses = camera_poses(scene, center_mm, conditions.pose)

@@ -1,10 +1,10 @@
 """Procedural pictures: textures to dress objects in, backgrounds to put behind them.
 
 In: a numpy generator. Out: P×P×3 in [0, 1], or uint8 for backgrounds. A photograph's background has detail at all
-scales and regions of different stuff; so have these: noise with the 1/f spectrum of natural pictures, clouds, cells,
-bricks, stripes, checks and grain, in regions, with clutter in front. Before photographs of brick, grass and roads, a
-network trained with plain walls and smooth clouds alone named half of the objects; with these it names three quarters.
-Source of the spectrum: Field, JOSA A 4 (1987) 2379.
+scales and regions of different materials; so have these: noise with the 1/f spectrum of natural pictures, clouds,
+cells, bricks, stripes, checks and grain, in regions, with clutter in front. Before photographs of brick, grass and
+roads, a network trained with plain walls and smooth clouds alone named half of the objects; with these it names three
+quarters. Source of the spectrum: Field, JOSA A 4 (1987) 2379.
 """
 
 from __future__ import annotations
@@ -15,32 +15,32 @@ import numpy as np
 
 from patchproof.base.color import codes_from_srgb
 
-_SQUARE_PX = 4  # whose corners are asked for their nearest point first; with 8 textures took up to half as long again
-PictureMaker = Callable[[], np.ndarray]  # drawn, but not made yet: of what nobody sees, nothing else is needed
+_SQUARE_PX = 4  # squares whose corners are looked up first; with 8 textures took up to half as long again
+PictureMaker = Callable[[], np.ndarray]  # makes a picture whose random numbers are drawn; hidden ones are never made
 
 
 def texture(rng: np.random.Generator, px: int = 64) -> np.ndarray:
-    """P×P×3 in [0, 1]: one of the patterns in drawn colors, with some natural unevenness."""
+    """Return P×P×3 in [0, 1]: one of the patterns in random colors, with some natural unevenness."""
     return drawn_texture(rng, px)()
 
 
 def drawn_texture(rng: np.random.Generator, px: int) -> PictureMaker:
-    """The same when it is called; all that is random in it is drawn now."""
+    """Draw all random numbers of a texture now, and return the function that makes it."""
     blend = _PATTERNS[int(rng.choice(len(_PATTERNS), p=_SHARES))](rng, px)
     first, second, uneven = color(rng), color(rng), rng.random() < 0.5
     strength, field = (rng.uniform(0, 0.25), natural(rng, px)) if uneven else (0, None)
 
-    def made() -> np.ndarray:
-        picture = _mixed(first, second, blend())
+    def make() -> np.ndarray:
+        picture = _mix(first, second, blend())
         if field is not None:
             picture += (strength * (field() - 0.5))[..., None]
         return np.clip(picture, 0, 1, out=picture)
 
-    return made
+    return make
 
 
 def background(rng: np.random.Generator, px: int = 128) -> np.ndarray:
-    """P×P×3 uint8: plain or a gradient (a third), or up to three regions of texture; most with clutter in front."""
+    """Return P×P×3 uint8: plain or a gradient (a third), or up to three textures; most with clutter in front."""
     import cv2
 
     if rng.random() < 0.33:
@@ -67,24 +67,24 @@ def background(rng: np.random.Generator, px: int = 128) -> np.ndarray:
 
 
 def color(rng: np.random.Generator) -> np.ndarray:
-    """3 numbers in [0, 1]: any color, more often a grayish one than a strong one."""
+    """Return 3 numbers in [0, 1]: any color, more often a grayish one than a strong one."""
     strong = rng.random(3)
     return strong.mean() + (strong - strong.mean()) * rng.uniform(0, 1) ** 1.5
 
 
 def natural(rng: np.random.Generator, px: int) -> PictureMaker:
-    """P×P in [0, 1]: noise with amplitude 1/f^a, the mean and spread of a photograph."""
-    squeeze = np.exp(rng.normal(0, 0.4))  # grass and water have a direction
+    """Draw noise P×P in [0, 1] with amplitude 1/f^a and the mean and spread of a photograph."""
+    stretch = np.exp(rng.normal(0, 0.4))  # grass and water have a direction
     noise, steepness = rng.normal(size=(px, px)), rng.uniform(0.5, 1.6)
 
-    def made() -> np.ndarray:
+    def make() -> np.ndarray:
         fy, fx = np.fft.fftfreq(px)[:, None], np.fft.rfftfreq(px)[None]
-        frequency = np.hypot(fy * squeeze, fx / squeeze)
+        frequency = np.hypot(fy * stretch, fx / stretch)
         frequency[0, 0] = np.inf
         field = np.fft.irfft2(np.fft.rfft2(noise) / frequency**steepness, (px, px))
         return np.clip(0.5 + 0.25 * field / field.std(), 0, 1)
 
-    return made
+    return make
 
 
 def _clouds(rng: np.random.Generator, px: int) -> PictureMaker:
@@ -92,77 +92,77 @@ def _clouds(rng: np.random.Generator, px: int) -> PictureMaker:
 
     steepness, octaves = rng.uniform(0.4, 0.9), [rng.random((2 ** (octave + 1) + 1,) * 2) for octave in range(5)]
 
-    def made() -> np.ndarray:
+    def make() -> np.ndarray:
         total = np.zeros((px, px))
         for octave, coarse in enumerate(octaves):
             total += steepness**octave * cv2.resize(coarse, (px, px), interpolation=cv2.INTER_CUBIC)
         return (total - total.min()) / max(np.ptp(total), 1e-9)
 
-    return made
+    return make
 
 
 def _cells(rng: np.random.Generator, px: int) -> PictureMaker:
-    """Gravel, leaves, a crowd: each pixel has the shade of its nearest of some points."""
+    """Draw gravel, leaves, a crowd: each pixel has the shade of the nearest of some points."""
     points = rng.random((int(np.exp(rng.uniform(np.log(8), np.log(800)))), 2)) * px
-    shades, darker = rng.random(len(points)), rng.uniform(0, 1)
+    shades, darkening = rng.random(len(points)), rng.uniform(0, 1)
 
-    def made() -> np.ndarray:
+    def make() -> np.ndarray:
         index = _nearest(points, px)
         down, across = np.mgrid[:px, :px] - points.T[:, index]
-        away = np.sqrt(down**2 + across**2)
-        return shades[index] * np.clip(1.2 - away / max(away.max(), 1e-9) * darker, 0, 1)
+        distance = np.sqrt(down**2 + across**2)
+        return shades[index] * np.clip(1.2 - distance / max(distance.max(), 1e-9) * darkening, 0, 1)
 
-    return made
+    return make
 
 
 def _nearest(points: np.ndarray, px: int) -> np.ndarray:
-    """P×P: which of the points M×2 is nearest to each pixel. What is near a point is convex: a square that is it at all
-    corners is it within, and is not asked.
+    """Return P×P: the index of the nearest of points M×2 to each pixel. The pixels nearest to one point are a convex
+    region, so that a square whose corners all have the same nearest point needs no further queries.
     """
     from scipy.spatial import KDTree
 
     tree, corners = KDTree(points), np.arange(0, px + _SQUARE_PX, _SQUARE_PX)
-    known = np.asarray(tree.query(np.stack(np.meshgrid(corners, corners, indexing="ij"), 2))[1])
-    first, others = known[:-1, :-1], (known[1:, :-1], known[:-1, 1:], known[1:, 1:])
-    whole = np.logical_and.reduce([first == other for other in others])
-    index, asked = (each.repeat(_SQUARE_PX, 0).repeat(_SQUARE_PX, 1)[:px, :px] for each in (first, ~whole))
-    index[asked] = tree.query(np.argwhere(asked))[1]
+    at_corners = np.asarray(tree.query(np.stack(np.meshgrid(corners, corners, indexing="ij"), 2))[1])
+    first, others = at_corners[:-1, :-1], (at_corners[1:, :-1], at_corners[:-1, 1:], at_corners[1:, 1:])
+    uniform = np.logical_and.reduce([first == other for other in others])
+    index, mixed = (values.repeat(_SQUARE_PX, 0).repeat(_SQUARE_PX, 1)[:px, :px] for values in (first, ~uniform))
+    index[mixed] = tree.query(np.argwhere(mixed))[1]
     return index
 
 
 def _bricks(rng: np.random.Generator, px: int) -> PictureMaker:
-    """Rows of bricks or slabs, each of its own shade, with joints."""
+    """Draw rows of bricks or slabs, each of its own shade, with joints."""
     high, wide, shift = rng.uniform(4, 18), rng.uniform(6, 40), rng.choice([0.5, 0.0, 0.33])
     shade, strength, joints = rng.random((px, px)), rng.uniform(0.1, 0.8), rng.uniform(0.5, 2, 2)
 
-    def made() -> np.ndarray:
+    def make() -> np.ndarray:
         y, x = np.mgrid[:px, :px].astype(float)
         row = np.floor(y / high)
         x = x + row * wide * shift
         joint = ((y % high) < joints[0]) | ((x % wide) < joints[1])
         return np.where(joint, 1.0, (shade * strength)[row.astype(int), (x // wide).astype(int) % px])
 
-    return made
+    return make
 
 
 def _stripes(rng: np.random.Generator, px: int) -> PictureMaker:
-    turn, waves, least = rng.uniform(0, np.pi), rng.uniform(1.5, 14), rng.uniform(-0.8, 0.8)
+    turn, waves, threshold = rng.uniform(0, np.pi), rng.uniform(1.5, 14), rng.uniform(-0.8, 0.8)
 
-    def made() -> np.ndarray:
+    def make() -> np.ndarray:
         y, x = np.mgrid[:px, :px] / px
-        return (np.sin(2 * np.pi * waves * (x * np.cos(turn) + y * np.sin(turn))) > least).astype(float)
+        return (np.sin(2 * np.pi * waves * (x * np.cos(turn) + y * np.sin(turn))) > threshold).astype(float)
 
-    return made
+    return make
 
 
 def _checks(rng: np.random.Generator, px: int) -> PictureMaker:
     waves = rng.uniform(1.5, 14)
 
-    def made() -> np.ndarray:
+    def make() -> np.ndarray:
         y, x = np.mgrid[:px, :px] / px * waves
         return (np.floor(x) + np.floor(y)) % 2
 
-    return made
+    return make
 
 
 def _grain(rng: np.random.Generator, px: int) -> PictureMaker:
@@ -182,12 +182,12 @@ def _gradient(rng: np.random.Generator, px: int) -> np.ndarray:
     y, x = np.mgrid[:px, :px] / px
     angle, first, second = rng.uniform(0, 2 * np.pi), color(rng), color(rng)
     blend = 0.5 + rng.uniform(0, 0.8) * ((x - 0.5) * np.cos(angle) + (y - 0.5) * np.sin(angle))
-    picture = _mixed(first, second, blend)
+    picture = _mix(first, second, blend)
     return np.clip(picture, 0, 1, out=picture)
 
 
-def _mixed(first: np.ndarray, second: np.ndarray, blend: np.ndarray) -> np.ndarray:
-    """Two colors by a share P×P of the second; one channel after the other in memory, which is three times as fast."""
+def _mix(first: np.ndarray, second: np.ndarray, blend: np.ndarray) -> np.ndarray:
+    """Mix two colors by a share P×P of the second; channel by channel in memory, three times as fast."""
     picture = np.empty((3, *blend.shape))
     for channel, (a, b) in enumerate(zip(first, second, strict=True)):
         picture[channel] = a + (b - a) * blend
@@ -195,7 +195,7 @@ def _mixed(first: np.ndarray, second: np.ndarray, blend: np.ndarray) -> np.ndarr
 
 
 def _half_plane(rng: np.random.Generator, px: int) -> np.ndarray:
-    """One side of a line, level as often as not: floor and wall, road and sky."""
+    """Return one side of a line, level as often as not: floor and wall, road and sky."""
     y, x = np.mgrid[:px, :px] / px
     angle = np.pi / 2 if rng.random() < 0.5 else rng.uniform(0, 2 * np.pi)
     return (x - rng.random()) * np.cos(angle) + (y - rng.random()) * np.sin(angle) > 0

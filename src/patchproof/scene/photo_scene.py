@@ -1,17 +1,17 @@
-"""A scene of photographs: the object as it was seen with a blank sheet on it, no mesh, nothing modeled but light.
+"""A scene of photographs: the object as it was seen with a blank sheet on it; no mesh, and only light is modeled.
 
 In: a folder of photographs and the blank sheet's manifest. Out: `PhotoScene`. Markers give the homography from the
 piece to each photograph, white paper the light on it, marker borders its blur, the paper's grain its noise. The new
-piece has the blank's geometry and takes its place. Views vary around what was seen: which photograph, zoom, roll and a
-shift of the whole picture, and exposure and white balance as a camera would set them.
+piece has the blank's geometry and takes its place. Views vary around the photographs: in the photograph, in zoom, roll
+and a shift of the whole picture, and in exposure and white balance as a camera would set them.
 
-What a promise of such a scene covers: these photographed places and lights and mild changes of them, since all streams
-draw from the same few photographs. It says nothing of other viewpoints, backgrounds or lamps: photograph them, too.
+A promise of such a scene covers these photographed places and lights and mild changes of them, because all streams draw
+from the same few photographs. It does not cover other viewpoints, backgrounds or lamps: photograph them, too.
 
 The paper alone gives the light, because a printed swatch's own reflectance depends on a printer that is not known here.
 Left out on purpose: shine on the piece (paper in glare counts as an outlier), veiling glare (black ink is as dark as
-the printer makes it), and whatever stood in front of the piece. Photographs that cannot be used are named with the
-code that a judged photograph would get.
+the printer makes it), and whatever stood in front of the piece. Photographs that cannot be used are named with the code
+that a judged photograph would get.
 """
 
 from __future__ import annotations
@@ -34,10 +34,21 @@ from patchproof.photo.quality import blur_px
 from patchproof.photo.read import SUFFIXES, read_photo
 from patchproof.photo.rectify import PageFit, corner_uncertainty_mm, fit_page
 from patchproof.photo.rejection import PhotoRejected
-from patchproof.scene import flat
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.interface import SceneSource, SceneTerm
 from patchproof.scene.paper_light import PaperLight, paper_light
+from patchproof.scene.picture_scene import (
+    BasePicture,
+    PictureScene,
+    photo_from,
+    pick_indices,
+    picture_for,
+    print_scalings,
+    refuse_bending,
+    similarity_matrix,
+    size_from_photo,
+    warp_picture,
+)
 from patchproof.sheets.blank import blank_piece
 from patchproof.sheets.manifest import Manifest, load_manifest
 from patchproof.sheets.markers import DICTIONARY
@@ -45,82 +56,82 @@ from patchproof.sheets.piece import Piece, with_ids
 from patchproof.sheets.template import load_template
 from patchproof.sheets.tiles import refuse_larger_than_page
 
-LEAST_PHOTOS = 6
-_MOST_BLUR = 0.4  # modules of Gaussian sigma: up to here it is measured within a tenth, then too small
-_MOST_RESIDUAL = 0.01  # as in verify, of the piece's shorter side
-_MOST_UNCERTAIN = 0.01  # 95 % point of the worst corner, as a share of the same
-_UNEVEN = 0.05  # of the light: what the quadratic leaves; from here on a reader should know
+MIN_PHOTOS = 6
+_MAX_BLUR_MODULES = 0.4  # Gaussian sigma: up to here it is measured within a tenth, beyond it too small
+_MAX_RESIDUAL_SHARE = 0.01  # of the piece's shorter side, as in verify
+_MAX_UNCERTAINTY_SHARE = 0.01  # of the piece's shorter side: 95 % point of the worst corner
+_UNEVEN_SHARE = 0.05  # of the light: a larger remainder of the quadratic gives a warning
 
 
 @dataclass(frozen=True)
 class BasePhoto:
-    """One usable photograph: homography to its pixels at the scene's `photo_px`, and what was measured on its paper."""
+    """A usable photograph: the homography to its pixels at the scene's `photo_px`, and measurements of its paper."""
 
     name: str
-    picture: flat.BasePicture
+    picture: BasePicture
     photo_from_piece: np.ndarray
     light: PaperLight
     blur_px: float
 
 
 EVEN_LIGHT = SceneTerm("uneven light on paper")
-OWN_BLUR = SceneTerm("photographs' own blur", whole=True)
-OWN_NOISE = SceneTerm("photographs' own noise", whole=True)
+OWN_BLUR = SceneTerm("photographs' own blur", needs_whole_photo=True)
+OWN_NOISE = SceneTerm("photographs' own noise", needs_whole_photo=True)
 
 
 @dataclass(frozen=True)
-class PhotoScene(flat.PictureScene):
+class PhotoScene(PictureScene):
     """A scene whose base pictures are photographs of the object with a blank sheet on it."""
 
     photos: tuple[BasePhoto, ...]
     TERMS = (EVEN_LIGHT, OWN_BLUR, OWN_NOISE)
 
     def description(self) -> str:
-        """How many photographs there are."""
+        """Return how many photographs there are."""
         return f"{len(self.photos)} photographs"
 
     def _laid_out(self) -> Self:
         refuse_larger_than_page(load_template(self.settings.sheet.template), self.piece)
         return replace(self, piece=with_ids(self.piece, self.sheet_id, "design"))
 
-    def without(self, part: SceneTerm) -> Self | None:
-        """The scene with photographs that light their paper evenly, or without their own blur or noise."""
+    def without(self, term: SceneTerm) -> Self | None:
+        """Return the scene with photographs that light their paper evenly, or without their own blur or noise."""
         photos, even = self.photos, [1.0, 0, 0, 0, 0, 0]
-        if part == EVEN_LIGHT:
+        if term == EVEN_LIGHT:
             lights = [replace(photo.light, coefficients=photo.light.coefficients * even) for photo in photos]
-        elif part == OWN_NOISE and any(photo.light.noise for photo in photos):
+        elif term == OWN_NOISE and any(photo.light.noise for photo in photos):
             lights = [replace(photo.light, noise=0.0) for photo in photos]
-        elif part == OWN_BLUR and any(photo.blur_px for photo in photos):
+        elif term == OWN_BLUR and any(photo.blur_px for photo in photos):
             return replace(self, photos=tuple(replace(photo, blur_px=0.0) for photo in photos))
         else:
             return None
         return replace(self, photos=tuple(replace(p, light=light) for p, light in zip(photos, lights, strict=True)))
 
     def piece_homographies(self, conditions: Conditions, size_px: tuple[int, int]) -> np.ndarray:
-        """N×3×3 from piece millimeters to pixels."""
-        to_size = flat.size_from_photo(self.photo_px, size_px)
+        """Return N×3×3 from piece millimeters to pixels."""
+        to_size = size_from_photo(self.photo_px, size_px)
         matrices = self._view_from_photo(conditions)
-        printed = flat.prints(self.piece, conditions)
-        both = zip(matrices, self._chosen(conditions), printed, strict=True)
-        return np.stack([to_size @ matrix @ photo.photo_from_piece @ scale for matrix, photo, scale in both])
+        printed = print_scalings(self.piece, conditions)
+        views = zip(matrices, self._chosen_photos(conditions), printed, strict=True)
+        return np.stack([to_size @ matrix @ photo.photo_from_piece @ scale for matrix, photo, scale in views])
 
     def pictures(self, conditions: Conditions, size_px: tuple[int, int]) -> np.ndarray:
-        """N×H×W×3 uint8 sRGB: the photographs, turned, zoomed and shifted, with the blank sheet still on them."""
-        views = zip(self._chosen(conditions), self._view_from_photo(conditions), strict=True)
-        return np.stack([flat.warp_picture(photo.picture, matrix, self.photo_px, size_px) for photo, matrix in views])
+        """Return N×H×W×3 uint8 sRGB: the photographs, turned, zoomed and shifted, with the blank sheet on them."""
+        views = zip(self._chosen_photos(conditions), self._view_from_photo(conditions), strict=True)
+        return np.stack([warp_picture(photo.picture, matrix, self.photo_px, size_px) for photo, matrix in views])
 
     def piece_light(self, conditions: Conditions) -> np.ndarray:
-        """N×3×6 coefficients as in `FlatScene.piece_light`, in light of the photograph: 1 is its full white."""
-        return np.stack([photo.light.coefficients for photo in self._chosen(conditions)])
+        """Return N×3×6 coefficients (see `PieceScene.piece_light`) in light of the photograph: 1 is its full white."""
+        return np.stack([photo.light.coefficients for photo in self._chosen_photos(conditions)])
 
     def picture_blur_and_noise(self, conditions: Conditions) -> tuple[np.ndarray, np.ndarray]:
-        """As in `Scene.picture_blur_and_noise`; zoom enlarges the blur with the picture."""
-        chosen = self._chosen(conditions)
-        blur_px = np.array([photo.blur_px for photo in chosen]) * self._zoom(conditions)
-        return blur_px, np.array([photo.light.noise for photo in chosen])
+        """Implement `Scene.picture_blur_and_noise`; zoom enlarges the blur with the picture."""
+        photos = self._chosen_photos(conditions)
+        blur_px = np.array([photo.blur_px for photo in photos]) * self._zoom(conditions)
+        return blur_px, np.array([photo.light.noise for photo in photos])
 
-    def _chosen(self, conditions: Conditions) -> list[BasePhoto]:
-        return [self.photos[i] for i in flat.pick(conditions.pose.background[:, 0], len(self.photos))]
+    def _chosen_photos(self, conditions: Conditions) -> list[BasePhoto]:
+        return [self.photos[i] for i in pick_indices(conditions.pose.background[:, 0], len(self.photos))]
 
     def _zoom(self, conditions: Conditions) -> np.ndarray:
         low, high = self.settings.view.zoom
@@ -130,19 +141,20 @@ class PhotoScene(flat.PictureScene):
         middle, side = np.array(self.photo_px) / 2, min(self.photo_px)
         shifts = conditions.pose.look_at_offset[:, :2] * side
         views = zip(conditions.pose.roll_deg, self._zoom(conditions), shifts, strict=True)
-        return [flat.similarity_matrix(roll, zoom, shift, middle) for roll, zoom, shift in views]
+        return [similarity_matrix(roll, zoom, shift, middle) for roll, zoom, shift in views]
 
 
 def build(source: SceneSource) -> PhotoScene:
-    """The scene of a folder of photographs; those that cannot be used are warned about, fewer than six are refused.
+    """Build the scene of a folder of photographs. Unusable ones are warned about; fewer than six usable ones are
+    refused.
 
-    The scene's settings have the blank's `width_mm` and `height_mm`, also where the file gave none.
+    The scene's settings have the blank's `width_mm` and `height_mm`, also if the file gave none.
     """
     settings, base = source.settings, source.base
-    flat.refuse_bending(settings)
+    refuse_bending(settings)
     photos, sheet = settings.object.photos, settings.object.sheet
     if photos is None or sheet is None:
-        raise ValueError("a scene of photographs names them and their sheet")
+        raise ValueError("a scene of photographs needs object.photos and object.sheet")
     manifest = load_manifest(expand_path(sheet, base))
     blank = blank_piece(manifest)
     settings = _with_size(settings, blank.size_mm)
@@ -151,10 +163,10 @@ def build(source: SceneSource) -> PhotoScene:
     identity = replace(source, settings=settings).sheet_id(known)
     piece = with_ids(blank, identity, "design")
     refuse_larger_than_page(load_template(settings.sheet.template), piece)
-    base_photos, skipped = _see_all(folder, manifest, piece, settings.camera.photo_px)
-    warnings = [f"{name} is left out: {reason}" for name, reason in skipped.items()]
+    base_photos, rejected = _load_all(folder, manifest, piece, settings.camera.photo_px)
+    warnings = [f"{name} is left out: {reason}" for name, reason in rejected.items()]
     for photo in base_photos:
-        if photo.light.unevenness > _UNEVEN:
+        if photo.light.unevenness > _UNEVEN_SHARE:
             warnings.append(
                 f"the light on the paper in {photo.name} is uneven: {photo.light.unevenness:.0%} is unexplained"
             )
@@ -162,18 +174,18 @@ def build(source: SceneSource) -> PhotoScene:
 
 
 def measure_photo(path: Path, manifest: Manifest, piece: Piece, photo_px: tuple[int, int]) -> BasePhoto:
-    """What one photograph of the blank sheet says; `PhotoRejected` where it cannot be used."""
+    """Measure one photograph of the blank sheet; `PhotoRejected` if it cannot be used."""
     srgb = read_photo(path).srgb
     fit, blur = _locate(srgb, manifest, min(piece.size_mm))
     x, y, *_ = manifest.cut_mm
-    picture, photo_from_srgb = flat.picture_for(srgb, photo_px)
+    picture, photo_from_srgb = picture_for(srgb, photo_px)
     px_from_piece = fit.px_from_mm @ np.array([[1, 0, x], [0, 1, y], [0, 0, 1.0]])
     photo_from_piece = photo_from_srgb @ px_from_piece
     scale = photo_from_srgb[0, 0]
-    # a picture enlarged brings its own pixels' width along: 1/12 px² and the interpolation's 1/6 px²
+    # enlarging adds the width of the picture's own pixels: 1/12 px², and the interpolation's 1/6 px²
     blur = float(np.sqrt((blur * scale) ** 2 + max(0.0, scale**2 - 1) / 4))
     height, width = picture.srgb.shape[:2]
-    picture_from_photo = np.linalg.inv(flat.photo_from((width, height), photo_px))
+    picture_from_photo = np.linalg.inv(photo_from((width, height), photo_px))
     light = paper_light(picture.srgb, picture_from_photo @ photo_from_piece, piece, blur)
     return BasePhoto(path.name, picture, photo_from_piece, light, blur)
 
@@ -184,61 +196,61 @@ def _files(folder: Path) -> list[Path]:
 
 
 def _digest(folder: Path) -> str:
-    """What the photographs are, so that a run does not go on with others."""
-    whole = hashlib.sha256()
+    """Return a hash of the photographs, so that a run cannot be continued with others."""
+    digest = hashlib.sha256()
     for path in _files(folder):
-        whole.update(hashlib.sha256(path.read_bytes()).digest())
-    return whole.hexdigest()
+        digest.update(hashlib.sha256(path.read_bytes()).digest())
+    return digest.hexdigest()
 
 
-def _see_all(folder: Path, manifest: Manifest, piece: Piece, photo_px) -> tuple[tuple[BasePhoto, ...], dict[str, str]]:
-    """The usable photographs of a folder in the order of their names, and why others are not."""
-    files, photos, skipped = _files(folder), [], {}
+def _load_all(folder: Path, manifest: Manifest, piece: Piece, photo_px) -> tuple[tuple[BasePhoto, ...], dict[str, str]]:
+    """Return the usable photographs of a folder in the order of their names, and the rejection codes of the others."""
+    files, photos, rejected = _files(folder), [], {}
     for path in files:
         try:
             photos.append(run_limited(measure_photo, path, manifest, piece, photo_px))
-        except PhotoRejected as cannot:
-            skipped[path.name] = cannot.code
-    if len(photos) < LEAST_PHOTOS:
-        reasons = f" ({'; '.join(f'{name}: {code}' for name, code in skipped.items())})" if skipped else ""
+        except PhotoRejected as rejection:
+            rejected[path.name] = rejection.code
+    if len(photos) < MIN_PHOTOS:
+        reasons = f" ({'; '.join(f'{name}: {code}' for name, code in rejected.items())})" if rejected else ""
         raise Refused(
-            f"at least {LEAST_PHOTOS} photographs of the blank sheet on the object",
-            "; ".join([f"{len(photos)} usable of {len(files)} in {folder}{reasons}", *_in_folders(folder)]),
+            f"at least {MIN_PHOTOS} photographs of the blank sheet on the object",
+            "; ".join([f"{len(photos)} usable of {len(files)} in {folder}{reasons}", *_subfolder_note(folder)]),
             "take more, sharp, with the whole flat sheet in view",
         )
-    return tuple(photos), skipped
+    return tuple(photos), rejected
 
 
-def _in_folders(folder: Path) -> list[str]:
-    """Words for photographs in folders in the folder, as sessions of a print lie for `verify`."""
-    inside = [p for p in folder.iterdir() if is_folder(p)] if is_folder(folder) else []
-    count = sum(len(_files(each)) for each in inside)
-    return [f"{count} more in folders there, which are not looked into: lay all in one"] if count else []
+def _subfolder_note(folder: Path) -> list[str]:
+    """Mention photographs in subfolders, which hold sessions of a print for `verify`."""
+    folders = [p for p in folder.iterdir() if is_folder(p)] if is_folder(folder) else []
+    count = sum(len(_files(subfolder)) for subfolder in folders)
+    return [f"{count} more in subfolders, which are not searched (put all into one folder)"] if count else []
 
 
 def _locate(srgb: np.ndarray, manifest: Manifest, side_mm: float) -> tuple[PageFit, float]:
-    """Where the sheet's piece lies in a photograph, and the blur of its markers' borders in px."""
+    """Return where the sheet's piece lies in a photograph, and the blur of its markers' borders in px."""
     markers = {m.id: np.array(m.corners_mm) for m in manifest.markers}
     x, y, w, h = manifest.cut_mm
     on_piece = {i: c for i, c in markers.items() if (c >= [x, y]).all() and (c <= [x + w, y + h]).all()}
-    found = find_markers(srgb, frozenset(on_piece), frozenset(markers), DICTIONARY)
-    if not found.markers.keys() & on_piece.keys():
-        if found.foreign:
-            raise PhotoRejected("wrong_sheet", len(found.foreign), 0, "these are the markers of another sheet")
+    detection = find_markers(srgb, frozenset(on_piece), frozenset(markers), DICTIONARY)
+    if not detection.markers.keys() & on_piece.keys():
+        if detection.foreign:
+            raise PhotoRejected("wrong_sheet", len(detection.foreign), 0, "these are the markers of another sheet")
         raise PhotoRejected("too_few_markers", 0, 3, "no marker of the piece is readable")
-    found = complete_markers(srgb, found, on_piece)
-    borders = [b for i, b in found.markers.items() if b.fitted and i in on_piece]
+    detection = complete_markers(srgb, detection, on_piece)
+    borders = [b for i, b in detection.markers.items() if b.fitted and i in on_piece]
     if len(borders) < 3:
         raise PhotoRejected("too_few_markers", len(borders), 3, "show the whole piece, sharp and well lit")
-    corners = {i: b.corners_px for i, b in found.markers.items() if b.fitted and i in on_piece}
+    corners = {i: b.corners_px for i, b in detection.markers.items() if b.fitted and i in on_piece}
     fit, blur = fit_page(corners, on_piece), blur_px(borders)
-    if blur > _MOST_BLUR * (module_px := float(np.median([b.module_px for b in borders]))):
-        raise PhotoRejected("blurred", blur, _MOST_BLUR * module_px, "hold still and focus on the sheet")
-    if fit.residual_mm > _MOST_RESIDUAL * side_mm:
+    if blur > _MAX_BLUR_MODULES * (module_px := float(np.median([b.module_px for b in borders]))):
+        raise PhotoRejected("blurred", blur, _MAX_BLUR_MODULES * module_px, "hold still and focus on the sheet")
+    if fit.residual_mm > _MAX_RESIDUAL_SHARE * side_mm:
         raise PhotoRejected("too_few_markers", len(fit.inlier_ids), len(on_piece), "press the sheet flat")
     uncertain = corner_uncertainty_mm(fit, manifest.cut_mm)
-    if uncertain > _MOST_UNCERTAIN * side_mm:
-        raise PhotoRejected("too_small", uncertain, _MOST_UNCERTAIN * side_mm, "come closer")
+    if uncertain > _MAX_UNCERTAINTY_SHARE * side_mm:
+        raise PhotoRejected("too_small", uncertain, _MAX_UNCERTAINTY_SHARE * side_mm, "come closer")
     return fit, blur
 
 

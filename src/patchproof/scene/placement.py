@@ -1,4 +1,4 @@
-"""Where the paper lies: a flat rigid card that touches the highest surface points under it.
+"""Place paper on an object: a flat rigid card that touches the highest surface points under it.
 
 In: a mesh (world mm), a named side or a point, a spin and the piece's size. Out: a `Placement`: the piece in the world,
 and how well paper and surface agree: the gap below the card and the overhang beyond the object, in mm and shares. A
@@ -21,7 +21,7 @@ from patchproof.mesh.surface_chart import SurfaceChart, surface_heights
 
 GRID = 65  # heights are sampled on this many points along each edge of the card
 LIFT_MM = 0.15  # the paper's own thickness, which also keeps it clear of the surface in the z-buffer
-# Assumed: beyond this share of its shorter edge a card stands so far off the object that its shadow shows.
+# Assumed: a card that stands off the object by more than this share of its shorter edge casts a visible shadow.
 WARN_GAP_SHARE = 0.15
 WARN_OVERHANG_SHARE = 0.02
 
@@ -37,25 +37,25 @@ _SIDES = {  # side: (up, normal); right is up × normal
 
 @dataclass(frozen=True)
 class Placement:
-    """A piece on its place. Piece millimeters: from its top-left corner, x right, y down."""
+    """A piece at its place. Piece millimeters count from its top-left corner, x right, y down."""
 
-    family: str  # "card", "cylinder" or "exponential"
+    family: str  # "card", "cylinder", "exponential" or "curled"
     size_mm: tuple[float, float]
     vertices_mm: np.ndarray  # float64 V×3 in the world: a card's corners clockwise from top-left, else a grid by rows
     faces: np.ndarray  # int64 F×3, counter-clockwise as one faces the printed side
     piece_mm: np.ndarray  # V×2: where each vertex lies on the flat piece
     normals: np.ndarray  # V×3 unit, out of the printed face
     world_from_piece: np.ndarray  # 4×4, z into the object: the card's frame, or the bent piece's tangent at its middle
-    gap_mm: float  # largest distance from the piece to the surface where there is surface
+    gap_mm: float  # largest distance from the piece to the surface under it
     gap_mean_mm: float
     gaps_mm: np.ndarray  # GRID×GRID by rows from the top: from the piece to the surface, NaN where there is none
     overhang_share: float  # of the piece's area with no object under it
     stretch: float  # largest relative change of length on the surface against the sheet
-    stretches: np.ndarray  # N×N by rows from the top: the same at each point of the piece
+    stretches: np.ndarray  # N×N by rows from the top: the stretch at each point of the piece
     reason: str
 
     def world(self, points_mm: np.ndarray) -> np.ndarray:
-        """World millimeters N×3 of piece points N×2; bilinear between a bent piece's vertices."""
+        """Return the world millimeters N×3 of piece points N×2; bilinear between a bent piece's vertices."""
         frame = self.world_from_piece
         if self.is_flat:
             return points_mm @ frame[:3, :2].T + frame[:3, 3]
@@ -63,12 +63,12 @@ class Placement:
 
         xs, ys = (np.unique(self.piece_mm[:, i]) for i in range(2))
         grid = self.vertices_mm.reshape(len(ys), len(xs), 3)
-        at = points_mm[:, ::-1]  # None extrapolates, which scipy's stubs do not know
-        return interpn((ys, xs), grid, at, bounds_error=False, fill_value=None)  # pyright: ignore[reportArgumentType]
+        rows_and_columns = points_mm[:, ::-1]  # None extrapolates, which scipy's stubs do not know
+        return interpn((ys, xs), grid, rows_and_columns, bounds_error=False, fill_value=None)  # pyright: ignore[reportArgumentType]
 
     @property
     def is_flat(self) -> bool:
-        """Whether the piece is a plane, so that its picture is a homography of the sheet."""
+        """True if the piece is a plane, so that its picture is a homography of the sheet."""
         return self.family == "card"
 
     @property
@@ -83,7 +83,7 @@ class Placement:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What a user should hear about its gap and its overhang."""
+        """Warnings about a large gap or overhang."""
         notes = []
         if self.gap_mm > gap_limit_mm(self.size_mm):
             share = f"{self.gap_mm / min(self.size_mm):.0%} of its shorter edge"
@@ -95,7 +95,7 @@ class Placement:
 
 @dataclass(frozen=True)
 class SurfaceFrame:
-    """Axes of the place a patch faces: unit vectors in the world, and the point the patch is centered at."""
+    """Axes of the place that a patch faces: unit vectors in the world, and the point that the patch is centered at."""
 
     right: np.ndarray
     up: np.ndarray
@@ -104,12 +104,12 @@ class SurfaceFrame:
     extent_mm: tuple[float, float]  # the object's size along right and up
 
 
-# lays a piece of that size and spin (degrees) on a mesh at a frame's origin; refuses in one sentence
+# places a piece of a size and spin (degrees) on a mesh at a frame's origin, or refuses it
 PlacementMethod = Callable[[Mesh, SurfaceFrame, tuple[float, float], float], Placement]
 
 
 def patch_frame(mesh: Mesh, patch: PatchSettings) -> SurfaceFrame:
-    """The frame of the patch's side, or of the surface point nearest to `at_mm`."""
+    """Return the frame of the patch's side, or of the surface point nearest to `at_mm`."""
     if patch.at_mm is None:
         frame = side_frame(mesh, patch.side)
     else:
@@ -119,23 +119,23 @@ def patch_frame(mesh: Mesh, patch: PatchSettings) -> SurfaceFrame:
 
 
 def view_frame(mesh: Mesh, settings: SceneSettings) -> SurfaceFrame:
-    """The frame from which azimuths count, of cameras and lights: the patch's own, or that of `view.front`. A piece
-    that is still to be placed is seen as on its side.
+    """Return the frame from which the azimuths of cameras and lights count: the patch's, or that of `view.front`. A
+    piece without a place is seen as if it were on its side.
     """
     front = settings.view.front
     return patch_frame(mesh, settings.patch) if front == "patch" else side_frame(mesh, front)
 
 
 def side_frame(mesh: Mesh, side: Side) -> SurfaceFrame:
-    """The frame in the middle of a side of the object's bounding box."""
+    """Return the frame in the middle of a side of the object's bounding box."""
     low, high = mesh.ends_mm
     up, normal = (np.array(v, float) for v in _SIDES[side])
-    middle = (low + high) / 2 + normal * (np.abs(normal) @ (high - low)) / 2
-    return _frame(mesh, np.cross(up, normal), up, normal, middle)
+    center = (low + high) / 2 + normal * (np.abs(normal) @ (high - low)) / 2
+    return _frame(mesh, np.cross(up, normal), up, normal, center)
 
 
 def surface_frame(mesh: Mesh, point_mm: np.ndarray, normal: np.ndarray) -> SurfaceFrame:
-    """The frame at a point of the surface with that unit normal, as level as it can be."""
+    """Return the frame at a point of the surface with that unit normal, as level as possible."""
     level = np.array([0.0, 1, 0]) if abs(normal[1]) < 0.99 else np.array([0.0, 0, -1])
     right = np.cross(level, normal)
     right /= np.linalg.norm(right)
@@ -148,8 +148,8 @@ def _frame(mesh: Mesh, right: np.ndarray, up: np.ndarray, normal: np.ndarray, or
 
 
 def place_card(mesh: Mesh, frame: SurfaceFrame, size_mm: tuple[float, float], spin_deg: float) -> Placement:
-    """Lay a card of `size_mm` on the surface, its middle at the frame's origin; spin turns it clockwise as one faces
-    it. Refused where it is larger than the object's side.
+    """Place a card of `size_mm` on the surface, its middle at the frame's origin; spin turns it clockwise as one faces
+    it. Refused if it is larger than the object's side.
     """
     refuse_larger_than_side(size_mm, spin_deg, frame.extent_mm)
     return lay_card(mesh.vertices[mesh.faces], frame, size_mm, spin_deg)
@@ -158,7 +158,7 @@ def place_card(mesh: Mesh, frame: SurfaceFrame, size_mm: tuple[float, float], sp
 def lay_card(
     triangles: np.ndarray, frame: SurfaceFrame, size_mm, spin_deg: float, reach_mm: float = np.inf
 ) -> Placement:
-    """`place_card` of any size on triangles F×3×3; surface over `reach_mm` from the frame's plane does not count."""
+    """Place a card of any size on triangles F×3×3; surface beyond `reach_mm` from the frame's plane does not count."""
     width, height = size_mm
     right, up = spun_axes(frame, spin_deg)
     chart = SurfaceChart(frame.origin_mm, np.stack([right, up, frame.normal]), 0.0, np.array([1.0, 0.0]))
@@ -166,7 +166,7 @@ def lay_card(
     hit = np.isfinite(surface)
     if not hit.any():
         raise Refused("a patch that lies on the object", "no surface under it", "change offset_mm or at_mm")
-    # peaks are at corners, which the net may miss
+    # peaks are at corners, which the grid may miss
     peaks = chart.local(triangles.reshape(-1, 3))
     inside = (np.abs(peaks) <= [width / 2, height / 2, reach_mm]).all(1)
     top = max(surface[hit].max(), peaks[inside, 2].max(initial=-np.inf))
@@ -193,7 +193,7 @@ def lay_card(
 
 
 def piece_pose(right: np.ndarray, up: np.ndarray, normal: np.ndarray, middle_mm: np.ndarray, size_mm) -> np.ndarray:
-    """4×4 world from piece of a piece with its middle there."""
+    """Return the 4×4 world from piece of a piece with its middle at `middle_mm`."""
     pose = np.eye(4)
     pose[:3, :3] = np.stack([right, -up, -normal], 1)
     pose[:3, 3] = middle_mm - right * size_mm[0] / 2 + up * size_mm[1] / 2
@@ -201,13 +201,13 @@ def piece_pose(right: np.ndarray, up: np.ndarray, normal: np.ndarray, middle_mm:
 
 
 def spun_axes(frame: SurfaceFrame, spin_deg: float) -> tuple[np.ndarray, np.ndarray]:
-    """The piece's right and up in the world."""
+    """Return the piece's right and up in the world."""
     c, s = np.cos(np.radians(spin_deg)), np.sin(np.radians(spin_deg))
     return c * frame.right - s * frame.up, s * frame.right + c * frame.up
 
 
 def refuse_larger_than_side(size_mm: tuple[float, float], spin_deg: float, extent_mm) -> None:
-    """A card may not reach beyond the object's outline; 0.5 % of slack for rounded figures."""
+    """Refuse a card that reaches beyond the object's outline; 0.5 % of tolerance for rounded numbers."""
     across, along = rotated_extent(size_mm, spin_deg)
     if across > 1.005 * extent_mm[0] or along > 1.005 * extent_mm[1]:
         expected = f"a piece no larger than the object's side ({extent_mm[0]:.0f} × {extent_mm[1]:.0f} mm)"
@@ -216,19 +216,19 @@ def refuse_larger_than_side(size_mm: tuple[float, float], spin_deg: float, exten
 
 
 def gap_limit_mm(size_mm) -> float:
-    """How far a piece may stand off the surface without a warning."""
+    """Return how far a piece may stand off the surface without a warning."""
     return WARN_GAP_SHARE * min(size_mm)
 
 
 def _nearest_surface(mesh: Mesh, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The surface point nearest to `point` and its face's unit normal."""
+    """Return the surface point nearest to `point` and its face's unit normal."""
     from trimesh.triangles import closest_point, normals
 
     triangles = mesh.vertices[mesh.faces]
-    # a triangle whose box is farther off than another's corner is not the nearest
+    # a triangle whose box is farther away than another's corner is not the nearest
     outside = np.maximum(np.maximum(triangles.min(1) - point, point - triangles.max(1)), 0)
     nearest_corner = ((triangles - point) ** 2).sum(-1).min()
     triangles = triangles[(outside**2).sum(-1) <= nearest_corner]
-    places = closest_point(triangles, np.broadcast_to(point, (len(triangles), 3)))
-    best = int(np.argmin(((places - point) ** 2).sum(1)))
-    return places[best], normals(triangles[best : best + 1])[0][0]
+    points = closest_point(triangles, np.broadcast_to(point, (len(triangles), 3)))
+    nearest = int(np.argmin(((points - point) ** 2).sum(1)))
+    return points[nearest], normals(triangles[nearest : nearest + 1])[0][0]

@@ -1,7 +1,7 @@
-"""One door to scenes of all kinds: from a scene file, or settings made in Python.
+"""Load or make a scene of any kind: from a scene file, or from settings made in Python.
 
-Each kind is built by a module of its own, which is imported when a scene is of that kind and not before: a card on a
-mesh needs nothing of textures, bent paper, photographs or images.
+Each kind is built by its own module, which is imported only when a scene is of that kind: a card on a mesh needs
+nothing of textures, bent paper, photographs or images.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 def load_scene(path: str | Path, seed: int | None = None, steps: int | None = None) -> Scene:
-    """The scene of a file; `seed` and the `steps` of its optimization replace the file's own."""
+    """Load the scene of a file; `seed` and the `steps` of its optimization replace those in the file."""
     path = Path(path)
     settings = load_scene_settings(path)
     if steps is not None:
@@ -56,15 +56,15 @@ def make_scene(
     """
     models: dict[str, Any] = {}
     if not isinstance(settings, SceneSettings):
-        named, given_mesh, models = _named(settings, Path(base))
+        named, given_mesh, models = _replace_objects(settings, Path(base))
         settings, mesh = validate_model(SceneSettings, named, "the scene's settings"), mesh or given_mesh
     glb: Any = None if mesh is None else mesh.export(file_type="glb")
     scene = build_scene(settings, Path(base), seed, mesh_glb=glb)
     return replace(scene, given_models=models) if models else scene
 
 
-def _named(settings: Mapping[str, Any], base: Path) -> tuple[dict[str, Any], Any, dict[str, Any]]:
-    """The settings with names in place of objects, the mesh among these, and the networks by name."""
+def _replace_objects(settings: Mapping[str, Any], base: Path) -> tuple[dict[str, Any], Any, dict[str, Any]]:
+    """Return the settings with names in place of objects, the mesh if it was one of these, and the networks by name."""
     tables = {key: dict(value) if isinstance(value, Mapping) else value for key, value in settings.items()}
     mesh, models = None, {}
     for table in (value for value in tables.values() if isinstance(value, dict)):
@@ -72,7 +72,7 @@ def _named(settings: Mapping[str, Any], base: Path) -> tuple[dict[str, Any], Any
     for key, name in (("object", "photos"), ("object", "images"), ("background", "images")):
         table = tables.get(key)
         if isinstance(table, dict) and isinstance(table.get(name), list | tuple):
-            table[name] = str(_written(table[name], base).name)
+            table[name] = str(_write_pictures(table[name], base).name)
     thing, target = tables.get("object"), tables.get("target")
     if isinstance(thing, dict) and hasattr(thing.get("mesh"), "export"):
         mesh, thing["mesh"] = thing["mesh"], "python:mesh"
@@ -86,8 +86,8 @@ def _named(settings: Mapping[str, Any], base: Path) -> tuple[dict[str, Any], Any
     return tables, mesh, models
 
 
-def _written(pictures: Sequence[np.ndarray], base: Path) -> Path:
-    """The folder of `base` that holds these pictures."""
+def _write_pictures(pictures: Sequence[np.ndarray], base: Path) -> Path:
+    """Write pictures into a folder of `base` that is named after their bytes, and return it."""
     digest = hashlib.sha256()
     for picture in pictures:
         digest.update(np.ascontiguousarray(picture).tobytes())
@@ -101,14 +101,14 @@ def build_scene(
     printed_sheet_id: str | None = None,
     mesh_glb: bytes | None = None,
 ) -> Scene:
-    """The scene of settings whose paths are relative to `base`; `printed_sheet_id` is the sheet id of its print, if any."""
+    """Build the scene of settings with paths relative to `base`; `printed_sheet_id` is that of its print, if any."""
     seed = settings.optimize.seed if seed is None else seed
     module = import_module(f"patchproof.scene.{module_of(settings)}")
     return module.build(SceneSource(settings, base, seed, printed_sheet_id, mesh_glb))
 
 
 def module_of(settings: SceneSettings) -> str:
-    """The module of this room whose `build` makes a scene of the kind that the settings state."""
+    """Return the module of this room whose `build` makes a scene of the kind that the settings state."""
     if settings.object.photos is not None:
         return "photo_scene"
     if settings.object.images is not None:
@@ -116,5 +116,5 @@ def module_of(settings: SceneSettings) -> str:
     if settings.patch.kind != "patch":
         return "texture_scene"
     if settings.patch.place == "auto":
-        return "open_scene"
+        return "unplaced_scene"
     return "bent_scene" if settings.patch.bend else "patch_scene"

@@ -1,4 +1,4 @@
-"""A mesh whose own texture is what is optimized, whole or under a mask; nothing hangs on it."""
+"""A scene in which the object's own texture is optimized, whole or under a mask; nothing hangs on it."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from patchproof.scene.mesh_scene import MeshScene, load_bare
 
 @dataclass(frozen=True)
 class TextureScene(MeshScene):
-    """An object some of whose own texels may change."""
+    """An object of which some texels may change."""
 
     canvas: Canvas
     LEARNS_TEXTURE = True
 
     def object_canvas(self) -> Canvas:
-        """As in `Scene.object_canvas`."""
+        """Implement `Scene.object_canvas`."""
         return self.canvas
 
 
 def build(source: SceneSource) -> TextureScene:
-    """The scene of settings whose `patch.kind` is "texture" or "masked"."""
+    """Build the scene of settings whose `patch.kind` is "texture" or "masked"."""
     bare = load_bare(source)
     canvas = texture_canvas(bare.mesh, source.settings.patch, source.base)
-    own = {"mesh": canvas.mesh, "canvas": canvas, "notes": (*bare.notes, *canvas.warnings)}
-    return TextureScene(**vars(bare) | own)
+    fields = {"mesh": canvas.mesh, "canvas": canvas, "notes": (*bare.notes, *canvas.warnings)}
+    return TextureScene(**vars(bare) | fields)

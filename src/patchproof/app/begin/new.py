@@ -27,8 +27,8 @@ from patchproof.mesh.load_mesh import load_mesh
 from patchproof.mesh.primitives import longest_mm
 from patchproof.scene.candidate_places import PlaceFinder
 from patchproof.scene.image_scene import read_labels
-from patchproof.scene.open_scene import UnplacedScene
 from patchproof.scene.scene import build_scene
+from patchproof.scene.unplaced_scene import UnplacedScene
 from patchproof.sheets.manifest import load_manifest
 
 NEAR, FAR = 1.5, 2.7  # camera distances over the object's length: those of a default scene of 300 mm
@@ -60,7 +60,7 @@ def new_scene(
         text, lines = _of_folder(Path(thing), base, label, models)
     scene = build_scene(validate_model(SceneSettings, tomllib.loads(text), "the new scene"), base)
     if isinstance(scene, UnplacedScene):
-        PlaceFinder(scene).spots(1)  # refused where it has no place
+        PlaceFinder(scene).candidates(1)  # refused where it has no place
     write_atomically(out, text)
     return [*lines, *(f"warning: {warning}" for warning in scene.warnings)]
 

@@ -33,14 +33,14 @@ from patchproof.render.stage import Stage, set_stage
 from patchproof.report.images import base64_uri, data_uri, jpeg, png
 from patchproof.report.page import page
 from patchproof.scene.bend import STRETCH_LIMIT
-from patchproof.scene.canvas import whole_colors
+from patchproof.scene.canvas import bake_base_colors
 from patchproof.scene.interface import Scene
 from patchproof.scene.mesh_scene import MeshScene, require_mesh
-from patchproof.scene.open_scene import UnplacedScene
 from patchproof.scene.patch_scene import PatchScene
 from patchproof.scene.placement import gap_limit_mm
 from patchproof.scene.scene import build_scene
 from patchproof.scene.texture_scene import TextureScene
+from patchproof.scene.unplaced_scene import UnplacedScene
 
 PAGE, OBJECT = "preview.html", "preview.glb"
 _TEXTURE_PX = 1024  # of the textures in the GLB file
@@ -119,7 +119,7 @@ def _scene(settings: SceneSettings, base: Path) -> tuple[Scene, str | None]:
     if not isinstance(scene, UnplacedScene):
         return scene, None
     try:
-        placed = scene.at(settings.patch.side, 0.0)
+        placed = scene.with_piece_at(settings.patch.side, 0.0)
     except Refused:  # the search will find another place, or refuse
         return scene, None
     return (scene if placed.placement.warnings else placed), None
@@ -148,7 +148,7 @@ def _facts(scene: Scene, settings: SceneSettings) -> list[tuple[str, str]]:
         around = f"{left:g}° to {right:g}° about the {SIDE_NAMES[front]} ({front}), {low:g}° to {high:g}° above it"
         facts = [("object", f"{size}, {len(scene.mesh.faces)} faces")]
         facts.append(("camera", f"{around}, {near:g} to {far:g} mm away"))
-    lies = scene.lies()
+    lies = scene.placement_summary()
     size = "{:g} × {:g} mm".format(*lies["size_mm"])
     if isinstance(scene, PatchScene):
         side = side_of(scene.placement.normal)
@@ -204,7 +204,7 @@ def _maps(scene: PatchScene) -> list[dict[str, str]]:
 def _write_object(stage: Stage, design: np.ndarray | None, path: Path) -> None:
     """The object as a GLB file, with the piece that shows `design` where a scene has one."""
     scene = require_mesh(stage.scene)
-    mesh = whole_colors(scene.mesh, np.zeros(len(scene.mesh.faces), bool))
+    mesh = bake_base_colors(scene.mesh, np.zeros(len(scene.mesh.faces), bool))
     textures = [downscale(m.texture_srgb, _TEXTURE_PX) for m in mesh.materials if m.texture_srgb is not None]
     piece = None
     if isinstance(scene, PatchScene):
@@ -219,4 +219,4 @@ def _gray_design(stage: Stage) -> np.ndarray | None:
         return None
     size_mm = stage.scene.piece.size_mm
     width, height = (max(8, round(side * _DESIGN_PX / max(size_mm))) for side in size_mm)
-    return codes_from_srgb(stage.look.shown(torch.full((3, height, width), 0.5)).srgb).cpu().numpy()
+    return codes_from_srgb(stage.design_renderer.appearance(torch.full((3, height, width), 0.5)).srgb).cpu().numpy()

@@ -2,7 +2,7 @@
 
 In: a problem and a design. Out: `Cost`: median milliseconds of each part over a few steps' views, after a warm-up. The
 parts are those of the loop, where views that share a pose share what it takes to see it; what cannot be timed inside of
-`see` is the difference of two calls of it.
+`render_views` is the difference of two calls of it.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ def _step_ms(problem: Problem, design: Tensor, conditions: Conditions) -> dict[s
 
 
 def _see_ms(problem: Problem, shown: Appearance, conditions: Conditions) -> tuple[dict[str, float], Views]:
-    """(milliseconds of the parts of `see`, the views)."""
+    """(milliseconds of the parts of `render_views`, the views)."""
     side_px = problem.training_px
     problem.see(None, conditions, 16)  # brings the places behind the object into memory, which a run does once
     clock = _Clock(problem.device)

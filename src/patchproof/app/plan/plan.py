@@ -37,8 +37,8 @@ from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.optimizer.promise import PROMISE_VIEWS
 from patchproof.scene.bent_scene import placement_with_other_bend
 from patchproof.scene.interface import PX_PER_MODULE, READABLE_SHARE, PieceScene, require_piece
-from patchproof.scene.open_scene import UnplacedScene
 from patchproof.scene.scene import load_scene
+from patchproof.scene.unplaced_scene import UnplacedScene
 from patchproof.sheets.markers import MARKER_MODULES
 from patchproof.sheets.piece import SMALLEST_MARKER_MM
 
@@ -134,7 +134,7 @@ def plan_geometry(
     scene, place = load_scene(scene_path), None
     if isinstance(scene, UnplacedScene):
         place = choose_place(scene, compute=Compute(device), progress=progress)
-        scene = scene.at(place.at, place.spin_deg)
+        scene = scene.with_piece_at(place.at, place.spin_deg)
     problem, target = set_problem(scene, device), scene.settings.target
     _, sentence = placement_with_other_bend(scene)
     geometry = GeometryPlan(
@@ -143,7 +143,7 @@ def plan_geometry(
         target=f"{target.goal} {target.label}",
         models=tuple(classifier.name for classifier in problem.classifiers),
         place=place,
-        surface=SurfacePlan(**scene.lies(), other=sentence),
+        surface=SurfacePlan(**scene.placement_summary(), other=sentence),
         resolution=resolution_plan(problem),
         markers=marker_plan(require_piece(scene)) if scene.HAS_PIECE else None,
         warnings=scene.warnings,

@@ -57,7 +57,10 @@ def scene_terms(problem: Problem, design: Tensor, other_surface: Placement | Non
         table: tuple(term for term in effect_terms(table) if scene.models(EFFECT_BY_NAME[term.name]))
         for table in ("light", "printer", "camera")
     }
-    own = {part: Term(part.name, part.key, partial(_without_part, part=part), whole=part.whole) for part in scene.TERMS}
+    own = {
+        part: Term(part.name, part.key, partial(_without_part, part=part), whole=part.needs_whole_photo)
+        for part in scene.TERMS
+    }
     terms = (*effects["light"], *(term for term in own.values() if not term.key))
     if scene.HAS_PIECE:
         terms = (*terms, Term(PRINTER, "printer.profile", partial(_without_printer, problem, design)))
@@ -72,9 +75,9 @@ def scene_terms(problem: Problem, design: Tensor, other_surface: Placement | Non
 def effect_terms(table: str) -> tuple[Term, ...]:
     """The effects that a table of the settings turns on and off."""
     return tuple(
-        Term(effect.name, effect.keys[0], partial(_without, effect=effect), whole=effect.whole)
+        Term(effect.name, effect.keys[0], partial(_without, effect=effect), whole=effect.needs_whole_photo)
         for effect in EFFECTS
-        if effect.switch and effect.keys[0].startswith(f"{table}.")
+        if effect.can_be_off and effect.keys[0].startswith(f"{table}.")
     )
 
 

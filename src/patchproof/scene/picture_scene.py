@@ -1,10 +1,11 @@
-"""What scenes made of pictures share: photographs of an object (`photo_scene`) and folders of images (`image_scene`).
+"""The common part of scenes made of pictures: photographs of an object (`photo_scene`) and folders of images
+(`image_scene`).
 
-Neither has a mesh. A view is a base picture carried onto the scene's photograph, and a homography that says where the
-piece lies in it. Pictures of any size become `photo_px` so that their *centered squares* agree, since the centered
-square is what classifiers see; beyond it a longer picture is cropped and a shorter one is mirrored at its edge. A
-square `size_px` asks for that centered square alone, any other for the whole photograph.
-Left out on purpose: what lies in front of the piece (a hand, a handle); the new piece covers it.
+They have no mesh. A view is a base picture transformed onto the scene's photograph, and a homography that says where
+the piece lies in it. Pictures of any size become `photo_px` so that their *centered squares* agree, because classifiers
+see the centered square; beyond it a longer picture is cropped and a shorter one is mirrored at its edge. A square
+`size_px` asks for that centered square alone, any other for the whole photograph. Left out on purpose: anything in
+front of the piece (a hand, a handle); the new piece covers it.
 """
 
 from __future__ import annotations
@@ -25,12 +26,12 @@ from patchproof.scene.conditions import Conditions, Stream
 from patchproof.scene.interface import PX_PER_MODULE, READABLE_SHARE, PieceScene
 from patchproof.sheets.piece import Piece
 
-VIEWS_TRIED = 256  # for figures over a scene's views
+VIEWS_TRIED = 256  # for statistics over a scene's views
 
 
 @dataclass(frozen=True)
 class PictureScene(PieceScene):
-    """A scene without a mesh; N is the number of conditions."""
+    """A scene without a mesh, made of pictures; N is the number of conditions."""
 
     OMITTED = (
         "other viewpoints, backgrounds and lamps than the pictures show; what stands in front of the piece;",
@@ -38,47 +39,45 @@ class PictureScene(PieceScene):
     )
 
     def draw(self, stream: Stream, n: int, seed: int | None = None, start: int = 0, per_session: int = 1) -> Conditions:
-        """As in `Scene.draw`; which picture it is, is drawn for each photograph: it decides the pose, too."""
-        drawn = super().draw(stream, n, seed, start, per_session)
-        return drawn if per_session == 1 else replace(drawn, pose=super().draw(stream, n, seed, start).pose)
+        """Draw like `Scene.draw`, but choose the picture for each photograph: it decides the pose, too."""
+        conditions = super().draw(stream, n, seed, start, per_session)
+        return conditions if per_session == 1 else replace(conditions, pose=super().draw(stream, n, seed, start).pose)
 
     @abstractmethod
     def piece_light(self, conditions: Conditions) -> np.ndarray:
-        """As in `PieceScene.piece_light`: what was seen on the pictures' own paper."""
+        """Implement `PieceScene.piece_light` with the light on the pictures' own paper."""
 
-    def lies(self) -> dict[str, Any]:
-        """As in `Scene.lies`: in a plane."""
+    def placement_summary(self) -> dict[str, Any]:
+        """Implement `Scene.placement_summary`: the piece lies in a plane."""
         reason = "pictures say nothing of a surface: the piece is a plane that their homographies carry"
         return {"family": "plane", "size_mm": self.piece.size_mm, "reason": reason}
 
     def paper(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """As in `PieceScene.paper`: in the plane z = 1 of its own millimeters, which a view's homography projects."""
+        """Implement `PieceScene.paper`: the plane z = 1 of the piece's millimeters, which homographies project."""
         corners = rect_corners((0, 0, *self.piece.size_mm))[[0, 1, 3, 2]]
         return np.concatenate([corners, np.ones((4, 1))], 1), np.broadcast_to([0.0, 0.0, -1.0], (4, 3)), corners
 
     def piece_azimuth_deg(self, conditions: Conditions) -> np.ndarray:
-        """N NaN: a picture without a known camera does not say from where it was taken."""
+        """Return N NaN: a picture without a known camera does not say from where it was taken."""
         return np.full(len(conditions), np.nan)
 
     def white_light(self, conditions: Conditions) -> np.ndarray:
-        """N: the light on white paper at the piece's middle, mean of the channels."""
+        """Return N: the light on white paper at the piece's middle, mean of the channels."""
         return self.piece_light(conditions)[:, :, 0].mean(1)
 
     def closest_px_per_mm(self, size_px: tuple[int, int]) -> float:
-        """Pixels per millimeter of the piece in the closest view."""
+        """Return the pixels per millimeter of the piece in the closest view."""
         return float(self.piece_scales(self.draw("select", VIEWS_TRIED, 0), size_px).max())
 
     @property
     def unreadable_share(self) -> float:
-        """The share of the views in which a module of the piece's markers is under `PX_PER_MODULE` along its
-        foreshortened side.
-        """
+        """The share of views in which a marker's module is under `PX_PER_MODULE` along its foreshortened side."""
         scales = self.piece_scales(self.draw("select", VIEWS_TRIED, 0), self.photo_px, shorter=True)
         return float((scales * self.piece.module_mm < PX_PER_MODULE * 0.999).mean())
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What a reader should know, also where more than one view in twenty shows markers that cannot be read."""
+        """The scene's notes, and a warning if more than one view in twenty shows markers that cannot be read."""
         if self.unreadable_share <= 1 - READABLE_SHARE:
             return self.notes
         warning = (
@@ -100,9 +99,7 @@ class BasePicture:
 
 
 def picture_for(srgb: np.ndarray, photo_px: tuple[int, int]) -> tuple[BasePicture, np.ndarray]:
-    """The picture, reduced where its shorter side is longer than the photograph's, and `photo_from_picture` 3×3 (from
-    pixels of `srgb`).
-    """
+    """Return the picture, no larger than the photograph, and `photo_from_picture` 3×3 from pixels of `srgb`."""
     height, width = srgb.shape[:2]
     scale = min(photo_px) / min(width, height)
     size = (width, height)
@@ -113,64 +110,62 @@ def picture_for(srgb: np.ndarray, photo_px: tuple[int, int]) -> tuple[BasePictur
 
 
 def photo_from(picture_px: tuple[int, int], photo_px: tuple[int, int]) -> np.ndarray:
-    """3×3 from a picture's pixels to the photograph's: shorter sides and middles agree."""
+    """Return 3×3 from a picture's pixels to the photograph's, with which shorter sides and middles agree."""
     scale = min(photo_px) / min(picture_px)
     shift = (np.array(photo_px) - scale * np.array(picture_px)) / 2
     return np.array([[scale, 0, shift[0]], [0, scale, shift[1]], [0, 0, 1.0]])
 
 
 def size_from_photo(photo_px: tuple[int, int], size_px: tuple[int, int]) -> np.ndarray:
-    """3×3 from the photograph's pixels to a view's: the whole of it or, where square, its centered square."""
+    """Return 3×3 from the photograph's pixels to a view's: the whole photograph or, if square, its centered square."""
     if size_px[0] == size_px[1]:
         return photo_from(photo_px, size_px)
     return np.diag([size_px[0] / photo_px[0], size_px[1] / photo_px[1], 1.0])
 
 
-def prints(piece: Piece, conditions: Conditions) -> np.ndarray:
-    """N×3×3 from the sheet's millimeters to those of a print of another size about the same middle."""
+def print_scalings(piece: Piece, conditions: Conditions) -> np.ndarray:
+    """Return N×3×3 from the sheet's millimeters to those of a print of another size about the same middle."""
     middle = np.array(piece.size_mm) / 2
     return np.stack([scaling_about(middle, scale) for scale in conditions.pose.printed_scale])
 
 
 def similarity_matrix(roll_deg: float, zoom: float, shift_px, about_px) -> np.ndarray:
-    """3×3 similarity of a picture whose camera turns clockwise by roll: what it shows turns the other way."""
+    """Return the 3×3 similarity of a picture when its camera turns clockwise: the picture turns the other way."""
     c, s = zoom * np.cos(np.radians(roll_deg)), zoom * np.sin(np.radians(roll_deg))
-    turn = np.array([[c, s], [-s, c]])
+    rotation = np.array([[c, s], [-s, c]])
     matrix = np.eye(3)
-    matrix[:2, :2], matrix[:2, 2] = turn, np.asarray(about_px) + shift_px - turn @ about_px
+    matrix[:2, :2], matrix[:2, 2] = rotation, np.asarray(about_px) + shift_px - rotation @ about_px
     return matrix
 
 
 def warp_picture(
     picture: BasePicture, view_from_photo: np.ndarray, photo_px: tuple[int, int], size_px: tuple[int, int]
 ) -> np.ndarray:
-    """The picture as uint8 H×W×3 in a view: carried by `view_from_photo` (both in the photograph's pixels), reduced
-    by area, mirrored at its edge.
-    """
-    fine = 2 if min(size_px) < min(photo_px) else 1  # two samples per pixel each way keep a reduced picture calm
-    size = (fine * size_px[0], fine * size_px[1])
+    """Return the picture, uint8 H×W×3, transformed by `view_from_photo`, reduced by area, mirrored at its edge."""
+    samples = 2 if min(size_px) < min(photo_px) else 1  # two per pixel each way prevent aliasing in a reduced picture
+    size = (samples * size_px[0], samples * size_px[1])
     height, width = picture.srgb.shape[:2]
-    whole = size_from_photo(photo_px, size) @ view_from_photo @ photo_from((width, height), photo_px)
-    shrunk = picture.levels[0]
+    view_from_picture = size_from_photo(photo_px, size) @ view_from_photo @ photo_from((width, height), photo_px)
+    reduced = picture.levels[0]
     for level in picture.levels[1:]:
-        # no finer than the samples: a level may lack none of what they can show
-        if abs(np.linalg.det(whole[:2, :2])) ** 0.5 * width / level.shape[1] > 1:
+        # a level must not be coarser than the samples
+        if abs(np.linalg.det(view_from_picture[:2, :2])) ** 0.5 * width / level.shape[1] > 1:
             break
-        shrunk = level
-    to_level = np.diag([width / shrunk.shape[1], height / shrunk.shape[0], 1.0])
-    index_from_size = index_homography(np.linalg.inv(whole @ to_level))
+        reduced = level
+    to_level = np.diag([width / reduced.shape[1], height / reduced.shape[0], 1.0])
+    index_from_size = index_homography(np.linalg.inv(view_from_picture @ to_level))
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    view = cv2.warpAffine(shrunk, index_from_size[:2], size, flags=flags, borderMode=cv2.BORDER_REFLECT)
-    return view if fine == 1 else cv2.resize(view, size_px, interpolation=cv2.INTER_AREA)
+    view = cv2.warpAffine(reduced, index_from_size[:2], size, flags=flags, borderMode=cv2.BORDER_REFLECT)
+    return view if samples == 1 else cv2.resize(view, size_px, interpolation=cv2.INTER_AREA)
 
 
-def pick(choice: np.ndarray, count: int) -> np.ndarray:
-    """Indices below `count` of numbers in [0, 1)."""
+def pick_indices(choice: np.ndarray, count: int) -> np.ndarray:
+    """Turn numbers in [0, 1) into indices below `count`."""
     return np.minimum((choice * count).astype(np.int64), count - 1)
 
 
 def refuse_bending(settings: SceneSettings) -> None:
-    """Pictures say nothing of a surface that a piece could bend along."""
+    """Refuse `patch.bend`: pictures do not show a surface that a piece could bend along."""
     if settings.patch.bend:
         raise Refused(
             "a flat patch where the object is known from pictures alone", "bend = true", "give a mesh instead"
