@@ -18,8 +18,8 @@ from patchproof.scene.placement import patch_frame
 from patchproof.scene.tape_measure import tapes
 from patchproof.sheets.plan_page import PlacementPicture, PlanPage, edge_distances_mm, lay_out_plan, wrap_text
 from patchproof.sheets.template import load_template
+from test_benefit_shown import promise_with
 from test_scene import scene_of
-from test_worth_shown import promise_with
 
 A4 = load_template("a4")
 OUTLINE = ((-20.0, -45.0), (60.0, -45.0), (60.0, 15.0), (-20.0, 15.0))

@@ -13,9 +13,9 @@ from patchproof.evidence.results import Control
 from patchproof.evidence.verdict import PHOTOS_PER_SESSION, judge, next_step, photos_line, sessions_needed
 from patchproof.report.words import headline_of, promise_lines, verdict_lines
 from patchproof.report.write import report_html
+from test_benefit import promise_of as promise_beside
 from test_report import some_report
 from test_verify_verdict import promise_of
-from test_worth import promise_of as promise_beside
 
 
 def summary_of(recognized, photos, promise, controls=()):
