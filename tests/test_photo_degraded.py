@@ -23,7 +23,7 @@ from degraded_photos import KINDS, take
 from patchproof.base.geometry import rect_corners
 from patchproof.evidence import measure as measuring
 from patchproof.evidence.camera import pinhole_photo
-from patchproof.evidence.locate import LocatedSheet, place
+from patchproof.evidence.locate import LocatedSheet, locate_sheet
 from patchproof.evidence.ranges import promised_ranges
 from patchproof.evidence.results import PhotoEntry
 from patchproof.photo.read import read_photo
@@ -59,9 +59,9 @@ def outcome(kind: str, seed: int, folder) -> Outcome:
     """One photograph, taken and measured as `verify` does."""
     truth, surface, promised = take(kind, seed)
     (folder / "a.jpg").write_bytes(truth.jpeg)
-    with patch.object(measuring, "place", wraps=place) as placing:
+    with patch.object(measuring, "place", wraps=locate_sheet) as placing:
         returned: list[LocatedSheet | None] = []
-        placing.side_effect = lambda *args: returned.append(place(*args)) or returned[-1]
+        placing.side_effect = lambda *args: returned.append(locate_sheet(*args)) or returned[-1]
         view = pinhole_photo(read_photo(folder / "a.jpg"), None)
         entry = measuring.measure(view, "a.jpg", surface, promised, promised_ranges(())).entry
     geometry, pose, off = entry.geometry, entry.pose, {}

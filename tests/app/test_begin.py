@@ -14,13 +14,13 @@ from console import command
 
 from patchproof.app.begin.guess import footing, guess_label, guess_length_mm, guess_up
 from patchproof.app.begin.new import new_scene
-from patchproof.app.begin.preview import OBJECT, PAGE, _lying, preview_scene
+from patchproof.app.begin.preview import OBJECT, PAGE, _up_warning, preview_scene
 from patchproof.app.begin.sides import (
     NO_SURFACE_RGB,
     PICTURE_PX,
     RAMP_RGB,
     gap_colors,
-    ramp,
+    ramp_colors,
     round_length,
     side_of,
     side_views,
@@ -87,7 +87,9 @@ def test_gaps_are_drawn_where_they_are():
     assert nothing.mean() == pytest.approx(over.overhang_share) == pytest.approx(1 / 6, abs=0.02)
     assert nothing[:, -5:].all() and not nothing[:, :50].any()  # on the right as one faces it
     assert gap_limit_mm(over.size_mm) == pytest.approx(0.15 * 90)
-    assert (ramp(np.array([-1.0, 0, 1, 7])) == np.array([RAMP_RGB[0], RAMP_RGB[0], RAMP_RGB[-1], RAMP_RGB[-1]])).all()
+    assert (
+        ramp_colors(np.array([-1.0, 0, 1, 7])) == np.array([RAMP_RGB[0], RAMP_RGB[0], RAMP_RGB[-1], RAMP_RGB[-1]])
+    ).all()
 
 
 @pytest.mark.parametrize(("most", "length"), [(100, 100), (99, 50), (21, 20), (1.99, 1), (0.5, 0.5)])
@@ -202,15 +204,15 @@ def bottles(tmp_path_factory):
 
 def test_gltf_is_y_up_and_in_meters_by_its_standard(bottles):
     up = guess_up(bottles / "bottle.glb")
-    assert (up.axis, up.odd) == ("y", None) and guess_length_mm(bottles / "bottle.glb") == 250
+    assert (up.axis, up.doubt) == ("y", None) and guess_length_mm(bottles / "bottle.glb") == 250
     odd = guess_up(bottles / "lying.glb")
-    assert odd.axis == "y" and re.search(r'stands on 1\d% of its footprint so, with "z" on 7[789]%', odd.odd)
+    assert odd.axis == "y" and re.search(r'stands on 1\d% of its footprint so, with "z" on 7[789]%', odd.doubt)
 
 
 def test_a_habit_gives_way_to_how_the_object_stands(bottles):
     assert guess_up(bottles / "bottle.obj").axis == "y"
     stl = guess_up(bottles / "bottle.stl")
-    assert stl.axis == "y" and stl.odd is None and "as it stands" in stl.reason
+    assert stl.axis == "y" and stl.doubt is None and "as it stands" in stl.reason
 
 
 @pytest.mark.parametrize("suffix", ["obj", "stl", "ply"])
@@ -246,7 +248,7 @@ def test_an_object_that_may_lie_is_turned_by_one_word(tmp_path, few_turns):
     text = path.read_text(encoding="utf-8") + "[camera]\nphoto_px = [400, 300]\n[background]\ncolor = [0.5, 0.5, 0.5]\n"
     path.write_text(re.sub(r'(?m)^up = "y".*\n# (up = "z")', r"\1", text), encoding="utf-8")
     turned = load_scene(path)
-    assert np.argmax(np.ptp(turned.mesh.vertices, axis=0)) == 1 and not _lying(turned, turned.settings)
+    assert np.argmax(np.ptp(turned.mesh.vertices, axis=0)) == 1 and not _up_warning(turned, turned.settings)
     path.write_text(text, encoding="utf-8")
     (warning,) = [each for each in preview_scene(path, tmp_path / "a").warnings if "may lie" in each]
     assert warning.endswith('write up = "z" in [object]')
@@ -320,7 +322,7 @@ def test_a_new_scene_of_a_primitive_has_a_flat_card_where_one_will_do(tmp_path):
 
 def test_what_cannot_be_optimized_is_not_written(tmp_path):
     path = tmp_path / "scene.toml"
-    with pytest.raises(Refused, match="room for a piece of 39 mm, got one of 30 mm"):
+    with pytest.raises(Refused, match="room for a piece of 39 mm, got an object of 30 mm"):
         new_scene("primitive:carton", path, length_mm=30)
     (tmp_path / "things").mkdir()
     with pytest.raises(Refused, match="a CSV of labels among images, or a blank sheet's JSON"):

@@ -218,7 +218,7 @@ def test_only_the_token_opens_anything(client, tmp_path):
     for path in ("/", "/state", f"/{TOKEN[:-1]}/", f"/{TOKEN}x/state", "/../photos.jsonl", f"/{TOKEN.upper()}/", "/é/"):
         for method in ("GET", "POST"):
             answered = client.ask(method, quote(path), b"x" if method == "POST" else b"")
-            assert answered.status == 403 and "address with its token" in answered.json["refused"]
+            assert answered.status == 403 and "got one without its token" in answered.json["refused"]
     for path in ("photos.jsonl", "session_01/photo_0001.jpg", "../photos.jsonl", "photos/", "state/x"):
         assert client.get(path).status == 404
     assert client.get("photos").status == 405 and client.get("state").status == 200
@@ -248,7 +248,7 @@ def test_the_page_is_let_load_nothing_of_others(client):
         (b"short", "session_01", 415, "a photograph"),
         (b"", "session_01", 415, "a photograph"),
         (b"%PDF-1.7 is a document", "session_01", 415, "a photograph"),
-        (b"\xff\xd8\xff", "../../elsewhere", 404, "a session or a control that is here"),
+        (b"\xff\xd8\xff", "../../elsewhere", 404, "a session or a control of this folder"),
         (b"\xff\xd8\xff", "session_02", 404, "a session or a control"),
         (b"\xff\xd8\xff", "controls", 404, "a session or a control"),
         (b"\xff\xd8\xff", "", 404, "a session or a control"),
@@ -320,7 +320,7 @@ def test_200_megabytes_are_refused_before_they_are_read(tmp_path, sheet):
         client = Client(address)
         with closing(client.begin(("Content-Length", "200000000"), body=b"\xff\xd8\xff")) as connection:
             answered = connection.getresponse()
-            assert answered.status == 413 and "one of 200 MB" in json.loads(answered.read())["refused"]
+            assert answered.status == 413 and "got 200 MB" in json.loads(answered.read())["refused"]
         sent, block = 0, b"\xff\xd8\xff" + bytes((1 << 20) - 3)
         with closing(client.begin(("Transfer-Encoding", "chunked"), body=b"")) as connection, pytest.raises(OSError):
             for _ in range(200):
@@ -388,12 +388,12 @@ def test_the_map_of_views_by_hand():
 def has_timer(_: object) -> None:
     """As the process apart begins: photographs are measured in a main thread, where their time is limited."""
     assert input.has_timer()
-    serve.ready(None)
+    serve.prepare_worker(None)
 
 
 def test_served_until_interrupted_and_at_the_same_address_afterwards(tmp_path, sheet, photos, monkeypatch):
     """With a process apart; what is in the folder is measured before there is an address."""
-    monkeypatch.setattr(serve, "ready", has_timer)
+    monkeypatch.setattr(serve, "prepare_worker", has_timer)
     monkeypatch.setattr(serve, "options_of", lambda sheet, manifest, *_: options_of(sheet, manifest, [NET]))
     addresses, answers, measured = [], [], []
 
@@ -411,7 +411,7 @@ def test_served_until_interrupted_and_at_the_same_address_afterwards(tmp_path, s
     capture = partial(serve.serve_capture, sheet, tmp_path / "photos", progress=progress, on_address=begin)
     with monkeypatch.context() as patch:  # the first time in this process, which has imported everything
         patch.setattr(serve, "open_workers", lambda *_, **__: open_workers(1))
-        patch.setattr(serve, "ready", lambda _: None)
+        patch.setattr(serve, "prepare_worker", lambda _: None)
         reports = [capture()]
     reports.append(capture())
     assert [report.summary.judged for report in reports] == [1, 2] and measured == [(0, 0), (1, 1)]
@@ -420,15 +420,15 @@ def test_served_until_interrupted_and_at_the_same_address_afterwards(tmp_path, s
 
 
 def test_a_port_that_is_taken_is_not_waited_for():
-    with socket.create_server(("127.0.0.1", 0)) as other, serve._listening("127.0.0.1", other.getsockname()[1]) as ours:
+    with socket.create_server(("127.0.0.1", 0)) as other, serve._listen("127.0.0.1", other.getsockname()[1]) as ours:
         assert ours.getsockname()[1] not in (0, other.getsockname()[1])
 
 
 def test_it_listens_on_this_machine_unless_the_local_network_is_asked_for(monkeypatch):
     asked = []
-    monkeypatch.setattr(serve, "_own_address", lambda: asked.append("network") or "127.0.0.2")
+    monkeypatch.setattr(serve, "_network_address", lambda: asked.append("network") or "127.0.0.2")
     for lan, host in ((False, "127.0.0.1"), (True, "127.0.0.2")):
-        with serve._listening(serve._host(lan), 0) as listener:
+        with serve._listen(serve._host(lan), 0) as listener:
             assert listener.getsockname()[0] == host
     assert asked == ["network"]
 

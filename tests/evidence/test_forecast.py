@@ -19,7 +19,7 @@ def enumerated(chances: np.ndarray) -> np.ndarray:
 
 
 def test_counts_without_a_shift_are_those_of_independent_chances(monkeypatch):
-    monkeypatch.setattr(forecast, "SHIFT", 0.0)
+    monkeypatch.setattr(forecast, "LOG_ODDS_DEVIATION", 0.0)
     chances = np.array([0.05, 0.3, 0.5, 0.9, 0.97])
     assert count_chances(chances) == pytest.approx(enumerated(chances), abs=1e-12)
 
@@ -27,7 +27,7 @@ def test_counts_without_a_shift_are_those_of_independent_chances(monkeypatch):
 def test_a_shift_widens_counts_as_drawn_sessions_do():
     chances, rng = np.linspace(0.1, 0.9, 20), np.random.default_rng(0)
     odds = np.log(chances / (1 - chances))
-    shift = forecast.SHIFT * rng.standard_normal((20_000, 1))
+    shift = forecast.LOG_ODDS_DEVIATION * rng.standard_normal((20_000, 1))
     counts = (rng.random((20_000, 20)) < 1 / (1 + np.exp(-odds - shift))).sum(1)
     drawn = np.bincount(counts, minlength=21) / len(counts)
     assert count_chances(chances) == pytest.approx(drawn, abs=0.01)

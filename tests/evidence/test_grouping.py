@@ -6,7 +6,7 @@ import pytest
 from PIL import Image
 
 from patchproof.base.errors import Refused
-from patchproof.evidence.grouping import BY_FOLDERS, BY_GUESS, BY_TIMES, group
+from patchproof.evidence.grouping import BY_FOLDERS, BY_GUESS, BY_TIMES, group_sessions
 
 
 def photo(path, taken=None, camera="A"):
@@ -22,19 +22,19 @@ def test_folders_in_the_folder_are_sessions_and_controls_are_none(tmp_path):
     for name in ("yard/1.jpg", "yard/2.jpg", "hall/1.jpg", "gray/1.jpg", ".trash/1.jpg"):
         photo(tmp_path / name)
     (tmp_path / "empty").mkdir()
-    grouping = group(tmp_path, without=tmp_path / "gray")
+    grouping = group_sessions(tmp_path, without=tmp_path / "gray")
     assert (grouping.names, grouping.session, grouping.known_from) == (("hall", "yard"), (0, 1, 1), BY_FOLDERS)
     assert [grouping.file(i) for i in range(3)] == ["hall/1.jpg", "yard/1.jpg", "yard/2.jpg"]
     photo(tmp_path / "loose.jpg")
-    assert group(tmp_path, tmp_path / "gray").names == ("", "hall", "yard")
-    assert group(tmp_path, tmp_path / "gray").file(0) == "loose.jpg"
+    assert group_sessions(tmp_path, tmp_path / "gray").names == ("", "hall", "yard")
+    assert group_sessions(tmp_path, tmp_path / "gray").file(0) == "loose.jpg"
 
 
 @pytest.mark.parametrize(("second", "sessions"), [("2026:05:01 10:30:00", 1), ("2026:05:01 10:30:01", 2)])
 def test_a_pause_of_more_than_half_an_hour_begins_another_session(tmp_path, second, sessions):
     photo(tmp_path / "b.jpg", "2026:05:01 10:00:00")
     photo(tmp_path / "a.jpg", second)
-    grouping = group(tmp_path)
+    grouping = group_sessions(tmp_path)
     assert len(grouping.names) == sessions and grouping.known_from == BY_TIMES
     assert grouping.session == ((1, 0) if sessions == 2 else (0, 0))  # in the order of names; numbered by time
 
@@ -43,22 +43,22 @@ def test_another_camera_is_another_session(tmp_path):
     photo(tmp_path / "a.jpg", "2026:05:01 10:00:00", "A")
     photo(tmp_path / "b.jpg", "2026:05:01 10:00:00", "B")
     photo(tmp_path / "c.jpg", "2026:05:01 10:01:00", "A")
-    assert group(tmp_path).session == (0, 1, 0)
+    assert group_sessions(tmp_path).session == (0, 1, 0)
 
 
 @pytest.mark.parametrize("taken", [None, "yesterday", "0000:00:00 00:00:00"])
 def test_photographs_that_do_not_all_say_their_time_are_taken_as_one_session(tmp_path, taken):
     photo(tmp_path / "a.jpg", "2026:05:01 10:00:00")
     photo(tmp_path / "b.jpg", taken)
-    assert group(tmp_path).known_from == BY_GUESS and group(tmp_path).session == (0, 0)
+    assert group_sessions(tmp_path).known_from == BY_GUESS and group_sessions(tmp_path).session == (0, 0)
 
 
 def test_files_that_are_no_pictures_are_a_guess_and_no_photographs_are_refused(tmp_path):
     (tmp_path / "a.jpg").write_bytes(b"no picture")
-    assert group(tmp_path).known_from == BY_GUESS
+    assert group_sessions(tmp_path).known_from == BY_GUESS
     (tmp_path / "a.jpg").rename(tmp_path / "a.txt")
     with pytest.raises(Refused, match=r"photographs .*got none"):
-        group(tmp_path)
+        group_sessions(tmp_path)
     with pytest.raises(Refused, match="no folder at"):
-        group(tmp_path / "nowhere")
-    assert group(tmp_path / "a.txt").paths == (tmp_path / "a.txt",)
+        group_sessions(tmp_path / "nowhere")
+    assert group_sessions(tmp_path / "a.txt").paths == (tmp_path / "a.txt",)

@@ -21,7 +21,7 @@ from patchproof.evidence.print_fit import LEAST_CELLS, fit_print
 from patchproof.evidence.reproject import (
     PhotoSquare,
     Reference,
-    deblurred,
+    change_blur,
     light_fit,
     photo_square,
     reprojected_square,
@@ -306,8 +306,8 @@ def test_blur_is_taken_back_as_far_as_noise_allows():
     soft = cv2.GaussianBlur(sharp, (0, 0), 2.5)
     noisy = soft + rng.normal(0, 0.005, soft.shape).astype(np.float32)
     inner = np.s_[12:-12, 12:-12]
-    left = np.abs(deblurred(noisy, 2.5, 0.3, 0.005) - sharp)[inner].mean()
+    left = np.abs(change_blur(noisy, 2.5, 0.3, 0.005) - sharp)[inner].mean()
     assert left < 0.4 * np.abs(soft - sharp)[inner].mean()
     # the other way it is a blur, and nothing changes where nothing should
-    assert deblurred(sharp, 0.0, 2.5, 0.0)[inner] == pytest.approx(soft[inner], abs=1e-5)
-    assert np.abs(deblurred(sharp, 1.0, 1.0, 0.0) - sharp).max() < 1e-6
+    assert change_blur(sharp, 0.0, 2.5, 0.0)[inner] == pytest.approx(soft[inner], abs=1e-5)
+    assert np.abs(change_blur(sharp, 1.0, 1.0, 0.0) - sharp).max() < 1e-6

@@ -9,7 +9,7 @@ import pytest
 
 from patchproof.base.geometry import apply_homography, intrinsics, look_at, normalize_homography, plane_homography
 from patchproof.channel import lens
-from patchproof.evidence.camera import _turned, pinhole_photo
+from patchproof.evidence.camera import _turn_clockwise, pinhole_photo
 from patchproof.photo.print_ratio import x_over_y
 from patchproof.photo.read import Photo
 from patchproof.photo.rectify import fit_page
@@ -71,7 +71,7 @@ def test_a_turned_camera_bends_turned_points():
     camera = PHONE.model_copy(update={"cx": 1980.0, "cy": 1530.0, "p1": 2e-3, "p2": -1e-3})
     points = np.array([[100.0, 200], [3900, 250], [2500, 2800]])
     turn = lambda p: np.column_stack([3000 - p[:, 1], p[:, 0]])  # noqa: E731
-    bent = _turned(camera).distort_points(turn(points), (3000, 4000))
+    bent = _turn_clockwise(camera).distort_points(turn(points), (3000, 4000))
     assert bent == pytest.approx(turn(camera.distort_points(points, (4000, 3000))), abs=1e-6)
 
 

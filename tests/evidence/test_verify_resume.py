@@ -241,6 +241,6 @@ def test_a_sheet_does_not_choose_code_that_is_run():
         Refused, match=r"got module:theirs\.network: name it yourself .*--models module:theirs\.network"
     ):
         _networks(manifest, None)
-    with pytest.raises(Refused, match="no code"):
+    with pytest.raises(Refused, match="files, not code"):
         _networks(manifest, ["builtin"])
     assert _networks(manifest, ["module:theirs.network"]) == ("module:theirs.network",)

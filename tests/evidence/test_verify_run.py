@@ -26,7 +26,7 @@ from patchproof.base.errors import Refused
 from patchproof.base.intervals import wilson
 from patchproof.channel.printer import identity_printer, load_printer
 from patchproof.classifier import Classifier
-from patchproof.evidence.appearance import _fitted_by_others, cells_fit
+from patchproof.evidence.appearance import _cross_fitted_cells, fit_cells
 from patchproof.evidence.camera import pinhole_photo
 from patchproof.evidence.gather import gather_evidence
 from patchproof.evidence.measure import measure
@@ -153,8 +153,8 @@ def test_no_cell_is_fitted_to_itself():
         rng = np.random.default_rng(seed)
         promised = rng.uniform(0.05, 0.9, (8, 8, 3))
         lit = promised + rng.normal(0, 0.05, promised.shape)
-        fit = cells_fit(lit[usable], promised[usable], light_on(1.0), np.zeros(3))
-        fitted = _fitted_by_others(lit, promised, usable, fit, light_on(1.0), np.zeros(3))
+        fit = fit_cells(lit[usable], promised[usable], light_on(1.0), np.zeros(3))
+        fitted = _cross_fitted_cells(lit, promised, usable, fit, light_on(1.0), np.zeros(3))
         errors.append([np.sqrt(((cells - promised)[usable] ** 2).mean()) for cells in (lit, fit.apply(lit), fitted)])
     truth, own, others = np.mean(errors, 0)
     assert own < 0.98 * truth < truth < others < 1.15 * truth
@@ -164,7 +164,7 @@ def test_gloss_on_part_of_the_design_does_not_turn_the_map():
     promised = cv2.resize(linear_from_srgb(noisy_design()), (46, 46), interpolation=cv2.INTER_AREA)
     lit = 0.5 * promised
     lit[10:24, 5:19] += 0.25  # on 9 % of it
-    fit = cells_fit(lit.reshape(-1, 3), promised.reshape(-1, 3), light_on(0.5), np.zeros(3))
+    fit = fit_cells(lit.reshape(-1, 3), promised.reshape(-1, 3), light_on(0.5), np.zeros(3))
     assert fit.name == "affine12" and fit.matrix == pytest.approx(np.column_stack([2 * np.eye(3), np.zeros(3)]))
 
 
@@ -395,6 +395,6 @@ def test_folders_and_judges_that_will_not_do_are_refused_in_a_sentence(tmp_path)
     save(np.zeros((50, 50, 3), np.uint8), tmp_path / "a.jpg")
     other = Classifier("other", None, 32, ("bright", "dark"), brightness)
     retrained = Classifier("net", "cd" * 32, 32, ("bright", "dark"), brightness)
-    for model, words in ((other, "the promise's own network net"), (retrained, "another file under that name")):
+    for model, words in ((other, "the promise's own network net"), (retrained, "got SHA-256 cdcdcdcdcdcd")):
         with pytest.raises(Refused, match=words):
             gather_evidence(tmp_path, make_manifest(promise()), Options([model], identity_printer()))

@@ -29,7 +29,7 @@ from patchproof.base.errors import Refused
 from patchproof.base.intervals import Estimate, paired_difference
 from patchproof.optimizer.run import optimize
 from patchproof.render.photograph import photograph
-from patchproof.report.images import drawn as drawing_of
+from patchproof.report.images import draw_figure as drawing_of
 from patchproof.scene.conditions import with_values
 
 
@@ -105,7 +105,7 @@ def test_hidden_corners_cover_their_share_of_the_piece(world, quarters):
 
 def test_mismatch_begins_at_the_run_s_printer_and_is_the_other_one_at_one(world):
     assert torch.equal(piece_at(world, {"mismatch": 0.0}, 0).srgb, piece_at(world, {}, 0).srgb)
-    other = world.other.apply(world.sheet.sent)[0].permute(1, 2, 0)
+    other = world.other.apply(world.sheet.sent_srgb)[0].permute(1, 2, 0)
     assert torch.allclose(piece_at(world, {"mismatch": 1.0}, 0).srgb, other, atol=1e-6)
 
 

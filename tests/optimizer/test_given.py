@@ -289,9 +289,7 @@ def test_a_folder_of_pictures_is_compared_on_the_same_conditions(several, capsys
 def test_runs_that_are_not_seen_alike_are_not_compared(several, tmp_path):
     other = scene_with(several, **SMALL | {"camera__photo_px": [96, 64]})
     import_patch(slopes(64, 64), other, tmp_path / "other", **DRAFT)
-    with pytest.raises(
-        Refused, match=r"runs that are seen alike, as red is, got other: compare runs whose scenes differ"
-    ):
+    with pytest.raises(Refused, match=r"runs with the same views as red, got other with other settings of its views"):
         compare_runs([several / "runs" / "red", tmp_path / "other"], tmp_path / "out", n=4)
     with pytest.raises(Refused, match="two runs or more to compare, each once"):
         compare_runs([several / "runs" / "red"] * 2, tmp_path / "out", n=4)

@@ -20,7 +20,7 @@ from patchproof.base import input as bounds
 from patchproof.base.errors import Refused
 from patchproof.calibrate import boards
 from patchproof.calibrate.boards import BoardView, find_boards, find_corners
-from patchproof.evidence.batch import PhotoItem, _measured
+from patchproof.evidence.batch import PhotoItem, _measure_or_reject
 from patchproof.evidence.camera import pinhole_photo
 from patchproof.evidence.measure import measure
 from patchproof.evidence.ranges import promised_ranges
@@ -87,7 +87,7 @@ def test_inside_a_limit_there_is_one_and_in_other_threads_none(monkeypatch):
 def test_a_photograph_that_takes_too_long_is_rejected_with_advice(tmp_path, monkeypatch):
     monkeypatch.setattr(bounds, "TIME_LIMIT_S", 0.2)
     monkeypatch.setattr("patchproof.evidence.batch.read_photo", lambda path: toy.spin(5.0))
-    entry = _measured(small_task(), PhotoItem(tmp_path / "a.jpg", "a.jpg")).entry
+    entry = _measure_or_reject(small_task(), PhotoItem(tmp_path / "a.jpg", "a.jpg")).entry
     assert (entry.status, entry.code, entry.remark.threshold) == ("rejected", "too_costly", 0.2)
     assert "save it smaller" in entry.remark.advice
 

@@ -13,7 +13,7 @@ from patchproof.classifier import center_square
 from patchproof.evidence import appearance
 from patchproof.evidence.camera import pinhole_photo
 from patchproof.evidence.classify import squares_of
-from patchproof.evidence.measure import identify, measure
+from patchproof.evidence.measure import identify_sheet, measure
 from patchproof.evidence.ranges import promised_ranges
 from patchproof.evidence.surface import promised_of, surface_of
 from patchproof.photo import colorfit, detect, edges, known_page
@@ -72,14 +72,14 @@ def test_a_sheet_too_small_for_the_first_levels_is_found_and_one_too_small_for_a
     far[900:1500, 1300:2100] = near
     expected = find_sheet(near, IDS, surface.corners_mm).corners_px
     levels.clear()
-    shown, _ = identify(far, surface)
+    shown, _ = identify_sheet(far, surface)
     assert shown.corners_px.keys() == expected.keys() == IDS and levels[0] == (450, 600) and len(levels) > 1
     for marker_id, corners in shown.corners_px.items():
         np.testing.assert_allclose(corners - [1300, 900], expected[marker_id], atol=0.01, rtol=0)
     far[900:1500, 1300:2100] = 128
     far[900:975, 1300:1400] = cv2.resize(near, (100, 75), interpolation=cv2.INTER_AREA)
     with pytest.raises(PhotoRejected, match="no marker is readable"):
-        identify(far, surface)
+        identify_sheet(far, surface)
 
 
 @pytest.mark.parametrize("moved_px", [0, 2])
@@ -142,7 +142,7 @@ def test_colors_are_those_of_all_pixels(piece, surface, monkeypatch):
         return measure(photo, "a", surface, promised, promised_ranges(()), with_pictures=False).entry.color
 
     reduced = color()
-    monkeypatch.setattr(appearance, "_SAMPLES", 1e6)
+    monkeypatch.setattr(appearance, "_SAMPLES_PER_CELL", 1e6)
     whole = color()
     # the 12-megapixel photographs that were compared differ by 0.0125 at most
     assert reduced.delta_e00_mean == pytest.approx(whole.delta_e00_mean, abs=0.03)

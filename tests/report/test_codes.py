@@ -119,10 +119,10 @@ def test_one_foreign_marker_is_clutter_and_two_are_another_sheet(monkeypatch):
         found = MarkersInView({i: borders for i in PIECE_IDS}, foreign, doubled)
         monkeypatch.setattr(measure, "find_sheet", lambda *_, found=found: found)
         if code is None:
-            assert measure.identify(np.zeros((9, 9, 3), np.uint8), SURFACE)[0] is found
+            assert measure.identify_sheet(np.zeros((9, 9, 3), np.uint8), SURFACE)[0] is found
         else:
             with pytest.raises(measure.PhotoRejected, match="several_sheets: more than one sheet"):
-                measure.identify(np.zeros((9, 9, 3), np.uint8), SURFACE)
+                measure.identify_sheet(np.zeros((9, 9, 3), np.uint8), SURFACE)
 
 
 @pytest.mark.parametrize("flip", [np.fliplr, np.flipud])

@@ -11,15 +11,15 @@ from conftest import SCENE
 
 from patchproof.base.errors import Refused
 from patchproof.base.settings import load_scene_settings
-from patchproof.reprints.plan_view import hang
-from patchproof.reprints.run_sheet import _wrapped
+from patchproof.reprints.plan_view import draw_plan_view
+from patchproof.reprints.run_sheet import _wrapping
 from patchproof.reprints.shot_plan import shot_sections
 from patchproof.scene.placement import patch_frame
 from patchproof.scene.tape_measure import measure_tapes
 from patchproof.sheets.plan_page import PlacementPicture, PlanPage, edge_distances_mm, lay_out_plan, wrap_text
 from patchproof.sheets.template import load_template
+from test_benefit_shown import promise_with
 from test_scene import scene_of
-from test_worth_shown import promise_with
 
 A4 = load_template("a4")
 OUTLINE = ((-20.0, -45.0), (60.0, -45.0), (60.0, 15.0), (-20.0, 15.0))
@@ -39,7 +39,7 @@ def boxed(tmp_path, **patch):
 def test_edges_of_a_piece_on_a_box(tmp_path, spin):
     scene = boxed(tmp_path, offset_mm="[30, 20]", spin_deg=spin)
     width, height = scene.piece.size_mm if spin == 0 else scene.piece.size_mm[::-1]
-    found = hang(scene, A4)
+    found = draw_plan_view(scene, A4)
     # the side is 400 × 240: its middle lies 200 and 120 from the edges, the piece's 30 right of it and 20 up
     assert edge_distances_mm(found) == pytest.approx(
         {
@@ -63,7 +63,7 @@ def test_edges_of_a_real_mesh_add_up_to_what_another_reader_measures(tmp_path, d
     path = data / "meshes" / "gz_suv.glb"
     extents = trimesh.load(path, force="mesh").extents
     text = SCENE.replace("primitive:carton", str(path)).replace("length_mm = 300", "length_mm = 480")
-    found = hang(scene_of(tmp_path, text.replace('"+z"', '"+x"').replace("[500, 900]", "[700, 900]")), A4)
+    found = draw_plan_view(scene_of(tmp_path, text.replace('"+z"', '"+x"').replace("[500, 900]", "[700, 900]")), A4)
     edges, (xs, ys) = edge_distances_mm(found), zip(*found.outline_mm, strict=True)
     scaled = sorted(extents * 480 / extents.max())
     wide, high = (edges["left"] + edges["right"] + np.ptp(xs), edges["top"] + edges["bottom"] + np.ptp(ys))
@@ -120,7 +120,7 @@ def test_tapes_on_a_can_run_to_its_rim_its_ground_and_round_to_its_outline(tmp_p
         # the last step before the outline, a fifteenth of a millimeter in the picture, is 2.6 mm of the can
         assert found[name][0] == pytest.approx(length, abs=3.0 if end == "outline" else 0.3), name
         assert found[name][1] == f"to the {end}"
-    text = _wrapped(scene)
+    text = _wrapping(scene)
     assert "Wrap the piece round the object" in text and f"{names[0]} {up:.0f} mm to the top" in text
 
 

@@ -35,8 +35,8 @@ from patchproof.sheets.print_advice import sheet_advice
 from patchproof.sheets.template import load_template, template_names
 from patchproof.sheets.tiles import plan_tiles, refuse_larger_than_page
 from patchproof.sheets.write import write_sheet
+from test_benefit import promise_of
 from test_sheet_write import DPI, ID, PX_PER_MM, detect, sample_design
-from test_worth import promise_of
 
 NAMES = template_names()
 DESIGN = cv2.resize(sample_design(12, 12), (120, 120), interpolation=cv2.INTER_CUBIC)

@@ -1,1 +1,1 @@
-"""The verbs: each joins rooms into one command, with no logic of its own below it."""
+"""The verbs of the command line: each combines other rooms into one command."""

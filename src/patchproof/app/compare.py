@@ -1,12 +1,12 @@
-"""Designs side by side: several runs of one scene under the same conditions, and the best of them under fresh ones.
+"""Compare the designs of several runs of one scene under the same conditions, and the best two under fresh ones.
 
 In: finished runs, optimized here or imported, whose scenes differ in [patch], [optimize] and [sheet] at most. Out:
 DIR/designs.html with each design's picture, rate, gain over its best control and difference to the best design, paired
 on the same views; DIR/designs.json, and a CSV of each table.
 
-The best of several rates is too good on the views that chose it (the winner's curse), and so is its lead. The two best
-are therefore shown under as many conditions again, which had no say in the choice: those figures are to be quoted. Left
-out on purpose: corrections of the other rows for how many there are; they only choose.
+The best of several rates is biased upward on the views that selected it (the winner's curse), and so is its lead. The
+two best are therefore evaluated under as many fresh conditions: those figures are to be quoted. Left out on purpose:
+corrections of the other rows for the number of designs; they only serve the selection.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ from patchproof.scene.interface import Scene, require_piece
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-OWN = ("designs.html", "designs.json", "designs_*.csv", "designs_*.png")
+COMPARISON_FILES = ("designs.html", "designs.json", "designs_*.csv", "designs_*.png")
 _HEAD = ("design", "made", "network", "rate", "best control", "minus it", "minus the best design")
-AnswersByKind = Mapping[str, Responses]  # what networks answered to a design and its controls
+AnswersByKind = Mapping[str, Responses]  # to a design and each of its controls
 
 
 def compare(
@@ -62,29 +62,29 @@ def compare(
     Raises:
         Refused: for runs of different scenes.
     """
-    networks, loaded = None if models is None else tuple(models), _loaded(runs, models is None)
+    networks, loaded = None if models is None else tuple(models), _load_runs(runs, models is None)
     refuse_networks_in_memory(networks, compute)
-    scene, total, before = next(iter(loaded.values())).scene, n * (len(loaded) + 2), 0
+    scene, total, views_done = next(iter(loaded.values())).scene, n * (len(loaded) + 2), 0
     judges = networks or scene.settings.target.models
     names = tuple(each.name if isinstance(each, Classifier) else each for each in judges)
     seed = scene.seed if seed is None else seed
-    with new_folder(out, OWN, overwrite) as folder, open_workers(compute.jobs, compute.cluster) as workers:
+    with new_folder(out, COMPARISON_FILES, overwrite) as folder, open_workers(compute.jobs, compute.cluster) as workers:
 
         def ask(name: str, start: int) -> AnswersByKind:
-            nonlocal before
-            run, done = loaded[name], before
+            nonlocal views_done
+            run, start_count = loaded[name], views_done
             conditions = run.scene.draw("evaluate", n, seed, start)
 
             def advance(count: int, _: int) -> None:
-                progress("evaluate", done + count, total)
+                progress("evaluate", start_count + count, total)
 
             answers, _ = run_responses(run.folder.resolve(), conditions, workers, networks, compute.device, advance)
-            before += n
+            views_done += n
             return answers
 
         try:
-            chosen_by = {name: ask(name, 0) for name in loaded}
-            order = sorted(loaded, key=partial(_reached, chosen_by, scene))[::-1]
+            by_design = {name: ask(name, 0) for name in loaded}
+            order = sorted(loaded, key=partial(_goal_score, by_design, scene))[::-1]
             fresh = {name: ask(name, n) for name in order[:2]}
         finally:
             close_run()
@@ -95,34 +95,36 @@ def compare(
             f'"{scene.settings.target.label}", under the same conditions.',
             extent=f"{len(loaded)} designs, {n} conditions, and {n} more for the best two; seed {seed}",
             settings=scene.settings.model_dump(mode="json"),
-            tables=_tables(loaded, names, order, chosen_by, fresh),
-            figures=[_drawing({name: loaded[name] for name in order}, chosen_by)],
+            tables=_tables(loaded, names, order, by_design, fresh),
+            figures=[_drawing({name: loaded[name] for name in order}, by_design)],
             failed={},
-            more={"imported": {name: run.details["imported"] for name, run in loaded.items() if _made(run) != "here"}},
+            more={
+                "imported": {name: run.details["imported"] for name, run in loaded.items() if _origin(run) != "here"}
+            },
         )
         write_results(folder, results)
     return results
 
 
-def _loaded(runs: Sequence[str | Path], with_networks: bool) -> dict[str, Run]:
-    """The runs by their folders' names, in full where two are alike; refused where their views are not the same."""
+def _load_runs(runs: Sequence[str | Path], with_networks: bool) -> dict[str, Run]:
+    """Load runs by their folders' names, or by full paths if two names are equal; refused if their views differ."""
     paths = [Path(run).resolve() for run in runs]
     if len(set(paths)) < max(len(paths), 2):
         raise Refused(
             "two runs or more to compare, each once", summarize_names([str(run) for run in runs]) or "none", "name them"
         )
-    alike = len({path.name for path in paths}) < len(paths)
-    loaded = {str(path) if alike else path.name: load_run(path) for path in paths}
+    ambiguous = len({path.name for path in paths}) < len(paths)
+    loaded = {str(path) if ambiguous else path.name: load_run(path) for path in paths}
     first, *others = loaded
     for name in others:
         if _views_of(loaded[name].scene, with_networks) != _views_of(loaded[first].scene, with_networks):
             do = "compare runs whose scenes differ in [patch], [optimize] and [sheet] at most"
-            raise Refused(f"runs that are seen alike, as {first} is", name, do)
+            raise Refused(f"runs with the same views as {first}", f"{name} with other settings of its views", do)
     return loaded
 
 
 def _views_of(scene: Scene, with_networks: bool) -> tuple[Any, ...]:
-    """All that views of the scene depend on but its piece, and what is asked of networks."""
+    """Everything except the piece that views of the scene and the networks' answers depend on."""
     require_piece(scene)
     settings = scene.settings.model_dump(mode="json", exclude={"patch", "optimize", "sheet"})
     if not with_networks:
@@ -130,8 +132,8 @@ def _views_of(scene: Scene, with_networks: bool) -> tuple[Any, ...]:
     return settings, scene.base.resolve(), scene.mesh_glb
 
 
-def _reached(answers: Mapping[str, AnswersByKind], scene: Scene, name: str) -> tuple[float, float]:
-    """How far a design reaches its goal before the first network: by rate, then by confidence."""
+def _goal_score(answers: Mapping[str, AnswersByKind], scene: Scene, name: str) -> tuple[float, float]:
+    """Rank a design by the first network's rate, then by its confidence; larger is better for the goal."""
     design, sign = answers[name]["design"], scene.settings.target.goal.sign
     return sign * float(design.recognized[0].mean()), sign * float(design.confidence[0].mean())
 
@@ -145,14 +147,14 @@ def _tables(
 ) -> list[Table]:
     best = order[0]
     n = all_views[best]["design"].recognized.shape[1]
-    quoted = Table(
+    confirmed = Table(
         "fresh",
         "The best two, under conditions that had no say in choosing them",
         _HEAD,
         tuple(_row(runs, fresh, name, best, networks[0], 0) for name in fresh),
         f"{n} fresh conditions: these are the figures to quote.",
     )
-    chosen = Table(
+    selected = Table(
         "designs",
         "All designs, under the same conditions",
         _HEAD,
@@ -160,7 +162,7 @@ def _tables(
         f"{n} conditions, the same for all; differences are paired. The best is the best by the first network. That it "
         "was chosen on these conditions flatters its rate and its lead.",
     )
-    return [quoted, chosen]
+    return [confirmed, selected]
 
 
 def _row(
@@ -171,16 +173,16 @@ def _row(
     control = max(CONTROLS, key=lambda kind: sign * sum(hits[kind]))
     lead = None if name == best else estimate_difference(hits["design"], answers[best]["design"].recognized[i].tolist())
     gain = estimate_difference(hits["design"], hits[control])
-    return name, _made(runs[name]), network, rate(hits["design"]), control, gain, lead
+    return name, _origin(runs[name]), network, rate(hits["design"]), control, gain, lead
 
 
-def _made(run: Run) -> str:
-    """Where a run's design was made."""
+def _origin(run: Run) -> str:
+    """'here' for a design that was optimized, 'elsewhere' for an imported one."""
     return "here" if run.details.get("imported") is None else "elsewhere"
 
 
 def _drawing(runs: Mapping[str, Run], answers: Mapping[str, AnswersByKind]) -> Drawing:
-    """Each design's picture beside its rate and its best control's."""
+    """Draw each design's picture beside its rate and its controls' rates."""
 
     def draw(figure: Figure) -> None:
         grid = figure.subplots(len(runs), 2, squeeze=False, width_ratios=(1, 5), sharex="col")

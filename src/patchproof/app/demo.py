@@ -1,8 +1,7 @@
-"""The demo: the whole journey on an object and a network that come with the package, offline, in about a minute.
+"""The demo: from scene to report on an object and a network of the package, offline, in about a minute.
 
-In: nothing. Out: scene.toml run/ sheet.pdf sheet.json photos/ report/. Its conditions are hard ones on purpose: far,
-dim, oblique and in cluttered places, so that the bare object and the controls are often misread and there is something
-to gain.
+In: nothing. Out: scene.toml run/ sheet.pdf sheet.json photos/ report/. Its conditions are hard on purpose: far, dim,
+oblique and in cluttered places, so that the bare object and the controls are often misread and a patch can help.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from patchproof.reprints.reprint import reprint
 from patchproof.reprints.run_sheet import sheet
 
 PHOTOS, SESSIONS = 48, 12
-OWN = ("scene.toml", "run", "sheet.pdf", "sheet.json", "photos", "report")
+DEMO_FILES = ("scene.toml", "run", "sheet.pdf", "sheet.json", "photos", "report")
 
 SCENE = """\
 # A toy truck seen from a drone, dim and over clutter. The built-in classifier knows trucks from the side.
@@ -71,22 +70,22 @@ def run_demo(
 ) -> list[str]:
     """Run every step into the folder `out`, before the built-in classifier or detector; returns the summary's lines."""
     compute = Compute(jobs=jobs)
-    with new_folder(out, OWN, overwrite) as folder:
+    with new_folder(out, DEMO_FILES, overwrite) as folder:
         pdf, photos, report = folder / "sheet.pdf", folder / "photos", folder / "report"
         run = optimize(demo_scene(folder, detector), folder / "run", compute=compute, progress=progress)
         sheet(run, pdf)
         reprint(pdf, run, PHOTOS, photos, sessions=SESSIONS, compute=compute, progress=progress)
-        judged = verify(photos, folder / "sheet.json", report, compute=compute, progress=progress)
+        judgment = verify(photos, folder / "sheet.json", report, compute=compute, progress=progress)
     return [
         "Hard conditions on purpose (far, dim, oblique, cluttered): bare object and controls are often misread.",
         *promise_lines(run.promise, background_summary(run.scene.settings.model_dump())),
-        *verdict_lines(judged),
+        *verdict_lines(judgment),
         *(f"{out}/{name}" for name in ("run/design.png", "sheet.pdf", "sheet.json", "photos/", "report/report.html")),
     ]
 
 
 def demo_scene(folder: Path, detector: bool = False) -> Path:
-    """Write scene.toml into a folder; its path."""
+    """Write scene.toml into a folder and return its path."""
     scene = folder / "scene.toml"
     scene.write_text(SCENE.replace('"builtin"', '"builtin-detector"') if detector else SCENE, encoding="utf-8")
     return scene

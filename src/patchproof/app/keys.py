@@ -1,7 +1,7 @@
-"""Every key of scene files and page templates as one Markdown page, read from the settings classes.
+"""Write every key of scene files and page templates as one Markdown page, read from the settings classes.
 
 Out: per table a row per key: type and range, unit, default, meaning. The meaning is the comment at the end of the
-field's last line or, where there is none, the comment above the field: it stands once, where the code says the key.
+field's last line or, without one, the comment above the field, so that it is written only once, in the code.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _UNITS = {"mm": "mm", "deg": "°", "px": "px", "ev": "stops"}
 _WORDS = {str: "text", int: "integer", float: "number", bool: "true or false"}
 
 
-Documents = Mapping[str, tuple[str, type[StrictModel]]]  # by name what a file of settings is for, and its settings
+Documents = Mapping[str, tuple[str, type[StrictModel]]]  # by name, the purpose of a settings file and its class
 DOCUMENTS: Documents = {
     "scene": ("A scene file: `patchproof optimize`, `plan`.", SceneSettings),
     "template": ("A page template: `patchproof sheet --template FILE.toml`.", Template),
@@ -44,10 +44,10 @@ DOCUMENTS: Documents = {
 
 
 def keys_page(documents: Documents, name: str | None = None, head: str = HEAD) -> str:
-    """The page of these documents as Markdown, or what it says of one kind of file."""
+    """Write the page of all documents as Markdown, or the part on the document `name`."""
     if name is None:
-        where: dict[type[BaseModel], str] = {}
-        return "\n".join([head, *(_document(name, *documents[name], where) for name in documents)])
+        places: dict[type[BaseModel], str] = {}
+        return "\n".join([head, *(_document(name, *documents[name], places) for name in documents)])
     if name not in documents:
         raise Refused(f"one of {', '.join(documents)}", f'"{name}"', spelling_hint(name, documents))
     return _document(name, *documents[name], {})
@@ -55,7 +55,7 @@ def keys_page(documents: Documents, name: str | None = None, head: str = HEAD) -
 
 @lru_cache
 def meanings(model: type[BaseModel]) -> dict[str, str]:
-    """By key the comment that says what it means; a key without one is missing."""
+    """Read the comments that explain a class's keys, by key; keys without a comment are missing."""
     texts = {}
     for owner in reversed(model.__mro__):
         if not issubclass(owner, StrictModel) or owner is StrictModel:
@@ -73,29 +73,29 @@ def meanings(model: type[BaseModel]) -> dict[str, str]:
     return texts
 
 
-def _document(name: str, about: str, settings: type[StrictModel], where: dict[type[BaseModel], str]) -> str:
-    """One file's tables; those in `where` are told there."""
+def _document(name: str, about: str, settings: type[StrictModel], places: dict[type[BaseModel], str]) -> str:
+    """Write one document's tables; for a class that was written before, refer to its place in `places`."""
     lines = [f"## {name}", "", about, ""]
     for path, model in tables(settings):
         if path:
             lines += [f"### {name}: `{path}`", ""]
-        if model in where:
-            lines += [f"As in {where[model]}.", ""]
+        if model in places:
+            lines += [f"As in {places[model]}.", ""]
             continue
-        where[model] = f"{name}: `{path}`" if path else name
+        places[model] = f"{name}: `{path}`" if path else name
         lines += [_cell(model.__doc__ or ""), "", "| key | value | unit | default | meaning |", "|---|---|---|---|---|"]
         lines += [_row(model, key, field) for key, field in model.model_fields.items()] + [""]
     return "\n".join(lines)
 
 
 def tables(model: type[BaseModel], path: str = "") -> Iterator[tuple[str, type[BaseModel]]]:
-    """The settings and the tables in them, each with its place as TOML writes it."""
+    """Iterate over the settings and the tables in them, each with its path as in TOML."""
     yield path, model
     for key, hint in get_type_hints(model).items():
-        many = any(get_origin(each) is tuple for each in (hint, *get_args(hint)))
+        is_array = any(get_origin(each) is tuple for each in (hint, *get_args(hint)))
         for inner in models_in(hint):
-            place = f"{path.strip('[]')}.{key}".strip(".")
-            yield from tables(inner, f"[[{place}]]" if many else f"[{place}]")
+            inner_path = f"{path.strip('[]')}.{key}".strip(".")
+            yield from tables(inner, f"[[{inner_path}]]" if is_array else f"[{inner_path}]")
 
 
 def _row(model: type[BaseModel], key: str, field: FieldInfo) -> str:
@@ -110,7 +110,7 @@ def _cell(text: str) -> str:
 
 
 def default_text(field: FieldInfo) -> str:
-    """A key's default as a cell of the page."""
+    """Format a key's default as a cell of the page."""
     if field.is_required():
         return "required"
     value = field.get_default(call_default_factory=True)
@@ -118,7 +118,7 @@ def default_text(field: FieldInfo) -> str:
 
 
 def toml_text(value: Any) -> str:
-    """A value as TOML writes it, four digits of numbers."""
+    """Format a value as TOML, numbers with four digits."""
     if isinstance(value, StrictModel):
         value = value.model_dump(exclude_defaults=True)
     if isinstance(value, Mapping):
@@ -131,7 +131,7 @@ def toml_text(value: Any) -> str:
 
 
 def _kind(hint: Any, checks: tuple[Any, ...] = (), plural: str = "") -> str:
-    """A type as one who writes TOML needs to know it, with its range."""
+    """Describe a type for somebody who writes TOML, with its range."""
     origin, inner = get_origin(hint), get_args(hint)
     if origin is Annotated:
         return _kind(inner[0], (*checks, *inner[1:]), plural)
@@ -154,7 +154,7 @@ def _kind(hint: Any, checks: tuple[Any, ...] = (), plural: str = "") -> str:
 
 
 def _range(checks: tuple[Any, ...]) -> str:
-    """The tighter one of two bounds; of equal ones the one that leaves the end out."""
+    """Describe the tightest bounds; of two equal bounds, the one that excludes the end."""
     bounds = _bounds(checks)
     low = max(((value, name == "gt") for name, value in bounds if name in ("ge", "gt")), default=None)
     high = min(((value, name == "le") for name, value in bounds if name in ("le", "lt")), default=None)
@@ -165,7 +165,7 @@ def _range(checks: tuple[Any, ...]) -> str:
 
 
 def _bounds(checks: tuple[Any, ...]) -> list[tuple[str, Any]]:
-    """What a type's checks bound it by, by pydantic's names."""
+    """List the bounds in a type's checks, with pydantic's names."""
     bounds = []
     for check in checks:
         if isinstance(check, AfterValidator) and isinstance(check.func, partial):  # validation.within

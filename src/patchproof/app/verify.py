@@ -1,10 +1,10 @@
-"""Verify: photographs and a manifest in, a report out.
+"""Verify: judge photographs of a printed sheet against its manifest, and write the report.
 
 In: a folder of photographs (or of folders, one a session) and SHEET.json. Out: REPORT/ with report.json, report.csv,
-report.html, pictures, coco.json with the piece's and a detected object's place, and photos.jsonl, one line per finished
-photograph, from which `resume` goes on. This joins what must not know each other: the judge, its networks and the page.
-The promise's primary network always judges, whatever others are named. Only a given run brings its scene, the renderer
-and the optimizer in.
+report.html, pictures, coco.json with places of the piece and of a detected object, and photos.jsonl, one line per
+finished photograph, from which `resume` continues. This combines evidence, classifiers and report, which do not import
+each other. The promise's primary network always judges, also if other networks are named. Scene, renderer and optimizer
+are imported only if a run is given.
 """
 
 from __future__ import annotations
@@ -44,19 +44,19 @@ if TYPE_CHECKING:
     from patchproof.optimizer.run import Run
 
 _JOURNAL, _PHOTOS = "photos.jsonl", "photos"
-OWN = ("report.json", "report.csv", "report.html", "coco.json", "pictures", _PHOTOS, _JOURNAL)
+REPORT_FILES = ("report.json", "report.csv", "report.html", "coco.json", "pictures", _PHOTOS, _JOURNAL)
 _LIBRARIES = ("patchproof", "numpy", "opencv-contrib-python-headless", "torch", "scipy")
 
 
 @dataclass(frozen=True)
 class CaptureInfo:
-    """What is known about how the photographs were taken.
+    """Facts about how the photographs were taken.
 
     Attributes:
         camera: a camera file's name or path, which replaces the EXIF focal length and takes the lens's distortion out.
         scan_dpi: resolution of flat scans of the uncut page; None for photographs.
         ruler_mm: lengths (x, y) of the two printed 100 mm rulers as measured on the print, in millimeters.
-        boxes: COCO JSON with the object's box in photographs, for detectors, where the sheet does not tell it.
+        boxes: COCO JSON with the object's box in photographs, for detectors, if the sheet does not tell.
     """
 
     camera: str | Path | None = None
@@ -123,12 +123,12 @@ def verify(
     )
     if boxes is not None:
         if manifest.promise is None or not any(model.LOOKS_AT_BOXES for model in options.models):
-            got = "none that judges these photographs"
-            raise Refused("a detector, which alone looks at boxes", got, "leave boxes out")
+            got = f"the classifiers {', '.join(model.name for model in options.models) or '(none)'}"
+            raise Refused("a detector, since classifiers use no boxes", got, "leave boxes out")
         options = replace(options, boxes=load_boxes(boxes, manifest.promise.target.label))
     forecast = None
     if run is not None:
-        from patchproof.reprints.photo_forecast import photo_forecaster  # brings scene, renderer and optimizer in
+        from patchproof.reprints.photo_forecast import photo_forecaster  # imports scene, renderer and optimizer
 
         forecast = photo_forecaster(run, manifest)
     report = gather_evidence(
@@ -142,14 +142,14 @@ def verify(
         on_pictures=lambda file, kinds: save_pictures(out / "pictures", file, kinds),
         advance=partial(progress, "verify"),
     )
-    given = {"scan_dpi": capture.scan_dpi, "ruler_mm": capture.ruler_mm}
-    given |= {"camera": capture.camera and Path(capture.camera).name}
-    given |= {"boxes": boxes and Path(boxes).name, "ledger_photos": ledger_photos}
+    parameters = {"scan_dpi": capture.scan_dpi, "ruler_mm": capture.ruler_mm}
+    parameters |= {"camera": capture.camera and Path(capture.camera).name}
+    parameters |= {"boxes": boxes and Path(boxes).name, "ledger_photos": ledger_photos}
     hashes = {"manifest": file_sha256(Path(sheet)), **{f"network {each.name}": each.sha256 for each in options.models}}
-    report = report.changed(origin=Origin(options=given, sha256=hashes, versions=versions_of(_LIBRARIES)))
-    shown = {stem_of(photo.file) for photo in report.photos[:MAX_PICTURED_PHOTOS]}
+    report = report.changed(origin=Origin(options=parameters, sha256=hashes, versions=versions_of(_LIBRARIES)))
+    stems = {stem_of(photo.file) for photo in report.photos[:MAX_PICTURED_PHOTOS]}
     for path in list((out / "pictures").glob("*")):  # those of photographs that this report does not show
-        if path.name.rsplit(".", 2)[0] not in shown:
+        if path.name.rsplit(".", 2)[0] not in stems:
             path.unlink()
     ledger = report.ledger and report.ledger.model_dump()
     write_report(report.model_dump(mode="json"), manifest.model_dump(mode="json"), out, ledger)
@@ -158,11 +158,11 @@ def verify(
 
 
 def _boxes(report: Report, manifest: Manifest, camera: Camera | None) -> str:
-    """The photographs, and where the piece lies in those that show it flat and straight, as COCO JSON; where detectors
-    were asked and it is known, the object's box, too: what of it lies in the middle square.
+    """Write the photographs as COCO JSON, with the piece's outline where it is flat and not rejected, and for detectors
+    the part of the object's box in the centered square, if it is known.
     """
     corners, photos = rect_corners(manifest.cut_mm), []
-    bends = camera is not None and camera.has_distortion  # then places are those in the picture made straight
+    bends = camera is not None and camera.has_distortion  # then places are those in the undistorted picture
     label = "object" if manifest.promise is None else manifest.promise.target.label
     for entry in report.photos:
         if entry.photo_px is None:
@@ -182,7 +182,7 @@ def options_of(
     models: Sequence[str | Classifier] | None = None,
     camera: str | Path | None = None,
 ) -> Options:
-    """What photographs of the sheet are judged with and measured against; see `verify`."""
+    """Load the networks, the printer and the camera for photographs of the sheet; see `verify`."""
     base, promise = Path(sheet).resolve().parent, manifest.promise
     least_score = None if promise is None else promise.models[0].least_score
     return Options(
@@ -195,28 +195,30 @@ def options_of(
 
 
 def _check_out(out: Path, resume: bool, overwrite: bool) -> None:
-    """Refuse a folder with files in it, unless they are ours and to be gone on from, or replaced."""
-    begun = is_file(out / _JOURNAL)
+    """Refuse a folder with files, unless they are of a verification that is resumed or overwritten."""
+    has_journal = is_file(out / _JOURNAL)
     if resume:
-        check_folder(out, OWN if begun else (), overwrite=begun)
+        check_folder(out, REPORT_FILES if has_journal else (), overwrite=has_journal)
         return
-    if begun and not overwrite and not is_file(out / "report.json"):
+    if has_journal and not overwrite and not is_file(out / "report.json"):
         raise Refused("an empty or new folder", f"{out} with an unfinished verification", "add --resume or --overwrite")
-    check_folder(out, OWN, overwrite)
+    check_folder(out, REPORT_FILES, overwrite)
 
 
 def _networks(manifest: Manifest, models: Sequence[str | Classifier] | None) -> tuple[str | Classifier, ...]:
-    """The primary network first, then the others asked for, or else the promise's; of one given in memory, itself."""
-    given = {model.name if isinstance(model, Classifier) else model: model for model in models or ()}
-    if manifest.promise is None and not given:
+    """List the primary network, then the named ones or else the promise's; classifiers in memory stand for themselves.
+    Refused is a sheet's network that is code, unless the user names it.
+    """
+    named = {model.name if isinstance(model, Classifier) else model: model for model in models or ()}
+    if manifest.promise is None and not named:
         got = f"the {manifest.kind} sheet {manifest.sheet_id}"
         raise Refused("a sheet that promises something", got, "name --models")
     if manifest.promise is None:
-        return tuple(given.values())
+        return tuple(named.values())
     promised = tuple(model.name for model in manifest.promise.models)
-    names = dict.fromkeys((promised[0], *(given or promised)))
-    code = next((name for name in names if name.startswith("module:") and name not in given), None)
+    names = dict.fromkeys((promised[0], *(named or promised)))
+    code = next((name for name in names if name.startswith("module:") and name not in named), None)
     if code is not None:
         do = f"name it yourself if that code is yours (--models {code})"
-        raise Refused("a sheet whose networks are no code, which would be run", f"{code}", do)
-    return tuple(given.get(name, name) for name in names)
+        raise Refused("a sheet whose networks are files, not code that would be run", code, do)
+    return tuple(named.get(name, name) for name in names)

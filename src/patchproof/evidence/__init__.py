@@ -1,1 +1,1 @@
-"""The judge: photographs of a print against the promise in its manifest. Knows nothing of how the design was made."""
+"""Measure and judge photographs of a print against the promise in its manifest, whatever made the design."""

@@ -1,9 +1,9 @@
-"""Each photograph of a folder, on its own: measured (over processes), classified, kept in the journal and let go.
+"""Measure each photograph of a folder (over processes), classify it, write it to the journal and free its memory.
 
-In: `PhotoItem`s, a `Task` (all that a photograph is measured against), the networks, open workers. Out: a `MeasuredPhoto`
-for each, in order, however they finished, without its pictures and squares. A file that cannot be read, cannot be
-measured or ends its process each time becomes a rejected entry; the others go on. Of a control's photographs only what
-the networks see counts, since a bare object carries no marker; one that shows nothing at all is rejected.
+In: `PhotoItem`s, a `Task` (all that a photograph is measured against), the networks, open workers. Out: a
+`MeasuredPhoto` for each, in their order, without pictures and squares. A file that cannot be read or measured, or that
+ends its process each time, becomes a rejected entry, and the batch continues. Photographs of controls are only
+classified, since a bare object carries no marker; one that shows a single tone or noise is rejected.
 """
 
 from __future__ import annotations
@@ -39,23 +39,25 @@ from patchproof.photo.quality import FrameLight, is_featureless
 from patchproof.photo.read import read_photo
 from patchproof.photo.rejection import PhotoRejected
 
-MAX_PICTURED_PHOTOS = 120  # photographs shown with pictures; the rest is listed. Keeps the page below some 15 MB
+MAX_PICTURED_PHOTOS = 120  # photographs whose pictures are on the page; the rest is listed. Keeps it below some 15 MB
 _THUMBNAIL_PX = 560  # longer side: enough for a phone's width at twice its density, some 40 kB as JPEG
 _DESIGN_COLOR, _MARKER_COLOR = (255, 64, 129), (0, 200, 140)
-_DIED = "measuring it ended its process each time, for want of memory: save it smaller"
-_EMPTY = "it shows one tone or noise and nothing else: take it again"
-# codes of photographs whose homography can still be believed
+_DIED_ADVICE = "measuring it ended its process each time, for want of memory: save it smaller"
+_EMPTY_ADVICE = "it shows one tone or noise and nothing else: take it again"
+_CROPPED_ADVICE = (
+    "it is a crop or a screenshot by its shape, its name or EXIF: it counts, but use the camera's own file"
+)
+# codes of photographs whose homography is still accurate enough to put pieces into them
 MEASURABLE_CODES = (None, "clipped", "blurred", "too_small", "cropped")
-_PART = "it is a crop or a screenshot by its shape, its name or EXIF: it counts, but use the camera's own file"
 
-# linear light of paper and ink; `frame_light` can give no more, and less than none of a print lighter than its paper
+# linear light of paper and ink, within the bounds of `frame_light`; negative where a print is lighter than its paper
 LightLevel = Annotated[Finite, Field(ge=-4, le=4)]
 
 
 @dataclass(frozen=True)
 class PhotoItem:
-    """A photograph to look at, its name in the report, the control that it shows (None: the patch), whether pictures of
-    it are wanted, and the box that somebody drew round the object.
+    """A photograph to measure: its name in the report, the control that it shows (None: the patch), whether the page
+    shows its pictures, and the box (left, top, right, bottom) that somebody drew round the object.
     """
 
     path: Path
@@ -66,7 +68,7 @@ class PhotoItem:
 
     @property
     def name(self) -> str:
-        """Its name in the journal, where controls' photographs may be called as the patch's are."""
+        """The name in the journal, which tells a control's photograph from one of the patch with the same file name."""
         return self.file if self.control is None else f"{self.control}/{self.file}"
 
 
@@ -79,30 +81,30 @@ def measure_all(
     on_pictures: Callable[[str, Mapping[str, np.ndarray]], None],
     step: Callable[[int, int], None],
 ) -> list[MeasuredPhoto]:
-    """Every photograph in order; those in the journal are not opened again. `step` gets how many are done, and all."""
+    """Measure every photograph, in order; the journal's are not opened again. `step` gets (done, total)."""
     photos: dict[int, MeasuredPhoto] = {}
     for number, item in enumerate(items):
-        kept = journal.find(item.name, item.path) if journal is not None else None
-        finished = None if kept is None else _parsed(kept, item, judges)
-        if finished is not None:
-            photos[number] = finished
+        line = journal.find(item.name, item.path) if journal is not None else None
+        photo = None if line is None else _parse(line, item, judges)
+        if photo is not None:
+            photos[number] = photo
     todo = [number for number in range(len(items)) if number not in photos]
     step(len(photos), len(items))
-    for at, future in workers.completed(partial(_measured, task), [items[number] for number in todo]):
-        number, item = todo[at], items[todo[at]]
+    for position, future in workers.completed(partial(_measure_or_reject, task), [items[number] for number in todo]):
+        number, item = todo[position], items[todo[position]]
         try:
             measured = result_of(future)
         except WorkerDied:
-            measured = _rejected(item, Remark(code="unreadable", advice=_DIED))
+            measured = _rejected(item, Remark(code="unreadable", advice=_DIED_ADVICE))
         entry, squares, sha256 = measured.entry, measured.squares, file_sha256(item.path)
         predictions = judges.predictions(squares, entry.box) if judges and squares is not None else {}
         entry = entry.changed(sha256=sha256, predictions=predictions)
         if item.control is None:
             on_pictures(item.file, measured.pictures)
-        kept = _serialized(replace(measured, entry=entry), item.with_pictures)
+        line = _serialize(replace(measured, entry=entry), item.with_pictures)
         if journal is not None:
-            journal.add(item.name, sha256, kept)
-        photos[number] = _Kept.model_validate(kept).photo  # as a later run will find it: both must not differ
+            journal.add(item.name, sha256, line)
+        photos[number] = _JournalPhoto.model_validate(line).photo  # read back, so that a resumed run cannot differ
         step(len(photos), len(items))
     return [photos[number] for number in range(len(items))]
 
@@ -114,7 +116,7 @@ class _Light(StrictModel):
     clipped: Share
 
 
-class _Kept(StrictModel):
+class _JournalPhoto(StrictModel):
     """A photograph's result in the journal."""
 
     entry: PhotoEntry
@@ -130,30 +132,30 @@ class _Kept(StrictModel):
         return MeasuredPhoto(self.entry, self.counted, light=light)
 
 
-def _serialized(measured: MeasuredPhoto, pictures: bool) -> dict[str, Any]:
+def _serialize(measured: MeasuredPhoto, pictures: bool) -> dict[str, Any]:
     light = measured.light and {key: np.asarray(value).tolist() for key, value in vars(measured.light).items()}
     entry = measured.entry.model_dump(mode="json")
     return {"entry": entry, "counted": measured.counted, "light": light, "pictures": pictures}
 
 
-def _parsed(kept: Mapping[str, Any], item: PhotoItem, judges: Judges | None) -> MeasuredPhoto | None:
-    """What the journal has of the photograph; None where it is of another, or not what this run needs."""
+def _parse(line: Mapping[str, Any], item: PhotoItem, judges: Judges | None) -> MeasuredPhoto | None:
+    """Read a journal line; None if it is another photograph's, or lacks predictions or pictures that this run needs."""
     try:
-        result = _Kept.model_validate(kept)
+        result = _JournalPhoto.model_validate(line)
     except ValidationError:
         return None
     entry, names = result.entry, {model.name for model in judges.models} if judges else set()
-    whole = entry.file == item.file and set(entry.predictions) in (set(), names)
-    return result.photo if whole and (result.pictures or not item.with_pictures) else None
+    complete = entry.file == item.file and set(entry.predictions) in (set(), names)
+    return result.photo if complete and (result.pictures or not item.with_pictures) else None
 
 
-def _measured(task: Task, item: PhotoItem) -> MeasuredPhoto:
+def _measure_or_reject(task: Task, item: PhotoItem) -> MeasuredPhoto:
     try:
         return run_limited(_measure, task, item)
-    except PhotoRejected as cannot:
-        return _rejected(item, Remark.of(cannot))
+    except PhotoRejected as rejection:
+        return _rejected(item, Remark.of(rejection))
     except (ArithmeticError, ValueError, TypeError, LookupError, MemoryError, cv2.error) as error:
-        # no photograph is known that does this; one that does must not cost the others
+        # no known photograph causes this; one that does must not stop the batch
         advice = f"it could not be measured ({type(error).__name__}): leave it out, or take it again"
         return _rejected(item, Remark(code="unreadable", advice=advice))
 
@@ -164,15 +166,14 @@ def _measure(task: Task, item: PhotoItem) -> MeasuredPhoto:
     box = None if item.box_px is None else box_in_square(item.box_px, size_px)
     if item.control is not None:
         if is_featureless(square_of(photo.srgb)[0]):
-            return _rejected(item, Remark(code="empty", advice=_EMPTY))
+            return _rejected(item, Remark(code="empty", advice=_EMPTY_ADVICE))
         return MeasuredPhoto(PhotoEntry(file=item.file, status="judged", box=box), True, squares=squares)
     view = pinhole_photo(photo, task.camera)
-    wanted = task.scan_dpi, item.with_pictures
-    measured = measure(view, item.file, task.surface, task.promised, task.ranges, *wanted)
+    measured = measure(view, item.file, task.surface, task.promised, task.ranges, task.scan_dpi, item.with_pictures)
     entry, pictures = measured.entry, {}
-    # a crop or a screenshot: EXIF or its name says so, or cameras and the promise have other shapes
+    # a crop or a screenshot by EXIF or its name, or by a shape that neither cameras nor the promise have
     if measured.counted and entry.code is None and (photo.is_crop or not has_camera_shape(size_px, task.photo_px)):
-        entry = entry.changed(remark=Remark(code="cropped", advice=_PART))
+        entry = entry.changed(remark=Remark(code="cropped", advice=_CROPPED_ADVICE))
     if item.with_pictures:
         px_from_mm = entry.geometry and entry.geometry.homography_px_from_mm
         pictures = {"photo": _thumbnail(view.srgb, px_from_mm, task.surface), **measured.pictures}
@@ -180,12 +181,12 @@ def _measure(task: Task, item: PhotoItem) -> MeasuredPhoto:
 
 
 def _thumbnail(srgb: np.ndarray, px_from_mm: ArrayLike | None, surface: Surface) -> np.ndarray:
-    """The photograph reduced, with the outline of the design and of the piece's markers where they are known to lie."""
+    """Reduce the photograph and draw the outlines of the design and of the piece's markers, if their place is known."""
     shrink = min(1.0, _THUMBNAIL_PX / max(srgb.shape[:2]))
     size = downscaled_size(srgb.shape[1::-1], _THUMBNAIL_PX)
-    # four pixels for each of it: all of 12 megapixels took a tenth of the whole measurement's time
-    few = cv2.resize(srgb, (2 * size[0], 2 * size[1]), interpolation=cv2.INTER_NEAREST)
-    small = cv2.resize(few, size, interpolation=cv2.INTER_AREA)
+    # averages four pixels each: averaging all of 12 megapixels took a tenth of the whole measurement's time
+    sampled = cv2.resize(srgb, (2 * size[0], 2 * size[1]), interpolation=cv2.INTER_NEAREST)
+    small = cv2.resize(sampled, size, interpolation=cv2.INTER_AREA)
     if px_from_mm is None:
         return small
     small_from_mm = np.diag([shrink, shrink, 1.0]) @ np.asarray(px_from_mm)
@@ -201,14 +202,14 @@ def _rejected(item: PhotoItem, remark: Remark) -> MeasuredPhoto:
 
 
 def reread_square(task: Task, size_px: int, item: tuple[Path, MeasuredPhoto]) -> PhotoSquare | None:
-    """What it takes to put other pieces into a photograph, which is read again for it: only few are, and none waits.
+    """Read a measured photograph again, to put other pieces into it: keeping all of them would cost memory.
 
-    None where that cannot be done: it does not count, or its sheet is not flat or not to be believed.
+    None if it is not counted, its sheet is not flat or its homography is not reliable.
     """
     path, measured = item
     entry, geometry, light = measured.entry, measured.entry.geometry, measured.light
-    believed = measured.counted and entry.code in MEASURABLE_CODES
-    if not believed or geometry is None or geometry.homography_px_from_mm is None or light is None:
+    reliable = measured.counted and entry.code in MEASURABLE_CODES
+    if not reliable or geometry is None or geometry.homography_px_from_mm is None or light is None:
         return None
     px_from_mm, blur_px = np.array(geometry.homography_px_from_mm), geometry.blur_px
 
@@ -220,4 +221,4 @@ def reread_square(task: Task, size_px: int, item: tuple[Path, MeasuredPhoto]) ->
     try:
         return run_limited(shot)
     except (PhotoRejected, ArithmeticError, ValueError, LookupError, MemoryError, cv2.error):
-        return None  # read before, so this is a file that went away: the ledger does without
+        return None  # it was readable before, so the file is gone: the ledger does without it

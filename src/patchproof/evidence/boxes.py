@@ -1,8 +1,9 @@
-"""Boxes that somebody drew round the object, for detectors: of photographs whose sheet does not tell where the object
-ends, since they show none (bare ones; there whatever is found counts), or since the object is not the scene's mesh.
+"""Read the object's boxes that somebody drew in photographs, which detectors are judged by.
 
-In: COCO JSON, as annotation tools and `reprint` write it. Out: per photograph's name its box in pixels of the upright
-picture. Left out on purpose: objects in several parts, and any other thing that is drawn.
+They are needed where the sheet does not tell the object's extent: bare objects (without a box any detection counts),
+and objects that are not the scene's mesh. In: COCO JSON, as annotation tools and `reprint` write it. Out: by
+photograph's name its box in pixels of the upright picture. Left out on purpose: objects in several parts, and
+annotations of other things.
 """
 
 from __future__ import annotations
@@ -44,40 +45,40 @@ class _Coco(BaseModel):
 
 
 def load_boxes(path: str | Path, label: str) -> dict[str, BoxEdges]:
-    """(left, top, right, bottom) by a photograph's name in the file, and by its last part where no other has it, of the
-    category `label`, or of the only one; refused where a photograph has more than one.
+    """Load boxes (left, top, right, bottom) by the photograph's name in the file, and by its last part if that is
+    unique. Boxes are of the category `label`, or of the only one; several in one photograph are refused.
     """
     do = "export it again, one box a photograph"
     coco = validate_model(_Coco, read_json(path, "boxes as COCO JSON", do), str(path))
-    ours = [category.id for category in coco.categories if category.name == label]
-    if not ours and len(coco.categories) == 1:
-        ours = [coco.categories[0].id]
-    if not ours:
-        known = [category.name for category in coco.categories]
+    category_ids = [category.id for category in coco.categories if category.name == label]
+    if not category_ids and len(coco.categories) == 1:
+        category_ids = [coco.categories[0].id]
+    if not category_ids:
+        names = [category.name for category in coco.categories]
         raise Refused(
-            f'a category "{label}" of boxes in {path}', ", ".join(known) or "none", spelling_hint(label, known)
+            f'a category "{label}" of boxes in {path}', ", ".join(names) or "none", spelling_hint(label, names)
         )
-    drawn = [annotation for annotation in coco.annotations if annotation.category_id in ours]
-    names, often = {image.id: image.file_name for image in coco.images}, Counter(each.image_id for each in drawn)
-    for image_id, count in often.items():
+    annotations = [annotation for annotation in coco.annotations if annotation.category_id in category_ids]
+    names, counts = {image.id: image.file_name for image in coco.images}, Counter(a.image_id for a in annotations)
+    for image_id, count in counts.items():
         if image_id not in names or count > 1:
-            found = f"{count} in {names[image_id]}" if image_id in names else f"one of the unknown image {image_id}"
-            raise Refused(f"one box of each photograph in {path}", found, "draw one round the whole object")
-    corners = {each.image_id: (left, top, left + w, top + h) for each in drawn for left, top, w, h in [each.bbox]}
-    boxes = {names[image_id]: box for image_id, box in corners.items()}
-    last = {name: PurePosixPath(name).name for name in boxes}
-    alone = Counter(last.values())
-    return {last[name]: box for name, box in boxes.items() if alone[last[name]] == 1} | boxes
+            got = f"{count} in {names[image_id]}" if image_id in names else f"a box in the unknown image {image_id}"
+            raise Refused(f"one box in each photograph of {path}", got, "draw one round the whole object")
+    edges = {a.image_id: (left, top, left + w, top + h) for a in annotations for left, top, w, h in [a.bbox]}
+    boxes = {names[image_id]: box for image_id, box in edges.items()}
+    last_parts = {name: PurePosixPath(name).name for name in boxes}
+    uses = Counter(last_parts.values())
+    return {last_parts[name]: box for name, box in boxes.items() if uses[last_parts[name]] == 1} | boxes
 
 
 def box_of_photo(boxes: Mapping[str, BoxEdges], name: str) -> BoxEdges | None:
-    """The box of the photograph of that name, or else of its last part."""
+    """Find a photograph's box by its name, or else by the last part of it."""
     return boxes.get(name, boxes.get(PurePosixPath(name).name))
 
 
 def box_in_square(box_px: BoxEdges, size_px: tuple[int, int]) -> BoxEdges:
-    """The box as shares of the centered square of a photograph of `size_px`; all zeros, which nothing overlaps, where
-    none of it lies in there.
+    """Convert a box in pixels to shares of the centered square of a photograph of `size_px`; to all zeros, which no
+    detection overlaps, if it lies outside.
     """
     side = min(size_px)
     left, top = ((size - side) / 2 for size in size_px)
@@ -88,7 +89,7 @@ def box_in_square(box_px: BoxEdges, size_px: tuple[int, int]) -> BoxEdges:
 
 
 def box_corners_px(box: BoxEdges, size_px: tuple[int, int]) -> np.ndarray:
-    """The corners 4×2 in pixels of a box that `box_in_square` gave."""
+    """Convert a box of `box_in_square` back to its corners (4×2) in pixels."""
     (width, height), side = size_px, min(size_px)
     x0, y0, x1, y1 = box
     return side * rect_corners((x0, y0, x1 - x0, y1 - y0)) + ((width - side) / 2, (height - side) / 2)

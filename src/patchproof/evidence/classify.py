@@ -1,8 +1,8 @@
-"""What the networks make of the photographs: the whole photo's centered square, as in training, one by one.
+"""Classify photographs one by one: each network gets the photograph's centered square, as in training.
 
 In: a square of every network's input size, and `Judges`. Out: `Prediction`s. The target's labels are looked up in each
-network's own list; the promise fixes them for its primary network. No batches: a photograph's figures must not depend
-on which others lie beside it (they did, by 2e-5), and on a processor batches are no faster.
+network's own list; the promise fixes them for its primary network. There are no batches: with them, a photograph's
+figures depended by 2e-5 on the photographs beside it, and on a CPU they are no faster.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from patchproof.sheets.manifest import Manifest, Promise
 if TYPE_CHECKING:
     from patchproof.classifier import Classifier
 
-_STRIP_ROWS = 32  # of a photograph as float: of these few pixels of a square are made, and caches hold them
+_STRIP_ROWS = 32  # of a photograph as float at a time: caches hold them
 BoxEdges = tuple[float, float, float, float]  # left, top, right, bottom as shares of the photograph's centered square
 
 
@@ -35,35 +35,38 @@ class Judges:
     primary: Classifier
 
     def predictions(self, squares: Mapping[int, np.ndarray], box: BoxEdges | None) -> dict[str, Prediction]:
-        """What every network says of one photograph with the object in `box`, by name."""
+        """Classify one photograph with the object in `box` by every network: predictions by network's name."""
         models = {model.name: model for model in self.models}
         return {n: predict(m, self.indices[n], squares[m.input_px], box) for n, m in models.items()}
 
 
 def judges_of(models: Sequence[Classifier], manifest: Manifest) -> Judges | None:
-    """The networks as the sheet's judges; None where it promises nothing. Refused without the promise's own network, or
-    with another under its name.
+    """Combine the networks with the sheet's target; None if the sheet has no promise. Refused are networks without the
+    promise's own one, and another file under its name.
     """
     if manifest.promise is None:
         return None
-    promised, named = manifest.promise.models[0], {model.name: model for model in models}
-    if promised.name not in named:
-        raise Refused(f"the promise's own network {promised.name}", ", ".join(named) or "none", f"add {promised.name}")
-    primary = named[promised.name]
+    promised, by_name = manifest.promise.models[0], {model.name: model for model in models}
+    if promised.name not in by_name:
+        raise Refused(
+            f"the promise's own network {promised.name}", ", ".join(by_name) or "none", f"add {promised.name}"
+        )
+    primary = by_name[promised.name]
     if promised.sha256 not in (None, primary.sha256):
         expected = f"the network {promised.name} that the promise was made for (SHA-256 {promised.sha256[:12]}...)"
-        raise Refused(expected, "another file under that name", "use the same weights, or make the sheet again")
+        got = "a network without a file" if primary.sha256 is None else f"SHA-256 {primary.sha256[:12]}..."
+        raise Refused(expected, got, "use the same weights, or make the sheet again")
     indices = {model.name: target_indices(model, manifest.promise, manifest.settings) for model in models}
     return Judges(models, indices, primary)
 
 
 def boxes_of(box: BoxEdges | None, n: int = 1) -> np.ndarray | None:
-    """The object's box in n pictures that all show it there, as networks take it."""
+    """Repeat the object's box for n pictures (n×4), as networks take it; None stays None."""
     return None if box is None else np.tile(np.array(box), (n, 1))
 
 
 def square_of(srgb: np.ndarray) -> tuple[np.ndarray, tuple[int, int]]:
-    """The centered square of a picture H×W×3 (a view of it), and its left and top pixel."""
+    """Slice the centered square from a picture H×W×3, without a copy; also returns its left and top pixel."""
     height, width = srgb.shape[:2]
     side = min(height, width)
     top, left = (height - side) // 2, (width - side) // 2
@@ -71,28 +74,29 @@ def square_of(srgb: np.ndarray) -> tuple[np.ndarray, tuple[int, int]]:
 
 
 def squares_of(srgb: np.ndarray, sizes_px: Sequence[int]) -> dict[int, np.ndarray]:
-    """The centered square of an uint8 photograph at each size, float32 3×S×S in [0, 1]: `center_square`'s pixels, in an
-    eighth of its time, since a strip of rows counts in few rows of the result. The same bits on any number of threads.
+    """Resample the centered square of an uint8 photograph to each size, float32 3×S×S in [0, 1].
+
+    The pixels are those of `center_square`, in an eighth of its time, with the same bits for any number of threads.
     """
     square, _ = square_of(srgb)
     side = len(square)
     rows = {size: np.zeros((size, 3 * side), np.float32) for size in sizes_px}
     for number, top in enumerate(range(0, side, _STRIP_ROWS)):
         strip = square[top : top + _STRIP_ROWS].astype(np.float32).reshape(-1, 3 * side)
-        for size, own in rows.items():
-            reached, part = _strips(side, size)[number]
-            own[reached] += part @ strip
-    squares = {size: np.empty((3, size, size), np.float32) for size in sizes_px}  # other strides: other sums
-    for size, own in rows.items():
+        for size, sums in rows.items():
+            affected, part = _strip_weights(side, size)[number]
+            sums[affected] += part @ strip
+    squares = {size: np.empty((3, size, size), np.float32) for size in sizes_px}  # other strides change rounding
+    for size, sums in rows.items():
         for channel, plane in enumerate(squares[size]):
-            plane[:] = (_weights(side, size) @ np.ascontiguousarray(own[:, channel::3].T)).T / 255
+            plane[:] = (_weights(side, size) @ np.ascontiguousarray(sums[:, channel::3].T)).T / 255
     return squares
 
 
 @lru_cache(8)  # most photographs of a verification are of one size
 def _weights(side: int, size: int) -> csr_array:
-    """What each of `side` pixels in a row counts in each of `size`, float32 size×side: `center_square`'s resampling,
-    whose kernel is a triangle as wide as two of the new pixels, or two of the old ones where these are larger.
+    """Weights (float32, size×side) of resampling a row of `side` pixels to `size`, as `center_square` does it: the
+    kernel is a triangle two new pixels wide, or two old ones if these are larger.
     """
     scale = side / size
     off = np.abs((np.arange(size)[:, None] + 0.5) * scale - (np.arange(side) + 0.5))
@@ -101,30 +105,30 @@ def _weights(side: int, size: int) -> csr_array:
 
 
 @lru_cache(8)
-def _strips(side: int, size: int) -> list[tuple[slice, csr_array]]:
-    """Of each strip of rows the rows of the result that it counts in, and its weights there."""
+def _strip_weights(side: int, size: int) -> list[tuple[slice, csr_array]]:
+    """For each strip of rows, the rows of the result that it contributes to, and its weights in them."""
     weights, strips = _weights(side, size).toarray(), []
     for top in range(0, side, _STRIP_ROWS):
         part = weights[:, top : top + _STRIP_ROWS]
         first, last = np.flatnonzero(part.any(1))[[0, -1]]
-        reached = slice(int(first), int(last) + 1)
-        strips.append((reached, csr_array(part[reached])))
+        affected = slice(int(first), int(last) + 1)
+        strips.append((affected, csr_array(part[affected])))
     return strips
 
 
 def target_indices(model: Classifier, promise: Promise, settings: Mapping[str, Any]) -> tuple[int, ...]:
-    """The labels of `model` that count as recognized; for the promise's primary network those of the promise itself."""
+    """Indices of the labels that count as recognized; for the promise's primary network, the promise's own."""
     from patchproof.classifier import find_labels
 
     target = promise.target
     if model.name == promise.models[0].name and max(target.indices) < len(model.labels):
         return target.indices
-    wanted = settings.get("target", {})
-    return find_labels(model.labels, wanted.get("label", target.label), wanted.get("accept", ()))
+    target_settings = settings.get("target", {})
+    return find_labels(model.labels, target_settings.get("label", target.label), target_settings.get("accept", ()))
 
 
 def predict(model: Classifier, indices: tuple[int, ...], square: np.ndarray, box: BoxEdges | None) -> Prediction:
-    """What the network makes of one square of its size, float32 3×S×S, with the object in `box`."""
+    """Classify one square of the network's input size, float32 3×S×S, with the object in `box`."""
     import torch
 
     with torch.inference_mode():

@@ -1,13 +1,12 @@
-"""The effect without photographs of controls: what photographs of the patch would have shown with a control in its
-place.
+"""Estimate the patch's effect without photographs of controls: render controls into the photographs of the patch.
 
-In: `PhotoSquare`s of judged photographs, the manifest and its printer, the promise's primary network, what it recognized.
-Out: `EffectEstimate`. A control's pixels, as this print would have made them, are put into each photograph under its own
-light and blur (`reproject`) and classified. The same is done with the design itself: where that does not nearly always
-get the photograph's own answer, nothing is estimated.
+In: `PhotoSquare`s of judged photographs, the manifest and its printer, the promise's primary network, what it
+recognized. Out: `EffectEstimate`. A control's pixels, as this print would have made them, are rendered into each
+photograph under its light and blur (`reproject`) and classified. So is the design itself: if the network's answer then
+differs from its answer to the original photograph in more than 20 %, nothing is estimated.
 
 Left out on purpose: the bare object, whose surface behind the piece no photograph shows; shadows and glare on the
-piece, in which the design put back fails, too.
+piece, with which rendering the design back fails, too.
 """
 
 from __future__ import annotations
@@ -29,9 +28,9 @@ from patchproof.sheets.piece import control_design
 if TYPE_CHECKING:
     from patchproof.channel.printer import Printer
 
-KINDS = ("mean", "gray", "noise")  # controls of the promise that are printed
+ESTIMATED_CONTROLS = ("mean", "gray", "noise")  # controls of the promise that are printed
 LEAST_PHOTOS = 5
-LEAST_AGREEING = 0.8  # of the photographs
+LEAST_AGREEMENT = 0.8  # share of the photographs
 
 
 def estimate_effect(
@@ -42,33 +41,36 @@ def estimate_effect(
     judges: Judges,
     recognized: Mapping[str, bool],
 ) -> EffectEstimate | None:
-    """The patch beside each of `KINDS` in the same photographs, whose own answers are `recognized` by file; None of
-    fewer than `LEAST_PHOTOS`, or of a sheet without a design.
+    """Compare the patch with each of `ESTIMATED_CONTROLS` in the same photographs; `recognized` is the network's answer
+    to each original photograph by file. None for fewer than `LEAST_PHOTOS`, or for a sheet without a design.
     """
     if manifest.design is None or len(shots) < LEAST_PHOTOS:
         return None
     pixels = manifest.design.pixels()
-    looks = {kind: printed_colors(control_design(kind, pixels, ""), surface, printer) for kind in ("design", *KINDS)}
-    printed, _, lights = fit_print_and_lights(shots, looks["design"])
+    looks = {
+        kind: printed_colors(control_design(kind, pixels, ""), surface, printer)
+        for kind in ("design", *ESTIMATED_CONTROLS)
+    }
+    apply_print, _, lights = fit_print_and_lights(shots, looks["design"])
     pictures = {kind: piece_picture(surface, look.design) for kind, look in looks.items()}
-    if printed is not None:
-        pictures = {kind: printed(picture) for kind, picture in pictures.items()}
+    if apply_print is not None:
+        pictures = {kind: apply_print(picture) for kind, picture in pictures.items()}
     answers = {
         kind: [_recognized(shot, picture, surface, light, judges) for shot, light in zip(shots, lights, strict=True)]
         for kind, picture in pictures.items()
     }
-    own = [recognized[shot.file] for shot in shots]
-    agree = float(np.mean([a == b for a, b in zip(own, answers["design"], strict=True)]))
+    original = [recognized[shot.file] for shot in shots]
+    agree = float(np.mean([a == b for a, b in zip(original, answers["design"], strict=True)]))
     controls = []
-    for kind in KINDS if agree >= LEAST_AGREEING else ():
-        difference, ends = paired_difference(own, answers[kind])
+    for kind in ESTIMATED_CONTROLS if agree >= LEAST_AGREEMENT else ():
+        difference, ends = paired_difference(original, answers[kind])
         rate = float(np.mean(answers[kind]))
         controls.append(EstimatedControl(name=kind, rate=rate, difference=difference, difference_interval=ends))
-    return EffectEstimate(photos=len(own), agree=agree, controls=tuple(controls))
+    return EffectEstimate(photos=len(original), agree=agree, controls=tuple(controls))
 
 
 def _recognized(shot: PhotoSquare, look: np.ndarray, surface: Surface, light: ColorFit, judges: Judges) -> bool:
-    """Whether the primary network recognizes the photograph with that piece in it."""
+    """Classify the photograph with a piece of this look by the primary network."""
     codes = np.rint(255 * reprojected_square(shot, look, surface.rect_mm, light)).astype(np.uint8)
     model = judges.primary
     square = squares_of(codes, [model.input_px])[model.input_px]

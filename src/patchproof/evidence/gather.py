@@ -1,9 +1,9 @@
-"""A folder of photographs against a manifest: every photograph listed, one bad file never stops the batch.
+"""Judge a folder of photographs against a manifest. Every photograph is listed; a bad file never stops the batch.
 
-In: photographs, a manifest, networks, and where there are any photographs of controls. Out: a `Report`. Photographs
-are taken in the order of their names; sidecar files and anything that is no picture by its suffix are never opened.
-Each is measured on its own (over processes when `jobs` > 1), classified at once and let go, so that memory does not
-grow with their number; with a journal, what is finished survives a kill.
+In: photographs, a manifest, networks, and photographs of controls if there are any. Out: a `Report`. Photographs are
+taken in the order of their names; files that are no pictures by their suffix are never opened. Each is measured on its
+own (over processes if `jobs` > 1), classified and freed, so that memory does not grow with their number; with a
+journal, finished photographs survive a kill.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from patchproof.evidence.classify import Judges, judges_of
 from patchproof.evidence.copies import COPY_CODE, reject_copies
 from patchproof.evidence.effect_estimate import estimate_effect
 from patchproof.evidence.forecast import forecast_of
-from patchproof.evidence.grouping import Grouping, group
+from patchproof.evidence.grouping import Grouping, group_sessions
 from patchproof.evidence.journal import Journal, settings_key
 from patchproof.evidence.ledger import ledger_of
 from patchproof.evidence.measure import MeasuredPhoto
@@ -56,17 +56,17 @@ def gather_evidence(
     on_pictures: Callable[[str, Mapping[str, np.ndarray]], None] = lambda file, pictures: None,
     advance: Advance = no_advance,
 ) -> Report:
-    """Measure, classify and judge every picture in the folder (or the one picture) `photos`, folders in it being
+    """Measure, classify and judge every picture in the folder (or the one picture) `photos`, whose subfolders are
     sessions (see `grouping`).
 
-    Photographs are measured by the processes or the cluster of `compute`. The file `journal` keeps what is
-    finished; with `resume`, what it has of an earlier run is not done again. `forecast` gives a photograph's chance of
-    being recognized without looking at its piece. `on_pictures` gets the pictures of each
-    photograph that is (of the first `batch.MAX_PICTURED_PHOTOS`: `photo`, and `seen`, `fitted`, `promised`, `delta_e00` where
-    it was measured); `advance` is called with (done, all).
+    Photographs are measured by the processes or the cluster of `compute`. The file `journal` records
+    finished photographs; with `resume` those of an earlier run are not measured again. `forecast` computes the chance
+    that a photograph is recognized, without its pixels of the piece. `on_pictures` gets a name and pictures by kind
+    (`photo`, and `seen`, `fitted`, `promised`, `delta_e00` of a measured one) of the first `batch.MAX_PICTURED_PHOTOS`
+    photographs when each is measured; `advance` is called with (done, total).
     """
-    apart = None if options.controls is None else Path(options.controls)
-    grouping, control_paths = group(photos, apart), _list_controls(apart)
+    controls_folder = None if options.controls is None else Path(options.controls)
+    grouping, control_paths = group_sessions(photos, controls_folder), _list_controls(controls_folder)
     paths = grouping.paths
     judges = judges_of(options.models, manifest)
     task = task_of(manifest, options, judges)
@@ -78,68 +78,71 @@ def gather_evidence(
     ]
     items = [replace(item, box_px=box_of_photo(options.boxes, item.name)) for item in items]
     if options.boxes and not any(item.box_px for item in items):
-        do = "name the images of the boxes' file as the photographs are called"
-        raise Refused("boxes of these photographs", f"some of {next(iter(options.boxes))} and others", do)
-    kept = closing(Journal(journal, settings_key(manifest, options), resume)) if journal else nullcontext()
-    with kept as open_journal, open_workers(compute.jobs, compute.cluster) as workers:
+        do = "name the images in the boxes' file as the photographs"
+        got = f"boxes of {next(iter(options.boxes))} and {len(options.boxes) - 1} more"
+        raise Refused("boxes of these photographs", got, do)
+    journal_file = closing(Journal(journal, settings_key(manifest, options), resume)) if journal else nullcontext()
+    with journal_file as open_journal, open_workers(compute.jobs, compute.cluster) as workers:
         results = measure_all(task, items, judges, workers, open_journal, on_pictures, advance)
-        own = reject_copies(results[: len(paths)], grouping.session, task.surface.rect_mm)
-        ledger, estimated = None, None
+        patch_photos = reject_copies(results[: len(paths)], grouping.session, task.surface.rect_mm)
+        ledger, estimate = None, None
         if judges and task.promised:
-            others = [number for number, photo in enumerate(own) if photo.entry.code != COPY_CODE]
-            most, name = min(len(others), options.ledger_photos), judges.primary.name
-            chosen = [others[number * len(others) // most] for number in range(most)]  # evenly spread
-            again = partial(reread_square, task, judges.primary.input_px)
-            shots = workers.map(again, [(paths[number], own[number]) for number in chosen])
+            originals = [number for number, photo in enumerate(patch_photos) if photo.entry.code != COPY_CODE]
+            most, name = min(len(originals), options.ledger_photos), judges.primary.name
+            numbers = [originals[number * len(originals) // most] for number in range(most)]  # evenly spread
+            read_shot = partial(reread_square, task, judges.primary.input_px)
+            shots = workers.map(read_shot, [(paths[number], patch_photos[number]) for number in numbers])
             shots = [shot for shot in shots if shot is not None]
-            judged = {photo.entry.file: photo.entry.predictions[name] for photo in own if photo.entry.predictions}
-            confidence = {file: prediction.target_confidence for file, prediction in judged.items()}
+            entries = [photo.entry for photo in patch_photos if photo.entry.predictions]
+            confidence = {entry.file: entry.predictions[name].target_confidence for entry in entries}
             ledger = ledger_of(shots, manifest, task.surface, task.promised, judges, confidence)
-            recognized = {file: prediction.recognized for file, prediction in judged.items()}
-            estimated = estimate_effect(shots, manifest, task.surface, options.printer, judges, recognized)
+            recognized = _recognized(entries, name)
+            estimate = estimate_effect(shots, manifest, task.surface, options.printer, judges, recognized)
             if forecast is not None:
-                own = [with_forecast(again, forecast, path, photo) for path, photo in zip(paths, own, strict=True)]
-    shown: dict[str, dict[str, PhotoEntry]] = {}
-    left_out = list_skipped_files(Path(photos), apart and apart.resolve())
-    left_out += [f"{printable_name(apart.name)}: {sentence}" for sentence in list_skipped_files(apart)] if apart else []
+                pairs = zip(paths, patch_photos, strict=True)
+                patch_photos = [with_forecast(read_shot, forecast, path, photo) for path, photo in pairs]
+    entries_by_control: dict[str, dict[str, PhotoEntry]] = {}
+    left_out = list_skipped_files(Path(photos), controls_folder and controls_folder.resolve())
+    if controls_folder:
+        left_out += [f"{printable_name(controls_folder.name)}: {text}" for text in list_skipped_files(controls_folder)]
     for item, result in zip(items, results, strict=True):
         if item.control is not None:
-            name, entry, others = item.control, result.entry, shown.setdefault(item.control, {})
-            first = others.setdefault(entry.sha256 or item.name, entry)
+            name, entry = item.control, result.entry
+            first = entries_by_control.setdefault(name, {}).setdefault(entry.sha256 or item.name, entry)
             if first is not entry:
                 left_out.append(f"{name}/{entry.file} has the bytes of {name}/{first.file}, which counts once")
             elif entry.status == "rejected" and entry.remark is not None:
                 left_out.append(f"{name}/{entry.file} does not count: {entry.remark.advice}")
-    controls = {name: list(entries.values()) for name, entries in shown.items()}
-    report = report_of(manifest, judges, own, grouping, controls, ledger, options.ruler_mm)
-    return report.changed(summary=report.summary.changed(estimated=estimated, left_out=tuple(left_out)))
+    controls = {name: list(entries.values()) for name, entries in entries_by_control.items()}
+    report = report_of(manifest, judges, patch_photos, grouping, controls, ledger, options.ruler_mm)
+    return report.changed(summary=report.summary.changed(estimated=estimate, left_out=tuple(left_out)))
 
 
 def with_forecast(
-    again: Callable[[tuple[Path, MeasuredPhoto]], PhotoSquare | None],
+    read_shot: Callable[[tuple[Path, MeasuredPhoto]], PhotoSquare | None],
     forecast: Callable[[PhotoSquare], float | None],
     path: Path,
     photo: MeasuredPhoto,
 ) -> MeasuredPhoto:
-    """The photograph with its forecast, where it can have one."""
-    shot = again((path, photo)) if photo.entry.predictions else None
+    """Add the forecast to a photograph; None if it was not classified or cannot be read again."""
+    shot = read_shot((path, photo)) if photo.entry.predictions else None
     chance = None if shot is None else forecast(shot)
     return replace(photo, entry=photo.entry.changed(forecast=chance))
 
 
 def _list_controls(folder: Path | None) -> dict[str, list[Path]]:
-    """Photographs by control: the folder's own pictures, or one control for each folder in it."""
+    """List photographs by control: the folder's own pictures, or one control for each subfolder."""
     if folder is None:
         return {}
     if not is_folder(folder):
         raise Refused("a folder of control photographs", f"no folder at {folder}", "check the path")
-    if own := list_images(folder):
-        return {printable_name(folder.name): own}
+    if pictures := list_images(folder):
+        return {printable_name(folder.name): pictures}
     folders = sorted(p for p in folder.iterdir() if p.is_dir() and not p.name.startswith("."))
-    inside = {printable_name(p.name): files for p in folders if (files := list_images(p))}
-    if not inside:
+    controls = {printable_name(p.name): files for p in folders if (files := list_images(p))}
+    if not controls:
         raise Refused(f"control photographs in {folder}", "none", "copy them there, one control per folder")
-    return inside
+    return controls
 
 
 def report_of(
@@ -151,33 +154,32 @@ def report_of(
     ledger: Ledger | None = None,
     ruler_mm: tuple[float, float] | None = None,
 ) -> Report:
-    """All photographs together; where the promise's network judges, its verdict and the controls' effect."""
+    """Sum up all photographs; with a promise and `judges` also verdict, rates, forecast and the controls' effect."""
     entries, counted = [photo.entry for photo in photos], [photo.entry for photo in photos if photo.counted]
     verdict, matched = Verdict("cannot_tell", None, "The sheet promises nothing."), None
-    compared, rates, rate, interval, sessions, forecast, do, worth = [], {}, _rate({}), None, (), None, "", None
+    comparisons, rates, rate, interval, sessions, forecast, do, worth = [], {}, _rate({}), None, (), None, "", None
     if judges and manifest.promise:
         promise, primary = manifest.promise, judges.primary.name
         rates = {model.name: _rate(_recognized(counted, model.name)) for model in judges.models}
         rate, recognized = rates[primary], _recognized(counted, primary)
-        without = sum(e.code == "too_few_markers" and e.status == "rejected" for e in entries)
+        without_markers = sum(e.code == "too_few_markers" and e.status == "rejected" for e in entries)
         goal = promise.target.goal
         sessions = _sessions(grouping, photos, recognized)
         counts = sum(recognized.values()), [session.judged for session in sessions if session.judged]
-        verdict = judge(*counts, promise, without)
+        verdict = judge(*counts, promise, without_markers)
         if recognized:
             posterior = promise.posterior
             interval = posterior.least_rate(*counts, TAIL), posterior.most_rate(*counts, TAIL)
         measured = (entry for entry in counted if entry.status == "measured")
         matched = matched_rate(measured, promise.conditions, promised_side_px(manifest))
-        expected = [entry for entry in counted if entry.forecast is not None and entry.file in recognized]
-        if expected:
-            chances = [entry.forecast for entry in expected if entry.forecast is not None]
-            forecast = forecast_of(chances, [recognized[entry.file] for entry in expected], promise.rate)
-        compared = [compare(recognized, name, _recognized(shown, primary), goal) for name, shown in controls.items()]
+        pairs = [(e.forecast, recognized[e.file]) for e in counted if e.forecast is not None and e.file in recognized]
+        if pairs:
+            forecast = forecast_of([p for p, _ in pairs], [answer for _, answer in pairs], promise.rate)
+        comparisons = [compare(recognized, name, _recognized(e, primary), goal) for name, e in controls.items()]
         if verdict.verdict == "cannot_tell":
-            do = next_step(promise, counts[1], without)
+            do = next_step(promise, counts[1], without_markers)
         if rate.rate is not None and interval is not None:
-            worth = benefit_of(rate.rate, interval, compared, promise)
+            worth = benefit_of(rate.rate, interval, comparisons, promise)
     summary = Summary(
         photos=len(entries),
         judged=len(counted),
@@ -188,7 +190,7 @@ def report_of(
         sessions_known_from=grouping.known_from,
         prediction_interval=verdict.prediction_interval,
         verdict=verdict.verdict,
-        effect=effect_of(compared),
+        effect=effect_of(comparisons),
         matched_rate=matched,
         ledger=ledger and ledger.shares,
         culprit=ledger and ledger.culprit,
@@ -205,23 +207,23 @@ def report_of(
         scale = Scale(scale_x=x, scale_y=y)
         entries = [entry if entry.scale else entry.changed(scale=scale) for entry in entries]
     sheet_id = manifest.sheet_id
-    return Report(sheet_id=sheet_id, photos=tuple(entries), summary=summary, controls=tuple(compared), ledger=ledger)
+    return Report(sheet_id=sheet_id, photos=tuple(entries), summary=summary, controls=tuple(comparisons), ledger=ledger)
 
 
 def _sessions(
     grouping: Grouping, photos: Sequence[MeasuredPhoto], recognized: Mapping[str, bool]
 ) -> tuple[SessionCount, ...]:
-    """What was recognized in each session."""
+    """Count the judged and recognized photographs of each session."""
     hits: list[list[bool]] = [[] for _ in grouping.names]
     for number, photo in zip(grouping.session, photos, strict=True):
         if photo.counted and photo.entry.file in recognized:
             hits[number].append(recognized[photo.entry.file])
     named = zip(grouping.names, hits, strict=True)
-    return tuple(SessionCount(name=name, recognized=sum(own), judged=len(own)) for name, own in named)
+    return tuple(SessionCount(name=name, recognized=sum(answers), judged=len(answers)) for name, answers in named)
 
 
 def _recognized(entries: Iterable[PhotoEntry], network: str) -> dict[str, bool]:
-    """Whether the network recognized the target, by file."""
+    """The network's answers (recognized or not) by file."""
     return {entry.file: entry.predictions[network].recognized for entry in entries if entry.predictions}
 
 

@@ -1,9 +1,9 @@
-"""What is finished of a verification, one flushed line per photograph, so that a kill costs the photographs in work.
+"""The journal of a verification: one flushed line per finished photograph, so that a kill loses only those in work.
 
 In: a file of JSON lines and a key that stands for everything a result depends on besides the photograph itself. Out:
-what an earlier run made of a photograph of the same name and the same bytes under the same key. Lines of other keys
-and lines that are broken or were cut short do not count, so a photograph, network, sheet or option that changed since
-is looked at anew. What a result has to be is its reader's business.
+the result of an earlier run for a photograph of the same name and bytes under the same key. Lines of other keys and
+broken lines are dropped, so that a photograph is measured again if it, a network, the sheet or an option changed.
+The reader validates the results themselves.
 """
 
 from __future__ import annotations
@@ -37,35 +37,35 @@ class _Line(StrictModel):
 
 
 class Journal:
-    """An open file of finished photographs; opening it drops what does not count, or all of it unless `resume`."""
+    """An open file of finished photographs; opening it drops invalid lines, or without `resume` all lines."""
 
     def __init__(self, path: Path, key: str, resume: bool):
         make_folder(path.parent)
-        lines = [line for line in _lines(path) if line.key == key] if resume else []
-        self._key, self._kept = key, {line.file: line for line in lines}
-        write_atomically(path, "".join(json.dumps(line.model_dump()) + "\n" for line in self._kept.values()))
+        lines = [line for line in _read_lines(path) if line.key == key] if resume else []
+        self._key, self._lines_by_name = key, {line.file: line for line in lines}
+        write_atomically(path, "".join(json.dumps(line.model_dump()) + "\n" for line in self._lines_by_name.values()))
         self._file: TextIO = open(path, "a", encoding="utf-8")
 
     def find(self, name: str, photo: Path) -> Any:
-        """The result of the photograph under that name; None where there is none, or its bytes have changed."""
-        line = self._kept.get(name)
+        """Result of the photograph of that name; None if there is none, or if the file's bytes have changed."""
+        line = self._lines_by_name.get(name)
         return line.result if line is not None and line.sha256 == file_sha256(photo) else None
 
     def add(self, name: str, sha256: str | None, result: Any) -> None:
-        """Keep JSON values for the photograph of those bytes."""
+        """Write the result (JSON values) of a photograph of that name and SHA-256, and flush it."""
         line = {"file": name, "sha256": sha256, "key": self._key, "result": result}
         self._file.write(json.dumps(line, allow_nan=False) + "\n")
         self._file.flush()
 
     def close(self) -> None:
-        """Nothing is added after this."""
+        """Close the file; nothing can be added after this."""
         self._file.close()
 
 
 def settings_key(manifest: Manifest, options: Options) -> str:
-    """SHA-256 of what a photograph's result depends on besides its bytes.
+    """SHA-256 of everything that a photograph's result depends on besides its bytes.
 
-    A network without a SHA-256 of its own (the user's code) is known by its name alone.
+    A network without a SHA-256 (the user's code) is identified by its name alone.
     """
     printer, digest = options.printer, hashlib.sha256(repr(options.printer.paper).encode())
     for table in (printer.lut, printer.gamut):
@@ -83,7 +83,7 @@ def settings_key(manifest: Manifest, options: Options) -> str:
 
 
 def file_sha256(path: Path) -> str | None:
-    """SHA-256 of a file's bytes; None where it cannot be read, or is too large to be read as a photograph."""
+    """SHA-256 of a file's bytes; None if it cannot be read, or is larger than photographs may be."""
     try:
         if path.stat().st_size <= MOST_BYTES:
             with open(path, "rb") as file:
@@ -93,9 +93,9 @@ def file_sha256(path: Path) -> str | None:
     return None
 
 
-def _lines(path: Path) -> Iterator[_Line]:
-    """The lines that are whole, and of this layout; none where there is no file."""
+def _read_lines(path: Path) -> Iterator[_Line]:
+    """Read the complete lines that have this layout; none if there is no file."""
     with suppress(FileNotFoundError), open(path, encoding="utf-8", errors="replace") as file:
-        while text := file.readline(MAX_JSON_BYTES):  # a part of a longer one is none
-            with suppress(ValueError, RecursionError):  # cut short by a kill; what is not JSON, or another's
+        while text := file.readline(MAX_JSON_BYTES):  # a piece of a longer line is no JSON
+            with suppress(ValueError, RecursionError):  # a line that a kill cut short, or of another layout
                 yield validate_model(_Line, json.loads(text), str(path))

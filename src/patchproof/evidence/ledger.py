@@ -1,22 +1,23 @@
-"""The gap ledger: how much confidence each step from the ideal picture to the photograph costs.
+"""The gap ledger: how much confidence is lost in each step from the ideal picture to the photograph.
 
     ideal → gamut → print → light and camera → blur and noise → photo
 
-In: `PhotoSquare`s of judged photographs, the manifest, the promise's primary network. Out: a `Ledger`: shares in confidence
-(for a goal of deceiving, confidence gained), mean over photographs, with bootstrap intervals over photographs. Each
-photograph is classified with its piece re-projected under all combinations of four effects on or off (`reproject`),
-and each effect gets its mean cost over all orders of switching them on (Shapley, A Value for n-Person Games, 1953):
+In: `PhotoSquare`s of judged photographs, the manifest, the promise's primary network. Out: a `Ledger`: shares in
+confidence (for a goal of deceiving, confidence gained), mean over photographs, with bootstrap intervals over
+photographs. Each photograph is classified with its piece re-projected under all combinations of four effects on or off
+(`reproject`), and each effect gets its mean cost over all orders of switching them on (Shapley, A Value for n-Person
+Games, 1953):
 
     share_k = Σ_{S ∌ k} |S|! (n - |S| - 1)! / n! · (v(S) - v(S ∪ {k}))
 
-`photo` is what remains between all effects on and the photograph itself: shadows, glare, curl, whatever no effect
-explains. Shares sum to the whole, v(nothing on) - v(photograph), and may be negative. "Off" means off by the promise:
-each photograph borrows light and blur from one of the promise's own conditions, so that what was promised is no loss.
+`photo` is the difference between all effects on and the photograph itself: shadows, glare, curl, whatever no effect
+explains. Shares sum to the whole, v(nothing on) - v(photograph), and may be negative. With an effect off, light and
+blur are those of one of the promise's conditions, so that what the promise already contains is no loss.
 
-Gains and a veil that make paper white and marker black what was promised are light and camera, the rest of a color
-difference is print. Ink lighter than promised and a veil of stray light look alike but for one thing: a veil lies over
-the whole photograph, so what exceeds its darkest place is ink; up to there it counts as light. Where the design's
-colors are too few or too much alike to say what the print made of them, print and light are one step.
+Light and camera are the gains and the veil that take paper white and marker black to their promised values; the rest of
+a color difference is print. Ink lighter than promised and a veil of stray light look alike, but a veil lies over the
+whole photograph: lightening up to that of the darkest place counts as light, more as ink. If the design's colors are
+too few or too alike to fit the print, print and light are one step.
 """
 
 from __future__ import annotations
@@ -37,12 +38,12 @@ from patchproof.evidence.results import Ledger, LedgerShare
 from patchproof.evidence.surface import DESIGN_PX, PromisedColors, Surface, piece_picture, with_markers
 from patchproof.sheets.manifest import Manifest
 
-ConfidenceBySwitches = Mapping[Switches, float]  # confidence by what is switched on
+ConfidenceBySwitches = Mapping[Switches, float]  # confidence by the effects that are on
 
 GAMUT, PRINT, LIGHT, BLUR, PHOTO = "gamut", "print", "light_and_camera", "blur_and_noise", "photo"
 PRINT_AND_LIGHT = "print_light_and_camera"
 LEAST_PHOTOS = MIN_CLUSTERS
-LEAST_SHARE = 0.05  # a culprit costs at least as much
+LEAST_SHARE = 0.05  # of confidence that a culprit costs
 _RESAMPLES = 2000
 
 
@@ -54,45 +55,46 @@ def ledger_of(
     judges: Judges,
     confidence: Mapping[str, float],
 ) -> Ledger | None:
-    """The ledger of photographs whose own target confidence is `confidence` by file; None where nothing can be said."""
+    """Make the ledger of photographs, whose target confidences are `confidence` by file; None without shots, promise,
+    design or conditions.
+    """
     if not shots or manifest.promise is None or manifest.design is None:
         return None
     conditions = manifest.promise.conditions
     claims = [(c.contrast, c.blur_px) for c in conditions if c.contrast is not None and c.blur_px is not None]
     if not claims:
         return None
-    printed, undo, print_lights = fit_print_and_lights(shots, promised)
-    looks = _looks(manifest.design.pixels(), surface, promised, printed)
-    camera = manifest.settings.get("camera", {})
+    apply_print, undo, print_lights = fit_print_and_lights(shots, promised)
+    looks = _looks(manifest.design.pixels(), surface, promised, apply_print)
     values = []
-    references = _references(claims, shots, camera, promised)
+    references = _references(claims, shots, manifest.settings.get("camera", {}), promised)
     for shot, fit, print_light, reference in zip(shots, undo, print_lights, references, strict=True):
         squares = reprojected_squares(shot, looks, surface.rect_mm, fit, print_light, reference)
         values.append(_confidences(squares, judges, shot.box))
-    steps = (GAMUT, PRINT, LIGHT, BLUR) if printed is not None else (GAMUT, PRINT_AND_LIGHT, BLUR)
-    own = np.array([confidence[shot.file] for shot in shots])
-    return _ledger(steps, values, own, manifest.promise.target.goal.sign)
+    steps = (GAMUT, PRINT, LIGHT, BLUR) if apply_print is not None else (GAMUT, PRINT_AND_LIGHT, BLUR)
+    photo = np.array([confidence[shot.file] for shot in shots])
+    return _ledger(steps, values, photo, manifest.promise.target.goal.sign)
 
 
 def shapley(values: ConfidenceBySwitches) -> np.ndarray:
-    """Mean cost of switching each of k players on, over all orders; `values` has all 2^k combinations."""
+    """Shapley values: the mean cost of switching each of k effects on, over all orders, from all 2^k `values`."""
     k = len(next(iter(values)))
     cost = np.zeros(k)
     for on in product((False, True), repeat=k):
         weight = factorial(sum(on)) * factorial(max(k - sum(on) - 1, 0)) / factorial(k)
-        for player in range(k):
-            if not on[player]:
-                cost[player] += weight * (values[on] - values[(*on[:player], True, *on[player + 1 :])])
+        for effect in range(k):
+            if not on[effect]:
+                cost[effect] += weight * (values[on] - values[(*on[:effect], True, *on[effect + 1 :])])
     return cost
 
 
 def _ledger(steps: Sequence[str], values: Sequence[ConfidenceBySwitches], photo: np.ndarray, sign: float) -> Ledger:
-    """The ledger of `values` by photograph, whose own confidences are `photo` (n)."""
-    parts = np.array([[*shapley(v), v[(True,) * len(steps)] - own] for v, own in zip(values, photo, strict=True)])
-    parts, names = sign * parts, (*steps, PHOTO)
-    means, resampled, intervals = parts.mean(0), None, [None] * len(names)
-    if len(parts) >= LEAST_PHOTOS:
-        resampled = resampled_means(parts, _RESAMPLES)
+    """Sum up n photographs, each with its `values` and the confidence in it as it is (`photo`)."""
+    shares = np.array([[*shapley(v), v[(True,) * len(steps)] - p] for v, p in zip(values, photo, strict=True)])
+    shares, names = sign * shares, (*steps, PHOTO)
+    means, resampled, intervals = shares.mean(0), None, [None] * len(names)
+    if len(shares) >= LEAST_PHOTOS:
+        resampled = resampled_means(shares, _RESAMPLES)
         intervals = np.quantile(resampled, (0.025, 0.975), axis=0).T.tolist()
     return Ledger(
         shares={n: LedgerShare(share=m, interval=i) for n, m, i in zip(names, means, intervals, strict=True)},
@@ -104,28 +106,28 @@ def _ledger(steps: Sequence[str], values: Sequence[ConfidenceBySwitches], photo:
 
 
 def _culprit(names: Sequence[str], means: np.ndarray, resampled: np.ndarray | None) -> str | None:
-    """The step with the largest share, where resampling hardly ever lets another one be larger.
+    """Name the step with the largest share, if no other is larger in 97.5 % of the resamples; else None.
 
-    Gamut is no candidate: the promise was made with it. What no step explains is none, but stands in the way.
+    Gamut is no candidate: the promise was made with it. If `photo` is the largest, there is no culprit.
     """
     if resampled is None:
         return None
     rivals = [i for i, name in enumerate(names) if name != GAMUT]
     top = max(rivals, key=lambda i: means[i])
-    others = [i for i in rivals if i != top]
-    lead = np.minimum(resampled[:, top] - resampled[:, others].max(1), resampled[:, top])
+    rest = [i for i in rivals if i != top]
+    lead = np.minimum(resampled[:, top] - resampled[:, rest].max(1), resampled[:, top])
     clear = np.quantile(lead, 0.025) > 0 and means[top] >= LEAST_SHARE
     return names[top] if clear and names[top] != PHOTO else None
 
 
-def _looks(sent_srgb: np.ndarray, surface: Surface, promised: PromisedColors, printed) -> dict[Switches, np.ndarray]:
-    """The piece's light by (gamut, print), or by (gamut,) alone where the print is not known."""
-    design = downscale(linear_from_srgb(sent_srgb / 255.0).astype(np.float32), DESIGN_PX)
-    sent = piece_picture(surface, with_markers(design, surface, np.zeros(3)))
-    looks = {False: sent, True: piece_picture(surface, promised.design)}
-    if printed is None:
+def _looks(pixels: np.ndarray, surface: Surface, promised: PromisedColors, apply_print) -> dict[Switches, np.ndarray]:
+    """The piece's light by (gamut, print), or by (gamut,) alone if the print's map is unknown."""
+    design = downscale(linear_from_srgb(pixels / 255.0).astype(np.float32), DESIGN_PX)
+    ideal = piece_picture(surface, with_markers(design, surface, np.zeros(3)))
+    looks = {False: ideal, True: piece_picture(surface, promised.design)}
+    if apply_print is None:
         return {(gamut,): look for gamut, look in looks.items()}
-    return {(gamut, on): printed(look) if on else look for on in (False, True) for gamut, look in looks.items()}
+    return {(gamut, on): apply_print(look) if on else look for on in (False, True) for gamut, look in looks.items()}
 
 
 def _references(
@@ -134,10 +136,10 @@ def _references(
     camera: Mapping[str, Any],
     promised: PromisedColors,
 ) -> list[Reference]:
-    """One of the promise's conditions (contrast, blur_px) for each photograph, spread evenly over their contrasts.
+    """Pair each photograph with one of the promise's conditions (contrast, blur_px), spread evenly over contrast.
 
-    The brightest photograph gets the brightest, and so on: paired by chance, a few photographs' light share is mostly
-    the luck of the draw.
+    The brightest photograph gets the brightest condition, and so on: with random pairs, the light share of a few
+    photographs would mostly be chance.
     """
     claims = sorted(claims, key=lambda claim: claim[0])
     spread = ((np.arange(len(shots)) + 0.5) / len(shots) * len(claims)).astype(int)
@@ -153,7 +155,7 @@ def _references(
 
 
 def _confidences(squares: Mapping[Switches, np.ndarray], judges: Judges, box: BoxEdges | None) -> ConfidenceBySwitches:
-    """Target confidence by combination, of squares with the object in `box`."""
+    """Target confidence by combination of effects, of squares with the object in `box`."""
     import torch
 
     from patchproof.classifier import center_square

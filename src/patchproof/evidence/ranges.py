@@ -1,8 +1,8 @@
-"""What the promise covered, and which photographs lie outside of it or near to which of its conditions.
+"""The ranges of view that the promise covers, and the promised rate near the views of photographs.
 
 In: the promise's conditions, as far as a photograph can show them. Out: `PromisedRanges` (smallest and largest with a
 margin of 10 %), and `matched_rate`, the promised rate at the conditions nearest to the photographs. A network sees
-every photograph at one size, so a photograph with more pixels than the promised ones is compared as if it had theirs.
+every photograph at one size, so pixels of a photograph are scaled to the size of the promised photographs.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ class PromisedRanges:
     side_px: float | None = None
 
     def violated(self, entry: PhotoEntry, trust_angles: bool) -> PhotoRejected | None:
-        """The first figure of the photo that the promise does not cover."""
+        """Reject the photo by its first figure outside of the ranges; None if all lie inside."""
         figures = figures_of(entry, self.side_px)
         for name, (low, high) in self.limits.items():
             value = figures.get(name)
             if value is None or (name != "px_per_mm" and not trust_angles):
                 continue
-            if name == "azimuth_deg" and entry.pose is not None:  # left out only where it is sure to lie outside
+            if name == "azimuth_deg" and entry.pose is not None:  # rejected only if it lies outside at 95 %
                 low, high = low - entry.pose.azimuth_uncertainty_deg, high + entry.pose.azimuth_uncertainty_deg
             if low <= value <= high:
                 continue
@@ -57,13 +57,13 @@ class PromisedRanges:
 
 
 def promised_side_px(manifest: Manifest) -> float | None:
-    """Pixels of the shorter side of the photographs that were promised; None where the settings do not say."""
+    """Pixels of the shorter side of the promised photographs; None if the settings do not say."""
     sides = manifest.settings.get("camera", {}).get("photo_px")
     return float(min(sides)) if sides else None
 
 
 def promised_ranges(conditions: Sequence[ConditionClaim], side_px: float | None = None) -> PromisedRanges:
-    """The span of the promised conditions with its margin."""
+    """Compute the spans of the promised conditions, each with its margin."""
     limits = {}
     for name in _ADVICE:
         values = [v for c in conditions if (v := getattr(c, name)) is not None]
@@ -81,14 +81,14 @@ def promised_ranges(conditions: Sequence[ConditionClaim], side_px: float | None 
 def matched_rate(
     entries: Iterable[PhotoEntry], conditions: Sequence[ConditionClaim], side_px: float | None = None
 ) -> float | None:
-    """Mean over photos of the rate at their nearest promised conditions; None where nothing can be compared."""
+    """Average over photos the rate at their nearest promised conditions; None if none can be compared."""
     rates = [_rate_near(figures_of(entry, side_px), conditions) for entry in entries]
     rates = [rate for rate in rates if rate is not None]
     return float(np.mean(rates)) if rates else None
 
 
 def figures_of(entry: PhotoEntry, side_px: float | None) -> dict[str, float]:
-    """The known ones of the figures that conditions have, pixels as a photograph of that shorter side shows them."""
+    """Figures of a photo that conditions have, too, if known; pixels are scaled to a shorter side of `side_px`."""
     geometry, azimuth_deg = entry.geometry, entry.pose and entry.pose.azimuth_deg
     if geometry is None:
         return {}
@@ -104,11 +104,11 @@ def _rate_near(figures: Mapping[str, float], conditions: Sequence[ConditionClaim
     point, recognized = np.array(list(figures.values())), np.array([c.recognized for c in conditions])
     table = np.array([[getattr(c, name) for name in figures] for c in conditions], float)
     known = np.isfinite(table)
-    if 2 * known.all(1).sum() < len(table):  # the promise does not have all of the photo's figures: use those it has
-        often = 2 * known.sum(0) > len(table)
-        table, point, known = table[:, often], point[often], known[:, often]
-    full = known.all(1)
-    if not point.size or not full.any():
+    if 2 * known.all(1).sum() < len(table):  # most conditions lack some figure: use those that most conditions have
+        frequent = 2 * known.sum(0) > len(table)
+        table, point, known = table[:, frequent], point[frequent], known[:, frequent]
+    complete = known.all(1)
+    if not point.size or not complete.any():
         return None
-    distance = np.linalg.norm((table[full] - point) / np.maximum(table[full].std(0), 1e-9), axis=1)
-    return float(np.mean(recognized[full][np.argsort(distance, kind="stable")[:_NEAREST]]))
+    distance = np.linalg.norm((table[complete] - point) / np.maximum(table[complete].std(0), 1e-9), axis=1)
+    return float(np.mean(recognized[complete][np.argsort(distance, kind="stable")[:_NEAREST]]))

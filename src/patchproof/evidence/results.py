@@ -1,4 +1,4 @@
-"""report.json, as types: what was measured in each photograph and what all of them say together.
+"""Types of report.json: the figures of each photograph, and the summary of all of them.
 
 Lengths in mm and px as named, angles in degrees, rates in [0, 1]; null is "not measured". `measured` implies judged,
 except in page checks.
@@ -20,15 +20,16 @@ Status = Literal["judged", "measured", "rejected"]
 VerdictWord = Literal["kept", "broken", "cannot_tell"]
 BenefitWord = Literal["helps", "no_better", "worse", "not_shown"]
 Effect = Literal["shown", "not_shown", "not_tested"]
-Required = Literal["kept", "helps"]  # of a verification that scripts go on from
-Row = tuple[Finite, Finite, Finite]
-# where the focal length is from: a camera file; EXIF, which the sheet's own perspective confirms, is too weak to check
-# (so that there is no distance), or contradicts; EXIF of a picture of another size or shape, which is not used; nowhere
+Required = Literal["kept", "helps"]  # what a script may require of a verification to continue
+_Row = tuple[Finite, Finite, Finite]
+# Source of the focal length. calibrated: a camera file. confirmed, unchecked, contradicted: EXIF, which the sheet's
+# perspective confirms, is too weak to check (then there is no distance), or contradicts. cropped: EXIF is of a picture
+# of another size or shape, and is not used. unknown: there is none.
 FocalSource = Literal["calibrated", "confirmed", "unchecked", "contradicted", "cropped", "unknown"]
 
 
 class Prediction(StrictModel):
-    """What one network makes of one photograph; `target_confidence` sums over the accepted labels."""
+    """One network's answer to one photograph; `target_confidence` sums over the accepted labels."""
 
     label: str
     confidence: Finite
@@ -37,7 +38,7 @@ class Prediction(StrictModel):
 
 
 class Geometry(StrictModel):
-    """Where the sheet lies in a photograph, how sure that is, and how sharp and bright the print's markers came out."""
+    """The sheet's place in a photograph and its uncertainty, and sharpness and contrast of the print's markers."""
 
     residual_mm: Finite
     px_per_mm: Finite
@@ -46,7 +47,7 @@ class Geometry(StrictModel):
     blur_px: Finite
     corner_uncertainty_mm: Finite
     curl_radius_mm: Finite | None = None  # of paper that was unrolled; negative where it is hollow
-    homography_px_from_mm: tuple[Row, Row, Row] | None = None  # null for paper that was unrolled
+    homography_px_from_mm: tuple[_Row, _Row, _Row] | None = None  # null for paper that was unrolled
     tilt_uncertainty_deg: Finite | None = None  # 95 %, as all uncertainties are
     bend_mm: Finite = 0.0  # the part of the residual that is no noise: of paper that no plane and no cylinder explains
     design_shift_mm: Finite | None = None  # of the design's own cells, 90 % point; null where it shows no texture
@@ -54,7 +55,7 @@ class Geometry(StrictModel):
 
 
 class CameraPose(StrictModel):
-    """What a camera of known focal length says besides; null where it cannot tell."""
+    """The camera's position, if its focal length is known; figures that are too uncertain are null."""
 
     azimuth_uncertainty_deg: Finite  # 95 %, from the corners and the focal length
     azimuth_deg: Finite | None = None  # null where the uncertainty is too large to tell left from right
@@ -71,7 +72,7 @@ class Scale(StrictModel):
 
 
 class Color(StrictModel):
-    """The design's color against its promise after a fit; no difference where too much of it is clipped."""
+    """Color difference of the design from its promise after a color fit; null if too much of it is clipped."""
 
     color_fit: str
     clipped_share: Finite  # of the design
@@ -81,7 +82,7 @@ class Color(StrictModel):
 
 
 class Remark(StrictModel):
-    """What to do about a photograph; where something is wrong with it, its code, the figure that decided, its limit."""
+    """Advice about a photograph; if something is wrong with it, the code, the figure that decided and its limit."""
 
     advice: str
     code: str | None = None
@@ -89,9 +90,9 @@ class Remark(StrictModel):
     threshold: Finite | None = None
 
     @classmethod
-    def of(cls, cannot: PhotoRejected) -> Remark:
-        """The remark that says why."""
-        return cls(code=cannot.code, figure=cannot.figure, threshold=cannot.threshold, advice=cannot.advice)
+    def of(cls, rejection: PhotoRejected) -> Remark:
+        """Make the remark that explains a rejection."""
+        return cls(code=rejection.code, figure=rejection.figure, threshold=rejection.threshold, advice=rejection.advice)
 
 
 _PARTS = {"geometry": Geometry, "pose": CameraPose, "scale": Scale, "color": Color, "remark": Remark}
@@ -105,9 +106,9 @@ PHOTO_KEYS = """
 
 
 class PhotoEntry(StrictModel):
-    """One photograph in the parts that were measured; a rejected one is not counted.
+    """One photograph's figures, in parts (None: not measured); a rejected photograph is not counted.
 
-    As JSON the figures of all parts lie side by side, null where a part is not there.
+    In JSON the figures of all parts lie side by side; those of missing parts are null.
     """
 
     file: str
@@ -120,20 +121,20 @@ class PhotoEntry(StrictModel):
     scale: Scale | None = None
     color: Color | None = None
     remark: Remark | None = None
-    # the object's, where a detector is asked and it is known: left, top, right, bottom as shares of the middle square
+    # the object's, for detectors: left, top, right, bottom as shares of the centered square
     box: tuple[Finite, Finite, Finite, Finite] | None = None
     forecast: Finite | None = None  # the chance of being recognized, by rendering the run's scene at its measured view
     predictions: dict[str, Prediction] = Field(default_factory=dict)
 
     @property
     def code(self) -> str | None:
-        """What is wrong with it."""
+        """The code of what is wrong with the photograph; None if nothing is."""
         return None if self.remark is None else self.remark.code
 
     @model_validator(mode="before")
     @classmethod
-    def _parts_of(cls, data: Any) -> Any:
-        """A part is there where its first figure is, which is never null."""
+    def _group_figures(cls, data: Any) -> Any:
+        """Group the figures of JSON into parts; a part exists if its first figure, which is never null, does."""
         if not isinstance(data, dict):
             return data
         data = dict(data)
@@ -144,8 +145,8 @@ class PhotoEntry(StrictModel):
         return data
 
     @model_serializer(mode="wrap")
-    def _side_by_side(self, plain: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        parts = plain(self)
+    def _flatten(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        parts = serialize(self)
         figures = parts | {key: value for name in _PARTS for key, value in (parts[name] or {}).items()}
         return {key: figures.get(key) for key in PHOTO_KEYS}
 
@@ -167,7 +168,7 @@ class LedgerShare(StrictModel):
 class Ledger(StrictModel):
     """Shares by step in their order, mean confidence of the ideal pictures and of the photographs, and their number.
 
-    `culprit` is the step that clearly costs the most, None where none does.
+    `culprit` is the step that clearly costs the most; None if no step does.
     """
 
     shares: dict[str, LedgerShare]
@@ -178,7 +179,7 @@ class Ledger(StrictModel):
 
 
 class EstimatedControl(StrictModel):
-    """A control put into photographs of the patch: its rate there, and the patch's own minus that, with 95 %."""
+    """A control rendered into photographs of the patch: its rate, and the patch's rate minus that, with 95 %."""
 
     name: str
     rate: Finite
@@ -187,8 +188,8 @@ class EstimatedControl(StrictModel):
 
 
 class EffectEstimate(StrictModel):
-    """The effect as estimated from so many photographs. Where the design itself was put back, a share `agree` of them
-    kept its answer; too few of them leave no controls.
+    """The patch's effect as estimated by rendering controls into its photographs. With the design itself rendered into
+    them, a share `agree` got the original answer; if that is too small, there are no controls.
     """
 
     photos: int
@@ -197,8 +198,8 @@ class EffectEstimate(StrictModel):
 
 
 class Forecast(StrictModel):
-    """What was to be expected of so many photographs at their own measured views, and what they showed: counts, and
-    Brier scores of the chances and of the promised rate in their place.
+    """Forecast and result of photographs at their own measured views: counts, and Brier scores of the forecast chances
+    and of the promised rate in their place.
     """
 
     photos: int
@@ -218,7 +219,7 @@ class SessionCount(StrictModel):
 
 
 class Benefit(StrictModel):
-    """What the patch is worth beside the control that decided it, whose rate is the promise's unless `photographed`."""
+    """The patch's benefit over the control that decided it, whose rate was promised or, if so, `photographed`."""
 
     word: BenefitWord
     goal: Goal
@@ -230,8 +231,8 @@ class Benefit(StrictModel):
 
 
 class Summary(StrictModel):
-    """All photographs together, for the promise's primary model. The rate's interval knows how much sessions differ,
-    and `sessions_known_from` says how sessions were told apart; `left_out` names what was not looked at.
+    """The summary of all photographs, for the promise's primary model. The rate's interval accounts for differences
+    between sessions; `sessions_known_from` says how these were told apart, `left_out` which files were not used.
     """
 
     photos: int
@@ -246,11 +247,11 @@ class Summary(StrictModel):
     ledger: dict[str, LedgerShare] | None = None
     culprit: str | None = None
     reason: str = ""  # for the verdict, in a sentence
-    next_step: str = ""  # what to do where photographs cannot tell
-    worth: Benefit | None = None  # beside its controls; null where there is nothing to compare
+    next_step: str = ""  # advice if the photographs cannot tell
+    worth: Benefit | None = None  # over its controls; null if there is nothing to compare
     left_out: tuple[str, ...] = ()
-    background: str = ""  # what stood behind the object when the promise was made
-    draft_views: int = 0  # of a promise that is a draft: from how many views
+    background: str = ""  # of the views that the promise was made from
+    draft_views: int = 0  # that a draft of a promise was made from; 0 for a full promise
     models: dict[str, ModelRate] = Field(default_factory=dict)
     sessions: tuple[SessionCount, ...] = ()
     sessions_known_from: str = ""
@@ -258,8 +259,8 @@ class Summary(StrictModel):
     forecast: Forecast | None = None
 
     def meets(self, required: Required) -> bool:
-        """Whether the promise held; for "helps" also whether the patch helps, since a useless one that was promised to
-        be useless keeps its promise.
+        """True if the promise held; for "helps" the patch must also help, since a useless patch can keep a promise to
+        be useless.
         """
         helps = self.worth is not None and self.worth.word == "helps"
         return self.verdict == "kept" and (helps or required == "kept")
@@ -267,8 +268,8 @@ class Summary(StrictModel):
 
 @dataclass(frozen=True)
 class Control:
-    """Photographs of one control and how the patch compares, null where there was nothing to compare; `difference` is
-    patch minus control, `pairs` 0 where photographs are not paired.
+    """Photographs of one control, compared with those of the patch (null: nothing to compare). `difference` is patch
+    minus control; `pairs` is 0 if photographs are not paired.
     """
 
     name: str
@@ -283,7 +284,7 @@ class Control:
 
 
 class Origin(StrictModel):
-    """What a report rests on besides the photographs: options as given, SHA-256 by name, versions by library."""
+    """Everything besides the photographs that a report depends on: options, SHA-256 by name, versions by library."""
 
     options: dict[str, Any] = Field(default_factory=dict)
     sha256: dict[str, str | None] = Field(default_factory=dict)
@@ -291,7 +292,7 @@ class Origin(StrictModel):
 
 
 class Report(StrictModel):
-    """A whole report.json; beside it the ledger, for its chart."""
+    """The content of report.json, and the ledger for its chart, which is not written there."""
 
     sheet_id: str
     photos: tuple[PhotoEntry, ...]

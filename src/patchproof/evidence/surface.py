@@ -1,8 +1,8 @@
-"""What a manifest says about the printed surface, as the judge needs it: where things lie, how they should look.
+"""Geometry and promised colors of the printed surface, as far as judging photographs needs them.
 
-In: a manifest and a printer model. Out: `Surface` (millimeters) and `PromisedColors` (media-relative linear light: paper is
-1). Only the page that carries the design counts. A piece in tiles is one surface when assembled, in the millimeters of
-the design's page; each of its pages is another, by which scans and photographs of it are known.
+In: a manifest and a printer model. Out: `Surface` (millimeters) and `PromisedColors` (media-relative linear light:
+paper is 1). Only the page that carries the design counts. A piece in tiles is one surface when assembled, in the
+millimeters of the design's page; each of its uncut pages is another surface, to recognize scans and photographs of it.
 """
 
 from __future__ import annotations
@@ -26,23 +26,23 @@ if TYPE_CHECKING:
     from patchproof.channel.printer import Printer
 
 DESIGN_PX = 512  # of the design as it is compared; photographs never resolve more
-_LARGEST_PIECE_PX = 1024  # of the piece as it is put back
+_LARGEST_PIECE_PX = 1024  # of the piece as it is rendered into photographs
 
 
 @dataclass(frozen=True)
 class Surface:
-    """Markers 4×2 mm by id (`piece_ids`: those inside the cut), and `rect_mm`: the piece, which the design fills, or
-    what shows of it on a page of tiles.
+    """Markers' corners (4×2 mm) by id, `piece_ids` of those inside the cut, and `rect_mm`: the piece, which the design
+    fills, or the part of it on one page of tiles.
     """
 
     dictionary: str
     corners_mm: dict[int, np.ndarray]
     piece_ids: frozenset[int]
     rect_mm: Rect
-    label: PageCode  # what the page's code says
-    page_mm: tuple[float, float] | None  # None where the code lies on another page than the design
+    label: PageCode  # the content of the page's code
+    page_mm: tuple[float, float] | None  # None if the code is on another page than the design
     pages: tuple[Surface, ...] = ()  # of a piece in tiles: each uncut page, which carries no piece ids
-    bent: bool = False  # whether the piece was made to follow a curved surface
+    bent: bool = False  # True if the piece was made to follow a curved surface
     outermost_mm: np.ndarray | None = None  # the object's outermost points P×3, for its box; z into the paper
     fov_deg: float = 45.0  # of the promised photographs, for those whose focal length is not known
 
@@ -54,26 +54,26 @@ class Surface:
 
     @property
     def all_ids(self) -> frozenset[int]:
-        """Its own markers and those of its pages."""
+        """Ids of the surface's markers and of its pages'."""
         return frozenset(self.corners_mm).union(*(page.corners_mm for page in self.pages))
 
     @property
     def page_ids(self) -> frozenset[int]:
-        """Markers of the page outside of the cut."""
+        """Ids of the page's markers outside of the cut."""
         return frozenset(self.corners_mm) - self.piece_ids
 
 
 @dataclass(frozen=True)
 class PromisedColors:
-    """Linear light as the printer model has it: the design with what markers lie on it H×W×3, marker ink (3,)."""
+    """Linear light by the printer model: of the design with the markers that lie on it (H×W×3), of marker ink (3,)."""
 
     design: np.ndarray
     ink: np.ndarray
 
 
 def surface_of(manifest: Manifest) -> Surface:
-    """The surface of the design's page; without a design, of the first page with markers, measured over the cut.
-    Refused where the design's page has none, or is none of the tiles.
+    """The surface of the design's page, or without a design of the first page with markers; its rectangle is the cut.
+    Refused if the design's page has no markers, or is none of the tiles.
     """
     pages = {tile.page for tile in manifest.tiles} or set(_corners_by_page(manifest))
     page = manifest.design.page if manifest.design else min(pages)
@@ -88,15 +88,17 @@ def surface_of(manifest: Manifest) -> Surface:
 
 
 def _assembled(manifest: Manifest) -> Surface:
-    """The piece glued together, in the millimeters of the design's page (the first tile's without a design)."""
+    """The surface of a piece glued together, in millimeters of the design's page, or without a design of the first
+    tile's.
+    """
     to_page = {tile.page: np.linalg.inv(manifest.page_from_design_page(tile.page))[:2] for tile in manifest.tiles}
     cuts, corners = {tile.page: tile.cut_mm for tile in manifest.tiles}, _corners_by_page(manifest)
     piece, pages = {}, []
     for number, cut in cuts.items():
-        carried = {i: _carry(to_page[number], c) for i, c in corners.get(number, {}).items()}
-        piece |= {i: carried[i] for i, c in corners.get(number, {}).items() if _inside(cut, c)}
-        (x0, y0), _, (x1, y1), _ = _carry(to_page[number], rect_corners(cut)).tolist()
-        pages.append(_surface(manifest, carried, frozenset(), (x0, y0, x1 - x0, y1 - y0)))
+        page_corners = {i: _transform(to_page[number], c) for i, c in corners.get(number, {}).items()}
+        piece |= {i: page_corners[i] for i, c in corners.get(number, {}).items() if _inside(cut, c)}
+        (x0, y0), _, (x1, y1), _ = _transform(to_page[number], rect_corners(cut)).tolist()
+        pages.append(_surface(manifest, page_corners, frozenset(), (x0, y0, x1 - x0, y1 - y0)))
     for number in sorted(corners.keys() - cuts.keys()):  # the page with the chart
         points = np.concatenate(list(corners[number].values()))
         x, y, w, h = (float(v) for v in (*points.min(0), *np.ptp(points, axis=0)))
@@ -121,33 +123,33 @@ def _surface(manifest: Manifest, corners, piece_ids, rect_mm, pages=()) -> Surfa
 
 
 def promised_of(manifest: Manifest, surface: Surface, printer: Printer) -> PromisedColors | None:
-    """How design and ink should look; None on pages without a design."""
+    """The promised colors of the sheet's design and ink; None without a design."""
     return None if manifest.design is None else printed_colors(manifest.design.pixels(), surface, printer)
 
 
 def printed_colors(pixels: np.ndarray, surface: Surface, printer: Printer) -> PromisedColors:
-    """How a design of uint8 pixels H×W×3 in this one's place should look, and its ink."""
+    """Colors that the printer model makes of a design (uint8 pixels H×W×3) in the sheet's place, and of its ink."""
     import torch
 
-    def printed(srgb: np.ndarray) -> np.ndarray:
+    def apply_printer(srgb: np.ndarray) -> np.ndarray:
         tensor = torch.from_numpy(np.ascontiguousarray(srgb.transpose(2, 0, 1), np.float32))[None]
         with torch.inference_mode():
             return linear_from_srgb(printer.apply(tensor)[0].numpy().transpose(1, 2, 0).astype(float))
 
-    design, ink = printed(pixels / 255.0).astype(np.float32), printed(np.zeros((1, 1, 3)))[0, 0]
+    design, ink = apply_printer(pixels / 255.0).astype(np.float32), apply_printer(np.zeros((1, 1, 3)))[0, 0]
     return PromisedColors(downscale(with_markers(design, surface, ink), DESIGN_PX), ink)
 
 
 def with_markers(design: np.ndarray, surface: Surface, ink: np.ndarray) -> np.ndarray:
-    """Linear light H×W×3 over the piece with the markers that lie on it; `ink` is their black."""
+    """Draw the markers that lie on the piece over the design's linear light H×W×3; `ink` is their black."""
     on_piece = {i: surface.corners_mm[i] for i in sorted(surface.piece_ids)}
-    on_it = {i: corners for i, corners in on_piece.items() if _inside(surface.rect_mm, corners)}
-    if not on_it:
+    on_design = {i: corners for i, corners in on_piece.items() if _inside(surface.rect_mm, corners)}
+    if not on_design:
         return design
-    finer = max(1, DESIGN_PX // max(design.shape))  # a design of few pixels: markers' modules are smaller
-    design = design.repeat(finer, 0).repeat(finer, 1)
+    zoom = max(1, DESIGN_PX // max(design.shape))  # markers need more pixels than a small design has
+    design = design.repeat(zoom, 0).repeat(zoom, 1)
     x, y, *size_mm = surface.rect_mm
-    markers = tuple(square_marker(i, tuple(c[0] - (x, y)), float(c[1, 0] - c[0, 0])) for i, c in on_it.items())
+    markers = tuple(square_marker(i, tuple(c[0] - (x, y)), float(c[1, 0] - c[0, 0])) for i, c in on_design.items())
     piece = Piece((size_mm[0], size_mm[1]), markers, marker_rect(markers[0])[2] / MARKER_MODULES)
     image, reserved = marker_image(piece, (design.shape[1], design.shape[0]))
     light = (ink + linear_from_srgb(image) * (1 - ink)).astype(np.float32)
@@ -155,9 +157,9 @@ def with_markers(design: np.ndarray, surface: Surface, ink: np.ndarray) -> np.nd
 
 
 def piece_picture(surface: Surface, design: np.ndarray) -> np.ndarray:
-    """The whole piece as float32 linear light H×W×3 in whole pixels; `design` as `with_markers` makes it.
+    """Resize a design of `with_markers` to the piece's shape: float32 linear light H×W×3 of at most 1024 pixels.
 
-    Scissors, folds and what a shop adds are left out.
+    Left out: inaccurate cuts, folds and anything that a print shop adds.
     """
     _, _, w, h = surface.rect_mm
     px_per_mm = _LARGEST_PIECE_PX / max(w, h)
@@ -166,7 +168,7 @@ def piece_picture(surface: Surface, design: np.ndarray) -> np.ndarray:
 
 
 def _corners_by_page(manifest: Manifest) -> dict[int, dict[int, np.ndarray]]:
-    """Corners by page and id of the markers of the first one's dictionary."""
+    """Corners by page and id of the markers that have the first marker's dictionary."""
     pages: dict[int, dict[int, np.ndarray]] = {}
     for marker in manifest.markers:
         if marker.dictionary == manifest.markers[0].dictionary:
@@ -179,5 +181,5 @@ def _inside(rect: Rect, points: np.ndarray) -> bool:
     return bool((points >= [x, y]).all() and (points <= [x + w, y + h]).all())
 
 
-def _carry(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
+def _transform(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
     return points @ matrix[:, :2].T + matrix[:, 2]

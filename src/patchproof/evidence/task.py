@@ -1,7 +1,4 @@
-"""What photographs are judged with and measured against.
-
-In: a manifest and the `Options` of a verification. Out: a `Task`: all that one photograph is measured against.
-"""
+"""Options of a verification, and the `Task` that every photograph is measured against, made of them and a manifest."""
 
 from __future__ import annotations
 
@@ -25,13 +22,12 @@ LEDGER_PHOTOS = 24  # each costs 16 classifications; 24 leave intervals of some 
 
 @dataclass(frozen=True)
 class Options:
-    """What a verification's figures depend on besides photographs and manifest.
+    """Everything besides photographs and manifest that a verification's figures depend on.
 
-    `printer` is the appearance model that the promise was made with.
-    `camera` replaces the EXIF focal length and takes out the lens. `ruler_mm` are the printed rulers (x, y) as somebody
-    measured them. `controls` is a folder of photographs of controls. `ledger_photos` of the photographs at most, spread
-    evenly, go into the gap ledger (0: no ledger). `boxes` are those that somebody drew round the object, by photograph
-    (`boxes.load_boxes`).
+    `printer` is the printer model that the promise was made with. `camera` replaces the EXIF focal length and removes
+    lens distortion. `ruler_mm` are the printed rulers (x, y) as measured by hand. `controls` is a folder of photographs
+    of controls. At most `ledger_photos` photographs, evenly spread, go into the gap ledger (0: no ledger). `boxes` are
+    those that somebody drew round the object, by photograph (`boxes.load_boxes`).
     """
 
     models: Sequence[Classifier]
@@ -46,7 +42,7 @@ class Options:
 
 @dataclass(frozen=True)
 class Task:
-    """All that one photograph is measured against; small enough to be sent to another process."""
+    """Everything that one photograph is measured against; small enough to be sent to another process."""
 
     surface: Surface
     promised: PromisedColors | None
@@ -58,7 +54,7 @@ class Task:
 
 
 def task_of(manifest: Manifest, options: Options, judges: Judges | None) -> Task:
-    """What all photographs of a verification are measured against."""
+    """Make the task of a verification; without `judges` photographs are not classified."""
     surface = surface_of(manifest)
     promised = promised_of(manifest, surface, options.printer)
     ranges = promised_ranges(manifest.promise.conditions if manifest.promise else (), promised_side_px(manifest))

@@ -1,15 +1,15 @@
-"""From counts to a verdict: pure functions, no photographs.
+"""Derive the verdict on a promise, and the effect of the patch, from counts. Pure functions.
 
-In: how many photographs of each session were recognized, what was promised, what controls showed. Out: `kept`, `broken`
-or `cannot_tell` with the prediction interval that decided it, and whether an effect was shown. For `assist`:
+In: how many photographs of each session were recognized, the promise, counts of controls. Out: `kept`, `broken` or
+`cannot_tell` with the prediction interval that decided it, and the effect (`shown` or not). For `assist`:
 
-    broken       fewer are recognized than the promise allows for, at 95 %, of photographs in so many sessions
-    kept         the least rate that the photographs leave possible (97.5 %, sessions differ) is at most 20 points under
-                 the promised one, and no less than the best control's
+    broken       fewer are recognized than the 95 % prediction interval allows for in these sessions
+    kept         the photographs' 97.5 % lower bound of the rate, which accounts for differences between sessions, is at
+                 most 20 points under the promised rate, and no less than the best control's
     cannot_tell  otherwise; always below 5 judged photographs, or with more than 10 % of readable ones without a marker
 
-mirrored for `deceive`, where a rate too high breaks the promise. `kept` is a claim that the photographs prove; too few
-of them, or all in one place, can prove none.
+mirrored for `deceive`, where a rate too high breaks the promise. `kept` is proved by the photographs; too few of them,
+or all in one place, can prove nothing.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ from patchproof.sheets.manifest import Promise
 
 LEAST_JUDGED = 5
 MOST_WITHOUT_MARKERS = 0.10
-SLACK = 0.20  # how far below the promised rate the photographs may leave the true one
+RATE_SLACK = 0.20  # how far below the promised rate the proved rate may be
 LEAST_PAIRS = 6  # fewer pairs can never reach 5 % in McNemar's test; the unpaired interval is used then
-PHOTOS_PER_SESSION = 10  # photographs of a session, where their number is asked for
-MIN_KEPT_CHANCE = 0.80  # chance of `kept` that is enough
-MOST_PHOTOS = 150  # nobody takes more
+PHOTOS_PER_SESSION = 10  # photographs that are advised in each session
+MIN_KEPT_CHANCE = 0.80  # chance of `kept` for which sessions are advised
+MOST_PHOTOS = 150  # that are advised: nobody takes more
 LEAST_PAIRED = 0.5  # of either folder's photographs: a few names that happen to be equal are no pairs
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """The word, the counts that the promise allows, and one sentence with the figures that decided it."""
+    """The verdict, the counts that the promise allows for, and one sentence with the figures that decided it."""
 
     verdict: VerdictWord
     prediction_interval: tuple[int, int] | None
@@ -44,8 +44,8 @@ class Verdict:
 
 
 def judge(recognized: int, photos: Sequence[int], promise: Promise, without_markers: int = 0) -> Verdict:
-    """The verdict on photographs of which `recognized` were, so many in each session; `without_markers` more are
-    readable and show no marker.
+    """Judge the promise by `photos` (how many in each session), of which `recognized` were recognized;
+    `without_markers` more are readable and show no marker.
     """
     judged, goal = sum(photos), promise.target.goal
     if judged == 0:
@@ -54,9 +54,9 @@ def judge(recognized: int, photos: Sequence[int], promise: Promise, without_mark
     low, high = posterior.count_interval(photos)
     sessions = "one session" if len(photos) == 1 else f"{len(photos)} sessions"
     allowed = f"the promise allows for {low} to {high} in {sessions}"
-    lost = _lost(judged, without_markers)
-    if lost > MOST_WITHOUT_MARKERS:
-        reason = f"{without_markers} readable photographs show no marker ({lost:.0%}, at most 10 % are allowed)."
+    share = _share_without_markers(judged, without_markers)
+    if share > MOST_WITHOUT_MARKERS:
+        reason = f"{without_markers} readable photographs show no marker ({share:.0%}, at most 10 % are allowed)."
         return Verdict("cannot_tell", (low, high), reason)
     if judged < LEAST_JUDGED:
         return Verdict("cannot_tell", (low, high), f"Only {judged} photographs could be judged; at least 5 are needed.")
@@ -64,72 +64,75 @@ def judge(recognized: int, photos: Sequence[int], promise: Promise, without_mark
     if goal.sign * (recognized - (low if goal.sign > 0 else high)) < 0:
         return Verdict("broken", (low, high), f"{counts}; {allowed}.")
     ends = posterior.least_rate if goal.sign > 0 else posterior.most_rate
-    proved, asked = ends(recognized, photos, TAIL), required_rate(promise)
+    proved, required = ends(recognized, photos, TAIL), required_rate(promise)
     side = "at least" if goal.sign > 0 else "at most"
-    counts = f"{counts}; {allowed}. They prove a rate of {side} {proved:.0%}, and {side} {asked:.0%} is asked for"
-    return Verdict("kept" if goal.sign * (proved - asked) >= 0 else "cannot_tell", (low, high), f"{counts}.")
+    counts = f"{counts}; {allowed}. They prove a rate of {side} {proved:.0%}, and {side} {required:.0%} is asked for"
+    return Verdict("kept" if goal.sign * (proved - required) >= 0 else "cannot_tell", (low, high), f"{counts}.")
 
 
 def required_rate(promise: Promise) -> float:
-    """The rate that photographs have to prove: the promise's with its slack, and no worse than the best control's."""
+    """The rate that photographs have to prove: 20 points worse than promised, and no worse than the best control's."""
     sign = promise.target.goal.sign
     controls = (sign * control.rate for control in promise.controls.values())
-    return sign * max([sign * promise.rate - SLACK, *controls])
+    return sign * max([sign * promise.rate - RATE_SLACK, *controls])
 
 
 def kept_chance(promise: Promise, photos: Sequence[int]) -> float:
-    """The chance that the promise is called kept by photographs, so many in each session, where it holds."""
+    """The chance that photographs (`photos` in each session) prove the promise, if it holds."""
     chances = promise.posterior.chances(photos)
-    # from the worst to the best: once kept, kept from there on
+    # from the worst count to the best: all counts after the first that is kept are kept, too
     counts = range(len(chances))[:: promise.target.goal.sign]
     first = bisect_left(counts, True, key=lambda count: judge(count, photos, promise).verdict == "kept")
     return float(chances[list(counts[first:])].sum())
 
 
 def sessions_needed(promise: Promise) -> int | None:
-    """In how many places `PHOTOS_PER_SESSION` photographs prove the promise, where it holds, with a chance of `MIN_KEPT_CHANCE`; None where that
-    takes more than `MOST_PHOTOS`.
+    """The number of sessions of `PHOTOS_PER_SESSION` photographs that prove the promise, if it holds, with a chance of
+    `MIN_KEPT_CHANCE`; None if that takes more than `MOST_PHOTOS` photographs.
     """
     counts = range(1, MOST_PHOTOS // PHOTOS_PER_SESSION + 1)
     return next((s for s in counts if kept_chance(promise, (PHOTOS_PER_SESSION,) * s) >= MIN_KEPT_CHANCE), None)
 
 
 def next_step(promise: Promise, photos: Sequence[int], without_markers: int = 0) -> str:
-    """What to do where photographs, so many judged in each session, cannot tell."""
-    if _lost(sum(photos), without_markers) > MOST_WITHOUT_MARKERS:
+    """Advise what to do if photographs (`photos` judged in each session) cannot tell."""
+    if _share_without_markers(sum(photos), without_markers) > MOST_WITHOUT_MARKERS:
         return "Leave out pictures that do not show the piece, and take again those whose markers cannot be read."
     return photos_line(sessions_needed(promise), photos)
 
 
 def photos_line(sessions: int | None, photos: Sequence[int] = ()) -> str:
-    """How many photographs to take: for `sessions_needed`, beside `photos` judged so far in each session."""
+    """Advise how many photographs to take for `sessions` (None: no number would do), after `photos` in each so far."""
     if sessions is None:
         return f"No {MOST_PHOTOS} photographs are likely to prove this promise: make a design that gains more."
-    if sum(photos) >= PHOTOS_PER_SESSION * sessions and len(photos) >= sessions:
-        return f"Take {PHOTOS_PER_SESSION * sessions} more, {PHOTOS_PER_SESSION} in each of {places(sessions)} that are new."
+    each, places, total = PHOTOS_PER_SESSION, places_text(sessions), PHOTOS_PER_SESSION * sessions
+    if sum(photos) >= total and len(photos) >= sessions:
+        return f"Take {total} more, {each} in each of {places} that are new."
     needed = (
-        f"Take at least {PHOTOS_PER_SESSION} photographs in each of {places(sessions)}, with other light in each, and keep "
-        "those of each place in a folder of their own."
+        f"Take at least {each} photographs in each of {places}, with other light in each, and keep those of each place "
+        "in a folder of their own."
     )
-    so_far = f" So far: {sum(photos)} of {PHOTOS_PER_SESSION * sessions}, in {places(len(photos))} of {sessions}."
+    so_far = f" So far: {sum(photos)} of {total}, in {places_text(len(photos))} of {sessions}."
     return needed + so_far if photos else needed
 
 
-def places(count: int) -> str:
-    """So many places."""
+def places_text(count: int) -> str:
+    """'1 place' or 'N places'."""
     return "1 place" if count == 1 else f"{count} places"
 
 
-def _lost(judged: int, without_markers: int) -> float:
+def _share_without_markers(judged: int, without_markers: int) -> float:
     return without_markers / max(judged + without_markers, 1)
 
 
 def compare(patch: Mapping[str, bool], name: str, control: Mapping[str, bool], goal: Goal) -> Control:
-    """Whether the patch changes recognition in the goal's direction; answers by file name, equal names are pairs."""
+    """Compare answers to the patch with those to a control, both by file name; equal names are pairs. `shown` says
+    whether the patch changes recognition in the goal's direction, at 95 %.
+    """
     counts = sum(control.values()), len(control)
-    beside = Control(name, *counts, wilson(*counts))
+    comparison = Control(name, *counts, wilson(*counts))
     if not patch or not control:
-        return beside
+        return comparison
     names = sorted(patch.keys() & control.keys())
     if len(names) >= max(LEAST_PAIRS, LEAST_PAIRED * len(patch), LEAST_PAIRED * len(control)):
         a, b = [patch[name] for name in names], [control[name] for name in names]
@@ -141,12 +144,12 @@ def compare(patch: Mapping[str, bool], name: str, control: Mapping[str, bool], g
         difference, interval = independent_difference(sum(patch.values()), len(patch), *counts)
         shown, p_value, pairs = min(goal.sign * end for end in interval) > 0, None, 0
     return replace(
-        beside, pairs=pairs, difference=difference, difference_interval=interval, p_value=p_value, shown=shown
+        comparison, pairs=pairs, difference=difference, difference_interval=interval, p_value=p_value, shown=shown
     )
 
 
 def effect_of(controls: Sequence[Control]) -> Effect:
-    """`shown` only where every control was beaten; controls without a judged photograph are not tests."""
+    """The effect is `shown` if every control was beaten; controls without a judged photograph do not count."""
     answers = [control.shown for control in controls if control.shown is not None]
     if not answers:
         return "not_tested"

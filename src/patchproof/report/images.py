@@ -1,7 +1,7 @@
-"""Pictures for a page without files: arrays as data URIs, color differences as a map with a fixed scale, figures.
+"""Encode pictures for a page without files: arrays, color differences as a map with a fixed scale, figures.
 
-In: uint8 sRGB H×W×3, float cells, or what draws with matplotlib. Out: the bytes of files, the same for the same input,
-and `data:` URIs. The scale of the map is the same in all reports, so that two reports can be laid side by side.
+In: uint8 sRGB H×W×3, float cells, or functions that draw with matplotlib. Out: the bytes of files, the same for the
+same input, and `data:` URIs. All reports share the map's scale, so that two reports can be compared.
 """
 
 from __future__ import annotations
@@ -21,19 +21,19 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 DELTA_TOP = 20.0  # ΔE00 at the map's dark end; 2 is just visible side by side, 20 another color
-KINDS = ("photo", "promised", "seen", "fitted", "delta_e00")
+PICTURE_KINDS = ("photo", "promised", "seen", "fitted", "delta_e00")
 _JPEG_QUALITY = 82
 _LONGEST_STEM = 220  # bytes; systems take 255, and kind and suffix come after it
 _PNG = b"\x89PNG"
 
 
 def jpeg(pixels: np.ndarray) -> bytes:
-    """uint8 sRGB as JPEG, for photographs."""
+    """Encode uint8 sRGB as JPEG, for photographs."""
     return image_bytes(pixels, "JPEG", {"quality": _JPEG_QUALITY, "optimize": True})
 
 
 def png(pixels: np.ndarray) -> bytes:
-    """uint8 sRGB or sRGB with alpha as PNG, for flat colors."""
+    """Encode uint8 sRGB, with or without alpha, as PNG, for flat colors."""
     return image_bytes(pixels, "PNG", {"optimize": True})
 
 
@@ -50,12 +50,14 @@ def save_pictures(folder: Path, file: str, kinds: Mapping[str, np.ndarray]) -> N
 
 
 def saved_pictures(folder: Path, file: str) -> dict[str, bytes]:
-    """The bytes of the photograph's pictures in `folder` by kind; those that are there."""
+    """Read the files of a photograph's pictures in `folder`, by kind; missing ones are left out."""
     return {path.suffixes[-2][1:]: path.read_bytes() for path in _paths(folder, file) if path.is_file()}
 
 
 def stem_of(file: str) -> str:
-    """How the pictures of a photograph begin, which may lie in a folder of its session; no longer than names may be."""
+    """The stem of a photograph's picture files: its name, which may contain its session's folder, encoded; a long one
+    is shortened and gets a hash.
+    """
     stem = file.replace("/", "%2F")
     if len(stem.encode()) <= _LONGEST_STEM:
         return stem
@@ -63,21 +65,21 @@ def stem_of(file: str) -> str:
 
 
 def _paths(folder: Path, file: str) -> list[Path]:
-    return [folder / f"{stem_of(file)}.{kind}.{suffix}" for kind in KINDS for suffix in ("jpg", "png")]
+    return [folder / f"{stem_of(file)}.{kind}.{suffix}" for kind in PICTURE_KINDS for suffix in ("jpg", "png")]
 
 
 def data_uri(content: bytes) -> str:
-    """The bytes of a JPEG or PNG as something that `<img src>` takes."""
+    """Encode the bytes of a JPEG or PNG as a data URI for `<img src>`."""
     return base64_uri(content, f"image/{'png' if content.startswith(_PNG) else 'jpeg'}")
 
 
 def base64_uri(content: bytes, kind: str) -> str:
-    """Bytes of that media type as an address that needs no file."""
+    """Encode bytes of a media type (`kind`) as a data URI."""
     return f"data:{kind};base64,{base64.b64encode(content).decode()}"
 
 
 def delta_map(delta_e00: np.ndarray, longer_px: int = 192) -> np.ndarray:
-    """ΔE00 cells as uint8 RGBA squares: pale is equal, dark is `DELTA_TOP` or more, see-through is not measured."""
+    """Draw ΔE00 cells as uint8 RGBA squares: pale is 0, dark is `DELTA_TOP` or more, transparent is not measured."""
     import matplotlib
 
     colors = matplotlib.colormaps["magma_r"](np.clip(np.nan_to_num(delta_e00) / DELTA_TOP, 0, 1), bytes=True)
@@ -86,8 +88,8 @@ def delta_map(delta_e00: np.ndarray, longer_px: int = 192) -> np.ndarray:
     return np.repeat(np.repeat(colors, zoom, axis=0), zoom, axis=1)
 
 
-def drawn(draw: Callable[[Figure], None], size_in: tuple[float, float], kind: str, **options: Any) -> bytes:
-    """A figure as the bytes of a "png" or "svg"; `options` are those of matplotlib's `savefig`."""
+def draw_figure(draw: Callable[[Figure], None], size_in: tuple[float, float], kind: str, **options: Any) -> bytes:
+    """Draw a figure and encode it as "png" or "svg"; `options` are those of matplotlib's `savefig`."""
     import matplotlib
     from matplotlib.figure import Figure
 

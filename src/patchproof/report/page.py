@@ -1,4 +1,4 @@
-"""One HTML page from a template; values in it are escaped, an unknown one is an error."""
+"""Render an HTML page from a template; values are escaped, and a missing one is an error."""
 
 from __future__ import annotations
 
@@ -10,13 +10,16 @@ from pathlib import Path
 from patchproof.base.intervals import Estimate
 
 
-def page(template: str, folder: Path = Path(__file__).parent, **values: object) -> str:
-    """The template of that folder, of this one if none is given, with its values."""
+def render_page(template: str, folder: Path = Path(__file__).parent, **values: object) -> str:
+    """Render a template of `folder` (by default this room's) with its values."""
     import jinja2
 
-    loader, strict = jinja2.FileSystemLoader(folder), jinja2.StrictUndefined
     environment = jinja2.Environment(
-        loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=strict
+        loader=jinja2.FileSystemLoader(folder),
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        undefined=jinja2.StrictUndefined,
     )
     environment.filters |= {"percent": _percent, "figure": _figure}
     environment.tests["figure"] = lambda value: isinstance(value, (int, float, Estimate)) or value is None
@@ -32,9 +35,9 @@ def _figure(value: float | None, digits: int = 2) -> str:
 
 
 def versions_of(libraries: Iterable[str]) -> dict[str, str]:
-    """The versions of those that are installed."""
+    """Look up the versions of libraries; those that are not installed are left out."""
     versions = {}
     for name in libraries:
-        with suppress(PackageNotFoundError):  # run from a checkout, or another of OpenCV's four wheels
+        with suppress(PackageNotFoundError):  # in a checkout, or with another of OpenCV's four wheels
             versions[name] = version(name)
     return versions

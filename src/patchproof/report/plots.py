@@ -1,7 +1,7 @@
-"""Where photographs were recognized and where not: small plots as inline SVG that follow the page's text color.
+"""Small plots of a report as inline SVG that follows the page's text color: recognition, print scale, gap ledger.
 
-In: entries of a report as plain data. Out: SVG text. Points lie at 0 or 1 with a little fixed scatter; the line is a
-running share of the nearest photographs, and is drawn only where there are enough of them to mean something.
+In: entries of a report as plain data. Out: SVG text. Points of recognition lie at 0 or 1 with a little fixed scatter;
+the line is a running share over neighboring photographs, drawn from 24 photographs on.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from patchproof.report.images import drawn
+from patchproof.report.images import draw_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -25,7 +25,7 @@ _LEAST_FOR_LINE = 24
 def recognition_plot(
     photos: Sequence[Mapping], model: str, figure: str, label: str, promised: Sequence[Mapping]
 ) -> str | None:
-    """Recognition by one figure of the photographs; None where fewer than two photographs have it."""
+    """Plot recognition over one figure of the photographs; None if fewer than two photographs have it."""
     x, y = _points(photos, figure, lambda photo: photo["predictions"].get(model, {}).get("recognized"))
     if len(x) < 2:
         return None
@@ -34,15 +34,15 @@ def recognition_plot(
 
 
 def scale_plot(photos: Sequence[Mapping]) -> str | None:
-    """How large the print is, across and down, in photographs that show it; None where none does."""
+    """Plot the print's scale, across and down, of the photographs that measured it; None if none did."""
     scales = [(photo["scale_x"], photo["scale_y"]) for photo in photos if photo.get("scale_x") is not None]
     return _svg(lambda axes: _draw_scales(axes, np.array(scales))) if scales else None
 
 
 def ledger_plot(ledger: Mapping) -> str:
-    """The gap ledger as a waterfall from the ideal picture's confidence to the photographs', with 95 % intervals.
+    """Plot the gap ledger as a waterfall from the ideal picture's confidence to the photographs', with 95 % intervals.
 
-    `ledger` holds `shares` {step: {share, interval}}, `ideal` and `photo` (mean confidence), as the report's notes do.
+    `ledger` holds `shares` {step: {share, interval}}, `ideal` and `photo` (mean confidence).
     """
     return _svg(lambda axes: _draw_ledger(axes, ledger))
 
@@ -66,20 +66,20 @@ def _draw_scales(axes, scales: np.ndarray) -> None:
 def _draw_ledger(axes, ledger: Mapping) -> None:
     shares, ideal = ledger["shares"], ledger["ideal"]
     costs = np.array([share["share"] for share in shares.values()])
-    # shares count what the goal loses: for deceiving, confidence that was gained
-    after = ideal + np.sign(ledger["photo"] - ideal or -1) * np.sign(costs.sum() or 1) * np.cumsum(costs)
-    before = np.concatenate([[ideal], after[:-1]])
+    # a positive share is a loss for the goal: for deceiving, a gain in confidence
+    levels_after = ideal + np.sign(ledger["photo"] - ideal or -1) * np.sign(costs.sum() or 1) * np.cumsum(costs)
+    starts = np.concatenate([[ideal], levels_after[:-1]])
     rows = np.arange(1, len(costs) + 1)
     axes.barh([0, len(costs) + 1], [ideal, ledger["photo"]], color=_INK, alpha=0.35, height=0.62)
-    axes.barh(rows, after - before, left=before, color=[_NO if c > 0 else _YES for c in costs], height=0.62)
-    for row, start, end, share in zip(rows, before, after, shares.values(), strict=True):
+    axes.barh(rows, levels_after - starts, left=starts, color=[_NO if c > 0 else _YES for c in costs], height=0.62)
+    for row, start, end, share in zip(rows, starts, levels_after, shares.values(), strict=True):
         if share["interval"] is not None:
             ends = start + (np.sign(end - start) * np.sign(share["share"]) or -1) * np.array(share["interval"])
             axes.plot(ends, [row, row], color=_INK, linewidth=1.2)
     levels = [
         f"{100 * ideal:.0f} %",
-        *(f"{round(100 * change, 1) + 0:+.1f}" for change in after - before),
-        f"{100 * after[-1]:.0f} %",
+        *(f"{round(100 * change, 1) + 0:+.1f}" for change in levels_after - starts),
+        f"{100 * levels_after[-1]:.0f} %",
     ]
     for row, level in enumerate(levels):
         axes.text(1.02, row, level, color=_INK, va="center", transform=axes.get_yaxis_transform())
@@ -127,6 +127,6 @@ def _svg(draw: Callable[[Axes], None]) -> str:
         axes.xaxis.label.set_color(_INK)
 
     metadata = {"Date": None, "Creator": None}
-    text = drawn(fill, (4.2, 2.3), "svg", transparent=True, metadata=metadata).decode()
+    text = draw_figure(fill, (4.2, 2.3), "svg", transparent=True, metadata=metadata).decode()
     text = text[text.index("<svg") :]
     return text.replace(_INK, "currentColor").replace("font-family: 'DejaVu Sans', sans-serif", "font-family: inherit")

@@ -1,8 +1,8 @@
-"""Tables and figures of studies and benchmarks: what is handed over to be written, and how a figure reads.
+"""Tables and figures of comparisons, studies and benchmarks, written to files or as lines for a terminal.
 
-In: rows of plain values and `Estimate`s, drawings for matplotlib, what failed, and the settings to repeat it. Out:
-NAME.json, a CSV per table with numbers in full, a PNG per figure, and one HTML page that needs nothing from outside of
-itself, each written whole; or lines for a terminal. The same input gives the same bytes.
+In: rows of plain values and `Estimate`s, drawings for matplotlib, failures, and the settings to repeat it. Out:
+NAME.json, a CSV per table with numbers in full, a PNG per figure, and one self-contained HTML page, each written whole;
+or lines. The same input gives the same bytes.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, Any
 
 from patchproof.base.intervals import Estimate
 from patchproof.base.output import write_atomically
-from patchproof.report.images import data_uri, drawn
-from patchproof.report.page import page, versions_of
+from patchproof.report.images import data_uri, draw_figure
+from patchproof.report.page import render_page, versions_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -30,7 +30,7 @@ Value = str | int | float | bool | None | Estimate
 
 @dataclass(frozen=True)
 class Table:
-    """Rows under a head; `name` becomes the file's, `about` says what was measured and on what."""
+    """Rows under a head; `name` becomes part of the file's, `about` says what was measured and on what."""
 
     name: str
     title: str
@@ -52,8 +52,8 @@ class Drawing:
 
 @dataclass(frozen=True)
 class Results:
-    """A page's content. `program` and `kind` ("patchlab", "study") head it, `extent` says how much was done,
-    `failed` are sentences by what they are about; `more` stands in the JSON alone.
+    """A page's content. `program` and `kind` (such as "patchlab", "study") are its title, `extent` says how much was
+    computed, `failed` has a sentence for each cell that failed; `more` is written to the JSON alone.
     """
 
     kind: str
@@ -69,21 +69,21 @@ class Results:
 
 
 def write_results(folder: Path, results: Results) -> None:
-    """Write all of it into the folder."""
+    """Write the page, its JSON, tables as CSV and figures as PNG into the folder."""
     versions = versions_of(_LIBRARIES)
-    bare = {"dpi": 130, "metadata": {"Software": None}}  # without date or version
-    pictures = [(figure, drawn(figure.draw, figure.size_in, "png", **bare)) for figure in results.figures]
+    options = {"dpi": 130, "metadata": {"Software": None}}  # without date or version
+    pictures = [(figure, draw_figure(figure.draw, figure.size_in, "png", **options)) for figure in results.figures]
     for table in results.tables:
         write_atomically(folder / f"{results.name}_{table.name}.csv", csv_text(table))
     for figure, content in pictures:
         write_atomically(folder / f"{results.name}_{figure.name}.png", content)
-    text = page(
+    text = render_page(
         "results.html.j2",
         results=results,
         pictures=[(figure, data_uri(content)) for figure, content in pictures],
         settings=json.dumps(results.settings, indent=1, ensure_ascii=False),
         versions=versions,
-        shown=shown,
+        cell_text=cell_text,
     )
     write_atomically(folder / f"{results.name}.html", text)
     data = {
@@ -98,12 +98,12 @@ def write_results(folder: Path, results: Results) -> None:
 
 
 def write_json(path: Path, data: Mapping[str, Any]) -> None:
-    """The data as a JSON file, written whole."""
+    """Write data as a JSON file, whole or not at all."""
     write_atomically(path, json.dumps(data, indent=1, allow_nan=False) + "\n")
 
 
 def csv_text(table: Table) -> str:
-    """The table with numbers in full; an `Estimate`'s column becomes four (value, _low, _high, _n)."""
+    """Convert a table to CSV, numbers in full; a column of `Estimate`s becomes four (value, _low, _high, _n)."""
     buffer, columns = io.StringIO(), []
     for name, *values in zip(table.head, *table.rows, strict=True):
         if any(isinstance(value, Estimate) for value in values):
@@ -116,12 +116,12 @@ def csv_text(table: Table) -> str:
     return buffer.getvalue()
 
 
-def shown(value: Value) -> str:
-    """A value as people read it: three digits, an interval in brackets, a dash for nothing."""
+def cell_text(value: Value) -> str:
+    """Format a value for people: three digits, an interval in brackets, a dash for None."""
     if value is None:
         return "–"
     if isinstance(value, Estimate):
-        return f"{shown(value.value)} [{shown(value.low)}, {shown(value.high)}]"
+        return f"{cell_text(value.value)} [{cell_text(value.low)}, {cell_text(value.high)}]"
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, float):
@@ -132,14 +132,14 @@ def shown(value: Value) -> str:
 
 
 def text_lines(table: Table) -> list[str]:
-    """The table for a terminal: columns aligned, numbers to the right."""
-    rows = [table.head, *(tuple(map(shown, row)) for row in table.rows)]
+    """Format a table for a terminal: text to the left, numbers to the right."""
+    rows = [table.head, *(tuple(map(cell_text, row)) for row in table.rows)]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    left = [all(isinstance(row[i], str) for row in table.rows) for i in range(len(table.head))]
+    is_text = [all(isinstance(row[i], str) for row in table.rows) for i in range(len(table.head))]
     return [
         "  ".join(
-            cell.ljust(width) if is_left else cell.rjust(width)
-            for cell, width, is_left in zip(row, widths, left, strict=True)
+            cell.ljust(width) if to_left else cell.rjust(width)
+            for cell, width, to_left in zip(row, widths, is_text, strict=True)
         ).rstrip()
         for row in rows
     ]

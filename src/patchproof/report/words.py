@@ -1,8 +1,7 @@
-"""What a promise, an evaluation or a verification comes to, in words: for terminal and page alike.
+"""Sentences for terminal and page that sum up a promise, an evaluation or a verification.
 
-In: a promise, an evaluation or a report; of a verification's summary plain data. Out: lines for the terminal, which say
-what a person wants to know before opening any file; a headline that says whether the patch helps, which is what
-somebody came for, a sentence with the figures behind it, and whether the promise held.
+In: a promise, an evaluation or a report, or a report's summary as plain data. Out: lines for the terminal; and a
+headline that says whether the patch helps, a sentence with its figures, and the verdict on the promise.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ _HELPS = {"assist": "help", "deceive": "deceive"}
 
 
 def headline_of(summary: Mapping[str, Any]) -> str:
-    """Whether the patch helps."""
+    """Say whether the patch helps, as a headline."""
     worth = summary["worth"]
     if worth is None:
         return "Cannot tell whether it helps"
@@ -37,37 +36,37 @@ def headline_of(summary: Mapping[str, Any]) -> str:
 
 
 def benefit_sentence(summary: Mapping[str, Any]) -> str:
-    """The figures behind the headline."""
+    """Say the figures behind the headline."""
     worth = summary["worth"]
     if worth is None:
         return "There is nothing to compare the photographs with."
     low, high = (100 * end for end in worth["difference_interval"])
-    how = "as photographed" if worth["photographed"] else "as simulated for the promise, not photographed"
+    source = "as photographed" if worth["photographed"] else "as simulated for the promise, not photographed"
     return (
         f"Recognized in {summary['rate']:.1%} of {summary['judged']} photographs, {control_words(worth['control'])} in "
-        f"{worth['control_rate']:.1%} ({how}): {100 * worth['difference']:+.1f} points [{low:+.1f}, {high:+.1f}]."
+        f"{worth['control_rate']:.1%} ({source}): {100 * worth['difference']:+.1f} points [{low:+.1f}, {high:+.1f}]."
     )
 
 
 def control_words(name: str) -> str:
-    """A control as people call it."""
+    """Describe a control in plain words."""
     return _CONTROLS.get(name, f"the control “{name}”")
 
 
 def remarks(photos: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, int, str]]:
-    """Codes of photographs with advice, their number and the first names: the most frequent first, then by name. Advice
-    that says figures of its own photograph is that of the first.
+    """Group photographs by code and advice: (code, advice, their number, the first names), the most frequent first,
+    then by code.
     """
-    alike: dict[tuple[str, str], list[str]] = {}
+    groups: dict[tuple[str, str], list[str]] = {}
     for photo in photos:
         if photo["code"]:
-            alike.setdefault((photo["code"], photo["advice"]), []).append(photo["file"])
-    rows = ((code, advice, len(files), summarize_names(files)) for (code, advice), files in alike.items())
+            groups.setdefault((photo["code"], photo["advice"]), []).append(photo["file"])
+    rows = ((code, advice, len(files), summarize_names(files)) for (code, advice), files in groups.items())
     return sorted(rows, key=lambda row: (-row[2], row[:2]))
 
 
 def recognition_meaning(model: Mapping[str, Any]) -> str:
-    """What it means that this network of a promise recognizes the object; of a classifier that is plain."""
+    """Explain when a detector of a promise recognizes the object; empty for a classifier."""
     if model["least_score"] is None:
         return ""
     return (
@@ -77,22 +76,22 @@ def recognition_meaning(model: Mapping[str, Any]) -> str:
 
 
 def promise_lines(promise: Any, background: str = "") -> list[str]:
-    """The promised rate, what stood behind the object, and how it compares with each control."""
-    (low, high), target, (first, *others) = promise.interval, promise.target, promise.models
+    """Sum up a promise: the rate, the background of its views, and the difference to each control."""
+    (low, high), target, (first, *more_models) = promise.interval, promise.target, promise.models
     meaning = recognition_meaning(first.model_dump())
     return [
         promise.headline,
         f'promise ({target.goal} "{target.label}"): recognized in {promise.rate:.1%} of {promise.n} unseen conditions '
         f"in {promise.sessions} sessions "
         f"[{low:.1%}, {high:.1%}] by {first.name}{background and f', before {background}'}",
-        *(f"  also {m.name}: {m.rate:.1%} [{m.interval[0]:.1%}, {m.interval[1]:.1%}]" for m in others),
+        *(f"  also {m.name}: {m.rate:.1%} [{m.interval[0]:.1%}, {m.interval[1]:.1%}]" for m in more_models),
         *([meaning] if meaning else []),
         *_control_lines({kind: claim.model_dump() for kind, claim in promise.controls.items()}),
     ]
 
 
 def imported_lines(imported: Mapping[str, Any]) -> list[str]:
-    """What became of a picture that was made elsewhere."""
+    """Sum up an imported picture: its size in print, and how far the printer misses its colors."""
     width, height = imported["picture_px"]
     return [
         f"{imported['file']}: {width} × {height} pixels, printed at {imported['dpi']:.0f} dpi; {imported['printer']} "
@@ -103,7 +102,7 @@ def imported_lines(imported: Mapping[str, Any]) -> list[str]:
 
 
 def evaluation_lines(result: Mapping[str, Any]) -> list[str]:
-    """Each network's rate and controls."""
+    """Sum up an evaluation: each network's rate and controls."""
     lines = []
     for name, rates in result["models"].items():
         low, high = rates["interval"]
@@ -115,10 +114,10 @@ def evaluation_lines(result: Mapping[str, Any]) -> list[str]:
 
 
 def verdict_lines(report: Any) -> list[str]:
-    """What the patch is worth, the verdict, and the counts behind them."""
+    """Sum up a report: the patch's benefit, the verdict on the promise, and the counts behind them."""
     summary = report.summary
-    plain = summary.model_dump()
-    lines = [f"{headline_of(plain)}. {benefit_sentence(plain)}"]
+    data = summary.model_dump()
+    lines = [f"{headline_of(data)}. {benefit_sentence(data)}"]
     lines.append(f"verdict: {summary.verdict} (effect: {summary.effect}). {summary.reason}".strip())
     lines += [summary.next_step] if summary.next_step else []
     if summary.background:
@@ -145,13 +144,13 @@ def verdict_lines(report: Any) -> list[str]:
 
 
 def _estimated_lines(estimated: Any) -> list[str]:
-    """The effect as estimated from the photographs themselves, by control."""
+    """Sum up the effect as estimated by rendering controls into the photographs."""
     if not estimated.controls:
         return [
-            f"effect not estimated: {estimated.agree:.0%} of {estimated.photos} photographs say of the design put "
-            "back into them what they say themselves"
+            f"effect not estimated: the network gives the original answer in {estimated.agree:.0%} of "
+            f"{estimated.photos} photographs when the design is rendered back into them"
         ]
-    head = f"estimated by putting controls into {estimated.photos} photographs ({estimated.agree:.0%} agree):"
+    head = f"estimated by rendering controls into {estimated.photos} photographs ({estimated.agree:.0%} agree):"
     return [head, *_control_lines({control.name: control.model_dump() for control in estimated.controls})]
 
 
@@ -159,9 +158,9 @@ def _control_lines(controls: Mapping[str, Mapping[str, Any]]) -> list[str]:
     rows = []
     for kind, claim in controls.items():
         low, high = (100 * bound for bound in claim["difference_interval"])
-        seen = f" of {claim['n']}" if claim.get("n") else ""
+        of_count = f" of {claim['n']}" if claim.get("n") else ""
         rows.append(
-            f"  {kind:>6}: {claim['rate']:6.1%}{seen}   "
+            f"  {kind:>6}: {claim['rate']:6.1%}{of_count}   "
             f"difference {100 * claim['difference']:+.1f} points [{low:+.1f}, {high:+.1f}]"
         )
     return rows

@@ -1,9 +1,9 @@
-"""Write a report: report.json as it is, report.csv for spreadsheets and statistics, report.html for people.
+"""Write a report: report.json with all data, report.csv for spreadsheets and statistics, report.html for people.
 
-In: the report and its manifest as plain data, and the pictures that lie in the report's folder. Out: files there. The
-page needs nothing from outside of itself: styles are inline, pictures are data URIs, there is no script. In the table
-the nine entries of a homography and the predictions of every network have columns of their own; what was not measured
-is an empty cell. The same input gives the same bytes.
+In: the report and its manifest as plain data, and the pictures in the report's folder. Out: files in that folder. The
+page is self-contained: styles are inline, pictures are data URIs, there is no script. In the CSV each of the nine
+entries of a homography and each network's predictions have their own columns; a figure that was not measured is an
+empty cell. The same input gives the same bytes.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any
 
 from patchproof.base.output import make_folder, write_atomically
 from patchproof.report.images import DELTA_TOP, data_uri, saved_pictures
-from patchproof.report.page import page
+from patchproof.report.page import render_page
 from patchproof.report.plots import ledger_plot, recognition_plot, scale_plot
 from patchproof.report.words import VERDICTS, benefit_sentence, headline_of, recognition_meaning, remarks
 
@@ -44,14 +44,14 @@ def write_report(
     pictures = {photo["file"]: saved_pictures(out / "pictures", photo["file"]) for photo in report["photos"]}
     write_atomically(out / "report.json", json.dumps(report, indent=1, allow_nan=False) + "\n")
     write_atomically(out / "report.csv", photos_csv(report["photos"]))
-    write_atomically(out / "report.html", render(report, manifest, pictures, ledger))
+    write_atomically(out / "report.html", report_html(report, manifest, pictures, ledger))
     return out / "report.html"
 
 
-def render(
+def report_html(
     report: Mapping, manifest: Mapping, encoded: Mapping[str, Mapping[str, bytes]], ledger: Mapping | None
 ) -> str:
-    """The page's HTML; `encoded` are JPEG or PNG bytes by photo and kind."""
+    """Render the page's HTML; `encoded` are JPEG or PNG bytes by photo and kind."""
     promise, summary, photos = manifest.get("promise"), report["summary"], report["photos"]
     judged = [photo for photo in photos if photo["status"] != "rejected"]
     plots, primary = [(scale_plot(judged), "chart of the print's scale")], None
@@ -62,7 +62,7 @@ def render(
             for name, label in _PLOTS
         ]
     estimated = summary["effect"] == "not_tested" and (summary["estimated"] or {}).get("controls")
-    return page(
+    return render_page(
         "page.html.j2",
         report=report,
         summary=summary,
@@ -96,7 +96,7 @@ def render(
 
 
 def _bars(summary: Mapping, promise: Mapping | None, controls: Sequence[Mapping]) -> list[dict]:
-    """Rows of the chart of rates: name, rate, interval, and which side of the evidence they belong to."""
+    """Rows of the chart of rates: name, rate, interval, and the kind of bar."""
     rows, judged = [], summary["judged"]
     if summary["rate"] is not None:
         rows.append(("These photographs", summary["rate"], summary["interval"], "seen"))
@@ -120,8 +120,8 @@ def _bars(summary: Mapping, promise: Mapping | None, controls: Sequence[Mapping]
 
 
 def photos_csv(photos: Sequence[Mapping[str, Any]]) -> str:
-    """The rows with a head; only the head's first columns where there are no photographs."""
-    rows = [_flat(photo) for photo in photos]
+    """Convert photographs to CSV; without any, only the head's first columns."""
+    rows = [_csv_row(photo) for photo in photos]
     head = list(dict.fromkeys((*_FIRST, *(name for row in rows for name in row))))
     buffer = io.StringIO()
     writer = csv.DictWriter(buffer, head, restval="", lineterminator="\n")
@@ -130,19 +130,21 @@ def photos_csv(photos: Sequence[Mapping[str, Any]]) -> str:
     return buffer.getvalue()
 
 
-def _flat(photo: Mapping[str, Any]) -> dict[str, Any]:
+def _csv_row(photo: Mapping[str, Any]) -> dict[str, Any]:
     row = {}
     for name, value in photo.items():
         if name == "homography_px_from_mm":
             numbers = [None] * 9 if value is None else [number for line in value for number in line]
             row |= {f"{name}_{i // 3}{i % 3}": number for i, number in enumerate(numbers)}
         elif name == "predictions":
-            row |= {f"{model} {key}": _plain(v) for model, prediction in value.items() for key, v in prediction.items()}
+            row |= {
+                f"{model} {key}": _csv_value(v) for model, prediction in value.items() for key, v in prediction.items()
+            }
         else:
-            row[name] = _plain(value)
+            row[name] = _csv_value(value)
     return row
 
 
-def _plain(value: Any) -> Any:
-    """The value; text that a spreadsheet would take for a formula gets an apostrophe."""
+def _csv_value(value: Any) -> Any:
+    """Put an apostrophe before text that a spreadsheet would take for a formula."""
     return f"'{value}" if isinstance(value, str) and value.startswith(("=", "+", "-", "@", "\t", "\r")) else value

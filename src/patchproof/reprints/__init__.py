@@ -1,1 +1,1 @@
-"""A run's page, hung on the object and photographed in simulation: our renderer, one that is not ours, and charts."""
+"""Simulate photographs of a run's page on its object, by our renderer or by path tracing, and of pages lying flat."""

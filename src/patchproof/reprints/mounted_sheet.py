@@ -1,8 +1,8 @@
-"""A printed sheet hung up on its object, to be photographed.
+"""Mount a printed sheet on its object in simulation, and photograph it.
 
-In: a sheet's PDF and the run it was made from, and how it was printed. Out: `MountedSheet`, which takes JPEG photographs
-and says where the page lies in them. What hangs there are the pixels that another library reads from the PDF, so that
-an error in the page shows here and not at the print shop.
+In: a sheet's PDF and the run it was made from, and how it was printed. Out: `MountedSheet`, which takes JPEG
+photographs and computes where the page lies in them. The piece's pixels are read from the PDF by another library, so
+that an error in the page shows here and not at the print shop.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ from patchproof.scene.patch_scene import PatchScene
 from patchproof.sheets.manifest import Manifest
 from patchproof.sheets.pdf_raster import attached_manifest, rasterize_piece
 
-# The print is rasterized this much finer than the closest view can see. Rasterizers of pages average code values: fine
-# patterns of strong colors came out 2 to 5 % too dark at 1.25, within 1 % at 2.5 and at 5.
+# The print is rasterized this much finer than the closest view resolves. Rasterizers of pages average code values: fine
+# patterns of strong colors became 2 to 5 % too dark at 1.25, within 1 % at 2.5 and at 5.
 OVERSAMPLING = 2.5
 DPI_RANGE = (100.0, 400.0)
 _SIDE_POINTS = 8
@@ -46,7 +46,7 @@ _FULL_FRAME_DIAGONAL_MM = 43.2666  # of 36 × 24 mm, to which EXIF's 35 mm focal
 
 @dataclass(frozen=True)
 class PhotoTruth:
-    """What is known of a simulated photograph.
+    """Ground truth of a simulated photograph.
 
     Attributes:
         homography_px_from_mm: 3×3 from page millimeters to pixels; None where the piece is bent or absent.
@@ -70,9 +70,9 @@ class PhotoTruth:
 
 @dataclass(frozen=True)
 class ReprintSetup:
-    """How a sheet was printed and what hangs there: by another printer than the scene's (a name or a file), larger or
-    smaller along x and y, in its place that `control`'s own sheet (mean, gray, noise) or nothing (bare); `path_traced`
-    photographs are by a renderer that is not ours (see `path_traced`).
+    """Options of printing and mounting a sheet: `printer` (a name or a file; None: the scene's), `print_scale` along x
+    and y, `control` in place of the design (mean, gray or noise on its own sheet, or bare: nothing), `path_traced` to
+    render photographs by Mitsuba (see `path_traced`).
     """
 
     printer: str | None = None
@@ -81,7 +81,7 @@ class ReprintSetup:
     path_traced: bool = False
 
     def printer_for(self, scene: Scene) -> Printer:
-        """The printer; the scene's own where none is named."""
+        """Load the printer, or the scene's if none is named."""
         if self.printer is None:
             return load_printer(scene.settings.printer.profile, scene.base)
         return load_printer(self.printer)
@@ -92,11 +92,11 @@ DEFAULT_SETUP = ReprintSetup()
 
 @dataclass(frozen=True, eq=False)
 class MountedSheet:
-    """A stage and the sheet that hangs on it: `sent` is its piece as the PDF has it, sRGB 1×3×H×W, for `printer`."""
+    """A stage and the sheet mounted on it; `sent_srgb` is its piece as sent to `printer`, 1×3×H×W."""
 
     stage: Stage
     manifest: Manifest
-    sent: Tensor
+    sent_srgb: Tensor
     printer: Printer
     how: ReprintSetup = DEFAULT_SETUP
 
@@ -107,27 +107,27 @@ class MountedSheet:
 
     @cached_property
     def piece(self) -> PiecePicture | None:
-        """What hangs there; None where the object is bare."""
+        """The printed piece; None on a bare object."""
         return None if self.how.control == "bare" else self.printed(self.printer.apply)
 
-    def printed(self, shows: Callable[[Tensor], Tensor]) -> PiecePicture:
-        """The piece as a print shows it that makes sRGB as seen of sRGB as sent, 1×3×H×W both."""
-        return PiecePicture.of(shows(self.sent)[0].permute(1, 2, 0).contiguous())
+    def printed(self, apply_print: Callable[[Tensor], Tensor]) -> PiecePicture:
+        """Print the piece: `apply_print` maps sRGB as sent to sRGB as seen, 1×3×H×W both."""
+        return PiecePicture.of(apply_print(self.sent_srgb)[0].permute(1, 2, 0).contiguous())
 
     def photograph(self, conditions: Conditions) -> bytes:
-        """A JPEG file of one view, of the drawn quality, with the camera's focal length in its EXIF data."""
+        """Take a JPEG photograph of one view, of the drawn quality, with the camera's focal length in its EXIF data."""
         if self.how.path_traced:
-            from patchproof.reprints.path_traced import photograph_traced  # whose renderer is an extra of its own
+            from patchproof.reprints.path_traced import photograph_traced  # which needs an optional dependency
 
-            return _stored(photograph_traced(self.stage, self.piece, conditions), self.scene, conditions)
+            return _camera_file(photograph_traced(self.stage, self.piece, conditions), self.scene, conditions)
         return take_photo(self.stage, self.piece, conditions)
 
     def truth(self, conditions: Conditions) -> PhotoTruth:
-        """Return where the page's millimeters fall in the photograph of one view, and its conditions."""
-        drawn: dict[str, Any] = {name: values[0].tolist() for name, values in fields_of(conditions).items()}
-        drawn["print_scale"] = [scale * float(conditions.pose.printed_scale[0]) for scale in self.how.print_scale]
+        """Compute the homography from page millimeters to one view's photograph, marker corners, and its conditions."""
+        values: dict[str, Any] = {name: values[0].tolist() for name, values in fields_of(conditions).items()}
+        values["print_scale"] = [scale * float(conditions.pose.printed_scale[0]) for scale in self.how.print_scale]
         if self.piece is None:
-            return PhotoTruth(None, {}, drawn)
+            return PhotoTruth(None, {}, values)
         surface, homography, cut = surface_of(self.manifest), self.px_from_page(conditions), self.manifest.cut_mm[:2]
         corners = {
             i: geometry.apply_homography(homography, page_mm)
@@ -136,11 +136,11 @@ class MountedSheet:
             for i, page_mm in surface.corners_mm.items()
             if i in surface.piece_ids
         }
-        return PhotoTruth(geometry.normalize_homography(homography) if self.scene.is_flat else None, corners, drawn)
+        return PhotoTruth(geometry.normalize_homography(homography) if self.scene.is_flat else None, corners, values)
 
     def outlines(self, conditions: Conditions) -> dict[str, np.ndarray]:
-        """Corners of the object's box, where it has a mesh, and pixels N×2 round the piece, where it faces the camera
-        of one view.
+        """Outlines N×2 in pixels of one view: corners of the object's box, if it has a mesh, and the piece's border, if
+        it faces the camera.
         """
         scene, outlines = self.scene, {}
         if isinstance(scene, PatchScene):
@@ -154,28 +154,28 @@ class MountedSheet:
         return outlines
 
     def px_from_page(self, conditions: Conditions) -> np.ndarray:
-        """3×3 from page millimeters to pixels of one view; of bent paper its tangent plane's, without the lens."""
+        """3×3 from page millimeters to undistorted pixels of one view; for bent paper by its tangent plane."""
         x, y, *_ = self.manifest.cut_mm
         piece_from_page = np.array([[1, 0, -x], [0, 1, -y], [0, 0, 1.0]])
         photo_px = self.scene.settings.camera.photo_px
         return self.scene.piece_homographies(conditions, photo_px)[0] @ piece_from_page
 
 
-def hang(pdf_path: str | Path, run: Run, how: ReprintSetup = DEFAULT_SETUP) -> MountedSheet:
-    """The PDF's sheet on the object of its run; refused where it is not of this run."""
+def mount_sheet(pdf_path: str | Path, run: Run, how: ReprintSetup = DEFAULT_SETUP) -> MountedSheet:
+    """Mount the PDF's sheet on the object of its run; refused if the sheet is not of this run."""
     manifest, scene = sheet_scene(pdf_path, run)
-    sent, stage = (
+    sent_srgb, stage = (
         sent_pixels(pdf_path, manifest, scene),
         set_stage(require_piece(scene).with_print_scale(how.print_scale)),
     )
-    return MountedSheet(stage, manifest, sent, how.printer_for(scene), how)
+    return MountedSheet(stage, manifest, sent_srgb, how.printer_for(scene), how)
 
 
 def sheet_scene(pdf_path: str | Path, run: Run) -> tuple[Manifest, Scene]:
-    """A sheet's manifest and the scene with its template; refused where the sheet is not of this run."""
+    """Read a sheet's manifest, and set its run's scene to the sheet's template; refused if it is not of this run."""
     manifest = attached_manifest(pdf_path, run.scene.sheet_id)
-    own = run.scene.settings.sheet.template
-    scene = run.scene.with_template(manifest.settings.get("sheet", {}).get("template", own))
+    default = run.scene.settings.sheet.template
+    scene = run.scene.with_template(manifest.settings.get("sheet", {}).get("template", default))
     if manifest.sheet_id != scene.sheet_id:
         expected, do = f"a sheet of this run ({scene.sheet_id})", "name the run that it was made from"
         raise Refused(expected, f"sheet {manifest.sheet_id}", do)
@@ -183,21 +183,21 @@ def sheet_scene(pdf_path: str | Path, run: Run) -> tuple[Manifest, Scene]:
 
 
 def sent_pixels(pdf_path: str | Path, manifest: Manifest, scene: Scene) -> Tensor:
-    """The piece of a PDF as 1×3×H×W sRGB, with more pixels than the closest view can see."""
+    """Rasterize the piece of a PDF to 1×3×H×W sRGB, finer than the closest view resolves."""
     finest = scene.closest_px_per_mm(scene.settings.camera.photo_px)
     dpi = float(np.clip(OVERSAMPLING * finest * MM_PER_INCH, *DPI_RANGE))
     return torch.tensor(rasterize_piece(pdf_path, manifest, dpi)).permute(2, 0, 1)[None] / 255
 
 
 def take_photo(stage: Stage, piece: PiecePicture | None, conditions: Conditions) -> bytes:
-    """A JPEG file of one view with the piece, or of the bare object, as `HungSheet.photograph` makes them."""
+    """Take a JPEG photograph of one view with the piece (None: of the bare object), as `HungSheet.photograph` does."""
     with torch.no_grad():
         picture = photograph(stage, piece, conditions, stage.scene.settings.camera.photo_px, jpeg=False)
-    return _stored(picture, stage.scene, conditions)
+    return _camera_file(picture, stage.scene, conditions)
 
 
-def _stored(picture: Tensor, scene: Scene, conditions: Conditions) -> bytes:
-    """A 1×3×H×W sRGB picture as this scene's camera writes it."""
+def _camera_file(picture: Tensor, scene: Scene, conditions: Conditions) -> bytes:
+    """Encode a 1×3×H×W sRGB picture as the scene's camera does: JPEG, with its focal length in EXIF data."""
     from PIL import Image
 
     exif, photo_px = Image.Exif(), scene.settings.camera.photo_px
@@ -208,6 +208,6 @@ def _stored(picture: Tensor, scene: Scene, conditions: Conditions) -> bytes:
 
 
 def jpeg_of(picture: Tensor, conditions: Conditions, options: dict[str, Any] | None = None) -> bytes:
-    """A 1×3×H×W sRGB picture as a JPEG file of the view's drawn quality; `options` are Pillow's."""
+    """Encode a 1×3×H×W sRGB picture as JPEG of the view's drawn quality; `options` are Pillow's."""
     codes = photo_codes_from_srgb(picture[0].permute(1, 2, 0).cpu().numpy())
     return image_bytes(codes, "JPEG", {"quality": int(conditions.sensor.jpeg[0])} | (options or {}))

@@ -1,7 +1,7 @@
-"""Simulated photographs of a page that lies flat: any printer, uneven light, and the reprint's camera.
+"""Simulate photographs of a page that lies flat: any printer, uneven light, and the reprint's camera.
 
 In: a page as pixels, a printer as a function from sRGB to light, a seed. Out: pages as light, photographs as JPEG
-files. Their light is less even than that of scenes, so that readers of charts have to even it out: a lamp stands near
+files. Their light is less even than that of scenes, so that readers of charts have to correct it: a lamp stands near
 the page, and the picture's corners are darker. Blur, noise and clipping are those of `channel`.
 """
 
@@ -37,7 +37,7 @@ PHOTO_PX = (1600, 1200)
 
 @dataclass(frozen=True)
 class _Sources:
-    """What lights a page: ambient light, the sun's on the page, and a lamp's on what faces it in the page's middle."""
+    """Light on a page: ambient, the sun's, and a lamp's on a surface that faces it in the page's middle."""
 
     ambient: float
     sun: float
@@ -47,24 +47,24 @@ class _Sources:
 
 @dataclass(frozen=True)
 class Shot:
-    """A photograph's file, and the light of bare paper in the middle of the page as its sensor saw it (3,)."""
+    """A photograph's file, and the light (3,) of blank paper in the middle of the page at its sensor."""
 
     file: bytes
     paper: np.ndarray
 
     @cached_property
     def photo(self) -> Photo:
-        """The file as it is read."""
+        """The file's pixels, as a photograph that was read."""
         return Photo(image_pixels(self.file), None)
 
 
-def page_light(page: np.ndarray, shows: PrintFunction) -> np.ndarray:
-    """A page's uint8 H×W×3 as the light of its print, of bare paper 1; a tall page is turned as photographs lie."""
+def page_light(page: np.ndarray, apply_printer: PrintFunction) -> np.ndarray:
+    """Convert a page (uint8 H×W×3) to its print's light, relative to blank paper, turned to landscape."""
     page = np.rot90(page) if page.shape[0] > page.shape[1] else page
-    white = shows(np.ones((1, 3)))
+    white = apply_printer(np.ones((1, 3)))
     packed, index = np.unique(page.reshape(-1, 3) @ np.array([65536, 256, 1]), return_inverse=True)
     colors = np.stack([packed >> 16, packed >> 8 & 255, packed & 255], 1) / 255
-    return (shows(colors) / white)[index.reshape(-1)].reshape(page.shape).astype(np.float32)
+    return (apply_printer(colors) / white)[index.reshape(-1)].reshape(page.shape).astype(np.float32)
 
 
 def reprint_pages(
@@ -76,19 +76,19 @@ def reprint_pages(
     seed: int | None = None,
     overwrite: bool = False,
 ) -> None:
-    """Write n photographs of the pages of a PDF, in turn, lying flat: of pages that belong to no run, as blank ones,
-    charts and boards. `how` names their printer (without a name: coated) and the print's size.
+    """Write n photographs of the pages of a PDF, in turn, lying flat: for pages that belong to no run, such as blank
+    ones, charts and boards. `how` names their printer (None: coated) and the print's scale.
     """
     printer = load_printer(how.printer or "coated")
 
-    def shows(colors: np.ndarray) -> np.ndarray:
+    def apply_printer(colors: np.ndarray) -> np.ndarray:
         sent = torch.tensor(colors.T[None, :, :, None], dtype=torch.float32)
         return linear_from_srgb(printer.apply(sent)[0, :, :, 0].T.numpy())
 
     with new_folder(out, ("photo_*.jpg",), overwrite) as folder:
         pages = []
         for number in range(page_count(pdf_path)):
-            light = page_light(rasterize_page(pdf_path, number + 1, PX_PER_MM * MM_PER_INCH), shows)
+            light = page_light(rasterize_page(pdf_path, number + 1, PX_PER_MM * MM_PER_INCH), apply_printer)
             pages.append(cv2.resize(light, None, fx=how.print_scale[0], fy=how.print_scale[1]))
         for i in range(n):
             shot = photograph_page(pages[i % len(pages)], (seed or 0) + i)
@@ -96,7 +96,7 @@ def reprint_pages(
 
 
 def photograph_page(page: np.ndarray, seed: int, camera: Camera | None = None) -> Shot:
-    """One photograph of a page lying flat, from above and a little from the side; all conditions follow the seed."""
+    """Photograph a page that lies flat, from above within 25° to each side; the seed determines all conditions."""
     rng = np.random.default_rng([seed, 4])
     page_mm = np.array(page.shape[1::-1]) / PX_PER_MM
     distance = rng.uniform(1.2, 1.55) * page_mm.max()
@@ -105,13 +105,13 @@ def photograph_page(page: np.ndarray, seed: int, camera: Camera | None = None) -
     flat = np.eye(4)
     flat[:2, 3] = -page_mm / 2
     px_from_mm = geometry.plane_homography(geometry.intrinsics(50, PHOTO_PX), pose, flat)
-    sources = _light(rng)
+    sources = _draw_sources(rng)
     white_balance = 1 + rng.uniform(-0.15, 0.15, 3)
     corners = geometry.rect_corners((0, 0, *page_mm))
-    at_middle, brightest = (_falling(at - page_mm / 2, sources) for at in (corners.mean(0)[None], corners))
-    exposure = rng.uniform(0.5, 0.85) / (brightest.max() * white_balance.max())
+    middle_light, corner_light = (_light_at(mm - page_mm / 2, sources) for mm in (corners.mean(0)[None], corners))
+    exposure = rng.uniform(0.5, 0.85) / (corner_light.max() * white_balance.max())
     light = _light_in_picture(px_from_mm, page_mm / 2, sources)
-    raw = _warped(page, px_from_mm) * (light * _left_by_vignetting(rng.uniform(0, 0.2)))[..., None]
+    raw = _warp_page(page, px_from_mm) * (light * _vignetting(rng.uniform(0, 0.2)))[..., None]
     sensor = Sensor(
         blur_px=np.array([rng.uniform(0, 1)]),
         exposure_ev=np.array([np.log2(exposure)]),
@@ -123,45 +123,45 @@ def photograph_page(page: np.ndarray, seed: int, camera: Camera | None = None) -
     picture = torch.tensor(raw.transpose(2, 0, 1)[None], dtype=torch.float32)
     codes = develop(picture, sensor, 1.0, jpeg=False, camera=camera)[0].permute(1, 2, 0).numpy().astype(float)
     file = image_bytes(photo_codes_from_srgb(codes), "JPEG", {"quality": int(sensor.jpeg[0])})
-    return Shot(file, at_middle * exposure * white_balance)
+    return Shot(file, middle_light * exposure * white_balance)
 
 
-def _light(rng: np.random.Generator) -> _Sources:
-    """The lamp is 300 to 600 mm away, so that one side of the page is up to twice as light."""
+def _draw_sources(rng: np.random.Generator) -> _Sources:
+    """Draw the sources; the lamp is 300 to 600 mm away, so that one side of the page is up to twice as bright."""
     lamp = geometry.orbit(rng.uniform(-60, 60), rng.uniform(-60, 60), (0, 0, -1.0), (0, -1.0, 0)) * rng.uniform(
         300, 600
     )
     toward = geometry.orbit(rng.uniform(-50, 50), rng.uniform(-50, 50), (0, 0, -1.0), (0, -1.0, 0))
-    near = rng.uniform(0.2, 0.8)
-    return _Sources(rng.uniform(0.3, 0.7), rng.uniform(0, 0.5) * -toward[2], near, lamp)
+    lamp_light = rng.uniform(0.2, 0.8)
+    return _Sources(rng.uniform(0.3, 0.7), rng.uniform(0, 0.5) * -toward[2], lamp_light, lamp)
 
 
-def _falling(from_middle_mm: np.ndarray, sources: _Sources) -> np.ndarray:
-    """Light N on points N×2 of the page's plane; the lamp's falls with the square of its distance."""
-    away = sources.lamp_mm - np.column_stack([from_middle_mm, np.zeros(len(from_middle_mm))])
-    distance = np.linalg.norm(away, axis=1)
-    lamp = sources.lamp * (np.linalg.norm(sources.lamp_mm) / distance) ** 2 * -away[:, 2] / distance
+def _light_at(from_middle_mm: np.ndarray, sources: _Sources) -> np.ndarray:
+    """Light (N) at points N×2 of the page's plane; the lamp's falls with the square of its distance."""
+    to_lamp = sources.lamp_mm - np.column_stack([from_middle_mm, np.zeros(len(from_middle_mm))])
+    distance = np.linalg.norm(to_lamp, axis=1)
+    lamp = sources.lamp * (np.linalg.norm(sources.lamp_mm) / distance) ** 2 * -to_lamp[:, 2] / distance
     return sources.ambient + sources.sun + lamp
 
 
-def _left_by_vignetting(lost: float) -> np.ndarray:
-    """H×W: what is left of a picture's light that falls as cos⁴ of an angle does, down to 1 - `lost` in the corners."""
+def _vignetting(loss: float) -> np.ndarray:
+    """Factors H×W of a picture's light, which falls as cos⁴ of an angle does, down to 1 - `loss` in the corners."""
     x, y = (np.arange(side) + 0.5 - side / 2 for side in PHOTO_PX)
     square = (y[:, None] ** 2 + x**2) * 4 / (PHOTO_PX[0] ** 2 + PHOTO_PX[1] ** 2)
-    return (1 + ((1 - lost) ** -0.5 - 1) * square) ** -2
+    return (1 + ((1 - loss) ** -0.5 - 1) * square) ** -2
 
 
 def _light_in_picture(px_from_mm: np.ndarray, middle_mm: np.ndarray, sources: _Sources) -> np.ndarray:
-    """Light H×W on the page's plane as the photograph sees it; computed at every 8th pixel, since it is smooth."""
+    """Light on the page's plane at each pixel of the photograph, H×W; computed at every 8th, since it is smooth."""
     width, height = PHOTO_PX
     x, y = np.meshgrid(np.arange(4.0, width, 8), np.arange(4.0, height, 8))
-    at = geometry.apply_homography(np.linalg.inv(px_from_mm), np.stack([x.ravel(), y.ravel()], 1))
-    return cv2.resize(_falling(at - middle_mm, sources).reshape(x.shape), PHOTO_PX, interpolation=cv2.INTER_LINEAR)
+    mm = geometry.apply_homography(np.linalg.inv(px_from_mm), np.stack([x.ravel(), y.ravel()], 1))
+    return cv2.resize(_light_at(mm - middle_mm, sources).reshape(x.shape), PHOTO_PX, interpolation=cv2.INTER_LINEAR)
 
 
-def _warped(page: np.ndarray, px_from_mm: np.ndarray) -> np.ndarray:
-    """The page in the picture's pixels before a gray table, averaged over pixels."""
-    finer = PX_PER_MM / np.sqrt(np.linalg.det((px_from_mm / px_from_mm[2, 2])[:2, :2]))
-    soft = cv2.GaussianBlur(page, (0, 0), 0.35 * float(finer))  # a pixel's own width, before it is sampled once
+def _warp_page(page: np.ndarray, px_from_mm: np.ndarray) -> np.ndarray:
+    """Warp a page to the picture, on a gray table, averaged over pixels."""
+    page_px_per_px = PX_PER_MM / np.sqrt(np.linalg.det((px_from_mm / px_from_mm[2, 2])[:2, :2]))
+    blurred = cv2.GaussianBlur(page, (0, 0), 0.35 * float(page_px_per_px))  # over a pixel, which is sampled once
     matrix = index_homography(px_from_mm @ np.diag([1 / PX_PER_MM, 1 / PX_PER_MM, 1]))
-    return cv2.warpPerspective(soft, matrix, PHOTO_PX, flags=cv2.INTER_LINEAR, borderValue=(0.3, 0.28, 0.25))
+    return cv2.warpPerspective(blurred, matrix, PHOTO_PX, flags=cv2.INTER_LINEAR, borderValue=(0.3, 0.28, 0.25))

@@ -1,11 +1,10 @@
-"""Photographs by a renderer that is not ours: Mitsuba 3 traces paths through the same scene under the same conditions.
+"""Photograph a scene by an independent renderer: Mitsuba 3 traces paths under the same conditions.
 
-In: a stage, the printed piece (or none) and one view's conditions. Out: a picture, as `render.photograph` gives. What
-our renderer leaves out is here: shadows that are cast, with soft edges, light that goes back and forth between paper,
-object and what stands beside it, and depth of field. How large the light and the lens are follows from `draw_optics`,
-since conditions do not say. What stays ours: the printer, the camera behind its lens (`channel.camera`), and the
-picture in the background, which lights nothing. Levels follow `channel.light`: a surface with nothing around it comes
-out alike.
+In: a stage, the printed piece (or none) and one view's conditions. Out: a picture, as `render.photograph` makes it.
+Mitsuba adds the effects that our renderer leaves out: cast shadows with soft edges, light that is reflected between
+paper and object, and depth of field. Conditions do not have the size of light and lens: `draw_optics` draws them. Our
+own are the printer, the camera behind its lens (`channel.camera`), and the picture in the background, which lights
+nothing. Levels follow `channel.light`: a surface with nothing around it gets the same light.
 
 Left out on purpose: colored light, transparency, scenes made of pictures.
 
@@ -46,23 +45,23 @@ APERTURE_MM = (1.0, 6.0)  # from a phone's lens to a small camera's
 PASSES, PASS_SAMPLES = 2, 16  # paths per pixel; a pass at a time bounds memory: 2 GB at 2 megapixels
 MOST_BOUNCES = 4  # of a path, the light included: paper lit by what paper lights
 _SQUARE = 1e-4  # how far a pixel's sides may differ
-# Older ones end the whole process: they cannot compile the minimum that Dr.Jit asks for.
+# Older versions end the whole process: they cannot compile Dr.Jit's minimum.
 _FIRST_LLVM = 17
 _FAR = 20.0  # the directional light's distance in lengths of the object
 _SKY_PX = (64, 128)
-_SKY_WEIGHT = 1e-3  # of paths sent to a light on purpose; 0 is refused where there is no other light
+_SKY_WEIGHT = 1e-3  # share of light samples; Mitsuba refuses 0 if there is no other light
 
 
 @dataclass(frozen=True)
 class Optics:
-    """What conditions do not say: the directional light's radius as an angle, and the lens's diameter."""
+    """Sizes that conditions do not have: the directional light's radius as an angle, and the lens's diameter."""
 
     light_radius_deg: float
     aperture_mm: float
 
 
 def draw_optics(conditions: Conditions) -> Optics:
-    """One view's light and lens, evenly drawn; they follow from the view's noise seed."""
+    """Draw one view's light and lens evenly, by the view's noise seed."""
     u = np.random.default_rng([int(conditions.sensor.noise_seed[0]), 1]).random(2)
     ends = zip((LIGHT_RADIUS_DEG, APERTURE_MM), u, strict=True)
     return Optics(*(float(low + (high - low) * share) for (low, high), share in ends))
@@ -71,7 +70,7 @@ def draw_optics(conditions: Conditions) -> Optics:
 def photograph_traced(
     stage: Stage, piece: PiecePicture | None, conditions: Conditions, optics: Optics | None = None
 ) -> Tensor:
-    """1×3×H×W sRGB: the photograph of one view, without JPEG; `piece=None` is the bare object."""
+    """Photograph one view, without JPEG: 1×3×H×W sRGB; `piece=None` is the bare object."""
     light = traced_light(stage, piece, conditions, draw_optics(conditions) if optics is None else optics)
     if stage.camera is not None:
         light = stage.camera.distort_pictures(light, stage.scene.settings.camera.photo_px)
@@ -79,7 +78,7 @@ def photograph_traced(
 
 
 def traced_light(stage: Stage, piece: PiecePicture | None, conditions: Conditions, optics: Optics) -> Tensor:
-    """1×3×H×W linear light before lens distortion and sensor, of the size of the lens's frame."""
+    """Trace one view's linear light before lens distortion and sensor: 1×3×H×W, of the size of the lens's frame."""
     scene, mi = _traceable(stage), mitsuba()
     photo_px = scene.settings.camera.photo_px
     frame = lens_frame(stage, scene, photo_px)
@@ -94,22 +93,19 @@ def traced_light(stage: Stage, piece: PiecePicture | None, conditions: Condition
     if piece is not None:
         parts["piece"] = _piece(mi, scene, piece, conditions)
     left, top, width, height = box
-    traced, total = mi.load_dict(parts), np.zeros((height, width, 4))
-    for i in range(PASSES):  # seeds of one view are its own
+    mitsuba_scene, total = mi.load_dict(parts), np.zeros((height, width, 4))
+    for i in range(PASSES):  # no two views share a seed
         seed = (int(conditions.sensor.noise_seed[0]) * PASSES + i) % 2**32
-        total = total + np.array(mi.render(traced, spp=PASS_SAMPLES, seed=seed), np.float64) / PASSES
-    whole = LINEAR_FROM_CODE[backgrounds(scene, conditions, photo_px, frame)[0]]
-    inside = whole[top : top + height, left : left + width]
+        total = total + np.array(mi.render(mitsuba_scene, spp=PASS_SAMPLES, seed=seed), np.float64) / PASSES
+    light = LINEAR_FROM_CODE[backgrounds(scene, conditions, photo_px, frame)[0]]
+    inside = light[top : top + height, left : left + width]
     inside *= 1 - total[..., 3:].clip(0, 1)
     inside += total[..., :3] / PAPER_REFLECTANCE
-    return torch.tensor(whole, dtype=torch.float32).permute(2, 0, 1)[None]
+    return torch.tensor(light, dtype=torch.float32).permute(2, 0, 1)[None]
 
 
 def mitsuba() -> ModuleType:
-    """Mitsuba with a variant set: compiled by LLVM where there is one that can, else the slow one that needs nothing.
-
-    Refused where it is not installed.
-    """
+    """Load Mitsuba: with LLVM if a recent one is installed, else its slow variant. Refused if Mitsuba is missing."""
     try:
         drjit, mi = import_module("drjit"), import_module("mitsuba")
     except ImportError as error:
@@ -119,7 +115,7 @@ def mitsuba() -> ModuleType:
             mi.set_variant("llvm_ad_rgb")
             if drjit.detail.llvm_version()[0] < _FIRST_LLVM:
                 mi.set_variant("scalar_rgb")
-        except ImportError:  # what Dr.Jit raises where it finds no library
+        except ImportError:  # raised by Dr.Jit if it finds no LLVM
             mi.set_variant("scalar_rgb")
     if mi.variant().startswith("llvm"):
         drjit.set_thread_count(torch.get_num_threads())
@@ -127,7 +123,7 @@ def mitsuba() -> ModuleType:
 
 
 def _traceable(stage: Stage) -> MeshScene:
-    """The stage's scene; refused where Mitsuba cannot show it."""
+    """The stage's scene; refused if it has no mesh, or a camera whose pixels are not square."""
     scene = require_mesh(stage.scene, "a scene with a mesh to trace paths in", "leave --path-traced out")
     matrix = scene.matrix_px(scene.settings.camera.photo_px)
     if abs(matrix[0, 0] / matrix[1, 1] - 1) > _SQUARE:
@@ -136,12 +132,12 @@ def _traceable(stage: Stage) -> MeshScene:
 
 
 def _box(scene: MeshScene, conditions: Conditions, frame: Frame, aperture_mm: float) -> tuple[int, int, int, int]:
-    """The part of the frame that shows anything but background: left, top, width and height, 1 at least."""
+    """Bound the part of the frame that shows object and piece: left, top, width and height, each 1 at least."""
     points = [scene.mesh.vertices, require_piece(scene).paper()[0]] if scene.HAS_PIECE else [scene.mesh.vertices]
     px = geometry.project(frame.matrix_px, scene.camera_from_world(conditions)[0], np.concatenate(points))
     if not np.isfinite(px).all():  # some of it lies behind the camera
         return 0, 0, *frame.size_px
-    # out of focus and printed larger it reaches farther
+    # the margin covers blur out of focus and prints that are larger
     margin = 8 + 0.05 * np.ptp(px, axis=0) + frame.matrix_px[0, 0] * aperture_mm / conditions.pose.distance_mm[0]
     size = np.array(frame.size_px)
     low = np.clip(np.floor(px.min(0) - margin), 0, size - 1).astype(int)
@@ -150,7 +146,7 @@ def _box(scene: MeshScene, conditions: Conditions, frame: Frame, aperture_mm: fl
 
 
 def _sensor(mi: ModuleType, scene: MeshScene, conditions: Conditions, frame: Frame, box, aperture_mm: float) -> dict:
-    """A thin lens that is focused on the piece's middle; a pinhole where the picture's middle is not the lens's.
+    """A thin lens focused on the piece's middle; a pinhole if the principal point is not the picture's middle.
 
     Mitsuba's cameras have x left and y up.
     """
@@ -175,7 +171,7 @@ def _sensor(mi: ModuleType, scene: MeshScene, conditions: Conditions, frame: Fra
             "height": height,
             **dict(zip(("crop_offset_x", "crop_offset_y", "crop_width", "crop_height"), box, strict=True)),
             "pixel_format": "rgba",
-            "rfilter": {"type": "box"},  # what a pixel collects
+            "rfilter": {"type": "box"},  # a pixel averages over its own square
         },
         "sampler": {"type": "multijitter", "sample_count": PASS_SAMPLES},
     }
@@ -186,7 +182,7 @@ def _lights(mi: ModuleType, scene: MeshScene, light: Light, radius_deg: float) -
 
     An outgoing radiance of 1 is white: paper of reflectance ρ gives ρ·E/π, so that E is π where our light is 1.
     """
-    # almost no paths are sent to light from all around: those that surfaces scatter find it anyway
+    # hardly any light samples go to the surroundings: scattered paths reach them anyway
     sky = mi.Bitmap(np.full((*_SKY_PX, 3), light.ambient[0], np.float32))
     emitters = {"sky": {"type": "envmap", "bitmap": sky, "sampling_weight": _SKY_WEIGHT}}
     if light.directional[0] > 0:
@@ -205,26 +201,25 @@ def _lights(mi: ModuleType, scene: MeshScene, light: Light, radius_deg: float) -
 
 
 def _piece(mi: ModuleType, scene: MeshScene, picture: PiecePicture, conditions: Conditions):
-    """The printed piece as large as it came out of the printer, plain paper on its back."""
+    """The printed piece as large as it was printed, with plain paper on its back."""
     placement = require_patch(scene).placement
     scale = geometry.scaling_about(scene.middle_mm, conditions.pose.printed_scale[0])
     vertices = placement.vertices_mm @ scale[:3, :3].T + scale[:3, 3]
-    printed = _printed(picture, conditions.print)
-    front = _diffuse(_texture(mi, printed, "clamp"))
+    front = _diffuse(_texture(mi, _print_light(picture, conditions.print), "clamp"))
     back = _diffuse({"type": "rgb", "value": PAPER_BACK_LINEAR * PAPER_REFLECTANCE})
     uv = placement.piece_mm / np.array(placement.size_mm)
     bsdf = {"type": "twosided", "front": front, "back": back}
     return _mesh(mi, "piece", vertices, placement.faces, placement.normals, uv, bsdf)
 
 
-def _printed(picture: PiecePicture, drawn: Print) -> np.ndarray:
-    """H×W×3 light of this print under white light, beside the sheet that light is measured by."""
-    change = torch.tensor([drawn.dot_gain[0], drawn.density[0], drawn.black[0]]).to(picture.srgb)
+def _print_light(picture: PiecePicture, variation: Print) -> np.ndarray:
+    """Light (H×W×3) of a print with this variation, relative to white paper."""
+    change = torch.tensor([variation.dot_gain[0], variation.density[0], variation.black[0]]).to(picture.srgb)
     return vary_print(linear_from_srgb(picture.srgb), change).numpy()
 
 
 def _object(mi: ModuleType, mesh: Mesh) -> list:
-    """One Mitsuba mesh per material, its corners apart: they have normals and texture coordinates of their own."""
+    """One Mitsuba mesh per material; corners are not shared, since each has its normal and texture coordinates."""
     shapes = []
     for number, material in enumerate(mesh.materials):
         faces = mesh.face_material == number
@@ -236,7 +231,9 @@ def _object(mi: ModuleType, mesh: Mesh) -> list:
         if material.texture_srgb is not None:
             if np.ptp(colors, axis=0).max() > 1 / 255:
                 raise Refused(
-                    "objects whose textures are not colored by corners, too", material.name, "bake the colors in"
+                    "objects whose materials have a texture or colors of corners, not both",
+                    f"both in {material.name}",
+                    "bake the colors in",
                 )
             color = _texture(mi, LINEAR_FROM_CODE[material.texture_srgb] * colors[0], "repeat")
         corners = mesh.vertices[mesh.faces[faces]].reshape(-1, 3)
@@ -254,13 +251,13 @@ def _diffuse(reflectance: dict) -> dict:
 
 
 def _texture(mi: ModuleType, linear: np.ndarray, wrap: str) -> dict:
-    """A picture of light beside white as reflectances."""
+    """Convert light relative to white paper to a texture of reflectances."""
     bitmap = mi.Bitmap((linear * PAPER_REFLECTANCE).clip(0, 1).astype(np.float32))
     return {"type": "bitmap", "bitmap": bitmap, "raw": True, "wrap_mode": wrap}
 
 
 def _mesh(mi: ModuleType, name: str, vertices, faces, normals, uv, bsdf: dict, colors: np.ndarray | None = None):
-    """Triangles as a Mitsuba shape; `uv` runs down from the top-left, as everywhere here."""
+    """Make a Mitsuba shape of triangles; `uv` (0, 0) is the top left, and v runs down."""
     properties = mi.Properties()
     properties["bsdf"] = mi.load_dict(bsdf)
     mesh = mi.Mesh(

@@ -1,9 +1,8 @@
-"""Where the piece goes on the object: a picture of the object's side, and millimeters to its edges.
+"""Draw where the piece goes on the object: a picture of the object's side, and distances to its edges.
 
-In: a scene with a mesh and its piece. Out: a `PlacementPicture` for the sheet's last page, with millimeters to the object's edges
-or, of bent paper, along its surface. The picture is rendered by the project's
-own rasterizer from so far away that it is a plan: at 60 times the object's length perspective moves nothing by more
-than 1 % of the object's depth.
+In: a scene with a mesh and its piece. Out: a `PlacementPicture` for the sheet's last page, with millimeters to the
+object's edges or, for bent paper, along its surface. The picture is rendered from a distance of 60 times the object's
+length, at which perspective moves nothing by more than 1 % of the object's depth.
 """
 
 from __future__ import annotations
@@ -37,35 +36,35 @@ from patchproof.sheets.tiles import plan_tiles
 if TYPE_CHECKING:
     from patchproof.scene.tape_measure import TapeMeasurement
 
-AWAY = 60.0  # of the object's length
+DISTANCE_LENGTHS = 60.0  # of the camera, over the object's length
 PICTURE_PX = 600  # along the longer side
-ROOM = 1.06  # of the object's extent
+MARGIN_FACTOR = 1.06  # of the object's extent
 
 
-def hang(scene: PatchScene, template: Template) -> PlacementPicture:
-    """The object seen straight from the piece's side, with the piece's outline and, in tiles, its seams."""
+def draw_plan_view(scene: PatchScene, template: Template) -> PlacementPicture:
+    """Draw the object as seen from the piece's side, with the piece's outline and, in tiles, its seams."""
     # cameras may count their angles from another side
     scene = replace(scene, frame=patch_frame(scene.mesh, scene.settings.patch))
     frame, placement = scene.frame, scene.placement
     axes = np.stack([frame.right, -frame.up])  # millimeters right and down, from the middle of the object
 
-    def flat(points: np.ndarray) -> np.ndarray:
+    def project(points: np.ndarray) -> np.ndarray:  # to the picture's plane
         return np.asarray(points) @ axes.T
 
-    low, high = flat(scene.mesh.vertices).min(0), flat(scene.mesh.vertices).max(0)
-    outline = flat(placement.world(rect_border((0, 0, *placement.size_mm), 16)))  # bent paper has bent edges
-    half = np.maximum(np.abs([low, high, outline.min(0), outline.max(0)]).max(0) * ROOM, 1.0)
+    low, high = project(scene.mesh.vertices).min(0), project(scene.mesh.vertices).max(0)
+    outline = project(placement.world(rect_border((0, 0, *placement.size_mm), 16)))  # bent paper has bent edges
+    half = np.maximum(np.abs([low, high, outline.min(0), outline.max(0)]).max(0) * MARGIN_FACTOR, 1.0)
     seams, names = [], []
     for tile in plan_tiles(template, scene.piece):
-        corners = flat(placement.world(rect_corners(tile.part_mm)))
+        corners = project(placement.world(rect_corners(tile.part_mm)))
         seams += [(tuple(corners[1]), tuple(corners[2])), (tuple(corners[2]), tuple(corners[3]))]
         names.append((tuple(corners.mean(0)), tile.name))
-    measured = None
+    spans = None
     if not placement.is_flat:
-        laid_out = scene.tape_measurements()
-        measured = _spans(laid_out, flat)
-        for tape in laid_out:
-            start, end = flat(tape.points_mm[[0, -1]])
+        tapes = scene.tape_measurements()
+        spans = _spans(tapes, project)
+        for tape in tapes:
+            start, end = project(tape.points_mm[[0, -1]])
             seams.append((tuple(start), tuple(end)))
     return PlacementPicture(
         picture=plan_picture(set_stage(scene), scene.frame, half),
@@ -74,17 +73,17 @@ def hang(scene: PatchScene, template: Template) -> PlacementPicture:
         outline_mm=tuple(map(tuple, outline)),
         seams_mm=tuple(seams),
         names_mm=tuple(names),
-        dimension_chains=measured,
+        dimension_chains=spans,
     )
 
 
 def _spans(
-    laid_out: Sequence[TapeMeasurement], flat: Callable[[np.ndarray], np.ndarray]
+    tapes: Sequence[TapeMeasurement], project: Callable[[np.ndarray], np.ndarray]
 ) -> tuple[tuple[DimensionSpan, ...], tuple[DimensionSpan, ...]]:
-    """The tapes that run across the picture, from the left, and those that run down, from the top."""
+    """Split tapes into those that run across the picture, from the left, and those that run down, from the top."""
     spans: tuple[list[DimensionSpan], list[DimensionSpan]] = ([], [])
-    for tape in laid_out:
-        start, end = flat(tape.points_mm[[0, -1]])
+    for tape in tapes:
+        start, end = project(tape.points_mm[[0, -1]])
         axis = int(np.abs(end - start).argmax())
         ends = sorted((float(start[axis]), float(end[axis])))
         spans[axis].append(DimensionSpan((ends[0], ends[1]), tape.length_mm, tape.end))
@@ -99,12 +98,12 @@ def plan_picture(
     picture_px: int = PICTURE_PX,
     on_piece: np.ndarray | None = None,
 ) -> np.ndarray:
-    """uint8 H×W×3: the object of a stage in even light on white, seen along a frame's normal, spanning ± half_mm.
+    """Render a stage's object in even light on white, seen along a frame's normal, spanning ± half_mm: uint8 H×W×3.
 
-    `on_piece`: uint8 h×w×3 colors over the piece of a scene that has one; they are shown as they are, without light.
+    `on_piece` are colors (uint8 h×w×3) over the scene's piece, which are shown without light.
     """
     scene = require_mesh(stage.scene)
-    distance = AWAY * scene.length_mm
+    distance = DISTANCE_LENGTHS * scene.length_mm
     px_per_mm = picture_px / (2 * half_mm.max())
     width, height = (int(v) for v in np.maximum(np.rint(2 * half_mm * px_per_mm), 16))
     fov = float(np.degrees(2 * np.arctan(half_mm.min() / distance)))
@@ -112,25 +111,26 @@ def plan_picture(
     settings = scene.settings.changed(view=view, camera={"photo_px": (width, height), "file": None})
     white = load_backgrounds(BackgroundSettings(color=(1.0, 1.0, 1.0)), Path())
     plain = replace(stage, scene=replace(scene, settings=settings, frame=frame, backgrounds=white, camera=None))
-    shown = None if on_piece is None else PiecePicture.of(torch.tensor(on_piece, dtype=torch.float32) / 255)
+    piece = None if on_piece is None else PiecePicture.of(torch.tensor(on_piece, dtype=torch.float32) / 255)
     with torch.no_grad():
-        views = render_views(plain, shown, _even(distance, 0.55, 0.45), (width, height))
-        light = _by_rows(shade(views, None))
-        if shown is not None:
+        views = render_views(plain, piece, _frontal_conditions(distance, 0.55, 0.45), (width, height))
+        light = _pixel_rows(shade(views, None))
+        if piece is not None:
             covered = views.on_piece.pixel[views.on_piece.share[:, 0] > 0]
             if len(covered):
-                light[covered] = _by_rows(shade(relight(views, _even(distance, 1.0, 0.0)), shown))[covered]
+                ambient = _frontal_conditions(distance, 1.0, 0.0)
+                light[covered] = _pixel_rows(shade(relight(views, ambient), piece))[covered]
     picture = srgb_from_linear(light.clamp(0, 1)).reshape(height, width, 3).cpu().numpy()
     return photo_codes_from_srgb(picture)
 
 
-def _by_rows(pictures: Tensor) -> Tensor:
-    """1×3×H×W as H·W × 3."""
+def _pixel_rows(pictures: Tensor) -> Tensor:
+    """Reshape 1×3×H×W to H·W × 3."""
     return pictures[0].permute(1, 2, 0).reshape(-1, 3)
 
 
-def _even(distance_mm: float, ambient: float, directional: float) -> Conditions:
-    """One view straight from the front, lit from everywhere and from the upper left."""
+def _frontal_conditions(distance_mm: float, ambient: float, directional: float) -> Conditions:
+    """Conditions of one frontal view in ambient light and directional light from the upper left."""
     return Conditions(
         pose=Pose(distance_mm=np.array([distance_mm])),
         light=Light(

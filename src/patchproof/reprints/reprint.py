@@ -1,9 +1,9 @@
-"""Simulated photographs of a printed sheet on its object (scans of the uncut page: see `scan`).
+"""Simulate photographs of a printed sheet on its object (scans of the uncut page: see `scan`).
 
-In: a sheet's PDF and the run it was made from. Out: a folder of JPEG photographs of that piece on the object, and
-`truth.json` with each one's homography, marker corners and conditions (see `hung_sheet`), and `coco.json` with boxes of
-object and piece. Conditions come from the reprint stream, which nothing else has seen: one print, photographed in one
-session or in several, each with a place, light and camera of its own and in a folder of its own.
+In: a sheet's PDF and the run it was made from. Out: a folder of JPEG photographs of that piece on the object,
+`truth.json` with each one's homography, marker corners and conditions, and `coco.json` with boxes of object and piece.
+Conditions come from the reprint stream, which nothing else uses: one print, photographed in one or several sessions,
+each with its own place, light, camera and folder.
 """
 
 from __future__ import annotations
@@ -23,7 +23,14 @@ from patchproof.base.progress import Progress, no_progress
 from patchproof.base.workers import Workers, fork_workers, open_workers, result_of
 from patchproof.optimizer.run import Run, load_run
 from patchproof.report.coco import LabeledPhoto, coco_json
-from patchproof.reprints.mounted_sheet import DEFAULT_SETUP, MountedSheet, PhotoTruth, ReprintSetup, hang, sheet_scene
+from patchproof.reprints.mounted_sheet import (
+    DEFAULT_SETUP,
+    MountedSheet,
+    PhotoTruth,
+    ReprintSetup,
+    mount_sheet,
+    sheet_scene,
+)
 from patchproof.reprints.run_sheet import sheet as sheet_of
 from patchproof.scene.conditions import Conditions
 
@@ -51,7 +58,7 @@ def reprint(
     overwrite: bool = False,
     progress: Progress = no_progress,
 ) -> Reprint:
-    """Print a sheet in simulation, hang the piece on its object, and photograph it.
+    """Print a sheet in simulation, mount the piece on its object, and photograph it.
 
     Args:
         pdf_path: the sheet's PDF, its manifest beside it.
@@ -71,8 +78,8 @@ def reprint(
     compute = compute.without("reprint", device=True)
     if not 1 <= sessions <= n:
         raise Refused(f"1 to {n} sessions of {n} photographs", f"{sessions}", "ask for fewer")
-    with _hung_pdf(pdf_path, run, how.control, Path(out)) as pdf:
-        sheet = hang(pdf, run, how)
+    with _pdf_to_mount(pdf_path, run, how.control, Path(out)) as pdf:
+        sheet = mount_sheet(pdf, run, how)
         each, done = -(-n // sessions), 0
         conditions = sheet.scene.draw("reprint", n, seed, per_session=each)
         scale = conditions.pose.printed_scale[[0] * n]  # one print, wherever it is photographed
@@ -82,10 +89,11 @@ def reprint(
         names = [f"photo_{i + 1:04d}.jpg" for i in range(n)]
         if sessions > 1:
             names = [f"session_{i // each + 1:02d}/{name}" for i, name in enumerate(names)]
-        there = partial(_take_there, Path(pdf).resolve(), run.folder.resolve(), how)
+        take_photo = partial(_take_photo, Path(pdf).resolve(), run.folder.resolve(), how)
         jobs, cluster = compute.jobs, compute.cluster
-        opened = fork_workers(sheet.photograph, jobs) if cluster is None else _by_name(there, jobs, cluster)
-        with new_folder(out, REPRINT_FILES, overwrite) as folder, opened as (workers, take):
+        local = cluster is None
+        opening = fork_workers(sheet.photograph, jobs) if local else _cluster_workers(take_photo, jobs, cluster)
+        with new_folder(out, REPRINT_FILES, overwrite) as folder, opening as (workers, take):
             for i, photo in workers.completed(take, views):
                 make_folder((folder / names[i]).parent)
                 (folder / names[i]).write_bytes(result_of(photo))
@@ -101,19 +109,19 @@ def reprint(
 
 
 @contextmanager
-def _by_name(take: Callable[[Conditions], bytes], jobs: int, cluster: str) -> Iterator[tuple[Workers, Callable]]:
-    """A cluster's workers and what they do: each hangs the sheet for itself."""
+def _cluster_workers(take: Callable, jobs: int, cluster: str) -> Iterator[tuple[Workers, Callable]]:
+    """Open a cluster's workers, each of which mounts the sheet itself; yields them and their function."""
     with open_workers(jobs, cluster) as workers:
         yield workers, take
 
 
 @contextmanager
-def _hung_pdf(pdf_path: str | Path, run: Run, control: str | None, out: Path) -> Iterator[str | Path]:
-    """The PDF of what hangs: the given one, or that of a control for as long as it takes."""
+def _pdf_to_mount(pdf_path: str | Path, run: Run, control: str | None, out: Path) -> Iterator[str | Path]:
+    """Yield the PDF to mount: the given one, or a control's in a temporary folder."""
     if control in (None, "bare"):
         yield pdf_path
         return
-    # beside the photographs, where other machines may look, too
+    # beside the photographs, since other machines can read that folder, too
     make_folder(out.resolve().parent)
     with TemporaryDirectory(dir=out.resolve().parent, prefix=".control.") as folder:
         template = sheet_scene(pdf_path, run)[1].settings.sheet.template
@@ -121,14 +129,14 @@ def _hung_pdf(pdf_path: str | Path, run: Run, control: str | None, out: Path) ->
         yield Path(folder) / "control.pdf"
 
 
-def _take_there(pdf: Path, run_folder: Path, how: ReprintSetup, conditions: Conditions) -> bytes:
-    return _hung_there(pdf, run_folder, how).photograph(conditions)
+def _take_photo(pdf: Path, run_folder: Path, how: ReprintSetup, conditions: Conditions) -> bytes:
+    return _mounted_sheet(pdf, run_folder, how).photograph(conditions)
 
 
 @lru_cache(maxsize=1)
-def _hung_there(pdf: Path, run_folder: Path, how: ReprintSetup) -> MountedSheet:
-    """The sheet as another process hangs it up for itself."""
-    return hang(pdf, load_run(run_folder), how)
+def _mounted_sheet(pdf: Path, run_folder: Path, how: ReprintSetup) -> MountedSheet:
+    """Mount the sheet in another process, once."""
+    return mount_sheet(pdf, load_run(run_folder), how)
 
 
 def write_truth(folder: Path, truth: Mapping[str, PhotoTruth]) -> None:

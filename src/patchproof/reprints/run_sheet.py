@@ -1,9 +1,8 @@
-"""A run's sheets: the design's own page and those of its controls, each with the marker ids that tell it from the
-others.
+"""Write a run's sheets: the design's and those of its controls, each with its own marker ids.
 
-In: finished runs. Out: SHEET.pdf and SHEET.json, or one page with the designs of several and a manifest for each. The
-piece is the same on every template that has room for it, but for the ids of its markers. The last page of a template
-with `plan_page` says where the piece goes and how to photograph it. Pages that need no run: see `sheets.blank`.
+In: finished runs. Out: SHEET.pdf and SHEET.json, or one page with the designs of several runs and a manifest for each.
+The piece is the same on every template that has room for it, except for the ids of its markers. The last page of a
+template with `plan_page` says where the piece goes and how to photograph it. Pages without a run: see `sheets.blank`.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from patchproof.optimizer.run import Run
-from patchproof.reprints.plan_view import hang
+from patchproof.reprints.plan_view import draw_plan_view
 from patchproof.reprints.shot_plan import shot_sections
 from patchproof.scene.interface import PieceScene, require_piece
 from patchproof.scene.patch_scene import PatchScene, require_patch
@@ -57,15 +56,15 @@ def sheet_of_several(
     another is named.
     """
     name = template or runs[0].scene.settings.sheet.template
-    page, made = load_template(name), [content_of(run, name, control) for run in runs]
-    plans = [plan_of(scene, page, content) for content, scene in made] if page.plan_page else []
-    return write_several(pdf_path, page, [content for content, _ in made], plans)
+    page, contents = load_template(name), [content_of(run, name, control) for run in runs]
+    plans = [plan_of(scene, page, content) for content, scene in contents] if page.plan_page else []
+    return write_several(pdf_path, page, [content for content, _ in contents], plans)
 
 
 def content_of(run: Run, template: str | None, control: str | None) -> tuple[SheetContent, PieceScene]:
-    """The run's design (or a control) in its piece on that template, with the promise made for that piece."""
-    own = require_piece(run.scene)
-    scene = own if template is None else own.with_template(template)
+    """Make the piece's content on that template: the run's design with its promise, or a control; and the scene."""
+    scene = require_piece(run.scene)
+    scene = scene if template is None else scene.with_template(template)
     settings = scene.settings.model_dump(mode="json") | {"seed": scene.seed, "printer_model": run.details["printer"]}
     if (imported := run.details.get("imported")) is not None:
         settings["imported"] = {name: imported[name] for name in ("file", "sha256")}
@@ -78,43 +77,43 @@ def content_of(run: Run, template: str | None, control: str | None) -> tuple[She
 
 
 def plan_of(scene: PieceScene, template: Template, content: SheetContent) -> PlanPage | None:
-    """Where the piece goes, whose design it is if not ours and, for a promise, how to photograph it; None where none of
-    it can be said.
+    """Make the plan page: where the piece goes, the file of an imported design and, with a promise, how to photograph
+    it. None if there is nothing to say.
     """
-    hung, sections, imported = None, [], content.settings.get("imported")
+    picture, sections, imported = None, [], content.settings.get("imported")
     if scene.HAS_OBJECT:
-        patch, own = require_patch(scene), scene.settings.patch
-        hung = hang(patch, template)
-        facing = f"the object's {own.side} side" if own.at_mm is None else "the place where the piece goes"
-        placed = [
-            f"Seen as you face {facing}. {_edges(hung) if patch.placement.is_flat else _wrapped(patch)}",
+        patch, settings = require_patch(scene), scene.settings.patch
+        picture = draw_plan_view(patch, template)
+        facing = f"the object's {settings.side} side" if settings.at_mm is None else "the place where the piece goes"
+        lines = [
+            f"Seen as you face {facing}. {_edge_distances(picture) if patch.placement.is_flat else _wrapping(patch)}",
             f"The piece is {size_text(scene.piece.size_mm)} mm; {scene.placement_summary()['reason']}.",
         ]
         if template.tiles is not None:
-            placed.append(
+            lines.append(
                 "Glue from the top left to the bottom right on a flat table: each tile covers the white flaps of its "
                 "neighbors and 1 mm of their picture. Letters name rows, numbers columns."
             )
-        sections.append(("Where the piece goes", tuple(placed)))
+        sections.append(("Where the piece goes", tuple(lines)))
     if imported is not None and content.kind == "design":
-        file = imported["file"] if len(imported["file"]) <= 60 else f"{imported['file'][:57]}..."  # breaks no line
+        file = imported["file"] if len(imported["file"]) <= 60 else f"{imported['file'][:57]}..."  # fits on one line
         origin = f"Imported from {file} (SHA-256 {imported['sha256'][:16]}...); it was not optimized here."
         sections.append(("Whose design it is", (origin,)))
     if content.promise is not None:
         sections += shot_sections(content.promise, scene.settings)
-    return PlanPage(hung, tuple(sections)) if sections else None
+    return PlanPage(picture, tuple(sections)) if sections else None
 
 
-def _edges(hung: PlacementPicture) -> str:
-    edges = ", ".join(f"{name} {mm:.0f} mm" for name, mm in edge_distances_mm(hung).items())
+def _edge_distances(picture: PlacementPicture) -> str:
+    edges = ", ".join(f"{name} {mm:.0f} mm" for name, mm in edge_distances_mm(picture).items())
     return f"From the piece's cut edge to the outermost edges of that side: {edges}."
 
 
-def _wrapped(scene: PatchScene) -> str:
-    """How bent paper goes on the object, and what a tape measure says beside it."""
-    laid_out = scene.tape_measurements()
+def _wrapping(scene: PatchScene) -> str:
+    """Say how bent paper goes on the object, with distances by tape measure."""
+    tapes = scene.tape_measurements()
     text = "Wrap the piece round the object from its middle outwards, its top edge up, without folds or air under it."
-    if not laid_out:
+    if not tapes:
         return text
-    lengths = ", ".join(f"{tape.edge} {tape.length_mm:.0f} mm {tape.end}" for tape in laid_out)
+    lengths = ", ".join(f"{tape.edge} {tape.length_mm:.0f} mm {tape.end}" for tape in tapes)
     return f"{text} Lay a tape on the surface, straight on from the middle of each of the piece's edges: {lengths}."

@@ -1,4 +1,4 @@
-"""Flat scans of a sheet's uncut page, in place of photographs of its piece on the object."""
+"""Simulate flat scans of a sheet's uncut page."""
 
 from __future__ import annotations
 
@@ -37,7 +37,9 @@ def scan(
     printer, px_from_mm = how.printer_for(run.scene), np.diag([*(dpi / MM_PER_INCH * np.array(how.print_scale)), 1.0])
     with new_folder(out, REPRINT_FILES, overwrite) as folder:
         for page in sorted({marker.page for marker in manifest.markers}):
-            picture = _scanned(rasterize_page(pdf_path, page, 2 * dpi), manifest.page_mm, dpi, printer, how.print_scale)
+            picture = _scan_page(
+                rasterize_page(pdf_path, page, 2 * dpi), manifest.page_mm, dpi, printer, how.print_scale
+            )
             corners = {
                 m.id: geometry.apply_homography(px_from_mm, m.corners_mm) for m in manifest.markers if m.page == page
             }
@@ -51,8 +53,8 @@ def scan(
     return Reprint(Path(out), truth)
 
 
-def _scanned(page: np.ndarray, page_mm, dpi: float, printer: Printer, print_scale: tuple[float, float]) -> np.ndarray:
-    """A page's pixels, twice as fine as the scan, as the scanner shows their print: H×W×3 in [0, 1]."""
+def _scan_page(page: np.ndarray, page_mm, dpi: float, printer: Printer, print_scale: tuple[float, float]) -> np.ndarray:
+    """Print and scan a page's pixels, which are twice as fine as the scan: H×W×3 sRGB in [0, 1]."""
     with torch.no_grad():
         light = printer.apply(torch.tensor(page).permute(2, 0, 1)[None] / 255)[0].permute(1, 2, 0).numpy()
     (x, y), (width, height) = print_scale, (round(side * dpi / MM_PER_INCH) for side in page_mm)

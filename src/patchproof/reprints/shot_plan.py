@@ -1,12 +1,12 @@
-"""The shot plan: how many photographs, in how many places, from where and of which controls, so that the verdict will
-not be `cannot_tell`.
+"""The shot plan: how many photographs to take, in how many places, from where and of which controls, so that the
+verdict will not be `cannot_tell`.
 
 In: a promise and the scene's ranges. Out: counts, and sentences for the sheet's last page. Photographs of one session
-are alike, so that a few in each of several places say more than many in one: for some ways to take them, what the
-promise allows for and the chance that they will prove it. An effect needs as many pairs of design and control that
-McNemar's exact test, or Newcombe's interval where photographs are not paired, finds it with 90 % power. Design and
-control are taken to be recognized independently at their promised rates, which asks for more photographs than pairs of
-one view need. Assumed: the promise holds.
+are alike, so that a few in each of several places prove more than many in one: for some numbers of photographs and
+sessions, the counts that the promise allows for and the chance that they prove it. For an effect, the number of
+photographs with which McNemar's exact test of pairs, or Newcombe's interval without pairs, has 90 % power. Assumed: the
+promise holds, and design and control are recognized independently at their promised rates, which asks for more
+photographs than pairs of one view need.
 """
 
 from __future__ import annotations
@@ -19,18 +19,25 @@ import numpy as np
 from patchproof.base.intervals import CONFIDENCE, independent_difference
 from patchproof.base.sessions import split_evenly
 from patchproof.base.settings import SceneSettings, background_summary
-from patchproof.evidence.verdict import MOST_PHOTOS, kept_chance, photos_line, places, required_rate, sessions_needed
+from patchproof.evidence.verdict import (
+    MOST_PHOTOS,
+    kept_chance,
+    photos_line,
+    places_text,
+    required_rate,
+    sessions_needed,
+)
 from patchproof.optimizer.promise import PROMISE_VIEWS
 from patchproof.sheets.manifest import Promise
 
 POWER = 0.90
-WAYS = ((40, 1), (40, 2), (40, 4), (40, 8), (80, 8))  # photographs, sessions
-STEADY = 12  # so many counts in a row must do: floors of intervals are whole photographs, so that some n just miss
+SHOT_COUNTS = ((40, 1), (40, 2), (40, 4), (40, 8), (80, 8))  # photographs, sessions
+STEADY_COUNTS = 12  # consecutive counts that must suffice: bounds are whole photographs, so that some n just miss
 
 
 @dataclass(frozen=True)
 class ShotOption:
-    """Photographs in some sessions, the counts that the promise allows for, and the chance that they prove it."""
+    """A number of photographs and sessions, the counts that the promise allows for, and the chance to prove it."""
 
     photos: int
     sessions: int
@@ -40,11 +47,11 @@ class ShotOption:
 
 @dataclass(frozen=True)
 class ShotPlan:
-    """Ways to take photographs, sessions of `EACH` that a verdict needs (None: more than 150 photographs), the best
-    control, and photographs for an effect with and without pairs (None likewise).
+    """Options for taking photographs, sessions that a verdict needs (None: more than 150 photographs), the best
+    control, and photographs that an effect needs with and without pairs (None: more than 150).
     """
 
-    ways: tuple[ShotOption, ...]
+    options: tuple[ShotOption, ...]
     sessions: int | None
     control: str
     paired: int | None
@@ -52,12 +59,12 @@ class ShotPlan:
 
 
 def plan_shots(promise: Promise) -> ShotPlan:
-    """The counts for a promise; the control that is hardest to beat decides."""
+    """Compute the counts for a promise; those for an effect follow from the control that is hardest to beat."""
     best = promise.best_control
     better, worse = (promise.rate, promise.controls[best].rate)[:: promise.target.goal.sign]
-    parts = [(way, split_evenly(*way)) for way in WAYS]
+    splits = [(counts, split_evenly(*counts)) for counts in SHOT_COUNTS]
     return ShotPlan(
-        ways=tuple(ShotOption(*way, promise.posterior.count_interval(p), kept_chance(promise, p)) for way, p in parts),
+        options=tuple(ShotOption(*c, promise.posterior.count_interval(p), kept_chance(promise, p)) for c, p in splits),
         sessions=sessions_needed(promise),
         control=best,
         paired=fewest_photos(lambda n: paired_power(better, worse, n) >= POWER),
@@ -66,17 +73,17 @@ def plan_shots(promise: Promise) -> ShotPlan:
 
 
 def fewest_photos(enough: Callable[[int], bool]) -> int | None:
-    """The smallest n from 5 to 150 from which on n photographs are enough; None where there is none."""
+    """The smallest n from 5 to 150 from which on n photographs are enough; None if there is none."""
     run = 0
-    for n in range(5, MOST_PHOTOS + STEADY):
+    for n in range(5, MOST_PHOTOS + STEADY_COUNTS):
         run = run + 1 if enough(n) else 0
-        if run == STEADY:
-            return n - STEADY + 1
+        if run == STEADY_COUNTS:
+            return n - STEADY_COUNTS + 1
     return None
 
 
 def paired_power(better: float, worse: float, n: int) -> float:
-    """Chance that McNemar's exact test on n independent pairs shows the better rate to be better."""
+    """The chance that McNemar's exact test on n independent pairs shows the better rate to be better."""
     from scipy.stats import binom
 
     only_better, only_worse = better * (1 - worse), worse * (1 - better)
@@ -90,14 +97,14 @@ def paired_power(better: float, worse: float, n: int) -> float:
 
 
 def unpaired_power(better: float, worse: float, n: int) -> float:
-    """Chance that Newcombe's interval of n photographs each lies above zero."""
+    """The chance that Newcombe's interval of the difference, with n photographs each, lies above zero."""
     from scipy.stats import binom
 
     counts = np.arange(n + 1)
     chances = binom.pmf(counts, n, better), binom.pmf(counts, n, worse)
     power, most = 0.0, -1
     for a in counts:
-        # the more of the better, the more of the worse may be recognized: the border only ever moves up
+        # the more of the better are recognized, the more of the worse may be: `most` never decreases
         while most < n and independent_difference(int(a), n, most + 1, n)[1][0] > 0:
             most += 1
         power += float(chances[0][a] * chances[1][: most + 1].sum())
@@ -105,15 +112,16 @@ def unpaired_power(better: float, worse: float, n: int) -> float:
 
 
 def shot_sections(promise: Promise, settings: SceneSettings) -> tuple[tuple[str, tuple[str, ...]], ...]:
-    """What to photograph, as (heading, lines)."""
+    """Say how many photographs to take, and from where, as (heading, lines)."""
     plan = plan_shots(promise)
-    worth = promise.headline.removeprefix(promise.draft_prefix)
+    comparison = promise.headline.removeprefix(promise.draft_prefix)
     background = background_summary(settings.model_dump())
-    what = f"{promise.draft_prefix or 'The design is '}{worth} Promised before {background}."
-    return (("How many photographs", (what, *_how_many(promise, plan))), ("From where", _from_where(settings)))
+    summary = f"{promise.draft_prefix or 'The design is '}{comparison} Promised before {background}."
+    counts = (summary, *_count_lines(promise, plan))
+    return (("How many photographs", counts), ("From where", _view_lines(settings)))
 
 
-def _how_many(promise: Promise, plan: ShotPlan) -> tuple[str, ...]:
+def _count_lines(promise: Promise, plan: ShotPlan) -> tuple[str, ...]:
     control = promise.controls[plan.control]
     lines = [
         f"Promised: {promise.rate:.0%} recognized as {promise.target.label}, of {promise.n} views in "
@@ -124,8 +132,8 @@ def _how_many(promise: Promise, plan: ShotPlan) -> tuple[str, ...]:
         f"A verdict asks the photographs to prove a rate of {required_rate(promise):.0%}. What they will show if the "
         "promise holds, and the chance that it is enough: "
         + "; ".join(
-            f"{way.photos} in {places(way.sessions)}: {way.allowed[0]} to {way.allowed[1]} ({way.chance:.0%})"
-            for way in plan.ways
+            f"{o.photos} in {places_text(o.sessions)}: {o.allowed[0]} to {o.allowed[1]} ({o.chance:.0%})"
+            for o in plan.options
         )
         + "."
     )
@@ -141,10 +149,10 @@ def _how_many(promise: Promise, plan: ShotPlan) -> tuple[str, ...]:
             "by too little."
         )
         return tuple(lines)
-    wanted = plan.paired if plan.paired is not None else plan.unpaired
+    pairs = plan.paired if plan.paired is not None else plan.unpaired
     kind = "bare object (without any marker)" if plan.control == "bare" else f"{plan.control} control"
     lines.append(
-        f"To show that the patch makes the difference (90 % power): {wanted} pairs, each view once with the piece and "
+        f"To show that the patch makes the difference (90 % power): {pairs} pairs, each view once with the piece and "
         f"once with the {kind} in the same place and light, saved under equal file names in a folder of its own."
     )
     if plan.unpaired is not None:
@@ -156,7 +164,7 @@ def _how_many(promise: Promise, plan: ShotPlan) -> tuple[str, ...]:
     return tuple(lines)
 
 
-def _from_where(settings: SceneSettings) -> tuple[str, ...]:
+def _view_lines(settings: SceneSettings) -> tuple[str, ...]:
     if settings.object.mesh is None:
         return ("As the scene's own photographs were taken: the same places, distances and light.",)
     view, low = settings.view, settings.light.ambient

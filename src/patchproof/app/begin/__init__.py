@@ -1,1 +1,1 @@
-"""A scene file to begin with, and a look at it before anything is optimized."""
+"""The verbs `new` and `preview`: write a scene file, and show its scene before anything is optimized."""

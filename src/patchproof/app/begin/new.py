@@ -1,8 +1,8 @@
-"""`new`: a commented scene file for an object that somebody has as a mesh, as photographs or as images.
+"""`new`: write a commented scene file for a mesh, photographs of an object, or images.
 
 In: a mesh (a file, or `primitive:NAME`), a folder of photographs with a blank sheet's manifest in or beside it, or a
-folder of images with a CSV of labels. Out: a TOML file that loads, and lines that say what was guessed. Distances
-follow the object's length, the piece is the largest that lies well on one of its sides. A file that could not be
+folder of images with a CSV of labels. Out: a TOML file that loads, and lines that say what was guessed. Camera
+distances follow the object's length; the piece is the largest that fits on one of its sides. A file that could not be
 optimized is never written.
 """
 
@@ -45,59 +45,60 @@ def new_scene(
     models: Sequence[str] = ("builtin",),
     overwrite: bool = False,
 ) -> list[str]:
-    """Write the scene file `out` for a mesh or a folder; returns what was guessed and warned of. `length_mm` and `up`
-    are in place of what a mesh's file says.
+    """Write the scene file `out` for a mesh or a folder; returns lines with the guesses and warnings. `length_mm` and
+    `up` replace those of the mesh's file.
     """
     out = Path(out)
     check_file(out, overwrite)
     base = out.resolve().parent
     if thing.startswith("primitive:") or not is_folder(Path(thing)):
-        text, lines = _of_mesh(thing, base, label, length_mm, up, models)
+        text, lines = _mesh_scene(thing, base, label, length_mm, up, models)
     elif length_mm is not None or up is not None:
         do = "leave it out: pictures have no length and no axes"
         raise Refused("a mesh with --length-mm or --up", f"the folder {thing}", do)
     else:
-        text, lines = _of_folder(Path(thing), base, label, models)
+        text, lines = _folder_scene(Path(thing), base, label, models)
     scene = build_scene(validate_model(SceneSettings, tomllib.loads(text), "the new scene"), base)
     if isinstance(scene, UnplacedScene):
-        PlaceFinder(scene).candidates(1)  # refused where it has no place
+        PlaceFinder(scene).candidates(1)  # refuses an object without any place for the piece
     write_atomically(out, text)
     return [*lines, *(f"warning: {warning}" for warning in scene.warnings)]
 
 
-def _of_mesh(
+def _mesh_scene(
     thing: str, base: Path, label: str | None, length_mm: float | None, axis: UpAxis | None, models
 ) -> tuple[str, list[str]]:
-    named = guess_label(_labels(models, base), label, thing)
-    path, primitive, said = Path(thing), thing.startswith("primitive:"), "as given"
-    up = UpGuess("y", "primitives are") if primitive else UpGuess(axis, said) if axis else guess_up(path)
+    """The scene file's text for a mesh, and lines with the guesses."""
+    target = guess_label(_labels(models, base), label, thing)
+    path, primitive, source = Path(thing), thing.startswith("primitive:"), "as given"
+    up = UpGuess("y", "primitives are") if primitive else UpGuess(axis, source) if axis else guess_up(path)
     if length_mm is None:
-        said = "the primitive's own" if primitive else "by the file's units, meters: measure it"
+        source = "the primitive's own" if primitive else "by the file's units, meters: measure it"
         length_mm = longest_mm(thing.partition(":")[2]) if primitive else guess_length_mm(path)
-    hang = guess_piece(load_mesh(thing, length_mm, up.axis), length_mm)
+    piece = guess_piece(load_mesh(thing, length_mm, up.axis), length_mm)
     near, far = (float(f"{times * length_mm:.2g}") for times in (NEAR, FAR))
     azimuth, elevation = "of the camera about the vertical; 0 faces the piece", "above the horizontal"
-    if hang.side == "+y":
+    if piece.side == "+y":
         azimuth, elevation = "of the camera to left and right of straight above", "from there toward the back"
-    lies = "paper follows the surface" if hang.bend else "a flat card lies close enough"
+    bend_comment = "paper follows the surface" if piece.bend else "a flat card lies close enough"
     text = "\n".join(
         [
             *_HEAD,
             "[object]",
             f"mesh = {_quoted(thing if primitive else _path(path, base))}",
-            _line(f"length_mm = {length_mm:g}", f"its longest extent, {said}"),
+            _line(f"length_mm = {length_mm:g}", f"its longest extent, {source}"),
             _line(f'up = "{up.axis}"', f"the file's axis that points up: {up.reason}"),
-            *_turned(up),
+            *_doubt_lines(up),
             "",
             "[patch]",
-            *_size(*hang.size_mm),
-            _line(f'side = "{hang.side}"', f'{SIDE_NAMES[hang.side]}; place = "auto" searches the whole object')
-            if hang.side
+            *_size(*piece.size_mm),
+            _line(f'side = "{piece.side}"', f'{SIDE_NAMES[piece.side]}; place = "auto" searches the whole object')
+            if piece.side
             else _line('place = "auto"', "no side's middle takes it: optimize searches the whole object"),
-            *([] if hang.side else [_line('side = "+z"', "front: what azimuth 0 faces")]),
-            _line(f"bend = {str(hang.bend).lower()}", lies),
+            *([] if piece.side else [_line('side = "+z"', "front: what azimuth 0 faces")]),
+            _line(f"bend = {str(piece.bend).lower()}", bend_comment),
             "",
-            *_target(named, models, base),
+            *_target(target, models, base),
             "",
             "[view]",
             _line(f"distance_mm = [{near:g}, {far:g}]", f"to the object's middle: {NEAR} to {FAR} times its length"),
@@ -109,32 +110,33 @@ def _of_mesh(
             "",
         ]
     )
-    width, height = hang.size_mm
-    odd = f"; {up.odd}: if the preview shows it lying, {_again(up)}" if up.odd else ""
+    width, height = piece.size_mm
+    doubt = f"; {up.doubt}: if the preview shows it lying, {_rewrite_advice(up)}" if up.doubt else ""
     return text, [
-        f'up: "{up.axis}", {up.reason}{odd}',
-        f"length: {length_mm:g} mm, {said}",
-        f"piece: {width:g} × {height:g} mm, {hang.words}",
-        f'label: "{named}" ({models[0]})',
+        f'up: "{up.axis}", {up.reason}{doubt}',
+        f"length: {length_mm:g} mm, {source}",
+        f"piece: {width:g} × {height:g} mm, {piece.words}",
+        f'label: "{target}" ({models[0]})',
     ]
 
 
-def _turned(up: UpGuess) -> list[str]:
-    """The other axis as a comment beside the one of an object that may lie."""
-    if up.odd is None:
+def _doubt_lines(up: UpGuess) -> list[str]:
+    """The other axis as a comment, if the up axis is doubted."""
+    if up.doubt is None:
         return []
-    other = f'# up = "{other_axis(up.axis)}"'
-    return [_line(other, f"in its place if the preview shows it lying: {up.odd}"), f"# Best of all {_again(up)}."]
+    line = _line(f'# up = "{other_axis(up.axis)}"', f"in its place if the preview shows it lying: {up.doubt}")
+    return [line, f"# Best of all {_rewrite_advice(up)}."]
 
 
-def _again(up: UpGuess) -> str:
+def _rewrite_advice(up: UpGuess) -> str:
     return f"write the scene again with --up {other_axis(up.axis)}: sides and sizes change with it"
 
 
-def _of_folder(folder: Path, base: Path, label: str | None, models) -> tuple[str, list[str]]:
+def _folder_scene(folder: Path, base: Path, label: str | None, models) -> tuple[str, list[str]]:
+    """The scene file's text for a folder of photographs or images, and lines with the guesses."""
     tables = sorted(folder.glob("*.csv"))
-    found = sorted([*folder.glob("*.json"), *folder.resolve().parent.glob("*.json")])
-    manifests = [path for path in found if _blank(path)]
+    files = sorted([*folder.glob("*.json"), *folder.resolve().parent.glob("*.json")])
+    manifests = [path for path in files if _is_blank_sheet(path)]
     if not tables and not manifests:
         expected = "a CSV of labels among images, or a blank sheet's JSON in or beside the folder of photographs"
         raise Refused(expected, f"neither for {folder}", "put one there, or name a mesh")
@@ -142,26 +144,26 @@ def _of_folder(folder: Path, base: Path, label: str | None, models) -> tuple[str
         do = "lay the one that hangs there into the folder, the others elsewhere"
         raise Refused("one blank sheet's JSON", ", ".join(path.name for path in manifests), do)
     if not tables:
-        named = guess_label(_labels(models, base), label, folder.resolve().name)
+        target = guess_label(_labels(models, base), label, folder.resolve().name)
         sheet = _line(f"sheet = {_quoted(_path(manifests[0], base))}", "of the blank that hangs on the object there")
         lines = ["[object]", f"photos = {_quoted(_path(folder, base))}", sheet, "", _line("[patch]", "as the blank's")]
-        text = "\n".join([*_HEAD, *lines, "", *_target(named, models, base), ""])
-        said = f"photographs: {folder}, with the blank of {manifests[0].name}"
-        return text, [said, f'label: "{named}" ({models[0]})']
+        text = "\n".join([*_HEAD, *lines, "", *_target(target, models, base), ""])
+        source = f"photographs: {folder}, with the blank of {manifests[0].name}"
+        return text, [source, f'label: "{target}" ({models[0]})']
     table = next((path for path in tables if path.stem == "labels"), tables[0])
-    counts = Counter(named for name, named in read_labels(table) if is_file(folder / name))
+    counts = Counter(words for name, words in read_labels(table) if is_file(folder / name))
     if not counts:
         raise Refused(f"images that {table.name} names in {folder}", "none", "write their file names there")
-    named = guess_label(_labels(models, base), label or counts.most_common(1)[0][0], folder.name)
+    target = guess_label(_labels(models, base), label or counts.most_common(1)[0][0], folder.name)
     lines = ["[object]", f"images = {_quoted(_path(folder, base))}", f"labels = {_quoted(_path(table, base))}", ""]
-    lines += ["[patch]", *_size(100, 100), "", *_target(named, models, base), "", "[view]"]
+    lines += ["[patch]", *_size(100, 100), "", *_target(target, models, base), "", "[view]"]
     lines += [_line("patch_share = [0.2, 0.3]", "the piece's longer side over the picture's shorter one"), ""]
     text = "\n".join([*_HEAD, *lines])
-    return text, [f"images: {folder}, labels of {table.name}", f'label: "{named}" ({models[0]})']
+    return text, [f"images: {folder}, labels of {table.name}", f'label: "{target}" ({models[0]})']
 
 
-def _blank(path: Path) -> bool:
-    """Whether a JSON file is the manifest of a blank sheet."""
+def _is_blank_sheet(path: Path) -> bool:
+    """Check whether a JSON file is the manifest of a blank sheet."""
     try:
         return load_manifest(path).kind == "blank"
     except Refused:
@@ -169,21 +171,21 @@ def _blank(path: Path) -> bool:
 
 
 def _labels(models: Sequence[str], base: Path) -> tuple[str, ...]:
-    """The first network's list."""
+    """The labels of the first network."""
     if not models:
         raise Refused("a network", "none", "leave --models out, or name one")
     return load_classifier(_model(models[0], base), base).labels
 
 
-def _target(named: str | int, models: Sequence[str], base: Path) -> list[str]:
-    written = [_model(name, base) for name in models]
-    for name in written[1:]:
-        find_labels(load_classifier(name, base).labels, named)
-    label = named if isinstance(named, int) else _quoted(named)
+def _target(label: str | int, models: Sequence[str], base: Path) -> list[str]:
+    names = [_model(name, base) for name in models]
+    for name in names[1:]:
+        find_labels(load_classifier(name, base).labels, label)
+    value = label if isinstance(label, int) else _quoted(label)
     return [
         "[target]",
-        _line(f"label = {label}", "an index, or a name in the network's list"),
-        f"models = [{', '.join(map(_quoted, written))}]",
+        _line(f"label = {value}", "an index, or a name in the network's list"),
+        f"models = [{', '.join(map(_quoted, names))}]",
         _line('goal = "assist"', '"deceive" measures robustness'),
     ]
 
@@ -197,15 +199,15 @@ def _line(setting: str, comment: str) -> str:
 
 
 def _model(name: str, base: Path) -> str:
-    """A network's name as a scene in `base` says it; on the command line paths start where one is."""
+    """A network's name with its path relative to the scene's folder `base`, not to the working directory."""
     match = NETWORK_FILE.fullmatch(name)
     return f"{match[1]}{_path(Path(match[2]), base)}" if match and "${" not in match[2] else name
 
 
 def _path(path: Path, base: Path) -> str:
-    """Relative to the scene's folder where it lies in it, else whole."""
-    whole = path.resolve()
-    return (whole.relative_to(base) if whole.is_relative_to(base) else whole).as_posix()
+    """A path relative to the scene's folder if it lies in there, else absolute."""
+    path = path.resolve()
+    return (path.relative_to(base) if path.is_relative_to(base) else path).as_posix()
 
 
 def _quoted(text: str) -> str:

@@ -1,10 +1,10 @@
-"""`preview`: a look at a scene before anything is optimized, in seconds.
+"""`preview`: show a scene as a page before anything is optimized, in seconds.
 
-In: a scene file. Out: a folder with `preview.html`, which needs nothing from outside of itself and asks nobody for
-anything, and for a mesh `preview.glb`. Where the piece is refused, the page shows the object without it and says why:
-that is when a look helps most. A piece that is still to be placed is shown in the middle of the side that azimuth 0
-faces. Left out on purpose: anything that a design decides, which is `plan`'s; layouts of texture coordinates to draw
-masks on, which 3D programs such as Blender export.
+In: a scene file. Out: a folder with `preview.html`, a self-contained page without requests, and for a mesh
+`preview.glb`. If the piece is refused, the page shows the object without it and the reason. A piece whose place is
+still to be searched is shown in the middle of the side that azimuth 0 faces. Left out on purpose: anything that depends
+on a design, which `plan` shows; layouts of texture coordinates to draw masks on, which 3D programs such as Blender
+export.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ import numpy as np
 import torch
 
 from patchproof.app.begin.guess import lying_hint, other_axis
-from patchproof.app.begin.sample_views import SampleView, looks
-from patchproof.app.begin.sides import SIDE_NAMES, gap_colors, ramp, side_of, side_views, turntable
+from patchproof.app.begin.sample_views import SampleView, sample_views
+from patchproof.app.begin.sides import SIDE_NAMES, gap_colors, ramp_colors, side_of, side_views, turntable
 from patchproof.base.color import codes_from_srgb
 from patchproof.base.errors import Refused
 from patchproof.base.output import image_bytes, new_folder, write_atomically
@@ -31,7 +31,7 @@ from patchproof.mesh.export import write_glb
 from patchproof.mesh.mesh import Material, MeshPart
 from patchproof.render.stage import Stage, set_stage
 from patchproof.report.images import base64_uri, data_uri, jpeg, png
-from patchproof.report.page import page
+from patchproof.report.page import render_page
 from patchproof.scene.bend import STRETCH_LIMIT
 from patchproof.scene.canvas import bake_base_colors
 from patchproof.scene.interface import Scene
@@ -50,7 +50,7 @@ _DESIGN_PX = 256  # of the gray design on the piece, along its longer side
 
 @dataclass(frozen=True)
 class Preview:
-    """What a preview found: the page, lines for the terminal, warnings, and what was refused."""
+    """The page's path, lines for the terminal, warnings, and refusals in a sentence (None: nothing was refused)."""
 
     page: Path
     lines: tuple[str, ...]
@@ -59,7 +59,7 @@ class Preview:
 
 
 def preview_scene(scene_path: str | Path, out: str | Path, *, overwrite: bool = False) -> Preview:
-    """Look at the scene of a file; what cannot be read, and networks that cannot be used, are refused."""
+    """Write the preview of a scene file into the folder `out`; unreadable files and unusable networks are refused."""
     path = Path(scene_path)
     settings = load_scene_settings(path)
     with new_folder(out, (PAGE, OBJECT), overwrite) as folder:
@@ -67,8 +67,8 @@ def preview_scene(scene_path: str | Path, out: str | Path, *, overwrite: bool = 
         classifiers = [load_classifier(name, scene.base) for name in settings.target.models]
         indices, unknown = _indices(settings, [classifier.labels for classifier in classifiers])
         stage = set_stage(scene)
-        seen = looks(stage, classifiers, indices)
-        warnings = (*scene.warnings, *_lying(scene, settings))
+        views = sample_views(stage, classifiers, indices)
+        warnings = (*scene.warnings, *_up_warning(scene, settings))
         sides, turns = [], []
         if isinstance(scene, MeshScene):
             design = _gray_design(stage)
@@ -77,9 +77,9 @@ def preview_scene(scene_path: str | Path, out: str | Path, *, overwrite: bool = 
             for azimuth_deg, picture in turntable(stage, design).items():
                 webp = image_bytes(picture, "WEBP", {"quality": 80})  # 3 to 10 kB: as JPEG it would be twice as large
                 turns.append((azimuth_deg, picture.shape[:2], base64_uri(webp, "image/webp")))
-        facts, summaries = _facts(scene, settings), _answers(settings, seen)
+        facts, summaries = _facts(scene, settings), _answers(settings, views)
         problems = [text for text in (refused, unknown) if text]
-        text = page(
+        text = render_page(
             "preview.html.j2",
             name=path.name,
             target=settings.target,
@@ -90,7 +90,7 @@ def preview_scene(scene_path: str | Path, out: str | Path, *, overwrite: bool = 
             maps=_maps(scene) if isinstance(scene, PatchScene) else [],
             turns=turns,
             first_deg=_FIRST_DEG,
-            looks=[(look, data_uri(jpeg(look.picture))) for look in seen],
+            looks=[(look, data_uri(jpeg(look.picture))) for look in views],
             summaries=summaries,
         )
         write_atomically(folder / PAGE, text)
@@ -98,16 +98,16 @@ def preview_scene(scene_path: str | Path, out: str | Path, *, overwrite: bool = 
     return Preview(Path(out) / PAGE, lines, warnings, " ".join(problems) or None)
 
 
-def _lying(scene: Scene, settings: SceneSettings) -> tuple[str, ...]:
-    """What to do about an object that would stand better with its file's other axis up."""
+def _up_warning(scene: Scene, settings: SceneSettings) -> tuple[str, ...]:
+    """Warn of an object that would stand better with its file's other axis up."""
     up, name = settings.object.up, settings.object.mesh or ""
-    if not isinstance(scene, MeshScene) or ":" in name or (odd := lying_hint(scene.mesh.vertices, up)) is None:
+    if not isinstance(scene, MeshScene) or ":" in name or (doubt := lying_hint(scene.mesh.vertices, up)) is None:
         return ()
-    return (f'the object may lie: {odd}. If it does, write up = "{other_axis(up)}" in [object]',)
+    return (f'the object may lie: {doubt}. If it does, write up = "{other_axis(up)}" in [object]',)
 
 
 def _scene(settings: SceneSettings, base: Path) -> tuple[Scene, str | None]:
-    """The scene, where its piece is refused without it, and the refusal."""
+    """Build the scene; if its piece is refused, the scene without it, and the refusal."""
     try:
         scene = build_scene(settings, base)
     except Refused as refused:
@@ -119,18 +119,18 @@ def _scene(settings: SceneSettings, base: Path) -> tuple[Scene, str | None]:
     if not isinstance(scene, UnplacedScene):
         return scene, None
     try:
-        placed = scene.with_piece_at(settings.patch.side, 0.0)
-    except Refused:  # the search will find another place, or refuse
+        placed_scene = scene.with_piece_at(settings.patch.side, 0.0)
+    except Refused:  # the piece does not fit there; the search may find another place
         return scene, None
-    return (scene if placed.placement.warnings else placed), None
+    return (scene if placed_scene.placement.warnings else placed_scene), None
 
 
 def _indices(settings: SceneSettings, labels: Sequence[Sequence[str]]) -> tuple[list[tuple[int, ...]], str | None]:
-    """The target's indices in each network, none where it is not known there, and the refusal."""
+    """Find the target in each network's labels: its indices, empty if it is unknown there, and the last refusal."""
     target, indices, unknown = settings.target, [], None
-    for own in labels:
+    for network_labels in labels:
         try:
-            indices.append(find_labels(own, target.label, target.accept))
+            indices.append(find_labels(network_labels, target.label, target.accept))
         except Refused as refused:
             indices.append(())
             unknown = str(refused)
@@ -138,7 +138,7 @@ def _indices(settings: SceneSettings, labels: Sequence[Sequence[str]]) -> tuple[
 
 
 def _facts(scene: Scene, settings: SceneSettings) -> list[tuple[str, str]]:
-    """What is where, in words."""
+    """Describe object, camera, piece, markers and place, as (name, sentence)."""
     facts = [("object", scene.description())]
     if isinstance(scene, MeshScene):
         width, height, depth = np.ptp(scene.mesh.vertices, axis=0)
@@ -148,19 +148,19 @@ def _facts(scene: Scene, settings: SceneSettings) -> list[tuple[str, str]]:
         around = f"{left:g}° to {right:g}° about the {SIDE_NAMES[front]} ({front}), {low:g}° to {high:g}° above it"
         facts = [("object", f"{size}, {len(scene.mesh.faces)} faces")]
         facts.append(("camera", f"{around}, {near:g} to {far:g} mm away"))
-    lies = scene.placement_summary()
-    size = "{:g} × {:g} mm".format(*lies["size_mm"])
+    placement = scene.placement_summary()
+    size = "{:g} × {:g} mm".format(*placement["size_mm"])
     if isinstance(scene, PatchScene):
         side = side_of(scene.placement.normal)
-        fits = (
-            f"gap {lies['gap_mm']:.1f} mm at most, {lies['gap_mean_mm']:.1f} mm on average; "
-            f"{lies['overhang_share']:.0%} overhangs; stretch {lies['stretch']:.2%}"
+        fit = (
+            f"gap {placement['gap_mm']:.1f} mm at most, {placement['gap_mean_mm']:.1f} mm on average; "
+            f"{placement['overhang_share']:.0%} overhangs; stretch {placement['stretch']:.2%}"
         )
-        facts.append(("piece", f"{lies['family']}, {size}, facing {SIDE_NAMES[side]} ({side}): {fits}"))
+        facts.append(("piece", f"{placement['family']}, {size}, facing {SIDE_NAMES[side]} ({side}): {fit}"))
         readable = f"unreadable in {scene.unreadable_share:.0%} of views"
         facts.append(("markers", f"{scene.piece.marker_mm:.1f} mm, {readable}"))
     else:
-        facts.append(("piece", "not placed" if isinstance(scene, UnplacedScene) else f"{size}: {lies['reason']}"))
+        facts.append(("piece", "not placed" if isinstance(scene, UnplacedScene) else f"{size}: {placement['reason']}"))
     if isinstance(scene, TextureScene):
         for name, mask in zip(scene.canvas.names, scene.canvas.mask, strict=True):
             if mask.any():
@@ -168,33 +168,35 @@ def _facts(scene: Scene, settings: SceneSettings) -> list[tuple[str, str]]:
                 facts.append(("texture", f'"{name}", {texels}'))
     if settings.patch.place == "auto":
         side = settings.patch.side
-        tried = f"; until then it is tried on the {SIDE_NAMES[side]} ({side})" if isinstance(scene, PatchScene) else ""
-        facts.append(("place", f'"auto": optimize searches the object for it{tried}'))
+        note = f"; until then it is tried on the {SIDE_NAMES[side]} ({side})" if isinstance(scene, PatchScene) else ""
+        facts.append(("place", f'"auto": optimize searches the object for it{note}'))
     return facts
 
 
-def _answers(settings: SceneSettings, seen: Sequence[SampleView]) -> list[str]:
-    """How often each network recognizes the bare object."""
+def _answers(settings: SceneSettings, views: Sequence[SampleView]) -> list[str]:
+    """Say how often each network recognizes the bare object, and its most frequent label."""
     lines = []
-    for number, first in enumerate(seen[0].answers):
-        answers = [look.answers[number] for look in seen]
+    for number, first in enumerate(views[0].answers):
+        answers = [look.answers[number] for look in views]
         ((most, times),) = Counter(answer.labels[0][0] for answer in answers).most_common(1)
         count = sum(answer.recognized for answer in answers)
         lines.append(
-            f'{first.network}: "{settings.target.label}" first in {count} of {len(seen)} views of the bare object; '
+            f'{first.network}: "{settings.target.label}" first in {count} of {len(views)} views of the bare object; '
             f'most often "{most}" ({times})'
         )
     return lines
 
 
 def _maps(scene: PatchScene) -> list[dict[str, str]]:
-    """The piece's gap and stretch, each a picture with the words at the ends of its scale."""
-    laid = scene.placement
-    rows = [("gap to the surface", gap_colors(laid), "0 mm", f"{gap_limit_mm(laid.size_mm):.2g} mm: too much")]
-    if not laid.is_flat:
-        stretches = ramp(laid.stretches / STRETCH_LIMIT)
+    """Pictures of the piece's gap and stretch, each with the words at the ends of its scale."""
+    placement = scene.placement
+    rows = [
+        ("gap to the surface", gap_colors(placement), "0 mm", f"{gap_limit_mm(placement.size_mm):.2g} mm: too much")
+    ]
+    if not placement.is_flat:
+        stretches = ramp_colors(placement.stretches / STRETCH_LIMIT)
         rows.append(("stretch of the paper", stretches, "0 %", f"{STRETCH_LIMIT:.0%}: refused"))
-    shape = "{:g} / {:g}".format(*laid.size_mm)
+    shape = "{:g} / {:g}".format(*placement.size_mm)
     return [
         {"title": title, "shape": shape, "picture": data_uri(png(colors)), "low": low, "high": high}
         for title, colors, low, high in rows
@@ -202,19 +204,21 @@ def _maps(scene: PatchScene) -> list[dict[str, str]]:
 
 
 def _write_object(stage: Stage, design: np.ndarray | None, path: Path) -> None:
-    """The object as a GLB file, with the piece that shows `design` where a scene has one."""
+    """Write the object as a GLB file, with the scene's piece, if it has one, showing `design`."""
     scene = require_mesh(stage.scene)
     mesh = bake_base_colors(scene.mesh, np.zeros(len(scene.mesh.faces), bool))
     textures = [downscale(m.texture_srgb, _TEXTURE_PX) for m in mesh.materials if m.texture_srgb is not None]
     piece = None
     if isinstance(scene, PatchScene):
-        laid, material = scene.placement, Material("piece", (1.0, 1.0, 1.0), design)
-        piece = MeshPart(laid.vertices_mm, laid.faces, material, laid.piece_mm / laid.size_mm, laid.normals)
+        placement, material = scene.placement, Material("piece", (1.0, 1.0, 1.0), design)
+        piece = MeshPart(
+            placement.vertices_mm, placement.faces, material, placement.piece_mm / placement.size_mm, placement.normals
+        )
     write_atomically(path, lambda part: write_glb(mesh, textures, part, piece))
 
 
 def _gray_design(stage: Stage) -> np.ndarray | None:
-    """The printed piece with a gray design, uint8 h×w×3; None where no piece hangs on the object."""
+    """Make the printed piece with a gray design, uint8 h×w×3; None if the object has no piece."""
     if not isinstance(stage.scene, PatchScene):
         return None
     size_mm = stage.scene.piece.size_mm

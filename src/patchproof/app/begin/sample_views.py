@@ -1,8 +1,8 @@
-"""What the camera sees before anything is on the object, and what the networks call it.
+"""Sample views of the bare object, and the networks' answers to them.
 
 In: a scene and its classifiers. Out: `SampleView`s: pictures as the networks get them, drawn from the train stream as
-optimizing draws them, with the piece's outline (a line for people: the networks do not see it) and each network's five
-most likely labels of the bare object.
+optimizing draws them, the piece's outline (for people: it is not in the picture), and each network's five most likely
+labels of the bare object.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from patchproof.scene.conditions import Conditions
 from patchproof.scene.interface import PieceScene
 
 _VIEWS, _TOP = 8, 5
-_LEAST_PX = 200  # what is smaller is hard to look at
-_STEPS = 8  # points along each edge: bent paper has bent edges
+_LEAST_PX = 200  # of a view's side: people see little in smaller ones
+_EDGE_POINTS = 8  # bent paper has bent edges
 
 
 @dataclass(frozen=True)
 class NetworkAnswer:
-    """A network's most likely labels of one picture with their confidences, and whether the first is the target."""
+    """A network's most likely labels of one picture with their confidences; `recognized` if it sees the target."""
 
     network: str
     labels: tuple[tuple[str, float], ...]
@@ -40,7 +40,7 @@ class NetworkAnswer:
 
 @dataclass(frozen=True)
 class SampleView:
-    """One view: uint8 S×S×3, the piece's outline M×2 in its pixels (none where the piece is turned away)."""
+    """One view: uint8 S×S×3, and the piece's outline M×2 in its pixels (None if the piece is turned away)."""
 
     picture: np.ndarray
     outline_px: np.ndarray | None
@@ -50,10 +50,10 @@ class SampleView:
     answers: tuple[NetworkAnswer, ...]
 
 
-def looks(
+def sample_views(
     stage: Stage, classifiers: Sequence[Classifier], indices: Sequence[tuple[int, ...]]
 ) -> tuple[SampleView, ...]:
-    """`_VIEWS` of the bare object; `indices` are the target's in each network, empty where it is not known."""
+    """Render 8 views of the bare object and classify them; `indices` are the target's in each network (empty: none)."""
     network_px = max(classifier.input_px for classifier in classifiers)
     side_px = network_px * math.ceil(_LEAST_PX / network_px)
     conditions = stage.scene.draw("train", _VIEWS)
@@ -69,26 +69,26 @@ def looks(
             elevation_deg=float(pose.elevation_deg[i]),
             distance_mm=float(pose.distance_mm[i]),
             answers=tuple(
-                _answer(classifier, own[i], known)
-                for classifier, own, known in zip(classifiers, logits, indices, strict=True)
+                _answer(classifier, network_logits[i], target)
+                for classifier, network_logits, target in zip(classifiers, logits, indices, strict=True)
             ),
         )
         for i in range(_VIEWS)
     )
 
 
-def _answer(classifier: Classifier, logits: Tensor, known: tuple[int, ...]) -> NetworkAnswer:
+def _answer(classifier: Classifier, logits: Tensor, target: tuple[int, ...]) -> NetworkAnswer:
     best = classifier.probabilities(logits[None])[0].topk(min(_TOP, len(classifier.labels)))
     labels = tuple((classifier.labels[index], share) for share, index in zip(*map(Tensor.tolist, best), strict=True))
-    recognized = bool(known) and bool(classifier.recognized(logits[None], known)[0])
+    recognized = bool(target) and bool(classifier.recognized(logits[None], target)[0])
     return NetworkAnswer(Path(classifier.name).name, labels, recognized)
 
 
 def _outline(stage: Stage, conditions: Conditions, side_px: int) -> np.ndarray | None:
-    """Where the piece's cut line is in the photograph's centered square."""
+    """The piece's cut line in pixels of the photograph's centered square; None if it is turned away."""
     scene = stage.scene
     if not isinstance(scene, PieceScene) or not scene.facing(conditions)[0]:
         return None
-    border, whole = rect_border((0, 0, *scene.piece.size_mm), _STEPS), np.array(scene.photo_px)
-    points = (scene.piece_px(conditions, border) - (whole - whole.min()) / 2) * side_px / whole.min()
+    border, photo_px = rect_border((0, 0, *scene.piece.size_mm), _EDGE_POINTS), np.array(scene.photo_px)
+    points = (scene.piece_px(conditions, border) - (photo_px - photo_px.min()) / 2) * side_px / photo_px.min()
     return points if np.isfinite(points).all() else None

@@ -1,10 +1,9 @@
-"""The object from its six sides, with a ground line, a scale bar and the piece where it lies; and from all around.
+"""Pictures of an object from its six sides, with ground line, scale bar and piece; and from all around.
 
-In: a stage with a mesh, with a piece on it or without. Out: `SideView`s, and pictures from a ring of directions for a
-page that turns the object by a slider, each all at one scale; the piece's gap and stretch as colors. The sides are
-those that `patch.side` names; front and back are along z, since that is where glTF's standard has them and where
-`object.up = "z"` turns the y of other programs to. Around it goes from far away, in even light; a piece on top is
-looked down at, one below looked up at.
+In: a stage with a mesh, with a piece on it or without. Out: `SideView`s at one scale; pictures at one scale from a ring
+of directions, for a page that turns the object by a slider; the piece's gap and stretch as colors. The sides are those
+of `patch.side`; front and back are along z, as in glTF's standard and after `object.up = "z"` turned the y of other
+programs there. The ring is seen from far away, in even light, and from above or below if the piece is on top or below.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ _ROOM = 1.12  # of the largest extent
 _STEP_DEG = 15
 _ABOVE_DEG, _STEEPEST_DEG = 20.0, 55.0
 _BAR_SHARE = 0.35  # of the picture's width at most
-# five colors of viridis, legible to the color-blind; and one that is none of them
+# five colors of viridis, legible to the color-blind; and a color for no surface that is none of them
 RAMP_RGB = ((68, 1, 84), (59, 82, 139), (33, 145, 140), (94, 201, 98), (253, 231, 37))
 NO_SURFACE_RGB = (230, 0, 90)
 
@@ -43,11 +42,11 @@ class SideView:
     ground_px: float | None  # row of the ground under an upright view
     bar_mm: float
     bar_px: float
-    holds_piece: bool
+    holds_piece: bool  # True for the side that the piece faces
 
 
 def side_views(stage: Stage) -> tuple[SideView, ...]:
-    """All six of a stage's object, front first, the piece colored by its gap."""
+    """Render a stage's object from all six sides, front first, the piece colored by its gap."""
     scene = require_mesh(stage.scene)
     half_mm = _ROOM * float(np.abs(_points_mm(scene)).max())
     bar_mm = round_length(2 * half_mm * _BAR_SHARE)
@@ -62,9 +61,9 @@ def side_views(stage: Stage) -> tuple[SideView, ...]:
 
 
 def turntable(stage: Stage, on_piece: np.ndarray | None) -> dict[int, np.ndarray]:
-    """Pictures uint8 H×W×3 by degrees to the right of the side that the piece or the scene's front is on: a ring from
-    180 down to -165, so that what faces the camera moves to the right from one to the next; `on_piece` (uint8 h×w×3) is
-    shown on the piece of a scene that has one.
+    """Render the object from a ring of directions, 180° down to -165° to the right of the side of the piece or of the
+    scene's front: uint8 H×W×3 by degrees. From one to the next, what faces the camera moves to the right. `on_piece`
+    are colors (uint8 h×w×3) of the scene's piece.
     """
     scene = require_mesh(stage.scene)
     x, y, z = scene.normal
@@ -79,39 +78,39 @@ def turntable(stage: Stage, on_piece: np.ndarray | None) -> dict[int, np.ndarray
 
 
 def side_of(direction: np.ndarray) -> Side:
-    """The side that faces most nearly in a direction of the world."""
+    """The side whose normal is nearest to a direction of the world."""
     axis = int(np.abs(direction).argmax())
     return get_args(Side)[2 * axis + int(direction[axis] < 0)]
 
 
 def round_length(most_mm: float) -> float:
-    """The largest 1, 2 or 5 times a power of ten that is no longer."""
+    """Round down to 1, 2 or 5 times a power of ten."""
     power = 10.0 ** np.floor(np.log10(most_mm))
     return float(power * max(step for step in (1, 2, 5) if step * power <= most_mm * (1 + 1e-9)))
 
 
 def gap_colors(placement: Placement) -> np.ndarray:
-    """uint8 N×N×3 over the piece: 0 to `gap_limit_mm` from dark to light, `NO_SURFACE_RGB` where nothing is under it."""
-    colors = ramp(placement.gaps_mm / gap_limit_mm(placement.size_mm))
+    """Color the piece's gaps, uint8 N×N×3: 0 to `gap_limit_mm` from dark to light, `NO_SURFACE_RGB` off the surface."""
+    colors = ramp_colors(placement.gaps_mm / gap_limit_mm(placement.size_mm))
     colors[np.isnan(placement.gaps_mm)] = NO_SURFACE_RGB
     return colors
 
 
-def ramp(shares: np.ndarray) -> np.ndarray:
-    """uint8 ...×3: colors of shares in [0, 1]; beyond, those of the ends."""
+def ramp_colors(shares: np.ndarray) -> np.ndarray:
+    """Color shares in [0, 1] by `RAMP_RGB`, uint8 ...×3; shares beyond get the colors of the ends."""
     stops = np.linspace(0, 1, len(RAMP_RGB))
     channels = [np.interp(np.nan_to_num(shares), stops, column) for column in np.array(RAMP_RGB, float).T]
     return np.stack(channels, -1).round().astype(np.uint8)
 
 
 def _points_mm(scene: MeshScene) -> np.ndarray:
-    """The object's vertices, and the piece's, which may go beyond them."""
-    own = scene.mesh.vertices
-    return np.concatenate([own, scene.placement.vertices_mm]) if isinstance(scene, PatchScene) else own
+    """The object's vertices and the piece's, which may overhang."""
+    points = scene.mesh.vertices
+    return np.concatenate([points, scene.placement.vertices_mm]) if isinstance(scene, PatchScene) else points
 
 
 def _upright(toward: np.ndarray, like: SurfaceFrame) -> SurfaceFrame:
-    """The upright frame that faces a direction."""
+    """An upright frame whose normal is a direction, with the origin and extent of `like`."""
     right = np.cross(UP, toward)
     right /= np.linalg.norm(right)
     return SurfaceFrame(right, np.cross(toward, right), toward, like.origin_mm, like.extent_mm)

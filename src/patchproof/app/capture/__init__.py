@@ -1,1 +1,1 @@
-"""Photographs from a phone's browser into a folder, each answered at once."""
+"""The verb `capture`: receive photographs from a phone's browser, and answer each at once."""

@@ -1,12 +1,12 @@
-"""The folder that photographs are received into: a folder for each session, one for each control.
+"""The folder that uploads are written to: a subfolder for each session and for each control.
 
     OUT/session_01/photo_0001.jpg  ...  OUT/controls/mean/photo_0017.jpg  ...
 
-In: bytes from anybody who has the address. Out: files that `verify OUT --controls OUT/controls` reads. Their names are
-ours and what they are is known from their first bytes; a file appears when it has come whole. A number is taken by
-creating a hidden part file, which nobody else can create too, so that whoever receives at the same time gets another.
-Bytes that are here already are that photograph sent again, and no second one. Left out on purpose: removing any, since
-photographs picked by their answers prove nothing.
+In: bytes from anybody who has the address. Out: files that `verify OUT --controls OUT/controls` reads. We choose their
+names, and tell their kind by their first bytes; a file appears once it is complete. A number is reserved by creating a
+hidden part file, so that simultaneous uploads get different ones. Bytes that are here already are the same photograph
+sent again, and are not stored twice. Left out on purpose: removing photographs, since a selection by their answers
+proves nothing.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ CONTROLS = ("bare", "mean", "gray", "noise", "shuffled", "blank")
 MOST_BYTES = 40_000_000  # phones' largest JPEGs, of 108 and 200 megapixels, have some 30
 MOST_PHOTOS = 1000
 _OWN = ("session_*", CONTROLS_FOLDER, JOURNAL_FILE, ADDRESS_FILE)
-_HEAD = 12  # bytes that tell a kind
+_HEAD = 12  # bytes that tell the kind of a file
 _HEIF = (b"heic", b"heix", b"heim", b"heis", b"mif1", b"msf1")
 _NUMBERED = re.compile(r"\.?photo_(\d{4,})\.")
 
@@ -43,13 +43,13 @@ class UploadRefused(Refused):
 
 
 class Album:
-    """The folder with what is in it; a new one is made, one with anything else in it is refused."""
+    """A folder of photographs, which is created if it is missing; refused if it has other files."""
 
     def __init__(self, folder: Path):
         check_folder(folder, _OWN, overwrite=True)
         make_folder(folder)
         self.folder = folder
-        for part in folder.rglob(".photo_*.part"):  # of uploads that ended with an earlier server
+        for part in folder.rglob(".photo_*.part"):  # of uploads that an earlier server did not finish
             part.unlink()
         self._by_sha256: dict[str, Path] = {}
         if not self.sessions:
@@ -57,22 +57,22 @@ class Album:
 
     @property
     def sessions(self) -> list[str]:
-        """The sessions' names in order, those without a photograph too."""
+        """The sessions' names in order, including empty ones."""
         return sorted(path.name for path in self.folder.glob("session_*") if path.is_dir())
 
     def photos(self) -> list[Path]:
-        """Every photograph, those of controls last."""
-        shown = [self.folder / CONTROLS_FOLDER / name for name in CONTROLS]
-        folders = [self.folder / name for name in self.sessions] + [path for path in shown if path.is_dir()]
+        """List all photographs, those of controls last."""
+        controls = [self.folder / CONTROLS_FOLDER / name for name in CONTROLS]
+        folders = [self.folder / name for name in self.sessions] + [path for path in controls if path.is_dir()]
         return [photo for folder in folders for photo in list_images(folder)]
 
-    def know(self, photo: Path, sha256: str | None) -> None:
-        """The photograph has these bytes."""
+    def remember(self, photo: Path, sha256: str | None) -> None:
+        """Remember a photograph's SHA-256, to recognize the same bytes when they are sent again."""
         if sha256 is not None:
             self._by_sha256[sha256] = photo
 
     def new_session(self) -> str:
-        """A new session; the last one again where it has no photograph yet."""
+        """Begin a new session and return its name; the last one's if it is still empty."""
         last = self.sessions[-1]
         if list_images(self.folder / last):
             last = f"session_{int(last.rpartition('_')[2]) + 1:02d}"
@@ -80,14 +80,15 @@ class Album:
         return last
 
     def incoming(self, into: str) -> Incoming:
-        """Room for one more photograph in the session, or of the control, of that name."""
+        """Prepare for one more photograph in the session, or of the control, of that name."""
         if into in CONTROLS:
             folder = self.folder / CONTROLS_FOLDER / into
             make_folder(folder)
         elif into in self.sessions:
             folder = self.folder / into
         else:
-            raise UploadRefused(404, "a session or a control that is here", "another name", "load the page again")
+            got = f'"{into[:40]}"'
+            raise UploadRefused(404, "a session or a control of this folder", got, "load the page again")
         return Incoming(folder, self._free_number(), self._by_sha256)
 
     def _free_number(self) -> int:
@@ -101,31 +102,31 @@ class Album:
 
 
 class Incoming:
-    """One photograph on its way; left before `keep`, nothing of it stays."""
+    """One upload, as a context manager; without a call of `keep` its file is removed at the end."""
 
-    def __init__(self, folder: Path, number: int, known: dict[str, Path]):
-        self._folder, self._known, self._digest = folder, known, hashlib.sha256()
+    def __init__(self, folder: Path, number: int, by_sha256: dict[str, Path]):
+        self._folder, self._by_sha256, self._digest = folder, by_sha256, hashlib.sha256()
         self._head, self._bytes = b"", 0
         while True:
             self._stem, self._part = f"photo_{number:04d}", folder / f".photo_{number:04d}.part"
             try:
-                self._file = open(self._part, "xb")  # fails where another takes this number now
+                self._file = open(self._part, "xb")  # fails if another upload has this number
             except FileExistsError:
                 number += 1
                 continue
             if not list(folder.glob(f"{self._stem}.*")):
                 return
-            self._leave()
+            self._discard()
             number += 1
 
     def __enter__(self) -> Incoming:
         return self
 
     def __exit__(self, *error: object) -> None:
-        self._leave()
+        self._discard()
 
     def write(self, chunk: bytes) -> None:
-        """The next bytes; refused as soon as they are too many, or of no photograph."""
+        """Write the next bytes; refused as soon as they are too many, or are not a photograph's."""
         refuse_size(self._bytes + len(chunk))
         if len(self._head) < _HEAD:
             self._head += chunk[: _HEAD - len(self._head)]
@@ -136,36 +137,36 @@ class Incoming:
         self._file.write(chunk)
 
     def keep(self) -> Path:
-        """The whole photograph's path: a new one's, or that of the same bytes in the same place."""
+        """Store the whole photograph and return its path, or that of the same bytes in the same folder."""
         path, sha256 = self._folder / f"{self._stem}{_suffix_of(self._head)}", self._digest.hexdigest()
-        kept = self._known.get(sha256)
-        if kept is not None:
-            if kept.parent != self._folder:
-                got = f"{kept.parent.name}/{kept.name} once more"
+        earlier = self._by_sha256.get(sha256)
+        if earlier is not None:
+            if earlier.parent != self._folder:
+                got = f"{earlier.parent.name}/{earlier.name} once more"
                 raise UploadRefused(409, "a photograph that is not here yet", got, "take a new one")
-            return kept
+            return earlier
         self._file.flush()
         os.fsync(self._file.fileno())
         self._file.close()
         os.replace(self._part, path)
-        self._known[sha256] = path
+        self._by_sha256[sha256] = path
         return path
 
-    def _leave(self) -> None:
+    def _discard(self) -> None:
         self._file.close()
         self._part.unlink(missing_ok=True)
 
 
 def refuse_size(size: int) -> None:
-    """Refuse a photograph of so many bytes where they are too many."""
+    """Refuse a photograph of more than `MOST_BYTES`; `size` is the number of bytes that came or are announced."""
     if size > MOST_BYTES:
-        got = "a larger file" if size < 2 * MOST_BYTES else f"one of {size / 1e6:.0f} MB"
+        got = "a larger file" if size < 2 * MOST_BYTES else f"{size / 1e6:.0f} MB"
         do = "choose a smaller picture size in the camera's settings"
         raise UploadRefused(413, f"a photograph of at most {MOST_BYTES / 1e6:.0f} MB", got, do)
 
 
 def _suffix_of(head: bytes) -> str:
-    """The suffix of the kind of picture that starts so; refused where it is none that phones make."""
+    """Suffix of the kind of picture that begins with these bytes; refused if phones do not make it."""
     if head.startswith(b"\xff\xd8\xff"):
         return ".jpg"
     if head.startswith(b"\x89PNG\r\n\x1a\n"):
@@ -174,4 +175,5 @@ def _suffix_of(head: bytes) -> str:
         return ".webp"
     if head[4:8] == b"ftyp" and head[8:12] in (*_HEIF, b"avif"):
         return ".avif" if head[8:12] == b"avif" else ".heic"
-    raise UploadRefused(415, "a photograph (JPEG, PNG, WebP, HEIC or AVIF)", "a file of another kind", "take it again")
+    got = f"a file that begins with the bytes {head.hex(' ')}"
+    raise UploadRefused(415, "a photograph (JPEG, PNG, WebP, HEIC or AVIF)", got, "take it again")

@@ -1,12 +1,12 @@
-"""The page and its JSON over HTTP, behind a token: nothing else is served, no file of the folder is ever read out.
+"""Serve the capture page and its JSON over HTTP, behind a token; files of the folder are never served.
 
     GET /TOKEN/            the page           POST /TOKEN/photos?into=NAME   one photograph, its bytes as the body
     GET /TOKEN/state       JSON               POST /TOKEN/sessions           begin a new session
 
-In: requests of anybody who reaches the port. Out: the page, `state_of`, `answer_of`, or one sentence that refuses. A
-photograph is the whole body, without a form round it and without a name, so that there is no name to be trusted; it is
-written as it comes, and a body that stops or stalls leaves nothing. An answer comes when the photograph is measured,
-one at a time; bytes that were sent before are answered as before, so a page that lost its connection sends them again.
+In: requests of anybody who reaches the port. Out: the page, `state_of`, `answer_of`, or a refusal in one sentence. A
+photograph is the whole body, without a form and a name that would have to be trusted; it is written as it arrives, and
+a body that stops or stalls leaves no file. Photographs are measured one at a time, then answered; the same bytes get
+the same answer, so that a page that lost its connection can send them again.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from patchproof.app.capture.album import MOST_BYTES, UploadRefused, refuse_size
 from patchproof.app.capture.collection import PhotoCollection
 from patchproof.app.capture.state import answer_of, state_of
 from patchproof.evidence.verdict import sessions_needed
-from patchproof.report.page import page
+from patchproof.report.page import render_page
 
 if TYPE_CHECKING:
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-STALLED_S = 30.0  # without a byte: a phone that went out of reach says no goodbye
-_UPLOADS = 8  # at once; more wait before their body is read
+STALLED_S = 30.0  # without a byte: a phone out of reach does not close its connection
+_MOST_UPLOADS = 8  # at once; more wait before their body is read
 _HEADERS = {
     "Cache-Control": "no-store",
     "Referrer-Policy": "no-referrer",
@@ -41,22 +41,22 @@ _HEADERS = {
 }
 
 
-def capture_app(gathered: PhotoCollection, token: str) -> ASGIApp:
-    """The application for what is gathered; it answers whoever knows the token."""
-    desk = _Desk(gathered)
+def capture_app(collection: PhotoCollection, token: str) -> ASGIApp:
+    """Make the application for a collection of photographs; it answers requests with the token only."""
+    handlers = _Handlers(collection)
     routes = [
-        Route(f"/{token}/", desk.page, methods=["GET"]),
-        Route(f"/{token}/state", desk.state, methods=["GET"]),
-        Route(f"/{token}/photos", desk.photo, methods=["POST"]),
-        Route(f"/{token}/sessions", desk.session, methods=["POST"]),
+        Route(f"/{token}/", handlers.page, methods=["GET"]),
+        Route(f"/{token}/state", handlers.state, methods=["GET"]),
+        Route(f"/{token}/photos", handlers.photo, methods=["POST"]),
+        Route(f"/{token}/sessions", handlers.session, methods=["POST"]),
     ]
-    app = Starlette(routes=routes, exception_handlers={UploadRefused: _refused})
+    app = Starlette(routes=routes, exception_handlers={UploadRefused: _refuse})
     app.router.redirect_slashes = False
-    return _Guard(app, token)
+    return _TokenCheck(app, token)
 
 
-class _Guard:
-    """Lets through who knows the token, compared in constant time, before anything else of a request is looked at."""
+class _TokenCheck:
+    """Check the token, in constant time, before anything else of a request is read, and add headers to responses."""
 
     def __init__(self, app: ASGIApp, token: str):
         self._app, self._token = app, token.encode()
@@ -64,35 +64,35 @@ class _Guard:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         async def with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
-                own = [(name.lower().encode(), value.encode()) for name, value in _HEADERS.items()]
-                message = {**message, "headers": [*message["headers"], *own]}
+                headers = [(name.lower().encode(), value.encode()) for name, value in _HEADERS.items()]
+                message = {**message, "headers": [*message["headers"], *headers]}
             await send(message)
 
         if scope["type"] != "http":
             return
-        given = scope["path"].lstrip("/").partition("/")[0]
+        token = scope["path"].lstrip("/").partition("/")[0]
         app: ASGIApp = self._app
-        if not hmac.compare_digest(given.encode("utf-8", "surrogateescape"), self._token):
-            sentence = "Expected the address with its token, got another: open the one that the terminal shows."
+        if not hmac.compare_digest(token.encode("utf-8", "surrogateescape"), self._token):
+            sentence = "Expected the address that the terminal shows, got one without its token: open that address."
             app = JSONResponse({"refused": sentence}, 403, headers={"Connection": "close"})
         await app(scope, receive, with_headers)
 
 
-class _Desk:
-    """What the routes share."""
+class _Handlers:
+    """The routes' handlers, and the state that they share."""
 
-    def __init__(self, gathered: PhotoCollection):
-        self._gathered, promise = gathered, gathered.manifest.promise
-        self._planned = None if promise is None else sessions_needed(promise)
-        self._state = state_of(gathered, self._planned)
-        self._one_at_a_time, self._receiving = anyio.Lock(), anyio.Semaphore(_UPLOADS)
+    def __init__(self, collection: PhotoCollection):
+        self._collection, promise = collection, collection.manifest.promise
+        self._planned_sessions = None if promise is None else sessions_needed(promise)
+        self._state = state_of(collection, self._planned_sessions)
+        self._one_at_a_time, self._receiving = anyio.Lock(), anyio.Semaphore(_MOST_UPLOADS)
 
     async def page(self, request: Request) -> Response:
-        """The page; scripts and styles of others are not let in, nor requests to others."""
-        manifest, nonce = self._gathered.manifest, secrets.token_urlsafe(16)
+        """The page; its policy allows only its own scripts and styles, and requests to this server."""
+        manifest, nonce = self._collection.manifest, secrets.token_urlsafe(16)
         target = manifest.promise and manifest.promise.target
         values = {"nonce": nonce, "sheet_id": manifest.sheet_id, "target": target, "most_bytes": MOST_BYTES}
-        html = page("page.html.j2", Path(__file__).parent, **values)
+        html = render_page("page.html.j2", Path(__file__).parent, **values)
         policy = (
             f"default-src 'none'; script-src 'nonce-{nonce}'; style-src 'nonce-{nonce}'; connect-src 'self'; "
             "img-src data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -100,34 +100,34 @@ class _Desk:
         return HTMLResponse(html, headers={"Content-Security-Policy": policy})
 
     async def state(self, request: Request) -> Response:
-        """What the photographs say so far."""
+        """The state of all photographs so far, as JSON."""
         return JSONResponse(self._state)
 
     async def session(self, request: Request) -> Response:
-        """A new session."""
+        """Begin a new session."""
         async with self._one_at_a_time:
-            name = self._gathered.album.new_session()
-            self._state = await anyio.to_thread.run_sync(state_of, self._gathered, self._planned)
+            name = self._collection.album.new_session()
+            self._state = await anyio.to_thread.run_sync(state_of, self._collection, self._planned_sessions)
         return JSONResponse({"session": name, "state": self._state})
 
     async def photo(self, request: Request) -> Response:
-        """Receive one photograph and say what it shows."""
+        """Receive one photograph, measure it and answer."""
         length = request.headers.get("content-length", "")
         refuse_size(int(length[:18]) if length.isdecimal() else 0)
         async with self._receiving:
             try:
-                path = await self._received(request)
+                path = await self._receive(request)
             except (ClientDisconnect, TimeoutError):
-                return _refusal(408, "Expected a whole photograph, got a part: send it again.")
+                return _refusal(408, "Expected a whole photograph, got only a part of it: send it again.")
             except OSError as error:
                 sentence = f"Expected room for a photograph, got {error.strerror}: make room and send it again."
                 return _refusal(507, sentence)
         async with self._one_at_a_time:
-            answer = await anyio.to_thread.run_sync(self._measured, path)
+            answer = await anyio.to_thread.run_sync(self._measure, path)
         return JSONResponse({"photo": answer, "state": self._state})
 
-    async def _received(self, request: Request) -> Path:
-        with self._gathered.album.incoming(request.query_params.get("into", "")) as incoming:
+    async def _receive(self, request: Request) -> Path:
+        with self._collection.album.incoming(request.query_params.get("into", "")) as incoming:
             chunks = request.stream()
             while True:
                 with anyio.fail_after(STALLED_S):
@@ -136,18 +136,18 @@ class _Desk:
                     return incoming.keep()
                 incoming.write(chunk)
 
-    def _measured(self, path: Path) -> dict[str, Any]:
-        gathered, shown = self._gathered, []
-        gathered.measure([path], on_pictures=lambda file, kinds: shown.append(kinds.get("photo")))
-        self._state = state_of(gathered, self._planned)
-        return answer_of(gathered, path, shown[0] if shown else None)
+    def _measure(self, path: Path) -> dict[str, Any]:
+        collection, pictures = self._collection, []
+        collection.measure([path], on_pictures=lambda file, kinds: pictures.append(kinds.get("photo")))
+        self._state = state_of(collection, self._planned_sessions)
+        return answer_of(collection, path, pictures[0] if pictures else None)
 
 
-async def _refused(request: Request, error: Exception) -> Response:
+async def _refuse(request: Request, error: Exception) -> Response:
     assert isinstance(error, UploadRefused)
     return _refusal(error.status, str(error))
 
 
 def _refusal(status: int, sentence: str) -> Response:
-    # a body that was not read to its end is not waited for
+    # close: the rest of a body that was not read is not waited for
     return JSONResponse({"refused": sentence}, status, headers={"Connection": "close"})

@@ -1,9 +1,9 @@
-"""The photographs of an album, each measured when it has come, and what all of them say so far.
+"""Measure the photographs of an album as they arrive, and report on all of them.
 
-In: an album, a manifest, what photographs are judged with. Out: a `Report`, as `verify` makes it of the same folder: by
-the same functions, from what is kept of each photograph. One at a time is measured, in the one process of the workers,
-where the limits of time and memory hold; the album's journal keeps what is finished, so that a restart measures only
-what is new. Left out on purpose: the gap ledger and the estimated effect, which take longer than a person waits.
+In: an album, a manifest, the options of a verification. Out: a `Report`, as `verify` makes it of the same folder, by
+the same functions. Photographs are measured one at a time, in the single process of the workers, where limits of time
+and memory apply; finished ones are in the album's journal, so that a restart measures only new ones. Left out on
+purpose: the gap ledger and the estimated effect, which take longer than a person waits.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ RunAndSheet = tuple[Path, Path]  # the folder of a run and its sheet's manifest
 
 
 class PhotoCollection:
-    """What is known of an album's photographs; called by one thread at a time. By `forecast` each has its forecast."""
+    """An album's measured photographs; not thread-safe. With `forecast` each photograph gets its forecast."""
 
     def __init__(
         self, album: Album, manifest: Manifest, options: Options, workers: Workers, forecast: RunAndSheet | None = None
@@ -48,7 +48,7 @@ class PhotoCollection:
 
     @property
     def side_px(self) -> float | None:
-        """The shorter side of the photographs that were promised."""
+        """Pixels of the promised photographs' shorter side; None if unknown."""
         return self._task.ranges.side_px
 
     def measure(
@@ -57,47 +57,48 @@ class PhotoCollection:
         advance: Advance = no_advance,
         on_pictures: Callable[[str, Mapping[str, np.ndarray]], None] = lambda file, pictures: None,
     ) -> None:
-        """Measure and classify those of these photographs that are not yet; see `gather_evidence`."""
+        """Measure and classify the photographs that are new; for the callbacks see `gather_evidence`."""
         paths = [path for path in paths if path not in self._measured]
         items = [self._item(path) for path in paths]
         results = measure_all(self._task, items, self._judges, self._workers, self._journal, on_pictures, advance)
         if self._forecast is not None and self._judges is not None:
-            there = partial(_forecast_there, self._forecast, self._task, self._judges.primary.input_px)
-            own = [i for i, item in enumerate(items) if item.control is None]
-            for i, photo in zip(own, self._workers.map(there, [(paths[i], results[i]) for i in own]), strict=True):
+            add_forecast = partial(_add_forecast, self._forecast, self._task, self._judges.primary.input_px)
+            numbers = [i for i, item in enumerate(items) if item.control is None]
+            photos = self._workers.map(add_forecast, [(paths[i], results[i]) for i in numbers])
+            for i, photo in zip(numbers, photos, strict=True):
                 results[i] = photo
         for path, photo in zip(paths, results, strict=True):
             self._measured[path] = photo
-            self.album.know(path, photo.entry.sha256)
+            self.album.remember(path, photo.entry.sha256)
 
     @property
     def photos(self) -> dict[Path, MeasuredPhoto]:
-        """The measured photographs as they count, in the order of their names."""
+        """The measured photographs in the order of their names, copies rejected, those of controls last."""
         grouping, rect_mm = self._grouping(), self._task.surface.rect_mm
-        own = [self._measured[path] for path in grouping.paths]
-        counted = dict(zip(grouping.paths, reject_copies(own, grouping.session, rect_mm), strict=True))
-        return counted | {path: self._measured[path] for path in sorted(self._measured.keys() - counted)}
+        measured = [self._measured[path] for path in grouping.paths]
+        patch_photos = dict(zip(grouping.paths, reject_copies(measured, grouping.session, rect_mm), strict=True))
+        return patch_photos | {path: self._measured[path] for path in sorted(self._measured.keys() - patch_photos)}
 
     def control_of(self, path: Path) -> str | None:
-        """The control that a photograph shows; None for the piece itself."""
+        """The control that a photograph shows; None for the patch itself."""
         return path.parent.name if path.parent.parent.name == CONTROLS_FOLDER else None
 
     def report(self) -> Report:
-        """What the photographs that are measured say together."""
+        """Report on all photographs that were measured so far."""
         photos, grouping = self.photos, self._grouping()
-        own = [photos.pop(path) for path in grouping.paths]
+        patch_photos = [photos.pop(path) for path in grouping.paths]
         controls: dict[str, list[PhotoEntry]] = {}
         for path, photo in photos.items():
             controls.setdefault(path.parent.name, []).append(photo.entry)
-        return report_of(self.manifest, self._judges, own, grouping, controls)
+        return report_of(self.manifest, self._judges, patch_photos, grouping, controls)
 
     def _grouping(self) -> Grouping:
-        own = sorted(path for path in self._measured if self.control_of(path) is None)
-        names = sorted({path.parent.name for path in own})
-        return Grouping(tuple(own), tuple(names.index(path.parent.name) for path in own), tuple(names), BY_FOLDERS)
+        paths = sorted(path for path in self._measured if self.control_of(path) is None)
+        names = sorted({path.parent.name for path in paths})
+        return Grouping(tuple(paths), tuple(names.index(path.parent.name) for path in paths), tuple(names), BY_FOLDERS)
 
     def close(self) -> None:
-        """Nothing is measured after this."""
+        """Close the journal; nothing can be measured after this."""
         self._journal.close()
 
     def _item(self, path: Path) -> PhotoItem:
@@ -106,12 +107,12 @@ class PhotoCollection:
         return PhotoItem(path, file, control, with_pictures=control is None)
 
 
-def ready(_: object) -> None:
-    """Import in the workers' process what measuring takes; an interrupt ends the server, which ends that process."""
+def prepare_worker(_: object) -> None:
+    """Import the modules for measuring in the worker, and let it ignore interrupts: the server ends it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-def _forecast_there(source: RunAndSheet, task: Task, size_px: int, item: tuple[Path, MeasuredPhoto]) -> MeasuredPhoto:
+def _add_forecast(source: RunAndSheet, task: Task, size_px: int, item: tuple[Path, MeasuredPhoto]) -> MeasuredPhoto:
     return with_forecast(partial(reread_square, task, size_px), _forecaster(*source), *item)
 
 

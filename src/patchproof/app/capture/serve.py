@@ -1,9 +1,9 @@
-"""Listen on this machine, or on the local network where that is asked for, until interrupted.
+"""Serve the capture page on this machine, or on request on the local network, until interrupted.
 
 In: a sheet's manifest, the folder for the photographs. Out: the last `Report`. The address has a random token. Port and
-token are kept in the folder, readable by its owner alone, so that after a restart an open page goes on. HTTP is not
-encrypted: in a network of strangers use none but this machine's own address. Left out on purpose: live pictures, which
-browsers allow to encrypted pages only; the phone's own camera takes better ones.
+token are stored in the folder, readable by its owner only, so that an open page continues after a restart. HTTP is not
+encrypted: in a network of strangers serve this machine only. Left out on purpose: live pictures, which browsers allow
+to encrypted pages only; the phone's camera app takes better ones.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from typing import Annotated
 from pydantic import Field
 
 from patchproof.app.capture.album import ADDRESS_FILE, Album
-from patchproof.app.capture.collection import PhotoCollection, ready
+from patchproof.app.capture.collection import PhotoCollection, prepare_worker
 from patchproof.app.verify import options_of
 from patchproof.base.errors import Refused
 from patchproof.base.input import read_json
@@ -31,8 +31,8 @@ from patchproof.base.workers import open_workers
 from patchproof.evidence.results import Report
 from patchproof.sheets.manifest import load_manifest
 
-_NOWHERE = ("192.0.2.1", 9)  # reserved for documentation: a datagram socket that is "connected" to it sends nothing
-_CONNECTIONS = 64
+_TEST_ADDRESS = ("192.0.2.1", 9)  # reserved for documentation: connecting a datagram socket to it sends nothing
+_MOST_CONNECTIONS = 64
 
 
 class _Address(StrictModel):
@@ -56,9 +56,10 @@ def serve_capture(
     progress: Progress = no_progress,
     on_address: Callable[[str], None] = print,
 ) -> Report:
-    """Serve the page and receive photographs into `out` until interrupted. `progress` is called with the stage
-    "measure" for photographs that are there already, `on_address` with the address once the server listens; `run`,
-    `models` and `camera` as in `verify`.
+    """Serve the page and receive photographs into the folder `out` until interrupted; returns the report on them.
+
+    `progress` is called with the stage "measure" for photographs that are there already, `on_address` with the address
+    once the server listens. `run`, `models` and `camera` are those of `verify`.
     """
     try:
         import uvicorn
@@ -74,66 +75,67 @@ def serve_capture(
     forecast = None if run is None else (Path(run).resolve(), Path(sheet).resolve())
     album = Album(Path(out))
     with open_workers(1, spawn=True) as workers:
-        workers.map(ready, [None])
-        with closing(PhotoCollection(album, manifest, options, workers, forecast)) as gathered:
-            gathered.measure(album.photos(), partial(progress, "measure"))
-            kept = _kept_address(album.folder)
-            with _listening(_host(lan), kept.port) as listener:
+        workers.map(prepare_worker, [None])
+        with closing(PhotoCollection(album, manifest, options, workers, forecast)) as collection:
+            collection.measure(album.photos(), partial(progress, "measure"))
+            address = _stored_address(album.folder)
+            with _listen(_host(lan), address.port) as listener:
                 host, port = listener.getsockname()
-                write_atomically(album.folder / ADDRESS_FILE, kept.changed(port=port).write)
-                on_address(f"http://{host}:{port}/{kept.token}/")
+                write_atomically(album.folder / ADDRESS_FILE, address.changed(port=port).write)
+                on_address(f"http://{host}:{port}/{address.token}/")
                 config = uvicorn.Config(
-                    capture_app(gathered, kept.token),
+                    capture_app(collection, address.token),
                     http="h11",
                     ws="none",
                     lifespan="off",
                     log_level="warning",
-                    access_log=False,  # addresses have the token
+                    access_log=False,  # it would contain the token
                     server_header=False,
-                    limit_concurrency=_CONNECTIONS,
+                    limit_concurrency=_MOST_CONNECTIONS,
                     timeout_graceful_shutdown=2,
                 )
                 try:
                     uvicorn.Server(config).run(sockets=[listener])
-                except KeyboardInterrupt:  # how it ends
+                except KeyboardInterrupt:  # the way to end the server
                     pass
-            return gathered.report()
+            return collection.report()
 
 
-def _listening(host: str, port: int) -> socket.socket:
-    """A socket at that port, or at a free one where it is taken."""
+def _listen(host: str, port: int) -> socket.socket:
+    """Listen at that port, or at a free one if it is taken."""
     for wanted in dict.fromkeys((port, 0)):
         listener = socket.socket()
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, os.name != "nt")
         try:
             listener.bind((host, wanted))
-            listener.listen()  # who comes before the server is ready waits
+            listener.listen()  # requests that come before the server is ready wait
             return listener
         except OSError as error:
             listener.close()
             if not wanted:
-                raise Refused("a port to listen at", f"none on {host} ({error.strerror})", "mend that") from error
+                got = f"an error on {host}: {error.strerror}"
+                raise Refused("a port to listen at", got, "free a port, or check the network") from error
     raise AssertionError("port 0 is always tried")
 
 
 def _host(lan: bool) -> str:
-    """One address, never all that this machine has."""
-    return _own_address() if lan else "127.0.0.1"
+    """The one address to serve at; never all that this machine has."""
+    return _network_address() if lan else "127.0.0.1"
 
 
-def _own_address() -> str:
+def _network_address() -> str:
     """This machine's address in its local network."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
-            probe.connect(_NOWHERE)
+            probe.connect(_TEST_ADDRESS)
             return probe.getsockname()[0]
         except OSError as error:
             do = "connect to one, or leave --lan out"
             raise Refused("a local network", f"none ({error.strerror})", do) from error
 
 
-def _kept_address(folder: Path) -> _Address:
-    """Token and port of last time; new ones where there are none."""
+def _stored_address(folder: Path) -> _Address:
+    """Token and port of the last server for this folder; a new token if there is none."""
     try:
         return validate_model(_Address, read_json(folder / ADDRESS_FILE, "an address", "remove it"), ADDRESS_FILE)
     except Refused:

@@ -1,7 +1,7 @@
-"""What the page shows, as plain data: the verdict so far, the map of views, sessions, and photographs with advice.
+"""The content of the capture page as plain data: verdict so far, map of views, sessions, photographs with advice.
 
-In: what is gathered. Out: JSON values. Every sentence about a photograph or the promise is that of the report: remarks'
-advice, the verdict's reason, the plan page's counts.
+In: a collection of photographs. Out: JSON values. Every sentence about a photograph or the promise is the report's:
+remarks' advice, the verdict's reason, the plan page's counts.
 """
 
 from __future__ import annotations
@@ -21,24 +21,24 @@ from patchproof.evidence.verdict import PHOTOS_PER_SESSION, photos_line
 from patchproof.report.images import data_uri
 from patchproof.report.words import VERDICTS, benefit_sentence, headline_of
 
-_LATEST = 12  # photographs with advice
-_USUAL_SESSIONS = 4  # where no number of them would do
-_PREVIEW = {"quality": 80}
+_LATEST_PHOTOS = 12  # that are listed with advice
+_USUAL_SESSIONS = 4  # on the map, if no number of sessions would prove the promise
+_PREVIEW_OPTIONS = {"quality": 80}
 
 
-def state_of(gathered: PhotoCollection, sessions: int | None) -> dict[str, Any]:
-    """All that the page shows but single answers; `sessions` of `PHOTOS_PER_SESSION` photographs are planned."""
-    report = gathered.report()
-    summary, plain, promise = report.summary, report.summary.model_dump(), gathered.manifest.promise
-    counts = {row["name"]: row for row in plain["sessions"]}
-    rows = [counts.get(name, {"name": name, "judged": 0, "recognized": 0}) for name in gathered.album.sessions]
+def state_of(collection: PhotoCollection, sessions: int | None) -> dict[str, Any]:
+    """Everything that the page shows, except for single answers; `sessions` (None: 4) are planned on the map."""
+    report = collection.report()
+    summary, data, promise = report.summary, report.summary.model_dump(), collection.manifest.promise
+    counts = {row["name"]: row for row in data["sessions"]}
+    rows = [counts.get(name, {"name": name, "judged": 0, "recognized": 0}) for name in collection.album.sessions]
     promised = promise.controls if promise is not None else ()
-    names = sorted(gathered.photos, key=lambda path: path.name)  # in the order in which they came
+    names = sorted(collection.photos, key=lambda path: path.name)  # in the order of arrival
     return {
         "verdict": summary.verdict,
         "headline": VERDICTS[summary.verdict],
         "reason": summary.reason,
-        "effect": f"{headline_of(plain)}. {benefit_sentence(plain)}",
+        "effect": f"{headline_of(data)}. {benefit_sentence(data)}",
         "photos": summary.photos,
         "judged": summary.judged,
         "recognized": sum(row["recognized"] for row in rows),
@@ -51,14 +51,14 @@ def state_of(gathered: PhotoCollection, sessions: int | None) -> dict[str, Any]:
             {"name": control.name, "photos": control.n, "recognized": control.recognized} for control in report.controls
         ],
         "controls_known": [name for name in CONTROLS if name in promised] or CONTROLS,
-        "map": _map(gathered, PHOTOS_PER_SESSION * (sessions or _USUAL_SESSIONS)),
-        "latest": [answer_of(gathered, path) for path in names[-_LATEST:][::-1]],
+        "map": _map(collection, PHOTOS_PER_SESSION * (sessions or _USUAL_SESSIONS)),
+        "latest": [answer_of(collection, path) for path in names[-_LATEST_PHOTOS:][::-1]],
     }
 
 
-def answer_of(gathered: PhotoCollection, path: Path, picture: np.ndarray | None = None) -> dict[str, Any]:
-    """What one measured photograph says, and what to do; `picture` (uint8 H×W×3) goes along as a data URI."""
-    photo, promise, answer, prediction = gathered.photos[path], gathered.manifest.promise, "not counted", None
+def answer_of(collection: PhotoCollection, path: Path, picture: np.ndarray | None = None) -> dict[str, Any]:
+    """The answer to one measured photograph, with advice; `picture` (uint8 H×W×3) is included as a data URI."""
+    photo, promise, answer, prediction = collection.photos[path], collection.manifest.promise, "not counted", None
     entry = photo.entry
     if promise is not None and photo.counted:
         prediction = entry.predictions.get(promise.models[0].name)
@@ -67,18 +67,18 @@ def answer_of(gathered: PhotoCollection, path: Path, picture: np.ndarray | None 
     return {
         "file": f"{path.parent.name}/{path.name}",
         "answer": answer,
-        "control": gathered.control_of(path),
+        "control": collection.control_of(path),
         "label": prediction and f"{prediction.label} {prediction.confidence:.0%}",
         "code": entry.code,
         "advice": entry.remark and entry.remark.advice,
-        "view": _view(entry),
+        "view": _view_words(entry),
         "forecast": entry.forecast,
-        "picture": None if picture is None else data_uri(image_bytes(picture, "JPEG", _PREVIEW)),
+        "picture": None if picture is None else data_uri(image_bytes(picture, "JPEG", _PREVIEW_OPTIONS)),
     }
 
 
-def _view(entry: PhotoEntry) -> str:
-    """Where it was taken from, as far as it tells."""
+def _view_words(entry: PhotoEntry) -> str:
+    """Describe the view by distance, side and tilt, as far as they were measured."""
     geometry, pose, parts = entry.geometry, entry.pose, []
     if pose is not None and pose.distance_mm is not None:
         parts.append(f"{pose.distance_mm / 1000:.2f} m")
@@ -89,10 +89,12 @@ def _view(entry: PhotoEntry) -> str:
     return ", ".join(parts)
 
 
-def _map(gathered: PhotoCollection, wanted: int) -> dict[str, Any] | None:
-    """The map with its rows' and columns' names: degrees, and the piece's share of the picture's shorter side."""
-    promise, side_px, photos = gathered.manifest.promise, gathered.side_px, gathered.photos
-    counted = [photo.entry for path, photo in photos.items() if photo.counted and gathered.control_of(path) is None]
+def _map(collection: PhotoCollection, wanted: int) -> dict[str, Any] | None:
+    """The map of views with names of its columns (degrees) and rows (the piece's share of the picture's shorter side,
+    or else pixels per millimeter); None if the promise has no views.
+    """
+    promise, side_px, photos = collection.manifest.promise, collection.side_px, collection.photos
+    counted = [photo.entry for path, photo in photos.items() if photo.counted and collection.control_of(path) is None]
     views = promise and map_views(promise.conditions, counted, wanted, side_px)
     if not views:
         return None
@@ -100,10 +102,10 @@ def _map(gathered: PhotoCollection, wanted: int) -> dict[str, Any] | None:
     if side_px is None:
         rows = [f"{low:.1f}–{high:.1f} px/mm" for high, low in pairs]
     else:
-        share = 100 * gathered.manifest.cut_mm[2] / side_px
+        share = 100 * collection.manifest.cut_mm[2] / side_px
         rows = [f"{share * low:.0f}–{share * high:.0f} %" for high, low in pairs]
     return {
-        "columns": [_side(low, high) for low, high in pairwise(views.azimuth_deg)],
+        "columns": [_azimuth_words(low, high) for low, high in pairwise(views.azimuth_deg)],
         "rows": rows,
         "photos": views.photos,
         "wanted": views.wanted,
@@ -113,8 +115,8 @@ def _map(gathered: PhotoCollection, wanted: int) -> dict[str, Any] | None:
     }
 
 
-def _side(low: float, high: float) -> str:
-    """A range of azimuths, as seen by who looks at the piece."""
+def _azimuth_words(low: float, high: float) -> str:
+    """Describe a range of azimuths, as seen by somebody who looks at the piece."""
     if low < 0 < high:
         return f"{-low:.0f}° left to {high:.0f}° right"
     near, far = sorted((abs(low), abs(high)))

@@ -1,9 +1,8 @@
-"""Which views the promise was made of, and which of them photographs show: azimuth × how large the piece is in the
-picture.
+"""Map the promise's views, and the photographs that show them, by azimuth and size of the piece in the picture.
 
 In: the promise's conditions and the photographs' entries. Out: a `ViewMap` of counts. Cells are equal steps of azimuth
-and of distance (1 over pixels per millimeter); how many photographs a cell needs is its share of the conditions.
-Distance itself is not on the map: only cameras of known focal length tell it, and a network does not see it.
+and of distance (1 over pixels per millimeter); a cell needs photographs in proportion to its share of the conditions.
+Distance itself is not on the map: only cameras of known focal length measure it, and a network does not see it.
 """
 
 from __future__ import annotations
@@ -18,13 +17,13 @@ from patchproof.evidence.results import PhotoEntry
 from patchproof.sheets.manifest import ConditionClaim
 
 _ROWS, _MOST_COLUMNS = 3, 5
-_LEAST_COLUMN_DEG = 12.0  # about what a phone held by hand is off
+_LEAST_COLUMN_DEG = 12.0  # about the error of a person who aims a phone by hand
 
 
 @dataclass(frozen=True)
 class ViewMap:
-    """Edges of columns (degrees, from left to right) and rows (pixels per millimeter, from near to far), and by row
-    how many photographs there are and how many are needed; `elsewhere` more cannot be placed.
+    """Edges of columns (degrees, from left to right) and rows (pixels per millimeter, from near to far), and by row the
+    photographs that there are and that are wanted; `elsewhere` counts those whose view is unknown.
     """
 
     azimuth_deg: tuple[float, ...]
@@ -44,8 +43,8 @@ class ViewMap:
 def map_views(
     conditions: Sequence[ConditionClaim], entries: Iterable[PhotoEntry], wanted: int, side_px: float | None
 ) -> ViewMap | None:
-    """The map of counted photographs where `wanted` are needed in all; None where the conditions say no views.
-    Photographs beyond the edges, which the promise's margin lets in, count in the outermost cells.
+    """Map counted photographs, of which `wanted` are needed in total; None if the conditions have no views.
+    Photographs beyond the edges, which the promise's margin allows, count in the outermost cells.
     """
     views = np.array([(c.azimuth_deg, c.px_per_mm) for c in conditions if c.azimuth_deg is not None and c.px_per_mm])
     if not len(views):
@@ -60,14 +59,14 @@ def map_views(
         return np.histogram2d(*inside, (distance, azimuth_deg))[0]
 
     figures = [figures_of(entry, side_px) for entry in entries]
-    shown = [(each.get("azimuth_deg"), each.get("px_per_mm")) for each in figures]
-    placed = np.array([view for view in shown if None not in view]).reshape(-1, 2)
+    photo_views = [(each.get("azimuth_deg"), each.get("px_per_mm")) for each in figures]
+    known_views = np.array([view for view in photo_views if None not in view]).reshape(-1, 2)
     return ViewMap(
         azimuth_deg=tuple(map(float, azimuth_deg)),
         px_per_mm=tuple(float(1 / d) for d in distance),
-        photos=_rows(counts(placed)),
+        photos=_rows(counts(known_views)),
         wanted=_rows(np.rint(wanted * counts(views) / len(views))),
-        elsewhere=len(shown) - len(placed),
+        elsewhere=len(photo_views) - len(known_views),
     )
 
 

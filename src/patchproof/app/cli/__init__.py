@@ -1,7 +1,7 @@
-"""The command line: verbs only. Each one reads its arguments, calls one function, and prints a short summary.
+"""The command line. Each verb reads its arguments, calls one function, and prints a short summary.
 
-Heavy imports happen inside the verbs, so that help is quick. What a user can cause ends in one sentence and exit code
-1.
+Heavy imports happen inside the verbs, so that help is quick. Errors that a user can cause end in one sentence and exit
+code 1.
 """
 
 from __future__ import annotations

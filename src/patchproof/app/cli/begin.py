@@ -1,4 +1,4 @@
-"""Before anything is optimized: new, preview, plan, keys."""
+"""The verbs before anything is optimized: new, preview, plan, keys."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ def new(
     """Write a commented scene for an object, photographs of it, or a folder of images."""
     from patchproof.app.begin.new import new_scene
 
-    given = names_of(models) or ()
-    lines = new_scene(thing, out, label=label, length_mm=length_mm, up=up, models=given, overwrite=overwrite)
+    network_names = names_of(models) or ()
+    lines = new_scene(thing, out, label=label, length_mm=length_mm, up=up, models=network_names, overwrite=overwrite)
     say(*lines, f"scene: {out}", f"next: patchproof preview {out}")
 
 
@@ -46,11 +46,11 @@ def preview(
     """A page that shows the object, the piece on it, and what networks see now; in seconds."""
     from patchproof.app.begin.preview import preview_scene
 
-    shown = preview_scene(scene, out, overwrite=overwrite)
-    warn(shown.warnings)
-    say(*shown.lines, f"page: {shown.page}")
-    if shown.refused:
-        print(shown.refused, file=sys.stderr)
+    result = preview_scene(scene, out, overwrite=overwrite)
+    warn(result.warnings)
+    say(*result.lines, f"page: {result.page}")
+    if result.refused:
+        print(result.refused, file=sys.stderr)
         raise typer.Exit(1)
     say(f"next: patchproof optimize {scene} --out run (--draft for a first look)")
 
@@ -61,7 +61,7 @@ def plan(
     no_timing: Annotated[bool, typer.Option("--no-timing", help="Leave out the cost of a step.")] = False,
     overwrite: Overwrite = False,
 ) -> None:
-    """What is modeled, what is not, and why: first how the piece lies, then what is measured."""
+    """Show what is modeled, what is not, and why: first how the piece lies, then what is measured."""
     from patchproof.app.plan.lines import geometry_lines, measured_lines
     from patchproof.app.plan.plan import measured_plan, plan_geometry
     from patchproof.base.output import check_file, write_atomically
@@ -74,10 +74,10 @@ def plan(
     say(*geometry_lines(geometry))
     sys.stdout.flush()  # what follows takes minutes
     with progress() as bar:
-        planned = measured_plan(geometry, problem, timing=not no_timing, progress=bar)
-    say(*measured_lines(planned))
+        full_plan = measured_plan(geometry, problem, timing=not no_timing, progress=bar)
+    say(*measured_lines(full_plan))
     if out is not None:
-        write_atomically(out, planned.model_dump_json(indent=1) + "\n")
+        write_atomically(out, full_plan.model_dump_json(indent=1) + "\n")
 
 
 def keys(

@@ -1,4 +1,4 @@
-"""Models of a printer or a camera."""
+"""The verbs of `calibrate`: printer, camera."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ def printer(
     if (icc is None) == (chart is None) or (more and chart is None):
         raise typer.BadParameter("give either --icc FILE or --chart PHOTO...", param_hint="--icc / --chart")
     if icc is not None:
-        lines, warned = printer_from_icc(icc, out, intent == "perceptual", licence, source, overwrite), ()
+        lines, warnings = printer_from_icc(icc, out, intent == "perceptual", licence, source, overwrite), ()
     elif sheet is None:
         raise typer.BadParameter("name the JSON that was written beside the chart's PDF", param_hint="--sheet")
     else:
         with progress() as bar:
-            lines, warned = printer_from_chart(photos, sheet, out, camera, overwrite, bar)
-    warn(warned)
+            lines, warnings = printer_from_chart(photos, sheet, out, camera, overwrite, bar)
+    warn(warnings)
     say(*lines)
 
 
@@ -57,5 +57,5 @@ def camera(
 
     ruler = None if ruler_mm is None else pair_of(ruler_mm, "--ruler-mm")
     with progress() as bar:
-        fitted = calibrate_camera(photos, board, out, ruler_mm=ruler, overwrite=overwrite, progress=bar)
-    say(*calibration_lines(fitted), f"camera: {out}")
+        fitted_camera = calibrate_camera(photos, board, out, ruler_mm=ruler, overwrite=overwrite, progress=bar)
+    say(*calibration_lines(fitted_camera), f"camera: {out}")

@@ -1,4 +1,4 @@
-"""Photographs from a phone: capture."""
+"""The verb capture: photographs from a phone."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from patchproof.app.cli.console import Models, names_of, progress, say
 
 def capture(
     sheet: Annotated[Path, typer.Argument(help="The manifest that was written beside the PDF.")],
-    out: Annotated[Path, typer.Option(help="Folder for the photographs; an earlier one is gone on with.")] = Path(
+    out: Annotated[Path, typer.Option(help="Folder for the photographs; an existing one is continued.")] = Path(
         "photos"
     ),
     run: Annotated[

@@ -1,4 +1,4 @@
-"""What all commands share: options, progress, and how things are said.
+"""Options, progress and output that all commands share.
 
 Summaries go to standard output; warnings, failures and progress to standard error.
 """
@@ -39,16 +39,16 @@ Cluster = Annotated[str | None, typer.Option(help="A Dask scheduler's address, i
 Models = Annotated[str | None, typer.Option(help="Comma-separated classifiers in place of the sheet's own.")]
 
 
-LINE_EVERY_S = 30.0  # where progress is not seen by a person at a terminal
+LINE_EVERY_S = 30.0  # of progress, if standard error is not a terminal
 
 
 @contextmanager
 def progress() -> Iterator[Callable[[str, int, int], None]]:
-    """A bar with time left on standard error: call it with a stage's name, what is done, and the total. A file or pipe
-    in place of a terminal gets a line now and then.
+    """Show progress on standard error: yields a function of a stage's name, the number done, and the total. A terminal
+    gets a bar with the time left, a file or pipe a line every 30 s.
     """
     if not sys.stderr.isatty():
-        yield _line_now_and_then()
+        yield _print_lines()
         return
     from rich import progress as rich
     from rich.console import Console
@@ -66,7 +66,7 @@ def progress() -> Iterator[Callable[[str, int, int], None]]:
         yield advance
 
 
-def _line_now_and_then() -> Callable[[str, int, int], None]:
+def _print_lines() -> Callable[[str, int, int], None]:
     last = time.monotonic()
 
     def advance(stage: str, done: int, total: int) -> None:
@@ -79,40 +79,40 @@ def _line_now_and_then() -> Callable[[str, int, int], None]:
 
 
 def as_command(verb: Callable[..., None]) -> Callable[..., None]:
-    """A verb on the cores that are free (`jobs`), which, stopped by Ctrl-C, says what is kept and how to go on, and
-    exits with 130.
+    """Make a verb a command: with `jobs` it uses the free cores; Ctrl-C ends it with exit code 130 and a sentence on
+    what was kept and how to continue.
     """
 
     @wraps(verb)
-    def carry_out(**given: Any) -> None:
+    def command(**arguments: Any) -> None:
         try:
-            with _on_free_cores(given):
-                verb(**given)
+            with _on_free_cores(arguments):
+                verb(**arguments)
         except KeyboardInterrupt:
-            print(_stopped(given), file=sys.stderr)
+            print(_stop_sentence(arguments), file=sys.stderr)
             raise typer.Exit(130) from None
 
-    return carry_out
+    return command
 
 
-def _on_free_cores(given: dict[str, Any]) -> AbstractContextManager[None]:
-    """One process for each free core, each on one thread, where they can be forked; a GPU, a cluster and processes that
-    would import everything anew have the number that is asked for, one by default, and the threads of this one.
+def _on_free_cores(arguments: dict[str, Any]) -> AbstractContextManager[None]:
+    """Set `jobs` by default to the free cores, each process with one thread, if processes can be forked; with a GPU, a
+    cluster or processes that would have to import everything, to one with this process's threads.
     """
-    if "jobs" not in given:
+    if "jobs" not in arguments:
         return nullcontext()
-    by_processes = can_fork() and given.get("device", "cpu") == "cpu"
-    if given["jobs"] is None:
-        given["jobs"] = available_cores() if by_processes and given.get("cluster") is None else 1
+    by_processes = can_fork() and arguments.get("device", "cpu") == "cpu"
+    if arguments["jobs"] is None:
+        arguments["jobs"] = available_cores() if by_processes and arguments.get("cluster") is None else 1
     return use_threads(1) if by_processes else nullcontext()
 
 
-def _stopped(given: dict[str, Any]) -> str:
-    out = given.get("out")
-    if "resume" not in given or not Path(out or "").is_dir():
+def _stop_sentence(arguments: dict[str, Any]) -> str:
+    out = arguments.get("out")
+    if "resume" not in arguments or not Path(out or "").is_dir():
         return "Stopped: nothing was written."
-    again = [word for word in sys.argv[1:] if word not in ("--overwrite", "--resume")]
-    return f"Stopped: {out} keeps what was finished. Go on with: {shlex.join([_program(), *again, '--resume'])}"
+    words = [word for word in sys.argv[1:] if word not in ("--overwrite", "--resume")]
+    return f"Stopped: {out} keeps what was finished. Go on with: {shlex.join([_program(), *words, '--resume'])}"
 
 
 def _program() -> str:
@@ -121,8 +121,8 @@ def _program() -> str:
     return path.parent.name if path.stem == "__main__" else path.stem
 
 
-def _say_version(asked: bool) -> None:
-    if asked:
+def _say_version(requested: bool) -> None:
+    if requested:
         print(f"{_program()} {__version__}")
         raise typer.Exit()
 
@@ -132,11 +132,11 @@ def version_option(
         bool, typer.Option("--version", callback=_say_version, is_eager=True, help="Say the version and exit.")
     ] = False,
 ) -> None:
-    """The options that stand before the verb."""
+    """Options before the verb."""
 
 
 def run_command_line(app: typer.Typer) -> None:
-    """Run one of the commands; a refusal is one sentence on standard error and exit code 1."""
+    """Run the command line; a refusal ends in one sentence on standard error and exit code 1."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # Windows gives pipes its code page, which has no ε
             stream.reconfigure(encoding="utf-8")
@@ -161,13 +161,13 @@ def run_command_line(app: typer.Typer) -> None:
 
 
 def say(*lines: str) -> None:
-    """A summary's lines."""
+    """Print a summary's lines to standard output."""
     for line in lines:
         print(line)
 
 
 def say_study(finished) -> None:
-    """A study's or benchmark's tables, and on standard error what failed."""
+    """Print a study's or benchmark's tables, and its failures on standard error."""
     from patchproof.report.tables import text_lines
 
     for table in finished.tables:
@@ -177,18 +177,18 @@ def say_study(finished) -> None:
 
 
 def warn(lines: tuple[str, ...]) -> None:
-    """One line each, on standard error."""
+    """Print each warning on a line of standard error."""
     for line in lines:
         print(f"warning: {line}", file=sys.stderr)
 
 
 def names_of(models: str | None) -> tuple[str, ...] | None:
-    """Names between commas."""
+    """Split names at commas; None stays None."""
     return None if models is None else tuple(name.strip() for name in models.split(",") if name.strip())
 
 
 def pair_of(text: str, option: str) -> tuple[float, float]:
-    """A number, or two as XxY."""
+    """Parse one positive number, or two as XxY; refused as a bad value of `option`."""
     try:
         numbers = [float(part) for part in text.lower().split("x")]
         x, y = numbers * 2 if len(numbers) == 1 else numbers

@@ -1,4 +1,4 @@
-"""Designs that are there: pictures made elsewhere as runs, and rates on fresh conditions, of one run or of several."""
+"""The verbs for existing designs: import (pictures made elsewhere) and evaluate (one run, or several compared)."""
 
 from __future__ import annotations
 

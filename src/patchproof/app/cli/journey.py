@@ -1,4 +1,4 @@
-"""From a scene to a verdict: demo, optimize, evaluate, sheet, reprint, verify."""
+"""The verbs from a scene to a verdict: demo, optimize, promise, sheet, reprint, verify."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def optimize(
         )
     warn(tuple(text for text in run.scene.warnings if text not in loaded.warnings))  # of the place that was found
     say(*promise_lines(run.promise, background_summary(run.scene.settings.model_dump())))
-    if (out / "place.json").is_file():  # what searches a place is loaded where one was searched for
+    if (out / "place.json").is_file():  # only then import the search's modules
         from patchproof.optimizer.place_files import read_place
         from patchproof.optimizer.place_search import place_lines
 
@@ -106,15 +106,15 @@ def promise(
     device: Device = "cpu",
     jobs: Jobs = None,
 ) -> None:
-    """Promise a finished run's rate anew: the full promise of a draft, or one of more views."""
+    """Promise a finished run's rate again: in full after a draft, or from more views."""
     from patchproof.base.settings import background_summary
     from patchproof.optimizer.run import promise_run
     from patchproof.report.words import promise_lines
 
     with progress() as bar:
-        made = promise_run(run, views=n, compute=Compute(device, jobs or 1), progress=bar)
-    say(*promise_lines(made.promise, background_summary(made.scene.settings.model_dump())))
-    if made.scene.settings.patch.kind == "patch":
+        finished_run = promise_run(run, views=n, compute=Compute(device, jobs or 1), progress=bar)
+    say(*promise_lines(finished_run.promise, background_summary(finished_run.scene.settings.model_dump())))
+    if finished_run.scene.settings.patch.kind == "patch":
         say(f"next: patchproof sheet {run} --out sheet.pdf (a page that was written before has the former promise)")
 
 
@@ -169,7 +169,7 @@ def sheet(
         say(f"sheet {manifest.sheet_id} ({manifest.kind}): {out}, {path.name}")
     if check:
         lines = (line for manifest in manifests for line in sheet_advice(manifest))
-        say(*dict.fromkeys(lines), *pdf_advice(out))  # what holds for several designs is said once
+        say(*dict.fromkeys(lines), *pdf_advice(out))  # lines that several designs share are printed once
 
 
 def reprint(
@@ -215,14 +215,14 @@ def reprint(
             raise typer.BadParameter(only, param_hint="--run")
         reprint_pages(pdf, n, out, how, seed=seed, overwrite=overwrite)
         return say(f"{n} photographs: {out}")
-    made = load_run(run)
+    finished_run = load_run(run)
     if scan_dpi is not None:
-        taken = scan(pdf, made, n, out, scan_dpi, how, overwrite=overwrite)
+        taken = scan(pdf, finished_run, n, out, scan_dpi, how, overwrite=overwrite)
     else:
         with progress() as bar:
             taken = reprint_sheet(
                 pdf,
-                made,
+                finished_run,
                 n,
                 out,
                 how,

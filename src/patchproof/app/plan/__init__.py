@@ -1,1 +1,1 @@
-"""What of a scene is modeled, what is not, and why."""
+"""The plan of a scene: its geometry, the error of each term of the model, sample sizes, and the cost of a step."""

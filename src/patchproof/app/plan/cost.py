@@ -1,8 +1,8 @@
-"""What one step of optimization costs on this machine, and where the time goes.
+"""Measure the time of one optimization step on this machine, by parts.
 
 In: a problem and a design. Out: `Cost`: median milliseconds of each part over a few steps' views, after a warm-up. The
-parts are those of the loop, where views that share a pose share what it takes to see it; what cannot be timed inside of
-`render_views` is the difference of two calls of it.
+parts are those of the loop, in which views of one pose share its rasterization; a part inside of `render_views` is the
+difference of two calls of it.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class Cost(StrictModel):
 
 
 def measure_cost(problem: Problem, design: Tensor, advance: Advance = no_advance) -> Cost:
-    """The cost of a step that shows `design`, with all classifiers of the problem."""
+    """Time steps that show `design`, with all classifiers of the problem."""
     views, threads, rows = problem.scene.settings.optimize.views, torch.get_num_threads(), []
     for number in range(REPEATS + 1):  # the first one warms up
         rows.append(_step_ms(problem, design, problem.scene.draw("train", views, start=number * views)))
@@ -59,15 +59,15 @@ def measure_cost(problem: Problem, design: Tensor, advance: Advance = no_advance
 
 
 def _step_ms(problem: Problem, design: Tensor, conditions: Conditions) -> dict[str, float]:
-    """Milliseconds of each part of one step, in the order of the loop."""
+    """Time each part of one step in milliseconds, in the order of the loop."""
     design = design.clone().requires_grad_()
     parts, views = _see_ms(problem, problem.subject.appearance(design.detach()), conditions)
     share = new_pose_share(problem.scene)
     parts = {name: ms * share for name, ms in parts.items()}
     clock = _Clock(problem.device)
-    shown = problem.subject.appearance(design)
+    appearance = problem.subject.appearance(design)
     parts[problem.subject.STAGE_NAME] = clock.lap()
-    pictures = expose(views, shown)
+    pictures = expose(views, appearance)
     parts["light, piece and camera"] = clock.lap()
     leaf, boxes, windows = pictures.detach().requires_grad_(), problem.boxes(conditions), affected_windows(views)
     losses = [
@@ -84,13 +84,13 @@ def _step_ms(problem: Problem, design: Tensor, conditions: Conditions) -> dict[s
     return parts
 
 
-def _see_ms(problem: Problem, shown: Appearance, conditions: Conditions) -> tuple[dict[str, float], Views]:
-    """(milliseconds of the parts of `render_views`, the views)."""
+def _see_ms(problem: Problem, appearance: Appearance, conditions: Conditions) -> tuple[dict[str, float], Views]:
+    """Time the parts of `render_views` in milliseconds; also returns the views."""
     side_px = problem.training_px
-    problem.see(None, conditions, 16)  # brings the places behind the object into memory, which a run does once
+    problem.see(None, conditions, 16)  # loads the background pictures, which a run does once
     clock = _Clock(problem.device)
-    views = problem.see(shown, conditions, side_px)
-    whole = clock.lap()
+    views = problem.see(appearance, conditions, side_px)
+    total = clock.lap()
     problem.see(None, conditions, side_px)
     parts = {"see: background": clock.lap()}
     if problem.scene.HAS_OBJECT:
@@ -104,7 +104,7 @@ def _see_ms(problem: Problem, shown: Appearance, conditions: Conditions) -> tupl
         rest = parts.pop("see: background") - rasterizing
         parts |= {"see: rasterize object": rasterizing, "see: object's texels, outlines, background": rest}
     if views.piece is not None:
-        parts["see: piece's footprints"] = max(0.0, whole - sum(parts.values()))
+        parts["see: piece's footprints"] = max(0.0, total - sum(parts.values()))
     return parts, views
 
 
@@ -116,8 +116,8 @@ class _Clock:
         self.lap()
 
     def lap(self) -> float:
-        """Milliseconds since the last time, and begin again."""
+        """Return the milliseconds since the last call, and restart."""
         if self._device.type == "cuda":
             torch.cuda.synchronize(self._device)
-        before, self._last = self._last, time.perf_counter()
-        return 1000 * (self._last - before)
+        start, self._last = self._last, time.perf_counter()
+        return 1000 * (self._last - start)

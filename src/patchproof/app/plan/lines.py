@@ -1,4 +1,4 @@
-"""A plan as lines for the terminal."""
+"""Format a plan as lines for the terminal."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from patchproof.scene.interface import PX_PER_MODULE, READABLE_SHARE
 
 
 def geometry_lines(plan: GeometryPlan) -> list[str]:
-    """What a plan knows before it has measured anything."""
+    """Format the part of a plan that is known before anything is measured."""
     lines = [f"{plan.scene}: {plan.target}, {plan.kind}, seen by {', '.join(plan.models)}"]
     if plan.place is not None:
         lines += ["place", *(f"  {line}" for line in place_lines(plan.place))]
@@ -21,7 +21,7 @@ def geometry_lines(plan: GeometryPlan) -> list[str]:
 
 
 def measured_lines(plan: Plan) -> list[str]:
-    """What a plan measured."""
+    """Format the part of a plan that was measured."""
     lines = _term_lines(plan)
     lines += [f"chance, at the draft's rate of {plan.draft.rate:.0%} (95 %)"]
     lines += [
@@ -68,10 +68,10 @@ def _resolution_lines(views: Resolution) -> list[str]:
 
 
 def _marker_lines(markers: Markers) -> list[str]:
-    fits = "" if markers.printed_mm > 0.95 * markers.needed_mm else " (all that page, object or blank allows)"
+    note = "" if markers.printed_mm > 0.95 * markers.needed_mm else " (all that page, object or blank allows)"
     return [
         f"  needed {markers.needed_mm:.1f} mm ({PX_PER_MODULE:g} px per module at the {READABLE_SHARE:.0%} point of "
-        f"the views), printed {markers.printed_mm:.1f} mm{fits}; unreadable in {markers.unreadable_share:.0%} of views"
+        f"the views), printed {markers.printed_mm:.1f} mm{note}; unreadable in {markers.unreadable_share:.0%} of views"
     ]
 
 
@@ -85,8 +85,8 @@ def _term_lines(plan: Plan) -> list[str]:
     ]
     lines += [_term_line(term) for term in terms.errors if term.verdict != "off"]
     if terms.together is not None:
-        fits = "" if terms.together < terms.threshold else ": too much, keep some"
-        lines.append(f"  {'all that can go, at once':42}   {terms.together:.3f}{fits}")
+        note = "" if terms.together < terms.threshold else ": too much, keep some"
+        lines.append(f"  {'all that can go, at once':42}   {terms.together:.3f}{note}")
     off = [f"{term.name} ({term.key})" for term in terms.errors if term.verdict == "off" and term.key]
     return [*lines, *([f"  off: {', '.join(off)}"] if off else [])]
 

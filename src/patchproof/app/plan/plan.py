@@ -1,17 +1,16 @@
-"""`plan`: what of a scene is modeled, what is not, and why, each time with the figure that decided it.
+"""`plan`: which parts of a scene are modeled and which are not, each with the figure that decided it.
 
-In: a scene file. Out: `Plan`: where the piece lies (searched for first, where the scene asks for that) and what a
-simpler or richer surface would do, the pixels that views have for design and markers, the error that each term of
-light, camera and renderer would leave, what chance leaves, and the cost of a step. All of it comes from the code that
-optimizes: a draft of a few steps is what the terms are measured with, because a classifier that a design says nothing
-to would miss none of them.
+In: a scene file. Out: `Plan`: where the piece lies (after a search, if the scene asks for one) and how a simpler or
+richer surface would differ, the pixels that views have for design and markers, the error of leaving out each term of
+light, camera and renderer, sampling errors, and the cost of a step. All figures come from the code that optimizes.
+Terms are measured with a draft of a few steps, since a classifier that ignores the design would miss none of them.
 
-Chance is what selection and promise may be off by with as many samples as they take, and with four times as many, which
-is the next rung: it shrinks with their root, cost grows with them. The promise's interval is Wilson's, of views that
-share no session. What photographs can say depends on how much sessions differ, which the promise measures: the sheet's
-plan page has it.
+Sampling errors are the half-widths of 95 % intervals of selection and promise, with the numbers of views that they use,
+and with four times as many: errors shrink with the root of the number, cost grows with it. The promise's interval is
+Wilson's, of views that share no session. What photographs can prove depends on how much sessions differ, which the
+promise measures: the sheet's plan page says it.
 
-Left out on purpose: deciding for the user. The plan says what can go; the scene file says what is modeled.
+Left out on purpose: deciding for the user. The plan says which terms can go; the scene file decides.
 """
 
 from __future__ import annotations
@@ -44,11 +43,11 @@ from patchproof.sheets.piece import SMALLEST_MARKER_MM
 
 TERM_VIEWS = 16
 DRAFT_VIEWS = 120  # that the draft is trained on
-_NEXT = 4  # times as many samples
+_NEXT_FACTOR = 4  # of the number of samples
 
 
 class SurfacePlan(StrictModel):
-    """Where the piece lies. `other` is what `patch.bend` the other way round would do."""
+    """The piece on the object; `other` says how it would lie with the opposite `patch.bend`."""
 
     family: str
     size_mm: tuple[float, float]
@@ -61,7 +60,7 @@ class SurfacePlan(StrictModel):
 
 
 class Resolution(StrictModel):
-    """Pixels per millimeter at the 5 % and 95 % points of the views, and the design's own; null where unknown."""
+    """Pixels per millimeter at the 5 % and 95 % points of the views, and of the design; null if unknown."""
 
     network_px: int
     photo_px: tuple[int, int]
@@ -84,7 +83,7 @@ class Markers(StrictModel):
 
 
 class Draft(StrictModel):
-    """The design that terms are measured with: the loop's own after `steps` steps, and the rate it has there."""
+    """The design that terms are measured with: the number of optimization steps, and the rate it reached."""
 
     steps: int
     rate: float
@@ -101,7 +100,7 @@ class Sample(StrictModel):
 
 
 class GeometryPlan(StrictModel):
-    """What needs no design: known in seconds, unless a place is searched for."""
+    """The part of a plan that needs no design: computed in seconds, unless a place is searched for."""
 
     scene: str
     kind: str
@@ -115,7 +114,7 @@ class GeometryPlan(StrictModel):
 
 
 class Plan(GeometryPlan):
-    """Everything that `plan` found out."""
+    """A whole plan: its geometry, and all that is measured with a draft of the design."""
 
     draft: Draft
     terms: Terms
@@ -130,7 +129,7 @@ def plan_geometry(
     device: str = "cpu",
     progress: Progress = no_progress,
 ) -> tuple[GeometryPlan, Problem]:
-    """How the piece of a scene lies and what views show of it, and the problem that a plan goes on with."""
+    """Compute how the piece of a scene lies and how well views resolve it; also returns the problem to measure."""
     scene, place = load_scene(scene_path), None
     if isinstance(scene, UnplacedScene):
         place = choose_place(scene, compute=Compute(device), progress=progress)
@@ -159,7 +158,7 @@ def measured_plan(
     views: int = TERM_VIEWS,
     progress: Progress = no_progress,
 ) -> Plan:
-    """The rest of a plan: a draft of the design, the terms and the cost."""
+    """Measure the rest of a plan: a draft of the design, the terms and, with `timing`, the cost of a step."""
     scene = problem.scene
     other, _ = placement_with_other_bend(scene)
     design, draft = _draft(problem, progress)
@@ -176,7 +175,7 @@ def measured_plan(
 
 
 def resolution_plan(problem: Problem) -> Resolution:
-    """What views resolve of the design."""
+    """Compute how finely views and print resolve the design."""
     scene, grid = problem.scene, problem.subject.grid
     network_px = max(classifier.input_px for classifier in problem.classifiers)
     closest = scene.closest_px_per_mm((network_px, network_px))
@@ -195,7 +194,7 @@ def resolution_plan(problem: Problem) -> Resolution:
 
 
 def marker_plan(scene: PieceScene) -> Markers:
-    """The marker rule on this scene's views."""
+    """Apply the rule for the markers' size to this scene's views."""
     px_per_mm = np.quantile(scene.px_per_mm(scene.photo_px, shorter=True), 1 - READABLE_SHARE)
     return Markers(
         needed_mm=max(MARKER_MODULES * PX_PER_MODULE / float(px_per_mm), SMALLEST_MARKER_MM),
@@ -205,13 +204,13 @@ def marker_plan(scene: PieceScene) -> Markers:
 
 
 def sample_plan(rate: float, standard_error: float) -> tuple[Sample, ...]:
-    """The samples' ladder at a rate; `standard_error` is that of the selection set's mean confidence."""
-    selection = [1.96 * standard_error / k**0.5 for k in (1, _NEXT)]
-    promise = [np.ptp(wilson(round(rate * n), n)) / 2 for n in (PROMISE_VIEWS, _NEXT * PROMISE_VIEWS)]
+    """Compute the sampling errors at a rate; `standard_error` is that of the selection set's mean confidence."""
+    selection = [1.96 * standard_error / k**0.5 for k in (1, _NEXT_FACTOR)]
+    promise = [np.ptp(wilson(round(rate * n), n)) / 2 for n in (PROMISE_VIEWS, _NEXT_FACTOR * PROMISE_VIEWS)]
     rows = (("selection: mean confidence", SELECT_VIEWS, selection), ("promise: rate", PROMISE_VIEWS, promise))
     return tuple(
-        Sample(name=name, n=n, half_width=now, next_n=_NEXT * n, next_half_width=after)
-        for name, n, (now, after) in rows
+        Sample(name=name, n=n, half_width=width, next_n=_NEXT_FACTOR * n, next_half_width=next_width)
+        for name, n, (width, next_width) in rows
     )
 
 
@@ -221,7 +220,7 @@ def _quantiles(values: np.ndarray) -> tuple[float, float]:
 
 
 def _draft(problem: Problem, progress: Callable[[str, int, int], None]) -> tuple[Tensor, Draft]:
-    """The loop's design after a few steps, in 8-bit colors, tried on the selection set."""
+    """Optimize a design for a few steps: its 8-bit colors, and its rate on the selection set."""
     settings = problem.scene.settings.optimize
     count = min(settings.steps, math.ceil(DRAFT_VIEWS / settings.views))
     state, rate = start(problem), None

@@ -1,8 +1,8 @@
-"""The parts of the model that a plan weighs, and what a simpler model would put in the place of each.
+"""The terms of the model that a plan measures, and the simpler model that replaces each.
 
-In: a problem. Out: `Term`s: functions that take a part out of a `Setup`, everything that pictures are made of. What
-takes a part's place is the best of what is simpler: even light as strong on the patch in place of the sun, not
-darkness. How drawn effects are switched off is said in `channel.effects`.
+In: a problem. Out: `Term`s: functions that take a term out of a `Setup`, everything that pictures are made of. A term
+is replaced by the best simpler model: the sun by even light that is as strong on the patch, not by darkness.
+`channel.effects` defines how drawn effects are switched off.
 """
 
 from __future__ import annotations
@@ -32,15 +32,14 @@ class Setup:
     """Everything that pictures are made of."""
 
     stage: Stage
-    shown: Appearance
+    appearance: Appearance
     conditions: Conditions
 
 
 @dataclass(frozen=True)
 class Term:
-    """A part of the model: the settings key that governs it and the same setup without it, None where it is off.
-
-    Of a term that is not `modeled`, `change` puts it in. `whole`: it needs whole photographs to be seen as it is.
+    """A term of the model: the settings key that governs it, and `change`, which takes it out of a setup, or returns
+    None if it is off. A term that is not `modeled` is added by `change`. `whole`: only whole photographs show it fully.
     """
 
     name: str
@@ -57,31 +56,31 @@ def scene_terms(problem: Problem, design: Tensor, other_surface: Placement | Non
         table: tuple(term for term in effect_terms(table) if scene.models(EFFECT_BY_NAME[term.name]))
         for table in ("light", "printer", "camera")
     }
-    own = {
-        part: Term(part.name, part.key, partial(_without_part, part=part), whole=part.needs_whole_photo)
+    parts = [
+        Term(part.name, part.key, partial(_without_part, part=part), whole=part.needs_whole_photo)
         for part in scene.TERMS
-    }
-    terms = (*effects["light"], *(term for term in own.values() if not term.key))
+    ]
+    terms = (*effects["light"], *(term for term in parts if not term.key))
     if scene.HAS_PIECE:
         terms = (*terms, Term(PRINTER, "printer.profile", partial(_without_printer, problem, design)))
-    terms = (*terms, *effects["printer"], *effects["camera"], *(term for term in own.values() if term.key))
+    terms = (*terms, *effects["printer"], *effects["camera"], *(term for term in parts if term.key))
     if other_surface is not None:
-        lies, change = require_patch(scene).placement, partial(_on_surface, placement=other_surface)
-        name = "bent piece" if lies.is_flat else f"{lies.family}, not a card"
-        terms = (*terms, Term(name, "patch.bend", change, modeled=not lies.is_flat))
+        placement, change = require_patch(scene).placement, partial(_on_surface, placement=other_surface)
+        name = "bent piece" if placement.is_flat else f"{placement.family}, not a card"
+        terms = (*terms, Term(name, "patch.bend", change, modeled=not placement.is_flat))
     return terms
 
 
 def effect_terms(table: str) -> tuple[Term, ...]:
-    """The effects that a table of the settings turns on and off."""
+    """Terms for the effects that a table of the settings turns on and off."""
     return tuple(
-        Term(effect.name, effect.keys[0], partial(_without, effect=effect), whole=effect.needs_whole_photo)
+        Term(effect.name, effect.keys[0], partial(_without_effect, effect=effect), whole=effect.needs_whole_photo)
         for effect in EFFECTS
         if effect.can_be_off and effect.keys[0].startswith(f"{table}.")
     )
 
 
-def _without(setup: Setup, effect: ViewEffect) -> Setup | None:
+def _without_effect(setup: Setup, effect: ViewEffect) -> Setup | None:
     facing = lambda *angles: require_mesh(setup.stage.scene).cosines(*angles)  # noqa: E731
     conditions = without_effect(setup.conditions, effect, facing)
     return None if conditions is None else replace(setup, conditions=conditions)
@@ -90,7 +89,7 @@ def _without(setup: Setup, effect: ViewEffect) -> Setup | None:
 def _without_printer(problem: Problem, design: Tensor, setup: Setup) -> Setup | None:
     if problem.printer.name == "identity":
         return None
-    return replace(setup, shown=problem.subject.with_printer(identity_printer()).appearance(design))
+    return replace(setup, appearance=problem.subject.with_printer(identity_printer()).appearance(design))
 
 
 def _without_part(setup: Setup, part: SceneTerm) -> Setup | None:

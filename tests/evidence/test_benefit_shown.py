@@ -12,10 +12,10 @@ from patchproof.evidence.benefit import benefit_of
 from patchproof.evidence.results import Control
 from patchproof.evidence.verdict import PHOTOS_PER_SESSION, judge, next_step, photos_line, sessions_needed
 from patchproof.report.words import headline_of, promise_lines, verdict_lines
-from patchproof.report.write import render
+from patchproof.report.write import report_html
+from test_benefit import promise_of as promise_beside
 from test_report import some_report
 from test_verify_verdict import promise_of
-from test_worth import promise_of as promise_beside
 
 
 def summary_of(recognized, photos, promise, controls=()):
@@ -90,7 +90,7 @@ def test_terminal_and_page_begin_with_what_the_patch_is_worth(promise, recognize
     assert first.startswith(f"{headline}. Recognized in {recognized / 40:.1%} of 40 photographs, the bare object in")
     assert "not photographed" in first and second.startswith(f"verdict: {verdict} ")
     manifest = {"promise": promise.model_dump(mode="json"), "settings": {}, "kind": "design", "page_mm": (210, 297)}
-    page = render(report.model_dump(mode="json"), manifest | {"design": None}, {}, None)
+    page = report_html(report.model_dump(mode="json"), manifest | {"design": None}, {}, None)
     assert f'<h1 class="{word}">{headline}</h1>' in page and page.index(headline) < page.index("Promise ")
     assert ".helps { color:var(--yes) }" in page and f'<b class="{verdict}">Promise ' in page
 
@@ -151,7 +151,7 @@ def test_what_stood_behind_the_object_is_said_and_a_plain_color_loudly():
     assert any("ONE PLAIN COLOR" in line for line in verdict_lines(report))
     assert any("ONE PLAIN COLOR" in line for line in promise_lines(HELPFUL, plain))
     manifest = {"promise": HELPFUL.model_dump(mode="json"), "settings": {}, "kind": "design", "page_mm": (210, 297)}
-    assert "ONE PLAIN COLOR" in render(report.model_dump(mode="json"), manifest | {"design": None}, {}, None)
+    assert "ONE PLAIN COLOR" in report_html(report.model_dump(mode="json"), manifest | {"design": None}, {}, None)
 
 
 @pytest.mark.parametrize("views", [0, 48])
@@ -160,7 +160,7 @@ def test_that_the_promise_is_a_draft_is_said(views):
     report = some_report().changed(summary=summary)
     promise = HELPFUL.changed(draft=views > 0)
     manifest = {"promise": promise.model_dump(mode="json"), "settings": {}, "kind": "design", "page_mm": (210, 297)}
-    page = render(report.model_dump(mode="json"), manifest | {"design": None}, {}, None)
+    page = report_html(report.model_dump(mode="json"), manifest | {"design": None}, {}, None)
     assert ("The promise is a draft of 48 views, no more than a hint." in page) == (views > 0)
     line = "promised before procedural rooms"
     hint = f"{line}, a draft of 48 views and no more than a hint"

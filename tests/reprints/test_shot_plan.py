@@ -33,7 +33,7 @@ def test_the_plan_s_sessions_are_enough_and_one_less_is_not():
         > kept_chance(promise, (PHOTOS_PER_SESSION,) * (sessions - 1))
     )
     assert plan_shots(promise_of(0.3, 0.28, correlation=0.2)).sessions is None
-    ways = plan_shots(promise).ways
+    ways = plan_shots(promise).options
     assert [way.chance for way in ways[:4]] == sorted(way.chance for way in ways[:4])
     assert np.ptp(ways[0].allowed) > np.ptp(ways[3].allowed)
 
