@@ -70,7 +70,8 @@ def test_a_promise_knows_another_place_for_every_session_and_says_which_share_on
     assert count_by_session(hits, 4) == ([4, 0, 2, 2], [4, 4, 4, 4])
     # sessions of one place say less of the rate than as many of places of their own
     hits = [True] * 4 + [False] * 4
-    together, apart = (rate_posterior(*count_by_session(hits * 20, 4, places)).rate_interval for places in ((0, 1) * 20, ()))
+    counts = [count_by_session(hits * 20, 4, places) for places in ((0, 1) * 20, ())]
+    together, apart = (rate_posterior(*each).rate_interval for each in counts)
     assert np.ptp(together) > 2 * np.ptp(apart)
 
 
