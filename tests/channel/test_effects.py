@@ -139,8 +139,8 @@ def setup(problem):
 @pytest.fixture(scope="module")
 def whole(problem, setup):
     """Operations and photographs with every effect; the first time, the scene's own textures are made."""
-    photographed(problem, setup.conditions, setup.shown)
-    return photographed(problem, setup.conditions, setup.shown)
+    photographed(problem, setup.conditions, setup.appearance)
+    return photographed(problem, setup.conditions, setup.appearance)
 
 
 def test_plan_and_ablation_know_every_effect(problem):
@@ -164,7 +164,7 @@ def test_an_effect_that_is_switched_off_is_off_and_the_rest_of_its_table_stays(p
     # light that is left out is made up for by other light
     others = {"ambient", "directional"} if effect.replacement else set()
     assert effect.fields[0] in moved <= {effect.fields[0]} | others
-    less_count, plain = photographed(problem, less.conditions, setup.shown)
+    less_count, plain = photographed(problem, less.conditions, setup.appearance)
     assert (less_count < whole[0]) == (effect.name in SLOWS) and not torch.equal(whole[1], plain)
 
 

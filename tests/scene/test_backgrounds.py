@@ -140,14 +140,14 @@ def test_textures_that_nobody_sees_are_drawn_as_if_they_were_made(monkeypatch, p
     """So that a place stays the same whatever shows in it: all that is random is drawn before a texture is made."""
 
     def at_once(rng, px):
-        picture = patterns.drawn_texture(rng, px)()
+        picture = patterns.draw_texture(rng, px)()
         return lambda: picture
 
-    monkeypatch.setattr(module, "drawn_texture", at_once)
+    monkeypatch.setattr(module, "draw_texture", at_once)
     assert all(np.array_equal(module.procedural_place(2 * i), place) for i, place in enumerate(places))
     for seed in range(60):  # every pattern
         rng = np.random.default_rng(seed)
-        later = patterns.drawn_texture(rng, 32)
+        later = patterns.draw_texture(rng, 32)
         drawn = rng.bit_generator.state
         assert np.array_equal(later(), later()) and rng.bit_generator.state == drawn
 

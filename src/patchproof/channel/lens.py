@@ -132,7 +132,7 @@ def load_camera(name_or_file: str | Path, base: Path | None = None, photo_px: tu
 
 
 def check_camera(camera: Camera, where: str) -> None:
-    """Refuse a principal point outside the picture, a tone curve that falls, and irreversible distortion."""
+    """Refuse a principal point outside the picture, a tone curve that does not rise, irreversible distortion."""
     (width, height), light = camera.image_px, camera.tone_light
     if not (0 < camera.cx < width and 0 < camera.cy < height):
         raise Refused(

@@ -22,7 +22,7 @@ AROUND = 24  # corners of a round cross-section: 15° each, below the crease, so
 CREASE_DEG = 40.0
 
 
-def skin(rings: Sequence[np.ndarray], name: str, srgb: Sequence[float], planar: bool = False) -> MeshPart:
+def loft(rings: Sequence[np.ndarray], name: str, srgb: Sequence[float], planar: bool = False) -> MeshPart:
     """Join rings K×3, counter-clockwise about their direction, to a surface; 1×3 at both ends closes it."""
     grid = np.stack([np.broadcast_to(ring, (max(map(len, rings)), 3)) for ring in rings])
     rows, columns = grid.shape[:2]
@@ -50,7 +50,7 @@ def lathe(profile: Sequence[tuple[float, float]], name: str, srgb, around: int =
     angle = np.arange(around) * 2 * np.pi / around
     circle = np.stack([np.cos(angle), 0 * angle, -np.sin(angle)], 1)
     up = np.array([0.0, 1.0, 0.0])
-    return skin([(circle if r > 0 else circle[:1]) * r + up * y for r, y in profile], name, srgb)
+    return loft([(circle if r > 0 else circle[:1]) * r + up * y for r, y in profile], name, srgb)
 
 
 def tube(points: Sequence[Sequence[float]], radius: ArrayLike, name: str, srgb, around: int = 12) -> MeshPart:
@@ -65,7 +65,7 @@ def tube(points: Sequence[Sequence[float]], radius: ArrayLike, name: str, srgb, 
         e1 = e1 - direction * (e1 @ direction)  # parallel transport, without twist
         e1 = e1 / np.linalg.norm(e1)
         rings.append(point + r * (np.cos(angle) * e1 + np.sin(angle) * np.cross(direction, e1)))
-    return skin([*rings, path[-1:]], name, srgb)
+    return loft([*rings, path[-1:]], name, srgb)
 
 
 def prism(outline: ArrayLike, x0: float, x1: float, name: str, srgb) -> MeshPart:
@@ -78,7 +78,7 @@ def prism(outline: ArrayLike, x0: float, x1: float, name: str, srgb) -> MeshPart
         return np.stack([np.full_like(z, x), y, z], 1)
 
     middle = z.mean(keepdims=True), y.mean(keepdims=True)
-    return skin([ring(x0, *middle), ring(x0, z, y), ring(x1, z, y), ring(x1, *middle)], name, srgb, planar=True)
+    return loft([ring(x0, *middle), ring(x0, z, y), ring(x1, z, y), ring(x1, *middle)], name, srgb, planar=True)
 
 
 def box(size: tuple[float, float, float], bottom_middle: tuple[float, float, float], name: str, srgb) -> MeshPart:

@@ -72,7 +72,7 @@ class Fragments:
         b, z = self.barycentric, self.depth
         first.addcmul_(b[:, 1], total, value=-1).mul_(z)
         second.addcmul_(b[:, 2], total, value=-1).mul_(z)
-        return columns(-(first + second), first, second)
+        return stack_columns(-(first + second), first, second)
 
     def where(self, keep: Tensor) -> Fragments:
         """Return the fragments for which `keep` (P, bool) is true."""
@@ -81,7 +81,7 @@ class Fragments:
         return replace(self, **{name: getattr(self, name).index_select(0, index) for name in names})
 
 
-def columns(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
+def stack_columns(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
     """Return P×3 float32; `torch.stack` takes four times as long for columns this narrow."""
     out = torch.empty(len(a), 3, device=a.device)
     out[:, 0], out[:, 1], out[:, 2] = a, b, c

@@ -18,7 +18,7 @@ from torch import Tensor
 from patchproof.base.color import linear_from_srgb, srgb_from_linear
 from patchproof.render.edges import Edges
 from patchproof.render.fragments import Cameras
-from patchproof.render.raster import CHUNK, homogeneous, index_ranges, ranked
+from patchproof.render.raster import CHUNK, homogeneous, index_ranges, rank_values
 
 # In pixels at an edge's depth. An edge HIDDEN_PX farther than both of its pixels see is hidden; if one of them sees
 # CREASE_GAP_PX farther than a crease, another edge ends the surface there.
@@ -113,7 +113,7 @@ def find_outlines(
         target += [pixel, beside]
         source += [beside, pixel]
         share += [(_cut_off(distance, slope) / counts).float() for distance in (place, 1 - place)]
-    pixel, index = ranked(torch.cat(target), len(nearest_mm))
+    pixel, index = rank_values(torch.cat(target), len(nearest_mm))
     shares = torch.cat(share)
     total = shares.new_zeros(len(pixel)).index_add_(0, index, shares)
     shares = shares / total.clamp_min(1).index_select(0, index)

@@ -25,7 +25,7 @@ from torch import Tensor
 from patchproof.base.errors import Refused
 from patchproof.base.geometry import cross, dot
 from patchproof.render.clip import GUARD_PX, clip_triangles
-from patchproof.render.fragments import Cameras, Fragments, columns
+from patchproof.render.fragments import Cameras, Fragments, stack_columns
 
 SUBPIXELS = 256  # corners snap to this fraction of a pixel
 # Faces, rows or fragments held at a time. Sixteen views of 20k faces took 1.9 times as long with 2^20, whose
@@ -248,7 +248,7 @@ def _resolve(fragments: Fragments, part: slice, points: Tensor, faces: Tensor, v
     view = (row / height).floor_()
     x, y = position.sub_(row, alpha=width).add_(0.5), row.sub_(view, alpha=height).add_(0.5)
     pair = view.long().sub_(view0).mul_(len(faces)).add_(fragments.face[part])
-    owner, rank = ranked(pair, points.shape[1] * len(faces))
+    owner, rank = rank_values(pair, points.shape[1] * len(faces))
     corners = _take_corners(points, [i.index_select(0, owner) for i in _corner_index(points, faces)])
     planes, volume = _planes(corners, near)
     second, third, inverse = (_at_center(plane, rank, x, y) for plane in planes)
@@ -256,14 +256,14 @@ def _resolve(fragments: Fragments, part: slice, points: Tensor, faces: Tensor, v
     deepest = torch.stack([corner[2].max() for corner in corners]).max()
     z = inverse.clamp_min_(0.5 / deepest).clamp_max_(1 / near).reciprocal_()
     second, third = second.mul_(z), third.mul_(z)
-    fragments.barycentric[part] = columns(1 - second - third, second, third)
+    fragments.barycentric[part] = stack_columns(1 - second - third, second, third)
     fragments.depth[part] = z
     fragments.front[part] = (volume < 0).index_select(0, rank)
     fragments.rank[part] = rank
     return torch.stack([t for plane in planes for t in plane[:2]]).float()
 
 
-def ranked(values: Tensor, limit: int) -> tuple[Tensor, Tensor]:
+def rank_values(values: Tensor, limit: int) -> tuple[Tensor, Tensor]:
     """Return the distinct values below `limit`, ascending, and each value's index among them; `unique` would sort."""
     present = torch.zeros(limit, dtype=torch.bool, device=values.device).index_fill_(0, values, True)
     distinct = present.nonzero()[:, 0]

@@ -157,7 +157,7 @@ def _stretch(gray: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def bake_base_colors(mesh: Mesh, chosen_faces: np.ndarray, texels: int = TEXELS) -> Mesh:
-    """Put each material's color into its texture; single colors get `texels`² where `chosen_faces` F are."""
+    """Put each material's color into its texture; a single color becomes `texels`² if `chosen_faces` show it."""
 
     def with_base_color(index: int, material: Material) -> Material:
         table = codes_from_srgb(srgb_from_linear((LINEAR_FROM_CODE[:, None] * material.base_color_linear).clip(0, 1)))

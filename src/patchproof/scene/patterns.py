@@ -21,10 +21,10 @@ PictureMaker = Callable[[], np.ndarray]  # makes a picture whose random numbers 
 
 def texture(rng: np.random.Generator, px: int = 64) -> np.ndarray:
     """Return P×P×3 in [0, 1]: one of the patterns in random colors, with some natural unevenness."""
-    return drawn_texture(rng, px)()
+    return draw_texture(rng, px)()
 
 
-def drawn_texture(rng: np.random.Generator, px: int) -> PictureMaker:
+def draw_texture(rng: np.random.Generator, px: int) -> PictureMaker:
     """Draw all random numbers of a texture now, and return the function that makes it."""
     blend = _PATTERNS[int(rng.choice(len(_PATTERNS), p=_SHARES))](rng, px)
     first, second, uneven = color(rng), color(rng), rng.random() < 0.5

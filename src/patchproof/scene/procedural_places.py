@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from patchproof.base.color import codes_from_srgb
-from patchproof.scene.patterns import background, color, drawn_texture
+from patchproof.scene.patterns import background, color, draw_texture
 
 PLACE_PX = 256
 _SEED = 20
@@ -67,7 +67,7 @@ def _rays(rng: np.random.Generator, px: int) -> np.ndarray:
 def _draw_plane(rng, picture, depth, ray, rays, distance, axis) -> None:
     """Draw a surface square to an axis, at `distance` along the `rays` (indices), in front of farther things."""
     paint, textured = _paint(rng), rng.random() < 0.7
-    make = drawn_texture(rng, _TEXTURE_PX) if textured else lambda: np.ones((1, 1, 3))
+    make = draw_texture(rng, _TEXTURE_PX) if textured else lambda: np.ones((1, 1, 3))
     fineness = np.exp(rng.uniform(-1.5, 0.7))
     visible = (distance > 0) & (distance < depth[rays])
     if not visible.any():
