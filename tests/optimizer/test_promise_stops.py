@@ -168,7 +168,7 @@ def test_leaving_controls_out_leaves_their_difference_its_level():
 
 @cache
 def interval(counts):
-    return rate_posterior(counts, (VIEWS_PER_SESSION,) * len(counts)).rate
+    return rate_posterior(counts, (VIEWS_PER_SESSION,) * len(counts)).rate_interval
 
 
 if __name__ == "__main__":  # the figures beside `promise._looks`
