@@ -20,7 +20,7 @@ INTERFACES = {
     *("main", "train", "write"),  # programs
 }
 COMMANDS = {"cli"}  # verbs of a command line are called as the public functions behind them
-FORBIDDEN = ("got others", "got none of that", "got one of", "anew", "lest ", "gone on with")
+FORBIDDEN = ("got others", "got none of that", "got one of", "anew", " lest ", "gone on with")
 ELLIPTICAL = ("What ", "The same", "Whether ", "Of ", "As in ")
 
 

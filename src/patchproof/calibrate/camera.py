@@ -176,24 +176,24 @@ def _refuse_too_few(views: Sequence[BoardView], left_out: Mapping[str, str]) -> 
 
 def _without_odd(views: Sequence[BoardView]) -> tuple[list[BoardView], dict[str, str]]:
     """Views without photographs, then without corners, that fit badly: moved, of a bent board, occluded."""
-    kept, odd = list(views), {}
-    while len(kept) >= MIN_PHOTOS and (fit := fit_rung(kept, _TRIAL_RUNG)) is not None:
+    remaining, odd = list(views), {}
+    while len(remaining) >= MIN_PHOTOS and (fit := fit_rung(remaining, _TRIAL_RUNG)) is not None:
         errors = [np.linalg.norm(residual, axis=1) for residual in fit.residuals_px]
         typical = np.array([np.median(error) for error in errors])
         typical_px, worst = float(np.median(typical)), int(typical.argmax())
         if typical[worst] > max(_ODD_PHOTO_RATIO * typical_px, _ODD_PX):
             # only the worst is dropped, since an odd photograph spoils the others' fit, as does an odd corner
             miss = f"its corners miss by {typical[worst]:.2f} px where most miss by {typical_px:.2f}"
-            odd[kept.pop(worst).file] = f"{miss}: moved, or a bent board"
+            odd[remaining.pop(worst).file] = f"{miss}: moved, or a bent board"
             continue
         farthest = max(float(error.max()) for error in errors)
         if farthest <= max(_ODD_CORNER_RATIO * typical_px, _ODD_PX):
             break
-        kept = [view.select(error < farthest / 2) for view, error in zip(kept, errors, strict=True)]
+        remaining = [view.select(error < farthest / 2) for view, error in zip(remaining, errors, strict=True)]
         reason = "too few of its corners agree with the others: show more of the board, sharp"
-        odd |= {view.file: reason for view in kept if len(view.ids) < MIN_CORNERS}
-        kept = [view for view in kept if len(view.ids) >= MIN_CORNERS]
-    return kept, odd
+        odd |= {view.file: reason for view in remaining if len(view.ids) < MIN_CORNERS}
+        remaining = [view for view in remaining if len(view.ids) >= MIN_CORNERS]
+    return remaining, odd
 
 
 def _refuse_undetermined(fit: LensFit) -> None:
@@ -225,9 +225,9 @@ def _is_usable(fit: LensFit, size_px: tuple[int, int]) -> bool:
 
 
 def _camera(fit: LensFit, name: str, size_px: tuple[int, int], instrument: str, uncertainty: str) -> Camera:
-    about = {"instrument": instrument, "uncertainty": uncertainty, "when": date.today().isoformat()}
+    description = {"instrument": instrument, "uncertainty": uncertainty, "when": date.today().isoformat()}
     numbers = {n: round(float(v), 6) for n, v in zip(PARAMETERS, fit.numbers, strict=True)}
-    return Camera.model_validate({"name": name, "method": "measured", "image_px": size_px} | about | numbers)
+    return Camera.model_validate({"name": name, "method": "measured", "image_px": size_px} | description | numbers)
 
 
 def _uncertainty(fit: LensFit) -> str:

@@ -174,16 +174,16 @@ def print_variation(prints: Sequence[np.ndarray]) -> dict[str, Any] | None:
     from scipy.optimize import least_squares
 
     mean = combine_light(prints, robust=False)
-    known = np.isfinite(np.stack(prints)).all((0, 2))
-    middle, changes, distances = torch.tensor(mean[known].clip(0, 1)), [], []
+    readable = np.isfinite(np.stack(prints)).all((0, 2))
+    middle, changes, distances = torch.tensor(mean[readable].clip(0, 1)), [], []
     for light in prints:
-        target = srgb_from_linear(light[known])
+        target = srgb_from_linear(light[readable])
 
         def residuals(change: np.ndarray, target: np.ndarray = target) -> np.ndarray:
             return (srgb_from_linear(vary_print(middle, torch.tensor(change)).numpy()) - target).ravel()
 
         changes.append(least_squares(residuals, np.zeros(3), x_scale=_PRINT_CHANGE).x)
-        distances.append(color_difference(target, srgb_from_linear(mean[known])).mean())
+        distances.append(color_difference(target, srgb_from_linear(mean[readable])).mean())
     gain, density, lift = np.std(changes, axis=0, ddof=1)
     figures = {"delta_e00": np.mean(distances), "dot_gain_sd": gain, "density_sd": density, "black_lift_sd": lift}
     return {"prints": len(prints), **{key: round(float(value), 4) for key, value in figures.items()}}
@@ -245,17 +245,17 @@ def _agreement(readings: Sequence[PhotoReading], by_print: Sequence[np.ndarray])
     means = dict(zip(sorted(set(numbers)), by_print, strict=True))
     errors = []
     for reading in readings:
-        known = np.isfinite(reading.chart.light).all(1)
-        alone = numbers.count(reading.print_number) == 1 or not known.any()
-        pair = (srgb_from_linear(light[known]) for light in (reading.chart.light, means[reading.print_number]))
+        readable = np.isfinite(reading.chart.light).all(1)
+        alone = numbers.count(reading.print_number) == 1 or not readable.any()
+        pair = (srgb_from_linear(light[readable]) for light in (reading.chart.light, means[reading.print_number]))
         errors.append(None if alone else float(color_difference(*pair).mean()))
     return errors
 
 
-def _unreadable(manifest: Manifest, known: np.ndarray) -> int:
+def _unreadable(manifest: Manifest, readable: np.ndarray) -> int:
     """Count the swatches of charts in view that no photograph shows well enough; the piece's own do not count."""
-    pages = {swatch.page for swatch, readable in zip(manifest.chart, known.tolist(), strict=True) if readable}
-    return sum(not known[row] for page in pages for row in chart_rows(manifest, page))
+    pages = {swatch.page for swatch, is_read in zip(manifest.chart, readable.tolist(), strict=True) if is_read}
+    return sum(not readable[row] for page in pages for row in chart_rows(manifest, page))
 
 
 def _duplicates(sent: np.ndarray, light: np.ndarray) -> float | None:

@@ -110,11 +110,11 @@ def _find_page(srgb: np.ndarray, manifest: Manifest) -> _Page:
     detected = complete_markers(srgb, detected, corners_mm, dictionary)
     corners_px = {i: borders.corners_px for i, borders in detected.markers.items() if i in corners_mm}
     rects_mm = {i: _bounding_rect(corners_mm[i]) for i in corners_px}
-    beside = {i: px for i, px in corners_px.items() if not rect_contains(manifest.cut_mm, rects_mm[i])}
-    fit = fit_page(beside if len(beside) > 1 else corners_px, corners_mm)
-    together = fit_page(corners_px, corners_mm)
-    if set(beside) <= set(together.inlier_ids):
-        fit = together
+    beside_chart = {i: px for i, px in corners_px.items() if not rect_contains(manifest.cut_mm, rects_mm[i])}
+    fit = fit_page(beside_chart if len(beside_chart) > 1 else corners_px, corners_mm)
+    all_fit = fit_page(corners_px, corners_mm)
+    if set(beside_chart) <= set(all_fit.inlier_ids):
+        fit = all_fit
     rects = np.array([manifest.chart[i].rect_mm for i in chart_rows(manifest, number)]).reshape(-1, 4)
     if not len(rects):
         raise PhotoRejected("too_few_markers", 0, 1, "there is no chart on this page: photograph the one that has it")

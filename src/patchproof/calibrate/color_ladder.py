@@ -63,35 +63,35 @@ class MapChoice:
 
 def map_kinds(priors: Mapping[str, ColorMap]) -> tuple[MapKind, ...]:
     """All kinds, simplest first; without priors, the kinds that need them are left out."""
-    free = (
+    free_kinds = (
         MapKind("identity", lambda sent, seen: lambda colors: colors, 0, True),
         MapKind("white_black", fit_white_black, 2, True),
         MapKind("affine", fit_affine, 12),
     )
-    known = (
+    prior_kinds = (
         MapKind("prior", partial(_best_prior, priors), 0, True),
         MapKind("prior+affine", partial(fit_prior_affine, priors), 12),
         MapKind("prior+affine+spline", partial(fit_prior_spline, priors), 24),
     )
-    return free + (known if priors else ()) + (MapKind("spline", fit_spline, 24),)
+    return free_kinds + (prior_kinds if priors else ()) + (MapKind("spline", fit_spline, 24),)
 
 
 def choose_map(kinds: Sequence[MapKind], sent: Colors, seen: Colors) -> MapChoice:
     """Choose the simplest kind that is no worse than the best; repeated colors are averaged first."""
     sent, seen = average_repeats(sent, seen)
     corners, width = np.isin(sent, (0.0, 1.0)).all(1), color_width(sent)
-    tried = [kind for kind in kinds if len(sent) >= kind.min_colors and (kind.endpoints_only or width >= MIN_WIDTH)]
+    usable = [kind for kind in kinds if len(sent) >= kind.min_colors and (kind.endpoints_only or width >= MIN_WIDTH)]
     folds = _folds(np.flatnonzero(~corners))
     if (~corners).sum() < MIN_HELD_OUT:
         ends = (sent == 1).all(1) | (sent.sum(1) == sent.sum(1).min())
-        tried = [kind for kind in tried if kind.endpoints_only]
+        usable = [kind for kind in usable if kind.endpoints_only]
         folds = [np.flatnonzero(~ends if not ends.all() else ends)]
-    names = [kind.name for kind in tried]
-    errors, seconds = zip(*(_held_out(kind, sent, seen, folds) for kind in tried), strict=True)
+    names = [kind.name for kind in usable]
+    errors, seconds = zip(*(_held_out(kind, sent, seen, folds) for kind in usable), strict=True)
     rungs = compare_rungs(names, np.array(errors))
     chosen = simplest_rung(rungs)
-    left_out = tuple(kind.name for kind in kinds if kind not in tried)
-    fitted, times = tried[chosen].fit(sent, seen), dict(zip(names, seconds, strict=True))
+    left_out = tuple(kind.name for kind in kinds if kind not in usable)
+    fitted, times = usable[chosen].fit(sent, seen), dict(zip(names, seconds, strict=True))
     return MapChoice(rungs[chosen], fitted, rungs, times, len(sent), len(errors[0]), left_out, width)
 
 
@@ -170,8 +170,8 @@ def _folds(held_out: np.ndarray) -> list[np.ndarray]:
 
 def _held_out(kind: MapKind, sent: Colors, seen: Colors, folds: list[np.ndarray]) -> tuple[np.ndarray, float]:
     """ΔE00 of each held-out color, fold by fold, and the mean seconds of a fit."""
-    errors, begin = [], time.perf_counter()
+    errors, started = [], time.perf_counter()
     for fold in folds:
         train = np.setdiff1d(np.arange(len(sent)), fold)
         errors.append(color_difference(kind.fit(sent[train], seen[train])(sent[fold]), seen[fold]))
-    return np.concatenate(errors), (time.perf_counter() - begin) / len(folds)
+    return np.concatenate(errors), (time.perf_counter() - started) / len(folds)

@@ -42,26 +42,26 @@ def load_clip(name: str) -> Classifier:
     """The classifier that `name`, MODEL@FILE, stands for."""
     open_clip = import_library("open_clip", "clip", "clip")
     model, _, file = name.rpartition("@")
-    path, (known, _, published) = Path(file), model.partition("/")
+    path, (architecture, _, published) = Path(file), model.partition("/")
     if not model or path.suffix not in (".safetensors", ".json"):
         expected = "prompts, as clip:MODEL@WEIGHTS.safetensors with WEIGHTS.json or clip:MODEL/PRETRAINED@PROMPTS.json"
         raise Refused(expected, f'"clip:{name}"', 'write {"input_px": 224, "labels": ["a photo of a mug", ...]} there')
-    if known not in open_clip.list_models():
-        do = nearest_names(known, open_clip.list_models(), "choose one of open_clip.list_models()")
-        raise Refused("a model of open_clip", f'"{known}"', do)
+    if architecture not in open_clip.list_models():
+        do = nearest_names(architecture, open_clip.list_models(), "choose one of open_clip.list_models()")
+        raise Refused("a model of open_clip", f'"{architecture}"', do)
     card = read_card(path.with_suffix(".json"))
     if path.suffix == ".json":
         options = {"pretrained": published or None, "require_pretrained": True}
-        network = download(f"clip:{model}", lambda: open_clip.create_model(known, **options))
+        network = download(f"clip:{model}", lambda: open_clip.create_model(architecture, **options))
     else:
-        network = open_clip.create_model(known)
-        load_weights(network, read_weights(path), f"clip:{known}", "check the model's name")
+        network = open_clip.create_model(architecture)
+        load_weights(network, read_weights(path), f"clip:{architecture}", "check the model's name")
     view, size = network.visual.preprocess_cfg, network.visual.image_size
     side_px = int(size if isinstance(size, int) else min(size))
     if side_px != card.input_px:
         do = f'write "input_px": {side_px} into it'
-        raise Refused(f"the input size of clip:{known}", f"{card.input_px} in {path.with_suffix('.json')}", do)
+        raise Refused(f"the input size of clip:{architecture}", f"{card.input_px} in {path.with_suffix('.json')}", do)
     with torch.no_grad():
-        prompts = network.eval().encode_text(open_clip.get_tokenizer(known)(list(card.labels)), normalize=True)
+        prompts = network.eval().encode_text(open_clip.get_tokenizer(architecture)(list(card.labels)), normalize=True)
     sees = Prompted(network.visual, prompts, network.logit_scale.exp())
     return classifier_of(Normalized(sees, view["mean"], view["std"]), side_px, card.labels, f"clip:{name}")

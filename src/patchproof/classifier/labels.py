@@ -35,7 +35,8 @@ def find_words(labels: Sequence[str], text: str, whole: bool = False) -> int:
         if matches:
             shown = ", ".join(f'"{labels[i].split(",")[0]}"' for i in matches[:6])
             more = ", ..." if len(matches) > 6 else ""
-            raise Refused("words of one label", f'"{text}", which is in {len(matches)} labels', f"choose {shown}{more}")
+            got = f'"{text}", which is in {len(matches)} labels'
+            raise Refused("words of one label", got, f"choose {shown}{more}")
     raise Refused("a label that the network knows", f'"{text}"', _nearest(labels, text))
 
 

@@ -79,10 +79,10 @@ def load_classifier(
     else:
         from patchproof.classifier.network_file import EXPORT_ADVICE
 
-        known = "builtin, builtin-detector, torchvision:NAME, timm:NAME, clip:NAME@FILE, file:NAME.onnx"
+        names = "builtin, builtin-detector, torchvision:NAME, timm:NAME, clip:NAME@FILE, file:NAME.onnx"
         words = {".onnx": f'write "file:{name}"', ".pt2": EXPORT_ADVICE}
         do = words.get(Path(name).suffix, "write one of these")
-        raise Refused(f"a model named {known} or module:package.factory", f'"{name}"', do)
+        raise Refused(f"a model named {names} or module:package.factory", f'"{name}"', do)
     return _prepare(replace(classifier, name=name), device)
 
 

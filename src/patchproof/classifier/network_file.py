@@ -39,13 +39,13 @@ def load_network(path: Path) -> Classifier:
     card = read_card(path.with_suffix(".json"))
     digest = hashlib.sha256(stored)
 
-    def beside() -> bytes:
+    def read_data() -> bytes:
         data = network_bytes(path.with_name(f"{path.name}.data"))
         digest.update(data)
         return data
 
     try:
-        network = BatchedNetwork(*read_onnx(stored, beside))
+        network = BatchedNetwork(*read_onnx(stored, read_data))
     except UnsupportedNetwork as error:
         do = "export it in evaluation mode, without custom operators and control flow, opset 13 or later"
         raise Refused("an ONNX file of plain tensors and operators", f"{path} with {error}", do) from error

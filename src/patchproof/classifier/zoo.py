@@ -57,9 +57,9 @@ def load_torchvision(name: str) -> Classifier:
     if name in models.list_models(module=models.detection):
         return _detector(models, name)
     name, local = _split_weights(name)
-    known = models.list_models(module=models)  # segmentation, detection and video have modules of their own
-    if name not in known:
-        do = nearest_names(name, known, "choose one of torchvision.models.list_models()")
+    names = models.list_models(module=models)  # segmentation, detection and video have modules of their own
+    if name not in names:
+        do = nearest_names(name, names, "choose one of torchvision.models.list_models()")
         raise Refused("a torchvision classifier or detector", f'"{name}"', do)
     weights = models.get_model_weights(name).DEFAULT
     view = weights.transforms()
@@ -181,20 +181,20 @@ def _make_classifier(
 
 def load_weights(network: Any, local: LocalWeights, name: str, advice: str) -> None:
     """Load the file's weights into a network called `name`; refused, with the `advice`, where they do not fit it."""
-    wanted = {key: tensor.shape for key, tensor in network.state_dict().items() if not _UNUSED.fullmatch(key)}
-    found = {key: tensor.shape for key, tensor in local.tensors.items() if not _UNUSED.fullmatch(key)}
-    if wrong := sorted(wanted.items() ^ found.items()):
+    network_shapes = {key: tensor.shape for key, tensor in network.state_dict().items() if not _UNUSED.fullmatch(key)}
+    file_shapes = {key: tensor.shape for key, tensor in local.tensors.items() if not _UNUSED.fullmatch(key)}
+    if wrong := sorted(network_shapes.items() ^ file_shapes.items()):
         key = wrong[0][0]
-        have, want = (tuple(shapes[key]) if key in shapes else "absent" for shapes in (found, wanted))
+        have, want = (tuple(shapes[key]) if key in shapes else "absent" for shapes in (file_shapes, network_shapes))
         raise Refused(f"weights of {name}", f"{local.path}, where {key} is {have} instead of {want}", advice)
-    network.load_state_dict({key: local.tensors[key] for key in wanted}, strict=False)
+    network.load_state_dict({key: local.tensors[key] for key in network_shapes}, strict=False)
 
 
 @contextmanager
 def _offline_if_unreachable() -> Iterator[None]:
     """Use only earlier downloads where timm's hub cannot be reached; timm itself would retry for over a minute."""
     constants: Any = importlib.import_module("huggingface_hub.constants")
-    hub, before = urlsplit(constants.ENDPOINT), constants.HF_HUB_OFFLINE
+    hub, was_offline = urlsplit(constants.ENDPOINT), constants.HF_HUB_OFFLINE
     try:
         if not getproxies():  # a proxy resolves the host itself
             socket.create_connection((hub.hostname, hub.port or 443), timeout=5).close()
@@ -203,7 +203,7 @@ def _offline_if_unreachable() -> Iterator[None]:
     try:
         yield
     finally:
-        constants.HF_HUB_OFFLINE = before
+        constants.HF_HUB_OFFLINE = was_offline
 
 
 def download(name: str, load: Callable[[], Any]) -> Any:

@@ -75,15 +75,15 @@ class Cut:
         return values[program.output]
 
 
-def _update_in_windows(known: Tensor, photos: Tensor, cut: Cut, windows: np.ndarray, rectangles: np.ndarray) -> Tensor:
-    """The cut's value for pictures that equal those of the `known` value outside of the windows."""
-    value = known.clone()
-    again = cut.program.first(cut.steps, _stack(_crops(photos, rectangles)))[cut.value]
+def _update_in_windows(cached: Tensor, photos: Tensor, cut: Cut, windows: np.ndarray, rectangles: np.ndarray) -> Tensor:
+    """The cut's value for pictures that equal those of the `cached` value outside of the windows."""
+    value = cached.clone()
+    new = cut.program.first(cut.steps, _stack(_crops(photos, rectangles)))[cut.value]
     # the rows and columns that see a window
     first = (-((cut.high - windows[:, :2]) // cut.stride)).clip(0)
     last = (windows[:, 2:] - 1 - cut.low) // cut.stride + 1
-    seen, corner = np.hstack([first, last]), rectangles[:, :2] // cut.stride
-    for part, crop in zip(_crops(value, seen), _crops(again, seen - np.hstack([corner, corner])), strict=True):
+    affected, corner = np.hstack([first, last]), rectangles[:, :2] // cut.stride
+    for part, crop in zip(_crops(value, affected), _crops(new, affected - np.hstack([corner, corner])), strict=True):
         part.copy_(crop)
     return value
 
@@ -104,13 +104,13 @@ class _InRectangles(torch.autograd.Function):
         (photos,), (cut, rectangles) = ctx.saved_tensors, ctx.given
         cropped = _stack(_crops(photos, rectangles)).requires_grad_()
         with torch.enable_grad():
-            again = cut.program.first(cut.steps, cropped)[cut.value]
-            height, width = again.shape[2:]
-            wanted = [part[:, :height, :width] for part in _crops(gradient, rectangles // cut.stride)]
-            weighted = (again * _stack(wanted)).sum()  # grad_outputs would make torch import SymPy for half a second
-        (found,) = torch.autograd.grad(weighted, cropped)
+            value = cut.program.first(cut.steps, cropped)[cut.value]
+            height, width = value.shape[2:]
+            parts = [part[:, :height, :width] for part in _crops(gradient, rectangles // cut.stride)]
+            weighted = (value * _stack(parts)).sum()  # grad_outputs would make torch import SymPy for half a second
+        (gradients,) = torch.autograd.grad(weighted, cropped)
         full = torch.zeros_like(photos)
-        for part, values in zip(_crops(full, rectangles), found, strict=True):
+        for part, values in zip(_crops(full, rectangles), gradients, strict=True):
             part.copy_(values)
         return full, None, None
 
@@ -170,8 +170,8 @@ def _cuts(program: Program, pictures: Tensor) -> list[Cut]:
             break
         if stride in STRIDES:
             marks = zip(pixels, value.isnan().any(1), strict=True)
-            away = torch.cat([pixel - stride * picture.nonzero() for pixel, picture in marks])
-            cuts.append(Cut(program, count, step.results[0], stride, int(away.min()), int(away.max()), numbers))
+            offsets = torch.cat([pixel - stride * picture.nonzero() for pixel, picture in marks])
+            cuts.append(Cut(program, count, step.results[0], stride, int(offsets.min()), int(offsets.max()), numbers))
     return cuts
 
 
@@ -189,9 +189,9 @@ def _is_correct(network: Callable[[Tensor], Tensor], cut: Cut, pictures: Tensor)
     @torch.enable_grad()
     def gradients(compute: Callable[[Tensor], Tensor]) -> Tensor:
         photos = pictures.clone(memory_format=torch.channels_last).requires_grad_()
-        found = compute(photos)
-        weights = torch.linspace(-1, 1, found.numel()).view(found.shape)
-        return _stack(_crops(torch.autograd.grad((found * weights).sum(), photos)[0], windows))
+        output = compute(photos)
+        weights = torch.linspace(-1, 1, output.numel()).view(output.shape)
+        return _stack(_crops(torch.autograd.grad((output * weights).sum(), photos)[0], windows))
 
     with torch.no_grad():
         _, updated = (cut.answers(photos, Windows(windows, cache)) for photos in (pictures, changed))
@@ -202,6 +202,6 @@ def _is_correct(network: Callable[[Tensor], Tensor], cut: Cut, pictures: Tensor)
     )
 
 
-def _are_close(expected: Tensor, found: Tensor, share: float) -> bool:
+def _are_close(expected: Tensor, actual: Tensor, share: float) -> bool:
     largest = float(expected.abs().max())  # 0 proves nothing
-    return 0 < largest and float((expected - found).abs().max()) <= share * largest
+    return 0 < largest and float((expected - actual).abs().max()) <= share * largest

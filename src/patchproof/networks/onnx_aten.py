@@ -49,6 +49,6 @@ def _conv(
 
 def _clip(low=None, high=None) -> AtenCalls:
     """A hardtanh if both limits are known; unlike torch.clamp, its gradient is 0 at the limits, as ReLU6's is."""
-    known = (end for end in (low, high) if isinstance(end, Tensor) and end.is_floating_point() and not end.dim())
-    limits = [float(end) for end in known]
+    tensors = (end for end in (low, high) if isinstance(end, Tensor) and end.is_floating_point() and not end.dim())
+    limits = [float(end) for end in tensors]
     return [(_ATEN.hardtanh.default, limits)] if len(limits) == 2 and limits[0] <= limits[1] else []

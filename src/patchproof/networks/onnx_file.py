@@ -91,13 +91,13 @@ _MODEL: Schema = {
 }
 
 
-def read_onnx(stored: bytes, beside: Callable[[], bytes]) -> tuple[Program, int | None]:
-    """The network, and the number of pictures it takes (None: any). `beside` reads NAME.onnx.data, at most once."""
+def read_onnx(stored: bytes, read_data: Callable[[], bytes]) -> tuple[Program, int | None]:
+    """The network, and the number of pictures it takes (None: any). `read_data` reads NAME.onnx.data, at most once."""
     model = read_message(stored, _MODEL)
     versions = [opset.get("version", 0) for opset in model.get("opset", []) if opset.get("domain", "") in _STANDARD]
     if len(versions) != 1 or not OPSETS[0] <= versions[0] <= OPSETS[1]:
         raise UnsupportedNetwork(f"opset {quote(versions)[1:-1]}, not one from {OPSETS[0]} to {OPSETS[1]}")
-    return _GraphReader(model["graph"], _Weights(beside)).read()
+    return _GraphReader(model["graph"], _Weights(read_data)).read()
 
 
 _STANDARD = ("", "ai.onnx")
@@ -106,8 +106,8 @@ _STANDARD = ("", "ai.onnx")
 class _Weights:
     """Reads tensors from their descriptions; each byte of the other file belongs to one tensor at most."""
 
-    def __init__(self, beside: Callable[[], bytes]):
-        self.beside, self.data, self.used_bytes, self.locations = beside, b"", 0, set()
+    def __init__(self, read_data: Callable[[], bytes]):
+        self.read_data, self.data, self.used_bytes, self.locations = read_data, b"", 0, set()
 
     def tensor(self, content: dict[str, Any]) -> Tensor:
         """Return the described tensor in memory of its own."""
@@ -135,7 +135,7 @@ class _Weights:
         self.locations.add(where["location"])
         if len(self.locations) > 1:
             raise UnsupportedNetwork("weights in more than one other file")
-        self.data = self.data or self.beside()
+        self.data = self.data or self.read_data()
         offset = checked_integer(int(where.get("offset", 0)), 0, len(self.data))
         size = checked_integer(int(where.get("length", len(self.data))), 0, len(self.data))
         part = memoryview(self.data)[offset : offset + size]

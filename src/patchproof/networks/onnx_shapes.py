@@ -93,8 +93,8 @@ def in_torchs_order(sides: list[tuple[int, int]]) -> list[int]:
 def arange(start, limit, delta, *, device):
     """torch.arange(start, limit, delta)."""
     first, end, step = (numbers(number)[0] for number in (start, limit, delta))
-    few = math.ceil((end - first) / step) <= MAX_SIZES
-    return torch.arange(first, end, step, dtype=start.dtype, device="cpu" if few else device)
+    is_short = math.ceil((end - first) / step) <= MAX_SIZES
+    return torch.arange(first, end, step, dtype=start.dtype, device="cpu" if is_short else device)
 
 
 _RESIZED = {

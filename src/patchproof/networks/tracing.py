@@ -27,10 +27,10 @@ def trace_module(network: torch.nn.Module) -> Program | None:
 
 
 def _program(network: torch.nn.Module, nodes: list[Node]) -> Program:
-    *others, output = nodes
-    (photos,) = (node for node in others if node.op == "placeholder")
-    weights = [node for node in others if node.op == "get_attr"]
-    computed = [node for node in others if node.op.startswith("call_")]
+    *inner_nodes, output = nodes
+    (photos,) = (node for node in inner_nodes if node.op == "placeholder")
+    weights = [node for node in inner_nodes if node.op == "get_attr"]
+    computed = [node for node in inner_nodes if node.op.startswith("call_")]
     numbers = {node: number for number, node in enumerate([*weights, photos, *computed])}
 
     def step(node: Node) -> Step:

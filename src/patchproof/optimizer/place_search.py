@@ -218,10 +218,10 @@ class _Search:
 
     def _map(self, look: Callable[[Problem], Any], problems: Sequence[Problem], passes: int) -> list[Any]:
         """Call `look` with each problem, in parallel, and count `passes` for each."""
-        before, jobs = self.passes, min(len(problems), self._options[-1])
+        passes_before, jobs = self.passes, min(len(problems), self._options[-1])
         with fork_workers(lambda number: look(problems[number]), max(1, jobs)) as (workers, share):
             looks = range(len(problems))
-            return workers.map(share, looks, lambda done, _: self._count(before + done * passes - self.passes))
+            return workers.map(share, looks, lambda done, _: self._count(passes_before + done * passes - self.passes))
 
     def _losses(self, problem: Problem, appearance: Appearance, conditions: Conditions) -> np.ndarray:
         self._count(len(conditions))

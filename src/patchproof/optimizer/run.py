@@ -115,7 +115,7 @@ def optimize(
     if not resume:
         unfinished = is_file(out / CHECKPOINT_FILE) and not is_file(out / RUN_FILE)
         check_folder(out, RUN_FILE_PATTERNS, overwrite, unfinished=unfinished)
-    scene = scene_of(scene, seed)
+    scene = resolve_scene(scene, seed)
     save_place = None
     if not scene.HAS_PLACE:
         search_options = {"models": models, "loss": loss, "compute": compute, "progress": progress}
@@ -133,7 +133,7 @@ def optimize(
     return finish_run(problem, design, out, promise, progress)
 
 
-def scene_of(scene: str | Path | Scene, seed: int | None) -> Scene:
+def resolve_scene(scene: str | Path | Scene, seed: int | None) -> Scene:
     """Return a scene, or load that of a file with `seed` in place of the file's; a scene in memory keeps its own."""
     if not isinstance(scene, Scene):
         return load_scene(scene, seed)
@@ -203,9 +203,9 @@ def load_run(folder: str | Path) -> Run:
     """Load a finished run; refused if the folder holds none, or an unfinished one."""
     folder = Path(folder)
     if not is_file(folder / RUN_FILE):
-        begun = is_file(folder / CHECKPOINT_FILE)
-        do = "finish it with --resume" if begun else "name the folder that optimize wrote"
-        raise Refused("a finished run", f"{'an unfinished one' if begun else 'none'} at {folder}", do)
+        has_checkpoint = is_file(folder / CHECKPOINT_FILE)
+        do = "finish it with --resume" if has_checkpoint else "name the folder that optimize wrote"
+        raise Refused("a finished run", f"{'an unfinished one' if has_checkpoint else 'none'} at {folder}", do)
     details = read_json(folder / RUN_FILE, "a finished run", "optimize again")
     record = validate_model(_Record, details, str(folder / RUN_FILE))
     settings, promise = record.settings, record.promise

@@ -71,8 +71,8 @@ class Texture(Subject):
         parts, first = [], 0
         for mask in self.surface.masks:
             count = pyramid.level_count(mask.shape)
-            whole = pyramid.collapse_pyramid(updates[first : first + count])
-            parts.append(whole[:, mask])
+            update = pyramid.collapse_pyramid(updates[first : first + count])
+            parts.append(update[:, mask])
             first += count
         return torch.cat(parts, 1)[:, None]
 
