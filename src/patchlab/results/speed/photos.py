@@ -18,7 +18,7 @@ TIMED = """
 import json, sys, time
 from pathlib import Path
 import cv2, torch
-from patchproof.evidence.batch import PhotoItem, _measure
+from patchproof.evidence.batch import PhotoItem, _measure_or_reject
 from patchproof.evidence.classify import judges_of
 from patchproof.evidence.task import task_of
 from patchproof.app.verify import options_of
@@ -35,7 +35,7 @@ items = [PhotoItem(path, path.name, with_pictures=True) for path in sorted(Path(
 rows = []
 for item in 2 * items:
     begin = time.process_time()
-    measured = _measure(task, item)
+    measured = _measure_or_reject(task, item)
     took = 1000 * (time.process_time() - begin)
     entry = measured.entry
     found = {"status": entry.status, "code": entry.code, "markers": entry.markers_found}

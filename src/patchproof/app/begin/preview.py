@@ -211,9 +211,8 @@ def _write_object(stage: Stage, design: np.ndarray | None, path: Path) -> None:
     piece = None
     if isinstance(scene, PatchScene):
         placement, material = scene.placement, Material("piece", (1.0, 1.0, 1.0), design)
-        piece = MeshPart(
-            placement.vertices_mm, placement.faces, material, placement.piece_mm / placement.size_mm, placement.normals
-        )
+        uv = placement.piece_mm / placement.size_mm
+        piece = MeshPart(placement.vertices_mm, placement.faces, material, uv, placement.normals)
     write_atomically(path, lambda part: write_glb(mesh, textures, part, piece))
 
 

@@ -84,7 +84,7 @@ def measure_terms(
         advance(done, 3 * len(conditions))
 
     with torch.no_grad():
-        photo_terms = [term for term in on if term.whole]
+        photo_terms = [term for term in on if term.needs_whole_photo]
         photos = _squares(problem, photo_px, base, [setups[term.name] for term in photo_terms], add_views)
         small = _squares(problem, problem.training_px, base, [setups[term.name] for term in on], add_views)
         boxes = problem.boxes(conditions)

@@ -39,14 +39,15 @@ class Setup:
 @dataclass(frozen=True)
 class Term:
     """A term of the model: the settings key that governs it, and `change`, which takes it out of a setup, or returns
-    None if it is off. A term that is not `modeled` is added by `change`. `whole`: only whole photographs show it fully.
+    None if it is off. A term that is not `modeled` is added by `change`. One that `needs_whole_photo` shows fully in
+    whole photographs only.
     """
 
     name: str
     key: str
     change: Callable[[Setup], Setup | None]
     modeled: bool = True
-    whole: bool = False
+    needs_whole_photo: bool = False
 
 
 def scene_terms(problem: Problem, design: Tensor, other_surface: Placement | None) -> tuple[Term, ...]:
@@ -57,7 +58,7 @@ def scene_terms(problem: Problem, design: Tensor, other_surface: Placement | Non
         for table in ("light", "printer", "camera")
     }
     parts = [
-        Term(part.name, part.key, partial(_without_part, part=part), whole=part.needs_whole_photo)
+        Term(part.name, part.key, partial(_without_part, part=part), needs_whole_photo=part.needs_whole_photo)
         for part in scene.TERMS
     ]
     terms = (*effects["light"], *(term for term in parts if not term.key))
@@ -74,7 +75,12 @@ def scene_terms(problem: Problem, design: Tensor, other_surface: Placement | Non
 def effect_terms(table: str) -> tuple[Term, ...]:
     """Terms for the effects that a table of the settings turns on and off."""
     return tuple(
-        Term(effect.name, effect.keys[0], partial(_without_effect, effect=effect), whole=effect.needs_whole_photo)
+        Term(
+            effect.name,
+            effect.keys[0],
+            partial(_without_effect, effect=effect),
+            needs_whole_photo=effect.needs_whole_photo,
+        )
         for effect in EFFECTS
         if effect.can_be_off and effect.keys[0].startswith(f"{table}.")
     )
