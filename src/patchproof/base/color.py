@@ -98,13 +98,8 @@ def ciede2000(lab_a, lab_b):
     wrapped = xp.where(h_sum < 2 * math.pi, h_sum / 2 + math.pi, h_sum / 2 - math.pi)
     h_bar = xp.where(xp.abs(h1p - h2p) <= math.pi, h_sum / 2, wrapped)
     h_bar = xp.where(gray, h_sum, h_bar)
-    T = (
-        1
-        - 0.17 * xp.cos(h_bar - math.radians(30))
-        + 0.24 * xp.cos(2 * h_bar)
-        + 0.32 * xp.cos(3 * h_bar + math.radians(6))
-        - 0.20 * xp.cos(4 * h_bar - math.radians(63))
-    )
+    T = 1 - 0.17 * xp.cos(h_bar - math.radians(30)) + 0.24 * xp.cos(2 * h_bar)
+    T = T + 0.32 * xp.cos(3 * h_bar + math.radians(6)) - 0.20 * xp.cos(4 * h_bar - math.radians(63))
     d_theta = math.radians(30) * xp.exp(-(((h_bar * (180 / math.pi) - 275) / 25) ** 2))
     R_C = 2 * xp.sqrt(C_barp**7 / (C_barp**7 + 25.0**7) + tiny)
     S_L = 1 + 0.015 * (L_bar - 50) ** 2 / xp.sqrt(20 + (L_bar - 50) ** 2)

@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 UP = (0.0, 1.0, 0.0)
-
 MM_PER_INCH = 25.4
 
 Numbers = TypeVar("Numbers", "np.ndarray", "Tensor")
@@ -48,9 +47,7 @@ def orbit(azimuth_deg: ArrayLike, elevation_deg: ArrayLike, forward: ArrayLike, 
 
 
 def look_at(eye_mm: ArrayLike, target_mm: ArrayLike, roll_deg: ArrayLike = 0.0, up: ArrayLike = UP) -> np.ndarray:
-    """`camera_from_world` 4×4 of a camera at `eye_mm` that looks at `target_mm`, turned clockwise by `roll_deg`; N×4×4
-    for arrays N×3 and N.
-    """
+    """`camera_from_world` (N×)4×4 of a camera at `eye_mm` that looks at `target_mm`, turned clockwise by `roll_deg`."""
     eye, target, roll = np.asarray(eye_mm, float), np.asarray(target_mm, float), np.radians(roll_deg)[..., None]
     z = _unit(target - eye)
     side = np.cross(z, _unit(up))
@@ -91,9 +88,7 @@ def camera_centers(poses) -> np.ndarray:
 
 
 def plane_homography(matrix_px, camera_from_world, world_from_plane) -> np.ndarray:
-    """Homography 3×3 from plane millimeters to pixels; `world_from_plane` 4×4 has the plane's x, y axes and origin. For
-    poses N×4×4 it is N×3×3.
-    """
+    """(N×)3×3 homography from plane millimeters to pixels; `world_from_plane` 4×4 has the plane's axes and origin."""
     pose = camera_from_world @ world_from_plane
     return normalize_homography(matrix_px @ pose[..., :3, [0, 1, 3]])
 
@@ -172,8 +167,7 @@ def view_angles(camera_from_plane, point) -> tuple[float, float, float]:
     Azimuth is positive where the camera is to the right of the page's normal, elevation where it is above.
     """
     rotation, translation = camera_from_plane[:3, :3], camera_from_plane[:3, 3]
-    camera_in_plane = -rotation.T @ translation
-    x, y, z = camera_in_plane - np.array([point[0], point[1], 0.0])
+    x, y, z = -rotation.T @ translation - np.array([point[0], point[1], 0.0])
     distance = float(np.sqrt(x * x + y * y + z * z))
     # plane z points into the paper (x right, y down, right-handed)
     return float(np.degrees(np.arctan2(x, -z))), float(np.degrees(np.arcsin(-y / distance))), distance

@@ -18,6 +18,7 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
@@ -31,7 +32,7 @@ TIME_LIMIT_S = 10.0  # of processor time: a photograph of 119 megapixels takes 4
 _REPEAT_S = 0.5  # until the next interruption, in case a library swallows the first
 _POLL_S = 0.1
 
-Arguments = ParamSpec("Arguments")
+Params = ParamSpec("Params")
 ReturnType = TypeVar("ReturnType")
 
 # an allow-list, because Pillow also opens formats that start other programs (EPS) or hold no photograph
@@ -94,12 +95,10 @@ class _Expired(BaseException):
     """The time is over; a BaseException, so that no `except Exception` in the work catches it."""
 
 
-def run_within_time(
-    work: Callable[Arguments, ReturnType], *arguments: Arguments.args, **keywords: Arguments.kwargs
-) -> ReturnType:
+def run_within_time(work: Callable[Params, ReturnType], *args: Params.args, **kwargs: Params.kwargs) -> ReturnType:
     """Call `work` and return its result; raises `TimeLimitExceeded` after `TIME_LIMIT_S`."""
     if not has_timer() or signal.getitimer(signal.ITIMER_PROF)[0] > 0:
-        return work(*arguments, **keywords)
+        return work(*args, **kwargs)
     armed = [True]
 
     def expire(*_) -> None:
@@ -110,7 +109,7 @@ def run_within_time(
     try:
         try:
             signal.setitimer(signal.ITIMER_PROF, TIME_LIMIT_S, _REPEAT_S)
-            return work(*arguments, **keywords)
+            return work(*args, **kwargs)
         finally:
             armed.clear()
             signal.setitimer(signal.ITIMER_PROF, 0)
@@ -126,22 +125,19 @@ def run_in_daemon_thread(work: Callable[[], ReturnType]) -> ReturnType:
     """Call `work` in a thread and return its result; an interruption abandons the thread. For calls into libraries that
     cannot be interrupted and share nothing with other work.
     """
-    results: list[ReturnType] = []
-    errors: list[BaseException] = []
+    future: Future[ReturnType] = Future()
 
     def run() -> None:
         try:
-            results.append(work())
+            future.set_result(work())
         except BaseException as error:
-            errors.append(error)
+            future.set_exception(error)
 
     thread = threading.Thread(target=run, daemon=True)
     thread.start()
     while thread.is_alive():
         thread.join(_POLL_S)  # the signal may reach the other thread, and does not wake a thread that waits
-    if errors:
-        raise errors[0]
-    return results[0]
+    return future.result()
 
 
 def remaining_seconds() -> float:

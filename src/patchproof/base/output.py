@@ -86,9 +86,7 @@ def make_folder(path: Path) -> None:
 
 
 def write_atomically(path: Path, content: str | bytes | Callable[[Path], Any]) -> None:
-    """Write `content`, or let it write, to a file beside `path` and move that there: readers see either the complete
-    old file or the complete new one.
-    """
+    """Write `content`, or let it write, beside `path`, and move it there: readers see the complete old or new file."""
     part = path.with_name(f".{path.name}.part")
     try:
         if callable(content):

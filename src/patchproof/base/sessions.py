@@ -23,6 +23,7 @@ import numpy as np
 
 from patchproof.base.intervals import CONFIDENCE, paired_difference, student_mean
 
+Hits = Sequence[bool] | np.ndarray
 TAIL = (1 - CONFIDENCE) / 2
 _RATES, _CORRELATIONS = 240, 36
 _MAX_CORRELATION = 0.95
@@ -104,9 +105,7 @@ def _chances_of(posterior: RatePosterior, photos: tuple[int, ...]) -> np.ndarray
     return chances
 
 
-def count_by_session(
-    hits: Sequence[bool] | np.ndarray, per_session: int, places: Sequence[int] = ()
-) -> tuple[list[int], list[int]]:
+def count_by_session(hits: Hits, per_session: int, places: Sequence[int] = ()) -> tuple[list[int], list[int]]:
     """(recognized, photographs) of sessions of `per_session` successive photographs; the last may have fewer. Sessions
     with the same number in `places` count as one, because sessions differ mostly by their place.
     """
@@ -117,13 +116,11 @@ def count_by_session(
     return list(map(sum, by_place.values())), list(map(len, by_place.values()))
 
 
-def _split(values: Sequence[bool] | np.ndarray, per_session: int) -> list[Sequence[bool] | np.ndarray]:
+def _split(values: Hits, per_session: int) -> list[Hits]:
     return [values[first : first + per_session] for first in range(0, len(values), per_session)]
 
 
-def session_difference(
-    a: Sequence[bool] | np.ndarray, b: Sequence[bool] | np.ndarray, per_session: int
-) -> tuple[float, tuple[float, float]]:
+def session_difference(a: Hits, b: Hits, per_session: int) -> tuple[float, tuple[float, float]]:
     """Return rate(a) - rate(b) on the same conditions in sessions of `per_session` successive ones, and the wider of
     two intervals: Newcombe's paired one over conditions, and Student's over sessions (of width 0 if all agree).
     """

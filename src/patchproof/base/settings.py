@@ -258,9 +258,8 @@ class SceneSettings(StrictModel):
         if self.patch.place == "auto" and self.object.mesh is None:
             raise ValueError('name object.mesh, or leave out patch.place = "auto": only a mesh has other places')
         if self.patch.place == "auto" and (self.view.look_at != "object" or self.view.front != "patch"):
-            raise ValueError(
-                'leave out view.look_at and view.front with patch.place = "auto": views then refer to patch.side'
-            )
+            message = 'leave out view.look_at and view.front with patch.place = "auto": views then refer to patch.side'
+            raise ValueError(message)
         if self.patch.kind == "patch" and self.object.photos is None and self.patch.width_mm is None:
             raise ValueError("add patch.width_mm and patch.height_mm")
         return self
@@ -283,7 +282,5 @@ def load_scene_settings(path: str | Path) -> SceneSettings:
 
 
 def identity_settings(settings: StrictModel) -> dict[str, Any]:
-    """The settings that a sheet id is computed from: those that differ from their defaults, so that a new key with a
-    default changes no sheet id.
-    """
+    """The settings that a sheet id is computed from: no defaults, so that a new key with one changes no sheet id."""
     return settings.model_dump(mode="json", exclude={"promise"}, exclude_defaults=True)

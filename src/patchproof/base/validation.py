@@ -58,10 +58,9 @@ class StrictModel(BaseModel):
         """
         tables = {name: getattr(self, name) for name in type(self).model_fields}
         for name, value in values.items():
-            table = tables.get(name)
-            tables[name] = (
-                table.changed(**value) if isinstance(table, StrictModel) and isinstance(value, dict) else value
-            )
+            if isinstance(table := tables.get(name), StrictModel) and isinstance(value, dict):
+                value = table.changed(**value)
+            tables[name] = value
         return validate_model(type(self), tables, type(self).__name__)
 
 

@@ -30,8 +30,10 @@ from pathlib import Path
 from typing import Any
 
 from patchproof.base.errors import Refused, WorkerDied
+from patchproof.base.progress import Advance, no_advance
 
-_NumberedItem = tuple[int, Any]
+_Task = Callable[[Any], Any]
+_Item = tuple[int, Any]  # its number, and the item
 MAX_TRIES = 3  # of an item whose worker dies each time
 MAX_QUEUED_ITEMS = 1000  # on a cluster at a time: enough to keep it busy, and for its scheduler to plan ahead
 _QUOTA = Path("/sys/fs/cgroup/cpu.max")  # of a container: microseconds of processor time per period
@@ -47,19 +49,14 @@ class Workers:
         self._start, self._in_flight, self._one_thread = start, in_flight, one_thread
         self._executor = start()
 
-    def completed(self, function: Callable[[Any], Any], items: Iterable[Any]) -> Iterator[tuple[int, Future]]:
+    def completed(self, function: _Task, items: Iterable[Any]) -> Iterator[tuple[int, Future]]:
         """Yield (number of the item, its finished future) as they finish; items are taken only as they are needed."""
-        suspects: list[_NumberedItem] = []
+        suspects: list[_Item] = []
         yield from self._run(function, enumerate(items), self._in_flight, suspects)
         for suspect in suspects:
             yield from self._run_alone(function, suspect)
 
-    def map(
-        self,
-        function: Callable[[Any], Any],
-        items: Iterable[Any],
-        on_done: Callable[[int, int], None] = lambda done, total: None,
-    ) -> list[Any]:
+    def map(self, function: _Task, items: Iterable[Any], on_done: Advance = no_advance) -> list[Any]:
         """Return the results in the order of the items; raises the first exception. `on_done` gets (done, total)."""
         items = list(items)
         results = [None] * len(items)
@@ -72,9 +69,7 @@ class Workers:
         """Stop the workers; items that have not begun are dropped."""
         self._executor.shutdown(wait=True, cancel_futures=True)
 
-    def _run(
-        self, function, items: Iterable[_NumberedItem], in_flight: int, lost: list[_NumberedItem]
-    ) -> Iterator[tuple[int, Future]]:
+    def _run(self, function, items: Iterable[_Item], in_flight: int, lost: list[_Item]) -> Iterator[tuple[int, Future]]:
         """Keep `in_flight` items running; those whose workers died are appended to `lost`."""
         todo, running = iter(items), {}
         while True:
@@ -96,16 +91,15 @@ class Workers:
                 self._executor.shutdown(wait=True)
                 self._executor = self._start()
 
-    def _run_alone(self, function, suspect: _NumberedItem) -> Iterator[tuple[int, Future]]:
+    def _run_alone(self, function, suspect: _Item) -> Iterator[tuple[int, Future]]:
         for _ in range(MAX_TRIES):
-            lost: list[_NumberedItem] = []
+            lost: list[_Item] = []
             yield from self._run(function, [suspect], 1, lost)
             if not lost:
                 return
+        error = WorkerDied("a worker that finishes its work", f"one that died {MAX_TRIES} times", "give it more memory")
         future: Future = Future()
-        future.set_exception(
-            WorkerDied("a worker that finishes its work", f"one that died {MAX_TRIES} times", "give it more memory")
-        )
+        future.set_exception(error)
         yield suspect[0], future
 
     def _submit(self, function, item) -> Future:
@@ -139,9 +133,7 @@ def open_workers(jobs: int = 1, cluster: str | None = None, spawn: bool = False)
 
 
 @contextmanager
-def fork_workers(
-    function: Callable[[Any], Any], jobs: int, in_turn: bool = False
-) -> Iterator[tuple[Workers, Callable[[Any], Any]]]:
+def fork_workers(function: _Task, jobs: int, in_turn: bool = False) -> Iterator[tuple[Workers, _Task]]:
     """Fork `jobs` processes that hold `function` and all that it refers to in their memory; yields the workers and the
     callable to give them in its place. Only items and results are sent.
 
@@ -226,7 +218,7 @@ def _call_on_one_thread(function, item):
         return function(item)
 
 
-def _process_pool(jobs: int, forks: bool, function: Callable[[Any], Any] | None = None) -> Executor:
+def _process_pool(jobs: int, forks: bool, function: _Task | None = None) -> Executor:
     import multiprocessing
 
     context = multiprocessing.get_context("fork" if forks else "spawn")
@@ -236,7 +228,7 @@ def _process_pool(jobs: int, forks: bool, function: Callable[[Any], Any] | None 
 class _RotatingExecutor(Executor):
     """Single processes that get items in rotation."""
 
-    def __init__(self, jobs: int, forks: bool, function: Callable[[Any], Any]):
+    def __init__(self, jobs: int, forks: bool, function: _Task):
         self._executors = [_process_pool(1, forks, function) for _ in range(jobs)]
         self._next = cycle(self._executors)
 
@@ -259,7 +251,7 @@ class _QuietProcessPool(futures.ProcessPoolExecutor):
             return super().submit(fn, *args, **kwargs)
 
 
-_function: Callable[[Any], Any] | None = None  # in a forked worker the function that it was forked for
+_function: _Task | None = None  # in a forked worker the function that it was forked for
 
 
 def _call_shared_function(item: Any) -> Any:
@@ -267,7 +259,7 @@ def _call_shared_function(item: Any) -> Any:
     return _function(item)
 
 
-def _init_worker(parent: int, function: Callable[[Any], Any] | None) -> None:
+def _init_worker(parent: int, function: _Task | None) -> None:
     """Set up a new process: it ignores Ctrl-C, and ends when its parent has ended."""
     global _function
     _function = function

@@ -45,6 +45,9 @@ _REDUCED_WINDOW_PX = 5
 
 ImageRegion = tuple[slice, slice]
 """Rows and columns of a part of the photograph."""
+Ids = Set[int]
+Detections = dict[int, list[np.ndarray]]
+"""Rough corners 4×2 px by marker id, for each place where it was detected."""
 
 
 @dataclass(frozen=True)
@@ -74,16 +77,14 @@ class Level:
 
 def find_markers(
     srgb: np.ndarray,
-    expected: Set[int],
-    also: Set[int] = frozenset(),
+    expected: Ids,
+    also: Ids = frozenset(),
     dictionary: str = DICTIONARY,
-    or_all_of: Sequence[Set[int]] = (),
+    or_all_of: Sequence[Ids] = (),
 ) -> MarkersInView:
-    """Find the markers of `expected` and `also` in a uint8 photograph; the search ends when all of `expected`, or all
-    of one set in `or_all_of`, are found.
-    """
+    """Find markers of `expected` and `also` in a uint8 photo, until `expected` or a set in `or_all_of` is complete."""
     aruco = aruco_dictionary(dictionary)
-    detections: dict[int, list[np.ndarray]] = {}
+    detections: Detections = {}
     for level in pyramid_levels(srgb, full_region(srgb)):
         search_level(srgb, full_region(srgb), level, aruco, detections)
         if any(ids <= detections.keys() for ids in (expected, *or_all_of)):
@@ -92,11 +93,7 @@ def find_markers(
 
 
 def fit_detections(
-    srgb: np.ndarray,
-    detections: dict[int, list[np.ndarray]],
-    sheet_ids: Set[int],
-    dictionary: str,
-    borders: dict[int, Borders] | None = None,
+    srgb: np.ndarray, detections: Detections, sheet_ids: Ids, dictionary: str, borders: dict[int, Borders] | None = None
 ) -> MarkersInView:
     """Fit the borders of `detections` in the full photograph; `borders` is a cache by id, which is extended."""
     borders, ids = {} if borders is None else borders, sorted(detections.keys() & sheet_ids)
@@ -108,7 +105,7 @@ def fit_detections(
     return MarkersInView(markers, foreign, tuple(i for i in ids if len(detections[i]) > 1))
 
 
-def is_mirrored(srgb: np.ndarray, expected: Set[int], dictionary: str = DICTIONARY) -> bool:
+def is_mirrored(srgb: np.ndarray, expected: Ids, dictionary: str = DICTIONARY) -> bool:
     """True if the flipped picture shows the sheet: selfie cameras and scans through the back mirror it."""
     mirrored = np.ascontiguousarray(downscale(srgb, MIRROR_PX)[:, ::-1])
     return bool(find_markers(mirrored, expected, frozenset(), dictionary).markers)
@@ -149,9 +146,7 @@ def pyramid_levels(srgb: np.ndarray, region: ImageRegion, coarsest_px: int = COA
         yield from (Level(2.0, to_gray) for to_gray in (light_picture, codes))
 
 
-def search_level(
-    srgb: np.ndarray, region: ImageRegion, level: Level, aruco, detections: dict[int, list[np.ndarray]]
-) -> None:
+def search_level(srgb: np.ndarray, region: ImageRegion, level: Level, aruco, detections: Detections) -> None:
     """Search a region of the photograph at one level; corners, in full pixels, are added to `detections` by id."""
     part = srgb[region]
     height, width = part.shape[:2]
@@ -198,9 +193,7 @@ def contrast_picture(srgb: np.ndarray) -> np.ndarray:
 
 
 def detector_settings() -> cv2.aruco.DetectorParameters:
-    """Parameters of the detector, chosen on warped pages of known geometry: of 48 markers blurred by 0.3 modules the
-    defaults find 37, these 46.
-    """
+    """Detector parameters: of 48 markers blurred by 0.3 modules on warped pages these find 46, the defaults 37."""
     settings = cv2.aruco.DetectorParameters()
     settings.perspectiveRemovePixelPerCell = 8
     settings.perspectiveRemoveIgnoredMarginPerCell = 0.3
@@ -240,9 +233,7 @@ def detect_markers(picture: np.ndarray, aruco, settings: cv2.aruco.DetectorParam
 
 
 def fit_marker_borders(srgb: np.ndarray, rough: np.ndarray, cells: np.ndarray) -> list[Borders]:
-    """Fit the borders of markers with rough corners M×4×2 in the photograph, of which only the regions about the
-    markers are converted to light.
-    """
+    """Fit the borders of markers with rough corners M×4×2; only the regions about them are converted to light."""
     region = region_around(rough.reshape(-1, 2), _MARGIN_PX, srgb.shape)
     low = np.array([region[1].start, region[0].start])
     part, quads = srgb[region], rough - low

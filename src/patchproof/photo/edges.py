@@ -178,9 +178,7 @@ def _predict_light(theta, model):
 
 
 def _gauss_newton(theta, prediction, light, model, weight, range_px, max_steps, converged_px):
-    """Damped Gauss-Newton of all borders at once, each until it moves by less than `converged_px`; `prediction` is that
-    of `theta`.
-    """
+    """Damped Gauss-Newton of all borders at once, from `theta` and its `prediction`, each to within `converged_px`."""
     fitted, active = theta.copy(), np.arange(len(theta))
     damping, root = np.full(len(theta), 1e-3), np.sqrt(weight)[..., None]
     cost = (((light - prediction[0]) * root) ** 2).sum((1, 2))

@@ -18,9 +18,7 @@ EXIF_SPREAD = 0.03  # of its logarithm: rounding to whole millimeters at 26 mm (
 LOOSE_SPREAD = 0.1
 _SENSOR_SHAPES, _CUT_SHAPES = (4 / 3, 3 / 2), (16 / 9,)
 _SAME_SHAPE = 0.01
-_EDITORS = re.compile(
-    r"photoshop|lightroom|gimp|snapseed|darktable|affinity|paint|pixelmator|capture one|luminar", re.I
-)
+_EDITOR = re.compile(r"photoshop|lightroom|gimp|snapseed|darktable|affinity|paint|pixelmator|capture one|luminar", re.I)
 _EXIF_IFD, _FOCAL_35MM, _WIDTH, _HEIGHT, _ZOOM, _SOFTWARE = 0x8769, 0xA405, 0xA002, 0xA003, 0xA404, 0x0131
 _COMMENT = 0x9286  # marks screenshots of phones and desktops of one maker
 _SCREEN = re.compile(r"screen.?shot", re.I)
@@ -41,7 +39,7 @@ def read_focal(image) -> tuple[float | None, float, bool]:
     resized = len(stated) == 2 and sorted(stated) != [short, long]
     if resized or (zoom is not None and zoom > 1.01) or not _has_shape(long, short, _SENSOR_SHAPES + _CUT_SHAPES):
         return None, EXIF_SPREAD, True
-    edited = bool(_EDITORS.search(str(exif.get(_SOFTWARE, ""))))
+    edited = bool(_EDITOR.search(str(exif.get(_SOFTWARE, ""))))
     uncertain = edited or not _has_shape(long, short, _SENSOR_SHAPES)
     return focal_35mm / _DIAGONAL_35MM * math.hypot(long, short), LOOSE_SPREAD if uncertain else EXIF_SPREAD, False
 

@@ -9,26 +9,14 @@ most; they search only where markers are still missing. Prediction never identif
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Set
-
 import cv2
 import numpy as np
 
 from patchproof.base.geometry import apply_homography
-from patchproof.photo.detect import (
-    COARSEST_PX,
-    ImageRegion,
-    MarkersInView,
-    fit_detections,
-    fit_marker_borders,
-    full_region,
-    is_plausible_quad,
-    luminance,
-    pyramid_levels,
-    search_level,
-)
+from patchproof.photo import detect
+from patchproof.photo.detect import COARSEST_PX, Detections, Ids, ImageRegion, MarkersInView
 from patchproof.photo.edges import Borders, sample
-from patchproof.photo.rectify import fit_page, region_around
+from patchproof.photo.rectify import Quads, fit_page, region_around
 from patchproof.photo.rejection import PhotoRejected
 from patchproof.sheets.markers import DICTIONARY, aruco_dictionary, marker_cells
 
@@ -43,11 +31,7 @@ READABLE_PX = 28.0
 
 
 def find_sheet(
-    srgb: np.ndarray,
-    expected: Set[int],
-    corners_mm: Mapping[int, np.ndarray],
-    dictionary: str = DICTIONARY,
-    coarsest_px: int = COARSEST_PX,
+    srgb: np.ndarray, expected: Ids, corners_mm: Quads, dictionary: str = DICTIONARY, coarsest_px: int = COARSEST_PX
 ) -> MarkersInView:
     """Find the markers of `corners_mm` (page mm by id) in a uint8 photograph.
 
@@ -55,14 +39,14 @@ def find_sheet(
     about a single foreign marker or one at two places.
     """
     aruco = aruco_dictionary(dictionary)
-    detections: dict[int, list[np.ndarray]] = {}
+    detections: Detections = {}
     borders: dict[int, Borders] = {}
-    region, view = full_region(srgb), MarkersInView({}, (), ())
-    for level in pyramid_levels(srgb, region, coarsest_px):
+    region, view = detect.full_region(srgb), MarkersInView({}, (), ())
+    for level in detect.pyramid_levels(srgb, region, coarsest_px):
         count, foreign = sum(map(len, detections.values())), view.foreign
-        search_level(srgb, region, level, aruco, detections)
+        detect.search_level(srgb, region, level, aruco, detections)
         if sum(map(len, detections.values())) != count:
-            detected = fit_detections(srgb, detections, set(corners_mm), dictionary, borders)
+            detected = detect.fit_detections(srgb, detections, set(corners_mm), dictionary, borders)
             view = complete_markers(srgb, detected, corners_mm, dictionary)
         missing = expected - view.markers.keys()
         if missing and view.markers:
@@ -75,7 +59,7 @@ def find_sheet(
     return view
 
 
-def _findable(srgb, missing: Set[int], view: MarkersInView, corners_mm, scale: float) -> tuple[Set[int], ImageRegion]:
+def _findable(srgb, missing: Ids, view: MarkersInView, corners_mm, scale: float) -> tuple[Ids, ImageRegion]:
     """The missing markers that a finer level could still find, and the region to search."""
     quads = None
     if sum(b.fitted for b in view.markers.values()) >= 2:  # one marker predicts the others' places badly
@@ -83,13 +67,13 @@ def _findable(srgb, missing: Set[int], view: MarkersInView, corners_mm, scale: f
     if quads is not None:
         missing = {i for i, quad in quads.items() if _side_px(quad) * scale < READABLE_PX}
     if quads is None or not missing:
-        return missing, full_region(srgb)
+        return missing, detect.full_region(srgb)
     margin = 2 * max(_side_px(quads[i]) for i in missing)
     return missing, region_around(np.concatenate([quads[i] for i in missing]), margin, srgb.shape)
 
 
 def complete_markers(
-    srgb: np.ndarray, view: MarkersInView, corners_mm: Mapping[int, np.ndarray], dictionary: str = DICTIONARY
+    srgb: np.ndarray, view: MarkersInView, corners_mm: Quads, dictionary: str = DICTIONARY
 ) -> MarkersInView:
     """Add to `view` all markers of `corners_mm` that are confirmed at their predicted places, and replace bad fits."""
     for _ in range(3):  # each round's markers predict farther ones better
@@ -112,7 +96,7 @@ def _confirm_markers(srgb, view: MarkersInView, corners_mm, dictionary: str) -> 
     if not ids:
         return {}
     cells = np.array([codes[i] for i in ids])
-    borders = fit_marker_borders(srgb, np.array([predicted[i] for i in ids]), cells)
+    borders = detect.fit_marker_borders(srgb, np.array([predicted[i] for i in ids]), cells)
     return {
         i: b
         for i, b, code in zip(ids, borders, cells, strict=True)
@@ -120,14 +104,14 @@ def _confirm_markers(srgb, view: MarkersInView, corners_mm, dictionary: str) -> 
     }
 
 
-def _predict_corners(srgb, view: MarkersInView, missing: Set[int], corners_mm) -> dict[int, np.ndarray] | None:
+def _predict_corners(srgb, view: MarkersInView, missing: Ids, corners_mm) -> dict[int, np.ndarray] | None:
     """Corners of missing markers in the picture, by id, from the fitted ones; None if these determine no homography."""
     try:
         px_from_mm = fit_page({i: b.corners_px for i, b in view.markers.items() if b.fitted}, corners_mm).px_from_mm
     except (PhotoRejected, np.linalg.LinAlgError):
         return None
     quads = {i: apply_homography(px_from_mm, corners_mm[i]) for i in missing}
-    return {i: quad for i, quad in quads.items() if is_plausible_quad(quad) and _is_in_picture(quad, srgb)}
+    return {i: quad for i, quad in quads.items() if detect.is_plausible_quad(quad) and _is_in_picture(quad, srgb)}
 
 
 def _is_in_picture(quad: np.ndarray, srgb: np.ndarray) -> bool:
@@ -152,7 +136,7 @@ def _correlation(srgb: np.ndarray, corners_px: np.ndarray, code: np.ndarray, off
     inner = np.column_stack([columns.ravel(), rows.ravel()])
     centers = apply_homography(to_px, (np.array(offsets)[:, None] + inner).reshape(-1, 2))
     region = region_around(centers, 1, srgb.shape)
-    light = luminance(np.ascontiguousarray(srgb[region]))
+    light = detect.luminance(np.ascontiguousarray(srgb[region]))
     cells = sample(light, centers - [region[1].start, region[0].start]).reshape(len(offsets), -1)
     values, printed = cells[cells.std(1) > 1e-6], code[1:-1, 1:-1].ravel()
     values, printed = values - values.mean(1, keepdims=True), printed - printed.mean()

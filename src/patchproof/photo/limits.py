@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from patchproof.base.errors import TimeLimitExceeded
-from patchproof.base.input import Arguments, ReturnType, has_timer, run_within_time
+from patchproof.base.input import Params, ReturnType, has_timer, run_within_time
 from patchproof.photo.rejection import PhotoRejected
 
 MOST_BYTES = 1_000_000_000  # 119 megapixels take 0.5 GB while they are read
@@ -24,12 +24,10 @@ _ROW_STEP = 4  # rows of which one is examined
 _NOISE_FACTOR = 4  # with four times as many edges as the squares have, most of them are noise
 
 
-def run_limited(
-    work: Callable[Arguments, ReturnType], *arguments: Arguments.args, **keywords: Arguments.kwargs
-) -> ReturnType:
+def run_limited(work: Callable[Params, ReturnType], *args: Params.args, **kwargs: Params.kwargs) -> ReturnType:
     """Call `work` and return its result; raises `PhotoRejected("too_costly")` after the limit of `run_within_time`."""
     try:
-        return run_within_time(work, *arguments, **keywords)
+        return run_within_time(work, *args, **kwargs)
     except TimeLimitExceeded as error:
         advice = f"it takes {error}: save it smaller, or leave it out"
         raise PhotoRejected("too_costly", None, error.seconds, advice) from None
@@ -37,9 +35,7 @@ def run_limited(
 
 @contextmanager
 def limit_memory() -> Iterator[None]:
-    """Within the block `MOST_BYTES` more than before can be allocated; beyond that allocations fail, mostly with a
-    MemoryError.
-    """
+    """Within the block `MOST_BYTES` more than before can be allocated; beyond that, mostly a MemoryError is raised."""
     if not has_timer() or not Path("/proc/self/statm").is_file():
         yield
         return

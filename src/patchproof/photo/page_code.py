@@ -53,10 +53,9 @@ def read_page_code(srgb: np.ndarray) -> PageCode | None:
     """Read the code in a uint8 picture; None without one. A detector that would take too long is skipped."""
     gray = cv2.cvtColor(downscale(srgb, _LARGEST_PX), cv2.COLOR_RGB2GRAY)
     # of 7 oblique pages of A4 they read 6 and 1, of 7 labels 5 and 7: neither detector is enough
-    for detector, count, max_count in (
-        (cv2.QRCodeDetectorAruco, count_squares, _MAX_SQUARES),
-        (cv2.QRCodeDetector, count_finder_lines, _MAX_LINES),
-    ):
+    by_squares = cv2.QRCodeDetectorAruco, count_squares, _MAX_SQUARES
+    by_lines = cv2.QRCodeDetector, count_finder_lines, _MAX_LINES
+    for detector, count, max_count in (by_squares, by_lines):
         if count(gray) > max_count:
             continue
         try:
@@ -76,8 +75,6 @@ def refuse_other_page(srgb: np.ndarray, px_from_mm: np.ndarray, page_mm: tuple[f
         return
     advice = f"its code says sheet {found.sheet_id}, the JSON is of {code.sheet_id}: name that sheet's JSON"
     if found.sheet_id == code.sheet_id:
-        advice = (
-            f"it is sheet {found.sheet_id} with another design: its code says {found.content}, the JSON "
-            f"{code.content}; name the JSON that was written with this PDF"
-        )
+        codes = f"{found.content}, the JSON {code.content}; name the JSON that was written with this PDF"
+        advice = f"it is sheet {found.sheet_id} with another design: its code says {codes}"
     raise PhotoRejected("wrong_sheet", None, None, advice)

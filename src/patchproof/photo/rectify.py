@@ -25,6 +25,7 @@ from patchproof.base.geometry import apply_homography, fit_homography, normalize
 from patchproof.base.resample import index_homography
 from patchproof.photo.rejection import PhotoRejected
 
+Quads = Mapping[int, np.ndarray]  # corners 4×2 by marker id
 CORNER_NOISE_PX = 0.045  # per coordinate, of fitted corners in noisy JPEGs of flat pages (measured 0.03 to 0.05)
 UNSEEN_NOISE_PX = 0.2  # assumed for one marker, whose residual is always 0: more than sharp photographs have
 _BEND_FACTOR = 3.0  # error of the design's corners per bend of markers: 2 to 4.5 on wavy, wobbly and folded paper
@@ -44,7 +45,7 @@ class PageFit:
     outlier_mm: float = 0.0  # rms of the worst outlier marker
 
 
-def fit_page(corners_px: Mapping[int, np.ndarray], corners_mm: Mapping[int, np.ndarray]) -> PageFit:
+def fit_page(corners_px: Quads, corners_mm: Quads) -> PageFit:
     """Fit the homography page mm → photo px to all markers in both mappings; raises `PhotoRejected` without any."""
     ids, px, mm = common_corners(corners_px, corners_mm)
     if not ids:
@@ -66,9 +67,7 @@ def fit_page(corners_px: Mapping[int, np.ndarray], corners_mm: Mapping[int, np.n
     return _page_fit(homography, mm, px, inlier, inlier_ids)
 
 
-def common_corners(
-    corners_px: Mapping[int, np.ndarray], corners_mm: Mapping[int, np.ndarray]
-) -> tuple[tuple[int, ...], np.ndarray, np.ndarray]:
+def common_corners(corners_px: Quads, corners_mm: Quads) -> tuple[tuple[int, ...], np.ndarray, np.ndarray]:
     """(ids, px 4N×2, mm 4N×2) of the markers in both mappings."""
     ids = tuple(sorted(corners_px.keys() & corners_mm.keys()))
     px, mm = (np.array([corners[i] for i in ids], float).reshape(-1, 2) for corners in (corners_px, corners_mm))

@@ -8,22 +8,8 @@ from __future__ import annotations
 from patchproof.base.errors import PatchproofError
 
 REJECTION_CODES = (
-    "unreadable",
-    "too_costly",
-    "empty",
-    "too_few_markers",
-    "blurred",
-    "clipped",
-    "too_small",
-    "tilted",
-    "out_of_range",
-    "scale_off",
-    "wrong_sheet",
-    "several_sheets",
-    "mirrored",
-    "curled",
-    "cropped",
-    "copy",
+    *("unreadable", "too_costly", "empty", "too_few_markers", "blurred", "clipped", "too_small", "tilted"),
+    *("out_of_range", "scale_off", "wrong_sheet", "several_sheets", "mirrored", "curled", "cropped", "copy"),
 )
 
 

@@ -10,25 +10,17 @@ residual is less than half of the plane's; a photograph with too much residual b
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from patchproof.base.geometry import apply_homography, fit_homography, rect_corners
+from patchproof.photo import rectify
 from patchproof.photo.detect import row_strips
 from patchproof.photo.edges import BORDER_SHARE, RECT_GRID, border_frame, intersect_borders
-from patchproof.photo.rectify import (
-    CORNER_NOISE_PX,
-    PageFit,
-    bend_mm,
-    common_corners,
-    largest_shift_mm,
-    region_around,
-    rms_length_mm,
-    root_of,
-)
+from patchproof.photo.rectify import CORNER_NOISE_PX, PageFit, Quads
 from patchproof.photo.shapes import UNKNOWN_FOCAL, Shape, fit_cylinder, fit_radial_lens, rms
 
 MAX_FLAT_RMS_PX = 0.15  # per coordinate, up to which a sheet counts as flat: three times the corners' noise
@@ -63,14 +55,14 @@ class ShapeFit:
 
 
 def fit_shape(
-    corners_px: Mapping[int, np.ndarray],
-    corners_mm: Mapping[int, np.ndarray],
+    corners_px: Quads,
+    corners_mm: Quads,
     size_px: tuple[int, int],
     focal_px: float | None = None,
     focal_spread: float = UNKNOWN_FOCAL,
 ) -> ShapeFit | None:
     """Fit a cylinder or a lens to the corners in a picture of this size; None if a plane fits as well."""
-    ids, px, mm = common_corners(corners_px, corners_mm)
+    ids, px, mm = rectify.common_corners(corners_px, corners_mm)
     if len(ids) < LEAST_MARKERS:
         return None
     flat = fit_homography(mm, px)
@@ -88,8 +80,8 @@ def fit_shape(
 
 def unroll(
     srgb: np.ndarray,
-    corners_px: Mapping[int, np.ndarray],
-    corners_mm: Mapping[int, np.ndarray],
+    corners_px: Quads,
+    corners_mm: Quads,
     rect_mm,
     focal_px: float | None = None,
     focal_spread: float = UNKNOWN_FOCAL,
@@ -107,10 +99,10 @@ def unroll(
     margin = np.linalg.norm(apply_homography(flat, mm) - px, axis=1).max()  # pixels move about that far
     picture = _flatten(srgb, shape.px, px_from_mm, rect_mm, margin_px=margin)
     # the homography's covariance would not cover the bend, so it is 0 and `uncertainty_mm` covers everything
-    ids = common_corners(corners_px, corners_mm)[0]
+    ids = rectify.common_corners(corners_px, corners_mm)[0]
     residual = shape.px(mm) - px
-    length = rms_length_mm(_mm_by_px(shape.px, mm), residual)
-    fit = PageFit(px_from_mm, np.zeros((8, 8)), length, ids, bend_mm(shape.bend_px, residual, length))
+    length = rectify.rms_length_mm(_mm_by_px(shape.px, mm), residual)
+    fit = PageFit(px_from_mm, np.zeros((8, 8)), length, ids, rectify.bend_mm(shape.bend_px, residual, length))
     return UnrolledSheet(picture, fit, _uncertainty_mm(shape, rect_corners(rect_mm)), shape)
 
 
@@ -144,8 +136,8 @@ def _uncertainty_mm(shape: Shape, corners: np.ndarray) -> float:
         step = np.zeros(len(spread))
         step[i] = 0.1 * sigma
         rows.append((shape.project(shape.parameters + step, corners) - px).ravel() / (0.1 * sigma))
-    root = spread[:, None] * root_of(shape.covariance / np.outer(spread, spread))
-    return largest_shift_mm(root, np.array(rows), _mm_by_px(shape.px, corners))
+    root = spread[:, None] * rectify.root_of(shape.covariance / np.outer(spread, spread))
+    return rectify.largest_shift_mm(root, np.array(rows), _mm_by_px(shape.px, corners))
 
 
 def _mm_by_px(project: Callable[[np.ndarray], np.ndarray], mm: np.ndarray) -> np.ndarray:
@@ -157,7 +149,7 @@ def _mm_by_px(project: Callable[[np.ndarray], np.ndarray], mm: np.ndarray) -> np
 
 def _flatten(srgb, project, px_from_mm, rect_mm, margin_px: float) -> np.ndarray:
     """The photograph with the rectangle of the page resampled as if the sheet were flat."""
-    rows, columns = region_around(apply_homography(px_from_mm, rect_corners(rect_mm)), margin_px, srgb.shape)
+    rows, columns = rectify.region_around(apply_homography(px_from_mm, rect_corners(rect_mm)), margin_px, srgb.shape)
     left, top, width, height = rect_mm
     picture = srgb.copy()
     for strip in row_strips(srgb[rows]):  # in strips, because coordinates of a whole large picture take gigabytes

@@ -18,15 +18,7 @@ from patchproof.sheets.content import SheetContent
 from patchproof.sheets.manifest import Manifest
 from patchproof.sheets.markers import MARKER_MODULES
 from patchproof.sheets.page import lay_out_parts
-from patchproof.sheets.piece import (
-    Piece,
-    PieceMarker,
-    lay_out_piece,
-    marker_ids,
-    marker_rect,
-    move_marker,
-    page_id,
-)
+from patchproof.sheets.piece import Piece, PieceMarker, lay_out_piece, marker_ids, marker_rect, move_marker, page_id
 from patchproof.sheets.rects import rect_contains
 from patchproof.sheets.template import Template, load_template, template_names
 from patchproof.sheets.write import write_page, write_sheet
@@ -67,7 +59,7 @@ def chart_sheet(template: Template, pdf_path: str | Path) -> Manifest:
     page = lay_out_parts(template, [], ids, f"patchproof:{identity}:{CHART}", words)
     pitch = grid.swatch_mm + grid.gap_mm
     width, height = (round(count * pitch - grid.gap_mm, 6) for count in (grid.columns, grid.rows))
-    return write_page(pdf_path, page, template, (*grid.corner_mm, width, height), CHART, grid)
+    return write_page(pdf_path, page, template, (*grid.corner_mm, width, height), CHART)
 
 
 def blank_piece(manifest: Manifest) -> Piece:

@@ -42,7 +42,7 @@ def is_board(template: str | Path) -> bool:
 def board_sheet(template: str | Path, pdf_path: str | Path) -> Manifest:
     """Write the page of a board and its manifest beside it."""
     page = _load(template)
-    return write_page(pdf_path, _lay_out(page, page_id(page)), page, _rect(page.board), KIND, page.board)
+    return write_page(pdf_path, _lay_out(page, page_id(page)), page, _rect(page.board), KIND)
 
 
 def load_board(name_or_file: str | Path) -> Board:
@@ -71,11 +71,9 @@ def _lay_out(template: BoardTemplate, identity: str) -> PageLayout:
     inset = (grid.square_mm - grid.marker_mm) / 2
     if inset < grid.marker_mm / MARKER_MODULES - 1e-6:
         largest = grid.square_mm * MARKER_MODULES / (MARKER_MODULES + 2)
-        raise Refused(
-            f"board.marker_mm of at most {largest:.3g}, which leaves a module of white around it",
-            f"{grid.marker_mm:g} in squares of {grid.square_mm:g} mm",
-            "make the markers smaller or the squares larger",
-        )
+        expected = f"board.marker_mm of at most {largest:.3g}, which leaves a module of white around it"
+        got = f"{grid.marker_mm:g} in squares of {grid.square_mm:g} mm"
+        raise Refused(expected, got, "make the markers smaller or the squares larger")
     (x, y), side = grid.corner_mm, grid.square_mm
     black, white = (board_squares(grid.rows, grid.columns, white) for white in (False, True))
     if len(white) > 1000:

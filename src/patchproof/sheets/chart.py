@@ -63,7 +63,5 @@ def chart_swatches(grid: ChartGrid) -> tuple[SwatchRect, ...]:
     pitch = grid.swatch_mm + grid.gap_mm
     (x, y), side = grid.corner_mm, grid.swatch_mm
     cells = product(range(grid.rows), range(grid.columns))
-    return tuple(
-        ((x + column * pitch, y + row * pitch, side, side), colors[index])
-        for (row, column), index in zip(cells, order, strict=True)
-    )
+    rects = ((x + column * pitch, y + row * pitch, side, side) for row, column in cells)
+    return tuple(zip(rects, (colors[index] for index in order), strict=True))

@@ -17,7 +17,7 @@ from patchproof.sheets.layout import PageLayout
 from patchproof.sheets.manifest import Design, Manifest, Promise, Swatch, design_sha256
 from patchproof.sheets.piece import Piece, manifest_marker, whiten_marker_pixels
 from patchproof.sheets.rects import RectMm, size_text
-from patchproof.sheets.template import BoardTemplate, Template
+from patchproof.sheets.template import AnyTemplate, Template
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +71,8 @@ class SheetContent:
 
     def manifest(self, page: PageLayout, template: Template, cut_mm: RectMm, design_page: int = 1) -> Manifest:
         """The manifest of the page, with the design within the cut line."""
-        manifest = page_manifest(page, template, cut_mm, self.sheet_id, self.kind, self.settings)
+        fields = {"sheet_id": self.sheet_id, "kind": self.kind, "settings": self.settings}
+        manifest = page_manifest(page, template, cut_mm, **fields)
         design, pixels = None, self.design_srgb8
         if pixels is not None:
             sha256, size_px, png = design_sha256(pixels), pixels.shape[1::-1], png_base64(pixels)
@@ -79,19 +80,10 @@ class SheetContent:
         return manifest.changed(design=design, promise=self.promise)
 
 
-def page_manifest(
-    page: PageLayout,
-    template: Template | BoardTemplate,
-    cut_mm: RectMm,
-    sheet_id: str,
-    kind: str,
-    settings: dict[str, Any],
-) -> Manifest:
-    """The manifest of a page without a design."""
+def page_manifest(page: PageLayout, template: AnyTemplate, cut_mm: RectMm, **fields: Any) -> Manifest:
+    """The manifest of a page without a design; `fields` are its sheet_id, kind and settings."""
     return Manifest(
         version=2,
-        sheet_id=sheet_id,
-        kind=kind,
         page_mm=page.page_mm,
         design=None,
         markers=tuple(manifest_marker(marker) for marker in page.markers),
@@ -99,7 +91,7 @@ def page_manifest(
         cut_mm=cut_mm,
         ruler_mm=(template.ruler.length_mm, template.ruler.length_mm),
         promise=None,
-        settings=settings,
+        **fields,
     )
 
 

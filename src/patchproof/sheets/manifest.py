@@ -213,10 +213,8 @@ class Promise(StrictModel):
         rate = control.rate + control.difference
         shared = "" if abs(rate - self.rate) < 5e-4 else " in the same views"
         points = f"{100 * control.difference:+.1f} points [{low:+.1f}, {high:+.1f}]"
-        return (
-            f"{self.draft_prefix}{self.comparison} than its best control ({self.best_control}): {rate:.1%} beside "
-            f"{control.rate:.1%} recognized{shared}, {points}.{advice}"
-        )
+        rates = f"{rate:.1%} beside {control.rate:.1%} recognized{shared}, {points}"
+        return f"{self.draft_prefix}{self.comparison} than its best control ({self.best_control}): {rates}.{advice}"
 
     def figures(self) -> dict[str, str]:
         """The target, rate, interval and controls as text, in the order to be read."""

@@ -26,16 +26,13 @@ from patchproof.sheets.pdf import PdfPage
 from patchproof.sheets.piece import hash_order, move_marker, sheet_id
 from patchproof.sheets.piece_words import piece_words
 from patchproof.sheets.plan_page import PlanPage, lay_out_plan
-from patchproof.sheets.rects import PointMm, size_text
+from patchproof.sheets.rects import RectMm, size_text
 from patchproof.sheets.template import Template
 from patchproof.sheets.write import check_pdf_path, manifest_paths, save_sheets
 
 
 def write_several(
-    pdf_path: str | Path,
-    template: Template,
-    designs: Sequence[SheetContent],
-    plans: Sequence[PlanPage | None] = (),
+    pdf_path: str | Path, template: Template, designs: Sequence[SheetContent], plans: Sequence[PlanPage | None] = ()
 ) -> list[Manifest]:
     """Write a page with at least two designs and a manifest for each; `plans`, in the order of the designs, become
     further pages. Refused if two designs belong to the same sheet.
@@ -56,7 +53,8 @@ def write_several(
     fix = "Put each piece on its object as its own plan page shows"
     words = {"sheet_id": identity, "kind": f"{len(designs)} designs", "design": sizes, "piece": sizes, "fix": fix}
     page = lay_out_parts(template, pieces, _page_ids(designs, template), code, words, labels)
-    manifests = [_manifest(template, page, design, pieces[i][1], i, code) for i, design in enumerate(designs)]
+    cuts = zip(designs, page.cuts_mm, strict=True)
+    manifests = [_manifest(template, page, design, cut_mm).changed(page_code=code) for design, cut_mm in cuts]
     pages = [PdfPage(page, tuple(chain(*map(SheetContent.pictures, designs, page.cuts_mm))))]
     for i, plan in enumerate(plans):
         if plan is not None:
@@ -80,12 +78,10 @@ def _page_code(identity: str, designs: Sequence[SheetContent]) -> str:
     return f"patchproof:{identity}:{hashlib.sha256(''.join(hashes).encode()).hexdigest()[:16]}"
 
 
-def _manifest(
-    template: Template, page: PageLayout, design: SheetContent, corner: PointMm, index: int, code: str
-) -> Manifest:
+def _manifest(template: Template, page: PageLayout, design: SheetContent, cut_mm: RectMm) -> Manifest:
     """One design's manifest: the markers of its piece, then all others on the page whose id is unique."""
-    piece_markers = [move_marker(marker, corner) for marker in design.piece.markers]
+    piece_markers = [move_marker(marker, cut_mm[:2]) for marker in design.piece.markers]
     counts = Counter(marker.id for marker in page.markers)
     others = [marker for marker in page.markers if counts[marker.id] == 1 and marker not in piece_markers]
     design_page = replace(page, markers=(*piece_markers, *others))
-    return design.manifest(design_page, template, page.cuts_mm[index]).changed(page_code=code)
+    return design.manifest(design_page, template, cut_mm)

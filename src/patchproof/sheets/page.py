@@ -16,17 +16,10 @@ from patchproof.sheets.chart import chart_swatches
 from patchproof.sheets.content import SheetContent
 from patchproof.sheets.layout import Box, PageLayout, PageParts, check_layout, quiet_zone_rect, ruler_parts, text_box
 from patchproof.sheets.markers import MARKER_MODULES
-from patchproof.sheets.piece import (
-    Piece,
-    black_runs,
-    marker_ids,
-    marker_rect,
-    move_marker,
-    square_marker,
-)
+from patchproof.sheets.piece import Piece, black_runs, marker_ids, marker_rect, move_marker, square_marker
 from patchproof.sheets.piece_words import piece_words
 from patchproof.sheets.rects import PointMm, RectMm, grow_rect, round_rect, shift_rect, size_text
-from patchproof.sheets.template import BoardTemplate, Template, TextLine, template_names
+from patchproof.sheets.template import AnyTemplate, Template, TextLine, template_names
 
 CUT_LINE_MM = 0.2  # drawn outside the cut, so that no ink of it stays on the piece
 PIECE_GAP_MM = 4.0  # of white paper between pieces, for scissors
@@ -91,9 +84,7 @@ def lay_out_parts(
     return add_template_parts(template, page, qr_text, words)
 
 
-def add_template_parts(
-    template: Template | BoardTemplate, page: PageLayout, qr_text: str, words: dict[str, str]
-) -> PageLayout:
+def add_template_parts(template: AnyTemplate, page: PageLayout, qr_text: str, words: dict[str, str]) -> PageLayout:
     """Add the template's QR code, rulers and texts to a page, and check the whole layout."""
     (x, y), side = template.qr.corner_mm, template.qr.size_mm
     qr = qr_rects_mm(qr_text, (x, y), side)
@@ -137,11 +128,9 @@ def place_pieces(template: Template, pieces: Sequence[Piece]) -> list[tuple[Piec
     heights = [max(piece.size_mm[1] for piece in row) for row in rows]
     total = sum(heights) + PIECE_GAP_MM * (len(rows) - 1)
     if total > h - 2 * CUT_LINE_MM + 1e-6:
-        raise Refused(
-            f"pieces that fit on one page, in rows with a total height of at most {h:g} mm",
-            f"{len(pieces)} pieces with a total height of {total:.0f} mm",
-            "choose a larger template or put fewer designs on a page",
-        )
+        expected = f"pieces that fit on one page, in rows with a total height of at most {h:g} mm"
+        got = f"{len(pieces)} pieces with a total height of {total:.0f} mm"
+        raise Refused(expected, got, "choose a larger template or put fewer designs on a page")
     corners, top = [], y + (h - total) / 2
     for row, height in zip(rows, heights, strict=True):
         left = x + (w - sum(piece.size_mm[0] for piece in row) - PIECE_GAP_MM * (len(row) - 1)) / 2

@@ -97,9 +97,8 @@ def attached_manifest(pdf_path: str | Path, sheet_id: str | None = None) -> Mani
         raise Refused(f"a PDF with {ATTACHMENT} attached", got, "make the sheet again") from error
     if not texts:
         raise Refused(f"a PDF with {ATTACHMENT} attached", f"{pdf_path} without one", "make the sheet again")
-    manifests = [
-        validate_model(Manifest, data, f"{name} of {pdf_path}") for name, data in zip(names, texts, strict=True)
-    ]
+    attached = zip(names, texts, strict=True)
+    manifests = [validate_model(Manifest, data, f"{name} of {pdf_path}") for name, data in attached]
     return next((manifest for manifest in manifests if manifest.sheet_id == sheet_id), manifests[0])
 
 
@@ -183,9 +182,8 @@ def _render(page, rect_points: tuple[float, ...], size_px: tuple[int, int]) -> n
     width, height = size_px
     pixels = np.full((height, width, 3), 255, np.uint8)
     bitmap = pdfium.FPDFBitmap_CreateEx(width, height, pdfium.FPDFBitmap_BGR, pixels.ctypes.data, 3 * width)
-    pdfium.FPDF_RenderPageBitmap(
-        bitmap, page, 0, 0, width, height, 0, pdfium.FPDF_ANNOT | pdfium.FPDF_REVERSE_BYTE_ORDER
-    )
+    flags = pdfium.FPDF_ANNOT | pdfium.FPDF_REVERSE_BYTE_ORDER
+    pdfium.FPDF_RenderPageBitmap(bitmap, page, 0, 0, width, height, 0, flags)
     pdfium.FPDFBitmap_Destroy(bitmap)
     return pixels
 

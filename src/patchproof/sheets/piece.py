@@ -49,9 +49,7 @@ class PieceMarker:
 
 @dataclass(frozen=True)
 class Piece:
-    """The geometry of a piece; `size_mm` is that of the cut line. The four corner markers come first, clockwise from
-    the top-left.
-    """
+    """A piece's geometry; `size_mm` is the cut line's. The corner markers come first, clockwise from the top-left."""
 
     size_mm: tuple[float, float]
     markers: tuple[PieceMarker, ...]
@@ -101,11 +99,8 @@ def marker_size_mm(needed_mm: float, piece_mm: tuple[float, float]) -> float:
     """
     wanted, min_side = max(needed_mm, SMALLEST_MARKER_MM), _corner_mm(SMALLEST_MARKER_MM) / MAX_CORNER_SHARE
     if min(piece_mm) < min_side:
-        raise Refused(
-            f"a piece of at least {math.ceil(min_side)} mm, which has room for {SMALLEST_MARKER_MM:g} mm markers",
-            f"{piece_mm[0]:g} × {piece_mm[1]:g} mm",
-            "make the patch larger",
-        )
+        expected = f"a piece of at least {math.ceil(min_side)} mm, which has room for {SMALLEST_MARKER_MM:g} mm markers"
+        raise Refused(expected, f"{piece_mm[0]:g} × {piece_mm[1]:g} mm", "make the patch larger")
     largest = (MAX_CORNER_SHARE * min(piece_mm) - SCISSORS_MM) * MARKER_MODULES / (MARKER_MODULES + 2)
     return wanted if largest >= wanted else math.floor(largest * 10 + 1e-6) / 10
 

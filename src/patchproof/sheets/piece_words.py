@@ -26,16 +26,13 @@ def piece_words(content: SheetContent, corner: PointMm, holder: str = "piece") -
     """
     top_left, top_right, _, bottom_left = content.piece.reserved_mm[:4]
     lines, texts, boxes = [], [], []
-    for rect, text, arrow in (
-        (top_left, "TOP", True),
-        (top_right, content.sheet_id, False),
-        (bottom_left, content.name.upper(), False),
-    ):
-        text = _shorten(text, rect[2] - 2 * _INSET_MM - (_ARROW_MM if arrow else 0))
+    for rect, text in ((top_left, "TOP"), (top_right, content.sheet_id), (bottom_left, content.name.upper())):
+        arrow_mm = _ARROW_MM if rect is top_left else 0
+        text = _shorten(text, rect[2] - 2 * _INSET_MM - arrow_mm)
         left, top = corner[0] + rect[0] + _INSET_MM, corner[1] + _text_top(rect)
-        if arrow:
+        if arrow_mm:
             lines += _arrow(left, top)
-        start, width = left + (_ARROW_MM if arrow else 0), text_width_mm(text, SIZE_MM, True)
+        start, width = left + arrow_mm, text_width_mm(text, SIZE_MM, True)
         texts.append(TextLine(at_mm=(start, top + _CAPS_MM), size_mm=SIZE_MM, text=text, bold=True, gray=0.2))
         boxes.append(Box(f'words "{text}" of {holder}', (left, top, start + width - left, _CAPS_MM), holder))
     return PageParts(tuple(lines), tuple(texts), tuple(boxes))

@@ -73,12 +73,8 @@ def lay_out_plan(plan: PlanPage, template: Template, sheet_id: str) -> PdfPage:
                 top += TEXT_MM * LEADING
             top += 0.9
         top += 2.0
-    layout = PageLayout(
-        page_mm=template.page_mm,
-        ticks=tuple(lines),
-        texts=(*texts, *labels),
-        boxes=(*boxes, *(text_box(line) for line in texts)),
-    )
+    all_boxes = (*boxes, *map(text_box, texts))
+    layout = PageLayout(template.page_mm, ticks=tuple(lines), texts=(*texts, *labels), boxes=all_boxes)
     check_layout(layout.boxes, template.page_mm, margin)
     return PdfPage(layout, pictures)
 
@@ -113,9 +109,8 @@ def _drawing(placement: PlacementPicture, area: RectMm):
     labels = []
     for point, name in placement.names_mm:
         cx, cy = to_page(point)
-        labels.append(
-            TextLine(at_mm=(cx - text_width_mm(name, 2.8, True) / 2, cy + 1.0), size_mm=2.8, text=name, bold=True)
-        )
+        left_end = cx - text_width_mm(name, 2.8, True) / 2
+        labels.append(TextLine(at_mm=(left_end, cy + 1.0), size_mm=2.8, text=name, bold=True))
     rect = (*corner, scale * wide, scale * high)
     across, down = placement.dimension_chains or _edge_chains(placement)
     for more_lines, more_labels in (_chain_above(across, to_page, rect), _chain_beside(down, to_page, rect)):
@@ -161,10 +156,8 @@ def _chain_beside(spans: tuple[DimensionSpan, ...], to_page, rect: RectMm) -> tu
     lines, labels, free = [], [], rect[1]
     for span in spans:
         start, end = (to_page((0, y))[1] for y in span.ends_mm)
-        lines += [
-            Line((column, start, column, end), 0.2),
-            *(Line((column - 1, s, column + 1, s), 0.2) for s in (start, end)),
-        ]
+        lines.append(Line((column, start, column, end), 0.2))
+        lines += [Line((column - 1, s, column + 1, s), 0.2) for s in (start, end)]
         text, middle = f"{span.length_mm:.0f} mm", max((start + end) / 2 - 1.2, free)
         labels.append(TextLine(at_mm=(column + 2, middle + 2.3 * CAP_HEIGHT), size_mm=2.3, text=text))
         low = middle + 2.6 + 2.3 * CAP_HEIGHT

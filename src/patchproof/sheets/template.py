@@ -13,18 +13,10 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
+from patchproof.base import validation
 from patchproof.base.errors import Refused
 from patchproof.base.packaged import packaged_path
-from patchproof.base.validation import (
-    Finite,
-    NotNegative,
-    Positive,
-    Share,
-    StrictModel,
-    read_toml,
-    spelling_hint,
-    validate_model,
-)
+from patchproof.base.validation import Finite, NotNegative, Positive, Share, StrictModel
 
 PagePoint = tuple[Finite, Finite]
 PageRect = tuple[Finite, Finite, Positive, Positive]
@@ -132,10 +124,13 @@ class BoardTemplate(StrictModel):
     text: tuple[TextLine, ...] = ()  # placeholders: {sheet_id}, {columns}, {rows}, {square}, {marker}, {dictionary}
 
 
+AnyTemplate = Template | BoardTemplate
+
+
 def load_template(name_or_file: str | Path) -> Template:
     """Load a shipped template by name, or a TOML file; an unknown name is refused with the nearest one."""
     path, data = template_data(name_or_file)
-    template = validate_model(Template, data, str(path))
+    template = validation.validate_model(Template, data, str(path))
     swatches = template.chart.columns * template.chart.rows
     if swatches < 48:
         raise Refused(f"at least 48 swatches in the chart of {path}", f"{swatches}", "add columns or rows")
@@ -148,9 +143,10 @@ def template_data(name_or_file: str | Path) -> tuple[Path, dict[str, Any]]:
     if path.suffix != ".toml":
         names = template_names()
         if str(path) not in names:
-            raise Refused("a print template's name or a .toml file", f'"{path}"', spelling_hint(str(path), names))
+            do = validation.spelling_hint(str(path), names)
+            raise Refused("a print template's name or a .toml file", f'"{path}"', do)
         path = packaged_path("print_templates", f"{path}.toml")
-    return path, read_toml(path)
+    return path, validation.read_toml(path)
 
 
 def template_summaries() -> list[str]:
@@ -165,4 +161,4 @@ def template_summaries() -> list[str]:
 def template_names(table: str | None = None) -> list[str]:
     """The names of the shipped templates, with `table` only of those that have this table."""
     paths = packaged_path("print_templates").glob("*.toml")
-    return sorted(path.stem for path in paths if table is None or table in read_toml(path))
+    return sorted(path.stem for path in paths if table is None or table in validation.read_toml(path))

@@ -13,36 +13,19 @@ edges, and `tiles` maps them to every other page.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 from patchproof.base.errors import Refused
+from patchproof.sheets import layout
 from patchproof.sheets.content import SheetContent
-from patchproof.sheets.layout import (
-    Box,
-    Line,
-    PageLayout,
-    PageParts,
-    PieceWindow,
-    check_layout,
-    quiet_zone_rect,
-    text_box,
-    text_width_mm,
-)
-from patchproof.sheets.manifest import Manifest, Tile
+from patchproof.sheets.layout import Box, Line, PageLayout, PageParts, PieceWindow
+from patchproof.sheets.manifest import Manifest, Marker, Tile
 from patchproof.sheets.markers import MARKER_MODULES
 from patchproof.sheets.page import CUT_LINE_MM, MAX_TILES, lay_out_parts, piece_zone_mm, place_pieces
 from patchproof.sheets.pdf import PdfPage
-from patchproof.sheets.piece import (
-    Piece,
-    PieceMarker,
-    manifest_marker,
-    marker_ids,
-    marker_rect,
-    move_marker,
-    square_marker,
-)
+from patchproof.sheets.piece import Piece, manifest_marker, marker_ids, marker_rect, move_marker, square_marker
 from patchproof.sheets.piece_words import piece_words
 from patchproof.sheets.rects import PointMm, RectMm, grow_rect, rect_contains, rects_overlap, shift_rect, size_text
 from patchproof.sheets.template import Template, TextLine, TileGrid, template_names
@@ -86,11 +69,9 @@ def plan_tiles(template: Template, piece: Piece) -> list[TilePlan]:
     xs, ys = (_seams(piece, axis, max_mm) for axis, max_mm in enumerate(grid.zone_mm[2:]))
     columns, rows = len(xs) - 1, len(ys) - 1
     if columns * rows > MAX_TILES:
-        raise Refused(
-            f"a piece of at most {MAX_TILES} tiles, limited by the number of marker ids",
-            f"{size_text(piece.size_mm)} mm on {columns} × {rows} = {columns * rows} tiles",
-            f"make the patch smaller or {_larger_tiles()}",
-        )
+        expected = f"a piece of at most {MAX_TILES} tiles, limited by the number of marker ids"
+        got = f"{size_text(piece.size_mm)} mm on {columns} × {rows} = {columns * rows} tiles"
+        raise Refused(expected, got, f"make the patch smaller or {_larger_tiles()}")
     names = [[f"{chr(ord('A') + row)}{column + 1}" for column in range(columns)] for row in range(rows)]
     return [
         TilePlan(
@@ -114,18 +95,15 @@ def tile_pages(template: Template, grid: TileGrid, content: SheetContent) -> tup
     tile_map, map_rect = _tile_map(piece, tiles, piece_zone_mm(template))
     words = content.words | {"tiles": str(len(tiles))}
     first = lay_out_parts(template, [], ids[page_ids:tile_ids], content.code, words, [tile_map])
-    starts = range(tile_ids, len(ids), MARKERS_PER_TILE)
-    layouts = [
-        _lay_out_tile(template, grid, content, tile, ids[start : start + MARKERS_PER_TILE])
-        for tile, start in zip(tiles, starts, strict=True)
-    ]
+    tiles_ids = (ids[start : start + MARKERS_PER_TILE] for start in range(tile_ids, len(ids), MARKERS_PER_TILE))
+    layouts = [_tile_page(template, grid, content, *pair) for pair in zip(tiles, tiles_ids, strict=True)]
     # the map is pale, so that names can be read on it and nobody cuts it out
     pages = [PdfPage(first, tuple((rect, 255 - (255 - design) // 3) for rect, design in content.pictures(map_rect)))]
     markers, entries, piece_rect = [], [], (0.0, 0.0, *piece.size_mm)
     for number, (tile, page) in enumerate(zip(tiles, layouts, strict=True), FIRST_TILE_PAGE):
         dx, dy = tile.page_from_piece_mm
         pages.append(PdfPage(page, window_pictures=content.pictures(shift_rect(piece_rect, (dx, dy)))))
-        markers += [manifest_marker(marker, number) for marker in _markers_on(tile, piece)]
+        markers += _markers_on(tile, piece, number)
         shift = (1.0, 0.0, round(dx, 6)), (0.0, 1.0, round(dy, 6))
         entries.append(Tile(page=number, page_from_design_mm=shift, cut_mm=tile.page_rect_mm))
     for number, page in enumerate((first, *layouts), FIRST_TILE_PAGE - 1):
@@ -143,17 +121,15 @@ def refuse_larger_than_page(template: Template, piece: Piece) -> None:
     marker_ids("", "design", len(piece.markers) + others)
 
 
-def _lay_out_tile(
-    template: Template, grid: TileGrid, content: SheetContent, tile: TilePlan, ids: Sequence[int]
-) -> PageLayout:
+def _tile_page(template: Template, grid: TileGrid, content: SheetContent, tile: TilePlan, ids: list[int]) -> PageLayout:
     """Lay out and check one tile's page; its own markers are the layout's, the piece's markers lie in the window."""
     shift, part, page_mm, margin_mm = tile.page_from_piece_mm, tile.page_rect_mm, template.page_mm, template.margin_mm
     window, cut = tile.rect_with_flaps(BLEED_MM), tile.rect_with_flaps(grid.overlap_mm)
     side, corners = grid.marker_mm, _marker_corners(grid, part)
     tile_markers = [square_marker(i, corner, side) for i, corner in zip(ids, corners, strict=True)]
-    quiet = [quiet_zone_rect(marker_rect(m), side / MARKER_MODULES, page_mm, margin_mm) for m in tile_markers]
+    quiet = [layout.quiet_zone_rect(marker_rect(m), side / MARKER_MODULES, page_mm, margin_mm) for m in tile_markers]
     texts, labels = _tile_texts(template, grid, tile, content.sheet_id), _within(window, piece_words(content, shift))
-    boxes = [Box(f"tile marker {i}", rect) for i, rect in enumerate(quiet, 1)] + [text_box(line) for line in texts]
+    boxes = [*(Box(f"tile marker {i}", rect) for i, rect in enumerate(quiet, 1)), *map(layout.text_box, texts)]
     piece_markers = [move_marker(marker, shift) for marker in content.piece.markers]
     window_markers = (m for m in piece_markers if rects_overlap(grow_rect(window, 1e-6), marker_rect(m)))
     boxes = (
@@ -161,7 +137,7 @@ def _lay_out_tile(
         Box("its picture", window, "tile"),
         *(Box(box.name, box.rect_mm, "tile" if rects_overlap(cut, box.rect_mm) else None) for box in boxes),
     )
-    check_layout(boxes, page_mm, margin_mm)
+    layout.check_layout(boxes, page_mm, margin_mm)
     return PageLayout(
         page_mm=page_mm,
         cuts_mm=(cut,),
@@ -197,20 +173,19 @@ def _tile_map(piece: Piece, tiles: Sequence[TilePlan], zone_mm: RectMm) -> tuple
         lines += [Line((left, top, right, top), 0.25), Line((left, top, left, bottom), 0.25)]
         lines += [Line((right, top, right, bottom), 0.25), Line((left, bottom, right, bottom), 0.25)]
         size = min(6.0, height / 3, width / 3)
-        corner = (left + (width - text_width_mm(tile.name, size, True)) / 2, top + height / 2 + size / 3)
+        corner = (left + (width - layout.text_width_mm(tile.name, size, True)) / 2, top + height / 2 + size / 3)
         texts.append(TextLine(at_mm=corner, size_mm=size, text=tile.name, bold=True))
     map_rect = to_map((0, 0, *piece.size_mm))
     return PageParts(tuple(lines), tuple(texts), (Box("plan of the tiles", map_rect),)), map_rect
 
 
-def _markers_on(tile: TilePlan, piece: Piece) -> list[PieceMarker]:
-    """The piece's markers whose middle lies on the tile, in page millimeters."""
-    (x, y, w, h), markers = tile.page_rect_mm, []
+def _markers_on(tile: TilePlan, piece: Piece, page: int) -> Iterator[Marker]:
+    """The piece's markers whose middle lies on the tile, as entries of its page in the manifest."""
+    x, y, w, h = tile.page_rect_mm
     for marker in (move_marker(m, tile.page_from_piece_mm) for m in piece.markers):
         left, top, wide, high = marker_rect(marker)
         if x <= left + wide / 2 < x + w and y <= top + high / 2 < y + h:
-            markers.append(marker)
-    return markers
+            yield manifest_marker(marker, page)
 
 
 def _seams(piece: Piece, axis: int, max_mm: float) -> list[float]:
@@ -225,11 +200,8 @@ def _seams(piece: Piece, axis: int, max_mm: float) -> list[float]:
         seams = [0.0, *(_nearest_free(length * i / count, blocked) for i in range(1, count)), length]
         if all(0 < b - a <= max_mm + 1e-6 for a, b in pairwise(seams)):
             return seams
-    raise Refused(
-        "a piece that can be divided into tiles without cutting a marker",
-        f"markers of {piece.marker_mm:.0f} mm on tiles of {max_mm:.0f} mm",
-        _larger_tiles(),
-    )
+    got = f"markers of {piece.marker_mm:.0f} mm on tiles of {max_mm:.0f} mm"
+    raise Refused("a piece that can be divided into tiles without cutting a marker", got, _larger_tiles())
 
 
 def _larger_tiles() -> str:
@@ -248,14 +220,9 @@ def _marker_corners(grid: TileGrid, part: RectMm) -> list[PointMm]:
     size, (x, y, w, h) = grid.marker_mm, part
     module = size / MARKER_MODULES
     distance = BLEED_MM + module  # from the part's edge: the picture's bleed and a quiet zone
-    left = x - CUT_LINE_MM - module - size
-    return [
-        (left, y),
-        (left, y + h - size),
-        (x + w + distance, y + module),
-        (x + w + distance, y + h - size - module),
-        (x + w - size - module, y + h + distance),
-    ]
+    left, right, low = x - CUT_LINE_MM - module - size, x + w + distance, y + h - size
+    below = x + w - size - module, y + h + distance
+    return [(left, y), (left, low), (right, y + module), (right, low - module), below]
 
 
 def _tile_texts(template: Template, grid: TileGrid, tile: TilePlan, sheet_id: str) -> list[TextLine]:
@@ -272,7 +239,7 @@ def _tile_texts(template: Template, grid: TileGrid, tile: TilePlan, sheet_id: st
     if tile.right:
         middle = x + w + grid.overlap_mm / 2 + BLEED_MM / 2
         for i, word in enumerate(("glue", tile.right, "here")):
-            start = (middle - text_width_mm(word, 2.2, False) / 2, y + h / 2 + 3.2 * (i - 1))
+            start = (middle - layout.text_width_mm(word, 2.2, False) / 2, y + h / 2 + 3.2 * (i - 1))
             lines.append(TextLine(at_mm=start, size_mm=2.2, text=word, gray=0.35))
     if tile.below:
         start = (x + 4.0, y + h + grid.overlap_mm / 2 + 1.2)

@@ -13,7 +13,6 @@ from pathlib import Path
 
 from patchproof.base.errors import Refused
 from patchproof.base.output import write_files_atomically
-from patchproof.base.validation import StrictModel
 from patchproof.sheets.content import SheetContent, page_manifest
 from patchproof.sheets.layout import PageLayout
 from patchproof.sheets.manifest import Manifest, dump_manifest
@@ -22,7 +21,7 @@ from patchproof.sheets.pdf import ATTACHMENT, PdfPage, numbered_name, pages_pdf
 from patchproof.sheets.piece import page_id
 from patchproof.sheets.plan_page import PlanPage, lay_out_plan
 from patchproof.sheets.rects import RectMm
-from patchproof.sheets.template import BoardTemplate, Template
+from patchproof.sheets.template import AnyTemplate, Template
 from patchproof.sheets.tiles import tile_pages
 
 
@@ -48,18 +47,11 @@ def write_sheet(
     return manifest
 
 
-def write_page(
-    pdf_path: str | Path,
-    page: PageLayout,
-    template: Template | BoardTemplate,
-    cut_mm: RectMm,
-    kind: str,
-    grid: StrictModel,
-) -> Manifest:
-    """Write a page without a piece, and its manifest beside it; `grid` becomes the manifest's setting `kind`."""
+def write_page(pdf_path: str | Path, page: PageLayout, template: AnyTemplate, cut_mm: RectMm, kind: str) -> Manifest:
+    """Write a page without a piece, and its manifest beside it, whose only setting is the template's table `kind`."""
     pdf_path = check_pdf_path(pdf_path)
-    settings = {kind: grid.model_dump(mode="json")}
-    manifest = page_manifest(page, template, cut_mm, page_id(template), kind, settings)
+    settings = {kind: getattr(template, kind).model_dump(mode="json")}
+    manifest = page_manifest(page, template, cut_mm, sheet_id=page_id(template), kind=kind, settings=settings)
     save_sheets(pdf_path, [PdfPage(page)], {pdf_path.with_suffix(".json"): manifest})
     return manifest
 
