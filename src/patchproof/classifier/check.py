@@ -30,9 +30,8 @@ def check_network(classifier: Classifier, device: torch.device | str = "cpu") ->
     name = f"the network {classifier.name}"
     try:
         with torch.no_grad():
-            logits, again, alone, swapped = (
-                classifier.square_logits(batch) for batch in (photos, photos.clone(), photos[1:2], photos.flip(1))
-            )
+            batches = (photos, photos.clone(), photos[1:2], photos.flip(1))
+            logits, again, alone, swapped = map(classifier.square_logits, batches)
     except Refused:
         raise
     except Exception as error:  # the network is the user's program and may raise anything
