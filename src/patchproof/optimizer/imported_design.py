@@ -123,13 +123,14 @@ def import_folder(
     """
     scene, out, total = _load_piece_scene(scene, seed), Path(out), promise.views or PROMISE_VIEWS
     runs = {path: out / printable_name(path.stem) for path in list_photos(folder)}
-    if len(set(runs.values())) < len(runs):
-        raise Refused(
-            "pictures whose names differ in more than their kind",
-            f"{len(runs)} pictures with {len(set(runs.values()))} names in {folder}",
-            "rename them",
-        )
+    if (names := len(set(runs.values()))) < len(runs):
+        got = f"{len(runs)} pictures with {names} names in {folder}"
+        raise Refused("pictures whose names differ in more than their kind", got, "rename them")
     runs_by_path: dict[Path, Run] = {}
+
+    def advance(stage: str, done: int, _: int) -> None:
+        progress(stage, len(runs_by_path) * total + done, len(runs) * total)
+
     for path, run_folder in runs.items():
         _, sha256, pixels = _read_picture(path)
         fit_to_piece(pixels, scene)
@@ -140,15 +141,8 @@ def import_folder(
             check_folder(run_folder, RUN_FILE_PATTERNS, overwrite)
     for path, run_folder in runs.items():
         if path not in runs_by_path:
-            before = len(runs_by_path) * total
             runs_by_path[path] = import_patch(
-                path,
-                scene,
-                run_folder,
-                promise=promise,
-                compute=compute,
-                overwrite=overwrite,
-                progress=lambda stage, done, _, before=before: progress(stage, before + done, len(runs) * total),
+                path, scene, run_folder, promise=promise, compute=compute, overwrite=overwrite, progress=advance
             )
     return [runs_by_path[path] for path in runs]
 
