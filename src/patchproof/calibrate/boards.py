@@ -47,10 +47,7 @@ class BoardView:
 
 
 def find_boards(
-    photos: str | Path,
-    board: Board,
-    ruler_mm: tuple[float, float] | None = None,
-    advance: Advance = no_advance,
+    photos: str | Path, board: Board, ruler_mm: tuple[float, float] | None = None, advance: Advance = no_advance
 ) -> tuple[list[BoardView], dict[str, str], str]:
     """Read a folder's photographs: (views, reasons by the names of photographs left out, the camera's name).
 

@@ -78,9 +78,8 @@ def calibrate_camera(
     views, left_out, camera = find_boards(photos, template, ruler_mm, partial(progress, "find corners"))
     result = fit_camera(views, left_out, template, out.stem, camera, partial(progress, "lens models"))
     residuals = _residual_picture(result.views, result.rungs, result.fit)
-    write_files_atomically(
-        {figures: _text(_fit_figures(result)), picture: residuals, out: _text(result.camera.model_dump())}
-    )
+    files = {figures: _text(_fit_figures(result)), picture: residuals, out: _text(result.camera.model_dump())}
+    write_files_atomically(files)
     return result
 
 
@@ -110,27 +109,18 @@ def _fit_figures(result: CameraCalibration) -> dict:
     """All figures as plain data; lengths in px of `image_px`, null where a rung found no fit."""
     fit = result.fit
     figure = lambda value: round(value, 5) if np.isfinite(value) else None  # noqa: E731
+    tilts = [round(float(tilt), 2) for tilt in fit.tilts_deg]
     photos: list[dict[str, Any]] = [
-        {
-            "file": view.file,
-            "status": "used",
-            "corners": len(view.ids),
-            "rms_px": figure(rms),
-            "tilt_deg": round(float(tilt), 2),
-        }
-        for view, rms, tilt in zip(result.views, fit.photo_rms_px, fit.tilts_deg, strict=True)
+        {"file": view.file, "status": "used", "corners": len(view.ids), "rms_px": figure(rms), "tilt_deg": tilt}
+        for view, rms, tilt in zip(result.views, fit.photo_rms_px, tilts, strict=True)
     ]
     photos += [{"file": file, "status": "left out", "reason": reason} for file, reason in result.left_out.items()]
+    names = {"held_out_px": "error", "worse_by_px": "worse_by", "standard_error_px": "standard_error"}
     return {
         "board": result.board.sheet_id,
         "rung": fit.rung,
         "ladder": [
-            {
-                "rung": rung.name,
-                "held_out_px": figure(rung.error),
-                "worse_by_px": figure(rung.worse_by),
-                "standard_error_px": figure(rung.standard_error),
-            }
+            {"rung": rung.name} | {key: figure(getattr(rung, name)) for key, name in names.items()}
             for rung in result.rungs
         ],
         "numbers": {
@@ -167,11 +157,9 @@ def calibration_lines(result: CameraCalibration) -> list[str]:
 def _refuse_too_few(views: Sequence[BoardView], left_out: Mapping[str, str]) -> None:
     if len(views) < MIN_PHOTOS:
         why = f" ({': '.join(next(iter(left_out.items())))})" if left_out else ""
-        raise Refused(
-            f"at least {MIN_PHOTOS} photographs that show {MIN_CORNERS} corners of the board",
-            f"{len(views)} of {len(views) + len(left_out)}{why}",
-            "take 15 or more, sharp, from different sides",
-        )
+        expected = f"at least {MIN_PHOTOS} photographs that show {MIN_CORNERS} corners of the board"
+        got = f"{len(views)} of {len(views) + len(left_out)}{why}"
+        raise Refused(expected, got, "take 15 or more, sharp, from different sides")
 
 
 def _without_odd(views: Sequence[BoardView]) -> tuple[list[BoardView], dict[str, str]]:
@@ -201,18 +189,14 @@ def _refuse_undetermined(fit: LensFit) -> None:
     turns = np.degrees(np.arccos(np.clip(fit.normals @ fit.normals.T, -1, 1))).max()
     share = max(fit.sd[0] / fit.numbers[0], fit.sd[1] / fit.numbers[1])
     if fit.rms_px > _MAX_RMS_PX * max(1.0, float(np.hypot(*fit.numbers[2:4])) / 1000):
-        raise Refused(
-            "photographs of a flat board that a lens model explains",
-            f"residuals of {fit.rms_px:.1f} px rms",
-            "glue the board to something flat, measure both of its rulers and type them in with --ruler-mm",
-        )
+        do = "glue the board to something flat, measure both of its rulers and type them in with --ruler-mm"
+        expected = "photographs of a flat board that a lens model explains"
+        raise Refused(expected, f"residuals of {fit.rms_px:.1f} px rms", do)
     if turns < MIN_TURN_DEG or share > MAX_FOCAL_SHARE:
-        raise Refused(
-            f"boards turned against each other by {MIN_TURN_DEG:g}° and more, and a focal length known to "
-            f"{MAX_FOCAL_SHARE:.0%}",
-            f"{turns:.0f}° and a focal length known to {share:.1%}",
-            "photograph the board from 20 to 45° aside, from all sides",
-        )
+        focal = "a focal length known to"
+        expected = f"boards turned against each other by {MIN_TURN_DEG:g}° and more, and {focal} {MAX_FOCAL_SHARE:.0%}"
+        do = "photograph the board from 20 to 45° aside, from all sides"
+        raise Refused(expected, f"{turns:.0f}° and {focal} {share:.1%}", do)
 
 
 def _is_usable(fit: LensFit, size_px: tuple[int, int]) -> bool:

@@ -26,15 +26,9 @@ from patchproof.base.color import linear_from_srgb, srgb_from_linear
 from patchproof.base.errors import Refused
 from patchproof.base.input import is_file, is_folder
 from patchproof.base.progress import Advance, no_advance
+from patchproof.calibrate import color_ladder
 from patchproof.calibrate.chart_photo import ChartPhoto, chart_rows, read_chart
-from patchproof.calibrate.color_ladder import (
-    WELL_SPREAD_WIDTH,
-    ColorMap,
-    MapChoice,
-    choose_map,
-    color_difference,
-    map_kinds,
-)
+from patchproof.calibrate.color_ladder import ColorMap, MapChoice, choose_map, color_difference, map_kinds
 from patchproof.calibrate.printer_files import printer_from_table, printer_output
 from patchproof.channel.lens import Camera
 from patchproof.channel.printer import Printer, load_printer, node_colors, vary_print
@@ -93,7 +87,7 @@ def calibrate_chart(
         for reading, error in zip(readings, agreement, strict=True)
         if error is not None and error > MAX_PHOTO_DELTA_E00
     ]
-    if choice.width < WELL_SPREAD_WIDTH:
+    if choice.width < color_ladder.WELL_SPREAD_WIDTH:
         warnings.append(
             f"the {choice.colors} readable swatches hardly spread over the color cube ({choice.width:.2f} in their "
             f"thinnest direction, whole charts 0.3): errors are stated for colors like these, others are a guess"

@@ -67,22 +67,18 @@ def read_chart(photo: Photo, manifest: Manifest, camera: Camera | None = None) -
     """Read the chart's swatches; raises `PhotoRejected` where there is none, or none that can be trusted."""
     page = _find_page(photo.srgb, manifest)
     rows = chart_rows(manifest, page.number)
-    cores, readable = [], []
-    for row in rows:
-        core = _core(manifest.chart[row].rect_mm, page, photo.srgb.shape)
-        if core is not None:
-            cores.append(core)
-            readable.append(row)
-    if not readable:
+    found = {row: _core(manifest.chart[row].rect_mm, page, photo.srgb.shape) for row in rows}
+    cores = {row: core for row, core in found.items() if core is not None}
+    if not cores:
         advice = "come closer to the chart, hold still and show all of it"
         raise PhotoRejected("too_small", page.px_per_mm, None, advice)
     patches = _bare_patches(manifest, page, photo.srgb.shape)
-    whites = [core for core, row in zip(cores, readable, strict=True) if min(manifest.chart[row].srgb) == 1]
+    whites = [core for row, core in cores.items() if min(manifest.chart[row].srgb) == 1]
     patches = np.concatenate([patches, np.reshape(whites, (-1, 4))])
     paper_light_at, misfit = _paper(photo.srgb, page, patches, camera)
     light = np.full((len(manifest.chart), 3), np.nan)
-    paper_light = paper_light_at(np.array([[x + w / 2, y + h / 2] for x, y, w, h in cores]))
-    for row, core, paper in zip(readable, cores, paper_light, strict=True):
+    paper_light = paper_light_at(np.array([[x + w / 2, y + h / 2] for x, y, w, h in cores.values()]))
+    for (row, core), paper in zip(cores.items(), paper_light, strict=True):
         codes = _codes(photo.srgb, page, core)
         if (codes >= CLIPPED_CODE).any(-1).mean() <= MAX_CLIPPED_SHARE:
             light[row] = light_of_codes(codes / 255, camera).mean(0) / paper
@@ -171,9 +167,8 @@ def _paper(srgb: np.ndarray, page: _Page, patches: np.ndarray, camera: Camera | 
     codes = _codes(srgb, page, patches.T, 5)
     clipped = float(np.median((codes >= CLIPPED_CODE).any(-1).mean(1)))
     if clipped > MAX_CLIPPED_SHARE:
-        raise PhotoRejected(
-            "clipped", clipped, MAX_CLIPPED_SHARE, "the paper is overexposed: lower the exposure by one step"
-        )
+        advice = "the paper is overexposed: lower the exposure by one step"
+        raise PhotoRejected("clipped", clipped, MAX_CLIPPED_SHARE, advice)
     light = np.log(np.maximum(light_of_codes(codes / 255, camera).mean(1), 1e-4))
     centers = patches[:, :2] + patches[:, 2:] / 2
     middle, reach = centers.mean(0), max(float(np.ptp(centers, 0).max()), 1.0) / 2

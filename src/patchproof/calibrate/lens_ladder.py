@@ -72,14 +72,9 @@ class LensFit:
 
 
 def choose_lens_model(
-    views: Sequence[BoardView],
-    usable: Callable[[LensFit], bool] = lambda fit: True,
-    advance: Advance = no_advance,
+    views: Sequence[BoardView], usable: Callable[[LensFit], bool] = lambda fit: True, advance: Advance = no_advance
 ) -> tuple[tuple[Rung, ...], LensFit]:
-    """All rungs, with errors as the photographs' RMS in px, and the chosen rung's fit to all photographs.
-
-    A rung whose fit is not `usable` is passed over.
-    """
+    """All rungs, with the photographs' RMS in px, and the chosen one's fit to all; a rung not `usable` is left out."""
     folds = [np.arange(len(views)) % min(FOLDS, len(views)) == k for k in range(min(FOLDS, len(views)))]
     errors, fits, start = np.full((len(RUNG_FLAGS), len(views)), np.inf), {}, None
     for number, name in enumerate(RUNG_FLAGS):
@@ -113,9 +108,8 @@ def fit_rung(views: Sequence[BoardView], name: str, start: LensFit | None = None
     numbers = np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *distortion])
     if not (np.isfinite(numbers).all() and np.isfinite(sd).all() and (numbers[:2] > 0).all()):
         return None
-    poses = tuple(
-        (np.asarray(r, float).reshape(3), np.asarray(t, float).reshape(3)) for r, t in zip(rvecs, tvecs, strict=True)
-    )
+    rotations, translations = ([np.asarray(v, float).reshape(3) for v in vectors] for vectors in (rvecs, tvecs))
+    poses = tuple(zip(rotations, translations, strict=True))
     residuals = tuple(_residual(view, numbers, pose) for view, pose in zip(views, poses, strict=True))
     return LensFit(name, numbers, np.where(np.arange(9) < FREE_PARAMETERS[name], sd, 0.0), poses, residuals)
 
@@ -127,9 +121,7 @@ def matrix_and_distortion(numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _held_out(views: Sequence[BoardView], folds: list[np.ndarray], full: LensFit) -> tuple[np.ndarray, np.ndarray]:
-    """RMS px of every view under the fit without its fold, and the numbers' standard deviations (delete-a-group
-    jackknife).
-    """
+    """RMS px of every view in the fit without its fold; the numbers' standard deviations (delete-a-group jackknife)."""
     errors, numbers = np.full(len(views), np.inf), []
     for fold in folds:
         fit = fit_rung([v for v, held in zip(views, fold, strict=True) if not held], full.rung, full)

@@ -64,7 +64,6 @@ def _new_file(out: Path, overwrite: bool) -> Path:
 def _write_files(printer: Printer, out: Path) -> str:
     with TemporaryDirectory() as folder:
         path = save_printer(printer, Path(folder))
-        write_files_atomically(
-            {out.with_suffix(suffix): path.with_suffix(suffix).read_bytes() for suffix in (".npz", ".json")}
-        )
+        files = {out.with_suffix(suffix): path.with_suffix(suffix).read_bytes() for suffix in (".npz", ".json")}
+        write_files_atomically(files)
     return f"written: {out}, {out.with_suffix('.json').name}"

@@ -30,9 +30,8 @@ def check_network(classifier: Classifier, device: torch.device | str = "cpu") ->
     name = f"the network {classifier.name}"
     try:
         with torch.no_grad():
-            logits, repeated, single, swapped = (
-                classifier.square_logits(batch) for batch in (photos, photos.clone(), photos[1:2], photos.flip(1))
-            )
+            batches = (photos, photos.clone(), photos[1:2], photos.flip(1))
+            logits, again, alone, swapped = map(classifier.square_logits, batches)
     except Refused:
         raise
     except Exception as error:  # the network is the user's program and may raise anything
@@ -44,10 +43,10 @@ def check_network(classifier: Classifier, device: torch.device | str = "cpu") ->
         warnings.warn(f"{name} finds nothing in smooth pictures: its gradients were not tested", stacklevel=2)
         return
     spread = float(logits.max() - logits.min())
-    if float((logits - repeated).abs().max()) > MAX_DIFFERENCE * spread:
+    if float((logits - again).abs().max()) > MAX_DIFFERENCE * spread:
         got = f"different logits on a second call from {name}"
         raise Refused("the same logits for the same pictures", got, _EVAL_ADVICE)
-    if float((logits[1:2] - single).abs().max()) > MAX_DIFFERENCE * spread:
+    if float((logits[1:2] - alone).abs().max()) > MAX_DIFFERENCE * spread:
         got = f"different logits in a larger batch from {name}"
         raise Refused("logits that do not depend on the rest of the batch", got, _EVAL_ADVICE)
     if float((logits - logits.mean(0)).abs().max()) <= MIN_VARIATION * spread:

@@ -36,13 +36,9 @@ def load_custom(dotted: str, base: Path) -> Classifier:
 
 def labeled_module(module: object, name: str) -> Classifier:
     """The Classifier of a torch module that has its `input_px` and `labels` as attributes; anything else is refused."""
-    input_px, labels = getattr(module, "input_px", None), getattr(module, "labels", None)
-    if (
-        not isinstance(module, torch.nn.Module)
-        or not isinstance(input_px, int)
-        or not labels
-        or isinstance(labels, str)
-    ):
+    input_px, labels = getattr(module, "input_px", None), getattr(module, "labels", ())
+    has_labels = bool(labels) and not isinstance(labels, str)
+    if not isinstance(module, torch.nn.Module) or not isinstance(input_px, int) or not has_labels:
         do = "give it input_px (an int) and labels (a list of names), or wrap it with classifier_of"
         got = f"an object of type {type(module).__name__}"
         raise Refused(f"a torch.nn.Module with input_px and labels as {name}", got, do)
@@ -115,8 +111,7 @@ class AsCandidates(torch.nn.Module):
         output = self.network(photos)
         if isinstance(output, Tensor):
             return output
-        rows = [self._rows(each["boxes"], each["labels"], each["scores"]) for each in output]
-        return torch.stack(rows)
+        return torch.stack([self._rows(each["boxes"], each["labels"], each["scores"]) for each in output])
 
     def _rows(self, boxes: Tensor, labels: Tensor, scores: Tensor) -> Tensor:
         """`MAX_DETECTIONS`×(4+K) of one picture, the surest first; unused rows have an empty box and no score."""

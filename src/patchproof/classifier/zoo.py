@@ -72,7 +72,7 @@ def load_torchvision(name: str) -> Classifier:
             network = models.get_model(name, weights=None, num_classes=len(labels))
         if hasattr(network, "transform_input"):  # Inception's published weights are for another normalization
             network.transform_input = True
-    return _make_classifier(local, network, view.mean, view.std, side_px, labels, f"torchvision:{name}")
+    return _classifier(local, Normalized(network, view.mean, view.std), side_px, labels, f"torchvision:{name}")
 
 
 # arguments of torchvision's detectors with which they return all candidates, none suppressed
@@ -104,7 +104,7 @@ def load_timm(name: str) -> Classifier:
     view = timm.data.resolve_model_data_config(network)
     card = local and local.card and local.card[:2]
     side_px, labels = card or (int(view["input_size"][-1]), _timm_labels(timm, network, name))
-    return _make_classifier(local, network, view["mean"], view["std"], side_px, labels, f"timm:{name}")
+    return _classifier(local, Normalized(network, view["mean"], view["std"]), side_px, labels, f"timm:{name}")
 
 
 def _timm_labels(timm: Any, network: Any, name: str) -> list[str]:
@@ -161,21 +161,13 @@ def read_weights(path: Path) -> LocalWeights:
 _UNUSED = re.compile(r"(aux\d?|AuxLogits)\..*|.*\.num_batches_tracked")
 
 
-def _make_classifier(
-    local: LocalWeights | None,
-    network: Any,
-    mean: Sequence[float],
-    std: Sequence[float],
-    side_px: int,
-    labels: Any,
-    name: str,
-) -> Classifier:
+def _classifier(local: LocalWeights | None, network: Normalized, side_px: int, labels: Any, name: str) -> Classifier:
     """The network as a Classifier, with the file's weights if there are any."""
-    classifier = classifier_of(Normalized(network, mean, std), side_px, labels, name)
+    classifier = classifier_of(network, side_px, labels, name)
     if local is None:
         return classifier
     do = "check the name, and write the labels of a network with others into NAME.json beside it"
-    load_weights(network, local, f"{name} for {len(labels)} labels", do)
+    load_weights(network.network, local, f"{name} for {len(labels)} labels", do)
     return replace(classifier, sha256=local.sha256)
 
 

@@ -127,9 +127,7 @@ def _stack(parts: list[Tensor]) -> Tensor:
 
 
 def find_cut(network: Callable[[Tensor], Tensor], pictures: Tensor) -> Cut | None:
-    """Find the cut that saves most with typical windows, checked with two pictures 2×3×S×S; None where the check fails
-    or nothing is saved.
-    """
+    """The cut that saves most with typical windows and passes a check with two pictures 2×3×S×S; None without one."""
     if not isinstance(network, torch.nn.Module):
         return None
     program = network if isinstance(network, Program) else trace_module(network)
@@ -197,9 +195,8 @@ def _is_correct(network: Callable[[Tensor], Tensor], cut: Cut, pictures: Tensor)
         _, updated = (cut.answers(photos, Windows(windows, cache)) for photos in (pictures, changed))
         if not _are_close(network(changed), updated, ANSWER_TOLERANCE):
             return False
-    return _are_close(
-        gradients(network), gradients(lambda photos: cut.answers(photos, Windows(windows))), GRADIENT_TOLERANCE
-    )
+    found = gradients(lambda photos: cut.answers(photos, Windows(windows)))
+    return _are_close(gradients(network), found, GRADIENT_TOLERANCE)
 
 
 def _are_close(expected: Tensor, actual: Tensor, share: float) -> bool:

@@ -34,9 +34,7 @@ def aten_calls(name: str, inputs: Sequence[Any], attributes: dict[str, Any], of_
     return []
 
 
-def _conv(
-    w, b=None, *, auto_pad="NOTSET", dilations=None, group=1, kernel_shape=None, pads=None, strides=None
-) -> AtenCalls:
+def _conv(w, b=None, *, auto_pad="NOTSET", dilations=None, group=1, pads=None, strides=None, **_: Any) -> AtenCalls:
     if auto_pad != "NOTSET" or (pads is not None and len(pads) != 4):
         return []
     top, left, bottom, right = pads or [0] * 4

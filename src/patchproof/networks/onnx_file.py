@@ -19,15 +19,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from patchproof.networks.bounds import (
-    MAX_BATCH,
-    MAX_DIMENSIONS,
-    MAX_LIST,
-    MAX_NUMBERS,
-    UnsupportedNetwork,
-    checked_integer,
-    quote,
-)
+from patchproof.networks import bounds
+from patchproof.networks.bounds import UnsupportedNetwork, checked_integer, quote
 from patchproof.networks.graph import Program
 from patchproof.networks.onnx_aten import AtenCalls, aten_calls
 from patchproof.networks.onnx_operators import DTYPES, OPERATORS
@@ -111,10 +104,10 @@ class _Weights:
 
     def tensor(self, content: dict[str, Any]) -> Tensor:
         """Return the described tensor in memory of its own."""
-        sizes = [checked_integer(size, 0, MAX_NUMBERS) for size in content.get("dims", [])]
-        dtype = DTYPES.get(content.get("data_type", 0))
-        if dtype is None or len(sizes) > MAX_DIMENSIONS:
-            raise UnsupportedNetwork(f"{quote(content.get('name'))} of a type that is not supported")
+        sizes = [checked_integer(size, 0, bounds.MAX_NUMBERS) for size in content.get("dims", [])]
+        dtype, name = DTYPES.get(content.get("data_type", 0)), quote(content.get("name"))
+        if dtype is None or len(sizes) > bounds.MAX_DIMENSIONS:
+            raise UnsupportedNetwork(f"{name} of a type that is not supported")
         if "ints" in content or "longs" in content:
             values = torch.tensor(content.get("ints") or content["longs"], dtype=torch.int64).to(dtype)
             if dtype.is_floating_point:
@@ -122,9 +115,7 @@ class _Weights:
         else:
             values = _from_bytes(self._bytes(content), dtype)
         if values.numel() != math.prod(sizes):
-            raise UnsupportedNetwork(
-                f"{values.numel()} numbers in {quote(content.get('name'))} of the shape {quote(sizes)}"
-            )
+            raise UnsupportedNetwork(f"{values.numel()} numbers in {name} of the shape {quote(sizes)}")
         return values.reshape(sizes)
 
     def _bytes(self, content: dict[str, Any]) -> Any:
@@ -255,8 +246,8 @@ class _GraphReader:
         ((kind, content),) = contents.items()
         if kind == "t":
             return self.tensor(content)
-        if isinstance(content, list) and len(content) > MAX_LIST:
-            raise UnsupportedNetwork(f"a list of more than {MAX_LIST} items")
+        if isinstance(content, list) and len(content) > bounds.MAX_LIST:
+            raise UnsupportedNetwork(f"a list of more than {bounds.MAX_LIST} items")
         return content
 
 
@@ -268,5 +259,5 @@ def _shape(tensor: dict[str, Any]) -> tuple[int | None, list[int | None]]:
     if len(sizes) != 4:
         raise UnsupportedNetwork(f"an input of {len(sizes)} dimensions, not N×3×S×S")
     fixed = [None if size is None else checked_integer(size, 1, 1 << 16) for size in sizes]
-    batch = None if fixed[0] is None else checked_integer(fixed[0], 1, MAX_BATCH)
+    batch = None if fixed[0] is None else checked_integer(fixed[0], 1, bounds.MAX_BATCH)
     return batch, [None, *fixed[1:]]

@@ -28,18 +28,8 @@ from patchproof.networks.bounds import UnsupportedNetwork
 from patchproof.networks.onnx_shapes import MAX_SIZES, numbers
 
 # the numbers of TensorProto.DataType
-DTYPES = {
-    1: torch.float32,
-    2: torch.uint8,
-    3: torch.int8,
-    5: torch.int16,
-    6: torch.int32,
-    7: torch.int64,
-    9: torch.bool,
-    10: torch.float16,
-    11: torch.float64,
-    16: torch.bfloat16,
-}
+_INTEGERS = {2: torch.uint8, 3: torch.int8, 5: torch.int16, 6: torch.int32, 7: torch.int64}
+DTYPES = _INTEGERS | {1: torch.float32, 9: torch.bool, 10: torch.float16, 11: torch.float64, 16: torch.bfloat16}
 _ON_SIZES = frozenset(
     "Abs Add And Cast Ceil Concat ConstantOfShape Div Equal Expand Floor Gather Greater GreaterOrEqual Less Mod Mul "
     "LessOrEqual Neg Not Or Pow Range Reciprocal ReduceProd Reshape ScatterND Slice Split Sqrt Squeeze Sub Transpose "
@@ -80,9 +70,7 @@ class Operator:
 # --- windows and products ---
 
 
-def _pad_unevenly(
-    x: Tensor, pads: Sequence[int] | None, limits: Sequence[float], fill: float
-) -> tuple[Tensor, list[int]]:
+def _pad_unevenly(x: Tensor, pads: list[int] | None, limits: Sequence[float], fill: float) -> tuple[Tensor, list[int]]:
     """The input and the padding left for torch, which pads both ends alike and pools by half a window at most."""
     n = x.dim() - 2
     before, after = list(pads or [0] * n)[:n], list(pads or [0] * n)[-n:]
@@ -195,15 +183,13 @@ _TABLE: dict[str, Callable[..., Any]] = {
     "LogSoftmax": lambda x, /, *, axis=-1: x.log_softmax(axis),
     "Cast": lambda x, /, *, to, saturate=1: x.to(DTYPES[to]),
     # of two or more
-    **{name: _binary(getattr(torch, name.lower())) for name in ("Add", "Sub", "Mul", "MatMul")},
+    **{name: _binary(getattr(torch, name.lower())) for name in ("Add", "Sub", "Mul", "MatMul", "Greater", "Less")},
     "Div": _binary(lambda a, b: a / b if a.is_floating_point() else torch.div(a, b, rounding_mode="trunc")),
     "Mod": lambda a, b, /, *, fmod=0: torch.fmod(a, b) if fmod else torch.remainder(a, b),
     "Pow": _binary(lambda x, y: torch.pow(x, y).to(x.dtype)),
     "PRelu": _binary(lambda x, slope: torch.where(x < 0, slope * x, x)),
     "Equal": _binary(torch.eq),
-    "Greater": _binary(torch.gt),
     "GreaterOrEqual": _binary(torch.ge),
-    "Less": _binary(torch.lt),
     "LessOrEqual": _binary(torch.le),
     "And": _binary(torch.logical_and),
     "Or": _binary(torch.logical_or),
@@ -230,9 +216,7 @@ _TABLE: dict[str, Callable[..., Any]] = {
         x, x.shape[axis:], scale, b, epsilon
     ),
     "GroupNormalization": _group_norm,
-    "InstanceNormalization": lambda x, scale, b, /, *, epsilon=1e-5: F.instance_norm(
-        x, None, None, scale, b, eps=epsilon
-    ),
+    "InstanceNormalization": lambda x, a, b, /, *, epsilon=1e-5: F.instance_norm(x, None, None, a, b, eps=epsilon),
     "Dropout": _dropout,
     # shapes
     "Reshape": shapes.reshape,

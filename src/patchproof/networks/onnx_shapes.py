@@ -97,15 +97,12 @@ def arange(start, limit, delta, *, device):
     return torch.arange(first, end, step, dtype=start.dtype, device="cpu" if is_short else device)
 
 
+_PIXEL_GRIDS = ("half_pixel", "pytorch_half_pixel", "align_corners")  # the second differs for results of one pixel
 _RESIZED = {
     ("nearest", "asymmetric", "floor"): "nearest",
     ("nearest", "half_pixel", "round_prefer_floor"): "nearest-exact",
-    ("linear", "half_pixel"): "bilinear",
-    ("linear", "pytorch_half_pixel"): "bilinear",  # differs where the result is one pixel
-    ("linear", "align_corners"): "bilinear",
-    ("cubic", "half_pixel"): "bicubic",
-    ("cubic", "pytorch_half_pixel"): "bicubic",
-    ("cubic", "align_corners"): "bicubic",
+    **{("linear", grid): "bilinear" for grid in _PIXEL_GRIDS},
+    **{("cubic", grid): "bicubic" for grid in _PIXEL_GRIDS},
 }
 
 

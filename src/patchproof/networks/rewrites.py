@@ -98,9 +98,6 @@ def _hardtanh_(values: Tensor, low: float = -1, high: float = 1) -> Tensor:
 
 
 # operators whose gradient needs their result only, and in-place forms of them
-_IN_PLACE: dict[Callable[..., Any], Callable[..., Any]] = {
-    _ATEN.relu.default: _ATEN.relu_.default,
-    _ATEN.hardtanh.default: _hardtanh_,
-}
+_IN_PLACE: dict[Any, Callable[..., Any]] = {_ATEN.relu.default: _ATEN.relu_.default, _ATEN.hardtanh.default: _hardtanh_}
 # operators that allocate their result and do not need it for their own gradient
 _ALLOCATING = {_ATEN.convolution.default, _ATEN.add.Tensor}

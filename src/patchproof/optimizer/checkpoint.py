@@ -50,11 +50,8 @@ def load_checkpoint(out: Path, problem: Problem) -> State:
             note = _Note.model_validate_json((file.metadata() or {})["state"])
             if note.sheet_id != problem.scene.sheet_id:
                 do = "resume with the same scene file and seed, or start in another folder"
-                raise Refused(
-                    "the checkpoint of this scene and seed",
-                    f"a checkpoint of sheet {note.sheet_id} in {out}, not {problem.scene.sheet_id}",
-                    do,
-                )
+                got = f"a checkpoint of sheet {note.sheet_id} in {out}, not {problem.scene.sheet_id}"
+                raise Refused("the checkpoint of this scene and seed", got, do)
             design, best = _tensor(file, "design", start_state.design), _tensor(file, "best", start_state.design)
             mean = tuple(_tensor(file, f"mean{n}", level) for n, level in enumerate(start_state.mean))
             square = tuple(_tensor(file, f"square{n}", level) for n, level in enumerate(start_state.square))
@@ -73,7 +70,7 @@ class _Note(StrictModel):
 
 
 def _tensor(file: Any, name: str, start: torch.Tensor) -> torch.Tensor:
-    """The tensor of that name; refused unless it has the size and type of `like` and is finite."""
+    """The tensor of that name; refused unless it has the size and type of `start` and is finite."""
     if file.get_slice(name).get_shape() != list(start.shape):
         raise ValueError(f"{name} of another size than the scene's design")
     tensor = file.get_tensor(name)

@@ -172,10 +172,7 @@ def _detections(problem: Problem, appearances: Mapping[str, Appearance], conditi
             if not network.LOOKS_AT_BOXES:
                 continue
             boxes_px, shows = torch.as_tensor(boxes * network.input_px), [True] * len(boxes)
-            detections[network.name] = {
-                kind: find_detections(
-                    network.network(center_square(photos, network.input_px)), indices, boxes_px, shows
-                )
-                for kind, photos in pictures.items()
-            }
+            squares = ((kind, center_square(photos, network.input_px)) for kind, photos in pictures.items())
+            candidates = ((kind, network.network(square)) for kind, square in squares)
+            detections[network.name] = {k: find_detections(c, indices, boxes_px, shows) for k, c in candidates}
     return detections

@@ -23,13 +23,8 @@ from torch import Tensor
 from patchproof.base.workers import fork_workers
 from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.problem import Problem
-from patchproof.optimizer.training_views import (
-    ViewCache,
-    pose_count,
-    task_conditions,
-    training_conditions,
-    training_views,
-)
+from patchproof.optimizer.training_views import ViewCache, pose_count, task_conditions, training_conditions
+from patchproof.optimizer.training_views import training_views as render_training_views
 from patchproof.render.photograph import affected_windows, expose
 from patchproof.render.views import Views
 from patchproof.scene.conditions import Conditions
@@ -39,9 +34,7 @@ SELECT_CHUNK = 4  # selection views that a process renders together
 
 @dataclass(frozen=True)
 class Answer:
-    """Means over a step's views, and the gradient 3×h×w of their mean loss at the design; the subject's penalty is not
-    included.
-    """
+    """Means over a step's views, and the gradient 3×h×w of their mean loss at the design, without the penalty."""
 
     gradient: Tensor
     loss: float
@@ -107,12 +100,10 @@ class Expectation:
 
 @contextmanager
 def expectation(problem: Problem, selection: Conditions) -> Iterator[Expectation]:
-    """The expectation over a run's training conditions, by as many processes as the problem has; `selection` are the
-    conditions of its selection set.
-    """
+    """The expectation over a run's training conditions and the `selection` set's, by the problem's processes."""
     conditions = training_conditions(problem.scene)
     cache = ViewCache(problem, conditions)  # each process keeps the views it has rendered
-    selection_views = lru_cache(lambda first: training_views(problem, selection[first : first + SELECT_CHUNK]))
+    selection_views = lru_cache(lambda first: render_training_views(problem, selection[first : first + SELECT_CHUNK]))
 
     def answer(task: _TrainTask | _SelectTask) -> _ViewsAnswer | tuple[float, float]:
         printed = torch.as_tensor(task.printed, device=problem.device)
@@ -120,9 +111,8 @@ def expectation(problem: Problem, selection: Conditions) -> Iterator[Expectation
             return _views_answer(problem, printed, cache.views(task.pose, task.conditions), task.pictures)
         views = selection_views(task.first)
         with torch.no_grad():
-            loss, _, rate = score(
-                problem, expose(views, problem.subject.appearance_of_print(printed)), views.conditions
-            )
+            photos = expose(views, problem.subject.appearance_of_print(printed))
+            loss, _, rate = score(problem, photos, views.conditions)
         return float(loss), rate
 
     with fork_workers(answer, problem.jobs, in_turn=True) as (workers, share):
@@ -164,13 +154,8 @@ def _mean_answer(problem: Problem, design: Tensor, ask: Callable[[Tensor], Seque
     # differentiating a product, since torch imports SymPy for grad_outputs (networks/cuts.py)
     (gradient,) = torch.autograd.grad((printed * print_gradient).sum(), design)
     pictures = [torch.as_tensor(answer.pictures) for answer in answers if answer.pictures is not None]
-    return Answer(
-        gradient,
-        mean(answer.loss for answer in answers),
-        mean(answer.confidence for answer in answers),
-        mean(answer.rate for answer in answers),
-        torch.cat(pictures) if pictures else None,
-    )
+    loss, confidence, rate = (mean(getattr(a, name) for a in answers) for name in ("loss", "confidence", "rate"))
+    return Answer(gradient, loss, confidence, rate, torch.cat(pictures) if pictures else None)
 
 
 def _views_answer(problem: Problem, printed: Tensor, views: Views, pictures: bool = False) -> _ViewsAnswer:

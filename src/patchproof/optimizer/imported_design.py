@@ -34,7 +34,7 @@ from patchproof.classifier.network import Classifier
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.optimizer.promise import PROMISE_VIEWS, PromiseOptions
-from patchproof.optimizer.run import RUN_FILE_PATTERNS, Run, finish_run, load_run, resolve_scene
+from patchproof.optimizer.run import RUN_FILE_PATTERNS, Run, finish_run, load_run, scene_of
 from patchproof.photo.detect import find_markers
 from patchproof.photo.read import list_photos, printable_name, read_photo
 from patchproof.photo.rejection import PhotoRejected
@@ -123,13 +123,14 @@ def import_folder(
     """
     scene, out, total = _load_piece_scene(scene, seed), Path(out), promise.views or PROMISE_VIEWS
     runs = {path: out / printable_name(path.stem) for path in list_photos(folder)}
-    if len(set(runs.values())) < len(runs):
-        raise Refused(
-            "pictures whose names differ in more than their kind",
-            f"{len(runs)} pictures with {len(set(runs.values()))} names in {folder}",
-            "rename them",
-        )
+    if (names := len(set(runs.values()))) < len(runs):
+        got = f"{len(runs)} pictures with {names} names in {folder}"
+        raise Refused("pictures whose names differ in more than their kind", got, "rename them")
     runs_by_path: dict[Path, Run] = {}
+
+    def advance(stage: str, done: int, _: int) -> None:
+        progress(stage, len(runs_by_path) * total + done, len(runs) * total)
+
     for path, run_folder in runs.items():
         _, sha256, pixels = _read_picture(path)
         fit_to_piece(pixels, scene)
@@ -140,15 +141,8 @@ def import_folder(
             check_folder(run_folder, RUN_FILE_PATTERNS, overwrite)
     for path, run_folder in runs.items():
         if path not in runs_by_path:
-            offset = len(runs_by_path) * total
             runs_by_path[path] = import_patch(
-                path,
-                scene,
-                run_folder,
-                promise=promise,
-                compute=compute,
-                overwrite=overwrite,
-                progress=lambda stage, done, _, offset=offset: progress(stage, offset + done, len(runs) * total),
+                path, scene, run_folder, promise=promise, compute=compute, overwrite=overwrite, progress=advance
             )
     return [runs_by_path[path] for path in runs]
 
@@ -186,7 +180,7 @@ def _shape_advice(width: int, height: int, scene: PieceScene) -> str:
 
 
 def _load_piece_scene(scene: str | Path | Scene, seed: int | None) -> PieceScene:
-    return require_piece(resolve_scene(scene, seed), 'leave patch.kind out, or "patch"')
+    return require_piece(scene_of(scene, seed), 'leave patch.kind out, or "patch"')
 
 
 def _read_picture(picture: str | Path | np.ndarray) -> tuple[str, str, np.ndarray]:
@@ -263,7 +257,7 @@ def _marker_notes(design: np.ndarray, piece: Piece) -> Iterator[str]:
     if missing := ids - detected.markers.keys():
         raise Refused(expected, f"one that hides {len(missing)} of {len(ids)} markers", do)
     if max(len(detected.foreign), len(detected.doubled)) > 1:
-        names = summarize_names([str(marker_id) for marker_id in (*detected.foreign, *detected.doubled)])
-        raise Refused(expected, f"one that shows markers of its own ({names})", do)
+        found = summarize_names([str(marker_id) for marker_id in (*detected.foreign, *detected.doubled)])
+        raise Refused(expected, f"one that shows markers of its own ({found})", do)
     for marker_id in (*detected.foreign, *detected.doubled):
         yield f"the detector takes a part of it for marker {marker_id}"

@@ -138,10 +138,8 @@ def _descend(problem: Problem, state: State, answer: Answer) -> TrainingStep:
     if isinstance(penalty, Tensor):
         gradient = gradient + torch.autograd.grad(penalty, design)[0]
         penalty = float(penalty.detach())
-    state_after = _update(problem, state, gradient)
-    return TrainingStep(
-        state_after, answer.loss + penalty, answer.confidence, answer.rate, largest, pictures=answer.pictures
-    )
+    updated, loss = _update(problem, state, gradient), answer.loss + penalty
+    return TrainingStep(updated, loss, answer.confidence, answer.rate, largest, pictures=answer.pictures)
 
 
 def _update(problem: Problem, state: State, gradient: Tensor) -> State:
@@ -149,16 +147,10 @@ def _update(problem: Problem, state: State, gradient: Tensor) -> State:
     clipped, settings = problem.subject.clip, problem.scene.settings.optimize
     number, step_size = state.number + 1, settings.step_size
     if settings.optimizer == "sign":
-        design = clipped(state.design - step_size * gradient.sign())
-        return replace(state, number=number, design=design)
+        return replace(state, number=number, design=clipped(state.design - step_size * gradient.sign()))
     levels = problem.subject.gradient_levels(gradient)
-    mean = tuple(
-        torch.lerp(gradient_level, moment, _BETAS[0]) for gradient_level, moment in zip(levels, state.mean, strict=True)
-    )
-    square = tuple(
-        torch.lerp(gradient_level**2, moment, _BETAS[1])
-        for gradient_level, moment in zip(levels, state.square, strict=True)
-    )
+    mean = tuple(torch.lerp(level, moment, _BETAS[0]) for level, moment in zip(levels, state.mean, strict=True))
+    square = tuple(torch.lerp(level**2, moment, _BETAS[1]) for level, moment in zip(levels, state.square, strict=True))
     updates = [
         (m / (1 - _BETAS[0] ** number)) / ((v / (1 - _BETAS[1] ** number)).sqrt() + _EPSILON)
         for m, v in zip(mean, square, strict=True)

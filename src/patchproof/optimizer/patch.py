@@ -35,9 +35,7 @@ PRINTED_PX_PER_MM = 2.0
 
 @dataclass(frozen=True, eq=False)
 class Patch:
-    """Designs are 3×h×w in [0, 1] on the optimized grid `design_px` (width, height); each pixel is printed as a
-    block.
-    """
+    """Designs are 3×h×w in [0, 1] on the optimized grid `design_px` (width, height); pixels are printed as blocks."""
 
     scene: PieceScene
     printer: Printer

@@ -59,11 +59,8 @@ def read_place(folder: Path, scene: UnplacedScene | None = None) -> Place | None
     place = validate_model(Place, record, str(path))
     if scene is not None and place.sheet_id != scene.sheet_id:
         do = "resume with the same scene file and seed, or start in another folder"
-        raise Refused(
-            "the place of this scene and seed",
-            f"a place of sheet {place.sheet_id} in {folder}, not {scene.sheet_id}",
-            do,
-        )
+        got = f"a place of sheet {place.sheet_id} in {folder}, not {scene.sheet_id}"
+        raise Refused("the place of this scene and seed", got, do)
     return place
 
 

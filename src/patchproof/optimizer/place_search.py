@@ -187,9 +187,7 @@ class _Search:
         ]
 
     def draft_at(self, trials: Sequence[_ScreenedPlace]) -> list[np.ndarray]:
-        """N losses of a draft at each place in the held-out views, minus the bare object's; the drafts take as many
-        steps as the budget allows.
-        """
+        """N losses of drafts of as many steps as the budget allows, in the held-out views, minus the bare object's."""
         held_out = self._scene.draw("select", HELD_OUT_VIEWS)
         remaining = MAX_PASSES - self.passes - (len(trials) + 1) * HELD_OUT_VIEWS
         steps = max(1, remaining // (len(trials) * 2 * DRAFT_VIEWS))

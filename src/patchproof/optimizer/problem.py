@@ -29,7 +29,7 @@ from patchproof.optimizer.subject import Subject, subject_of
 from patchproof.render.pixels import PHOTO_SAMPLING, Appearance, TextureSampling
 from patchproof.render.stage import Stage, set_stage
 from patchproof.render.surfaces import piece_surface
-from patchproof.render.views import Views, relight_and_replace_background, render_views
+from patchproof.render.views import Views, render_views
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.interface import Scene
 from patchproof.scene.patch_scene import PatchScene
@@ -85,10 +85,6 @@ class Problem:
         sampling = TRAINING_SAMPLING if side_px < self.figure_px else PHOTO_SAMPLING
         sampling = FIGURE_SAMPLING if side_px == self.figure_px else sampling
         return render_views(self.stage, appearance, conditions, (side_px, side_px), sampling)
-
-    def see_again(self, views: Views, conditions: Conditions) -> Views:
-        """Views under other conditions of the same poses."""
-        return relight_and_replace_background(views, conditions)
 
     @cached_property
     def start_appearance(self) -> Appearance:
@@ -146,8 +142,7 @@ def set_problem(
     names, least_score = models or settings.target.models, settings.target.least_score
     names = [scene.given_models.get(name, name) if isinstance(name, str) else name for name in names]
     classifiers = tuple(load_classifier(name, scene.base, device).with_least_score(least_score) for name in names)
-    accept = settings.target.accept
-    indices = tuple(find_labels(c.labels, settings.target.label, accept) for c in classifiers)
+    indices = tuple(find_labels(c.labels, settings.target.label, settings.target.accept) for c in classifiers)
     printer = load_printer(settings.printer.profile, scene.base)
     stage = set_stage(scene, device)
     subject = subject_of(scene, printer, max(classifier.input_px for classifier in classifiers), stage.device)

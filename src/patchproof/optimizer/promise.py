@@ -139,9 +139,7 @@ def _paired_claims(by_kind: Mapping[str, Responses], per_session: int) -> dict[s
 
 
 def _is_settled(claim: ControlClaim, half_width: float) -> bool:
-    """True if a control's difference is known as well as the rate has to be, or is so clearly not zero that an early
-    look does not invalidate its interval.
-    """
+    """True if a difference is as precise as the rate has to be, or so far from 0 that an early look does no harm."""
     half = np.ptp(claim.difference_interval) / 2
     return bool(half <= half_width or abs(claim.difference) >= SETTLED * half)
 
@@ -235,17 +233,10 @@ def _condition_claims(problem: Problem, conditions: Conditions, recognized: np.n
         azimuth = scene.piece_azimuth_deg(conditions)
         values = scale, tilt, azimuth, _contrasts(problem, scene, conditions)
         turned_away = np.abs(azimuth) >= 90  # NaN, an unknown angle, counts as facing the camera
-        properties = {
-            name: np.where(turned_away, np.nan, value) for name, value in zip(properties, values, strict=True)
-        }
-    return tuple(
-        ConditionClaim(
-            **{name: _rounded(value[i]) for name, value in properties.items()},
-            blur_px=_rounded(conditions.sensor.blur_px[i]),
-            recognized=bool(recognized[i]),
-        )
-        for i in range(n)
-    )
+        properties = dict(zip(names, np.where(turned_away, np.nan, values), strict=True))
+    properties["blur_px"] = conditions.sensor.blur_px
+    rows = [{name: _rounded(value[i]) for name, value in properties.items()} for i in range(n)]
+    return tuple(ConditionClaim(**row, recognized=bool(recognized[i])) for i, row in enumerate(rows))
 
 
 def _contrasts(problem: Problem, scene: PieceScene, conditions: Conditions) -> np.ndarray:

@@ -63,9 +63,7 @@ def responses(
 def open_responses(
     problem: Problem, appearances: Mapping[Thing, Appearance], conditions: Conditions, side_px: int | None = None
 ) -> Iterator[Callable[..., dict[Thing, Responses]]]:
-    """A function like `responses` for some of the things and, by index array, some of the conditions; the same
-    processes serve every call.
-    """
+    """A function like `responses` for some things and, by index array, some conditions; processes serve every call."""
     first_appearance = next((thing for thing in appearances.values() if thing is not None), None)
 
     @torch.no_grad()
@@ -81,10 +79,7 @@ def open_responses(
         return answers
 
     def respond(
-        things: Sequence[Thing],
-        rows: np.ndarray,
-        control_mask: np.ndarray | None = None,
-        advance: Advance = no_advance,
+        things: Sequence[Thing], rows: np.ndarray, control_mask: np.ndarray | None = None, advance: Advance = no_advance
     ) -> dict[Thing, Responses]:
         with_controls = np.ones(len(rows), bool) if control_mask is None else control_mask
         all_things = [_Chunk(part, things) for part in in_chunks(rows[with_controls])]

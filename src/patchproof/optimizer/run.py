@@ -145,10 +145,8 @@ def resolve_scene(scene: str | Path | Scene, seed: int | None) -> Scene:
 def _choose_place(
     scene: Scene, out: Path, resume: bool, search_options: Mapping[str, Any]
 ) -> tuple[PatchScene, Callable[[], None]]:
-    """The scene with the piece at the place that a search chooses or chose, and a function that saves the place.
-
-    The search is imported only here, for scenes that give no place.
-    """
+    """The scene with the piece at the place that a search chooses or chose, and a function that saves the place."""
+    # only scenes that give no place import the search
     from patchproof.optimizer.place_files import read_place, save_place
     from patchproof.optimizer.place_search import choose_place
     from patchproof.scene.unplaced_scene import require_unplaced
@@ -179,11 +177,7 @@ def finish_run(
 
 
 def promise_run(
-    run_folder: str | Path,
-    *,
-    views: int | None = None,
-    compute: Compute = Compute(),
-    progress: Progress = no_progress,
+    run_folder: str | Path, *, views: int | None = None, compute: Compute = Compute(), progress: Progress = no_progress
 ) -> Run:
     """Promise the rate of a finished run's design again, from `views` views and with the run's own controls; the run is
     the same to the byte as if `optimize` had been given these views. A sheet keeps its promise until it is written

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import chain, islice
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import ClassVar
@@ -60,20 +61,14 @@ class Texture(Subject):
 
     def gradient_levels(self, gradient: Tensor) -> tuple[Tensor, ...]:
         """The gradient's pyramids, texture by texture."""
-        return tuple(
-            level
-            for image, mask in zip(self.surface.images(gradient), self.surface.masks, strict=True)
-            for level in pyramid.build_pyramid(image, mask)
-        )
+        return tuple(chain(*map(pyramid.build_pyramid, self.surface.images(gradient), self.surface.masks)))
 
     def combine_levels(self, updates: Sequence[Tensor]) -> Tensor:
         """Combine the updates of the pyramids' levels into one update of the design."""
-        parts, first = [], 0
+        parts, remaining = [], iter(updates)
         for mask in self.surface.masks:
-            count = pyramid.level_count(mask.shape)
-            update = pyramid.collapse_pyramid(updates[first : first + count])
-            parts.append(update[:, mask])
-            first += count
+            levels = list(islice(remaining, pyramid.level_count(mask.shape)))
+            parts.append(pyramid.collapse_pyramid(levels)[:, mask])
         return torch.cat(parts, 1)[:, None]
 
     def penalty(self, design: Tensor) -> Tensor | float:
@@ -123,9 +118,7 @@ class Texture(Subject):
         return self.surface.appearance(design)
 
     def save(self, pixels: np.ndarray, folder: Path) -> None:
-        """Write the object with its new textures, each texture, and the masks one below the other, white where texels
-        may change.
-        """
+        """Write the object with its new textures, each texture, and masks one below the other, white if changeable."""
         textures, masks = self.surface.textures(pixels), self.canvas.mask
         write_atomically(folder / OBJECT_FILE, lambda path: write_glb(self.canvas.mesh, textures, path))
         for i, texture in enumerate(textures):
@@ -174,8 +167,8 @@ def read_design(scene: Scene, folder: Path) -> np.ndarray:
     textures = [read_png(folder / TEXTURE_FILES.replace("*", f"{i}")) for i in range(len(canvas.mask))]
     for texture, mask in zip(textures, canvas.mask, strict=True):
         if texture.shape[:2] != mask.shape:
-            got = f"{texture.shape[1]} × {texture.shape[0]} pixels"
-            raise Refused("the textures of this scene", got, "optimize again")
+            height, width = texture.shape[:2]
+            raise Refused("the textures of this scene", f"{width} × {height} pixels", "optimize again")
     return LearnedTextures(canvas, torch.device("cpu")).texels(textures)
 
 
