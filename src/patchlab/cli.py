@@ -42,7 +42,7 @@ def harden(
     cluster: Cluster = None,
 ) -> None:
     """Change labeled images so that classifiers recognize them better, and attack them."""
-    from patchlab.harden.folder import HardenSettings, harden_images
+    from patchlab.harden.harden_study import HardenSettings, harden_images
     from patchlab.study.study import Work
     from patchproof.base.validation import validate_model
 
@@ -73,11 +73,11 @@ class ListsStudies(TyperCommand):
 
     def format_help(self, ctx, formatter) -> None:
         """The usual help, then a line per study."""
-        from patchlab.study.study import STUDIES, first_line
+        from patchlab.study.study import STUDIES, module_summary
 
         super().format_help(ctx, formatter)
         say("Studies (all keys of a config: patchlab keys NAME):")
-        say(*(f"  {name:<10} {first_line(module)}" for name, module in STUDIES.items()))
+        say(*(f"  {name:<10} {module_summary(module)}" for name, module in STUDIES.items()))
 
 
 def study(

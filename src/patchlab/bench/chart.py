@@ -7,7 +7,7 @@ default is asked whether it lies there. Other claims that a chart is made to tes
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,12 +15,13 @@ import numpy as np
 from patchproof.base.intervals import Estimate
 from patchproof.report.tables import Table, Value
 
-Progress = Callable[[str, int, int], None]
-OFF_FRONT = 5.0  # % more error than the front's at its cost that a default may have, where intervals do not overlap
+MAX_EXCESS_PERCENT = (
+    5.0  # % more error than the front's at its cost that a default may have, where intervals do not overlap
+)
 
 
 @dataclass(frozen=True)
-class Point:
+class ChartPoint:
     """One setting of a knob: what it costs and how far off it is; a plain number is known, not estimated."""
 
     setting: str
@@ -31,12 +32,12 @@ class Point:
     @property
     def drawable(self) -> bool:
         """Whether its error is finite."""
-        return bool(np.isfinite(span(self.error)).all())
+        return bool(np.isfinite(value_and_ends(self.error)).all())
 
     @property
     def at(self) -> tuple[float, float]:
         """Cost and error without their intervals."""
-        return span(self.cost)[0], span(self.error)[0]
+        return value_and_ends(self.cost)[0], value_and_ends(self.error)[0]
 
 
 @dataclass(frozen=True)
@@ -70,30 +71,30 @@ class Chart:
     title: str
     cost: str
     error: str
-    series: Mapping[str, Sequence[Point]]
+    series: Mapping[str, Sequence[ChartPoint]]
     about: str
     checks: tuple[Check, ...] = ()
     tables: tuple[Table, ...] = ()
     one_front: bool = False
 
     @property
-    def tasks(self) -> dict[str, list[Point]]:
+    def tasks(self) -> dict[str, list[ChartPoint]]:
         """Points among which one chooses, by task; those without a finite error are no choice."""
         tasks = {label: [p for p in points if p.drawable] for label, points in self.series.items()}
         return {self.name: [p for points in tasks.values() for p in points]} if self.one_front else tasks
 
-    def front(self, points: Sequence[Point]) -> list[Point]:
+    def front(self, points: Sequence[ChartPoint]) -> list[ChartPoint]:
         """Those of a task's points that no other beats, cheapest first."""
-        kept = pareto([p.at[0] for p in points], [p.at[1] for p in points])
+        kept = pareto_mask([p.at[0] for p in points], [p.at[1] for p in points])
         return sorted((p for p, is_kept in zip(points, kept, strict=True) if is_kept), key=lambda p: p.at[0])
 
 
-def span(figure: Estimate | float) -> tuple[float, float, float]:
+def value_and_ends(figure: Estimate | float) -> tuple[float, float, float]:
     """A figure with the ends of its interval."""
     return (figure.value, figure.low, figure.high) if isinstance(figure, Estimate) else (figure, figure, figure)
 
 
-def pareto(cost: Sequence[float], error: Sequence[float]) -> np.ndarray:
+def pareto_mask(cost: Sequence[float], error: Sequence[float]) -> np.ndarray:
     """Which points no other beats: none is as good in both and better in one; bool, one per point."""
     figures = np.stack([cost, error], 1).astype(float)
     own, other = figures[:, None], figures
@@ -108,9 +109,9 @@ def all_checks(chart: Chart) -> list[Check]:
     checks = list(chart.checks)
     for task, points in chart.tasks.items():
         for default in (p for p in points if p.default):
-            rivals = [span(p.error) for p in points if p.at[0] <= default.at[0]]
+            rivals = [value_and_ends(p.error) for p in points if p.at[0] <= default.at[0]]
             claim = f"{task}: % more error of the default than of the front at its cost"
-            checks.append(Check(claim, _excess(span(default.error), min(rivals)), OFF_FRONT))
+            checks.append(Check(claim, _excess(value_and_ends(default.error), min(rivals)), MAX_EXCESS_PERCENT))
     return checks
 
 

@@ -15,10 +15,11 @@ from tempfile import TemporaryDirectory
 from time import perf_counter
 from typing import Any
 
-from patchlab.bench.chart import Chart, Point, Progress
-from patchlab.bench.measure import clocked
+from patchlab.bench.chart import Chart, ChartPoint
+from patchlab.bench.measure import time_call
 from patchproof.app.demo import SCENE
 from patchproof.base.intervals import Estimate, rate
+from patchproof.base.progress import Progress
 from patchproof.base.settings import OptimizeSettings, SceneSettings
 from patchproof.base.validation import validate_model
 from patchproof.base.workers import use_threads
@@ -33,7 +34,7 @@ from patchproof.scene.interface import Scene
 from patchproof.scene.scene import build_scene
 
 # By label, all from above: the primitive, its length, how far the piece is off its middle, and its size, in mm.
-OBJECTS = {
+OBJECTS_BY_LABEL = {
     "box truck": ("box_truck", 400, 45, 147),
     "carton": ("carton", 300, 0, 140),
     "chair": ("chair", 450, 0, 140),
@@ -48,7 +49,7 @@ QUICK_EFFORTS = {"draft": DRAFT_EFFORT, DEFAULT: (2 * DRAFT_EFFORT[0], 2 * DRAFT
 
 def charts(quick: bool, progress: Progress) -> Iterator[Chart]:
     """The one chart."""
-    labels = list(OBJECTS)[:1] if quick else list(OBJECTS)
+    labels = list(OBJECTS_BY_LABEL)[:1] if quick else list(OBJECTS_BY_LABEL)
     yield effort_chart(labels, QUICK_EFFORTS if quick else EFFORTS, 100 if quick else 400, progress)
 
 
@@ -60,12 +61,12 @@ def effort_chart(
     for label in labels:
         runs = {}
         for name, (steps, views) in efforts.items():
-            runs[name] = _timed_run(_scene(label, steps), views)
+            runs[name] = _timed_run(object_scene(label, steps), views)
             progress("runs", len(series) * len(efforts) + len(runs), len(labels) * len(efforts))
-        missed = _missed({name: run for name, (run, _) in runs.items()}, judged)
+        missed = _missed_shares({name: run for name, (run, _) in runs.items()}, judged)
         seconds = {name: taken for name, (_, taken) in runs.items()}
         series[label] = [
-            Point(name, seconds[name] / seconds[DEFAULT], missed[name], name == DEFAULT) for name in efforts
+            ChartPoint(name, seconds[name] / seconds[DEFAULT], missed[name], name == DEFAULT) for name in efforts
         ]
         for name, (run, taken) in runs.items():
             low, high = run.promise.interval
@@ -83,8 +84,8 @@ def effort_chart(
     )
 
 
-def _scene(label: str, steps: int) -> Scene:
-    primitive, length_mm, off_mm, size_mm = OBJECTS[label]
+def object_scene(label: str, steps: int) -> Scene:
+    primitive, length_mm, off_mm, size_mm = OBJECTS_BY_LABEL[label]
     settings: dict[str, Any] = tomllib.loads(SCENE)
     settings["object"] |= {"mesh": f"primitive:{primitive}", "length_mm": length_mm}
     settings["patch"] |= {"offset_mm": [0, off_mm], "width_mm": size_mm, "height_mm": size_mm}
@@ -95,13 +96,13 @@ def _scene(label: str, steps: int) -> Scene:
 
 def _timed_run(scene: Scene, views: int | None) -> tuple[Run, float]:
     with TemporaryDirectory() as folder, use_threads(1):
-        run, ms = clocked(
+        run, ms = time_call(
             lambda: optimize_scene(scene, Path(folder) / "run", promise=PromiseOptions(views)), perf_counter
         )
         return run, ms / 1000
 
 
-def _missed(runs: dict[str, Run], judged: int) -> dict[str, Estimate]:
+def _missed_shares(runs: dict[str, Run], judged: int) -> dict[str, Estimate]:
     """By name the share of the same fresh views in which each run's design is not recognized."""
     problem = set_problem(next(iter(runs.values())).scene)
     shown = {name: problem.subject.appearance(from_pixels(run.design), "design") for name, run in runs.items()}

@@ -25,8 +25,8 @@ DRIVERS = ("plain", "saturated", "black ink", "matching", "saturated matching")
 # transmitted light of solid cyan, magenta and yellow in red, green and blue; the middle of what is drawn
 _INKS = np.array([[0.06, 0.42, 0.72], [0.62, 0.05, 0.22], [0.92, 0.78, 0.07]])
 _SOLIDS = np.array(list(product((0, 1), repeat=4)))  # cyan, magenta, yellow, black; slowest first
-_NODES = np.linspace(0, 1, 17)  # of a matching driver's own table
-_NEAREST = 4  # printable colors that a matching driver averages, so that its table is smooth
+_TABLE_NODES = np.linspace(0, 1, 17)  # of a matching driver's own table
+_AVERAGED_COLORS = 4  # printable colors that a matching driver averages, so that its table is smooth
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,14 +68,14 @@ class Inkjet:
 
         ink = _grid(np.linspace(0, 1, 33))
         printable = lab_from_linear(self._printed(ink))
-        wanted = lab_from_srgb(_grid(_NODES))
+        wanted = lab_from_srgb(_grid(_TABLE_NODES))
         darkest = printable[:, 0].min()
         wanted = wanted * [1 - darkest / 100, 1 + self.saturation, 1 + self.saturation] + [darkest, 0, 0]
-        away, index = KDTree(printable).query(wanted, _NEAREST)
+        away, index = KDTree(printable).query(wanted, _AVERAGED_COLORS)
         weights = 1 / (away + 0.1) ** 2
         sent = (ink[index] * weights[..., None]).sum(1) / weights.sum(1, keepdims=True)
         sent[-1] = 0  # no driver prints on white
-        return RegularGridInterpolator((_NODES,) * 3, sent.reshape(*(len(_NODES),) * 3, 3))
+        return RegularGridInterpolator((_TABLE_NODES,) * 3, sent.reshape(*(len(_TABLE_NODES),) * 3, 3))
 
 
 def draw_inkjet(seed: int) -> Inkjet:

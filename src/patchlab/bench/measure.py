@@ -20,15 +20,15 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from patchlab.study.claims import median
+from patchlab.study.estimates import median
 from patchproof.base.intervals import Estimate
 from patchproof.base.progress import Advance, no_advance
 
 Name = TypeVar("Name", bound=Hashable)
-Answer = TypeVar("Answer")
+ReturnValue = TypeVar("ReturnValue")
 
 
-def machine() -> dict[str, Any]:
+def machine_details() -> dict[str, Any]:
     """What the figures depend on beside the code."""
     import torch
 
@@ -43,19 +43,17 @@ def machine() -> dict[str, Any]:
     }
 
 
-def describe(about: Mapping[str, Any]) -> str:
+def machine_line(about: Mapping[str, Any]) -> str:
     """The machine in one line, for the corner of a chart."""
     threads = f"{about['threads']} thread{'' if about['threads'] == 1 else 's'} of {about['cores']} cores"
     return f"{about['processor']}, {threads}, torch {about['torch']}, {about['date']}"
 
 
-def in_turn(
-    calls: Mapping[Name, Callable[[], Answer]],
-    rounds: int,
-    advance: Advance = no_advance,
-) -> dict[Name, list[Answer]]:
+def call_in_turn(
+    calls: Mapping[Name, Callable[[], ReturnValue]], rounds: int, advance: Advance = no_advance
+) -> dict[Name, list[ReturnValue]]:
     """What each call returns in each of some rounds, all calls in turn in every round; a round before them warms up."""
-    answers: dict[Name, list[Answer]] = {name: [] for name in calls}
+    answers: dict[Name, list[ReturnValue]] = {name: [] for name in calls}
     for number in range(rounds + 1):
         for name, call in calls.items():
             answers[name].append(call())
@@ -63,13 +61,15 @@ def in_turn(
     return {name: values[1:] for name, values in answers.items()}
 
 
-def timed(calls: Mapping[Name, Callable[[], object]], rounds: int) -> dict[Name, np.ndarray]:
-    """Wall milliseconds of each call in `rounds` rounds of `in_turn`."""
-    told = in_turn({name: partial(clocked, call, time.perf_counter) for name, call in calls.items()}, rounds)
+def time_calls(calls: Mapping[Name, Callable[[], object]], rounds: int) -> dict[Name, np.ndarray]:
+    """Wall milliseconds of each call in `rounds` rounds of `call_in_turn`."""
+    told = call_in_turn({name: partial(time_call, call, time.perf_counter) for name, call in calls.items()}, rounds)
     return {name: np.array([ms for _, ms in values]) for name, values in told.items()}
 
 
-def clocked(call: Callable[[], Answer], clock: Callable[[], float] = time.process_time) -> tuple[Answer, float]:
+def time_call(
+    call: Callable[[], ReturnValue], clock: Callable[[], float] = time.process_time
+) -> tuple[ReturnValue, float]:
     """What a call returns, and its milliseconds; of the processor, where other work on the machine does not count, if
     no other clock is given.
     """
@@ -77,12 +77,12 @@ def clocked(call: Callable[[], Answer], clock: Callable[[], float] = time.proces
     return call(), 1000 * (clock() - begin)
 
 
-def ratio(times: Mapping[Name, np.ndarray], a: Name, b: Name) -> Estimate:
+def time_ratio(times: Mapping[Name, np.ndarray], a: Name, b: Name) -> Estimate:
     """How many times as long `a` took as `b`: the median over rounds, each with its own ratio."""
     return median(times[a] / times[b])
 
 
-def said_by(source: Path, code: str, *arguments: str) -> tuple[str, Any]:
+def run_in_checkout(source: Path, code: str, *arguments: str) -> tuple[str, Any]:
     """(the short commit, the JSON in the last line that `code` prints) in a process of its own, which imports from the
     `src` folder of a checkout.
     """

@@ -11,11 +11,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from patchlab.bench.chart import Chart, Point, Progress
-from patchlab.bench.measure import ratio, timed
-from patchlab.bench.world import design_for_demo
+from patchlab.bench.chart import Chart, ChartPoint
+from patchlab.bench.demo_problem import optimize_demo_design
+from patchlab.bench.measure import time_calls, time_ratio
 from patchproof.base.intervals import student_mean
 from patchproof.base.output import image_pixels
+from patchproof.base.progress import Progress
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import Problem
 from patchproof.optimizer.responses import ask_networks
@@ -30,7 +31,7 @@ SIDES_PX = (96, 128, 192, 224, 384)  # and the default's
 
 def charts(quick: bool, progress: Progress) -> Iterator[Chart]:
     """The one chart."""
-    problem, design = design_for_demo(80 if quick else 160, progress)
+    problem, design = optimize_demo_design(80 if quick else 160, progress)
     yield resolution_chart(problem, design, 6 if quick else 40, 2 if quick else 15, progress)
 
 
@@ -56,12 +57,12 @@ def resolution_chart(problem: Problem, trained: Tensor, views: int, rounds: int,
             photo = image_pixels(take_photo(problem.stage, shown, conditions[i : i + 1]))
             truth.append(confidence(from_pixels(photo)[None])[0])
             progress("photographs", i + 1, views)
-    times, points, rows = timed({side: lambda side=side: step(side) for side in sides}, rounds), [], []
+    times, points, rows = time_calls({side: lambda side=side: step(side) for side in sides}, rounds), [], []
     for side in sides:
         with torch.no_grad():
             off = confidence(pictures(side, shown, conditions)) - truth
-        cost, is_default = ratio(times, side, problem.training_px), side == problem.training_px
-        points.append(Point(f"{side} px", cost, student_mean(np.abs(off)), is_default))
+        cost, is_default = time_ratio(times, side, problem.training_px), side == problem.training_px
+        points.append(ChartPoint(f"{side} px", cost, student_mean(np.abs(off)), is_default))
         rows.append((f"{side} px", student_mean(off)))
     photo_px = problem.scene.settings.camera.photo_px
     return Chart(

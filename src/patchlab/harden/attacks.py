@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 Logits = Callable[[Tensor], Tensor]
-Loss = Callable[[Tensor, Tensor], Tensor]
+PictureLoss = Callable[[Tensor, Tensor], Tensor]
 PGD_STEPS = 40
 PGD_STEP = 1 / 4  # of ε
 
@@ -38,15 +38,15 @@ def margin(logits: Tensor, labels: Tensor) -> Tensor:
     return others.amax(1) - logits.gather(1, labels[:, None])[:, 0]
 
 
-LOSSES: tuple[Loss, ...] = (cross_entropy, margin)
+LOSSES: tuple[PictureLoss, ...] = (cross_entropy, margin)
 
 
-def right(logits: Tensor, labels: Tensor) -> Tensor:
+def is_correct(logits: Tensor, labels: Tensor) -> Tensor:
     """N bool: top-1 is the label."""
     return logits.argmax(1) == labels
 
 
-def fgsm(network: Logits, pictures: Tensor, labels: Tensor, epsilon: float, loss: Loss) -> Tensor:
+def fgsm(network: Logits, pictures: Tensor, labels: Tensor, epsilon: float, loss: PictureLoss) -> Tensor:
     """clip(x + ε sign ∇L): one step."""
     return (pictures + epsilon * _gradient(network, pictures, labels, loss).sign()).clamp(0, 1)
 
@@ -56,7 +56,7 @@ def pgd(
     pictures: Tensor,
     labels: Tensor,
     epsilon: float,
-    loss: Loss,
+    loss: PictureLoss,
     steps: int = PGD_STEPS,
     step: float = PGD_STEP,
 ) -> Iterator[Tensor]:
@@ -68,7 +68,13 @@ def pgd(
 
 
 def pgd_step(
-    network: Logits, x: Tensor, pictures: Tensor, labels: Tensor, epsilon: float, loss: Loss, step: float = PGD_STEP
+    network: Logits,
+    x: Tensor,
+    pictures: Tensor,
+    labels: Tensor,
+    epsilon: float,
+    loss: PictureLoss,
+    step: float = PGD_STEP,
 ) -> Tensor:
     """x ← clip(Π(x + `step` ε sign ∇L)), Π onto the ε-ball round the pictures."""
     x = x + step * epsilon * _gradient(network, x, labels, loss).sign()
@@ -77,23 +83,25 @@ def pgd_step(
 
 def survives_fgsm(network: Logits, pictures: Tensor, labels: Tensor, epsilon: float) -> Tensor:
     """N bool: right, and still right after the step along either loss's gradient."""
-    alive = _right(network, pictures, labels)
+    alive = _predicts_label(network, pictures, labels)
     for loss in LOSSES:
         if len(left := alive.nonzero()[:, 0]):
-            alive[left] = _right(network, fgsm(network, pictures[left], labels[left], epsilon, loss), labels[left])
+            alive[left] = _predicts_label(
+                network, fgsm(network, pictures[left], labels[left], epsilon, loss), labels[left]
+            )
     return alive
 
 
 def survives_pgd(network: Logits, pictures: Tensor, labels: Tensor, epsilon: float, steps: int = PGD_STEPS) -> Tensor:
     """N bool: right, and still right wherever either loss leads on its way; what is lost goes no further."""
-    alive = _right(network, pictures, labels)
+    alive = _predicts_label(network, pictures, labels)
     for loss in LOSSES:
         left, x = alive.nonzero()[:, 0], pictures[alive]
         for _ in range(steps):
             if not len(left):
                 break
             x = pgd_step(network, x, pictures[left], labels[left], epsilon, loss)
-            still = _right(network, x, labels[left])
+            still = _predicts_label(network, x, labels[left])
             alive[left[~still]] = False
             left, x = left[still], x[still]
     return alive
@@ -102,7 +110,7 @@ def survives_pgd(network: Logits, pictures: Tensor, labels: Tensor, epsilon: flo
 ATTACKS = {"fgsm": survives_fgsm, "pgd": survives_pgd}
 
 
-def even_loss(logits: Sequence[Tensor], labels: Sequence[Tensor], loss: Loss) -> Tensor:
+def balanced_loss(logits: Sequence[Tensor], labels: Sequence[Tensor], loss: PictureLoss) -> Tensor:
     """A number with the gradient of the networks' mean loss, scaled per picture so that none of it is lost.
 
     `logits[m]` and `labels[m]` are network m's. The gradient with respect to a picture's logits has 1 as its largest
@@ -118,12 +126,12 @@ def even_loss(logits: Sequence[Tensor], labels: Sequence[Tensor], loss: Loss) ->
         return torch.stack([(own * (slope / largest[:, None])).sum() for own, slope in pairs]).sum()
 
 
-def _gradient(network: Logits, pictures: Tensor, labels: Tensor, loss: Loss) -> Tensor:
+def _gradient(network: Logits, pictures: Tensor, labels: Tensor, loss: PictureLoss) -> Tensor:
     pictures = pictures.detach().requires_grad_(True)
     with torch.enable_grad():
-        return torch.autograd.grad(even_loss([network(pictures)], [labels], loss), pictures)[0]
+        return torch.autograd.grad(balanced_loss([network(pictures)], [labels], loss), pictures)[0]
 
 
-def _right(network: Logits, pictures: Tensor, labels: Tensor) -> Tensor:
+def _predicts_label(network: Logits, pictures: Tensor, labels: Tensor) -> Tensor:
     with torch.no_grad():
-        return right(network(pictures), labels)
+        return is_correct(network(pictures), labels)

@@ -17,18 +17,26 @@ from typing import Any
 
 from pydantic import Field
 
-from patchlab.paper.sides import sides
+from patchlab.paper.object_views import views_from_sides
 from patchlab.study.figures import picture_sheet
-from patchlab.study.grid import grouped, of_values, problem_of, short_name
+from patchlab.study.grid import group_by, problem_of, short_name, values_key
 from patchlab.study.record import Record
 from patchlab.study.study import Cell, Result, Study
-from patchlab.study.trained import TrainedSettings, Way, Word, answers_and_sheet, tested_in, trained_cells, trained_on
+from patchlab.study.trained_designs import (
+    NamePart,
+    SceneVariant,
+    TrainedSettings,
+    ask_and_draw,
+    tested_networks,
+    trained_cells,
+    with_trainers,
+)
 from patchproof.optimizer.loop import best_design
 from patchproof.optimizer.promise import pictures_with_controls
 from patchproof.report.tables import Drawing, Table
 
 CONTROLS = ("bare", "gray", "noise", "shuffled")
-_KINDS = ("design", *CONTROLS)
+_SHOWN_KINDS = ("design", *CONTROLS)
 _SHEET_PX, _SHEET_VIEWS = 160, 4
 
 
@@ -36,7 +44,7 @@ class DeceiveSettings(TrainedSettings):
     """As in all studies of trained designs; each network trains alone and all of them test."""
 
     # By name: tables of the scene file with the keys that change.
-    ways: dict[Word, Way] = Field(
+    ways: dict[NamePart, SceneVariant] = Field(
         {"free": {"patch": {"kind": "texture"}}, "within_8": {"patch": {"kind": "texture", "epsilon": 8 / 255}}},
         min_length=1,
     )
@@ -50,26 +58,26 @@ def cells(settings: DeceiveSettings, base: Path) -> list[Cell]:
 def run(settings: DeceiveSettings, base: Path, cell: Cell) -> dict[str, Any]:
     """Train against one network, show design and controls to all."""
     problem = problem_of(base, cell.values)
-    design = best_design(trained_on(problem, cell))
+    design = best_design(with_trainers(problem, cell))
     things = pictures_with_controls(problem, design, CONTROLS)
     suffix, content = problem.subject.file(design)
-    sheet = sides(problem, _SHEET_VIEWS), _SHEET_PX
-    return answers_and_sheet(problem, cell.name, things, settings.n, sheet) | {f"{cell.name}.{suffix}": content}
+    sheet = views_from_sides(problem, _SHEET_VIEWS), _SHEET_PX
+    return ask_and_draw(problem, cell.name, things, settings.n, sheet) | {f"{cell.name}.{suffix}": content}
 
 
 def tables(settings: DeceiveSettings, results: Sequence[Result]) -> list[Table]:
     """Rates of everything shown, and the design minus each control."""
     rates, differences = [], []
-    for design, of_design in grouped(results, of_values("name", "way", "row")).items():
-        records = {kind: Record(of_design, kind) for kind in _KINDS}
-        for network in tested_in(of_design):
+    for design, of_design in group_by(results, values_key("name", "way", "row")).items():
+        records = {kind: Record(of_design, kind) for kind in _SHOWN_KINDS}
+        for network in tested_networks(of_design):
             start = (*design, short_name(network))
             levels = [record.level(network) for record in records.values()]
             rates.append((*start, *(level[0] for level in levels), levels[0][1]))
             differences.append((*start, *(records["design"].gain(records[kind], network)[0] for kind in CONTROLS)))
     head, n = ("scene", "way", "trained on", "tested on"), f"{settings.n} unseen conditions per seed"
     return [
-        Table("rates", "Rates", (*head, *_KINDS, "confidence"), tuple(rates), f"Over {n}."),
+        Table("rates", "Rates", (*head, *_SHOWN_KINDS, "confidence"), tuple(rates), f"Over {n}."),
         Table(
             "differences",
             "The design minus each control",
@@ -87,11 +95,11 @@ def figures(settings: DeceiveSettings, results: Sequence[Result]) -> list[Drawin
             f"sheet_{scene}_{way}_{row}",
             f"{scene}, {way}, trained on {row}",
             [("", of_design[0].file(f"{of_design[0].cell.name}.sheet.png"))],
-            (1.2 * _SHEET_VIEWS + 0.8, 1.2 * len(_KINDS)),
+            (1.2 * _SHEET_VIEWS + 0.8, 1.2 * len(_SHOWN_KINDS)),
             "In even light; the first seed.",
-            rows=_KINDS,
+            rows=_SHOWN_KINDS,
         )
-        for (scene, way, row), of_design in grouped(results, of_values("name", "way", "row")).items()
+        for (scene, way, row), of_design in group_by(results, values_key("name", "way", "row")).items()
     ]
 
 

@@ -16,8 +16,8 @@ from typing import Annotated
 import torch
 from pydantic import Field, model_validator
 
-from patchlab.harden.labeled import write_labels
-from patchlab.study.grid import Values, scene_of
+from patchlab.harden.labeled_photos import write_labels
+from patchlab.study.grid import CellValues, scene_of
 from patchproof.base.color import srgb_from_linear
 from patchproof.base.errors import Refused
 from patchproof.base.input import is_file
@@ -78,14 +78,14 @@ class ImageClass:
 
     label: str | int
     accept: tuple[str | int, ...] = ()
-    scene: Values | None = None  # of which they are renders
+    scene: CellValues | None = None  # of which they are renders
 
 
-def classes_of(images: str | None, table: str | None, scenes: Sequence[Values], base: Path) -> list[ImageClass]:
+def list_classes(images: str | None, table: str | None, scenes: Sequence[CellValues], base: Path) -> list[ImageClass]:
     """Every class that there are images of: a folder's by its CSV of labels, then one per scene to render."""
     classes = []
     if images is not None and table is not None:
-        for label in labels_of(Path(expand_path(images, base)), Path(expand_path(table, base))):
+        for label in labels_with_images(Path(expand_path(images, base)), Path(expand_path(table, base))):
             classes.append(ImageClass(int(label) if label.isdecimal() else label))
     for values in scenes:
         if values["scene"]["object"]["mesh"] is None:
@@ -96,7 +96,7 @@ def classes_of(images: str | None, table: str | None, scenes: Sequence[Values], 
     return classes
 
 
-def labels_of(folder: Path, table: Path) -> list[str]:
+def labels_with_images(folder: Path, table: Path) -> list[str]:
     """The different labels, in small letters, of the images in `folder` that the CSV `table` names."""
     found = list(dict.fromkeys(label for name, label in read_labels(table) if is_file(folder / name)))
     if not found:
@@ -141,7 +141,7 @@ def scene_settings(
     )
 
 
-def _render_class(label: str | int, values: Values, base: Path, seed: int, n: int, folder: Path) -> tuple[str, str]:
+def _render_class(label: str | int, values: CellValues, base: Path, seed: int, n: int, folder: Path) -> tuple[str, str]:
     """Write n renders of a scene and their labels into a new folder in `folder`; the paths of both."""
     own = folder / str(len(list(folder.iterdir())))
     own.mkdir()

@@ -25,13 +25,23 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field
 
-from patchlab.harden.labeled import write_labels
+from patchlab.harden.labeled_photos import write_labels
 from patchlab.paper.image_classes import write_renders
-from patchlab.study.claims import clustered
+from patchlab.study.estimates import cluster_estimate
 from patchlab.study.figures import picture_sheet
-from patchlab.study.grid import Count, GridSettings, Seeds, by_scene, grid_cells, grouped, of_values, problem_of, who
-from patchlab.study.pictures import contact_sheet, enlarged, photographs
-from patchlab.study.record import Record, hits_of, recorded
+from patchlab.study.grid import (
+    GridSettings,
+    PositiveInt,
+    Seeds,
+    by_scene,
+    cell_key,
+    grid_cells,
+    group_by,
+    problem_of,
+    values_key,
+)
+from patchlab.study.pictures import contact_sheet, enlarge_design, photographs
+from patchlab.study.record import Record, answers_record, parse_hits
 from patchlab.study.study import Cell, Result, Study
 from patchproof.base.errors import Refused
 from patchproof.base.intervals import estimate_difference, rate
@@ -52,16 +62,16 @@ from patchproof.scene.interface import SceneSource
 from patchproof.scene.patch_scene import PatchScene, require_patch
 
 KINDS = ("bare", "gray", "noise", "2d", "3d")
-HARD = 0.2  # clean rate up to which an object counts as misread
+MAX_MISREAD_RATE = 0.2  # clean rate up to which an object counts as misread
 _TILE_PX = 192
-_SIZES = (0.05, 0.95)  # quantiles of the design's size over the 3D views that bound its size in 2D
+_SIZE_QUANTILES = (0.05, 0.95)  # quantiles of the design's size over the 3D views that bound its size in 2D
 
 
 class Patch3dSettings(GridSettings):
     """How patches are trained stands in each scene's [optimize]."""
 
     seeds: Seeds = (0, 1, 2)  # of the scenes' draws
-    n: Count = 200  # conditions per cell, of the evaluate stream
+    n: PositiveInt = 200  # conditions per cell, of the evaluate stream
     renders: Annotated[int, Field(ge=2)] = 64  # images of the clean object; from 20 on, half of them are held out
     roll_deg: Range = (-22.5, 22.5)  # of the 2D patch, as in Brown et al.'s published program
     erasing: Share = 0.5  # chance of Random Erasing in 2D training
@@ -94,8 +104,8 @@ def run(settings: Patch3dSettings, base: Path, cell: Cell) -> dict[str, Any]:
     designs = {"3d": best_design(problem), "2d": best_design(twin)}
     conditions, in_images = (world.scene.draw("evaluate", settings.n) for world in (problem, twin))
     return {
-        **recorded(responses(problem, things_of(problem, designs), conditions)),
-        "in_images": recorded(responses(twin, things_of(twin, designs), in_images)),
+        **answers_record(responses(problem, appearances_by_kind(problem, designs), conditions)),
+        "in_images": answers_record(responses(twin, appearances_by_kind(twin, designs), in_images)),
         "azimuth_deg": conditions.pose.azimuth_deg.tolist(),
         "azimuth_range_deg": problem.scene.settings.view.azimuth_deg,
         "passes": {
@@ -103,7 +113,7 @@ def run(settings: Patch3dSettings, base: Path, cell: Cell) -> dict[str, Any]:
         },
         "share": twin.scene.settings.view.patch_share,
         "warnings": list(problem.scene.warnings),
-        f"{cell.name}.png": picture_of(problem, twin, designs),
+        f"{cell.name}.png": compose_picture(problem, twin, designs),
         f"{cell.name}-2d.png": png(designs["2d"]),
         f"{cell.name}-3d.png": png(designs["3d"]),
     }
@@ -123,7 +133,7 @@ def flat_settings(scene: PatchScene, settings: Patch3dSettings) -> SceneSettings
     """A scene of images with the patch, printer, camera and optimizer of a scene with a mesh, and as large in it."""
     width, height = scene.piece.size_mm
     patch = PatchSettings(width_mm=width, height_mm=height)
-    low, high = np.quantile(design_shares(scene), _SIZES)
+    low, high = np.quantile(design_shares(scene), _SIZE_QUANTILES)
     largest = largest_share(settings.roll_deg)
     share = (float(min(low, largest)), float(min(high, largest)))
     return scene.settings.changed(
@@ -142,18 +152,18 @@ def design_shares(scene: PatchScene, views: int = 256) -> np.ndarray:
     return scales * max(scene.piece.size_mm) / min(photo_px)
 
 
-def things_of(problem: Problem, designs: Mapping[str, np.ndarray]) -> dict[str, Appearance]:
+def appearances_by_kind(problem: Problem, designs: Mapping[str, np.ndarray]) -> dict[str, Appearance]:
     """What hangs on the object, by `KINDS`."""
     things = pictures_with_controls(problem, designs["3d"], KINDS[:3])
     things |= {"2d": problem.subject.appearance(from_pixels(designs["2d"], problem.device)), "3d": things["design"]}
     return {kind: things[kind] for kind in KINDS}
 
 
-def picture_of(problem: Problem, twin: Problem, designs: Mapping[str, np.ndarray]) -> bytes:
+def compose_picture(problem: Problem, twin: Problem, designs: Mapping[str, np.ndarray]) -> bytes:
     """Side by side: the 2D design, an image with it, the object with it; the 3D design, the object with it."""
     tiles = []
     for kind, worlds in (("2d", (twin, problem)), ("3d", (problem,))):
-        tiles.append(enlarged(designs[kind], _TILE_PX))
+        tiles.append(enlarge_design(designs[kind], _TILE_PX))
         for world in worlds:
             shown = world.subject.appearance(from_pixels(designs[kind], world.device))
             tiles.append(photographs(world, shown, world.scene.draw("evaluate", 1), _TILE_PX)[0])
@@ -179,17 +189,17 @@ def tables(settings: Patch3dSettings, results: Sequence[Result]) -> list[Table]:
 
 
 def _pooled(results: Sequence[Result]) -> Table:
-    groups = grouped(results, of_values("name", "network"))
-    hard = {key: group for key, group in groups.items() if _mean(group, "bare") <= HARD}
+    groups = group_by(results, values_key("name", "network"))
+    hard = {key: group for key, group in groups.items() if _mean_rate(group, "bare") <= MAX_MISREAD_RATE}
     rows = []
     for a, b in (("3d", "2d"), ("3d", "gray"), ("3d", "noise"), ("2d", "gray"), ("2d", "noise"), ("3d", "bare")):
-        gains = [[_mean(group, a) - _mean(group, b) for group in some.values()] for some in (groups, hard)]
-        rows.append((f"{a} minus {b}", *map(clustered, gains)))
+        gains = [[_mean_rate(group, a) - _mean_rate(group, b) for group in some.values()] for some in (groups, hard)]
+        rows.append((f"{a} minus {b}", *map(cluster_estimate, gains)))
     about = (
         "Differences of the rate on the same conditions. The interval is a bootstrap over clusters, a cluster being an"
         " object before a network with all its seeds; n counts clusters, and fewer than 5 get none."
     )
-    head = ("difference", "all clusters", f"clean rate up to {HARD:g}")
+    head = ("difference", "all clusters", f"clean rate up to {MAX_MISREAD_RATE:g}")
     return Table("pooled", "Pooled over objects, networks and seeds", head, tuple(rows), about)
 
 
@@ -206,10 +216,10 @@ def _by_object(results: Sequence[Result], pair: tuple[str, str], where: str | No
 def _by_view(settings: Patch3dSettings, results: Sequence[Result]) -> Table:
     groups: dict[tuple[str, str], dict[str, list[bool]]] = {}
     for result in results:
-        for view, (low, high) in _views(settings, result).items():
+        for view, (low, high) in _view_ranges(settings, result).items():
             group = groups.setdefault((result.cell.values["network"], view), {kind: [] for kind in KINDS})
             for kind in KINDS:
-                hits = zip(hits_of(result.answers["hits"][kind][0]), result.answers["azimuth_deg"], strict=True)
+                hits = zip(parse_hits(result.answers["hits"][kind][0]), result.answers["azimuth_deg"], strict=True)
                 group[kind] += [hit for hit, azimuth in hits if low <= azimuth <= high]
     rows = tuple(
         (*key, *(rate(group[kind]) for kind in KINDS), estimate_difference(group["3d"], group["2d"]))
@@ -224,7 +234,9 @@ def _by_cell(results: Sequence[Result]) -> Table:
     for result in results:
         gain = Record([result], "3d").gain(Record([result], "2d"))[0]
         passes = result.answers["passes"]
-        rows.append((*who(result), *(_mean([result], kind) for kind in KINDS), gain, passes["3d"], passes["2d"]))
+        rows.append(
+            (*cell_key(result), *(_mean_rate([result], kind) for kind in KINDS), gain, passes["3d"], passes["2d"])
+        )
     head = ("object", "network", "seed", *KINDS, "3d minus 2d", "passes 3d", "passes 2d")
     return Table("cells", "Cell by cell", head, tuple(rows), "Passes are views that the network saw in training.")
 
@@ -239,11 +251,11 @@ def figures(settings: Patch3dSettings, results: Sequence[Result]) -> list[Drawin
             [(first.cell.name, first.file(f"{first.cell.name}.png")) for first in firsts],
             (7.0, 1.3 * len(firsts) + 0.4),
             "2D design, pasted into an image, on the object; 3D design, on the object in the same view.",
-        ),
+        )
     ]
 
 
-def _views(settings: Patch3dSettings, result: Result) -> dict[str, tuple[float, float]]:
+def _view_ranges(settings: Patch3dSettings, result: Result) -> dict[str, tuple[float, float]]:
     if settings.views:
         return dict(settings.views)
     first, last = result.answers["azimuth_range_deg"]
@@ -251,7 +263,7 @@ def _views(settings: Patch3dSettings, result: Result) -> dict[str, tuple[float, 
     return dict(zip(("left", "middle", "right"), itertools.pairwise(edges), strict=True))
 
 
-def _mean(results: Sequence[Result], kind: str) -> float:
+def _mean_rate(results: Sequence[Result], kind: str) -> float:
     return float(np.mean(Record(results, kind).hits()))
 
 

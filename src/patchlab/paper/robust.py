@@ -16,20 +16,20 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 from pydantic import Field
 
-from patchlab.paper.sides import mean_color, sides
+from patchlab.paper.object_views import mean_color, views_from_sides
 from patchlab.study.figures import picture_sheet
-from patchlab.study.grid import grouped, of_values, problem_of, short_name
+from patchlab.study.grid import group_by, problem_of, short_name, values_key
 from patchlab.study.record import Record
 from patchlab.study.study import Cell, Result, Study
-from patchlab.study.trained import (
+from patchlab.study.trained_designs import (
+    NamePart,
+    SceneVariant,
     TrainedSettings,
-    Way,
-    Word,
-    answers_and_sheet,
-    tested_in,
+    ask_and_draw,
+    gain_word,
+    tested_networks,
     trained_cells,
-    trained_on,
-    verdict,
+    with_trainers,
 )
 from patchproof.base.color import linear_from_srgb, srgb_from_linear
 from patchproof.optimizer.loop import best_design
@@ -39,7 +39,7 @@ from patchproof.report.tables import Drawing, Table
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_SHEET_PX, _TURN_VIEWS, _SIDES = 160, 8, 3
+_SHEET_PX, _TURN_VIEWS, _SHEET_VIEWS = 160, 8, 3
 _KINDS = ("start", "design")
 
 
@@ -48,7 +48,7 @@ class RobustSettings(TrainedSettings):
 
     classes: Annotated[tuple[str | int, ...], Field(min_length=1)]  # in place of the scene's label
     # By name: tables of the scene file with the keys that change.
-    ways: dict[Word, Way] = Field({"free": {"patch": {"kind": "texture", "start": "gray"}}}, min_length=1)
+    ways: dict[NamePart, SceneVariant] = Field({"free": {"patch": {"kind": "texture", "start": "gray"}}}, min_length=1)
 
 
 def cells(settings: RobustSettings, base: Path) -> list[Cell]:
@@ -64,23 +64,23 @@ def run(settings: RobustSettings, base: Path, cell: Cell) -> dict[str, Any]:
     """Train for one class on one network; rates on all, pictures, mean color."""
     problem = problem_of(base, cell.values)
     subject = problem.subject
-    design = best_design(trained_on(problem, cell))
+    design = best_design(with_trainers(problem, cell))
     pixels = (subject.start(), from_pixels(design, problem.device))
     things = {kind: subject.appearance(each) for kind, each in zip(_KINDS, pixels, strict=True)}
     suffix, content = subject.file(design)
     return {
-        **answers_and_sheet(problem, cell.name, things, settings.n, (sides(problem, _SIDES), _SHEET_PX)),
+        **ask_and_draw(problem, cell.name, things, settings.n, (views_from_sides(problem, _SHEET_VIEWS), _SHEET_PX)),
         "color": mean_color(problem, things["design"], _TURN_VIEWS, _SHEET_PX),
         f"{cell.name}.{suffix}": content,
     }
 
 
-Key = tuple  # scene, way, class, trained on
+DesignKey = tuple  # scene, way, class, trained on
 _HEAD = ("scene", "way", "class", "trained on")
 
 
-def _by_design(results: Sequence[Result]) -> Mapping[Key, Sequence[Result]]:
-    return grouped(results, of_values("name", "way", "class", "row"))
+def _by_design(results: Sequence[Result]) -> Mapping[DesignKey, Sequence[Result]]:
+    return group_by(results, values_key("name", "way", "class", "row"))
 
 
 def tables(settings: RobustSettings, results: Sequence[Result]) -> list[Table]:
@@ -88,10 +88,10 @@ def tables(settings: RobustSettings, results: Sequence[Result]) -> list[Table]:
     rates, colors = [], []
     for key, of_key in _by_design(results).items():
         design, begun = Record(of_key, "design"), Record(of_key, "start")
-        for network in tested_in(of_key):
+        for network in tested_networks(of_key):
             gain = design.gain(begun, network)[0]
             levels = begun.level(network)[0], *design.level(network)
-            rates.append((*key, short_name(network), *levels, gain, verdict(gain)))
+            rates.append((*key, short_name(network), *levels, gain, gain_word(gain)))
         codes = _mean_codes(of_key)
         colors.append((*key, _hex(codes), *codes))
     about = f"Over {settings.n} unseen conditions per seed, paired with the untrained start."
@@ -138,7 +138,7 @@ def figures(settings: RobustSettings, results: Sequence[Result]) -> list[Drawing
 
 
 def _color_grid(
-    figure: Figure, by_design: Mapping[Key, Sequence[Result]], rows: Sequence[tuple], networks: Sequence[str]
+    figure: Figure, by_design: Mapping[DesignKey, Sequence[Result]], rows: Sequence[tuple], networks: Sequence[str]
 ) -> None:
     picture, axes = np.ones((len(rows), len(networks), 3)), figure.add_subplot()
     for key, of_key in by_design.items():

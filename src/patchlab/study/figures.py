@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.image import AxesImage
 
-EMPTY = "#dddddd"  # where there is nothing to see
+EMPTY_COLOR = "#dddddd"  # where there is nothing to see
 
 
 def picture_sheet(
@@ -62,7 +62,7 @@ def number_grid(
 
     image = axes.imshow(values, cmap=colors, vmin=limits[0], vmax=limits[1], aspect="auto")
     for row, column in empty:
-        axes.add_patch(Rectangle((column - 0.5, row - 0.5), 1, 1, facecolor=EMPTY))
+        axes.add_patch(Rectangle((column - 0.5, row - 0.5), 1, 1, facecolor=EMPTY_COLOR))
     for (row, column), value in np.ndenumerate(values):
         red, green, blue, _ = image.cmap(image.norm(value))
         ink = "black" if (row, column) in empty or 0.3 * red + 0.6 * green + 0.1 * blue > 0.45 else "white"

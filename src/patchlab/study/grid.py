@@ -23,9 +23,9 @@ from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.scene.interface import Scene
 from patchproof.scene.scene import build_scene
 
-Values = dict[str, Any]  # of a cell: JSON values
-Tables = Mapping[str, Mapping[str, Any]]  # tables of a scene file with the keys that change
-Count = Annotated[int, Field(ge=1)]
+CellValues = dict[str, Any]  # of a cell: JSON values
+SceneChanges = Mapping[str, Mapping[str, Any]]  # tables of a scene file with the keys that change
+PositiveInt = Annotated[int, Field(ge=1)]
 Names = Annotated[tuple[str, ...], Field(min_length=1)]
 Seeds = Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)]
 Key = TypeVar("Key", bound=Hashable)
@@ -53,27 +53,27 @@ def short_name(name: str) -> str:
     return re.sub(r"[^\w.+-]", "-", Path(word).stem if "/" in word or word.endswith((".toml", ".onnx")) else word)[-40:]
 
 
-def scene_values(file: str, base: Path, tables: Tables | None = None, where: str = "") -> Values:
+def scene_values(file: str, base: Path, tables: SceneChanges | None = None, where: str = "") -> CellValues:
     """The values of a cell that say its scene: name, file, and all settings with keys of some tables changed."""
     path = Path(expand_path(file, base))
-    scene = _changed(read_toml(path), tables or {}, path.name + where)
+    scene = _changed_settings(read_toml(path), tables or {}, path.name + where)
     return {"name": short_name(file), "file": file, "scene": scene}
 
 
-def with_tables(values: Values, tables: Tables) -> Values:
+def with_scene_changes(values: CellValues, tables: SceneChanges) -> CellValues:
     """The values with keys of some of the scene's tables changed."""
-    return values | {"scene": _changed(values["scene"], tables, values["file"])}
+    return values | {"scene": _changed_settings(values["scene"], tables, values["file"])}
 
 
-def pairs(settings: GridSettings, base: Path) -> Iterator[Values]:
+def scene_network_pairs(settings: GridSettings, base: Path) -> Iterator[CellValues]:
     """The values of every scene before every single network, whose name tables say, but for the seed."""
     for file in settings.scenes:
-        values: Values = scene_values(file, base) | {"of_scene": not settings.networks}
+        values: CellValues = scene_values(file, base) | {"of_scene": not settings.networks}
         for network in settings.networks or values["scene"]["target"]["models"]:
             yield values | {"networks": [network], "network": short_name(network)}
 
 
-def cell_of(values: Values, seed: int, *words: str) -> Cell:
+def make_cell(values: CellValues, seed: int, *words: str) -> Cell:
     """A cell named after its scene, what the words say, and the seed."""
     name = ".".join((values["name"][:30], *words, str(seed)))
     return Cell(re.sub(r"[^\w=+.,-]+", "-", name), {**values, "seed": seed})
@@ -82,14 +82,14 @@ def cell_of(values: Values, seed: int, *words: str) -> Cell:
 def grid_cells(
     settings: GridSettings,
     base: Path,
-    vary: Callable[[Values], Iterable[tuple[Values, tuple[str, ...]]]] = lambda values: ((values, ()),),
+    vary: Callable[[CellValues], Iterable[tuple[CellValues, tuple[str, ...]]]] = lambda values: ((values, ()),),
 ) -> list[Cell]:
     """A cell for every scene before every single network, each of its variants (values, and words for the name), and
     every seed.
     """
     return [
-        cell_of(varied, seed, values["network"], *words)
-        for values in pairs(settings, base)
+        make_cell(varied, seed, values["network"], *words)
+        for values in scene_network_pairs(settings, base)
         for varied, words in vary(values)
         for seed in settings.seeds
     ]
@@ -98,21 +98,21 @@ def grid_cells(
 def scene_of(base: Path, values: Mapping[str, Any]) -> Scene:
     """The scene that a cell's values hold, its paths relative to the scene file's folder."""
     settings = validate_model(SceneSettings, values["scene"], values["file"])
-    return build_scene(settings, _folder(base, values), values["seed"])
+    return build_scene(settings, _scene_folder(base, values), values["seed"])
 
 
-def networks_at(base: Path, values: Mapping[str, Any]) -> tuple[str, ...]:
+def network_names(base: Path, values: Mapping[str, Any]) -> tuple[str, ...]:
     """The values' networks, their paths relative to the config or, where it names none, to the scene."""
-    folder = _folder(base, values) if values["of_scene"] else base
+    folder = _scene_folder(base, values) if values["of_scene"] else base
     return tuple(expand_path(name, folder) for name in values["networks"])
 
 
 def problem_of(base: Path, values: Mapping[str, Any]) -> Problem:
     """The values' scene before their networks."""
-    return set_problem(scene_of(base, values), models=networks_at(base, values))
+    return set_problem(scene_of(base, values), models=network_names(base, values))
 
 
-def grouped(results: Iterable[Result], key: Callable[[Result], Key]) -> dict[Key, list[Result]]:
+def group_by(results: Iterable[Result], key: Callable[[Result], Key]) -> dict[Key, list[Result]]:
     """Results by key, keys in the order they come."""
     groups: dict[Key, list[Result]] = {}
     for result in results:
@@ -120,23 +120,23 @@ def grouped(results: Iterable[Result], key: Callable[[Result], Key]) -> dict[Key
     return groups
 
 
-def of_values(*names: str) -> Callable[[Result], tuple]:
+def values_key(*names: str) -> Callable[[Result], tuple]:
     """A key to group by: these values of a result's cell."""
     return lambda result: tuple(result.cell.values[name] for name in names)
 
 
 def by_scene(results: Sequence[Result]) -> dict[str, list[Result]]:
     """Results by their scene's name."""
-    return grouped(results, lambda result: result.cell.values["name"])
+    return group_by(results, lambda result: result.cell.values["name"])
 
 
-who = of_values("name", "network", "seed")  # scene, network and seed, as tables begin
+cell_key = values_key("name", "network", "seed")  # scene, network and seed, as tables begin
 
 
-def _changed(data: Mapping[str, Any], tables: Tables, where: str) -> dict[str, Any]:
+def _changed_settings(data: Mapping[str, Any], tables: SceneChanges, where: str) -> dict[str, Any]:
     whole = {**data, **{name: {**data.get(name, {}), **keys} for name, keys in tables.items()}}
     return validate_model(SceneSettings, whole, where).model_dump(mode="json")
 
 
-def _folder(base: Path, values: Mapping[str, Any]) -> Path:
+def _scene_folder(base: Path, values: Mapping[str, Any]) -> Path:
     return Path(expand_path(values["file"], base)).resolve().parent

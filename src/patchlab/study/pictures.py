@@ -30,7 +30,7 @@ def contact_sheet(rows: Sequence[Sequence[Tensor] | Tensor]) -> bytes:
     return png(as_pixels(torch.cat([torch.cat(list(row), 2) for row in rows], 1)))
 
 
-def enlarged(pixels: np.ndarray, side_px: int) -> Tensor:
+def enlarge_design(pixels: np.ndarray, side_px: int) -> Tensor:
     """A design H×W×3 in the middle of a white square 3×S×S, as large as fits, so that its pixels can be seen."""
     height, width = pixels.shape[:2]
     scale = side_px / max(height, width)

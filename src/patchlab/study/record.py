@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from patchlab.study.claims import mean
+from patchlab.study.estimates import mean
 from patchlab.study.study import Result
 from patchproof.base.geometry import apply_homography
 from patchproof.base.goal import Goal
@@ -21,27 +21,27 @@ from patchproof.evidence.results import Geometry
 from patchproof.optimizer.responses import Responses
 
 
-def recorded(answers: Mapping[str, Responses]) -> dict[str, Any]:
+def answers_record(answers: Mapping[str, Responses]) -> dict[str, Any]:
     """Hits and confidences as JSON values, each per shown thing and network."""
     return {
-        "hits": {thing: [bits(row) for row in answer.recognized] for thing, answer in answers.items()},
+        "hits": {thing: [hits_text(row) for row in answer.recognized] for thing, answer in answers.items()},
         "confidence": {thing: np.round(answer.confidence, 5).tolist() for thing, answer in answers.items()},
     }
 
 
-def bits(hits: Sequence[bool] | np.ndarray) -> str:
+def hits_text(hits: Sequence[bool] | np.ndarray) -> str:
     """Hits as a text of 0 and 1."""
     return "".join("01"[int(hit)] for hit in hits)
 
 
-def hits_of(text: str) -> list[bool]:
-    """The hits of `bits`."""
+def parse_hits(text: str) -> list[bool]:
+    """The hits of `hits_text`."""
     return [digit == "1" for digit in text]
 
 
 def rate_of(result: Result, thing: str) -> float:
     """The rate of a shown thing before the first of its cell's networks."""
-    return float(np.mean(hits_of(result.answers["hits"][thing][0])))
+    return float(np.mean(parse_hits(result.answers["hits"][thing][0])))
 
 
 def gain_of(result: Result, thing: str, other: str) -> float:
@@ -49,7 +49,7 @@ def gain_of(result: Result, thing: str, other: str) -> float:
     return Goal(result.cell.values["scene"]["target"]["goal"]).sign * (rate_of(result, thing) - rate_of(result, other))
 
 
-def hardest(result: Result, controls: Sequence[str]) -> str:
+def hardest_control(result: Result, controls: Sequence[str]) -> str:
     """The control that is hardest to beat."""
     return max(controls, key=lambda name: gain_of(result, name, controls[0]))
 
@@ -79,7 +79,7 @@ class Record:
 
     def hits(self, network: str | None = None, among: Iterable[Hashable] | None = None) -> list[bool]:
         """Recognized or not, per condition."""
-        return [hit for text in self._rows("hits", network, among) for hit in hits_of(text)]
+        return [hit for text in self._rows("hits", network, among) for hit in parse_hits(text)]
 
     def confidences(self, network: str | None = None, among: Iterable[Hashable] | None = None) -> list[float]:
         """The target's confidence, per condition."""

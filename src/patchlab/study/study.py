@@ -38,20 +38,20 @@ STUDIES: dict[str, str] = {
     "detection": "patchlab.validation.detection",
     "envelope": "patchlab.validation.envelope.sweeps",
     "forecasts": "patchlab.validation.forecasts",
-    "harden": "patchlab.harden.folder",
+    "harden": "patchlab.harden.harden_study",
     "layouts": "patchlab.validation.layouts",
     "ledger": "patchlab.validation.ledger_trials",
     "patch2d": "patchlab.paper.patch2d",
     "patch3d": "patchlab.paper.patch3d",
     "peers": "patchlab.bench.peers",
     "promises": "patchlab.validation.promises",
-    "real": "patchlab.validation.real",
+    "real": "patchlab.validation.real_photos",
     "robust": "patchlab.paper.robust",
     "stress": "patchlab.paper.stress",
     "transfer": "patchlab.paper.transfer",
     "verdicts": "patchlab.validation.verdicts",
 }
-_NAME = re.compile(r"[\w=+.,-]{1,120}")
+_CELL_NAME = re.compile(r"[\w=+.,-]{1,120}")
 
 
 @dataclass(frozen=True)
@@ -102,11 +102,11 @@ class Study:
     @property
     def about(self) -> str:
         """What it is about, in one line."""
-        return first_line(self.run.__module__)
+        return module_summary(self.run.__module__)
 
 
 @dataclass(frozen=True)
-class Finished:
+class FinishedStudy:
     """A study's tables and what failed, cell by cell."""
 
     tables: tuple[Table, ...]
@@ -121,7 +121,7 @@ def load_study(name: str) -> Study:
     return import_module(STUDIES[name]).STUDY
 
 
-def first_line(module: str) -> str:
+def module_summary(module: str) -> str:
     """What a study's module is about: the first line of its docstring; it is not imported."""
     spec = find_spec(module)
     source = "" if spec is None or spec.origin is None else Path(spec.origin).read_text(encoding="utf-8")
@@ -141,36 +141,38 @@ class Work:
     on_cell: Callable[[int, int], None] = lambda done, total: None
 
 
-HERE = Work()  # in this process, into a new folder
+DEFAULT_WORK = Work()  # in this process, into a new folder
 
 
-def run_study(name: str, config: str | Path, out: str | Path, work: Work = HERE) -> Finished:
+def run_study(name: str, config: str | Path, out: str | Path, work: Work = DEFAULT_WORK) -> FinishedStudy:
     """Run the study that the TOML file describes into the folder `out`."""
     study = load_study(name)
     settings = validate_model(study.settings, read_toml(config), str(config))
-    return carry_out(study, settings, Path(config).resolve().parent, out, work)
+    return run_cells(study, settings, Path(config).resolve().parent, out, work)
 
 
-def carry_out(study: Study, settings: StrictModel, base: Path, out: str | Path, work: Work = HERE) -> Finished:
+def run_cells(
+    study: Study, settings: StrictModel, base: Path, out: str | Path, work: Work = DEFAULT_WORK
+) -> FinishedStudy:
     """Run a study with settings at hand."""
     out = Path(out)
     if not work.resume:
         unfinished = (out / f"{study.name}.json").is_file() and not (out / f"{study.name}.html").is_file()
-        check_folder(out, _own(study), work.overwrite, unfinished)
+        check_folder(out, _owned_patterns(study), work.overwrite, unfinished)
     cells = tuple(study.cells(settings, base))
     _check_cells(study, cells)
     with open_workers(work.jobs, work.cluster) as workers:
-        _begin(study, settings, out, work.resume)
-        kept = {cell.name: answers for cell in cells if (answers := _kept(out, cell)) is not None}
+        _prepare_folder(study, settings, out, work.resume)
+        kept = {cell.name: answers for cell in cells if (answers := _load_finished(out, cell)) is not None}
         todo = [cell for cell in cells if cell.name not in kept]
         failed: dict[str, str] = {}
         work.on_cell(len(kept), len(cells))
         do = partial(_run_cell, study.run, settings, base)
         for done, (number, future) in enumerate(workers.completed(do, todo), len(kept) + 1):
             cell = todo[number]
-            values, files, sentence = _outcome(future)
+            values, files, sentence = _future_outcome(future)
             if sentence is None:
-                kept[cell.name] = _keep(study, out, cell, values, files)
+                kept[cell.name] = _save_cell(study, out, cell, values, files)
             else:
                 failed[cell.name] = sentence
             work.on_cell(done, len(cells))
@@ -189,23 +191,23 @@ def carry_out(study: Study, settings: StrictModel, base: Path, out: str | Path, 
         more={"cells": {each.cell.name: {"cell": dict(each.cell.values), "found": each.answers} for each in results}},
     )
     write_results(out, page)
-    return Finished(tables, results, dict(page.failed))
+    return FinishedStudy(tables, results, dict(page.failed))
 
 
 def _check_cells(study: Study, cells: Sequence[Cell]) -> None:
     names = [cell.name for cell in cells]
-    bad = [name for name in names if not _NAME.fullmatch(name) or names.count(name) > 1]
+    bad = [name for name in names if not _CELL_NAME.fullmatch(name) or names.count(name) > 1]
     if bad:
         raise ValueError(f"cells of {study.name} need unique names that files can have, got {bad[0]!r}")
     if not cells:
         raise Refused(f"settings that leave the study {study.name} something to do", "no cells", "ask for more")
 
 
-def _own(study: Study) -> tuple[str, ...]:
+def _owned_patterns(study: Study) -> tuple[str, ...]:
     return (f"{study.name}.json", f"{study.name}.html", f"{study.name}_*", "cells", ".*.part", *study.own_files)
 
 
-def _begin(study: Study, settings: StrictModel, out: Path, resume: bool) -> None:
+def _prepare_folder(study: Study, settings: StrictModel, out: Path, resume: bool) -> None:
     """The study's settings in `out`, which must be the same where one goes on."""
     path, asked = out / f"{study.name}.json", settings.model_dump(mode="json")
     if resume and path.is_file():
@@ -215,7 +217,7 @@ def _begin(study: Study, settings: StrictModel, out: Path, resume: bool) -> None
     else:
         if resume:  # nothing was begun: as without it, so that no stranger's files are mistaken for the study's
             check_folder(out, ())
-        for pattern in _own(study):
+        for pattern in _owned_patterns(study):
             for old in out.glob(pattern):
                 shutil.rmtree(old) if old.is_dir() else old.unlink()
         make_folder(out)
@@ -223,7 +225,7 @@ def _begin(study: Study, settings: StrictModel, out: Path, resume: bool) -> None
     make_folder(out / "cells")
 
 
-def _kept(out: Path, cell: Cell) -> dict[str, Any] | None:
+def _load_finished(out: Path, cell: Cell) -> dict[str, Any] | None:
     """What an earlier run found for this very cell, with its files in place."""
     path = out / "cells" / f"{cell.name}.json"
     if not path.is_file():
@@ -232,7 +234,7 @@ def _kept(out: Path, cell: Cell) -> dict[str, Any] | None:
         kept = _read(path)
     except Refused:  # cut short when the machine went down
         return None
-    if kept.get("cell") != _through_json(cell.values) or not all((out / name).is_file() for name in kept["files"]):
+    if kept.get("cell") != _as_json_values(cell.values) or not all((out / name).is_file() for name in kept["files"]):
         return None
     return kept["found"]
 
@@ -248,24 +250,24 @@ def _run_cell(
         with use_threads(1):
             answers = run(settings, base, cell)
         files = {key: value for key, value in answers.items() if isinstance(value, bytes)}
-        return _through_json({key: value for key, value in answers.items() if key not in files}), files, None
+        return _as_json_values({key: value for key, value in answers.items() if key not in files}), files, None
     except Exception as error:  # also what a user's own network raises
-        return {}, {}, _sentence(error)
+        return {}, {}, _error_text(error)
 
 
-def _outcome(future: Future) -> Outcome:
+def _future_outcome(future: Future) -> Outcome:
     try:
         return result_of(future)
     except Exception as error:  # a worker that died
-        return {}, {}, _sentence(error)
+        return {}, {}, _error_text(error)
 
 
-def _sentence(error: Exception) -> str:
+def _error_text(error: Exception) -> str:
     text = " ".join(str(error).split())[:500]
     return text if isinstance(error, Refused) else f"{type(error).__name__}: {text}"
 
 
-def _keep(study: Study, out: Path, cell: Cell, values: dict, files: dict[str, bytes]) -> dict[str, Any]:
+def _save_cell(study: Study, out: Path, cell: Cell, values: dict, files: dict[str, bytes]) -> dict[str, Any]:
     """Write the cell's files, then its JSON, each whole: the JSON says that all of it is there."""
     names = {key: (Path(study.files) / key).as_posix() for key in files}
     for key, name in names.items():
@@ -276,7 +278,7 @@ def _keep(study: Study, out: Path, cell: Cell, values: dict, files: dict[str, by
     return values | names
 
 
-def _through_json(values: Mapping[str, Any]) -> dict[str, Any]:
+def _as_json_values(values: Mapping[str, Any]) -> dict[str, Any]:
     """What a reader of the JSON will find, also now: a resumed study must not see other types than one in one go."""
     return json.loads(json.dumps(dict(values), allow_nan=False))
 

@@ -19,12 +19,12 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from patchlab.training.pictures import HELD_OUT, Pictures, kept, pictures
+from patchlab.training.pictures import HELD_OUT_SEED, Pictures, load_or_render, render_pictures
 from patchproof.scene import patterns
 
 
 @dataclass(frozen=True)
-class Recipe:
+class TrainingRecipe:
     """Everything that decides the weights, but for the machine's rounding."""
 
     seed: int = 0
@@ -38,7 +38,7 @@ class Recipe:
     threads: int = 1
 
 
-R = TypeVar("R", bound=Recipe)
+RecipeType = TypeVar("RecipeType", bound=TrainingRecipe)
 Epochs = Iterator[tuple[int, float, nn.Module]]  # after each epoch: its number, its mean loss, the network as it is
 
 
@@ -50,22 +50,22 @@ class Seconds(NamedTuple):
 
 
 def run(
-    make: type[R],
+    make: type[RecipeType],
     about: str,
     input_px: int,
-    train: Callable[[Pictures, R], Epochs],
+    train: Callable[[Pictures, RecipeType], Epochs],
     score: Callable[[nn.Module, Pictures], np.ndarray],
-    write: Callable[[Path, nn.Module, R, Pictures, Seconds], None],
-    seen: Callable[[Pictures, R], Pictures] = lambda shown, recipe: shown,
+    write: Callable[[Path, nn.Module, RecipeType, Pictures, Seconds], None],
+    seen: Callable[[Pictures, RecipeType], Pictures] = lambda shown, recipe: shown,
 ) -> None:
     """The command: render at `input_px`, train, judge every fourth epoch by the mean of `score`, and write the network;
     `seen` makes of rendered pictures those that the recipe's network takes.
     """
-    out, folder, recipe = _asked(make, about)
+    out, folder, recipe = _parse_options(make, about)
     torch.set_num_threads(recipe.threads)
     started = time.time()
-    render = pictures if folder is None else lambda *what: kept(folder, *what)
-    held_out = seen(render(recipe.held_out_per_class, recipe.seed + HELD_OUT, input_px), recipe)
+    render = render_pictures if folder is None else lambda *what: load_or_render(folder, *what)
+    held_out = seen(render(recipe.held_out_per_class, recipe.seed + HELD_OUT_SEED, input_px), recipe)
     training = seen(render(recipe.pictures_per_class, recipe.seed, input_px), recipe)
     rendered = time.time()
     for epoch, loss, network in train(training, recipe):
@@ -78,7 +78,7 @@ def run(
             write(out, network.eval(), recipe, held_out, seconds)
 
 
-def _asked(make: type[R], about: str) -> tuple[Path, Path | None, R]:
+def _parse_options(make: type[RecipeType], about: str) -> tuple[Path, Path | None, RecipeType]:
     parser = argparse.ArgumentParser(description=about)
     parser.add_argument("--out", type=Path, required=True, help="folder for the weights and their card")
     parser.add_argument("--pictures", type=Path, help="folder that keeps the rendered pictures for further trainings")
@@ -88,10 +88,10 @@ def _asked(make: type[R], about: str) -> tuple[Path, Path | None, R]:
     return options.pop("out"), options.pop("pictures"), make(**options)
 
 
-def epochs(
+def train_epochs(
     make: Callable[[], nn.Module],
     shown: Pictures,
-    recipe: Recipe,
+    recipe: TrainingRecipe,
     loss_of: Callable[[nn.Module, Tensor, Tensor, np.random.Generator], Tensor],
 ) -> Epochs:
     """Learn by `loss_of(network, rows of the pictures, cards to paste on, generator)`, batch after batch."""
@@ -103,7 +103,7 @@ def epochs(
     steps = recipe.epochs * (len(shown.images) // recipe.batch)
     optimizer = torch.optim.AdamW(network.parameters(), recipe.learning_rate, weight_decay=recipe.weight_decay)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, recipe.learning_rate, total_steps=steps, pct_start=0.15)
-    cards = torch.from_numpy(np.stack([_card(rng) for _ in range(256)])).permute(0, 3, 1, 2)
+    cards = torch.from_numpy(np.stack([_draw_card(rng) for _ in range(256)])).permute(0, 3, 1, 2)
     for epoch in range(recipe.epochs):
         losses, order = [], torch.randperm(len(shown.images))
         for rows in order[: len(order) // recipe.batch * recipe.batch].split(recipe.batch):
@@ -116,7 +116,7 @@ def epochs(
         yield epoch, float(np.mean(losses)), network
 
 
-def _card(rng: np.random.Generator, px: int = 40) -> np.ndarray:
+def _draw_card(rng: np.random.Generator, px: int = 40) -> np.ndarray:
     """P×P×3 float32 in [0, 1]: anything, mostly in a frame of white paper with black blocks on it."""
     picture = patterns.texture(rng, px)
     if rng.random() < 0.6:
@@ -129,7 +129,7 @@ def _card(rng: np.random.Generator, px: int = 40) -> np.ndarray:
     return picture.astype(np.float32)
 
 
-def folded(trained: nn.Module) -> nn.Module:
+def fold_batch_norm(trained: nn.Module) -> nn.Module:
     """The same function without BatchNorm: its scale and shift moved into the convolutions (evaluation statistics)."""
     plain = copy.deepcopy(trained).eval()
     for parent in list(plain.modules()):

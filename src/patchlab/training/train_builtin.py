@@ -22,15 +22,15 @@ import torch
 from torch import Tensor
 
 from patchlab.training import fit
-from patchlab.training.card import by_class, exported, stored, write_card
-from patchlab.training.pictures import Pictures, augmented, reduced
+from patchlab.training.card import export_onnx, round_by_class, store_float16, write_card
+from patchlab.training.pictures import Pictures, augment, shrink_pictures
 from patchproof.classifier.builtin import DEVIATION, INPUT_PX, MEAN, SmallNetwork
 from patchproof.classifier.zoo import Normalized
 from patchproof.mesh import primitives
 
 
 @dataclass(frozen=True)
-class Recipe(fit.Recipe):
+class ClassifierRecipe(fit.TrainingRecipe):
     """The built-in network's, or another's."""
 
     label_smoothing: float = 0.1  # keeps the softmax off its ends, where gradients vanish
@@ -40,18 +40,18 @@ class Recipe(fit.Recipe):
     input_px: int = INPUT_PX  # what another one takes of the pictures' 96
 
 
-def train(shown: Pictures, recipe: Recipe) -> fit.Epochs:
+def train(shown: Pictures, recipe: ClassifierRecipe) -> fit.Epochs:
     """After each epoch: its number, its mean loss, and the network as it is."""
     loss_of = torch.nn.CrossEntropyLoss(label_smoothing=recipe.label_smoothing)
 
     def learn(network: torch.nn.Module, rows: Tensor, cards: Tensor, rng: np.random.Generator) -> Tensor:
-        batch, _ = augmented(shown.images[rows], shown.boxes[rows], cards, rng, recipe.pasted)
+        batch, _ = augment(shown.images[rows], shown.boxes[rows], cards, rng, recipe.pasted)
         return loss_of(network(batch.contiguous(memory_format=torch.channels_last)), shown.labels[rows])
 
-    return fit.epochs(lambda: untrained(recipe), shown, recipe, learn)
+    return fit.train_epochs(lambda: build_network(recipe), shown, recipe, learn)
 
 
-def untrained(recipe: Recipe) -> torch.nn.Module:
+def build_network(recipe: ClassifierRecipe) -> torch.nn.Module:
     """The recipe's network: N×3×S×S sRGB in [0, 1] → N×K logits."""
     classes = len(primitives.primitive_names())
     if not recipe.network:
@@ -60,26 +60,28 @@ def untrained(recipe: Recipe) -> torch.nn.Module:
     return Normalized(made, [MEAN] * 3, [DEVIATION] * 3)
 
 
-def write(out: Path, trained: torch.nn.Module, recipe: Recipe, held_out: Pictures, seconds: fit.Seconds) -> None:
+def write(
+    out: Path, trained: torch.nn.Module, recipe: ClassifierRecipe, held_out: Pictures, seconds: fit.Seconds
+) -> None:
     """The network and what is known about it; the accuracy is that of what is stored."""
     if recipe.network:
-        network, count = trained, exported(trained, out / f"{recipe.name}.onnx", recipe.input_px)
+        network, count = trained, export_onnx(trained, out / f"{recipe.name}.onnx", recipe.input_px)
     else:
-        network = fit.folded(trained)
-        count = stored(network, out / f"{recipe.name}.safetensors")
-    right = accuracy(network, held_out)
+        network = fit.fold_batch_norm(trained)
+        count = store_float16(network, out / f"{recipe.name}.safetensors")
+    right = accuracy_by_class(network, held_out)
     figures = {
         "input_px": recipe.input_px,
         "weights": count,
         "held_out_accuracy": round(float(right.mean()), 4),
-        "held_out_accuracy_by_class": by_class(right),
+        "held_out_accuracy_by_class": round_by_class(right),
     }
     write_card(out / f"{recipe.name}.json", figures, "train_builtin", recipe, seconds)
     print(f"held-out accuracy {figures['held_out_accuracy']:.3f}: {figures['held_out_accuracy_by_class']}")
 
 
 @torch.no_grad()
-def accuracy(network: torch.nn.Module, shown: Pictures) -> np.ndarray:
+def accuracy_by_class(network: torch.nn.Module, shown: Pictures) -> np.ndarray:
     """Share of right answers, class by class."""
     was_training = network.training
     network.eval()
@@ -93,7 +95,15 @@ def accuracy(network: torch.nn.Module, shown: Pictures) -> np.ndarray:
 def main() -> None:
     """Render, train, measure, and write the network with its card."""
     about = "Train a network to name objects in procedural renders."
-    fit.run(Recipe, about, INPUT_PX, train, accuracy, write, lambda shown, recipe: reduced(shown, recipe.input_px))
+    fit.run(
+        ClassifierRecipe,
+        about,
+        INPUT_PX,
+        train,
+        accuracy_by_class,
+        write,
+        lambda shown, recipe: shrink_pictures(shown, recipe.input_px),
+    )
 
 
 if __name__ == "__main__":

@@ -21,8 +21,8 @@ import torch
 from torch import Tensor
 
 from patchlab.training import fit
-from patchlab.training.card import by_class, stored, write_card
-from patchlab.training.pictures import Pictures, augmented
+from patchlab.training.card import round_by_class, store_float16, write_card
+from patchlab.training.pictures import Pictures, augment
 from patchproof.classifier.average_precision import Detection, average_precision, find_detections
 from patchproof.classifier.builtin_detector import INPUT_PX, SmallDetector, centers_px
 from patchproof.classifier.detector import iou
@@ -30,7 +30,7 @@ from patchproof.mesh import primitives
 
 
 @dataclass(frozen=True)
-class Recipe(fit.Recipe):
+class DetectorRecipe(fit.TrainingRecipe):
     """Fewer pictures than the classifier's, some of them made of four."""
 
     pictures_per_class: int = 1200
@@ -38,15 +38,17 @@ class Recipe(fit.Recipe):
     mosaics: float = 0.33  # share that is made of four
 
 
-def train(shown: Pictures, recipe: Recipe) -> fit.Epochs:
+def train(shown: Pictures, recipe: DetectorRecipe) -> fit.Epochs:
     """After each epoch: its number, its mean loss, and the network as it is."""
 
     def learn(network: torch.nn.Module, rows: Tensor, cards: Tensor, rng: np.random.Generator) -> Tensor:
-        images, boxes = augmented(shown.images[rows], shown.boxes[rows], cards, rng, recipe.pasted, widest=1.4)
+        images, boxes = augment(shown.images[rows], shown.boxes[rows], cards, rng, recipe.pasted, widest=1.4)
         images, labels, boxes = with_mosaics(images, shown.labels[rows], boxes, recipe.mosaics, rng)
-        return loss_of(network(images.contiguous(memory_format=torch.channels_last)), labels, boxes * INPUT_PX)
+        return detector_loss(network(images.contiguous(memory_format=torch.channels_last)), labels, boxes * INPUT_PX)
 
-    return fit.epochs(lambda: SmallDetector(len(primitives.primitive_names()), batch_norm=True), shown, recipe, learn)
+    return fit.train_epochs(
+        lambda: SmallDetector(len(primitives.primitive_names()), batch_norm=True), shown, recipe, learn
+    )
 
 
 def with_mosaics(
@@ -70,10 +72,10 @@ def with_mosaics(
     return mixed, all_labels, all_boxes
 
 
-def loss_of(candidates: Tensor, labels: Tensor, boxes_px: Tensor) -> Tensor:
+def detector_loss(candidates: Tensor, labels: Tensor, boxes_px: Tensor) -> Tensor:
     """Of candidates N×A×(4+K) before objects with labels N×M (-1: none) and boxes N×M×4: names and boxes together."""
     boxes, logits = candidates.split([4, candidates.shape[-1] - 4], -1)
-    answers_for = owners(labels, boxes_px)
+    answers_for = assign_objects(labels, boxes_px)
     view, cell = torch.nonzero(answers_for >= 0, as_tuple=True)
     mine = answers_for[view, cell]
     truth, own = boxes_px[view, mine], boxes[view, cell]
@@ -86,7 +88,7 @@ def loss_of(candidates: Tensor, labels: Tensor, boxes_px: Tensor) -> Tensor:
     return (focus * entropy).sum() / count + (1 - overlap + hull_share).sum() / count
 
 
-def owners(labels: Tensor, boxes_px: Tensor) -> Tensor:
+def assign_objects(labels: Tensor, boxes_px: Tensor) -> Tensor:
     """N×A: which of the M objects a cell answers for, the smallest whose middle half it lies in or whose center lies in
     it; -1 for none.
     """
@@ -111,7 +113,7 @@ def _overlaps(own: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
 
 
 @torch.no_grad()
-def found_by_class(network: torch.nn.Module, shown: Pictures) -> list[list[Detection]]:
+def detections_by_class(network: torch.nn.Module, shown: Pictures) -> list[list[Detection]]:
     """All that is found of each class in pictures with one object each."""
     was_training = network.training
     network.eval()
@@ -121,29 +123,31 @@ def found_by_class(network: torch.nn.Module, shown: Pictures) -> list[list[Detec
     return [find_detections(candidates, [label], boxes_px, (shown.labels == label).tolist()) for label in labels]
 
 
-def scored(network: torch.nn.Module, shown: Pictures) -> np.ndarray:
+def score_network(network: torch.nn.Module, shown: Pictures) -> np.ndarray:
     """AP50 of each class of what a network finds."""
-    return precision(found_by_class(network, shown), shown)
+    return ap50_by_class(detections_by_class(network, shown), shown)
 
 
-def precision(found: Sequence[Sequence[Detection]], shown: Pictures) -> np.ndarray:
+def ap50_by_class(found: Sequence[Sequence[Detection]], shown: Pictures) -> np.ndarray:
     """AP50 of each class."""
     counts = shown.labels.bincount(minlength=len(found)).tolist()
     return np.array([average_precision(each, count) for each, count in zip(found, counts, strict=True)])
 
 
-def write(out: Path, trained: torch.nn.Module, recipe: Recipe, held_out: Pictures, seconds: fit.Seconds) -> None:
+def write(
+    out: Path, trained: torch.nn.Module, recipe: DetectorRecipe, held_out: Pictures, seconds: fit.Seconds
+) -> None:
     """The weights and what is known about them; the precision is that of the stored weights."""
-    network = fit.folded(trained)
-    count = stored(network, out / "builtin_detector.safetensors")
-    found = found_by_class(network, held_out)
-    ap50 = precision(found, held_out)
+    network = fit.fold_batch_norm(trained)
+    count = store_float16(network, out / "builtin_detector.safetensors")
+    found = detections_by_class(network, held_out)
+    ap50 = ap50_by_class(found, held_out)
     figures = {
         "input_px": INPUT_PX,
         "weights": count,
         "least_score": best_score(chain(*found), len(held_out.labels)),  # of best F1 on the held-out pictures
         "held_out_ap50": round(float(ap50.mean()), 4),
-        "held_out_ap50_by_class": by_class(ap50),
+        "held_out_ap50_by_class": round_by_class(ap50),
     }
     write_card(out / "builtin_detector.json", figures, "train_detector", recipe, seconds)
     print(f"held-out AP50 {figures['held_out_ap50']:.3f}: {figures['held_out_ap50_by_class']}")
@@ -162,7 +166,9 @@ def best_score(found: Iterable[Detection], objects: int) -> float:
 
 def main() -> None:
     """Render, train, measure, and write the network with its card."""
-    fit.run(Recipe, "Train the built-in detector from procedural renders.", INPUT_PX, train, scored, write)
+    fit.run(
+        DetectorRecipe, "Train the built-in detector from procedural renders.", INPUT_PX, train, score_network, write
+    )
 
 
 if __name__ == "__main__":

@@ -24,9 +24,9 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field
 
-from patchlab.study.claims import mean
-from patchlab.study.grid import GridSettings, Names, Values, grid_cells, grouped, of_values, problem_of, who
-from patchlab.study.record import hits_of, recorded
+from patchlab.study.estimates import mean
+from patchlab.study.grid import CellValues, GridSettings, Names, cell_key, grid_cells, group_by, problem_of, values_key
+from patchlab.study.record import answers_record, parse_hits
 from patchlab.study.study import Cell, Result, Study
 from patchproof.app.plan.terms import PRINTER, Setup, effect_terms, scene_terms
 from patchproof.base.errors import Refused
@@ -49,18 +49,18 @@ from patchproof.reprints.path_traced import photograph_traced
 from patchproof.scene.conditions import Conditions, draw
 from patchproof.scene.conditions import without_effect as drawn_without
 
-ALL = "all"
+ALL_EFFECTS = "all"
 # What goes together, because alone it is too little to tell.
-_TOGETHER = ("dot gain + ink density + printed black", "blur + motion blur")
-_UNSEEN = "JPEG"  # training's views are too small to show it
+_EFFECT_GROUPS = ("dot gain + ink density + printed black", "blur + motion blur")
+_INVISIBLE_EFFECT = "JPEG"  # training's views are too small to show it
 
 
 def _default_effects() -> tuple[str, ...]:
     """All effects that `plan` can switch off, in its order."""
     printed = (PRINTER, *(term.name for term in effect_terms("printer")))
     names = (*(term.name for term in effect_terms("light")), *printed, *(term.name for term in effect_terms("camera")))
-    merge_responses = {name: group for group in _TOGETHER for name in group.split(" + ")}
-    return tuple(dict.fromkeys(merge_responses.get(name, name) for name in names if name != _UNSEEN))
+    joined = {name: group for group in _EFFECT_GROUPS for name in group.split(" + ")}
+    return tuple(dict.fromkeys(joined.get(name, name) for name in names if name != _INVISIBLE_EFFECT))
 
 
 EFFECTS = _default_effects()
@@ -76,7 +76,7 @@ class AblationSettings(GridSettings):
 
 
 @dataclass(frozen=True, eq=False)
-class Without(Problem):
+class SimplifiedProblem(Problem):
     """A problem that sees its views without some effects."""
 
     changes: tuple[Callable[[Setup], Setup | None], ...] = ()
@@ -97,7 +97,7 @@ class Without(Problem):
         return setup
 
 
-def without(problem: Problem, effect: str) -> Problem:
+def simplify_problem(problem: Problem, effect: str) -> Problem:
     """The problem without the effects of that name, joined by " + "; refused where none of them is on."""
     terms = {term.name: term for term in scene_terms(problem, problem.subject.start(), None) if term.modeled}
     names = effect.split(" + ")
@@ -112,20 +112,20 @@ def without(problem: Problem, effect: str) -> Problem:
     if PRINTER in on:
         subject = subject.with_printer(identity_printer())
     changes = tuple(terms[name].change for name in on if name != PRINTER)
-    return Without(**vars(replace(problem, subject=subject)), changes=changes)
+    return SimplifiedProblem(**vars(replace(problem, subject=subject)), changes=changes)
 
 
 def cells(settings: AblationSettings, base: Path) -> list[Cell]:
     """For each scene, network and seed: a design trained with all effects, and one without each that is on."""
 
-    def vary(values: Values) -> list[tuple[Values, tuple[str, ...]]]:
+    def vary(values: CellValues) -> list[tuple[CellValues, tuple[str, ...]]]:
         on = [effect for effect in settings.effects if _is_on(values, effect)]
-        return [(values | {"effect": effect}, (effect[:40],)) for effect in (ALL, *on)]
+        return [(values | {"effect": effect}, (effect[:40],)) for effect in (ALL_EFFECTS, *on)]
 
     return grid_cells(settings, base, vary)
 
 
-def _is_on(values: Values, effect: str) -> bool:
+def _is_on(values: CellValues, effect: str) -> bool:
     """Whether the scene has one of the effects joined by " + "; one that is no row of `EFFECTS` counts as on."""
     scene = validate_model(SceneSettings, values["scene"], values["file"])
     drawn = draw(scene, "select", 64, 0)
@@ -140,22 +140,22 @@ def _is_on(values: Values, effect: str) -> bool:
 def run(settings: AblationSettings, base: Path, cell: Cell) -> dict[str, Any]:
     """Train without the effect; hits and confidences in the whole world, and without the effect in it."""
     problem, effect = problem_of(base, cell.values), cell.values["effect"]
-    simpler = problem if effect == ALL else without(problem, effect)
+    simpler = problem if effect == ALL_EFFECTS else simplify_problem(problem, effect)
     design = best_design(simpler)
     shown = problem.subject.appearance(from_pixels(design, problem.device))
     conditions = problem.scene.draw("evaluate", settings.n, per_session=VIEWS_PER_SESSION)
     answers = {"modeled": responses(problem, {"design": shown}, conditions)}
-    if effect != ALL:
-        as_trained = simpler.subject.appearance(from_pixels(design, problem.device))
+    if effect != ALL_EFFECTS:
+        as_trained = simpler.subject.shown(from_pixels(design, problem.device))
         answers["promised"] = responses(simpler, {"design": as_trained}, conditions)
     if settings.photos:
         drawn = problem.scene.draw("reprint", settings.photos)
         piece = shown if isinstance(shown, PiecePicture) else None
         alone = [drawn[i : i + 1] for i in range(len(drawn))]
         photos = (photograph_traced(problem.stage, piece, each) for each in alone)
-        asked = (ask_networks(problem, photo, problem.boxes(each)) for photo, each in zip(photos, alone, strict=True))
-        answers["path_traced"] = merge_responses([{"design": answer} for answer in asked])
-    return {world: recorded(some) for world, some in answers.items()}
+        asked = (ask(problem, photo, problem.boxes(each)) for photo, each in zip(photos, alone, strict=True))
+        answers["path_traced"] = joined([{"design": answer} for answer in asked])
+    return {world: answers_record(some) for world, some in answers.items()}
 
 
 def tables(settings: AblationSettings, results: Sequence[Result]) -> tuple[Table, ...]:
@@ -168,14 +168,14 @@ def tables(settings: AblationSettings, results: Sequence[Result]) -> tuple[Table
         "without it; “half width” is the mean of the promises' own 95 % intervals, “outside” counts designs "
     )
     missed_about += "whose rate in the whole world lies outside of them"
-    earned, missed, designs, groups = [], [], [], _groups(results)
+    earned, missed, designs, groups = [], [], [], _group_by_effect(results)
     for group in groups:
         designs += [_design_row(result) for result in group.values()]
     for effect in settings.effects:
-        compared = [(group[ALL], group[effect]) for group in groups if ALL in group and effect in group]
+        compared = [(group[ALL_EFFECTS], group[effect]) for group in groups if ALL_EFFECTS in group and effect in group]
         if compared:
-            earned.append((effect, len(compared), *_earned(compared)))
-            missed.append((effect, *_missed([less for _, less in compared])))
+            earned.append((effect, len(compared), *_mean_differences(compared)))
+            missed.append((effect, *_promise_errors([less for _, less in compared])))
     missed_head = ("left out", "designs", "rate", "confidence", "largest", "half width", "outside")
     start = ("scene", "network", "seed", "trained without", *head, "promised", "promised confidence")
     return (
@@ -186,34 +186,33 @@ def tables(settings: AblationSettings, results: Sequence[Result]) -> tuple[Table
 
 
 def _design_row(result: Result) -> tuple:
-    traced_and_ours = (*who(result), result.cell.values["effect"], *_means(result))
+    traced_and_ours = (*cell_key(result), result.cell.values["effect"], *_world_means(result))
     if "promised" not in result.answers:
         return (*traced_and_ours, None, None)
-    return (*traced_and_ours, _promised(result), _mean_of(result, "promised", "confidence"))
+    return (*traced_and_ours, _promised_rate(result), _mean_of(result, "promised", "confidence"))
 
 
-def _promised(result: Result) -> Estimate:
+def _promised_rate(result: Result) -> Estimate:
     """The rate in the world without the effect, with its interval over sessions as a promise has it."""
-    hits = hits_of(result.answers["promised"]["hits"]["design"][0])
-    posterior = rate_posterior(*count_by_session(hits, VIEWS_PER_SESSION))
-    return Estimate(float(np.mean(hits)), *posterior.rate_interval, len(hits))
+    hits = parse_hits(result.answers["promised"]["hits"]["design"][0])
+    return Estimate(float(np.mean(hits)), *rate_posterior(*count_by_session(hits, VIEWS_PER_SESSION)).rate, len(hits))
 
 
-def _missed(results: Sequence[Result]) -> tuple:
+def _promise_errors(results: Sequence[Result]) -> tuple:
     """(designs, rate, confidence, largest change of rate, mean half width of the promises, how many lie outside)."""
-    of_pairs = grouped(results, of_values("name", "network")).values()
+    of_pairs = group_by(results, values_key("name", "network")).values()
     rate, confidence = (
-        mean([float(np.mean([_off(result, kind) for result in pair])) for pair in of_pairs])
+        mean([float(np.mean([_promise_error(result, kind) for result in pair])) for pair in of_pairs])
         for kind in ("hits", "confidence")
     )
-    promises = [_promised(result) for result in results]
+    promises = [_promised_rate(result) for result in results]
     half = float(np.mean([(promise.high - promise.low) / 2 for promise in promises]))
     rates = [_mean_of(result, "modeled", "hits") for result in results]
     outside = sum(not promise.low <= rate <= promise.high for rate, promise in zip(rates, promises, strict=True))
-    return len(results), rate, confidence, max((_off(r, "hits") for r in results), key=abs), half, outside
+    return len(results), rate, confidence, max((_promise_error(r, "hits") for r in results), key=abs), half, outside
 
 
-def _off(result: Result, kind: str) -> float:
+def _promise_error(result: Result, kind: str) -> float:
     """What a design shows in the whole world more than it would be promised."""
     return _mean_of(result, "modeled", kind) - _mean_of(result, "promised", kind)
 
@@ -221,25 +220,28 @@ def _off(result: Result, kind: str) -> float:
 def _mean_of(result: Result, world: str, kind: str) -> float:
     """The rate ("hits") or mean confidence of a design in one of the worlds."""
     values = result.answers[world][kind]["design"][0]
-    return float(np.mean(hits_of(values) if kind == "hits" else values))
+    return float(np.mean(parse_hits(values) if kind == "hits" else values))
 
 
-def _groups(results: Sequence[Result]) -> list[dict[str, Result]]:
+def _group_by_effect(results: Sequence[Result]) -> list[dict[str, Result]]:
     """By scene, network and seed the results of each effect."""
-    groups = grouped(results, who).values()
+    groups = group_by(results, cell_key).values()
     return [{result.cell.values["effect"]: result for result in group} for group in groups]
 
 
-def _means(result: Result) -> list[float | None]:
+def _world_means(result: Result) -> list[float | None]:
     """Rate and confidence of a design in each world; None where nothing was photographed."""
     kinds = ("hits", "confidence")
     return [_mean_of(result, world, kind) if world in result.answers else None for world in WORLDS for kind in kinds]
 
 
-def _earned(compared: Sequence[tuple[Result, Result]]) -> list[Estimate | None]:
+def _mean_differences(compared: Sequence[tuple[Result, Result]]) -> list[Estimate | None]:
     """What the first of each pair is better by: rate and confidence in each world."""
     differences = [
-        [None if a is None or b is None else a - b for a, b in zip(_means(whole), _means(less), strict=True)]
+        [
+            None if a is None or b is None else a - b
+            for a, b in zip(_world_means(whole), _world_means(less), strict=True)
+        ]
         for whole, less in compared
     ]
     columns = ([value for value in column if value is not None] for column in zip(*differences, strict=True))

@@ -1,6 +1,6 @@
 """A photographed board taken apart: light, printed black, blur; put together again by our channel; and what is left.
 
-In: an uint8 photograph and a `Pose`. Out: a `BoardFit`, whose `rendered` is the photograph that print, light and camera
+In: an uint8 photograph and a `BoardPose`. Out: a `BoardFit`, whose `rendered` is the photograph that print, light and camera
 of our channel would have given: light × print, blurred as `channel.camera` does it, encoded as sRGB. Per channel
 
     light(x) = q(x) · [b + (1 - b) · share(x)],   share = paper's share of the pixel, blurred by sigma
@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 import torch
 
-from patchlab.validation.known_boards import Pose, Printed, moved, paper_share
+from patchlab.validation.marker_boards import BoardPose, PrintedSquare, paper_share, shift_squares
 from patchproof.base.color import LINEAR_FROM_CODE, LUMINANCE, codes_from_srgb
 from patchproof.channel.camera import READ_SHARE, SMALLEST_BLUR_PX, encode_light, gaussian_blur
 from patchproof.photo.detect import LINEAR_FLOAT32_FROM_CODE
@@ -30,13 +30,13 @@ from patchproof.photo.rejection import PhotoRejected
 from patchproof.scene.paper_light import quadratic_terms
 
 # px, to 4.4; a smaller one than 0.4 the channel skips
-_BLURS = (0.0, *(SMALLEST_BLUR_PX * 1.05 ** np.arange(50)).tolist())
-_COARSE = 5  # steps between those that are tried first
+_BLURS_PX = (0.0, *(SMALLEST_BLUR_PX * 1.05 ** np.arange(50)).tolist())
+_COARSE_STEP = 5  # steps between those that are tried first
 _ROUNDS = 4  # of shift, then light and blur; a fifth moves nothing by 0.01 px
-_MOST_PIXELS, _LEAST_PIXELS = 10_000, 500
-_MOST_CLIPPED = 0.5  # share of the board at full white
-_LARGEST_MISS = 0.3  # of paper's light; what a shift cannot explain, such as a hand, pulls no harder
-_FLAT, _FLAT_PX = 0.995, 7  # paper's share all over a square of pixels that count as flat white
+_MAX_PIXELS, _MIN_PIXELS = 10_000, 500
+_MAX_CLIPPED_SHARE = 0.5  # share of the board at full white
+_MAX_MISS = 0.3  # of paper's light; what a shift cannot explain, such as a hand, pulls no harder
+_FLAT_SHARE, _FLAT_PX = 0.995, 7  # paper's share all over a square of pixels that count as flat white
 _EDGE_BIN_PX, _EDGE_REACH_PX = 0.1, 2.5
 
 
@@ -46,7 +46,7 @@ class BoardFit:
     `bend_px` the root mean square of the cubic shift; `clipped` the share of the board at full white.
     """
 
-    prints: tuple[Printed, ...]
+    prints: tuple[PrintedSquare, ...]
     mask: np.ndarray
     share: np.ndarray
     light: np.ndarray
@@ -67,18 +67,18 @@ class BoardFit:
         return ((relative - self.black) / (1 - self.black)) @ np.array(LUMINANCE)
 
 
-def fit_board(srgb: np.ndarray, pose: Pose) -> BoardFit:
+def fit_board(srgb: np.ndarray, pose: BoardPose) -> BoardFit:
     """What light, black and blur explain the board best; `PhotoRejected` where it is too small or overexposed."""
     mask = pose.mask(srgb.shape)
     clipped = np.asarray((srgb >= CLIPPED_CODE).any(-1))
     known = np.flatnonzero(mask & ~clipped)
-    if mask.sum() < _LEAST_PIXELS:
-        raise PhotoRejected("too_small", int(mask.sum()), _LEAST_PIXELS, "the board has too few pixels")
+    if mask.sum() < _MIN_PIXELS:
+        raise PhotoRejected("too_small", int(mask.sum()), _MIN_PIXELS, "the board has too few pixels")
     lost = float(clipped[mask].mean())
-    if lost > _MOST_CLIPPED:
-        raise PhotoRejected("clipped", lost, _MOST_CLIPPED, f"{lost:.0%} of the board is overexposed")
-    known = np.random.default_rng(0).permutation(known)[:_MOST_PIXELS]  # fixed: the same figures each time
-    places = _places(srgb.shape)
+    if lost > _MAX_CLIPPED_SHARE:
+        raise PhotoRejected("clipped", lost, _MAX_CLIPPED_SHARE, f"{lost:.0%} of the board is overexposed")
+    known = np.random.default_rng(0).permutation(known)[:_MAX_PIXELS]  # fixed: the same figures each time
+    places = _pixel_centers(srgb.shape)
     terms, light = (
         _quadratic(places, srgb.shape)[known],
         LINEAR_FLOAT32_FROM_CODE[srgb].reshape(-1, 3)[known].astype(float),
@@ -86,14 +86,16 @@ def fit_board(srgb: np.ndarray, pose: Pose) -> BoardFit:
     bend, prints, share = np.zeros((10, 2)), pose.prints, paper_share(pose.prints, srgb.shape)
     shade, blur = _best_blur(share, known, terms, light, _Shade(np.zeros((3, 6)), np.full(3, 0.03)), None)
     for _ in range(_ROUNDS):
-        bend = bend + _shift(_soft(share, _BLURS[blur]), known, places[known], srgb.shape, shade, terms, light)
-        prints = moved(pose.prints, lambda at, bend=bend: _cubic(at, srgb.shape) @ bend)
+        bend = bend + _fit_shift(
+            _blur_share(share, _BLURS_PX[blur]), known, places[known], srgb.shape, shade, terms, light
+        )
+        prints = shift_squares(pose.prints, lambda at, bend=bend: _cubic(at, srgb.shape) @ bend)
         share = paper_share(prints, srgb.shape)
         shade, blur = _best_blur(share, known, terms, light, shade, blur)
     paper = (_quadratic(places, srgb.shape) @ shade.quadratic.T).reshape(srgb.shape)
     shifts = _cubic(places[known], srgb.shape) @ bend
     bend_px = float(np.sqrt((shifts**2).sum(1).mean()))
-    return BoardFit(prints, mask, share, paper, shade.black, _BLURS[blur], bend_px, lost)
+    return BoardFit(prints, mask, share, paper, shade.black, _BLURS_PX[blur], bend_px, lost)
 
 
 @dataclass(frozen=True)
@@ -109,20 +111,20 @@ class _Shade:
 
 
 def _best_blur(share, known, terms, light, shade: _Shade, near: int | None) -> tuple[_Shade, int]:
-    """Light, black and the blur (of `_BLURS`) that leave least; looked for around a former one."""
+    """Light, black and the blur (of `_BLURS_PX`) that leave least; looked for around a former one."""
 
     def left(at: int) -> tuple[float, int]:
-        soft = _soft(share, _BLURS[at]).ravel()[known]
-        tried = _shaded(terms, soft, light, shade.black, 2)
-        return float((np.clip(tried.misses(terms, soft, light), -_LARGEST_MISS, _LARGEST_MISS) ** 2).mean()), at
+        soft = _blur_share(share, _BLURS_PX[at]).ravel()[known]
+        tried = _fit_shade(terms, soft, light, shade.black, 2)
+        return float((np.clip(tried.misses(terms, soft, light), -_MAX_MISS, _MAX_MISS) ** 2).mean()), at
 
     if near is None:
-        near = min(left(at) for at in range(0, len(_BLURS), _COARSE))[1]
-    best = min(left(at) for at in range(max(near - _COARSE + 1, 0), min(near + _COARSE, len(_BLURS))))[1]
-    return _shaded(terms, _soft(share, _BLURS[best]).ravel()[known], light, shade.black, 10), best
+        near = min(left(at) for at in range(0, len(_BLURS_PX), _COARSE_STEP))[1]
+    best = min(left(at) for at in range(max(near - _COARSE_STEP + 1, 0), min(near + _COARSE_STEP, len(_BLURS_PX))))[1]
+    return _fit_shade(terms, _blur_share(share, _BLURS_PX[best]).ravel()[known], light, shade.black, 10), best
 
 
-def _shaded(terms: np.ndarray, share: np.ndarray, light: np.ndarray, black: np.ndarray, rounds: int) -> _Shade:
+def _fit_shade(terms: np.ndarray, share: np.ndarray, light: np.ndarray, black: np.ndarray, rounds: int) -> _Shade:
     """Light and black in turns, each by least squares with Tukey's weights, which all channels share."""
     weight, quadratic, ink = np.ones(len(terms)), np.zeros((3, 6)), 1 - share
     for _ in range(rounds):
@@ -141,18 +143,18 @@ def _shaded(terms: np.ndarray, share: np.ndarray, light: np.ndarray, black: np.n
     return _Shade(quadratic, np.clip(black, 0, 0.9))
 
 
-def _shift(soft, known, at, shape, shade: _Shade, terms, light) -> np.ndarray:
+def _fit_shift(soft, known, at, shape, shade: _Shade, terms, light) -> np.ndarray:
     """10×2: the cubic by which the pattern has to be shifted, one Gauss-Newton step."""
     down, across = (slope.ravel()[known] for slope in np.gradient(soft))
     miss, cubic = shade.misses(terms, soft.ravel()[known], light).mean(1), _cubic(at, shape)
-    root = np.sqrt(np.minimum(1, _LARGEST_MISS / np.maximum(np.abs(miss), 1e-9)))  # Huber's weights
+    root = np.sqrt(np.minimum(1, _MAX_MISS / np.maximum(np.abs(miss), 1e-9)))  # Huber's weights
     rows = -float(1 - shade.black.mean()) * np.concatenate([cubic * across[:, None], cubic * down[:, None]], 1)
     rows, miss = rows * root[:, None], miss * root
     ridge = 1e-6 * len(rows) * np.eye(20)  # where no edge speaks, nothing is shifted
     return np.linalg.solve(rows.T @ rows + ridge, rows.T @ miss).reshape(2, 10).T
 
 
-def _places(shape: tuple[int, ...]) -> np.ndarray:
+def _pixel_centers(shape: tuple[int, ...]) -> np.ndarray:
     """Centers N×2 of all pixels, row by row."""
     rows, columns = np.mgrid[0 : shape[0], 0 : shape[1]] + 0.5
     return np.column_stack([columns.ravel(), rows.ravel()])
@@ -169,7 +171,7 @@ def _cubic(at: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     return np.column_stack([lower, u**3, u * u * v, u * v * v, v**3])
 
 
-def _soft(share: np.ndarray, blur_px: float) -> np.ndarray:
+def _blur_share(share: np.ndarray, blur_px: float) -> np.ndarray:
     """H×W as the channel's blur leaves it."""
     return gaussian_blur(_tensor(share[..., None]), torch.tensor([blur_px]))[0, 0].numpy()
 
@@ -178,7 +180,9 @@ def _tensor(picture: np.ndarray) -> torch.Tensor:
     return torch.from_numpy(np.ascontiguousarray(picture.transpose(2, 0, 1), np.float32))[None]
 
 
-def edge_of(paper_seen: np.ndarray, prints: Sequence[Printed], module_px: float) -> tuple[float | None, float | None]:
+def edge_profile(
+    paper_seen: np.ndarray, prints: Sequence[PrintedSquare], module_px: float
+) -> tuple[float | None, float | None]:
     """(10 to 90 % width in pixels, overshoot over paper as a share of the contrast) of the outer borders of the markers
     that count: a slanted-edge profile (ISO 12233) of native pixels, each border's own place taken off first.
     """
@@ -210,7 +214,7 @@ def _across(picture: np.ndarray, start: np.ndarray, end: np.ndarray, reach: floa
     low = np.maximum(np.floor(np.minimum(start, end) - reach).astype(int), 0)
     high = np.ceil(np.maximum(start, end) + reach).astype(int)
     part = picture[low[1] : high[1], low[0] : high[0]]
-    points = _places(part.shape) + low
+    points = _pixel_centers(part.shape) + low
     along = (end - start) / np.linalg.norm(end - start)
     s = (points - start) @ along / np.linalg.norm(end - start)
     t = (points - start) @ np.array([along[1], -along[0]])
@@ -229,7 +233,7 @@ def _crossing(places: np.ndarray, profile: np.ndarray, level: float) -> float:
 
 def flat_white(fit: BoardFit, srgb: np.ndarray) -> np.ndarray:
     """H×W bool: pixels that see nothing but white paper some way around, none of it clipped."""
-    clear = (_soft(fit.share, fit.blur_px) > _FLAT) & fit.mask & (srgb < CLIPPED_CODE).all(-1)
+    clear = (_blur_share(fit.share, fit.blur_px) > _FLAT_SHARE) & fit.mask & (srgb < CLIPPED_CODE).all(-1)
     return cv2.erode(clear.astype(np.uint8), np.ones((_FLAT_PX, _FLAT_PX), np.uint8)) > 0
 
 

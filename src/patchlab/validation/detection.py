@@ -21,10 +21,10 @@ import numpy as np
 import torch
 from pydantic import Field
 
-from patchlab.study.claims import clustered_median
+from patchlab.study.estimates import clustered_median
 from patchlab.study.record import corner_error_mm
 from patchlab.study.study import Cell, Result, Study
-from patchlab.validation.hung import hang_piece
+from patchlab.validation.mounted_sheets import mount_content
 from patchproof.base.errors import Refused
 from patchproof.base.geometry import apply_homography, local_scale, rect_corners
 from patchproof.base.intervals import Estimate, rate
@@ -48,7 +48,7 @@ from patchproof.sheets.piece import control_design
 
 MEASURABLE_TILT_DEG, MEASURABLE_BLUR_PX = 70.0, 1.5  # beyond these the bounds on errors are not claimed
 SHARP_MODULE_PX = 4.0  # pixels per marker module from which corners should be right to a tenth of a pixel
-_BINS = {
+_BIN_EDGES = {
     "tilt_deg": (0, 20, 40, 50, 60, 70, 90),
     "module_px": (0, 1.5, 2, 3, 4, 6, 30),
     "blur_px": (0, 0.5, 1, 1.5, 2, 9),
@@ -84,12 +84,12 @@ def cells(settings: DetectionSettings, base: Path) -> list[Cell]:
 
 def run(settings: DetectionSettings, base: Path, cell: Cell) -> dict[str, Any]:
     """What was photographed, what was made of it and, where there is a homography, the design's corner errors."""
-    (sheet, scene), number = _hung(str(base / settings.scene), settings.seed), cell.values["number"]
+    (sheet, scene), number = _mounted_sheet(str(base / settings.scene), settings.seed), cell.values["number"]
     surface = surface_of(sheet.manifest)
     conditions = scene.draw("reprint", 1, settings.seed, number)
     rng = np.random.default_rng([settings.seed, number])
     truth = sheet.px_from_page(conditions)
-    srgb, hidden = _photographed(sheet, conditions, truth, rng, rng.random() < settings.hidden)
+    srgb, hidden = _photograph_sheet(sheet, conditions, truth, rng, rng.random() < settings.hidden)
     photo = Photo(srgb, float(scene.matrix_px(scene.settings.camera.photo_px)[0, 0]))
     entry = measure(pinhole_photo(photo, None), "photo.jpg", surface, None, promised_ranges(())).entry
     geometry = entry.geometry
@@ -117,14 +117,14 @@ def run(settings: DetectionSettings, base: Path, cell: Cell) -> dict[str, Any]:
     return answers | {"error_mm": corner_error_mm(geometry, corners, true_px), "error_px": errors_px}
 
 
-def _photographed(sheet: MountedSheet, conditions: Conditions, truth, rng, hide: bool) -> tuple[np.ndarray, float]:
+def _photograph_sheet(sheet: MountedSheet, conditions: Conditions, truth, rng, hide: bool) -> tuple[np.ndarray, float]:
     """uint8 pixels as read back from the JPEG, and the share of the piece behind a card, where one hides it."""
     photo_px, share = sheet.scene.settings.camera.photo_px, 0.0
     with torch.no_grad():
         picture = photograph(sheet.stage, sheet.piece, conditions, photo_px, jpeg=False)
     if hide:
         piece_px = apply_homography(truth, rect_corners(sheet.manifest.cut_mm))
-        cover, piece = (_filled(quad, photo_px) for quad in (_card(rng, piece_px), piece_px))
+        cover, piece = (_fill_quad(quad, photo_px) for quad in (_draw_card(rng, piece_px), piece_px))
         share = float((cover * piece).sum() / max(piece.sum(), 1))
         card = torch.from_numpy(rng.uniform(0.05, 0.8, 3).astype(np.float32))[:, None, None]
         picture = picture + torch.from_numpy(cover) * (card - picture)
@@ -132,7 +132,7 @@ def _photographed(sheet: MountedSheet, conditions: Conditions, truth, rng, hide:
 
 
 @lru_cache(maxsize=1)
-def _hung(scene_path: str, seed: int) -> tuple[MountedSheet, PatchScene]:
+def _mounted_sheet(scene_path: str, seed: int) -> tuple[MountedSheet, PatchScene]:
     """The scene's sheet with noise on it, hung up in the scene."""
     scene = require_patch(load_scene(scene_path, seed), "a scene of an object with a flat patch")
     if not scene.is_flat:
@@ -140,10 +140,10 @@ def _hung(scene_path: str, seed: int) -> tuple[MountedSheet, PatchScene]:
     piece = scene.piece
     blank = np.zeros((240, round(240 * piece.size_mm[0] / piece.size_mm[1]), 3), np.uint8)
     noise = control_design("noise", blank, scene.sheet_id, piece)
-    return hang_piece(set_stage(scene), SheetContent(piece, scene.sheet_id, "design", noise)), scene
+    return mount_content(set_stage(scene), SheetContent(piece, scene.sheet_id, "design", noise)), scene
 
 
-def _card(rng: np.random.Generator, piece_px: np.ndarray) -> np.ndarray:
+def _draw_card(rng: np.random.Generator, piece_px: np.ndarray) -> np.ndarray:
     """Corners of a card, a fifth to two thirds of the piece long, with its middle somewhere on the piece."""
     u, v = rng.random(2)
     top, bottom = piece_px[0] + u * (piece_px[1] - piece_px[0]), piece_px[3] + u * (piece_px[2] - piece_px[3])
@@ -153,7 +153,7 @@ def _card(rng: np.random.Generator, piece_px: np.ndarray) -> np.ndarray:
     return top + v * (bottom - top) + (np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * half) @ turn.T
 
 
-def _filled(quad: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
+def _fill_quad(quad: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
     """H×W float32 in [0, 1]: what share of each pixel, about, lies in the quad."""
     mask = np.zeros((size_px[1], size_px[0]), np.uint8)
     cv2.fillConvexPoly(mask, to_sixteenths(quad), 255, cv2.LINE_AA, 4)
@@ -186,14 +186,14 @@ def _bounds(shots: Sequence[Mapping]) -> Table:
         ("largest corner error, median, mm", _median(claimed, "error_mm")),
         ("largest corner error of all, mm", max((shot["error_mm"] for shot in claimed), default=None)),
         ("the same at any tilt and blur, mm", max((shot["error_mm"] for shot in measured), default=None)),
-        ("stated 95 % uncertainty covers the largest corner error", _covered(claimed)),
-        ("the same at any tilt and blur", _covered(measured)),
+        ("stated 95 % uncertainty covers the largest corner error", _coverage(claimed)),
+        ("the same at any tilt and blur", _coverage(measured)),
     )
     about = f"{len(usual)} of {len(shots)} photographs have tilt ≤ 70° and blur ≤ 1.5 px; corners are the design's four"
     return Table("bounds", "Errors against the truth", ("figure", "value"), rows, about)
 
 
-def _covered(measured: Sequence[Mapping]) -> Estimate | None:
+def _coverage(measured: Sequence[Mapping]) -> Estimate | None:
     return rate([shot["error_mm"] <= shot["uncertainty_mm"] for shot in measured])
 
 
@@ -203,13 +203,13 @@ def _median(shots: Sequence[Mapping], name: str) -> Estimate | None:
 
 def _by_quantity(shots: Sequence[Mapping]) -> Table:
     rows = []
-    for name, edges in _BINS.items():
+    for name, edges in _BIN_EDGES.items():
         for low, high in pairwise(edges):
             here = [shot for shot in shots if shot[name] is not None and low <= shot[name] < high]
             if here:
                 identified = rate([shot["status"] != "rejected" for shot in here])
                 measured = rate([shot["status"] == "measured" for shot in here])
-                rows.append((_LABELS[name], f"{low:g} to {high:g}", identified, measured, _covered(_measured(here))))
+                rows.append((_LABELS[name], f"{low:g} to {high:g}", identified, measured, _coverage(_measured(here))))
     head = ("quantity", "range", "identified", "measured", "covered")
     about = "each with all other quantities over their whole ranges; light is known where markers were found"
     return Table("by_quantity", "By what a photograph was taken under", head, tuple(rows), about)

@@ -15,18 +15,18 @@ from typing import Any, Literal
 
 import numpy as np
 
-from patchlab.study.claims import mean
+from patchlab.study.estimates import mean
 from patchlab.study.grid import by_scene
-from patchlab.study.record import hits_of
+from patchlab.study.record import parse_hits
 from patchlab.study.study import Cell, Result, Study
-from patchlab.validation.photographed import (
+from patchlab.validation.photo_sessions import (
     SessionsSettings,
     cells,
-    judged,
-    printed_run,
-    recorded_promise,
-    recorded_spread,
+    make_run_and_sheet,
+    promise_posterior,
+    record_promise,
     take_photos,
+    verify_photos,
 )
 from patchproof.base.intervals import rate, wilson
 from patchproof.evidence.forecast import forecast_of
@@ -46,7 +46,7 @@ def run(settings: ForecastsSettings, base: Path, cell: Cell) -> dict[str, Any]:
 
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        made = printed_run(base, cell, folder)
+        made = make_run_and_sheet(base, cell, folder)
         photos, controls = take_photos(settings, cell, made, folder), None
         if settings.control is not None:
             controls = take_photos(settings, cell, made, folder, settings.control)
@@ -54,12 +54,12 @@ def run(settings: ForecastsSettings, base: Path, cell: Cell) -> dict[str, Any]:
         for own in sorted(photos.iterdir()):
             if own.is_dir():
                 beside = None if controls is None else controls / own.name
-                report = judged(own, folder, base, cell, forecast, controls=beside)
-                sessions.append(_session(report, settings.control))
-    return recorded_promise(made) | {"sessions": sessions}
+                report = verify_photos(own, folder, base, cell, forecast, controls=beside)
+                sessions.append(_record_session(report, settings.control))
+    return record_promise(made) | {"sessions": sessions}
 
 
-def _session(report: Any, control: str | None) -> dict[str, Any]:
+def _record_session(report: Any, control: str | None) -> dict[str, Any]:
     """What is kept of a session's report; effects as the patch's rate minus the control's."""
     (network, *_), summary = report.summary.models, report.summary
     forecast = [
@@ -90,7 +90,7 @@ def tables(settings: ForecastsSettings, results: Sequence[Result]) -> tuple[Tabl
         effects = [(name, *_effect_row(group)) for name, group in groups.items()]
         about = f"{about}; the patch beside {settings.control}"
         tables_.append(Table("effects", "Effects estimated and photographed", head, tuple(effects), about))
-    return (*tables_, _each(results))
+    return (*tables_, _session_table(results))
 
 
 def _forecast_row(group: Sequence[Result]) -> tuple:
@@ -100,7 +100,7 @@ def _forecast_row(group: Sequence[Result]) -> tuple:
     chances, hits = np.array(pairs, float).T
     held, widths, held_promise, widths_promise, promised = [], [], [], [], []
     for result in group:
-        spread, level = recorded_spread(result), float(np.mean(hits_of(result.answers["promised"])))
+        spread, level = promise_posterior(result), float(np.mean(parse_hits(result.answers["promised"])))
         for session in result.answers["sessions"]:
             if not session["forecast"]:
                 continue
@@ -113,12 +113,12 @@ def _forecast_row(group: Sequence[Result]) -> tuple:
             widths_promise.append((high - low) / n)
             promised += [(level - answer) ** 2 for answer in answers]
     brier = float(np.mean((chances - hits) ** 2))
-    scores = brier, float(np.mean(promised)), slope(chances, hits)
+    scores = brier, float(np.mean(promised)), calibration_slope(chances, hits)
     middles = float(np.median(widths)), float(np.median(widths_promise))
     return (len(pairs), *scores, rate(held), *middles, rate(held_promise))
 
 
-def slope(chances: np.ndarray, hits: np.ndarray) -> float | None:
+def calibration_slope(chances: np.ndarray, hits: np.ndarray) -> float | None:
     """Of the logistic regression of answers on the chances' log odds (Cox, Biometrika 45 (1958) 562): 1 where they are
     as sure as they may be, below where they are too sure. None where all answers are the same.
     """
@@ -149,7 +149,7 @@ def _effect_row(group: Sequence[Result]) -> tuple:
     return len(sessions), rate(refused), mean([photographed for *_, photographed in both]), mean(off), held
 
 
-def _each(results: Sequence[Result]) -> Table:
+def _session_table(results: Sequence[Result]) -> Table:
     head = ("scene", "network", "seed", "session", "photographs", "expected", "recognized", "agree", "estimated")
     rows = []
     for result in results:

@@ -18,20 +18,20 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from patchlab.study.claims import clustered_median, mean
+from patchlab.study.estimates import clustered_median, mean
 from patchlab.study.grid import (
-    Count,
     GridSettings,
+    PositiveInt,
+    cell_key,
     grid_cells,
-    grouped,
-    networks_at,
+    group_by,
+    network_names,
     scene_of,
-    who,
-    with_tables,
+    with_scene_changes,
 )
-from patchlab.study.record import Record, corner_error_mm, gain_of, hardest, recorded
+from patchlab.study.record import Record, answers_record, corner_error_mm, gain_of, hardest_control
 from patchlab.study.study import Cell, Result, Study
-from patchlab.validation.hung import hang_piece
+from patchlab.validation.mounted_sheets import mount_content
 from patchproof.base.geometry import apply_homography, rect_corners
 from patchproof.base.intervals import Estimate, rate
 from patchproof.base.output import image_pixels
@@ -81,12 +81,12 @@ class LayoutsSettings(GridSettings):
     """A design for each scene, network, seed and layout."""
 
     layouts: dict[str, Layout] = Field(_LAYOUTS, min_length=1)  # by name; the others are compared with the first
-    n: Count = 400  # unseen conditions that measure
+    n: PositiveInt = 400  # unseen conditions that measure
     photos: Annotated[int, Field(ge=0)] = 40  # of each design's sheet
 
 
 @dataclass(frozen=True)
-class LaidOut(Piece):
+class PieceVariant(Piece):
     """A piece that reserves other pixels for its markers."""
 
     quiet: float = 1.0
@@ -98,24 +98,24 @@ class LaidOut(Piece):
         if not self.framed:
             wider = (self.quiet - 1) * self.module_mm
             rects = (grow_rect(rect, wider) for rect in super().reserved_mm)
-            return tuple(_within(rect, self.size_mm) for rect in rects)
+            return tuple(_clip_rect(rect, self.size_mm) for rect in rects)
         (width, height), frame = self.size_mm, self.marker_mm + 2 * self.module_mm + SCISSORS_MM
         sides = ((0.0, 0.0, width, frame), (0.0, height - frame, width, frame))
         return (*sides, (0.0, 0.0, frame, height), (width - frame, 0.0, frame, height))
 
 
-def _within(rect: RectMm, size_mm: tuple[float, float]) -> RectMm:
+def _clip_rect(rect: RectMm, size_mm: tuple[float, float]) -> RectMm:
     low = [max(v, 0.0) for v in rect[:2]]
     high = [min(v + side, whole) for v, side, whole in zip(rect[:2], rect[2:], size_mm, strict=True)]
     return low[0], low[1], high[0] - low[0], high[1] - low[1]
 
 
-def laid_out(scene: PatchScene, layout: Layout) -> PatchScene:
+def with_layout(scene: PatchScene, layout: Layout) -> PatchScene:
     """The scene with its piece in another layout."""
     piece = scene.piece
     other = lay_out_piece(piece.size_mm, layout.size * piece.marker_mm, scene.sheet_id, "design", layout.markers == 8)
     plain = {field.name: getattr(other, field.name) for field in fields(other)}
-    return replace(scene, piece=LaidOut(**plain, quiet=layout.quiet, framed=layout.framed))
+    return replace(scene, piece=PieceVariant(**plain, quiet=layout.quiet, framed=layout.framed))
 
 
 def cells(settings: LayoutsSettings, base: Path) -> list[Cell]:
@@ -124,26 +124,30 @@ def cells(settings: LayoutsSettings, base: Path) -> list[Cell]:
     return grid_cells(
         settings,
         base,
-        lambda values: ((with_tables(values, scene) | {"layout": a, "how": how}, (a,)) for a, scene, how in ways),
+        lambda values: (
+            (with_scene_changes(values, scene) | {"layout": a, "how": how}, (a,)) for a, scene, how in ways
+        ),
     )
 
 
 def run(settings: LayoutsSettings, base: Path, cell: Cell) -> dict[str, Any]:
     """Train, at a place that is searched where the scene asks for it; show and photograph."""
-    problem = _problem(base, cell)
-    scene = laid_out(require_patch(problem.scene), Layout(**cell.values["how"]))
+    problem = _build_cell_problem(base, cell)
+    scene = with_layout(require_patch(problem.scene), Layout(**cell.values["how"]))
     patch = replace(problem.patch, scene=scene)
     problem = replace(problem, scene=scene, stage=replace(problem.stage, scene=scene), subject=patch)
     design = best_design(problem)
     shown = pictures_with_controls(problem, design, CONTROLS)
     answers = responses(problem, shown, scene.draw("evaluate", settings.n))
     return (
-        recorded(answers) | {"free": _free_share(scene.piece)} | _photographed(problem, scene, design, settings.photos)
+        answers_record(answers)
+        | {"free": _free_share(scene.piece)}
+        | _photograph_and_measure(problem, scene, design, settings.photos)
     )
 
 
-def _problem(base: Path, cell: Cell) -> Problem:
-    scene, networks = scene_of(base, cell.values), networks_at(base, cell.values)
+def _build_cell_problem(base: Path, cell: Cell) -> Problem:
+    scene, networks = scene_of(base, cell.values), network_names(base, cell.values)
     if isinstance(scene, UnplacedScene):
         place = choose_place(scene, models=networks)
         scene = scene.with_piece_at(place.at, place.spin_deg)
@@ -159,9 +163,9 @@ def _free_share(piece: Piece) -> float:
     return float(mask.mean())
 
 
-def _photographed(problem: Problem, scene: PatchScene, design: np.ndarray, count: int) -> dict[str, Any]:
+def _photograph_and_measure(problem: Problem, scene: PatchScene, design: np.ndarray, count: int) -> dict[str, Any]:
     """What `verify` makes of photographs of the design's sheet, and how far it is off, by photograph."""
-    sheet = hang_piece(problem.stage, SheetContent(scene.piece, scene.sheet_id, "design", design))
+    sheet = mount_content(problem.stage, SheetContent(scene.piece, scene.sheet_id, "design", design))
     manifest = sheet.manifest
     surface = surface_of(manifest)
     promised, drawn = promised_of(manifest, surface, sheet.printer), scene.draw("reprint", count)
@@ -181,16 +185,16 @@ def _photographed(problem: Problem, scene: PatchScene, design: np.ndarray, count
     return out
 
 
-def _gain(result: Result) -> float:
+def _gain_over_controls(result: Result) -> float:
     """The design's rate over that of its best control."""
-    return gain_of(result, "design", hardest(result, CONTROLS))
+    return gain_of(result, "design", hardest_control(result, CONTROLS))
 
 
 def tables(settings: LayoutsSettings, results: Sequence[Result]) -> Sequence[Table]:
     """Costs and gains by layout, and every cell."""
-    by_layout = grouped(results, lambda result: result.cell.values["layout"])
-    first = {who(result): _gain(result) for result in next(iter(by_layout.values()))}
-    rows = [(name, *_figures(group, first)) for name, group in by_layout.items()]
+    by_layout = group_by(results, lambda result: result.cell.values["layout"])
+    first = {cell_key(result): _gain_over_controls(result) for result in next(iter(by_layout.values()))}
+    rows = [(name, *_layout_figures(group, first)) for name, group in by_layout.items()]
     head = ("layout", "share for the design", "gain over the best control", "beside the first layout")
     head = (*head, "identified", "measured", "corner error, mm", "uncertainty holds", "ΔE00")
     about = (
@@ -199,9 +203,9 @@ def tables(settings: LayoutsSettings, results: Sequence[Result]) -> Sequence[Tab
     about += "of the worst of the piece's four; gains are over scenes, networks and seeds"
     every = [
         (
-            *who(r),
+            *cell_key(r),
             r.cell.values["layout"],
-            _gain(r),
+            _gain_over_controls(r),
             *(Record([r], thing).level()[0] for thing in ("design", *CONTROLS)),
         )
         for r in results
@@ -214,7 +218,7 @@ def tables(settings: LayoutsSettings, results: Sequence[Result]) -> Sequence[Tab
     )
 
 
-def _figures(group: Sequence[Result], first: dict) -> tuple:
+def _layout_figures(group: Sequence[Result], first: dict) -> tuple:
     status = [word for result in group for word in result.answers["status"]]
     measured = [
         {key: result.answers[key][i] for key in ("error_mm", "uncertainty_mm", "delta_e00")}
@@ -223,10 +227,10 @@ def _figures(group: Sequence[Result], first: dict) -> tuple:
         if word == "measured"
     ]
     errors = [(m["error_mm"], m["uncertainty_mm"]) for m in measured if m["error_mm"] is not None]
-    beside = [_gain(result) - first[who(result)] for result in group if who(result) in first]
+    beside = [_gain_over_controls(result) - first[cell_key(result)] for result in group if cell_key(result) in first]
     return (
         float(np.mean([result.answers["free"] for result in group])),
-        _mean_or_single([_gain(result) for result in group]),
+        _mean_or_single([_gain_over_controls(result) for result in group]),
         _mean_or_single(beside),
         rate([word != "rejected" for word in status]),
         rate([word == "measured" for word in status]),
@@ -250,7 +254,7 @@ def figures(settings: LayoutsSettings, results: Sequence[Result]) -> Sequence[Dr
     def draw(figure: Figure) -> None:
         axes = figure.subplots()
         for name, _, gain, _, _, measured, *_ in table.rows:
-            (x, x_span), (y, y_span) = _with_span(measured), _with_span(gain)
+            (x, x_span), (y, y_span) = _value_and_reach(measured), _value_and_reach(gain)
             axes.errorbar([x], [y], y_span, x_span, "o", label=name)
         axes.set_xlabel("photographs measured")
         axes.set_ylabel("gain over the best control")
@@ -259,7 +263,7 @@ def figures(settings: LayoutsSettings, results: Sequence[Result]) -> Sequence[Dr
     return (Drawing("layouts", "What layouts cost and buy", draw, (7.0, 4.5), table.about),)
 
 
-def _with_span(value: Value) -> tuple[float, list[list[float]] | None]:
+def _value_and_reach(value: Value) -> tuple[float, list[list[float]] | None]:
     """A figure and how far its interval reaches down and up, as matplotlib takes it."""
     if isinstance(value, Estimate):
         return value.value, [[value.value - value.low], [value.high - value.value]]

@@ -25,7 +25,7 @@ from torch import Tensor
 
 from patchlab.bench.inkjets import draw_inkjet
 from patchlab.study.study import Cell, Result, Study
-from patchlab.validation.hung import hang_own
+from patchlab.validation.mounted_sheets import mount_run_sheet
 from patchproof.base.color import linear_from_srgb, srgb_from_linear
 from patchproof.base.intervals import rate
 from patchproof.base.output import image_pixels
@@ -47,11 +47,11 @@ from patchproof.reprints.mounted_sheet import MountedSheet, jpeg_of
 from patchproof.scene.conditions import Conditions, with_values
 from patchproof.scene.interface import PieceScene
 
-STEP = {"print": "print", "blur": "blur_and_noise", "cast": "light_and_camera", "dim": "light_and_camera"}
-LEAST_COST = 0.10  # of confidence
-_TRIES = 3  # troubles drawn for a trial until one costs enough
-Printed = Callable[[Tensor], Tensor]  # sRGB as sent, 1×3×H×W, to what is seen
-_FADED = 0.2  # of the density that dyes may keep
+STEP_OF_CULPRIT = {"print": "print", "blur": "blur_and_noise", "cast": "light_and_camera", "dim": "light_and_camera"}
+MIN_COST = 0.10  # of confidence
+_MAX_TRIES = 3  # troubles drawn for a trial until one costs enough
+TensorPrinter = Callable[[Tensor], Tensor]  # sRGB as sent, 1×3×H×W, to what is seen
+_MIN_DYE_SHARE = 0.2  # of the density that dyes may keep
 
 
 class LedgerSettings(StrictModel):
@@ -65,26 +65,26 @@ class LedgerSettings(StrictModel):
 
 def cells(settings: LedgerSettings, base: Path) -> list[Cell]:
     """Trials in turn of culprits, and of runs."""
-    kinds, runs = list(STEP), settings.runs
+    kinds, runs = list(STEP_OF_CULPRIT), settings.runs
     turns = [(i, kinds[i % len(kinds)], runs[i // len(kinds) % len(runs)]) for i in range(settings.trials)]
     return [Cell(f"trial_{i:04d}", {"number": i, "culprit": kind, "run": run}) for i, kind, run in turns]
 
 
 def run(settings: LedgerSettings, base: Path, cell: Cell) -> dict[str, Any]:
     """What was put in, what it cost and what the ledger says; `outcome` is asked, weak or unreadable."""
-    hall = _hall(str(base / cell.values["run"]))
+    hall = _open_setup(str(base / cell.values["run"]))
     number, n = cell.values["number"], settings.photos
     conditions = hall.scene.draw("reprint", n, settings.seed, number * n)
     views = hall.views(conditions)
     plain = hall.confidence(hall.take(views, conditions))
     rng = np.random.default_rng([settings.seed, number])
     answers: dict[str, Any] = {}
-    for _ in range(_TRIES):
-        trouble, printer, changed = _trouble(cell.values["culprit"], rng, conditions, hall)
+    for _ in range(_MAX_TRIES):
+        trouble, printer, changed = _draw_trouble(cell.values["culprit"], rng, conditions, hall)
         photos = hall.take(views, changed, printer)
         loss = hall.sign * (plain - hall.confidence(photos))
         answers = {"trouble": trouble, "outcome": "weak", "cost": float(loss.mean()), "photos": 0}
-        if loss.mean() >= LEAST_COST:
+        if loss.mean() >= MIN_COST:
             answers |= hall.judged(photos, loss)
         if answers["outcome"] == "asked":
             break
@@ -92,7 +92,7 @@ def run(settings: LedgerSettings, base: Path, cell: Cell) -> dict[str, Any]:
 
 
 @dataclass(frozen=True)
-class _Hall:
+class _PhotoSetup:
     """A run's sheet, ready to be photographed, and what judges its photographs."""
 
     sheet: MountedSheet
@@ -116,7 +116,7 @@ class _Hall:
             render_views(self.sheet.stage, self.sheet.piece, conditions[i : i + 1], self.scene.photo_px) for i in each
         ]
 
-    def take(self, views: Sequence[Views], conditions: Conditions, printed: Printed | None = None) -> list[bytes]:
+    def take(self, views: Sequence[Views], conditions: Conditions, printed: TensorPrinter | None = None) -> list[bytes]:
         """A JPEG file for each condition of the piece as `printed` shows it (by default as promised)."""
         piece, photos = self.sheet.piece if printed is None else self.sheet.printed(printed), []
         for i, view in enumerate(views):
@@ -145,7 +145,7 @@ class _Hall:
         whole = self.sign * (ledger.ideal - ledger.photo)
         cost = float(loss[used].mean())
         return {
-            "outcome": "asked" if cost >= LEAST_COST else "weak",
+            "outcome": "asked" if cost >= MIN_COST else "weak",
             "cost": cost,
             "photos": ledger.photos,
             "named": ledger.culprit,
@@ -155,19 +155,19 @@ class _Hall:
 
 
 @lru_cache(maxsize=8)
-def _hall(folder: str) -> _Hall:
+def _open_setup(folder: str) -> _PhotoSetup:
     made = load_run(folder)
-    sheet, promise = hang_own(made), made.promise
+    sheet, promise = mount_run_sheet(made), made.promise
     model = load_classifier(promise.models[0].name, made.scene.base)
-    return _Hall(sheet, model, target_indices(model, promise, sheet.manifest.settings), promise.target.goal.sign)
+    return _PhotoSetup(sheet, model, target_indices(model, promise, sheet.manifest.settings), promise.target.goal.sign)
 
 
-def _trouble(
-    kind: str, rng: np.random.Generator, conditions: Conditions, hall: _Hall
-) -> tuple[str, Printed | None, Conditions]:
+def _draw_trouble(
+    kind: str, rng: np.random.Generator, conditions: Conditions, hall: _PhotoSetup
+) -> tuple[str, TensorPrinter | None, Conditions]:
     """(what it is in words, the printer in place of the promise's or None, the conditions)."""
     if kind == "print":
-        name, printer = _wrong_printer(rng, hall)
+        name, printer = _draw_wrong_printer(rng, hall)
         return name, printer, conditions
     if kind == "blur":  # up to what still shows the cells of markers apart
         modules = rng.uniform(0.35, 0.55)
@@ -180,7 +180,7 @@ def _trouble(
     return f"{stops:.1f} stops", None, with_values(conditions, exposure_ev=conditions.sensor.exposure_ev - stops)
 
 
-def _wrong_printer(rng: np.random.Generator, hall: _Hall) -> tuple[str, Printed]:
+def _draw_wrong_printer(rng: np.random.Generator, hall: _PhotoSetup) -> tuple[str, TensorPrinter]:
     """A name, and a function from sRGB tensors 1×3×H×W as sent to what is seen."""
     which = rng.random()
     if which < 0.2:
@@ -191,8 +191,8 @@ def _wrong_printer(rng: np.random.Generator, hall: _Hall) -> tuple[str, Printed]
         inkjet = draw_inkjet(seed)
         name, light = f"inkjet {seed}", lambda srgb: inkjet(srgb)
     else:
-        kept = rng.uniform(_FADED, 1, 3) if rng.random() < 0.5 else np.full(3, rng.uniform(_FADED, 0.5))
-        name, light = f"faded {kept.round(2)}", lambda srgb: _faded(hall.sheet.printer, kept, srgb)
+        kept = rng.uniform(_MIN_DYE_SHARE, 1, 3) if rng.random() < 0.5 else np.full(3, rng.uniform(_MIN_DYE_SHARE, 0.5))
+        name, light = f"faded {kept.round(2)}", lambda srgb: _faded_light(hall.sheet.printer, kept, srgb)
 
     def printed(pixels: Tensor) -> Tensor:
         reflected = light(pixels[0].permute(1, 2, 0).double().numpy())
@@ -201,7 +201,7 @@ def _wrong_printer(rng: np.random.Generator, hall: _Hall) -> tuple[str, Printed]
     return name, printed
 
 
-def _faded(printer: Printer, kept: np.ndarray, srgb: np.ndarray) -> np.ndarray:
+def _faded_light(printer: Printer, kept: np.ndarray, srgb: np.ndarray) -> np.ndarray:
     """Light of a print whose dyes keep these shares of their density; what is neutral is black ink and stays."""
     shown = printer.apply(torch.from_numpy(srgb).float().permute(2, 0, 1)[None])[0].permute(1, 2, 0).double().numpy()
     density = -np.log(np.clip(linear_from_srgb(shown), 1e-3, 1))
@@ -221,12 +221,12 @@ def _culprit(trial: Result) -> str:
 
 def _rates(results: Sequence[Result], asked: Sequence[Result]) -> Table:
     rows = []
-    for kind in (*STEP, None):
+    for kind in (*STEP_OF_CULPRIT, None):
         mine = [trial for trial in asked if kind in (None, _culprit(trial))]
         outcomes = [trial.answers["outcome"] for trial in results if kind in (None, _culprit(trial))]
-        hits = [trial.answers["named"] == STEP[_culprit(trial)] for trial in mine]
+        hits = [trial.answers["named"] == STEP_OF_CULPRIT[_culprit(trial)] for trial in mine]
         rows.append((kind or "all", rate(hits), outcomes.count("weak"), outcomes.count("unreadable")))
-    about = f"of trials that cost at least {LEAST_COST:.0%} of confidence; the shares' sum is the whole within "
+    about = f"of trials that cost at least {MIN_COST:.0%} of confidence; the shares' sum is the whole within "
     about += f"{max((trial.answers['sum_error'] for trial in asked), default=0):.0e}"
     return Table("rates", "Culprits named", ("culprit", "named", "cost less", "unreadable"), tuple(rows), about)
 
@@ -234,7 +234,7 @@ def _rates(results: Sequence[Result], asked: Sequence[Result]) -> Table:
 def _confusions(asked: Sequence[Result]) -> Table:
     names = ("print", "light_and_camera", "blur_and_noise", "print_light_and_camera", None)
     counts = Counter((_culprit(trial), trial.answers["named"]) for trial in asked)
-    rows = tuple((kind, *(counts[kind, name] for name in names)) for kind in STEP)
+    rows = tuple((kind, *(counts[kind, name] for name in names)) for kind in STEP_OF_CULPRIT)
     return Table("confusions", "Put in and named", ("put in", *(n or "none" for n in names)), rows, "trials")
 
 

@@ -23,18 +23,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 from pydantic import Field
 
-from patchlab.study.claims import mean
+from patchlab.study.estimates import mean
 from patchlab.study.grid import Names, by_scene, short_name
-from patchlab.study.record import bits, hits_of
+from patchlab.study.record import hits_text, parse_hits
 from patchlab.study.study import Cell, Result, Study
-from patchlab.validation.photographed import (
+from patchlab.validation.photo_sessions import (
     SessionsSettings,
     cells,
-    judged,
-    printed_run,
-    recorded_promise,
-    recorded_spread,
+    make_run_and_sheet,
+    promise_posterior,
+    record_promise,
     take_photos,
+    verify_photos,
 )
 from patchproof.base.errors import Refused
 from patchproof.base.intervals import rate
@@ -51,7 +51,7 @@ if TYPE_CHECKING:
     from patchproof.optimizer.run import Run
 
 
-_LEAST_SESSIONS = 20  # of which the ends of what they showed say anything
+_MIN_SESSIONS = 20  # of which the ends of what they showed say anything
 
 
 class PromisesSettings(SessionsSettings):
@@ -82,14 +82,14 @@ def run(settings: PromisesSettings, base: Path, cell: Cell) -> dict[str, Any]:
     """Promise and count of one combination."""
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        made = printed_run(base, cell, folder)
-        report = judged(take_photos(settings, cell, made, folder), folder, base, cell, ledger_photos=0)
+        made = make_run_and_sheet(base, cell, folder)
+        report = verify_photos(take_photos(settings, cell, made, folder), folder, base, cell, ledger_photos=0)
     sessions = [(session.recognized, session.judged) for session in report.summary.sessions]
-    kept = recorded_promise(made) | {"sessions": sessions, "verdict": report.summary.verdict}
-    return kept | _without_paper(settings, made)
+    kept = record_promise(made) | {"sessions": sessions, "verdict": report.summary.verdict}
+    return kept | _measure_views(settings, made)
 
 
-def _without_paper(settings: PromisesSettings, made: Run) -> dict[str, Any]:
+def _measure_views(settings: PromisesSettings, made: Run) -> dict[str, Any]:
     """What our own renderer's views show of the design, in sessions and elsewhere."""
     if not settings.rendered and not settings.elsewhere:
         return {}
@@ -100,7 +100,7 @@ def _without_paper(settings: PromisesSettings, made: Run) -> dict[str, Any]:
         hits = show(views)["design"].recognized[0]
         kept["rendered"] = list(zip(*count_by_session(hits, settings.photos), strict=True))
     if settings.elsewhere:
-        kept["elsewhere"] = bits(show(scene.draw("evaluate", settings.elsewhere))["design"].recognized[0])
+        kept["elsewhere"] = hits_text(show(scene.draw("evaluate", settings.elsewhere))["design"].recognized[0])
     return kept
 
 
@@ -108,17 +108,17 @@ def tables(settings: PromisesSettings, results: Sequence[Result]) -> tuple[Table
     """Shares that held, by scene and in all; every combination; the same of views; rates elsewhere."""
     how = "path-traced photographs" if settings.path_traced else "photographs by our own renderer"
     about = f"{settings.sessions} sessions of {settings.photos} {how} for each promise"
-    all_tables = [_shares("held", "Sessions in which promises held", about, results)]
+    all_tables = [_share_table("held", "Sessions in which promises held", about, results)]
     if settings.rendered:
         about = f"{settings.rendered} sessions of {settings.photos} views by our own renderer for each promise"
-        all_tables.append(_shares("rendered", "Sessions of views in which promises held", about, results))
+        all_tables.append(_share_table("rendered", "Sessions of views in which promises held", about, results))
     if settings.elsewhere:
-        all_tables.append(_elsewhere(settings, results))
-    return *all_tables, _each(results)
+        all_tables.append(_elsewhere_table(settings, results))
+    return *all_tables, _session_table(results)
 
 
 @dataclass(frozen=True)
-class Counted:
+class JudgedSession:
     """One session of one run: what was recognized of the photographs that were judged, and its promise."""
 
     recognized: int
@@ -142,33 +142,33 @@ class Counted:
         return low <= self.recognized <= high
 
 
-def counted(result: Result, sessions: str = "sessions") -> list[Counted]:
+def count_sessions(result: Result, sessions: str = "sessions") -> list[JudgedSession]:
     """A run's sessions, or those of "rendered" views, in which anything could be judged."""
-    hits = hits_of(result.answers["promised"])
-    about = sum(hits) / len(hits), recorded_spread(result), rate_posterior(*count_by_session(hits, 1))
-    return [Counted(recognized, judged, *about) for recognized, judged in result.answers[sessions] if judged]
+    hits = parse_hits(result.answers["promised"])
+    about = sum(hits) / len(hits), promise_posterior(result), rate_posterior(*count_by_session(hits, 1))
+    return [JudgedSession(recognized, judged, *about) for recognized, judged in result.answers[sessions] if judged]
 
 
-def _width(sessions: Sequence[Counted], alone: bool = False) -> float:
+def _median_width(sessions: Sequence[JudgedSession], alone: bool = False) -> float:
     """The median width of the intervals, as a share of the photographs."""
     return float(np.median([np.ptp(session.interval(alone)) / session.judged for session in sessions]))
 
 
-def _best_width(sessions: Sequence[Counted]) -> float | None:
+def _best_width(sessions: Sequence[JudgedSession]) -> float | None:
     """Between the 2.5 and 97.5 % points of what sessions showed beside their promise: who knew how much sessions really
     differ could not promise less. None of too few sessions to say.
     """
-    if len(sessions) < _LEAST_SESSIONS:
+    if len(sessions) < _MIN_SESSIONS:
         return None
     low, high = np.quantile([session.share - session.rate for session in sessions], (TAIL, 1 - TAIL))
     return float(high - low)
 
 
-def _shares(name: str, title: str, about: str, results: Sequence[Result]) -> Table:
+def _share_table(name: str, title: str, about: str, results: Sequence[Result]) -> Table:
     kind = "rendered" if name == "rendered" else "sessions"
     rows = []
     for scene, group in (by_scene(results) | {"all": list(results)}).items():
-        by_run = [own for result in group if (own := counted(result, kind))]
+        by_run = [own for result in group if (own := count_sessions(result, kind))]
         sessions = [session for own in by_run for session in own]
         if not sessions:
             continue
@@ -176,10 +176,10 @@ def _shares(name: str, title: str, about: str, results: Sequence[Result]) -> Tab
             (
                 scene,
                 rate([session.held() for session in sessions]),
-                _width(sessions),
+                _median_width(sessions),
                 _best_width(sessions),
                 rate([session.held(alone=True) for session in sessions]),
-                _width(sessions, alone=True),
+                _median_width(sessions, alone=True),
                 mean([float(np.mean([session.share - session.rate for session in own])) for own in by_run]),
             )
         )
@@ -191,13 +191,13 @@ def _shares(name: str, title: str, about: str, results: Sequence[Result]) -> Tab
     return Table(name, title, head, tuple(rows), about)
 
 
-def _each(results: Sequence[Result]) -> Table:
+def _session_table(results: Sequence[Result]) -> Table:
     head = ("scene", "network", "printer", "seed", "design", "session", "promised", "correlation")
     head = (*head, "judged", "recognized", "low", "high", "held", "verdict")
     rows = []
     for result in results:
         values, printer = result.cell.values, short_name(result.cell.values["scene"]["printer"]["profile"])
-        for number, session in enumerate(counted(result), 1):
+        for number, session in enumerate(count_sessions(result), 1):
             design = short_name(f"/{values['picture']}") if "picture" in values else "own"
             start = (values["name"], values["network"], printer, values["seed"], design, number)
             what = (session.rate, session.spread.correlation[0], session.judged, session.recognized)
@@ -205,11 +205,11 @@ def _each(results: Sequence[Result]) -> Table:
     return Table("promises", "Every session", head, tuple(rows), "the verdict is that of all sessions of the run")
 
 
-def _elsewhere(settings: PromisesSettings, results: Sequence[Result]) -> Table:
+def _elsewhere_table(settings: PromisesSettings, results: Sequence[Result]) -> Table:
     rows = []
     for result in results:
-        values, (low, high) = result.cell.values, recorded_spread(result).rate_interval
-        shown, promised = rate(hits_of(result.answers["elsewhere"])), hits_of(result.answers["promised"])
+        values, (low, high) = result.cell.values, promise_posterior(result).rate
+        shown, promised = rate(parse_hits(result.answers["elsewhere"])), parse_hits(result.answers["promised"])
         within = shown is not None and low <= shown.value <= high
         about = (values["name"], values["network"], values["seed"])
         rows.append((*about, sum(promised) / len(promised), low, high, shown, within))
@@ -225,7 +225,7 @@ def figures(settings: PromisesSettings, results: Sequence[Result]) -> tuple[Draw
         axes = figure.subplots()
         axes.plot([0, 1], [0, 1], color="0.6", linewidth=1)
         for name, group in by_scene(results).items():
-            sessions = [session for result in group for session in counted(result)]
+            sessions = [session for result in group for session in count_sessions(result)]
             if not sessions:
                 continue
             promised = [session.rate for session in sessions]

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 from pydantic import Field
 
-from patchlab.study.grid import Count
+from patchlab.study.grid import PositiveInt
 from patchlab.study.study import Cell, Result, Study
 from patchproof.base.goal import Goal
 from patchproof.base.sessions import RatePosterior, split_evenly
@@ -28,8 +28,8 @@ from patchproof.sheets.manifest import ConditionClaim, ControlClaim, ModelClaim,
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_WORDS = ("kept", "cannot_tell", "broken")
-_STEPS = 26  # of true rates in the figure
+_VERDICTS = ("kept", "cannot_tell", "broken")
+_PLOTTED_RATES = 26  # of true rates in the figure
 
 
 class VerdictsSettings(StrictModel):
@@ -39,10 +39,15 @@ class VerdictsSettings(StrictModel):
     control: Share = 0.3  # the best control's rate
     # of two photographs of one session
     correlations: Annotated[tuple[Annotated[Positive, Field(le=0.9)], ...], Field(min_length=1)] = (0.02, 0.05, 0.1)
-    photos: Count = 40  # of the print, in all
-    sessions: Annotated[tuple[Count, ...], Field(min_length=1)] = (1, 2, 4, 8)  # that the photographs are spread over
+    photos: PositiveInt = 40  # of the print, in all
+    sessions: Annotated[tuple[PositiveInt, ...], Field(min_length=1)] = (
+        1,
+        2,
+        4,
+        8,
+    )  # that the photographs are spread over
     below: tuple[Share, ...] = (0.0, 0.1, 0.15, 0.2)  # how far true rates lie under the promised one
-    promises: Count = 20  # drawn for each correlation
+    promises: PositiveInt = 20  # drawn for each correlation
 
 
 def cells(settings: VerdictsSettings, base: Path) -> list[Cell]:
@@ -53,18 +58,18 @@ def cells(settings: VerdictsSettings, base: Path) -> list[Cell]:
 def run(settings: VerdictsSettings, base: Path, cell: Cell) -> dict[str, Any]:
     """The share of promises that give each count each word, by number of sessions."""
     rng, words = np.random.default_rng(0), {}
-    promises = [_promise(settings, cell.values["correlation"], rng) for _ in range(settings.promises)]
+    promises = [_draw_promise(settings, cell.values["correlation"], rng) for _ in range(settings.promises)]
     for sessions in settings.sessions:
         parts = split_evenly(settings.photos, sessions)
         rows = [[judge(k, parts, promise).verdict for k in range(settings.photos + 1)] for promise in promises]
         words[str(sessions)] = [
-            [float(np.mean([word == each for each in of_count])) for word in _WORDS]
+            [float(np.mean([word == each for each in of_count])) for word in _VERDICTS]
             for of_count in zip(*rows, strict=True)
         ]
     return words
 
 
-def _promise(settings: VerdictsSettings, correlation: float, rng: np.random.Generator) -> Promise:
+def _draw_promise(settings: VerdictsSettings, correlation: float, rng: np.random.Generator) -> Promise:
     strength = 1 / correlation - 1
     sessions = PROMISE_VIEWS // VIEWS_PER_SESSION
     own = rng.beta(settings.rate * strength, (1 - settings.rate) * strength, (sessions, 1))
@@ -87,7 +92,7 @@ def _promise(settings: VerdictsSettings, correlation: float, rng: np.random.Gene
 
 
 def _chances(settings: VerdictsSettings, result: Result, sessions: int, rate: float) -> np.ndarray:
-    """The chance of each of `_WORDS` at a true rate."""
+    """The chance of each of `_VERDICTS` at a true rate."""
     at = RatePosterior(np.array([rate]), np.array([result.cell.values["correlation"]]), np.ones(1))
     return at.chances(split_evenly(settings.photos, sessions)) @ np.array(result.answers[str(sessions)])
 
@@ -104,7 +109,9 @@ def tables(settings: VerdictsSettings, results: Sequence[Result]) -> tuple[Table
         f"{settings.photos} photographs, {settings.rate:.0%} promised, the best control at {settings.control:.0%}; "
         f"means over {settings.promises} promises"
     )
-    return (Table("verdicts", "Chances of verdicts", ("correlation", "sessions", "true rate", *_WORDS), rows, about),)
+    return (
+        Table("verdicts", "Chances of verdicts", ("correlation", "sessions", "true rate", *_VERDICTS), rows, about),
+    )
 
 
 def figures(settings: VerdictsSettings, results: Sequence[Result]) -> tuple[Drawing, ...]:
@@ -112,7 +119,7 @@ def figures(settings: VerdictsSettings, results: Sequence[Result]) -> tuple[Draw
 
     def draw(figure: Figure) -> None:
         panels = figure.subplots(1, len(results), sharey=True, squeeze=False)[0]
-        rates = np.linspace(max(0.01, settings.rate - 0.4), min(0.99, settings.rate + 0.12), _STEPS)
+        rates = np.linspace(max(0.01, settings.rate - 0.4), min(0.99, settings.rate + 0.12), _PLOTTED_RATES)
         for axes, result in zip(panels, results, strict=True):
             for sessions in settings.sessions:
                 kept = [_chances(settings, result, sessions, float(rate))[0] for rate in rates]

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 import patchproof as pp
-from patchlab.bench.measure import clocked, in_turn
+from patchlab.bench.measure import call_in_turn, time_call
 from patchlab.results.rows import write_rows
 from patchproof.base.workers import keep_freed_memory
 from patchproof.classifier.network import Classifier
@@ -48,11 +48,11 @@ def measured(path: str) -> list[dict]:
     control_mask = _control_mask(PROMISE_VIEWS, VIEWS_PER_SESSION)
 
     def told(way):
-        Classifier._call_network = way
-        return clocked(lambda: responses(problem, shown, conditions, control_mask=control_mask))
+        Classifier._asked = way
+        return time_call(lambda: responses(problem, shown, conditions, beside=beside))
 
-    rounds, rows = in_turn({way: partial(told, way) for way in (asked, rounded)}, ROUNDS), []
-    Classifier._call_network, (wholes, halves) = asked, rounds.values()
+    rounds, rows = call_in_turn({way: partial(told, way) for way in (asked, rounded)}, ROUNDS), []
+    Classifier._asked, (wholes, halves) = asked, rounds.values()
     share = statistics.median(half_ms / ms for (_, ms), (_, half_ms) in zip(wholes, halves, strict=True))
     for thing in ("design", "bare"):
         whole, half = wholes[-1][0][thing], halves[-1][0][thing]

@@ -11,7 +11,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import patchproof as pp
-from patchlab.bench.measure import said_by
+from patchlab.bench.measure import run_in_checkout
 from patchlab.results.rows import write_rows
 
 TIMED = """
@@ -46,7 +46,7 @@ print(json.dumps(rows[len(items):]))  # the first time warms up
 
 def measured(source: Path, number: int, folder: str) -> list[dict]:
     """Lines of the table."""
-    commit, rows = said_by(source, TIMED, folder)
+    commit, rows = run_in_checkout(source, TIMED, folder)
     return [{"commit": commit, "round": number} | row for row in rows]
 
 

@@ -15,7 +15,7 @@ from time import perf_counter
 import numpy as np
 import torch
 
-from patchlab.bench.measure import clocked, in_turn
+from patchlab.bench.measure import call_in_turn, time_call
 from patchlab.results.rows import write_rows
 from patchproof.base.workers import keep_freed_memory
 from patchproof.classifier import load_classifier
@@ -36,8 +36,8 @@ def gradient(network, photos, windows):
 
 def in_turn_ms(whole, some):
     """(what both calls return in each round, their median milliseconds)."""
-    calls = {call: partial(clocked, call, perf_counter) for call in (whole, some)}
-    answers, times = zip(*(zip(*each, strict=True) for each in in_turn(calls, ROUNDS).values()), strict=True)
+    calls = {call: partial(time_call, call, perf_counter) for call in (whole, some)}
+    answers, times = zip(*(zip(*each, strict=True) for each in call_in_turn(calls, ROUNDS).values()), strict=True)
     return list(zip(*answers, strict=True)), [statistics.median(ms) for ms in times]
 
 

@@ -1,7 +1,7 @@
 """What an operating envelope varies: tilt, distance, light, camera, paper and print, one number each.
 
 In: a scene. Out: `AXES`: for every axis its unit, the sweep from an easy to a hard end that suits the scene, and what a
-value does to drawn conditions (`conditions_at`) or to where the piece lies (`placed_at`). What an axis does not name
+value does to drawn conditions (`conditions_at`) or to where the piece lies (`scene_at`). What an axis does not name
 stays as it was drawn, so that the points of a sweep differ in nothing else.
 """
 
@@ -17,10 +17,10 @@ from patchproof.scene.conditions import Conditions, with_values
 from patchproof.scene.interface import Scene
 from patchproof.scene.patch_scene import require_patch
 
-Point = Mapping[str, float]
+SweepPoint = Mapping[str, float]
 """Values by axis; what is not named is as drawn, or as the run has it."""
 
-Ends = Callable[[Scene], tuple[float, float]]
+AxisEnds = Callable[[Scene], tuple[float, float]]
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Axis:
 
     title: str
     unit: str
-    ends: Ends
+    ends: AxisEnds
     ratio: bool = False
     needs_mesh: bool = True
 
@@ -79,8 +79,8 @@ AXES: dict[str, Axis] = {
     "size": Axis("patch size", "× its own", lambda scene: (1.0, 0.1), ratio=True),
 }
 # Axes that move the camera or the paper: views of other values have to be rasterized anew.
-GEOMETRY = ("tilt", "distance", "curl", "gap", "size")
-MAPS = (
+GEOMETRY_AXES = ("tilt", "distance", "curl", "gap", "size")
+DEFAULT_MAPS = (
     ("tilt", "distance"),
     ("blur", "darkness"),
     ("hidden", "size"),
@@ -90,29 +90,29 @@ MAPS = (
 )
 
 
-def possible(scene: Scene, name: str) -> bool:
+def is_possible(scene: Scene, name: str) -> bool:
     """Whether this scene can be photographed at other values of the axis."""
     if not scene.HAS_OBJECT:
         return not AXES[name].needs_mesh
     return name != "curl" or require_patch(scene).placement.is_flat
 
 
-def conditions_at(scene: Scene, conditions: Conditions, point: Point) -> Conditions:
+def conditions_at(scene: Scene, conditions: Conditions, point: SweepPoint) -> Conditions:
     """`conditions` with what the point says about camera and light."""
     for axis, value in point.items():
         if axis == "tilt":
-            conditions = _tilted(conditions, value)
+            conditions = _tilt_cameras(conditions, value)
         elif axis == "darkness":
             conditions = with_values(conditions, exposure_ev=-value)
-        elif axis in _FIELDS:
-            conditions = with_values(conditions, **{_FIELDS[axis]: value})
+        elif axis in _FIELD_OF_AXIS:
+            conditions = with_values(conditions, **{_FIELD_OF_AXIS[axis]: value})
     return conditions
 
 
-_FIELDS = {"distance": "distance_mm", "blur": "blur_px", "noise": "noise", "jpeg": "jpeg"}
+_FIELD_OF_AXIS = {"distance": "distance_mm", "blur": "blur_px", "noise": "noise", "jpeg": "jpeg"}
 
 
-def placed_at(scene: Scene, point: Point) -> Scene:
+def scene_at(scene: Scene, point: SweepPoint) -> Scene:
     """The scene with its piece printed smaller, standing off, or curled."""
     if not {"size", "curl", "gap"} & point.keys():
         return scene
@@ -128,7 +128,7 @@ def placed_at(scene: Scene, point: Point) -> Scene:
     return replace(scene, placement=placement)
 
 
-def _tilted(conditions: Conditions, tilt_deg: float) -> Conditions:
+def _tilt_cameras(conditions: Conditions, tilt_deg: float) -> Conditions:
     """The cameras moved to this angle from straight before the side, each towards where it stood."""
     azimuth, elevation = np.radians(conditions.pose.azimuth_deg), np.radians(conditions.pose.elevation_deg)
     right, up = np.cos(elevation) * np.sin(azimuth), np.sin(elevation)

@@ -23,17 +23,17 @@ import numpy as np
 
 from patchproof.base.intervals import wilson
 
-DRAWS = 200
-TOLERANCE = 0.1  # in log-likelihood: curves this near to the best are as good as it
-NOT_MONOTONE = 0.01  # two curves to a sweep are tested at once
-LEAST_AT_EASY_END = 0.05  # Wilson's lower end of the rate there, below which there is nothing to lose
-LEAST_LOST = 0.25  # of the rate at the easy end: what loses less over the whole sweep holds
-BEYOND = 2.0  # stands for a breaking point that is not in the sweep
+BOOTSTRAP_SAMPLES = 200
+LIKELIHOOD_TOLERANCE = 0.1  # in log-likelihood: curves this near to the best are as good as it
+MAX_P_NOT_MONOTONE = 0.01  # two curves to a sweep are tested at once
+MIN_EASY_RATE = 0.05  # Wilson's lower end of the rate there, below which there is nothing to lose
+MIN_LOST_SHARE = 0.25  # of the rate at the easy end: what loses less over the whole sweep holds
+BEYOND_SWEEP = 2.0  # stands for a breaking point that is not in the sweep
 
 
 @dataclass(frozen=True)
 class Break:
-    """Positions in the sweep, `BEYOND` where the curve holds; None where nothing worked at the easy end.
+    """Positions in the sweep, `BEYOND_SWEEP` where the curve holds; None where nothing worked at the easy end.
 
     `rates` are those of the best curve at both ends; `monotone_p` is None where no curve was fitted.
     """
@@ -49,14 +49,16 @@ def find_break(worked: np.ndarray, at: np.ndarray, seed: int = 0) -> Break:
     """The breaking point of `worked` n×P at positions P in [0, 1]: the bootstrap's median with its 95 % interval."""
     n = len(worked)
     rng = np.random.default_rng([seed, n])
-    weights = rng.multinomial(n, np.full(n, 1 / n), DRAWS)
+    weights = rng.multinomial(n, np.full(n, 1 / n), BOOTSTRAP_SAMPLES)
     counts = weights @ worked.astype(float)
     p = monotone_p(worked.mean(0), counts / n)
-    first, last = curve_at(_fit(worked.sum(0, keepdims=True).astype(float), n, at)[2][0], np.array([0.0, 1.0])).tolist()
-    if wilson(int(worked[:, 0].sum()), n)[0] < LEAST_AT_EASY_END:
+    first, last = curve_at(
+        _fit_curves(worked.sum(0, keepdims=True).astype(float), n, at)[2][0], np.array([0.0, 1.0])
+    ).tolist()
+    if wilson(int(worked[:, 0].sum()), n)[0] < MIN_EASY_RATE:
         return Break(None, None, None, p, (first, last))
-    low, high, _ = _fit(counts, n, at)
-    middle = np.where(high < BEYOND, (low + high) / 2, low)
+    low, high, _ = _fit_curves(counts, n, at)
+    middle = np.where(high < BEYOND_SWEEP, (low + high) / 2, low)
     value, low, high = (
         float(np.quantile(drawn, q, method="inverted_cdf")) for drawn, q in ((middle, 0.5), (low, 0.025), (high, 0.975))
     )
@@ -73,16 +75,16 @@ def curve_at(curve: np.ndarray, at: np.ndarray) -> np.ndarray:
 
 def monotone_p(rates: np.ndarray, drawn: np.ndarray) -> float:
     """How likely rates P that fall everywhere would look as unlike it as these; `drawn` B×P is their bootstrap."""
-    nearest = falling(rates)
+    nearest = nearest_falling(rates)
     observed = ((rates - nearest) ** 2).sum()
     if observed <= 1e-12:
         return 1.0
     moved = drawn - rates + nearest
-    distances = np.array([((row - falling(row)) ** 2).sum() for row in moved])
+    distances = np.array([((row - nearest_falling(row)) ** 2).sum() for row in moved])
     return float((1 + (distances >= observed).sum()) / (1 + len(drawn)))
 
 
-def falling(rates: np.ndarray) -> np.ndarray:
+def nearest_falling(rates: np.ndarray) -> np.ndarray:
     """The nearest rates P (least squares) that never rise."""
     from scipy.optimize import isotonic_regression
 
@@ -90,7 +92,7 @@ def falling(rates: np.ndarray) -> np.ndarray:
 
 
 @lru_cache(maxsize=1)
-def _grid() -> tuple[np.ndarray, np.ndarray]:
+def _curve_grid() -> tuple[np.ndarray, np.ndarray]:
     """Curves G×4 and where each has lost half of what it loses from 0 to 1, the earliest first."""
     centers, widths = np.linspace(0, 1.2, 61), np.geomspace(0.002, 0.4, 10)
     tops, floors = np.sin(np.linspace(0.05, np.pi / 2 - 0.05, 15)) ** 2, np.array([0, 0.1, 0.25, 0.4, 0.6, 0.8])
@@ -99,16 +101,16 @@ def _grid() -> tuple[np.ndarray, np.ndarray]:
     first, last = (curve_at(curves.T, np.full(1, end)) for end in (0.0, 1.0))
     level = (((first + last) / 2 - curves[:, 3]) / (top * (1 - share))).clip(1e-9, 1 - 1e-9)  # flat ones round to 1
     lost = center - width * np.log(level / (1 - level))
-    lost = np.where(first - last >= LEAST_LOST * first, lost.clip(0, 1), BEYOND)
+    lost = np.where(first - last >= MIN_LOST_SHARE * first, lost.clip(0, 1), BEYOND_SWEEP)
     order = np.argsort(lost, kind="stable")
     return curves[order], lost[order]
 
 
-def _fit(counts: np.ndarray, n: int, at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _fit_curves(counts: np.ndarray, n: int, at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Per row of counts B×P: the lowest and the highest breaking point of the curves as good as the best, B×4 best."""
-    curves, lost = _grid()
+    curves, lost = _curve_grid()
     rates = np.stack([curve_at(curves.T, np.full(1, x)) for x in at]).clip(1e-4, 1 - 1e-4)  # P×G
     odds, none = np.log(rates / (1 - rates)).astype(np.float32), n * np.log(1 - rates).sum(0).astype(np.float32)
     likelihood = counts.astype(np.float32) @ odds + none
-    good = likelihood >= likelihood.max(1, keepdims=True) - TOLERANCE  # curves are sorted by breaking point
+    good = likelihood >= likelihood.max(1, keepdims=True) - LIKELIHOOD_TOLERANCE  # curves are sorted by breaking point
     return lost[good.argmax(1)], lost[::-1][good[:, ::-1].argmax(1)], curves[likelihood.argmax(1)]

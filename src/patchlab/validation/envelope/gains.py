@@ -11,13 +11,13 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from patchlab.validation.envelope.fit import BEYOND, Break
+from patchlab.validation.envelope.fit import BEYOND_SWEEP, Break
 from patchproof.base.intervals import Estimate, paired_difference
 
 CONTROLS = ("bare", "gray")  # of the promise's the bare object and the markers alone; a noise design needs its own draw
 
 
-def gains_of(design: np.ndarray, controls: Mapping[str, np.ndarray]) -> list[Estimate]:
+def gains_over_controls(design: np.ndarray, controls: Mapping[str, np.ndarray]) -> list[Estimate]:
     """Per point the rate of `design` P×N minus that of the control, each P×N, that is hardest to beat there."""
     gains = []
     for point, own in enumerate(design):
@@ -38,7 +38,7 @@ def gain_break(gains: Sequence[Estimate], at: np.ndarray) -> Break:
     """
     ends, lost = (gains[0].value, gains[-1].value), [i for i, gain in enumerate(gains) if not has_effect(gain)]
     if not lost:
-        return Break(BEYOND, BEYOND, BEYOND, None, ends)
+        return Break(BEYOND_SWEEP, BEYOND_SWEEP, BEYOND_SWEEP, None, ends)
     if lost[0] == 0:
         return Break(None, None, None, None, ends)
     low, high = float(at[lost[0] - 1]), float(at[lost[0]])

@@ -21,19 +21,21 @@ import numpy as np
 from pydantic import Field
 
 from patchlab.study.study import Cell, Study
-from patchlab.validation.envelope.axes import AXES, MAPS, possible
+from patchlab.validation.envelope.axes import AXES, DEFAULT_MAPS, is_possible
 from patchlab.validation.envelope.fit import find_break
 from patchlab.validation.envelope.gains import gain_break
 from patchlab.validation.envelope.pages import figures, found_and_measured, gains_in, tables
-from patchlab.validation.envelope.world import measured, open_world, recognized
+from patchlab.validation.envelope.simulation import measure_photos, open_simulation, recognize_target
 from patchproof.base.errors import Refused
 from patchproof.base.validation import Finite, StrictModel, spelling_hint
 from patchproof.optimizer.run import load_run
 from patchproof.scene.interface import require_piece
 
-_SEED = 1_000_000  # the study's seeds begin here, far from those of scenes: Sobol points are what runs are selected on
-Count = Annotated[int, Field(ge=1, le=4096)]
-Points = Annotated[int, Field(ge=3, le=33)]
+_FIRST_SEED = (
+    1_000_000  # the study's seeds begin here, far from those of scenes: Sobol points are what runs are selected on
+)
+ConditionCount = Annotated[int, Field(ge=1, le=4096)]
+PointCount = Annotated[int, Field(ge=3, le=33)]
 
 
 class Sweep(StrictModel):
@@ -42,15 +44,15 @@ class Sweep(StrictModel):
     axis: str  # such as tilt, distance, blur; an unknown one is refused with all names
     easy: Finite | None = None  # value at the easy end
     hard: Finite | None = None  # value at the hard end
-    points: Points | None = None  # values; by default the study's
+    points: PointCount | None = None  # values; by default the study's
 
 
-class Map(StrictModel):
+class AxisPair(StrictModel):
     """Two axes against each other, each from its easy to its hard end."""
 
     x: str  # the axis across
     y: str  # the axis upwards
-    points: Points = 4  # values of each axis
+    points: PointCount = 4  # values of each axis
 
 
 class EnvelopeSettings(StrictModel):
@@ -60,26 +62,26 @@ class EnvelopeSettings(StrictModel):
 
     run: str  # the folder of a finished run of a patch
     seed: Annotated[int, Field(ge=0)] = 0  # of everything that is drawn
-    n: Count = 96  # conditions per point that the network sees; a quarter where JPEG is varied
-    photos: Count = 6  # of them photographed in full and measured
-    points: Points = 6  # values of each swept axis
-    map_n: Count = 32  # n for points of maps
-    map_photos: Count = 3  # photos for points of maps
+    n: ConditionCount = 96  # conditions per point that the network sees; a quarter where JPEG is varied
+    photos: ConditionCount = 6  # of them photographed in full and measured
+    points: PointCount = 6  # values of each swept axis
+    map_n: ConditionCount = 32  # n for points of maps
+    map_photos: ConditionCount = 3  # photos for points of maps
     sweeps: tuple[Sweep, ...] | None = None  # by default every axis that suits the scene
-    maps: tuple[Map, ...] | None = None  # likewise; none: []
+    maps: tuple[AxisPair, ...] | None = None  # likewise; none: []
     other_printer: str | None = None  # what `mismatch` counts from the run's own printer towards
 
 
 def cells(settings: EnvelopeSettings, base: Path) -> Sequence[Cell]:
     """A cell per sweep and per map; refused where the scene has no such axis."""
     scene = require_piece(load_run(base / settings.run).scene, "name the run of a printed patch")
-    able = [name for name in AXES if possible(scene, name)]
+    able = [name for name in AXES if is_possible(scene, name)]
     sweeps = settings.sweeps
     if sweeps is None:
         sweeps = tuple(Sweep(axis=name) for name in able)
     maps = settings.maps
     if maps is None:
-        maps = tuple(Map(x=x, y=y) for x, y in MAPS if x in able and y in able)
+        maps = tuple(AxisPair(x=x, y=y) for x, y in DEFAULT_MAPS if x in able and y in able)
     for name in [sweep.axis for sweep in sweeps] + [name for pair in maps for name in (pair.x, pair.y)]:
         if name not in able:
             raise Refused("an axis along which this scene can be varied", f'"{name}"', spelling_hint(name, able))
@@ -101,7 +103,7 @@ def _sweep_values(sweep: Sweep, scene, settings: EnvelopeSettings) -> dict[str, 
     return {"x": {"axis": sweep.axis, "easy": easy, "hard": hard, "points": points}}
 
 
-def _map_values(pair: Map, scene) -> dict[str, Any]:
+def _map_values(pair: AxisPair, scene) -> dict[str, Any]:
     ends = {key: (name, *AXES[name].ends(scene)) for key, name in (("x", pair.x), ("y", pair.y))}
     return {
         key: {"axis": name, "easy": easy, "hard": hard, "points": pair.points}
@@ -111,18 +113,18 @@ def _map_values(pair: Map, scene) -> dict[str, Any]:
 
 def run(settings: EnvelopeSettings, base: Path, cell: Cell) -> dict[str, Any]:
     """Per point which conditions were recognized and what was said of each photograph; of sweeps the breaks, too."""
-    world = open_world(base / settings.run, settings.other_printer)
+    world = open_simulation(base / settings.run, settings.other_printer)
     is_map = "y" in cell.values
     n, photos = (settings.map_n, settings.map_photos) if is_map else (settings.n, settings.photos)
-    drawn = world.scene.draw("select", max(n, photos), _SEED + settings.seed)
+    drawn = world.scene.draw("select", max(n, photos), _FIRST_SEED + settings.seed)
     x, along = _values(cell.values["x"])
     points = [{x: value} for value in along]
     if is_map:
         y, across = _values(cell.values["y"])
         points = [point | {y: value} for value in across for point in points]
     shown = max(n // 4, photos) if "jpeg" in points[0] else n
-    as_target = recognized(world, points, drawn[:shown])
-    photographed = measured(world, points, drawn[:photos])
+    as_target = recognize_target(world, points, drawn[:shown])
+    photographed = measure_photos(world, points, drawn[:photos])
     wanted = world.scene.settings.target.goal.sign > 0
     works = {kind: (hits == wanted).astype(int).tolist() for kind, hits in as_target.items()}
     answers = {

@@ -1,6 +1,6 @@
 """The window of a photograph that shows the piece, rendered alone, at full resolution.
 
-In: a stage and a view's conditions. Out: `Frame`: a stage whose camera sees that part, at the same scale; the rest of
+In: a stage and a view's conditions. Out: `RenderedWindow`: a stage whose camera sees that part, at the same scale; the rest of
 the photograph costs most and shows no markers. Left out on purpose: what else in it might look like a marker.
 """
 
@@ -19,7 +19,7 @@ _MARGIN_SHARE, _MARGIN_PX, _BLOCK = 0.25, 32, 16  # of a window round the piece;
 
 
 @dataclass(frozen=True)
-class Frame:
+class RenderedWindow:
     """What is rendered: pictures of `size_px`, whose corner lies at `origin_px` of the photograph."""
 
     stage: Stage
@@ -27,10 +27,10 @@ class Frame:
     origin_px: tuple[int, int] = (0, 0)
 
 
-def window(stage: Stage, conditions: Conditions) -> Frame:
+def piece_window(stage: Stage, conditions: Conditions) -> RenderedWindow:
     """The part of the photograph that shows the piece; all of it where the lens bends or a part would not do."""
     whole_px = stage.scene.photo_px
-    everything = Frame(stage, whole_px)
+    everything = RenderedWindow(stage, whole_px)
     if not stage.scene.HAS_OBJECT or stage.camera is not None:
         return everything
     scene = require_patch(stage.scene)
@@ -45,10 +45,10 @@ def window(stage: Stage, conditions: Conditions) -> Frame:
     if (high - low < 64).any():  # outside of the picture, almost
         return everything
     (left, top), (width, height) = low.tolist(), (high - low).tolist()
-    return Frame(_seen_through(stage, scene, (left, top), (width, height)), (width, height), (left, top))
+    return RenderedWindow(_window_stage(stage, scene, (left, top), (width, height)), (width, height), (left, top))
 
 
-def on_plain_ground(part: np.ndarray, origin_px, whole_px: tuple[int, int]) -> np.ndarray:
+def paste_on_plain(part: np.ndarray, origin_px, whole_px: tuple[int, int]) -> np.ndarray:
     """A photograph that shows `part` at `origin_px` and nothing else."""
     srgb, (x, y) = np.full((whole_px[1], whole_px[0], 3), np.median(part, (0, 1)).astype(np.uint8)), origin_px
     srgb[y : y + part.shape[0], x : x + part.shape[1]] = part
@@ -82,7 +82,7 @@ class _WindowBackgrounds:
         return self.whole.picture(choice, self.whole_px, self.whole_px)[y : y + size_px[1], x : x + size_px[0]]
 
 
-def _seen_through(stage: Stage, scene: PatchScene, origin_px: tuple[int, int], size_px: tuple[int, int]) -> Stage:
+def _window_stage(stage: Stage, scene: PatchScene, origin_px: tuple[int, int], size_px: tuple[int, int]) -> Stage:
     """The stage as a camera sees it that shows a window of the photograph only."""
     whole_px = scene.settings.camera.photo_px
     parts = {field.name: getattr(scene, field.name) for field in fields(PatchScene)}

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from patchlab.bench.chart import Chart, Point, span
+from patchlab.bench.chart import Chart, ChartPoint, value_and_ends
 from patchproof.report.tables import Drawing
 
 if TYPE_CHECKING:
@@ -21,13 +21,13 @@ if TYPE_CHECKING:
     from matplotlib.transforms import Bbox
 
 _COLORS = ("#1f5fa8", "#c2571a", "#2a8f62", "#8a4fa3", "#6b6b6b")
-_LINE = 60  # characters of an axis label in one line
-_MANY = 2000  # times the smallest: decades alone are written at the axis
+_LABEL_CHARACTERS = 60  # characters of an axis label in one line
+_DECADES_ONLY_RATIO = 2000  # times the smallest: decades alone are written at the axis
 _MARKERS = ("o", "s", "^", "D", "v")
 _RING = {"marker": "o", "ms": 12, "mfc": "none", "mec": "black", "mew": 1.2, "ls": "none"}
 
 
-def drawing(chart: Chart, machine: str) -> Drawing:
+def chart_drawing(chart: Chart, machine: str) -> Drawing:
     """The chart's figure; `machine` is the line in its corner."""
     return Drawing(chart.name, chart.title, partial(_draw, chart, machine), (7.0, 4.4), chart.about)
 
@@ -43,11 +43,11 @@ def _draw(chart: Chart, machine: str, figure: Figure) -> None:
         axes.plot(*np.array([p.at for p in front]).T, color=color, lw=1, ls="--", zorder=1)
     axes.plot([], [], color="0.4", lw=1, ls="--", label="Pareto front (filled)")
     axes.plot([], [], **_RING, label="default")
-    _scale(axes, [p for points in chart.series.values() for p in points if p.drawable])
+    _set_scales(axes, [p for points in chart.series.values() for p in points if p.drawable])
     figure.suptitle(chart.title, x=0.01, ha="left")
     figure.supxlabel(machine, fontsize=6.5, color="0.35", x=0.995, ha="right")
-    axes.set_xlabel(fill(chart.cost, _LINE))
-    axes.set_ylabel(fill(chart.error, _LINE))
+    axes.set_xlabel(fill(chart.cost, _LABEL_CHARACTERS))
+    axes.set_ylabel(fill(chart.error, _LABEL_CHARACTERS))
     axes.set_axisbelow(True)
     axes.grid(alpha=0.25)
     axes.spines[["top", "right"]].set_visible(False)
@@ -55,8 +55,8 @@ def _draw(chart: Chart, machine: str, figure: Figure) -> None:
     _write_settings(figure, axes, chart)
 
 
-def _draw_point(axes: Axes, point: Point, color: str, marker: str, filled: bool) -> None:
-    (x, *x_ends), (y, *y_ends) = span(point.cost), span(point.error)
+def _draw_point(axes: Axes, point: ChartPoint, color: str, marker: str, filled: bool) -> None:
+    (x, *x_ends), (y, *y_ends) = value_and_ends(point.cost), value_and_ends(point.error)
     bars = [[[middle - low], [high - middle]] for middle, (low, high) in ((y, y_ends), (x, x_ends))]
     axes.errorbar(x, y, *bars, fmt="none", ecolor=color, elinewidth=1, capsize=2.5, alpha=0.6)
     axes.plot(x, y, marker, color=color, mfc=color if filled else "white", ms=5)
@@ -64,7 +64,7 @@ def _draw_point(axes: Axes, point: Point, color: str, marker: str, filled: bool)
         axes.plot(x, y, **_RING)
 
 
-def _scale(axes: Axes, points: list[Point]) -> None:
+def _set_scales(axes: Axes, points: list[ChartPoint]) -> None:
     """Logarithmic axes where figures spread far."""
     costs, errors = zip(*(p.at for p in points), strict=True)
     if max(costs) > 4 * min(costs) > 0:
@@ -78,7 +78,7 @@ def _plain_log(axis, set_scale, ratio: float) -> None:
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     set_scale("log")
-    axis.set_major_locator(LogLocator(subs=(1, 2, 5) if ratio < _MANY else (1,)))
+    axis.set_major_locator(LogLocator(subs=(1, 2, 5) if ratio < _DECADES_ONLY_RATIO else (1,)))
     axis.set_major_formatter(FuncFormatter(lambda value, position: f"{value:g}"))
     axis.set_minor_formatter(NullFormatter())
 
@@ -104,11 +104,11 @@ def _write_settings(figure: Figure, axes: Axes, chart: Chart) -> None:
             return text.get_window_extent()
 
         corners = [(right, up) for right in (True, False) for up in (True, False)]
-        hidden = [_hidden(move(*corner), taken, axes.bbox) for corner in corners]
+        hidden = [_covered_area(move(*corner), taken, axes.bbox) for corner in corners]
         taken.append(move(*corners[int(np.argmin(hidden))]))
 
 
-def _hidden(box: Bbox, taken: list[Bbox], frame: Bbox) -> float:
+def _covered_area(box: Bbox, taken: list[Bbox], frame: Bbox) -> float:
     """The area of a text that lies on others or beyond the axes."""
     shared = (box.intersection(box, other) for other in taken)
     inside = box.intersection(box, frame)

@@ -1,10 +1,10 @@
 """Boards of markers whose print is known, found in photographs: what lies where, and how much of each pixel is paper.
 
-In: an uint8 photograph and the `BoardSettings` of what it shows. Out: a `Pose`: every printed square with the
+In: an uint8 photograph and the `BoardSettings` of what it shows. Out: a `BoardPose`: every printed square with the
 homography that takes it into the photograph, and the mask of the pixels in which the pattern is known, which are those
 of the markers that were found and of what lies between them. A grid and a ChArUco board lie in one plane; where its
 homography misses the markers' corners by too much, `PhotoRejected`. Loose markers have a plane each.
-Left out on purpose: boards that are bent. A lens that bends, and paper that is nearly flat, are followed by `moved`.
+Left out on purpose: boards that are bent. A lens that bends, and paper that is nearly flat, are followed by `shift_squares`.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from patchproof.photo.rectify import fit_page, region_around
 from patchproof.photo.rejection import PhotoRejected
 from patchproof.sheets.markers import board_squares, marker_cells, marker_corner
 
-LEAST_MARKERS = 4  # of a grid or a ChArUco board: two are met by planes that are far off
+MIN_MARKERS = 4  # of a grid or a ChArUco board: two are met by planes that are far off
 # Of a module: how far corners may lie off the plane, root mean square. In 25 photographs of flat boards they were off
 # by 0.02 to 0.17.
-LARGEST_MISFIT = 0.2
-_FINE = 8  # samples along each side of a pixel
-_QUIET = 1 / 8  # of a loose marker's side: the paper around it that has to be white for it to be found
-UNIT = rect_corners((0, 0, 1, 1))
+MAX_MISFIT_MODULES = 0.2
+_SAMPLES = 8  # samples along each side of a pixel
+_QUIET_ZONE = 1 / 8  # of a loose marker's side: the paper around it that has to be white for it to be found
+UNIT_SQUARE = rect_corners((0, 0, 1, 1))
 
 
 class BoardSettings(StrictModel):
@@ -69,7 +69,7 @@ class BoardSettings(StrictModel):
 
 
 @dataclass(frozen=True)
-class Printed:
+class PrintedSquare:
     """A printed square: modules n×n (1 = paper, 0 = ink), and the homography from the unit square to pixels.
 
     `area_px` K×4×2 are the quadrilaterals about it in which the pattern is known; none where it does not count.
@@ -83,16 +83,16 @@ class Printed:
     @property
     def corners_px(self) -> np.ndarray:
         """Its corners 4×2."""
-        return apply_homography(self.px_from_unit, UNIT)
+        return apply_homography(self.px_from_unit, UNIT_SQUARE)
 
 
 @dataclass(frozen=True)
-class Pose:
+class BoardPose:
     """What is printed where in a photograph; `misfit_px` is the root mean square by which corners miss the plane (None
     of loose markers), `module_px` the median side of a module.
     """
 
-    prints: tuple[Printed, ...]
+    prints: tuple[PrintedSquare, ...]
     found: int
     expected: int
     misfit_px: float | None
@@ -107,24 +107,26 @@ class Pose:
         return filled > 0
 
 
-def find_pose(srgb: np.ndarray, board: BoardSettings) -> Pose:
+def find_board(srgb: np.ndarray, board: BoardSettings) -> BoardPose:
     """The board in an uint8 photograph; `PhotoRejected` where too few markers or no plane are to be seen."""
     detected = find_markers(srgb, set(board.names), dictionary=board.dictionary)
-    least = 1 if board.kind == "loose" else min(LEAST_MARKERS, len(board.names))
+    least = 1 if board.kind == "loose" else min(MIN_MARKERS, len(board.names))
     if len(detected.markers) < least:
         advice = f"{len(detected.markers)} markers of {board.dictionary} with the board's ids were found"
         raise PhotoRejected("too_few_markers", len(detected.markers), least, advice)
     corners_px = detected.corners_px
     module_px = float(np.median([borders.module_px for borders in detected.markers.values()]))
     if board.kind == "loose":
-        prints, misfit_px = _loose(board, corners_px), None
+        prints, misfit_px = _loose_markers(board, corners_px), None
     else:
-        px_from_board, misfit_px = _plane(board, corners_px, module_px)
-        prints = _on_board(board, px_from_board, set(corners_px))
-    return Pose(prints, len(corners_px), len(board.names), misfit_px, module_px)
+        px_from_board, misfit_px = _fit_plane(board, corners_px, module_px)
+        prints = _board_squares(board, px_from_board, set(corners_px))
+    return BoardPose(prints, len(corners_px), len(board.names), misfit_px, module_px)
 
 
-def _plane(board: BoardSettings, corners_px: Mapping[int, np.ndarray], module_px: float) -> tuple[np.ndarray, float]:
+def _fit_plane(
+    board: BoardSettings, corners_px: Mapping[int, np.ndarray], module_px: float
+) -> tuple[np.ndarray, float]:
     """The homography from the board, in marker sides, and what the corners miss it by."""
     corners = {
         i: rect_corners((*marker_corner(at, 1 + board.gap, 1), 1, 1))
@@ -133,13 +135,13 @@ def _plane(board: BoardSettings, corners_px: Mapping[int, np.ndarray], module_px
     fit = fit_page(corners_px, corners)
     off = [corners_px[i] - apply_homography(fit.px_from_mm, corners[i]) for i in corners_px]
     misfit_px = float(np.sqrt((np.concatenate(off) ** 2).sum(1).mean()))
-    if misfit_px > LARGEST_MISFIT * module_px:
+    if misfit_px > MAX_MISFIT_MODULES * module_px:
         advice = f"no plane fits: corners lie {misfit_px:.2f} px off it, a module is {module_px:.1f} px"
-        raise PhotoRejected("curled", misfit_px, LARGEST_MISFIT * module_px, advice)
+        raise PhotoRejected("curled", misfit_px, MAX_MISFIT_MODULES * module_px, advice)
     return fit.px_from_mm, misfit_px
 
 
-def _on_board(board: BoardSettings, px_from_board: np.ndarray, found: set[int]) -> tuple[Printed, ...]:
+def _board_squares(board: BoardSettings, px_from_board: np.ndarray, found: set[int]) -> tuple[PrintedSquare, ...]:
     """All markers and black squares. Around a marker that was found half the white to the next one is known; a black
     square is where all the markers beside it were found, as nothing hides it then.
     """
@@ -148,60 +150,68 @@ def _on_board(board: BoardSettings, px_from_board: np.ndarray, found: set[int]) 
     prints = []
     for at, modules in zip(board.places, marker_cells(board.dictionary, board.names), strict=True):
         x, y = marker_corner(at, grown, 1)
-        area = _area(board, px_from_board, at, (x - half, y - half, grown)) if at in clear else []
-        prints.append(_printed(modules, px_from_board, (x, y, 1), area))
+        area = _square_area(board, px_from_board, at, (x - half, y - half, grown)) if at in clear else []
+        prints.append(_printed_square(modules, px_from_board, (x, y, 1), area))
     for at in board_squares(board.rows, board.columns, white=False) if board.kind == "charuco" else ():
         square = at[1] * grown, at[0] * grown, grown
         beside = {(at[0] + down, at[1] + right) for down, right in ((-1, 0), (1, 0), (0, -1), (0, 1))}
-        area = _area(board, px_from_board, at, square) if beside & set(board.places) <= clear else []
-        prints.append(replace(_printed(np.zeros((1, 1)), px_from_board, square, area), is_marker=False))
+        area = _square_area(board, px_from_board, at, square) if beside & set(board.places) <= clear else []
+        prints.append(replace(_printed_square(np.zeros((1, 1)), px_from_board, square, area), is_marker=False))
     return tuple(prints)
 
 
-def _area(board: BoardSettings, px_from_board, at: tuple[int, ...], square: tuple[float, float, float]) -> np.ndarray:
+def _square_area(
+    board: BoardSettings, px_from_board, at: tuple[int, ...], square: tuple[float, float, float]
+) -> np.ndarray:
     """A square 1×4×2 in pixels; a ChArUco board's outermost ones with some of the paper around it."""
     low, high = np.array(square[:2]), np.array(square[:2]) + square[2]
     if board.kind == "charuco":
         last = board.columns - 1, board.rows - 1
-        low = low - [_QUIET * (place == 0) for place in at[::-1]]
-        high = high + [_QUIET * (place == end) for place, end in zip(at[::-1], last, strict=True)]
+        low = low - [_QUIET_ZONE * (place == 0) for place in at[::-1]]
+        high = high + [_QUIET_ZONE * (place == end) for place, end in zip(at[::-1], last, strict=True)]
     return apply_homography(px_from_board, rect_corners((*low, *(high - low))))[None]
 
 
-def _printed(cells: np.ndarray, px_from_board: np.ndarray, square: tuple[float, float, float], area) -> Printed:
+def _printed_square(
+    cells: np.ndarray, px_from_board: np.ndarray, square: tuple[float, float, float], area
+) -> PrintedSquare:
     x, y, side = square
     place = np.array([[side, 0, x], [0, side, y], [0, 0, 1.0]])
-    return Printed(cells, px_from_board @ place, np.reshape(area, (-1, 4, 2)))
+    return PrintedSquare(cells, px_from_board @ place, np.reshape(area, (-1, 4, 2)))
 
 
-def _loose(board: BoardSettings, corners_px: Mapping[int, np.ndarray]) -> tuple[Printed, ...]:
+def _loose_markers(board: BoardSettings, corners_px: Mapping[int, np.ndarray]) -> tuple[PrintedSquare, ...]:
     ids, prints = sorted(corners_px), []
     for number, cells in zip(ids, marker_cells(board.dictionary, ids), strict=True):
-        px_from_unit = fit_homography(UNIT, corners_px[number])
-        area = apply_homography(px_from_unit, rect_corners((-_QUIET, -_QUIET, 1 + 2 * _QUIET, 1 + 2 * _QUIET)))
-        prints.append(Printed(cells, px_from_unit, area[None]))
+        px_from_unit = fit_homography(UNIT_SQUARE, corners_px[number])
+        area = apply_homography(
+            px_from_unit, rect_corners((-_QUIET_ZONE, -_QUIET_ZONE, 1 + 2 * _QUIET_ZONE, 1 + 2 * _QUIET_ZONE))
+        )
+        prints.append(PrintedSquare(cells, px_from_unit, area[None]))
     return tuple(prints)
 
 
-def moved(prints: Sequence[Printed], shift_px: Callable[[np.ndarray], np.ndarray]) -> tuple[Printed, ...]:
+def shift_squares(
+    prints: Sequence[PrintedSquare], shift_px: Callable[[np.ndarray], np.ndarray]
+) -> tuple[PrintedSquare, ...]:
     """The prints with their corners shifted by N×2 pixels at N×2 pixels."""
     out = []
     for printed in prints:
         corners = printed.corners_px
-        out.append(replace(printed, px_from_unit=fit_homography(UNIT, corners + shift_px(corners))))
+        out.append(replace(printed, px_from_unit=fit_homography(UNIT_SQUARE, corners + shift_px(corners))))
     return tuple(out)
 
 
-def paper_share(prints: Sequence[Printed], shape: tuple[int, ...]) -> np.ndarray:
+def paper_share(prints: Sequence[PrintedSquare], shape: tuple[int, ...]) -> np.ndarray:
     """H×W float32: how much of each pixel is paper, from 8 × 8 samples; around the prints all is paper."""
     share = np.ones(shape[:2], np.float32)
     for printed in prints:
         box = region_around(printed.corners_px, 1, shape)
         top, left, n = box[0].start, box[1].start, len(printed.cells)
         size = box[1].stop - left, box[0].stop - top
-        to_fine = np.array([[_FINE, 0, -_FINE * left], [0, _FINE, -_FINE * top], [0, 0, 1.0]])
+        to_fine = np.array([[_SAMPLES, 0, -_SAMPLES * left], [0, _SAMPLES, -_SAMPLES * top], [0, 0, 1.0]])
         matrix = index_homography(to_fine @ printed.px_from_unit @ np.diag([1 / n, 1 / n, 1]))
         ink = (1 - printed.cells).astype(np.float32)
-        fine = cv2.warpPerspective(ink, matrix, (size[0] * _FINE, size[1] * _FINE), flags=cv2.INTER_NEAREST)
+        fine = cv2.warpPerspective(ink, matrix, (size[0] * _SAMPLES, size[1] * _SAMPLES), flags=cv2.INTER_NEAREST)
         share[box] -= cv2.resize(fine, size, interpolation=cv2.INTER_AREA)
     return np.maximum(share, 0)

@@ -14,7 +14,7 @@ from scipy.stats import binom, t
 
 from patchproof.base.intervals import CONFIDENCE, MIN_CLUSTERS, Estimate, resampled_means, student_mean
 
-_ENDS = (1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2  # of an interval, as shares of a distribution
+_INTERVAL_QUANTILES = (1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2  # of an interval, as shares of a distribution
 
 
 def mean(values: Sequence[float]) -> Estimate | None:
@@ -25,7 +25,7 @@ def mean(values: Sequence[float]) -> Estimate | None:
 def median(values: Sequence[float] | np.ndarray) -> Estimate:
     """The median with its distribution-free interval from order statistics; of few values, their range."""
     ordered, n = sorted(map(float, values)), len(values)
-    skipped = max(int(binom.ppf(_ENDS[0], n, 0.5)) - 1, 0)
+    skipped = max(int(binom.ppf(_INTERVAL_QUANTILES[0], n, 0.5)) - 1, 0)
     return Estimate(statistics.median(ordered), ordered[skipped], ordered[n - 1 - skipped], n)
 
 
@@ -35,11 +35,15 @@ def paired_means(values: np.ndarray) -> list[Estimate]:
     """
     seeds, settings = values.shape
     left = values - values.mean(1, keepdims=True)
-    half = float(t.ppf(_ENDS[1], seeds - 1)) * left.std(0, ddof=1) * math.sqrt(settings / (settings - 1) / seeds)
+    half = (
+        float(t.ppf(_INTERVAL_QUANTILES[1], seeds - 1))
+        * left.std(0, ddof=1)
+        * math.sqrt(settings / (settings - 1) / seeds)
+    )
     return [Estimate(float(m), float(m - h), float(m + h), seeds) for m, h in zip(values.mean(0), half, strict=True)]
 
 
-def clustered(values: Sequence[float]) -> Estimate | float | None:
+def cluster_estimate(values: Sequence[float]) -> Estimate | float | None:
     """The mean of one figure per cluster as a table says it, n the number of clusters: without an interval where they
     are too few for one, None of nothing.
     """
@@ -58,7 +62,7 @@ def clustered_mean(values: Sequence[float]) -> tuple[float, tuple[float, float]]
     if len(values) < MIN_CLUSTERS:
         raise ValueError(f"expected at least {MIN_CLUSTERS} clusters, got {len(values)}")
     means = resampled_means(np.asarray(values, float), 10_000)
-    low, high = np.quantile(means, _ENDS)
+    low, high = np.quantile(means, _INTERVAL_QUANTILES)
     return float(np.mean(values)), (float(low), float(high))
 
 

@@ -19,15 +19,15 @@ from patchproof.photo.read import read_photo
 from patchproof.photo.rejection import PhotoRejected
 from patchproof.scene.image_scene import read_labels
 
-BLOCK_PHOTOS, BLOCK_PX = 8, 4_000_000  # of photographs hardened together: some 200 MB with gradients
-SMALLEST_PX = 8  # of a photograph's shorter side
-_HEADS = {"file", "filename", "file_name", "image", "name"}
+MAX_BLOCK_PHOTOS, MAX_BLOCK_PX = 8, 4_000_000  # of photographs hardened together: some 200 MB with gradients
+MIN_SIDE_PX = 8  # of a photograph's shorter side
+_HEADING_NAMES = {"file", "filename", "file_name", "image", "name"}
 
 
-def labeled_files(folder: Path, table: Path) -> list[tuple[str, str, str]]:
+def list_labeled_files(folder: Path, table: Path) -> list[tuple[str, str, str]]:
     """(file, its PNG's name, label) of every line; two files of one stem keep their suffixes in the PNG's name."""
     rows = read_labels(table)
-    if rows and rows[0][0].casefold() in _HEADS and not is_file(folder / rows[0][0]):
+    if rows and rows[0][0].casefold() in _HEADING_NAMES and not is_file(folder / rows[0][0]):
         rows = rows[1:]
     missing = [file for file, _ in rows if not is_file(folder / file)]
     if missing or not rows:
@@ -51,7 +51,7 @@ def write_labels(rows: Sequence[tuple[str, str | int]], folder: Path) -> Path:
     return path
 
 
-def in_blocks(folder: Path, rows) -> Iterator[list]:
+def split_into_blocks(folder: Path, rows) -> Iterator[list]:
     """Rows in their order, in blocks that fit into memory; sizes from the files' heads."""
     block, pixels = [], 0
     for row in rows:
@@ -60,7 +60,7 @@ def in_blocks(folder: Path, rows) -> Iterator[list]:
                 size = image.width * image.height
         except Exception:  # what is no image is reported when it is read
             size = 0
-        if block and (len(block) == BLOCK_PHOTOS or pixels + size > BLOCK_PX):
+        if block and (len(block) == MAX_BLOCK_PHOTOS or pixels + size > MAX_BLOCK_PX):
             yield block
             block, pixels = [], 0
         block.append(row)
@@ -71,7 +71,7 @@ def in_blocks(folder: Path, rows) -> Iterator[list]:
 def read_large_enough(path: Path) -> np.ndarray:
     """A photograph as uint8 H×W×3; `PhotoRejected` where it is no picture or a few pixels only."""
     srgb = read_photo(path).srgb
-    if min(srgb.shape[:2]) < SMALLEST_PX:
+    if min(srgb.shape[:2]) < MIN_SIDE_PX:
         shape = "×".join(map(str, srgb.shape[1::-1]))
-        raise PhotoRejected("too_small", min(srgb.shape[:2]), SMALLEST_PX, f"{shape} px are too few: use a larger one")
+        raise PhotoRejected("too_small", min(srgb.shape[:2]), MIN_SIDE_PX, f"{shape} px are too few: use a larger one")
     return srgb

@@ -11,8 +11,8 @@ from tempfile import TemporaryDirectory
 
 from torch import Tensor
 
-from patchlab.bench.chart import Progress
 from patchproof.app.demo import demo_scene
+from patchproof.base.progress import Progress
 from patchproof.base.settings import OptimizeSettings
 from patchproof.optimizer.loop import start, steps
 from patchproof.optimizer.pixels import as_pixels, from_pixels
@@ -20,7 +20,7 @@ from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.scene.scene import load_scene
 
 
-def design_for_demo(count: int, progress: Progress) -> tuple[Problem, Tensor]:
+def optimize_demo_design(count: int, progress: Progress) -> tuple[Problem, Tensor]:
     """The demo's problem, and the best design 3×h×w of `count` steps of its optimization."""
     problem = demo_problem().with_training(OptimizeSettings(steps=count))
     state = start(problem)

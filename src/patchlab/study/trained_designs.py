@@ -13,9 +13,17 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
-from patchlab.study.grid import GridSettings, Names, Tables, cell_of, scene_values, short_name, with_tables
+from patchlab.study.grid import (
+    GridSettings,
+    Names,
+    SceneChanges,
+    make_cell,
+    scene_values,
+    short_name,
+    with_scene_changes,
+)
 from patchlab.study.pictures import contact_sheet, photographs
-from patchlab.study.record import recorded
+from patchlab.study.record import answers_record
 from patchlab.study.study import Cell, Result
 from patchproof.base.intervals import Estimate
 from patchproof.optimizer.problem import Problem
@@ -23,8 +31,8 @@ from patchproof.optimizer.responses import responses
 from patchproof.render.photograph import Appearance
 from patchproof.scene.conditions import Conditions
 
-Way = dict[str, dict[str, Any]]  # tables of a scene file with the keys that change
-Word = Annotated[str, Field(pattern=r"^[\w=+,-]{1,24}$")]  # part of a file's name
+SceneVariant = dict[str, dict[str, Any]]  # tables of a scene file with the keys that change
+NamePart = Annotated[str, Field(pattern=r"^[\w=+,-]{1,24}$")]  # part of a file's name
 ORIGINAL = "original"  # the row of the object as it came
 
 
@@ -33,11 +41,11 @@ class TrainedSettings(GridSettings):
 
     networks: Names = Field(...)  # to train on and to test
     # By name: tables of the scene file with the keys that change.
-    ways: dict[Word, Way] = Field({"as_is": {}}, min_length=1)
+    ways: dict[NamePart, SceneVariant] = Field({"as_is": {}}, min_length=1)
     n: Annotated[int, Field(ge=2)] = 400  # unseen conditions that measure
 
 
-def alone(networks: Sequence[str]) -> dict[str, Sequence[str]]:
+def single_network_rows(networks: Sequence[str]) -> dict[str, Sequence[str]]:
     """Rows in which each network trains alone."""
     return {short_name(name): (name,) for name in networks}
 
@@ -45,43 +53,43 @@ def alone(networks: Sequence[str]) -> dict[str, Sequence[str]]:
 def trained_cells(
     settings: TrainedSettings,
     base: Path,
-    rows: Callable[[Sequence[str]], Mapping[str, Sequence[str]]] = alone,
-    variants: Sequence[tuple[Tables, Mapping[str, str]]] = (({}, {}),),
+    rows: Callable[[Sequence[str]], Mapping[str, Sequence[str]]] = single_network_rows,
+    variants: Sequence[tuple[SceneChanges, Mapping[str, str]]] = (({}, {}),),
 ) -> list[Cell]:
     """A cell per scene, way, variant, row and seed; all networks test. `rows` names those that train (none: the
     original); a variant is tables of the scene to change, and what of it cells should say.
     """
     networks, cells = settings.networks, []
     for file, (way, changed), (tables, more) in product(settings.scenes, settings.ways.items(), variants):
-        values = with_tables(scene_values(file, base, changed, f", way {way}"), tables)
+        values = with_scene_changes(scene_values(file, base, changed, f", way {way}"), tables)
         for (row, trained), seed in product(rows(networks).items(), settings.seeds):
             who, words = {"way": way, **more, "row": row}, (way, *(text[:24] for text in more.values()), row)
             networks_of_cell = {"trained": list(trained), "networks": list(networks), "of_scene": False}
-            cells.append(cell_of(values | who | networks_of_cell, seed, *words))
+            cells.append(make_cell(values | who | networks_of_cell, seed, *words))
     return cells
 
 
-def trained_on(problem: Problem, cell: Cell) -> Problem:
+def with_trainers(problem: Problem, cell: Cell) -> Problem:
     """The same problem before the networks that train."""
     return problem.with_classifiers([cell.values["networks"].index(name) for name in cell.values["trained"]])
 
 
-def answers_and_sheet(
+def ask_and_draw(
     problem: Problem, name: str, things: Mapping[str, Appearance], n: int, sheet: tuple[Conditions, int]
 ) -> dict[str, Any]:
     """What all networks say of `things` under n unseen conditions, and a cell's contact sheet: views and their side."""
-    answers = recorded(responses(problem, things, problem.scene.draw("evaluate", n)))
+    answers = answers_record(responses(problem, things, problem.scene.draw("evaluate", n)))
     return answers | {
         f"{name}.sheet.png": contact_sheet([photographs(problem, each, *sheet) for each in things.values()])
     }
 
 
-def tested_in(results: Sequence[Result]) -> list[str]:
+def tested_networks(results: Sequence[Result]) -> list[str]:
     """All networks that some cell was tested on."""
     return list(dict.fromkeys(name for result in results for name in result.cell.values["networks"]))
 
 
-def verdict(gain: Estimate | None) -> str:
+def gain_word(gain: Estimate | None) -> str:
     """What an interval of a difference allows one to say."""
     if gain is None:
         return "not measured"

@@ -30,17 +30,17 @@ import torch
 from pydantic import BeforeValidator
 from torch import Tensor
 
-from patchlab.harden.attacks import cross_entropy, even_loss, pgd
+from patchlab.harden.attacks import balanced_loss, cross_entropy, pgd
 from patchproof.classifier.network import Classifier, center_square
 
-Method = Literal["pgd", "fgsm", "adam"]
+HardenMethod = Literal["pgd", "fgsm", "adam"]
 # Without ε. Of 11 photographs hardened in 50 steps against a MobileNetV1 0.25, PGD of 0.01 left, with steps of 0.03 and
 # of 0.1 that do not fall, 3 and 0; with falling ones 3 and 11. At ε = 0.1, FGSM left 6 without and 11 with the fall.
-UNBOUNDED_STEP = 0.1
+UNBOUNDED_STEP_SIZE = 0.1
 THROUGH_STEPS = 7  # of ε/4, so that they reach the ball's edge
 
 
-def _epsilon(value: Any) -> float | None:
+def _parse_epsilon(value: Any) -> float | None:
     """0.03, "0.03", "8/255" or "none"."""
     if value is None or value == "none":
         return None
@@ -54,10 +54,10 @@ def _epsilon(value: Any) -> float | None:
     return epsilon
 
 
-Epsilon = Annotated[float | None, BeforeValidator(_epsilon)]
+Epsilon = Annotated[float | None, BeforeValidator(_parse_epsilon)]
 
 
-def epsilon_words(epsilon: float | None) -> str:
+def epsilon_text(epsilon: float | None) -> str:
     """ε as it is written: in code values of 255 where it is a whole number of them."""
     if epsilon is None:
         return "none"
@@ -69,7 +69,7 @@ def harden(
     photos: Sequence[np.ndarray],
     labels: Sequence[Sequence[int]],
     classifiers: Sequence[Classifier],
-    method: Method,
+    method: HardenMethod,
     epsilon: float | None,
     steps: int,
     step_size: float | None = None,
@@ -83,11 +83,11 @@ def harden(
     start = [_tensor(photo) for photo in photos]
     truth = [torch.tensor(indices) for indices in labels]
     pixels = [picture.clone().requires_grad_(True) for picture in start]
-    step = step_size or _step(method, epsilon, steps)
+    step = step_size or _first_step_size(method, epsilon, steps)
     adam = torch.optim.Adam(pixels, lr=step) if method == "adam" else None
     for number in range(steps):
         alpha = step if method == "fgsm" else step * (1 - number / steps)
-        gradients = torch.autograd.grad(_evened_loss(pixels, truth, classifiers, through), pixels)
+        gradients = torch.autograd.grad(_total_loss(pixels, truth, classifiers, through), pixels)
         with torch.no_grad():
             for picture, gradient in zip(pixels, gradients, strict=True):
                 if adam is None:
@@ -98,16 +98,16 @@ def harden(
                 adam.param_groups[0]["lr"] = alpha
                 adam.step()
             for picture, original in zip(pixels, start, strict=True):
-                picture.copy_(_projected(picture, original, epsilon))
-    return [_rounded(picture.detach(), photo, epsilon) for picture, photo in zip(pixels, photos, strict=True)]
+                picture.copy_(_project(picture, original, epsilon))
+    return [_round_to_codes(picture.detach(), photo, epsilon) for picture, photo in zip(pixels, photos, strict=True)]
 
 
-def squares(photos: Sequence[np.ndarray], classifier: Classifier) -> Tensor:
+def center_squares(photos: Sequence[np.ndarray], classifier: Classifier) -> Tensor:
     """N×3×S×S in [0, 1]: what the network sees of uint8 photographs of any sizes."""
     return torch.cat([center_square(_tensor(photo), classifier.input_px) for photo in photos])
 
 
-def moved(original: np.ndarray, hardened: np.ndarray) -> tuple[float, float]:
+def image_change(original: np.ndarray, hardened: np.ndarray) -> tuple[float, float]:
     """How far a photograph moved: RMS over all values in [0, 1], and the mean SSIM (11 px Gaussian window)."""
     from kornia.metrics import ssim
 
@@ -117,7 +117,7 @@ def moved(original: np.ndarray, hardened: np.ndarray) -> tuple[float, float]:
     return float((a - b).double().square().mean().sqrt()), sum(similar) / 3
 
 
-def _evened_loss(
+def _total_loss(
     pixels: Sequence[Tensor], truth: Sequence[Tensor], classifiers: Sequence[Classifier], through: float | None
 ) -> Tensor:
     logits = []
@@ -128,24 +128,24 @@ def _evened_loss(
             *_, worst = pgd(classifier.network, here, labels, through, cross_entropy, THROUGH_STEPS)
             view = view + (worst - here)
         logits.append(classifier.network(view))
-    return even_loss(logits, truth, cross_entropy)
+    return balanced_loss(logits, truth, cross_entropy)
 
 
-def _step(method: Method, epsilon: float | None, steps: int) -> float:
+def _first_step_size(method: HardenMethod, epsilon: float | None, steps: int) -> float:
     if method == "fgsm":
         return (1 if epsilon is None else epsilon) / steps
     if epsilon is None:
-        return UNBOUNDED_STEP
+        return UNBOUNDED_STEP_SIZE
     return max(epsilon / 4, 2 * epsilon / (steps + 1))  # so that few steps, too, reach the ball's edge together
 
 
-def _projected(pixels: Tensor, original: Tensor, epsilon: float | None) -> Tensor:
+def _project(pixels: Tensor, original: Tensor, epsilon: float | None) -> Tensor:
     if epsilon is not None:
         pixels = torch.clamp(pixels, original - epsilon, original + epsilon)
     return pixels.clamp(0, 1)
 
 
-def _rounded(pixels: Tensor, original: np.ndarray, epsilon: float | None) -> np.ndarray:
+def _round_to_codes(pixels: Tensor, original: np.ndarray, epsilon: float | None) -> np.ndarray:
     """uint8 within the ball: rounding may not leave it, or a stated ε would be exceeded by half a code value."""
     values = (pixels[0].permute(1, 2, 0).double() * 255).round().numpy().astype(np.int16)
     if epsilon is not None:

@@ -16,16 +16,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 from pydantic import Field
 
 from patchlab.study.grid import (
-    Count,
     GridSettings,
     Names,
+    PositiveInt,
     grid_cells,
-    networks_at,
+    network_names,
     scene_of,
     short_name,
-    with_tables,
+    with_scene_changes,
 )
-from patchlab.study.record import bits, hits_of
+from patchlab.study.record import hits_text, parse_hits
 from patchlab.study.study import Cell, Result
 from patchproof.base.sessions import RatePosterior, count_by_session, rate_posterior
 from patchproof.base.validation import expand_path
@@ -41,7 +41,7 @@ class SessionsSettings(GridSettings):
     """A run for each scene, network, printer and seed, and sessions of photographs of each."""
 
     printers: Names = ("coated",)  # that print the designs, and are known while optimizing
-    sessions: Count = 4  # of each print
+    sessions: PositiveInt = 4  # of each print
     photos: Annotated[int, Field(ge=5, le=1000)] = 20  # of each session
     path_traced: bool = True  # taken by Mitsuba 3, else by our renderer
 
@@ -53,20 +53,20 @@ def cells(settings: SessionsSettings, base: Path) -> list[Cell]:
         settings,
         base,
         lambda values: (
-            (with_tables(values, {"target": {"models": values["networks"]}, **table}), (printer,))
+            (with_scene_changes(values, {"target": {"models": values["networks"]}, **table}), (printer,))
             for printer, table in profiles.items()
         ),
     )
 
 
-def printed_run(base: Path, cell: Cell, folder: Path) -> Run:
+def make_run_and_sheet(base: Path, cell: Cell, folder: Path) -> Run:
     """The cell's design in folder/run, its sheet in folder/sheet.pdf."""
     from patchproof.optimizer.imported_design import import_patch
     from patchproof.optimizer.run import optimize
     from patchproof.reprints.run_sheet import sheet as sheet_of
 
     scene = scene_of(base, cell.values)
-    scene = replace(scene, settings=scene.settings.changed(target={"models": networks_at(base, cell.values)}))
+    scene = replace(scene, settings=scene.settings.changed(target={"models": network_names(base, cell.values)}))
     # one control is enough for a page, and all of them would take most of a promise's time
     if (picture := cell.values.get("picture")) is None:
         made = optimize(scene, folder / "run", promise=PromiseOptions(controls=("bare",)))
@@ -93,7 +93,7 @@ def take_photos(settings: SessionsSettings, cell: Cell, made: Run, folder: Path,
     return out
 
 
-def judged(
+def verify_photos(
     photos: Path,
     folder: Path,
     base: Path,
@@ -106,20 +106,20 @@ def judged(
     from patchproof.evidence.gather import gather_evidence
     from patchproof.sheets.manifest import load_manifest
 
-    sheet, networks = folder / "sheet.json", networks_at(base, cell.values)
+    sheet, networks = folder / "sheet.json", network_names(base, cell.values)
     manifest = load_manifest(sheet)
     given = replace(options_of(sheet, manifest, networks, None), **options)
     return gather_evidence(photos, manifest, given, forecast=forecast)
 
 
-def recorded_promise(made: Run) -> dict[str, Any]:
+def record_promise(made: Run) -> dict[str, Any]:
     """What answers keep of a run's promise."""
     promise = made.promise
-    hits = bits([condition.recognized for condition in promise.conditions])
+    hits = hits_text([condition.recognized for condition in promise.conditions])
     return {"promised": hits, "per_session": promise.per_session, "places": list(promise.places)}
 
 
-def recorded_spread(result: Result) -> RatePosterior:
+def promise_posterior(result: Result) -> RatePosterior:
     """What that promise says of photographs to come."""
     answers = result.answers
-    return rate_posterior(*count_by_session(hits_of(answers["promised"]), answers["per_session"], answers["places"]))
+    return rate_posterior(*count_by_session(parse_hits(answers["promised"]), answers["per_session"], answers["places"]))

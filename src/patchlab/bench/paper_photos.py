@@ -8,6 +8,7 @@ sheet are their own judges.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
@@ -21,15 +22,16 @@ from patchproof.base.geometry import intrinsics, look_at, rect_corners
 from patchproof.sheets.markers import DICTIONARY, aruco_dictionary
 
 Kind = Literal["flat", "lens", "rolled"]
+MarkerCorners = Mapping[int, np.ndarray]  # corners 4×2 by marker
 PIECE_MM, MARKER_MM = 140.0, 14.0
 DESIGN_MM = (20.0, 20.0, 100.0, 100.0)
 SIZE_PX = (1600, 1200)
-LENS = np.array([-0.12, 0.03, 5e-4, -5e-4, 0.0])  # k1 k2 p1 p2 k3: a wide phone camera
+LENS_TERMS = np.array([-0.12, 0.03, 5e-4, -5e-4, 0.0])  # k1 k2 p1 p2 k3: a wide phone camera
 RADII_MM = (100.0, 400.0)
-ASIDE_DEG = 35.0  # rolled paper hides a part of itself beyond
+MAX_AZIMUTH_DEG = 35.0  # rolled paper hides a part of itself beyond
 _RASTER_PX_PER_MM = 10
 _SAMPLES = 3  # along each side of a pixel
-_AROUND = np.array([[0, 0], [1, 0], [1, 1], [0, 1], [0, 0]])  # the piece's corners, as shares of it
+_OUTLINE = np.array([[0, 0], [1, 0], [1, 1], [0, 1], [0, 0]])  # the piece's corners, as shares of it
 
 
 @dataclass(frozen=True)
@@ -82,8 +84,8 @@ def corners_mm() -> dict[int, np.ndarray]:
     return {100 + i: rect_corners([x, y, MARKER_MM, MARKER_MM]) for i, (x, y) in enumerate(places)}
 
 
-def drawn_sheet(
-    kind: Kind, seed: int, size_px: tuple[int, int] = SIZE_PX, aside_deg: float = ASIDE_DEG
+def draw_sheet(
+    kind: Kind, seed: int, size_px: tuple[int, int] = SIZE_PX, aside_deg: float = MAX_AZIMUTH_DEG
 ) -> tuple[Sheet, np.random.Generator]:
     """A sheet that fills a third of a photograph's height or so, and what draws the rest of its photograph."""
     rng = np.random.default_rng([seed, 1])
@@ -93,16 +95,16 @@ def drawn_sheet(
     world_from_piece[:2, 3] = [-PIECE_MM / 2, PIECE_MM / 2]
     camera_from_world = look_at(rng.uniform(350, 700) * np.array(toward), [0, 0, 0], rng.uniform(-20, 20))
     curvature = rng.choice([-1, 1]) / rng.uniform(*RADII_MM) if kind == "rolled" else 0.0
-    terms = LENS if kind == "lens" else np.zeros(5)
+    terms = LENS_TERMS if kind == "lens" else np.zeros(5)
     pose, matrix = camera_from_world @ world_from_piece, intrinsics(50.0, size_px)
     return Sheet(pose, matrix, size_px, terms, float(curvature)), rng
 
 
-def photographed(sheet: Sheet, rng: np.random.Generator) -> np.ndarray:
+def photograph_paper(sheet: Sheet, rng: np.random.Generator) -> np.ndarray:
     """uint8 H×W×3 photograph of the sheet over something soft."""
     clutter = rng.uniform(0.05, 0.6, (24, 32)).astype(np.float32)
-    picture, raster = cv2.resize(clutter, sheet.size_px, interpolation=cv2.INTER_CUBIC), _raster(rng)
-    border = sheet.px(np.concatenate([PIECE_MM * np.linspace(a, b, 50) for a, b in pairwise(_AROUND)]))
+    picture, raster = cv2.resize(clutter, sheet.size_px, interpolation=cv2.INTER_CUBIC), _draw_raster(rng)
+    border = sheet.px(np.concatenate([PIECE_MM * np.linspace(a, b, 50) for a, b in pairwise(_OUTLINE)]))
     left, top = np.clip(np.floor(border.min(0)).astype(int) - 2, 0, sheet.size_px)
     right, bottom = np.clip(np.ceil(border.max(0)).astype(int) + 2, 0, sheet.size_px)
     y, x = np.mgrid[top:bottom, left:right] + 0.5
@@ -115,10 +117,10 @@ def photographed(sheet: Sheet, rng: np.random.Generator) -> np.ndarray:
     light = cv2.multiply(inside, cv2.remap(raster, column, row, cv2.INTER_NEAREST))
     light, cover = (cv2.resize(part, x.shape[::-1], interpolation=cv2.INTER_AREA) for part in (light, inside))
     picture[top:bottom, left:right] = picture[top:bottom, left:right] * (1 - cover) + light
-    return _developed(picture, rng)
+    return _develop(picture, rng)
 
 
-def _raster(rng: np.random.Generator) -> np.ndarray:
+def _draw_raster(rng: np.random.Generator) -> np.ndarray:
     """Light of the piece: markers, and a soft design."""
     side, marker_px = (round(mm * _RASTER_PX_PER_MM) for mm in (PIECE_MM, MARKER_MM))
     raster = np.full((side, side), 0.95, np.float32)
@@ -132,7 +134,7 @@ def _raster(rng: np.random.Generator) -> np.ndarray:
     return raster
 
 
-def _developed(light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def _develop(light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """uint8 H×W×3: the light H×W with drawn exposure, blur, noise and JPEG."""
     light = cv2.GaussianBlur(rng.uniform(0.3, 0.9) * light, (0, 0), rng.uniform(0.3, 1.2))
     light += rng.normal(0, rng.uniform(0, 0.01), light.shape).astype(np.float32)

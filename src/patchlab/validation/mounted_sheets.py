@@ -14,12 +14,12 @@ from patchproof.sheets.template import load_template
 from patchproof.sheets.write import write_sheet
 
 
-def hang_own(run: Run, control: str | None = None) -> MountedSheet:
+def mount_run_sheet(run: Run, control: str | None = None) -> MountedSheet:
     """The sheet that the run makes, or that of a printed control, without the page that says how to photograph it."""
-    return hang_piece(set_stage(run.scene), content_of(run, None, control)[0])
+    return mount_content(set_stage(run.scene), content_of(run, None, control)[0])
 
 
-def hang_piece(stage: Stage, content: SheetContent) -> MountedSheet:
+def mount_content(stage: Stage, content: SheetContent) -> MountedSheet:
     """A sheet of the stage's scene with any content in its piece."""
     template = load_template(stage.scene.settings.sheet.template)
     with TemporaryDirectory() as folder:
