@@ -135,8 +135,8 @@ def test_every_study_is_listed_under_its_own_name_and_says_what_it_is_about():
 
 def test_listing_the_studies_imports_none_of_them():
     code = (
-        "import sys; from patchlab.study.study import STUDIES, first_line\n"
-        "print(*map(first_line, STUDIES.values())); sys.exit('torch' in sys.modules)"
+        "import sys; from patchlab.study.study import STUDIES, module_summary\n"
+        "print(*map(module_summary, STUDIES.values())); sys.exit('torch' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
@@ -147,9 +147,9 @@ def test_a_kill_in_the_middle_and_more_workers_change_no_byte(tmp_path):
     run_cells(toy.STUDY, settings, BASE, whole, Work(jobs=2))
     code = (
         f"import sys; sys.path.insert(0, {str(BASE)!r})\n"
-        "import toy_studies as toy\nfrom pathlib import Path\nfrom patchlab.study.study import carry_out\n"
+        "import toy_studies as toy\nfrom pathlib import Path\nfrom patchlab.study.study import run_cells\n"
         f"settings = toy.ToySettings.model_validate_json({settings.model_dump_json()!r})\n"
-        f"carry_out(toy.STUDY, settings, Path({str(BASE)!r}), {str(killed)!r})"
+        f"run_cells(toy.STUDY, settings, Path({str(BASE)!r}), {str(killed)!r})"
     )
     process = subprocess.Popen([sys.executable, "-c", code])
     while len(list(killed.glob("cells/*.json"))) < 3:

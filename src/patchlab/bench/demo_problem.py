@@ -1,7 +1,7 @@
-"""What benchmarks of rendering and training look at: the demo's scene, and a design for it.
+"""The demo's scene and a design for it, which benchmarks of rendering and training use.
 
-In: nothing but the package's own object and classifier, so that it runs anywhere. The design comes from a short
-optimization, since a real one has more contrast and finer detail than a picture one would make up.
+In: only the package's object and classifier, so that benchmarks run anywhere. Out: a `Problem` and a design from a
+short optimization, which has more contrast and finer detail than an invented picture.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from patchproof.scene.scene import load_scene
 
 
 def optimize_demo_design(count: int, progress: Progress) -> tuple[Problem, Tensor]:
-    """The demo's problem, and the best design 3×h×w of `count` steps of its optimization."""
+    """The demo's problem, and the best design 3×h×w of `count` optimizer steps."""
     problem = demo_problem().with_training(OptimizeSettings(steps=count))
     state = start(problem)
     for step in steps(problem, state):
@@ -31,6 +31,6 @@ def optimize_demo_design(count: int, progress: Progress) -> tuple[Problem, Tenso
 
 
 def demo_problem() -> Problem:
-    """The demo's problem."""
+    """Build the demo's scene and set its problem."""
     with TemporaryDirectory() as folder:
         return set_problem(load_scene(demo_scene(Path(folder))))

@@ -1,6 +1,6 @@
-"""The knobs of detection: at which size the search starts, how corners are refined, how large photographs are.
+"""Benchmark detection: the size at which the search starts, corner refinement, and the size of photographs.
 
-In: photographs of flat paper. Out: a chart by photo size: milliseconds per photograph against the error of the
+In: photographs of flat paper. Out: a chart per photo size, of milliseconds per photograph against the error of the
 design's corners.
 """
 
@@ -31,13 +31,13 @@ WIDE_AZIMUTH_DEG = 50.0
 MAX_MILLISECONDS = 333.0  # 12 megapixels, three a second
 
 CornerFinder = Callable[[np.ndarray, int], MarkerCorners]
-KnownPhoto = tuple[np.ndarray, Sheet]  # a photograph, and where its millimeters truly lie
+KnownPhoto = tuple[np.ndarray, Sheet]  # a photograph, and the sheet that it shows
 
 
 @dataclass(frozen=True)
 class DetectionTrial:
     """Milliseconds per photograph, all errors of the design's corners in px (infinite without a fit), and the share of
-    markers that was found.
+    markers found.
     """
 
     milliseconds: list[float]
@@ -46,7 +46,7 @@ class DetectionTrial:
 
 
 def charts(quick: bool, progress: Progress) -> Iterator[Chart]:
-    """Start size and refinement, one chart per photo size."""
+    """Chart start size and refinement, one chart per photo size."""
     count = 3 if quick else 12
     for number, size_px in enumerate(SIZES_PX):
         yield _levels_chart([photograph_sheet(size_px, seed) for seed in range(count)], size_px)
@@ -62,16 +62,16 @@ def _levels_chart(shots: list[KnownPhoto], size_px: tuple[int, int]) -> Chart:
             points.append(ChartPoint(setting, cost, error, coarsest_px == COARSEST_PX and find is find_fitted_corners))
             shares.append((setting, trial.share))
     default = next(point for point in points if point.default)
-    checks = [Check("px of corner error by default", default.at[1], 0.1)]
+    checks = [Check("px of corner error by default", default.center[1], 0.1)]
     if size_px == SIZES_PX[-1]:
-        checks.append(Check("milliseconds by default", default.at[0], MAX_MILLISECONDS))
+        checks.append(Check("milliseconds by default", default.center[0], MAX_MILLISECONDS))
     return Chart(
         name=f"levels_{megapixels}mp",
         title=f"Detection in photographs of {megapixels} MP: start size and refinement",
         cost="milliseconds of processor time per photograph (median)",
         error="error of the design's corners, px (median)",
         series={f"{megapixels} MP": points},
-        about="The search starts at so many px; corners are fitted or OpenCV's. "
+        about="Setting: px at which the search starts, and whose corners are taken. "
         f"{len(shots)} photographs, tilt to 60°, blur to 1.2 px, JPEG 60 to 95; decoding is not counted.",
         checks=tuple(checks),
         tables=(Table(f"found_{megapixels}mp", "Markers found", ("setting", "share"), tuple(shares)),),
@@ -79,18 +79,18 @@ def _levels_chart(shots: list[KnownPhoto], size_px: tuple[int, int]) -> Chart:
 
 
 def photograph_sheet(size_px: tuple[int, int], seed: int) -> KnownPhoto:
-    """One photograph of flat paper from a fixed seed."""
+    """A photograph of flat paper, drawn from the seed, with its sheet."""
     sheet, rng = draw_sheet("flat", seed, size_px, WIDE_AZIMUTH_DEG)
     return photograph_paper(sheet, rng), sheet
 
 
 def find_fitted_corners(srgb: np.ndarray, coarsest_px: int) -> MarkerCorners:
-    """MarkerCorners as patchproof takes them."""
+    """Find corners as patchproof does."""
     return find_sheet(srgb, frozenset(corners_mm()), corners_mm(), DICTIONARY, coarsest_px).corners_px
 
 
 def find_opencv_corners(srgb: np.ndarray, coarsest_px: int) -> MarkerCorners:
-    """MarkerCorners as OpenCV refines them on the level that first shows each marker."""
+    """Find corners as OpenCV refines them on the pyramid level that first shows each marker."""
     quads: dict[int, list[np.ndarray]] = {}
     for level in pyramid_levels(srgb, full_region(srgb), coarsest_px):
         search_level(srgb, full_region(srgb), level, aruco_dictionary(DICTIONARY), quads)
@@ -100,11 +100,11 @@ def find_opencv_corners(srgb: np.ndarray, coarsest_px: int) -> MarkerCorners:
 
 
 def try_finder(shots: list[KnownPhoto], find: CornerFinder, coarsest_px: int) -> DetectionTrial:
-    """A way to find corners on all photographs."""
+    """Try a corner finder on all photographs."""
     milliseconds, errors, markers = [], [], 0
     for photo, sheet in shots:
-        corners, taken = time_call(partial(find, photo, coarsest_px))
-        milliseconds.append(taken)
+        corners, ms = time_call(partial(find, photo, coarsest_px))
+        milliseconds.append(ms)
         markers += len(corners)
         errors.append(_corner_errors_px(corners, sheet))
     return DetectionTrial(milliseconds, np.concatenate(errors), markers / (len(shots) * len(corners_mm())))

@@ -1,9 +1,8 @@
-"""The whole tool: what a draft, the default and three times its effort take, and how good their designs are.
+"""Benchmark whole runs: time and quality of a draft, the default, and three times its effort.
 
-In: five of the package's own objects before the built-in classifier, in the demo's hard conditions. Out: one chart, and
+In: five of the package's objects, the built-in classifier, and the demo's hard conditions. Out: one chart, and
 a table of seconds and promises. A run is timed from its scene to the promise with controls, in one process on one
-thread, so that its seconds compare with those of its other efforts. The designs of an object are judged in the same
-fresh conditions.
+thread, so that efforts compare. All designs of an object are judged in the same fresh conditions.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ from patchproof.report.tables import Table
 from patchproof.scene.interface import Scene
 from patchproof.scene.scene import build_scene
 
-# By label, all from above: the primitive, its length, how far the piece is off its middle, and its size, in mm.
+# By label: the primitive, its length, the piece's offset from its middle, and the piece's size, in mm.
 OBJECTS_BY_LABEL = {
     "box truck": ("box_truck", 400, 45, 147),
     "carton": ("carton", 300, 0, 140),
@@ -42,13 +41,13 @@ OBJECTS_BY_LABEL = {
     "table lamp": ("table_lamp", 450, 0, 90),
 }
 DEFAULT = "default"
-# By name the steps, and the views of the promise (None: as many as the scene's half width needs).
+# By name: steps, and views of the promise (None: as many as the scene's half width needs).
 EFFORTS = {"draft": DRAFT_EFFORT, DEFAULT: (OptimizeSettings().steps, None), "thorough": THOROUGH_EFFORT}
 QUICK_EFFORTS = {"draft": DRAFT_EFFORT, DEFAULT: (2 * DRAFT_EFFORT[0], 2 * DRAFT_EFFORT[1])}
 
 
 def charts(quick: bool, progress: Progress) -> Iterator[Chart]:
-    """The one chart."""
+    """Chart the efforts on five objects, quick: two efforts on one."""
     labels = list(OBJECTS_BY_LABEL)[:1] if quick else list(OBJECTS_BY_LABEL)
     yield effort_chart(labels, QUICK_EFFORTS if quick else EFFORTS, 100 if quick else 400, progress)
 
@@ -56,7 +55,7 @@ def charts(quick: bool, progress: Progress) -> Iterator[Chart]:
 def effort_chart(
     labels: list[str], efforts: Mapping[str, tuple[int, int | None]], judged: int, progress: Progress
 ) -> Chart:
-    """Each effort's seconds beside the default's against the share of `judged` views that its design misses."""
+    """Seconds of each effort over the default's, against the share of fresh views in which its design fails."""
     series, rows = {}, []
     for label in labels:
         runs = {}
@@ -85,6 +84,7 @@ def effort_chart(
 
 
 def object_scene(label: str, steps: int) -> Scene:
+    """The demo's scene with one of `OBJECTS_BY_LABEL` and this number of optimizer steps."""
     primitive, length_mm, off_mm, size_mm = OBJECTS_BY_LABEL[label]
     settings: dict[str, Any] = tomllib.loads(SCENE)
     settings["object"] |= {"mesh": f"primitive:{primitive}", "length_mm": length_mm}
@@ -103,7 +103,7 @@ def _timed_run(scene: Scene, views: int | None) -> tuple[Run, float]:
 
 
 def _missed_shares(runs: dict[str, Run], judged: int) -> dict[str, Estimate]:
-    """By name the share of the same fresh views in which each run's design is not recognized."""
+    """By name: the share of fresh views, the same for all, in which a run's design is not recognized."""
     problem = set_problem(next(iter(runs.values())).scene)
     shown = {name: problem.subject.appearance(from_pixels(run.design), "design") for name, run in runs.items()}
     answers = responses(problem, shown, problem.scene.draw("evaluate", judged))

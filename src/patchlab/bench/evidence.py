@@ -1,6 +1,6 @@
-"""What evidence costs: which model makes a piece's photograph flat.
+"""Benchmark models of the sheet's shape: plane, lens, cylinder.
 
-In: photographs of paper. Out: a chart. Errors are in millimeters of the paper, over the whole design.
+In: photographs of paper. Out: a chart. Errors are in millimeters on the paper, over the whole design.
 """
 
 from __future__ import annotations
@@ -33,28 +33,28 @@ from patchproof.photo.shapes import fit_cylinder, fit_radial_lens
 from patchproof.photo.unroll import fit_shape
 from patchproof.sheets.markers import DICTIONARY
 
-MARKER_SHIFT_PX = 4.0  # by which a marker is moved that was glued on again
+MARKER_SHIFT_PX = 4.0  # shift of one marker, as if it had been glued on again
 
 PixelModel = Callable[[np.ndarray], np.ndarray]
 
 
 def charts(quick: bool, progress: Progress) -> Iterator[Chart]:
-    """Models."""
+    """Chart the models."""
     yield models_chart(4 if quick else 24, progress)
 
 
 def error_mm(model: PixelModel, sheet: Sheet) -> float:
-    """The largest distance on paper, over a net on the design, between where a model sees a point and where it is."""
+    """The largest error of a model on paper, over a 5×5 grid on the design."""
     x, y, width, height = DESIGN_MM
     across, down = np.meshgrid(np.linspace(x, x + width, 5), np.linspace(y, y + height, 5))
-    net = np.column_stack([across.ravel(), down.ravel()])
-    by_mm = [(sheet.px(net + step) - sheet.px(net - step)) / 0.1 for step in 0.05 * np.eye(2)]
-    off = np.linalg.solve(np.stack(by_mm, -1), (model(net) - sheet.px(net))[..., None])
+    grid = np.column_stack([across.ravel(), down.ravel()])
+    by_mm = [(sheet.px(grid + step) - sheet.px(grid - step)) / 0.1 for step in 0.05 * np.eye(2)]
+    off = np.linalg.solve(np.stack(by_mm, -1), (model(grid) - sheet.px(grid))[..., None])
     return float(np.linalg.norm(off[..., 0], axis=1).max())
 
 
 def fit_robust_plane(corners_px: MarkerCorners) -> PixelModel:
-    """The page's homography as the tool fits it."""
+    """The page's homography as the tool fits it, robust to single markers."""
     homography = fit_page(corners_px, corners_mm()).px_from_mm
     return lambda mm: apply_homography(homography, mm)
 
@@ -80,7 +80,7 @@ def _fit_cylinder(corners_px: MarkerCorners) -> PixelModel:
 
 
 def choose_model(corners_px: MarkerCorners) -> PixelModel:
-    """As photographs are measured: a plane, unless a cylinder or a lens explains the corners far better."""
+    """The model that the tool measures with: a plane, unless a cylinder or a lens fits the corners far better."""
     explained = fit_shape(corners_px, corners_mm(), SIZE_PX)
     return fit_robust_plane(corners_px) if explained is None else explained.shape.px
 
@@ -97,13 +97,13 @@ DEFAULT_MODEL = "what pays"  # as in `evidence.measure`
 
 @lru_cache(maxsize=512)
 def find_sheet_corners(kind: Kind, seed: int) -> dict[int, np.ndarray]:
-    """The corners that are found in a sheet's photograph, by marker."""
+    """Corners found in a photograph of the sheet, by marker."""
     photo = photograph_paper(*draw_sheet(kind, seed))
     return find_sheet(photo, frozenset(corners_mm()), corners_mm(), DICTIONARY).corners_px
 
 
 def models_chart(count: int, progress: Progress) -> Chart:
-    """Models of the sheet against the error of the design, on flat, misprinted, bent and rolled sheets."""
+    """Milliseconds of each model against its error, on flat, misprinted, distorted and rolled sheets."""
     kinds: dict[str, tuple[Kind, float]] = {
         "flat": ("flat", 0.0),
         f"flat, a marker {MARKER_SHIFT_PX:g} px off": ("flat", MARKER_SHIFT_PX),
@@ -115,13 +115,13 @@ def models_chart(count: int, progress: Progress) -> Chart:
         errors: dict[str, list[float]] = {name: [] for name in MODELS}
         milliseconds: dict[str, list[float]] = {name: [] for name in MODELS}
         for seed in range(count):
-            sheet, wrong = draw_sheet(kind, seed)[0], sorted(corners_mm())[seed % len(corners_mm())]
+            sheet, shifted = draw_sheet(kind, seed)[0], sorted(corners_mm())[seed % len(corners_mm())]
             corners = {
-                i: px + np.array([wrong_px * (i == wrong), 0]) for i, px in find_sheet_corners(kind, seed).items()
+                i: px + np.array([wrong_px * (i == shifted), 0]) for i, px in find_sheet_corners(kind, seed).items()
             }
             for name, model in MODELS.items():
-                fitted, taken = time_call(partial(model, corners))
-                milliseconds[name].append(taken)
+                fitted, ms = time_call(partial(model, corners))
+                milliseconds[name].append(ms)
                 errors[name].append(error_mm(fitted, sheet))
         series[label] = [
             ChartPoint(name, median(milliseconds[name]), median(errors[name]), name == DEFAULT_MODEL) for name in MODELS
@@ -129,7 +129,7 @@ def models_chart(count: int, progress: Progress) -> Chart:
         progress("models of sheets", number + 1, len(kinds))
     return Chart(
         name="models",
-        title="What makes a sheet flat",
+        title="Models of a sheet's shape",
         cost="milliseconds to fit (median); finding the markers is not counted",
         error="largest error on the design, mm (median)",
         series=series,

@@ -1,7 +1,7 @@
-"""How benchmarks measure: times taken in turn within one run, their ratios, and the machine.
+"""Measure time: calls in turn within one run, ratios of their times, and the machine.
 
-In: calls. Out: seconds and ratios. A machine's seconds mean little elsewhere, so that times are compared only with
-times of the same run.
+In: calls. Out: milliseconds and ratios. Seconds of one machine mean little on another, so times are compared only
+within a run.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ ReturnValue = TypeVar("ReturnValue")
 
 
 def machine_details() -> dict[str, Any]:
-    """What the figures depend on beside the code."""
+    """Everything besides the code that times depend on: processor, cores, threads, versions, date."""
     import torch
 
     return {
@@ -44,7 +44,7 @@ def machine_details() -> dict[str, Any]:
 
 
 def machine_line(about: Mapping[str, Any]) -> str:
-    """The machine in one line, for the corner of a chart."""
+    """One line about the machine, for the corner of a chart."""
     threads = f"{about['threads']} thread{'' if about['threads'] == 1 else 's'} of {about['cores']} cores"
     return f"{about['processor']}, {threads}, torch {about['torch']}, {about['date']}"
 
@@ -52,7 +52,7 @@ def machine_line(about: Mapping[str, Any]) -> str:
 def call_in_turn(
     calls: Mapping[Name, Callable[[], ReturnValue]], rounds: int, advance: Advance = no_advance
 ) -> dict[Name, list[ReturnValue]]:
-    """What each call returns in each of some rounds, all calls in turn in every round; a round before them warms up."""
+    """By name the results of each call in `rounds` rounds; every round makes all calls in turn; one before warms up."""
     answers: dict[Name, list[ReturnValue]] = {name: [] for name in calls}
     for number in range(rounds + 1):
         for name, call in calls.items():
@@ -62,38 +62,36 @@ def call_in_turn(
 
 
 def time_calls(calls: Mapping[Name, Callable[[], object]], rounds: int) -> dict[Name, np.ndarray]:
-    """Wall milliseconds of each call in `rounds` rounds of `call_in_turn`."""
-    told = call_in_turn({name: partial(time_call, call, time.perf_counter) for name, call in calls.items()}, rounds)
-    return {name: np.array([ms for _, ms in values]) for name, values in told.items()}
+    """Wall milliseconds of each call, one per round of `call_in_turn`."""
+    results = call_in_turn({name: partial(time_call, call, time.perf_counter) for name, call in calls.items()}, rounds)
+    return {name: np.array([ms for _, ms in values]) for name, values in results.items()}
 
 
 def time_call(
     call: Callable[[], ReturnValue], clock: Callable[[], float] = time.process_time
 ) -> tuple[ReturnValue, float]:
-    """What a call returns, and its milliseconds; of the processor, where other work on the machine does not count, if
-    no other clock is given.
-    """
+    """(the call's result, milliseconds); by default processor time, which other work on the machine leaves alone."""
     begin = clock()
     return call(), 1000 * (clock() - begin)
 
 
 def time_ratio(times: Mapping[Name, np.ndarray], a: Name, b: Name) -> Estimate:
-    """How many times as long `a` took as `b`: the median over rounds, each with its own ratio."""
+    """Time of `a` over time of `b`: the median of the rounds' ratios."""
     return median(times[a] / times[b])
 
 
 def run_in_checkout(source: Path, code: str, *arguments: str) -> tuple[str, Any]:
-    """(the short commit, the JSON in the last line that `code` prints) in a process of its own, which imports from the
-    `src` folder of a checkout.
+    """Run `code` in a process that imports from a checkout's `src` folder: (short commit, JSON in the last line that it
+    prints).
     """
     command, environment = [sys.executable, "-c", code, *arguments], {**os.environ, "PYTHONPATH": str(source.resolve())}
-    said = subprocess.run(command, env=environment, stdout=subprocess.PIPE, check=True).stdout
+    output = subprocess.run(command, env=environment, stdout=subprocess.PIPE, check=True).stdout
     commit = subprocess.run(["git", "-C", source, "rev-parse", "--short", "HEAD"], stdout=subprocess.PIPE, text=True)
-    return commit.stdout.strip(), json.loads(said.splitlines()[-1])
+    return commit.stdout.strip(), json.loads(output.splitlines()[-1])
 
 
 def _processor() -> str:
-    """The processor's name, which Linux keeps in a file of its own."""
+    """The processor's name; on Linux from /proc/cpuinfo."""
     info = Path("/proc/cpuinfo")
     lines = info.read_text(encoding="utf-8").splitlines() if info.is_file() else []
     named = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]

@@ -1,16 +1,16 @@
-"""Ways to make a design for the same piece and as many passes: ours, and what one would use instead.
+"""Methods that make a design for the same piece with as many passes: ours, and alternatives.
 
-In: a `Problem` before one network. Out: `MadeDesign`: the design's pixels, as printed, and its passes. A pass is a picture
-that the network sees; one of training, forward and backward, and one of our selection set, forward only, count alike.
+In: a `Problem` with one network. Out: `MadeDesign`: the design's pixels, as printed, and its passes. A pass is one
+picture that the network sees; pictures of training (forward and backward) and of selection (forward) count alike.
 
-`optimize_design` is the loop as the scene sets it, `optimize_by_sign` the same with the signed steps of Pestana et al. `paste_and_optimize` does what a
-tutorial would do: it pastes the design at random places, sizes and angles into photographs of the bare object, and
-descends by Adam. `train_with_art` gives the same photographs to the Adversarial Robustness Toolbox (Nicolae et al.,
+`ours` is the loop as the scene sets it, `sign` the loop with the signed steps of Pestana et al. `flat` does what a
+tutorial does: it pastes the design at random places, sizes and angles into photographs of the bare object, and
+descends by Adam. `art` gives the same photographs to the Adversarial Robustness Toolbox (Nicolae et al.,
 arXiv:1807.01069), whose `AdversarialPatchPyTorch` follows Brown et al. (Adversarial Patch, 2017) likewise. The
-photographs are of conditions that `optimize_design` trains under, too; the design is as large in them as in its own views.
+photographs show conditions that `ours` trains under, too; designs are as large in them as in its views.
 
-Left out on purpose: printer, paper, light and perspective in `paste_and_optimize` and `train_with_art`, which is what is compared, and a
-selection set, which neither has: both train on the passes that ours spends on its own.
+Left out on purpose: printer, paper, light and perspective in `flat` and `art`, which is the comparison, and a selection
+set, which neither has: both train with the passes that ours spends on it.
 """
 
 from __future__ import annotations
@@ -35,35 +35,35 @@ from patchproof.render.photograph import expose
 from patchproof.scene.patch_scene import require_patch
 
 SIGN_STEP = 0.01  # as the paper has it
-# Best of 0.02, 0.05 and 0.1 for `paste_and_optimize` and, of 255 code values, 5 (ART's default), 13 and 25 for `train_with_art`: mean rates of
-# two seeds of the demo in 512 views were 0.609, 0.579, 0.571 and 0.568, 0.597, 0.579, those of `optimize_design` 0.806.
+# Best of 0.02, 0.05 and 0.1 for `flat` and, of 255 code values, 5 (ART's default), 13 and 25 for `art`: mean rates of
+# two seeds of the demo in 512 views were 0.609, 0.579, 0.571 and 0.568, 0.597, 0.579, those of `ours` 0.806.
 FLAT_STEP, ART_STEP = 0.02, 13.0
-MAX_ROLL_DEG = 22.5  # of pasted designs, either way: Brown et al.'s published program, and ART's own default
+MAX_ROLL_DEG = 22.5  # of pasted designs, in either direction: Brown et al.'s published program, and ART's own default
 MAX_PHOTOS = 256  # of the bare object, at most
-_SIZE_QUANTILES = (0.05, 0.95)  # quantiles of the design's size in our views that bound its size where it is pasted
+_SIZE_QUANTILES = (0.05, 0.95)  # of the design's sizes in our views; pasted sizes lie between them
 
 
 @dataclass(frozen=True)
 class MadeDesign:
-    """A design's pixels, uint8 H×W×3 as printed, and the passes that it took."""
+    """A design's pixels, uint8 H×W×3 as printed, and the number of passes that made it."""
 
     pixels: np.ndarray
     passes: int
 
 
 def optimize_design(problem: Problem) -> MadeDesign:
-    """The loop, as the scene's settings have it."""
+    """Optimize with the scene's settings."""
     return MadeDesign(best_design(problem), pass_budget(problem))
 
 
 def optimize_by_sign(problem: Problem) -> MadeDesign:
-    """The same loop with signed steps of the paper's size."""
+    """Optimize with signed steps of the paper's size."""
     settings = problem.scene.settings.changed(optimize={"optimizer": "sign", "step_size": SIGN_STEP})
     return optimize_design(replace(problem, scene=replace(problem.scene, settings=settings)))
 
 
 def paste_and_optimize(problem: Problem) -> MadeDesign:
-    """Paste the design into photographs of the bare object and descend by Adam; the last design."""
+    """Paste the design into photographs of the bare object, descend by Adam, and return the last design."""
     settings, photos, shares = problem.scene.settings.optimize, bare_photos(problem), paste_size_range(problem)
     rng, (classifier,), (indices,) = np.random.default_rng(problem.scene.seed), problem.classifiers, problem.indices
     design = problem.patch.start().requires_grad_()
@@ -79,8 +79,8 @@ def paste_and_optimize(problem: Problem) -> MadeDesign:
 
 
 def train_with_art(problem: Problem) -> MadeDesign:
-    """The patch that ART makes, as it is published: 1.20 sums up the patch's gradients over all steps. It knows square
-    patches alone: a design of another shape is one squeezed.
+    """Make the patch with ART as it is published: version 1.20 sums up the patch's gradients over all steps. It makes
+    square patches only, which are then resized to the design's shape.
     """
     attack, wrapper = load_art()
     settings, (classifier,) = problem.scene.settings, problem.classifiers
@@ -102,7 +102,7 @@ def train_with_art(problem: Problem) -> MadeDesign:
         attacking = attack(
             network,
             rotation_max=MAX_ROLL_DEG,
-            scale_min=min(low, 0.99 * high),  # refused where both are the same
+            scale_min=min(low, 0.99 * high),  # ART refuses equal scales
             scale_max=high,
             learning_rate=ART_STEP,
             max_iter=epochs,
@@ -128,17 +128,17 @@ METHODS: dict[str, Callable[[Problem], MadeDesign]] = {
 
 
 def load_art() -> tuple[Any, Any]:
-    """ART's attack and its wrapper of networks; refused in a sentence where they cannot be imported."""
+    """ART's attack and its wrapper of networks; refused if they cannot be imported."""
     try:
         attack, wrapper = import_module("art.attacks.evasion"), import_module("art.estimators.classification")
     except (ImportError, RuntimeError):  # the latter of a torchvision that was built for another torch
         do = 'pip install "patchproof[lab]", or leave art out of peers'
-        raise Refused("the Adversarial Robustness Toolbox", "none", do) from None
+        raise Refused("the Adversarial Robustness Toolbox", "none that can be imported", do) from None
     return attack.AdversarialPatchPyTorch, wrapper.PyTorchClassifier
 
 
 class _CodeValueNetwork(torch.nn.Module):
-    """A network that takes code values up to 255."""
+    """A network that takes code values from 0 to 255."""
 
     def __init__(self, classifier: Classifier):
         super().__init__()
@@ -149,13 +149,13 @@ class _CodeValueNetwork(torch.nn.Module):
 
 
 def pass_budget(problem: Problem) -> int:
-    """Passes that each method may use: those of our training and selection."""
+    """The passes of each method: as many as our training and selection take."""
     return views_per_network(problem.scene.settings.optimize)
 
 
 def bare_photos(problem: Problem) -> Tensor:
-    """N×3×S×S photographs of the bare object under the first training conditions, at the training size: as many as
-    divide the budget, but for a rest, into whole rounds.
+    """N×3×S×S photographs of the bare object under the first training conditions, at the training size. N is at most
+    `MAX_PHOTOS` and divides the passes into whole rounds, but for a rest.
     """
     passes = pass_budget(problem)
     count = passes // -(-passes // MAX_PHOTOS)
@@ -166,14 +166,14 @@ def bare_photos(problem: Problem) -> Tensor:
 
 
 def paste_size_range(problem: Problem) -> tuple[float, float]:
-    """The range of the design's longer side, over the photograph's."""
+    """The range of the design's longer side as a share of the photograph's."""
     low, high = np.quantile(design_shares(require_patch(problem.scene, "a printed patch on a mesh")), _SIZE_QUANTILES)
     return min(float(low), 1.0), min(float(high), 1.0)
 
 
 def paste_designs(photos: Tensor, design: Tensor, shares: tuple[float, float], rng: np.random.Generator) -> Tensor:
-    """Photographs N×3×S×S with the design 3×h×w upon them, wholly inside where it fits: its longer side is a share
-    of the photograph's between `shares`; differentiable in the design.
+    """Paste a design 3×h×w into photographs N×3×S×S, wholly inside where it fits; differentiable in the design. Its
+    longer side is a share of the photograph's, drawn between `shares`.
     """
     count, size = len(photos), np.array([design.shape[2], design.shape[1]])
     half = rng.uniform(*shares, (count, 1)) * size / size.max()  # photographs reach from -1 to 1
@@ -185,5 +185,5 @@ def paste_designs(photos: Tensor, design: Tensor, shares: tuple[float, float], r
     from_photo = torch.tensor(np.concatenate([back, -back @ middle[..., None]], 2)).to(photos)
     grid = F.affine_grid(from_photo, list(photos.shape), align_corners=False)
     layers = torch.cat([design, torch.ones_like(design[:1])]).expand(count, -1, -1, -1)
-    layers = F.grid_sample(layers, grid, align_corners=False)  # 0 outside, so that colors come times their share
+    layers = F.grid_sample(layers, grid, align_corners=False)  # 0 outside, so colors are multiplied by their share
     return photos * (1 - layers[:, 3:]) + layers[:, :3]

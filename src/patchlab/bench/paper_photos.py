@@ -1,9 +1,9 @@
-"""Photographs of paper whose true place is known: flat, through a lens that bends, or rolled.
+"""Simulated photographs of paper whose true position is known: flat, through a distorting lens, or rolled.
 
-In: a seed. Out: `Sheet`s and photographs. A frame of eight markers is drawn by OpenCV; every pixel is traced back to
-the paper by OpenCV's lens and a ray through a cylinder, and developed by means of this module's own (area-averaged
-look-up, Gaussian blur and noise in linear light, JPEG), so that neither our renderer nor our page nor our models of a
-sheet are their own judges.
+In: a seed. Out: `Sheet`s and photographs. OpenCV draws a frame of eight markers; every pixel is traced back to the
+paper by OpenCV's lens model and a ray that meets a cylinder, then developed by this module (area-averaged look-up,
+Gaussian blur and noise in linear light, JPEG). So our renderer, our page and our models of a sheet do not judge
+themselves.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ DESIGN_MM = (20.0, 20.0, 100.0, 100.0)
 SIZE_PX = (1600, 1200)
 LENS_TERMS = np.array([-0.12, 0.03, 5e-4, -5e-4, 0.0])  # k1 k2 p1 p2 k3: a wide phone camera
 RADII_MM = (100.0, 400.0)
-MAX_AZIMUTH_DEG = 35.0  # rolled paper hides a part of itself beyond
+MAX_AZIMUTH_DEG = 35.0  # beyond it, rolled paper hides a part of itself
 _RASTER_PX_PER_MM = 10
 _SAMPLES = 3  # along each side of a pixel
 _OUTLINE = np.array([[0, 0], [1, 0], [1, 1], [0, 1], [0, 0]])  # the piece's corners, as shares of it
@@ -36,7 +36,7 @@ _OUTLINE = np.array([[0, 0], [1, 0], [1, 1], [0, 1], [0, 0]])  # the piece's cor
 
 @dataclass(frozen=True)
 class Sheet:
-    """Paper before a camera (mm, z into the paper): flat where `curvature` (1/mm) is 0, else rolled about its upright
+    """Paper seen by a camera (mm, z into the paper): flat where `curvature` (1/mm) is 0, else rolled about its vertical
     middle.
     """
 
@@ -47,7 +47,7 @@ class Sheet:
     curvature: float
 
     def px(self, mm: np.ndarray) -> np.ndarray:
-        """Where points N×2 of the paper are seen, N×2."""
+        """Pixels N×2 of points N×2 in mm on the paper."""
         x, y = np.asarray(mm, float).T
         along, k = x - PIECE_MM / 2, self.curvature
         away = (1 - np.cos(k * along)) / k if k else 0 * x
@@ -56,7 +56,7 @@ class Sheet:
         return cv2.projectPoints(points, turn, move, self.matrix_px, self.terms)[0].reshape(-1, 2)
 
     def mm(self, px: np.ndarray) -> np.ndarray:
-        """Which point N×2 of the paper is seen at pixels N×2; NaN where none is."""
+        """Points N×2 in mm on the paper at pixels N×2; NaN where there is no paper."""
         stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-9)
         bent = px.reshape(-1, 1, 2), self.matrix_px, self.terms
         before_5 = getattr(cv2, "undistortPointsIter", None)  # what OpenCV 4 calls it with a criterion
@@ -78,7 +78,7 @@ class Sheet:
 
 @lru_cache(maxsize=1)
 def corners_mm() -> dict[int, np.ndarray]:
-    """The frame's markers: corners and middles of the piece's sides."""
+    """Corners 4×2 in mm of the frame's eight markers, at the corners and the middles of the sides."""
     near, middle, far = 2.0, (PIECE_MM - MARKER_MM) / 2, PIECE_MM - 2.0 - MARKER_MM
     places = [(x, y) for y in (near, middle, far) for x in (near, middle, far) if (x, y) != (middle, middle)]
     return {100 + i: rect_corners([x, y, MARKER_MM, MARKER_MM]) for i, (x, y) in enumerate(places)}
@@ -87,7 +87,7 @@ def corners_mm() -> dict[int, np.ndarray]:
 def draw_sheet(
     kind: Kind, seed: int, size_px: tuple[int, int] = SIZE_PX, aside_deg: float = MAX_AZIMUTH_DEG
 ) -> tuple[Sheet, np.random.Generator]:
-    """A sheet that fills a third of a photograph's height or so, and what draws the rest of its photograph."""
+    """A sheet that fills about a third of a photograph's height, and the generator that draws its photograph."""
     rng = np.random.default_rng([seed, 1])
     azimuth, elevation = np.radians(rng.uniform([-aside_deg, -30], [aside_deg, 30]))
     toward = [np.cos(elevation) * np.sin(azimuth), np.sin(elevation), np.cos(elevation) * np.cos(azimuth)]
@@ -101,7 +101,7 @@ def draw_sheet(
 
 
 def photograph_paper(sheet: Sheet, rng: np.random.Generator) -> np.ndarray:
-    """uint8 H×W×3 photograph of the sheet over something soft."""
+    """uint8 H×W×3 photograph of the sheet on a blurred background."""
     clutter = rng.uniform(0.05, 0.6, (24, 32)).astype(np.float32)
     picture, raster = cv2.resize(clutter, sheet.size_px, interpolation=cv2.INTER_CUBIC), _draw_raster(rng)
     border = sheet.px(np.concatenate([PIECE_MM * np.linspace(a, b, 50) for a, b in pairwise(_OUTLINE)]))
@@ -109,11 +109,11 @@ def photograph_paper(sheet: Sheet, rng: np.random.Generator) -> np.ndarray:
     right, bottom = np.clip(np.ceil(border.max(0)).astype(int) + 2, 0, sheet.size_px)
     y, x = np.mgrid[top:bottom, left:right] + 0.5
     mm = sheet.mm(np.column_stack([x.ravel(), y.ravel()])).reshape(*x.shape, 2)
-    # the map from pixels to paper is smooth: between pixels it is straight to a thousandth of one
+    # the map from pixels to paper is smooth: between pixels it is linear to a thousandth of a pixel
     fine = (_SAMPLES * (right - left), _SAMPLES * (bottom - top))
-    at = cv2.resize(np.nan_to_num(mm, nan=-1e3).astype(np.float32), fine, interpolation=cv2.INTER_LINEAR)
-    inside = np.asarray(((at > 0) & (at < PIECE_MM)).all(2), np.float32)
-    column, row = cv2.split(at * _RASTER_PX_PER_MM - 0.5)
+    points = cv2.resize(np.nan_to_num(mm, nan=-1e3).astype(np.float32), fine, interpolation=cv2.INTER_LINEAR)
+    inside = np.asarray(((points > 0) & (points < PIECE_MM)).all(2), np.float32)
+    column, row = cv2.split(points * _RASTER_PX_PER_MM - 0.5)
     light = cv2.multiply(inside, cv2.remap(raster, column, row, cv2.INTER_NEAREST))
     light, cover = (cv2.resize(part, x.shape[::-1], interpolation=cv2.INTER_AREA) for part in (light, inside))
     picture[top:bottom, left:right] = picture[top:bottom, left:right] * (1 - cover) + light
@@ -121,7 +121,7 @@ def photograph_paper(sheet: Sheet, rng: np.random.Generator) -> np.ndarray:
 
 
 def _draw_raster(rng: np.random.Generator) -> np.ndarray:
-    """Light of the piece: markers, and a soft design."""
+    """Draw the piece's light H×W: markers, and a smooth random design."""
     side, marker_px = (round(mm * _RASTER_PX_PER_MM) for mm in (PIECE_MM, MARKER_MM))
     raster = np.full((side, side), 0.95, np.float32)
     x, y, width, height = (round(v * _RASTER_PX_PER_MM) for v in DESIGN_MM)
@@ -135,7 +135,7 @@ def _draw_raster(rng: np.random.Generator) -> np.ndarray:
 
 
 def _develop(light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """uint8 H×W×3: the light H×W with drawn exposure, blur, noise and JPEG."""
+    """Develop light H×W into uint8 H×W×3 with drawn exposure, blur, noise and JPEG."""
     light = cv2.GaussianBlur(rng.uniform(0.3, 0.9) * light, (0, 0), rng.uniform(0.3, 1.2))
     light += rng.normal(0, rng.uniform(0, 0.01), light.shape).astype(np.float32)
     codes = photo_codes_from_srgb(srgb_from_linear(light.clip(0, 1)))

@@ -1,12 +1,11 @@
-"""Our designs beside those of other tools and recipes, on the same piece, for as many passes and in the same views.
+"""Compare our designs with those of other tools and recipes: same piece, as many passes, same views.
 
 In: scene files with meshes, networks, seeds; for the benchmark, the demo's scene. A cell is one of each: every method
-makes a design for the scene's piece (`bench.methods`), then all hang in it under conditions of the evaluate stream,
-beside the bare object and gray. Out: rates, gains over the best control, ours minus each, passes and seconds; pictures.
+makes a design for the scene's piece (`bench.methods`), and all are shown under conditions of the evaluate stream,
+beside the bare object and gray. Out: rates, gains over the best control, ours minus each, passes, seconds, pictures.
 
-A gain counts in the direction of the goal: with `deceive`, a rate that falls. Unlike in other studies the tables hold
-times, which differ from run to run: seconds of one core, with all that a method prepares but without the network's
-loading.
+A gain counts in the direction of the goal: with `deceive`, a falling rate. Unlike other studies, this one has tables
+with times, which differ from run to run: seconds of one core, without loading the network.
 """
 
 from __future__ import annotations
@@ -62,28 +61,28 @@ QUICK_STEPS, QUICK_VIEWS = 30, 40
 
 
 class PeersSettings(GridSettings):
-    """How long designs are trained stands in each scene's [optimize]; every method has as many passes."""
+    """Scenes, networks, seeds and peers; each scene's [optimize] sets the passes of every method."""
 
     seeds: Seeds = (0, 1, 2)  # of the scenes' draws
-    # What ours is held against: signed steps; a patch pasted flat; that of ART (`pip install "patchproof[lab]"`).
+    # Compared with ours: signed steps; a patch pasted flat; that of ART (`pip install "patchproof[lab]"`).
     peers: Annotated[tuple[Peer, ...], Field(min_length=1)] = PEERS
     n: PositiveInt = 400  # conditions per cell, of the evaluate stream
 
     @property
     def methods(self) -> tuple[str, ...]:
-        """Ours and its peers."""
+        """Names of our method and its peers."""
         return ("ours", *self.peers)
 
 
 def cells(settings: PeersSettings, base: Path) -> list[Cell]:
     """A cell per scene, network and seed."""
     if "art" in settings.peers:
-        load_art()  # refused before hours of other methods
+        load_art()  # a refusal comes before hours of other methods
     return patch_cells(settings, base)
 
 
 def run(settings: PeersSettings, base: Path, cell: Cell) -> dict[str, Any]:
-    """Every method's design for one object, network and seed, in the same views."""
+    """Make every method's design for one object, network and seed, and show them in the same views."""
     problem = problem_of(base, cell.values)
     made = {name: time_call(partial(METHODS[name], problem)) for name in settings.methods}
     pixels = {name: design.pixels for name, (design, _) in made.items()}
@@ -92,25 +91,25 @@ def run(settings: PeersSettings, base: Path, cell: Cell) -> dict[str, Any]:
     things |= {name: problem.subject.appearance(from_pixels(each, problem.device)) for name, each in pixels.items()}
     conditions = problem.scene.draw("evaluate", settings.n)
     view = conditions[problem.scene.facing(conditions)][:1]
-    hung = [photographs(problem, things[name], view, _TILE_PX)[0] for name in pixels]
+    on_object = [photographs(problem, things[name], view, _TILE_PX)[0] for name in pixels]
     return {
         **answers_record(responses(problem, things, conditions)),
         "passes": {name: design.passes for name, (design, _) in made.items()},
         "seconds": {name: milliseconds / 1000 for name, (_, milliseconds) in made.items()},
-        f"{cell.name}.png": contact_sheet([[enlarge_design(each, _TILE_PX) for each in pixels.values()], hung]),
+        f"{cell.name}.png": contact_sheet([[enlarge_design(each, _TILE_PX) for each in pixels.values()], on_object]),
         **{f"{cell.name}-{name}.png": png(each) for name, each in pixels.items()},
     }
 
 
 def tables(settings: PeersSettings, results: Sequence[Result]) -> list[Table]:
-    """Pooled, and cell by cell."""
+    """Tables of pooled results, and of every cell."""
     return [_pooled(settings, results), _by_cell(settings, results)]
 
 
 def _pooled(settings: PeersSettings, results: Sequence[Result]) -> Table:
     rows = []
     for name in settings.methods:
-        behind = [gain_of(result, "ours", name) for result in results]
+        leads = [gain_of(result, "ours", name) for result in results]
         by_pair = [
             float(np.mean([gain_of(result, "ours", name) for result in group]))
             for group in group_by(results, values_key("name", "network")).values()
@@ -120,7 +119,7 @@ def _pooled(settings: PeersSettings, results: Sequence[Result]) -> Table:
                 name,
                 float(np.mean([rate_of(result, name) for result in results])),
                 cluster_estimate([gain_of(result, name, hardest_control(result, CONTROLS)) for result in results]),
-                *((None, None) if name == "ours" else (cluster_estimate(behind), cluster_estimate(by_pair))),
+                *((None, None) if name == "ours" else (cluster_estimate(leads), cluster_estimate(by_pair))),
                 round(float(np.mean([result.answers["passes"][name] for result in results]))),
                 float(np.mean([result.answers["seconds"][name] for result in results])),
             )
@@ -142,7 +141,7 @@ def _by_cell(settings: PeersSettings, results: Sequence[Result]) -> Table:
 
 
 def figures(settings: PeersSettings, results: Sequence[Result]) -> list[Drawing]:
-    """Ours against each peer by cell, and the designs of each pair's first seed."""
+    """A scatter plot of ours against each peer, and pictures of designs (first seeds)."""
     firsts = [group[0] for group in group_by(results, values_key("name", "network")).values()]
     return [
         Drawing(
@@ -173,11 +172,11 @@ def _scatter(settings: PeersSettings, results: Sequence[Result], figure: Figure)
 STUDY = Study("peers", PeersSettings, cells, run, tables, figures)
 
 
-# The benchmark: the same on the demo's scene
+# The benchmark: this study on the demo's scene
 
 
 def charts(quick: bool, progress: Progress) -> Iterator[Chart]:
-    """Every method's time against its error on the demo's scene; ART where it is installed."""
+    """Chart every method's time against its error on the demo's scene; ART only where it is installed."""
     with TemporaryDirectory() as folder:
         base, peers = Path(folder), PEERS if _has_art() else PEERS_WITHOUT_EXTRA
         seeds, n = (range(2), QUICK_VIEWS) if quick else (range(5), 400)
@@ -193,7 +192,7 @@ def charts(quick: bool, progress: Progress) -> Iterator[Chart]:
 
 
 def peers_chart(settings: PeersSettings, results: Sequence[Result]) -> Chart:
-    """Seconds of each method, relative to ours, against the share of unseen views that its design loses."""
+    """Seconds of each method over ours, against the share of unseen views in which its design fails."""
     losses = np.array([[1 - rate_of(result, name) for name in settings.methods] for result in results])
     points = []
     for name, loss in zip(settings.methods, paired_means(losses), strict=True):

@@ -1,7 +1,7 @@
-"""Benchmarks: what each knob costs and what it buys, measured on this machine, as charts, tables and a page.
+"""Run benchmarks on this machine and write charts, tables and a page.
 
 In: the name of a benchmark. Out: a folder with `NAME.json`, `NAME.html`, and a CSV and PNG per chart. A benchmark is a
-generator of `Chart`s. A check that fails is reported, not raised.
+generator of `Chart`s. A failed check is reported, not raised.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def run_bench(
     overwrite: bool = False,
     progress: Progress = lambda stage, done, total: None,
 ) -> list[Results]:
-    """Run one benchmark, or `all`, into the folder `out`; returns what was written."""
+    """Run one benchmark, or `all`, and write it into the folder `out`; returns the results."""
     if name not in ("all", *BENCHES):
         raise Refused("the name of a benchmark", f'"{name}"', spelling_hint(name, ("all", *BENCHES)))
     written = []
@@ -45,7 +45,7 @@ def run_bench(
 
 
 def load_bench(name: str) -> Bench:
-    """The generator of a benchmark's charts, imported when asked for."""
+    """Import a benchmark: its generator of charts."""
     return import_module(f"patchlab.bench.{name}").charts
 
 

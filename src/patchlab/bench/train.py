@@ -1,8 +1,8 @@
-"""The knobs of training: views per step, optimizer and step size.
+"""Benchmark training: views per step, optimizer and step size.
 
-In: the demo's scene. Out: a chart per knob. Designs are compared on conditions of the evaluate stream, which neither
-trains nor selects. The cost of training is counted in views that the network sees, those of the selection set
-included; what one of them takes is `render`'s business.
+In: the demo's scene. Out: two charts. Designs are compared on conditions of the evaluate stream, which neither
+trains nor selects. Cost is the number of views that the network sees, selection included; `bench.render`
+measures the time of a view.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ Losses = Mapping[tuple[OptimizeSettings, int], Sequence[float]]  # by settings a
 
 @dataclass(frozen=True)
 class TrainingEffort:
-    """Training views of a whole run, of which half is charted, too; seeds; views that designs are compared on."""
+    """Training views of a whole run (half of them is charted, too), seeds, and views that designs are judged on."""
 
     views: int
     seeds: int
@@ -41,7 +41,7 @@ class TrainingEffort:
 
 
 def charts(quick: bool, progress: Progress) -> Iterator[Chart]:
-    """Every chart of training, one after the other."""
+    """Chart views per step, then optimizer and step size."""
     effort = TrainingEffort(120, 3, 64) if quick else TrainingEffort(960, 4, 256)
     views = {f"{n}": DEFAULT_SETTINGS.changed(views=n) for n in (QUICK_STEP_VIEWS if quick else STEP_VIEWS)}
     moves = {
@@ -55,13 +55,10 @@ def charts(quick: bool, progress: Progress) -> Iterator[Chart]:
     yield runs_chart("optimizer", "Optimizer and step size", moves, losses, effort)
 
 
-# Views per step, and how the design moves: quality after as many views
-
-
 def runs_chart(
     name: str, title: str, runs: Mapping[str, OptimizeSettings], losses: Losses, effort: TrainingEffort
 ) -> Chart:
-    """Settings by name, after half of the views and after all, against the loss of what has been trained."""
+    """Chart the loss of designs by setting, after half of the training views and after all."""
     columns = [(setting, run, end) for setting, run in runs.items() for end in charted_ends(run, effort)]
     series: dict[int, list[ChartPoint]] = {end: [] for end in sorted({end for _, _, end in columns})}
     table = np.array([losses[run, end] for _, run, end in columns]).T
@@ -81,7 +78,7 @@ def runs_chart(
 
 
 def charted_ends(run: OptimizeSettings, effort: TrainingEffort) -> list[int]:
-    """Training views after which a run is charted: there the design was tried on the selection set."""
+    """Training views after which a run is charted, where the selection set has just been seen."""
     whole = run.changed(steps=effort.views // run.views)
     return [end for end in (effort.views // 2, effort.views) if is_selection_step(whole, end // run.views)]
 
@@ -89,7 +86,7 @@ def charted_ends(run: OptimizeSettings, effort: TrainingEffort) -> list[int]:
 def train_and_judge(
     problem: Problem, runs: Collection[OptimizeSettings], effort: TrainingEffort, progress: Progress
 ) -> dict[tuple[OptimizeSettings, int], list[float]]:
-    """Losses on new conditions, the same for every design."""
+    """Train every run with every seed; losses on new conditions, the same for all designs."""
     shown = {}
     for seed in range(effort.seeds):
         for i, run in enumerate(runs):
@@ -106,6 +103,6 @@ def train_and_judge(
 
 
 def designs_after(problem: Problem, numbers: Sequence[int]) -> list[Tensor]:
-    """The best design, as printed, after each of these numbers of steps (rising)."""
+    """The best designs, as printed, after these numbers of steps (rising)."""
     states: dict[int, State] = {step.state.number: step.state for step in steps(problem)}
     return [from_pixels(as_pixels(states[number].best)) for number in numbers]

@@ -1,12 +1,12 @@
-"""Photographs changed so that networks recognize them better, and what attacks leave of that.
+"""Change photographs so that networks recognize them better, and attack the results.
 
 In: images, a CSV of file names and labels, networks. Out: PNGs under the images' names at their own sizes, and tables:
 accuracy clean and attacked, hardened beside original on the same photographs, per network, with 95 % intervals; how far
-the images moved. What is judged are the 8-bit PNGs as a reader of the file gets them. A cell of the table where a
-stronger attack leaves more than a weaker one is flagged: there the attack failed, not the network held.
+the images moved. The 8-bit PNGs are judged as a reader of the file gets them. A cell of the table is flagged where
+a stronger attack leaves more than a weaker one: there the attack failed.
 
-`harden_images` is the command's one setting; the study `harden` varies networks, methods and ε, and then its PNGs lie
-in `images/`. Originals are judged in cells of their own, once per network.
+`harden_images` runs the command's single variant; the study `harden` varies networks, methods and ε, and writes its
+PNGs to `images/`. Originals are judged in separate cells, once per network.
 """
 
 from __future__ import annotations
@@ -44,39 +44,39 @@ _ATTACK_RANKS = {"clean": 0, "fgsm": 1, "pgd": 2}
 
 
 class HardenSettings(StrictModel):
-    """Every method with every ε, for each network alone or for all of them together."""
+    """Settings: every method with every ε, for each network alone or for all networks together."""
 
     images: str  # a folder of images
     labels: str  # CSV: file name, label
-    models: Names  # hardened for, each alone
-    together: bool = False  # against the mean of the networks' losses
+    models: Names  # networks to harden for, each alone
+    together: bool = False  # harden for all networks at once, by their mean loss
     judges: tuple[str, ...] = ()  # networks that only judge
     methods: Annotated[tuple[HardenMethod, ...], Field(min_length=1)] = ("pgd",)  # how to step
     # Largest change of a value in [0, 1]: 0.03, "8/255", or "none".
     epsilons: Annotated[tuple[Epsilon, ...], Field(min_length=1)] = (8 / 255, 0.1, None)
-    steps: PositiveInt = 100  # of hardening
-    step_size: Positive | None = None  # in place of the method's own
-    # ε of the PGD that each step goes through: for images that withstand it, at eight times the passes.
+    steps: PositiveInt = 100  # steps of hardening
+    step_size: Positive | None = None  # first step size; by default the method's own
+    # ε of a PGD attack that each step is taken under, so that images withstand it; takes eight times the passes.
     through: Annotated[Share, Field(gt=0)] | None = None
-    attacks: tuple[Attack, ...] = ("fgsm", "pgd")  # that are to be withstood
+    attacks: tuple[Attack, ...] = ("fgsm", "pgd")  # attacks to withstand
     attack_epsilons: tuple[Annotated[Share, Field(gt=0)], ...] = (0.01, 0.02, 0.04)  # the attacks' largest change
 
 
 def harden_images(settings: HardenSettings, out: str | Path, work: Work = DEFAULT_WORK) -> FinishedStudy:
-    """Harden into the folder `out`: PNGs and labels.csv, which is again a labeled folder of images, and the tables."""
+    """Harden images into the folder `out`: PNGs and labels.csv (again a labeled folder of images), and tables."""
     out, base = Path(out), Path.cwd()
     if out.resolve() == Path(expand_path(settings.images, base)).resolve():
         raise Refused("another folder for hardened images than the originals'", str(out), "choose another --out")
-    # PNGs beside the tables are this command's own only where its JSON says so
-    own = (*STUDY.own_files, "labels.csv", "*.png") if (out / "harden.json").is_file() else STUDY.own_files
-    finished = run_cells(replace(STUDY, own_files=own), settings, base, out, work)
+    # PNGs beside the tables may be replaced only where this command's JSON says that it wrote them
+    own_files = (*STUDY.own_files, "labels.csv", "*.png") if (out / "harden.json").is_file() else STUDY.own_files
+    finished = run_cells(replace(STUDY, own_files=own_files), settings, base, out, work)
     lines = [f'{photo["png"]},"{photo["label"]}"\n' for photo in _photos_of(finished.results, _variants(settings)[0])]
     write_atomically(out / "labels.csv", lambda path: path.write_text("file,label\n" + "".join(lines), "utf-8"))
     return finished
 
 
 def cells(settings: HardenSettings, base: Path) -> list[Cell]:
-    """Originals by network, and every variant, in blocks of photographs; networks and labels are checked here."""
+    """Cells of originals by network and of every variant, in blocks of photographs; checks networks and labels."""
     folder = Path(expand_path(settings.images, base))
     rows = list_labeled_files(folder, Path(expand_path(settings.labels, base)))
     names = tuple(dict.fromkeys((*settings.models, *settings.judges)))
@@ -85,27 +85,27 @@ def cells(settings: HardenSettings, base: Path) -> list[Cell]:
     variants, work = _variants(settings), []
     for number, block in enumerate(split_into_blocks(folder, rows), 1):
         photos = [{"file": file, "png": png, "label": label} for file, png, label in block]
-        for at, name in enumerate(names, 1):
-            work.append(Cell(f"original{at}_{number:04d}", {"photos": photos, "judges": [name]}))
-        for at, variant in enumerate(variants, 1):
-            words = f"{at:02d}_{variant['method']}_{epsilon_text(variant['epsilon']).replace('/', '-')}"
+        for index, name in enumerate(names, 1):
+            work.append(Cell(f"original{index}_{number:04d}", {"photos": photos, "judges": [name]}))
+        for index, variant in enumerate(variants, 1):
+            words = f"{index:02d}_{variant['method']}_{epsilon_text(variant['epsilon']).replace('/', '-')}"
             judges = list(dict.fromkeys((*variant["models"], *settings.judges)))
-            into = "" if len(variants) == 1 else f"images/{words}/"
-            values = {"photos": photos, "judges": judges, "variant": variant, "folder": into}
-            work.append(Cell(f"hardened{at}_{number:04d}", values))
+            folder_out = "" if len(variants) == 1 else f"images/{words}/"
+            values = {"photos": photos, "judges": judges, "variant": variant, "folder": folder_out}
+            work.append(Cell(f"hardened{index}_{number:04d}", values))
     return work
 
 
 def run(settings: HardenSettings, base: Path, cell: Cell) -> dict[str, Any]:
-    """One block: hardened if it has a variant, then judged."""
+    """Harden one block if it has a variant, then judge it."""
     values, folder = cell.values, Path(expand_path(settings.images, base))
     photos, originals, unread = [], [], []
     for photo in values["photos"]:
         try:
             originals.append(read_large_enough(folder / photo["file"]))
             photos.append(photo | {"right": {}})
-        except PhotoRejected as cannot:
-            unread.append({"file": photo["file"], "reason": cannot.advice})
+        except PhotoRejected as error:
+            unread.append({"file": photo["file"], "reason": error.advice})
     labels, pictures, files = [photo["label"] for photo in photos], originals, {}
     if photos and "variant" in values:
         names, how = values["variant"]["models"], (values["variant"]["method"], values["variant"]["epsilon"])
@@ -129,7 +129,7 @@ def run(settings: HardenSettings, base: Path, cell: Cell) -> dict[str, Any]:
 def _judge(
     settings: HardenSettings, classifier: Classifier, pictures: Sequence[np.ndarray], truth: torch.Tensor
 ) -> list[torch.Tensor]:
-    """Under each condition, whether the network is right about the photographs."""
+    """Per condition N bool: the network is correct about the photographs."""
     views, network = center_squares(pictures, classifier), classifier.network
     with torch.no_grad():
         outcomes = [is_correct(network(views), truth)]
@@ -138,7 +138,7 @@ def _judge(
 
 
 def tables(settings: HardenSettings, results: Sequence[Result]) -> list[Table]:
-    """Accuracy with intervals and flags, how far images moved, and what could not be read."""
+    """Tables of accuracy with intervals and flags, of changes to the images, and of unreadable files."""
     rows, distances = [], []
     for variant in _variants(settings):
         for name in dict.fromkeys((*variant["models"], *settings.judges)):
@@ -175,7 +175,7 @@ def _accuracy_rows(
         condition: [[some[file][i] for file in files] for some in (before, after)]
         for i, condition in enumerate(conditions.values())
     }
-    left = {
+    survivors = {
         word: {condition: sum(pair[side]) for condition, pair in pairs.items()}
         for side, word in enumerate(("original", "hardened"))
     }
@@ -187,14 +187,14 @@ def _accuracy_rows(
         (
             *(*start, words, rate(old), rate(new), estimate_difference(new, old)),
             cluster_estimate([float(np.mean([new[i] - old[i] for i in rows])) for rows in classes if rows]),
-            ", ".join(word for word, survivors in left.items() if attack_failed(condition, survivors)),
+            ", ".join(word for word, counts in survivors.items() if attack_failed(condition, counts)),
         )
         for (words, condition), (old, new) in zip(conditions.items(), pairs.values(), strict=True)
     ]
 
 
 def attack_failed(condition: Condition, survivors: Mapping[Condition, int]) -> bool:
-    """Whether more survive this attack than some weaker one: nothing, a smaller ε, or FGSM against PGD."""
+    """True if more pictures survive this attack than a weaker one: none, a smaller ε, or FGSM against PGD."""
     attack, epsilon = condition
     return any(
         survivors[condition] > count
@@ -217,7 +217,7 @@ def _variants(settings: HardenSettings) -> list[dict[str, Any]]:
 
 
 def _conditions(settings: HardenSettings) -> dict[str, Condition]:
-    """By what tables call it: clean, then each attack with each ε."""
+    """Conditions by their names in tables: clean, then each attack with each ε."""
     attacks = [(attack, epsilon) for attack in settings.attacks for epsilon in settings.attack_epsilons]
     return {"clean": CLEAN, **{f"{attack} {epsilon:g}": (attack, epsilon) for attack, epsilon in attacks}}
 
@@ -232,14 +232,14 @@ def _classifier(name: str, base: Path) -> Classifier:
 
 
 def _label_indices(name: str, base: Path, labels: Sequence[str]) -> list[int]:
-    """A network's indices of labels; refused where it does not have one."""
+    """A network's indices of labels; refused if it lacks one."""
     known = _classifier(name, base).labels
     index = {label: find_labels(known, int(label) if label.isdigit() else label)[0] for label in dict.fromkeys(labels)}
     return [index[label] for label in labels]
 
 
 def _photos_of(results: Sequence[Result], variant: Mapping[str, Any] | None) -> Iterator[Mapping[str, Any]]:
-    """The photographs of a variant, or the originals."""
+    """Photographs of a variant, or the originals where it is None."""
     for result in results:
         if result.cell.values.get("variant") == variant:
             yield from result.answers["photos"]
@@ -248,5 +248,5 @@ def _photos_of(results: Sequence[Result], variant: Mapping[str, Any] | None) -> 
 def _outcomes_by_file(
     results: Sequence[Result], variant: Mapping[str, Any] | None, name: str
 ) -> dict[str, Sequence[bool]]:
-    """By file, whether the network is right under each condition."""
+    """By file: if the network is correct, one bool per condition."""
     return {photo["file"]: photo["right"][name] for photo in _photos_of(results, variant) if name in photo["right"]}

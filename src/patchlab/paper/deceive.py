@@ -3,7 +3,7 @@
 In: scenes that the networks read well, networks, seeds, and ways (by default a free texture and one within 8/255 of the
 original). Out: rates of the design, the original object and gray, noise and shuffled controls on the same conditions;
 the design minus each control, paired; contact sheets. The controls are the point: often plain gray alone hides an
-object, and only what a texture does beyond that is owed to its training. Controls ignore the ball.
+object, and only the difference is due to training. Controls ignore the ε-ball.
 
 Source: Pestana et al., supplement, deceptive textures. For measuring the robustness of networks on objects that are
 yours to test.
@@ -41,7 +41,7 @@ _SHEET_PX, _SHEET_VIEWS = 160, 4
 
 
 class DeceiveSettings(TrainedSettings):
-    """As in all studies of trained designs; each network trains alone and all of them test."""
+    """Settings of a study of trained designs in which each network trains alone and all networks test."""
 
     # By name: tables of the scene file with the keys that change.
     ways: dict[NamePart, SceneVariant] = Field(
@@ -51,12 +51,12 @@ class DeceiveSettings(TrainedSettings):
 
 
 def cells(settings: DeceiveSettings, base: Path) -> list[Cell]:
-    """One per scene, way, network and seed; the goal is `deceive` whatever the scene file says."""
+    """A cell per scene, way, network and seed; the goal is `deceive`, whatever the scene file says."""
     return trained_cells(settings, base, variants=[({"target": {"goal": "deceive"}}, {})])
 
 
 def run(settings: DeceiveSettings, base: Path, cell: Cell) -> dict[str, Any]:
-    """Train against one network, show design and controls to all."""
+    """Train against one network, and show the design and its controls to all networks."""
     problem = problem_of(base, cell.values)
     design = best_design(with_trainers(problem, cell))
     things = pictures_with_controls(problem, design, CONTROLS)
@@ -66,7 +66,7 @@ def run(settings: DeceiveSettings, base: Path, cell: Cell) -> dict[str, Any]:
 
 
 def tables(settings: DeceiveSettings, results: Sequence[Result]) -> list[Table]:
-    """Rates of everything shown, and the design minus each control."""
+    """Tables of rates, and of the design minus each control."""
     rates, differences = [], []
     for design, of_design in group_by(results, values_key("name", "way", "row")).items():
         records = {kind: Record(of_design, kind) for kind in _SHOWN_KINDS}
@@ -83,13 +83,13 @@ def tables(settings: DeceiveSettings, results: Sequence[Result]) -> list[Table]:
             "The design minus each control",
             (*head, *(f"minus {kind}" for kind in CONTROLS)),
             tuple(differences),
-            f"Of rates, paired over {n}: below zero hides the object better than what was not trained to.",
+            f"Of rates, paired over {n}: below zero, the design hides the object better than the control.",
         ),
     ]
 
 
 def figures(settings: DeceiveSettings, results: Sequence[Result]) -> list[Drawing]:
-    """One contact sheet per scene, way and network: the design, then the controls."""
+    """A contact sheet per scene, way and network: the design, then the controls."""
     return [
         picture_sheet(
             f"sheet_{scene}_{way}_{row}",

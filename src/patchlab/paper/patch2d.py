@@ -2,13 +2,13 @@
 
 In: labeled images, scenes whose clean object is rendered where no photographs of a class exist, or both; networks,
 seeds. A cell is a target, a network and a seed: a patch of `made_px` texels a side is optimized on images of the target
-alone, at random places, sizes and angles, with Random Erasing of the picture below it, and shown `shown_px` wide at the
-network's own size. Out: recognition with and without it, paired on the same images and places, for the target, and for
-each other class by *its* labels, with how often the patch has it called the target: an assistive patch must not become
+only, at random places, sizes and angles, with Random Erasing of the picture below it, and shown `shown_px` wide at the
+network's input size. Out: recognition with and without it, paired on the same images and places, for the target, and for
+each other class by its labels, with the rate at which the patch makes it the target: an assistive patch must not become
 an adversarial one. Gray and noise of the same size are the controls.
 
-Unlike a printed piece this patch has no frame of markers. With fewer than `MIN_IMAGES_TO_SPLIT` images of a class it is measured
-on those it was made with, and the table says so.
+Unlike a printed piece, this patch has no frame of markers. A class with fewer than `MIN_IMAGES_TO_SPLIT` images is
+measured on those that the patch was made with, and the table says so.
 Sources: Pestana et al., supplement, algorithm 2; Brown et al., Adversarial Patch, 2017; Zhong et al., Random Erasing,
 AAAI 2020.
 """
@@ -51,21 +51,21 @@ from patchproof.scene.image_scene import MIN_IMAGES_TO_SPLIT, ImageScene
 from patchproof.scene.interface import Scene
 
 KINDS = ("bare", "gray", "noise", "patch")
-OWN_LABEL, TARGET_LABEL = 0, 1  # by whose labels hits count: the image's own class, or the patch's target
+OWN_LABEL, TARGET_LABEL = 0, 1  # whose labels hits count for: the image's class, or the patch's target
 _TILE_PX = 192
 
 
 class Patch2dSettings(PastedSettings):
-    """Targets × networks × seeds."""
+    """Settings: targets × networks × seeds."""
 
-    targets: tuple[str | int, ...] = ()  # classes that patches are made for; without any, every class
-    networks: Names  # each trains alone
+    targets: tuple[str | int, ...] = ()  # classes that patches are made for; by default all
+    networks: Names  # networks, each of which trains alone
     seeds: Seeds = (0,)  # of draws
     n: PositiveInt = 200  # conditions per class and cell
 
 
 def cells(settings: Patch2dSettings, base: Path) -> list[Cell]:
-    """Targets × networks × seeds; all targets with the first seed come first."""
+    """A cell per target, network and seed; all targets with the first seed come first."""
     renders = [scene_values(file, base) for file in settings.renders]
     known = [each.label for each in list_classes(settings.images, settings.labels, renders, base)]
     targets = settings.targets or tuple(dict.fromkeys(known))
@@ -83,7 +83,7 @@ def cells(settings: Patch2dSettings, base: Path) -> list[Cell]:
 
 
 def run(settings: Patch2dSettings, base: Path, cell: Cell) -> dict[str, Any]:
-    """One patch, and every class with and without it."""
+    """Make one patch, and show every class with and without it."""
     values, seed = cell.values, cell.values["seed"]
     classifier = load_classifier(expand_path(values["networks"][0], base), base)
     classes = list_classes(settings.images, settings.labels, values["renders"], base)
@@ -104,14 +104,14 @@ def run(settings: Patch2dSettings, base: Path, cell: Cell) -> dict[str, Any]:
 def flat_problem(
     settings: Patch2dSettings, base: Path, scene: ImageScene, classifier: Classifier, images_of: ImageClass
 ) -> Problem:
-    """A patch on images of its class."""
+    """The problem of a patch on images of its class."""
     stage, printer = set_stage(scene), load_printer(settings.printer.profile, base)
     subject = Patch(scene, printer, (settings.made_px, settings.made_px), stage.device)
     return Problem(scene, stage, printer, (classifier,), (_indices(classifier, images_of),), subject, None)
 
 
 def pasted_by_kind(problem: Problem, design: np.ndarray) -> dict[str, Appearance]:
-    """What is pasted, by `KINDS`; controls have no markers of their own."""
+    """Pasted pictures by `KINDS`; controls have no markers."""
     shown: dict[str, Appearance] = {"bare": None}
     with torch.no_grad():
         for kind in KINDS[1:]:
@@ -121,14 +121,14 @@ def pasted_by_kind(problem: Problem, design: np.ndarray) -> dict[str, Appearance
 
 
 def _with_scene(problem: Problem, scene: Scene) -> Problem:
-    """The patch on other images."""
+    """The problem with other images."""
     return replace(problem, scene=scene, stage=set_stage(scene))
 
 
 def _ask_about_class(
     problem: Problem, images_of: ImageClass, scene: ImageScene, shown: Mapping[str, Appearance], n: int
 ) -> dict[str, Any]:
-    """Per kind and condition: recognized by the class's own labels, and called the patch's target."""
+    """Hits by kind and condition, for the class's labels and for the patch's target."""
     (classifier,), (target,) = problem.classifiers, problem.indices
     own = _indices(classifier, images_of)
     judged = replace(_with_scene(problem, scene), classifiers=(classifier, classifier), indices=(own, target))
@@ -145,17 +145,17 @@ def _indices(classifier: Classifier, images_of: ImageClass) -> tuple[int, ...]:
 
 
 def _picture(problem: Problem, scenes: Sequence[ImageScene], design: np.ndarray, shown: Appearance) -> bytes:
-    """Side by side: the patch, an image of its class with it, and up to three of other classes."""
+    """PNG of the patch, an image of its class with it, and up to three images of other classes with it."""
     worlds = (problem, *(_with_scene(problem, scene) for scene in scenes if scene is not problem.scene))[:4]
     tiles = [photographs(world, shown, world.scene.draw("evaluate", 1), _TILE_PX)[0] for world in worlds]
     return contact_sheet([[enlarge_design(design, _TILE_PX), *tiles]])
 
 
-ClassAnswers = Mapping[str, Any]  # what a cell found of one class
+ClassAnswers = Mapping[str, Any]  # a cell's answers about one class
 
 
 def tables(settings: Patch2dSettings, results: Sequence[Result]) -> list[Table]:
-    """Gain on targets, harm on other classes, and both over all cells."""
+    """Tables of gain on targets, harm on other classes, and both over all cells."""
     return [_pooled(results), _gains(results), _harm(results)]
 
 
@@ -219,7 +219,7 @@ def _pooled(results: Sequence[Result]) -> Table:
 
 
 def figures(settings: Patch2dSettings, results: Sequence[Result]) -> list[Drawing]:
-    """What was made."""
+    """Pictures of the patches (first network and seed of each target)."""
     firsts = [group[0] for group in group_by(results, values_key("target")).values()]
     files = [(_target_answers(first)["name"], first.file(f"{first.cell.name}.png")) for first in firsts]
     return [
@@ -234,7 +234,7 @@ def figures(settings: Patch2dSettings, results: Sequence[Result]) -> list[Drawin
 
 
 def _by_target(results: Sequence[Result]) -> dict[tuple, list[Result]]:
-    """Seeds together: results by (target, network)."""
+    """Results by (target, network), with all seeds."""
     return group_by(results, values_key("target", "network"))
 
 

@@ -1,8 +1,8 @@
-"""Free textures from gray: what networks ask for when an object should be read as a class.
+"""Free textures trained from gray: the colors and patterns that networks prefer for a class.
 
-In: scenes, classes (labels), networks and seeds. Every texture is free and starts from gray, so that whatever color and
-pattern it has, a network asked for. Out: rates on all networks beside the untrained gray, the mean color per class
-(which color is preferred), and a contact sheet.
+In: scenes, classes (labels), networks and seeds. Every texture is free and starts from gray, so its colors and patterns
+come from the network. Out: rates on all networks beside the untrained gray, the mean color per class, and a contact
+sheet.
 
 Source: Pestana et al., robust designs.
 """
@@ -44,7 +44,7 @@ _KINDS = ("start", "design")
 
 
 class RobustSettings(TrainedSettings):
-    """Each network trains alone for each class, and all of them test."""
+    """Settings: each network trains alone for each class, and all networks test."""
 
     classes: Annotated[tuple[str | int, ...], Field(min_length=1)]  # in place of the scene's label
     # By name: tables of the scene file with the keys that change.
@@ -52,7 +52,7 @@ class RobustSettings(TrainedSettings):
 
 
 def cells(settings: RobustSettings, base: Path) -> list[Cell]:
-    """One per scene, way, class, network and seed."""
+    """A cell per scene, way, class, network and seed."""
     variants = [
         ({"target": {"label": label, "accept": [], "goal": "assist"}}, {"class": str(label)})
         for label in settings.classes
@@ -61,7 +61,7 @@ def cells(settings: RobustSettings, base: Path) -> list[Cell]:
 
 
 def run(settings: RobustSettings, base: Path, cell: Cell) -> dict[str, Any]:
-    """Train for one class on one network; rates on all, pictures, mean color."""
+    """Train for one class on one network; record rates on all networks, pictures and mean color."""
     problem = problem_of(base, cell.values)
     subject = problem.subject
     design = best_design(with_trainers(problem, cell))
@@ -84,13 +84,13 @@ def _by_design(results: Sequence[Result]) -> Mapping[DesignKey, Sequence[Result]
 
 
 def tables(settings: RobustSettings, results: Sequence[Result]) -> list[Table]:
-    """Rates on all networks beside gray; the mean color of each class."""
+    """Tables of rates on all networks beside gray, and of each class's mean color."""
     rates, colors = [], []
     for key, of_key in _by_design(results).items():
-        design, begun = Record(of_key, "design"), Record(of_key, "start")
+        design, start = Record(of_key, "design"), Record(of_key, "start")
         for network in tested_networks(of_key):
-            gain = design.gain(begun, network)[0]
-            levels = begun.level(network)[0], *design.level(network)
+            gain = design.gain(start, network)[0]
+            levels = start.level(network)[0], *design.level(network)
             rates.append((*key, short_name(network), *levels, gain, gain_word(gain)))
         codes = _mean_codes(of_key)
         colors.append((*key, _hex(codes), *codes))
@@ -105,7 +105,7 @@ def tables(settings: RobustSettings, results: Sequence[Result]) -> list[Table]:
 
 
 def _mean_codes(results: Sequence[Result]) -> tuple[int, int, int]:
-    """The mean over designs, in light."""
+    """sRGB codes of the mean over designs, taken in linear light."""
     light = linear_from_srgb(np.array([result.answers["color"] for result in results]) / 255).mean(0)
     red, green, blue = (int(code) for code in np.rint(srgb_from_linear(light) * 255))
     return red, green, blue
@@ -116,7 +116,7 @@ def _hex(codes: tuple[int, int, int]) -> str:
 
 
 def figures(settings: RobustSettings, results: Sequence[Result]) -> list[Drawing]:
-    """Colors of all classes, and per scene and way what the designs look like."""
+    """A grid of all classes' colors, and a contact sheet of designs per scene and way."""
     by_design = _by_design(results)
     rows, networks = list(dict.fromkeys(key[:3] for key in by_design)), list(dict.fromkeys(key[3] for key in by_design))
     drawings = [

@@ -1,10 +1,10 @@
-"""Where the clean object fails: black squares, maps of pose × light, worst pose and worst light.
+"""Find where networks fail on the clean object: black squares, maps of pose × light, worst pose and light.
 
 In: scenes with a mesh, networks, seeds. Out, per cell: a black square over every position of the picture; maps of pose
-× light; the worst pose and the worst light that a random search finds that closes in round by round, each with the
-condition found and its confidence. Whatever was chosen for being worst is measured again on draws of the evaluate
-stream that the choice never saw: the same draws flatter a choice. Cells of a map where the object is recognized no more
-often than the background alone are said to show no effect: a network may answer the label of anything.
+× light; the worst pose and the worst light of a random search that narrows round by round, each with the condition found
+and its confidence. Everything chosen as worst is measured again on draws of the evaluate stream that the choice never
+saw, since the draws that chose it exaggerate. Cells of a map where the object is recognized no more often than the
+background alone are marked “no effect”: a network may give the label to anything.
 
 Sources: occlusion and maps as in Pestana et al., figures 1 and 2 (occlusion maps: Zeiler and Fergus, ECCV 2014); search
 for poses that fail: Alcorn et al., Strike (with) a Pose, CVPR 2019, its random search.
@@ -58,27 +58,27 @@ _FRESH_SEED_OFFSET = 3_000_001  # added to a seed: the evaluate stream's draws t
 
 
 class OcclusionSettings(StrictModel):
-    """A black square, everywhere in the picture."""
+    """A black square at every position of a grid over the picture."""
 
-    share: Annotated[Share, Field(gt=0)] = 0.3  # its side, as a share of the picture's
+    share: Annotated[Share, Field(gt=0)] = 0.3  # the square's side as a share of the picture's
     positions: Annotated[int, Field(ge=2)] = 7  # places from edge to edge, across and down
     n: PositiveInt = 32  # draws at each place
 
 
 class WorstCaseSettings(StrictModel):
-    """A search from coarse to fine."""
+    """A random search from coarse to fine."""
 
     tries: PositiveInt = 48  # poses (or lights) in each round
-    rounds: PositiveInt = 4  # the reach round the best halves from one to the next
-    draws: PositiveInt = 4  # of everything else, the same for all tries
+    rounds: PositiveInt = 4  # the range around the best halves from round to round
+    draws: PositiveInt = 4  # draws of everything else, the same for all tries
     n: PositiveInt = 64  # draws that measure what was found
 
 
 class StressSettings(GridSettings):
-    """What is tried."""
+    """Scenes, networks, seeds and the three tests."""
 
     maps: tuple[MapSettings, ...] = (MapSettings(),)  # of pose × light
-    occlusion: OcclusionSettings = OcclusionSettings()  # the black square
+    occlusion: OcclusionSettings = OcclusionSettings()  # a black square over the picture
     search: WorstCaseSettings = WorstCaseSettings()  # for the worst pose and light
 
 
@@ -88,7 +88,7 @@ def cells(settings: StressSettings, base: Path) -> list[Cell]:
 
 
 def run(settings: StressSettings, base: Path, cell: Cell) -> dict[str, Any]:
-    """All tests of one scene before one network."""
+    """Run all tests of one scene and one network."""
     problem, seed = problem_of(base, cell.values), cell.values["seed"]
     (pose, of_pose), (light, of_light) = (
         find_worst_case(problem, names, settings.search, seed) for names in (POSE_FIELDS, LIGHT_FIELDS)
@@ -106,12 +106,12 @@ def run(settings: StressSettings, base: Path, cell: Cell) -> dict[str, Any]:
 
 
 def _photographs(problem: Problem, conditions: Conditions) -> Tensor:
-    """The clean object's."""
+    """Photographs of the clean object."""
     return photographs(problem, None, conditions, problem.figure_px)
 
 
 def _measure_again(problem: Problem, there: Conditions, anywhere: Conditions) -> dict[str, Any]:
-    """The clean object where it was found to do worst, and under the same draws without."""
+    """Measure the clean object in the worst condition found, and under the same draws without it."""
     worst, usual = clean_responses(problem, there), clean_responses(problem, anywhere)
     return {
         "hits": hits_text(worst.recognized[0]),
@@ -137,7 +137,7 @@ def _measure_map(problem: Problem, asked: MapSettings, seed: int) -> dict[str, A
 
 
 def measure_occlusion(problem: Problem, settings: OcclusionSettings, seed: int) -> tuple[dict[str, Any], Tensor]:
-    """Hits per position (row by row), the worst position's on fresh draws, and a picture of it."""
+    """Hits per position (row by row), those of the worst position on fresh draws, and a picture of it."""
     side = problem.figure_px
     square = max(round(settings.share * side), 1)
     corners = np.linspace(0, side - square, settings.positions).round().astype(int).tolist()
@@ -166,7 +166,7 @@ PixelBox = tuple[int, int, int, int]  # first column and row, and those after th
 def _ask_under(
     problem: Problem, conditions: Conditions, boxes: Sequence[PixelBox | None]
 ) -> dict[PixelBox | None, Responses]:
-    """The answers to the clean object under each box."""
+    """Responses to the clean object under each black box."""
     parts = []
     for part in in_chunks(conditions):
         pictures = _photographs(problem, part)
@@ -187,15 +187,15 @@ def _blacken(pictures: Tensor, box: PixelBox | None) -> Tensor:
 def find_worst_case(
     problem: Problem, names: Sequence[str], settings: WorstCaseSettings, seed: int
 ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """The values of the fields `names` under which the clean object does worst: as arrays of one row, and as found.
+    """Search the values of the fields `names` with the largest mean loss of the clean object over `draws` of all else.
 
-    Worst is the largest mean loss over `draws` of everything else.
+    Returns the values as arrays of one row, and the JSON record.
     """
     scene, best, best_loss, course = problem.scene, {}, -np.inf, []
     rest = scene.draw("select", settings.draws, seed)
     for number in range(settings.rounds):
         drawn = scene.draw("select", settings.tries, seed, settings.draws + number * settings.tries)
-        # between two points of a box all lies within it
+        # the ranges are a box, so points between two of its points lie in it
         fields = fields_of(drawn)
         drawn = with_values(drawn, **{n: v + 0.5**number * (fields[n] - v) for n, v in best.items()})
         losses = clean_responses(problem, combine_conditions(drawn, rest, names), problem.training_px).loss.mean(0)
@@ -210,13 +210,13 @@ def find_worst_case(
 
 
 def _varied_fields(drawn: Conditions, names: Sequence[str]) -> list[str]:
-    """Fields of one figure whose range is more than a value."""
+    """Scalar fields that vary."""
     fields = fields_of(drawn)
     return [name for name in names if fields[name].ndim == 1 and np.ptp(fields[name]) > 0]
 
 
 def tables(settings: StressSettings, results: Sequence[Result]) -> tuple[Table, ...]:
-    """What was worst, measured anew; and every cell of the maps."""
+    """Tables of worst cases, measured on fresh draws, and of every cell of the maps."""
     start = ("scene", "network", "seed")
     return (
         Table(
@@ -275,7 +275,7 @@ def _map_rows(result: Result, map_: Mapping[str, Any]) -> Iterator[tuple]:
 
 
 def _empty_cells(map_: Mapping[str, Any]) -> list[MapCell]:
-    """Where the object is not shown to be recognized more often than the background alone."""
+    """Cells in which the object is not shown to be recognized more often than the background alone."""
     return [
         (i, j)
         for i, columns in enumerate(zip(map_["hits"], map_["alone"], strict=True))
@@ -285,7 +285,7 @@ def _empty_cells(map_: Mapping[str, Any]) -> list[MapCell]:
 
 
 def figures(settings: StressSettings, results: Sequence[Result]) -> tuple[Drawing, ...]:
-    """Per cell of the study: its maps, the map of positions, and what the worst cases look like."""
+    """Per cell of the study: its maps, the map of positions, and pictures of the worst cases."""
     return tuple(drawing for result in results for drawing in _figures(settings, result))
 
 

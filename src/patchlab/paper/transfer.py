@@ -1,15 +1,14 @@
-"""Designs trained on each network and on ensembles, tested on every network, beside the original object.
+"""Train designs on each network and on ensembles, and test them on every network beside the original object.
 
 In: scenes, ways (full texture, masked, many or few signed steps, patches, ...), networks and seeds. Out: the matrix of
-rates and confidences with intervals, each beside the *original* object's on the same conditions; what a network gains
-from designs that never saw it; three fixed views in changed light; heat maps and contact sheets; each design as a GLB
-that opens elsewhere. A nil transfer is said, with its interval. Where networks are given families, ensembles leave out
-whole ones, and gains are also said from family to family.
+rates and confidences with intervals, each beside the original object's on the same conditions; gains of networks that a
+design was not trained on; three fixed views in changed light; heat maps and contact sheets; each design as a GLB.
+Where no gain is shown, its interval stands in the table. If networks have families, ensembles leave out whole families,
+and another table has the gains from family to family.
 
 Source: Pestana et al., algorithm "Full Texture" and table "Transferability". Their ε is the signed step, here
-`optimize.step_size`; a ball round the start is `patch.epsilon`. Intervals are over conditions, of the designs that were
-trained: another seed's design may do better or worse. Only those over objects are of one figure per object and seed:
-conditions of one object are no evidence of another.
+`optimize.step_size`; a ball around the start is `patch.epsilon`. Intervals are over conditions, for the designs that were
+trained: another seed's design may do better or worse. Only intervals over objects take one figure per object and seed.
 """
 
 from __future__ import annotations
@@ -54,11 +53,11 @@ _SHEET_PX = 224
 
 
 class TransferSettings(TrainedSettings):
-    """As in all studies of trained designs."""
+    """Settings of a study of trained designs with ensembles and families of networks."""
 
-    ensembles: bool = True  # also trained on all networks but one, each in turn, and on all
-    # By name: networks of one family, all of `networks` in one or another. Ensembles leave out a whole family; {}: each
-    # network is one of its own.
+    ensembles: bool = True  # also train on all networks but one, each in turn, and on all
+    # By name: networks of a family; each of `networks` is in one. Ensembles leave out whole families. {}: every network
+    # is a family.
     families: dict[NamePart, Names] = Field({})
     lights: PositiveInt = 20  # lights in each of three fixed views
 
@@ -66,23 +65,23 @@ class TransferSettings(TrainedSettings):
     def _know_every_family(self):
         members = [name for family in self.families.values() for name in family]
         if self.families and sorted(members) != sorted(self.networks):
-            raise ValueError("takes families in which each of networks is once, and nothing else")
+            raise ValueError("takes families in which each of networks is once, and no other network")
         return self
 
     def family_of(self, network: str) -> str:
-        """The name of the family that a network is in."""
+        """The family of a network."""
         return next((name for name, family in self.families.items() if network in family), short_name(network))
 
 
 def cells(settings: TransferSettings, base: Path) -> list[Cell]:
-    """The original and every training set, per scene, way and seed."""
+    """A cell per scene, way and seed for the original and for every training set."""
 
     def rows(networks: Sequence[str]) -> dict[str, Sequence[str]]:
         ensembles: dict[str, Sequence[str]] = {}
         if settings.ensembles and len(networks) > 1:
             for family in dict.fromkeys(map(settings.family_of, networks)):
                 rest = [name for name in networks if settings.family_of(name) != family]
-                if len(rest) > 1:  # else one network is left, which is a row already
+                if len(rest) > 1:  # a single network is a row already
                     ensembles[_WITHOUT_PREFIX + family] = rest
             ensembles[_ALL_ROW] = networks
         return {ORIGINAL: (), **single_network_rows(networks), **ensembles}
@@ -91,7 +90,7 @@ def cells(settings: TransferSettings, base: Path) -> list[Cell]:
 
 
 def run(settings: TransferSettings, base: Path, cell: Cell) -> dict[str, Any]:
-    """Train where the cell says so, and test."""
+    """Train if the cell names training networks, then test on all."""
     problem = problem_of(base, cell.values)
     answers: dict[str, Any] = {}
     things: dict[str, Appearance] = {"design": None}
@@ -109,7 +108,7 @@ def run(settings: TransferSettings, base: Path, cell: Cell) -> dict[str, Any]:
 
 
 def tables(settings: TransferSettings, results: Sequence[Result]) -> list[Table]:
-    """The matrix, the same over objects, networks left out, and fixed views."""
+    """Tables: the matrix, gains over objects, networks left out, and fixed views."""
     rows = _rows(results)
     left_out = _left_out_tables(settings, results, rows)
     return [_matrix(settings, rows), *_object_tables(settings, results), *left_out, *_view_tables(settings, rows)]
@@ -147,7 +146,7 @@ def _matrix(settings: TransferSettings, groups: ResultsByRow) -> Table:
 
 
 def _object_tables(settings: TransferSettings, results: Sequence[Result]) -> list[Table]:
-    """Mean gains over objects and seeds: network by network and, where families are given, family by family."""
+    """Mean gains over objects and seeds, by network and, if there are families, by family."""
 
     def family_of_row(result: Result) -> str:
         trained = result.cell.values["trained"]
@@ -165,19 +164,21 @@ def _object_tables(settings: TransferSettings, results: Sequence[Result]) -> lis
 def _gain_table(
     results: Sequence[Result], name: str, title: str, trainer: Callable[[Result], str], tester: Callable[[str], str]
 ) -> Table:
-    """One figure of each object and seed: the mean over rows and networks that are called the same."""
-    place = values_key("way", "name", "seed")
-    originals = {place(result): Record([result], "design") for result in results if not result.cell.values["trained"]}
+    """A table of gains from one figure per object and seed, the mean over rows and networks of one name."""
+    group_of = values_key("way", "name", "seed")
+    originals = {
+        group_of(result): Record([result], "design") for result in results if not result.cell.values["trained"]
+    }
     figures: dict[tuple, dict[tuple, list[tuple[float, float]]]] = {}
     for result, network in product(results, tested_networks(results)):
-        trained, here = result.cell.values["trained"], place(result)
-        if trained and here in originals:
-            start = (here[0], trainer(result), tester(network), "yes" if network in trained else "no")
-            before, after = (np.mean(of.hits(network)) for of in (originals[here], Record([result], "design")))
-            figures.setdefault(start, {}).setdefault(here, []).append((float(before), float(after)))
+        trained, group = result.cell.values["trained"], group_of(result)
+        if trained and group in originals:
+            start = (group[0], trainer(result), tester(network), "yes" if network in trained else "no")
+            before, after = (np.mean(of.hits(network)) for of in (originals[group], Record([result], "design")))
+            figures.setdefault(start, {}).setdefault(group, []).append((float(before), float(after)))
     rows = []
-    for start, by_place in figures.items():
-        before, after = np.array([np.mean(rates, 0) for rates in by_place.values()]).T
+    for start, by_group in figures.items():
+        before, after = np.array([np.mean(rates, 0) for rates in by_group.values()]).T
         gain = mean((after - before).tolist())
         rows.append((*start, float(before.mean()), float(after.mean()), gain, gain_word(gain)))
     head = ("way", "trained on", "tested on", "seen", "original", "rate", "gain in rate", "shows")
@@ -207,7 +208,7 @@ def _left_out_tables(settings: TransferSettings, results: Sequence[Result], grou
 
 
 def _rate_from_others(settings: TransferSettings, by_row: Mapping[str, Sequence[Result]], network: str) -> float | None:
-    """The mean rate on a network of the designs trained on one of another family."""
+    """The mean rate on a network of designs trained on a single network of another family."""
     family = settings.family_of(network)
     rates = [
         np.mean(Record(results, "design").hits(network))
@@ -233,7 +234,7 @@ def _view_tables(settings: TransferSettings, groups: ResultsByRow) -> list[Table
 
 
 def figures(settings: TransferSettings, results: Sequence[Result]) -> list[Drawing]:
-    """A heat map and a contact sheet per scene and way."""
+    """A heat map and a contact sheet of designs per scene and way."""
     networks, drawings = tested_networks(results), []
     for (scene, way), by_row in _rows(results).items():
         drawings += [

@@ -1,7 +1,7 @@
-"""What the studies of trained designs share: train a scene on some networks, then measure it on all of them.
+"""Parts that the studies of trained designs share: train a scene on some networks, measure it on all.
 
-In: a grid with ways to vary each scene, and networks. Out: cells of which each says who trains and who looks; tables
-that group by what was trained. Left out on purpose: promises, which belong to runs that get printed.
+In: a grid with ways to vary each scene, and networks. Out: cells that name the networks that train and those that test;
+tables that group by what was trained. Left out on purpose: promises, which belong to runs that get printed.
 """
 
 from __future__ import annotations
@@ -33,20 +33,20 @@ from patchproof.scene.conditions import Conditions
 
 SceneVariant = dict[str, dict[str, Any]]  # tables of a scene file with the keys that change
 NamePart = Annotated[str, Field(pattern=r"^[\w=+,-]{1,24}$")]  # part of a file's name
-ORIGINAL = "original"  # the row of the object as it came
+ORIGINAL = "original"  # the row of the unchanged object
 
 
 class TrainedSettings(GridSettings):
-    """Every scene in every way, before networks that train and test."""
+    """Settings: every scene in every way, and networks that train and test."""
 
-    networks: Names = Field(...)  # to train on and to test
+    networks: Names = Field(...)  # networks to train on and to test
     # By name: tables of the scene file with the keys that change.
     ways: dict[NamePart, SceneVariant] = Field({"as_is": {}}, min_length=1)
     n: Annotated[int, Field(ge=2)] = 400  # unseen conditions that measure
 
 
 def single_network_rows(networks: Sequence[str]) -> dict[str, Sequence[str]]:
-    """Rows in which each network trains alone."""
+    """Rows in which a single network trains, by its short name."""
     return {short_name(name): (name,) for name in networks}
 
 
@@ -56,28 +56,28 @@ def trained_cells(
     rows: Callable[[Sequence[str]], Mapping[str, Sequence[str]]] = single_network_rows,
     variants: Sequence[tuple[SceneChanges, Mapping[str, str]]] = (({}, {}),),
 ) -> list[Cell]:
-    """A cell per scene, way, variant, row and seed; all networks test. `rows` names those that train (none: the
-    original); a variant is tables of the scene to change, and what of it cells should say.
+    """A cell per scene, way, variant, row and seed; all networks test. `rows` names those that train (none for the
+    original); a variant is changes of the scene, and values that describe it.
     """
     networks, cells = settings.networks, []
     for file, (way, changed), (tables, more) in product(settings.scenes, settings.ways.items(), variants):
         values = with_scene_changes(scene_values(file, base, changed, f", way {way}"), tables)
         for (row, trained), seed in product(rows(networks).items(), settings.seeds):
-            who, words = {"way": way, **more, "row": row}, (way, *(text[:24] for text in more.values()), row)
+            row_values, words = {"way": way, **more, "row": row}, (way, *(text[:24] for text in more.values()), row)
             networks_of_cell = {"trained": list(trained), "networks": list(networks), "of_scene": False}
-            cells.append(make_cell(values | who | networks_of_cell, seed, *words))
+            cells.append(make_cell(values | row_values | networks_of_cell, seed, *words))
     return cells
 
 
 def with_trainers(problem: Problem, cell: Cell) -> Problem:
-    """The same problem before the networks that train."""
-    return problem.with_classifiers([cell.values["networks"].index(name) for name in cell.values["trained"]])
+    """The problem with the cell's training networks only."""
+    return problem.before([cell.values["networks"].index(name) for name in cell.values["trained"]])
 
 
 def ask_and_draw(
     problem: Problem, name: str, things: Mapping[str, Appearance], n: int, sheet: tuple[Conditions, int]
 ) -> dict[str, Any]:
-    """What all networks say of `things` under n unseen conditions, and a cell's contact sheet: views and their side."""
+    """Record all networks' answers to `things` under n unseen conditions, and draw a contact sheet (views, side in px)."""
     answers = answers_record(responses(problem, things, problem.scene.draw("evaluate", n)))
     return answers | {
         f"{name}.sheet.png": contact_sheet([photographs(problem, each, *sheet) for each in things.values()])
@@ -85,12 +85,12 @@ def ask_and_draw(
 
 
 def tested_networks(results: Sequence[Result]) -> list[str]:
-    """All networks that some cell was tested on."""
+    """All networks that a cell was tested on."""
     return list(dict.fromkeys(name for result in results for name in result.cell.values["networks"]))
 
 
 def gain_word(gain: Estimate | None) -> str:
-    """What an interval of a difference allows one to say."""
+    """The word for a difference by its interval: "gain", "loss" or "none shown"."""
     if gain is None:
         return "not measured"
     return "gain" if gain.low > 0 else "loss" if gain.high < 0 else "none shown"
