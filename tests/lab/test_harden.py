@@ -194,7 +194,7 @@ def test_settings_that_will_not_do(folder, changed, words):
         ("a.jpg,red\ngone.png,red", r"1 missing \(gone\.png\)"),
         ("a.jpg,red\na.jpg,blue", "twice"),
         ("a.jpg,green", "label that the network knows"),
-        ("file,label", "none"),
+        ("file,label", "a table without rows"),
     ],
 )
 def test_tables_that_will_not_do(folder, tmp_path, table, words):

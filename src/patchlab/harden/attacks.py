@@ -2,10 +2,10 @@
 
 In: a network, pictures N×3×S×S in [0, 1] of its input size, their labels, ε. Out: which pictures survive. Attacks work
 on the network's own input; one on the photograph's pixels by at most ε would be no stronger, since downsampling
-averages. On hardened pictures a saturated softmax leaves no gradient, and an overconfident network would pass for a robust
-one. So losses come from float64 logits, their gradient is scaled before it goes back through a float32 network, and a
-picture survives only if it does so under both the cross-entropy and a margin loss.
-Left out on purpose: random starts (results would differ by chance) and attacks without gradients.
+averages. On hardened pictures a saturated softmax leaves no gradient, and an overconfident network would pass for a
+robust one. So losses come from float64 logits, their gradient is scaled before it goes back through a float32 network,
+and a picture survives only if it does so under both the cross-entropy and a margin loss. Left out on purpose: random
+starts (results would differ by chance) and attacks without gradients.
 
 Sources: Goodfellow et al., Explaining and Harnessing Adversarial Examples, ICLR 2015 (FGSM); Madry et al., Towards Deep
 Learning Models Resistant to Adversarial Attacks, ICLR 2018 (PGD); Carlini and Wagner, Towards Evaluating the Robustness

@@ -12,8 +12,8 @@ square stay. The loss of several networks is their mean.
 A picture that is easy to recognize can still be easy to attack. With `through`, each step uses the gradient after a
 short PGD attack within that ε, as in adversarial training (Madry et al.), but for the picture.
 
-Gradients are scaled per photograph (`attacks.balanced_loss`), so that steps continue where a float32 softmax is saturated. Π
-projects onto the ε-ball, if there is one, and [0, 1].
+Gradients are scaled per photograph (`attacks.balanced_loss`), so that steps continue where a float32 softmax is
+saturated. Π projects onto the ε-ball, if there is one, and [0, 1].
 
 Sources: Pestana et al., Physical world assistive signals for deep neural network classifiers, algorithm 1; Kurakin et
 al., Adversarial Examples in the Physical World, 2017 (iterated FGSM); Madry et al., Towards Deep Learning Models

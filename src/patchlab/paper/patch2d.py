@@ -3,9 +3,9 @@
 In: labeled images, scenes whose clean object is rendered where no photographs of a class exist, or both; networks,
 seeds. A cell is a target, a network and a seed: a patch of `made_px` texels a side is optimized on images of the target
 only, at random places, sizes and angles, with Random Erasing of the picture below it, and shown `shown_px` wide at the
-network's input size. Out: recognition with and without it, paired on the same images and places, for the target, and for
-each other class by its labels, with the rate at which the patch makes it the target: an assistive patch must not become
-an adversarial one. Gray and noise of the same size are the controls.
+network's input size. Out: recognition with and without it, paired on the same images and places, for the target, and
+for each other class by its labels, with the rate at which the patch makes it the target: an assistive patch must not
+become an adversarial one. Gray and noise of the same size are the controls.
 
 Unlike a printed piece, this patch has no frame of markers. A class with fewer than `MIN_IMAGES_TO_SPLIT` images is
 measured on those that the patch was made with, and the table says so.

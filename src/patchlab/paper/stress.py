@@ -1,10 +1,10 @@
 """Find where networks fail on the clean object: black squares, maps of pose × light, worst pose and light.
 
 In: scenes with a mesh, networks, seeds. Out, per cell: a black square over every position of the picture; maps of pose
-× light; the worst pose and the worst light of a random search that narrows round by round, each with the condition found
-and its confidence. Everything chosen as worst is measured again on draws of the evaluate stream that the choice never
-saw, since the draws that chose it exaggerate. Cells of a map where the object is recognized no more often than the
-background alone are marked “no effect”: a network may give the label to anything.
+× light; the worst pose and the worst light of a random search that narrows round by round, each with the condition
+found and its confidence. Everything chosen as worst is measured again on draws of the evaluate stream that the choice
+never saw, since the draws that chose it exaggerate. Cells of a map where the object is recognized no more often than
+the background alone are marked “no effect”: a network may give the label to anything.
 
 Sources: occlusion and maps as in Pestana et al., figures 1 and 2 (occlusion maps: Zeiler and Fergus, ECCV 2014); search
 for poses that fail: Alcorn et al., Strike (with) a Pose, CVPR 2019, its random search.

@@ -1,7 +1,7 @@
 """Maps of stress tests: conditions in cells of pose × light, a network's answers there, and heat maps.
 
-In: a problem with a mesh and one network, and draws of its streams. Out: draws whose pose and light lie in one cell of a
-map while everything else stays as drawn; recognized and confidence per draw, also for the background alone; the worst
+In: a problem with a mesh and one network, and draws of its streams. Out: draws whose pose and light lie in one cell of
+a map while everything else stays as drawn; recognized and confidence per draw, also for the background alone; the worst
 tenth of a map's cells; and `Drawing`s with one scale from 0 to 1. All cells of a map share their draws of background,
 camera and everything else, so that they differ in pose and light only.
 """

@@ -7,8 +7,9 @@ Where no gain is shown, its interval stands in the table. If networks have famil
 and another table has the gains from family to family.
 
 Source: Pestana et al., algorithm "Full Texture" and table "Transferability". Their ε is the signed step, here
-`optimize.step_size`; a ball around the start is `patch.epsilon`. Intervals are over conditions, for the designs that were
-trained: another seed's design may do better or worse. Only intervals over objects take one figure per object and seed.
+`optimize.step_size`; a ball around the start is `patch.epsilon`. Intervals are over conditions, for the designs that
+were trained: another seed's design may do better or worse. Only intervals over objects take one figure per object and
+seed.
 """
 
 from __future__ import annotations

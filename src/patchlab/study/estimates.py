@@ -30,8 +30,8 @@ def median(values: Sequence[float] | np.ndarray) -> Estimate:
 
 
 def paired_means(values: np.ndarray) -> list[Estimate]:
-    """Means of the columns of S×K (K settings, each with S seeds), with intervals for comparing settings: the mean of each
-    seed is subtracted, and the remainder gets Student's interval (Morey 2008).
+    """Means of the columns of S×K (K settings, each with S seeds), with intervals for comparing settings: the mean of
+    each seed is subtracted, and the remainder gets Student's interval (Morey 2008).
     """
     seeds, settings = values.shape
     centered = values - values.mean(1, keepdims=True)
@@ -44,8 +44,8 @@ def paired_means(values: np.ndarray) -> list[Estimate]:
 
 
 def cluster_estimate(values: Sequence[float]) -> Estimate | float | None:
-    """The mean of one figure per cluster, for a table: a plain number if there are too few clusters for an interval, None
-    if there is no cluster.
+    """The mean of one figure per cluster, for a table: a plain number if there are too few clusters for an interval,
+    None if there is no cluster.
     """
     if len(values) < MIN_CLUSTERS:
         return statistics.fmean(values) if values else None
@@ -54,8 +54,8 @@ def cluster_estimate(values: Sequence[float]) -> Estimate | float | None:
 
 
 def clustered_mean(values: Sequence[float]) -> tuple[float, tuple[float, float]]:
-    """Mean of one figure per cluster with a percentile bootstrap over clusters, since values within a cluster (seeds and
-    conditions of one object and network) are alike. Repeatable. Needs MIN_CLUSTERS: fewer would give far too narrow
+    """Mean of one figure per cluster with a percentile bootstrap over clusters, since values within a cluster (seeds
+    and conditions of one object and network) are alike. Repeatable. Needs MIN_CLUSTERS: fewer would give far too narrow
     intervals (one: a point), and with ten it covers about nine times in ten.
     """
     if len(values) < MIN_CLUSTERS:

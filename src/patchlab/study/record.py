@@ -55,8 +55,8 @@ def hardest_control(result: Result, controls: Sequence[str]) -> str:
 
 
 def corner_error_mm(geometry: Geometry, corners_mm: np.ndarray, true_px: np.ndarray) -> float | None:
-    """The largest error in mm on paper of measured corners N×2, whose true pixels are `true_px`; None without a homography
-    of the photograph.
+    """The largest error in mm on paper of measured corners N×2, whose true pixels are `true_px`; None without a
+    homography of the photograph.
     """
     if geometry.homography_px_from_mm is None:
         return None

@@ -56,8 +56,8 @@ _CELL_NAME = re.compile(r"[\w=+.,-]{1,120}")
 
 @dataclass(frozen=True)
 class Cell:
-    """One piece of work. `name` is unique and names its file; `values` are JSON values and all that it depends on besides
-    the settings: a stored cell whose values have changed is run again.
+    """One piece of work. `name` is unique and names its file; `values` are JSON values and all that it depends on
+    besides the settings: a stored cell whose values have changed is run again.
     """
 
     name: str

@@ -1,7 +1,7 @@
-"""One training on rendered pictures, from the command line to the files: what all networks of this package share.
+"""Train a network on rendered pictures, from the command line to its files; shared by all built-in networks.
 
-In: a recipe, and of each network what it is, how it learns from a batch, how it is judged and what is written. Out: one
-step after the other, and printed lines. Rendered pictures can be kept in a folder, for trainings that follow.
+In: a recipe, and functions that build, train, score and write a network. Out: the written network, and printed
+progress. Rendered pictures can be stored in a folder for later trainings.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from patchproof.scene import patterns
 
 @dataclass(frozen=True)
 class TrainingRecipe:
-    """Everything that decides the weights, but for the machine's rounding."""
+    """Everything that determines the weights, up to the machine's rounding."""
 
     seed: int = 0
     pictures_per_class: int = 1500
@@ -34,16 +34,16 @@ class TrainingRecipe:
     batch: int = 64
     learning_rate: float = 2e-3
     weight_decay: float = 0.02
-    pasted: float = 0.3  # share of training pictures with a card pasted on
+    pasted: float = 0.3  # share of training pictures with a pasted card
     threads: int = 1
 
 
 RecipeType = TypeVar("RecipeType", bound=TrainingRecipe)
-Epochs = Iterator[tuple[int, float, nn.Module]]  # after each epoch: its number, its mean loss, the network as it is
+Epochs = Iterator[tuple[int, float, nn.Module]]  # after each epoch: its number, its mean loss, the network
 
 
 class Seconds(NamedTuple):
-    """How long the parts of a training took."""
+    """Seconds that the parts of a training took."""
 
     render: int
     train: int
@@ -56,22 +56,23 @@ def run(
     train: Callable[[Pictures, RecipeType], Epochs],
     score: Callable[[nn.Module, Pictures], np.ndarray],
     write: Callable[[Path, nn.Module, RecipeType, Pictures, Seconds], None],
-    seen: Callable[[Pictures, RecipeType], Pictures] = lambda shown, recipe: shown,
+    prepare: Callable[[Pictures, RecipeType], Pictures] = lambda rendered, recipe: rendered,
 ) -> None:
-    """The command: render at `input_px`, train, judge every fourth epoch by the mean of `score`, and write the network;
-    `seen` makes of rendered pictures those that the recipe's network takes.
+    """Run the command: render at `input_px`, train, print the mean of `score` every fourth epoch, and write the
+    network; `prepare` turns rendered pictures into the network's input.
     """
     out, folder, recipe = _parse_options(make, about)
     torch.set_num_threads(recipe.threads)
     started = time.time()
     render = render_pictures if folder is None else lambda *what: load_or_render(folder, *what)
-    held_out = seen(render(recipe.held_out_per_class, recipe.seed + HELD_OUT_SEED, input_px), recipe)
-    training = seen(render(recipe.pictures_per_class, recipe.seed, input_px), recipe)
+    held_out = prepare(render(recipe.held_out_per_class, recipe.seed + HELD_OUT_SEED, input_px), recipe)
+    training = prepare(render(recipe.pictures_per_class, recipe.seed, input_px), recipe)
     rendered = time.time()
     for epoch, loss, network in train(training, recipe):
-        shown = f", held out {score(network, held_out).mean():.3f}" if epoch % 4 == 3 else ""
+        score_text = f", held out {score(network, held_out).mean():.3f}" if epoch % 4 == 3 else ""
         print(
-            f"epoch {epoch + 1} of {recipe.epochs}: loss {loss:.3f}{shown}, {time.time() - started:.0f} s", flush=True
+            f"epoch {epoch + 1} of {recipe.epochs}: loss {loss:.3f}{score_text}, {time.time() - started:.0f} s",
+            flush=True,
         )
         if epoch + 1 == recipe.epochs:
             seconds = Seconds(round(rendered - started), round(time.time() - rendered))
@@ -90,22 +91,22 @@ def _parse_options(make: type[RecipeType], about: str) -> tuple[Path, Path | Non
 
 def train_epochs(
     make: Callable[[], nn.Module],
-    shown: Pictures,
+    pictures: Pictures,
     recipe: TrainingRecipe,
     loss_of: Callable[[nn.Module, Tensor, Tensor, np.random.Generator], Tensor],
 ) -> Epochs:
-    """Learn by `loss_of(network, rows of the pictures, cards to paste on, generator)`, batch after batch."""
+    """Train by `loss_of(network, rows of the pictures, cards to paste, generator)`; yields after each epoch."""
     torch.manual_seed(recipe.seed)
     rng = np.random.default_rng([recipe.seed, 1])
     network = make().train()
     # a quarter faster on a CPU; torch's stubs do not know that a module takes this alone
     network.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
-    steps = recipe.epochs * (len(shown.images) // recipe.batch)
+    steps = recipe.epochs * (len(pictures.images) // recipe.batch)
     optimizer = torch.optim.AdamW(network.parameters(), recipe.learning_rate, weight_decay=recipe.weight_decay)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, recipe.learning_rate, total_steps=steps, pct_start=0.15)
     cards = torch.from_numpy(np.stack([_draw_card(rng) for _ in range(256)])).permute(0, 3, 1, 2)
     for epoch in range(recipe.epochs):
-        losses, order = [], torch.randperm(len(shown.images))
+        losses, order = [], torch.randperm(len(pictures.images))
         for rows in order[: len(order) // recipe.batch * recipe.batch].split(recipe.batch):
             loss = loss_of(network, rows, cards, rng)
             optimizer.zero_grad()
@@ -117,7 +118,7 @@ def train_epochs(
 
 
 def _draw_card(rng: np.random.Generator, px: int = 40) -> np.ndarray:
-    """P×P×3 float32 in [0, 1]: anything, mostly in a frame of white paper with black blocks on it."""
+    """Draw a card P×P×3 float32 in [0, 1]: a texture, mostly framed by white paper with black blocks."""
     picture = patterns.texture(rng, px)
     if rng.random() < 0.6:
         margin, cell = int(rng.integers(4, 9)), int(rng.integers(2, 4))
@@ -130,7 +131,7 @@ def _draw_card(rng: np.random.Generator, px: int = 40) -> np.ndarray:
 
 
 def fold_batch_norm(trained: nn.Module) -> nn.Module:
-    """The same function without BatchNorm: its scale and shift moved into the convolutions (evaluation statistics)."""
+    """A copy without BatchNorm, whose scale and shift (of evaluation) are folded into the convolutions."""
     plain = copy.deepcopy(trained).eval()
     for parent in list(plain.modules()):
         for name, child in list(parent.named_children()):

@@ -1,12 +1,12 @@
-"""How the built-in network was made: `python -m patchlab.training.train_builtin --out DIR`.
+"""Train the built-in classifier: `python -m patchlab.training.train_builtin --out DIR`.
 
-In: nothing but seeds (pictures.py); a small convolutional network learns to name the objects. Out:
-`builtin.safetensors` and `builtin.json` with the recipe, its seeds and the accuracy on shapes, textures and backgrounds
-that training never saw.
+In: seeds (`training.pictures`); a small convolutional network learns to name the objects. Out: `builtin.safetensors`
+and `builtin.json` with the recipe, its seeds and the accuracy on shapes, textures and backgrounds that training never
+saw.
 
-Another architecture learns from the same pictures where `--network` names what makes it, which is called with
-`num_classes` and what `--settings` says: `--name levit --network timm.create_model --settings '{"model_name":
-"levit_128s", "img_size": 96}'`. It is loaded as `file:DIR/levit.onnx`, without the library that it is from; writing it
+`--network` names a callable that makes another architecture for these pictures; it is called with `num_classes` and
+the arguments in `--settings`: `--name levit --network timm.create_model --settings '{"model_name":
+"levit_128s", "img_size": 96}'`. `file:DIR/levit.onnx` loads it without the library it comes from; writing it
 takes `pip install "patchproof[lab]"`.
 """
 
@@ -31,39 +31,39 @@ from patchproof.mesh import primitives
 
 @dataclass(frozen=True)
 class ClassifierRecipe(fit.TrainingRecipe):
-    """The built-in network's, or another's."""
+    """The recipe of the built-in classifier, or of another architecture."""
 
     label_smoothing: float = 0.1  # keeps the softmax off its ends, where gradients vanish
-    name: str = "builtin"  # of the files
+    name: str = "builtin"  # name of the files
     network: str = ""  # package.module.callable of another architecture
-    settings: str = "{}"  # what it is called with, in JSON
-    input_px: int = INPUT_PX  # what another one takes of the pictures' 96
+    settings: str = "{}"  # its keyword arguments as JSON
+    input_px: int = INPUT_PX  # input size of another architecture; pictures are rendered at 96
 
 
-def train(shown: Pictures, recipe: ClassifierRecipe) -> fit.Epochs:
-    """After each epoch: its number, its mean loss, and the network as it is."""
+def train(pictures: Pictures, recipe: ClassifierRecipe) -> fit.Epochs:
+    """Train the classifier; yields (number, mean loss, network) after each epoch."""
     loss_of = torch.nn.CrossEntropyLoss(label_smoothing=recipe.label_smoothing)
 
     def learn(network: torch.nn.Module, rows: Tensor, cards: Tensor, rng: np.random.Generator) -> Tensor:
-        batch, _ = augment(shown.images[rows], shown.boxes[rows], cards, rng, recipe.pasted)
-        return loss_of(network(batch.contiguous(memory_format=torch.channels_last)), shown.labels[rows])
+        batch, _ = augment(pictures.images[rows], pictures.boxes[rows], cards, rng, recipe.pasted)
+        return loss_of(network(batch.contiguous(memory_format=torch.channels_last)), pictures.labels[rows])
 
-    return fit.train_epochs(lambda: build_network(recipe), shown, recipe, learn)
+    return fit.train_epochs(lambda: build_network(recipe), pictures, recipe, learn)
 
 
 def build_network(recipe: ClassifierRecipe) -> torch.nn.Module:
-    """The recipe's network: N×3×S×S sRGB in [0, 1] → N×K logits."""
+    """Build the recipe's untrained network: N×3×S×S sRGB in [0, 1] → N×K logits."""
     classes = len(primitives.primitive_names())
     if not recipe.network:
         return SmallNetwork(classes, batch_norm=True)
-    made = pkgutil.resolve_name(recipe.network)(num_classes=classes, **json.loads(recipe.settings))
-    return Normalized(made, [MEAN] * 3, [DEVIATION] * 3)
+    module = pkgutil.resolve_name(recipe.network)(num_classes=classes, **json.loads(recipe.settings))
+    return Normalized(module, [MEAN] * 3, [DEVIATION] * 3)
 
 
 def write(
     out: Path, trained: torch.nn.Module, recipe: ClassifierRecipe, held_out: Pictures, seconds: fit.Seconds
 ) -> None:
-    """The network and what is known about it; the accuracy is that of what is stored."""
+    """Write the network and its card; the accuracy is that of the stored network."""
     if recipe.network:
         network, count = trained, export_onnx(trained, out / f"{recipe.name}.onnx", recipe.input_px)
     else:
@@ -81,14 +81,16 @@ def write(
 
 
 @torch.no_grad()
-def accuracy_by_class(network: torch.nn.Module, shown: Pictures) -> np.ndarray:
-    """Share of right answers, class by class."""
+def accuracy_by_class(network: torch.nn.Module, pictures: Pictures) -> np.ndarray:
+    """Share of correct answers by class."""
     was_training = network.training
     network.eval()
-    right = torch.cat([network(batch.float() / 255).argmax(1) for batch in shown.images.split(256)]) == shown.labels
+    right = (
+        torch.cat([network(batch.float() / 255).argmax(1) for batch in pictures.images.split(256)]) == pictures.labels
+    )
     network.train(was_training)
     return np.array(
-        [right[shown.labels == label].float().mean().item() for label in range(int(shown.labels.max()) + 1)]
+        [right[pictures.labels == label].float().mean().item() for label in range(int(pictures.labels.max()) + 1)]
     )
 
 
@@ -102,7 +104,7 @@ def main() -> None:
         train,
         accuracy_by_class,
         write,
-        lambda shown, recipe: shrink_pictures(shown, recipe.input_px),
+        lambda pictures, recipe: shrink_pictures(pictures, recipe.input_px),
     )
 
 

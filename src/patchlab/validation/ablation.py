@@ -1,17 +1,17 @@
-"""What each modeled effect earns when training knows it, and what a promise without it is off by.
+"""Leave each modeled effect out of training: the rate that it earns, and the error of a promise without it.
 
-It is left out of training, and the design is tried in the whole world and in the world without it.
-In: scene files in which the effects of interest are on, networks, seeds. Out: for each effect how much rate and
-confidence designs lose that were trained without it, against designs trained with all, under the same conditions; by
-our renderer, and in path-traced photographs (`path_traced`), whose light is not ours. And what such a design shows in
-the whole world more than without the effect, which is what it would be promised: the same design in the same sessions.
-What takes an effect's place is what `plan` puts there (`plan.terms`): even light for the sun, not darkness. Effects
-joined by " + " go together; a scene in which all of them are off is left out.
+A design is trained without the effect and tested in the full world and in the world without it.
+In: scene files in which the effects of interest are on, networks, seeds. Out: for each effect the rate and
+confidence that designs trained without it lose against designs trained with all, under the same conditions, by our
+renderer and in path-traced photographs (`path_traced`), whose light is not ours. And the design's rate in the full
+world minus that in the world without the effect, which would be its promise: same design, same sessions.
+An effect is replaced as `plan` does it (`plan.terms`): even light for the sun, not darkness. Effects joined by " + "
+are left out together; a scene in which all of them are off is skipped.
 
-All designs of a scene, network and seed share their draws, but each is another design: its own luck is in what an
-effect earned, so intervals are over such groups, not over conditions; those of what a promise is off by, which hardly
-depends on the design, are over pairs of scene and network. Views keep their poses for one step. Left out on
-purpose: what an effect takes of a step's time. The table's figures were within some 20 %, which told nothing.
+All designs of a scene, network and seed share their draws, but designs differ by chance, so intervals of earned rates
+are over such groups, not over conditions; errors of promises hardly depend on the design, and their intervals are over
+pairs of scene and network. Views keep their poses for one step. Left out on purpose: an effect's share of a step's
+time, which varies by some 20 % from run to run.
 """
 
 from __future__ import annotations
@@ -50,13 +50,13 @@ from patchproof.scene.conditions import Conditions, draw
 from patchproof.scene.conditions import without_effect as drawn_without
 
 ALL_EFFECTS = "all"
-# What goes together, because alone it is too little to tell.
+# effects left out together, because each alone is too small to measure
 _EFFECT_GROUPS = ("dot gain + ink density + printed black", "blur + motion blur")
-_INVISIBLE_EFFECT = "JPEG"  # training's views are too small to show it
+_INVISIBLE_EFFECT = "JPEG"  # training views are too small to show it
 
 
 def _default_effects() -> tuple[str, ...]:
-    """All effects that `plan` can switch off, in its order."""
+    """All effects that `plan` can switch off, in its order, grouped."""
     printed = (PRINTER, *(term.name for term in effect_terms("printer")))
     names = (*(term.name for term in effect_terms("light")), *printed, *(term.name for term in effect_terms("camera")))
     joined = {name: group for group in _EFFECT_GROUPS for name in group.split(" + ")}
@@ -64,11 +64,11 @@ def _default_effects() -> tuple[str, ...]:
 
 
 EFFECTS = _default_effects()
-WORLDS = ("modeled", "path_traced")  # whose photographs: our renderer's, or the path tracer's
+WORLDS = ("modeled", "path_traced")  # photographs by our renderer, or by the path tracer
 
 
 class AblationSettings(GridSettings):
-    """A design for each scene, network and seed with all effects, and one without each."""
+    """Settings: for each scene, network and seed a design with all effects, and one without each."""
 
     effects: Names = EFFECTS  # left out one by one; "a + b" leaves out both at once
     n: Annotated[int, Field(ge=10)] = 400  # unseen conditions for each design, in sessions as a promise has them
@@ -77,18 +77,18 @@ class AblationSettings(GridSettings):
 
 @dataclass(frozen=True, eq=False)
 class SimplifiedProblem(Problem):
-    """A problem that sees its views without some effects."""
+    """A problem whose views are rendered without some effects."""
 
     changes: tuple[Callable[[Setup], Setup | None], ...] = ()
 
-    def see(self, appearance: Appearance, conditions: Conditions, side_px: int) -> Views:
-        """Views in which what is left out is as in the simpler model."""
-        setup = self._simpler(appearance, conditions)
-        return Problem.see(replace(self, stage=setup.stage), appearance, setup.conditions, side_px)
+    def see(self, shown: Appearance, conditions: Conditions, side_px: int) -> Views:
+        """Render views with the simpler model."""
+        setup = self._simpler(shown, conditions)
+        return Problem.see(replace(self, stage=setup.stage), shown, setup.conditions, side_px)
 
     def see_again(self, views: Views, conditions: Conditions) -> Views:
-        """As in `Problem`, and without what is left out, too."""
-        return relight_and_replace_background(views, self._simpler(self.start_appearance, conditions).conditions)
+        """Relight views as `Problem` does, without the effects left out."""
+        return relight_and_replace_background(views, self._simpler(self.laid_out, conditions).conditions)
 
     def _simpler(self, shown: Appearance, conditions: Conditions) -> Setup:
         setup = Setup(self.stage, shown, conditions)
@@ -98,16 +98,18 @@ class SimplifiedProblem(Problem):
 
 
 def simplify_problem(problem: Problem, effect: str) -> Problem:
-    """The problem without the effects of that name, joined by " + "; refused where none of them is on."""
+    """The problem without the effects joined by " + "; refused if none of them is on."""
     terms = {term.name: term for term in scene_terms(problem, problem.subject.start(), None) if term.modeled}
     names = effect.split(" + ")
     unknown = [name for name in names if name not in terms]
     if unknown:
-        raise Refused("an effect that this kind of scene has", f'"{unknown[0]}"', "choose of " + ", ".join(terms))
-    setup = Setup(problem.stage, problem.subject.appearance(problem.subject.start()), problem.scene.draw("select", 64))
+        raise Refused("an effect that this kind of scene has", f'"{unknown[0]}"', "choose one of " + ", ".join(terms))
+    setup = Setup(problem.stage, problem.subject.shown(problem.subject.start()), problem.scene.draw("select", 64))
     on = [name for name in names if terms[name].change(setup) is not None]
     if not on:
-        raise Refused(f"a scene with {effect} in it", "one where it is off", f"give {terms[names[0]].key} a range")
+        raise Refused(
+            f"a scene with {effect} in it", "a scene in which it is off", f"give {terms[names[0]].key} a range"
+        )
     subject = problem.subject
     if PRINTER in on:
         subject = subject.with_printer(identity_printer())
@@ -116,7 +118,7 @@ def simplify_problem(problem: Problem, effect: str) -> Problem:
 
 
 def cells(settings: AblationSettings, base: Path) -> list[Cell]:
-    """For each scene, network and seed: a design trained with all effects, and one without each that is on."""
+    """A cell per scene, network, seed and effect that is on, and one with all effects."""
 
     def vary(values: CellValues) -> list[tuple[CellValues, tuple[str, ...]]]:
         on = [effect for effect in settings.effects if _is_on(values, effect)]
@@ -126,7 +128,7 @@ def cells(settings: AblationSettings, base: Path) -> list[Cell]:
 
 
 def _is_on(values: CellValues, effect: str) -> bool:
-    """Whether the scene has one of the effects joined by " + "; one that is no row of `EFFECTS` counts as on."""
+    """True if the scene has one of the effects joined by " + "; an effect that is not in `EFFECTS` counts as on."""
     scene = validate_model(SceneSettings, values["scene"], values["file"])
     drawn = draw(scene, "select", 64, 0)
     names = [name for name in effect.split(" + ") if name in EFFECT_BY_NAME]
@@ -138,7 +140,7 @@ def _is_on(values: CellValues, effect: str) -> bool:
 
 
 def run(settings: AblationSettings, base: Path, cell: Cell) -> dict[str, Any]:
-    """Train without the effect; hits and confidences in the whole world, and without the effect in it."""
+    """Train without the effect; record hits and confidences in the full world, and in the world without it."""
     problem, effect = problem_of(base, cell.values), cell.values["effect"]
     simpler = problem if effect == ALL_EFFECTS else simplify_problem(problem, effect)
     design = best_design(simpler)
@@ -159,7 +161,7 @@ def run(settings: AblationSettings, base: Path, cell: Cell) -> dict[str, Any]:
 
 
 def tables(settings: AblationSettings, results: Sequence[Result]) -> tuple[Table, ...]:
-    """What each effect earned and what promises without it were off by, over all groups and in each."""
+    """Tables of the rate each effect earned, of the errors of promises without it, and of every design."""
     head = ("rate", "confidence", "rate, path-traced", "confidence, path-traced")
     about = f"trained with all effects minus without: positive is what the effect earned; {settings.n} conditions and "
     about += f"{settings.photos} photographs for each design; intervals over groups of scene, network and seed"
@@ -193,13 +195,13 @@ def _design_row(result: Result) -> tuple:
 
 
 def _promised_rate(result: Result) -> Estimate:
-    """The rate in the world without the effect, with its interval over sessions as a promise has it."""
+    """The rate in the world without the effect, with a promise's interval over sessions."""
     hits = parse_hits(result.answers["promised"]["hits"]["design"][0])
     return Estimate(float(np.mean(hits)), *rate_posterior(*count_by_session(hits, VIEWS_PER_SESSION)).rate, len(hits))
 
 
 def _promise_errors(results: Sequence[Result]) -> tuple:
-    """(designs, rate, confidence, largest change of rate, mean half width of the promises, how many lie outside)."""
+    """(designs, rate, confidence, largest change of rate, mean half width of promises, number outside)."""
     of_pairs = group_by(results, values_key("name", "network")).values()
     rate, confidence = (
         mean([float(np.mean([_promise_error(result, kind) for result in pair])) for pair in of_pairs])
@@ -213,7 +215,7 @@ def _promise_errors(results: Sequence[Result]) -> tuple:
 
 
 def _promise_error(result: Result, kind: str) -> float:
-    """What a design shows in the whole world more than it would be promised."""
+    """A design's rate or confidence in the full world minus that in the world without the effect."""
     return _mean_of(result, "modeled", kind) - _mean_of(result, "promised", kind)
 
 
@@ -224,19 +226,19 @@ def _mean_of(result: Result, world: str, kind: str) -> float:
 
 
 def _group_by_effect(results: Sequence[Result]) -> list[dict[str, Result]]:
-    """By scene, network and seed the results of each effect."""
+    """Results by effect, a dict for each scene, network and seed."""
     groups = group_by(results, cell_key).values()
     return [{result.cell.values["effect"]: result for result in group} for group in groups]
 
 
 def _world_means(result: Result) -> list[float | None]:
-    """Rate and confidence of a design in each world; None where nothing was photographed."""
+    """Rate and confidence of a design in each world; None without photographs."""
     kinds = ("hits", "confidence")
     return [_mean_of(result, world, kind) if world in result.answers else None for world in WORLDS for kind in kinds]
 
 
 def _mean_differences(compared: Sequence[tuple[Result, Result]]) -> list[Estimate | None]:
-    """What the first of each pair is better by: rate and confidence in each world."""
+    """Mean differences, first minus second of each pair: rate and confidence in each world."""
     differences = [
         [
             None if a is None or b is None else a - b

@@ -1,11 +1,10 @@
-"""What a piece's layout costs in recognition, and what it buys in finding and measuring the sheet.
+"""Compare layouts of a piece: their cost in recognition, their benefit in finding and measuring the sheet.
 
-In: scene files, networks, seeds and layouts: how many markers, how large, with how much white round them, with the
-design all over the piece or in a frame of markers, and whatever else of the scene file changes: the piece's size or
-place, how it is trained. Per cell a design is trained in that layout and shown, beside the controls, under unseen
-conditions; then its sheet is printed, hung up, photographed, found and measured against the renderer's truth. All
-layouts of a scene, network and seed share their draws; intervals are over such groups, since each design has its own
-luck.
+In: scene files, networks, seeds and layouts: number and size of markers, white around them, a design all over the
+piece or in a frame of markers, and other changes of the scene file: the piece's size or place, its training. Out: per
+cell a design is trained in that layout and shown, beside the controls, under unseen conditions; then its sheet is
+printed, mounted, photographed, found and measured against the renderer's truth. All layouts of a scene, network and
+seed share their draws; intervals are over such groups, since designs differ by chance.
 """
 
 from __future__ import annotations
@@ -60,11 +59,11 @@ if TYPE_CHECKING:
 class Layout(StrictModel):
     """One way to lay out a piece."""
 
-    markers: Literal[4, 8] = 4  # in the corners; or in the middle of each side, too
-    size: Positive = 1.0  # of the markers that the scene's views ask for
+    markers: Literal[4, 8] = 4  # in the corners; 8: also in the middle of each side
+    size: Positive = 1.0  # factor of the marker size that the scene's views need
     quiet: Positive = 1.0  # modules of white between a marker and the design
-    framed: bool = False  # the design inside a frame of markers, all of which is white
-    scene: dict[str, dict[str, Any]] = Field(default_factory=dict)  # tables of the scene file, keys that change with it
+    framed: bool = False  # put the design inside a white frame with the markers
+    scene: dict[str, dict[str, Any]] = Field(default_factory=dict)  # changes of the scene file, by table and key
 
 
 _LAYOUTS = {
@@ -78,23 +77,23 @@ _LAYOUTS = {
 
 
 class LayoutsSettings(GridSettings):
-    """A design for each scene, network, seed and layout."""
+    """Settings: a design for each scene, network, seed and layout."""
 
     layouts: dict[str, Layout] = Field(_LAYOUTS, min_length=1)  # by name; the others are compared with the first
     n: PositiveInt = 400  # unseen conditions that measure
-    photos: Annotated[int, Field(ge=0)] = 40  # of each design's sheet
+    photos: Annotated[int, Field(ge=0)] = 40  # photographs of each design's sheet
 
 
 @dataclass(frozen=True)
 class PieceVariant(Piece):
-    """A piece that reserves other pixels for its markers."""
+    """A piece with other pixels reserved for its markers."""
 
     quiet: float = 1.0
     framed: bool = False
 
     @property
     def reserved_mm(self) -> tuple[RectMm, ...]:
-        """The white round each marker; the four sides of a frame."""
+        """The white around each marker, or the four sides of a frame."""
         if not self.framed:
             wider = (self.quiet - 1) * self.module_mm
             rects = (grow_rect(rect, wider) for rect in super().reserved_mm)
@@ -119,7 +118,7 @@ def with_layout(scene: PatchScene, layout: Layout) -> PatchScene:
 
 
 def cells(settings: LayoutsSettings, base: Path) -> list[Cell]:
-    """For each scene, network and seed a cell per layout."""
+    """A cell per scene, network, seed and layout."""
     ways = [(name, layout.scene, layout.model_dump()) for name, layout in settings.layouts.items()]
     return grid_cells(
         settings,
@@ -131,7 +130,7 @@ def cells(settings: LayoutsSettings, base: Path) -> list[Cell]:
 
 
 def run(settings: LayoutsSettings, base: Path, cell: Cell) -> dict[str, Any]:
-    """Train, at a place that is searched where the scene asks for it; show and photograph."""
+    """Train (after a place search if the scene asks for one), show under unseen conditions, and photograph."""
     problem = _build_cell_problem(base, cell)
     scene = with_layout(require_patch(problem.scene), Layout(**cell.values["how"]))
     patch = replace(problem.patch, scene=scene)
@@ -155,7 +154,7 @@ def _build_cell_problem(base: Path, cell: Cell) -> Problem:
 
 
 def _free_share(piece: Piece) -> float:
-    """The share of the piece that is the design's."""
+    """The share of the piece that is free for the design."""
     scale = 4  # samples per millimeter
     mask = np.ones([int(side * scale) for side in piece.size_mm], bool)
     for x, y, w, h in piece.reserved_mm:
@@ -164,7 +163,7 @@ def _free_share(piece: Piece) -> float:
 
 
 def _photograph_and_measure(problem: Problem, scene: PatchScene, design: np.ndarray, count: int) -> dict[str, Any]:
-    """What `verify` makes of photographs of the design's sheet, and how far it is off, by photograph."""
+    """Measure photographs of the design's sheet as `verify` does, with errors against the truth, by photograph."""
     sheet = mount_content(problem.stage, SheetContent(scene.piece, scene.sheet_id, "design", design))
     manifest = sheet.manifest
     surface = surface_of(manifest)
@@ -186,12 +185,12 @@ def _photograph_and_measure(problem: Problem, scene: PatchScene, design: np.ndar
 
 
 def _gain_over_controls(result: Result) -> float:
-    """The design's rate over that of its best control."""
+    """The design's rate minus that of its best control."""
     return gain_of(result, "design", hardest_control(result, CONTROLS))
 
 
 def tables(settings: LayoutsSettings, results: Sequence[Result]) -> Sequence[Table]:
-    """Costs and gains by layout, and every cell."""
+    """Tables of costs and gains by layout, and of every cell."""
     by_layout = group_by(results, lambda result: result.cell.values["layout"])
     first = {cell_key(result): _gain_over_controls(result) for result in next(iter(by_layout.values()))}
     rows = [(name, *_layout_figures(group, first)) for name, group in by_layout.items()]
@@ -241,12 +240,12 @@ def _layout_figures(group: Sequence[Result], first: dict) -> tuple:
 
 
 def _mean_or_single(values: Sequence[float]) -> Estimate | float | None:
-    """The mean with its interval; a single value has none."""
+    """The mean with its interval, or a single value as it is."""
     return values[0] if len(values) == 1 else mean(values)
 
 
 def figures(settings: LayoutsSettings, results: Sequence[Result]) -> Sequence[Drawing]:
-    """Recognition against measured photographs, where there are any."""
+    """A plot of gain against the share of measured photographs, if there are photographs."""
     table = tables(settings, results)[0]
     if not settings.photos:
         return []
@@ -264,7 +263,7 @@ def figures(settings: LayoutsSettings, results: Sequence[Result]) -> Sequence[Dr
 
 
 def _value_and_reach(value: Value) -> tuple[float, list[list[float]] | None]:
-    """A figure and how far its interval reaches down and up, as matplotlib takes it."""
+    """A figure, and its interval's reach down and up for matplotlib's error bars."""
     if isinstance(value, Estimate):
         return value.value, [[value.value - value.low], [value.high - value.value]]
     return float(value or 0), None

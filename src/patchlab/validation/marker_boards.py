@@ -1,10 +1,10 @@
-"""Boards of markers whose print is known, found in photographs: what lies where, and how much of each pixel is paper.
+"""Find boards of markers in photographs: where each printed square lies, and each pixel's share of paper.
 
-In: an uint8 photograph and the `BoardSettings` of what it shows. Out: a `BoardPose`: every printed square with the
-homography that takes it into the photograph, and the mask of the pixels in which the pattern is known, which are those
-of the markers that were found and of what lies between them. A grid and a ChArUco board lie in one plane; where its
-homography misses the markers' corners by too much, `PhotoRejected`. Loose markers have a plane each.
-Left out on purpose: boards that are bent. A lens that bends, and paper that is nearly flat, are followed by `shift_squares`.
+In: a uint8 photograph and the `BoardSettings` of its board. Out: a `BoardPose`: every printed square with its
+homography to the photograph, and the mask of pixels with a known pattern, which are those of found markers and of the
+squares between them. A grid and a ChArUco board lie in one plane; if its homography misses the markers' corners by too
+much, `PhotoRejected`. Every loose marker has its own plane. Left out on purpose: bent boards. `shift_squares` follows
+lens distortion and paper that is not quite flat.
 """
 
 from __future__ import annotations
@@ -25,25 +25,25 @@ from patchproof.photo.rectify import fit_page, region_around
 from patchproof.photo.rejection import PhotoRejected
 from patchproof.sheets.markers import board_squares, marker_cells, marker_corner
 
-MIN_MARKERS = 4  # of a grid or a ChArUco board: two are met by planes that are far off
-# Of a module: how far corners may lie off the plane, root mean square. In 25 photographs of flat boards they were off
-# by 0.02 to 0.17.
+MIN_MARKERS = 4  # of a grid or a ChArUco board: two allow planes that are far off
+# Largest root mean square distance of corners from the plane, in modules. In 25 photographs of flat boards it was 0.02
+# to 0.17.
 MAX_MISFIT_MODULES = 0.2
 _SAMPLES = 8  # samples along each side of a pixel
-_QUIET_ZONE = 1 / 8  # of a loose marker's side: the paper around it that has to be white for it to be found
+_QUIET_ZONE = 1 / 8  # of a loose marker's side: paper around it must be white, or it is not found
 UNIT_SQUARE = rect_corners((0, 0, 1, 1))
 
 
 class BoardSettings(StrictModel):
-    """Photographs, and the board that each of them shows."""
+    """Photographs, and the board in each of them."""
 
     photos: Annotated[tuple[str, ...], Field(min_length=1)]  # files, or folders of them
     kind: Literal["grid", "charuco", "loose"]  # ChArUco: black squares between the markers; loose: a plane for each
     dictionary: str = "DICT_6X6_250"  # OpenCV's name of the markers' dictionary
     rows: Annotated[int, Field(ge=1, le=100)] = 1  # of markers in a grid, of squares in a ChArUco board
-    columns: Annotated[int, Field(ge=1, le=100)] = 1  # likewise
-    gap: NotNegative = 0.0  # white between two markers over a marker's side; a ChArUco board's square is 1 + gap
-    ids: tuple[Annotated[int, Field(ge=0, le=1023)], ...] = ()  # row by row; without any, 0, 1, 2 and so on
+    columns: Annotated[int, Field(ge=1, le=100)] = 1  # of markers in a grid, of squares in a ChArUco board
+    gap: NotNegative = 0.0  # white between two markers, in marker sides; a ChArUco board's square is 1 + gap
+    ids: tuple[Annotated[int, Field(ge=0, le=1023)], ...] = ()  # row by row; by default 0, 1, 2, ...
 
     @model_validator(mode="after")
     def _as_many_ids_as_places(self):
@@ -51,28 +51,28 @@ class BoardSettings(StrictModel):
             raise ValueError(f"dictionary takes a name that OpenCV knows, such as DICT_6X6_250, not {self.dictionary}")
         if self.kind == "loose" and not self.ids:
             raise ValueError("loose markers take ids")
-        if self.kind != "loose" and len(self.ids) not in (0, len(self.places)):
-            raise ValueError(f"ids takes one for each of the {len(self.places)} markers, or none")
+        if self.kind != "loose" and len(self.ids) not in (0, len(self.marker_places)):
+            raise ValueError(f"ids takes one for each of the {len(self.marker_places)} markers, or none")
         return self
 
     @property
-    def places(self) -> tuple[tuple[int, int], ...]:
+    def marker_places(self) -> tuple[tuple[int, int], ...]:
         """(row, column) of every marker of a grid or ChArUco board, in the order of the ids."""
         if self.kind == "grid":
             return tuple(np.ndindex(self.rows, self.columns))
         return tuple(board_squares(self.rows, self.columns, white=True))
 
     @property
-    def names(self) -> tuple[int, ...]:
-        """The ids in order."""
-        return self.ids or tuple(range(len(self.places)))
+    def marker_ids(self) -> tuple[int, ...]:
+        """The markers' ids in order."""
+        return self.ids or tuple(range(len(self.marker_places)))
 
 
 @dataclass(frozen=True)
 class PrintedSquare:
     """A printed square: modules n×n (1 = paper, 0 = ink), and the homography from the unit square to pixels.
 
-    `area_px` K×4×2 are the quadrilaterals about it in which the pattern is known; none where it does not count.
+    `area_px` K×4×2 are quadrilaterals around it with a known pattern; K is 0 where the square may be hidden.
     """
 
     cells: np.ndarray
@@ -82,14 +82,14 @@ class PrintedSquare:
 
     @property
     def corners_px(self) -> np.ndarray:
-        """Its corners 4×2."""
+        """The square's corners 4×2 in pixels."""
         return apply_homography(self.px_from_unit, UNIT_SQUARE)
 
 
 @dataclass(frozen=True)
 class BoardPose:
-    """What is printed where in a photograph; `misfit_px` is the root mean square by which corners miss the plane (None
-    of loose markers), `module_px` the median side of a module.
+    """The printed squares in a photograph; `misfit_px` is the root mean square distance of corners from the plane (None
+    for loose markers), `module_px` the median side of a module.
     """
 
     prints: tuple[PrintedSquare, ...]
@@ -99,7 +99,7 @@ class BoardPose:
     module_px: float
 
     def mask(self, shape: tuple[int, ...]) -> np.ndarray:
-        """H×W bool: the pixels whose print is known."""
+        """H×W bool: the pixels with a known pattern."""
         filled = np.zeros(shape[:2], np.uint8)
         for printed in self.prints:
             for quad in printed.area_px:
@@ -108,9 +108,9 @@ class BoardPose:
 
 
 def find_board(srgb: np.ndarray, board: BoardSettings) -> BoardPose:
-    """The board in an uint8 photograph; `PhotoRejected` where too few markers or no plane are to be seen."""
-    detected = find_markers(srgb, set(board.names), dictionary=board.dictionary)
-    least = 1 if board.kind == "loose" else min(MIN_MARKERS, len(board.names))
+    """Find the board in a uint8 photograph; `PhotoRejected` if there are too few markers or no plane fits them."""
+    detected = find_markers(srgb, set(board.marker_ids), dictionary=board.dictionary)
+    least = 1 if board.kind == "loose" else min(MIN_MARKERS, len(board.marker_ids))
     if len(detected.markers) < least:
         advice = f"{len(detected.markers)} markers of {board.dictionary} with the board's ids were found"
         raise PhotoRejected("too_few_markers", len(detected.markers), least, advice)
@@ -121,20 +121,20 @@ def find_board(srgb: np.ndarray, board: BoardSettings) -> BoardPose:
     else:
         px_from_board, misfit_px = _fit_plane(board, corners_px, module_px)
         prints = _board_squares(board, px_from_board, set(corners_px))
-    return BoardPose(prints, len(corners_px), len(board.names), misfit_px, module_px)
+    return BoardPose(prints, len(corners_px), len(board.marker_ids), misfit_px, module_px)
 
 
 def _fit_plane(
     board: BoardSettings, corners_px: Mapping[int, np.ndarray], module_px: float
 ) -> tuple[np.ndarray, float]:
-    """The homography from the board, in marker sides, and what the corners miss it by."""
+    """The homography from the board, in marker sides, and its misfit in pixels."""
     corners = {
         i: rect_corners((*marker_corner(at, 1 + board.gap, 1), 1, 1))
-        for i, at in zip(board.names, board.places, strict=True)
+        for i, at in zip(board.marker_ids, board.marker_places, strict=True)
     }
     fit = fit_page(corners_px, corners)
-    off = [corners_px[i] - apply_homography(fit.px_from_mm, corners[i]) for i in corners_px]
-    misfit_px = float(np.sqrt((np.concatenate(off) ** 2).sum(1).mean()))
+    misses = [corners_px[i] - apply_homography(fit.px_from_mm, corners[i]) for i in corners_px]
+    misfit_px = float(np.sqrt((np.concatenate(misses) ** 2).sum(1).mean()))
     if misfit_px > MAX_MISFIT_MODULES * module_px:
         advice = f"no plane fits: corners lie {misfit_px:.2f} px off it, a module is {module_px:.1f} px"
         raise PhotoRejected("curled", misfit_px, MAX_MISFIT_MODULES * module_px, advice)
@@ -142,20 +142,20 @@ def _fit_plane(
 
 
 def _board_squares(board: BoardSettings, px_from_board: np.ndarray, found: set[int]) -> tuple[PrintedSquare, ...]:
-    """All markers and black squares. Around a marker that was found half the white to the next one is known; a black
-    square is where all the markers beside it were found, as nothing hides it then.
+    """All markers and black squares. The pattern is known around a found marker up to half the gap, and in a black
+    square if all markers beside it were found, since then nothing hides it.
     """
     grown, half = 1 + board.gap, board.gap / 2
-    clear = {at for number, at in zip(board.names, board.places, strict=True) if number in found}
+    clear = {at for number, at in zip(board.marker_ids, board.marker_places, strict=True) if number in found}
     prints = []
-    for at, modules in zip(board.places, marker_cells(board.dictionary, board.names), strict=True):
+    for at, modules in zip(board.marker_places, marker_cells(board.dictionary, board.marker_ids), strict=True):
         x, y = marker_corner(at, grown, 1)
         area = _square_area(board, px_from_board, at, (x - half, y - half, grown)) if at in clear else []
         prints.append(_printed_square(modules, px_from_board, (x, y, 1), area))
     for at in board_squares(board.rows, board.columns, white=False) if board.kind == "charuco" else ():
         square = at[1] * grown, at[0] * grown, grown
         beside = {(at[0] + down, at[1] + right) for down, right in ((-1, 0), (1, 0), (0, -1), (0, 1))}
-        area = _square_area(board, px_from_board, at, square) if beside & set(board.places) <= clear else []
+        area = _square_area(board, px_from_board, at, square) if beside & set(board.marker_places) <= clear else []
         prints.append(replace(_printed_square(np.zeros((1, 1)), px_from_board, square, area), is_marker=False))
     return tuple(prints)
 
@@ -163,7 +163,7 @@ def _board_squares(board: BoardSettings, px_from_board: np.ndarray, found: set[i
 def _square_area(
     board: BoardSettings, px_from_board, at: tuple[int, ...], square: tuple[float, float, float]
 ) -> np.ndarray:
-    """A square 1×4×2 in pixels; a ChArUco board's outermost ones with some of the paper around it."""
+    """A square 1×4×2 in pixels; outer squares of a ChArUco board include some paper around the board."""
     low, high = np.array(square[:2]), np.array(square[:2]) + square[2]
     if board.kind == "charuco":
         last = board.columns - 1, board.rows - 1
@@ -194,7 +194,7 @@ def _loose_markers(board: BoardSettings, corners_px: Mapping[int, np.ndarray]) -
 def shift_squares(
     prints: Sequence[PrintedSquare], shift_px: Callable[[np.ndarray], np.ndarray]
 ) -> tuple[PrintedSquare, ...]:
-    """The prints with their corners shifted by N×2 pixels at N×2 pixels."""
+    """The squares with their corners moved by `shift_px`, a function from N×2 pixels to N×2 shifts."""
     out = []
     for printed in prints:
         corners = printed.corners_px
@@ -203,7 +203,7 @@ def shift_squares(
 
 
 def paper_share(prints: Sequence[PrintedSquare], shape: tuple[int, ...]) -> np.ndarray:
-    """H×W float32: how much of each pixel is paper, from 8 × 8 samples; around the prints all is paper."""
+    """H×W float32: the share of paper in each pixel, from 8 × 8 samples; around the squares all is paper."""
     share = np.ones(shape[:2], np.float32)
     for printed in prints:
         box = region_around(printed.corners_px, 1, shape)

@@ -1,8 +1,8 @@
-"""What studies of promises share: a run for each combination, its sheet, and sessions of photographs of the print.
+"""Steps that studies of promises share: make a run and its sheet, photograph it in sessions, verify.
 
-In: scene files, networks, printers, seeds. Out: cells, and for one of them the design (optimized, or a picture that is
-imported), the page, the photographs, their judgment; what answers keep of the promise. All as a user's commands do it,
-but that no report is written of what is judged.
+In: scene files, networks, printers, seeds. Out: cells, and for a cell the design (optimized, or an imported picture),
+the page, the photographs and their verification; a record of the promise. Everything is done as by a user's commands,
+but no report is written.
 """
 
 from __future__ import annotations
@@ -38,16 +38,16 @@ if TYPE_CHECKING:
 
 
 class SessionsSettings(GridSettings):
-    """A run for each scene, network, printer and seed, and sessions of photographs of each."""
+    """Settings: a run for each scene, network, printer and seed, and sessions of photographs of each."""
 
-    printers: Names = ("coated",)  # that print the designs, and are known while optimizing
-    sessions: PositiveInt = 4  # of each print
-    photos: Annotated[int, Field(ge=5, le=1000)] = 20  # of each session
-    path_traced: bool = True  # taken by Mitsuba 3, else by our renderer
+    printers: Names = ("coated",)  # printers of the designs, which optimizing knows
+    sessions: PositiveInt = 4  # sessions of each print
+    photos: Annotated[int, Field(ge=5, le=1000)] = 20  # photographs of each session
+    path_traced: bool = True  # photograph with Mitsuba 3, else with our renderer
 
 
 def cells(settings: SessionsSettings, base: Path) -> list[Cell]:
-    """One per combination, with the whole scene in it."""
+    """A cell per scene, network, printer and seed, with the whole scene in it."""
     profiles = {short_name(name): {"printer": {"profile": name}} for name in settings.printers}
     return grid_cells(
         settings,
@@ -60,14 +60,14 @@ def cells(settings: SessionsSettings, base: Path) -> list[Cell]:
 
 
 def make_run_and_sheet(base: Path, cell: Cell, folder: Path) -> Run:
-    """The cell's design in folder/run, its sheet in folder/sheet.pdf."""
+    """Optimize or import the cell's design into folder/run, and write its sheet to folder/sheet.pdf."""
     from patchproof.optimizer.imported_design import import_patch
     from patchproof.optimizer.run import optimize
     from patchproof.reprints.run_sheet import sheet as sheet_of
 
     scene = scene_of(base, cell.values)
     scene = replace(scene, settings=scene.settings.changed(target={"models": network_names(base, cell.values)}))
-    # one control is enough for a page, and all of them would take most of a promise's time
+    # a page needs one control only, and all of them would take most of a promise's time
     if (picture := cell.values.get("picture")) is None:
         made = optimize(scene, folder / "run", promise=PromiseOptions(controls=("bare",)))
     else:
@@ -79,17 +79,15 @@ def make_run_and_sheet(base: Path, cell: Cell, folder: Path) -> Run:
 
 
 def take_photos(settings: SessionsSettings, cell: Cell, made: Run, folder: Path, control: str | None = None) -> Path:
-    """The folder with sessions of photographs of folder/sheet.pdf, or of a control in its place and under the same
-    conditions.
-    """
+    """Photograph folder/sheet.pdf, or a control in its place under the same conditions; returns the folder of sessions."""
     from patchproof.reprints.mounted_sheet import ReprintSetup
     from patchproof.reprints.reprint import reprint
 
     out, n = folder / ("photos" if control is None else control), settings.sessions * settings.photos
-    how = ReprintSetup(path_traced=settings.path_traced, control=control)
-    # cells that shared a seed's draws would be one case
+    setup = ReprintSetup(path_traced=settings.path_traced, control=control)
+    # another seed per cell: cells with the same draws would not be independent
     seed = zlib.crc32(cell.name.encode())
-    reprint(folder / "sheet.pdf", made, n, out, how, sessions=settings.sessions, seed=seed)
+    reprint(folder / "sheet.pdf", made, n, out, setup, sessions=settings.sessions, seed=seed)
     return out
 
 
@@ -101,25 +99,25 @@ def verify_photos(
     forecast: Callable[[PhotoSquare], float | None] | None = None,
     **options: Any,
 ) -> Report:
-    """What `verify` finds in photographs of folder/sheet.pdf, without its files; `options` are some of `Options`."""
+    """Verify photographs of folder/sheet.pdf without writing a report; `options` replace fields of `Options`."""
     from patchproof.app.verify import options_of
     from patchproof.evidence.gather import gather_evidence
     from patchproof.sheets.manifest import load_manifest
 
     sheet, networks = folder / "sheet.json", network_names(base, cell.values)
     manifest = load_manifest(sheet)
-    given = replace(options_of(sheet, manifest, networks, None), **options)
-    return gather_evidence(photos, manifest, given, forecast=forecast)
+    changed = replace(options_of(sheet, manifest, networks, None), **options)
+    return gather_evidence(photos, manifest, changed, forecast=forecast)
 
 
 def record_promise(made: Run) -> dict[str, Any]:
-    """What answers keep of a run's promise."""
+    """Record a run's promise as JSON values."""
     promise = made.promise
     hits = hits_text([condition.recognized for condition in promise.conditions])
     return {"promised": hits, "per_session": promise.per_session, "places": list(promise.places)}
 
 
 def promise_posterior(result: Result) -> RatePosterior:
-    """What that promise says of photographs to come."""
+    """The rate's posterior from a recorded promise."""
     answers = result.answers
     return rate_posterior(*count_by_session(parse_hits(answers["promised"]), answers["per_session"], answers["places"]))

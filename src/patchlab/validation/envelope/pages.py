@@ -1,8 +1,8 @@
-"""Tables and figures of an operating envelope: breaking points, every point of every sweep, what was said beyond, maps.
+"""Tables and figures of an operating envelope: breaking points, points of sweeps, codes beyond them, maps.
 
-In: finished cells. Out: tables, and drawings of which the first is one page to print beside the patch. Breaking points
-come as values of their axis; one outside of the sweep is said to hold, and an interval that ends at the sweep's own end
-is open there. A design breaks where it stops gaining over its controls, whatever label the network answers beyond.
+In: finished cells. Out: tables, and a page to print beside the patch. Breaking points are values of their axis; one
+beyond the sweep is called “holds”, and an interval that ends at the sweep's end is open there. A design breaks where it
+stops gaining over its controls, whatever label the network gives beyond.
 """
 
 from __future__ import annotations
@@ -31,16 +31,14 @@ if TYPE_CHECKING:
 STAGES = {"gains": "design gains", "found": "sheet found", "measured": "measured"}
 _COLORS = {"gains": "#2a6f97", "found": "#e09f3e", "measured": "#2a9d6f"}
 _RATE_HEADINGS = ("recognized", *CONTROLS, "gain", "effect", "sheet found", "measured")
-EndValues = BreakValues = Mapping[
-    str, Any
-]  # of a cell's values its axis with both ends; of its answers where a stage breaks
+EndValues = BreakValues = Mapping[str, Any]  # a cell's axis with both ends; a stage's `Break` in its answers
 HOLDS_WORD, NEVER_WORD, EFFECT_WORD, NO_EFFECT_WORD = "holds", "never worked", "gains", "no effect"
 _CONTROL_TEXT = "the better of the bare object and a gray piece in the same markers, on the same conditions"
-_PAGE_IN = (11.69, 8.27)  # A4, lying
+_PAGE_IN = (11.69, 8.27)  # A4, landscape
 
 
 def tables(settings: Any, results: Sequence[Result]) -> Sequence[Table]:
-    """Breaking points, points of sweeps, codes beyond the breaking point, points of maps."""
+    """Tables of breaking points, codes beyond them, points of sweeps, points of maps."""
     sweeps, maps = _split_results(results)
     ends = ("axis", "unit", "easy", "hard")
     all_tables = (
@@ -82,7 +80,7 @@ def tables(settings: Any, results: Sequence[Result]) -> Sequence[Table]:
 
 
 def figures(settings: Any, results: Sequence[Result]) -> Sequence[Drawing]:
-    """The page to print."""
+    """The operating envelope as one page to print."""
     sweeps, maps = _split_results(results)
     page = Drawing(
         "page",
@@ -103,13 +101,13 @@ def _split_results(results: Sequence[Result]) -> tuple[list[Result], list[Result
 
 
 def found_and_measured(answers: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """P×N bool by stage of the sheet."""
+    """By stage of the sheet P×N bool: the sheet was found, it was measured."""
     status = np.array(answers["status"])
     return {"found": status != "rejected", "measured": status == "measured"}
 
 
 def gains_in(answers: Mapping[str, Any]) -> list[Estimate]:
-    """Per point how much more often the design worked than the better control."""
+    """Per point the design's gain over the better control."""
     controls = {kind: np.array(hits, bool) for kind, hits in answers["controls"].items()}
     return gains_over_controls(np.array(answers["recognized"], bool), controls)
 
@@ -145,8 +143,8 @@ def _axis_value(x: EndValues, position: float) -> float:
 def _beyond_row(result: Result) -> tuple[Value, ...]:
     x, answers = result.cell.values["x"], result.answers
     where = answers["breaks"]["measured"]["value"]
-    at = np.linspace(0, 1, x["points"])
-    beyond = [i for i in range(x["points"]) if where is None or at[i] > min(where, 1 - 1e-9)]
+    positions = np.linspace(0, 1, x["points"])
+    beyond = [i for i in range(x["points"]) if where is None or positions[i] > min(where, 1 - 1e-9)]
     photos = [photo for i in beyond for photo in zip(answers["status"][i], answers["code"][i], strict=True)]
     status, codes = [status for status, _ in photos], [code for status, code in photos if status != "measured"]
     return AXES[x["axis"]].title, len(status), status.count("measured"), _count_codes(codes)
@@ -173,7 +171,7 @@ def _map_rows(result: Result) -> list[tuple[Value, ...]]:
 
 
 def _rates(answers: Mapping[str, Any]) -> list[tuple[Value, ...]]:
-    """Per point what `_RATE_HEADINGS` names."""
+    """Per point the values under `_RATE_HEADINGS`."""
     shown = [answers["recognized"], *(answers["controls"][kind] for kind in CONTROLS)]
     sheet = found_and_measured(answers).values()
     return [
@@ -228,7 +226,7 @@ def _draw_bars(axes: Axes, sweeps: Sequence[Result]) -> None:
 
 
 def _draw_without(axes: Axes, y: float, gains: Sequence[bool], color: str) -> None:
-    """Beyond its breaking point: where the design has no effect, and where it gains again."""
+    """Draw where the design has no effect beyond its breaking point, and where it gains again."""
     ends = [0.0, *((np.arange(len(gains) - 1) + 0.5) / (len(gains) - 1)).tolist(), 1.0]  # half way between the points
     for gaining, run in groupby(range(len(gains)), lambda i: gains[i]):
         left, *_, right = (ends[i] for point in run for i in (point, point + 1))

@@ -1,10 +1,10 @@
-"""The photographs behind an operating envelope, what a network makes of them, and what the tool measures in them.
+"""Simulate the photographs of an operating envelope, ask a network about them, and measure them.
 
-In: a run and points (values of axes). Out: per point and condition whether the target was recognized, of the design, of
-the bare object and of a gray piece in its place; and the codes and corner errors of full photographs. Pieces come from
-the PDFs of their sheets, as in `reprint`, and what a point does to the design it does to the gray one. Recognition is
-judged at the promise's resolution, except where JPEG is varied: that is met at full size or not at all. Of a photograph
-that is to be measured only the window around the piece is rendered (see `piece_window`).
+In: a run and points (values of axes). Out: hits per point and condition of the design, of the bare object and of a gray
+piece in its place; codes and corner errors of full photographs. Pieces come from the PDFs of their sheets, as in
+`reprint`, and a point changes the gray piece as it changes the design. Recognition is judged at the promise's
+resolution, except where JPEG is varied, which needs full size. Photographs that are only measured are rendered only in
+the window around the piece (`piece_window`).
 """
 
 from __future__ import annotations
@@ -44,12 +44,12 @@ from patchproof.scene.conditions import Conditions
 from patchproof.scene.interface import Scene, require_piece
 from patchproof.scene.mesh_scene import require_mesh
 
-_TAPE_SRGB = 0.45  # what hides a corner
+_TAPE_SRGB = 0.45  # color of the tape that hides a corner
 
 
 @dataclass(frozen=True, eq=False)
 class Simulation:
-    """A run with its hung sheet and the gray control's, the sheet's surface, and a printer that was not promised."""
+    """A run with its mounted sheet and the gray control's, the sheet's surface, and a printer other than the promised."""
 
     run: Run
     problem: Problem
@@ -66,7 +66,7 @@ class Simulation:
 
 @dataclass(frozen=True)
 class Measurement:
-    """A photograph's status and code, and the largest error of the design's corners in mm where it was measured."""
+    """A photograph's status and code, and the design's largest corner error in mm if it was measured."""
 
     status: str
     code: str | None
@@ -75,7 +75,7 @@ class Measurement:
 
 @lru_cache(maxsize=1)
 def open_simulation(folder: Path, other_printer: str | None) -> Simulation:
-    """A run's world; `other_printer` None stands for uncoated paper, or coated where the run has uncoated."""
+    """Open a run's simulation; `other_printer` None stands for uncoated paper, or coated if the run has uncoated."""
     run = load_run(folder)
     require_piece(run.scene, "name the run of a printed patch")
     profile = run.scene.settings.printer.profile
@@ -87,18 +87,18 @@ def open_simulation(folder: Path, other_printer: str | None) -> Simulation:
 
 
 def piece_at(world: Simulation, point: SweepPoint, first_corner: int, gray: bool = False) -> PiecePicture:
-    """The piece as this point's printer shows it, with quarters hidden beginning at one of its corners."""
+    """The piece by the point's printer, with its hidden quarters counted from `first_corner`."""
     whole = _printed_piece(world, gray, float(point.get("mismatch", 0.0)))
     if not point.get("hidden"):
         return whole
-    srgb, left = whole.srgb.clone(), float(point["hidden"])
+    srgb, hidden = whole.srgb.clone(), float(point["hidden"])
     height, width = srgb.shape[:2]
     for corner in range(4):
-        side = min(max(left - corner, 0.0), 1.0) ** 0.5  # a part of a corner is a smaller square
+        side = min(max(hidden - corner, 0.0), 1.0) ** 0.5  # a part of a corner is a smaller square
         high, wide = round(side * height / 2), round(side * width / 2)
-        at = (first_corner + corner) % 4
-        rows = slice(0, high) if at in (0, 1) else slice(height - high, height)
-        columns = slice(0, wide) if at in (0, 3) else slice(width - wide, width)
+        index = (first_corner + corner) % 4
+        rows = slice(0, high) if index in (0, 1) else slice(height - high, height)
+        columns = slice(0, wide) if index in (0, 3) else slice(width - wide, width)
         srgb[rows, columns] = _TAPE_SRGB
     return PiecePicture.of(srgb)
 
@@ -116,7 +116,7 @@ def _printed_piece(world: Simulation, gray: bool, mismatch: float) -> PiecePictu
 
 
 def recognize_target(world: Simulation, points: Sequence[SweepPoint], conditions: Conditions) -> dict[str, np.ndarray]:
-    """P×N bool by what is shown, the design and `CONTROLS`: whether the run's first network sees the target."""
+    """By the design and `CONTROLS` P×N bool: the run's first network recognizes the target."""
     out = {kind: np.zeros((len(points), len(conditions)), bool) for kind in ("design", *CONTROLS)}
     as_file = any("jpeg" in point for point in points)
     side = min(world.scene.settings.camera.photo_px) if as_file else world.problem.figure_px
@@ -138,7 +138,7 @@ def recognize_target(world: Simulation, points: Sequence[SweepPoint], conditions
 
 
 def measure_photos(world: Simulation, points: Sequence[SweepPoint], conditions: Conditions) -> list[list[Measurement]]:
-    """P×N measurements of photographs as verify would make them."""
+    """P×N measurements of photographs, as `verify` makes them."""
     out: list[list[Measurement]] = [[] for _ in points]
     stages = _StageCache(world)
     with torch.inference_mode():
@@ -148,7 +148,7 @@ def measure_photos(world: Simulation, points: Sequence[SweepPoint], conditions: 
             )
             for i in _by_cost(points):
                 srgb, origin_px = views.file(points[i])
-                if "curl" in points[i]:  # the middle of the picture says how rolled paper is seen
+                if "curl" in points[i]:  # measuring rolled paper needs the picture's middle
                     srgb, origin_px = paste_on_plain(srgb, origin_px, world.scene.settings.camera.photo_px), (0, 0)
                 drawn = conditions_at(world.scene, conditions[[n]], points[i])
                 out[i].append(_measure_window(world, stages.at(points[i]).scene, drawn, srgb, origin_px))
@@ -156,7 +156,7 @@ def measure_photos(world: Simulation, points: Sequence[SweepPoint], conditions: 
 
 
 class _StageCache:
-    """The stage of each geometry, the last few kept."""
+    """The stage of each geometry, created once."""
 
     def __init__(self, world: Simulation):
         self._world, self._kept = world, {}
@@ -169,7 +169,7 @@ class _StageCache:
 
 
 class _ViewCache:
-    """Views of some conditions at one point after another; what consecutive points share is computed once."""
+    """Views of some conditions at successive points; parts that consecutive points share are computed once."""
 
     def __init__(
         self,
@@ -184,12 +184,12 @@ class _ViewCache:
         self._origin_px = (0, 0)
 
     def at(self, point: SweepPoint, kind: str = "design", jpeg: bool = True) -> Tensor:
-        """N×3×H×W pictures of the design, or of a control."""
+        """N×3×H×W pictures of the design or a control at the point."""
         shown = None if kind == "bare" else piece_at(self._world, point, self._first, kind == "gray")
         return expose(self._views(point), shown, jpeg)
 
     def file(self, point: SweepPoint, kind: str = "design") -> tuple[np.ndarray, tuple[int, int]]:
-        """The only picture as uint8 H×W×3, read back from a JPEG file of its quality, and where its corner lies."""
+        """The single picture as uint8 H×W×3, read back from a JPEG file, and its corner in the photograph."""
         rest = {name: value for name, value in point.items() if name != "jpeg"}
         if kind not in self._pictures or self._pictures[kind][0] != rest:
             self._pictures[kind] = rest, self.at(rest, kind, jpeg=False)
@@ -197,7 +197,7 @@ class _ViewCache:
         return image_pixels(jpeg_of(self._pictures[kind][1], drawn)), self._origin_px
 
     def _views(self, point: SweepPoint) -> Views:
-        """The point's views, in which any piece of the sheet's size can be shown."""
+        """Views at the point that can show any piece of the sheet's size."""
         if self._kept is None or self._kept[0] != point:
             conditions = conditions_at(self._world.scene, self._drawn, point)
             if self._kept is None or _geometry_values(self._kept[0]) != _geometry_values(point):
@@ -213,10 +213,10 @@ class _ViewCache:
 def _measure_window(
     world: Simulation, scene: Scene, conditions: Conditions, srgb: np.ndarray, origin_px
 ) -> Measurement:
-    """What the tool says of a part of a photograph whose corner lies at `origin_px`."""
+    """Measure a part of a photograph whose corner is at `origin_px`."""
     whole_px = world.scene.settings.camera.photo_px
     matrix_px = None
-    if scene.HAS_OBJECT:  # of pictures nobody knows the focal length
+    if scene.HAS_OBJECT:  # a flat picture has no focal length
         matrix_px = require_mesh(scene).matrix_px(whole_px).copy()
         matrix_px[:2, 2] -= origin_px
     view = PinholePhoto(srgb, matrix_px, calibrated=False)
@@ -234,6 +234,6 @@ def _geometry_values(point: SweepPoint) -> tuple:
 
 
 def _by_cost(points: Sequence[SweepPoint]) -> list[int]:
-    """Points of one geometry together, and among them those that differ in their JPEG alone."""
+    """Indices of points sorted so that equal geometries, and points that differ in JPEG only, are adjacent."""
     key = lambda i: (_geometry_values(points[i]), sorted((k, v) for k, v in points[i].items() if k != "jpeg"))  # noqa: E731
     return sorted(range(len(points)), key=key)
