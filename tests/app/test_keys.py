@@ -99,4 +99,4 @@ def test_one_kind_of_file_is_printed_alone(capsys):
 def test_the_help_of_study_names_every_study(capsys):
     assert lab_command("study", "--help") == 0
     printed = capsys.readouterr().out
-    assert "  promises   Whether promised rates hold" in printed and "patchlab keys NAME" in printed
+    assert "  promises   Check that promised rates hold" in printed and "patchlab keys NAME" in printed

@@ -353,8 +353,8 @@ def printer_errors(seed: int, swatches: int, camera: Camera) -> tuple[float, flo
         light = read_chart(shot.photo, manifest, known).light
         usable = np.isfinite(light).all(1)
         sent = np.array([s.srgb for s in manifest.chart])[usable]
-        choice = choose(map_kinds(priors), sent, srgb_from_linear(light[usable]))
-        errors.append(float(difference(bench_printer.relative_to_paper(choice.predict, colors), truth).mean()))
+        choice = choose_map(map_kinds(priors), sent, srgb_from_linear(light[usable]))
+        errors.append(float(color_difference(bench_printer.relative_to_paper(choice.predict, colors), truth).mean()))
     return errors[0], errors[1]
 
 

@@ -48,7 +48,7 @@ def test_without_the_printer_colors_are_shown_as_they_are_sent(problem):
 
 
 def test_views_without_it_are_looked_at_in_the_same_way(problem):
-    drawn, shown = problem.scene.draw("evaluate", 2), problem.subject.shown(problem.subject.start())
+    drawn, shown = problem.scene.draw("evaluate", 2), problem.subject.appearance(problem.subject.start())
     less = simplify_problem(problem, "noise")
     for side_px in (problem.training_px, problem.figure_px):
         by_hand = problem.see(shown, with_values(drawn, noise=0.0), side_px)

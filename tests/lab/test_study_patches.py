@@ -13,7 +13,7 @@ from PIL import Image
 
 from patchlab.paper import patch2d, patch3d
 from patchlab.paper.image_classes import ImageClass, class_scene, list_classes, scene_settings, write_renders
-from patchlab.study.estimates import cluster_estimate, clustered_mean
+from patchlab.study.estimates import cluster_mean, clustered_mean
 from patchlab.study.grid import scene_values
 from patchlab.study.record import hits_text
 from patchlab.study.study import Cell, Result, run_study
@@ -47,8 +47,8 @@ def test_the_cluster_interval_is_that_of_the_mean_and_repeats():
 
 def test_few_clusters_have_no_interval():
     values = [0.1] * MIN_CLUSTERS
-    assert cluster_estimate(values).low == pytest.approx(0.1) and cluster_estimate(values).n == MIN_CLUSTERS
-    assert cluster_estimate(values[1:]) == pytest.approx(0.1) and cluster_estimate([]) is None
+    assert cluster_mean(values).low == pytest.approx(0.1) and cluster_mean(values).n == MIN_CLUSTERS
+    assert cluster_mean(values[1:]) == pytest.approx(0.1) and cluster_mean([]) is None
     with pytest.raises(ValueError, match="at least 5 clusters, got 4"):
         clustered_mean(values[1:])
 

@@ -101,9 +101,7 @@ def pareto_mask(cost: Sequence[float], error: Sequence[float]) -> np.ndarray:
 
 
 def all_checks(chart: Chart) -> list[Check]:
-    """The chart's checks, and one per default: by how many % its error exceeds the front's at its cost, 0 where the two
-    intervals overlap.
-    """
+    """The chart's checks, and one per default: the % by which its error exceeds the front's, 0 if intervals overlap."""
     checks = list(chart.checks)
     for task, points in chart.tasks.items():
         for default in (p for p in points if p.default):

@@ -65,7 +65,6 @@ def _draw_point(axes: Axes, point: ChartPoint, color: str, marker: str, filled: 
 
 
 def _set_scales(axes: Axes, points: list[ChartPoint]) -> None:
-    """Make an axis logarithmic if its figures spread far."""
     costs, errors = zip(*(p.center for p in points), strict=True)
     if max(costs) > 4 * min(costs) > 0:
         _plain_log(axes.xaxis, axes.set_xscale, max(costs) / min(costs))
@@ -74,7 +73,6 @@ def _set_scales(axes: Axes, points: list[ChartPoint]) -> None:
 
 
 def _plain_log(axis, set_scale, ratio: float) -> None:
-    """Make an axis logarithmic, with plain numbers at its ticks."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     set_scale("log")

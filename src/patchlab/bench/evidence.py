@@ -129,7 +129,7 @@ def models_chart(count: int, progress: Progress) -> Chart:
         progress("models of sheets", number + 1, len(kinds))
     return Chart(
         name="models",
-        title="Models of a sheet's shape",
+        title="What makes a sheet flat",
         cost="milliseconds to fit (median); finding the markers is not counted",
         error="largest error on the design, mm (median)",
         series=series,

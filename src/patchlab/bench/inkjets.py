@@ -60,9 +60,7 @@ class Inkjet:
 
     @cached_property
     def _table(self):
-        """A matching driver's table sRGB → cyan, magenta, yellow: nearest printable colors in CIELAB, black moved to
-        the printer's black.
-        """
+        """A matching driver's table sRGB → cyan, magenta, yellow: nearest printable colors, by CIELAB."""
         from scipy.interpolate import RegularGridInterpolator
         from scipy.spatial import KDTree
 

@@ -81,9 +81,7 @@ def time_ratio(times: Mapping[Name, np.ndarray], a: Name, b: Name) -> Estimate:
 
 
 def run_in_checkout(source: Path, code: str, *arguments: str) -> tuple[str, Any]:
-    """Run `code` in a process that imports from a checkout's `src` folder: (short commit, JSON in the last line that it
-    prints).
-    """
+    """Run code that imports from a checkout's `src`: (short commit, JSON in the last line that it prints)."""
     command, environment = [sys.executable, "-c", code, *arguments], {**os.environ, "PYTHONPATH": str(source.resolve())}
     output = subprocess.run(command, env=environment, stdout=subprocess.PIPE, check=True).stdout
     commit = subprocess.run(["git", "-C", source, "rev-parse", "--short", "HEAD"], stdout=subprocess.PIPE, text=True)
@@ -91,7 +89,6 @@ def run_in_checkout(source: Path, code: str, *arguments: str) -> tuple[str, Any]
 
 
 def _processor() -> str:
-    """The processor's name; on Linux from /proc/cpuinfo."""
     info = Path("/proc/cpuinfo")
     lines = info.read_text(encoding="utf-8").splitlines() if info.is_file() else []
     named = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]

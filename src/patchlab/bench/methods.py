@@ -138,8 +138,6 @@ def load_art() -> tuple[Any, Any]:
 
 
 class _CodeValueNetwork(torch.nn.Module):
-    """A network that takes code values from 0 to 255."""
-
     def __init__(self, classifier: Classifier):
         super().__init__()
         self._classifier = classifier

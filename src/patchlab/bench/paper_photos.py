@@ -36,9 +36,7 @@ _OUTLINE = np.array([[0, 0], [1, 0], [1, 1], [0, 1], [0, 0]])  # the piece's cor
 
 @dataclass(frozen=True)
 class Sheet:
-    """Paper seen by a camera (mm, z into the paper): flat where `curvature` (1/mm) is 0, else rolled about its vertical
-    middle.
-    """
+    """Paper seen by a camera (mm, z into the paper): flat if `curvature` (1/mm) is 0, else rolled about its middle."""
 
     camera_from_piece: np.ndarray
     matrix_px: np.ndarray

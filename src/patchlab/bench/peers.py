@@ -24,20 +24,20 @@ from patchlab.bench.chart import Chart, ChartPoint
 from patchlab.bench.measure import time_call
 from patchlab.bench.methods import METHODS, load_art
 from patchlab.paper.patch3d import patch_cells
-from patchlab.study.estimates import cluster_estimate, median, paired_means
+from patchlab.study.estimates import cluster_mean, median, paired_means
 from patchlab.study.figures import picture_sheet
 from patchlab.study.grid import (
     GridSettings,
     PositiveInt,
     Seeds,
+    by_values,
     cell_key,
     group_by,
     problem_of,
-    values_key,
-    with_scene_changes,
+    with_changes,
 )
 from patchlab.study.pictures import contact_sheet, enlarge_design, photographs
-from patchlab.study.record import answers_record, gain_of, hardest_control, rate_of
+from patchlab.study.record import gain_of, hardest_control, rate_of, to_record
 from patchlab.study.study import Cell, Result, Study
 from patchproof.app.demo import demo_scene
 from patchproof.base.errors import Refused
@@ -93,7 +93,7 @@ def run(settings: PeersSettings, base: Path, cell: Cell) -> dict[str, Any]:
     view = conditions[problem.scene.facing(conditions)][:1]
     on_object = [photographs(problem, things[name], view, _TILE_PX)[0] for name in pixels]
     return {
-        **answers_record(responses(problem, things, conditions)),
+        **to_record(responses(problem, things, conditions)),
         "passes": {name: design.passes for name, (design, _) in made.items()},
         "seconds": {name: milliseconds / 1000 for name, (_, milliseconds) in made.items()},
         f"{cell.name}.png": contact_sheet([[enlarge_design(each, _TILE_PX) for each in pixels.values()], on_object]),
@@ -112,14 +112,14 @@ def _pooled(settings: PeersSettings, results: Sequence[Result]) -> Table:
         leads = [gain_of(result, "ours", name) for result in results]
         by_pair = [
             float(np.mean([gain_of(result, "ours", name) for result in group]))
-            for group in group_by(results, values_key("name", "network")).values()
+            for group in group_by(results, by_values("name", "network")).values()
         ]
         rows.append(
             (
                 name,
                 float(np.mean([rate_of(result, name) for result in results])),
-                cluster_estimate([gain_of(result, name, hardest_control(result, CONTROLS)) for result in results]),
-                *((None, None) if name == "ours" else (cluster_estimate(leads), cluster_estimate(by_pair))),
+                cluster_mean([gain_of(result, name, hardest_control(result, CONTROLS)) for result in results]),
+                *((None, None) if name == "ours" else (cluster_mean(leads), cluster_mean(by_pair))),
                 round(float(np.mean([result.answers["passes"][name] for result in results]))),
                 float(np.mean([result.answers["seconds"][name] for result in results])),
             )
@@ -142,7 +142,7 @@ def _by_cell(settings: PeersSettings, results: Sequence[Result]) -> Table:
 
 def figures(settings: PeersSettings, results: Sequence[Result]) -> list[Drawing]:
     """A scatter plot of ours against each peer, and pictures of designs (first seeds)."""
-    firsts = [group[0] for group in group_by(results, values_key("name", "network")).values()]
+    firsts = [group[0] for group in group_by(results, by_values("name", "network")).values()]
     return [
         Drawing(
             "scatter", "Ours against each peer, a point per cell", partial(_scatter, settings, results), (4.4, 4.2)
@@ -184,7 +184,7 @@ def charts(quick: bool, progress: Progress) -> Iterator[Chart]:
         results = []
         for cell in cells(settings, base):
             if quick:
-                cell = replace(cell, values=with_scene_changes(dict(cell.values), {"optimize": {"steps": QUICK_STEPS}}))
+                cell = replace(cell, values=with_changes(dict(cell.values), {"optimize": {"steps": QUICK_STEPS}}))
             with use_threads(1):
                 results.append(Result(cell, run(settings, base, cell), base))
             progress("cells", len(results), len(settings.seeds))

@@ -75,8 +75,8 @@ def ladder_chart(trials: list[PrinterTrial]) -> Chart:
         error="mean ΔE00 of unseen colors",
         series={"rungs": points},
         about=f"{len(trials)} printers, each chart photographed once under uneven light with noise and JPEG. Error: "
-        f"the mean over {HELD_OUT_COLORS} colors that the chart does not hold, against what the camera shows of the true "
-        "print under even light; intervals are over printers. Default: the rung that is chosen most often.",
+        f"the mean over {HELD_OUT_COLORS} colors that the chart does not hold, against what the camera shows of the "
+        "true print under even light; intervals are over printers. Default: the rung that is chosen most often.",
         checks=tuple(_checks(swatches, trials)),
         tables=(_choices(trials),),
     )
@@ -124,11 +124,11 @@ def try_printer(seed: int, swatches: int) -> PrinterTrial:
     usable = np.isfinite(light).all(1)
     sent, seen = np.array([s.srgb for s in manifest.chart])[usable], srgb_from_linear(light[usable])
     kinds = map_kinds(priors)
-    choice = choose(kinds, sent, seen)
+    choice = choose_map(kinds, sent, seen)
     truth, errors = camera_colors(printer, shot, draw_held_out_colors()), {}
     for kind in (kind for kind in kinds if kind.name not in choice.left_out):
-        predicted = relative_to_paper(kind.fit(*distinct(sent, seen)), draw_held_out_colors())
-        errors[kind.name] = float(difference(predicted, truth).mean())
+        predicted = relative_to_paper(kind.fit(*average_repeats(sent, seen)), draw_held_out_colors())
+        errors[kind.name] = float(color_difference(predicted, truth).mean())
     return PrinterTrial(driver, swatches, errors, choice.seconds, choice.chosen.name)
 
 

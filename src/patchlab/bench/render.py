@@ -37,7 +37,7 @@ def charts(quick: bool, progress: Progress) -> Iterator[Chart]:
 
 def resolution_chart(problem: Problem, trained: Tensor, views: int, rounds: int, progress: Progress) -> Chart:
     """Compare views rendered at several sides with full photographs, JPEG files, of the same conditions."""
-    shown = problem.patch.shown(trained)
+    shown = problem.patch.appearance(trained)
     conditions, (classifier,), (indices,) = problem.scene.draw("select", views), problem.classifiers, problem.indices
 
     def pictures(side: int, picture: PiecePicture, part: Conditions) -> Tensor:

@@ -93,7 +93,7 @@ def train_and_judge(
             ends = charted_ends(run, effort)
             numbers = [end // run.views for end in ends]
             designs = designs_after(problem.with_training(run.changed(steps=numbers[-1]), seed), numbers)
-            shown |= {(run, end, seed): problem.subject.shown(d) for end, d in zip(ends, designs, strict=True)}
+            shown |= {(run, end, seed): problem.subject.appearance(d) for end, d in zip(ends, designs, strict=True)}
             progress("training", seed * len(runs) + i + 1, effort.seeds * len(runs))
     answers = responses(problem, shown, problem.scene.draw("evaluate", effort.judged), problem.training_px)
     return {

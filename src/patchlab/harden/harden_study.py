@@ -24,7 +24,7 @@ from pydantic import Field
 from patchlab.harden.attacks import ATTACKS, is_correct
 from patchlab.harden.hardening import Epsilon, HardenMethod, center_squares, epsilon_text, harden, image_change
 from patchlab.harden.labeled_photos import list_labeled_files, read_large_enough, split_into_blocks
-from patchlab.study.estimates import cluster_estimate
+from patchlab.study.estimates import cluster_mean
 from patchlab.study.grid import Names, PositiveInt, short_name
 from patchlab.study.study import DEFAULT_WORK, Cell, FinishedStudy, Result, Study, Work, run_cells
 from patchproof.base.errors import Refused
@@ -133,7 +133,7 @@ def _judge(
     views, network = center_squares(pictures, classifier), classifier.network
     with torch.no_grad():
         outcomes = [is_correct(network(views), truth)]
-    _, *attacks = _conditions(settings).values()
+    _, *attacks = _attack_conditions(settings).values()
     return outcomes + [ATTACKS[attack](network, views, truth, epsilon) for attack, epsilon in attacks]
 
 
@@ -170,7 +170,7 @@ def _accuracy_rows(
     before, after = _outcomes_by_file(results, None, name), _outcomes_by_file(results, variant, name)
     if not (files := [file for file in after if file in before]):
         return []
-    conditions = _conditions(settings)
+    conditions = _attack_conditions(settings)
     pairs = {
         condition: [[some[file][i] for file in files] for some in (before, after)]
         for i, condition in enumerate(conditions.values())
@@ -186,7 +186,7 @@ def _accuracy_rows(
     return [
         (
             *(*start, words, rate(old), rate(new), estimate_difference(new, old)),
-            cluster_estimate([float(np.mean([new[i] - old[i] for i in rows])) for rows in classes if rows]),
+            cluster_mean([float(np.mean([new[i] - old[i] for i in rows])) for rows in classes if rows]),
             ", ".join(word for word, counts in survivors.items() if attack_failed(condition, counts)),
         )
         for (words, condition), (old, new) in zip(conditions.items(), pairs.values(), strict=True)
@@ -216,7 +216,7 @@ def _variants(settings: HardenSettings) -> list[dict[str, Any]]:
     ]
 
 
-def _conditions(settings: HardenSettings) -> dict[str, Condition]:
+def _attack_conditions(settings: HardenSettings) -> dict[str, Condition]:
     """Conditions by their names in tables: clean, then each attack with each ε."""
     attacks = [(attack, epsilon) for attack in settings.attacks for epsilon in settings.attack_epsilons]
     return {"clean": CLEAN, **{f"{attack} {epsilon:g}": (attack, epsilon) for attack, epsilon in attacks}}
@@ -239,7 +239,6 @@ def _label_indices(name: str, base: Path, labels: Sequence[str]) -> list[int]:
 
 
 def _photos_of(results: Sequence[Result], variant: Mapping[str, Any] | None) -> Iterator[Mapping[str, Any]]:
-    """Photographs of a variant, or the originals where it is None."""
     for result in results:
         if result.cell.values.get("variant") == variant:
             yield from result.answers["photos"]

@@ -19,14 +19,14 @@ from pydantic import Field
 
 from patchlab.paper.object_views import views_from_sides
 from patchlab.study.figures import picture_sheet
-from patchlab.study.grid import group_by, problem_of, short_name, values_key
+from patchlab.study.grid import by_values, group_by, problem_of, short_name
 from patchlab.study.record import Record
 from patchlab.study.study import Cell, Result, Study
 from patchlab.study.trained_designs import (
     NamePart,
     SceneVariant,
     TrainedSettings,
-    ask_and_draw,
+    test_and_draw,
     tested_networks,
     trained_cells,
     with_trainers,
@@ -62,13 +62,13 @@ def run(settings: DeceiveSettings, base: Path, cell: Cell) -> dict[str, Any]:
     things = pictures_with_controls(problem, design, CONTROLS)
     suffix, content = problem.subject.file(design)
     sheet = views_from_sides(problem, _SHEET_VIEWS), _SHEET_PX
-    return ask_and_draw(problem, cell.name, things, settings.n, sheet) | {f"{cell.name}.{suffix}": content}
+    return test_and_draw(problem, cell.name, things, settings.n, sheet) | {f"{cell.name}.{suffix}": content}
 
 
 def tables(settings: DeceiveSettings, results: Sequence[Result]) -> list[Table]:
     """Tables of rates, and of the design minus each control."""
     rates, differences = [], []
-    for design, of_design in group_by(results, values_key("name", "way", "row")).items():
+    for design, of_design in group_by(results, by_values("name", "way", "row")).items():
         records = {kind: Record(of_design, kind) for kind in _SHOWN_KINDS}
         for network in tested_networks(of_design):
             start = (*design, short_name(network))
@@ -83,7 +83,7 @@ def tables(settings: DeceiveSettings, results: Sequence[Result]) -> list[Table]:
             "The design minus each control",
             (*head, *(f"minus {kind}" for kind in CONTROLS)),
             tuple(differences),
-            f"Of rates, paired over {n}: below zero, the design hides the object better than the control.",
+            f"Of rates, paired over {n}: below zero hides the object better than what was not trained to.",
         ),
     ]
 
@@ -99,7 +99,7 @@ def figures(settings: DeceiveSettings, results: Sequence[Result]) -> list[Drawin
             "In even light; the first seed.",
             rows=_SHOWN_KINDS,
         )
-        for (scene, way, row), of_design in group_by(results, values_key("name", "way", "row")).items()
+        for (scene, way, row), of_design in group_by(results, by_values("name", "way", "row")).items()
     ]
 
 

@@ -48,7 +48,7 @@ def views_in_drawn_light(problem: Problem, lights: int) -> Conditions:
 
 
 def mean_color(problem: Problem, shown: Appearance, views: int, side_px: int) -> tuple[int, int, int]:
-    """sRGB codes of the mean light of the object's pixels without its outlines, over a full turn in even white light."""
+    """sRGB codes of the object's mean light, without its outlines, over a full turn in even white light."""
     turned = problem.see(shown, views_from(problem, np.arange(views) * 360 / views), side_px)
     with torch.no_grad():
         light = shade(turned, shown).permute(0, 2, 3, 1).reshape(-1, 3)

@@ -26,11 +26,11 @@ import numpy as np
 import torch
 
 from patchlab.paper.image_classes import ImageClass, PastedSettings, class_scene, list_classes
-from patchlab.study.estimates import cluster_estimate
+from patchlab.study.estimates import cluster_mean
 from patchlab.study.figures import picture_sheet
-from patchlab.study.grid import Names, PositiveInt, Seeds, group_by, make_cell, scene_values, short_name, values_key
+from patchlab.study.grid import Names, PositiveInt, Seeds, by_values, group_by, make_cell, scene_values, short_name
 from patchlab.study.pictures import contact_sheet, enlarge_design, photographs
-from patchlab.study.record import answers_record, parse_hits
+from patchlab.study.record import parse_hits, to_record
 from patchlab.study.study import Cell, Result, Study
 from patchproof.base.errors import Refused
 from patchproof.base.intervals import estimate_difference, rate
@@ -121,7 +121,6 @@ def pasted_by_kind(problem: Problem, design: np.ndarray) -> dict[str, Appearance
 
 
 def _with_scene(problem: Problem, scene: Scene) -> Problem:
-    """The problem with other images."""
     return replace(problem, scene=scene, stage=set_stage(scene))
 
 
@@ -136,7 +135,7 @@ def _ask_about_class(
         "name": classifier.labels[own[0]].partition(",")[0] + (" (renders)" if images_of.scene else ""),
         "images": len(scene.images),
         "same": bool(set(own) & set(target)),  # the target itself, or a class that its labels include
-        "hits": answers_record(responses(judged, shown, scene.draw("evaluate", n)))["hits"],
+        "hits": to_record(responses(judged, shown, scene.draw("evaluate", n)))["hits"],
     }
 
 
@@ -209,7 +208,7 @@ def _pooled(results: Sequence[Result]) -> Table:
         ("other classes called the target", others, TARGET_LABEL),
     ):
         controls = ([_rate_difference(some, which, control) for some in clusters if some] for control in KINDS[:3])
-        rows.append((name, *map(cluster_estimate, controls)))
+        rows.append((name, *map(cluster_mean, controls)))
     about = (
         "Mean differences of rates over targets and networks; the interval is a bootstrap over these clusters, each"
         " with all its seeds, images and other classes; n counts clusters, and fewer than 5 get none."
@@ -220,7 +219,7 @@ def _pooled(results: Sequence[Result]) -> Table:
 
 def figures(settings: Patch2dSettings, results: Sequence[Result]) -> list[Drawing]:
     """Pictures of the patches (first network and seed of each target)."""
-    firsts = [group[0] for group in group_by(results, values_key("target")).values()]
+    firsts = [group[0] for group in group_by(results, by_values("target")).values()]
     files = [(_target_answers(first)["name"], first.file(f"{first.cell.name}.png")) for first in firsts]
     return [
         picture_sheet(
@@ -234,8 +233,7 @@ def figures(settings: Patch2dSettings, results: Sequence[Result]) -> list[Drawin
 
 
 def _by_target(results: Sequence[Result]) -> dict[tuple, list[Result]]:
-    """Results by (target, network), with all seeds."""
-    return group_by(results, values_key("target", "network"))
+    return group_by(results, by_values("target", "network"))
 
 
 def _target_answers(result: Result) -> ClassAnswers:

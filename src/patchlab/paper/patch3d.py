@@ -27,21 +27,21 @@ from pydantic import Field
 
 from patchlab.harden.labeled_photos import write_labels
 from patchlab.paper.image_classes import write_renders
-from patchlab.study.estimates import cluster_estimate
+from patchlab.study.estimates import cluster_mean
 from patchlab.study.figures import picture_sheet
 from patchlab.study.grid import (
     GridSettings,
     PositiveInt,
     Seeds,
     by_scene,
+    by_values,
     cell_key,
     grid_cells,
     group_by,
     problem_of,
-    values_key,
 )
 from patchlab.study.pictures import contact_sheet, enlarge_design, photographs
-from patchlab.study.record import Record, answers_record, parse_hits
+from patchlab.study.record import Record, parse_hits, to_record
 from patchlab.study.study import Cell, Result, Study
 from patchproof.base.errors import Refused
 from patchproof.base.intervals import estimate_difference, rate
@@ -104,8 +104,8 @@ def run(settings: Patch3dSettings, base: Path, cell: Cell) -> dict[str, Any]:
     designs = {"3d": best_design(problem), "2d": best_design(twin)}
     conditions, in_images = (world.scene.draw("evaluate", settings.n) for world in (problem, twin))
     return {
-        **answers_record(responses(problem, appearances_by_kind(problem, designs), conditions)),
-        "in_images": answers_record(responses(twin, appearances_by_kind(twin, designs), in_images)),
+        **to_record(responses(problem, appearances_by_kind(problem, designs), conditions)),
+        "in_images": to_record(responses(twin, appearances_by_kind(twin, designs), in_images)),
         "azimuth_deg": conditions.pose.azimuth_deg.tolist(),
         "azimuth_range_deg": problem.scene.settings.view.azimuth_deg,
         "passes": {
@@ -189,12 +189,12 @@ def tables(settings: Patch3dSettings, results: Sequence[Result]) -> list[Table]:
 
 
 def _pooled(results: Sequence[Result]) -> Table:
-    groups = group_by(results, values_key("name", "network"))
+    groups = group_by(results, by_values("name", "network"))
     hard = {key: group for key, group in groups.items() if _mean_rate(group, "bare") <= MAX_MISREAD_RATE}
     rows = []
     for a, b in (("3d", "2d"), ("3d", "gray"), ("3d", "noise"), ("2d", "gray"), ("2d", "noise"), ("3d", "bare")):
         gains = [[_mean_rate(group, a) - _mean_rate(group, b) for group in some.values()] for some in (groups, hard)]
-        rows.append((f"{a} minus {b}", *map(cluster_estimate, gains)))
+        rows.append((f"{a} minus {b}", *map(cluster_mean, gains)))
     about = (
         "Differences of the rate on the same conditions. The interval is a bootstrap over clusters, a cluster being an"
         " object before a network with all its seeds; n counts clusters, and fewer than 5 get none."
@@ -204,7 +204,6 @@ def _pooled(results: Sequence[Result]) -> Table:
 
 
 def _by_object(results: Sequence[Result], pair: tuple[str, str], where: str | None) -> tuple[tuple, ...]:
-    """Rates by object, and the difference of a pair of kinds."""
     rows = []
     for name, group in by_scene(results).items():
         records = {kind: Record(group, kind, where) for kind in KINDS}

@@ -18,15 +18,15 @@ from pydantic import Field
 
 from patchlab.paper.object_views import mean_color, views_from_sides
 from patchlab.study.figures import picture_sheet
-from patchlab.study.grid import group_by, problem_of, short_name, values_key
+from patchlab.study.grid import by_values, group_by, problem_of, short_name
 from patchlab.study.record import Record
 from patchlab.study.study import Cell, Result, Study
 from patchlab.study.trained_designs import (
     NamePart,
     SceneVariant,
     TrainedSettings,
-    ask_and_draw,
     gain_word,
+    test_and_draw,
     tested_networks,
     trained_cells,
     with_trainers,
@@ -69,7 +69,7 @@ def run(settings: RobustSettings, base: Path, cell: Cell) -> dict[str, Any]:
     things = {kind: subject.appearance(each) for kind, each in zip(_KINDS, pixels, strict=True)}
     suffix, content = subject.file(design)
     return {
-        **ask_and_draw(problem, cell.name, things, settings.n, (views_from_sides(problem, _SHEET_VIEWS), _SHEET_PX)),
+        **test_and_draw(problem, cell.name, things, settings.n, (views_from_sides(problem, _SHEET_VIEWS), _SHEET_PX)),
         "color": mean_color(problem, things["design"], _TURN_VIEWS, _SHEET_PX),
         f"{cell.name}.{suffix}": content,
     }
@@ -80,7 +80,7 @@ _HEAD = ("scene", "way", "class", "trained on")
 
 
 def _by_design(results: Sequence[Result]) -> Mapping[DesignKey, Sequence[Result]]:
-    return group_by(results, values_key("name", "way", "class", "row"))
+    return group_by(results, by_values("name", "way", "class", "row"))
 
 
 def tables(settings: RobustSettings, results: Sequence[Result]) -> list[Table]:
@@ -105,7 +105,6 @@ def tables(settings: RobustSettings, results: Sequence[Result]) -> list[Table]:
 
 
 def _mean_codes(results: Sequence[Result]) -> tuple[int, int, int]:
-    """sRGB codes of the mean over designs, taken in linear light."""
     light = linear_from_srgb(np.array([result.answers["color"] for result in results]) / 255).mean(0)
     red, green, blue = (int(code) for code in np.rint(srgb_from_linear(light) * 255))
     return red, green, blue

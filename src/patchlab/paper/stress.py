@@ -106,7 +106,6 @@ def run(settings: StressSettings, base: Path, cell: Cell) -> dict[str, Any]:
 
 
 def _photographs(problem: Problem, conditions: Conditions) -> Tensor:
-    """Photographs of the clean object."""
     return photographs(problem, None, conditions, problem.figure_px)
 
 
@@ -166,13 +165,12 @@ PixelBox = tuple[int, int, int, int]  # first column and row, and those after th
 def _ask_under(
     problem: Problem, conditions: Conditions, boxes: Sequence[PixelBox | None]
 ) -> dict[PixelBox | None, Responses]:
-    """Responses to the clean object under each black box."""
     parts = []
     for part in in_chunks(conditions):
         pictures = _photographs(problem, part)
         around = problem.boxes(part)
-        parts.append({box: ask(problem, _blacken(pictures, box), around) for box in boxes})
-    return joined(parts)
+        parts.append({box: ask_networks(problem, _blacken(pictures, box), around) for box in boxes})
+    return merge_responses(parts)
 
 
 def _blacken(pictures: Tensor, box: PixelBox | None) -> Tensor:
@@ -210,7 +208,6 @@ def find_worst_case(
 
 
 def _varied_fields(drawn: Conditions, names: Sequence[str]) -> list[str]:
-    """Scalar fields that vary."""
     fields = fields_of(drawn)
     return [name for name in names if fields[name].ndim == 1 and np.ptp(fields[name]) > 0]
 

@@ -25,16 +25,16 @@ from pydantic import Field, model_validator
 from patchlab.paper.object_views import views_from_sides, views_in_drawn_light
 from patchlab.study.estimates import mean
 from patchlab.study.figures import number_grid, picture_sheet
-from patchlab.study.grid import Names, PositiveInt, group_by, problem_of, short_name, values_key
-from patchlab.study.record import Record, answers_record
+from patchlab.study.grid import Names, PositiveInt, by_values, group_by, problem_of, short_name
+from patchlab.study.record import Record, to_record
 from patchlab.study.study import Cell, Result, Study
 from patchlab.study.trained_designs import (
     ORIGINAL,
     NamePart,
     TrainedSettings,
-    ask_and_draw,
     gain_word,
     single_network_rows,
+    test_and_draw,
     tested_networks,
     trained_cells,
     with_trainers,
@@ -100,10 +100,10 @@ def run(settings: TransferSettings, base: Path, cell: Cell) -> dict[str, Any]:
         things = pictures_with_controls(problem, design, ())
         suffix, content = problem.subject.file(design)
         answers[f"{cell.name}.{suffix}"] = content
-    answers |= ask_and_draw(problem, cell.name, things, settings.n, (views_from_sides(problem, 3), _SHEET_PX))
+    answers |= test_and_draw(problem, cell.name, things, settings.n, (views_from_sides(problem, 3), _SHEET_PX))
     if problem.scene.HAS_OBJECT:
         fixed = views_in_drawn_light(problem, settings.lights)
-        answers["views"] = answers_record(responses(problem, things, fixed))
+        answers["views"] = to_record(responses(problem, things, fixed))
         answers["azimuths"] = fixed.pose.azimuth_deg[:: settings.lights].tolist()
     return answers
 
@@ -119,7 +119,7 @@ ResultsByRow = Mapping[tuple, Mapping[str, Sequence[Result]]]  # results by (sce
 
 
 def _rows(results: Sequence[Result]) -> ResultsByRow:
-    groups = group_by(results, values_key("name", "way"))
+    groups = group_by(results, by_values("name", "way"))
     return {key: group_by(group, lambda result: result.cell.values["row"]) for key, group in groups.items()}
 
 
@@ -147,7 +147,6 @@ def _matrix(settings: TransferSettings, groups: ResultsByRow) -> Table:
 
 
 def _object_tables(settings: TransferSettings, results: Sequence[Result]) -> list[Table]:
-    """Mean gains over objects and seeds, by network and, if there are families, by family."""
 
     def family_of_row(result: Result) -> str:
         trained = result.cell.values["trained"]
@@ -166,7 +165,7 @@ def _gain_table(
     results: Sequence[Result], name: str, title: str, trainer: Callable[[Result], str], tester: Callable[[str], str]
 ) -> Table:
     """A table of gains from one figure per object and seed, the mean over rows and networks of one name."""
-    group_of = values_key("way", "name", "seed")
+    group_of = by_values("way", "name", "seed")
     originals = {
         group_of(result): Record([result], "design") for result in results if not result.cell.values["trained"]
     }
@@ -209,7 +208,6 @@ def _left_out_tables(settings: TransferSettings, results: Sequence[Result], grou
 
 
 def _rate_from_others(settings: TransferSettings, by_row: Mapping[str, Sequence[Result]], network: str) -> float | None:
-    """The mean rate on a network of designs trained on a single network of another family."""
     family = settings.family_of(network)
     rates = [
         np.mean(Record(results, "design").hits(network))

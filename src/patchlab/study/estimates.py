@@ -43,10 +43,8 @@ def paired_means(values: np.ndarray) -> list[Estimate]:
     return [Estimate(float(m), float(m - h), float(m + h), seeds) for m, h in zip(values.mean(0), half, strict=True)]
 
 
-def cluster_estimate(values: Sequence[float]) -> Estimate | float | None:
-    """The mean of one figure per cluster, for a table: a plain number if there are too few clusters for an interval,
-    None if there is no cluster.
-    """
+def cluster_mean(values: Sequence[float]) -> Estimate | float | None:
+    """The mean of one figure per cluster; a plain number if clusters are too few for an interval, None if none."""
     if len(values) < MIN_CLUSTERS:
         return statistics.fmean(values) if values else None
     value, (low, high) = clustered_mean(values)

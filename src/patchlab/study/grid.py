@@ -60,7 +60,7 @@ def scene_values(file: str, base: Path, tables: SceneChanges | None = None, wher
     return {"name": short_name(file), "file": file, "scene": scene}
 
 
-def with_scene_changes(values: CellValues, tables: SceneChanges) -> CellValues:
+def with_changes(values: CellValues, tables: SceneChanges) -> CellValues:
     """Cell values with keys of some of the scene's tables changed."""
     return values | {"scene": _changed_settings(values["scene"], tables, values["file"])}
 
@@ -118,7 +118,7 @@ def group_by(results: Iterable[Result], key: Callable[[Result], Key]) -> dict[Ke
     return groups
 
 
-def values_key(*names: str) -> Callable[[Result], tuple]:
+def by_values(*names: str) -> Callable[[Result], tuple]:
     """A function that returns these values of a result's cell, to group by."""
     return lambda result: tuple(result.cell.values[name] for name in names)
 
@@ -128,7 +128,7 @@ def by_scene(results: Sequence[Result]) -> dict[str, list[Result]]:
     return group_by(results, lambda result: result.cell.values["name"])
 
 
-cell_key = values_key("name", "network", "seed")  # (scene, network, seed), the first columns of many tables
+cell_key = by_values("name", "network", "seed")  # (scene, network, seed), the first columns of many tables
 
 
 def _changed_settings(data: Mapping[str, Any], tables: SceneChanges, where: str) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from patchproof.evidence.results import Geometry
 from patchproof.optimizer.responses import Responses
 
 
-def answers_record(answers: Mapping[str, Responses]) -> dict[str, Any]:
+def to_record(answers: Mapping[str, Responses]) -> dict[str, Any]:
     """Hits and confidences as JSON values, each per shown thing and network."""
     return {
         "hits": {thing: [hits_text(row) for row in answer.recognized] for thing, answer in answers.items()},
@@ -55,9 +55,7 @@ def hardest_control(result: Result, controls: Sequence[str]) -> str:
 
 
 def corner_error_mm(geometry: Geometry, corners_mm: np.ndarray, true_px: np.ndarray) -> float | None:
-    """The largest error in mm on paper of measured corners N×2, whose true pixels are `true_px`; None without a
-    homography of the photograph.
-    """
+    """The largest error in mm of corners N×2 whose true pixels are `true_px`; None without a homography."""
     if geometry.homography_px_from_mm is None:
         return None
     seen_mm = apply_homography(np.linalg.inv(np.array(geometry.homography_px_from_mm)), true_px)

@@ -130,9 +130,7 @@ def module_summary(module: str) -> str:
 
 @dataclass(frozen=True)
 class Work:
-    """How a study is run: what may be in its folder already, and who computes (see `open_workers`); `on_cell` is called
-    with (done, all).
-    """
+    """How a study is run: folder, and workers (see `open_workers`); `on_cell` is called with (done, all)."""
 
     resume: bool = False
     overwrite: bool = False
@@ -229,7 +227,6 @@ def _prepare_folder(study: Study, settings: StrictModel, out: Path, resume: bool
 
 
 def _first_difference(stored: dict[str, Any] | None, dumped: dict[str, Any]) -> str:
-    """The first key whose value is not the stored one, with both values."""
     before = stored or {}
     key = next(key for key in {**dumped, **before} if before.get(key) != dumped.get(key))
     return f"{key} = {json.dumps(dumped.get(key))[:80]} in place of {json.dumps(before.get(key))[:80]}"

@@ -13,17 +13,9 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
-from patchlab.study.grid import (
-    GridSettings,
-    Names,
-    SceneChanges,
-    make_cell,
-    scene_values,
-    short_name,
-    with_scene_changes,
-)
+from patchlab.study.grid import GridSettings, Names, SceneChanges, make_cell, scene_values, short_name, with_changes
 from patchlab.study.pictures import contact_sheet, photographs
-from patchlab.study.record import answers_record
+from patchlab.study.record import to_record
 from patchlab.study.study import Cell, Result
 from patchproof.base.intervals import Estimate
 from patchproof.optimizer.problem import Problem
@@ -61,7 +53,7 @@ def trained_cells(
     """
     networks, cells = settings.networks, []
     for file, (way, changed), (tables, more) in product(settings.scenes, settings.ways.items(), variants):
-        values = with_scene_changes(scene_values(file, base, changed, f", way {way}"), tables)
+        values = with_changes(scene_values(file, base, changed, f", way {way}"), tables)
         for (row, trained), seed in product(rows(networks).items(), settings.seeds):
             row_values, words = {"way": way, **more, "row": row}, (way, *(text[:24] for text in more.values()), row)
             networks_of_cell = {"trained": list(trained), "networks": list(networks), "of_scene": False}
@@ -71,14 +63,14 @@ def trained_cells(
 
 def with_trainers(problem: Problem, cell: Cell) -> Problem:
     """The problem with the cell's training networks only."""
-    return problem.before([cell.values["networks"].index(name) for name in cell.values["trained"]])
+    return problem.with_classifiers([cell.values["networks"].index(name) for name in cell.values["trained"]])
 
 
-def ask_and_draw(
+def test_and_draw(
     problem: Problem, name: str, things: Mapping[str, Appearance], n: int, sheet: tuple[Conditions, int]
 ) -> dict[str, Any]:
-    """Record all networks' answers to `things` under n unseen conditions, and draw a contact sheet (views, side in px)."""
-    answers = answers_record(responses(problem, things, problem.scene.draw("evaluate", n)))
+    """Record all networks' answers to `things` in n unseen conditions; draw a contact sheet (views, side in px)."""
+    answers = to_record(responses(problem, things, problem.scene.draw("evaluate", n)))
     return answers | {
         f"{name}.sheet.png": contact_sheet([photographs(problem, each, *sheet) for each in things.values()])
     }

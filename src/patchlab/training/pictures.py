@@ -77,14 +77,11 @@ def shrink_pictures(pictures: Pictures, size_px: int) -> Pictures:
 
 
 def _render_shape(name: str, seed: int, rng: np.random.Generator, size_px: int) -> tuple[Tensor, Tensor]:
-    """Render VIEWS_PER_SHAPE pictures and boxes of one shape with one set of materials."""
     return render_mesh(randomize_materials(primitives.build(name, seed), rng), VIEWS_PER_SHAPE, rng, size_px)
 
 
 def render_mesh(mesh: Mesh, count: int, rng: np.random.Generator, size_px: int) -> tuple[Tensor, Tensor]:
-    """Render `count` pictures uint8 and boxes of a mesh scaled to LENGTH_MM; half of them, rounded down, directly at
-    `size_px`.
-    """
+    """Render `count` uint8 pictures and boxes of a mesh scaled to LENGTH_MM; half of them directly at `size_px`."""
     scale = LENGTH_MM / np.ptp(mesh.vertices, axis=0).max()
     mesh = dataclasses.replace(mesh, vertices=mesh.vertices * scale)
     backgrounds = Backgrounds(tuple(patterns.background(rng) for _ in range(count)))

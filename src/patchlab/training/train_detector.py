@@ -54,9 +54,7 @@ def train(pictures: Pictures, recipe: DetectorRecipe) -> fit.Epochs:
 def with_mosaics(
     images: Tensor, labels: Tensor, boxes: Tensor, share: float, rng: np.random.Generator
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Replace a share of the pictures by mosaics of four at half their size; labels become N×4 (-1: none) and boxes
-    N×4×4.
-    """
+    """Replace a share of pictures by mosaics of four at half size; labels become N×4 (-1: none), boxes N×4×4."""
     n = len(images)
     all_labels = torch.cat([labels[:, None], labels.new_full((n, 3), -1)], 1)
     all_boxes = torch.cat([boxes[:, None], boxes.new_zeros(n, 3, 4)], 1)

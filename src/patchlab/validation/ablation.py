@@ -25,8 +25,8 @@ import numpy as np
 from pydantic import Field
 
 from patchlab.study.estimates import mean
-from patchlab.study.grid import CellValues, GridSettings, Names, cell_key, grid_cells, group_by, problem_of, values_key
-from patchlab.study.record import answers_record, parse_hits
+from patchlab.study.grid import CellValues, GridSettings, Names, by_values, cell_key, grid_cells, group_by, problem_of
+from patchlab.study.record import parse_hits, to_record
 from patchlab.study.study import Cell, Result, Study
 from patchproof.app.plan.terms import PRINTER, Setup, effect_terms, scene_terms
 from patchproof.base.errors import Refused
@@ -59,8 +59,8 @@ def _default_effects() -> tuple[str, ...]:
     """All effects that `plan` can switch off, in its order, grouped."""
     printed = (PRINTER, *(term.name for term in effect_terms("printer")))
     names = (*(term.name for term in effect_terms("light")), *printed, *(term.name for term in effect_terms("camera")))
-    joined = {name: group for group in _EFFECT_GROUPS for name in group.split(" + ")}
-    return tuple(dict.fromkeys(joined.get(name, name) for name in names if name != _INVISIBLE_EFFECT))
+    group_of = {name: group for group in _EFFECT_GROUPS for name in group.split(" + ")}
+    return tuple(dict.fromkeys(group_of.get(name, name) for name in names if name != _INVISIBLE_EFFECT))
 
 
 EFFECTS = _default_effects()
@@ -81,17 +81,17 @@ class SimplifiedProblem(Problem):
 
     changes: tuple[Callable[[Setup], Setup | None], ...] = ()
 
-    def see(self, shown: Appearance, conditions: Conditions, side_px: int) -> Views:
+    def see(self, appearance: Appearance, conditions: Conditions, side_px: int) -> Views:
         """Render views with the simpler model."""
-        setup = self._simpler(shown, conditions)
-        return Problem.see(replace(self, stage=setup.stage), shown, setup.conditions, side_px)
+        setup = self._simpler(appearance, conditions)
+        return Problem.see(replace(self, stage=setup.stage), appearance, setup.conditions, side_px)
 
     def see_again(self, views: Views, conditions: Conditions) -> Views:
         """Relight views as `Problem` does, without the effects left out."""
-        return relight_and_replace_background(views, self._simpler(self.laid_out, conditions).conditions)
+        return relight_and_replace_background(views, self._simpler(self.start_appearance, conditions).conditions)
 
-    def _simpler(self, shown: Appearance, conditions: Conditions) -> Setup:
-        setup = Setup(self.stage, shown, conditions)
+    def _simpler(self, appearance: Appearance, conditions: Conditions) -> Setup:
+        setup = Setup(self.stage, appearance, conditions)
         for change in self.changes:
             setup = change(setup) or setup
         return setup
@@ -104,7 +104,7 @@ def simplify_problem(problem: Problem, effect: str) -> Problem:
     unknown = [name for name in names if name not in terms]
     if unknown:
         raise Refused("an effect that this kind of scene has", f'"{unknown[0]}"', "choose one of " + ", ".join(terms))
-    setup = Setup(problem.stage, problem.subject.shown(problem.subject.start()), problem.scene.draw("select", 64))
+    setup = Setup(problem.stage, problem.subject.appearance(problem.subject.start()), problem.scene.draw("select", 64))
     on = [name for name in names if terms[name].change(setup) is not None]
     if not on:
         raise Refused(
@@ -148,16 +148,16 @@ def run(settings: AblationSettings, base: Path, cell: Cell) -> dict[str, Any]:
     conditions = problem.scene.draw("evaluate", settings.n, per_session=VIEWS_PER_SESSION)
     answers = {"modeled": responses(problem, {"design": shown}, conditions)}
     if effect != ALL_EFFECTS:
-        as_trained = simpler.subject.shown(from_pixels(design, problem.device))
+        as_trained = simpler.subject.appearance(from_pixels(design, problem.device))
         answers["promised"] = responses(simpler, {"design": as_trained}, conditions)
     if settings.photos:
         drawn = problem.scene.draw("reprint", settings.photos)
         piece = shown if isinstance(shown, PiecePicture) else None
         alone = [drawn[i : i + 1] for i in range(len(drawn))]
         photos = (photograph_traced(problem.stage, piece, each) for each in alone)
-        asked = (ask(problem, photo, problem.boxes(each)) for photo, each in zip(photos, alone, strict=True))
-        answers["path_traced"] = joined([{"design": answer} for answer in asked])
-    return {world: answers_record(some) for world, some in answers.items()}
+        asked = (ask_networks(problem, photo, problem.boxes(each)) for photo, each in zip(photos, alone, strict=True))
+        answers["path_traced"] = merge_responses([{"design": answer} for answer in asked])
+    return {world: to_record(some) for world, some in answers.items()}
 
 
 def tables(settings: AblationSettings, results: Sequence[Result]) -> tuple[Table, ...]:
@@ -197,12 +197,13 @@ def _design_row(result: Result) -> tuple:
 def _promised_rate(result: Result) -> Estimate:
     """The rate in the world without the effect, with a promise's interval over sessions."""
     hits = parse_hits(result.answers["promised"]["hits"]["design"][0])
-    return Estimate(float(np.mean(hits)), *rate_posterior(*count_by_session(hits, VIEWS_PER_SESSION)).rate, len(hits))
+    posterior = rate_posterior(*count_by_session(hits, VIEWS_PER_SESSION))
+    return Estimate(float(np.mean(hits)), *posterior.rate_interval, len(hits))
 
 
 def _promise_errors(results: Sequence[Result]) -> tuple:
     """(designs, rate, confidence, largest change of rate, mean half width of promises, number outside)."""
-    of_pairs = group_by(results, values_key("name", "network")).values()
+    of_pairs = group_by(results, by_values("name", "network")).values()
     rate, confidence = (
         mean([float(np.mean([_promise_error(result, kind) for result in pair])) for pair in of_pairs])
         for kind in ("hits", "confidence")
@@ -215,18 +216,15 @@ def _promise_errors(results: Sequence[Result]) -> tuple:
 
 
 def _promise_error(result: Result, kind: str) -> float:
-    """A design's rate or confidence in the full world minus that in the world without the effect."""
     return _mean_of(result, "modeled", kind) - _mean_of(result, "promised", kind)
 
 
 def _mean_of(result: Result, world: str, kind: str) -> float:
-    """The rate ("hits") or mean confidence of a design in one of the worlds."""
     values = result.answers[world][kind]["design"][0]
     return float(np.mean(parse_hits(values) if kind == "hits" else values))
 
 
 def _group_by_effect(results: Sequence[Result]) -> list[dict[str, Result]]:
-    """Results by effect, a dict for each scene, network and seed."""
     groups = group_by(results, cell_key).values()
     return [{result.cell.values["effect"]: result for result in group} for group in groups]
 

@@ -174,7 +174,6 @@ def _cubic(at: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def _blur_share(share: np.ndarray, blur_px: float) -> np.ndarray:
-    """Blur a share H×W as the channel does."""
     return gaussian_blur(_tensor(share[..., None]), torch.tensor([blur_px]))[0, 0].numpy()
 
 
@@ -225,7 +224,6 @@ def _across(picture: np.ndarray, start: np.ndarray, end: np.ndarray, reach: floa
 
 
 def _crossing(places: np.ndarray, profile: np.ndarray, level: float) -> float:
-    """The position where a profile first rises through a level."""
     after = int(np.argmax(profile >= level))
     if after == 0:
         return float(places[0])

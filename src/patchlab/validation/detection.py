@@ -133,7 +133,6 @@ def _photograph_sheet(sheet: MountedSheet, conditions: Conditions, truth, rng, h
 
 @lru_cache(maxsize=1)
 def _mounted_sheet(scene_path: str, seed: int) -> tuple[MountedSheet, PatchScene]:
-    """The scene's sheet with a design of noise, mounted in the scene."""
     scene = require_patch(load_scene(scene_path, seed), "a scene of an object with a flat patch")
     if not scene.is_flat:
         raise Refused("a scene of an object with a flat patch", "a bent patch", "leave bend out")

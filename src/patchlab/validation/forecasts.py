@@ -106,7 +106,7 @@ def _forecast_row(group: Sequence[Result]) -> tuple:
                 continue
             chances_here, answers = zip(*session["forecast"], strict=True)
             forecast, n = forecast_of(chances_here, answers, level), len(answers)
-            low, high = posterior.counts((n,))
+            low, high = posterior.count_interval((n,))
             held.append(forecast.interval[0] <= forecast.recognized <= forecast.interval[1])
             held_promise.append(low <= forecast.recognized <= high)
             widths.append(np.ptp(forecast.interval) / n)

@@ -26,9 +26,9 @@ from patchlab.study.grid import (
     group_by,
     network_names,
     scene_of,
-    with_scene_changes,
+    with_changes,
 )
-from patchlab.study.record import Record, answers_record, corner_error_mm, gain_of, hardest_control
+from patchlab.study.record import Record, corner_error_mm, gain_of, hardest_control, to_record
 from patchlab.study.study import Cell, Result, Study
 from patchlab.validation.mounted_sheets import mount_content
 from patchproof.base.geometry import apply_homography, rect_corners
@@ -123,9 +123,7 @@ def cells(settings: LayoutsSettings, base: Path) -> list[Cell]:
     return grid_cells(
         settings,
         base,
-        lambda values: (
-            (with_scene_changes(values, scene) | {"layout": a, "how": how}, (a,)) for a, scene, how in ways
-        ),
+        lambda values: ((with_changes(values, scene) | {"layout": a, "how": how}, (a,)) for a, scene, how in ways),
     )
 
 
@@ -139,7 +137,7 @@ def run(settings: LayoutsSettings, base: Path, cell: Cell) -> dict[str, Any]:
     shown = pictures_with_controls(problem, design, CONTROLS)
     answers = responses(problem, shown, scene.draw("evaluate", settings.n))
     return (
-        answers_record(answers)
+        to_record(answers)
         | {"free": _free_share(scene.piece)}
         | _photograph_and_measure(problem, scene, design, settings.photos)
     )
@@ -154,7 +152,6 @@ def _build_cell_problem(base: Path, cell: Cell) -> Problem:
 
 
 def _free_share(piece: Piece) -> float:
-    """The share of the piece that is free for the design."""
     scale = 4  # samples per millimeter
     mask = np.ones([int(side * scale) for side in piece.size_mm], bool)
     for x, y, w, h in piece.reserved_mm:
@@ -185,7 +182,6 @@ def _photograph_and_measure(problem: Problem, scene: PatchScene, design: np.ndar
 
 
 def _gain_over_controls(result: Result) -> float:
-    """The design's rate minus that of its best control."""
     return gain_of(result, "design", hardest_control(result, CONTROLS))
 
 
@@ -240,7 +236,6 @@ def _layout_figures(group: Sequence[Result], first: dict) -> tuple:
 
 
 def _mean_or_single(values: Sequence[float]) -> Estimate | float | None:
-    """The mean with its interval, or a single value as it is."""
     return values[0] if len(values) == 1 else mean(values)
 
 

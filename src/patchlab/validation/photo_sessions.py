@@ -23,7 +23,7 @@ from patchlab.study.grid import (
     network_names,
     scene_of,
     short_name,
-    with_scene_changes,
+    with_changes,
 )
 from patchlab.study.record import hits_text, parse_hits
 from patchlab.study.study import Cell, Result
@@ -53,7 +53,7 @@ def cells(settings: SessionsSettings, base: Path) -> list[Cell]:
         settings,
         base,
         lambda values: (
-            (with_scene_changes(values, {"target": {"models": values["networks"]}, **table}), (printer,))
+            (with_changes(values, {"target": {"models": values["networks"]}, **table}), (printer,))
             for printer, table in profiles.items()
         ),
     )
@@ -79,7 +79,7 @@ def make_run_and_sheet(base: Path, cell: Cell, folder: Path) -> Run:
 
 
 def take_photos(settings: SessionsSettings, cell: Cell, made: Run, folder: Path, control: str | None = None) -> Path:
-    """Photograph folder/sheet.pdf, or a control in its place under the same conditions; returns the folder of sessions."""
+    """Photograph folder/sheet.pdf, or a control under the same conditions; returns the folder of sessions."""
     from patchproof.reprints.mounted_sheet import ReprintSetup
     from patchproof.reprints.reprint import reprint
 

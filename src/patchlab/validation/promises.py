@@ -90,7 +90,6 @@ def run(settings: PromisesSettings, base: Path, cell: Cell) -> dict[str, Any]:
 
 
 def _measure_views(settings: PromisesSettings, made: Run) -> dict[str, Any]:
-    """Hits of the design in our renderer's views, in sessions and elsewhere."""
     if not settings.rendered and not settings.elsewhere:
         return {}
     problem, scene, answers = set_problem(made.scene), made.scene, {}
@@ -134,7 +133,9 @@ class JudgedSession:
 
     def interval(self, independent: bool = False) -> tuple[int, int]:
         """The promise's interval of counts, optionally as if photographs were independent."""
-        return self.independent.counts((1,) * self.judged) if independent else self.posterior.counts((self.judged,))
+        if independent:
+            return self.independent.count_interval((1,) * self.judged)
+        return self.posterior.count_interval((self.judged,))
 
     def held(self, independent: bool = False) -> bool:
         """True if the count lies in that interval."""
@@ -150,7 +151,6 @@ def count_sessions(result: Result, sessions: str = "sessions") -> list[JudgedSes
 
 
 def _median_width(sessions: Sequence[JudgedSession], independent: bool = False) -> float:
-    """The intervals' median width, as a share of the photographs."""
     return float(np.median([np.ptp(session.interval(independent)) / session.judged for session in sessions]))
 
 
@@ -208,7 +208,7 @@ def _session_table(results: Sequence[Result]) -> Table:
 def _elsewhere_table(settings: PromisesSettings, results: Sequence[Result]) -> Table:
     rows = []
     for result in results:
-        values, (low, high) = result.cell.values, promise_posterior(result).rate
+        values, (low, high) = result.cell.values, promise_posterior(result).rate_interval
         shown, promised = rate(parse_hits(result.answers["elsewhere"])), parse_hits(result.answers["promised"])
         within = shown is not None and low <= shown.value <= high
         about = (values["name"], values["network"], values["seed"])

@@ -162,7 +162,6 @@ def _compare_pictures(srgb: np.ndarray, pasted: np.ndarray, fit: BoardFit) -> by
 
 
 def _panel(picture: np.ndarray) -> np.ndarray:
-    """A picture resized to fit the middle of a white panel."""
     panel = np.full((_PANEL_PX[1], _PANEL_PX[0], 3), 255, np.uint8)
     scale = min((_PANEL_PX[0] - 8) / picture.shape[1], _PANEL_PX[1] / picture.shape[0])
     size = round(picture.shape[1] * scale), round(picture.shape[0] * scale)

@@ -92,7 +92,6 @@ def _draw_promise(settings: VerdictsSettings, correlation: float, rng: np.random
 
 
 def _chances(settings: VerdictsSettings, result: Result, sessions: int, rate: float) -> np.ndarray:
-    """The chance of each verdict in `_VERDICTS` at a true rate."""
     posterior = RatePosterior(np.array([rate]), np.array([result.cell.values["correlation"]]), np.ones(1))
     return posterior.chances(split_evenly(settings.photos, sessions)) @ np.array(result.answers[str(sessions)])
 

@@ -49,7 +49,7 @@ def measured(path: str) -> list[dict]:
 
     def told(way):
         Classifier._asked = way
-        return time_call(lambda: responses(problem, shown, conditions, beside=beside))
+        return time_call(lambda: responses(problem, shown, conditions, control_mask=control_mask))
 
     rounds, rows = call_in_turn({way: partial(told, way) for way in (asked, rounded)}, ROUNDS), []
     Classifier._asked, (wholes, halves) = asked, rounds.values()

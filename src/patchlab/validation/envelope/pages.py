@@ -32,8 +32,8 @@ STAGES = {"gains": "design gains", "found": "sheet found", "measured": "measured
 _COLORS = {"gains": "#2a6f97", "found": "#e09f3e", "measured": "#2a9d6f"}
 _RATE_HEADINGS = ("recognized", *CONTROLS, "gain", "effect", "sheet found", "measured")
 EndValues = BreakValues = Mapping[str, Any]  # a cell's axis with both ends; a stage's `Break` in its answers
-HOLDS_WORD, NEVER_WORD, EFFECT_WORD, NO_EFFECT_WORD = "holds", "never worked", "gains", "no effect"
-_CONTROL_TEXT = "the better of the bare object and a gray piece in the same markers, on the same conditions"
+HOLDS, NEVER, EFFECT, NO_EFFECT = "holds", "never worked", "gains", "no effect"
+_CONTROL = "the better of the bare object and a gray piece in the same markers, on the same conditions"
 _PAGE_IN = (11.69, 8.27)  # A4, landscape
 
 
@@ -45,13 +45,13 @@ def tables(settings: Any, results: Sequence[Result]) -> Sequence[Table]:
         Table(
             "breaks",
             "Breaking points",
-            (*ends, *STAGES.values(), "not monotone", f"{NO_EFFECT_WORD} at"),
+            (*ends, *STAGES.values(), "not monotone", f"{NO_EFFECT} at"),
             tuple(_break_row(result) for result in sweeps),
-            f"The design gains up to where it does no more than {_CONTROL_TEXT}: the last point at which the 95 % interval "
+            f"The design gains up to where it does no more than {_CONTROL}: the last point at which the 95 % interval "
             "of the difference lies above 0, and the first at which it does not. For the sheet, where a fitted falling "
             "curve has lost half of what it loses over the sweep: median of the bootstrap over conditions, 95 % "
-            f"interval; “{HOLDS_WORD}”: it loses less than {MIN_LOST_SHARE:.0%} of its rate. n conditions: {settings.n} shown "
-            f"to the network (a quarter where JPEG is varied), {settings.photos} photographed.",
+            f"interval; “{HOLDS}”: it loses less than {MIN_LOST_SHARE:.0%} of its rate. n conditions: {settings.n} "
+            f"shown to the network (a quarter where JPEG is varied), {settings.photos} photographed.",
         ),
         Table(
             "beyond",
@@ -65,7 +65,7 @@ def tables(settings: Any, results: Sequence[Result]) -> Sequence[Table]:
             "All points",
             ("axis", "value", *_RATE_HEADINGS, "median error mm", "largest error mm", "said"),
             tuple(row for result in sweeps for row in _point_rows(result)),
-            f"Gain: over {_CONTROL_TEXT} (Newcombe). “{NO_EFFECT_WORD}”: none is shown. Errors are the largest of the design's "
+            f"Gain: over {_CONTROL} (Newcombe). “{NO_EFFECT}”: none is shown. Errors are the largest of the design's "
             "four corners, against the simulation's truth, where a flat sheet was measured. Intervals: Wilson.",
         ),
         Table(
@@ -87,7 +87,7 @@ def figures(settings: Any, results: Sequence[Result]) -> Sequence[Drawing]:
         "Operating envelope",
         lambda figure: _draw_page(figure, sweeps, maps),
         _PAGE_IN,
-        f"The design gains where it does better than {_CONTROL_TEXT} (95 %); beyond, it has no effect, whatever the "
+        f"The design gains where it does better than {_CONTROL} (95 %); beyond, it has no effect, whatever the "
         "network answers. Beside its bar: the last point with a gain and the first without, in brackets the gains "
         "at both ends. Bars of the sheet run to where half of what the sweep takes is lost; whiskers: 95 % intervals; "
         "→: it holds; !: not monotone; in brackets the fitted rates at both ends.",
@@ -129,9 +129,9 @@ def _is_not_monotone(break_: BreakValues) -> bool:
 
 def _break_value(x: EndValues, break_: BreakValues, n: int) -> Value:
     if break_["value"] is None:
-        return NEVER_WORD
+        return NEVER
     if break_["value"] >= BEYOND_SWEEP:
-        return HOLDS_WORD
+        return HOLDS
     ends = [_axis_value(x, break_[name]) for name in ("low", "high")]
     return Estimate(_axis_value(x, break_["value"]), min(ends), max(ends), n)
 
@@ -171,14 +171,13 @@ def _map_rows(result: Result) -> list[tuple[Value, ...]]:
 
 
 def _rates(answers: Mapping[str, Any]) -> list[tuple[Value, ...]]:
-    """Per point the values under `_RATE_HEADINGS`."""
     shown = [answers["recognized"], *(answers["controls"][kind] for kind in CONTROLS)]
     sheet = found_and_measured(answers).values()
     return [
         (
             *(rate(hits[i]) for hits in shown),
             gain,
-            EFFECT_WORD if has_effect(gain) else NO_EFFECT_WORD,
+            EFFECT if has_effect(gain) else NO_EFFECT,
             *(rate(hits[i].tolist()) for hits in sheet),
         )
         for i, gain in enumerate(gains_in(answers))
@@ -201,7 +200,7 @@ def _draw_page(figure: Figure, sweeps: Sequence[Result], maps: Sequence[Result])
         for axes in right.axes[len(maps) :]:
             axes.set_axis_off()
         right.supxlabel(
-            f"above: share recognized, %; below: gain over the better control; gray: {NO_EFFECT_WORD} shown\n"
+            f"above: share recognized, %; below: gain over the better control; gray: {NO_EFFECT} shown\n"
             "×: fewer than half of the photographs can be measured",
             fontsize=7,
         )
@@ -232,7 +231,7 @@ def _draw_without(axes: Axes, y: float, gains: Sequence[bool], color: str) -> No
         left, *_, right = (ends[i] for point in run for i in (point, point + 1))
         if not gaining:
             axes.barh(y, right - left, left=left, height=0.2, color=EMPTY_COLOR)
-            axes.text((left + right) / 2, y, NO_EFFECT_WORD, ha="center", va="center", fontsize=5.5)
+            axes.text((left + right) / 2, y, NO_EFFECT, ha="center", va="center", fontsize=5.5)
         elif left:
             axes.barh(y, right - left, left=left, height=0.2, color=color, alpha=0.75)
 
@@ -242,7 +241,7 @@ def _draw_bar(axes: Axes, y: float, x: EndValues, break_: BreakValues, color: st
     axes.barh(y, min(value or 0.0, 1.0), height=0.2, color=color, alpha=0.75, label=label)
     of_sheet = break_["monotone_p"] is not None
     if value is None:
-        axes.text(0.01, y, NEVER_WORD if of_sheet else "", va="center", fontsize=6.5)
+        axes.text(0.01, y, NEVER if of_sheet else "", va="center", fontsize=6.5)
         return
     if value >= BEYOND_SWEEP:
         axes.text(1.01, y, "→", va="center", fontsize=8, color=color)

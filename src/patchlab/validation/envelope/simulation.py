@@ -49,7 +49,7 @@ _TAPE_SRGB = 0.45  # color of the tape that hides a corner
 
 @dataclass(frozen=True, eq=False)
 class Simulation:
-    """A run with its mounted sheet and the gray control's, the sheet's surface, and a printer other than the promised."""
+    """A run with its mounted sheet and the gray control's, the sheet's surface, and another printer."""
 
     run: Run
     problem: Problem
@@ -120,7 +120,7 @@ def recognize_target(world: Simulation, points: Sequence[SweepPoint], conditions
     out = {kind: np.zeros((len(points), len(conditions)), bool) for kind in ("design", *CONTROLS)}
     as_file = any("jpeg" in point for point in points)
     side = min(world.scene.settings.camera.photo_px) if as_file else world.problem.figure_px
-    stages, first_network = _StageCache(world), world.problem.before([0])
+    stages, first_network = _StageCache(world), world.problem.with_classifiers([0])
     with torch.inference_mode():
         for first in range(4):  # the corner that is hidden first; each goes with a quarter of the conditions
             every = np.arange(first, len(conditions), 4)
@@ -156,8 +156,6 @@ def measure_photos(world: Simulation, points: Sequence[SweepPoint], conditions: 
 
 
 class _StageCache:
-    """The stage of each geometry, created once."""
-
     def __init__(self, world: Simulation):
         self._world, self._kept = world, {}
 

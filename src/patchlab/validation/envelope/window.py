@@ -72,8 +72,6 @@ class _WindowScene(PatchScene):
 
 @dataclass(frozen=True)
 class _WindowBackgrounds:
-    """The window's part of the whole picture's background."""
-
     whole: Backgrounds
     whole_px: tuple[int, int]
     origin_px: tuple[int, int]
@@ -84,7 +82,6 @@ class _WindowBackgrounds:
 
 
 def _window_stage(stage: Stage, scene: PatchScene, origin_px: tuple[int, int], size_px: tuple[int, int]) -> Stage:
-    """The stage with a camera that sees only a window of the photograph."""
     whole_px = scene.settings.camera.photo_px
     parts = {field.name: getattr(scene, field.name) for field in fields(PatchScene)}
     parts["settings"] = scene.settings.changed(camera={"photo_px": size_px})
