@@ -129,12 +129,12 @@ def _ask_about_class(
 ) -> dict[str, Any]:
     """Hits by kind and condition, for the class's labels and for the patch's target."""
     (classifier,), (target,) = problem.classifiers, problem.indices
-    own = _indices(classifier, images_of)
-    judged = replace(_with_scene(problem, scene), classifiers=(classifier, classifier), indices=(own, target))
+    own_indices = _indices(classifier, images_of)
+    judged = replace(_with_scene(problem, scene), classifiers=(classifier, classifier), indices=(own_indices, target))
     return {
-        "name": classifier.labels[own[0]].partition(",")[0] + (" (renders)" if images_of.scene else ""),
+        "name": classifier.labels[own_indices[0]].partition(",")[0] + (" (renders)" if images_of.scene else ""),
         "images": len(scene.images),
-        "same": bool(set(own) & set(target)),  # the target itself, or a class that its labels include
+        "same": bool(set(own_indices) & set(target)),  # the target itself, or a class that its labels include
         "hits": to_record(responses(judged, shown, scene.draw("evaluate", n)))["hits"],
     }
 
@@ -161,9 +161,9 @@ def tables(settings: Patch2dSettings, results: Sequence[Result]) -> list[Table]:
 def _gains(results: Sequence[Result]) -> Table:
     rows = []
     for (_, network), group in _by_target(results).items():
-        own = [_target_answers(result) for result in group]
-        hits = {kind: _hits(own, kind, OWN_LABEL) for kind in KINDS}
-        start = (own[0]["name"], network, own[0]["images"], own[0]["images"] >= MIN_IMAGES_TO_SPLIT)
+        answers = [_target_answers(result) for result in group]
+        hits = {kind: _hits(answers, kind, OWN_LABEL) for kind in KINDS}
+        start = (answers[0]["name"], network, answers[0]["images"], answers[0]["images"] >= MIN_IMAGES_TO_SPLIT)
         gains = (estimate_difference(hits["patch"], hits[control]) for control in ("bare", "gray"))
         rows.append((*start, *(rate(hits[kind]) for kind in KINDS), *gains))
     about = (
@@ -182,10 +182,10 @@ def _harm(results: Sequence[Result]) -> Table:
             if other["same"]:
                 continue
             of_class = [result.answers["classes"][i] for result in group]
-            own = {kind: _hits(of_class, kind, OWN_LABEL) for kind in KINDS}
+            hits = {kind: _hits(of_class, kind, OWN_LABEL) for kind in KINDS}
             called, usual = (_hits(of_class, kind, TARGET_LABEL) for kind in ("patch", "bare"))
-            rates = (rate(own[kind]) for kind in ("bare", "gray", "patch"))
-            harm = (estimate_difference(own["patch"], own[control]) for control in ("bare", "gray"))
+            rates = (rate(hits[kind]) for kind in ("bare", "gray", "patch"))
+            harm = (estimate_difference(hits["patch"], hits[control]) for control in ("bare", "gray"))
             start = (_target_answers(group[0])["name"], network, other["name"])
             rows.append((*start, *rates, *harm, rate(called), estimate_difference(called, usual)))
     about = (
@@ -199,11 +199,11 @@ def _harm(results: Sequence[Result]) -> Table:
 
 def _pooled(results: Sequence[Result]) -> Table:
     groups = _by_target(results).values()
-    own = [[_target_answers(result) for result in group] for group in groups]
+    targets = [[_target_answers(result) for result in group] for group in groups]
     others = [[each for result in group for each in result.answers["classes"] if not each["same"]] for group in groups]
     rows = []
     for name, clusters, which in (
-        ("target recognized", own, OWN_LABEL),
+        ("target recognized", targets, OWN_LABEL),
         ("other classes recognized", others, OWN_LABEL),
         ("other classes called the target", others, TARGET_LABEL),
     ):

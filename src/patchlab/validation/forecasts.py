@@ -46,17 +46,17 @@ def run(settings: ForecastsSettings, base: Path, cell: Cell) -> dict[str, Any]:
 
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        made = make_run_and_sheet(base, cell, folder)
-        photos, controls = take_photos(settings, cell, made, folder), None
+        patch_run = make_run_and_sheet(base, cell, folder)
+        photos, controls = take_photos(settings, cell, patch_run, folder), None
         if settings.control is not None:
-            controls = take_photos(settings, cell, made, folder, settings.control)
-        forecast, sessions = photo_forecaster(made, load_manifest(folder / "sheet.json")), []
+            controls = take_photos(settings, cell, patch_run, folder, settings.control)
+        forecast, sessions = photo_forecaster(patch_run, load_manifest(folder / "sheet.json")), []
         for session in sorted(photos.iterdir()):
             if session.is_dir():
                 of_control = None if controls is None else controls / session.name
                 report = verify_photos(session, folder, base, cell, forecast, controls=of_control)
                 sessions.append(_record_session(report, settings.control))
-    return record_promise(made) | {"sessions": sessions}
+    return record_promise(patch_run) | {"sessions": sessions}
 
 
 def _record_session(report: Any, control: str | None) -> dict[str, Any]:

@@ -213,29 +213,29 @@ def _faded_light(printer: Printer, shares: np.ndarray, srgb: np.ndarray) -> np.n
 
 def tables(settings: LedgerSettings, results: Sequence[Result]) -> Sequence[Table]:
     """Tables of rates by culprit, of confusions, and of every trial."""
-    asked = [trial for trial in results if trial.answers["outcome"] == "asked"]
-    return (_rates(results, asked), _confusions(asked), _trials(results))
+    counted = [trial for trial in results if trial.answers["outcome"] == "asked"]
+    return (_rates(results, counted), _confusions(counted), _trials(results))
 
 
 def _culprit(trial: Result) -> str:
     return trial.cell.values["culprit"]
 
 
-def _rates(results: Sequence[Result], asked: Sequence[Result]) -> Table:
+def _rates(results: Sequence[Result], counted: Sequence[Result]) -> Table:
     rows = []
     for kind in (*STEP_OF_CULPRIT, None):
-        of_kind = [trial for trial in asked if kind in (None, _culprit(trial))]
+        of_kind = [trial for trial in counted if kind in (None, _culprit(trial))]
         outcomes = [trial.answers["outcome"] for trial in results if kind in (None, _culprit(trial))]
         hits = [trial.answers["named"] == STEP_OF_CULPRIT[_culprit(trial)] for trial in of_kind]
         rows.append((kind or "all", rate(hits), outcomes.count("weak"), outcomes.count("unreadable")))
     about = f"of trials that cost at least {MIN_COST:.0%} of confidence; the shares' sum is the whole within "
-    about += f"{max((trial.answers['sum_error'] for trial in asked), default=0):.0e}"
+    about += f"{max((trial.answers['sum_error'] for trial in counted), default=0):.0e}"
     return Table("rates", "Culprits named", ("culprit", "named", "cost less", "unreadable"), tuple(rows), about)
 
 
-def _confusions(asked: Sequence[Result]) -> Table:
+def _confusions(counted: Sequence[Result]) -> Table:
     names = ("print", "light_and_camera", "blur_and_noise", "print_light_and_camera", None)
-    counts = Counter((_culprit(trial), trial.answers["named"]) for trial in asked)
+    counts = Counter((_culprit(trial), trial.answers["named"]) for trial in counted)
     rows = tuple((kind, *(counts[kind, name] for name in names)) for kind in STEP_OF_CULPRIT)
     return Table("confusions", "Put in and named", ("put in", *(n or "none" for n in names)), rows, "trials")
 

@@ -69,16 +69,18 @@ def make_run_and_sheet(base: Path, cell: Cell, folder: Path) -> Run:
     scene = replace(scene, settings=scene.settings.changed(target={"models": network_names(base, cell.values)}))
     # a page needs one control only, and all of them would take most of a promise's time
     if (picture := cell.values.get("picture")) is None:
-        made = optimize(scene, folder / "run", promise=PromiseOptions(controls=("bare",)))
+        patch_run = optimize(scene, folder / "run", promise=PromiseOptions(controls=("bare",)))
     else:
-        made = import_patch(
+        patch_run = import_patch(
             expand_path(picture, base), scene, folder / "run", promise=PromiseOptions(controls=("bare",))
         )
-    sheet_of(made, folder / "sheet.pdf")
-    return made
+    sheet_of(patch_run, folder / "sheet.pdf")
+    return patch_run
 
 
-def take_photos(settings: SessionsSettings, cell: Cell, made: Run, folder: Path, control: str | None = None) -> Path:
+def take_photos(
+    settings: SessionsSettings, cell: Cell, patch_run: Run, folder: Path, control: str | None = None
+) -> Path:
     """Photograph folder/sheet.pdf, or a control under the same conditions; returns the folder of sessions."""
     from patchproof.reprints.mounted_sheet import ReprintSetup
     from patchproof.reprints.reprint import reprint
@@ -87,7 +89,7 @@ def take_photos(settings: SessionsSettings, cell: Cell, made: Run, folder: Path,
     setup = ReprintSetup(path_traced=settings.path_traced, control=control)
     # another seed per cell: cells with the same draws would not be independent
     seed = zlib.crc32(cell.name.encode())
-    reprint(folder / "sheet.pdf", made, n, out, setup, sessions=settings.sessions, seed=seed)
+    reprint(folder / "sheet.pdf", patch_run, n, out, setup, sessions=settings.sessions, seed=seed)
     return out
 
 
@@ -110,9 +112,9 @@ def verify_photos(
     return gather_evidence(photos, manifest, changed, forecast=forecast)
 
 
-def record_promise(made: Run) -> dict[str, Any]:
+def record_promise(patch_run: Run) -> dict[str, Any]:
     """Record a run's promise as JSON values."""
-    promise = made.promise
+    promise = patch_run.promise
     hits = hits_text([condition.recognized for condition in promise.conditions])
     return {"promised": hits, "per_session": promise.per_session, "places": list(promise.places)}
 

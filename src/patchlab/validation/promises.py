@@ -82,18 +82,18 @@ def run(settings: PromisesSettings, base: Path, cell: Cell) -> dict[str, Any]:
     """Promise, photograph and verify one combination."""
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        made = make_run_and_sheet(base, cell, folder)
-        report = verify_photos(take_photos(settings, cell, made, folder), folder, base, cell, ledger_photos=0)
+        patch_run = make_run_and_sheet(base, cell, folder)
+        report = verify_photos(take_photos(settings, cell, patch_run, folder), folder, base, cell, ledger_photos=0)
     sessions = [(session.recognized, session.judged) for session in report.summary.sessions]
-    answers = record_promise(made) | {"sessions": sessions, "verdict": report.summary.verdict}
-    return answers | _measure_views(settings, made)
+    answers = record_promise(patch_run) | {"sessions": sessions, "verdict": report.summary.verdict}
+    return answers | _measure_views(settings, patch_run)
 
 
-def _measure_views(settings: PromisesSettings, made: Run) -> dict[str, Any]:
+def _measure_views(settings: PromisesSettings, patch_run: Run) -> dict[str, Any]:
     if not settings.rendered and not settings.elsewhere:
         return {}
-    problem, scene, answers = set_problem(made.scene), made.scene, {}
-    show = partial(responses, problem, pictures_with_controls(problem, made.design, ()))
+    problem, scene, answers = set_problem(patch_run.scene), patch_run.scene, {}
+    show = partial(responses, problem, pictures_with_controls(problem, patch_run.design, ()))
     if settings.rendered:
         views = scene.draw("reprint", settings.rendered * settings.photos, per_session=settings.photos)
         hits = show(views)["design"].recognized[0]

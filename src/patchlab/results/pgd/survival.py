@@ -1,4 +1,4 @@
-"""What hardened pictures must meet to survive PGD: one thing changed at a time.
+"""Test the survival of hardened pictures under PGD, with one setting changed at a time.
 
     python src/patchlab/results/pgd/survival.py NAME NETWORK DIR...  measures, into src/patchlab/results/pgd/NAME.json
     python src/patchlab/results/pgd/survival.py draw                 draws src/patchlab/results/pgd.png from all of them

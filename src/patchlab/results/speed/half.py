@@ -1,4 +1,4 @@
-"""What networks in half precision change in a promise: what it takes, and what is answered.
+"""Compare promises by networks in half precision with those in float32: time and answers.
 
 In: scene files. Out: `half.csv`, by scene and thing shown (a design, and the bare object in half of its views): answers
 in bfloat16 (`torch.autocast`) beside those in float32 under the same conditions, as mean and root mean square of the
@@ -35,7 +35,7 @@ asked = Classifier._call_network
 
 
 def rounded(self, squares, windows):
-    """What a network says in half precision."""
+    """A network's answers in half precision."""
     with torch.autocast("cpu", dtype=torch.bfloat16):
         return asked(self, squares, windows).float()
 

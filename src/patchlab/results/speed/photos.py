@@ -1,4 +1,4 @@
-"""What a photograph of 12 megapixels takes to be read and measured, by the code of several checkouts in turn.
+"""Time reading and measuring photographs of 12 megapixels, with the code of several checkouts in turn.
 
 In: `photos.toml`, and `src` folders of checkouts (git worktree add). Out: `photos.csv`: by checkout, round and
 photograph milliseconds of processor time, from the file to figures and the networks' squares, without the networks and

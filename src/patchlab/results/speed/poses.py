@@ -1,4 +1,4 @@
-"""What it costs a design that a run's poses come round again, each time in other light: no pose twice, the run's own
+"""Compare designs trained on poses that repeat, each time in other light: no pose twice, the run's own
 240 poses before other backgrounds each time, and 240 poses each of which keeps its background.
 
 In: three objects of `bench effort`. Out: `poses.csv`: by object and seed the mean loss and the rate of each design,

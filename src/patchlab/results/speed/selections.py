@@ -1,4 +1,4 @@
-"""What trying a design on the selection set twice as often as a run does would change.
+"""Try designs on the selection set twice as often as a run does, and compare the designs kept.
 
 In: three objects of `bench effort`, to be recognized, and two of them not to be, and by signed steps. Out:
 `selections.csv`: by run the loss on the selection set after every 120 of 960 views, after how many the best of these

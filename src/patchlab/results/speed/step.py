@@ -58,7 +58,7 @@ def resnet50() -> pp.Classifier:
 
 
 def pass_ms(problem, pictures, indices) -> float:
-    """Of one forward and backward pass of the network, each picture's loss to its pixels."""
+    """Milliseconds of a forward and backward pass of the network, each picture's loss to its pixels."""
     leaf, (classifier,) = pictures.clone().requires_grad_(), problem.classifiers
 
     def work():

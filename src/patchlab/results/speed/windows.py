@@ -27,7 +27,7 @@ ROUNDS = 30
 
 
 def gradient(network, photos, windows):
-    """Of a weighted sum of the answers, at the pictures."""
+    """The gradient of a weighted sum of the answers at the pictures."""
     leaf = photos.clone().requires_grad_()
     answers = network(leaf, windows)
     weights = torch.linspace(-1, 1, answers.numel()).view(answers.shape)
@@ -49,13 +49,13 @@ def placed(size: int, share: float, count: int) -> np.ndarray:
 
 
 def parts(photos, windows):
-    """What each picture shows in its window."""
+    """The window of each picture."""
     edges = windows.tolist()
     return [one[:, top:bottom, left:right] for one, (left, top, right, bottom) in zip(photos, edges, strict=True)]
 
 
 def asked_for_gradients(network, size: int, share: float) -> dict:
-    """Of two pictures, in the windows only and of all of them."""
+    """Compare gradients of two pictures in their windows with whole gradients."""
     windows, photos = placed(size, share, 2), torch.rand(2, 3, size, size)
     calls = (partial(gradient, network, photos, w) for w in (None, Windows(windows)))
     ((whole, some), *_), (whole_ms, windows_ms) = in_turn_ms(*calls)
