@@ -80,7 +80,7 @@ def test_a_scene_in_which_it_is_off_is_left_out(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("effect", "says"), [("motion blur", "one where it is off"), ("smell", "this kind of scene has")]
+    ("effect", "says"), [("motion blur", "a scene in which it is off"), ("smell", "this kind of scene has")]
 )
 def test_an_effect_that_is_not_there_is_refused(problem, effect, says):
     with pytest.raises(Refused, match=says):

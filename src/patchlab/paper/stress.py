@@ -97,7 +97,7 @@ def run(settings: StressSettings, base: Path, cell: Cell) -> dict[str, Any]:
     typical = problem.scene.draw("select", 1, seed)
     views = [_photographs(problem, with_values(typical, **changed))[0] for changed in ({}, pose, light)]
     return {
-        "maps": [_measure_map(problem, map_settings, seed) for map_settings in settings.maps],
+        "maps": [_measure_map(problem, options, seed) for options in settings.maps],
         "occlusion": occlusion,
         "pose": of_pose,
         "light": of_light,
@@ -120,11 +120,11 @@ def _measure_again(problem: Problem, there: Conditions, anywhere: Conditions) ->
     }
 
 
-def _measure_map(problem: Problem, map_settings: MapSettings, seed: int) -> dict[str, Any]:
-    axes = map_axes(problem.scene.settings, map_settings)
-    hits, confidence, alone = measure_map(problem, axes, problem.scene.draw("select", map_settings.n, seed))
+def _measure_map(problem: Problem, options: MapSettings, seed: int) -> dict[str, Any]:
+    axes = map_axes(problem.scene.settings, options)
+    hits, confidence, alone = measure_map(problem, axes, problem.scene.draw("select", options.n, seed))
     worst = worst_cells(hits, confidence, problem.scene.settings.target.goal)
-    fresh = problem.scene.draw("evaluate", map_settings.n * len(worst), seed + _FRESH_SEED_OFFSET)
+    fresh = problem.scene.draw("evaluate", options.n * len(worst), seed + _FRESH_SEED_OFFSET)
     return {
         "axes": axes_values(axes),
         "hits": [[hits_text(place) for place in column] for column in hits],
@@ -288,24 +288,21 @@ def figures(settings: StressSettings, results: Sequence[Result]) -> tuple[Drawin
 
 def _figures(settings: StressSettings, result: Result) -> Iterator[Drawing]:
     name, title = result.cell.name, "{}, {}, seed {}: clean object".format(*cell_key(result))
-    for number, (map_, map_settings) in enumerate(zip(result.answers["maps"], settings.maps, strict=True)):
+    for number, (map_, options) in enumerate(zip(result.answers["maps"], settings.maps, strict=True)):
         rates = [[float(np.mean(parse_hits(hits))) for hits in column] for column in map_["hits"]]
         caption = (
-            f"rate, n = {map_settings.n} draws per cell; framed: the worst tenth\ngray: no effect over background alone"
+            f"rate, n = {options.n} draws per cell; framed: the worst tenth\ngray: no effect over background alone"
         )
         ticks, empty = map_ticks(map_["axes"]), _empty_cells(map_)
         yield heat_map(f"map{number}_{name}", (title, caption), rates, map_["worst"], ticks, empty=empty)
-    hidden, grid_settings = result.answers["occlusion"], settings.occlusion
-    grid = np.reshape(
-        [np.mean(parse_hits(hits)) for hits in hidden["hits"]], (grid_settings.positions, grid_settings.positions)
-    ).T
+    hidden, options = result.answers["occlusion"], settings.occlusion
+    grid = np.reshape([np.mean(parse_hits(hits)) for hits in hidden["hits"]], (options.positions, options.positions)).T
     middles = [
-        f"{grid_settings.share / 2 + (1 - grid_settings.share) * i / (grid_settings.positions - 1):.0%}"
-        for i in range(grid_settings.positions)
+        f"{options.share / 2 + (1 - options.share) * i / (options.positions - 1):.0%}" for i in range(options.positions)
     ]
     labels = ("middle of the square, from the left", "from the top")
-    ticks = [(label, range(grid_settings.positions), middles) for label in labels]
-    caption = f"black square, {grid_settings.share:.0%} of the side; n = {grid_settings.n}"
+    ticks = [(label, range(options.positions), middles) for label in labels]
+    caption = f"black square, {options.share:.0%} of the side; n = {options.n}"
     yield heat_map(f"occlusion_{name}", (title, caption), grid.tolist(), [hidden["worst"]], ticks, upward=False)
     files = [("", result.file(f"{name}.png"))]
     yield picture_sheet(f"views_{name}", title, files, (2.1 * len(_VIEW_TITLES), 2.4), columns=_VIEW_TITLES)

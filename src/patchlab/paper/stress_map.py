@@ -77,7 +77,7 @@ def mesh_cells(settings: GridSettings, base: Path) -> list[Cell]:
     return cells
 
 
-def map_axes(settings: SceneSettings, map_settings: MapSettings) -> tuple[MapAxis, MapAxis]:
+def map_axes(settings: SceneSettings, options: MapSettings) -> tuple[MapAxis, MapAxis]:
     """The map's axes, pose and light, over the scene's ranges; refuses a range that is a single value."""
 
     def axis(name: str, count: int) -> MapAxis:
@@ -87,7 +87,7 @@ def map_axes(settings: SceneSettings, map_settings: MapSettings) -> tuple[MapAxi
             raise Refused(f"a range of {name} that a map can be cut from", f"[{low:g}, {high:g}]", do)
         return MapAxis(name, tuple(np.linspace(low, high, count + 1).tolist()))
 
-    return axis(map_settings.pose, map_settings.pose_cells), axis(map_settings.light, map_settings.light_cells)
+    return axis(options.pose, options.pose_cells), axis(options.light, options.light_cells)
 
 
 def axes_values(axes: tuple[MapAxis, MapAxis]) -> dict[str, Any]:

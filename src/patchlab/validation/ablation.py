@@ -155,10 +155,8 @@ def run(settings: AblationSettings, base: Path, cell: Cell) -> dict[str, Any]:
         piece = shown if isinstance(shown, PiecePicture) else None
         alone = [drawn[i : i + 1] for i in range(len(drawn))]
         photos = (photograph_traced(problem.stage, piece, each) for each in alone)
-        photo_answers = (
-            ask_networks(problem, photo, problem.boxes(each)) for photo, each in zip(photos, alone, strict=True)
-        )
-        answers["path_traced"] = merge_responses([{"design": answer} for answer in photo_answers])
+        replies = (ask_networks(problem, photo, problem.boxes(each)) for photo, each in zip(photos, alone, strict=True))
+        answers["path_traced"] = merge_responses([{"design": answer} for answer in replies])
     return {world: to_record(some) for world, some in answers.items()}
 
 
