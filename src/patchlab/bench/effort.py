@@ -103,7 +103,6 @@ def _timed_run(scene: Scene, views: int | None) -> tuple[Run, float]:
 
 
 def _missed_shares(runs: dict[str, Run], judged: int) -> dict[str, Estimate]:
-    """By name: the share of fresh views, the same for all, in which a run's design is not recognized."""
     problem = set_problem(next(iter(runs.values())).scene)
     shown = {name: problem.subject.appearance(from_pixels(run.design), "design") for name, run in runs.items()}
     answers = responses(problem, shown, problem.scene.draw("evaluate", judged))

@@ -101,7 +101,6 @@ def _checks(swatches: int, trials: list[PrinterTrial]) -> list[Check]:
 
 
 def _choices(trials: list[PrinterTrial]) -> Table:
-    """By driver: the chosen model's error, how often it is near the best, and which models were chosen."""
     rows = []
     for driver in (*dict.fromkeys(trial.driver for trial in trials), "all"):
         some = [trial for trial in trials if driver in (trial.driver, "all")]

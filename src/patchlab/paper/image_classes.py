@@ -144,7 +144,6 @@ def scene_settings(
 
 
 def _render_class(label: str | int, values: CellValues, base: Path, seed: int, n: int, folder: Path) -> tuple[str, str]:
-    """Write n renders of a scene and their labels into a new subfolder; returns the paths of both."""
     subfolder = folder / str(len(list(folder.iterdir())))
     subfolder.mkdir()
     names = write_renders(set_stage(scene_of(base, values | {"seed": seed})), n, _RENDER_PX, subfolder)

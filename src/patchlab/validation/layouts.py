@@ -258,7 +258,6 @@ def figures(settings: LayoutsSettings, results: Sequence[Result]) -> Sequence[Dr
 
 
 def _value_and_reach(value: Value) -> tuple[float, list[list[float]] | None]:
-    """A figure, and its interval's reach down and up for matplotlib's error bars."""
     if isinstance(value, Estimate):
         return value.value, [[value.value - value.low], [value.high - value.value]]
     return float(value or 0), None

@@ -271,7 +271,6 @@ def _caption(result: Result) -> str:
 
 
 def _range_plot(settings: RealSettings, used: Sequence[Result]):
-    """A function that plots blur, noise and black of every photograph by board, over the default ranges."""
     camera, printer = CameraSettings(), PrinterSettings()
     ink = load_printer(printer.profile).apply(torch.zeros(1, 3, 2, 2))[0, :, 0, 0].double().numpy()
     black = float(linear_from_srgb(ink) @ np.array(LUMINANCE))

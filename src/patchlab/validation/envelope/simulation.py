@@ -211,7 +211,6 @@ class _ViewCache:
 def _measure_window(
     world: Simulation, scene: Scene, conditions: Conditions, srgb: np.ndarray, origin_px
 ) -> Measurement:
-    """Measure a part of a photograph whose corner is at `origin_px`."""
     whole_px = world.scene.settings.camera.photo_px
     matrix_px = None
     if scene.HAS_OBJECT:  # a flat picture has no focal length
