@@ -405,13 +405,16 @@ CARD = {"input_px": 16, "labels": ["a", "b", "c"]}
 
 
 def labels_csv(rng: Rng, folder: Path) -> Read:
-    from patchlab.harden.labeled import labeled_files
-    from patchlab.paper.image_classes import labels_of
+    from patchlab.harden.labeled_photos import list_labeled_files
+    from patchlab.paper.image_classes import labels_with_images
 
     (folder / "labels.csv").write_bytes(broken_lines(rng, LABELS))
     for name in "abc":
         Image.new("RGB", (4, 4)).save(folder / f"{name}.png")
-    return lambda: (labels_of(folder, folder / "labels.csv"), labeled_files(folder, folder / "labels.csv"))
+    return lambda: (
+        labels_with_images(folder, folder / "labels.csv"),
+        list_labeled_files(folder, folder / "labels.csv"),
+    )
 
 
 def faces_txt(rng: Rng, folder: Path) -> Read:

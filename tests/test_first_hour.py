@@ -16,7 +16,6 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
-import conftest  # noqa: F401 - finds helpers of other rooms where this is a program
 import pytest
 import trimesh
 from PIL import Image

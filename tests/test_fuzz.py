@@ -11,7 +11,6 @@ import re
 import subprocess
 import sys
 
-import conftest  # noqa: F401 - finds helpers of other rooms where this is a program
 import numpy as np
 import pytest
 from fuzz import READERS, Outcome, attempt

@@ -19,7 +19,6 @@ import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-import conftest  # noqa: F401 - finds helpers of other rooms where this is a program
 import numpy as np
 import pytest
 
@@ -75,9 +74,9 @@ def reprint(base: Path, out: Path, again: bool) -> None:
 def study(base: Path, out: Path, again: bool) -> None:
     import toy_studies as toy
 
-    from patchlab.study.study import Work, carry_out
+    from patchlab.study.study import Work, run_cells
 
-    carry_out(toy.STUDY, toy.ToySettings(numbers=(1, 2, 13, 4)), base, out, Work(resume=again))  # one cell fails
+    run_cells(toy.STUDY, toy.ToySettings(numbers=(1, 2, 13, 4)), base, out, Work(resume=again))  # one cell fails
 
 
 DO = dict(zip(JOBS, (optimize, verify, sheet, reprint, study), strict=True))

@@ -14,7 +14,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from unittest.mock import patch
 
-import conftest  # noqa: F401 - finds helpers of other rooms where this is a program
 import numpy as np
 import pytest
 from bent_paper import SIDE_MM

@@ -15,7 +15,7 @@ from console import command
 from test_imports import MAY_IMPORT
 
 from patchlab.bench.run import BENCHES
-from patchlab.study.record import hits_of
+from patchlab.study.record import parse_hits
 from patchlab.study.study import load_study
 from patchproof.base.intervals import student_mean
 from patchproof.base.settings import SceneSettings
@@ -238,7 +238,10 @@ def shown_by_run(name: str) -> np.ndarray:
     found = [cell["found"] for cell in stored(name)["cells"].values()]
     return np.array(
         [
-            (np.mean(hits_of(run["promised"])), np.mean([seen / judged for seen, judged in run["sessions"] if judged]))
+            (
+                np.mean(parse_hits(run["promised"])),
+                np.mean([seen / judged for seen, judged in run["sessions"] if judged]),
+            )
             for run in found
         ]
     ).T

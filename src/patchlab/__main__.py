@@ -1,4 +1,4 @@
-"""`python -m patchlab`."""
+"""Entry point of `python -m patchlab`."""
 
 from patchlab.cli import main
 

@@ -1,4 +1,4 @@
-"""The command `patchlab`: studies, benchmarks, hardened images, and the figures that they left."""
+"""The command line `patchlab`: run studies and benchmarks, harden images, print keys and stored figures."""
 
 from __future__ import annotations
 
@@ -31,22 +31,22 @@ def harden(
     method: Annotated[Literal["pgd", "fgsm", "adam"], typer.Option(help="How to step.")] = "pgd",
     eps: Annotated[str, typer.Option(help='Largest change of a value in [0, 1]: 0.03, 8/255 or "none".')] = "8/255",
     steps: Annotated[int, typer.Option(min=1, help="Steps.")] = 100,
-    step_size: Annotated[float | None, typer.Option(help="In place of the method's own.")] = None,
-    through: Annotated[float | None, typer.Option(help="ε of a PGD that each step goes through.")] = None,
+    step_size: Annotated[float | None, typer.Option(help="First step size; by default the method's own.")] = None,
+    through: Annotated[float | None, typer.Option(help="ε of a PGD attack that each step is taken under.")] = None,
     judges: Annotated[str | None, typer.Option(help="Comma-separated classifiers that only judge.")] = None,
     evaluate: Annotated[str, typer.Option(help="Attacks to withstand: fgsm, pgd.")] = "",
-    attack_eps: Annotated[str, typer.Option(help="Their ε.")] = "0.01,0.02,0.04",
+    attack_eps: Annotated[str, typer.Option(help="Values of ε of these attacks.")] = "0.01,0.02,0.04",
     resume: Resume = False,
     overwrite: Overwrite = False,
     jobs: Jobs = None,
     cluster: Cluster = None,
 ) -> None:
     """Change labeled images so that classifiers recognize them better, and attack them."""
-    from patchlab.harden.folder import HardenSettings, harden_images
+    from patchlab.harden.harden_study import HardenSettings, harden_images
     from patchlab.study.study import Work
     from patchproof.base.validation import validate_model
 
-    given = {
+    options = {
         "images": str(images),
         "labels": str(labels),
         "models": names_of(model),
@@ -62,22 +62,22 @@ def harden(
     }
     with progress() as bar:
         work = Work(resume, overwrite, jobs or 1, cluster, lambda done, total: bar("harden", done, total))
-        finished = harden_images(validate_model(HardenSettings, given, "the options"), out, work)
+        finished = harden_images(validate_model(HardenSettings, options, "the options"), out, work)
     say_study(finished)
     say(f"images: {out}, tables: {out / 'harden.html'}")
     raise typer.Exit(0 if finished.results else 1)
 
 
-class ListsStudies(TyperCommand):
-    """A command whose help ends with all studies."""
+class StudyCommand(TyperCommand):
+    """A command whose help ends with a list of all studies."""
 
     def format_help(self, ctx, formatter) -> None:
-        """The usual help, then a line per study."""
-        from patchlab.study.study import STUDIES, first_line
+        """Write typer's help, then a line per study."""
+        from patchlab.study.study import STUDIES, module_summary
 
         super().format_help(ctx, formatter)
         say("Studies (all keys of a config: patchlab keys NAME):")
-        say(*(f"  {name:<10} {first_line(module)}" for name, module in STUDIES.items()))
+        say(*(f"  {name:<10} {module_summary(module)}" for name, module in STUDIES.items()))
 
 
 def study(
@@ -91,7 +91,7 @@ def study(
     jobs: Jobs = None,
     cluster: Cluster = None,
 ) -> None:
-    """An experiment of the paper or a test of the tool: many cells, tables with intervals, figures and one page."""
+    """Run an experiment of the paper or a test of the tool: tables with intervals, figures and one page."""
     from patchlab.keys import documents, example_config
     from patchlab.study.study import Work, run_study
     from patchproof.app.keys import keys_page
@@ -111,7 +111,7 @@ def study(
 
 
 def keys(name: Annotated[str | None, typer.Argument(help="A study; without one, all.")] = None) -> None:
-    """All keys of studies' configs: range, unit, default and meaning, as Markdown."""
+    """Print all keys of studies' configs as Markdown: range, unit, default and meaning."""
     from patchlab.keys import HEAD, documents
     from patchproof.app.keys import keys_page
 
@@ -119,7 +119,7 @@ def keys(name: Annotated[str | None, typer.Argument(help="A study; without one, 
 
 
 def table(name: Annotated[str | None, typer.Argument(help="A word of the heading; without one, all.")] = None) -> None:
-    """The current figures with their dates, commands and stored data, as Markdown."""
+    """Print the current figures with their dates, commands and stored data, as Markdown."""
     from patchlab.results.figures import figures_page
 
     print(figures_page(name), end="")
@@ -133,7 +133,7 @@ def bench(
     out: Annotated[Path, typer.Option(help="Folder for charts, tables and pages.")] = Path("patchlab-bench"),
     overwrite: Overwrite = False,
 ) -> None:
-    """Speed against accuracy of each knob on this machine: charts, tables and a page."""
+    """Chart speed against accuracy of each setting on this machine: charts, tables and a page."""
     from patchlab.bench.run import run_bench
 
     with progress() as bar:
@@ -148,12 +148,12 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Studies and benchmarks that produce the figures which patchproof's documents quote.",
 )
-app.command(cls=ListsStudies)(as_command(study))
+app.command(cls=StudyCommand)(as_command(study))
 for _verb in (bench, harden, table, keys):
     app.command()(as_command(_verb))
 app.callback()(version_option)
 
 
 def main() -> None:
-    """Run the command line."""
+    """Run the command line of the laboratory."""
     run_command_line(app)

@@ -1,4 +1,4 @@
-"""Every key of studies' configs as one Markdown page, and a config of each to start from."""
+"""Document every key of the studies' configs as Markdown, and write an example config of each study."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Printed by `patchlab keys`; for scenes and pages see `patchproof keys`.
 
 
 def documents() -> Documents:
-    """By name what a study's config is for, and its settings."""
+    """By study: a line that says what its config is for, and its settings class."""
     studies = {name: load_study(name) for name in STUDIES}
     return {
         name: (f"`patchlab study {name} --config FILE.toml`: {study.about}", study.settings)
@@ -23,7 +23,7 @@ def documents() -> Documents:
     }
 
 
-# what an example has where a key, or one of several, is required: files that a user has, or could make
+# example values of required keys: files that a user has or can make
 _EXAMPLES = {
     "scenes": ("scene.toml",),
     "scene": "scene.toml",
@@ -41,7 +41,7 @@ _EXAMPLES = {
 
 
 def example_config(name: str) -> str:
-    """A study's config to start from: what it requires, and all else at its default, commented out."""
+    """A TOML config to start from: required keys are set, all others stand at their defaults, commented out."""
     study = load_study(name)
     lines = [f"# {study.about}", f"# patchlab study {name} --config {name}.toml --out {name}"]
     for path, model in tables(study.settings):

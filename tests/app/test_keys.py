@@ -66,7 +66,7 @@ def test_meanings_stand_beside_fields_or_above_them():
     assert meanings(view)["roll_deg"] == "of the camera about its axis"
     assert meanings(camera)["photo_px"] == "Width and height of a whole photograph."  # above
     inherited = meanings(EVERY["transfer"][1])
-    assert inherited["networks"] == "to train on and to test" and "lights" in inherited
+    assert inherited["networks"] == "networks to train on and to test" and "lights" in inherited
 
 
 @pytest.mark.parametrize(
@@ -80,8 +80,8 @@ def test_meanings_stand_beside_fields_or_above_them():
         "| `corners_mm` | list of [2 numbers], 2 or more | mm | required | top-left, one per marker |",
         "| `swatch_mm` | number, ≥ 4 | mm | required | side; below 4 a phone's photograph of the page has too few "
         "pixels |",
-        "| `views` | table of [low, high] |  | `{}` | Azimuths in degrees by name; without any, thirds of each scene's "
-        "own range. |",
+        "| `views` | table of [low, high] |  | `{}` | Ranges of azimuth in degrees, by name; by default thirds of each "
+        "scene's range. |",
     ],
 )
 def test_rows(row, pages):
@@ -99,4 +99,4 @@ def test_one_kind_of_file_is_printed_alone(capsys):
 def test_the_help_of_study_names_every_study(capsys):
     assert lab_command("study", "--help") == 0
     printed = capsys.readouterr().out
-    assert "  promises   Whether promised rates hold" in printed and "patchlab keys NAME" in printed
+    assert "  promises   Check that promised rates hold" in printed and "patchlab keys NAME" in printed

@@ -16,7 +16,7 @@ import pytest
 import torch
 import toy_studies as toy
 
-from patchlab.study.study import Work, carry_out
+from patchlab.study.study import Work, run_cells
 from patchproof.base import workers as processes
 from patchproof.base.errors import Refused
 from patchproof.base.workers import available_cores, can_fork, fork_workers, open_workers, result_of, use_threads
@@ -189,7 +189,7 @@ def test_a_cluster_gives_the_same_also_when_workers_die(tmp_path):
     """Of single items, and to the byte of a whole study, in whose midst a worker dies."""
     distributed = pytest.importorskip("distributed", reason="needs dask: pip install 'patchproof[cluster]'")
     settings = toy.ToySettings(numbers=tuple(range(8)), die_in=str(tmp_path))
-    carry_out(toy.STUDY, settings, tmp_path, tmp_path / "here")
+    run_cells(toy.STUDY, settings, tmp_path, tmp_path / "here")
     (tmp_path / "n3").touch()
     with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
         with open_workers(cluster=cluster.scheduler_address) as workers:
@@ -197,7 +197,7 @@ def test_a_cluster_gives_the_same_also_when_workers_die(tmp_path):
             assert workers.map(toy.threads, range(3)) == [1, 1, 1]
             with pytest.raises(Refused, match=r"^Expected a, got 7: c\.$"):
                 workers.map(toy.refuse, [7])
-        carry_out(toy.STUDY, settings, tmp_path, tmp_path / "there", Work(cluster=cluster.scheduler_address))
+        run_cells(toy.STUDY, settings, tmp_path, tmp_path / "there", Work(cluster=cluster.scheduler_address))
     assert not (tmp_path / "n3").exists()
     here, there = (
         {path.relative_to(out): path.read_bytes() for path in out.rglob("*.*")}

@@ -345,16 +345,16 @@ def toned_camera() -> Camera:
 
 def printer_errors(seed: int, swatches: int, camera: Camera) -> tuple[float, float]:
     """Error of the chosen rung against the printer itself, without and with the camera's file."""
-    _, shows, priors = bench_printer.drawn_printer(seed)
-    manifest, colors = chart_manifest(swatches), bench_printer.held_out_colors()
+    _, shows, priors = bench_printer.draw_printer(seed)
+    manifest, colors = chart_manifest(swatches), bench_printer.draw_held_out_colors()
     shot = photograph_page(printed_page(manifest, shows), seed, camera)
-    truth, errors = bench_printer.shown_by(shows, shot, colors), []
+    truth, errors = bench_printer.camera_colors(shows, shot, colors), []
     for known in (None, camera):
         light = read_chart(shot.photo, manifest, known).light
         usable = np.isfinite(light).all(1)
         sent = np.array([s.srgb for s in manifest.chart])[usable]
         choice = choose_map(map_kinds(priors), sent, srgb_from_linear(light[usable]))
-        errors.append(float(color_difference(bench_printer.relative(choice.predict, colors), truth).mean()))
+        errors.append(float(color_difference(bench_printer.relative_to_paper(choice.predict, colors), truth).mean()))
     return errors[0], errors[1]
 
 
@@ -412,7 +412,9 @@ def test_a_camera_file_tells_printer_and_camera_apart():
 def test_the_bench_holds_choices_against_the_best_rung():
     def one(chosen, driver):
         errors = {"white_black": 5.0, "affine": 2.0, "spline": 1.0}
-        return bench_printer.Trial(driver, 48, errors, {"white_black": 0.1, "affine": 0.2, "spline": 0.4}, chosen)
+        return bench_printer.PrinterTrial(
+            driver, 48, errors, {"white_black": 0.1, "affine": 0.2, "spline": 0.4}, chosen
+        )
 
     trials = [one("spline", "plain"), one("spline", "plain"), one("affine", "matching")]
     drawn = bench_printer.ladder_chart(trials)
@@ -427,7 +429,7 @@ def test_the_bench_holds_choices_against_the_best_rung():
 
 def test_a_printer_is_never_its_own_prior():
     for seed in (5, 11):
-        driver, shows, priors = bench_printer.drawn_printer(seed)
+        driver, shows, priors = bench_printer.draw_printer(seed)
         assert driver == "the other profile" and len(priors) == 1
         prior = next(iter(priors.values()))
         assert color_difference(prior(UNSEEN), shown(shows, UNSEEN)).mean() > 3

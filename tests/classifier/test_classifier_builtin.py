@@ -10,7 +10,7 @@ import torch
 from patchlab.training import pictures as rendered
 from patchlab.training import train_builtin
 from patchlab.training.fit import Seconds
-from patchlab.training.pictures import HELD_OUT, Pictures, augmented, pictures, reduced
+from patchlab.training.pictures import HELD_OUT_SEED, Pictures, augment, render_pictures, shrink_pictures
 from patchproof.base.errors import Refused
 from patchproof.classifier import find_labels, load_classifier
 from patchproof.classifier.builtin import INPUT_PX, WEIGHTS_FOLDER, load_builtin
@@ -28,7 +28,7 @@ def builtin():
 def fresh() -> Pictures:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(rendered, "VIEWS_PER_SHAPE", 4)
-        return pictures(4, FRESH, INPUT_PX)
+        return render_pictures(4, FRESH, INPUT_PX)
 
 
 def test_it_names_the_primitives_and_is_small(builtin):
@@ -66,7 +66,7 @@ def test_pictures_are_repeatable_and_follow_the_seed(fresh, monkeypatch):
     names = primitives.primitive_names()[:3]
     monkeypatch.setattr(primitives, "primitive_names", lambda: names)
     monkeypatch.setattr(rendered, "VIEWS_PER_SHAPE", 1)
-    first, again, other = (pictures(1, seed, INPUT_PX).images for seed in (3, 3, 4))
+    first, again, other = (render_pictures(1, seed, INPUT_PX).images for seed in (3, 3, 4))
     assert len(first) == 3 and torch.equal(first, again)
     assert not any(torch.equal(one, another) for one, another in zip(first, other, strict=True))
 
@@ -75,15 +75,15 @@ def test_augmenting_keeps_the_range_and_pastes_as_often_as_said():
     images = torch.full((200, 3, 96, 96), 128, dtype=torch.uint8)
     cards = torch.ones(1, 3, 40, 40)
 
-    def augment(pasted):
-        return augmented(images, torch.zeros(200, 4), cards, np.random.default_rng(0), pasted)[0]
+    def augment_at(pasted):
+        return augment(images, torch.zeros(200, 4), cards, np.random.default_rng(0), pasted)[0]
 
-    made = augment(0.3)
-    assert torch.equal(made, augment(0.3))
+    made = augment_at(0.3)
+    assert torch.equal(made, augment_at(0.3))
     assert 0 <= made.min() and made.max() <= 1
     flat = made.std((2, 3)).amax(1) < 1e-6  # without a card a plain picture stays plain
     assert 0.6 < flat.float().mean() < 0.8
-    assert (augment(0.0).std((2, 3)) < 1e-6).all()
+    assert (augment_at(0.0).std((2, 3)) < 1e-6).all()
 
 
 def plain_colors() -> Pictures:
@@ -94,7 +94,7 @@ def plain_colors() -> Pictures:
 
 
 def test_training_is_repeatable_and_what_it_writes_can_be_loaded(tmp_path):
-    recipe, shown = train_builtin.Recipe(epochs=2, batch=12, pasted=0.0), plain_colors()
+    recipe, shown = train_builtin.ClassifierRecipe(epochs=2, batch=12, pasted=0.0), plain_colors()
     before = torch.get_num_threads()
     runs = [list(train_builtin.train(shown, recipe)) for _ in range(2)]
     assert torch.get_num_threads() == before
@@ -104,7 +104,7 @@ def test_training_is_repeatable_and_what_it_writes_can_be_loaded(tmp_path):
     assert card["recipe"] == dataclasses.asdict(recipe)
     assert card["command"].endswith("train_builtin --out DIR --epochs 2 --batch 12 --pasted 0.0")
     loaded = load_builtin(folder=tmp_path)
-    by_class = train_builtin.accuracy(loaded.network, shown)
+    by_class = train_builtin.accuracy_by_class(loaded.network, shown)
     assert card["held_out_accuracy"] == pytest.approx(by_class.mean(), abs=1e-4)
 
 
@@ -117,7 +117,7 @@ def test_another_network_learns_by_the_same_command_from_pictures_that_are_kept(
         rendered_seeds.append(seed)
         return shown
 
-    monkeypatch.setattr(rendered, "pictures", fake_pictures)
+    monkeypatch.setattr(rendered, "render_pictures", fake_pictures)
     more = ("--pictures", str(tmp_path / "kept"), "--batch", "8", "--learning-rate", "0.1")
     network = ("--network", "fake_networks.MeanColor", "--settings", '{"steep": 2}', "--input-px", "32")
     for name, epochs in (("first", "1"), ("colors", "12")):
@@ -125,12 +125,12 @@ def test_another_network_learns_by_the_same_command_from_pictures_that_are_kept(
         command = [*named, "--pasted", "0", *network, *more]
         monkeypatch.setattr("sys.argv", command)
         train_builtin.main()
-    assert rendered_seeds == [HELD_OUT, 0]
+    assert rendered_seeds == [HELD_OUT_SEED, 0]
     assert "epoch 12 of 12: loss " in capsys.readouterr().out
     classifier = load_classifier("file:colors.onnx", tmp_path)
     assert classifier.input_px == 32 and list(classifier.labels) == list(load_builtin().labels)
     card = json.loads((tmp_path / "colors.json").read_text())
-    right = train_builtin.accuracy(classifier.network, reduced(shown, 32)).mean()
+    right = train_builtin.accuracy_by_class(classifier.network, shrink_pictures(shown, 32)).mean()
     assert right == pytest.approx(card["held_out_accuracy"], abs=1e-4) and right > 0.8
     assert "--network fake_networks.MeanColor --settings '{\"steep\": 2}'" in card["command"]
 
@@ -140,13 +140,13 @@ def test_reduced_pictures_are_means_of_what_they_cover():
     stripes = torch.zeros(1, 3, 8, 8, dtype=torch.uint8)
     stripes[..., ::2] = 200
     shown = Pictures(stripes, torch.zeros(1), torch.zeros(1, 4))
-    assert torch.equal(reduced(shown, 8).images, stripes)
-    half = reduced(shown, 4).images.int()
+    assert torch.equal(shrink_pictures(shown, 8).images, stripes)
+    half = shrink_pictures(shown, 4).images.int()
     assert half.shape == (1, 3, 4, 4) and (half[..., 1:-1] - 100).abs().max() <= 1
 
 
 def test_held_out_shapes_are_none_of_the_training_shapes():
-    recipe = train_builtin.Recipe()
+    recipe = train_builtin.ClassifierRecipe()
     shapes = recipe.pictures_per_class // rendered.VIEWS_PER_SHAPE
-    assert recipe.seed + shapes < recipe.seed + HELD_OUT
-    assert recipe.seed + HELD_OUT + recipe.held_out_per_class < FRESH
+    assert recipe.seed + shapes < recipe.seed + HELD_OUT_SEED
+    assert recipe.seed + HELD_OUT_SEED + recipe.held_out_per_class < FRESH

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import nn
 
-from patchlab.training.fit import folded
+from patchlab.training.fit import fold_batch_norm
 from patchproof.base.errors import Refused
 from patchproof.classifier import Classifier, load_classifier, zoo
 from patchproof.classifier.builtin import SmallNetwork
@@ -259,7 +259,7 @@ def test_folding_the_batch_norms_changes_nothing_but_the_speed():
         nn.init.uniform_(norm.weight, 0.5, 2)
         nn.init.normal_(norm.bias)
     photos = torch.rand(4, 3, 96, 96)
-    plain = folded(trained.eval())
+    plain = fold_batch_norm(trained.eval())
     assert not any(isinstance(module, nn.BatchNorm2d) for module in plain.modules())
     with torch.no_grad():
         torch.testing.assert_close(plain(photos), trained(photos), rtol=1e-4, atol=1e-4)

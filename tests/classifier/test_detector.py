@@ -218,13 +218,13 @@ def shipped():
 def fresh():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(rendered, "VIEWS_PER_SHAPE", 4)
-        return rendered.pictures(4, 7_000_000, INPUT_PX)
+        return rendered.render_pictures(4, 7_000_000, INPUT_PX)
 
 
 def test_it_is_small_and_finds_fresh_objects_about_as_well_as_its_card_says(shipped, fresh):
     card = json.loads((WEIGHTS_FOLDER / "builtin_detector.json").read_text())
     assert card["held_out_ap50"] >= 0.8 and (WEIGHTS_FOLDER / "builtin_detector.safetensors").stat().st_size < 5_000_000
-    found = train_detector.precision(train_detector.found_by_class(shipped.network, fresh), fresh)
+    found = train_detector.ap50_by_class(train_detector.detections_by_class(shipped.network, fresh), fresh)
     assert shipped.least_score == card["least_score"]
     assert found.mean() > card["held_out_ap50"] - 0.15  # four views of one shape are alike
 
@@ -238,7 +238,7 @@ def two_stage(monkeypatch):
 
 def test_two_stages_find_fresh_objects_and_pass_gradients(two_stage, fresh):
     made = two_stage.rcnn()
-    assert train_detector.scored(made.network, fresh).mean() >= 0.8
+    assert train_detector.score_network(made.network, fresh).mean() >= 0.8
     photo, box, index = fresh.images[:1].float() / 255, fresh.boxes[:1].numpy(), fresh.labels[:1].tolist()
     before = made.logits(photo.requires_grad_(), box)[0, index]
     (gradient,) = torch.autograd.grad(before.sum(), photo)

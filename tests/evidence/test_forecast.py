@@ -5,7 +5,7 @@ from itertools import product
 import numpy as np
 import pytest
 
-from patchlab.validation.forecasts import slope
+from patchlab.validation.forecasts import calibration_slope
 from patchproof.evidence import forecast
 from patchproof.evidence.forecast import count_chances, forecast_of
 
@@ -46,5 +46,5 @@ def test_the_slope_says_how_much_too_sure_chances_are(sure):
     rng = np.random.default_rng(0)
     odds = rng.normal(0, 1.5, 20_000)
     hits = (rng.random(len(odds)) < 1 / (1 + np.exp(-odds))).astype(float)
-    assert slope(1 / (1 + np.exp(-sure * odds)), hits) == pytest.approx(1 / sure, rel=0.08)
-    assert slope(np.array([0.2, 0.4]), np.array([1.0, 1.0])) is None
+    assert calibration_slope(1 / (1 + np.exp(-sure * odds)), hits) == pytest.approx(1 / sure, rel=0.08)
+    assert calibration_slope(np.array([0.2, 0.4]), np.array([1.0, 1.0])) is None

@@ -9,8 +9,17 @@ import pytest
 import torch
 
 from patchlab.harden import attacks
-from patchlab.harden.attacks import cross_entropy, even_loss, fgsm, margin, pgd, right, survives_fgsm, survives_pgd
-from patchlab.harden.harden import squares
+from patchlab.harden.attacks import (
+    balanced_loss,
+    cross_entropy,
+    fgsm,
+    is_correct,
+    margin,
+    pgd,
+    survives_fgsm,
+    survives_pgd,
+)
+from patchlab.harden.hardening import center_squares
 from patchproof.classifier.builtin import load_builtin
 from patchproof.classifier.load import load_classifier
 from patchproof.photo.read import read_photo
@@ -27,7 +36,7 @@ def real(data):
     """A real network, what it sees of the labeled photographs, and their labels."""
     classifier = load_classifier(f"file:{data}/models/mobilenet_v1_0.25_128.onnx", data)
     rows = list(csv.DictReader((data / "photos/labels.csv").read_text().splitlines()))
-    pictures = squares([read_photo(data / "photos" / row["file"]).srgb for row in rows], classifier).clamp(0, 1)
+    pictures = center_squares([read_photo(data / "photos" / row["file"]).srgb for row in rows], classifier).clamp(0, 1)
     return classifier.network, pictures, torch.tensor([int(row["label"]) for row in rows])
 
 
@@ -62,7 +71,7 @@ def test_pgd_leaves_the_other_librarys_accuracy_and_loss(real):
         *_, ours = pgd(network, pictures, labels, epsilon, cross_entropy, steps)
         with torch.no_grad():
             theirs, ours = network(theirs), network(ours)
-        assert right(ours, labels).tolist() == right(theirs, labels).tolist()
+        assert is_correct(ours, labels).tolist() == is_correct(theirs, labels).tolist()
         ours, theirs = cross_entropy(ours, labels).mean(), cross_entropy(theirs, labels).mean()
         assert float((ours - theirs).abs()) < 1e-3
 
@@ -89,8 +98,8 @@ def test_a_network_that_shouts_is_not_taken_for_a_robust_one():
     # margins 4, 400 and 800: float32 loses the gradient at 103, float64 at 745, the margin loss never
     for gain, holds32, holds64 in ((100, False, False), (10000, True, False), (20000, True, True)):
         network = Shouting(gain)
-        assert bool(right(network(fgsm(network, pictures, labels, epsilon, float32)), labels)) is holds32
-        assert bool(right(network(fgsm(network, pictures, labels, epsilon, cross_entropy)), labels)) is holds64
+        assert bool(is_correct(network(fgsm(network, pictures, labels, epsilon, float32)), labels)) is holds32
+        assert bool(is_correct(network(fgsm(network, pictures, labels, epsilon, cross_entropy)), labels)) is holds64
         assert not survives_fgsm(network, pictures, labels, epsilon)
         assert not survives_pgd(network, pictures, labels, epsilon)
 
@@ -99,7 +108,7 @@ def test_even_loss_has_the_direction_of_the_mean_loss():
     generator = torch.Generator().manual_seed(0)
     logits = [torch.randn(5, 4, generator=generator, dtype=torch.float64, requires_grad=True) for _ in range(2)]
     labels = [torch.tensor([0, 1, 2, 3, 0]), torch.tensor([3, 2, 1, 0, 0])]
-    steered = torch.cat(torch.autograd.grad(even_loss(logits, labels, cross_entropy), logits), 1)
+    steered = torch.cat(torch.autograd.grad(balanced_loss(logits, labels, cross_entropy), logits), 1)
     mean = sum(cross_entropy(one, truth).sum() for one, truth in zip(logits, labels, strict=True)) / 2
     plain = torch.cat(torch.autograd.grad(mean, logits), 1)
     assert torch.allclose(steered, plain / plain.abs().amax(1, keepdim=True))
@@ -150,7 +159,7 @@ def test_a_picture_that_was_lost_on_the_way_is_lost():
 
     pictures, labels = torch.full((2, 3, 2, 2), 0.52), torch.tensor([0, 1])
     *_, last = pgd(network, pictures, labels, 0.03, margin)
-    assert right(network(last), labels).tolist() == [True, False]
+    assert is_correct(network(last), labels).tolist() == [True, False]
     assert survives_pgd(network, pictures, labels, 0.03).tolist() == [False, False]
     assert survives_pgd(network, pictures, labels, 0.005).tolist() == [True, False]  # does not reach it
     # what is read wrongly to begin with survives nothing

@@ -14,14 +14,14 @@ from PIL import Image
 
 from patchlab.bench import chart as charts
 from patchlab.bench import measure, run
-from patchlab.bench.chart import Chart, Check, Point, all_checks, pareto, points_table
+from patchlab.bench.chart import Chart, ChartPoint, Check, all_checks, pareto_mask, points_table
+from patchlab.bench.demo_problem import demo_problem
 from patchlab.bench.render import resolution_chart
-from patchlab.bench.world import demo_problem
 from patchproof.base.intervals import Estimate
 
 
 def point(setting="a", cost=1.0, error=1.0, default=False):
-    return Point(setting, *(Estimate(x, 0.9 * x, 1.1 * x, 5) for x in (cost, error)), default)
+    return ChartPoint(setting, *(Estimate(x, 0.9 * x, 1.1 * x, 5) for x in (cost, error)), default)
 
 
 def chart(points=((1, 3), (2, 1), (3, 2)), **more):
@@ -36,7 +36,7 @@ def quiet(stage, done, total):
 def test_a_point_that_another_beats_is_not_on_the_front():
     #                 cheap  exact  beaten  as exact but dearer  the same as another
     cost, error = [1, 3, 4, 4, 1], [5, 1, 2, 1, 5]
-    assert pareto(cost, error).tolist() == [True, True, False, False, True]
+    assert pareto_mask(cost, error).tolist() == [True, True, False, False, True]
 
 
 def test_the_front_is_the_lower_edge_cheapest_first():
@@ -52,17 +52,17 @@ def test_a_point_without_a_finite_error_is_no_choice():
 
 def test_ratios_are_those_of_the_same_round():
     seconds = {"a": np.array([2.0, 20, 200]), "b": np.array([1.0, 10, 100])}
-    assert measure.ratio(seconds, "a", "b") == Estimate(2, 2, 2, 3)
+    assert measure.time_ratio(seconds, "a", "b") == Estimate(2, 2, 2, 3)
 
 
 def test_calls_are_timed_in_turn_after_a_warm_up():
     order = []
-    seconds = measure.timed({"a": lambda: order.append("a"), "b": lambda: order.append("b")}, 2)
+    seconds = measure.time_calls({"a": lambda: order.append("a"), "b": lambda: order.append("b")}, 2)
     assert order == ["a", "b"] * 3 and [len(values) for values in seconds.values()] == [2, 2]
 
 
 def test_waiting_is_not_counted_as_work():
-    answer, milliseconds = measure.clocked(lambda: time.sleep(0.05) or 7)
+    answer, milliseconds = measure.time_call(lambda: time.sleep(0.05) or 7)
     assert answer == 7 and 0 <= milliseconds < 25
 
 

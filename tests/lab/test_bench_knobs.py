@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from patchlab.bench import effort, evidence, train
-from patchlab.bench.chart import Chart, Point, all_checks
-from patchlab.bench.paper import PIECE_MM, corners_mm, drawn_sheet
-from patchlab.bench.world import demo_problem
+from patchlab.bench.chart import Chart, ChartPoint, all_checks
+from patchlab.bench.demo_problem import demo_problem
+from patchlab.bench.paper_photos import PIECE_MM, corners_mm, draw_sheet
 from patchproof.base.intervals import Estimate
 from patchproof.base.settings import OptimizeSettings
 from patchproof.optimizer import expectation, loop
@@ -21,7 +21,7 @@ def quiet(stage, done, total):
 
 
 def point(cost, error, half=0.0, default=False):
-    return Point(f"{cost:g}", cost, Estimate(error, error - half, error + half, 9), default)
+    return ChartPoint(f"{cost:g}", cost, Estimate(error, error - half, error + half, 9), default)
 
 
 def checked(*points, **more):
@@ -58,7 +58,7 @@ def test_views_are_counted_as_the_loop_sees_them(problem, monkeypatch):
     monkeypatch.setattr(expectation, "score", lambda *a: seen.append(len(a[1])) or score(*a))
     monkeypatch.setattr(loop, "SELECT_AFTER", 6)
     monkeypatch.setattr(loop, "SELECT_VIEWS", 8)
-    train.trained(problem.with_training(OptimizeSettings(views=3, steps=2)), [2])
+    train.designs_after(problem.with_training(OptimizeSettings(views=3, steps=2)), [2])
     assert sum(seen) == loop.views_per_network(OptimizeSettings(views=3, steps=2))
 
 
@@ -66,9 +66,9 @@ def test_training_charts_have_one_default_and_its_real_settings(monkeypatch):
     usual = OptimizeSettings()
 
     def losses(problem, runs, effort, on_stage):
-        return {(run, end): [run.step_size] * effort.seeds for run in runs for end in train.ends_of(run, effort)}
+        return {(run, end): [run.step_size] * effort.seeds for run in runs for end in train.charted_ends(run, effort)}
 
-    monkeypatch.setattr(train, "trained_losses", losses)
+    monkeypatch.setattr(train, "train_and_judge", losses)
     charts = train.charts(True, quiet)
     for chart, name in ((next(charts), f"{usual.views}"), (next(charts), f"{usual.optimizer} {usual.step_size:g}")):
         (default,) = (p for points in chart.series.values() for p in points if p.default)
@@ -76,21 +76,21 @@ def test_training_charts_have_one_default_and_its_real_settings(monkeypatch):
             usual.changed(steps=120 // usual.views)
         )
     (*_, last) = chart.series.values()
-    assert [p.error.value for p in last] == pytest.approx([*train.QUICK_ADAM, *train.QUICK_SIGN])
+    assert [p.error.value for p in last] == pytest.approx([*train.QUICK_ADAM_STEP_SIZES, *train.QUICK_SIGN_STEP_SIZES])
 
 
 def test_designs_are_judged_on_the_same_new_conditions(problem, monkeypatch):
     monkeypatch.setattr(loop, "SELECT_AFTER", 6)
     monkeypatch.setattr(loop, "SELECT_VIEWS", 4)
-    run, effort = OptimizeSettings(views=3), train.Effort(6, 2, 4)
-    losses = train.trained_losses(problem, [run], effort, quiet)
+    run, effort = OptimizeSettings(views=3), train.TrainingEffort(6, 2, 4)
+    losses = train.train_and_judge(problem, [run], effort, quiet)
     assert list(losses) == [(run, 6)] and len(set(losses[run, 6])) == 2
-    assert losses == train.trained_losses(problem, [run], effort, quiet)
+    assert losses == train.train_and_judge(problem, [run], effort, quiet)
 
 
 @pytest.mark.parametrize("kind", ["flat", "lens", "rolled"])
 def test_pixels_and_paper_are_each_other_s_inverse(kind):
-    sheet, rng = drawn_sheet(kind, 1)
+    sheet, rng = draw_sheet(kind, 1)
     mm = rng.uniform(0, PIECE_MM, (50, 2))
     assert sheet.mm(sheet.px(mm)) == pytest.approx(mm, abs=1e-6)
     assert evidence.error_mm(sheet.px, sheet) == pytest.approx(0, abs=1e-9)
@@ -98,7 +98,7 @@ def test_pixels_and_paper_are_each_other_s_inverse(kind):
 
 
 def test_a_photograph_shows_the_paper_where_the_sheet_says():
-    found, (sheet, _) = evidence.corners_found("flat", 0), drawn_sheet("flat", 0)
+    found, (sheet, _) = evidence.find_sheet_corners("flat", 0), draw_sheet("flat", 0)
     assert found.keys() == corners_mm().keys()
     off = np.concatenate([found[i] - sheet.px(corners_mm()[i]) for i in found])
     assert np.linalg.norm(off, axis=1).max() < 0.2
@@ -106,7 +106,7 @@ def test_a_photograph_shows_the_paper_where_the_sheet_says():
 
 @pytest.mark.parametrize(("kind", "beaten"), [("lens", "robust plane"), ("rolled", "lens")])
 def test_exact_corners_of_bent_sheets_need_their_model(kind, beaten):
-    sheet, _ = drawn_sheet(kind, 2)
+    sheet, _ = draw_sheet(kind, 2)
     corners = {i: sheet.px(mm) for i, mm in corners_mm().items()}
     right, wrong = (evidence.error_mm(evidence.MODELS[name](corners), sheet) for name in ("what pays", beaten))
     assert right < wrong / 3

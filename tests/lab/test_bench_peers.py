@@ -14,7 +14,7 @@ from PIL import Image
 from patchlab.bench import methods, peers
 from patchlab.bench.chart import all_checks
 from patchlab.study.grid import scene_values
-from patchlab.study.record import bits
+from patchlab.study.record import hits_text
 from patchlab.study.study import Cell, Result, run_study
 from patchproof.base.errors import Refused
 from patchproof.optimizer import loop
@@ -57,22 +57,22 @@ def redness(pixels: np.ndarray) -> float:
 def test_a_pasted_design_covers_its_share_and_nothing_else(monkeypatch):
     photos = torch.full((6, 3, 200, 200), 0.25)
     # the longer side half of the photograph's, the other half of that, at any angle
-    made = methods.pasted(photos, torch.ones(3, 10, 20), (0.5, 0.5), np.random.default_rng(0))
+    made = methods.paste_designs(photos, torch.ones(3, 10, 20), (0.5, 0.5), np.random.default_rng(0))
     covered = (made - 0.25) / 0.75
     assert covered.sum((2, 3)) / 200**2 == pytest.approx(0.5 * 0.25, rel=0.01)
     assert covered.min() >= 0 and covered.max() == pytest.approx(1, abs=1e-6)
     assert len({tuple(one[0].nonzero()[0].tolist()) for one in covered}) == 6  # each at its own place
-    monkeypatch.setattr(methods, "ROLL_DEG", 0.0)
-    made = methods.pasted(photos[:1], torch.ones(3, 10, 20), (0.5, 0.5), np.random.default_rng(0))
+    monkeypatch.setattr(methods, "MAX_ROLL_DEG", 0.0)
+    made = methods.paste_designs(photos[:1], torch.ones(3, 10, 20), (0.5, 0.5), np.random.default_rng(0))
     rows, columns = (made[0, 0] > 0.625).numpy().nonzero()  # half white on a quarter
     assert (np.ptp(columns), np.ptp(rows)) == (pytest.approx(99, abs=1), pytest.approx(49, abs=1))
 
 
 def test_a_pasted_design_is_upright_and_keeps_its_colors(monkeypatch):
-    monkeypatch.setattr(methods, "ROLL_DEG", 0.0)
+    monkeypatch.setattr(methods, "MAX_ROLL_DEG", 0.0)
     design = torch.zeros(3, 2, 2)
     design[0, 0, 0], design[1, 0, 1], design[2, 1, 0] = 1, 1, 1  # red, green above blue, black
-    made = methods.pasted(torch.ones(1, 3, 64, 64), design, (1.0, 1.0), np.random.default_rng(0))[0]
+    made = methods.paste_designs(torch.ones(1, 3, 64, 64), design, (1.0, 1.0), np.random.default_rng(0))[0]
     corners = [made[:, y, x].tolist() for y in (15, 47) for x in (15, 47)]
     assert np.allclose(
         corners, [[1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, 0]], atol=0.05
@@ -81,7 +81,7 @@ def test_a_pasted_design_is_upright_and_keeps_its_colors(monkeypatch):
 
 def test_a_pasted_design_has_a_gradient_where_it_is_seen():
     design = torch.full((3, 8, 8), 0.5, requires_grad=True)
-    methods.pasted(torch.zeros(2, 3, 64, 64), design, (0.5, 0.6), np.random.default_rng(1)).sum().backward()
+    methods.paste_designs(torch.zeros(2, 3, 64, 64), design, (0.5, 0.6), np.random.default_rng(1)).sum().backward()
     assert design.grad is not None and (design.grad > 0).all()
 
 
@@ -92,7 +92,7 @@ def test_a_pasted_design_has_a_gradient_where_it_is_seen():
 def test_every_method_of_ours_goes_where_the_goal_is_for_no_more_than_the_budget(scene_file, goal, way):
     problem = set_problem(load_scene(red_scene(scene_file, goal)))
     passes = 4 * 4 + 8
-    assert methods.budget(problem) == passes
+    assert methods.pass_budget(problem) == passes
     for name in ("ours", "sign", "flat"):
         made = methods.METHODS[name](problem)
         assert made.passes == passes and way * redness(made.pixels) > 10, name
@@ -101,7 +101,7 @@ def test_every_method_of_ours_goes_where_the_goal_is_for_no_more_than_the_budget
 
 def test_signed_steps_are_the_paper_s(scene_file):
     problem = set_problem(load_scene(red_scene(scene_file, steps=2)))
-    made = methods.sign(problem)
+    made = methods.optimize_by_sign(problem)
     _, reserved = marker_image(problem.patch.scene.piece, problem.patch.printed_px)
     steps = (made.pixels[~reserved] / 255 - 0.5) / methods.SIGN_STEP
     assert np.abs(steps).max() == pytest.approx(2, abs=0.4)  # of two; codes are 0.4 of a step apart
@@ -110,7 +110,7 @@ def test_signed_steps_are_the_paper_s(scene_file):
 def test_photographs_of_the_bare_object_use_up_the_budget_in_whole_rounds(scene_file, monkeypatch):
     problem = set_problem(load_scene(red_scene(scene_file, steps=8)))
     for most, count in ((256, 40), (39, 20), (7, 6)):  # 8 × 4 + 8 passes; 6 rounds of 6 leave 4 of them
-        monkeypatch.setattr(methods, "PHOTOS", most)
+        monkeypatch.setattr(methods, "MAX_PHOTOS", most)
         photos = methods.bare_photos(problem)
         assert photos.shape == (count, 3, problem.training_px, problem.training_px)
 
@@ -151,12 +151,12 @@ def test_art_gets_the_same_photographs_the_target_and_the_design_s_size(scene_fi
     problem = set_problem(load_scene(red_scene(scene_file, steps=8)))
     np.random.seed(5)
     untouched = np.random.RandomState(5).random()
-    made = methods.art(problem)
+    made = methods.train_with_art(problem)
     assert np.random.random() == untouched and given.draw != untouched  # its own draws, and ours as before
     assert np.array_equal(given.x, 255 * methods.bare_photos(problem).numpy()) and given.x.max() > 2
     assert given.y.tolist() == [[1, 0]] * 40 and made.passes == 40 * given.options["max_iter"] == 40
     assert given.options["targeted"] is True and given.options["batch_size"] == 4
-    low, high = methods.pasted_shares(problem)
+    low, high = methods.paste_size_range(problem)
     assert (given.options["scale_min"], given.options["scale_max"]) == (low, high) and 0 < low < high <= 1
     codes = torch.full((1, 3, 64, 64), 255.0)
     assert torch.equal(given.network.model(codes), problem.classifiers[0].logits(codes / 255))
@@ -167,7 +167,7 @@ def test_art_gets_the_same_photographs_the_target_and_the_design_s_size(scene_fi
 def test_art_s_square_patch_is_squeezed_into_a_design_of_another_shape(scene_file, given):
     size = "width_mm = 120\nheight_mm = 60"
     problem = set_problem(load_scene(red_scene(scene_file, "deceive", steps=1, size=size)))
-    made, (width, height) = methods.art(problem), problem.patch.design_px
+    made, (width, height) = methods.train_with_art(problem), problem.patch.design_px
     assert given.options["patch_shape"] == (3, width, width) and width > height
     assert given.options["targeted"] is False
     assert made.pixels.shape[:2][::-1] == problem.patch.printed_px
@@ -183,10 +183,10 @@ def test_art_itself_goes_where_the_goal_is(scene_file):
     except Refused as missing:
         pytest.skip(str(missing))
     problem = set_problem(load_scene(red_scene(scene_file, steps=8)))
-    made = methods.art(problem)
+    made = methods.train_with_art(problem)
     assert made.passes == 72 and redness(made.pixels) > 10
     assert made.pixels.shape[:2][::-1] == problem.patch.printed_px
-    assert np.array_equal(made.pixels, methods.art(problem).pixels)
+    assert np.array_equal(made.pixels, methods.train_with_art(problem).pixels)
 
 
 def test_a_missing_art_is_said_before_anything_is_trained(scene_file, without_art, tmp_path):
@@ -233,7 +233,7 @@ def result_of(scene_file, network, seed, goal="assist", **hits):
     values = scene_values(scene_file.name, scene_file.parent, {"target": {"goal": goal}})
     values |= {"networks": [network], "network": network, "seed": seed}
     answers = {
-        "hits": {name: [bits(i < count for i in range(4))] for name, count in hits.items()},
+        "hits": {name: [hits_text(i < count for i in range(4))] for name, count in hits.items()},
         "passes": dict.fromkeys(("ours", "flat"), 100),
         "seconds": {"ours": 2.0, "flat": 3.0},
     }
@@ -274,8 +274,8 @@ def test_the_chart_holds_ours_against_the_front(scene_file):
 
 
 def test_the_benchmark_runs_on_the_demo_s_scene_without_art(without_art, monkeypatch):
-    monkeypatch.setattr(peers, "_QUICK_STEPS", 1)
-    monkeypatch.setattr(peers, "_QUICK_VIEWS", 2)
+    monkeypatch.setattr(peers, "QUICK_STEPS", 1)
+    monkeypatch.setattr(peers, "QUICK_VIEWS", 2)
     stages = []
     (chart,) = peers.charts(True, lambda *stage: stages.append(stage))
     assert [point.setting for point in chart.series["methods"]] == ["ours", "sign", "flat"]

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from patchlab.study.claims import mean, median, paired_means
+from patchlab.study.estimates import mean, median, paired_means
 
 
 def test_intervals_of_medians_are_order_statistics():

@@ -10,20 +10,20 @@ import pytest
 import torch
 
 from patchlab.study.study import run_study
-from patchlab.validation.envelope.axes import AXES, conditions_at, placed_at
-from patchlab.validation.envelope.fit import BEYOND
-from patchlab.validation.envelope.gains import gain_break, gains_of, has_effect
+from patchlab.validation.envelope.axes import AXES, conditions_at, scene_at
+from patchlab.validation.envelope.fit import BEYOND_SWEEP
+from patchlab.validation.envelope.gains import gain_break, gains_over_controls, has_effect
 from patchlab.validation.envelope.pages import figures
-from patchlab.validation.envelope.sweeps import EnvelopeSettings, cells
-from patchlab.validation.envelope.window import window
-from patchlab.validation.envelope.world import (
+from patchlab.validation.envelope.simulation import (
     Measurement,
-    _Stages,
-    measured,
-    open_world,
+    _StageCache,
+    measure_photos,
+    open_simulation,
     piece_at,
-    recognized,
+    recognize_target,
 )
+from patchlab.validation.envelope.sweeps import EnvelopeSettings, cells
+from patchlab.validation.envelope.window import piece_window
 from patchproof.base import geometry
 from patchproof.base.errors import Refused
 from patchproof.base.intervals import Estimate, paired_difference
@@ -44,7 +44,7 @@ def world(tmp_path_factory):
         patch.setattr("patchproof.optimizer.run.PROMISE_VIEWS", 8)
         patch.setattr("patchproof.optimizer.loop.SELECT_VIEWS", 4)
         optimize(folder / "scene.toml", folder / "run")
-    return open_world(folder / "run", None)
+    return open_simulation(folder / "run", None)
 
 
 def rows_of(path):
@@ -76,7 +76,7 @@ def test_tilt_is_the_angle_from_the_patch_s_axis_and_keeps_its_direction(world, 
 
 def test_curled_paper_keeps_its_lengths_and_its_middle(world):
     flat, radius = world.scene.placement, 60.0
-    bent = placed_at(world.scene, {"curl": radius}).placement
+    bent = scene_at(world.scene, {"curl": radius}).placement
     assert bent.center_mm == pytest.approx(flat.center_mm, abs=0.05)
     grid = bent.vertices_mm.reshape(33, 33, 3)
     # chords of 32 arcs: 2 R sin(w / 64 R) each
@@ -85,15 +85,15 @@ def test_curled_paper_keeps_its_lengths_and_its_middle(world):
     height = (bent.vertices_mm - flat.center_mm) @ flat.normal
     assert height.max() == pytest.approx(radius * (1 - np.cos(flat.size_mm[0] / 2 / radius))) and height.min() > -1e-9
     with pytest.raises(Refused, match="a flat card to curl"):
-        placed_at(replace(world.scene, placement=bent), {"curl": 50.0})
+        scene_at(replace(world.scene, placement=bent), {"curl": 50.0})
 
 
 def test_gap_moves_the_piece_along_its_normal_and_size_shrinks_it(world):
     flat = world.scene.placement
-    off = placed_at(world.scene, {"gap": 30.0}).placement
+    off = scene_at(world.scene, {"gap": 30.0}).placement
     assert off.center_mm - flat.center_mm == pytest.approx(30 * flat.normal)
     assert off.vertices_mm - flat.vertices_mm == pytest.approx(np.tile(30 * flat.normal, (4, 1)))
-    small = placed_at(world.scene, {"size": 0.5, "gap": 30.0}).placement
+    small = scene_at(world.scene, {"size": 0.5, "gap": 30.0}).placement
     assert np.ptp(small.vertices_mm, axis=0).max() == pytest.approx(flat.size_mm[0] / 2)
 
 
@@ -120,8 +120,8 @@ def test_the_gray_piece_is_the_printed_control_and_suffers_what_the_design_does(
 
 def test_a_window_shows_what_the_whole_photograph_shows_there(world, drawn):
     one = with_values(drawn[:1], noise=0.0, blur_px=0.0)
-    stage, shown = _Stages(world).at({}), piece_at(world, {}, 0)
-    frame = window(stage, one)
+    stage, shown = _StageCache(world).at({}), piece_at(world, {}, 0)
+    frame = piece_window(stage, one)
     (x, y), (width, height) = frame.origin_px, frame.size_px
     assert width * height < 800 * 600 / 2 and x % 16 == y % 16 == 0
     whole = photograph(stage, shown, one, (800, 600), jpeg=False)[..., y : y + height, x : x + width]
@@ -131,7 +131,7 @@ def test_a_window_shows_what_the_whole_photograph_shows_there(world, drawn):
 
 def test_measuring_works_at_the_easy_end_and_says_why_not_at_the_hard_one(world, drawn):
     points = [{}, {"tilt": 86.0}, {"blur": 12.0}, {"hidden": 4.0}]
-    plain, tilted, blurred, hidden = measured(world, points, drawn[:2])
+    plain, tilted, blurred, hidden = measure_photos(world, points, drawn[:2])
     assert all(one.status == "measured" and one.error_mm < 0.3 for one in plain)
     for row in (tilted, blurred, hidden):
         assert all(one.status != "measured" and one.code for one in row)
@@ -140,8 +140,8 @@ def test_measuring_works_at_the_easy_end_and_says_why_not_at_the_hard_one(world,
 
 def test_points_see_common_conditions_whatever_their_neighbors_are(world, drawn):
     points = [{"blur": 20.0}, {}, {"distance": 4000.0}, {"blur": 3.0}]
-    together = recognized(world, points, drawn)
-    alone = [recognized(world, [point], drawn) for point in points]
+    together = recognize_target(world, points, drawn)
+    alone = [recognize_target(world, [point], drawn) for point in points]
     assert list(together) == ["design", "bare", "gray"]
     for kind, hits in together.items():
         assert np.array_equal(hits, np.concatenate([each[kind] for each in alone]))
@@ -174,20 +174,20 @@ def test_a_gain_is_over_the_control_that_is_hardest_to_beat_at_that_point():
     design = np.array([[1] * 20, [1] * 20, [1] * 20], bool)
     bare = np.array([[0] * 20, [0] * 15 + [1] * 5, [1] * 20], bool)
     gray = np.array([[0] * 10 + [1] * 10, [0] * 20, [0] * 20], bool)
-    gains = gains_of(design, {"bare": bare, "gray": gray})
+    gains = gains_over_controls(design, {"bare": bare, "gray": gray})
     assert [gain.value for gain in gains] == [0.5, 0.75, 0.0] and [has_effect(gain) for gain in gains] == [1, 1, 0]
     assert (gains[0].low, gains[0].high) == pytest.approx(paired_difference(design[0].tolist(), gray[0].tolist())[1])
     # last that shows a gain and first that does not: of 20 conditions 5 more, and 3 more
-    assert has_effect(gains_of(design[:1], {"bare": bare[1:2] | (np.arange(20) >= 5)})[0])
-    assert not has_effect(gains_of(design[:1], {"bare": np.arange(20)[None] >= 3})[0])
-    assert not has_effect(gains_of(bare[:1], {"bare": design[:1]})[0])  # it does harm
+    assert has_effect(gains_over_controls(design[:1], {"bare": bare[1:2] | (np.arange(20) >= 5)})[0])
+    assert not has_effect(gains_over_controls(design[:1], {"bare": np.arange(20)[None] >= 3})[0])
+    assert not has_effect(gains_over_controls(bare[:1], {"bare": design[:1]})[0])  # it does harm
 
 
 def test_a_gain_ends_between_the_last_point_with_one_and_the_first_without():
     at, some, none = np.linspace(0, 1, 5), Estimate(0.3, 0.1, 0.5, 50), Estimate(0.1, 0.0, 0.2, 50)
     ends = gain_break([some, some, none, none, some], at)
     assert (ends.low, ends.value, ends.high, ends.rates) == (0.25, 0.375, 0.5, (0.3, 0.3))
-    assert gain_break([some] * 5, at).value == BEYOND and gain_break([none, *[some] * 4], at).value is None
+    assert gain_break([some] * 5, at).value == BEYOND_SWEEP and gain_break([none, *[some] * 4], at).value is None
 
 
 @pytest.fixture(scope="module")
@@ -213,7 +213,9 @@ def test_where_nothing_is_left_of_the_object_the_page_says_no_effect_whatever_is
     blue_run, tmp_path, monkeypatch
 ):
     unseen = Measurement("rejected", "too_few_markers", None)  # a search of noise for markers takes seconds
-    monkeypatch.setattr("patchlab.validation.envelope.sweeps.measured", lambda _, points, __: [[unseen]] * len(points))
+    monkeypatch.setattr(
+        "patchlab.validation.envelope.sweeps.measure_photos", lambda _, points, __: [[unseen]] * len(points)
+    )
     config, out = tmp_path / "envelope.toml", tmp_path / "out"
     config.write_text(
         f'run = "{blue_run}"\nn = 8\nphotos = 1\nmap_n = 4\nmap_photos = 1\n'

@@ -14,8 +14,8 @@ from PIL import Image
 
 from patchlab import cli
 from patchlab.harden.attacks import margin, survives_pgd
-from patchlab.harden.folder import HardenSettings, harden_images, tables, too_strong
-from patchlab.harden.harden import harden, moved, squares
+from patchlab.harden.harden_study import HardenSettings, attack_failed, harden_images, tables
+from patchlab.harden.hardening import center_squares, harden, image_change
 from patchlab.study.study import Cell, Result, Work, run_study
 from patchproof.base.errors import Refused
 from patchproof.base.validation import validate_model
@@ -36,7 +36,7 @@ def test_the_true_class_gains_inside_of_the_ball_and_nothing_else_moves(method, 
     photos = [noise(40, 70), noise(32, 32, 1)]
     labels = [[1, 0]]  # blue, red
     hardened = harden(photos, labels, [RED], method, epsilon, 10)
-    before, after = (margin(RED.network(squares(p, RED)), torch.tensor(labels[0])) for p in (photos, hardened))
+    before, after = (margin(RED.network(center_squares(p, RED)), torch.tensor(labels[0])) for p in (photos, hardened))
     assert (after < before).all()
     for photo, picture in zip(photos, hardened, strict=True):
         assert picture.shape == photo.shape and picture.dtype == np.uint8
@@ -64,19 +64,19 @@ def test_photographs_do_not_depend_on_their_company():
 
 def test_moved_is_zero_and_one_for_the_same_and_rms_is_the_root_mean_square():
     photo = noise(40, 50) // 2
-    assert moved(photo, photo) == pytest.approx((0, 1), abs=1e-6)
-    assert moved(photo, photo + 51)[0] == pytest.approx(0.2)
+    assert image_change(photo, photo) == pytest.approx((0, 1), abs=1e-6)
+    assert image_change(photo, photo + 51)[0] == pytest.approx(0.2)
     # by definition (Wang et al. 2004) flat pictures of means a and b have SSIM (2ab + C1) / (a² + b² + C1), C1 = 1e-4
     a, b = np.full((40, 40, 3), 51, np.uint8), np.full((40, 40, 3), 102, np.uint8)
-    assert moved(a, b)[1] == pytest.approx((2 * 0.08 + 1e-4) / (0.04 + 0.16 + 1e-4), abs=1e-4)
+    assert image_change(a, b)[1] == pytest.approx((2 * 0.08 + 1e-4) / (0.04 + 0.16 + 1e-4), abs=1e-4)
 
 
 def test_attacks_that_leave_more_than_weaker_ones_are_flagged():
     survivors = {("clean", 0.0): 9, ("fgsm", 0.01): 5, ("fgsm", 0.02): 6, ("pgd", 0.01): 4, ("pgd", 0.02): 5}
-    flagged = [condition for condition in survivors if too_strong(condition, survivors)]
+    flagged = [condition for condition in survivors if attack_failed(condition, survivors)]
     assert flagged == [("fgsm", 0.02), ("pgd", 0.02)]
-    assert too_strong(("pgd", 0.01), {("clean", 0.0): 9, ("fgsm", 0.01): 3, ("pgd", 0.01): 4})
-    assert not too_strong(("pgd", 0.01), {("fgsm", 0.02): 3, ("pgd", 0.01): 4})  # neither is the weaker
+    assert attack_failed(("pgd", 0.01), {("clean", 0.0): 9, ("fgsm", 0.01): 3, ("pgd", 0.01): 4})
+    assert not attack_failed(("pgd", 0.01), {("fgsm", 0.02): 3, ("pgd", 0.01): 4})  # neither is the weaker
 
 
 @pytest.fixture
@@ -114,7 +114,7 @@ def test_the_command_keeps_names_and_sizes_and_writes_a_table(folder, tmp_path, 
     assert all(row["hardened_n"] == "3" for row in rows)
     # what the table says of the clean images is what the files say
     written = [read_photo(out / name).srgb for name in ("a.jpg.png", "a.png.png", "b.png")]
-    truth = RED.network(squares(written, RED)).argmax(1).tolist()
+    truth = RED.network(center_squares(written, RED)).argmax(1).tolist()
     assert float(rows[0]["hardened"]) == pytest.approx(np.mean([a == b for a, b in zip(truth, [0, 1, 1], strict=True)]))
 
 
@@ -194,7 +194,7 @@ def test_settings_that_will_not_do(folder, changed, words):
         ("a.jpg,red\ngone.png,red", r"1 missing \(gone\.png\)"),
         ("a.jpg,red\na.jpg,blue", "twice"),
         ("a.jpg,green", "label that the network knows"),
-        ("file,label", "none"),
+        ("file,label", "a table without rows"),
     ],
 )
 def test_tables_that_will_not_do(folder, tmp_path, table, words):
@@ -214,7 +214,7 @@ def test_steps_that_fall_settle_where_the_loss_is_least():
     classifier = replace(RED, network=near)
     photo = np.full((32, 32, 3), 118, np.uint8)
     (picture,) = harden([photo], [[0]], [classifier], "pgd", 0.2, 40)
-    assert abs(squares([picture], classifier).mean().item() - 0.6) < 0.006
+    assert abs(center_squares([picture], classifier).mean().item() - 0.6) < 0.006
 
 
 def test_through_the_attack_steps_go_where_the_attacked_loss_falls():
@@ -228,7 +228,7 @@ def test_through_the_attack_steps_go_where_the_attacked_loss_falls():
     classifier = replace(RED, network=peaked)
     photo = np.full((32, 32, 3), round(0.62 * 255), np.uint8)
     near, far = (
-        squares(harden([photo], [[0]], [classifier], "pgd", 0.15, 40, through=through), classifier)
+        center_squares(harden([photo], [[0]], [classifier], "pgd", 0.15, 40, through=through), classifier)
         for through in (None, 0.05)
     )
     assert abs(near.mean().item() - 0.6) < 0.01 and far.mean().item() > 0.75

@@ -46,7 +46,7 @@ def test_only_troubles_that_cost_something_are_counted():
 def test_faded_dyes_keep_their_share_of_density_and_black_stays():
     srgb = np.array([[[0.9, 0.5, 0.5], [0.0, 0.0, 0.0], [0.4, 0.4, 0.4]]])
     before = linear_from_srgb(identity_printer().apply(as_tensor(srgb))[0].permute(1, 2, 0).numpy())
-    after = ledger_trials._faded(identity_printer(), np.full(3, 0.5), srgb)
+    after = ledger_trials._faded_light(identity_printer(), np.full(3, 0.5), srgb)
     assert after[0, 1:] == pytest.approx(np.maximum(before[0, 1:], 1e-3), rel=1e-3)
     ratio = np.log(after[0, 0, 0] / after[0, 0, 1]) / np.log(before[0, 0, 0] / before[0, 0, 1])
     assert ratio == pytest.approx(0.5, rel=1e-3)

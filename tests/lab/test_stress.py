@@ -9,20 +9,20 @@ import numpy as np
 import pytest
 
 from patchlab.paper import stress
-from patchlab.paper.stress import OcclusionSettings, SearchSettings, _empty_cells, occluded, worst_case
+from patchlab.paper.stress import OcclusionSettings, WorstCaseSettings, _empty_cells, find_worst_case, measure_occlusion
 from patchlab.paper.stress_map import (
-    LIGHT,
-    Axis,
+    LIGHT_FIELDS,
+    MapAxis,
     MapSettings,
-    axes_of,
-    clean,
-    in_cell,
-    map_of,
+    clean_responses,
+    map_axes,
+    measure_map,
     mesh_cells,
+    move_into_cell,
     worst_cells,
 )
 from patchlab.study.grid import GridSettings
-from patchlab.study.record import bits
+from patchlab.study.record import hits_text
 from patchlab.study.study import run_study
 from patchproof.base.errors import Refused
 from patchproof.base.goal import Goal
@@ -70,7 +70,7 @@ def few_views(monkeypatch):
 
 
 def losses_of(problem, conditions):
-    return clean(problem, conditions, problem.training_px).loss.mean(0)
+    return clean_responses(problem, conditions, problem.training_px).loss.mean(0)
 
 
 def rows_of(conditions, names):
@@ -82,10 +82,10 @@ def rows_of(conditions, names):
 
 def test_a_cell_moves_pose_and_light_as_far_as_they_lay_in_their_ranges(tmp_path):
     problem = problem_with(tmp_path)
-    both = axes_of(problem.scene.settings, MapSettings(light="ambient", pose_cells=3, light_cells=2))
+    both = map_axes(problem.scene.settings, MapSettings(light="ambient", pose_cells=3, light_cells=2))
     assert both[0].edges == pytest.approx((-60, -20, 20, 60)) and both[1].edges == pytest.approx((0, 0.3, 0.6))
     drawn = problem.scene.draw("select", 32)
-    there = in_cell(drawn, both, (2, 0))
+    there = move_into_cell(drawn, both, (2, 0))
     np.testing.assert_allclose(there.pose.azimuth_deg, 20 + (drawn.pose.azimuth_deg + 60) / 3)
     np.testing.assert_allclose(there.light.ambient, drawn.light.ambient / 2)
     others = [name for name in FIELDS if name not in ("azimuth_deg", "ambient")]
@@ -95,7 +95,7 @@ def test_a_cell_moves_pose_and_light_as_far_as_they_lay_in_their_ranges(tmp_path
 def test_an_axis_without_a_range_is_refused(tmp_path):
     settings = problem_with(tmp_path, view={"roll_deg": [3, 3]}).scene.settings
     with pytest.raises(Refused, match=r"a range of roll_deg .* got \[3, 3\]"):
-        axes_of(settings, MapSettings(pose="roll_deg"))
+        map_axes(settings, MapSettings(pose="roll_deg"))
 
 
 def test_the_worst_tenth_by_hand():
@@ -115,8 +115,8 @@ def test_a_map_shows_where_light_fails(tmp_path):
     dark = {"background": {"color": [0, 0, 0]}, "view": {"distance_mm": [330, 340], "look_at_jitter": 0}}
     light = {"ambient": [0.0, 1.2], "directional": [0, 0]}
     problem = problem_with(tmp_path, target=BRIGHT, light=light, camera={"exposure_ev": [0, 0]}, **dark)
-    both = axes_of(problem.scene.settings, MapSettings(light="ambient", pose_cells=2, light_cells=3))
-    hits, confidence, alone = map_of(problem, both, problem.scene.draw("select", 4))
+    both = map_axes(problem.scene.settings, MapSettings(light="ambient", pose_cells=2, light_cells=3))
+    hits, confidence, alone = measure_map(problem, both, problem.scene.draw("select", 4))
     assert hits.shape == confidence.shape == alone.shape == (2, 3, 4) and not alone.any()
     assert not hits[:, 0].any() and (confidence.mean((0, 2))[1:] > confidence.mean((0, 2))[:-1]).all()
     assert worst_cells(hits, confidence)[0][1] == 0
@@ -129,10 +129,10 @@ def test_cells_where_the_object_is_recognized_no_more_often_than_its_background_
     look, empty = {"view": view, "camera": {"exposure_ev": [0, 0]}}, {}
     for color in (0, 1):
         problem = problem_with(tmp_path, target=BRIGHT, light=light, background={"color": [color] * 3}, **look)
-        both = axes_of(problem.scene.settings, MapSettings(light="ambient", pose_cells=1, light_cells=8))
-        hits, _, alone = map_of(problem, both, problem.scene.draw("select", 4))
+        both = map_axes(problem.scene.settings, MapSettings(light="ambient", pose_cells=1, light_cells=8))
+        hits, _, alone = measure_map(problem, both, problem.scene.draw("select", 4))
         assert alone.all() == alone.any() == color
-        map_ = {"hits": [[bits(cell) for cell in hits[0]]], "alone": [[bits(cell) for cell in alone[0]]]}
+        map_ = {"hits": [[hits_text(cell) for cell in hits[0]]], "alone": [[hits_text(cell) for cell in alone[0]]]}
         empty[color] = _empty_cells(map_)
         assert hits[0, 7].all()
     assert (0, 0) in empty[0] and (0, 7) not in empty[0] and len(empty[1]) == 8
@@ -143,7 +143,7 @@ def test_cells_where_the_object_is_recognized_no_more_often_than_its_background_
 
 def test_the_black_square_that_hides_what_the_network_looks_at_is_the_worst(tmp_path):
     problem = problem_with(tmp_path, target=BRIGHT, light={"ambient": [1, 1]}, camera={"exposure_ev": [0, 0]})
-    found, picture = occluded(problem, OcclusionSettings(share=0.5, positions=3, n=8), 0)
+    found, picture = measure_occlusion(problem, OcclusionSettings(share=0.5, positions=3, n=8), 0)
     picture = as_pixels(picture)
     assert found["worst"] == [0, 0] and found["worst_again"] == "0" * 8
     # of the other corners none reaches the upper left quarter
@@ -157,19 +157,19 @@ def test_the_black_square_that_hides_what_the_network_looks_at_is_the_worst(tmp_
 def test_the_search_ends_in_the_dark_for_a_network_that_wants_brightness(tmp_path):
     """It begins with the worst of the first draws, never loses ground, and stays within the ranges."""
     problem = problem_with(tmp_path, target=BRIGHT, background={"color": [0, 0, 0]})
-    settings = SearchSettings(tries=8, rounds=3, draws=2, n=8)
-    best, found = worst_case(problem, LIGHT, settings, 0)
+    settings = WorstCaseSettings(tries=8, rounds=3, draws=2, n=8)
+    best, found = find_worst_case(problem, LIGHT_FIELDS, settings, 0)
     assert found["losses"] == sorted(found["losses"]) and len(found["losses"]) == 3
     condition, ranges = found["condition"], problem.scene.settings.light
     assert set(condition) == {"ambient", "directional", "light_azimuth_deg", "light_elevation_deg", "exposure_ev"}
     assert ranges.ambient[0] <= condition["ambient"] <= 0.2 and ranges.directional[0] <= condition["directional"]
     drawn = problem.scene.draw("select", 2 + 8, 0)
     first = [
-        losses_of(problem, with_values(drawn[:2], **{n: fields_of(drawn)[n][i : i + 1] for n in LIGHT})).mean()
+        losses_of(problem, with_values(drawn[:2], **{n: fields_of(drawn)[n][i : i + 1] for n in LIGHT_FIELDS})).mean()
         for i in range(2, 10)
     ]
     assert found["losses"][0] == pytest.approx(max(first)) and found["losses"][-1] > max(first)
-    assert all(best[name].shape[0] == 1 for name in LIGHT) and found["confidence"] < found["confidence_anywhere"]
+    assert all(best[name].shape[0] == 1 for name in LIGHT_FIELDS) and found["confidence"] < found["confidence_anywhere"]
 
 
 # ---------------------------------------------------------------------------------------------------- whole studies
@@ -225,4 +225,4 @@ def test_settings_that_will_not_do_are_refused(tmp_path):
         mesh_cells(GridSettings(scenes=("flat.toml",)), tmp_path)
     with pytest.raises(Refused, match="different names"):
         validate_model(GridSettings, {"scenes": ["a/s.toml", "b/s.toml"]}, "test")
-    assert len(Axis("x", (0.0, 1.0, 2.0))) == 2
+    assert len(MapAxis("x", (0.0, 1.0, 2.0))) == 2

@@ -17,14 +17,14 @@ import toy_studies as toy
 
 import patchlab
 from patchlab.study import study
-from patchlab.study.study import Work, carry_out, load_study, run_study
+from patchlab.study.study import Work, load_study, run_cells, run_study
 from patchproof.base.errors import Refused
 
 BASE = Path(__file__).parents[1]
 
 
 def carried_out(out, *numbers, **options):
-    return carry_out(toy.STUDY, toy.ToySettings(numbers=numbers), BASE, out, Work(**options))
+    return run_cells(toy.STUDY, toy.ToySettings(numbers=numbers), BASE, out, Work(**options))
 
 
 def contents(folder):
@@ -72,10 +72,10 @@ def test_resuming_does_what_failed_changed_or_is_missing_and_nothing_else(tmp_pa
         done.append(cell.name)
         return {"square": -1}
 
-    carry_out(replace(toy.STUDY, run=run), toy.ToySettings(numbers=(2, 3, 13)), BASE, tmp_path, Work(resume=True))
+    run_cells(replace(toy.STUDY, run=run), toy.ToySettings(numbers=(2, 3, 13)), BASE, tmp_path, Work(resume=True))
     assert done == ["n3", "n13"]
     changed = replace(toy.STUDY, run=run, cells=lambda s, b: [study.Cell("n2", {"number": 20})])
-    carry_out(changed, toy.ToySettings(numbers=(2, 3, 13)), BASE, tmp_path, Work(resume=True))
+    run_cells(changed, toy.ToySettings(numbers=(2, 3, 13)), BASE, tmp_path, Work(resume=True))
     assert done == ["n3", "n13", "n2"]
 
 
@@ -130,13 +130,13 @@ def test_every_study_is_listed_under_its_own_name_and_says_what_it_is_about():
     assert modules == set(study.STUDIES.values()), "list it in STUDIES"
     for name, module in study.STUDIES.items():
         assert load_study(name).name == name
-        assert re.fullmatch(r"[A-Z].{20,118}\.", study.first_line(module)), module
+        assert re.fullmatch(r"[A-Z].{20,118}\.", study.module_summary(module)), module
 
 
 def test_listing_the_studies_imports_none_of_them():
     code = (
-        "import sys; from patchlab.study.study import STUDIES, first_line\n"
-        "print(*map(first_line, STUDIES.values())); sys.exit('torch' in sys.modules)"
+        "import sys; from patchlab.study.study import STUDIES, module_summary\n"
+        "print(*map(module_summary, STUDIES.values())); sys.exit('torch' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
@@ -144,12 +144,12 @@ def test_listing_the_studies_imports_none_of_them():
 def test_a_kill_in_the_middle_and_more_workers_change_no_byte(tmp_path):
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     settings = toy.ToySettings(numbers=tuple(range(20, 32)), pause_s=0.2)
-    carry_out(toy.STUDY, settings, BASE, whole, Work(jobs=2))
+    run_cells(toy.STUDY, settings, BASE, whole, Work(jobs=2))
     code = (
         f"import sys; sys.path.insert(0, {str(BASE)!r})\n"
-        "import toy_studies as toy\nfrom pathlib import Path\nfrom patchlab.study.study import carry_out\n"
+        "import toy_studies as toy\nfrom pathlib import Path\nfrom patchlab.study.study import run_cells\n"
         f"settings = toy.ToySettings.model_validate_json({settings.model_dump_json()!r})\n"
-        f"carry_out(toy.STUDY, settings, Path({str(BASE)!r}), {str(killed)!r})"
+        f"run_cells(toy.STUDY, settings, Path({str(BASE)!r}), {str(killed)!r})"
     )
     process = subprocess.Popen([sys.executable, "-c", code])
     while len(list(killed.glob("cells/*.json"))) < 3:
@@ -158,5 +158,5 @@ def test_a_kill_in_the_middle_and_more_workers_change_no_byte(tmp_path):
     process.send_signal(signal.SIGKILL)
     process.wait()
     assert len(list(killed.glob("cells/*.json"))) < 12
-    carry_out(toy.STUDY, settings, BASE, killed, Work(resume=True))
+    run_cells(toy.STUDY, settings, BASE, killed, Work(resume=True))
     assert contents(killed) == contents(whole)

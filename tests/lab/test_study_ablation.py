@@ -7,7 +7,7 @@ import torch
 
 from patchlab.study.study import Cell, Result
 from patchlab.validation import ablation
-from patchlab.validation.ablation import ALL, PRINTER, AblationSettings, without
+from patchlab.validation.ablation import ALL_EFFECTS, PRINTER, AblationSettings, simplify_problem
 from patchproof.base.errors import Refused
 from patchproof.channel.printer import load_printer
 from patchproof.optimizer import expectation, loop
@@ -28,17 +28,17 @@ def seen(problem):
 
 
 def test_views_are_seen_without_the_effect_and_otherwise_alike(problem):
-    plain, less = seen(problem).conditions, seen(without(problem, "noise")).conditions
+    plain, less = seen(problem).conditions, seen(simplify_problem(problem, "noise")).conditions
     assert (plain.sensor.noise > 0).all() and (less.sensor.noise == 0).all()
     assert (plain.pose.azimuth_deg == less.pose.azimuth_deg).all() and (
         plain.sensor.exposure_ev == less.sensor.exposure_ev
     ).all()
-    both = seen(without(problem, "noise + exposure")).conditions
+    both = seen(simplify_problem(problem, "noise + exposure")).conditions
     assert (both.sensor.noise == 0).all() and (both.sensor.exposure_ev == 0).all()
 
 
 def test_without_the_printer_colors_are_shown_as_they_are_sent(problem):
-    subject = without(problem, PRINTER).subject
+    subject = simplify_problem(problem, PRINTER).subject
     green = torch.tensor([0.0, 1.0, 0.0])
     design = green[:, None, None].expand_as(subject.start())
     srgb = subject.appearance(design).srgb
@@ -49,7 +49,7 @@ def test_without_the_printer_colors_are_shown_as_they_are_sent(problem):
 
 def test_views_without_it_are_looked_at_in_the_same_way(problem):
     drawn, shown = problem.scene.draw("evaluate", 2), problem.subject.appearance(problem.subject.start())
-    less = without(problem, "noise")
+    less = simplify_problem(problem, "noise")
     for side_px in (problem.training_px, problem.figure_px):
         by_hand = problem.see(shown, with_values(drawn, noise=0.0), side_px)
         assert torch.equal(expose(less.see(shown, drawn, side_px), shown), expose(by_hand, shown))
@@ -63,7 +63,7 @@ def test_training_never_meets_it(problem, monkeypatch):
         return score(problem, pictures, conditions, *more)
 
     monkeypatch.setattr(expectation, "score", noting)
-    next(loop.steps(without(problem, "noise")))
+    next(loop.steps(simplify_problem(problem, "noise")))
     assert len(met) == problem.scene.settings.optimize.views and not any(met)
 
 
@@ -72,15 +72,19 @@ def test_a_scene_in_which_it_is_off_is_left_out(tmp_path):
     toml(tmp_path / "off.toml", camera__noise=[0, 0])
     settings = AblationSettings(scenes=("on.toml", "off.toml"), effects=("noise", "noise + exposure"))
     cells = [(cell.values["name"], cell.values["effect"]) for cell in ablation.cells(settings, tmp_path)]
-    assert cells == [*(("on", name) for name in (ALL, *settings.effects)), ("off", ALL), ("off", "noise + exposure")]
+    assert cells == [
+        *(("on", name) for name in (ALL_EFFECTS, *settings.effects)),
+        ("off", ALL_EFFECTS),
+        ("off", "noise + exposure"),
+    ]
 
 
 @pytest.mark.parametrize(
-    ("effect", "says"), [("motion blur", "one where it is off"), ("smell", "this kind of scene has")]
+    ("effect", "says"), [("motion blur", "a scene in which it is off"), ("smell", "this kind of scene has")]
 )
 def test_an_effect_that_is_not_there_is_refused(problem, effect, says):
     with pytest.raises(Refused, match=says):
-        without(problem, effect)
+        simplify_problem(problem, effect)
 
 
 def result_by_hand(seed, effect, **counts):
@@ -98,7 +102,7 @@ def test_what_an_effect_earned_and_moved_by_hand():
     counts = ((0, 8, 6, 6), (1, 9, 5, 6), (2, 8, 6, 10), (3, 9, 5, 10))  # seed, with it, without, promised
     results = []
     for seed, whole, less, promised in counts:
-        results.append(result_by_hand(seed, ALL, modeled=whole))
+        results.append(result_by_hand(seed, ALL_EFFECTS, modeled=whole))
         results.append(result_by_hand(seed, "noise", modeled=less, promised=promised))
     earned, missed, designs = ablation.tables(settings, results)
     ((effect, groups, rate, confidence, *traced),) = earned.rows

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from patchlab.study.study import run_study
-from patchlab.validation.layouts import Layout, laid_out
+from patchlab.validation.layouts import Layout, with_layout
 from patchproof.optimizer import loop
 from patchproof.scene.patch_scene import require_patch
 from patchproof.scene.scene import make_scene
@@ -27,7 +27,7 @@ def scene():
 
 
 def reserved(scene, **layout) -> np.ndarray:
-    return marker_image(laid_out(scene, Layout(**layout)).piece, (240, 240))[1]
+    return marker_image(with_layout(scene, Layout(**layout)).piece, (240, 240))[1]
 
 
 def test_a_layout_reserves_what_it_says(scene):
@@ -38,8 +38,8 @@ def test_a_layout_reserves_what_it_says(scene):
     assert (usual <= reserved(scene, markers=8)).all()
     frame = reserved(scene, markers=8, framed=True)
     assert (usual <= frame).all() and not frame[120, 120] and frame[120, 2]
-    assert len(laid_out(scene, Layout(markers=8)).piece.markers) == 8
-    assert laid_out(scene, Layout(size=0.7)).piece.marker_mm == pytest.approx(0.7 * scene.piece.marker_mm)
+    assert len(with_layout(scene, Layout(markers=8)).piece.markers) == 8
+    assert with_layout(scene, Layout(size=0.7)).piece.marker_mm == pytest.approx(0.7 * scene.piece.marker_mm)
 
 
 def test_cells_are_trained_shown_and_photographed(tmp_path, monkeypatch, a_small_search):

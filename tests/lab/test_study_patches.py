@@ -12,10 +12,10 @@ import torch
 from PIL import Image
 
 from patchlab.paper import patch2d, patch3d
-from patchlab.paper.image_classes import ImageClass, class_scene, classes_of, scene_settings, write_renders
-from patchlab.study.claims import clustered, clustered_mean
+from patchlab.paper.image_classes import ImageClass, class_scene, list_classes, scene_settings, write_renders
+from patchlab.study.estimates import cluster_mean, clustered_mean
 from patchlab.study.grid import scene_values
-from patchlab.study.record import bits
+from patchlab.study.record import hits_text
 from patchlab.study.study import Cell, Result, run_study
 from patchproof.base.errors import Refused
 from patchproof.base.geometry import local_scale
@@ -47,8 +47,8 @@ def test_the_cluster_interval_is_that_of_the_mean_and_repeats():
 
 def test_few_clusters_have_no_interval():
     values = [0.1] * MIN_CLUSTERS
-    assert clustered(values).low == pytest.approx(0.1) and clustered(values).n == MIN_CLUSTERS
-    assert clustered(values[1:]) == pytest.approx(0.1) and clustered([]) is None
+    assert cluster_mean(values).low == pytest.approx(0.1) and cluster_mean(values).n == MIN_CLUSTERS
+    assert cluster_mean(values[1:]) == pytest.approx(0.1) and cluster_mean([]) is None
     with pytest.raises(ValueError, match="at least 5 clusters, got 4"):
         clustered_mean(values[1:])
 
@@ -109,7 +109,7 @@ def test_renders_show_the_bare_object_and_never_an_evaluated_view(scene_file, tm
 
 def result3d(scene, model, seed, **kinds):
     """A result whose kinds were recognized in so many of four conditions."""
-    hits = {kind: [bits(i < kinds.get(kind, 0) for i in range(4))] for kind in patch3d.KINDS}
+    hits = {kind: [hits_text(i < kinds.get(kind, 0) for i in range(4))] for kind in patch3d.KINDS}
     record = {"hits": hits, "confidence": {kind: [[0.5] * 4] for kind in patch3d.KINDS}}
     answers = {
         **record,
@@ -193,7 +193,7 @@ def test_classes_are_those_of_the_table_that_have_images_and_of_the_scenes(scene
     config = two_classes(tmp_path, scene_file)
     settings = validate_model(patch2d.Patch2dSettings, read_toml(config), "study.toml")
     renders = [scene_values(file, tmp_path) for file in settings.renders]
-    classes = classes_of(settings.images, settings.labels, renders, tmp_path)
+    classes = list_classes(settings.images, settings.labels, renders, tmp_path)
     assert [one.label for one in classes] == ["mug", 2, "carton"]
     assert [cell.values["target"] for cell in patch2d.cells(settings, tmp_path)] == ["mug", 2, "carton"]
     with pytest.raises(Refused, match='"cartoon": did you mean "carton"'):
@@ -219,7 +219,7 @@ def test_a_2d_patch_has_its_size_in_the_networks_pixels_and_no_frame(scene_file,
     assert min(widths) >= 16 - 1e-6 and max(widths) <= 25 + 1e-6  # 20 times 0.8 to 1.25
     assert np.median(widths) == pytest.approx(20, rel=0.05)
     problem = patch2d.flat_problem(settings, tmp_path, scene, classifier, one)
-    shown = patch2d.shown_by_kind(problem, problem.subject.pixels(torch.full((3, 60, 60), 0.25)))
+    shown = patch2d.pasted_by_kind(problem, problem.subject.pixels(torch.full((3, 60, 60), 0.25)))
     assert shown["patch"].srgb.shape == shown["gray"].srgb.shape == (120, 120, 3)  # printed pixels, and no frame
     largest = replace(classifier, input_px=30)
     with pytest.raises(Refused, match="pixels before a network of 30"):

@@ -32,9 +32,9 @@ def result(scene, *sessions, hits=320, n=400):
 
 def test_an_interval_holds_up_to_its_ends_and_not_beyond():
     low, high = rate_posterior([1] * 320 + [0] * 80, [1] * 400).count_interval([40])
-    sessions = promises.counted(result("a", *((hits, 40) for hits in (low - 1, low, high, high + 1)), (0, 0)))
+    sessions = promises.count_sessions(result("a", *((hits, 40) for hits in (low - 1, low, high, high + 1)), (0, 0)))
     assert [session.held() for session in sessions] == [False, True, True, False]
-    assert sessions[0].interval() == (low, high) == sessions[0].interval(alone=True)
+    assert sessions[0].interval() == (low, high) == sessions[0].interval(independent=True)
 
 
 def test_shares_and_biases_by_hand():

@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 
 from patchlab.study.study import Result, load_study, run_study
-from patchlab.validation import real
-from patchlab.validation.board_fit import BoardFit, edge_of, fit_board, white_noise
-from patchlab.validation.known_boards import BoardSettings, Pose, find_pose
+from patchlab.validation import real_photos
+from patchlab.validation.board_fit import BoardFit, edge_profile, fit_board, white_noise
+from patchlab.validation.marker_boards import BoardPose, BoardSettings, find_board
 from patchproof.base.errors import Refused
 from patchproof.base.validation import validate_model
 from patchproof.photo.rejection import PhotoRejected
@@ -71,9 +71,9 @@ BOARDS = {"grid": grid(), "charuco": grid(kind="charuco", rows=4, columns=5)}
 
 
 @lru_cache(maxsize=2)
-def fitted(kind: str = "grid") -> tuple[Pose, BoardFit]:
+def fitted(kind: str = "grid") -> tuple[BoardPose, BoardFit]:
     srgb = photograph(kind)[0]
-    pose = find_pose(srgb, BOARDS[kind])
+    pose = find_board(srgb, BOARDS[kind])
     return pose, fit_board(srgb, pose)
 
 
@@ -92,13 +92,13 @@ def test_known_figures_come_back(kind):
 
 def test_an_edge_is_as_wide_as_its_blur_and_pixel_say():
     srgb, _ = photograph(noise=0.0)
-    pose = find_pose(srgb, grid())
+    pose = find_board(srgb, grid())
     fit = fit_board(srgb, pose)
     wide = 2.563 * np.sqrt(
         BLUR_PX**2 + 1 / 12
     )  # 10 to 90 % of a Gaussian are 2.563 sigma; a pixel's own variance is 1/12
     for picture in (srgb, fit.rendered()):
-        width, overshoot = edge_of(fit.paper_seen(picture), fit.prints, pose.module_px)
+        width, overshoot = edge_profile(fit.paper_seen(picture), fit.prints, pose.module_px)
         assert width == pytest.approx(wide, rel=0.08) and overshoot == pytest.approx(0, abs=0.02)
 
 
@@ -107,7 +107,7 @@ def test_a_lens_that_bends_a_little_is_followed():
     rows, columns = np.mgrid[0 : SIZE[1], 0 : SIZE[0]].astype(np.float32)
     bowed = columns + 0.8 * ((rows - SIZE[1] / 2) / SIZE[1] * 2) ** 2
     srgb = cv2.remap(srgb, bowed, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    fit = fit_board(srgb, find_pose(srgb, grid()))
+    fit = fit_board(srgb, find_board(srgb, grid()))
     assert fit.bend_px > 0.1 and residual(srgb, fit) < 4
 
 
@@ -126,17 +126,17 @@ def test_the_wrong_print_leaves_much():
 def test_boards_that_are_not_there_or_not_flat_are_told():
     srgb, _ = photograph()
     with pytest.raises(PhotoRejected, match="0 markers of DICT_4X4_50"):
-        find_pose(srgb, grid(dictionary="DICT_4X4_50"))
+        find_board(srgb, grid(dictionary="DICT_4X4_50"))
     with pytest.raises(PhotoRejected, match="no plane fits"):
-        find_pose(srgb, grid(gap=0.6))
+        find_board(srgb, grid(gap=0.6))
     with pytest.raises(PhotoRejected, match="overexposed"):
-        fit_board(np.full_like(srgb, 255), find_pose(srgb, grid()))
+        fit_board(np.full_like(srgb, 255), find_board(srgb, grid()))
 
 
 def test_only_what_was_found_counts():
     srgb, (whole, _) = photograph("charuco")[0].copy(), fitted("charuco")
     srgb[:80, :90] = 128  # hides the first markers
-    part = find_pose(srgb, BOARDS["charuco"])
+    part = find_board(srgb, BOARDS["charuco"])
     assert part.found < whole.found
     assert not part.mask(srgb.shape)[:60, :70].any() and part.mask(srgb.shape).sum() < whole.mask(srgb.shape).sum()
     assert residual(srgb, fit_board(srgb, part)) < 4
@@ -160,7 +160,7 @@ def test_the_study_end_to_end(tmp_path):
     folder.mkdir()
     for name, picture in (("a", photograph()[0]), ("b", np.full((240, 320, 3), 200, np.uint8))):
         cv2.imwrite(str(folder / f"{name}.png"), picture[..., ::-1])
-    config = tmp_path / "real.toml"
+    config = tmp_path / "real_photos.toml"
     config.write_text('[boards.desk]\nphotos = ["photos"]\nkind = "grid"\nrows = 3\ncolumns = 4\ngap = 0.25\n')
     finished = run_study("real", config, tmp_path / "out")
     tables = {table.name: table for table in finished.tables}
@@ -175,16 +175,16 @@ def test_the_study_end_to_end(tmp_path):
 
 
 def test_medians_by_hand():
-    settings = real.RealSettings(boards={"desk": grid()})
-    figures = dict.fromkeys((*real._FIGURES, "clipped"), 1.0) | {"markers": "12 of 12", "left_out": None}
+    settings = real_photos.RealSettings(boards={"desk": grid()})
+    figures = dict.fromkeys((*real_photos._FIGURES, "clipped"), 1.0) | {"markers": "12 of 12", "left_out": None}
     change = {"label": "x", "changed": False, "confidence": -0.1, "log_rms": 0.5}
-    moved = {"label": "x", "confidence": 0.5} | dict.fromkeys(real._CHANGES, change)
-    cell = real.Cell("photo_000", {"board": "desk", "photo": "a.png"})
+    moved = {"label": "x", "confidence": 0.5} | dict.fromkeys(real_photos._CHANGES, change)
+    cell = real_photos.Cell("photo_000", {"board": "desk", "photo": "a.png"})
     results = [
         Result(cell, figures | {"noise": noise, "networks": {"builtin": moved}}, Path())
         for noise in (None, 0.1, 0.3, 0.2)
     ]
-    boards, networks = real.tables(settings, results)[:2]
+    boards, networks = real_photos.tables(settings, results)[:2]
     assert ("desk", "noise at white", 0.2, 0.1, 0.3, 3) in boards.rows
     assert networks.rows[0] == ("desk", "builtin", "our rendering", 4, 0, 0.1, 0.5)
 
@@ -193,9 +193,9 @@ def test_real_photographs(data):
     board = validate_model(
         BoardSettings, {"photos": ["x"], "kind": "grid", "rows": 5, "columns": 4, "gap": 0.13}, "the test"
     )
-    srgb = real.read_photo(data / "markers" / "grid_6x6" / "aruco_data_0.jpg").srgb
-    pose = find_pose(srgb, board)
+    srgb = real_photos.read_photo(data / "markers" / "grid_6x6" / "aruco_data_0.jpg").srgb
+    pose = find_board(srgb, board)
     fit = fit_board(srgb, pose)
     assert pose.found == 20 and pose.misfit_px is not None and pose.misfit_px < 0.4
     assert residual(srgb, fit) < 14 and fit.blur_px < 0.8 and 0.03 < fit.black.mean() < 0.15
-    assert load_study("real") is real.STUDY
+    assert load_study("real") is real_photos.STUDY

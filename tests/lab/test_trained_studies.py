@@ -10,12 +10,12 @@ import pytest
 import torch
 
 from patchlab.paper import deceive, transfer
-from patchlab.paper.sides import from_sides, mean_color, three_views
-from patchlab.study.claims import mean
+from patchlab.paper.object_views import mean_color, views_from, views_in_drawn_light
+from patchlab.study.estimates import mean
 from patchlab.study.grid import short_name
 from patchlab.study.record import Record
 from patchlab.study.study import Cell, Result, run_study
-from patchlab.study.trained import TrainedSettings, trained_cells, verdict
+from patchlab.study.trained_designs import TrainedSettings, gain_word, trained_cells
 from patchproof.base.errors import Refused
 from patchproof.base.intervals import Estimate
 from patchproof.base.validation import validate_model
@@ -211,10 +211,10 @@ def test_the_mean_color_of_an_object_of_one_color_is_that_color(tmp_path):
 def test_fixed_views_keep_their_pose_and_change_their_light(tmp_path):
     written(tmp_path, "carton")
     problem = set_problem(load_scene(tmp_path / "texture.toml"))
-    views = three_views(problem, 4)
+    views = views_in_drawn_light(problem, 4)
     assert sorted(set(views.pose.azimuth_deg.round(6))) == pytest.approx([-80 / 3, 0, 80 / 3])  # sixths of [-40, 40]
     assert len(set(views.light.directional)) == 12 and len(set(views.pose.distance_mm)) == 1
-    still = from_sides(problem, np.array([0.0, 90.0]))
+    still = views_from(problem, np.array([0.0, 90.0]))
     assert not still.light.directional.any() and not still.sensor.noise.any() and (still.light.ambient == 1).all()
 
 
@@ -267,7 +267,7 @@ def test_pairs_are_those_of_seeds_that_both_have():
     gain, _ = one.gain(other, "net")
     assert gain.n == 4 and gain.value == 0.75 and one.level("net")[0].n == 8
     assert one.gain(other) == one.gain(other, "net")  # the only network need not be named
-    assert one.gain(Record([], "x"), "net") == (None, None) and verdict(None) == "not measured"
+    assert one.gain(Record([], "x"), "net") == (None, None) and gain_word(None) == "not measured"
 
 
 def test_means_have_students_interval():

@@ -1,1 +1,1 @@
-"""Speed against accuracy of every knob."""
+"""Benchmarks: speed against accuracy of every setting."""

@@ -1,6 +1,6 @@
-"""A small page with a color chart, to be photographed without a template or a PDF: many printers have theirs.
+"""A small page with a color chart, photographed without a template or a PDF, so that many printers can have one.
 
-In: how many swatches, and what a printer shows of colors. Out: the page's manifest, and the page as light.
+In: a number of swatches, and a printer's function from sRGB to light. Out: the page's manifest, the page as light.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _GAP_MM = 0.4
 
 
 def chart_manifest(count: int) -> Manifest:
-    """A small page with `count` swatches in the middle, its colors and their order as those of the printed sheets."""
+    """The manifest of a page with `count` swatches in the middle, colored and ordered like those of printed sheets."""
     x, y, width, height = _CHART_MM
     columns = math.ceil(math.sqrt(count * width / height))
     side = min(width / columns, height / math.ceil(count / columns))
@@ -34,7 +34,7 @@ def chart_manifest(count: int) -> Manifest:
         {"rect_mm": (*cell, side - _GAP_MM, side - _GAP_MM), "srgb": colors[index], "page": 1}
         for cell, index in zip(cells, order, strict=True)
     ]
-    markers = [manifest_marker(square_marker(7 + i, at, MARKER_MM)) for i, at in enumerate(_MARKERS_MM)]
+    markers = [manifest_marker(square_marker(7 + i, corner, MARKER_MM)) for i, corner in enumerate(_MARKERS_MM)]
     head = {
         "version": 2,
         "sheet_id": "CHART00000",
@@ -43,12 +43,12 @@ def chart_manifest(count: int) -> Manifest:
         "design": None,
         "promise": None,
     }
-    where = {"cut_mm": (100.0, 6.0, 1.0, 1.0), "ruler_mm": (100.0, 100.0), "settings": {}}
-    return Manifest.model_validate(head | where | {"markers": markers, "chart": swatches})
+    rest = {"cut_mm": (100.0, 6.0, 1.0, 1.0), "ruler_mm": (100.0, 100.0), "settings": {}}
+    return Manifest.model_validate(head | rest | {"markers": markers, "chart": swatches})
 
 
 def printed_page(manifest: Manifest, shows: PrintFunction) -> np.ndarray:
-    """The page as light H×W×3 at `PX_PER_MM`, with some writing beside the chart, as sheets have."""
+    """The printed page as light H×W×3 at `PX_PER_MM`, with lines of text beside the chart as on sheets."""
     width, height = (round(side * PX_PER_MM) for side in manifest.page_mm)
     page = np.full((height, width, 3), 255, np.uint8)
     for marker, code in zip(manifest.markers, marker_cells(DICTIONARY, [m.id for m in manifest.markers]), strict=True):
@@ -56,9 +56,9 @@ def printed_page(manifest: Manifest, shows: PrintFunction) -> np.ndarray:
         _fill(
             page, (*marker.corners_mm[0], MARKER_MM, MARKER_MM), 255 * cv2.resize(code, (side, side), interpolation=0)
         )
-    for line, at in enumerate((14, 20, 26, 124, 131, 138)):
-        where = (30 * PX_PER_MM, at * PX_PER_MM)
-        cv2.putText(page, f"{line} what stands beside a chart is not white paper", where, 0, 0.9, (0, 0, 0), 2)
+    for line, y_mm in enumerate((14, 20, 26, 124, 131, 138)):
+        position = (30 * PX_PER_MM, y_mm * PX_PER_MM)
+        cv2.putText(page, f"{line} what stands beside a chart is not white paper", position, 0, 0.9, (0, 0, 0), 2)
     for swatch in manifest.chart:
         _fill(page, swatch.rect_mm, codes_from_srgb(np.array(swatch.srgb)))
     return page_light(page, shows)

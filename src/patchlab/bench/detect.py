@@ -1,6 +1,6 @@
-"""The knobs of detection: at which size the search starts, how corners are refined, how large photographs are.
+"""Benchmark detection: the size at which the search starts, corner refinement, and the size of photographs.
 
-In: photographs of flat paper. Out: a chart by photo size: milliseconds per photograph against the error of the
+In: photographs of flat paper. Out: a chart per photo size, of milliseconds per photograph against the error of the
 design's corners.
 """
 
@@ -12,11 +12,12 @@ from functools import partial
 
 import numpy as np
 
-from patchlab.bench.chart import Chart, Check, Point, Progress
-from patchlab.bench.measure import clocked
-from patchlab.bench.paper import DESIGN_MM, Sheet, corners_mm, drawn_sheet, photographed
-from patchlab.study.claims import median
+from patchlab.bench.chart import Chart, ChartPoint, Check
+from patchlab.bench.measure import time_call
+from patchlab.bench.paper_photos import DESIGN_MM, MarkerCorners, Sheet, corners_mm, draw_sheet, photograph_paper
+from patchlab.study.estimates import median
 from patchproof.base.geometry import apply_homography, rect_corners
+from patchproof.base.progress import Progress
 from patchproof.photo.detect import COARSEST_PX, full_region, pyramid_levels, search_level
 from patchproof.photo.known_page import find_sheet
 from patchproof.photo.rectify import fit_page
@@ -25,19 +26,18 @@ from patchproof.report.tables import Table
 from patchproof.sheets.markers import DICTIONARY, aruco_dictionary
 
 SIZES_PX = ((1600, 1200), (2400, 1800), (4000, 3000))
-COARSEST = (500, COARSEST_PX, 2000)
-ASIDE_DEG = 50.0
-MOST_MS = 333.0  # 12 megapixels, three a second
+START_SIDES_PX = (500, COARSEST_PX, 2000)
+WIDE_AZIMUTH_DEG = 50.0
+MAX_MILLISECONDS = 333.0  # 12 megapixels, three a second
 
-Corners = dict[int, np.ndarray]
-Find = Callable[[np.ndarray, int], Corners]
-Shot = tuple[np.ndarray, Sheet]  # a photograph, and where its millimeters truly lie
+CornerFinder = Callable[[np.ndarray, int], MarkerCorners]
+KnownPhoto = tuple[np.ndarray, Sheet]  # a photograph, and the sheet that it shows
 
 
 @dataclass(frozen=True)
-class Trial:
+class DetectionTrial:
     """Milliseconds per photograph, all errors of the design's corners in px (infinite without a fit), and the share of
-    markers that was found.
+    markers found.
     """
 
     milliseconds: list[float]
@@ -46,25 +46,25 @@ class Trial:
 
 
 def charts(quick: bool, progress: Progress) -> Iterator[Chart]:
-    """Start size and refinement, one chart per photo size."""
+    """Chart start size and refinement, one chart per photo size."""
     count = 3 if quick else 12
     for number, size_px in enumerate(SIZES_PX):
-        yield _levels_chart([shoot(size_px, seed) for seed in range(count)], size_px)
+        yield _levels_chart([photograph_sheet(size_px, seed) for seed in range(count)], size_px)
         progress("detect", number + 1, len(SIZES_PX))
 
 
-def _levels_chart(shots: list[Shot], size_px: tuple[int, int]) -> Chart:
+def _levels_chart(shots: list[KnownPhoto], size_px: tuple[int, int]) -> Chart:
     megapixels, points, shares = round(size_px[0] * size_px[1] / 1e6), [], []
-    for coarsest_px in COARSEST:
-        for name, find in (("fitted", find_fitted), ("OpenCV's", find_plain)):
-            trial, setting = tried(shots, find, coarsest_px), f"{coarsest_px} px, {name}"
+    for coarsest_px in START_SIDES_PX:
+        for name, find in (("fitted", find_fitted_corners), ("OpenCV's", find_opencv_corners)):
+            trial, setting = try_finder(shots, find, coarsest_px), f"{coarsest_px} px, {name}"
             cost, error = median(trial.milliseconds), median(trial.errors_px)
-            points.append(Point(setting, cost, error, coarsest_px == COARSEST_PX and find is find_fitted))
+            points.append(ChartPoint(setting, cost, error, coarsest_px == COARSEST_PX and find is find_fitted_corners))
             shares.append((setting, trial.share))
     default = next(point for point in points if point.default)
-    checks = [Check("px of corner error by default", default.at[1], 0.1)]
+    checks = [Check("px of corner error by default", default.center[1], 0.1)]
     if size_px == SIZES_PX[-1]:
-        checks.append(Check("milliseconds by default", default.at[0], MOST_MS))
+        checks.append(Check("milliseconds by default", default.center[0], MAX_MILLISECONDS))
     return Chart(
         name=f"levels_{megapixels}mp",
         title=f"Detection in photographs of {megapixels} MP: start size and refinement",
@@ -78,19 +78,19 @@ def _levels_chart(shots: list[Shot], size_px: tuple[int, int]) -> Chart:
     )
 
 
-def shoot(size_px: tuple[int, int], seed: int) -> Shot:
-    """One photograph of flat paper from a fixed seed."""
-    sheet, rng = drawn_sheet("flat", seed, size_px, ASIDE_DEG)
-    return photographed(sheet, rng), sheet
+def photograph_sheet(size_px: tuple[int, int], seed: int) -> KnownPhoto:
+    """A photograph of flat paper, drawn from the seed, with its sheet."""
+    sheet, rng = draw_sheet("flat", seed, size_px, WIDE_AZIMUTH_DEG)
+    return photograph_paper(sheet, rng), sheet
 
 
-def find_fitted(srgb: np.ndarray, coarsest_px: int) -> Corners:
-    """Corners as patchproof takes them."""
+def find_fitted_corners(srgb: np.ndarray, coarsest_px: int) -> MarkerCorners:
+    """Find corners as patchproof does."""
     return find_sheet(srgb, frozenset(corners_mm()), corners_mm(), DICTIONARY, coarsest_px).corners_px
 
 
-def find_plain(srgb: np.ndarray, coarsest_px: int) -> Corners:
-    """Corners as OpenCV refines them on the level that first shows each marker."""
+def find_opencv_corners(srgb: np.ndarray, coarsest_px: int) -> MarkerCorners:
+    """Find corners as OpenCV refines them on the pyramid level that first shows each marker."""
     quads: dict[int, list[np.ndarray]] = {}
     for level in pyramid_levels(srgb, full_region(srgb), coarsest_px):
         search_level(srgb, full_region(srgb), level, aruco_dictionary(DICTIONARY), quads)
@@ -99,18 +99,18 @@ def find_plain(srgb: np.ndarray, coarsest_px: int) -> Corners:
     return {i: quads[i][0] for i in quads if i in corners_mm()}
 
 
-def tried(shots: list[Shot], find: Find, coarsest_px: int) -> Trial:
-    """A way to find corners on all photographs."""
+def try_finder(shots: list[KnownPhoto], find: CornerFinder, coarsest_px: int) -> DetectionTrial:
+    """Try a corner finder on all photographs."""
     milliseconds, errors, markers = [], [], 0
     for photo, sheet in shots:
-        corners, taken = clocked(partial(find, photo, coarsest_px))
-        milliseconds.append(taken)
+        corners, ms = time_call(partial(find, photo, coarsest_px))
+        milliseconds.append(ms)
         markers += len(corners)
-        errors.append(_errors(corners, sheet))
-    return Trial(milliseconds, np.concatenate(errors), markers / (len(shots) * len(corners_mm())))
+        errors.append(_corner_errors_px(corners, sheet))
+    return DetectionTrial(milliseconds, np.concatenate(errors), markers / (len(shots) * len(corners_mm())))
 
 
-def _errors(corners: Corners, sheet: Sheet) -> np.ndarray:
+def _corner_errors_px(corners: MarkerCorners, sheet: Sheet) -> np.ndarray:
     design = rect_corners(DESIGN_MM)
     try:
         fit = fit_page(corners, corners_mm())

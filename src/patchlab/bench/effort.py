@@ -1,9 +1,8 @@
-"""The whole tool: what a draft, the default and three times its effort take, and how good their designs are.
+"""Benchmark whole runs: time and quality of a draft, the default, and three times its effort.
 
-In: five of the package's own objects before the built-in classifier, in the demo's hard conditions. Out: one chart, and
+In: five of the package's objects, the built-in classifier, and the demo's hard conditions. Out: one chart, and
 a table of seconds and promises. A run is timed from its scene to the promise with controls, in one process on one
-thread, so that its seconds compare with those of its other efforts. The designs of an object are judged in the same
-fresh conditions.
+thread, so that efforts compare. All designs of an object are judged in the same fresh conditions.
 """
 
 from __future__ import annotations
@@ -15,10 +14,11 @@ from tempfile import TemporaryDirectory
 from time import perf_counter
 from typing import Any
 
-from patchlab.bench.chart import Chart, Point, Progress
-from patchlab.bench.measure import clocked
+from patchlab.bench.chart import Chart, ChartPoint
+from patchlab.bench.measure import time_call
 from patchproof.app.demo import SCENE
 from patchproof.base.intervals import Estimate, rate
+from patchproof.base.progress import Progress
 from patchproof.base.settings import OptimizeSettings, SceneSettings
 from patchproof.base.validation import validate_model
 from patchproof.base.workers import use_threads
@@ -32,8 +32,8 @@ from patchproof.report.tables import Table
 from patchproof.scene.interface import Scene
 from patchproof.scene.scene import build_scene
 
-# By label, all from above: the primitive, its length, how far the piece is off its middle, and its size, in mm.
-OBJECTS = {
+# By label: the primitive, its length, the piece's offset from its middle, and the piece's size, in mm.
+OBJECTS_BY_LABEL = {
     "box truck": ("box_truck", 400, 45, 147),
     "carton": ("carton", 300, 0, 140),
     "chair": ("chair", 450, 0, 140),
@@ -41,31 +41,31 @@ OBJECTS = {
     "table lamp": ("table_lamp", 450, 0, 90),
 }
 DEFAULT = "default"
-# By name the steps, and the views of the promise (None: as many as the scene's half width needs).
+# By name: steps, and views of the promise (None: as many as the scene's half width needs).
 EFFORTS = {"draft": DRAFT_EFFORT, DEFAULT: (OptimizeSettings().steps, None), "thorough": THOROUGH_EFFORT}
 QUICK_EFFORTS = {"draft": DRAFT_EFFORT, DEFAULT: (2 * DRAFT_EFFORT[0], 2 * DRAFT_EFFORT[1])}
 
 
 def charts(quick: bool, progress: Progress) -> Iterator[Chart]:
-    """The one chart."""
-    labels = list(OBJECTS)[:1] if quick else list(OBJECTS)
+    """Chart the efforts on five objects, quick: two efforts on one."""
+    labels = list(OBJECTS_BY_LABEL)[:1] if quick else list(OBJECTS_BY_LABEL)
     yield effort_chart(labels, QUICK_EFFORTS if quick else EFFORTS, 100 if quick else 400, progress)
 
 
 def effort_chart(
     labels: list[str], efforts: Mapping[str, tuple[int, int | None]], judged: int, progress: Progress
 ) -> Chart:
-    """Each effort's seconds beside the default's against the share of `judged` views that its design misses."""
+    """Seconds of each effort over the default's, against the share of fresh views in which its design fails."""
     series, rows = {}, []
     for label in labels:
         runs = {}
         for name, (steps, views) in efforts.items():
-            runs[name] = _timed_run(_scene(label, steps), views)
+            runs[name] = _timed_run(object_scene(label, steps), views)
             progress("runs", len(series) * len(efforts) + len(runs), len(labels) * len(efforts))
-        missed = _missed({name: run for name, (run, _) in runs.items()}, judged)
+        missed = _missed_shares({name: run for name, (run, _) in runs.items()}, judged)
         seconds = {name: taken for name, (_, taken) in runs.items()}
         series[label] = [
-            Point(name, seconds[name] / seconds[DEFAULT], missed[name], name == DEFAULT) for name in efforts
+            ChartPoint(name, seconds[name] / seconds[DEFAULT], missed[name], name == DEFAULT) for name in efforts
         ]
         for name, (run, taken) in runs.items():
             low, high = run.promise.interval
@@ -83,8 +83,9 @@ def effort_chart(
     )
 
 
-def _scene(label: str, steps: int) -> Scene:
-    primitive, length_mm, off_mm, size_mm = OBJECTS[label]
+def object_scene(label: str, steps: int) -> Scene:
+    """The demo's scene with one of `OBJECTS_BY_LABEL` and this number of optimizer steps."""
+    primitive, length_mm, off_mm, size_mm = OBJECTS_BY_LABEL[label]
     settings: dict[str, Any] = tomllib.loads(SCENE)
     settings["object"] |= {"mesh": f"primitive:{primitive}", "length_mm": length_mm}
     settings["patch"] |= {"offset_mm": [0, off_mm], "width_mm": size_mm, "height_mm": size_mm}
@@ -95,14 +96,13 @@ def _scene(label: str, steps: int) -> Scene:
 
 def _timed_run(scene: Scene, views: int | None) -> tuple[Run, float]:
     with TemporaryDirectory() as folder, use_threads(1):
-        run, ms = clocked(
+        run, ms = time_call(
             lambda: optimize_scene(scene, Path(folder) / "run", promise=PromiseOptions(views)), perf_counter
         )
         return run, ms / 1000
 
 
-def _missed(runs: dict[str, Run], judged: int) -> dict[str, Estimate]:
-    """By name the share of the same fresh views in which each run's design is not recognized."""
+def _missed_shares(runs: dict[str, Run], judged: int) -> dict[str, Estimate]:
     problem = set_problem(next(iter(runs.values())).scene)
     shown = {name: problem.subject.appearance(from_pixels(run.design), "design") for name, run in runs.items()}
     answers = responses(problem, shown, problem.scene.draw("evaluate", judged))

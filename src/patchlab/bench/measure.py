@@ -1,7 +1,7 @@
-"""How benchmarks measure: times taken in turn within one run, their ratios, and the machine.
+"""Measure time: calls in turn within one run, ratios of their times, and the machine.
 
-In: calls. Out: seconds and ratios. A machine's seconds mean little elsewhere, so that times are compared only with
-times of the same run.
+In: calls. Out: milliseconds and ratios. Seconds of one machine mean little on another, so times are compared only
+within a run.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from patchlab.study.claims import median
+from patchlab.study.estimates import median
 from patchproof.base.intervals import Estimate
 from patchproof.base.progress import Advance, no_advance
 
 Name = TypeVar("Name", bound=Hashable)
-Answer = TypeVar("Answer")
+ReturnValue = TypeVar("ReturnValue")
 
 
-def machine() -> dict[str, Any]:
-    """What the figures depend on beside the code."""
+def machine_details() -> dict[str, Any]:
+    """Everything besides the code that times depend on: processor, cores, threads, versions, date."""
     import torch
 
     return {
@@ -43,19 +43,17 @@ def machine() -> dict[str, Any]:
     }
 
 
-def describe(about: Mapping[str, Any]) -> str:
-    """The machine in one line, for the corner of a chart."""
+def machine_line(about: Mapping[str, Any]) -> str:
+    """One line about the machine, for the corner of a chart."""
     threads = f"{about['threads']} thread{'' if about['threads'] == 1 else 's'} of {about['cores']} cores"
     return f"{about['processor']}, {threads}, torch {about['torch']}, {about['date']}"
 
 
-def in_turn(
-    calls: Mapping[Name, Callable[[], Answer]],
-    rounds: int,
-    advance: Advance = no_advance,
-) -> dict[Name, list[Answer]]:
-    """What each call returns in each of some rounds, all calls in turn in every round; a round before them warms up."""
-    answers: dict[Name, list[Answer]] = {name: [] for name in calls}
+def call_in_turn(
+    calls: Mapping[Name, Callable[[], ReturnValue]], rounds: int, advance: Advance = no_advance
+) -> dict[Name, list[ReturnValue]]:
+    """By name the results of each call in `rounds` rounds; every round makes all calls in turn; one before warms up."""
+    answers: dict[Name, list[ReturnValue]] = {name: [] for name in calls}
     for number in range(rounds + 1):
         for name, call in calls.items():
             answers[name].append(call())
@@ -63,37 +61,34 @@ def in_turn(
     return {name: values[1:] for name, values in answers.items()}
 
 
-def timed(calls: Mapping[Name, Callable[[], object]], rounds: int) -> dict[Name, np.ndarray]:
-    """Wall milliseconds of each call in `rounds` rounds of `in_turn`."""
-    told = in_turn({name: partial(clocked, call, time.perf_counter) for name, call in calls.items()}, rounds)
-    return {name: np.array([ms for _, ms in values]) for name, values in told.items()}
+def time_calls(calls: Mapping[Name, Callable[[], object]], rounds: int) -> dict[Name, np.ndarray]:
+    """Wall milliseconds of each call, one per round of `call_in_turn`."""
+    results = call_in_turn({name: partial(time_call, call, time.perf_counter) for name, call in calls.items()}, rounds)
+    return {name: np.array([ms for _, ms in values]) for name, values in results.items()}
 
 
-def clocked(call: Callable[[], Answer], clock: Callable[[], float] = time.process_time) -> tuple[Answer, float]:
-    """What a call returns, and its milliseconds; of the processor, where other work on the machine does not count, if
-    no other clock is given.
-    """
+def time_call(
+    call: Callable[[], ReturnValue], clock: Callable[[], float] = time.process_time
+) -> tuple[ReturnValue, float]:
+    """(the call's result, milliseconds); by default processor time, which other work on the machine leaves alone."""
     begin = clock()
     return call(), 1000 * (clock() - begin)
 
 
-def ratio(times: Mapping[Name, np.ndarray], a: Name, b: Name) -> Estimate:
-    """How many times as long `a` took as `b`: the median over rounds, each with its own ratio."""
+def time_ratio(times: Mapping[Name, np.ndarray], a: Name, b: Name) -> Estimate:
+    """Time of `a` over time of `b`: the median of the rounds' ratios."""
     return median(times[a] / times[b])
 
 
-def said_by(source: Path, code: str, *arguments: str) -> tuple[str, Any]:
-    """(the short commit, the JSON in the last line that `code` prints) in a process of its own, which imports from the
-    `src` folder of a checkout.
-    """
+def run_in_checkout(source: Path, code: str, *arguments: str) -> tuple[str, Any]:
+    """Run code that imports from a checkout's `src`: (short commit, JSON in the last line that it prints)."""
     command, environment = [sys.executable, "-c", code, *arguments], {**os.environ, "PYTHONPATH": str(source.resolve())}
-    said = subprocess.run(command, env=environment, stdout=subprocess.PIPE, check=True).stdout
+    output = subprocess.run(command, env=environment, stdout=subprocess.PIPE, check=True).stdout
     commit = subprocess.run(["git", "-C", source, "rev-parse", "--short", "HEAD"], stdout=subprocess.PIPE, text=True)
-    return commit.stdout.strip(), json.loads(said.splitlines()[-1])
+    return commit.stdout.strip(), json.loads(output.splitlines()[-1])
 
 
 def _processor() -> str:
-    """The processor's name, which Linux keeps in a file of its own."""
     info = Path("/proc/cpuinfo")
     lines = info.read_text(encoding="utf-8").splitlines() if info.is_file() else []
     named = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]

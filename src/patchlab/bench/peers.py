@@ -1,12 +1,11 @@
-"""Our designs beside those of other tools and recipes, on the same piece, for as many passes and in the same views.
+"""Compare our designs with those of other tools and recipes: same piece, as many passes, same views.
 
 In: scene files with meshes, networks, seeds; for the benchmark, the demo's scene. A cell is one of each: every method
-makes a design for the scene's piece (`bench.methods`), then all hang in it under conditions of the evaluate stream,
-beside the bare object and gray. Out: rates, gains over the best control, ours minus each, passes and seconds; pictures.
+makes a design for the scene's piece (`bench.methods`), and all are shown under conditions of the evaluate stream,
+beside the bare object and gray. Out: rates, gains over the best control, ours minus each, passes, seconds, pictures.
 
-A gain counts in the direction of the goal: with `deceive`, a rate that falls. Unlike in other studies the tables hold
-times, which differ from run to run: seconds of one core, with all that a method prepares but without the network's
-loading.
+A gain counts in the direction of the goal: with `deceive`, a falling rate. Unlike other studies, this one has tables
+with times, which differ from run to run: seconds of one core, without loading the network.
 """
 
 from __future__ import annotations
@@ -21,18 +20,28 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from patchlab.bench.chart import Chart, Point, Progress
-from patchlab.bench.measure import clocked
+from patchlab.bench.chart import Chart, ChartPoint
+from patchlab.bench.measure import time_call
 from patchlab.bench.methods import METHODS, load_art
 from patchlab.paper.patch3d import patch_cells
-from patchlab.study.claims import clustered, median, paired_means
+from patchlab.study.estimates import cluster_mean, median, paired_means
 from patchlab.study.figures import picture_sheet
-from patchlab.study.grid import Count, GridSettings, Seeds, grouped, of_values, problem_of, who, with_tables
-from patchlab.study.pictures import contact_sheet, enlarged, photographs
-from patchlab.study.record import gain_of, hardest, rate_of, recorded
+from patchlab.study.grid import (
+    GridSettings,
+    PositiveInt,
+    Seeds,
+    by_values,
+    cell_key,
+    group_by,
+    problem_of,
+    with_changes,
+)
+from patchlab.study.pictures import contact_sheet, enlarge_design, photographs
+from patchlab.study.record import gain_of, hardest_control, rate_of, to_record
 from patchlab.study.study import Cell, Result, Study
 from patchproof.app.demo import demo_scene
 from patchproof.base.errors import Refused
+from patchproof.base.progress import Progress
 from patchproof.base.workers import use_threads
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.promise import pictures_with_controls
@@ -45,72 +54,72 @@ if TYPE_CHECKING:
 
 Peer = Literal["sign", "flat", "art"]
 PEERS: tuple[Peer, ...] = ("sign", "flat", "art")
-PEERS_ALWAYS: tuple[Peer, ...] = ("sign", "flat")  # those that need no extra
+PEERS_WITHOUT_EXTRA: tuple[Peer, ...] = ("sign", "flat")  # those that need no extra
 CONTROLS = ("bare", "gray")
 _TILE_PX = 192
-_QUICK_STEPS, _QUICK_VIEWS = 30, 40
+QUICK_STEPS, QUICK_VIEWS = 30, 40
 
 
 class PeersSettings(GridSettings):
-    """How long designs are trained stands in each scene's [optimize]; every method has as many passes."""
+    """Scenes, networks, seeds and peers; each scene's [optimize] sets the passes of every method."""
 
     seeds: Seeds = (0, 1, 2)  # of the scenes' draws
-    # What ours is held against: signed steps; a patch pasted flat; that of ART (`pip install "patchproof[lab]"`).
+    # Compared with ours: signed steps; a patch pasted flat; that of ART (`pip install "patchproof[lab]"`).
     peers: Annotated[tuple[Peer, ...], Field(min_length=1)] = PEERS
-    n: Count = 400  # conditions per cell, of the evaluate stream
+    n: PositiveInt = 400  # conditions per cell, of the evaluate stream
 
     @property
     def methods(self) -> tuple[str, ...]:
-        """Ours and its peers."""
+        """Names of our method and its peers."""
         return ("ours", *self.peers)
 
 
 def cells(settings: PeersSettings, base: Path) -> list[Cell]:
     """A cell per scene, network and seed."""
     if "art" in settings.peers:
-        load_art()  # refused before hours of other methods
+        load_art()  # a refusal comes before hours of other methods
     return patch_cells(settings, base)
 
 
 def run(settings: PeersSettings, base: Path, cell: Cell) -> dict[str, Any]:
-    """Every method's design for one object, network and seed, in the same views."""
+    """Make every method's design for one object, network and seed, and show them in the same views."""
     problem = problem_of(base, cell.values)
-    made = {name: clocked(partial(METHODS[name], problem)) for name in settings.methods}
+    made = {name: time_call(partial(METHODS[name], problem)) for name in settings.methods}
     pixels = {name: design.pixels for name, (design, _) in made.items()}
     controls = pictures_with_controls(problem, pixels["ours"], CONTROLS)
     things = {name: controls[name] for name in CONTROLS}
     things |= {name: problem.subject.appearance(from_pixels(each, problem.device)) for name, each in pixels.items()}
     conditions = problem.scene.draw("evaluate", settings.n)
     view = conditions[problem.scene.facing(conditions)][:1]
-    hung = [photographs(problem, things[name], view, _TILE_PX)[0] for name in pixels]
+    on_object = [photographs(problem, things[name], view, _TILE_PX)[0] for name in pixels]
     return {
-        **recorded(responses(problem, things, conditions)),
+        **to_record(responses(problem, things, conditions)),
         "passes": {name: design.passes for name, (design, _) in made.items()},
         "seconds": {name: milliseconds / 1000 for name, (_, milliseconds) in made.items()},
-        f"{cell.name}.png": contact_sheet([[enlarged(each, _TILE_PX) for each in pixels.values()], hung]),
+        f"{cell.name}.png": contact_sheet([[enlarge_design(each, _TILE_PX) for each in pixels.values()], on_object]),
         **{f"{cell.name}-{name}.png": png(each) for name, each in pixels.items()},
     }
 
 
 def tables(settings: PeersSettings, results: Sequence[Result]) -> list[Table]:
-    """Pooled, and cell by cell."""
+    """Tables of pooled results, and of every cell."""
     return [_pooled(settings, results), _by_cell(settings, results)]
 
 
 def _pooled(settings: PeersSettings, results: Sequence[Result]) -> Table:
     rows = []
     for name in settings.methods:
-        behind = [gain_of(result, "ours", name) for result in results]
+        leads = [gain_of(result, "ours", name) for result in results]
         by_pair = [
             float(np.mean([gain_of(result, "ours", name) for result in group]))
-            for group in grouped(results, of_values("name", "network")).values()
+            for group in group_by(results, by_values("name", "network")).values()
         ]
         rows.append(
             (
                 name,
                 float(np.mean([rate_of(result, name) for result in results])),
-                clustered([gain_of(result, name, hardest(result, CONTROLS)) for result in results]),
-                *((None, None) if name == "ours" else (clustered(behind), clustered(by_pair))),
+                cluster_mean([gain_of(result, name, hardest_control(result, CONTROLS)) for result in results]),
+                *((None, None) if name == "ours" else (cluster_mean(leads), cluster_mean(by_pair))),
                 round(float(np.mean([result.answers["passes"][name] for result in results]))),
                 float(np.mean([result.answers["seconds"][name] for result in results])),
             )
@@ -127,13 +136,13 @@ def _pooled(settings: PeersSettings, results: Sequence[Result]) -> Table:
 
 def _by_cell(settings: PeersSettings, results: Sequence[Result]) -> Table:
     names = (*CONTROLS, *settings.methods)
-    rows = tuple((*who(result), *(rate_of(result, name) for name in names)) for result in results)
+    rows = tuple((*cell_key(result), *(rate_of(result, name) for name in names)) for result in results)
     return Table("cells", "Rates, cell by cell", ("object", "network", "seed", *names), rows)
 
 
 def figures(settings: PeersSettings, results: Sequence[Result]) -> list[Drawing]:
-    """Ours against each peer by cell, and the designs of each pair's first seed."""
-    firsts = [group[0] for group in grouped(results, of_values("name", "network")).values()]
+    """A scatter plot of ours against each peer, and pictures of designs (first seeds)."""
+    firsts = [group[0] for group in group_by(results, by_values("name", "network")).values()]
     return [
         Drawing(
             "scatter", "Ours against each peer, a point per cell", partial(_scatter, settings, results), (4.4, 4.2)
@@ -163,19 +172,19 @@ def _scatter(settings: PeersSettings, results: Sequence[Result], figure: Figure)
 STUDY = Study("peers", PeersSettings, cells, run, tables, figures)
 
 
-# The benchmark: the same on the demo's scene
+# The benchmark: this study on the demo's scene
 
 
 def charts(quick: bool, progress: Progress) -> Iterator[Chart]:
-    """Every method's time against its error on the demo's scene; ART where it is installed."""
+    """Chart every method's time against its error on the demo's scene; ART only where it is installed."""
     with TemporaryDirectory() as folder:
-        base, peers = Path(folder), PEERS if _has_art() else PEERS_ALWAYS
-        seeds, n = (range(2), _QUICK_VIEWS) if quick else (range(5), 400)
+        base, peers = Path(folder), PEERS if _has_art() else PEERS_WITHOUT_EXTRA
+        seeds, n = (range(2), QUICK_VIEWS) if quick else (range(5), 400)
         settings = PeersSettings(scenes=(demo_scene(base).name,), seeds=tuple(seeds), peers=peers, n=n)
         results = []
         for cell in cells(settings, base):
             if quick:
-                cell = replace(cell, values=with_tables(dict(cell.values), {"optimize": {"steps": _QUICK_STEPS}}))
+                cell = replace(cell, values=with_changes(dict(cell.values), {"optimize": {"steps": QUICK_STEPS}}))
             with use_threads(1):
                 results.append(Result(cell, run(settings, base, cell), base))
             progress("cells", len(results), len(settings.seeds))
@@ -183,13 +192,13 @@ def charts(quick: bool, progress: Progress) -> Iterator[Chart]:
 
 
 def peers_chart(settings: PeersSettings, results: Sequence[Result]) -> Chart:
-    """Seconds of each method, relative to ours, against the share of unseen views that its design loses."""
+    """Seconds of each method over ours, against the share of unseen views in which its design fails."""
     losses = np.array([[1 - rate_of(result, name) for name in settings.methods] for result in results])
     points = []
     for name, loss in zip(settings.methods, paired_means(losses), strict=True):
         seconds = [result.answers["seconds"] for result in results]
         cost = median([each[name] / each["ours"] for each in seconds])
-        points.append(Point(name, cost, loss, name == "ours"))
+        points.append(ChartPoint(name, cost, loss, name == "ours"))
     missing = "" if "art" in settings.peers else ' ART is not installed (`pip install "patchproof[lab]"`): left out.'
     return Chart(
         name="demo",

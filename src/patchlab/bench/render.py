@@ -1,6 +1,6 @@
-"""How large training's views have to be: a step's time against how far confidences lie from photographs'.
+"""Benchmark the size of training views: a step's time against the error of confidences.
 
-In: the benchmarks' world. Out: one chart.
+In: the demo's scene and a design for it. Out: one chart.
 """
 
 from __future__ import annotations
@@ -11,11 +11,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from patchlab.bench.chart import Chart, Point, Progress
-from patchlab.bench.measure import ratio, timed
-from patchlab.bench.world import design_for_demo
+from patchlab.bench.chart import Chart, ChartPoint
+from patchlab.bench.demo_problem import optimize_demo_design
+from patchlab.bench.measure import time_calls, time_ratio
 from patchproof.base.intervals import student_mean
 from patchproof.base.output import image_pixels
+from patchproof.base.progress import Progress
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import Problem
 from patchproof.optimizer.responses import ask_networks
@@ -25,17 +26,17 @@ from patchproof.report.tables import Table
 from patchproof.reprints.mounted_sheet import take_photo
 from patchproof.scene.conditions import Conditions
 
-SIDES_PX = (96, 128, 192, 224, 384)  # and the default's
+SIDES_PX = (96, 128, 192, 224, 384)  # besides the default's
 
 
 def charts(quick: bool, progress: Progress) -> Iterator[Chart]:
-    """The one chart."""
-    problem, design = design_for_demo(80 if quick else 160, progress)
+    """Chart the sides of training views."""
+    problem, design = optimize_demo_design(80 if quick else 160, progress)
     yield resolution_chart(problem, design, 6 if quick else 40, 2 if quick else 15, progress)
 
 
 def resolution_chart(problem: Problem, trained: Tensor, views: int, rounds: int, progress: Progress) -> Chart:
-    """Sides at which views are rendered against whole photographs of the same conditions, JPEG files and all."""
+    """Compare views rendered at several sides with full photographs, JPEG files, of the same conditions."""
     shown = problem.patch.appearance(trained)
     conditions, (classifier,), (indices,) = problem.scene.draw("select", views), problem.classifiers, problem.indices
 
@@ -56,13 +57,13 @@ def resolution_chart(problem: Problem, trained: Tensor, views: int, rounds: int,
             photo = image_pixels(take_photo(problem.stage, shown, conditions[i : i + 1]))
             truth.append(confidence(from_pixels(photo)[None])[0])
             progress("photographs", i + 1, views)
-    times, points, rows = timed({side: lambda side=side: step(side) for side in sides}, rounds), [], []
+    times, points, rows = time_calls({side: lambda side=side: step(side) for side in sides}, rounds), [], []
     for side in sides:
         with torch.no_grad():
-            off = confidence(pictures(side, shown, conditions)) - truth
-        cost, is_default = ratio(times, side, problem.training_px), side == problem.training_px
-        points.append(Point(f"{side} px", cost, student_mean(np.abs(off)), is_default))
-        rows.append((f"{side} px", student_mean(off)))
+            errors = confidence(pictures(side, shown, conditions)) - truth
+        cost, is_default = time_ratio(times, side, problem.training_px), side == problem.training_px
+        points.append(ChartPoint(f"{side} px", cost, student_mean(np.abs(errors)), is_default))
+        rows.append((f"{side} px", student_mean(errors)))
     photo_px = problem.scene.settings.camera.photo_px
     return Chart(
         name="resolution",

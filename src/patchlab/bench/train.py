@@ -1,8 +1,8 @@
-"""The knobs of training: views per step, optimizer and step size.
+"""Benchmark training: views per step, optimizer and step size.
 
-In: the demo's scene. Out: a chart per knob. Designs are compared on conditions of the evaluate stream, which neither
-trains nor selects. The cost of training is counted in views that the network sees, those of the selection set
-included; what one of them takes is `render`'s business.
+In: the demo's scene. Out: two charts. Designs are compared on conditions of the evaluate stream, which neither
+trains nor selects. Cost is the number of views that the network sees, selection included; `bench.render`
+measures the time of a view.
 """
 
 from __future__ import annotations
@@ -13,26 +13,27 @@ from dataclasses import dataclass
 import numpy as np
 from torch import Tensor
 
-from patchlab.bench.chart import Chart, Point, Progress
-from patchlab.bench.world import demo_problem
-from patchlab.study.claims import paired_means
+from patchlab.bench.chart import Chart, ChartPoint
+from patchlab.bench.demo_problem import demo_problem
+from patchlab.study.estimates import paired_means
+from patchproof.base.progress import Progress
 from patchproof.base.settings import OptimizeSettings
 from patchproof.optimizer.loop import SELECT_AFTER, SELECT_VIEWS, State, is_selection_step, steps, views_per_network
 from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.problem import Problem
 from patchproof.optimizer.responses import responses
 
-VIEWS, QUICK_VIEWS = (2, 4, 8, 12, 24), (2, 4, 12)
-ADAM, QUICK_ADAM = (0.0075, 0.015, 0.03, 0.06, 0.12), (0.0075, 0.015, 0.03)  # step sizes
-SIGN, QUICK_SIGN = (0.01, 0.03, 0.1), (0.03,)
+STEP_VIEWS, QUICK_STEP_VIEWS = (2, 4, 8, 12, 24), (2, 4, 12)
+ADAM_STEP_SIZES, QUICK_ADAM_STEP_SIZES = (0.0075, 0.015, 0.03, 0.06, 0.12), (0.0075, 0.015, 0.03)  # step sizes
+SIGN_STEP_SIZES, QUICK_SIGN_STEP_SIZES = (0.01, 0.03, 0.1), (0.03,)
 
-USUAL = OptimizeSettings()
+DEFAULT_SETTINGS = OptimizeSettings()
 Losses = Mapping[tuple[OptimizeSettings, int], Sequence[float]]  # by settings and training views, one per seed
 
 
 @dataclass(frozen=True)
-class Effort:
-    """Training views of a whole run, of which half is charted, too; seeds; views that designs are compared on."""
+class TrainingEffort:
+    """Training views of a whole run (half of them is charted, too), seeds, and views that designs are judged on."""
 
     views: int
     seeds: int
@@ -40,28 +41,30 @@ class Effort:
 
 
 def charts(quick: bool, progress: Progress) -> Iterator[Chart]:
-    """Every chart of training, one after the other."""
-    effort = Effort(120, 3, 64) if quick else Effort(960, 4, 256)
-    views = {f"{n}": USUAL.changed(views=n) for n in (QUICK_VIEWS if quick else VIEWS)}
-    moves = {f"adam {size:g}": USUAL.changed(step_size=size) for size in (QUICK_ADAM if quick else ADAM)}
-    for size in QUICK_SIGN if quick else SIGN:
-        moves[f"sign {size:g}"] = USUAL.changed(optimizer="sign", step_size=size)
-    losses = trained_losses(demo_problem(), list(dict.fromkeys([*views.values(), *moves.values()])), effort, progress)
+    """Chart views per step, then optimizer and step size."""
+    effort = TrainingEffort(120, 3, 64) if quick else TrainingEffort(960, 4, 256)
+    views = {f"{n}": DEFAULT_SETTINGS.changed(views=n) for n in (QUICK_STEP_VIEWS if quick else STEP_VIEWS)}
+    moves = {
+        f"adam {size:g}": DEFAULT_SETTINGS.changed(step_size=size)
+        for size in (QUICK_ADAM_STEP_SIZES if quick else ADAM_STEP_SIZES)
+    }
+    for size in QUICK_SIGN_STEP_SIZES if quick else SIGN_STEP_SIZES:
+        moves[f"sign {size:g}"] = DEFAULT_SETTINGS.changed(optimizer="sign", step_size=size)
+    losses = train_and_judge(demo_problem(), list(dict.fromkeys([*views.values(), *moves.values()])), effort, progress)
     yield runs_chart("views", "Views per step, for as many views in all", views, losses, effort)
     yield runs_chart("optimizer", "Optimizer and step size", moves, losses, effort)
 
 
-# Views per step, and how the design moves: quality after as many views
-
-
-def runs_chart(name: str, title: str, runs: Mapping[str, OptimizeSettings], losses: Losses, effort: Effort) -> Chart:
-    """Settings by name, after half of the views and after all, against the loss of what has been trained."""
-    columns = [(setting, run, end) for setting, run in runs.items() for end in ends_of(run, effort)]
-    series: dict[int, list[Point]] = {end: [] for end in sorted({end for _, _, end in columns})}
+def runs_chart(
+    name: str, title: str, runs: Mapping[str, OptimizeSettings], losses: Losses, effort: TrainingEffort
+) -> Chart:
+    """Chart the loss of designs by setting, after half of the training views and after all."""
+    columns = [(setting, run, end) for setting, run in runs.items() for end in charted_ends(run, effort)]
+    series: dict[int, list[ChartPoint]] = {end: [] for end in sorted({end for _, _, end in columns})}
     table = np.array([losses[run, end] for _, run, end in columns]).T
     for (setting, run, end), loss in zip(columns, paired_means(table), strict=True):
         cost = views_per_network(run.changed(steps=end // run.views))
-        series[end].append(Point(setting, cost, loss, run == USUAL and end == effort.views))
+        series[end].append(ChartPoint(setting, cost, loss, run == DEFAULT_SETTINGS and end == effort.views))
     return Chart(
         name=name,
         title=title,
@@ -74,22 +77,22 @@ def runs_chart(name: str, title: str, runs: Mapping[str, OptimizeSettings], loss
     )
 
 
-def ends_of(run: OptimizeSettings, effort: Effort) -> list[int]:
-    """Training views after which a run is charted: there the design was tried on the selection set."""
+def charted_ends(run: OptimizeSettings, effort: TrainingEffort) -> list[int]:
+    """Training views after which a run is charted, where the selection set has just been seen."""
     whole = run.changed(steps=effort.views // run.views)
     return [end for end in (effort.views // 2, effort.views) if is_selection_step(whole, end // run.views)]
 
 
-def trained_losses(
-    problem: Problem, runs: Collection[OptimizeSettings], effort: Effort, progress: Progress
+def train_and_judge(
+    problem: Problem, runs: Collection[OptimizeSettings], effort: TrainingEffort, progress: Progress
 ) -> dict[tuple[OptimizeSettings, int], list[float]]:
-    """Losses on new conditions, the same for every design."""
+    """Train every run with every seed; losses on new conditions, the same for all designs."""
     shown = {}
     for seed in range(effort.seeds):
         for i, run in enumerate(runs):
-            ends = ends_of(run, effort)
+            ends = charted_ends(run, effort)
             numbers = [end // run.views for end in ends]
-            designs = trained(problem.with_training(run.changed(steps=numbers[-1]), seed), numbers)
+            designs = designs_after(problem.with_training(run.changed(steps=numbers[-1]), seed), numbers)
             shown |= {(run, end, seed): problem.subject.appearance(d) for end, d in zip(ends, designs, strict=True)}
             progress("training", seed * len(runs) + i + 1, effort.seeds * len(runs))
     answers = responses(problem, shown, problem.scene.draw("evaluate", effort.judged), problem.training_px)
@@ -99,7 +102,7 @@ def trained_losses(
     }
 
 
-def trained(problem: Problem, numbers: Sequence[int]) -> list[Tensor]:
-    """The best design, as printed, after each of these numbers of steps (rising)."""
+def designs_after(problem: Problem, numbers: Sequence[int]) -> list[Tensor]:
+    """The best designs, as printed, after these numbers of steps (rising)."""
     states: dict[int, State] = {step.state.number: step.state for step in steps(problem)}
     return [from_pixels(as_pixels(states[number].best)) for number in numbers]

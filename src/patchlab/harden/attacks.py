@@ -1,11 +1,11 @@
-"""What attacks leave of a network's accuracy: FGSM and PGD in an ε-ball around what the network sees.
+"""Attacks on a network within an ε-ball around its input: FGSM and PGD.
 
 In: a network, pictures N×3×S×S in [0, 1] of its input size, their labels, ε. Out: which pictures survive. Attacks work
 on the network's own input; one on the photograph's pixels by at most ε would be no stronger, since downsampling
-averages. On pictures that were made easy a saturated softmax leaves no gradient, and a network that merely shouts would
-pass for a robust one. So losses come from float64 logits, what they say of the logits is scaled before it goes back
-through a float32 network, and a picture survives only where it does so under the cross-entropy and a margin loss.
-Left out on purpose: random starts (results would differ by chance) and attacks without gradients.
+averages. On hardened pictures a saturated softmax leaves no gradient, and an overconfident network would pass for a
+robust one. So losses come from float64 logits, their gradient is scaled before it goes back through a float32 network,
+and a picture survives only if it does so under both the cross-entropy and a margin loss. Left out on purpose: random
+starts (results would differ by chance) and attacks without gradients.
 
 Sources: Goodfellow et al., Explaining and Harnessing Adversarial Examples, ICLR 2015 (FGSM); Madry et al., Towards Deep
 Learning Models Resistant to Adversarial Attacks, ICLR 2018 (PGD); Carlini and Wagner, Towards Evaluating the Robustness
@@ -21,13 +21,13 @@ import torch
 from torch import Tensor
 
 Logits = Callable[[Tensor], Tensor]
-Loss = Callable[[Tensor, Tensor], Tensor]
+PictureLoss = Callable[[Tensor, Tensor], Tensor]
 PGD_STEPS = 40
 PGD_STEP = 1 / 4  # of ε
 
 
 def cross_entropy(logits: Tensor, labels: Tensor) -> Tensor:
-    """N cross-entropies in float64, where their gradient vanishes at margins of 745, in float32 at 103."""
+    """N cross-entropies in float64, whose gradient vanishes at margins of 745; in float32, at 103."""
     return torch.nn.functional.cross_entropy(logits.double(), labels, reduction="none")
 
 
@@ -38,16 +38,16 @@ def margin(logits: Tensor, labels: Tensor) -> Tensor:
     return others.amax(1) - logits.gather(1, labels[:, None])[:, 0]
 
 
-LOSSES: tuple[Loss, ...] = (cross_entropy, margin)
+LOSSES: tuple[PictureLoss, ...] = (cross_entropy, margin)
 
 
-def right(logits: Tensor, labels: Tensor) -> Tensor:
+def is_correct(logits: Tensor, labels: Tensor) -> Tensor:
     """N bool: top-1 is the label."""
     return logits.argmax(1) == labels
 
 
-def fgsm(network: Logits, pictures: Tensor, labels: Tensor, epsilon: float, loss: Loss) -> Tensor:
-    """clip(x + ε sign ∇L): one step."""
+def fgsm(network: Logits, pictures: Tensor, labels: Tensor, epsilon: float, loss: PictureLoss) -> Tensor:
+    """Attack by one step: clip(x + ε sign ∇L)."""
     return (pictures + epsilon * _gradient(network, pictures, labels, loss).sign()).clamp(0, 1)
 
 
@@ -56,11 +56,11 @@ def pgd(
     pictures: Tensor,
     labels: Tensor,
     epsilon: float,
-    loss: Loss,
+    loss: PictureLoss,
     steps: int = PGD_STEPS,
     step: float = PGD_STEP,
 ) -> Iterator[Tensor]:
-    """The pictures after each of `steps` steps, from x itself."""
+    """Yield the pictures after each of `steps` PGD steps, which start at the pictures themselves."""
     x = pictures
     for _ in range(steps):
         x = pgd_step(network, x, pictures, labels, epsilon, loss, step)
@@ -68,62 +68,69 @@ def pgd(
 
 
 def pgd_step(
-    network: Logits, x: Tensor, pictures: Tensor, labels: Tensor, epsilon: float, loss: Loss, step: float = PGD_STEP
+    network: Logits,
+    x: Tensor,
+    pictures: Tensor,
+    labels: Tensor,
+    epsilon: float,
+    loss: PictureLoss,
+    step: float = PGD_STEP,
 ) -> Tensor:
-    """x ← clip(Π(x + `step` ε sign ∇L)), Π onto the ε-ball round the pictures."""
+    """One PGD step: clip(Π(x + `step` ε sign ∇L)), Π the projection onto the ε-ball around the pictures."""
     x = x + step * epsilon * _gradient(network, x, labels, loss).sign()
     return torch.clamp(x, pictures - epsilon, pictures + epsilon).clamp(0, 1)
 
 
 def survives_fgsm(network: Logits, pictures: Tensor, labels: Tensor, epsilon: float) -> Tensor:
-    """N bool: right, and still right after the step along either loss's gradient."""
-    alive = _right(network, pictures, labels)
+    """N bool: correct before the attack and after a step along either loss's gradient."""
+    alive = _predicts_label(network, pictures, labels)
     for loss in LOSSES:
-        if len(left := alive.nonzero()[:, 0]):
-            alive[left] = _right(network, fgsm(network, pictures[left], labels[left], epsilon, loss), labels[left])
+        if len(rows := alive.nonzero()[:, 0]):
+            attacked = fgsm(network, pictures[rows], labels[rows], epsilon, loss)
+            alive[rows] = _predicts_label(network, attacked, labels[rows])
     return alive
 
 
 def survives_pgd(network: Logits, pictures: Tensor, labels: Tensor, epsilon: float, steps: int = PGD_STEPS) -> Tensor:
-    """N bool: right, and still right wherever either loss leads on its way; what is lost goes no further."""
-    alive = _right(network, pictures, labels)
+    """N bool: correct before the attack and after every step along either loss's gradient; a lost picture stops."""
+    alive = _predicts_label(network, pictures, labels)
     for loss in LOSSES:
-        left, x = alive.nonzero()[:, 0], pictures[alive]
+        rows, x = alive.nonzero()[:, 0], pictures[alive]
         for _ in range(steps):
-            if not len(left):
+            if not len(rows):
                 break
-            x = pgd_step(network, x, pictures[left], labels[left], epsilon, loss)
-            still = _right(network, x, labels[left])
-            alive[left[~still]] = False
-            left, x = left[still], x[still]
+            x = pgd_step(network, x, pictures[rows], labels[rows], epsilon, loss)
+            correct = _predicts_label(network, x, labels[rows])
+            alive[rows[~correct]] = False
+            rows, x = rows[correct], x[correct]
     return alive
 
 
 ATTACKS = {"fgsm": survives_fgsm, "pgd": survives_pgd}
 
 
-def even_loss(logits: Sequence[Tensor], labels: Sequence[Tensor], loss: Loss) -> Tensor:
-    """A number with the gradient of the networks' mean loss, scaled per picture so that none of it is lost.
+def balanced_loss(logits: Sequence[Tensor], labels: Sequence[Tensor], loss: PictureLoss) -> Tensor:
+    """A scalar with the gradient of the networks' mean loss, scaled per picture so that float32 keeps it.
 
-    `logits[m]` and `labels[m]` are network m's. The gradient with respect to a picture's logits has 1 as its largest
-    value over all networks: a sign does not change by that, and float32 does not round it to 0.
+    `logits[m]` and `labels[m]` are network m's. The largest gradient of a picture's logits over all
+    networks becomes 1: signs stay the same, and float32 does not round the gradient to 0.
     """
     with torch.enable_grad():
-        leaves = [own.detach().double().requires_grad_(True) for own in logits]
+        leaves = [each.detach().double().requires_grad_(True) for each in logits]
         total = torch.stack([loss(leaf, truth).sum() for leaf, truth in zip(leaves, labels, strict=True)]).sum()
         slopes = torch.autograd.grad(total, leaves)
         largest = torch.stack([slope.abs().amax(1) for slope in slopes]).amax(0)
         largest = torch.where(largest > 0, largest, 1)
         pairs = zip(logits, slopes, strict=True)
-        return torch.stack([(own * (slope / largest[:, None])).sum() for own, slope in pairs]).sum()
+        return torch.stack([(each * (slope / largest[:, None])).sum() for each, slope in pairs]).sum()
 
 
-def _gradient(network: Logits, pictures: Tensor, labels: Tensor, loss: Loss) -> Tensor:
+def _gradient(network: Logits, pictures: Tensor, labels: Tensor, loss: PictureLoss) -> Tensor:
     pictures = pictures.detach().requires_grad_(True)
     with torch.enable_grad():
-        return torch.autograd.grad(even_loss([network(pictures)], [labels], loss), pictures)[0]
+        return torch.autograd.grad(balanced_loss([network(pictures)], [labels], loss), pictures)[0]
 
 
-def _right(network: Logits, pictures: Tensor, labels: Tensor) -> Tensor:
+def _predicts_label(network: Logits, pictures: Tensor, labels: Tensor) -> Tensor:
     with torch.no_grad():
-        return right(network(pictures), labels)
+        return is_correct(network(pictures), labels)

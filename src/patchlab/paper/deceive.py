@@ -3,7 +3,7 @@
 In: scenes that the networks read well, networks, seeds, and ways (by default a free texture and one within 8/255 of the
 original). Out: rates of the design, the original object and gray, noise and shuffled controls on the same conditions;
 the design minus each control, paired; contact sheets. The controls are the point: often plain gray alone hides an
-object, and only what a texture does beyond that is owed to its training. Controls ignore the ball.
+object, and only the difference is due to training. Controls ignore the ε-ball.
 
 Source: Pestana et al., supplement, deceptive textures. For measuring the robustness of networks on objects that are
 yours to test.
@@ -17,59 +17,67 @@ from typing import Any
 
 from pydantic import Field
 
-from patchlab.paper.sides import sides
+from patchlab.paper.object_views import views_from_sides
 from patchlab.study.figures import picture_sheet
-from patchlab.study.grid import grouped, of_values, problem_of, short_name
+from patchlab.study.grid import by_values, group_by, problem_of, short_name
 from patchlab.study.record import Record
 from patchlab.study.study import Cell, Result, Study
-from patchlab.study.trained import TrainedSettings, Way, Word, answers_and_sheet, tested_in, trained_cells, trained_on
+from patchlab.study.trained_designs import (
+    NamePart,
+    SceneVariant,
+    TrainedSettings,
+    test_and_draw,
+    tested_networks,
+    trained_cells,
+    with_trainers,
+)
 from patchproof.optimizer.loop import best_design
 from patchproof.optimizer.promise import pictures_with_controls
 from patchproof.report.tables import Drawing, Table
 
 CONTROLS = ("bare", "gray", "noise", "shuffled")
-_KINDS = ("design", *CONTROLS)
+_SHOWN_KINDS = ("design", *CONTROLS)
 _SHEET_PX, _SHEET_VIEWS = 160, 4
 
 
 class DeceiveSettings(TrainedSettings):
-    """As in all studies of trained designs; each network trains alone and all of them test."""
+    """Settings of a study of trained designs in which each network trains alone and all networks test."""
 
     # By name: tables of the scene file with the keys that change.
-    ways: dict[Word, Way] = Field(
+    ways: dict[NamePart, SceneVariant] = Field(
         {"free": {"patch": {"kind": "texture"}}, "within_8": {"patch": {"kind": "texture", "epsilon": 8 / 255}}},
         min_length=1,
     )
 
 
 def cells(settings: DeceiveSettings, base: Path) -> list[Cell]:
-    """One per scene, way, network and seed; the goal is `deceive` whatever the scene file says."""
+    """A cell per scene, way, network and seed; the goal is `deceive`, whatever the scene file says."""
     return trained_cells(settings, base, variants=[({"target": {"goal": "deceive"}}, {})])
 
 
 def run(settings: DeceiveSettings, base: Path, cell: Cell) -> dict[str, Any]:
-    """Train against one network, show design and controls to all."""
+    """Train against one network, and show the design and its controls to all networks."""
     problem = problem_of(base, cell.values)
-    design = best_design(trained_on(problem, cell))
+    design = best_design(with_trainers(problem, cell))
     things = pictures_with_controls(problem, design, CONTROLS)
     suffix, content = problem.subject.file(design)
-    sheet = sides(problem, _SHEET_VIEWS), _SHEET_PX
-    return answers_and_sheet(problem, cell.name, things, settings.n, sheet) | {f"{cell.name}.{suffix}": content}
+    sheet = views_from_sides(problem, _SHEET_VIEWS), _SHEET_PX
+    return test_and_draw(problem, cell.name, things, settings.n, sheet) | {f"{cell.name}.{suffix}": content}
 
 
 def tables(settings: DeceiveSettings, results: Sequence[Result]) -> list[Table]:
-    """Rates of everything shown, and the design minus each control."""
+    """Tables of rates, and of the design minus each control."""
     rates, differences = [], []
-    for design, of_design in grouped(results, of_values("name", "way", "row")).items():
-        records = {kind: Record(of_design, kind) for kind in _KINDS}
-        for network in tested_in(of_design):
+    for design, of_design in group_by(results, by_values("name", "way", "row")).items():
+        records = {kind: Record(of_design, kind) for kind in _SHOWN_KINDS}
+        for network in tested_networks(of_design):
             start = (*design, short_name(network))
             levels = [record.level(network) for record in records.values()]
             rates.append((*start, *(level[0] for level in levels), levels[0][1]))
             differences.append((*start, *(records["design"].gain(records[kind], network)[0] for kind in CONTROLS)))
     head, n = ("scene", "way", "trained on", "tested on"), f"{settings.n} unseen conditions per seed"
     return [
-        Table("rates", "Rates", (*head, *_KINDS, "confidence"), tuple(rates), f"Over {n}."),
+        Table("rates", "Rates", (*head, *_SHOWN_KINDS, "confidence"), tuple(rates), f"Over {n}."),
         Table(
             "differences",
             "The design minus each control",
@@ -81,17 +89,17 @@ def tables(settings: DeceiveSettings, results: Sequence[Result]) -> list[Table]:
 
 
 def figures(settings: DeceiveSettings, results: Sequence[Result]) -> list[Drawing]:
-    """One contact sheet per scene, way and network: the design, then the controls."""
+    """A contact sheet per scene, way and network: the design, then the controls."""
     return [
         picture_sheet(
             f"sheet_{scene}_{way}_{row}",
             f"{scene}, {way}, trained on {row}",
             [("", of_design[0].file(f"{of_design[0].cell.name}.sheet.png"))],
-            (1.2 * _SHEET_VIEWS + 0.8, 1.2 * len(_KINDS)),
+            (1.2 * _SHEET_VIEWS + 0.8, 1.2 * len(_SHOWN_KINDS)),
             "In even light; the first seed.",
-            rows=_KINDS,
+            rows=_SHOWN_KINDS,
         )
-        for (scene, way, row), of_design in grouped(results, of_values("name", "way", "row")).items()
+        for (scene, way, row), of_design in group_by(results, by_values("name", "way", "row")).items()
     ]
 
 

@@ -1,9 +1,9 @@
-"""Images by class for 2D patches: photographs named in a CSV, or renders of an object where none exist.
+"""Images by class for 2D patches: photographs named in a CSV, or renders of an object without photographs.
 
-In: a folder with its CSV, scenes with meshes, how a patch is pasted. Out: the classes and their scenes; a folder of
+In: a folder with its CSV, scenes with meshes, settings of pasting. Out: the classes and their scenes; a folder of
 PNGs with `labels.csv`, as a scene of images reads them. The bare object is rendered over its scene's backgrounds from
 training views, in training light and without camera effects, which the scene of images adds itself; light beyond sRGB
-white is clipped. Views that anything is measured on in 3D are never among them.
+white is clipped. These views are never among those that measure designs in 3D.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from typing import Annotated
 import torch
 from pydantic import Field, model_validator
 
-from patchlab.harden.labeled import write_labels
-from patchlab.study.grid import Values, scene_of
+from patchlab.harden.labeled_photos import write_labels
+from patchlab.study.grid import CellValues, scene_of
 from patchproof.base.color import srgb_from_linear
 from patchproof.base.errors import Refused
 from patchproof.base.input import is_file
@@ -48,15 +48,15 @@ _RENDER_PX = 384
 
 
 class PastedSettings(StrictModel):
-    """Images by class, and how a patch lies in them."""
+    """Images by class, and how a patch is pasted into them."""
 
     images: str | None = None  # a folder of images
     labels: str | None = None  # CSV: file name, label
-    renders: tuple[str, ...] = ()  # scenes with meshes: each is one more class, its target's
+    renders: tuple[str, ...] = ()  # scenes with meshes; each adds a class, its target's
     renders_each: Annotated[int, Field(ge=2)] = 64  # renders of each scene
     made_px: Annotated[int, Field(ge=8, le=512)] = 60  # the patch's side in texels
     shown_px: Positive = 30.0  # and in pixels of the network's own size
-    scale: PositiveRange = (0.8, 1.25)  # random, times shown_px
+    scale: PositiveRange = (0.8, 1.25)  # random factor of shown_px
     roll_deg: Range = (-22.5, 22.5)  # as in Brown et al.'s published program
     erasing: Share = 0.5  # chance of Random Erasing in training
     printer: PrinterSettings = PrinterSettings()  # as in a scene
@@ -78,14 +78,14 @@ class ImageClass:
 
     label: str | int
     accept: tuple[str | int, ...] = ()
-    scene: Values | None = None  # of which they are renders
+    scene: CellValues | None = None  # the scene whose renders they are, if any
 
 
-def classes_of(images: str | None, table: str | None, scenes: Sequence[Values], base: Path) -> list[ImageClass]:
-    """Every class that there are images of: a folder's by its CSV of labels, then one per scene to render."""
+def list_classes(images: str | None, table: str | None, scenes: Sequence[CellValues], base: Path) -> list[ImageClass]:
+    """All classes with images: a folder's by its CSV of labels, then one per scene to render."""
     classes = []
     if images is not None and table is not None:
-        for label in labels_of(Path(expand_path(images, base)), Path(expand_path(table, base))):
+        for label in labels_with_images(Path(expand_path(images, base)), Path(expand_path(table, base))):
             classes.append(ImageClass(int(label) if label.isdecimal() else label))
     for values in scenes:
         if values["scene"]["object"]["mesh"] is None:
@@ -96,18 +96,20 @@ def classes_of(images: str | None, table: str | None, scenes: Sequence[Values], 
     return classes
 
 
-def labels_of(folder: Path, table: Path) -> list[str]:
-    """The different labels, in small letters, of the images in `folder` that the CSV `table` names."""
+def labels_with_images(folder: Path, table: Path) -> list[str]:
+    """The different labels, in lower case, of the images in `folder` that the CSV `table` names."""
     found = list(dict.fromkeys(label for name, label in read_labels(table) if is_file(folder / name)))
     if not found:
-        raise Refused(f"the images that {table.name} names in {folder}", "none of them", "copy them there")
+        raise Refused(
+            f"the images that {table.name} names in {folder}", "a folder that holds none of them", "copy them there"
+        )
     return found
 
 
 def class_scene(
     settings: PastedSettings, base: Path, images_of: ImageClass, classifier: Classifier, seed: int, folder: Path
 ) -> ImageScene:
-    """A scene of one class's images, in which the patch has no frame; renders are written to `folder`."""
+    """Build a scene of one class's images, with a patch without frame; writes renders to `folder`."""
     images, table = settings.images or "", settings.labels or ""
     if images_of.scene is not None:
         images, table = _render_class(images_of.label, images_of.scene, base, seed, settings.renders_each, folder)
@@ -119,7 +121,7 @@ def class_scene(
 def scene_settings(
     settings: PastedSettings, images_of: ImageClass, classifier: Classifier, images: str, table: str
 ) -> SceneSettings:
-    """A millimeter of the patch is one of its texels; its size in pictures follows from the network's own."""
+    """Scene settings in which a millimeter of the patch is one texel; its size in pictures follows the network's."""
     side = settings.made_px
     low, high = (settings.shown_px * factor / classifier.input_px for factor in settings.scale)
     largest = largest_share(settings.roll_deg)
@@ -141,16 +143,15 @@ def scene_settings(
     )
 
 
-def _render_class(label: str | int, values: Values, base: Path, seed: int, n: int, folder: Path) -> tuple[str, str]:
-    """Write n renders of a scene and their labels into a new folder in `folder`; the paths of both."""
-    own = folder / str(len(list(folder.iterdir())))
-    own.mkdir()
-    names = write_renders(set_stage(scene_of(base, values | {"seed": seed})), n, _RENDER_PX, own)
-    return str(own), str(write_labels([(name, label) for name in names], own))
+def _render_class(label: str | int, values: CellValues, base: Path, seed: int, n: int, folder: Path) -> tuple[str, str]:
+    subfolder = folder / str(len(list(folder.iterdir())))
+    subfolder.mkdir()
+    names = write_renders(set_stage(scene_of(base, values | {"seed": seed})), n, _RENDER_PX, subfolder)
+    return str(subfolder), str(write_labels([(name, label) for name in names], subfolder))
 
 
 def write_renders(stage: Stage, n: int, side_px: int, folder: Path) -> list[str]:
-    """Write n square renders of the stage's bare object as PNGs; their names in `folder`."""
+    """Write n square renders of the stage's bare object as PNGs; returns their names in `folder`."""
     names = []
     for part in in_chunks(stage.scene.draw("train", n)):
         with torch.no_grad():

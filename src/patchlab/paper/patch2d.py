@@ -2,13 +2,13 @@
 
 In: labeled images, scenes whose clean object is rendered where no photographs of a class exist, or both; networks,
 seeds. A cell is a target, a network and a seed: a patch of `made_px` texels a side is optimized on images of the target
-alone, at random places, sizes and angles, with Random Erasing of the picture below it, and shown `shown_px` wide at the
-network's own size. Out: recognition with and without it, paired on the same images and places, for the target, and for
-each other class by *its* labels, with how often the patch has it called the target: an assistive patch must not become
-an adversarial one. Gray and noise of the same size are the controls.
+only, at random places, sizes and angles, with Random Erasing of the picture below it, and shown `shown_px` wide at the
+network's input size. Out: recognition with and without it, paired on the same images and places, for the target, and
+for each other class by its labels, with the rate at which the patch makes it the target: an assistive patch must not
+become an adversarial one. Gray and noise of the same size are the controls.
 
-Unlike a printed piece this patch has no frame of markers. With fewer than `MIN_IMAGES_TO_SPLIT` images of a class it is measured
-on those it was made with, and the table says so.
+Unlike a printed piece, this patch has no frame of markers. A class with fewer than `MIN_IMAGES_TO_SPLIT` images is
+measured on those that the patch was made with, and the table says so.
 Sources: Pestana et al., supplement, algorithm 2; Brown et al., Adversarial Patch, 2017; Zhong et al., Random Erasing,
 AAAI 2020.
 """
@@ -25,12 +25,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from patchlab.paper.image_classes import ImageClass, PastedSettings, class_scene, classes_of
-from patchlab.study.claims import clustered
+from patchlab.paper.image_classes import ImageClass, PastedSettings, class_scene, list_classes
+from patchlab.study.estimates import cluster_mean
 from patchlab.study.figures import picture_sheet
-from patchlab.study.grid import Count, Names, Seeds, cell_of, grouped, of_values, scene_values, short_name
-from patchlab.study.pictures import contact_sheet, enlarged, photographs
-from patchlab.study.record import hits_of, recorded
+from patchlab.study.grid import Names, PositiveInt, Seeds, by_values, group_by, make_cell, scene_values, short_name
+from patchlab.study.pictures import contact_sheet, enlarge_design, photographs
+from patchlab.study.record import parse_hits, to_record
 from patchlab.study.study import Cell, Result, Study
 from patchproof.base.errors import Refused
 from patchproof.base.intervals import estimate_difference, rate
@@ -51,23 +51,23 @@ from patchproof.scene.image_scene import MIN_IMAGES_TO_SPLIT, ImageScene
 from patchproof.scene.interface import Scene
 
 KINDS = ("bare", "gray", "noise", "patch")
-OWN, TARGET = 0, 1  # by whose labels hits count: the image's own class, or the patch's target
+OWN_LABEL, TARGET_LABEL = 0, 1  # whose labels hits count for: the image's class, or the patch's target
 _TILE_PX = 192
 
 
 class Patch2dSettings(PastedSettings):
-    """Targets × networks × seeds."""
+    """Settings: targets × networks × seeds."""
 
-    targets: tuple[str | int, ...] = ()  # classes that patches are made for; without any, every class
-    networks: Names  # each trains alone
+    targets: tuple[str | int, ...] = ()  # classes that patches are made for; by default all
+    networks: Names  # networks, each of which trains alone
     seeds: Seeds = (0,)  # of draws
-    n: Count = 200  # conditions per class and cell
+    n: PositiveInt = 200  # conditions per class and cell
 
 
 def cells(settings: Patch2dSettings, base: Path) -> list[Cell]:
-    """Targets × networks × seeds; all targets with the first seed come first."""
+    """A cell per target, network and seed; all targets with the first seed come first."""
     renders = [scene_values(file, base) for file in settings.renders]
-    known = [each.label for each in classes_of(settings.images, settings.labels, renders, base)]
+    known = [each.label for each in list_classes(settings.images, settings.labels, renders, base)]
     targets = settings.targets or tuple(dict.fromkeys(known))
     for target in targets:
         if target not in known:
@@ -78,24 +78,24 @@ def cells(settings: Patch2dSettings, base: Path) -> list[Cell]:
     for seed, (i, target), network in itertools.product(settings.seeds, enumerate(targets), settings.networks):
         name = short_name(network)
         values = {"name": f"target{i}", "target": target, "networks": [network], "network": name, "renders": renders}
-        cells.append(cell_of(values, seed, name))
+        cells.append(make_cell(values, seed, name))
     return cells
 
 
 def run(settings: Patch2dSettings, base: Path, cell: Cell) -> dict[str, Any]:
-    """One patch, and every class with and without it."""
+    """Make one patch, and show every class with and without it."""
     values, seed = cell.values, cell.values["seed"]
     classifier = load_classifier(expand_path(values["networks"][0], base), base)
-    classes = classes_of(settings.images, settings.labels, values["renders"], base)
+    classes = list_classes(settings.images, settings.labels, values["renders"], base)
     target = [each.label for each in classes].index(values["target"])
     with tempfile.TemporaryDirectory() as folder:
         scenes = [class_scene(settings, base, each, classifier, seed, Path(folder)) for each in classes]
     problem = flat_problem(settings, base, scenes[target], classifier, classes[target])
     design = best_design(problem)
-    shown = shown_by_kind(problem, design)
+    shown = pasted_by_kind(problem, design)
     pairs = zip(classes, scenes, strict=True)
     return {
-        "classes": [_answers(problem, each, scene, shown, settings.n) for each, scene in pairs],
+        "classes": [_ask_about_class(problem, each, scene, shown, settings.n) for each, scene in pairs],
         "target": target,
         f"{cell.name}.png": _picture(problem, scenes, design, shown["patch"]),
     }
@@ -104,14 +104,14 @@ def run(settings: Patch2dSettings, base: Path, cell: Cell) -> dict[str, Any]:
 def flat_problem(
     settings: Patch2dSettings, base: Path, scene: ImageScene, classifier: Classifier, images_of: ImageClass
 ) -> Problem:
-    """A patch on images of its class."""
+    """The problem of a patch on images of its class."""
     stage, printer = set_stage(scene), load_printer(settings.printer.profile, base)
     subject = Patch(scene, printer, (settings.made_px, settings.made_px), stage.device)
     return Problem(scene, stage, printer, (classifier,), (_indices(classifier, images_of),), subject, None)
 
 
-def shown_by_kind(problem: Problem, design: np.ndarray) -> dict[str, Appearance]:
-    """What is pasted, by `KINDS`; controls have no markers of their own."""
+def pasted_by_kind(problem: Problem, design: np.ndarray) -> dict[str, Appearance]:
+    """Pasted pictures by `KINDS`; controls have no markers."""
     shown: dict[str, Appearance] = {"bare": None}
     with torch.no_grad():
         for kind in KINDS[1:]:
@@ -120,23 +120,22 @@ def shown_by_kind(problem: Problem, design: np.ndarray) -> dict[str, Appearance]
     return shown
 
 
-def _on(problem: Problem, scene: Scene) -> Problem:
-    """The patch on other images."""
+def _with_scene(problem: Problem, scene: Scene) -> Problem:
     return replace(problem, scene=scene, stage=set_stage(scene))
 
 
-def _answers(
+def _ask_about_class(
     problem: Problem, images_of: ImageClass, scene: ImageScene, shown: Mapping[str, Appearance], n: int
 ) -> dict[str, Any]:
-    """Per kind and condition: recognized by the class's own labels, and called the patch's target."""
+    """Hits by kind and condition, for the class's labels and for the patch's target."""
     (classifier,), (target,) = problem.classifiers, problem.indices
-    own = _indices(classifier, images_of)
-    judged = replace(_on(problem, scene), classifiers=(classifier, classifier), indices=(own, target))
+    own_indices = _indices(classifier, images_of)
+    judged = replace(_with_scene(problem, scene), classifiers=(classifier, classifier), indices=(own_indices, target))
     return {
-        "name": classifier.labels[own[0]].partition(",")[0] + (" (renders)" if images_of.scene else ""),
+        "name": classifier.labels[own_indices[0]].partition(",")[0] + (" (renders)" if images_of.scene else ""),
         "images": len(scene.images),
-        "same": bool(set(own) & set(target)),  # the target itself, or a class that its labels include
-        "hits": recorded(responses(judged, shown, scene.draw("evaluate", n)))["hits"],
+        "same": bool(set(own_indices) & set(target)),  # the target itself, or a class that its labels include
+        "hits": to_record(responses(judged, shown, scene.draw("evaluate", n)))["hits"],
     }
 
 
@@ -145,26 +144,26 @@ def _indices(classifier: Classifier, images_of: ImageClass) -> tuple[int, ...]:
 
 
 def _picture(problem: Problem, scenes: Sequence[ImageScene], design: np.ndarray, shown: Appearance) -> bytes:
-    """Side by side: the patch, an image of its class with it, and up to three of other classes."""
-    worlds = (problem, *(_on(problem, scene) for scene in scenes if scene is not problem.scene))[:4]
+    """PNG of the patch, an image of its class with it, and up to three images of other classes with it."""
+    worlds = (problem, *(_with_scene(problem, scene) for scene in scenes if scene is not problem.scene))[:4]
     tiles = [photographs(world, shown, world.scene.draw("evaluate", 1), _TILE_PX)[0] for world in worlds]
-    return contact_sheet([[enlarged(design, _TILE_PX), *tiles]])
+    return contact_sheet([[enlarge_design(design, _TILE_PX), *tiles]])
 
 
-Class = Mapping[str, Any]  # what a cell found of one class
+ClassAnswers = Mapping[str, Any]  # a cell's answers about one class
 
 
 def tables(settings: Patch2dSettings, results: Sequence[Result]) -> list[Table]:
-    """Gain on targets, harm on other classes, and both over all cells."""
+    """Tables of gain on targets, harm on other classes, and both over all cells."""
     return [_pooled(results), _gains(results), _harm(results)]
 
 
 def _gains(results: Sequence[Result]) -> Table:
     rows = []
     for (_, network), group in _by_target(results).items():
-        own = [_target(result) for result in group]
-        hits = {kind: _hits(own, kind, OWN) for kind in KINDS}
-        start = (own[0]["name"], network, own[0]["images"], own[0]["images"] >= MIN_IMAGES_TO_SPLIT)
+        answers = [_target_answers(result) for result in group]
+        hits = {kind: _hits(answers, kind, OWN_LABEL) for kind in KINDS}
+        start = (answers[0]["name"], network, answers[0]["images"], answers[0]["images"] >= MIN_IMAGES_TO_SPLIT)
         gains = (estimate_difference(hits["patch"], hits[control]) for control in ("bare", "gray"))
         rows.append((*start, *(rate(hits[kind]) for kind in KINDS), *gains))
     about = (
@@ -183,11 +182,11 @@ def _harm(results: Sequence[Result]) -> Table:
             if other["same"]:
                 continue
             of_class = [result.answers["classes"][i] for result in group]
-            own = {kind: _hits(of_class, kind, OWN) for kind in KINDS}
-            called, usual = (_hits(of_class, kind, TARGET) for kind in ("patch", "bare"))
-            rates = (rate(own[kind]) for kind in ("bare", "gray", "patch"))
-            harm = (estimate_difference(own["patch"], own[control]) for control in ("bare", "gray"))
-            start = (_target(group[0])["name"], network, other["name"])
+            hits = {kind: _hits(of_class, kind, OWN_LABEL) for kind in KINDS}
+            called, usual = (_hits(of_class, kind, TARGET_LABEL) for kind in ("patch", "bare"))
+            rates = (rate(hits[kind]) for kind in ("bare", "gray", "patch"))
+            harm = (estimate_difference(hits["patch"], hits[control]) for control in ("bare", "gray"))
+            start = (_target_answers(group[0])["name"], network, other["name"])
             rows.append((*start, *rates, *harm, rate(called), estimate_difference(called, usual)))
     about = (
         "Images of another class with the same patch. Recognized means its own labels; a negative difference is harm."
@@ -200,16 +199,16 @@ def _harm(results: Sequence[Result]) -> Table:
 
 def _pooled(results: Sequence[Result]) -> Table:
     groups = _by_target(results).values()
-    own = [[_target(result) for result in group] for group in groups]
+    targets = [[_target_answers(result) for result in group] for group in groups]
     others = [[each for result in group for each in result.answers["classes"] if not each["same"]] for group in groups]
     rows = []
     for name, clusters, which in (
-        ("target recognized", own, OWN),
-        ("other classes recognized", others, OWN),
-        ("other classes called the target", others, TARGET),
+        ("target recognized", targets, OWN_LABEL),
+        ("other classes recognized", others, OWN_LABEL),
+        ("other classes called the target", others, TARGET_LABEL),
     ):
-        controls = ([_effect(some, which, control) for some in clusters if some] for control in KINDS[:3])
-        rows.append((name, *map(clustered, controls)))
+        controls = ([_rate_difference(some, which, control) for some in clusters if some] for control in KINDS[:3])
+        rows.append((name, *map(cluster_mean, controls)))
     about = (
         "Mean differences of rates over targets and networks; the interval is a bootstrap over these clusters, each"
         " with all its seeds, images and other classes; n counts clusters, and fewer than 5 get none."
@@ -219,9 +218,9 @@ def _pooled(results: Sequence[Result]) -> Table:
 
 
 def figures(settings: Patch2dSettings, results: Sequence[Result]) -> list[Drawing]:
-    """What was made."""
-    firsts = [group[0] for group in grouped(results, of_values("target")).values()]
-    files = [(_target(first)["name"], first.file(f"{first.cell.name}.png")) for first in firsts]
+    """Pictures of the patches (first network and seed of each target)."""
+    firsts = [group[0] for group in group_by(results, by_values("target")).values()]
+    files = [(_target_answers(first)["name"], first.file(f"{first.cell.name}.png")) for first in firsts]
     return [
         picture_sheet(
             "patches",
@@ -229,24 +228,23 @@ def figures(settings: Patch2dSettings, results: Sequence[Result]) -> list[Drawin
             files,
             (7.0, 1.6 * len(firsts) + 0.3),
             "The patch, its own class, and other classes; first network and seed of each target.",
-        ),
+        )
     ]
 
 
 def _by_target(results: Sequence[Result]) -> dict[tuple, list[Result]]:
-    """Seeds together: results by (target, network)."""
-    return grouped(results, of_values("target", "network"))
+    return group_by(results, by_values("target", "network"))
 
 
-def _target(result: Result) -> Class:
+def _target_answers(result: Result) -> ClassAnswers:
     return result.answers["classes"][result.answers["target"]]
 
 
-def _hits(classes: Sequence[Class], kind: str, which: int) -> list[bool]:
-    return [hit for each in classes for hit in hits_of(each["hits"][kind][which])]
+def _hits(classes: Sequence[ClassAnswers], kind: str, which: int) -> list[bool]:
+    return [hit for each in classes for hit in parse_hits(each["hits"][kind][which])]
 
 
-def _effect(classes: Sequence[Class], which: int, control: str) -> float:
+def _rate_difference(classes: Sequence[ClassAnswers], which: int, control: str) -> float:
     return float(np.mean(_hits(classes, "patch", which)) - np.mean(_hits(classes, control, which)))
 
 

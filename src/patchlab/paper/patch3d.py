@@ -1,14 +1,14 @@
-"""Patches optimized in 3D and in 2D, both on the object, under the same conditions.
+"""Compare patches optimized in 3D and in 2D, both shown on the object under the same conditions.
 
 In: scene files with meshes, networks, seeds. A cell is one of each: the scene's patch is optimized in 3D, as `optimize`
-does, and once more as the classic 2D patch: pasted flat at a random place, size and angle into renders of the same
-clean object over the same backgrounds (renders, since photographs of most objects do not exist), with Random Erasing.
-Same design grid, same frame, printer and camera; sizes in pixels from the 3D views; the same number of classifier
-passes. Then both hang on the object, under conditions of the evaluate stream, beside the bare object, gray and noise.
+does, and again as the classic 2D patch: pasted flat at a random place, size and angle into renders of the same clean
+object over the same backgrounds (renders, since most objects have no photographs), with Random Erasing. Design grid,
+frame, printer, camera and number of classifier passes are the same; sizes in pixels come from the 3D views. Then both
+are shown on the object, under conditions of the evaluate stream, beside the bare object, gray and noise.
 Out: paired differences per condition, pooled, by mesh, and by network and view (where the camera stands).
 
-Left out on purpose: the 2D patch knows neither light nor place, since images say nothing of them. Whether it is weak in
-its own world, too, is measured: both designs are shown in held-out images as well.
+Left out on purpose: the 2D patch knows neither light nor place, since images do not tell them. Both designs are also
+shown in held-out images, which tells if the 2D patch is weak there, too.
 Sources: Pestana et al., algorithm "Masked Textures and 3D Patches" and the table of 2D and 3D patches by model and
 view, supplement algorithm 2 (2D patch); Brown et al., Adversarial Patch, 2017.
 """
@@ -25,13 +25,23 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field
 
-from patchlab.harden.labeled import write_labels
+from patchlab.harden.labeled_photos import write_labels
 from patchlab.paper.image_classes import write_renders
-from patchlab.study.claims import clustered
+from patchlab.study.estimates import cluster_mean
 from patchlab.study.figures import picture_sheet
-from patchlab.study.grid import Count, GridSettings, Seeds, by_scene, grid_cells, grouped, of_values, problem_of, who
-from patchlab.study.pictures import contact_sheet, enlarged, photographs
-from patchlab.study.record import Record, hits_of, recorded
+from patchlab.study.grid import (
+    GridSettings,
+    PositiveInt,
+    Seeds,
+    by_scene,
+    by_values,
+    cell_key,
+    grid_cells,
+    group_by,
+    problem_of,
+)
+from patchlab.study.pictures import contact_sheet, enlarge_design, photographs
+from patchlab.study.record import Record, parse_hits, to_record
 from patchlab.study.study import Cell, Result, Study
 from patchproof.base.errors import Refused
 from patchproof.base.intervals import estimate_difference, rate
@@ -52,20 +62,20 @@ from patchproof.scene.interface import SceneSource
 from patchproof.scene.patch_scene import PatchScene, require_patch
 
 KINDS = ("bare", "gray", "noise", "2d", "3d")
-HARD = 0.2  # clean rate up to which an object counts as misread
+MAX_MISREAD_RATE = 0.2  # clean rate up to which an object counts as misread by the network
 _TILE_PX = 192
-_SIZES = (0.05, 0.95)  # quantiles of the design's size over the 3D views that bound its size in 2D
+_SIZE_QUANTILES = (0.05, 0.95)  # of the design's sizes in 3D views; its sizes in 2D lie between them
 
 
 class Patch3dSettings(GridSettings):
-    """How patches are trained stands in each scene's [optimize]."""
+    """Scenes, networks, seeds and the 2D patch; each scene's [optimize] sets the training."""
 
     seeds: Seeds = (0, 1, 2)  # of the scenes' draws
-    n: Count = 200  # conditions per cell, of the evaluate stream
-    renders: Annotated[int, Field(ge=2)] = 64  # images of the clean object; from 20 on, half of them are held out
-    roll_deg: Range = (-22.5, 22.5)  # of the 2D patch, as in Brown et al.'s published program
+    n: PositiveInt = 200  # conditions per cell, of the evaluate stream
+    renders: Annotated[int, Field(ge=2)] = 64  # images of the clean object; half of 20 or more are held out
+    roll_deg: Range = (-22.5, 22.5)  # roll of the 2D patch, as in Brown et al.'s program
     erasing: Share = 0.5  # chance of Random Erasing in 2D training
-    # Azimuths in degrees by name; without any, thirds of each scene's own range.
+    # Ranges of azimuth in degrees, by name; by default thirds of each scene's range.
     views: dict[str, Range] = Field(default_factory=dict)
 
 
@@ -75,8 +85,8 @@ def cells(settings: Patch3dSettings, base: Path) -> list[Cell]:
 
 
 def patch_cells(settings: GridSettings, base: Path) -> list[Cell]:
-    """A cell per scene, network and seed; refused of scenes without a mesh or a printed patch. All objects with the
-    first seed come first: an unfinished study says something of each.
+    """A cell per scene, network and seed; refuses scenes without a mesh or a printed patch. All objects with the first
+    seed come first, so that an unfinished study covers each.
     """
     cells = grid_cells(settings, base)
     for cell in cells:
@@ -87,15 +97,15 @@ def patch_cells(settings: GridSettings, base: Path) -> list[Cell]:
 
 
 def run(settings: Patch3dSettings, base: Path, cell: Cell) -> dict[str, Any]:
-    """One object, network and seed: optimize in both worlds, measure in both."""
+    """Optimize for one object, network and seed in 3D and in 2D, and measure both designs in both."""
     problem = problem_of(base, cell.values)
     with tempfile.TemporaryDirectory() as folder:
         twin = flat_twin(problem, settings, Path(folder))
     designs = {"3d": best_design(problem), "2d": best_design(twin)}
     conditions, in_images = (world.scene.draw("evaluate", settings.n) for world in (problem, twin))
     return {
-        **recorded(responses(problem, things_of(problem, designs), conditions)),
-        "in_images": recorded(responses(twin, things_of(twin, designs), in_images)),
+        **to_record(responses(problem, appearances_by_kind(problem, designs), conditions)),
+        "in_images": to_record(responses(twin, appearances_by_kind(twin, designs), in_images)),
         "azimuth_deg": conditions.pose.azimuth_deg.tolist(),
         "azimuth_range_deg": problem.scene.settings.view.azimuth_deg,
         "passes": {
@@ -103,14 +113,14 @@ def run(settings: Patch3dSettings, base: Path, cell: Cell) -> dict[str, Any]:
         },
         "share": twin.scene.settings.view.patch_share,
         "warnings": list(problem.scene.warnings),
-        f"{cell.name}.png": picture_of(problem, twin, designs),
+        f"{cell.name}.png": compose_picture(problem, twin, designs),
         f"{cell.name}-2d.png": png(designs["2d"]),
         f"{cell.name}-3d.png": png(designs["3d"]),
     }
 
 
 def flat_twin(problem: Problem, settings: Patch3dSettings, folder: Path) -> Problem:
-    """The same patch as a classic 2D one: its scene is made of renders that are written to `folder`."""
+    """The problem of the classic 2D patch: its scene has renders of the object, which are written to `folder`."""
     scene = require_patch(problem.scene, "a printed patch on a mesh")
     names = write_renders(problem.stage, settings.renders, problem.training_px, folder)
     write_labels([(name, scene.settings.target.label) for name in names], folder)
@@ -120,10 +130,10 @@ def flat_twin(problem: Problem, settings: Patch3dSettings, folder: Path) -> Prob
 
 
 def flat_settings(scene: PatchScene, settings: Patch3dSettings) -> SceneSettings:
-    """A scene of images with the patch, printer, camera and optimizer of a scene with a mesh, and as large in it."""
+    """Settings of a scene of images with the printer, camera and optimizer of a mesh scene, and its patch as large."""
     width, height = scene.piece.size_mm
     patch = PatchSettings(width_mm=width, height_mm=height)
-    low, high = np.quantile(design_shares(scene), _SIZES)
+    low, high = np.quantile(design_shares(scene), _SIZE_QUANTILES)
     largest = largest_share(settings.roll_deg)
     share = (float(min(low, largest)), float(min(high, largest)))
     return scene.settings.changed(
@@ -136,24 +146,24 @@ def flat_settings(scene: PatchScene, settings: Patch3dSettings) -> SceneSettings
 
 
 def design_shares(scene: PatchScene, views: int = 256) -> np.ndarray:
-    """The piece's longer side over the picture's shorter one, in training views that see its face."""
+    """The piece's longer side over the picture's shorter one, in training views that face it."""
     conditions, photo_px = scene.draw("train", views), scene.settings.camera.photo_px
     scales = scene.piece_scales(conditions[scene.facing(conditions)], photo_px)
     return scales * max(scene.piece.size_mm) / min(photo_px)
 
 
-def things_of(problem: Problem, designs: Mapping[str, np.ndarray]) -> dict[str, Appearance]:
-    """What hangs on the object, by `KINDS`."""
+def appearances_by_kind(problem: Problem, designs: Mapping[str, np.ndarray]) -> dict[str, Appearance]:
+    """Appearances of the object by `KINDS`."""
     things = pictures_with_controls(problem, designs["3d"], KINDS[:3])
     things |= {"2d": problem.subject.appearance(from_pixels(designs["2d"], problem.device)), "3d": things["design"]}
     return {kind: things[kind] for kind in KINDS}
 
 
-def picture_of(problem: Problem, twin: Problem, designs: Mapping[str, np.ndarray]) -> bytes:
-    """Side by side: the 2D design, an image with it, the object with it; the 3D design, the object with it."""
+def compose_picture(problem: Problem, twin: Problem, designs: Mapping[str, np.ndarray]) -> bytes:
+    """PNG of the 2D design, an image with it, the object with it; the 3D design, the object with it."""
     tiles = []
     for kind, worlds in (("2d", (twin, problem)), ("3d", (problem,))):
-        tiles.append(enlarged(designs[kind], _TILE_PX))
+        tiles.append(enlarge_design(designs[kind], _TILE_PX))
         for world in worlds:
             shown = world.subject.appearance(from_pixels(designs[kind], world.device))
             tiles.append(photographs(world, shown, world.scene.draw("evaluate", 1), _TILE_PX)[0])
@@ -161,7 +171,7 @@ def picture_of(problem: Problem, twin: Problem, designs: Mapping[str, np.ndarray
 
 
 def tables(settings: Patch3dSettings, results: Sequence[Result]) -> list[Table]:
-    """Pooled, by mesh, by network and view, in the flat images, and cell by cell."""
+    """Tables: pooled, by object, by network and view, pasted into images, and by cell."""
     objects, images = _by_object(results, ("3d", "2d"), None), _by_object(results, ("2d", "gray"), "in_images")
     about = "Networks and seeds together; the difference is paired (Newcombe), as if all conditions were independent."
     in_images = (
@@ -179,22 +189,21 @@ def tables(settings: Patch3dSettings, results: Sequence[Result]) -> list[Table]:
 
 
 def _pooled(results: Sequence[Result]) -> Table:
-    groups = grouped(results, of_values("name", "network"))
-    hard = {key: group for key, group in groups.items() if _mean(group, "bare") <= HARD}
+    groups = group_by(results, by_values("name", "network"))
+    hard = {key: group for key, group in groups.items() if _mean_rate(group, "bare") <= MAX_MISREAD_RATE}
     rows = []
     for a, b in (("3d", "2d"), ("3d", "gray"), ("3d", "noise"), ("2d", "gray"), ("2d", "noise"), ("3d", "bare")):
-        gains = [[_mean(group, a) - _mean(group, b) for group in some.values()] for some in (groups, hard)]
-        rows.append((f"{a} minus {b}", *map(clustered, gains)))
+        gains = [[_mean_rate(group, a) - _mean_rate(group, b) for group in some.values()] for some in (groups, hard)]
+        rows.append((f"{a} minus {b}", *map(cluster_mean, gains)))
     about = (
         "Differences of the rate on the same conditions. The interval is a bootstrap over clusters, a cluster being an"
         " object before a network with all its seeds; n counts clusters, and fewer than 5 get none."
     )
-    head = ("difference", "all clusters", f"clean rate up to {HARD:g}")
+    head = ("difference", "all clusters", f"clean rate up to {MAX_MISREAD_RATE:g}")
     return Table("pooled", "Pooled over objects, networks and seeds", head, tuple(rows), about)
 
 
 def _by_object(results: Sequence[Result], pair: tuple[str, str], where: str | None) -> tuple[tuple, ...]:
-    """Rows of rates by object, and the difference of a pair."""
     rows = []
     for name, group in by_scene(results).items():
         records = {kind: Record(group, kind, where) for kind in KINDS}
@@ -206,10 +215,10 @@ def _by_object(results: Sequence[Result], pair: tuple[str, str], where: str | No
 def _by_view(settings: Patch3dSettings, results: Sequence[Result]) -> Table:
     groups: dict[tuple[str, str], dict[str, list[bool]]] = {}
     for result in results:
-        for view, (low, high) in _views(settings, result).items():
+        for view, (low, high) in _view_ranges(settings, result).items():
             group = groups.setdefault((result.cell.values["network"], view), {kind: [] for kind in KINDS})
             for kind in KINDS:
-                hits = zip(hits_of(result.answers["hits"][kind][0]), result.answers["azimuth_deg"], strict=True)
+                hits = zip(parse_hits(result.answers["hits"][kind][0]), result.answers["azimuth_deg"], strict=True)
                 group[kind] += [hit for hit, azimuth in hits if low <= azimuth <= high]
     rows = tuple(
         (*key, *(rate(group[kind]) for kind in KINDS), estimate_difference(group["3d"], group["2d"]))
@@ -224,13 +233,15 @@ def _by_cell(results: Sequence[Result]) -> Table:
     for result in results:
         gain = Record([result], "3d").gain(Record([result], "2d"))[0]
         passes = result.answers["passes"]
-        rows.append((*who(result), *(_mean([result], kind) for kind in KINDS), gain, passes["3d"], passes["2d"]))
+        rows.append(
+            (*cell_key(result), *(_mean_rate([result], kind) for kind in KINDS), gain, passes["3d"], passes["2d"])
+        )
     head = ("object", "network", "seed", *KINDS, "3d minus 2d", "passes 3d", "passes 2d")
     return Table("cells", "Cell by cell", head, tuple(rows), "Passes are views that the network saw in training.")
 
 
 def figures(settings: Patch3dSettings, results: Sequence[Result]) -> list[Drawing]:
-    """What was optimized."""
+    """Pictures of the designs (first network and seed of each object)."""
     firsts = [group[0] for group in by_scene(results).values()]
     return [
         picture_sheet(
@@ -239,11 +250,11 @@ def figures(settings: Patch3dSettings, results: Sequence[Result]) -> list[Drawin
             [(first.cell.name, first.file(f"{first.cell.name}.png")) for first in firsts],
             (7.0, 1.3 * len(firsts) + 0.4),
             "2D design, pasted into an image, on the object; 3D design, on the object in the same view.",
-        ),
+        )
     ]
 
 
-def _views(settings: Patch3dSettings, result: Result) -> dict[str, tuple[float, float]]:
+def _view_ranges(settings: Patch3dSettings, result: Result) -> dict[str, tuple[float, float]]:
     if settings.views:
         return dict(settings.views)
     first, last = result.answers["azimuth_range_deg"]
@@ -251,7 +262,7 @@ def _views(settings: Patch3dSettings, result: Result) -> dict[str, tuple[float, 
     return dict(zip(("left", "middle", "right"), itertools.pairwise(edges), strict=True))
 
 
-def _mean(results: Sequence[Result], kind: str) -> float:
+def _mean_rate(results: Sequence[Result], kind: str) -> float:
     return float(np.mean(Record(results, kind).hits()))
 
 

@@ -1,8 +1,8 @@
-"""Free textures from gray: what networks ask for when an object should be read as a class.
+"""Free textures trained from gray: the colors and patterns that networks prefer for a class.
 
-In: scenes, classes (labels), networks and seeds. Every texture is free and starts from gray, so that whatever color and
-pattern it has, a network asked for. Out: rates on all networks beside the untrained gray, the mean color per class
-(which color is preferred), and a contact sheet.
+In: scenes, classes (labels), networks and seeds. Every texture is free and starts from gray, so its colors and patterns
+come from the network. Out: rates on all networks beside the untrained gray, the mean color per class, and a contact
+sheet.
 
 Source: Pestana et al., robust designs.
 """
@@ -16,20 +16,20 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 from pydantic import Field
 
-from patchlab.paper.sides import mean_color, sides
+from patchlab.paper.object_views import mean_color, views_from_sides
 from patchlab.study.figures import picture_sheet
-from patchlab.study.grid import grouped, of_values, problem_of, short_name
+from patchlab.study.grid import by_values, group_by, problem_of, short_name
 from patchlab.study.record import Record
 from patchlab.study.study import Cell, Result, Study
-from patchlab.study.trained import (
+from patchlab.study.trained_designs import (
+    NamePart,
+    SceneVariant,
     TrainedSettings,
-    Way,
-    Word,
-    answers_and_sheet,
-    tested_in,
+    gain_word,
+    test_and_draw,
+    tested_networks,
     trained_cells,
-    trained_on,
-    verdict,
+    with_trainers,
 )
 from patchproof.base.color import linear_from_srgb, srgb_from_linear
 from patchproof.optimizer.loop import best_design
@@ -39,20 +39,20 @@ from patchproof.report.tables import Drawing, Table
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_SHEET_PX, _TURN_VIEWS, _SIDES = 160, 8, 3
+_SHEET_PX, _TURN_VIEWS, _SHEET_VIEWS = 160, 8, 3
 _KINDS = ("start", "design")
 
 
 class RobustSettings(TrainedSettings):
-    """Each network trains alone for each class, and all of them test."""
+    """Settings: each network trains alone for each class, and all networks test."""
 
     classes: Annotated[tuple[str | int, ...], Field(min_length=1)]  # in place of the scene's label
     # By name: tables of the scene file with the keys that change.
-    ways: dict[Word, Way] = Field({"free": {"patch": {"kind": "texture", "start": "gray"}}}, min_length=1)
+    ways: dict[NamePart, SceneVariant] = Field({"free": {"patch": {"kind": "texture", "start": "gray"}}}, min_length=1)
 
 
 def cells(settings: RobustSettings, base: Path) -> list[Cell]:
-    """One per scene, way, class, network and seed."""
+    """A cell per scene, way, class, network and seed."""
     variants = [
         ({"target": {"label": label, "accept": [], "goal": "assist"}}, {"class": str(label)})
         for label in settings.classes
@@ -61,37 +61,37 @@ def cells(settings: RobustSettings, base: Path) -> list[Cell]:
 
 
 def run(settings: RobustSettings, base: Path, cell: Cell) -> dict[str, Any]:
-    """Train for one class on one network; rates on all, pictures, mean color."""
+    """Train for one class on one network; record rates on all networks, pictures and mean color."""
     problem = problem_of(base, cell.values)
     subject = problem.subject
-    design = best_design(trained_on(problem, cell))
+    design = best_design(with_trainers(problem, cell))
     pixels = (subject.start(), from_pixels(design, problem.device))
     things = {kind: subject.appearance(each) for kind, each in zip(_KINDS, pixels, strict=True)}
     suffix, content = subject.file(design)
     return {
-        **answers_and_sheet(problem, cell.name, things, settings.n, (sides(problem, _SIDES), _SHEET_PX)),
+        **test_and_draw(problem, cell.name, things, settings.n, (views_from_sides(problem, _SHEET_VIEWS), _SHEET_PX)),
         "color": mean_color(problem, things["design"], _TURN_VIEWS, _SHEET_PX),
         f"{cell.name}.{suffix}": content,
     }
 
 
-Key = tuple  # scene, way, class, trained on
+DesignKey = tuple  # scene, way, class, trained on
 _HEAD = ("scene", "way", "class", "trained on")
 
 
-def _by_design(results: Sequence[Result]) -> Mapping[Key, Sequence[Result]]:
-    return grouped(results, of_values("name", "way", "class", "row"))
+def _by_design(results: Sequence[Result]) -> Mapping[DesignKey, Sequence[Result]]:
+    return group_by(results, by_values("name", "way", "class", "row"))
 
 
 def tables(settings: RobustSettings, results: Sequence[Result]) -> list[Table]:
-    """Rates on all networks beside gray; the mean color of each class."""
+    """Tables of rates on all networks beside gray, and of each class's mean color."""
     rates, colors = [], []
     for key, of_key in _by_design(results).items():
-        design, begun = Record(of_key, "design"), Record(of_key, "start")
-        for network in tested_in(of_key):
-            gain = design.gain(begun, network)[0]
-            levels = begun.level(network)[0], *design.level(network)
-            rates.append((*key, short_name(network), *levels, gain, verdict(gain)))
+        design, start = Record(of_key, "design"), Record(of_key, "start")
+        for network in tested_networks(of_key):
+            gain = design.gain(start, network)[0]
+            levels = start.level(network)[0], *design.level(network)
+            rates.append((*key, short_name(network), *levels, gain, gain_word(gain)))
         codes = _mean_codes(of_key)
         colors.append((*key, _hex(codes), *codes))
     about = f"Over {settings.n} unseen conditions per seed, paired with the untrained start."
@@ -105,7 +105,6 @@ def tables(settings: RobustSettings, results: Sequence[Result]) -> list[Table]:
 
 
 def _mean_codes(results: Sequence[Result]) -> tuple[int, int, int]:
-    """The mean over designs, in light."""
     light = linear_from_srgb(np.array([result.answers["color"] for result in results]) / 255).mean(0)
     red, green, blue = (int(code) for code in np.rint(srgb_from_linear(light) * 255))
     return red, green, blue
@@ -116,7 +115,7 @@ def _hex(codes: tuple[int, int, int]) -> str:
 
 
 def figures(settings: RobustSettings, results: Sequence[Result]) -> list[Drawing]:
-    """Colors of all classes, and per scene and way what the designs look like."""
+    """A grid of all classes' colors, and a contact sheet of designs per scene and way."""
     by_design = _by_design(results)
     rows, networks = list(dict.fromkeys(key[:3] for key in by_design)), list(dict.fromkeys(key[3] for key in by_design))
     drawings = [
@@ -138,7 +137,7 @@ def figures(settings: RobustSettings, results: Sequence[Result]) -> list[Drawing
 
 
 def _color_grid(
-    figure: Figure, by_design: Mapping[Key, Sequence[Result]], rows: Sequence[tuple], networks: Sequence[str]
+    figure: Figure, by_design: Mapping[DesignKey, Sequence[Result]], rows: Sequence[tuple], networks: Sequence[str]
 ) -> None:
     picture, axes = np.ones((len(rows), len(networks), 3)), figure.add_subplot()
     for key, of_key in by_design.items():

@@ -1,9 +1,9 @@
-"""Maps of stress tests: cells of pose × light, what a network answers to the clean object there, and how that is drawn.
+"""Maps of stress tests: conditions in cells of pose × light, a network's answers there, and heat maps.
 
-In: a scene with a mesh before one network, and draws of its streams. Out: draws whose pose and light lie in one cell of
-a map while everything else stays as drawn; recognized and confidence per draw, and what the network answers to the
-background alone; the worst tenth of a map's cells; and `Drawing`s, which share one scale from 0 to 1. All cells of a
-map share the same draws of background, camera and whatever is no axis, so that cells differ in pose and light alone.
+In: a problem with a mesh and one network, and draws of its streams. Out: draws whose pose and light lie in one cell of
+a map while everything else stays as drawn; recognized and confidence per draw, also for the background alone; the worst
+tenth of a map's cells; and `Drawing`s with one scale from 0 to 1. All cells of a map share their draws of background,
+camera and everything else, so that they differ in pose and light only.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from patchlab.study.figures import number_grid
-from patchlab.study.grid import Count, GridSettings, grid_cells
+from patchlab.study.grid import GridSettings, PositiveInt, grid_cells
 from patchlab.study.study import Cell
 from patchproof.base.errors import Refused
 from patchproof.base.goal import Goal
@@ -36,10 +36,10 @@ if TYPE_CHECKING:
 
 PoseAxis = Literal["azimuth_deg", "elevation_deg", "distance_mm", "roll_deg"]
 LightAxis = Literal["ambient", "directional", "light_azimuth_deg", "light_elevation_deg", "exposure_ev"]
-# What of a draw is the pose and the light; the rest is background, print and camera.
-POSE = EFFECT_BY_NAME["viewpoint"].fields
-_LIGHT = ("ambient light", "directional light", "exposure")
-LIGHT = tuple(name for effect in _LIGHT for name in EFFECT_BY_NAME[effect].fields)
+# fields of conditions that are pose and light; the rest is background, print and camera
+POSE_FIELDS = EFFECT_BY_NAME["viewpoint"].fields
+_LIGHT_EFFECTS = ("ambient light", "directional light", "exposure")
+LIGHT_FIELDS = tuple(name for effect in _LIGHT_EFFECTS for name in EFFECT_BY_NAME[effect].fields)
 WORST_SHARE = 0.1
 
 
@@ -48,13 +48,13 @@ class MapSettings(StrictModel):
 
     pose: PoseAxis = "azimuth_deg"  # the axis across
     light: LightAxis = "light_azimuth_deg"  # the axis upwards
-    pose_cells: Count = 10  # cells of equal width across the scene's own range
-    light_cells: Count = 6  # likewise
-    n: Count = 32  # draws in each cell
+    pose_cells: PositiveInt = 10  # cells of equal width across the scene's own range
+    light_cells: PositiveInt = 6  # cells of equal height upwards
+    n: PositiveInt = 32  # draws in each cell
 
 
 @dataclass(frozen=True)
-class Axis:
+class MapAxis:
     """One axis of a map: a field of the conditions and the edges of its cells."""
 
     name: str
@@ -64,39 +64,39 @@ class Axis:
         return len(self.edges) - 1
 
 
-Ticks = tuple[str, Sequence[float], Sequence[str]]  # an axis's label, where its ticks are, and what they say
-_UNITS = {"deg": "°", "mm": "mm", "ev": "EV"}
-Place = tuple[int, int]  # a map's cell: which of the poses, which of the lights
+AxisTicks = tuple[str, Sequence[float], Sequence[str]]  # an axis's label, tick positions, tick texts
+_UNIT_SYMBOLS = {"deg": "°", "mm": "mm", "ev": "EV"}
+MapCell = tuple[int, int]  # indices of a map's cell: pose, light
 
 
 def mesh_cells(settings: GridSettings, base: Path) -> list[Cell]:
-    """A cell per scene, network and seed; refused where pose and light cannot be set."""
+    """A cell per scene, network and seed; refuses scenes without a mesh, whose pose and light cannot be set."""
     cells = grid_cells(settings, base)
     if flat := [cell.values["file"] for cell in cells if cell.values["scene"]["object"]["mesh"] is None]:
         raise Refused("scenes with a mesh, whose pose and light can be set", flat[0], "name object.mesh in it")
     return cells
 
 
-def axes_of(settings: SceneSettings, asked: MapSettings) -> tuple[Axis, Axis]:
-    """The map's axes, pose and light, over the scene's ranges; refused where a range is a single value."""
+def map_axes(settings: SceneSettings, options: MapSettings) -> tuple[MapAxis, MapAxis]:
+    """The map's axes, pose and light, over the scene's ranges; refuses a range that is a single value."""
 
-    def axis(name: str, count: int) -> Axis:
+    def axis(name: str, count: int) -> MapAxis:
         low, high = next(effect.range(settings, name) for effect in EFFECTS if name in effect.columns)
         if low == high:
             do = "widen it, or choose another axis"
             raise Refused(f"a range of {name} that a map can be cut from", f"[{low:g}, {high:g}]", do)
-        return Axis(name, tuple(np.linspace(low, high, count + 1).tolist()))
+        return MapAxis(name, tuple(np.linspace(low, high, count + 1).tolist()))
 
-    return axis(asked.pose, asked.pose_cells), axis(asked.light, asked.light_cells)
+    return axis(options.pose, options.pose_cells), axis(options.light, options.light_cells)
 
 
-def axes_values(axes: tuple[Axis, Axis]) -> dict[str, Any]:
+def axes_values(axes: tuple[MapAxis, MapAxis]) -> dict[str, Any]:
     """The axes as JSON values."""
     return {"names": [axis.name for axis in axes], "edges": [list(axis.edges) for axis in axes]}
 
 
-def in_cell(conditions: Conditions, axes: tuple[Axis, Axis], place: Place) -> Conditions:
-    """`conditions` with pose and light moved into a cell, each as far in as it lay in its range."""
+def move_into_cell(conditions: Conditions, axes: tuple[MapAxis, MapAxis], place: MapCell) -> Conditions:
+    """Conditions with pose and light moved into a cell, linearly from the whole range."""
     changed, fields = {}, fields_of(conditions)
     for axis, number in zip(axes, place, strict=True):
         first, last, low, high = axis.edges[0], axis.edges[-1], axis.edges[number], axis.edges[number + 1]
@@ -105,27 +105,27 @@ def in_cell(conditions: Conditions, axes: tuple[Axis, Axis], place: Place) -> Co
     return with_values(conditions, **changed)
 
 
-def in_cells(conditions: Conditions, axes: tuple[Axis, Axis], places: Sequence[Place]) -> Conditions:
-    """`conditions` moved into cells, an equal share of the rows into each, in order; no draw serves two cells."""
+def spread_over_cells(conditions: Conditions, axes: tuple[MapAxis, MapAxis], places: Sequence[MapCell]) -> Conditions:
+    """Conditions moved into cells: an equal number of rows into each, in order, no row into two."""
     n = len(conditions) // len(places)
-    parts = [fields_of(in_cell(conditions[i * n : (i + 1) * n], axes, place)) for i, place in enumerate(places)]
+    parts = [fields_of(move_into_cell(conditions[i * n : (i + 1) * n], axes, place)) for i, place in enumerate(places)]
     return conditions_from_fields({name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
 
 
-def each_before_all(tried: Conditions, rest: Conditions, names: Sequence[str]) -> Conditions:
-    """The fields `names` of each row of `tried`, with all else from each row of `rest`: row by row of `tried`."""
-    rows = np.tile(np.arange(len(rest)), len(tried))
-    fields = fields_of(tried)
+def combine_conditions(tries: Conditions, rest: Conditions, names: Sequence[str]) -> Conditions:
+    """Every row of `tries` with every row of `rest`: fields `names` from `tries`, all others from `rest`."""
+    rows = np.tile(np.arange(len(rest)), len(tries))
+    fields = fields_of(tries)
     return with_values(rest[rows], **{name: fields[name].repeat(len(rest), 0) for name in names})
 
 
-def clean(problem: Problem, conditions: Conditions, side_px: int | None = None) -> Responses:
-    """The networks' answers to the clean object (bare, or with its own texture)."""
+def clean_responses(problem: Problem, conditions: Conditions, side_px: int | None = None) -> Responses:
+    """Responses to the clean object, bare or with its texture."""
     return responses(problem, {"clean": None}, conditions, side_px)["clean"]
 
 
-def with_and_without(problem: Problem, conditions: Conditions) -> tuple[Responses, Responses]:
-    """The networks' answers to the clean object, and to the background alone through the same camera."""
+def responses_and_background(problem: Problem, conditions: Conditions) -> tuple[Responses, Responses]:
+    """Responses to the clean object, and to the background alone through the same camera."""
     parts: list[dict[str, Responses]] = []
     with torch.no_grad():
         for part in in_chunks(conditions):
@@ -138,19 +138,21 @@ def with_and_without(problem: Problem, conditions: Conditions) -> tuple[Response
     return answers["clean"], answers["alone"]
 
 
-def map_of(problem: Problem, axes: tuple[Axis, Axis], drawn: Conditions) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The clean object's hits (bool) and confidence, and the hits of the background alone, each P×L×N: poses, lights,
-    draws.
-    """
+def measure_map(
+    problem: Problem, axes: tuple[MapAxis, MapAxis], drawn: Conditions
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Hits (bool) and confidence of the clean object, and hits of the background alone, each poses × lights × draws."""
     shape = (len(axes[0]), len(axes[1]), len(drawn))
-    answers = [with_and_without(problem, in_cell(drawn, axes, place)) for place in np.ndindex(*shape[:2])]
-    hits, confidence = ([getattr(own, name)[0] for own, _ in answers] for name in ("recognized", "confidence"))
+    answers = [
+        responses_and_background(problem, move_into_cell(drawn, axes, place)) for place in np.ndindex(*shape[:2])
+    ]
+    hits, confidence = ([getattr(clean, name)[0] for clean, _ in answers] for name in ("recognized", "confidence"))
     alone = [background.recognized[0] for _, background in answers]
     return np.reshape(hits, shape), np.reshape(confidence, shape), np.reshape(alone, shape)
 
 
-def worst_cells(hits: np.ndarray, confidence: np.ndarray, goal: Goal = Goal.assist) -> list[Place]:
-    """The worst tenth of a map's cells, at least one: by rate, among equals by mean confidence, then in their order."""
+def worst_cells(hits: np.ndarray, confidence: np.ndarray, goal: Goal = Goal.assist) -> list[MapCell]:
+    """The worst tenth of a map's cells, at least one: by rate, then by mean confidence, then by index."""
     rate, sure = goal.sign * hits.mean(2).ravel(), goal.sign * confidence.mean(2).ravel()
     order = np.lexsort((np.arange(rate.size), sure, rate))[: math.ceil(WORST_SHARE * rate.size)]
     return [(int(i), int(j)) for i, j in zip(*np.unravel_index(order, hits.shape[:2]), strict=True)]
@@ -161,12 +163,12 @@ def heat_map(
     titles: tuple[str, str],
     rates: Sequence[Sequence[float]],
     framed: Sequence[Sequence[int]],
-    ticks: Sequence[Ticks],
+    ticks: Sequence[AxisTicks],
     upward: bool = True,
-    empty: Sequence[Place] = (),
+    empty: Sequence[MapCell] = (),
 ) -> Drawing:
-    """Rates over two axes, the second one upward or down; `titles` are the drawing's and the plot's own. `empty` cells,
-    whose rates say nothing, are gray.
+    """Draw rates over two axes, the second one upward or downward; `titles` are the drawing's and the plot's. `empty`
+    cells, whose rates mean nothing, are gray.
     """
 
     def draw(figure: Figure) -> None:
@@ -186,17 +188,17 @@ def heat_map(
     return Drawing(name, titles[0], draw, size)
 
 
-def map_ticks(axes: Mapping[str, Any]) -> list[Ticks]:
-    """Of a map's axes (`names`, and the `edges` of their cells)."""
+def map_ticks(axes: Mapping[str, Any]) -> list[AxisTicks]:
+    """Ticks of both axes from their JSON values (`names`, and the `edges` of cells)."""
     return [
-        (words_of(name), [i - 0.5 for i in range(len(edges))], [f"{value:.4g}" for value in edges])
+        (field_title(name), [i - 0.5 for i in range(len(edges))], [f"{value:.4g}" for value in edges])
         for name, edges in zip(axes["names"], axes["edges"], strict=True)
     ]
 
 
-def words_of(name: str) -> str:
-    """A condition's field as people read it: "azimuth (°)" for azimuth_deg."""
+def field_title(name: str) -> str:
+    """The title of a condition's field: "azimuth (°)" for azimuth_deg."""
     words, unit = name.split("_"), ""
-    if words[-1] in _UNITS:
-        unit = f" ({_UNITS[words.pop()]})"
+    if words[-1] in _UNIT_SYMBOLS:
+        unit = f" ({_UNIT_SYMBOLS[words.pop()]})"
     return " ".join(words) + unit

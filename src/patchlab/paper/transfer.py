@@ -1,15 +1,15 @@
-"""Designs trained on each network and on ensembles, tested on every network, beside the original object.
+"""Train designs on each network and on ensembles, and test them on every network beside the original object.
 
 In: scenes, ways (full texture, masked, many or few signed steps, patches, ...), networks and seeds. Out: the matrix of
-rates and confidences with intervals, each beside the *original* object's on the same conditions; what a network gains
-from designs that never saw it; three fixed views in changed light; heat maps and contact sheets; each design as a GLB
-that opens elsewhere. A nil transfer is said, with its interval. Where networks are given families, ensembles leave out
-whole ones, and gains are also said from family to family.
+rates and confidences with intervals, each beside the original object's on the same conditions; gains of networks that a
+design was not trained on; three fixed views in changed light; heat maps and contact sheets; each design as a GLB.
+Where no gain is shown, its interval stands in the table. If networks have families, ensembles leave out whole families,
+and another table has the gains from family to family.
 
 Source: Pestana et al., algorithm "Full Texture" and table "Transferability". Their ε is the signed step, here
-`optimize.step_size`; a ball round the start is `patch.epsilon`. Intervals are over conditions, of the designs that were
-trained: another seed's design may do better or worse. Only those over objects are of one figure per object and seed:
-conditions of one object are no evidence of another.
+`optimize.step_size`; a ball around the start is `patch.epsilon`. Intervals are over conditions, for the designs that
+were trained: another seed's design may do better or worse. Only intervals over objects take one figure per object and
+seed.
 """
 
 from __future__ import annotations
@@ -22,22 +22,22 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pydantic import Field, model_validator
 
-from patchlab.paper.sides import sides, three_views
-from patchlab.study.claims import mean
+from patchlab.paper.object_views import views_from_sides, views_in_drawn_light
+from patchlab.study.estimates import mean
 from patchlab.study.figures import number_grid, picture_sheet
-from patchlab.study.grid import Count, Names, grouped, of_values, problem_of, short_name
-from patchlab.study.record import Record, recorded
+from patchlab.study.grid import Names, PositiveInt, by_values, group_by, problem_of, short_name
+from patchlab.study.record import Record, to_record
 from patchlab.study.study import Cell, Result, Study
-from patchlab.study.trained import (
+from patchlab.study.trained_designs import (
     ORIGINAL,
+    NamePart,
     TrainedSettings,
-    Word,
-    alone,
-    answers_and_sheet,
-    tested_in,
+    gain_word,
+    single_network_rows,
+    test_and_draw,
+    tested_networks,
     trained_cells,
-    trained_on,
-    verdict,
+    with_trainers,
 )
 from patchproof.base.intervals import rate
 from patchproof.optimizer.loop import best_design
@@ -49,94 +49,94 @@ from patchproof.report.tables import Drawing, Table
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_ALL, _WITHOUT = "all", "without_"
+_ALL_ROW, _WITHOUT_PREFIX = "all", "without_"
 _SHEET_PX = 224
 
 
 class TransferSettings(TrainedSettings):
-    """As in all studies of trained designs."""
+    """Settings of a study of trained designs with ensembles and families of networks."""
 
-    ensembles: bool = True  # also trained on all networks but one, each in turn, and on all
-    # By name: networks of one family, all of `networks` in one or another. Ensembles leave out a whole family; {}: each
-    # network is one of its own.
-    families: dict[Word, Names] = Field({})
-    lights: Count = 20  # lights in each of three fixed views
+    ensembles: bool = True  # also train on all networks but one, each in turn, and on all
+    # By name: networks of a family; each of `networks` is in one. Ensembles leave out whole families. {}: every network
+    # is a family.
+    families: dict[NamePart, Names] = Field({})
+    lights: PositiveInt = 20  # lights in each of three fixed views
 
     @model_validator(mode="after")
     def _know_every_family(self):
         members = [name for family in self.families.values() for name in family]
         if self.families and sorted(members) != sorted(self.networks):
-            raise ValueError("takes families in which each of networks is once, and nothing else")
+            raise ValueError("takes families in which each of networks is once, and no other network")
         return self
 
     def family_of(self, network: str) -> str:
-        """The name of the family that a network is in."""
+        """The family of a network."""
         return next((name for name, family in self.families.items() if network in family), short_name(network))
 
 
 def cells(settings: TransferSettings, base: Path) -> list[Cell]:
-    """The original and every training set, per scene, way and seed."""
+    """A cell per scene, way and seed for the original and for every training set."""
 
     def rows(networks: Sequence[str]) -> dict[str, Sequence[str]]:
         ensembles: dict[str, Sequence[str]] = {}
         if settings.ensembles and len(networks) > 1:
             for family in dict.fromkeys(map(settings.family_of, networks)):
                 rest = [name for name in networks if settings.family_of(name) != family]
-                if len(rest) > 1:  # else one network is left, which is a row already
-                    ensembles[_WITHOUT + family] = rest
-            ensembles[_ALL] = networks
-        return {ORIGINAL: (), **alone(networks), **ensembles}
+                if len(rest) > 1:  # a single network is a row already
+                    ensembles[_WITHOUT_PREFIX + family] = rest
+            ensembles[_ALL_ROW] = networks
+        return {ORIGINAL: (), **single_network_rows(networks), **ensembles}
 
     return trained_cells(settings, base, rows)
 
 
 def run(settings: TransferSettings, base: Path, cell: Cell) -> dict[str, Any]:
-    """Train where the cell says so, and test."""
+    """Train if the cell names training networks, then test on all."""
     problem = problem_of(base, cell.values)
     answers: dict[str, Any] = {}
     things: dict[str, Appearance] = {"design": None}
     if cell.values["trained"]:
-        design = best_design(trained_on(problem, cell))
+        design = best_design(with_trainers(problem, cell))
         things = pictures_with_controls(problem, design, ())
         suffix, content = problem.subject.file(design)
         answers[f"{cell.name}.{suffix}"] = content
-    answers |= answers_and_sheet(problem, cell.name, things, settings.n, (sides(problem, 3), _SHEET_PX))
+    answers |= test_and_draw(problem, cell.name, things, settings.n, (views_from_sides(problem, 3), _SHEET_PX))
     if problem.scene.HAS_OBJECT:
-        fixed = three_views(problem, settings.lights)
-        answers["views"] = recorded(responses(problem, things, fixed))
+        fixed = views_in_drawn_light(problem, settings.lights)
+        answers["views"] = to_record(responses(problem, things, fixed))
         answers["azimuths"] = fixed.pose.azimuth_deg[:: settings.lights].tolist()
     return answers
 
 
 def tables(settings: TransferSettings, results: Sequence[Result]) -> list[Table]:
-    """The matrix, the same over objects, networks left out, and fixed views."""
+    """Tables: the matrix, gains over objects, networks left out, and fixed views."""
     rows = _rows(results)
-    left_out = _left_out(settings, results, rows)
-    return [_matrix(settings, rows), *_over_objects(settings, results), *left_out, *_views(settings, rows)]
+    left_out = _left_out_tables(settings, results, rows)
+    return [_matrix(settings, rows), *_object_tables(settings, results), *left_out, *_view_tables(settings, rows)]
 
 
-Rows = Mapping[tuple, Mapping[str, Sequence[Result]]]  # results by (scene, way), then by row
+ResultsByRow = Mapping[tuple, Mapping[str, Sequence[Result]]]  # results by (scene, way), then by row
 
 
-def _rows(results: Sequence[Result]) -> Rows:
-    groups = grouped(results, of_values("name", "way"))
-    return {key: grouped(group, lambda result: result.cell.values["row"]) for key, group in groups.items()}
+def _rows(results: Sequence[Result]) -> ResultsByRow:
+    groups = group_by(results, by_values("name", "way"))
+    return {key: group_by(group, lambda result: result.cell.values["row"]) for key, group in groups.items()}
 
 
-def _matrix(settings: TransferSettings, groups: Rows) -> Table:
+def _matrix(settings: TransferSettings, groups: ResultsByRow) -> Table:
     rows = []
     for key, by_row in groups.items():
         original = Record(by_row.get(ORIGINAL, ()), "design")
         for row, of_row in by_row.items():
             record = Record(of_row, "design")
-            for network in tested_in(of_row):
+            for network in tested_networks(of_row):
                 (level, sure), (gain, surer) = record.level(network), record.gain(original, network)
                 trained = network in of_row[0].cell.values["trained"]
                 start = (*key, row, short_name(network))
                 if row == ORIGINAL:
                     rows.append((*start, "", level, None, "", sure, None))
                 else:
-                    rows.append((*start, "yes" if trained else "no", level, gain, verdict(gain), sure, surer))
+                    rows.append((*start, "yes" if trained else "no", level, gain, gain_word(gain), sure, surer))
     head = ("scene", "way", "trained on", "tested on", "seen", "rate", "gain in rate", "shows")
     about = (
         f"Rates and mean confidences of the target over {settings.n} unseen conditions per seed"
@@ -146,8 +146,7 @@ def _matrix(settings: TransferSettings, groups: Rows) -> Table:
     return Table("matrix", "Trained on one, tested on another", head, tuple(rows), about)
 
 
-def _over_objects(settings: TransferSettings, results: Sequence[Result]) -> list[Table]:
-    """Mean gains over objects and seeds: network by network and, where families are given, family by family."""
+def _object_tables(settings: TransferSettings, results: Sequence[Result]) -> list[Table]:
 
     def family_of_row(result: Result) -> str:
         trained = result.cell.values["trained"]
@@ -156,47 +155,49 @@ def _over_objects(settings: TransferSettings, results: Sequence[Result]) -> list
     title = "Gains over objects"
     if len({(result.cell.values["name"], result.cell.values["seed"]) for result in results}) < 2:
         return []
-    tables = [_gains(results, "objects", title, lambda result: result.cell.values["row"], short_name)]
+    tables = [_gain_table(results, "objects", title, lambda result: result.cell.values["row"], short_name)]
     if settings.families:
-        tables.append(_gains(results, "families", f"{title}, by family", family_of_row, settings.family_of))
+        tables.append(_gain_table(results, "families", f"{title}, by family", family_of_row, settings.family_of))
     return tables
 
 
-def _gains(
+def _gain_table(
     results: Sequence[Result], name: str, title: str, trainer: Callable[[Result], str], tester: Callable[[str], str]
 ) -> Table:
-    """One figure of each object and seed: the mean over rows and networks that are called the same."""
-    place = of_values("way", "name", "seed")
-    originals = {place(result): Record([result], "design") for result in results if not result.cell.values["trained"]}
+    """A table of gains from one figure per object and seed, the mean over rows and networks of one name."""
+    group_of = by_values("way", "name", "seed")
+    originals = {
+        group_of(result): Record([result], "design") for result in results if not result.cell.values["trained"]
+    }
     figures: dict[tuple, dict[tuple, list[tuple[float, float]]]] = {}
-    for result, network in product(results, tested_in(results)):
-        trained, here = result.cell.values["trained"], place(result)
-        if trained and here in originals:
-            start = (here[0], trainer(result), tester(network), "yes" if network in trained else "no")
-            before, after = (np.mean(of.hits(network)) for of in (originals[here], Record([result], "design")))
-            figures.setdefault(start, {}).setdefault(here, []).append((float(before), float(after)))
+    for result, network in product(results, tested_networks(results)):
+        trained, group = result.cell.values["trained"], group_of(result)
+        if trained and group in originals:
+            start = (group[0], trainer(result), tester(network), "yes" if network in trained else "no")
+            before, after = (np.mean(of.hits(network)) for of in (originals[group], Record([result], "design")))
+            figures.setdefault(start, {}).setdefault(group, []).append((float(before), float(after)))
     rows = []
-    for start, by_place in figures.items():
-        before, after = np.array([np.mean(rates, 0) for rates in by_place.values()]).T
+    for start, by_group in figures.items():
+        before, after = np.array([np.mean(rates, 0) for rates in by_group.values()]).T
         gain = mean((after - before).tolist())
-        rows.append((*start, float(before.mean()), float(after.mean()), gain, verdict(gain)))
+        rows.append((*start, float(before.mean()), float(after.mean()), gain, gain_word(gain)))
     head = ("way", "trained on", "tested on", "seen", "original", "rate", "gain in rate", "shows")
     about = "Means of one figure per object and seed, with Student's interval over these."
     return Table(name, title, head, tuple(rows), about)
 
 
-def _left_out(settings: TransferSettings, results: Sequence[Result], groups: Rows) -> list[Table]:
+def _left_out_tables(settings: TransferSettings, results: Sequence[Result], groups: ResultsByRow) -> list[Table]:
     rows = []
     for key, by_row in groups.items():
         original = Record(by_row.get(ORIGINAL, ()), "design")
-        for network in tested_in(results):
-            if (without := by_row.get(_WITHOUT + settings.family_of(network))) is None:
+        for network in tested_networks(results):
+            if (without := by_row.get(_WITHOUT_PREFIX + settings.family_of(network))) is None:
                 continue
             record = Record(without, "design")
             gain, confidence = record.gain(original, network)
             before, after = original.level(network)[0], record.level(network)[0]
-            single = _from_others(settings, by_row, network)
-            rows.append((*key, short_name(network), before, after, gain, confidence, single, verdict(gain)))
+            single = _rate_from_others(settings, by_row, network)
+            rows.append((*key, short_name(network), before, after, gain, confidence, single, gain_word(gain)))
     head = ("scene", "way", "left out", "original", "ensemble of the others", "gain", "gain in confidence")
     head = (*head, "mean rate of one other", "shows")
     about = (
@@ -206,8 +207,7 @@ def _left_out(settings: TransferSettings, results: Sequence[Result], groups: Row
     return [Table("left_out", "Networks left out", head, tuple(rows), about)] if rows else []
 
 
-def _from_others(settings: TransferSettings, by_row: Mapping[str, Sequence[Result]], network: str) -> float | None:
-    """The mean rate on a network of the designs trained on one of another family."""
+def _rate_from_others(settings: TransferSettings, by_row: Mapping[str, Sequence[Result]], network: str) -> float | None:
     family = settings.family_of(network)
     rates = [
         np.mean(Record(results, "design").hits(network))
@@ -217,7 +217,7 @@ def _from_others(settings: TransferSettings, by_row: Mapping[str, Sequence[Resul
     return float(np.mean(rates)) if rates else None
 
 
-def _views(settings: TransferSettings, groups: Rows) -> list[Table]:
+def _view_tables(settings: TransferSettings, groups: ResultsByRow) -> list[Table]:
     rows = []
     for key, by_row in groups.items():
         for row, of_row in by_row.items():
@@ -233,8 +233,8 @@ def _views(settings: TransferSettings, groups: Rows) -> list[Table]:
 
 
 def figures(settings: TransferSettings, results: Sequence[Result]) -> list[Drawing]:
-    """A heat map and a contact sheet per scene and way."""
-    networks, drawings = tested_in(results), []
+    """A heat map and a contact sheet of designs per scene and way."""
+    networks, drawings = tested_networks(results), []
     for (scene, way), by_row in _rows(results).items():
         drawings += [
             Drawing(

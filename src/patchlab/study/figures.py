@@ -1,6 +1,6 @@
-"""Figures that several studies draw: pictures that cells left behind, numbers in a grid.
+"""Figures that several studies draw: stored pictures of cells, and grids of numbers.
 
-In: files of pictures; rates as lists. Out: `Drawing`s for a study's page, or what matplotlib takes.
+In: files of pictures; arrays of numbers. Out: `Drawing`s for a study's page, or images on axes.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.image import AxesImage
 
-EMPTY = "#dddddd"  # where there is nothing to see
+EMPTY_COLOR = "#dddddd"  # of cells without an effect
 
 
 def picture_sheet(
@@ -30,7 +30,7 @@ def picture_sheet(
     rows: Sequence[str] = (),
     columns: Sequence[str] = (),
 ) -> Drawing:
-    """PNGs below one another under their titles; `rows` and `columns` name equal parts of each picture."""
+    """Draw PNGs one below the other with titles; `rows` and `columns` label equal parts of each picture."""
 
     def draw(figure: Figure) -> None:
         from matplotlib.image import imread
@@ -57,12 +57,12 @@ def number_grid(
     fontsize: float = 7,
     empty: Sequence[tuple[int, int]] = (),
 ) -> AxesImage:
-    """R×C colored cells with a text in each; `framed` and `empty` ones, which say nothing, are (row, column)."""
+    """Draw R×C colored cells with a text in each; `framed` cells and gray `empty` ones are (row, column)."""
     from matplotlib.patches import Rectangle
 
     image = axes.imshow(values, cmap=colors, vmin=limits[0], vmax=limits[1], aspect="auto")
     for row, column in empty:
-        axes.add_patch(Rectangle((column - 0.5, row - 0.5), 1, 1, facecolor=EMPTY))
+        axes.add_patch(Rectangle((column - 0.5, row - 0.5), 1, 1, facecolor=EMPTY_COLOR))
     for (row, column), value in np.ndenumerate(values):
         red, green, blue, _ = image.cmap(image.norm(value))
         ink = "black" if (row, column) in empty or 0.3 * red + 0.6 * green + 0.1 * blue > 0.45 else "white"

@@ -1,10 +1,10 @@
-"""The grid that most studies walk: every scene file with every network and seed, and whatever a study varies besides.
+"""The grid of most studies: every scene file with every network and seed, and what else a study varies.
 
-In: a study's settings, with paths relative to the config's folder. Out: cells whose values carry the whole scene, so
-that a changed scene file is done again; from a cell's values the scene and its problem; results in groups.
+In: a study's settings, with paths relative to the config's folder. Out: cells whose values hold the whole scene, so
+that a cell is run again when its scene file changes; a cell's scene and problem; results in groups.
 
-A study may change keys of tables of the scene file (`patch`, `optimize`, ...), so that one scene serves for patches,
-full and masked textures, bounded or free. Changes are checked like the file.
+A study may change keys of the scene file's tables (`patch`, `optimize`, ...), so that one file serves for patches, full
+and masked textures, bounded or free. Changes are checked like the file.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.scene.interface import Scene
 from patchproof.scene.scene import build_scene
 
-Values = dict[str, Any]  # of a cell: JSON values
-Tables = Mapping[str, Mapping[str, Any]]  # tables of a scene file with the keys that change
-Count = Annotated[int, Field(ge=1)]
+CellValues = dict[str, Any]  # a cell's JSON values
+SceneChanges = Mapping[str, Mapping[str, Any]]  # tables of a scene file with the keys that change
+PositiveInt = Annotated[int, Field(ge=1)]
 Names = Annotated[tuple[str, ...], Field(min_length=1)]
 Seeds = Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)]
 Key = TypeVar("Key", bound=Hashable)
@@ -35,8 +35,8 @@ class GridSettings(StrictModel):
     """Every scene file with every network and seed; paths are relative to the config's folder."""
 
     scenes: Names  # scene files
-    networks: tuple[str, ...] = ()  # in place of each scene's own
-    seeds: Seeds = (0,)  # of the optimizer and the draws
+    networks: tuple[str, ...] = ()  # in place of each scene's networks
+    seeds: Seeds = (0,)  # seeds of the optimizer and the draws
 
     @model_validator(mode="after")
     def _have_different_names(self):
@@ -48,33 +48,33 @@ class GridSettings(StrictModel):
 
 
 def short_name(name: str) -> str:
-    """A scene's or network's name as tables and files say it: a file's stem, a registry's entry."""
+    """A scene's or network's name for tables and file names: a file's stem, a registry's entry."""
     word = name.rpartition(":")[2]
     return re.sub(r"[^\w.+-]", "-", Path(word).stem if "/" in word or word.endswith((".toml", ".onnx")) else word)[-40:]
 
 
-def scene_values(file: str, base: Path, tables: Tables | None = None, where: str = "") -> Values:
-    """The values of a cell that say its scene: name, file, and all settings with keys of some tables changed."""
+def scene_values(file: str, base: Path, tables: SceneChanges | None = None, where: str = "") -> CellValues:
+    """A cell's values for a scene: name, file, and all settings with some tables' keys changed."""
     path = Path(expand_path(file, base))
-    scene = _changed(read_toml(path), tables or {}, path.name + where)
+    scene = _changed_settings(read_toml(path), tables or {}, path.name + where)
     return {"name": short_name(file), "file": file, "scene": scene}
 
 
-def with_tables(values: Values, tables: Tables) -> Values:
-    """The values with keys of some of the scene's tables changed."""
-    return values | {"scene": _changed(values["scene"], tables, values["file"])}
+def with_changes(values: CellValues, tables: SceneChanges) -> CellValues:
+    """Cell values with keys of some of the scene's tables changed."""
+    return values | {"scene": _changed_settings(values["scene"], tables, values["file"])}
 
 
-def pairs(settings: GridSettings, base: Path) -> Iterator[Values]:
-    """The values of every scene before every single network, whose name tables say, but for the seed."""
+def scene_network_pairs(settings: GridSettings, base: Path) -> Iterator[CellValues]:
+    """Cell values without seed of every scene with every single network, under the network's short name."""
     for file in settings.scenes:
-        values: Values = scene_values(file, base) | {"of_scene": not settings.networks}
+        values: CellValues = scene_values(file, base) | {"of_scene": not settings.networks}
         for network in settings.networks or values["scene"]["target"]["models"]:
             yield values | {"networks": [network], "network": short_name(network)}
 
 
-def cell_of(values: Values, seed: int, *words: str) -> Cell:
-    """A cell named after its scene, what the words say, and the seed."""
+def make_cell(values: CellValues, seed: int, *words: str) -> Cell:
+    """A cell named after its scene, the words, and the seed."""
     name = ".".join((values["name"][:30], *words, str(seed)))
     return Cell(re.sub(r"[^\w=+.,-]+", "-", name), {**values, "seed": seed})
 
@@ -82,61 +82,59 @@ def cell_of(values: Values, seed: int, *words: str) -> Cell:
 def grid_cells(
     settings: GridSettings,
     base: Path,
-    vary: Callable[[Values], Iterable[tuple[Values, tuple[str, ...]]]] = lambda values: ((values, ()),),
+    vary: Callable[[CellValues], Iterable[tuple[CellValues, tuple[str, ...]]]] = lambda values: ((values, ()),),
 ) -> list[Cell]:
-    """A cell for every scene before every single network, each of its variants (values, and words for the name), and
-    every seed.
-    """
+    """A cell for every scene, single network, variant (values, and words for the name) and seed."""
     return [
-        cell_of(varied, seed, values["network"], *words)
-        for values in pairs(settings, base)
+        make_cell(varied, seed, values["network"], *words)
+        for values in scene_network_pairs(settings, base)
         for varied, words in vary(values)
         for seed in settings.seeds
     ]
 
 
 def scene_of(base: Path, values: Mapping[str, Any]) -> Scene:
-    """The scene that a cell's values hold, its paths relative to the scene file's folder."""
+    """Build the scene in a cell's values; its paths are relative to the scene file's folder."""
     settings = validate_model(SceneSettings, values["scene"], values["file"])
-    return build_scene(settings, _folder(base, values), values["seed"])
+    return build_scene(settings, _scene_folder(base, values), values["seed"])
 
 
-def networks_at(base: Path, values: Mapping[str, Any]) -> tuple[str, ...]:
-    """The values' networks, their paths relative to the config or, where it names none, to the scene."""
-    folder = _folder(base, values) if values["of_scene"] else base
+def network_names(base: Path, values: Mapping[str, Any]) -> tuple[str, ...]:
+    """Networks in a cell's values, with paths relative to the config's folder, or to the scene's if it names them."""
+    folder = _scene_folder(base, values) if values["of_scene"] else base
     return tuple(expand_path(name, folder) for name in values["networks"])
 
 
 def problem_of(base: Path, values: Mapping[str, Any]) -> Problem:
-    """The values' scene before their networks."""
-    return set_problem(scene_of(base, values), models=networks_at(base, values))
+    """The problem of the scene and networks in a cell's values."""
+    return set_problem(scene_of(base, values), models=network_names(base, values))
 
 
-def grouped(results: Iterable[Result], key: Callable[[Result], Key]) -> dict[Key, list[Result]]:
-    """Results by key, keys in the order they come."""
+def group_by(results: Iterable[Result], key: Callable[[Result], Key]) -> dict[Key, list[Result]]:
+    """Results by key, keys in order of appearance."""
     groups: dict[Key, list[Result]] = {}
     for result in results:
         groups.setdefault(key(result), []).append(result)
     return groups
 
 
-def of_values(*names: str) -> Callable[[Result], tuple]:
-    """A key to group by: these values of a result's cell."""
+def by_values(*names: str) -> Callable[[Result], tuple]:
+    """A function that returns these values of a result's cell, to group by."""
     return lambda result: tuple(result.cell.values[name] for name in names)
 
 
 def by_scene(results: Sequence[Result]) -> dict[str, list[Result]]:
     """Results by their scene's name."""
-    return grouped(results, lambda result: result.cell.values["name"])
+    return group_by(results, lambda result: result.cell.values["name"])
 
 
-who = of_values("name", "network", "seed")  # scene, network and seed, as tables begin
+cell_key = by_values("name", "network", "seed")  # (scene, network, seed), the first columns of many tables
 
 
-def _changed(data: Mapping[str, Any], tables: Tables, where: str) -> dict[str, Any]:
-    whole = {**data, **{name: {**data.get(name, {}), **keys} for name, keys in tables.items()}}
-    return validate_model(SceneSettings, whole, where).model_dump(mode="json")
+def _changed_settings(data: Mapping[str, Any], tables: SceneChanges, where: str) -> dict[str, Any]:
+    tables = {**data, **{name: {**data.get(name, {}), **keys} for name, keys in tables.items()}}
+    return validate_model(SceneSettings, tables, where).model_dump(mode="json")
 
 
-def _folder(base: Path, values: Mapping[str, Any]) -> Path:
+def _scene_folder(base: Path, values: Mapping[str, Any]) -> Path:
     return Path(expand_path(values["file"], base)).resolve().parent

@@ -1,6 +1,6 @@
-"""Pictures that a study's cells leave behind, as bytes of files: photographs side by side, designs large.
+"""Pictures that a study's cells store: photographs side by side, enlarged designs.
 
-In: a problem and what shows, or pixels. Out: tensors N×3×S×S in [0, 1], and PNG bytes.
+In: a problem and an appearance, or pixels. Out: tensors N×3×S×S in [0, 1], and PNG bytes.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from patchproof.scene.conditions import Conditions
 
 
 def photographs(problem: Problem, shown: Appearance, conditions: Conditions, side_px: int) -> Tensor:
-    """N×3×S×S square photographs of one thing; None is the bare object."""
+    """N×3×S×S square photographs of one appearance; None is the bare object."""
     with torch.no_grad():
         return expose(problem.see(shown, conditions, side_px), shown)
 
 
 def contact_sheet(rows: Sequence[Sequence[Tensor] | Tensor]) -> bytes:
-    """Rows of pictures 3×S×S as one PNG."""
+    """One PNG of rows of pictures 3×S×S."""
     return png(as_pixels(torch.cat([torch.cat(list(row), 2) for row in rows], 1)))
 
 
-def enlarged(pixels: np.ndarray, side_px: int) -> Tensor:
-    """A design H×W×3 in the middle of a white square 3×S×S, as large as fits, so that its pixels can be seen."""
+def enlarge_design(pixels: np.ndarray, side_px: int) -> Tensor:
+    """A design H×W×3 enlarged, without smoothing, in the middle of a white square 3×S×S."""
     height, width = pixels.shape[:2]
     scale = side_px / max(height, width)
     size = (round(width * scale), round(height * scale))

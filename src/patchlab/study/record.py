@@ -1,8 +1,8 @@
-"""What cells record of networks' answers: short as JSON, and paired across cells.
+"""Record networks' answers as short JSON values, and pair them across cells.
 
-In: answers by what was shown. Out: per thing and network a text of 0 and 1, and confidences to five digits; from
-results the rates, mean confidences and paired differences of tables. Cells of one scene, its networks and a seed are
-measured on the same draws of the evaluate stream, which training and selection never see.
+In: answers by shown thing (a design, a control). Out: per thing and network a text of 0 and 1, and confidences to five
+digits; from results the rates, mean confidences and paired differences of tables. Cells of one scene, its networks and
+a seed share draws of the evaluate stream, which training and selection never see.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from patchlab.study.claims import mean
+from patchlab.study.estimates import mean
 from patchlab.study.study import Result
 from patchproof.base.geometry import apply_homography
 from patchproof.base.goal import Goal
@@ -21,43 +21,41 @@ from patchproof.evidence.results import Geometry
 from patchproof.optimizer.responses import Responses
 
 
-def recorded(answers: Mapping[str, Responses]) -> dict[str, Any]:
+def to_record(answers: Mapping[str, Responses]) -> dict[str, Any]:
     """Hits and confidences as JSON values, each per shown thing and network."""
     return {
-        "hits": {thing: [bits(row) for row in answer.recognized] for thing, answer in answers.items()},
+        "hits": {thing: [hits_text(row) for row in answer.recognized] for thing, answer in answers.items()},
         "confidence": {thing: np.round(answer.confidence, 5).tolist() for thing, answer in answers.items()},
     }
 
 
-def bits(hits: Sequence[bool] | np.ndarray) -> str:
-    """Hits as a text of 0 and 1."""
+def hits_text(hits: Sequence[bool] | np.ndarray) -> str:
+    """Write hits as a text of 0 and 1."""
     return "".join("01"[int(hit)] for hit in hits)
 
 
-def hits_of(text: str) -> list[bool]:
-    """The hits of `bits`."""
+def parse_hits(text: str) -> list[bool]:
+    """Read hits from a text of 0 and 1."""
     return [digit == "1" for digit in text]
 
 
 def rate_of(result: Result, thing: str) -> float:
-    """The rate of a shown thing before the first of its cell's networks."""
-    return float(np.mean(hits_of(result.answers["hits"][thing][0])))
+    """The rate of a shown thing with the first of its cell's networks."""
+    return float(np.mean(parse_hits(result.answers["hits"][thing][0])))
 
 
 def gain_of(result: Result, thing: str, other: str) -> float:
-    """The rate of a thing over another's, in the direction of the goal of its cell's scene."""
+    """The rate of a thing minus another's, in the direction of the scene's goal."""
     return Goal(result.cell.values["scene"]["target"]["goal"]).sign * (rate_of(result, thing) - rate_of(result, other))
 
 
-def hardest(result: Result, controls: Sequence[str]) -> str:
+def hardest_control(result: Result, controls: Sequence[str]) -> str:
     """The control that is hardest to beat."""
     return max(controls, key=lambda name: gain_of(result, name, controls[0]))
 
 
 def corner_error_mm(geometry: Geometry, corners_mm: np.ndarray, true_px: np.ndarray) -> float | None:
-    """How far on paper the corners N×2, which lie at `true_px`, are seen at most from where they are; None where the
-    photograph's homography is not known.
-    """
+    """The largest error in mm of corners N×2 whose true pixels are `true_px`; None without a homography."""
     if geometry.homography_px_from_mm is None:
         return None
     seen_mm = apply_homography(np.linalg.inv(np.array(geometry.homography_px_from_mm)), true_px)
@@ -65,9 +63,9 @@ def corner_error_mm(geometry: Geometry, corners_mm: np.ndarray, true_px: np.ndar
 
 
 class Record:
-    """What results recorded of one shown thing, one cell after the other; in `where` of their answers, if given.
+    """Hits and confidences of one shown thing over several results; taken from `answers[where]` if `where` is given.
 
-    A network may be left out where cells have one only.
+    `network` may be None where every cell has a single network.
     """
 
     def __init__(self, results: Iterable[Result], thing: str, where: str | None = None):
@@ -79,23 +77,23 @@ class Record:
 
     def hits(self, network: str | None = None, among: Iterable[Hashable] | None = None) -> list[bool]:
         """Recognized or not, per condition."""
-        return [hit for text in self._rows("hits", network, among) for hit in hits_of(text)]
+        return [hit for text in self._rows("hits", network, among) for hit in parse_hits(text)]
 
     def confidences(self, network: str | None = None, among: Iterable[Hashable] | None = None) -> list[float]:
         """The target's confidence, per condition."""
         return [value for row in self._rows("confidence", network, among) for value in row]
 
     def level(self, network: str | None = None) -> tuple[Estimate | None, Estimate | None]:
-        """(rate, mean confidence)."""
+        """(rate, mean confidence) with intervals."""
         return rate(self.hits(network)), mean(self.confidences(network))
 
     def gain(self, other: Record, network: str | None = None) -> tuple[Estimate | None, Estimate | None]:
-        """(rate, mean confidence) over those of `other`, paired by condition in the cells that both have."""
+        """(rate, mean confidence) minus those of `other`, paired by condition in the cells that both have."""
         shared = [key for key in self._cells if key in other._cells]
         pairs = zip(self.confidences(network, shared), other.confidences(network, shared), strict=True)
         return (
             estimate_difference(self.hits(network, shared), other.hits(network, shared)),
-            mean([own - others for own, others in pairs]),
+            mean([mine - others for mine, others in pairs]),
         )
 
     def _rows(self, kind: str, network: str | None, among: Iterable[Hashable] | None) -> list[Any]:

@@ -1,11 +1,11 @@
-"""Studies: many independent cells, each finished one kept, so that a study that was killed goes on where it was.
+"""Run studies: many independent cells, each stored when finished, so that a killed study can be resumed.
 
 In: a study's name and one strict TOML file. Out: a folder with `NAME.json` (settings, every cell's values, failures,
-tables), a CSV per table, a PNG per figure, `NAME.html`, and `cells/`, one JSON per finished cell, written whole. A cell
-that fails is reported with its sentence and the rest goes on; `resume` does again what failed or is missing. Cells
-compute on one thread each, so the tables are the same for any number of jobs, on a cluster, and after a kill.
+tables), a CSV per table, a PNG per figure, `NAME.html`, and `cells/`, one JSON per finished cell, written atomically. A
+cell that fails is reported with its error and the others run; `resume` runs failed and missing cells again. Cells
+compute on one thread each, so tables are the same for any number of jobs, on a cluster, and after a kill.
 
-A study is a module with a `STUDY`; its parts get plain values and know nothing of files, processes or resuming.
+A study is a module with a `STUDY`; its functions get plain values and know nothing of files, processes or resuming.
 Left out on purpose: cells that depend on one another (one cell trains and tests), and times (they would differ).
 """
 
@@ -31,33 +31,33 @@ from patchproof.base.validation import StrictModel, read_toml, spelling_hint, va
 from patchproof.base.workers import open_workers, result_of, use_threads
 from patchproof.report.tables import Drawing, Results, Table, write_json, write_results
 
-# by name the module whose STUDY it is; the first line of its docstring says what it is about
+# by name: the module with the STUDY; the first line of its docstring describes the study
 STUDIES: dict[str, str] = {
     "ablation": "patchlab.validation.ablation",
     "deceive": "patchlab.paper.deceive",
     "detection": "patchlab.validation.detection",
     "envelope": "patchlab.validation.envelope.sweeps",
     "forecasts": "patchlab.validation.forecasts",
-    "harden": "patchlab.harden.folder",
+    "harden": "patchlab.harden.harden_study",
     "layouts": "patchlab.validation.layouts",
     "ledger": "patchlab.validation.ledger_trials",
     "patch2d": "patchlab.paper.patch2d",
     "patch3d": "patchlab.paper.patch3d",
     "peers": "patchlab.bench.peers",
     "promises": "patchlab.validation.promises",
-    "real": "patchlab.validation.real",
+    "real": "patchlab.validation.real_photos",
     "robust": "patchlab.paper.robust",
     "stress": "patchlab.paper.stress",
     "transfer": "patchlab.paper.transfer",
     "verdicts": "patchlab.validation.verdicts",
 }
-_NAME = re.compile(r"[\w=+.,-]{1,120}")
+_CELL_NAME = re.compile(r"[\w=+.,-]{1,120}")
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One piece of work. `name` is unique and becomes a file's; `values` are JSON values and all that it depends on
-    besides the settings: a finished cell whose values have changed since is done again.
+    """One piece of work. `name` is unique and names its file; `values` are JSON values and all that it depends on
+    besides the settings: a stored cell whose values have changed is run again.
     """
 
     name: str
@@ -66,9 +66,9 @@ class Cell:
 
 @dataclass(frozen=True)
 class Result:
-    """A finished cell and what `run` returned for it, after a way through JSON: tuples are lists, keys are text.
+    """A finished cell and what `run` returned for it, read from JSON: tuples are lists, keys are text.
 
-    What `run` gave as `bytes` lies in the file that stands in its place, relative to the study's folder `out`.
+    Where `run` returned `bytes`, `answers` has the path of their file, relative to the study's folder `out`.
     """
 
     cell: Cell
@@ -76,16 +76,16 @@ class Result:
     out: Path
 
     def file(self, key: str) -> Path:
-        """The file of what `run` gave as bytes."""
+        """The file of the bytes that `run` returned under this key."""
         return self.out / self.answers[key]
 
 
 @dataclass(frozen=True)
 class Study:
-    """A study's parts: functions of a module's top level, so that they reach other processes.
+    """A study's parts: module-level functions, so that other processes can import them.
 
     `cells(settings, base)` lists the work; paths in settings are relative to the config's folder `base`.
-    `run(settings, base, cell)` does one cell: JSON values and, under keys that are file names, bytes to be kept.
+    `run(settings, base, cell)` runs one cell: JSON values and, under keys that are file names, bytes to store.
     `tables(settings, results)` and, if any, `figures(settings, results)` get the finished cells in the order of
     `cells`; some may be missing. Whatever `run` needs at random follows from the settings' seed and the cell's values.
     """
@@ -96,18 +96,18 @@ class Study:
     run: Callable[[Any, Path, Cell], dict[str, Any]]
     tables: Callable[[Any, Sequence[Result]], Sequence[Table]]
     figures: Callable[[Any, Sequence[Result]], Sequence[Drawing]] = lambda settings, results: ()
-    files: str = "files"  # folder for what cells gave as bytes; "." is the study's own
-    own_files: tuple[str, ...] = ("files",)  # patterns of names that --overwrite may replace besides
+    files: str = "files"  # folder for files of cells' bytes; "." is the study's folder
+    own_files: tuple[str, ...] = ("files",)  # patterns of more names that --overwrite may replace
 
     @property
     def about(self) -> str:
-        """What it is about, in one line."""
-        return first_line(self.run.__module__)
+        """A line about the study: the first of its module's docstring."""
+        return module_summary(self.run.__module__)
 
 
 @dataclass(frozen=True)
-class Finished:
-    """A study's tables and what failed, cell by cell."""
+class FinishedStudy:
+    """A study's tables, results, and errors by cell."""
 
     tables: tuple[Table, ...]
     results: tuple[Result, ...]
@@ -115,14 +115,14 @@ class Finished:
 
 
 def load_study(name: str) -> Study:
-    """The study of that name; refused with the nearest one where there is none."""
+    """Load the study of that name; an unknown name is refused with the nearest one."""
     if name not in STUDIES:
         raise Refused("the name of a study", f'"{name}"', spelling_hint(name, STUDIES))
     return import_module(STUDIES[name]).STUDY
 
 
-def first_line(module: str) -> str:
-    """What a study's module is about: the first line of its docstring; it is not imported."""
+def module_summary(module: str) -> str:
+    """The first line of a module's docstring, read without importing the module."""
     spec = find_spec(module)
     source = "" if spec is None or spec.origin is None else Path(spec.origin).read_text(encoding="utf-8")
     return (ast.get_docstring(ast.parse(source)) or "").partition("\n")[0]
@@ -130,9 +130,7 @@ def first_line(module: str) -> str:
 
 @dataclass(frozen=True)
 class Work:
-    """How a study is carried out: what may lie in its folder already, and who computes (see `open_workers`);
-    `on_cell` is called with (done, all).
-    """
+    """How a study is run: folder, and workers (see `open_workers`); `on_cell` is called with (done, all)."""
 
     resume: bool = False
     overwrite: bool = False
@@ -141,40 +139,42 @@ class Work:
     on_cell: Callable[[int, int], None] = lambda done, total: None
 
 
-HERE = Work()  # in this process, into a new folder
+DEFAULT_WORK = Work()  # in this process, into a new folder
 
 
-def run_study(name: str, config: str | Path, out: str | Path, work: Work = HERE) -> Finished:
+def run_study(name: str, config: str | Path, out: str | Path, work: Work = DEFAULT_WORK) -> FinishedStudy:
     """Run the study that the TOML file describes into the folder `out`."""
     study = load_study(name)
     settings = validate_model(study.settings, read_toml(config), str(config))
-    return carry_out(study, settings, Path(config).resolve().parent, out, work)
+    return run_cells(study, settings, Path(config).resolve().parent, out, work)
 
 
-def carry_out(study: Study, settings: StrictModel, base: Path, out: str | Path, work: Work = HERE) -> Finished:
-    """Run a study with settings at hand."""
+def run_cells(
+    study: Study, settings: StrictModel, base: Path, out: str | Path, work: Work = DEFAULT_WORK
+) -> FinishedStudy:
+    """Run a study with these settings; paths in them are relative to `base`."""
     out = Path(out)
     if not work.resume:
         unfinished = (out / f"{study.name}.json").is_file() and not (out / f"{study.name}.html").is_file()
-        check_folder(out, _own(study), work.overwrite, unfinished)
+        check_folder(out, _owned_patterns(study), work.overwrite, unfinished)
     cells = tuple(study.cells(settings, base))
     _check_cells(study, cells)
     with open_workers(work.jobs, work.cluster) as workers:
-        _begin(study, settings, out, work.resume)
-        kept = {cell.name: answers for cell in cells if (answers := _kept(out, cell)) is not None}
-        todo = [cell for cell in cells if cell.name not in kept]
+        _prepare_folder(study, settings, out, work.resume)
+        found = {cell.name: answers for cell in cells if (answers := _load_finished(out, cell)) is not None}
+        todo = [cell for cell in cells if cell.name not in found]
         failed: dict[str, str] = {}
-        work.on_cell(len(kept), len(cells))
-        do = partial(_run_cell, study.run, settings, base)
-        for done, (number, future) in enumerate(workers.completed(do, todo), len(kept) + 1):
+        work.on_cell(len(found), len(cells))
+        task = partial(_run_cell, study.run, settings, base)
+        for done, (number, future) in enumerate(workers.completed(task, todo), len(found) + 1):
             cell = todo[number]
-            values, files, sentence = _outcome(future)
-            if sentence is None:
-                kept[cell.name] = _keep(study, out, cell, values, files)
+            values, files, error = _future_outcome(future)
+            if error is None:
+                found[cell.name] = _save_cell(study, out, cell, values, files)
             else:
-                failed[cell.name] = sentence
+                failed[cell.name] = error
             work.on_cell(done, len(cells))
-    results = tuple(Result(cell, kept[cell.name], out) for cell in cells if cell.name in kept)
+    results = tuple(Result(cell, found[cell.name], out) for cell in cells if cell.name in found)
     tables = tuple(study.tables(settings, results)) if results else ()
     page = Results(
         program="patchlab",
@@ -189,95 +189,106 @@ def carry_out(study: Study, settings: StrictModel, base: Path, out: str | Path, 
         more={"cells": {each.cell.name: {"cell": dict(each.cell.values), "found": each.answers} for each in results}},
     )
     write_results(out, page)
-    return Finished(tables, results, dict(page.failed))
+    return FinishedStudy(tables, results, dict(page.failed))
 
 
 def _check_cells(study: Study, cells: Sequence[Cell]) -> None:
     names = [cell.name for cell in cells]
-    bad = [name for name in names if not _NAME.fullmatch(name) or names.count(name) > 1]
+    bad = [name for name in names if not _CELL_NAME.fullmatch(name) or names.count(name) > 1]
     if bad:
         raise ValueError(f"cells of {study.name} need unique names that files can have, got {bad[0]!r}")
     if not cells:
-        raise Refused(f"settings that leave the study {study.name} something to do", "no cells", "ask for more")
+        raise Refused(
+            f"settings that give the study {study.name} something to do", "settings without cells", "ask for more"
+        )
 
 
-def _own(study: Study) -> tuple[str, ...]:
+def _owned_patterns(study: Study) -> tuple[str, ...]:
     return (f"{study.name}.json", f"{study.name}.html", f"{study.name}_*", "cells", ".*.part", *study.own_files)
 
 
-def _begin(study: Study, settings: StrictModel, out: Path, resume: bool) -> None:
-    """The study's settings in `out`, which must be the same where one goes on."""
-    path, asked = out / f"{study.name}.json", settings.model_dump(mode="json")
+def _prepare_folder(study: Study, settings: StrictModel, out: Path, resume: bool) -> None:
+    """Write the study's settings into `out`; refused if a study to resume has others."""
+    path, dumped = out / f"{study.name}.json", settings.model_dump(mode="json")
     if resume and path.is_file():
-        if _read(path).get("settings") != asked:
+        if (stored := _read(path).get("settings")) != dumped:
+            changed = _first_difference(stored, dumped)
             do = "give it the same settings, or another --out"
-            raise Refused(f"the settings that {out} was begun with, to resume it", "others", do)
+            raise Refused(f"the settings that {out} was begun with, to resume it", changed, do)
     else:
-        if resume:  # nothing was begun: as without it, so that no stranger's files are mistaken for the study's
+        if resume:  # there is nothing to resume: other files must not be mistaken for the study's
             check_folder(out, ())
-        for pattern in _own(study):
+        for pattern in _owned_patterns(study):
             for old in out.glob(pattern):
                 shutil.rmtree(old) if old.is_dir() else old.unlink()
         make_folder(out)
-        write_json(path, {"study": study.name, "settings": asked})  # first: by it a study is known
+        write_json(path, {"study": study.name, "settings": dumped})  # first: this file marks the folder as the study's
     make_folder(out / "cells")
 
 
-def _kept(out: Path, cell: Cell) -> dict[str, Any] | None:
-    """What an earlier run found for this very cell, with its files in place."""
+def _first_difference(stored: dict[str, Any] | None, dumped: dict[str, Any]) -> str:
+    before = stored or {}
+    key = next(key for key in {**dumped, **before} if before.get(key) != dumped.get(key))
+    return f"{key} = {json.dumps(dumped.get(key))[:80]} in place of {json.dumps(before.get(key))[:80]}"
+
+
+def _load_finished(out: Path, cell: Cell) -> dict[str, Any] | None:
+    """A cell's stored answers, or None if there are none for these values with all their files."""
     path = out / "cells" / f"{cell.name}.json"
     if not path.is_file():
         return None
     try:
-        kept = _read(path)
-    except Refused:  # cut short when the machine went down
+        stored = _read(path)
+    except Refused:  # cut off when the machine went down
         return None
-    if kept.get("cell") != _through_json(cell.values) or not all((out / name).is_file() for name in kept["files"]):
+    if stored.get("cell") != _as_json_values(cell.values) or not all((out / f).is_file() for f in stored["files"]):
         return None
-    return kept["found"]
+    return stored["found"]
 
 
-Outcome = tuple[dict[str, Any], dict[str, bytes], str | None]  # (JSON values, bytes, None), or why there are none
+Outcome = tuple[
+    dict[str, Any], dict[str, bytes], str | None
+]  # (JSON values, bytes by file name, None), or ({}, {}, the error)
 
 
 def _run_cell(
     run: Callable[[Any, Path, Cell], dict[str, Any]], settings: StrictModel, base: Path, cell: Cell
 ) -> Outcome:
-    """What a cell gave; errors do not travel, since not every one survives it."""
+    """Run a cell and return its outcome; errors become text, since not every exception can be pickled."""
     try:
         with use_threads(1):
             answers = run(settings, base, cell)
         files = {key: value for key, value in answers.items() if isinstance(value, bytes)}
-        return _through_json({key: value for key, value in answers.items() if key not in files}), files, None
-    except Exception as error:  # also what a user's own network raises
-        return {}, {}, _sentence(error)
+        return _as_json_values({key: value for key, value in answers.items() if key not in files}), files, None
+    except Exception as error:  # including those of a user's network
+        return {}, {}, _error_text(error)
 
 
-def _outcome(future: Future) -> Outcome:
+def _future_outcome(future: Future) -> Outcome:
     try:
         return result_of(future)
     except Exception as error:  # a worker that died
-        return {}, {}, _sentence(error)
+        return {}, {}, _error_text(error)
 
 
-def _sentence(error: Exception) -> str:
+def _error_text(error: Exception) -> str:
     text = " ".join(str(error).split())[:500]
     return text if isinstance(error, Refused) else f"{type(error).__name__}: {text}"
 
 
-def _keep(study: Study, out: Path, cell: Cell, values: dict, files: dict[str, bytes]) -> dict[str, Any]:
-    """Write the cell's files, then its JSON, each whole: the JSON says that all of it is there."""
+def _save_cell(study: Study, out: Path, cell: Cell, values: dict, files: dict[str, bytes]) -> dict[str, Any]:
+    """Write the cell's files, then its JSON, each atomically: the JSON proves that all files are there."""
     names = {key: (Path(study.files) / key).as_posix() for key in files}
     for key, name in names.items():
         make_folder((out / name).parent)
         write_atomically(out / name, lambda path, key=key: path.write_bytes(files[key]))
-    kept = {"cell": dict(cell.values), "found": values | names, "files": list(names.values())}
-    write_json(out / "cells" / f"{cell.name}.json", kept)
+    stored = {"cell": dict(cell.values), "found": values | names, "files": list(names.values())}
+    write_json(out / "cells" / f"{cell.name}.json", stored)
     return values | names
 
 
-def _through_json(values: Mapping[str, Any]) -> dict[str, Any]:
-    """What a reader of the JSON will find, also now: a resumed study must not see other types than one in one go."""
+def _as_json_values(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Values as read from JSON, so that a resumed study sees the same types as an uninterrupted one."""
     return json.loads(json.dumps(dict(values), allow_nan=False))
 
 

@@ -1,1 +1,1 @@
-"""How the built-in networks were made, and others on the same pictures."""
+"""Training of the built-in networks, and of others on the same pictures."""

@@ -1,6 +1,4 @@
-"""What is stored of a trained network: weights as float16 or an ONNX file, and a card that says how it was made and how
-good it is.
-"""
+"""Store a trained network: weights as float16 or an ONNX file, and a card with its recipe and its accuracy."""
 
 from __future__ import annotations
 
@@ -15,19 +13,19 @@ from typing import Any
 import torch
 from torch import nn
 
-from patchlab.training.fit import Recipe, Seconds
+from patchlab.training.fit import Seconds, TrainingRecipe
 from patchproof.mesh import primitives
 
-HELD_OUT = "renders of other shapes, textures, backgrounds and conditions of the same kinds; nothing real"
+HELD_OUT_TEXT = "renders of other shapes, textures, backgrounds and conditions of the same kinds; nothing real"
 
 
 def class_names() -> list[str]:
-    """The labels of the procedural objects, as people write them."""
+    """Labels of the procedural objects, with spaces in place of underscores."""
     return [name.replace("_", " ") for name in primitives.primitive_names()]
 
 
-def stored(network: nn.Module, path: Path) -> int:
-    """Write the weights as float16 and give the network what was stored; how many they are."""
+def store_float16(network: nn.Module, path: Path) -> int:
+    """Write the weights as float16, load them back into the network, and return their number."""
     from safetensors.torch import save_file
 
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -37,8 +35,8 @@ def stored(network: nn.Module, path: Path) -> int:
     return sum(tensor.numel() for tensor in weights.values())
 
 
-def exported(network: nn.Module, path: Path, input_px: int) -> int:
-    """Write the network as an ONNX file for any number of pictures; how many weights it has."""
+def export_onnx(network: nn.Module, path: Path, input_px: int) -> int:
+    """Write the network as an ONNX file for batches of any size, and return the number of weights."""
     path.parent.mkdir(parents=True, exist_ok=True)
     photos, any_number = torch.rand(2, 3, input_px, input_px), {0: torch.export.Dim("n")}
     options: dict[str, Any] = {"dynamo": True, "external_data": False, "verbose": False}
@@ -46,14 +44,14 @@ def exported(network: nn.Module, path: Path, input_px: int) -> int:
     return sum(weights.numel() for weights in network.parameters())
 
 
-def write_card(path: Path, figures: dict[str, Any], module: str, recipe: Recipe, seconds: Seconds) -> None:
-    """The labels, the figures and how to make the network again."""
+def write_card(path: Path, figures: dict[str, Any], module: str, recipe: TrainingRecipe, seconds: Seconds) -> None:
+    """Write the labels, the figures and the command that makes the network again."""
     changed = [field for field in dataclasses.fields(recipe) if getattr(recipe, field.name) != field.default]
     options = [f"--{field.name.replace('_', '-')} {shlex.quote(str(getattr(recipe, field.name)))}" for field in changed]
     card = {
         "labels": class_names(),
         **figures,
-        "held_out": HELD_OUT,
+        "held_out": HELD_OUT_TEXT,
         "command": " ".join([f"python -m patchlab.training.{module} --out DIR", *options]),
         "recipe": dataclasses.asdict(recipe),
         "seconds": seconds._asdict(),
@@ -63,6 +61,6 @@ def write_card(path: Path, figures: dict[str, Any], module: str, recipe: Recipe,
     path.write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
 
 
-def by_class(figures: Any) -> dict[str, float]:
-    """A figure of each class, rounded."""
+def round_by_class(figures: Any) -> dict[str, float]:
+    """By class name a figure, rounded to four digits."""
     return {name: round(float(figure), 4) for name, figure in zip(class_names(), figures, strict=True)}

@@ -1,7 +1,7 @@
-"""One training on rendered pictures, from the command line to the files: what all networks of this package share.
+"""Train a network on rendered pictures, from the command line to its files; shared by all built-in networks.
 
-In: a recipe, and of each network what it is, how it learns from a batch, how it is judged and what is written. Out: one
-step after the other, and printed lines. Rendered pictures can be kept in a folder, for trainings that follow.
+In: a recipe, and functions that build, train, score and write a network. Out: the written network, and printed
+progress. Rendered pictures can be stored in a folder for later trainings.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from patchlab.training.pictures import HELD_OUT, Pictures, kept, pictures
+from patchlab.training.pictures import HELD_OUT_SEED, Pictures, load_or_render, render_pictures
 from patchproof.scene import patterns
 
 
 @dataclass(frozen=True)
-class Recipe:
-    """Everything that decides the weights, but for the machine's rounding."""
+class TrainingRecipe:
+    """Everything that determines the weights, up to the machine's rounding."""
 
     seed: int = 0
     pictures_per_class: int = 1500
@@ -34,51 +34,52 @@ class Recipe:
     batch: int = 64
     learning_rate: float = 2e-3
     weight_decay: float = 0.02
-    pasted: float = 0.3  # share of training pictures with a card pasted on
+    pasted: float = 0.3  # share of training pictures with a pasted card
     threads: int = 1
 
 
-R = TypeVar("R", bound=Recipe)
-Epochs = Iterator[tuple[int, float, nn.Module]]  # after each epoch: its number, its mean loss, the network as it is
+RecipeType = TypeVar("RecipeType", bound=TrainingRecipe)
+Epochs = Iterator[tuple[int, float, nn.Module]]  # after each epoch: its number, its mean loss, the network
 
 
 class Seconds(NamedTuple):
-    """How long the parts of a training took."""
+    """Seconds that the parts of a training took."""
 
     render: int
     train: int
 
 
 def run(
-    make: type[R],
+    make: type[RecipeType],
     about: str,
     input_px: int,
-    train: Callable[[Pictures, R], Epochs],
+    train: Callable[[Pictures, RecipeType], Epochs],
     score: Callable[[nn.Module, Pictures], np.ndarray],
-    write: Callable[[Path, nn.Module, R, Pictures, Seconds], None],
-    seen: Callable[[Pictures, R], Pictures] = lambda shown, recipe: shown,
+    write: Callable[[Path, nn.Module, RecipeType, Pictures, Seconds], None],
+    prepare: Callable[[Pictures, RecipeType], Pictures] = lambda rendered, recipe: rendered,
 ) -> None:
-    """The command: render at `input_px`, train, judge every fourth epoch by the mean of `score`, and write the network;
-    `seen` makes of rendered pictures those that the recipe's network takes.
+    """Run the command: render at `input_px`, train, print the mean of `score` every fourth epoch, and write the
+    network; `prepare` turns rendered pictures into the network's input.
     """
-    out, folder, recipe = _asked(make, about)
+    out, folder, recipe = _parse_options(make, about)
     torch.set_num_threads(recipe.threads)
     started = time.time()
-    render = pictures if folder is None else lambda *what: kept(folder, *what)
-    held_out = seen(render(recipe.held_out_per_class, recipe.seed + HELD_OUT, input_px), recipe)
-    training = seen(render(recipe.pictures_per_class, recipe.seed, input_px), recipe)
+    render = render_pictures if folder is None else lambda *what: load_or_render(folder, *what)
+    held_out = prepare(render(recipe.held_out_per_class, recipe.seed + HELD_OUT_SEED, input_px), recipe)
+    training = prepare(render(recipe.pictures_per_class, recipe.seed, input_px), recipe)
     rendered = time.time()
     for epoch, loss, network in train(training, recipe):
-        shown = f", held out {score(network, held_out).mean():.3f}" if epoch % 4 == 3 else ""
+        score_text = f", held out {score(network, held_out).mean():.3f}" if epoch % 4 == 3 else ""
         print(
-            f"epoch {epoch + 1} of {recipe.epochs}: loss {loss:.3f}{shown}, {time.time() - started:.0f} s", flush=True
+            f"epoch {epoch + 1} of {recipe.epochs}: loss {loss:.3f}{score_text}, {time.time() - started:.0f} s",
+            flush=True,
         )
         if epoch + 1 == recipe.epochs:
             seconds = Seconds(round(rendered - started), round(time.time() - rendered))
             write(out, network.eval(), recipe, held_out, seconds)
 
 
-def _asked(make: type[R], about: str) -> tuple[Path, Path | None, R]:
+def _parse_options(make: type[RecipeType], about: str) -> tuple[Path, Path | None, RecipeType]:
     parser = argparse.ArgumentParser(description=about)
     parser.add_argument("--out", type=Path, required=True, help="folder for the weights and their card")
     parser.add_argument("--pictures", type=Path, help="folder that keeps the rendered pictures for further trainings")
@@ -88,24 +89,24 @@ def _asked(make: type[R], about: str) -> tuple[Path, Path | None, R]:
     return options.pop("out"), options.pop("pictures"), make(**options)
 
 
-def epochs(
+def train_epochs(
     make: Callable[[], nn.Module],
-    shown: Pictures,
-    recipe: Recipe,
+    pictures: Pictures,
+    recipe: TrainingRecipe,
     loss_of: Callable[[nn.Module, Tensor, Tensor, np.random.Generator], Tensor],
 ) -> Epochs:
-    """Learn by `loss_of(network, rows of the pictures, cards to paste on, generator)`, batch after batch."""
+    """Train by `loss_of(network, rows of the pictures, cards to paste, generator)`; yields after each epoch."""
     torch.manual_seed(recipe.seed)
     rng = np.random.default_rng([recipe.seed, 1])
     network = make().train()
     # a quarter faster on a CPU; torch's stubs do not know that a module takes this alone
     network.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
-    steps = recipe.epochs * (len(shown.images) // recipe.batch)
+    steps = recipe.epochs * (len(pictures.images) // recipe.batch)
     optimizer = torch.optim.AdamW(network.parameters(), recipe.learning_rate, weight_decay=recipe.weight_decay)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, recipe.learning_rate, total_steps=steps, pct_start=0.15)
-    cards = torch.from_numpy(np.stack([_card(rng) for _ in range(256)])).permute(0, 3, 1, 2)
+    cards = torch.from_numpy(np.stack([_draw_card(rng) for _ in range(256)])).permute(0, 3, 1, 2)
     for epoch in range(recipe.epochs):
-        losses, order = [], torch.randperm(len(shown.images))
+        losses, order = [], torch.randperm(len(pictures.images))
         for rows in order[: len(order) // recipe.batch * recipe.batch].split(recipe.batch):
             loss = loss_of(network, rows, cards, rng)
             optimizer.zero_grad()
@@ -116,8 +117,8 @@ def epochs(
         yield epoch, float(np.mean(losses)), network
 
 
-def _card(rng: np.random.Generator, px: int = 40) -> np.ndarray:
-    """P×P×3 float32 in [0, 1]: anything, mostly in a frame of white paper with black blocks on it."""
+def _draw_card(rng: np.random.Generator, px: int = 40) -> np.ndarray:
+    """Draw a card P×P×3 float32 in [0, 1]: a texture, mostly framed by white paper with black blocks."""
     picture = patterns.texture(rng, px)
     if rng.random() < 0.6:
         margin, cell = int(rng.integers(4, 9)), int(rng.integers(2, 4))
@@ -129,8 +130,8 @@ def _card(rng: np.random.Generator, px: int = 40) -> np.ndarray:
     return picture.astype(np.float32)
 
 
-def folded(trained: nn.Module) -> nn.Module:
-    """The same function without BatchNorm: its scale and shift moved into the convolutions (evaluation statistics)."""
+def fold_batch_norm(trained: nn.Module) -> nn.Module:
+    """A copy without BatchNorm, whose scale and shift (of evaluation) are folded into the convolutions."""
     plain = copy.deepcopy(trained).eval()
     for parent in list(plain.modules()):
         for name, child in list(parent.named_children()):

@@ -1,8 +1,8 @@
-"""A folder of labeled renders, as `harden` reads it: `python -m patchlab.training.labeled --out DIR`.
+"""Write a folder of labeled renders for `harden`: `python -m patchlab.training.labeled --out DIR`.
 
-In: seeds, and objects: the procedural ones, or scene files. Out: PNGs and labels.csv. A procedural object has another
-shape, view, light, camera and background in every render, drawn like those that the built-in networks learn from, from
-seeds that none of them has seen. Of a scene, the bare object is seen in its views.
+In: seeds, and objects: the procedural ones, or scene files. Out: PNGs and labels.csv. A procedural object gets
+another shape, view, light, camera and background in every render, drawn like the built-in networks' training pictures
+but from seeds that they have not seen. A scene's bare object is rendered in its views.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from patchlab.harden.labeled import write_labels
+from patchlab.harden.labeled_photos import write_labels
 from patchlab.training.card import class_names
-from patchlab.training.pictures import HELD_OUT, dressed, views_of
+from patchlab.training.pictures import HELD_OUT_SEED, randomize_materials, render_mesh
 from patchproof.base.color import codes_from_srgb
 from patchproof.base.output import check_folder, make_folder
 from patchproof.base.settings import SceneSettings
@@ -28,45 +28,45 @@ from patchproof.render.photograph import photograph
 from patchproof.render.stage import set_stage
 from patchproof.scene.scene import build_scene
 
-SEED = 2 * HELD_OUT  # the built-in networks' accuracy was measured on seeds below
+DEFAULT_SEED = 2 * HELD_OUT_SEED  # the built-in networks' accuracy was measured on smaller seeds
 
 
 def main() -> None:
-    """Render, and write the folder."""
+    """Render objects and write the folder."""
     parser = argparse.ArgumentParser(description="Write labeled renders of objects.")
     parser.add_argument("--out", type=Path, required=True, help="a new folder")
     parser.add_argument("--each", type=int, default=18, help="renders of each object")
     parser.add_argument("--size-px", type=int, default=96, help="their side")
-    parser.add_argument("--seed", type=int, default=SEED, help="of procedural objects at least 1000000")
+    parser.add_argument("--seed", type=int, default=DEFAULT_SEED, help="of procedural objects at least 1000000")
     parser.add_argument("--scenes", type=Path, nargs="*", help="scene files in place of the procedural objects")
     options = parser.parse_args()
-    how = options.each, options.size_px, options.seed
-    renders = of_scenes(options.scenes, *how) if options.scenes else procedural(*how)
+    common = options.each, options.size_px, options.seed
+    renders = render_scenes(options.scenes, *common) if options.scenes else render_procedural(*common)
     print(f"{write_labeled(options.out, renders)} renders in {options.out}")
 
 
-def procedural(each: int, size_px: int, seed: int) -> Iterator[tuple[str, Tensor]]:
-    """(label, uint8 3×S×S) of `each` shapes of every object that the built-in networks know."""
+def render_procedural(each: int, size_px: int, seed: int) -> Iterator[tuple[str, Tensor]]:
+    """Yield (label, uint8 3×S×S) of `each` shapes of every object that the built-in networks know."""
     for number, (label, name) in enumerate(zip(class_names(), primitives.primitive_names(), strict=True)):
         for i in range(each):
             rng = np.random.default_rng([seed, number, i])
-            yield label, views_of(dressed(primitives.build(name, seed + i), rng), 1, rng, size_px)[0][0]
+            yield label, render_mesh(randomize_materials(primitives.build(name, seed + i), rng), 1, rng, size_px)[0][0]
 
 
-def of_scenes(files: list[Path], each: int, size_px: int, seed: int) -> Iterator[tuple[str, Tensor]]:
-    """(label, uint8 3×S×S) of `each` views of every scene's bare object."""
+def render_scenes(files: list[Path], each: int, size_px: int, seed: int) -> Iterator[tuple[str, Tensor]]:
+    """Yield (label, uint8 3×S×S) of `each` views of every scene's bare object."""
     for file in files:
         settings = validate_model(SceneSettings, read_toml(file), str(file))
         scene = build_scene(settings, file.resolve().parent, seed)
         stage = set_stage(scene)
         for i in range(each):
             with torch.no_grad():
-                seen = photograph(stage, None, scene.draw("evaluate", 1, seed, i), (size_px, size_px))
-            yield str(settings.target.label), codes_from_srgb(seen)[0]
+                render = photograph(stage, None, scene.draw("evaluate", 1, seed, i), (size_px, size_px))
+            yield str(settings.target.label), codes_from_srgb(render)[0]
 
 
 def write_labeled(out: Path, renders: Iterator[tuple[str, Tensor]]) -> int:
-    """Write renders and labels.csv into a new folder; how many they are."""
+    """Write renders and labels.csv into a new folder; returns their number."""
     check_folder(out, ())
     make_folder(out)
     rows = []

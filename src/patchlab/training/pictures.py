@@ -1,9 +1,9 @@
-"""The pictures that the built-in networks learn from: renders of our own procedural objects.
+"""Render the training pictures of the built-in networks: procedural objects.
 
-In: nothing but seeds. Out: pictures, labels and boxes. Our own renderer shows objects with drawn shapes, colors,
-textures, poses, lights, cameras and backgrounds. Half of the pictures are rendered at the network's size, as in
-training a patch, half at twice the size and then reduced, as a photograph is.
-Left out on purpose: anything real. The networks serve demos and tests and say nothing of photographs of real objects.
+In: seeds. Out: pictures, labels and boxes. Our renderer shows objects with drawn shapes, colors, textures, poses,
+lights, cameras and backgrounds. Half of the pictures are rendered at the network's size, as in
+training a patch, half at twice the size and then downscaled, as a photograph is.
+Left out on purpose: real photographs. The networks serve demos and tests; their accuracy on real objects is unknown.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from patchproof.scene.placement import view_frame
 
 LENGTH_MM = 300.0
 VIEWS_PER_SHAPE = 10
-HELD_OUT = 1_000_000  # seeds from here on are never trained on
+HELD_OUT_SEED = 1_000_000  # training uses smaller seeds only
 
 
 class Pictures(NamedTuple):
@@ -42,69 +42,66 @@ class Pictures(NamedTuple):
     boxes: Tensor
 
 
-def pictures(per_class: int, seed: int, size_px: int) -> Pictures:
-    """Every shape is seen from VIEWS_PER_SHAPE drawn conditions."""
+def render_pictures(per_class: int, seed: int, size_px: int) -> Pictures:
+    """Render every class, each shape under VIEWS_PER_SHAPE drawn conditions."""
     images, labels, boxes = [], [], []
     for label, name in enumerate(primitives.primitive_names()):
         for shape in range(-(-per_class // VIEWS_PER_SHAPE)):
             rng = np.random.default_rng([seed, label, shape])
-            seen, around = _views(name, seed + shape, rng, size_px)
-            images.append(seen)
-            boxes.append(around)
+            shape_images, shape_boxes = _render_shape(name, seed + shape, rng, size_px)
+            images.append(shape_images)
+            boxes.append(shape_boxes)
             labels += [label] * VIEWS_PER_SHAPE
     return Pictures(torch.cat(images), torch.tensor(labels), torch.cat(boxes))
 
 
-def kept(folder: Path, per_class: int, seed: int, size_px: int) -> Pictures:
-    """The same from a file of the folder, where an earlier call left them, by whatever code."""
+def load_or_render(folder: Path, per_class: int, seed: int, size_px: int) -> Pictures:
+    """Render pictures, or load them from the folder if an earlier call, by any version of the code, stored them."""
     from safetensors.torch import load_file, save_file
 
     file = folder / f"{per_class}_{seed}_{size_px}.safetensors"
     if file.is_file():
         return Pictures(**load_file(file))
-    rendered = pictures(per_class, seed, size_px)
+    rendered = render_pictures(per_class, seed, size_px)
     folder.mkdir(parents=True, exist_ok=True)
     save_file(rendered._asdict(), file)
     return rendered
 
 
-def reduced(shown: Pictures, size_px: int) -> Pictures:
-    """The same pictures, smaller."""
-    parts = shown.images.split(1024)
-    return shown._replace(
+def shrink_pictures(pictures: Pictures, size_px: int) -> Pictures:
+    """Downscale pictures to `size_px`; labels and boxes stay."""
+    parts = pictures.images.split(1024)
+    return pictures._replace(
         images=torch.cat([codes_from_srgb(center_square(part.float() / 255, size_px)) for part in parts])
     )
 
 
-def _views(name: str, seed: int, rng: np.random.Generator, size_px: int) -> tuple[Tensor, Tensor]:
-    """VIEWS_PER_SHAPE pictures and boxes of one shape with one set of materials."""
-    return views_of(dressed(primitives.build(name, seed), rng), VIEWS_PER_SHAPE, rng, size_px)
+def _render_shape(name: str, seed: int, rng: np.random.Generator, size_px: int) -> tuple[Tensor, Tensor]:
+    return render_mesh(randomize_materials(primitives.build(name, seed), rng), VIEWS_PER_SHAPE, rng, size_px)
 
 
-def views_of(mesh: Mesh, count: int, rng: np.random.Generator, size_px: int) -> tuple[Tensor, Tensor]:
-    """`count` pictures uint8 and boxes of a mesh, which is made LENGTH_MM long; half of them, rounded down, rendered at
-    `size_px`.
-    """
+def render_mesh(mesh: Mesh, count: int, rng: np.random.Generator, size_px: int) -> tuple[Tensor, Tensor]:
+    """Render `count` uint8 pictures and boxes of a mesh scaled to LENGTH_MM; half of them directly at `size_px`."""
     scale = LENGTH_MM / np.ptp(mesh.vertices, axis=0).max()
     mesh = dataclasses.replace(mesh, vertices=mesh.vertices * scale)
-    behind = Backgrounds(tuple(patterns.background(rng) for _ in range(count)))
-    settings = _settings(rng, 2 * size_px)
+    backgrounds = Backgrounds(tuple(patterns.background(rng) for _ in range(count)))
+    settings = _draw_settings(rng, 2 * size_px)
     frame, seed = view_frame(mesh, settings), settings.optimize.seed
-    scene = MeshScene(settings, Path(), seed, "", mesh, frame, behind, notes=mesh.warnings)
+    scene = MeshScene(settings, Path(), seed, "", mesh, frame, backgrounds, notes=mesh.warnings)
     stage, conditions = set_stage(scene), scene.draw("evaluate", count, int(rng.integers(1 << 30)))
     half = count // 2
-    seen = [center_square(photograph(stage, None, conditions[half:], (2 * size_px, 2 * size_px)), size_px)]
+    renders = [center_square(photograph(stage, None, conditions[half:], (2 * size_px, 2 * size_px)), size_px)]
     if half:
-        seen.insert(0, photograph(stage, None, conditions[:half], (size_px, size_px)))
-    return codes_from_srgb(torch.cat(seen)), torch.as_tensor(scene.boxes(conditions), dtype=torch.float32)
+        renders.insert(0, photograph(stage, None, conditions[:half], (size_px, size_px)))
+    return codes_from_srgb(torch.cat(renders)), torch.as_tensor(scene.boxes(conditions), dtype=torch.float32)
 
 
-def _settings(rng: np.random.Generator, photo_px: int) -> SceneSettings:
-    """Ranges for one shape: the object fills a quarter to nine tenths of the picture, seen from all round."""
+def _draw_settings(rng: np.random.Generator, photo_px: int) -> SceneSettings:
+    """Draw a scene's ranges for one shape, which fills a quarter to nine tenths of the picture, from all around."""
     fov_deg = rng.uniform(25, 65)
     share = np.exp(rng.uniform(np.log(0.3), np.log(0.85)))
     distance = LENGTH_MM / (2 * np.tan(np.radians(fov_deg) / 2) * share)
-    nearest = max(0.85 * distance, 1.05 * LENGTH_MM)  # nearer than that, the camera could be in the object
+    nearest = max(0.85 * distance, 1.05 * LENGTH_MM)  # any nearer, the camera could be inside the object
     return validate_model(
         SceneSettings,
         {
@@ -133,8 +130,8 @@ def _settings(rng: np.random.Generator, photo_px: int) -> SceneSettings:
     )
 
 
-def dressed(mesh: Mesh, rng: np.random.Generator) -> Mesh:
-    """The mesh with its own colors (half of the time), with worn ones, or with drawn colors and textures."""
+def randomize_materials(mesh: Mesh, rng: np.random.Generator) -> Mesh:
+    """The mesh with its own colors (in half of the cases), worn ones, or drawn colors and textures."""
     kind = rng.choice(["own", "worn", "mixed", "drawn"], p=[0.5, 0.2, 0.2, 0.1])
     materials = []
     for material in mesh.materials:
@@ -150,11 +147,11 @@ def dressed(mesh: Mesh, rng: np.random.Generator) -> Mesh:
     return dataclasses.replace(mesh, materials=tuple(materials))
 
 
-def augmented(
+def augment(
     images: Tensor, boxes: Tensor, cards: Tensor, rng: np.random.Generator, pasted: float, widest: float = 1.1
 ) -> tuple[Tensor, Tensor]:
-    """uint8 pictures as [0, 1] floats and their boxes: mirrored, shifted, scaled (up to `widest` of a picture shows)
-    and tinted, and some with a card pasted on.
+    """Augment uint8 pictures, as floats in [0, 1], and their boxes: mirror, shift, scale (up to `widest` of a picture
+    shows), tint, and paste cards onto a share `pasted`.
     """
     n, size_px = len(images), images.shape[-1]
     x = images.float() / 255
@@ -165,7 +162,7 @@ def augmented(
     matrix[:, :, 2] = shift.T
     grid = torch.nn.functional.affine_grid(torch.from_numpy(matrix), list(x.shape), align_corners=False)
     x = torch.nn.functional.grid_sample(x, grid, padding_mode="border", align_corners=False)
-    boxes = _moved(boxes, torch.from_numpy(matrix))
+    boxes = _transform_boxes(boxes, torch.from_numpy(matrix))
     gain = torch.from_numpy(np.exp(rng.normal(0, [[0.25], [0.07], [0.07], [0.07]], (4, n))).astype(np.float32))
     x = (x - 0.45) * gain[0, :, None, None, None] + 0.45
     x = (
@@ -181,8 +178,8 @@ def augmented(
     return x, boxes
 
 
-def _moved(boxes: Tensor, matrix: Tensor) -> Tensor:
-    """Boxes N×4 of pictures that were sampled at matrix N×2×3 times the place in [-1, 1], clipped to the picture."""
+def _transform_boxes(boxes: Tensor, matrix: Tensor) -> Tensor:
+    """Transform boxes N×4 with pictures that were sampled by matrices N×2×3 on [-1, 1]; clipped to the picture."""
     corners = ((2 * boxes - 1).view(-1, 2, 2) - matrix[:, None, :, 2]) / torch.stack(
         [matrix[:, 0, 0], matrix[:, 1, 1]], 1
     )[:, None]

@@ -1,10 +1,10 @@
-"""How the built-in detector was made: `python -m patchlab.training.train_detector --out DIR`.
+"""Train the built-in detector: `python -m patchlab.training.train_detector --out DIR`.
 
-In: nothing but seeds (pictures.py). Out: `builtin_detector.safetensors` and `builtin_detector.json` with the recipe,
+In: seeds (`training.pictures`). Out: `builtin_detector.safetensors` and `builtin_detector.json` with the recipe,
 its seeds and the average precision on shapes, textures and backgrounds that training never saw. A third of the training
-pictures are mosaics of four, so that objects of all sizes come alone and in company.
+pictures are mosaics of four, so that objects of all sizes appear alone and together.
 
-Cells in the middle half of an object's box answer for it. Their scores are to be the overlap of their box with the true
+Cells in the middle half of an object's box predict it. Their target score is the overlap of their box with the true
 one (Li et al., Generalized focal loss, NeurIPS 2020), their boxes follow the generalized IoU (Rezatofighi et al., CVPR
 2019).
 """
@@ -21,8 +21,8 @@ import torch
 from torch import Tensor
 
 from patchlab.training import fit
-from patchlab.training.card import by_class, stored, write_card
-from patchlab.training.pictures import Pictures, augmented
+from patchlab.training.card import round_by_class, store_float16, write_card
+from patchlab.training.pictures import Pictures, augment
 from patchproof.classifier.average_precision import Detection, average_precision, find_detections
 from patchproof.classifier.builtin_detector import INPUT_PX, SmallDetector, centers_px
 from patchproof.classifier.detector import iou
@@ -30,31 +30,31 @@ from patchproof.mesh import primitives
 
 
 @dataclass(frozen=True)
-class Recipe(fit.Recipe):
-    """Fewer pictures than the classifier's, some of them made of four."""
+class DetectorRecipe(fit.TrainingRecipe):
+    """The detector's recipe: fewer pictures than the classifier's, some of them mosaics."""
 
     pictures_per_class: int = 1200
     held_out_per_class: int = 100
-    mosaics: float = 0.33  # share that is made of four
+    mosaics: float = 0.33  # share of pictures that are mosaics of four
 
 
-def train(shown: Pictures, recipe: Recipe) -> fit.Epochs:
-    """After each epoch: its number, its mean loss, and the network as it is."""
+def train(pictures: Pictures, recipe: DetectorRecipe) -> fit.Epochs:
+    """Train the detector; yields (number, mean loss, network) after each epoch."""
 
     def learn(network: torch.nn.Module, rows: Tensor, cards: Tensor, rng: np.random.Generator) -> Tensor:
-        images, boxes = augmented(shown.images[rows], shown.boxes[rows], cards, rng, recipe.pasted, widest=1.4)
-        images, labels, boxes = with_mosaics(images, shown.labels[rows], boxes, recipe.mosaics, rng)
-        return loss_of(network(images.contiguous(memory_format=torch.channels_last)), labels, boxes * INPUT_PX)
+        images, boxes = augment(pictures.images[rows], pictures.boxes[rows], cards, rng, recipe.pasted, widest=1.4)
+        images, labels, boxes = with_mosaics(images, pictures.labels[rows], boxes, recipe.mosaics, rng)
+        return detector_loss(network(images.contiguous(memory_format=torch.channels_last)), labels, boxes * INPUT_PX)
 
-    return fit.epochs(lambda: SmallDetector(len(primitives.primitive_names()), batch_norm=True), shown, recipe, learn)
+    return fit.train_epochs(
+        lambda: SmallDetector(len(primitives.primitive_names()), batch_norm=True), pictures, recipe, learn
+    )
 
 
 def with_mosaics(
     images: Tensor, labels: Tensor, boxes: Tensor, share: float, rng: np.random.Generator
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The pictures with up to four objects each: labels N×4 (-1: none) and boxes N×4×4; a share of them is replaced by
-    four of the others at half their size.
-    """
+    """Replace a share of pictures by mosaics of four at half size; labels become N×4 (-1: none), boxes N×4×4."""
     n = len(images)
     all_labels = torch.cat([labels[:, None], labels.new_full((n, 3), -1)], 1)
     all_boxes = torch.cat([boxes[:, None], boxes.new_zeros(n, 3, 4)], 1)
@@ -70,25 +70,25 @@ def with_mosaics(
     return mixed, all_labels, all_boxes
 
 
-def loss_of(candidates: Tensor, labels: Tensor, boxes_px: Tensor) -> Tensor:
-    """Of candidates N×A×(4+K) before objects with labels N×M (-1: none) and boxes N×M×4: names and boxes together."""
+def detector_loss(candidates: Tensor, labels: Tensor, boxes_px: Tensor) -> Tensor:
+    """The loss, of classes and boxes, of candidates N×A×(4+K) for objects with labels N×M (-1: none), boxes N×M×4."""
     boxes, logits = candidates.split([4, candidates.shape[-1] - 4], -1)
-    answers_for = owners(labels, boxes_px)
+    answers_for = assign_objects(labels, boxes_px)
     view, cell = torch.nonzero(answers_for >= 0, as_tuple=True)
-    mine = answers_for[view, cell]
-    truth, own = boxes_px[view, mine], boxes[view, cell]
-    overlap, hull_share = _overlaps(own, truth)
+    target = answers_for[view, cell]
+    truth, predicted = boxes_px[view, target], boxes[view, cell]
+    overlap, hull_share = _overlaps(predicted, truth)
     wanted = torch.zeros_like(logits)
-    wanted[view, cell, labels[view, mine]] = overlap.detach().clamp_min(0)
+    wanted[view, cell, labels[view, target]] = overlap.detach().clamp_min(0)
     focus = (wanted - torch.sigmoid(logits)).detach().abs() ** 2
     entropy = torch.nn.functional.binary_cross_entropy_with_logits(logits, wanted, reduction="none")
     count = max(len(view), 1)
     return (focus * entropy).sum() / count + (1 - overlap + hull_share).sum() / count
 
 
-def owners(labels: Tensor, boxes_px: Tensor) -> Tensor:
-    """N×A: which of the M objects a cell answers for, the smallest whose middle half it lies in or whose center lies in
-    it; -1 for none.
+def assign_objects(labels: Tensor, boxes_px: Tensor) -> Tensor:
+    """N×A: the index of the object that a cell predicts, the smallest of those whose middle half (at least 8 px) holds
+    the cell's center; -1 for none.
     """
     cells = INPUT_PX // 16
     centers = centers_px(cells, cells)
@@ -101,56 +101,58 @@ def owners(labels: Tensor, boxes_px: Tensor) -> Tensor:
     return torch.where(torch.isfinite(area), owner, -1)
 
 
-def _overlaps(own: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
-    """IoU of boxes P×4 with the true ones, and the share of the box around both that neither covers."""
-    overlap = iou(own[:, None], truth)[:, 0]
-    areas = (own[:, 2:] - own[:, :2]).prod(-1) + (truth[:, 2:] - truth[:, :2]).prod(-1)
-    low, high = torch.minimum(own[:, :2], truth[:, :2]), torch.maximum(own[:, 2:], truth[:, 2:])
+def _overlaps(predicted: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
+    """IoU of boxes P×4 with the true ones, and the share of their common bounding box that neither covers."""
+    overlap = iou(predicted[:, None], truth)[:, 0]
+    areas = (predicted[:, 2:] - predicted[:, :2]).prod(-1) + (truth[:, 2:] - truth[:, :2]).prod(-1)
+    low, high = torch.minimum(predicted[:, :2], truth[:, :2]), torch.maximum(predicted[:, 2:], truth[:, 2:])
     hull = (high - low).prod(-1).clamp_min(1e-6)
     return overlap, 1 - areas / (1 + overlap) / hull
 
 
 @torch.no_grad()
-def found_by_class(network: torch.nn.Module, shown: Pictures) -> list[list[Detection]]:
-    """All that is found of each class in pictures with one object each."""
+def detections_by_class(network: torch.nn.Module, pictures: Pictures) -> list[list[Detection]]:
+    """Detections of each class in pictures with one object each."""
     was_training = network.training
     network.eval()
-    candidates = torch.cat([network(batch.float() / 255) for batch in shown.images.split(256)])
+    candidates = torch.cat([network(batch.float() / 255) for batch in pictures.images.split(256)])
     network.train(was_training)
-    boxes_px, labels = shown.boxes * INPUT_PX, range(len(primitives.primitive_names()))
-    return [find_detections(candidates, [label], boxes_px, (shown.labels == label).tolist()) for label in labels]
+    boxes_px, labels = pictures.boxes * INPUT_PX, range(len(primitives.primitive_names()))
+    return [find_detections(candidates, [label], boxes_px, (pictures.labels == label).tolist()) for label in labels]
 
 
-def scored(network: torch.nn.Module, shown: Pictures) -> np.ndarray:
-    """AP50 of each class of what a network finds."""
-    return precision(found_by_class(network, shown), shown)
+def score_network(network: torch.nn.Module, pictures: Pictures) -> np.ndarray:
+    """AP50 of each class for a network."""
+    return ap50_by_class(detections_by_class(network, pictures), pictures)
 
 
-def precision(found: Sequence[Sequence[Detection]], shown: Pictures) -> np.ndarray:
-    """AP50 of each class."""
-    counts = shown.labels.bincount(minlength=len(found)).tolist()
+def ap50_by_class(found: Sequence[Sequence[Detection]], pictures: Pictures) -> np.ndarray:
+    """AP50 of each class from its detections."""
+    counts = pictures.labels.bincount(minlength=len(found)).tolist()
     return np.array([average_precision(each, count) for each, count in zip(found, counts, strict=True)])
 
 
-def write(out: Path, trained: torch.nn.Module, recipe: Recipe, held_out: Pictures, seconds: fit.Seconds) -> None:
-    """The weights and what is known about them; the precision is that of the stored weights."""
-    network = fit.folded(trained)
-    count = stored(network, out / "builtin_detector.safetensors")
-    found = found_by_class(network, held_out)
-    ap50 = precision(found, held_out)
+def write(
+    out: Path, trained: torch.nn.Module, recipe: DetectorRecipe, held_out: Pictures, seconds: fit.Seconds
+) -> None:
+    """Write the weights and their card; the average precision is that of the stored weights."""
+    network = fit.fold_batch_norm(trained)
+    count = store_float16(network, out / "builtin_detector.safetensors")
+    found = detections_by_class(network, held_out)
+    ap50 = ap50_by_class(found, held_out)
     figures = {
         "input_px": INPUT_PX,
         "weights": count,
         "least_score": best_score(chain(*found), len(held_out.labels)),  # of best F1 on the held-out pictures
         "held_out_ap50": round(float(ap50.mean()), 4),
-        "held_out_ap50_by_class": by_class(ap50),
+        "held_out_ap50_by_class": round_by_class(ap50),
     }
     write_card(out / "builtin_detector.json", figures, "train_detector", recipe, seconds)
     print(f"held-out AP50 {figures['held_out_ap50']:.3f}: {figures['held_out_ap50_by_class']}")
 
 
 def best_score(found: Iterable[Detection], objects: int) -> float:
-    """The score, in twentieths, from which on findings have the highest F1, of so many objects."""
+    """The score threshold, in twentieths, with the highest F1 of detections of this number of objects."""
 
     def f1(score: float) -> float:
         right = [finding.is_hit for finding in known if 1 / (1 + np.exp(-finding.logit)) >= score]
@@ -162,7 +164,9 @@ def best_score(found: Iterable[Detection], objects: int) -> float:
 
 def main() -> None:
     """Render, train, measure, and write the network with its card."""
-    fit.run(Recipe, "Train the built-in detector from procedural renders.", INPUT_PX, train, scored, write)
+    fit.run(
+        DetectorRecipe, "Train the built-in detector from procedural renders.", INPUT_PX, train, score_network, write
+    )
 
 
 if __name__ == "__main__":

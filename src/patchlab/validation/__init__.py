@@ -1,1 +1,1 @@
-"""Studies of the tool itself: whether what it states holds, and where it stops working."""
+"""Studies of the tool: do its statements hold, and where does it stop working?"""

@@ -1,17 +1,17 @@
-"""What each modeled effect earns when training knows it, and what a promise without it is off by.
+"""Leave each modeled effect out of training: the rate that it earns, and the error of a promise without it.
 
-It is left out of training, and the design is tried in the whole world and in the world without it.
-In: scene files in which the effects of interest are on, networks, seeds. Out: for each effect how much rate and
-confidence designs lose that were trained without it, against designs trained with all, under the same conditions; by
-our renderer, and in path-traced photographs (`path_traced`), whose light is not ours. And what such a design shows in
-the whole world more than without the effect, which is what it would be promised: the same design in the same sessions.
-What takes an effect's place is what `plan` puts there (`plan.terms`): even light for the sun, not darkness. Effects
-joined by " + " go together; a scene in which all of them are off is left out.
+A design is trained without the effect and tested in the full world and in the world without it.
+In: scene files in which the effects of interest are on, networks, seeds. Out: for each effect the rate and
+confidence that designs trained without it lose against designs trained with all, under the same conditions, by our
+renderer and in path-traced photographs (`path_traced`), whose light is not ours. And the design's rate in the full
+world minus that in the world without the effect, which would be its promise: same design, same sessions.
+An effect is replaced as `plan` does it (`plan.terms`): even light for the sun, not darkness. Effects joined by " + "
+are left out together; a scene in which all of them are off is skipped.
 
-All designs of a scene, network and seed share their draws, but each is another design: its own luck is in what an
-effect earned, so intervals are over such groups, not over conditions; those of what a promise is off by, which hardly
-depends on the design, are over pairs of scene and network. Views keep their poses for one step. Left out on
-purpose: what an effect takes of a step's time. The table's figures were within some 20 %, which told nothing.
+All designs of a scene, network and seed share their draws, but designs differ by chance, so intervals of earned rates
+are over such groups, not over conditions; errors of promises hardly depend on the design, and their intervals are over
+pairs of scene and network. Views keep their poses for one step. Left out on purpose: an effect's share of a step's
+time, which varies by some 20 % from run to run.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field
 
-from patchlab.study.claims import mean
-from patchlab.study.grid import GridSettings, Names, Values, grid_cells, grouped, of_values, problem_of, who
-from patchlab.study.record import hits_of, recorded
+from patchlab.study.estimates import mean
+from patchlab.study.grid import CellValues, GridSettings, Names, by_values, cell_key, grid_cells, group_by, problem_of
+from patchlab.study.record import parse_hits, to_record
 from patchlab.study.study import Cell, Result, Study
 from patchproof.app.plan.terms import PRINTER, Setup, effect_terms, scene_terms
 from patchproof.base.errors import Refused
@@ -49,26 +49,26 @@ from patchproof.reprints.path_traced import photograph_traced
 from patchproof.scene.conditions import Conditions, draw
 from patchproof.scene.conditions import without_effect as drawn_without
 
-ALL = "all"
-# What goes together, because alone it is too little to tell.
-_TOGETHER = ("dot gain + ink density + printed black", "blur + motion blur")
-_UNSEEN = "JPEG"  # training's views are too small to show it
+ALL_EFFECTS = "all"
+# effects left out together, because each alone is too small to measure
+_EFFECT_GROUPS = ("dot gain + ink density + printed black", "blur + motion blur")
+_INVISIBLE_EFFECT = "JPEG"  # training views are too small to show it
 
 
 def _default_effects() -> tuple[str, ...]:
-    """All effects that `plan` can switch off, in its order."""
+    """All effects that `plan` can switch off, in its order, grouped."""
     printed = (PRINTER, *(term.name for term in effect_terms("printer")))
     names = (*(term.name for term in effect_terms("light")), *printed, *(term.name for term in effect_terms("camera")))
-    merge_responses = {name: group for group in _TOGETHER for name in group.split(" + ")}
-    return tuple(dict.fromkeys(merge_responses.get(name, name) for name in names if name != _UNSEEN))
+    group_of = {name: group for group in _EFFECT_GROUPS for name in group.split(" + ")}
+    return tuple(dict.fromkeys(group_of.get(name, name) for name in names if name != _INVISIBLE_EFFECT))
 
 
 EFFECTS = _default_effects()
-WORLDS = ("modeled", "path_traced")  # whose photographs: our renderer's, or the path tracer's
+WORLDS = ("modeled", "path_traced")  # photographs by our renderer, or by the path tracer
 
 
 class AblationSettings(GridSettings):
-    """A design for each scene, network and seed with all effects, and one without each."""
+    """Settings: for each scene, network and seed a design with all effects, and one without each."""
 
     effects: Names = EFFECTS  # left out one by one; "a + b" leaves out both at once
     n: Annotated[int, Field(ge=10)] = 400  # unseen conditions for each design, in sessions as a promise has them
@@ -76,57 +76,59 @@ class AblationSettings(GridSettings):
 
 
 @dataclass(frozen=True, eq=False)
-class Without(Problem):
-    """A problem that sees its views without some effects."""
+class SimplifiedProblem(Problem):
+    """A problem whose views are rendered without some effects."""
 
     changes: tuple[Callable[[Setup], Setup | None], ...] = ()
 
     def see(self, appearance: Appearance, conditions: Conditions, side_px: int) -> Views:
-        """Views in which what is left out is as in the simpler model."""
+        """Render views with the simpler model."""
         setup = self._simpler(appearance, conditions)
         return Problem.see(replace(self, stage=setup.stage), appearance, setup.conditions, side_px)
 
     def see_again(self, views: Views, conditions: Conditions) -> Views:
-        """As in `Problem`, and without what is left out, too."""
+        """Relight views as `Problem` does, without the effects left out."""
         return relight_and_replace_background(views, self._simpler(self.start_appearance, conditions).conditions)
 
-    def _simpler(self, shown: Appearance, conditions: Conditions) -> Setup:
-        setup = Setup(self.stage, shown, conditions)
+    def _simpler(self, appearance: Appearance, conditions: Conditions) -> Setup:
+        setup = Setup(self.stage, appearance, conditions)
         for change in self.changes:
             setup = change(setup) or setup
         return setup
 
 
-def without(problem: Problem, effect: str) -> Problem:
-    """The problem without the effects of that name, joined by " + "; refused where none of them is on."""
+def simplify_problem(problem: Problem, effect: str) -> Problem:
+    """The problem without the effects joined by " + "; refused if none of them is on."""
     terms = {term.name: term for term in scene_terms(problem, problem.subject.start(), None) if term.modeled}
     names = effect.split(" + ")
     unknown = [name for name in names if name not in terms]
     if unknown:
-        raise Refused("an effect that this kind of scene has", f'"{unknown[0]}"', "choose of " + ", ".join(terms))
+        raise Refused("an effect that this kind of scene has", f'"{unknown[0]}"', "choose one of " + ", ".join(terms))
     setup = Setup(problem.stage, problem.subject.appearance(problem.subject.start()), problem.scene.draw("select", 64))
     on = [name for name in names if terms[name].change(setup) is not None]
     if not on:
-        raise Refused(f"a scene with {effect} in it", "one where it is off", f"give {terms[names[0]].key} a range")
+        raise Refused(
+            f"a scene with {effect} in it", "a scene in which it is off", f"give {terms[names[0]].key} a range"
+        )
     subject = problem.subject
     if PRINTER in on:
         subject = subject.with_printer(identity_printer())
     changes = tuple(terms[name].change for name in on if name != PRINTER)
-    return Without(**vars(replace(problem, subject=subject)), changes=changes)
+    return SimplifiedProblem(**vars(replace(problem, subject=subject)), changes=changes)
 
 
 def cells(settings: AblationSettings, base: Path) -> list[Cell]:
-    """For each scene, network and seed: a design trained with all effects, and one without each that is on."""
+    """A cell per scene, network, seed and effect that is on, and one with all effects."""
 
-    def vary(values: Values) -> list[tuple[Values, tuple[str, ...]]]:
+    def vary(values: CellValues) -> list[tuple[CellValues, tuple[str, ...]]]:
         on = [effect for effect in settings.effects if _is_on(values, effect)]
-        return [(values | {"effect": effect}, (effect[:40],)) for effect in (ALL, *on)]
+        return [(values | {"effect": effect}, (effect[:40],)) for effect in (ALL_EFFECTS, *on)]
 
     return grid_cells(settings, base, vary)
 
 
-def _is_on(values: Values, effect: str) -> bool:
-    """Whether the scene has one of the effects joined by " + "; one that is no row of `EFFECTS` counts as on."""
+def _is_on(values: CellValues, effect: str) -> bool:
+    """True if the scene has one of the effects joined by " + "; an effect that is not in `EFFECTS` counts as on."""
     scene = validate_model(SceneSettings, values["scene"], values["file"])
     drawn = draw(scene, "select", 64, 0)
     names = [name for name in effect.split(" + ") if name in EFFECT_BY_NAME]
@@ -138,14 +140,14 @@ def _is_on(values: Values, effect: str) -> bool:
 
 
 def run(settings: AblationSettings, base: Path, cell: Cell) -> dict[str, Any]:
-    """Train without the effect; hits and confidences in the whole world, and without the effect in it."""
+    """Train without the effect; record hits and confidences in the full world, and in the world without it."""
     problem, effect = problem_of(base, cell.values), cell.values["effect"]
-    simpler = problem if effect == ALL else without(problem, effect)
+    simpler = problem if effect == ALL_EFFECTS else simplify_problem(problem, effect)
     design = best_design(simpler)
     shown = problem.subject.appearance(from_pixels(design, problem.device))
     conditions = problem.scene.draw("evaluate", settings.n, per_session=VIEWS_PER_SESSION)
     answers = {"modeled": responses(problem, {"design": shown}, conditions)}
-    if effect != ALL:
+    if effect != ALL_EFFECTS:
         as_trained = simpler.subject.appearance(from_pixels(design, problem.device))
         answers["promised"] = responses(simpler, {"design": as_trained}, conditions)
     if settings.photos:
@@ -153,13 +155,13 @@ def run(settings: AblationSettings, base: Path, cell: Cell) -> dict[str, Any]:
         piece = shown if isinstance(shown, PiecePicture) else None
         alone = [drawn[i : i + 1] for i in range(len(drawn))]
         photos = (photograph_traced(problem.stage, piece, each) for each in alone)
-        asked = (ask_networks(problem, photo, problem.boxes(each)) for photo, each in zip(photos, alone, strict=True))
-        answers["path_traced"] = merge_responses([{"design": answer} for answer in asked])
-    return {world: recorded(some) for world, some in answers.items()}
+        replies = (ask_networks(problem, photo, problem.boxes(each)) for photo, each in zip(photos, alone, strict=True))
+        answers["path_traced"] = merge_responses([{"design": answer} for answer in replies])
+    return {world: to_record(some) for world, some in answers.items()}
 
 
 def tables(settings: AblationSettings, results: Sequence[Result]) -> tuple[Table, ...]:
-    """What each effect earned and what promises without it were off by, over all groups and in each."""
+    """Tables of the rate each effect earned, of the errors of promises without it, and of every design."""
     head = ("rate", "confidence", "rate, path-traced", "confidence, path-traced")
     about = f"trained with all effects minus without: positive is what the effect earned; {settings.n} conditions and "
     about += f"{settings.photos} photographs for each design; intervals over groups of scene, network and seed"
@@ -168,14 +170,14 @@ def tables(settings: AblationSettings, results: Sequence[Result]) -> tuple[Table
         "without it; “half width” is the mean of the promises' own 95 % intervals, “outside” counts designs "
     )
     missed_about += "whose rate in the whole world lies outside of them"
-    earned, missed, designs, groups = [], [], [], _groups(results)
+    earned, missed, designs, groups = [], [], [], _group_by_effect(results)
     for group in groups:
         designs += [_design_row(result) for result in group.values()]
     for effect in settings.effects:
-        compared = [(group[ALL], group[effect]) for group in groups if ALL in group and effect in group]
+        compared = [(group[ALL_EFFECTS], group[effect]) for group in groups if ALL_EFFECTS in group and effect in group]
         if compared:
-            earned.append((effect, len(compared), *_earned(compared)))
-            missed.append((effect, *_missed([less for _, less in compared])))
+            earned.append((effect, len(compared), *_mean_differences(compared)))
+            missed.append((effect, *_promise_errors([less for _, less in compared])))
     missed_head = ("left out", "designs", "rate", "confidence", "largest", "half width", "outside")
     start = ("scene", "network", "seed", "trained without", *head, "promised", "promised confidence")
     return (
@@ -186,60 +188,60 @@ def tables(settings: AblationSettings, results: Sequence[Result]) -> tuple[Table
 
 
 def _design_row(result: Result) -> tuple:
-    traced_and_ours = (*who(result), result.cell.values["effect"], *_means(result))
+    traced_and_ours = (*cell_key(result), result.cell.values["effect"], *_world_means(result))
     if "promised" not in result.answers:
         return (*traced_and_ours, None, None)
-    return (*traced_and_ours, _promised(result), _mean_of(result, "promised", "confidence"))
+    return (*traced_and_ours, _promised_rate(result), _mean_of(result, "promised", "confidence"))
 
 
-def _promised(result: Result) -> Estimate:
-    """The rate in the world without the effect, with its interval over sessions as a promise has it."""
-    hits = hits_of(result.answers["promised"]["hits"]["design"][0])
+def _promised_rate(result: Result) -> Estimate:
+    """The rate in the world without the effect, with a promise's interval over sessions."""
+    hits = parse_hits(result.answers["promised"]["hits"]["design"][0])
     posterior = rate_posterior(*count_by_session(hits, VIEWS_PER_SESSION))
     return Estimate(float(np.mean(hits)), *posterior.rate_interval, len(hits))
 
 
-def _missed(results: Sequence[Result]) -> tuple:
-    """(designs, rate, confidence, largest change of rate, mean half width of the promises, how many lie outside)."""
-    of_pairs = grouped(results, of_values("name", "network")).values()
+def _promise_errors(results: Sequence[Result]) -> tuple:
+    """(designs, rate, confidence, largest change of rate, mean half width of promises, number outside)."""
+    of_pairs = group_by(results, by_values("name", "network")).values()
     rate, confidence = (
-        mean([float(np.mean([_off(result, kind) for result in pair])) for pair in of_pairs])
+        mean([float(np.mean([_promise_error(result, kind) for result in pair])) for pair in of_pairs])
         for kind in ("hits", "confidence")
     )
-    promises = [_promised(result) for result in results]
+    promises = [_promised_rate(result) for result in results]
     half = float(np.mean([(promise.high - promise.low) / 2 for promise in promises]))
     rates = [_mean_of(result, "modeled", "hits") for result in results]
     outside = sum(not promise.low <= rate <= promise.high for rate, promise in zip(rates, promises, strict=True))
-    return len(results), rate, confidence, max((_off(r, "hits") for r in results), key=abs), half, outside
+    return len(results), rate, confidence, max((_promise_error(r, "hits") for r in results), key=abs), half, outside
 
 
-def _off(result: Result, kind: str) -> float:
-    """What a design shows in the whole world more than it would be promised."""
+def _promise_error(result: Result, kind: str) -> float:
     return _mean_of(result, "modeled", kind) - _mean_of(result, "promised", kind)
 
 
 def _mean_of(result: Result, world: str, kind: str) -> float:
-    """The rate ("hits") or mean confidence of a design in one of the worlds."""
     values = result.answers[world][kind]["design"][0]
-    return float(np.mean(hits_of(values) if kind == "hits" else values))
+    return float(np.mean(parse_hits(values) if kind == "hits" else values))
 
 
-def _groups(results: Sequence[Result]) -> list[dict[str, Result]]:
-    """By scene, network and seed the results of each effect."""
-    groups = grouped(results, who).values()
+def _group_by_effect(results: Sequence[Result]) -> list[dict[str, Result]]:
+    groups = group_by(results, cell_key).values()
     return [{result.cell.values["effect"]: result for result in group} for group in groups]
 
 
-def _means(result: Result) -> list[float | None]:
-    """Rate and confidence of a design in each world; None where nothing was photographed."""
+def _world_means(result: Result) -> list[float | None]:
+    """Rate and confidence of a design in each world; None without photographs."""
     kinds = ("hits", "confidence")
     return [_mean_of(result, world, kind) if world in result.answers else None for world in WORLDS for kind in kinds]
 
 
-def _earned(compared: Sequence[tuple[Result, Result]]) -> list[Estimate | None]:
-    """What the first of each pair is better by: rate and confidence in each world."""
+def _mean_differences(compared: Sequence[tuple[Result, Result]]) -> list[Estimate | None]:
+    """Mean differences, first minus second of each pair: rate and confidence in each world."""
     differences = [
-        [None if a is None or b is None else a - b for a, b in zip(_means(whole), _means(less), strict=True)]
+        [
+            None if a is None or b is None else a - b
+            for a, b in zip(_world_means(whole), _world_means(less), strict=True)
+        ]
         for whole, less in compared
     ]
     columns = ([value for value in column if value is not None] for column in zip(*differences, strict=True))

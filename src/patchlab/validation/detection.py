@@ -1,10 +1,10 @@
-"""Finding and measuring the sheet in rendered photographs, against the renderer's truth.
+"""Find and measure the sheet in rendered photographs, and compare with the renderer's truth.
 
-Also whether the stated uncertainty holds.
-In: a scene with wide ranges of view, light and camera. Out: by photograph its status and code, and against the
-renderer's truth the error of the design's corners; over all of them shares with Wilson intervals by tilt, distance,
-blur, noise, light, hiding and JPEG. The sheet carries noise in place of a design, since only markers are
-read here. In a share of the photographs a card of drawn size, place and color hides a part of the piece.
+The stated uncertainty is checked, too.
+In: a scene with wide ranges of view, light and camera. Out: by photograph its status, its code and
+the error of the design's corners; over all photographs shares with Wilson intervals by tilt, distance, blur, noise,
+light, hiding and JPEG. The sheet has noise in place of a design, since only markers are read. In a share of the
+photographs a card of drawn size, position and color hides a part of the piece.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ import numpy as np
 import torch
 from pydantic import Field
 
-from patchlab.study.claims import clustered_median
+from patchlab.study.estimates import clustered_median
 from patchlab.study.record import corner_error_mm
 from patchlab.study.study import Cell, Result, Study
-from patchlab.validation.hung import hang_piece
+from patchlab.validation.mounted_sheets import mount_content
 from patchproof.base.errors import Refused
 from patchproof.base.geometry import apply_homography, local_scale, rect_corners
 from patchproof.base.intervals import Estimate, rate
@@ -46,9 +46,9 @@ from patchproof.scene.scene import load_scene
 from patchproof.sheets.content import SheetContent
 from patchproof.sheets.piece import control_design
 
-MEASURABLE_TILT_DEG, MEASURABLE_BLUR_PX = 70.0, 1.5  # beyond these the bounds on errors are not claimed
+MEASURABLE_TILT_DEG, MEASURABLE_BLUR_PX = 70.0, 1.5  # bounds on errors are claimed up to these
 SHARP_MODULE_PX = 4.0  # pixels per marker module from which corners should be right to a tenth of a pixel
-_BINS = {
+_BIN_EDGES = {
     "tilt_deg": (0, 20, 40, 50, 60, 70, 90),
     "module_px": (0, 1.5, 2, 3, 4, 6, 30),
     "blur_px": (0, 0.5, 1, 1.5, 2, 9),
@@ -69,27 +69,27 @@ _LABELS = {
 
 
 class DetectionSettings(StrictModel):
-    """What is photographed, and how often."""
+    """The scene, and the number of photographs."""
 
     scene: str  # a scene file of one object with a patch
-    photos: Annotated[int, Field(ge=1, le=100_000)] = 200  # how many are taken
-    hidden: Share = 0.4  # share of them in which something hides a part of the sheet
-    seed: int = 0  # of everything that is drawn
+    photos: Annotated[int, Field(ge=1, le=100_000)] = 200  # number of photographs
+    hidden: Share = 0.4  # share of them in which a card hides a part of the piece
+    seed: int = 0  # seed of all draws
 
 
 def cells(settings: DetectionSettings, base: Path) -> list[Cell]:
-    """One for each photograph."""
+    """A cell per photograph."""
     return [Cell(f"photo_{i:05d}", {"number": i}) for i in range(settings.photos)]
 
 
 def run(settings: DetectionSettings, base: Path, cell: Cell) -> dict[str, Any]:
-    """What was photographed, what was made of it and, where there is a homography, the design's corner errors."""
-    (sheet, scene), number = _hung(str(base / settings.scene), settings.seed), cell.values["number"]
+    """Take one photograph and measure it; corner errors are None without a homography."""
+    (sheet, scene), number = _mounted_sheet(str(base / settings.scene), settings.seed), cell.values["number"]
     surface = surface_of(sheet.manifest)
     conditions = scene.draw("reprint", 1, settings.seed, number)
     rng = np.random.default_rng([settings.seed, number])
     truth = sheet.px_from_page(conditions)
-    srgb, hidden = _photographed(sheet, conditions, truth, rng, rng.random() < settings.hidden)
+    srgb, hidden = _photograph_sheet(sheet, conditions, truth, rng, rng.random() < settings.hidden)
     photo = Photo(srgb, float(scene.matrix_px(scene.settings.camera.photo_px)[0, 0]))
     entry = measure(pinhole_photo(photo, None), "photo.jpg", surface, None, promised_ranges(())).entry
     geometry = entry.geometry
@@ -117,14 +117,14 @@ def run(settings: DetectionSettings, base: Path, cell: Cell) -> dict[str, Any]:
     return answers | {"error_mm": corner_error_mm(geometry, corners, true_px), "error_px": errors_px}
 
 
-def _photographed(sheet: MountedSheet, conditions: Conditions, truth, rng, hide: bool) -> tuple[np.ndarray, float]:
-    """uint8 pixels as read back from the JPEG, and the share of the piece behind a card, where one hides it."""
+def _photograph_sheet(sheet: MountedSheet, conditions: Conditions, truth, rng, hide: bool) -> tuple[np.ndarray, float]:
+    """uint8 pixels as read back from the JPEG, and the share of the piece that a card hides (0 without `hide`)."""
     photo_px, share = sheet.scene.settings.camera.photo_px, 0.0
     with torch.no_grad():
         picture = photograph(sheet.stage, sheet.piece, conditions, photo_px, jpeg=False)
     if hide:
         piece_px = apply_homography(truth, rect_corners(sheet.manifest.cut_mm))
-        cover, piece = (_filled(quad, photo_px) for quad in (_card(rng, piece_px), piece_px))
+        cover, piece = (_fill_quad(quad, photo_px) for quad in (_draw_card(rng, piece_px), piece_px))
         share = float((cover * piece).sum() / max(piece.sum(), 1))
         card = torch.from_numpy(rng.uniform(0.05, 0.8, 3).astype(np.float32))[:, None, None]
         picture = picture + torch.from_numpy(cover) * (card - picture)
@@ -132,19 +132,18 @@ def _photographed(sheet: MountedSheet, conditions: Conditions, truth, rng, hide:
 
 
 @lru_cache(maxsize=1)
-def _hung(scene_path: str, seed: int) -> tuple[MountedSheet, PatchScene]:
-    """The scene's sheet with noise on it, hung up in the scene."""
+def _mounted_sheet(scene_path: str, seed: int) -> tuple[MountedSheet, PatchScene]:
     scene = require_patch(load_scene(scene_path, seed), "a scene of an object with a flat patch")
     if not scene.is_flat:
-        raise Refused("a scene of an object with a flat patch", "another one", "name a mesh and leave bend out")
+        raise Refused("a scene of an object with a flat patch", "a bent patch", "leave bend out")
     piece = scene.piece
     blank = np.zeros((240, round(240 * piece.size_mm[0] / piece.size_mm[1]), 3), np.uint8)
     noise = control_design("noise", blank, scene.sheet_id, piece)
-    return hang_piece(set_stage(scene), SheetContent(piece, scene.sheet_id, "design", noise)), scene
+    return mount_content(set_stage(scene), SheetContent(piece, scene.sheet_id, "design", noise)), scene
 
 
-def _card(rng: np.random.Generator, piece_px: np.ndarray) -> np.ndarray:
-    """Corners of a card, a fifth to two thirds of the piece long, with its middle somewhere on the piece."""
+def _draw_card(rng: np.random.Generator, piece_px: np.ndarray) -> np.ndarray:
+    """Draw corners of a card, a fifth to two thirds of the piece long, with its middle on the piece."""
     u, v = rng.random(2)
     top, bottom = piece_px[0] + u * (piece_px[1] - piece_px[0]), piece_px[3] + u * (piece_px[2] - piece_px[3])
     length = rng.uniform(0.2, 0.67) * np.linalg.norm(piece_px[2] - piece_px[0]) / np.sqrt(2)
@@ -153,15 +152,15 @@ def _card(rng: np.random.Generator, piece_px: np.ndarray) -> np.ndarray:
     return top + v * (bottom - top) + (np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * half) @ turn.T
 
 
-def _filled(quad: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
-    """H×W float32 in [0, 1]: what share of each pixel, about, lies in the quad."""
+def _fill_quad(quad: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
+    """H×W float32 in [0, 1]: about the share of each pixel that lies in the quad."""
     mask = np.zeros((size_px[1], size_px[0]), np.uint8)
     cv2.fillConvexPoly(mask, to_sixteenths(quad), 255, cv2.LINE_AA, 4)
     return mask.astype(np.float32) / 255
 
 
 def tables(settings: DetectionSettings, results: Sequence[Result]) -> Sequence[Table]:
-    """Bounds over all photographs, shares by each quantity, and codes."""
+    """Tables of bounds over all photographs, of shares by quantity, and of codes."""
     shots = [result.answers for result in results]
     return (_bounds(shots), _by_quantity(shots), _codes(shots))
 
@@ -186,14 +185,14 @@ def _bounds(shots: Sequence[Mapping]) -> Table:
         ("largest corner error, median, mm", _median(claimed, "error_mm")),
         ("largest corner error of all, mm", max((shot["error_mm"] for shot in claimed), default=None)),
         ("the same at any tilt and blur, mm", max((shot["error_mm"] for shot in measured), default=None)),
-        ("stated 95 % uncertainty covers the largest corner error", _covered(claimed)),
-        ("the same at any tilt and blur", _covered(measured)),
+        ("stated 95 % uncertainty covers the largest corner error", _coverage(claimed)),
+        ("the same at any tilt and blur", _coverage(measured)),
     )
     about = f"{len(usual)} of {len(shots)} photographs have tilt ≤ 70° and blur ≤ 1.5 px; corners are the design's four"
     return Table("bounds", "Errors against the truth", ("figure", "value"), rows, about)
 
 
-def _covered(measured: Sequence[Mapping]) -> Estimate | None:
+def _coverage(measured: Sequence[Mapping]) -> Estimate | None:
     return rate([shot["error_mm"] <= shot["uncertainty_mm"] for shot in measured])
 
 
@@ -203,13 +202,13 @@ def _median(shots: Sequence[Mapping], name: str) -> Estimate | None:
 
 def _by_quantity(shots: Sequence[Mapping]) -> Table:
     rows = []
-    for name, edges in _BINS.items():
+    for name, edges in _BIN_EDGES.items():
         for low, high in pairwise(edges):
             here = [shot for shot in shots if shot[name] is not None and low <= shot[name] < high]
             if here:
                 identified = rate([shot["status"] != "rejected" for shot in here])
                 measured = rate([shot["status"] == "measured" for shot in here])
-                rows.append((_LABELS[name], f"{low:g} to {high:g}", identified, measured, _covered(_measured(here))))
+                rows.append((_LABELS[name], f"{low:g} to {high:g}", identified, measured, _coverage(_measured(here))))
     head = ("quantity", "range", "identified", "measured", "covered")
     about = "each with all other quantities over their whole ranges; light is known where markers were found"
     return Table("by_quantity", "By what a photograph was taken under", head, tuple(rows), about)

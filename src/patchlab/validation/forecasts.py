@@ -1,8 +1,8 @@
-"""Whether photographs were forecast well, and effects estimated from them are those of photographed controls.
+"""Check forecasts of single photographs, and estimated effects against those of photographed controls.
 
-In: as `promises`, and a control. Out: for every session of photographs by a renderer that is not ours, each
-photograph's chance as `verify --run` states it beside what it showed, and the effect as estimated from the photographs
-beside the one with the control really in the piece's place, under the same conditions. Tables by scene: Brier scores,
+In: settings of `promises`, and a control. Out: for every session of photographs by another renderer, each photograph's
+chance as `verify --run` states it beside its answer, and the effect estimated from the photographs beside that with
+photographs of the control under the same conditions. Tables by scene: Brier scores,
 calibration and interval widths beside the promise's own; bias and coverage of estimated effects.
 """
 
@@ -15,18 +15,18 @@ from typing import Any, Literal
 
 import numpy as np
 
-from patchlab.study.claims import mean
+from patchlab.study.estimates import mean
 from patchlab.study.grid import by_scene
-from patchlab.study.record import hits_of
+from patchlab.study.record import parse_hits
 from patchlab.study.study import Cell, Result, Study
-from patchlab.validation.photographed import (
+from patchlab.validation.photo_sessions import (
     SessionsSettings,
     cells,
-    judged,
-    printed_run,
-    recorded_promise,
-    recorded_spread,
+    make_run_and_sheet,
+    promise_posterior,
+    record_promise,
     take_photos,
+    verify_photos,
 )
 from patchproof.base.intervals import rate, wilson
 from patchproof.evidence.forecast import forecast_of
@@ -34,51 +34,51 @@ from patchproof.report.tables import Drawing, Table
 
 
 class ForecastsSettings(SessionsSettings):
-    """As promises, with a control in the place of each design."""
+    """Settings of sessions, and the control that is photographed in place of each design."""
 
-    control: Literal["mean", "gray", "noise"] | None = "gray"  # photographed, too, under the same conditions
+    control: Literal["mean", "gray", "noise"] | None = "gray"  # photographed under the same conditions
 
 
 def run(settings: ForecastsSettings, base: Path, cell: Cell) -> dict[str, Any]:
-    """Forecasts, estimates and what was photographed, by session."""
+    """Record forecasts, estimated effects and photographed effects by session."""
     from patchproof.reprints.photo_forecast import photo_forecaster
     from patchproof.sheets.manifest import load_manifest
 
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        made = printed_run(base, cell, folder)
-        photos, controls = take_photos(settings, cell, made, folder), None
+        patch_run = make_run_and_sheet(base, cell, folder)
+        photos, controls = take_photos(settings, cell, patch_run, folder), None
         if settings.control is not None:
-            controls = take_photos(settings, cell, made, folder, settings.control)
-        forecast, sessions = photo_forecaster(made, load_manifest(folder / "sheet.json")), []
-        for own in sorted(photos.iterdir()):
-            if own.is_dir():
-                beside = None if controls is None else controls / own.name
-                report = judged(own, folder, base, cell, forecast, controls=beside)
-                sessions.append(_session(report, settings.control))
-    return recorded_promise(made) | {"sessions": sessions}
+            controls = take_photos(settings, cell, patch_run, folder, settings.control)
+        forecast, sessions = photo_forecaster(patch_run, load_manifest(folder / "sheet.json")), []
+        for session in sorted(photos.iterdir()):
+            if session.is_dir():
+                of_control = None if controls is None else controls / session.name
+                report = verify_photos(session, folder, base, cell, forecast, controls=of_control)
+                sessions.append(_record_session(report, settings.control))
+    return record_promise(patch_run) | {"sessions": sessions}
 
 
-def _session(report: Any, control: str | None) -> dict[str, Any]:
-    """What is kept of a session's report; effects as the patch's rate minus the control's."""
+def _record_session(report: Any, control: str | None) -> dict[str, Any]:
+    """A session's record from its report; effects are the patch's rate minus the control's."""
     (network, *_), summary = report.summary.models, report.summary
     forecast = [
         (entry.forecast, entry.predictions[network].recognized)
         for entry in report.photos
         if entry.forecast is not None and entry.predictions
     ]
-    kept: dict[str, Any] = {"forecast": forecast, "agree": None, "estimated": None, "photographed": None}
+    record: dict[str, Any] = {"forecast": forecast, "agree": None, "estimated": None, "photographed": None}
     if summary.estimated is not None:
-        kept["agree"] = summary.estimated.agree
+        record["agree"] = summary.estimated.agree
         of_control = [claim for claim in summary.estimated.controls if claim.name == control]
-        kept["estimated"] = [(claim.difference, *claim.difference_interval) for claim in of_control][0:1] or None
+        record["estimated"] = [(claim.difference, *claim.difference_interval) for claim in of_control][0:1] or None
     if report.controls:
-        kept["photographed"] = report.controls[0].difference
-    return kept
+        record["photographed"] = report.controls[0].difference
+    return record
 
 
 def tables(settings: ForecastsSettings, results: Sequence[Result]) -> tuple[Table, ...]:
-    """Forecasts and effects, by scene and in all; every session."""
+    """Tables of forecasts and of effects, by scene and in all, and of every session."""
     groups = by_scene(results) | {"all": list(results)}
     about = f"{settings.sessions} sessions of {settings.photos} photographs of each run"
     head = ("scene", "photographs", "Brier", "Brier of the promise", "calibration slope", "counts held", "width")
@@ -90,7 +90,7 @@ def tables(settings: ForecastsSettings, results: Sequence[Result]) -> tuple[Tabl
         effects = [(name, *_effect_row(group)) for name, group in groups.items()]
         about = f"{about}; the patch beside {settings.control}"
         tables_.append(Table("effects", "Effects estimated and photographed", head, tuple(effects), about))
-    return (*tables_, _each(results))
+    return (*tables_, _session_table(results))
 
 
 def _forecast_row(group: Sequence[Result]) -> tuple:
@@ -100,27 +100,27 @@ def _forecast_row(group: Sequence[Result]) -> tuple:
     chances, hits = np.array(pairs, float).T
     held, widths, held_promise, widths_promise, promised = [], [], [], [], []
     for result in group:
-        spread, level = recorded_spread(result), float(np.mean(hits_of(result.answers["promised"])))
+        posterior, level = promise_posterior(result), float(np.mean(parse_hits(result.answers["promised"])))
         for session in result.answers["sessions"]:
             if not session["forecast"]:
                 continue
-            own, answers = zip(*session["forecast"], strict=True)
-            forecast, n = forecast_of(own, answers, level), len(own)
-            low, high = spread.count_interval((n,))
+            chances_here, answers = zip(*session["forecast"], strict=True)
+            forecast, n = forecast_of(chances_here, answers, level), len(answers)
+            low, high = posterior.count_interval((n,))
             held.append(forecast.interval[0] <= forecast.recognized <= forecast.interval[1])
             held_promise.append(low <= forecast.recognized <= high)
             widths.append(np.ptp(forecast.interval) / n)
             widths_promise.append((high - low) / n)
             promised += [(level - answer) ** 2 for answer in answers]
     brier = float(np.mean((chances - hits) ** 2))
-    scores = brier, float(np.mean(promised)), slope(chances, hits)
+    scores = brier, float(np.mean(promised)), calibration_slope(chances, hits)
     middles = float(np.median(widths)), float(np.median(widths_promise))
     return (len(pairs), *scores, rate(held), *middles, rate(held_promise))
 
 
-def slope(chances: np.ndarray, hits: np.ndarray) -> float | None:
-    """Of the logistic regression of answers on the chances' log odds (Cox, Biometrika 45 (1958) 562): 1 where they are
-    as sure as they may be, below where they are too sure. None where all answers are the same.
+def calibration_slope(chances: np.ndarray, hits: np.ndarray) -> float | None:
+    """The slope of a logistic regression of answers on the chances' log odds (Cox, Biometrika 45 (1958) 562): 1 if
+    chances are calibrated, less if they are overconfident. None if all answers are the same.
     """
     from scipy.optimize import minimize
 
@@ -128,8 +128,8 @@ def slope(chances: np.ndarray, hits: np.ndarray) -> float | None:
         return None
     odds = np.log(chances / (1 - chances))
 
-    def loss(at: np.ndarray) -> float:
-        return float(np.mean(np.logaddexp(0, (1 - 2 * hits) * (at[0] + at[1] * odds))))
+    def loss(line: np.ndarray) -> float:
+        return float(np.mean(np.logaddexp(0, (1 - 2 * hits) * (line[0] + line[1] * odds))))
 
     return float(minimize(loss, np.array([0.0, 1.0])).x[1])
 
@@ -144,12 +144,12 @@ def _effect_row(group: Sequence[Result]) -> tuple:
     ]
     if not both:
         return len(sessions), rate(refused), None, None, None
-    off = [estimated - photographed for estimated, _, _, photographed in both]
+    errors = [estimated - photographed for estimated, _, _, photographed in both]
     held = rate([low <= photographed <= high for _, low, high, photographed in both])
-    return len(sessions), rate(refused), mean([photographed for *_, photographed in both]), mean(off), held
+    return len(sessions), rate(refused), mean([photographed for *_, photographed in both]), mean(errors), held
 
 
-def _each(results: Sequence[Result]) -> Table:
+def _session_table(results: Sequence[Result]) -> Table:
     head = ("scene", "network", "seed", "session", "photographs", "expected", "recognized", "agree", "estimated")
     rows = []
     for result in results:
@@ -164,7 +164,7 @@ def _each(results: Sequence[Result]) -> Table:
 
 
 def figures(settings: ForecastsSettings, results: Sequence[Result]) -> tuple[Drawing, ...]:
-    """Reliability: what was recognized by chance."""
+    """A reliability plot: share recognized by forecast chance."""
     pairs = [pair for result in results for session in result.answers["sessions"] for pair in session["forecast"]]
     if not pairs:
         return ()
@@ -175,10 +175,10 @@ def figures(settings: ForecastsSettings, results: Sequence[Result]) -> tuple[Dra
         number = np.clip(np.digitize(chances, edges) - 1, 0, len(edges) - 2)
         axes.plot([0, 1], [0, 1], color="0.6", linewidth=1)
         for i in sorted(set(number.tolist())):
-            own = hits[number == i]
-            low, high = wilson(int(own.sum()), len(own))
-            span = [[own.mean() - low], [high - own.mean()]]
-            axes.errorbar([chances[number == i].mean()], [own.mean()], span, fmt="o", color="tab:blue")
+            some = hits[number == i]
+            low, high = wilson(int(some.sum()), len(some))
+            span = [[some.mean() - low], [high - some.mean()]]
+            axes.errorbar([chances[number == i].mean()], [some.mean()], span, fmt="o", color="tab:blue")
         axes.set(xlabel="chance of the forecast", ylabel="share recognized", xlim=(0, 1), ylim=(0, 1))
 
     about = f"{len(pairs)} photographs in five groups; bars: 95 %, as if all were independent"

@@ -1,11 +1,10 @@
-"""What a piece's layout costs in recognition, and what it buys in finding and measuring the sheet.
+"""Compare layouts of a piece: their cost in recognition, their benefit in finding and measuring the sheet.
 
-In: scene files, networks, seeds and layouts: how many markers, how large, with how much white round them, with the
-design all over the piece or in a frame of markers, and whatever else of the scene file changes: the piece's size or
-place, how it is trained. Per cell a design is trained in that layout and shown, beside the controls, under unseen
-conditions; then its sheet is printed, hung up, photographed, found and measured against the renderer's truth. All
-layouts of a scene, network and seed share their draws; intervals are over such groups, since each design has its own
-luck.
+In: scene files, networks, seeds and layouts: number and size of markers, white around them, a design all over the
+piece or in a frame of markers, and other changes of the scene file: the piece's size or place, its training. Out: per
+cell a design is trained in that layout and shown, beside the controls, under unseen conditions; then its sheet is
+printed, mounted, photographed, found and measured against the renderer's truth. All layouts of a scene, network and
+seed share their draws; intervals are over such groups, since designs differ by chance.
 """
 
 from __future__ import annotations
@@ -18,20 +17,20 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from patchlab.study.claims import clustered_median, mean
+from patchlab.study.estimates import clustered_median, mean
 from patchlab.study.grid import (
-    Count,
     GridSettings,
+    PositiveInt,
+    cell_key,
     grid_cells,
-    grouped,
-    networks_at,
+    group_by,
+    network_names,
     scene_of,
-    who,
-    with_tables,
+    with_changes,
 )
-from patchlab.study.record import Record, corner_error_mm, gain_of, hardest, recorded
+from patchlab.study.record import Record, corner_error_mm, gain_of, hardest_control, to_record
 from patchlab.study.study import Cell, Result, Study
-from patchlab.validation.hung import hang_piece
+from patchlab.validation.mounted_sheets import mount_content
 from patchproof.base.geometry import apply_homography, rect_corners
 from patchproof.base.intervals import Estimate, rate
 from patchproof.base.output import image_pixels
@@ -60,11 +59,11 @@ if TYPE_CHECKING:
 class Layout(StrictModel):
     """One way to lay out a piece."""
 
-    markers: Literal[4, 8] = 4  # in the corners; or in the middle of each side, too
-    size: Positive = 1.0  # of the markers that the scene's views ask for
+    markers: Literal[4, 8] = 4  # in the corners; 8: also in the middle of each side
+    size: Positive = 1.0  # factor of the marker size that the scene's views need
     quiet: Positive = 1.0  # modules of white between a marker and the design
-    framed: bool = False  # the design inside a frame of markers, all of which is white
-    scene: dict[str, dict[str, Any]] = Field(default_factory=dict)  # tables of the scene file, keys that change with it
+    framed: bool = False  # put the design inside a white frame with the markers
+    scene: dict[str, dict[str, Any]] = Field(default_factory=dict)  # changes of the scene file, by table and key
 
 
 _LAYOUTS = {
@@ -78,72 +77,74 @@ _LAYOUTS = {
 
 
 class LayoutsSettings(GridSettings):
-    """A design for each scene, network, seed and layout."""
+    """Settings: a design for each scene, network, seed and layout."""
 
     layouts: dict[str, Layout] = Field(_LAYOUTS, min_length=1)  # by name; the others are compared with the first
-    n: Count = 400  # unseen conditions that measure
-    photos: Annotated[int, Field(ge=0)] = 40  # of each design's sheet
+    n: PositiveInt = 400  # unseen conditions that measure
+    photos: Annotated[int, Field(ge=0)] = 40  # photographs of each design's sheet
 
 
 @dataclass(frozen=True)
-class LaidOut(Piece):
-    """A piece that reserves other pixels for its markers."""
+class PieceVariant(Piece):
+    """A piece with other pixels reserved for its markers."""
 
     quiet: float = 1.0
     framed: bool = False
 
     @property
     def reserved_mm(self) -> tuple[RectMm, ...]:
-        """The white round each marker; the four sides of a frame."""
+        """The white around each marker, or the four sides of a frame."""
         if not self.framed:
             wider = (self.quiet - 1) * self.module_mm
             rects = (grow_rect(rect, wider) for rect in super().reserved_mm)
-            return tuple(_within(rect, self.size_mm) for rect in rects)
+            return tuple(_clip_rect(rect, self.size_mm) for rect in rects)
         (width, height), frame = self.size_mm, self.marker_mm + 2 * self.module_mm + SCISSORS_MM
         sides = ((0.0, 0.0, width, frame), (0.0, height - frame, width, frame))
         return (*sides, (0.0, 0.0, frame, height), (width - frame, 0.0, frame, height))
 
 
-def _within(rect: RectMm, size_mm: tuple[float, float]) -> RectMm:
+def _clip_rect(rect: RectMm, size_mm: tuple[float, float]) -> RectMm:
     low = [max(v, 0.0) for v in rect[:2]]
     high = [min(v + side, whole) for v, side, whole in zip(rect[:2], rect[2:], size_mm, strict=True)]
     return low[0], low[1], high[0] - low[0], high[1] - low[1]
 
 
-def laid_out(scene: PatchScene, layout: Layout) -> PatchScene:
+def with_layout(scene: PatchScene, layout: Layout) -> PatchScene:
     """The scene with its piece in another layout."""
     piece = scene.piece
     other = lay_out_piece(piece.size_mm, layout.size * piece.marker_mm, scene.sheet_id, "design", layout.markers == 8)
     plain = {field.name: getattr(other, field.name) for field in fields(other)}
-    return replace(scene, piece=LaidOut(**plain, quiet=layout.quiet, framed=layout.framed))
+    return replace(scene, piece=PieceVariant(**plain, quiet=layout.quiet, framed=layout.framed))
 
 
 def cells(settings: LayoutsSettings, base: Path) -> list[Cell]:
-    """For each scene, network and seed a cell per layout."""
+    """A cell per scene, network, seed and layout."""
     ways = [(name, layout.scene, layout.model_dump()) for name, layout in settings.layouts.items()]
     return grid_cells(
         settings,
         base,
-        lambda values: ((with_tables(values, scene) | {"layout": a, "how": how}, (a,)) for a, scene, how in ways),
+        lambda values: ((with_changes(values, scene) | {"layout": a, "how": how}, (a,)) for a, scene, how in ways),
     )
 
 
 def run(settings: LayoutsSettings, base: Path, cell: Cell) -> dict[str, Any]:
-    """Train, at a place that is searched where the scene asks for it; show and photograph."""
-    problem = _problem(base, cell)
-    scene = laid_out(require_patch(problem.scene), Layout(**cell.values["how"]))
+    """Train (after a place search if the scene asks for one), show under unseen conditions, and photograph."""
+    problem = _build_cell_problem(base, cell)
+    scene = with_layout(require_patch(problem.scene), Layout(**cell.values["how"]))
     patch = replace(problem.patch, scene=scene)
     problem = replace(problem, scene=scene, stage=replace(problem.stage, scene=scene), subject=patch)
     design = best_design(problem)
     shown = pictures_with_controls(problem, design, CONTROLS)
     answers = responses(problem, shown, scene.draw("evaluate", settings.n))
     return (
-        recorded(answers) | {"free": _free_share(scene.piece)} | _photographed(problem, scene, design, settings.photos)
+        to_record(answers)
+        | {"free": _free_share(scene.piece)}
+        | _photograph_and_measure(problem, scene, design, settings.photos)
     )
 
 
-def _problem(base: Path, cell: Cell) -> Problem:
-    scene, networks = scene_of(base, cell.values), networks_at(base, cell.values)
+def _build_cell_problem(base: Path, cell: Cell) -> Problem:
+    scene, networks = scene_of(base, cell.values), network_names(base, cell.values)
     if isinstance(scene, UnplacedScene):
         place = choose_place(scene, models=networks)
         scene = scene.with_piece_at(place.at, place.spin_deg)
@@ -151,7 +152,6 @@ def _problem(base: Path, cell: Cell) -> Problem:
 
 
 def _free_share(piece: Piece) -> float:
-    """The share of the piece that is the design's."""
     scale = 4  # samples per millimeter
     mask = np.ones([int(side * scale) for side in piece.size_mm], bool)
     for x, y, w, h in piece.reserved_mm:
@@ -159,9 +159,9 @@ def _free_share(piece: Piece) -> float:
     return float(mask.mean())
 
 
-def _photographed(problem: Problem, scene: PatchScene, design: np.ndarray, count: int) -> dict[str, Any]:
-    """What `verify` makes of photographs of the design's sheet, and how far it is off, by photograph."""
-    sheet = hang_piece(problem.stage, SheetContent(scene.piece, scene.sheet_id, "design", design))
+def _photograph_and_measure(problem: Problem, scene: PatchScene, design: np.ndarray, count: int) -> dict[str, Any]:
+    """Measure photographs of the design's sheet as `verify` does, with errors against the truth, by photograph."""
+    sheet = mount_content(problem.stage, SheetContent(scene.piece, scene.sheet_id, "design", design))
     manifest = sheet.manifest
     surface = surface_of(manifest)
     promised, drawn = promised_of(manifest, surface, sheet.printer), scene.draw("reprint", count)
@@ -181,16 +181,15 @@ def _photographed(problem: Problem, scene: PatchScene, design: np.ndarray, count
     return out
 
 
-def _gain(result: Result) -> float:
-    """The design's rate over that of its best control."""
-    return gain_of(result, "design", hardest(result, CONTROLS))
+def _gain_over_controls(result: Result) -> float:
+    return gain_of(result, "design", hardest_control(result, CONTROLS))
 
 
 def tables(settings: LayoutsSettings, results: Sequence[Result]) -> Sequence[Table]:
-    """Costs and gains by layout, and every cell."""
-    by_layout = grouped(results, lambda result: result.cell.values["layout"])
-    first = {who(result): _gain(result) for result in next(iter(by_layout.values()))}
-    rows = [(name, *_figures(group, first)) for name, group in by_layout.items()]
+    """Tables of costs and gains by layout, and of every cell."""
+    by_layout = group_by(results, lambda result: result.cell.values["layout"])
+    first = {cell_key(result): _gain_over_controls(result) for result in next(iter(by_layout.values()))}
+    rows = [(name, *_layout_figures(group, first)) for name, group in by_layout.items()]
     head = ("layout", "share for the design", "gain over the best control", "beside the first layout")
     head = (*head, "identified", "measured", "corner error, mm", "uncertainty holds", "ΔE00")
     about = (
@@ -199,9 +198,9 @@ def tables(settings: LayoutsSettings, results: Sequence[Result]) -> Sequence[Tab
     about += "of the worst of the piece's four; gains are over scenes, networks and seeds"
     every = [
         (
-            *who(r),
+            *cell_key(r),
             r.cell.values["layout"],
-            _gain(r),
+            _gain_over_controls(r),
             *(Record([r], thing).level()[0] for thing in ("design", *CONTROLS)),
         )
         for r in results
@@ -214,7 +213,7 @@ def tables(settings: LayoutsSettings, results: Sequence[Result]) -> Sequence[Tab
     )
 
 
-def _figures(group: Sequence[Result], first: dict) -> tuple:
+def _layout_figures(group: Sequence[Result], first: dict) -> tuple:
     status = [word for result in group for word in result.answers["status"]]
     measured = [
         {key: result.answers[key][i] for key in ("error_mm", "uncertainty_mm", "delta_e00")}
@@ -223,10 +222,10 @@ def _figures(group: Sequence[Result], first: dict) -> tuple:
         if word == "measured"
     ]
     errors = [(m["error_mm"], m["uncertainty_mm"]) for m in measured if m["error_mm"] is not None]
-    beside = [_gain(result) - first[who(result)] for result in group if who(result) in first]
+    beside = [_gain_over_controls(result) - first[cell_key(result)] for result in group if cell_key(result) in first]
     return (
         float(np.mean([result.answers["free"] for result in group])),
-        _mean_or_single([_gain(result) for result in group]),
+        _mean_or_single([_gain_over_controls(result) for result in group]),
         _mean_or_single(beside),
         rate([word != "rejected" for word in status]),
         rate([word == "measured" for word in status]),
@@ -237,12 +236,11 @@ def _figures(group: Sequence[Result], first: dict) -> tuple:
 
 
 def _mean_or_single(values: Sequence[float]) -> Estimate | float | None:
-    """The mean with its interval; a single value has none."""
     return values[0] if len(values) == 1 else mean(values)
 
 
 def figures(settings: LayoutsSettings, results: Sequence[Result]) -> Sequence[Drawing]:
-    """Recognition against measured photographs, where there are any."""
+    """A plot of gain against the share of measured photographs, if there are photographs."""
     table = tables(settings, results)[0]
     if not settings.photos:
         return []
@@ -250,7 +248,7 @@ def figures(settings: LayoutsSettings, results: Sequence[Result]) -> Sequence[Dr
     def draw(figure: Figure) -> None:
         axes = figure.subplots()
         for name, _, gain, _, _, measured, *_ in table.rows:
-            (x, x_span), (y, y_span) = _with_span(measured), _with_span(gain)
+            (x, x_span), (y, y_span) = _value_and_reach(measured), _value_and_reach(gain)
             axes.errorbar([x], [y], y_span, x_span, "o", label=name)
         axes.set_xlabel("photographs measured")
         axes.set_ylabel("gain over the best control")
@@ -259,8 +257,7 @@ def figures(settings: LayoutsSettings, results: Sequence[Result]) -> Sequence[Dr
     return (Drawing("layouts", "What layouts cost and buy", draw, (7.0, 4.5), table.about),)
 
 
-def _with_span(value: Value) -> tuple[float, list[list[float]] | None]:
-    """A figure and how far its interval reaches down and up, as matplotlib takes it."""
+def _value_and_reach(value: Value) -> tuple[float, list[list[float]] | None]:
     if isinstance(value, Estimate):
         return value.value, [[value.value - value.low], [value.high - value.value]]
     return float(value or 0), None

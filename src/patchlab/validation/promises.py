@@ -1,14 +1,14 @@
-"""Whether promised rates hold in independently rendered sessions.
+"""Check that promised rates hold in independently rendered sessions.
 
-Many runs are promised, printed, photographed by a renderer that is not ours, and verified.
+Many runs are promised, printed, photographed by another renderer, and verified.
 In: scene files, networks, printers, seeds. Out: for every combination the promised rate, and for each session of its
-photographs (one print, one place, light and camera) the counts that the promise allows for and what it shows; the share
-of intervals that held, their widths beside those of the best possible ones, and each scene's bias. Beside them the rule
-that takes photographs for independent. If asked for, sessions of views by our own renderer and the rate in many other
-places, too. A cell runs the same commands as a user does: optimize, sheet, reprint, verify.
+photographs (one print, one place, light and camera) the promise's interval of counts and the count seen; the share of
+intervals that held, their widths beside those of the best possible ones, each scene's bias, and the same for intervals
+that treat photographs as independent. Optionally sessions of views by our renderer, and the rate in many other places.
+A cell runs a user's commands: optimize, sheet, reprint, verify.
 
-Photographs are path-traced (`path_traced`), since those of our own renderer would share the promise's mistakes; with
-`path_traced = false` they are ours, and only sampling and the page in between are tested.
+Photographs are path-traced (`path_traced`), since our renderer's would share the promise's errors; with
+`path_traced = false` they are ours, which tests only sampling and the page.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 from pydantic import Field
 
-from patchlab.study.claims import mean
+from patchlab.study.estimates import mean
 from patchlab.study.grid import Names, by_scene, short_name
-from patchlab.study.record import bits, hits_of
+from patchlab.study.record import hits_text, parse_hits
 from patchlab.study.study import Cell, Result, Study
-from patchlab.validation.photographed import (
+from patchlab.validation.photo_sessions import (
     SessionsSettings,
     cells,
-    judged,
-    printed_run,
-    recorded_promise,
-    recorded_spread,
+    make_run_and_sheet,
+    promise_posterior,
+    record_promise,
     take_photos,
+    verify_photos,
 )
 from patchproof.base.errors import Refused
 from patchproof.base.intervals import rate
@@ -51,20 +51,20 @@ if TYPE_CHECKING:
     from patchproof.optimizer.run import Run
 
 
-_LEAST_SESSIONS = 20  # of which the ends of what they showed say anything
+_MIN_SESSIONS = 20  # fewest sessions for which the best width is estimated
 
 
 class PromisesSettings(SessionsSettings):
-    """As above, and views by our own renderer without paper, in places that the promise does not know."""
+    """Settings of sessions, and views by our renderer without paper, also in places that the promise does not know."""
 
     rendered: Annotated[int, Field(ge=0, le=1000)] = 0  # sessions of as many views as photographs
     elsewhere: Annotated[int, Field(ge=0, le=100_000)] = 0  # views, each in a place of its own
-    # By scene's name pictures made elsewhere, imported in place of optimized designs; scenes without any have no runs.
+    # By scene's name: pictures imported in place of optimized designs; if given, other scenes have no runs.
     pictures: dict[str, Names] = Field(default_factory=dict)
 
 
 def promise_cells(settings: PromisesSettings, base: Path) -> list[Cell]:
-    """One per combination and picture."""
+    """A cell per combination and picture."""
     optimized = cells(settings, base)
     if not settings.pictures:
         return optimized
@@ -79,108 +79,108 @@ def promise_cells(settings: PromisesSettings, base: Path) -> list[Cell]:
 
 
 def run(settings: PromisesSettings, base: Path, cell: Cell) -> dict[str, Any]:
-    """Promise and count of one combination."""
+    """Promise, photograph and verify one combination."""
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        made = printed_run(base, cell, folder)
-        report = judged(take_photos(settings, cell, made, folder), folder, base, cell, ledger_photos=0)
+        patch_run = make_run_and_sheet(base, cell, folder)
+        report = verify_photos(take_photos(settings, cell, patch_run, folder), folder, base, cell, ledger_photos=0)
     sessions = [(session.recognized, session.judged) for session in report.summary.sessions]
-    kept = recorded_promise(made) | {"sessions": sessions, "verdict": report.summary.verdict}
-    return kept | _without_paper(settings, made)
+    answers = record_promise(patch_run) | {"sessions": sessions, "verdict": report.summary.verdict}
+    return answers | _measure_views(settings, patch_run)
 
 
-def _without_paper(settings: PromisesSettings, made: Run) -> dict[str, Any]:
-    """What our own renderer's views show of the design, in sessions and elsewhere."""
+def _measure_views(settings: PromisesSettings, patch_run: Run) -> dict[str, Any]:
     if not settings.rendered and not settings.elsewhere:
         return {}
-    problem, scene, kept = set_problem(made.scene), made.scene, {}
-    show = partial(responses, problem, pictures_with_controls(problem, made.design, ()))
+    problem, scene, answers = set_problem(patch_run.scene), patch_run.scene, {}
+    show = partial(responses, problem, pictures_with_controls(problem, patch_run.design, ()))
     if settings.rendered:
         views = scene.draw("reprint", settings.rendered * settings.photos, per_session=settings.photos)
         hits = show(views)["design"].recognized[0]
-        kept["rendered"] = list(zip(*count_by_session(hits, settings.photos), strict=True))
+        answers["rendered"] = list(zip(*count_by_session(hits, settings.photos), strict=True))
     if settings.elsewhere:
-        kept["elsewhere"] = bits(show(scene.draw("evaluate", settings.elsewhere))["design"].recognized[0])
-    return kept
+        answers["elsewhere"] = hits_text(show(scene.draw("evaluate", settings.elsewhere))["design"].recognized[0])
+    return answers
 
 
 def tables(settings: PromisesSettings, results: Sequence[Result]) -> tuple[Table, ...]:
-    """Shares that held, by scene and in all; every combination; the same of views; rates elsewhere."""
+    """Tables of the share of promises that held (photographs, then views), of rates elsewhere, of every session."""
     how = "path-traced photographs" if settings.path_traced else "photographs by our own renderer"
     about = f"{settings.sessions} sessions of {settings.photos} {how} for each promise"
-    all_tables = [_shares("held", "Sessions in which promises held", about, results)]
+    all_tables = [_share_table("held", "Sessions in which promises held", about, results)]
     if settings.rendered:
         about = f"{settings.rendered} sessions of {settings.photos} views by our own renderer for each promise"
-        all_tables.append(_shares("rendered", "Sessions of views in which promises held", about, results))
+        all_tables.append(_share_table("rendered", "Sessions of views in which promises held", about, results))
     if settings.elsewhere:
-        all_tables.append(_elsewhere(settings, results))
-    return *all_tables, _each(results)
+        all_tables.append(_elsewhere_table(settings, results))
+    return *all_tables, _session_table(results)
 
 
 @dataclass(frozen=True)
-class Counted:
-    """One session of one run: what was recognized of the photographs that were judged, and its promise."""
+class JudgedSession:
+    """One session of a run: photographs recognized and judged, and the run's promise."""
 
     recognized: int
     judged: int
     rate: float
-    spread: RatePosterior
-    alone: RatePosterior  # as if every condition were drawn anew
+    posterior: RatePosterior
+    independent: RatePosterior  # as if photographs were independent
 
     @property
     def share(self) -> float:
-        """What the session shows."""
+        """The share of judged photographs that were recognized."""
         return self.recognized / self.judged
 
-    def interval(self, alone: bool = False) -> tuple[int, int]:
-        """Counts that the promise allows for, or would if photographs were independent."""
-        return self.alone.count_interval((1,) * self.judged) if alone else self.spread.count_interval((self.judged,))
+    def interval(self, independent: bool = False) -> tuple[int, int]:
+        """The promise's interval of counts, optionally as if photographs were independent."""
+        if independent:
+            return self.independent.count_interval((1,) * self.judged)
+        return self.posterior.count_interval((self.judged,))
 
-    def held(self, alone: bool = False) -> bool:
-        """Whether the count lies in that interval."""
-        low, high = self.interval(alone)
+    def held(self, independent: bool = False) -> bool:
+        """True if the count lies in that interval."""
+        low, high = self.interval(independent)
         return low <= self.recognized <= high
 
 
-def counted(result: Result, sessions: str = "sessions") -> list[Counted]:
-    """A run's sessions, or those of "rendered" views, in which anything could be judged."""
-    hits = hits_of(result.answers["promised"])
-    about = sum(hits) / len(hits), recorded_spread(result), rate_posterior(*count_by_session(hits, 1))
-    return [Counted(recognized, judged, *about) for recognized, judged in result.answers[sessions] if judged]
+def count_sessions(result: Result, sessions: str = "sessions") -> list[JudgedSession]:
+    """A run's sessions of photographs, or of "rendered" views, that have judged photographs."""
+    hits = parse_hits(result.answers["promised"])
+    about = sum(hits) / len(hits), promise_posterior(result), rate_posterior(*count_by_session(hits, 1))
+    return [JudgedSession(recognized, judged, *about) for recognized, judged in result.answers[sessions] if judged]
 
 
-def _width(sessions: Sequence[Counted], alone: bool = False) -> float:
-    """The median width of the intervals, as a share of the photographs."""
-    return float(np.median([np.ptp(session.interval(alone)) / session.judged for session in sessions]))
+def _median_width(sessions: Sequence[JudgedSession], independent: bool = False) -> float:
+    return float(np.median([np.ptp(session.interval(independent)) / session.judged for session in sessions]))
 
 
-def _best_width(sessions: Sequence[Counted]) -> float | None:
-    """Between the 2.5 and 97.5 % points of what sessions showed beside their promise: who knew how much sessions really
-    differ could not promise less. None of too few sessions to say.
+def _best_width(sessions: Sequence[JudgedSession]) -> float | None:
+    """The distance between the 2.5 and 97.5 % points of shown minus promised rates: the narrowest intervals that hold
+    for these sessions. None for too few sessions.
     """
-    if len(sessions) < _LEAST_SESSIONS:
+    if len(sessions) < _MIN_SESSIONS:
         return None
     low, high = np.quantile([session.share - session.rate for session in sessions], (TAIL, 1 - TAIL))
     return float(high - low)
 
 
-def _shares(name: str, title: str, about: str, results: Sequence[Result]) -> Table:
+def _share_table(name: str, title: str, about: str, results: Sequence[Result]) -> Table:
     kind = "rendered" if name == "rendered" else "sessions"
     rows = []
     for scene, group in (by_scene(results) | {"all": list(results)}).items():
-        by_run = [own for result in group if (own := counted(result, kind))]
-        sessions = [session for own in by_run for session in own]
+        by_run = [some for result in group if (some := count_sessions(result, kind))]
+        sessions = [session for some in by_run for session in some]
         if not sessions:
             continue
         rows.append(
             (
                 scene,
                 rate([session.held() for session in sessions]),
-                _width(sessions),
+                _median_width(sessions),
                 _best_width(sessions),
-                rate([session.held(alone=True) for session in sessions]),
-                _width(sessions, alone=True),
-                mean([float(np.mean([session.share - session.rate for session in own])) for own in by_run]),
+                rate([session.held(independent=True) for session in sessions]),
+                _median_width(sessions, independent=True),
+                mean([float(np.mean([session.share - session.rate for session in some])) for some in by_run]),
             )
         )
     about = (
@@ -191,25 +191,25 @@ def _shares(name: str, title: str, about: str, results: Sequence[Result]) -> Tab
     return Table(name, title, head, tuple(rows), about)
 
 
-def _each(results: Sequence[Result]) -> Table:
+def _session_table(results: Sequence[Result]) -> Table:
     head = ("scene", "network", "printer", "seed", "design", "session", "promised", "correlation")
     head = (*head, "judged", "recognized", "low", "high", "held", "verdict")
     rows = []
     for result in results:
         values, printer = result.cell.values, short_name(result.cell.values["scene"]["printer"]["profile"])
-        for number, session in enumerate(counted(result), 1):
+        for number, session in enumerate(count_sessions(result), 1):
             design = short_name(f"/{values['picture']}") if "picture" in values else "own"
             start = (values["name"], values["network"], printer, values["seed"], design, number)
-            what = (session.rate, session.spread.correlation[0], session.judged, session.recognized)
+            what = (session.rate, session.posterior.correlation[0], session.judged, session.recognized)
             rows.append((*start, *what, *session.interval(), session.held(), result.answers["verdict"]))
     return Table("promises", "Every session", head, tuple(rows), "the verdict is that of all sessions of the run")
 
 
-def _elsewhere(settings: PromisesSettings, results: Sequence[Result]) -> Table:
+def _elsewhere_table(settings: PromisesSettings, results: Sequence[Result]) -> Table:
     rows = []
     for result in results:
-        values, (low, high) = result.cell.values, recorded_spread(result).rate_interval
-        shown, promised = rate(hits_of(result.answers["elsewhere"])), hits_of(result.answers["promised"])
+        values, (low, high) = result.cell.values, promise_posterior(result).rate_interval
+        shown, promised = rate(parse_hits(result.answers["elsewhere"])), parse_hits(result.answers["promised"])
         within = shown is not None and low <= shown.value <= high
         about = (values["name"], values["network"], values["seed"])
         rows.append((*about, sum(promised) / len(promised), low, high, shown, within))
@@ -219,13 +219,13 @@ def _elsewhere(settings: PromisesSettings, results: Sequence[Result]) -> Table:
 
 
 def figures(settings: PromisesSettings, results: Sequence[Result]) -> tuple[Drawing, ...]:
-    """The calibration plot."""
+    """A plot of the share recognized in each session against the promised rate."""
 
     def draw(figure: Figure) -> None:
         axes = figure.subplots()
         axes.plot([0, 1], [0, 1], color="0.6", linewidth=1)
         for name, group in by_scene(results).items():
-            sessions = [session for result in group for session in counted(result)]
+            sessions = [session for result in group for session in count_sessions(result)]
             if not sessions:
                 continue
             promised = [session.rate for session in sessions]

@@ -1,9 +1,9 @@
-"""How often photographs get which verdict, at true rates from the promised one downwards.
+"""Compute the chances of each verdict at true rates from the promised one downwards.
 
-In: a promised rate, correlations within a session, ways to spread photographs over sessions. Out: the chances of
-`kept`, `broken` and `cannot_tell` by correlation, way and true rate: what the rule of `evidence.verdict` is worth.
-Nothing is rendered. A promise is drawn with as many sessions as a real one has and judged as a real one is; the counts'
-chances at a true rate are exact, and figures are means over promises.
+In: a promised rate, correlations within a session, numbers of sessions that photographs are spread over. Out: the
+chances of `kept`, `broken` and `cannot_tell` by correlation, sessions and true rate, which tell the power of the rule
+in `evidence.verdict`. Nothing is rendered. Promises are drawn with as many sessions as real ones and judged like them;
+the counts' chances at a true rate are exact, and figures are means over promises.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 from pydantic import Field
 
-from patchlab.study.grid import Count
+from patchlab.study.grid import PositiveInt
 from patchlab.study.study import Cell, Result, Study
 from patchproof.base.goal import Goal
 from patchproof.base.sessions import RatePosterior, split_evenly
@@ -28,49 +28,54 @@ from patchproof.sheets.manifest import ConditionClaim, ControlClaim, ModelClaim,
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_WORDS = ("kept", "cannot_tell", "broken")
-_STEPS = 26  # of true rates in the figure
+_VERDICTS = ("kept", "cannot_tell", "broken")
+_PLOTTED_RATES = 26  # of true rates in the figure
 
 
 class VerdictsSettings(StrictModel):
-    """One promise as it might be made, and photographs as they might be taken."""
+    """A promise that might be made, and photographs that might be taken."""
 
-    rate: Share = 0.85  # that is promised
+    rate: Share = 0.85  # promised rate
     control: Share = 0.3  # the best control's rate
-    # of two photographs of one session
+    # correlation of two photographs of one session
     correlations: Annotated[tuple[Annotated[Positive, Field(le=0.9)], ...], Field(min_length=1)] = (0.02, 0.05, 0.1)
-    photos: Count = 40  # of the print, in all
-    sessions: Annotated[tuple[Count, ...], Field(min_length=1)] = (1, 2, 4, 8)  # that the photographs are spread over
+    photos: PositiveInt = 40  # photographs of the print, in all
+    sessions: Annotated[tuple[PositiveInt, ...], Field(min_length=1)] = (
+        1,
+        2,
+        4,
+        8,
+    )  # numbers of sessions that photographs are spread over
     below: tuple[Share, ...] = (0.0, 0.1, 0.15, 0.2)  # how far true rates lie under the promised one
-    promises: Count = 20  # drawn for each correlation
+    promises: PositiveInt = 20  # promises drawn for each correlation
 
 
 def cells(settings: VerdictsSettings, base: Path) -> list[Cell]:
-    """One per correlation."""
+    """A cell per correlation."""
     return [Cell(f"correlation={value:g}", {"correlation": value}) for value in settings.correlations]
 
 
 def run(settings: VerdictsSettings, base: Path, cell: Cell) -> dict[str, Any]:
-    """The share of promises that give each count each word, by number of sessions."""
+    """By number of sessions: for each count, the share of promises with each verdict."""
     rng, words = np.random.default_rng(0), {}
-    promises = [_promise(settings, cell.values["correlation"], rng) for _ in range(settings.promises)]
+    promises = [_draw_promise(settings, cell.values["correlation"], rng) for _ in range(settings.promises)]
     for sessions in settings.sessions:
         parts = split_evenly(settings.photos, sessions)
         rows = [[judge(k, parts, promise).verdict for k in range(settings.photos + 1)] for promise in promises]
         words[str(sessions)] = [
-            [float(np.mean([word == each for each in of_count])) for word in _WORDS]
+            [float(np.mean([word == each for each in of_count])) for word in _VERDICTS]
             for of_count in zip(*rows, strict=True)
         ]
     return words
 
 
-def _promise(settings: VerdictsSettings, correlation: float, rng: np.random.Generator) -> Promise:
+def _draw_promise(settings: VerdictsSettings, correlation: float, rng: np.random.Generator) -> Promise:
     strength = 1 / correlation - 1
     sessions = PROMISE_VIEWS // VIEWS_PER_SESSION
-    own = rng.beta(settings.rate * strength, (1 - settings.rate) * strength, (sessions, 1))
-    hits = (rng.random((sessions, VIEWS_PER_SESSION)) < own).ravel()
+    rates = rng.beta(settings.rate * strength, (1 - settings.rate) * strength, (sessions, 1))
+    hits = (rng.random((sessions, VIEWS_PER_SESSION)) < rates).ravel()
     rate, whole = float(hits.mean()), (0.0, 1.0)
-    beside = ControlClaim(
+    control = ControlClaim(
         n=len(hits), rate=settings.control, interval=whole, confidence=0, difference=0, difference_interval=(-1, 1)
     )
     unknown = dict.fromkeys(("px_per_mm", "tilt_deg", "azimuth_deg", "contrast", "blur_px"))
@@ -81,19 +86,18 @@ def _promise(settings: VerdictsSettings, correlation: float, rng: np.random.Gene
         interval=whole,
         n=len(hits),
         per_session=VIEWS_PER_SESSION,
-        controls={"bare": beside},
+        controls={"bare": control},
         conditions=tuple(ConditionClaim(recognized=bool(hit), **unknown) for hit in hits),
     )
 
 
 def _chances(settings: VerdictsSettings, result: Result, sessions: int, rate: float) -> np.ndarray:
-    """The chance of each of `_WORDS` at a true rate."""
-    at = RatePosterior(np.array([rate]), np.array([result.cell.values["correlation"]]), np.ones(1))
-    return at.chances(split_evenly(settings.photos, sessions)) @ np.array(result.answers[str(sessions)])
+    posterior = RatePosterior(np.array([rate]), np.array([result.cell.values["correlation"]]), np.ones(1))
+    return posterior.chances(split_evenly(settings.photos, sessions)) @ np.array(result.answers[str(sessions)])
 
 
 def tables(settings: VerdictsSettings, results: Sequence[Result]) -> tuple[Table, ...]:
-    """Every correlation, way and true rate."""
+    """The chances by correlation, number of sessions and true rate."""
     rows = tuple(
         (result.cell.values["correlation"], sessions, rate, *map(float, _chances(settings, result, sessions, rate)))
         for result in results
@@ -104,15 +108,17 @@ def tables(settings: VerdictsSettings, results: Sequence[Result]) -> tuple[Table
         f"{settings.photos} photographs, {settings.rate:.0%} promised, the best control at {settings.control:.0%}; "
         f"means over {settings.promises} promises"
     )
-    return (Table("verdicts", "Chances of verdicts", ("correlation", "sessions", "true rate", *_WORDS), rows, about),)
+    return (
+        Table("verdicts", "Chances of verdicts", ("correlation", "sessions", "true rate", *_VERDICTS), rows, about),
+    )
 
 
 def figures(settings: VerdictsSettings, results: Sequence[Result]) -> tuple[Drawing, ...]:
-    """The chance of `kept` by true rate, a panel for each correlation."""
+    """A plot of the chance of `kept` by true rate, a panel for each correlation."""
 
     def draw(figure: Figure) -> None:
         panels = figure.subplots(1, len(results), sharey=True, squeeze=False)[0]
-        rates = np.linspace(max(0.01, settings.rate - 0.4), min(0.99, settings.rate + 0.12), _STEPS)
+        rates = np.linspace(max(0.01, settings.rate - 0.4), min(0.99, settings.rate + 0.12), _PLOTTED_RATES)
         for axes, result in zip(panels, results, strict=True):
             for sessions in settings.sessions:
                 kept = [_chances(settings, result, sessions, float(rate))[0] for rate in rates]

@@ -1,4 +1,4 @@
-"""The same pictures, gradients and answers on a GPU as on a CPU, and how fast they come.
+"""Compare pictures, gradients and answers of a GPU with those of a CPU, and their speed.
 
 In: scene files. Out: `cuda.csv`, by scene and quantity a value for each device: of 8 training views the largest
 difference of a pixel and the relative difference of the gradient at one design; of a run of 60 steps its seconds, its

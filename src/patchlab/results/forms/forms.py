@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from patchlab.training.card import exported
+from patchlab.training.card import export_onnx
 from patchproof.classifier.builtin import INPUT_PX, load_builtin
 from patchproof.classifier.custom import classifier_of
 from patchproof.classifier.network import Classifier
@@ -24,7 +24,7 @@ def network() -> Classifier:
 def main() -> None:
     """Write the file and its card into the working folder."""
     builtin = load_builtin()
-    exported(builtin.network, Path("builtin.onnx"), INPUT_PX)
+    export_onnx(builtin.network, Path("builtin.onnx"), INPUT_PX)
     card = json.dumps({"input_px": INPUT_PX, "labels": list(builtin.labels)})
     Path("builtin.json").write_text(card, encoding="utf-8")
 

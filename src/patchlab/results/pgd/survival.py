@@ -1,4 +1,4 @@
-"""What hardened pictures must meet to survive PGD: one thing changed at a time.
+"""Test the survival of hardened pictures under PGD, with one setting changed at a time.
 
     python src/patchlab/results/pgd/survival.py NAME NETWORK DIR...  measures, into src/patchlab/results/pgd/NAME.json
     python src/patchlab/results/pgd/survival.py draw                 draws src/patchlab/results/pgd.png from all of them
@@ -22,8 +22,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from patchlab.harden.attacks import cross_entropy, even_loss, margin, right
-from patchlab.harden.harden import harden, squares
+from patchlab.harden.attacks import balanced_loss, cross_entropy, is_correct, margin
+from patchlab.harden.hardening import center_squares, harden
 from patchproof.base.intervals import wilson
 from patchproof.base.validation import expand_path
 from patchproof.classifier.labels import find_labels
@@ -47,12 +47,12 @@ class Before:
     def right(self, pictures: Tensor) -> Tensor:
         """N bool."""
         with torch.no_grad():
-            return right(self.network(pictures), self.labels)
+            return is_correct(self.network(pictures), self.labels)
 
     def scaled(self, loss, x: Tensor, labels: Tensor) -> Tensor:
         """The gradient as ours: from float64 logits, scaled before it goes back."""
         x = x.detach().requires_grad_(True)
-        return torch.autograd.grad(even_loss([self.network(x)], [labels], loss), x)[0]
+        return torch.autograd.grad(balanced_loss([self.network(x)], [labels], loss), x)[0]
 
     def plain(self, of_logits, x: Tensor, labels: Tensor) -> Tensor:
         """The gradient as torch gives it in float32."""
@@ -101,7 +101,7 @@ def measured(name: str, folders: list[Path]) -> dict:
     rows = [(folder, row) for folder in folders for row in csv.DictReader((folder / "labels.csv").open())]
     words = [row["label"] for _, row in rows]
     labels = [find_labels(classifier.labels, int(w) if w.isdigit() else w)[0] for w in words]
-    views = squares([read_photo(folder / row["file"]).srgb for folder, row in rows], classifier)
+    views = center_squares([read_photo(folder / row["file"]).srgb for folder, row in rows], classifier)
     start = (views.clamp(0, 1) * 255).round() / 255
     before = Before(classifier.network, torch.tensor(labels))
     ours, at_margin = (partial(before.scaled, loss) for loss in (cross_entropy, margin))
@@ -109,7 +109,9 @@ def measured(name: str, folders: list[Path]) -> dict:
 
     def hardened(pictures: Tensor, epsilon: float, method="pgd", steps=STEPS, through=None) -> Tensor:
         photos = list((pictures * 255).round().byte().permute(0, 2, 3, 1).numpy())
-        return squares(harden(photos, [labels], [classifier], method, epsilon, steps, through=through), classifier)
+        return center_squares(
+            harden(photos, [labels], [classifier], method, epsilon, steps, through=through), classifier
+        )
 
     def keep(table: str, key: str, alive: Tensor, pictures: Tensor | None = None) -> None:
         kept = {"hits": "".join("01"[int(hit)] for hit in alive)}

@@ -1,4 +1,4 @@
-"""What networks in half precision change in a promise: what it takes, and what is answered.
+"""Compare promises by networks in half precision with those in float32: time and answers.
 
 In: scene files. Out: `half.csv`, by scene and thing shown (a design, and the bare object in half of its views): answers
 in bfloat16 (`torch.autocast`) beside those in float32 under the same conditions, as mean and root mean square of the
@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 import patchproof as pp
-from patchlab.bench.measure import clocked, in_turn
+from patchlab.bench.measure import call_in_turn, time_call
 from patchlab.results.rows import write_rows
 from patchproof.base.workers import keep_freed_memory
 from patchproof.classifier.network import Classifier
@@ -35,7 +35,7 @@ asked = Classifier._call_network
 
 
 def rounded(self, squares, windows):
-    """What a network says in half precision."""
+    """A network's answers in half precision."""
     with torch.autocast("cpu", dtype=torch.bfloat16):
         return asked(self, squares, windows).float()
 
@@ -48,11 +48,11 @@ def measured(path: str) -> list[dict]:
     control_mask = _control_mask(PROMISE_VIEWS, VIEWS_PER_SESSION)
 
     def told(way):
-        Classifier._call_network = way
-        return clocked(lambda: responses(problem, shown, conditions, control_mask=control_mask))
+        Classifier._asked = way
+        return time_call(lambda: responses(problem, shown, conditions, control_mask=control_mask))
 
-    rounds, rows = in_turn({way: partial(told, way) for way in (asked, rounded)}, ROUNDS), []
-    Classifier._call_network, (wholes, halves) = asked, rounds.values()
+    rounds, rows = call_in_turn({way: partial(told, way) for way in (asked, rounded)}, ROUNDS), []
+    Classifier._asked, (wholes, halves) = asked, rounds.values()
     share = statistics.median(half_ms / ms for (_, ms), (_, half_ms) in zip(wholes, halves, strict=True))
     for thing in ("design", "bare"):
         whole, half = wholes[-1][0][thing], halves[-1][0][thing]

@@ -1,4 +1,4 @@
-"""What a photograph of 12 megapixels takes to be read and measured, by the code of several checkouts in turn.
+"""Time reading and measuring photographs of 12 megapixels, with the code of several checkouts in turn.
 
 In: `photos.toml`, and `src` folders of checkouts (git worktree add). Out: `photos.csv`: by checkout, round and
 photograph milliseconds of processor time, from the file to figures and the networks' squares, without the networks and
@@ -11,7 +11,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import patchproof as pp
-from patchlab.bench.measure import said_by
+from patchlab.bench.measure import run_in_checkout
 from patchlab.results.rows import write_rows
 
 TIMED = """
@@ -46,7 +46,7 @@ print(json.dumps(rows[len(items):]))  # the first time warms up
 
 def measured(source: Path, number: int, folder: str) -> list[dict]:
     """Lines of the table."""
-    commit, rows = said_by(source, TIMED, folder)
+    commit, rows = run_in_checkout(source, TIMED, folder)
     return [{"commit": commit, "round": number} | row for row in rows]
 
 

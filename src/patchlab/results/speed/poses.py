@@ -1,4 +1,4 @@
-"""What it costs a design that a run's poses come round again, each time in other light: no pose twice, the run's own
+"""Compare designs trained on poses that repeat, each time in other light: no pose twice, the run's own
 240 poses before other backgrounds each time, and 240 poses each of which keeps its background.
 
 In: three objects of `bench effort`. Out: `poses.csv`: by object and seed the mean loss and the rate of each design,
@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 import patchproof as pp
-from patchlab.bench.effort import _scene
+from patchlab.bench.effort import object_scene
 from patchlab.results.rows import write_rows
 from patchproof.base.workers import keep_freed_memory
 from patchproof.optimizer.loop import start, take_step
@@ -25,7 +25,7 @@ LABELS, SEEDS, JUDGED = ("box truck", "chair", "mailbox"), range(6), 300
 
 def measured(label: str, seed: int) -> dict:
     """A line of the table."""
-    scene = pp.make_scene(_scene(label, 240).settings.changed(optimize={"seed": seed}))
+    scene = pp.make_scene(object_scene(label, 240).settings.changed(optimize={"seed": seed}))
     problem, drawn, again = set_problem(scene), scene.draw("train", 960), training_conditions(scene)
     kept = replace(again, pose=replace(again.pose, background=drawn.pose.background[np.arange(960) % 240]))
     shown = {}

@@ -1,4 +1,4 @@
-"""What trying a design on the selection set twice as often as a run does would change.
+"""Try designs on the selection set twice as often as a run does, and compare the designs kept.
 
 In: three objects of `bench effort`, to be recognized, and two of them not to be, and by signed steps. Out:
 `selections.csv`: by run the loss on the selection set after every 120 of 960 views, after how many the best of these
@@ -9,7 +9,7 @@ in this folder: python selections.py
 import numpy as np
 
 import patchproof as pp
-from patchlab.bench.effort import _scene
+from patchlab.bench.effort import object_scene
 from patchlab.results.rows import write_rows
 from patchproof.base.workers import keep_freed_memory
 from patchproof.optimizer import loop
@@ -30,7 +30,7 @@ RUNS += [
 def measured(goal: str, optimizer: str, label: str, seed: int) -> dict:
     """A line of the table."""
     changed = {"optimize": {"seed": seed, "optimizer": optimizer}, "target": {"goal": goal}}
-    scene = pp.make_scene(_scene(label, 240).settings.changed(**changed))
+    scene = pp.make_scene(object_scene(label, 240).settings.changed(**changed))
     problem = set_problem(scene, jobs=2)
     tried = [step for step in loop.steps(problem) if step.select_loss is not None]
     losses = [step.select_loss for step in tried]

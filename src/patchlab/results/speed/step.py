@@ -17,7 +17,7 @@ import torch
 from torch import nn
 
 import patchproof as pp
-from patchlab.bench.measure import clocked, in_turn
+from patchlab.bench.measure import call_in_turn, time_call
 from patchlab.results.rows import write_rows
 from patchproof.base.workers import keep_freed_memory
 from patchproof.optimizer import loop, training_views
@@ -58,14 +58,14 @@ def resnet50() -> pp.Classifier:
 
 
 def pass_ms(problem, pictures, indices) -> float:
-    """Of one forward and backward pass of the network, each picture's loss to its pixels."""
+    """Milliseconds of a forward and backward pass of the network, each picture's loss to its pixels."""
     leaf, (classifier,) = pictures.clone().requires_grad_(), problem.classifiers
 
     def work():
         loss = problem.losses(classifier, classifier.logits(leaf), indices).mean()
         torch.autograd.grad(loss, leaf)
 
-    return clocked(work, perf_counter)[1]
+    return time_call(work, perf_counter)[1]
 
 
 def measured(name: str, scene: str, processes: int) -> dict:
@@ -85,12 +85,12 @@ def measured(name: str, scene: str, processes: int) -> dict:
 
     def steps() -> float:
         torch.set_num_threads(1)
-        timed = [clocked(partial(next, running), perf_counter) for _ in range(STEPS)]
+        timed = [time_call(partial(next, running), perf_counter) for _ in range(STEPS)]
         return statistics.mean(
             ms for step, ms in timed if not loop.is_selection_step(scene.settings.optimize, step.state.number)
         )
 
-    rounds = in_turn({"pass": passes, "step": steps}, ROUNDS - 1)
+    rounds = call_in_turn({"pass": passes, "step": steps}, ROUNDS - 1)
     running.close()
     parts = {name: (statistics.mean(ms[: NEW - 1]), statistics.mean(ms[NEW - 1 :])) for name, ms in rounds.items()}
     own_ms, step_ms = ((new + 3 * again) / 4 for new, again in parts.values())

@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from patchlab.bench.measure import said_by
+from patchlab.bench.measure import run_in_checkout
 from patchlab.results.rows import write_rows
 
 RUN = """
@@ -39,7 +39,7 @@ print(json.dumps(parts | {"rate": run.promise.rate, "low": low, "high": high, "v
 def measured(source: Path, number: int, scene: str) -> dict:
     """A line of the table."""
     with TemporaryDirectory() as folder:
-        commit, values = said_by(source, RUN, folder, scene)
+        commit, values = run_in_checkout(source, RUN, folder, scene)
     return {"commit": commit, "round": number} | {name: round(v, 4) for name, v in values.items()}
 
 

@@ -15,7 +15,7 @@ from time import perf_counter
 import numpy as np
 import torch
 
-from patchlab.bench.measure import clocked, in_turn
+from patchlab.bench.measure import call_in_turn, time_call
 from patchlab.results.rows import write_rows
 from patchproof.base.workers import keep_freed_memory
 from patchproof.classifier import load_classifier
@@ -27,7 +27,7 @@ ROUNDS = 30
 
 
 def gradient(network, photos, windows):
-    """Of a weighted sum of the answers, at the pictures."""
+    """The gradient of a weighted sum of the answers at the pictures."""
     leaf = photos.clone().requires_grad_()
     answers = network(leaf, windows)
     weights = torch.linspace(-1, 1, answers.numel()).view(answers.shape)
@@ -36,8 +36,8 @@ def gradient(network, photos, windows):
 
 def in_turn_ms(whole, some):
     """(what both calls return in each round, their median milliseconds)."""
-    calls = {call: partial(clocked, call, perf_counter) for call in (whole, some)}
-    answers, times = zip(*(zip(*each, strict=True) for each in in_turn(calls, ROUNDS).values()), strict=True)
+    calls = {call: partial(time_call, call, perf_counter) for call in (whole, some)}
+    answers, times = zip(*(zip(*each, strict=True) for each in call_in_turn(calls, ROUNDS).values()), strict=True)
     return list(zip(*answers, strict=True)), [statistics.median(ms) for ms in times]
 
 
@@ -49,13 +49,13 @@ def placed(size: int, share: float, count: int) -> np.ndarray:
 
 
 def parts(photos, windows):
-    """What each picture shows in its window."""
+    """The window of each picture."""
     edges = windows.tolist()
     return [one[:, top:bottom, left:right] for one, (left, top, right, bottom) in zip(photos, edges, strict=True)]
 
 
 def asked_for_gradients(network, size: int, share: float) -> dict:
-    """Of two pictures, in the windows only and of all of them."""
+    """Compare gradients of two pictures in their windows with whole gradients."""
     windows, photos = placed(size, share, 2), torch.rand(2, 3, size, size)
     calls = (partial(gradient, network, photos, w) for w in (None, Windows(windows)))
     ((whole, some), *_), (whole_ms, windows_ms) = in_turn_ms(*calls)

@@ -1,4 +1,4 @@
-"""What outlines cost: photographs of the bare object, its outlines jagged and smooth, beside 3×3 samples to a pixel.
+"""Compare ways to draw outlines: the bare object with jagged and smooth outlines, beside 3×3 samples to a pixel.
 
 In: scene files of `../promises`. Out: a line of `edges.csv` per scene: confidence less that of the samples, means over
 the conditions with 95 % intervals (Student's). Run in this folder: python edges.py suv pickup light postbox mug carton

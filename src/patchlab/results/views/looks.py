@@ -1,4 +1,4 @@
-"""What views of other sizes, whose pixels look at textures otherwise, would show less what full photographs do.
+"""Compare views of other sizes and texture sampling with full photographs.
 
 In: scene files. Out: lines of `looks.csv`, by scene, size (times the network's), width of a pixel that textures are
 averaged over, taps and what is shown: means over conditions that `views.py` does not judge by, with 95 % intervals

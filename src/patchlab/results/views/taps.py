@@ -1,4 +1,4 @@
-"""What fewer taps at a piece change in the views that figures come from.
+"""Compare views with fewer texture taps at a piece with those of photographs' taps.
 
 In: scene files. Out: `taps.csv`, by scene and taps along a pixel's shorter side: confidences of 200 views of a
 design less those with as many taps as photographs have, as mean and root mean square, and views that change sides. One

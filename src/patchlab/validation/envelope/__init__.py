@@ -1,1 +1,1 @@
-"""Where each stage of one run's patch stops working."""
+"""The operating envelope of a run's patch: where each stage stops working."""

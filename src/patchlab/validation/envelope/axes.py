@@ -1,8 +1,8 @@
-"""What an operating envelope varies: tilt, distance, light, camera, paper and print, one number each.
+"""Axes of an operating envelope: tilt, distance, light, camera, paper and print, one number each.
 
-In: a scene. Out: `AXES`: for every axis its unit, the sweep from an easy to a hard end that suits the scene, and what a
-value does to drawn conditions (`conditions_at`) or to where the piece lies (`placed_at`). What an axis does not name
-stays as it was drawn, so that the points of a sweep differ in nothing else.
+In: a scene. Out: `AXES`: for every axis its unit and the sweep from an easy to a hard end that suits the scene; drawn
+conditions (`conditions_at`) and the scene (`scene_at`) at a point. Everything that a point does not name stays as
+drawn, so that points of a sweep differ in nothing else.
 """
 
 from __future__ import annotations
@@ -17,24 +17,24 @@ from patchproof.scene.conditions import Conditions, with_values
 from patchproof.scene.interface import Scene
 from patchproof.scene.patch_scene import require_patch
 
-Point = Mapping[str, float]
-"""Values by axis; what is not named is as drawn, or as the run has it."""
+SweepPoint = Mapping[str, float]
+"""Values by axis; all others are as drawn, or as the run has them."""
 
-Ends = Callable[[Scene], tuple[float, float]]
+AxisEnds = Callable[[Scene], tuple[float, float]]
 
 
 @dataclass(frozen=True)
 class Axis:
-    """One thing that is made harder: `ends` are (easy, hard); `ratio` steps multiply instead of adding."""
+    """One quantity from easy to hard: `ends` are (easy, hard); steps multiply if `ratio`, else they add."""
 
     title: str
     unit: str
-    ends: Ends
+    ends: AxisEnds
     ratio: bool = False
     needs_mesh: bool = True
 
     def values(self, easy: float, hard: float, points: int) -> np.ndarray:
-        """Evenly spaced values from easy to hard."""
+        """Evenly spaced values from easy to hard, geometrically if `ratio`."""
         return np.geomspace(easy, hard, points) if self.ratio else np.linspace(easy, hard, points)
 
     def value(self, easy: float, hard: float, position: float) -> float:
@@ -43,7 +43,7 @@ class Axis:
 
 
 def _distances(scene: Scene) -> tuple[float, float]:
-    """From the scene's closest to where a marker's module is two thirds of a pixel."""
+    """From the scene's nearest distance to where a marker's module is two thirds of a pixel."""
     patch, nearest = require_patch(scene), scene.settings.view.distance_mm[0]
     far = 1.5 * patch.focal_px * patch.piece.module_mm
     return nearest, max(far, 2 * nearest)
@@ -69,7 +69,7 @@ AXES: dict[str, Axis] = {
         needs_mesh=False,
     ),
     "darkness": Axis("darkness", "stops under", lambda scene: (0.0, 9.0), needs_mesh=False),
-    # a network that reduces photographs sees through noise as strong as white: of the demo's truck 16 leaves nothing
+    # noise as strong as white still leaves an answer, since networks downscale photographs; 16 hides the demo's truck
     "noise": Axis("noise", "of white", lambda scene: (0.02, 16.0), ratio=True, needs_mesh=False),
     "jpeg": Axis("JPEG", "quality", lambda scene: (95.0, 1.0), ratio=True, needs_mesh=False),
     "hidden": Axis("hidden corners", "quarters", lambda scene: (0.0, 4.0), needs_mesh=False),
@@ -78,9 +78,9 @@ AXES: dict[str, Axis] = {
     "mismatch": Axis("print mismatch", "× other printer", lambda scene: (0.0, 6.0), needs_mesh=False),
     "size": Axis("patch size", "× its own", lambda scene: (1.0, 0.1), ratio=True),
 }
-# Axes that move the camera or the paper: views of other values have to be rasterized anew.
-GEOMETRY = ("tilt", "distance", "curl", "gap", "size")
-MAPS = (
+# Axes that move the camera or the paper: views of other values have to be rasterized again.
+GEOMETRY_AXES = ("tilt", "distance", "curl", "gap", "size")
+DEFAULT_MAPS = (
     ("tilt", "distance"),
     ("blur", "darkness"),
     ("hidden", "size"),
@@ -90,30 +90,30 @@ MAPS = (
 )
 
 
-def possible(scene: Scene, name: str) -> bool:
-    """Whether this scene can be photographed at other values of the axis."""
+def is_possible(scene: Scene, name: str) -> bool:
+    """True if this scene can be photographed at other values of the axis."""
     if not scene.HAS_OBJECT:
         return not AXES[name].needs_mesh
     return name != "curl" or require_patch(scene).placement.is_flat
 
 
-def conditions_at(scene: Scene, conditions: Conditions, point: Point) -> Conditions:
-    """`conditions` with what the point says about camera and light."""
+def conditions_at(scene: Scene, conditions: Conditions, point: SweepPoint) -> Conditions:
+    """Conditions with camera and light at the point."""
     for axis, value in point.items():
         if axis == "tilt":
-            conditions = _tilted(conditions, value)
+            conditions = _tilt_cameras(conditions, value)
         elif axis == "darkness":
             conditions = with_values(conditions, exposure_ev=-value)
-        elif axis in _FIELDS:
-            conditions = with_values(conditions, **{_FIELDS[axis]: value})
+        elif axis in _FIELD_OF_AXIS:
+            conditions = with_values(conditions, **{_FIELD_OF_AXIS[axis]: value})
     return conditions
 
 
-_FIELDS = {"distance": "distance_mm", "blur": "blur_px", "noise": "noise", "jpeg": "jpeg"}
+_FIELD_OF_AXIS = {"distance": "distance_mm", "blur": "blur_px", "noise": "noise", "jpeg": "jpeg"}
 
 
-def placed_at(scene: Scene, point: Point) -> Scene:
-    """The scene with its piece printed smaller, standing off, or curled."""
+def scene_at(scene: Scene, point: SweepPoint) -> Scene:
+    """The scene with its piece printed smaller, moved off the surface, or curled, as the point says."""
     if not {"size", "curl", "gap"} & point.keys():
         return scene
     size = point.get("size", 1.0)
@@ -128,8 +128,8 @@ def placed_at(scene: Scene, point: Point) -> Scene:
     return replace(scene, placement=placement)
 
 
-def _tilted(conditions: Conditions, tilt_deg: float) -> Conditions:
-    """The cameras moved to this angle from straight before the side, each towards where it stood."""
+def _tilt_cameras(conditions: Conditions, tilt_deg: float) -> Conditions:
+    """Move each camera to this angle off the side's axis, in its former direction."""
     azimuth, elevation = np.radians(conditions.pose.azimuth_deg), np.radians(conditions.pose.elevation_deg)
     right, up = np.cos(elevation) * np.sin(azimuth), np.sin(elevation)
     toward = np.arctan2(up, right)

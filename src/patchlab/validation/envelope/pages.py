@@ -1,8 +1,8 @@
-"""Tables and figures of an operating envelope: breaking points, every point of every sweep, what was said beyond, maps.
+"""Tables and figures of an operating envelope: breaking points, points of sweeps, codes beyond them, maps.
 
-In: finished cells. Out: tables, and drawings of which the first is one page to print beside the patch. Breaking points
-come as values of their axis; one outside of the sweep is said to hold, and an interval that ends at the sweep's own end
-is open there. A design breaks where it stops gaining over its controls, whatever label the network answers beyond.
+In: finished cells. Out: tables, and a page to print beside the patch. Breaking points are values of their axis; one
+beyond the sweep is called “holds”, and an interval that ends at the sweep's end is open there. A design breaks where it
+stops gaining over its controls, whatever label the network gives beyond.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from patchlab.study.figures import EMPTY, number_grid
+from patchlab.study.figures import EMPTY_COLOR, number_grid
 from patchlab.validation.envelope.axes import AXES
-from patchlab.validation.envelope.fit import BEYOND, LEAST_LOST, NOT_MONOTONE
-from patchlab.validation.envelope.gains import CONTROLS, gains_of, has_effect
+from patchlab.validation.envelope.fit import BEYOND_SWEEP, MAX_P_NOT_MONOTONE, MIN_LOST_SHARE
+from patchlab.validation.envelope.gains import CONTROLS, gains_over_controls, has_effect
 from patchproof.base.goal import Goal
 from patchproof.base.intervals import Estimate, rate
 from patchproof.report.tables import Drawing, Table, Value
@@ -30,16 +30,16 @@ if TYPE_CHECKING:
 
 STAGES = {"gains": "design gains", "found": "sheet found", "measured": "measured"}
 _COLORS = {"gains": "#2a6f97", "found": "#e09f3e", "measured": "#2a9d6f"}
-_RATES = ("recognized", *CONTROLS, "gain", "effect", "sheet found", "measured")
-End = Break = Mapping[str, Any]  # of a cell's values its axis with both ends; of its answers where a stage breaks
+_RATE_HEADINGS = ("recognized", *CONTROLS, "gain", "effect", "sheet found", "measured")
+EndValues = BreakValues = Mapping[str, Any]  # a cell's axis with both ends; a stage's `Break` in its answers
 HOLDS, NEVER, EFFECT, NO_EFFECT = "holds", "never worked", "gains", "no effect"
-_BESIDE = "the better of the bare object and a gray piece in the same markers, on the same conditions"
-_PAGE_IN = (11.69, 8.27)  # A4, lying
+_CONTROL = "the better of the bare object and a gray piece in the same markers, on the same conditions"
+_PAGE_IN = (11.69, 8.27)  # A4, landscape
 
 
 def tables(settings: Any, results: Sequence[Result]) -> Sequence[Table]:
-    """Breaking points, points of sweeps, codes beyond the breaking point, points of maps."""
-    sweeps, maps = _split(results)
+    """Tables of breaking points, codes beyond them, points of sweeps, points of maps."""
+    sweeps, maps = _split_results(results)
     ends = ("axis", "unit", "easy", "hard")
     all_tables = (
         Table(
@@ -47,11 +47,11 @@ def tables(settings: Any, results: Sequence[Result]) -> Sequence[Table]:
             "Breaking points",
             (*ends, *STAGES.values(), "not monotone", f"{NO_EFFECT} at"),
             tuple(_break_row(result) for result in sweeps),
-            f"The design gains up to where it does no more than {_BESIDE}: the last point at which the 95 % interval "
+            f"The design gains up to where it does no more than {_CONTROL}: the last point at which the 95 % interval "
             "of the difference lies above 0, and the first at which it does not. For the sheet, where a fitted falling "
             "curve has lost half of what it loses over the sweep: median of the bootstrap over conditions, 95 % "
-            f"interval; “{HOLDS}”: it loses less than {LEAST_LOST:.0%} of its rate. n conditions: {settings.n} shown "
-            f"to the network (a quarter where JPEG is varied), {settings.photos} photographed.",
+            f"interval; “{HOLDS}”: it loses less than {MIN_LOST_SHARE:.0%} of its rate. n conditions: {settings.n} "
+            f"shown to the network (a quarter where JPEG is varied), {settings.photos} photographed.",
         ),
         Table(
             "beyond",
@@ -63,15 +63,15 @@ def tables(settings: Any, results: Sequence[Result]) -> Sequence[Table]:
         Table(
             "sweeps",
             "All points",
-            ("axis", "value", *_RATES, "median error mm", "largest error mm", "said"),
+            ("axis", "value", *_RATE_HEADINGS, "median error mm", "largest error mm", "said"),
             tuple(row for result in sweeps for row in _point_rows(result)),
-            f"Gain: over {_BESIDE} (Newcombe). “{NO_EFFECT}”: none is shown. Errors are the largest of the design's "
+            f"Gain: over {_CONTROL} (Newcombe). “{NO_EFFECT}”: none is shown. Errors are the largest of the design's "
             "four corners, against the simulation's truth, where a flat sheet was measured. Intervals: Wilson.",
         ),
         Table(
             "maps",
             "Maps",
-            ("x", "y", "at x", "at y", *_RATES),
+            ("x", "y", "at x", "at y", *_RATE_HEADINGS),
             tuple(row for result in maps for row in _map_rows(result)),
             f"n per point: {settings.map_n} recognized, {settings.map_photos} photographed.",
         ),
@@ -80,14 +80,14 @@ def tables(settings: Any, results: Sequence[Result]) -> Sequence[Table]:
 
 
 def figures(settings: Any, results: Sequence[Result]) -> Sequence[Drawing]:
-    """The page to print."""
-    sweeps, maps = _split(results)
+    """The operating envelope as one page to print."""
+    sweeps, maps = _split_results(results)
     page = Drawing(
         "page",
         "Operating envelope",
         lambda figure: _draw_page(figure, sweeps, maps),
         _PAGE_IN,
-        f"The design gains where it does better than {_BESIDE} (95 %); beyond, it has no effect, whatever the "
+        f"The design gains where it does better than {_CONTROL} (95 %); beyond, it has no effect, whatever the "
         "network answers. Beside its bar: the last point with a gain and the first without, in brackets the gains "
         "at both ends. Bars of the sheet run to where half of what the sweep takes is lost; whiskers: 95 % intervals; "
         "→: it holds; !: not monotone; in brackets the fitted rates at both ends.",
@@ -95,62 +95,62 @@ def figures(settings: Any, results: Sequence[Result]) -> Sequence[Drawing]:
     return (page,)
 
 
-def _split(results: Sequence[Result]) -> tuple[list[Result], list[Result]]:
+def _split_results(results: Sequence[Result]) -> tuple[list[Result], list[Result]]:
     sweeps, maps = ([each for each in results if ("y" in each.cell.values) == is_map] for is_map in (False, True))
     return sweeps, maps
 
 
 def found_and_measured(answers: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """P×N bool by stage of the sheet."""
+    """By stage of the sheet P×N bool: the sheet was found, it was measured."""
     status = np.array(answers["status"])
     return {"found": status != "rejected", "measured": status == "measured"}
 
 
 def gains_in(answers: Mapping[str, Any]) -> list[Estimate]:
-    """Per point how much more often the design worked than the better control."""
+    """Per point the design's gain over the better control."""
     controls = {kind: np.array(hits, bool) for kind, hits in answers["controls"].items()}
-    return gains_of(np.array(answers["recognized"], bool), controls)
+    return gains_over_controls(np.array(answers["recognized"], bool), controls)
 
 
 def _break_row(result: Result) -> tuple[Value, ...]:
     x, answers = result.cell.values["x"], result.answers
     axis, breaks = AXES[x["axis"]], answers["breaks"]
-    rising = [f"{STAGES[name]} (p = {b['monotone_p']:.3f})" for name, b in breaks.items() if _rises(b)]
+    rising = [f"{STAGES[name]} (p = {b['monotone_p']:.3f})" for name, b in breaks.items() if _is_not_monotone(b)]
     shown, photographed = len(answers["recognized"][0]), len(answers["status"][0])
     values = [_break_value(x, breaks[name], shown if name == "gains" else photographed) for name in STAGES]
     gains = zip(answers["points"], gains_in(answers), strict=True)
-    without = [_short(point[x["axis"]]) for point, gain in gains if not has_effect(gain)]
+    without = [_short_number(point[x["axis"]]) for point, gain in gains if not has_effect(gain)]
     return axis.title, axis.unit, x["easy"], x["hard"], *values, ", ".join(rising), ", ".join(without)
 
 
-def _rises(break_: Break) -> bool:
-    return break_["monotone_p"] is not None and break_["monotone_p"] < NOT_MONOTONE
+def _is_not_monotone(break_: BreakValues) -> bool:
+    return break_["monotone_p"] is not None and break_["monotone_p"] < MAX_P_NOT_MONOTONE
 
 
-def _break_value(x: End, break_: Break, n: int) -> Value:
+def _break_value(x: EndValues, break_: BreakValues, n: int) -> Value:
     if break_["value"] is None:
         return NEVER
-    if break_["value"] >= BEYOND:
+    if break_["value"] >= BEYOND_SWEEP:
         return HOLDS
-    ends = [_at(x, break_[name]) for name in ("low", "high")]
-    return Estimate(_at(x, break_["value"]), min(ends), max(ends), n)
+    ends = [_axis_value(x, break_[name]) for name in ("low", "high")]
+    return Estimate(_axis_value(x, break_["value"]), min(ends), max(ends), n)
 
 
-def _at(x: End, position: float) -> float:
+def _axis_value(x: EndValues, position: float) -> float:
     return AXES[x["axis"]].value(x["easy"], x["hard"], min(position, 1.0))
 
 
 def _beyond_row(result: Result) -> tuple[Value, ...]:
     x, answers = result.cell.values["x"], result.answers
     where = answers["breaks"]["measured"]["value"]
-    at = np.linspace(0, 1, x["points"])
-    beyond = [i for i in range(x["points"]) if where is None or at[i] > min(where, 1 - 1e-9)]
+    positions = np.linspace(0, 1, x["points"])
+    beyond = [i for i in range(x["points"]) if where is None or positions[i] > min(where, 1 - 1e-9)]
     photos = [photo for i in beyond for photo in zip(answers["status"][i], answers["code"][i], strict=True)]
     status, codes = [status for status, _ in photos], [code for status, code in photos if status != "measured"]
-    return AXES[x["axis"]].title, len(status), status.count("measured"), _counted(codes)
+    return AXES[x["axis"]].title, len(status), status.count("measured"), _count_codes(codes)
 
 
-def _counted(codes: Sequence[str | None]) -> str:
+def _count_codes(codes: Sequence[str | None]) -> str:
     return ", ".join(f"{code} {count}" for code, count in Counter(code for code in codes if code).most_common())
 
 
@@ -160,7 +160,7 @@ def _point_rows(result: Result) -> list[tuple[Value, ...]]:
     for i, (point, rates) in enumerate(zip(answers["points"], _rates(answers), strict=True)):
         errors = [e for e in answers["error_mm"][i] if e is not None]
         median, largest = (float(np.median(errors)), max(errors)) if errors else (None, None)
-        rows.append((AXES[name].title, point[name], *rates, median, largest, _counted(answers["code"][i])))
+        rows.append((AXES[name].title, point[name], *rates, median, largest, _count_codes(answers["code"][i])))
     return rows
 
 
@@ -171,7 +171,6 @@ def _map_rows(result: Result) -> list[tuple[Value, ...]]:
 
 
 def _rates(answers: Mapping[str, Any]) -> list[tuple[Value, ...]]:
-    """Per point what `_RATES` names."""
     shown = [answers["recognized"], *(answers["controls"][kind] for kind in CONTROLS)]
     sheet = found_and_measured(answers).values()
     return [
@@ -217,8 +216,8 @@ def _draw_bars(axes: Axes, sweeps: Sequence[Result]) -> None:
             _draw_bar(axes, y, x, result.answers["breaks"][stage], color, label)
         axis = AXES[x["axis"]]
         axes.text(-0.02, row, f"{axis.title}\n{axis.unit}", ha="right", va="center", fontsize=7.5)
-        axes.text(0.0, row + 0.46, _short(x["easy"]), ha="left", va="center", fontsize=6, alpha=0.7)
-        axes.text(1.0, row + 0.46, _short(x["hard"]), ha="right", va="center", fontsize=6, alpha=0.7)
+        axes.text(0.0, row + 0.46, _short_number(x["easy"]), ha="left", va="center", fontsize=6, alpha=0.7)
+        axes.text(1.0, row + 0.46, _short_number(x["hard"]), ha="right", va="center", fontsize=6, alpha=0.7)
     axes.set_xlim(-0.3, 1.3)
     axes.set_ylim(len(sweeps) - 0.3, -0.7)
     axes.set_axis_off()
@@ -226,37 +225,37 @@ def _draw_bars(axes: Axes, sweeps: Sequence[Result]) -> None:
 
 
 def _draw_without(axes: Axes, y: float, gains: Sequence[bool], color: str) -> None:
-    """Beyond its breaking point: where the design has no effect, and where it gains again."""
+    """Draw where the design has no effect beyond its breaking point, and where it gains again."""
     ends = [0.0, *((np.arange(len(gains) - 1) + 0.5) / (len(gains) - 1)).tolist(), 1.0]  # half way between the points
     for gaining, run in groupby(range(len(gains)), lambda i: gains[i]):
         left, *_, right = (ends[i] for point in run for i in (point, point + 1))
         if not gaining:
-            axes.barh(y, right - left, left=left, height=0.2, color=EMPTY)
+            axes.barh(y, right - left, left=left, height=0.2, color=EMPTY_COLOR)
             axes.text((left + right) / 2, y, NO_EFFECT, ha="center", va="center", fontsize=5.5)
         elif left:
             axes.barh(y, right - left, left=left, height=0.2, color=color, alpha=0.75)
 
 
-def _draw_bar(axes: Axes, y: float, x: End, break_: Break, color: str, label: str | None) -> None:
+def _draw_bar(axes: Axes, y: float, x: EndValues, break_: BreakValues, color: str, label: str | None) -> None:
     value, low, high = (break_[name] for name in ("value", "low", "high"))
     axes.barh(y, min(value or 0.0, 1.0), height=0.2, color=color, alpha=0.75, label=label)
     of_sheet = break_["monotone_p"] is not None
     if value is None:
         axes.text(0.01, y, NEVER if of_sheet else "", va="center", fontsize=6.5)
         return
-    if value >= BEYOND:
+    if value >= BEYOND_SWEEP:
         axes.text(1.01, y, "→", va="center", fontsize=8, color=color)
         return
     first, last = break_["rates"]
-    where, end = f"{_short(_at(x, low))} to {_short(_at(x, high))}", 1.0
+    where, end = f"{_short_number(_axis_value(x, low))} to {_short_number(_axis_value(x, high))}", 1.0
     if of_sheet:
-        where, end = _short(_at(x, value)), min(high, 1.0)
+        where, end = _short_number(_axis_value(x, value)), min(high, 1.0)
         axes.plot([low, end], [y, y], color="black", linewidth=0.9)
-    text = f"{where} ({first:.2f}, {last:.2f})" + (" !" if _rises(break_) else "")
+    text = f"{where} ({first:.2f}, {last:.2f})" + (" !" if _is_not_monotone(break_) else "")
     axes.text(end + 0.01, y, text, va="center", fontsize=6.5)
 
 
-def _short(value: float) -> str:
+def _short_number(value: float) -> str:
     return f"{value:.2g}" if abs(value) < 100 else f"{value:.0f}"
 
 
@@ -273,5 +272,5 @@ def _draw_map(axes: Axes, result: Result) -> None:
     for drawn, end in ((axes.xaxis, x), (axes.yaxis, y)):
         axis = AXES[end["axis"]]
         values = axis.values(end["easy"], end["hard"], end["points"])
-        drawn.set_ticks(range(end["points"]), [_short(v) for v in values], fontsize=6)
+        drawn.set_ticks(range(end["points"]), [_short_number(v) for v in values], fontsize=6)
         drawn.set_label_text(f"{axis.title}, {axis.unit}", fontsize=7)

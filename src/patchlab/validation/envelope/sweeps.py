@@ -1,14 +1,14 @@
-"""Where recognition, detection and measurement of this patch on this scene stop working, in simulation.
+"""Sweep a run's patch to where recognition, detection and measurement stop working, in simulation.
 
-This is the patch's operating envelope, with what the tool says beyond. The design is judged by what it gains over the
-bare object and a gray piece on the same conditions: a network may answer the target's label where nothing can be seen.
-In: a run, sweeps of one axis and maps of two (`envelope_axes`; left out, all that the scene allows). Out: tables, a
-page to print beside the patch, and the curves and maps behind it. All points of a study share their draws of everything
-that is not varied, so that differences between them are not luck. Draws cover the ranges evenly (scrambled Sobol points
-of a seed of their own); intervals take them for independent ones, which is cautious.
+This is the patch's operating envelope, with the tool's codes beyond. The design is judged by its gain over the bare
+object and a gray piece under the same conditions, since a network may give the target's label where nothing is visible.
+In: a run, sweeps of one axis and maps of two (`envelope.axes`; by default all that the scene allows). Out: tables and
+a page to print beside the patch. All points share their draws of everything that is not varied, so that differences
+between them are not due to chance. Draws cover the ranges evenly (scrambled Sobol points of a seed of their own);
+intervals treat them as independent, which is cautious.
 
-Left out on purpose: shadows of a card that stands off, which the renderer does not have, and a camera that answers
-darkness with a longer exposure: darkness is light that is missing from the picture.
+Left out on purpose: shadows of a card off the surface, which the renderer does not have, and a camera that exposes
+longer in the dark: here, darkness is light missing from the picture.
 """
 
 from __future__ import annotations
@@ -21,70 +21,70 @@ import numpy as np
 from pydantic import Field
 
 from patchlab.study.study import Cell, Study
-from patchlab.validation.envelope.axes import AXES, MAPS, possible
+from patchlab.validation.envelope.axes import AXES, DEFAULT_MAPS, is_possible
 from patchlab.validation.envelope.fit import find_break
 from patchlab.validation.envelope.gains import gain_break
 from patchlab.validation.envelope.pages import figures, found_and_measured, gains_in, tables
-from patchlab.validation.envelope.world import measured, open_world, recognized
+from patchlab.validation.envelope.simulation import measure_photos, open_simulation, recognize_target
 from patchproof.base.errors import Refused
 from patchproof.base.validation import Finite, StrictModel, spelling_hint
 from patchproof.optimizer.run import load_run
 from patchproof.scene.interface import require_piece
 
-_SEED = 1_000_000  # the study's seeds begin here, far from those of scenes: Sobol points are what runs are selected on
-Count = Annotated[int, Field(ge=1, le=4096)]
-Points = Annotated[int, Field(ge=3, le=33)]
+_FIRST_SEED = 1_000_000  # the study's first seed, far from scenes' seeds, whose Sobol points select designs
+ConditionCount = Annotated[int, Field(ge=1, le=4096)]
+PointCount = Annotated[int, Field(ge=3, le=33)]
 
 
 class Sweep(StrictModel):
-    """One axis from an easy to a hard value; ends left out are those that suit the scene."""
+    """One axis from an easy to a hard value; by default ends that suit the scene."""
 
-    axis: str  # such as tilt, distance, blur; an unknown one is refused with all names
+    axis: str  # such as tilt, distance, blur; an unknown name is refused with all names
     easy: Finite | None = None  # value at the easy end
     hard: Finite | None = None  # value at the hard end
-    points: Points | None = None  # values; by default the study's
+    points: PointCount | None = None  # values; by default the study's
 
 
-class Map(StrictModel):
+class AxisPair(StrictModel):
     """Two axes against each other, each from its easy to its hard end."""
 
     x: str  # the axis across
     y: str  # the axis upwards
-    points: Points = 4  # values of each axis
+    points: PointCount = 4  # values of each axis
 
 
 class EnvelopeSettings(StrictModel):
-    """Whose envelope, and how finely. Beside a control that reaches 55 %, a gain of 20 points is shown by 32 conditions
-    and one of 10 by 96, where 3 % of them go the other way.
+    """The run, and how finely its envelope is sampled. Over a control at 55 %, a gain of 20 points is shown by 32
+    conditions, one of 10 by 96, where 3 % of them go the other way.
     """
 
     run: str  # the folder of a finished run of a patch
-    seed: Annotated[int, Field(ge=0)] = 0  # of everything that is drawn
-    n: Count = 96  # conditions per point that the network sees; a quarter where JPEG is varied
-    photos: Count = 6  # of them photographed in full and measured
-    points: Points = 6  # values of each swept axis
-    map_n: Count = 32  # n for points of maps
-    map_photos: Count = 3  # photos for points of maps
+    seed: Annotated[int, Field(ge=0)] = 0  # seed of all draws
+    n: ConditionCount = 96  # conditions per point that the network sees; a quarter where JPEG is varied
+    photos: ConditionCount = 6  # of them photographed in full and measured
+    points: PointCount = 6  # values of each swept axis
+    map_n: ConditionCount = 32  # n for points of maps
+    map_photos: ConditionCount = 3  # photos for points of maps
     sweeps: tuple[Sweep, ...] | None = None  # by default every axis that suits the scene
-    maps: tuple[Map, ...] | None = None  # likewise; none: []
-    other_printer: str | None = None  # what `mismatch` counts from the run's own printer towards
+    maps: tuple[AxisPair, ...] | None = None  # by default those that suit the scene; [] for none
+    other_printer: str | None = None  # `mismatch` goes from the run's printer towards this one
 
 
 def cells(settings: EnvelopeSettings, base: Path) -> Sequence[Cell]:
-    """A cell per sweep and per map; refused where the scene has no such axis."""
+    """A cell per sweep and per map; refuses an axis that the scene does not have."""
     scene = require_piece(load_run(base / settings.run).scene, "name the run of a printed patch")
-    able = [name for name in AXES if possible(scene, name)]
+    possible = [name for name in AXES if is_possible(scene, name)]
     sweeps = settings.sweeps
     if sweeps is None:
-        sweeps = tuple(Sweep(axis=name) for name in able)
+        sweeps = tuple(Sweep(axis=name) for name in possible)
     maps = settings.maps
     if maps is None:
-        maps = tuple(Map(x=x, y=y) for x, y in MAPS if x in able and y in able)
+        maps = tuple(AxisPair(x=x, y=y) for x, y in DEFAULT_MAPS if x in possible and y in possible)
     for name in [sweep.axis for sweep in sweeps] + [name for pair in maps for name in (pair.x, pair.y)]:
-        if name not in able:
-            raise Refused("an axis along which this scene can be varied", f'"{name}"', spelling_hint(name, able))
+        if name not in possible:
+            raise Refused("an axis along which this scene can be varied", f'"{name}"', spelling_hint(name, possible))
     if any(pair.x == pair.y for pair in maps):
-        raise Refused("two different axes for a map", "one twice", "name another")
+        raise Refused("two different axes for a map", "a map with one axis twice", "name another axis")
     return [
         *(Cell(f"sweep-{sweep.axis}", _sweep_values(sweep, scene, settings)) for sweep in sweeps),
         *(Cell(f"map-{pair.x}-{pair.y}", _map_values(pair, scene)) for pair in maps),
@@ -96,12 +96,14 @@ def _sweep_values(sweep: Sweep, scene, settings: EnvelopeSettings) -> dict[str, 
     easy, hard = axis.ends(scene)
     easy, hard = easy if sweep.easy is None else sweep.easy, hard if sweep.hard is None else sweep.hard
     if easy == hard or (axis.ratio and (easy <= 0 or hard <= 0)):
-        raise Refused(f"two different ends of {axis.title}, above 0 where it multiplies", f"{easy:g}, {hard:g}", "mend")
+        raise Refused(
+            f"two different ends of {axis.title}, above 0 where it multiplies", f"{easy:g} and {hard:g}", "change them"
+        )
     points = 5 if sweep.axis == "hidden" and sweep.points is None else sweep.points or settings.points
     return {"x": {"axis": sweep.axis, "easy": easy, "hard": hard, "points": points}}
 
 
-def _map_values(pair: Map, scene) -> dict[str, Any]:
+def _map_values(pair: AxisPair, scene) -> dict[str, Any]:
     ends = {key: (name, *AXES[name].ends(scene)) for key, name in (("x", pair.x), ("y", pair.y))}
     return {
         key: {"axis": name, "easy": easy, "hard": hard, "points": pair.points}
@@ -110,19 +112,19 @@ def _map_values(pair: Map, scene) -> dict[str, Any]:
 
 
 def run(settings: EnvelopeSettings, base: Path, cell: Cell) -> dict[str, Any]:
-    """Per point which conditions were recognized and what was said of each photograph; of sweeps the breaks, too."""
-    world = open_world(base / settings.run, settings.other_printer)
+    """Hits per point and condition, status and code of each photograph; of sweeps also the breaks."""
+    world = open_simulation(base / settings.run, settings.other_printer)
     is_map = "y" in cell.values
     n, photos = (settings.map_n, settings.map_photos) if is_map else (settings.n, settings.photos)
-    drawn = world.scene.draw("select", max(n, photos), _SEED + settings.seed)
+    drawn = world.scene.draw("select", max(n, photos), _FIRST_SEED + settings.seed)
     x, along = _values(cell.values["x"])
     points = [{x: value} for value in along]
     if is_map:
         y, across = _values(cell.values["y"])
         points = [point | {y: value} for value in across for point in points]
     shown = max(n // 4, photos) if "jpeg" in points[0] else n
-    as_target = recognized(world, points, drawn[:shown])
-    photographed = measured(world, points, drawn[:photos])
+    as_target = recognize_target(world, points, drawn[:shown])
+    photographed = measure_photos(world, points, drawn[:photos])
     wanted = world.scene.settings.target.goal.sign > 0
     works = {kind: (hits == wanted).astype(int).tolist() for kind, hits in as_target.items()}
     answers = {
@@ -139,9 +141,11 @@ def run(settings: EnvelopeSettings, base: Path, cell: Cell) -> dict[str, Any]:
     }
     if is_map:
         return answers
-    at = np.linspace(0, 1, len(points))
-    of_sheet = {stage: find_break(hits.T, at, settings.seed) for stage, hits in found_and_measured(answers).items()}
-    breaks = {"gains": gain_break(gains_in(answers), at)} | of_sheet
+    positions = np.linspace(0, 1, len(points))
+    of_sheet = {
+        stage: find_break(hits.T, positions, settings.seed) for stage, hits in found_and_measured(answers).items()
+    }
+    breaks = {"gains": gain_break(gains_in(answers), positions)} | of_sheet
     return answers | {"breaks": {stage: vars(each) for stage, each in breaks.items()}}
 
 

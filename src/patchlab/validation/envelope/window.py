@@ -1,7 +1,8 @@
-"""The window of a photograph that shows the piece, rendered alone, at full resolution.
+"""Render only the window of a photograph that shows the piece, at full resolution.
 
-In: a stage and a view's conditions. Out: `Frame`: a stage whose camera sees that part, at the same scale; the rest of
-the photograph costs most and shows no markers. Left out on purpose: what else in it might look like a marker.
+In: a stage and a view's conditions. Out: `RenderedWindow`: a stage whose camera sees that window at the same scale; the
+rest of the photograph takes most of the time and shows no markers. Left out on purpose: false markers outside of the
+window.
 """
 
 from __future__ import annotations
@@ -15,41 +16,41 @@ from patchproof.scene.backgrounds import Backgrounds
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.patch_scene import PatchScene, require_patch
 
-_MARGIN_SHARE, _MARGIN_PX, _BLOCK = 0.25, 32, 16  # of a window round the piece; blocks of JPEG stay where they are
+_MARGIN_SHARE, _MARGIN_PX, _BLOCK = 0.25, 32, 16  # of the margin around the piece; windows start at blocks of JPEG
 
 
 @dataclass(frozen=True)
-class Frame:
-    """What is rendered: pictures of `size_px`, whose corner lies at `origin_px` of the photograph."""
+class RenderedWindow:
+    """A part of a photograph: `size_px` pixels whose top left corner is `origin_px` of the photograph."""
 
     stage: Stage
     size_px: tuple[int, int]
     origin_px: tuple[int, int] = (0, 0)
 
 
-def window(stage: Stage, conditions: Conditions) -> Frame:
-    """The part of the photograph that shows the piece; all of it where the lens bends or a part would not do."""
+def piece_window(stage: Stage, conditions: Conditions) -> RenderedWindow:
+    """The window around the piece; the whole photograph if the lens distorts or the piece is hardly in it."""
     whole_px = stage.scene.photo_px
-    everything = Frame(stage, whole_px)
+    whole = RenderedWindow(stage, whole_px)
     if not stage.scene.HAS_OBJECT or stage.camera is not None:
-        return everything
+        return whole
     scene = require_patch(stage.scene)
     edge = np.linspace(0, 1, 9)
     grid = np.stack(np.meshgrid(edge, edge), -1).reshape(-1, 2) * scene.placement.size_mm
     points = scene.piece_px(conditions, grid)
     if not np.isfinite(points).all():
-        return everything
+        return whole
     margin = _MARGIN_SHARE * np.ptp(points, axis=0).max() + _MARGIN_PX
     low = np.clip(np.floor((points.min(0) - margin) / _BLOCK) * _BLOCK, 0, None).astype(int)
     high = np.minimum(np.ceil((points.max(0) + margin) / _BLOCK).astype(int) * _BLOCK, whole_px)
-    if (high - low < 64).any():  # outside of the picture, almost
-        return everything
+    if (high - low < 64).any():  # almost outside of the picture
+        return whole
     (left, top), (width, height) = low.tolist(), (high - low).tolist()
-    return Frame(_seen_through(stage, scene, (left, top), (width, height)), (width, height), (left, top))
+    return RenderedWindow(_window_stage(stage, scene, (left, top), (width, height)), (width, height), (left, top))
 
 
-def on_plain_ground(part: np.ndarray, origin_px, whole_px: tuple[int, int]) -> np.ndarray:
-    """A photograph that shows `part` at `origin_px` and nothing else."""
+def paste_on_plain(part: np.ndarray, origin_px, whole_px: tuple[int, int]) -> np.ndarray:
+    """A photograph with `part` at `origin_px` on its median color."""
     srgb, (x, y) = np.full((whole_px[1], whole_px[0], 3), np.median(part, (0, 1)).astype(np.uint8)), origin_px
     srgb[y : y + part.shape[0], x : x + part.shape[1]] = part
     return srgb
@@ -57,7 +58,7 @@ def on_plain_ground(part: np.ndarray, origin_px, whole_px: tuple[int, int]) -> n
 
 @dataclass(frozen=True)
 class _WindowScene(PatchScene):
-    """A scene whose camera sees a part of the picture, at the same scale; its `photo_px` is the part's size."""
+    """A scene whose camera sees a window of the picture at the same scale; its `photo_px` is the window's size."""
 
     whole_px: tuple[int, int] = (0, 0)
     origin_px: tuple[int, int] = (0, 0)
@@ -71,8 +72,6 @@ class _WindowScene(PatchScene):
 
 @dataclass(frozen=True)
 class _WindowBackgrounds:
-    """The window's part of the whole picture's background."""
-
     whole: Backgrounds
     whole_px: tuple[int, int]
     origin_px: tuple[int, int]
@@ -82,8 +81,7 @@ class _WindowBackgrounds:
         return self.whole.picture(choice, self.whole_px, self.whole_px)[y : y + size_px[1], x : x + size_px[0]]
 
 
-def _seen_through(stage: Stage, scene: PatchScene, origin_px: tuple[int, int], size_px: tuple[int, int]) -> Stage:
-    """The stage as a camera sees it that shows a window of the photograph only."""
+def _window_stage(stage: Stage, scene: PatchScene, origin_px: tuple[int, int], size_px: tuple[int, int]) -> Stage:
     whole_px = scene.settings.camera.photo_px
     parts = {field.name: getattr(scene, field.name) for field in fields(PatchScene)}
     parts["settings"] = scene.settings.changed(camera={"photo_px": size_px})

@@ -1,13 +1,14 @@
-"""Photographs of paper whose true place is known: flat, through a lens that bends, or rolled.
+"""Simulated photographs of paper whose true position is known: flat, through a distorting lens, or rolled.
 
-In: a seed. Out: `Sheet`s and photographs. A frame of eight markers is drawn by OpenCV; every pixel is traced back to
-the paper by OpenCV's lens and a ray through a cylinder, and developed by means of this module's own (area-averaged
-look-up, Gaussian blur and noise in linear light, JPEG), so that neither our renderer nor our page nor our models of a
-sheet are their own judges.
+In: a seed. Out: `Sheet`s and photographs. OpenCV draws a frame of eight markers; every pixel is traced back to the
+paper by OpenCV's lens model and a ray that meets a cylinder, then developed by this module (area-averaged look-up,
+Gaussian blur and noise in linear light, JPEG). So our renderer, our page and our models of a sheet do not judge
+themselves.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
@@ -21,22 +22,21 @@ from patchproof.base.geometry import intrinsics, look_at, rect_corners
 from patchproof.sheets.markers import DICTIONARY, aruco_dictionary
 
 Kind = Literal["flat", "lens", "rolled"]
+MarkerCorners = Mapping[int, np.ndarray]  # corners 4×2 by marker
 PIECE_MM, MARKER_MM = 140.0, 14.0
 DESIGN_MM = (20.0, 20.0, 100.0, 100.0)
 SIZE_PX = (1600, 1200)
-LENS = np.array([-0.12, 0.03, 5e-4, -5e-4, 0.0])  # k1 k2 p1 p2 k3: a wide phone camera
+LENS_TERMS = np.array([-0.12, 0.03, 5e-4, -5e-4, 0.0])  # k1 k2 p1 p2 k3: a wide phone camera
 RADII_MM = (100.0, 400.0)
-ASIDE_DEG = 35.0  # rolled paper hides a part of itself beyond
+MAX_AZIMUTH_DEG = 35.0  # beyond it, rolled paper hides a part of itself
 _RASTER_PX_PER_MM = 10
 _SAMPLES = 3  # along each side of a pixel
-_AROUND = np.array([[0, 0], [1, 0], [1, 1], [0, 1], [0, 0]])  # the piece's corners, as shares of it
+_OUTLINE = np.array([[0, 0], [1, 0], [1, 1], [0, 1], [0, 0]])  # the piece's corners, as shares of it
 
 
 @dataclass(frozen=True)
 class Sheet:
-    """Paper before a camera (mm, z into the paper): flat where `curvature` (1/mm) is 0, else rolled about its upright
-    middle.
-    """
+    """Paper seen by a camera (mm, z into the paper): flat if `curvature` (1/mm) is 0, else rolled about its middle."""
 
     camera_from_piece: np.ndarray
     matrix_px: np.ndarray
@@ -45,7 +45,7 @@ class Sheet:
     curvature: float
 
     def px(self, mm: np.ndarray) -> np.ndarray:
-        """Where points N×2 of the paper are seen, N×2."""
+        """Pixels N×2 of points N×2 in mm on the paper."""
         x, y = np.asarray(mm, float).T
         along, k = x - PIECE_MM / 2, self.curvature
         away = (1 - np.cos(k * along)) / k if k else 0 * x
@@ -54,7 +54,7 @@ class Sheet:
         return cv2.projectPoints(points, turn, move, self.matrix_px, self.terms)[0].reshape(-1, 2)
 
     def mm(self, px: np.ndarray) -> np.ndarray:
-        """Which point N×2 of the paper is seen at pixels N×2; NaN where none is."""
+        """Points N×2 in mm on the paper at pixels N×2; NaN where there is no paper."""
         stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-9)
         bent = px.reshape(-1, 1, 2), self.matrix_px, self.terms
         before_5 = getattr(cv2, "undistortPointsIter", None)  # what OpenCV 4 calls it with a criterion
@@ -76,16 +76,16 @@ class Sheet:
 
 @lru_cache(maxsize=1)
 def corners_mm() -> dict[int, np.ndarray]:
-    """The frame's markers: corners and middles of the piece's sides."""
+    """Corners 4×2 in mm of the frame's eight markers, at the corners and the middles of the sides."""
     near, middle, far = 2.0, (PIECE_MM - MARKER_MM) / 2, PIECE_MM - 2.0 - MARKER_MM
     places = [(x, y) for y in (near, middle, far) for x in (near, middle, far) if (x, y) != (middle, middle)]
     return {100 + i: rect_corners([x, y, MARKER_MM, MARKER_MM]) for i, (x, y) in enumerate(places)}
 
 
-def drawn_sheet(
-    kind: Kind, seed: int, size_px: tuple[int, int] = SIZE_PX, aside_deg: float = ASIDE_DEG
+def draw_sheet(
+    kind: Kind, seed: int, size_px: tuple[int, int] = SIZE_PX, aside_deg: float = MAX_AZIMUTH_DEG
 ) -> tuple[Sheet, np.random.Generator]:
-    """A sheet that fills a third of a photograph's height or so, and what draws the rest of its photograph."""
+    """A sheet that fills about a third of a photograph's height, and the generator that draws its photograph."""
     rng = np.random.default_rng([seed, 1])
     azimuth, elevation = np.radians(rng.uniform([-aside_deg, -30], [aside_deg, 30]))
     toward = [np.cos(elevation) * np.sin(azimuth), np.sin(elevation), np.cos(elevation) * np.cos(azimuth)]
@@ -93,33 +93,33 @@ def drawn_sheet(
     world_from_piece[:2, 3] = [-PIECE_MM / 2, PIECE_MM / 2]
     camera_from_world = look_at(rng.uniform(350, 700) * np.array(toward), [0, 0, 0], rng.uniform(-20, 20))
     curvature = rng.choice([-1, 1]) / rng.uniform(*RADII_MM) if kind == "rolled" else 0.0
-    terms = LENS if kind == "lens" else np.zeros(5)
+    terms = LENS_TERMS if kind == "lens" else np.zeros(5)
     pose, matrix = camera_from_world @ world_from_piece, intrinsics(50.0, size_px)
     return Sheet(pose, matrix, size_px, terms, float(curvature)), rng
 
 
-def photographed(sheet: Sheet, rng: np.random.Generator) -> np.ndarray:
-    """uint8 H×W×3 photograph of the sheet over something soft."""
+def photograph_paper(sheet: Sheet, rng: np.random.Generator) -> np.ndarray:
+    """uint8 H×W×3 photograph of the sheet on a blurred background."""
     clutter = rng.uniform(0.05, 0.6, (24, 32)).astype(np.float32)
-    picture, raster = cv2.resize(clutter, sheet.size_px, interpolation=cv2.INTER_CUBIC), _raster(rng)
-    border = sheet.px(np.concatenate([PIECE_MM * np.linspace(a, b, 50) for a, b in pairwise(_AROUND)]))
+    picture, raster = cv2.resize(clutter, sheet.size_px, interpolation=cv2.INTER_CUBIC), _draw_raster(rng)
+    border = sheet.px(np.concatenate([PIECE_MM * np.linspace(a, b, 50) for a, b in pairwise(_OUTLINE)]))
     left, top = np.clip(np.floor(border.min(0)).astype(int) - 2, 0, sheet.size_px)
     right, bottom = np.clip(np.ceil(border.max(0)).astype(int) + 2, 0, sheet.size_px)
     y, x = np.mgrid[top:bottom, left:right] + 0.5
     mm = sheet.mm(np.column_stack([x.ravel(), y.ravel()])).reshape(*x.shape, 2)
-    # the map from pixels to paper is smooth: between pixels it is straight to a thousandth of one
+    # the map from pixels to paper is smooth: between pixels it is linear to a thousandth of a pixel
     fine = (_SAMPLES * (right - left), _SAMPLES * (bottom - top))
-    at = cv2.resize(np.nan_to_num(mm, nan=-1e3).astype(np.float32), fine, interpolation=cv2.INTER_LINEAR)
-    inside = np.asarray(((at > 0) & (at < PIECE_MM)).all(2), np.float32)
-    column, row = cv2.split(at * _RASTER_PX_PER_MM - 0.5)
+    points = cv2.resize(np.nan_to_num(mm, nan=-1e3).astype(np.float32), fine, interpolation=cv2.INTER_LINEAR)
+    inside = np.asarray(((points > 0) & (points < PIECE_MM)).all(2), np.float32)
+    column, row = cv2.split(points * _RASTER_PX_PER_MM - 0.5)
     light = cv2.multiply(inside, cv2.remap(raster, column, row, cv2.INTER_NEAREST))
     light, cover = (cv2.resize(part, x.shape[::-1], interpolation=cv2.INTER_AREA) for part in (light, inside))
     picture[top:bottom, left:right] = picture[top:bottom, left:right] * (1 - cover) + light
-    return _developed(picture, rng)
+    return _develop(picture, rng)
 
 
-def _raster(rng: np.random.Generator) -> np.ndarray:
-    """Light of the piece: markers, and a soft design."""
+def _draw_raster(rng: np.random.Generator) -> np.ndarray:
+    """Draw the piece's light H×W: markers, and a smooth random design."""
     side, marker_px = (round(mm * _RASTER_PX_PER_MM) for mm in (PIECE_MM, MARKER_MM))
     raster = np.full((side, side), 0.95, np.float32)
     x, y, width, height = (round(v * _RASTER_PX_PER_MM) for v in DESIGN_MM)
@@ -132,8 +132,8 @@ def _raster(rng: np.random.Generator) -> np.ndarray:
     return raster
 
 
-def _developed(light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """uint8 H×W×3: the light H×W with drawn exposure, blur, noise and JPEG."""
+def _develop(light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Develop light H×W into uint8 H×W×3 with drawn exposure, blur, noise and JPEG."""
     light = cv2.GaussianBlur(rng.uniform(0.3, 0.9) * light, (0, 0), rng.uniform(0.3, 1.2))
     light += rng.normal(0, rng.uniform(0, 0.01), light.shape).astype(np.float32)
     codes = photo_codes_from_srgb(srgb_from_linear(light.clip(0, 1)))

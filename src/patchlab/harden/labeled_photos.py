@@ -1,7 +1,7 @@
-"""A folder of labeled photographs, in blocks that fit into memory.
+"""Read a folder of labeled photographs in blocks that fit into memory.
 
-In: a folder and a CSV of file names and labels. Out: rows with the name of each photograph's PNG; a head line is left
-out, files that are missing or named twice are refused.
+In: a folder and a CSV of file names and labels. Out: rows with the name of each photograph's PNG. A heading line is
+skipped; missing files and files named twice are refused.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from patchproof.photo.read import read_photo
 from patchproof.photo.rejection import PhotoRejected
 from patchproof.scene.image_scene import read_labels
 
-BLOCK_PHOTOS, BLOCK_PX = 8, 4_000_000  # of photographs hardened together: some 200 MB with gradients
-SMALLEST_PX = 8  # of a photograph's shorter side
-_HEADS = {"file", "filename", "file_name", "image", "name"}
+MAX_BLOCK_PHOTOS, MAX_BLOCK_PX = 8, 4_000_000  # of photographs hardened together: some 200 MB with gradients
+MIN_SIDE_PX = 8  # of a photograph's shorter side
+_HEADING_NAMES = {"file", "filename", "file_name", "image", "name"}
 
 
-def labeled_files(folder: Path, table: Path) -> list[tuple[str, str, str]]:
-    """(file, its PNG's name, label) of every line; two files of one stem keep their suffixes in the PNG's name."""
+def list_labeled_files(folder: Path, table: Path) -> list[tuple[str, str, str]]:
+    """(file, its PNG's name, label) of every line; files that share a stem keep their suffixes in the PNG's name."""
     rows = read_labels(table)
-    if rows and rows[0][0].casefold() in _HEADS and not is_file(folder / rows[0][0]):
+    if rows and rows[0][0].casefold() in _HEADING_NAMES and not is_file(folder / rows[0][0]):
         rows = rows[1:]
     missing = [file for file, _ in rows if not is_file(folder / file)]
     if missing or not rows:
-        got = f"{len(missing)} missing ({missing[0]})" if missing else "none"
+        got = f"{len(missing)} missing ({missing[0]})" if missing else "a table without rows"
         raise Refused(f"the images that {table.name} names in {folder}", got, "copy them there, or mend the table")
     twice = next((file for file in (f for f, _ in rows) if [f for f, _ in rows].count(file) > 1), None)
     if twice:
@@ -51,16 +51,16 @@ def write_labels(rows: Sequence[tuple[str, str | int]], folder: Path) -> Path:
     return path
 
 
-def in_blocks(folder: Path, rows) -> Iterator[list]:
-    """Rows in their order, in blocks that fit into memory; sizes from the files' heads."""
+def split_into_blocks(folder: Path, rows) -> Iterator[list]:
+    """Split rows, in order, into blocks that fit into memory; sizes come from the files' headers."""
     block, pixels = [], 0
     for row in rows:
         try:
             with Image.open(folder / row[0], formats=readable_formats()) as image:
                 size = image.width * image.height
-        except Exception:  # what is no image is reported when it is read
+        except Exception:  # a file that is no image is reported when it is read
             size = 0
-        if block and (len(block) == BLOCK_PHOTOS or pixels + size > BLOCK_PX):
+        if block and (len(block) == MAX_BLOCK_PHOTOS or pixels + size > MAX_BLOCK_PX):
             yield block
             block, pixels = [], 0
         block.append(row)
@@ -69,9 +69,9 @@ def in_blocks(folder: Path, rows) -> Iterator[list]:
 
 
 def read_large_enough(path: Path) -> np.ndarray:
-    """A photograph as uint8 H×W×3; `PhotoRejected` where it is no picture or a few pixels only."""
+    """Read a photograph as uint8 H×W×3; `PhotoRejected` if it is no picture or too small."""
     srgb = read_photo(path).srgb
-    if min(srgb.shape[:2]) < SMALLEST_PX:
+    if min(srgb.shape[:2]) < MIN_SIDE_PX:
         shape = "×".join(map(str, srgb.shape[1::-1]))
-        raise PhotoRejected("too_small", min(srgb.shape[:2]), SMALLEST_PX, f"{shape} px are too few: use a larger one")
+        raise PhotoRejected("too_small", min(srgb.shape[:2]), MIN_SIDE_PX, f"{shape} px are too few: use a larger one")
     return srgb

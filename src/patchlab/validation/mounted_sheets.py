@@ -1,4 +1,4 @@
-"""Sheets that are made only to be hung up and photographed: their PDF is thrown away."""
+"""Sheets that are mounted and photographed in simulation; their PDF is temporary."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from patchproof.sheets.template import load_template
 from patchproof.sheets.write import write_sheet
 
 
-def hang_own(run: Run, control: str | None = None) -> MountedSheet:
-    """The sheet that the run makes, or that of a printed control, without the page that says how to photograph it."""
-    return hang_piece(set_stage(run.scene), content_of(run, None, control)[0])
+def mount_run_sheet(run: Run, control: str | None = None) -> MountedSheet:
+    """Mount the run's sheet, or a printed control's, without the page of instructions."""
+    return mount_content(set_stage(run.scene), content_of(run, None, control)[0])
 
 
-def hang_piece(stage: Stage, content: SheetContent) -> MountedSheet:
-    """A sheet of the stage's scene with any content in its piece."""
+def mount_content(stage: Stage, content: SheetContent) -> MountedSheet:
+    """Mount a sheet of the stage's scene with this content in its piece."""
     template = load_template(stage.scene.settings.sheet.template)
     with TemporaryDirectory() as folder:
         pdf = Path(folder) / "sheet.pdf"

@@ -1,23 +1,23 @@
-"""Assistive images: photographs changed so that networks recognize what they show, also when they are attacked.
+"""Harden photographs: change them so that networks recognize what they show, also under attack.
 
 In: uint8 photographs of any size and their labels, networks, a method and ε. Out: uint8 photographs of the same size,
-each within ε of its original in every pixel after rounding. The step runs down the cross-entropy of the true class (as
-printed, the paper's Θ + α∇L would go up it), through the same centered square that classifiers see; what lies outside
-of the square stays as it is. The loss of several networks is their mean.
+each within ε of its original in every pixel after rounding. Steps go down the cross-entropy of the true class (as
+printed, the paper's Θ + α∇L would go up), through the centered square that classifiers see; pixels outside of the
+square stay. The loss of several networks is their mean.
 
     pgd    x ← Π(x - α sign ∇L), α from ε/4 linearly down to 0, so that the pixels settle
-    fgsm   the same with α = ε/steps throughout: iterated FGSM, which ends where FGSM would if the gradient stayed
-    adam   Adam on the pixels at a rate that falls likewise, then Π
+    fgsm   that step with α = ε/steps throughout: iterated FGSM, which ends where FGSM would if the gradient stayed
+    adam   Adam on the pixels, at a rate that falls linearly down to 0, then Π
 
-What is easy to recognize is not hard to attack: with `through` each step goes down the loss at the place that a short
-PGD within that ε leads to from where the pixels are, as in adversarial training (Madry et al.), but for the picture.
+A picture that is easy to recognize can still be easy to attack. With `through`, each step uses the gradient after a
+short PGD attack within that ε, as in adversarial training (Madry et al.), but for the picture.
 
-Gradients are scaled per photograph (attacks.even_loss), so that steps go on where a float32 softmax is saturated. Π
-keeps the ε-ball (none where it is unbounded) and [0, 1].
+Gradients are scaled per photograph (`attacks.balanced_loss`), so that steps continue where a float32 softmax is
+saturated. Π projects onto the ε-ball, if there is one, and [0, 1].
 
 Sources: Pestana et al., Physical world assistive signals for deep neural network classifiers, algorithm 1; Kurakin et
 al., Adversarial Examples in the Physical World, 2017 (iterated FGSM); Madry et al., Towards Deep Learning Models
-Resistant to Adversarial Attacks, ICLR 2018 (the loss at the attacked place).
+Resistant to Adversarial Attacks, ICLR 2018 (the loss under attack).
 """
 
 from __future__ import annotations
@@ -30,18 +30,18 @@ import torch
 from pydantic import BeforeValidator
 from torch import Tensor
 
-from patchlab.harden.attacks import cross_entropy, even_loss, pgd
+from patchlab.harden.attacks import balanced_loss, cross_entropy, pgd
 from patchproof.classifier.network import Classifier, center_square
 
-Method = Literal["pgd", "fgsm", "adam"]
+HardenMethod = Literal["pgd", "fgsm", "adam"]
 # Without ε. Of 11 photographs hardened in 50 steps against a MobileNetV1 0.25, PGD of 0.01 left, with steps of 0.03 and
 # of 0.1 that do not fall, 3 and 0; with falling ones 3 and 11. At ε = 0.1, FGSM left 6 without and 11 with the fall.
-UNBOUNDED_STEP = 0.1
+UNBOUNDED_STEP_SIZE = 0.1
 THROUGH_STEPS = 7  # of ε/4, so that they reach the ball's edge
 
 
-def _epsilon(value: Any) -> float | None:
-    """0.03, "0.03", "8/255" or "none"."""
+def _parse_epsilon(value: Any) -> float | None:
+    """Parse ε: 0.03, "0.03", "8/255" or "none"."""
     if value is None or value == "none":
         return None
     numerator, _, denominator = str(value).partition("/")
@@ -54,11 +54,11 @@ def _epsilon(value: Any) -> float | None:
     return epsilon
 
 
-Epsilon = Annotated[float | None, BeforeValidator(_epsilon)]
+Epsilon = Annotated[float | None, BeforeValidator(_parse_epsilon)]
 
 
-def epsilon_words(epsilon: float | None) -> str:
-    """ε as it is written: in code values of 255 where it is a whole number of them."""
+def epsilon_text(epsilon: float | None) -> str:
+    """ε as text: "N/255" where it is a whole number of code values."""
     if epsilon is None:
         return "none"
     codes = epsilon * 255
@@ -69,25 +69,25 @@ def harden(
     photos: Sequence[np.ndarray],
     labels: Sequence[Sequence[int]],
     classifiers: Sequence[Classifier],
-    method: Method,
+    method: HardenMethod,
     epsilon: float | None,
     steps: int,
     step_size: float | None = None,
     through: float | None = None,
 ) -> list[np.ndarray]:
-    """Photographs H×W×3 of any sizes, hardened together; `labels[m][n]` is network m's index for photograph n.
+    """Harden uint8 photographs H×W×3 of any sizes together; `labels[m][n]` is network m's index for photograph n.
 
-    `epsilon` is in units of the full range, None for no bound; `step_size` replaces the method's own at the start;
-    `through` is the ε of the attack to withstand, for THROUGH_STEPS times the passes, None for the unattacked loss.
+    `epsilon` is in units of the full range, None for no bound; `step_size` replaces the method's first step
+    size; `through` is the ε of an attack to withstand (it multiplies passes by 1 + THROUGH_STEPS), None for no attack.
     """
     start = [_tensor(photo) for photo in photos]
     truth = [torch.tensor(indices) for indices in labels]
     pixels = [picture.clone().requires_grad_(True) for picture in start]
-    step = step_size or _step(method, epsilon, steps)
+    step = step_size or _first_step_size(method, epsilon, steps)
     adam = torch.optim.Adam(pixels, lr=step) if method == "adam" else None
     for number in range(steps):
         alpha = step if method == "fgsm" else step * (1 - number / steps)
-        gradients = torch.autograd.grad(_evened_loss(pixels, truth, classifiers, through), pixels)
+        gradients = torch.autograd.grad(_total_loss(pixels, truth, classifiers, through), pixels)
         with torch.no_grad():
             for picture, gradient in zip(pixels, gradients, strict=True):
                 if adam is None:
@@ -98,55 +98,55 @@ def harden(
                 adam.param_groups[0]["lr"] = alpha
                 adam.step()
             for picture, original in zip(pixels, start, strict=True):
-                picture.copy_(_projected(picture, original, epsilon))
-    return [_rounded(picture.detach(), photo, epsilon) for picture, photo in zip(pixels, photos, strict=True)]
+                picture.copy_(_project(picture, original, epsilon))
+    return [_round_to_codes(picture.detach(), photo, epsilon) for picture, photo in zip(pixels, photos, strict=True)]
 
 
-def squares(photos: Sequence[np.ndarray], classifier: Classifier) -> Tensor:
-    """N×3×S×S in [0, 1]: what the network sees of uint8 photographs of any sizes."""
+def center_squares(photos: Sequence[np.ndarray], classifier: Classifier) -> Tensor:
+    """The network's input N×3×S×S in [0, 1] from uint8 photographs of any sizes."""
     return torch.cat([center_square(_tensor(photo), classifier.input_px) for photo in photos])
 
 
-def moved(original: np.ndarray, hardened: np.ndarray) -> tuple[float, float]:
-    """How far a photograph moved: RMS over all values in [0, 1], and the mean SSIM (11 px Gaussian window)."""
+def image_change(original: np.ndarray, hardened: np.ndarray) -> tuple[float, float]:
+    """How much a photograph changed: RMS of values in [0, 1], and mean SSIM (11 px Gaussian window)."""
     from kornia.metrics import ssim
 
     a, b = _tensor(original), _tensor(hardened)
-    # a channel at a time: the maps behind it are a dozen times as large as what they are of
+    # one channel at a time, since SSIM's maps take a dozen times the channel's memory
     similar = [float(ssim(a[:, i : i + 1], b[:, i : i + 1], window_size=11).double().mean()) for i in range(3)]
     return float((a - b).double().square().mean().sqrt()), sum(similar) / 3
 
 
-def _evened_loss(
+def _total_loss(
     pixels: Sequence[Tensor], truth: Sequence[Tensor], classifiers: Sequence[Classifier], through: float | None
 ) -> Tensor:
     logits = []
     for classifier, labels in zip(classifiers, truth, strict=True):
         view = torch.cat([center_square(picture, classifier.input_px) for picture in pixels])
         if through is not None:
-            here = view.detach()
-            *_, worst = pgd(classifier.network, here, labels, through, cross_entropy, THROUGH_STEPS)
-            view = view + (worst - here)
+            start = view.detach()
+            *_, worst = pgd(classifier.network, start, labels, through, cross_entropy, THROUGH_STEPS)
+            view = view + (worst - start)
         logits.append(classifier.network(view))
-    return even_loss(logits, truth, cross_entropy)
+    return balanced_loss(logits, truth, cross_entropy)
 
 
-def _step(method: Method, epsilon: float | None, steps: int) -> float:
+def _first_step_size(method: HardenMethod, epsilon: float | None, steps: int) -> float:
     if method == "fgsm":
         return (1 if epsilon is None else epsilon) / steps
     if epsilon is None:
-        return UNBOUNDED_STEP
+        return UNBOUNDED_STEP_SIZE
     return max(epsilon / 4, 2 * epsilon / (steps + 1))  # so that few steps, too, reach the ball's edge together
 
 
-def _projected(pixels: Tensor, original: Tensor, epsilon: float | None) -> Tensor:
+def _project(pixels: Tensor, original: Tensor, epsilon: float | None) -> Tensor:
     if epsilon is not None:
         pixels = torch.clamp(pixels, original - epsilon, original + epsilon)
     return pixels.clamp(0, 1)
 
 
-def _rounded(pixels: Tensor, original: np.ndarray, epsilon: float | None) -> np.ndarray:
-    """uint8 within the ball: rounding may not leave it, or a stated ε would be exceeded by half a code value."""
+def _round_to_codes(pixels: Tensor, original: np.ndarray, epsilon: float | None) -> np.ndarray:
+    """Round to uint8 within the ε-ball; plain rounding could exceed a stated ε by half a code value."""
     values = (pixels[0].permute(1, 2, 0).double() * 255).round().numpy().astype(np.int16)
     if epsilon is not None:
         reach = int(np.floor(epsilon * 255 + 1e-6))  # 8/255 is 8 code values

@@ -1,12 +1,12 @@
-"""Photographs changed so that networks recognize them better, and what attacks leave of that.
+"""Change photographs so that networks recognize them better, and attack the results.
 
 In: images, a CSV of file names and labels, networks. Out: PNGs under the images' names at their own sizes, and tables:
 accuracy clean and attacked, hardened beside original on the same photographs, per network, with 95 % intervals; how far
-the images moved. What is judged are the 8-bit PNGs as a reader of the file gets them. A cell of the table where a
-stronger attack leaves more than a weaker one is flagged: there the attack failed, not the network held.
+the images moved. The 8-bit PNGs are judged as a reader of the file gets them. A cell of the table is flagged where
+a stronger attack leaves more than a weaker one: there the attack failed.
 
-`harden_images` is the command's one setting; the study `harden` varies networks, methods and ε, and then its PNGs lie
-in `images/`. Originals are judged in cells of their own, once per network.
+`harden_images` runs the command's single variant; the study `harden` varies networks, methods and ε, and writes its
+PNGs to `images/`. Originals are judged in separate cells, once per network.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ import numpy as np
 import torch
 from pydantic import Field
 
-from patchlab.harden.attacks import ATTACKS, right
-from patchlab.harden.harden import Epsilon, Method, epsilon_words, harden, moved, squares
-from patchlab.harden.labeled import in_blocks, labeled_files, read_large_enough
-from patchlab.study.claims import clustered
-from patchlab.study.grid import Count, Names, short_name
-from patchlab.study.study import HERE, Cell, Finished, Result, Study, Work, carry_out
+from patchlab.harden.attacks import ATTACKS, is_correct
+from patchlab.harden.hardening import Epsilon, HardenMethod, center_squares, epsilon_text, harden, image_change
+from patchlab.harden.labeled_photos import list_labeled_files, read_large_enough, split_into_blocks
+from patchlab.study.estimates import cluster_mean
+from patchlab.study.grid import Names, PositiveInt, short_name
+from patchlab.study.study import DEFAULT_WORK, Cell, FinishedStudy, Result, Study, Work, run_cells
 from patchproof.base.errors import Refused
 from patchproof.base.intervals import estimate_difference, rate
 from patchproof.base.output import image_bytes, write_atomically
@@ -40,110 +40,113 @@ from patchproof.report.tables import Table
 Attack = Literal["fgsm", "pgd"]
 Condition = tuple[str, float]  # an attack and its ε
 CLEAN: Condition = ("clean", 0.0)
-_RANKS = {"clean": 0, "fgsm": 1, "pgd": 2}
+_ATTACK_RANKS = {"clean": 0, "fgsm": 1, "pgd": 2}
 
 
 class HardenSettings(StrictModel):
-    """Every method with every ε, for each network alone or for all of them together."""
+    """Settings: every method with every ε, for each network alone or for all networks together."""
 
     images: str  # a folder of images
     labels: str  # CSV: file name, label
-    models: Names  # hardened for, each alone
-    together: bool = False  # against the mean of the networks' losses
+    models: Names  # networks to harden for, each alone
+    together: bool = False  # harden for all networks at once, by their mean loss
     judges: tuple[str, ...] = ()  # networks that only judge
-    methods: Annotated[tuple[Method, ...], Field(min_length=1)] = ("pgd",)  # how to step
+    methods: Annotated[tuple[HardenMethod, ...], Field(min_length=1)] = ("pgd",)  # how to step
     # Largest change of a value in [0, 1]: 0.03, "8/255", or "none".
     epsilons: Annotated[tuple[Epsilon, ...], Field(min_length=1)] = (8 / 255, 0.1, None)
-    steps: Count = 100  # of hardening
-    step_size: Positive | None = None  # in place of the method's own
-    # ε of the PGD that each step goes through: for images that withstand it, at eight times the passes.
+    steps: PositiveInt = 100  # steps of hardening
+    step_size: Positive | None = None  # first step size; by default the method's own
+    # ε of a PGD attack that each step is taken under, so that images withstand it; takes eight times the passes.
     through: Annotated[Share, Field(gt=0)] | None = None
-    attacks: tuple[Attack, ...] = ("fgsm", "pgd")  # that are to be withstood
+    attacks: tuple[Attack, ...] = ("fgsm", "pgd")  # attacks to withstand
     attack_epsilons: tuple[Annotated[Share, Field(gt=0)], ...] = (0.01, 0.02, 0.04)  # the attacks' largest change
 
 
-def harden_images(settings: HardenSettings, out: str | Path, work: Work = HERE) -> Finished:
-    """Harden into the folder `out`: PNGs and labels.csv, which is again a labeled folder of images, and the tables."""
+def harden_images(settings: HardenSettings, out: str | Path, work: Work = DEFAULT_WORK) -> FinishedStudy:
+    """Harden images into the folder `out`: PNGs and labels.csv (again a labeled folder of images), and tables."""
     out, base = Path(out), Path.cwd()
     if out.resolve() == Path(expand_path(settings.images, base)).resolve():
         raise Refused("another folder for hardened images than the originals'", str(out), "choose another --out")
-    # PNGs beside the tables are this command's own only where its JSON says so
-    own = (*STUDY.own_files, "labels.csv", "*.png") if (out / "harden.json").is_file() else STUDY.own_files
-    finished = carry_out(replace(STUDY, own_files=own), settings, base, out, work)
-    lines = [f'{photo["png"]},"{photo["label"]}"\n' for photo in _photos(finished.results, _variants(settings)[0])]
+    # PNGs beside the tables may be replaced only where this command's JSON says that it wrote them
+    own_files = (*STUDY.own_files, "labels.csv", "*.png") if (out / "harden.json").is_file() else STUDY.own_files
+    finished = run_cells(replace(STUDY, own_files=own_files), settings, base, out, work)
+    lines = [f'{photo["png"]},"{photo["label"]}"\n' for photo in _photos_of(finished.results, _variants(settings)[0])]
     write_atomically(out / "labels.csv", lambda path: path.write_text("file,label\n" + "".join(lines), "utf-8"))
     return finished
 
 
 def cells(settings: HardenSettings, base: Path) -> list[Cell]:
-    """Originals by network, and every variant, in blocks of photographs; networks and labels are checked here."""
+    """Cells of originals by network and of every variant, in blocks of photographs; checks networks and labels."""
     folder = Path(expand_path(settings.images, base))
-    rows = labeled_files(folder, Path(expand_path(settings.labels, base)))
+    rows = list_labeled_files(folder, Path(expand_path(settings.labels, base)))
     names = tuple(dict.fromkeys((*settings.models, *settings.judges)))
     for name in names:
-        _truth(name, base, [label for _, _, label in rows])
+        _label_indices(name, base, [label for _, _, label in rows])
     variants, work = _variants(settings), []
-    for number, block in enumerate(in_blocks(folder, rows), 1):
+    for number, block in enumerate(split_into_blocks(folder, rows), 1):
         photos = [{"file": file, "png": png, "label": label} for file, png, label in block]
-        for at, name in enumerate(names, 1):
-            work.append(Cell(f"original{at}_{number:04d}", {"photos": photos, "judges": [name]}))
-        for at, variant in enumerate(variants, 1):
-            words = f"{at:02d}_{variant['method']}_{epsilon_words(variant['epsilon']).replace('/', '-')}"
+        for index, name in enumerate(names, 1):
+            work.append(Cell(f"original{index}_{number:04d}", {"photos": photos, "judges": [name]}))
+        for index, variant in enumerate(variants, 1):
+            words = f"{index:02d}_{variant['method']}_{epsilon_text(variant['epsilon']).replace('/', '-')}"
             judges = list(dict.fromkeys((*variant["models"], *settings.judges)))
-            into = "" if len(variants) == 1 else f"images/{words}/"
-            values = {"photos": photos, "judges": judges, "variant": variant, "folder": into}
-            work.append(Cell(f"hardened{at}_{number:04d}", values))
+            folder_out = "" if len(variants) == 1 else f"images/{words}/"
+            values = {"photos": photos, "judges": judges, "variant": variant, "folder": folder_out}
+            work.append(Cell(f"hardened{index}_{number:04d}", values))
     return work
 
 
 def run(settings: HardenSettings, base: Path, cell: Cell) -> dict[str, Any]:
-    """One block: hardened if it has a variant, then judged."""
+    """Harden one block if it has a variant, then judge it."""
     values, folder = cell.values, Path(expand_path(settings.images, base))
     photos, originals, unread = [], [], []
     for photo in values["photos"]:
         try:
             originals.append(read_large_enough(folder / photo["file"]))
             photos.append(photo | {"right": {}})
-        except PhotoRejected as cannot:
-            unread.append({"file": photo["file"], "reason": cannot.advice})
+        except PhotoRejected as error:
+            unread.append({"file": photo["file"], "reason": error.advice})
     labels, pictures, files = [photo["label"] for photo in photos], originals, {}
     if photos and "variant" in values:
         names, how = values["variant"]["models"], (values["variant"]["method"], values["variant"]["epsilon"])
-        networks, truth = [_classifier(name, base) for name in names], [_truth(name, base, labels) for name in names]
+        networks, truth = (
+            [_classifier(name, base) for name in names],
+            [_label_indices(name, base, labels) for name in names],
+        )
         steps = settings.steps, settings.step_size, settings.through
         pictures = harden(originals, truth, networks, *how, *steps)
         for photo, original, picture in zip(photos, originals, pictures, strict=True):
             files[values["folder"] + photo["png"]] = image_bytes(picture, "PNG")
-            photo["rms"], photo["ssim"] = moved(original, picture)
+            photo["rms"], photo["ssim"] = image_change(original, picture)
     for name in values["judges"] if photos else ():
-        truth = torch.tensor(_truth(name, base, labels))
-        outcomes = _judged(settings, _classifier(name, base), pictures, truth)
+        truth = torch.tensor(_label_indices(name, base, labels))
+        outcomes = _judge(settings, _classifier(name, base), pictures, truth)
         for i, photo in enumerate(photos):
             photo["right"][name] = [bool(outcome[i]) for outcome in outcomes]
     return {"photos": photos, "unread": unread} | files
 
 
-def _judged(
+def _judge(
     settings: HardenSettings, classifier: Classifier, pictures: Sequence[np.ndarray], truth: torch.Tensor
 ) -> list[torch.Tensor]:
-    """Under each condition, whether the network is right about the photographs."""
-    views, network = squares(pictures, classifier), classifier.network
+    """Per condition N bool: the network is correct about the photographs."""
+    views, network = center_squares(pictures, classifier), classifier.network
     with torch.no_grad():
-        outcomes = [right(network(views), truth)]
-    _, *attacks = _conditions(settings).values()
+        outcomes = [is_correct(network(views), truth)]
+    _, *attacks = _attack_conditions(settings).values()
     return outcomes + [ATTACKS[attack](network, views, truth, epsilon) for attack, epsilon in attacks]
 
 
 def tables(settings: HardenSettings, results: Sequence[Result]) -> list[Table]:
-    """Accuracy with intervals and flags, how far images moved, and what could not be read."""
+    """Tables of accuracy with intervals and flags, of changes to the images, and of unreadable files."""
     rows, distances = [], []
     for variant in _variants(settings):
         for name in dict.fromkeys((*variant["models"], *settings.judges)):
             rows += _accuracy_rows(settings, results, variant, name)
-        if photos := list(_photos(results, variant)):
+        if photos := list(_photos_of(results, variant)):
             rms, ssim = ([photo[kind] for photo in photos] for kind in ("rms", "ssim"))
             row = (len(photos), float(np.mean(rms)), max(rms), float(np.mean(ssim)), min(ssim))
-            distances.append((*_words(variant), *row))
+            distances.append((*_variant_texts(variant), *row))
     head = ("network", "hardened for", "method", "epsilon", "attack")
     head = (*head, "original", "hardened", "gain", "gain by class", "flag")
     about = (
@@ -164,39 +167,39 @@ def tables(settings: HardenSettings, results: Sequence[Result]) -> list[Table]:
 def _accuracy_rows(
     settings: HardenSettings, results: Sequence[Result], variant: Mapping[str, Any], name: str
 ) -> list[tuple]:
-    before, after = _outcomes(results, None, name), _outcomes(results, variant, name)
+    before, after = _outcomes_by_file(results, None, name), _outcomes_by_file(results, variant, name)
     if not (files := [file for file in after if file in before]):
         return []
-    conditions = _conditions(settings)
+    conditions = _attack_conditions(settings)
     pairs = {
         condition: [[some[file][i] for file in files] for some in (before, after)]
         for i, condition in enumerate(conditions.values())
     }
-    left = {
+    survivors = {
         word: {condition: sum(pair[side]) for condition, pair in pairs.items()}
         for side, word in enumerate(("original", "hardened"))
     }
-    label = {photo["file"]: photo["label"] for photo in _photos(results, variant)}
+    label = {photo["file"]: photo["label"] for photo in _photos_of(results, variant)}
     classes = [[i for i, file in enumerate(files) if label[file] == each] for each in dict.fromkeys(label.values())]
-    group, *how = _words(variant)
+    group, *how = _variant_texts(variant)
     start = (short_name(name), "itself" if variant["models"] == [name] else group, *how)
     return [
         (
             *(*start, words, rate(old), rate(new), estimate_difference(new, old)),
-            clustered([float(np.mean([new[i] - old[i] for i in rows])) for rows in classes if rows]),
-            ", ".join(word for word, survivors in left.items() if too_strong(condition, survivors)),
+            cluster_mean([float(np.mean([new[i] - old[i] for i in rows])) for rows in classes if rows]),
+            ", ".join(word for word, counts in survivors.items() if attack_failed(condition, counts)),
         )
         for (words, condition), (old, new) in zip(conditions.items(), pairs.values(), strict=True)
     ]
 
 
-def too_strong(condition: Condition, survivors: Mapping[Condition, int]) -> bool:
-    """Whether more survive this attack than some weaker one: nothing, a smaller ε, or FGSM against PGD."""
+def attack_failed(condition: Condition, survivors: Mapping[Condition, int]) -> bool:
+    """True if more pictures survive this attack than a weaker one: none, a smaller ε, or FGSM against PGD."""
     attack, epsilon = condition
     return any(
         survivors[condition] > count
         for (other, smaller), count in survivors.items()
-        if _RANKS[other] <= _RANKS[attack] and smaller <= epsilon
+        if _ATTACK_RANKS[other] <= _ATTACK_RANKS[attack] and smaller <= epsilon
     )
 
 
@@ -213,14 +216,14 @@ def _variants(settings: HardenSettings) -> list[dict[str, Any]]:
     ]
 
 
-def _conditions(settings: HardenSettings) -> dict[str, Condition]:
-    """By what tables call it: clean, then each attack with each ε."""
+def _attack_conditions(settings: HardenSettings) -> dict[str, Condition]:
+    """Conditions by their names in tables: clean, then each attack with each ε."""
     attacks = [(attack, epsilon) for attack in settings.attacks for epsilon in settings.attack_epsilons]
     return {"clean": CLEAN, **{f"{attack} {epsilon:g}": (attack, epsilon) for attack, epsilon in attacks}}
 
 
-def _words(variant: Mapping[str, Any]) -> tuple[str, str, str]:
-    return ", ".join(map(short_name, variant["models"])), variant["method"], epsilon_words(variant["epsilon"])
+def _variant_texts(variant: Mapping[str, Any]) -> tuple[str, str, str]:
+    return ", ".join(map(short_name, variant["models"])), variant["method"], epsilon_text(variant["epsilon"])
 
 
 @lru_cache(maxsize=4)  # a process works through one study: its networks stay loaded
@@ -228,20 +231,21 @@ def _classifier(name: str, base: Path) -> Classifier:
     return load_classifier(name, base)
 
 
-def _truth(name: str, base: Path, labels: Sequence[str]) -> list[int]:
-    """A network's indices of labels; refused where it does not have one."""
+def _label_indices(name: str, base: Path, labels: Sequence[str]) -> list[int]:
+    """A network's indices of labels; refused if it lacks one."""
     known = _classifier(name, base).labels
     index = {label: find_labels(known, int(label) if label.isdigit() else label)[0] for label in dict.fromkeys(labels)}
     return [index[label] for label in labels]
 
 
-def _photos(results: Sequence[Result], variant: Mapping[str, Any] | None) -> Iterator[Mapping[str, Any]]:
-    """The photographs of a variant, or the originals."""
+def _photos_of(results: Sequence[Result], variant: Mapping[str, Any] | None) -> Iterator[Mapping[str, Any]]:
     for result in results:
         if result.cell.values.get("variant") == variant:
             yield from result.answers["photos"]
 
 
-def _outcomes(results: Sequence[Result], variant: Mapping[str, Any] | None, name: str) -> dict[str, Sequence[bool]]:
-    """By file, whether the network is right under each condition."""
-    return {photo["file"]: photo["right"][name] for photo in _photos(results, variant) if name in photo["right"]}
+def _outcomes_by_file(
+    results: Sequence[Result], variant: Mapping[str, Any] | None, name: str
+) -> dict[str, Sequence[bool]]:
+    """By file: if the network is correct, one bool per condition."""
+    return {photo["file"]: photo["right"][name] for photo in _photos_of(results, variant) if name in photo["right"]}

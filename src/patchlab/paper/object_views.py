@@ -1,7 +1,7 @@
-"""The object from a few sides: views to look at, and its mean color.
+"""Views of the object from fixed sides, and its mean color.
 
-In: a problem and what shows. Out: conditions, a mean color. Views from the sides have even light and a still camera;
-they are for eyes and are never counted as a rate.
+In: a problem and an appearance. Out: conditions, a mean color. Views from the sides have even light and a still camera;
+they are for people to look at, never for rates.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from patchproof.render.photograph import Appearance, shade
 from patchproof.scene.conditions import Conditions, with_values
 
 
-def from_sides(problem: Problem, azimuth_deg: np.ndarray) -> Conditions:
-    """Views from these azimuths at the middle of the scene's other ranges, in even light, before one background."""
+def views_from(problem: Problem, azimuth_deg: np.ndarray) -> Conditions:
+    """Views from these azimuths in even light, at the middle of all other ranges, with one background."""
     drawn, view = problem.scene.draw("evaluate", 1), problem.scene.settings.view
     pose = Pose(
         azimuth_deg=np.asarray(azimuth_deg, float),
@@ -30,26 +30,26 @@ def from_sides(problem: Problem, azimuth_deg: np.ndarray) -> Conditions:
     return Conditions(pose=pose, light=light, print=drawn.print, sensor=sensor)
 
 
-def sides(problem: Problem, count: int) -> Conditions:
-    """Views for a contact sheet: evenly through the scene's azimuths, or draws where there is no mesh to go round."""
+def views_from_sides(problem: Problem, count: int) -> Conditions:
+    """Views for a contact sheet: evenly through the scene's azimuths, or drawn where the scene has no mesh."""
     if not problem.scene.HAS_OBJECT:
         return problem.scene.draw("evaluate", count)
     low, high = problem.scene.settings.view.azimuth_deg
-    return from_sides(problem, low + (high - low) * (np.arange(count) + 0.5) / count)
+    return views_from(problem, low + (high - low) * (np.arange(count) + 0.5) / count)
 
 
-def three_views(problem: Problem, lights: int) -> Conditions:
-    """Three fixed views round a mesh (see `sides`), each in `lights` drawn lights, backgrounds and cameras; 3 · lights
-    conditions, view by view.
+def views_in_drawn_light(problem: Problem, lights: int) -> Conditions:
+    """Three fixed views of a mesh (`views_from_sides`), each in `lights` drawn lights, backgrounds and cameras:
+    3 · lights conditions, view by view.
     """
-    poses = sides(problem, 3)[np.repeat(np.arange(3), lights)]
+    poses = views_from_sides(problem, 3)[np.repeat(np.arange(3), lights)]
     drawn = problem.scene.draw("evaluate", 3 * lights)
     return with_values(drawn, **{name: getattr(poses.pose, name) for name in EFFECT_BY_NAME["viewpoint"].fields})
 
 
 def mean_color(problem: Problem, shown: Appearance, views: int, side_px: int) -> tuple[int, int, int]:
-    """sRGB codes of the mean light of the object's pixels, its outlines apart, over a full turn in even white light."""
-    turned = problem.see(shown, from_sides(problem, np.arange(views) * 360 / views), side_px)
+    """sRGB codes of the object's mean light, without its outlines, over a full turn in even white light."""
+    turned = problem.see(shown, views_from(problem, np.arange(views) * 360 / views), side_px)
     with torch.no_grad():
         light = shade(turned, shown).permute(0, 2, 3, 1).reshape(-1, 3)
     within = torch.zeros(len(light), dtype=torch.bool, device=light.device)

@@ -1,4 +1,4 @@
-"""Estimates that tables of studies and benchmarks state besides `patchproof.base.intervals`: of means, medians, clusters.
+"""Estimates of means, medians and clusters, for tables of studies and benchmarks.
 
 Source: Morey, Tutorials in Quantitative Methods for Psychology 4 (2008) 61-64 (several settings on the same seeds).
 """
@@ -14,35 +14,37 @@ from scipy.stats import binom, t
 
 from patchproof.base.intervals import CONFIDENCE, MIN_CLUSTERS, Estimate, resampled_means, student_mean
 
-_ENDS = (1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2  # of an interval, as shares of a distribution
+_INTERVAL_QUANTILES = (1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2  # of an interval, as shares of a distribution
 
 
 def mean(values: Sequence[float]) -> Estimate | None:
-    """The mean with Student's interval; None of fewer than two values."""
+    """The mean with Student's interval; None for fewer than two values."""
     return student_mean(values) if len(values) > 1 else None
 
 
 def median(values: Sequence[float] | np.ndarray) -> Estimate:
-    """The median with its distribution-free interval from order statistics; of few values, their range."""
+    """The median with its distribution-free interval from order statistics; for few values, their range."""
     ordered, n = sorted(map(float, values)), len(values)
-    skipped = max(int(binom.ppf(_ENDS[0], n, 0.5)) - 1, 0)
+    skipped = max(int(binom.ppf(_INTERVAL_QUANTILES[0], n, 0.5)) - 1, 0)
     return Estimate(statistics.median(ordered), ordered[skipped], ordered[n - 1 - skipped], n)
 
 
 def paired_means(values: np.ndarray) -> list[Estimate]:
-    """Means of the columns of S×K (K settings tried on the same S seeds) with intervals for comparing them: what all
-    settings of a seed have in common is taken out, and what is left gets Student's interval (Morey 2008).
+    """Means of the columns of S×K (K settings, each with S seeds), with intervals for comparing settings: the mean of
+    each seed is subtracted, and the remainder gets Student's interval (Morey 2008).
     """
     seeds, settings = values.shape
-    left = values - values.mean(1, keepdims=True)
-    half = float(t.ppf(_ENDS[1], seeds - 1)) * left.std(0, ddof=1) * math.sqrt(settings / (settings - 1) / seeds)
+    centered = values - values.mean(1, keepdims=True)
+    half = (
+        float(t.ppf(_INTERVAL_QUANTILES[1], seeds - 1))
+        * centered.std(0, ddof=1)
+        * math.sqrt(settings / (settings - 1) / seeds)
+    )
     return [Estimate(float(m), float(m - h), float(m + h), seeds) for m, h in zip(values.mean(0), half, strict=True)]
 
 
-def clustered(values: Sequence[float]) -> Estimate | float | None:
-    """The mean of one figure per cluster as a table says it, n the number of clusters: without an interval where they
-    are too few for one, None of nothing.
-    """
+def cluster_mean(values: Sequence[float]) -> Estimate | float | None:
+    """The mean of one figure per cluster; a plain number if clusters are too few for an interval, None if none."""
     if len(values) < MIN_CLUSTERS:
         return statistics.fmean(values) if values else None
     value, (low, high) = clustered_mean(values)
@@ -50,20 +52,19 @@ def clustered(values: Sequence[float]) -> Estimate | float | None:
 
 
 def clustered_mean(values: Sequence[float]) -> tuple[float, tuple[float, float]]:
-    """Mean of one figure per cluster with a percentile bootstrap over clusters: what is alike within a cluster (seeds
-    and conditions of one object before one network) is not evidence of its own. The same values give the same
-    interval. Needs LEAST_CLUSTERS: of fewer it would claim far too much (of one, certainty), and of ten it covers
-    about nine times in ten.
+    """Mean of one figure per cluster with a percentile bootstrap over clusters, since values within a cluster (seeds
+    and conditions of one object and network) are alike. Repeatable. Needs MIN_CLUSTERS: fewer would give far too narrow
+    intervals (one: a point), and with ten it covers about nine times in ten.
     """
     if len(values) < MIN_CLUSTERS:
         raise ValueError(f"expected at least {MIN_CLUSTERS} clusters, got {len(values)}")
     means = resampled_means(np.asarray(values, float), 10_000)
-    low, high = np.quantile(means, _ENDS)
+    low, high = np.quantile(means, _INTERVAL_QUANTILES)
     return float(np.mean(values)), (float(low), float(high))
 
 
 def clustered_median(values: np.ndarray) -> Estimate:
-    """The median of n × ... values with a percentile bootstrap over the n rows; the same values, the same interval."""
+    """The median of n × ... values with a percentile bootstrap over the n rows; repeatable."""
     rows = np.random.default_rng(0).integers(0, len(values), (1000, len(values)))
     low, high = np.quantile(
         [np.median(values[picked]) for picked in rows], ((1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2)

@@ -1,11 +1,11 @@
-"""How far photographs by real cameras lie from what our channel makes of the same print.
+"""Compare photographs by real cameras with our channel's rendering of the same print.
 
-In: photographs of printed boards of markers, whose pattern is known without having been there. Each is found, its
-light, printed black and blur are fitted (`board_fit`), and print, light and camera of our channel render it again in
-its place. Out, by photograph: what is left in code values, edge widths, blur, noise, light, black beside the defaults
-of scenes; and how far networks' answers move when the rendering takes the board's place, beside two changes that nobody
-would mind: the photograph saved again as JPEG, or moved by half a pixel. What cannot be used is listed with the reason.
-Photographs by one camera are one case, so medians carry no intervals.
+In: photographs of printed boards of markers, whose pattern is known. Each board is found, its light, printed black and
+blur are fitted (`board_fit`), and print, light and camera of our channel render it again in its place. Out, by
+photograph: the residual in code values, edge widths, blur, noise, light and black beside the defaults of scenes; and
+the change of networks' answers when the rendering replaces the board, beside two harmless changes: the photograph saved
+again as JPEG, or moved by half a pixel. Unusable photographs are listed with the reason. Photographs by one camera are
+not independent, so medians have no intervals.
 Left out on purpose: color, since boards are black and white; distances and angles, as these cameras are not calibrated.
 """
 
@@ -24,8 +24,8 @@ from pydantic import Field
 
 from patchlab.study.figures import picture_sheet
 from patchlab.study.study import Cell, Result, Study
-from patchlab.validation.board_fit import BoardFit, edge_of, fit_board, white_noise
-from patchlab.validation.known_boards import BoardSettings, Pose, find_pose
+from patchlab.validation.board_fit import BoardFit, edge_profile, fit_board, white_noise
+from patchlab.validation.marker_boards import BoardPose, BoardSettings, find_board
 from patchproof.base.color import LUMINANCE, linear_from_srgb
 from patchproof.base.geometry import rect_corners
 from patchproof.base.output import image_bytes, image_pixels
@@ -47,9 +47,9 @@ if TYPE_CHECKING:
 _JPEG_QUALITY, _SHIFT_PX = 90, 0.5
 _CHANGES = ("our rendering", f"JPEG {_JPEG_QUALITY}", "half a pixel")
 _PANEL_PX, _MARGIN_PX = (480, 360), 6
-_AMPLIFIED = 2  # of the difference in pictures
-_ON_A_SHEET = 5
-# by key what it is called in tables
+_DIFFERENCE_GAIN = 2  # factor of the difference in pictures
+_PHOTOS_PER_SHEET = 5
+# names of figures in tables, by key
 _FIGURES = {
     "residual_rms": "what is left, RMS, code values",
     "residual_p95": "what is left, 95 % point, code values",
@@ -68,14 +68,14 @@ _FIGURES = {
 
 
 class RealSettings(StrictModel):
-    """Whose photographs, of which boards, and the networks that look at them."""
+    """Photographs of boards, and the networks that are asked about them."""
 
-    boards: Annotated[dict[str, BoardSettings], Field(min_length=1)]  # by a name for camera and board
-    networks: tuple[str, ...] = ("builtin",)  # whose answers are compared
+    boards: Annotated[dict[str, BoardSettings], Field(min_length=1)]  # by name of camera and board
+    networks: tuple[str, ...] = ("builtin",)  # networks whose answers are compared
 
 
 def cells(settings: RealSettings, base: Path) -> list[Cell]:
-    """One for each photograph."""
+    """A cell per photograph."""
     photos = []
     for name, board in settings.boards.items():
         for text in board.photos:
@@ -86,31 +86,31 @@ def cells(settings: RealSettings, base: Path) -> list[Cell]:
 
 
 def run(settings: RealSettings, base: Path, cell: Cell) -> dict[str, Any]:
-    """The figures of one photograph, the changes by network, and a picture; or why it was left out."""
+    """Figures of one photograph, changes by network, and a picture; or the reason why it was left out."""
     try:
         srgb = read_photo(expand_path(cell.values["photo"], base)).srgb
-        pose = find_pose(srgb, settings.boards[cell.values["board"]])
+        pose = find_board(srgb, settings.boards[cell.values["board"]])
         fit = fit_board(srgb, pose)
-    except PhotoRejected as cannot:
-        return {"left_out": cannot.advice}
+    except PhotoRejected as error:
+        return {"left_out": error.advice}
     ours = fit.rendered()
     pasted = np.where(fit.mask[..., None], ours, srgb)
-    networks = {name: _changes(_network(name, str(base)), srgb, pasted) for name in settings.networks}
-    answers = {"left_out": None, **_figures(srgb, ours, pose, fit), "networks": networks}
-    return answers | {f"{cell.name}.png": _picture(srgb, pasted, fit)}
+    networks = {name: _measure_changes(_network(name, str(base)), srgb, pasted) for name in settings.networks}
+    answers = {"left_out": None, **_photo_figures(srgb, ours, pose, fit), "networks": networks}
+    return answers | {f"{cell.name}.png": _compare_pictures(srgb, pasted, fit)}
 
 
-def _figures(srgb: np.ndarray, ours: np.ndarray, pose: Pose, fit: BoardFit) -> dict[str, Any]:
-    left = (srgb.astype(float) - ours)[fit.mask]
-    edge_photo, overshoot = edge_of(fit.paper_seen(srgb), fit.prints, pose.module_px)
+def _photo_figures(srgb: np.ndarray, ours: np.ndarray, pose: BoardPose, fit: BoardFit) -> dict[str, Any]:
+    residual = (srgb.astype(float) - ours)[fit.mask]
+    edge_photo, overshoot = edge_profile(fit.paper_seen(srgb), fit.prints, pose.module_px)
     noise, uneven = white_noise(fit, srgb)
     paper = (fit.light @ np.array(LUMINANCE))[fit.mask]
     return {
         "markers": f"{pose.found} of {pose.expected}",
-        "residual_rms": float(np.sqrt((left**2).mean())),
-        "residual_p95": float(np.percentile(np.abs(left), 95)),
+        "residual_rms": float(np.sqrt((residual**2).mean())),
+        "residual_p95": float(np.percentile(np.abs(residual), 95)),
         "edge_photo_px": edge_photo,
-        "edge_ours_px": edge_of(fit.paper_seen(ours), fit.prints, pose.module_px)[0],
+        "edge_ours_px": edge_profile(fit.paper_seen(ours), fit.prints, pose.module_px)[0],
         "overshoot": overshoot,
         "blur_px": fit.blur_px,
         "noise": noise,
@@ -129,13 +129,13 @@ def _network(name: str, base: str) -> Classifier:
     return load_classifier(name, Path(base))
 
 
-def _changes(network: Classifier, srgb: np.ndarray, pasted: np.ndarray) -> dict[str, Any]:
-    """By change: whether the label is another one, by how much its confidence grew, the RMS of log-probabilities."""
+def _measure_changes(network: Classifier, srgb: np.ndarray, pasted: np.ndarray) -> dict[str, Any]:
+    """By change: if the label changed, the change of its confidence, the RMS change of log-probabilities."""
     again = image_pixels(image_bytes(srgb, "JPEG", {"quality": _JPEG_QUALITY}))
     by_half = np.array([[1, 0, _SHIFT_PX], [0, 1, 0]])
     beside = cv2.warpAffine(srgb, by_half, srgb.shape[1::-1], flags=cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE)
     with torch.inference_mode():
-        logs = [_log_odds(network, picture) for picture in (srgb, pasted, again, beside)]
+        logs = [_log_probabilities(network, picture) for picture in (srgb, pasted, again, beside)]
     before, best = logs[0], int(logs[0].argmax())
     found: dict[str, Any] = {"label": network.labels[best], "confidence": float(np.exp(before[best]))}
     for name, after in zip(_CHANGES, logs[1:], strict=True):
@@ -148,21 +148,20 @@ def _changes(network: Classifier, srgb: np.ndarray, pasted: np.ndarray) -> dict[
     return found
 
 
-def _log_odds(network: Classifier, srgb: np.ndarray) -> np.ndarray:
+def _log_probabilities(network: Classifier, srgb: np.ndarray) -> np.ndarray:
     return torch.log_softmax(network.logits(from_pixels(srgb)[None]).double(), 1)[0].numpy()
 
 
-def _picture(srgb: np.ndarray, pasted: np.ndarray, fit: BoardFit) -> bytes:
-    """Photograph, rendering in its place, and their difference about gray, side by side, cut out around the board."""
+def _compare_pictures(srgb: np.ndarray, pasted: np.ndarray, fit: BoardFit) -> bytes:
+    """PNG of the photograph, the rendering in its place, and their difference around gray, cropped to the board."""
     rows, columns = np.nonzero(fit.mask)
     corners = rect_corners((columns.min(), rows.min(), np.ptp(columns) + 1, np.ptp(rows) + 1))
     box = region_around(corners, _MARGIN_PX, srgb.shape)
-    difference = np.clip(128 + _AMPLIFIED * (srgb.astype(float) - pasted), 0, 255).astype(np.uint8)
+    difference = np.clip(128 + _DIFFERENCE_GAIN * (srgb.astype(float) - pasted), 0, 255).astype(np.uint8)
     return png(np.concatenate([_panel(picture[box]) for picture in (srgb, pasted, difference)], 1))
 
 
 def _panel(picture: np.ndarray) -> np.ndarray:
-    """A picture as large as fits in the middle of a white panel."""
     panel = np.full((_PANEL_PX[1], _PANEL_PX[0], 3), 255, np.uint8)
     scale = min((_PANEL_PX[0] - 8) / picture.shape[1], _PANEL_PX[1] / picture.shape[0])
     size = round(picture.shape[1] * scale), round(picture.shape[0] * scale)
@@ -173,7 +172,7 @@ def _panel(picture: np.ndarray) -> np.ndarray:
 
 
 def tables(settings: RealSettings, results: Sequence[Result]) -> Sequence[Table]:
-    """Medians by board, networks by board, every photograph, every answer, and what was left out."""
+    """Tables: medians by board, networks by board, every photograph, every answer, photographs left out."""
     return (
         _by_board(settings, results),
         _by_network(settings, results),
@@ -183,16 +182,18 @@ def tables(settings: RealSettings, results: Sequence[Result]) -> Sequence[Table]
     )
 
 
-def _used(results: Sequence[Result], board: str | None = None) -> list[Result]:
-    mine = [result for result in results if board in (None, result.cell.values["board"])]
-    return [result for result in mine if result.answers["left_out"] is None]
+def _used_results(results: Sequence[Result], board: str | None = None) -> list[Result]:
+    of_board = [result for result in results if board in (None, result.cell.values["board"])]
+    return [result for result in of_board if result.answers["left_out"] is None]
 
 
 def _by_board(settings: RealSettings, results: Sequence[Result]) -> Table:
     rows = []
     for board in settings.boards:
         for key, words in _FIGURES.items():
-            values = [result.answers[key] for result in _used(results, board) if result.answers[key] is not None]
+            values = [
+                result.answers[key] for result in _used_results(results, board) if result.answers[key] is not None
+            ]
             if values:
                 rows.append((board, words, statistics.median(values), min(values), max(values), len(values)))
     head = ("board", "figure", "median", "least", "most", "photographs")
@@ -202,8 +203,8 @@ def _by_board(settings: RealSettings, results: Sequence[Result]) -> Table:
 def _by_network(settings: RealSettings, results: Sequence[Result]) -> Table:
     rows = []
     for board in settings.boards:
-        for network in settings.networks if _used(results, board) else ():
-            answers = [result.answers["networks"][network] for result in _used(results, board)]
+        for network in settings.networks if _used_results(results, board) else ():
+            answers = [result.answers["networks"][network] for result in _used_results(results, board)]
             for change in _CHANGES:
                 each = [answer[change] for answer in answers]
                 labels = sum(one["changed"] for one in each)
@@ -217,7 +218,7 @@ def _by_network(settings: RealSettings, results: Sequence[Result]) -> Table:
 def _photographs(results: Sequence[Result]) -> Table:
     rows = tuple(
         (*_names(result), result.answers["markers"], *(result.answers[key] for key in (*_FIGURES, "clipped")))
-        for result in _used(results)
+        for result in _used_results(results)
     )
     head = ("board", "photograph", "markers", *_FIGURES.values(), "share of the board at full white")
     return Table("photographs", "Every photograph", head, rows)
@@ -225,7 +226,7 @@ def _photographs(results: Sequence[Result]) -> Table:
 
 def _answers(results: Sequence[Result]) -> Table:
     rows = []
-    for result in _used(results):
+    for result in _used_results(results):
         for network, answer in result.answers["networks"].items():
             for change in _CHANGES:
                 moved = (answer[change][key] for key in ("label", "confidence", "log_rms"))
@@ -247,14 +248,16 @@ def _names(result: Result) -> tuple[str, str]:
 
 
 def figures(settings: RealSettings, results: Sequence[Result]) -> Sequence[Drawing]:
-    """What scenes draw from beside what was found, and every photograph with its rendering."""
-    used = _used(results)
+    """A plot of fitted figures over the ranges of scenes, and every photograph with its rendering."""
+    used = _used_results(results)
     if not used:
         return ()
-    drawings = [Drawing("ranges", "What scenes draw from (gray), and photographs", _ranges(settings, used), (9.0, 3.0))]
-    columns = ("photograph", "our rendering in its place", f"difference × {_AMPLIFIED}, gray where equal")
-    for first in range(0, len(used), _ON_A_SHEET):
-        some = used[first : first + _ON_A_SHEET]
+    drawings = [
+        Drawing("ranges", "What scenes draw from (gray), and photographs", _range_plot(settings, used), (9.0, 3.0))
+    ]
+    columns = ("photograph", "our rendering in its place", f"difference × {_DIFFERENCE_GAIN}, gray where equal")
+    for first in range(0, len(used), _PHOTOS_PER_SHEET):
+        some = used[first : first + _PHOTOS_PER_SHEET]
         files = [(_caption(result), result.file(f"{result.cell.name}.png")) for result in some]
         title, size_in = f"Photographs {first + 1} to {first + len(some)}", (11.0, 3.0 * len(some))
         drawings.append(picture_sheet(f"pictures_{first:03d}", title, files, size_in, columns=columns))
@@ -267,8 +270,7 @@ def _caption(result: Result) -> str:
     return f"{' / '.join(_names(result))}: {left}, black {answers['black']:.3f}"
 
 
-def _ranges(settings: RealSettings, used: Sequence[Result]):
-    """Blur, noise and black of every photograph by board, over the ranges that are on by default."""
+def _range_plot(settings: RealSettings, used: Sequence[Result]):
     camera, printer = CameraSettings(), PrinterSettings()
     ink = load_printer(printer.profile).apply(torch.zeros(1, 3, 2, 2))[0, :, 0, 0].double().numpy()
     black = float(linear_from_srgb(ink) @ np.array(LUMINANCE))
@@ -282,7 +284,7 @@ def _ranges(settings: RealSettings, used: Sequence[Result]):
         for axes, (key, (low, high)) in zip(figure.subplots(1, 3, sharey=True), ranges.items(), strict=True):
             axes.axvspan(low, high, color="0.85")
             for row, board in enumerate(settings.boards):
-                values = [each.answers[key] for each in _used(used, board) if each.answers[key] is not None]
+                values = [each.answers[key] for each in _used_results(used, board) if each.answers[key] is not None]
                 axes.plot(values, [row] * len(values), "o", alpha=0.5, markersize=5)
             axes.set_xlabel(_FIGURES[key])
             axes.set_yticks(range(len(settings.boards)), list(settings.boards))

@@ -1,7 +1,7 @@
-"""What benchmarks of rendering and training look at: the demo's scene, and a design for it.
+"""The demo's scene and a design for it, which benchmarks of rendering and training use.
 
-In: nothing but the package's own object and classifier, so that it runs anywhere. The design comes from a short
-optimization, since a real one has more contrast and finer detail than a picture one would make up.
+In: only the package's object and classifier, so that benchmarks run anywhere. Out: a `Problem` and a design from a
+short optimization, which has more contrast and finer detail than an invented picture.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from tempfile import TemporaryDirectory
 
 from torch import Tensor
 
-from patchlab.bench.chart import Progress
 from patchproof.app.demo import demo_scene
+from patchproof.base.progress import Progress
 from patchproof.base.settings import OptimizeSettings
 from patchproof.optimizer.loop import start, steps
 from patchproof.optimizer.pixels import as_pixels, from_pixels
@@ -20,8 +20,8 @@ from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.scene.scene import load_scene
 
 
-def design_for_demo(count: int, progress: Progress) -> tuple[Problem, Tensor]:
-    """The demo's problem, and the best design 3×h×w of `count` steps of its optimization."""
+def optimize_demo_design(count: int, progress: Progress) -> tuple[Problem, Tensor]:
+    """The demo's problem, and the best design 3×h×w of `count` optimizer steps."""
     problem = demo_problem().with_training(OptimizeSettings(steps=count))
     state = start(problem)
     for step in steps(problem, state):
@@ -31,6 +31,6 @@ def design_for_demo(count: int, progress: Progress) -> tuple[Problem, Tensor]:
 
 
 def demo_problem() -> Problem:
-    """The demo's problem."""
+    """Build the demo's scene and set its problem."""
     with TemporaryDirectory() as folder:
         return set_problem(load_scene(demo_scene(Path(folder))))

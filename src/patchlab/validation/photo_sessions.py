@@ -1,0 +1,125 @@
+"""Steps that studies of promises share: make a run and its sheet, photograph it in sessions, verify.
+
+In: scene files, networks, printers, seeds. Out: cells, and for a cell the design (optimized, or an imported picture),
+the page, the photographs and their verification; a record of the promise. Everything is done as by a user's commands,
+but no report is written.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from pydantic import Field
+
+from patchlab.study.grid import (
+    GridSettings,
+    Names,
+    PositiveInt,
+    grid_cells,
+    network_names,
+    scene_of,
+    short_name,
+    with_changes,
+)
+from patchlab.study.record import hits_text, parse_hits
+from patchlab.study.study import Cell, Result
+from patchproof.base.sessions import RatePosterior, count_by_session, rate_posterior
+from patchproof.base.validation import expand_path
+from patchproof.optimizer.promise import PromiseOptions
+
+if TYPE_CHECKING:
+    from patchproof.evidence.reproject import PhotoSquare
+    from patchproof.evidence.results import Report
+    from patchproof.optimizer.run import Run
+
+
+class SessionsSettings(GridSettings):
+    """Settings: a run for each scene, network, printer and seed, and sessions of photographs of each."""
+
+    printers: Names = ("coated",)  # printers of the designs, which optimizing knows
+    sessions: PositiveInt = 4  # sessions of each print
+    photos: Annotated[int, Field(ge=5, le=1000)] = 20  # photographs of each session
+    path_traced: bool = True  # photograph with Mitsuba 3, else with our renderer
+
+
+def cells(settings: SessionsSettings, base: Path) -> list[Cell]:
+    """A cell per scene, network, printer and seed, with the whole scene in it."""
+    profiles = {short_name(name): {"printer": {"profile": name}} for name in settings.printers}
+    return grid_cells(
+        settings,
+        base,
+        lambda values: (
+            (with_changes(values, {"target": {"models": values["networks"]}, **table}), (printer,))
+            for printer, table in profiles.items()
+        ),
+    )
+
+
+def make_run_and_sheet(base: Path, cell: Cell, folder: Path) -> Run:
+    """Optimize or import the cell's design into folder/run, and write its sheet to folder/sheet.pdf."""
+    from patchproof.optimizer.imported_design import import_patch
+    from patchproof.optimizer.run import optimize
+    from patchproof.reprints.run_sheet import sheet as sheet_of
+
+    scene = scene_of(base, cell.values)
+    scene = replace(scene, settings=scene.settings.changed(target={"models": network_names(base, cell.values)}))
+    # a page needs one control only, and all of them would take most of a promise's time
+    if (picture := cell.values.get("picture")) is None:
+        patch_run = optimize(scene, folder / "run", promise=PromiseOptions(controls=("bare",)))
+    else:
+        patch_run = import_patch(
+            expand_path(picture, base), scene, folder / "run", promise=PromiseOptions(controls=("bare",))
+        )
+    sheet_of(patch_run, folder / "sheet.pdf")
+    return patch_run
+
+
+def take_photos(
+    settings: SessionsSettings, cell: Cell, patch_run: Run, folder: Path, control: str | None = None
+) -> Path:
+    """Photograph folder/sheet.pdf, or a control under the same conditions; returns the folder of sessions."""
+    from patchproof.reprints.mounted_sheet import ReprintSetup
+    from patchproof.reprints.reprint import reprint
+
+    out, n = folder / ("photos" if control is None else control), settings.sessions * settings.photos
+    setup = ReprintSetup(path_traced=settings.path_traced, control=control)
+    # another seed per cell: cells with the same draws would not be independent
+    seed = zlib.crc32(cell.name.encode())
+    reprint(folder / "sheet.pdf", patch_run, n, out, setup, sessions=settings.sessions, seed=seed)
+    return out
+
+
+def verify_photos(
+    photos: Path,
+    folder: Path,
+    base: Path,
+    cell: Cell,
+    forecast: Callable[[PhotoSquare], float | None] | None = None,
+    **options: Any,
+) -> Report:
+    """Verify photographs of folder/sheet.pdf without writing a report; `options` replace fields of `Options`."""
+    from patchproof.app.verify import options_of
+    from patchproof.evidence.gather import gather_evidence
+    from patchproof.sheets.manifest import load_manifest
+
+    sheet, networks = folder / "sheet.json", network_names(base, cell.values)
+    manifest = load_manifest(sheet)
+    changed = replace(options_of(sheet, manifest, networks, None), **options)
+    return gather_evidence(photos, manifest, changed, forecast=forecast)
+
+
+def record_promise(patch_run: Run) -> dict[str, Any]:
+    """Record a run's promise as JSON values."""
+    promise = patch_run.promise
+    hits = hits_text([condition.recognized for condition in promise.conditions])
+    return {"promised": hits, "per_session": promise.per_session, "places": list(promise.places)}
+
+
+def promise_posterior(result: Result) -> RatePosterior:
+    """The rate's posterior from a recorded promise."""
+    answers = result.answers
+    return rate_posterior(*count_by_session(parse_hits(answers["promised"]), answers["per_session"], answers["places"]))
