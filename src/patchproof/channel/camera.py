@@ -12,7 +12,7 @@ JPEG by the code that writes the file.
 
 from __future__ import annotations
 
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import TYPE_CHECKING
 
 import torch
@@ -43,10 +43,7 @@ def develop(linear: Tensor, sensor: Sensor, scale: float, jpeg: bool = True, cam
 
     `scale` is the pictures' size divided by the photograph's. `jpeg=False` leaves JPEG to the writer of a real file.
     """
-
-    def tensor(values) -> Tensor:
-        return torch.as_tensor(values).to(linear)
-
+    tensor = partial(torch.as_tensor, dtype=linear.dtype, device=linear.device)
     light = gaussian_blur(linear, tensor(sensor.blur_px * scale))
     light = motion_blur(light, tensor(sensor.motion_px * scale), sensor.motion_deg)
     light = light * gains(sensor, linear)[:, :, None, None]

@@ -107,13 +107,8 @@ class Camera(StrictModel):
             return pictures
         # pyright cannot know that frozen models have a hash
         grid = torch.as_tensor(_sampling_grid(self, size_px)).to(pictures)  # pyright: ignore[reportArgumentType]
-        return torch.nn.functional.grid_sample(
-            pictures,
-            grid.expand(len(pictures), -1, -1, -1),
-            mode="bilinear",
-            padding_mode="border",
-            align_corners=False,
-        )
+        grid, sample = grid.expand(len(pictures), -1, -1, -1), torch.nn.functional.grid_sample
+        return sample(pictures, grid, mode="bilinear", padding_mode="border", align_corners=False)
 
 
 def load_camera(name_or_file: str | Path, base: Path | None = None, photo_px: tuple[int, int] | None = None) -> Camera:
@@ -123,11 +118,9 @@ def load_camera(name_or_file: str | Path, base: Path | None = None, photo_px: tu
     check_camera(camera, str(path))
     width, height = camera.image_px
     if photo_px is not None and not camera.fits(photo_px):
-        raise Refused(
-            f"photographs with the aspect of {path} ({width} × {height} px)",
-            f"photo_px = [{photo_px[0]}, {photo_px[1]}]",
-            "set camera.photo_px to that aspect or calibrate the camera as it is held",
-        )
+        expected = f"photographs with the aspect of {path} ({width} × {height} px)"
+        remedy = "set camera.photo_px to that aspect or calibrate the camera as it is held"
+        raise Refused(expected, f"photo_px = [{photo_px[0]}, {photo_px[1]}]", remedy)
     return camera
 
 
@@ -135,17 +128,13 @@ def check_camera(camera: Camera, where: str) -> None:
     """Refuse a principal point outside the picture, a tone curve that does not rise, irreversible distortion."""
     (width, height), light = camera.image_px, camera.tone_light
     if not (0 < camera.cx < width and 0 < camera.cy < height):
-        raise Refused(
-            f"a principal point inside the picture of {width} × {height} px in {where}",
-            f"({camera.cx:g}, {camera.cy:g})",
-            "give cx, cy and image_px in the same pixels",
-        )
+        expected = f"a principal point inside the picture of {width} × {height} px in {where}"
+        got = f"({camera.cx:g}, {camera.cy:g})"
+        raise Refused(expected, got, "give cx, cy and image_px in the same pixels")
     if light is not None and not (light[0] == 0 and light[-1] == 1 and (np.diff(light) > 0).all()):
-        raise Refused(
-            f"a tone_light in {where} that grows from 0 to 1 at every step",
-            f"{len(light)} values from {light[0]:g} to {light[-1]:g} that do not",
-            "give the light at evenly spaced code values, or leave it out for sRGB's curve",
-        )
+        got = f"{len(light)} values from {light[0]:g} to {light[-1]:g} that do not"
+        remedy = "give the light at evenly spaced code values, or leave it out for sRGB's curve"
+        raise Refused(f"a tone_light in {where} that grows from 0 to 1 at every step", got, remedy)
     _refuse_irreversible(camera, where)
 
 
@@ -219,8 +208,6 @@ def _refuse_irreversible(camera: Camera, where: str) -> None:
     with np.errstate(over="ignore", invalid="ignore"):
         error_px = np.abs((_distort(camera, _undistort(camera, points)) - points) * [camera.fx, camera.fy]).max()
     if not error_px < _MAX_ERROR_PX:  # true also for NaN
-        raise Refused(
-            f"distortion that can be undone in the whole picture in {where}",
-            f"k1 k2 k3 = {camera.k1:g} {camera.k2:g} {camera.k3:g}, p1 p2 = {camera.p1:g} {camera.p2:g}",
-            "calibrate again with the board in the picture's corners, or with fewer terms",
-        )
+        got = f"k1 k2 k3 = {camera.k1:g} {camera.k2:g} {camera.k3:g}, p1 p2 = {camera.p1:g} {camera.p2:g}"
+        remedy = "calibrate again with the board in the picture's corners, or with fewer terms"
+        raise Refused(f"distortion that can be undone in the whole picture in {where}", got, remedy)

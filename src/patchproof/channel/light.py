@@ -16,8 +16,8 @@ Source: Lambert.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -36,10 +36,7 @@ class Lighting:
 
 def lighting_of(light: Light, forward, up, device: torch.device | str = "cpu") -> Lighting:
     """Return the light of N views on a patch whose printed side faces `forward`."""
-
-    def tensor(values) -> Tensor:
-        return torch.as_tensor(np.asarray(values), dtype=torch.float32, device=device)
-
+    tensor = partial(torch.as_tensor, dtype=torch.float32, device=device)
     toward = geometry.orbit(light.light_azimuth_deg, light.light_elevation_deg, forward, up)
     return Lighting(tensor(light.ambient), tensor(light.directional), tensor(toward))
 

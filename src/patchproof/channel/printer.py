@@ -118,9 +118,8 @@ def load_printer(name_or_file: str, base: Path | None = None) -> Printer:
         return _read((base or Path()) / name_or_file)
     shipped = sorted(path.stem for path in packaged_path("calibration", "printers").glob("*.npz"))
     if name_or_file not in shipped:
-        raise Refused(
-            "a printer's name or file", f'"{name_or_file}"', spelling_hint(name_or_file, [*shipped, "identity"])
-        )
+        hint = spelling_hint(name_or_file, [*shipped, "identity"])
+        raise Refused("a printer's name or file", f'"{name_or_file}"', hint)
     return _read(packaged_path("calibration", "printers", f"{name_or_file}.npz"))
 
 

@@ -59,9 +59,8 @@ def _textured(vertices_mm, faces, normals, uv: np.ndarray, name: str, texture: n
     from trimesh.visual import TextureVisuals
     from trimesh.visual.material import PBRMaterial
 
-    material = PBRMaterial(
-        name=name, baseColorTexture=Image.fromarray(texture), metallicFactor=0.0, roughnessFactor=1.0, doubleSided=True
-    )
+    image = Image.fromarray(texture)
+    material = PBRMaterial(name=name, baseColorTexture=image, metallicFactor=0.0, roughnessFactor=1.0, doubleSided=True)
     visual = TextureVisuals(uv=np.column_stack([uv[:, 0], 1 - uv[:, 1]]), material=material)
     if np.any(np.asarray(color) != 1):
         # trimesh always writes bytes

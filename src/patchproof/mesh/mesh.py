@@ -86,16 +86,9 @@ def mesh_from_parts(parts: Sequence[MeshPart], length_mm: float, warnings: Seque
     low, high = drawn_points.min(0), drawn_points.max(0)
     materials = tuple(dict.fromkeys(part.material for part in parts))
     index = np.array([materials.index(part.material) for part in parts])
-    return Mesh(
-        vertices=(drawn_points - (low + high) / 2) * (length_mm / (high - low).max()),
-        faces=drawn_faces.reshape(-1, 3),
-        corner_uv=uv,
-        corner_normal=corner_normals,
-        corner_color_linear=colors,
-        face_material=index[owner[drawn]],
-        materials=materials,
-        warnings=tuple(warnings),
-    )
+    vertices = (drawn_points - (low + high) / 2) * (length_mm / (high - low).max())
+    arrays = (vertices, drawn_faces.reshape(-1, 3), uv, corner_normals, colors, index[owner[drawn]])
+    return Mesh(*arrays, materials, tuple(warnings))
 
 
 def _join(parts: Sequence[MeshPart]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

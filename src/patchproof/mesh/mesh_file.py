@@ -24,8 +24,7 @@ import numpy as np
 
 from patchproof.base.color import linear_from_srgb
 from patchproof.base.errors import Refused
-from patchproof.base.input import IMAGE_FORMATS as PICTURES
-from patchproof.base.input import MAX_IMAGE_PX, is_file
+from patchproof.base.input import IMAGE_FORMATS, MAX_IMAGE_PX, is_file
 from patchproof.mesh.assets import MOST_BYTES, Assets
 from patchproof.mesh.mesh import Material, MeshPart, normal_transform, topology_warnings
 
@@ -93,11 +92,8 @@ class _MeshFileReader:
         if faces > MOST_FACES:
             got = f"{faces} faces in {self.path.name}, counted as often as they are placed"
             raise Refused(f"a mesh of at most {MOST_FACES // 10**6} million faces", got, "export a coarser one")
-        return [
-            self.part(raw, primitive, world_from_file @ world[:3])
-            for world, raw, primitive in placements
-            if np.size(raw["vertices"])
-        ]
+        placements = [placement for placement in placements if np.size(placement[1]["vertices"])]
+        return [self.part(raw, primitive, world_from_file @ world[:3]) for world, raw, primitive in placements]
 
     def placements(self) -> list[tuple[np.ndarray, dict, dict]]:
         """Return (world_from_part 4×4, trimesh's arrays, the glTF primitive) of each placed geometry."""
@@ -238,7 +234,7 @@ class _MeshFileReader:
         """Return an image as uint8 H×W×3; 16 bits are cut to 8, alpha is dropped."""
         if id(image) not in self.textures:
             try:
-                if image.format not in PICTURES or image.width * image.height > MAX_IMAGE_PX:
+                if image.format not in IMAGE_FORMATS or image.width * image.height > MAX_IMAGE_PX:
                     raise ValueError(f"{image.format} of {image.width} × {image.height} pixels")
                 if image.mode.startswith("I"):  # Pillow would clip 16 bits at 255 instead of scaling them
                     pixels = np.repeat((np.asarray(image) >> 8).clip(0, 255).astype(np.uint8)[..., None], 3, axis=2)

@@ -258,8 +258,6 @@ def _hammer(rng) -> list[MeshPart]:
     return solids
 
 
-_MAKERS = (
-    *(_mug, _bottle, _traffic_cone, _street_sign, _box_truck, _chair, _table_lamp, _carton, _mailbox, _umbrella),
-    *(_watering_can, _hammer),
-)
+_MAKERS = (_mug, _bottle, _traffic_cone, _street_sign, _box_truck, _chair, _table_lamp, _carton, _mailbox)
+_MAKERS += (_umbrella, _watering_can, _hammer)
 _OBJECTS = {make.__name__[1:]: make for make in _MAKERS}

@@ -54,13 +54,8 @@ def unwrap(mesh: Mesh, faces: np.ndarray, texels: int) -> Mesh:
     index = np.where(faces, len(mesh.materials), mesh.face_material)
     used_materials, face_material = np.unique(index, return_inverse=True)
     materials = (*mesh.materials, Material(name, (1.0, 1.0, 1.0), texture))
-    return replace(
-        mesh,
-        corner_uv=corner_uv,
-        corner_color_linear=corner_color,
-        face_material=face_material.reshape(-1),
-        materials=tuple(materials[i] for i in used_materials),
-    )
+    used = {"face_material": face_material.reshape(-1), "materials": tuple(materials[i] for i in used_materials)}
+    return replace(mesh, corner_uv=corner_uv, corner_color_linear=corner_color, **used)
 
 
 def _make_atlas(vertices: np.ndarray, faces: np.ndarray, texels: int) -> tuple[np.ndarray, tuple[int, int]]:
@@ -86,9 +81,8 @@ def _pack(points: np.ndarray, faces: np.ndarray, group: np.ndarray, texels: int)
         import xatlas
     except ModuleNotFoundError as error:
         remedy = 'pip install "patchproof[textures]", or give the mesh texture coordinates'
-        raise Refused(
-            "the package xatlas, to unwrap a mesh without texture coordinates", "no such package", remedy
-        ) from error
+        expected = "the package xatlas, to unwrap a mesh without texture coordinates"
+        raise Refused(expected, "no such package", remedy) from error
     atlas, packing = xatlas.Atlas(), xatlas.PackOptions()
     for index in np.unique(group):
         atlas.add_mesh(points.astype(np.float32), faces[group == index].astype(np.uint32))

@@ -59,11 +59,9 @@ def atlas_table(textures: Sequence[Tensor], layout: TexelLayout) -> Tensor:
     lowest = max((first // layout.pitch) + height for rows in places for _, height, first in rows)
     table = textures[0].new_zeros(lowest + _MARGIN, layout.pitch, 3)
     for texture, rows in zip(textures, places, strict=True):
-        for level, (width, height, first) in zip(mip_levels(texture), rows, strict=False):
+        for level, (w, h, first) in zip(mip_levels(texture), rows, strict=False):
             y, x = (corner - _MARGIN for corner in divmod(first, layout.pitch))
-            down, across = (
-                torch.arange(-_MARGIN, side + _MARGIN, device=table.device) % side for side in (height, width)
-            )
+            down, across = (torch.arange(-_MARGIN, side + _MARGIN, device=table.device) % side for side in (h, w))
             table[y : y + len(down), x : x + len(across)] = level[down][:, across]
     return table.flatten(0, 1)
 

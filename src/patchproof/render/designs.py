@@ -71,11 +71,8 @@ class LearnedTextures:
 
     def images(self, design: Tensor) -> list[Tensor]:
         """Return a design's texels as 3×H×W per material, 0 where nothing may change."""
-        parts = design[:, 0].split(self._counts, 1)
-        return [
-            part.new_zeros(3, *mask.shape).masked_scatter(mask, part)
-            for mask, part in zip(self.masks, parts, strict=True)
-        ]
+        parts = zip(self.masks, design[:, 0].split(self._counts, 1), strict=True)
+        return [part.new_zeros(3, *mask.shape).masked_scatter(mask, part) for mask, part in parts]
 
     def texels(self, textures: Sequence[np.ndarray]) -> np.ndarray:
         """Return the changeable texels of uint8 textures as uint8 1×M×3."""

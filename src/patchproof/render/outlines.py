@@ -79,15 +79,9 @@ class _Mix(torch.autograd.Function):
 
 @torch.no_grad()
 def find_outlines(
-    edges: Edges,
-    vertices: Tensor,
-    cameras: Cameras,
-    eye_mm: Tensor,
-    nearest_mm: Tensor,
-    covered: Tensor,
-    near_mm: float,
+    edges: Edges, vertices: Tensor, cameras: Cameras, eye_mm: Tensor, depth_mm: Tensor, covered: Tensor, near_mm: float
 ) -> Outlines:
-    """Find the outlines of N views from `eye_mm` N×3, whose pixels N·H·W see `nearest_mm` far (infinity: no object).
+    """Find the outlines of N views from `eye_mm` N×3, whose pixels N·H·W see `depth_mm` far (infinity: no object).
     There are none between two pixels that only the piece covers (`covered`).
     """
     views_at_once = max(1, CHUNK // max(len(vertices), len(edges.ends), len(edges.planes)))
@@ -101,19 +95,19 @@ def find_outlines(
     for crossings, step in zip(sides, (1, cameras.size_px[0]), strict=True):
         pixel, crease, place, slope, inverse = (torch.cat(part) for part in zip(*crossings, strict=True))
         beside = pixel + step
-        far_mm = torch.maximum(nearest_mm.index_select(0, pixel), nearest_mm.index_select(0, beside))
+        far_mm = torch.maximum(depth_mm.index_select(0, pixel), depth_mm.index_select(0, beside))
         depth_gap_px = (far_mm * inverse - 1) * cameras.matrix_px[0, 0, 0]
         visible = (depth_gap_px > -HIDDEN_PX) & ~(crease & (depth_gap_px > CREASE_GAP_PX))
         both_covered = covered.index_select(0, pixel) & covered.index_select(0, beside)
         selected = (visible & ~both_covered).nonzero()[:, 0]
         pixel, beside, place, slope = (part.index_select(0, selected) for part in (pixel, beside, place, slope))
         # the rim of small faces may cross several times between two pixels: take the mean of its shares
-        counts = torch.zeros_like(nearest_mm).index_add_(0, pixel, torch.ones_like(pixel, dtype=nearest_mm.dtype))
+        counts = torch.zeros_like(depth_mm).index_add_(0, pixel, torch.ones_like(pixel, dtype=depth_mm.dtype))
         counts = counts.index_select(0, pixel)
         target += [pixel, beside]
         source += [beside, pixel]
         share += [(_cut_off(distance, slope) / counts).float() for distance in (place, 1 - place)]
-    pixel, index = rank_values(torch.cat(target), len(nearest_mm))
+    pixel, index = rank_values(torch.cat(target), len(depth_mm))
     shares = torch.cat(share)
     total = shares.new_zeros(len(pixel)).index_add_(0, index, shares)
     shares = shares / total.clamp_min(1).index_select(0, index)

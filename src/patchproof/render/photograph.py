@@ -12,16 +12,8 @@ import torch
 from torch import Tensor
 
 from patchproof.base.color import linear_from_srgb, srgb_from_linear
-from patchproof.channel.camera import (
-    SMALLEST_BLUR_PX,
-    SMALLEST_NOISE,
-    add_noise,
-    develop,
-    encode_light,
-    gaussian_blur,
-    is_pointwise,
-    reach_px,
-)
+from patchproof.channel import camera as camera_model
+from patchproof.channel.camera import add_noise, develop, encode_light, gaussian_blur, is_pointwise, reach_px
 from patchproof.channel.printer import vary_print
 from patchproof.render.pixels import Appearance, ObjectTextures, PiecePicture
 from patchproof.render.stage import Stage
@@ -31,6 +23,8 @@ from patchproof.render.views import Views, render_views
 from patchproof.scene.conditions import Conditions
 
 PAPER_BACK_LINEAR = 0.8  # reflectance of plain white card, for a piece seen from behind
+_OUTLINE_REACH_PX = 1  # outlines mix neighboring pixels
+_PICTURE_GRAIN_SEED = 1 << 40  # added to the seed: the base photograph's grain is not that of the simulated camera
 
 
 def photograph(
@@ -104,9 +98,6 @@ def affected_windows(views: Views) -> np.ndarray | None:
     return (views.piece.box_px + (reach + _OUTLINE_REACH_PX) * np.array([-1, -1, 1, 1])).clip(0, [width, height] * 2)
 
 
-_OUTLINE_REACH_PX = 1  # outlines mix neighboring pixels
-
-
 def _blend(image: Tensor, pixel: Tensor, share: Tensor, value: Tensor, by_code: bool) -> Tensor:
     """Return `image` with the share of each pixel replaced by `value`; light `by_code` is averaged as code values."""
     if not len(pixel) and not value.requires_grad:  # a design that no view shows has a gradient of zero
@@ -141,13 +132,11 @@ def _paste_piece(views: Views, image: Tensor, light: Tensor, blur_px: np.ndarray
     return torch.lerp(pictures, add_noise(pictures, torch.as_tensor(noise).to(image), seeds), share)
 
 
-_PICTURE_GRAIN_SEED = 1 << 40  # added to the seed: the base photograph's grain is not that of the simulated camera
-
-
 def _picture_blur_and_noise(views: Views) -> tuple[np.ndarray, np.ndarray] | None:
     """Return the blur and noise of the scene's own photographs, N each at this size; None if neither shows."""
     blur_px, noise = (values * _scale(views) for values in views.stage.scene.picture_blur_and_noise(views.conditions))
-    return (blur_px, noise) if blur_px.max() >= SMALLEST_BLUR_PX or noise.max() >= SMALLEST_NOISE else None
+    is_visible = blur_px.max() >= camera_model.SMALLEST_BLUR_PX or noise.max() >= camera_model.SMALLEST_NOISE
+    return (blur_px, noise) if is_visible else None
 
 
 def _scale(views: Views) -> float:

@@ -90,13 +90,9 @@ class ObjectPixels:
     def part(self, views: range, pixels: int) -> ObjectPixels:
         """Return those of some views, of `pixels` pixels each, equal to those of these views alone."""
         rows = _rows(self.pixel, views, pixels)
-        return ObjectPixels(
-            self.pixel[rows] - views.start * pixels,
-            self.view[rows] - views.start,
-            None if self.texels is None else self.texels.part(rows.start, rows.stop),
-            self.color[rows],
-            self.normal[rows],
-        )
+        pixel, view = self.pixel[rows] - views.start * pixels, self.view[rows] - views.start
+        texels = None if self.texels is None else self.texels.part(rows.start, rows.stop)
+        return ObjectPixels(pixel, view, texels, self.color[rows], self.normal[rows])
 
 
 @dataclass(frozen=True)
@@ -119,17 +115,11 @@ class PiecePixels:
     def part(self, views: range, pixels: int) -> PiecePixels:
         """Return those of some views, of `pixels` pixels each, equal to those of these views alone."""
         rows, back = (_rows(pixel, views, pixels) for pixel in (self.pixel, self.back_pixel))
-        return PiecePixels(
-            self.pixel[rows] - views.start * pixels,
-            self.view[rows] - views.start,
-            self.share[rows],
-            self.texels.part(rows.start, rows.stop),
-            self.normal[rows],
-            None if self.white is None else self.white[rows],
-            self.back_pixel[back] - views.start * pixels,
-            self.back_share[back],
-            self.box_px[views.start : views.stop],
-        )
+        pixel, view = self.pixel[rows] - views.start * pixels, self.view[rows] - views.start
+        texels, white = self.texels.part(rows.start, rows.stop), None if self.white is None else self.white[rows]
+        front = (pixel, view, self.share[rows], texels, self.normal[rows], white)
+        back_pixel, box_px = self.back_pixel[back] - views.start * pixels, self.box_px[views.start : views.stop]
+        return PiecePixels(*front, back_pixel, self.back_share[back], box_px)
 
 
 def _rows(pixel: Tensor, views: range, pixels: int) -> slice:
@@ -159,17 +149,12 @@ def piece_pixels(
     front, back = ((is_covered & side).nonzero()[:, 0] for side in (fragments.front, ~fragments.front))
     mm, mm_dx, mm_dy = (values.index_select(0, front) for values in (mm, mm_dx, mm_dy))
     back_pixel = fragments.pixel.index_select(0, back)
-    return PiecePixels(
-        visible.pixel,
-        visible.view,
-        share.index_select(0, front)[:, None],
-        _piece_footprint(piece, mm / size, mm_dx * look.side / size, mm_dy * look.side / size, look.piece_taps),
-        torch.nn.functional.normalize(_interpolate(surface.corner_normal, visible), dim=-1),
-        None if white_coefficients is None else _paper_light(white_coefficients[visible.view], 2 * mm / size - 1),
-        back_pixel,
-        share.index_select(0, back)[:, None],
-        _boxes(torch.cat([visible.pixel, back_pixel]), fragments.shape),
-    )
+    texels = _piece_footprint(piece, mm / size, mm_dx * look.side / size, mm_dy * look.side / size, look.piece_taps)
+    normal = torch.nn.functional.normalize(_interpolate(surface.corner_normal, visible), dim=-1)
+    white = None if white_coefficients is None else _paper_light(white_coefficients[visible.view], 2 * mm / size - 1)
+    front_share, back_share = (share.index_select(0, side)[:, None] for side in (front, back))
+    box_px = _boxes(torch.cat([visible.pixel, back_pixel]), fragments.shape)
+    return PiecePixels(visible.pixel, visible.view, front_share, texels, normal, white, back_pixel, back_share, box_px)
 
 
 def _boxes(pixel: Tensor, shape: tuple[int, int, int]) -> np.ndarray:
@@ -183,11 +168,8 @@ def _boxes(pixel: Tensor, shape: tuple[int, int, int]) -> np.ndarray:
 
 def _piece_footprint(piece: PiecePicture, uv: Tensor, uv_dx: Tensor, uv_dy: Tensor, taps: int) -> Footprint:
     """Return the texels of the piece's picture that are seen; `uv` P×2 from 0 to 1 across the piece."""
-    layout, texture = (
-        texel_layout([piece.size_px], wrap=False, device=uv.device),
-        uv.new_zeros(len(uv), dtype=torch.long),
-    )
-    return footprint(layout, texture, uv, uv_dx, uv_dy, taps=taps, blocks=True)
+    layout = texel_layout([piece.size_px], wrap=False, device=uv.device)
+    return footprint(layout, uv.new_zeros(len(uv), dtype=torch.long), uv, uv_dx, uv_dy, taps=taps, blocks=True)
 
 
 def object_pixels(
@@ -205,13 +187,7 @@ def object_pixels(
         texels = footprint(surface.layout, *query)
     else:
         color = sample_atlas(surface.atlas, fixed, *query) * color
-    return ObjectPixels(
-        fragments.pixel,
-        fragments.view,
-        texels,
-        color,
-        normals,
-    )
+    return ObjectPixels(fragments.pixel, fragments.view, texels, color, normals)
 
 
 def _interpolate(corner_values: Tensor, fragments: Fragments) -> Tensor:

@@ -167,9 +167,8 @@ def _planes(corners: list[list[Tensor]], near: float) -> tuple[list[list[Tensor]
     if edge_on.any():
         third = (inverse[0] + inverse[1] + inverse[2]) / 9
         flat = ((0.0, 0.0, third), (0.0, 0.0, third), (0.0, 0.0, 3 * third))
-        planes = [
-            [torch.where(edge_on, f, e) for f, e in zip(*pair, strict=True)] for pair in zip(flat, planes, strict=True)
-        ]
+        pairs = (zip(*pair, strict=True) for pair in zip(flat, planes, strict=True))
+        planes = [[torch.where(edge_on, f, e) for f, e in pair] for pair in pairs]
     return planes, volume
 
 
@@ -235,9 +234,8 @@ def _allocate(nearest: Tensor, shape: tuple[int, int, int]) -> Fragments:
     pixel = nearest.nonzero()[:, 0]
     face = nearest.index_select(0, pixel).bitwise_and_(_FACE_MASK).neg_().add_(_FACE_MASK)
     depth, front = (torch.empty_like(pixel, dtype=dtype) for dtype in (torch.float32, torch.bool))
-    return Fragments(
-        pixel, face, depth.new_empty(len(pixel), 3), depth, front, torch.empty_like(pixel), depth.new_empty(6, 0), shape
-    )
+    barycentric, rank, slopes = depth.new_empty(len(pixel), 3), torch.empty_like(pixel), depth.new_empty(6, 0)
+    return Fragments(pixel, face, barycentric, depth, front, rank, slopes, shape)
 
 
 def _resolve(fragments: Fragments, part: slice, points: Tensor, faces: Tensor, view0: int, near: float) -> Tensor:

@@ -131,13 +131,7 @@ def _half_rows(level: Tensor) -> Tensor:
 
 
 def footprint(
-    layout: TexelLayout,
-    texture: Tensor,
-    uv: Tensor,
-    uv_dx: Tensor,
-    uv_dy: Tensor,
-    taps: int,
-    blocks: bool = False,
+    layout: TexelLayout, texture: Tensor, uv: Tensor, uv_dx: Tensor, uv_dy: Tensor, taps: int, blocks: bool = False
 ) -> Footprint:
     """Return the footprint of P fragments of `texture` (P, index into the layout); `uv_dx`, `uv_dy` P×2: uv change per
     pixel.

@@ -26,20 +26,10 @@ from patchproof.base.geometry import camera_centers
 from patchproof.channel.camera import encode_light, encode_light_by_table, gains
 from patchproof.channel.light import Lighting, irradiance, lighting_of
 from patchproof.channel.render_frame import Frame
+from patchproof.render import pixels
 from patchproof.render.fragments import Cameras
 from patchproof.render.outlines import Outlines, find_outlines
-from patchproof.render.pixels import (
-    MIN_SHARE,
-    PHOTO_SAMPLING,
-    Appearance,
-    ObjectPixels,
-    ObjectTextures,
-    PiecePicture,
-    PiecePixels,
-    TextureSampling,
-    object_pixels,
-    piece_pixels,
-)
+from patchproof.render.pixels import Appearance, ObjectPixels, PiecePicture, PiecePixels, TextureSampling
 from patchproof.render.raster import rasterize
 from patchproof.render.stage import Stage
 from patchproof.render.texture import look_up
@@ -101,17 +91,17 @@ class Views:
 
     def _object_color(self, texels: Tensor | None = None) -> Tensor:
         """Return the light P×3 of the object's fragments."""
-        pixels, reflected = self.on_object, self.on_object.color
-        if pixels.texels is not None:
+        visible, reflected = self.on_object, self.on_object.color
+        if visible.texels is not None:
             table = self.stage.object_surface.texels(self.reduced, fixed=False) if texels is None else texels
-            reflected = look_up(pixels.texels, table) * reflected
-        return reflected * self._irradiance(pixels)
+            reflected = look_up(visible.texels, table) * reflected
+        return reflected * self._irradiance(visible)
 
-    def _irradiance(self, pixels: ObjectPixels | PiecePixels) -> Tensor:
+    def _irradiance(self, lit: ObjectPixels | PiecePixels) -> Tensor:
         """Return the light P×1 that falls on pixels."""
         if self.light is None:
             raise ValueError("pictures bring their own light")
-        return irradiance(pixels.normal, pixels.view, self.light)[:, None]
+        return irradiance(lit.normal, lit.view, self.light)[:, None]
 
     @cached_property
     def _behind(self) -> Tensor:
@@ -151,7 +141,7 @@ def render_views(
     appearance: Appearance,
     conditions: Conditions,
     size_px: tuple[int, int],
-    look: TextureSampling = PHOTO_SAMPLING,
+    look: TextureSampling = pixels.PHOTO_SAMPLING,
 ) -> Views:
     """Render the views of `conditions`, with nothing on the object unless `appearance` is a piece. Any picture of the
     same size can be shown in them; the object behind it is rendered, too.
@@ -169,25 +159,19 @@ def render_views(
     fragments = rasterize(surface.vertices, surface.faces, view_cameras, near)
     nearest = torch.full((math.prod(fragments.shape),), torch.inf, device=stage.device)
     nearest[fragments.pixel] = fragments.depth
-    look, piece_parts, fixed = replace(look, taps=PHOTO_SAMPLING.taps) if scene.LEARNS_TEXTURE else look, None, None
+    look, piece_parts = replace(look, taps=pixels.PHOTO_SAMPLING.taps) if scene.LEARNS_TEXTURE else look, None
     if piece is not None:
         print_cameras = cameras(poses @ scene.printed_from_sheet(conditions), matrices, frame.size_px, stage)
         piece_fragments = rasterize(stage.piece_surface.vertices, stage.piece_surface.faces, print_cameras, near)
         hidden = nearest.index_select(0, piece_fragments.pixel) < piece_fragments.depth
-        piece_parts = piece_pixels(stage.piece_surface, piece, piece_fragments, hidden, look)
-    if not scene.LEARNS_TEXTURE and not isinstance(appearance, ObjectTextures):
-        fixed = surface.texels(_reduced(stage, size_px), fixed=True)
-    return Views(
-        stage,
-        conditions,
-        size_px,
-        frame.size_px,
-        light,
-        backgrounds(scene, conditions, size_px, frame),
-        object_pixels(surface, fragments, look, fixed),
-        piece_parts,
-        find_outlines(surface.edges, surface.vertices, view_cameras, eye, nearest, _covers(piece_parts, nearest), near),
-    )
+        piece_parts = pixels.piece_pixels(stage.piece_surface, piece, piece_fragments, hidden, look)
+    has_fixed_textures = not scene.LEARNS_TEXTURE and not isinstance(appearance, pixels.ObjectTextures)
+    fixed = surface.texels(_reduced(stage, size_px), fixed=True) if has_fixed_textures else None
+    behind = backgrounds(scene, conditions, size_px, frame)
+    on_object = pixels.object_pixels(surface, fragments, look, fixed)
+    covered = _covers(piece_parts, nearest)
+    outlines = find_outlines(surface.edges, surface.vertices, view_cameras, eye, nearest, covered, near)
+    return Views(stage, conditions, size_px, frame.size_px, light, behind, on_object, piece_parts, outlines)
 
 
 def _reduced(stage: Stage, size_px: tuple[int, int]) -> bool:
@@ -199,7 +183,7 @@ def _covers(piece: PiecePixels | None, nearest: Tensor) -> Tensor:
     covered = torch.zeros_like(nearest, dtype=torch.bool)
     if piece is not None:
         for pixel, share in ((piece.pixel, piece.share), (piece.back_pixel, piece.back_share)):
-            covered[pixel] = share[:, 0] > 1 - MIN_SHARE
+            covered[pixel] = share[:, 0] > 1 - pixels.MIN_SHARE
     return covered
 
 
@@ -225,11 +209,11 @@ def relight_and_replace_background(views: Views, conditions: Conditions) -> View
 
 def split_views(views: Views, sizes: Sequence[int]) -> list[Views]:
     """Split views into batches of these sizes, each equal to the bit to a batch that was rendered alone."""
-    pixels, parts = views.frame_px[0] * views.frame_px[1], []
+    per_view, parts = views.frame_px[0] * views.frame_px[1], []
     for first, last in pairwise(accumulate(sizes, initial=0)):
         rows, numbers = slice(first, last), range(first, last)
         pixel_fields = {"object": views.object, "piece": views.piece, "outlines": views.outlines}
-        selected = {name: None if part is None else part.part(numbers, pixels) for name, part in pixel_fields.items()}
+        selected = {name: None if part is None else part.part(numbers, per_view) for name, part in pixel_fields.items()}
         batch = replace(views, conditions=views.conditions[rows], background=views.background[rows], **selected)
         parts.append(relight(batch, batch.conditions))
     return parts
@@ -259,7 +243,7 @@ def _render_flat(stage: Stage, piece: PiecePicture | None, conditions: Condition
         flat_cameras = cameras(np.broadcast_to(np.eye(4), (len(homographies), 4, 4)), homographies, size_px, stage)
         fragments = rasterize(surface.vertices, surface.faces, flat_cameras, 1e-9)
         coefficients = torch.as_tensor(scene.piece_light(conditions), dtype=torch.float32, device=stage.device)
-        parts = piece_pixels(surface, piece, fragments, None, white_coefficients=coefficients)
+        parts = pixels.piece_pixels(surface, piece, fragments, None, white_coefficients=coefficients)
     return Views(stage, conditions, size_px, size_px, None, pictures, None, parts, None)
 
 

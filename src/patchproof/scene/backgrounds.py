@@ -99,10 +99,7 @@ class Backgrounds:
         if size_px[0] == size_px[1]:
             side = min(crop_w, crop_h)
             x0, y0, crop_w, crop_h = x0 + (crop_w - side) / 2, y0 + (crop_h - side) / 2, side, side
-        level = 0
-        while level + 1 < len(levels) and crop_w / 2 ** (level + 1) >= size_px[0]:
-            level += 1
-        shrunk = levels[level]
+        shrunk = [level for i, level in enumerate(levels) if i == 0 or crop_w / 2**i >= size_px[0]][-1]
         sx, sy = shrunk.shape[1] / width, shrunk.shape[0] / height
         scale_x, scale_y = crop_w * sx / size_px[0], crop_h * sy / size_px[1]
         matrix = index_homography(np.array([[scale_x, 0, x0 * sx], [0, scale_y, y0 * sy], [0, 0, 1.0]]))
@@ -127,9 +124,8 @@ def load_backgrounds(settings: BackgroundSettings, base: Path) -> Backgrounds:
         return Backgrounds((_read(folder),))
     files = sorted(p for p in folder.iterdir() if p.suffix.lower() in _SUFFIXES) if is_folder(folder) else []
     if not files:
-        raise Refused(
-            "a folder of pictures (background.images)", f"no picture in {folder}", "put some there or give a color"
-        )
+        remedy = "put some there or give a color"
+        raise Refused("a folder of pictures (background.images)", f"no picture in {folder}", remedy)
     return _split_by_purpose(files)
 
 

@@ -15,28 +15,12 @@ from dataclasses import replace
 import numpy as np
 
 from patchproof.base.errors import Refused
+from patchproof.mesh import surface_chart
 from patchproof.mesh.exponential_map import SmoothSurface, exponential_map, grid_stretch
 from patchproof.mesh.mesh import Mesh
-from patchproof.mesh.surface_chart import (
-    SurfaceChart,
-    edge_points,
-    piece_grid,
-    surface_heights,
-    surface_point,
-    triangles_near,
-)
-from patchproof.scene.placement import (
-    GRID,
-    LIFT_MM,
-    Placement,
-    PlacementMethod,
-    SurfaceFrame,
-    lay_card,
-    piece_pose,
-    place_card,
-    refuse_larger_than_side,
-    spun_axes,
-)
+from patchproof.mesh.surface_chart import SurfaceChart, piece_grid
+from patchproof.scene import placement
+from patchproof.scene.placement import GRID, LIFT_MM, Placement, PlacementMethod, SurfaceFrame, piece_pose, spun_axes
 
 # A simpler family is accepted up to this mean gap, as a share of the shorter edge: 0.6 mm on 60 mm.
 CLOSE_SHARE = 0.01
@@ -54,7 +38,7 @@ _DEGREE = 4
 
 def placement_method(bend: bool) -> PlacementMethod:
     """Return the method that places a piece on a surface: bent along it, or as a flat card."""
-    return place_bent if bend else place_card
+    return place_bent if bend else placement.place_card
 
 
 def place_bent(mesh: Mesh, frame: SurfaceFrame, size_mm: tuple[float, float], spin_deg: float) -> Placement:
@@ -62,17 +46,17 @@ def place_bent(mesh: Mesh, frame: SurfaceFrame, size_mm: tuple[float, float], sp
     frame's; spin turns it clockwise as one faces it. Refused with a reason if paper cannot follow the surface.
     """
     triangles, axes = mesh.vertices[mesh.faces], np.stack([frame.right, frame.up, frame.normal])
-    middle = surface_point(triangles, frame.origin_mm, axes)
+    middle = surface_chart.surface_point(triangles, frame.origin_mm, axes)
     # paper ends half a diagonal from its middle; a surface farther than that from its chart is not under it
-    near = triangles_near(triangles, middle, float(np.hypot(*size_mm)))
+    near = surface_chart.triangles_near(triangles, middle, float(np.hypot(*size_mm)))
     reach = float(np.hypot(*size_mm)) / 2
     tangent, curvatures = _fit_tangent(near, _turn_frame(frame, frame.normal, middle), size_mm)
     close_mm = CLOSE_SHARE * min(size_mm)
-    card = lay_card(near, tangent, size_mm, spin_deg, reach)
+    card = placement.lay_card(near, tangent, size_mm, spin_deg, reach)
     if card.gap_mean_mm <= close_mm:
         _refuse_overhang(card)
         extent = np.ptp(mesh.vertices @ np.stack([tangent.right, tangent.up], 1), axis=0)
-        refuse_larger_than_side(size_mm, spin_deg, extent)
+        placement.refuse_larger_than_side(size_mm, spin_deg, extent)
         return replace(card, reason=f"the surface is flat: a card stands {card.gap_mean_mm:.2f} mm off it on average")
     chart = _fit_cylinder(near, tangent, curvatures, size_mm, spin_deg)
     rolled = _lay_on(SmoothSurface(chart, np.zeros((1, 1)), 1.0), near, frame, size_mm, spin_deg)
@@ -110,15 +94,8 @@ def curl_card(card: Placement, radius_mm: float) -> Placement:
     flat = np.concatenate([width / 2 + radius_mm / scale * np.sin(angle), points[:, 1:]], 1)
     offsets = radius_mm * (1 - np.cos(angle)) * inward
     normals = -np.sin(angle) * across / scale - np.cos(angle) * inward
-    return replace(
-        card,
-        family="curled",
-        vertices_mm=card.world(flat) - offsets,
-        faces=_grid_faces(_PIECE_GRID),
-        piece_mm=points,
-        normals=normals,
-        reason=f"curled to a radius of {radius_mm:.0f} mm",
-    )
+    curled = replace(card, vertices_mm=card.world(flat) - offsets, faces=_grid_faces(_PIECE_GRID), normals=normals)
+    return replace(curled, family="curled", piece_mm=points, reason=f"curled to a radius of {radius_mm:.0f} mm")
 
 
 def _turn_frame(frame: SurfaceFrame, normal: np.ndarray, origin_mm: np.ndarray) -> SurfaceFrame:
@@ -139,7 +116,7 @@ def _chart(frame: SurfaceFrame, across: np.ndarray, curvature: float, spin_deg: 
 def _surface_heights(chart: SurfaceChart, near: np.ndarray, size_mm, n: int) -> np.ndarray:
     """Return heights of the surface over the piece's grid, NaN where there is none; refused if that is most of it."""
     reach = float(np.hypot(*size_mm)) / 2
-    h = surface_heights(chart, near, size_mm, n, (-reach, reach))
+    h = surface_chart.surface_heights(chart, near, size_mm, n, (-reach, reach))
     if np.isfinite(h).mean() < 0.5:
         got = f"a surface under {np.isfinite(h).mean():.0%} of it"
         raise Refused("a patch with the object under at least half of it", got, _REMEDY)
@@ -201,9 +178,8 @@ def _refine_cylinder(
 
     start = np.array([0, 0, 0, 0, chart.curvature * unit])
     # dents and bumps weigh less than the surface that the paper will lie on
-    fit = least_squares(
-        lambda x: chart_at(x).local(points_mm)[:, 2], start, loss="soft_l1", f_scale=CLOSE_SHARE * min(size_mm)
-    )
+    close_mm = CLOSE_SHARE * min(size_mm)
+    fit = least_squares(lambda x: chart_at(x).local(points_mm)[:, 2], start, loss="soft_l1", f_scale=close_mm)
     return chart_at(fit.x)
 
 
@@ -228,13 +204,13 @@ def _lay_on(surface: SmoothSurface, near: np.ndarray, frame: SurfaceFrame, size_
     faces = _grid_faces(_PIECE_GRID)
     surface = surface.raise_by(_highest(surface, near, surface_h, size_mm) + LIFT_MM)
     _, st = _map_grid(surface, frame, size_mm, spin_deg)
-    paper = surface_heights(surface.chart, surface.points_and_normals(*st.T)[0][faces], size_mm, GRID)
+    paper = surface_chart.surface_heights(surface.chart, surface.points_and_normals(*st.T)[0][faces], size_mm, GRID)
     grid_st = piece_grid(size_mm, GRID) @ surface.chart.turn
     # flat cells cut below a round surface
     surface = surface.raise_by(max(0.0, float(np.nanmax(surface.height(*grid_st.T) - paper))))
     world_from_piece, st = _map_grid(surface, frame, size_mm, spin_deg)
     vertices, normals = surface.points_and_normals(*st.T)
-    paper = surface_heights(surface.chart, vertices[faces], size_mm, GRID)
+    paper = surface_chart.surface_heights(surface.chart, vertices[faces], size_mm, GRID)
     # a cell's chords end short of a round surface's edge
     clearance = np.where(np.isfinite(paper), paper, surface.height(*grid_st.T)) - surface_h
     gaps = clearance[np.isfinite(clearance) & np.isfinite(paper)] - LIFT_MM
@@ -259,7 +235,7 @@ def _lay_on(surface: SmoothSurface, near: np.ndarray, frame: SurfaceFrame, size_
 
 def _highest(surface: SmoothSurface, near: np.ndarray, surface_h: np.ndarray, size_mm) -> float:
     """Return the greatest height under the piece over the smooth surface; ridges lie along edges, which grids miss."""
-    ridges = surface.chart.local(edge_points(near, float(np.hypot(*size_mm)) / GRID))
+    ridges = surface.chart.local(surface_chart.edge_points(near, float(np.hypot(*size_mm)) / GRID))
     inside = (np.abs(ridges[:, :2] @ surface.chart.turn.T) <= np.array(size_mm) / 2).all(1)
     inside &= np.abs(ridges[:, 2]) <= np.hypot(*size_mm) / 2
     peaks = ridges[inside, 2] - surface.height(*ridges[inside, :2].T)
@@ -292,16 +268,14 @@ def _refuse_overlap(chart: SurfaceChart, size_mm) -> None:
         raise Refused("a surface on which the piece does not overlap itself", got, _REMEDY)
 
 
-def _refuse_overhang(placement: Placement) -> None:
-    if placement.overhang_share > OVERHANG_LIMIT:
+def _refuse_overhang(piece: Placement) -> None:
+    if piece.overhang_share > OVERHANG_LIMIT:
         expected = f"a surface under at least {1 - OVERHANG_LIMIT:.0%} of a bent piece"
-        raise Refused(expected, f"a surface under {1 - placement.overhang_share:.0%} of it", _REMEDY)
+        raise Refused(expected, f"a surface under {1 - piece.overhang_share:.0%} of it", _REMEDY)
 
 
 def _refuse_gap(gap_mean_mm: float, size_mm) -> None:
     if gap_mean_mm > GAP_LIMIT * min(size_mm):
-        raise Refused(
-            f"a surface that paper stands off by at most {GAP_LIMIT:.0%} of its shorter edge on average",
-            f"an edge, bump, hole or handle that keeps it {gap_mean_mm:.1f} mm off ({gap_mean_mm / min(size_mm):.0%})",
-            _REMEDY,
-        )
+        expected = f"a surface that paper stands off by at most {GAP_LIMIT:.0%} of its shorter edge on average"
+        got = f"an edge, bump, hole or handle that keeps it {gap_mean_mm:.1f} mm off ({gap_mean_mm / min(size_mm):.0%})"
+        raise Refused(expected, got, _REMEDY)

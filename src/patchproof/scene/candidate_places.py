@@ -20,19 +20,12 @@ from patchproof.base.errors import Refused
 from patchproof.base.geometry import camera_centers
 from patchproof.base.validation import Side
 from patchproof.mesh.surface_chart import SurfaceChart, piece_grid, surface_heights, triangles_near
+from patchproof.scene import placement
 from patchproof.scene.bend import placement_method
 from patchproof.scene.canvas import select_faces
 from patchproof.scene.fitting import place_if_close
 from patchproof.scene.patch_scene import PiecePosition
-from patchproof.scene.placement import (
-    WARN_OVERHANG_SHARE,
-    Placement,
-    SurfaceFrame,
-    gap_limit_mm,
-    patch_frame,
-    spun_axes,
-    surface_frame,
-)
+from patchproof.scene.placement import Placement, SurfaceFrame, patch_frame, spun_axes, surface_frame
 from patchproof.scene.unplaced_scene import UnplacedScene
 
 MIN_DISTANCE_SHARE = 0.5  # of the piece's shorter edge, between two candidates
@@ -119,27 +112,22 @@ class PlaceFinder:
         frame_there = self._frame_at(at_mm)
         if frame_there.normal @ frame.normal < _SAME_SIDE_COSINE:
             return None
-        return self._candidate(at_mm, frame_there, spin_deg, self._gap_mm, WARN_OVERHANG_SHARE)
+        return self._candidate(at_mm, frame_there, spin_deg, self._gap_mm, placement.WARN_OVERHANG_SHARE)
 
     def _candidate(
         self, at: PiecePosition, frame: SurfaceFrame, spin_deg: float, gap_mm: float, overhang_share: float
     ) -> CandidatePlace | None:
         """Return the piece at a frame; None if it exceeds these limits or lies on a part that is to be kept free."""
         lay = placement_method(self.scene.settings.patch.bend)
-        placement = place_if_close(self.scene.mesh, frame, self.size_mm, spin_deg, lay, gap_mm, overhang_share)
-        return (
-            None if placement is None or self._touches_forbidden(placement) else CandidatePlace(at, spin_deg, placement)
-        )
+        piece = place_if_close(self.scene.mesh, frame, self.size_mm, spin_deg, lay, gap_mm, overhang_share)
+        return None if piece is None or self._touches_forbidden(piece) else CandidatePlace(at, spin_deg, piece)
 
     def _move_to_level(self, frame: SurfaceFrame, spin_deg: float) -> np.ndarray | None:
         """Move the frame's origin until the surface under the piece is as high as its middle; None if that fails."""
         right, up = spun_axes(frame, spin_deg)
         reach = float(np.hypot(*self.size_mm)) / 2
-        near, points, middle = (
-            triangles_near(self._triangles, frame.origin_mm, 2 * reach),
-            piece_grid(self.size_mm, _NET),
-            _NET**2 // 2,
-        )
+        near = triangles_near(self._triangles, frame.origin_mm, 2 * reach)
+        points, middle = piece_grid(self.size_mm, _NET), _NET**2 // 2
         origin = frame.origin_mm
         for _ in range(_MOVES):
             chart = SurfaceChart(origin, np.stack([right, up, frame.normal]), 0.0, np.array([1.0, 0.0]))
@@ -161,7 +149,7 @@ class PlaceFinder:
 
     @property
     def _gap_mm(self) -> float:
-        return self.scene.settings.patch.search.gap_mm or gap_limit_mm(self.size_mm)
+        return self.scene.settings.patch.search.gap_mm or placement.gap_limit_mm(self.size_mm)
 
     @cached_property
     def _eyes(self) -> np.ndarray:
@@ -208,15 +196,15 @@ class PlaceFinder:
         faces = select_faces(self.scene.mesh, search.keep_off, search.keep_off_faces, self.scene.base)
         return faces[self._samples[2]]
 
-    def _touches_forbidden(self, placement: Placement) -> bool:
+    def _touches_forbidden(self, piece: Placement) -> bool:
         """True if a point of the piece is nearest to a sampled point, facing like it, that is to be kept free."""
         from scipy.spatial import KDTree
 
         points, normals, _ = self._samples
-        same_facing = normals @ placement.normal > 0
+        same_facing = normals @ piece.normal > 0
         if not (self._forbidden & same_facing).any():
             return False
-        paper = placement.world(piece_grid(self.size_mm, _NET) * [1, -1] + np.array(self.size_mm) / 2)
+        paper = piece.world(piece_grid(self.size_mm, _NET) * [1, -1] + np.array(self.size_mm) / 2)
         return bool(self._forbidden[same_facing][KDTree(points[same_facing]).query(paper)[1]].any())
 
 

@@ -54,7 +54,9 @@ def texture_canvas(mesh: Mesh, patch: PatchSettings, base: Path, texels: int = T
     lighter may change; it cannot reach faces without texture coordinates. Face numbers are those of `mesh.faces`. A
     face may change together with a rim of GUTTER_TEXELS around it.
     """
-    chosen_faces, has_uv = _select_patch_faces(mesh, patch, base), has_usable_uv(mesh)
+    chosen_faces, has_uv = np.ones(len(mesh.faces), bool), has_usable_uv(mesh)
+    if patch.materials or patch.faces is not None:
+        chosen_faces = select_faces(mesh, patch.materials, patch.faces, base)
     if patch.mask is not None:
         chosen_faces = chosen_faces & has_uv
         if not chosen_faces.any():
@@ -81,13 +83,6 @@ def texture_canvas(mesh: Mesh, patch: PatchSettings, base: Path, texels: int = T
     if patch.start == "gray":
         start = tuple(np.where(mask[..., None], np.uint8(GRAY), old) for mask, old in zip(masks, start, strict=True))
     return Canvas(mesh, start, masks, (*warnings, *_texel_warnings(mesh, chosen_faces, masks)))
-
-
-def _select_patch_faces(mesh: Mesh, patch: PatchSettings, base: Path) -> np.ndarray:
-    """Return the faces F that the settings name."""
-    if patch.materials or patch.faces is not None:
-        return select_faces(mesh, patch.materials, patch.faces, base)
-    return np.ones(len(mesh.faces), bool)
 
 
 def select_faces(mesh: Mesh, materials: tuple[str, ...], faces: str | None, base: Path) -> np.ndarray:
@@ -235,11 +230,9 @@ def _shares(mesh: Mesh, chosen_faces: np.ndarray, masks: tuple[np.ndarray, ...])
         palette[faces] = changeable[faces] * _in_palette(y * size[0] + x, size, area[faces], centers == 0)
         unnamed[faces] = texels_per_face(corners, of_chosen & mask)[0] / np.maximum(centers, 1)
     changing = max(float(area[chosen_faces] @ changeable[chosen_faces]), 1e-300)
-    return (
-        float(area[chosen_faces] @ repeated[chosen_faces]) / changing,
-        float(area[chosen_faces] @ palette[chosen_faces]) / changing,
-        float(area[~chosen_faces] @ unnamed[~chosen_faces] / area.sum()),
-    )
+    repeated_mm2, palette_mm2 = (float(area[chosen_faces] @ share[chosen_faces]) for share in (repeated, palette))
+    unnamed_share = float(area[~chosen_faces] @ unnamed[~chosen_faces] / area.sum())
+    return repeated_mm2 / changing, palette_mm2 / changing, unnamed_share
 
 
 def _in_palette(texel: np.ndarray, size: tuple[int, int], area: np.ndarray, small: np.ndarray) -> np.ndarray:

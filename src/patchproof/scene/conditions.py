@@ -21,19 +21,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from patchproof.base.settings import SceneSettings
-from patchproof.channel.effects import (
-    EFFECTS,
-    FIELDS,
-    RECORD_OF,
-    RECORDS,
-    Draws,
-    FacingCosine,
-    Light,
-    Pose,
-    Print,
-    Sensor,
-    ViewEffect,
-)
+from patchproof.channel import effects
+from patchproof.channel.effects import RECORD_OF, RECORDS, Draws, FacingCosine, Light, Pose, Print, Sensor, ViewEffect
 
 Stream = Literal["train", "select", "promise", "reprint", "evaluate"]
 _STREAMS = ("train", "select", "promise", "reprint", "evaluate")
@@ -57,7 +46,7 @@ def draw(
     settings: SceneSettings, stream: Stream, n: int, seed: int, start: int = 0, per_session: int = 1, salt: str = ""
 ) -> Conditions:
     """Return draws `start` to `start + n` of a stream, `per_session` in a row for one session; `salt` changes them."""
-    return conditions_from_fields(sample_fields(EFFECTS, settings, stream, n, seed, start, per_session, salt))
+    return conditions_from_fields(sample_fields(effects.EFFECTS, settings, stream, n, seed, start, per_session, salt))
 
 
 def sample_fields(
@@ -100,7 +89,7 @@ def sample_fields(
 
 def fields_of(conditions: Conditions) -> dict[str, np.ndarray]:
     """Return all records' fields by name, in the order that files have."""
-    return {name: getattr(getattr(conditions, RECORD_OF[name]), name) for name in FIELDS}
+    return {name: getattr(getattr(conditions, RECORD_OF[name]), name) for name in effects.FIELDS}
 
 
 def conditions_from_fields(values: Mapping[str, np.ndarray]) -> Conditions:

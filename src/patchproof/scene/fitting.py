@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import get_args
 
 import numpy as np
@@ -18,15 +19,8 @@ from patchproof.base.errors import Refused
 from patchproof.base.settings import PatchSettings
 from patchproof.base.validation import Side
 from patchproof.mesh.mesh import Mesh
-from patchproof.scene.placement import (
-    WARN_OVERHANG_SHARE,
-    Placement,
-    PlacementMethod,
-    SurfaceFrame,
-    gap_limit_mm,
-    patch_frame,
-    side_frame,
-)
+from patchproof.scene import placement
+from patchproof.scene.placement import Placement, PlacementMethod, SurfaceFrame, patch_frame, side_frame
 
 _STEP_SHARE = 0.25  # of the piece's shorter side between places that are tried
 _TRIES_FLAT, _TRIES_BENT = 120, 6  # one takes about 5 and 200 ms
@@ -40,28 +34,27 @@ def place_if_close(
     spin_deg: float,
     lay: PlacementMethod,
     gap_mm: float | None = None,
-    overhang_share: float = WARN_OVERHANG_SHARE,
+    overhang_share: float = placement.WARN_OVERHANG_SHARE,
 ) -> Placement | None:
     """Place the piece with its middle at the frame's origin. None if that is refused, if the piece stands off farther
     than `gap_mm` (by default the limit of the warning), or if more than `overhang_share` of it overhangs.
     """
     try:
-        placement = lay(mesh, frame, size_mm, spin_deg)
+        piece = lay(mesh, frame, size_mm, spin_deg)
     except Refused:
         return None
-    limit_mm = gap_limit_mm(size_mm) if gap_mm is None else gap_mm
-    return placement if placement.gap_mm <= limit_mm and placement.overhang_share <= overhang_share else None
+    limit_mm = placement.gap_limit_mm(size_mm) if gap_mm is None else gap_mm
+    return piece if piece.gap_mm <= limit_mm and piece.overhang_share <= overhang_share else None
 
 
 def placement_advice(mesh: Mesh, patch: PatchSettings, lay: PlacementMethod, least_mm: float) -> str:
     """Suggest, as keys of a scene file, sizes and places at which a refused piece would lie well; empty if none was
     found. Places are tried on the same side from the nearest on, then in the middles of the other sides.
     """
-    frame, size_mm, spin_and_method = patch_frame(mesh, patch), patch.size_mm, (patch.spin_deg, lay)
+    frame, size_mm = patch_frame(mesh, patch), patch.size_mm
     width, height = np.minimum(size_mm, frame.extent_mm).tolist()
-    smaller = largest_fitting_size(
-        (width, height), lambda trial: place_if_close(mesh, frame, trial, *spin_and_method), least_mm
-    )
+    fits = partial(place_if_close, mesh, frame, spin_deg=patch.spin_deg, lay=lay)
+    smaller = largest_fitting_size((width, height), fits, least_mm)
     place = _nearest_place(mesh, patch, lay)
     suggestions = [f"{smaller[0]:g} × {smaller[1]:g} mm lies well there"] if smaller is not None else []
     suggestions += [f"{size_mm[0]:g} × {size_mm[1]:g} mm lies well with {place}"] if place is not None else []
@@ -70,10 +63,7 @@ def placement_advice(mesh: Mesh, patch: PatchSettings, lay: PlacementMethod, lea
 
 def _nearest_place(mesh: Mesh, patch: PatchSettings, lay: PlacementMethod) -> str | None:
     """Return the nearest place where the piece lies well, as a key of a scene file."""
-
-    def fits(frame: SurfaceFrame) -> bool:
-        return place_if_close(mesh, frame, patch.size_mm, patch.spin_deg, lay) is not None
-
+    fits = partial(place_if_close, mesh, size_mm=patch.size_mm, spin_deg=patch.spin_deg, lay=lay)
     middle = patch_frame(mesh, patch.changed(offset_mm=(0.0, 0.0)))
     step = max(1.0, round(_STEP_SHARE * min(patch.size_mm)))
     (across, along), wanted_mm = (int(extent // (2 * step)) for extent in middle.extent_mm), np.array(patch.offset_mm)

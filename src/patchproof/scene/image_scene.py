@@ -30,19 +30,10 @@ from patchproof.base.settings import SceneSettings
 from patchproof.base.validation import expand_path
 from patchproof.photo.read import read_photo
 from patchproof.photo.rejection import PhotoRejected
+from patchproof.scene import picture_scene
 from patchproof.scene.conditions import Conditions, Stream
 from patchproof.scene.interface import PX_PER_MODULE, READABLE_SHARE, SceneSource
-from patchproof.scene.picture_scene import (
-    BasePicture,
-    PictureScene,
-    pick_indices,
-    picture_for,
-    print_scalings,
-    refuse_bending,
-    similarity_matrix,
-    size_from_photo,
-    warp_picture,
-)
+from patchproof.scene.picture_scene import BasePicture, PictureScene
 from patchproof.sheets.markers import MARKER_MODULES
 from patchproof.sheets.piece import Piece, lay_out_piece, marker_size_mm
 from patchproof.sheets.template import load_template
@@ -84,20 +75,20 @@ class ImageScene(PictureScene):
 
     def piece_homographies(self, conditions: Conditions, size_px: tuple[int, int]) -> np.ndarray:
         """Return N×3×3 from piece millimeters to pixels."""
-        to_size = size_from_photo(self.photo_px, size_px)
+        to_size = picture_scene.size_from_photo(self.photo_px, size_px)
         side, photo, pose = min(self.photo_px), np.array(self.photo_px), conditions.pose
         piece_mm, scales = np.array(self.piece.size_mm), px_per_mm(self.settings, self.piece, conditions)
         matrices = []
         for scale, roll, place in zip(scales, pose.roll_deg, pose.background[:, 2:4], strict=True):
             free_px = side - rotated_extent(piece_mm * scale, roll)
             middle = (photo - side) / 2 + side / 2 + (place - 0.5) * free_px
-            matrices.append(to_size @ similarity_matrix(roll, scale, middle - piece_mm / 2, piece_mm / 2))
-        return np.stack(matrices) @ print_scalings(self.piece, conditions)
+            matrices.append(to_size @ picture_scene.similarity_matrix(roll, scale, middle - piece_mm / 2, piece_mm / 2))
+        return np.stack(matrices) @ picture_scene.print_scalings(self.piece, conditions)
 
     def pictures(self, conditions: Conditions, size_px: tuple[int, int]) -> np.ndarray:
         """Return N×H×W×3 uint8 sRGB: the images, some with a box of random values."""
-        indices = pick_indices(conditions.pose.background[:, 0], len(self.images))
-        pictures = [warp_picture(self.images[i], np.eye(3), self.photo_px, size_px) for i in indices]
+        indices = picture_scene.pick_indices(conditions.pose.background[:, 0], len(self.images))
+        pictures = [picture_scene.warp_picture(self.images[i], np.eye(3), self.photo_px, size_px) for i in indices]
         for picture, chance in zip(pictures, conditions.pose.background[:, 4], strict=True):
             if chance < self.settings.background.erasing:
                 erase(picture, int(chance * 2**53))  # its digits: a view in other light has the same box
@@ -117,7 +108,7 @@ def build(source: SceneSource) -> ImageScene:
     target's name, its index, or a label in `target.accept`; case does not matter.
     """
     settings, base = source.settings, source.base
-    refuse_bending(settings)
+    picture_scene.refuse_bending(settings)
     files = _files_of_class(settings, base)
     images, unread = _read_all(files, settings.camera.photo_px)
     identity = source.sheet_id({})
@@ -174,27 +165,21 @@ def _erased_box(rng: np.random.Generator) -> tuple[float, float, float, float]:
 
 def _files_of_class(settings: SceneSettings, base: Path) -> list[Path]:
     """Return the files with the target's label, in an order that depends on nothing but their names."""
-    folder, table = (
-        Path(expand_path(text, base)) for text in (settings.object.images or "", settings.object.labels or "")
-    )
+    names = (settings.object.images or "", settings.object.labels or "")
+    folder, table = (Path(expand_path(name, base)) for name in names)
     rows = read_labels(table)
     target = settings.target
     labels = {str(label).strip().casefold() for label in (target.label, *target.accept)}
     file_names = [name for name, label in rows if labels & {label, *(part.strip() for part in label.split(","))}]
     if not file_names:
         others = ", ".join(sorted({label for _, label in rows})[:5])
-        raise Refused(
-            f'images labeled "{target.label}" in {table}',
-            f"{len(rows)} images with other labels ({others} ...)",
-            "give the target the name or index that it has in this file",
-        )
+        got = f"{len(rows)} images with other labels ({others} ...)"
+        remedy = "give the target the name or index that it has in this file"
+        raise Refused(f'images labeled "{target.label}" in {table}', got, remedy)
     missing = [name for name in file_names if not is_file(folder / name)]
     if missing:
-        raise Refused(
-            f"the images that {table.name} names in {folder}",
-            f"{len(missing)} missing ({missing[0]})",
-            "copy them there",
-        )
+        got = f"{len(missing)} missing ({missing[0]})"
+        raise Refused(f"the images that {table.name} names in {folder}", got, "copy them there")
     return [folder / name for name in sorted(set(file_names), key=lambda name: hashlib.sha256(name.encode()).digest())]
 
 
@@ -217,13 +202,12 @@ def _read_all(files: list[Path], photo_px: tuple[int, int]) -> tuple[tuple[BaseP
     images, unread = [], []
     for path in files:
         try:
-            images.append(picture_for(read_photo(path).srgb, photo_px)[0])
+            images.append(picture_scene.picture_for(read_photo(path).srgb, photo_px)[0])
         except PhotoRejected:
             unread.append(path.name)
     if not images:
-        raise Refused(
-            "an image that can be read", f"{len(files)} unreadable in {files[0].parent}", "save them as JPEG or PNG"
-        )
+        got = f"{len(files)} unreadable in {files[0].parent}"
+        raise Refused("an image that can be read", got, "save them as JPEG or PNG")
     return tuple(images), unread
 
 
@@ -234,11 +218,9 @@ def _piece(settings: SceneSettings, identity: str) -> Piece:
         raise Refused("view.patch_share above 0", f"{low:g}", "give a share between 0 and 1")
     largest = largest_share(settings.view.roll_deg)
     if high > largest:
-        raise Refused(
-            "a piece that fits into the picture's centered square at the largest view.patch_share",
-            f"{high:g}, which is {high / largest:.0%} of what fits",
-            f"lower it to {largest:g}",
-        )
+        expected = "a piece that fits into the picture's centered square at the largest view.patch_share"
+        got = f"{high:g}, which is {high / largest:.0%} of what fits"
+        raise Refused(expected, got, f"lower it to {largest:g}")
     smallest = low * (high / low) ** (1 - READABLE_SHARE)
     needed_mm = MARKER_MODULES * PX_PER_MODULE * max(size_mm) / (smallest * min(settings.camera.photo_px))
     piece = lay_out_piece(size_mm, marker_size_mm(needed_mm, size_mm), identity, "design")

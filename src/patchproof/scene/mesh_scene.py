@@ -61,11 +61,8 @@ class MeshScene(Scene):
 
     def placement_summary(self) -> dict[str, Any]:
         """Implement `Scene.placement_summary`: the texture covers the object."""
-        return {
-            "family": "texture",
-            "size_mm": self.frame.extent_mm,
-            "reason": "the object's own texture is the design",
-        }
+        reason = "the object's own texture is the design"
+        return {"family": "texture", "size_mm": self.frame.extent_mm, "reason": reason}
 
     @property
     def length_mm(self) -> float:
@@ -124,10 +121,8 @@ class MeshScene(Scene):
         side_px = min(self.photo_px)
         size_px = side_px, side_px
         matrix_px, poses = self.matrix_px(size_px), self.camera_from_world(conditions)
-        return (
-            np.stack([project_box(self.outermost_mm, pose, matrix_px, size_px, self.camera) for pose in poses])
-            / side_px
-        )
+        boxes = [project_box(self.outermost_mm, pose, matrix_px, size_px, self.camera) for pose in poses]
+        return np.stack(boxes) / side_px
 
     @cached_property
     def outermost_mm(self) -> np.ndarray:
@@ -166,19 +161,10 @@ def load_bare(source: SceneSource) -> MeshScene:
     mesh = load_mesh(expand_path(settings_object.mesh, base), settings_object.length_mm, settings_object.up, mesh_glb)
     backgrounds = load_backgrounds(settings.background, base)
     known = {} if mesh_glb is None else {"mesh": hashlib.sha256(mesh_glb).hexdigest()}
-    return MeshScene(
-        settings,
-        base,
-        source.seed,
-        source.sheet_id(known),
-        mesh,
-        view_frame(mesh, settings),
-        backgrounds,
-        notes=(*mesh.warnings, *backgrounds.notes),
-        known=known,
-        camera=load_optional_camera(camera.file, base, camera.photo_px),
-        mesh_glb=mesh_glb,
-    )
+    identity, frame = source.sheet_id(known), view_frame(mesh, settings)
+    lens = load_optional_camera(camera.file, base, camera.photo_px)
+    others: dict[str, Any] = {"notes": (*mesh.warnings, *backgrounds.notes), "known": known, "mesh_glb": mesh_glb}
+    return MeshScene(settings, base, source.seed, identity, mesh, frame, backgrounds, camera=lens, **others)
 
 
 def camera_poses(scene: MeshScene, patch_mm: np.ndarray, pose: Pose) -> np.ndarray:
@@ -196,8 +182,6 @@ def _refuse_cameras_inside(mesh: Mesh, eyes: np.ndarray) -> None:
     clearance_mm = CLEARANCE_SHARE * float((high - low).max())
     inside = ((eyes > low - clearance_mm) & (eyes < high + clearance_mm)).all(1)
     if inside.any():
-        raise Refused(
-            f"cameras outside the object ({high[0] - low[0]:.0f} × {high[1] - low[1]:.0f} × {high[2] - low[2]:.0f} mm)",
-            f"{inside.sum()} of {len(eyes)} views inside its bounding box or within {clearance_mm:.2g} mm of it",
-            "raise view.distance_mm",
-        )
+        size = " × ".join(f"{side_mm:.0f}" for side_mm in high - low)
+        got = f"{inside.sum()} of {len(eyes)} views inside its bounding box or within {clearance_mm:.2g} mm of it"
+        raise Refused(f"cameras outside the object ({size} mm)", got, "raise view.distance_mm")

@@ -14,17 +14,10 @@ import numpy as np
 from patchproof.base import geometry
 from patchproof.base.errors import Refused
 from patchproof.base.validation import Side
+from patchproof.scene import interface
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.fitting import placement_advice
-from patchproof.scene.interface import (
-    PX_PER_MODULE,
-    READABLE_SHARE,
-    SCALE_VIEWS,
-    PieceScene,
-    Scene,
-    SceneSource,
-    refuse_without_place,
-)
+from patchproof.scene.interface import SCALE_VIEWS, PieceScene, Scene, SceneSource, refuse_without_place
 from patchproof.scene.mesh_scene import MeshScene, camera_poses, load_bare
 from patchproof.scene.placement import Placement, PlacementMethod, patch_frame, place_card
 from patchproof.sheets.markers import MARKER_MODULES
@@ -159,13 +152,13 @@ def _place_piece(scene: MeshScene, lay: PlacementMethod) -> tuple[Piece, Placeme
     if not len(scales):
         got = f"{SCALE_VIEWS} views from behind it"
         raise Refused("views from which the patch can be seen", got, "turn azimuth_deg towards the patch")
-    needed_mm = float(MARKER_MODULES * PX_PER_MODULE / np.quantile(scales, 1 - READABLE_SHARE))
+    needed_mm = float(MARKER_MODULES * interface.PX_PER_MODULE / np.quantile(scales, 1 - interface.READABLE_SHARE))
     marker_mm = marker_size_mm(needed_mm, patch.size_mm)
     piece = lay_out_piece(patch.size_mm, marker_mm, scene.sheet_id, "design", patch.bend)
     refuse_larger_than_page(load_template(settings.sheet.template), piece)  # before hours of optimizing
-    unreadable = float((scales * piece.module_mm < PX_PER_MODULE * 0.999).mean())
+    unreadable = float((scales * piece.module_mm < interface.PX_PER_MODULE * 0.999).mean())
     notes = (*mesh.warnings, *scene.backgrounds.notes, *placement.warnings)
-    if unreadable > 1 - READABLE_SHARE:
+    if unreadable > 1 - interface.READABLE_SHARE:
         notes += (
             f"markers of {marker_mm:.1f} mm, the largest that fit, will be unreadable in {unreadable:.0%} of the "
             f"views: view.distance_mm and camera.photo_px ask for {needed_mm:.1f} mm, and those for a piece of "

@@ -34,21 +34,11 @@ from patchproof.photo.quality import blur_px
 from patchproof.photo.read import SUFFIXES, read_photo
 from patchproof.photo.rectify import PageFit, corner_uncertainty_mm, fit_page
 from patchproof.photo.rejection import PhotoRejected
+from patchproof.scene import picture_scene
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.interface import SceneSource, SceneTerm
 from patchproof.scene.paper_light import PaperLight, paper_light
-from patchproof.scene.picture_scene import (
-    BasePicture,
-    PictureScene,
-    photo_from,
-    pick_indices,
-    picture_for,
-    print_scalings,
-    refuse_bending,
-    similarity_matrix,
-    size_from_photo,
-    warp_picture,
-)
+from patchproof.scene.picture_scene import BasePicture, PictureScene
 from patchproof.sheets.blank import blank_piece
 from patchproof.sheets.manifest import Manifest, load_manifest
 from patchproof.sheets.markers import DICTIONARY
@@ -109,16 +99,19 @@ class PhotoScene(PictureScene):
 
     def piece_homographies(self, conditions: Conditions, size_px: tuple[int, int]) -> np.ndarray:
         """Return N×3×3 from piece millimeters to pixels."""
-        to_size = size_from_photo(self.photo_px, size_px)
+        to_size = picture_scene.size_from_photo(self.photo_px, size_px)
         matrices = self._view_from_photo(conditions)
-        printed = print_scalings(self.piece, conditions)
+        printed = picture_scene.print_scalings(self.piece, conditions)
         views = zip(matrices, self._chosen_photos(conditions), printed, strict=True)
         return np.stack([to_size @ matrix @ photo.photo_from_piece @ scale for matrix, photo, scale in views])
 
     def pictures(self, conditions: Conditions, size_px: tuple[int, int]) -> np.ndarray:
         """Return N×H×W×3 uint8 sRGB: the photographs, turned, zoomed and shifted, with the blank sheet on them."""
         views = zip(self._chosen_photos(conditions), self._view_from_photo(conditions), strict=True)
-        return np.stack([warp_picture(photo.picture, matrix, self.photo_px, size_px) for photo, matrix in views])
+        pictures = [
+            picture_scene.warp_picture(photo.picture, matrix, self.photo_px, size_px) for photo, matrix in views
+        ]
+        return np.stack(pictures)
 
     def piece_light(self, conditions: Conditions) -> np.ndarray:
         """Return N×3×6 coefficients (see `PieceScene.piece_light`) in light of the photograph: 1 is its full white."""
@@ -131,7 +124,7 @@ class PhotoScene(PictureScene):
         return blur_px, np.array([photo.light.noise for photo in photos])
 
     def _chosen_photos(self, conditions: Conditions) -> list[BasePhoto]:
-        return [self.photos[i] for i in pick_indices(conditions.pose.background[:, 0], len(self.photos))]
+        return [self.photos[i] for i in picture_scene.pick_indices(conditions.pose.background[:, 0], len(self.photos))]
 
     def _zoom(self, conditions: Conditions) -> np.ndarray:
         low, high = self.settings.view.zoom
@@ -141,7 +134,7 @@ class PhotoScene(PictureScene):
         middle, side = np.array(self.photo_px) / 2, min(self.photo_px)
         shifts = conditions.pose.look_at_offset[:, :2] * side
         views = zip(conditions.pose.roll_deg, self._zoom(conditions), shifts, strict=True)
-        return [similarity_matrix(roll, zoom, shift, middle) for roll, zoom, shift in views]
+        return [picture_scene.similarity_matrix(roll, zoom, shift, middle) for roll, zoom, shift in views]
 
 
 def build(source: SceneSource) -> PhotoScene:
@@ -151,7 +144,7 @@ def build(source: SceneSource) -> PhotoScene:
     The scene's settings have the blank's `width_mm` and `height_mm`, also if the file gave none.
     """
     settings, base = source.settings, source.base
-    refuse_bending(settings)
+    picture_scene.refuse_bending(settings)
     photos, sheet = settings.object.photos, settings.object.sheet
     if photos is None or sheet is None:
         raise ValueError("a scene of photographs needs object.photos and object.sheet")
@@ -165,11 +158,8 @@ def build(source: SceneSource) -> PhotoScene:
     refuse_larger_than_page(load_template(settings.sheet.template), piece)
     base_photos, rejected = _load_all(folder, manifest, piece, settings.camera.photo_px)
     warnings = [f"{name} is left out: {reason}" for name, reason in rejected.items()]
-    for photo in base_photos:
-        if photo.light.unevenness > _UNEVEN_SHARE:
-            warnings.append(
-                f"the light on the paper in {photo.name} is uneven: {photo.light.unevenness:.0%} is unexplained"
-            )
+    uneven = ((photo.name, photo.light.unevenness) for photo in base_photos if photo.light.unevenness > _UNEVEN_SHARE)
+    warnings += [f"the light on the paper in {name} is uneven: {share:.0%} is unexplained" for name, share in uneven]
     return PhotoScene(settings, base, source.seed, identity, piece, base_photos, notes=tuple(warnings), known=known)
 
 
@@ -178,14 +168,14 @@ def measure_photo(path: Path, manifest: Manifest, piece: Piece, photo_px: tuple[
     srgb = read_photo(path).srgb
     fit, blur = _locate(srgb, manifest, min(piece.size_mm))
     x, y, *_ = manifest.cut_mm
-    picture, photo_from_srgb = picture_for(srgb, photo_px)
+    picture, photo_from_srgb = picture_scene.picture_for(srgb, photo_px)
     px_from_piece = fit.px_from_mm @ np.array([[1, 0, x], [0, 1, y], [0, 0, 1.0]])
     photo_from_piece = photo_from_srgb @ px_from_piece
     scale = photo_from_srgb[0, 0]
     # enlarging adds the width of the picture's own pixels: 1/12 px², and the interpolation's 1/6 px²
     blur = float(np.sqrt((blur * scale) ** 2 + max(0.0, scale**2 - 1) / 4))
     height, width = picture.srgb.shape[:2]
-    picture_from_photo = np.linalg.inv(photo_from((width, height), photo_px))
+    picture_from_photo = np.linalg.inv(picture_scene.photo_from((width, height), photo_px))
     light = paper_light(picture.srgb, picture_from_photo @ photo_from_piece, piece, blur)
     return BasePhoto(path.name, picture, photo_from_piece, light, blur)
 
@@ -213,11 +203,9 @@ def _load_all(folder: Path, manifest: Manifest, piece: Piece, photo_px) -> tuple
             rejected[path.name] = rejection.code
     if len(photos) < MIN_PHOTOS:
         reasons = f" ({'; '.join(f'{name}: {code}' for name, code in rejected.items())})" if rejected else ""
-        raise Refused(
-            f"at least {MIN_PHOTOS} photographs of the blank sheet on the object",
-            "; ".join([f"{len(photos)} usable of {len(files)} in {folder}{reasons}", *_subfolder_note(folder)]),
-            "take more, sharp, with the whole flat sheet in view",
-        )
+        expected = f"at least {MIN_PHOTOS} photographs of the blank sheet on the object"
+        got = "; ".join([f"{len(photos)} usable of {len(files)} in {folder}{reasons}", *_subfolder_note(folder)])
+        raise Refused(expected, got, "take more, sharp, with the whole flat sheet in view")
     return tuple(photos), rejected
 
 
@@ -257,9 +245,7 @@ def _locate(srgb: np.ndarray, manifest: Manifest, side_mm: float) -> tuple[PageF
 def _with_size(settings: SceneSettings, size_mm: tuple[float, float]) -> SceneSettings:
     patch = settings.patch
     if patch.width_mm is not None and not np.allclose(patch.size_mm, size_mm, atol=0.01):
-        raise Refused(
-            f"a patch as large as the blank sheet's ({size_mm[0]:g} × {size_mm[1]:g} mm)",
-            f"{patch.size_mm[0]:g} × {patch.size_mm[1]:g} mm",
-            "leave out width_mm and height_mm, or print a blank of that size",
-        )
+        expected = f"a patch as large as the blank sheet's ({size_mm[0]:g} × {size_mm[1]:g} mm)"
+        got = f"{patch.size_mm[0]:g} × {patch.size_mm[1]:g} mm"
+        raise Refused(expected, got, "leave out width_mm and height_mm, or print a blank of that size")
     return settings.changed(patch={"width_mm": size_mm[0], "height_mm": size_mm[1]})

@@ -78,12 +78,10 @@ class PictureScene(PieceScene):
     @property
     def warnings(self) -> tuple[str, ...]:
         """The scene's notes, and a warning if more than one view in twenty shows markers that cannot be read."""
-        if self.unreadable_share <= 1 - READABLE_SHARE:
+        share = self.unreadable_share
+        if share <= 1 - READABLE_SHARE:
             return self.notes
-        warning = (
-            f"markers of {self.piece.marker_mm:.1f} mm will be unreadable in {self.unreadable_share:.0%} of the views"
-        )
-        return (*self.notes, warning)
+        return (*self.notes, f"markers of {self.piece.marker_mm:.1f} mm will be unreadable in {share:.0%} of the views")
 
 
 @dataclass(frozen=True)
@@ -167,6 +165,5 @@ def pick_indices(choice: np.ndarray, count: int) -> np.ndarray:
 def refuse_bending(settings: SceneSettings) -> None:
     """Refuse `patch.bend`: pictures do not show a surface that a piece could bend along."""
     if settings.patch.bend:
-        raise Refused(
-            "a flat patch where the object is known from pictures alone", "bend = true", "give a mesh instead"
-        )
+        expected = "a flat patch where the object is known from pictures alone"
+        raise Refused(expected, "bend = true", "give a mesh instead")

@@ -47,18 +47,15 @@ def measure_tapes(mesh: Mesh, piece: Placement, normal: np.ndarray) -> tuple[Tap
         ("left", (0.0, height / 2), -right),
         ("right", (width, height / 2), right),
     )
-    found = (
-        _measure(mesh, piece, edge, piece.world(np.array([point]))[0], along, normal)
-        for edge, point, along in directions
-    )
+    found = (_measure(mesh, piece, edge, middle_mm, along, normal) for edge, middle_mm, along in directions)
     return tuple(tape for tape in found if tape is not None)
 
 
 def _measure(
-    mesh: Mesh, placement: Placement, edge: Edge, start: np.ndarray, along: np.ndarray, normal: np.ndarray
+    mesh: Mesh, piece: Placement, edge: Edge, middle_mm: tuple[float, float], along: np.ndarray, normal: np.ndarray
 ) -> TapeMeasurement | None:
-    """Measure from `start` in the piece's direction `along`, as one sees it; None if there is nothing to measure to."""
-    along = along - (along @ normal) * normal
+    """Measure from an edge's middle in the piece's direction `along`, as one sees it; None if nothing is found."""
+    start, along = piece.world(np.array([middle_mm]))[0], along - (along @ normal) * normal
     if np.linalg.norm(along) < _MIN_VISIBLE_SHARE:
         return None
     along = along / np.linalg.norm(along)
@@ -69,7 +66,7 @@ def _measure(
     h = profile(rotated[mesh.faces], step, -finger)
     gaps = np.flatnonzero(np.isnan(h[finger:]))
     end = finger + int(gaps[0] if len(gaps) else len(h) - finger) - 1
-    if end <= finger or not abs(h[finger]) < _MAX_GAP_SHARE * min(placement.size_mm):
+    if end <= finger or not abs(h[finger]) < _MAX_GAP_SHARE * min(piece.size_mm):
         return None  # the piece's edge lies beyond the outline, or there is nothing under it
     stop = _edge(h[: end + 1], finger, step)
     path = np.arange(finger, (end if stop is None else stop) + 1)

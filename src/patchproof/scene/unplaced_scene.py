@@ -45,6 +45,5 @@ def require_unplaced(scene: Scene) -> UnplacedScene:
     """Return the scene as one whose piece has no place yet; refused for any other."""
     if isinstance(scene, UnplacedScene):
         return scene
-    raise Refused(
-        'a scene with patch.place = "auto"', scene.description(), "set it, or use the place that the scene has"
-    )
+    remedy = "set it, or use the place that the scene has"
+    raise Refused('a scene with patch.place = "auto"', scene.description(), remedy)
