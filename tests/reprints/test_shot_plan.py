@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.stats import binom
 
 from patchproof.base.goal import Goal
+from patchproof.base.intervals import independent_difference
 from patchproof.evidence.verdict import MIN_KEPT_CHANCE, PHOTOS_PER_SESSION, compare, kept_chance
 from patchproof.reprints.shot_plan import fewest_photos, paired_power, plan_shots, unpaired_power
 from test_verify_verdict import promise_of
@@ -22,6 +24,14 @@ def test_power_is_what_the_judge_finds_in_simulation(rates, n):
     # three standard errors of 900 trials
     assert paired_power(*rates, n) == pytest.approx(paired / trials, abs=0.05)
     assert unpaired_power(*rates, n) == pytest.approx(unpaired / trials, abs=0.05)
+
+
+@pytest.mark.parametrize(("better", "worse", "n"), [(0.9, 0.4, 5), (0.55, 0.5, 41), (0.7, 0.0, 17), (1.0, 0.97, 150)])
+def test_unpaired_power_sums_the_counts_whose_interval_lies_above_zero(better, worse, n):
+    counts = range(n + 1)
+    a, b = binom.pmf(counts, n, better), binom.pmf(counts, n, worse)
+    shown = ((i, j) for i in counts for j in counts if independent_difference(i, n, j, n)[1][0] > 0)
+    assert unpaired_power(better, worse, n) == pytest.approx(sum(a[i] * b[j] for i, j in shown), abs=1e-12)
 
 
 def test_the_plan_s_sessions_are_enough_and_one_less_is_not():

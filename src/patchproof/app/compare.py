@@ -98,9 +98,7 @@ def compare(
             tables=_tables(loaded, names, order, by_design, fresh),
             figures=[_drawing({name: loaded[name] for name in order}, by_design)],
             failed={},
-            more={
-                "imported": {name: run.details["imported"] for name, run in loaded.items() if _origin(run) != "here"}
-            },
+            more={"imported": {key: run.details["imported"] for key, run in loaded.items() if _origin(run) != "here"}},
         )
         write_results(folder, results)
     return results
@@ -110,9 +108,8 @@ def _load_runs(runs: Sequence[str | Path], with_networks: bool) -> dict[str, Run
     """Load runs by their folders' names, or by full paths if two names are equal; refused if their views differ."""
     paths = [Path(run).resolve() for run in runs]
     if len(set(paths)) < max(len(paths), 2):
-        raise Refused(
-            "two runs or more to compare, each once", summarize_names([str(run) for run in runs]) or "none", "name them"
-        )
+        got = summarize_names([str(run) for run in runs]) or "none"
+        raise Refused("two runs or more to compare, each once", got, "name them")
     ambiguous = len({path.name for path in paths}) < len(paths)
     loaded = {str(path) if ambiguous else path.name: load_run(path) for path in paths}
     first, *others = loaded

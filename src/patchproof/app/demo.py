@@ -61,12 +61,7 @@ seed = 1
 
 
 def run_demo(
-    out: str | Path,
-    *,
-    detector: bool = False,
-    jobs: int = 1,
-    overwrite: bool = False,
-    progress: Progress = no_progress,
+    out: str | Path, *, detector: bool = False, jobs: int = 1, overwrite: bool = False, progress: Progress = no_progress
 ) -> list[str]:
     """Run every step into the folder `out`, before the built-in classifier or detector; returns the summary's lines."""
     compute = Compute(jobs=jobs)

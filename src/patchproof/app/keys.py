@@ -34,7 +34,6 @@ nearest one that does. `[low, high]` is a range to draw from. Paths are relative
 _UNITS = {"mm": "mm", "deg": "°", "px": "px", "ev": "stops"}
 _WORDS = {str: "text", int: "integer", float: "number", bool: "true or false"}
 
-
 Documents = Mapping[str, tuple[str, type[StrictModel]]]  # by name, the purpose of a settings file and its class
 DOCUMENTS: Documents = {
     "scene": ("A scene file: `patchproof optimize`, `plan`.", SceneSettings),
@@ -66,9 +65,8 @@ def meanings(model: type[BaseModel]) -> dict[str, str]:
         for field in definition.body if isinstance(definition, ast.ClassDef) else ():
             if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name):
                 above = takewhile(lambda line: line.startswith("    # "), lines[field.lineno - 2 :: -1])
-                text = lines[(field.end_lineno or field.lineno) - 1].partition("  # ")[2] or " ".join(
-                    [*above][::-1]
-                ).replace("    # ", "")
+                comment = " ".join([*above][::-1]).replace("    # ", "")
+                text = lines[(field.end_lineno or field.lineno) - 1].partition("  # ")[2] or comment
                 texts |= {field.target.id: text} if text else {}
     return texts
 

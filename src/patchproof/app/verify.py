@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -114,13 +114,9 @@ def verify(
     if not isinstance(photos, str | Path):
         photos = write_pictures(photos, out / _PHOTOS)
     boxes = capture.boxes
-    options = replace(
-        options_of(sheet, manifest, models, capture.camera),
-        scan_dpi=capture.scan_dpi,
-        ruler_mm=capture.ruler_mm,
-        controls=controls,
-        ledger_photos=ledger_photos,
-    )
+    options = options_of(sheet, manifest, models, capture.camera)
+    parameters: dict[str, Any] = {"scan_dpi": capture.scan_dpi, "ruler_mm": capture.ruler_mm}
+    options = replace(options, **parameters, controls=controls, ledger_photos=ledger_photos)
     if boxes is not None:
         if manifest.promise is None or not any(model.LOOKS_AT_BOXES for model in options.models):
             got = f"the classifiers {', '.join(model.name for model in options.models) or '(none)'}"
@@ -131,18 +127,9 @@ def verify(
         from patchproof.reprints.photo_forecast import photo_forecaster  # imports scene, renderer and optimizer
 
         forecast = photo_forecaster(run, manifest)
-    report = gather_evidence(
-        photos,
-        manifest,
-        options,
-        compute=compute,
-        journal=out / _JOURNAL,
-        resume=resume,
-        forecast=forecast,
-        on_pictures=lambda file, kinds: save_pictures(out / "pictures", file, kinds),
-        advance=partial(progress, "verify"),
-    )
-    parameters = {"scan_dpi": capture.scan_dpi, "ruler_mm": capture.ruler_mm}
+    gather = partial(gather_evidence, compute=compute, journal=out / _JOURNAL, resume=resume, forecast=forecast)
+    on_pictures = partial(save_pictures, out / "pictures")
+    report = gather(photos, manifest, options, on_pictures=on_pictures, advance=partial(progress, "verify"))
     parameters |= {"camera": capture.camera and Path(capture.camera).name}
     parameters |= {"boxes": boxes and Path(boxes).name, "ledger_photos": ledger_photos}
     hashes = {"manifest": file_sha256(Path(sheet)), **{f"network {each.name}": each.sha256 for each in options.models}}
@@ -186,9 +173,7 @@ def options_of(
     base, promise = Path(sheet).resolve().parent, manifest.promise
     least_score = None if promise is None else promise.models[0].least_score
     return Options(
-        models=[
-            load_classifier(network, base).with_least_score(least_score) for network in _networks(manifest, models)
-        ],
+        models=[load_classifier(each, base).with_least_score(least_score) for each in _networks(manifest, models)],
         printer=load_printer((manifest.settings.get("printer") or {}).get("profile", "coated"), base),
         camera=load_optional_camera(camera),
     )

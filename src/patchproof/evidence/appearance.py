@@ -72,24 +72,16 @@ def appearance(
     if fit.name == "white_black" and light.clipped > _MOST_CLIPPED_PAPER:
         share = 1.0  # overexposed paper is no reference
     valid_delta = delta[usable] if share <= MOST_CLIPPED else delta[:0]
-    color = Color(
-        color_fit=fit.name,
-        clipped_share=share,
-        glossy_share=float(glossy[inner].mean()),
-        delta_e00_mean=float(valid_delta.mean()) if valid_delta.size else None,
-        delta_e00_p95=float(np.percentile(valid_delta, 95)) if valid_delta.size else None,
-    )
+    color = Color(color_fit=fit.name, clipped_share=share, glossy_share=float(glossy[inner].mean()))
+    if valid_delta.size:
+        p95 = float(np.percentile(valid_delta, 95))
+        color = color.changed(delta_e00_mean=float(valid_delta.mean()), delta_e00_p95=p95)
     if not with_pictures:
         return color, {}
-    light_picture = resize_by_area(flat, rectified_px(surface.rect_mm, picture_per_mm))[..., :3]
-    fitted_picture = fit.apply(light_picture)
-    pictures = {
-        "seen": photo_codes_from_srgb(srgb_from_linear(light_picture)),
-        "fitted": photo_codes_from_srgb(srgb_from_linear(fitted_picture)),
-        "promised": photo_codes_from_srgb(srgb_from_linear(coarse_cells(design, fitted_picture.shape[:2], 0.0))),
-        "delta_e00": np.where(usable, delta, np.nan).astype(np.float32),
-    }
-    return color, pictures
+    seen = resize_by_area(flat, rectified_px(surface.rect_mm, picture_per_mm))[..., :3]
+    lights = {"seen": seen, "fitted": fit.apply(seen), "promised": coarse_cells(design, seen.shape[:2], 0.0)}
+    pictures = {kind: photo_codes_from_srgb(srgb_from_linear(linear)) for kind, linear in lights.items()}
+    return color, pictures | {"delta_e00": np.where(usable, delta, np.nan).astype(np.float32)}
 
 
 def _reduced_light(srgb: np.ndarray, step: int) -> np.ndarray:

@@ -44,9 +44,7 @@ _THUMBNAIL_PX = 560  # longer side: enough for a phone's width at twice its dens
 _DESIGN_COLOR, _MARKER_COLOR = (255, 64, 129), (0, 200, 140)
 _DIED_ADVICE = "measuring it ended its process each time, for want of memory: save it smaller"
 _EMPTY_ADVICE = "it shows one tone or noise and nothing else: take it again"
-_CROPPED_ADVICE = (
-    "it is a crop or a screenshot by its shape, its name or EXIF: it counts, but use the camera's own file"
-)
+_CROP_ADVICE = "it is a crop or a screenshot by its shape, its name or EXIF: it counts, but use the camera's own file"
 # codes of photographs whose homography is still accurate enough to put pieces into them
 MEASURABLE_CODES = (None, "clipped", "blurred", "too_small", "cropped")
 
@@ -173,7 +171,7 @@ def _measure(task: Task, item: PhotoItem) -> MeasuredPhoto:
     entry, pictures = measured.entry, {}
     # a crop or a screenshot by EXIF or its name, or by a shape that neither cameras nor the promise have
     if measured.counted and entry.code is None and (photo.is_crop or not has_camera_shape(size_px, task.photo_px)):
-        entry = entry.changed(remark=Remark(code="cropped", advice=_CROPPED_ADVICE))
+        entry = entry.changed(remark=Remark(code="cropped", advice=_CROP_ADVICE))
     if item.with_pictures:
         px_from_mm = entry.geometry and entry.geometry.homography_px_from_mm
         pictures = {"photo": _thumbnail(view.srgb, px_from_mm, task.surface), **measured.pictures}

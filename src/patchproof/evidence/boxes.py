@@ -55,9 +55,8 @@ def load_boxes(path: str | Path, label: str) -> dict[str, BoxEdges]:
         category_ids = [coco.categories[0].id]
     if not category_ids:
         names = [category.name for category in coco.categories]
-        raise Refused(
-            f'a category "{label}" of boxes in {path}', ", ".join(names) or "none", spelling_hint(label, names)
-        )
+        do = spelling_hint(label, names)
+        raise Refused(f'a category "{label}" of boxes in {path}', ", ".join(names) or "none", do)
     annotations = [annotation for annotation in coco.annotations if annotation.category_id in category_ids]
     names, counts = {image.id: image.file_name for image in coco.images}, Counter(a.image_id for a in annotations)
     for image_id, count in counts.items():
@@ -82,9 +81,8 @@ def box_in_square(box_px: BoxEdges, size_px: tuple[int, int]) -> BoxEdges:
     """
     side = min(size_px)
     left, top = ((size - side) / 2 for size in size_px)
-    x0, y0, x1, y1 = (
-        min(max((value - start) / side, 0.0), 1.0) for value, start in zip(box_px, (left, top, left, top), strict=True)
-    )
+    edges = zip(box_px, (left, top, left, top), strict=True)
+    x0, y0, x1, y1 = (min(max((value - start) / side, 0.0), 1.0) for value, start in edges)
     return (x0, y0, x1, y1) if x1 > x0 and y1 > y0 else (0.0, 0.0, 0.0, 0.0)
 
 

@@ -48,9 +48,8 @@ def judges_of(models: Sequence[Classifier], manifest: Manifest) -> Judges | None
         return None
     promised, by_name = manifest.promise.models[0], {model.name: model for model in models}
     if promised.name not in by_name:
-        raise Refused(
-            f"the promise's own network {promised.name}", ", ".join(by_name) or "none", f"add {promised.name}"
-        )
+        got = ", ".join(by_name) or "none"
+        raise Refused(f"the promise's own network {promised.name}", got, f"add {promised.name}")
     primary = by_name[promised.name]
     if promised.sha256 not in (None, primary.sha256):
         expected = f"the network {promised.name} that the promise was made for (SHA-256 {promised.sha256[:12]}...)"

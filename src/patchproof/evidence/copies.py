@@ -58,17 +58,15 @@ def _view(photo: MeasuredPhoto, rect_mm: Rect) -> np.ndarray | None:
     if not photo.counted or geometry is None or photo.light is None or size_px is None:
         return None
     light = np.log(np.maximum(photo.light.paper, 1e-3)) / LIGHT_TOLERANCE
-    figures = [
-        np.log(geometry.px_per_mm / max(size_px)) / SCALE_TOLERANCE,
-        np.cos(np.radians(geometry.tilt_deg)) / TILT_TOLERANCE,
-        *light,
-    ]
+    scale = np.log(geometry.px_per_mm / max(size_px)) / SCALE_TOLERANCE
+    tilt = np.cos(np.radians(geometry.tilt_deg)) / TILT_TOLERANCE
     corners = np.full((4, 2), np.nan)  # unknown on rolled paper
     if geometry.homography_px_from_mm is not None:
         corners = apply_homography(np.array(geometry.homography_px_from_mm), rect_corners(rect_mm)) / max(size_px)
     middle = corners.mean(0)
     side = geometry.px_per_mm * max(rect_mm[2:]) / max(size_px)
-    return np.array([*figures, *(middle / AIM_TOLERANCE), *((corners - middle) / side / SHAPE_TOLERANCE).ravel()])
+    shape = (corners - middle) / side / SHAPE_TOLERANCE
+    return np.array([scale, tilt, *light, *(middle / AIM_TOLERANCE), *shape.ravel()])
 
 
 def _is_same_view(view: np.ndarray, other: np.ndarray) -> bool:

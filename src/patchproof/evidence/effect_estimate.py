@@ -47,10 +47,8 @@ def estimate_effect(
     if manifest.design is None or len(shots) < LEAST_PHOTOS:
         return None
     pixels = manifest.design.pixels()
-    looks = {
-        kind: printed_colors(control_design(kind, pixels, ""), surface, printer)
-        for kind in ("design", *ESTIMATED_CONTROLS)
-    }
+    kinds = ("design", *ESTIMATED_CONTROLS)
+    looks = {kind: printed_colors(control_design(kind, pixels, ""), surface, printer) for kind in kinds}
     apply_print, _, lights = fit_print_and_lights(shots, looks["design"])
     pictures = {kind: piece_picture(surface, look.design) for kind, look in looks.items()}
     if apply_print is not None:

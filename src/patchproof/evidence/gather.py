@@ -66,16 +66,12 @@ def gather_evidence(
     photographs when each is measured; `advance` is called with (done, total).
     """
     controls_folder = None if options.controls is None else Path(options.controls)
-    grouping, control_paths = group_sessions(photos, controls_folder), _list_controls(controls_folder)
+    grouping, by_control = group_sessions(photos, controls_folder), _list_controls(controls_folder)
     paths = grouping.paths
     judges = judges_of(options.models, manifest)
     task = task_of(manifest, options, judges)
     items = [PhotoItem(path, grouping.file(i), with_pictures=i < MAX_PICTURED_PHOTOS) for i, path in enumerate(paths)]
-    items += [
-        PhotoItem(path, printable_name(path.name), control)
-        for control, files in control_paths.items()
-        for path in files
-    ]
+    items += [PhotoItem(path, printable_name(path.name), name) for name, files in by_control.items() for path in files]
     items = [replace(item, box_px=box_of_photo(options.boxes, item.name)) for item in items]
     if options.boxes and not any(item.box_px for item in items):
         do = "name the images in the boxes' file as the photographs"
@@ -211,15 +207,15 @@ def report_of(
 
 
 def _sessions(
-    grouping: Grouping, photos: Sequence[MeasuredPhoto], recognized: Mapping[str, bool]
+    grouping: Grouping, photos: Sequence[MeasuredPhoto], hits: Mapping[str, bool]
 ) -> tuple[SessionCount, ...]:
     """Count the judged and recognized photographs of each session."""
-    hits: list[list[bool]] = [[] for _ in grouping.names]
+    answers: list[list[bool]] = [[] for _ in grouping.names]
     for number, photo in zip(grouping.session, photos, strict=True):
-        if photo.counted and photo.entry.file in recognized:
-            hits[number].append(recognized[photo.entry.file])
-    named = zip(grouping.names, hits, strict=True)
-    return tuple(SessionCount(name=name, recognized=sum(answers), judged=len(answers)) for name, answers in named)
+        if photo.counted and photo.entry.file in hits:
+            answers[number].append(hits[photo.entry.file])
+    named = zip(grouping.names, answers, strict=True)
+    return tuple(SessionCount(name=name, recognized=sum(session), judged=len(session)) for name, session in named)
 
 
 def _recognized(entries: Iterable[PhotoEntry], network: str) -> dict[str, bool]:

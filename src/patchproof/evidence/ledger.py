@@ -131,10 +131,7 @@ def _looks(pixels: np.ndarray, surface: Surface, promised: PromisedColors, apply
 
 
 def _references(
-    claims: Sequence[tuple[float, float]],
-    shots: Sequence[PhotoSquare],
-    camera: Mapping[str, Any],
-    promised: PromisedColors,
+    claims: list[tuple[float, float]], shots: Sequence[PhotoSquare], camera: Mapping[str, Any], promised: PromisedColors
 ) -> list[Reference]:
     """Pair each photograph with one of the promise's conditions (contrast, blur_px), spread evenly over contrast.
 

@@ -17,14 +17,8 @@ from patchproof.evidence.camera import FOCAL_ERROR, PinholePhoto
 from patchproof.evidence.classify import BoxEdges
 from patchproof.evidence.results import CameraPose, FocalSource, Geometry
 from patchproof.evidence.surface import PromisedColors, Surface
+from patchproof.photo import pose as sheet_pose
 from patchproof.photo.detect import MarkersInView
-from patchproof.photo.pose import (
-    bent_sheet_position,
-    flat_sheet_position,
-    scale_and_tilt,
-    tilt_uncertainty_deg,
-    turn_rad,
-)
 from patchproof.photo.print_ratio import x_over_y
 from patchproof.photo.quality import FrameLight, blur_px
 from patchproof.photo.rectify import PageFit, corner_uncertainty_mm, fit_page
@@ -75,10 +69,8 @@ def locate_sheet(view: PinholePhoto, detected: MarkersInView, surface: Surface) 
     fit = _fit(detected, surface)
     if fit is None:
         return None
-    unrolled = _unroll_piece(view, detected, surface)
-    return (
-        LocatedSheet(view.srgb, fit, None) if unrolled is None else LocatedSheet(unrolled.srgb, unrolled.fit, unrolled)
-    )
+    sheet = _unroll_piece(view, detected, surface)
+    return LocatedSheet(view.srgb, fit, None) if sheet is None else LocatedSheet(sheet.srgb, sheet.fit, sheet)
 
 
 def _fit(detected: MarkersInView, surface: Surface) -> PageFit | None:
@@ -132,23 +124,19 @@ def object_box(view: PinholePhoto, location: LocatedSheet, surface: Surface) -> 
 
 
 def geometry_of(
-    location: LocatedSheet,
-    detected: MarkersInView,
-    light: FrameLight,
-    surface: Surface,
-    promised: PromisedColors | None,
+    location: LocatedSheet, detected: MarkersInView, light: FrameLight, surface: Surface, colors: PromisedColors | None
 ) -> tuple[Geometry, int]:
     """Measure the sheet's geometry, and count the corners of the design in which its pixels were found: four if that
     is unknown.
     """
     fit, unrolled = location.fit, location.unrolled
-    px_per_mm, tilt_deg = scale_and_tilt(location.px, location.parameters, surface.center_mm)
+    px_per_mm, tilt_deg = sheet_pose.scale_and_tilt(location.px, location.parameters, surface.center_mm)
     blur, shift, corners = blur_px(detected.markers.values()), None, 4
     uncertainty = unrolled.uncertainty_mm if unrolled else corner_uncertainty_mm(fit, surface.rect_mm)
     uncertainty = float(np.hypot(uncertainty, _OUTLIER_FACTOR * fit.outlier_mm))
     # one page of a piece in tiles has none of the piece's markers, or some of them
-    if promised is not None and surface.piece_ids:
-        cells = register(location.srgb, fit.px_from_mm, surface.rect_mm, promised.design, px_per_mm, blur)
+    if colors is not None and surface.piece_ids:
+        cells = register(location.srgb, fit.px_from_mm, surface.rect_mm, colors.design, px_per_mm, blur)
         shift, corners, corner_shift = _shifts(cells, surface)
         uncertainty = float(np.hypot(uncertainty, _SURE_SIGMAS * corner_shift))
     tilt_model = location.px, location.parameters, location.covariance, surface.center_mm, _turn_rad(location, surface)
@@ -156,7 +144,7 @@ def geometry_of(
         residual_mm=fit.residual_mm,
         px_per_mm=px_per_mm,
         tilt_deg=tilt_deg,
-        tilt_uncertainty_deg=tilt_uncertainty_deg(*tilt_model),
+        tilt_uncertainty_deg=sheet_pose.tilt_uncertainty_deg(*tilt_model),
         contrast=light.contrast,
         blur_px=blur,
         corner_uncertainty_mm=uncertainty,
@@ -170,7 +158,9 @@ def geometry_of(
 
 
 def _turn_rad(location: LocatedSheet, surface: Surface) -> float:
-    return turn_rad(location.fit.bend_mm / min(surface.rect_mm[2:]), location.unrolled and location.unrolled.shape)
+    return sheet_pose.turn_rad(
+        location.fit.bend_mm / min(surface.rect_mm[2:]), location.unrolled and location.unrolled.shape
+    )
 
 
 def _shifts(cells: Registration, surface: Surface) -> tuple[float | None, int, float]:
@@ -196,9 +186,9 @@ def camera_pose(view: PinholePhoto, location: LocatedSheet, surface: Surface) ->
         return None, "cropped" if view.cropped else "unknown"
     camera = view.matrix_px, view.focal_spread, surface.center_mm, _turn_rad(location, surface), view.calibrated
     if location.unrolled is None:
-        stance = flat_sheet_position(location.fit, *camera)
+        stance = sheet_pose.flat_sheet_position(location.fit, *camera)
     else:
-        stance = bent_sheet_position(location.unrolled.shape, *camera)
+        stance = sheet_pose.bent_sheet_position(location.unrolled.shape, *camera)
     # perspective cannot tell a stretched print from a wrong focal length: a camera file is trusted, EXIF is not
     if stance.focal_agrees is False and not view.calibrated:
         return None, "contradicted"

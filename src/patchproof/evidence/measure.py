@@ -229,9 +229,7 @@ def _scan_scale(px_from_mm: np.ndarray, surface: Surface, scan_dpi: float) -> Sc
     left, right, top, bottom = apply_homography(px_from_mm, ends)
     px_per_mm = scan_dpi / MM_PER_INCH
     scale_x, scale_y = (float(np.linalg.norm(px) / mm / px_per_mm) for px, mm in ((right - left, w), (bottom - top, h)))
-    if perspective < _MOST_PERSPECTIVE and all(
-        _SCALE_RANGE[0] < scale < _SCALE_RANGE[1] for scale in (scale_x, scale_y)
-    ):
+    if perspective < _MOST_PERSPECTIVE and all(_SCALE_RANGE[0] < s < _SCALE_RANGE[1] for s in (scale_x, scale_y)):
         return Scale(scale_x=scale_x, scale_y=scale_y)
     return None
 

@@ -103,9 +103,8 @@ def photo_square(
         light, blur_px = replace(light, paper=unmixed.paper, ink=unmixed.ink), unmixed.blur_px
     square, matrix = np.ascontiguousarray(square), None if matrix_px is None else to_square @ matrix_px
     cells = _design_cells(square, to_square @ px_from_mm, surface)
-    return PhotoSquare(
-        file, square, to_square @ px_from_mm, light, blur_px * scale, noise_of(square), cells, scale, matrix
-    )
+    noise = noise_of(square)
+    return PhotoSquare(file, square, to_square @ px_from_mm, light, blur_px * scale, noise, cells, scale, matrix)
 
 
 def _design_cells(square: np.ndarray, px_from_mm: np.ndarray, surface: Surface) -> np.ndarray:
@@ -137,11 +136,8 @@ def light_fit(shot: PhotoSquare, promised: PromisedColors) -> ColorFit:
     """
     paper, ink = shot.light.paper, shot.light.ink
     # of local means: noise that is clipped at zero lightens them as it lightens dark ink
-    darkest = np.quantile(
-        cv2.blur(LINEAR_FLOAT32_FROM_CODE[shot.square], (_AVERAGE_PX, _AVERAGE_PX)).reshape(-1, 3),
-        _DARKEST_SHARE,
-        axis=0,
-    )
+    means = cv2.blur(LINEAR_FLOAT32_FROM_CODE[shot.square], (_AVERAGE_PX, _AVERAGE_PX)).reshape(-1, 3)
+    darkest = np.quantile(means, _DARKEST_SHARE, axis=0)
     veil = np.clip((ink - paper * promised.ink) / (1 - promised.ink), 0, darkest)
     return white_black(paper, veil + (paper - veil) * promised.ink, promised.ink)
 
@@ -190,10 +186,8 @@ def reprojected_squares(
         surroundings[True, blur] = picture
         surroundings[False, blur] = np.clip(reference.white * undo.apply(picture), 0, 1).astype(np.float32)
     srgb = {key: srgb_from_linear(picture) for key, picture in surroundings.items()}
-    lights = {
-        True: invert_affine(print_light.matrix),
-        False: np.column_stack([np.eye(3) * reference.white, np.zeros(3)]),
-    }
+    promised_light = np.column_stack([np.eye(3) * reference.white, np.zeros(3)])
+    lights = {True: invert_affine(print_light.matrix), False: promised_light}
     squares = {}
     for switches, look in looks.items():
         sharp = _layer(look, shot.px_from_mm, rect_mm, box)

@@ -130,9 +130,9 @@ def compare(patch: Mapping[str, bool], name: str, control: Mapping[str, bool], g
     whether the patch changes recognition in the goal's direction, at 95 %.
     """
     counts = sum(control.values()), len(control)
-    comparison = Control(name, *counts, wilson(*counts))
+    row = Control(name, *counts, wilson(*counts))
     if not patch or not control:
-        return comparison
+        return row
     names = sorted(patch.keys() & control.keys())
     if len(names) >= max(LEAST_PAIRS, LEAST_PAIRED * len(patch), LEAST_PAIRED * len(control)):
         a, b = [patch[name] for name in names], [control[name] for name in names]
@@ -143,9 +143,7 @@ def compare(patch: Mapping[str, bool], name: str, control: Mapping[str, bool], g
     else:
         difference, interval = independent_difference(sum(patch.values()), len(patch), *counts)
         shown, p_value, pairs = min(goal.sign * end for end in interval) > 0, None, 0
-    return replace(
-        comparison, pairs=pairs, difference=difference, difference_interval=interval, p_value=p_value, shown=shown
-    )
+    return replace(row, pairs=pairs, difference=difference, difference_interval=interval, p_value=p_value, shown=shown)
 
 
 def effect_of(controls: Sequence[Control]) -> Effect:

@@ -34,17 +34,15 @@ class LabeledPhoto:
 def coco_json(photos: Sequence[LabeledPhoto], label: str, about: str) -> str:
     """Make the text of a `coco.json`; `label` is the object's category, `about` the description."""
     categories = {label: 1, PATCH: 2} if label != PATCH else {PATCH: 1}
-    annotations = []
+    images, annotations = [], []
     for number, photo in enumerate(photos, 1):
+        width, height = photo.size_px
+        images.append({"id": number, "file_name": photo.file, "width": width, "height": height})
         for name, outline in photo.outlines.items():
             shape = _annotation(outline, photo.size_px, name == PATCH)
             if shape is not None:
                 ids = {"id": len(annotations) + 1, "image_id": number, "category_id": categories[name]}
                 annotations.append(ids | shape)
-    images = [
-        {"id": number, "file_name": photo.file, "width": photo.size_px[0], "height": photo.size_px[1]}
-        for number, photo in enumerate(photos, 1)
-    ]
     data = {
         "info": {"description": about},
         "images": images,

@@ -12,15 +12,10 @@ from patchproof.base.intervals import Estimate
 
 def render_page(template: str, folder: Path = Path(__file__).parent, **values: object) -> str:
     """Render a template of `folder` (by default this room's) with its values."""
-    import jinja2
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(folder),
-        autoescape=True,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        undefined=jinja2.StrictUndefined,
-    )
+    environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=StrictUndefined)
+    environment.loader = FileSystemLoader(folder)
     environment.filters |= {"percent": _percent, "figure": _figure}
     environment.tests["figure"] = lambda value: isinstance(value, (int, float, Estimate)) or value is None
     return environment.get_template(template).render(values)

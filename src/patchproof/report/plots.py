@@ -20,11 +20,10 @@ if TYPE_CHECKING:
 _INK = "#010203"  # stands for the page's own text color and is replaced in the SVG
 _YES, _NO = "#2a9d6f", "#d1495b"
 _LEAST_FOR_LINE = 24
+PlotRows = Sequence[Mapping]
 
 
-def recognition_plot(
-    photos: Sequence[Mapping], model: str, figure: str, label: str, promised: Sequence[Mapping]
-) -> str | None:
+def recognition_plot(photos: PlotRows, model: str, figure: str, label: str, promised: PlotRows) -> str | None:
     """Plot recognition over one figure of the photographs; None if fewer than two photographs have it."""
     x, y = _points(photos, figure, lambda photo: photo["predictions"].get(model, {}).get("recognized"))
     if len(x) < 2:
@@ -33,7 +32,7 @@ def recognition_plot(
     return _svg(lambda axes: _draw(axes, x, y, px, py, label))
 
 
-def scale_plot(photos: Sequence[Mapping]) -> str | None:
+def scale_plot(photos: PlotRows) -> str | None:
     """Plot the print's scale, across and down, of the photographs that measured it; None if none did."""
     scales = [(photo["scale_x"], photo["scale_y"]) for photo in photos if photo.get("scale_x") is not None]
     return _svg(lambda axes: _draw_scales(axes, np.array(scales))) if scales else None
@@ -54,11 +53,8 @@ def _draw_scales(axes, scales: np.ndarray) -> None:
     axes.plot(number, scales[:, 0], "o", color="#2457c5", markersize=5, label="across (x)")
     axes.plot(number, scales[:, 1], "s", color="#b0713c", markersize=4, label="down (y)")
     reach = max(0.02, 1.2 * float(np.abs(scales - 1).max()))
-    axes.set_ylim(1 - reach, 1 + reach)
-    axes.set_xlim(0.5, len(scales) + 0.5)
-    axes.set_xticks([])
-    axes.set_xlabel("photographs that show the print's size")
-    axes.set_ylabel("print scale")
+    axes.set(ylim=(1 - reach, 1 + reach), xlim=(0.5, len(scales) + 0.5), xticks=[])
+    axes.set(xlabel="photographs that show the print's size", ylabel="print scale")
     axes.yaxis.label.set_color(_INK)
     axes.legend(frameon=False, labelcolor=_INK)
 
@@ -112,8 +108,7 @@ def _draw(axes, x, y, promised_x, promised_y, label) -> None:
             window = np.ones(max(5, len(points) // 4))
             running = (np.convolve(values, window / len(window), "valid") for values in (points, hits))
             axes.plot(*running, style, color=_INK, linewidth=1.3)
-    axes.set_xlabel(label)
-    axes.set_ylim(-0.15, 1.15)
+    axes.set(xlabel=label, ylim=(-0.15, 1.15))
     axes.set_yticks([0, 0.5, 1], ["not recognized", "50 %", "recognized"])
 
 

@@ -135,11 +135,6 @@ def text_lines(table: Table) -> list[str]:
     """Format a table for a terminal: text to the left, numbers to the right."""
     rows = [table.head, *(tuple(map(cell_text, row)) for row in table.rows)]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    is_text = [all(isinstance(row[i], str) for row in table.rows) for i in range(len(table.head))]
-    return [
-        "  ".join(
-            cell.ljust(width) if to_left else cell.rjust(width)
-            for cell, width, to_left in zip(row, widths, is_text, strict=True)
-        ).rstrip()
-        for row in rows
-    ]
+    are_text = (all(isinstance(row[i], str) for row in table.rows) for i in range(len(table.head)))
+    pads = [str.ljust if is_text else str.rjust for is_text in are_text]
+    return ["  ".join(pad(cell, n) for pad, cell, n in zip(pads, row, widths, strict=True)).rstrip() for row in rows]

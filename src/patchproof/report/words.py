@@ -159,8 +159,6 @@ def _control_lines(controls: Mapping[str, Mapping[str, Any]]) -> list[str]:
     for kind, claim in controls.items():
         low, high = (100 * bound for bound in claim["difference_interval"])
         of_count = f" of {claim['n']}" if claim.get("n") else ""
-        rows.append(
-            f"  {kind:>6}: {claim['rate']:6.1%}{of_count}   "
-            f"difference {100 * claim['difference']:+.1f} points [{low:+.1f}, {high:+.1f}]"
-        )
+        difference = f"difference {100 * claim['difference']:+.1f} points [{low:+.1f}, {high:+.1f}]"
+        rows.append(f"  {kind:>6}: {claim['rate']:6.1%}{of_count}   {difference}")
     return rows

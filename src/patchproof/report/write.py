@@ -31,9 +31,7 @@ _FIRST = ("file", "status", "code", "figure", "threshold", "advice")
 _PLOTS = (("tilt_deg", "tilt in degrees"), ("px_per_mm", "pixels per millimeter"))
 
 
-def write_report(
-    report: Mapping[str, Any], manifest: Mapping[str, Any], out_dir: str | Path, ledger: Mapping[str, Any] | None = None
-) -> Path:
+def write_report(report: Mapping, manifest: Mapping, out_dir: str | Path, ledger: Mapping | None = None) -> Path:
     """Write report.json, report.csv and report.html into `out_dir`; returns the page's path.
 
     `report` and `manifest` are `model_dump()`s. Pictures are those of `images.save_pictures` in `out_dir`/pictures:
@@ -48,9 +46,7 @@ def write_report(
     return out / "report.html"
 
 
-def report_html(
-    report: Mapping, manifest: Mapping, encoded: Mapping[str, Mapping[str, bytes]], ledger: Mapping | None
-) -> str:
+def report_html(report: Mapping, manifest: Mapping, encoded: Mapping[str, Mapping], ledger: Mapping | None) -> str:
     """Render the page's HTML; `encoded` are JPEG or PNG bytes by photo and kind."""
     promise, summary, photos = manifest.get("promise"), report["summary"], report["photos"]
     judged = [photo for photo in photos if photo["status"] != "rejected"]
@@ -62,6 +58,7 @@ def report_html(
             for name, label in _PLOTS
         ]
     estimated = summary["effect"] == "not_tested" and (summary["estimated"] or {}).get("controls")
+    pictures = {file: {kind: data_uri(data) for kind, data in kinds.items()} for file, kinds in encoded.items()}
     return render_page(
         "page.html.j2",
         report=report,
@@ -81,13 +78,7 @@ def report_html(
         waterfall=ledger_plot(ledger) if ledger else "",
         plots=[(svg, about) for svg, about in plots if svg],
         sized=any(photo["scale_x"] is not None for photo in photos),
-        cards=[
-            {
-                "photo": photo,
-                "pictures": {kind: data_uri(file) for kind, file in encoded.get(photo["file"], {}).items()},
-            }
-            for photo in photos
-        ],
+        cards=[{"photo": photo, "pictures": pictures.get(photo["file"], {})} for photo in photos],
         remarks=remarks(photos),
         delta_top=DELTA_TOP,
         settings=json.dumps(manifest["settings"], indent=1, ensure_ascii=False),
@@ -108,8 +99,7 @@ def _bars(summary: Mapping, promise: Mapping | None, controls: Sequence[Mapping]
         allowed = [count / judged for count in summary["prediction_interval"]]
         rows.append((f"Allowed for {judged} photographs", None, allowed, "allowed"))
     if forecast := summary["forecast"]:
-        n = forecast["photos"]
-        allowed = [count / n for count in forecast["interval"]]
+        n, allowed = forecast["photos"], [count / forecast["photos"] for count in forecast["interval"]]
         rows.append((f"Expected of {n} at their views", forecast["expected"] / n, allowed, "promised"))
     for c in controls:
         if c["n"]:
@@ -137,9 +127,7 @@ def _csv_row(photo: Mapping[str, Any]) -> dict[str, Any]:
             numbers = [None] * 9 if value is None else [number for line in value for number in line]
             row |= {f"{name}_{i // 3}{i % 3}": number for i, number in enumerate(numbers)}
         elif name == "predictions":
-            row |= {
-                f"{model} {key}": _csv_value(v) for model, prediction in value.items() for key, v in prediction.items()
-            }
+            row |= {f"{model} {key}": _csv_value(v) for model, answer in value.items() for key, v in answer.items()}
         else:
             row[name] = _csv_value(value)
     return row

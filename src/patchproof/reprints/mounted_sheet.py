@@ -129,14 +129,12 @@ class MountedSheet:
         if self.piece is None:
             return PhotoTruth(None, {}, values)
         surface, homography, cut = surface_of(self.manifest), self.px_from_page(conditions), self.manifest.cut_mm[:2]
-        corners = {
-            i: geometry.apply_homography(homography, page_mm)
-            if self.scene.is_flat
-            else self.scene.piece_px(conditions, page_mm - cut)
-            for i, page_mm in surface.corners_mm.items()
-            if i in surface.piece_ids
-        }
-        return PhotoTruth(geometry.normalize_homography(homography) if self.scene.is_flat else None, corners, values)
+        on_piece = {i: page_mm for i, page_mm in surface.corners_mm.items() if i in surface.piece_ids}
+        if not self.scene.is_flat:
+            corners = {i: self.scene.piece_px(conditions, page_mm - cut) for i, page_mm in on_piece.items()}
+            return PhotoTruth(None, corners, values)
+        corners = {i: geometry.apply_homography(homography, page_mm) for i, page_mm in on_piece.items()}
+        return PhotoTruth(geometry.normalize_homography(homography), corners, values)
 
     def outlines(self, conditions: Conditions) -> dict[str, np.ndarray]:
         """Outlines N×2 in pixels of one view: corners of the object's box, if it has a mesh, and the piece's border, if
@@ -164,10 +162,8 @@ class MountedSheet:
 def mount_sheet(pdf_path: str | Path, run: Run, how: ReprintSetup = DEFAULT_SETUP) -> MountedSheet:
     """Mount the PDF's sheet on the object of its run; refused if the sheet is not of this run."""
     manifest, scene = sheet_scene(pdf_path, run)
-    sent_srgb, stage = (
-        sent_pixels(pdf_path, manifest, scene),
-        set_stage(require_piece(scene).with_print_scale(how.print_scale)),
-    )
+    sent_srgb = sent_pixels(pdf_path, manifest, scene)
+    stage = set_stage(require_piece(scene).with_print_scale(how.print_scale))
     return MountedSheet(stage, manifest, sent_srgb, how.printer_for(scene), how)
 
 

@@ -68,13 +68,7 @@ def page_light(page: np.ndarray, apply_printer: PrintFunction) -> np.ndarray:
 
 
 def reprint_pages(
-    pdf_path: str | Path,
-    n: int,
-    out: str | Path,
-    how: ReprintSetup,
-    *,
-    seed: int | None = None,
-    overwrite: bool = False,
+    pdf: str | Path, n: int, out: str | Path, how: ReprintSetup, *, seed: int | None = None, overwrite: bool = False
 ) -> None:
     """Write n photographs of the pages of a PDF, in turn, lying flat: for pages that belong to no run, such as blank
     ones, charts and boards. `how` names their printer (None: coated) and the print's scale.
@@ -87,8 +81,8 @@ def reprint_pages(
 
     with new_folder(out, ("photo_*.jpg",), overwrite) as folder:
         pages = []
-        for number in range(page_count(pdf_path)):
-            light = page_light(rasterize_page(pdf_path, number + 1, PX_PER_MM * MM_PER_INCH), apply_printer)
+        for number in range(page_count(pdf)):
+            light = page_light(rasterize_page(pdf, number + 1, PX_PER_MM * MM_PER_INCH), apply_printer)
             pages.append(cv2.resize(light, None, fx=how.print_scale[0], fy=how.print_scale[1]))
         for i in range(n):
             shot = photograph_page(pages[i % len(pages)], (seed or 0) + i)
@@ -112,14 +106,10 @@ def photograph_page(page: np.ndarray, seed: int, camera: Camera | None = None) -
     exposure = rng.uniform(0.5, 0.85) / (corner_light.max() * white_balance.max())
     light = _light_in_picture(px_from_mm, page_mm / 2, sources)
     raw = _warp_page(page, px_from_mm) * (light * _vignetting(rng.uniform(0, 0.2)))[..., None]
-    sensor = Sensor(
-        blur_px=np.array([rng.uniform(0, 1)]),
-        exposure_ev=np.array([np.log2(exposure)]),
-        white_balance=white_balance[None],
-        noise=np.array([rng.uniform(0, 0.01)]),
-        noise_seed=np.array([seed]),
-        jpeg=np.array([rng.uniform(60, 95)]),
-    )
+    ranges = {"blur_px": (0, 1), "noise": (0, 0.01), "jpeg": (60, 95)}
+    drawn = {name: np.array([rng.uniform(*ends)]) for name, ends in ranges.items()}
+    exposure_ev, noise_seed = np.array([np.log2(exposure)]), np.array([seed])
+    sensor = Sensor(exposure_ev=exposure_ev, white_balance=white_balance[None], noise_seed=noise_seed, **drawn)
     picture = torch.tensor(raw.transpose(2, 0, 1)[None], dtype=torch.float32)
     codes = develop(picture, sensor, 1.0, jpeg=False, camera=camera)[0].permute(1, 2, 0).numpy().astype(float)
     file = image_bytes(photo_codes_from_srgb(codes), "JPEG", {"quality": int(sensor.jpeg[0])})
@@ -128,10 +118,9 @@ def photograph_page(page: np.ndarray, seed: int, camera: Camera | None = None) -
 
 def _draw_sources(rng: np.random.Generator) -> _Sources:
     """Draw the sources; the lamp is 300 to 600 mm away, so that one side of the page is up to twice as bright."""
-    lamp = geometry.orbit(rng.uniform(-60, 60), rng.uniform(-60, 60), (0, 0, -1.0), (0, -1.0, 0)) * rng.uniform(
-        300, 600
-    )
-    toward = geometry.orbit(rng.uniform(-50, 50), rng.uniform(-50, 50), (0, 0, -1.0), (0, -1.0, 0))
+    front, up = (0, 0, -1.0), (0, -1.0, 0)
+    lamp = geometry.orbit(rng.uniform(-60, 60), rng.uniform(-60, 60), front, up) * rng.uniform(300, 600)
+    toward = geometry.orbit(rng.uniform(-50, 50), rng.uniform(-50, 50), front, up)
     lamp_light = rng.uniform(0.2, 0.8)
     return _Sources(rng.uniform(0.3, 0.7), rng.uniform(0, 0.5) * -toward[2], lamp_light, lamp)
 

@@ -156,9 +156,7 @@ def _sensor(mi: ModuleType, scene: MeshScene, conditions: Conditions, frame: Fra
     off = matrix[:2, 2] / frame.size_px - 0.5
     lens = {"type": "thinlens", "aperture_radius": aperture_mm / 2, "focus_distance": float(middle[2])}
     if aperture_mm == 0 or off.any():
-        lens = {"type": "perspective"} | {
-            f"principal_point_offset_{axis}": float(off[i]) for i, axis in enumerate("xy")
-        }
+        lens = {"type": "perspective"} | {f"principal_point_offset_{x}": float(off[i]) for i, x in enumerate("xy")}
     return lens | {
         "to_world": mi.ScalarTransform4f(np.linalg.inv(pose) @ np.diag([-1.0, -1.0, 1.0, 1.0])),
         "fov": float(np.degrees(2 * np.arctan(width / 2 / matrix[0, 0]))),
@@ -192,11 +190,8 @@ def _lights(mi: ModuleType, scene: MeshScene, light: Light, radius_deg: float) -
         up = np.eye(3)[np.abs(toward).argmin()]  # any that is not along the light
         place = mi.ScalarTransform4f().look_at((middle + far * toward).tolist(), middle.tolist(), up.tolist())
         radiance = {"type": "rgb", "value": [float(light.directional[0] / np.sin(angle) ** 2)] * 3}
-        emitters["sun"] = {
-            "type": "disk",
-            "to_world": place @ mi.ScalarTransform4f().scale(float(far * np.tan(angle))),
-            "emitter": {"type": "area", "radiance": radiance},
-        }
+        to_world = place @ mi.ScalarTransform4f().scale(float(far * np.tan(angle)))
+        emitters["sun"] = {"type": "disk", "to_world": to_world, "emitter": {"type": "area", "radiance": radiance}}
     return emitters
 
 
@@ -223,26 +218,21 @@ def _object(mi: ModuleType, mesh: Mesh) -> list:
     shapes = []
     for number, material in enumerate(mesh.materials):
         faces = mesh.face_material == number
-        count = int(faces.sum())
-        if not count:
+        if not (count := int(faces.sum())):
             continue
         colors = (mesh.corner_color_linear[faces] * np.array(material.base_color_linear)).reshape(-1, 3)
         color = {"type": "mesh_attribute", "name": "vertex_color"}
         if material.texture_srgb is not None:
             if np.ptp(colors, axis=0).max() > 1 / 255:
-                raise Refused(
-                    "objects whose materials have a texture or colors of corners, not both",
-                    f"both in {material.name}",
-                    "bake the colors in",
-                )
+                expected = "objects whose materials have a texture or colors of corners, not both"
+                raise Refused(expected, f"both in {material.name}", "bake the colors in")
             color = _texture(mi, LINEAR_FROM_CODE[material.texture_srgb] * colors[0], "repeat")
         corners = mesh.vertices[mesh.faces[faces]].reshape(-1, 3)
         normals, uv = mesh.corner_normal[faces].reshape(-1, 3), mesh.corner_uv[faces].reshape(-1, 2)
         bsdf = {"type": "twosided", "both": _diffuse(color)}
         paint = (colors * PAPER_REFLECTANCE).clip(0, 1)
-        shapes.append(
-            _mesh(mi, f"object{number}", corners, np.arange(3 * count).reshape(-1, 3), normals, uv, bsdf, paint)
-        )
+        triangles = np.arange(3 * count).reshape(-1, 3)
+        shapes.append(_mesh(mi, f"object{number}", corners, triangles, normals, uv, bsdf, paint))
     return shapes
 
 
@@ -258,11 +248,9 @@ def _texture(mi: ModuleType, linear: np.ndarray, wrap: str) -> dict:
 
 def _mesh(mi: ModuleType, name: str, vertices, faces, normals, uv, bsdf: dict, colors: np.ndarray | None = None):
     """Make a Mitsuba shape of triangles; `uv` (0, 0) is the top left, and v runs down."""
-    properties = mi.Properties()
-    properties["bsdf"] = mi.load_dict(bsdf)
-    mesh = mi.Mesh(
-        name, len(vertices), len(faces), has_vertex_normals=True, has_vertex_texcoords=True, props=properties
-    )
+    props = mi.Properties()
+    props["bsdf"] = mi.load_dict(bsdf)
+    mesh = mi.Mesh(name, len(vertices), len(faces), has_vertex_normals=True, has_vertex_texcoords=True, props=props)
     if colors is not None:
         mesh.add_attribute("vertex_color", 3, np.ravel(colors).astype(np.float32))
     parameters = mi.traverse(mesh)

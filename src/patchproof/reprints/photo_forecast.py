@@ -107,9 +107,8 @@ def render_measured_view(
     background = PhotoBackground(pictures=(), srgb=photo_codes_from_srgb(srgb_from_linear(light.clip(0, 1))))
     values: dict[str, Any] = {field.name: getattr(scene, field.name) for field in fields(scene)}
     values["backgrounds"] = background
-    measured_scene = MeasuredCameraScene(
-        **values, pose=pose, unit_matrix=np.diag([1 / side, 1 / side, 1.0]) @ shot.matrix_px
-    )
+    values |= {"pose": pose, "unit_matrix": np.diag([1 / side, 1 / side, 1.0]) @ shot.matrix_px}
+    measured_scene = MeasuredCameraScene(**values)
     conditions = _conditions(scene, shot, float(paper[1]), tint)
     size_px = problem.figure_px, problem.figure_px
     return render_views(replace(problem.stage, scene=measured_scene), piece, conditions, size_px)

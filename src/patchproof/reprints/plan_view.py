@@ -63,9 +63,7 @@ def draw_plan_view(scene: PatchScene, template: Template) -> PlacementPicture:
     if not placement.is_flat:
         tapes = scene.tape_measurements()
         spans = _spans(tapes, project)
-        for tape in tapes:
-            start, end = project(tape.points_mm[[0, -1]])
-            seams.append((tuple(start), tuple(end)))
+        seams += [tuple(map(tuple, project(tape.points_mm[[0, -1]]))) for tape in tapes]
     return PlacementPicture(
         picture=plan_picture(set_stage(scene), scene.frame, half),
         picture_mm=(-half[0], -half[1], 2 * half[0], 2 * half[1]),
@@ -92,26 +90,22 @@ def _spans(
 
 
 def plan_picture(
-    stage: Stage,
-    frame: SurfaceFrame,
-    half_mm: np.ndarray,
-    picture_px: int = PICTURE_PX,
-    on_piece: np.ndarray | None = None,
+    stage: Stage, frame: SurfaceFrame, half_mm: np.ndarray, side_px: int = PICTURE_PX, colors: np.ndarray | None = None
 ) -> np.ndarray:
     """Render a stage's object in even light on white, seen along a frame's normal, spanning ± half_mm: uint8 H×W×3.
 
-    `on_piece` are colors (uint8 h×w×3) over the scene's piece, which are shown without light.
+    `colors` (uint8 h×w×3) are laid over the scene's piece, and shown without light.
     """
     scene = require_mesh(stage.scene)
     distance = DISTANCE_LENGTHS * scene.length_mm
-    px_per_mm = picture_px / (2 * half_mm.max())
+    px_per_mm = side_px / (2 * half_mm.max())
     width, height = (int(v) for v in np.maximum(np.rint(2 * half_mm * px_per_mm), 16))
     fov = float(np.degrees(2 * np.arctan(half_mm.min() / distance)))
     view = {"fov_deg": fov, "look_at": "object"}
     settings = scene.settings.changed(view=view, camera={"photo_px": (width, height), "file": None})
     white = load_backgrounds(BackgroundSettings(color=(1.0, 1.0, 1.0)), Path())
     plain = replace(stage, scene=replace(scene, settings=settings, frame=frame, backgrounds=white, camera=None))
-    piece = None if on_piece is None else PiecePicture.of(torch.tensor(on_piece, dtype=torch.float32) / 255)
+    piece = None if colors is None else PiecePicture.of(torch.tensor(colors, dtype=torch.float32) / 255)
     with torch.no_grad():
         views = render_views(plain, piece, _frontal_conditions(distance, 0.55, 0.45), (width, height))
         light = _pixel_rows(shade(views, None))
@@ -131,12 +125,6 @@ def _pixel_rows(pictures: Tensor) -> Tensor:
 
 def _frontal_conditions(distance_mm: float, ambient: float, directional: float) -> Conditions:
     """Conditions of one frontal view in ambient light and directional light from the upper left."""
-    return Conditions(
-        pose=Pose(distance_mm=np.array([distance_mm])),
-        light=Light(
-            ambient=np.array([ambient]),
-            directional=np.array([directional]),
-            light_azimuth_deg=np.array([-30.0]),
-            light_elevation_deg=np.array([45.0]),
-        ),
-    )
+    direction = {"light_azimuth_deg": np.array([-30.0]), "light_elevation_deg": np.array([45.0])}
+    light = Light(ambient=np.array([ambient]), directional=np.array([directional]), **direction)
+    return Conditions(pose=Pose(distance_mm=np.array([distance_mm])), light=light)

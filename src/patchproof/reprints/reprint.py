@@ -23,14 +23,7 @@ from patchproof.base.progress import Progress, no_progress
 from patchproof.base.workers import Workers, fork_workers, open_workers, result_of
 from patchproof.optimizer.run import Run, load_run
 from patchproof.report.coco import LabeledPhoto, coco_json
-from patchproof.reprints.mounted_sheet import (
-    DEFAULT_SETUP,
-    MountedSheet,
-    PhotoTruth,
-    ReprintSetup,
-    mount_sheet,
-    sheet_scene,
-)
+from patchproof.reprints.mounted_sheet import DEFAULT_SETUP, PhotoTruth, ReprintSetup, mount_sheet, sheet_scene
 from patchproof.reprints.run_sheet import sheet as sheet_of
 from patchproof.scene.conditions import Conditions
 
@@ -91,8 +84,7 @@ def reprint(
             names = [f"session_{i // each + 1:02d}/{name}" for i, name in enumerate(names)]
         take_photo = partial(_take_photo, Path(pdf).resolve(), run.folder.resolve(), how)
         jobs, cluster = compute.jobs, compute.cluster
-        local = cluster is None
-        opening = fork_workers(sheet.photograph, jobs) if local else _cluster_workers(take_photo, jobs, cluster)
+        opening = _cluster_workers(take_photo, jobs, cluster) if cluster else fork_workers(sheet.photograph, jobs)
         with new_folder(out, REPRINT_FILES, overwrite) as folder, opening as (workers, take):
             for i, photo in workers.completed(take, views):
                 make_folder((folder / names[i]).parent)
@@ -130,13 +122,13 @@ def _pdf_to_mount(pdf_path: str | Path, run: Run, control: str | None, out: Path
 
 
 def _take_photo(pdf: Path, run_folder: Path, how: ReprintSetup, conditions: Conditions) -> bytes:
-    return _mounted_sheet(pdf, run_folder, how).photograph(conditions)
+    return _photographer(pdf, run_folder, how)(conditions)
 
 
 @lru_cache(maxsize=1)
-def _mounted_sheet(pdf: Path, run_folder: Path, how: ReprintSetup) -> MountedSheet:
+def _photographer(pdf: Path, run_folder: Path, how: ReprintSetup) -> Callable[[Conditions], bytes]:
     """Mount the sheet in another process, once."""
-    return mount_sheet(pdf, load_run(run_folder), how)
+    return mount_sheet(pdf, load_run(run_folder), how).photograph
 
 
 def write_truth(folder: Path, truth: Mapping[str, PhotoTruth]) -> None:

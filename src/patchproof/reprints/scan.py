@@ -8,9 +8,8 @@ import cv2
 import numpy as np
 import torch
 
-from patchproof.base import geometry
 from patchproof.base.color import photo_codes_from_srgb
-from patchproof.base.geometry import MM_PER_INCH
+from patchproof.base.geometry import MM_PER_INCH, apply_homography
 from patchproof.base.output import image_bytes, new_folder
 from patchproof.base.resample import index_homography
 from patchproof.channel.printer import Printer
@@ -37,12 +36,9 @@ def scan(
     printer, px_from_mm = how.printer_for(run.scene), np.diag([*(dpi / MM_PER_INCH * np.array(how.print_scale)), 1.0])
     with new_folder(out, REPRINT_FILES, overwrite) as folder:
         for page in sorted({marker.page for marker in manifest.markers}):
-            picture = _scan_page(
-                rasterize_page(pdf_path, page, 2 * dpi), manifest.page_mm, dpi, printer, how.print_scale
-            )
-            corners = {
-                m.id: geometry.apply_homography(px_from_mm, m.corners_mm) for m in manifest.markers if m.page == page
-            }
+            pixels = rasterize_page(pdf_path, page, 2 * dpi)
+            picture = _scan_page(pixels, manifest.page_mm, dpi, printer, how.print_scale)
+            corners = {m.id: apply_homography(px_from_mm, m.corners_mm) for m in manifest.markers if m.page == page}
             content = image_bytes(photo_codes_from_srgb(picture), "JPEG", {"quality": SCAN_QUALITY})
             for _ in range(n):
                 name = f"scan_{len(truth) + 1:04d}.jpg"

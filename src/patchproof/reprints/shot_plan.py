@@ -16,17 +16,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from patchproof.base.intervals import CONFIDENCE, independent_difference
+from patchproof.base.intervals import CONFIDENCE, wilson
 from patchproof.base.sessions import split_evenly
 from patchproof.base.settings import SceneSettings, background_summary
-from patchproof.evidence.verdict import (
-    MOST_PHOTOS,
-    kept_chance,
-    photos_line,
-    places_text,
-    required_rate,
-    sessions_needed,
-)
+from patchproof.evidence import verdict
 from patchproof.optimizer.promise import PROMISE_VIEWS
 from patchproof.sheets.manifest import Promise
 
@@ -64,8 +57,10 @@ def plan_shots(promise: Promise) -> ShotPlan:
     better, worse = (promise.rate, promise.controls[best].rate)[:: promise.target.goal.sign]
     splits = [(counts, split_evenly(*counts)) for counts in SHOT_COUNTS]
     return ShotPlan(
-        options=tuple(ShotOption(*c, promise.posterior.count_interval(p), kept_chance(promise, p)) for c, p in splits),
-        sessions=sessions_needed(promise),
+        options=tuple(
+            ShotOption(*c, promise.posterior.count_interval(p), verdict.kept_chance(promise, p)) for c, p in splits
+        ),
+        sessions=verdict.sessions_needed(promise),
         control=best,
         paired=fewest_photos(lambda n: paired_power(better, worse, n) >= POWER),
         unpaired=fewest_photos(lambda n: unpaired_power(better, worse, n) >= POWER),
@@ -75,7 +70,7 @@ def plan_shots(promise: Promise) -> ShotPlan:
 def fewest_photos(enough: Callable[[int], bool]) -> int | None:
     """The smallest n from 5 to 150 from which on n photographs are enough; None if there is none."""
     run = 0
-    for n in range(5, MOST_PHOTOS + STEADY_COUNTS):
+    for n in range(5, verdict.MOST_PHOTOS + STEADY_COUNTS):
         run = run + 1 if enough(n) else 0
         if run == STEADY_COUNTS:
             return n - STEADY_COUNTS + 1
@@ -101,14 +96,10 @@ def unpaired_power(better: float, worse: float, n: int) -> float:
     from scipy.stats import binom
 
     counts = np.arange(n + 1)
-    chances = binom.pmf(counts, n, better), binom.pmf(counts, n, worse)
-    power, most = 0.0, -1
-    for a in counts:
-        # the more of the better are recognized, the more of the worse may be: `most` never decreases
-        while most < n and independent_difference(int(a), n, most + 1, n)[1][0] > 0:
-            most += 1
-        power += float(chances[0][a] * chances[1][: most + 1].sum())
-    return power
+    rates, (low, high) = counts / n, np.transpose([wilson(k, n) for k in range(n + 1)])
+    # the interval's lower limit by the count of the better (rows) and that of the worse (columns)
+    limits = rates[:, None] - rates - np.sqrt((rates - low)[:, None] ** 2 + (high - rates) ** 2)
+    return float(binom.pmf(counts, n, better) @ (limits > 0) @ binom.pmf(counts, n, worse))
 
 
 def shot_sections(promise: Promise, settings: SceneSettings) -> tuple[tuple[str, tuple[str, ...]], ...]:
@@ -128,27 +119,23 @@ def _count_lines(promise: Promise, plan: ShotPlan) -> tuple[str, ...]:
         f"{promise.sessions} sessions, each with a place, light, camera and print of its own; the best control "
         f"({plan.control}) {control.rate:.0%}."
     ]
-    lines.append(
-        f"A verdict asks the photographs to prove a rate of {required_rate(promise):.0%}. What they will show if the "
-        "promise holds, and the chance that it is enough: "
-        + "; ".join(
-            f"{o.photos} in {places_text(o.sessions)}: {o.allowed[0]} to {o.allowed[1]} ({o.chance:.0%})"
-            for o in plan.options
-        )
-        + "."
+    options = (
+        f"{o.photos} in {verdict.places_text(o.sessions)}: {o.allowed[0]} to {o.allowed[1]} ({o.chance:.0%})"
+        for o in plan.options
     )
-    lines.append(photos_line(plan.sessions))
+    lines.append(
+        f"A verdict asks the photographs to prove a rate of {verdict.required_rate(promise):.0%}. What they will show "
+        f"if the promise holds, and the chance that it is enough: {'; '.join(options)}."
+    )
+    lines.append(verdict.photos_line(plan.sessions))
     if promise.n < PROMISE_VIEWS and not promise.draft:
         lines.append(
             f"A promise of {PROMISE_VIEWS} views (patchproof promise RUN --n {PROMISE_VIEWS}, then this page again) "
             "knows better how much places differ, and often asks for fewer of them."
         )
     if plan.paired is None and plan.unpaired is None:
-        lines.append(
-            f"No {MOST_PHOTOS} photographs would show that the patch beats {plan.control}: it is not promised to, or "
-            "by too little."
-        )
-        return tuple(lines)
+        no_gain = f"that the patch beats {plan.control}: it is not promised to, or by too little."
+        return (*lines, f"No {verdict.MOST_PHOTOS} photographs would show {no_gain}")
     pairs = plan.paired if plan.paired is not None else plan.unpaired
     kind = "bare object (without any marker)" if plan.control == "bare" else f"{plan.control} control"
     lines.append(
@@ -167,11 +154,10 @@ def _count_lines(promise: Promise, plan: ShotPlan) -> tuple[str, ...]:
 def _view_lines(settings: SceneSettings) -> tuple[str, ...]:
     if settings.object.mesh is None:
         return ("As the scene's own photographs were taken: the same places, distances and light.",)
-    view, low = settings.view, settings.light.ambient
+    view, patch = settings.view, settings.patch
     target = "object" if view.look_at == "object" else "piece"
-    front = (
-        "the place of the piece" if settings.patch.at_mm is not None else f"the piece's side ({settings.patch.side})"
-    )
+    light = "Light as it comes" if settings.light.ambient[0] < 1 else "Bright light"
+    front = "the place of the piece" if patch.at_mm is not None else f"the piece's side ({patch.side})"
     if view.front != "patch":
         front = f"the object's {view.front} side"
     return (
@@ -181,9 +167,7 @@ def _view_lines(settings: SceneSettings) -> tuple[str, ...]:
         f"camera turned by {_degrees(view.roll_deg)}.",
         f"The {target} belongs in the middle of the picture, the whole piece in view; classifiers see the picture's "
         "centered square.",
-        "Light as it comes, without flash, shine or filters; views outside of these ranges are not counted."
-        if low[0] < 1
-        else "Bright light, without flash, shine or filters; views outside of these ranges are not counted.",
+        f"{light}, without flash, shine or filters; views outside of these ranges are not counted.",
     )
 
 

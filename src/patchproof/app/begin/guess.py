@@ -197,7 +197,5 @@ def _wanted_size_mm(frame: SurfaceFrame) -> tuple[float, float]:
 def _fit_on_side(mesh: Mesh, side: Side, size_mm: tuple[float, float], bend: bool) -> PieceGuess | None:
     """The largest piece of that shape that fits in the middle of a side."""
     frame, lay = side_frame(mesh, side), placement_method(bend)
-    fitted_mm = largest_fitting_size(
-        size_mm, lambda trial: place_if_close(mesh, frame, trial, 0.0, lay), smallest_piece_mm()
-    )
+    fitted_mm = largest_fitting_size(size_mm, lambda mm: place_if_close(mesh, frame, mm, 0.0, lay), smallest_piece_mm())
     return None if fitted_mm is None else PieceGuess(side, fitted_mm, bend)

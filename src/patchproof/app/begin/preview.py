@@ -190,9 +190,8 @@ def _answers(settings: SceneSettings, views: Sequence[SampleView]) -> list[str]:
 def _maps(scene: PatchScene) -> list[dict[str, str]]:
     """Pictures of the piece's gap and stretch, each with the words at the ends of its scale."""
     placement = scene.placement
-    rows = [
-        ("gap to the surface", gap_colors(placement), "0 mm", f"{gap_limit_mm(placement.size_mm):.2g} mm: too much")
-    ]
+    limit = f"{gap_limit_mm(placement.size_mm):.2g} mm: too much"
+    rows = [("gap to the surface", gap_colors(placement), "0 mm", limit)]
     if not placement.is_flat:
         stretches = ramp_colors(placement.stretches / STRETCH_LIMIT)
         rows.append(("stretch of the paper", stretches, "0 %", f"{STRETCH_LIMIT:.0%}: refused"))

@@ -8,7 +8,6 @@ labels of the bare object.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -50,9 +49,7 @@ class SampleView:
     answers: tuple[NetworkAnswer, ...]
 
 
-def sample_views(
-    stage: Stage, classifiers: Sequence[Classifier], indices: Sequence[tuple[int, ...]]
-) -> tuple[SampleView, ...]:
+def sample_views(stage: Stage, classifiers: list[Classifier], indices: list[tuple[int, ...]]) -> tuple[SampleView, ...]:
     """Render 8 views of the bare object and classify them; `indices` are the target's in each network (empty: none)."""
     network_px = max(classifier.input_px for classifier in classifiers)
     side_px = network_px * math.ceil(_LEAST_PX / network_px)

@@ -95,9 +95,8 @@ class Album:
         names = (match for path in self.folder.rglob("*photo_*") if (match := _NUMBERED.match(path.name)))
         number = 1 + max((int(match[1]) for match in names), default=0)
         if number > MOST_PHOTOS:
-            raise UploadRefused(
-                507, f"at most {MOST_PHOTOS} photographs in a folder", f"photograph {number}", "start with a new folder"
-            )
+            expected = f"at most {MOST_PHOTOS} photographs in a folder"
+            raise UploadRefused(507, expected, f"photograph {number}", "start with a new folder")
         return number
 
 

@@ -34,15 +34,15 @@ RunAndSheet = tuple[Path, Path]  # the folder of a run and its sheet's manifest
 
 
 class PhotoCollection:
-    """An album's measured photographs; not thread-safe. With `forecast` each photograph gets its forecast."""
+    """An album's measured photographs; not thread-safe. With a `run` each photograph gets its forecast."""
 
     def __init__(
-        self, album: Album, manifest: Manifest, options: Options, workers: Workers, forecast: RunAndSheet | None = None
+        self, album: Album, manifest: Manifest, options: Options, workers: Workers, run: RunAndSheet | None = None
     ):
         self.album, self.manifest = album, manifest
         self._judges = judges_of(options.models, manifest)
         self._task = task_of(manifest, options, self._judges)
-        self._workers, self._forecast = workers, forecast
+        self._workers, self._forecast = workers, run
         self._journal = Journal(album.folder / JOURNAL_FILE, settings_key(manifest, options), resume=True)
         self._measured: dict[Path, MeasuredPhoto] = {}
 

@@ -47,9 +47,7 @@ def state_of(collection: PhotoCollection, sessions: int | None) -> dict[str, Any
         "sessions": rows,
         "each": PHOTOS_PER_SESSION,
         "plan": summary.next_step or (photos_line(sessions) if promise is not None else ""),
-        "controls": [
-            {"name": control.name, "photos": control.n, "recognized": control.recognized} for control in report.controls
-        ],
+        "controls": [{"name": each.name, "photos": each.n, "recognized": each.recognized} for each in report.controls],
         "controls_known": [name for name in CONTROLS if name in promised] or CONTROLS,
         "map": _map(collection, PHOTOS_PER_SESSION * (sessions or _USUAL_SESSIONS)),
         "latest": [answer_of(collection, path) for path in names[-_LATEST_PHOTOS:][::-1]],

@@ -6,28 +6,28 @@ import sys
 from pathlib import Path
 from typing import Annotated, Literal
 
-import typer
+from typer import Argument, Exit, Option
 
 from patchproof.app.cli.console import Overwrite, names_of, progress, say, warn
 
-SceneFile = Annotated[Path, typer.Argument(help="The scene file (TOML).")]
+SceneFile = Annotated[Path, Argument(help="The scene file (TOML).")]
 
 
 def new(
     thing: Annotated[
-        str, typer.Argument(metavar="MESH|PHOTOS|IMAGES", help="A mesh file, primitive:NAME, or a folder of pictures.")
+        str, Argument(metavar="MESH|PHOTOS|IMAGES", help="A mesh file, primitive:NAME, or a folder of pictures.")
     ],
-    out: Annotated[Path, typer.Option(help="The scene file to write.")] = Path("scene.toml"),
+    out: Annotated[Path, Option(help="The scene file to write.")] = Path("scene.toml"),
     label: Annotated[
-        str | None, typer.Option(help="What networks should see: words of a label; from the file's name without.")
+        str | None, Option(help="What networks should see: words of a label; from the file's name without.")
     ] = None,
     length_mm: Annotated[
-        float | None, typer.Option(min=1e-3, help="The object's longest extent; from the file's units without.")
+        float | None, Option(min=1e-3, help="The object's longest extent; from the file's units without.")
     ] = None,
     up: Annotated[
-        Literal["y", "z"] | None, typer.Option(help="The file's axis that points up; by its format without.")
+        Literal["y", "z"] | None, Option(help="The file's axis that points up; by its format without.")
     ] = None,
-    models: Annotated[str, typer.Option(help="Comma-separated classifiers.")] = "builtin",
+    models: Annotated[str, Option(help="Comma-separated classifiers.")] = "builtin",
     overwrite: Overwrite = False,
 ) -> None:
     """Write a commented scene for an object, photographs of it, or a folder of images."""
@@ -40,7 +40,7 @@ def new(
 
 def preview(
     scene: SceneFile,
-    out: Annotated[Path, typer.Option(help="Folder for the page and the object.")] = Path("patchproof-preview"),
+    out: Annotated[Path, Option(help="Folder for the page and the object.")] = Path("patchproof-preview"),
     overwrite: Overwrite = False,
 ) -> None:
     """A page that shows the object, the piece on it, and what networks see now; in seconds."""
@@ -51,14 +51,14 @@ def preview(
     say(*result.lines, f"page: {result.page}")
     if result.refused:
         print(result.refused, file=sys.stderr)
-        raise typer.Exit(1)
+        raise Exit(1)
     say(f"next: patchproof optimize {scene} --out run (--draft for a first look)")
 
 
 def plan(
     scene: SceneFile,
-    out: Annotated[Path | None, typer.Option(help="Write the plan as JSON, too.")] = None,
-    no_timing: Annotated[bool, typer.Option("--no-timing", help="Leave out the cost of a step.")] = False,
+    out: Annotated[Path | None, Option(help="Write the plan as JSON, too.")] = None,
+    no_timing: Annotated[bool, Option("--no-timing", help="Leave out the cost of a step.")] = False,
     overwrite: Overwrite = False,
 ) -> None:
     """Show what is modeled, what is not, and why: first how the piece lies, then what is measured."""
@@ -80,9 +80,7 @@ def plan(
         write_atomically(out, full_plan.model_dump_json(indent=1) + "\n")
 
 
-def keys(
-    name: Annotated[str | None, typer.Argument(help="scene, template or board; without one, all.")] = None,
-) -> None:
+def keys(name: Annotated[str | None, Argument(help="scene, template or board; without one, all.")] = None) -> None:
     """All keys of scene files and page templates: range, unit, default and meaning, as Markdown."""
     from patchproof.app.keys import DOCUMENTS, keys_page
 

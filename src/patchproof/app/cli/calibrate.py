@@ -5,25 +5,25 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-import typer
+from typer import Argument, BadParameter, Option
 
 from patchproof.app.cli.console import Overwrite, pair_of, progress, say, warn
 
 
 def printer(
-    out: Annotated[Path, typer.Option(help="NAME.npz; NAME.json is written beside it.")],
-    more: Annotated[list[Path] | None, typer.Argument(metavar="[PHOTO]...", help="More photographs.")] = None,
-    icc: Annotated[Path | None, typer.Option(help="An RGB or CMYK output profile.")] = None,
+    out: Annotated[Path, Option(help="NAME.npz; NAME.json is written beside it.")],
+    more: Annotated[list[Path] | None, Argument(metavar="[PHOTO]...", help="More photographs.")] = None,
+    icc: Annotated[Path | None, Option(help="An RGB or CMYK output profile.")] = None,
     intent: Annotated[
-        Literal["relative", "perceptual"], typer.Option(help="The profile's intent that the driver is set to.")
+        Literal["relative", "perceptual"], Option(help="The profile's intent that the driver is set to.")
     ] = "relative",
-    licence: Annotated[str, typer.Option(help="Of the profile, for the record.")] = "unknown",
-    source: Annotated[str, typer.Option(help="Where the profile is from, for the record.")] = "unknown",
+    licence: Annotated[str, Option(help="Of the profile, for the record.")] = "unknown",
+    source: Annotated[str, Option(help="Where the profile is from, for the record.")] = "unknown",
     chart: Annotated[
-        list[Path] | None, typer.Option(help="Photographs of the printed chart; a folder holds those of one print.")
+        list[Path] | None, Option(help="Photographs of the printed chart; a folder holds those of one print.")
     ] = None,
-    sheet: Annotated[Path | None, typer.Option(help="The manifest of the chart's page.")] = None,
-    camera: Annotated[str | None, typer.Option(help="A camera file with a tone curve.")] = None,
+    sheet: Annotated[Path | None, Option(help="The manifest of the chart's page.")] = None,
+    camera: Annotated[str | None, Option(help="A camera file with a tone curve.")] = None,
     overwrite: Overwrite = False,
 ) -> None:
     """A printer from its ICC profile, or from photographs of its printed chart."""
@@ -31,11 +31,11 @@ def printer(
 
     photos = [*(chart or []), *(more or [])]
     if (icc is None) == (chart is None) or (more and chart is None):
-        raise typer.BadParameter("give either --icc FILE or --chart PHOTO...", param_hint="--icc / --chart")
+        raise BadParameter("give either --icc FILE or --chart PHOTO...", param_hint="--icc / --chart")
     if icc is not None:
         lines, warnings = printer_from_icc(icc, out, intent == "perceptual", licence, source, overwrite), ()
     elif sheet is None:
-        raise typer.BadParameter("name the JSON that was written beside the chart's PDF", param_hint="--sheet")
+        raise BadParameter("name the JSON that was written beside the chart's PDF", param_hint="--sheet")
     else:
         with progress() as bar:
             lines, warnings = printer_from_chart(photos, sheet, out, camera, overwrite, bar)
@@ -44,12 +44,12 @@ def printer(
 
 
 def camera(
-    photos: Annotated[Path, typer.Argument(help="A folder of photographs of a board.")],
-    board: Annotated[str, typer.Option(help="The board's template, or the BOARD.json beside its PDF.")] = "charuco_a4",
-    out: Annotated[Path, typer.Option(help="The camera file; its figures and a picture are written beside it.")] = Path(
+    photos: Annotated[Path, Argument(help="A folder of photographs of a board.")],
+    board: Annotated[str, Option(help="The board's template, or the BOARD.json beside its PDF.")] = "charuco_a4",
+    out: Annotated[Path, Option(help="The camera file; its figures and a picture are written beside it.")] = Path(
         "camera.json"
     ),
-    ruler_mm: Annotated[str | None, typer.Option(help="The printed rulers as measured, e.g. 97.1x97.3 (x, y).")] = None,
+    ruler_mm: Annotated[str | None, Option(help="The printed rulers as measured, e.g. 97.1x97.3 (x, y).")] = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Focal length, middle and lens distortion of a camera."""

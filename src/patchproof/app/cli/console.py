@@ -16,28 +16,27 @@ from functools import wraps
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
+from typer import BadParameter, Exit, Option, Typer
 
 from patchproof.base.errors import Refused
 from patchproof.base.output import disk_is_full
 from patchproof.base.version import __version__
 from patchproof.base.workers import available_cores, can_fork, keep_freed_memory, use_threads
 
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace this command's earlier output.")]
-Device = Annotated[str, typer.Option(help="cpu or cuda.")]
-Seed = Annotated[int | None, typer.Option(min=0, help="In place of the scene's own seed.")]
-Resume = Annotated[bool, typer.Option("--resume", help="Go on where a run that was stopped left off.")]
+Overwrite = Annotated[bool, Option("--overwrite", help="Replace this command's earlier output.")]
+Device = Annotated[str, Option(help="cpu or cuda.")]
+Seed = Annotated[int | None, Option(min=0, help="In place of the scene's own seed.")]
+Resume = Annotated[bool, Option("--resume", help="Go on where a run that was stopped left off.")]
 Jobs = Annotated[
     int | None,
-    typer.Option(
+    Option(
         min=1,
         help="Local processes that share the work, by default one for each free core where they can be forked; any "
         "number of them gives the same results.",
     ),
 ]
-Cluster = Annotated[str | None, typer.Option(help="A Dask scheduler's address, in place of local processes.")]
-Models = Annotated[str | None, typer.Option(help="Comma-separated classifiers in place of the sheet's own.")]
-
+Cluster = Annotated[str | None, Option(help="A Dask scheduler's address, in place of local processes.")]
+Models = Annotated[str | None, Option(help="Comma-separated classifiers in place of the sheet's own.")]
 
 LINE_EVERY_S = 30.0  # of progress, if standard error is not a terminal
 
@@ -90,7 +89,7 @@ def as_command(verb: Callable[..., None]) -> Callable[..., None]:
                 verb(**arguments)
         except KeyboardInterrupt:
             print(_stop_sentence(arguments), file=sys.stderr)
-            raise typer.Exit(130) from None
+            raise Exit(130) from None
 
     return command
 
@@ -124,18 +123,18 @@ def _program() -> str:
 def _say_version(requested: bool) -> None:
     if requested:
         print(f"{_program()} {__version__}")
-        raise typer.Exit()
+        raise Exit()
 
 
 def version_option(
     version: Annotated[
-        bool, typer.Option("--version", callback=_say_version, is_eager=True, help="Say the version and exit.")
+        bool, Option("--version", callback=_say_version, is_eager=True, help="Say the version and exit.")
     ] = False,
 ) -> None:
     """Options before the verb."""
 
 
-def run_command_line(app: typer.Typer) -> None:
+def run_command_line(app: Typer) -> None:
     """Run the command line; a refusal ends in one sentence on standard error and exit code 1."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # Windows gives pipes its code page, which has no ε
@@ -196,5 +195,5 @@ def pair_of(text: str, option: str) -> tuple[float, float]:
             raise ValueError
     except ValueError:
         needed = "takes one or two positive numbers, such as 0.97 or 0.97x0.98"
-        raise typer.BadParameter(needed, param_hint=option) from None
+        raise BadParameter(needed, param_hint=option) from None
     return x, y

@@ -5,32 +5,21 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
+from typer import Argument, BadParameter, Option
 
-from patchproof.app.cli.console import (
-    Cluster,
-    Device,
-    Jobs,
-    Models,
-    Overwrite,
-    Seed,
-    names_of,
-    progress,
-    say,
-    say_study,
-    warn,
-)
+from patchproof.app.cli import console
+from patchproof.app.cli.console import Cluster, Device, Jobs, Models, Overwrite, Seed, progress, say, warn
 from patchproof.base.compute import Compute
 
 
 def import_picture(
-    picture: Annotated[Path, typer.Argument(help="A picture file, or a folder of them: a run in OUT for each.")],
-    scene: Annotated[Path, typer.Argument(help="The scene file (TOML).")],
-    out: Annotated[Path, typer.Option(help="Folder for the run, or for the runs.")],
-    resume: Annotated[bool, typer.Option("--resume", help="Of a folder: keep the runs that are finished.")] = False,
+    picture: Annotated[Path, Argument(help="A picture file, or a folder of them: a run in OUT for each.")],
+    scene: Annotated[Path, Argument(help="The scene file (TOML).")],
+    out: Annotated[Path, Option(help="Folder for the run, or for the runs.")],
+    resume: Annotated[bool, Option("--resume", help="Of a folder: keep the runs that are finished.")] = False,
     overwrite: Overwrite = False,
-    draft: Annotated[bool, typer.Option("--draft", help="A first look: promised from few views.")] = False,
-    promise: Annotated[int | None, typer.Option(min=8, help="Views to promise from; of under 400: a draft.")] = None,
+    draft: Annotated[bool, Option("--draft", help="A first look: promised from few views.")] = False,
+    promise: Annotated[int | None, Option(min=8, help="Views to promise from; of under 400: a draft.")] = None,
     device: Device = "cpu",
     seed: Seed = None,
     jobs: Jobs = None,
@@ -58,10 +47,10 @@ def import_picture(
 
 
 def evaluate(
-    runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Finished runs; several are compared.")],
+    runs: Annotated[list[Path], Argument(metavar="RUN...", help="Finished runs; several are compared.")],
     models: Models = None,
-    n: Annotated[int, typer.Option(min=1, help="Fresh conditions.")] = 400,
-    out: Annotated[Path | None, typer.Option(help="Folder for the table and the page of several runs.")] = None,
+    n: Annotated[int, Option(min=1, help="Fresh conditions.")] = 400,
+    out: Annotated[Path | None, Option(help="Folder for the table and the page of several runs.")] = None,
     seed: Seed = None,
     device: Device = "cpu",
     jobs: Jobs = None,
@@ -74,13 +63,13 @@ def evaluate(
     from patchproof.report.words import evaluation_lines
 
     if (out is None) != (len(runs) == 1):
-        raise typer.BadParameter("is for several runs, and they need it; one has its own folder", param_hint="--out")
+        raise BadParameter("is for several runs, and they need it; one has its own folder", param_hint="--out")
     with progress() as bar:
-        options: dict[str, Any] = {"models": names_of(models), "n": n, "seed": seed, "overwrite": overwrite}
+        options: dict[str, Any] = {"models": console.names_of(models), "n": n, "seed": seed, "overwrite": overwrite}
         options |= {"compute": Compute(device, jobs or 1, cluster), "progress": bar}
         if out is None:
             result = evaluate_run(runs[0], **options)
             say(*evaluation_lines(result.model_dump()), f"written: {runs[0] / 'evaluate.json'}")
         else:
-            say_study(compare(runs, out, **options))
+            console.say_study(compare(runs, out, **options))
             say(f"page: {out / 'designs.html'}")

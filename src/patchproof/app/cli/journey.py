@@ -4,24 +4,12 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-import typer
+from typer import Argument, BadParameter, Exit, Option
 
-from patchproof.app.cli.console import (
-    Cluster,
-    Device,
-    Jobs,
-    Models,
-    Overwrite,
-    Resume,
-    Seed,
-    names_of,
-    pair_of,
-    progress,
-    say,
-    warn,
-)
+from patchproof.app.cli import console
+from patchproof.app.cli.console import Cluster, Device, Jobs, Models, Overwrite, Resume, Seed, progress, say, warn
 from patchproof.base.compute import Compute
 
 PrintableControl = Literal["mean", "gray", "noise", "shuffled", "blank"]  # that can be printed
@@ -29,10 +17,10 @@ PhotographedControl = Literal["bare", "mean", "gray", "noise"]  # that can hang 
 
 
 def demo(
-    out: Annotated[Path, typer.Option(help="Folder for the run, the sheet, the photographs and the report.")] = Path(
+    out: Annotated[Path, Option(help="Folder for the run, the sheet, the photographs and the report.")] = Path(
         "patchproof-demo"
     ),
-    detector: Annotated[bool, typer.Option("--detector", help="Before the built-in detector, not classifier.")] = False,
+    detector: Annotated[bool, Option("--detector", help="Before the built-in detector, not classifier.")] = False,
     jobs: Jobs = None,
     overwrite: Overwrite = False,
 ) -> None:
@@ -45,20 +33,20 @@ def demo(
 
 
 def optimize(
-    scene: Annotated[Path, typer.Argument(help="The scene file (TOML).")],
-    out: Annotated[Path, typer.Option(help="Folder for the run.")],
-    resume: Annotated[bool, typer.Option("--resume", help="Go on from the run's checkpoint.")] = False,
+    scene: Annotated[Path, Argument(help="The scene file (TOML).")],
+    out: Annotated[Path, Option(help="Folder for the run.")],
+    resume: Annotated[bool, Option("--resume", help="Go on from the run's checkpoint.")] = False,
     overwrite: Overwrite = False,
-    draft: Annotated[bool, typer.Option("--draft", help="A first look: few steps, promised from few views.")] = False,
-    thorough: Annotated[bool, typer.Option("--thorough", help="Three times the steps, four times the views.")] = False,
-    steps: Annotated[int | None, typer.Option(min=1, help="In place of the scene's own.")] = None,
-    promise: Annotated[int | None, typer.Option(min=8, help="Views to promise from; under 400: a draft.")] = None,
+    draft: Annotated[bool, Option("--draft", help="A first look: few steps, promised from few views.")] = False,
+    thorough: Annotated[bool, Option("--thorough", help="Three times the steps, four times the views.")] = False,
+    steps: Annotated[int | None, Option(min=1, help="In place of the scene's own.")] = None,
+    promise: Annotated[int | None, Option(min=8, help="Views to promise from; under 400: a draft.")] = None,
     device: Device = "cpu",
     seed: Seed = None,
     jobs: Jobs = None,
     require: Annotated[
         Literal["better"] | None,
-        typer.Option(help='"better" makes a design exit with 1 that is not better than its best control.'),
+        Option(help='"better" makes a design exit with 1 that is not better than its best control.'),
     ] = None,
 ) -> None:
     """Optimize the patch of a scene and promise its rate."""
@@ -70,22 +58,15 @@ def optimize(
     from patchproof.scene.scene import load_scene
 
     if draft and thorough:
-        raise typer.BadParameter("is the opposite of --draft; leave one out", param_hint="--thorough")
+        raise BadParameter("is the opposite of --draft; leave one out", param_hint="--thorough")
     if draft or thorough:
         effort = DRAFT_EFFORT if draft else THOROUGH_EFFORT
         steps, promise = steps or effort[0], promise or effort[1]
     with progress() as bar:
         loaded = load_scene(scene, seed, steps)
         warn(loaded.warnings)
-        run = optimize_scene(
-            loaded,
-            out,
-            promise=PromiseOptions(promise),
-            compute=Compute(device, jobs or 1),
-            resume=resume,
-            overwrite=overwrite,
-            progress=bar,
-        )
+        options: dict[str, Any] = {"promise": PromiseOptions(promise), "compute": Compute(device, jobs or 1)}
+        run = optimize_scene(loaded, out, **options, resume=resume, overwrite=overwrite, progress=bar)
     warn(tuple(text for text in run.scene.warnings if text not in loaded.warnings))  # of the place that was found
     say(*promise_lines(run.promise, background_summary(run.scene.settings.model_dump())))
     if (out / "place.json").is_file():  # only then import the search's modules
@@ -97,12 +78,12 @@ def optimize(
     say(f"run: {out}")
     if run.scene.settings.patch.kind == "patch":
         say(f"next: patchproof sheet {out} --out sheet.pdf")
-    raise typer.Exit(1 if require == "better" and run.promise.comparison != "better" else 0)
+    raise Exit(1 if require == "better" and run.promise.comparison != "better" else 0)
 
 
 def promise(
-    run: Annotated[Path, typer.Argument(help="A finished run, such as a draft's.")],
-    n: Annotated[int | None, typer.Option("--n", min=8, help="Views to promise from, by default up to 400.")] = None,
+    run: Annotated[Path, Argument(help="A finished run, such as a draft's.")],
+    n: Annotated[int | None, Option("--n", min=8, help="Views to promise from, by default up to 400.")] = None,
     device: Device = "cpu",
     jobs: Jobs = None,
 ) -> None:
@@ -119,18 +100,16 @@ def promise(
 
 
 def sheet(
-    out: Annotated[Path | None, typer.Option(help="The PDF; its manifest is written beside it.")] = None,
+    out: Annotated[Path | None, Option(help="The PDF; its manifest is written beside it.")] = None,
     runs: Annotated[
         list[Path] | None,
-        typer.Argument(metavar="[RUN]...", help="Finished runs, on one page; none for blank, chart and board pages."),
+        Argument(metavar="[RUN]...", help="Finished runs, on one page; none for blank, chart and board pages."),
     ] = None,
-    template: Annotated[str | None, typer.Option(help="A template's name or file.")] = None,
-    control: Annotated[
-        PrintableControl | None, typer.Option(help="The sheet of a control in place of the design's.")
-    ] = None,
-    copies: Annotated[int, typer.Option(min=1, max=1000, help="Pages of the same, for label rolls.")] = 1,
-    check: Annotated[bool, typer.Option("--check", help="Say what a print shop needs to know.")] = False,
-    templates: Annotated[bool, typer.Option("--list", help="Say which templates there are.")] = False,
+    template: Annotated[str | None, Option(help="A template's name or file.")] = None,
+    control: Annotated[PrintableControl | None, Option(help="The sheet of a control in place of the design's.")] = None,
+    copies: Annotated[int, Option(min=1, max=1000, help="Pages of the same, for label rolls.")] = 1,
+    check: Annotated[bool, Option("--check", help="Say what a print shop needs to know.")] = False,
+    templates: Annotated[bool, Option("--list", help="Say which templates there are.")] = False,
     overwrite: Overwrite = False,
 ) -> None:
     """Write the page: design, markers, chart and rulers at true size."""
@@ -144,10 +123,10 @@ def sheet(
     if templates:
         return say(*template_summaries())
     if out is None:
-        raise typer.BadParameter("name the PDF to write", param_hint="--out")
+        raise BadParameter("name the PDF to write", param_hint="--out")
     runs = runs or []
     if copies > 1 and len(runs) != 1:
-        raise typer.BadParameter("copies are of one run's sheet", param_hint="--copies")
+        raise BadParameter("copies are of one run's sheet", param_hint="--copies")
     paths = manifest_paths(out, len(runs))
     for path in (out, *paths):
         check_file(path, overwrite)
@@ -173,24 +152,18 @@ def sheet(
 
 
 def reprint(
-    pdf: Annotated[Path, typer.Argument(help="A sheet's PDF.")],
-    n: Annotated[int, typer.Option("--n", min=1, help="Photographs to take.")],
-    out: Annotated[Path, typer.Option(help="Folder for the photographs.")],
-    run: Annotated[
-        Path | None, typer.Option(help="The run it was made from; none for blank, chart and board pages.")
-    ] = None,
-    sessions: Annotated[
-        int, typer.Option(min=1, help="Places to take them in, each with its light, camera and folder.")
-    ] = 1,
+    pdf: Annotated[Path, Argument(help="A sheet's PDF.")],
+    n: Annotated[int, Option("--n", min=1, help="Photographs to take.")],
+    out: Annotated[Path, Option(help="Folder for the photographs.")],
+    run: Annotated[Path | None, Option(help="The run it was made from; none for blank, chart and board pages.")] = None,
+    sessions: Annotated[int, Option(min=1, help="Places to take them in, each with its light, camera and folder.")] = 1,
     seed: Seed = None,
-    printer: Annotated[str | None, typer.Option(help="Another printer than the scene's: a name or a file.")] = None,
-    print_scale: Annotated[str, typer.Option(help="Size of the print, 0.97 or 0.97x0.98 (x, y).")] = "1",
-    control: Annotated[
-        PhotographedControl | None, typer.Option(help="Photograph a control in place of the design.")
-    ] = None,
-    scan_dpi: Annotated[float | None, typer.Option(min=30, max=1200, help="Scan the uncut page flat instead.")] = None,
+    printer: Annotated[str | None, Option(help="Another printer than the scene's: a name or a file.")] = None,
+    print_scale: Annotated[str, Option(help="Size of the print, 0.97 or 0.97x0.98 (x, y).")] = "1",
+    control: Annotated[PhotographedControl | None, Option(help="Photograph a control in place of the design.")] = None,
+    scan_dpi: Annotated[float | None, Option(min=30, max=1200, help="Scan the uncut page flat instead.")] = None,
     path_traced: Annotated[
-        bool, typer.Option("--path-traced", help="Render with Mitsuba 3 in place of our renderer (slow).")
+        bool, Option("--path-traced", help="Render with Mitsuba 3 in place of our renderer (slow).")
     ] = False,
     jobs: Jobs = None,
     cluster: Cluster = None,
@@ -203,16 +176,16 @@ def reprint(
     from patchproof.reprints.reprint import reprint as reprint_sheet
     from patchproof.reprints.scan import scan
 
-    scale = pair_of(print_scale, "--print-scale")
+    scale = console.pair_of(print_scale, "--print-scale")
     if scan_dpi is not None and control is not None:
-        raise typer.BadParameter("a scan is of the PDF itself; leave --control out", param_hint="--scan-dpi")
+        raise BadParameter("a scan is of the PDF itself; leave --control out", param_hint="--scan-dpi")
     if path_traced and scan_dpi is not None:
-        raise typer.BadParameter("is of the piece on its object; leave --scan-dpi out", param_hint="--path-traced")
+        raise BadParameter("is of the piece on its object; leave --scan-dpi out", param_hint="--path-traced")
     how = ReprintSetup(printer, scale, control, path_traced)
     if run is None:
         if scan_dpi is not None or control is not None or path_traced or sessions > 1:
             only = "scans, controls, sessions and path tracing are of a run's sheet; name the run"
-            raise typer.BadParameter(only, param_hint="--run")
+            raise BadParameter(only, param_hint="--run")
         reprint_pages(pdf, n, out, how, seed=seed, overwrite=overwrite)
         return say(f"{n} photographs: {out}")
     finished_run = load_run(run)
@@ -220,47 +193,34 @@ def reprint(
         taken = scan(pdf, finished_run, n, out, scan_dpi, how, overwrite=overwrite)
     else:
         with progress() as bar:
-            taken = reprint_sheet(
-                pdf,
-                finished_run,
-                n,
-                out,
-                how,
-                sessions=sessions,
-                seed=seed,
-                compute=Compute(jobs=jobs or 1, cluster=cluster),
-                overwrite=overwrite,
-                progress=bar,
-            )
+            options: dict[str, Any] = {"sessions": sessions, "seed": seed, "overwrite": overwrite, "progress": bar}
+            compute = Compute(jobs=jobs or 1, cluster=cluster)
+            taken = reprint_sheet(pdf, finished_run, n, out, how, compute=compute, **options)
     say(f"{len(taken.photos)} photographs: {out}")
 
 
 def verify(
-    photos: Annotated[Path, typer.Argument(help="A folder of photographs, or of folders: one for each place.")],
-    sheet: Annotated[Path, typer.Option(help="The manifest that was written beside the PDF.")],
-    out: Annotated[Path, typer.Option(help="Folder for the report.")],
+    photos: Annotated[Path, Argument(help="A folder of photographs, or of folders: one for each place.")],
+    sheet: Annotated[Path, Option(help="The manifest that was written beside the PDF.")],
+    out: Annotated[Path, Option(help="Folder for the report.")],
     models: Models = None,
-    controls: Annotated[Path | None, typer.Option(help="Photographs of a control, one control per folder.")] = None,
-    scan_dpi: Annotated[
-        float | None, typer.Option(min=30, max=4800, help="These are scans at this resolution.")
-    ] = None,
-    ruler_mm: Annotated[str | None, typer.Option(help="The printed rulers as measured, e.g. 97.1x97.3 (x, y).")] = None,
-    camera: Annotated[str | None, typer.Option(help="The camera that took them: a camera file or its name.")] = None,
-    boxes: Annotated[
-        Path | None, typer.Option(help="The object's boxes in photographs (COCO JSON), for detectors.")
-    ] = None,
+    controls: Annotated[Path | None, Option(help="Photographs of a control, one control per folder.")] = None,
+    scan_dpi: Annotated[float | None, Option(min=30, max=4800, help="These are scans at this resolution.")] = None,
+    ruler_mm: Annotated[str | None, Option(help="The printed rulers as measured, e.g. 97.1x97.3 (x, y).")] = None,
+    camera: Annotated[str | None, Option(help="The camera that took them: a camera file or its name.")] = None,
+    boxes: Annotated[Path | None, Option(help="The object's boxes in photographs (COCO JSON), for detectors.")] = None,
     require: Annotated[
         Literal["kept", "helps"] | None,
-        typer.Option(
+        Option(
             help='What else than exits with 1: "kept", a promise that held, however little it promised; "helps", one '
             "that held of a patch that beats every control."
         ),
     ] = None,
     ledger: Annotated[
-        int, typer.Option(min=0, help="Photographs in gap ledger and estimated effect at most; 0 for none.")
+        int, Option(min=0, help="Photographs in gap ledger and estimated effect at most; 0 for none.")
     ] = 24,
     run: Annotated[
-        Path | None, typer.Option(help="The run that the sheet is of: forecasts each photograph at its measured view.")
+        Path | None, Option(help="The run that the sheet is of: forecasts each photograph at its measured view.")
     ] = None,
     jobs: Jobs = None,
     cluster: Cluster = None,
@@ -273,20 +233,11 @@ def verify(
     from patchproof.report.words import verdict_lines
 
     with progress() as bar:
-        report = verify_photos(
-            photos,
-            sheet,
-            out,
-            models=names_of(models),
-            controls=controls,
-            capture=CaptureInfo(camera, scan_dpi, pair_of(ruler_mm, "--ruler-mm") if ruler_mm else None, boxes),
-            run=run,
-            ledger_photos=ledger,
-            compute=Compute(jobs=jobs or 1, cluster=cluster),
-            resume=resume,
-            overwrite=overwrite,
-            progress=bar,
-        )
+        ruler = console.pair_of(ruler_mm, "--ruler-mm") if ruler_mm else None
+        options: dict[str, Any] = {"models": console.names_of(models), "controls": controls, "run": run}
+        options |= {"capture": CaptureInfo(camera, scan_dpi, ruler, boxes), "ledger_photos": ledger}
+        options |= {"compute": Compute(jobs=jobs or 1, cluster=cluster), "resume": resume, "overwrite": overwrite}
+        report = verify_photos(photos, sheet, out, **options, progress=bar)
     say(*verdict_lines(report), f"report: {out / 'report.html'}")
     summary = report.summary
     nothing = summary.judged == 0 and summary.measured == 0
@@ -295,4 +246,4 @@ def verify(
         print(see, file=sys.stderr)
     if require == "kept" and summary.meets("kept") and not summary.meets("helps"):
         print("The promise held, and the patch is not shown to help: --require helps asks for both.", file=sys.stderr)
-    raise typer.Exit(1 if nothing or (require is not None and not summary.meets(require)) else 0)
+    raise Exit(1 if nothing or (require is not None and not summary.meets(require)) else 0)

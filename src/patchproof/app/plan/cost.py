@@ -97,9 +97,8 @@ def _see_ms(problem: Problem, appearance: Appearance, conditions: Conditions) ->
         scene = require_mesh(problem.scene)
         poses, surface = scene.camera_from_world(conditions), problem.stage.object_surface
         matrices = np.broadcast_to(scene.matrix_px((side_px, side_px)), (len(poses), 3, 3))
-        rasterize(
-            surface.vertices, surface.faces, cameras(poses, matrices, (side_px, side_px), problem.stage), near_mm(scene)
-        )
+        view_cameras = cameras(poses, matrices, (side_px, side_px), problem.stage)
+        rasterize(surface.vertices, surface.faces, view_cameras, near_mm(scene))
         rasterizing = min(clock.lap(), parts["see: background"])
         rest = parts.pop("see: background") - rasterizing
         parts |= {"see: rasterize object": rasterizing, "see: object's texels, outlines, background": rest}

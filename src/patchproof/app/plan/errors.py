@@ -9,7 +9,7 @@ interactions of terms, except for one check with all terms left out that can go.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -101,13 +101,8 @@ def measure_terms(
         if small_terms:
             (pictures,) = _squares(problem, photo_px, setup, [], add_views)
             together = float((_confidence(problem, pictures, boxes) - confidence).abs().mean())
-    return Terms(
-        views=len(conditions),
-        confidence=float(confidence.mean()),
-        threshold=threshold,
-        errors=tuple(errors.values()),
-        together=together,
-    )
+    views, mean = len(conditions), float(confidence.mean())
+    return Terms(views=views, confidence=mean, threshold=threshold, errors=tuple(errors.values()), together=together)
 
 
 def _with_verdicts(terms: tuple[Term, ...], rows: dict[str, TermError], threshold: float) -> dict[str, TermError]:
@@ -128,15 +123,9 @@ def _with_verdicts(terms: tuple[Term, ...], rows: dict[str, TermError], threshol
 def _row(problem: Problem, term: Term, base: Tensor, changed: Tensor, boxes: np.ndarray | None) -> TermError:
     codes = (255 * (changed - base)).abs().cpu().numpy()
     change = _confidence(problem, changed, boxes) - _confidence(problem, base, boxes)
-    return TermError(
-        name=term.name,
-        key=term.key,
-        verdict="keep",
-        codes_mean=float(codes.mean()),
-        codes_p95=float(np.quantile(codes, 0.95)),
-        confidence=float(change.abs().mean()),
-        bias=float(change.mean()),
-    )
+    figures: dict[str, Any] = {"codes_mean": float(codes.mean()), "codes_p95": float(np.quantile(codes, 0.95))}
+    figures |= {"confidence": float(change.abs().mean()), "bias": float(change.mean())}
+    return TermError(name=term.name, key=term.key, verdict="keep", **figures)
 
 
 def _confidence(problem: Problem, pictures: Tensor, boxes: np.ndarray | None) -> Tensor:
@@ -158,8 +147,7 @@ def _squares(
         scale = base_conditions.pose.printed_scale
         for setup in (base, *setups):
             conditions = setup.conditions[rows]
-            same_geometry = setup.stage is base.stage and (conditions.pose.printed_scale == scale).all()
-            if same_geometry:
+            if setup.stage is base.stage and (conditions.pose.printed_scale == scale).all():  # the same geometry
                 views = relight(base_views, conditions)
             else:
                 views = render_views(setup.stage, setup.appearance, conditions, size_px)

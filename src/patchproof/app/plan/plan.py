@@ -124,10 +124,7 @@ class Plan(GeometryPlan):
 
 
 def plan_geometry(
-    scene_path: str | Path,
-    *,
-    device: str = "cpu",
-    progress: Progress = no_progress,
+    scene_path: str | Path, *, device: str = "cpu", progress: Progress = no_progress
 ) -> tuple[GeometryPlan, Problem]:
     """Compute how the piece of a scene lies and how well views resolve it; also returns the problem to measure."""
     scene, place = load_scene(scene_path), None
