@@ -34,7 +34,7 @@ from patchproof.classifier.network import Classifier
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.optimizer.promise import PROMISE_VIEWS, PromiseOptions
-from patchproof.optimizer.run import RUN_FILE_PATTERNS, Run, finish_run, load_run, scene_of
+from patchproof.optimizer.run import RUN_FILE_PATTERNS, Run, finish_run, load_run, resolve_scene
 from patchproof.photo.detect import find_markers
 from patchproof.photo.read import list_photos, printable_name, read_photo
 from patchproof.photo.rejection import PhotoRejected
@@ -180,7 +180,7 @@ def _shape_advice(width: int, height: int, scene: PieceScene) -> str:
 
 
 def _load_piece_scene(scene: str | Path | Scene, seed: int | None) -> PieceScene:
-    return require_piece(scene_of(scene, seed), 'leave patch.kind out, or "patch"')
+    return require_piece(resolve_scene(scene, seed), 'leave patch.kind out, or "patch"')
 
 
 def _read_picture(picture: str | Path | np.ndarray) -> tuple[str, str, np.ndarray]:
