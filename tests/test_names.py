@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 from collections import defaultdict
+from functools import cache
 from pathlib import Path
 
 import patchlab
@@ -39,20 +40,25 @@ def definitions(tree: ast.Module) -> dict[str, str]:
     return found
 
 
+@cache
+def parsed(path: Path) -> ast.Module:
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
 def homes(kind: str) -> dict[str, list[Path]]:
     """The modules that define each name of a kind."""
     by_name = defaultdict(list)
     for path in SOURCES:
         if RESULTS not in path.parents and not (kind == "function" and COMMANDS & {path.stem, path.parent.name}):
-            for name, found in definitions(ast.parse(path.read_text(encoding="utf-8"))).items():
+            for name, found in definitions(parsed(path)).items():
                 if found == kind:
                     by_name[name].append(path)
     return by_name
 
 
 def test_the_reader_of_definitions_sees_them():
-    source = "class A: ...\nB = dict[str, int]\nMAX_C = 3\ndef d(): ...\ndef _e(): ..."
-    assert definitions(ast.parse(source)) == {"A": "type", "B": "type", "d": "function"}
+    source = "class A: ...\nBounds = dict[str, int]\nMAX_C = 3\ndef d(): ...\ndef _e(): ..."
+    assert definitions(ast.parse(source)) == {"A": "type", "Bounds": "type", "d": "function"}
     assert len(homes("type")) > 300 and len(homes("function")) > 800
 
 
@@ -72,7 +78,7 @@ def test_sentences_say_what_they_are_about():
     for path in SOURCES:
         text = path.read_text(encoding="utf-8")
         assert not [word for word in FORBIDDEN if word in text], path
-        for node in ast.walk(ast.parse(text)):
+        for node in ast.walk(parsed(path)):
             if isinstance(node, ast.FunctionDef | ast.ClassDef | ast.Module):
                 said = ast.get_docstring(node) or ""
                 elliptical += [f"{path}: {said}"] if said.startswith(ELLIPTICAL) and "\n" not in said else []

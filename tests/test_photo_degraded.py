@@ -58,7 +58,7 @@ def outcome(kind: str, seed: int, folder) -> Outcome:
     """One photograph, taken and measured as `verify` does."""
     truth, surface, promised = take(kind, seed)
     (folder / "a.jpg").write_bytes(truth.jpeg)
-    with patch.object(measuring, "place", wraps=locate_sheet) as placing:
+    with patch.object(measuring, "locate_sheet", wraps=locate_sheet) as placing:
         returned: list[LocatedSheet | None] = []
         placing.side_effect = lambda *args: returned.append(locate_sheet(*args)) or returned[-1]
         view = pinhole_photo(read_photo(folder / "a.jpg"), None)

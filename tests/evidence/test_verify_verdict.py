@@ -9,7 +9,7 @@ from synthetic_photos import make_manifest
 from patchproof.base.goal import Goal
 from patchproof.evidence.ranges import matched_rate, promised_ranges, promised_side_px
 from patchproof.evidence.results import CameraPose, Geometry, PhotoEntry
-from patchproof.evidence.verdict import compare, effect_of, judge, kept_chance, required_rate
+from patchproof.evidence.verdict import compare_with_control, effect_of, judge, kept_chance, required_rate
 from patchproof.sheets.manifest import ConditionClaim, Promise
 
 
@@ -102,25 +102,25 @@ def test_fewer_than_five_or_too_many_without_markers_cannot_tell():
 def test_pairs_by_file_name_go_to_mcnemar():
     patch = {f"{i}.jpg": True for i in range(10)}
     control = {f"{i}.jpg": i < 4 for i in range(10)}
-    compared = compare(patch, "bare", control, Goal.assist)
+    compared = compare_with_control(patch, "bare", control, Goal.assist)
     # six discordant pairs, all one way: 2 · (1/2)⁶ = 0.03125
     assert (compared.pairs, compared.p_value, compared.shown) == (10, pytest.approx(0.03125), True)
-    assert not compare(patch, "bare", control, Goal.deceive).shown
-    assert compare(control, "bare", patch, Goal.deceive).shown
+    assert not compare_with_control(patch, "bare", control, Goal.deceive).shown
+    assert compare_with_control(control, "bare", patch, Goal.deceive).shown
     control["4.jpg"] = True  # five pairs: 0.0625
-    assert not compare(patch, "bare", control, Goal.assist).shown
+    assert not compare_with_control(patch, "bare", control, Goal.assist).shown
 
 
 def test_a_few_names_that_happen_to_be_equal_are_no_pairs():
     patch = {f"a{i}.jpg": True for i in range(40)} | {f"{i}.jpg": True for i in range(6)}
     control = {f"b{i}.jpg": False for i in range(40)} | {f"{i}.jpg": True for i in range(6)}
-    assert compare(patch, "bare", control, Goal.assist).pairs == 0
-    assert compare(patch, "bare", control, Goal.assist).shown
+    assert compare_with_control(patch, "bare", control, Goal.assist).pairs == 0
+    assert compare_with_control(patch, "bare", control, Goal.assist).shown
 
 
 def test_different_names_go_to_newcombe():
     patch, control = {f"a{i}": True for i in range(20)}, {f"b{i}": i < 5 for i in range(20)}
-    compared = compare(patch, "bare", control, Goal.assist)
+    compared = compare_with_control(patch, "bare", control, Goal.assist)
     assert compared.pairs == 0 and compared.p_value is None and compared.shown
     assert compared.difference == pytest.approx(0.75) and compared.difference_interval[0] > 0
 
@@ -128,12 +128,12 @@ def test_different_names_go_to_newcombe():
 def test_every_control_must_be_beaten_and_none_is_no_test():
     patch = {f"{i}": True for i in range(10)}
     good, bad = (
-        compare(patch, "bare", {f"{i}": False for i in range(10)}, Goal.assist),
-        compare(patch, "bare", patch, Goal.assist),
+        compare_with_control(patch, "bare", {f"{i}": False for i in range(10)}, Goal.assist),
+        compare_with_control(patch, "bare", patch, Goal.assist),
     )
     assert effect_of([good]) == "shown" and effect_of([good, bad]) == "not_shown"
-    assert effect_of([]) == effect_of([compare(patch, "bare", {}, Goal.assist)]) == "not_tested"
-    assert compare(patch, "bare", {}, Goal.assist).shown is None
+    assert effect_of([]) == effect_of([compare_with_control(patch, "bare", {}, Goal.assist)]) == "not_tested"
+    assert compare_with_control(patch, "bare", {}, Goal.assist).shown is None
 
 
 def conditions(scales, recognized):

@@ -8,7 +8,7 @@ from scipy.stats import binom
 
 from patchproof.base.goal import Goal
 from patchproof.base.intervals import independent_difference
-from patchproof.evidence.verdict import MIN_KEPT_CHANCE, PHOTOS_PER_SESSION, compare, kept_chance
+from patchproof.evidence.verdict import MIN_KEPT_CHANCE, PHOTOS_PER_SESSION, compare_with_control, kept_chance
 from patchproof.reprints.shot_plan import fewest_photos, paired_power, plan_shots, unpaired_power
 from test_verify_verdict import promise_of
 
@@ -19,8 +19,8 @@ def test_power_is_what_the_judge_finds_in_simulation(rates, n):
     for _ in range(trials):
         a, b = (rng.random(n) < rate for rate in rates)
         left = {str(i): bool(x) for i, x in enumerate(a)}
-        paired += compare(left, "bare", {str(i): bool(x) for i, x in enumerate(b)}, Goal.assist).shown
-        unpaired += compare(left, "bare", {f"c{i}": bool(x) for i, x in enumerate(b)}, Goal.assist).shown
+        paired += compare_with_control(left, "bare", {str(i): bool(x) for i, x in enumerate(b)}, Goal.assist).shown
+        unpaired += compare_with_control(left, "bare", {f"c{i}": bool(x) for i, x in enumerate(b)}, Goal.assist).shown
     # three standard errors of 900 trials
     assert paired_power(*rates, n) == pytest.approx(paired / trials, abs=0.05)
     assert unpaired_power(*rates, n) == pytest.approx(unpaired / trials, abs=0.05)

@@ -39,7 +39,7 @@ from patchproof.evidence.ranges import matched_rate, promised_side_px
 from patchproof.evidence.reproject import PhotoSquare
 from patchproof.evidence.results import Ledger, ModelRate, PhotoEntry, Report, Scale, SessionCount, Summary
 from patchproof.evidence.task import Options, task_of
-from patchproof.evidence.verdict import Verdict, compare, effect_of, judge, next_step
+from patchproof.evidence.verdict import Verdict, compare_with_control, effect_of, judge, next_step
 from patchproof.photo.read import list_images, list_skipped_files, printable_name
 from patchproof.sheets.manifest import Manifest
 
@@ -171,7 +171,9 @@ def report_of(
         pairs = [(e.forecast, recognized[e.file]) for e in counted if e.forecast is not None and e.file in recognized]
         if pairs:
             forecast = forecast_of([p for p, _ in pairs], [answer for _, answer in pairs], promise.rate)
-        comparisons = [compare(recognized, name, _recognized(e, primary), goal) for name, e in controls.items()]
+        comparisons = [
+            compare_with_control(recognized, name, _recognized(e, primary), goal) for name, e in controls.items()
+        ]
         if verdict.verdict == "cannot_tell":
             do = next_step(promise, counts[1], without_markers)
         if rate.rate is not None and interval is not None:

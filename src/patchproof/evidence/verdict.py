@@ -125,7 +125,7 @@ def _share_without_markers(judged: int, without_markers: int) -> float:
     return without_markers / max(judged + without_markers, 1)
 
 
-def compare(patch: Mapping[str, bool], name: str, control: Mapping[str, bool], goal: Goal) -> Control:
+def compare_with_control(patch: Mapping[str, bool], name: str, control: Mapping[str, bool], goal: Goal) -> Control:
     """Compare answers to the patch with those to a control, both by file name; equal names are pairs. `shown` says
     whether the patch changes recognition in the goal's direction, at 95 %.
     """

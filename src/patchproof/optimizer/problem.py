@@ -29,7 +29,7 @@ from patchproof.optimizer.subject import Subject, subject_of
 from patchproof.render.pixels import PHOTO_SAMPLING, Appearance, TextureSampling
 from patchproof.render.stage import Stage, set_stage
 from patchproof.render.surfaces import piece_surface
-from patchproof.render.views import Views, render_views
+from patchproof.render.views import Views, relight_and_replace_background, render_views
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.interface import Scene
 from patchproof.scene.patch_scene import PatchScene
@@ -85,6 +85,10 @@ class Problem:
         sampling = TRAINING_SAMPLING if side_px < self.figure_px else PHOTO_SAMPLING
         sampling = FIGURE_SAMPLING if side_px == self.figure_px else sampling
         return render_views(self.stage, appearance, conditions, (side_px, side_px), sampling)
+
+    def see_again(self, views: Views, conditions: Conditions) -> Views:
+        """Relight views and replace their backgrounds; overridden, as `see` is, by studies that simplify the model."""
+        return relight_and_replace_background(views, conditions)
 
     @cached_property
     def start_appearance(self) -> Appearance:

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from patchproof.optimizer.problem import Problem
-from patchproof.render.views import Views, relight_and_replace_background, split_views
+from patchproof.render.views import Views, split_views
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.interface import Scene
 
@@ -78,7 +78,7 @@ class ViewCache:
         views = self._stored.get(pose) or self._ahead.pop(pose)
         if len(self._stored) < self._capacity:
             self._stored[pose] = views
-        return relight_and_replace_background(views, conditions)
+        return self._problem.see_again(views, conditions)
 
     def _render_ahead(self, pose: int, count: int) -> None:
         step = self._problem.scene.settings.optimize.views

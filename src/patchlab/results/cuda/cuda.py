@@ -3,7 +3,7 @@
 In: scene files. Out: `cuda.csv`, by scene and quantity a value for each device: of 8 training views the largest
 difference of a pixel and the relative difference of the gradient at one design; of a run of 60 steps its seconds, its
 median step and its last loss on the selection set; of 96 views of one design the seconds, the answers that are alike
-and the largest difference of a confidence; training views a second by how many are rendered together, new and lit anew.
+and the largest difference of a confidence; training views a second by how many are rendered together, new and relit.
 The CPU's runs are shared by as many processes as it has cores. Run in this folder: python cuda.py suv truck
 """
 
@@ -90,7 +90,7 @@ def measured(name: str) -> Iterator[dict]:
         again = [seconds(lambda v=views, s=start: gradient_in_views(gpu, s, [v])) for _ in range(ROUNDS)]
         new_s, again_s = (statistics.median(times[1:]) for times in (new, again))
         yield line(f"new views a second, {count} together", None, count / (new_s + again_s))
-        yield line(f"views a second lit anew, {count} together", None, count / again_s)
+        yield line(f"views a second relit, {count} together", None, count / again_s)
 
 
 if __name__ == "__main__":
