@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import weakref
 from concurrent.futures import Future
@@ -244,3 +245,15 @@ def test_a_sheet_does_not_choose_code_that_is_run():
     with pytest.raises(Refused, match="files, not code"):
         _networks(manifest, ["builtin"])
     assert _networks(manifest, ["module:theirs.network"]) == ("module:theirs.network",)
+
+
+@pytest.mark.parametrize(
+    "name", ["${EMPTY}module:evil.make", "mod${EMPTY}ule:evil.make", "timm:hf-hub:someone/x-${KEY}"]
+)
+def test_a_sheet_does_not_choose_what_is_read_of_the_environment(name, monkeypatch):
+    monkeypatch.setenv("EMPTY", "")
+    said = promise()
+    said["models"][0]["name"] = name
+    with pytest.raises(Refused, match=re.escape(f"got {name}: name it yourself")):
+        _networks(make_manifest(said), ["builtin"])
+    assert _networks(make_manifest(said), [name]) == (name,)

@@ -192,7 +192,8 @@ def _check_out(out: Path, resume: bool, overwrite: bool) -> None:
 
 def _networks(manifest: Manifest, models: Sequence[str | Classifier] | None) -> tuple[str | Classifier, ...]:
     """List the primary network, then the named ones or else the promise's; classifiers in memory stand for themselves.
-    Refused is a sheet's network that is code, unless the user names it.
+    Refused is a sheet's network that is code, or has a variable in its name, unless the user names it: a received file
+    decides neither what runs nor what is read of the environment.
     """
     named = {model.name if isinstance(model, Classifier) else model: model for model in models or ()}
     if manifest.promise is None and not named:
@@ -202,8 +203,11 @@ def _networks(manifest: Manifest, models: Sequence[str | Classifier] | None) -> 
         return tuple(named.values())
     promised = tuple(model.name for model in manifest.promise.models)
     names = dict.fromkeys((promised[0], *(named or promised)))
-    code = next((name for name in names if name.startswith("module:") and name not in named), None)
-    if code is not None:
-        do = f"name it yourself if that code is yours (--models {code})"
-        raise Refused("a sheet whose networks are files, not code that would be run", code, do)
+    for name in names:
+        if name not in named and name.startswith("module:"):
+            do = f"name it yourself if that code is yours (--models {name})"
+            raise Refused("a sheet whose networks are files, not code that would be run", name, do)
+        if name not in named and "${" in name:
+            do = f"name it yourself if you trust the sheet (--models '{name}')"
+            raise Refused("a sheet whose networks are named without variables of your environment", name, do)
     return tuple(named.get(name, name) for name in names)
