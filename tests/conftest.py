@@ -21,7 +21,10 @@ keep_freed_memory()
 # tests of one room take helpers from those of another
 sys.path += [str(folder) for folder in sorted(Path(__file__).parent.iterdir()) if folder.is_dir()]
 
-LONG = ("types", "readme", "journey", "optimize", "first_hour", "kill_anywhere")  # of the file's name
+LONG = (  # of the files' names
+    *("types", "readme", "journey", "optimize", "first_hour", "kill_anywhere"),
+    *("flat_journey", "ledger", "verify_run", "photo_degraded", "sheet_pages", "calibrate_printer", "begin", "workers"),
+)
 
 
 def pytest_collection_modifyitems(items):
