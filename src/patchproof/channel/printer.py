@@ -107,7 +107,7 @@ def vary_print(seen_linear: Tensor, change: Tensor) -> Tensor:
 
 
 def load_printer(name_or_file: str, base: Path | None = None) -> Printer:
-    """Load a shipped printer by name, `identity`, or a NAME.npz or NAME.json file relative to `base`."""
+    """Load a shipped printer by name, `identity`, or NAME.npz or NAME.json relative to `base`; else it is refused."""
     if name_or_file == "identity":
         return identity_printer()
     suffix = Path(name_or_file).suffix.lower()

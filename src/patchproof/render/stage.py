@@ -61,7 +61,7 @@ class Stage:
 
 
 def set_stage(scene: Scene, device: torch.device | str = "cpu") -> Stage:
-    """Move a scene's mesh, textures and piece to a device."""
+    """Move a scene's mesh, textures and piece to a device, "cpu" or "cuda"; torch raises RuntimeError without it."""
     device = torch.device(device)
     surface = object_surface(require_mesh(scene).mesh, device) if scene.HAS_OBJECT else None
     return Stage(scene, device, surface, piece_surface(require_piece(scene), device) if scene.HAS_PIECE else None)

@@ -25,7 +25,11 @@ if TYPE_CHECKING:
 
 
 def load_scene(path: str | Path, seed: int | None = None, steps: int | None = None) -> Scene:
-    """Load the scene of a file; `seed` and the `steps` of its optimization replace those in the file."""
+    """Load the scene of a file; `seed` and the `steps` of its optimization replace those in the file.
+
+    Raises:
+        Refused: for a file that is missing, has unknown or contradicting settings, or names files that cannot be read.
+    """
     path = Path(path)
     settings = load_scene_settings(path)
     if steps is not None:
