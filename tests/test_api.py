@@ -152,6 +152,12 @@ def test_a_dictionary_may_hold_the_objects_that_a_scene_file_names(tmp_path):
     )
     assert pp.make_scene(SETTINGS | tables, base=tmp_path).sheet_id == made.sheet_id
     assert [judge.labels for judge in set_problem(made).classifiers] == [("box", "cup", "tin")] * 2
+    twice = {"target": {"label": "box", "models": [network(), network()]}}
+    with pytest.raises(pp.Refused, match="python:net twice"):
+        pp.make_scene(SETTINGS | twice, mesh)
+    neither = pp.make_scene(SETTINGS | {"target": {"label": "box", "models": [7]}}, mesh)
+    with pytest.raises(pp.Refused, match="an object of type int"):
+        set_problem(neither)
     with pytest.raises(pp.Refused, match=r"float64 \(8, 8, 3\) at index 1"):
         pp.make_scene(SETTINGS | {"background": {"images": [pictures[0], np.zeros((8, 8, 3))]}}, mesh, tmp_path)
 

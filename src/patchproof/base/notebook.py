@@ -6,13 +6,12 @@ are the notebook's; whole pages, which `report` writes.
 
 from __future__ import annotations
 
-import base64
 import html
 from collections.abc import Mapping
 
 import numpy as np
 
-from patchproof.base.output import image_bytes
+from patchproof.base.output import base64_uri, image_bytes
 
 _PICTURE_PX = 160  # side at which a design is shown; its own pixels are larger blocks
 
@@ -22,7 +21,7 @@ def notebook_html(heading: str, rows: Mapping[str, str], picture: np.ndarray | N
     cells = "".join(f"<tr><th>{html.escape(k)}</th><td>{html.escape(v)}</td></tr>" for k, v in rows.items())
     image = ""
     if picture is not None:
-        uri = f"data:image/png;base64,{base64.b64encode(image_bytes(picture, 'PNG')).decode()}"
+        uri = base64_uri(image_bytes(picture, "PNG"), "image/png")
         style = f"height:{_PICTURE_PX}px;image-rendering:pixelated"
         image = f'<img alt="design" src="{uri}" style="{style}">'
     return f"<div><b>{html.escape(heading)}</b><table>{cells}</table>{image}</div>"

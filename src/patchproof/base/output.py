@@ -7,6 +7,7 @@ overwritten, so that a mistyped path loses nothing.
 
 from __future__ import annotations
 
+import base64
 import errno
 import io
 import os
@@ -146,6 +147,11 @@ def write_pictures(pictures: Sequence[np.ndarray], folder: Path) -> Path:
         for number, array in enumerate(pictures, 1):
             (part / f"photo_{number:04d}.png").write_bytes(image_bytes(array, "PNG"))
     return folder
+
+
+def base64_uri(content: bytes, kind: str) -> str:
+    """Encode bytes of a media type (`kind`) as a data URI."""
+    return f"data:{kind};base64,{base64.b64encode(content).decode()}"
 
 
 def image_pixels(content: bytes) -> np.ndarray:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import importlib
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -92,10 +93,8 @@ def _check_callable(network: object) -> None:
 def _in_evaluation_mode(network: Callable[[Tensor], Tensor]) -> Callable[[Tensor], Tensor]:
     """The network in evaluation mode; exported modules have no modes, nor have functions."""
     if isinstance(network, torch.nn.Module):
-        try:
-            return network.eval()
-        except NotImplementedError:  # of ExportedProgram.module(), which is frozen in the mode of its export
-            return network
+        with suppress(NotImplementedError):  # ExportedProgram.module() keeps the mode of its export
+            network.eval()
     return network
 
 

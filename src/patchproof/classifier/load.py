@@ -53,6 +53,9 @@ def load_classifier(
         name = labeled_module(name, "python:network")
     if isinstance(name, Classifier):
         return _prepare(name, device)
+    if not isinstance(name, str):
+        got = f"an object of type {type(name).__name__}"
+        raise Refused("a network's name, or a network in memory", got, "wrap it with classifier_of or detector_of")
     kind, _, rest = expand_path(name, Path(base)).partition(":")
     if name == "builtin":
         classifier = load_builtin()

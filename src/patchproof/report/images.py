@@ -6,7 +6,6 @@ same input, and `data:` URIs. All reports share the map's scale, so that two rep
 
 from __future__ import annotations
 
-import base64
 import hashlib
 import io
 from collections.abc import Callable, Mapping
@@ -15,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from patchproof.base.output import image_bytes, make_folder
+from patchproof.base.output import base64_uri, image_bytes, make_folder
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -71,11 +70,6 @@ def _paths(folder: Path, file: str) -> list[Path]:
 def data_uri(content: bytes) -> str:
     """Encode the bytes of a JPEG or PNG as a data URI for `<img src>`."""
     return base64_uri(content, f"image/{'png' if content.startswith(_PNG) else 'jpeg'}")
-
-
-def base64_uri(content: bytes, kind: str) -> str:
-    """Encode bytes of a media type (`kind`) as a data URI."""
-    return f"data:{kind};base64,{base64.b64encode(content).decode()}"
 
 
 def delta_map(delta_e00: np.ndarray, longer_px: int = 192) -> np.ndarray:

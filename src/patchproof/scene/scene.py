@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from patchproof.base.errors import Refused
 from patchproof.base.output import write_pictures
 from patchproof.base.settings import SceneSettings, load_scene_settings
 from patchproof.base.validation import validate_model
@@ -61,7 +62,10 @@ def make_scene(
     models: dict[str, Any] = {}
     if not isinstance(settings, SceneSettings):
         named, given_mesh, models = _replace_objects(settings, Path(base))
-        settings, mesh = validate_model(SceneSettings, named, "the scene's settings"), mesh or given_mesh
+        settings, mesh = (
+            validate_model(SceneSettings, named, "the scene's settings"),
+            given_mesh if mesh is None else mesh,
+        )
     glb: Any = None if mesh is None else mesh.export(file_type="glb")
     scene = build_scene(settings, Path(base), seed, mesh_glb=glb)
     return replace(scene, given_models=models) if models else scene
@@ -69,10 +73,7 @@ def make_scene(
 
 def _replace_objects(settings: Mapping[str, Any], base: Path) -> tuple[dict[str, Any], Any, dict[str, Any]]:
     """Return the settings with names in place of objects, the mesh if it was one of these, and the networks by name."""
-    tables = {key: dict(value) if isinstance(value, Mapping) else value for key, value in settings.items()}
-    mesh, models = None, {}
-    for table in (value for value in tables.values() if isinstance(value, dict)):
-        table.update({key: str(value) for key, value in table.items() if isinstance(value, Path)})
+    tables, mesh, models = _path_texts(settings), None, {}
     for key, name in (("object", "photos"), ("object", "images"), ("background", "images")):
         table = tables.get(key)
         if isinstance(table, dict) and isinstance(table.get(name), list | tuple):
@@ -85,9 +86,18 @@ def _replace_objects(settings: Mapping[str, Any], base: Path) -> tuple[dict[str,
         for number, model in enumerate(target["models"]):
             is_named = isinstance(model, str | Path)
             names.append(str(model) if is_named else getattr(model, "name", f"python:network{number}"))
+            if not is_named and names[-1] in models:
+                raise Refused("networks with a name each in target.models", f"{names[-1]} twice", "name them apart")
             models |= {} if is_named else {names[-1]: model}
         target["models"] = names
     return tables, mesh, models
+
+
+def _path_texts(value: Any) -> Any:
+    """Copy tables, also nested ones, with the text of each Path in its place."""
+    if isinstance(value, Mapping):
+        return {key: _path_texts(each) for key, each in value.items()}
+    return str(value) if isinstance(value, Path) else value
 
 
 def _write_pictures(pictures: Sequence[np.ndarray], base: Path) -> Path:

@@ -22,7 +22,7 @@ from patchproof.app.begin.sample_views import SampleView, sample_views
 from patchproof.app.begin.sides import SIDE_NAMES, gap_colors, ramp_colors, side_of, side_views, turntable
 from patchproof.base.color import codes_from_srgb
 from patchproof.base.errors import Refused
-from patchproof.base.output import image_bytes, new_folder, write_atomically
+from patchproof.base.output import base64_uri, image_bytes, new_folder, write_atomically
 from patchproof.base.resample import downscale
 from patchproof.base.settings import SceneSettings, load_scene_settings
 from patchproof.classifier.labels import find_labels
@@ -30,7 +30,7 @@ from patchproof.classifier.load import load_classifier
 from patchproof.mesh.export import write_glb
 from patchproof.mesh.mesh import Material, MeshPart
 from patchproof.render.stage import Stage, set_stage
-from patchproof.report.images import base64_uri, data_uri, jpeg, png
+from patchproof.report.images import data_uri, jpeg, png
 from patchproof.report.page import render_page
 from patchproof.scene.bend import STRETCH_LIMIT
 from patchproof.scene.canvas import bake_base_colors
