@@ -12,6 +12,7 @@ from console import lab_command
 import patchlab
 import patchproof
 from patchlab.keys import HEAD, documents
+from patchproof.app.files_page import files_page
 from patchproof.app.keys import DOCUMENTS, keys_page, meanings, tables
 from patchproof.base.errors import Refused
 from patchproof.base.validation import StrictModel
@@ -27,14 +28,14 @@ def models() -> set[type[StrictModel]]:
 
 @pytest.fixture(scope="module")
 def pages() -> dict[str, str]:
-    """Both pages, as they are printed."""
-    return {"keys": keys_page(DOCUMENTS), "lab_keys": keys_page(documents(), head=HEAD)}
+    """All pages, as they are printed."""
+    return {"keys": keys_page(DOCUMENTS), "lab_keys": keys_page(documents(), head=HEAD), "files": files_page()}
 
 
 def test_the_stored_page_is_what_is_printed(pages):
     for page, printed in pages.items():
         stored = (ROOT / f".readme/{page}.md").read_text(encoding="utf-8")
-        assert stored == printed, "run: patchproof keys > .readme/keys.md; patchlab keys > .readme/lab_keys.md"
+        assert stored == printed, f"print {page}.md again: patchproof keys [--files], patchlab keys"
 
 
 def test_every_key_says_what_it_means():

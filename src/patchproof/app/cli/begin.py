@@ -80,8 +80,12 @@ def plan(
         write_atomically(out, full_plan.model_dump_json(indent=1) + "\n")
 
 
-def keys(name: Annotated[str | None, Argument(help="scene, template or board; without one, all.")] = None) -> None:
+def keys(
+    name: Annotated[str | None, Argument(help="scene, template or board; without one, all.")] = None,
+    files: Annotated[bool, Option("--files", help="What files may declare, and what is done with it.")] = False,
+) -> None:
     """All keys of scene files and page templates: range, unit, default and meaning, as Markdown."""
+    from patchproof.app.files_page import files_page
     from patchproof.app.keys import DOCUMENTS, keys_page
 
-    print(keys_page(DOCUMENTS, name), end="")
+    print(files_page() if files else keys_page(DOCUMENTS, name), end="")
