@@ -12,9 +12,9 @@ from patchproof.base.declared import Declaration
 
 HEAD = """# What files declare
 
-Printed by `patchproof keys --files` from the lists of the readers. *used*: taken as the file says; *refused*: one sentence,
-exit code 1 (a photograph: rejected with its code); *said*: left aside, with a line in the command's output, the preview
-and the report.
+Printed by `patchproof keys --files` from the lists of the readers. *used*: taken as the file says. *refused*: one
+sentence, exit code 1 (a photograph: rejected with its code). *said*: left aside, with a line in the command's output,
+the preview and the report.
 """
 # the kinds of input, and the modules whose DECLARED lists what they can declare
 READERS: dict[str, tuple[str, ...]] = {}
