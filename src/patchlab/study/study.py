@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from patchproof.base.errors import Refused
+from patchproof.base.folder_lock import lock_folder
 from patchproof.base.input import read_json
 from patchproof.base.output import check_folder, make_folder, write_atomically
 from patchproof.base.validation import StrictModel, read_toml, spelling_hint, validate_model
@@ -153,7 +154,11 @@ def run_cells(
     study: Study, settings: StrictModel, base: Path, out: str | Path, work: Work = DEFAULT_WORK
 ) -> FinishedStudy:
     """Run a study with these settings; paths in them are relative to `base`."""
-    out = Path(out)
+    with lock_folder(out):
+        return _run_locked(study, settings, base, Path(out), work)
+
+
+def _run_locked(study: Study, settings: StrictModel, base: Path, out: Path, work: Work) -> FinishedStudy:
     if not work.resume:
         unfinished = (out / f"{study.name}.json").is_file() and not (out / f"{study.name}.html").is_file()
         check_folder(out, _owned_patterns(study), work.overwrite, unfinished)

@@ -19,6 +19,7 @@ import numpy as np
 
 from patchproof.base.compute import Compute
 from patchproof.base.errors import Refused
+from patchproof.base.folder_lock import lock_folder
 from patchproof.base.geometry import apply_homography, rect_corners
 from patchproof.base.input import is_file
 from patchproof.base.output import check_folder, write_atomically, write_pictures
@@ -110,37 +111,41 @@ def verify(
         ```
     """
     out, manifest, compute = Path(out), load_manifest(sheet), compute.without("verify", device=True)
-    _check_out(out, resume, overwrite)
-    if not isinstance(photos, str | Path):
-        photos = write_pictures(photos, out / _PHOTOS)
-    boxes = capture.boxes
-    options = options_of(sheet, manifest, models, capture.camera)
-    parameters: dict[str, Any] = {"scan_dpi": capture.scan_dpi, "ruler_mm": capture.ruler_mm}
-    options = replace(options, **parameters, controls=controls, ledger_photos=ledger_photos)
-    if boxes is not None:
-        if manifest.promise is None or not any(model.LOOKS_AT_BOXES for model in options.models):
-            got = f"the classifiers {', '.join(model.name for model in options.models) or '(none)'}"
-            raise Refused("a detector, since classifiers use no boxes", got, "leave boxes out")
-        options = replace(options, boxes=load_boxes(boxes, manifest.promise.target.label))
-    forecast = None
-    if run is not None:
-        from patchproof.reprints.photo_forecast import photo_forecaster  # imports scene, renderer and optimizer
+    with lock_folder(out):
+        _check_out(out, resume, overwrite)
+        if not isinstance(photos, str | Path):
+            photos = write_pictures(photos, out / _PHOTOS)
+        boxes = capture.boxes
+        options = options_of(sheet, manifest, models, capture.camera)
+        parameters: dict[str, Any] = {"scan_dpi": capture.scan_dpi, "ruler_mm": capture.ruler_mm}
+        options = replace(options, **parameters, controls=controls, ledger_photos=ledger_photos)
+        if boxes is not None:
+            if manifest.promise is None or not any(model.LOOKS_AT_BOXES for model in options.models):
+                got = f"the classifiers {', '.join(model.name for model in options.models) or '(none)'}"
+                raise Refused("a detector, since classifiers use no boxes", got, "leave boxes out")
+            options = replace(options, boxes=load_boxes(boxes, manifest.promise.target.label))
+        forecast = None
+        if run is not None:
+            from patchproof.reprints.photo_forecast import photo_forecaster  # imports scene, renderer and optimizer
 
-        forecast = photo_forecaster(run, manifest)
-    gather = partial(gather_evidence, compute=compute, journal=out / _JOURNAL, resume=resume, forecast=forecast)
-    on_pictures = partial(save_pictures, out / "pictures")
-    report = gather(photos, manifest, options, on_pictures=on_pictures, advance=partial(progress, "verify"))
-    parameters |= {"camera": capture.camera and Path(capture.camera).name}
-    parameters |= {"boxes": boxes and Path(boxes).name, "ledger_photos": ledger_photos}
-    hashes = {"manifest": file_sha256(Path(sheet)), **{f"network {each.name}": each.sha256 for each in options.models}}
-    report = report.changed(origin=Origin(options=parameters, sha256=hashes, versions=versions_of(_LIBRARIES)))
-    stems = {stem_of(photo.file) for photo in report.photos[:MAX_PICTURED_PHOTOS]}
-    for path in list((out / "pictures").glob("*")):  # those of photographs that this report does not show
-        if path.name.rsplit(".", 2)[0] not in stems:
-            path.unlink()
-    ledger = report.ledger and report.ledger.model_dump()
-    write_report(report.model_dump(mode="json"), manifest.model_dump(mode="json"), out, ledger)
-    write_atomically(out / "coco.json", _boxes(report, manifest, options.camera))
+            forecast = photo_forecaster(run, manifest)
+        gather = partial(gather_evidence, compute=compute, journal=out / _JOURNAL, resume=resume, forecast=forecast)
+        on_pictures = partial(save_pictures, out / "pictures")
+        report = gather(photos, manifest, options, on_pictures=on_pictures, advance=partial(progress, "verify"))
+        parameters |= {"camera": capture.camera and Path(capture.camera).name}
+        parameters |= {"boxes": boxes and Path(boxes).name, "ledger_photos": ledger_photos}
+        hashes = {
+            "manifest": file_sha256(Path(sheet)),
+            **{f"network {each.name}": each.sha256 for each in options.models},
+        }
+        report = report.changed(origin=Origin(options=parameters, sha256=hashes, versions=versions_of(_LIBRARIES)))
+        stems = {stem_of(photo.file) for photo in report.photos[:MAX_PICTURED_PHOTOS]}
+        for path in list((out / "pictures").glob("*")):  # those of photographs that this report does not show
+            if path.name.rsplit(".", 2)[0] not in stems:
+                path.unlink()
+        ledger = report.ledger and report.ledger.model_dump()
+        write_report(report.model_dump(mode="json"), manifest.model_dump(mode="json"), out, ledger)
+        write_atomically(out / "coco.json", _boxes(report, manifest, options.camera))
     return report
 
 

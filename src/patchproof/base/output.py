@@ -21,26 +21,28 @@ from typing import Any
 import numpy as np
 
 from patchproof.base.errors import Refused
+from patchproof.base.folder_lock import lock_folder
 
 
 @contextmanager
 def new_folder(out: str | Path, file_names: tuple[str, ...], overwrite: bool = False) -> Iterator[Path]:
     """A folder to write into that becomes `out` when the block ends without an error; see `check_folder`."""
     out = Path(out)
-    check_folder(out, file_names, overwrite)
-    part = out.with_name(f".{out.name}.part")
-    shutil.rmtree(part, ignore_errors=True)
-    make_folder(part)
-    try:
-        yield part
-        old = out.with_name(f".{out.name}.old")
-        shutil.rmtree(old, ignore_errors=True)
-        if out.is_dir():
-            out.rename(old)
-        part.rename(out)
-        shutil.rmtree(old, ignore_errors=True)
-    finally:
+    with lock_folder(out):
+        check_folder(out, file_names, overwrite)
+        part = out.with_name(f".{out.name}.part")
         shutil.rmtree(part, ignore_errors=True)
+        make_folder(part)
+        try:
+            yield part
+            old = out.with_name(f".{out.name}.old")
+            shutil.rmtree(old, ignore_errors=True)
+            if out.is_dir():
+                out.rename(old)
+            part.rename(out)
+            shutil.rmtree(old, ignore_errors=True)
+        finally:
+            shutil.rmtree(part, ignore_errors=True)
 
 
 def check_folder(out: Path, file_names: tuple[str, ...], overwrite: bool = False, unfinished: bool = False) -> None:

@@ -26,6 +26,7 @@ from pydantic import BaseModel, Field
 
 from patchproof.base.compute import Compute
 from patchproof.base.errors import Refused
+from patchproof.base.folder_lock import lock_folder
 from patchproof.base.input import is_file, read_json
 from patchproof.base.notebook import notebook_html
 from patchproof.base.output import check_folder, make_folder, write_atomically
@@ -112,25 +113,26 @@ def optimize(
         ```
     """
     out, compute = Path(out), compute.without("optimize", cluster=True)
-    if not resume:
-        unfinished = is_file(out / CHECKPOINT_FILE) and not is_file(out / RUN_FILE)
-        check_folder(out, RUN_FILE_PATTERNS, overwrite, unfinished=unfinished)
-    scene = resolve_scene(scene, seed)
-    save_place = None
-    if not scene.HAS_PLACE:
-        search_options = {"models": models, "loss": loss, "compute": compute, "progress": progress}
-        scene, save_place = _choose_place(scene, out, resume, search_options)
-    problem = set_problem(scene, compute.device, models, loss, compute.jobs)
-    if not resume:
-        for pattern in RUN_FILE_PATTERNS[:-1]:  # everything that the new run needs has been read
-            for path in out.glob(pattern):
-                path.unlink()
-    make_folder(out)
-    if save_place is not None:
-        save_place()
-    state = load_checkpoint(out, problem) if resume else start(problem)
-    design = _run_steps(problem, state, out, partial(progress, "optimize"))
-    return finish_run(problem, design, out, promise, progress)
+    with lock_folder(out):
+        if not resume:
+            unfinished = is_file(out / CHECKPOINT_FILE) and not is_file(out / RUN_FILE)
+            check_folder(out, RUN_FILE_PATTERNS, overwrite, unfinished=unfinished)
+        scene = resolve_scene(scene, seed)
+        save_place = None
+        if not scene.HAS_PLACE:
+            search_options = {"models": models, "loss": loss, "compute": compute, "progress": progress}
+            scene, save_place = _choose_place(scene, out, resume, search_options)
+        problem = set_problem(scene, compute.device, models, loss, compute.jobs)
+        if not resume:
+            for pattern in RUN_FILE_PATTERNS[:-1]:  # everything that the new run needs has been read
+                for path in out.glob(pattern):
+                    path.unlink()
+        make_folder(out)
+        if save_place is not None:
+            save_place()
+        state = load_checkpoint(out, problem) if resume else start(problem)
+        design = _run_steps(problem, state, out, partial(progress, "optimize"))
+        return finish_run(problem, design, out, promise, progress)
 
 
 def resolve_scene(scene: str | Path | Scene, seed: int | None) -> Scene:
@@ -184,12 +186,13 @@ def promise_run(
     again.
     """
     compute, options = compute.without("promise", cluster=True), PromiseOptions(views)
-    run = load_run(run_folder)
-    options = replace(options, controls=tuple(run.promise.controls))
-    problem = set_problem(run.scene, compute.device, jobs=compute.jobs)
-    promise = promise_of(problem, run.design, options, partial(progress, "promise"))
-    details = run.details | {"promise": promise.model_dump(mode="json")}
-    write_atomically(run.folder / RUN_FILE, json.dumps(details, indent=1) + "\n")
+    with lock_folder(run_folder):
+        run = load_run(run_folder)
+        options = replace(options, controls=tuple(run.promise.controls))
+        problem = set_problem(run.scene, compute.device, jobs=compute.jobs)
+        promise = promise_of(problem, run.design, options, partial(progress, "promise"))
+        details = run.details | {"promise": promise.model_dump(mode="json")}
+        write_atomically(run.folder / RUN_FILE, json.dumps(details, indent=1) + "\n")
     return replace(run, promise=promise, details=details)
 
 
