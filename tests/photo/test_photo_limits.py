@@ -18,6 +18,7 @@ from watch import peak_bytes
 
 from patchproof.base import input as bounds
 from patchproof.base.errors import Refused
+from patchproof.base.input import limit_memory
 from patchproof.calibrate import boards
 from patchproof.calibrate.boards import BoardView, find_boards, find_corners
 from patchproof.evidence.batch import PhotoItem, _measure_or_reject
@@ -25,7 +26,7 @@ from patchproof.evidence.camera import pinhole_photo
 from patchproof.evidence.measure import measure
 from patchproof.evidence.ranges import promised_ranges
 from patchproof.photo import detect, limits, page_code, read
-from patchproof.photo.limits import count_finder_lines, count_squares, limit_memory, run_limited
+from patchproof.photo.limits import count_finder_lines, count_squares, run_limited
 from patchproof.photo.page_code import read_page_code
 from patchproof.photo.read import read_photo
 from patchproof.photo.rejection import PhotoRejected
@@ -105,7 +106,7 @@ def test_a_photograph_of_a_board_that_takes_too_long_is_left_out(tmp_path, monke
 
 @needs_linux
 def test_memory_is_limited_while_a_photograph_is_read(tmp_path, monkeypatch):
-    with limit_memory():
+    with limit_memory(limits.MOST_BYTES):
         np.empty(limits.MOST_BYTES // 2, np.uint8)
         with pytest.raises(MemoryError):
             np.empty(limits.MOST_BYTES + 2**28, np.uint8)

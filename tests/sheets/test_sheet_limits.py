@@ -55,7 +55,7 @@ def test_a_page_that_takes_too_long_is_refused_and_left_behind(tmp_path, monkeyp
     forms_in_forms(tmp_path / "many.pdf", 5)
     before = time.process_time()
     with pytest.raises(
-        Refused, match=r"a page that can be drawn in time, got .*, which takes more than 0\.3 s of processor"
+        Refused, match=r"a page that can be drawn in time and memory, got .*, which takes more than 0\.3 s of processor"
     ):
         rasterize_page(tmp_path / "many.pdf", 1, 72)
     assert time.process_time() - before < 0.7

@@ -1,22 +1,28 @@
-"""Read untrusted JSON and images within size and time limits.
+"""Read untrusted files, JSON and images within limits of size, time and memory.
 
 In: a path, or bytes, and the words for a refusal. Out: the content, or one `Refused` whatever makes a decoder fail.
-Sizes are checked before memory is allocated, and only formats that hold pictures are opened, because Pillow also opens
-some that start other programs. Photographs have limits of their own (`photo.limits`), and so has every archive.
+Only regular files are opened, and no more of them is read than their size says: pipes wait, devices and some files of
+/proc never end. Sizes are checked before memory is allocated, and only formats that hold pictures are opened, because
+Pillow also opens some that start other programs. Photographs have limits of their own (`photo.limits`), and so has
+every archive.
 
 Time is limited by a timer that interrupts Python between two steps, so that a long call into a library ends first,
-unless it runs in `run_in_daemon_thread`. Such timers exist on Linux and macOS, in a process's main thread: not on
-Windows, and not in the threads of a cluster's workers. Within another time limit, or a profiler's timer, the outer one
-applies.
+unless it runs in `run_in_child`. Such timers exist on Linux and macOS, in a process's main thread: not on Windows, and
+not in the threads of a cluster's workers. Within another time limit, or a profiler's timer, the outer one applies.
 """
 
 from __future__ import annotations
 
+import errno
+import hashlib
 import io
 import json
 import os
+import pickle
 import signal
+import sys
 import threading
+import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from contextlib import contextmanager
@@ -38,6 +44,8 @@ ReturnType = TypeVar("ReturnType")
 # an allow-list, because Pillow also opens formats that start other programs (EPS) or hold no photograph
 IMAGE_FORMATS = ("JPEG", "MPO", "PNG", "TIFF", "WEBP", "BMP", "GIF", "AVIF", "HEIF")
 MAX_IMAGE_PX = 120_000_000  # 360 MB as pixels; the largest phone sensors in common use give 50 to 108 million
+MAX_FILE_BYTES = 1 << 30  # of one file, where its kind has no limit of its own
+MAX_CHILD_BYTES = 1_500_000_000  # more memory than at its start for a child: a page of 160 megapixels takes 1.1 GB
 MAX_JSON_BYTES = 16 << 20  # a manifest has 0.3 million; nested empty lists take 25 times their text in memory
 
 
@@ -51,16 +59,40 @@ def is_folder(path: str | Path) -> bool:
     return os.path.isdir(path)
 
 
+def file_size(path: str | Path, max_bytes: int = MAX_FILE_BYTES) -> int:
+    """Return the size of a regular file; an OSError for anything else that is at `path`, and beyond `max_bytes`."""
+    if not is_file(path):
+        raise FileNotFoundError(errno.ENOENT, "no file, or none with an end", str(path))
+    if (size := os.path.getsize(path)) > max_bytes:
+        raise OSError(errno.EFBIG, f"{size / 2**20:.0f} MiB, more than {max_bytes / 2**20:.0f}", str(path))
+    return size
+
+
+def read_file(path: str | Path, max_bytes: int = MAX_FILE_BYTES) -> bytes:
+    """Read a regular file of at most `max_bytes`; see `file_size`."""
+    size = file_size(path, max_bytes)
+    with open(path, "rb") as file:
+        return file.read(size)
+
+
+def hash_file(path: str | Path, max_bytes: int = MAX_FILE_BYTES) -> str:
+    """SHA-256 of a regular file of at most `max_bytes`; see `file_size`."""
+    remaining, digest = file_size(path, max_bytes), hashlib.sha256()
+    with open(path, "rb") as file:
+        while chunk := file.read(min(remaining, 1 << 20)):
+            digest.update(chunk)
+            remaining -= len(chunk)
+    return digest.hexdigest()
+
+
 def read_json(path: str | Path, expected: str, do: str, missing: str = "check the path") -> Any:
     """Read a JSON file; refused with the instruction `do` if it is broken, with `missing` if there is none."""
     path = Path(path)
     if not is_file(path):
         raise Refused(expected, f"no file at {path}", missing)
     try:
-        if path.stat().st_size > MAX_JSON_BYTES:
-            raise ValueError(f"more than {MAX_JSON_BYTES >> 20} MiB")
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:  # RecursionError: thousands of nested lists
+        return json.loads(str(read_file(path, MAX_JSON_BYTES), "utf-8"))
+    except (OSError, ValueError, RecursionError, MemoryError) as error:  # RecursionError: thousands of nested lists
         raise Refused(expected, f"{path} that cannot be read ({error})", do) from error
 
 
@@ -71,6 +103,8 @@ def open_image(source: Path | bytes, expected: str, do: str) -> Iterator[Image]:
 
     name = "an image" if isinstance(source, bytes) else source.name
     try:
+        if not isinstance(source, bytes) and not file_size(source):
+            raise ValueError("it is empty")
         stream = io.BytesIO(source) if isinstance(source, bytes) else source
         with Image.open(stream, formats=readable_formats()) as image:
             if image.width * image.height > MAX_IMAGE_PX:
@@ -121,10 +155,75 @@ def run_within_time(work: Callable[Params, ReturnType], *args: Params.args, **kw
         signal.signal(signal.SIGPROF, previous_handler)
 
 
-def run_in_daemon_thread(work: Callable[[], ReturnType]) -> ReturnType:
-    """Call `work` in a thread and return its result; an interruption abandons the thread. For calls into libraries that
-    cannot be interrupted and share nothing with other work.
+def run_in_child(work: Callable[[], ReturnType]) -> ReturnType:
+    """Call `work` in a forked process and return its result; raises `TimeLimitExceeded` after `TIME_LIMIT_S`, and a
+    MemoryError beyond `MAX_CHILD_BYTES` or if the process dies. For calls into libraries that cannot be interrupted and
+    share nothing with other work. On systems other than Linux it runs in a thread, whose memory is not limited.
     """
+    if sys.platform != "linux":
+        return run_within_time(_run_in_daemon_thread, work)
+    import multiprocessing
+
+    context = multiprocessing.get_context("fork")
+    receiver, sender = context.Pipe(duplex=False)
+    child = context.Process(target=_send_result, args=(work, sender))
+    with warnings.catch_warnings(action="ignore"):  # of a fork with other threads: the child uses none of their locks
+        child.start()
+    sender.close()
+    try:
+        result, error = pickle.loads(receiver.recv_bytes())
+    except EOFError:
+        child.join()
+        if child.exitcode == -signal.SIGPROF:
+            raise TimeLimitExceeded(TIME_LIMIT_S) from None
+        raise MemoryError("more memory than it may take") from None
+    finally:
+        receiver.close()
+        child.kill()
+        child.join()
+    if error is not None:
+        raise error
+    return result
+
+
+def _send_result(work: Callable[[], Any], sender: Any) -> None:
+    """Do the work of a child: the system ends it, even within a library, when its time is over."""
+    import resource
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGPROF, signal.SIG_DFL)
+    signal.setitimer(signal.ITIMER_PROF, TIME_LIMIT_S)
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    result = error = None
+    try:
+        with limit_memory(MAX_CHILD_BYTES):
+            result = work()
+    except Exception as caught:
+        error = caught
+    sender.send_bytes(pickle.dumps((result, error), 5))
+
+
+@contextmanager
+def limit_memory(max_bytes: int) -> Iterator[None]:
+    """Within the block `max_bytes` more than before can be allocated; beyond that, mostly a MemoryError is raised."""
+    if not has_timer() or not is_file("/proc/self/statm"):
+        yield
+        return
+    import resource
+
+    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
+    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    limit = pages * os.sysconf("SC_PAGE_SIZE") + max_bytes
+    if soft == resource.RLIM_INFINITY or limit < soft:
+        resource.setrlimit(resource.RLIMIT_AS, (limit, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
+
+
+def _run_in_daemon_thread(work: Callable[[], ReturnType]) -> ReturnType:
+    """Call `work` in a thread and return its result; an interruption abandons the thread."""
     future: Future[ReturnType] = Future()
 
     def run() -> None:

@@ -19,7 +19,10 @@ from typing import Annotated, Any, Literal, Self, TypeVar, get_args
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import ErrorDetails
 
-from patchproof.base.errors import Refused
+from patchproof.base.errors import Refused, TimeLimitExceeded
+from patchproof.base.input import read_file, run_within_time
+
+MAX_TOML_BYTES = 1 << 20  # the longest scene of the tests has 4 kB
 
 
 def _finite(value: float) -> float:
@@ -70,8 +73,8 @@ def read_toml(path: str | Path) -> dict[str, Any]:
     if not os.path.isfile(path):  # False, too, for a path that no system accepts (300 letters, a NUL)
         raise Refused("a TOML file", f"no file at {path}", "check the path")
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
+        return run_within_time(tomllib.loads, str(read_file(path, MAX_TOML_BYTES), "utf-8"))
+    except (OSError, ValueError, RecursionError, TimeLimitExceeded) as error:
         raise Refused("a TOML file", f"{path} that cannot be read ({error})", "correct that line") from error
 
 

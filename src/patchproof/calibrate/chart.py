@@ -12,7 +12,6 @@ own, and the table is the printer's. Either describes the paper under the light 
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -24,7 +23,7 @@ import torch
 
 from patchproof.base.color import linear_from_srgb, srgb_from_linear
 from patchproof.base.errors import Refused
-from patchproof.base.input import is_file, is_folder
+from patchproof.base.input import hash_file, is_file, is_folder
 from patchproof.base.progress import Advance, no_advance
 from patchproof.calibrate import color_ladder
 from patchproof.calibrate.chart_photo import ChartPhoto, chart_rows, read_chart
@@ -265,7 +264,7 @@ def _duplicates(sent: np.ndarray, light: np.ndarray) -> float | None:
 def _row(reading: PhotoReading, error: float | None) -> dict[str, Any]:
     return {
         "file": reading.path.name,
-        "sha256": hashlib.sha256(reading.path.read_bytes()).hexdigest(),
+        "sha256": hash_file(reading.path),
         "print": reading.print_number + 1,
         "paper": [round(value, 3) for value in reading.chart.paper],
         "unevenness": round(reading.chart.unevenness, 2),

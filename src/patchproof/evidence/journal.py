@@ -18,7 +18,8 @@ from typing import TYPE_CHECKING, Any, TextIO
 import cv2
 import numpy as np
 
-from patchproof.base.input import MAX_JSON_BYTES
+from patchproof.base.errors import Refused
+from patchproof.base.input import MAX_JSON_BYTES, file_size, hash_file, is_file
 from patchproof.base.output import make_folder, write_atomically
 from patchproof.base.validation import StrictModel, validate_model
 from patchproof.base.version import __version__
@@ -27,6 +28,8 @@ from patchproof.photo.limits import MOST_BYTES
 if TYPE_CHECKING:
     from patchproof.evidence.task import Options
     from patchproof.sheets.manifest import Manifest
+
+MAX_JOURNAL_BYTES = 128 << 20  # of 10,000 photographs
 
 
 class _Line(StrictModel):
@@ -84,18 +87,20 @@ def settings_key(manifest: Manifest, options: Options) -> str:
 
 def file_sha256(path: Path) -> str | None:
     """SHA-256 of a file's bytes; None if it cannot be read, or is larger than photographs may be."""
-    try:
-        if path.stat().st_size <= MOST_BYTES:
-            with open(path, "rb") as file:
-                return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError:
-        pass
+    with suppress(OSError):
+        return hash_file(path, MOST_BYTES)
     return None
 
 
 def _read_lines(path: Path) -> Iterator[_Line]:
     """Read the complete lines that have this layout; none if there is no file."""
-    with suppress(FileNotFoundError), open(path, encoding="utf-8", errors="replace") as file:
+    if not is_file(path):
+        return
+    try:
+        file_size(path, MAX_JOURNAL_BYTES)
+    except OSError as error:
+        raise Refused("a journal of photographs", f"{path} ({error.strerror})", "start in another folder") from error
+    with open(path, encoding="utf-8", errors="replace") as file:
         while text := file.readline(MAX_JSON_BYTES):  # a piece of a longer line is no JSON
             with suppress(ValueError, RecursionError):  # a line that a kill cut short, or of another layout
                 yield validate_model(_Line, json.loads(text), str(path))

@@ -10,9 +10,7 @@ import io
 import urllib.parse
 from pathlib import Path
 
-from patchproof.base.input import is_file, readable_formats
-
-MOST_BYTES = 1 << 30  # of one file
+from patchproof.base.input import is_file, read_file, readable_formats
 
 
 class Assets:
@@ -29,9 +27,7 @@ class Assets:
             name = name.split()[-1]
         for spelling in (name, name.replace("\\", "/"), urllib.parse.unquote(name)):
             if is_file(self.folder / spelling):
-                if (self.folder / spelling).stat().st_size > MOST_BYTES:
-                    raise ValueError(f"{spelling} is too large")
-                data = (self.folder / spelling).read_bytes()
+                data = read_file(self.folder / spelling)
                 if not spelling.lower().endswith((".mtl", ".bin")) and not _is_image(data):
                     self.broken.append(name)
                 return data

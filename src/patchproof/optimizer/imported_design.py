@@ -13,7 +13,6 @@ places with designs of its own; resuming, since a run that was stopped leaves no
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -26,7 +25,7 @@ from patchproof.base.color import LINEAR_FROM_CODE, codes_from_srgb, srgb_from_l
 from patchproof.base.compute import Compute
 from patchproof.base.errors import Refused
 from patchproof.base.geometry import MM_PER_INCH
-from patchproof.base.input import is_file
+from patchproof.base.input import hash_file, is_file
 from patchproof.base.output import check_folder, new_folder
 from patchproof.base.progress import Progress, no_progress
 from patchproof.base.validation import summarize_names
@@ -197,8 +196,7 @@ def _read_picture(picture: str | Path | np.ndarray) -> tuple[str, str, np.ndarra
         pixels = read_photo(path).srgb
     except PhotoRejected as rejection:
         raise Refused("a picture that can be read", printable_name(path.name), rejection.advice) from rejection
-    with open(path, "rb") as file:
-        return printable_name(path.name), hashlib.file_digest(file, "sha256").hexdigest(), pixels
+    return printable_name(path.name), hash_file(path), pixels
 
 
 def _import_record(

@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from patchproof.base.errors import Refused
 from patchproof.base.output import image_bytes
 from patchproof.channel.printer import Printer
 from patchproof.optimizer import pyramid
@@ -26,6 +27,7 @@ from patchproof.optimizer.subject import DESIGN_FILE, Grid, read_png, write_png
 from patchproof.render.designs import PrintedPiece
 from patchproof.render.pixels import PiecePicture
 from patchproof.scene.interface import PieceScene, Scene, require_piece
+from patchproof.sheets.manifest import MAX_PRINTED_PX
 from patchproof.sheets.piece import control_design, whiten_marker_pixels
 
 # A design's pixels are printed as blocks of at least this density. Some PDF readers smooth coarser pictures, and
@@ -42,6 +44,13 @@ class Patch:
     design_px: tuple[int, int]
     device: torch.device
     STAGE_NAME: ClassVar[str] = "printer"
+
+    def __post_init__(self) -> None:
+        if max(self.printed_px) > MAX_PRINTED_PX:  # what no manifest holds is refused before it is optimized
+            expected = f"a piece whose design is printed with at most {MAX_PRINTED_PX} pixels along its longer side"
+            width_mm, height_mm = self.scene.piece.size_mm
+            got = f"{max(self.printed_px)} for {width_mm:.0f} × {height_mm:.0f} mm"
+            raise Refused(expected, got, "make the piece smaller: patch.width_mm")
 
     def start(self) -> Tensor:
         """A mid-gray design."""
@@ -130,4 +139,4 @@ def subject_of(scene: Scene, printer: Printer, network_px: int, device: torch.de
 
 def read_design(scene: Scene, folder: Path) -> np.ndarray:
     """Implements `subject.read_design`: reads `design.png`."""
-    return read_png(folder / DESIGN_FILE)
+    return read_png(folder / DESIGN_FILE, MAX_PRINTED_PX)

@@ -27,7 +27,7 @@ from pydantic import BaseModel, Field
 from patchproof.base.compute import Compute
 from patchproof.base.errors import Refused
 from patchproof.base.folder_lock import lock_folder
-from patchproof.base.input import is_file, read_json
+from patchproof.base.input import is_file, read_file, read_json
 from patchproof.base.notebook import notebook_html
 from patchproof.base.output import check_folder, make_folder, write_atomically
 from patchproof.base.progress import Advance, Progress, no_progress
@@ -48,6 +48,7 @@ from patchproof.scene.scene import build_scene, load_scene
 from patchproof.sheets.manifest import Promise
 
 _LOG_FILE, RUN_FILE, _VIEWS_FILE = ("steps.jsonl", "run.json", "views.png")
+_MAX_LINE_BYTES = 4096  # of the log
 _MESH_FILE = "given.glb"  # the mesh of a scene that was made in Python
 _DESIGN_FILES = (DESIGN_FILE, OBJECT_FILE, TEXTURE_FILES, MASK_FILE)
 _STEP_FILES = (CHECKPOINT_FILE, _LOG_FILE, RUN_FILE, _VIEWS_FILE, _MESH_FILE, "place.*")
@@ -208,7 +209,7 @@ def load_run(folder: str | Path) -> Run:
     settings, promise = record.settings, record.promise
     try:
         base = (folder / record.scene_folder).resolve()
-        glb = (folder / _MESH_FILE).read_bytes() if is_file(folder / _MESH_FILE) else None
+        glb = read_file(folder / _MESH_FILE) if is_file(folder / _MESH_FILE) else None
         scene = build_scene(settings, base, record.seed, record.sheet_id, glb)
         if record.imported is not None:
             scene = replace(scene, known={**scene.known, "design": record.imported.sha256})
@@ -240,7 +241,9 @@ def _run_steps(problem: Problem, state: State, out: Path, advance: Advance) -> n
     """Run the remaining steps, writing log, checkpoint and views; the best design's pixels."""
     settings, largest_gradient, path = problem.scene.settings.optimize, None, out / _LOG_FILE
     # without the lines after the step from which the run resumes
-    lines = path.read_bytes().splitlines(keepends=True)[: state.number] if is_file(path) else []
+    count = min(state.number, settings.steps) if is_file(path) else 0
+    with open(path if count else os.devnull, "rb") as log:
+        lines = [log.readline(_MAX_LINE_BYTES) for _ in range(count)]
     write_atomically(path, b"".join(lines))
     with open(path, "a", encoding="utf-8") as log:
         for step in steps(problem, state):

@@ -123,7 +123,9 @@ def write_png(path: Path, pixels: np.ndarray) -> None:
     write_atomically(path, lambda part: Image.fromarray(pixels).save(part, "PNG"))
 
 
-def read_png(path: Path) -> np.ndarray:
+def read_png(path: Path, max_side_px: int = 1 << 16) -> np.ndarray:
     """uint8 H×W×3 of a picture file that a run wrote."""
     with open_image(path, "a picture of this run", "optimize again") as image:
+        if max(image.size) > max_side_px:
+            raise ValueError(f"{image.width} × {image.height} pixels, more than {max_side_px} along a side")
         return np.asarray(image.convert("RGB"))

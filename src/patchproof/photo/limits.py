@@ -1,25 +1,22 @@
-"""Limit the work on a photograph to ten seconds of processor time, and reading it to a gigabyte of memory.
+"""Limit the work on a photograph to ten seconds of processor time.
 
 In: work on a photograph. Out: its result, or `PhotoRejected("too_costly")`. A call into a library cannot be interrupted
 (`input.run_within_time`), so calls that a picture could make endless are avoided if `count_squares` or
-`count_finder_lines` count too many. Memory is limited on Linux only, where the kernel states how much is in use.
+`count_finder_lines` count too many.
 """
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from pathlib import Path
+from collections.abc import Callable
 
 import cv2
 import numpy as np
 
 from patchproof.base.errors import TimeLimitExceeded
-from patchproof.base.input import Params, ReturnType, has_timer, run_within_time
+from patchproof.base.input import Params, ReturnType, run_within_time
 from patchproof.photo.rejection import PhotoRejected
 
-MOST_BYTES = 1_000_000_000  # 119 megapixels take 0.5 GB while they are read
+MOST_BYTES = 1_000_000_000  # of a file, and of memory to read it: 119 megapixels take 0.5 GB
 _ROW_STEP = 4  # rows of which one is examined
 _NOISE_FACTOR = 4  # with four times as many edges as the squares have, most of them are noise
 
@@ -31,25 +28,6 @@ def run_limited(work: Callable[Params, ReturnType], *args: Params.args, **kwargs
     except TimeLimitExceeded as error:
         advice = f"it takes {error}: save it smaller, or leave it out"
         raise PhotoRejected("too_costly", None, error.seconds, advice) from None
-
-
-@contextmanager
-def limit_memory() -> Iterator[None]:
-    """Within the block `MOST_BYTES` more than before can be allocated; beyond that, mostly a MemoryError is raised."""
-    if not has_timer() or not Path("/proc/self/statm").is_file():
-        yield
-        return
-    import resource
-
-    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
-    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
-    max_bytes = pages * os.sysconf("SC_PAGE_SIZE") + MOST_BYTES
-    if soft == resource.RLIM_INFINITY or max_bytes < soft:
-        resource.setrlimit(resource.RLIMIT_AS, (max_bytes, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
 
 
 def count_squares(gray: np.ndarray, perimeter_px: float = 36, max_count: int = 0) -> int:

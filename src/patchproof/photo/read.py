@@ -22,10 +22,10 @@ import cv2
 import numpy as np
 
 from patchproof.base.errors import Refused
-from patchproof.base.input import MAX_IMAGE_PX, is_file, is_folder, readable_formats
+from patchproof.base.input import MAX_IMAGE_PX, file_size, is_file, is_folder, limit_memory, readable_formats
 from patchproof.base.validation import summarize_names
 from patchproof.photo.exif import EXIF_SPREAD, is_crop, read_focal
-from patchproof.photo.limits import MOST_BYTES, limit_memory, run_limited
+from patchproof.photo.limits import MOST_BYTES, run_limited
 from patchproof.photo.rejection import PhotoRejected
 
 SUFFIXES = frozenset(".jpg .jpeg .jpe .png .tif .tiff .webp .bmp .gif .mpo .avif .heic .heif".split())
@@ -68,7 +68,7 @@ def read_photo(path: str | Path) -> Photo:
     path = Path(path)
     _allow_heic(path)
     try:
-        with limit_memory():
+        with limit_memory(MOST_BYTES):
             srgb, orientation, focal, crop = run_limited(_decode, path)
             # the memory of Pillow's picture has been freed by now
             return Photo(np.ascontiguousarray(_UPRIGHT.get(orientation, np.asarray)(srgb)), *focal, crop)
@@ -84,7 +84,9 @@ def _decode(path: Path) -> tuple[np.ndarray, int, tuple[float | None, float, boo
     """(uint8 sRGB H×W×3 as stored, EXIF orientation, `read_focal`, `is_crop`); above `WHOLE_PX` at half size."""
     from PIL import Image
 
-    if (size := path.stat().st_size) > MOST_BYTES:
+    if not (size := file_size(path, 1 << 62)):
+        raise ValueError("an empty file")  # or one of the system's, of which Pillow would not see the end
+    if size > MOST_BYTES:
         raise _too_large(f"a file of {size / 1e9:.1f} GB is too large: save it smaller", size, MOST_BYTES)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of large pictures, which have a limit below, and of unusual EXIF

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from patchproof.base.input import read_file
 from patchproof.base.output import base64_uri, image_bytes, make_folder
 
 if TYPE_CHECKING:
@@ -50,7 +51,7 @@ def save_pictures(folder: Path, file: str, kinds: Mapping[str, np.ndarray]) -> N
 
 def saved_pictures(folder: Path, file: str) -> dict[str, bytes]:
     """Read the files of a photograph's pictures in `folder`, by kind; missing ones are left out."""
-    return {path.suffixes[-2][1:]: path.read_bytes() for path in _paths(folder, file) if path.is_file()}
+    return {path.suffixes[-2][1:]: read_file(path) for path in _paths(folder, file) if path.is_file()}
 
 
 def stem_of(file: str) -> str:

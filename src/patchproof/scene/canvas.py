@@ -17,7 +17,7 @@ import numpy as np
 
 from patchproof.base.color import LINEAR_FROM_CODE, codes_from_srgb, srgb_from_linear
 from patchproof.base.errors import Refused
-from patchproof.base.input import is_file, open_image
+from patchproof.base.input import MAX_JSON_BYTES, is_file, open_image, read_file
 from patchproof.base.settings import PatchSettings
 from patchproof.base.validation import expand_path, spelling_hint
 from patchproof.mesh.mesh import Material, Mesh, position_numbers
@@ -102,7 +102,7 @@ def _read_faces(path: Path, count: int) -> np.ndarray:
     if not is_file(path):
         raise Refused("a file of face numbers", f"no file at {path}", "check the path")
     chosen_faces = np.zeros(count, bool)
-    for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
+    for number, line in enumerate(str(read_file(path, MAX_JSON_BYTES), "utf-8", "replace").splitlines(), 1):
         words = line.partition("#")[0].split("-")
         if not "".join(words).strip() and len(words) == 1:
             continue

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import csv
 import hashlib
+import io
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Self
@@ -25,7 +26,7 @@ import numpy as np
 
 from patchproof.base.errors import Refused
 from patchproof.base.geometry import rotated_extent
-from patchproof.base.input import is_file
+from patchproof.base.input import MAX_JSON_BYTES, is_file, read_file
 from patchproof.base.settings import SceneSettings
 from patchproof.base.validation import expand_path
 from patchproof.photo.read import read_photo
@@ -188,8 +189,8 @@ def read_labels(table: Path) -> list[tuple[str, str]]:
     if not is_file(table):
         raise Refused("a CSV of file names and labels (object.labels)", f"no file at {table}", "check the path")
     try:
-        with table.open(encoding="utf-8-sig", newline="") as lines:
-            rows = [row for row in csv.reader(lines, skipinitialspace=True) if any(row)]
+        lines = io.StringIO(str(read_file(table, MAX_JSON_BYTES), "utf-8-sig"), newline="")
+        rows = [row for row in csv.reader(lines, skipinitialspace=True) if any(row)]
     except (OSError, csv.Error, ValueError) as error:
         raise Refused("a CSV of file names and labels", f"{table} that cannot be read ({error})", "mend it") from error
     short = next((row for row in rows if len(row) < 2), None)

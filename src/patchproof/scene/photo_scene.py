@@ -24,7 +24,7 @@ from typing import Self
 import numpy as np
 
 from patchproof.base.errors import Refused
-from patchproof.base.input import is_file, is_folder
+from patchproof.base.input import hash_file, is_file, is_folder
 from patchproof.base.settings import SceneSettings
 from patchproof.base.validation import expand_path
 from patchproof.photo.detect import find_markers
@@ -189,7 +189,7 @@ def _digest(folder: Path) -> str:
     """Return a hash of the photographs, so that a run cannot be continued with others."""
     digest = hashlib.sha256()
     for path in _files(folder):
-        digest.update(hashlib.sha256(path.read_bytes()).digest())
+        digest.update(bytes.fromhex(hash_file(path)))
     return digest.hexdigest()
 
 

@@ -34,7 +34,8 @@ Comparison = Literal["better", "no better", "worse"]
 PAGE_CODE_PATTERN = "^patchproof:([0-9A-Z]{10}):([0-9a-z]+)$"  # text of a page's QR code
 _MIN_MARKER_MM = 1.0
 PageNumber = Annotated[int, Field(ge=1, le=1000)]
-DesignSidePx = Annotated[int, Field(ge=1, le=2048)]  # designs have up to 512 pixels
+MAX_PRINTED_PX = 2048  # of a design's side as it is printed; up to 512 are optimized
+DesignSidePx = Annotated[int, Field(ge=1, le=MAX_PRINTED_PX)]
 Count = Annotated[int, Field(ge=1, le=1_000_000)]
 
 

@@ -16,6 +16,7 @@ import os
 import threading
 import zlib
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ import numpy as np
 
 from patchproof.base.errors import Refused, TimeLimitExceeded
 from patchproof.base.geometry import MM_PER_INCH
-from patchproof.base.input import MAX_JSON_BYTES, ReturnType, is_file, run_in_daemon_thread, run_within_time
+from patchproof.base.input import MAX_JSON_BYTES, ReturnType, is_file, run_in_child
 from patchproof.base.validation import validate_model
 from patchproof.sheets.manifest import Manifest
 from patchproof.sheets.pdf import ATTACHMENT, POINTS_PER_MM, numbered_name
@@ -83,23 +84,26 @@ def _part_pixels(pdf_path: str | Path, number: int, rect_mm: tuple, size_px: tup
 
 def attached_manifest(pdf_path: str | Path, sheet_id: str | None = None) -> Manifest:
     """Read the manifest attached to a sheet's PDF; on a page of several designs that of `sheet_id`, else the first."""
+    texts = call_within_limits(pdf_path, partial(_attached_texts, pdf_path))
+    if not texts:
+        raise Refused(f"a PDF with {ATTACHMENT} attached", f"{pdf_path} without one", "make the sheet again")
+    manifests = [validate_model(Manifest, data, f"{name} of {pdf_path}") for name, data in texts.items()]
+    return next((manifest for manifest in manifests if manifest.sheet_id == sheet_id), manifests[0])
+
+
+def _attached_texts(pdf_path: str | Path) -> dict[str, Any]:
+    """The JSON of the attached manifests by name, in their order."""
     import pikepdf
 
-    _check_exists(pdf_path)
     try:
         with pikepdf.open(pdf_path) as pdf:
             names = sorted(set(pdf.attachments) & {ATTACHMENT, *(numbered_name(ATTACHMENT, i) for i in range(99))})
-            texts = [json.loads(_decompress(pdf.attachments[name].get_file().obj)) for name in names]
+            return {name: json.loads(_decompress(pdf.attachments[name].get_file().obj)) for name in names}
     except pikepdf.PdfError as error:
         raise _unreadable(pdf_path) from error
     except Exception as error:  # objects of unexpected types fail in many ways
         got = f"{pdf_path} with one that cannot be read"
         raise Refused(f"a PDF with {ATTACHMENT} attached", got, "make the sheet again") from error
-    if not texts:
-        raise Refused(f"a PDF with {ATTACHMENT} attached", f"{pdf_path} without one", "make the sheet again")
-    attached = zip(names, texts, strict=True)
-    manifests = [validate_model(Manifest, data, f"{name} of {pdf_path}") for name, data in attached]
-    return next((manifest for manifest in manifests if manifest.sheet_id == sheet_id), manifests[0])
 
 
 def _decompress(stream) -> bytes:
@@ -112,9 +116,17 @@ def _decompress(stream) -> bytes:
     return zlib.decompressobj().decompress(stream.read_raw_bytes(), MAX_JSON_BYTES)
 
 
-def _check_exists(pdf_path: str | Path) -> None:
+def call_within_limits(pdf_path: str | Path, work: Callable[[], ReturnType]) -> ReturnType:
+    """Call `work` on a PDF in a child process; refused if it takes too long or too much memory, because a few lines may
+    draw nested forms a million times, and a few kilobytes may be unpacked to gigabytes, twice.
+    """
     if not is_file(pdf_path):
         raise Refused("a PDF of a sheet", f"no file at {pdf_path}", "check the path")
+    try:
+        return run_in_child(work)
+    except (TimeLimitExceeded, MemoryError) as error:
+        expected = "a page that can be drawn in time and memory"
+        raise Refused(expected, f"{pdf_path}, which takes {error}", "make the sheet again") from None
 
 
 def _unreadable(pdf_path: str | Path) -> Refused:
@@ -122,11 +134,13 @@ def _unreadable(pdf_path: str | Path) -> Refused:
 
 
 def _call_with_pdf(pdf_path: str | Path, work: Callable[[Any], ReturnType]) -> ReturnType:
-    """Call `work` with PDFium's handle of a file; refused if that takes too long, because a few lines may draw nested
-    forms a million times. Only PDFium's raw calls are used: objects of pypdfium2 are closed at the end of the process,
-    which crashes while a page is still being rendered.
+    """Call `work` with PDFium's handle of a file. Only PDFium's raw calls are used: objects of pypdfium2 are closed at
+    the end of the process, which crashes while a thread is still rendering a page.
     """
     import pypdfium2.raw as pdfium
+    from pypdfium2._library_scope import destroy_lib
+
+    atexit.unregister(destroy_lib)  # a thread that was left behind may still be using the library
 
     def call() -> ReturnType:
         with _PDFIUM_LOCK:
@@ -138,15 +152,7 @@ def _call_with_pdf(pdf_path: str | Path, work: Callable[[Any], ReturnType]) -> R
             finally:
                 pdfium.FPDF_CloseDocument(pdf)
 
-    _check_exists(pdf_path)
-    try:
-        return run_within_time(run_in_daemon_thread, call)
-    except TimeLimitExceeded as error:
-        from pypdfium2._library_scope import destroy_lib
-
-        atexit.unregister(destroy_lib)  # the library is still working and must not be unloaded
-        expected = "a page that can be drawn in time"
-        raise Refused(expected, f"{pdf_path}, which takes {error}", "make the sheet again") from None
+    return call_within_limits(pdf_path, call)
 
 
 def _call_with_page(pdf_path: str | Path, number: int, work: Callable[[Any], np.ndarray]) -> np.ndarray:

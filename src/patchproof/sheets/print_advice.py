@@ -11,12 +11,14 @@ from __future__ import annotations
 import io
 import math
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from patchproof.base.errors import Refused
 from patchproof.base.geometry import MM_PER_INCH
 from patchproof.sheets.manifest import Manifest
+from patchproof.sheets.pdf_raster import call_within_limits
 
 _MM = MM_PER_INCH / 72
 _LOSSLESS = {"/FlateDecode", "/LZWDecode", "/RunLengthDecode", "/ASCII85Decode", "/ASCIIHexDecode"}
@@ -76,19 +78,22 @@ def _nearest_ink_mm(manifest: Manifest) -> float:
 
 def pdf_advice(pdf_path: str | Path) -> list[str]:
     """Sentences for whoever prints the PDF, from its pages, fonts, images and colors."""
-    import pikepdf
-
-    try:
-        with pikepdf.open(pdf_path) as pdf:
-            lines = [*_page_lines(pdf), _scaling_line(pdf), *_font_lines(pdf), *_image_lines(pdf), _color_line(pdf)]
-    except Exception as error:  # objects of unexpected types fail in many ways
-        raise Refused("a PDF of a sheet", f"{pdf_path}, which cannot be read", "make the sheet again") from error
     return [
-        *lines,
+        *call_within_limits(pdf_path, partial(_lines_about, pdf_path)),
         "Total ink is not limited in the file: it is RGB, so the printer's own profile decides; black is RGB 0 0 0.",
         "Order: single-sided, full color, best quality, sRGB to your printer's profile, relative colorimetric intent.",
         "Switch off scaling, sharpening and all automatic color or photo enhancement; no lamination, no gloss.",
     ]
+
+
+def _lines_about(pdf_path: str | Path) -> list[str]:
+    import pikepdf
+
+    try:
+        with pikepdf.open(pdf_path) as pdf:
+            return [*_page_lines(pdf), _scaling_line(pdf), *_font_lines(pdf), *_image_lines(pdf), _color_line(pdf)]
+    except Exception as error:  # objects of unexpected types fail in many ways
+        raise Refused("a PDF of a sheet", f"{pdf_path}, which cannot be read", "make the sheet again") from error
 
 
 def _page_lines(pdf) -> Iterator[str]:

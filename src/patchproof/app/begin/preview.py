@@ -25,10 +25,12 @@ from patchproof.base.errors import Refused
 from patchproof.base.output import base64_uri, image_bytes, new_folder, write_atomically
 from patchproof.base.resample import downscale
 from patchproof.base.settings import SceneSettings, load_scene_settings
+from patchproof.channel.printer import identity_printer
 from patchproof.classifier.labels import find_labels
 from patchproof.classifier.load import load_classifier
 from patchproof.mesh.export import write_glb
 from patchproof.mesh.mesh import Material, MeshPart
+from patchproof.optimizer.subject import subject_of
 from patchproof.render.stage import Stage, set_stage
 from patchproof.report.images import data_uri, jpeg, png
 from patchproof.report.page import render_page
@@ -78,7 +80,8 @@ def preview_scene(scene_path: str | Path, out: str | Path, *, overwrite: bool = 
                 webp = image_bytes(picture, "WEBP", {"quality": 80})  # 3 to 10 kB: as JPEG it would be twice as large
                 turns.append((azimuth_deg, picture.shape[:2], base64_uri(webp, "image/webp")))
         facts, summaries = _facts(scene, settings), _answers(settings, views)
-        problems = [text for text in (refused, unknown) if text]
+        unprintable = _unprintable(scene, max(classifier.input_px for classifier in classifiers))
+        problems = [text for text in (refused, unknown, unprintable) if text]
         text = render_page(
             "preview.html.j2",
             name=path.name,
@@ -104,6 +107,16 @@ def _up_warning(scene: Scene, settings: SceneSettings) -> tuple[str, ...]:
     if not isinstance(scene, MeshScene) or ":" in name or (doubt := lying_hint(scene.mesh.vertices, up)) is None:
         return ()
     return (f'the object may lie: {doubt}. If it does, write up = "{other_axis(up)}" in [object]',)
+
+
+def _unprintable(scene: Scene, network_px: int) -> str | None:
+    """The refusal of a piece that `optimize` would refuse for its size."""
+    try:
+        if scene.HAS_PIECE and scene.HAS_PLACE:
+            subject_of(scene, identity_printer(), network_px, torch.device("cpu"))
+    except Refused as refused:
+        return str(refused)
+    return None
 
 
 def _scene(settings: SceneSettings, base: Path) -> tuple[Scene, str | None]:

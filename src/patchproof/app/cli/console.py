@@ -6,6 +6,7 @@ Summaries go to standard output; warnings, failures and progress to standard err
 from __future__ import annotations
 
 import io
+import re
 import shlex
 import sys
 import time
@@ -38,6 +39,8 @@ Jobs = Annotated[
 Cluster = Annotated[str | None, Option(help="A Dask scheduler's address, in place of local processes.")]
 Models = Annotated[str | None, Option(help="Comma-separated classifiers in place of the sheet's own.")]
 
+# how torch, OpenCV and the system say that there is none; numpy and Python raise a MemoryError
+_NO_MEMORY = re.compile(r"(?i)can(no|')t (allocate memory|start new thread)|(insufficient|out of) memory")
 LINE_EVERY_S = 30.0  # of progress, if standard error is not a terminal
 
 
@@ -148,6 +151,8 @@ def run_command_line(app: Typer) -> None:
             sentence = str(error)
         elif disk_is_full(error):
             sentence = "Expected room on the disk, got none left: make room, then run the command again."
+        elif isinstance(error, MemoryError) or _NO_MEMORY.search(str(error)):
+            sentence = "Expected enough memory, got none left: give it more, fewer --jobs, or smaller files."
         elif isinstance(error, OSError):
             sentence = f"Expected files that can be read and written, got {error}: mend that and try again."
         else:
