@@ -13,8 +13,8 @@ import sys
 
 import numpy as np
 import pytest
-from fuzz import READERS, Outcome, attempt
-from watch import MOST_BYTES, SECONDS, Watch
+from fuzz.readers import READERS, Outcome, attempt
+from fuzz.watch import MOST_BYTES, SECONDS, Watch
 
 IN_THE_SUITE = {"photo": 12, "photos.jsonl": 4, "run.json": 6}  # else:
 OF_OTHERS = 10

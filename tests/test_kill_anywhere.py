@@ -29,7 +29,7 @@ JOBS = ("optimize", "verify", "sheet", "reprint", "study")
 IN_THE_SUITE = len(JOBS)
 LATE = """
     kornia.enhance kornia.filters matplotlib.figure matplotlib.backends.backend_agg scipy.stats.qmc scipy.spatial jinja2
-    pikepdf pypdfium2 reportlab.pdfgen.canvas segno safetensors.torch fuzz test_optimize test_verify_run fake_networks
+    pikepdf pypdfium2 reportlab.pdfgen.canvas segno safetensors.torch fuzz.readers test_optimize test_verify_run fake_networks
     toy_studies patchlab.study.study patchproof.report.write
     patchproof.app.verify patchproof.optimizer.run patchproof.reprints.run_sheet patchproof.reprints.reprint
     patchproof.classifier.builtin patchproof.classifier.custom patchproof.report.plots"""
@@ -49,7 +49,7 @@ def optimize(base: Path, out: Path, again: bool) -> None:
 
 
 def verify(base: Path, out: Path, again: bool) -> None:
-    from fuzz import network
+    from fuzz.readers import network
 
     from patchproof.app.verify import verify as verify_photos
 
@@ -84,7 +84,7 @@ DO = dict(zip(JOBS, (optimize, verify, sheet, reprint, study), strict=True))
 
 def prepare(base: Path) -> None:
     """What the jobs work on: a scene, a finished run and its sheet, photographs and theirs."""
-    from fuzz import honest_photo, manifests
+    from fuzz.readers import honest_photo, manifests
 
     from test_optimize import toml
 

@@ -7,7 +7,7 @@ import time
 
 import numpy as np
 import pytest
-from hostile_bytes import PHOTO_KINDS, changed, mutated, whole_photo
+from fuzz.hostile_bytes import PHOTO_KINDS, changed, mutated, whole_photo
 from synthetic_photos import make_manifest
 
 from patchproof.base.errors import Refused

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 import toy_studies as toy
 from degraded_photos import take
-from fuzz import small_task
+from fuzz.readers import small_task
+from fuzz.watch import peak_bytes
 from PIL import Image
-from watch import peak_bytes
 
 from patchproof.base import input as bounds
 from patchproof.base.errors import Refused

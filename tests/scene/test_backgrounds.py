@@ -29,7 +29,7 @@ def shown(backgrounds, stream):
     """The numbers of files, and of procedural places, that a stream may show, and the share of views with files."""
     chosen = backgrounds.choose_for_stream(stream, (np.arange(40_000) + 0.5) / 40_000)
     pictures = [backgrounds.pictures[int(each * len(backgrounds.pictures))] for each in chosen]
-    real = [int(p[0, 0, 0]) for p in pictures if not isinstance(p, int)]
+    real = [int(p.path.stem) for p in pictures if not isinstance(p, int)]
     return set(real), {p for p in pictures if isinstance(p, int)}, len(real) / len(pictures)
 
 

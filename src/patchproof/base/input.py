@@ -24,8 +24,8 @@ import sys
 import threading
 import warnings
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
@@ -36,7 +36,6 @@ if TYPE_CHECKING:
 
 TIME_LIMIT_S = 10.0  # of processor time: a photograph of 119 megapixels takes 4, one of 12 less than 1
 _REPEAT_S = 0.5  # until the next interruption, in case a library swallows the first
-_POLL_S = 0.1
 
 Params = ParamSpec("Params")
 ReturnType = TypeVar("ReturnType")
@@ -131,8 +130,13 @@ class _Expired(BaseException):
 
 def run_within_time(work: Callable[Params, ReturnType], *args: Params.args, **kwargs: Params.kwargs) -> ReturnType:
     """Call `work` and return its result; raises `TimeLimitExceeded` after `TIME_LIMIT_S`."""
+    return run_within_seconds(TIME_LIMIT_S, partial(work, *args, **kwargs))
+
+
+def run_within_seconds(seconds: float, work: Callable[[], ReturnType]) -> ReturnType:
+    """Call `work` and return its result; raises `TimeLimitExceeded` after `seconds` of processor time."""
     if not has_timer() or signal.getitimer(signal.ITIMER_PROF)[0] > 0:
-        return work(*args, **kwargs)
+        return work()
     armed = [True]
 
     def expire(*_) -> None:
@@ -142,15 +146,15 @@ def run_within_time(work: Callable[Params, ReturnType], *args: Params.args, **kw
     previous_handler = signal.signal(signal.SIGPROF, expire)
     try:
         try:
-            signal.setitimer(signal.ITIMER_PROF, TIME_LIMIT_S, _REPEAT_S)
-            return work(*args, **kwargs)
+            signal.setitimer(signal.ITIMER_PROF, seconds, _REPEAT_S)
+            return work()
         finally:
             armed.clear()
             signal.setitimer(signal.ITIMER_PROF, 0)
     except _Expired:
         armed.clear()  # the interruption may have come just before these two lines in the `finally` above
         signal.setitimer(signal.ITIMER_PROF, 0)
-        raise TimeLimitExceeded(TIME_LIMIT_S) from None
+        raise TimeLimitExceeded(seconds) from None
     finally:
         signal.signal(signal.SIGPROF, previous_handler)
 
@@ -158,10 +162,10 @@ def run_within_time(work: Callable[Params, ReturnType], *args: Params.args, **kw
 def run_in_child(work: Callable[[], ReturnType]) -> ReturnType:
     """Call `work` in a forked process and return its result; raises `TimeLimitExceeded` after `TIME_LIMIT_S`, and a
     MemoryError beyond `MAX_CHILD_BYTES` or if the process dies. For calls into libraries that cannot be interrupted and
-    share nothing with other work. On systems other than Linux it runs in a thread, whose memory is not limited.
+    share nothing with other work. On systems other than Linux it runs in this process, and a long call ends first.
     """
     if sys.platform != "linux":
-        return run_within_time(_run_in_daemon_thread, work)
+        return run_within_time(work)
     import multiprocessing
 
     context = multiprocessing.get_context("fork")
@@ -220,23 +224,6 @@ def limit_memory(max_bytes: int) -> Iterator[None]:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
-
-
-def _run_in_daemon_thread(work: Callable[[], ReturnType]) -> ReturnType:
-    """Call `work` in a thread and return its result; an interruption abandons the thread."""
-    future: Future[ReturnType] = Future()
-
-    def run() -> None:
-        try:
-            future.set_result(work())
-        except BaseException as error:
-            future.set_exception(error)
-
-    thread = threading.Thread(target=run, daemon=True)
-    thread.start()
-    while thread.is_alive():
-        thread.join(_POLL_S)  # the signal may reach the other thread, and does not wake a thread that waits
-    return future.result()
 
 
 def remaining_seconds() -> float:

@@ -15,18 +15,26 @@ gradients. Several names give several classifiers.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
 import torch
 
-from patchproof.base.errors import Refused
+from patchproof.base.errors import Refused, TimeLimitExceeded
+from patchproof.base.input import limit_memory, run_within_seconds
 from patchproof.base.validation import expand_path
 from patchproof.classifier.builtin import load_builtin
 from patchproof.classifier.check import check_network, smooth_pictures
 from patchproof.classifier.custom import labeled_module, load_custom
 from patchproof.classifier.network import Classifier, freeze
 from patchproof.networks.batches import tune_batches
+
+# Processor time on each thread, and memory beside the network, a thread's stack and heap: a transformer as large as
+# ViT-L (1.2 GB) takes 32 s and 1 GB for three pictures of 224 px and their gradient.
+CHECK_S = 50.0
+CHECK_BYTES, CHECK_BYTES_PER_BYTE, CHECK_BYTES_PER_THREAD = 1_400_000_000, 64, 1 << 27
 
 
 def load_classifier(
@@ -94,9 +102,30 @@ def _prepare(classifier: Classifier, device: torch.device | str) -> Classifier:
     use_full_precision(device)
     if isinstance(classifier.network, torch.nn.Module):
         freeze(classifier.network).to(device)
+    return _prepare_within_limits(classifier, torch.device(device), lambda: _check_and_tune(classifier, device))
+
+
+def _check_and_tune(classifier: Classifier, device: torch.device | str) -> Classifier:
     check_network(classifier, device)
     pictures = smooth_pictures(classifier.input_px).to(device)
     return replace(classifier, network=tune_batches(classifier.network, pictures))
+
+
+def _prepare_within_limits(classifier: Classifier, device: torch.device, prepare: Callable[[], Classifier]):
+    """Prepare a network; refused if it is from a file and takes too much time or, on a CPU, memory for its size: a few
+    lines may ask for a matrix product ten thousand times.
+    """
+    if not classifier.name.startswith("file:"):
+        return prepare()
+    threads, network = torch.get_num_threads(), classifier.network
+    stored_bytes = sum(weight.nbytes for weight in network.buffers()) if isinstance(network, torch.nn.Module) else 0
+    max_bytes = CHECK_BYTES + CHECK_BYTES_PER_BYTE * stored_bytes + CHECK_BYTES_PER_THREAD * threads
+    try:
+        with limit_memory(max_bytes) if device.type == "cpu" else nullcontext():
+            return run_within_seconds(CHECK_S * threads, prepare)
+    except TimeLimitExceeded as error:
+        expected, got = "a network that three pictures can be tried with", f"{classifier.name}, which takes {error}"
+        raise Refused(expected, got, "use a smaller one, or more threads") from error
 
 
 def use_full_precision(device: torch.device | str) -> None:

@@ -156,12 +156,11 @@ def _cuts(program: Program, pictures: Tensor) -> list[Cut]:
     values = program.values(program.photos, marked)
     for count, step in enumerate(program.steps, 1):
         compute([step], values, marked)
-        remaining = {number: value for number, value in values.items() if number > program.photos}
-        value = remaining.get(step.results[0])
+        value = values.get(step.results[0])
         if not isinstance(value, Tensor):
             continue
         numbers += value.numel() // len(marked)
-        if len(remaining) > 1 or value.dim() != 4:
+        if len(values) > program.photos + 2 or value.dim() != 4:
             continue
         stride = size_px // value.shape[-1]
         if stride > max_stride:

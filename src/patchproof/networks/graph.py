@@ -7,8 +7,8 @@ computed, a file's steps run once on tensors without memory, to refuse values of
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,8 @@ from patchproof.networks.steps import InputDevice, Step, ValueRef
 from patchproof.networks.tensor_observer import TensorObserver
 
 MAX_VALUE = 1 << 30  # numbers in one value, for each picture: VGG's at the largest input_px
+MAX_VALUES = 1 << 32  # numbers in all values, for each picture: 15 times as many as those of the largest ViT of 2022
+MAX_PRODUCTS = 1 << 35  # in one operator, for each picture: 18 times as many as VGG's largest has at 224 px
 MAX_SPLIT = 1 << 16  # size of a dimension that is split into several tensors
 
 
@@ -62,7 +64,7 @@ class Program(torch.nn.Module):
         with torch.inference_mode(False), torch.no_grad():
             weights = [weight.to("meta") for weight in self.buffers()]
             photos = torch.empty(shape, device="meta")
-            with TensorObserver(partial(_refuse_absurd, MAX_VALUE * len(photos)), _SHAPE_ONLY):
+            with TensorObserver(_WorkCount(len(photos)), _SHAPE_ONLY):
                 compute(self.steps[:count], dict(enumerate([*weights, photos])), photos)
         self.tested.add((shape, count))
 
@@ -118,6 +120,7 @@ _ELEMENTWISE = (
     *(operator.Tensor for operator in (_ATEN.add, _ATEN.sub, _ATEN.mul, _ATEN.div)),
     *(operator.default for operator in (_ATEN.relu, _ATEN.relu_, _ATEN.hardtanh, _ATEN.hardtanh_, _ATEN.hardswish)),
 )
+_POOLS = (_ATEN.max_pool2d_with_indices, _ATEN.avg_pool2d)
 _SHAPE_ONLY: dict[Callable[..., Any], Callable[..., Any]] = {
     **{operator: _shape_of_first(operator) for operator in _ELEMENTWISE},
     _ATEN.convolution.default: _convolution,
@@ -134,7 +137,27 @@ def _filled(argument: Any, values: dict[int, Any], photos: Tensor) -> Any:
     return photos.device if argument is InputDevice else argument
 
 
-def _refuse_absurd(limit: int, tensor: Tensor) -> None:
-    """Refuse a tensor of absurd size, also one inside an operator (einsum, padding)."""
-    if tensor.numel() > limit or tensor.dim() > MAX_DIMENSIONS:
-        raise ValueError(f"it makes a tensor of an absurd size, {quote(tuple(tensor.shape))}")
+class _WorkCount:
+    """Refuses absurd work: a tensor's size, also inside an operator (einsum, padding), an operator's sum of products,
+    and the size of all tensors.
+    """
+
+    def __init__(self, pictures: int):
+        self.pictures, self.numbers = pictures, 0
+
+    def __call__(self, tensor: Tensor, operator: Any, arguments: tuple) -> None:
+        if tensor.numel() > MAX_VALUE * self.pictures or tensor.dim() > MAX_DIMENSIONS:
+            raise ValueError(f"it makes a tensor of an absurd size, {quote(tuple(tensor.shape))}")
+        self.numbers += tensor.numel()
+        terms = _TERMS[operator](*arguments) if operator in _TERMS else 1
+        if self.numbers > MAX_VALUES * self.pictures or tensor.numel() * terms > MAX_PRODUCTS * self.pictures:
+            raise ValueError(f"it asks for too many computations, with {quote(operator)} of {tuple(tensor.shape)}")
+
+
+# how many numbers are added up for each number of a result
+_TERMS: dict[Any, Callable[..., int]] = {
+    **{operator.default: lambda a, *_: a.shape[-1] for operator in (_ATEN.mm, _ATEN.bmm)},
+    **{operator.default: lambda _, a, *__: a.shape[-1] for operator in (_ATEN.addmm, _ATEN.baddbmm)},
+    **{operator.default: lambda _, kernel, *__: math.prod(kernel) for operator in _POOLS},
+    _ATEN.convolution.default: lambda _, weight, *__: weight[0].numel(),
+}

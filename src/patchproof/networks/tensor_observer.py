@@ -10,9 +10,13 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 
 class TensorObserver(TorchDispatchMode):
-    """A context that calls `look` with each tensor that an operator, or its stand-in from `instead`, creates."""
+    """A context that calls `look` with each tensor that an operator, or its stand-in from `instead`, creates, with the
+    operator and its arguments.
+    """
 
-    def __init__(self, look: Callable[[Tensor], None], instead: Mapping[Any, Callable[..., Any]] | None = None):
+    def __init__(
+        self, look: Callable[[Tensor, Any, tuple], None], instead: Mapping[Any, Callable[..., Any]] | None = None
+    ):
         super().__init__()
         self._look, self._instead = look, instead or {}
 
@@ -26,5 +30,5 @@ class TensorObserver(TorchDispatchMode):
         results = compute(*args, **(kwargs or {}))
         for value in results if isinstance(results, (list, tuple)) else [results]:
             if isinstance(value, Tensor):
-                self._look(value)
+                self._look(value, func, args)
         return results

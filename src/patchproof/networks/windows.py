@@ -41,6 +41,6 @@ def numbers_saved(numbers: float, share: float, answers_alone: bool = False) -> 
 def worth_cutting(network: Callable[[Tensor], Tensor], pictures: Tensor) -> bool:
     """True if windows could save anything, judged by all numbers computed for such pictures N×3×S×S."""
     numbers: list[int] = []
-    with torch.no_grad(), TensorObserver(lambda tensor: numbers.append(tensor.numel())):
+    with torch.no_grad(), TensorObserver(lambda tensor, *_: numbers.append(tensor.numel())):
         network(pictures)
     return numbers_saved(sum(numbers) / len(pictures), 0.0) > 0

@@ -43,6 +43,7 @@ FILE_WEIGHT = 4  # with fewer, they see a file as often as this many procedural 
 VIEWS_PER_FILE = 50  # other purposes see a file in one of this many views: a rate must not depend on two or three
 # the purposes of files in the order of a hash of their names, repeated
 _SPLIT_PATTERN = ("train", "promise", "evaluate", "select", "train", "promise", "train", "evaluate", "promise", "train")
+CACHED_FILE_BYTES = 1 << 28  # of halvings: a view of 224 px needs 2 MB of one
 _CACHED_PLACES = 192  # with their halvings 0.3 MB each; drawing one takes 12 ms
 _SUFFIXES = {".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff"}
 
@@ -57,13 +58,53 @@ class _Split:
     share: float
 
 
+class FileLevels:
+    """A picture's file and its halvings, decoded as they come into use: a cache holds those that were used last."""
+
+    def __init__(self, path: Path):
+        self.path = path
+        with open_image(path, "a background picture", "remove or replace it"):
+            pass  # what is no picture is refused before anything is computed
+
+    @cached_property
+    def _shapes(self) -> list[tuple[int, int]]:
+        return [level.shape[:2] for level in _decoded(self)]
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(height, width) of the picture."""
+        return self._shapes[0]
+
+    def __len__(self) -> int:
+        return len(self._shapes)
+
+    def __getitem__(self, number: int) -> np.ndarray:
+        level = _file_levels.pop((self, number), None)
+        _file_levels[self, number] = _decoded(self)[number] if level is None else level
+        while len(_file_levels) > 1 and sum(each.nbytes for each in _file_levels.values()) > CACHED_FILE_BYTES:
+            del _file_levels[next(iter(_file_levels))]  # the one that was used first
+        return _file_levels[self, number]
+
+
+_file_levels: dict[tuple[FileLevels, int], np.ndarray] = {}
+
+
+@lru_cache(maxsize=1)
+def _decoded(file: FileLevels) -> list[np.ndarray]:
+    """All levels of the file that was decoded last."""
+    from PIL import ImageOps
+
+    with open_image(file.path, "a background picture", "remove or replace it") as image:
+        return halving_pyramid(np.asarray(ImageOps.exif_transpose(image).convert("RGB")))
+
+
 @dataclass(frozen=True)
 class Backgrounds:
-    """Pictures as uint8 H×W×3 or numbers of procedural places; a single 1×1 picture if the background is plain.
+    """Pictures as files, uint8 H×W×3 or numbers of procedural places; a single 1×1 picture if the background is plain.
     `of_stream` holds the pictures that a stream may show; a stream that is not in it may show all.
     """
 
-    pictures: tuple[np.ndarray | int, ...]
+    pictures: tuple[np.ndarray | int | FileLevels, ...]
     of_stream: Mapping[str, _Split] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
 
@@ -79,8 +120,10 @@ class Backgrounds:
         """Halvings of pictures, added as they come into use, so that a small view does not read megapixels."""
         return {}
 
-    def _levels(self, number: int) -> list[np.ndarray]:
+    def _levels(self, number: int) -> Sequence[np.ndarray] | FileLevels:
         picture = self.pictures[number]
+        if isinstance(picture, FileLevels):
+            return picture
         if isinstance(picture, int):
             return _place_levels(picture)
         if number not in self._halvings:
@@ -90,7 +133,7 @@ class Backgrounds:
     def picture(self, choice: np.ndarray, photo_px: tuple[int, int], size_px: tuple[int, int]) -> np.ndarray:
         """Return the background of a view of `size_px`: the whole photograph or, if square, its centered square."""
         levels = self._levels(int(choice[0] * len(self.pictures)))
-        height, width = levels[0].shape[:2]
+        height, width = levels.shape if isinstance(levels, FileLevels) else levels[0].shape[:2]
         # a crop with the photograph's aspect
         largest = min(width / photo_px[0], height / photo_px[1])
         share = MIN_CROP_SHARE + (1 - MIN_CROP_SHARE) * choice[1]
@@ -99,7 +142,7 @@ class Backgrounds:
         if size_px[0] == size_px[1]:
             side = min(crop_w, crop_h)
             x0, y0, crop_w, crop_h = x0 + (crop_w - side) / 2, y0 + (crop_h - side) / 2, side, side
-        shrunk = [level for i, level in enumerate(levels) if i == 0 or crop_w / 2**i >= size_px[0]][-1]
+        shrunk = levels[max(i for i in range(len(levels)) if i == 0 or crop_w / 2**i >= size_px[0])]
         sx, sy = shrunk.shape[1] / width, shrunk.shape[0] / height
         scale_x, scale_y = crop_w * sx / size_px[0], crop_h * sy / size_px[1]
         matrix = index_homography(np.array([[scale_x, 0, x0 * sx], [0, scale_y, y0 * sy], [0, 0, 1.0]]))
@@ -121,7 +164,7 @@ def load_backgrounds(settings: BackgroundSettings, base: Path) -> Backgrounds:
         return _split_by_purpose([])
     folder = Path(expand_path(settings.images, base))
     if is_file(folder):
-        return Backgrounds((_read(folder),))
+        return Backgrounds((FileLevels(folder),))
     files = sorted(p for p in folder.iterdir() if p.suffix.lower() in _SUFFIXES) if is_folder(folder) else []
     if not files:
         remedy = "put some there or give a color"
@@ -132,7 +175,7 @@ def load_backgrounds(settings: BackgroundSettings, base: Path) -> Backgrounds:
 def _split_by_purpose(files: Sequence[Path]) -> Backgrounds:
     """Split files by purpose, and fill up with procedural places."""
     files = sorted(files, key=lambda file: hashlib.sha256(file.name.encode()).digest())
-    pictures: list[np.ndarray | int] = []
+    pictures: list[np.ndarray | int | FileLevels] = []
     parts = {}
     for name, rooms in PLACE_NUMBERS.items():
         split_files = [file for i, file in enumerate(files) if _SPLIT_PATTERN[i % len(_SPLIT_PATTERN)] == name]
@@ -142,7 +185,7 @@ def _split_by_purpose(files: Sequence[Path]) -> Backgrounds:
         else:
             share = min(1.0, len(split_files) / VIEWS_PER_FILE)
         parts[name] = _Split(len(pictures), len(split_files), len(rooms) if share < 1 else 0, share)
-        pictures += [*map(_read, split_files), *(rooms if share < 1 else ())]
+        pictures += [*map(FileLevels, split_files), *(rooms if share < 1 else ())]
     notes = ()
     if 0 < len(files) < FEW_PICTURES:
         notes = (
@@ -150,10 +193,3 @@ def _split_by_purpose(files: Sequence[Path]) -> Backgrounds:
             f"with {FEW_PICTURES} or more, training and promise know different ones",
         )
     return Backgrounds(tuple(pictures), parts | {"reprint": parts["evaluate"]}, notes)
-
-
-def _read(file: Path) -> np.ndarray:
-    from PIL import ImageOps
-
-    with open_image(file, "a background picture", "remove or replace it") as image:
-        return np.asarray(ImageOps.exif_transpose(image).convert("RGB"))

@@ -3,17 +3,15 @@
 In: a PDF and a resolution. Out: uint8 H×W×3 sRGB. The page is rendered by PDFium, which did not write it. PDFium
 stretches a page to a whole number of pixels (0.2 mm across A4 at 150 dpi), so the requested part is first made a page
 whose size is a whole number of pixels; then pixels are millimeters times a scale.
-Left out on purpose: rendering pages in parallel. PDFium is not thread-safe; render in several processes.
+PDFs may come from anybody: each call reads the file in a child process within limits of time and memory.
 """
 
 from __future__ import annotations
 
-import atexit
 import ctypes
 import json
 import math
 import os
-import threading
 import zlib
 from collections.abc import Callable
 from functools import partial
@@ -31,7 +29,6 @@ from patchproof.sheets.pdf import ATTACHMENT, POINTS_PER_MM, numbered_name
 
 MAX_SIDE_PX = 20_000
 MAX_PAGE_PX = 160_000_000  # 0.5 GB, A2 at 600 dpi
-_PDFIUM_LOCK = threading.Lock()  # an abandoned thread may still be rendering
 
 
 def rasterize_page(pdf_path: str | Path, number: int = 1, dpi: float = 150.0) -> np.ndarray:
@@ -134,23 +131,17 @@ def _unreadable(pdf_path: str | Path) -> Refused:
 
 
 def _call_with_pdf(pdf_path: str | Path, work: Callable[[Any], ReturnType]) -> ReturnType:
-    """Call `work` with PDFium's handle of a file. Only PDFium's raw calls are used: objects of pypdfium2 are closed at
-    the end of the process, which crashes while a thread is still rendering a page.
-    """
+    """Call `work` with PDFium's handle of a file."""
     import pypdfium2.raw as pdfium
-    from pypdfium2._library_scope import destroy_lib
-
-    atexit.unregister(destroy_lib)  # a thread that was left behind may still be using the library
 
     def call() -> ReturnType:
-        with _PDFIUM_LOCK:
-            pdf = pdfium.FPDF_LoadDocument(os.fsencode(pdf_path), None)
-            if not pdf:
-                raise _unreadable(pdf_path)
-            try:
-                return work(pdf)
-            finally:
-                pdfium.FPDF_CloseDocument(pdf)
+        pdf = pdfium.FPDF_LoadDocument(os.fsencode(pdf_path), None)
+        if not pdf:
+            raise _unreadable(pdf_path)
+        try:
+            return work(pdf)
+        finally:
+            pdfium.FPDF_CloseDocument(pdf)
 
     return call_within_limits(pdf_path, call)
 

@@ -23,7 +23,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from hostile_bytes import (
+from PIL import Image, ImageCms
+from safetensors.numpy import save as safetensors_bytes
+
+from fuzz.hostile_bytes import (
     PHOTO_KINDS,
     Rng,
     broken_json,
@@ -37,10 +40,7 @@ from hostile_bytes import (
     tweaked,
     whole_photo,
 )
-from PIL import Image, ImageCms
-from safetensors.numpy import save as safetensors_bytes
-from watch import MOST_BYTES, SECONDS, TooLong, Watch, limits, peak_bytes, temporary_files_in
-
+from fuzz.watch import MOST_BYTES, SECONDS, TooLong, Watch, limits, peak_bytes, temporary_files_in
 from patchproof.base.errors import Refused
 from patchproof.optimizer.promise import PromiseOptions
 
