@@ -29,8 +29,8 @@ JOBS = ("optimize", "verify", "sheet", "reprint", "study")
 IN_THE_SUITE = len(JOBS)
 LATE = """
     kornia.enhance kornia.filters matplotlib.figure matplotlib.backends.backend_agg scipy.stats.qmc scipy.spatial jinja2
-    pikepdf pypdfium2 reportlab.pdfgen.canvas segno safetensors.torch fuzz.readers test_optimize test_verify_run fake_networks
-    toy_studies patchlab.study.study patchproof.report.write
+    pikepdf pypdfium2 reportlab.pdfgen.canvas segno safetensors.torch fuzz.readers test_optimize test_verify_run
+    fake_networks toy_studies patchlab.study.study patchproof.report.write
     patchproof.app.verify patchproof.optimizer.run patchproof.reprints.run_sheet patchproof.reprints.reprint
     patchproof.classifier.builtin patchproof.classifier.custom patchproof.report.plots"""
 

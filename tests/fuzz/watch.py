@@ -15,21 +15,29 @@ _CAN_BE_HAD = 2_000_000_000  # bytes, beyond which allocations fail
 
 
 class Watch:
-    """Files opened for writing outside of a folder, processes, sockets; a hook stays for good, so it has a switch."""
+    """Files opened for writing outside of a folder, processes, sockets; a hook stays for good, so it has a switch. What
+    a forked process does comes through a pipe; forking itself is allowed.
+    """
 
     WRITES = re.compile(r"os\.(mkdir|rename|remove|rmdir|link|symlink|truncate|chmod|chown|utime)|shutil\.")
-    NEVER = re.compile(
-        r"os\.(system|exec|posix_spawn|spawn|fork|startfile)|subprocess\.|socket\.|pty\.|ctypes\.dlopen\b"
-    )
+    NEVER = re.compile(r"os\.(system|exec|posix_spawn|spawn|startfile)|subprocess\.|socket\.|pty\.|ctypes\.dlopen\b")
 
     def __init__(self):
         self.folder: str | None = None
         self.events: list[str] = []
+        self.process, (self.from_children, self.to_parent) = os.getpid(), os.pipe()
+        os.set_blocking(self.from_children, False)
         sys.addaudithook(self.hook)
 
     def hook(self, event: str, arguments: tuple) -> None:
         if self.folder is not None and self.harmful(event, arguments):
-            self.events.append(f"{event} {str(arguments)[:200]}")
+            self.report(f"{event} {str(arguments)[:200]}")
+
+    def report(self, text: str) -> None:
+        if os.getpid() == self.process:
+            self.events.append(text)
+        else:
+            os.write(self.to_parent, f"{text}\n".encode())
 
     def harmful(self, event: str, arguments: tuple) -> bool:
         if event == "open":
@@ -52,6 +60,8 @@ class Watch:
             yield
         finally:
             self.folder = None
+            with contextlib.suppress(BlockingIOError):
+                self.events += os.read(self.from_children, 1 << 16).decode().splitlines()
 
 
 class TooLong(BaseException):

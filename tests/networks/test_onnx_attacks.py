@@ -34,7 +34,7 @@ class Opened(Watch):
         self.paths: set[str] = set()
 
     def harmful(self, event: str, arguments: tuple) -> bool:
-        if event == "open" and not str(arguments[0]).endswith((".py", ".pyc", ".so")):
+        if event == "open" and not str(arguments[0]).endswith((".py", ".pyc", ".so", "/statm")):
             self.paths.add(str(arguments[0]))
         return super().harmful(event, arguments)
 
@@ -55,7 +55,7 @@ def refusal(made: ModelProto | bytes, watch: Opened, folder: Path) -> str:
         warnings.simplefilter("ignore")  # doubts about a network that was changed
         load_classifier(f"file:{path}", folder)
     assert not watch.events
-    assert watch.paths - {"/proc/self/statm"} <= {str(path), str(path.with_suffix(".json")), f"{path}.data"}
+    assert watch.paths <= {str(path), str(path.with_suffix(".json")), f"{path}.data"}
     assert "\n" not in str(caught.value) and len(str(caught.value)) < 700
     return str(caught.value)
 

@@ -69,7 +69,8 @@ def file_size(path: str | Path, max_bytes: int = MAX_FILE_BYTES) -> int:
 
 def read_file(path: str | Path, max_bytes: int = MAX_FILE_BYTES) -> bytes:
     """Read a regular file of at most `max_bytes`; see `file_size`."""
-    size = file_size(path, max_bytes)
+    if not (size := file_size(path, max_bytes)):
+        return b""  # or a file of the system's, of which some wait
     with open(path, "rb") as file:
         return file.read(size)
 
@@ -77,7 +78,7 @@ def read_file(path: str | Path, max_bytes: int = MAX_FILE_BYTES) -> bytes:
 def hash_file(path: str | Path, max_bytes: int = MAX_FILE_BYTES) -> str:
     """SHA-256 of a regular file of at most `max_bytes`; see `file_size`."""
     remaining, digest = file_size(path, max_bytes), hashlib.sha256()
-    with open(path, "rb") as file:
+    with open(path if remaining else os.devnull, "rb") as file:
         while chunk := file.read(min(remaining, 1 << 20)):
             digest.update(chunk)
             remaining -= len(chunk)

@@ -22,7 +22,7 @@ import numpy as np
 
 from patchproof.base.errors import Refused, TimeLimitExceeded
 from patchproof.base.geometry import MM_PER_INCH
-from patchproof.base.input import MAX_JSON_BYTES, ReturnType, is_file, run_in_child
+from patchproof.base.input import MAX_JSON_BYTES, ReturnType, file_size, is_file, run_in_child
 from patchproof.base.validation import validate_model
 from patchproof.sheets.manifest import Manifest
 from patchproof.sheets.pdf import ATTACHMENT, POINTS_PER_MM, numbered_name
@@ -119,6 +119,8 @@ def call_within_limits(pdf_path: str | Path, work: Callable[[], ReturnType]) -> 
     """
     if not is_file(pdf_path):
         raise Refused("a PDF of a sheet", f"no file at {pdf_path}", "check the path")
+    if not file_size(pdf_path, 1 << 62):
+        raise _unreadable(pdf_path)
     try:
         return run_in_child(work)
     except (TimeLimitExceeded, MemoryError) as error:
