@@ -13,7 +13,6 @@ not in the threads of a cluster's workers. Within another time limit, or a profi
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import io
 import json
@@ -44,7 +43,7 @@ ReturnType = TypeVar("ReturnType")
 IMAGE_FORMATS = ("JPEG", "MPO", "PNG", "TIFF", "WEBP", "BMP", "GIF", "AVIF", "HEIF")
 MAX_IMAGE_PX = 120_000_000  # 360 MB as pixels; the largest phone sensors in common use give 50 to 108 million
 MAX_FILE_BYTES = 1 << 30  # of one file, where its kind has no limit of its own
-MAX_CHILD_BYTES = 1_500_000_000  # more memory than at its start for a child: a page of 160 megapixels takes 1.1 GB
+MAX_CHILD_BYTES = 1_200_000_000  # more memory than a child has at its start: 140 megapixels took 0.9 GB in all
 MAX_JSON_BYTES = 16 << 20  # a manifest has 0.3 million; nested empty lists take 25 times their text in memory
 
 
@@ -61,18 +60,25 @@ def is_folder(path: str | Path) -> bool:
 def file_size(path: str | Path, max_bytes: int = MAX_FILE_BYTES) -> int:
     """Return the size of a regular file; an OSError for anything else that is at `path`, and beyond `max_bytes`."""
     if not is_file(path):
-        raise FileNotFoundError(errno.ENOENT, "no file, or none with an end", str(path))
+        raise FileNotFoundError(f"no file at {path}")
     if (size := os.path.getsize(path)) > max_bytes:
-        raise OSError(errno.EFBIG, f"{size / 2**20:.0f} MiB, more than {max_bytes / 2**20:.0f}", str(path))
+        raise OSError(f"{size / 2**20:.0f} MiB, more than {max_bytes / 2**20:.0f} MiB")
     return size
 
 
-def read_file(path: str | Path, max_bytes: int = MAX_FILE_BYTES) -> bytes:
-    """Read a regular file of at most `max_bytes`; see `file_size`."""
-    if not (size := file_size(path, max_bytes)):
-        return b""  # or a file of the system's, of which some wait
-    with open(path, "rb") as file:
-        return file.read(size)
+def read_file(
+    path: str | Path, expected: str, do: str = "check the path", max_bytes: int = MAX_FILE_BYTES, missing: str = ""
+) -> bytes:
+    """Read a regular file; refused if there is none (with the instruction `missing`), or beyond `max_bytes`."""
+    try:
+        if not (size := file_size(path, max_bytes)):
+            return b""  # or a file of the system's, of which some wait
+        with open(path, "rb") as file:
+            return file.read(size)
+    except FileNotFoundError as error:
+        raise Refused(expected, f"no file at {path}", missing or do) from error
+    except (OSError, MemoryError) as error:
+        raise Refused(expected, f"{path} that cannot be read ({error})", do) from error
 
 
 def hash_file(path: str | Path, max_bytes: int = MAX_FILE_BYTES) -> str:
@@ -87,12 +93,10 @@ def hash_file(path: str | Path, max_bytes: int = MAX_FILE_BYTES) -> str:
 
 def read_json(path: str | Path, expected: str, do: str, missing: str = "check the path") -> Any:
     """Read a JSON file; refused with the instruction `do` if it is broken, with `missing` if there is none."""
-    path = Path(path)
-    if not is_file(path):
-        raise Refused(expected, f"no file at {path}", missing)
+    text = read_file(path, expected, do, MAX_JSON_BYTES, missing)
     try:
-        return json.loads(str(read_file(path, MAX_JSON_BYTES), "utf-8"))
-    except (OSError, ValueError, RecursionError, MemoryError) as error:  # RecursionError: thousands of nested lists
+        return json.loads(str(text, "utf-8"))
+    except (ValueError, RecursionError, MemoryError) as error:  # RecursionError: thousands of nested lists
         raise Refused(expected, f"{path} that cannot be read ({error})", do) from error
 
 

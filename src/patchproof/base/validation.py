@@ -69,12 +69,10 @@ class StrictModel(BaseModel):
 
 def read_toml(path: str | Path) -> dict[str, Any]:
     """Read a TOML file as a dictionary; refused if it is missing, not text, or not TOML."""
-    path = Path(path)
-    if not os.path.isfile(path):  # False, too, for a path that no system accepts (300 letters, a NUL)
-        raise Refused("a TOML file", f"no file at {path}", "check the path")
+    text = read_file(path, "a TOML file", max_bytes=MAX_TOML_BYTES)
     try:
-        return run_within_time(tomllib.loads, str(read_file(path, MAX_TOML_BYTES), "utf-8"))
-    except (OSError, ValueError, RecursionError, TimeLimitExceeded) as error:
+        return run_within_time(tomllib.loads, str(text, "utf-8"))
+    except (ValueError, RecursionError, TimeLimitExceeded) as error:
         raise Refused("a TOML file", f"{path} that cannot be read ({error})", "correct that line") from error
 
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from patchproof.base.color import ciede2000, codes_from_srgb, lab_from_srgb
 from patchproof.base.errors import Refused
-from patchproof.base.input import is_file, read_file
+from patchproof.base.input import read_file
 from patchproof.calibrate.printer_files import printer_from_table, printer_output
 from patchproof.channel.printer import NODES_8BIT, Printer, node_colors
 
@@ -64,12 +64,7 @@ def bake(profile_path: Path, name: str, licence: str, source: str, perceptual: b
 
 def _profile_bytes(path: Path) -> bytes:
     """Read the file; refused where it is missing, too large, or shorter than its own header says."""
-    if not is_file(path):
-        raise Refused("an ICC profile", f"no file at {path}", "check the path")
-    try:
-        data = read_file(path, MAX_PROFILE_BYTES)
-    except OSError as error:
-        raise Refused("an ICC profile", f"{path.name} ({error.strerror})", "check that it is a profile") from error
+    data = read_file(path, "an ICC profile", max_bytes=MAX_PROFILE_BYTES)
     if len(data) < 128 or data[36:40] != b"acsp":  # ICC.1, 7.2: the header and its signature
         raise Refused("an ICC profile", f"{path.name}, which does not begin with a profile's header", "check the file")
     if int.from_bytes(data[:4], "big") > len(data):

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from patchproof.base.errors import Refused
-from patchproof.base.input import is_file, read_file, read_json
+from patchproof.base.input import read_file, read_json
 from patchproof.classifier.detector import Detector
 from patchproof.classifier.network import Classifier
 from patchproof.networks.batches import BatchedNetwork
@@ -60,14 +60,7 @@ def load_network(path: Path) -> Classifier:
 
 def network_bytes(path: Path) -> bytes:
     """Read a file of a network or its weights; refused if it is missing or larger than `MAX_BYTES`."""
-    if not is_file(path):
-        raise Refused("a network", f"no file at {path}", "check the path")
-    try:
-        return read_file(path, MAX_BYTES)
-    except (OSError, MemoryError) as error:
-        raise Refused(
-            f"a network of at most {MAX_BYTES >> 30} GiB", f"{path} ({error})", "use a smaller one"
-        ) from error
+    return read_file(path, "a network", max_bytes=MAX_BYTES)
 
 
 class Card(NamedTuple):

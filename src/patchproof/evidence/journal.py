@@ -9,6 +9,7 @@ The reader validates the results themselves.
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 from collections.abc import Iterator
 from contextlib import suppress
@@ -18,8 +19,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 import cv2
 import numpy as np
 
-from patchproof.base.errors import Refused
-from patchproof.base.input import MAX_JSON_BYTES, file_size, hash_file, is_file
+from patchproof.base.input import MAX_JSON_BYTES, hash_file, is_file, read_file
 from patchproof.base.output import make_folder, write_atomically
 from patchproof.base.validation import StrictModel, validate_model
 from patchproof.base.version import __version__
@@ -96,11 +96,7 @@ def _read_lines(path: Path) -> Iterator[_Line]:
     """Read the complete lines that have this layout; none if there is no file."""
     if not is_file(path):
         return
-    try:
-        file_size(path, MAX_JOURNAL_BYTES)
-    except OSError as error:
-        raise Refused("a journal of photographs", f"{path} ({error.strerror})", "start in another folder") from error
-    with open(path, encoding="utf-8", errors="replace") as file:
-        while text := file.readline(MAX_JSON_BYTES):  # a piece of a longer line is no JSON
-            with suppress(ValueError, RecursionError):  # a line that a kill cut short, or of another layout
-                yield validate_model(_Line, json.loads(text), str(path))
+    file = io.BytesIO(read_file(path, "a journal", max_bytes=MAX_JOURNAL_BYTES))
+    while text := file.readline(MAX_JSON_BYTES):  # a piece of a longer line is no JSON
+        with suppress(ValueError, RecursionError):  # a line that a kill cut short, or of another layout
+            yield validate_model(_Line, json.loads(text), str(path))

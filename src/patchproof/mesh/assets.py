@@ -27,7 +27,7 @@ class Assets:
             name = name.split()[-1]
         for spelling in (name, name.replace("\\", "/"), urllib.parse.unquote(name)):
             if is_file(self.folder / spelling):
-                data = read_file(self.folder / spelling)
+                data = read_file(self.folder / spelling, "a file of a mesh")
                 if not spelling.lower().endswith((".mtl", ".bin")) and not _is_image(data):
                     self.broken.append(name)
                 return data

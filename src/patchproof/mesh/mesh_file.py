@@ -249,7 +249,7 @@ class _MeshFileReader:
 
 def _gltf_header(path: Path) -> dict:
     """Return the JSON of a GLB or glTF file. If a .gltf is no JSON, trimesh reads another file, model.gltf, instead."""
-    text = read_file(path)
+    text = read_file(path, "a mesh file")
     if path.suffix.lower() == ".glb":
         if text[:4] != b"glTF":
             raise ValueError("it does not start with glTF")
@@ -269,7 +269,7 @@ def _check_obj(path: Path):
     """Refuse two things that trimesh misreads without a warning: faces with fewer than three corners, and indices
     relative to a vertex list that goes on after them.
     """
-    text = read_file(path).replace(b"\\\n", b" ")
+    text = read_file(path, "a mesh file").replace(b"\\\n", b" ")
     short = re.search(rb"^f(?:[ \t]+\S+){0,2}[ \t]*\r?$", text, re.MULTILINE)
     if short:
         line = text.count(b"\n", 0, short.start()) + 1

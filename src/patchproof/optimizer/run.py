@@ -209,7 +209,7 @@ def load_run(folder: str | Path) -> Run:
     settings, promise = record.settings, record.promise
     try:
         base = (folder / record.scene_folder).resolve()
-        glb = read_file(folder / _MESH_FILE) if is_file(folder / _MESH_FILE) else None
+        glb = read_file(folder / _MESH_FILE, "the mesh of a run") if is_file(folder / _MESH_FILE) else None
         scene = build_scene(settings, base, record.seed, record.sheet_id, glb)
         if record.imported is not None:
             scene = replace(scene, known={**scene.known, "design": record.imported.sha256})

@@ -51,7 +51,11 @@ def save_pictures(folder: Path, file: str, kinds: Mapping[str, np.ndarray]) -> N
 
 def saved_pictures(folder: Path, file: str) -> dict[str, bytes]:
     """Read the files of a photograph's pictures in `folder`, by kind; missing ones are left out."""
-    return {path.suffixes[-2][1:]: read_file(path) for path in _paths(folder, file) if path.is_file()}
+    return {
+        path.suffixes[-2][1:]: read_file(path, "a picture of a report")
+        for path in _paths(folder, file)
+        if path.is_file()
+    }
 
 
 def stem_of(file: str) -> str:

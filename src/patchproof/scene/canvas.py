@@ -99,10 +99,9 @@ def select_faces(mesh: Mesh, materials: tuple[str, ...], faces: str | None, base
 
 def _read_faces(path: Path, count: int) -> np.ndarray:
     """Return which of `count` faces a text file names: per line a number or a range a-b with both ends; # comments."""
-    if not is_file(path):
-        raise Refused("a file of face numbers", f"no file at {path}", "check the path")
+    text = str(read_file(path, "a file of face numbers", max_bytes=MAX_JSON_BYTES), "utf-8", "replace")
     chosen_faces = np.zeros(count, bool)
-    for number, line in enumerate(str(read_file(path, MAX_JSON_BYTES), "utf-8", "replace").splitlines(), 1):
+    for number, line in enumerate(text.splitlines(), 1):
         words = line.partition("#")[0].split("-")
         if not "".join(words).strip() and len(words) == 1:
             continue

@@ -186,12 +186,11 @@ def _files_of_class(settings: SceneSettings, base: Path) -> list[Path]:
 
 def read_labels(table: Path) -> list[tuple[str, str]]:
     """Return (file name, label in small letters) of each line; commas after the first belong to the label."""
-    if not is_file(table):
-        raise Refused("a CSV of file names and labels (object.labels)", f"no file at {table}", "check the path")
+    stored = read_file(table, "a CSV of file names and labels (object.labels)", max_bytes=MAX_JSON_BYTES)
     try:
-        lines = io.StringIO(str(read_file(table, MAX_JSON_BYTES), "utf-8-sig"), newline="")
+        lines = io.StringIO(str(stored, "utf-8-sig"), newline="")
         rows = [row for row in csv.reader(lines, skipinitialspace=True) if any(row)]
-    except (OSError, csv.Error, ValueError) as error:
+    except (csv.Error, ValueError) as error:
         raise Refused("a CSV of file names and labels", f"{table} that cannot be read ({error})", "mend it") from error
     short = next((row for row in rows if len(row) < 2), None)
     if short is not None:
