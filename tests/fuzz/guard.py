@@ -104,7 +104,11 @@ class Guard:
         if isinstance(path, int) or path is None:
             return
         text = os.path.abspath(os.fsdecode(path))
-        real = os.path.realpath(text) if follow else os.path.join(os.path.realpath(os.path.dirname(text)), "x")
+        real = (
+            os.path.realpath(text)
+            if follow
+            else os.path.join(os.path.realpath(os.path.dirname(text)), os.path.basename(text))
+        )
         if (SYSTEM.match(text) and not writes) or real.startswith(QUIET) or "__pycache__" in real:
             return
         if not f"{real}/".startswith(self.writable if writes else self.readable):

@@ -287,18 +287,24 @@ def checkpoint(place: Place, number: int) -> Use:
 
 def resumed_log(place: Place, number: int) -> Use:
     """A run to be resumed whose log is endless or a single line."""
+    import shutil
+
     import patchproof as pp
 
-    for file in finished_run().iterdir():
-        if file.name != "run.json":
-            (place.out / file.name).write_bytes(file.read_bytes())
-    (place.out / "steps.jsonl").unlink()
+    shutil.copytree(finished_run(), place.out / "run", ignore=shutil.ignore_patterns("run.json", "steps.jsonl"))
+    log, scene = place.out / "run" / "steps.jsonl", scene_beside(place)
     if number % 2:
-        (place.out / "steps.jsonl").write_bytes(b"x" * (50 << 20))
+        log.write_bytes(b"x" * (50 << 20))
     else:
-        endless(place.out / "steps.jsonl", of(number // 2, ("/dev/zero", "sparse", "itself")))
-    scene = finished_run().parent / "scene.toml"
-    return lambda: pp.optimize(scene, place.out, promise=pp.PromiseOptions(views=8, controls=()), resume=True)
+        endless(log, of(number // 2, ("/proc/self/pagemap", "sparse", "itself")))
+    return lambda: pp.optimize(scene, place.out / "run", promise=pp.PromiseOptions(views=8, controls=()), resume=True)
+
+
+def scene_beside(place: Place) -> Path:
+    """The scene of the finished run, as somebody sent it."""
+    path = place.given / "scene.toml"
+    path.write_bytes((finished_run().parent / "scene.toml").read_bytes())
+    return path
 
 
 def journal(place: Place, number: int) -> Use:
@@ -327,7 +333,7 @@ def imported_picture(place: Place, number: int) -> Use:
         path.write_bytes(of(number // 2, PICTURES)())
     else:
         endless(path, of(number // 2, ENDLESS))
-    scene = finished_run().parent / "scene.toml"
+    scene = scene_beside(place)
     return lambda: pp.import_patch(path, scene, place.out / "run", promise=pp.PromiseOptions(views=8, controls=()))
 
 
@@ -457,11 +463,11 @@ def template(place: Place, number: int) -> Use:
 def printer(place: Place, number: int) -> Use:
     import zipfile
 
+    from patchproof.base.packaged import packaged_path
     from patchproof.channel.printer import load_printer
 
-    (place.given / "p.json").write_text(
-        json.dumps({"name": "p", "method": "assumed", "paper": [1, 1, 1], "provenance": {}})
-    )
+    head_of = packaged_path("calibration", "printers", "coated.json")
+    (place.given / "p.json").write_bytes(head_of.read_bytes())
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
         head = b"{'descr': '|u1', 'fortran_order': False, 'shape': (33, 33, 33, 3), }\n"

@@ -11,10 +11,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 
 from patchproof.base.errors import Refused
-from patchproof.base.input import is_file, readable_formats
+from patchproof.base.input import is_file, open_lazily
 from patchproof.photo.read import read_photo
 from patchproof.photo.rejection import PhotoRejected
 from patchproof.scene.image_scene import read_labels
@@ -56,7 +55,7 @@ def split_into_blocks(folder: Path, rows) -> Iterator[list]:
     block, pixels = [], 0
     for row in rows:
         try:
-            with Image.open(folder / row[0], formats=readable_formats()) as image:
+            with open_lazily(folder / row[0]) as image:
                 size = image.width * image.height
         except Exception:  # a file that is no image is reported when it is read
             size = 0

@@ -103,14 +103,9 @@ def read_json(path: str | Path, expected: str, do: str, missing: str = "check th
 @contextmanager
 def open_image(source: Path | bytes, expected: str, do: str) -> Iterator[Image]:
     """Open a Pillow image from a file or a file's bytes; every error in decoding it is refused with `do`."""
-    from PIL import Image
-
     name = "an image" if isinstance(source, bytes) else source.name
     try:
-        if not isinstance(source, bytes) and not file_size(source):
-            raise ValueError("it is empty")
-        stream = io.BytesIO(source) if isinstance(source, bytes) else source
-        with Image.open(stream, formats=readable_formats()) as image:
+        with open_lazily(source) as image:
             if image.width * image.height > MAX_IMAGE_PX:
                 raise ValueError(f"{image.width} × {image.height} pixels")
             yield image
@@ -119,6 +114,17 @@ def open_image(source: Path | bytes, expected: str, do: str) -> Iterator[Image]:
     except Exception as error:  # decoders fail in many ways: OSError, SyntaxError, struct.error...
         reason = " ".join(str(error).split())[:100] or type(error).__name__
         raise Refused(expected, f"{name} that cannot be read ({reason})", do) from error
+
+
+def open_lazily(source: Path | bytes) -> Image:
+    """Open a picture with Pillow, which decodes it later; errors are Pillow's, and an OSError for what is no file or
+    empty, as files of the system are, of which Pillow would not see the end.
+    """
+    from PIL import Image
+
+    if not isinstance(source, bytes) and not file_size(source, 1 << 62):
+        raise OSError("an empty file")
+    return Image.open(io.BytesIO(source) if isinstance(source, bytes) else source, formats=readable_formats())
 
 
 def readable_formats() -> list[str]:

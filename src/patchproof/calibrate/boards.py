@@ -18,7 +18,7 @@ import numpy as np
 
 from patchproof.base.color import photo_codes_from_srgb
 from patchproof.base.errors import Refused
-from patchproof.base.input import readable_formats
+from patchproof.base.input import open_lazily
 from patchproof.base.progress import Advance, no_advance
 from patchproof.photo.detect import detect_markers, detector_settings, luminance
 from patchproof.photo.limits import run_limited
@@ -112,10 +112,8 @@ def find_corners(srgb: np.ndarray, board: Board) -> tuple[np.ndarray, np.ndarray
 
 def _camera_tags(path: Path) -> tuple[int, str]:
     """(EXIF orientation, maker and model) as the file has them."""
-    from PIL import Image
-
     try:
-        with Image.open(path, formats=readable_formats()) as image:
+        with open_lazily(path) as image:
             exif = image.getexif()
             words = [str(exif.get(tag, "")).strip("\0 ") for tag in (_MAKE, _MODEL)]
             return int(exif.get(_ORIENTATION, 1)), " ".join(word for word in words if word)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
-from patchproof.base.input import is_folder, readable_formats
+from patchproof.base.input import is_folder, open_lazily
 from patchproof.photo.limits import run_limited
 from patchproof.photo.read import list_images, list_photos, printable_name
 
@@ -81,8 +81,6 @@ def _time_and_camera(path: Path) -> tuple[datetime, str] | None:
 
 def _read_exif(path: Path) -> tuple[str, str]:
     """EXIF's time and camera as text."""
-    from PIL import Image
-
-    with warnings.catch_warnings(action="ignore"), Image.open(path, formats=readable_formats()) as image:
+    with warnings.catch_warnings(action="ignore"), open_lazily(path) as image:
         exif = image.getexif()
         return str(exif.get_ifd(_EXIF_IFD).get(_TIME_TAG)), str(exif.get(_MODEL_TAG) or "")

@@ -6,11 +6,10 @@ because trimesh does not report them.
 
 from __future__ import annotations
 
-import io
 import urllib.parse
 from pathlib import Path
 
-from patchproof.base.input import is_file, read_file, readable_formats
+from patchproof.base.input import is_file, open_lazily, read_file
 
 
 class Assets:
@@ -39,10 +38,8 @@ class Assets:
 
 def _is_image(data: bytes) -> bool:
     """True if Pillow knows the format and finds no error, as far as it can tell without decoding."""
-    from PIL import Image
-
     try:
-        Image.open(io.BytesIO(data), formats=readable_formats()).verify()
+        open_lazily(data).verify()
     except Exception:  # Pillow's readers raise many types of error
         return False
     return True

@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 
 from patchproof.base.errors import Refused
-from patchproof.base.input import MAX_IMAGE_PX, file_size, is_file, is_folder, limit_memory, readable_formats
+from patchproof.base.input import MAX_IMAGE_PX, is_file, is_folder, limit_memory, open_lazily
 from patchproof.base.validation import summarize_names
 from patchproof.photo.exif import EXIF_SPREAD, is_crop, read_focal
 from patchproof.photo.limits import MOST_BYTES, run_limited
@@ -82,15 +82,11 @@ def read_photo(path: str | Path) -> Photo:
 
 def _decode(path: Path) -> tuple[np.ndarray, int, tuple[float | None, float, bool], bool]:
     """(uint8 sRGB H×W×3 as stored, EXIF orientation, `read_focal`, `is_crop`); above `WHOLE_PX` at half size."""
-    from PIL import Image
-
-    if not (size := file_size(path, 1 << 62)):
-        raise ValueError("an empty file")  # or one of the system's, of which Pillow would not see the end
-    if size > MOST_BYTES:
+    if (size := path.stat().st_size) > MOST_BYTES:
         raise _too_large(f"a file of {size / 1e9:.1f} GB is too large: save it smaller", size, MOST_BYTES)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of large pictures, which have a limit below, and of unusual EXIF
-        with Image.open(path, formats=readable_formats()) as image:
+        with open_lazily(path) as image:
             pixels = image.width * image.height
             if pixels > MAX_IMAGE_PX:
                 raise _too_large(f"{pixels / 1e6:.0f} megapixels are too many: save it smaller", pixels, MAX_IMAGE_PX)
