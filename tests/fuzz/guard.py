@@ -23,6 +23,7 @@ from patchproof.base.errors import PatchproofError
 from patchproof.base.workers import use_threads
 
 SECONDS, BYTES = 60.0, 2_000_000_000
+WAIT_S = 900.0  # for a process that may have to share its core with others
 HERE = Path(__file__).resolve().parents[2]
 INSTALLED = tuple(f"{Path(p).resolve()}/" for p in (sys.prefix, sys.base_prefix, HERE, "/usr/lib", "/usr/share"))
 SYSTEM = re.compile(
@@ -128,7 +129,7 @@ def attempt(kind: str, number: int, make: Callable[[Place, int], Callable[[], ob
         reader = threading.Thread(target=_collect, args=(receiver, lines), daemon=True)
         reader.start()
         begin = time.monotonic()
-        child.join(2 * SECONDS)
+        child.join(WAIT_S)
         hung = child.is_alive()
         child.kill()
         child.join()
@@ -159,6 +160,7 @@ def _use(root: Path, number: int, make: Callable[[Place, int], Callable[[], obje
     for stream in (1, 2):
         os.dup2(silence, stream)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_CPU, (int(1.5 * SECONDS),) * 2)
     os.environ["EMPTY"], os.environ["SECRET"], os.environ["COLON"] = "", "hunter2", ":"
     os.environ["OUTSIDE"] = str(root / "outside")
     place = Place.at(root)

@@ -241,7 +241,7 @@ def _run_steps(problem: Problem, state: State, out: Path, advance: Advance) -> n
     """Run the remaining steps, writing log, checkpoint and views; the best design's pixels."""
     settings, largest_gradient, path = problem.scene.settings.optimize, None, out / _LOG_FILE
     # without the lines after the step from which the run resumes
-    count = min(state.number, settings.steps) if is_file(path) else 0
+    count = min(state.number, settings.steps) if is_file(path) and path.stat().st_size else 0
     with open(path if count else os.devnull, "rb") as log:
         lines = [log.readline(_MAX_LINE_BYTES) for _ in range(count)]
     write_atomically(path, b"".join(lines))
