@@ -141,3 +141,25 @@ def test_more_zeros_on_one_side_are_zeros_in_small_weights(sides):
 
 def test_even_zeros_are_a_convolutions_own():
     assert names(program("y = Conv<pads=[2,1,2,1]>(x, W)")) == ["convolution.default"]
+
+
+@pytest.mark.parametrize(
+    ("bound", "limit", "step"),
+    [
+        ("MAX_VALUES", 9 * 192, "Relu(x)"),
+        ("MAX_PRODUCTS", 8 * 8 * 3 * 8, "MatMul(x, x)"),
+        ("MAX_PRODUCTS", 8 * 8 * 3 * 9, "MaxPool<kernel_shape = [3, 3], pads = [1, 1, 1, 1]>(x)"),
+        ("MAX_PRODUCTS", 8 * 8 * 3 * 9, "AveragePool<kernel_shape = [3, 3], pads = [1, 1, 1, 1]>(x)"),
+    ],
+)
+def test_a_network_that_asks_for_too_much_is_refused_before_anything_is_computed(bound, limit, step, monkeypatch):
+    """3,000 products of matrices of 1,024 numbers a side took an hour; each of them is small enough by itself."""
+    body = "\n".join(["a0 = Identity(x)", *(f"a{i + 1} = {step.replace('(x', f'(a{i}')}" for i in range(8))])
+    network = program(f"{body}\ny = Flatten(a8)")
+    monkeypatch.setattr(graph, bound, limit)
+    photos = torch.rand(2, 3, 8, 8)
+    network.dry_run(len(network.steps), photos.shape)
+    monkeypatch.setattr(graph, bound, limit - 1)
+    network.tested.clear()
+    with pytest.raises(ValueError, match="too many computations"):
+        network.dry_run(len(network.steps), photos.shape)

@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageOps
 
 from patchproof.base.sessions import count_by_session, rate_posterior
 from patchproof.base.settings import BackgroundSettings
+from patchproof.scene import backgrounds as backgrounds_module
 from patchproof.scene import patterns
 from patchproof.scene import procedural_places as module
-from patchproof.scene.backgrounds import ENOUGH_FILES, FEW_PICTURES, PLACE_NUMBERS, VIEWS_PER_FILE, load_backgrounds
+from patchproof.scene.backgrounds import (
+    ENOUGH_FILES,
+    FEW_PICTURES,
+    PLACE_NUMBERS,
+    VIEWS_PER_FILE,
+    FileLevels,
+    load_backgrounds,
+)
 from patchproof.scene.procedural_places import PLACE_PX, procedural_place
 from patchproof.scene.scene import make_scene
 
@@ -73,6 +83,32 @@ def test_a_promise_knows_another_place_for_every_session_and_says_which_share_on
     counts = [count_by_session(hits * 20, 4, places) for places in ((0, 1) * 20, ())]
     together, apart = (rate_posterior(*each).rate_interval for each in counts)
     assert np.ptp(together) > 2 * np.ptp(apart)
+
+
+def test_files_are_decoded_when_they_are_shown_and_little_of_them_is_kept(tmp_path, monkeypatch):
+    """Views have the bytes that they would have if every picture were in memory."""
+    (tmp_path / "places").mkdir()
+    rng, pictures = np.random.default_rng(0), {}
+    for i in range(6):
+        pixels = rng.integers(0, 256, (260 + i, 300, 3), np.uint8)
+        Image.fromarray(pixels).save(tmp_path / "places" / f"{i}.png", compress_level=0)
+        pictures[f"{i}.png"] = pixels
+    decoded = []
+    monkeypatch.setattr(ImageOps, "exif_transpose", lambda image: decoded.append(image.filename) or image)
+    monkeypatch.setattr(backgrounds_module, "CACHED_FILE_BYTES", 200_000)
+    lazy = load_backgrounds(BackgroundSettings(images="places"), tmp_path)
+    assert not decoded
+    at_once = tuple(pictures[p.path.name] if isinstance(p, FileLevels) else p for p in lazy.pictures)
+    eager = replace(lazy, pictures=at_once)
+    files = [i for i, picture in enumerate(lazy.pictures) if isinstance(picture, FileLevels)]
+    for size_px in ((64, 64), (400, 300), (64, 48)):
+        for number in files:
+            choice = np.array([(number + 0.5) / len(lazy.pictures), *rng.random(4)])
+            views = [each.picture(choice, (400, 300), size_px) for each in (lazy, eager)]
+            assert np.array_equal(*views)
+            levels = backgrounds_module._file_levels.values()
+            assert len(levels) == 1 or sum(level.nbytes for level in levels) <= 200_000
+    assert len(decoded) > len(files)
 
 
 def test_a_picture_that_is_named_and_a_color_are_known_places(tmp_path):

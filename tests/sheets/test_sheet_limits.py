@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import signal
 import subprocess
 import sys
@@ -10,12 +11,15 @@ from pathlib import Path
 
 import pikepdf
 import pytest
+from fuzz.pdf_bombs import PDF_BOMBS
+from fuzz.watch import peak_bytes
 
 from patchproof.base import input as bounds
 from patchproof.base.errors import Refused
 from patchproof.sheets import pdf_raster
 from patchproof.sheets.blank import blank_sheet
-from patchproof.sheets.pdf_raster import rasterize_page
+from patchproof.sheets.pdf_raster import attached_manifest, rasterize_page
+from patchproof.sheets.print_advice import pdf_advice
 
 needs_timer = pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="there are no such timers on Windows")
 
@@ -61,6 +65,20 @@ def test_a_page_that_takes_too_long_is_refused_and_left_behind(tmp_path, monkeyp
     assert time.process_time() - before < 0.7
     monkeypatch.setattr(bounds, "TIME_LIMIT_S", 10.0)
     assert (rasterize_page(tmp_path / "few.pdf", 1, 72) == blue).all()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="memory is limited on Linux")
+@pytest.mark.parametrize("bomb", ["object stream", "attachment"])
+def test_kilobytes_that_unpack_to_gigabytes_are_refused_by_every_reader_of_pdfs(bomb, tmp_path, monkeypatch):
+    """In a process whose memory is limited: 3 GB from 5 kB took this one 4 GB, in PDFium as in qpdf."""
+    monkeypatch.setattr(bounds, "MAX_CHILD_BYTES", 60_000_000)
+    (tmp_path / "bomb.pdf").write_bytes(PDF_BOMBS[bomb]())
+    before = peak_bytes(reset=True)
+    with pytest.raises(Refused):
+        (rasterize_page if bomb == "object stream" else attached_manifest)(tmp_path / "bomb.pdf")
+    with contextlib.suppress(Refused):  # they need not look into every stream
+        pdf_advice(tmp_path / "bomb.pdf")
+    assert peak_bytes() - before < 50_000_000
 
 
 @needs_timer

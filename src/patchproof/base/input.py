@@ -209,6 +209,7 @@ def _send_result(work: Callable[[], Any], sender: Any) -> None:
     signal.signal(signal.SIGPROF, signal.SIG_DFL)
     signal.setitimer(signal.ITIMER_PROF, TIME_LIMIT_S)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # libraries say a lot before they abort
     result = error = None
     try:
         with limit_memory(MAX_CHILD_BYTES):

@@ -6,10 +6,13 @@ because trimesh does not report them.
 
 from __future__ import annotations
 
+import io
 import urllib.parse
 from pathlib import Path
 
-from patchproof.base.input import is_file, open_lazily, read_file
+from patchproof.base.input import is_file, readable_formats
+
+MOST_BYTES = 1 << 30  # of one file
 
 
 class Assets:
@@ -26,7 +29,9 @@ class Assets:
             name = name.split()[-1]
         for spelling in (name, name.replace("\\", "/"), urllib.parse.unquote(name)):
             if is_file(self.folder / spelling):
-                data = read_file(self.folder / spelling, "a file of a mesh")
+                if (self.folder / spelling).stat().st_size > MOST_BYTES:
+                    raise ValueError(f"{spelling} is too large")
+                data = (self.folder / spelling).read_bytes()
                 if not spelling.lower().endswith((".mtl", ".bin")) and not _is_image(data):
                     self.broken.append(name)
                 return data
@@ -38,8 +43,10 @@ class Assets:
 
 def _is_image(data: bytes) -> bool:
     """True if Pillow knows the format and finds no error, as far as it can tell without decoding."""
+    from PIL import Image
+
     try:
-        open_lazily(data).verify()
+        Image.open(io.BytesIO(data), formats=readable_formats()).verify()
     except Exception:  # Pillow's readers raise many types of error
         return False
     return True

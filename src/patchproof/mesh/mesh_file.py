@@ -24,8 +24,8 @@ import numpy as np
 
 from patchproof.base.color import linear_from_srgb
 from patchproof.base.errors import Refused
-from patchproof.base.input import IMAGE_FORMATS, MAX_FILE_BYTES, MAX_IMAGE_PX, is_file, read_file
-from patchproof.mesh.assets import Assets
+from patchproof.base.input import IMAGE_FORMATS, MAX_IMAGE_PX, is_file
+from patchproof.mesh.assets import MOST_BYTES, Assets
 from patchproof.mesh.mesh import Material, MeshPart, normal_transform, topology_warnings
 
 FORMATS = (".obj", ".glb", ".gltf", ".ply", ".stl")
@@ -36,8 +36,8 @@ WHITE = (1.0, 1.0, 1.0)
 
 def read_parts(path: Path, world_from_file: np.ndarray) -> tuple[list[MeshPart], list[str]]:
     """Read every placed geometry with faces, its vertices and normals turned by `world_from_file` 3×3; warnings."""
-    if not is_file(path):
-        raise Refused("a mesh file", f"no file at {path}", "check the path")
+    if not is_file(path) or not path.stat().st_size:  # some files of the system are empty, and never end
+        raise Refused("a mesh file", f"no file at {path}, or an empty one", "check the path")
     if path.suffix.lower() not in FORMATS:
         raise Refused(f"a mesh file ({', '.join(FORMATS)})", path.name, "export the mesh in one of these formats")
     reader = _MeshFileReader(path)
@@ -249,7 +249,7 @@ class _MeshFileReader:
 
 def _gltf_header(path: Path) -> dict:
     """Return the JSON of a GLB or glTF file. If a .gltf is no JSON, trimesh reads another file, model.gltf, instead."""
-    text = read_file(path, "a mesh file")
+    text = path.read_bytes()
     if path.suffix.lower() == ".glb":
         if text[:4] != b"glTF":
             raise ValueError("it does not start with glTF")
@@ -260,7 +260,7 @@ def _gltf_header(path: Path) -> dict:
     # trimesh allocates memory for both before it reads the file's contents
     data_bytes = sum(abs(view["byteLength"]) for view in header.get("bufferViews", ()))
     zeros = sum(abs(accessor["count"]) for accessor in header.get("accessors", ()) if "bufferView" not in accessor)
-    if data_bytes > MAX_FILE_BYTES or zeros > MOST_FACES:
+    if data_bytes > MOST_BYTES or zeros > MOST_FACES:
         raise ValueError(f"it asks for {data_bytes} bytes and {zeros} zeros in memory")
     return header
 
@@ -269,7 +269,7 @@ def _check_obj(path: Path):
     """Refuse two things that trimesh misreads without a warning: faces with fewer than three corners, and indices
     relative to a vertex list that goes on after them.
     """
-    text = read_file(path, "a mesh file").replace(b"\\\n", b" ")
+    text = path.read_bytes().replace(b"\\\n", b" ")
     short = re.search(rb"^f(?:[ \t]+\S+){0,2}[ \t]*\r?$", text, re.MULTILINE)
     if short:
         line = text.count(b"\n", 0, short.start()) + 1
