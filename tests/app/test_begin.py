@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +29,7 @@ from patchproof.app.begin.sides import (
 )
 from patchproof.base.errors import Refused
 from patchproof.base.settings import load_scene_settings
+from patchproof.classifier import load_classifier
 from patchproof.render.stage import set_stage
 from patchproof.scene.fitting import largest_fitting_size
 from patchproof.scene.placement import gap_limit_mm
@@ -149,8 +151,16 @@ def test_the_file_beside_the_page_is_the_object_with_the_piece_on_it(shown):
 
 
 def test_a_piece_that_is_refused_is_said_beside_the_bare_object(tmp_path, few_turns, monkeypatch, capsys):
-    """By the command line, which says where the page is and ends with what was refused."""
+    """By the command line, which says where the page is and ends with what was refused; so is what was said of a
+    network.
+    """
     monkeypatch.chdir(tmp_path)
+
+    def load_oddly(*given):
+        warnings.warn("the network is odd", stacklevel=2)
+        return load_classifier(*given)
+
+    monkeypatch.setattr("patchproof.app.begin.preview.load_classifier", load_oddly)
     assert command("new", "primitive:carton", "--length-mm", 300) == 0
     assert "next: patchproof preview scene.toml" in capsys.readouterr().out
     text = Path("scene.toml").read_text(encoding="utf-8") + "[camera]\nphoto_px = [400, 300]\n"
@@ -159,11 +169,13 @@ def test_a_piece_that_is_refused_is_said_beside_the_bare_object(tmp_path, few_tu
     assert command("preview", "scene.toml") == 1
     said = capsys.readouterr()
     refused = said.err.splitlines()[-1]
+    assert "warning: the network is odd" in said.err
     assert "page: patchproof-preview/preview.html" in said.out
     assert (
         refused.startswith("Expected a piece no larger than the object's side") and 'did you mean "carton"' in refused
     )
     html = Path("patchproof-preview", PAGE).read_text(encoding="utf-8").partition("<script>")[0]
+    assert "the network is odd" in html
     assert html.count('class="note refused"') == 2 and "piece hangs here" not in html and html.count("<ol") == 8
     with pytest.raises(Refused, match="add --overwrite"):
         preview_scene("scene.toml", "patchproof-preview")

@@ -24,6 +24,8 @@ from patchproof.classifier.builtin import load_builtin
 from patchproof.classifier.load import load_classifier
 from patchproof.photo.read import read_photo
 
+pytestmark = pytest.mark.filterwarnings("ignore:.*resize_short_px")  # of the network's card: not used here
+
 
 def foolbox():
     with warnings.catch_warnings():

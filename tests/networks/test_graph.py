@@ -52,7 +52,7 @@ def program(body: str, **weights) -> graph.Program:
     for tensor in made.graph.initializer:
         if tensor.name in weights:
             tensor.raw_data = weights[tensor.name].numpy().tobytes()
-    return read_onnx(made.SerializeToString(), lambda: b"")[0]
+    return read_onnx(made.SerializeToString(), lambda location: b"")[0]
 
 
 def names(network: graph.Program) -> list[str]:

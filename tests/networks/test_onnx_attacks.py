@@ -6,7 +6,9 @@ whether anything was written, started or connected; processor time and memory ar
 
 from __future__ import annotations
 
+import hashlib
 import importlib
+import os
 import pickle
 import re
 import sys
@@ -15,6 +17,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import torch
 from fuzz.watch import Watch, limits
 
 from patchproof.base.errors import Refused
@@ -24,6 +27,8 @@ pytest.importorskip("onnx", reason='needs onnx, of the extra "test"')
 
 from onnx import ModelProto, TensorProto, helper
 from onnx_files import SMALL, model, save, small
+
+SHA1 = hashlib.sha1(next(t for t in small().graph.initializer if t.name == "W").raw_data).hexdigest()
 
 
 class Opened(Watch):
@@ -55,7 +60,7 @@ def refusal(made: ModelProto | bytes, watch: Opened, folder: Path) -> str:
         warnings.simplefilter("ignore")  # doubts about a network that was changed
         load_classifier(f"file:{path}", folder)
     assert not watch.events
-    assert watch.paths <= {str(path), str(path.with_suffix(".json")), f"{path}.data"}
+    assert watch.paths <= {str(path), str(path.with_suffix(".json")), str(folder / "x")}
     assert "\n" not in str(caught.value) and len(str(caught.value)) < 700
     return str(caught.value)
 
@@ -87,6 +92,17 @@ def two_elsewhere(first: str, second: str) -> ModelProto:
     weight(made, "F").external_data.add(key="location", value=second)
     weight(made, "F").external_data.add(key="length", value="16")
     return made
+
+
+def twice_elsewhere(made: ModelProto) -> None:
+    made.CopyFrom(elsewhere(location="x"))
+    weight(made).external_data.add(key="location", value="y")
+
+
+def colors_last(made: ModelProto) -> None:
+    dimensions = made.graph.input[0].type.tensor_type.shape.dim
+    for dimension, word in zip(dimensions, ("BATCH", "FEATURE", "FEATURE", "CHANNEL"), strict=True):
+        dimension.denotation = f"DATA_{word}"
 
 
 def sized(*sizes: int) -> ModelProto:
@@ -138,12 +154,16 @@ def longest(made: ModelProto, count: int) -> ModelProto:
 SCALE = 's = Constant<value_floats=[1.0, 1.0, {0}, {0}]>() y = Resize<coordinate_transformation_mode="asymmetric", '
 HOSTILE: dict[str, tuple[Callable[[], ModelProto | bytes], str]] = {
     # another file
-    "a path upward": (lambda: elsewhere(location="../../../../../../etc/passwd"), r"no file at .*small\.onnx\.data"),
-    "an absolute path": (lambda: elsewhere(location="/etc/passwd"), r"no file at .*small\.onnx\.data"),
-    "a path with NUL": (lambda: elsewhere(location="a\0b"), r"no file at .*small\.onnx\.data"),
-    "a device": (lambda: elsewhere(location="/dev/zero", length="432"), r"no file at .*small\.onnx\.data"),
+    "a path upward": (lambda: elsewhere(location="../../../../../../etc/passwd"), "in a file beside the network"),
+    "an absolute path": (lambda: elsewhere(location="/etc/passwd"), "got '/etc/passwd' named in .*: save it again"),
+    "a path into a folder": (lambda: elsewhere(location="more/weights.bin"), "in a file beside the network"),
+    "a path of Windows": (lambda: elsewhere(location="C:\\secret"), "in a file beside the network"),
+    "the folder": (lambda: elsewhere(location="."), "in a file beside the network"),
+    "a path with NUL": (lambda: elsewhere(location="a\0b"), "in a file beside the network|ValueError"),
+    "a device": (lambda: elsewhere(location="/dev/zero", length="432"), "in a file beside the network"),
+    "a name of no file": (lambda: elsewhere(location="w.bin"), r"no file at .*w\.bin: put w\.bin beside small\.onnx"),
     "no location": (lambda: elsewhere(offset="0"), r"\(KeyError\)"),
-    "a pipe's name for an offset": (lambda: elsewhere(location="x", offset="|id"), r"small\.onnx\.data"),
+    "a pipe's name for an offset": (lambda: elsewhere(location="x", offset="|id"), r"no file at .*x"),
     # weights
     "two gigabytes claimed": (lambda: sized(1 << 29), r"108 numbers in 'W' of the shape \[536870912\]"),
     "sizes whose product wraps": (lambda: sized(1 << 31, 1 << 31, 1 << 31), "108 numbers in 'W'"),
@@ -160,6 +180,8 @@ HOSTILE: dict[str, tuple[Callable[[], ModelProto | bytes], str]] = {
     ),
     "strings for a weight": (lambda: changed(lambda m: weight(m).string_data.append(b"x")), "strings, which is not"),
     "the same weight twice": (lambda: changed(lambda m: m.graph.initializer.append(weight(m))), "'W' twice"),
+    "an unknown entry of a place": (lambda: elsewhere(location="x", basepath="/etc"), "'basepath', 'location'"),
+    "a place twice": (lambda: changed(twice_elsewhere), "some unknown or twice"),
     "sparse weights": (lambda: changed(lambda m: m.graph.sparse_initializer.add()), "sparse weights, which is not"),
     # the graph
     "a cycle": (lambda: changed(lambda m: node(m, 0).input.__setitem__(0, "y")), "'y' before it is computed"),
@@ -173,6 +195,22 @@ HOSTILE: dict[str, tuple[Callable[[], ModelProto | bytes], str]] = {
     "a branch": (lambda: nested(1), "a graph within the graph, which is not supported"),
     "thirty graphs in each other": (lambda: nested(30), "a graph within the graph, which is not supported"),
     "a function": (lambda: changed(lambda m: m.functions.add(name="Relu")), "functions of its own, which is not"),
+    "a quantized tensor": (
+        lambda: changed(lambda m: m.graph.quantization_annotation.add()),
+        "quantized tensors, which",
+    ),
+    "colors last": (lambda: changed(colors_last), "DATA_FEATURE', 'DATA_CHANNEL'], not N×3×S×S"),
+    "a field of the future": (lambda: small().SerializeToString() + wire(99, b"x"), "a field of the unknown number 99"),
+    "an attribute of another type": (
+        lambda: changed(lambda m: setattr(node(m).attribute[0], "type", 1)),
+        "the attribute '.*' of 1 kinds",
+    ),
+    "a constant of two values": (
+        lambda: changed(
+            lambda m: m.graph.node.append(helper.make_node("Constant", [], ["q"], value_int=1, value_ints=[1]))
+        ),
+        "description cannot be read",
+    ),
     "training": (lambda: changed(lambda m: m.training_info.add()), "training steps, which is not supported"),
     "no graph": (lambda: changed(lambda m: m.ClearField("graph")), r"\(KeyError\)"),
     "two inputs": (lambda: changed(lambda m: m.graph.input.add(name="x2")), "2 inputs, not one of N×3×S×S"),
@@ -213,7 +251,10 @@ HOSTILE: dict[str, tuple[Callable[[], ModelProto | bytes], str]] = {
     "no groups": (lambda: model("y = Conv<group=0>(x, W, F)"), "fails on"),
     "a step of nothing": (lambda: ending("y = Slice(z, [0], [4], [3], [0])"), r"fails on .*ValueError"),
     "a place past the end": (lambda: ending("y = Gather<axis=3>(z, [99])"), "fails on"),
-    "training mode": (lambda: model("y = BatchNormalization<training_mode=1>(x, S, P, S, P)"), "in training mode"),
+    "training mode": (
+        lambda: model("y = BatchNormalization<training_mode=1>(x, S, P, S, P)"),
+        "the attribute training_mode = 1",
+    ),
     # sizes that follow from others
     "sixty doublings": (lambda: doubled(60), "a tensor of an absurd size"),
     "a repetition past memory": (lambda: ending(f"y = Expand(z, [{1 << 24}, 1, 1, 1, 1, 1])"), "of an absurd size"),
@@ -277,7 +318,9 @@ def test_hostile_files_are_refused_in_one_sentence(name, watch, tmp_path):
 @pytest.mark.parametrize(
     ("entries", "sentence"),
     [
-        ({"location": "/etc/passwd"}, None),  # the place is not looked at: what is read lies beside the file
+        ({"location": "x"}, None),
+        ({"location": "x", "length": "432", "offset": "0", "checksum": SHA1.upper()}, None),
+        ({"location": "x", "checksum": SHA1.replace("a", "b")}, "in 'x' whose SHA-1 is not the stated checksum"),
         ({"location": "x", "offset": "-1"}, "-1 instead of a whole number from 0 to 432"),
         ({"location": "x", "offset": "433"}, "433 instead of a whole number from 0 to 432"),
         ({"location": "x", "length": str(1 << 40)}, "instead of a whole number from 0 to 432"),
@@ -286,23 +329,36 @@ def test_hostile_files_are_refused_in_one_sentence(name, watch, tmp_path):
     ],
 )
 def test_weights_in_the_other_file_stay_within_it(entries, sentence, watch, tmp_path):
-    (tmp_path / "small.onnx.data").write_bytes(weight(small()).raw_data)
+    (tmp_path / "x").write_bytes(weight(small()).raw_data)
+    (tmp_path / "small.onnx.data").write_bytes(bytes(432))  # of an earlier export, which the file does not name
     if sentence is not None:
         assert re.search(sentence, refusal(elsewhere(**entries), watch, tmp_path))
         return
     path = save(tmp_path, elsewhere(**entries))
     watch.paths.clear()
     with watch.on(tmp_path):
-        load_classifier(f"file:{path}", tmp_path)
-    assert watch.paths == {str(path), str(path.with_suffix(".json")), f"{path}.data"} and not watch.events
+        loaded = load_classifier(f"file:{path}", tmp_path)
+    assert watch.paths == {str(path), str(path.with_suffix(".json")), str(tmp_path / "x")} and not watch.events
+    whole = load_classifier(f"file:{save(tmp_path, small(), name='whole')}", tmp_path)
+    photos = torch.rand(1, 3, 8, 8)
+    torch.testing.assert_close(loaded.logits(photos), whole.logits(photos))
 
 
-def test_weights_that_share_bytes_or_lie_in_two_other_files_are_refused(watch, tmp_path):
-    (tmp_path / "small.onnx.data").write_bytes(bytes(440))
+def test_weights_may_lie_in_several_files_and_share_no_bytes(watch, tmp_path):
+    (tmp_path / "x").write_bytes(weight(small()).raw_data + bytes(8))
+    (tmp_path / "y").write_bytes(weight(small(), "F").raw_data)
     assert "weights that overlap" in refusal(two_elsewhere("x", "x"), watch, tmp_path)
-    assert "in more than one other file" in refusal(two_elsewhere("x", "y"), watch, tmp_path)
+    photos = torch.rand(1, 3, 8, 8)
+    networks = [save(tmp_path, two_elsewhere("x", "y"), name="two"), save(tmp_path, small(), name="whole")]
+    torch.testing.assert_close(*(load_classifier(f"file:{path}", tmp_path).logits(photos) for path in networks))
 
 
-def test_a_data_file_that_is_no_file_is_refused(watch, tmp_path):
-    (tmp_path / "small.onnx.data").mkdir()
+def test_what_is_no_file_of_the_folder_is_not_read_as_weights(watch, tmp_path, tmp_path_factory):
+    (tmp_path / "x").mkdir()
     assert "no file at" in refusal(elsewhere(location="x"), watch, tmp_path)
+    outside = tmp_path_factory.mktemp("outside") / "x"
+    outside.write_bytes(weight(small()).raw_data)
+    (tmp_path / "y").symlink_to(outside)
+    assert "weights in a file beside the network" in refusal(elsewhere(location="y"), watch, tmp_path)
+    os.mkfifo(tmp_path / "z")
+    assert "no file at" in refusal(elsewhere(location="z"), watch, tmp_path)

@@ -17,7 +17,9 @@ sentence, exit code 1 (a photograph: rejected with its code). *said*: left aside
 the preview and the report.
 """
 # the kinds of input, and the modules whose DECLARED lists what they can declare
-READERS: dict[str, tuple[str, ...]] = {}
+READERS: dict[str, tuple[str, ...]] = {
+    "Networks": ("classifier.declarations",),
+}
 
 
 def declarations(reader: str) -> tuple[Declaration, ...]:

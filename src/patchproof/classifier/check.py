@@ -1,8 +1,8 @@
 """Test a network before it is used, on three synthetic pictures, for faults that would falsify every later figure.
 
-In: a Classifier. Out: nothing if all is well; refused if the network cannot be used (wrong outputs, probabilities
-instead of logits, answers that depend on chance or on the batch, no gradient, not for pictures in [0, 1]); a warning if
-it may be right but looks odd. The idea is auto-attack's: a tool should distrust its own instrument.
+In: a Classifier. Out: nothing if all is well; refused if the network cannot be used (wrong outputs, answers that depend
+on chance or on the batch, no gradient, not for pictures in [0, 1]; what outputs.py finds); a warning if it may be right
+but looks odd. The idea is auto-attack's: a tool should distrust its own instrument.
 
 Source: Croce et al., "Flags", github.com/fra31/auto-attack, checks.py.
 """
@@ -16,6 +16,7 @@ from torch import Tensor
 
 from patchproof.base.errors import Refused
 from patchproof.classifier.network import NO_BOX_LOGIT, Classifier
+from patchproof.classifier.outputs import check_boxes, check_scores, check_shape
 
 # Logits differ by rounding when the batch does: 1e-6 of their spread in float32 here, 1e-3 with TF32. A dropout or a
 # BatchNorm in training mode moves them by more than a hundredth.
@@ -30,15 +31,23 @@ def check_network(classifier: Classifier, device: torch.device | str = "cpu") ->
     name = f"the network {classifier.name}"
     try:
         with torch.no_grad():
-            batches = (photos, photos.clone(), photos[1:2], photos.flip(1))
-            logits, again, alone, swapped = map(classifier.square_logits, batches)
+            output = classifier.network(photos)
+            check_shape(output, classifier)
+            batches = (photos.clone(), photos[1:2], photos.flip(1))
+            again, alone, swapped = map(classifier.square_logits, batches)
     except Refused:
         raise
     except Exception as error:  # the network is the user's program and may raise anything
         reason = f"{type(error).__name__}: {error_summary(error)}"
         got = f"{name}, which fails on 3×3×{classifier.input_px}×{classifier.input_px} ({reason})"
         raise Refused("a network that takes N×3×S×S pictures", got, "check input_px and the export") from error
-    _check_outputs(logits, len(classifier.labels), name)
+    scores = output[..., 4:] if classifier.LOOKS_AT_BOXES else output
+    logits = scores.amax(1) if classifier.LOOKS_AT_BOXES else scores
+    if not torch.isfinite(logits).all() or torch.isnan(output).any():
+        raise Refused("finite logits", f"NaN or infinity from {name}", "check its weights and its number format")
+    if classifier.LOOKS_AT_BOXES:
+        check_boxes(classifier, output)
+    check_scores(classifier, photos, scores)
     if classifier.LOOKS_AT_BOXES and float(logits.max()) <= NO_BOX_LOGIT:
         warnings.warn(f"{name} finds nothing in smooth pictures: its gradients were not tested", stacklevel=2)
         return
@@ -58,18 +67,6 @@ def check_network(classifier: Classifier, device: torch.device | str = "cpu") ->
 
 
 _EVAL_ADVICE = "export it in evaluation mode, so that dropout and batch statistics are frozen"
-
-
-def _check_outputs(logits: Tensor, classes: int, name: str) -> None:
-    """Check shape, finite values, and that there is no softmax at the end."""
-    if not isinstance(logits, Tensor) or logits.shape != (3, classes):
-        got = tuple(logits.shape) if isinstance(logits, Tensor) else type(logits).__name__
-        do = "give it as many labels as it has outputs"
-        raise Refused(f"{classes} logits for each picture, one a label", f"{got} for 3 pictures from {name}", do)
-    if not torch.isfinite(logits).all():
-        raise Refused("finite logits", f"NaN or infinity from {name}", "check its weights and its number format")
-    if logits.min() >= 0 and logits.max() <= 1 and ((logits.sum(1) - 1).abs() < 1e-3).all():
-        raise Refused("logits", f"probabilities from {name} (rows that sum to 1)", "leave its last softmax out")
 
 
 def _check_gradient(classifier: Classifier, photos: Tensor, name: str) -> None:

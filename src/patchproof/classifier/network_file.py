@@ -7,21 +7,28 @@ that was exported for a fixed number of pictures is called with that number.
 Nothing of the file is executed: protobuf.py reads its fields, onnx_file.py the graph from them, and graph.py computes
 its operators, which are on the list in onnx_operators.py. The library onnx is not called.
 
-`EXPORT_ADVICE` says how to make such a file. Data that an exporter writes into NAME.onnx.data belong to NAME.onnx.
+`EXPORT_ADVICE` says how to make such a file. Weights may lie in files beside it that NAME.onnx names. Entries of the
+card or of the file's metadata that say how pictures are prepared are refused unless they say sRGB in [0, 1]; others
+that may matter are said.
 """
 
 from __future__ import annotations
 
 import hashlib
+import os
+import re
+import warnings
+from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from patchproof.base.errors import Refused
 from patchproof.base.input import read_file, read_json
+from patchproof.base.validation import summarize_names
 from patchproof.classifier.detector import Detector
 from patchproof.classifier.network import Classifier
 from patchproof.networks.batches import BatchedNetwork
-from patchproof.networks.bounds import UnsupportedNetwork
+from patchproof.networks.bounds import UnsupportedNetwork, quote
 from patchproof.networks.onnx_file import read_onnx
 
 MAX_BYTES = 4 << 30  # larger than any classifier tested
@@ -37,15 +44,17 @@ def load_network(path: Path) -> Classifier:
         raise Refused("a network as an ONNX file, file:NAME.onnx", f"{path}", EXPORT_ADVICE)
     stored = network_bytes(path)  # read once, so that the hash is of the bytes that are loaded
     card = read_card(path.with_suffix(".json"))
-    digest = hashlib.sha256(stored)
+    digest, other_bytes = hashlib.sha256(stored), len(stored)
 
-    def read_data() -> bytes:
-        data = network_bytes(path.with_name(f"{path.name}.data"))
+    def read_data(location: str) -> bytes:
+        nonlocal other_bytes
+        data = network_bytes(_beside(path, location), f"put {location} beside {path.name}, which names it", other_bytes)
+        other_bytes += len(data)
         digest.update(data)
         return data
 
     try:
-        network = BatchedNetwork(*read_onnx(stored, read_data))
+        program, batch, metadata = read_onnx(stored, read_data)
     except UnsupportedNetwork as error:
         do = "export it in evaluation mode, without custom operators and control flow, opset 13 or later"
         raise Refused("an ONNX file of plain tensors and operators", f"{path} with {error}", do) from error
@@ -54,13 +63,53 @@ def load_network(path: Path) -> Classifier:
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError, OverflowError) as error:
         got = f"{path}, whose description cannot be read ({type(error).__name__})"
         raise Refused("an ONNX file", got, "export it again with torch.onnx.export") from error
+    check_entries(metadata, path)
     make = Detector if card.kind == Detector.KIND else Classifier
-    return make(f"file:{path}", digest.hexdigest(), card.input_px, card.labels, network)
+    return make(f"file:{path}", digest.hexdigest(), card.input_px, card.labels, BatchedNetwork(program, batch))
 
 
-def network_bytes(path: Path) -> bytes:
-    """Read a file of a network or its weights; refused if it is missing or larger than `MAX_BYTES`."""
-    return read_file(path, "a network", max_bytes=MAX_BYTES)
+def _beside(path: Path, location: str) -> Path:
+    """The file of weights that an ONNX file names; refused unless it lies in the same folder."""
+    beside = path.parent / location
+    folders = {os.path.dirname(os.path.realpath(file)) for file in (path.parent / "x", beside)}
+    if location in ("", ".", "..") or set("/\\:\0") & set(location) or len(folders) > 1:
+        do = 'save it again with onnx.save(..., save_as_external_data=True, location="NAME.onnx.data")'
+        raise Refused("weights in a file beside the network", f"{quote(location)} named in {path}", do)
+    return beside
+
+
+def network_bytes(path: Path, do: str = "check the path", other_bytes: int = 0) -> bytes:
+    """Read a file of a network; refused if it is missing or, with the network's other files, beyond `MAX_BYTES`."""
+    return read_file(path, "a network", do, MAX_BYTES - other_bytes)
+
+
+# words at the end of a key, by which pictures are prepared, and what they say of sRGB in [0, 1]
+_PREPARED = {
+    r"means?|mean_values": r"\W*0(\.0*)?(, *0(\.0*)?)*\W?",
+    r"stds?|std_values|scale_values": r"\W*1(\.0*)?(, *1(\.0*)?)*\W?",
+    r"channels?|channel_order|color_?(space|mode|format)|BitmapPixelFormat|layout": r"3|s?rgb8?|n?chw",
+    r"NominalPixelRange|range|ColorSpaceGamma": r"srgb|normalized_0_1|\W?0(\.0*)?, *1(\.0*)?\W?",
+    r"bgr|normali[sz](e|ation)|preprocess(ing)?|do_\w+": r"false|no|none|0",
+}
+_DESCRIPTIONS = "name|description|source|url|docs|version|licen[cs]e|author|date|format"
+_CARD_NOTES = "(?!.*(resize|crop|interpol|thresh|activation|softmax|sigmoid)).*"  # a card may hold any notes but these
+
+
+def check_entries(entries: Mapping[str, Any], source: Path, notes: str = _DESCRIPTIONS) -> None:
+    """Refuse entries of a card, or of a file's metadata, by which pictures are anything but sRGB in [0, 1]; warn of
+    others unless their keys match `notes`.
+    """
+    unused = []
+    for key, value in ((key[:60], value) for key, value in entries.items()):
+        text = f"{key} = {quote(value)}"
+        harmless = [values for words, values in _PREPARED.items() if re.fullmatch(rf"(.*[._ ])?({words})", key, re.I)]
+        if harmless and not re.fullmatch(harmless[0], str(value), re.I):
+            do = "prepare the pictures inside of the network, export it again, and remove this entry"
+            raise Refused("a network that takes sRGB in [0, 1]", f"{text} in {source}", do)
+        if not harmless and not re.fullmatch(notes, key, re.I):
+            unused.append(text)
+    if unused:
+        warnings.warn(f"{source} says what is not used: {summarize_names(unused)}", stacklevel=2)
 
 
 class Card(NamedTuple):
@@ -86,4 +135,5 @@ def read_card(path: Path) -> Card:
     kind = card.get("kind", Classifier.KIND)
     if kind not in (Classifier.KIND, Detector.KIND):
         raise Refused(f'kind, "{Classifier.KIND}" or "{Detector.KIND}"', f"{kind!r} in {path}", "write one of these")
+    check_entries(card, path, _CARD_NOTES)
     return Card(input_px, tuple(labels), kind)

@@ -13,10 +13,11 @@ from __future__ import annotations
 
 import hashlib
 import importlib
+import json
 import re
 import socket
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -34,7 +35,8 @@ from patchproof.classifier.custom import MAX_DETECTIONS, classifier_of, detector
 from patchproof.classifier.detector import Detector
 from patchproof.classifier.labels import nearest_names
 from patchproof.classifier.network import Classifier
-from patchproof.classifier.network_file import Card, network_bytes, read_card
+from patchproof.classifier.network_file import Card, check_entries, network_bytes, read_card
+from patchproof.networks.bounds import quote
 
 
 class Normalized(nn.Module):
@@ -153,6 +155,12 @@ def read_weights(path: Path) -> LocalWeights:
     except (SafetensorError, KeyError, ValueError, RuntimeError) as error:
         got = f"{path} that cannot be read ({error_summary(error)})"
         raise Refused("weights in safetensors", got, "save it again") from error
+    header = json.loads(stored[8 : 8 + int.from_bytes(stored[:8], "little")])
+    declared = header.get("__metadata__", {})
+    if declared.get("format", "pt") != "pt":  # of other libraries, whose weights lie in another order
+        got = f"format = {quote(declared['format'])} in {path}"
+        raise Refused("weights of PyTorch", got, "convert them with the library that wrote them")
+    check_entries(declared, path)
     card = path.with_suffix(".json")
     return LocalWeights(path, tensors, hashlib.sha256(stored).hexdigest(), read_card(card) if is_file(card) else None)
 
@@ -171,13 +179,18 @@ def _classifier(local: LocalWeights | None, network: Normalized, side_px: int, l
     return replace(classifier, sha256=local.sha256)
 
 
+def _shapes(tensors: Mapping[str, Tensor]) -> dict[str, str]:
+    """The shapes of weights by name; those of whole numbers say so, since quantized weights are no weights."""
+    kinds = {key: "" if tensor.is_floating_point() else " of whole numbers" for key, tensor in tensors.items()}
+    return {key: f"{tuple(tensors[key].shape)}{kind}" for key, kind in kinds.items() if not _UNUSED.fullmatch(key)}
+
+
 def load_weights(network: Any, local: LocalWeights, name: str, advice: str) -> None:
     """Load the file's weights into a network called `name`; refused, with the `advice`, where they do not fit it."""
-    network_shapes = {key: tensor.shape for key, tensor in network.state_dict().items() if not _UNUSED.fullmatch(key)}
-    file_shapes = {key: tensor.shape for key, tensor in local.tensors.items() if not _UNUSED.fullmatch(key)}
+    network_shapes, file_shapes = map(_shapes, (network.state_dict(), local.tensors))
     if wrong := sorted(network_shapes.items() ^ file_shapes.items()):
         key = wrong[0][0]
-        have, want = (tuple(shapes[key]) if key in shapes else "absent" for shapes in (file_shapes, network_shapes))
+        have, want = (shapes.get(key, "absent") for shapes in (file_shapes, network_shapes))
         raise Refused(f"weights of {name}", f"{local.path}, where {key} is {have} instead of {want}", advice)
     network.load_state_dict({key: local.tensors[key] for key in network_shapes}, strict=False)
 

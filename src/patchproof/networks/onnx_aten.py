@@ -8,7 +8,7 @@ core, November 2026).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -20,10 +20,15 @@ _ATEN = torch.ops.aten
 AtenCalls = list[tuple[Callable[..., Any], list[Any]]]  # operators, each with its arguments after the first
 
 
-def aten_calls(name: str, inputs: Sequence[Any], attributes: dict[str, Any], of_four: Collection[int]) -> AtenCalls:
-    """The operators for a node; `of_four` holds the numbers of weights and pictures, N×C×H×W."""
+def aten_calls(
+    name: str, inputs: Sequence[Any], attributes: dict[str, Any], of_four: Mapping[int | None, Any]
+) -> AtenCalls:
+    """The operators for a node; `of_four` holds the numbers of weights and pictures, N×C×H×W, with H×W of weights."""
     numbers = [item.number if type(item) is ValueRef else None for item in inputs]
-    if name == "Conv" and numbers[1] in of_four and not isinstance(inputs[-1], Tensor):
+    weight = numbers[1] if name == "Conv" else None
+    if weight in of_four and not isinstance(inputs[-1], Tensor):
+        if attributes.get("kernel_shape", of_four[weight]) != of_four[weight]:
+            return []
         return _conv(*inputs[1:], **attributes)
     if name == "Clip" and numbers[0] is not None:
         return _clip(*inputs[1:])

@@ -1,8 +1,8 @@
 """`file:NAME.onnx`: read an untrusted ONNX file without the library onnx.
 
-In: its bytes, and a function that reads NAME.onnx.data, where exporters put large weights. Out: a Program of numbered
-steps (graph.py), and how many pictures it takes; anything unsupported raises UnsupportedNetwork. Nothing of the file is
-executed, and no text of it becomes a path: the path in a weight's "location" is not followed.
+In: its bytes, and a function that reads the files where exporters put large weights, by a weight's "location". Out: a
+Program of numbered steps (graph.py), how many pictures it takes, and the file's metadata; anything unsupported raises
+UnsupportedNetwork, and so does every field and attribute that nothing here takes. Nothing of the file is executed.
 Left out on purpose: subgraphs (If, Loop), functions of the file, operators of other domains, sparse and quantized
 weights, opsets before 13, which onnx.version_converter converts to newer ones.
 
@@ -11,7 +11,10 @@ Source: github.com/onnx/onnx, onnx.proto (IR version 13).
 
 from __future__ import annotations
 
+import functools
+import hashlib
 import math
+from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
@@ -25,10 +28,11 @@ from patchproof.networks.graph import Program
 from patchproof.networks.onnx_aten import AtenCalls, aten_calls
 from patchproof.networks.onnx_operators import DTYPES, OPERATORS
 from patchproof.networks.onnx_shapes import MAX_SIZES
-from patchproof.networks.protobuf import BYTES, FLOAT, INT, TEXT, UNSUPPORTED, Schema, read_message
+from patchproof.networks.protobuf import BYTES, FLOAT, INT, TEXT, UNSUPPORTED, Schema, read_message, skipped
 from patchproof.networks.steps import InputDevice, Step, ValueRef, mark_last_uses
 
 OPSETS = (13, 28)
+_EXTERNAL = {"location", "offset", "length", "checksum"}  # what says where a weight lies in another file
 MAX_SCALARS = 8  # floats that stay on the CPU; a Resize has up to eight factors
 
 _ENTRY: Schema = {1: ("key", TEXT, False), 2: ("value", TEXT, False)}
@@ -46,6 +50,7 @@ _TENSOR: Schema = {
     11: ("unsigned", UNSUPPORTED, False),
     13: ("external", _ENTRY, True),
     14: ("place", INT, False),
+    **skipped(12, 16),
 }
 _ATTRIBUTE: Schema = {
     1: ("name", TEXT, False),
@@ -56,6 +61,8 @@ _ATTRIBUTE: Schema = {
     6: ("a graph within the graph", UNSUPPORTED, False),
     7: ("floats", FLOAT, True),
     8: ("ints", INT, True),
+    20: ("type", INT, False),
+    **skipped(13),
     **{number: ("an attribute of an unusual kind", UNSUPPORTED, True) for number in (9, 10, 11, 14, 15, 21, 22, 23)},
 }
 _NODE: Schema = {
@@ -65,42 +72,58 @@ _NODE: Schema = {
     5: ("attribute", _ATTRIBUTE, True),
     7: ("domain", TEXT, False),
     8: ("overload", UNSUPPORTED, False),
+    **skipped(3, 6, 9),
 }
-_SIZE: Schema = {1: ("value", INT, False), 2: ("symbol", TEXT, False)}
-_TYPE: Schema = {1: ("tensor", {1: ("kind", INT, False), 2: ("shape", {1: ("dim", _SIZE, True)}, False)}, False)}
-_PLACE: Schema = {1: ("name", TEXT, False), 2: ("type", _TYPE, False)}
+_SIZE: Schema = {1: ("value", INT, False), 2: ("symbol", TEXT, False), 3: ("denotation", TEXT, False)}
+_TYPE: Schema = {
+    1: ("tensor", {1: ("kind", INT, False), 2: ("shape", {1: ("dim", _SIZE, True)}, False)}, False),
+    **{number: ("an input that is no tensor", UNSUPPORTED, False) for number in (4, 5, 8, 9)},
+    **skipped(6),
+}
+_PLACE: Schema = {1: ("name", TEXT, False), 2: ("type", _TYPE, False), **skipped(3, 4)}
 _GRAPH: Schema = {
     1: ("node", _NODE, True),
     5: ("initializer", _TENSOR, True),
     11: ("input", _PLACE, True),
-    12: ("output", {1: ("name", TEXT, False)}, True),
+    12: ("output", {1: ("name", TEXT, False), **skipped(2, 3, 4)}, True),
+    14: ("quantized tensors", UNSUPPORTED, True),
     15: ("sparse weights", UNSUPPORTED, True),
+    **skipped(2, 10, 13, 16),
 }
 _MODEL: Schema = {
     7: ("graph", _GRAPH, False),
     8: ("opset", {1: ("domain", TEXT, False), 2: ("version", INT, False)}, True),
+    14: ("metadata", _ENTRY, True),
     20: ("training steps", UNSUPPORTED, True),
     25: ("functions of its own", UNSUPPORTED, True),
+    **skipped(1, 2, 3, 4, 5, 6),
 }
+# an attribute's type, as the file states it: where its value is, and the value where none is written
+_ATTRIBUTE_TYPES = {1: ("f", 0.0), 2: ("i", 0), 3: ("s", ""), 4: ("t", None), 6: ("floats", []), 7: ("ints", [])}
+_DENOTATIONS = ("DATA_BATCH", "DATA_CHANNEL", "DATA_FEATURE", "DATA_FEATURE")  # of a picture's dimensions
 
 
-def read_onnx(stored: bytes, read_data: Callable[[], bytes]) -> tuple[Program, int | None]:
-    """The network, and the number of pictures it takes (None: any). `read_data` reads NAME.onnx.data, at most once."""
+def read_onnx(stored: bytes, read_data: Callable[[str], bytes]) -> tuple[Program, int | None, dict[str, str]]:
+    """The network, the number of pictures it takes (None: any), and its metadata. `read_data` reads the file of weights
+    that a location names, each at most once.
+    """
     model = read_message(stored, _MODEL)
     versions = [opset.get("version", 0) for opset in model.get("opset", []) if opset.get("domain", "") in _STANDARD]
     if len(versions) != 1 or not OPSETS[0] <= versions[0] <= OPSETS[1]:
         raise UnsupportedNetwork(f"opset {quote(versions)[1:-1]}, not one from {OPSETS[0]} to {OPSETS[1]}")
-    return _GraphReader(model["graph"], _Weights(read_data)).read()
+    metadata = {entry.get("key", ""): entry.get("value", "") for entry in model.get("metadata", [])}
+    return *_GraphReader(model["graph"], _Weights(read_data)).read(), metadata
 
 
 _STANDARD = ("", "ai.onnx")
 
 
 class _Weights:
-    """Reads tensors from their descriptions; each byte of the other file belongs to one tensor at most."""
+    """Reads tensors from their descriptions; each byte of another file belongs to one tensor at most."""
 
-    def __init__(self, read_data: Callable[[], bytes]):
-        self.read_data, self.data, self.used_bytes, self.locations = read_data, b"", 0, set()
+    def __init__(self, read_data: Callable[[str], bytes]):
+        self.read_data, self.used_bytes = functools.cache(read_data), Counter[str]()
+        self.sha1 = functools.cache(lambda name: hashlib.sha1(self.read_data(name), usedforsecurity=False).hexdigest())
 
     def tensor(self, content: dict[str, Any]) -> Tensor:
         """Return the described tensor in memory of its own."""
@@ -123,15 +146,16 @@ class _Weights:
             lists = content.get("floats", []) if content["data_type"] == 1 else content.get("doubles", [])
             return content["raw"] if "raw" in content else b"".join(lists)
         where = {entry["key"]: entry["value"] for entry in content["external"]}
-        self.locations.add(where["location"])
-        if len(self.locations) > 1:
-            raise UnsupportedNetwork("weights in more than one other file")
-        self.data = self.data or self.read_data()
-        offset = checked_integer(int(where.get("offset", 0)), 0, len(self.data))
-        size = checked_integer(int(where.get("length", len(self.data))), 0, len(self.data))
-        part = memoryview(self.data)[offset : offset + size]
-        self.used_bytes += len(part)
-        if self.used_bytes > len(self.data):
+        if len(where) < len(content["external"]) or not where.keys() <= _EXTERNAL:
+            raise UnsupportedNetwork(f"entries {quote(sorted(where))} of external weights, some unknown or twice")
+        data = self.read_data(location := where["location"])
+        if "checksum" in where and where["checksum"].lower() != self.sha1(location):
+            raise UnsupportedNetwork(f"weights in {quote(location)} whose SHA-1 is not the stated checksum")
+        offset = checked_integer(int(where.get("offset", 0)), 0, len(data))
+        size = checked_integer(int(where.get("length", len(data))), 0, len(data))
+        part = memoryview(data)[offset : offset + size]
+        self.used_bytes[location] += len(part)
+        if self.used_bytes[location] > len(data):
             raise UnsupportedNetwork("weights that overlap")
         return part
 
@@ -152,7 +176,8 @@ class _GraphReader:
         self.graph, self.nodes = graph, graph.get("node", [])
         self.weights: list[Tensor] = []
         self.count = 0  # numbered values so far
-        self.of_four = set[int]()  # numbers of values known to have four dimensions
+        # values known to have four dimensions; of weights the last two
+        self.of_four: dict[int | None, list[int] | None] = {}
         self.values: dict[str, ValueRef | Tensor | None] = {"": None}  # an omitted input
         self.tensor = weights.tensor
 
@@ -163,17 +188,18 @@ class _GraphReader:
         inputs = [place for place in self.graph["input"] if place["name"] not in self.values]
         for node in self.nodes:
             if node["op_type"] == "Constant":
-                self._constant(node["output"][0], self._attribute(node["attribute"][0]))
+                ((_, value),) = self._attributes(node).items()
+                self._constant(node["output"][0], value)
         if len(inputs) != 1:
             raise UnsupportedNetwork(f"{len(inputs)} inputs, not one of N×3×S×S")
         batch, sizes = _shape(inputs[0]["type"]["tensor"])
         self.count = len(self.weights)
-        self.of_four = {number for number, weight in enumerate(self.weights) if weight.dim() == 4}
+        self.of_four |= {i: list(weight.shape[2:]) for i, weight in enumerate(self.weights) if weight.dim() == 4}
         self._new(inputs[0]["name"])
         steps = [step for node in self.nodes for step in self._steps(node)]
         outputs = [self._known(place["name"]) for place in self.graph["output"]]
         if len(outputs) != 1 or not isinstance(outputs[0], ValueRef):
-            raise UnsupportedNetwork(f"{len(outputs)} outputs, not one of N×K")
+            raise UnsupportedNetwork(f"{len(outputs)} outputs, not one of N×K, or N×A×(4+K) of a detector")
         mark_last_uses(steps, {*range(len(self.weights) + 1), outputs[0].number})
         return Program(self.weights, steps, outputs[0].number, sizes), batch
 
@@ -207,6 +233,8 @@ class _GraphReader:
         if domain not in _STANDARD or name not in (*OPERATORS, "Constant", "Identity"):
             raise UnsupportedNetwork(f"the operator {quote(f'{domain}.{name}'.lstrip('.'))}")
         is_split = name == "Split"  # the operator of several results
+        if name == "Identity" and node.get("attribute"):
+            raise UnsupportedNetwork("an attribute of Identity")
         if len(outputs) != 1 and not is_split:
             raise UnsupportedNetwork(f"{len(outputs)} results of {name}, where only the first is supported")
         inputs = [self._known(word) for word in node.get("input", [])]
@@ -229,7 +257,7 @@ class _GraphReader:
             steps.append(Step(compute, [value, *others], {}, [self.count], False, []))
             value, self.count = ValueRef(self.count), self.count + 1
         self._name(output, value)
-        self.of_four |= {value.number} if is_four else set()
+        self.of_four |= {value.number: None} if is_four else {}
         return steps
 
     def _attributes(self, node: dict[str, Any]) -> dict[str, Any]:
@@ -240,8 +268,11 @@ class _GraphReader:
 
     def _attribute(self, attribute: dict[str, Any]) -> Any:
         """A plain number, word or list of numbers, or a tensor."""
-        contents = {kind: content for kind, content in attribute.items() if kind != "name"}
-        if len(contents) != 1:
+        contents = {kind: content for kind, content in attribute.items() if kind not in ("name", "type")}
+        stated, default = _ATTRIBUTE_TYPES.get(attribute.get("type", 0), (None, None))
+        if default is not None:  # writers may leave out zeros and empty lists
+            contents = contents or {stated: default}
+        if len(contents) != 1 or (stated and stated not in contents):
             raise UnsupportedNetwork(f"the attribute {quote(attribute.get('name'))} of {len(contents)} kinds")
         ((kind, content),) = contents.items()
         if kind == "t":
@@ -255,9 +286,13 @@ def _shape(tensor: dict[str, Any]) -> tuple[int | None, list[int | None]]:
     """The batch size and the input's sizes; None where any size is allowed."""
     if tensor["kind"] != 1:
         raise UnsupportedNetwork("an input that is not float32")
-    sizes = [size.get("value") for size in tensor["shape"].get("dim", [])]
+    dimensions = tensor["shape"].get("dim", [])
+    sizes = [size.get("value") for size in dimensions]
     if len(sizes) != 4:
         raise UnsupportedNetwork(f"an input of {len(sizes)} dimensions, not N×3×S×S")
+    stated = [size.get("denotation") or right for size, right in zip(dimensions, _DENOTATIONS, strict=True)]
+    if stated != list(_DENOTATIONS):
+        raise UnsupportedNetwork(f"an input of the dimensions {quote(stated)}, not N×3×S×S")
     fixed = [None if size is None else checked_integer(size, 1, 1 << 16) for size in sizes]
     batch = None if fixed[0] is None else checked_integer(fixed[0], 1, bounds.MAX_BATCH)
     return batch, [None, *fixed[1:]]

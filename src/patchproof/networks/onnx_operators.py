@@ -24,7 +24,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 import patchproof.networks.onnx_shapes as shapes
-from patchproof.networks.bounds import UnsupportedNetwork
+from patchproof.networks.bounds import UnsupportedNetwork, quote
 from patchproof.networks.onnx_shapes import MAX_SIZES, numbers
 
 # the numbers of TensorProto.DataType
@@ -35,12 +35,28 @@ _ON_SIZES = frozenset(
     "LessOrEqual Neg Not Or Pow Range Reciprocal ReduceProd Reshape ScatterND Slice Split Sqrt Squeeze Sub Transpose "
     "Unsqueeze Where".split()
 )
+# attributes that have to have this value, or (None) that change nothing here
+FIXED_ATTRIBUTES: dict[str, dict[str, Any]] = {
+    "AveragePool": {"dilations": [1, 1]},
+    "BatchNormalization": {"training_mode": 0, "momentum": None},
+    "Cast": {"saturate": None},  # 8-bit floats
+    "Dropout": {"seed": None},
+    "GroupNormalization": {"stash_type": 1},
+    "LayerNormalization": {"stash_type": 1},
+    "MaxPool": {"storage_order": None},  # of the second result
+    "Resize": {
+        **{"antialias": 0, "cubic_coeff_a": -0.75, "exclude_outside": 0, "keep_aspect_ratio_policy": "stretch"},
+        "extrapolation_value": None,  # of crops
+    },
+    "ScatterND": {"reduction": "none"},
+}
 
 
 class Operator:
     """A line of the table, as a function of the pictures' device and the operator's inputs."""
 
     def __init__(self, name: str, compute: Callable[..., Any]):
+        self.fixed = FIXED_ATTRIBUTES.get(name, {})
         self.compute, self.on_sizes, self.signature = compute, name in _ON_SIZES, inspect.signature(compute)
         kinds = [parameter.kind for parameter in self.signature.parameters.values()]
         variadic = inspect.Parameter.VAR_POSITIONAL in kinds
@@ -48,9 +64,13 @@ class Operator:
         self.needs_device = "device" in self.signature.parameters
 
     def check(self, inputs: Sequence[Any], attributes: dict[str, Any]) -> None:
-        """Raise UnsupportedNetwork for inputs or attributes that the operator does not take."""
+        """Raise UnsupportedNetwork for inputs or attributes that the operator does not take; remove fixed ones."""
         if "device" in attributes:
             raise UnsupportedNetwork("an attribute 'device'")
+        for name in self.fixed.keys() & attributes.keys():
+            if self.fixed[name] is not None and repr(attributes[name]) != repr(self.fixed[name]):
+                raise UnsupportedNetwork(f"the attribute {name} = {quote(attributes[name])}")
+            del attributes[name]
         try:
             self.signature.bind(*inputs, **attributes, **({"device": None} if self.needs_device else {}))
         except TypeError as error:
@@ -79,33 +99,38 @@ def _pad_unevenly(x: Tensor, pads: list[int] | None, limits: Sequence[float], fi
     return F.pad(x, shapes.in_torchs_order(list(zip(before, after, strict=True))), value=fill), [0] * n
 
 
-def _check_auto_pad(auto_pad: str) -> None:
-    if auto_pad not in ("NOTSET", "VALID"):
+def _check_auto_pad(auto_pad: str, pads: list[int] | None) -> None:
+    if auto_pad not in ("NOTSET", "VALID") or (auto_pad == "VALID" and any(pads or [])):
         raise ValueError("paddings that depend on the size (auto_pad)")
 
 
 def _conv(x, w, b=None, /, *, auto_pad="NOTSET", dilations=None, group=1, kernel_shape=None, pads=None, strides=None):
-    _check_auto_pad(auto_pad)
+    _check_auto_pad(auto_pad, pads)
+    if kernel_shape not in (None, list(w.shape[2:])):
+        raise ValueError(f"weights of {tuple(w.shape)} for kernel_shape = {kernel_shape}")
     ones = [1] * (x.dim() - 2)
     x, padding = _pad_unevenly(x, pads, [math.inf] * len(ones), 0.0)
     return torch.convolution(x, w, b, strides or ones, padding, dilations or ones, False, [0] * len(ones), group)
 
 
-def _max_pool(
-    x, /, *, kernel_shape, auto_pad="NOTSET", ceil_mode=0, dilations=None, pads=None, storage_order=0, strides=None
-):
-    _check_auto_pad(auto_pad)
-    x, padding = _pad_unevenly(x, pads, [size // 2 for size in kernel_shape], -math.inf)
-    return F.max_pool2d(x, kernel_shape, strides or [1, 1], padding, dilations or [1, 1], bool(ceil_mode))
+def _max_pool(x, /, *, kernel_shape, auto_pad="NOTSET", ceil_mode=0, dilations=None, pads=None, strides=None):
+    _check_auto_pad(auto_pad, pads)
+    pads, strides = pads or [0] * 4, strides or [1, 1]
+    if any(pad >= size for pad, size in zip(pads, kernel_shape * 2, strict=True)):
+        raise ValueError(f"a MaxPool of kernel_shape = {kernel_shape} with windows in its padding")
+    padded, padding = _pad_unevenly(x, pads, [size // 2 for size in kernel_shape], -math.inf)
+    pooled = F.max_pool2d(padded, kernel_shape, strides, padding, dilations or [1, 1], bool(ceil_mode))
+    if ceil_mode:  # no window begins in the padding at the end, which torch does not know where it was padded above
+        ends = [math.ceil((x.shape[2 + i] + pads[i]) / strides[i]) for i in (0, 1)]
+        pooled = pooled[..., : ends[0], : ends[1]]
+    return pooled
 
 
-def _average_pool(
-    x, /, *, kernel_shape, auto_pad="NOTSET", ceil_mode=0, count_include_pad=0, dilations=None, pads=None, strides=None
-):
-    _check_auto_pad(auto_pad)
+def _average_pool(x, /, *, kernel_shape, auto_pad="NOTSET", ceil_mode=0, count_include_pad=0, pads=None, strides=None):
+    _check_auto_pad(auto_pad, pads)
     padded, padding = _pad_unevenly(x, pads, [size // 2 for size in kernel_shape], 0.0)
-    if set(dilations or [1]) != {1} or (padded is not x and (ceil_mode or not count_include_pad)):
-        raise ValueError("an AveragePool with dilations, or with different paddings before and after")
+    if padded is not x and (ceil_mode or not count_include_pad):
+        raise ValueError("an AveragePool with different paddings before and after")
     return F.avg_pool2d(padded, kernel_shape, strides or [1, 1], padding, bool(ceil_mode), bool(count_include_pad))
 
 
@@ -117,18 +142,12 @@ def _gemm(a, b, c=None, /, *, alpha=1.0, beta=1.0, transA=0, transB=0):
 # --- normalization ---
 
 
-def _batch_norm(x, scale, b, mean, var, /, *, epsilon=1e-5, momentum=0.9, training_mode=0):
-    if training_mode:
-        raise ValueError("a BatchNormalization in training mode")
-    return F.batch_norm(x, mean, var, scale, b, False, 0.0, epsilon)
-
-
-def _group_norm(x, scale, b, /, *, num_groups, epsilon=1e-5, stash_type=1):
+def _group_norm(x, scale, b, /, *, num_groups, epsilon=1e-5):
     repeats = x.shape[1] // len(scale)  # before opset 21, there is one scale for each group
     return F.group_norm(x, num_groups, scale.repeat_interleave(repeats), b.repeat_interleave(repeats), epsilon)
 
 
-def _dropout(x, /, ratio=None, training_mode=None, *, seed=None):
+def _dropout(x, /, ratio=None, training_mode=None):
     if any(numbers(training_mode)):
         raise ValueError("a Dropout in training mode")
     return x
@@ -149,13 +168,13 @@ def _variadic(compute: Callable[[Tensor, Tensor], Tensor]) -> Callable[..., Tens
     return lambda *tensors: functools.reduce(compute, tensors)
 
 
-def _reduction(compute: Callable[..., Tensor]) -> Callable[..., Tensor]:
-    """A sum or an extreme along `axes`, by default along all."""
+def _reduction(compute: Callable[..., Tensor], of_one: Callable[..., Tensor] = lambda x: x) -> Callable[..., Tensor]:
+    """A sum or an extreme along `axes`, by default along all; `of_one` computes that of each number alone."""
 
     def computed(x, /, axes=None, *, keepdims=1, noop_with_empty_axes=0):
         dims = numbers(axes)
         if not dims and noop_with_empty_axes:
-            return x
+            return of_one(x)
         return compute(x, dims or list(range(x.dim())), keepdim=bool(keepdims))
 
     return computed
@@ -181,7 +200,7 @@ _TABLE: dict[str, Callable[..., Any]] = {
     "Gelu": lambda x, /, *, approximate="none": F.gelu(x, approximate=approximate),
     "Softmax": lambda x, /, *, axis=-1: x.softmax(axis),
     "LogSoftmax": lambda x, /, *, axis=-1: x.log_softmax(axis),
-    "Cast": lambda x, /, *, to, saturate=1: x.to(DTYPES[to]),
+    "Cast": lambda x, /, *, to: x.to(DTYPES[to]),
     # of two or more
     **{name: _binary(getattr(torch, name.lower())) for name in ("Add", "Sub", "Mul", "MatMul", "Greater", "Less")},
     "Div": _binary(lambda a, b: a / b if a.is_floating_point() else torch.div(a, b, rounding_mode="trunc")),
@@ -206,13 +225,15 @@ _TABLE: dict[str, Callable[..., Any]] = {
     "ReduceMax": _reduction(torch.amax),
     "ReduceMin": _reduction(torch.amin),
     "ReduceProd": _reduction(_product),
-    "ReduceL2": _reduction(lambda x, along, keepdim: torch.linalg.vector_norm(x, 2, along, keepdim)),
+    "ReduceL2": _reduction(lambda x, along, keepdim: torch.linalg.vector_norm(x, 2, along, keepdim), torch.abs),
     # windows and norms
     "Conv": _conv,
     "MaxPool": _max_pool,
     "AveragePool": _average_pool,
-    "BatchNormalization": _batch_norm,
-    "LayerNormalization": lambda x, scale, b=None, /, *, axis=-1, epsilon=1e-5, stash_type=1: F.layer_norm(
+    "BatchNormalization": lambda x, scale, b, mean, var, /, *, epsilon=1e-5: F.batch_norm(
+        x, mean, var, scale, b, False, 0.0, epsilon
+    ),
+    "LayerNormalization": lambda x, scale, b=None, /, *, axis=-1, epsilon=1e-5: F.layer_norm(
         x, x.shape[axis:], scale, b, epsilon
     ),
     "GroupNormalization": _group_norm,

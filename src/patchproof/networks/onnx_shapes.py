@@ -67,10 +67,8 @@ def gather(x, indices, /, *, axis=0):
     return x.index_select(axis, positions.reshape(-1)).reshape(x.shape[:axis] + indices.shape + x.shape[axis + 1 :])
 
 
-def scatter_nd(x, indices, updates, /, *, reduction="none"):
+def scatter_nd(x, indices, updates, /):
     """Put `updates` in the places that `indices` name."""
-    if reduction != "none":
-        raise ValueError("a ScatterND that adds")
     return x.index_put(tuple(indices.unbind(-1)), updates)
 
 
@@ -97,10 +95,10 @@ def arange(start, limit, delta, *, device):
     return torch.arange(first, end, step, dtype=start.dtype, device="cpu" if is_short else device)
 
 
-_PIXEL_GRIDS = ("half_pixel", "pytorch_half_pixel", "align_corners")  # the second differs for results of one pixel
+_PIXEL_GRIDS = ("half_pixel", "pytorch_half_pixel", "align_corners")
 _RESIZED = {
     ("nearest", "asymmetric", "floor"): "nearest",
-    ("nearest", "half_pixel", "round_prefer_floor"): "nearest-exact",
+    **{("nearest", "half_pixel", f"round_prefer_{end}"): "nearest-exact" for end in ("floor", "ceil")},
     **{("linear", grid): "bilinear" for grid in _PIXEL_GRIDS},
     **{("cubic", grid): "bicubic" for grid in _PIXEL_GRIDS},
 }
@@ -108,14 +106,23 @@ _RESIZED = {
 
 def resize(
     x, /, roi=None, scales=None, sizes=None, *, mode="nearest", coordinate_transformation_mode="half_pixel",
-    nearest_mode="round_prefer_floor", cubic_coeff_a=-0.75, extrapolation_value=0.0
+    nearest_mode="round_prefer_floor"
 ):  # fmt: skip
-    """Resize pictures by factors or sizes for all four dimensions."""
+    """Resize pictures by factors or sizes for all four dimensions; refused where torch would take the other one of two
+    equally near pixels, or another place for a result of one pixel.
+    """
     corners = coordinate_transformation_mode
     kind = _RESIZED.get((mode, corners, nearest_mode) if mode == "nearest" else (mode, corners))
     factors, target = numbers(scales), numbers(sizes)
     keeps_batch = factors[:2] == [1, 1] if factors else target[:2] == list(x.shape[:2])
-    if kind is None or not keeps_batch or cubic_coeff_a != -0.75:
+    after = target[2:] or [int(size * factor) for size, factor in zip(x.shape[2:], factors[2:], strict=True)]
+    ratios = factors[2:] or [new / old for new, old in zip(after, x.shape[2:], strict=True)]
+    if mode == "nearest":
+        differs = nearest_mode == "round_prefer_floor" and any(ratio % 1 for ratio in ratios)
+    else:
+        lone = any(new == 1 < old for new, old in zip(after, x.shape[2:], strict=True))
+        differs = corners == "pytorch_half_pixel" and lone
+    if kind is None or not keeps_batch or differs:
         raise ValueError(f"a Resize of an unsupported kind ({mode}, {corners})")
     options: dict[str, Any] = {} if mode == "nearest" else {"align_corners": corners == "align_corners"}
     return F.interpolate(x, target[2:] or None, factors[2:] or None, kind, **options)

@@ -2,7 +2,7 @@
 
 In: untrusted bytes. Out: names, numbers and views of the bytes, or UnsupportedNetwork. Messages are nested as deep as
 the schema and no deeper, all fields are counted before they are kept, and bytes are not copied: Google's own reader
-makes 810 MB of a hostile file of 10 MB. Fields that the schema does not name are skipped.
+makes 810 MB of a hostile file of 10 MB. A field that the schema does not name is refused, since it may mean anything.
 
 Source: protobuf.dev/programming-guides/encoding.
 """
@@ -20,9 +20,14 @@ MAX_FIELDS = 1 << 19  # in a file; Swin's, which computes all its sizes, has 57 
 MAX_ITEMS = 1 << 15  # of one kind in a message
 MAX_TEXT = 1 << 16  # bytes of a name, which is a path through modules
 
-INT, FLOAT, TEXT, BYTES, UNSUPPORTED = "int", "float", "text", "bytes", "never"
+INT, FLOAT, TEXT, BYTES, UNSUPPORTED, SKIPPED = "int", "float", "text", "bytes", "never", "skipped"
 # by a field's number: its name, its kind (a schema for a message), and whether it may be repeated
 Schema = dict[int, tuple[str, Any, bool]]
+
+
+def skipped(*numbers: int) -> Schema:
+    """Fields that change nothing: names, comments, versions of exporters."""
+    return {number: ("", SKIPPED, True) for number in numbers}
 
 
 def read_message(stored: bytes, schema: Schema) -> dict[str, Any]:
@@ -40,8 +45,10 @@ class _MessageReader:
         table: dict[str, Any] = {}
         for number, content in self._fields(data):
             if number not in schema:
-                continue
+                raise UnsupportedNetwork(f"a field of the unknown number {number}")
             name, kind, repeated = schema[number]
+            if kind == SKIPPED:
+                continue
             if repeated:
                 items = table.setdefault(name, [])
                 items.extend(self._values(content, kind, name))

@@ -9,6 +9,7 @@ export.
 
 from __future__ import annotations
 
+import warnings as python_warnings
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -66,11 +67,12 @@ def preview_scene(scene_path: str | Path, out: str | Path, *, overwrite: bool = 
     settings = load_scene_settings(path)
     with new_folder(out, (PAGE, OBJECT), overwrite) as folder:
         scene, refused = _scene(settings, path.resolve().parent)
-        classifiers = [load_classifier(name, scene.base) for name in settings.target.models]
+        with python_warnings.catch_warnings(action="always", record=True) as said:
+            classifiers = [load_classifier(name, scene.base) for name in settings.target.models]
         indices, unknown = _indices(settings, [classifier.labels for classifier in classifiers])
         stage = set_stage(scene)
         views = sample_views(stage, classifiers, indices)
-        warnings = (*scene.warnings, *_up_warning(scene, settings))
+        warnings = (*scene.warnings, *_up_warning(scene, settings), *(str(each.message) for each in said))
         sides, turns = [], []
         if isinstance(scene, MeshScene):
             design = _gray_design(stage)
