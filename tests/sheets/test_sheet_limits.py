@@ -7,8 +7,11 @@ import signal
 import subprocess
 import sys
 import time
+from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
+import numpy as np
 import pikepdf
 import pytest
 from fuzz.pdf_bombs import PDF_BOMBS
@@ -18,6 +21,8 @@ from patchproof.base import input as bounds
 from patchproof.base.errors import Refused
 from patchproof.sheets import pdf_raster
 from patchproof.sheets.blank import blank_sheet
+from patchproof.sheets.declarations import DECLARED
+from patchproof.sheets.manifest import Manifest
 from patchproof.sheets.pdf_raster import attached_manifest, rasterize_page
 from patchproof.sheets.print_advice import pdf_advice
 
@@ -93,3 +98,75 @@ def test_a_process_that_has_left_a_page_behind_ends_as_any_other(tmp_path):
     command = [sys.executable, "-c", code, str(tmp_path / "endless.pdf")]
     done = subprocess.run(command, capture_output=True, check=False, timeout=60)
     assert (done.returncode, done.stderr) == (7, b"")
+
+
+@cache
+def one_sheet(suffix: str) -> bytes:
+    with TemporaryDirectory() as folder:
+        blank_sheet("blank_a4", Path(folder) / "s.pdf")
+        return (Path(folder) / f"s.{suffix}").read_bytes()
+
+
+def declaring(path: Path, **entries) -> Path:
+    """A small sheet whose first page declares something."""
+    path.write_bytes(one_sheet("pdf"))
+    with pikepdf.open(path, allow_overwriting_input=True) as pdf:
+        for name, value in entries.items():
+            pdf.pages[0][f"/{name}"] = value
+        pdf.save(path)
+    return path
+
+
+def is_refused(path: Path) -> bool:
+    """True if the first page, or the manifest in the file, is not read."""
+    try:
+        attached_manifest(path)
+        rasterize_page(path, 1, 20)
+    except Refused:
+        return True
+    return False
+
+
+def with_password(path: Path) -> Path:
+    with pikepdf.open(declaring(path), allow_overwriting_input=True) as pdf:
+        pdf.save(path, encryption=pikepdf.Encryption(owner="a", user="b"))
+    return path
+
+
+def shifted(path: Path) -> bool:
+    """True if a page whose corner lies elsewhere shows the same pixels."""
+    right = rasterize_page(declaring(path), 1, 20)
+    with pikepdf.open(path, allow_overwriting_input=True) as pdf:
+        page = pdf.pages[0]
+        x, y, right_end, top = (float(value) for value in page.mediabox)
+        page.contents_add(b"1 0 0 1 30 20 cm", prepend=True)
+        for box in [name for name in page.keys() if name.endswith("Box")]:
+            page[box] = [x + 30, y + 20, right_end + 30, top + 20]
+        pdf.save(path)
+    return bool(np.abs(rasterize_page(path, 1, 20).astype(int) - right).mean() < 0.5)
+
+
+def more_pages(path: Path) -> bool:
+    before = attached_manifest(declaring(path))
+    with pikepdf.open(path, allow_overwriting_input=True) as pdf:
+        pdf.add_blank_page()
+        pdf.save(path)
+    return attached_manifest(path) == before and not is_refused(path)
+
+
+CASES = {  # by what is declared: True if the answer is that of the list
+    "attached manifest": lambda path: (
+        attached_manifest(declaring(path)) == Manifest.model_validate_json(one_sheet("json"))
+    ),
+    "pages": more_pages,
+    "MediaBox": shifted,
+    "CropBox other than the MediaBox": lambda path: is_refused(declaring(path, CropBox=[9, 9, 300, 300])),
+    "Rotate": lambda path: is_refused(declaring(path, Rotate=90)),
+    "UserUnit": lambda path: is_refused(declaring(path, UserUnit=2)),
+    "a password": lambda path: is_refused(with_password(path)),
+}
+
+
+@pytest.mark.parametrize("entry", DECLARED, ids=lambda entry: entry.declares)
+def test_what_a_pdf_declares_is_used_or_refused(entry, tmp_path):
+    assert CASES[entry.declares](tmp_path / "s.pdf")

@@ -95,6 +95,8 @@ def _attached_texts(pdf_path: str | Path) -> dict[str, Any]:
     try:
         with pikepdf.open(pdf_path) as pdf:
             names = sorted(set(pdf.attachments) & {ATTACHMENT, *(numbered_name(ATTACHMENT, i) for i in range(99))})
+            if any(page.get("/UserUnit", 1) != 1 for page in pdf.pages):
+                raise ValueError("pages in another unit")
             return {name: json.loads(_decompress(pdf.attachments[name].get_file().obj)) for name in names}
     except pikepdf.PdfError as error:
         raise _unreadable(pdf_path) from error
@@ -159,11 +161,22 @@ def _call_with_page(pdf_path: str | Path, number: int, work: Callable[[Any], np.
         if not page:
             raise _unreadable(pdf_path)
         try:
+            if pdfium.FPDFPage_GetRotation(page) or _is_cropped(page):
+                raise Refused("a page as the sheet was made", f"{pdf_path} with one turned or cropped", "make it again")
             return work(page)
         finally:
             pdfium.FPDF_ClosePage(page)
 
     return _call_with_pdf(pdf_path, call)
+
+
+def _is_cropped(page) -> bool:
+    """True if the page has a crop box other than its media box, from whose corner millimeters are counted."""
+    import pypdfium2.raw as pdfium
+
+    media, crop = ([ctypes.c_float() for _ in range(4)] for _ in range(2))
+    both = pdfium.FPDFPage_GetMediaBox(page, *media) and pdfium.FPDFPage_GetCropBox(page, *crop)
+    return bool(both) and any(abs(a.value - b.value) > 0.01 for a, b in zip(media, crop, strict=True))
 
 
 def _render(page, rect_points: tuple[float, ...], size_px: tuple[int, int]) -> np.ndarray:
