@@ -112,7 +112,7 @@ def test_memory_is_limited_while_a_photograph_is_read(tmp_path, monkeypatch):
             np.empty(limits.MOST_BYTES + 2**28, np.uint8)
     np.empty(limits.MOST_BYTES + 2**28, np.uint8)
     Image.new("RGB", (40, 40)).save(tmp_path / "a.png")
-    monkeypatch.setattr(read, "_decode_pixels", lambda image, step: np.empty(limits.MOST_BYTES + 2**28, np.uint8))
+    monkeypatch.setattr(read, "_decode_pixels", lambda *_: np.empty(limits.MOST_BYTES + 2**28, np.uint8))
     with pytest.raises(PhotoRejected, match="too_costly: the picture takes too much memory: save it smaller"):
         read_photo(tmp_path / "a.png")
 

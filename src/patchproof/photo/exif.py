@@ -12,6 +12,9 @@ from __future__ import annotations
 
 import math
 import re
+import struct
+from collections.abc import Mapping
+from typing import Any
 
 _DIAGONAL_35MM = 43.2666  # mm, of the 36×24 mm frame that FocalLengthIn35mmFilm refers to
 EXIF_SPREAD = 0.03  # of its logarithm: rounding to whole millimeters at 26 mm (0.011), and tolerances of lenses
@@ -19,39 +22,45 @@ LOOSE_SPREAD = 0.1
 _SENSOR_SHAPES, _CUT_SHAPES = (4 / 3, 3 / 2), (16 / 9,)
 _SAME_SHAPE = 0.01
 _EDITOR = re.compile(r"photoshop|lightroom|gimp|snapseed|darktable|affinity|paint|pixelmator|capture one|luminar", re.I)
-_EXIF_IFD, _FOCAL_35MM, _WIDTH, _HEIGHT, _ZOOM, _SOFTWARE = 0x8769, 0xA405, 0xA002, 0xA003, 0xA404, 0x0131
+EXIF_IFD, _FOCAL_35MM, _WIDTH, _HEIGHT, _ZOOM, _SOFTWARE = 0x8769, 0xA405, 0xA002, 0xA003, 0xA404, 0x0131
 _COMMENT = 0x9286  # marks screenshots of phones and desktops of one maker
 _SCREEN = re.compile(r"screen.?shot", re.I)
 
 
-def read_focal(image) -> tuple[float | None, float, bool]:
-    """(focal length in pixels or None, standard deviation of its logarithm, True if EXIF has one that was rejected)."""
+def exif_tags(image, inner_list: int = 0) -> Mapping[int, Any]:
+    """A picture's EXIF tags, or those of an inner list; none if they cannot be read."""
     try:
         exif = image.getexif()
-        details = exif.get_ifd(_EXIF_IFD)
-    except (TypeError, ValueError, ZeroDivisionError, KeyError, SyntaxError, OSError):
-        return None, EXIF_SPREAD, False
+        return exif.get_ifd(inner_list) if inner_list else exif
+    except (TypeError, ValueError, ArithmeticError, LookupError, SyntaxError, OSError, struct.error):
+        return {}
+
+
+def _stated_sides(details: Mapping[int, Any]) -> list[float]:
+    """The shorter and the longer side in pixels that EXIF states; empty if it does not state both."""
+    sides = sorted(side for key in (_WIDTH, _HEIGHT) if (side := _number(details.get(key))) is not None)
+    return sides if len(sides) == 2 else []
+
+
+def read_focal(image) -> tuple[float | None, float, bool]:
+    """(focal length in pixels or None, standard deviation of its logarithm, True if EXIF has one that was rejected)."""
+    details, (long, short) = exif_tags(image, EXIF_IFD), sorted(image.size, reverse=True)
     focal_35mm, zoom = _number(details.get(_FOCAL_35MM)), _number(details.get(_ZOOM))
     if focal_35mm is None:  # 0 means unknown in EXIF
         return None, EXIF_SPREAD, False
-    stated = [side for key in (_WIDTH, _HEIGHT) if (side := _number(details.get(key))) is not None]
-    long, short = max(image.size), min(image.size)
-    resized = len(stated) == 2 and sorted(stated) != [short, long]
+    resized = bool(stated := _stated_sides(details)) and stated != [short, long]
     if resized or (zoom is not None and zoom > 1.01) or not _has_shape(long, short, _SENSOR_SHAPES + _CUT_SHAPES):
         return None, EXIF_SPREAD, True
-    edited = bool(_EDITOR.search(str(exif.get(_SOFTWARE, ""))))
+    edited = bool(_EDITOR.search(str(exif_tags(image).get(_SOFTWARE, ""))))
     uncertain = edited or not _has_shape(long, short, _SENSOR_SHAPES)
     return focal_35mm / _DIAGONAL_35MM * math.hypot(long, short), LOOSE_SPREAD if uncertain else EXIF_SPREAD, False
 
 
 def is_crop(image, name: str) -> bool:
     """True if EXIF states another shape than the picture's, or EXIF or the file's name declares a screenshot."""
-    try:
-        details = image.getexif().get_ifd(_EXIF_IFD)
-    except (TypeError, ValueError, ZeroDivisionError, KeyError, SyntaxError, OSError):
-        details = {}
-    stated = [side for key in (_WIDTH, _HEIGHT) if (side := _number(details.get(key))) is not None]
-    reshaped = len(stated) == 2 and not _has_shape(max(image.size), min(image.size), (max(stated) / min(stated),))
+    details = exif_tags(image, EXIF_IFD)
+    stated = _stated_sides(details)
+    reshaped = bool(stated) and not _has_shape(max(image.size), min(image.size), (stated[1] / stated[0],))
     comment = details.get(_COMMENT, "")
     comment = comment.decode("latin-1").replace("\0", "") if isinstance(comment, bytes) else str(comment)
     return reshaped or bool(_SCREEN.search(name) or _SCREEN.search(comment))

@@ -1,22 +1,23 @@
 """Read a photograph as upright 8-bit sRGB pixels, with its focal length if the camera wrote one.
 
-In: any still picture that Pillow reads as one of `IMAGE_FORMATS` (HEIC with the `heic` extra). Out: `Photo`. EXIF
-orientation is applied, an embedded color profile (phones write Display P3) is converted to sRGB, alpha is put on white,
-deeper channels become 8-bit. A file that cannot be read raises `PhotoRejected("unreadable")`, one that exceeds `limits`
-"too_costly", so that a bad file never stops a batch. Pixels are converted in strips, since whole copies take twice the
-memory; above `WHOLE_PX` four pixels become one, since measuring takes up to 30 bytes each. Complete JPEG files are
-decoded by OpenCV, which prints warnings about damaged data on stderr.
-Ignored on purpose: the DPI that a photograph states, and sidecar files.
+In: any still picture that Pillow reads as one of `IMAGE_FORMATS` (HEIC with the `heic` extra). Out: `Photo`.
+Orientation is applied once, the color space that the file declares is converted to sRGB, alpha is put on white, deeper
+channels become 8-bit; `declarations` lists all that files can declare, and `Photo.said` what was left aside. A file
+that cannot be read, or not all of it, raises `PhotoRejected("unreadable")`, one that exceeds `limits` "too_costly", so
+that a bad file never stops a batch. Pixels are converted in strips, since whole copies take twice the memory; above
+`WHOLE_PX` four pixels become one, since measuring takes up to 30 bytes each.
+Ignored on purpose: sidecar files, dates and places, what a camera's maker notes say of its lens.
 """
 
 from __future__ import annotations
 
-import io
 import os
+import re
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -24,12 +25,15 @@ import numpy as np
 from patchproof.base.errors import Refused
 from patchproof.base.input import MAX_IMAGE_PX, is_file, is_folder, limit_memory, open_lazily
 from patchproof.base.validation import summarize_names
-from patchproof.photo.exif import EXIF_SPREAD, is_crop, read_focal
+from patchproof.photo.color_space import SRGB_PRIMARIES, ColorSpace, color_space, eight_bits, rgb_space
+from patchproof.photo.deep_codes import deep_codes
+from patchproof.photo.exif import EXIF_SPREAD, exif_tags, is_crop, read_focal
+from patchproof.photo.jpeg import decode_jpeg
 from patchproof.photo.limits import MOST_BYTES, run_limited
 from patchproof.photo.rejection import PhotoRejected
 
 SUFFIXES = frozenset(".jpg .jpeg .jpe .png .tif .tiff .webp .bmp .gif .mpo .avif .heic .heif".split())
-_ORIENTATION = 0x0112
+_ORIENTATION, _XMP_ORIENTATION = 0x0112, re.compile(rb"tiff:Orientation\s*(?:=\s*[\"']|>)\s*([1-8])")
 # the operation that makes the pixels of each orientation upright (EXIF 2.32)
 _UPRIGHT: dict[int, Callable[[np.ndarray], np.ndarray]] = {
     2: lambda a: a[:, ::-1],
@@ -46,7 +50,14 @@ WHOLE_PX = 30_000_000  # few cameras except phones give more; markers are search
 _SKIPPED_KINDS = (
     (".mov .mp4 .m4v .avi .mkv .webm .3gp .mts", "videos, which are not read (take still photographs)"),
     (".dng .cr2 .cr3 .nef .arw .raf .orf .rw2 .pef .srw", "raw files, which are not read (save them as JPEG)"),
+    (".pdf .jxl .jp2 .psd", "files of other kinds, which are not read (save each page as JPEG or PNG)"),
 )
+TWO_ORIENTATIONS = "orientations in XMP that contradict EXIF's, which is used"
+MORE_PAGES = "pages or pictures after the first in a file, which are not read (save each as a file of its own)"
+GAIN_MAP = "gain maps for HDR screens, which are not applied"
+EXTRA_CHANNELS = "extra channels that are neither color nor transparency"
+_GAIN_MAPS = (b"hdrgm:Version", b"iso:ts:21496:-1", b"hdrgainmap")  # Adobe's and Android's, ISO's, a phone maker's
+_HEAD_BYTES, _EXTRA_SAMPLES = 1 << 16, 338
 _TOO_DEEP = "folders in folders, which are not read (one folder for each session)"
 
 
@@ -59,6 +70,8 @@ class Photo:
     focal_spread: float = EXIF_SPREAD  # standard deviation of the focal length's logarithm
     focal_rejected: bool = False  # EXIF has a focal length that does not fit this picture
     is_crop: bool = False  # a crop or a screenshot, as far as file name and EXIF tell
+    dpi: tuple[float, ...] = ()  # (x, y) as the file states it, for scans; 0 or empty if it does not
+    said: tuple[str, ...] = ()  # what the file declares and is left aside, a phrase for each kind
 
 
 def read_photo(path: str | Path) -> Photo:
@@ -69,9 +82,9 @@ def read_photo(path: str | Path) -> Photo:
     _allow_heic(path)
     try:
         with limit_memory(MOST_BYTES):
-            srgb, orientation, focal, crop = run_limited(_decode, path)
+            srgb, orientation, fields = run_limited(_decode, path)
             # the memory of Pillow's picture has been freed by now
-            return Photo(np.ascontiguousarray(_UPRIGHT.get(orientation, np.asarray)(srgb)), *focal, crop)
+            return Photo(np.ascontiguousarray(_UPRIGHT.get(orientation, np.asarray)(srgb)), **fields)
     except PhotoRejected:
         raise
     except Exception as error:  # decoders fail in many ways: OSError, SyntaxError, struct.error...
@@ -80,8 +93,8 @@ def read_photo(path: str | Path) -> Photo:
         raise _unreadable(_advice(path, error)) from error
 
 
-def _decode(path: Path) -> tuple[np.ndarray, int, tuple[float | None, float, bool], bool]:
-    """(uint8 sRGB H×W×3 as stored, EXIF orientation, `read_focal`, `is_crop`); above `WHOLE_PX` at half size."""
+def _decode(path: Path) -> tuple[np.ndarray, int, dict[str, Any]]:
+    """(uint8 sRGB H×W×3 as stored, orientation, the other fields of `Photo`); above `WHOLE_PX` at half size."""
     if (size := path.stat().st_size) > MOST_BYTES:
         raise _too_large(f"a file of {size / 1e9:.1f} GB is too large: save it smaller", size, MOST_BYTES)
     with warnings.catch_warnings():
@@ -91,9 +104,43 @@ def _decode(path: Path) -> tuple[np.ndarray, int, tuple[float | None, float, boo
             if pixels > MAX_IMAGE_PX:
                 raise _too_large(f"{pixels / 1e6:.0f} megapixels are too many: save it smaller", pixels, MAX_IMAGE_PX)
             step = 2 if pixels > WHOLE_PX and min(image.size) > 1 else 1
-            (focal_px, spread, rejected), orientation = read_focal(image), image.getexif().get(_ORIENTATION, 1)
-            focal, crop = (focal_px and focal_px / step, spread, rejected), is_crop(image, path.name)
-            return _decode_pixels(image, step), orientation if isinstance(orientation, int) else 1, focal, crop
+            focal_px, spread, rejected = read_focal(image)
+            fields = {"focal_px": focal_px and focal_px / step, "focal_spread": spread, "focal_rejected": rejected}
+            dpi = tuple(float(each) for each in np.ravel(image.info.get("dpi", ())))
+            fields |= {"is_crop": is_crop(image, path.name), "dpi": dpi}
+            (orientation, contradiction), rest = _orientation(image), _left_aside(image)
+            srgb, said = _decode_pixels(image, path, step)
+            return srgb, orientation, fields | {"said": (*contradiction, *rest, *said)}
+
+
+def _orientation(image) -> tuple[int, tuple[str, ...]]:
+    """The stored pixels' orientation (1: upright), and whether EXIF and XMP contradict each other. Pillow and OpenCV
+    turn TIFFs themselves; Pillow takes XMP's where EXIF has none, and gives that of AVIF's boxes as EXIF.
+    """
+    if image.format in ("AVIF", "HEIF") and "exif" not in image.info:
+        return 1, ()
+    xmp = image.info.get("xmp") or b""
+    stated = _XMP_ORIENTATION.search(xmp if isinstance(xmp, bytes) else xmp.encode())
+    orientation = exif_tags(image).get(_ORIENTATION, int(stated[1]) if stated else 1)
+    said = (TWO_ORIENTATIONS,) if stated and int(stated[1]) != orientation else ()
+    return orientation if isinstance(orientation, int) and image.format != "TIFF" else 1, said
+
+
+def _left_aside(image) -> tuple[str, ...]:
+    """What else is in a file besides the picture that is read."""
+    said = []
+    with open(image.filename, "rb") as file:
+        head = file.read(-1 if image.format == "MPO" else _HEAD_BYTES)
+    if any(name in head for name in _GAIN_MAPS):
+        said.append(GAIN_MAP)
+    elif image.format == "MPO":
+        kinds = [entry["Attribute"]["MPType"] for entry in image.mpinfo[0xB002][1:]]
+        said += [MORE_PAGES] if any(not kind.startswith("Large Thumbnail") for kind in kinds) else []
+    elif getattr(image, "is_animated", False):
+        said.append(MORE_PAGES)
+    if 0 in np.atleast_1d(getattr(image, "tag_v2", {}).get(_EXTRA_SAMPLES, 1)):
+        said.append(EXTRA_CHANNELS)
+    return tuple(said)
 
 
 def list_photos(folder: str | Path) -> list[Path]:
@@ -140,6 +187,15 @@ def list_skipped_files(folder: Path, without: Path | None = None) -> list[str]:
     return [f"{kind}: {summarize_names(names)}" for kind, names in skipped.items()]
 
 
+def summarize_said(said: Iterable[tuple[str, Sequence[str]]]) -> list[str]:
+    """Sum up what files of these names declare and was left aside (`Photo.said`): a phrase for each kind."""
+    names: dict[str, list[str]] = {}
+    for name, phrases in said:
+        for phrase in phrases:
+            names.setdefault(phrase, []).append(name)
+    return [f"{phrase}: {summarize_names(files)}" for phrase, files in names.items()]
+
+
 def printable_name(name: str) -> str:
     """A file's name as valid text; bytes that are not UTF-8 are escaped."""
     return name.encode("utf-8", "backslashreplace").decode()
@@ -156,38 +212,44 @@ def _allow_heic(path: Path) -> None:
     pillow_heif.register_heif_opener()
 
 
-def _decode_pixels(image, step: int) -> np.ndarray:
-    """uint8 sRGB H×W×3 of an open picture, each the mean of `step` × `step` pixels."""
-    to_srgb = _profile_conversion(image)
-    if step == 1 and to_srgb is None and (jpeg := _decode_jpeg(image)) is not None:
-        return jpeg
-    image.load()
-    if image.mode.startswith("I") or image.mode == "F":
-        return np.repeat(_average(_deep_gray(image), step)[..., None], 3, axis=2)
-    pixels = np.empty((image.height // step, image.width // step, 3), np.uint8)
-    rows = max(1, _STRIP_PX // image.width // step)
+def _decode_pixels(image, path: Path, step: int) -> tuple[np.ndarray, tuple[str, ...]]:
+    """uint8 sRGB H×W×3 of an open picture, each the mean of `step` × `step` pixels, and what is left aside of it."""
+    from PIL import ImageChops
+
+    space, said = color_space(image)
+    codes = _jpeg_codes(image, path)
+    if codes is None:
+        image.load()
+        if image.mode == "CMYK" and image.format == "JPEG" and "adobe" not in image.info:
+            image = ImageChops.invert(image)  # Pillow takes the inks of every JPEG as Adobe's, which are inverted
+        if (deep := deep_codes(image, path)) is not None:
+            codes, space = deep[0], rgb_space(SRGB_PRIMARIES, None, 1.0) if image.mode == "F" else space
+            said += (deep[1],) if deep[1] else ()
+    if codes is not None and codes.dtype == np.uint8 and space is None and step == 1:
+        return codes, said
+    width, height = image.size if codes is None else codes.shape[1::-1]
+    pixels = np.empty((height // step, width // step, 3), np.uint8)
+    rows = max(1, _STRIP_PX // width // step)
     for top in range(0, len(pixels), rows):
         bottom = min(top + rows, len(pixels))
-        strip = image.crop((0, step * top, image.width, step * bottom))
-        strip = _opaque_rgb(strip if to_srgb is None else to_srgb(strip))
-        pixels[top:bottom] = _average(np.asarray(strip), step)
-    return pixels
+        if codes is None:
+            strip = _opaque_srgb(image.crop((0, step * top, width, step * bottom)), space)
+        else:
+            part = codes[step * top : step * bottom]
+            strip = eight_bits(part) if space is None else space.to_srgb(part)
+        pixels[top:bottom] = _average(strip, step)
+    return pixels, said
 
 
-def _decode_jpeg(image) -> np.ndarray | None:
-    """uint8 H×W×3 of an RGB JPEG, which OpenCV decodes to the same bits in half the time; None for other files, and for
-    truncated ones, which only Pillow refuses.
+def _jpeg_codes(image, path: Path) -> np.ndarray | None:
+    """uint8 H×W×3 of a JPEG, which OpenCV decodes to the same bits in half the time; None for inks, other files, and
+    truncated ones, which Pillow refuses.
     """
-    if image.format != "JPEG" or image.mode != "RGB":
+    if image.format not in ("JPEG", "MPO"):
         return None
-    data = np.fromfile(image.filename, np.uint8)
-    if data[-2:].tobytes() != b"\xff\xd9":
-        return None
-    try:
-        pixels = cv2.imdecode(data, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION)
-    except cv2.error:
-        return None
-    return pixels if pixels is not None and pixels.shape == (image.height, image.width, 3) else None
+    inks = image.mode not in ("RGB", "L")
+    pixels = decode_jpeg(path.read_bytes(), cv2.IMREAD_REDUCED_COLOR_8 if inks else cv2.IMREAD_COLOR_RGB)
+    return None if inks or pixels is None or pixels.shape[1::-1] != image.size else pixels
 
 
 def _average(pixels: np.ndarray, step: int) -> np.ndarray:
@@ -197,42 +259,23 @@ def _average(pixels: np.ndarray, step: int) -> np.ndarray:
     return pixels if step == 1 else cv2.resize(complete, (width, height), interpolation=cv2.INTER_AREA)
 
 
-def _profile_conversion(image) -> Callable | None:
-    """A function that converts parts of the picture from its embedded profile to sRGB; None without a valid profile."""
-    from PIL import ImageCms
+def _opaque_srgb(image, space: ColorSpace | None) -> np.ndarray:
+    """uint8 sRGB H×W×3 of a part of a picture, on white where it is transparent."""
+    from PIL import Image
 
-    profile = image.info.get("icc_profile")
-    if not profile or image.mode not in {"RGB", "RGBA", "CMYK"}:
-        return None
-    try:
-        source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
-        if "srgb" in ImageCms.getProfileDescription(source).lower():
-            return None
-        target_mode = "RGBA" if image.mode == "RGBA" else "RGB"  # alpha is preserved
-        transform = ImageCms.buildTransform(source, ImageCms.createProfile("sRGB"), image.mode, target_mode)
-    except (ImageCms.PyCMSError, OSError, ValueError):
-        return None
-    return lambda part: ImageCms.applyTransform(part, transform)
-
-
-def _deep_gray(image) -> np.ndarray:
-    """uint8 H×W of a gray picture of more than 8 bits."""
-    values = np.asarray(image)
-    if values.dtype.kind == "f":  # floating-point TIFF ranges from 0 to 1
-        values = np.nan_to_num(values.astype(np.float32), posinf=1.0)
-        top = max(1.0, float(values.max(initial=0)))
-    else:  # 16-bit gray arrives as I;16 or I
-        values, top = np.clip(values, 0, 65535).astype(np.uint16), 65535
-    return cv2.convertScaleAbs(np.maximum(values, 0), alpha=255 / top)
-
-
-def _opaque_rgb(image):
-    if "transparency" in image.info or image.mode in {"RGBA", "LA", "PA", "La", "RGBa"}:
-        from PIL import Image
-
+    if image.mode == "La":  # Pillow converts it to nothing else
+        image = image.convert("LA")
+    alpha = None
+    if "transparency" in image.info or image.mode in {"RGBA", "LA", "PA", "RGBa"}:
         image = image.convert("RGBA")
-        image = Image.alpha_composite(Image.new("RGBA", image.size, "white"), image)
-    return image if image.mode == "RGB" else image.convert("RGB")
+        alpha = image.getchannel("A")
+    colors = image.convert("RGB" if space is None else space.mode)
+    if space is not None:
+        colors = Image.fromarray(space.to_srgb(np.asarray(colors)))
+    if alpha is not None:
+        colors.putalpha(alpha)
+        colors = Image.alpha_composite(Image.new("RGBA", image.size, "white"), colors).convert("RGB")
+    return np.asarray(colors)
 
 
 def _advice(path: Path, error: Exception) -> str:

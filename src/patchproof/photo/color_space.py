@@ -1,0 +1,177 @@
+"""Convert a picture's colors to sRGB from the color space that its file declares.
+
+In: an open Pillow image. Out: a `ColorSpace`, or None if the colors are sRGB, and what the file declares in vain. A
+profile is known by what it does to colors, never by its name. A PNG's cICP precedes its profile, that its sRGB chunk,
+that cHRM and gAMA; elsewhere a profile precedes nclx and EXIF. ColorSpace 65535 means any other space: it is Adobe RGB
+with interoperability R03 alone, since some phones write it over sRGB. Colors outside of sRGB are clipped.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+
+from patchproof.base.color import codes_from_srgb, linear_from_srgb, srgb_from_linear
+from patchproof.photo.exif import EXIF_IFD, exif_tags
+from patchproof.photo.rejection import PhotoRejected
+
+BROKEN_PROFILE = "color profiles that cannot be used, whose pictures are read as sRGB"
+UNNAMED_SPACE = "EXIF color spaces that are neither sRGB nor named, read as sRGB"
+CONTRADICTION = "Adobe RGB beside sRGB in EXIF, read as sRGB"
+BROKEN_PRIMARIES = "primaries or gammas that no screen has, read as sRGB"
+BMP_SPACE = "color spaces in BMP files, read as sRGB"
+BARE_INKS = "inks (CMYK) without a profile, of which RGB is only an estimate"
+_HDR = "it has colors for HDR screens or of a kind that is not read (cICP {}, {}): save it as JPEG in sRGB"
+# x and y of red, green and blue
+SRGB_PRIMARIES = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06)
+_ADOBE, _ADOBE_GAMMA = (0.64, 0.33, 0.21, 0.71, 0.15, 0.06), 563 / 256
+_P3, _BT2020 = (0.68, 0.32, 0.265, 0.69, 0.15, 0.06), (0.708, 0.292, 0.17, 0.797, 0.131, 0.046)
+_PAL, _NTSC = (0.64, 0.33, 0.29, 0.60, 0.15, 0.06), (0.63, 0.34, 0.31, 0.595, 0.155, 0.07)
+# by their numbers in ITU-T H.273 (2: not specified), primaries that are white at D65, and curves
+_PRIMARIES = {1: SRGB_PRIMARIES, 2: SRGB_PRIMARIES, 5: _PAL, 6: _NTSC, 7: _NTSC, 9: _BT2020, 12: _P3}
+_TELEVISION = "television"  # the curve of BT.709, 601 and 2020
+_CURVES = {2: None, 13: None, **dict.fromkeys((1, 6, 14, 15), _TELEVISION), 4: 2.2, 5: 2.8, 8: 1.0}
+_D65, _MAX_GAMMA = (0.3127, 0.329), 5.0
+_BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
+_INTEROP_IFD, _COLOR_SPACE, _GAMMA, _WHITE_TAG, _PRIMARIES_TAG = 0xA005, 0xA001, 0xA500, 318, 319
+_HEAD_BYTES = 1 << 20  # declarations precede the pixels
+_MODES = {"RGB": "RGB", "GRAY": "L", "CMYK": "CMYK"}  # of pictures, by their profile's
+
+
+class ColorSpace(NamedTuple):
+    """A picture's own `mode` of Pillow ("RGB", "L", "CMYK"), and the conversion of its codes (uint8, RGB also uint16)
+    to sRGB uint8 H×W×3.
+    """
+
+    mode: str
+    to_srgb: Callable[[np.ndarray], np.ndarray]
+
+
+def color_space(image) -> tuple[ColorSpace | None, tuple[str, ...]]:
+    """The picture's color space, None for sRGB, and sentences on declarations that are left aside."""
+    profile, head = image.info.get("icc_profile"), b""
+    if image.format in ("PNG", "AVIF", "HEIF", "BMP"):
+        with open(image.filename, "rb") as file:
+            head = file.read(_HEAD_BYTES)
+    if (cicp := _cicp(image.format, head)) and (image.format == "PNG" or not profile):
+        primaries, transfer, full_range = cicp
+        if primaries not in _PRIMARIES or transfer not in _CURVES or not full_range:
+            raise PhotoRejected("unreadable", None, None, _HDR.format(primaries, transfer))
+        return rgb_space(_PRIMARIES[primaries], None, _CURVES[transfer]), ()
+    if profile:
+        return _space_of_profile(profile, image.mode)
+    if image.mode == "CMYK":
+        return None, (BARE_INKS,)
+    if image.format == "BMP" and int.from_bytes(head[14:18], "little") >= 108:  # a header of version 4 or 5
+        return None, () if head[70:74] in (b"BGRs", b" niW") else (BMP_SPACE,)
+    declared, said = (None, ()) if "srgb" in image.info else _declared_primaries(image)
+    try:
+        return declared and rgb_space(*declared), said
+    except (ValueError, TypeError, ArithmeticError, np.linalg.LinAlgError):
+        return None, (BROKEN_PRIMARIES,)
+
+
+def rgb_space(
+    primaries: Sequence[float], white: Sequence[float] | None, curve: float | str | None
+) -> ColorSpace | None:
+    """The space of an RGB picture by chromaticities and by the exponent of its curve (None: sRGB's; "television":
+    BT.709's); None if it is sRGB, and ValueError if no screen could show it.
+    """
+    if isinstance(curve, float) and not 1 / _MAX_GAMMA <= curve <= _MAX_GAMMA:
+        raise ValueError(f"gamma {curve:g}")
+    matrix = np.linalg.solve(_xyz_from_rgb(SRGB_PRIMARIES, _D65), _xyz_from_rgb(primaries, white or _D65))
+
+    def light(codes: np.ndarray) -> np.ndarray:
+        if curve == _TELEVISION:
+            return np.where(codes < 0.081, codes / 4.5, ((codes + 0.099) / 1.099) ** (1 / 0.45))
+        return linear_from_srgb(codes) if curve is None else codes**curve
+
+    def to_srgb(codes: np.ndarray) -> np.ndarray:
+        table = 65535 * light(np.linspace(0, 1, np.iinfo(codes.dtype).max + 1)).astype(np.float32)
+        linear = cv2.transform(np.take(table, codes), matrix.astype(np.float32))
+        return np.take(_srgb_codes(), np.clip(linear + 0.5, 0, 65535).astype(np.uint16))
+
+    return _unless_srgb(ColorSpace("RGB", to_srgb))
+
+
+def eight_bits(codes: np.ndarray) -> np.ndarray:
+    """uint8 of uint8 or uint16 codes."""
+    return codes if codes.dtype == np.uint8 else cv2.convertScaleAbs(codes, alpha=255 / 65535)
+
+
+@lru_cache(1)
+def _srgb_codes() -> np.ndarray:
+    """uint8 sRGB by linear light in 65,535 steps."""
+    return codes_from_srgb(srgb_from_linear(np.arange(65536) / 65535))
+
+
+def _unless_srgb(space: ColorSpace) -> ColorSpace | None:
+    """None if the space moves no color of a lattice by more than the rounding of 8 bits."""
+    ramp = np.arange(0, 256, 15, dtype=np.uint8)
+    codes = np.stack(np.meshgrid(ramp, ramp, ramp), -1).reshape(1, -1, 3) if space.mode == "RGB" else ramp[None]
+    moved = space.mode == "CMYK" or np.abs(space.to_srgb(codes) - codes.reshape(*codes.shape[:2], -1).astype(int)) > 1
+    return space if np.any(moved) else None
+
+
+def _xyz_from_rgb(primaries: Sequence[float], white: Sequence[float]) -> np.ndarray:
+    """The matrix from linear RGB to XYZ, adapted to D65."""
+    points = np.array([*_D65, *white, *primaries], float).reshape(5, 2)
+    if not (np.abs(points) < 1.5).all() or not points[:, 1].all():
+        raise ValueError("chromaticities")
+    d65, own_white, *columns = np.c_[points, 1 - points.sum(1)] / points[:, 1:]
+    matrix = np.transpose(columns) * np.linalg.solve(np.transpose(columns), own_white)
+    return np.linalg.solve(_BRADFORD, (_BRADFORD @ d65 / (_BRADFORD @ own_white))[:, None] * _BRADFORD) @ matrix
+
+
+def _cicp(kind: str, head: bytes) -> tuple[int, int, bool] | None:
+    """(primaries, transfer, full range) of a PNG's cICP chunk, or of the first nclx box; None without one."""
+    if kind == "PNG" and (at := head.find(b"\0\0\0\4cICP", 0, head.find(b"IDAT"))) >= 0:
+        return head[at + 8], head[at + 9], head[at + 10 : at + 12] == b"\0\1"
+    if kind != "PNG" and (at := head.find(b"colrnclx")) >= 0:
+        return int.from_bytes(head[at + 8 : at + 10]), int.from_bytes(head[at + 10 : at + 12]), True
+    return None
+
+
+@lru_cache(4)
+def _space_of_profile(profile: bytes, mode: str) -> tuple[ColorSpace | None, tuple[str, ...]]:
+    """The space of an embedded profile; said if it is broken or belongs to pictures of another mode."""
+    from PIL import Image, ImageCms
+
+    try:
+        source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
+        own_mode = _MODES[source.profile.xcolor_space.strip()]  # type: ignore[reportAttributeAccessIssue]
+        if (own_mode == "CMYK") != (mode == "CMYK") or (own_mode == "L" and mode[0] not in "1LI"):
+            return None, (BROKEN_PROFILE,)
+        transform = ImageCms.buildTransform(source, ImageCms.createProfile("sRGB"), own_mode, "RGB")
+    except (ImageCms.PyCMSError, OSError, ValueError, KeyError, TypeError):
+        return None, (BROKEN_PROFILE,)
+
+    def to_srgb(codes: np.ndarray) -> np.ndarray:
+        # deep gray has three channels, which are equal
+        part = eight_bits(codes[..., 0] if own_mode == "L" and codes.ndim == 3 else codes)
+        size, content = part.shape[1::-1], np.ascontiguousarray(part)
+        image = Image.frombuffer(own_mode, size, content, "raw", own_mode, 0, 1)
+        return np.asarray(ImageCms.applyTransform(image, transform))
+
+    return _unless_srgb(ColorSpace(own_mode, to_srgb)), ()
+
+
+def _declared_primaries(image) -> tuple[tuple[Any, Any, float | None] | None, tuple[str, ...]]:
+    """The arguments of `rgb_space` by a PNG's chunks or by EXIF and TIFF tags, None where nothing else than sRGB is
+    declared, and a sentence on what is left aside.
+    """
+    chunk, gamma = image.info.get("chromaticity", ()), image.info.get("gamma")
+    if chunk or gamma is not None:
+        return (chunk[2:] or SRGB_PRIMARIES, chunk[:2], None if gamma is None else float(np.divide(1, gamma))), ()
+    exif, details, adobe = exif_tags(image), exif_tags(image, EXIF_IFD), exif_tags(image, _INTEROP_IFD).get(1) == "R03"
+    space, gamma = details.get(_COLOR_SPACE), details.get(_GAMMA)
+    if space == 2 or (adobe and space != 1):
+        return (_ADOBE, None, _ADOBE_GAMMA), ()
+    if _PRIMARIES_TAG in exif and space != 1:
+        return (exif[_PRIMARIES_TAG], exif.get(_WHITE_TAG), None if gamma is None else float(gamma)), ()
+    return None, (CONTRADICTION,) if adobe else (UNNAMED_SPACE,) if space not in (None, 1) else ()

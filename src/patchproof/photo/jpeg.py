@@ -1,0 +1,80 @@
+"""Decode a JPEG by OpenCV, strictly: what its decoder warns of is damage.
+
+In: a file's bytes. Out: pixels, or `DamagedJpeg`. libjpeg fills what it cannot decode with gray or wrong blocks, and
+says so on stderr alone, so that is read meanwhile. Zeroed bytes may decode without a warning: a run of them is damage
+if the code of zeros is not that of a flat block, where one scan holds all (chroma alone, or a progressive file, may be
+flat). Bytes that change within one block leave no trace.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import tempfile
+import threading
+from contextlib import suppress
+
+import cv2
+import numpy as np
+
+_WARNINGS = (b"Corrupt JPEG data", b"Premature end of JPEG")
+_PADDING = re.compile(rb"Corrupt JPEG data: (\d+) extraneous bytes before marker 0xd9")
+_MAX_PADDING = 64  # bytes that some cameras write before the end of a picture
+_ZERO_RUN = bytes(64)  # takes three blocks of coefficients -1
+_LOCK = threading.Lock()  # a process has one stderr
+
+
+class DamagedJpeg(ValueError):
+    """A JPEG whose pixels cannot all be decoded."""
+
+
+def decode_jpeg(content: bytes, flags: int = cv2.IMREAD_COLOR_RGB) -> np.ndarray | None:
+    """uint8 H×W×3 as stored, None where OpenCV cannot decode it; raises `DamagedJpeg`."""
+    pixels, messages = _decode(np.frombuffer(content, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
+    if not messages and _ZERO_RUN not in content:
+        return pixels
+    start, zeros_are_flat = _start_of_scan(content)
+    scan = content[start : content.find(b"\xff\xd9", start)]
+    padding = _PADDING.match(messages)
+    padded = padding and (size := int(padding[1])) <= _MAX_PADDING and not scan[-size:].strip(b"\0\xff")
+    zeroed = _ZERO_RUN in scan and not zeros_are_flat and scan.count(b"\xff\xda") == 1
+    if (messages and not padded) or zeroed:
+        raise DamagedJpeg(messages.decode("latin-1") or "zeros among its pixels")
+    return pixels
+
+
+def _decode(data: np.ndarray, flags: int) -> tuple[np.ndarray | None, bytes]:
+    """OpenCV's pixels and what libjpeg writes to stderr; other lines there are passed on."""
+    with _LOCK, tempfile.TemporaryFile() as file, suppress(cv2.error):
+        try:
+            stderr = os.dup(2)
+        except OSError:  # a process without stderr
+            return cv2.imdecode(data, flags), b""
+        try:
+            os.dup2(file.fileno(), 2)
+            pixels = cv2.imdecode(data, flags)
+        finally:
+            os.dup2(stderr, 2)
+            os.close(stderr)
+        file.seek(0)
+        messages = file.read()
+        if any(warning in messages for warning in _WARNINGS):
+            return pixels, messages
+        if messages:
+            os.write(2, messages)
+        return pixels, b""
+    return None, b""
+
+
+def _start_of_scan(content: bytes) -> tuple[int, bool]:
+    """The offset of the first scan, and whether zeros can be flat blocks: their code ends one in the first."""
+    at, first_symbol = 2, {}
+    while at + 4 < len(content) and content[at + 1] != 0xDA:
+        end = at + 2 + int.from_bytes(content[at + 2 : at + 4])
+        table = at + 4
+        while content[at + 1] == 0xC4 and table + 17 < end:
+            first_symbol[content[table]] = content[table + 17]
+            table += 17 + sum(content[table + 1 : table + 17])
+        at = end
+    ac_table = 0x10 | content[at + 6] & 15 if at + 6 < len(content) else 0
+    return at, first_symbol.get(ac_table, 0) == 0
