@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from synthetic_photos import (
     CONDITION,
     make_manifest,
@@ -34,7 +35,8 @@ from patchproof.evidence.ranges import promised_ranges
 from patchproof.evidence.surface import promised_of, surface_of
 from patchproof.evidence.task import Options
 from patchproof.photo.quality import FrameLight, is_featureless
-from patchproof.photo.read import Photo
+from patchproof.photo.read import MORE_PAGES, Photo
+from patchproof.report.words import verdict_lines
 
 
 def promise(conditions=(CONDITION,)):
@@ -258,6 +260,14 @@ def test_the_uncut_page_and_scans_are_measured_but_not_counted():
         assert (scale.scale_x, scale.scale_y) == pytest.approx((sx, sy), abs=0.002)
 
 
+@pytest.mark.parametrize(("dpi", "stretch"), [(150, 1), (75, 2)])
+def test_a_scan_at_another_resolution_than_stated_has_no_scale_and_says_so(dpi, stretch):
+    scan = photograph(raster(False), np.diag([75 / 25.4, 75 / 25.4 * stretch, 1.0]), (640, 900 * stretch), light=0.9)
+    look = measured(scan, scan_dpi=dpi)
+    assert (look.entry.code, look.entry.scale, look.counted) == ("scale_off", None, False)
+    assert f"cannot be a scan at {dpi} dpi" in look.entry.remark.advice and "no scale" in look.entry.remark.advice
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     photos = tmp_path_factory.mktemp("photos")
@@ -383,8 +393,15 @@ def test_two_tones_show_something_from_a_code_or_two_on(contrast, nothing):
 
 def test_only_scans_have_no_rate(tmp_path):
     homography = np.diag([3.0, 3.0, 1.0])
-    save(photograph(raster(False), homography, (640, 900), light=0.9), tmp_path / "scan.png")
-    summary = verified(tmp_path, scan_dpi=76.2).summary
+    scan = Image.fromarray(photograph(raster(False), homography, (640, 900), light=0.9))
+    more = {"save_all": True, "append_images": [scan]}
+    scan.save(tmp_path / "scan.tif", dpi=(300, 300), **more)
+    report = verified(tmp_path, scan_dpi=76.2)
+    summary, (entry,) = report.summary, report.photos
+    for phrase, sentence in zip(entry.said, summary.left_out, strict=True):
+        assert sentence == f"{phrase}: scan.tif" and sentence in "\n".join(verdict_lines(report))
+    assert entry.said[0] == MORE_PAGES and "300 × 300 dpi, where --scan-dpi says 76.2" in entry.said[1]
+    assert entry.model_dump()["said"] == entry.said and "said" not in entry.changed(said=()).model_dump()
     assert (summary.judged, summary.measured, summary.rate, summary.verdict) == (0, 1, None, "cannot_tell")
 
 

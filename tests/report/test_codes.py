@@ -92,7 +92,7 @@ def test_a_marker_off_the_plane_and_a_corner_that_is_not_seen_are_said():
     ("scale", "code"), [(0.9905, None), (0.9895, "scale_off"), (1.0095, None), (1.0105, "scale_off")]
 )
 def test_a_print_more_than_one_percent_off_is_scale_off(scale, code):
-    remark = measure._print_check(False, Scale(scale_x=scale, scale_y=1.0))
+    remark = measure._print_check(False, Scale(scale_x=scale, scale_y=1.0), 300)
     assert remark.code == code and ("100 %" if code else "not counted") in remark.advice
 
 

@@ -46,7 +46,9 @@ def some_report(verdict="kept"):
         )
         for i in range(3)
     ]  # fmt: skip
-    photos.append(PhotoEntry(file="bad.jpg", status="rejected", code="unreadable", advice="copy it again"))
+    photos.append(
+        PhotoEntry(file="bad.jpg", status="rejected", code="unreadable", advice="copy it again", said=["more pages"])
+    )
     summary = Summary(
         photos=4, judged=3, measured=3, rate=1.0, interval=(0.44, 1.0), prediction_interval=(2, 3), verdict=verdict,
         effect="not_tested", matched_rate=None, reason="3 of 3 photographs were recognized.",
@@ -114,6 +116,7 @@ def test_the_page_says_what_the_report_says_and_escapes_it(shown):
         "p2.jpg",
         "unreadable",
         "copy it again",
+        "Left out: more pages.",
         "&lt;b&gt;bright",
         "not measured",
         "3 of 3 photographs were recognized.",

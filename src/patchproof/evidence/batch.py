@@ -45,6 +45,7 @@ _DESIGN_COLOR, _MARKER_COLOR = (255, 64, 129), (0, 200, 140)
 _DIED_ADVICE = "measuring it ended its process each time, for want of memory: save it smaller"
 _EMPTY_ADVICE = "it shows one tone or noise and nothing else: take it again"
 _CROP_ADVICE = "it is a crop or a screenshot by its shape, its name or EXIF: it counts, but use the camera's own file"
+_OTHER_DPI = "resolutions of scans by their files, {:.0f} × {:.0f} dpi, where --scan-dpi says {:g}"
 # codes of photographs whose homography is still accurate enough to put pieces into them
 MEASURABLE_CODES = (None, "clipped", "blurred", "too_small", "cropped")
 
@@ -165,7 +166,8 @@ def _measure(task: Task, item: PhotoItem) -> MeasuredPhoto:
     if item.control is not None:
         if is_featureless(square_of(photo.srgb)[0]):
             return _rejected(item, Remark(code="empty", advice=_EMPTY_ADVICE))
-        return MeasuredPhoto(PhotoEntry(file=item.file, status="judged", box=box), True, squares=squares)
+        entry = PhotoEntry(file=item.file, status="judged", box=box, said=photo.said)
+        return MeasuredPhoto(entry, True, squares=squares)
     view = pinhole_photo(photo, task.camera)
     measured = measure(view, item.file, task.surface, task.promised, task.ranges, task.scan_dpi, item.with_pictures)
     entry, pictures = measured.entry, {}
@@ -175,7 +177,11 @@ def _measure(task: Task, item: PhotoItem) -> MeasuredPhoto:
     if item.with_pictures:
         px_from_mm = entry.geometry and entry.geometry.homography_px_from_mm
         pictures = {"photo": _thumbnail(view.srgb, px_from_mm, task.surface), **measured.pictures}
-    return replace(measured, entry=entry.changed(box=box or entry.box), pictures=pictures, squares=squares)
+    said = photo.said
+    if task.scan_dpi and not measured.counted and any(abs(dpi / task.scan_dpi - 1) > 0.01 for dpi in photo.dpi if dpi):
+        said += (_OTHER_DPI.format(*photo.dpi, task.scan_dpi),)
+    entry = entry.changed(box=box or entry.box, said=said)
+    return replace(measured, entry=entry, pictures=pictures, squares=squares)
 
 
 def _thumbnail(srgb: np.ndarray, px_from_mm: ArrayLike | None, surface: Surface) -> np.ndarray:

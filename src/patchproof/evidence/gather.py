@@ -40,7 +40,7 @@ from patchproof.evidence.reproject import PhotoSquare
 from patchproof.evidence.results import Ledger, ModelRate, PhotoEntry, Report, Scale, SessionCount, Summary
 from patchproof.evidence.task import Options, task_of
 from patchproof.evidence.verdict import Verdict, compare_with_control, effect_of, judge, next_step
-from patchproof.photo.read import list_images, list_skipped_files, printable_name
+from patchproof.photo.read import list_images, list_skipped_files, printable_name, summarize_said
 from patchproof.sheets.manifest import Manifest
 
 
@@ -101,6 +101,7 @@ def gather_evidence(
     left_out = list_skipped_files(Path(photos), controls_folder and controls_folder.resolve())
     if controls_folder:
         left_out += [f"{printable_name(controls_folder.name)}: {text}" for text in list_skipped_files(controls_folder)]
+    left_out += summarize_said((item.name, result.entry.said) for item, result in zip(items, results, strict=True))
     for item, result in zip(items, results, strict=True):
         if item.control is not None:
             name, entry = item.control, result.entry

@@ -42,7 +42,8 @@ _MOST_CURL = 0.1  # of the piece's diagonal: how far curling moves a marker of t
 _LEAST_AGREEING = 3  # markers: on bent paper each has its own slope, so that three do not fit a plane
 MOST_SCALE_ERROR = 0.01
 _MOST_PERSPECTIVE = 0.005  # of a scan: relative difference in length of opposite sides; scanners have none
-_SCALE_RANGE = (0.8, 1.25)  # a print outside of it is no print of this page
+_SCALE_RANGE = (1 / 1.15, 1.15)  # no print of this page lies outside of it, but a scan at another resolution does
+_MOST_ASKEW_DEG = 3.0  # of a sheet in a scanner
 _COME_CLOSER_ADVICE = "come closer or use the camera's full resolution"
 _SQUARELY_ADVICE = "look at the patch more squarely: so far from the side its cells are too narrow"
 _FEW_MARKERS_ADVICE = "show more of the piece: its markers fix where it lies"
@@ -119,7 +120,9 @@ def measure(
     if trouble is not None:
         entry = partial(entry, status="judged", remark=Remark.of(trouble))
     else:
-        entry = partial(entry, status="measured", scale=scale, remark=_print_check(page_check, scale))
+        remark = _print_check(page_check, scale, scan_dpi)
+        scale = scale if scale is not None and _SCALE_RANGE[0] < _worst(scale) < _SCALE_RANGE[1] else None
+        entry = partial(entry, status="measured", scale=scale, remark=remark)
     return MeasuredPhoto(entry(color=color), counted, pictures, light)
 
 
@@ -219,7 +222,7 @@ def _trouble(
 
 def _scan_scale(px_from_mm: np.ndarray, surface: Surface, scan_dpi: float) -> Scale | None:
     """Measure the print's scale through the middle of the design, by the DPI that the user states, not by the file's.
-    None if the picture has perspective or another resolution, and so is no scan; stretched prints may be scans.
+    None if the picture has perspective, or lies askew in it at no scale of a print, and so is no scan.
     """
     corners = apply_homography(px_from_mm, rect_corners(surface.rect_mm))
     sides = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)
@@ -229,15 +232,28 @@ def _scan_scale(px_from_mm: np.ndarray, surface: Surface, scan_dpi: float) -> Sc
     left, right, top, bottom = apply_homography(px_from_mm, ends)
     px_per_mm = scan_dpi / MM_PER_INCH
     scale_x, scale_y = (float(np.linalg.norm(px) / mm / px_per_mm) for px, mm in ((right - left, w), (bottom - top, h)))
-    if perspective < _MOST_PERSPECTIVE and all(_SCALE_RANGE[0] < s < _SCALE_RANGE[1] for s in (scale_x, scale_y)):
-        return Scale(scale_x=scale_x, scale_y=scale_y)
-    return None
+    scale = Scale(scale_x=scale_x, scale_y=scale_y)
+    askew_deg = abs((np.degrees(np.arctan2(*(right - left))) + 45) % 90 - 45)
+    possible = askew_deg < _MOST_ASKEW_DEG or _SCALE_RANGE[0] < _worst(scale) < _SCALE_RANGE[1]
+    return scale if perspective < _MOST_PERSPECTIVE and possible else None
 
 
-def _print_check(page_check: bool, scale: Scale | None) -> Remark | None:
+def _worst(scale: Scale) -> float:
+    """The side's scale that is farther from 1."""
+    return max((scale.scale_x, scale.scale_y), key=lambda side: abs(np.log(side)))
+
+
+def _print_check(page_check: bool, scale: Scale | None, scan_dpi: float | None) -> Remark | None:
     """Remark on the print by a photograph that is not counted: a scan or an uncut page; None for one that is."""
     if scale is not None:
-        worst = max((scale.scale_x, scale.scale_y), key=lambda scale: abs(scale - 1))
+        worst = _worst(scale)
+        if not _SCALE_RANGE[0] < worst < _SCALE_RANGE[1]:
+            advice = (
+                f"it cannot be a scan at {scan_dpi:g} dpi, where its print would be {scale.scale_x:.3f} × "
+                f"{scale.scale_y:.3f} of its size, so no scale was measured: give --scan-dpi the scan's own, the same "
+                "in both directions"
+            )
+            return Remark(code="scale_off", figure=worst, threshold=_SCALE_RANGE[worst > 1], advice=advice)
         if abs(worst - 1) > MOST_SCALE_ERROR:
             advice = f'it is printed {worst:.3f} times its size: print again at 100 %, "actual size", not "fit to page"'
             return Remark(code="scale_off", figure=worst, threshold=MOST_SCALE_ERROR, advice=advice)

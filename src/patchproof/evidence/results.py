@@ -124,6 +124,7 @@ class PhotoEntry(StrictModel):
     # the object's, for detectors: left, top, right, bottom as shares of the centered square
     box: tuple[Finite, Finite, Finite, Finite] | None = None
     forecast: Finite | None = None  # the chance of being recognized, by rendering the run's scene at its measured view
+    said: tuple[str, ...] = ()  # what its file declares and was left aside; in JSON only where there is something
     predictions: dict[str, Prediction] = Field(default_factory=dict)
 
     @property
@@ -148,7 +149,7 @@ class PhotoEntry(StrictModel):
     def _flatten(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
         parts = serialize(self)
         figures = parts | {key: value for name in _PARTS for key, value in (parts[name] or {}).items()}
-        return {key: figures.get(key) for key in PHOTO_KEYS}
+        return {key: figures.get(key) for key in PHOTO_KEYS} | ({"said": figures["said"]} if figures["said"] else {})
 
 
 class ModelRate(StrictModel):

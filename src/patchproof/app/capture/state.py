@@ -68,7 +68,7 @@ def answer_of(collection: PhotoCollection, path: Path, picture: np.ndarray | Non
         "control": collection.control_of(path),
         "label": prediction and f"{prediction.label} {prediction.confidence:.0%}",
         "code": entry.code,
-        "advice": entry.remark and entry.remark.advice,
+        "advice": "; ".join(filter(None, (entry.remark and entry.remark.advice, *entry.said))) or None,
         "view": _view_words(entry),
         "forecast": entry.forecast,
         "picture": None if picture is None else data_uri(image_bytes(picture, "JPEG", _PREVIEW_OPTIONS)),
