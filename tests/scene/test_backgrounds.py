@@ -6,8 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from PIL import Image, ImageOps
+from PIL import Image
 
+from patchproof.base.errors import Refused
 from patchproof.base.sessions import count_by_session, rate_posterior
 from patchproof.base.settings import BackgroundSettings
 from patchproof.scene import backgrounds as backgrounds_module
@@ -94,7 +95,8 @@ def test_files_are_decoded_when_they_are_shown_and_little_of_them_is_kept(tmp_pa
         Image.fromarray(pixels).save(tmp_path / "places" / f"{i}.png", compress_level=0)
         pictures[f"{i}.png"] = pixels
     decoded = []
-    monkeypatch.setattr(ImageOps, "exif_transpose", lambda image: decoded.append(image.filename) or image)
+    read = backgrounds_module.read_photo
+    monkeypatch.setattr(backgrounds_module, "read_photo", lambda path: decoded.append(path) or read(path))
     monkeypatch.setattr(backgrounds_module, "CACHED_FILE_BYTES", 200_000)
     lazy = load_backgrounds(BackgroundSettings(images="places"), tmp_path)
     assert not decoded
@@ -117,6 +119,17 @@ def test_a_picture_that_is_named_and_a_color_are_known_places(tmp_path):
         backgrounds = load_backgrounds(BackgroundSettings(**settings), tmp_path)
         assert len(backgrounds.pictures) == 1 and not backgrounds.notes
         assert all((backgrounds.choose_for_stream(stream, np.array([0.1, 0.9])) == 0.5).all() for stream in STREAMS)
+
+
+def test_a_background_is_read_as_a_photograph_is(tmp_path):
+    Image.fromarray(np.full((8, 8), 100 * 257, np.uint16)).save(tmp_path / "deep.png")
+    assert (
+        load_backgrounds(BackgroundSettings(images="deep.png"), tmp_path).picture(np.full(5, 0.5), (8, 8), (8, 8))
+        == 100
+    ).all()
+    (tmp_path / "text.png").write_text("no picture")
+    with pytest.raises(Refused, match=r"text.png .*cannot be read"):
+        load_backgrounds(BackgroundSettings(images="text.png"), tmp_path)
 
 
 def test_without_any_word_places_are_procedural_and_always_the_same():

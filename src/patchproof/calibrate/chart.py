@@ -32,7 +32,7 @@ from patchproof.calibrate.printer_files import printer_from_table, printer_outpu
 from patchproof.channel.lens import Camera
 from patchproof.channel.printer import Printer, load_printer, node_colors, vary_print
 from patchproof.photo.limits import run_limited
-from patchproof.photo.read import list_images, read_photo
+from patchproof.photo.read import list_images, read_photo, summarize_said
 from patchproof.photo.rejection import PhotoRejected
 from patchproof.sheets.manifest import Manifest
 
@@ -217,19 +217,20 @@ def _read_all(
     """All photographs that can be read, and warnings about the others; refused if none can be read."""
     if not manifest.chart:
         raise Refused("a sheet with a chart", f"sheet {manifest.sheet_id} without", "name the page's own JSON")
-    readings, warnings, total = [], [], sum(map(len, prints))
+    readings, warnings, said, total = [], [], [], sum(map(len, prints))
     for number, paths in enumerate(prints):
         for path in paths:
             try:
-                photo = run_limited(lambda path: read_chart(read_photo(path), manifest, camera), path)
-                readings.append(PhotoReading(path, number, photo))
+                photo = read_photo(path)
+                readings.append(PhotoReading(path, number, run_limited(read_chart, photo, manifest, camera)))
+                said.append((path.name, photo.said))
             except PhotoRejected as rejection:
                 warnings.append(f"{path.name} is left out ({rejection})")
             advance(len(readings) + len(warnings), total)
     if not readings:
         first = warnings[0] if warnings else "none given"
         raise Refused("photographs in which the chart can be read", f"none of {total}", f"see the first: {first}")
-    return readings, warnings
+    return readings, warnings + summarize_said(said)
 
 
 def _agreement(readings: Sequence[PhotoReading], by_print: Sequence[np.ndarray]) -> list[float | None]:

@@ -94,12 +94,13 @@ def import_patch(
     """
     out, compute = Path(out), compute.without("import_patch", cluster=True)
     check_folder(out, RUN_FILE_PATTERNS, overwrite)
-    (file, sha256, pixels), scene = _read_picture(picture), _load_piece_scene(scene, seed)
+    (file, sha256, pixels, said), scene = _read_picture(picture), _load_piece_scene(scene, seed)
     fitted, scene = fit_to_piece(pixels, scene), scene.for_design(sha256)
     problem = set_problem(scene, compute.device, models, jobs=compute.jobs)
     problem = replace(problem, subject=replace(problem.patch, design_px=fitted.shape[1::-1]))
     design = problem.patch.pixels(from_pixels(fitted, problem.device))
     record = _import_record(problem, file, sha256, pixels, fitted, design)
+    record = replace(record, notes=said + record.notes)
     with new_folder(out, RUN_FILE_PATTERNS, overwrite) as folder:
         run = finish_run(problem, design, folder, promise, progress, asdict(record))
     return replace(run, folder=out)
@@ -131,7 +132,7 @@ def import_folder(
         progress(stage, len(runs_by_path) * total + done, len(runs) * total)
 
     for path, run_folder in runs.items():
-        _, sha256, pixels = _read_picture(path)
+        _, sha256, pixels, _ = _read_picture(path)
         fit_to_piece(pixels, scene)
         run = load_run(run_folder) if resume and is_file(run_folder / "run.json") else None
         if run is not None and run.details.get("imported", {}).get("sha256") == sha256:
@@ -182,21 +183,21 @@ def _load_piece_scene(scene: str | Path | Scene, seed: int | None) -> PieceScene
     return require_piece(resolve_scene(scene, seed), 'leave patch.kind out, or "patch"')
 
 
-def _read_picture(picture: str | Path | np.ndarray) -> tuple[str, str, np.ndarray]:
-    """(file name, SHA-256, uint8 sRGB H×W×3) of a picture."""
+def _read_picture(picture: str | Path | np.ndarray) -> tuple[str, str, np.ndarray, tuple[str, ...]]:
+    """(file name, SHA-256, uint8 sRGB H×W×3, what the file declares and was left aside) of a picture."""
     if isinstance(picture, np.ndarray):
         if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] != 3:
             do = "convert it to 8-bit RGB"
             raise Refused("a picture of uint8 H×W×3 pixels", f"{picture.dtype} {picture.shape}", do)
-        return "an array", design_sha256(picture), picture
+        return "an array", design_sha256(picture), picture, ()
     path = Path(picture)
     if not is_file(path):
         raise Refused("a picture", f"no file at {path}", "check the path")
     try:
-        pixels = read_photo(path).srgb
+        photo = read_photo(path)
     except PhotoRejected as rejection:
         raise Refused("a picture that can be read", printable_name(path.name), rejection.advice) from rejection
-    return printable_name(path.name), hash_file(path), pixels
+    return printable_name(path.name), hash_file(path), photo.srgb, photo.said
 
 
 def _import_record(

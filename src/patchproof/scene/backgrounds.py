@@ -27,6 +27,8 @@ from patchproof.base.input import is_file, is_folder, open_image
 from patchproof.base.resample import halving_pyramid, index_homography
 from patchproof.base.settings import BackgroundSettings
 from patchproof.base.validation import expand_path
+from patchproof.photo.read import read_photo
+from patchproof.photo.rejection import PhotoRejected
 from patchproof.scene.procedural_places import procedural_place
 
 MIN_CROP_SHARE = 0.6  # of the largest crop that fits
@@ -92,10 +94,11 @@ _file_levels: dict[tuple[FileLevels, int], np.ndarray] = {}
 @lru_cache(maxsize=1)
 def _decoded(file: FileLevels) -> list[np.ndarray]:
     """All levels of the file that was decoded last."""
-    from PIL import ImageOps
-
-    with open_image(file.path, "a background picture", "remove or replace it") as image:
-        return halving_pyramid(np.asarray(ImageOps.exif_transpose(image).convert("RGB")))
+    try:
+        return halving_pyramid(read_photo(file.path).srgb)
+    except PhotoRejected as rejection:
+        got = f"{file.path.name} that cannot be read ({rejection.advice})"
+        raise Refused("a background picture", got, "remove or replace it") from rejection
 
 
 @dataclass(frozen=True)

@@ -119,10 +119,13 @@ def _read_faces(path: Path, count: int) -> np.ndarray:
 
 
 def _read_mask(path: Path) -> np.ndarray:
-    """Return the gray values of a mask as float H×W in 0..255."""
+    """Return the gray values of a mask, upright, as float H×W in 0..255."""
+    from PIL import ImageOps
+
     if not is_file(path):
         raise Refused("a mask image", f"no file at {path}", "check the path")
     with open_image(path, "a mask image", "save it as PNG") as image:
+        ImageOps.exif_transpose(image, in_place=True)
         is_16_bit = image.mode.startswith("I")  # 16 bits: Pillow would clip them at 255 instead of scaling them
         gray = np.asarray(image, float) / 257 if is_16_bit else np.asarray(image.convert("L"), float)
     if gray.max() < 128:

@@ -29,7 +29,7 @@ from patchproof.base.geometry import rotated_extent
 from patchproof.base.input import MAX_JSON_BYTES, is_file, read_file
 from patchproof.base.settings import SceneSettings
 from patchproof.base.validation import expand_path
-from patchproof.photo.read import read_photo
+from patchproof.photo.read import read_photo, summarize_said
 from patchproof.photo.rejection import PhotoRejected
 from patchproof.scene import picture_scene
 from patchproof.scene.conditions import Conditions, Stream
@@ -111,10 +111,10 @@ def build(source: SceneSource) -> ImageScene:
     settings, base = source.settings, source.base
     picture_scene.refuse_bending(settings)
     files = _files_of_class(settings, base)
-    images, unread = _read_all(files, settings.camera.photo_px)
+    images, unread, said = _read_all(files, settings.camera.photo_px)
     identity = source.sheet_id({})
     piece = _piece(settings, identity)
-    warnings = [f"{name} is left out: it cannot be read" for name in unread]
+    warnings = [f"{name} is left out: it cannot be read" for name in unread] + said
     if len(images) < MIN_IMAGES_TO_SPLIT:
         warnings.append("the promise is made on the same image that the patch is optimized on")
     elif len(images) < FEW_IMAGES:
@@ -198,17 +198,20 @@ def read_labels(table: Path) -> list[tuple[str, str]]:
     return [(row[0].strip(), ",".join(row[1:]).strip().casefold()) for row in rows]
 
 
-def _read_all(files: list[Path], photo_px: tuple[int, int]) -> tuple[tuple[BasePicture, ...], list[str]]:
-    images, unread = [], []
+def _read_all(files: list[Path], photo_px: tuple[int, int]) -> tuple[tuple[BasePicture, ...], list[str], list[str]]:
+    """(pictures, names of unreadable files, what files declare and was left aside)."""
+    images, unread, said = [], [], []
     for path in files:
         try:
-            images.append(picture_scene.picture_for(read_photo(path).srgb, photo_px)[0])
+            photo = read_photo(path)
+            images.append(picture_scene.picture_for(photo.srgb, photo_px)[0])
+            said.append((path.name, photo.said))
         except PhotoRejected:
             unread.append(path.name)
     if not images:
         got = f"{len(files)} unreadable in {files[0].parent}"
         raise Refused("an image that can be read", got, "save them as JPEG or PNG")
-    return tuple(images), unread
+    return tuple(images), unread, summarize_said(said)
 
 
 def _piece(settings: SceneSettings, identity: str) -> Piece:

@@ -31,7 +31,7 @@ from patchproof.photo.detect import find_markers
 from patchproof.photo.known_page import complete_markers
 from patchproof.photo.limits import run_limited
 from patchproof.photo.quality import blur_px
-from patchproof.photo.read import SUFFIXES, read_photo
+from patchproof.photo.read import SUFFIXES, read_photo, summarize_said
 from patchproof.photo.rectify import PageFit, corner_uncertainty_mm, fit_page
 from patchproof.photo.rejection import PhotoRejected
 from patchproof.scene import picture_scene
@@ -62,6 +62,7 @@ class BasePhoto:
     photo_from_piece: np.ndarray
     light: PaperLight
     blur_px: float
+    said: tuple[str, ...] = ()  # see `Photo`
 
 
 EVEN_LIGHT = SceneTerm("uneven light on paper")
@@ -160,12 +161,14 @@ def build(source: SceneSource) -> PhotoScene:
     warnings = [f"{name} is left out: {reason}" for name, reason in rejected.items()]
     uneven = ((photo.name, photo.light.unevenness) for photo in base_photos if photo.light.unevenness > _UNEVEN_SHARE)
     warnings += [f"the light on the paper in {name} is uneven: {share:.0%} is unexplained" for name, share in uneven]
+    warnings += summarize_said((photo.name, photo.said) for photo in base_photos)
     return PhotoScene(settings, base, source.seed, identity, piece, base_photos, notes=tuple(warnings), known=known)
 
 
 def measure_photo(path: Path, manifest: Manifest, piece: Piece, photo_px: tuple[int, int]) -> BasePhoto:
     """Measure one photograph of the blank sheet; `PhotoRejected` if it cannot be used."""
-    srgb = read_photo(path).srgb
+    photo = read_photo(path)
+    srgb = photo.srgb
     fit, blur = _locate(srgb, manifest, min(piece.size_mm))
     x, y, *_ = manifest.cut_mm
     picture, photo_from_srgb = picture_scene.picture_for(srgb, photo_px)
@@ -177,7 +180,7 @@ def measure_photo(path: Path, manifest: Manifest, piece: Piece, photo_px: tuple[
     height, width = picture.srgb.shape[:2]
     picture_from_photo = np.linalg.inv(picture_scene.photo_from((width, height), photo_px))
     light = paper_light(picture.srgb, picture_from_photo @ photo_from_piece, piece, blur)
-    return BasePhoto(path.name, picture, photo_from_piece, light, blur)
+    return BasePhoto(path.name, picture, photo_from_piece, light, blur, photo.said)
 
 
 def _files(folder: Path) -> list[Path]:
