@@ -18,6 +18,7 @@ the preview and the report.
 """
 # the kinds of input, and the modules whose DECLARED lists what they can declare
 READERS: dict[str, tuple[str, ...]] = {
+    "Meshes": ("mesh.declarations",),
     "Networks": ("classifier.declarations",),
     "Photographs and pictures": ("photo.declarations",),
     "PDFs": ("sheets.declarations",),

@@ -9,12 +9,14 @@ needs no inside, so open, non-manifold and loose triangles will do.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
 from patchproof.base.errors import Refused
+
+MOST_FACES = 20_000_000  # a scan of a building has fewer
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,6 +132,16 @@ def _corner_arrays(part: MeshPart, face_normals: np.ndarray) -> tuple[np.ndarray
     if part.colors_linear is not None:
         colors[:] = part.colors_linear[part.faces]
     return uv, normals, colors
+
+
+def transform_part(part: MeshPart, transform: np.ndarray) -> MeshPart:
+    """Return a part moved by `transform` 3×4; a mirror, which turns triangles inside out, reverses their corners."""
+    rotation = transform[:, :3]
+    with np.errstate(invalid="ignore", over="ignore"):
+        vertices = part.vertices @ rotation.T + transform[:, 3]
+        normals = None if part.normals is None else part.normals @ normal_transform(rotation).T
+    faces = part.faces[:, ::-1] if np.linalg.det(rotation) < 0 else part.faces
+    return replace(part, vertices=vertices, faces=faces, normals=normals)
 
 
 def normal_transform(rotation: np.ndarray) -> np.ndarray:
