@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from conftest import SCENE
 from PIL import Image
 
@@ -106,6 +107,18 @@ def test_what_can_go_adds_up_to_less_than_selection_can_tell(plan):
     assert gone and sum(gone) < plan.terms.threshold
     assert all(abs(error.bias) <= error.confidence + 1e-12 for error in errors if error.verdict != "off")
     assert plan.terms.together is not None
+
+
+def test_what_was_not_measured_has_a_reason(plan):
+    assert plan.not_measured == {"the cost of a step": "left out by --no-timing"}
+    assert "not measured: the cost of a step (left out by --no-timing)" in plan_lines(plan)
+
+
+def test_a_classifier_that_answers_alike_to_every_view_lets_no_term_go(tmp_path, monkeypatch):
+    monkeypatch.setattr(errors, "_confidence", lambda problem, pictures, boxes: torch.full((len(pictures),), 0.25))
+    found, terms = errors_of(scene_with(tmp_path, camera__blur_px=[1, 1]))
+    assert {error.verdict for error in found.values()} <= {"off", "unknown"} and found["blur"].verdict == "unknown"
+    assert "is 0.25, whatever" in terms.unknown and terms.together is None
 
 
 def test_four_times_the_samples_would_halve_what_chance_leaves(plan):

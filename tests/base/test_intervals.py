@@ -6,7 +6,6 @@ from scipy.stats import binom, multinomial
 
 from patchproof.base.intervals import (
     independent_difference,
-    mcnemar_p,
     paired_difference,
     wilson,
 )
@@ -92,9 +91,3 @@ def test_paired_difference_wants_pairs():
     for a, b in (([], []), ([True], [True, False])):
         with pytest.raises(ValueError, match="equally long"):
             paired_difference(a, b)
-
-
-def test_mcnemar_by_hand():
-    assert mcnemar_p(*pairs(5, 0, 0, 5)) == 1
-    assert mcnemar_p(*pairs(5, 6, 0, 5)) == pytest.approx(2 / 2**6)
-    assert mcnemar_p(*pairs(3, 9, 1, 7)) == pytest.approx(2 * (1 + 10) / 2**10)

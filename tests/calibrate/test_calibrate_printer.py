@@ -285,6 +285,7 @@ def test_a_printer_is_calibrated_stored_and_loaded(shots, tmp_path, capsys):
     assert mine.method == "measured" and mine.provenance["chosen"] == "spline"
     assert [row["rung"] for row in mine.provenance["ladder"]] == [rung.name for rung in map_kinds({"x": None})]
     assert len(mine.provenance["photographs"]) == 2 and "no camera file" in mine.provenance["model_of"]
+    assert mine.provenance["not_measured"]["how prints differ"] == "there is one print"
     np.testing.assert_allclose(mine.lut[-1, -1, -1], 1, atol=1e-6)
     assert color_difference(printer_output(mine, UNSEEN), shown(printer, UNSEEN)).mean() < 2
     with pytest.raises(Refused, match="which exists"):

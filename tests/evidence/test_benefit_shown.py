@@ -98,7 +98,7 @@ def test_terminal_and_page_begin_with_what_the_patch_is_worth(promise, recognize
 def test_photographed_controls_come_before_simulated_ones_and_the_bare_object_before_others():
     def beside(name, recognized):
         low = 0.5 - recognized / 40 - 0.2
-        return Control(name, recognized, 40, (0, 1), 0, 0.5 - recognized / 40, (low, low + 0.4), None, low > 0)
+        return Control(name, recognized, 40, (0, 1), 0, 0.5 - recognized / 40, (low, low + 0.4), 4, "", low > 0)
 
     interval = wilson(20, 40)
     assert benefit_of(0.5, interval, [beside("bare", 4)], HARMFUL).word == "helps"
@@ -110,7 +110,7 @@ def test_photographed_controls_come_before_simulated_ones_and_the_bare_object_be
 
 @pytest.mark.parametrize(("high", "word"), [(0.099, "no_better"), (0.101, "not_shown")])
 def test_a_gain_of_ten_points_that_is_not_ruled_out_is_not_shown(high, word):
-    control = Control("bare", 20, 40, (0, 1), 0, 0.0, (-0.1, high), None, False)
+    control = Control("bare", 20, 40, (0, 1), 0, 0.0, (-0.1, high), 4, "", False)
     assert benefit_of(0.5, (0.3, 0.7), [control], HELPFUL).word == word
 
 

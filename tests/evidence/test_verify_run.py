@@ -346,13 +346,14 @@ def test_two_processes_give_the_same_bytes_as_one(few):
     assert verified(few, jobs=2).model_dump_json() == verified(few).model_dump_json()
 
 
-def test_controls_decide_the_effect(folder, tmp_path):
+def test_controls_of_one_session_are_paired_and_cannot_decide_the_effect(folder, tmp_path):
     for i in range(6):
         save(half_lit(20 + i), tmp_path / f"b{i}.jpg")
     evidence = verified(folder, controls=tmp_path)
-    assert evidence.summary.effect == "shown"
+    assert evidence.summary.effect == "not_shown" and not evidence.summary.meets("helps")
     (control,) = evidence.controls
-    assert (control.recognized, control.n, control.pairs) == (0, 6, 6)
+    assert (control.recognized, control.n, control.pairs, control.sessions) == (0, 6, 6, 1)
+    assert "two places" in control.advice and "This cannot tell" in "".join(verdict_lines(evidence))
 
 
 def half_lit(code):

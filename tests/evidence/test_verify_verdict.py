@@ -2,14 +2,27 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 from synthetic_photos import make_manifest
 
+from patchproof.app.verify import _look_at
 from patchproof.base.goal import Goal
+from patchproof.base.sessions import TAIL
 from patchproof.evidence.ranges import matched_rate, promised_ranges, promised_side_px
 from patchproof.evidence.results import CameraPose, Geometry, PhotoEntry
-from patchproof.evidence.verdict import compare_with_control, effect_of, judge, kept_chance, required_rate
+from patchproof.evidence.verdict import (
+    Look,
+    compare_with_control,
+    effect_of,
+    judge,
+    kept_chance,
+    required_rate,
+    sessions_needed,
+    watched,
+)
 from patchproof.sheets.manifest import ConditionClaim, Promise
 
 
@@ -99,41 +112,78 @@ def test_fewer_than_five_or_too_many_without_markers_cannot_tell():
     assert word(36, (36,), promise_of(0.9), 5) == "cannot_tell"
 
 
-def test_pairs_by_file_name_go_to_mcnemar():
-    patch = {f"{i}.jpg": True for i in range(10)}
-    control = {f"{i}.jpg": i < 4 for i in range(10)}
+def answers(sessions: list[str], first: int = 0, prefix: str = "") -> dict[tuple[int, str], bool]:
+    """Answers by session from a text of 0 and 1 each."""
+    return {(first + i, f"{prefix}{j}"): x == "1" for i, text in enumerate(sessions) for j, x in enumerate(text)}
+
+
+def test_photographs_of_equal_names_in_a_session_are_pairs():
+    patch, control = answers(["1111111111"] * 4), answers(["1100000000", "0000000011"] * 2)
     compared = compare_with_control(patch, "bare", control, Goal.assist)
-    # six discordant pairs, all one way: 2 · (1/2)⁶ = 0.03125
-    assert (compared.pairs, compared.p_value, compared.shown) == (10, pytest.approx(0.03125), True)
+    assert (compared.pairs, compared.sessions, compared.shown, compared.advice) == (40, 4, True, "")
+    assert compared.difference == pytest.approx(0.8) and compared.difference_interval[0] > 0.4
     assert not compare_with_control(patch, "bare", control, Goal.deceive).shown
     assert compare_with_control(control, "bare", patch, Goal.deceive).shown
-    control["4.jpg"] = True  # five pairs: 0.0625
-    assert not compare_with_control(patch, "bare", control, Goal.assist).shown
 
 
 def test_a_few_names_that_happen_to_be_equal_are_no_pairs():
-    patch = {f"a{i}.jpg": True for i in range(40)} | {f"{i}.jpg": True for i in range(6)}
-    control = {f"b{i}.jpg": False for i in range(40)} | {f"{i}.jpg": True for i in range(6)}
-    assert compare_with_control(patch, "bare", control, Goal.assist).pairs == 0
-    assert compare_with_control(patch, "bare", control, Goal.assist).shown
-
-
-def test_different_names_go_to_newcombe():
-    patch, control = {f"a{i}": True for i in range(20)}, {f"b{i}": i < 5 for i in range(20)}
+    patch = answers(["1" * 10] * 4, prefix="a") | answers(["111111"])
+    control = answers(["0" * 10] * 4, prefix="b") | answers(["111111"])
     compared = compare_with_control(patch, "bare", control, Goal.assist)
-    assert compared.pairs == 0 and compared.p_value is None and compared.shown
-    assert compared.difference == pytest.approx(0.75) and compared.difference_interval[0] > 0
+    assert compared.pairs == 0 and compared.shown
+
+
+@pytest.mark.parametrize(("first", "prefix"), [(0, ""), (0, "b"), (9, "b")])
+def test_one_session_cannot_tell_what_its_place_does_and_says_what_would(first, prefix):
+    patch, control = answers(["1" * 20]), answers(["0" * 20], first, prefix)
+    compared = compare_with_control(patch, "bare", control, Goal.assist)
+    assert compared.shown is False and compared.difference_interval == (-1, 1) and "two places" in compared.advice
+
+
+def test_sessions_that_disagree_prove_less_than_their_photographs():
+    even = answers(["1111100000"] * 4, 9, "c")
+    steady, uneven = (answers(each) for each in (["1111111100"] * 4, ["1111111111"] * 3 + ["1100000000"]))
+    assert compare_with_control(steady, "bare", even, Goal.assist).difference == pytest.approx(0.3)
+    assert compare_with_control(uneven, "bare", even, Goal.assist).difference == pytest.approx(0.3)
+    assert compare_with_control(answers(["1111111110"] * 4), "bare", answers(["1000000000"] * 4, 9), Goal.assist).shown
+    low = [compare_with_control(a, "bare", even, Goal.assist).difference_interval[0] for a in (steady, uneven)]
+    assert low[1] < low[0] - 0.1
 
 
 def test_every_control_must_be_beaten_and_none_is_no_test():
-    patch = {f"{i}": True for i in range(10)}
-    good, bad = (
-        compare_with_control(patch, "bare", {f"{i}": False for i in range(10)}, Goal.assist),
-        compare_with_control(patch, "bare", patch, Goal.assist),
-    )
+    patch, none = answers(["1111111"] * 3), answers(["0000000"] * 3)
+    good, bad = (compare_with_control(patch, "bare", control, Goal.assist) for control in (none, patch))
+    unjudged = compare_with_control(patch, "gray", {}, Goal.assist)
     assert effect_of([good]) == "shown" and effect_of([good, bad]) == "not_shown"
-    assert effect_of([]) == effect_of([compare_with_control(patch, "bare", {}, Goal.assist)]) == "not_tested"
-    assert compare_with_control(patch, "bare", {}, Goal.assist).shown is None
+    assert effect_of([]) == effect_of([unjudged]) == "not_tested"
+    assert unjudged.shown is None and "no photograph of it" in unjudged.advice
+    assert effect_of([good, unjudged]) == "not_shown"  # a control that nobody could judge was not beaten
+
+
+def test_looks_that_were_not_planned_ask_for_more_and_together_spend_no_more_than_the_planned_one():
+    for planned in (1, 4):
+        tails = [Look(number, planned).tail for number in range(1, 2000)]
+        assert tails[planned - 1] == TAIL and TAIL < sum(tails) <= 2 * TAIL
+    promise = promise_of(0.9)
+    words = [judge(34, (40,), promise, look=Look(number)) for number in range(1, 9)]
+    assert words[0] == judge(34, (40,), promise) and words[0].verdict == "kept" and "look" not in words[0].reason
+    assert words[-1].verdict == "cannot_tell" and "as for look 8" in words[-1].reason
+
+
+def test_looking_until_it_fits_keeps_no_more_promises_falsely():
+    """12 sessions of 10, the rate just asked for, a correlation of 0.1: 9 % are kept falsely if looks are free."""
+    rng, promise, found = np.random.default_rng(0), promise_of(0.85, 0.3, correlation=0.1), np.zeros((2, 1000), bool)
+    rate, sizes = required_rate(promise), [(10,) * n for n in range(1, 13)]
+    hits = rng.binomial(10, rng.beta(9 * rate, 9 * (1 - rate), (1000, 12))).cumsum(1)
+    for i, photos in enumerate(sizes):
+        for row, look in enumerate((Look(i + 1), Look())):
+            least = next((k for k in range(sum(photos) + 1) if is_kept(k, photos, promise, look)), 999)
+            found[row] |= hits[:, i] >= least
+    assert found[0].mean() <= 0.05 < 0.08 < found[1].mean()
+
+
+def is_kept(recognized: int, photos: tuple[int, ...], promise: Promise, look: Look) -> bool:
+    return judge(recognized, photos, promise, look=look).verdict == "kept"
 
 
 def conditions(scales, recognized):
@@ -187,3 +237,23 @@ def test_the_matched_rate_is_that_of_the_nearest_conditions():
     assert matched_rate([entry(px_per_mm=1.0), entry(px_per_mm=5.0)], claims) == 0.5
     assert matched_rate([entry()], claims) is None and matched_rate([], claims) is None
     assert matched_rate([entry(px_per_mm=1.0)], conditions([None], [True])) is None
+
+
+@pytest.mark.parametrize(("earlier", "seen", "number"), [(None, "a", 1), (2, "a", 2), (2, "b", 3), ("x", "a", 1)])
+def test_a_report_of_other_photographs_in_the_same_folder_is_a_look(tmp_path, earlier, seen, number):
+    manifest, entry = make_manifest(), PhotoEntry(file="a.jpg", status="judged", sha256=seen)
+    content = {"sheet_id": manifest.sheet_id, "summary": {"looks": earlier}, "photos": [{"sha256": "a"}]}
+    if earlier is not None:
+        (tmp_path / "report.json").write_text(json.dumps(content))
+    assert _look_at(tmp_path, manifest)([entry]) == Look(number)
+    (tmp_path / "report.json").write_text(json.dumps(content | {"sheet_id": "other"}))
+    assert _look_at(tmp_path, manifest)([entry]) == Look(1)
+
+
+def test_photographs_that_were_watched_have_a_look_for_each_session():
+    promise = promise_of(0.85, 0.2, correlation=0.1)
+    planned = sessions_needed(promise)
+    assert watched((), promise) == Look(1, planned) and watched((10,) * planned, promise).tail == TAIL
+    assert (
+        watched((10,) * 3, promise).number == 3 and watched((10,), promise_of(0.3, 0.28, correlation=0.2)).planned == 15
+    )

@@ -50,3 +50,21 @@ def test_a_cell_goes_from_the_scene_to_forecasts_and_effects(tmp_path, monkeypat
         # a photograph or two may be too small to be taken again
         assert 3 <= len(session["forecast"]) <= 5 and all(0 < chance < 1 for chance, _ in session["forecast"])
         assert session["photographed"] is not None and (session["agree"] is None) == (len(session["forecast"]) < 5)
+
+
+def test_photographs_of_one_session_are_verified_too(tmp_path, monkeypatch):
+    """One session's photographs lie in the folder itself, in no folder of a session."""
+    verified = []
+    folders = {None: tmp_path / "photos", "gray": tmp_path / "gray"}
+    for folder in folders.values():
+        folder.mkdir()
+        (folder / "photo_0001.jpg").write_bytes(b"")
+    monkeypatch.setattr(forecasts, "make_run_and_sheet", lambda base, cell, folder: None)
+    monkeypatch.setattr(forecasts, "take_photos", lambda settings, cell, run, folder, control=None: folders[control])
+    monkeypatch.setattr("patchproof.reprints.photo_forecast.photo_forecaster", lambda run, manifest: None)
+    monkeypatch.setattr("patchproof.sheets.manifest.load_manifest", lambda path: None)
+    monkeypatch.setattr(forecasts, "verify_photos", lambda photos, *rest, controls: verified.append((photos, controls)))
+    monkeypatch.setattr(forecasts, "_record_session", lambda report, control: session([]))
+    monkeypatch.setattr(forecasts, "record_promise", lambda run: {})
+    answers = forecasts.run(SETTINGS, tmp_path, Cell("a", {}))
+    assert len(answers["sessions"]) == 1 and verified == [(folders[None], folders["gray"])]

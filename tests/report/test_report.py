@@ -27,11 +27,14 @@ from patchproof.evidence.results import (
     PhotoEntry,
     Prediction,
     Report,
+    SessionCount,
     Summary,
 )
+from patchproof.optimizer.evaluate import Evaluation
 from patchproof.report.images import delta_map, save_pictures
 from patchproof.report.tables import Drawing, Results, Table, write_results
-from patchproof.report.write import photos_csv, write_report
+from patchproof.report.words import evaluation_lines, verdict_lines
+from patchproof.report.write import photos_csv, report_html, write_report
 from test_verify_run import promise
 
 
@@ -54,7 +57,7 @@ def some_report(verdict="kept"):
         effect="not_tested", matched_rate=None, reason="3 of 3 photographs were recognized.",
     )  # fmt: skip
     origin = Origin(options={"ruler_mm": (97.1, 97.3)}, sha256={"network net": "e" * 64}, versions={"numpy": "1"})
-    controls = (Control("gray", 1, 3, (0.06, 0.79), 3, 0.67, (0.1, 0.9), 0.5, False),)
+    controls = (Control("gray", 1, 3, (0.06, 0.79), 3, 0.67, (0.1, 0.9), 2, "", False),)
     return Report(sheet_id="TESTSHEET0", photos=tuple(photos), summary=summary, controls=controls, origin=origin)
 
 
@@ -304,3 +307,25 @@ def test_a_report_of_fifty_photographs_prints_on_a_few_pages(tmp_path):
     subprocess.run([browser, *flags.split(), f"--print-to-pdf={out}", page.as_uri()], capture_output=True, timeout=60)
     pages = len(re.findall(rb"/Type\s*/Page\b", out.read_bytes()))
     assert 2 <= pages <= 6
+
+
+def test_what_was_not_measured_how_often_was_looked_and_which_folders_are_one_is_said():
+    missing, note = {"the scale of the print": "no scan"}, "3 folders look like 2 sessions: a, b"
+    sessions = [
+        SessionCount(name=n, recognized=1, judged=1, same_as=s) for n, s in (("a", None), ("b", "a"), ("c", None))
+    ]
+    changes = {"not_measured": missing, "sessions_note": note, "sessions": sessions, "looks": 3}
+    report = some_report().changed(summary=some_report().summary.changed(**changes))
+    lines = "\n".join(verdict_lines(report))
+    for text in ("not measured: the scale of the print (no scan)", "sessions: 2", note, "looks: 3, counted in"):
+        assert text in lines
+    page = report_html(
+        report.model_dump(mode="json"),
+        {"settings": {}, "promise": None, "design": None, "kind": "blank", "page_mm": (210, 297)},
+        {},
+        None,
+    )
+    assert "Not measured: the scale of the print (no scan)." in page and note in page
+    result = Evaluation(n=1, seed=0, models={}, not_measured={"AP50 of net": "no box"})
+    assert evaluation_lines(result.model_dump()) == ["not measured: AP50 of net (no box)"]
+    assert json.loads(result.to_json())["not_measured"] == {"AP50 of net": "no box"}

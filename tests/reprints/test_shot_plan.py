@@ -4,23 +4,22 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.stats import binom
+from scipy.stats import binom, binomtest
 
-from patchproof.base.goal import Goal
 from patchproof.base.intervals import independent_difference
-from patchproof.evidence.verdict import MIN_KEPT_CHANCE, PHOTOS_PER_SESSION, compare_with_control, kept_chance
+from patchproof.evidence.verdict import MIN_KEPT_CHANCE, PHOTOS_PER_SESSION, kept_chance
 from patchproof.reprints.shot_plan import fewest_photos, paired_power, plan_shots, unpaired_power
 from test_verify_verdict import promise_of
 
 
 @pytest.mark.parametrize(("rates", "n"), [((0.9, 0.4), 20), ((0.7, 0.5), 60)])
-def test_power_is_what_the_judge_finds_in_simulation(rates, n):
+def test_power_is_that_of_photographs_that_agree_between_places(rates, n):
     rng, paired, unpaired, trials = np.random.default_rng(0), 0, 0, 900
     for _ in range(trials):
         a, b = (rng.random(n) < rate for rate in rates)
-        left = {str(i): bool(x) for i, x in enumerate(a)}
-        paired += compare_with_control(left, "bare", {str(i): bool(x) for i, x in enumerate(b)}, Goal.assist).shown
-        unpaired += compare_with_control(left, "bare", {f"c{i}": bool(x) for i, x in enumerate(b)}, Goal.assist).shown
+        only_a, only_b = int((a & ~b).sum()), int((b & ~a).sum())
+        paired += only_a > only_b and binomtest(only_a, only_a + only_b).pvalue < 0.05
+        unpaired += independent_difference(int(a.sum()), n, int(b.sum()), n)[1][0] > 0
     # three standard errors of 900 trials
     assert paired_power(*rates, n) == pytest.approx(paired / trials, abs=0.05)
     assert unpaired_power(*rates, n) == pytest.approx(unpaired / trials, abs=0.05)

@@ -48,6 +48,7 @@ STUDIES: dict[str, str] = {
     "promises": "patchlab.validation.promises",
     "real": "patchlab.validation.real_photos",
     "robust": "patchlab.paper.robust",
+    "session-trials": "patchlab.validation.session_trials",
     "stress": "patchlab.paper.stress",
     "transfer": "patchlab.paper.transfer",
     "verdicts": "patchlab.validation.verdicts",

@@ -51,11 +51,10 @@ def run(settings: ForecastsSettings, base: Path, cell: Cell) -> dict[str, Any]:
         if settings.control is not None:
             controls = take_photos(settings, cell, patch_run, folder, settings.control)
         forecast, sessions = photo_forecaster(patch_run, load_manifest(folder / "sheet.json")), []
-        for session in sorted(photos.iterdir()):
-            if session.is_dir():
-                of_control = None if controls is None else controls / session.name
-                report = verify_photos(session, folder, base, cell, forecast, controls=of_control)
-                sessions.append(_record_session(report, settings.control))
+        for name in sorted(path.name for path in photos.iterdir() if path.is_dir()) or [""]:  # one has no folder
+            of_control = None if controls is None else controls / name
+            report = verify_photos(photos / name, folder, base, cell, forecast, controls=of_control)
+            sessions.append(_record_session(report, settings.control))
     return record_promise(patch_run) | {"sessions": sessions}
 
 

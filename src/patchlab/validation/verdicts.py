@@ -58,7 +58,7 @@ def cells(settings: VerdictsSettings, base: Path) -> list[Cell]:
 def run(settings: VerdictsSettings, base: Path, cell: Cell) -> dict[str, Any]:
     """By number of sessions: for each count, the share of promises with each verdict."""
     rng, words = np.random.default_rng(0), {}
-    promises = [_draw_promise(settings, cell.values["correlation"], rng) for _ in range(settings.promises)]
+    promises = [draw_promise(settings, cell.values["correlation"], rng) for _ in range(settings.promises)]
     for sessions in settings.sessions:
         parts = split_evenly(settings.photos, sessions)
         rows = [[judge(k, parts, promise).verdict for k in range(settings.photos + 1)] for promise in promises]
@@ -69,7 +69,8 @@ def run(settings: VerdictsSettings, base: Path, cell: Cell) -> dict[str, Any]:
     return words
 
 
-def _draw_promise(settings: VerdictsSettings, correlation: float, rng: np.random.Generator) -> Promise:
+def draw_promise(settings: VerdictsSettings, correlation: float, rng: np.random.Generator) -> Promise:
+    """Draw a promise with as many sessions as real ones, whose rates have that correlation."""
     strength = 1 / correlation - 1
     sessions = PROMISE_VIEWS // VIEWS_PER_SESSION
     rates = rng.beta(settings.rate * strength, (1 - settings.rate) * strength, (sessions, 1))

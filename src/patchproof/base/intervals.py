@@ -115,15 +115,6 @@ def resampled_means(values: np.ndarray, draws: int) -> np.ndarray:
     return values[np.random.default_rng(0).integers(0, len(values), (draws, len(values)))].mean(1)
 
 
-def mcnemar_p(a: list[bool], b: list[bool]) -> float:
-    """Return the exact two-sided McNemar p-value of equal rates in the pairs (a, b); 1 if no pair differs."""
-    from scipy.stats import binomtest
-
-    only_a = sum(x and not y for x, y in zip(a, b, strict=True))
-    only_b = sum(y and not x for x, y in zip(a, b, strict=True))
-    return 1.0 if only_a + only_b == 0 else float(binomtest(only_a, only_a + only_b).pvalue)
-
-
 @lru_cache(maxsize=8)
 def _z(confidence: float) -> float:
     return statistics.NormalDist().inv_cdf(0.5 + confidence / 2)

@@ -11,7 +11,7 @@ import math
 import os
 import re
 import tomllib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeVar, get_args
@@ -116,6 +116,11 @@ def spelling_hint(word: str, known_words: Iterable[str]) -> str:
 def summarize_names(names: Sequence[str]) -> str:
     """The first three names, and the number of further ones: 'a, b, c and 4 more'."""
     return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+
+
+def not_measured_lines(reasons: Mapping[str, str]) -> list[str]:
+    """'not measured: FIGURE (REASON)' for each figure."""
+    return [f"not measured: {figure} ({reason})" for figure, reason in reasons.items()]
 
 
 def within(low: float, high: float) -> AfterValidator:

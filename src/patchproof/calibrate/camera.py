@@ -25,6 +25,7 @@ import numpy as np
 from patchproof.base.errors import Refused
 from patchproof.base.output import check_file, write_files_atomically
 from patchproof.base.progress import Advance, Progress, no_advance, no_progress
+from patchproof.base.validation import not_measured_lines
 from patchproof.calibrate.boards import MIN_CORNERS, BoardView, find_boards
 from patchproof.calibrate.ladder import Rung
 from patchproof.calibrate.lens_ladder import PARAMETERS, LensFit, choose_lens_model, fit_rung
@@ -50,6 +51,12 @@ class CameraCalibration:
     views: tuple[BoardView, ...]
     left_out: Mapping[str, str]
     board: Board
+
+    @property
+    def not_measured(self) -> dict[str, str]:
+        """Reasons by lens model that has no held-out error."""
+        why = "no usable fit to these photographs, or to parts of them"
+        return {f"lens model {rung.name}": why for rung in self.rungs if not np.isfinite(rung.error)}
 
     @property
     def coverage(self) -> float:
@@ -127,6 +134,7 @@ def _fit_figures(result: CameraCalibration) -> dict:
             n: {"value": float(v), "standard_deviation": float(s)}
             for n, v, s in zip(PARAMETERS, fit.numbers, fit.sd, strict=True)
         },
+        "not_measured": result.not_measured,
         "rms_px": figure(fit.rms_px),
         "coverage": round(result.coverage, 3),
         "photos": sorted(photos, key=lambda photo: photo["file"]),
@@ -145,6 +153,7 @@ def calibration_lines(result: CameraCalibration) -> list[str]:
         f"{len(result.views)} photographs leave {fit.rms_px:.3f} px rms; tilts {fit.tilts_deg.min():.0f} to "
         f"{fit.tilts_deg.max():.0f}°",
     ]
+    lines += not_measured_lines(result.not_measured)
     lines += [f"left out: {file}: {reason}" for file, reason in result.left_out.items()]
     if result.coverage < GOOD_COVERAGE:
         lines.append(

@@ -25,6 +25,7 @@ from patchproof.base.color import linear_from_srgb, srgb_from_linear
 from patchproof.base.errors import Refused
 from patchproof.base.input import hash_file, is_file, is_folder
 from patchproof.base.progress import Advance, no_advance
+from patchproof.base.validation import not_measured_lines
 from patchproof.calibrate import color_ladder
 from patchproof.calibrate.chart_photo import ChartPhoto, chart_rows, read_chart
 from patchproof.calibrate.color_ladder import ColorMap, MapChoice, choose_map, color_difference, map_kinds
@@ -102,6 +103,7 @@ def calibrate_chart(
         "swatches": {"colors": choice.colors, "held_out": choice.held_out, "unreadable": _unreadable(manifest, usable)},
         "delta_e00_of_duplicates": _duplicates(sent[usable], light[usable]),
         "print_to_print": print_variation(by_print),
+        "not_measured": _not_measured(by_print, readings, sent[usable]),
         "photographs": [_row(reading, error) for reading, error in zip(readings, agreement, strict=True)],
         "uncertainty": f"mean ΔE00 {choice.chosen.error:.2f} of {choice.held_out} held-out colors of the chart",
     }
@@ -208,7 +210,21 @@ def summary_lines(calibration: PrinterCalibration) -> list[str]:
     spread = provenance["print_to_print"]
     if spread is not None:
         lines.append(f"prints differ from their mean by ΔE00 {spread['delta_e00']:.2f} ({spread['prints']} prints)")
-    return lines
+    if unreadable := provenance["swatches"]["unreadable"]:
+        lines.append(f"swatches that no photograph shows well enough: {unreadable}")
+    return lines + not_measured_lines(provenance["not_measured"])
+
+
+def _not_measured(by_print: Sequence[np.ndarray], readings: Sequence[PhotoReading], sent: np.ndarray) -> dict[str, str]:
+    """Reasons by figure that these photographs cannot show."""
+    reasons = {
+        "how prints differ": "there is one print" if len(by_print) < 2 else "",
+        "how photographs of a print differ": "each print has one photograph" if len(readings) == len(by_print) else "",
+        "the error of reading": "no readable color is on the chart twice"
+        if len(np.unique(sent, axis=0)) == len(sent)
+        else "",
+    }
+    return {figure: reason for figure, reason in reasons.items() if reason}
 
 
 def _read_all(

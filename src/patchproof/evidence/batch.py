@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from datetime import datetime
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -19,6 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field, ValidationError
 
+from patchproof.base.color import linear_from_srgb
 from patchproof.base.errors import WorkerDied
 from patchproof.base.geometry import apply_homography, rect_corners
 from patchproof.base.resample import downscaled_size, to_sixteenths
@@ -27,10 +29,11 @@ from patchproof.base.workers import Workers, result_of
 from patchproof.evidence.boxes import box_in_square
 from patchproof.evidence.camera import pinhole_photo
 from patchproof.evidence.classify import BoxEdges, Judges, square_of, squares_of
+from patchproof.evidence.grouping import time_and_camera
 from patchproof.evidence.journal import Journal, file_sha256
 from patchproof.evidence.measure import MeasuredPhoto, measure
 from patchproof.evidence.reproject import PhotoSquare, photo_square
-from patchproof.evidence.results import PhotoEntry, Remark
+from patchproof.evidence.results import PhotoEntry, Remark, Trace
 from patchproof.evidence.surface import Surface
 from patchproof.evidence.task import Task
 from patchproof.photo.exif import has_camera_shape
@@ -122,19 +125,21 @@ class _JournalPhoto(StrictModel):
     counted: bool
     light: _Light | None
     pictures: bool
+    trace: Trace | None = None
 
     @property
     def photo(self) -> MeasuredPhoto:
         light = self.light
         if light is not None:
             light = FrameLight(np.array(light.paper), np.array(light.ink), light.contrast, light.clipped)
-        return MeasuredPhoto(self.entry, self.counted, light=light)
+        return MeasuredPhoto(self.entry, self.counted, light=light, trace=self.trace)
 
 
 def _serialize(measured: MeasuredPhoto, pictures: bool) -> dict[str, Any]:
     light = measured.light and {key: np.asarray(value).tolist() for key, value in vars(measured.light).items()}
     entry = measured.entry.model_dump(mode="json")
-    return {"entry": entry, "counted": measured.counted, "light": light, "pictures": pictures}
+    trace = measured.trace and measured.trace.model_dump()
+    return {"entry": entry, "counted": measured.counted, "light": light, "pictures": pictures, "trace": trace}
 
 
 def _parse(line: Mapping[str, Any], item: PhotoItem, judges: Judges | None) -> MeasuredPhoto | None:
@@ -167,7 +172,7 @@ def _measure(task: Task, item: PhotoItem) -> MeasuredPhoto:
         if is_featureless(square_of(photo.srgb)[0]):
             return _rejected(item, Remark(code="empty", advice=_EMPTY_ADVICE))
         entry = PhotoEntry(file=item.file, status="judged", box=box, said=photo.said)
-        return MeasuredPhoto(entry, True, squares=squares)
+        return MeasuredPhoto(entry, True, squares=squares, trace=_trace(item.path, photo.srgb))
     view = pinhole_photo(photo, task.camera)
     measured = measure(view, item.file, task.surface, task.promised, task.ranges, task.scan_dpi, item.with_pictures)
     entry, pictures = measured.entry, {}
@@ -181,7 +186,21 @@ def _measure(task: Task, item: PhotoItem) -> MeasuredPhoto:
     if task.scan_dpi and not measured.counted and any(abs(dpi / task.scan_dpi - 1) > 0.01 for dpi in photo.dpi if dpi):
         said += (_OTHER_DPI.format(*photo.dpi, task.scan_dpi),)
     entry = entry.changed(box=box or entry.box, said=said)
-    return replace(measured, entry=entry, pictures=pictures, squares=squares)
+    trace = _trace(item.path, photo.srgb)
+    return replace(measured, entry=entry, pictures=pictures, squares=squares, trace=trace)
+
+
+def _trace(path: Path, srgb: np.ndarray) -> Trace:
+    """Read time and camera, and average the outer eighth of the picture on each side, where the piece rarely is."""
+    step = max(1, min(srgb.shape[:2]) // 256)  # averaging all pixels of large photographs takes long
+    sampled = np.ascontiguousarray(srgb[::step, ::step])
+    small = linear_from_srgb(cv2.resize(sampled, (32, 32), interpolation=cv2.INTER_AREA) / 255)
+    frame = np.ones((32, 32), bool)
+    frame[4:-4, 4:-4] = False
+    red, green, blue = map(float, small[frame].mean(0))
+    taken = time_and_camera(path)
+    minute = taken and (taken[0] - datetime.min).total_seconds() / 60
+    return Trace(minute=minute, camera=taken[1] if taken else "", frame=(red, green, blue))
 
 
 def _thumbnail(srgb: np.ndarray, px_from_mm: ArrayLike | None, surface: Surface) -> np.ndarray:

@@ -6,7 +6,7 @@ In: the photographs' rate, photographs of controls or, without any, the controls
     helps      every control was beaten, at 95 %
     worse      the interval of the difference to that control lies below zero
     no_better  neither; the promise expected no more, or a gain of 10 points is ruled out
-    not_shown  neither; the promise expected more, and such a gain is not ruled out
+    not_shown  neither; such a gain is not ruled out, and the promise expected more or all were taken in one session
 
 with gain and loss mirrored for `deceive`. The verdict on the promise is independent: a patch that was promised to be
 useless, and is, keeps its promise.
@@ -46,7 +46,10 @@ def benefit_of(
     row = min(unbeaten or rows, key=lambda row: (bool(unbeaten) and row[0] != "bare", gain_interval(row)))
     (low, high), (name, control_rate, difference, ends) = gain_interval(row), row
     word: BenefitWord = "helps" if low > 0 else "worse" if high < 0 else "no_better"
-    if word == "no_better" and promise.controls and promise.comparison == "better" and high >= LEAST_GAIN:
+    advice = next((each.advice for each in controls if each.advice and photographed), "")
+    if word == "helps" and advice:
+        word = "not_shown"
+    if word == "no_better" and (advice or (promise.controls and promise.comparison == "better")) and high >= LEAST_GAIN:
         word = "not_shown"
     return Benefit(
         word=word,
@@ -56,4 +59,5 @@ def benefit_of(
         difference=difference,
         difference_interval=ends,
         photographed=photographed,
+        advice=advice,
     )

@@ -8,6 +8,7 @@ journal, finished photographs survive a kill.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing, nullcontext
 from dataclasses import replace
@@ -38,8 +39,18 @@ from patchproof.evidence.measure import MeasuredPhoto
 from patchproof.evidence.ranges import matched_rate, promised_side_px
 from patchproof.evidence.reproject import PhotoSquare
 from patchproof.evidence.results import Ledger, ModelRate, PhotoEntry, Report, Scale, SessionCount, Summary
+from patchproof.evidence.same_session import control_keys, merge_folders
 from patchproof.evidence.task import Options, task_of
-from patchproof.evidence.verdict import Verdict, compare_with_control, effect_of, judge, next_step
+from patchproof.evidence.verdict import (
+    PLANNED_LOOK,
+    Look,
+    Verdict,
+    compare_with_control,
+    effect_of,
+    judge,
+    next_step,
+    watched,
+)
 from patchproof.photo.read import list_images, list_skipped_files, printable_name, summarize_said
 from patchproof.sheets.manifest import Manifest
 
@@ -53,6 +64,7 @@ def gather_evidence(
     journal: Path | None = None,
     resume: bool = False,
     forecast: Callable[[PhotoSquare], float | None] | None = None,
+    look_at: Callable[[Sequence[PhotoEntry]], Look | None] = lambda entries: PLANNED_LOOK,
     on_pictures: Callable[[str, Mapping[str, np.ndarray]], None] = lambda file, pictures: None,
     advance: Advance = no_advance,
 ) -> Report:
@@ -61,17 +73,18 @@ def gather_evidence(
 
     Photographs are measured by the processes or the cluster of `compute`. The file `journal` records
     finished photographs; with `resume` those of an earlier run are not measured again. `forecast` computes the chance
-    that a photograph is recognized, without its pixels of the piece. `on_pictures` gets a name and pictures by kind
-    (`photo`, and `seen`, `fitted`, `promised`, `delta_e00` of a measured one) of the first `batch.MAX_PICTURED_PHOTOS`
-    photographs when each is measured; `advance` is called with (done, total).
+    that a photograph is recognized, without its pixels of the piece. `look_at` tells the look from the entries, see
+    `report_of`. `on_pictures` gets a name and pictures by kind (`photo`, and `seen`, `fitted`, `promised`, `delta_e00`
+    of a measured one) of the first `batch.MAX_PICTURED_PHOTOS` photographs when each is measured; `advance` is called
+    with (done, total).
     """
     controls_folder = None if options.controls is None else Path(options.controls)
-    grouping, by_control = group_sessions(photos, controls_folder), _list_controls(controls_folder)
-    paths = grouping.paths
+    grouping = group_sessions(photos, controls_folder)
+    by_control, paths = _list_controls(controls_folder, grouping.names), grouping.paths
     judges = judges_of(options.models, manifest)
     task = task_of(manifest, options, judges)
     items = [PhotoItem(path, grouping.file(i), with_pictures=i < MAX_PICTURED_PHOTOS) for i, path in enumerate(paths)]
-    items += [PhotoItem(path, printable_name(path.name), name) for name, files in by_control.items() for path in files]
+    items += [PhotoItem(path, file, name) for name, files in by_control.items() for file, path in files.items()]
     items = [replace(item, box_px=box_of_photo(options.boxes, item.name)) for item in items]
     if options.boxes and not any(item.box_px for item in items):
         do = "name the images in the boxes' file as the photographs"
@@ -80,7 +93,8 @@ def gather_evidence(
     journal_file = closing(Journal(journal, settings_key(manifest, options), resume)) if journal else nullcontext()
     with journal_file as open_journal, open_workers(compute.jobs, compute.cluster) as workers:
         results = measure_all(task, items, judges, workers, open_journal, on_pictures, advance)
-        patch_photos = reject_copies(results[: len(paths)], grouping.session, task.surface.rect_mm)
+        grouping = merge_folders(grouping, results[: len(paths)])
+        patch_photos = reject_copies(results[: len(paths)], grouping.merged, task.surface.rect_mm)
         ledger, estimate = None, None
         if judges and task.promised:
             originals = [number for number, photo in enumerate(patch_photos) if photo.entry.code != COPY_CODE]
@@ -97,22 +111,31 @@ def gather_evidence(
             if forecast is not None:
                 pairs = zip(paths, patch_photos, strict=True)
                 patch_photos = [with_forecast(read_shot, forecast, path, photo) for path, photo in pairs]
-    entries_by_control: dict[str, dict[str, PhotoEntry]] = {}
+    by_sha256: dict[str, dict[str, MeasuredPhoto]] = {}
     left_out = list_skipped_files(Path(photos), controls_folder and controls_folder.resolve())
     if controls_folder:
-        left_out += [f"{printable_name(controls_folder.name)}: {text}" for text in list_skipped_files(controls_folder)]
+        left_out += [
+            f"{printable_name(controls_folder.name)}: {text}" for text in list_skipped_files(controls_folder, depth=2)
+        ]
     left_out += summarize_said((item.name, result.entry.said) for item, result in zip(items, results, strict=True))
     for item, result in zip(items, results, strict=True):
         if item.control is not None:
             name, entry = item.control, result.entry
-            first = entries_by_control.setdefault(name, {}).setdefault(entry.sha256 or item.name, entry)
+            first = by_sha256.setdefault(name, {}).setdefault(entry.sha256 or item.name, result).entry
             if first is not entry:
                 left_out.append(f"{name}/{entry.file} has the bytes of {name}/{first.file}, which counts once")
             elif entry.status == "rejected" and entry.remark is not None:
                 left_out.append(f"{name}/{entry.file} does not count: {entry.remark.advice}")
-    controls = {name: list(entries.values()) for name, entries in entries_by_control.items()}
-    report = report_of(manifest, judges, patch_photos, grouping, controls, ledger, options.ruler_mm)
-    return report.changed(summary=report.summary.changed(estimated=estimate, left_out=tuple(left_out)))
+    controls = {name: list(photos.values()) for name, photos in by_sha256.items()}
+    look = look_at([photo.entry for photo in patch_photos])
+    report = report_of(manifest, judges, patch_photos, grouping, controls, ledger, options.ruler_mm, look)
+    missing = {}
+    if options.scan_dpi and not any(photo.entry.scale for photo in patch_photos):
+        missing["the print's scale"] = f"no photograph is a flat scan at {options.scan_dpi:g} dpi"
+    if judges and task.promised and options.ledger_photos and (ledger is None or estimate is None):
+        missing["where the rate was lost, what controls would show"] = "too few photographs can be measured"
+    summary = report.summary.changed(estimated=estimate, left_out=tuple(left_out), not_measured=missing)
+    return report.changed(summary=summary)
 
 
 def with_forecast(
@@ -127,19 +150,30 @@ def with_forecast(
     return replace(photo, entry=photo.entry.changed(forecast=chance))
 
 
-def _list_controls(folder: Path | None) -> dict[str, list[Path]]:
-    """List photographs by control: the folder's own pictures, or one control for each subfolder."""
+def _list_controls(folder: Path | None, sessions: Sequence[str]) -> dict[str, dict[str, Path]]:
+    """List photographs by control, and by FILE or SESSION/FILE: those of the folder itself, also if its folders have
+    the names of the patch's `sessions`, or one control for each subfolder.
+    """
     if folder is None:
         return {}
     if not is_folder(folder):
         raise Refused("a folder of control photographs", f"no folder at {folder}", "check the path")
-    if pictures := list_images(folder):
-        return {printable_name(folder.name): pictures}
     folders = sorted(p for p in folder.iterdir() if p.is_dir() and not p.name.startswith("."))
-    controls = {printable_name(p.name): files for p in folders if (files := list_images(p))}
+    named = [p for p in folders if list_images(p)]
+    if list_images(folder) or (named and all(printable_name(p.name) in sessions for p in named)):
+        return {printable_name(folder.name): _control_files(folder)}
+    controls = {printable_name(p.name): files for p in folders if (files := _control_files(p))}
     if not controls:
         raise Refused(f"control photographs in {folder}", "none", "copy them there, one control per folder")
     return controls
+
+
+def _control_files(folder: Path) -> dict[str, Path]:
+    """A control's photographs: those in the folder, or in its folders if there are none."""
+    if pictures := list_images(folder):
+        return {printable_name(path.name): path for path in pictures}
+    sessions = sorted(p for p in folder.iterdir() if p.is_dir() and not p.name.startswith("."))
+    return {printable_name(f"{p.name}/{path.name}"): path for p in sessions for path in list_images(p)}
 
 
 def report_of(
@@ -147,11 +181,14 @@ def report_of(
     judges: Judges | None,
     photos: Sequence[MeasuredPhoto],
     grouping: Grouping,
-    controls: Mapping[str, Sequence[PhotoEntry]],
+    controls: Mapping[str, Sequence[MeasuredPhoto]],
     ledger: Ledger | None = None,
     ruler_mm: tuple[float, float] | None = None,
+    look: Look | None = PLANNED_LOOK,
 ) -> Report:
-    """Sum up all photographs; with a promise and `judges` also verdict, rates, forecast and the controls' effect."""
+    """Sum up all photographs; with a promise and `judges` also verdict, rates, forecast and the controls' effect.
+    Without a `look` the photographs were watched while they were taken.
+    """
     entries, counted = [photo.entry for photo in photos], [photo.entry for photo in photos if photo.counted]
     verdict, matched = Verdict("cannot_tell", None, "The sheet promises nothing."), None
     comparisons, rates, rate, interval, sessions, forecast, do, worth = [], {}, _rate({}), None, (), None, "", None
@@ -162,8 +199,10 @@ def report_of(
         without_markers = sum(e.code == "too_few_markers" and e.status == "rejected" for e in entries)
         goal = promise.target.goal
         sessions = _sessions(grouping, photos, recognized)
-        counts = sum(recognized.values()), [session.judged for session in sessions if session.judged]
-        verdict = judge(*counts, promise, without_markers)
+        numbers = dict(zip((entry.file for entry in entries), grouping.merged, strict=True))
+        counts = sum(recognized.values()), list(Counter(numbers[file] for file in recognized).values())
+        look = look or watched(counts[1], promise)
+        verdict = judge(*counts, promise, without_markers, look)
         if recognized:
             posterior = promise.posterior
             interval = posterior.least_rate(*counts, TAIL), posterior.most_rate(*counts, TAIL)
@@ -172,9 +211,11 @@ def report_of(
         pairs = [(e.forecast, recognized[e.file]) for e in counted if e.forecast is not None and e.file in recognized]
         if pairs:
             forecast = forecast_of([p for p, _ in pairs], [answer for _, answer in pairs], promise.rate)
-        comparisons = [
-            compare_with_control(recognized, name, _recognized(e, primary), goal) for name, e in controls.items()
-        ]
+        answers = {(numbers[file], file): answer for file, answer in recognized.items()}
+        for name, control in controls.items():
+            keys, hits = control_keys(grouping, photos, control), _recognized((p.entry for p in control), primary)
+            hits_by_key = {keys[file]: hit for file, hit in hits.items()}
+            comparisons.append(compare_with_control(answers, name, hits_by_key, goal))
         if verdict.verdict == "cannot_tell":
             do = next_step(promise, counts[1], without_markers)
         if rate.rate is not None and interval is not None:
@@ -187,6 +228,9 @@ def report_of(
         interval=interval,
         sessions=sessions,
         sessions_known_from=grouping.known_from,
+        sessions_note=grouping.note,
+        looks=(look or PLANNED_LOOK).number,
+        looks_planned=(look or PLANNED_LOOK).planned,
         prediction_interval=verdict.prediction_interval,
         verdict=verdict.verdict,
         effect=effect_of(comparisons),
@@ -212,13 +256,15 @@ def report_of(
 def _sessions(
     grouping: Grouping, photos: Sequence[MeasuredPhoto], hits: Mapping[str, bool]
 ) -> tuple[SessionCount, ...]:
-    """Count the judged and recognized photographs of each session."""
+    """Count the judged and recognized photographs of each session, or of each folder that is part of one."""
     answers: list[list[bool]] = [[] for _ in grouping.names]
     for number, photo in zip(grouping.session, photos, strict=True):
         if photo.counted and photo.entry.file in hits:
             answers[number].append(hits[photo.entry.file])
-    named = zip(grouping.names, answers, strict=True)
-    return tuple(SessionCount(name=name, recognized=sum(session), judged=len(session)) for name, session in named)
+    firsts = grouping.same_as or range(len(grouping.names))
+    same_as = [None if first == number else grouping.names[first] for number, first in enumerate(firsts)]
+    rows = zip(grouping.names, answers, same_as, strict=True)
+    return tuple(SessionCount(name=n, recognized=sum(a), judged=len(a), same_as=first) for n, a, first in rows)
 
 
 def _recognized(entries: Iterable[PhotoEntry], network: str) -> dict[str, bool]:

@@ -13,12 +13,14 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
+from patchproof.base.errors import TimeLimitExceeded
 from patchproof.base.input import is_folder, open_lazily
 from patchproof.photo.limits import run_limited
 from patchproof.photo.read import list_images, list_photos, printable_name
+from patchproof.photo.rejection import PhotoRejected
 
 PAUSE_MINUTES = 30.0
-_EXIF_IFD, _TIME_TAG, _MODEL_TAG = 0x8769, 0x9003, 0x0110
+_EXIF_IFD, _TIME_TAG, _SERIAL_TAG, _MODEL_TAG = 0x8769, 0x9003, 0xA431, 0x0110
 
 
 @dataclass(frozen=True)
@@ -29,6 +31,13 @@ class Grouping:
     session: tuple[int, ...]
     names: tuple[str, ...]
     known_from: str
+    same_as: tuple[int, ...] = ()  # the number of the session that each one is part of; itself if empty
+    note: str = ""  # how they were merged, or that this could not be checked
+
+    @property
+    def merged(self) -> tuple[int, ...]:
+        """The number of each photograph's session, as merged."""
+        return tuple(self.same_as[number] for number in self.session) if self.same_as else self.session
 
     def file(self, number: int) -> str:
         """Name the photograph in reports: FILE, or FOLDER/FILE where folders are sessions."""
@@ -57,7 +66,7 @@ def group_sessions(folder: str | Path, without: Path | None = None) -> Grouping:
 
 
 def _group_by_time(paths: Sequence[Path]) -> Grouping:
-    sources = [source for path in paths if (source := _time_and_camera(path)) is not None]
+    sources = [source for path in paths if (source := _time_within_limits(path)) is not None]
     if len(sources) < len(paths):
         return Grouping(tuple(paths), (0,) * len(paths), ("",), BY_GUESS)
     sessions, names, last = [0] * len(paths), [], {}
@@ -70,17 +79,27 @@ def _group_by_time(paths: Sequence[Path]) -> Grouping:
     return Grouping(tuple(paths), tuple(sessions), tuple(names), BY_TIMES)
 
 
-def _time_and_camera(path: Path) -> tuple[datetime, str] | None:
+def time_and_camera(path: Path) -> tuple[datetime, str] | None:
     """Time and camera by the file's EXIF data; None if either is missing."""
     try:
-        time, camera = run_limited(_read_exif, path)
+        time, camera = _read_exif(path)
         return datetime.strptime(time.strip("\0 "), "%Y:%m:%d %H:%M:%S"), " ".join(camera.split())[:40]
+    except TimeLimitExceeded:
+        raise
     except Exception:  # an unreadable file has no time; it is rejected later
         return None
 
 
+def _time_within_limits(path: Path) -> tuple[datetime, str] | None:
+    try:
+        return run_limited(time_and_camera, path)
+    except PhotoRejected:
+        return None
+
+
 def _read_exif(path: Path) -> tuple[str, str]:
-    """EXIF's time and camera as text."""
+    """EXIF's time, and its camera's model and serial number, as text."""
     with warnings.catch_warnings(action="ignore"), open_lazily(path) as image:
         exif = image.getexif()
-        return str(exif.get_ifd(_EXIF_IFD).get(_TIME_TAG)), str(exif.get(_MODEL_TAG) or "")
+        details = exif.get_ifd(_EXIF_IFD)
+        return str(details.get(_TIME_TAG)), f"{exif.get(_MODEL_TAG) or ''} {details.get(_SERIAL_TAG) or ''}"

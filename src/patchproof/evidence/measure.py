@@ -19,7 +19,7 @@ from patchproof.evidence.appearance import MOST_CLIPPED, appearance
 from patchproof.evidence.camera import PinholePhoto
 from patchproof.evidence.locate import MOST_SHIFT, LocatedSheet, camera_pose, geometry_of, locate_sheet, object_box
 from patchproof.evidence.ranges import PromisedRanges
-from patchproof.evidence.results import Geometry, PhotoEntry, Remark, Scale
+from patchproof.evidence.results import Geometry, PhotoEntry, Remark, Scale, Trace
 from patchproof.evidence.surface import PromisedColors, Surface
 from patchproof.photo.detect import MarkersInView, find_markers, is_mirrored
 from patchproof.photo.known_page import complete_markers, find_sheet
@@ -62,7 +62,7 @@ _HIDDEN_ADVICE = "a corner of the design is covered, folded away or out of the p
 @dataclass(frozen=True)
 class MeasuredPhoto:
     """An entry without predictions, whether it is counted, pictures by kind, the light on the markers (None: unread),
-    and the networks' squares by their side in pixels (None: not made).
+    the networks' squares by their side in pixels (None: not made), and its trace (None: rejected).
     """
 
     entry: PhotoEntry
@@ -70,6 +70,7 @@ class MeasuredPhoto:
     pictures: dict[str, np.ndarray] = field(default_factory=dict)
     light: FrameLight | None = None
     squares: dict[int, np.ndarray] | None = None
+    trace: Trace | None = None
 
 
 def measure(

@@ -152,6 +152,16 @@ class PhotoEntry(StrictModel):
         return {key: figures.get(key) for key in PHOTO_KEYS} | ({"said": figures["said"]} if figures["said"] else {})
 
 
+class Trace(StrictModel):
+    """When and with which camera a photograph was taken (null: EXIF does not say), and the mean linear light of its
+    frame, which shows the place (1 = full white).
+    """
+
+    minute: Finite | None
+    camera: str
+    frame: _Row
+
+
 class ModelRate(StrictModel):
     """One network's rate over the judged photographs."""
 
@@ -212,15 +222,20 @@ class Forecast(StrictModel):
 
 
 class SessionCount(StrictModel):
-    """One session's judged photographs, and how many of them were recognized."""
+    """One session's judged photographs, and how many of them were recognized; `same_as` names the session that a folder
+    is part of (null: its own).
+    """
 
     name: str
     recognized: int
     judged: int
+    same_as: str | None = None
 
 
 class Benefit(StrictModel):
-    """The patch's benefit over the control that decided it, whose rate was promised or, if so, `photographed`."""
+    """The patch's benefit over the control that decided it, whose rate was promised or, if so, `photographed`; `advice`
+    says why such photographs cannot tell.
+    """
 
     word: BenefitWord
     goal: Goal
@@ -229,11 +244,13 @@ class Benefit(StrictModel):
     difference: Finite
     difference_interval: tuple[Finite, Finite]
     photographed: bool
+    advice: str = ""
 
 
 class Summary(StrictModel):
     """The summary of all photographs, for the promise's primary model. The rate's interval accounts for differences
-    between sessions; `sessions_known_from` says how these were told apart, `left_out` which files were not used.
+    between sessions; `sessions_known_from` says how these were told apart, `sessions_note` which folders count as one.
+    `looks` is the number of this look, as far as OUT or `capture` knows; `left_out` says which files were not used.
     """
 
     photos: int
@@ -256,7 +273,11 @@ class Summary(StrictModel):
     models: dict[str, ModelRate] = Field(default_factory=dict)
     sessions: tuple[SessionCount, ...] = ()
     sessions_known_from: str = ""
+    sessions_note: str = ""
+    looks: int = 1
+    looks_planned: int = 1
     estimated: EffectEstimate | None = None
+    not_measured: dict[str, str] = Field(default_factory=dict)  # reasons by figure
     forecast: Forecast | None = None
 
     def meets(self, required: Required) -> bool:
@@ -270,7 +291,7 @@ class Summary(StrictModel):
 @dataclass(frozen=True)
 class Control:
     """Photographs of one control, compared with those of the patch (null: nothing to compare). `difference` is patch
-    minus control; `pairs` is 0 if photographs are not paired.
+    minus control over `sessions`; `pairs` is 0 if photographs are not paired, `advice` says why nothing can be told.
     """
 
     name: str
@@ -280,7 +301,8 @@ class Control:
     pairs: int = 0
     difference: float | None = None
     difference_interval: tuple[float, float] | None = None
-    p_value: float | None = None
+    sessions: int = 0
+    advice: str = ""
     shown: bool | None = None
 
 

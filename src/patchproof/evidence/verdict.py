@@ -9,7 +9,8 @@ In: how many photographs of each session were recognized, the promise, counts of
     cannot_tell  otherwise; always below 5 judged photographs, or with more than 10 % of readable ones without a marker
 
 mirrored for `deceive`, where a rate too high breaks the promise. `kept` is proved by the photographs; too few of them,
-or all in one place, can prove nothing.
+or all in one place, can prove nothing. Looking again after each session until it fits would find `kept` falsely in 9 to
+18 % of trials: looks are counted, and the bound of those that were not planned is stricter (see `Look`).
 """
 
 from __future__ import annotations
@@ -19,19 +20,26 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from patchproof.base.goal import Goal
-from patchproof.base.intervals import CONFIDENCE, independent_difference, mcnemar_p, paired_difference, wilson
-from patchproof.base.sessions import TAIL
+from patchproof.base.intervals import wilson
+from patchproof.base.sessions import LEAST_SESSIONS, TAIL, sessions_difference
 from patchproof.evidence.results import Control, Effect, VerdictWord
 from patchproof.sheets.manifest import Promise
 
 LEAST_JUDGED = 5
 MOST_WITHOUT_MARKERS = 0.10
 RATE_SLACK = 0.20  # how far below the promised rate the proved rate may be
-LEAST_PAIRS = 6  # fewer pairs can never reach 5 % in McNemar's test; the unpaired interval is used then
+LEAST_PAIRS = 6  # fewer pairs can never reach 5 %; photographs are compared as different ones then
 PHOTOS_PER_SESSION = 10  # photographs that are advised in each session
 MIN_KEPT_CHANCE = 0.80  # chance of `kept` for which sessions are advised
 MOST_PHOTOS = 150  # that are advised: nobody takes more
 LEAST_PAIRED = 0.5  # of either folder's photographs: a few names that happen to be equal are no pairs
+ONE_SESSION_ADVICE = (
+    "one place cannot tell what the patch does from what the place does: photograph both in "
+    "two places or more, better in four, with the control's photographs of each in a folder named as the patch's"
+)
+
+PhotoKey = tuple[int, str]  # the number of a session, and a photograph's name in it
+Answers = Mapping[PhotoKey, bool]
 
 
 @dataclass(frozen=True)
@@ -43,9 +51,35 @@ class Verdict:
     reason: str
 
 
-def judge(recognized: int, photos: Sequence[int], promise: Promise, without_markers: int = 0) -> Verdict:
+@dataclass(frozen=True)
+class Look:
+    """The number of this look at photographs that were judged before, and that of the look that was planned."""
+
+    number: int = 1
+    planned: int = 1
+
+    @property
+    def tail(self) -> float:
+        """The chance of a false `kept` that this look may spend: 2.5 % for the planned one, and 2.5 % for all others
+        together, k-th of which gets the share 1 / (k (k + 1)) (Bonferroni's bound, so that any dependence is allowed).
+        """
+        k = self.number - (self.number > self.planned)
+        return TAIL if self.number == self.planned else TAIL / (k * (k + 1))
+
+
+PLANNED_LOOK = Look()
+
+
+def watched(photos: Sequence[int], promise: Promise) -> Look:
+    """The look at photographs (`photos` in each session) that were watched while they were taken: one each session."""
+    return Look(max(len(photos), 1), sessions_needed(promise) or MOST_PHOTOS // PHOTOS_PER_SESSION)
+
+
+def judge(
+    recognized: int, photos: Sequence[int], promise: Promise, without_markers: int = 0, look: Look = PLANNED_LOOK
+) -> Verdict:
     """Judge the promise by `photos` (how many in each session), of which `recognized` were recognized;
-    `without_markers` more are readable and show no marker.
+    `without_markers` more are readable and show no marker. Looks besides the planned one ask for more proof.
     """
     judged, goal = sum(photos), promise.target.goal
     if judged == 0:
@@ -64,10 +98,12 @@ def judge(recognized: int, photos: Sequence[int], promise: Promise, without_mark
     if goal.sign * (recognized - (low if goal.sign > 0 else high)) < 0:
         return Verdict("broken", (low, high), f"{counts}; {allowed}.")
     ends = posterior.least_rate if goal.sign > 0 else posterior.most_rate
-    proved, required = ends(recognized, photos, TAIL), required_rate(promise)
+    proved, required = ends(recognized, photos, look.tail), required_rate(promise)
     side = "at least" if goal.sign > 0 else "at most"
-    counts = f"{counts}; {allowed}. They prove a rate of {side} {proved:.0%}, and {side} {required:.0%} is asked for"
-    return Verdict("kept" if goal.sign * (proved - required) >= 0 else "cannot_tell", (low, high), f"{counts}.")
+    certain = "" if look.tail == TAIL else f" (with {1 - look.tail:.2%} certainty, as for look {look.number})"
+    proof = f"They prove a rate of {side} {proved:.0%}{certain}, and {side} {required:.0%} is asked for."
+    word: VerdictWord = "kept" if goal.sign * (proved - required) >= 0 else "cannot_tell"
+    return Verdict(word, (low, high), f"{counts}; {allowed}. {proof}")
 
 
 def required_rate(promise: Promise) -> float:
@@ -125,30 +161,31 @@ def _share_without_markers(judged: int, without_markers: int) -> float:
     return without_markers / max(judged + without_markers, 1)
 
 
-def compare_with_control(patch: Mapping[str, bool], name: str, control: Mapping[str, bool], goal: Goal) -> Control:
-    """Compare answers to the patch with those to a control, both by file name; equal names are pairs. `shown` says
-    whether the patch changes recognition in the goal's direction, at 95 %.
+def compare_with_control(patch: Answers, name: str, control: Answers, goal: Goal) -> Control:
+    """Compare answers to the patch with those to a control, both by session and photograph; equal keys are pairs, if at
+    least half of either are. `shown` says whether the patch changes recognition in the goal's direction, at 95 % over
+    sessions.
     """
     counts = sum(control.values()), len(control)
     row = Control(name, *counts, wilson(*counts))
     if not patch or not control:
-        return row
-    names = sorted(patch.keys() & control.keys())
-    if len(names) >= max(LEAST_PAIRS, LEAST_PAIRED * len(patch), LEAST_PAIRED * len(control)):
-        a, b = [patch[name] for name in names], [control[name] for name in names]
-        difference, interval = paired_difference(a, b)
-        p_value = mcnemar_p(a, b)
-        shown = p_value < 1 - CONFIDENCE and goal.sign * difference > 0
-        pairs = len(names)
-    else:
-        difference, interval = independent_difference(sum(patch.values()), len(patch), *counts)
-        shown, p_value, pairs = min(goal.sign * end for end in interval) > 0, None, 0
-    return replace(row, pairs=pairs, difference=difference, difference_interval=interval, p_value=p_value, shown=shown)
+        return replace(row, advice=f"no photograph of {'it' if patch else 'the patch'} could be judged")
+    keys = sorted(patch.keys() & control.keys())
+    paired = len(keys) >= max(LEAST_PAIRS, LEAST_PAIRED * len(patch), LEAST_PAIRED * len(control))
+    a: dict[int, list[bool]] = {}
+    b: dict[int, list[bool]] = {}
+    for sessions, answers in ((a, patch), (b, control)):
+        for key in keys if paired else sorted(answers):
+            sessions.setdefault(key[0], []).append(answers[key])
+    difference, interval = sessions_difference(a, b, paired)
+    shown = min(goal.sign * end for end in interval) > 0
+    count, pairs = min(len(a), len(b)), len(keys) if paired else 0
+    row = replace(row, sessions=count, pairs=pairs, difference=difference, difference_interval=interval, shown=shown)
+    return row if count >= LEAST_SESSIONS else replace(row, advice=ONE_SESSION_ADVICE)
 
 
 def effect_of(controls: Sequence[Control]) -> Effect:
-    """The effect is `shown` if every control was beaten; controls without a judged photograph do not count."""
-    answers = [control.shown for control in controls if control.shown is not None]
-    if not answers:
+    """The effect is `shown` if every control was beaten; one without a judged photograph was not."""
+    if all(control.shown is None for control in controls):
         return "not_tested"
-    return "shown" if all(answers) else "not_shown"
+    return "shown" if all(control.shown for control in controls) else "not_shown"

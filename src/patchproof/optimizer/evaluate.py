@@ -13,6 +13,7 @@ from functools import lru_cache, partial
 from pathlib import Path
 
 import torch
+from pydantic import Field
 
 from patchproof.base.compute import Compute
 from patchproof.base.errors import Refused
@@ -51,6 +52,7 @@ class Evaluation(StrictModel):
     n: int
     seed: int
     models: dict[str, ModelEvaluation]
+    not_measured: dict[str, str] = Field(default_factory=dict)  # reasons by figure
 
     def _repr_html_(self) -> str:
         """The rates in a notebook."""
@@ -66,7 +68,8 @@ class Evaluation(StrictModel):
         for each in models.values():
             if each["ap50"] is None:  # of classifiers
                 del each["ap50"]
-        return json.dumps({"n": self.n, "seed": self.seed, "models": models}, indent=1) + "\n"
+        values = {"n": self.n, "seed": self.seed, "models": models, "not_measured": self.not_measured}
+        return json.dumps(values, indent=1) + "\n"
 
 
 def evaluate(
@@ -110,7 +113,10 @@ def evaluate(
             ap50 = {kind: average_precision([f for part in parts for f in part[kind]], n) for kind in parts[0]}
         controls = control_claims(responses_by_kind, i)
         evaluations[claim.name] = ModelEvaluation(**claim.model_dump(), controls=controls, ap50=ap50)
-    result = Evaluation(n=n, seed=run.scene.seed if seed is None else seed, models=evaluations)
+    seed, why = run.scene.seed if seed is None else seed, "the object's box in these views is not known"
+    boxless = (net.name for net in problem.classifiers if net.LOOKS_AT_BOXES and evaluations[net.name].ap50 is None)
+    reasons = {f"AP50 of {name}": why for name in boxless}
+    result = Evaluation(n=n, seed=seed, models=evaluations, not_measured=reasons)
     write_atomically(run.folder / "evaluate.json", result.to_json())
     return result
 

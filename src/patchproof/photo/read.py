@@ -164,17 +164,17 @@ def list_images(folder: Path) -> list[Path]:
     return sorted((p for p in files if p.suffix.lower() in SUFFIXES), key=lambda p: p.name)
 
 
-def list_skipped_files(folder: Path, without: Path | None = None) -> list[str]:
+def list_skipped_files(folder: Path, without: Path | None = None, depth: int = 1) -> list[str]:
     """Name the files in a folder and its subfolders that people may have meant as photographs but that are not read, a
-    phrase for each kind: videos and raw files without a picture of the same name, and pictures in deeper folders. The
-    folder `without` is not searched.
+    phrase for each kind: videos and raw files without a picture of the same name, and pictures in folders deeper than
+    `depth`. The folder `without` is not searched.
     """
     skipped: dict[str, list[str]] = {}
     for parent, folders, files in os.walk(folder):
         inside = Path(parent).relative_to(folder)
         paths = [Path(name) for name in sorted(files) if not name.startswith(".")]
         stems = {path.stem for path in paths if path.suffix.lower() in SUFFIXES}
-        if len(inside.parts) > 1:
+        if len(inside.parts) > depth:
             folders.clear()
             if stems:
                 skipped.setdefault(_TOO_DEEP, []).append(printable_name(str(inside)))

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from patchproof.base.validation import summarize_names
+from patchproof.base.validation import not_measured_lines, summarize_names
 
 VERDICTS = {"kept": "Promise kept", "broken": "Promise broken", "cannot_tell": "Promise neither broken nor proved"}
 _CONTROLS = {
@@ -45,7 +45,17 @@ def benefit_sentence(summary: Mapping[str, Any]) -> str:
     return (
         f"Recognized in {summary['rate']:.1%} of {summary['judged']} photographs, {control_words(worth['control'])} in "
         f"{worth['control_rate']:.1%} ({source}): {100 * worth['difference']:+.1f} points [{low:+.1f}, {high:+.1f}]."
+        + (f" This cannot tell: {worth['advice']}." if worth["advice"] else "")
     )
+
+
+def looks_sentence(summary: Mapping[str, Any]) -> str:
+    """Say how often these photographs were looked at, as far as it is known."""
+    number, planned = summary["looks"], summary["looks_planned"]
+    if planned > 1:
+        return f"looks: watched while taken, so one for each session: {number}, {planned} planned"
+    more = "; those in other folders are not known, and each one more asks for more proof"
+    return f"looks: {number}, counted in the report's folder{more}"
 
 
 def control_words(name: str) -> str:
@@ -110,7 +120,7 @@ def evaluation_lines(result: Mapping[str, Any]) -> list[str]:
         lines += _control_lines(rates["controls"])
         if rates["ap50"] is not None:
             lines.append("  AP50 " + ", ".join(f"{kind} {share:.3f}" for kind, share in rates["ap50"].items()))
-    return lines
+    return lines + not_measured_lines(result["not_measured"])
 
 
 def verdict_lines(report: Any) -> list[str]:
@@ -125,7 +135,10 @@ def verdict_lines(report: Any) -> list[str]:
         lines.append(f"promised before {summary.background}{hint}")
     lines.append(f"photographs: {summary.photos}, judged {summary.judged}, measured {summary.measured}")
     if summary.sessions:
-        lines.append(f"sessions: {len(summary.sessions)} ({summary.sessions_known_from})")
+        count = sum(session.same_as is None for session in summary.sessions)
+        lines.append(f"sessions: {count} ({summary.sessions_known_from})")
+        lines += [f"  {summary.sessions_note}"] if summary.sessions_note else []
+        lines.append(looks_sentence(data))
     if summary.rate is not None:
         lines.append("recognized: {:.1%} [{:.1%}, {:.1%}]".format(summary.rate, *summary.interval))
     if summary.prediction_interval is not None:
@@ -138,6 +151,7 @@ def verdict_lines(report: Any) -> list[str]:
     if summary.culprit is not None:
         share = summary.ledger[summary.culprit].share
         lines.append(f"costs the most: {summary.culprit.replace('_', ' ')} ({100 * share:.0f} points of confidence)")
+    lines += not_measured_lines(summary.not_measured)
     rows = remarks([photo.model_dump() for photo in report.photos])
     lines += [f"  {code}: {count} ({files}): {advice}" for code, advice, count, files in rows]
     return lines + [f"  left out: {sentence}" for sentence in summary.left_out]

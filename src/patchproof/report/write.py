@@ -19,7 +19,14 @@ from patchproof.base.output import make_folder, write_atomically
 from patchproof.report.images import DELTA_TOP, data_uri, saved_pictures
 from patchproof.report.page import render_page
 from patchproof.report.plots import ledger_plot, recognition_plot, scale_plot
-from patchproof.report.words import VERDICTS, benefit_sentence, headline_of, recognition_meaning, remarks
+from patchproof.report.words import (
+    VERDICTS,
+    benefit_sentence,
+    headline_of,
+    looks_sentence,
+    recognition_meaning,
+    remarks,
+)
 
 _EFFECTS = {
     "shown": "The patch itself makes the difference: it did better than every control.",
@@ -68,6 +75,7 @@ def report_html(report: Mapping, manifest: Mapping, encoded: Mapping[str, Mappin
         primary=primary,
         headline=headline_of(summary),
         worth=benefit_sentence(summary),
+        looks=looks_sentence(summary),
         meaning=recognition_meaning(promise["models"][0]) if promise else "",
         word=(summary["worth"] or {}).get("word", "not_shown"),
         verdict=VERDICTS[summary["verdict"]],

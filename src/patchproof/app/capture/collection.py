@@ -26,7 +26,8 @@ from patchproof.evidence.grouping import BY_FOLDERS, Grouping
 from patchproof.evidence.journal import Journal, settings_key
 from patchproof.evidence.measure import MeasuredPhoto
 from patchproof.evidence.reproject import PhotoSquare
-from patchproof.evidence.results import PhotoEntry, Report
+from patchproof.evidence.results import Report
+from patchproof.evidence.same_session import merge_folders
 from patchproof.evidence.task import Options, Task, task_of
 from patchproof.sheets.manifest import Manifest, load_manifest
 
@@ -76,7 +77,7 @@ class PhotoCollection:
         """The measured photographs in the order of their names, copies rejected, those of controls last."""
         grouping, rect_mm = self._grouping(), self._task.surface.rect_mm
         measured = [self._measured[path] for path in grouping.paths]
-        patch_photos = dict(zip(grouping.paths, reject_copies(measured, grouping.session, rect_mm), strict=True))
+        patch_photos = dict(zip(grouping.paths, reject_copies(measured, grouping.merged, rect_mm), strict=True))
         return patch_photos | {path: self._measured[path] for path in sorted(self._measured.keys() - patch_photos)}
 
     def control_of(self, path: Path) -> str | None:
@@ -87,15 +88,17 @@ class PhotoCollection:
         """Report on all photographs that were measured so far."""
         photos, grouping = self.photos, self._grouping()
         patch_photos = [photos.pop(path) for path in grouping.paths]
-        controls: dict[str, list[PhotoEntry]] = {}
+        controls: dict[str, list[MeasuredPhoto]] = {}
         for path, photo in photos.items():
-            controls.setdefault(path.parent.name, []).append(photo.entry)
-        return report_of(self.manifest, self._judges, patch_photos, grouping, controls)
+            controls.setdefault(path.parent.name, []).append(photo)
+        return report_of(self.manifest, self._judges, patch_photos, grouping, controls, look=None)
 
     def _grouping(self) -> Grouping:
         paths = sorted(path for path in self._measured if self.control_of(path) is None)
         names = sorted({path.parent.name for path in paths})
-        return Grouping(tuple(paths), tuple(names.index(path.parent.name) for path in paths), tuple(names), BY_FOLDERS)
+        numbers = tuple(names.index(path.parent.name) for path in paths)
+        grouping = Grouping(tuple(paths), numbers, tuple(names), BY_FOLDERS)
+        return merge_folders(grouping, [self._measured[path] for path in paths])
 
     def close(self) -> None:
         """Close the journal; nothing can be measured after this."""

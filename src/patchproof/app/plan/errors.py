@@ -40,7 +40,8 @@ class TermError(StrictModel):
 
     name: str
     key: str  # empty if there is no setting to change
-    verdict: Literal["off", "keep", "can go", "missing", "left out"]  # the last two are of what is not modeled
+    # missing, left out: of what is not modeled; unknown: no term changes the confidence at all
+    verdict: Literal["off", "keep", "can go", "missing", "left out", "unknown"]
     codes_mean: float | None = None
     codes_p95: float | None = None
     confidence: float | None = None
@@ -58,6 +59,12 @@ class Terms(StrictModel):
     threshold: float
     errors: tuple[TermError, ...]
     together: float | None = None
+
+    @property
+    def unknown(self) -> str:
+        """Why no term's verdict is known; empty if they are."""
+        same = f"the draft's confidence in {self.views} views is {self.confidence:.2g}, whatever is left out"
+        return same if any(error.verdict == "unknown" for error in self.errors) else ""
 
 
 def measure_terms(
@@ -95,6 +102,8 @@ def measure_terms(
             in_training = bool(rows[term.name].codes_mean)
             rows[term.name] = _row(problem, term, photos[0], pictures, boxes).changed(in_training=in_training)
         errors = _with_verdicts(terms, rows, threshold)
+        if not any(row.confidence for row in rows.values()):  # nothing was measured; every term would seem to be small
+            errors = {name: e if e.verdict == "off" else e.changed(verdict="unknown") for name, e in errors.items()}
         small_terms, setup, together = [t for t in on if t.key and errors[t.name].verdict == "can go"], base, None
         for term in small_terms:
             setup = term.change(setup) or setup

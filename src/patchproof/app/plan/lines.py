@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from patchproof.app.plan.errors import TermError
 from patchproof.app.plan.plan import GeometryPlan, Markers, Plan, Resolution, SurfacePlan
+from patchproof.base.validation import not_measured_lines
 from patchproof.optimizer.place_search import place_lines
 from patchproof.scene.interface import PX_PER_MODULE, READABLE_SHARE
 
@@ -33,7 +34,7 @@ def measured_lines(plan: Plan) -> list[str]:
         views = f"{cost.views} views of {cost.side_px} px, {cost.threads} threads"
         lines += [f"cost of a step ({views}): {cost.ms:.0f} ms"]
         lines += [f"  {part.name:32} {part.ms:7.0f} ms {part.share:6.1%}" for part in cost.parts]
-    return lines
+    return lines + not_measured_lines(plan.not_measured)
 
 
 def _surface_lines(surface: SurfacePlan) -> list[str]:
@@ -87,7 +88,7 @@ def _term_lines(plan: Plan) -> list[str]:
     if terms.together is not None:
         note = "" if terms.together < terms.threshold else ": too much, keep some"
         lines.append(f"  {'all that can go, at once':42}   {terms.together:.3f}{note}")
-    off = [f"{term.name} ({term.key})" for term in terms.errors if term.verdict == "off" and term.key]
+    off = [f"{term.name} ({term.key or 'no setting'})" for term in terms.errors if term.verdict == "off"]
     return [*lines, *([f"  off: {', '.join(off)}"] if off else [])]
 
 

@@ -121,6 +121,7 @@ class Plan(GeometryPlan):
     samples: tuple[Sample, ...]
     omitted: tuple[str, ...]
     cost: Cost | None
+    not_measured: dict[str, str]  # reasons by figure
 
 
 def plan_geometry(
@@ -161,8 +162,15 @@ def measured_plan(
     design, draft = _draft(problem, progress)
     conditions = scene.draw("select", views)
     terms = measure_terms(problem, design, conditions, SELECT_VIEWS, other, partial(progress, "terms"))
+    reasons = {
+        "terms that can go": terms.unknown,
+        "the size of markers": "" if geometry.markers else "the scene has no printed piece",
+        "how the piece fits the object": "" if geometry.surface.gap_mm is not None else geometry.surface.reason,
+        "the cost of a step": "" if timing else "left out by --no-timing",
+    }
     return Plan(
         **dict(geometry),
+        not_measured={figure: reason for figure, reason in reasons.items() if reason},
         draft=draft,
         terms=terms,
         samples=sample_plan(draft.rate, terms.threshold),

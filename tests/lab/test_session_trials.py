@@ -1,0 +1,28 @@
+"""The study of trials by sessions: a trial of each kind, and its tables."""
+
+from pathlib import Path
+
+import numpy as np
+
+from patchlab.study.study import Cell, Result
+from patchlab.validation import session_trials
+
+SETTINGS = session_trials.SessionTrialsSettings(deals=2)
+
+
+def test_folders_of_dealt_sessions_are_merged_and_true_ones_are_not():
+    rng = np.random.default_rng(0)
+    trials, *kept, found = session_trials._folder_trials(SETTINGS, 0.1, "runs of 3", True, rng)
+    assert trials == 2 and all(0 <= count <= 2 for count in kept) and found <= 4
+    assert session_trials._folder_trials(SETTINGS, 0.1, "true", False, rng)[-1] > 5
+
+
+def test_controls_are_counted_and_tables_show_shares():
+    trials = session_trials._control_trials(6, 0.0, 4, 0.95, 0.05, "pairs", np.random.default_rng(0))
+    assert trials == (6, 6, 6)
+    answers = {"controls": [[4, 0.95, 0.05, "pairs", *trials]], "folders": [["true", True, 2, 1, 1, 0, 6.0]]}
+    result = Result(Cell("a", {"correlation": 0.1}), answers | {"looks": [["one look", 200, 4, 4]]}, Path())
+    controls, folders, looks = (table.rows[0] for table in session_trials.tables(SETTINGS, [result]))
+    assert controls[:5] == (0.1, 4, 0.95, 0.05, "pairs") and controls[5].value == 1
+    assert folders[:3] == (0.1, "true", "yes") and folders[3].value == 0.5 and folders[-1] == 6
+    assert looks[2].value == 0.02 and looks[2].n == 200
