@@ -7,7 +7,7 @@ every photograph at one size, so pixels of a photograph are scaled to the size o
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import hmac
 import secrets
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,6 +26,7 @@ from starlette.routing import Route
 from patchproof.app.capture.album import MOST_BYTES, UploadRefused, refuse_size
 from patchproof.app.capture.collection import PhotoCollection
 from patchproof.app.capture.state import answer_of, state_of
+from patchproof.base.errors import Refused
 from patchproof.evidence.verdict import sessions_needed
 from patchproof.report.page import render_page
 
@@ -32,17 +34,21 @@ if TYPE_CHECKING:
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 STALLED_S = 30.0  # without a byte: a phone out of reach does not close its connection
+LEAST_BYTES_PER_S = 20_000  # of a whole photograph, after `STALLED_S`
 _MOST_UPLOADS = 8  # at once; more wait before their body is read
 _HEADERS = {
     "Cache-Control": "no-store",
     "Referrer-Policy": "no-referrer",
     "X-Content-Type-Options": "nosniff",
     "Cross-Origin-Resource-Policy": "same-origin",
+    "Connection": "close",
 }
 
 
-def capture_app(collection: PhotoCollection, token: str) -> ASGIApp:
-    """Make the application for a collection of photographs; it answers requests with the token only."""
+def capture_app(collection: PhotoCollection, token: str, admit: Callable[[tuple[str, int] | None], object]) -> ASGIApp:
+    """Make the application for a collection of photographs; it answers requests with the token only, and calls `admit`
+    with the address of each client that has shown it.
+    """
     handlers = _Handlers(collection)
     routes = [
         Route(f"/{token}/", handlers.page, methods=["GET"]),
@@ -50,16 +56,16 @@ def capture_app(collection: PhotoCollection, token: str) -> ASGIApp:
         Route(f"/{token}/photos", handlers.photo, methods=["POST"]),
         Route(f"/{token}/sessions", handlers.session, methods=["POST"]),
     ]
-    app = Starlette(routes=routes, exception_handlers={UploadRefused: _refuse})
+    app = Starlette(routes=routes, exception_handlers={Refused: _refuse, OSError: _refuse})
     app.router.redirect_slashes = False
-    return _TokenCheck(app, token)
+    return _TokenCheck(app, token, admit)
 
 
 class _TokenCheck:
     """Check the token, in constant time, before anything else of a request is read, and add headers to responses."""
 
-    def __init__(self, app: ASGIApp, token: str):
-        self._app, self._token = app, token.encode()
+    def __init__(self, app: ASGIApp, token: str, admit: Callable[[tuple[str, int] | None], object]):
+        self._app, self._token, self._admit = app, token.encode(), admit
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         async def with_headers(message: Message) -> None:
@@ -74,7 +80,9 @@ class _TokenCheck:
         app: ASGIApp = self._app
         if not hmac.compare_digest(token.encode("utf-8", "surrogateescape"), self._token):
             sentence = "Expected the address that the terminal shows, got one without its token: open that address."
-            app = JSONResponse({"refused": sentence}, 403, headers={"Connection": "close"})
+            app = JSONResponse({"refused": sentence}, 403)
+        else:
+            self._admit(scope["client"])
         await app(scope, receive, with_headers)
 
 
@@ -119,22 +127,20 @@ class _Handlers:
                 path = await self._receive(request)
             except (ClientDisconnect, TimeoutError):
                 return _refusal(408, "Expected a whole photograph, got only a part of it: send it again.")
-            except OSError as error:
-                sentence = f"Expected room for a photograph, got {error.strerror}: make room and send it again."
-                return _refusal(507, sentence)
         async with self._one_at_a_time:
             answer = await anyio.to_thread.run_sync(self._measure, path)
         return JSONResponse({"photo": answer, "state": self._state})
 
     async def _receive(self, request: Request) -> Path:
         with self._collection.album.incoming(request.query_params.get("into", "")) as incoming:
-            chunks = request.stream()
+            chunks, end = request.stream(), anyio.current_time() + STALLED_S
             while True:
-                with anyio.fail_after(STALLED_S):
+                with anyio.fail_after(min(STALLED_S, end - anyio.current_time())):
                     chunk = await anext(chunks, None)
                 if chunk is None:
                     return incoming.keep()
                 incoming.write(chunk)
+                end += len(chunk) / LEAST_BYTES_PER_S
 
     def _measure(self, path: Path) -> dict[str, Any]:
         collection, pictures = self._collection, []
@@ -144,10 +150,11 @@ class _Handlers:
 
 
 async def _refuse(request: Request, error: Exception) -> Response:
-    assert isinstance(error, UploadRefused)
-    return _refusal(error.status, str(error))
+    """Answer with a refusal's sentence, or with that of a disk that takes no more."""
+    if isinstance(error, OSError):
+        error = Refused("room for a photograph", error.strerror or str(error), "make room and send it again")
+    return _refusal(error.status if isinstance(error, UploadRefused) else 507, str(error))
 
 
 def _refusal(status: int, sentence: str) -> Response:
-    # close: the rest of a body that was not read is not waited for
-    return JSONResponse({"refused": sentence}, status, headers={"Connection": "close"})
+    return JSONResponse({"refused": sentence}, status)

@@ -69,9 +69,12 @@ class PhotoCollection:
             for i, photo in zip(numbers, photos, strict=True):
                 results[i] = photo
         for path, photo in zip(paths, results, strict=True):
-            self._measured[path] = photo
-            self._photos = None
-            self.album.remember(path, photo.entry.sha256)
+            self.add(path, photo)
+
+    def add(self, path: Path, photo: MeasuredPhoto) -> None:
+        """Add a measured photograph of the album."""
+        self._measured[path], self._photos = photo, None
+        self.album.remember(path, photo.entry.sha256)
 
     @property
     def photos(self) -> dict[Path, MeasuredPhoto]:
