@@ -32,10 +32,10 @@ from synthetic_photos import make_manifest, save
 
 from patchproof.app.capture import album as album_module
 from patchproof.app.capture import app as app_module
-from patchproof.app.capture import connections, serve
+from patchproof.app.capture import serve
 from patchproof.app.capture.album import CONTROLS, MOST_BYTES, Album, UploadRefused
+from patchproof.app.capture.app import server_config
 from patchproof.app.capture.collection import PhotoCollection
-from patchproof.app.capture.connections import server_config
 from patchproof.app.capture.state import answer_of, state_of
 from patchproof.app.capture.view_map import map_views
 from patchproof.app.verify import options_of
@@ -424,7 +424,7 @@ def test_served_until_interrupted_and_at_the_same_address_afterwards(tmp_path, s
     assert [report.summary.judged for report in reports] == [1, 2] and measured == [(0, 0), (1, 1)]
     assert answers == [200, 200] and addresses[0] == addresses[1]
     (stored,) = (tmp_path / "state" / "patchproof" / "capture").iterdir()
-    assert stored.stat().st_mode & 0o777 == 0o600 and files_in(tmp_path / "photos")[0] == "photos.jsonl"
+    assert stored.parent.stat().st_mode & 0o777 == 0o700 and files_in(tmp_path / "photos")[0] == "photos.jsonl"
 
 
 def test_a_port_that_is_taken_is_not_waited_for():
@@ -492,13 +492,13 @@ def test_a_phone_shows_the_answer_and_sends_again_what_a_lost_connection_cost(tm
 
 def test_silent_and_slow_connections_do_not_keep_the_owner_out(client, photos, monkeypatch):
     """80 of them, more than there are places; the oldest go first, and all in the end."""
-    monkeypatch.setattr(connections, "TOKEN_SHOWN_S", 0.5)
+    monkeypatch.setattr(app_module, "TOKEN_SHOWN_S", 0.5)
     place = urlsplit(client.address).hostname, urlsplit(client.address).port
     silent = [socket.create_connection(place) for _ in range(80)]
     silent[-1].sendall(b"GET /without-an-end")
     assert client.get("state").status == 200 and client.send(photos[0]).status == 200
     for number, each in enumerate(silent):
-        each.settimeout(0.001 if number > 80 - connections.MOST_STRANGERS else 5)
+        each.settimeout(0.001 if number > 80 - app_module.MOST_STRANGERS else 5)
         with closing(each), suppress(ConnectionError, TimeoutError):
             assert each.recv(1) == b"" or number == 0
     last = socket.create_connection(place)

@@ -23,10 +23,10 @@ from patchproof.base.intervals import wilson
 from patchproof.base.progress import Advance, no_advance
 from patchproof.base.sessions import TAIL
 from patchproof.base.settings import background_summary
+from patchproof.base.text import printable
 from patchproof.base.workers import open_workers
 from patchproof.evidence.batch import MAX_PICTURED_PHOTOS, PhotoItem, measure_all, reread_square
 from patchproof.evidence.benefit import benefit_of
-from patchproof.evidence.boxes import box_of_photo
 from patchproof.evidence.classify import Judges, judges_of
 from patchproof.evidence.copies import COPY_CODE, reject_copies
 from patchproof.evidence.effect_estimate import estimate_effect
@@ -40,7 +40,7 @@ from patchproof.evidence.reproject import PhotoSquare
 from patchproof.evidence.results import Ledger, ModelRate, PhotoEntry, Report, Scale, SessionCount, Summary
 from patchproof.evidence.task import Options, task_of
 from patchproof.evidence.verdict import Verdict, compare_with_control, effect_of, judge, next_step
-from patchproof.photo.read import list_images, list_skipped_files, printable_name, summarize_said
+from patchproof.photo.read import list_images, list_skipped_files, summarize_said
 from patchproof.sheets.manifest import Manifest
 
 
@@ -71,12 +71,15 @@ def gather_evidence(
     judges = judges_of(options.models, manifest)
     task = task_of(manifest, options, judges)
     items = [PhotoItem(path, grouping.file(i), with_pictures=i < MAX_PICTURED_PHOTOS) for i, path in enumerate(paths)]
-    items += [PhotoItem(path, printable_name(path.name), name) for name, files in by_control.items() for path in files]
-    items = [replace(item, box_px=box_of_photo(options.boxes, item.name)) for item in items]
-    if options.boxes and not any(item.box_px for item in items):
-        do = "name the images in the boxes' file as the photographs"
-        got = f"boxes of {next(iter(options.boxes))} and {len(options.boxes) - 1} more"
-        raise Refused("boxes of these photographs", got, do)
+    items += [PhotoItem(path, printable(path.name), name) for name, files in by_control.items() for path in files]
+    if options.boxes:
+        from patchproof.evidence.boxes import box_of_photo
+
+        items = [replace(item, box=box_of_photo(options.boxes, item.name, item.path)) for item in items]
+        if not any(item.box for item in items):
+            do = "name the images in the boxes' file as the photographs"
+            got = f"boxes of {next(iter(options.boxes))} and {len(options.boxes) - 1} more"
+            raise Refused("boxes of these photographs", got, do)
     journal_file = closing(Journal(journal, settings_key(manifest, options), resume)) if journal else nullcontext()
     with journal_file as open_journal, open_workers(compute.jobs, compute.cluster) as workers:
         results = measure_all(task, items, judges, workers, open_journal, on_pictures, advance)
@@ -100,7 +103,7 @@ def gather_evidence(
     entries_by_control: dict[str, dict[str, PhotoEntry]] = {}
     left_out = list_skipped_files(Path(photos), controls_folder and controls_folder.resolve())
     if controls_folder:
-        left_out += [f"{printable_name(controls_folder.name)}: {text}" for text in list_skipped_files(controls_folder)]
+        left_out += [f"{printable(controls_folder.name)}: {text}" for text in list_skipped_files(controls_folder)]
     left_out += summarize_said((item.name, result.entry.said) for item, result in zip(items, results, strict=True))
     for item, result in zip(items, results, strict=True):
         if item.control is not None:
@@ -134,9 +137,9 @@ def _list_controls(folder: Path | None) -> dict[str, list[Path]]:
     if not is_folder(folder):
         raise Refused("a folder of control photographs", f"no folder at {folder}", "check the path")
     if pictures := list_images(folder):
-        return {printable_name(folder.name): pictures}
+        return {printable(folder.name): pictures}
     folders = sorted(p for p in folder.iterdir() if p.is_dir() and not p.name.startswith("."))
-    controls = {printable_name(p.name): files for p in folders if (files := list_images(p))}
+    controls = {printable(p.name): files for p in folders if (files := list_images(p))}
     if not controls:
         raise Refused(f"control photographs in {folder}", "none", "copy them there, one control per folder")
     return controls

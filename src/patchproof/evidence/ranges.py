@@ -82,7 +82,7 @@ def matched_rate(
     entries: Iterable[PhotoEntry], conditions: Sequence[ConditionClaim], side_px: float | None = None
 ) -> float | None:
     """Average over photos the rate at their nearest promised conditions; None if none can be compared."""
-    points = [figures_of(entry, side_px) for entry in entries]
+    points = [figures for entry in entries if (figures := figures_of(entry, side_px))]
     # photographs know few different sets of figures, and each takes a table of all conditions
     tables = {names: _table_of(names, conditions) for names in {tuple(point) for point in points}}
     rates = [_rate_near(np.array(list(point.values())), *tables[tuple(point)]) for point in points]

@@ -65,13 +65,14 @@ class Album:
     @property
     def sessions(self) -> list[str]:
         """The sessions' names in order, including empty ones."""
-        folders = (path for path in self.folder.iterdir() if _SESSION.fullmatch(path.name) and is_own_folder(path))
-        return sorted((path.name for path in folders), key=_number_of)
+        folders = (path for path in self.folder.iterdir() if path.is_dir() and not path.is_symlink())
+        names = (path.name for path in folders if _SESSION.fullmatch(path.name))
+        return sorted(names, key=lambda name: (len(name), name))
 
     def photos(self) -> list[Path]:
         """List all photographs, those of controls last."""
         controls = [self.folder / CONTROLS_FOLDER / name for name in CONTROLS]
-        folders = [self.folder / name for name in self.sessions] + [path for path in controls if is_own_folder(path)]
+        folders = [self.folder / name for name in self.sessions] + [path for path in controls if path.is_dir()]
         return [photo for folder in folders for photo in list_images(folder)]
 
     def remember(self, photo: Path, sha256: str | None) -> None:
@@ -83,7 +84,7 @@ class Album:
         """Begin a new session and return its name; the last one's if it is still empty."""
         last = self.sessions[-1]
         if list_images(self.folder / last):
-            last = f"session_{_number_of(last)[0] + 1:02d}"
+            last = f"session_{int(last.removeprefix('session_')) + 1:02d}"
             make_folder(self.folder / last)
         return last
 
@@ -161,16 +162,6 @@ class Incoming:
         with suppress(OSError):  # a full disk, which takes no byte of what is still to be written
             self._file.close()
         self._part.unlink(missing_ok=True)
-
-
-def is_own_folder(path: Path) -> bool:
-    """True for a folder that is no link."""
-    return path.is_dir() and not path.is_symlink()
-
-
-def _number_of(session: str) -> tuple[int, str]:
-    """A session's number, to sort and to count by; and its name, since 02 and 002 are the same number."""
-    return int(session.rpartition("_")[2]), session
 
 
 def refuse_size(size: int) -> None:

@@ -6,11 +6,13 @@
 In: requests of anybody who reaches the port. Out: the page, `state_of`, `answer_of`, or a refusal in one sentence. A
 photograph is the whole body, without a form and a name that would have to be trusted; it is written as it arrives, and
 a body that stops or stalls leaves no file. Photographs are measured one at a time, then answered; the same bytes get
-the same answer, so that a page that lost its connection can send them again.
+the same answer, so that a page that lost its connection can send them again. An answer ends its connection, and one
+that has not shown the token loses its place to whoever comes later, so that silent ones cannot keep the owner out.
 """
 
 from __future__ import annotations
 
+import asyncio
 import hmac
 import secrets
 from collections.abc import Callable
@@ -18,10 +20,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import anyio
+import uvicorn
 from starlette.applications import Starlette
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import HTMLResponse, JSONResponse, Response
 from starlette.routing import Route
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from patchproof.app.capture.album import MOST_BYTES, UploadRefused, refuse_size
 from patchproof.app.capture.collection import PhotoCollection
@@ -36,6 +40,9 @@ if TYPE_CHECKING:
 STALLED_S = 30.0  # without a byte: a phone out of reach does not close its connection
 LEAST_BYTES_PER_S = 20_000  # of a whole photograph, after `STALLED_S`
 _MOST_UPLOADS = 8  # at once; more wait before their body is read
+TOKEN_SHOWN_S = 10.0  # from a connection to the end of a request's head; whoever takes longer loses its place
+MOST_STRANGERS, _MOST_CONNECTIONS = 32, 64  # connections that have not shown the token, and all
+_Client = tuple[str, int] | None
 _HEADERS = {
     "Cache-Control": "no-store",
     "Referrer-Policy": "no-referrer",
@@ -45,7 +52,41 @@ _HEADERS = {
 }
 
 
-def capture_app(collection: PhotoCollection, token: str, admit: Callable[[tuple[str, int] | None], object]) -> ASGIApp:
+def server_config(collection: PhotoCollection, token: str) -> uvicorn.Config:
+    """Settings of a server for a collection of photographs, with the application `capture_app`."""
+    strangers: dict[_Client, asyncio.Transport] = {}  # the oldest first
+
+    def expel(client: _Client, transport: asyncio.Transport) -> None:
+        if strangers.get(client) is transport:
+            strangers.pop(client).abort()
+
+    class Connection(H11Protocol):
+        def connection_made(self, transport: asyncio.Transport) -> None:
+            super().connection_made(transport)
+            strangers[self.client] = transport
+            self.loop.call_later(TOKEN_SHOWN_S, expel, self.client, transport)
+            if len(strangers) > MOST_STRANGERS:
+                expel(*next(iter(strangers.items())))
+
+        def connection_lost(self, exc: Exception | None) -> None:
+            super().connection_lost(exc)
+            strangers.pop(self.client, None)
+
+    return uvicorn.Config(
+        capture_app(collection, token, lambda client: strangers.pop(client, None)),
+        http=Connection,
+        ws="none",
+        lifespan="off",
+        log_level="warning",
+        access_log=False,  # it would contain the token
+        server_header=False,
+        proxy_headers=False,  # a client is known by its own address
+        limit_concurrency=_MOST_CONNECTIONS,
+        timeout_graceful_shutdown=2,
+    )
+
+
+def capture_app(collection: PhotoCollection, token: str, admit: Callable[[_Client], object]) -> ASGIApp:
     """Make the application for a collection of photographs; it answers requests with the token only, and calls `admit`
     with the address of each client that has shown it.
     """
@@ -64,7 +105,7 @@ def capture_app(collection: PhotoCollection, token: str, admit: Callable[[tuple[
 class _TokenCheck:
     """Check the token, in constant time, before anything else of a request is read, and add headers to responses."""
 
-    def __init__(self, app: ASGIApp, token: str, admit: Callable[[tuple[str, int] | None], object]):
+    def __init__(self, app: ASGIApp, token: str, admit: Callable[[_Client], object]):
         self._app, self._token, self._admit = app, token.encode(), admit
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:

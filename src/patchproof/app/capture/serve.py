@@ -60,7 +60,7 @@ def serve_capture(
     try:
         import uvicorn
 
-        from patchproof.app.capture.connections import server_config
+        from patchproof.app.capture.app import server_config
     except ImportError:
         raise Refused("Starlette and uvicorn", "none", "pip install 'patchproof[capture]'") from None
     manifest = load_manifest(sheet)
@@ -122,7 +122,7 @@ def _network_address() -> str:
 
 def _address_file(folder: Path) -> Path:
     """The file with the address of a folder's server, among what programs keep for this user on this machine."""
-    state = os.environ.get("XDG_STATE_HOME") or Path("~/.local/state").expanduser()
+    state = os.environ.get("XDG_STATE_HOME") or os.path.expanduser("~/.local/state")
     return Path(state, "patchproof", "capture", f"{hashlib.sha256(os.fsencode(folder)).hexdigest()}.json")
 
 
@@ -135,12 +135,8 @@ def _stored_address(path: Path) -> _Address:
 
 
 def _store(address: _Address, path: Path) -> None:
-    """Store an address, readable by the user only; without a place for it, the next server has a new one."""
-
-    def write(part: Path) -> None:
-        with open(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="ascii") as file:
-            file.write(address.model_dump_json())
-
+    """Store an address, in a folder of the user's own; without a place for it, the next server has a new one."""
     with suppress(Refused):
         make_folder(path.parent)
-        write_atomically(path, write)
+        path.parent.chmod(0o700)
+        write_atomically(path, address.model_dump_json())
