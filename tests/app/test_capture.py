@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import http.client
 import json
 import os
@@ -12,12 +13,14 @@ import sys
 import threading
 import time
 from collections.abc import Mapping
-from contextlib import closing, contextmanager
-from dataclasses import dataclass
+from contextlib import closing, contextmanager, suppress
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from urllib.parse import quote, urlencode, urlsplit
 
+import numpy as np
 import pytest
 
 pytest.importorskip("starlette")
@@ -31,16 +34,19 @@ from patchproof.app.capture import album as album_module
 from patchproof.app.capture import app as app_module
 from patchproof.app.capture import serve
 from patchproof.app.capture.album import CONTROLS, MOST_BYTES, Album, UploadRefused
-from patchproof.app.capture.app import capture_app
+from patchproof.app.capture.app import server_config
 from patchproof.app.capture.collection import PhotoCollection
+from patchproof.app.capture.state import answer_of, state_of
 from patchproof.app.capture.view_map import map_views
 from patchproof.app.verify import options_of
 from patchproof.app.verify import verify as verify_photos
 from patchproof.base import input
 from patchproof.base.errors import Refused
 from patchproof.base.workers import open_workers
-from patchproof.evidence.results import CameraPose, Geometry, PhotoEntry
+from patchproof.evidence.measure import MeasuredPhoto
+from patchproof.evidence.results import CameraPose, Geometry, PhotoEntry, Prediction
 from patchproof.sheets.manifest import ConditionClaim, dump_manifest, load_manifest
+from test_copies import seen
 from test_verify_run import NET, promise, shot
 
 pytestmark = pytest.mark.filterwarnings("ignore:the network net:UserWarning")  # it sees no color
@@ -134,14 +140,14 @@ def gathered_in(folder: Path, sheet: Path):
 @pytest.fixture
 def client(tmp_path, sheet):
     with gathered_in(tmp_path / "photos", sheet) as gathered:
-        with listening(capture_app(gathered, TOKEN)) as address:
+        with listening(gathered) as address:
             yield Client(address)
 
 
 @contextmanager
-def listening(app):
+def listening(gathered):
     """A real server on this machine; the address it is at."""
-    server = uvicorn.Server(uvicorn.Config(app, port=0, lifespan="off", log_level="warning"))
+    server = uvicorn.Server(server_config(gathered, TOKEN))
     with socket.create_server(("127.0.0.1", 0)) as listener:
         thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
         thread.start()
@@ -158,7 +164,7 @@ def files_in(folder: Path) -> list[str]:
 
 def test_two_tabs_send_a_walk_and_verify_says_what_the_page_said(tmp_path, sheet, photos):
     folder = tmp_path / "photos"
-    with gathered_in(folder, sheet) as gathered, listening(capture_app(gathered, TOKEN)) as address:
+    with gathered_in(folder, sheet) as gathered, listening(gathered) as address:
         client, answers = Client(address), []
 
         def tab(own: list[bytes], into: str) -> None:
@@ -201,13 +207,13 @@ def test_two_tabs_send_a_walk_and_verify_says_what_the_page_said(tmp_path, sheet
 def test_a_restart_goes_on_and_measures_nothing_twice(tmp_path, sheet, photos, monkeypatch):
     folder = tmp_path / "photos"
     with gathered_in(folder, sheet) as gathered:
-        with listening(capture_app(gathered, TOKEN)) as address:
+        with listening(gathered) as address:
             for photo in photos[:3]:
                 before = Client(address).send(photo).json["state"]
     (folder / "session_01" / ".photo_0009.part").write_bytes(b"of a server that was killed")
     monkeypatch.setattr("patchproof.evidence.batch.read_photo", None)  # nothing is read
     with gathered_in(folder, sheet) as gathered:
-        with listening(capture_app(gathered, TOKEN)) as address:
+        with listening(gathered) as address:
             assert Client(address).get("state").json == before
             again = Client(address).send(photos[1]).json
             assert again["photo"]["file"] == "session_01/photo_0002.jpg" and again["state"] == before
@@ -316,7 +322,7 @@ def test_numbers_are_taken_once_whoever_takes_them(tmp_path):
 
 def test_200_megabytes_are_refused_before_they_are_read(tmp_path, sheet):
     """With their length said, none is; without, no more than the limit and what lies in sockets."""
-    with gathered_in(tmp_path / "photos", sheet) as gathered, listening(capture_app(gathered, TOKEN)) as address:
+    with gathered_in(tmp_path / "photos", sheet) as gathered, listening(gathered) as address:
         client = Client(address)
         with closing(client.begin(("Content-Length", "200000000"), body=b"\xff\xd8\xff")) as connection:
             answered = connection.getresponse()
@@ -333,7 +339,7 @@ def test_200_megabytes_are_refused_before_they_are_read(tmp_path, sheet):
 def test_a_connection_that_is_lost_or_stalls_leaves_nothing_and_the_next_one_all(tmp_path, sheet, photos, monkeypatch):
     monkeypatch.setattr(app_module, "STALLED_S", 1.0)
     folder = tmp_path / "photos"
-    with gathered_in(folder, sheet) as gathered, listening(capture_app(gathered, TOKEN)) as address:
+    with gathered_in(folder, sheet) as gathered, listening(gathered) as address:
         client, whole = Client(address), ("Content-Length", str(len(photos[0])))
         lost, stalled = (client.begin(whole, body=photos[0][:-500]) for _ in range(2))
         end = time.monotonic() + 20
@@ -393,6 +399,7 @@ def has_timer(_: object) -> None:
 
 def test_served_until_interrupted_and_at_the_same_address_afterwards(tmp_path, sheet, photos, monkeypatch):
     """With a process apart; what is in the folder is measured before there is an address."""
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     monkeypatch.setattr(serve, "prepare_worker", has_timer)
     monkeypatch.setattr(serve, "options_of", lambda sheet, manifest, *_: options_of(sheet, manifest, [NET]))
     addresses, answers, measured = [], [], []
@@ -416,7 +423,8 @@ def test_served_until_interrupted_and_at_the_same_address_afterwards(tmp_path, s
     reports.append(capture())
     assert [report.summary.judged for report in reports] == [1, 2] and measured == [(0, 0), (1, 1)]
     assert answers == [200, 200] and addresses[0] == addresses[1]
-    assert (tmp_path / "photos" / ".capture.json").stat().st_mode & 0o777 == 0o600
+    (stored,) = (tmp_path / "state" / "patchproof" / "capture").iterdir()
+    assert stored.parent.stat().st_mode & 0o777 == 0o700 and files_in(tmp_path / "photos")[0] == "photos.jsonl"
 
 
 def test_a_port_that_is_taken_is_not_waited_for():
@@ -455,7 +463,7 @@ def test_a_phone_shows_the_answer_and_sends_again_what_a_lost_connection_cost(tm
     taken.write_bytes(photos[2])
     dark = tmp_path / "dark.jpg"
     dark.write_bytes(photos[3])
-    with gathered_in(tmp_path / "photos", sheet) as gathered, listening(capture_app(gathered, TOKEN)) as address:
+    with gathered_in(tmp_path / "photos", sheet) as gathered, listening(gathered) as address:
         with Browser(tmp_path) as browser:
             browser.call("Page.navigate", url=address)
             browser.wait_for("document.querySelector('#into') && document.querySelector('#into').value")
@@ -480,3 +488,124 @@ def test_a_phone_shows_the_answer_and_sends_again_what_a_lost_connection_cost(tm
             assert not [t for t in browser.troubles if "ERR_INTERNET_DISCONNECTED" not in json.dumps(t)]
     assert files_in(tmp_path / "photos")[1:] == ["session_01/photo_0001.jpg", "session_01/photo_0002.jpg"]
     assert set(CONTROLS) == {"bare", "mean", "gray", "noise", "shuffled", "blank"}
+
+
+def test_silent_and_slow_connections_do_not_keep_the_owner_out(client, photos, monkeypatch):
+    """80 of them, more than there are places; the oldest go first, and all in the end."""
+    monkeypatch.setattr(app_module, "TOKEN_SHOWN_S", 0.5)
+    place = urlsplit(client.address).hostname, urlsplit(client.address).port
+    silent = [socket.create_connection(place) for _ in range(80)]
+    silent[-1].sendall(b"GET /without-an-end")
+    assert client.get("state").status == 200 and client.send(photos[0]).status == 200
+    for number, each in enumerate(silent):
+        each.settimeout(0.001 if number > 80 - app_module.MOST_STRANGERS else 5)
+        with closing(each), suppress(ConnectionError, TimeoutError):
+            assert each.recv(1) == b"" or number == 0
+    last = socket.create_connection(place)
+    last.settimeout(5)
+    with closing(last), suppress(ConnectionError):
+        assert last.recv(1) == b""
+
+
+def test_a_photograph_that_drips_in_is_given_up(client, photos, monkeypatch, tmp_path):
+    monkeypatch.setattr(app_module, "STALLED_S", 0.3)
+    with closing(client.begin(("Content-Length", str(len(photos[0]))), body=photos[0][:20])) as connection:
+        for byte in photos[0][20:30]:  # one each 0.05 s: never silent for 0.3 s
+            with suppress(OSError):
+                connection.send(bytes([byte]))
+            time.sleep(0.05)
+        assert connection.getresponse().status == 408
+    assert files_in(tmp_path) == ["photos/photos.jsonl"]
+
+
+def test_a_full_disk_is_not_kept_full_by_what_did_not_fit(client, photos, monkeypatch, tmp_path):
+    def fail(*_, **__) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    def write(incoming, chunk) -> None:
+        incoming._file.close()
+        incoming._file = SimpleNamespace(close=fail)  # what is still to be written does not fit, either
+        fail()
+
+    for place, name, failure in ((album_module.Incoming, "write", write), (PhotoCollection, "measure", fail)):
+        with monkeypatch.context() as patch:
+            patch.setattr(place, name, failure)
+            answered = client.send(photos[0])
+        assert answered.status == 507 and "got No space left on device: make room" in answered.json["refused"]
+        assert not list(tmp_path.rglob(".photo*"))
+    assert client.send(photos[0]).json["photo"]["file"] == "session_01/photo_0001.jpg"
+
+
+@pytest.mark.parametrize("received", ["session_x", "session_01", "controls/gray/photo_0001.jpg", "photos.jsonl"])
+def test_links_and_sessions_without_a_number_are_refused(tmp_path, received):
+    path = tmp_path / "photos" / received
+    path.parent.mkdir(parents=True)
+    if received == "session_x":
+        path.mkdir()
+    else:
+        path.symlink_to(tmp_path)
+    with pytest.raises(Refused, match=rf"got \S+{received}: move it out of the folder"):
+        Album(tmp_path / "photos")
+
+
+def test_a_session_that_becomes_a_link_receives_nothing(tmp_path):
+    album, folder = Album(tmp_path / "photos"), tmp_path / "photos"
+    (tmp_path / "elsewhere").mkdir()
+    (folder / "session_02").symlink_to(tmp_path / "elsewhere")
+    (folder / "session_x").mkdir()
+    (folder / "controls").symlink_to(tmp_path / "elsewhere")
+    assert album.sessions == ["session_01"] == [album.new_session()]
+    for into in ("session_02", "session_x", "gray"):
+        with pytest.raises(UploadRefused, match="a session or a control"):
+            album.incoming(into)
+
+
+def test_an_address_in_a_received_folder_is_not_taken(tmp_path, sheet, monkeypatch):
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    monkeypatch.setattr(serve, "options_of", lambda sheet, manifest, *_: options_of(sheet, manifest, [NET]))
+    monkeypatch.setattr(serve, "open_workers", lambda *_, **__: open_workers(1))
+    monkeypatch.setattr(serve, "prepare_worker", lambda _: None)
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    (folder / ".capture.json").write_text(json.dumps({"token": "senders" * 4, "port": 0}))
+    addresses = []
+
+    def stop(address: str) -> None:
+        addresses.append(address)
+        with pytest.raises(Refused, match=r"into which process \d+ writes"):  # a second server
+            serve.serve_capture(sheet, folder)
+        raise KeyboardInterrupt
+
+    for _ in range(2):
+        with pytest.raises(KeyboardInterrupt):
+            serve.serve_capture(sheet, folder, on_address=stop)
+    assert "senders" not in addresses[0] and addresses[0] == addresses[1]
+    monkeypatch.setenv("XDG_STATE_HOME", str(sheet))  # no folder: there is an address, and another one next time
+    with pytest.raises(KeyboardInterrupt):
+        serve.serve_capture(sheet, folder, on_address=stop)
+    assert addresses[2] not in addresses[:2]
+
+
+def test_400_photographs_are_answered_at_once_and_as_from_scratch(tmp_path, sheet):
+    """0.3 s of processor time besides measuring; copies are among them."""
+    rng = np.random.default_rng(0)
+
+    def photo(path: Path) -> MeasuredPhoto:
+        distance, tilt = rng.uniform(440, 800), rng.uniform(2, 27)
+        one = seen(f"session_01/{path.name}", rng.uniform(-40, 40), distance, tilt, aside=rng.uniform(-200, 200))
+        answer = Prediction(label="bright", confidence=0.9, target_confidence=0.9, recognized=bool(rng.random() < 0.8))
+        pose = CameraPose(azimuth_uncertainty_deg=1, azimuth_deg=rng.uniform(-40, 40))
+        return replace(one, entry=one.entry.changed(predictions={"net": answer}, pose=pose))
+
+    with gathered_in(tmp_path / "photos", sheet) as gathered, gathered_in(tmp_path / "other", sheet) as other:
+        paths = [gathered.album.folder / "session_01" / f"photo_{number:04}.jpg" for number in range(1, 403)]
+        gathered._measured |= {path: photo(path) for path in paths[:400]}
+        state_of(gathered, 3)
+        for path in paths[400:]:
+            gathered.add(path, photo(path))
+            start = time.process_time()
+            state, answer = state_of(gathered, 3), answer_of(gathered, path)
+            assert time.process_time() - start < 0.3
+        other._measured, other.album = dict(gathered._measured), gathered.album
+        assert (state_of(other, 3), answer_of(other, paths[-1])) == (state, answer)
+        assert 300 < state["judged"] < state["photos"] == 402

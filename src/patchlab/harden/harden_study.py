@@ -30,6 +30,7 @@ from patchlab.study.study import DEFAULT_WORK, Cell, FinishedStudy, Result, Stud
 from patchproof.base.errors import Refused
 from patchproof.base.intervals import estimate_difference, rate
 from patchproof.base.output import image_bytes, write_atomically
+from patchproof.base.text import csv_lines
 from patchproof.base.validation import Positive, Share, StrictModel, expand_path
 from patchproof.classifier.labels import find_labels
 from patchproof.classifier.load import load_classifier
@@ -70,8 +71,8 @@ def harden_images(settings: HardenSettings, out: str | Path, work: Work = DEFAUL
     # PNGs beside the tables may be replaced only where this command's JSON says that it wrote them
     own_files = (*STUDY.own_files, "labels.csv", "*.png") if (out / "harden.json").is_file() else STUDY.own_files
     finished = run_cells(replace(STUDY, own_files=own_files), settings, base, out, work)
-    lines = [f'{photo["png"]},"{photo["label"]}"\n' for photo in _photos_of(finished.results, _variants(settings)[0])]
-    write_atomically(out / "labels.csv", lambda path: path.write_text("file,label\n" + "".join(lines), "utf-8"))
+    rows = [(photo["png"], photo["label"]) for photo in _photos_of(finished.results, _variants(settings)[0])]
+    write_atomically(out / "labels.csv", csv_lines([("file", "label"), *rows]))
     return finished
 
 

@@ -6,7 +6,6 @@ skipped; missing files and files named twice are refused.
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -14,6 +13,7 @@ import numpy as np
 
 from patchproof.base.errors import Refused
 from patchproof.base.input import is_file, open_lazily
+from patchproof.base.text import csv_lines
 from patchproof.photo.read import read_photo
 from patchproof.photo.rejection import PhotoRejected
 from patchproof.scene.image_scene import read_labels
@@ -45,8 +45,7 @@ def list_labeled_files(folder: Path, table: Path) -> list[tuple[str, str, str]]:
 def write_labels(rows: Sequence[tuple[str, str | int]], folder: Path) -> Path:
     """Write `labels.csv` of (file, label) into a folder."""
     path = folder / "labels.csv"
-    with path.open("w", encoding="utf-8", newline="") as file:
-        csv.writer(file).writerows([("file", "label"), *rows])
+    path.write_text(csv_lines([("file", "label"), *rows]), encoding="utf-8")
     return path
 
 

@@ -22,6 +22,8 @@ READERS: dict[str, tuple[str, ...]] = {
     "Networks": ("classifier.declarations",),
     "Photographs and pictures": ("photo.declarations",),
     "PDFs": ("sheets.declarations",),
+    "Settings and text files": ("base.declarations",),
+    "Boxes": ("evidence.declarations",),
 }
 
 

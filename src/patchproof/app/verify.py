@@ -30,7 +30,7 @@ from patchproof.channel.printer import load_printer
 from patchproof.classifier.load import load_classifier
 from patchproof.classifier.network import Classifier
 from patchproof.evidence.batch import MAX_PICTURED_PHOTOS
-from patchproof.evidence.boxes import box_corners_px, load_boxes
+from patchproof.evidence.classify import box_corners_px
 from patchproof.evidence.gather import gather_evidence
 from patchproof.evidence.journal import file_sha256
 from patchproof.evidence.results import Origin, PhotoEntry, Report
@@ -128,6 +128,8 @@ def verify(
             if manifest.promise is None or not any(model.LOOKS_AT_BOXES for model in options.models):
                 got = f"the classifiers {', '.join(model.name for model in options.models) or '(none)'}"
                 raise Refused("a detector, since classifiers use no boxes", got, "leave boxes out")
+            from patchproof.evidence.boxes import load_boxes
+
             options = replace(options, boxes=load_boxes(boxes, manifest.promise.target.label))
         forecast = None
         if run is not None:

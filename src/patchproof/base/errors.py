@@ -17,6 +17,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from patchproof.base.text import printable
+
 
 class PatchproofError(Exception):
     """Base of all errors that patchproof raises on purpose."""
@@ -29,7 +31,7 @@ class Refused(PatchproofError, ValueError):
         self._parts = expected, got, do
         # a hostile file may put text of any length here
         expected, got, do = (part if len(part) < 2000 else f"{part[:1000]} ..." for part in self._parts)
-        super().__init__(" ".join(f"Expected {expected}, got {got}: {do.rstrip('.')}.".split()))
+        super().__init__(printable(" ".join(f"Expected {expected}, got {got}: {do.rstrip('.')}.".split())))
 
     def with_advice(self, advice: str) -> Refused:
         """A copy of this error with `advice` appended to the instruction."""

@@ -1,4 +1,4 @@
-"""Read untrusted files, JSON and images within limits of size, time and memory.
+"""Read untrusted files, text, JSON, CSV and images within limits of size, time and memory.
 
 In: a path, or bytes, and the words for a refusal. Out: the content, or one `Refused` whatever makes a decoder fail.
 Only regular files are opened, and no more of them is read than their size says: pipes wait, devices and some files of
@@ -13,6 +13,7 @@ not in the threads of a cluster's workers. Within another time limit, or a profi
 
 from __future__ import annotations
 
+import csv
 import hashlib
 import io
 import json
@@ -29,6 +30,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
 from patchproof.base.errors import Refused, TimeLimitExceeded
+from patchproof.base.text import strip_apostrophe
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -41,10 +43,10 @@ ReturnType = TypeVar("ReturnType")
 
 # an allow-list, because Pillow also opens formats that start other programs (EPS) or hold no photograph
 IMAGE_FORMATS = ("JPEG", "MPO", "PNG", "TIFF", "WEBP", "BMP", "GIF", "AVIF", "HEIF")
+MAX_JSON_BYTES = 16 << 20  # of any text: a manifest has 0.3 million; nested empty lists take 25 times that in memory
 MAX_IMAGE_PX = 120_000_000  # 360 MB as pixels; the largest phone sensors in common use give 50 to 108 million
 MAX_FILE_BYTES = 1 << 30  # of one file, where its kind has no limit of its own
 MAX_CHILD_BYTES = 1_200_000_000  # more memory than a child has at its start: 140 megapixels took 0.9 GB in all
-MAX_JSON_BYTES = 16 << 20  # a manifest has 0.3 million; nested empty lists take 25 times their text in memory
 
 
 def is_file(path: str | Path) -> bool:
@@ -91,13 +93,51 @@ def hash_file(path: str | Path, max_bytes: int = MAX_FILE_BYTES) -> str:
     return digest.hexdigest()
 
 
+def read_text(
+    path: str | Path,
+    expected: str,
+    do: str = "correct it",
+    missing: str = "check the path",
+    max_bytes: int = MAX_JSON_BYTES,
+) -> str:
+    """Read a text file, of which a byte order mark is skipped; refused with `missing` if there is none, with `do` if it
+    cannot be read, and with its encoding if that is not UTF-8.
+    """
+    content, do_save = read_file(path, expected, do, max_bytes, missing), "save it as UTF-8"
+    even, odd = (content[start:200:2].count(0) for start in (0, 1))
+    if content.startswith((b"\xff\xfe", b"\xfe\xff")) or (min(even, odd) == 0 and max(even, odd) > 1):
+        raise Refused(f"{expected} in UTF-8", f"{path} in UTF-16", do_save)
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = content.count(b"\n", 0, error.start) + 1
+        byte = content[error.start : error.start + 1]
+        got = f'{path}, whose line {line} has the byte 0x{byte.hex()} ("{byte.decode("latin-1")}" in Latin-1)'
+        raise Refused(f"{expected} in UTF-8", got, do_save) from error
+
+
 def read_json(path: str | Path, expected: str, do: str, missing: str = "check the path") -> Any:
     """Read a JSON file; refused with the instruction `do` if it is broken, with `missing` if there is none."""
-    text = read_file(path, expected, do, MAX_JSON_BYTES, missing)
+    text = read_text(path, expected, do, missing)
     try:
-        return json.loads(str(text, "utf-8"))
+        return json.loads(text)
     except (ValueError, RecursionError, MemoryError) as error:  # RecursionError: thousands of nested lists
         raise Refused(expected, f"{path} that cannot be read ({error})", do) from error
+
+
+def read_csv(path: str | Path, expected: str) -> list[list[str]]:
+    """Read the rows of a CSV file that are not empty, without the apostrophes of `csv_lines`; refused with its
+    separator if that is no comma.
+    """
+    text = read_text(path, expected)
+    try:
+        rows = [row for row in csv.reader(io.StringIO(text, newline=""), skipinitialspace=True) if any(row)]
+    except csv.Error as error:
+        raise Refused(expected, f"{path} that cannot be read ({error})", "mend it") from error
+    for separator, name in ((";", "semicolons"), ("\t", "tabs")):
+        if rows and all(separator in row[0] for row in rows):
+            raise Refused(f"{expected}, separated by commas", f"{path} with {name}", "save it with commas")
+    return [[strip_apostrophe(cell) for cell in row] for row in rows]
 
 
 @contextmanager

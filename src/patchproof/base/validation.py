@@ -20,7 +20,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 from pydantic_core import ErrorDetails
 
 from patchproof.base.errors import Refused, TimeLimitExceeded
-from patchproof.base.input import read_file, run_within_time
+from patchproof.base.input import read_text, run_within_time
 
 MAX_TOML_BYTES = 1 << 20  # the longest scene of the tests has 4 kB
 
@@ -69,9 +69,9 @@ class StrictModel(BaseModel):
 
 def read_toml(path: str | Path) -> dict[str, Any]:
     """Read a TOML file as a dictionary; refused if it is missing, not text, or not TOML."""
-    text = read_file(path, "a TOML file", max_bytes=MAX_TOML_BYTES)
+    text = read_text(path, "a TOML file", max_bytes=MAX_TOML_BYTES)
     try:
-        return run_within_time(tomllib.loads, str(text, "utf-8"))
+        return run_within_time(tomllib.loads, text)
     except (ValueError, RecursionError, TimeLimitExceeded) as error:
         raise Refused("a TOML file", f"{path} that cannot be read ({error})", "correct that line") from error
 

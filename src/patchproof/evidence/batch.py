@@ -26,9 +26,8 @@ from patchproof.base.geometry import apply_homography, rect_corners
 from patchproof.base.resample import downscaled_size, to_sixteenths
 from patchproof.base.validation import Finite, Share, StrictModel
 from patchproof.base.workers import Workers, result_of
-from patchproof.evidence.boxes import box_in_square
 from patchproof.evidence.camera import pinhole_photo
-from patchproof.evidence.classify import BoxEdges, Judges, square_of, squares_of
+from patchproof.evidence.classify import BoxEdges, Judges, box_in_square, square_of, squares_of
 from patchproof.evidence.grouping import time_and_camera
 from patchproof.evidence.journal import Journal, file_sha256
 from patchproof.evidence.measure import MeasuredPhoto, measure
@@ -59,14 +58,15 @@ LightLevel = Annotated[Finite, Field(ge=-4, le=4)]
 @dataclass(frozen=True)
 class PhotoItem:
     """A photograph to measure: its name in the report, the control that it shows (None: the patch), whether the page
-    shows its pictures, and the box (left, top, right, bottom) that somebody drew round the object.
+    shows its pictures, and the box that somebody drew round the object (left, top, right, bottom, as shares of the
+    upright photograph's sides).
     """
 
     path: Path
     file: str
     control: str | None = None
     with_pictures: bool = False
-    box_px: BoxEdges | None = None
+    box: BoxEdges | None = None
 
     @property
     def name(self) -> str:
@@ -167,7 +167,7 @@ def _measure_or_reject(task: Task, item: PhotoItem) -> MeasuredPhoto:
 def _measure(task: Task, item: PhotoItem) -> MeasuredPhoto:
     photo = read_photo(item.path)
     squares, size_px = squares_of(photo.srgb, task.sizes_px), photo.srgb.shape[1::-1]
-    box = None if item.box_px is None else box_in_square(item.box_px, size_px)
+    box = None if item.box is None else box_in_square(item.box, size_px)
     if item.control is not None:
         if is_featureless(square_of(photo.srgb)[0]):
             return _rejected(item, Remark(code="empty", advice=_EMPTY_ADVICE))

@@ -16,6 +16,7 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from patchproof.base.errors import Refused
+from patchproof.base.geometry import rect_corners
 from patchproof.evidence.results import Prediction
 from patchproof.sheets.manifest import Manifest, Promise
 
@@ -62,6 +63,22 @@ def judges_of(models: Sequence[Classifier], manifest: Manifest) -> Judges | None
 def boxes_of(box: BoxEdges | None, n: int = 1) -> np.ndarray | None:
     """Repeat the object's box for n pictures (n×4), as networks take it; None stays None."""
     return None if box is None else np.tile(np.array(box), (n, 1))
+
+
+def box_in_square(box: BoxEdges, size_px: tuple[int, int]) -> BoxEdges:
+    """Convert a box in shares of the sides of a photograph of `size_px` to shares of its centered square; to all zeros,
+    which no detection overlaps, if it lies outside.
+    """
+    edges = (size * (value - 0.5) / min(size_px) + 0.5 for value, size in zip(box, 2 * size_px, strict=True))
+    x0, y0, x1, y1 = (min(max(value, 0.0), 1.0) for value in edges)
+    return (x0, y0, x1, y1) if x1 > x0 and y1 > y0 else (0.0, 0.0, 0.0, 0.0)
+
+
+def box_corners_px(box: BoxEdges, size_px: tuple[int, int]) -> np.ndarray:
+    """Convert a box of `box_in_square` back to its corners (4×2) in pixels."""
+    (width, height), side = size_px, min(size_px)
+    x0, y0, x1, y1 = box
+    return side * rect_corners((x0, y0, x1 - x0, y1 - y0)) + ((width - side) / 2, (height - side) / 2)
 
 
 def square_of(srgb: np.ndarray) -> tuple[np.ndarray, tuple[int, int]]:

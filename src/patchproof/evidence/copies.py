@@ -26,23 +26,24 @@ SCALE_TOLERANCE, TILT_TOLERANCE = 0.02, 0.02  # relative of pixels per mm, absol
 LIGHT_TOLERANCE = 0.05  # relative, of the light of white paper
 AIM_TOLERANCE = 0.01  # of the picture's longer side
 SHAPE_TOLERANCE = 0.01  # of the design's longer side: offset of its corners about its middle
+_FIGURES = 16  # of a view: session, scale, tilt, light in three colors, the middle's place, the shape of four corners
 
 
 def reject_copies(photos: Sequence[MeasuredPhoto], session: Sequence[int], rect_mm: Rect) -> list[MeasuredPhoto]:
     """Reject every photograph that repeats an earlier one; the design lies at `rect_mm` of the page."""
     first_by_sha256: dict[str, PhotoEntry] = {}
-    views: dict[int, list[tuple[np.ndarray, PhotoEntry]]] = {}
-    results = []
-    for photo, number in zip(photos, session, strict=True):
-        entry, view = photo.entry, _view(photo, rect_mm)
+    originals, results = np.full((len(photos), _FIGURES), np.inf), []  # infinite: not an original with a known view
+    for row, (photo, number) in enumerate(zip(photos, session, strict=True)):
+        entry, view = photo.entry, _view(photo, number, rect_mm)
         first = None if entry.sha256 is None else first_by_sha256.get(entry.sha256)
         advice = "its bytes are those of {}, which counts once: leave it out"
         if first is None and view is not None:
-            first = next((other for earlier, other in views.get(number, ()) if _is_same_view(view, earlier)), None)
+            same = _find_same_view(view, originals[:row])
+            first = None if same is None else photos[same].entry
             advice = "it shows what {} shows, from there and in its light, and counts once: take another view"
         if first is None:
             first_by_sha256 |= {} if entry.sha256 is None else {entry.sha256: entry}
-            views.setdefault(number, []).extend([] if view is None else [(view, entry)])
+            originals[row] = np.inf if view is None else view
         else:
             remark = Remark(code=COPY_CODE, advice=advice.format(first.file))
             photo = replace(photo, entry=entry.changed(status="rejected", remark=remark), counted=False)
@@ -50,9 +51,9 @@ def reject_copies(photos: Sequence[MeasuredPhoto], session: Sequence[int], rect_
     return results
 
 
-def _view(photo: MeasuredPhoto, rect_mm: Rect) -> np.ndarray | None:
-    """Describe pose and light by figures in units of their tolerance (NaN: unknown); None for a photograph that is not
-    counted, or whose geometry or light is unknown.
+def _view(photo: MeasuredPhoto, session: int, rect_mm: Rect) -> np.ndarray | None:
+    """Describe session, pose and light by `_FIGURES` in units of their tolerance (NaN: unknown); None for a photograph
+    that is not counted, or whose geometry or light is unknown.
     """
     geometry, size_px = photo.entry.geometry, photo.entry.photo_px
     if not photo.counted or geometry is None or photo.light is None or size_px is None:
@@ -66,10 +67,12 @@ def _view(photo: MeasuredPhoto, rect_mm: Rect) -> np.ndarray | None:
     middle = corners.mean(0)
     side = geometry.px_per_mm * max(rect_mm[2:]) / max(size_px)
     shape = (corners - middle) / side / SHAPE_TOLERANCE
-    return np.array([scale, tilt, *light, *(middle / AIM_TOLERANCE), *shape.ravel()])
+    return np.array([2 * session, scale, tilt, *light, *(middle / AIM_TOLERANCE), *shape.ravel()])
 
 
-def _is_same_view(view: np.ndarray, other: np.ndarray) -> bool:
-    """Check that both know the same figures and that none differs by more than its tolerance."""
+def _find_same_view(view: np.ndarray, others: np.ndarray) -> int | None:
+    """The first row of `others` that knows the same figures, none of which differs by more than its tolerance."""
     unknown = np.isnan(view)
-    return bool((unknown == np.isnan(other)).all() and (np.abs(view - other)[~unknown] <= 1).all())
+    alike = (np.isnan(others) == unknown) & ((np.abs(others - view) <= 1) | unknown)
+    rows = np.flatnonzero(alike.all(1))
+    return int(rows[0]) if len(rows) else None

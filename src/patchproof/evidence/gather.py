@@ -24,10 +24,10 @@ from patchproof.base.intervals import wilson
 from patchproof.base.progress import Advance, no_advance
 from patchproof.base.sessions import TAIL
 from patchproof.base.settings import background_summary
+from patchproof.base.text import printable
 from patchproof.base.workers import open_workers
 from patchproof.evidence.batch import MAX_PICTURED_PHOTOS, PhotoItem, measure_all, reread_square
 from patchproof.evidence.benefit import benefit_of
-from patchproof.evidence.boxes import box_of_photo
 from patchproof.evidence.classify import Judges, judges_of
 from patchproof.evidence.copies import COPY_CODE, reject_copies
 from patchproof.evidence.effect_estimate import estimate_effect
@@ -51,7 +51,7 @@ from patchproof.evidence.verdict import (
     next_step,
     watched,
 )
-from patchproof.photo.read import list_images, list_skipped_files, printable_name, summarize_said
+from patchproof.photo.read import list_images, list_skipped_files, summarize_said
 from patchproof.sheets.manifest import Manifest
 
 
@@ -85,11 +85,14 @@ def gather_evidence(
     task = task_of(manifest, options, judges)
     items = [PhotoItem(path, grouping.file(i), with_pictures=i < MAX_PICTURED_PHOTOS) for i, path in enumerate(paths)]
     items += [PhotoItem(path, file, name) for name, files in by_control.items() for file, path in files.items()]
-    items = [replace(item, box_px=box_of_photo(options.boxes, item.name)) for item in items]
-    if options.boxes and not any(item.box_px for item in items):
-        do = "name the images in the boxes' file as the photographs"
-        got = f"boxes of {next(iter(options.boxes))} and {len(options.boxes) - 1} more"
-        raise Refused("boxes of these photographs", got, do)
+    if options.boxes:
+        from patchproof.evidence.boxes import box_of_photo
+
+        items = [replace(item, box=box_of_photo(options.boxes, item.name, item.path)) for item in items]
+        if not any(item.box for item in items):
+            do = "name the images in the boxes' file as the photographs"
+            got = f"boxes of {next(iter(options.boxes))} and {len(options.boxes) - 1} more"
+            raise Refused("boxes of these photographs", got, do)
     journal_file = closing(Journal(journal, settings_key(manifest, options), resume)) if journal else nullcontext()
     with journal_file as open_journal, open_workers(compute.jobs, compute.cluster) as workers:
         results = measure_all(task, items, judges, workers, open_journal, on_pictures, advance)
@@ -115,7 +118,7 @@ def gather_evidence(
     left_out = list_skipped_files(Path(photos), controls_folder and controls_folder.resolve())
     if controls_folder:
         left_out += [
-            f"{printable_name(controls_folder.name)}: {text}" for text in list_skipped_files(controls_folder, depth=2)
+            f"{printable(controls_folder.name)}: {text}" for text in list_skipped_files(controls_folder, depth=2)
         ]
     left_out += summarize_said((item.name, result.entry.said) for item, result in zip(items, results, strict=True))
     for item, result in zip(items, results, strict=True):
@@ -160,9 +163,9 @@ def _list_controls(folder: Path | None, sessions: Sequence[str]) -> dict[str, di
         raise Refused("a folder of control photographs", f"no folder at {folder}", "check the path")
     folders = sorted(p for p in folder.iterdir() if p.is_dir() and not p.name.startswith("."))
     named = [p for p in folders if list_images(p)]
-    if list_images(folder) or (named and all(printable_name(p.name) in sessions for p in named)):
-        return {printable_name(folder.name): _control_files(folder)}
-    controls = {printable_name(p.name): files for p in folders if (files := _control_files(p))}
+    if list_images(folder) or (named and all(printable(p.name) in sessions for p in named)):
+        return {printable(folder.name): _control_files(folder)}
+    controls = {printable(p.name): files for p in folders if (files := _control_files(p))}
     if not controls:
         raise Refused(f"control photographs in {folder}", "none", "copy them there, one control per folder")
     return controls
@@ -171,9 +174,9 @@ def _list_controls(folder: Path | None, sessions: Sequence[str]) -> dict[str, di
 def _control_files(folder: Path) -> dict[str, Path]:
     """A control's photographs: those in the folder, or in its folders if there are none."""
     if pictures := list_images(folder):
-        return {printable_name(path.name): path for path in pictures}
+        return {printable(path.name): path for path in pictures}
     sessions = sorted(p for p in folder.iterdir() if p.is_dir() and not p.name.startswith("."))
-    return {printable_name(f"{p.name}/{path.name}"): path for p in sessions for path in list_images(p)}
+    return {printable(f"{p.name}/{path.name}"): path for p in sessions for path in list_images(p)}
 
 
 def report_of(

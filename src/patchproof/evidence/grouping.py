@@ -15,8 +15,9 @@ from pathlib import Path
 
 from patchproof.base.errors import TimeLimitExceeded
 from patchproof.base.input import is_folder, open_lazily
+from patchproof.base.text import printable
 from patchproof.photo.limits import run_limited
-from patchproof.photo.read import list_images, list_photos, printable_name
+from patchproof.photo.read import list_images, list_photos
 from patchproof.photo.rejection import PhotoRejected
 
 PAUSE_MINUTES = 30.0
@@ -42,7 +43,7 @@ class Grouping:
     def file(self, number: int) -> str:
         """Name the photograph in reports: FILE, or FOLDER/FILE where folders are sessions."""
         folder, path = self.names[self.session[number]], self.paths[number]
-        name, parent = printable_name(path.name), printable_name(path.parent.name)
+        name, parent = printable(path.name), printable(path.parent.name)
         return f"{folder}/{name}" if parent == folder and self.known_from == BY_FOLDERS else name
 
 
@@ -56,7 +57,7 @@ def group_sessions(folder: str | Path, without: Path | None = None) -> Grouping:
     folder, excluded = Path(folder), None if without is None else without.resolve()
     entries = sorted(folder.iterdir()) if is_folder(folder) else []
     subfolders = [p for p in entries if p.is_dir() and not p.name.startswith(".") and p.resolve() != excluded]
-    sessions = {printable_name(p.name): paths for p in subfolders if (paths := list_images(p))}
+    sessions = {printable(p.name): paths for p in subfolders if (paths := list_images(p))}
     if not sessions:
         return _group_by_time(list_photos(folder))
     if loose := list_images(folder):

@@ -7,7 +7,7 @@ every photograph at one size, so pixels of a photograph are scaled to the size o
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -82,7 +82,10 @@ def matched_rate(
     entries: Iterable[PhotoEntry], conditions: Sequence[ConditionClaim], side_px: float | None = None
 ) -> float | None:
     """Average over photos the rate at their nearest promised conditions; None if none can be compared."""
-    rates = [_rate_near(figures_of(entry, side_px), conditions) for entry in entries]
+    points = [figures for entry in entries if (figures := figures_of(entry, side_px))]
+    # photographs know few different sets of figures, and each takes a table of all conditions
+    tables = {names: _table_of(names, conditions) for names in {tuple(point) for point in points}}
+    rates = [_rate_near(np.array(list(point.values())), *tables[tuple(point)]) for point in points]
     rates = [rate for rate in rates if rate is not None]
     return float(np.mean(rates)) if rates else None
 
@@ -98,17 +101,18 @@ def figures_of(entry: PhotoEntry, side_px: float | None) -> dict[str, float]:
     return figures | {"contrast": geometry.contrast, "blur_px": scale * geometry.blur_px}
 
 
-def _rate_near(figures: Mapping[str, float], conditions: Sequence[ConditionClaim]) -> float | None:
-    if not figures or not conditions:
-        return None
-    point, recognized = np.array(list(figures.values())), np.array([c.recognized for c in conditions])
-    table = np.array([[getattr(c, name) for name in figures] for c in conditions], float)
-    known = np.isfinite(table)
+def _table_of(names: Sequence[str], conditions: Sequence[ConditionClaim]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The figures that are compared of those named (as a mask), by condition, and which conditions are recognized."""
+    table = np.array([[getattr(c, name) for name in names] for c in conditions], float).reshape(-1, len(names))
+    known, used = np.isfinite(table), np.ones(len(names), bool)
     if 2 * known.all(1).sum() < len(table):  # most conditions lack some figure: use those that most conditions have
-        frequent = 2 * known.sum(0) > len(table)
-        table, point, known = table[:, frequent], point[frequent], known[:, frequent]
-    complete = known.all(1)
-    if not point.size or not complete.any():
+        used = 2 * known.sum(0) > len(table)
+    complete = known[:, used].all(1)
+    return used, table[complete][:, used], np.array([c.recognized for c in conditions])[complete]
+
+
+def _rate_near(point: np.ndarray, used: np.ndarray, table: np.ndarray, recognized: np.ndarray) -> float | None:
+    if not used.any() or not len(table):
         return None
-    distance = np.linalg.norm((table[complete] - point) / np.maximum(table[complete].std(0), 1e-9), axis=1)
-    return float(np.mean(recognized[complete][np.argsort(distance, kind="stable")[:_NEAREST]]))
+    distance = np.linalg.norm((table - point[used]) / np.maximum(table.std(0), 1e-9), axis=1)
+    return float(np.mean(recognized[np.argsort(distance, kind="stable")[:_NEAREST]]))

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from patchproof.evidence.classify import BoxEdges, Judges
+from patchproof.evidence.classify import Judges
 from patchproof.evidence.ranges import PromisedRanges, promised_ranges, promised_side_px
 from patchproof.evidence.surface import PromisedColors, Surface, promised_of, surface_of
 from patchproof.sheets.manifest import Manifest
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from patchproof.channel.lens import Camera
     from patchproof.channel.printer import Printer
     from patchproof.classifier import Classifier
+    from patchproof.evidence.boxes import DrawnBox
 
 LEDGER_PHOTOS = 24  # each costs 16 classifications; 24 leave intervals of some ± 5 points
 
@@ -37,7 +38,7 @@ class Options:
     ruler_mm: tuple[float, float] | None = None
     controls: str | Path | None = None
     ledger_photos: int = LEDGER_PHOTOS
-    boxes: Mapping[str, BoxEdges] = field(default_factory=dict)
+    boxes: Mapping[str, DrawnBox] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,7 @@ from patchproof.base.geometry import MM_PER_INCH
 from patchproof.base.input import hash_file, is_file
 from patchproof.base.output import check_folder, new_folder
 from patchproof.base.progress import Progress, no_progress
+from patchproof.base.text import printable
 from patchproof.base.validation import summarize_names
 from patchproof.classifier.network import Classifier
 from patchproof.optimizer.pixels import from_pixels
@@ -35,7 +36,7 @@ from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.optimizer.promise import PROMISE_VIEWS, PromiseOptions
 from patchproof.optimizer.run import RUN_FILE_PATTERNS, Run, finish_run, load_run, resolve_scene
 from patchproof.photo.detect import find_markers
-from patchproof.photo.read import list_photos, printable_name, read_photo
+from patchproof.photo.read import list_photos, read_photo
 from patchproof.photo.rejection import PhotoRejected
 from patchproof.scene.interface import PieceScene, Scene, require_piece
 from patchproof.sheets.manifest import design_sha256
@@ -122,7 +123,7 @@ def import_folder(
     pictures are looked at before the first promise; with `resume` finished runs of theirs are kept.
     """
     scene, out, total = _load_piece_scene(scene, seed), Path(out), promise.views or PROMISE_VIEWS
-    runs = {path: out / printable_name(path.stem) for path in list_photos(folder)}
+    runs = {path: out / printable(path.stem) for path in list_photos(folder)}
     if (names := len(set(runs.values()))) < len(runs):
         got = f"{len(runs)} pictures with {names} names in {folder}"
         raise Refused("pictures whose names differ in more than their kind", got, "rename them")
@@ -196,8 +197,8 @@ def _read_picture(picture: str | Path | np.ndarray) -> tuple[str, str, np.ndarra
     try:
         photo = read_photo(path)
     except PhotoRejected as rejection:
-        raise Refused("a picture that can be read", printable_name(path.name), rejection.advice) from rejection
-    return printable_name(path.name), hash_file(path), photo.srgb, photo.said
+        raise Refused("a picture that can be read", path.name, rejection.advice) from rejection
+    return printable(path.name), hash_file(path), photo.srgb, photo.said
 
 
 def _import_record(

@@ -24,6 +24,7 @@ import numpy as np
 
 from patchproof.base.errors import Refused
 from patchproof.base.input import MAX_IMAGE_PX, is_file, is_folder, limit_memory, open_lazily
+from patchproof.base.text import printable
 from patchproof.base.validation import summarize_names
 from patchproof.photo.color_space import SRGB_PRIMARIES, ColorSpace, color_space, eight_bits, rgb_space
 from patchproof.photo.deep_codes import deep_codes
@@ -79,7 +80,7 @@ def read_photo(path: str | Path) -> Photo:
     it takes too much memory or time.
     """
     path = Path(path)
-    _allow_heic(path)
+    allow_heic(path)
     try:
         with limit_memory(MOST_BYTES):
             srgb, orientation, fields = run_limited(_decode, path)
@@ -177,13 +178,13 @@ def list_skipped_files(folder: Path, without: Path | None = None, depth: int = 1
         if len(inside.parts) > depth:
             folders.clear()
             if stems:
-                skipped.setdefault(_TOO_DEEP, []).append(printable_name(str(inside)))
+                skipped.setdefault(_TOO_DEEP, []).append(printable(str(inside)))
             continue
         folders[:] = sorted(f for f in folders if not f.startswith(".") and Path(parent, f).resolve() != without)
         for path in paths:
             kinds = (kind for suffixes, kind in _SKIPPED_KINDS if path.suffix.lower() in suffixes.split())
             if path.stem not in stems and (kind := next(kinds, None)):
-                skipped.setdefault(kind, []).append(printable_name(str(inside / path)))
+                skipped.setdefault(kind, []).append(printable(str(inside / path)))
     return [f"{kind}: {summarize_names(names)}" for kind, names in skipped.items()]
 
 
@@ -196,12 +197,8 @@ def summarize_said(said: Iterable[tuple[str, Sequence[str]]]) -> list[str]:
     return [f"{phrase}: {summarize_names(files)}" for phrase, files in names.items()]
 
 
-def printable_name(name: str) -> str:
-    """A file's name as valid text; bytes that are not UTF-8 are escaped."""
-    return name.encode("utf-8", "backslashreplace").decode()
-
-
-def _allow_heic(path: Path) -> None:
+def allow_heic(path: Path) -> None:
+    """Let Pillow open HEIC files, if this is one; raises `PhotoRejected` without the library for it."""
     if path.suffix.lower() not in {".heic", ".heif"}:
         return
     try:

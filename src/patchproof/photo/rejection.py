@@ -6,6 +6,7 @@ The codes are those of report.json. A `PhotoRejected` never stops a batch: the r
 from __future__ import annotations
 
 from patchproof.base.errors import PatchproofError
+from patchproof.base.text import printable
 
 REJECTION_CODES = (
     *("unreadable", "too_costly", "empty", "too_few_markers", "blurred", "clipped", "too_small", "tilted"),
@@ -19,6 +20,7 @@ class PhotoRejected(PatchproofError, ValueError):
     def __init__(self, code: str, figure: float | None, threshold: float | None, advice: str):
         if code not in REJECTION_CODES:
             raise ValueError(f"expected one of {', '.join(REJECTION_CODES)}, got {code!r}")
+        advice = printable(advice)  # it may name a file
         super().__init__(f"{code}: {advice}")
         self.code, self.figure, self.threshold, self.advice = code, figure, threshold, advice
 

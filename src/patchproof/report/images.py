@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import io
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +17,7 @@ import numpy as np
 
 from patchproof.base.input import read_file
 from patchproof.base.output import base64_uri, image_bytes, make_folder
+from patchproof.base.text import drawable, printable
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -87,14 +89,46 @@ def delta_map(delta_e00: np.ndarray, longer_px: int = 192) -> np.ndarray:
     return np.repeat(np.repeat(colors, zoom, axis=0), zoom, axis=1)
 
 
+def _make_drawable(figure: Figure) -> None:
+    """Let installed fonts stand in for characters that the figure's font lacks; those that no font has are escaped."""
+    from matplotlib import font_manager
+    from matplotlib.text import Text
+
+    texts, fonts = figure.findobj(Text), ["DejaVu Sans"]
+    font = font_manager.get_font(font_manager.findfont(fonts[0]))
+    characters = {c for text in texts for c in text.get_text()} - {"\n"}
+    lacking = {c for c in characters if printable(c) != c or not font.get_char_index(ord(c))}
+    if not lacking:
+        return
+    for entry in sorted(font_manager.fontManager.ttflist, key=lambda entry: entry.name):
+        with suppress(OSError, RuntimeError):  # a font that FreeType does not open
+            font = font_manager.get_font(entry.fname)
+            found = {c for c in lacking if printable(c) == c and font.get_char_index(ord(c))}
+            if found and font.scalable and not entry.name.startswith("Last Resort"):  # whose glyphs are boxes
+                fonts.append(entry.name)
+                lacking -= found
+
+    def shown(text: str) -> str:
+        return "\n".join(drawable(line, lambda c: c not in lacking) for line in text.split("\n"))
+
+    for axis in (axis for axes in figure.axes for axis in (axes.xaxis, axes.yaxis)):
+        labels = [label.get_text() for label in axis.get_ticklabels()]
+        if labels != list(map(shown, labels)):
+            axis.set_ticklabels(map(shown, labels))
+    for text in texts:
+        text.set(text=shown(text.get_text()), family=fonts)
+
+
 def draw_figure(draw: Callable[[Figure], None], size_in: tuple[float, float], kind: str, **options: Any) -> bytes:
     """Draw a figure and encode it as "png" or "svg"; `options` are those of matplotlib's `savefig`."""
     import matplotlib
     from matplotlib.figure import Figure
 
     # text stays text in the page's own font; ids follow from a fixed salt, so that reports have the same bytes
-    with matplotlib.rc_context({"font.size": 9, "svg.fonttype": "none", "svg.hashsalt": "patchproof"}):
+    settings: Any = {"font.size": 9, "text.parse_math": False, "svg.fonttype": "none", "svg.hashsalt": "patchproof"}
+    with matplotlib.rc_context(settings):
         figure, buffer = Figure(figsize=size_in, layout="constrained"), io.BytesIO()
         draw(figure)
+        _make_drawable(figure)
         figure.savefig(buffer, format=kind, **options)
     return buffer.getvalue()

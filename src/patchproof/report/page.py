@@ -8,17 +8,24 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from patchproof.base.intervals import Estimate
+from patchproof.base.text import printable
 
 
 def render_page(template: str, folder: Path = Path(__file__).parent, **values: object) -> str:
     """Render a template of `folder` (by default this room's) with its values."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-    environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=StrictUndefined)
+    options = {"trim_blocks": True, "lstrip_blocks": True, "undefined": StrictUndefined, "finalize": _printable_lines}
+    environment = Environment(autoescape=True, **options)
     environment.loader = FileSystemLoader(folder)
     environment.filters |= {"percent": _percent, "figure": _figure}
     environment.tests["figure"] = lambda value: isinstance(value, (int, float, Estimate)) or value is None
     return environment.get_template(template).render(values)
+
+
+def _printable_lines(value: object) -> object:
+    """Make text `printable`, but for its line ends; what is markup is our own."""
+    return "\n".join(map(printable, value.split("\n"))) if type(value) is str else value
 
 
 def _percent(share: float | None) -> str:

@@ -7,8 +7,6 @@ or lines. The same input gives the same bytes.
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -18,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from patchproof.base.intervals import Estimate
 from patchproof.base.output import write_atomically
+from patchproof.base.text import csv_lines
 from patchproof.report.images import data_uri, draw_figure
 from patchproof.report.page import render_page, versions_of
 
@@ -104,7 +103,7 @@ def write_json(path: Path, data: Mapping[str, Any]) -> None:
 
 def csv_text(table: Table) -> str:
     """Convert a table to CSV, numbers in full; a column of `Estimate`s becomes four (value, _low, _high, _n)."""
-    buffer, columns = io.StringIO(), []
+    columns = []
     for name, *values in zip(table.head, *table.rows, strict=True):
         if any(isinstance(value, Estimate) for value in values):
             columns.append([name, *(value.value if isinstance(value, Estimate) else value for value in values)])
@@ -112,8 +111,7 @@ def csv_text(table: Table) -> str:
                 columns.append([f"{name}_{part}", *(getattr(value, part, None) for value in values)])
         else:
             columns.append([name, *values])
-    csv.writer(buffer, lineterminator="\n").writerows(zip(*columns, strict=True))
-    return buffer.getvalue()
+    return csv_lines(zip(*columns, strict=True))
 
 
 def cell_text(value: Value) -> str:

@@ -8,14 +8,13 @@ empty cell. The same input gives the same bytes.
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from patchproof.base.output import make_folder, write_atomically
+from patchproof.base.text import csv_lines
 from patchproof.report.images import DELTA_TOP, data_uri, saved_pictures
 from patchproof.report.page import render_page
 from patchproof.report.plots import ledger_plot, recognition_plot, scale_plot
@@ -121,11 +120,7 @@ def photos_csv(photos: Sequence[Mapping[str, Any]]) -> str:
     """Convert photographs to CSV; without any, only the head's first columns."""
     rows = [_csv_row(photo) for photo in photos]
     head = list(dict.fromkeys((*_FIRST, *(name for row in rows for name in row))))
-    buffer = io.StringIO()
-    writer = csv.DictWriter(buffer, head, restval="", lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return buffer.getvalue()
+    return csv_lines([head, *([row.get(name, "") for name in head] for row in rows)])
 
 
 def _csv_row(photo: Mapping[str, Any]) -> dict[str, Any]:
@@ -135,12 +130,7 @@ def _csv_row(photo: Mapping[str, Any]) -> dict[str, Any]:
             numbers = [None] * 9 if value is None else [number for line in value for number in line]
             row |= {f"{name}_{i // 3}{i % 3}": number for i, number in enumerate(numbers)}
         elif name == "predictions":
-            row |= {f"{model} {key}": _csv_value(v) for model, answer in value.items() for key, v in answer.items()}
+            row |= {f"{model} {key}": figure for model, answer in value.items() for key, figure in answer.items()}
         else:
-            row[name] = _csv_value(value)
+            row[name] = value
     return row
-
-
-def _csv_value(value: Any) -> Any:
-    """Put an apostrophe before text that a spreadsheet would take for a formula."""
-    return f"'{value}" if isinstance(value, str) and value.startswith(("=", "+", "-", "@", "\t", "\r")) else value

@@ -17,7 +17,7 @@ import numpy as np
 
 from patchproof.base.color import LINEAR_FROM_CODE, codes_from_srgb, srgb_from_linear
 from patchproof.base.errors import Refused
-from patchproof.base.input import MAX_JSON_BYTES, is_file, open_image, read_file
+from patchproof.base.input import is_file, open_image, read_text
 from patchproof.base.settings import PatchSettings
 from patchproof.base.validation import expand_path, spelling_hint
 from patchproof.mesh.mesh import Material, Mesh, position_numbers
@@ -99,7 +99,7 @@ def select_faces(mesh: Mesh, materials: tuple[str, ...], faces: str | None, base
 
 def _read_faces(path: Path, count: int) -> np.ndarray:
     """Return which of `count` faces a text file names: per line a number or a range a-b with both ends; # comments."""
-    text = str(read_file(path, "a file of face numbers", max_bytes=MAX_JSON_BYTES), "utf-8", "replace")
+    text = read_text(path, "a file of face numbers")
     chosen_faces = np.zeros(count, bool)
     for number, line in enumerate(text.splitlines(), 1):
         words = line.partition("#")[0].split("-")

@@ -15,9 +15,7 @@ Augmentation, AAAI 2020, algorithm 1.
 
 from __future__ import annotations
 
-import csv
 import hashlib
-import io
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Self
@@ -26,7 +24,7 @@ import numpy as np
 
 from patchproof.base.errors import Refused
 from patchproof.base.geometry import rotated_extent
-from patchproof.base.input import MAX_JSON_BYTES, is_file, read_file
+from patchproof.base.input import is_file, read_csv
 from patchproof.base.settings import SceneSettings
 from patchproof.base.validation import expand_path
 from patchproof.photo.read import read_photo, summarize_said
@@ -186,12 +184,7 @@ def _files_of_class(settings: SceneSettings, base: Path) -> list[Path]:
 
 def read_labels(table: Path) -> list[tuple[str, str]]:
     """Return (file name, label in small letters) of each line; commas after the first belong to the label."""
-    stored = read_file(table, "a CSV of file names and labels (object.labels)", max_bytes=MAX_JSON_BYTES)
-    try:
-        lines = io.StringIO(str(stored, "utf-8-sig"), newline="")
-        rows = [row for row in csv.reader(lines, skipinitialspace=True) if any(row)]
-    except (csv.Error, ValueError) as error:
-        raise Refused("a CSV of file names and labels", f"{table} that cannot be read ({error})", "mend it") from error
+    rows = read_csv(table, "a CSV of file names and labels (object.labels)")
     short = next((row for row in rows if len(row) < 2), None)
     if short is not None:
         raise Refused(f"a file name and a label in each line of {table}", f'"{short[0]}"', "add the label")

@@ -9,8 +9,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import combinations
+from typing import Any
 
 from patchproof.base.errors import Refused
+from patchproof.base.text import drawable
 from patchproof.sheets.piece import PieceMarker
 from patchproof.sheets.rects import PointMm, RectMm, SwatchRect, grow_rect, rect_contains, rects_overlap
 from patchproof.sheets.template import Rulers, TextLine
@@ -101,7 +103,15 @@ def text_width_mm(text: str, size_mm: float, bold: bool) -> float:
     """The width of a line of text."""
     from reportlab.pdfbase import pdfmetrics
 
-    return pdfmetrics.stringWidth(text, font_name(bold), size_mm)
+    return pdfmetrics.stringWidth(drawable_text(text, bold), font_name(bold), size_mm)
+
+
+def drawable_text(text: str, bold: bool) -> str:
+    """A line of text as it is drawn, with characters that Vera lacks as "\\u5361"."""
+    from reportlab.pdfbase import pdfmetrics
+
+    font: Any = pdfmetrics.getFont(font_name(bold))
+    return drawable(text, lambda character: ord(character) in font.face.charToGlyph)
 
 
 def text_box(line: TextLine) -> Box:

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from patchproof.base.geometry import MM_PER_INCH
-from patchproof.sheets.layout import PageLayout, font_name
+from patchproof.sheets.layout import PageLayout, drawable_text, font_name
 from patchproof.sheets.page import CUT_LINE_MM
 from patchproof.sheets.piece import marker_rects_mm
 from patchproof.sheets.rects import RectMm, Srgb, grow_rect
@@ -110,7 +110,7 @@ def _draw_page(canvas: Canvas, page: PdfPage) -> None:
     for line in layout.texts:
         canvas.setFillGray(line.gray)
         canvas.setFont(font_name(line.bold), line.size_mm)
-        canvas.drawString(line.at_mm[0], height - line.at_mm[1], line.text)
+        canvas.drawString(line.at_mm[0], height - line.at_mm[1], drawable_text(line.text, line.bold))
 
 
 def _draw_parts(canvas: Canvas, pictures, swatches, markers, height: float) -> None:

@@ -5,8 +5,8 @@
 In: bytes from anybody who has the address. Out: files that `verify OUT --controls OUT/controls` reads. We choose their
 names, and tell their kind by their first bytes; a file appears once it is complete. A number is reserved by creating a
 hidden part file, so that simultaneous uploads get different ones. Bytes that are here already are the same photograph
-sent again, and are not stored twice. Left out on purpose: removing photographs, since a selection by their answers
-proves nothing.
+sent again, and are not stored twice. No link is followed. Left out on purpose: removing photographs, since a selection
+by their answers proves nothing.
 """
 
 from __future__ import annotations
@@ -14,6 +14,8 @@ from __future__ import annotations
 import hashlib
 import os
 import re
+from contextlib import suppress
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
@@ -21,14 +23,15 @@ from patchproof.base.errors import Refused
 from patchproof.base.output import check_folder, make_folder
 from patchproof.photo.read import list_images
 
-CONTROLS_FOLDER, JOURNAL_FILE, ADDRESS_FILE = "controls", "photos.jsonl", ".capture.json"
+CONTROLS_FOLDER, JOURNAL_FILE = "controls", "photos.jsonl"
 CONTROLS = ("bare", "mean", "gray", "noise", "shuffled", "blank")
 MOST_BYTES = 40_000_000  # phones' largest JPEGs, of 108 and 200 megapixels, have some 30
 MOST_PHOTOS = 1000
-_OWN = ("session_*", CONTROLS_FOLDER, JOURNAL_FILE, ADDRESS_FILE)
+_OWN = ("session_*", CONTROLS_FOLDER, JOURNAL_FILE, ".capture.json")  # the last is never read: it may be a sender's
 _HEAD = 12  # bytes that tell the kind of a file
 _HEIF = (b"heic", b"heix", b"heim", b"heis", b"mif1", b"msf1")
 _NUMBERED = re.compile(r"\.?photo_(\d{4,})\.")
+_SESSION = re.compile(r"session_[0-9]+")
 
 
 class UploadRefused(Refused):
@@ -43,14 +46,18 @@ class UploadRefused(Refused):
 
 
 class Album:
-    """A folder of photographs, which is created if it is missing; refused if it has other files."""
+    """A folder of photographs, which is created if it is missing; refused if it has other files, or links."""
 
     def __init__(self, folder: Path):
         check_folder(folder, _OWN, overwrite=True)
         make_folder(folder)
-        self.folder = folder
-        for part in folder.rglob(".photo_*.part"):  # of uploads that an earlier server did not finish
-            part.unlink()
+        self.folder = folder = folder.resolve()
+        for path in folder.rglob("*"):
+            if fnmatch(path.name, ".photo_*.part"):  # of an upload that an earlier server did not finish
+                path.unlink()
+            elif path.is_symlink() or (path.name.startswith("session_") and not _SESSION.fullmatch(path.name)):
+                do = "move it out of the folder, or choose another --out"
+                raise Refused("no links, and sessions with numbers, among the photographs", str(path), do)
         self._by_sha256: dict[str, Path] = {}
         if not self.sessions:
             make_folder(folder / "session_01")
@@ -58,7 +65,9 @@ class Album:
     @property
     def sessions(self) -> list[str]:
         """The sessions' names in order, including empty ones."""
-        return sorted(path.name for path in self.folder.glob("session_*") if path.is_dir())
+        folders = (path for path in self.folder.iterdir() if path.is_dir() and not path.is_symlink())
+        names = (path.name for path in folders if _SESSION.fullmatch(path.name))
+        return sorted(names, key=lambda name: (len(name), name))
 
     def photos(self) -> list[Path]:
         """List all photographs, those of controls last."""
@@ -75,18 +84,16 @@ class Album:
         """Begin a new session and return its name; the last one's if it is still empty."""
         last = self.sessions[-1]
         if list_images(self.folder / last):
-            last = f"session_{int(last.rpartition('_')[2]) + 1:02d}"
+            last = f"session_{int(last.removeprefix('session_')) + 1:02d}"
             make_folder(self.folder / last)
         return last
 
     def incoming(self, into: str) -> Incoming:
         """Prepare for one more photograph in the session, or of the control, of that name."""
+        folder = self.folder / (CONTROLS_FOLDER if into in CONTROLS else "") / into
         if into in CONTROLS:
-            folder = self.folder / CONTROLS_FOLDER / into
             make_folder(folder)
-        elif into in self.sessions:
-            folder = self.folder / into
-        else:
+        if into not in (*CONTROLS, *self.sessions) or folder.resolve() != folder:
             got = f'"{into[:40]}"'
             raise UploadRefused(404, "a session or a control of this folder", got, "load the page again")
         return Incoming(folder, self._free_number(), self._by_sha256)
@@ -152,7 +159,8 @@ class Incoming:
         return path
 
     def _discard(self) -> None:
-        self._file.close()
+        with suppress(OSError):  # a full disk, which takes no byte of what is still to be written
+            self._file.close()
         self._part.unlink(missing_ok=True)
 
 

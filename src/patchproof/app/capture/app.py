@@ -6,25 +6,31 @@
 In: requests of anybody who reaches the port. Out: the page, `state_of`, `answer_of`, or a refusal in one sentence. A
 photograph is the whole body, without a form and a name that would have to be trusted; it is written as it arrives, and
 a body that stops or stalls leaves no file. Photographs are measured one at a time, then answered; the same bytes get
-the same answer, so that a page that lost its connection can send them again.
+the same answer, so that a page that lost its connection can send them again. An answer ends its connection, and one
+that has not shown the token loses its place to whoever comes later, so that silent ones cannot keep the owner out.
 """
 
 from __future__ import annotations
 
+import asyncio
 import hmac
 import secrets
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import anyio
+import uvicorn
 from starlette.applications import Starlette
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import HTMLResponse, JSONResponse, Response
 from starlette.routing import Route
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from patchproof.app.capture.album import MOST_BYTES, UploadRefused, refuse_size
 from patchproof.app.capture.collection import PhotoCollection
 from patchproof.app.capture.state import answer_of, state_of
+from patchproof.base.errors import Refused
 from patchproof.evidence.verdict import sessions_needed
 from patchproof.report.page import render_page
 
@@ -32,17 +38,58 @@ if TYPE_CHECKING:
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 STALLED_S = 30.0  # without a byte: a phone out of reach does not close its connection
+LEAST_BYTES_PER_S = 20_000  # of a whole photograph, after `STALLED_S`
 _MOST_UPLOADS = 8  # at once; more wait before their body is read
+TOKEN_SHOWN_S = 10.0  # from a connection to the end of a request's head; whoever takes longer loses its place
+MOST_STRANGERS, _MOST_CONNECTIONS = 32, 64  # connections that have not shown the token, and all
+_Client = tuple[str, int] | None
 _HEADERS = {
     "Cache-Control": "no-store",
     "Referrer-Policy": "no-referrer",
     "X-Content-Type-Options": "nosniff",
     "Cross-Origin-Resource-Policy": "same-origin",
+    "Connection": "close",
 }
 
 
-def capture_app(collection: PhotoCollection, token: str) -> ASGIApp:
-    """Make the application for a collection of photographs; it answers requests with the token only."""
+def server_config(collection: PhotoCollection, token: str) -> uvicorn.Config:
+    """Settings of a server for a collection of photographs, with the application `capture_app`."""
+    strangers: dict[_Client, asyncio.Transport] = {}  # the oldest first
+
+    def expel(client: _Client, transport: asyncio.Transport) -> None:
+        if strangers.get(client) is transport:
+            strangers.pop(client).abort()
+
+    class Connection(H11Protocol):
+        def connection_made(self, transport: asyncio.Transport) -> None:
+            super().connection_made(transport)
+            strangers[self.client] = transport
+            self.loop.call_later(TOKEN_SHOWN_S, expel, self.client, transport)
+            if len(strangers) > MOST_STRANGERS:
+                expel(*next(iter(strangers.items())))
+
+        def connection_lost(self, exc: Exception | None) -> None:
+            super().connection_lost(exc)
+            strangers.pop(self.client, None)
+
+    return uvicorn.Config(
+        capture_app(collection, token, lambda client: strangers.pop(client, None)),
+        http=Connection,
+        ws="none",
+        lifespan="off",
+        log_level="warning",
+        access_log=False,  # it would contain the token
+        server_header=False,
+        proxy_headers=False,  # a client is known by its own address
+        limit_concurrency=_MOST_CONNECTIONS,
+        timeout_graceful_shutdown=2,
+    )
+
+
+def capture_app(collection: PhotoCollection, token: str, admit: Callable[[_Client], object]) -> ASGIApp:
+    """Make the application for a collection of photographs; it answers requests with the token only, and calls `admit`
+    with the address of each client that has shown it.
+    """
     handlers = _Handlers(collection)
     routes = [
         Route(f"/{token}/", handlers.page, methods=["GET"]),
@@ -50,16 +97,16 @@ def capture_app(collection: PhotoCollection, token: str) -> ASGIApp:
         Route(f"/{token}/photos", handlers.photo, methods=["POST"]),
         Route(f"/{token}/sessions", handlers.session, methods=["POST"]),
     ]
-    app = Starlette(routes=routes, exception_handlers={UploadRefused: _refuse})
+    app = Starlette(routes=routes, exception_handlers={Refused: _refuse, OSError: _refuse})
     app.router.redirect_slashes = False
-    return _TokenCheck(app, token)
+    return _TokenCheck(app, token, admit)
 
 
 class _TokenCheck:
     """Check the token, in constant time, before anything else of a request is read, and add headers to responses."""
 
-    def __init__(self, app: ASGIApp, token: str):
-        self._app, self._token = app, token.encode()
+    def __init__(self, app: ASGIApp, token: str, admit: Callable[[_Client], object]):
+        self._app, self._token, self._admit = app, token.encode(), admit
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         async def with_headers(message: Message) -> None:
@@ -74,7 +121,9 @@ class _TokenCheck:
         app: ASGIApp = self._app
         if not hmac.compare_digest(token.encode("utf-8", "surrogateescape"), self._token):
             sentence = "Expected the address that the terminal shows, got one without its token: open that address."
-            app = JSONResponse({"refused": sentence}, 403, headers={"Connection": "close"})
+            app = JSONResponse({"refused": sentence}, 403)
+        else:
+            self._admit(scope["client"])
         await app(scope, receive, with_headers)
 
 
@@ -119,22 +168,20 @@ class _Handlers:
                 path = await self._receive(request)
             except (ClientDisconnect, TimeoutError):
                 return _refusal(408, "Expected a whole photograph, got only a part of it: send it again.")
-            except OSError as error:
-                sentence = f"Expected room for a photograph, got {error.strerror}: make room and send it again."
-                return _refusal(507, sentence)
         async with self._one_at_a_time:
             answer = await anyio.to_thread.run_sync(self._measure, path)
         return JSONResponse({"photo": answer, "state": self._state})
 
     async def _receive(self, request: Request) -> Path:
         with self._collection.album.incoming(request.query_params.get("into", "")) as incoming:
-            chunks = request.stream()
+            chunks, end = request.stream(), anyio.current_time() + STALLED_S
             while True:
-                with anyio.fail_after(STALLED_S):
+                with anyio.fail_after(min(STALLED_S, end - anyio.current_time())):
                     chunk = await anext(chunks, None)
                 if chunk is None:
                     return incoming.keep()
                 incoming.write(chunk)
+                end += len(chunk) / LEAST_BYTES_PER_S
 
     def _measure(self, path: Path) -> dict[str, Any]:
         collection, pictures = self._collection, []
@@ -144,10 +191,11 @@ class _Handlers:
 
 
 async def _refuse(request: Request, error: Exception) -> Response:
-    assert isinstance(error, UploadRefused)
-    return _refusal(error.status, str(error))
+    """Answer with a refusal's sentence, or with that of a disk that takes no more."""
+    if isinstance(error, OSError):
+        error = Refused("room for a photograph", error.strerror or str(error), "make room and send it again")
+    return _refusal(error.status if isinstance(error, UploadRefused) else 507, str(error))
 
 
 def _refusal(status: int, sentence: str) -> Response:
-    # close: the rest of a body that was not read is not waited for
-    return JSONResponse({"refused": sentence}, status, headers={"Connection": "close"})
+    return JSONResponse({"refused": sentence}, status)

@@ -46,6 +46,7 @@ class PhotoCollection:
         self._workers, self._forecast = workers, run
         self._journal = Journal(album.folder / JOURNAL_FILE, settings_key(manifest, options), resume=True)
         self._measured: dict[Path, MeasuredPhoto] = {}
+        self._photos: dict[Path, MeasuredPhoto] | None = None  # those of `photos` once they were asked for
 
     @property
     def side_px(self) -> float | None:
@@ -69,16 +70,23 @@ class PhotoCollection:
             for i, photo in zip(numbers, photos, strict=True):
                 results[i] = photo
         for path, photo in zip(paths, results, strict=True):
-            self._measured[path] = photo
-            self.album.remember(path, photo.entry.sha256)
+            self.add(path, photo)
+
+    def add(self, path: Path, photo: MeasuredPhoto) -> None:
+        """Add a measured photograph of the album."""
+        self._measured[path], self._photos = photo, None
+        self.album.remember(path, photo.entry.sha256)
 
     @property
     def photos(self) -> dict[Path, MeasuredPhoto]:
         """The measured photographs in the order of their names, copies rejected, those of controls last."""
-        grouping, rect_mm = self._grouping(), self._task.surface.rect_mm
-        measured = [self._measured[path] for path in grouping.paths]
-        patch_photos = dict(zip(grouping.paths, reject_copies(measured, grouping.merged, rect_mm), strict=True))
-        return patch_photos | {path: self._measured[path] for path in sorted(self._measured.keys() - patch_photos)}
+        if self._photos is None:  # each answer asks several times
+            grouping = self._grouping()
+            measured = [self._measured[path] for path in grouping.paths]
+            measured = reject_copies(measured, grouping.merged, self._task.surface.rect_mm)
+            photos = dict(zip(grouping.paths, measured, strict=True))
+            self._photos = photos | {path: self._measured[path] for path in sorted(self._measured.keys() - photos)}
+        return self._photos
 
     def control_of(self, path: Path) -> str | None:
         """The control that a photograph shows; None for the patch itself."""
@@ -86,7 +94,7 @@ class PhotoCollection:
 
     def report(self) -> Report:
         """Report on all photographs that were measured so far."""
-        photos, grouping = self.photos, self._grouping()
+        photos, grouping = dict(self.photos), self._grouping()
         patch_photos = [photos.pop(path) for path in grouping.paths]
         controls: dict[str, list[MeasuredPhoto]] = {}
         for path, photo in photos.items():

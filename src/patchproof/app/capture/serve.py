@@ -1,30 +1,32 @@
 """Serve the capture page on this machine, or on request on the local network, until interrupted.
 
 In: a sheet's manifest, the folder for the photographs. Out: the last `Report`. The address has a random token. Port and
-token are stored in the folder, readable by its owner only, so that an open page continues after a restart. HTTP is not
-encrypted: in a network of strangers serve this machine only. Left out on purpose: live pictures, which browsers allow
-to encrypted pages only; the phone's camera app takes better ones.
+token are stored for the user and not in the folder, which may have come from somebody who knows them, so that an open
+page continues after a restart. HTTP is not encrypted: in a network of strangers serve this machine only. Left out on
+purpose: live pictures, which browsers allow to encrypted pages only; the phone's camera app takes better ones.
 """
 
 from __future__ import annotations
 
+import hashlib
 import os
 import secrets
 import socket
 from collections.abc import Callable, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 from pydantic import Field
 
-from patchproof.app.capture.album import ADDRESS_FILE, Album
+from patchproof.app.capture.album import Album
 from patchproof.app.capture.collection import PhotoCollection, prepare_worker
 from patchproof.app.verify import options_of
 from patchproof.base.errors import Refused
+from patchproof.base.folder_lock import lock_folder
 from patchproof.base.input import read_json
-from patchproof.base.output import write_atomically
+from patchproof.base.output import make_folder, write_atomically
 from patchproof.base.progress import Progress, no_progress
 from patchproof.base.validation import StrictModel, validate_model
 from patchproof.base.workers import open_workers
@@ -32,17 +34,11 @@ from patchproof.evidence.results import Report
 from patchproof.sheets.manifest import load_manifest
 
 _TEST_ADDRESS = ("192.0.2.1", 9)  # reserved for documentation: connecting a datagram socket to it sends nothing
-_MOST_CONNECTIONS = 64
 
 
 class _Address(StrictModel):
     token: Annotated[str, Field(pattern="^[A-Za-z0-9_-]{22,64}$")]
     port: Annotated[int, Field(ge=0, le=65535)]
-
-    def write(self, path: Path) -> None:
-        path.unlink(missing_ok=True)
-        with open(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="ascii") as file:
-            file.write(self.model_dump_json())
 
 
 def serve_capture(
@@ -64,7 +60,7 @@ def serve_capture(
     try:
         import uvicorn
 
-        from patchproof.app.capture.app import capture_app
+        from patchproof.app.capture.app import server_config
     except ImportError:
         raise Refused("Starlette and uvicorn", "none", "pip install 'patchproof[capture]'") from None
     manifest = load_manifest(sheet)
@@ -73,29 +69,19 @@ def serve_capture(
         raise Refused("a sheet that promises something", got, "photograph it with any camera")
     options = options_of(sheet, manifest, models, camera)
     forecast = None if run is None else (Path(run).resolve(), Path(sheet).resolve())
-    album = Album(Path(out))
-    with open_workers(1, spawn=True) as workers:
+    with lock_folder(out), open_workers(1, spawn=True) as workers:
+        album = Album(Path(out))
         workers.map(prepare_worker, [None])
         with closing(PhotoCollection(album, manifest, options, workers, forecast)) as collection:
             collection.measure(album.photos(), partial(progress, "measure"))
-            address = _stored_address(album.folder)
+            path = _address_file(album.folder)
+            address = _stored_address(path)
             with _listen(_host(lan), address.port) as listener:
                 host, port = listener.getsockname()
-                write_atomically(album.folder / ADDRESS_FILE, address.changed(port=port).write)
+                _store(address.changed(port=port), path)
                 on_address(f"http://{host}:{port}/{address.token}/")
-                config = uvicorn.Config(
-                    capture_app(collection, address.token),
-                    http="h11",
-                    ws="none",
-                    lifespan="off",
-                    log_level="warning",
-                    access_log=False,  # it would contain the token
-                    server_header=False,
-                    limit_concurrency=_MOST_CONNECTIONS,
-                    timeout_graceful_shutdown=2,
-                )
                 try:
-                    uvicorn.Server(config).run(sockets=[listener])
+                    uvicorn.Server(server_config(collection, address.token)).run(sockets=[listener])
                 except KeyboardInterrupt:  # the way to end the server
                     pass
             return collection.report()
@@ -134,9 +120,23 @@ def _network_address() -> str:
             raise Refused("a local network", f"none ({error.strerror})", do) from error
 
 
-def _stored_address(folder: Path) -> _Address:
-    """Token and port of the last server for this folder; a new token if there is none."""
+def _address_file(folder: Path) -> Path:
+    """The file with the address of a folder's server, among what programs keep for this user on this machine."""
+    state = os.environ.get("XDG_STATE_HOME") or os.path.expanduser("~/.local/state")
+    return Path(state, "patchproof", "capture", f"{hashlib.sha256(os.fsencode(folder)).hexdigest()}.json")
+
+
+def _stored_address(path: Path) -> _Address:
+    """Token and port of the last server; a new token if there is none."""
     try:
-        return validate_model(_Address, read_json(folder / ADDRESS_FILE, "an address", "remove it"), ADDRESS_FILE)
+        return validate_model(_Address, read_json(path, "an address", "remove it"), path.name)
     except Refused:
         return _Address(token=secrets.token_urlsafe(24), port=0)
+
+
+def _store(address: _Address, path: Path) -> None:
+    """Store an address, in a folder of the user's own; without a place for it, the next server has a new one."""
+    with suppress(Refused):
+        make_folder(path.parent)
+        path.parent.chmod(0o700)
+        write_atomically(path, address.model_dump_json())

@@ -21,6 +21,7 @@ from typer import BadParameter, Exit, Option, Typer
 
 from patchproof.base.errors import Refused
 from patchproof.base.output import disk_is_full
+from patchproof.base.text import printable
 from patchproof.base.version import __version__
 from patchproof.base.workers import available_cores, can_fork, keep_freed_memory, use_threads
 
@@ -143,7 +144,7 @@ def run_command_line(app: Typer) -> None:
         if isinstance(stream, io.TextIOWrapper):  # Windows gives pipes its code page, which has no ε
             stream.reconfigure(encoding="utf-8")
     keep_freed_memory()
-    warnings.formatwarning = lambda message, *where: f"warning: {message}\n"
+    warnings.formatwarning = lambda message, *where: f"warning: {printable(' '.join(str(message).split()))}\n"
     try:
         app()
     except Exception as error:
@@ -154,7 +155,7 @@ def run_command_line(app: Typer) -> None:
         elif isinstance(error, MemoryError) or _NO_MEMORY.search(str(error)):
             sentence = "Expected enough memory, got none left: give it more, fewer --jobs, or smaller files."
         elif isinstance(error, OSError):
-            sentence = f"Expected files that can be read and written, got {error}: mend that and try again."
+            sentence = printable(f"Expected files that can be read and written, got {error}: mend that and try again.")
         else:
             raise
         print(sentence, file=sys.stderr)
@@ -167,7 +168,7 @@ def run_command_line(app: Typer) -> None:
 def say(*lines: str) -> None:
     """Print a summary's lines to standard output."""
     for line in lines:
-        print(line)
+        print(printable(line))
 
 
 def say_study(finished) -> None:
@@ -177,13 +178,13 @@ def say_study(finished) -> None:
     for table in finished.tables:
         say(table.title, *(f"  {line}" for line in text_lines(table)))
     for cell, sentence in finished.failed.items():
-        print(f"failed: {cell}: {sentence}", file=sys.stderr)
+        print(printable(f"failed: {cell}: {sentence}"), file=sys.stderr)
 
 
 def warn(lines: tuple[str, ...]) -> None:
     """Print each warning on a line of standard error."""
     for line in lines:
-        print(f"warning: {line}", file=sys.stderr)
+        print(printable(f"warning: {line}"), file=sys.stderr)
 
 
 def names_of(models: str | None) -> tuple[str, ...] | None:

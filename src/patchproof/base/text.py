@@ -1,0 +1,52 @@
+"""Text that others wrote, such as names and labels, made fit for terminals, pages and spreadsheets.
+
+In: text from files. Out: text without characters that move a cursor or turn the direction of reading; CSV without
+formulas.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+import unicodedata
+from collections.abc import Callable, Iterable
+from typing import Any
+
+_FORMULA = re.compile(r"\s*[=+@＝＋－＠-]|[\t\r\n]")  # what a spreadsheet computes, after an apostrophe does not
+_UNSEEN = ("Cc", "Cf", "Cs", "Zl", "Zp")  # control, format, surrogate, line and paragraph separators
+_JOINERS = "\u200c\u200d"  # invisible, and needed within words and emoji
+
+
+def printable(text: str) -> str:
+    """Escape control characters, marks of direction, line separators and bytes that are not UTF-8, as in "\\\\x1b"."""
+    if text.isprintable():
+        return text
+    return "".join(_escape(c) if unicodedata.category(c) in _UNSEEN and c not in _JOINERS else c for c in text)
+
+
+def drawable(text: str, has_glyph: Callable[[str], bool]) -> str:
+    """Make text `printable`, and escape the characters that a font lacks, too."""
+    return "".join(c if has_glyph(c) else _escape(c) for c in printable(text))
+
+
+def _escape(character: str) -> str:
+    return character.encode("unicode_escape").decode()
+
+
+def csv_lines(rows: Iterable[Iterable[Any]]) -> str:
+    """Write rows as CSV, their text `printable`, and with an apostrophe where a spreadsheet would see a formula."""
+    buffer = io.StringIO()
+    csv.writer(buffer, lineterminator="\n").writerows([_cell(value) for value in row] for row in rows)
+    return buffer.getvalue()
+
+
+def _cell(value: Any) -> Any:
+    if not isinstance(value, str):
+        return value
+    return f"'{printable(value)}" if _FORMULA.match(value) else printable(value)
+
+
+def strip_apostrophe(cell: str) -> str:
+    """Undo the apostrophe of `csv_lines`."""
+    return cell[1:] if cell.startswith("'") and _FORMULA.match(cell, 1) else cell

@@ -1,0 +1,21 @@
+"""What COCO JSON with the object's boxes can declare, and what `boxes` does with it."""
+
+from __future__ import annotations
+
+from patchproof.base.declared import Declaration
+
+_FILE = "COCO JSON"
+DECLARED: tuple[Declaration, ...] = (
+    Declaration(_FILE, "`width`, `height`", "used", "boxes are scaled from a copy to the photograph"),
+    Declaration(_FILE, "size of the photograph as stored, which EXIF turns", "used", "the box is turned along"),
+    Declaration(_FILE, "size of another shape than the photograph's", "refused", "it is another picture"),
+    Declaration(_FILE, "no `width` or `height`", "refused", "COCO asks for them"),
+    Declaration(_FILE, "`bbox` outside of the picture, or below a pixel", "refused", "corners and shares are named"),
+    Declaration(_FILE, "`attributes.rotation` of a box", "refused", "boxes are upright"),
+    Declaration(_FILE, "`iscrowd`", "refused", "one object is judged"),
+    Declaration(_FILE, "several boxes of an image", "refused", "one object is judged"),
+    Declaration(_FILE, "`segmentation`", "said", "its box counts"),
+    Declaration(_FILE, "`category_id`", "used", "of the target's label, or the only one; others are other things"),
+    Declaration(_FILE, "`file_name` in folders, also with backslashes", "used", "or its last part, if it is unique"),
+    Declaration(_FILE, "`file_name` or `id` of an image twice", "refused", "boxes could not be told apart"),
+)
