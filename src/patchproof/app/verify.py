@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from patchproof.app.capture.album import ADDRESS_FILE
+from patchproof.app.capture.album import JOURNAL_FILE
 from patchproof.base.compute import Compute
 from patchproof.base.errors import Refused
 from patchproof.base.folder_lock import lock_folder
@@ -115,7 +115,7 @@ def verify(
     out, manifest, compute = Path(out), load_manifest(sheet), compute.without("verify", device=True)
     with lock_folder(out):
         look_at = _look_at(out, manifest)
-        if isinstance(photos, str | Path) and is_file(Path(photos) / ADDRESS_FILE):
+        if isinstance(photos, str | Path) and is_file(Path(photos) / JOURNAL_FILE):
             look_at = lambda entries: None  # noqa: E731  # `capture` showed the answers while they were taken
         _check_out(out, resume, overwrite)
         if not isinstance(photos, str | Path):
