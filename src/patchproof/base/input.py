@@ -64,7 +64,7 @@ def file_size(path: str | Path, max_bytes: int = MAX_FILE_BYTES) -> int:
     if not is_file(path):
         raise FileNotFoundError(f"no file at {path}")
     if (size := os.path.getsize(path)) > max_bytes:
-        raise OSError(f"{size / 2**20:.0f} MiB, more than {max_bytes / 2**20:.0f} MiB")
+        raise OSError(f"{size >> 10} KiB, more than {max_bytes >> 10} KiB")
     return size
 
 
@@ -84,13 +84,8 @@ def read_file(
 
 
 def hash_file(path: str | Path, max_bytes: int = MAX_FILE_BYTES) -> str:
-    """SHA-256 of a regular file of at most `max_bytes`; see `file_size`."""
-    remaining, digest = file_size(path, max_bytes), hashlib.sha256()
-    with open(path if remaining else os.devnull, "rb") as file:
-        while chunk := file.read(min(remaining, 1 << 20)):
-            digest.update(chunk)
-            remaining -= len(chunk)
-    return digest.hexdigest()
+    """SHA-256 of a regular file; see `read_file`."""
+    return hashlib.sha256(read_file(path, "a file", max_bytes=max_bytes)).hexdigest()
 
 
 def read_text(
