@@ -44,6 +44,7 @@ def few_views_to_select_by(monkeypatch):
         MemoryError(),
         RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory: you tried to allocate 9 bytes"),
         RuntimeError("can't start new thread"),
+        ImportError("_ufuncs.so: failed to map segment from shared object"),
         cv2.error("(-4:Insufficient memory) Failed to allocate 9 bytes"),
     ],
 )
