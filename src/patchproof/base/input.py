@@ -14,6 +14,7 @@ not in the threads of a cluster's workers. Within another time limit, or a profi
 from __future__ import annotations
 
 import csv
+import faulthandler
 import hashlib
 import io
 import json
@@ -27,7 +28,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
+from typing import TYPE_CHECKING, Any, NoReturn, ParamSpec, TypeVar
 
 from patchproof.base.errors import Refused, TimeLimitExceeded
 from patchproof.base.text import strip_apostrophe
@@ -212,46 +213,50 @@ def run_in_child(work: Callable[[], ReturnType]) -> ReturnType:
     """
     if sys.platform != "linux":
         return run_within_time(work)
-    import multiprocessing
-
-    context = multiprocessing.get_context("fork")
-    receiver, sender = context.Pipe(duplex=False)
-    child = context.Process(target=_send_result, args=(work, sender))
+    receiver, sender = os.pipe()
     with warnings.catch_warnings(action="ignore"):  # of a fork with other threads: the child uses none of their locks
-        child.start()
-    sender.close()
+        child = os.fork()  # multiprocessing allows none in the workers of a cluster
+    if child == 0:
+        _send_result(work, sender)
+    os.close(sender)
     try:
-        result, error = pickle.loads(receiver.recv_bytes())
-    except EOFError:
-        child.join()
-        if child.exitcode == -signal.SIGPROF:
+        with open(receiver, "rb") as file:
+            stored = file.read()
+    finally:
+        os.kill(child, signal.SIGKILL)
+        _, status = os.waitpid(child, 0)
+    try:
+        result, error = pickle.loads(stored)
+    except (EOFError, pickle.UnpicklingError):
+        if os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGPROF:
             raise TimeLimitExceeded(TIME_LIMIT_S) from None
         raise MemoryError("more memory than it may take") from None
-    finally:
-        receiver.close()
-        child.kill()
-        child.join()
     if error is not None:
         raise error
     return result
 
 
-def _send_result(work: Callable[[], Any], sender: Any) -> None:
+def _send_result(work: Callable[[], Any], sender: int) -> NoReturn:
     """Do the work of a child: the system ends it, even within a library, when its time is over."""
     import resource
 
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGPROF, signal.SIG_DFL)
-    signal.setitimer(signal.ITIMER_PROF, TIME_LIMIT_S)
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # libraries say a lot before they abort
-    result = error = None
     try:
-        with limit_memory(MAX_CHILD_BYTES):
-            result = work()
-    except Exception as caught:
-        error = caught
-    sender.send_bytes(pickle.dumps((result, error), 5))
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        signal.signal(signal.SIGPROF, signal.SIG_DFL)
+        signal.setitimer(signal.ITIMER_PROF, TIME_LIMIT_S)
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # libraries say a lot before they abort
+        faulthandler.disable()
+        result = error = None
+        try:
+            with limit_memory(MAX_CHILD_BYTES):
+                result = work()
+        except Exception as caught:
+            error = caught
+        with open(sender, "wb") as file:
+            pickle.dump((result, error), file, 5)
+    finally:
+        os._exit(0)
 
 
 @contextmanager
