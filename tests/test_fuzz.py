@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import collections
+import importlib
 import re
 import runpy
 import socket
@@ -164,4 +165,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    importlib.import_module("conftest")  # which puts the folders of tests on the path
     main()

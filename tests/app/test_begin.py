@@ -15,7 +15,7 @@ from console import command
 
 from patchproof.app.begin.guess import footing, guess_label, guess_length_mm, guess_up
 from patchproof.app.begin.new import new_scene
-from patchproof.app.begin.preview import OBJECT, PAGE, _up_warning, preview_scene
+from patchproof.app.begin.preview import OBJECT, PAGE, _unprintable, _up_warning, preview_scene
 from patchproof.app.begin.sides import (
     NO_SURFACE_RGB,
     PICTURE_PX,
@@ -30,6 +30,7 @@ from patchproof.app.begin.sides import (
 from patchproof.base.errors import Refused
 from patchproof.base.settings import load_scene_settings
 from patchproof.classifier import load_classifier
+from patchproof.optimizer.problem import set_problem
 from patchproof.render.stage import set_stage
 from patchproof.scene.fitting import largest_fitting_size
 from patchproof.scene.placement import gap_limit_mm
@@ -179,6 +180,22 @@ def test_a_piece_that_is_refused_is_said_beside_the_bare_object(tmp_path, few_tu
     assert html.count('class="note refused"') == 2 and "piece hangs here" not in html and html.count("<ol") == 8
     with pytest.raises(Refused, match="add --overwrite"):
         preview_scene("scene.toml", "patchproof-preview")
+
+
+def test_a_piece_that_no_sheet_could_hold_is_refused_before_the_first_step_and_by_its_preview():
+    """A design is printed with 2 pixels a millimeter or more, and a manifest holds 2,048 a side."""
+    settings = {
+        "object": {"mesh": "primitive:carton", "length_mm": 4000, "up": "y"},
+        "patch": {"width_mm": 1100, "height_mm": 800},
+        "target": {"label": "carton", "models": ["builtin"]},
+        "view": {"distance_mm": [9000, 9000]},
+        "sheet": {"template": "a3_tiles"},
+    }
+    scene = make_scene(settings)
+    with pytest.raises(Refused, match=r"at most 2048 pixels along its longer side, got 2\d+ for 1100 × 800 mm"):
+        set_problem(scene)
+    assert "at most 2048 pixels" in (_unprintable(scene, 96) or "")
+    assert _unprintable(make_scene(settings | {"patch": {"width_mm": 500, "height_mm": 500}}), 96) is None
 
 
 @pytest.mark.parametrize(

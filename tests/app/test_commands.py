@@ -11,6 +11,7 @@ import time
 import tomllib
 from dataclasses import replace
 
+import cv2
 import pytest
 from console import command, lab_command
 from safetensors import SafetensorError
@@ -35,6 +36,26 @@ from patchproof.sheets.template import template_names
 @pytest.fixture(autouse=True)
 def few_views_to_select_by(monkeypatch):
     monkeypatch.setattr("patchproof.optimizer.loop.SELECT_VIEWS", 4)
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        MemoryError(),
+        RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory: you tried to allocate 9 bytes"),
+        RuntimeError("can't start new thread"),
+        ImportError("_ufuncs.so: failed to map segment from shared object"),
+        cv2.error("(-4:Insufficient memory) Failed to allocate 9 bytes"),
+    ],
+)
+def test_too_little_memory_ends_in_a_sentence(error, monkeypatch, capsys):
+    def fail():
+        raise error
+
+    with pytest.raises(SystemExit) as stopped:
+        console.run_command_line(fail)
+    assert stopped.value.code == 1
+    assert capsys.readouterr().err.startswith("Expected enough memory, got none left: give it more")
 
 
 def program(name, *arguments, **environment) -> subprocess.CompletedProcess:

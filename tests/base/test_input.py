@@ -6,7 +6,6 @@ import hashlib
 import os
 import sys
 import time
-import tomllib
 
 import numpy as np
 import pytest
@@ -28,7 +27,7 @@ def test_pipes_devices_and_files_that_never_end_are_not_read(tmp_path):
     for name in ("pipe", "zeros"):
         with pytest.raises(Refused, match=f"Expected some text, got no file at .*{name}: check the path"):
             read_file(tmp_path / name, "some text")
-        with pytest.raises(FileNotFoundError):
+        with pytest.raises(Refused, match="no file"):
             hash_file(tmp_path / name)
     assert read_file(tmp_path / "pages", "some text") == b""
     assert hash_file(tmp_path / "pages").startswith("e3b0c442")  # of no bytes
@@ -42,21 +41,19 @@ def test_files_are_no_larger_than_what_they_are_read_as(tmp_path):
         file.truncate(1 << 40)
     assert file_size(tmp_path / "large", 1 << 40) == 1 << 40
     for read in (read_toml, lambda path: read_json(path, "JSON", "mend it"), lambda path: read_file(path, "text")):
-        with pytest.raises(Refused, match="1048576 MiB, more than"):
+        with pytest.raises(Refused, match="1073741824 KiB, more than"):
             read(tmp_path / "large")
-    with pytest.raises(OSError, match="more than"):
+    with pytest.raises(Refused, match="more than"):
         hash_file(tmp_path / "large")
     (tmp_path / "text").write_bytes(b"abc" * 1_000_000)
     assert hash_file(tmp_path / "text") == hashlib.sha256(b"abc" * 1_000_000).hexdigest()
 
 
-def test_settings_that_take_long_to_read_are_refused(tmp_path, monkeypatch):
-    """A key of so many parts takes Python's reader a time that grows with their square."""
-    monkeypatch.setattr(bounds, "TIME_LIMIT_S", 0.1)
-    (tmp_path / "dots.toml").write_text(".".join(["a"] * 30_000) + " = 1")
-    with pytest.raises(Refused, match=r"more than 0\.1 s of processor time"):
+def test_settings_with_a_key_of_many_parts_are_refused_for_their_size(tmp_path):
+    """The time that Python's reader takes grows with the square of their number: a minute for 100,000."""
+    (tmp_path / "dots.toml").write_text(".".join(["a"] * 100_000) + " = 1")
+    with pytest.raises(Refused, match="195 KiB, more than 64 KiB"):
         read_toml(tmp_path / "dots.toml")
-    assert tomllib.loads("a.b = 1") == {"a": {"b": 1}}
 
 
 def spin() -> None:
@@ -78,7 +75,7 @@ def test_work_in_a_child_ends_in_time_in_memory_and_with_its_own_result_or_error
         run_in_child(spin)
     assert time.monotonic() - before < 20
     with pytest.raises(MemoryError):
-        run_in_child(lambda: bytes(50_000_000))
+        run_in_child(lambda: bytes(2_000_000_000))
     with pytest.raises(MemoryError, match="than it may take"):
         run_in_child(lambda: os._exit(3))
     assert len(run_in_child(lambda: bytes(5_000_000))) == 5_000_000

@@ -177,7 +177,7 @@ def test_profiles_that_are_none(tmp_path):
     refused_profile(tmp_path / "a.icc", "which does not begin with a profile's header")
     with open(tmp_path / "big.icc", "wb") as file:
         file.truncate(100 * 2**20)  # sparse: takes no room
-    refused_profile(tmp_path / "big.icc", "100 MiB, more than 32 MiB")
+    refused_profile(tmp_path / "big.icc", "102400 KiB, more than 32768 KiB")
 
 
 def test_a_display_profile_is_no_printer(tmp_path):

@@ -392,6 +392,7 @@ def blank_photos(place: Place, number: int) -> Use:
     endless(place.given / "photos" / "b.jpg", of(number, ENDLESS))
     settings = {
         "object": {"photos": "photos", "sheet": "sheet.json"},
+        "patch": {},
         "target": {"label": "carton", "models": ["builtin"]},
     }
     return lambda: pp.make_scene(settings, base=place.given)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import signal
-import subprocess
 import sys
 import time
 from functools import cache
@@ -55,8 +54,8 @@ def forms_in_forms(path: Path, levels: int) -> None:
 
 
 @needs_timer
-def test_a_page_that_takes_too_long_is_refused_and_left_behind(tmp_path, monkeypatch):
-    """Five levels take 1 s, and nothing interrupts PDFium; the next page waits for it."""
+def test_a_page_that_takes_too_long_is_refused(tmp_path, monkeypatch):
+    """Five levels take 1 s, and nothing interrupts PDFium but the system, which ends its process."""
     monkeypatch.setattr(bounds, "TIME_LIMIT_S", 0.3)
     forms_in_forms(tmp_path / "few.pdf", 3)
     blue = rasterize_page(tmp_path / "few.pdf", 1, 72)
@@ -84,20 +83,6 @@ def test_kilobytes_that_unpack_to_gigabytes_are_refused_by_every_reader_of_pdfs(
     with contextlib.suppress(Refused):  # they need not look into every stream
         pdf_advice(tmp_path / "bomb.pdf")
     assert peak_bytes() - before < 50_000_000
-
-
-@needs_timer
-def test_a_process_that_has_left_a_page_behind_ends_as_any_other(tmp_path):
-    """What is drawn ten thousand million times is not waited for."""
-    forms_in_forms(tmp_path / "endless.pdf", 10)
-    code = (
-        "import sys; from patchproof.base import input; from patchproof.sheets.pdf_raster import rasterize_page;"
-        "from patchproof.base.errors import Refused; input.TIME_LIMIT_S = 0.2\n"
-        "try: rasterize_page(sys.argv[1])\nexcept Refused: sys.exit(7)"
-    )
-    command = [sys.executable, "-c", code, str(tmp_path / "endless.pdf")]
-    done = subprocess.run(command, capture_output=True, check=False, timeout=60)
-    assert (done.returncode, done.stderr) == (7, b"")
 
 
 @cache

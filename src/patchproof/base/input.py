@@ -14,6 +14,7 @@ not in the threads of a cluster's workers. Within another time limit, or a profi
 from __future__ import annotations
 
 import csv
+import faulthandler
 import hashlib
 import io
 import json
@@ -27,7 +28,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
+from typing import TYPE_CHECKING, Any, NoReturn, ParamSpec, TypeVar
 
 from patchproof.base.errors import Refused, TimeLimitExceeded
 from patchproof.base.text import strip_apostrophe
@@ -64,7 +65,7 @@ def file_size(path: str | Path, max_bytes: int = MAX_FILE_BYTES) -> int:
     if not is_file(path):
         raise FileNotFoundError(f"no file at {path}")
     if (size := os.path.getsize(path)) > max_bytes:
-        raise OSError(f"{size / 2**20:.0f} MiB, more than {max_bytes / 2**20:.0f} MiB")
+        raise OSError(f"{size >> 10} KiB, more than {max_bytes >> 10} KiB")
     return size
 
 
@@ -84,13 +85,8 @@ def read_file(
 
 
 def hash_file(path: str | Path, max_bytes: int = MAX_FILE_BYTES) -> str:
-    """SHA-256 of a regular file of at most `max_bytes`; see `file_size`."""
-    remaining, digest = file_size(path, max_bytes), hashlib.sha256()
-    with open(path if remaining else os.devnull, "rb") as file:
-        while chunk := file.read(min(remaining, 1 << 20)):
-            digest.update(chunk)
-            remaining -= len(chunk)
-    return digest.hexdigest()
+    """SHA-256 of a regular file; see `read_file`."""
+    return hashlib.sha256(read_file(path, "a file", max_bytes=max_bytes)).hexdigest()
 
 
 def read_text(
@@ -217,46 +213,50 @@ def run_in_child(work: Callable[[], ReturnType]) -> ReturnType:
     """
     if sys.platform != "linux":
         return run_within_time(work)
-    import multiprocessing
-
-    context = multiprocessing.get_context("fork")
-    receiver, sender = context.Pipe(duplex=False)
-    child = context.Process(target=_send_result, args=(work, sender))
+    receiver, sender = os.pipe()
     with warnings.catch_warnings(action="ignore"):  # of a fork with other threads: the child uses none of their locks
-        child.start()
-    sender.close()
+        child = os.fork()  # multiprocessing allows none in the workers of a cluster
+    if child == 0:
+        _send_result(work, sender)
+    os.close(sender)
     try:
-        result, error = pickle.loads(receiver.recv_bytes())
-    except EOFError:
-        child.join()
-        if child.exitcode == -signal.SIGPROF:
+        with open(receiver, "rb") as file:
+            stored = file.read()
+    finally:
+        os.kill(child, signal.SIGKILL)
+        _, status = os.waitpid(child, 0)
+    try:
+        result, error = pickle.loads(stored)
+    except (EOFError, pickle.UnpicklingError):
+        if os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGPROF:
             raise TimeLimitExceeded(TIME_LIMIT_S) from None
         raise MemoryError("more memory than it may take") from None
-    finally:
-        receiver.close()
-        child.kill()
-        child.join()
     if error is not None:
         raise error
     return result
 
 
-def _send_result(work: Callable[[], Any], sender: Any) -> None:
+def _send_result(work: Callable[[], Any], sender: int) -> NoReturn:
     """Do the work of a child: the system ends it, even within a library, when its time is over."""
     import resource
 
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGPROF, signal.SIG_DFL)
-    signal.setitimer(signal.ITIMER_PROF, TIME_LIMIT_S)
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # libraries say a lot before they abort
-    result = error = None
     try:
-        with limit_memory(MAX_CHILD_BYTES):
-            result = work()
-    except Exception as caught:
-        error = caught
-    sender.send_bytes(pickle.dumps((result, error), 5))
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        signal.signal(signal.SIGPROF, signal.SIG_DFL)
+        signal.setitimer(signal.ITIMER_PROF, TIME_LIMIT_S)
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # libraries say a lot before they abort
+        faulthandler.disable()
+        result = error = None
+        try:
+            with limit_memory(MAX_CHILD_BYTES):
+                result = work()
+        except Exception as caught:
+            error = caught
+        with open(sender, "wb") as file:
+            pickle.dump((result, error), file, 5)
+    finally:
+        os._exit(0)
 
 
 @contextmanager

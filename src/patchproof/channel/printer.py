@@ -10,6 +10,7 @@ what a camera resolves beyond 0.2 mm per pixel) and ink spread.
 
 from __future__ import annotations
 
+import io
 import math
 import zipfile
 from dataclasses import dataclass, field
@@ -24,7 +25,7 @@ from torch import Tensor
 
 from patchproof.base.color import clamp_to_unit
 from patchproof.base.errors import Refused
-from patchproof.base.input import is_file, read_json
+from patchproof.base.input import read_file, read_json
 from patchproof.base.packaged import packaged_path
 from patchproof.base.validation import Finite, StrictModel, spelling_hint, validate_model
 
@@ -125,12 +126,10 @@ def load_printer(name_or_file: str, base: Path | None = None) -> Printer:
 
 def _read(path: Path) -> Printer:
     tables, text, expected = path.with_suffix(".npz"), path.with_suffix(".json"), "a printer as NAME.npz with NAME.json"
-    for file in (tables, text):
-        if not is_file(file):
-            raise Refused(f"{expected} beside it", f"no file at {file}", "check the path")
-    head = validate_model(PrinterHead, read_json(text, expected, "calibrate again"), str(text))
+    stored = read_file(tables, f"{expected} beside it")
+    head = validate_model(PrinterHead, read_json(text, f"{expected} beside it", "calibrate again"), str(text))
     try:
-        with zipfile.ZipFile(tables) as archive:
+        with zipfile.ZipFile(io.BytesIO(stored)) as archive:
             lut = _array(archive, "lut", (SIZE, SIZE, SIZE, 3), (np.uint8, np.uint16))
             gamut = _array(archive, "gamut", (SIZE, SIZE, SIZE), (np.uint8,))
     except Exception as error:  # zip, deflate, LZMA and NumPy's header: each fails in its own way

@@ -15,7 +15,6 @@ gradients. Several names give several classifiers.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -98,34 +97,29 @@ def load_classifier(
 
 
 def _prepare(classifier: Classifier, device: torch.device | str) -> Classifier:
-    """Freeze the classifier, check it, and choose the batches in which it computes fastest on the device."""
+    """Freeze the classifier, check it, and choose the batches in which it computes fastest on the device. A network
+    from a file is refused if that takes too long or, on a CPU, too much memory: a few lines may ask for a lot.
+    """
     use_full_precision(device)
     if isinstance(classifier.network, torch.nn.Module):
         freeze(classifier.network).to(device)
-    return _prepare_within_limits(classifier, torch.device(device), lambda: _check_and_tune(classifier, device))
+    if not classifier.name.startswith("file:"):
+        return _check_and_tune(classifier, device)
+    threads, network = torch.get_num_threads(), classifier.network
+    stored_bytes = sum(weight.nbytes for weight in network.buffers()) if isinstance(network, torch.nn.Module) else 0
+    max_bytes = CHECK_BYTES + CHECK_BYTES_PER_BYTE * stored_bytes + CHECK_BYTES_PER_THREAD * threads
+    try:
+        with limit_memory(max_bytes) if torch.device(device).type == "cpu" else nullcontext():
+            return run_within_seconds(CHECK_S * threads, lambda: _check_and_tune(classifier, device))
+    except TimeLimitExceeded as error:
+        expected, got = "a network that three pictures can be tried with", f"{classifier.name}, which takes {error}"
+        raise Refused(expected, got, "use a smaller one, or more threads") from error
 
 
 def _check_and_tune(classifier: Classifier, device: torch.device | str) -> Classifier:
     check_network(classifier, device)
     pictures = smooth_pictures(classifier.input_px).to(device)
     return replace(classifier, network=tune_batches(classifier.network, pictures))
-
-
-def _prepare_within_limits(classifier: Classifier, device: torch.device, prepare: Callable[[], Classifier]):
-    """Prepare a network; refused if it is from a file and takes too much time or, on a CPU, memory for its size: a few
-    lines may ask for a matrix product ten thousand times.
-    """
-    if not classifier.name.startswith("file:"):
-        return prepare()
-    threads, network = torch.get_num_threads(), classifier.network
-    stored_bytes = sum(weight.nbytes for weight in network.buffers()) if isinstance(network, torch.nn.Module) else 0
-    max_bytes = CHECK_BYTES + CHECK_BYTES_PER_BYTE * stored_bytes + CHECK_BYTES_PER_THREAD * threads
-    try:
-        with limit_memory(max_bytes) if device.type == "cpu" else nullcontext():
-            return run_within_seconds(CHECK_S * threads, prepare)
-    except TimeLimitExceeded as error:
-        expected, got = "a network that three pictures can be tried with", f"{classifier.name}, which takes {error}"
-        raise Refused(expected, got, "use a smaller one, or more threads") from error
 
 
 def use_full_precision(device: torch.device | str) -> None:

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 import cv2
 import numpy as np
 
+from patchproof.base.errors import Refused
 from patchproof.base.input import MAX_JSON_BYTES, hash_file, is_file, read_file
 from patchproof.base.output import make_folder, write_atomically
 from patchproof.base.validation import StrictModel, validate_model
@@ -87,7 +88,7 @@ def settings_key(manifest: Manifest, options: Options) -> str:
 
 def file_sha256(path: Path) -> str | None:
     """SHA-256 of a file's bytes; None if it cannot be read, or is larger than photographs may be."""
-    with suppress(OSError):
+    with suppress(Refused):
         return hash_file(path, MOST_BYTES)
     return None
 

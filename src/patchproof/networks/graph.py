@@ -21,7 +21,7 @@ from patchproof.networks.steps import InputDevice, Step, ValueRef
 from patchproof.networks.tensor_observer import TensorObserver
 
 MAX_VALUE = 1 << 30  # numbers in one value, for each picture: VGG's at the largest input_px
-MAX_VALUES = 1 << 32  # numbers in all values, for each picture: 15 times as many as those of the largest ViT of 2022
+MAX_VALUES = 1 << 32  # numbers in all values, for each picture, which are 17 GB
 MAX_PRODUCTS = 1 << 35  # in one operator, for each picture: 18 times as many as VGG's largest has at 224 px
 MAX_SPLIT = 1 << 16  # size of a dimension that is split into several tensors
 

@@ -41,7 +41,9 @@ Cluster = Annotated[str | None, Option(help="A Dask scheduler's address, in plac
 Models = Annotated[str | None, Option(help="Comma-separated classifiers in place of the sheet's own.")]
 
 # how torch, OpenCV and the system say that there is none; numpy and Python raise a MemoryError
-_NO_MEMORY = re.compile(r"(?i)can(no|')t (allocate memory|start new thread)|(insufficient|out of) memory")
+_NO_MEMORY = re.compile(
+    r"(?i)can(no|')t (allocate memory|start new thread)|(insufficient|out of) memory|failed to map seg"
+)
 LINE_EVERY_S = 30.0  # of progress, if standard error is not a terminal
 
 
