@@ -68,7 +68,8 @@ def compare(
     judges = networks or scene.settings.target.models
     names = tuple(each.name if isinstance(each, Classifier) else each for each in judges)
     seed = scene.seed if seed is None else seed
-    with new_folder(out, COMPARISON_FILES, overwrite) as folder, open_workers(compute.jobs, compute.cluster) as workers:
+    opening = open_workers(compute.jobs, compute.cluster)
+    with new_folder(out, COMPARISON_FILES, overwrite, runs) as folder, opening as workers:
 
         def ask(name: str, start: int) -> AnswersByKind:
             nonlocal views_done

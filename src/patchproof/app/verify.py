@@ -22,7 +22,7 @@ from patchproof.base.errors import Refused
 from patchproof.base.folder_lock import lock_folder
 from patchproof.base.geometry import apply_homography, rect_corners
 from patchproof.base.input import is_file
-from patchproof.base.output import check_folder, write_atomically, write_pictures
+from patchproof.base.output import check_folder, clear_folder, refuse_other_files, write_atomically, write_pictures
 from patchproof.base.progress import Progress, no_progress
 from patchproof.channel.cameras import load_optional_camera
 from patchproof.channel.printer import load_printer
@@ -112,9 +112,7 @@ def verify(
     """
     out, manifest, compute = Path(out), load_manifest(sheet), compute.without("verify", device=True)
     with lock_folder(out):
-        _check_out(out, resume, overwrite)
-        if not isinstance(photos, str | Path):
-            photos = write_pictures(photos, out / _PHOTOS)
+        _check_out(out, resume, overwrite, (photos, sheet, controls, run, capture.camera, capture.boxes))
         boxes = capture.boxes
         options = options_of(sheet, manifest, models, capture.camera)
         parameters: dict[str, Any] = {"scan_dpi": capture.scan_dpi, "ruler_mm": capture.ruler_mm}
@@ -129,20 +127,21 @@ def verify(
             from patchproof.reprints.photo_forecast import photo_forecaster  # imports scene, renderer and optimizer
 
             forecast = photo_forecaster(run, manifest)
+        if not resume:
+            clear_folder(out)
+        if not isinstance(photos, str | Path):
+            photos = write_pictures(photos, out / _PHOTOS)
         gather = partial(gather_evidence, compute=compute, journal=out / _JOURNAL, resume=resume, forecast=forecast)
         on_pictures = partial(save_pictures, out / "pictures")
         report = gather(photos, manifest, options, on_pictures=on_pictures, advance=partial(progress, "verify"))
         parameters |= {"camera": capture.camera and Path(capture.camera).name}
         parameters |= {"boxes": boxes and Path(boxes).name, "ledger_photos": ledger_photos}
-        hashes = {
-            "manifest": file_sha256(Path(sheet)),
-            **{f"network {each.name}": each.sha256 for each in options.models},
-        }
+        hashes = {f"network {each.name}": each.sha256 for each in options.models}
+        hashes = {"manifest": file_sha256(Path(sheet)), **hashes}
         report = report.changed(origin=Origin(options=parameters, sha256=hashes, versions=versions_of(_LIBRARIES)))
         stems = {stem_of(photo.file) for photo in report.photos[:MAX_PICTURED_PHOTOS]}
-        for path in list((out / "pictures").glob("*")):  # those of photographs that this report does not show
-            if path.name.rsplit(".", 2)[0] not in stems:
-                path.unlink()
+        # but for pictures of photographs that this report does not show
+        clear_folder(out, lambda name: not name.startswith("pictures/") or name[9:].rsplit(".", 2)[0] in stems)
         ledger = report.ledger and report.ledger.model_dump()
         write_report(report.model_dump(mode="json"), manifest.model_dump(mode="json"), out, ledger)
         write_atomically(out / "coco.json", _boxes(report, manifest, options.camera))
@@ -184,15 +183,15 @@ def options_of(
     )
 
 
-def _check_out(out: Path, resume: bool, overwrite: bool) -> None:
+def _check_out(out: Path, resume: bool, overwrite: bool, inputs: Sequence[object]) -> None:
     """Refuse a folder with files, unless they are of a verification that is resumed or overwritten."""
     has_journal = is_file(out / _JOURNAL)
     if resume:
-        check_folder(out, REPORT_FILES if has_journal else (), overwrite=has_journal)
+        refuse_other_files(out, REPORT_FILES if has_journal else ())
         return
     if has_journal and not overwrite and not is_file(out / "report.json"):
         raise Refused("an empty or new folder", f"{out} with an unfinished verification", "add --resume or --overwrite")
-    check_folder(out, REPORT_FILES, overwrite)
+    check_folder(out, REPORT_FILES, overwrite, inputs=inputs)
 
 
 def _networks(manifest: Manifest, models: Sequence[str | Classifier] | None) -> tuple[str | Classifier, ...]:

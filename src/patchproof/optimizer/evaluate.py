@@ -16,6 +16,7 @@ import torch
 
 from patchproof.base.compute import Compute
 from patchproof.base.errors import Refused
+from patchproof.base.folder_lock import lock_folder
 from patchproof.base.input import is_file
 from patchproof.base.notebook import notebook_html, rate_text
 from patchproof.base.output import write_atomically
@@ -111,7 +112,8 @@ def evaluate(
         controls = control_claims(responses_by_kind, i)
         evaluations[claim.name] = ModelEvaluation(**claim.model_dump(), controls=controls, ap50=ap50)
     result = Evaluation(n=n, seed=run.scene.seed if seed is None else seed, models=evaluations)
-    write_atomically(run.folder / "evaluate.json", result.to_json())
+    with lock_folder(run.folder):
+        write_atomically(run.folder / "evaluate.json", result.to_json())
     return result
 
 

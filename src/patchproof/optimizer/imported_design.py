@@ -93,7 +93,7 @@ def import_patch(
         Refused: where the picture does not fit the piece, or where the piece's markers could not be read beside it.
     """
     out, compute = Path(out), compute.without("import_patch", cluster=True)
-    check_folder(out, RUN_FILE_PATTERNS, overwrite)
+    check_folder(out, RUN_FILE_PATTERNS, overwrite, inputs=(picture, scene))
     (file, sha256, pixels, said), scene = _read_picture(picture), _load_piece_scene(scene, seed)
     fitted, scene = fit_to_piece(pixels, scene), scene.for_design(sha256)
     problem = set_problem(scene, compute.device, models, jobs=compute.jobs)

@@ -29,7 +29,7 @@ from patchproof.base.errors import Refused
 from patchproof.base.folder_lock import lock_folder
 from patchproof.base.input import is_file, read_file, read_json
 from patchproof.base.notebook import notebook_html
-from patchproof.base.output import check_folder, make_folder, write_atomically
+from patchproof.base.output import check_folder, clear_folder, make_folder, write_atomically
 from patchproof.base.progress import Advance, Progress, no_progress
 from patchproof.base.settings import SceneSettings
 from patchproof.base.validation import validate_model
@@ -52,7 +52,7 @@ _MAX_LINE_BYTES = 4096  # of the log
 _MESH_FILE = "given.glb"  # the mesh of a scene that was made in Python
 _DESIGN_FILES = (DESIGN_FILE, OBJECT_FILE, TEXTURE_FILES, MASK_FILE)
 _STEP_FILES = (CHECKPOINT_FILE, _LOG_FILE, RUN_FILE, _VIEWS_FILE, _MESH_FILE, "place.*")
-RUN_FILE_PATTERNS = (*_STEP_FILES, *_DESIGN_FILES, "evaluate.json", ".*.part")
+RUN_FILE_PATTERNS = (*_STEP_FILES, *_DESIGN_FILES, "evaluate.json")
 
 # (steps, promised views) of a first look, whose interval is some four times as wide, and of a print that counts, with
 # three times the default's steps and an interval half as wide (`bench effort`).
@@ -117,7 +117,7 @@ def optimize(
     with lock_folder(out):
         if not resume:
             unfinished = is_file(out / CHECKPOINT_FILE) and not is_file(out / RUN_FILE)
-            check_folder(out, RUN_FILE_PATTERNS, overwrite, unfinished=unfinished)
+            check_folder(out, RUN_FILE_PATTERNS, overwrite, unfinished=unfinished, inputs=(scene,))
         scene = resolve_scene(scene, seed)
         save_place = None
         if not scene.HAS_PLACE:
@@ -125,9 +125,7 @@ def optimize(
             scene, save_place = _choose_place(scene, out, resume, search_options)
         problem = set_problem(scene, compute.device, models, loss, compute.jobs)
         if not resume:
-            for pattern in RUN_FILE_PATTERNS[:-1]:  # everything that the new run needs has been read
-                for path in out.glob(pattern):
-                    path.unlink()
+            clear_folder(out)  # everything that the new run needs has been read
         make_folder(out)
         if save_place is not None:
             save_place()
