@@ -136,7 +136,7 @@ def test_resuming_and_originals_in_the_way(folder, tmp_path):
         harden_images(settings, mine, Work(overwrite=True))
 
 
-@pytest.mark.parametrize("name", ["../photos/b.jpg", "{folder}/b.jpg"])
+@pytest.mark.parametrize("name", ["../photos/b.png", "{folder}/b.png"])
 def test_names_that_lead_out_of_the_folder_are_refused(folder, tmp_path, name):
     """Their PNGs would have been written there."""
     table, before = tmp_path / "labels.csv", sorted(folder.iterdir())

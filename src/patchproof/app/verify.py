@@ -24,6 +24,7 @@ from patchproof.base.geometry import apply_homography, rect_corners
 from patchproof.base.input import is_file
 from patchproof.base.output import check_folder, clear_folder, refuse_other_files, write_atomically, write_pictures
 from patchproof.base.progress import Progress, no_progress
+from patchproof.base.validation import refuse_untrusted
 from patchproof.channel.cameras import load_optional_camera
 from patchproof.channel.printer import load_printer
 from patchproof.classifier.load import load_classifier
@@ -75,6 +76,7 @@ def verify(
     controls: str | Path | None = None,
     capture: CaptureInfo = CaptureInfo(),
     run: str | Path | Run | None = None,
+    trust: bool = False,
     ledger_photos: int = LEDGER_PHOTOS,
     compute: Compute = Compute(),
     resume: bool = False,
@@ -88,11 +90,12 @@ def verify(
             session, which are kept as PNG files in `out`.
         sheet: the manifest, SHEET.json; its folder is where its models and printers are looked up.
         out: folder for the report, new or empty.
-        models: networks besides the sheet's first: names, or classifiers in memory. Code (`module:`) that the sheet
-            names runs only where it is one of them.
+        models: networks besides the sheet's first: names, or classifiers in memory. Code (`module:`) and downloads that
+            the sheet or the run names are used only where they are among them.
         controls: folder with a folder of photographs for each control ("bare", "mean", ...).
         capture: camera, scan resolution, measured rulers, the object's boxes.
         run: the run that the sheet was made from; each photograph then gets a forecast at its measured view.
+        trust: use what sheet and run name without naming it in `models`, also variables of the environment.
         ledger_photos: photographs at most in the gap ledger and the estimated effect, 0 for neither; each costs 16
             classifications.
         compute: processes or cluster; photographs are judged on the CPU, and another device is refused.
@@ -114,7 +117,7 @@ def verify(
     with lock_folder(out):
         _check_out(out, resume, overwrite, (photos, sheet, controls, run, capture.camera, capture.boxes))
         boxes = capture.boxes
-        options = options_of(sheet, manifest, models, capture.camera)
+        options = options_of(sheet, manifest, models, capture.camera, trust)
         parameters: dict[str, Any] = {"scan_dpi": capture.scan_dpi, "ruler_mm": capture.ruler_mm}
         options = replace(options, **parameters, controls=controls, ledger_photos=ledger_photos)
         if boxes is not None:
@@ -126,7 +129,7 @@ def verify(
         if run is not None:
             from patchproof.reprints.photo_forecast import photo_forecaster  # imports scene, renderer and optimizer
 
-            forecast = photo_forecaster(run, manifest)
+            forecast = photo_forecaster(run, manifest, trust, _by_name(models))
         if not resume:
             clear_folder(out)
         if not isinstance(photos, str | Path):
@@ -172,12 +175,15 @@ def options_of(
     manifest: Manifest,
     models: Sequence[str | Classifier] | None = None,
     camera: str | Path | None = None,
+    trust: bool = False,
 ) -> Options:
     """Load the networks, the printer and the camera for photographs of the sheet; see `verify`."""
     base, promise = Path(sheet).resolve().parent, manifest.promise
-    least_score = None if promise is None else promise.models[0].least_score
+    least_score, networks = None if promise is None else promise.models[0].least_score, _networks(manifest, models)
+    if not trust:
+        refuse_untrusted(sheet, [name for name in networks if isinstance(name, str) and name not in _by_name(models)])
     return Options(
-        models=[load_classifier(each, base).with_least_score(least_score) for each in _networks(manifest, models)],
+        models=[load_classifier(each, base).with_least_score(least_score) for each in networks],
         printer=load_printer((manifest.settings.get("printer") or {}).get("profile", "coated"), base),
         camera=load_optional_camera(camera),
     )
@@ -195,11 +201,8 @@ def _check_out(out: Path, resume: bool, overwrite: bool, inputs: Sequence[object
 
 
 def _networks(manifest: Manifest, models: Sequence[str | Classifier] | None) -> tuple[str | Classifier, ...]:
-    """List the primary network, then the named ones or else the promise's; classifiers in memory stand for themselves.
-    Refused is a sheet's network that is code, or has a variable in its name, unless the user names it: a received file
-    decides neither what runs nor what is read of the environment.
-    """
-    named = {model.name if isinstance(model, Classifier) else model: model for model in models or ()}
+    """List the primary network, then the named ones or else the promise's; classifiers in memory stay as they are."""
+    named = _by_name(models)
     if manifest.promise is None and not named:
         got = f"the {manifest.kind} sheet {manifest.sheet_id}"
         raise Refused("a sheet that promises something", got, "name --models")
@@ -207,11 +210,8 @@ def _networks(manifest: Manifest, models: Sequence[str | Classifier] | None) -> 
         return tuple(named.values())
     promised = tuple(model.name for model in manifest.promise.models)
     names = dict.fromkeys((promised[0], *(named or promised)))
-    for name in names:
-        if name not in named and name.startswith("module:"):
-            do = f"name it yourself if that code is yours (--models {name})"
-            raise Refused("a sheet whose networks are files, not code that would be run", name, do)
-        if name not in named and "${" in name:
-            do = f"name it yourself if you trust the sheet (--models '{name}')"
-            raise Refused("a sheet whose networks are named without variables of your environment", name, do)
     return tuple(named.get(name, name) for name in names)
+
+
+def _by_name(models: Sequence[str | Classifier] | None) -> dict[str, str | Classifier]:
+    return {model.name if isinstance(model, Classifier) else model: model for model in models or ()}

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from patchproof.base.errors import Refused
 from patchproof.base.settings import OptimizeSettings
+from patchproof.base.validation import refuse_untrusted
 from patchproof.base.workers import use_threads
 from patchproof.channel.printer import Printer, load_printer
 from patchproof.classifier.labels import find_labels
@@ -144,6 +145,8 @@ def set_problem(
     _check_device(device)
     settings = scene.settings
     names, least_score = models or settings.target.models, settings.target.least_score
+    if scene.received is not None and not models:
+        refuse_untrusted(scene.received, settings.target.models)
     names = [scene.given_models.get(name, name) if isinstance(name, str) else name for name in names]
     classifiers = tuple(load_classifier(name, scene.base, device).with_least_score(least_score) for name in names)
     indices = tuple(find_labels(c.labels, settings.target.label, settings.target.accept) for c in classifiers)

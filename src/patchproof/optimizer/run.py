@@ -13,7 +13,7 @@ import json
 import os
 import platform
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib.metadata import version
@@ -32,7 +32,7 @@ from patchproof.base.notebook import notebook_html
 from patchproof.base.output import check_folder, clear_folder, make_folder, write_atomically
 from patchproof.base.progress import Advance, Progress, no_progress
 from patchproof.base.settings import SceneSettings
-from patchproof.base.validation import validate_model
+from patchproof.base.validation import refuse_untrusted, validate_model
 from patchproof.base.version import __version__
 from patchproof.classifier.network import Classifier
 from patchproof.optimizer.checkpoint import CHECKPOINT_FILE, load_checkpoint, save_checkpoint
@@ -178,15 +178,20 @@ def finish_run(
 
 
 def promise_run(
-    run_folder: str | Path, *, views: int | None = None, compute: Compute = Compute(), progress: Progress = no_progress
+    run_folder: str | Path,
+    *,
+    views: int | None = None,
+    trust: bool = False,
+    compute: Compute = Compute(),
+    progress: Progress = no_progress,
 ) -> Run:
     """Promise the rate of a finished run's design again, from `views` views and with the run's own controls; the run is
     the same to the byte as if `optimize` had been given these views. A sheet keeps its promise until it is written
-    again.
+    again. For `trust` see `load_run`.
     """
     compute, options = compute.without("promise", cluster=True), PromiseOptions(views)
     with lock_folder(run_folder):
-        run = load_run(run_folder)
+        run = load_run(run_folder, trust)
         options = replace(options, controls=tuple(run.promise.controls))
         problem = set_problem(run.scene, compute.device, jobs=compute.jobs)
         promise = promise_of(problem, run.design, options, partial(progress, "promise"))
@@ -195,8 +200,12 @@ def promise_run(
     return replace(run, promise=promise, details=details)
 
 
-def load_run(folder: str | Path) -> Run:
-    """Load a finished run; refused if the folder holds none, or an unfinished one."""
+def load_run(folder: str | Path, trust: bool = False, named: Iterable[str] = ()) -> Run:
+    """Load a finished run; refused if the folder holds none, or an unfinished one.
+
+    A run may be from somebody else. Without `trust`, paths with `${VAR}` are refused, and its networks will not be
+    loaded if they are code (`module:`) or downloads, unless they are all `named`.
+    """
     folder = Path(folder)
     if not is_file(folder / RUN_FILE):
         has_checkpoint = is_file(folder / CHECKPOINT_FILE)
@@ -208,7 +217,11 @@ def load_run(folder: str | Path) -> Run:
     try:
         base = (folder / record.scene_folder).resolve()
         glb = read_file(folder / _MESH_FILE, "the mesh of a run") if is_file(folder / _MESH_FILE) else None
+        if not trust:
+            refuse_untrusted(folder / RUN_FILE, (), settings.model_dump(exclude={"target": {"models"}}))
         scene = build_scene(settings, base, record.seed, record.sheet_id, glb)
+        if not trust and not {*settings.target.models} <= {*named}:
+            scene = replace(scene, received=folder / RUN_FILE)
         if record.imported is not None:
             scene = replace(scene, known={**scene.known, "design": record.imported.sha256})
         design = read_design(scene, folder)

@@ -128,7 +128,7 @@ def _take_photo(pdf: Path, run_folder: Path, how: ReprintSetup, conditions: Cond
 @lru_cache(maxsize=1)
 def _photographer(pdf: Path, run_folder: Path, how: ReprintSetup) -> Callable[[Conditions], bytes]:
     """Mount the sheet in another process, once."""
-    return mount_sheet(pdf, load_run(run_folder), how).photograph
+    return mount_sheet(pdf, load_run(run_folder, trust=True), how).photograph  # it was loaded before
 
 
 def write_truth(folder: Path, truth: Mapping[str, PhotoTruth]) -> None:
