@@ -20,7 +20,7 @@ class Assets:
 
     def __init__(self, mesh: Path):
         self.folder, self.file_name = mesh.parent, mesh.name
-        self.missing, self.broken = [], []
+        self.missing, self.broken, self.files = [], [], [mesh]
 
     def get(self, name: str) -> bytes:
         """Return the bytes of a file."""
@@ -32,6 +32,7 @@ class Assets:
                 if (self.folder / spelling).stat().st_size > MOST_BYTES:
                     raise ValueError(f"{spelling} is too large")
                 data = (self.folder / spelling).read_bytes()
+                self.files.append(self.folder / spelling)
                 if not spelling.lower().endswith((".mtl", ".bin")) and not _is_image(data):
                     self.broken.append(name)
                 return data

@@ -34,8 +34,10 @@ GRAY_LINEAR = (0.21404114, 0.21404114, 0.21404114)  # sRGB 0.5, for an object wi
 WHITE = (1.0, 1.0, 1.0)
 
 
-def read_parts(path: Path, world_from_file: np.ndarray) -> tuple[list[MeshPart], list[str]]:
-    """Read every placed geometry with faces, its vertices and normals turned by `world_from_file` 3×3; warnings."""
+def read_parts(path: Path, world_from_file: np.ndarray) -> tuple[list[MeshPart], list[str], list[Path]]:
+    """Read every placed geometry with faces, its vertices and normals turned by `world_from_file` 3×3; warnings; and
+    the files that were read.
+    """
     if not is_file(path) or not path.stat().st_size:  # some files of the system are empty, and never end
         raise Refused("a mesh file", f"no file at {path}, or an empty one", "check the path")
     if path.suffix.lower() not in FORMATS:
@@ -46,7 +48,7 @@ def read_parts(path: Path, world_from_file: np.ndarray) -> tuple[list[MeshPart],
         parts = reader.parts(world_from_file)
         if not parts:
             raise Refused("a mesh with faces", f"no face in {path.name}", "export the object as triangles")
-        return parts, [*dict.fromkeys(reader.warnings), *topology_warnings(parts)]
+        return parts, [*dict.fromkeys(reader.warnings), *topology_warnings(parts)], reader.assets.files
     except Refused:
         raise
     except Exception as error:  # parsers, arrays of odd shapes and broken graphs raise many types of error

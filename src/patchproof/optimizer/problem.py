@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from patchproof.base.errors import Refused
+from patchproof.base.fingerprint import refuse_other_inputs
 from patchproof.base.settings import OptimizeSettings
 from patchproof.base.validation import refuse_untrusted
 from patchproof.base.workers import use_threads
@@ -56,6 +57,11 @@ class Problem:
     subject: Subject
     custom_loss: Loss | None  # in place of the goal's
     jobs: int = 1  # processes that share the views
+
+    @cached_property
+    def inputs(self) -> dict[str, str]:
+        """Fingerprints of everything that results depend on, by settings key; a network's ends with its name."""
+        return {**self.scene.inputs, **{f"target.models {each.name}": each.fingerprint for each in self.classifiers}}
 
     @property
     def training_px(self) -> int:
@@ -161,7 +167,10 @@ def set_problem(
             for network in (classifier.network for classifier in classifiers if scene.HAS_PIECE):
                 if isinstance(network, BatchedNetwork):
                     _ = network.cut  # computed on access
-    return Problem(scene, stage, printer, classifiers, indices, subject, loss, jobs)
+    problem = Problem(scene, stage, printer, classifiers, indices, subject, loss, jobs)
+    if not models:
+        refuse_other_inputs(scene.recorded, problem.inputs, f"the run of sheet {scene.sheet_id}", settings.model_dump())
+    return problem
 
 
 def _check_device(device: str) -> None:

@@ -26,6 +26,7 @@ from pydantic import BaseModel, Field
 
 from patchproof.base.compute import Compute
 from patchproof.base.errors import Refused
+from patchproof.base.fingerprint import refuse_other_inputs
 from patchproof.base.folder_lock import lock_folder
 from patchproof.base.input import is_file, read_file, read_json
 from patchproof.base.notebook import notebook_html
@@ -119,11 +120,12 @@ def optimize(
             unfinished = is_file(out / CHECKPOINT_FILE) and not is_file(out / RUN_FILE)
             check_folder(out, RUN_FILE_PATTERNS, overwrite, unfinished=unfinished, inputs=(scene,))
         scene = resolve_scene(scene, seed)
-        save_place = None
+        save_place, searched = None, {}
         if not scene.HAS_PLACE:
             search_options = {"models": models, "loss": loss, "compute": compute, "progress": progress}
-            scene, save_place = _choose_place(scene, out, resume, search_options)
+            scene, save_place, searched = _choose_place(scene, out, resume, search_options)
         problem = set_problem(scene, compute.device, models, loss, compute.jobs)
+        refuse_other_inputs(searched, problem.inputs, out, scene.settings.model_dump())
         if not resume:
             clear_folder(out)  # everything that the new run needs has been read
         make_folder(out)
@@ -145,8 +147,10 @@ def resolve_scene(scene: str | Path | Scene, seed: int | None) -> Scene:
 
 def _choose_place(
     scene: Scene, out: Path, resume: bool, search_options: Mapping[str, Any]
-) -> tuple[PatchScene, Callable[[], None]]:
-    """The scene with the piece at the place that a search chooses or chose, and a function that saves the place."""
+) -> tuple[PatchScene, Callable[[], None], Mapping[str, str]]:
+    """The scene with the piece at the place that a search chooses or chose, a function that saves the place, and the
+    fingerprints of what was searched.
+    """
     # only scenes that give no place import the search
     from patchproof.optimizer.place_files import read_place, save_place
     from patchproof.optimizer.place_search import choose_place
@@ -155,7 +159,7 @@ def _choose_place(
     scene = require_unplaced(scene)
     place = (read_place(out, scene) if resume else None) or choose_place(scene, **search_options)
     placed_scene = scene.with_piece_at(place.at, place.spin_deg)
-    return placed_scene, lambda: save_place(place, placed_scene, out)
+    return placed_scene, lambda: save_place(place, placed_scene, out), place.inputs
 
 
 def finish_run(
@@ -220,6 +224,10 @@ def load_run(folder: str | Path, trust: bool = False, named: Iterable[str] = ())
         if not trust:
             refuse_untrusted(folder / RUN_FILE, (), settings.model_dump(exclude={"target": {"models"}}))
         scene = build_scene(settings, base, record.seed, record.sheet_id, glb)
+        files = {key: sha256 for key, sha256 in record.inputs.items() if key in scene.inputs}
+        refuse_other_inputs(files, scene.inputs, folder / RUN_FILE, settings.model_dump())
+        networks = {key: sha256 for key, sha256 in record.inputs.items() if key.startswith("target.models ")}
+        scene = replace(scene, recorded=networks)
         if not trust and not {*settings.target.models} <= {*named}:
             scene = replace(scene, received=folder / RUN_FILE)
         if record.imported is not None:
@@ -245,6 +253,7 @@ class _Record(BaseModel):
     seed: Annotated[int, Field(ge=0)]
     sheet_id: str
     printer: dict[str, Any]
+    inputs: dict[str, str] = {}
     imported: _Imported | None = None
 
 
@@ -306,6 +315,7 @@ def _details(problem: Problem, promise: Promise, out: Path) -> dict[str, Any]:
         "scene_folder": os.path.relpath(scene.base.resolve(), out.resolve()),
         "settings": scene.settings.model_dump(mode="json"),
         "printer": problem.printer.provenance | {"method": problem.printer.method},
+        "inputs": problem.inputs,
         "placement": scene.record(),
         "warnings": list(scene.warnings),
         "select_after_views": SELECT_AFTER,

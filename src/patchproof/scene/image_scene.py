@@ -25,6 +25,7 @@ from typing import Self
 import numpy as np
 
 from patchproof.base.errors import Refused
+from patchproof.base.fingerprint import files_sha256
 from patchproof.base.geometry import rotated_extent
 from patchproof.base.input import MAX_JSON_BYTES, is_file, read_file
 from patchproof.base.settings import SceneSettings
@@ -122,7 +123,8 @@ def build(source: SceneSource) -> ImageScene:
         warnings.append(
             f"the promise is made on {promised} images, and says little of others: give {FEW_IMAGES} or more"
         )
-    return ImageScene(settings, base, source.seed, identity, piece, images, notes=tuple(warnings))
+    inputs = {"object.images": files_sha256(files, whole=False)}
+    return ImageScene(settings, base, source.seed, identity, piece, images, notes=tuple(warnings), inputs=inputs)
 
 
 def px_per_mm(settings: SceneSettings, piece: Piece, conditions: Conditions) -> np.ndarray:
