@@ -115,7 +115,7 @@ def test_an_input_in_the_folder_is_refused(out, tmp_path):
     """Also by another name of the same folder."""
     (tmp_path / "link").symlink_to(out)
     for path in (out, out / "a.txt", tmp_path / "link" / "a.txt", str(out / "inner")):
-        with pytest.raises(Refused, match="inputs that lie outside of the folder to write"):
+        with pytest.raises(Refused, match="inputs that lie outside of what is written"):
             check_folder(out, OWN, overwrite=True, inputs=(None, np.zeros(3), path))
     check_folder(out, OWN, overwrite=True, inputs=(tmp_path / "theirs", "coated", 3))
 

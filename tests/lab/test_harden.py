@@ -127,7 +127,7 @@ def test_resuming_and_originals_in_the_way(folder, tmp_path):
     harden_images(settings, out, Work(resume=True))
     assert (out / "b.png").read_bytes() == picture and (out / "harden_accuracy.csv").read_bytes() == table
     harden_images(settings, out, Work(overwrite=True))
-    with pytest.raises(Refused, match="inputs that lie outside of the folder"):
+    with pytest.raises(Refused, match="inputs that lie outside of what is written"):
         harden_images(settings, folder, Work(overwrite=True))
     mine = tmp_path / "mine"
     mine.mkdir()

@@ -135,6 +135,17 @@ def test_runs_of_pictures_are_kept_only_with_the_same_inputs(made, tmp_path):
         import_folder(folder / "pictures", scene, out, **options)
 
 
+def test_a_scene_of_files_in_the_run_is_not_optimized_over_them(made, tmp_path):
+    folder = shutil.copytree(made, tmp_path / "copy")
+    scene, before = folder / "scene.toml", sorted(folder.rglob("*"))
+    scene.write_text(scene.read_text().replace('"places"', '"run/design.png"'))
+    with pytest.raises(Refused, match=r"inputs that lie outside of what is written, got .*design\.png"):
+        optimize(scene, folder / "run", overwrite=True)
+    with pytest.raises(Refused, match=r"inputs that lie outside of what is written, got .*design\.png"):
+        import_patch(folder / "run" / "design.png", made / "scene.toml", folder / "run", overwrite=True)
+    assert sorted(folder.rglob("*")) == before
+
+
 def test_an_optimization_is_not_resumed_with_another_network(made, tmp_path, monkeypatch):
     """Its labels alone are another network, too."""
     monkeypatch.setattr(loop, "SAVE_AFTER", 1)

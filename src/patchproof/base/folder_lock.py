@@ -50,7 +50,9 @@ def lock_folder(folder: str | Path) -> Iterator[None]:
         yield
     finally:
         if handle is not None:
-            _release(path, handle)
+            with suppress(OSError):  # while it is still ours; Windows keeps files that are open
+                path.unlink()
+            os.close(handle)
         with _GUARD:
             del _OPEN[real]
 
@@ -64,7 +66,14 @@ def _open_locked(path: Path, folder: str | Path) -> int:
             got = f"{folder} ({error.strerror})"
             raise Refused("a folder that can be written to", got, "choose another --out") from error
         try:
-            _lock(handle)
+            if sys.platform == "win32":
+                import msvcrt
+
+                msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)
+            else:
+                import fcntl
+
+                fcntl.lockf(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
             if error.errno in _BUSY:
                 owner = os.read(handle, 20).decode(errors="replace") if os.name != "nt" else ""
@@ -76,27 +85,6 @@ def _open_locked(path: Path, folder: str | Path) -> int:
                 os.write(handle, str(os.getpid()).encode())
                 return handle
         os.close(handle)
-
-
-def _lock(handle: int) -> None:
-    if sys.platform == "win32":
-        import msvcrt
-
-        msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)
-    else:
-        import fcntl
-
-        fcntl.lockf(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-
-
-def _release(path: Path, handle: int) -> None:
-    """Remove the file while it is still ours; Windows removes none that is open, and so none of another process."""
-    if os.name != "nt":
-        path.unlink(missing_ok=True)
-    os.close(handle)
-    if os.name == "nt":
-        with suppress(OSError):
-            path.unlink()
 
 
 def _busy(folder: str | Path, owner: str) -> Refused:

@@ -81,12 +81,12 @@ def check_folder(
 
 
 def refuse_inputs_in(out: Path, inputs: Iterable[object]) -> None:
-    """Refuse a file or folder that a command reads, if it is or lies in the folder that the command writes."""
+    """Refuse a file or folder that a command reads, if it is or lies in what the command writes."""
     for path in inputs:  # objects in memory are none
         if not isinstance(path, str | Path) or not os.path.exists(path):
             continue
         if Path(path).resolve().is_relative_to(out.resolve()):
-            raise Refused("inputs that lie outside of the folder to write", f"{path} in {out}", _ANOTHER)
+            raise Refused("inputs that lie outside of what is written", f"{path} in {out}", _ANOTHER)
 
 
 def refuse_other_files(out: Path, file_names: tuple[str, ...]) -> None:
@@ -155,8 +155,9 @@ def _remove(part: Path) -> None:
     shutil.rmtree(part, ignore_errors=True)
 
 
-def check_file(path: Path, overwrite: bool = False) -> None:
-    """Refuse a file that exists unless it may be overwritten."""
+def check_file(path: Path, overwrite: bool = False, inputs: Iterable[object] = ()) -> None:
+    """Refuse a file that exists unless it may be overwritten and is none of the command's inputs."""
+    refuse_inputs_in(path, inputs)
     if os.path.exists(path) and not overwrite:
         raise Refused("a new file", f"{path}, which exists", "choose another --out or add --overwrite")
 

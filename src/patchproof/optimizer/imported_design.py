@@ -38,6 +38,7 @@ from patchproof.photo.detect import find_markers
 from patchproof.photo.read import list_photos, printable_name, read_photo
 from patchproof.photo.rejection import PhotoRejected
 from patchproof.scene.interface import PieceScene, Scene, require_piece
+from patchproof.scene.scene import named_paths
 from patchproof.sheets.manifest import design_sha256
 from patchproof.sheets.piece import Piece, marker_image
 
@@ -101,7 +102,7 @@ def import_patch(
     design = problem.patch.pixels(from_pixels(fitted, problem.device))
     record = _import_record(problem, file, sha256, pixels, fitted, design)
     record = replace(record, notes=said + record.notes)
-    with new_folder(out, RUN_FILE_PATTERNS, overwrite) as folder:
+    with new_folder(out, RUN_FILE_PATTERNS, overwrite, named_paths(scene).values()) as folder:
         run = finish_run(problem, design, folder, promise, progress, asdict(record))
     return replace(run, folder=out)
 

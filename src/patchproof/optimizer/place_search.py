@@ -18,6 +18,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from pydantic import Field
 
 from patchproof.base.compute import Compute
 from patchproof.base.errors import Refused
@@ -83,7 +84,7 @@ class Place(StrictModel):
     """
 
     sheet_id: str  # of the scene that was searched
-    inputs: dict[str, str] = {}  # fingerprints of its files and networks
+    inputs: dict[str, str] = Field(default_factory=dict)  # fingerprints of its files and networks
     front: Side
     at: PiecePosition
     spin_deg: float

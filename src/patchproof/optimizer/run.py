@@ -30,7 +30,7 @@ from patchproof.base.fingerprint import refuse_other_inputs
 from patchproof.base.folder_lock import lock_folder
 from patchproof.base.input import is_file, read_file, read_json
 from patchproof.base.notebook import notebook_html
-from patchproof.base.output import check_folder, clear_folder, make_folder, write_atomically
+from patchproof.base.output import check_folder, clear_folder, make_folder, refuse_inputs_in, write_atomically
 from patchproof.base.progress import Advance, Progress, no_progress
 from patchproof.base.settings import SceneSettings
 from patchproof.base.validation import refuse_untrusted, validate_model
@@ -45,7 +45,7 @@ from patchproof.optimizer.promise import PROMISE_VIEWS, VIEWS_PER_SESSION, Promi
 from patchproof.optimizer.subject import DESIGN_FILE, MASK_FILE, OBJECT_FILE, TEXTURE_FILES, read_design, write_png
 from patchproof.scene.interface import Scene
 from patchproof.scene.patch_scene import PatchScene
-from patchproof.scene.scene import build_scene, load_scene
+from patchproof.scene.scene import build_scene, load_scene, named_paths
 from patchproof.sheets.manifest import Promise
 
 _LOG_FILE, RUN_FILE, _VIEWS_FILE = ("steps.jsonl", "run.json", "views.png")
@@ -127,6 +127,7 @@ def optimize(
         problem = set_problem(scene, compute.device, models, loss, compute.jobs)
         refuse_other_inputs(searched, problem.inputs, out, scene.settings.model_dump())
         if not resume:
+            refuse_inputs_in(out, named_paths(scene).values())
             clear_folder(out)  # everything that the new run needs has been read
         make_folder(out)
         if save_place is not None:

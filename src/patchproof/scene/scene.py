@@ -127,14 +127,24 @@ def build_scene(
 
 def _fingerprints(scene: Scene) -> dict[str, str]:
     """Return the fingerprints of the files that scenes of several kinds name, by settings key; `build` adds others."""
-    settings, thing, patch = scene.settings, scene.settings.object, scene.settings.patch
-    found = {"printer.profile": load_printer(settings.printer.profile, scene.base).sha256}
+    found = {"printer.profile": load_printer(scene.settings.printer.profile, scene.base).sha256}
     if scene.camera is not None:
         found["camera.file"] = value_sha256(scene.camera.model_dump(mode="json"))
-    named = {"object.sheet": thing.sheet, "object.labels": thing.labels, "patch.mask": patch.mask}
-    named |= {"patch.faces": patch.faces, "patch.search.keep_off_faces": patch.search.keep_off_faces}
-    paths = {key: Path(expand_path(text, scene.base)) for key, text in named.items() if text is not None}
+    paths = {key: path for key, path in named_paths(scene).items() if key not in scene.inputs}
     return found | {key: files_sha256([path]) for key, path in paths.items() if is_file(path)}
+
+
+def named_paths(scene: Scene) -> dict[str, Path]:
+    """Return the files and folders that a scene's settings name, by key."""
+    thing, patch = scene.settings.object, scene.settings.patch
+    names = {f"object.{name}": getattr(thing, name) for name in ("mesh", "photos", "sheet", "images", "labels")}
+    names |= {
+        "patch.mask": patch.mask,
+        "patch.faces": patch.faces,
+        "background.images": scene.settings.background.images,
+    }
+    names |= {"patch.search.keep_off_faces": patch.search.keep_off_faces}
+    return {key: Path(expand_path(name, scene.base)) for key, name in names.items() if name is not None}
 
 
 def module_of(settings: SceneSettings) -> str:

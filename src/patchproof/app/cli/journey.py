@@ -143,7 +143,7 @@ def sheet(
         raise BadParameter("copies are of one run's sheet", param_hint="--copies")
     paths = manifest_paths(out, len(runs))
     for path in (out, *paths):
-        check_file(path, overwrite)
+        check_file(path, overwrite, [folder / "run.json" for folder in runs])
     if not runs:
         manifests = [blank_page(out, template=template, control=control)]
     else:
