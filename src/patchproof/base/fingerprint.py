@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 from patchproof.base.errors import Refused
+from patchproof.base.input import hash_file, is_file
 
 _END_BYTES = 1 << 16
 
@@ -23,7 +23,7 @@ _END_BYTES = 1 << 16
 def files_sha256(paths: Sequence[Path], whole: bool = True) -> str:
     """SHA-256 of one file's bytes, or of several files; unless `whole`, of their names, sizes and ends."""
     digest = hashlib.sha256()
-    for path in paths:
+    for path in filter(is_file, paths):  # readers refuse what is none
         status = path.stat()
         if whole:
             content = _file_sha256(path, status.st_size, status.st_mtime_ns)
@@ -33,15 +33,14 @@ def files_sha256(paths: Sequence[Path], whole: bool = True) -> str:
             continue
         with open(path, "rb") as file:
             digest.update(f"{path.name}\0{status.st_size}\0".encode() + file.read(_END_BYTES))
-            file.seek(max(_END_BYTES, status.st_size - _END_BYTES), os.SEEK_SET)
+            file.seek(max(_END_BYTES, status.st_size - _END_BYTES))
             digest.update(file.read(_END_BYTES))
     return digest.hexdigest()
 
 
 @lru_cache(maxsize=1000)  # once a process: size and time of the last change tell versions apart
 def _file_sha256(path: Path, size: int, changed_ns: int) -> str:
-    with open(path, "rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    return hash_file(path, size)
 
 
 def value_sha256(value: Any) -> str:

@@ -8,7 +8,6 @@ The reader validates the results themselves.
 
 from __future__ import annotations
 
-import hashlib
 import io
 import json
 from collections.abc import Iterator
