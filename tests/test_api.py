@@ -148,7 +148,7 @@ def test_a_dictionary_may_hold_the_objects_that_a_scene_file_names(tmp_path):
     folder = tmp_path / made.settings.background.images
     assert (
         np.array_equal(np.asarray(Image.open(folder / "photo_0002.png")), pictures[1])
-        and len(list(folder.iterdir())) == 6
+        and len(list(folder.glob("*.png"))) == 6
     )
     assert pp.make_scene(SETTINGS | tables, base=tmp_path).sheet_id == made.sheet_id
     assert [judge.labels for judge in set_problem(made).classifiers] == [("box", "cup", "tin")] * 2

@@ -127,13 +127,25 @@ def test_resuming_and_originals_in_the_way(folder, tmp_path):
     harden_images(settings, out, Work(resume=True))
     assert (out / "b.png").read_bytes() == picture and (out / "harden_accuracy.csv").read_bytes() == table
     harden_images(settings, out, Work(overwrite=True))
-    with pytest.raises(Refused, match="another folder"):
+    with pytest.raises(Refused, match="inputs that lie outside of what is written"):
         harden_images(settings, folder, Work(overwrite=True))
     mine = tmp_path / "mine"
     mine.mkdir()
     (mine / "mine.png").touch()
     with pytest.raises(Refused, match=r"mine\.png"):
         harden_images(settings, mine, Work(overwrite=True))
+
+
+@pytest.mark.parametrize("name", ["../photos/b.png", "{folder}/b.png"])
+def test_names_that_lead_out_of_the_folder_are_refused(folder, tmp_path, name):
+    """Their PNGs would have been written there."""
+    table, before = tmp_path / "labels.csv", sorted(folder.iterdir())
+    table.write_text(f"{name.format(folder=folder)},red\n")
+    with pytest.raises(Refused, match="names of files within"):
+        harden_images(options(folder, labels=str(table)), tmp_path / "out")
+    with pytest.raises(Refused, match="inputs that lie outside"):  # beside which PNGs would lie
+        harden_images(options(folder), folder.parent)
+    assert sorted(folder.iterdir()) == before and not (tmp_path / "out").exists()
 
 
 def test_the_study_varies_networks_and_epsilons(folder, tmp_path):

@@ -473,11 +473,11 @@ def test_a_draft_gets_the_promise_that_it_would_have_had(tmp_path, few_views):
     optimize_scene(scene, tmp_path / "whole")
     draft = optimize_scene(scene, tmp_path / "draft", promise=PromiseOptions(views=8))
     assert draft.promise.draft and not same_files(tmp_path / "whole", tmp_path / "draft", ("run.json",))
-    promised = promise_run(tmp_path / "draft")
+    promised = promise_run(tmp_path / "draft", trust=True)
     assert same_files(tmp_path / "whole", tmp_path / "draft", ("run.json",)) and not promised.promise.draft
     assert load_run(tmp_path / "draft").promise == promised.promise
     with pytest.raises(Refused, match="a promise of 8 views"):
-        promise_run(tmp_path / "draft", views=4)
+        promise_run(tmp_path / "draft", views=4, trust=True)
     with pytest.raises(Refused, match="a finished run, got none"):
         promise_run(tmp_path / "nothing")
 

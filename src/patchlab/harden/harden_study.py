@@ -27,9 +27,9 @@ from patchlab.harden.labeled_photos import list_labeled_files, read_large_enough
 from patchlab.study.estimates import cluster_mean
 from patchlab.study.grid import Names, PositiveInt, short_name
 from patchlab.study.study import DEFAULT_WORK, Cell, FinishedStudy, Result, Study, Work, run_cells
-from patchproof.base.errors import Refused
+from patchproof.base.folder_lock import lock_folder
 from patchproof.base.intervals import estimate_difference, rate
-from patchproof.base.output import image_bytes, write_atomically
+from patchproof.base.output import image_bytes, refuse_inputs_in, write_atomically
 from patchproof.base.text import csv_lines
 from patchproof.base.validation import Positive, Share, StrictModel, expand_path
 from patchproof.classifier.labels import find_labels
@@ -66,13 +66,12 @@ class HardenSettings(StrictModel):
 def harden_images(settings: HardenSettings, out: str | Path, work: Work = DEFAULT_WORK) -> FinishedStudy:
     """Harden images into the folder `out`: PNGs and labels.csv (again a labeled folder of images), and tables."""
     out, base = Path(out), Path.cwd()
-    if out.resolve() == Path(expand_path(settings.images, base)).resolve():
-        raise Refused("another folder for hardened images than the originals'", str(out), "choose another --out")
-    # PNGs beside the tables may be replaced only where this command's JSON says that it wrote them
-    own_files = (*STUDY.own_files, "labels.csv", "*.png") if (out / "harden.json").is_file() else STUDY.own_files
-    finished = run_cells(replace(STUDY, own_files=own_files), settings, base, out, work)
+    refuse_inputs_in(out, (expand_path(settings.images, base), expand_path(settings.labels, base)))
+    # PNGs have the names of the images, and lie beside the tables
+    finished = run_cells(replace(STUDY, own_files=("*",)), settings, base, out, work)
     rows = [(photo["png"], photo["label"]) for photo in _photos_of(finished.results, _variants(settings)[0])]
-    write_atomically(out / "labels.csv", csv_lines([("file", "label"), *rows]))
+    with lock_folder(out):
+        write_atomically(out / "labels.csv", csv_lines([("file", "label"), *rows]))
     return finished
 
 

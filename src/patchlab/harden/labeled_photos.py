@@ -7,7 +7,7 @@ skipped; missing files and files named twice are refused.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from pathlib import Path
+from pathlib import Path, PurePath
 
 import numpy as np
 
@@ -28,6 +28,9 @@ def list_labeled_files(folder: Path, table: Path) -> list[tuple[str, str, str]]:
     rows = read_labels(table)
     if rows and rows[0][0].casefold() in _HEADING_NAMES and not is_file(folder / rows[0][0]):
         rows = rows[1:]
+    outside = next((file for file, _ in rows if PurePath(file).is_absolute() or ".." in PurePath(file).parts), None)
+    if outside is not None:  # results are written under these names
+        raise Refused(f"names of files within {folder} in {table}", f'"{outside}"', "copy it there, and name it so")
     missing = [file for file, _ in rows if not is_file(folder / file)]
     if missing or not rows:
         got = f"{len(missing)} missing ({missing[0]})" if missing else "a table without rows"

@@ -14,7 +14,6 @@ from __future__ import annotations
 import ast
 import json
 import re
-import shutil
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass
@@ -27,7 +26,7 @@ from typing import Any
 from patchproof.base.errors import Refused
 from patchproof.base.folder_lock import lock_folder
 from patchproof.base.input import read_json
-from patchproof.base.output import check_folder, make_folder, write_atomically
+from patchproof.base.output import check_folder, clear_folder, make_folder, refuse_other_files, write_atomically
 from patchproof.base.validation import StrictModel, read_toml, spelling_hint, validate_model
 from patchproof.base.workers import open_workers, result_of, use_threads
 from patchproof.report.tables import Drawing, Results, Table, write_json, write_results
@@ -160,7 +159,9 @@ def run_cells(
 
 
 def _run_locked(study: Study, settings: StrictModel, base: Path, out: Path, work: Work) -> FinishedStudy:
-    if not work.resume:
+    if work.resume:
+        refuse_other_files(out, ("*",))
+    else:
         unfinished = (out / f"{study.name}.json").is_file() and not (out / f"{study.name}.html").is_file()
         check_folder(out, _owned_patterns(study), work.overwrite, unfinished)
     cells = tuple(study.cells(settings, base))
@@ -210,7 +211,7 @@ def _check_cells(study: Study, cells: Sequence[Cell]) -> None:
 
 
 def _owned_patterns(study: Study) -> tuple[str, ...]:
-    return (f"{study.name}.json", f"{study.name}.html", f"{study.name}_*", "cells", ".*.part", *study.own_files)
+    return (f"{study.name}.json", f"{study.name}.html", f"{study.name}_*", "cells", *study.own_files)
 
 
 def _prepare_folder(study: Study, settings: StrictModel, out: Path, resume: bool) -> None:
@@ -224,9 +225,7 @@ def _prepare_folder(study: Study, settings: StrictModel, out: Path, resume: bool
     else:
         if resume:  # there is nothing to resume: other files must not be mistaken for the study's
             check_folder(out, ())
-        for pattern in _owned_patterns(study):
-            for old in out.glob(pattern):
-                shutil.rmtree(old) if old.is_dir() else old.unlink()
+        clear_folder(out)
         make_folder(out)
         write_json(path, {"study": study.name, "settings": dumped})  # first: this file marks the folder as the study's
     make_folder(out / "cells")

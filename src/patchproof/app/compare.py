@@ -46,6 +46,7 @@ def compare(
     models: Sequence[str | Classifier] | None = None,
     n: int = PROMISE_VIEWS,
     seed: int | None = None,
+    trust: bool = False,
     compute: Compute = Compute(),
     overwrite: bool = False,
     progress: Progress = no_progress,
@@ -55,20 +56,21 @@ def compare(
     Args:
         runs: folders of finished runs of one scene, two or more.
         out: folder for designs.html, designs.json and the tables.
-        models, compute, overwrite, progress: as in `evaluate`.
+        models, trust, compute, overwrite, progress: as in `evaluate`.
         n: conditions for each comparison.
         seed: of the conditions, in place of the first run's.
 
     Raises:
         Refused: for runs of different scenes.
     """
-    networks, loaded = None if models is None else tuple(models), _load_runs(runs, models is None)
+    networks, loaded = None if models is None else tuple(models), _load_runs(runs, models is None, trust)
     refuse_networks_in_memory(networks, compute)
     scene, total, views_done = next(iter(loaded.values())).scene, n * (len(loaded) + 2), 0
     judges = networks or scene.settings.target.models
     names = tuple(each.name if isinstance(each, Classifier) else each for each in judges)
     seed = scene.seed if seed is None else seed
-    with new_folder(out, COMPARISON_FILES, overwrite) as folder, open_workers(compute.jobs, compute.cluster) as workers:
+    opening = open_workers(compute.jobs, compute.cluster)
+    with new_folder(out, COMPARISON_FILES, overwrite, runs) as folder, opening as workers:
 
         def ask(name: str, start: int) -> AnswersByKind:
             nonlocal views_done
@@ -78,7 +80,8 @@ def compare(
             def advance(count: int, _: int) -> None:
                 progress("evaluate", start_count + count, total)
 
-            answers, _ = run_responses(run.folder.resolve(), conditions, workers, networks, compute.device, advance)
+            options = networks, compute.device, trust, advance
+            answers, _ = run_responses(run.folder.resolve(), conditions, workers, *options)
             views_done += n
             return answers
 
@@ -104,14 +107,14 @@ def compare(
     return results
 
 
-def _load_runs(runs: Sequence[str | Path], with_networks: bool) -> dict[str, Run]:
+def _load_runs(runs: Sequence[str | Path], with_networks: bool, trust: bool) -> dict[str, Run]:
     """Load runs by their folders' names, or by full paths if two names are equal; refused if their views differ."""
     paths = [Path(run).resolve() for run in runs]
     if len(set(paths)) < max(len(paths), 2):
         got = summarize_names([str(run) for run in runs]) or "none"
         raise Refused("two runs or more to compare, each once", got, "name them")
     ambiguous = len({path.name for path in paths}) < len(paths)
-    loaded = {str(path) if ambiguous else path.name: load_run(path) for path in paths}
+    loaded = {str(path) if ambiguous else path.name: load_run(path, trust) for path in paths}
     first, *others = loaded
     for name in others:
         if _views_of(loaded[name].scene, with_networks) != _views_of(loaded[first].scene, with_networks):

@@ -23,8 +23,9 @@ from patchproof.base.errors import Refused
 from patchproof.base.folder_lock import lock_folder
 from patchproof.base.geometry import apply_homography, rect_corners
 from patchproof.base.input import is_file, read_json
-from patchproof.base.output import check_folder, write_atomically, write_pictures
+from patchproof.base.output import check_folder, clear_folder, refuse_other_files, write_atomically, write_pictures
 from patchproof.base.progress import Progress, no_progress
+from patchproof.base.validation import refuse_untrusted
 from patchproof.channel.cameras import load_optional_camera
 from patchproof.channel.printer import load_printer
 from patchproof.classifier.load import load_classifier
@@ -77,6 +78,7 @@ def verify(
     controls: str | Path | None = None,
     capture: CaptureInfo = CaptureInfo(),
     run: str | Path | Run | None = None,
+    trust: bool = False,
     ledger_photos: int = LEDGER_PHOTOS,
     compute: Compute = Compute(),
     resume: bool = False,
@@ -90,11 +92,12 @@ def verify(
             session, which are kept as PNG files in `out`.
         sheet: the manifest, SHEET.json; its folder is where its models and printers are looked up.
         out: folder for the report, new or empty.
-        models: networks besides the sheet's first: names, or classifiers in memory. Code (`module:`) that the sheet
-            names runs only where it is one of them.
+        models: networks besides the sheet's first: names, or classifiers in memory. Code (`module:`) and downloads that
+            the sheet or the run names are used only where they are among them.
         controls: folder with a folder of photographs for each control ("bare", "mean", ...).
         capture: camera, scan resolution, measured rulers, the object's boxes.
         run: the run that the sheet was made from; each photograph then gets a forecast at its measured view.
+        trust: use what sheet and run name without naming it in `models`, also variables of the environment.
         ledger_photos: photographs at most in the gap ledger and the estimated effect, 0 for neither; each costs 16
             classifications.
         compute: processes or cluster; photographs are judged on the CPU, and another device is refused.
@@ -117,11 +120,9 @@ def verify(
         look_at = _look_at(out, manifest)
         if isinstance(photos, str | Path) and is_file(Path(photos) / JOURNAL_FILE):
             look_at = lambda entries: None  # noqa: E731  # `capture` showed the answers while they were taken
-        _check_out(out, resume, overwrite)
-        if not isinstance(photos, str | Path):
-            photos = write_pictures(photos, out / _PHOTOS)
+        _check_out(out, resume, overwrite, (photos, sheet, controls, run, capture.camera, capture.boxes))
         boxes = capture.boxes
-        options = options_of(sheet, manifest, models, capture.camera)
+        options = options_of(sheet, manifest, models, capture.camera, trust)
         parameters: dict[str, Any] = {"scan_dpi": capture.scan_dpi, "ruler_mm": capture.ruler_mm}
         options = replace(options, **parameters, controls=controls, ledger_photos=ledger_photos)
         if boxes is not None:
@@ -135,22 +136,23 @@ def verify(
         if run is not None:
             from patchproof.reprints.photo_forecast import photo_forecaster  # imports scene, renderer and optimizer
 
-            forecast = photo_forecaster(run, manifest)
+            forecast = photo_forecaster(run, manifest, trust, _by_name(models))
+        if not resume:
+            clear_folder(out)
+        if not isinstance(photos, str | Path):
+            photos = write_pictures(photos, out / _PHOTOS)
         journal, look = out / _JOURNAL, {"look_at": look_at}
         gather = partial(gather_evidence, compute=compute, journal=journal, resume=resume, forecast=forecast, **look)
         on_pictures = partial(save_pictures, out / "pictures")
         report = gather(photos, manifest, options, on_pictures=on_pictures, advance=partial(progress, "verify"))
         parameters |= {"camera": capture.camera and Path(capture.camera).name}
         parameters |= {"boxes": boxes and Path(boxes).name, "ledger_photos": ledger_photos}
-        hashes = {
-            "manifest": file_sha256(Path(sheet)),
-            **{f"network {each.name}": each.sha256 for each in options.models},
-        }
+        hashes = {f"network {each.name}": each.sha256 for each in options.models}
+        hashes = {"manifest": file_sha256(Path(sheet)), **hashes}
         report = report.changed(origin=Origin(options=parameters, sha256=hashes, versions=versions_of(_LIBRARIES)))
         stems = {stem_of(photo.file) for photo in report.photos[:MAX_PICTURED_PHOTOS]}
-        for path in list((out / "pictures").glob("*")):  # those of photographs that this report does not show
-            if path.name.rsplit(".", 2)[0] not in stems:
-                path.unlink()
+        # but for pictures of photographs that this report does not show
+        clear_folder(out, lambda name: not name.startswith("pictures/") or name[9:].rsplit(".", 2)[0] in stems)
         ledger = report.ledger and report.ledger.model_dump()
         write_report(report.model_dump(mode="json"), manifest.model_dump(mode="json"), out, ledger)
         write_atomically(out / "coco.json", _boxes(report, manifest, options.camera))
@@ -181,12 +183,15 @@ def options_of(
     manifest: Manifest,
     models: Sequence[str | Classifier] | None = None,
     camera: str | Path | None = None,
+    trust: bool = False,
 ) -> Options:
     """Load the networks, the printer and the camera for photographs of the sheet; see `verify`."""
     base, promise = Path(sheet).resolve().parent, manifest.promise
-    least_score = None if promise is None else promise.models[0].least_score
+    least_score, networks = None if promise is None else promise.models[0].least_score, _networks(manifest, models)
+    if not trust:
+        refuse_untrusted(sheet, [name for name in networks if isinstance(name, str) and name not in _by_name(models)])
     return Options(
-        models=[load_classifier(each, base).with_least_score(least_score) for each in _networks(manifest, models)],
+        models=[load_classifier(each, base).with_least_score(least_score) for each in networks],
         printer=load_printer((manifest.settings.get("printer") or {}).get("profile", "coated"), base),
         camera=load_optional_camera(camera),
     )
@@ -205,23 +210,20 @@ def _look_at(out: Path, manifest: Manifest) -> Callable[[Sequence[PhotoEntry]], 
     return lambda entries: Look(earlier + (earlier == 0 or {entry.sha256 for entry in entries} != hashes))
 
 
-def _check_out(out: Path, resume: bool, overwrite: bool) -> None:
+def _check_out(out: Path, resume: bool, overwrite: bool, inputs: Sequence[object]) -> None:
     """Refuse a folder with files, unless they are of a verification that is resumed or overwritten."""
     has_journal = is_file(out / _JOURNAL)
     if resume:
-        check_folder(out, REPORT_FILES if has_journal else (), overwrite=has_journal)
+        refuse_other_files(out, REPORT_FILES if has_journal else ())
         return
     if has_journal and not overwrite and not is_file(out / "report.json"):
         raise Refused("an empty or new folder", f"{out} with an unfinished verification", "add --resume or --overwrite")
-    check_folder(out, REPORT_FILES, overwrite)
+    check_folder(out, REPORT_FILES, overwrite, inputs=inputs)
 
 
 def _networks(manifest: Manifest, models: Sequence[str | Classifier] | None) -> tuple[str | Classifier, ...]:
-    """List the primary network, then the named ones or else the promise's; classifiers in memory stand for themselves.
-    Refused is a sheet's network that is code, or has a variable in its name, unless the user names it: a received file
-    decides neither what runs nor what is read of the environment.
-    """
-    named = {model.name if isinstance(model, Classifier) else model: model for model in models or ()}
+    """List the primary network, then the named ones or else the promise's; classifiers in memory stay as they are."""
+    named = _by_name(models)
     if manifest.promise is None and not named:
         got = f"the {manifest.kind} sheet {manifest.sheet_id}"
         raise Refused("a sheet that promises something", got, "name --models")
@@ -229,11 +231,8 @@ def _networks(manifest: Manifest, models: Sequence[str | Classifier] | None) -> 
         return tuple(named.values())
     promised = tuple(model.name for model in manifest.promise.models)
     names = dict.fromkeys((promised[0], *(named or promised)))
-    for name in names:
-        if name not in named and name.startswith("module:"):
-            do = f"name it yourself if that code is yours (--models {name})"
-            raise Refused("a sheet whose networks are files, not code that would be run", name, do)
-        if name not in named and "${" in name:
-            do = f"name it yourself if you trust the sheet (--models '{name}')"
-            raise Refused("a sheet whose networks are named without variables of your environment", name, do)
     return tuple(named.get(name, name) for name in names)
+
+
+def _by_name(models: Sequence[str | Classifier] | None) -> dict[str, str | Classifier]:
+    return {model.name if isinstance(model, Classifier) else model: model for model in models or ()}

@@ -1,30 +1,33 @@
-"""One command at a time writes into an output folder.
+"""One command at a time writes into an output folder, and the folder lists what was written.
 
-In: the folder, which need not exist. Out: a lock that the system releases when the process ends, however it ends. Left
-out on purpose: locks on single files, which appear whole (`base.output`); and file systems without locks, where
-commands in one folder are not kept apart.
+In: the folder, which need not exist. Out: a lock that the system releases when the process ends, however it ends, and
+`.patchproof.jsonl` in the folder, by which `--overwrite` knows what it may delete (`base.output`). Left out on purpose:
+locks on single files, which appear whole; and file systems without locks, where commands are not kept apart.
 """
 
 from __future__ import annotations
 
+import json
 import os
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from errno import EACCES, EAGAIN, EDEADLK
 from pathlib import Path
 
 from patchproof.base.errors import Refused
 
-_HELD: set[Path] = set()  # by this process, to which the system would give its own lock once more
-_HELD_GUARD = threading.Lock()
-_BUSY = (EACCES, EAGAIN, EDEADLK)  # what systems answer if another process has the lock
+LISTING_FILE = ".patchproof.jsonl"  # lines of lists of names, relative to the folder
+_OPEN: dict[Path, set[str]] = {}  # folders that this process has locked, with what it listed in each
+_GUARD = threading.Lock()  # systems give a process its own lock once more
+_BUSY = (EACCES, EAGAIN, EDEADLK)  # what they answer if another process has the lock
 
 
 @contextmanager
 def lock_folder(folder: str | Path) -> Iterator[None]:
-    """Keep other commands out of an output folder while the block runs; refused if one of them is in it.
+    """Keep other commands out of an output folder while the block runs, and list in it what `write_atomically` writes
+    there; refused if another command is in it.
 
     Put it around all from the first look at the folder to the last file: `with lock_folder(out): check_folder(out,
     ...); ...`. `new_folder` does so itself. Different folders may be locked within each other. The lock is a hidden
@@ -34,23 +37,24 @@ def lock_folder(folder: str | Path) -> Iterator[None]:
     try:
         real = Path(folder).resolve()
         real.parent.mkdir(parents=True, exist_ok=True)
-        beside = not real.is_dir() or os.access(real.parent, os.W_OK)
+        inside = real.is_dir() and not os.access(real.parent, os.W_OK)
     except (OSError, ValueError) as error:  # ValueError: a name with a NUL
         raise Refused("a folder that can be made", f"{folder} ({error})", "choose another --out") from error
-    path = real.with_name(f".{real.name}.lock.part") if beside else real / ".lock.part"
-    with _HELD_GUARD:
-        if path in _HELD:
+    path, handle = real / ".lock.part" if inside else real.with_name(f".{real.name}.lock.part"), None
+    with _GUARD:
+        if real in _OPEN:
             raise _busy(folder, str(os.getpid()))
-        _HELD.add(path)
-    handle = None
+        _OPEN[real] = set()
     try:
         handle = _open_locked(path, folder)
         yield
     finally:
         if handle is not None:
-            _release(path, handle)
-        with _HELD_GUARD:
-            _HELD.discard(path)
+            with suppress(OSError):  # while it is still ours; Windows keeps files that are open
+                path.unlink()
+            os.close(handle)
+        with _GUARD:
+            del _OPEN[real]
 
 
 def _open_locked(path: Path, folder: str | Path) -> int:
@@ -62,7 +66,14 @@ def _open_locked(path: Path, folder: str | Path) -> int:
             got = f"{folder} ({error.strerror})"
             raise Refused("a folder that can be written to", got, "choose another --out") from error
         try:
-            _lock(handle)
+            if sys.platform == "win32":
+                import msvcrt
+
+                msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)
+            else:
+                import fcntl
+
+                fcntl.lockf(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
             if error.errno in _BUSY:
                 owner = os.read(handle, 20).decode(errors="replace") if os.name != "nt" else ""
@@ -76,27 +87,24 @@ def _open_locked(path: Path, folder: str | Path) -> int:
         os.close(handle)
 
 
-def _lock(handle: int) -> None:
-    if sys.platform == "win32":
-        import msvcrt
-
-        msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)
-    else:
-        import fcntl
-
-        fcntl.lockf(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-
-
-def _release(path: Path, handle: int) -> None:
-    """Remove the file while it is still ours; Windows removes none that is open, and so none of another process."""
-    if os.name != "nt":
-        path.unlink(missing_ok=True)
-    os.close(handle)
-    if os.name == "nt":
-        with suppress(OSError):
-            path.unlink()
-
-
 def _busy(folder: str | Path, owner: str) -> Refused:
     got = f"{folder}, into which process {owner or 'unknown'} writes"
     return Refused("a folder that no other command writes into", got, "wait until it ends, or choose another --out")
+
+
+def list_file(path: Path) -> None:
+    """List a file that is about to be written in each locked folder that it lies in."""
+    real = path.parent.resolve() / path.name
+    for folder, listed in [*_OPEN.items()]:
+        if real.is_relative_to(folder) and (name := real.relative_to(folder).as_posix()) not in {LISTING_FILE, *listed}:
+            listed.add(name)
+            append_listing(folder, [name])
+
+
+def append_listing(folder: Path, names: Iterable[str]) -> None:
+    """Append names to a folder's listing; refused where something else lies in its place."""
+    path = folder / LISTING_FILE
+    if os.path.lexists(path) and (path.is_symlink() or not path.is_file()):
+        raise Refused(f"a file {LISTING_FILE} of this program", f"{path}, which is none", "remove it")
+    with open(path, "a", encoding="utf-8") as file:
+        file.write(f"\n{json.dumps(list(names))}\n")  # begins a line of its own after one that a kill cut short

@@ -1,8 +1,8 @@
 """Write files and folders atomically, and encode pictures.
 
 In: where a command should write. Out: a temporary place to write to that becomes the real one at the end. An existing
-file or folder is refused unless the user asked to overwrite it, and only a folder of the command's own files can be
-overwritten, so that a mistyped path loses nothing.
+file or folder is refused unless the user asked to overwrite it, and only a folder whose listing (`base.folder_lock`)
+names all of its files can be overwritten: neither a mistyped path nor a received folder deletes anything else.
 """
 
 from __future__ import annotations
@@ -10,9 +10,10 @@ from __future__ import annotations
 import base64
 import errno
 import io
+import json
 import os
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from fnmatch import fnmatch
 from pathlib import Path
@@ -21,51 +22,142 @@ from typing import Any
 import numpy as np
 
 from patchproof.base.errors import Refused
-from patchproof.base.folder_lock import lock_folder
+from patchproof.base.folder_lock import LISTING_FILE, append_listing, list_file, lock_folder
+from patchproof.base.input import MAX_JSON_BYTES, is_file, is_folder
+
+_ANOTHER = "choose another --out"
 
 
 @contextmanager
-def new_folder(out: str | Path, file_names: tuple[str, ...], overwrite: bool = False) -> Iterator[Path]:
+def new_folder(
+    out: str | Path, file_names: tuple[str, ...], overwrite: bool = False, inputs: Iterable[object] = ()
+) -> Iterator[Path]:
     """A folder to write into that becomes `out` when the block ends without an error; see `check_folder`."""
     out = Path(out)
     with lock_folder(out):
-        check_folder(out, file_names, overwrite)
-        part = out.with_name(f".{out.name}.part")
-        shutil.rmtree(part, ignore_errors=True)
+        check_folder(out, file_names, overwrite, inputs=inputs)
+        part, old = (out.with_name(f".{out.name}.{kind}") for kind in ("part", "old"))
+        _remove(part)
         make_folder(part)
         try:
             yield part
-            old = out.with_name(f".{out.name}.old")
-            shutil.rmtree(old, ignore_errors=True)
+            append_listing(part, _files_in(part))
+            check_folder(out, file_names, overwrite)  # once more: what came in between is not deleted
+            _remove_listed(old)  # of a process that was killed in the next lines
             if out.is_dir():
                 out.rename(old)
             part.rename(out)
-            shutil.rmtree(old, ignore_errors=True)
+            _remove_listed(old)
+            list_file(out / LISTING_FILE)
         finally:
-            shutil.rmtree(part, ignore_errors=True)
+            _remove(part)
 
 
-def check_folder(out: Path, file_names: tuple[str, ...], overwrite: bool = False, unfinished: bool = False) -> None:
-    """Refuse a folder with files in it, unless they may be overwritten and match `file_names`, the patterns that this
-    command writes. For an `unfinished` folder the refusal says how to continue.
+def check_folder(
+    out: Path,
+    file_names: tuple[str, ...],
+    overwrite: bool = False,
+    unfinished: bool = False,
+    inputs: Iterable[object] = (),
+) -> None:
+    """Refuse a folder with files in it, unless they may be overwritten: such commands wrote them all, by the folder's
+    listing and by `file_names`, the patterns of names that this command writes, and none of its `inputs` is among them.
+    For an `unfinished` folder the refusal says how to continue.
     """
     if os.path.isfile(out):
         raise Refused("a folder to write to", f"the file {out}", "choose another --out")
-    names = sorted(path.name for path in out.iterdir()) if os.path.isdir(out) else []
-    names = [name for name in names if not fnmatch(name, ".*.part")]  # temporary files of a killed command
+    names = _files_in(out)
     if names and not overwrite:
         got, do = f"{out} with {len(names)} files", "choose another --out or add --overwrite"
         if unfinished:
             got, do = f"{out}, which is unfinished", "continue with --resume, or start again with --overwrite"
         raise Refused("an empty or new folder", got, do)
-    foreign = [name for name in names if not any(fnmatch(name, pattern) for pattern in file_names)]
+    refuse_inputs_in(out, inputs)
+    own = _listed(out, names)
+    foreign = [n for n in names if n not in own or not _matches(n, file_names) or (out / n).is_symlink()]
+    if foreign or (names and out.is_symlink()):
+        got = f"{out} with {foreign[0]}" if foreign else f"{out}, a link to another folder"
+        raise Refused(f"a folder that holds nothing but what this command wrote ({LISTING_FILE})", got, _ANOTHER)
+
+
+def refuse_inputs_in(out: Path, inputs: Iterable[object]) -> None:
+    """Refuse a file or folder that a command reads, if it is or lies in what the command writes."""
+    for path in inputs:  # objects in memory are none
+        if not isinstance(path, str | Path) or not os.path.exists(path):
+            continue
+        if Path(path).resolve().is_relative_to(out.resolve()):
+            raise Refused("inputs that lie outside of what is written", f"{path} in {out}", _ANOTHER)
+
+
+def refuse_other_files(out: Path, file_names: tuple[str, ...]) -> None:
+    """Refuse to continue a folder that has files beside those of the patterns, or a link to a folder within it."""
+    foreign = [
+        n for n in _files_in(out) if not _matches(n, file_names) or ((out / n).is_symlink() and is_folder(out / n))
+    ]
     if foreign:
-        expected = f"a folder with this command's own output only ({', '.join(file_names)})"
-        raise Refused(expected, f"{out} with {foreign[0]}", "choose another --out")
+        expected = f"a folder with this command's own output only ({', '.join(file_names) or 'none'})"
+        raise Refused(expected, f"{out} with {foreign[0]}", _ANOTHER)
 
 
-def check_file(path: Path, overwrite: bool = False) -> None:
-    """Refuse a file that exists unless it may be overwritten."""
+def clear_folder(folder: Path, keep: Callable[[str], bool] = lambda name: False) -> None:
+    """Delete the files that a folder's listing names, except those to keep, and folders that this leaves empty."""
+    names = _files_in(folder)
+    for name in {*names} & _listed(folder, names):
+        if not keep(name):
+            (folder / name).unlink()
+            (folder / name).with_name(f".{name.rpartition('/')[2]}.part").unlink(missing_ok=True)
+    if not _files_in(folder):
+        (folder / LISTING_FILE).unlink(missing_ok=True)
+    for path, _, _ in os.walk(folder, topdown=False):
+        with suppress(OSError):  # it has files
+            os.rmdir(path)
+
+
+def _remove_listed(folder: Path) -> None:
+    """Remove the listed files of a folder that was replaced; a link alone, not what it leads to."""
+    if folder.is_symlink():
+        folder.unlink()
+    clear_folder(folder)
+
+
+def _files_in(folder: Path) -> list[str]:
+    """Names of all files in a folder and its subfolders; links count as files, temporary and hidden lists do not."""
+    found = []
+    for root, folders, files in os.walk(folder):
+        links = [name for name in folders if os.path.islink(os.path.join(root, name))]
+        found += [Path(root, name).relative_to(folder).as_posix() for name in (*files, *links)]
+    return sorted(n for n in found if n != LISTING_FILE and not fnmatch(n.rpartition("/")[2], ".*.part"))
+
+
+def _listed(folder: Path, names: Iterable[str]) -> set[str]:
+    """Names in a folder's listing, and in those of its subfolders among `names` that it lists itself."""
+    path, listed = folder / LISTING_FILE, set()
+    if is_file(path) and not path.is_symlink() and path.stat().st_size <= MAX_JSON_BYTES:
+        for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+            with suppress(ValueError, TypeError, RecursionError):  # a line that a kill cut short, or somebody made up
+                listed |= set(json.loads(line))
+    for name in names:
+        inner, slash, last = name.rpartition("/")
+        if slash and last == LISTING_FILE and name in listed:
+            below = [each.removeprefix(f"{inner}/") for each in names if each.startswith(f"{inner}/")]
+            listed |= {f"{inner}/{each}" for each in _listed(folder / inner, set(below) - {LISTING_FILE})}
+    return listed
+
+
+def _matches(name: str, patterns: Iterable[str]) -> bool:
+    return any(fnmatch(name.partition("/")[0], pattern) for pattern in patterns)
+
+
+def _remove(part: Path) -> None:
+    """Remove a temporary folder, or a link in its place."""
+    if part.is_symlink() or is_file(part):
+        part.unlink()
+    shutil.rmtree(part, ignore_errors=True)
+
+
+def check_file(path: Path, overwrite: bool = False, inputs: Iterable[object] = ()) -> None:
+    """Refuse a file that exists unless it may be overwritten and is none of the command's inputs."""
+    refuse_inputs_in(path, inputs)
     if os.path.exists(path) and not overwrite:
         raise Refused("a new file", f"{path}, which exists", "choose another --out or add --overwrite")
 
@@ -92,6 +184,8 @@ def write_atomically(path: Path, content: str | bytes | Callable[[Path], Any]) -
     """Write `content`, or let it write, beside `path`, and move it there: readers see the complete old or new file."""
     part = path.with_name(f".{path.name}.part")
     try:
+        part.unlink(missing_ok=True)  # a link there would lead the content elsewhere
+        list_file(path)
         if callable(content):
             content(part)
         else:
@@ -113,6 +207,7 @@ def write_files_atomically(contents: dict[Path, bytes]) -> None:
             path.parent.mkdir(parents=True, exist_ok=True)
             if path.is_dir():
                 raise IsADirectoryError(f"{path} is a folder")
+            parts[path].unlink(missing_ok=True)
             parts[path].write_bytes(data)
         for path, part in parts.items():
             os.replace(part, path)

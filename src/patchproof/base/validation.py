@@ -106,6 +106,28 @@ def expand_path(text: str, base: Path) -> str:
     return text if by_prefix or text in ("builtin", "builtin-detector") else str(base / text)
 
 
+def refuse_untrusted(source: str | Path, networks: Iterable[str] = (), settings: Any = ()) -> None:
+    """Refuse what a file that others may have made would have run, downloaded or read of the environment: networks but
+    for files and built-in ones, and `${VAR}` in them or in any text of its `settings` (tables, lists, text).
+    """
+    do = "add --trust if you trust where it is from, or name networks yourself with --models"
+    for name in networks:
+        is_local = ":" not in name or name.startswith(("file:", "python:"))
+        if not is_local and (name.startswith("clip:") or not NETWORK_FILE.fullmatch(name)):
+            raise Refused(f"networks in {source} that are files, not code or downloads", name, do)
+    for text in (*networks, *_texts(settings)):
+        if "${" in text:
+            raise Refused(f"names in {source} without variables of your environment", text, do)
+
+
+def _texts(value: Any) -> Iterator[str]:
+    """All text in nested tables and lists."""
+    if isinstance(value, str):
+        yield value
+    for each in value.values() if isinstance(value, Mapping) else value if isinstance(value, list | tuple) else ():
+        yield from _texts(each)
+
+
 def spelling_hint(word: str, known_words: Iterable[str]) -> str:
     """'did you mean "x"' for the most similar known word, else 'use one of: ...'."""
     known_words = list(known_words)

@@ -10,6 +10,7 @@ what a camera resolves beyond 0.2 mm per pixel) and ink spread.
 
 from __future__ import annotations
 
+import hashlib
 import io
 import math
 import zipfile
@@ -70,6 +71,14 @@ class Printer:
     def gamut_distance(self, srgb: Tensor) -> Tensor:
         """Return N×1×H×W: the ΔE00 by which the printer misses each color; differentiable, for use as a penalty."""
         return _look_up(self._distances, srgb)
+
+    @cached_property
+    def sha256(self) -> str:
+        """Return the SHA-256 of everything that the printer's appearance depends on."""
+        digest = hashlib.sha256(repr(self.paper).encode())
+        for table in (self.lut, self.gamut):
+            digest.update(table.detach().cpu().contiguous().numpy().tobytes())
+        return digest.hexdigest()
 
     @cached_property
     def _colors(self) -> Tensor:

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from patchproof.base.errors import Refused
+from patchproof.base.fingerprint import value_sha256
 from patchproof.networks.batches import BatchedNetwork
 from patchproof.networks.windows import Windows
 
@@ -44,6 +45,11 @@ class Classifier:
 
     KIND: ClassVar[str] = "classifier"
     LOOKS_AT_BOXES: ClassVar[bool] = False  # whether the object's box matters
+
+    @property
+    def fingerprint(self) -> str:
+        """SHA-256 of what its answers depend on: weights, input size, labels; code is not among it."""
+        return value_sha256([self.KIND, self.sha256, self.input_px, self.labels])
 
     def with_least_score(self, least_score: float | None) -> Classifier:
         """A copy with that `least_score`; the classifier itself if the score is None or it needs none."""

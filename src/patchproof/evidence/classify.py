@@ -47,15 +47,17 @@ def judges_of(models: Sequence[Classifier], manifest: Manifest) -> Judges | None
     """
     if manifest.promise is None:
         return None
-    promised, by_name = manifest.promise.models[0], {model.name: model for model in models}
-    if promised.name not in by_name:
+    (first, *_), by_name = manifest.promise.models, {model.name: model for model in models}
+    if first.name not in by_name:
         got = ", ".join(by_name) or "none"
-        raise Refused(f"the promise's own network {promised.name}", got, f"add {promised.name}")
-    primary = by_name[promised.name]
-    if promised.sha256 not in (None, primary.sha256):
-        expected = f"the network {promised.name} that the promise was made for (SHA-256 {promised.sha256[:12]}...)"
-        got = "a network without a file" if primary.sha256 is None else f"SHA-256 {primary.sha256[:12]}..."
-        raise Refused(expected, got, "use the same weights, or make the sheet again")
+        raise Refused(f"the promise's own network {first.name}", got, f"add {first.name}")
+    primary = by_name[first.name]
+    for promised in manifest.promise.models:
+        sha256 = by_name[promised.name].sha256 if promised.name in by_name else promised.sha256
+        if promised.sha256 not in (None, sha256):
+            expected = f"the network {promised.name} that the promise was made for (SHA-256 {promised.sha256[:12]}...)"
+            got = "a network without a file" if sha256 is None else f"SHA-256 {sha256[:12]}..."
+            raise Refused(expected, got, "use the same weights, or make the sheet again")
     indices = {model.name: target_indices(model, manifest.promise, manifest.settings) for model in models}
     return Judges(models, indices, primary)
 

@@ -8,7 +8,6 @@ The reader validates the results themselves.
 
 from __future__ import annotations
 
-import hashlib
 import io
 import json
 from collections.abc import Iterator
@@ -20,6 +19,7 @@ import cv2
 import numpy as np
 
 from patchproof.base.errors import Refused
+from patchproof.base.fingerprint import value_sha256
 from patchproof.base.input import MAX_JSON_BYTES, hash_file, is_file, read_file
 from patchproof.base.output import make_folder, write_atomically
 from patchproof.base.validation import StrictModel, validate_model
@@ -71,19 +71,16 @@ def settings_key(manifest: Manifest, options: Options) -> str:
 
     A network without a SHA-256 (the user's code) is identified by its name alone.
     """
-    printer, digest = options.printer, hashlib.sha256(repr(options.printer.paper).encode())
-    for table in (printer.lut, printer.gamut):
-        digest.update(table.detach().cpu().contiguous().numpy().tobytes())
     settings = {
         "versions": (__version__, cv2.__version__, np.__version__),
         "manifest": manifest.model_dump(mode="json"),
-        "models": [(model.name, model.sha256, model.input_px) for model in options.models],
-        "printer": digest.hexdigest(),
+        "models": [(model.name, model.fingerprint) for model in options.models],
+        "printer": options.printer.sha256,
         "scan_dpi": options.scan_dpi,
         "camera": options.camera and options.camera.model_dump(mode="json"),
         "boxes": dict(options.boxes),
     }
-    return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()
+    return value_sha256(settings)
 
 
 def file_sha256(path: Path) -> str | None:

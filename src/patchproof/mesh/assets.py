@@ -32,6 +32,11 @@ class Assets:
         self._files: dict[str | Path, bytes] = {}
         self._textures: dict[bytes, np.ndarray] = {}
 
+    @property
+    def files(self) -> list[Path]:
+        """The mesh file and the files beside it that have been read."""
+        return [self.path, *(source for source in self._files if isinstance(source, Path))]
+
     def say(self, warning: str) -> None:
         """Add a warning, unless it is there already."""
         self.warnings[warning] = None

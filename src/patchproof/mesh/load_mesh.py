@@ -41,14 +41,15 @@ def load_mesh(path: str | Path, length_mm: float, up: Literal["y", "z"] = "z", m
     from patchproof.mesh.mesh_file import read_parts
 
     with TemporaryDirectory() as folder:
-        if str(path).startswith(PYTHON_PREFIX):
+        if is_given := str(path).startswith(PYTHON_PREFIX):
             if mesh_glb is None:
                 raise Refused("a mesh for python:", f"{path} without one", "pass it: make_scene(settings, mesh=...)")
             path = Path(folder) / "given.glb"
             path.write_bytes(mesh_glb)
-        parts, warnings = read_parts(Path(path), _Y_UP_FROM_Z_UP if up == "z" else np.eye(3))
+        parts, warnings, files = read_parts(Path(path), _Y_UP_FROM_Z_UP if up == "z" else np.eye(3))
     parts, reductions = _reduce_textures(parts)
-    return mesh_from_parts(parts, length_mm, (*warnings, *reductions))
+    mesh = mesh_from_parts(parts, length_mm, (*warnings, *reductions))
+    return replace(mesh, files=() if is_given else tuple(dict.fromkeys(files)))
 
 
 def _reduce_textures(parts: Sequence[MeshPart]) -> tuple[list[MeshPart], list[str]]:

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 
@@ -52,6 +53,7 @@ class Mesh:
     face_material: np.ndarray  # int64 F, into materials
     materials: tuple[Material, ...]
     warnings: tuple[str, ...] = ()  # of assumptions, and of faces that are left out
+    files: tuple[Path, ...] = ()  # that it was read from: the mesh, its materials, textures and buffers
 
     @cached_property
     def ends_mm(self) -> tuple[np.ndarray, np.ndarray]:

@@ -19,8 +19,10 @@ from patchproof.mesh.mesh import MeshPart, topology_warnings, transform_part
 FORMATS = {".obj": "obj", ".glb": "gltf", ".gltf": "gltf", ".ply": "ply", ".stl": "stl"}
 
 
-def read_parts(path: Path, world_from_file: np.ndarray) -> tuple[list[MeshPart], list[str]]:
-    """Read every placed geometry with faces, its vertices and normals turned by `world_from_file` 3×3; warnings."""
+def read_parts(path: Path, world_from_file: np.ndarray) -> tuple[list[MeshPart], list[str], list[Path]]:
+    """Read every placed geometry with faces, its vertices and normals turned by `world_from_file` 3×3; warnings; and
+    the files that were read.
+    """
     if not is_file(path) or not path.stat().st_size:  # some files of the system are empty, and never end
         raise Refused("a mesh file", f"no file at {path}, or an empty one", "check the path")
     kind = FORMATS.get(path.suffix.lower())
@@ -34,7 +36,7 @@ def read_parts(path: Path, world_from_file: np.ndarray) -> tuple[list[MeshPart],
         ]
         if not parts:
             raise Refused("a mesh with faces", f"no face in {path.name}", "export the object as triangles")
-        return parts, [*assets.warnings, *topology_warnings(parts)]
+        return parts, [*assets.warnings, *topology_warnings(parts)], assets.files
     except Refused:
         raise
     except Exception as error:  # broken files raise many types of error

@@ -14,6 +14,7 @@ import torch
 from pydantic import Field
 
 from patchproof.base.errors import Refused
+from patchproof.base.fingerprint import refuse_other_inputs
 from patchproof.base.input import is_file
 from patchproof.base.output import write_atomically
 from patchproof.base.validation import StrictModel
@@ -33,6 +34,7 @@ def save_checkpoint(state: State, problem: Problem, out: Path) -> None:
     tensors = {name: tensor.cpu().contiguous().clone() for name, tensor in tensors.items()}
     # text keeps every bit of the loss; the sheet id identifies scene and seed
     note = {"number": state.number, "best_loss": state.best_loss.hex(), "sheet_id": problem.scene.sheet_id}
+    note |= {"inputs": problem.inputs}
     # a single key, since safetensors writes several in undefined order
     metadata = {"state": json.dumps(note)}
     write_atomically(out / CHECKPOINT_FILE, lambda path: save_file(tensors, path, metadata=metadata))
@@ -52,6 +54,7 @@ def load_checkpoint(out: Path, problem: Problem) -> State:
                 do = "resume with the same scene file and seed, or start in another folder"
                 got = f"a checkpoint of sheet {note.sheet_id} in {out}, not {problem.scene.sheet_id}"
                 raise Refused("the checkpoint of this scene and seed", got, do)
+            refuse_other_inputs(note.inputs, problem.inputs, out, problem.scene.settings.model_dump())
             design, best = _tensor(file, "design", start_state.design), _tensor(file, "best", start_state.design)
             mean = tuple(_tensor(file, f"mean{n}", level) for n, level in enumerate(start_state.mean))
             square = tuple(_tensor(file, f"square{n}", level) for n, level in enumerate(start_state.square))
@@ -67,6 +70,7 @@ class _Note(StrictModel):
     number: Annotated[int, Field(ge=0)]
     best_loss: str
     sheet_id: str
+    inputs: dict[str, str]
 
 
 def _tensor(file: Any, name: str, start: torch.Tensor) -> torch.Tensor:

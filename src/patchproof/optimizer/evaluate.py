@@ -17,6 +17,7 @@ from pydantic import Field
 
 from patchproof.base.compute import Compute
 from patchproof.base.errors import Refused
+from patchproof.base.folder_lock import lock_folder
 from patchproof.base.input import is_file
 from patchproof.base.notebook import notebook_html, rate_text
 from patchproof.base.output import write_atomically
@@ -78,6 +79,7 @@ def evaluate(
     models: Sequence[str | Classifier] | None = None,
     n: int = PROMISE_VIEWS,
     seed: int | None = None,
+    trust: bool = False,
     compute: Compute = Compute(),
     overwrite: bool = False,
     progress: Progress = no_progress,
@@ -89,6 +91,7 @@ def evaluate(
         models: networks in place of the run's: names, or classifiers in memory, which other processes cannot load.
         n: conditions, 1 or more.
         seed: of the conditions, in place of the scene's.
+        trust: as in `load_run`.
         compute: device, and processes or cluster.
         overwrite: replace an earlier evaluate.json.
         progress: called with the stage "evaluate" (views).
@@ -102,9 +105,10 @@ def evaluate(
         do = "add --overwrite, or rename it to keep it"
         raise Refused("a run that was not evaluated yet", f"{folder / 'evaluate.json'}, which exists", do)
     with open_workers(compute.jobs, compute.cluster) as workers:
-        run, problem = _open_run(folder, networks, compute.device)
+        run, problem = _open_run(folder, networks, compute.device, trust)
         conditions, advance = run.scene.draw("evaluate", n, seed), partial(progress, "evaluate")
-        responses_by_kind, detections = run_responses(folder, conditions, workers, networks, compute.device, advance)
+        options = networks, compute.device, trust, advance
+        responses_by_kind, detections = run_responses(folder, conditions, workers, *options)
     close_run()
     evaluations = {}
     for i, claim in enumerate(model_claims(problem, responses_by_kind["design"])):
@@ -117,7 +121,8 @@ def evaluate(
     boxless = (net.name for net in problem.classifiers if net.LOOKS_AT_BOXES and evaluations[net.name].ap50 is None)
     reasons = {f"AP50 of {name}": why for name in boxless}
     result = Evaluation(n=n, seed=seed, models=evaluations, not_measured=reasons)
-    write_atomically(run.folder / "evaluate.json", result.to_json())
+    with lock_folder(run.folder):
+        write_atomically(run.folder / "evaluate.json", result.to_json())
     return result
 
 
@@ -135,12 +140,13 @@ def run_responses(
     workers: Workers,
     networks: NetworkChoice = None,
     device: str = "cpu",
+    trust: bool = False,
     advance: Advance = no_advance,
 ) -> tuple[dict[str, Responses], list[DetectionsByKind]]:
     """The networks' responses to the design of the run in an absolute folder, and to its controls, under the
     conditions; and the detections of detectors, one dictionary per chunk of conditions.
     """
-    respond, n = partial(_chunk_responses, folder, networks, device), len(conditions)
+    respond, n = partial(_chunk_responses, folder, networks, device, trust), len(conditions)
     chunks = workers.map(respond, in_chunks(conditions), lambda done, _: advance(min(done * CHUNK_VIEWS, n), n))
     return merge_responses([by_kind for by_kind, _ in chunks]), [detections for _, detections in chunks]
 
@@ -151,16 +157,16 @@ def close_run() -> None:
 
 
 @lru_cache(maxsize=1)
-def _open_run(folder: Path, models: NetworkChoice, device: str) -> tuple[Run, Problem]:
+def _open_run(folder: Path, models: NetworkChoice, device: str, trust: bool) -> tuple[Run, Problem]:
     """The run and its problem, loaded once in each process."""
-    run = load_run(folder)
+    run = load_run(folder, trust)
     return run, set_problem(run.scene, device, models)
 
 
 def _chunk_responses(
-    folder: Path, models: NetworkChoice, device: str, conditions: Conditions
+    folder: Path, models: NetworkChoice, device: str, trust: bool, conditions: Conditions
 ) -> tuple[dict[str, Responses], DetectionsByKind]:
-    run, problem = _open_run(folder, models, device)
+    run, problem = _open_run(folder, models, device, trust)
     appearances = pictures_with_controls(problem, run.design, CONTROLS)
     return responses(problem, appearances, conditions), _detections(problem, appearances, conditions)
 

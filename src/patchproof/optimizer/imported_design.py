@@ -25,7 +25,7 @@ from patchproof.base.color import LINEAR_FROM_CODE, codes_from_srgb, srgb_from_l
 from patchproof.base.compute import Compute
 from patchproof.base.errors import Refused
 from patchproof.base.geometry import MM_PER_INCH
-from patchproof.base.input import hash_file, is_file
+from patchproof.base.input import hash_file, is_file, read_json
 from patchproof.base.output import check_folder, new_folder
 from patchproof.base.progress import Progress, no_progress
 from patchproof.base.text import printable
@@ -34,11 +34,12 @@ from patchproof.classifier.network import Classifier
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.optimizer.promise import PROMISE_VIEWS, PromiseOptions
-from patchproof.optimizer.run import RUN_FILE_PATTERNS, Run, finish_run, load_run, resolve_scene
+from patchproof.optimizer.run import RUN_FILE, RUN_FILE_PATTERNS, Run, finish_run, load_run, resolve_scene
 from patchproof.photo.detect import find_markers
 from patchproof.photo.read import list_photos, read_photo
 from patchproof.photo.rejection import PhotoRejected
 from patchproof.scene.interface import PieceScene, Scene, require_piece
+from patchproof.scene.scene import named_paths
 from patchproof.sheets.manifest import design_sha256
 from patchproof.sheets.piece import Piece, marker_image
 
@@ -94,7 +95,7 @@ def import_patch(
         Refused: where the picture does not fit the piece, or where the piece's markers could not be read beside it.
     """
     out, compute = Path(out), compute.without("import_patch", cluster=True)
-    check_folder(out, RUN_FILE_PATTERNS, overwrite)
+    check_folder(out, RUN_FILE_PATTERNS, overwrite, inputs=(picture, scene))
     (file, sha256, pixels, said), scene = _read_picture(picture), _load_piece_scene(scene, seed)
     fitted, scene = fit_to_piece(pixels, scene), scene.for_design(sha256)
     problem = set_problem(scene, compute.device, models, jobs=compute.jobs)
@@ -102,7 +103,7 @@ def import_patch(
     design = problem.patch.pixels(from_pixels(fitted, problem.device))
     record = _import_record(problem, file, sha256, pixels, fitted, design)
     record = replace(record, notes=said + record.notes)
-    with new_folder(out, RUN_FILE_PATTERNS, overwrite) as folder:
+    with new_folder(out, RUN_FILE_PATTERNS, overwrite, named_paths(scene).values()) as folder:
         run = finish_run(problem, design, folder, promise, progress, asdict(record))
     return replace(run, folder=out)
 
@@ -132,12 +133,17 @@ def import_folder(
     def advance(stage: str, done: int, _: int) -> None:
         progress(stage, len(runs_by_path) * total + done, len(runs) * total)
 
+    inputs = set_problem(scene, compute.device).inputs if resume else {}
+    source = {"settings": scene.settings.model_dump(mode="json"), "inputs": inputs}
     for path, run_folder in runs.items():
         _, sha256, pixels, _ = _read_picture(path)
         fit_to_piece(pixels, scene)
-        run = load_run(run_folder) if resume and is_file(run_folder / "run.json") else None
-        if run is not None and run.details.get("imported", {}).get("sha256") == sha256:
-            runs_by_path[path] = run
+        made = (
+            read_json(run_folder / RUN_FILE, "a run", "remove it") if is_file(run_folder / RUN_FILE) and resume else {}
+        )
+        same = isinstance(made, dict) and {key: made.get(key) for key in source} == source
+        if same and (made.get("imported") or {}).get("sha256") == sha256:
+            runs_by_path[path] = load_run(run_folder, trust=True)  # its settings are those of our scene
         else:
             check_folder(run_folder, RUN_FILE_PATTERNS, overwrite)
     for path, run_folder in runs.items():

@@ -18,6 +18,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from pydantic import Field
 
 from patchproof.base.compute import Compute
 from patchproof.base.errors import Refused
@@ -83,6 +84,7 @@ class Place(StrictModel):
     """
 
     sheet_id: str  # of the scene that was searched
+    inputs: dict[str, str] = Field(default_factory=dict)  # fingerprints of its files and networks
     front: Side
     at: PiecePosition
     spin_deg: float
@@ -136,6 +138,7 @@ def choose_place(
     advance(search.passes, search.passes)  # the search may stop short of MAX_PASSES
     return Place(
         sheet_id=scene.sheet_id,
+        inputs=finalists[0].problem.inputs,
         front=scene.settings.patch.side,
         at=candidates[0].at,
         spin_deg=candidates[0].spin_deg,

@@ -16,7 +16,9 @@ import torch
 from torch import Tensor
 
 from patchproof.base.errors import Refused
+from patchproof.base.fingerprint import refuse_other_inputs
 from patchproof.base.settings import OptimizeSettings
+from patchproof.base.validation import refuse_untrusted
 from patchproof.base.workers import use_threads
 from patchproof.channel.printer import Printer, load_printer
 from patchproof.classifier.labels import find_labels
@@ -55,6 +57,11 @@ class Problem:
     subject: Subject
     custom_loss: Loss | None  # in place of the goal's
     jobs: int = 1  # processes that share the views
+
+    @cached_property
+    def inputs(self) -> dict[str, str]:
+        """Fingerprints of everything that results depend on, by settings key; a network's ends with its name."""
+        return {**self.scene.inputs, **{f"target.models {each.name}": each.fingerprint for each in self.classifiers}}
 
     @property
     def training_px(self) -> int:
@@ -144,6 +151,8 @@ def set_problem(
     _check_device(device)
     settings = scene.settings
     names, least_score = models or settings.target.models, settings.target.least_score
+    if scene.received is not None and not models:
+        refuse_untrusted(scene.received, settings.target.models)
     names = [scene.given_models.get(name, name) if isinstance(name, str) else name for name in names]
     classifiers = tuple(load_classifier(name, scene.base, device).with_least_score(least_score) for name in names)
     indices = tuple(find_labels(c.labels, settings.target.label, settings.target.accept) for c in classifiers)
@@ -158,7 +167,10 @@ def set_problem(
             for network in (classifier.network for classifier in classifiers if scene.HAS_PIECE):
                 if isinstance(network, BatchedNetwork):
                     _ = network.cut  # computed on access
-    return Problem(scene, stage, printer, classifiers, indices, subject, loss, jobs)
+    problem = Problem(scene, stage, printer, classifiers, indices, subject, loss, jobs)
+    if not models:
+        refuse_other_inputs(scene.recorded, problem.inputs, f"the run of sheet {scene.sheet_id}", settings.model_dump())
+    return problem
 
 
 def _check_device(device: str) -> None:

@@ -13,7 +13,7 @@ import json
 import os
 import platform
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib.metadata import version
@@ -26,13 +26,14 @@ from pydantic import BaseModel, Field
 
 from patchproof.base.compute import Compute
 from patchproof.base.errors import Refused
+from patchproof.base.fingerprint import refuse_other_inputs
 from patchproof.base.folder_lock import lock_folder
 from patchproof.base.input import is_file, read_file, read_json
 from patchproof.base.notebook import notebook_html
-from patchproof.base.output import check_folder, make_folder, write_atomically
+from patchproof.base.output import check_folder, clear_folder, make_folder, refuse_inputs_in, write_atomically
 from patchproof.base.progress import Advance, Progress, no_progress
 from patchproof.base.settings import SceneSettings
-from patchproof.base.validation import validate_model
+from patchproof.base.validation import refuse_untrusted, validate_model
 from patchproof.base.version import __version__
 from patchproof.classifier.network import Classifier
 from patchproof.optimizer.checkpoint import CHECKPOINT_FILE, load_checkpoint, save_checkpoint
@@ -44,7 +45,7 @@ from patchproof.optimizer.promise import PROMISE_VIEWS, VIEWS_PER_SESSION, Promi
 from patchproof.optimizer.subject import DESIGN_FILE, MASK_FILE, OBJECT_FILE, TEXTURE_FILES, read_design, write_png
 from patchproof.scene.interface import Scene
 from patchproof.scene.patch_scene import PatchScene
-from patchproof.scene.scene import build_scene, load_scene
+from patchproof.scene.scene import build_scene, load_scene, named_paths
 from patchproof.sheets.manifest import Promise
 
 _LOG_FILE, RUN_FILE, _VIEWS_FILE = ("steps.jsonl", "run.json", "views.png")
@@ -52,7 +53,7 @@ _MAX_LINE_BYTES = 4096  # of the log
 _MESH_FILE = "given.glb"  # the mesh of a scene that was made in Python
 _DESIGN_FILES = (DESIGN_FILE, OBJECT_FILE, TEXTURE_FILES, MASK_FILE)
 _STEP_FILES = (CHECKPOINT_FILE, _LOG_FILE, RUN_FILE, _VIEWS_FILE, _MESH_FILE, "place.*")
-RUN_FILE_PATTERNS = (*_STEP_FILES, *_DESIGN_FILES, "evaluate.json", ".*.part")
+RUN_FILE_PATTERNS = (*_STEP_FILES, *_DESIGN_FILES, "evaluate.json")
 
 # (steps, promised views) of a first look, whose interval is some four times as wide, and of a print that counts, with
 # three times the default's steps and an interval half as wide (`bench effort`).
@@ -117,17 +118,17 @@ def optimize(
     with lock_folder(out):
         if not resume:
             unfinished = is_file(out / CHECKPOINT_FILE) and not is_file(out / RUN_FILE)
-            check_folder(out, RUN_FILE_PATTERNS, overwrite, unfinished=unfinished)
+            check_folder(out, RUN_FILE_PATTERNS, overwrite, unfinished=unfinished, inputs=(scene,))
         scene = resolve_scene(scene, seed)
-        save_place = None
+        save_place, searched = None, {}
         if not scene.HAS_PLACE:
             search_options = {"models": models, "loss": loss, "compute": compute, "progress": progress}
-            scene, save_place = _choose_place(scene, out, resume, search_options)
+            scene, save_place, searched = _choose_place(scene, out, resume, search_options)
         problem = set_problem(scene, compute.device, models, loss, compute.jobs)
+        refuse_other_inputs(searched, problem.inputs, out, scene.settings.model_dump())
         if not resume:
-            for pattern in RUN_FILE_PATTERNS[:-1]:  # everything that the new run needs has been read
-                for path in out.glob(pattern):
-                    path.unlink()
+            refuse_inputs_in(out, named_paths(scene).values())
+            clear_folder(out)  # everything that the new run needs has been read
         make_folder(out)
         if save_place is not None:
             save_place()
@@ -147,8 +148,10 @@ def resolve_scene(scene: str | Path | Scene, seed: int | None) -> Scene:
 
 def _choose_place(
     scene: Scene, out: Path, resume: bool, search_options: Mapping[str, Any]
-) -> tuple[PatchScene, Callable[[], None]]:
-    """The scene with the piece at the place that a search chooses or chose, and a function that saves the place."""
+) -> tuple[PatchScene, Callable[[], None], Mapping[str, str]]:
+    """The scene with the piece at the place that a search chooses or chose, a function that saves the place, and the
+    fingerprints of what was searched.
+    """
     # only scenes that give no place import the search
     from patchproof.optimizer.place_files import read_place, save_place
     from patchproof.optimizer.place_search import choose_place
@@ -157,7 +160,7 @@ def _choose_place(
     scene = require_unplaced(scene)
     place = (read_place(out, scene) if resume else None) or choose_place(scene, **search_options)
     placed_scene = scene.with_piece_at(place.at, place.spin_deg)
-    return placed_scene, lambda: save_place(place, placed_scene, out)
+    return placed_scene, lambda: save_place(place, placed_scene, out), place.inputs
 
 
 def finish_run(
@@ -180,15 +183,20 @@ def finish_run(
 
 
 def promise_run(
-    run_folder: str | Path, *, views: int | None = None, compute: Compute = Compute(), progress: Progress = no_progress
+    run_folder: str | Path,
+    *,
+    views: int | None = None,
+    trust: bool = False,
+    compute: Compute = Compute(),
+    progress: Progress = no_progress,
 ) -> Run:
     """Promise the rate of a finished run's design again, from `views` views and with the run's own controls; the run is
     the same to the byte as if `optimize` had been given these views. A sheet keeps its promise until it is written
-    again.
+    again. For `trust` see `load_run`.
     """
     compute, options = compute.without("promise", cluster=True), PromiseOptions(views)
     with lock_folder(run_folder):
-        run = load_run(run_folder)
+        run = load_run(run_folder, trust)
         options = replace(options, controls=tuple(run.promise.controls))
         problem = set_problem(run.scene, compute.device, jobs=compute.jobs)
         promise = promise_of(problem, run.design, options, partial(progress, "promise"))
@@ -197,8 +205,12 @@ def promise_run(
     return replace(run, promise=promise, details=details)
 
 
-def load_run(folder: str | Path) -> Run:
-    """Load a finished run; refused if the folder holds none, or an unfinished one."""
+def load_run(folder: str | Path, trust: bool = False, named: Iterable[str] = ()) -> Run:
+    """Load a finished run; refused if the folder holds none, or an unfinished one.
+
+    A run may be from somebody else. Without `trust`, paths with `${VAR}` are refused, and its networks will not be
+    loaded if they are code (`module:`) or downloads, unless they are all `named`.
+    """
     folder = Path(folder)
     if not is_file(folder / RUN_FILE):
         has_checkpoint = is_file(folder / CHECKPOINT_FILE)
@@ -210,7 +222,15 @@ def load_run(folder: str | Path) -> Run:
     try:
         base = (folder / record.scene_folder).resolve()
         glb = read_file(folder / _MESH_FILE, "the mesh of a run") if is_file(folder / _MESH_FILE) else None
+        if not trust:
+            refuse_untrusted(folder / RUN_FILE, (), settings.model_dump(exclude={"target": {"models"}}))
         scene = build_scene(settings, base, record.seed, record.sheet_id, glb)
+        files = {key: sha256 for key, sha256 in record.inputs.items() if key in scene.inputs}
+        refuse_other_inputs(files, scene.inputs, folder / RUN_FILE, settings.model_dump())
+        networks = {key: sha256 for key, sha256 in record.inputs.items() if key.startswith("target.models ")}
+        scene = replace(scene, recorded=networks)
+        if not trust and not {*settings.target.models} <= {*named}:
+            scene = replace(scene, received=folder / RUN_FILE)
         if record.imported is not None:
             scene = replace(scene, known={**scene.known, "design": record.imported.sha256})
         design = read_design(scene, folder)
@@ -234,6 +254,7 @@ class _Record(BaseModel):
     seed: Annotated[int, Field(ge=0)]
     sheet_id: str
     printer: dict[str, Any]
+    inputs: dict[str, str] = {}
     imported: _Imported | None = None
 
 
@@ -295,6 +316,7 @@ def _details(problem: Problem, promise: Promise, out: Path) -> dict[str, Any]:
         "scene_folder": os.path.relpath(scene.base.resolve(), out.resolve()),
         "settings": scene.settings.model_dump(mode="json"),
         "printer": problem.printer.provenance | {"method": problem.printer.method},
+        "inputs": problem.inputs,
         "placement": scene.record(),
         "warnings": list(scene.warnings),
         "select_after_views": SELECT_AFTER,

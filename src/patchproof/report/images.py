@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from patchproof.base.input import read_file
-from patchproof.base.output import base64_uri, image_bytes, make_folder
+from patchproof.base.output import base64_uri, image_bytes, make_folder, write_atomically
 from patchproof.base.text import drawable, printable
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ def save_pictures(folder: Path, file: str, kinds: Mapping[str, np.ndarray]) -> N
         path.unlink(missing_ok=True)
     for kind, pixels in kinds.items():
         suffix, content = ("png", png(delta_map(pixels))) if kind == "delta_e00" else ("jpg", jpeg(pixels))
-        (folder / f"{stem_of(file)}.{kind}.{suffix}").write_bytes(content)
+        write_atomically(folder / f"{stem_of(file)}.{kind}.{suffix}", content)
 
 
 def saved_pictures(folder: Path, file: str) -> dict[str, bytes]:

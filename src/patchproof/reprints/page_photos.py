@@ -79,7 +79,7 @@ def reprint_pages(
         sent = torch.tensor(colors.T[None, :, :, None], dtype=torch.float32)
         return linear_from_srgb(printer.apply(sent)[0, :, :, 0].T.numpy())
 
-    with new_folder(out, ("photo_*.jpg",), overwrite) as folder:
+    with new_folder(out, ("photo_*.jpg",), overwrite, (pdf,)) as folder:
         pages = []
         for number in range(page_count(pdf)):
             light = page_light(rasterize_page(pdf, number + 1, PX_PER_MM * MM_PER_INCH), apply_printer)

@@ -12,7 +12,7 @@ in front of the object; light that falls on the object, but not on the paper.
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -68,11 +68,14 @@ class MeasuredCameraScene(PatchScene):
         return np.diag([size_px[0], size_px[0], 1.0]) @ self.unit_matrix
 
 
-def photo_forecaster(run: str | Path | Run, manifest: Manifest) -> Callable[[PhotoSquare], float | None]:
+def photo_forecaster(
+    run: str | Path | Run, manifest: Manifest, trust: bool = False, named: Iterable[str] = ()
+) -> Callable[[PhotoSquare], float | None]:
     """Make the function that forecasts photographs of a sheet, by its run or that run's folder; it returns None for a
-    photograph that cannot be rendered. Refused is a run that the sheet is not of.
+    photograph that cannot be rendered. Refused is a run that the sheet is not of; for `trust` and `named` see
+    `load_run`.
     """
-    run = run if isinstance(run, Run) else load_run(run)
+    run = run if isinstance(run, Run) else load_run(run, trust, named)
     if manifest.sheet_id != run.scene.sheet_id:
         expected, got = f"the run of sheet {manifest.sheet_id}", f"the run of sheet {run.scene.sheet_id}"
         raise Refused(expected, got, "name the run that the sheet was made from")

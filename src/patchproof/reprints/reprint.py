@@ -85,7 +85,7 @@ def reprint(
         take_photo = partial(_take_photo, Path(pdf).resolve(), run.folder.resolve(), how)
         jobs, cluster = compute.jobs, compute.cluster
         opening = _cluster_workers(take_photo, jobs, cluster) if cluster else fork_workers(sheet.photograph, jobs)
-        with new_folder(out, REPRINT_FILES, overwrite) as folder, opening as (workers, take):
+        with new_folder(out, REPRINT_FILES, overwrite, (pdf_path, run.folder)) as folder, opening as (workers, take):
             for i, photo in workers.completed(take, views):
                 make_folder((folder / names[i]).parent)
                 (folder / names[i]).write_bytes(result_of(photo))
@@ -128,7 +128,7 @@ def _take_photo(pdf: Path, run_folder: Path, how: ReprintSetup, conditions: Cond
 @lru_cache(maxsize=1)
 def _photographer(pdf: Path, run_folder: Path, how: ReprintSetup) -> Callable[[Conditions], bytes]:
     """Mount the sheet in another process, once."""
-    return mount_sheet(pdf, load_run(run_folder), how).photograph
+    return mount_sheet(pdf, load_run(run_folder, trust=True), how).photograph  # it was loaded before
 
 
 def write_truth(folder: Path, truth: Mapping[str, PhotoTruth]) -> None:

@@ -34,7 +34,7 @@ def scan(
     """Scan each uncut page with markers n times at `dpi`, in simulation, into the folder `out`."""
     manifest, truth = sheet_scene(pdf_path, run)[0], {}
     printer, px_from_mm = how.printer_for(run.scene), np.diag([*(dpi / MM_PER_INCH * np.array(how.print_scale)), 1.0])
-    with new_folder(out, REPRINT_FILES, overwrite) as folder:
+    with new_folder(out, REPRINT_FILES, overwrite, (pdf_path, run.folder)) as folder:
         for page in sorted({marker.page for marker in manifest.markers}):
             pixels = rasterize_page(pdf_path, page, 2 * dpi)
             picture = _scan_page(pixels, manifest.page_mm, dpi, printer, how.print_scale)

@@ -165,14 +165,21 @@ def load_backgrounds(settings: BackgroundSettings, base: Path) -> Backgrounds:
         return Backgrounds((codes_from_srgb(np.array(settings.color)).reshape(1, 1, 3),))
     if settings.images is None:
         return _split_by_purpose([])
-    folder = Path(expand_path(settings.images, base))
-    if is_file(folder):
+    folder, files = Path(expand_path(settings.images, base)), background_files(settings, base)
+    if files == [folder]:
         return Backgrounds((FileLevels(folder),))
-    files = sorted(p for p in folder.iterdir() if p.suffix.lower() in _SUFFIXES) if is_folder(folder) else []
     if not files:
         remedy = "put some there or give a color"
         raise Refused("a folder of pictures (background.images)", f"no picture in {folder}", remedy)
     return _split_by_purpose(files)
+
+
+def background_files(settings: BackgroundSettings, base: Path) -> list[Path]:
+    """List the pictures that the settings name: those in a folder, or a file; none without `images`."""
+    path = None if settings.images is None else Path(expand_path(settings.images, base))
+    if path is None or is_file(path):
+        return [] if path is None else [path]
+    return sorted(p for p in path.iterdir() if p.suffix.lower() in _SUFFIXES) if is_folder(path) else []
 
 
 def _split_by_purpose(files: Sequence[Path]) -> Backgrounds:

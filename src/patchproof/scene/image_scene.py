@@ -23,6 +23,7 @@ from typing import Self
 import numpy as np
 
 from patchproof.base.errors import Refused
+from patchproof.base.fingerprint import files_sha256
 from patchproof.base.geometry import rotated_extent
 from patchproof.base.input import is_file, read_csv
 from patchproof.base.settings import SceneSettings
@@ -120,7 +121,8 @@ def build(source: SceneSource) -> ImageScene:
         warnings.append(
             f"the promise is made on {promised} images, and says little of others: give {FEW_IMAGES} or more"
         )
-    return ImageScene(settings, base, source.seed, identity, piece, images, notes=tuple(warnings))
+    inputs = {"object.images": files_sha256(files, whole=False)}
+    return ImageScene(settings, base, source.seed, identity, piece, images, notes=tuple(warnings), inputs=inputs)
 
 
 def px_per_mm(settings: SceneSettings, piece: Piece, conditions: Conditions) -> np.ndarray:

@@ -75,6 +75,9 @@ class Scene(ABC):
     camera: Camera | None = field(default=None, kw_only=True)  # a calibrated camera
     mesh_glb: bytes | None = field(default=None, kw_only=True)  # the mesh, if it was given in Python
     given_models: Mapping[str, Any] = field(default_factory=dict, kw_only=True)  # networks given in Python, by name
+    inputs: Mapping[str, str] = field(default_factory=dict, kw_only=True)  # fingerprints by settings key
+    recorded: Mapping[str, str] = field(default_factory=dict, kw_only=True)  # those of its run's networks
+    received: Path | None = field(default=None, kw_only=True)  # the run's file, if its networks need the user's word
 
     HAS_OBJECT: ClassVar[bool] = False  # an object's surface before a background
     HAS_PIECE: ClassVar[bool] = False

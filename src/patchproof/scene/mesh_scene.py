@@ -15,13 +15,14 @@ import numpy as np
 
 from patchproof.base import geometry
 from patchproof.base.errors import Refused
+from patchproof.base.fingerprint import files_sha256
 from patchproof.base.validation import expand_path
 from patchproof.channel.cameras import load_optional_camera
 from patchproof.channel.effects import Pose
 from patchproof.channel.object_box import hull_points, project_box
 from patchproof.mesh.load_mesh import load_mesh
 from patchproof.mesh.mesh import Mesh
-from patchproof.scene.backgrounds import Backgrounds, load_backgrounds
+from patchproof.scene.backgrounds import Backgrounds, background_files, load_backgrounds
 from patchproof.scene.conditions import Conditions, Stream
 from patchproof.scene.interface import SCALE_VIEWS, Scene, SceneSource, SceneTerm
 from patchproof.scene.placement import SurfaceFrame, view_frame
@@ -160,10 +161,16 @@ def load_bare(source: SceneSource) -> MeshScene:
         raise ValueError("a scene with a mesh needs object.mesh and object.length_mm")
     mesh = load_mesh(expand_path(settings_object.mesh, base), settings_object.length_mm, settings_object.up, mesh_glb)
     backgrounds = load_backgrounds(settings.background, base)
+    pictures, inputs = background_files(settings.background, base), {}
     known = {} if mesh_glb is None else {"mesh": hashlib.sha256(mesh_glb).hexdigest()}
+    if mesh.files or known:
+        inputs["object.mesh"] = files_sha256(mesh.files) if mesh.files else known["mesh"]
+    if pictures:
+        inputs["background.images"] = files_sha256(pictures, whole=False)
     identity, frame = source.sheet_id(known), view_frame(mesh, settings)
     lens = load_optional_camera(camera.file, base, camera.photo_px)
     others: dict[str, Any] = {"notes": (*mesh.warnings, *backgrounds.notes), "known": known, "mesh_glb": mesh_glb}
+    others |= {"inputs": inputs}
     return MeshScene(settings, base, source.seed, identity, mesh, frame, backgrounds, camera=lens, **others)
 
 

@@ -19,7 +19,7 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -162,7 +162,8 @@ def build(source: SceneSource) -> PhotoScene:
     uneven = ((photo.name, photo.light.unevenness) for photo in base_photos if photo.light.unevenness > _UNEVEN_SHARE)
     warnings += [f"the light on the paper in {name} is uneven: {share:.0%} is unexplained" for name, share in uneven]
     warnings += summarize_said((photo.name, photo.said) for photo in base_photos)
-    return PhotoScene(settings, base, source.seed, identity, piece, base_photos, notes=tuple(warnings), known=known)
+    others: dict[str, Any] = {"known": known, "inputs": {"object.photos": known["photos"]}}
+    return PhotoScene(settings, base, source.seed, identity, piece, base_photos, notes=tuple(warnings), **others)
 
 
 def measure_photo(path: Path, manifest: Manifest, piece: Piece, photo_px: tuple[int, int]) -> BasePhoto:

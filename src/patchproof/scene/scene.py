@@ -16,9 +16,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from patchproof.base.errors import Refused
+from patchproof.base.fingerprint import files_sha256, value_sha256
+from patchproof.base.input import is_file
 from patchproof.base.output import write_pictures
 from patchproof.base.settings import SceneSettings, load_scene_settings
-from patchproof.base.validation import validate_model
+from patchproof.base.validation import expand_path, validate_model
+from patchproof.channel.printer import load_printer
 from patchproof.scene.interface import Scene, SceneSource
 
 if TYPE_CHECKING:
@@ -118,7 +121,30 @@ def build_scene(
     """Build the scene of settings with paths relative to `base`; `printed_sheet_id` is that of its print, if any."""
     seed = settings.optimize.seed if seed is None else seed
     module = import_module(f"patchproof.scene.{module_of(settings)}")
-    return module.build(SceneSource(settings, base, seed, printed_sheet_id, mesh_glb))
+    scene = module.build(SceneSource(settings, base, seed, printed_sheet_id, mesh_glb))
+    return replace(scene, inputs={**scene.inputs, **_fingerprints(scene)})
+
+
+def _fingerprints(scene: Scene) -> dict[str, str]:
+    """Return the fingerprints of the files that scenes of several kinds name, by settings key; `build` adds others."""
+    found = {"printer.profile": load_printer(scene.settings.printer.profile, scene.base).sha256}
+    if scene.camera is not None:
+        found["camera.file"] = value_sha256(scene.camera.model_dump(mode="json"))
+    paths = {key: path for key, path in named_paths(scene).items() if key not in scene.inputs}
+    return found | {key: files_sha256([path]) for key, path in paths.items() if is_file(path)}
+
+
+def named_paths(scene: Scene) -> dict[str, Path]:
+    """Return the files and folders that a scene's settings name, by key."""
+    thing, patch = scene.settings.object, scene.settings.patch
+    names = {f"object.{name}": getattr(thing, name) for name in ("mesh", "photos", "sheet", "images", "labels")}
+    names |= {
+        "patch.mask": patch.mask,
+        "patch.faces": patch.faces,
+        "background.images": scene.settings.background.images,
+    }
+    names |= {"patch.search.keep_off_faces": patch.search.keep_off_faces}
+    return {key: Path(expand_path(name, scene.base)) for key, name in names.items() if name is not None}
 
 
 def module_of(settings: SceneSettings) -> str:

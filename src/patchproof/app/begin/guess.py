@@ -117,7 +117,7 @@ def file_length(path: Path) -> float:
     """The longest extent in the file's own unit."""
     from patchproof.mesh.mesh_file import read_parts
 
-    parts, _ = read_parts(path, np.eye(3))
+    parts, *_ = read_parts(path, np.eye(3))
     corners = np.concatenate([part.vertices[part.faces].reshape(-1, 3) for part in parts])
     corners = corners[np.isfinite(corners).all(1)]
     return float(np.ptp(corners, axis=0).max()) if len(corners) else 0.0

@@ -49,7 +49,7 @@ def new_scene(
     `up` replace those of the mesh's file.
     """
     out = Path(out)
-    check_file(out, overwrite)
+    check_file(out, overwrite, (thing,))
     base = out.resolve().parent
     if thing.startswith("primitive:") or not is_folder(Path(thing)):
         text, lines = _mesh_scene(thing, base, label, length_mm, up, models)

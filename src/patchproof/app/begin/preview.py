@@ -65,7 +65,7 @@ def preview_scene(scene_path: str | Path, out: str | Path, *, overwrite: bool = 
     """Write the preview of a scene file into the folder `out`; unreadable files and unusable networks are refused."""
     path = Path(scene_path)
     settings = load_scene_settings(path)
-    with new_folder(out, (PAGE, OBJECT), overwrite) as folder:
+    with new_folder(out, (PAGE, OBJECT), overwrite, (scene_path,)) as folder:
         scene, refused = _scene(settings, path.resolve().parent)
         with python_warnings.catch_warnings(action="always", record=True) as said:
             classifiers = [load_classifier(name, scene.base) for name in settings.target.models]

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from patchproof.base.errors import Refused
-from patchproof.base.output import check_folder, make_folder
+from patchproof.base.output import make_folder, refuse_other_files
 from patchproof.photo.read import list_images
 
 CONTROLS_FOLDER, JOURNAL_FILE = "controls", "photos.jsonl"
@@ -49,7 +49,7 @@ class Album:
     """A folder of photographs, which is created if it is missing; refused if it has other files, or links."""
 
     def __init__(self, folder: Path):
-        check_folder(folder, _OWN, overwrite=True)
+        refuse_other_files(folder, _OWN)
         make_folder(folder)
         self.folder = folder = folder.resolve()
         for path in folder.rglob("*"):

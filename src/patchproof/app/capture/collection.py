@@ -31,7 +31,8 @@ from patchproof.evidence.same_session import merge_folders
 from patchproof.evidence.task import Options, Task, task_of
 from patchproof.sheets.manifest import Manifest, load_manifest
 
-RunAndSheet = tuple[Path, Path]  # the folder of a run and its sheet's manifest
+# the folder of a run, its sheet's manifest, and what the user said of the run's networks (see `load_run`)
+RunAndSheet = tuple[Path, Path, bool, tuple[str, ...]]
 
 
 class PhotoCollection:
@@ -128,7 +129,7 @@ def _add_forecast(source: RunAndSheet, task: Task, size_px: int, item: tuple[Pat
 
 
 @lru_cache(maxsize=1)
-def _forecaster(run: Path, sheet: Path) -> Callable[[PhotoSquare], float | None]:
+def _forecaster(run: Path, sheet: Path, trust: bool, named: tuple[str, ...]) -> Callable[[PhotoSquare], float | None]:
     from patchproof.reprints.photo_forecast import photo_forecaster  # brings scene, renderer and optimizer in
 
-    return photo_forecaster(run, load_manifest(sheet))
+    return photo_forecaster(run, load_manifest(sheet), trust, named)

@@ -48,6 +48,7 @@ def serve_capture(
     run: str | Path | None = None,
     models: Sequence[str] | None = None,
     camera: str | None = None,
+    trust: bool = False,
     lan: bool = False,
     progress: Progress = no_progress,
     on_address: Callable[[str], None] = print,
@@ -55,7 +56,7 @@ def serve_capture(
     """Serve the page and receive photographs into the folder `out` until interrupted; returns the report on them.
 
     `progress` is called with the stage "measure" for photographs that are there already, `on_address` with the address
-    once the server listens. `run`, `models` and `camera` are those of `verify`.
+    once the server listens. `run`, `models`, `camera` and `trust` are those of `verify`.
     """
     try:
         import uvicorn
@@ -67,8 +68,8 @@ def serve_capture(
     if manifest.promise is None:
         got = f"the {manifest.kind} sheet {manifest.sheet_id}"
         raise Refused("a sheet that promises something", got, "photograph it with any camera")
-    options = options_of(sheet, manifest, models, camera)
-    forecast = None if run is None else (Path(run).resolve(), Path(sheet).resolve())
+    options = options_of(sheet, manifest, models, camera, trust)
+    forecast = None if run is None else (Path(run).resolve(), Path(sheet).resolve(), trust, tuple(models or ()))
     with lock_folder(out), open_workers(1, spawn=True) as workers:
         album = Album(Path(out))
         workers.map(prepare_worker, [None])

@@ -8,7 +8,7 @@ from typing import Annotated
 
 from typer import Argument, Option
 
-from patchproof.app.cli.console import Models, names_of, progress, say
+from patchproof.app.cli.console import Models, Trust, names_of, progress, say
 
 
 def capture(
@@ -19,6 +19,7 @@ def capture(
     ] = None,
     models: Models = None,
     camera: Annotated[str | None, Option(help="The camera that takes them: a camera file or its name.")] = None,
+    trust: Trust = False,
     lan: Annotated[
         bool, Option("--lan", help="Listen on the local network, for a phone; else on this machine alone.")
     ] = False,
@@ -35,7 +36,9 @@ def capture(
         say(address, "" if lan else "Only this machine can open it; --lan lets a phone.", "Ctrl-C ends it.")
 
     with progress() as bar:
-        serve = partial(serve_capture, sheet, out, run=run, models=names_of(models), camera=camera, lan=lan)
+        serve = partial(
+            serve_capture, sheet, out, run=run, models=names_of(models), camera=camera, lan=lan, trust=trust
+        )
         report = serve(progress=lambda stage, done, total: bar(stage, done, total) if total else None, on_address=show)
     controls = f" --controls {out / CONTROLS_FOLDER}" if report.controls else ""
     say(*verdict_lines(report), f"report: patchproof verify {out} --sheet {sheet}{controls} --out report")

@@ -38,6 +38,9 @@ Jobs = Annotated[
     ),
 ]
 Cluster = Annotated[str | None, Option(help="A Dask scheduler's address, in place of local processes.")]
+Trust = Annotated[
+    bool, Option("--trust", help="Use code, downloads and variables that the run or sheet names: you know who made it.")
+]
 Models = Annotated[str | None, Option(help="Comma-separated classifiers in place of the sheet's own.")]
 
 # how torch, OpenCV and the system say that there is none; numpy and Python raise a MemoryError

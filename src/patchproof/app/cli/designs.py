@@ -8,7 +8,7 @@ from typing import Annotated, Any
 from typer import Argument, BadParameter, Option
 
 from patchproof.app.cli import console
-from patchproof.app.cli.console import Cluster, Device, Jobs, Models, Overwrite, Seed, progress, say, warn
+from patchproof.app.cli.console import Cluster, Device, Jobs, Models, Overwrite, Seed, Trust, progress, say, warn
 from patchproof.base.compute import Compute
 
 
@@ -55,6 +55,7 @@ def evaluate(
     device: Device = "cpu",
     jobs: Jobs = None,
     cluster: Cluster = None,
+    trust: Trust = False,
     overwrite: Overwrite = False,
 ) -> None:
     """Rates on fresh conditions, with controls, on any classifiers; of several runs side by side."""
@@ -66,7 +67,7 @@ def evaluate(
         raise BadParameter("is for several runs, and they need it; one has its own folder", param_hint="--out")
     with progress() as bar:
         options: dict[str, Any] = {"models": console.names_of(models), "n": n, "seed": seed, "overwrite": overwrite}
-        options |= {"compute": Compute(device, jobs or 1, cluster), "progress": bar}
+        options |= {"trust": trust, "compute": Compute(device, jobs or 1, cluster), "progress": bar}
         if out is None:
             result = evaluate_run(runs[0], **options)
             say(*evaluation_lines(result.model_dump()), f"written: {runs[0] / 'evaluate.json'}")

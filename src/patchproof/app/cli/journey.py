@@ -9,7 +9,19 @@ from typing import Annotated, Any, Literal
 from typer import Argument, BadParameter, Exit, Option
 
 from patchproof.app.cli import console
-from patchproof.app.cli.console import Cluster, Device, Jobs, Models, Overwrite, Resume, Seed, progress, say, warn
+from patchproof.app.cli.console import (
+    Cluster,
+    Device,
+    Jobs,
+    Models,
+    Overwrite,
+    Resume,
+    Seed,
+    Trust,
+    progress,
+    say,
+    warn,
+)
 from patchproof.base.compute import Compute
 
 PrintableControl = Literal["mean", "gray", "noise", "shuffled", "blank"]  # that can be printed
@@ -84,6 +96,7 @@ def optimize(
 def promise(
     run: Annotated[Path, Argument(help="A finished run, such as a draft's.")],
     n: Annotated[int | None, Option("--n", min=8, help="Views to promise from, by default up to 400.")] = None,
+    trust: Trust = False,
     device: Device = "cpu",
     jobs: Jobs = None,
 ) -> None:
@@ -93,7 +106,7 @@ def promise(
     from patchproof.report.words import promise_lines
 
     with progress() as bar:
-        finished_run = promise_run(run, views=n, compute=Compute(device, jobs or 1), progress=bar)
+        finished_run = promise_run(run, views=n, trust=trust, compute=Compute(device, jobs or 1), progress=bar)
     say(*promise_lines(finished_run.promise, background_summary(finished_run.scene.settings.model_dump())))
     if finished_run.scene.settings.patch.kind == "patch":
         say(f"next: patchproof sheet {run} --out sheet.pdf (a page that was written before has the former promise)")
@@ -110,6 +123,7 @@ def sheet(
     copies: Annotated[int, Option(min=1, max=1000, help="Pages of the same, for label rolls.")] = 1,
     check: Annotated[bool, Option("--check", help="Say what a print shop needs to know.")] = False,
     templates: Annotated[bool, Option("--list", help="Say which templates there are.")] = False,
+    trust: Trust = False,
     overwrite: Overwrite = False,
 ) -> None:
     """Write the page: design, markers, chart and rulers at true size."""
@@ -129,7 +143,7 @@ def sheet(
         raise BadParameter("copies are of one run's sheet", param_hint="--copies")
     paths = manifest_paths(out, len(runs))
     for path in (out, *paths):
-        check_file(path, overwrite)
+        check_file(path, overwrite, [folder / "run.json" for folder in runs])
     if not runs:
         manifests = [blank_page(out, template=template, control=control)]
     else:
@@ -137,7 +151,7 @@ def sheet(
         from patchproof.reprints.run_sheet import sheet as sheet_of
         from patchproof.reprints.run_sheet import sheet_of_several
 
-        first, *others = loaded = [load_run(folder) for folder in runs]
+        first, *others = loaded = [load_run(folder, trust) for folder in runs]
         if others:
             manifests = sheet_of_several(loaded, out, template=template, control=control)
         else:
@@ -167,6 +181,7 @@ def reprint(
     ] = False,
     jobs: Jobs = None,
     cluster: Cluster = None,
+    trust: Trust = False,
     overwrite: Overwrite = False,
 ) -> None:
     """Print the PDF in simulation, put it back on the object, and photograph it."""
@@ -188,7 +203,7 @@ def reprint(
             raise BadParameter(only, param_hint="--run")
         reprint_pages(pdf, n, out, how, seed=seed, overwrite=overwrite)
         return say(f"{n} photographs: {out}")
-    finished_run = load_run(run)
+    finished_run = load_run(run, trust)
     if scan_dpi is not None:
         taken = scan(pdf, finished_run, n, out, scan_dpi, how, overwrite=overwrite)
     else:
@@ -222,6 +237,7 @@ def verify(
     run: Annotated[
         Path | None, Option(help="The run that the sheet is of: forecasts each photograph at its measured view.")
     ] = None,
+    trust: Trust = False,
     jobs: Jobs = None,
     cluster: Cluster = None,
     resume: Resume = False,
@@ -234,7 +250,7 @@ def verify(
 
     with progress() as bar:
         ruler = console.pair_of(ruler_mm, "--ruler-mm") if ruler_mm else None
-        options: dict[str, Any] = {"models": console.names_of(models), "controls": controls, "run": run}
+        options: dict[str, Any] = {"models": console.names_of(models), "controls": controls, "run": run, "trust": trust}
         options |= {"capture": CaptureInfo(camera, scan_dpi, ruler, boxes), "ledger_photos": ledger}
         options |= {"compute": Compute(jobs=jobs or 1, cluster=cluster), "resume": resume, "overwrite": overwrite}
         report = verify_photos(photos, sheet, out, **options, progress=bar)

@@ -1,0 +1,64 @@
+"""Fingerprints of what a run is made from, and their comparison wherever it is used.
+
+In: files, or values. Out: SHA-256 as text. Of a long list of files, such as 100,000 backgrounds, only names, sizes and
+the first and last 64 kB of each are read: an exchanged picture shows, a single retouched pixel may not. The inputs of a
+scene are listed in `scene.scene`, its networks in `optimizer.problem`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from patchproof.base.errors import Refused
+from patchproof.base.input import hash_file, is_file
+
+_END_BYTES = 1 << 16
+
+
+def files_sha256(paths: Sequence[Path], whole: bool = True) -> str:
+    """SHA-256 of one file's bytes, or of several files; unless `whole`, of their names, sizes and ends."""
+    digest = hashlib.sha256()
+    for path in filter(is_file, paths):  # readers refuse what is none
+        status = path.stat()
+        if whole:
+            content = _file_sha256(path, status.st_size, status.st_mtime_ns)
+            if len(paths) == 1:
+                return content
+            digest.update(content.encode())
+            continue
+        with open(path, "rb") as file:
+            digest.update(f"{path.name}\0{status.st_size}\0".encode() + file.read(_END_BYTES))
+            file.seek(max(_END_BYTES, status.st_size - _END_BYTES))
+            digest.update(file.read(_END_BYTES))
+    return digest.hexdigest()
+
+
+@lru_cache(maxsize=1000)  # once a process: size and time of the last change tell versions apart
+def _file_sha256(path: Path, size: int, changed_ns: int) -> str:
+    return hash_file(path, size)
+
+
+def value_sha256(value: Any) -> str:
+    """SHA-256 of JSON values."""
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
+
+
+def refuse_other_inputs(
+    recorded: Mapping[str, str], inputs: Mapping[str, str], source: str | Path, settings: Mapping[str, Any]
+) -> None:
+    """Refuse inputs, by the key of the settings that names them, whose fingerprints differ from those that `source`
+    recorded of itself.
+    """
+    for key, sha256 in recorded.items():
+        if inputs.get(key) != sha256:
+            value: Any = settings
+            for part in key.split("."):  # a network's key ends with its name, which may hold points
+                value = value.get(part) if isinstance(value, Mapping) else None
+            expected = f"the {key}{f' {value}' if isinstance(value, str) else ''} that {source} was made with"
+            got = f"another (sha256 {inputs[key][:8]}...)" if key in inputs else "none"
+            raise Refused(f"{expected} (sha256 {sha256[:8]}...)", got, "put the former back, or optimize again")
