@@ -62,7 +62,8 @@ def outcome(kind: str, seed: int, folder) -> Outcome:
         returned: list[LocatedSheet | None] = []
         placing.side_effect = lambda *args: returned.append(locate_sheet(*args)) or returned[-1]
         view = pinhole_photo(read_photo(folder / "a.jpg"), None)
-        entry = measuring.measure(view, "a.jpg", surface, promised, promised_ranges(())).entry
+        photo = measuring.measure(view, "a.jpg", surface, promised, promised_ranges(()))
+    entry = photo.entry
     geometry, pose, off = entry.geometry, entry.pose, {}
     if geometry is not None and returned[-1] is not None:
         off["corners"] = _corner_error_mm(returned[-1], truth.px(CORNERS)), geometry.corner_uncertainty_mm
