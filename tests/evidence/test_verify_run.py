@@ -120,6 +120,22 @@ def test_another_design_and_a_print_without_an_ink_do_not_count(printed, code):
     assert photo.entry.remark.figure < photo.entry.remark.threshold
 
 
+def test_a_design_of_one_color_is_told_from_others_by_structure_ink_and_color():
+    gray, black = np.full((140, 140, 3), 150, np.uint8), np.full((140, 140, 3), 20, np.uint8)
+    page = page_raster(make_manifest(design=gray), True)
+    photo = photograph(page, view(10, 5, 550, size_px=(800, 600)), (800, 600), blur_px=0.5, fine=2)
+    assert measured(photo, manifest=make_manifest(design=gray)).entry.code is None
+    for design, shown, code in (
+        (gray, shot(), "other_design"),
+        (some_design(), photo, "other_design"),
+        (black, photo, "other_design"),
+    ):
+        assert measured(shown, manifest=make_manifest(design=design)).entry.code == code
+    page = page_raster(make_manifest(design=without_ink(0, gray)), True)
+    photo = photograph(page, view(10, 5, 550, size_px=(800, 600)), (800, 600), blur_px=0.5, fine=2)
+    assert measured(photo, manifest=make_manifest(design=gray)).entry.code == "wrong_ink"
+
+
 def coated(srgb: np.ndarray) -> np.ndarray:
     """What a shipped printer makes of sRGB H×W×3."""
     seen = load_printer("coated").apply(torch.from_numpy(srgb).permute(2, 0, 1)[None].float())

@@ -25,7 +25,8 @@ LEAST_INK, WEAK_INK = 0.2, 0.3  # contrast: of the strongest ink's
 _LEAST_PLAIN_INK = 0.55  # the same of grays without structure, by the light absorbed: real prints have 0.65 and more
 _MOST_COLOR = 30.0  # ΔE00 without structure: real prints are off by 5 to 17
 _LEAST_CELLS, _LEAST_DETAILED = 40, 6
-_LEAST_STRUCTURE, _MOST_STRUCTURE = 0.02, 0.03  # of the square root of light: promised, and shown where none is
+# of the square root of light: promised, and shown where none is: glare makes 0.04, other designs 0.09 and more
+_LEAST_STRUCTURE, _MOST_STRUCTURE = 0.01, 0.065
 _SURROUNDINGS = 1 / 8  # of the shorter side: standard deviation of the mean that is subtracted
 _LEAST_CHROMA, _LEAST_COLORFUL = 0.1, 0.15  # of the largest singular value: of the gains, in the design's colors
 _INKS = ("cyan", "magenta", "yellow")
@@ -71,8 +72,9 @@ def match_design(seen: np.ndarray, promised: np.ndarray, usable: np.ndarray, lig
     seen, promised = np.sqrt(np.clip((seen / paper - veil) / (1 - veil), 0, 1.2)), np.sqrt(np.clip(promised, 0, 1))
     y, x = (_less_surroundings(v, usable)[usable] for v in (seen, promised))
     means = np.median(seen[usable], 0), promised[usable].mean(0)
-    if x.std() < _LEAST_STRUCTURE:
-        return DesignMatch(trouble=_plain_trouble(*means, float(np.median(np.abs(y)))))
+    structure_x, structure_y = (float(np.median(np.abs(v))) for v in (x, y))  # medians: blur spreads markers' light
+    if structure_x < _LEAST_STRUCTURE:
+        return DesignMatch(trouble=_plain_trouble(*means, structure_y))
     gains = _robust_gains(x, y)
     likeness, diagonal = float(np.corrcoef((x @ gains).ravel(), y.ravel())[0, 1]), np.diag(gains)
     largest, second, _ = np.linalg.svd(gains, compute_uv=False)
