@@ -141,7 +141,7 @@ def _glossy(cells: np.ndarray, expected: np.ndarray) -> np.ndarray:
 
 
 def _cells_per_mm(surface: Surface, geometry: Geometry) -> float:
-    foreshortened = np.sqrt(max(np.cos(np.radians(geometry.tilt_deg)), 0.05))
+    foreshortened = np.sqrt(max(np.cos(np.radians(geometry.tilt_deg or 0.0)), 0.05))
     cell_mm = max(2.0, 2 * geometry.blur_px) / geometry.px_per_mm / foreshortened
     cell_mm = max(cell_mm, 4 * geometry.corner_uncertainty_mm)
     side_mm = min(surface.rect_mm[2:])

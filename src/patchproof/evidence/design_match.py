@@ -112,7 +112,7 @@ def _less_surroundings(values: np.ndarray, usable: np.ndarray) -> np.ndarray:
 
 def _robust_gains(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Fit y ≈ x @ gains to N×3 by least squares, with less weight on what lies over the design."""
-    weight = np.ones((len(x), 1))
+    weight, gains = np.ones((len(x), 1)), np.eye(3)
     for _ in range(5):
         gains = np.linalg.lstsq(x * weight, y * weight, rcond=None)[0]
         error = np.linalg.norm(y - x @ gains, axis=1, keepdims=True)

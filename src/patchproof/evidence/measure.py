@@ -192,7 +192,7 @@ def _trouble(
     """Find the first reason why geometry or color cannot be trusted; None if they can. The design was recognized in
     `corners` of its four corners.
     """
-    tilt, blur, residual = geometry.tilt_deg, geometry.blur_px, geometry.residual_mm
+    tilt, blur, residual = geometry.tilt_deg or 0.0, geometry.blur_px, geometry.residual_mm
     side_mm, uncertainty = min(surface.rect_mm[2:]), geometry.corner_uncertainty_mm
     most_blur = MOST_BLUR * float(np.median([b.module_px for b in detected.markers.values()]))
     side_px, most_residual = side_mm * geometry.px_per_mm, MOST_RESIDUAL * side_mm
