@@ -51,7 +51,8 @@ class DesignMatch:
         told. Raises `PhotoRejected` for another design or a missing ink. `found` is the share of the `detailed` cells
         that were found near their places.
         """
-        if trouble is not None and trouble.code == "too_few_markers":  # what covers markers may cover the design
+        # what covers markers may cover the design, and full white shows none
+        if trouble is not None and trouble.code in ("too_few_markers", "clipped"):
             return trouble
         own, least = self.trouble, LEAST_FOUND if detailed >= _LEAST_DETAILED else 0.0
         if own is not None and own.code != "too_small" and (trouble is None or self.likeness is not None):

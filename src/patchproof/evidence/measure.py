@@ -115,14 +115,14 @@ def measure(
         if promised is not None and surface.piece_ids:
             seen = location.srgb, fit.px_from_mm, surface, promised, light, geometry, with_pictures and trouble is None
             color, pictures, match = appearance(*seen)
+            if trouble is None and color.clipped_share > MOST_CLIPPED:
+                advice = "the patch is overexposed: lower the exposure by one or two steps"
+                trouble = PhotoRejected("clipped", color.clipped_share, MOST_CLIPPED, advice)
             trouble = match.trouble_beside(trouble, *found)
     except PhotoRejected as rejection:
         return MeasuredPhoto(entry(status="rejected", remark=Remark.of(rejection)), False)
-    if trouble is not None:
+    if trouble is not None and trouble.code != "clipped":
         color = None
-    elif color is not None and color.clipped_share > MOST_CLIPPED:
-        advice = "the patch is overexposed: lower the exposure by one or two steps"
-        trouble = PhotoRejected("clipped", color.clipped_share, MOST_CLIPPED, advice)
     if trouble is not None:
         entry = partial(entry, status="judged", remark=Remark.of(trouble))
     else:
