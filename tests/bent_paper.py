@@ -7,6 +7,7 @@ printer than the one that its look was promised with.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 
 import cv2
@@ -20,7 +21,7 @@ from patchproof.channel.printer import load_printer
 from patchproof.evidence.surface import PromisedColors, Surface, promised_of, surface_of
 from patchproof.sheets.content import png_base64
 from patchproof.sheets.manifest import Manifest, design_sha256
-from patchproof.sheets.piece import lay_out_piece, marker_image
+from patchproof.sheets.piece import Piece, lay_out_piece, marker_image
 
 SIDE_MM, MARKER_MM, PAGE_PER_MM = 140.0, 14.0, 8
 CENTER = np.array([SIDE_MM, SIDE_MM]) / 2
@@ -29,16 +30,20 @@ Place = Callable[[np.ndarray], np.ndarray]
 """Page millimeters N×2 from the sheet's middle to points N×3 in space; z points into the paper, (0, 0) becomes 0."""
 
 
+DESIGNS: dict[str, Callable[[], np.ndarray]] = {
+    "noisy": lambda: (noisy_design() * 255).astype(np.uint8),
+    "smooth": some_design,
+    "plain": lambda: np.full((140, 140, 3), 150, np.uint8),
+}
+
+
 @cache
-def sheet(bends: bool, design: str) -> tuple[Surface, PromisedColors, np.ndarray]:
-    """The surface, how it was promised to look, and the printed page's linear light at `PAGE_PER_MM`."""
-    piece = lay_out_piece((SIDE_MM, SIDE_MM), MARKER_MM, "TESTSHEET0", "design", bends)
-    codes = {
-        "noisy": lambda: (noisy_design() * 255).astype(np.uint8),
-        "smooth": some_design,
-        "plain": lambda: np.full((140, 140, 3), 150, np.uint8),
-    }[design]()
-    markers = [dict(dictionary="DICT_5X5_1000", id=m.id, corners_mm=m.corners_mm, page=1) for m in piece.markers]
+def sheet(bends: bool, design: str) -> tuple[Surface, PromisedColors]:
+    """The surface, and how it was promised to look."""
+    codes = DESIGNS[design]()
+    markers = [
+        dict(dictionary="DICT_5X5_1000", id=m.id, corners_mm=m.corners_mm, page=1) for m in _piece(bends).markers
+    ]
     whole = (0.0, 0.0, SIDE_MM, SIDE_MM)
     manifest = Manifest.model_validate(
         dict(
@@ -59,15 +64,43 @@ def sheet(bends: bool, design: str) -> tuple[Surface, PromisedColors, np.ndarray
         )
     )
     surface = surface_of(manifest)
-    promised = promised_of(manifest, surface, load_printer("coated"))
-    size = round(SIDE_MM * PAGE_PER_MM)
-    image, reserved = marker_image(piece, (size, size))
-    page = np.where(
-        reserved[..., None], image, cv2.resize(codes / 255.0, (size, size), interpolation=cv2.INTER_NEAREST)
-    )
+    return surface, promised_of(manifest, surface, load_printer("coated"))
+
+
+def _piece(bends: bool, sheet_id: str = "TESTSHEET0") -> Piece:
+    return lay_out_piece((SIDE_MM, SIDE_MM), MARKER_MM, sheet_id, "design", bends)
+
+
+@cache
+def printed_page(bends: bool, design: str) -> np.ndarray:
+    """The printed page's linear light at `PAGE_PER_MM`, H×W×3."""
+    return printed(bends, DESIGNS[design]())
+
+
+def printed(
+    bends: bool,
+    codes: np.ndarray,
+    sheet_id: str = "TESTSHEET0",
+    moved: np.ndarray | None = None,
+    marker_shift_mm: tuple[float, float] = (0.0, 0.0),
+) -> np.ndarray:
+    """A page with these codes; `moved` (2×3, mm from the middle) has them elsewhere, one marker is shifted."""
+    piece, size = _piece(bends, sheet_id), round(SIDE_MM * PAGE_PER_MM)
+    x, y = (round(v * PAGE_PER_MM) for v in marker_shift_mm)
+    first = replace(piece, markers=piece.markers[:1])
+    image, reserved = marker_image(replace(piece, markers=piece.markers[1:]) if x or y else piece, (size, size))
+    if x or y:
+        single, place = (np.roll(a, (y, x), (0, 1)) for a in marker_image(first, (size, size)))
+        image, reserved = np.where(place[..., None], single, image), reserved | place
+    page = cv2.resize(codes / 255.0, (size, size), interpolation=cv2.INTER_NEAREST)
+    if moved is not None:
+        middle = np.array([[PAGE_PER_MM, 0, size / 2 - 0.5], [0, PAGE_PER_MM, size / 2 - 0.5], [0, 0, 1.0]])
+        matrix = middle @ np.vstack([moved, [0, 0, 1]]) @ np.linalg.inv(middle)
+        page = cv2.warpAffine(page, matrix[:2], (size, size), flags=cv2.INTER_LINEAR, borderValue=(1, 1, 1))
+    page = np.where(reserved[..., None], image, page)
     with torch.inference_mode():  # another printer than the promise has
         page = load_printer("uncoated").apply(torch.tensor(page.transpose(2, 0, 1)[None], dtype=torch.float32))
-    return surface, promised, linear_from_srgb(page[0].numpy().transpose(1, 2, 0).astype(float)).reshape(-1, 3)
+    return linear_from_srgb(page[0].numpy().transpose(1, 2, 0).astype(float))
 
 
 def flat(points: np.ndarray) -> np.ndarray:

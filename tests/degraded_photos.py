@@ -14,11 +14,27 @@ from functools import cache, partial
 
 import cv2
 import numpy as np
-from bent_paper import CENTER, PAGE_PER_MM, SIDE_MM, Place, bent, camera, cone, flat, folded, rolled, sheet
+from bent_paper import (
+    CENTER,
+    DESIGNS,
+    PAGE_PER_MM,
+    SIDE_MM,
+    Place,
+    bent,
+    camera,
+    cone,
+    flat,
+    folded,
+    printed,
+    printed_page,
+    rolled,
+    sheet,
+)
 from PIL import Image
 from scipy.sparse import csc_array
+from synthetic_photos import noisy_design, some_design
 
-from patchproof.base.color import srgb_from_linear
+from patchproof.base.color import linear_from_srgb, srgb_from_linear
 from patchproof.base.geometry import look_at, view_angles
 from patchproof.evidence.surface import PromisedColors, Surface
 
@@ -62,6 +78,13 @@ class Draw:
     zoom: float = 1.0  # digital: the middle, enlarged
     exif: dict[int, object] = field(default_factory=dict)
     twin: np.ndarray | None = None  # where the camera is, as a second print of the sheet has it
+    twin_sheet: str = "TESTSHEET0"  # of the second print
+    warp: Callable[[np.ndarray], np.ndarray] | None = None  # of pixels N×2 from the picture's middle
+    codes: Callable[[np.ndarray], np.ndarray] | None = None  # what is printed in place of the design
+    stretch: np.ndarray | float = 1.0  # of the whole print, along x and y
+    moved: np.ndarray | None = None  # 2×3: where the design was printed, in mm from the sheet's middle
+    marker_shift_mm: tuple[float, float] = (0.0, 0.0)
+    inks: Callable[[np.ndarray], np.ndarray] | None = None  # the page's linear light by other inks
 
 
 def fresh(rng: np.random.Generator) -> Draw:
@@ -191,6 +214,160 @@ def _twin(d: Draw) -> Draw:
     )
 
 
+def _stretched(d: Draw) -> Draw:
+    """Printed longer along one side by 1 to 5 %."""
+    return replace(d, stretch=np.exp(_sign(d.rng) * d.rng.uniform(0.01, 0.05) * np.array([1.0, 0.0])))
+
+
+def _squeezed(d: Draw) -> Draw:
+    """Saved in another shape: longer along one side by 2 to 12 %."""
+    scale = np.exp(_sign(d.rng) * d.rng.uniform(0.02, 0.12) * np.array([1.0, 0.0]))
+    return replace(d, warp=lambda off: off * scale)
+
+
+def _rolling_shutter(d: Draw) -> Draw:
+    """Rows read while the camera moves: sheared, stretched, and shaken."""
+    rng = d.rng
+    shear, stretch, shake = rng.normal(0, 0.06), rng.normal(0, 0.03), rng.choice([0.0, 1.0]) * rng.uniform(0, 2)
+    wave, start = 2 * np.pi / rng.uniform(200, 900), rng.uniform(0, 2 * np.pi)
+
+    def warp(off: np.ndarray) -> np.ndarray:
+        x, y = off.T
+        return np.column_stack([x + shear * y + shake * np.sin(wave * y + start), y * (1 + stretch)])
+
+    return replace(d, warp=warp)
+
+
+def _keystone(d: Draw) -> Draw:
+    """Perspective that software took away, all of it or a part, and the foreshortening with it; EXIF knows nothing."""
+    rng = d.rng
+    where = camera(_sign(rng) * rng.uniform(15, 45), rng.uniform(-20, 25), rng.uniform(380, 620))
+    slope = rng.uniform(0.4, 1.0) * where[:2, 2] / where[2, 2] / FOCAL  # at 1 no vanishing line is left
+    way, lengths, _ = np.linalg.svd(where[:2, :2])
+    widen = way @ np.diag([1.0, (lengths[0] / lengths[1]) ** rng.uniform(0, 1)]) @ way.T
+    return replace(d, camera_from_page=where, warp=lambda off: off @ widen / (1 + off @ slope)[:, None])
+
+
+def _moved(d: Draw, what: str) -> Draw:
+    """The design beside its place by 0.3 to 3 mm, or smaller or larger by 0.5 to 4 %."""
+    rng = d.rng
+    scale = np.exp(_sign(rng) * rng.uniform(0.005, 0.04)) if what == "scale" else 1.0
+    way = rng.uniform(0, 2 * np.pi)
+    shift = rng.uniform(0.3, 3) * np.array([np.cos(way), np.sin(way)]) if what == "shift" else np.zeros(2)
+    return replace(d, moved=np.column_stack([scale * np.eye(2), shift]), design=_textured(d))
+
+
+def _textured(d: Draw) -> str:
+    return d.design if d.design != "plain" else "noisy"
+
+
+def _displaced_marker(d: Draw) -> Draw:
+    way = d.rng.uniform(0, 2 * np.pi)
+    shift = d.rng.uniform(0.3, 3) * np.array([np.cos(way), np.sin(way)])
+    return replace(d, marker_shift_mm=tuple(shift), bends=bool(d.rng.random() < 0.5))
+
+
+def _small_ear(rng):
+    angle, reach = np.radians(rng.uniform(60, 150)), rng.uniform(72, 90)
+    return bent(lambda way: angle * (way > reach), np.pi / 4 + rng.integers(4) * np.pi / 2)
+
+
+def _second(d: Draw, how: str) -> Draw:
+    """A second print: partly out of the picture, far behind, covered, or of another sheet."""
+    rng, d = d.rng, _twin(d)
+    assert d.twin is not None
+    if how == "cut":
+        az, el, far = rng.uniform(-25, 25), rng.uniform(-15, 15), rng.uniform(450, 600)
+        half = far / FOCAL * SIZE[0] / 2
+        where = camera(az, el, far, 0, (half * rng.uniform(0.3, 0.5), 0))
+        return replace(d, camera_from_page=where, twin=camera(az, el, far, 0, (-half * rng.uniform(0.75, 1.0), 0)))
+    if how == "far":
+        far = rng.uniform(900, 2200)
+        aside = far / FOCAL * SIZE[0] / 2 * rng.uniform(0.3, 0.8)
+        return replace(d, twin=camera(rng.uniform(-30, 30), rng.uniform(-20, 20), far, 0, (-aside, 0)))
+    if how == "covered":
+        left = bool(rng.random() < 0.5)
+
+        def cover(light: np.ndarray) -> np.ndarray:
+            quad = _twin_px(d) if left else _twin_px(d)[[1, 0, 3, 2]]
+            part = np.array(
+                [quad[0], quad[0] + 0.6 * (quad[1] - quad[0]), quad[3] + 0.6 * (quad[2] - quad[3]), quad[3]]
+            )
+            light = light.copy()
+            cv2.fillConvexPoly(light, part.round().astype(np.int32), (0.3, 0.25, 0.2))
+            return light
+
+        return replace(d, on_light=[cover])
+    return replace(d, twin_sheet="OTHERSHEET")
+
+
+def _twin_px(d: Draw) -> np.ndarray:
+    corners = np.array([[-80, -80], [80, -80], [80, 80], [-80, 80.0]])
+    return _projected(d, flat(corners), d.twin, np.zeros_like)[0]
+
+
+def _foreign(change: Callable[[np.ndarray, np.random.Generator], np.ndarray]) -> Callable[[Draw], Draw]:
+    return lambda d: replace(d, design=_textured(d), codes=lambda codes: change(codes, d.rng))
+
+
+def _other_design(codes: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    other = (
+        noisy_design(int(rng.integers(1, 1000))) * 255 if rng.random() < 0.5 else some_design(int(rng.integers(9, 999)))
+    )
+    return other.astype(np.uint8)
+
+
+def _mean_color(codes: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    return np.broadcast_to(srgb_from_linear(linear_from_srgb(codes / 255).mean((0, 1))) * 255, codes.shape).astype(
+        np.uint8
+    )
+
+
+def _tiles(codes: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    tiles = codes.reshape(14, 10, 14, 10, 3).swapaxes(1, 2).reshape(196, 10, 10, 3)[rng.permutation(196)]
+    return tiles.reshape(14, 14, 10, 10, 3).swapaxes(1, 2).reshape(codes.shape)
+
+
+def _older(codes: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """An earlier version of the design: its coarse colors, but other detail."""
+    coarse = cv2.resize(codes, (4, 4), interpolation=cv2.INTER_AREA)
+    coarse = cv2.resize(coarse, codes.shape[1::-1], interpolation=cv2.INTER_CUBIC).astype(float)
+    detail = noisy_design(int(rng.integers(1, 1000))) * 255
+    return np.clip(coarse + 0.7 * (detail - cv2.GaussianBlur(detail, (0, 0), 15)), 0, 255).astype(np.uint8)
+
+
+# densities of red, green and blue by cyan, magenta and yellow ink
+_DYES = np.array([[1.0, 0.3, 0.1], [0.15, 1.0, 0.35], [0.03, 0.12, 1.0]])
+
+
+def _inks(change: Callable[[np.ndarray, np.random.Generator], np.ndarray]) -> Callable[[Draw], Draw]:
+    """Densities of cyan, magenta and yellow changed; black ink, which prints some of the dark, is not."""
+
+    def changed(d: Draw) -> Draw:
+        black = float(d.rng.choice([0.0, 0.8]))
+
+        def inks(light: np.ndarray) -> np.ndarray:
+            dyes = np.maximum(-np.log10(np.maximum(light, 1e-3)) @ np.linalg.inv(_DYES), 0)
+            key = black * dyes.min(-1, keepdims=True)
+            return 10 ** -(change(dyes - key, d.rng) @ _DYES + key * _DYES.sum(0))
+
+        return replace(d, design=_textured(d), inks=inks)
+
+    return changed
+
+
+def _without(ink: int):
+    return _inks(lambda dyes, rng: dyes * (np.arange(3) != ink))
+
+
+def _banded(dyes: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Clogged nozzles: bands in which an ink is missing."""
+    rows = np.arange(len(dyes)) / PAGE_PER_MM
+    missing = np.sin(2 * np.pi * rows / rng.uniform(2, 9) + rng.uniform(0, 6)) > rng.uniform(0.2, 0.7)
+    ink = int(rng.integers(3))
+    return dyes * (1 - missing[:, None, None] * (np.arange(3) == ink))
+
+
 MILD = ("plain", "defocus_1", "noise_mild", "jpeg_60", "motion_2", "shadow", "far", "lens_mild", "roll_300_1000_bends")
 KINDS: dict[str, Callable[[Draw], Draw]] = {
     "plain": lambda d: d,
@@ -239,6 +416,33 @@ KINDS: dict[str, Callable[[Draw], Draw]] = {
     "zoom_told": lambda d: replace(
         d, zoom=2.0, exif={0xA404: 2.0}, camera_from_page=camera(d.rng.uniform(-45, 45), 5, 900)
     ),
+    "dog_ear_small": _bent_by(_small_ear),
+    "second_cut": partial(_second, how="cut"),
+    "second_far": partial(_second, how="far"),
+    "second_covered": partial(_second, how="covered"),
+    "second_other": partial(_second, how="other"),
+    "stretched": _stretched,
+    "squeezed": _squeezed,
+    "rolling_shutter": _rolling_shutter,
+    "keystone": _keystone,
+    "design_shifted": partial(_moved, what="shift"),
+    "design_scaled": partial(_moved, what="scale"),
+    "marker_displaced": _displaced_marker,
+    "other_design": _foreign(_other_design),
+    "mean_color": _foreign(_mean_color),
+    "gray": _foreign(lambda codes, rng: np.full_like(codes, 128)),
+    "noise_cells": _foreign(lambda codes, rng: rng.integers(0, 256, (14, 14, 3), np.uint8).repeat(10, 0).repeat(10, 1)),
+    "tiles": _foreign(_tiles),
+    "mirrored_design": _foreign(lambda codes, rng: codes[:, ::-1]),
+    "turned_design": _foreign(lambda codes, rng: np.rot90(codes, int(rng.integers(1, 4)))),
+    "inverted": _foreign(lambda codes, rng: 255 - codes),
+    "older": _foreign(_older),
+    "no_cyan": _without(0),
+    "no_magenta": _without(1),
+    "no_yellow": _without(2),
+    "swapped_inks": _inks(lambda dyes, rng: dyes[..., [(1, 0, 2), (2, 1, 0), (0, 2, 1)][int(rng.integers(3))]]),
+    "banded": _inks(_banded),
+    "draft_gray": _inks(lambda dyes, rng: dyes.mean(-1, keepdims=True) * np.full(3, rng.uniform(0.5, 1.0))),
 }
 
 
@@ -246,24 +450,48 @@ def take(kind: str, seed: int) -> tuple[Degraded, Surface, PromisedColors]:
     """One photograph of that kind, and what it is measured against."""
     number = list(KINDS).index(kind)
     draw = KINDS[kind](fresh(np.random.default_rng([seed, number])))
-    surface, promised, page = sheet(draw.bends, draw.design)
+    surface, promised = sheet(draw.bends, draw.design)
+    page = _page(draw)
     wobble = _wobble(draw)
 
     def px(mm: np.ndarray, camera_from_page=draw.camera_from_page) -> np.ndarray:
-        return _projected(draw, draw.place(np.asarray(mm, float) - CENTER), camera_from_page, wobble)[0]
+        mm = np.asarray(mm, float) - CENTER
+        mm = mm if draw.moved is None else mm @ draw.moved[:, :2].T + draw.moved[:, 2]
+        return _projected(draw, draw.place(mm * draw.stretch), camera_from_page, wobble)[0]
 
     light = _background(draw)
-    for where in [draw.camera_from_page] + ([] if draw.twin is None else [draw.twin]):
-        light = _laid_on(light, page, *_projected(draw, draw.place(_samples() - CENTER), where, wobble))
+    light = _laid_on(
+        light, page, *_projected(draw, draw.place((_samples() - CENTER) * draw.stretch), draw.camera_from_page, wobble)
+    )
+    if draw.twin is not None:
+        page = printed(draw.bends, DESIGNS[draw.design](), draw.twin_sheet).reshape(-1, 3)
+        light = _laid_on(light, page, *_projected(draw, flat(_samples() - CENTER), draw.twin, wobble))
     for change in draw.on_light:
         light = change(light)
     codes = _exposed(light, draw)
     around = 0.01 * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
-    right, left, below, above = _projected(draw, draw.place(around), draw.camera_from_page, np.zeros_like)[0]
+    unwarped = replace(draw, warp=None)
+    right, left, below, above = _projected(unwarped, draw.place(around), draw.camera_from_page, np.zeros_like)[0]
     large, small = np.linalg.svd(np.stack([right - left, below - above], 1), compute_uv=False)
     azimuth, _, distance = view_angles(draw.camera_from_page, (0, 0))
     tilt = float(np.degrees(np.arccos(small / large)))
     return Degraded(_file(codes, draw), px, azimuth, tilt, distance), surface, promised
+
+
+def _page(draw: Draw) -> np.ndarray:
+    """The printed page's linear light, a row for each of `_samples`."""
+    usual = draw.codes is None and draw.moved is None and draw.marker_shift_mm == (0.0, 0.0)
+    codes = DESIGNS[draw.design]()
+    if usual:
+        page = printed_page(draw.bends, draw.design)
+    else:
+        page = printed(
+            draw.bends,
+            codes if draw.codes is None else draw.codes(codes),
+            moved=draw.moved,
+            marker_shift_mm=draw.marker_shift_mm,
+        )
+    return (page if draw.inks is None else draw.inks(page)).reshape(-1, 3)
 
 
 @cache
@@ -279,6 +507,7 @@ def _projected(draw: Draw, points: np.ndarray, camera_from_page, wobble) -> tupl
     off = seen[:, :2] * (FOCAL * draw.zoom / seen[:, 2:])
     if draw.lens:
         off *= 1 + draw.lens * (off**2).sum(1, keepdims=True) / (np.hypot(*SIZE) / 2) ** 2
+    off = off if draw.warp is None else draw.warp(off)
     shift = np.zeros(2) if draw.crop is None else np.array(draw.crop[:2])
     px = off + (np.array(SIZE) / 2 - shift)
     return (px + wobble(px) if draw.wobble_px else px), seen[:, 2]

@@ -66,7 +66,8 @@ def outcome(kind: str, seed: int, folder) -> Outcome:
     geometry, pose, off = entry.geometry, entry.pose, {}
     if geometry is not None and returned[-1] is not None:
         off["corners"] = _corner_error_mm(returned[-1], truth.px(CORNERS)), geometry.corner_uncertainty_mm
-        off["tilt"] = abs(geometry.tilt_deg - truth.tilt_deg), geometry.tilt_uncertainty_deg
+        if geometry.tilt_deg is not None:
+            off["tilt"] = abs(geometry.tilt_deg - truth.tilt_deg), geometry.tilt_uncertainty_deg
     if pose is not None and pose.azimuth_deg is not None:
         off["azimuth"] = abs(pose.azimuth_deg - truth.azimuth_deg), pose.azimuth_uncertainty_deg
     if pose is not None and pose.distance_mm is not None:
@@ -99,6 +100,27 @@ def test_what_is_called_measured_is_right(kind, tmp_path):
         assert result.measured and result.entry.pose is None
         expected = "contradicted" if kind == "crop_aside" else "cropped"
         assert result.entry.geometry is not None and result.entry.geometry.focal == expected
+
+
+@pytest.mark.parametrize(
+    ("kind", "seed", "code"),
+    [
+        ("squeezed", 0, None),
+        ("rolling_shutter", 0, None),
+        ("design_scaled", 8, None),
+        ("design_scaled", 1, "curled"),
+        ("dog_ear_small", 0, "too_few_markers"),
+        ("second_covered", 0, "several_sheets"),
+        ("draft_gray", 0, "wrong_ink"),
+    ],
+)
+def test_what_prints_and_pictures_do_to_a_sheet_is_in_the_uncertainty_or_refused(kind, seed, code, tmp_path):
+    result = outcome(kind, seed, tmp_path)
+    assert result.entry.code == code and not result.wrong()
+    geometry = result.entry.geometry
+    if geometry is not None and geometry.focal == "contradicted":
+        assert result.entry.pose is None and geometry.tilt_deg is geometry.tilt_uncertainty_deg is None
+    assert kind not in ("squeezed", "rolling_shutter") or (geometry and geometry.focal == "contradicted")
 
 
 def main() -> None:

@@ -93,8 +93,47 @@ def test_light_and_white_balance_are_no_color_difference_but_another_design_is()
     assert tinted == pytest.approx(plain, abs=0.5)
 
 
-def test_another_design_is_seen():
-    assert measured(shot(), manifest=make_manifest(design=some_design(9))).entry.color.delta_e00_mean > 40
+def without_ink(channel: int, design: np.ndarray) -> np.ndarray:
+    """What an ink's own channel has where that ink is missing: the light that the others let through."""
+    light = linear_from_srgb(design / 255)
+    light[..., channel] = 0.75 + 0.25 * np.delete(light, channel, -1).mean(-1)
+    return (srgb_from_linear(light) * 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("printed", "code"),
+    [
+        (lambda design: some_design(9), "other_design"),
+        (lambda design: np.full_like(design, design.mean((0, 1)).astype(np.uint8)), "other_design"),
+        (lambda design: design[:, ::-1], "other_design"),
+        (lambda design: 255 - design, "other_design"),
+        (functools.partial(without_ink, 0), "wrong_ink"),
+        (functools.partial(without_ink, 1), "wrong_ink"),
+        (functools.partial(without_ink, 2), "wrong_ink"),
+        (lambda design: np.repeat(design.mean(-1, keepdims=True), 3, -1).astype(np.uint8), "wrong_ink"),
+    ],
+)
+def test_another_design_and_a_print_without_an_ink_do_not_count(printed, code):
+    page = page_raster(make_manifest(design=np.ascontiguousarray(printed(some_design()))), True)
+    photo = measured(photograph(page, view(10, 5, 550, size_px=(800, 600)), (800, 600), blur_px=0.5, fine=2))
+    assert not photo.counted and (photo.entry.status, photo.entry.code) == ("rejected", code)
+    assert photo.entry.remark.figure < photo.entry.remark.threshold
+
+
+def test_a_design_of_one_color_is_told_from_others_by_structure_ink_and_color():
+    gray, black = np.full((140, 140, 3), 150, np.uint8), np.full((140, 140, 3), 20, np.uint8)
+    page = page_raster(make_manifest(design=gray), True)
+    photo = photograph(page, view(10, 5, 550, size_px=(800, 600)), (800, 600), blur_px=0.5, fine=2)
+    assert measured(photo, manifest=make_manifest(design=gray)).entry.code is None
+    for design, shown, code in (
+        (gray, shot(), "other_design"),
+        (some_design(), photo, "other_design"),
+        (black, photo, "other_design"),
+    ):
+        assert measured(shown, manifest=make_manifest(design=design)).entry.code == code
+    page = page_raster(make_manifest(design=without_ink(0, gray)), True)
+    photo = photograph(page, view(10, 5, 550, size_px=(800, 600)), (800, 600), blur_px=0.5, fine=2)
+    assert measured(photo, manifest=make_manifest(design=gray)).entry.code == "wrong_ink"
 
 
 def coated(srgb: np.ndarray) -> np.ndarray:

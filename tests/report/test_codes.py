@@ -108,12 +108,12 @@ def test_an_azimuth_that_corners_cannot_tell_is_not_measured():
             assert pose.azimuth_deg == pytest.approx(10, abs=2) and pose.distance_mm == pytest.approx(1500, rel=0.01)
 
 
-def test_one_foreign_marker_is_clutter_and_two_are_another_sheet(monkeypatch):
+def test_one_foreign_marker_is_clutter_two_or_one_of_this_sheet_twice_are_another_print(monkeypatch):
     borders = Borders(np.zeros((4, 2)), 1.0, 4.0, True)
     for foreign, doubled, code in (
         ((7,), (), None),
         ((7, 8), (), "several"),
-        ((), (100,), None),
+        ((), (100,), "several"),
         ((), (100, 101), "several"),
     ):
         found = MarkersInView({i: borders for i in PIECE_IDS}, foreign, doubled)

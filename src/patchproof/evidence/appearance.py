@@ -17,6 +17,7 @@ import numpy as np
 
 from patchproof.base.color import ciede2000, lab_from_linear, photo_codes_from_srgb, srgb_from_linear
 from patchproof.base.geometry import rect_corners
+from patchproof.evidence.design_match import DesignMatch, match_design
 from patchproof.evidence.results import Color, Geometry
 from patchproof.evidence.surface import PromisedColors, Surface
 from patchproof.photo.colorfit import ColorFit, affine12, white_black
@@ -43,9 +44,9 @@ def appearance(
     light: FrameLight,
     geometry: Geometry,
     with_pictures: bool = True,
-) -> tuple[Color, dict[str, np.ndarray]]:
-    """Measure the color difference of the whole design (None if more than half of it is clipped) and, if
-    `with_pictures`, make pictures: uint8 sRGB, and float cells as `delta_e00`.
+) -> tuple[Color, dict[str, np.ndarray], DesignMatch]:
+    """Measure the color difference of the whole design (None if more than half of it is clipped); if `with_pictures`,
+    make pictures: uint8 sRGB, and float cells as `delta_e00`; and compare the design with the promised one.
     """
     cells_per_mm, picture_per_mm = _cells_per_mm(surface, geometry), _PICTURE_PX / max(surface.rect_mm[2:])
     px_per_sample = least_px_per_mm(px_from_mm, surface.rect_mm) / max(_SAMPLES_PER_CELL * cells_per_mm, picture_per_mm)
@@ -62,6 +63,9 @@ def appearance(
     expected = coarse_cells(design, photographed.shape[:2], blur_mm * design.shape[1] / surface.rect_mm[2])
     usable = ~clipped
     usable[[0, -1]] = usable[:, [0, -1]] = False
+    middles_mm = (np.indices(usable.shape)[::-1].reshape(2, -1).T + 0.5) / cells_per_mm + surface.rect_mm[:2]
+    free = ~surface.on_marker(middles_mm, 0.5 / cells_per_mm).reshape(usable.shape)
+    match = match_design(photographed, expected, usable & free, light)
     fit = fit_cells(photographed[usable], expected[usable], light, promised.ink)
     cells = _cross_fitted_cells(photographed, expected, usable, fit, light, promised.ink)
     delta = ciede2000(lab_from_linear(expected), lab_from_linear(cells))
@@ -77,11 +81,11 @@ def appearance(
         p95 = float(np.percentile(valid_delta, 95))
         color = color.changed(delta_e00_mean=float(valid_delta.mean()), delta_e00_p95=p95)
     if not with_pictures:
-        return color, {}
+        return color, {}, match
     seen = resize_by_area(flat, rectified_px(surface.rect_mm, picture_per_mm))[..., :3]
     lights = {"seen": seen, "fitted": fit.apply(seen), "promised": coarse_cells(design, seen.shape[:2], 0.0)}
     pictures = {kind: photo_codes_from_srgb(srgb_from_linear(linear)) for kind, linear in lights.items()}
-    return color, pictures | {"delta_e00": np.where(usable, delta, np.nan).astype(np.float32)}
+    return color, pictures | {"delta_e00": np.where(usable, delta, np.nan).astype(np.float32)}, match
 
 
 def _reduced_light(srgb: np.ndarray, step: int) -> np.ndarray:
@@ -137,7 +141,7 @@ def _glossy(cells: np.ndarray, expected: np.ndarray) -> np.ndarray:
 
 
 def _cells_per_mm(surface: Surface, geometry: Geometry) -> float:
-    foreshortened = np.sqrt(max(np.cos(np.radians(geometry.tilt_deg)), 0.05))
+    foreshortened = np.sqrt(max(np.cos(np.radians(geometry.tilt_deg or 0.0)), 0.05))
     cell_mm = max(2.0, 2 * geometry.blur_px) / geometry.px_per_mm / foreshortened
     cell_mm = max(cell_mm, 4 * geometry.corner_uncertainty_mm)
     side_mm = min(surface.rect_mm[2:])

@@ -49,7 +49,7 @@ _EMPTY_ADVICE = "it shows one tone or noise and nothing else: take it again"
 _CROP_ADVICE = "it is a crop or a screenshot by its shape, its name or EXIF: it counts, but use the camera's own file"
 _OTHER_DPI = "resolutions of scans by their files, {:.0f} × {:.0f} dpi, where --scan-dpi says {:g}"
 # codes of photographs whose homography is still accurate enough to put pieces into them
-MEASURABLE_CODES = (None, "clipped", "blurred", "too_small", "cropped")
+MEASURABLE_CODES = (None, "clipped", "blurred", "too_small", "cropped", "weak_ink")
 
 # linear light of paper and ink, within the bounds of `frame_light`; negative where a print is lighter than its paper
 LightLevel = Annotated[Finite, Field(ge=-4, le=4)]

@@ -60,7 +60,7 @@ def _view(photo: MeasuredPhoto, session: int, rect_mm: Rect) -> np.ndarray | Non
         return None
     light = np.log(np.maximum(photo.light.paper, 1e-3)) / LIGHT_TOLERANCE
     scale = np.log(geometry.px_per_mm / max(size_px)) / SCALE_TOLERANCE
-    tilt = np.cos(np.radians(geometry.tilt_deg)) / TILT_TOLERANCE
+    tilt = np.nan if geometry.tilt_deg is None else np.cos(np.radians(geometry.tilt_deg)) / TILT_TOLERANCE
     corners = np.full((4, 2), np.nan)  # unknown on rolled paper
     if geometry.homography_px_from_mm is not None:
         corners = apply_homography(np.array(geometry.homography_px_from_mm), rect_corners(rect_mm)) / max(size_px)

@@ -31,6 +31,8 @@ _LEAST_CELLS = 3
 _TANGENT_MM = 5.0  # of paper round the middle that stands for a plane
 _SHIFT_PERCENTILE = 80  # of the cells; gloss, a shadow's edge or a thumb may lie over the others
 _SURE_SIGMAS = 2.0
+# of a cell: up to 1.2 where another printer's colors displace a smooth design's corners, 0.3 for designs with detail
+_OFFSET_SIGMAS, _LEAST_OFFSET_CELLS = 1.25, 9
 _OUTLIER_FACTOR = 2.0  # the design's corner beside an outlier marker may lie off by more than the marker
 # 95 % errors beyond which a figure is "not measured": the x:y ratio's, the azimuth's (beyond some 10° a view from the
 # left cannot be told from one from the right), and the distance's
@@ -124,27 +126,37 @@ def object_box(view: PinholePhoto, location: LocatedSheet, surface: Surface) -> 
 
 
 def geometry_of(
-    location: LocatedSheet, detected: MarkersInView, light: FrameLight, surface: Surface, colors: PromisedColors | None
-) -> tuple[Geometry, int]:
-    """Measure the sheet's geometry, and count the corners of the design in which its pixels were found: four if that
-    is unknown.
+    view: PinholePhoto,
+    location: LocatedSheet,
+    detected: MarkersInView,
+    light: FrameLight,
+    surface: Surface,
+    colors: PromisedColors | None,
+) -> tuple[Geometry, int, tuple[float, int]]:
+    """Measure the sheet's geometry; count the corners of the design in which its pixels were found, four if that is
+    unknown; and give the share found of the cells with detail between the markers, with their number.
     """
     fit, unrolled = location.fit, location.unrolled
     px_per_mm, tilt_deg = sheet_pose.scale_and_tilt(location.px, location.parameters, surface.center_mm)
-    blur, shift, corners = blur_px(detected.markers.values()), None, 4
+    blur, shift, corners, found = blur_px(detected.markers.values()), None, 4, (1.0, 0)
     uncertainty = unrolled.uncertainty_mm if unrolled else corner_uncertainty_mm(fit, surface.rect_mm)
     uncertainty = float(np.hypot(uncertainty, _OUTLIER_FACTOR * fit.outlier_mm))
     # one page of a piece in tiles has none of the piece's markers, or some of them
     if colors is not None and surface.piece_ids:
         cells = register(location.srgb, fit.px_from_mm, surface.rect_mm, colors.design, px_per_mm, blur)
-        shift, corners, corner_shift = _shifts(cells, surface)
-        uncertainty = float(np.hypot(uncertainty, _SURE_SIGMAS * corner_shift))
+        shift, corners, corner_shift = _shifts(cells, detected, surface)
+        free = ~surface.on_marker(cells.middle_mm, cells.size_mm / 2)
+        found = float(np.isfinite(cells.sigma_mm[free]).mean()) if free.any() else 1.0, int(free.sum())
+        offset = _offset_mm(cells, free, surface)
+        uncertainty = float(np.linalg.norm([uncertainty, _SURE_SIGMAS * corner_shift, offset]))
+        shift = None if shift is None else max(shift, offset)
     tilt_model = location.px, location.parameters, location.covariance, surface.center_mm, _turn_rad(location, surface)
+    distortion = None if unrolled else sheet_pose.distortion_of(fit, view.matrix_px, view.focal_spread)
     geometry = Geometry(
         residual_mm=fit.residual_mm,
         px_per_mm=px_per_mm,
         tilt_deg=tilt_deg,
-        tilt_uncertainty_deg=sheet_pose.tilt_uncertainty_deg(*tilt_model),
+        tilt_uncertainty_deg=sheet_pose.tilt_uncertainty_deg(*tilt_model, distortion),
         contrast=light.contrast,
         blur_px=blur,
         corner_uncertainty_mm=uncertainty,
@@ -154,7 +166,7 @@ def geometry_of(
         # no homography maps a page that was unrolled to the photograph
         homography_px_from_mm=None if unrolled else fit.px_from_mm.tolist(),
     )
-    return geometry, corners
+    return geometry, corners, found
 
 
 def _turn_rad(location: LocatedSheet, surface: Surface) -> float:
@@ -163,9 +175,24 @@ def _turn_rad(location: LocatedSheet, surface: Surface) -> float:
     )
 
 
-def _shifts(cells: Registration, surface: Surface) -> tuple[float | None, int, float]:
-    """The 80 % point of the cells' significant shifts in mm; the number of corners in which the design was found; the
-    largest significant shift in a corner. Significant is what exceeds two standard deviations.
+def _offset_mm(cells: Registration, free: np.ndarray, surface: Surface) -> float:
+    """The shift of the farthest of the design's corners by an affine map of the cells `free`; 0 if it is not
+    significant, `MOST_SHIFT` at most where cells are so smooth that a print's colors shift them, too.
+    """
+    most = MOST_SHIFT * min(surface.rect_mm[2:])
+    free = free & (cells.sigma_mm < most)  # False where NaN
+    if free.sum() < _LEAST_OFFSET_CELLS:
+        return 0.0
+    sigma, rows = cells.sigma_mm[free], np.column_stack([cells.middle_mm[free], np.ones(free.sum())])
+    affine = np.linalg.lstsq(rows / sigma[:, None], cells.shift_mm[free] / sigma[:, None], rcond=None)[0]
+    corners = np.column_stack([rect_corners(surface.rect_mm), np.ones(4)])
+    offset, sigma = float(np.linalg.norm(corners @ affine, axis=1).max()), float(np.median(sigma))
+    return 0.0 if offset < _OFFSET_SIGMAS * sigma else offset if sigma < most / 4 else min(offset, most)
+
+
+def _shifts(cells: Registration, detected: MarkersInView, surface: Surface) -> tuple[float | None, int, float]:
+    """The 80 % point of the cells' significant shifts in mm; the number of corners in which the design and a marker, if
+    one belongs there, were found; the largest significant shift in a corner. Significant: over two standard deviations.
     """
     shift = np.linalg.norm(cells.shift_mm, axis=1)
     significant = np.maximum(shift - _SURE_SIGMAS * cells.sigma_mm, 0)
@@ -175,7 +202,9 @@ def _shifts(cells: Registration, surface: Surface) -> tuple[float | None, int, f
     corners, largest = 0, 0.0
     for corner in rect_corners(surface.rect_mm):
         nearby = np.abs(cells.middle_mm - corner).max(1) < side / 8
-        corners += not nearby.any() or bool(np.isfinite(shift[nearby]).any())
+        markers = [i for i in surface.piece_ids if np.abs(surface.corners_mm[i] - corner).max() < side / 4]
+        is_seen = not nearby.any() or bool(np.isfinite(shift[nearby]).any())
+        corners += is_seen and (not markers or any(i in detected.markers for i in markers))
         largest = max(largest, float(significant[nearby & sure].max(initial=0)))
     return most_cells, corners, largest
 

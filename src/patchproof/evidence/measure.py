@@ -17,6 +17,7 @@ import numpy as np
 from patchproof.base.geometry import MM_PER_INCH, apply_homography, rect_corners
 from patchproof.evidence.appearance import MOST_CLIPPED, appearance
 from patchproof.evidence.camera import PinholePhoto
+from patchproof.evidence.design_match import DesignMatch
 from patchproof.evidence.locate import MOST_SHIFT, LocatedSheet, camera_pose, geometry_of, locate_sheet, object_box
 from patchproof.evidence.ranges import PromisedRanges
 from patchproof.evidence.results import Geometry, PhotoEntry, Remark, Scale, Trace
@@ -53,9 +54,7 @@ _NOT_ROLLED_ADVICE = (
     "the markers do not lie as on paper that is rolled in one direction: show all of the piece from nearer to the "
     "middle of its bend, and glue down what stands off the surface"
 )
-_SHIFTED_ADVICE = (
-    "the design lies elsewhere than its markers say, on paper that is bent between them: press it down on its surface"
-)
+_SHIFTED_ADVICE = "the design lies elsewhere than its markers say: press it down on its surface, or print it again"
 _HIDDEN_ADVICE = "a corner of the design is covered, folded away or out of the picture: show all of it"
 
 
@@ -96,32 +95,38 @@ def measure(
         return MeasuredPhoto(entry(status="judged", remark=Remark.of(trouble)), True)
     light = frame_light(view.srgb, detected.markers.values())
     fit = location.fit
-    geometry, corners = geometry_of(location, detected, light, surface, promised)
+    geometry, corners, found = geometry_of(view, location, detected, light, surface, promised)
     pose, focal = camera_pose(view, location, surface)
-    geometry = geometry.changed(focal=focal)
-    entry = partial(entry, geometry=geometry, pose=pose, box=object_box(view, location, surface))
+    # a stretched print, a squeezed picture or a rolling shutter tilts a sheet that stands straight
+    contradicted = {"tilt_deg": None, "tilt_uncertainty_deg": None} if focal == "contradicted" else {}
+    told = geometry.changed(focal=focal, **contradicted)
+    entry = partial(entry, geometry=told, pose=pose, box=object_box(view, location, surface))
     page_check = _is_uncut(location, detected, surface)
     scale = None if scan_dpi is None else _scan_scale(fit.px_from_mm, surface, scan_dpi)
     counted = not page_check and scale is None
     trouble = _trouble(geometry, fit, detected, surface, corners)
+    color, pictures, match = None, {}, DesignMatch()
     try:
         if page_check and surface.page_mm is not None:
             refuse_other_page(view.srgb, fit.px_from_mm, surface.page_mm, surface.label)
         if counted and (outside := ranges.violated(entry(status="judged"), trust_angles=trouble is None)) is not None:
             raise outside
+        # one page of a piece in tiles has none of the piece's markers, or some of them
+        if promised is not None and surface.piece_ids:
+            seen = location.srgb, fit.px_from_mm, surface, promised, light, geometry, with_pictures and trouble is None
+            color, pictures, match = appearance(*seen)
+            if trouble is None and color.clipped_share > MOST_CLIPPED:
+                advice = "the patch is overexposed: lower the exposure by one or two steps"
+                trouble = PhotoRejected("clipped", color.clipped_share, MOST_CLIPPED, advice)
+            trouble = match.trouble_beside(trouble, *found)
     except PhotoRejected as rejection:
         return MeasuredPhoto(entry(status="rejected", remark=Remark.of(rejection)), False)
-    color, pictures = None, {}
-    # one page of a piece in tiles has none of the piece's markers, or some of them
-    if trouble is None and promised is not None and surface.piece_ids:
-        color, pictures = appearance(location.srgb, fit.px_from_mm, surface, promised, light, geometry, with_pictures)
-        if color.clipped_share > MOST_CLIPPED:
-            advice = "the patch is overexposed: lower the exposure by one or two steps"
-            trouble = PhotoRejected("clipped", color.clipped_share, MOST_CLIPPED, advice)
+    if trouble is not None and trouble.code != "clipped":
+        color = None
     if trouble is not None:
         entry = partial(entry, status="judged", remark=Remark.of(trouble))
     else:
-        remark = _print_check(page_check, scale, scan_dpi)
+        remark = _print_check(page_check, scale, scan_dpi) or match.weak_ink
         scale = scale if scale is not None and _SCALE_RANGE[0] < _worst(scale) < _SCALE_RANGE[1] else None
         entry = partial(entry, status="measured", scale=scale, remark=remark)
     return MeasuredPhoto(entry(color=color), counted, pictures, light)
@@ -148,7 +153,8 @@ def identify_sheet(srgb: np.ndarray, surface: Surface) -> tuple[MarkersInView, S
             advice = f"this shows {which}: name that sheet's JSON, or leave the photo out"
             raise PhotoRejected("wrong_sheet", len(detected.foreign), 0, advice)
         raise PhotoRejected("too_few_markers", 0, 1, "no marker is readable: show the whole patch, sharp and well lit")
-    if len(detected.foreign) > 1 or len(detected.doubled) > 1:
+    # clutter may look like one of a thousand markers, but hardly like one of this sheet's
+    if len(detected.foreign) > 1 or detected.doubled:
         extra_markers = max(len(detected.foreign), len(detected.doubled))
         advice = "more than one sheet is in view: photograph one at a time"
         raise PhotoRejected("several_sheets", extra_markers, 1, advice)
@@ -186,7 +192,7 @@ def _trouble(
     """Find the first reason why geometry or color cannot be trusted; None if they can. The design was recognized in
     `corners` of its four corners.
     """
-    tilt, blur, residual = geometry.tilt_deg, geometry.blur_px, geometry.residual_mm
+    tilt, blur, residual = geometry.tilt_deg or 0.0, geometry.blur_px, geometry.residual_mm
     side_mm, uncertainty = min(surface.rect_mm[2:]), geometry.corner_uncertainty_mm
     most_blur = MOST_BLUR * float(np.median([b.module_px for b in detected.markers.values()]))
     side_px, most_residual = side_mm * geometry.px_per_mm, MOST_RESIDUAL * side_mm
@@ -211,9 +217,9 @@ def _trouble(
         (bent, "curled", residual, most_residual, bent_advice),
         (bend > most_bend, "curled", bend, most_bend, bent_advice),
         (fit.outlier_mm > MOST_OUTLIER * side_mm, "curled", fit.outlier_mm, MOST_OUTLIER * side_mm, bent_advice),
+        (shift > most_shift, "curled", shift, most_shift, _SHIFTED_ADVICE),
         (uncertain and markers < 3, "too_few_markers", markers, 3, _FEW_MARKERS_ADVICE),
         (uncertain, "too_small", uncertainty, most_uncertainty, uncertain_advice),
-        (shift > most_shift, "curled", shift, most_shift, _SHIFTED_ADVICE),
         (corners < 4, "too_few_markers", corners, 4, _HIDDEN_ADVICE),
     ):
         if fails:

@@ -96,7 +96,8 @@ def figures_of(entry: PhotoEntry, side_px: float | None) -> dict[str, float]:
     if geometry is None:
         return {}
     scale = 1.0 if side_px is None or entry.photo_px is None else side_px / min(entry.photo_px)
-    figures = {"px_per_mm": scale * geometry.px_per_mm, "tilt_deg": geometry.tilt_deg}
+    figures = {"px_per_mm": scale * geometry.px_per_mm}
+    figures |= {} if geometry.tilt_deg is None else {"tilt_deg": geometry.tilt_deg}
     figures |= {} if azimuth_deg is None else {"azimuth_deg": azimuth_deg}
     return figures | {"contrast": geometry.contrast, "blur_px": scale * geometry.blur_px}
 

@@ -42,7 +42,7 @@ class Geometry(StrictModel):
 
     residual_mm: Finite
     px_per_mm: Finite
-    tilt_deg: Finite
+    tilt_deg: Finite | None  # null where the focal length is contradicted
     contrast: Finite
     blur_px: Finite
     corner_uncertainty_mm: Finite

@@ -62,6 +62,13 @@ class Surface:
         """Ids of the page's markers outside of the cut."""
         return frozenset(self.corners_mm) - self.piece_ids
 
+    def on_marker(self, points_mm: np.ndarray, margin_mm: float) -> np.ndarray:
+        """True for points N×2 within a marker of the piece, its quiet zone or the margin about it."""
+        markers = np.stack([self.corners_mm[i] for i in sorted(self.piece_ids)])
+        margin = np.ptp(markers, axis=1) / MARKER_MODULES + margin_mm
+        low, high = markers.min(1) - margin, markers.max(1) + margin
+        return ((points_mm[:, None] > low) & (points_mm[:, None] < high)).all(2).any(1)
+
 
 @dataclass(frozen=True)
 class PromisedColors:

@@ -28,6 +28,9 @@ _MIN_TRIAL_CORRELATION = 0.5
 _TRIAL_OFFSETS = tuple((x, y) for x in (-0.4, 0.0, 0.4) for y in (-0.4, 0.0, 0.4))
 # px of a marker's side, 4 per module: the detector reads 0.99 of these, so one that is missing must be covered
 READABLE_PX = 28.0
+# px of a marker's side from which reduced pictures show a second print: of 36 photographs with one, at up to twice the
+# distance, the level at which the first print is complete shows 20, the level that this asks for 35
+SECOND_PRINT_PX = 17.0
 
 
 def find_sheet(
@@ -36,7 +39,7 @@ def find_sheet(
     """Find the markers of `corners_mm` (page mm by id) in a uint8 photograph.
 
     The search ends when each of `expected` is found, out of the picture or covered, unless a finer level could decide
-    about a single foreign marker or one at two places.
+    about a single foreign marker, or show a second print at twice the distance.
     """
     aruco = aruco_dictionary(dictionary)
     detections: Detections = {}
@@ -51,12 +54,16 @@ def find_sheet(
         missing = expected - view.markers.keys()
         if missing and view.markers:
             missing, region = _findable(srgb, missing, view, corners_mm, level.scale)
-        # one marker at two places, or of another sheet, is either clutter or the first one read of a second print,
-        # which a finer level can tell
-        unclear = len(view.doubled) == 1 or (len(view.foreign) == 1 and view.foreign != foreign)
-        if not missing and not unclear:
+        # one marker of another sheet is either clutter or the first one read of it, which a finer level can tell
+        unclear = len(view.foreign) == 1 and view.foreign != foreign
+        if not missing and not unclear and (level.scale >= 1 or _shows_half_size(view, level.scale)):
             break
     return view
+
+
+def _shows_half_size(view: MarkersInView, scale: float) -> bool:
+    """True if a second print, twice as far away as this one, could be read at this scale."""
+    return scale * max((_side_px(b.corners_px) for b in view.markers.values()), default=0.0) > 2 * SECOND_PRINT_PX
 
 
 def _findable(srgb, missing: Ids, view: MarkersInView, corners_mm, scale: float) -> tuple[Ids, ImageRegion]:

@@ -30,6 +30,9 @@ from patchproof.photo.shapes import Project, Shape
 # one σ of errors that are no noise of corners: of |r1| = |r2|, printers' errors of proportion; of both equations, of
 # angles in radians and of lengths, paper that is not quite flat or round, and lenses
 _PRINT_STRETCH, _PAPER = 0.015, 0.003
+# one σ of the stretch that tilts allow for where perspective cannot tell: prints stretched by up to 5 % and pictures
+# squeezed by up to 12 % then stay within three times what is stated, at half the width that 0.015 gives
+_TILT_STRETCH = 0.008
 _MAX_CHI2 = 9.2  # 99 % of two degrees of freedom
 _MAX_SIGMAS = 2.6
 _MAX_CONFIRMING_SPREAD = 0.1  # of the focal length's logarithm: perspective with a larger one cannot confirm it
@@ -61,6 +64,18 @@ def turn_rad(bend: float, shape: Shape | None) -> float:
     beyond noise, as a share of the paper's side) and from the turn of a `shape` between its markers.
     """
     return float(np.hypot(_TURN_PER_BEND * bend, 0.0 if shape is None else _HIDDEN_TURN * shape.hidden_turn_rad))
+
+
+def distortion_of(fit: PageFit, matrix_px: np.ndarray | None, focal_spread: float) -> tuple[np.ndarray, np.ndarray]:
+    """Estimate shear and stretch (the logarithm of x over y) of a print or picture by a flat sheet's perspective: mean
+    (2,) and covariance 2×2; without a matrix they are what prints usually have.
+    """
+    expected, paper = _TILT_STRETCH**2 * np.eye(2), _PAPER**2 * np.eye(2)
+    if matrix_px is None:
+        return np.zeros(2), expected + paper
+    error, covariance, by_focal = _disagreement(fit, matrix_px)
+    gain = np.linalg.solve(expected + covariance + focal_spread**2 * np.outer(by_focal, by_focal), expected).T
+    return gain @ error, expected - gain @ expected + paper
 
 
 def flat_sheet_position(
@@ -125,15 +140,19 @@ def scale_and_tilt(px: Project, parameters: np.ndarray, point_mm) -> tuple[float
 
 
 def tilt_uncertainty_deg(
-    px: Project, parameters: np.ndarray, covariance: np.ndarray, point_mm, turn: float = 0.0
+    px: Project, parameters: np.ndarray, covariance: np.ndarray, point_mm, turn: float = 0.0, distortion=None
 ) -> float:
-    """The 95 % uncertainty of the tilt of `scale_and_tilt`, by the parameters' covariance and a `turn_rad`."""
+    """The 95 % uncertainty of the tilt of `scale_and_tilt`, by the parameters' covariance, a `turn_rad` and a
+    `distortion_of`.
+    """
     root, stretch = root_of_scaled(covariance), _stretch(px, parameters, point_mm)
     sides = [[_stretch(px, parameters + sign * axis, point_mm) for axis in root.T] for sign in (1, -1)]
     by_axis = (np.array(sides[0]) - np.array(sides[1])) / 2
     rng = np.random.default_rng(0)  # fixed, so that the same photo gives the same bytes
     draws = stretch + np.einsum("nk,kij->nij", rng.standard_normal((1000, len(by_axis))), by_axis)
-    paper = np.eye(2) + _PAPER * rng.standard_normal((1000, 2, 2))
+    mean, spread = (np.zeros(2), 2 * _PAPER**2 * np.eye(2)) if distortion is None else distortion
+    shear, stretch_x = (mean + rng.standard_normal((1000, 2)) @ root_of(spread).T).T / 2
+    paper = np.eye(2) - np.moveaxis(np.array([[stretch_x, shear], [shear, -stretch_x]]), -1, 0)
     errors = _tilt_deg(draws @ paper) - _tilt_deg(stretch[None])
     return float(np.hypot(np.percentile(np.abs(errors), 95), 1.96 * np.degrees(turn)))
 
@@ -170,6 +189,20 @@ def _agreement(fit: PageFit, matrix_px: np.ndarray, focal_spread: float) -> tupl
     """(True or False if r1 and r2 confirm or contradict the focal length within their uncertainty, None if they cannot
     tell; the spread of its logarithm from perspective alone, one standard deviation).
     """
+    error, covariance, by_focal = _disagreement(fit, matrix_px)
+    covariance += np.diag([_PAPER**2, _PRINT_STRETCH**2 + _PAPER**2])
+    # an off-center principal point changes r1 and r2, too, and may cancel a wrong focal length: confirming takes more
+    confirming = covariance + _PRINT_STRETCH**2 * np.eye(2)
+    own_spread = 1 / np.sqrt(max(float(by_focal @ np.linalg.solve(confirming, by_focal)), 1e-12))
+    if error @ np.linalg.solve(covariance + focal_spread**2 * np.outer(by_focal, by_focal), error) > _MAX_CHI2:
+        return False, own_spread
+    return (True if own_spread < _MAX_CONFIRMING_SPREAD else None), own_spread
+
+
+def _disagreement(fit: PageFit, matrix_px: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The errors (2,) of r1 · r2 = 0 and |r1| = |r2|, their covariance by the fit's, and their derivatives by the
+    focal length's logarithm.
+    """
     entries = fit.px_from_mm.ravel()[:8]
 
     def residuals(log_scale: float) -> np.ndarray:
@@ -178,15 +211,8 @@ def _agreement(fit: PageFit, matrix_px: np.ndarray, focal_spread: float) -> tupl
 
     inverse = np.linalg.inv(matrix_px)
     by_entries = np.stack([gradient(f, entries, inverse) for f in (cosine, log_ratio)])
-    covariance = by_entries @ fit.covariance @ by_entries.T + np.diag([_PAPER**2, _PRINT_STRETCH**2 + _PAPER**2])
-    by_focal = (residuals(0.01) - residuals(-0.01)) / 0.02
-    error = residuals(0.0)
-    # an off-center principal point changes r1 and r2, too, and may cancel a wrong focal length: confirming takes more
-    confirming = covariance + _PRINT_STRETCH**2 * np.eye(2)
-    own_spread = 1 / np.sqrt(max(float(by_focal @ np.linalg.solve(confirming, by_focal)), 1e-12))
-    if error @ np.linalg.solve(covariance + focal_spread**2 * np.outer(by_focal, by_focal), error) > _MAX_CHI2:
-        return False, own_spread
-    return (True if own_spread < _MAX_CONFIRMING_SPREAD else None), own_spread
+    covariance = by_entries @ fit.covariance @ by_entries.T
+    return residuals(0.0), covariance, (residuals(0.01) - residuals(-0.01)) / 0.02
 
 
 def _tilt_deg(stretch: np.ndarray) -> np.ndarray:

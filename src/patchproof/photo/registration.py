@@ -39,6 +39,7 @@ class Registration:
     middle_mm: np.ndarray
     shift_mm: np.ndarray
     sigma_mm: np.ndarray
+    size_mm: float  # side of a cell
 
 
 def register(
@@ -66,7 +67,7 @@ def register(
             sigma = error * np.sqrt(1 / peak**2 - 1)
             rows.append([left + size / 2, top + size / 2, dx - search, dy - search, sigma])
     table = np.array(rows).reshape(-1, 5) / scale
-    return Registration(table[:, :2] + [x, y], table[:, 2:4], table[:, 4])
+    return Registration(table[:, :2] + [x, y], table[:, 2:4], table[:, 4], size / scale)
 
 
 def _blur(image: np.ndarray, sigma_px: float) -> np.ndarray:

@@ -82,7 +82,7 @@ def _view_words(entry: PhotoEntry) -> str:
         parts.append(f"{pose.distance_mm / 1000:.2f} m")
     if pose is not None and pose.azimuth_deg is not None:
         parts.append(f"{abs(pose.azimuth_deg):.0f}° {'right' if pose.azimuth_deg > 0 else 'left'}")
-    if geometry is not None:
+    if geometry is not None and geometry.tilt_deg is not None:
         parts.append(f"tilt {geometry.tilt_deg:.0f}°")
     return ", ".join(parts)
 
