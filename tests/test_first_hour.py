@@ -138,7 +138,7 @@ def test_a_first_hour_says_at_each_step_what_to_do_next(tmp_path, monkeypatch):
     assert '"lamp" first in ' in preview and "next: patchproof optimize scene.toml" in preview
     assert "Draft of" in optimize and ": better than its best control" in optimize
     assert "next: patchproof sheet run --out sheet.pdf" in optimize and "sheet.json" in sheet
-    assert f"name it yourself if that code is yours (--models {MODEL})" in refused
+    assert f"or name the networks yourself (--models '{MODEL}')" in refused
     assert "Helps beside simulated controls" in verify and "Take at least 10 photographs in each of" in verify
     assert "photographs: 11, judged 9, measured 9" in verify  # 8, two copies and a screenshot
     for named in ("copy: 2", "cropped: 1", "IMG_0007.MOV", "IMG_0008.CR2", "thumbnails"):

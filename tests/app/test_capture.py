@@ -424,7 +424,7 @@ def test_served_until_interrupted_and_at_the_same_address_afterwards(tmp_path, s
     assert [report.summary.judged for report in reports] == [1, 2] and measured == [(0, 0), (1, 1)]
     assert answers == [200, 200] and addresses[0] == addresses[1]
     (stored,) = (tmp_path / "state" / "patchproof" / "capture").iterdir()
-    assert stored.parent.stat().st_mode & 0o777 == 0o700 and files_in(tmp_path / "photos")[0] == "photos.jsonl"
+    assert stored.parent.stat().st_mode & 0o777 == 0o700 and files_in(tmp_path / "photos")[1] == "photos.jsonl"
 
 
 def test_a_port_that_is_taken_is_not_waited_for():

@@ -279,7 +279,7 @@ def test_detectors_carry_a_run_from_scene_to_verdict(tmp_path, two_stage, monkey
     assert 3 < len(run.promise.outermost_mm) <= MOST_POINTS
     pp.sheet(run, tmp_path / "sheet.pdf")
     pp.reprint(tmp_path / "sheet.pdf", run, 2, tmp_path / "photos")
-    evaluated = pp.evaluate(run.folder, n=2).models
+    evaluated = pp.evaluate(run.folder, n=2, trust=True).models
     report = pp.verify(
         tmp_path / "photos", tmp_path / "sheet.json", tmp_path / "report", run=run, models=names, ledger_photos=1
     )

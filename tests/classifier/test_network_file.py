@@ -58,7 +58,7 @@ def test_labels_may_lie_in_a_list_beside_the_card(small):
 def test_a_file_of_absurd_size_is_refused_unread(small, monkeypatch):
     monkeypatch.setattr(network_file, "MAX_BYTES", 100)
     monkeypatch.setattr(Path, "read_bytes", lambda self: pytest.fail("it was read"))
-    with pytest.raises(Refused, match="more than 0 MiB"):
+    with pytest.raises(Refused, match="more than 0 KiB"):
         load_network(small)
 
 

@@ -86,7 +86,7 @@ def test_a_run_does_not_choose_code_downloads_or_variables_as_networks(received)
     scene = load_run(received()).scene
     for name in NETWORKS:
         settings = scene.settings.changed(target={"models": ("builtin", name)})
-        with pytest.raises(Refused, match="add --trust if you trust where it is from, or name networks yourself"):
+        with pytest.raises(Refused, match="add --trust if you trust where it is from, or name the networks yourself"):
             set_problem(replace(scene, settings=settings))
 
 

@@ -17,6 +17,7 @@ from errno import EACCES, EAGAIN, EDEADLK
 from pathlib import Path
 
 from patchproof.base.errors import Refused
+from patchproof.base.input import MAX_JSON_BYTES, is_file
 
 LISTING_FILE = ".patchproof.jsonl"  # lines of lists of names, relative to the folder
 _OPEN: dict[Path, set[str]] = {}  # folders that this process has locked, with what it listed in each
@@ -50,6 +51,7 @@ def lock_folder(folder: str | Path) -> Iterator[None]:
         yield
     finally:
         if handle is not None:
+            _sort_listing(real)
             with suppress(OSError):  # while it is still ours; Windows keeps files that are open
                 path.unlink()
             os.close(handle)
@@ -108,3 +110,22 @@ def append_listing(folder: Path, names: Iterable[str]) -> None:
         raise Refused(f"a file {LISTING_FILE} of this program", f"{path}, which is none", "remove it")
     with open(path, "a", encoding="utf-8") as file:
         file.write(f"\n{json.dumps(list(names))}\n")  # begins a line of its own after one that a kill cut short
+
+
+def listed_names(folder: Path) -> set[str]:
+    """Return the names in a folder's own listing; empty without one."""
+    path, names = folder / LISTING_FILE, set()
+    if is_file(path) and not path.is_symlink() and path.stat().st_size <= MAX_JSON_BYTES:
+        for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+            with suppress(ValueError, TypeError, RecursionError):  # a line that a kill cut short, or somebody made up
+                names |= set(json.loads(line))
+    return names
+
+
+def _sort_listing(folder: Path) -> None:
+    """Rewrite the listing in order, so that its bytes do not tell in how many goes the files were written."""
+    if names := listed_names(folder):
+        with suppress(OSError, TypeError):  # a full disk; names that somebody made up: the listing stays as it is
+            content = "".join(f"{json.dumps([name])}\n" for name in sorted(names))
+            (folder / f"{LISTING_FILE}.part").write_text(content, encoding="utf-8")
+            os.replace(folder / f"{LISTING_FILE}.part", folder / LISTING_FILE)

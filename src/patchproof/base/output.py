@@ -10,7 +10,6 @@ from __future__ import annotations
 import base64
 import errno
 import io
-import json
 import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -22,8 +21,8 @@ from typing import Any
 import numpy as np
 
 from patchproof.base.errors import Refused
-from patchproof.base.folder_lock import LISTING_FILE, append_listing, list_file, lock_folder
-from patchproof.base.input import MAX_JSON_BYTES, is_file, is_folder
+from patchproof.base.folder_lock import LISTING_FILE, append_listing, list_file, listed_names, lock_folder
+from patchproof.base.input import is_file, is_folder
 
 _ANOTHER = "choose another --out"
 
@@ -131,11 +130,7 @@ def _files_in(folder: Path) -> list[str]:
 
 def _listed(folder: Path, names: Iterable[str]) -> set[str]:
     """Names in a folder's listing, and in those of its subfolders among `names` that it lists itself."""
-    path, listed = folder / LISTING_FILE, set()
-    if is_file(path) and not path.is_symlink() and path.stat().st_size <= MAX_JSON_BYTES:
-        for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
-            with suppress(ValueError, TypeError, RecursionError):  # a line that a kill cut short, or somebody made up
-                listed |= set(json.loads(line))
+    listed = listed_names(folder)
     for name in names:
         inner, slash, last = name.rpartition("/")
         if slash and last == LISTING_FILE and name in listed:

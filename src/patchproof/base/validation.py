@@ -110,11 +110,13 @@ def refuse_untrusted(source: str | Path, networks: Iterable[str] = (), settings:
     """Refuse what a file that others may have made would have run, downloaded or read of the environment: networks but
     for files and built-in ones, and `${VAR}` in them or in any text of its `settings` (tables, lists, text).
     """
-    do = "add --trust if you trust where it is from, or name networks yourself with --models"
+    do = "add --trust if you trust where it is from, or name the networks yourself"
     for name in networks:
         is_local = ":" not in name or name.startswith(("file:", "python:"))
         if not is_local and (name.startswith("clip:") or not NETWORK_FILE.fullmatch(name)):
-            raise Refused(f"networks in {source} that are files, not code or downloads", name, do)
+            raise Refused(
+                f"networks in {source} that are files, not code or downloads", name, f"{do} (--models '{name}')"
+            )
     for text in (*networks, *_texts(settings)):
         if "${" in text:
             raise Refused(f"names in {source} without variables of your environment", text, do)

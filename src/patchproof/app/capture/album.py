@@ -15,7 +15,6 @@ import hashlib
 import os
 import re
 from contextlib import suppress
-from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
@@ -49,15 +48,15 @@ class Album:
     """A folder of photographs, which is created if it is missing; refused if it has other files, or links."""
 
     def __init__(self, folder: Path):
-        refuse_other_files(folder, _OWN)
         make_folder(folder)
         self.folder = folder = folder.resolve()
         for path in folder.rglob("*"):
-            if fnmatch(path.name, ".photo_*.part"):  # of an upload that an earlier server did not finish
-                path.unlink()
-            elif path.is_symlink() or (path.name.startswith("session_") and not _SESSION.fullmatch(path.name)):
+            if path.is_symlink() or (path.name.startswith("session_") and not _SESSION.fullmatch(path.name)):
                 do = "move it out of the folder, or choose another --out"
                 raise Refused("no links, and sessions with numbers, among the photographs", str(path), do)
+        refuse_other_files(folder, _OWN)
+        for path in folder.rglob(".photo_*.part"):  # of uploads that an earlier server did not finish
+            path.unlink()
         self._by_sha256: dict[str, Path] = {}
         if not self.sessions:
             make_folder(folder / "session_01")
