@@ -29,9 +29,8 @@ class Refused(PatchproofError, ValueError):
 
     def __init__(self, expected: str, got: str, do: str):
         self._parts = expected, got, do
-        # a hostile file may put text of any length here
-        expected, got, do = (part if len(part) < 2000 else f"{part[:1000]} ..." for part in self._parts)
-        super().__init__(printable(" ".join(f"Expected {expected}, got {got}: {do.rstrip('.')}.".split())))
+        expected, got, do = map(_shorten, self._parts)
+        super().__init__(f"Expected {expected}, got {got}: {do.rstrip('.')}.")
 
     def with_advice(self, advice: str) -> Refused:
         """A copy of this error with `advice` appended to the instruction."""
@@ -41,6 +40,12 @@ class Refused(PatchproofError, ValueError):
     def __reduce__(self) -> Any:
         # exceptions are rebuilt from their message when they come back from another process; this one has three parts
         return type(self), self._parts
+
+
+def _shorten(part: str) -> str:
+    """Return printable text in one line; a hostile file may have put text of any kind and length there."""
+    text = printable(" ".join(part[:10_000].split()))
+    return text if len(text) < 2000 else f"{text[:1000]} ..."
 
 
 class WorkerDied(Refused):
