@@ -191,6 +191,16 @@ def unmarked(content: bytes) -> bytes:
     return content
 
 
+def odd_headers() -> list[Callable[[bytes], bytes]]:
+    """Headers of which libjpeg warns, and of nothing after them: a later JFIF, parameters of the scan."""
+
+    def with_parameters(content: bytes) -> bytes:
+        end = content.index(b"\xff\xda") + 2 + 12
+        return content[: end - 2] + b"\0" + content[end - 1 :]
+
+    return [lambda content: content.replace(b"JFIF\0\1", b"JFIF\0\2"), with_parameters]
+
+
 def noise_jpeg(**options) -> bytes:
     return saved(np.random.default_rng(0).integers(0, 256, (128, 128, 3), np.uint8), "JPEG", **options)
 
@@ -432,6 +442,19 @@ def test_what_a_picture_declares_is_used_refused_or_said_as_the_list_has_it(entr
             np.testing.assert_allclose(colors_of(photo), right, atol=3 if suffix in ("jpeg", "jpg", "avif") else 1.1)
             assert set(photo.said) <= {color_space.BARE_INKS, deep_codes.LINEAR_LIGHT}
     assert answers <= {entry.answer}
+
+
+@pytest.mark.parametrize("odd", odd_headers())
+def test_a_header_of_which_the_decoder_warns_hides_no_damage(odd, reading, capfd):
+    whole = noise_jpeg()
+    np.testing.assert_array_equal(reading(odd(whole), "jpg").srgb, reading(whole, "jpg").srgb)
+    with pytest.raises(PhotoRejected, match="unreadable"):
+        reading(odd(whole[: len(whole) // 2] + whole[len(whole) // 2 + 900 :]), "jpg")
+    assert not capfd.readouterr().err
+
+
+def test_float_light_up_to_65535_is_said_to_be_light(reading):
+    assert deep_codes.LINEAR_LIGHT in reading(tiff(np.float32([[0, 65535], [9, 7]])), "tif").said
 
 
 def test_each_case_is_of_an_entry():

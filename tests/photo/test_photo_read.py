@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -149,6 +151,12 @@ def test_opencv_reads_a_jpeg_as_pillow_does(tmp_path, monkeypatch, subsampling, 
     assert np.array_equal(read_photo(tmp_path / "a.jpg").srgb, expected)
 
 
+def test_a_jpeg_is_read_without_stderr(tmp_path):
+    Image.fromarray(UPRIGHT).save(tmp_path / "a.jpg")
+    code = "import os, sys; from patchproof.photo.read import read_photo; os.close(2); read_photo(sys.argv[1])"
+    subprocess.run([sys.executable, "-c", code, tmp_path / "a.jpg"], check=True)
+
+
 def test_too_many_pixels_are_refused_before_they_are_decoded(tmp_path, monkeypatch):
     Image.fromarray(UPRIGHT).save(tmp_path / "a.png")
     monkeypatch.setattr(read, "MAX_IMAGE_PX", 1000)
@@ -177,8 +185,6 @@ def test_of_too_many_pixels_to_measure_four_become_one(mode, suffix, tmp_path, m
 
 
 def test_heic_without_its_extra_says_what_to_install(tmp_path, monkeypatch):
-    import sys
-
     monkeypatch.setitem(sys.modules, "pillow_heif", None)
     (tmp_path / "a.heic").write_bytes(b"x")
     with pytest.raises(PhotoRejected, match=r"pip install 'patchproof\[heic\]'"):

@@ -121,6 +121,13 @@ def test_a_picture_that_is_named_and_a_color_are_known_places(tmp_path):
         assert all((backgrounds.choose_for_stream(stream, np.array([0.1, 0.9])) == 0.5).all() for stream in STREAMS)
 
 
+def test_hidden_files_are_no_backgrounds(tmp_path):
+    folder_of(tmp_path, 3)
+    (tmp_path / "places" / "._001.png").write_bytes(b"what another system keeps beside 001.png")
+    pictures = load_backgrounds(BackgroundSettings(images="places"), tmp_path).pictures
+    assert sum(isinstance(picture, FileLevels) for picture in pictures) == 3
+
+
 def test_a_background_is_read_as_a_photograph_is(tmp_path):
     Image.fromarray(np.full((8, 8), 100 * 257, np.uint16)).save(tmp_path / "deep.png")
     assert (

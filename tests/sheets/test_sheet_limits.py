@@ -97,7 +97,7 @@ def declaring(path: Path, **entries) -> Path:
     path.write_bytes(one_sheet("pdf"))
     with pikepdf.open(path, allow_overwriting_input=True) as pdf:
         for name, value in entries.items():
-            pdf.pages[0][f"/{name}"] = value
+            pdf.pages[0][f"/{name}"] = pikepdf.Array(value) if isinstance(value, list) else value
         pdf.save(path)
     return path
 
@@ -131,6 +131,18 @@ def shifted(path: Path) -> bool:
     return bool(np.abs(rasterize_page(path, 1, 20).astype(int) - right).mean() < 0.5)
 
 
+def inheriting(path: Path, **boxes: list[int]) -> Path:
+    """A PDF whose pages have these boxes from the list of pages, as far as they have none of their own."""
+    with pikepdf.open(declaring(path), allow_overwriting_input=True) as pdf:
+        for name, box in boxes.items():
+            pdf.Root.Pages[f"/{name}"] = pikepdf.Array(box)
+            for page in pdf.pages:
+                if f"/{name}" in page:
+                    del page[f"/{name}"]
+        pdf.save(path)
+    return path
+
+
 def more_pages(path: Path) -> bool:
     before = attached_manifest(declaring(path))
     with pikepdf.open(path, allow_overwriting_input=True) as pdf:
@@ -150,6 +162,14 @@ CASES = {  # by what is declared: True if the answer is that of the list
     "UserUnit": lambda path: is_refused(declaring(path, UserUnit=2)),
     "a password": lambda path: is_refused(with_password(path)),
 }
+
+
+def test_boxes_that_pages_inherit_are_used_as_their_own(tmp_path):
+    assert is_refused(inheriting(tmp_path / "s.pdf", CropBox=[9, 9, 300, 300]))
+    boxes = {name: [-72, -36, 500, 700] for name in ("MediaBox", "CropBox")}
+    paths = inheriting(tmp_path / "t.pdf", **boxes), declaring(tmp_path / "u.pdf", **boxes)
+    inherited, own = (rasterize_page(path, 1, 20) for path in paths)
+    assert np.array_equal(inherited, own)
 
 
 @pytest.mark.parametrize("entry", DECLARED, ids=lambda entry: entry.declares)

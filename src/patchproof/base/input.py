@@ -2,13 +2,11 @@
 
 In: a path, or bytes, and the words for a refusal. Out: the content, or one `Refused` whatever makes a decoder fail.
 Only regular files are opened, and no more of them is read than their size says: pipes wait, devices and some files of
-/proc never end. Sizes are checked before memory is allocated, and only formats that hold pictures are opened, because
-Pillow also opens some that start other programs. Photographs have limits of their own (`photo.limits`), and so has
-every archive.
+/proc never end. Sizes are checked before memory is allocated. Photographs and archives have limits of their own.
 
 Time is limited by a timer that interrupts Python between two steps, so that a long call into a library ends first,
-unless it runs in `run_in_child`. Such timers exist on Linux and macOS, in a process's main thread: not on Windows, and
-not in the threads of a cluster's workers. Within another time limit, or a profiler's timer, the outer one applies.
+unless it runs in `run_in_child`. Timers exist on Linux and macOS, in a process's main thread, which a cluster's workers
+do not use. Within another time limit, or a profiler's timer, the outer one applies.
 """
 
 from __future__ import annotations
@@ -26,9 +24,8 @@ import threading
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn, ParamSpec, TypeVar
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 from patchproof.base.errors import Refused, TimeLimitExceeded
 from patchproof.base.text import strip_apostrophe
@@ -39,7 +36,6 @@ if TYPE_CHECKING:
 TIME_LIMIT_S = 10.0  # of processor time: a photograph of 119 megapixels takes 4, one of 12 less than 1
 _REPEAT_S = 0.5  # until the next interruption, in case a library swallows the first
 
-Params = ParamSpec("Params")
 ReturnType = TypeVar("ReturnType")
 
 # an allow-list, because Pillow also opens formats that start other programs (EPS) or hold no photograph
@@ -50,14 +46,8 @@ MAX_FILE_BYTES = 1 << 30  # of one file, where its kind has no limit of its own
 MAX_CHILD_BYTES = 1_200_000_000  # more memory than a child has at its start: 140 megapixels took 0.9 GB in all
 
 
-def is_file(path: str | Path) -> bool:
-    """True if there is a file at `path`; False for a path that no system accepts (300 letters, a NUL)."""
-    return os.path.isfile(path)
-
-
-def is_folder(path: str | Path) -> bool:
-    """True if there is a folder at `path`; see `is_file`."""
-    return os.path.isdir(path)
+# False for a path that no system accepts (300 letters, a NUL), at which those of pathlib raise an error
+is_file, is_folder = os.path.isfile, os.path.isdir
 
 
 def file_size(path: str | Path, max_bytes: int = MAX_FILE_BYTES) -> int:
@@ -90,15 +80,9 @@ def hash_file(path: str | Path, max_bytes: int = MAX_FILE_BYTES) -> str:
 
 
 def read_text(
-    path: str | Path,
-    expected: str,
-    do: str = "correct it",
-    missing: str = "check the path",
-    max_bytes: int = MAX_JSON_BYTES,
+    path: str | Path, expected: str, do: str = "correct it", missing: str = "check the path", max_bytes=MAX_JSON_BYTES
 ) -> str:
-    """Read a text file, of which a byte order mark is skipped; refused with `missing` if there is none, with `do` if it
-    cannot be read, and with its encoding if that is not UTF-8.
-    """
+    """Read a text file without its byte order mark; refused as by `read_file`, and if it is not UTF-8."""
     content, do_save = read_file(path, expected, do, max_bytes, missing), "save it as UTF-8"
     even, odd = (content[start:200:2].count(0) for start in (0, 1))
     if content.startswith((b"\xff\xfe", b"\xfe\xff")) or (min(even, odd) == 0 and max(even, odd) > 1):
@@ -122,9 +106,7 @@ def read_json(path: str | Path, expected: str, do: str, missing: str = "check th
 
 
 def read_csv(path: str | Path, expected: str) -> list[list[str]]:
-    """Read the rows of a CSV file that are not empty, without the apostrophes of `csv_lines`; refused with its
-    separator if that is no comma.
-    """
+    """Read rows that are not empty, without the apostrophes of `csv_lines`; refused if another separator is used."""
     text = read_text(path, expected)
     try:
         rows = [row for row in csv.reader(io.StringIO(text, newline=""), skipinitialspace=True) if any(row)]
@@ -153,31 +135,18 @@ def open_image(source: Path | bytes, expected: str, do: str) -> Iterator[Image]:
 
 
 def open_lazily(source: Path | bytes) -> Image:
-    """Open a picture with Pillow, which decodes it later; errors are Pillow's, and an OSError for what is no file or
-    empty, as files of the system are, of which Pillow would not see the end.
-    """
+    """Open a picture with Pillow, which decodes it later; errors are Pillow's, and an OSError for what is no file."""
     from PIL import Image
 
     if not isinstance(source, bytes) and not file_size(source, 1 << 62):
-        raise OSError("an empty file")
-    return Image.open(io.BytesIO(source) if isinstance(source, bytes) else source, formats=readable_formats())
-
-
-def readable_formats() -> list[str]:
-    """The formats of `IMAGE_FORMATS` that the installed Pillow reads."""
-    from PIL import Image
-
+        raise OSError("an empty file")  # or one of the system's, of which Pillow would not see the end
     Image.init()
-    return [name for name in IMAGE_FORMATS if name in Image.OPEN]
+    formats = [name for name in IMAGE_FORMATS if name in Image.OPEN]
+    return Image.open(io.BytesIO(source) if isinstance(source, bytes) else source, formats=formats)
 
 
 class _Expired(BaseException):
     """The time is over; a BaseException, so that no `except Exception` in the work catches it."""
-
-
-def run_within_time(work: Callable[Params, ReturnType], *args: Params.args, **kwargs: Params.kwargs) -> ReturnType:
-    """Call `work` and return its result; raises `TimeLimitExceeded` after `TIME_LIMIT_S`."""
-    return run_within_seconds(TIME_LIMIT_S, partial(work, *args, **kwargs))
 
 
 def run_within_seconds(seconds: float, work: Callable[[], ReturnType]) -> ReturnType:
@@ -208,11 +177,10 @@ def run_within_seconds(seconds: float, work: Callable[[], ReturnType]) -> Return
 
 def run_in_child(work: Callable[[], ReturnType]) -> ReturnType:
     """Call `work` in a forked process and return its result; raises `TimeLimitExceeded` after `TIME_LIMIT_S`, and a
-    MemoryError beyond `MAX_CHILD_BYTES` or if the process dies. For calls into libraries that cannot be interrupted and
-    share nothing with other work. On systems other than Linux it runs in this process, and a long call ends first.
+    MemoryError beyond `MAX_CHILD_BYTES` or if the process dies. On systems other than Linux it runs in this process.
     """
     if sys.platform != "linux":
-        return run_within_time(work)
+        return run_within_seconds(TIME_LIMIT_S, work)
     receiver, sender = os.pipe()
     with warnings.catch_warnings(action="ignore"):  # of a fork with other threads: the child uses none of their locks
         child = os.fork()  # multiprocessing allows none in the workers of a cluster
@@ -247,14 +215,13 @@ def _send_result(work: Callable[[], Any], sender: int) -> NoReturn:
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
         os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # libraries say a lot before they abort
         faulthandler.disable()
-        result = error = None
         try:
             with limit_memory(MAX_CHILD_BYTES):
-                result = work()
-        except Exception as caught:
-            error = caught
+                answer = work(), None
+        except Exception as error:
+            answer = None, error
         with open(sender, "wb") as file:
-            pickle.dump((result, error), file, 5)
+            pickle.dump(answer, file, 5)
     finally:
         os._exit(0)
 
@@ -280,8 +247,7 @@ def limit_memory(max_bytes: int) -> Iterator[None]:
 
 def remaining_seconds() -> float:
     """Processor time that remains in the current time limit; infinite without one."""
-    seconds = signal.getitimer(signal.ITIMER_PROF)[0] if has_timer() else 0.0
-    return seconds or float("inf")
+    return (signal.getitimer(signal.ITIMER_PROF)[0] if has_timer() else 0) or float("inf")
 
 
 def has_timer() -> bool:

@@ -1,7 +1,6 @@
 """Text that others wrote, such as names and labels, made fit for terminals, pages and spreadsheets.
 
-In: text from files. Out: text without characters that move a cursor or turn the direction of reading; CSV without
-formulas.
+Out: text without characters that move a cursor or turn the direction of reading; CSV without formulas.
 """
 
 from __future__ import annotations
@@ -36,15 +35,13 @@ def _escape(character: str) -> str:
 
 def csv_lines(rows: Iterable[Iterable[Any]]) -> str:
     """Write rows as CSV, their text `printable`, and with an apostrophe where a spreadsheet would see a formula."""
+
+    def cell(value: Any) -> Any:
+        return "'" * bool(_FORMULA.match(value)) + printable(value) if isinstance(value, str) else value
+
     buffer = io.StringIO()
-    csv.writer(buffer, lineterminator="\n").writerows([_cell(value) for value in row] for row in rows)
+    csv.writer(buffer, lineterminator="\n").writerows(map(cell, row) for row in rows)
     return buffer.getvalue()
-
-
-def _cell(value: Any) -> Any:
-    if not isinstance(value, str):
-        return value
-    return f"'{printable(value)}" if _FORMULA.match(value) else printable(value)
 
 
 def strip_apostrophe(cell: str) -> str:

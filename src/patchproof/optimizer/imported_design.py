@@ -2,13 +2,10 @@
 
 In: a picture (a file, or its pixels) and a scene with a printed piece. Out: the folder that `optimize` writes, but for
 steps, views and checkpoint: the design, a promise beside its controls, and in run.json what was imported. A picture is
-read like a photograph: upright, in sRGB, on white where it is transparent, in 8 bits. Its pixels are printed unchanged,
-those of a coarse picture as blocks, like our own designs; only a picture of more than `MAX_DESIGN_PX` is reduced. What
-paper and cameras lose of it is reported and not corrected. The sheet id depends on the design, so that photographs of
-several designs on one scene are told apart by their markers.
-
-Left out on purpose: cropping and padding, which make another design; textures; the search for a place, which tries
-places with designs of its own; resuming, since a run that was stopped leaves no files.
+read like a photograph, and its pixels are printed unchanged, those of a coarse picture as blocks; only one of more than
+`MAX_DESIGN_PX` is reduced. What paper and cameras lose of it is reported and not corrected. The sheet id depends on the
+design, so that photographs of several designs on one scene are told apart by their markers.
+Left out on purpose: cropping and padding, which make another design; textures; the search for a place; resuming.
 """
 
 from __future__ import annotations
@@ -17,6 +14,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -44,29 +42,26 @@ from patchproof.sheets.manifest import design_sha256
 from patchproof.sheets.piece import Piece, marker_image
 
 MIN_DESIGN_PX = 32  # of the shorter side; our own designs have no fewer either
-# of the longer side: a manifest carries the pixels, and a photograph of 12 megapixels shows about as many
-MAX_DESIGN_PX = 1024
+MAX_DESIGN_PX = 1024  # of the longer side: a manifest carries the pixels, and 12 megapixels show about as many
 MAX_STRETCH = 0.02  # of one side relative to the other; paper and rulers may differ by more
 OUT_OF_GAMUT = 2.0  # ΔE00 that is just visible side by side
 VISIBLE_DETAIL_RATIO = 2.0  # times the closest photograph's resolution; finer detail is lost on any camera of the scene
+_NO_TEXTURE = 'leave patch.kind out, or "patch"'
 _FLAT_MODULE_PX = 8  # pixels per module of the flat piece in which markers are searched for
 
 
 @dataclass(frozen=True)
 class ImportRecord:
-    """Where a design comes from, and its quality on this piece: file name, SHA-256 of its bytes (of an array's pixels),
-    original size, dots per inch as printed; the share of its colors that the printer misses by more than
-    `OUT_OF_GAMUT`, and the mean miss of all of them (ΔE00); notes for a reader.
-    """
+    """Where a design comes from, and its quality on this piece."""
 
     file: str
-    sha256: str
+    sha256: str  # of the file's bytes, or of an array's pixels
     picture_px: tuple[int, int]
     design_px: tuple[int, int]
-    dpi: float
+    dpi: float  # as printed
     printer: str
-    out_of_gamut: float
-    delta_e00: float
+    out_of_gamut: float  # the share of its colors that the printer misses by more than `OUT_OF_GAMUT`
+    delta_e00: float  # the mean miss of all of them
     notes: tuple[str, ...]
 
 
@@ -96,15 +91,14 @@ def import_patch(
     """
     out, compute = Path(out), compute.without("import_patch", cluster=True)
     check_folder(out, RUN_FILE_PATTERNS, overwrite, inputs=(picture, scene))
-    (file, sha256, pixels, said), scene = _read_picture(picture), _load_piece_scene(scene, seed)
+    (file, sha256, pixels, said), scene = _read_picture(picture), require_piece(resolve_scene(scene, seed), _NO_TEXTURE)
     fitted, scene = fit_to_piece(pixels, scene), scene.for_design(sha256)
     problem = set_problem(scene, compute.device, models, jobs=compute.jobs)
     problem = replace(problem, subject=replace(problem.patch, design_px=fitted.shape[1::-1]))
     design = problem.patch.pixels(from_pixels(fitted, problem.device))
-    record = _import_record(problem, file, sha256, pixels, fitted, design)
-    record = replace(record, notes=said + record.notes)
+    record = asdict(_import_record(problem, file, sha256, pixels, fitted, design))
     with new_folder(out, RUN_FILE_PATTERNS, overwrite, named_paths(scene).values()) as folder:
-        run = finish_run(problem, design, folder, promise, progress, asdict(record))
+        run = finish_run(problem, design, folder, promise, progress, record | {"notes": said + record["notes"]})
     return replace(run, folder=out)
 
 
@@ -123,7 +117,11 @@ def import_folder(
     """A run `out`/NAME of every picture NAME.png (or another kind) in a folder, as `import_patch` makes it. All
     pictures are looked at before the first promise; with `resume` finished runs of theirs are kept.
     """
-    scene, out, total = _load_piece_scene(scene, seed), Path(out), promise.views or PROMISE_VIEWS
+    out, total, scene = (
+        Path(out),
+        promise.views or PROMISE_VIEWS,
+        require_piece(resolve_scene(scene, seed), _NO_TEXTURE),
+    )
     runs = {path: out / printable(path.stem) for path in list_photos(folder)}
     if (names := len(set(runs.values()))) < len(runs):
         got = f"{len(runs)} pictures with {names} names in {folder}"
@@ -138,31 +136,26 @@ def import_folder(
     for path, run_folder in runs.items():
         _, sha256, pixels, _ = _read_picture(path)
         fit_to_piece(pixels, scene)
-        made = (
-            read_json(run_folder / RUN_FILE, "a run", "remove it") if is_file(run_folder / RUN_FILE) and resume else {}
-        )
+        run_file = run_folder / RUN_FILE
+        made = read_json(run_file, "a run", "remove it") if resume and is_file(run_file) else {}
         same = isinstance(made, dict) and {key: made.get(key) for key in source} == source
         if same and (made.get("imported") or {}).get("sha256") == sha256:
             runs_by_path[path] = load_run(run_folder, trust=True)  # its settings are those of our scene
         else:
             check_folder(run_folder, RUN_FILE_PATTERNS, overwrite)
-    for path, run_folder in runs.items():
-        if path not in runs_by_path:
-            runs_by_path[path] = import_patch(
-                path, scene, run_folder, promise=promise, compute=compute, overwrite=overwrite, progress=advance
-            )
+    options: dict[str, Any] = {"promise": promise, "compute": compute, "overwrite": overwrite, "progress": advance}
+    for path in [path for path in runs if path not in runs_by_path]:
+        runs_by_path[path] = import_patch(path, scene, runs[path], **options)
     return [runs_by_path[path] for path in runs]
 
 
 def fit_to_piece(pixels: np.ndarray, scene: PieceScene) -> np.ndarray:
-    """The pixels uint8 H×W×3 of a picture as a design of the scene's piece, reduced if it is large; refused where its
-    shape is not the piece's, or it is too small for a design.
-    """
+    """A picture uint8 H×W×3 as a design of the scene's piece, reduced if it is large; refused if of another shape."""
     height, width = pixels.shape[:2]
     width_mm, height_mm = scene.piece.size_mm
     if min(width, height) < MIN_DESIGN_PX:
-        do = "enlarge it yourself, and look at the result"
-        raise Refused(f"a picture of {MIN_DESIGN_PX} pixels or more along its shorter side", f"{width} × {height}", do)
+        expected = f"a picture of {MIN_DESIGN_PX} pixels or more along its shorter side"
+        raise Refused(expected, f"{width} × {height}", "enlarge it yourself, and look at the result")
     ratio = (width / height) / (width_mm / height_mm)
     if max(ratio, 1 / ratio) > 1 + MAX_STRETCH:
         expected = f"a picture with the proportions of the piece ({width_mm:g} × {height_mm:g} mm)"
@@ -178,27 +171,21 @@ def fit_to_piece(pixels: np.ndarray, scene: PieceScene) -> np.ndarray:
 def _shape_advice(width: int, height: int, scene: PieceScene) -> str:
     """Advice on how to give picture and piece the same shape."""
     width_mm, height_mm = scene.piece.size_mm
-    cropped = min(width, round(height * width_mm / height_mm)), min(height, round(width * height_mm / width_mm))
-    padded = max(width, round(height * width_mm / height_mm)), max(height, round(width * height_mm / width_mm))
-    options = [f"{do} it to {size[0]} × {size[1]}" for do, size in (("crop", cropped), ("pad", padded))]
+    wide, high = round(height * width_mm / height_mm), round(width * height_mm / width_mm)
+    options = [f"{do} it to {way(width, wide)} × {way(height, high)}" for do, way in (("crop", min), ("pad", max))]
     if scene.settings.object.photos is None:  # with photos the piece is as large as the blank
         options.append(f"set patch.height_mm = {width_mm * height / width:.4g}")
     return ", or ".join(options)
 
 
-def _load_piece_scene(scene: str | Path | Scene, seed: int | None) -> PieceScene:
-    return require_piece(resolve_scene(scene, seed), 'leave patch.kind out, or "patch"')
-
-
 def _read_picture(picture: str | Path | np.ndarray) -> tuple[str, str, np.ndarray, tuple[str, ...]]:
     """(file name, SHA-256, uint8 sRGB H×W×3, what the file declares and was left aside) of a picture."""
     if isinstance(picture, np.ndarray):
-        if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] != 3:
-            do = "convert it to 8-bit RGB"
-            raise Refused("a picture of uint8 H×W×3 pixels", f"{picture.dtype} {picture.shape}", do)
+        if picture.dtype != np.uint8 or picture.shape[2:] != (3,):
+            got = f"{picture.dtype} {picture.shape}"
+            raise Refused("a picture of uint8 H×W×3 pixels", got, "convert it to 8-bit RGB")
         return "an array", design_sha256(picture), picture, ()
-    path = Path(picture)
-    if not is_file(path):
+    if not is_file(path := Path(picture)):
         raise Refused("a picture", f"no file at {path}", "check the path")
     try:
         photo = read_photo(path)
@@ -235,8 +222,7 @@ def _px_per_mm(design: np.ndarray, scene: PieceScene) -> float:
 def _resolution_notes(design: np.ndarray, picture: np.ndarray, scene: PieceScene, network_px: int) -> Iterator[str]:
     """Note a reduced picture, details finer than photographs show, or pixels coarser than the networks could see."""
     design_scale, text = _px_per_mm(design, scene), "{} than {}: {:.2g} pixels per mm beside {:.2g} in the closest view"
-    closest = scene.closest_px_per_mm
-    photo_scale, network_scale = closest(scene.photo_px), closest((network_px, network_px))
+    photo_scale, network_scale = map(scene.closest_px_per_mm, (scene.photo_px, (network_px, network_px)))
     if design.shape != picture.shape:
         yield f"made smaller, to {design.shape[1]} × {design.shape[0]} pixels"
     if design_scale > VISIBLE_DETAIL_RATIO * photo_scale:
@@ -246,9 +232,7 @@ def _resolution_notes(design: np.ndarray, picture: np.ndarray, scene: PieceScene
 
 
 def _marker_notes(design: np.ndarray, piece: Piece) -> Iterator[str]:
-    """Note markers that the detector finds in the flat piece besides its own; refused where photographs would look like
-    those of several sheets, or not all of the piece's own are found.
-    """
+    """Note a marker that is found in the flat piece besides its own; refused with more, or if its own are not found."""
     ids = {marker.id for marker in piece.markers}
     factor = math.ceil(_FLAT_MODULE_PX / (piece.module_mm * design.shape[1] / piece.size_mm[0]))
     large = design.repeat(factor, 0).repeat(factor, 1)
@@ -262,8 +246,8 @@ def _marker_notes(design: np.ndarray, piece: Piece) -> Iterator[str]:
         raise Refused(expected, f"one that makes photographs too costly ({rejection.advice})", do) from rejection
     if missing := ids - detected.markers.keys():
         raise Refused(expected, f"one that hides {len(missing)} of {len(ids)} markers", do)
+    others = [str(marker_id) for marker_id in (*detected.foreign, *detected.doubled)]
     if max(len(detected.foreign), len(detected.doubled)) > 1:
-        found = summarize_names([str(marker_id) for marker_id in (*detected.foreign, *detected.doubled)])
-        raise Refused(expected, f"one that shows markers of its own ({found})", do)
-    for marker_id in (*detected.foreign, *detected.doubled):
+        raise Refused(expected, f"one that shows markers of its own ({summarize_names(others)})", do)
+    for marker_id in others:
         yield f"the detector takes a part of it for marker {marker_id}"

@@ -1,7 +1,6 @@
 """Convert a picture's colors to sRGB from the color space that its file declares.
 
-In: an open Pillow image. Out: a `ColorSpace`, or None if the colors are sRGB, and what the file declares in vain. A
-profile is known by what it does to colors, never by its name. A PNG's cICP precedes its profile, that its sRGB chunk,
+A profile is known by what it does to colors, never by its name. A PNG's cICP precedes its profile, that its sRGB chunk,
 that cHRM and gAMA; elsewhere a profile precedes nclx and EXIF. ColorSpace 65535 means any other space: it is Adobe RGB
 with interoperability R03 alone, since some phones write it over sRGB. Colors outside of sRGB are clipped.
 """
@@ -27,37 +26,29 @@ BROKEN_PRIMARIES = "primaries or gammas that no screen has, read as sRGB"
 BMP_SPACE = "color spaces in BMP files, read as sRGB"
 BARE_INKS = "inks (CMYK) without a profile, of which RGB is only an estimate"
 _HDR = "it has colors for HDR screens or of a kind that is not read (cICP {}, {}): save it as JPEG in sRGB"
-# x and y of red, green and blue
-SRGB_PRIMARIES = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06)
+SRGB_PRIMARIES = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06)  # x and y of red, green and blue
 _ADOBE, _ADOBE_GAMMA = (0.64, 0.33, 0.21, 0.71, 0.15, 0.06), 563 / 256
 _P3, _BT2020 = (0.68, 0.32, 0.265, 0.69, 0.15, 0.06), (0.708, 0.292, 0.17, 0.797, 0.131, 0.046)
 _PAL, _NTSC = (0.64, 0.33, 0.29, 0.60, 0.15, 0.06), (0.63, 0.34, 0.31, 0.595, 0.155, 0.07)
 # by their numbers in ITU-T H.273 (2: not specified), primaries that are white at D65, and curves
 _PRIMARIES = {1: SRGB_PRIMARIES, 2: SRGB_PRIMARIES, 5: _PAL, 6: _NTSC, 7: _NTSC, 9: _BT2020, 12: _P3}
-_TELEVISION = "television"  # the curve of BT.709, 601 and 2020
-_CURVES = {2: None, 13: None, **dict.fromkeys((1, 6, 14, 15), _TELEVISION), 4: 2.2, 5: 2.8, 8: 1.0}
+_CURVES = {2: None, 13: None, **dict.fromkeys((1, 6, 14, 15), "television"), 4: 2.2, 5: 2.8, 8: 1.0}
 _D65, _MAX_GAMMA = (0.3127, 0.329), 5.0
 _BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
 _INTEROP_IFD, _COLOR_SPACE, _GAMMA, _WHITE_TAG, _PRIMARIES_TAG = 0xA005, 0xA001, 0xA500, 318, 319
-_HEAD_BYTES = 1 << 20  # declarations precede the pixels
 _MODES = {"RGB": "RGB", "GRAY": "L", "CMYK": "CMYK"}  # of pictures, by their profile's
 
 
 class ColorSpace(NamedTuple):
-    """A picture's own `mode` of Pillow ("RGB", "L", "CMYK"), and the conversion of its codes (uint8, RGB also uint16)
-    to sRGB uint8 H×W×3.
-    """
+    """Pillow's mode of a picture's codes, and their conversion to sRGB uint8 H×W×3."""
 
-    mode: str
-    to_srgb: Callable[[np.ndarray], np.ndarray]
+    mode: str  # "RGB", "L" or "CMYK"
+    to_srgb: Callable[[np.ndarray], np.ndarray]  # of uint8, or RGB also of uint16
 
 
-def color_space(image) -> tuple[ColorSpace | None, tuple[str, ...]]:
-    """The picture's color space, None for sRGB, and sentences on declarations that are left aside."""
-    profile, head = image.info.get("icc_profile"), b""
-    if image.format in ("PNG", "AVIF", "HEIF", "BMP"):
-        with open(image.filename, "rb") as file:
-            head = file.read(_HEAD_BYTES)
+def color_space(image, head: bytes) -> tuple[ColorSpace | None, tuple[str, ...]]:
+    """The color space of a picture in a file with this `head`, None for sRGB, and sentences on what is left aside."""
+    profile = image.info.get("icc_profile")
     if (cicp := _cicp(image.format, head)) and (image.format == "PNG" or not profile):
         primaries, transfer, full_range = cicp
         if primaries not in _PRIMARIES or transfer not in _CURVES or not full_range:
@@ -79,20 +70,18 @@ def color_space(image) -> tuple[ColorSpace | None, tuple[str, ...]]:
 def rgb_space(
     primaries: Sequence[float], white: Sequence[float] | None, curve: float | str | None
 ) -> ColorSpace | None:
-    """The space of an RGB picture by chromaticities and by the exponent of its curve (None: sRGB's; "television":
-    BT.709's); None if it is sRGB, and ValueError if no screen could show it.
-    """
+    """The space of these chromaticities and this curve (None: sRGB's); None if sRGB, ValueError if no screen has it."""
     if isinstance(curve, float) and not 1 / _MAX_GAMMA <= curve <= _MAX_GAMMA:
         raise ValueError(f"gamma {curve:g}")
     matrix = np.linalg.solve(_xyz_from_rgb(SRGB_PRIMARIES, _D65), _xyz_from_rgb(primaries, white or _D65))
 
-    def light(codes: np.ndarray) -> np.ndarray:
-        if curve == _TELEVISION:
-            return np.where(codes < 0.081, codes / 4.5, ((codes + 0.099) / 1.099) ** (1 / 0.45))
-        return linear_from_srgb(codes) if curve is None else codes**curve
-
     def to_srgb(codes: np.ndarray) -> np.ndarray:
-        table = 65535 * light(np.linspace(0, 1, np.iinfo(codes.dtype).max + 1)).astype(np.float32)
+        light = np.linspace(0, 1, np.iinfo(codes.dtype).max + 1)
+        if isinstance(curve, str):  # that of BT.709, 601 and 2020
+            light = np.where(light < 0.081, light / 4.5, ((light + 0.099) / 1.099) ** (1 / 0.45))
+        else:
+            light = linear_from_srgb(light) if curve is None else light**curve
+        table = 65535 * light.astype(np.float32)
         linear = cv2.transform(np.take(table, codes), matrix.astype(np.float32))
         return np.take(_srgb_codes(), np.clip(linear + 0.5, 0, 65535).astype(np.uint16))
 
@@ -132,7 +121,7 @@ def _cicp(kind: str, head: bytes) -> tuple[int, int, bool] | None:
     """(primaries, transfer, full range) of a PNG's cICP chunk, or of the first nclx box; None without one."""
     if kind == "PNG" and (at := head.find(b"\0\0\0\4cICP", 0, head.find(b"IDAT"))) >= 0:
         return head[at + 8], head[at + 9], head[at + 10 : at + 12] == b"\0\1"
-    if kind != "PNG" and (at := head.find(b"colrnclx")) >= 0:
+    if kind in ("AVIF", "HEIF") and (at := head.find(b"colrnclx")) >= 0:
         return int.from_bytes(head[at + 8 : at + 10]), int.from_bytes(head[at + 10 : at + 12]), True
     return None
 
@@ -162,9 +151,7 @@ def _space_of_profile(profile: bytes, mode: str) -> tuple[ColorSpace | None, tup
 
 
 def _declared_primaries(image) -> tuple[tuple[Any, Any, float | None] | None, tuple[str, ...]]:
-    """The arguments of `rgb_space` by a PNG's chunks or by EXIF and TIFF tags, None where nothing else than sRGB is
-    declared, and a sentence on what is left aside.
-    """
+    """The arguments of `rgb_space` by PNG's chunks or EXIF and TIFF tags, None for sRGB, and what is left aside."""
     chunk, gamma = image.info.get("chromaticity", ()), image.info.get("gamma")
     if chunk or gamma is not None:
         return (chunk[2:] or SRGB_PRIMARIES, chunk[:2], None if gamma is None else float(np.divide(1, gamma))), ()

@@ -14,9 +14,7 @@ DECLARED: tuple[Declaration, ...] = (
     Declaration(_ANY, "ICC profile of RGB", "used", "palette, gray and transparent pictures, too; by what it does"),
     Declaration(_ANY, "ICC profile of gray", "used", "in gray pictures, with alpha, too"),
     Declaration("JPEG, TIFF", "ICC profile of CMYK", "used", "in pictures of these inks"),
-    Declaration(
-        _ANY, "ICC profile named sRGB that is another", "used", "sRGB is what moves no color by more than 1/255"
-    ),
+    Declaration(_ANY, "ICC profile named sRGB that is another", "used", "sRGB moves no color by more than 1/255"),
     Declaration(_ANY, "ICC profile that is broken, or of another kind of picture", "said", "read as sRGB"),
     Declaration("JPEG, TIFF", "CMYK without a profile", "said", "RGB is an estimate"),
     Declaration("TIFF", "CIELAB", "used", "in 8 bits"),

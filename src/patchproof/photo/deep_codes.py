@@ -1,7 +1,7 @@
 """Read pictures of more than 8 bits a channel: integers of a declared depth, or floating-point light.
 
-In: a loaded Pillow picture and its file. Out: uint16 codes in full range. 16-bit RGB is decoded by OpenCV, since Pillow
-keeps 8 bits of it. A maximum of 10, 12 or 14 bits in TIFF's tags is the depth; other maxima are statistics.
+16-bit RGB is decoded by OpenCV, since Pillow keeps 8 bits of it. Floating-point values are linear light. A maximum of
+10, 12 or 14 bits in TIFF's tags is the depth; other maxima are statistics.
 """
 
 from __future__ import annotations
@@ -11,41 +11,41 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from patchproof.photo.color_space import SRGB_PRIMARIES, ColorSpace, eight_bits, rgb_space
+
 LINEAR_LIGHT = "floating-point values, read as linear light from 0 to 1, or to their maximum above 1"
 SHALLOW = "16-bit values that all fit into {} bits, which the file does not declare: read as dark as it stores them"
 _BITS, _INVERTED, _MAXIMA, _SIGNED = 258, 262, (341, 281), 339
 _DEPTHS = {1023: 10, 4095: 12, 16383: 14}
 
 
-def deep_codes(image, path: Path) -> tuple[np.ndarray, str | None] | None:
-    """(uint16 codes H×W×3, a sentence where their range is assumed) of a loaded picture, of which mode F is linear
-    light; None if it has 8 bits.
-    """
-    tags, said = getattr(image, "tag_v2", {}), None
+def deep_codes(
+    image, path: Path, space: ColorSpace | None
+) -> tuple[np.ndarray | None, ColorSpace | None, tuple[str, ...]]:
+    """(uint16 codes H×W×3, or None of 8 bits; their space if the picture declares `space`; how a range is assumed)."""
+    tags, said = getattr(image, "tag_v2", {}), ()
     bits, signed = tags.get(_BITS, (16,))[0], tags.get(_SIGNED, (1,))[0] == 2
     if image.mode == "F":
-        codes, said = np.nan_to_num(np.asarray(image), posinf=1.0), LINEAR_LIGHT
+        codes, space, said = (
+            np.nan_to_num(np.asarray(image), posinf=1.0),
+            rgb_space(SRGB_PRIMARIES, None, 1.0),
+            (LINEAR_LIGHT,),
+        )
         top = max(1.0, float(codes.max(initial=0)))
     elif image.mode.startswith("I"):
         codes, top = np.asarray(image), (1 << bits - signed) - 1
         codes = codes.view(np.uint32) if bits == 32 and not signed else codes
-    elif image.mode == "RGB" and (bits == 16 if tags else image.format == "PNG" and _png_bits(path) == 16):
-        codes, top = cv2.imread(str(path), cv2.IMREAD_UNCHANGED), 65535
-        if codes is None or codes.dtype != np.uint16 or codes.shape != (image.height, image.width, 3):
-            return None
-        codes = codes[..., ::-1]
     else:
-        return None
-    if top == 65535:
+        codes, top = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if (image.mode, bits) == ("RGB", 16) else None, 65535
+        if codes is None or codes.dtype != np.uint16 or codes.shape != (image.height, image.width, 3):
+            return None, space, ()
+        codes = codes[..., ::-1]
+    if top == 65535 and image.mode != "F":
         top = next((tags[tag][0] for tag in _MAXIMA if tag in tags and tags[tag][0] in _DEPTHS), top)
         limit = next((limit for limit in _DEPTHS if 0 < codes.max(initial=0) <= limit < top), None)
-        said = SHALLOW.format(_DEPTHS[limit]) if limit else None
+        said = (SHALLOW.format(_DEPTHS[limit]),) if limit else ()
     codes = top - codes if tags.get(_INVERTED) == 0 else codes
     if top != 65535 or codes.dtype != np.uint16:
         codes = np.clip(codes * np.float32(65535 / top) + np.float32(0.5), 0, 65535).astype(np.uint16)
-    return codes if codes.ndim == 3 else np.repeat(codes[..., None], 3, axis=2), said
-
-
-def _png_bits(path: Path) -> int:
-    with path.open("rb") as file:
-        return file.read(25)[24]
+    codes = codes if codes.ndim == 3 else np.repeat(codes[..., None], 3, axis=2)
+    return codes, space or ColorSpace("RGB", eight_bits), said

@@ -1,10 +1,9 @@
 """Read the focal length from a photograph's EXIF data, unless the picture was changed since it was taken.
 
-In: an open Pillow image. Out: the focal length in pixels, its spread, and whether one was rejected. EXIF gives the
-35 mm equivalent, by the diagonal: if a picture was cropped or zoomed digitally, neither that nor the principal point in
-the middle is true. So it is rejected if EXIF has another size than the picture or a digital zoom, or if no sensor has
-the picture's shape. Pictures saved by an editor, and 16:9, which cameras cut from 4:3 or 3:2, get a larger spread. A
-crop that keeps the shape and updates EXIF leaves no trace here; the sheet's perspective may still contradict it.
+EXIF gives the 35 mm equivalent, by the diagonal: if a picture was cropped or zoomed digitally, neither that nor the
+principal point in the middle is true. So it is rejected if EXIF has another size than the picture or a digital zoom, or
+if no sensor has the picture's shape. Pictures saved by an editor, and 16:9, which cameras cut from 4:3 or 3:2, get a
+larger spread. A crop that keeps the shape and updates EXIF leaves no trace; the sheet's perspective may contradict it.
 `is_crop` has other rules: a picture that was downscaled, or zoomed by its camera, is still a whole photograph.
 """
 
@@ -14,13 +13,13 @@ import math
 import re
 import struct
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import Any
 
 _DIAGONAL_35MM = 43.2666  # mm, of the 36×24 mm frame that FocalLengthIn35mmFilm refers to
 EXIF_SPREAD = 0.03  # of its logarithm: rounding to whole millimeters at 26 mm (0.011), and tolerances of lenses
 LOOSE_SPREAD = 0.1
-_SENSOR_SHAPES, _CUT_SHAPES = (4 / 3, 3 / 2), (16 / 9,)
-_SAME_SHAPE = 0.01
+_SENSOR_SHAPES, _CUT_SHAPES, _SAME_SHAPE = (4 / 3, 3 / 2), (16 / 9,), 0.01
 _EDITOR = re.compile(r"photoshop|lightroom|gimp|snapseed|darktable|affinity|paint|pixelmator|capture one|luminar", re.I)
 EXIF_IFD, _FOCAL_35MM, _WIDTH, _HEIGHT, _ZOOM, _SOFTWARE = 0x8769, 0xA405, 0xA002, 0xA003, 0xA404, 0x0131
 _COMMENT = 0x9286  # marks screenshots of phones and desktops of one maker
@@ -58,8 +57,7 @@ def read_focal(image) -> tuple[float | None, float, bool]:
 
 def is_crop(image, name: str) -> bool:
     """True if EXIF states another shape than the picture's, or EXIF or the file's name declares a screenshot."""
-    details = exif_tags(image, EXIF_IFD)
-    stated = _stated_sides(details)
+    stated = _stated_sides(details := exif_tags(image, EXIF_IFD))
     reshaped = bool(stated) and not _has_shape(max(image.size), min(image.size), (stated[1] / stated[0],))
     comment = details.get(_COMMENT, "")
     comment = comment.decode("latin-1").replace("\0", "") if isinstance(comment, bytes) else str(comment)
@@ -79,8 +77,5 @@ def _has_shape(long: int, short: int, shapes: tuple[float, ...]) -> bool:
 
 def _number(value) -> float | None:
     """A positive finite number, else None."""
-    try:
-        number = float(value or 0)
-    except (TypeError, ValueError, ZeroDivisionError):
-        return None
-    return number if math.isfinite(number) and number > 0 else None
+    with suppress(TypeError, ValueError, ZeroDivisionError):
+        return number if math.isfinite(number := float(value or 0)) and number > 0 else None

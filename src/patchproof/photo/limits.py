@@ -1,20 +1,24 @@
 """Limit the work on a photograph to ten seconds of processor time.
 
-In: work on a photograph. Out: its result, or `PhotoRejected("too_costly")`. A call into a library cannot be interrupted
-(`input.run_within_time`), so calls that a picture could make endless are avoided if `count_squares` or
-`count_finder_lines` count too many.
+A call into a library cannot be interrupted (`input.run_within_seconds`), so calls that a picture could make endless are
+avoided if `count_squares` or `count_finder_lines` count too many.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
+from typing import ParamSpec
 
 import cv2
 import numpy as np
 
+from patchproof.base import input as bounds
 from patchproof.base.errors import TimeLimitExceeded
-from patchproof.base.input import Params, ReturnType, run_within_time
+from patchproof.base.input import ReturnType
 from patchproof.photo.rejection import PhotoRejected
+
+Params = ParamSpec("Params")
 
 MOST_BYTES = 1_000_000_000  # of a file, and of memory to read it: 119 megapixels take 0.5 GB
 _ROW_STEP = 4  # rows of which one is examined
@@ -22,18 +26,16 @@ _NOISE_FACTOR = 4  # with four times as many edges as the squares have, most of 
 
 
 def run_limited(work: Callable[Params, ReturnType], *args: Params.args, **kwargs: Params.kwargs) -> ReturnType:
-    """Call `work` and return its result; raises `PhotoRejected("too_costly")` after the limit of `run_within_time`."""
+    """Call `work` and return its result; raises `PhotoRejected("too_costly")` after `TIME_LIMIT_S`."""
     try:
-        return run_within_time(work, *args, **kwargs)
+        return bounds.run_within_seconds(bounds.TIME_LIMIT_S, partial(work, *args, **kwargs))
     except TimeLimitExceeded as error:
         advice = f"it takes {error}: save it smaller, or leave it out"
         raise PhotoRejected("too_costly", None, error.seconds, advice) from None
 
 
 def count_squares(gray: np.ndarray, perimeter_px: float = 36, max_count: int = 0) -> int:
-    """Count the dark or light squares of at least that perimeter in uint8 H×W, which a marker detector would have to
-    examine; 0 if the number of edges shows that there are no more than `max_count`, which saves tracing outlines.
-    """
+    """Count the squares in uint8 H×W that a marker detector would examine; 0 if so few edges allow only `max_count`."""
     dark = cv2.adaptiveThreshold(gray, 255, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY_INV, 13, 3)
     edges = count_edges(dark)
     if edges <= max_count * perimeter_px:

@@ -1,11 +1,9 @@
 """Read a photograph as upright 8-bit sRGB pixels, with its focal length if the camera wrote one.
 
-In: any still picture that Pillow reads as one of `IMAGE_FORMATS` (HEIC with the `heic` extra). Out: `Photo`.
-Orientation is applied once, the color space that the file declares is converted to sRGB, alpha is put on white, deeper
-channels become 8-bit; `declarations` lists all that files can declare, and `Photo.said` what was left aside. A file
-that cannot be read, or not all of it, raises `PhotoRejected("unreadable")`, one that exceeds `limits` "too_costly", so
-that a bad file never stops a batch. Pixels are converted in strips, since whole copies take twice the memory; above
-`WHOLE_PX` four pixels become one, since measuring takes up to 30 bytes each.
+In: any still picture that Pillow reads as one of `IMAGE_FORMATS` (HEIC with the `heic` extra). Out: `Photo`, or
+`PhotoRejected`, so that a bad file never stops a batch. `declarations` lists what files can declare: colors become
+sRGB, alpha is put on white, deeper channels become 8-bit. Pixels are converted in strips, since whole copies take twice
+the memory; above `WHOLE_PX` four pixels become one, since measuring takes up to 30 bytes each.
 Ignored on purpose: sidecar files, dates and places, what a camera's maker notes say of its lens.
 """
 
@@ -14,10 +12,10 @@ from __future__ import annotations
 import os
 import re
 import warnings
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -26,39 +24,31 @@ from patchproof.base.errors import Refused
 from patchproof.base.input import MAX_IMAGE_PX, is_file, is_folder, limit_memory, open_lazily
 from patchproof.base.text import printable
 from patchproof.base.validation import summarize_names
-from patchproof.photo.color_space import SRGB_PRIMARIES, ColorSpace, color_space, eight_bits, rgb_space
-from patchproof.photo.deep_codes import deep_codes
-from patchproof.photo.exif import EXIF_SPREAD, exif_tags, is_crop, read_focal
+from patchproof.photo.exif import EXIF_IFD, EXIF_SPREAD, exif_tags, is_crop, read_focal
 from patchproof.photo.jpeg import decode_jpeg
 from patchproof.photo.limits import MOST_BYTES, run_limited
 from patchproof.photo.rejection import PhotoRejected
 
+if TYPE_CHECKING:
+    from patchproof.photo.color_space import ColorSpace
+
 SUFFIXES = frozenset(".jpg .jpeg .jpe .png .tif .tiff .webp .bmp .gif .mpo .avif .heic .heif".split())
 _ORIENTATION, _XMP_ORIENTATION = 0x0112, re.compile(rb"tiff:Orientation\s*(?:=\s*[\"']|>)\s*([1-8])")
-# the operation that makes the pixels of each orientation upright (EXIF 2.32)
-_UPRIGHT: dict[int, Callable[[np.ndarray], np.ndarray]] = {
-    2: lambda a: a[:, ::-1],
-    3: lambda a: a[::-1, ::-1],
-    4: lambda a: a[::-1],
-    5: lambda a: a.transpose(1, 0, 2),
-    6: lambda a: np.rot90(a, -1),
-    7: lambda a: a[::-1, ::-1].transpose(1, 0, 2),
-    8: lambda a: np.rot90(a),
-}
 _STRIP_PX = 250_000  # a megabyte: larger strips exceed the processor's cache, and take four times as long
 WHOLE_PX = 30_000_000  # few cameras except phones give more; markers are searched in 25 million at once
-# files that people copy together with photographs
-_SKIPPED_KINDS = (
+_SKIPPED = (  # files that people copy together with photographs
     (".mov .mp4 .m4v .avi .mkv .webm .3gp .mts", "videos, which are not read (take still photographs)"),
     (".dng .cr2 .cr3 .nef .arw .raf .orf .rw2 .pef .srw", "raw files, which are not read (save them as JPEG)"),
     (".pdf .jxl .jp2 .psd", "files of other kinds, which are not read (save each page as JPEG or PNG)"),
 )
+_SKIPPED_KINDS = {suffix: kind for suffixes, kind in _SKIPPED for suffix in suffixes.split()}
 TWO_ORIENTATIONS = "orientations in XMP that contradict EXIF's, which is used"
 MORE_PAGES = "pages or pictures after the first in a file, which are not read (save each as a file of its own)"
 GAIN_MAP = "gain maps for HDR screens, which are not applied"
 EXTRA_CHANNELS = "extra channels that are neither color nor transparency"
 _GAIN_MAPS = (b"hdrgm:Version", b"iso:ts:21496:-1", b"hdrgainmap")  # Adobe's and Android's, ISO's, a phone maker's
-_HEAD_BYTES, _EXTRA_SAMPLES = 1 << 16, 338
+_HEAD_BYTES, _EXTRA_SAMPLES, _PRIMARIES_TAG = 1 << 20, 338, 319  # declarations precede the pixels
+_MEAN = cv2.INTER_AREA
 _TOO_DEEP = "folders in folders, which are not read (one folder for each session)"
 
 
@@ -76,42 +66,52 @@ class Photo:
 
 
 def read_photo(path: str | Path) -> Photo:
-    """Read the photograph at `path`; raises `PhotoRejected("unreadable")` if it is missing or damaged, "too_costly" if
-    it takes too much memory or time.
-    """
+    """Read a photograph; raises `PhotoRejected`: "unreadable" if missing or damaged, "too_costly" beyond `limits`."""
     path = Path(path)
     allow_heic(path)
     try:
         with limit_memory(MOST_BYTES):
-            srgb, orientation, fields = run_limited(_decode, path)
-            # the memory of Pillow's picture has been freed by now
-            return Photo(np.ascontiguousarray(_UPRIGHT.get(orientation, np.asarray)(srgb)), **fields)
+            photo, orientation = run_limited(_decode, path)  # by now Pillow's picture has been freed
+            return replace(photo, srgb=_upright(photo.srgb, orientation))
     except PhotoRejected:
         raise
     except Exception as error:  # decoders fail in many ways: OSError, SyntaxError, struct.error...
-        if isinstance(error, MemoryError) or type(error).__name__ == "DecompressionBombError":
-            raise _too_large("the picture takes too much memory: save it smaller") from error
-        raise _unreadable(_advice(path, error)) from error
+        kind, advice = type(error).__name__, f"{path.name} is damaged or cut short: copy it again from the camera"
+        if isinstance(error, MemoryError) or kind == "DecompressionBombError":
+            advice = "the picture takes too much memory: save it smaller"
+            raise PhotoRejected("too_costly", None, None, advice) from error
+        if kind == "FileNotFoundError":
+            advice = "the file is gone: copy it again"
+        elif kind == "UnidentifiedImageError":
+            advice = f"{path.name} is not a picture of a known kind: save it as JPEG or PNG"
+        raise PhotoRejected("unreadable", None, None, advice) from error
 
 
-def _decode(path: Path) -> tuple[np.ndarray, int, dict[str, Any]]:
-    """(uint8 sRGB H×W×3 as stored, orientation, the other fields of `Photo`); above `WHOLE_PX` at half size."""
+def _decode(path: Path) -> tuple[Photo, int]:
+    """A photograph as it is stored, above `WHOLE_PX` at half size, and its orientation."""
     if (size := path.stat().st_size) > MOST_BYTES:
-        raise _too_large(f"a file of {size / 1e9:.1f} GB is too large: save it smaller", size, MOST_BYTES)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of large pictures, which have a limit below, and of unusual EXIF
-        with open_lazily(path) as image:
-            pixels = image.width * image.height
-            if pixels > MAX_IMAGE_PX:
-                raise _too_large(f"{pixels / 1e6:.0f} megapixels are too many: save it smaller", pixels, MAX_IMAGE_PX)
-            step = 2 if pixels > WHOLE_PX and min(image.size) > 1 else 1
-            focal_px, spread, rejected = read_focal(image)
-            fields = {"focal_px": focal_px and focal_px / step, "focal_spread": spread, "focal_rejected": rejected}
-            dpi = tuple(float(each) for each in np.ravel(image.info.get("dpi", ())))
-            fields |= {"is_crop": is_crop(image, path.name), "dpi": dpi}
-            (orientation, contradiction), rest = _orientation(image), _left_aside(image)
-            srgb, said = _decode_pixels(image, path, step)
-            return srgb, orientation, fields | {"said": (*contradiction, *rest, *said)}
+        raise PhotoRejected(
+            "too_costly", size, MOST_BYTES, f"a file of {size / 1e9:.1f} GB is too large: save it smaller"
+        )
+    with warnings.catch_warnings(action="ignore"), open_lazily(path) as image:  # of large pictures and of unusual EXIF
+        if (pixels := image.width * image.height) > MAX_IMAGE_PX:
+            advice = f"{pixels / 1e6:.0f} megapixels are too many: save it smaller"
+            raise PhotoRejected("too_costly", pixels, MAX_IMAGE_PX, advice)
+        step = 2 if pixels > WHOLE_PX and min(image.size) > 1 else 1
+        focal_px, spread, rejected = read_focal(image)
+        dpi, cropped = tuple(map(float, np.ravel(image.info.get("dpi", ())))), is_crop(image, path.name)
+        with path.open("rb") as file:
+            head = file.read(-1 if image.format == "MPO" else _HEAD_BYTES)
+        (orientation, contradiction), rest = _orientation(image), _left_aside(image, head)
+        srgb, said = _decode_pixels(image, path, head, step)
+        said = (*contradiction, *rest, *said)
+        return Photo(srgb, focal_px and focal_px / step, spread, rejected, cropped, dpi, said), orientation
+
+
+def _upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
+    """The pixels H×W×3 of a picture that is stored in one of the orientations 1 to 8 (EXIF 2.32)."""
+    down, right = ((1, 1), (1, -1), (-1, -1), (-1, 1))[(orientation - 1) % 4]
+    return np.ascontiguousarray((pixels.transpose(1, 0, 2) if orientation > 4 else pixels)[::down, ::right])
 
 
 def _orientation(image) -> tuple[int, tuple[str, ...]]:
@@ -124,19 +124,17 @@ def _orientation(image) -> tuple[int, tuple[str, ...]]:
     stated = _XMP_ORIENTATION.search(xmp if isinstance(xmp, bytes) else xmp.encode())
     orientation = exif_tags(image).get(_ORIENTATION, int(stated[1]) if stated else 1)
     said = (TWO_ORIENTATIONS,) if stated and int(stated[1]) != orientation else ()
-    return orientation if isinstance(orientation, int) and image.format != "TIFF" else 1, said
+    return int(orientation) if image.format != "TIFF" and orientation in range(1, 9) else 1, said
 
 
-def _left_aside(image) -> tuple[str, ...]:
+def _left_aside(image, head: bytes) -> tuple[str, ...]:
     """What else is in a file besides the picture that is read."""
     said = []
-    with open(image.filename, "rb") as file:
-        head = file.read(-1 if image.format == "MPO" else _HEAD_BYTES)
     if any(name in head for name in _GAIN_MAPS):
         said.append(GAIN_MAP)
     elif image.format == "MPO":
         kinds = [entry["Attribute"]["MPType"] for entry in image.mpinfo[0xB002][1:]]
-        said += [MORE_PAGES] if any(not kind.startswith("Large Thumbnail") for kind in kinds) else []
+        said += [MORE_PAGES] * any(not kind.startswith("Large Thumbnail") for kind in kinds)
     elif getattr(image, "is_animated", False):
         said.append(MORE_PAGES)
     if 0 in np.atleast_1d(getattr(image, "tag_v2", {}).get(_EXTRA_SAMPLES, 1)):
@@ -151,12 +149,10 @@ def list_photos(folder: str | Path) -> list[Path]:
         return [folder]
     if not is_folder(folder):
         raise Refused("a folder of photographs", f"no folder at {folder}", "check the path")
-    paths = list_images(folder)
-    if not paths:
-        expected = f"photographs ({', '.join(sorted(SUFFIXES)[:6])}, ...) in {folder}"
-        got = "; ".join(["none", *list_skipped_files(folder)])
-        raise Refused(expected, got, "copy the photographs there")
-    return paths
+    if paths := list_images(folder):
+        return paths
+    expected, got = f"photographs ({', '.join(sorted(SUFFIXES)[:6])}, ...) in {folder}", list_skipped_files(folder)
+    raise Refused(expected, "; ".join(["none", *got]), "copy the photographs there")
 
 
 def list_images(folder: Path) -> list[Path]:
@@ -166,11 +162,10 @@ def list_images(folder: Path) -> list[Path]:
 
 
 def list_skipped_files(folder: Path, without: Path | None = None, depth: int = 1) -> list[str]:
-    """Name the files in a folder and its subfolders that people may have meant as photographs but that are not read, a
-    phrase for each kind: videos and raw files without a picture of the same name, and pictures in folders deeper than
-    `depth`. The folder `without` is not searched.
+    """Name the files under a folder, except in `without`, that people may have meant as photographs, a phrase for each
+    kind: videos and raw files without a picture of the same name, and pictures in folders deeper than `depth`.
     """
-    skipped: dict[str, list[str]] = {}
+    skipped: list[tuple[str, Sequence[str]]] = []
     for parent, folders, files in os.walk(folder):
         inside = Path(parent).relative_to(folder)
         paths = [Path(name) for name in sorted(files) if not name.startswith(".")]
@@ -178,14 +173,13 @@ def list_skipped_files(folder: Path, without: Path | None = None, depth: int = 1
         if len(inside.parts) > depth:
             folders.clear()
             if stems:
-                skipped.setdefault(_TOO_DEEP, []).append(printable(str(inside)))
+                skipped.append((printable(str(inside)), [_TOO_DEEP]))
             continue
         folders[:] = sorted(f for f in folders if not f.startswith(".") and Path(parent, f).resolve() != without)
         for path in paths:
-            kinds = (kind for suffixes, kind in _SKIPPED_KINDS if path.suffix.lower() in suffixes.split())
-            if path.stem not in stems and (kind := next(kinds, None)):
-                skipped.setdefault(kind, []).append(printable(str(inside / path)))
-    return [f"{kind}: {summarize_names(names)}" for kind, names in skipped.items()]
+            if path.stem not in stems and (kind := _SKIPPED_KINDS.get(path.suffix.lower())):
+                skipped.append((printable(str(inside / path)), [kind]))
+    return summarize_said(skipped)
 
 
 def summarize_said(said: Iterable[tuple[str, Sequence[str]]]) -> list[str]:
@@ -199,30 +193,44 @@ def summarize_said(said: Iterable[tuple[str, Sequence[str]]]) -> list[str]:
 
 def allow_heic(path: Path) -> None:
     """Let Pillow open HEIC files, if this is one; raises `PhotoRejected` without the library for it."""
-    if path.suffix.lower() not in {".heic", ".heif"}:
-        return
-    try:
-        import pillow_heif  # type: ignore[reportMissingImports]  # an extra
-    except ImportError:
-        advice = "HEIC needs pillow-heif: pip install 'patchproof[heic]', or save the photo as JPEG"
-        raise _unreadable(advice) from None
-    pillow_heif.register_heif_opener()
+    if path.suffix.lower() in {".heic", ".heif"}:
+        try:
+            import pillow_heif  # type: ignore[reportMissingImports]  # an extra
+        except ImportError:
+            advice = "HEIC needs pillow-heif: pip install 'patchproof[heic]', or save the photo as JPEG"
+            raise PhotoRejected("unreadable", None, None, advice) from None
+        pillow_heif.register_heif_opener()
 
 
-def _decode_pixels(image, path: Path, step: int) -> tuple[np.ndarray, tuple[str, ...]]:
+def _declared_space(image, head: bytes) -> tuple[ColorSpace | None, tuple[str, ...]]:
+    """See `color_space`, which is loaded only for pictures that may declare another space than sRGB."""
+    if image.format in ("JPEG", "MPO", "PNG") and image.mode != "CMYK" and "icc_profile" not in image.info:
+        space, adobe = exif_tags(image, EXIF_IFD).get(0xA001), exif_tags(image, 0xA005).get(1) == "R03"
+        in_exif = adobe or (space != 1 and (space is not None or _PRIMARIES_TAG in exif_tags(image)))
+        in_chunks = {"chromaticity", "gamma"} & image.info.keys()
+        if ("srgb" in image.info or not (in_exif or in_chunks)) and (image.format != "PNG" or b"cICP" not in head):
+            return None, ()
+    from patchproof.photo.color_space import color_space
+
+    return color_space(image, head)
+
+
+def _decode_pixels(image, path: Path, head: bytes, step: int) -> tuple[np.ndarray, tuple[str, ...]]:
     """uint8 sRGB H×W×3 of an open picture, each the mean of `step` × `step` pixels, and what is left aside of it."""
-    from PIL import ImageChops
-
-    space, said = color_space(image)
+    space, said = _declared_space(image, head)
     codes = _jpeg_codes(image, path)
     if codes is None:
         image.load()
         if image.mode == "CMYK" and image.format == "JPEG" and "adobe" not in image.info:
+            from PIL import ImageChops
+
             image = ImageChops.invert(image)  # Pillow takes the inks of every JPEG as Adobe's, which are inverted
-        if (deep := deep_codes(image, path)) is not None:
-            codes, space = deep[0], rgb_space(SRGB_PRIMARIES, None, 1.0) if image.mode == "F" else space
-            said += (deep[1],) if deep[1] else ()
-    if codes is not None and codes.dtype == np.uint8 and space is None and step == 1:
+        if image.mode[0] in "FI" or image.format == "TIFF" or (image.format == "PNG" and head[24] == 16):
+            from patchproof.photo.deep_codes import deep_codes
+
+            codes, space, assumed = deep_codes(image, path, space)
+            said += assumed
+    if codes is not None and space is None and step == 1:
         return codes, said
     width, height = image.size if codes is None else codes.shape[1::-1]
     pixels = np.empty((height // step, width // step, 3), np.uint8)
@@ -233,27 +241,20 @@ def _decode_pixels(image, path: Path, step: int) -> tuple[np.ndarray, tuple[str,
             strip = _opaque_srgb(image.crop((0, step * top, width, step * bottom)), space)
         else:
             part = codes[step * top : step * bottom]
-            strip = eight_bits(part) if space is None else space.to_srgb(part)
-        pixels[top:bottom] = _average(strip, step)
+            strip = part if space is None else space.to_srgb(part)
+        if step > 1:  # an incomplete group at the right is dropped
+            strip = cv2.resize(strip[:, : step * pixels.shape[1]], pixels[top:bottom].shape[1::-1], interpolation=_MEAN)
+        pixels[top:bottom] = strip
     return pixels, said
 
 
 def _jpeg_codes(image, path: Path) -> np.ndarray | None:
-    """uint8 H×W×3 of a JPEG, which OpenCV decodes to the same bits in half the time; None for inks, other files, and
-    truncated ones, which Pillow refuses.
-    """
+    """uint8 H×W×3 of a JPEG, which OpenCV decodes to the same bits in half the time; None for inks and other files."""
     if image.format not in ("JPEG", "MPO"):
         return None
     inks = image.mode not in ("RGB", "L")
     pixels = decode_jpeg(path.read_bytes(), cv2.IMREAD_REDUCED_COLOR_8 if inks else cv2.IMREAD_COLOR_RGB)
     return None if inks or pixels is None or pixels.shape[1::-1] != image.size else pixels
-
-
-def _average(pixels: np.ndarray, step: int) -> np.ndarray:
-    """Means of `step` × `step` pixels; incomplete groups at the right and bottom are dropped."""
-    height, width = (side // step for side in pixels.shape[:2])
-    complete = pixels[: step * height, : step * width]
-    return pixels if step == 1 else cv2.resize(complete, (width, height), interpolation=cv2.INTER_AREA)
 
 
 def _opaque_srgb(image, space: ColorSpace | None) -> np.ndarray:
@@ -262,30 +263,12 @@ def _opaque_srgb(image, space: ColorSpace | None) -> np.ndarray:
 
     if image.mode == "La":  # Pillow converts it to nothing else
         image = image.convert("LA")
-    alpha = None
-    if "transparency" in image.info or image.mode in {"RGBA", "LA", "PA", "RGBa"}:
+    if clear := "transparency" in image.info or image.mode in {"RGBA", "LA", "PA", "RGBa"}:
         image = image.convert("RGBA")
-        alpha = image.getchannel("A")
     colors = image.convert("RGB" if space is None else space.mode)
     if space is not None:
         colors = Image.fromarray(space.to_srgb(np.asarray(colors)))
-    if alpha is not None:
-        colors.putalpha(alpha)
+    if clear:
+        colors.putalpha(image.getchannel("A"))
         colors = Image.alpha_composite(Image.new("RGBA", image.size, "white"), colors).convert("RGB")
     return np.asarray(colors)
-
-
-def _advice(path: Path, error: Exception) -> str:
-    if isinstance(error, FileNotFoundError):
-        return "the file is gone: copy it again"
-    if type(error).__name__ == "UnidentifiedImageError":
-        return f"{path.name} is not a picture of a known kind: save it as JPEG or PNG"
-    return f"{path.name} is damaged or cut short: copy it again from the camera"
-
-
-def _unreadable(advice: str) -> PhotoRejected:
-    return PhotoRejected("unreadable", None, None, advice)
-
-
-def _too_large(advice: str, figure: float | None = None, threshold: float | None = None) -> PhotoRejected:
-    return PhotoRejected("too_costly", figure, threshold, advice)

@@ -1,14 +1,12 @@
 """Render a sheet's PDF to pixels on an exact millimeter grid, and read the manifest that is attached to it.
 
-In: a PDF and a resolution. Out: uint8 H×W×3 sRGB. The page is rendered by PDFium, which did not write it. PDFium
-stretches a page to a whole number of pixels (0.2 mm across A4 at 150 dpi), so the requested part is first made a page
-whose size is a whole number of pixels; then pixels are millimeters times a scale.
+The page is rendered by PDFium, which did not write it. PDFium stretches a page to whole pixels (0.2 mm across A4 at 150
+dpi), so the requested part is first made a page of whole pixels, which are millimeters times a scale.
 PDFs may come from anybody: each call reads the file in a child process within limits of time and memory.
 """
 
 from __future__ import annotations
 
-import ctypes
 import json
 import math
 import os
@@ -22,44 +20,39 @@ import numpy as np
 
 from patchproof.base.errors import Refused, TimeLimitExceeded
 from patchproof.base.geometry import MM_PER_INCH
-from patchproof.base.input import MAX_JSON_BYTES, ReturnType, file_size, is_file, run_in_child
+from patchproof.base.input import MAX_JSON_BYTES, ReturnType, file_size, run_in_child
 from patchproof.base.validation import validate_model
 from patchproof.sheets.manifest import Manifest
 from patchproof.sheets.pdf import ATTACHMENT, POINTS_PER_MM, numbered_name
 
 MAX_SIDE_PX = 20_000
 MAX_PAGE_PX = 160_000_000  # 0.5 GB, A2 at 600 dpi
+_EXPECTED = f"a PDF with {ATTACHMENT} attached"
+_NO_CROP = (-1e6, -1e6, 1e6, 1e6)
+_View = tuple[tuple[float, float, float, float], tuple[int, int]]  # a rectangle (x, y, width, height) and its pixels
 
 
 def rasterize_page(pdf_path: str | Path, number: int = 1, dpi: float = 150.0) -> np.ndarray:
     """Render page `number` (from 1) with pixel = mm × dpi / 25.4; the last row and column may exceed the page."""
-    import pypdfium2.raw as pdfium
 
-    def pixels(page) -> np.ndarray:
-        sides = pdfium.FPDF_GetPageWidthF(page), pdfium.FPDF_GetPageHeightF(page)
+    def whole_page(*sides: float) -> _View:
         width, height = (math.ceil(side / 72 * dpi - 1e-3) for side in sides)
-        return _render(page, (0.0, 0.0, width * 72 / dpi, height * 72 / dpi), (width, height))
+        return (0.0, 0.0, width * 72 / dpi, height * 72 / dpi), (width, height)
 
-    return _call_with_page(pdf_path, number, pixels)
+    return _render(pdf_path, number, whole_page)
 
 
 def page_count(pdf_path: str | Path) -> int:
     """The number of pages of a PDF."""
-    import pypdfium2.raw as pdfium
-
-    return _call_with_pdf(pdf_path, pdfium.FPDF_GetPageCount)
+    return _call_with_pdf(pdf_path, lambda pdfium, pdf: pdfium.FPDF_GetPageCount(pdf))
 
 
 def rasterize_piece(pdf_path: str | Path, manifest: Manifest, dpi: float) -> np.ndarray:
-    """Render the piece only: its cut line is exactly the picture's border, so that pixel = mm × width_px / width_mm.
-
-    The numbers of pixels are rounded, so width and height differ from those at `dpi` by at most half a pixel.
-    """
+    """Render the piece only: its cut line is exactly the picture's border, which is rounded to whole pixels."""
     width, height = (max(round(side / MM_PER_INCH * dpi), 1) for side in manifest.cut_mm[2:])
     _refuse_size((width, height))
     if not manifest.tiles:
-        page = manifest.design.page if manifest.design else 1
-        return _part_pixels(pdf_path, page, manifest.cut_mm, (width, height))
+        return _part_pixels(pdf_path, manifest.design.page if manifest.design else 1, manifest.cut_mm, (width, height))
     pixels = np.full((height, width, 3), 255, np.uint8)
     px_per_mm = np.array([width, height]) / manifest.cut_mm[2:]
     for tile in manifest.tiles:
@@ -75,15 +68,14 @@ def rasterize_piece(pdf_path: str | Path, manifest: Manifest, dpi: float) -> np.
 
 
 def _part_pixels(pdf_path: str | Path, number: int, rect_mm: tuple, size_px: tuple[int, int]) -> np.ndarray:
-    rect_points = tuple(float(v) * POINTS_PER_MM for v in rect_mm)
-    return _call_with_page(pdf_path, number, lambda page: _render(page, rect_points, size_px))
+    x, y, w, h = (float(v) * POINTS_PER_MM for v in rect_mm)
+    return _render(pdf_path, number, lambda *_: ((x, y, w, h), size_px))
 
 
 def attached_manifest(pdf_path: str | Path, sheet_id: str | None = None) -> Manifest:
     """Read the manifest attached to a sheet's PDF; on a page of several designs that of `sheet_id`, else the first."""
-    texts = call_within_limits(pdf_path, partial(_attached_texts, pdf_path))
-    if not texts:
-        raise Refused(f"a PDF with {ATTACHMENT} attached", f"{pdf_path} without one", "make the sheet again")
+    if not (texts := call_within_limits(pdf_path, partial(_attached_texts, pdf_path))):
+        raise Refused(_EXPECTED, f"{pdf_path} without one", "make the sheet again")
     manifests = [validate_model(Manifest, data, f"{name} of {pdf_path}") for name, data in texts.items()]
     return next((manifest for manifest in manifests if manifest.sheet_id == sheet_id), manifests[0])
 
@@ -101,14 +93,12 @@ def _attached_texts(pdf_path: str | Path) -> dict[str, Any]:
     except pikepdf.PdfError as error:
         raise _unreadable(pdf_path) from error
     except Exception as error:  # objects of unexpected types fail in many ways
-        got = f"{pdf_path} with one that cannot be read"
-        raise Refused(f"a PDF with {ATTACHMENT} attached", got, "make the sheet again") from error
+        raise Refused(_EXPECTED, f"{pdf_path} with one that cannot be read", "make the sheet again") from error
 
 
 def _decompress(stream) -> bytes:
     """An attachment's bytes, up to the largest size of a manifest: pikepdf's own decompression has no limit."""
-    compression = stream.get("/Filter")
-    if compression is None:
+    if (compression := stream.get("/Filter")) is None:
         return stream.read_raw_bytes()
     if str(compression) != "/FlateDecode":
         raise ValueError(f"compressed by {compression}")
@@ -116,15 +106,13 @@ def _decompress(stream) -> bytes:
 
 
 def call_within_limits(pdf_path: str | Path, work: Callable[[], ReturnType]) -> ReturnType:
-    """Call `work` on a PDF in a child process; refused if it takes too long or too much memory, because a few lines may
-    draw nested forms a million times, and a few kilobytes may be unpacked to gigabytes, twice.
-    """
-    if not is_file(pdf_path):
-        raise Refused("a PDF of a sheet", f"no file at {pdf_path}", "check the path")
-    if not file_size(pdf_path, 1 << 62):
-        raise _unreadable(pdf_path)
+    """Call `work` on a PDF in a child process; refused beyond its limits: few lines may draw a million forms."""
     try:
+        if not file_size(pdf_path, 1 << 62):
+            raise _unreadable(pdf_path)
         return run_in_child(work)
+    except FileNotFoundError as error:
+        raise Refused("a PDF of a sheet", str(error), "check the path") from error
     except (TimeLimitExceeded, MemoryError) as error:
         expected = "a page that can be drawn in time and memory"
         raise Refused(expected, f"{pdf_path}, which takes {error}", "make the sheet again") from None
@@ -134,70 +122,48 @@ def _unreadable(pdf_path: str | Path) -> Refused:
     return Refused("a PDF of a sheet", f"{pdf_path}, which cannot be read", "make the sheet again")
 
 
-def _call_with_pdf(pdf_path: str | Path, work: Callable[[Any], ReturnType]) -> ReturnType:
-    """Call `work` with PDFium's handle of a file."""
+def _call_with_pdf(pdf_path: str | Path, work: Callable[[Any, Any], ReturnType]) -> ReturnType:
+    """Call `work` with PDFium and its handle of a file, in a child process, whose end closes it."""
     import pypdfium2.raw as pdfium
 
     def call() -> ReturnType:
-        pdf = pdfium.FPDF_LoadDocument(os.fsencode(pdf_path), None)
-        if not pdf:
+        if not (pdf := pdfium.FPDF_LoadDocument(os.fsencode(pdf_path), None)):
             raise _unreadable(pdf_path)
-        try:
-            return work(pdf)
-        finally:
-            pdfium.FPDF_CloseDocument(pdf)
+        return work(pdfium, pdf)
 
     return call_within_limits(pdf_path, call)
 
 
-def _call_with_page(pdf_path: str | Path, number: int, work: Callable[[Any], np.ndarray]) -> np.ndarray:
-    import pypdfium2.raw as pdfium
+def _render(pdf_path: str | Path, number: int, view: Callable[[float, float], _View]) -> np.ndarray:
+    """Render what `view` chooses of a page by its width and height in points."""
 
-    def call(pdf) -> np.ndarray:
+    def call(pdfium, pdf) -> np.ndarray:
+        def shown() -> np.ndarray:
+            """Left, top, right and bottom of the media box, the page's own or inherited, within a crop box."""
+            box = pdfium.FS_RECTF()
+            pdfium.FPDF_GetPageBoundingBox(page, box)
+            return np.array([box.left, box.top, box.right, box.bottom])
+
         pages = pdfium.FPDF_GetPageCount(pdf)
         if not 1 <= number <= pages:
             raise Refused(f"a page from 1 to {pages} of {pdf_path}", f"{number}", "ask for another page")
-        page = pdfium.FPDF_LoadPage(pdf, number - 1)
-        if not page:
+        if not (page := pdfium.FPDF_LoadPage(pdf, number - 1)):
             raise _unreadable(pdf_path)
-        try:
-            if pdfium.FPDFPage_GetRotation(page) or _is_cropped(page):
-                raise Refused("a page as the sheet was made", f"{pdf_path} with one turned or cropped", "make it again")
-            return work(page)
-        finally:
-            pdfium.FPDF_ClosePage(page)
+        cropped = shown()
+        pdfium.FPDFPage_SetCropBox(page, *_NO_CROP)
+        left, top, right, bottom = whole = shown()
+        if pdfium.FPDFPage_GetRotation(page) or np.abs(whole - cropped).max() > 0.01:
+            raise Refused("a page as the sheet was made", f"{pdf_path} with one turned or cropped", "make it again")
+        (x, y, w, h), (width, height) = view(right - left, top - bottom)
+        _refuse_size((width, height))
+        pdfium.FPDFPage_SetMediaBox(page, left + x, top - y - h, left + x + w, top - y)
+        pixels = np.full((height, width, 3), 255, np.uint8)
+        bitmap = pdfium.FPDFBitmap_CreateEx(width, height, pdfium.FPDFBitmap_BGR, pixels.ctypes.data, 3 * width)
+        flags = pdfium.FPDF_ANNOT | pdfium.FPDF_REVERSE_BYTE_ORDER
+        pdfium.FPDF_RenderPageBitmap(bitmap, page, 0, 0, width, height, 0, flags)
+        return pixels
 
     return _call_with_pdf(pdf_path, call)
-
-
-def _is_cropped(page) -> bool:
-    """True if the page has a crop box other than its media box, from whose corner millimeters are counted."""
-    import pypdfium2.raw as pdfium
-
-    media, crop = ([ctypes.c_float() for _ in range(4)] for _ in range(2))
-    both = pdfium.FPDFPage_GetMediaBox(page, *media) and pdfium.FPDFPage_GetCropBox(page, *crop)
-    return bool(both) and any(abs(a.value - b.value) > 0.01 for a, b in zip(media, crop, strict=True))
-
-
-def _render(page, rect_points: tuple[float, ...], size_px: tuple[int, int]) -> np.ndarray:
-    """Render the rectangle (x, y, width, height from the page's top-left, in points) to exactly `size_px` pixels."""
-    import pypdfium2.raw as pdfium
-
-    _refuse_size(size_px)
-    left, bottom, right, top = (ctypes.c_float() for _ in range(4))
-    if not pdfium.FPDFPage_GetMediaBox(page, left, bottom, right, top):
-        top.value = pdfium.FPDF_GetPageHeightF(page)
-    x, y, w, h = rect_points
-    box = (left.value + x, top.value - y - h, left.value + x + w, top.value - y)
-    pdfium.FPDFPage_SetMediaBox(page, *box)
-    pdfium.FPDFPage_SetCropBox(page, *box)
-    width, height = size_px
-    pixels = np.full((height, width, 3), 255, np.uint8)
-    bitmap = pdfium.FPDFBitmap_CreateEx(width, height, pdfium.FPDFBitmap_BGR, pixels.ctypes.data, 3 * width)
-    flags = pdfium.FPDF_ANNOT | pdfium.FPDF_REVERSE_BYTE_ORDER
-    pdfium.FPDF_RenderPageBitmap(bitmap, page, 0, 0, width, height, 0, flags)
-    pdfium.FPDFBitmap_Destroy(bitmap)
-    return pixels
 
 
 def _refuse_size(size_px: tuple[int, int]) -> None:
