@@ -173,6 +173,22 @@ def _(folder):
     raise Refused("", "", "")
 
 
+@case("buffers outside of its folder")
+def _(folder):
+    file = GltfFile()
+    file.square()
+    (folder / "sub").mkdir()
+    (folder / "a.bin").write_bytes(file.blob)
+    file.tree["buffers"] = [{"byteLength": len(file.blob), "uri": "../a.bin"}]
+    load(file.write(folder / "sub" / "a.gltf"))
+
+
+@case("more vertices, faces or texels than limits")
+def _(folder):
+    two_nodes(nodes=[{"mesh": 0}] * 20_000, scenes=[{"nodes": list(range(20_000))}]).write(folder / "a.gltf")
+    load(folder / "a.gltf")
+
+
 @case("a JSON key twice")
 def _(folder):
     file = GltfFile()
@@ -584,6 +600,14 @@ def _(folder):
     obj(folder, SQUARE_OBJ + "usemtl gold\n" + FACE, "", "no MTL file defines gold")
     text = "mtllib none.mtl\n" + SQUARE_OBJ + "usemtl gold\n" + FACE
     obj(folder, text, "", "the material file none.mtl is missing", "no MTL file defines gold")
+
+
+@case("mtllib outside of its folder")
+def _(folder):
+    (folder / "sub").mkdir()
+    (folder / "m.mtl").write_text("newmtl skin\nKd 1 0 0\n")
+    (folder / "sub" / "a.obj").write_text("mtllib ../m.mtl\n" + SQUARE_OBJ + FACE)
+    load(folder / "sub" / "a.obj", "the material file ../m.mtl is missing in the folder of a.obj")
 
 
 @case("Kd, map_Kd")

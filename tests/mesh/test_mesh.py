@@ -9,13 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from mesh_files import GltfFile
+from mesh_files import SQUARE_UV, GltfFile
 from PIL import Image
 
 from patchproof.base.color import linear_from_srgb
 from patchproof.base.errors import Refused
+from patchproof.mesh import assets, mesh_file
 from patchproof.mesh.load_mesh import load_mesh
 from patchproof.mesh.mesh import Material, MeshPart, mesh_from_parts
+from patchproof.mesh.mesh_file import read_parts
 
 DATA = os.environ.get("PATCHPROOF_DATA")
 needs_data = pytest.mark.skipif(not DATA, reason="PATCHPROOF_DATA is unset: no meshes from outside")
@@ -426,3 +428,82 @@ def test_a_texture_of_8192_is_reduced_and_said_to_be(tmp_path):
     assert large.warnings == ("the texture of 8192 × 512 of skin is reduced to 4096 × 256",)
     assert small.materials[0].texture_srgb.shape == (1, 1, 3) and small.warnings == ()
     assert large.materials[0].texture_srgb[0, 0].tolist() == small.materials[0].texture_srgb[0, 0].tolist()
+
+
+# ------------------------------------------------------------------------------------------------ limits
+
+
+def test_only_pictures_are_opened_outside_of_the_folder_of_a_mesh(tmp_path):
+    folder = tmp_path / "given"
+    (folder / "sub").mkdir(parents=True)
+    file = gltf(folder, [[0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    (folder / "a.bin").rename(tmp_path / "a.bin")
+    for place, is_within in ((folder / "b.bin", True), (tmp_path / "b.bin", False)):
+        place.write_bytes((tmp_path / "a.bin").read_bytes())
+        (folder / "a.bin").unlink(missing_ok=True)
+        (folder / "a.bin").symlink_to(place)
+        if is_within:
+            load_mesh(file, 1, "y")
+        else:
+            refused(file, "the file a.bin", "no such file in its folder")
+    write(tmp_path, "m.mtl", "newmtl red\nKd 1 0 0\n")
+    for name in ("../m.mtl", str(tmp_path / "m.mtl"), "link.mtl"):
+        (folder / "link.mtl").unlink(missing_ok=True)
+        (folder / "link.mtl").symlink_to(tmp_path / "m.mtl")
+        mesh = load_mesh(write(folder, "a.obj", f"mtllib {name}\n{TRIANGLE}usemtl red\nf 1 2 3\n"), 1, "y")
+        assert mesh.warnings[0] == f"the material file {name} is missing in the folder of a.obj"
+    file = textured_obj(folder, "newmtl red\nmap_Kd sub/t.png\n")
+    for target in ("t.jpg", "t.txt"):
+        (folder / "t.png").replace(tmp_path / target)
+        (folder / "sub" / "t.png").unlink(missing_ok=True)
+        (folder / "sub" / "t.png").symlink_to(tmp_path / target)
+        if target == "t.jpg":
+            assert load_mesh(file, 1, "y").materials[0].texture_srgb.shape == (4, 2, 3)
+            (tmp_path / target).replace(folder / "t.png")
+    refused(file, "sub/t.png", "no such file in its folder")
+
+
+def test_textures_have_a_limit_together(tmp_path, monkeypatch):
+    monkeypatch.setattr(assets, "MOST_TEXELS", 100)
+    file = GltfFile(samplers=[{"wrapS": 33071}])
+    file.square(SQUARE_UV * np.float32([3, 1]), np.zeros((8, 8, 3), np.uint8))
+    file.tree["textures"][0]["sampler"] = 0
+    mesh = load_mesh(file.write(tmp_path / "a.gltf"), 1, "y")
+    assert any("is repeated, not clamped: that would take 26 texels" in warning for warning in mesh.warnings)
+    monkeypatch.setattr(assets, "MOST_TEXELS", 63)
+    refused(file.write(tmp_path / "a.gltf"), "8 × 8 more in ")
+
+
+def test_places_and_shared_vertices_count(tmp_path):
+    for count in (300, 13_000):  # of a square, placed or with a list of vertices of which it has four
+        file = GltfFile(nodes=[{"mesh": 0}] * count, scenes=[{"nodes": list(range(count))}])
+        file.square()
+        shared = GltfFile()
+        points = shared.add(np.zeros((100_000, 3), np.float32))
+        shared.tree["bufferViews"][points]["byteLength"] = 12 * 100_000
+        primitive = {"attributes": {"POSITION": points}, "indices": shared.add(np.uint8([[0], [1], [99]]))}
+        shared.tree["meshes"] = [{"primitives": [primitive] * count}]
+        for each in (file, shared):
+            path = each.write(tmp_path / "a.gltf")
+            if count == 13_000:
+                refused(path, "million faces", "counted as often as they are placed")
+            else:
+                parts, *_ = read_parts(path, np.eye(3))
+                assert len(parts) == count and sum(len(part.vertices) for part in parts) <= 4 * count
+
+
+def test_long_words_and_long_headers_take_neither_memory_nor_minutes(tmp_path):
+    corner = "vertex 0 0 0\n"
+    text = f"solid a\n{corner * 3000}vertex 0 0 {'0' * 10**6}\nvertex 1 0 0\nvertex 0 1 0\nendsolid\n"
+    assert len(load_mesh(write(tmp_path, "a.stl", text), 1, "y").faces) == 1
+    names = "".join(f"property list uchar int p{i}\n" for i in range(20_000))
+    begin = time.process_time()
+    refused(write(tmp_path, "a.ply", f"ply\nformat ascii 1.0\nelement v 1\n{names}end_header\n{'0 ' * 20_000}"))
+    assert time.process_time() - begin < 5
+
+
+def test_an_outline_that_has_few_ears_ends(tmp_path, monkeypatch):
+    monkeypatch.setattr(mesh_file, "SECONDS", 0.5)
+    corners = np.random.default_rng(0).random((999, 2))
+    text = "".join(f"v {x} {y} 0\n" for x, y in corners) + f"f {' '.join(map(str, range(1, 1000)))}\n" * 20
+    refused(write(tmp_path, "a.obj", text), "a.obj", "processor time")

@@ -1,8 +1,9 @@
 """Files that a mesh names, read and decoded, and warnings about what a mesh says.
 
-In: names as a mesh writes them, paths or data URIs. Out: bytes of files beside the mesh, textures as pixels, and colors
-as light. Refused: a file that is missing, and an image that cannot be decoded. As glTF says for its images, color
-profiles and orientations of textures are not applied; alpha is dropped.
+In: names as a mesh writes them, paths or data URIs. Out: bytes of files, textures as pixels, and colors as light. All
+but pictures must lie in the mesh's folder or below, links followed. Refused: a file that is missing, an image that
+cannot be decoded, more bytes or texels than a mesh may have. As glTF says for its images, color profiles and
+orientations of textures are not applied; alpha is dropped.
 """
 
 from __future__ import annotations
@@ -12,68 +13,91 @@ import urllib.parse
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 from patchproof.base.color import linear_from_srgb
 from patchproof.base.errors import Refused
-from patchproof.base.input import is_file, open_image, read_file
+from patchproof.base.input import IMAGE_FORMATS, MAX_FILE_BYTES, is_file, open_image, read_file
 from patchproof.mesh.mesh import Material
 
 WHITE = (1.0, 1.0, 1.0)
 GRAY = Material("unnamed", (0.21404114, 0.21404114, 0.21404114))  # sRGB 0.5, for an object without color
 VERTEX_COLORS = Material("vertex colors", WHITE)
+MOST_TEXELS = 300_000_000  # of all textures of a mesh: 900 MB; 17 of 4096 × 4096
 
 
 class Assets:
     """A mesh file's `data`, the files beside it as far as they have been read, and the `warnings` of its reader."""
 
     def __init__(self, path: Path):
-        self.path, self.data = path, read_file(path, "a mesh file")
-        self.warnings: dict[str, None] = {}
+        self.path, self.data, self.warnings = path, read_file(path, "a mesh file"), dict[str, None]()
         self._files: dict[str | Path, bytes] = {}
-        self._textures: dict[bytes, np.ndarray] = {}
+        self._textures: dict[tuple[bytes, float, float], np.ndarray] = {}
+        self._free_bytes, self._free_texels = MAX_FILE_BYTES, MOST_TEXELS
 
     @property
     def files(self) -> list[Path]:
         """The mesh file and the files beside it that have been read."""
         return [self.path, *(source for source in self._files if isinstance(source, Path))]
 
+    @property
+    def size(self) -> int:
+        """The bytes of all files that have been read."""
+        return len(self.data) + MAX_FILE_BYTES - self._free_bytes
+
     def say(self, warning: str) -> None:
         """Add a warning, unless it is there already."""
         self.warnings[warning] = None
 
-    def find(self, name: str, folder: Path | None = None) -> Path | None:
+    def find(self, name: str, folder: Path | None = None, is_picture: bool = False) -> Path | None:
         """Return the path of a file in `folder` or beside the mesh, or None; names may have %20 or backslashes."""
-        spellings = (name.strip(), name.strip().replace("\\", "/"), urllib.parse.unquote(name.strip()))
-        places = [
-            place / spelling for place in (folder or self.path.parent, self.path.parent) for spelling in spellings
-        ]
-        return next(filter(is_file, places), None)
+        name = name.strip()
+        spellings = (name, name.replace("\\", "/"), urllib.parse.unquote(name))
+        places = [place / each for place in (folder or self.path.parent, self.path.parent) for each in spellings]
+        return next((path for path in places if is_file(path) and self._may_open(path, is_picture)), None)
 
-    def read(self, name: str, folder: Path | None = None) -> bytes:
-        """Return the bytes of a named file or of a data URI; refused if there is no such file."""
-        source = name if name.startswith("data:") else self.find(name, folder)
+    def _may_open(self, path: Path, is_picture: bool) -> bool:
+        real = path.resolve()
+        formats = Image.registered_extensions() if is_picture else {}
+        return formats.get(real.suffix.lower()) in IMAGE_FORMATS or real.is_relative_to(self.path.parent.resolve())
+
+    def read(self, name: str, folder: Path | None = None, is_picture: bool = False) -> bytes:
+        """Return the bytes of a named file or of a data URI; refused if there is no such file that may be opened."""
+        source = name if name.startswith("data:") else self.find(name, folder, is_picture)
         if source is None:
             remedy = f"put it into {folder or self.path.parent}"
-            raise Refused(f"the file {name}, which {self.path.name} names", "no such file", remedy)
+            raise Refused(f"the file {name}, which {self.path.name} names", "no such file in its folder", remedy)
         if source not in self._files:
-            is_path = isinstance(source, Path)
-            data = (
-                read_file(source, "a file of a mesh") if is_path else base64.b64decode(source.partition(";base64,")[2])
-            )
+            if isinstance(source, Path):
+                data = read_file(source, "a file of a mesh", max_bytes=self._free_bytes)
+                self._free_bytes -= len(data)
+            else:
+                data = base64.b64decode(source.partition(";base64,")[2])
             self._files[source] = data
         return self._files[source]
 
-    def texture(self, data: bytes, name: str) -> np.ndarray:
-        """Decode an image, once, as uint8 H×W×3; 16 bits are cut to 8."""
-        if data not in self._textures:
+    def texture(self, data: bytes, name: str, base: float = 0.0, gain: float = 1.0) -> np.ndarray:
+        """Decode an image, once, as uint8 H×W×3 of `base` + `gain` · value, where 1 is white; 16 bits are cut to 8."""
+        if (data, base, gain) not in self._textures:
             expected = f"the texture {name} of {self.path.name} as an image that can be read"
             with open_image(data, expected, "export it again as PNG or JPEG") as image:
+                if not self.has_room(image.width * image.height):
+                    expected = f"textures of {self.path.name} with at most {MOST_TEXELS // 10**6} million pixels in all"
+                    raise Refused(expected, f"{image.width} × {image.height} more in {name}", "export smaller ones")
                 if image.mode.startswith("I"):  # Pillow would clip 16 bits at 255 instead of scaling them
-                    pixels = np.repeat((np.asarray(image) >> 8).clip(0, 255).astype(np.uint8)[..., None], 3, axis=2)
-                else:
-                    pixels = np.asarray(image.convert("RGB"))
-            self._textures[data] = pixels
-        return self._textures[data]
+                    image = Image.fromarray((np.asarray(image) >> 8).clip(0, 255).astype(np.uint8))
+                image = image.convert("RGB")
+                if (base, gain) != (0, 1):
+                    curve = 255 * base + gain * np.arange(256, dtype=np.float32)
+                    image = image.point(curve.clip(0, 255).round().astype(int).tolist() * 3)
+                self._textures[data, base, gain] = np.asarray(image)
+        return self._textures[data, base, gain]
+
+    def has_room(self, texels: int) -> bool:
+        """Take so many texels of those that a mesh may have; False if there are fewer."""
+        has_room = texels <= self._free_texels
+        self._free_texels -= texels if has_room else 0
+        return has_room
 
     def gray(self) -> Material:
         """Return the material of faces that have none, and say so."""

@@ -24,7 +24,7 @@ from patchproof.mesh.texture_wrap import Wrap, draw_out_textures
 _TYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 _WRAPS: dict[int, Wrap] = {33071: "clamp", 33648: "mirror"}
-_LEAST_FACES = 200  # that a placed part counts as: a million places of one face each would take minutes
+_LEAST_FACES, _VERTICES_PER_FACE = 200, 100  # of what a placed part counts as
 _EXTENSIONS = {entry.declares: entry for entry in DECLARED if entry.file == "glTF extension"}
 _LEFT_OUT = ("metallicRoughnessTexture", "normalTexture", "occlusionTexture", "emissiveTexture")
 _IMAGE_EXTENSIONS = ("EXT_texture_webp", "EXT_texture_avif")
@@ -49,7 +49,7 @@ class _GltfReader:
 
     def parts(self) -> list[MeshPart]:
         """Return each primitive with triangles, once for every place."""
-        parts, faces = [], 0
+        parts, faces = [], 0  # counted, so that neither a million places nor a shared list of vertices takes minutes
         for node, world in self.shown_nodes():
             if "skin" in node:
                 self.assets.say("skins are left out: meshes are drawn as they were modeled, without a pose")
@@ -58,11 +58,13 @@ class _GltfReader:
             instances = {name.lower(): self.array(accessor) for name, accessor in attributes.items()}
             count = min(map(len, instances.values()), default=1)
             for primitive in mesh["primitives"]:
-                triangles = self.triangles(primitive)
+                vertices = len(self.array(primitive["attributes"]["POSITION"]))
+                triangles = self.triangles(primitive, vertices)
+                faces += vertices * (1 + len(primitive.get("targets", ()))) // _VERTICES_PER_FACE
                 faces += max(len(triangles), _LEAST_FACES) * count
-                if faces > MOST_FACES:
-                    got = f"{faces} faces in {self.assets.path.name}, counted as often as they are placed"
-                    raise Refused(f"a mesh of at most {MOST_FACES // 10**6} million faces", got, "export a coarser one")
+                if faces > (most := min(MOST_FACES, MOST_FACES // 10 + self.assets.size)):
+                    got = f"{faces} in {self.assets.path.name}, counted as often as they are placed"
+                    raise Refused(f"a mesh of at most {most / 1e6:.3g} million faces", got, "export a coarser one")
                 if len(triangles):
                     part = self.part(primitive, triangles, node.get("weights", mesh.get("weights", ())))
                     local = (_local({name: rows[i] for name, rows in instances.items()}) for i in range(count))
@@ -75,10 +77,8 @@ class _GltfReader:
         if len(scenes) > 1:
             self.assets.say(f"of {len(scenes)} scenes only scene {chosen} is shown")
         children = {child for node in nodes for child in node.get("children", ())}
-        stack = [(i, np.eye(4)) for i in range(len(nodes)) if i not in children]
-        if scenes:
-            stack = [(i, np.eye(4)) for i in self.item("scenes", chosen).get("nodes", ())]
-        shown, seen = [], set()
+        roots = self.item("scenes", chosen).get("nodes", ()) if scenes else sorted({*range(len(nodes))} - children)
+        stack, shown, seen = [(i, np.eye(4)) for i in roots], [], set()
         while stack:
             index, world = stack.pop()
             node = self.item("nodes", index)
@@ -89,54 +89,51 @@ class _GltfReader:
                 world = world @ _local(node)
                 shown += [(node, world)] if "mesh" in node else []
                 stack += [(child, world) for child in node.get("children", ())]
-        hidden = sum("mesh" in node for node in nodes) - len(shown)
-        if hidden:
+        if hidden := sum("mesh" in node for node in nodes) - len(shown):
             self.assets.say(f"{hidden} nodes with meshes are hidden or outside of the scene, and are left out")
         return shown
 
-    def triangles(self, primitive: Entry) -> np.ndarray:
+    def triangles(self, primitive: Entry, vertices: int) -> np.ndarray:
         """Return the faces F×3 of triangles (mode 4), a strip (5) or a fan (6)."""
-        mode = primitive.get("mode", 4)
-        if mode < 4:
+        if (mode := primitive.get("mode", 4)) < 4:
             self.assets.say("points and lines are left out")
             return np.zeros((0, 3), int)
-        if "indices" in primitive:
-            corners = self.array(primitive["indices"])[:, 0]
-        else:
-            corners = np.arange(len(self.array(primitive["attributes"]["POSITION"])), dtype=np.uint32)
+        is_list = "indices" in primitive
+        corners = self.array(primitive["indices"])[:, 0] if is_list else np.arange(vertices, dtype=np.uint32)
         if np.any(corners == np.iinfo(corners.dtype).max):
             raise ValueError(f"the index {corners.max()}, which glTF reserves")
+        corners, i = corners.astype(np.int64), np.arange(len(corners) - 2)
         if mode == 4:
-            return corners.astype(np.int64).reshape(-1, 3)
-        i = np.arange(len(corners) - 2)
-        order = [i, i + 1 + i % 2, i + 2 - i % 2] if mode == 5 else [i + 1, i + 2, 0 * i]
-        faces = corners.astype(np.int64)[np.stack(order, axis=1)]
+            return corners.reshape(-1, 3)
+        faces = corners[np.stack([i, i + 1 + i % 2, i + 2 - i % 2] if mode == 5 else [i + 1, i + 2, 0 * i], axis=1)]
         return faces[(faces != np.roll(faces, 1, axis=1)).all(1)]  # strips repeat corners to turn
 
     def part(self, primitive: Entry, faces: np.ndarray, weights) -> MeshPart:
         """Return a primitive's part in its mesh's axes, with `weights` of its morph targets."""
-        attributes = primitive["attributes"]
-        if "bufferView" not in self.item("accessors", attributes["POSITION"]):
-            for name in {"KHR_draco_mesh_compression"} & primitive.get("extensions", {}).keys():
-                _refuse_extension(name, self.assets)
+        attributes, used = primitive["attributes"], slice(None)
+        positions = self.item("accessors", attributes["POSITION"])
+        if "bufferView" not in positions and "KHR_draco_mesh_compression" in primitive.get("extensions", {}):
+            _refuse_extension("KHR_draco_mesh_compression", self.assets)
+        if positions["count"] > faces.size:
+            used, faces = np.unique(faces, return_inverse=True)
         material, uv_name, moved = VERTEX_COLORS, "TEXCOORD_0", {}
         if "material" in primitive:
             material, uv_name, moved = self.material(primitive["material"], attributes)
         elif "COLOR_0" not in attributes:
             material = self.assets.gray()
         names = {"POSITION", "NORMAL", "COLOR_0", uv_name} & attributes.keys()
-        arrays = {name: self.array(attributes[name], name == "COLOR_0").astype(float) for name in names}
+        arrays = {name: self.array(attributes[name], name == "COLOR_0")[used].astype(float) for name in names}
         if len({len(values) for values in arrays.values()}) > 1:
             raise ValueError("attributes of different lengths")
         for weight, target in zip(weights, primitive.get("targets", ()), strict=False):
             for name in target.keys() & names if weight else ():
-                arrays[name] += weight * self.array(target[name])
+                arrays[name] += weight * self.array(target[name])[used]
         uv, colors = arrays.get(uv_name), arrays.get("COLOR_0")
         if uv is not None:
             uv = self.assets.finite_uv(_transform_uv(uv, **moved))
         if colors is not None:
             colors = self.assets.linear_colors(colors[:, :3], is_srgb=False)
-        return MeshPart(arrays["POSITION"], faces, material, uv, arrays.get("NORMAL"), colors)
+        return MeshPart(arrays["POSITION"], faces.reshape(-1, 3), material, uv, arrays.get("NORMAL"), colors)
 
     def material(self, index: int, attributes: Entry) -> tuple[Material, str, Entry]:
         """Return a material, made once, the attribute with its texture coordinates, and how they are transformed."""
@@ -174,7 +171,8 @@ class _GltfReader:
         if source is None:
             _refuse_extension(next(iter(entry.get("extensions", {})), "a texture without an image"), self.assets)
         image = self.item("images", source)
-        data = self.assets.read(image["uri"]) if "uri" in image else bytes(self.view(image["bufferView"]))
+        is_file = "uri" in image
+        data = self.assets.read(image["uri"], is_picture=True) if is_file else bytes(self.view(image["bufferView"]))
         sampler = self.item("samplers", entry["sampler"]) if "sampler" in entry else {}
         if sampler.get("magFilter") == 9728:
             self.assets.say("textures whose texels are to look like blocks are drawn smooth")
@@ -226,8 +224,6 @@ def _open(assets: Assets) -> tuple[Entry, bytes]:
         end = 20 + int.from_bytes(data[12:16], "little")
         data, binary = data[20:end], data[end + 8 : end + 8 + int.from_bytes(data[end : end + 4], "little")]
     tree = json.loads(data, object_pairs_hook=_unique_keys)
-    if not isinstance(tree, dict):
-        raise ValueError("its JSON is no object")
     version = str(tree.get("asset", {}).get("version"))
     if not version.startswith("2."):
         raise Refused(f"{assets.path.name} as glTF 2.0", f"asset.version {version}", "export it again as glTF 2.0")
@@ -246,8 +242,7 @@ def _open(assets: Assets) -> tuple[Entry, bytes]:
             assets.say(f"the glTF extension {name} is not read: {entry.how}")
     if unknown:
         assets.say(f"glTF extensions that are not read, so that looks may differ: {summarize_names(unknown)}")
-    left_out = [key for key in ("cameras", "animations") if tree.get(key)]
-    if left_out:
+    if left_out := [key for key in ("cameras", "animations") if tree.get(key)]:
         assets.say(f"{' and '.join(left_out)} in {assets.path.name} are left out")
     return tree, binary
 

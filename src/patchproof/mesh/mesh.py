@@ -83,16 +83,17 @@ def mesh_from_parts(parts: Sequence[MeshPart], length_mm: float, warnings: Seque
         warnings.append(f"{np.count_nonzero(~has_finite_corners)} faces with NaN or infinite corners are left out")
     if np.any(has_finite_corners & ~has_area):
         warnings.append(f"{np.count_nonzero(has_finite_corners & ~has_area)} faces without area are left out")
-    corners = [_corner_arrays(part, normals[owner == i]) for i, part in enumerate(parts)]
+    of_parts = np.split(normals, np.cumsum([len(part.faces) for part in parts])[:-1])
+    corners = [_corner_arrays(part, face_normals) for part, face_normals in zip(parts, of_parts, strict=True)]
     uv, corner_normals, colors = (np.concatenate(array)[drawn] for array in zip(*corners, strict=True))
     used_vertices, drawn_faces = np.unique(faces[drawn], return_inverse=True)
     drawn_points = unit[used_vertices]
     low, high = drawn_points.min(0), drawn_points.max(0)
-    materials = tuple(dict.fromkeys(part.material for part in parts))
-    index = np.array([materials.index(part.material) for part in parts])
+    materials = {material: i for i, material in enumerate(dict.fromkeys(part.material for part in parts))}
+    index = np.array([materials[part.material] for part in parts])
     vertices = (drawn_points - (low + high) / 2) * (length_mm / (high - low).max())
     arrays = (vertices, drawn_faces.reshape(-1, 3), uv, corner_normals, colors, index[owner[drawn]])
-    return Mesh(*arrays, materials, tuple(warnings))
+    return Mesh(*arrays, tuple(materials), tuple(warnings))
 
 
 def _join(parts: Sequence[MeshPart]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

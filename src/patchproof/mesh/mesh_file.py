@@ -12,10 +12,12 @@ from pathlib import Path
 import numpy as np
 
 from patchproof.base.errors import Refused
-from patchproof.base.input import is_file
+from patchproof.base.input import is_file, run_within_seconds
 from patchproof.mesh.assets import Assets
 from patchproof.mesh.mesh import MeshPart, topology_warnings, transform_part
 
+SECONDS = 40.0  # of processor time to read a mesh, and more for long files, of which text takes longest:
+_BYTES_PER_SECOND = 500_000
 FORMATS = {".obj": "obj", ".glb": "gltf", ".gltf": "gltf", ".ply": "ply", ".stl": "stl"}
 
 
@@ -29,11 +31,10 @@ def read_parts(path: Path, world_from_file: np.ndarray) -> tuple[list[MeshPart],
     if kind is None:
         raise Refused(f"a mesh file ({', '.join(FORMATS)})", path.name, "export the mesh in one of these formats")
     try:
-        assets = Assets(path)
-        parts = getattr(import_module(f"patchproof.mesh.{kind}"), f"read_{kind}")(assets)
-        parts = [
-            transform_part(part, np.column_stack([world_from_file, np.zeros(3)])) for part in parts if len(part.faces)
-        ]
+        assets, read = Assets(path), getattr(import_module(f"patchproof.mesh.{kind}"), f"read_{kind}")
+        parts = run_within_seconds(SECONDS + len(assets.data) / _BYTES_PER_SECOND, lambda: read(assets))
+        world_from_file = np.column_stack([world_from_file, np.zeros(3)])
+        parts = [transform_part(part, world_from_file) for part in parts if len(part.faces)]
         if not parts:
             raise Refused("a mesh with faces", f"no face in {path.name}", "export the object as triangles")
         return parts, [*assets.warnings, *topology_warnings(parts)], assets.files

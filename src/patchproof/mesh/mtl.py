@@ -34,9 +34,8 @@ class MaterialLibrary:
     """The materials that an OBJ file's MTL files define, and how textures continue that do not repeat."""
 
     def __init__(self, assets: Assets):
-        self.assets = assets
-        self.wraps: dict[Material, tuple[Wrap, Wrap]] = {}
-        self._entries: dict[str, tuple[Path, dict[str, str]]] = {}
+        self.assets, self.wraps = assets, dict[Material, tuple[Wrap, Wrap]]()
+        self._entries: dict[str, tuple[Path | None, dict[str, str]]] = {}
         self._made: dict[tuple[str, bool], tuple[Material, np.ndarray, np.ndarray]] = {}
 
     def read(self, names: str) -> None:
@@ -44,47 +43,41 @@ class MaterialLibrary:
         for name in [names] if self.assets.find(names) else names.split():
             path, values = self.assets.find(name), {}
             if path is None:
-                self.assets.say(f"the material file {name} is missing")
-                continue
-            for line in logical_lines(self.assets.read(name)):
+                self.assets.say(f"the material file {name} is missing in the folder of {self.assets.path.name}")
+            for line in logical_lines(self.assets.read(name)) if path else ():
                 key, value = [*line.split(None, 1), "", ""][:2]
                 if key == "newmtl":
-                    values = self._entries.setdefault(value.strip(), (path.parent, {}))[1]
+                    values = self._entries.setdefault(value.strip(), (path and path.parent, {}))[1]
                 else:
                     values[key.lower()] = value.strip()
 
     def check_names(self, names: Sequence[str]) -> None:
         """Warn of materials that are used and that no file defines."""
-        undefined = [name for name in dict.fromkeys(names) if name and name not in self._entries]
-        if undefined:
+        if undefined := [name for name in dict.fromkeys(names) if name and name not in self._entries]:
             self.assets.say(f"no MTL file defines {summarize_names(undefined)}")
 
     def material(self, name: str, has_uv: bool, has_colors: bool) -> tuple[Material, np.ndarray, np.ndarray]:
         """Return a material, made once, and the scale and shift of its texture coordinates."""
         if (name, has_uv) not in self._made:
-            folder, values = self._entries.get(name, (self.assets.path.parent, {}))
+            folder, values = self._entries.get(name, (None, {}))
             texture, (options, file_name) = None, _options(values.get("map_kd", ""))
             if file_name and has_uv:
-                texture = self.assets.texture(self.assets.read(file_name, folder), file_name)
-                if "-mm" in options:
-                    base, gain = _numbers(options["-mm"])
-                    texture = np.clip(255 * base + gain * texture.astype(np.float32), 0, 255).round().astype(np.uint8)
+                base, gain = _numbers(options.get("-mm", "0 1"))
+                texture = self.assets.texture(self.assets.read(file_name, folder, True), file_name, base, gain)
             elif file_name:
                 self.assets.say("a texture without texture coordinates is left out")
             self._say_left_out(values, options)
             material = VERTEX_COLORS
             if texture is not None or not has_colors:
                 material = Material(name or "unnamed", self._kd(name, values, texture is not None), texture)
-            if options.get("-clamp") == "on":
-                self.wraps[material] = "clamp", "clamp"
+            self.wraps |= {material: ("clamp", "clamp")} if options.get("-clamp") == "on" else {}
             scale, shift = _numbers(options.get("-s", "")), _numbers(options.get("-o", ""))
             self._made[name, has_uv] = material, np.array([*scale, 1, 1])[:2], np.array([*shift, 0, 0])[:2]
         return self._made[name, has_uv]
 
     def _kd(self, name: str, values: dict[str, str], has_texture: bool) -> tuple[float, float, float]:
         """Return Kd as linear light; one number counts for all three, and black beside a texture as white."""
-        text = values.get("kd", "")
-        kd = _numbers(text)
+        kd = _numbers(text := values.get("kd", ""))
         if len(kd) < len(text.split()):  # "spectral" and "xyz" are allowed, too
             self.assets.say(f"Kd {text[:40]} of {name} is not read")
         if len(kd) not in (1, 3) or len(kd) < len(text.split()) or (has_texture and not any(kd)):
@@ -93,8 +86,8 @@ class MaterialLibrary:
         return red, green, blue
 
     def _say_left_out(self, values: dict[str, str], options: dict[str, str]) -> None:
-        left_out = [f"map_Kd {key}" for key, value in options.items() if f"{key} {value}" not in _WITHOUT_EFFECT]
-        left_out = [each for each in left_out if each[7:] not in ("-s", "-o", "-mm", "-clamp")]
+        others = [key for key, value in options.items() if f"{key} {value}" not in _WITHOUT_EFFECT]
+        left_out = [f"map_Kd {key}" for key in others if key not in ("-s", "-o", "-mm", "-clamp")]
         left_out += [key for key in values if key.startswith(_MAPS) and key not in ("map_kd", "map_d")]
         left_out += ["Ke"] if any(_numbers(values.get("ke", ""))) else []
         if left_out:

@@ -28,17 +28,14 @@ class _Faces:
     """Faces of one material: each different corner v/vt/vn by its number, and the polygons' corners, joined."""
 
     def __init__(self):
-        self.numbers: dict[str, int] = {}
-        self.corners, self.lengths = array("q"), array("q")
+        self.numbers, self.corners, self.lengths = dict[str, int](), array("q"), array("q")
 
 
 def read_obj(assets: Assets) -> list[MeshPart]:
     """Read the parts of an OBJ file."""
     library, left_out, widths = MaterialLibrary(assets), Counter[str](), set[int]()
     rows = {key: array("d") for key in _WIDTHS}
-    groups: dict[tuple[str, bool], _Faces] = defaultdict(
-        _Faces
-    )  # by material, and if the corners have texture coordinates
+    groups = defaultdict[tuple[str, bool], _Faces](_Faces)  # by material, and if corners have texture coordinates
     material, is_smooth = "", False
     for number, line in enumerate(logical_lines(assets.data), 1):
         key, rest = [*line.split(None, 1), "", ""][:2]
@@ -53,7 +50,7 @@ def read_obj(assets: Assets) -> list[MeshPart]:
             if "-" in rest:
                 words = [_absolute(word, rows) for word in words]
             faces = groups[material, "/" in words[0] and "//" not in rest]
-            faces.corners.extend(faces.numbers.setdefault(word, len(faces.numbers)) for word in words)
+            faces.corners.extend([faces.numbers.setdefault(word, len(faces.numbers)) for word in words])
             faces.lengths.append(len(words))
         elif key == "usemtl":
             material = rest.strip()
@@ -72,8 +69,9 @@ def read_obj(assets: Assets) -> list[MeshPart]:
     library.check_names([name for name, _ in groups])
     # row 0 is for corners without a number
     tables = [np.insert(np.reshape(rows[key], (-1, width)), 0, np.nan, axis=0) for key, width in _WIDTHS.items()]
-    colors = assets.linear_colors(tables[0][1:, 3:6], is_srgb=True) if widths in ({6}, {7}) else None
-    parts = [_part(*key, faces, tables, colors, library) for key, faces in groups.items()]
+    if widths in ({6}, {7}):
+        tables.append(np.insert(assets.linear_colors(tables[0][1:, 3:6], is_srgb=True), 0, np.nan, axis=0))
+    parts = [_part(key, faces, tables, library) for key, faces in groups.items()]
     return draw_out_textures(parts, library.wraps, assets)
 
 
@@ -83,30 +81,19 @@ def _absolute(corner: str, rows: dict[str, array]) -> str:
     return "/".join(str(len(row) // _WIDTHS[k] + 1 + int(n)) if "-" in n else n for n, (k, row) in numbers)
 
 
-def _part(
-    name: str,
-    has_uv: bool,
-    faces: _Faces,
-    tables: list[np.ndarray],
-    colors: np.ndarray | None,
-    library: MaterialLibrary,
-) -> MeshPart:
-    """Return the part of some faces with one material."""
+def _part(key: tuple[str, bool], faces: _Faces, tables: list[np.ndarray], library: MaterialLibrary) -> MeshPart:
+    """Return the part of some faces with one material; `tables` are those of v, vt and vn, and of colors if any."""
     corners = np.array([[int(number or 0) for number in f"{corner}//".split("/")[:3]] for corner in faces.numbers])
-    for table, column, kind in zip(tables, corners.T, _WIDTHS, strict=True):
+    for table, column, kind in zip(tables, corners.T, _WIDTHS, strict=False):
         low, high = column.min(), column.max()
         if low < (kind == "v") or high >= len(table):
             got = f"{high if high >= len(table) else low} in {library.assets.path.name}"
             raise Refused(f"faces that name {kind} 1 to {len(table) - 1}", got, "export the mesh again")
-    vertices, uv, normals = (table[column] for table, column in zip(tables, corners.T, strict=True))
-    vertices, triangles = (
-        vertices[:, :3],
-        triangulate(np.array(faces.corners), np.array(faces.lengths), vertices[:, :3]),
-    )
-    material, scale, shift = library.material(name, has_uv, colors is not None)
-    if colors is not None and material.texture_srgb is not None:
+    vertices, uv, normals, *colors = (table[corners[:, i % 3]] for i, table in enumerate(tables))
+    triangles = triangulate(np.array(faces.corners), np.array(faces.lengths), vertices[:, :3])
+    material, scale, shift = library.material(*key, bool(colors))
+    if colors and material.texture_srgb is not None:
         library.assets.say("vertex colors are left out where there is a texture")
-        colors = None
-    uv = library.assets.finite_uv(uv * scale + shift) * (1, -1) + (0, 1) if has_uv else None
-    colors = None if colors is None else colors[corners[:, 0] - 1]
-    return MeshPart(vertices, triangles, material, uv, normals if corners[:, 2].any() else None, colors)
+        colors = []
+    uv = library.assets.finite_uv(uv * scale + shift) * (1, -1) + (0, 1) if key[1] else None
+    return MeshPart(vertices[:, :3], triangles, material, uv, normals if corners[:, 2].any() else None, *colors)

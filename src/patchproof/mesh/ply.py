@@ -19,34 +19,30 @@ from patchproof.mesh.assets import VERTEX_COLORS, WHITE, Assets
 from patchproof.mesh.mesh import Material, MeshPart
 from patchproof.mesh.polygons import triangulate
 
-_TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4"}
-_TYPES |= {"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4", "float32": "f4"}
-_TYPES |= {"double": "f8", "float64": "f8"}
+_NAMES = "char uchar short ushort int uint float double int8 uint8 int16 uint16 int32 uint32 float32 float64".split()
+_TYPES: dict[str, str] = dict(zip(_NAMES, "i1 u1 i2 u2 i4 u4 f4 f8".split() * 2, strict=True))
 _HEAD = re.compile(rb"ply\r?\n.*?\nend_header[ \t]*\r?\n", re.DOTALL)
 _UV = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"))
 _RGBA = ("red", "green", "blue", "alpha")
 
 
 class _Element:
-    """One kind of element: its properties (name, numpy's type of values, and of a list's length if it is a list), and
-    the values of each, as arrays or as lists of lists of unequal lengths.
+    """One kind of element: its properties (name, numpy's types of values and of a list's length, "" if it is none), and
+    the values of each: an array, or arrays of unequal lengths.
     """
 
     def __init__(self, count: int):
-        self.count = count
-        self.properties: list[tuple[str, str, str]] = []
-        self.values: dict[str, Any] = {}
+        self.count, self.properties, self.values = count, list[tuple[str, str, str]](), dict[str, Any]()
 
     def table(self, names: Sequence[str]) -> np.ndarray | None:
         """Return the columns of these names as floats; None if one is missing."""
-        columns = [self.values[name] for name in names if name in self.values]
-        return np.column_stack(columns).astype(float) if len(columns) == len(names) else None
+        has_all = {*names} <= self.values.keys()
+        return np.column_stack([self.values[name] for name in names]).astype(float) if has_all else None
 
     def colors(self, assets: Assets) -> np.ndarray | None:
         """Return linear colors N×3, or None."""
         kinds = {name: np.dtype(kind) for name, kind, _ in self.properties if name in _RGBA}
-        table = self.table(_RGBA[: max(3, len(kinds))])
-        if table is None:
+        if (table := self.table(_RGBA[: max(3, len(kinds))])) is None:
             return None
         table /= [1 if kinds[name].kind == "f" else np.iinfo(kinds[name]).max for name in _RGBA[: len(kinds)]]
         if np.any(table[:, 3:] < 1):
@@ -55,41 +51,43 @@ class _Element:
 
     def read(self, data: bytes, start: int, is_text: bool) -> int:
         """Read the values from byte `start` on, all of them float64 if the file is text; return their end."""
-        plan = [
-            (n, "f8", length_kind and "f8") if is_text else (n, k, length_kind) for n, k, length_kind in self.properties
-        ]
+        plan = [(name, "f8", size and "f8") if is_text else (name, kind, size) for name, kind, size in self.properties]
+        if self.count < 1 or not plan:
+            return start
         fields: list[tuple] = []  # of one row, if all lists are as long as those of the first
-        for name, kind, length_kind in plan if self.count else ():
-            length = ()
-            if length_kind:
-                length = (int(np.frombuffer(data, length_kind, 1, start + np.dtype(fields).itemsize)[0]),)
-                fields.append((f"length of {name}", length_kind))
-            fields.append((name, kind, length))
+        for (name, kind, size), first in zip(plan, _row(data, start, plan)[0], strict=True):
+            fields += [(f"length of {name}", size), (name, kind, first.shape)] if size else [(name, kind)]
         row = np.dtype(fields)
-        end = start + self.count * row.itemsize
-        if end <= len(data):
-            rows = np.frombuffer(data, row, self.count if fields else 0, start)
-            if all(np.all(rows[name] == rows[name][:1]) for name in row.names or () if name.startswith("length of ")):
-                self.values = {name: rows[name] for name, *_ in plan if fields}
+        if (end := start + self.count * row.itemsize) <= len(data):
+            rows = np.frombuffer(data, row, self.count, start)
+            if all(np.all(rows[f"length of {name}"] == rows[f"length of {name}"][0]) for name, _, size in plan if size):
+                self.values = {name: rows[name] for name, *_ in plan}
                 return end
-        self.values = {name: [] for name, *_ in plan}
+        table = []
         for _ in range(self.count):
-            for name, kind, length_kind in plan:
-                length = 1
-                if length_kind:
-                    length = max(0, int(np.frombuffer(data, length_kind, 1, start)[0]))
-                    start += np.dtype(length_kind).itemsize
-                self.values[name].append(np.frombuffer(data, kind, length, start))
-                start += length * np.dtype(kind).itemsize
+            values, start = _row(data, start, plan)
+            table.append(values)
+        self.values = {name: column for (name, *_), column in zip(plan, zip(*table, strict=True), strict=True)}
         return start
+
+
+def _row(data: bytes, start: int, plan: list[tuple[str, str, str]]) -> tuple[list[np.ndarray], int]:
+    """Return the values of each property of one element, and their end."""
+    values = []
+    for _, kind, size in plan:
+        length = 1
+        if size:
+            length, start = max(0, int(np.frombuffer(data, size, 1, start)[0])), start + np.dtype(size).itemsize
+        values.append(np.frombuffer(data, kind, length, start))
+        start += values[-1].nbytes
+    return values, start
 
 
 def read_ply(assets: Assets) -> list[MeshPart]:
     """Read a PLY file as one part, or none if it has no faces."""
     elements, textures = _read(assets.data)
     vertex, face = (elements.pop(name, _Element(0)) for name in ("vertex", "face"))
-    others = [name for name, element in elements.items() if element.count]
-    if others:
+    if others := [name for name, element in elements.items() if element.count]:
         assets.say(f"left out of {assets.path.name}: {summarize_names(others)}")
     if len(textures) > 1:
         raise Refused("a PLY file with one texture", summarize_names(textures), "export the mesh as OBJ or GLB")
@@ -115,14 +113,14 @@ def read_ply(assets: Assets) -> list[MeshPart]:
     if textures and uv is None:
         assets.say("a texture without texture coordinates is left out")
     elif textures:
-        material = Material("unnamed", WHITE, assets.texture(assets.read(textures[0]), textures[0]))
-        if colors is not None:
+        data, left_out, colors = assets.read(textures[0], is_picture=True), colors, None
+        material = Material("unnamed", WHITE, assets.texture(data, textures[0]))
+        if left_out is not None:
             assets.say("vertex colors are left out where there is a texture")
-            colors = None
     return [MeshPart(points, triangulate(corners, lengths, points), material or assets.gray(), uv, normals, colors)]
 
 
-def _joined(lists: np.ndarray | list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+def _joined(lists: np.ndarray | tuple[np.ndarray, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Return the values of lists, one list after the other, and the lists' lengths."""
     if isinstance(lists, np.ndarray):
         return lists.reshape(-1), np.full(len(lists), lists.shape[1])
@@ -131,21 +129,18 @@ def _joined(lists: np.ndarray | list[np.ndarray]) -> tuple[np.ndarray, np.ndarra
 
 def _read(data: bytes) -> tuple[dict[str, _Element], list[str]]:
     """Return the elements with their values, and the names of textures."""
-    head = _HEAD.match(data)
-    if not head:
+    if not (head := _HEAD.match(data)):
         raise ValueError("it has no header")
-    elements: dict[str, _Element] = {}
-    order, textures, element = "", list[str](), _Element(0)
+    order, textures, elements, element = "", list[str](), dict[str, _Element](), _Element(0)
     for line in head[0].decode("utf-8", errors="replace").splitlines():
         match line.split():
             case ["format", form, *_]:
                 order = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}[form]
             case ["element", name, count]:
                 element = elements[name] = _Element(int(count))
-            case ["property", "list", length, kind, name]:
-                element.properties.append((name, order + _TYPES[kind], order + _TYPES[length]))
-            case ["property", kind, name]:
-                element.properties.append((name, order + _TYPES[kind], ""))
+            case ["property", *kinds, name]:
+                *sizes, kind = (order + _TYPES[kind] for kind in kinds if kind != "list")
+                element.properties.append((name, kind, "".join(sizes)))
             case ["comment", key, *_] if key.lower() == "texturefile":
                 textures.append(line.partition(key)[2].strip())
     start = head.end()

@@ -24,8 +24,8 @@ def read_stl(assets: Assets) -> list[MeshPart]:
         if facets["attribute"].any() or b"COLOR=" in data[:80]:
             assets.say("colors in the STL file are left out")
     elif b"endsolid" in data.lower():
-        words = re.findall(rb"\bvertex\s+(\S+)\s+(\S+)\s+(\S+)", data.lower())
-        corners = np.array(words, "S").astype(float).reshape(-1, 3)
+        rows = re.findall(rb"\bvertex\s+(\S+)\s+(\S+)\s+(\S+)", data.lower())
+        corners = np.array([[*map(float, row)] for row in rows]).reshape(-1, 3)
     else:
         raise ValueError("neither text nor of the size that it states")
     return [MeshPart(corners, np.arange(len(corners)).reshape(-1, 3), assets.gray())]

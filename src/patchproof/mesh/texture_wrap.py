@@ -26,28 +26,23 @@ def draw_out_textures(
     """Return parts whose textures repeat; `wraps` has (u, v) of the materials whose textures do not."""
     drawn = {id(part): part for part in parts}
     for material, modes in wraps.items():
-        texture = material.texture_srgb
+        texture, scale, shift = material.texture_srgb, np.ones(2), np.zeros(2)
         owners = [(part, part.uv) for part in parts if part.material is material and part.uv is not None]
         if texture is None or not owners:
             continue
         seen = np.concatenate([uv[np.unique(part.faces)] for part, uv in owners])
-        scale, shift = np.ones(2), np.zeros(2)
         for i, (mode, low, high) in enumerate(zip(modes, seen.min(0), seen.max(0), strict=True)):
             if mode == "repeat" or (low >= -_ROUNDING and high <= 1 + _ROUNDING):
                 continue
-            size = texture.shape[1 - i]
-            before, after = (
-                (0, size) if mode == "mirror" else np.ceil([1 - min(low, 0) * size, 1 + max(high - 1, 0) * size])
-            )
-            total = before + size + after
-            if total > _MOST_PX:
+            size, pad = texture.shape[1 - i], np.zeros((3, 2))
+            pad[1 - i] = (0, size) if mode == "mirror" else np.ceil(1 + size * np.maximum(0, [-low, high - 1]))
+            total = size + pad.sum()
+            if total > _MOST_PX or not assets.has_room(int(total) * texture.shape[i]):
                 got = f"{total:.0f} texels instead of {size}"
                 assets.say(f"the texture of {material.name} is repeated, not {mode}ed: that would take {got}")
                 continue
-            pad = [(0, 0)] * 3
-            pad[1 - i] = int(before), int(after)
-            texture = np.pad(texture, pad, "symmetric" if mode == "mirror" else "edge")
-            scale[i], shift[i] = size / total, before / total
+            texture = np.pad(texture, pad.astype(int), "symmetric" if mode == "mirror" else "edge")
+            scale[i], shift[i] = size / total, pad[1 - i, 0] / total
         if texture is not material.texture_srgb:
             larger = replace(material, texture_srgb=texture)
             for part, uv in owners:
