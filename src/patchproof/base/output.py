@@ -33,6 +33,8 @@ def new_folder(
 ) -> Iterator[Path]:
     """A folder to write into that becomes `out` when the block ends without an error; see `check_folder`."""
     out = Path(out)
+    if out.name in ("", ".."):
+        raise Refused("a folder by its name", f"{out}", _ANOTHER)
     with lock_folder(out):
         check_folder(out, file_names, overwrite, inputs=inputs)
         part, old = (out.with_name(f".{out.name}.{kind}") for kind in ("part", "old"))
@@ -42,11 +44,15 @@ def new_folder(
             yield part
             append_listing(part, _files_in(part))
             check_folder(out, file_names, overwrite)  # once more: what came in between is not deleted
-            _remove_listed(old)  # of a process that was killed in the next lines
-            if out.is_dir():
-                out.rename(old)
-            part.rename(out)
-            _remove_listed(old)
+            try:
+                _remove_listed(old)  # of a process that was killed in the next lines
+                if out.is_dir():
+                    out.rename(old)
+                part.rename(out)
+                _remove_listed(old)
+            except OSError as error:
+                got = f"{error.filename2 or error.filename} ({error.strerror})"
+                raise Refused("a folder that can be replaced", got, "remove that, or choose another --out") from error
             list_file(out / LISTING_FILE)
         finally:
             _remove(part)
@@ -63,8 +69,8 @@ def check_folder(
     listing and by `file_names`, the patterns of names that this command writes, and none of its `inputs` is among them.
     For an `unfinished` folder the refusal says how to continue.
     """
-    if os.path.isfile(out):
-        raise Refused("a folder to write to", f"the file {out}", "choose another --out")
+    if os.path.lexists(out) and not is_folder(out):
+        raise Refused("a folder to write to", f"{out}, which is none", _ANOTHER)
     names = _files_in(out)
     if names and not overwrite:
         got, do = f"{out} with {len(names)} files", "choose another --out or add --overwrite"
@@ -89,10 +95,8 @@ def refuse_inputs_in(out: Path, inputs: Iterable[object]) -> None:
 
 
 def refuse_other_files(out: Path, file_names: tuple[str, ...]) -> None:
-    """Refuse to continue a folder that has files beside those of the patterns, or a link to a folder within it."""
-    foreign = [
-        n for n in _files_in(out) if not _matches(n, file_names) or ((out / n).is_symlink() and is_folder(out / n))
-    ]
+    """Refuse to continue a folder that has files beside those of the patterns, or a link within it."""
+    foreign = [n for n in _files_in(out) if not _matches(n, file_names) or (out / n).is_symlink()]
     if foreign:
         expected = f"a folder with this command's own output only ({', '.join(file_names) or 'none'})"
         raise Refused(expected, f"{out} with {foreign[0]}", _ANOTHER)
@@ -104,7 +108,8 @@ def clear_folder(folder: Path, keep: Callable[[str], bool] = lambda name: False)
     for name in {*names} & _listed(folder, names):
         if not keep(name):
             (folder / name).unlink()
-            (folder / name).with_name(f".{name.rpartition('/')[2]}.part").unlink(missing_ok=True)
+            with suppress(OSError):  # there is none, or a folder
+                (folder / name).with_name(f".{name.rpartition('/')[2]}.part").unlink()
     if not _files_in(folder):
         (folder / LISTING_FILE).unlink(missing_ok=True)
     for path, _, _ in os.walk(folder, topdown=False):
@@ -184,13 +189,15 @@ def write_atomically(path: Path, content: str | bytes | Callable[[Path], Any]) -
         if callable(content):
             content(part)
         else:
-            part.write_bytes(content.encode() if isinstance(content, str) else content)
+            with open(part, "xb") as file:
+                file.write(content.encode() if isinstance(content, str) else content)
         os.replace(part, path)
     except OSError as error:
         got = f"{path} ({error.strerror or error})"
         raise Refused("a file that can be written", got, "make room or choose another --out") from error
     finally:
-        part.unlink(missing_ok=True)
+        with suppress(OSError):  # it was moved to its place, or never written
+            part.unlink()
 
 
 def write_files_atomically(contents: dict[Path, bytes]) -> None:

@@ -71,8 +71,8 @@ def load_network(path: Path) -> Classifier:
 def _beside(path: Path, location: str) -> Path:
     """The file of weights that an ONNX file names; refused unless it lies in the same folder."""
     beside = path.parent / location
-    folders = {os.path.dirname(os.path.realpath(file)) for file in (path.parent / "x", beside)}
-    if location in ("", ".", "..") or set("/\\:\0") & set(location) or len(folders) > 1:
+    is_named = location not in ("", ".", "..") and not set("/\\:\0") & set(location)
+    if not is_named or os.path.dirname(os.path.realpath(beside)) != os.path.realpath(path.parent):
         do = 'save it again with onnx.save(..., save_as_external_data=True, location="NAME.onnx.data")'
         raise Refused("weights in a file beside the network", f"{quote(location)} named in {path}", do)
     return beside
@@ -127,7 +127,7 @@ def read_card(path: Path) -> Card:
     input_px, labels = (card.get("input_px"), card.get("labels")) if isinstance(card, dict) else (None, None)
     if isinstance(labels, str):
         advice = "put the list of labels there"
-        labels = read_json(path.with_name(Path(labels).name), "a JSON file", advice, advice)
+        labels = read_json(path.parent / Path(labels).name, "a JSON file", advice, advice)
     if type(input_px) is not int or not 8 <= input_px <= 4096:
         raise Refused("input_px, a whole number of pixels from 8 to 4096", f"{input_px!r} in {path}", do)
     if not isinstance(labels, list) or len(labels) < 2 or not all(isinstance(label, str) for label in labels):

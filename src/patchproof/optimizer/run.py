@@ -30,7 +30,14 @@ from patchproof.base.fingerprint import refuse_other_inputs
 from patchproof.base.folder_lock import lock_folder
 from patchproof.base.input import is_file, read_file, read_json
 from patchproof.base.notebook import notebook_html
-from patchproof.base.output import check_folder, clear_folder, make_folder, refuse_inputs_in, write_atomically
+from patchproof.base.output import (
+    check_folder,
+    clear_folder,
+    make_folder,
+    refuse_inputs_in,
+    refuse_other_files,
+    write_atomically,
+)
 from patchproof.base.progress import Advance, Progress, no_progress
 from patchproof.base.settings import SceneSettings
 from patchproof.base.validation import refuse_untrusted, validate_model
@@ -116,7 +123,9 @@ def optimize(
     """
     out, compute = Path(out), compute.without("optimize", cluster=True)
     with lock_folder(out):
-        if not resume:
+        if resume and any(is_file(out / name) for name in (CHECKPOINT_FILE, _LOG_FILE, "place.json")):
+            refuse_other_files(out, ("*",))  # links, that is: no other file is written to
+        else:
             unfinished = is_file(out / CHECKPOINT_FILE) and not is_file(out / RUN_FILE)
             check_folder(out, RUN_FILE_PATTERNS, overwrite, unfinished=unfinished, inputs=(scene,))
         scene = resolve_scene(scene, seed)
@@ -126,8 +135,8 @@ def optimize(
             scene, save_place, searched = _choose_place(scene, out, resume, search_options)
         problem = set_problem(scene, compute.device, models, loss, compute.jobs)
         refuse_other_inputs(searched, problem.inputs, out, scene.settings.model_dump())
+        refuse_inputs_in(out, named_paths(scene).values())
         if not resume:
-            refuse_inputs_in(out, named_paths(scene).values())
             clear_folder(out)  # everything that the new run needs has been read
         make_folder(out)
         if save_place is not None:

@@ -20,9 +20,10 @@ from typing import Any
 
 from patchproof.base.errors import Refused
 from patchproof.base.output import make_folder, refuse_other_files
+from patchproof.evidence.journal import JOURNAL_FILE
 from patchproof.photo.read import list_images
 
-CONTROLS_FOLDER, JOURNAL_FILE = "controls", "photos.jsonl"
+CONTROLS_FOLDER = "controls"
 CONTROLS = ("bare", "mean", "gray", "noise", "shuffled", "blank")
 MOST_BYTES = 40_000_000  # phones' largest JPEGs, of 108 and 200 megapixels, have some 30
 MOST_PHOTOS = 1000
