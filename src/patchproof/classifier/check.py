@@ -16,7 +16,6 @@ from torch import Tensor
 
 from patchproof.base.errors import Refused
 from patchproof.classifier.network import NO_BOX_LOGIT, Classifier
-from patchproof.classifier.outputs import check_boxes, check_scores, check_shape
 
 # Logits differ by rounding when the batch does: 1e-6 of their spread in float32 here, 1e-3 with TF32. A dropout or a
 # BatchNorm in training mode moves them by more than a hundredth.
@@ -25,14 +24,19 @@ MIN_VARIATION = 1e-6  # of the spread: even untrained networks vary more between
 USUAL_VARIATION = 1e-3  # trained networks vary by a tenth
 
 
-def check_network(classifier: Classifier, device: torch.device | str = "cpu") -> None:
-    """Refuse a network whose answers or gradients cannot be trusted; warn of one that looks odd."""
+def check_network(classifier: Classifier, device: torch.device | str = "cpu", is_own: bool = False) -> None:
+    """Refuse a network whose answers or gradients cannot be trusted; warn of one that looks odd. What the outputs of
+    one of this package (`is_own`) mean is known.
+    """
     photos = smooth_pictures(classifier.input_px).to(device)
     name = f"the network {classifier.name}"
     try:
         with torch.no_grad():
             output = classifier.network(photos)
-            check_shape(output, classifier)
+            if not is_own:
+                from patchproof.classifier.outputs import check_shape
+
+                check_shape(output, classifier)
             batches = (photos.clone(), photos[1:2], photos.flip(1))
             again, alone, swapped = map(classifier.square_logits, batches)
     except Refused:
@@ -41,13 +45,13 @@ def check_network(classifier: Classifier, device: torch.device | str = "cpu") ->
         reason = f"{type(error).__name__}: {error_summary(error)}"
         got = f"{name}, which fails on 3×3×{classifier.input_px}×{classifier.input_px} ({reason})"
         raise Refused("a network that takes N×3×S×S pictures", got, "check input_px and the export") from error
-    scores = output[..., 4:] if classifier.LOOKS_AT_BOXES else output
-    logits = scores.amax(1) if classifier.LOOKS_AT_BOXES else scores
+    logits = output[..., 4:].amax(1) if classifier.LOOKS_AT_BOXES else output
     if not torch.isfinite(logits).all() or torch.isnan(output).any():
         raise Refused("finite logits", f"NaN or infinity from {name}", "check its weights and its number format")
-    if classifier.LOOKS_AT_BOXES:
-        check_boxes(classifier, output)
-    check_scores(classifier, photos, scores)
+    if not is_own:
+        from patchproof.classifier.outputs import check_values
+
+        check_values(classifier, photos, output)
     if classifier.LOOKS_AT_BOXES and float(logits.max()) <= NO_BOX_LOGIT:
         warnings.warn(f"{name} finds nothing in smooth pictures: its gradients were not tested", stacklevel=2)
         return
