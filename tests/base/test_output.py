@@ -178,7 +178,7 @@ def test_a_link_in_place_of_the_sorted_listing_leads_nowhere(out, tmp_path):
 
 def test_folders_in_place_of_temporary_files_are_refused_or_left(out):
     (out / ".a.txt.part").mkdir()
-    with pytest.raises(Refused, match="a file that can be written"):
+    with pytest.raises(Refused, match="a folder that can be written to"):
         write_atomically(out / "a.txt", "2")
     clear_folder(out)
     assert not out.exists()

@@ -2,9 +2,8 @@
 
 In: a folder of photographs (or of folders, one a session) and SHEET.json. Out: REPORT/ with report.json, report.csv,
 report.html, pictures, coco.json with places of the piece and of a detected object, and photos.jsonl, one line per
-finished photograph, from which `resume` continues. This combines evidence, classifiers and report, which do not import
-each other. The promise's primary network always judges, also if other networks are named. Scene, renderer and optimizer
-are imported only if a run is given.
+finished photograph, from which `resume` continues. The promise's primary network always judges, also if others are
+named. Scene, renderer and optimizer are imported only if a run is given.
 """
 
 from __future__ import annotations
@@ -231,11 +230,12 @@ def _check_out(out: Path, resume: bool, overwrite: bool, inputs: Sequence[object
 def _networks(manifest: Manifest, models: Sequence[str | Classifier] | None) -> tuple[str | Classifier, ...]:
     """List the primary network, then the named ones or else the promise's; classifiers in memory stay as they are."""
     named = _by_name(models)
-    if manifest.promise is None and not named:
-        got = f"the {manifest.kind} sheet {manifest.sheet_id}"
-        raise Refused("a sheet that promises something", got, "name --models")
     if manifest.promise is None:
-        return tuple(named.values())
+        if named:
+            return tuple(named.values())
+        raise Refused(
+            "a sheet that promises something", f"the {manifest.kind} sheet {manifest.sheet_id}", "name --models"
+        )
     promised = tuple(model.name for model in manifest.promise.models)
     names = dict.fromkeys((promised[0], *(named or promised)))
     return tuple(named.get(name, name) for name in names)

@@ -32,10 +32,9 @@ def lock_folder(folder: str | Path) -> Iterator[None]:
     """Keep other commands out of an output folder while the block runs, and list in it what `write_atomically` writes
     there; refused if another command is in it.
 
-    Put it around all from the first look at the folder to the last file: `with lock_folder(out): check_folder(out,
-    ...); ...`. `new_folder` does so itself. Different folders may be locked within each other. The lock is a hidden
-    file beside the folder (`.NAME.lock.part`), so that the folder may be missing, be replaced or be a symbolic link; a
-    file that a killed process left behind locks nothing, and `check_folder` passes over it.
+    Put it around all from the first look at the folder to the last file, as `new_folder` does itself. Different folders
+    may be locked within each other. The lock is a hidden file beside the folder (`.NAME.lock.part`), so that the folder
+    may be missing or be replaced; a file that a killed process left behind locks nothing.
     """
     try:
         real = Path(folder).resolve()

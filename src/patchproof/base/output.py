@@ -73,10 +73,10 @@ def check_folder(
         raise Refused("a folder to write to", f"{out}, which is none", _ANOTHER)
     names = _files_in(out)
     if names and not overwrite:
-        got, do = f"{out} with {len(names)} files", "choose another --out or add --overwrite"
         if unfinished:
-            got, do = f"{out}, which is unfinished", "continue with --resume, or start again with --overwrite"
-        raise Refused("an empty or new folder", got, do)
+            do = "continue with --resume, or start again with --overwrite"
+            raise Refused("an empty or new folder", f"{out}, which is unfinished", do)
+        raise Refused("an empty or new folder", f"{out} with {len(names)} files", f"{_ANOTHER} or add --overwrite")
     refuse_inputs_in(out, inputs)
     own = _listed(out, names)
     foreign = [n for n in names if n not in own or not _matches(n, file_names) or (out / n).is_symlink()]
@@ -88,9 +88,7 @@ def check_folder(
 def refuse_inputs_in(out: Path, inputs: Iterable[object]) -> None:
     """Refuse a file or folder that a command reads, if it is or lies in what the command writes."""
     for path in inputs:  # objects in memory are none
-        if not isinstance(path, str | Path) or not os.path.exists(path):
-            continue
-        if Path(path).resolve().is_relative_to(out.resolve()):
+        if isinstance(path, str | Path) and os.path.exists(path) and Path(path).resolve().is_relative_to(out.resolve()):
             raise Refused("inputs that lie outside of what is written", f"{path} in {out}", _ANOTHER)
 
 
@@ -159,7 +157,7 @@ def check_file(path: Path, overwrite: bool = False, inputs: Iterable[object] = (
     """Refuse a file that exists unless it may be overwritten and is none of the command's inputs."""
     refuse_inputs_in(path, inputs)
     if os.path.exists(path) and not overwrite:
-        raise Refused("a new file", f"{path}, which exists", "choose another --out or add --overwrite")
+        raise Refused("a new file", f"{path}, which exists", f"{_ANOTHER} or add --overwrite")
 
 
 def disk_is_full(error: BaseException | None) -> bool:
@@ -182,40 +180,35 @@ def make_folder(path: Path) -> None:
 
 def write_atomically(path: Path, content: str | bytes | Callable[[Path], Any]) -> None:
     """Write `content`, or let it write, beside `path`, and move it there: readers see the complete old or new file."""
-    part = path.with_name(f".{path.name}.part")
-    try:
-        part.unlink(missing_ok=True)  # a link there would lead the content elsewhere
-        list_file(path)
-        if callable(content):
-            content(part)
-        else:
-            with open(part, "xb") as file:
-                file.write(content.encode() if isinstance(content, str) else content)
-        os.replace(part, path)
-    except OSError as error:
-        got = f"{path} ({error.strerror or error})"
-        raise Refused("a file that can be written", got, "make room or choose another --out") from error
-    finally:
-        with suppress(OSError):  # it was moved to its place, or never written
-            part.unlink()
+    _write_beside({path: path.with_name(f".{path.name}.part")}, {path: content})
 
 
-def write_files_atomically(contents: dict[Path, bytes]) -> None:
-    """Write several files beside their places, then move all there: a full disk leaves the old files."""
-    parts = {path: path.with_name(f".{path.name}.{os.getpid()}.part") for path in contents}
+def write_files_atomically(contents: Mapping[Path, bytes]) -> None:
+    """Write several files beside their places, in folders that are made, then move all: a full disk leaves the old."""
+    for path in contents:
+        with suppress(OSError):  # writing says why
+            path.parent.mkdir(parents=True, exist_ok=True)
+    _write_beside({path: path.with_name(f".{path.name}.{os.getpid()}.part") for path in contents}, contents)
+
+
+def _write_beside(parts: Mapping[Path, Path], contents: Mapping[Path, Any]) -> None:
     path = next(iter(contents))
     try:
-        for path, data in contents.items():
-            path.parent.mkdir(parents=True, exist_ok=True)
+        for path, content in contents.items():
             if path.is_dir():
                 raise IsADirectoryError(f"{path} is a folder")
-            parts[path].unlink(missing_ok=True)
-            parts[path].write_bytes(data)
+            parts[path].unlink(missing_ok=True)  # a link there would lead the content elsewhere
+            list_file(path)
+            if callable(content):
+                content(parts[path])
+                continue
+            with open(parts[path], "xb") as file:
+                file.write(content.encode() if isinstance(content, str) else content)
         for path, part in parts.items():
             os.replace(part, path)
     except OSError as error:
-        reason = error.strerror or str(error)
-        raise Refused("a folder that can be written to", f"{path} ({reason})", "choose another --out") from error
+        got = f"{path} ({error.strerror or error})"
+        raise Refused("a folder that can be written to", got, "make room or choose another --out") from error
     finally:
         for part in parts.values():
             with suppress(OSError):  # it was moved to its place, or never written
@@ -235,8 +228,7 @@ def write_pictures(pictures: Sequence[np.ndarray], folder: Path) -> Path:
     """Write uint8 H×W×3 sRGB arrays as photo_0001.png and so on into a folder, in place of earlier ones; returns the
     folder. Refused for an empty list, or an array of another type or shape.
     """
-    pictures = list(pictures)
-    if not pictures:
+    if not len(pictures):
         raise Refused("a folder of photographs or arrays", "an empty list", "give one array or more")
     for number, array in enumerate(pictures):
         if not isinstance(array, np.ndarray) or array.dtype != np.uint8 or array.ndim != 3 or array.shape[2] != 3:

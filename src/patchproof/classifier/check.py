@@ -1,15 +1,14 @@
 """Test a network before it is used, on three synthetic pictures, for faults that would falsify every later figure.
 
-In: a Classifier. Out: nothing if all is well; refused if the network cannot be used (wrong outputs, answers that depend
-on chance or on the batch, no gradient, not for pictures in [0, 1]; what outputs.py finds); a warning if it may be right
-but looks odd. The idea is auto-attack's: a tool should distrust its own instrument.
-
-Source: Croce et al., "Flags", github.com/fra31/auto-attack, checks.py.
+In: a Classifier. Out: nothing if all is well; refused if the network cannot be used (answers that depend on chance or
+on the batch, no gradient, not for pictures in [0, 1]; what outputs.py finds); a warning if it may be right but looks
+odd. Source of the idea: Croce et al., "Flags", github.com/fra31/auto-attack, checks.py.
 """
 
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterator
 
 import torch
 from torch import Tensor
@@ -56,21 +55,18 @@ def check_network(classifier: Classifier, device: torch.device | str = "cpu", is
         warnings.warn(f"{name} finds nothing in smooth pictures: its gradients were not tested", stacklevel=2)
         return
     spread = float(logits.max() - logits.min())
+    do = "export it in evaluation mode, so that dropout and batch statistics are frozen"
     if float((logits - again).abs().max()) > MAX_DIFFERENCE * spread:
-        got = f"different logits on a second call from {name}"
-        raise Refused("the same logits for the same pictures", got, _EVAL_ADVICE)
+        raise Refused("the same logits for the same pictures", f"different logits on a second call from {name}", do)
     if float((logits[1:2] - alone).abs().max()) > MAX_DIFFERENCE * spread:
         got = f"different logits in a larger batch from {name}"
-        raise Refused("logits that do not depend on the rest of the batch", got, _EVAL_ADVICE)
+        raise Refused("logits that do not depend on the rest of the batch", got, do)
     if float((logits - logits.mean(0)).abs().max()) <= MIN_VARIATION * spread:
         do = "let it take sRGB in [0, 1], with its normalization inside"
         raise Refused("a network that tells pictures apart", f"{name}, whose logits are the same for all", do)
     _check_gradient(classifier, photos, name)
     for oddity in _oddities(logits, swapped, spread):
         warnings.warn(f"{name} {oddity}", stacklevel=2)
-
-
-_EVAL_ADVICE = "export it in evaluation mode, so that dropout and batch statistics are frozen"
 
 
 def _check_gradient(classifier: Classifier, photos: Tensor, name: str) -> None:
@@ -83,16 +79,14 @@ def _check_gradient(classifier: Classifier, photos: Tensor, name: str) -> None:
         raise Refused("a gradient from the logits to the pixels", got, "use a network of differentiable operations")
 
 
-def _oddities(logits: Tensor, swapped: Tensor, spread: float) -> list[str]:
+def _oddities(logits: Tensor, swapped: Tensor, spread: float) -> Iterator[str]:
     """Texts for warnings about outputs that are odd but can be right."""
-    oddities = []
     if float((logits - logits.mean(0)).abs().max()) <= USUAL_VARIATION * spread:
-        oddities.append("hardly tells pictures apart: does it take sRGB in [0, 1], with its normalization inside?")
+        yield "hardly tells pictures apart: does it take sRGB in [0, 1], with its normalization inside?"
     elif float((logits - swapped).abs().max()) <= USUAL_VARIATION * spread:
-        oddities.append("gives the same logits when red and blue are swapped: it may not see color")
+        yield "gives the same logits when red and blue are swapped: it may not see color"
     if (torch.softmax(logits.double(), 1).amax(1) > 1 - 1e-6).all():
-        oddities.append("is certain of pictures that show nothing: its gradients may be too small to optimize with")
-    return oddities
+        yield "is certain of pictures that show nothing: its gradients may be too small to optimize with"
 
 
 def smooth_pictures(size_px: int) -> Tensor:

@@ -8,7 +8,9 @@ DECLARED: tuple[Declaration, ...] = (
     Declaration("ONNX", "opset", "used", "13 to 28 of the standard domain; others are refused"),
     Declaration("ONNX", "attributes of operators", "used", "as onnxruntime does"),
     Declaration("ONNX", "attributes of a value that torch has no like for", "refused", "auto_pad by size, antialias"),
-    Declaration("ONNX", "fields and attributes that the reader does not know", "refused", "names and comments apart"),
+    Declaration(
+        "ONNX", "fields and attributes that the reader does not know", "refused", "names, comments and hints apart"
+    ),
     Declaration("ONNX", "operators of other domains, functions, subgraphs", "refused", "such as If, Loop"),
     Declaration("ONNX", "training mode and steps", "refused", "of BatchNormalization, Dropout, the model"),
     Declaration("ONNX", "sparse or quantized tensors", "refused", "also QuantizeLinear and its kind"),
@@ -19,13 +21,17 @@ DECLARED: tuple[Declaration, ...] = (
     Declaration("ONNX", "number of pictures", "used", "called with that number"),
     Declaration("ONNX", "type and dimensions of the input", "refused", "other than float32, N×3×S×S"),
     Declaration("ONNX", "several outputs", "refused", "one of N×K, or a detector's N×A×(4+K)"),
-    Declaration("ONNX", "metadata: how pictures are prepared", "refused", "other than sRGB in [0, 1]: BGR, mean"),
+    Declaration(
+        "ONNX", "metadata: how pictures are prepared", "refused", "other than sRGB in [0, 1]: BGR, mean, range"
+    ),
     Declaration("ONNX", "metadata: other entries", "said", "such as Ultralytics' names, imgsz, task"),
     Declaration("NAME.json", "input_px", "used", "the square's side; refused if the network takes another"),
     Declaration("NAME.json", "labels", "used", "by the order of outputs; refused if their number differs"),
     Declaration("NAME.json", "kind", "used", "classifier or detector"),
     Declaration("NAME.json", "mean, std, channels, range", "refused", "other than sRGB in [0, 1] and no normalization"),
-    Declaration("NAME.json", "resize, crop, interpolation, activation", "said", "the square is seen; others are notes"),
+    Declaration(
+        "NAME.json", "resize, crop, interpolation, activation", "said", "the whole square is seen; other keys are notes"
+    ),
     Declaration("safetensors", "names and shapes", "refused", "other than the network's own"),
     Declaration("safetensors", "whole numbers as weights", "refused", "quantized weights"),
     Declaration("safetensors", "format", "refused", "other than pt: weights in another order"),
@@ -33,6 +39,8 @@ DECLARED: tuple[Declaration, ...] = (
     Declaration("outputs", "probabilities, percent, 8 bits", "refused", "in place of logits, a detector's too"),
     Declaration("outputs", "values from 0 to 1 that may be logits", "said", "from an untrained network, say"),
     Declaration("outputs", "candidates of another shape", "refused", "than N×A×(4+K) for a detector"),
-    Declaration("outputs", "boxes in 0 to 1, (center, size), corners reversed", "refused", "if not corners in pixels"),
+    Declaration(
+        "outputs", "boxes in 0 to 1, (center, size), corners reversed", "refused", "not left, top, right, bottom"
+    ),
     Declaration("outputs", "boxes (top, left, bottom, right)", "said", "if they run down columns"),
 )

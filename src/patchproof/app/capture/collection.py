@@ -1,9 +1,9 @@
 """Measure the photographs of an album as they arrive, and report on all of them.
 
-In: an album, a manifest, the options of a verification. Out: a `Report`, as `verify` makes it of the same folder, by
-the same functions. Photographs are measured one at a time, in the single process of the workers, where limits of time
-and memory apply; finished ones are in the album's journal, so that a restart measures only new ones. Left out on
-purpose: the gap ledger and the estimated effect, which take longer than a person waits.
+In: an album, a manifest, the options of a verification. Out: a `Report`, as `verify` makes it of the same folder.
+Photographs are measured one at a time, in the single process of the workers, where limits of time and memory apply;
+finished ones are in the album's journal, so that a restart measures only new ones. Left out on purpose: the gap ledger
+and the estimated effect, which take longer than a person waits.
 """
 
 from __future__ import annotations
