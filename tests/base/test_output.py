@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -166,8 +167,73 @@ def test_links_in_place_of_temporary_folders_and_listings_lead_nowhere(out, tmp_
     assert everything(theirs) == {"a.txt": "theirs"} and everything(out)["a.txt"] == "1"
 
 
-def test_a_folder_that_is_continued_has_no_links_to_others(out, tmp_path):
+def test_a_link_in_place_of_the_sorted_listing_leads_nowhere(out, tmp_path):
+    """Every command that locks a received folder sorts its listing at the end, also one that only adds a file."""
+    (out / f"{LISTING_FILE}.part").symlink_to(tmp_path / "theirs" / "a.txt")
+    with lock_folder(out):
+        write_atomically(out / "inner" / "c.txt", "3")
+    assert (tmp_path / "theirs" / "a.txt").read_text() == "theirs"
+    assert (out / LISTING_FILE).read_text() == '["a.txt"]\n["inner/b.txt"]\n["inner/c.txt"]\n'
+
+
+def test_folders_in_place_of_temporary_files_are_refused_or_left(out):
+    (out / ".a.txt.part").mkdir()
+    with pytest.raises(Refused, match="a folder that can be written to"):
+        write_atomically(out / "a.txt", "2")
+    clear_folder(out)
+    assert not out.exists()
+
+
+def a_file(path: Path) -> None:
+    path.write_text("mine")
+
+
+def a_link_to_nothing(path: Path) -> None:
+    path.symlink_to(path.parent / "nothing")
+
+
+def a_folder_with_files(path: Path) -> None:
+    path.mkdir()
+    a_file(path / "mine.txt")
+
+
+@pytest.mark.parametrize(
+    ("name", "make", "sentence"),
+    [
+        ("new", a_file, "a folder to write to, got .*new, which is none"),
+        ("new", a_link_to_nothing, "a folder to write to, got .*new, which is none"),
+        ("new", os.mkfifo, "a folder to write to, got .*new, which is none"),
+        (".new.old", a_file, r"a folder that can be replaced, got .*\.new\.old"),
+        (".new.old", a_folder_with_files, r"a folder that can be replaced, got .*\.new\.old .*not empty"),
+        (".new.lock.part", os.mkfifo, r"a lock file of this program at .*\.new\.lock\.part, got something else"),
+        (".new.lock.part", lambda path: path.write_text("a longer text of somebody's"), "a lock file of this program"),
+    ],
+)
+def test_what_lies_in_the_way_of_a_new_folder_is_refused_and_stays(tmp_path, name, make, sentence):
+    if name != "new":
+        (tmp_path / "new").mkdir()
+    make(tmp_path / name)
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(Refused, match=sentence), new_folder(tmp_path / "new", OWN) as part:
+        (part / "a.txt").write_text("1")
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize("name", [".", "..", "/", "x/.."])
+def test_a_folder_without_a_name_cannot_be_replaced(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(Refused, match="a folder by its name"), new_folder(name, OWN, overwrite=True):
+        pass
+
+
+def test_a_folder_that_is_continued_has_no_links(out, tmp_path):
+    """What is written would go where they lead, and what they lead to would be read into reports."""
     refuse_other_files(out, OWN)
+    (out / "a.txt").unlink()
+    (out / "a.txt").symlink_to(tmp_path / "theirs" / "a.txt")
+    with pytest.raises(Refused, match=r"with a\.txt"):
+        refuse_other_files(out, OWN)
+    (out / "a.txt").unlink()
     a_linked_folder(out)
     with pytest.raises(Refused, match="with inner/more"):
         refuse_other_files(out, OWN)

@@ -291,6 +291,17 @@ def test_logits_are_not_taken_for_probabilities(network):
             assert "probabilities" not in str(doubt)
 
 
+def test_weights_are_not_read_through_links_whatever_else_is_linked(tmp_path):
+    """Nor if all files of the folder lead to the same other one."""
+    folder = tmp_path / "received"
+    folder.mkdir()
+    made = elsewhere(tmp_path, "w")
+    for name in ("w", "x"):
+        (folder / name).symlink_to(tmp_path / "w.bin")
+    with pytest.raises(Refused, match="a file beside the network, got 'w'"):
+        answers(folder, made)
+
+
 def test_rows_that_fill_up_a_table_are_no_boxes():
     def padded(x: Tensor) -> Tensor:
         rows = torch.full((len(x), 40, 7), -torch.inf)

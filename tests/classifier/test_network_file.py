@@ -35,6 +35,8 @@ def small(tmp_path) -> Path:
         ('{"input_px": "8", "labels": ["a", "b"]}', "input_px.*'8'"),
         ('{"input_px": 8, "labels": ["a"]}', "labels, a list of two or more names"),
         ('{"input_px": 8, "labels": "names.json"}', r"no file at .*names\.json: put the list of labels there"),
+        ('{"input_px": 8, "labels": ""}', "put the list of labels there"),
+        ('{"input_px": 8, "labels": "/"}', "put the list of labels there"),
         ('{"input_px": 8, "labels": ["a", "b", "c"]}', "3 logits for each picture.*\\(3, 4\\)"),
         ('{"input_px": 12, "labels": ["a", "b", "c", "d"]}', "takes N×3×S×S pictures"),
     ],

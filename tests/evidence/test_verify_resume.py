@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import weakref
 from concurrent.futures import Future
@@ -198,6 +199,17 @@ def test_a_folder_of_somebody_else_is_not_resumed(folder, sheet, tmp_path):
     with pytest.raises(Refused, match=r"thesis\.txt"):
         verify(folder, sheet, tmp_path, overwrite=True)
     assert [p.name for p in tmp_path.iterdir()] == ["thesis.txt"]
+
+
+def test_a_received_report_is_not_resumed_through_links_or_over_photographs(folder, sheet, tmp_path):
+    (tmp_path / "photos.jsonl").touch()
+    (tmp_path / "pictures").mkdir()
+    shutil.copy(next(folder.rglob("*.jpg")), tmp_path / "pictures" / "1.photo.jpg")
+    with pytest.raises(Refused, match="inputs that lie outside of what is written"):
+        verify(tmp_path / "pictures", sheet, tmp_path, resume=True)
+    (tmp_path / "report.html").symlink_to(sheet)
+    with pytest.raises(Refused, match="own output only .*with report.html"):
+        verify(folder, sheet, tmp_path, resume=True)
 
 
 def test_names_of_any_length_and_bytes_are_reported(folder, sheet, tmp_path):

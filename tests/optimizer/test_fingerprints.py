@@ -146,6 +146,27 @@ def test_a_scene_of_files_in_the_run_is_not_optimized_over_them(made, tmp_path):
     assert sorted(folder.rglob("*")) == before
 
 
+def test_only_a_run_is_resumed_and_not_over_inputs_or_through_links(made, tmp_path):
+    """A picture that happens to be named like a run's stays, as does what a received run's links lead to."""
+    folder, out = shutil.copytree(made, tmp_path / "copy"), tmp_path / "copy" / "new"
+    scene, text = folder / "scene.toml", (folder / "scene.toml").read_text()
+    out.mkdir()
+    Image.fromarray(PICTURE).save(out / "design.png")
+    mine = (out / "design.png").read_bytes()
+    with pytest.raises(Refused, match="an empty or new folder"):
+        optimize(scene, out, resume=True)
+    (out / "steps.jsonl").touch()
+    scene.write_text(text.replace('"places"', '"new/design.png"'))
+    with pytest.raises(Refused, match="inputs that lie outside of what is written"):
+        optimize(scene, out, resume=True)
+    scene.write_text(text)
+    (out / "steps.jsonl").unlink()
+    (out / "steps.jsonl").symlink_to(scene)
+    with pytest.raises(Refused, match="own output only.* got .*with steps.jsonl"):
+        optimize(scene, out, resume=True)
+    assert (out / "design.png").read_bytes() == mine and scene.read_text() == text
+
+
 def test_an_optimization_is_not_resumed_with_another_network(made, tmp_path, monkeypatch):
     """Its labels alone are another network, too."""
     monkeypatch.setattr(loop, "SAVE_AFTER", 1)

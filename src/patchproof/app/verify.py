@@ -2,9 +2,8 @@
 
 In: a folder of photographs (or of folders, one a session) and SHEET.json. Out: REPORT/ with report.json, report.csv,
 report.html, pictures, coco.json with places of the piece and of a detected object, and photos.jsonl, one line per
-finished photograph, from which `resume` continues. This combines evidence, classifiers and report, which do not import
-each other. The promise's primary network always judges, also if other networks are named. Scene, renderer and optimizer
-are imported only if a run is given.
+finished photograph, from which `resume` continues. The promise's primary network always judges, also if others are
+named. Scene, renderer and optimizer are imported only if a run is given.
 """
 
 from __future__ import annotations
@@ -17,13 +16,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from patchproof.app.capture.album import JOURNAL_FILE
 from patchproof.base.compute import Compute
 from patchproof.base.errors import Refused
 from patchproof.base.folder_lock import lock_folder
 from patchproof.base.geometry import apply_homography, rect_corners
 from patchproof.base.input import is_file, read_json
-from patchproof.base.output import check_folder, clear_folder, refuse_other_files, write_atomically, write_pictures
+from patchproof.base.output import (
+    check_folder,
+    clear_folder,
+    refuse_inputs_in,
+    refuse_other_files,
+    write_atomically,
+    write_pictures,
+)
 from patchproof.base.progress import Progress, no_progress
 from patchproof.base.validation import refuse_untrusted
 from patchproof.channel.cameras import load_optional_camera
@@ -33,7 +38,7 @@ from patchproof.classifier.network import Classifier
 from patchproof.evidence.batch import MAX_PICTURED_PHOTOS
 from patchproof.evidence.classify import box_corners_px
 from patchproof.evidence.gather import gather_evidence
-from patchproof.evidence.journal import file_sha256
+from patchproof.evidence.journal import JOURNAL_FILE, file_sha256
 from patchproof.evidence.results import Origin, PhotoEntry, Report
 from patchproof.evidence.task import LEDGER_PHOTOS, Options
 from patchproof.evidence.verdict import Look
@@ -47,8 +52,8 @@ if TYPE_CHECKING:
     from patchproof.channel.lens import Camera
     from patchproof.optimizer.run import Run
 
-_JOURNAL, _PHOTOS = "photos.jsonl", "photos"
-REPORT_FILES = ("report.json", "report.csv", "report.html", "coco.json", "pictures", _PHOTOS, _JOURNAL)
+_PHOTOS = "photos"
+REPORT_FILES = ("report.json", "report.csv", "report.html", "coco.json", "pictures", _PHOTOS, JOURNAL_FILE)
 _LIBRARIES = ("patchproof", "numpy", "opencv-contrib-python-headless", "torch", "scipy")
 
 
@@ -141,7 +146,7 @@ def verify(
             clear_folder(out)
         if not isinstance(photos, str | Path):
             photos = write_pictures(photos, out / _PHOTOS)
-        journal, look = out / _JOURNAL, {"look_at": look_at}
+        journal, look = out / JOURNAL_FILE, {"look_at": look_at}
         gather = partial(gather_evidence, compute=compute, journal=journal, resume=resume, forecast=forecast, **look)
         on_pictures = partial(save_pictures, out / "pictures")
         report = gather(photos, manifest, options, on_pictures=on_pictures, advance=partial(progress, "verify"))
@@ -212,8 +217,9 @@ def _look_at(out: Path, manifest: Manifest) -> Callable[[Sequence[PhotoEntry]], 
 
 def _check_out(out: Path, resume: bool, overwrite: bool, inputs: Sequence[object]) -> None:
     """Refuse a folder with files, unless they are of a verification that is resumed or overwritten."""
-    has_journal = is_file(out / _JOURNAL)
+    has_journal = is_file(out / JOURNAL_FILE)
     if resume:
+        refuse_inputs_in(out, inputs)
         refuse_other_files(out, REPORT_FILES if has_journal else ())
         return
     if has_journal and not overwrite and not is_file(out / "report.json"):
@@ -224,11 +230,12 @@ def _check_out(out: Path, resume: bool, overwrite: bool, inputs: Sequence[object
 def _networks(manifest: Manifest, models: Sequence[str | Classifier] | None) -> tuple[str | Classifier, ...]:
     """List the primary network, then the named ones or else the promise's; classifiers in memory stay as they are."""
     named = _by_name(models)
-    if manifest.promise is None and not named:
-        got = f"the {manifest.kind} sheet {manifest.sheet_id}"
-        raise Refused("a sheet that promises something", got, "name --models")
     if manifest.promise is None:
-        return tuple(named.values())
+        if named:
+            return tuple(named.values())
+        raise Refused(
+            "a sheet that promises something", f"the {manifest.kind} sheet {manifest.sheet_id}", "name --models"
+        )
     promised = tuple(model.name for model in manifest.promise.models)
     names = dict.fromkeys((promised[0], *(named or promised)))
     return tuple(named.get(name, name) for name in names)

@@ -1,8 +1,7 @@
 """Fingerprints of what a run is made from, and their comparison wherever it is used.
 
 In: files, or values. Out: SHA-256 as text. Of a long list of files, such as 100,000 backgrounds, only names, sizes and
-the first and last 64 kB of each are read: an exchanged picture shows, a single retouched pixel may not. The inputs of a
-scene are listed in `scene.scene`, its networks in `optimizer.problem`.
+the first and last 64 kB of each are read: an exchanged picture shows, a single retouched pixel may not.
 """
 
 from __future__ import annotations

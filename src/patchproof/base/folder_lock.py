@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import os
+import stat
 import sys
 import threading
 from collections.abc import Iterable, Iterator
@@ -22,6 +23,7 @@ from patchproof.base.input import MAX_JSON_BYTES, is_file
 LISTING_FILE = ".patchproof.jsonl"  # lines of lists of names, relative to the folder
 _OPEN: dict[Path, set[str]] = {}  # folders that this process has locked, with what it listed in each
 _GUARD = threading.Lock()  # systems give a process its own lock once more
+_MAX_PID_BYTES = 20  # of a lock's content
 _BUSY = (EACCES, EAGAIN, EDEADLK)  # what they answer if another process has the lock
 
 
@@ -30,18 +32,18 @@ def lock_folder(folder: str | Path) -> Iterator[None]:
     """Keep other commands out of an output folder while the block runs, and list in it what `write_atomically` writes
     there; refused if another command is in it.
 
-    Put it around all from the first look at the folder to the last file: `with lock_folder(out): check_folder(out,
-    ...); ...`. `new_folder` does so itself. Different folders may be locked within each other. The lock is a hidden
-    file beside the folder (`.NAME.lock.part`), so that the folder may be missing, be replaced or be a symbolic link; a
-    file that a killed process left behind locks nothing, and `check_folder` passes over it.
+    Put it around all from the first look at the folder to the last file, as `new_folder` does itself. Different folders
+    may be locked within each other. The lock is a hidden file beside the folder (`.NAME.lock.part`), so that the folder
+    may be missing or be replaced; a file that a killed process left behind locks nothing.
     """
     try:
         real = Path(folder).resolve()
         real.parent.mkdir(parents=True, exist_ok=True)
         inside = real.is_dir() and not os.access(real.parent, os.W_OK)
-    except (OSError, ValueError) as error:  # ValueError: a name with a NUL
+        path = real / ".lock.part" if inside else real.with_name(f".{real.name}.lock.part")
+    except (OSError, ValueError) as error:  # ValueError: a name with a NUL, or none
         raise Refused("a folder that can be made", f"{folder} ({error})", "choose another --out") from error
-    path, handle = real / ".lock.part" if inside else real.with_name(f".{real.name}.lock.part"), None
+    handle = None
     with _GUARD:
         if real in _OPEN:
             raise _busy(folder, str(os.getpid()))
@@ -78,11 +80,15 @@ def _open_locked(path: Path, folder: str | Path) -> int:
                 fcntl.lockf(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
             if error.errno in _BUSY:
-                owner = os.read(handle, 20).decode(errors="replace") if os.name != "nt" else ""
+                owner = os.read(handle, _MAX_PID_BYTES).decode(errors="replace") if os.name != "nt" else ""
                 os.close(handle)
                 raise _busy(folder, owner) from error
+        status = os.fstat(handle)
+        if not stat.S_ISREG(status.st_mode) or status.st_size > _MAX_PID_BYTES:
+            os.close(handle)
+            raise Refused(f"a lock file of this program at {path}", "something else", "move it away")
         with suppress(FileNotFoundError):
-            if os.path.samestat(os.fstat(handle), os.stat(path)):
+            if os.path.samestat(status, os.stat(path)):
                 os.ftruncate(handle, 0)
                 os.write(handle, str(os.getpid()).encode())
                 return handle
@@ -127,5 +133,8 @@ def _sort_listing(folder: Path) -> None:
     if names := listed_names(folder):
         with suppress(OSError, TypeError):  # a full disk; names that somebody made up: the listing stays as it is
             content = "".join(f"{json.dumps([name])}\n" for name in sorted(names))
-            (folder / f"{LISTING_FILE}.part").write_text(content, encoding="utf-8")
-            os.replace(folder / f"{LISTING_FILE}.part", folder / LISTING_FILE)
+            part = folder / f"{LISTING_FILE}.part"
+            part.unlink(missing_ok=True)  # a link there would lead the content elsewhere
+            with open(part, "x", encoding="utf-8") as file:
+                file.write(content)
+            os.replace(part, folder / LISTING_FILE)

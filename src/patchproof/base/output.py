@@ -33,6 +33,8 @@ def new_folder(
 ) -> Iterator[Path]:
     """A folder to write into that becomes `out` when the block ends without an error; see `check_folder`."""
     out = Path(out)
+    if out.name in ("", ".."):
+        raise Refused("a folder by its name", f"{out}", _ANOTHER)
     with lock_folder(out):
         check_folder(out, file_names, overwrite, inputs=inputs)
         part, old = (out.with_name(f".{out.name}.{kind}") for kind in ("part", "old"))
@@ -42,11 +44,15 @@ def new_folder(
             yield part
             append_listing(part, _files_in(part))
             check_folder(out, file_names, overwrite)  # once more: what came in between is not deleted
-            _remove_listed(old)  # of a process that was killed in the next lines
-            if out.is_dir():
-                out.rename(old)
-            part.rename(out)
-            _remove_listed(old)
+            try:
+                _remove_listed(old)  # of a process that was killed in the next lines
+                if out.is_dir():
+                    out.rename(old)
+                part.rename(out)
+                _remove_listed(old)
+            except OSError as error:
+                got = f"{error.filename2 or error.filename} ({error.strerror})"
+                raise Refused("a folder that can be replaced", got, "remove that, or choose another --out") from error
             list_file(out / LISTING_FILE)
         finally:
             _remove(part)
@@ -63,14 +69,14 @@ def check_folder(
     listing and by `file_names`, the patterns of names that this command writes, and none of its `inputs` is among them.
     For an `unfinished` folder the refusal says how to continue.
     """
-    if os.path.isfile(out):
-        raise Refused("a folder to write to", f"the file {out}", "choose another --out")
+    if os.path.lexists(out) and not is_folder(out):
+        raise Refused("a folder to write to", f"{out}, which is none", _ANOTHER)
     names = _files_in(out)
     if names and not overwrite:
-        got, do = f"{out} with {len(names)} files", "choose another --out or add --overwrite"
         if unfinished:
-            got, do = f"{out}, which is unfinished", "continue with --resume, or start again with --overwrite"
-        raise Refused("an empty or new folder", got, do)
+            do = "continue with --resume, or start again with --overwrite"
+            raise Refused("an empty or new folder", f"{out}, which is unfinished", do)
+        raise Refused("an empty or new folder", f"{out} with {len(names)} files", f"{_ANOTHER} or add --overwrite")
     refuse_inputs_in(out, inputs)
     own = _listed(out, names)
     foreign = [n for n in names if n not in own or not _matches(n, file_names) or (out / n).is_symlink()]
@@ -82,17 +88,13 @@ def check_folder(
 def refuse_inputs_in(out: Path, inputs: Iterable[object]) -> None:
     """Refuse a file or folder that a command reads, if it is or lies in what the command writes."""
     for path in inputs:  # objects in memory are none
-        if not isinstance(path, str | Path) or not os.path.exists(path):
-            continue
-        if Path(path).resolve().is_relative_to(out.resolve()):
+        if isinstance(path, str | Path) and os.path.exists(path) and Path(path).resolve().is_relative_to(out.resolve()):
             raise Refused("inputs that lie outside of what is written", f"{path} in {out}", _ANOTHER)
 
 
 def refuse_other_files(out: Path, file_names: tuple[str, ...]) -> None:
-    """Refuse to continue a folder that has files beside those of the patterns, or a link to a folder within it."""
-    foreign = [
-        n for n in _files_in(out) if not _matches(n, file_names) or ((out / n).is_symlink() and is_folder(out / n))
-    ]
+    """Refuse to continue a folder that has files beside those of the patterns, or a link within it."""
+    foreign = [n for n in _files_in(out) if not _matches(n, file_names) or (out / n).is_symlink()]
     if foreign:
         expected = f"a folder with this command's own output only ({', '.join(file_names) or 'none'})"
         raise Refused(expected, f"{out} with {foreign[0]}", _ANOTHER)
@@ -104,7 +106,8 @@ def clear_folder(folder: Path, keep: Callable[[str], bool] = lambda name: False)
     for name in {*names} & _listed(folder, names):
         if not keep(name):
             (folder / name).unlink()
-            (folder / name).with_name(f".{name.rpartition('/')[2]}.part").unlink(missing_ok=True)
+            with suppress(OSError):  # there is none, or a folder
+                (folder / name).with_name(f".{name.rpartition('/')[2]}.part").unlink()
     if not _files_in(folder):
         (folder / LISTING_FILE).unlink(missing_ok=True)
     for path, _, _ in os.walk(folder, topdown=False):
@@ -154,7 +157,7 @@ def check_file(path: Path, overwrite: bool = False, inputs: Iterable[object] = (
     """Refuse a file that exists unless it may be overwritten and is none of the command's inputs."""
     refuse_inputs_in(path, inputs)
     if os.path.exists(path) and not overwrite:
-        raise Refused("a new file", f"{path}, which exists", "choose another --out or add --overwrite")
+        raise Refused("a new file", f"{path}, which exists", f"{_ANOTHER} or add --overwrite")
 
 
 def disk_is_full(error: BaseException | None) -> bool:
@@ -177,38 +180,35 @@ def make_folder(path: Path) -> None:
 
 def write_atomically(path: Path, content: str | bytes | Callable[[Path], Any]) -> None:
     """Write `content`, or let it write, beside `path`, and move it there: readers see the complete old or new file."""
-    part = path.with_name(f".{path.name}.part")
-    try:
-        part.unlink(missing_ok=True)  # a link there would lead the content elsewhere
-        list_file(path)
-        if callable(content):
-            content(part)
-        else:
-            part.write_bytes(content.encode() if isinstance(content, str) else content)
-        os.replace(part, path)
-    except OSError as error:
-        got = f"{path} ({error.strerror or error})"
-        raise Refused("a file that can be written", got, "make room or choose another --out") from error
-    finally:
-        part.unlink(missing_ok=True)
+    _write_beside({path: path.with_name(f".{path.name}.part")}, {path: content})
 
 
-def write_files_atomically(contents: dict[Path, bytes]) -> None:
-    """Write several files beside their places, then move all there: a full disk leaves the old files."""
-    parts = {path: path.with_name(f".{path.name}.{os.getpid()}.part") for path in contents}
+def write_files_atomically(contents: Mapping[Path, bytes]) -> None:
+    """Write several files beside their places, in folders that are made, then move all: a full disk leaves the old."""
+    for path in contents:
+        with suppress(OSError):  # writing says why
+            path.parent.mkdir(parents=True, exist_ok=True)
+    _write_beside({path: path.with_name(f".{path.name}.{os.getpid()}.part") for path in contents}, contents)
+
+
+def _write_beside(parts: Mapping[Path, Path], contents: Mapping[Path, Any]) -> None:
     path = next(iter(contents))
     try:
-        for path, data in contents.items():
-            path.parent.mkdir(parents=True, exist_ok=True)
+        for path, content in contents.items():
             if path.is_dir():
                 raise IsADirectoryError(f"{path} is a folder")
-            parts[path].unlink(missing_ok=True)
-            parts[path].write_bytes(data)
+            parts[path].unlink(missing_ok=True)  # a link there would lead the content elsewhere
+            list_file(path)
+            if callable(content):
+                content(parts[path])
+                continue
+            with open(parts[path], "xb") as file:
+                file.write(content.encode() if isinstance(content, str) else content)
         for path, part in parts.items():
             os.replace(part, path)
     except OSError as error:
-        reason = error.strerror or str(error)
-        raise Refused("a folder that can be written to", f"{path} ({reason})", "choose another --out") from error
+        got = f"{path} ({error.strerror or error})"
+        raise Refused("a folder that can be written to", got, "make room or choose another --out") from error
     finally:
         for part in parts.values():
             with suppress(OSError):  # it was moved to its place, or never written
@@ -228,8 +228,7 @@ def write_pictures(pictures: Sequence[np.ndarray], folder: Path) -> Path:
     """Write uint8 H×W×3 sRGB arrays as photo_0001.png and so on into a folder, in place of earlier ones; returns the
     folder. Refused for an empty list, or an array of another type or shape.
     """
-    pictures = list(pictures)
-    if not pictures:
+    if not len(pictures):
         raise Refused("a folder of photographs or arrays", "an empty list", "give one array or more")
     for number, array in enumerate(pictures):
         if not isinstance(array, np.ndarray) or array.dtype != np.uint8 or array.ndim != 3 or array.shape[2] != 3:

@@ -26,7 +26,6 @@ from patchproof.base.input import limit_memory, run_within_seconds
 from patchproof.base.validation import expand_path
 from patchproof.classifier.builtin import load_builtin
 from patchproof.classifier.check import check_network, smooth_pictures
-from patchproof.classifier.custom import labeled_module, load_custom
 from patchproof.classifier.network import Classifier, freeze
 from patchproof.networks.batches import tune_batches
 
@@ -57,6 +56,8 @@ def load_classifier(
         ```
     """
     if isinstance(name, torch.nn.Module):
+        from patchproof.classifier.custom import labeled_module
+
         name = labeled_module(name, "python:network")
     if isinstance(name, Classifier):
         return _prepare(name, device)
@@ -65,12 +66,12 @@ def load_classifier(
         raise Refused("a network's name, or a network in memory", got, "wrap it with classifier_of or detector_of")
     kind, _, rest = expand_path(name, Path(base)).partition(":")
     if name == "builtin":
-        classifier = load_builtin()
-    elif name == "builtin-detector":
+        return _prepare(load_builtin(), device, is_own=True)
+    if name == "builtin-detector":
         from patchproof.classifier.builtin_detector import load_builtin_detector
 
-        classifier = load_builtin_detector()
-    elif kind == "file":
+        return _prepare(load_builtin_detector(), device, is_own=True)
+    if kind == "file":
         from patchproof.classifier.network_file import load_network
 
         classifier = load_network(Path(rest))
@@ -83,6 +84,8 @@ def load_classifier(
 
         classifier = load_clip(rest)
     elif kind == "module":
+        from patchproof.classifier.custom import load_custom
+
         classifier = load_custom(rest, Path(base))
     elif kind == "python":
         raise Refused("the network itself, which was given in Python", name, "give it again: models=[...]")
@@ -96,30 +99,30 @@ def load_classifier(
     return _prepare(replace(classifier, name=name), device)
 
 
-def _prepare(classifier: Classifier, device: torch.device | str) -> Classifier:
+def _prepare(classifier: Classifier, device: torch.device | str, is_own: bool = False) -> Classifier:
     """Freeze the classifier, check it, and choose the batches in which it computes fastest on the device. A network
     from a file is refused if that takes too long or, on a CPU, too much memory: a few lines may ask for a lot.
     """
+
+    def check_and_tune() -> Classifier:
+        check_network(classifier, device, is_own)
+        pictures = smooth_pictures(classifier.input_px).to(device)
+        return replace(classifier, network=tune_batches(classifier.network, pictures))
+
     use_full_precision(device)
     if isinstance(classifier.network, torch.nn.Module):
         freeze(classifier.network).to(device)
     if not classifier.name.startswith("file:"):
-        return _check_and_tune(classifier, device)
+        return check_and_tune()
     threads, network = torch.get_num_threads(), classifier.network
     stored_bytes = sum(weight.nbytes for weight in network.buffers()) if isinstance(network, torch.nn.Module) else 0
     max_bytes = CHECK_BYTES + CHECK_BYTES_PER_BYTE * stored_bytes + CHECK_BYTES_PER_THREAD * threads
     try:
         with limit_memory(max_bytes) if torch.device(device).type == "cpu" else nullcontext():
-            return run_within_seconds(CHECK_S * threads, lambda: _check_and_tune(classifier, device))
+            return run_within_seconds(CHECK_S * threads, check_and_tune)
     except TimeLimitExceeded as error:
         expected, got = "a network that three pictures can be tried with", f"{classifier.name}, which takes {error}"
         raise Refused(expected, got, "use a smaller one, or more threads") from error
-
-
-def _check_and_tune(classifier: Classifier, device: torch.device | str) -> Classifier:
-    check_network(classifier, device)
-    pictures = smooth_pictures(classifier.input_px).to(device)
-    return replace(classifier, network=tune_batches(classifier.network, pictures))
 
 
 def use_full_precision(device: torch.device | str) -> None:

@@ -2,14 +2,9 @@
 
 The JSON holds `input_px`, the side of the square that the network takes, and `labels`: a list, or the name of a JSON
 file beside it that holds one. The network takes N×3×S×S sRGB in [0, 1], its normalization inside, and gives N×K logits;
-with `"kind": "detector"` in the JSON, candidates N×A×(4+K), boxes in pixels before the logits (detector.py). A network
-that was exported for a fixed number of pictures is called with that number.
+with `"kind": "detector"` in the JSON, candidates N×A×(4+K), boxes in pixels before the logits (detector.py).
 Nothing of the file is executed: protobuf.py reads its fields, onnx_file.py the graph from them, and graph.py computes
-its operators, which are on the list in onnx_operators.py. The library onnx is not called.
-
-`EXPORT_ADVICE` says how to make such a file. Weights may lie in files beside it that NAME.onnx names. Entries of the
-card or of the file's metadata that say how pictures are prepared are refused unless they say sRGB in [0, 1]; others
-that may matter are said.
+its operators, which are on the list in onnx_operators.py. Weights may lie in files beside it that NAME.onnx names.
 """
 
 from __future__ import annotations
@@ -71,8 +66,8 @@ def load_network(path: Path) -> Classifier:
 def _beside(path: Path, location: str) -> Path:
     """The file of weights that an ONNX file names; refused unless it lies in the same folder."""
     beside = path.parent / location
-    folders = {os.path.dirname(os.path.realpath(file)) for file in (path.parent / "x", beside)}
-    if location in ("", ".", "..") or set("/\\:\0") & set(location) or len(folders) > 1:
+    is_named = location not in ("", ".", "..") and not set("/\\:\0") & set(location)
+    if not is_named or os.path.dirname(os.path.realpath(beside)) != os.path.realpath(path.parent):
         do = 'save it again with onnx.save(..., save_as_external_data=True, location="NAME.onnx.data")'
         raise Refused("weights in a file beside the network", f"{quote(location)} named in {path}", do)
     return beside
@@ -127,10 +122,10 @@ def read_card(path: Path) -> Card:
     input_px, labels = (card.get("input_px"), card.get("labels")) if isinstance(card, dict) else (None, None)
     if isinstance(labels, str):
         advice = "put the list of labels there"
-        labels = read_json(path.with_name(Path(labels).name), "a JSON file", advice, advice)
+        labels = read_json(path.parent / Path(labels).name, "a JSON file", advice, advice)
     if type(input_px) is not int or not 8 <= input_px <= 4096:
         raise Refused("input_px, a whole number of pixels from 8 to 4096", f"{input_px!r} in {path}", do)
-    if not isinstance(labels, list) or len(labels) < 2 or not all(isinstance(label, str) for label in labels):
+    if not isinstance(labels, list) or len(labels) < 2 or {*map(type, labels)} != {str}:
         raise Refused("labels, a list of two or more names", f"{str(labels)[:60]} in {path}", do)
     kind = card.get("kind", Classifier.KIND)
     if kind not in (Classifier.KIND, Detector.KIND):

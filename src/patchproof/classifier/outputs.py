@@ -33,24 +33,30 @@ def check_shape(output: Any, classifier: Classifier) -> None:
     """Refuse outputs for three pictures that are not 3×K, or not a detector's 3×A×(4+K)."""
     classes, is_tensor = len(classifier.labels), isinstance(output, Tensor)
     shape = tuple(output.shape) if is_tensor else ()
-    expected = f"{classes} logits for each picture, one a label"
-    do = "give it as many labels as it has outputs, a background's among them"
-    do += ', or write "kind": "detector"' if len(shape) == 3 else ""
-    if not classifier.LOOKS_AT_BOXES:
-        fits = shape == (3, classes)
-    else:
-        fits = len(shape) == 3 and shape[0] == 3 and shape[1] > 0 and shape[2] == 4 + classes
+    if classifier.LOOKS_AT_BOXES:
+        if len(shape) == 3 and shape[0] == 3 and shape[1] > 0 and shape[2] == 4 + classes:
+            return
         expected = f"a detector's candidates 3×A×{4 + classes}: left, top, right, bottom in pixels, {classes} logits"
         do = "decode its heads inside of the network"
         do = "swap the last two dimensions before the export" if shape[1:2] == (4 + classes,) else do
         do = "leave the column of objectness out, or name its label" if shape[2:] == (5 + classes,) else do
-    if not fits:
-        got = f"{shape if is_tensor else type(output).__name__} for 3 pictures from the network {classifier.name}"
-        raise Refused(expected, got, do)
+    else:
+        if shape == (3, classes):
+            return
+        expected = f"{classes} logits for each picture, one a label"
+        do = "give it as many labels as it has outputs, a background's among them"
+        do += ', or write "kind": "detector"' if len(shape) == 3 else ""
+    got = f"{shape if is_tensor else type(output).__name__} for 3 pictures from the network {classifier.name}"
+    raise Refused(expected, got, do)
 
 
-def check_scores(classifier: Classifier, photos: Tensor, scores: Tensor) -> None:
-    """Refuse scores, 3×K or a detector's 3×A×K, that can only be probabilities, percent or 8-bit numbers."""
+def check_values(classifier: Classifier, photos: Tensor, output: Tensor) -> None:
+    """Refuse scores, 3×K or a detector's 3×A×K, that can only be probabilities, percent or 8-bit numbers, and boxes
+    that are none.
+    """
+    if classifier.LOOKS_AT_BOXES:
+        _check_boxes(classifier, output)
+    scores = output[..., 4:] if classifier.LOOKS_AT_BOXES else output
     name, do = f"the network {classifier.name}", "leave its last Softmax or Sigmoid out"
     if bool((scores == scores.round()).all()) and bool((scores != scores[:1]).any()):
         got = f"whole numbers from {float(scores.min()):g} to {float(scores.max()):g} from {name}"
@@ -96,7 +102,7 @@ def _ends_squashed(node: Any, known: dict[Any, bool]) -> bool:
     return known[node]
 
 
-def check_boxes(classifier: Classifier, candidates: Tensor) -> None:
+def _check_boxes(classifier: Classifier, candidates: Tensor) -> None:
     """Refuse boxes, among candidates 3×A×(4+K), that are in 0 to 1, or whose corners are no corners."""
     name, sides = f"the network {classifier.name}", candidates[..., :4]
     found = (candidates[..., 4:].amax(-1) > NO_BOX_LOGIT) & (sides != 0).any(-1)  # rows of zeros fill up a table

@@ -2,10 +2,8 @@
 
 The weights are downloaded by these libraries, and only because the scene file names the model; `timm:hf-hub:ORG/NAME`
 is a model of the Hugging Face hub. With `NAME@FILE.safetensors` the weights are read from the file as numbers, never as
-a pickle; for a network trained with other labels, FILE.json beside it holds them and the input size. The libraries are
-not needed otherwise: where one is missing, the message says what to install. Input size, labels, and the mean and
-standard deviation that the weights were trained with are the library's own figures; normalization is put inside the
-network.
+a pickle; for a network trained with other labels, FILE.json beside it holds them and the input size. Input size, labels
+and normalization are the library's own; the latter is put inside the network.
 Left out on purpose: the libraries' resize-then-crop. Here every network sees the whole centered square.
 """
 
@@ -19,9 +17,9 @@ import socket
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from urllib.parse import urlsplit
 from urllib.request import getproxies
 
@@ -123,8 +121,7 @@ def _timm_labels(timm: Any, network: Any, name: str) -> list[str]:
     return [info.index_to_description(index) for index in range(network.num_classes)]
 
 
-@dataclass(frozen=True)
-class LocalWeights:
+class LocalWeights(NamedTuple):
     """Weights of a local file."""
 
     path: Path
@@ -135,10 +132,9 @@ class LocalWeights:
 
 def _split_weights(name: str) -> tuple[str, LocalWeights | None]:
     """Split NAME@FILE.safetensors into the model's name and the file's weights, None without a file."""
-    if name.startswith("hf-hub:"):  # there @ is followed by a revision
-        return name, None
-    name, separator, file = name.partition("@")
-    return name, read_weights(Path(file)) if separator else None
+    model, separator, file = name.partition("@")
+    is_hub = name.startswith("hf-hub:")  # there @ is followed by a revision
+    return (model, read_weights(Path(file))) if separator and not is_hub else (name, None)
 
 
 def read_weights(path: Path) -> LocalWeights:

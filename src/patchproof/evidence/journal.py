@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from patchproof.evidence.task import Options
     from patchproof.sheets.manifest import Manifest
 
+JOURNAL_FILE = "photos.jsonl"
 MAX_JOURNAL_BYTES = 128 << 20  # of 10,000 photographs
 
 

@@ -28,76 +28,34 @@ from patchproof.networks.graph import Program
 from patchproof.networks.onnx_aten import AtenCalls, aten_calls
 from patchproof.networks.onnx_operators import DTYPES, OPERATORS
 from patchproof.networks.onnx_shapes import MAX_SIZES
-from patchproof.networks.protobuf import BYTES, FLOAT, INT, TEXT, UNSUPPORTED, Schema, read_message, skipped
+from patchproof.networks.protobuf import read_message, read_schemas
 from patchproof.networks.steps import InputDevice, Step, ValueRef, mark_last_uses
 
 OPSETS = (13, 28)
 _EXTERNAL = {"location", "offset", "length", "checksum"}  # what says where a weight lies in another file
+_STANDARD = ("", "ai.onnx")  # the domain
 MAX_SCALARS = 8  # floats that stay on the CPU; a Resize has up to eight factors
 
-_ENTRY: Schema = {1: ("key", TEXT, False), 2: ("value", TEXT, False)}
-_TENSOR: Schema = {
-    1: ("dims", INT, True),
-    2: ("data_type", INT, False),
-    3: ("segment", UNSUPPORTED, False),
-    4: ("floats", BYTES, True),
-    5: ("ints", INT, True),
-    6: ("strings", UNSUPPORTED, False),
-    7: ("longs", INT, True),
-    8: ("name", TEXT, False),
-    9: ("raw", BYTES, False),
-    10: ("doubles", BYTES, True),
-    11: ("unsigned", UNSUPPORTED, False),
-    13: ("external", _ENTRY, True),
-    14: ("place", INT, False),
-    **skipped(12, 16),
-}
-_ATTRIBUTE: Schema = {
-    1: ("name", TEXT, False),
-    2: ("f", FLOAT, False),
-    3: ("i", INT, False),
-    4: ("s", TEXT, False),
-    5: ("t", _TENSOR, False),
-    6: ("a graph within the graph", UNSUPPORTED, False),
-    7: ("floats", FLOAT, True),
-    8: ("ints", INT, True),
-    20: ("type", INT, False),
-    **skipped(13),
-    **{number: ("an attribute of an unusual kind", UNSUPPORTED, True) for number in (9, 10, 11, 14, 15, 21, 22, 23)},
-}
-_NODE: Schema = {
-    1: ("input", TEXT, True),
-    2: ("output", TEXT, True),
-    4: ("op_type", TEXT, False),
-    5: ("attribute", _ATTRIBUTE, True),
-    7: ("domain", TEXT, False),
-    8: ("overload", UNSUPPORTED, False),
-    **skipped(3, 6, 9),
-}
-_SIZE: Schema = {1: ("value", INT, False), 2: ("symbol", TEXT, False), 3: ("denotation", TEXT, False)}
-_TYPE: Schema = {
-    1: ("tensor", {1: ("kind", INT, False), 2: ("shape", {1: ("dim", _SIZE, True)}, False)}, False),
-    **{number: ("an input that is no tensor", UNSUPPORTED, False) for number in (4, 5, 8, 9)},
-    **skipped(6),
-}
-_PLACE: Schema = {1: ("name", TEXT, False), 2: ("type", _TYPE, False), **skipped(3, 4)}
-_GRAPH: Schema = {
-    1: ("node", _NODE, True),
-    5: ("initializer", _TENSOR, True),
-    11: ("input", _PLACE, True),
-    12: ("output", {1: ("name", TEXT, False), **skipped(2, 3, 4)}, True),
-    14: ("quantized tensors", UNSUPPORTED, True),
-    15: ("sparse weights", UNSUPPORTED, True),
-    **skipped(2, 10, 13, 16),
-}
-_MODEL: Schema = {
-    7: ("graph", _GRAPH, False),
-    8: ("opset", {1: ("domain", TEXT, False), 2: ("version", INT, False)}, True),
-    14: ("metadata", _ENTRY, True),
-    20: ("training steps", UNSUPPORTED, True),
-    25: ("functions of its own", UNSUPPORTED, True),
-    **skipped(1, 2, 3, 4, 5, 6),
-}
+_SCHEMAS = read_schemas("""
+entry: 1 key text; 2 value text.
+tensor: 1 dims int*; 2 data_type int; 3 segment never; 4 floats bytes*; 5 ints int*; 6 strings never; 7 longs int*;
+  8 name text; 9 raw bytes; 10 doubles bytes*; 11 unsigned never; 13 external entry*; 14 place int; 12,16 skipped.
+attribute: 1 name text; 2 f float; 3 i int; 4 s text; 5 t tensor; 6 a graph within the graph never; 7 floats float*;
+  8 ints int*; 20 type int; 13 skipped; 9,10,11,14,15,21,22,23 an attribute of an unusual kind never.
+node: 1 input text*; 2 output text*; 4 op_type text; 5 attribute attribute*; 7 domain text; 8 overload never;
+  3,6,9 skipped.
+size: 1 value int; 2 symbol text; 3 denotation text.
+shape: 1 dim size*.
+array: 1 kind int; 2 shape shape.
+type: 1 tensor array; 4,5,8,9 an input that is no tensor never; 6 skipped.
+input: 1 name text; 2 type type; 3,4 skipped.
+output: 1 name text; 2,3,4 skipped.
+graph: 1 node node*; 5 initializer tensor*; 11 input input*; 12 output output*; 14 quantized tensors never;
+  15 sparse weights never; 2,10,13,16 skipped.
+opset: 1 domain text; 2 version int.
+model: 7 graph graph; 8 opset opset*; 14 metadata entry*; 20 training steps never; 25 functions of its own never;
+  1,2,3,4,5,6 skipped.
+""")
 # an attribute's type, as the file states it: where its value is, and the value where none is written
 _ATTRIBUTE_TYPES = {1: ("f", 0.0), 2: ("i", 0), 3: ("s", ""), 4: ("t", None), 6: ("floats", []), 7: ("ints", [])}
 _DENOTATIONS = ("DATA_BATCH", "DATA_CHANNEL", "DATA_FEATURE", "DATA_FEATURE")  # of a picture's dimensions
@@ -107,15 +65,12 @@ def read_onnx(stored: bytes, read_data: Callable[[str], bytes]) -> tuple[Program
     """The network, the number of pictures it takes (None: any), and its metadata. `read_data` reads the file of weights
     that a location names, each at most once.
     """
-    model = read_message(stored, _MODEL)
+    model = read_message(stored, _SCHEMAS["model"])
     versions = [opset.get("version", 0) for opset in model.get("opset", []) if opset.get("domain", "") in _STANDARD]
     if len(versions) != 1 or not OPSETS[0] <= versions[0] <= OPSETS[1]:
         raise UnsupportedNetwork(f"opset {quote(versions)[1:-1]}, not one from {OPSETS[0]} to {OPSETS[1]}")
     metadata = {entry.get("key", ""): entry.get("value", "") for entry in model.get("metadata", [])}
     return *_GraphReader(model["graph"], _Weights(read_data)).read(), metadata
-
-
-_STANDARD = ("", "ai.onnx")
 
 
 class _Weights:

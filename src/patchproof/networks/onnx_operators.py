@@ -1,11 +1,10 @@
 """The operators that an ONNX file may use: those of image classifiers, written with torch.
 
-In: a name as the file writes it. Out: a function of tensors. None of them reads or writes anything but its tensors or
-draws random numbers, and a name that is not in the table is refused. In a signature, inputs before `/` are data, inputs
-after it are sizes or axes; these and what follows `*` may be attributes of that name. Data are sent to the pictures'
-device, which has no memory during the dry run in graph.py. Only for the operators in `_ON_SIZES`, whose results are no
-larger than their inputs allow, a few numbers stay on the CPU, so that sizes can be computed.
-To allow one more, add a line to `_TABLE` with the same in torch (test_classifier_onnx.py compares it with onnx).
+In: a name as the file writes it. Out: a function of tensors, which reads and writes nothing else and draws no random
+numbers; a name that is not in the table is refused. In a signature, inputs before `/` are data, inputs after it are
+sizes or axes; these and what follows `*` may be attributes of that name. Data are sent to the pictures' device, which
+has no memory during the dry run in graph.py; only for the operators in `_ON_SIZES`, whose results are no larger than
+their inputs allow, a few numbers stay on the CPU, so that sizes can be computed.
 Left out on purpose: control flow, sequences, text, random numbers, quantized and recurrent networks, boxes.
 
 Source: onnx.ai/onnx/operators, opsets 13 to 28; where two differ, both forms are read.
@@ -41,8 +40,7 @@ FIXED_ATTRIBUTES: dict[str, dict[str, Any]] = {
     "BatchNormalization": {"training_mode": 0, "momentum": None},
     "Cast": {"saturate": None},  # 8-bit floats
     "Dropout": {"seed": None},
-    "GroupNormalization": {"stash_type": 1},
-    "LayerNormalization": {"stash_type": 1},
+    **{name: {"stash_type": 1} for name in ("GroupNormalization", "LayerNormalization")},
     "MaxPool": {"storage_order": None},  # of the second result
     "Resize": {
         **{"antialias": 0, "cubic_coeff_a": -0.75, "exclude_outside": 0, "keep_aspect_ratio_policy": "stretch"},
@@ -156,15 +154,15 @@ def _dropout(x, /, ratio=None, training_mode=None):
 # --- activations and arithmetic ---
 
 
-def _unary(compute: Callable[[Tensor], Tensor]) -> Callable[..., Tensor]:
+def _unary(compute: Callable[..., Tensor]) -> Callable[..., Tensor]:
     return lambda x, /: compute(x)
 
 
-def _binary(compute: Callable[[Tensor, Tensor], Tensor]) -> Callable[..., Tensor]:
+def _binary(compute: Callable[..., Tensor]) -> Callable[..., Tensor]:
     return lambda a, b, /: compute(a, b)
 
 
-def _variadic(compute: Callable[[Tensor, Tensor], Tensor]) -> Callable[..., Tensor]:
+def _variadic(compute: Callable[..., Tensor]) -> Callable[..., Tensor]:
     return lambda *tensors: functools.reduce(compute, tensors)
 
 
@@ -202,39 +200,33 @@ _TABLE: dict[str, Callable[..., Any]] = {
     "LogSoftmax": lambda x, /, *, axis=-1: x.log_softmax(axis),
     "Cast": lambda x, /, *, to: x.to(DTYPES[to]),
     # of two or more
-    **{name: _binary(getattr(torch, name.lower())) for name in ("Add", "Sub", "Mul", "MatMul", "Greater", "Less")},
+    **{name: _binary(getattr(torch, name.lower())) for name in "Add Sub Mul MatMul Greater Less".split()},
+    **{
+        name: _binary(getattr(torch, of))
+        for name, of in (("Equal", "eq"), ("GreaterOrEqual", "ge"), ("LessOrEqual", "le"))
+    },
+    **{name: _binary(getattr(torch, f"logical_{name.lower()}")) for name in ("And", "Or")},
     "Div": _binary(lambda a, b: a / b if a.is_floating_point() else torch.div(a, b, rounding_mode="trunc")),
     "Mod": lambda a, b, /, *, fmod=0: torch.fmod(a, b) if fmod else torch.remainder(a, b),
     "Pow": _binary(lambda x, y: torch.pow(x, y).to(x.dtype)),
     "PRelu": _binary(lambda x, slope: torch.where(x < 0, slope * x, x)),
-    "Equal": _binary(torch.eq),
-    "GreaterOrEqual": _binary(torch.ge),
-    "LessOrEqual": _binary(torch.le),
-    "And": _binary(torch.logical_and),
-    "Or": _binary(torch.logical_or),
     "Where": lambda condition, x, y, /: torch.where(condition, x, y),
     "Clip": lambda x, low=None, high=None, /: x if low is None and high is None else torch.clamp(x, low, high),
-    "Max": _variadic(torch.maximum),
-    "Min": _variadic(torch.minimum),
-    "Sum": _variadic(torch.add),
+    **{"Max": _variadic(torch.maximum), "Min": _variadic(torch.minimum), "Sum": _variadic(torch.add)},
     "Gemm": _gemm,
     "Einsum": lambda *tensors, equation: torch.einsum(equation, *tensors),
     # along axes
-    "ReduceMean": _reduction(torch.mean),
-    "ReduceSum": _reduction(torch.sum),
-    "ReduceMax": _reduction(torch.amax),
-    "ReduceMin": _reduction(torch.amin),
+    **{f"Reduce{name}": _reduction(getattr(torch, name.lower())) for name in ("Mean", "Sum")},
+    **{f"Reduce{name}": _reduction(getattr(torch, f"a{name.lower()}")) for name in ("Max", "Min")},
     "ReduceProd": _reduction(_product),
     "ReduceL2": _reduction(lambda x, along, keepdim: torch.linalg.vector_norm(x, 2, along, keepdim), torch.abs),
     # windows and norms
     "Conv": _conv,
     "MaxPool": _max_pool,
     "AveragePool": _average_pool,
-    "BatchNormalization": lambda x, scale, b, mean, var, /, *, epsilon=1e-5: F.batch_norm(
-        x, mean, var, scale, b, False, 0.0, epsilon
-    ),
-    "LayerNormalization": lambda x, scale, b=None, /, *, axis=-1, epsilon=1e-5: F.layer_norm(
-        x, x.shape[axis:], scale, b, epsilon
+    "BatchNormalization": lambda x, s, b, mean, var, /, *, epsilon=1e-5: F.batch_norm(x, mean, var, s, b, eps=epsilon),
+    "LayerNormalization": lambda x, s, b=None, /, *, axis=-1, epsilon=1e-5: F.layer_norm(
+        x, x.shape[axis:], s, b, epsilon
     ),
     "GroupNormalization": _group_norm,
     "InstanceNormalization": lambda x, a, b, /, *, epsilon=1e-5: F.instance_norm(x, None, None, a, b, eps=epsilon),

@@ -117,11 +117,10 @@ def resize(
     keeps_batch = factors[:2] == [1, 1] if factors else target[:2] == list(x.shape[:2])
     after = target[2:] or [int(size * factor) for size, factor in zip(x.shape[2:], factors[2:], strict=True)]
     ratios = factors[2:] or [new / old for new, old in zip(after, x.shape[2:], strict=True)]
+    lone = any(new == 1 < old for new, old in zip(after, x.shape[2:], strict=True))
+    differs = corners == "pytorch_half_pixel" and lone
     if mode == "nearest":
         differs = nearest_mode == "round_prefer_floor" and any(ratio % 1 for ratio in ratios)
-    else:
-        lone = any(new == 1 < old for new, old in zip(after, x.shape[2:], strict=True))
-        differs = corners == "pytorch_half_pixel" and lone
     if kind is None or not keeps_batch or differs:
         raise ValueError(f"a Resize of an unsupported kind ({mode}, {corners})")
     options: dict[str, Any] = {} if mode == "nearest" else {"align_corners": corners == "align_corners"}

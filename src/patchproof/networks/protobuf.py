@@ -25,9 +25,21 @@ INT, FLOAT, TEXT, BYTES, UNSUPPORTED, SKIPPED = "int", "float", "text", "bytes",
 Schema = dict[int, tuple[str, Any, bool]]
 
 
-def skipped(*numbers: int) -> Schema:
-    """Fields that change nothing: names, comments, versions of exporters."""
-    return {number: ("", SKIPPED, True) for number in numbers}
+def read_schemas(text: str) -> dict[str, Schema]:
+    """Schemas by name from "NAME: NUMBERS FIELD KIND; ...." A * behind a kind marks fields that may be repeated; kinds
+    are those above or messages that come before. Skipped fields change nothing: names, comments, exporters' versions.
+    """
+    schemas: dict[str, Schema] = {}
+    for message in text.strip().split(".")[:-1]:
+        message_name, _, fields = message.partition(":")
+        schema = schemas[message_name.strip()] = {}
+        for field in fields.split(";"):
+            numbers, *name, kind = field.split()
+            plain = kind.removesuffix("*")
+            schema |= {
+                int(number): (" ".join(name), schemas.get(plain, plain), plain != kind) for number in numbers.split(",")
+            }
+    return schemas
 
 
 def read_message(stored: bytes, schema: Schema) -> dict[str, Any]:

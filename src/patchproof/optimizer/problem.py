@@ -66,16 +66,16 @@ class Problem:
     @property
     def training_px(self) -> int:
         """The side at which views are rendered for training and selection."""
-        return self.figure_px if self.network_px < MIN_TRAINING_PX else min(self.network_px, self._photo_px)
+        return (
+            self.figure_px
+            if self.network_px < MIN_TRAINING_PX
+            else min(self.network_px, *self.scene.settings.camera.photo_px)
+        )
 
     @property
     def figure_px(self) -> int:
         """The side at which views are rendered for figures that people will read."""
-        return min(max(math.ceil(FIGURE_SCALE * self.network_px), MIN_FIGURE_PX), self._photo_px)
-
-    @property
-    def _photo_px(self) -> int:
-        return min(self.scene.settings.camera.photo_px)
+        return min(max(math.ceil(FIGURE_SCALE * self.network_px), MIN_FIGURE_PX), *self.scene.settings.camera.photo_px)
 
     def losses(self, classifier: Classifier, logits: Tensor, indices: Sequence[int]) -> Tensor:
         """N losses to descend on, from a network's logits."""
@@ -89,8 +89,8 @@ class Problem:
 
     def see(self, appearance: Appearance, conditions: Conditions, side_px: int) -> Views:
         """Square views of these conditions, for this appearance and any other design in its place."""
-        sampling = TRAINING_SAMPLING if side_px < self.figure_px else PHOTO_SAMPLING
-        sampling = FIGURE_SAMPLING if side_px == self.figure_px else sampling
+        is_figure, is_small = side_px == self.figure_px, side_px < self.figure_px
+        sampling = FIGURE_SAMPLING if is_figure else TRAINING_SAMPLING if is_small else PHOTO_SAMPLING
         return render_views(self.stage, appearance, conditions, (side_px, side_px), sampling)
 
     def see_again(self, views: Views, conditions: Conditions) -> Views:

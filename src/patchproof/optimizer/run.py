@@ -1,10 +1,9 @@
 """A run's folder: the results of an optimization, written so that a kill at any moment loses 120 views at most.
 
 In: a scene file. Out: RUN/ with `design.png`, `run.json` (settings, versions, seeds, threads, promise), `steps.jsonl`
-(one flushed line per step), `views.png` and `checkpoint.safetensors` (replaced atomically); where the place was
-searched for also `place.json` and `place.png`, while run.json holds the place as if the scene had given it. Imported
-designs (`imported_design`) are finished here, too. Nothing in the folder depends on the time of day, so that a seed
-always gives the same bytes on one machine with one thread count and device.
+(one flushed line per step), `views.png` and `checkpoint.safetensors`; where the place was searched also `place.json`
+and `place.png`, while run.json holds the place as if the scene had given it. Nothing in the folder depends on the time
+of day: a seed always gives the same bytes on one machine with one thread count and device.
 """
 
 from __future__ import annotations
@@ -30,7 +29,14 @@ from patchproof.base.fingerprint import refuse_other_inputs
 from patchproof.base.folder_lock import lock_folder
 from patchproof.base.input import is_file, read_file, read_json
 from patchproof.base.notebook import notebook_html
-from patchproof.base.output import check_folder, clear_folder, make_folder, refuse_inputs_in, write_atomically
+from patchproof.base.output import (
+    check_folder,
+    clear_folder,
+    make_folder,
+    refuse_inputs_in,
+    refuse_other_files,
+    write_atomically,
+)
 from patchproof.base.progress import Advance, Progress, no_progress
 from patchproof.base.settings import SceneSettings
 from patchproof.base.validation import refuse_untrusted, validate_model
@@ -51,9 +57,8 @@ from patchproof.sheets.manifest import Promise
 _LOG_FILE, RUN_FILE, _VIEWS_FILE = ("steps.jsonl", "run.json", "views.png")
 _MAX_LINE_BYTES = 4096  # of the log
 _MESH_FILE = "given.glb"  # the mesh of a scene that was made in Python
-_DESIGN_FILES = (DESIGN_FILE, OBJECT_FILE, TEXTURE_FILES, MASK_FILE)
 _STEP_FILES = (CHECKPOINT_FILE, _LOG_FILE, RUN_FILE, _VIEWS_FILE, _MESH_FILE, "place.*")
-RUN_FILE_PATTERNS = (*_STEP_FILES, *_DESIGN_FILES, "evaluate.json")
+RUN_FILE_PATTERNS = (*_STEP_FILES, DESIGN_FILE, OBJECT_FILE, TEXTURE_FILES, MASK_FILE, "evaluate.json")
 
 # (steps, promised views) of a first look, whose interval is some four times as wide, and of a print that counts, with
 # three times the default's steps and an interval half as wide (`bench effort`).
@@ -116,7 +121,9 @@ def optimize(
     """
     out, compute = Path(out), compute.without("optimize", cluster=True)
     with lock_folder(out):
-        if not resume:
+        if resume and any(is_file(out / name) for name in (CHECKPOINT_FILE, _LOG_FILE, "place.json")):
+            refuse_other_files(out, ("*",))  # links, that is: no other file is written to
+        else:
             unfinished = is_file(out / CHECKPOINT_FILE) and not is_file(out / RUN_FILE)
             check_folder(out, RUN_FILE_PATTERNS, overwrite, unfinished=unfinished, inputs=(scene,))
         scene = resolve_scene(scene, seed)
@@ -126,8 +133,8 @@ def optimize(
             scene, save_place, searched = _choose_place(scene, out, resume, search_options)
         problem = set_problem(scene, compute.device, models, loss, compute.jobs)
         refuse_other_inputs(searched, problem.inputs, out, scene.settings.model_dump())
+        refuse_inputs_in(out, named_paths(scene).values())
         if not resume:
-            refuse_inputs_in(out, named_paths(scene).values())
             clear_folder(out)  # everything that the new run needs has been read
         make_folder(out)
         if save_place is not None:
@@ -178,8 +185,12 @@ def finish_run(
     if scene.mesh_glb is not None:
         write_atomically(out / _MESH_FILE, scene.mesh_glb)
     details = _details(problem, promise, out) | ({} if imported is None else {"imported": dict(imported)})
-    write_atomically(out / RUN_FILE, json.dumps(details, indent=1) + "\n")
-    return Run(out, scene, design, promise, details)
+    return _write(Run(out, scene, design, promise, details))
+
+
+def _write(run: Run) -> Run:
+    write_atomically(run.folder / RUN_FILE, json.dumps(run.details, indent=1) + "\n")
+    return run
 
 
 def promise_run(
@@ -201,8 +212,7 @@ def promise_run(
         problem = set_problem(run.scene, compute.device, jobs=compute.jobs)
         promise = promise_of(problem, run.design, options, partial(progress, "promise"))
         details = run.details | {"promise": promise.model_dump(mode="json")}
-        write_atomically(run.folder / RUN_FILE, json.dumps(details, indent=1) + "\n")
-    return replace(run, promise=promise, details=details)
+        return _write(replace(run, promise=promise, details=details))
 
 
 def load_run(folder: str | Path, trust: bool = False, named: Iterable[str] = ()) -> Run:
@@ -268,8 +278,7 @@ def _run_steps(problem: Problem, state: State, out: Path, advance: Advance) -> n
     write_atomically(path, b"".join(lines))
     with open(path, "a", encoding="utf-8") as log:
         for step in steps(problem, state):
-            state = step.state
-            names = ["loss", "confidence", "rate", "gradient"]
+            state, names = step.state, ["loss", "confidence", "rate", "gradient"]
             names += [] if step.select_loss is None else ["select_loss", "select_rate"]
             line = {"step": state.number} | {name: getattr(step, name) for name in names}
             log.write(json.dumps(line) + "\n")

@@ -1,7 +1,7 @@
 """Encode pictures for a page without files: arrays, color differences as a map with a fixed scale, figures.
 
-In: uint8 sRGB H×W×3, float cells, or functions that draw with matplotlib. Out: the bytes of files, the same for the
-same input, and `data:` URIs. All reports share the map's scale, so that two reports can be compared.
+In: uint8 sRGB H×W×3, float cells, or functions that draw with matplotlib. Out: the bytes of files, and `data:` URIs.
+All reports share the map's scale, so that two can be compared.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from patchproof.base.input import read_file
+from patchproof.base.input import is_file, read_file
 from patchproof.base.output import base64_uri, image_bytes, make_folder, write_atomically
 from patchproof.base.text import drawable, printable
 
@@ -53,11 +53,8 @@ def save_pictures(folder: Path, file: str, kinds: Mapping[str, np.ndarray]) -> N
 
 def saved_pictures(folder: Path, file: str) -> dict[str, bytes]:
     """Read the files of a photograph's pictures in `folder`, by kind; missing ones are left out."""
-    return {
-        path.suffixes[-2][1:]: read_file(path, "a picture of a report")
-        for path in _paths(folder, file)
-        if path.is_file()
-    }
+    paths = filter(is_file, _paths(folder, file))
+    return {path.suffixes[-2][1:]: read_file(path, "a picture of a report") for path in paths}
 
 
 def stem_of(file: str) -> str:
@@ -65,9 +62,8 @@ def stem_of(file: str) -> str:
     is shortened and gets a hash.
     """
     stem = file.replace("/", "%2F")
-    if len(stem.encode()) <= _LONGEST_STEM:
-        return stem
-    return f"{stem[:40]}-{hashlib.sha256(stem.encode()).hexdigest()[:16]}"
+    is_long = len(stem.encode()) > _LONGEST_STEM
+    return f"{stem[:40]}-{hashlib.sha256(stem.encode()).hexdigest()[:16]}" if is_long else stem
 
 
 def _paths(folder: Path, file: str) -> list[Path]:
@@ -97,8 +93,7 @@ def _make_drawable(figure: Figure) -> None:
     texts, fonts = figure.findobj(Text), ["DejaVu Sans"]
     font = font_manager.get_font(font_manager.findfont(fonts[0]))
     characters = {c for text in texts for c in text.get_text()} - {"\n"}
-    lacking = {c for c in characters if printable(c) != c or not font.get_char_index(ord(c))}
-    if not lacking:
+    if not (lacking := {c for c in characters if printable(c) != c or not font.get_char_index(ord(c))}):
         return
     for entry in sorted(font_manager.fontManager.ttflist, key=lambda entry: entry.name):
         with suppress(OSError, RuntimeError):  # a font that FreeType does not open

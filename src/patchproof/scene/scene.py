@@ -65,10 +65,8 @@ def make_scene(
     models: dict[str, Any] = {}
     if not isinstance(settings, SceneSettings):
         named, given_mesh, models = _replace_objects(settings, Path(base))
-        settings, mesh = (
-            validate_model(SceneSettings, named, "the scene's settings"),
-            given_mesh if mesh is None else mesh,
-        )
+        settings = validate_model(SceneSettings, named, "the scene's settings")
+        mesh = given_mesh if mesh is None else mesh
     glb: Any = None if mesh is None else mesh.export(file_type="glb")
     scene = build_scene(settings, Path(base), seed, mesh_glb=glb)
     return replace(scene, given_models=models) if models else scene
@@ -138,11 +136,8 @@ def named_paths(scene: Scene) -> dict[str, Path]:
     """Return the files and folders that a scene's settings name, by key."""
     thing, patch = scene.settings.object, scene.settings.patch
     names = {f"object.{name}": getattr(thing, name) for name in ("mesh", "photos", "sheet", "images", "labels")}
-    names |= {
-        "patch.mask": patch.mask,
-        "patch.faces": patch.faces,
-        "background.images": scene.settings.background.images,
-    }
+    names |= {"patch.mask": patch.mask, "patch.faces": patch.faces}
+    names |= {"background.images": scene.settings.background.images}
     names |= {"patch.search.keep_off_faces": patch.search.keep_off_faces}
     return {key: Path(expand_path(name, scene.base)) for key, name in names.items() if name is not None}
 

@@ -3,10 +3,8 @@
     OUT/session_01/photo_0001.jpg  ...  OUT/controls/mean/photo_0017.jpg  ...
 
 In: bytes from anybody who has the address. Out: files that `verify OUT --controls OUT/controls` reads. We choose their
-names, and tell their kind by their first bytes; a file appears once it is complete. A number is reserved by creating a
-hidden part file, so that simultaneous uploads get different ones. Bytes that are here already are the same photograph
-sent again, and are not stored twice. No link is followed. Left out on purpose: removing photographs, since a selection
-by their answers proves nothing.
+names, and tell their kind by their first bytes; a file appears once it is complete, and the same bytes are not stored
+twice. No link is followed. Left out on purpose: removing photographs, since a selection by answers proves nothing.
 """
 
 from __future__ import annotations
@@ -20,15 +18,23 @@ from typing import Any
 
 from patchproof.base.errors import Refused
 from patchproof.base.output import make_folder, refuse_other_files
+from patchproof.evidence.journal import JOURNAL_FILE
 from patchproof.photo.read import list_images
 
-CONTROLS_FOLDER, JOURNAL_FILE = "controls", "photos.jsonl"
+CONTROLS_FOLDER = "controls"
 CONTROLS = ("bare", "mean", "gray", "noise", "shuffled", "blank")
 MOST_BYTES = 40_000_000  # phones' largest JPEGs, of 108 and 200 megapixels, have some 30
 MOST_PHOTOS = 1000
 _OWN = ("session_*", CONTROLS_FOLDER, JOURNAL_FILE, ".capture.json")  # the last is never read: it may be a sender's
 _HEAD = 12  # bytes that tell the kind of a file
-_HEIF = (b"heic", b"heix", b"heim", b"heis", b"mif1", b"msf1")
+# by suffix: where the bytes begin that tell a kind, and which they are
+_KINDS = {
+    ".jpg": (0, (b"\xff\xd8\xff",)),
+    ".png": (0, (b"\x89PNG\r\n\x1a\n",)),
+    ".webp": (8, (b"WEBP",)),
+    ".heic": (4, (b"ftypheic", b"ftypheix", b"ftypheim", b"ftypheis", b"ftypmif1", b"ftypmsf1")),
+    ".avif": (4, (b"ftypavif",)),
+}
 _NUMBERED = re.compile(r"\.?photo_(\d{4,})\.")
 _SESSION = re.compile(r"session_[0-9]+")
 
@@ -173,13 +179,8 @@ def refuse_size(size: int) -> None:
 
 def _suffix_of(head: bytes) -> str:
     """Suffix of the kind of picture that begins with these bytes; refused if phones do not make it."""
-    if head.startswith(b"\xff\xd8\xff"):
-        return ".jpg"
-    if head.startswith(b"\x89PNG\r\n\x1a\n"):
-        return ".png"
-    if head[:4] == b"RIFF" and head[8:12] == b"WEBP":
-        return ".webp"
-    if head[4:8] == b"ftyp" and head[8:12] in (*_HEIF, b"avif"):
-        return ".avif" if head[8:12] == b"avif" else ".heic"
+    for suffix, (start, beginnings) in _KINDS.items():
+        if head.startswith(beginnings, start) and (suffix != ".webp" or head.startswith(b"RIFF")):
+            return suffix
     got = f"a file that begins with the bytes {head.hex(' ')}"
     raise UploadRefused(415, "a photograph (JPEG, PNG, WebP, HEIC or AVIF)", got, "take it again")

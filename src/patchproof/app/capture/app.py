@@ -4,10 +4,10 @@
     GET /TOKEN/state       JSON               POST /TOKEN/sessions           begin a new session
 
 In: requests of anybody who reaches the port. Out: the page, `state_of`, `answer_of`, or a refusal in one sentence. A
-photograph is the whole body, without a form and a name that would have to be trusted; it is written as it arrives, and
-a body that stops or stalls leaves no file. Photographs are measured one at a time, then answered; the same bytes get
-the same answer, so that a page that lost its connection can send them again. An answer ends its connection, and one
-that has not shown the token loses its place to whoever comes later, so that silent ones cannot keep the owner out.
+photograph is the whole body, without a name that would have to be trusted; a body that stops or stalls leaves no file.
+Photographs are measured one at a time; the same bytes get the same answer, so that a page that lost its connection can
+send them again. An answer ends its connection, and one that has not shown the token loses its place to whoever comes
+later, so that silent ones cannot keep the owner out.
 """
 
 from __future__ import annotations
@@ -118,13 +118,11 @@ class _TokenCheck:
         if scope["type"] != "http":
             return
         token = scope["path"].lstrip("/").partition("/")[0]
-        app: ASGIApp = self._app
         if not hmac.compare_digest(token.encode("utf-8", "surrogateescape"), self._token):
             sentence = "Expected the address that the terminal shows, got one without its token: open that address."
-            app = JSONResponse({"refused": sentence}, 403)
-        else:
-            self._admit(scope["client"])
-        await app(scope, receive, with_headers)
+            return await _refusal(403, sentence)(scope, receive, with_headers)
+        self._admit(scope["client"])
+        await self._app(scope, receive, with_headers)
 
 
 class _Handlers:

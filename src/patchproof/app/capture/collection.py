@@ -1,9 +1,9 @@
 """Measure the photographs of an album as they arrive, and report on all of them.
 
-In: an album, a manifest, the options of a verification. Out: a `Report`, as `verify` makes it of the same folder, by
-the same functions. Photographs are measured one at a time, in the single process of the workers, where limits of time
-and memory apply; finished ones are in the album's journal, so that a restart measures only new ones. Left out on
-purpose: the gap ledger and the estimated effect, which take longer than a person waits.
+In: an album, a manifest, the options of a verification. Out: a `Report`, as `verify` makes it of the same folder.
+Photographs are measured one at a time, in the single process of the workers, where limits of time and memory apply;
+finished ones are in the album's journal, so that a restart measures only new ones. Left out on purpose: the gap ledger
+and the estimated effect, which take longer than a person waits.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from patchproof.app.capture.album import CONTROLS_FOLDER, JOURNAL_FILE, Album
+from patchproof.app.capture.album import CONTROLS_FOLDER, Album
 from patchproof.base.progress import Advance, no_advance
 from patchproof.base.workers import Workers
 from patchproof.evidence.batch import PhotoItem, measure_all, reread_square
@@ -23,7 +23,7 @@ from patchproof.evidence.classify import judges_of
 from patchproof.evidence.copies import reject_copies
 from patchproof.evidence.gather import report_of, with_forecast
 from patchproof.evidence.grouping import BY_FOLDERS, Grouping
-from patchproof.evidence.journal import Journal, settings_key
+from patchproof.evidence.journal import JOURNAL_FILE, Journal, settings_key
 from patchproof.evidence.measure import MeasuredPhoto
 from patchproof.evidence.reproject import PhotoSquare
 from patchproof.evidence.results import Report

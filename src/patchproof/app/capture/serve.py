@@ -1,9 +1,9 @@
 """Serve the capture page on this machine, or on request on the local network, until interrupted.
 
 In: a sheet's manifest, the folder for the photographs. Out: the last `Report`. The address has a random token. Port and
-token are stored for the user and not in the folder, which may have come from somebody who knows them, so that an open
-page continues after a restart. HTTP is not encrypted: in a network of strangers serve this machine only. Left out on
-purpose: live pictures, which browsers allow to encrypted pages only; the phone's camera app takes better ones.
+token are stored for the user and not in the folder, which may have come from somebody who knows them. HTTP is not
+encrypted: in a network of strangers serve this machine only. Left out on purpose: live pictures, which browsers allow
+to encrypted pages only.
 """
 
 from __future__ import annotations
@@ -79,7 +79,10 @@ def serve_capture(
             address = _stored_address(path)
             with _listen(_host(lan), address.port) as listener:
                 host, port = listener.getsockname()
-                _store(address.changed(port=port), path)
+                with suppress(Refused):  # without a place for it, the next server has a new address
+                    make_folder(path.parent)
+                    path.parent.chmod(0o700)
+                    write_atomically(path, address.changed(port=port).model_dump_json())
                 on_address(f"http://{host}:{port}/{address.token}/")
                 try:
                     uvicorn.Server(server_config(collection, address.token)).run(sockets=[listener])
@@ -133,11 +136,3 @@ def _stored_address(path: Path) -> _Address:
         return validate_model(_Address, read_json(path, "an address", "remove it"), path.name)
     except Refused:
         return _Address(token=secrets.token_urlsafe(24), port=0)
-
-
-def _store(address: _Address, path: Path) -> None:
-    """Store an address, in a folder of the user's own; without a place for it, the next server has a new one."""
-    with suppress(Refused):
-        make_folder(path.parent)
-        path.parent.chmod(0o700)
-        write_atomically(path, address.model_dump_json())

@@ -56,12 +56,10 @@ def state_of(collection: PhotoCollection, sessions: int | None) -> dict[str, Any
 
 def answer_of(collection: PhotoCollection, path: Path, picture: np.ndarray | None = None) -> dict[str, Any]:
     """The answer to one measured photograph, with advice; `picture` (uint8 H×W×3) is included as a data URI."""
-    photo, promise, answer, prediction = collection.photos[path], collection.manifest.promise, "not counted", None
-    entry = photo.entry
-    if promise is not None and photo.counted:
-        prediction = entry.predictions.get(promise.models[0].name)
-    if prediction is not None:
-        answer = "recognized" if prediction.recognized else "not recognized"
+    photo, promise = collection.photos[path], collection.manifest.promise
+    entry, is_counted = photo.entry, promise is not None and photo.counted
+    prediction = entry.predictions.get(promise.models[0].name) if promise is not None and is_counted else None
+    answer = "not counted" if prediction is None else "recognized" if prediction.recognized else "not recognized"
     return {
         "file": f"{path.parent.name}/{path.name}",
         "answer": answer,
@@ -96,12 +94,10 @@ def _map(collection: PhotoCollection, wanted: int) -> dict[str, Any] | None:
     views = promise and map_views(promise.conditions, counted, wanted, side_px)
     if not views:
         return None
-    pairs = pairwise(views.px_per_mm)
-    if side_px is None:
-        rows = [f"{low:.1f}–{high:.1f} px/mm" for high, low in pairs]
-    else:
+    rows = [f"{low:.1f}–{high:.1f} px/mm" for high, low in pairwise(views.px_per_mm)]
+    if side_px is not None:
         share = 100 * collection.manifest.cut_mm[2] / side_px
-        rows = [f"{share * low:.0f}–{share * high:.0f} %" for high, low in pairs]
+        rows = [f"{share * low:.0f}–{share * high:.0f} %" for high, low in pairwise(views.px_per_mm)]
     return {
         "columns": [_azimuth_words(low, high) for low, high in pairwise(views.azimuth_deg)],
         "rows": rows,

@@ -58,17 +58,16 @@ def map_views(
         inside = np.clip(row, distance[0], distance[-1]), np.clip(column, left, right)
         return np.histogram2d(*inside, (distance, azimuth_deg))[0]
 
+    def rows(table: np.ndarray) -> tuple[tuple[int, ...], ...]:
+        return tuple(map(tuple, table.astype(int).tolist()))
+
     figures = [figures_of(entry, side_px) for entry in entries]
     photo_views = [(each.get("azimuth_deg"), each.get("px_per_mm")) for each in figures]
     known_views = np.array([view for view in photo_views if None not in view]).reshape(-1, 2)
     return ViewMap(
         azimuth_deg=tuple(map(float, azimuth_deg)),
         px_per_mm=tuple(float(1 / d) for d in distance),
-        photos=_rows(counts(known_views)),
-        wanted=_rows(np.rint(wanted * counts(views) / len(views))),
+        photos=rows(counts(known_views)),
+        wanted=rows(np.rint(wanted * counts(views) / len(views))),
         elsewhere=len(photo_views) - len(known_views),
     )
-
-
-def _rows(table: np.ndarray) -> tuple[tuple[int, ...], ...]:
-    return tuple(map(tuple, table.astype(int).tolist()))
