@@ -208,7 +208,7 @@ def test_a_received_report_is_not_resumed_through_links_or_over_photographs(fold
     with pytest.raises(Refused, match="inputs that lie outside of what is written"):
         verify(tmp_path / "pictures", sheet, tmp_path, resume=True)
     (tmp_path / "report.html").symlink_to(sheet)
-    with pytest.raises(Refused, match="own output only .*with report.html"):
+    with pytest.raises(Refused, match=r"own output only .*with report\.html"):
         verify(folder, sheet, tmp_path, resume=True)
 
 

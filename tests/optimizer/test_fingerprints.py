@@ -162,7 +162,7 @@ def test_only_a_run_is_resumed_and_not_over_inputs_or_through_links(made, tmp_pa
     scene.write_text(text)
     (out / "steps.jsonl").unlink()
     (out / "steps.jsonl").symlink_to(scene)
-    with pytest.raises(Refused, match="own output only.* got .*with steps.jsonl"):
+    with pytest.raises(Refused, match=r"own output only.* got .*with steps\.jsonl"):
         optimize(scene, out, resume=True)
     assert (out / "design.png").read_bytes() == mine and scene.read_text() == text
 
