@@ -172,9 +172,8 @@ def geometry_of(
 
 
 def _turn_rad(location: LocatedSheet, surface: Surface) -> float:
-    return sheet_pose.turn_rad(
-        location.fit.bend_mm / min(surface.rect_mm[2:]), location.unrolled and location.unrolled.shape
-    )
+    bend = location.fit.bend_mm / min(surface.rect_mm[2:])
+    return sheet_pose.turn_rad(bend, location.unrolled and location.unrolled.shape)
 
 
 def _offset_mm(cells: Registration, free: np.ndarray, surface: Surface) -> float:

@@ -225,7 +225,7 @@ def _detect(
     settings.minMarkerPerimeterRate = min(0.03 * full_px, 4 * SMALLEST_MARKER_PX) / max(picture.shape)
     corners, ids, others = detect_markers(picture, aruco, settings)
     unread = others if is_reduced else ()
-    ids = [] if ids is None else np.asarray(ids).ravel().tolist()
+    ids = [] if ids is None else list(map(int, np.asarray(ids).ravel()))
     for marker_id, quad in zip([*ids, *[None] * len(unread)], [*corners, *unread], strict=True):
         # in the detector's coordinates pixel centers lie at whole numbers: its 0 is our .5
         quad = np.asarray(quad, float).reshape(4, 2) + 0.5
