@@ -301,6 +301,20 @@ def _second(d: Draw, how: str) -> Draw:
     return replace(d, twin_sheet="OTHERSHEET")
 
 
+def _corner_cut(d: Draw, eared: bool) -> Draw:
+    """A marker partly beyond the picture's right edge; its corner may be folded, too."""
+    rng, roll, far = d.rng, _sign(d.rng) * d.rng.uniform(12, 30), d.rng.uniform(380, 500)
+    corners = SIDE_MM / 2 * np.array([[1, 1], [1, -1]])
+    angle, reach, azimuth, cut = np.radians(rng.uniform(60, 150)), *rng.uniform([72, -30, 2], [90, 30, 12])
+    for aside in range(400):
+        d = replace(d, camera_from_page=camera(azimuth, 5, far, roll, (-aside, 0)))
+        x = _projected(d, flat(corners), d.camera_from_page, np.zeros_like)[0][:, 0]
+        if x.max() > SIZE[0] + cut:
+            break
+    way = np.arctan2(*corners[x.argmax()][::-1])
+    return replace(d, place=bent(lambda along: angle * (along > reach), way)) if eared else d
+
+
 def _twin_px(d: Draw) -> np.ndarray:
     corners = np.array([[-80, -80], [80, -80], [80, 80], [-80, 80.0]])
     return _projected(d, flat(corners), d.twin, np.zeros_like)[0]
@@ -443,6 +457,8 @@ KINDS: dict[str, Callable[[Draw], Draw]] = {
     "swapped_inks": _inks(lambda dyes, rng: dyes[..., [(1, 0, 2), (2, 1, 0), (0, 2, 1)][int(rng.integers(3))]]),
     "banded": _inks(_banded),
     "draft_gray": _inks(lambda dyes, rng: dyes.mean(-1, keepdims=True) * np.full(3, rng.uniform(0.5, 1.0))),
+    "corner_cut": partial(_corner_cut, eared=False),
+    "corner_cut_ear": partial(_corner_cut, eared=True),
 }
 
 

@@ -110,6 +110,8 @@ def test_what_is_called_measured_is_right(kind, tmp_path):
         ("design_scaled", 8, None),
         ("design_scaled", 1, "curled"),
         ("dog_ear_small", 0, "too_few_markers"),
+        ("corner_cut", 10, None),
+        ("corner_cut_ear", 10, "too_few_markers"),
         ("second_covered", 0, "several_sheets"),
         ("draft_gray", 0, "wrong_ink"),
     ],

@@ -205,3 +205,17 @@ def test_how_vague_cells_are_and_how_well_codes_agree_are_numpy_s_own(piece):
     expected = np.corrcoef(light, code[1:-1, 1:-1].ravel())[0, 1]
     assert known_page._correlation(srgb, quad, code) == pytest.approx(expected, abs=1e-5)
     assert known_page._correlation(np.full_like(srgb, 9), quad, code) == -1
+
+
+@pytest.mark.parametrize("second", [False, True])
+def test_a_finer_level_is_searched_only_in_squares_beside_the_print(piece, surface, monkeypatch, second):
+    near = photograph(piece, view(0, 0, 330, 0, (800, 600)), (800, 600), blur_px=0.4)
+    photo = np.full((1200, 1600, 3), 128, np.uint8)
+    photo[300:900, 600:1400] = near
+    if second:
+        photo[500:800, 150:550] = cv2.resize(near, (400, 300), interpolation=cv2.INTER_AREA)
+    sizes, inner = [], detect._detect
+    monkeypatch.setattr(detect, "_detect", lambda level, *rest: sizes.append(level.size) or inner(level, *rest))
+    found = find_sheet(photo, IDS, surface.corners_mm)
+    assert found.markers.keys() == IDS and bool(found.doubled) == second
+    assert sizes[0] == 600 * 800 and sum(sizes[1:]) < 600 * 800

@@ -112,8 +112,7 @@ def count_by_session(hits: Hits, per_session: int, places: Sequence[int] = ()) -
     """(recognized, photographs) of sessions of `per_session` successive photographs; the last may have fewer. Sessions
     with the same number in `places` count as one, because sessions differ mostly by their place.
     """
-    sessions = _split(hits, per_session)
-    by_place: dict[int, list[bool]] = {}
+    sessions, by_place = _split(hits, per_session), dict[int, list[bool]]()
     for place, session in zip(places or range(len(sessions)), sessions, strict=True):
         by_place.setdefault(place, []).extend(map(bool, session))
     return list(map(sum, by_place.values())), list(map(len, by_place.values()))

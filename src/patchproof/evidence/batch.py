@@ -58,8 +58,7 @@ LightLevel = Annotated[Finite, Field(ge=-4, le=4)]
 @dataclass(frozen=True)
 class PhotoItem:
     """A photograph to measure: its name in the report, the control that it shows (None: the patch), whether the page
-    shows its pictures, and the box that somebody drew round the object (left, top, right, bottom, as shares of the
-    upright photograph's sides).
+    shows its pictures, and the object's drawn box in shares of the upright photograph's sides.
     """
 
     path: Path
@@ -86,9 +85,8 @@ def measure_all(
     """Measure every photograph, in order; the journal's are not opened again. `step` gets (done, total)."""
     photos: dict[int, MeasuredPhoto] = {}
     for number, item in enumerate(items):
-        line = journal.find(item.name, item.path) if journal is not None else None
-        photo = None if line is None else _parse(line, item, judges)
-        if photo is not None:
+        line = None if journal is None else journal.find(item.name, item.path)
+        if line is not None and (photo := _parse(line, item, judges)) is not None:
             photos[number] = photo
     todo = [number for number in range(len(items)) if number not in photos]
     step(len(photos), len(items))
@@ -137,8 +135,7 @@ class _JournalPhoto(StrictModel):
 
 def _serialize(measured: MeasuredPhoto, pictures: bool) -> dict[str, Any]:
     light = measured.light and {key: np.asarray(value).tolist() for key, value in vars(measured.light).items()}
-    entry = measured.entry.model_dump(mode="json")
-    trace = measured.trace and measured.trace.model_dump()
+    entry, trace = measured.entry.model_dump(mode="json"), measured.trace and measured.trace.model_dump()
     return {"entry": entry, "counted": measured.counted, "light": light, "pictures": pictures, "trace": trace}
 
 
@@ -195,12 +192,11 @@ def _trace(path: Path, srgb: np.ndarray) -> Trace:
     step = max(1, min(srgb.shape[:2]) // 256)  # averaging all pixels of large photographs takes long
     sampled = np.ascontiguousarray(srgb[::step, ::step])
     small = linear_from_srgb(cv2.resize(sampled, (32, 32), interpolation=cv2.INTER_AREA) / 255)
-    frame = np.ones((32, 32), bool)
-    frame[4:-4, 4:-4] = False
+    frame = np.pad(np.zeros((24, 24), bool), 4, constant_values=True)
     red, green, blue = map(float, small[frame].mean(0))
-    taken = time_and_camera(path)
-    minute = taken and (taken[0] - datetime.min).total_seconds() / 60
-    return Trace(minute=minute, camera=taken[1] if taken else "", frame=(red, green, blue))
+    time, camera = time_and_camera(path) or (None, "")
+    minute = time and (time - datetime.min).total_seconds() / 60
+    return Trace(minute=minute, camera=camera, frame=(red, green, blue))
 
 
 def _thumbnail(srgb: np.ndarray, px_from_mm: ArrayLike | None, surface: Surface) -> np.ndarray:
@@ -225,9 +221,8 @@ def _rejected(item: PhotoItem, remark: Remark) -> MeasuredPhoto:
 
 
 def reread_square(task: Task, size_px: int, item: tuple[Path, MeasuredPhoto]) -> PhotoSquare | None:
-    """Read a measured photograph again, to put other pieces into it: keeping all of them would cost memory.
-
-    None if it is not counted, its sheet is not flat or its homography is not reliable.
+    """Read a measured photograph again, to put other pieces into it: keeping all of them would cost memory. None if it
+    is not counted, its sheet is not flat or its homography is not reliable.
     """
     path, measured = item
     entry, geometry, light = measured.entry, measured.entry.geometry, measured.light

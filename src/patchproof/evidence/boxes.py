@@ -74,8 +74,8 @@ def load_boxes(path: str | Path, label: str) -> dict[str, DrawnBox]:
         category_ids = [coco.categories[0].id]
     if not category_ids:
         names = [category.name for category in coco.categories]
-        do = spelling_hint(label, names)
-        raise Refused(f'a category "{label}" of boxes in {path}', ", ".join(names) or "none", do)
+        got = ", ".join(names) or "none"
+        raise Refused(f'a category "{label}" of boxes in {path}', got, spelling_hint(label, names))
     annotations = [annotation for annotation in coco.annotations if annotation.category_id in category_ids]
     images = {image.id: image for image in coco.images}
     names = {id: printable(image.file_name.replace("\\", "/")) for id, image in images.items()}
@@ -102,8 +102,9 @@ def load_boxes(path: str | Path, label: str) -> dict[str, DrawnBox]:
 
 def _refuse_outside(boxes: Mapping[str, DrawnBox], source: str) -> None:
     """Refuse boxes that lie partly outside of their pictures, or are smaller than a pixel; corners of boxes by name."""
-    for name, ((left, top, right, bottom), (width, height)) in boxes.items():
-        if not _inside((left, top, right, bottom), (width, height)):
+    for name, (edges, size_px) in boxes.items():
+        if not _inside(edges, size_px):
+            (left, top, right, bottom), (width, height) = edges, size_px
             corners = all(_inside((x, y, x1 - x, y1 - y), size) for (x, y, x1, y1), size in boxes.values())
             do = "these are all left, top, right and bottom: write width and height" if corners else "draw it again"
             expected = f"boxes [left, top, width, height] of a pixel or more within their pictures in {source}"

@@ -37,8 +37,7 @@ class Judges:
 
     def predictions(self, squares: Mapping[int, np.ndarray], box: BoxEdges | None) -> dict[str, Prediction]:
         """Classify one photograph with the object in `box` by every network: predictions by network's name."""
-        models = {model.name: model for model in self.models}
-        return {n: predict(m, self.indices[n], squares[m.input_px], box) for n, m in models.items()}
+        return {m.name: predict(m, self.indices[m.name], squares[m.input_px], box) for m in self.models}
 
 
 def judges_of(models: Sequence[Classifier], manifest: Manifest) -> Judges | None:
@@ -47,11 +46,9 @@ def judges_of(models: Sequence[Classifier], manifest: Manifest) -> Judges | None
     """
     if manifest.promise is None:
         return None
-    (first, *_), by_name = manifest.promise.models, {model.name: model for model in models}
-    if first.name not in by_name:
-        got = ", ".join(by_name) or "none"
-        raise Refused(f"the promise's own network {first.name}", got, f"add {first.name}")
-    primary = by_name[first.name]
+    by_name, first = {model.name: model for model in models}, manifest.promise.models[0].name
+    if first not in by_name:
+        raise Refused(f"the promise's own network {first}", ", ".join(by_name) or "none", f"add {first}")
     for promised in manifest.promise.models:
         sha256 = by_name[promised.name].sha256 if promised.name in by_name else promised.sha256
         if promised.sha256 not in (None, sha256):
@@ -59,7 +56,7 @@ def judges_of(models: Sequence[Classifier], manifest: Manifest) -> Judges | None
             got = "a network without a file" if sha256 is None else f"SHA-256 {sha256[:12]}..."
             raise Refused(expected, got, "use the same weights, or make the sheet again")
     indices = {model.name: target_indices(model, manifest.promise, manifest.settings) for model in models}
-    return Judges(models, indices, primary)
+    return Judges(models, indices, by_name[first])
 
 
 def boxes_of(box: BoxEdges | None, n: int = 1) -> np.ndarray | None:
@@ -152,10 +149,6 @@ def predict(model: Classifier, indices: tuple[int, ...], square: np.ndarray, box
     with torch.inference_mode():
         logits = model.logits(torch.from_numpy(square)[None], boxes_of(box)).cpu()
     likely = model.probabilities(logits)[0]
-    best = int(likely.argmax())
-    return Prediction(
-        label=model.labels[best],
-        confidence=float(likely[best]),
-        target_confidence=float(model.confidence(logits, indices)[0]),
-        recognized=bool(model.recognized(logits, indices)[0]),
-    )
+    best, target_confidence = int(likely.argmax()), float(model.confidence(logits, indices)[0])
+    figures = {"confidence": float(likely[best]), "target_confidence": target_confidence}
+    return Prediction(label=model.labels[best], recognized=bool(model.recognized(logits, indices)[0]), **figures)

@@ -32,7 +32,7 @@ from patchproof.evidence.classify import Judges, judges_of
 from patchproof.evidence.copies import COPY_CODE, reject_copies
 from patchproof.evidence.effect_estimate import estimate_effect
 from patchproof.evidence.forecast import forecast_of
-from patchproof.evidence.grouping import Grouping, group_sessions
+from patchproof.evidence.grouping import Grouping, group_sessions, subfolders
 from patchproof.evidence.journal import Journal, settings_key
 from patchproof.evidence.ledger import ledger_of
 from patchproof.evidence.measure import MeasuredPhoto
@@ -117,9 +117,8 @@ def gather_evidence(
     by_sha256: dict[str, dict[str, MeasuredPhoto]] = {}
     left_out = list_skipped_files(Path(photos), controls_folder and controls_folder.resolve())
     if controls_folder:
-        left_out += [
-            f"{printable(controls_folder.name)}: {text}" for text in list_skipped_files(controls_folder, depth=2)
-        ]
+        skipped = list_skipped_files(controls_folder, depth=2)
+        left_out += [f"{printable(controls_folder.name)}: {text}" for text in skipped]
     left_out += summarize_said((item.name, result.entry.said) for item, result in zip(items, results, strict=True))
     for item, result in zip(items, results, strict=True):
         if item.control is not None:
@@ -161,7 +160,7 @@ def _list_controls(folder: Path | None, sessions: Sequence[str]) -> dict[str, di
         return {}
     if not is_folder(folder):
         raise Refused("a folder of control photographs", f"no folder at {folder}", "check the path")
-    folders = sorted(p for p in folder.iterdir() if p.is_dir() and not p.name.startswith("."))
+    folders = subfolders(folder)
     named = [p for p in folders if list_images(p)]
     if list_images(folder) or (named and all(printable(p.name) in sessions for p in named)):
         return {printable(folder.name): _control_files(folder)}
@@ -175,8 +174,8 @@ def _control_files(folder: Path) -> dict[str, Path]:
     """A control's photographs: those in the folder, or in its folders if there are none."""
     if pictures := list_images(folder):
         return {printable(path.name): path for path in pictures}
-    sessions = sorted(p for p in folder.iterdir() if p.is_dir() and not p.name.startswith("."))
-    return {printable(f"{p.name}/{path.name}"): path for p in sessions for path in list_images(p)}
+    pairs = ((p, path) for p in subfolders(folder) for path in list_images(p))
+    return {printable(f"{p.name}/{path.name}"): path for p, path in pairs}
 
 
 def report_of(
@@ -249,7 +248,7 @@ def report_of(
         forecast=forecast,
     )
     if ruler_mm is not None:
-        x, y = (measured / nominal for measured, nominal in zip(ruler_mm, manifest.ruler_mm, strict=True))
+        x, y = np.divide(ruler_mm, manifest.ruler_mm).tolist()
         scale = Scale(scale_x=x, scale_y=y)
         entries = [entry if entry.scale else entry.changed(scale=scale) for entry in entries]
     sheet_id = manifest.sheet_id

@@ -55,15 +55,19 @@ def group_sessions(folder: str | Path, without: Path | None = None) -> Grouping:
     of controls. Refused if there are none.
     """
     folder, excluded = Path(folder), None if without is None else without.resolve()
-    entries = sorted(folder.iterdir()) if is_folder(folder) else []
-    subfolders = [p for p in entries if p.is_dir() and not p.name.startswith(".") and p.resolve() != excluded]
-    sessions = {printable(p.name): paths for p in subfolders if (paths := list_images(p))}
+    folders = [p for p in subfolders(folder) if p.resolve() != excluded] if is_folder(folder) else []
+    sessions = {printable(p.name): paths for p in folders if (paths := list_images(p))}
     if not sessions:
         return _group_by_time(list_photos(folder))
     if loose := list_images(folder):
         sessions = {"": loose} | sessions
     pairs = [(path, number) for number, paths in enumerate(sessions.values()) for path in paths]
     return Grouping(tuple(p for p, _ in pairs), tuple(n for _, n in pairs), tuple(sessions), BY_FOLDERS)
+
+
+def subfolders(folder: Path) -> list[Path]:
+    """The folders in a folder by name, without hidden ones."""
+    return sorted(p for p in folder.iterdir() if p.is_dir() and not p.name.startswith("."))
 
 
 def _group_by_time(paths: Sequence[Path]) -> Grouping:

@@ -63,15 +63,12 @@ class Journal:
         self._file.flush()
 
     def close(self) -> None:
-        """Close the file; nothing can be added after this."""
+        """Close the file."""
         self._file.close()
 
 
 def settings_key(manifest: Manifest, options: Options) -> str:
-    """SHA-256 of everything that a photograph's result depends on besides its bytes.
-
-    A network without a SHA-256 (the user's code) is identified by its name alone.
-    """
+    """SHA-256 of all that a photograph's result depends on besides its bytes; of the user's networks their names."""
     settings = {
         "versions": (__version__, cv2.__version__, np.__version__),
         "manifest": manifest.model_dump(mode="json"),

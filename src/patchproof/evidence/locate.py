@@ -7,6 +7,7 @@ rolled paper are those of the tangent plane at the design's middle.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,6 +20,7 @@ from patchproof.evidence.results import CameraPose, FocalSource, Geometry
 from patchproof.evidence.surface import PromisedColors, Surface
 from patchproof.photo import pose as sheet_pose
 from patchproof.photo.detect import MarkersInView
+from patchproof.photo.known_page import is_in_picture
 from patchproof.photo.print_ratio import x_over_y
 from patchproof.photo.quality import FrameLight, blur_px
 from patchproof.photo.rectify import PageFit, corner_uncertainty_mm, fit_page
@@ -144,7 +146,7 @@ def geometry_of(
     # one page of a piece in tiles has none of the piece's markers, or some of them
     if colors is not None and surface.piece_ids:
         cells = register(location.srgb, fit.px_from_mm, surface.rect_mm, colors.design, px_per_mm, blur)
-        shift, corners, corner_shift = _shifts(cells, detected, surface)
+        shift, corners, corner_shift = _shifts(cells, _absent_markers(view, location, detected, surface), surface)
         free = ~surface.on_marker(cells.middle_mm, cells.size_mm / 2)
         found = float(np.isfinite(cells.sigma_mm[free]).mean()) if free.any() else 1.0, int(free.sum())
         offset = _offset_mm(cells, free, surface)
@@ -170,9 +172,8 @@ def geometry_of(
 
 
 def _turn_rad(location: LocatedSheet, surface: Surface) -> float:
-    return sheet_pose.turn_rad(
-        location.fit.bend_mm / min(surface.rect_mm[2:]), location.unrolled and location.unrolled.shape
-    )
+    bend = location.fit.bend_mm / min(surface.rect_mm[2:])
+    return sheet_pose.turn_rad(bend, location.unrolled and location.unrolled.shape)
 
 
 def _offset_mm(cells: Registration, free: np.ndarray, surface: Surface) -> float:
@@ -190,9 +191,22 @@ def _offset_mm(cells: Registration, free: np.ndarray, surface: Surface) -> float
     return 0.0 if offset < _OFFSET_SIGMAS * sigma else offset if sigma < most / 4 else min(offset, most)
 
 
-def _shifts(cells: Registration, detected: MarkersInView, surface: Surface) -> tuple[float | None, int, float]:
+def _absent_markers(
+    view: PinholePhoto, location: LocatedSheet, detected: MarkersInView, surface: Surface
+) -> dict[int, bool]:
+    """The piece's markers that were not found, and whether each lies partly beyond the picture's edge."""
+    quads = {
+        i: location.px(location.parameters, surface.corners_mm[i]) for i in surface.piece_ids - detected.markers.keys()
+    }
+    return {i: not is_in_picture(quad, view.srgb) for i, quad in quads.items()}
+
+
+def _shifts(
+    cells: Registration, absent_markers: Mapping[int, bool], surface: Surface
+) -> tuple[float | None, int, float]:
     """The 80 % point of the cells' significant shifts in mm; the number of corners in which the design and a marker, if
     one belongs there, were found; the largest significant shift in a corner. Significant: over two standard deviations.
+    The design alone is enough where the picture's edge cuts the marker; a marker is where the design has no detail.
     """
     shift = np.linalg.norm(cells.shift_mm, axis=1)
     significant = np.maximum(shift - _SURE_SIGMAS * cells.sigma_mm, 0)
@@ -203,8 +217,11 @@ def _shifts(cells: Registration, detected: MarkersInView, surface: Surface) -> t
     for corner in rect_corners(surface.rect_mm):
         nearby = np.abs(cells.middle_mm - corner).max(1) < side / 8
         markers = [i for i in surface.piece_ids if np.abs(surface.corners_mm[i] - corner).max() < side / 4]
-        is_seen = not nearby.any() or bool(np.isfinite(shift[nearby]).any())
-        corners += is_seen and (not markers or any(i in detected.markers for i in markers))
+        is_found, absent = bool(np.isfinite(shift[nearby]).any()), [i for i in markers if i in absent_markers]
+        if markers and len(absent) == len(markers):
+            corners += is_found and all(absent_markers[i] for i in absent)
+        else:
+            corners += is_found or not nearby.any()
         largest = max(largest, float(significant[nearby & sure].max(initial=0)))
     return most_cells, corners, largest
 

@@ -45,6 +45,7 @@ MOST_SCALE_ERROR = 0.01
 _MOST_PERSPECTIVE = 0.005  # of a scan: relative difference in length of opposite sides; scanners have none
 _SCALE_RANGE = (1 / 1.15, 1.15)  # no print of this page lies outside of it, but a scan at another resolution does
 _MOST_ASKEW_DEG = 3.0  # of a sheet in a scanner
+_DISTORTED_ADVICE = "the marker in view is distorted: show the whole patch"
 _COME_CLOSER_ADVICE = "come closer or use the camera's full resolution"
 _SQUARELY_ADVICE = "look at the patch more squarely: so far from the side its cells are too narrow"
 _FEW_MARKERS_ADVICE = "show more of the piece: its markers fix where it lies"
@@ -55,6 +56,10 @@ _NOT_ROLLED_ADVICE = (
     "middle of its bend, and glue down what stands off the surface"
 )
 _SHIFTED_ADVICE = "the design lies elsewhere than its markers say: press it down on its surface, or print it again"
+_OTHER_DPI_ADVICE = (
+    "it cannot be a scan at {:g} dpi, where its print would be {:.3f} × {:.3f} of its size, so no scale was measured: "
+    "give --scan-dpi the scan's own, the same in both directions"
+)
 _HIDDEN_ADVICE = "a corner of the design is covered, folded away or out of the picture: show all of it"
 
 
@@ -90,8 +95,7 @@ def measure(
     entry = partial(PhotoEntry, file=name, photo_px=size_px, markers_found=len(detected.markers))
     location = locate_sheet(view, detected, surface)
     if location is None:
-        advice = "the marker in view is distorted: show the whole patch"
-        trouble = PhotoRejected("too_few_markers", len(detected.markers), 1, advice)
+        trouble = PhotoRejected("too_few_markers", len(detected.markers), 1, _DISTORTED_ADVICE)
         return MeasuredPhoto(entry(status="judged", remark=Remark.of(trouble)), True)
     light = frame_light(view.srgb, detected.markers.values())
     fit = location.fit
@@ -255,11 +259,7 @@ def _print_check(page_check: bool, scale: Scale | None, scan_dpi: float | None) 
     if scale is not None:
         worst = _worst(scale)
         if not _SCALE_RANGE[0] < worst < _SCALE_RANGE[1]:
-            advice = (
-                f"it cannot be a scan at {scan_dpi:g} dpi, where its print would be {scale.scale_x:.3f} × "
-                f"{scale.scale_y:.3f} of its size, so no scale was measured: give --scan-dpi the scan's own, the same "
-                "in both directions"
-            )
+            advice = _OTHER_DPI_ADVICE.format(scan_dpi, scale.scale_x, scale.scale_y)
             return Remark(code="scale_off", figure=worst, threshold=_SCALE_RANGE[worst > 1], advice=advice)
         if abs(worst - 1) > MOST_SCALE_ERROR:
             advice = f'it is printed {worst:.3f} times its size: print again at 100 %, "actual size", not "fit to page"'

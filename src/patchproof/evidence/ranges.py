@@ -29,9 +29,8 @@ _ADVICE = {
 
 @dataclass(frozen=True)
 class PromisedRanges:
-    """Allowed (low, high) by figure, margins included; figures that no condition has are not limited.
-
-    Pixels are those of photographs whose shorter side has `side_px`, where that is known.
+    """Allowed (low, high) by figure, margins included, of those that conditions have. Pixels are those of photographs
+    whose shorter side has `side_px`, where that is known.
     """
 
     limits: dict[str, tuple[float, float]]
@@ -48,11 +47,10 @@ class PromisedRanges:
                 low, high = low - entry.pose.azimuth_uncertainty_deg, high + entry.pose.azimuth_uncertainty_deg
             if low <= value <= high:
                 continue
-            below = value < low
-            do = _ADVICE[name][0 if below else 1]
+            do, limit = _ADVICE[name][value > high], low if value < low else high
             unit = f" at {self.side_px:g} px of the shorter side" if name == "px_per_mm" and self.side_px else ""
             advice = f"{name} is {value:.3g}{unit}, the promise covers {low:.3g} to {high:.3g}: {do}"
-            return PhotoRejected("out_of_range", value, low if below else high, advice)
+            return PhotoRejected("out_of_range", value, limit, advice)
         return None
 
 
@@ -66,15 +64,12 @@ def promised_ranges(conditions: Sequence[ConditionClaim], side_px: float | None 
     """Compute the spans of the promised conditions, each with its margin."""
     limits = {}
     for name in _ADVICE:
-        values = [v for c in conditions if (v := getattr(c, name)) is not None]
-        if not values:
-            continue
-        low, high = min(values), max(values)
-        least = [_LEAST_ANGLE_MARGIN_DEG] * 2
-        if name == "px_per_mm":
-            least = [_LEAST_SCALE_MARGIN * low, _LEAST_SCALE_MARGIN * high]
-        below, above = (max(MARGIN * (high - low), margin) for margin in least)
-        limits[name] = low - below, high + above
+        if values := [v for c in conditions if (v := getattr(c, name)) is not None]:
+            low, high = min(values), max(values)
+            is_scale = name == "px_per_mm"
+            least = [_LEAST_SCALE_MARGIN * end if is_scale else _LEAST_ANGLE_MARGIN_DEG for end in (low, high)]
+            below, above = (max(MARGIN * (high - low), margin) for margin in least)
+            limits[name] = low - below, high + above
     return PromisedRanges(limits, side_px)
 
 
@@ -85,8 +80,8 @@ def matched_rate(
     points = [figures for entry in entries if (figures := figures_of(entry, side_px))]
     # photographs know few different sets of figures, and each takes a table of all conditions
     tables = {names: _table_of(names, conditions) for names in {tuple(point) for point in points}}
-    rates = [_rate_near(np.array(list(point.values())), *tables[tuple(point)]) for point in points]
-    rates = [rate for rate in rates if rate is not None]
+    near = (_rate_near(np.array(list(point.values())), *tables[tuple(point)]) for point in points)
+    rates = [rate for rate in near if rate is not None]
     return float(np.mean(rates)) if rates else None
 
 

@@ -73,12 +73,12 @@ def control_keys(
     It belongs to the patch's session whose folder has the name of its folder, which has the only photograph of its
     name, or one of its camera within half an hour; else to one of its own, by folder and time (numbers below 0).
     """
-    numbers = {photo.entry.file: number for photo, number in zip(photos, grouping.merged, strict=True)}
+    pairs = list(zip(photos, grouping.merged, strict=True))
+    numbers, taken = ({photo.entry.file: n for photo, n in pairs}, [(photo.trace, n) for photo, n in pairs])
     by_name: dict[str, list[str]] = {}
     for file in numbers:
         by_name.setdefault(file.rpartition("/")[2], []).append(file)
     folders = dict(zip(grouping.names, grouping.same_as or range(len(grouping.names)), strict=True))
-    taken = [(photo.trace, number) for photo, number in zip(photos, grouping.merged, strict=True)]
     keys: dict[str, PhotoKey] = {}
     for photo in sorted(controls, key=lambda photo: photo.trace.minute or 0.0 if photo.trace else 0.0):
         file, folder, name = photo.entry.file, *photo.entry.file.rpartition("/")[::2]

@@ -172,16 +172,16 @@ def compare_with_control(patch: Answers, name: str, control: Answers, goal: Goal
         return replace(row, advice=f"no photograph of {'it' if patch else 'the patch'} could be judged")
     keys = sorted(patch.keys() & control.keys())
     paired = len(keys) >= max(LEAST_PAIRS, LEAST_PAIRED * len(patch), LEAST_PAIRED * len(control))
-    a: dict[int, list[bool]] = {}
-    b: dict[int, list[bool]] = {}
-    for sessions, answers in ((a, patch), (b, control)):
-        for key in keys if paired else sorted(answers):
-            sessions.setdefault(key[0], []).append(answers[key])
+    a, b = (_by_session(answers, keys if paired else sorted(answers)) for answers in (patch, control))
     difference, interval = sessions_difference(a, b, paired)
     shown = min(goal.sign * end for end in interval) > 0
     count, pairs = min(len(a), len(b)), len(keys) if paired else 0
     row = replace(row, sessions=count, pairs=pairs, difference=difference, difference_interval=interval, shown=shown)
     return row if count >= LEAST_SESSIONS else replace(row, advice=ONE_SESSION_ADVICE)
+
+
+def _by_session(answers: Answers, keys: Sequence[PhotoKey]) -> dict[int, list[bool]]:
+    return {session: [answers[key] for key in keys if key[0] == session] for session, _ in keys}
 
 
 def effect_of(controls: Sequence[Control]) -> Effect:

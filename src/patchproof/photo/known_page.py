@@ -16,7 +16,7 @@ from patchproof.base.geometry import apply_homography
 from patchproof.photo import detect
 from patchproof.photo.detect import COARSEST_PX, Detections, Ids, ImageRegion, MarkersInView
 from patchproof.photo.edges import Borders, sample
-from patchproof.photo.rectify import Quads, fit_page, region_around
+from patchproof.photo.rectify import PageFit, Quads, fit_page, region_around
 from patchproof.photo.rejection import PhotoRejected
 from patchproof.sheets.markers import DICTIONARY, aruco_dictionary, marker_cells
 
@@ -31,6 +31,7 @@ READABLE_PX = 28.0
 # px of a marker's side from which reduced pictures show a second print: of 36 photographs with one, at up to twice the
 # distance, the level at which the first print is complete shows 20, the level that this asks for 35
 SECOND_PRINT_PX = 17.0
+_LARGEST_SQUARE = 1.5  # of a marker's side: with its quiet zone it has 9 / 7
 
 
 def find_sheet(
@@ -39,26 +40,46 @@ def find_sheet(
     """Find the markers of `corners_mm` (page mm by id) in a uint8 photograph.
 
     The search ends when each of `expected` is found, out of the picture or covered, unless a finer level could decide
-    about a single foreign marker, or show a second print at twice the distance.
+    about a single foreign marker, or show a second print at twice the distance: in squares beside the first one.
     """
     aruco = aruco_dictionary(dictionary)
     detections: Detections = {}
     borders: dict[int, Borders] = {}
-    region, view = detect.full_region(srgb), MarkersInView({}, (), ())
-    for level in detect.pyramid_levels(srgb, region, coarsest_px):
+    whole, view = detect.full_region(srgb), MarkersInView({}, (), ())
+    regions = [whole]
+    for level in detect.pyramid_levels(srgb, whole, coarsest_px):
         count, foreign = sum(map(len, detections.values())), view.foreign
-        detect.search_level(srgb, region, level, aruco, detections)
+        unread = [q for region in regions for q in detect.search_level(srgb, region, level, aruco, detections)]
         if sum(map(len, detections.values())) != count:
             detected = detect.fit_detections(srgb, detections, set(corners_mm), dictionary, borders)
             view = complete_markers(srgb, detected, corners_mm, dictionary)
         missing = expected - view.markers.keys()
+        regions = [whole]
         if missing and view.markers:
-            missing, region = _findable(srgb, missing, view, corners_mm, level.scale)
+            missing, regions[0] = _findable(srgb, missing, view, corners_mm, level.scale)
         # one marker of another sheet is either clutter or the first one read of it, which a finer level can tell
         unclear = len(view.foreign) == 1 and view.foreign != foreign
-        if not missing and not unclear and (level.scale >= 1 or _shows_half_size(view, level.scale)):
-            break
+        if not missing and not unclear:
+            shown = level.scale >= 1 or _shows_half_size(view, level.scale)
+            regions = [] if shown else _regions_beside(srgb, view, corners_mm, unread)
+            if not regions:
+                break
     return view
+
+
+def _regions_beside(srgb: np.ndarray, view: MarkersInView, corners_mm, squares: list[np.ndarray]) -> list[ImageRegion]:
+    """The surroundings of squares no larger than the print's markers and not between them, where these agree that they
+    are of one print; all of the picture if the surroundings are larger.
+    """
+    corners_px = view.corners_px
+    largest = _LARGEST_SQUARE * max(map(_side_px, corners_px.values()), default=0.0)
+    fit = _fit(corners_px, corners_mm)
+    if fit is not None and len(fit.inlier_ids) == len(corners_px):
+        hull = cv2.convexHull(np.concatenate(list(corners_px.values())).astype(np.float32))
+        squares = [q for q in squares if cv2.pointPolygonTest(hull, q.mean(0).tolist(), False) < 0]
+    regions = [region_around(q, _side_px(q), srgb.shape) for q in squares if _side_px(q) < largest]
+    area = sum((rows.stop - rows.start) * (columns.stop - columns.start) for rows, columns in regions)
+    return regions if 2 * area < srgb.shape[0] * srgb.shape[1] else [detect.full_region(srgb)]
 
 
 def _shows_half_size(view: MarkersInView, scale: float) -> bool:
@@ -113,17 +134,27 @@ def _confirm_markers(srgb, view: MarkersInView, corners_mm, dictionary: str) -> 
 
 def _predict_corners(srgb, view: MarkersInView, missing: Ids, corners_mm) -> dict[int, np.ndarray] | None:
     """Corners of missing markers in the picture, by id, from the fitted ones; None if these determine no homography."""
+    fit = _fit({i: b.corners_px for i, b in view.markers.items() if b.fitted}, corners_mm)
+    if fit is None:
+        return None
+    quads = {i: apply_homography(fit.px_from_mm, corners_mm[i]) for i in missing}
+    return {
+        i: quad
+        for i, quad in quads.items()
+        if detect.is_plausible_quad(quad) and is_in_picture(quad, srgb) and _side_px(quad) >= 10
+    }
+
+
+def _fit(corners_px: Quads, corners_mm: Quads) -> PageFit | None:
     try:
-        px_from_mm = fit_page({i: b.corners_px for i, b in view.markers.items() if b.fitted}, corners_mm).px_from_mm
+        return fit_page(corners_px, corners_mm)
     except (PhotoRejected, np.linalg.LinAlgError):
         return None
-    quads = {i: apply_homography(px_from_mm, corners_mm[i]) for i in missing}
-    return {i: quad for i, quad in quads.items() if detect.is_plausible_quad(quad) and _is_in_picture(quad, srgb)}
 
 
-def _is_in_picture(quad: np.ndarray, srgb: np.ndarray) -> bool:
-    limit = [srgb.shape[1] - 2, srgb.shape[0] - 2]
-    return bool((quad > 2).all() and (quad < limit).all() and _side_px(quad) >= 10)
+def is_in_picture(quad: np.ndarray, srgb: np.ndarray) -> bool:
+    """True if corners 4×2 px lie in a picture, with two pixels to its edge."""
+    return bool((quad > 2).all() and (quad < [srgb.shape[1] - 2, srgb.shape[0] - 2]).all())
 
 
 def _side_px(quad: np.ndarray) -> float:

@@ -86,8 +86,7 @@ def flat_sheet_position(
     """
     agrees, own_spread = _agreement(fit, matrix_px, focal_spread)
     entries = np.append(fit.px_from_mm.ravel()[:8], 0.0)
-    root = np.zeros((9, 9))
-    root[:8, :8] = root_of(fit.covariance)
+    root = np.pad(root_of(fit.covariance), (0, 1))
     root[8, 8] = _trusted_spread(focal_spread, own_spread, agrees, matrix_is_known)
 
     def figures(values: np.ndarray) -> np.ndarray:
@@ -122,8 +121,7 @@ def bent_sheet_position(
     trusted_spread = _trusted_spread(focal_spread, spread, agrees, matrix_is_known)
     by_focal = shape.covariance[6] / spread**2
     added_variance = max(0.0, trusted_spread**2 - spread**2)
-    root = np.zeros((10, 10))
-    root[:9, :9] = root_of_scaled(shape.covariance + added_variance * np.outer(by_focal, by_focal))
+    root = np.pad(root_of_scaled(shape.covariance + added_variance * np.outer(by_focal, by_focal)), (0, 1))
     root[9, 9] = turn
     return _position(figures, np.append(shape.parameters, 0.0), root, agrees, matrix_is_known)
 
