@@ -122,10 +122,10 @@ def verify(
     """
     out, manifest, compute = Path(out), load_manifest(sheet), compute.without("verify", device=True)
     with lock_folder(out):
+        _check_out(out, resume, overwrite, (photos, sheet, controls, run, capture.camera, capture.boxes))
         look_at = _look_at(out, manifest)
         if isinstance(photos, str | Path) and is_file(Path(photos) / JOURNAL_FILE):
             look_at = lambda entries: None  # noqa: E731  # `capture` showed the answers while they were taken
-        _check_out(out, resume, overwrite, (photos, sheet, controls, run, capture.camera, capture.boxes))
         boxes = capture.boxes
         options = options_of(sheet, manifest, models, capture.camera, trust)
         parameters: dict[str, Any] = {"scan_dpi": capture.scan_dpi, "ruler_mm": capture.ruler_mm}
