@@ -31,7 +31,6 @@ from patchproof.scene.patch_scene import PatchScene
 from patchproof.scene.placement import SurfaceFrame, patch_frame
 from patchproof.sheets.plan_page import DimensionSpan, PlacementPicture
 from patchproof.sheets.template import Template
-from patchproof.sheets.tiles import plan_tiles
 
 if TYPE_CHECKING:
     from patchproof.scene.tape_measure import TapeMeasurement
@@ -55,7 +54,12 @@ def draw_plan_view(scene: PatchScene, template: Template) -> PlacementPicture:
     outline = project(placement.world(rect_border((0, 0, *placement.size_mm), 16)))  # bent paper has bent edges
     half = np.maximum(np.abs([low, high, outline.min(0), outline.max(0)]).max(0) * MARGIN_FACTOR, 1.0)
     seams, names = [], []
-    for tile in plan_tiles(template, scene.piece):
+    tiles = []
+    if template.tiles is not None:
+        from patchproof.sheets.tiles import plan_tiles
+
+        tiles = plan_tiles(template, scene.piece)
+    for tile in tiles:
         corners = project(placement.world(rect_corners(tile.part_mm)))
         seams += [(tuple(corners[1]), tuple(corners[2])), (tuple(corners[2]), tuple(corners[3]))]
         names.append((tuple(corners.mean(0)), tile.name))

@@ -18,7 +18,6 @@ from patchproof.scene.interface import PieceScene, require_piece
 from patchproof.scene.patch_scene import PatchScene, require_patch
 from patchproof.sheets.content import SheetContent
 from patchproof.sheets.manifest import Manifest
-from patchproof.sheets.multi_design import write_several
 from patchproof.sheets.piece import control_design, with_ids
 from patchproof.sheets.plan_page import PlacementPicture, PlanPage, edge_distances_mm
 from patchproof.sheets.rects import size_text
@@ -58,6 +57,8 @@ def sheet_of_several(
     name = template or runs[0].scene.settings.sheet.template
     page, contents = load_template(name), [content_of(run, name, control) for run in runs]
     plans = [plan_of(scene, page, content) for content, scene in contents] if page.plan_page else []
+    from patchproof.sheets.multi_design import write_several
+
     return write_several(pdf_path, page, [content for content, _ in contents], plans)
 
 

@@ -23,7 +23,7 @@ from patchproof.sheets.content import SheetContent
 from patchproof.sheets.layout import Box, Line, PageLayout, PageParts, PieceWindow
 from patchproof.sheets.manifest import Manifest, Marker, Tile
 from patchproof.sheets.markers import MARKER_MODULES
-from patchproof.sheets.page import CUT_LINE_MM, MAX_TILES, lay_out_parts, piece_zone_mm, place_pieces
+from patchproof.sheets.page import CUT_LINE_MM, MAX_TILES, lay_out_parts, piece_zone_mm
 from patchproof.sheets.pdf import PdfPage
 from patchproof.sheets.piece import Piece, manifest_marker, marker_ids, marker_rect, move_marker, square_marker
 from patchproof.sheets.piece_words import piece_words
@@ -111,14 +111,6 @@ def tile_pages(template: Template, grid: TileGrid, content: SheetContent) -> tup
     cut_mm = shift_rect(piece_rect, tiles[0].page_from_piece_mm)
     manifest = content.manifest(first, template, cut_mm, FIRST_TILE_PAGE)
     return pages, manifest.changed(markers=tuple(markers), tiles=tuple(entries))
-
-
-def refuse_larger_than_page(template: Template, piece: Piece) -> None:
-    """Refuse a piece of which no sheet can be made: too large, or with more markers than there are ids."""
-    if template.tiles is None:
-        place_pieces(template, [piece])
-    others = len(template.marker.corners_mm) + MARKERS_PER_TILE * len(plan_tiles(template, piece))
-    marker_ids("", "design", len(piece.markers) + others)
 
 
 def _tile_page(template: Template, grid: TileGrid, content: SheetContent, tile: TilePlan, ids: list[int]) -> PageLayout:

@@ -22,7 +22,6 @@ from patchproof.sheets.piece import page_id
 from patchproof.sheets.plan_page import PlanPage, lay_out_plan
 from patchproof.sheets.rects import RectMm
 from patchproof.sheets.template import AnyTemplate, Template
-from patchproof.sheets.tiles import tile_pages
 
 
 def write_sheet(
@@ -39,6 +38,8 @@ def write_sheet(
     elif copies > 1:
         raise Refused("one copy of a piece in tiles", f"{copies} copies", "print the file several times")
     else:
+        from patchproof.sheets.tiles import tile_pages
+
         pages, manifest = tile_pages(template, template.tiles, content)
     if plan is not None:
         pages.append(lay_out_plan(plan, template, content.sheet_id))
