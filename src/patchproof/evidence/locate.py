@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -27,9 +26,7 @@ from patchproof.photo.quality import FrameLight, blur_px
 from patchproof.photo.rectify import PageFit, corner_uncertainty_mm, fit_page
 from patchproof.photo.registration import Registration, register
 from patchproof.photo.rejection import PhotoRejected
-
-if TYPE_CHECKING:
-    from patchproof.photo.unroll import UnrolledSheet
+from patchproof.photo.unroll import UnrolledSheet, unroll
 
 MOST_SHIFT = 0.005  # of the design's shorter side: offset of its own pixels from where the markers put them
 _LEAST_CELLS = 3
@@ -103,8 +100,6 @@ def _fit(detected: MarkersInView, surface: Surface) -> PageFit | None:
 
 def _unroll_piece(view: PinholePhoto, detected: MarkersInView, surface: Surface) -> UnrolledSheet | None:
     """Flatten the piece, if its markers lie in no plane but fit a cylinder or a lens; else None."""
-    from patchproof.photo.unroll import unroll
-
     corners = {i: b.corners_px for i, b in detected.markers.items() if b.fitted and i in surface.piece_ids}
     focal = () if view.matrix_px is None else (float(view.matrix_px[0, 0]), view.focal_spread)
     try:

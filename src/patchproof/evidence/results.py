@@ -12,7 +12,6 @@ from typing import Any, Literal
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from patchproof.base.goal import Goal
-from patchproof.base.notebook import notebook_html, rate_text
 from patchproof.base.validation import Finite, StrictModel
 from patchproof.photo.rejection import PhotoRejected
 
@@ -326,6 +325,8 @@ class Report(StrictModel):
 
     def _repr_html_(self) -> str:
         """The verdict in a notebook."""
+        from patchproof.base.notebook import notebook_html, rate_text
+
         summary = self.summary
         rows = {"photographs": f"{summary.photos}, judged {summary.judged}, measured {summary.measured}"}
         if summary.rate is not None and summary.interval is not None:

@@ -28,7 +28,6 @@ from patchproof.base.errors import Refused
 from patchproof.base.fingerprint import refuse_other_inputs
 from patchproof.base.folder_lock import lock_folder
 from patchproof.base.input import is_file, read_file, read_json
-from patchproof.base.notebook import notebook_html
 from patchproof.base.output import (
     check_folder,
     clear_folder,
@@ -78,6 +77,8 @@ class Run:
 
     def _repr_html_(self) -> str:
         """The promise and the design in a notebook; a texture is not one picture."""
+        from patchproof.base.notebook import notebook_html
+
         picture = self.design if self.scene.HAS_PIECE else None
         return notebook_html(self.promise.headline, {"run": str(self.folder), **self.promise.figures()}, picture)
 
