@@ -19,10 +19,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from fuzz.watch import peak_bytes
 from patchproof.base.errors import PatchproofError
 from patchproof.base.workers import use_threads
 
 SECONDS, BYTES = 60.0, 2_000_000_000
+FRESH_BYTES = 450_000_000  # of a process that has loaded all and read nothing
 WAIT_S = 900.0  # for a process that may have to share its core with others
 HERE = Path(__file__).resolve().parents[2]
 INSTALLED = tuple(f"{Path(p).resolve()}/" for p in (sys.prefix, sys.base_prefix, HERE, "/usr/lib", "/usr/share"))
@@ -168,12 +170,13 @@ def _use(root: Path, number: int, make: Callable[[Place, int], Callable[[], obje
     os.chdir(root / "out")
     tempfile.tempdir = str(root / "temporary")
     before = place.contents()
+    held = peak_bytes(reset=True)  # by the process that was forked, which may have run other tests before
     Guard(root, lambda text: sender.send_bytes(text.encode("utf-8", "replace")))
     begin, children = time.process_time(), resource.getrusage(resource.RUSAGE_CHILDREN)
     how, said = _how(use)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     seconds = time.process_time() - begin + after.ru_utime + after.ru_stime - children.ru_utime - children.ru_stime
-    most = max(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, after.ru_maxrss) * 1024
+    most = FRESH_BYTES + max(peak_bytes() - held, after.ru_maxrss * 1024 - held, 0)
     if how in ("result", "refused") and place.contents() != before:
         how = f"changed {sorted({name for name, _ in before.items() ^ place.contents().items()})[:3]}"
     sender.send_bytes(json.dumps({"how": how, "said": said, "seconds": seconds, "bytes": most}).encode())
