@@ -1,7 +1,5 @@
 """The command line `patchlab`: run studies and benchmarks, harden images, print keys and stored figures."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Literal
 

@@ -1,7 +1,5 @@
 """Document every key of the studies' configs as Markdown, and write an example config of each study."""
 
-from __future__ import annotations
-
 from typing import get_type_hints
 
 from patchlab.study.study import STUDIES, load_study

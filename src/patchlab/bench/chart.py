@@ -4,8 +4,6 @@ In: points with a cost and an error. Out: tables as studies have them. The front
 beats in both; every default is checked against it. A chart lists the other claims that it tests as `Check`s.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass

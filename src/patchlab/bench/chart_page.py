@@ -3,8 +3,6 @@
 In: a number of swatches, and a printer's function from sRGB to light. Out: the page's manifest, the page as light.
 """
 
-from __future__ import annotations
-
 import math
 
 import cv2

@@ -4,8 +4,6 @@ In: only the package's object and classifier, so that benchmarks run anywhere. O
 short optimization, which has more contrast and finer detail than an invented picture.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from tempfile import TemporaryDirectory
 

@@ -4,8 +4,6 @@ In: photographs of flat paper. Out: a chart per photo size, of milliseconds per 
 design's corners.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial

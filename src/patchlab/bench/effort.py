@@ -5,8 +5,6 @@ a table of seconds and promises. A run is timed from its scene to the promise wi
 thread, so that efforts compare. All designs of an object are judged in the same fresh conditions.
 """
 
-from __future__ import annotations
-
 import tomllib
 from collections.abc import Iterator, Mapping
 from pathlib import Path

@@ -3,8 +3,6 @@
 In: photographs of paper. Out: a chart. Errors are in millimeters on the paper, over the whole design.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from functools import lru_cache, partial
 

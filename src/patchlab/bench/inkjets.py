@@ -11,8 +11,6 @@ Sources: Demichel's weights and the Yule-Nielsen modified Neugebauer model as in
 reflectance models for halftone prints, Color Research and Application 40 (2015).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product

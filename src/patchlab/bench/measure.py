@@ -4,8 +4,6 @@ In: calls. Out: milliseconds and ratios. Seconds of one machine mean little on a
 within a run.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import platform

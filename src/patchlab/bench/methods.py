@@ -13,8 +13,6 @@ Left out on purpose: printer, paper, light and perspective in `flat` and `art`, 
 set, which neither has: both train with the passes that ours spends on it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from importlib import import_module

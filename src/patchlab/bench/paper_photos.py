@@ -6,8 +6,6 @@ Gaussian blur and noise in linear light, JPEG). So our renderer, our page and ou
 themselves.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache

@@ -8,8 +8,6 @@ true print under even light at the chart's exposure; paper is white in both. A c
 models on these colors.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 

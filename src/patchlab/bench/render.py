@@ -3,8 +3,6 @@
 In: the demo's scene and a design for it. Out: one chart.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

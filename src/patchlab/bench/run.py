@@ -4,8 +4,6 @@ In: the name of a benchmark. Out: a folder with `NAME.json`, `NAME.html`, and a 
 generator of `Chart`s. A failed check is reported, not raised.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from importlib import import_module
 from pathlib import Path

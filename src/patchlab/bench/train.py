@@ -5,8 +5,6 @@ trains nor selects. Cost is the number of views that the network sees, selection
 measures the time of a view.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 

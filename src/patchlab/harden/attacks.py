@@ -13,8 +13,6 @@ of Neural Networks, 2017 (margin f6); Croce and Hein, Reliable Evaluation of Adv
 case over losses).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 
 import torch

@@ -9,8 +9,6 @@ a stronger attack leaves more than a weaker one: there the attack failed.
 PNGs to `images/`. Originals are judged in separate cells, once per network.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache

@@ -20,8 +20,6 @@ al., Adversarial Examples in the Physical World, 2017 (iterated FGSM); Madry et 
 Resistant to Adversarial Attacks, ICLR 2018 (the loss under attack).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Annotated, Any, Literal
 

@@ -4,8 +4,6 @@ In: a folder and a CSV of file names and labels. Out: rows with the name of each
 skipped; missing files and files named twice are refused.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePath
 

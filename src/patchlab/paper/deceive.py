@@ -9,8 +9,6 @@ Source: Pestana et al., supplement, deceptive textures. For measuring the robust
 yours to test.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

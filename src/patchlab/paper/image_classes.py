@@ -6,8 +6,6 @@ training views, in training light and without camera effects, which the scene of
 white is clipped. These views are never among those that measure designs in 3D.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

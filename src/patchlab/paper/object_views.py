@@ -4,8 +4,6 @@ In: a problem and an appearance. Out: conditions, a mean color. Views from the s
 they are for people to look at, never for rates.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 

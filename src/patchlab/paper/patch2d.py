@@ -13,8 +13,6 @@ Sources: Pestana et al., supplement, algorithm 2; Brown et al., Adversarial Patc
 AAAI 2020.
 """
 
-from __future__ import annotations
-
 import itertools
 import tempfile
 from collections.abc import Mapping, Sequence

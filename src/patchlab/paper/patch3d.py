@@ -13,8 +13,6 @@ Sources: Pestana et al., algorithm "Masked Textures and 3D Patches" and the tabl
 view, supplement algorithm 2 (2D patch); Brown et al., Adversarial Patch, 2017.
 """
 
-from __future__ import annotations
-
 import itertools
 import tempfile
 from collections.abc import Mapping, Sequence

@@ -10,8 +10,6 @@ Sources: occlusion and maps as in Pestana et al., figures 1 and 2 (occlusion map
 for poses that fail: Alcorn et al., Strike (with) a Pose, CVPR 2019, its random search.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any

@@ -1,7 +1,5 @@
 """The page of current figures: `measured.md`, which stands beside the configs and data that it quotes."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Tables that the scripts of this folder store beside themselves."""
 
-from __future__ import annotations
-
 import csv
 from collections.abc import Iterable, Mapping
 from pathlib import Path

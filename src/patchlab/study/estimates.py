@@ -3,8 +3,6 @@
 Source: Morey, Tutorials in Quantitative Methods for Psychology 4 (2008) 61-64 (several settings on the same seeds).
 """
 
-from __future__ import annotations
-
 import math
 import statistics
 from collections.abc import Sequence

@@ -7,8 +7,6 @@ A study may change keys of the scene file's tables (`patch`, `optimize`, ...), s
 and masked textures, bounded or free. Changes are checked like the file.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path

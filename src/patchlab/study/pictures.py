@@ -3,8 +3,6 @@
 In: a problem and an appearance, or pixels. Out: tensors N×3×S×S in [0, 1], and PNG bytes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

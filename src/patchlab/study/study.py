@@ -9,8 +9,6 @@ A study is a module with a `STUDY`; its functions get plain values and know noth
 Left out on purpose: cells that depend on one another (one cell trains and tests), and times (they would differ).
 """
 
-from __future__ import annotations
-
 import ast
 import json
 import re

@@ -4,8 +4,6 @@ In: a grid with ways to vary each scene, and networks. Out: cells that name the 
 tables that group by what was trained. Left out on purpose: promises, which belong to runs that get printed.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from itertools import product
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Store a trained network: weights as float16 or an ONNX file, and a card with its recipe and its accuracy."""
 
-from __future__ import annotations
-
 import dataclasses
 import datetime
 import json

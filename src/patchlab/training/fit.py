@@ -4,8 +4,6 @@ In: a recipe, and functions that build, train, score and write a network. Out: t
 progress. Rendered pictures can be stored in a folder for later trainings.
 """
 
-from __future__ import annotations
-
 import argparse
 import copy
 import dataclasses

@@ -5,8 +5,6 @@ another shape, view, light, camera and background in every render, drawn like th
 but from seeds that they have not seen. A scene's bare object is rendered in its views.
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Iterator
 from pathlib import Path

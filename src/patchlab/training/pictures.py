@@ -6,8 +6,6 @@ training a patch, half at twice the size and then downscaled, as a photograph is
 Left out on purpose: real photographs. The networks serve demos and tests; their accuracy on real objects is unknown.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 from typing import NamedTuple

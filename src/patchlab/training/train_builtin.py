@@ -10,8 +10,6 @@ the arguments in `--settings`: `--name levit --network timm.create_model --setti
 takes `pip install "patchproof[lab]"`.
 """
 
-from __future__ import annotations
-
 import json
 import pkgutil
 from dataclasses import dataclass

@@ -9,8 +9,6 @@ one (Li et al., Generalized focal loss, NeurIPS 2020), their boxes follow the ge
 2019).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import chain

@@ -14,8 +14,6 @@ pairs of scene and network. Views keep their poses for one step. Left out on pur
 time, which varies by some 20 % from run to run.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

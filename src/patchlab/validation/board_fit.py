@@ -11,8 +11,6 @@ flat, and errors of the homography. Noise and JPEG are not rendered. A tone curv
 sharpening are not modeled: they show in the printed black and in the residual.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise

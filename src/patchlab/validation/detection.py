@@ -7,8 +7,6 @@ light, hiding and JPEG. The sheet has noise in place of a design, since only mar
 photographs a card of drawn size, position and color hides a part of the piece.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from functools import lru_cache

@@ -6,8 +6,6 @@ photographs of the control under the same conditions. Tables by scene: Brier sco
 calibration and interval widths beside the promise's own; bias and coverage of estimated effects.
 """
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path

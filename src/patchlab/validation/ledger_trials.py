@@ -8,8 +8,6 @@ use, count for the rates; weaker ones, and those that leave too few usable photo
 printers are inkjets from `inkjets`, the other ICC profile, and faded dyes.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

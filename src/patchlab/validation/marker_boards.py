@@ -7,8 +7,6 @@ much, `PhotoRejected`. Every loose marker has its own plane. Left out on purpose
 lens distortion and paper that is not quite flat.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Literal

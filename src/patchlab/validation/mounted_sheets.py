@@ -1,7 +1,5 @@
 """Sheets that are mounted and photographed in simulation; their PDF is temporary."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from tempfile import TemporaryDirectory
 

@@ -6,8 +6,6 @@ dealt into many folders; and by looking after each session until it fits; each b
 without an effect's limit. Nothing is rendered: photographs are records of counts, times, cameras, light and background.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any

@@ -4,8 +4,6 @@ In: the readers' own lists. Out: a table for each kind of input. What is not in 
 files, or the comments in a file.
 """
 
-from __future__ import annotations
-
 from importlib import import_module
 
 from patchproof.base.declared import Declaration

@@ -4,8 +4,6 @@ Out: per table a row per key: type and range, unit, default, meaning. The meanin
 field's last line or, without one, the comment above the field, so that it is written only once, in the code.
 """
 
-from __future__ import annotations
-
 import ast
 import inspect
 import json

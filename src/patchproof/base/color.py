@@ -8,8 +8,6 @@ formula.
 Sources: IEC 61966-2-1 (sRGB); CIE 15:2004 (CIELAB); Sharma, Wu, Dalal, Color Res. Appl. 30 (2005) 21-30 (CIEDE2000).
 """
 
-from __future__ import annotations
-
 import math
 import sys
 from typing import Any, TypeVar

@@ -1,7 +1,5 @@
 """What settings and text files can declare, and what `input` and `validation` do with it."""
 
-from __future__ import annotations
-
 from patchproof.base.declared import Declaration
 
 _FILES = "TOML, JSON, CSV"

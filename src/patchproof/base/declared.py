@@ -4,8 +4,6 @@ In: the lists of the readers, each beside its reader (`declarations.py` of a roo
 `patchproof keys --files` makes the page of all formats, and for which the tests hold one file each.
 """
 
-from __future__ import annotations
-
 from typing import Literal, NamedTuple
 
 

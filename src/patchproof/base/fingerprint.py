@@ -4,8 +4,6 @@ In: files, or values. Out: SHA-256 as text. Of a long list of files, such as 100
 the first and last 64 kB of each are read: an exchanged picture shows, a single retouched pixel may not.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Mapping, Sequence

@@ -5,8 +5,6 @@ In: the folder, which need not exist. Out: a lock that the system releases when 
 locks on single files, which appear whole; and file systems without locks, where commands are not kept apart.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import stat

@@ -8,8 +8,6 @@ Left out on purpose: lens distortion. It is applied only where a camera file has
 Source of homographies and of the normalized DLT: Hartley and Zisserman, Multiple View Geometry, 2nd ed., 4.1 and 8.1.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, TypeVar
 

@@ -4,8 +4,6 @@ In: the word in a scene file or manifest. Out: `Goal`, whose sign tells losses, 
 better; none of them tests a goal's name. The loss of each goal is in `optimizer.goals`.
 """
 
-from __future__ import annotations
-
 from enum import StrEnum
 
 

@@ -4,8 +4,6 @@ In: plain text and uint8 pixels. Out: a fragment for `_repr_html_`, all text esc
 are the notebook's; whole pages, which `report` writes.
 """
 
-from __future__ import annotations
-
 import html
 from collections.abc import Mapping
 

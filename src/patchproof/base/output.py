@@ -5,8 +5,6 @@ file or folder is refused unless the user asked to overwrite it, and only a fold
 names all of its files can be overwritten: neither a mistyped path nor a received folder deletes anything else.
 """
 
-from __future__ import annotations
-
 import base64
 import errno
 import io

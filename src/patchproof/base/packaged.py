@@ -1,7 +1,5 @@
 """Paths of the data files that are installed with the package: `calibration/` and `print_templates/`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Literal
 

@@ -4,8 +4,6 @@ In: nothing. Out: the type of the `progress` parameter of every long public func
 nothing. Functions below a public one take an `advance` callback, for the stage that their caller named.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 Progress = Callable[[str, int, int], None]

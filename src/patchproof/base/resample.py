@@ -5,8 +5,6 @@ given in sixteenths of a pixel.
 Left out on purpose: the warps themselves, because each caller has its own interpolation and border.
 """
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

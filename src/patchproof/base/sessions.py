@@ -13,8 +13,6 @@ Differences between photographs of a patch and of a control have an interval wit
 Left out on purpose: a rate that depends on the pose, which all sessions share.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

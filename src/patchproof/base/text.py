@@ -3,8 +3,6 @@
 Out: text without characters that move a cursor or turn the direction of reading; CSV without formulas.
 """
 
-from __future__ import annotations
-
 import csv
 import io
 import re

@@ -4,8 +4,6 @@ In: a TOML file or a dictionary, and a model of it. Out: frozen settings with ev
 refused with the nearest known one, a NaN or a reversed range with the value. `expand_path` expands `${VAR}` in paths.
 """
 
-from __future__ import annotations
-
 import difflib
 import math
 import os

@@ -11,8 +11,6 @@ import all modules again, and work on shared data stays in this process. A clust
 same files at the same paths.
 """
 
-from __future__ import annotations
-
 import ctypes
 import os
 import signal

@@ -6,8 +6,6 @@ cannot be decoded, more bytes or texels than a mesh may have. As glTF says for i
 orientations of textures are not applied; alpha is dropped.
 """
 
-from __future__ import annotations
-
 import base64
 import urllib.parse
 from pathlib import Path

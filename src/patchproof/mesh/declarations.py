@@ -3,8 +3,6 @@
 The reader of glTF looks extensions up by their names; those not listed are refused where required, else said.
 """
 
-from __future__ import annotations
-
 from patchproof.base.declared import Declaration
 
 _CONVERT = "convert it first, such as with `gltf-transform cp IN.glb OUT.glb`, which writes it without compression"

@@ -7,8 +7,6 @@ sides, as in the renderer here. Left out on purpose: lights and cameras. Materia
 geometries are numbered.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -6,8 +6,6 @@ not read, and data shorter than declared. Left out on purpose: metal, roughness,
 skins and animation; `declarations` lists what is said of each.
 """
 
-from __future__ import annotations
-
 import json
 from typing import Any, NoReturn
 

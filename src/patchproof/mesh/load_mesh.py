@@ -5,8 +5,6 @@ Textures larger than any photograph shows are reduced. A mesh in memory goes thr
 that it equals what its run's folder will hold.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path

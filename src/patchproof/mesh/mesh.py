@@ -6,8 +6,6 @@ are left out; size and center are those of the faces that are drawn. Left out on
 needs no inside, so open, non-manifold and loose triangles will do.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property

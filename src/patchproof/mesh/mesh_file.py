@@ -4,8 +4,6 @@ In: a file and the rotation into the world's axes. Out: parts, and warnings. Ref
 a texture that the file names but that is missing or broken. `declarations` lists what each format can declare.
 """
 
-from __future__ import annotations
-
 from importlib import import_module
 from pathlib import Path
 

@@ -5,8 +5,6 @@ In: the lines `mtllib` of an OBJ file. Out: materials on demand, with the scale 
 used, others are said. Left out on purpose: other maps, emission, transparency.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import takewhile
 from pathlib import Path

@@ -5,8 +5,6 @@ coordinates are a part of their own. Vertex colors, taken as sRGB, stand for a m
 curves, surfaces, smoothing groups, and what `mtl` leaves out.
 """
 
-from __future__ import annotations
-
 from array import array
 from collections import Counter, defaultdict
 

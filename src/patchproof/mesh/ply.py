@@ -5,8 +5,6 @@ Colors are taken as sRGB, as exporters write them; those of faces go before thos
 Refused: several textures.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from typing import Any

@@ -5,8 +5,6 @@ fans; of others, ears are cut off (Meisters, Polygons have ears, 1975) in the pl
 largest. Left out on purpose: outlines that cross themselves, which are cut somehow.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from patchproof.base.errors import Refused

@@ -5,8 +5,6 @@ parts that may run into one another, each with its own color and with texture co
 texture can be put on. An object with a flat side broad enough for a card shows it to +x; fronts look to +z.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from patchproof.base.errors import Refused

@@ -7,8 +7,6 @@ texture) and planar on prism and box (each face direction sees the texture uprig
 purpose: booleans; parts may run into one another, and the z-buffer resolves that.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

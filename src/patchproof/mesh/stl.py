@@ -3,8 +3,6 @@
 In: a file. Out: its triangles. Left out on purpose: colors, which programs write in different ways.
 """
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

@@ -6,8 +6,6 @@ chart: each triangle visits the grid points of its box on the chart, and each vi
 (Möller and Trumbore, 1997). Triangles need not be joined, closed or oriented.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -4,8 +4,6 @@ In: parts, and how each material's texture continues along u and v. Out: the sam
 coordinates leave 0 to 1: a mirrored one is twice as wide, a clamped one gets its last texels as far as they are seen.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Literal

@@ -8,8 +8,6 @@ color, so that mip levels mix in no foreign colors. The same mesh gives the same
 rough scan of 80,000 faces took 80. Left out on purpose: seams placed by hand, and one atlas over several textures.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

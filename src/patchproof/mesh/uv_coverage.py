@@ -7,8 +7,6 @@ is within g of the face in both x and y: 0.5 gives every texel that the face tou
 bilinear look-up reads. Left out on purpose: area-weighted coverage.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

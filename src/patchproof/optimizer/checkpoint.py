@@ -4,8 +4,6 @@ In: a `State` and its problem. Out: `checkpoint.safetensors` in the run's folder
 tensors are compared with the problem's start before memory is taken for them.
 """
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Annotated, Any

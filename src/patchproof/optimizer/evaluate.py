@@ -5,8 +5,6 @@ detector also its average precision. Conditions come from the evaluate stream, w
 uses. They are evaluated a few at a time, by this process or by others, each of which opens the run for itself.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from functools import lru_cache, partial

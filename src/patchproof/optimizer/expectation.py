@@ -8,8 +8,6 @@ propagated back through the printer here.
 Source: Athalye et al. 2018, "Synthesizing robust adversarial examples", eq. 2 and 3.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field

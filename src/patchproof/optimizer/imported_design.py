@@ -8,8 +8,6 @@ design, so that photographs of several designs on one scene are told apart by th
 Left out on purpose: cropping and padding, which make another design; textures; the search for a place; resuming.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace

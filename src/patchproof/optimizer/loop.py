@@ -9,8 +9,6 @@ promise set is never used here.
 A step depends only on the state and its own number, so that a resumed run gives the same bytes.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace

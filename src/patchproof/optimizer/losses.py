@@ -7,8 +7,6 @@ The paper's printed update Θ + α∇L raises the loss (Pestana et al., Algorith
 here. TV: Mahendran and Vedaldi, CVPR 2015.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 from torch import Tensor

@@ -1,7 +1,5 @@
 """Convert between designs as tensors and designs as 8-bit pixels."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from torch import Tensor

@@ -5,8 +5,6 @@ from four directions across the scene's azimuths, each place as a small square f
 worst), the drafted ones with their rank, and the chosen piece's outline at its size.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path

@@ -10,8 +10,6 @@ Left out on purpose: whether the runner-up would win with more steps or another 
 alone, and it is slightly optimistic, since the best of a few is selected.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial

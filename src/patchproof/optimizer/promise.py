@@ -8,8 +8,6 @@ difference is settled, and the promise stops as soon as none is left and the rat
 checked after half and three quarters of the views.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -7,8 +7,6 @@ so that color and large shapes, which count in small and blurred views, come fir
 DeepDream (Mordvintsev et al., TensorFlow tutorial, 2015) scales levels likewise, by their spread instead of Adam's.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -6,8 +6,6 @@ and `place.png`, while run.json holds the place as if the scene had given it. No
 of day: a seed always gives the same bytes on one machine with one thread count and device.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import platform

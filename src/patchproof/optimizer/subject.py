@@ -5,8 +5,6 @@ files a run stores. A design is a float tensor 3×h×w in [0, 1], its `pixels` a
 a module each; a scene loads the one it needs.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import import_module

@@ -7,8 +7,6 @@ stays within that distance of its start. Nothing is printed, hence no printer an
 Source: Pestana et al., algorithms "Full Texture" and "Masked Textures and 3D Patches".
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property

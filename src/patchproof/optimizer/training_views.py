@@ -5,8 +5,6 @@ background, light, print and camera; and `ViewCache`, which renders poses once a
 memory allows.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -6,8 +6,6 @@ footprints reach, so that taps need not be wrapped and the library's own look-up
 in views, in three quarters in photographs.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import reduce
 from itertools import chain

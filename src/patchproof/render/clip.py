@@ -4,8 +4,6 @@ In: corners in homogeneous pixel coordinates (x·z, y·z, z). Out: the remaining
 belong to. Edges are always cut from their inside corner, so that faces with a common edge still share it afterwards.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -6,8 +6,6 @@ at one position are one. Left out on purpose: creases between two textured faces
 most of them, and mixing neighboring pixels would only blur it: a textured car was farther from 3×3 samples with them.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

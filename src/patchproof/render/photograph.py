@@ -5,8 +5,6 @@ Out: N×3×H×W sRGB. The work has three parts that can be run alone: `render_vi
 composite; the only part through which gradients reach the design) and the camera (`expose`).
 """
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from torch import Tensor

@@ -14,8 +14,6 @@ and Greer, 1997), which stays well-defined for faces that reach behind the camer
 not dropped. If depths are equal to 24 bits, the lower face index wins. Left out on purpose: transparency.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -4,8 +4,6 @@ In: a mesh, or a scene with a piece. Out: tensors on a device. The piece reaches
 pixels cut by its edge are found and can show their share of it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial

@@ -9,8 +9,6 @@ Each pixel takes one sample; outlines are smoothed along edges (see `find_outlin
 millimeters (see `pixels`). Left out on purpose: transparency.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -7,8 +7,6 @@ purpose: occlusion, so that boxes include hidden parts.
 Source: Lin et al., Microsoft COCO, ECCV 2014, and its data format.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Render an HTML page from a template; values are escaped, and a missing one is an error."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version

@@ -4,8 +4,6 @@ In: a promise, an evaluation or a report, or a report's summary as plain data. O
 headline that says whether the patch helps, a sentence with its figures, and the verdict on the promise.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

@@ -6,8 +6,6 @@ entries of a homography and each network's predictions have their own columns; a
 empty cell. The same input gives the same bytes.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path

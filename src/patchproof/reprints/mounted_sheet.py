@@ -5,8 +5,6 @@ photographs and computes where the page lies in them. The piece's pixels are rea
 that an error in the page shows here and not at the print shop.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property

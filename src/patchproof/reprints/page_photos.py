@@ -5,8 +5,6 @@ files. Their light is less even than that of scenes, so that readers of charts h
 the page, and the picture's corners are darker. Blur, noise and clipping are those of `channel`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property

@@ -12,8 +12,6 @@ Sources: Jakob et al., Mitsuba 3 renderer, 2022; Veach and Guibas, Optimally Com
 Carlo Rendering, SIGGRAPH 1995, for why the surrounding light is sampled by the surface alone.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from importlib import import_module
 from types import ModuleType

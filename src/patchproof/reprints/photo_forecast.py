@@ -9,8 +9,6 @@ Left out on purpose: bent pieces and scenes made of pictures, whose camera does 
 in front of the object; light that falls on the object, but not on the paper.
 """
 
-from __future__ import annotations
-
 import zlib
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields, replace

@@ -6,8 +6,6 @@ Conditions come from the reprint stream, which nothing else uses: one print, pho
 each with its own place, light, camera and folder.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager

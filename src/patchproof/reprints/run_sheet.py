@@ -5,8 +5,6 @@ The piece is the same on every template that has room for it, except for the ids
 template with `plan_page` says where the piece goes and how to photograph it. Pages without a run: see `sheets.blank`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path

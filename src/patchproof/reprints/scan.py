@@ -1,7 +1,5 @@
 """Simulate flat scans of a sheet's uncut page."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

@@ -9,8 +9,6 @@ promise holds, and design and control are recognized independently at their prom
 photographs than pairs of one view need.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

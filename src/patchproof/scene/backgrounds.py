@@ -9,8 +9,6 @@ training a few, which it learns, a promise another for every session, because on
 picture that the settings name itself is the known place for all purposes.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

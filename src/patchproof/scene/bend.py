@@ -8,8 +8,6 @@ facets or small dents. In each of these families the piece is raised until it is
 that height counts as gap. Left out on purpose: folds, cuts and darts.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

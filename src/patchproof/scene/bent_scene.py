@@ -1,7 +1,5 @@
 """A mesh with a piece of paper that follows its surface (`patch.bend`)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar
 

@@ -7,8 +7,6 @@ there as a piece with a given place is. A piece that is refused, overhangs, stan
 kept free is no candidate. Left out on purpose: objects in front of a place. The networks will tell.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property

@@ -8,8 +8,6 @@ places, palettes, vertex colors that go on multiplying, and faces that change al
 purpose: improving poor texture coordinates; textures keep their own sizes.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 

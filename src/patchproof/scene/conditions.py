@@ -10,8 +10,6 @@ sees the same views after a resume.
 Source of EoT: Athalye et al., Synthesizing Robust Adversarial Examples, ICML 2018.
 """
 
-from __future__ import annotations
-
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace

@@ -6,8 +6,6 @@ overhang are below those that give a warning. The largest size is found by bisec
 piece fits where a larger one does, which only holes under its middle contradict.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial

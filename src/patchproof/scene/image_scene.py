@@ -13,8 +13,6 @@ Sources: Brown et al., Adversarial Patch, 2017 (here also with the assistive goa
 Augmentation, AAAI 2020, algorithm 1.
 """
 
-from __future__ import annotations
-
 import hashlib
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -4,8 +4,6 @@ By itself a `MeshScene` is the bare object. Other modules put a piece on it (`pa
 the piece's place (`unplaced_scene`) or paint it (`texture_scene`).
 """
 
-from __future__ import annotations
-
 import hashlib
 from dataclasses import dataclass, replace
 from functools import cached_property

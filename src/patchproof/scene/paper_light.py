@@ -8,8 +8,6 @@ highlight or a shadow's edge. A quadratic, because a lamp's fall-off over a flat
 the piece's size above its middle the error is within 1 %, above its edge within 4 %.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -7,8 +7,6 @@ roads, a network trained with plain walls and smooth clouds alone named half of 
 quarters. Source of the spectrum: Field, JOSA A 4 (1987) 2379.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -14,8 +14,6 @@ the printer makes it), and whatever stood in front of the piece. Photographs tha
 that a judged photograph would get.
 """
 
-from __future__ import annotations
-
 import hashlib
 from dataclasses import dataclass, replace
 from pathlib import Path

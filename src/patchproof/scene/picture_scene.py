@@ -8,8 +8,6 @@ see the centered square; beyond it a longer picture is cropped and a shorter one
 front of the piece (a hand, a handle); the new piece covers it.
 """
 
-from __future__ import annotations
-
 from abc import abstractmethod
 from dataclasses import dataclass, replace
 from functools import cached_property

@@ -5,8 +5,6 @@ and how well paper and surface agree: the gap below the card and the overhang be
 card wider or higher than the object's side, or with nothing under it, is refused. Bent pieces: see `bend`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 

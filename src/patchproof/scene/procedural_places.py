@@ -6,8 +6,6 @@ sky, among boxes that have no class of their own; surfaces have the textures of 
 distant things are blurred. Every other place is one of the flat backgrounds of `patterns`, with details of other kinds.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from patchproof.base.color import codes_from_srgb

@@ -7,8 +7,6 @@ shells within others, cracks and overlapping parts of a mesh do not matter. A ta
 more than `EDGE_DEG` within a finger's breadth, or at the outline. Left out on purpose: the surface behind the outline.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """A scene in which the object's own texture is optimized, whole or under a mask; nothing hangs on it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from patchproof.scene.canvas import Canvas, texture_canvas

@@ -1,7 +1,5 @@
 """A mesh whose piece has no place yet: `patch.place = "auto"`, for which the optimizer searches a place."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from patchproof.base.errors import Refused

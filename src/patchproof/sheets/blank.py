@@ -8,8 +8,6 @@ printer; nothing is cut out of it, and its `cut_mm` is the part that photographs
 pages of boards (see `board`).
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from patchproof.base.errors import Refused

@@ -6,8 +6,6 @@ so that other tools can read it. The manifest holds the markers exactly, and `lo
 back. The sheet id is a hash of the template.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

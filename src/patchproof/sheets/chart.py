@@ -7,8 +7,6 @@ the page is not mistaken for a color. All values are multiples of 1/255, so that
 numbers.
 """
 
-from __future__ import annotations
-
 from itertools import product
 
 import numpy as np

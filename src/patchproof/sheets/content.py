@@ -3,8 +3,6 @@
 In: a piece, the design's pixels, the promise. Out: the texts and the QR code of its page, and its `Manifest`.
 """
 
-from __future__ import annotations
-
 import base64
 from dataclasses import dataclass, field
 from typing import Any

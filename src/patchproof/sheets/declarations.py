@@ -1,7 +1,5 @@
 """List what sheets' PDFs can declare, and what `sheets.pdf_raster` does with it."""
 
-from __future__ import annotations
-
 from patchproof.base.declared import Declaration
 
 DECLARED: tuple[Declaration, ...] = (

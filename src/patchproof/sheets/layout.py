@@ -5,8 +5,6 @@ all boxes lie within the margins and no two overlap. All is in page millimeters.
 comes with reportlab and may be embedded.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Any

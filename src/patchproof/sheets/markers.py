@@ -4,8 +4,6 @@ In: a dictionary's name, ids, or a board's rows and columns. Out: modules, and p
 is black; markers lie in the middle of its white squares, with their ids row by row.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 import numpy as np

@@ -8,8 +8,6 @@ one; the page's own markers avoid all of them. A design's manifest lists the oth
 page if their id is unique on it, so that a photograph of the uncut page can be recognized.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections import Counter
 from collections.abc import Sequence

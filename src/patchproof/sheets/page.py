@@ -4,8 +4,6 @@ In: a template and pieces. Out: a `PageLayout`, which `pdf` draws and `write` st
 Left out on purpose: automatic arrangement. The template places everything; only pieces are centered in their zone.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Sequence

@@ -3,8 +3,6 @@
 In: a template and a piece. Tiles are planned, and their module loaded, only for templates that have them.
 """
 
-from __future__ import annotations
-
 from patchproof.sheets.page import place_pieces
 from patchproof.sheets.piece import Piece, marker_ids
 from patchproof.sheets.template import Template

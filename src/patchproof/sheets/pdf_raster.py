@@ -5,8 +5,6 @@ dpi), so the requested part is first made a page of whole pixels, which are mill
 PDFs may come from anybody: each call reads the file in a child process within limits of time and memory.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import os

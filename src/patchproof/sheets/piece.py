@@ -11,8 +11,6 @@ sheet id is fixed before optimizing and does not depend on the design, because t
 ids.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

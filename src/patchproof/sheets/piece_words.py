@@ -6,8 +6,6 @@ no measurement depends on them. Capitals of 0.7 mm are legible at reading distan
 markers' quiet zones, and losing half of a quiet zone costs 0.1 mm of a measured corner.
 """
 
-from __future__ import annotations
-
 from patchproof.sheets.content import SheetContent
 from patchproof.sheets.layout import CAP_HEIGHT, Box, Line, PageParts, text_width_mm
 from patchproof.sheets.piece import SCISSORS_MM

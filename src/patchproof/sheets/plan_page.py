@@ -5,8 +5,6 @@ page. Dimension chains above and beside the picture run from edge to edge of the
 its surface. The picture is passed in; this module draws on paper only.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

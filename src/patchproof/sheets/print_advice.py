@@ -6,8 +6,6 @@ images with their resolution, compression and color space. Left out on purpose: 
 file rightly leaves to the printer; and PDF/X, which is made for one intended press.
 """
 
-from __future__ import annotations
-
 import io
 import math
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Operations on rectangles (x, y, width, height) in millimeters, x right, y down: the only shape on a page."""
 
-from __future__ import annotations
-
 RectMm = tuple[float, float, float, float]
 PointMm = tuple[float, float]
 Srgb = tuple[float, float, float]

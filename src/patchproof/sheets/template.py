@@ -6,8 +6,6 @@ comes from elsewhere. `page.add_template_parts` checks the page with its piece f
 Left out on purpose: expressions, inheritance and includes. A page is short enough to be written out.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Any
 

@@ -10,8 +10,6 @@ design's page is that of the first tile; `design.rect_mm` and `cut_mm` are in it
 edges, and `tiles` maps them to every other page.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

@@ -6,8 +6,6 @@ full disk or a crash leaves the old files.
 Left out on purpose: asking before overwriting, which the command line does.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

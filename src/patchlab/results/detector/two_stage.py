@@ -6,8 +6,6 @@ network and crops that gradients pass (Ren et al., Faster R-CNN, NeurIPS 2015; H
 Nothing is trained for it. Proposals themselves have no gradient, as in the papers.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import torch

@@ -4,8 +4,6 @@ it as a factory of one's own.
 It asks for `pip install "patchproof[lab]"`, which has onnx and onnxscript.
 """
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

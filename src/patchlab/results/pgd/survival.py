@@ -9,8 +9,6 @@ hardened by PGD in 40 steps within 0.04, attacked by PGD in 40 steps of ε/4 wit
 true label, its gradient scaled (harden/attacks.py), from the picture itself.
 """
 
-from __future__ import annotations
-
 import csv
 import json
 import sys

@@ -5,8 +5,6 @@ conditions (`conditions_at`) and the scene (`scene_at`) at a point. Everything t
 drawn, so that points of a sweep differ in nothing else.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 

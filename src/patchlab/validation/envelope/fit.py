@@ -13,8 +13,6 @@ Sources: Efron and Tibshirani, An Introduction to the Bootstrap, 1993, 13.3 (per
 Robertson, Wright and Dykstra, Order Restricted Statistical Inference, 1988, 1.4 (the nearest falling rates).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 

@@ -5,8 +5,6 @@ the best control with its paired interval, and the point where gains end. A rate
 give the target's label to pure noise, and then also to the bare object. Without a gain a design has no effect.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import numpy as np

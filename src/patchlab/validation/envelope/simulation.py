@@ -7,8 +7,6 @@ resolution, except where JPEG is varied, which needs full size. Photographs that
 the window around the piece (`piece_window`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache

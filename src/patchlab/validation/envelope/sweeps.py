@@ -11,8 +11,6 @@ Left out on purpose: shadows of a card off the surface, which the renderer does 
 longer in the dark: here, darkness is light missing from the picture.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any

@@ -5,8 +5,6 @@ rest of the photograph takes most of the time and shows no markers. Left out on 
 window.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields, replace
 
 import numpy as np

@@ -10,8 +10,6 @@ scanners' PLY z up, all without units. An up axis is doubted if the object would
 with the other one.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass

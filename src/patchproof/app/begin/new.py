@@ -6,8 +6,6 @@ distances follow the object's length; the piece is the largest that fits on one 
 optimized is never written.
 """
 
-from __future__ import annotations
-
 import json
 import tomllib
 from collections import Counter

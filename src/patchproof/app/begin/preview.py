@@ -7,8 +7,6 @@ on a design, which `plan` shows; layouts of texture coordinates to draw masks on
 export.
 """
 
-from __future__ import annotations
-
 import warnings as python_warnings
 from collections import Counter
 from collections.abc import Sequence

@@ -5,8 +5,6 @@ optimizing draws them, the piece's outline (for people: it is not in the picture
 labels of the bare object.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from pathlib import Path

@@ -6,8 +6,6 @@ of `patch.side`; front and back are along z, as in glTF's standard and after `ob
 programs there. The ring is seen from far away, in even light, and from above or below if the piece is on top or below.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import get_args
 

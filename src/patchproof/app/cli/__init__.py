@@ -4,8 +4,6 @@ Heavy imports happen inside the verbs, so that help is quick. Errors that a user
 code 1.
 """
 
-from __future__ import annotations
-
 import typer
 
 from patchproof.app.cli.begin import keys, new, plan, preview

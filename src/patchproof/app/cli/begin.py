@@ -1,7 +1,5 @@
 """The verbs before anything is optimized: new, preview, plan, keys."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 from typing import Annotated, Literal

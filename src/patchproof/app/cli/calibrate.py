@@ -1,7 +1,5 @@
 """The verbs of `calibrate`: printer, camera."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Literal
 

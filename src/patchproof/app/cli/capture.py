@@ -1,7 +1,5 @@
 """The verb capture: photographs from a phone."""
 
-from __future__ import annotations
-
 from functools import partial
 from pathlib import Path
 from typing import Annotated

@@ -3,8 +3,6 @@
 Summaries go to standard output; warnings, failures and progress to standard error.
 """
 
-from __future__ import annotations
-
 import io
 import re
 import shlex

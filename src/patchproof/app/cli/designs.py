@@ -1,7 +1,5 @@
 """The verbs for existing designs: import (pictures made elsewhere) and evaluate (one run, or several compared)."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Any
 

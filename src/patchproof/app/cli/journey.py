@@ -1,7 +1,5 @@
 """The verbs from a scene to a verdict: demo, optimize, promise, sheet, reprint, verify."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 from typing import Annotated, Any, Literal

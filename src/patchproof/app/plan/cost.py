@@ -5,8 +5,6 @@ parts are those of the loop, in which views of one pose share its rasterization;
 difference of two calls of it.
 """
 
-from __future__ import annotations
-
 import statistics
 import time
 

@@ -6,8 +6,6 @@ whole photographs, stored as real JPEGs; a flag says if training's smaller views
 interactions of terms, except for one check with all terms left out that can go.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any, Literal
 

@@ -1,7 +1,5 @@
 """Format a plan as lines for the terminal."""
 
-from __future__ import annotations
-
 from patchproof.app.plan.errors import TermError
 from patchproof.app.plan.plan import GeometryPlan, Markers, Plan, Resolution, SurfacePlan
 from patchproof.base.validation import not_measured_lines

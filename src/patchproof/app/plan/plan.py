@@ -13,8 +13,6 @@ promise measures: the sheet's plan page says it.
 Left out on purpose: deciding for the user. The plan says which terms can go; the scene file decides.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from functools import partial

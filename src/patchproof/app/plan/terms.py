@@ -5,8 +5,6 @@ is replaced by the best simpler model: the sun by even light that is as strong o
 `channel.effects` defines how drawn effects are switched off.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
