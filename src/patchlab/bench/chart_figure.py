@@ -4,8 +4,6 @@ In: a `Chart`. Out: a `Drawing` as studies have them. Points on the Pareto front
 hollow; a ring marks the default. A corner names the machine.
 """
 
-from __future__ import annotations
-
 from functools import partial
 from textwrap import fill
 from typing import TYPE_CHECKING
@@ -32,7 +30,7 @@ def chart_drawing(chart: Chart, machine: str) -> Drawing:
     return Drawing(chart.name, chart.title, partial(_draw, chart, machine), (7.0, 4.4), chart.about)
 
 
-def _draw(chart: Chart, machine: str, figure: Figure) -> None:
+def _draw(chart: Chart, machine: str, figure: "Figure") -> None:
     axes, fronts = figure.add_subplot(), {task: chart.front(points) for task, points in chart.tasks.items()}
     filled = [p for front in fronts.values() for p in front]
     for (label, points), color, marker in zip(chart.series.items(), _COLORS, _MARKERS, strict=False):
@@ -55,7 +53,7 @@ def _draw(chart: Chart, machine: str, figure: Figure) -> None:
     _write_settings(figure, axes, chart)
 
 
-def _draw_point(axes: Axes, point: ChartPoint, color: str, marker: str, filled: bool) -> None:
+def _draw_point(axes: "Axes", point: ChartPoint, color: str, marker: str, filled: bool) -> None:
     (x, *x_ends), (y, *y_ends) = value_and_ends(point.cost), value_and_ends(point.error)
     bars = [[[middle - low], [high - middle]] for middle, (low, high) in ((y, y_ends), (x, x_ends))]
     axes.errorbar(x, y, *bars, fmt="none", ecolor=color, elinewidth=1, capsize=2.5, alpha=0.6)
@@ -64,7 +62,7 @@ def _draw_point(axes: Axes, point: ChartPoint, color: str, marker: str, filled: 
         axes.plot(x, y, **_RING)
 
 
-def _set_scales(axes: Axes, points: list[ChartPoint]) -> None:
+def _set_scales(axes: "Axes", points: list[ChartPoint]) -> None:
     costs, errors = zip(*(p.center for p in points), strict=True)
     if max(costs) > 4 * min(costs) > 0:
         _plain_log(axes.xaxis, axes.set_xscale, max(costs) / min(costs))
@@ -81,7 +79,7 @@ def _plain_log(axis, set_scale, ratio: float) -> None:
     axis.set_minor_formatter(NullFormatter())
 
 
-def _write_settings(figure: Figure, axes: Axes, chart: Chart) -> None:
+def _write_settings(figure: "Figure", axes: "Axes", chart: Chart) -> None:
     """Write each point's setting beside it, in the one of four corners where the text hides least."""
     from matplotlib.transforms import Bbox
 
@@ -96,7 +94,7 @@ def _write_settings(figure: Figure, axes: Axes, chart: Chart) -> None:
         )
         text.set_in_layout(False)
 
-        def move(right: bool, up: bool, text=text) -> Bbox:
+        def move(right: bool, up: bool, text=text) -> "Bbox":
             sides = {"ha": "left" if right else "right", "va": "bottom" if up else "top"}
             text.set(position=(6 if right else -6, 2 if up else -2), **sides)
             return text.get_window_extent()
@@ -106,7 +104,7 @@ def _write_settings(figure: Figure, axes: Axes, chart: Chart) -> None:
         taken.append(move(*corners[int(np.argmin(areas))]))
 
 
-def _covered_area(box: Bbox, taken: list[Bbox], frame: Bbox) -> float:
+def _covered_area(box: "Bbox", taken: "list[Bbox]", frame: "Bbox") -> float:
     """The area of a text's box that lies on taken boxes or outside the axes."""
     shared = (box.intersection(box, other) for other in taken)
     inside = box.intersection(box, frame)

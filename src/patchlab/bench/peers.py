@@ -8,8 +8,6 @@ A gain counts in the direction of the goal: with `deceive`, a falling rate. Unli
 with times, which differ from run to run: seconds of one core, without loading the network.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
@@ -158,7 +156,7 @@ def figures(settings: PeersSettings, results: Sequence[Result]) -> list[Drawing]
     ]
 
 
-def _scatter(settings: PeersSettings, results: Sequence[Result], figure: Figure) -> None:
+def _scatter(settings: PeersSettings, results: Sequence[Result], figure: "Figure") -> None:
     axes = figure.add_subplot()
     for peer in settings.peers:
         theirs, ours = ([rate_of(result, name) for result in results] for name in (peer, "ours"))

@@ -7,8 +7,6 @@ sheet.
 Source: Pestana et al., robust designs.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -137,7 +135,7 @@ def figures(settings: RobustSettings, results: Sequence[Result]) -> list[Drawing
 
 
 def _color_grid(
-    figure: Figure, by_design: Mapping[DesignKey, Sequence[Result]], rows: Sequence[tuple], networks: Sequence[str]
+    figure: "Figure", by_design: Mapping[DesignKey, Sequence[Result]], rows: Sequence[tuple], networks: Sequence[str]
 ) -> None:
     picture, axes = np.ones((len(rows), len(networks), 3)), figure.add_subplot()
     for key, of_key in by_design.items():

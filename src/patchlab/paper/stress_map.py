@@ -6,8 +6,6 @@ tenth of a map's cells; and `Drawing`s with one scale from 0 to 1. All cells of 
 camera and everything else, so that they differ in pose and light only.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -171,7 +169,7 @@ def heat_map(
     cells, whose rates mean nothing, are gray.
     """
 
-    def draw(figure: Figure) -> None:
+    def draw(figure: "Figure") -> None:
         plot, values = figure.add_subplot(), np.array(rates).T
         texts = [[f"{value:.2f}" for value in row] for row in values]
         gray = [(y, x) for x, y in empty]

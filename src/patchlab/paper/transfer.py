@@ -12,8 +12,6 @@ were trained: another seed's design may do better or worse. Only intervals over 
 seed.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from itertools import product
 from pathlib import Path
@@ -255,7 +253,7 @@ def figures(settings: TransferSettings, results: Sequence[Result]) -> list[Drawi
     return drawings
 
 
-def _heat_map(figure: Figure, by_row: Mapping[str, Sequence[Result]], networks: Sequence[str]) -> None:
+def _heat_map(figure: "Figure", by_row: Mapping[str, Sequence[Result]], networks: Sequence[str]) -> None:
     original = Record(by_row.get(ORIGINAL, ()), "design")
     records = {row: Record(of_row, "design") for row, of_row in by_row.items()}
     panels = figure.subplots(1, 2, sharey=True)

@@ -3,8 +3,6 @@
 In: files of pictures; arrays of numbers. Out: `Drawing`s for a study's page, or images on axes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -32,7 +30,7 @@ def picture_sheet(
 ) -> Drawing:
     """Draw PNGs one below the other with titles; `rows` and `columns` label equal parts of each picture."""
 
-    def draw(figure: Figure) -> None:
+    def draw(figure: "Figure") -> None:
         from matplotlib.image import imread
 
         for axes, (caption, path) in zip(figure.subplots(len(files), 1, squeeze=False)[:, 0], files, strict=True):
@@ -48,7 +46,7 @@ def picture_sheet(
 
 
 def number_grid(
-    axes: Axes,
+    axes: "Axes",
     values: np.ndarray,
     texts: Sequence[Sequence[str]],
     framed: Sequence[tuple[int, int]] = (),
@@ -56,7 +54,7 @@ def number_grid(
     limits: tuple[float, float] = (0.0, 1.0),
     fontsize: float = 7,
     empty: Sequence[tuple[int, int]] = (),
-) -> AxesImage:
+) -> "AxesImage":
     """Draw R×C colored cells with a text in each; `framed` cells and gray `empty` ones are (row, column)."""
     from matplotlib.patches import Rectangle
 

@@ -5,8 +5,6 @@ digits; from results the rates, mean confidences and paired differences of table
 a seed share draws of the evaluate stream, which training and selection never see.
 """
 
-from __future__ import annotations
-
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from typing import Any
 
@@ -87,7 +85,7 @@ class Record:
         """(rate, mean confidence) with intervals."""
         return rate(self.hits(network)), mean(self.confidences(network))
 
-    def gain(self, other: Record, network: str | None = None) -> tuple[Estimate | None, Estimate | None]:
+    def gain(self, other: "Record", network: str | None = None) -> tuple[Estimate | None, Estimate | None]:
         """(rate, mean confidence) minus those of `other`, paired by condition in the cells that both have."""
         shared = [key for key in self._cells if key in other._cells]
         pairs = zip(self.confidences(network, shared), other.confidences(network, shared), strict=True)

@@ -7,8 +7,6 @@ printed, mounted, photographed, found and measured against the renderer's truth.
 seed share their draws; intervals are over such groups, since designs differ by chance.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -245,7 +243,7 @@ def figures(settings: LayoutsSettings, results: Sequence[Result]) -> Sequence[Dr
     if not settings.photos:
         return []
 
-    def draw(figure: Figure) -> None:
+    def draw(figure: "Figure") -> None:
         axes = figure.subplots()
         for name, _, gain, _, _, measured, *_ in table.rows:
             (x, x_span), (y, y_span) = _value_and_reach(measured), _value_and_reach(gain)

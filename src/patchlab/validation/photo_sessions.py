@@ -5,8 +5,6 @@ the page, the photographs and their verification; a record of the promise. Every
 but no report is written.
 """
 
-from __future__ import annotations
-
 import zlib
 from collections.abc import Callable
 from dataclasses import replace
@@ -59,7 +57,7 @@ def cells(settings: SessionsSettings, base: Path) -> list[Cell]:
     )
 
 
-def make_run_and_sheet(base: Path, cell: Cell, folder: Path) -> Run:
+def make_run_and_sheet(base: Path, cell: Cell, folder: Path) -> "Run":
     """Optimize or import the cell's design into folder/run, and write its sheet to folder/sheet.pdf."""
     from patchproof.optimizer.imported_design import import_patch
     from patchproof.optimizer.run import optimize
@@ -79,7 +77,7 @@ def make_run_and_sheet(base: Path, cell: Cell, folder: Path) -> Run:
 
 
 def take_photos(
-    settings: SessionsSettings, cell: Cell, patch_run: Run, folder: Path, control: str | None = None
+    settings: SessionsSettings, cell: Cell, patch_run: "Run", folder: Path, control: str | None = None
 ) -> Path:
     """Photograph folder/sheet.pdf, or a control under the same conditions; returns the folder of sessions."""
     from patchproof.reprints.mounted_sheet import ReprintSetup
@@ -98,9 +96,9 @@ def verify_photos(
     folder: Path,
     base: Path,
     cell: Cell,
-    forecast: Callable[[PhotoSquare], float | None] | None = None,
+    forecast: "Callable[[PhotoSquare], float | None] | None" = None,
     **options: Any,
-) -> Report:
+) -> "Report":
     """Verify photographs of folder/sheet.pdf without writing a report; `options` replace fields of `Options`."""
     from patchproof.app.verify import options_of
     from patchproof.evidence.gather import gather_evidence
@@ -112,7 +110,7 @@ def verify_photos(
     return gather_evidence(photos, manifest, changed, forecast=forecast)
 
 
-def record_promise(patch_run: Run) -> dict[str, Any]:
+def record_promise(patch_run: "Run") -> dict[str, Any]:
     """Record a run's promise as JSON values."""
     promise = patch_run.promise
     hits = hits_text([condition.recognized for condition in promise.conditions])

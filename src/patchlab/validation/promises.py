@@ -11,8 +11,6 @@ Photographs are path-traced (`path_traced`), since our renderer's would share th
 `path_traced = false` they are ours, which tests only sampling and the page.
 """
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -89,7 +87,7 @@ def run(settings: PromisesSettings, base: Path, cell: Cell) -> dict[str, Any]:
     return answers | _measure_views(settings, patch_run)
 
 
-def _measure_views(settings: PromisesSettings, patch_run: Run) -> dict[str, Any]:
+def _measure_views(settings: PromisesSettings, patch_run: "Run") -> dict[str, Any]:
     if not settings.rendered and not settings.elsewhere:
         return {}
     problem, scene, answers = set_problem(patch_run.scene), patch_run.scene, {}
@@ -221,7 +219,7 @@ def _elsewhere_table(settings: PromisesSettings, results: Sequence[Result]) -> T
 def figures(settings: PromisesSettings, results: Sequence[Result]) -> tuple[Drawing, ...]:
     """A plot of the share recognized in each session against the promised rate."""
 
-    def draw(figure: Figure) -> None:
+    def draw(figure: "Figure") -> None:
         axes = figure.subplots()
         axes.plot([0, 1], [0, 1], color="0.6", linewidth=1)
         for name, group in by_scene(results).items():

@@ -9,8 +9,6 @@ not independent, so medians have no intervals.
 Left out on purpose: color, since boards are black and white; distances and angles, as these cameras are not calibrated.
 """
 
-from __future__ import annotations
-
 import statistics
 from collections.abc import Sequence
 from functools import lru_cache
@@ -280,7 +278,7 @@ def _range_plot(settings: RealSettings, used: Sequence[Result]):
         "black": (black + printer.black[0], black + printer.black[1]),
     }
 
-    def draw(figure: Figure) -> None:
+    def draw(figure: "Figure") -> None:
         for axes, (key, (low, high)) in zip(figure.subplots(1, 3, sharey=True), ranges.items(), strict=True):
             axes.axvspan(low, high, color="0.85")
             for row, board in enumerate(settings.boards):

@@ -6,8 +6,6 @@ in `evidence.verdict`. Nothing is rendered. Promises are drawn with as many sess
 the counts' chances at a true rate are exact, and figures are means over promises.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -117,7 +115,7 @@ def tables(settings: VerdictsSettings, results: Sequence[Result]) -> tuple[Table
 def figures(settings: VerdictsSettings, results: Sequence[Result]) -> tuple[Drawing, ...]:
     """A plot of the chance of `kept` by true rate, a panel for each correlation."""
 
-    def draw(figure: Figure) -> None:
+    def draw(figure: "Figure") -> None:
         panels = figure.subplots(1, len(results), sharey=True, squeeze=False)[0]
         rates = np.linspace(max(0.01, settings.rate - 0.4), min(0.99, settings.rate + 0.12), _PLOTTED_RATES)
         for axes, result in zip(panels, results, strict=True):

@@ -9,8 +9,6 @@ two best are therefore evaluated under as many fresh conditions: those figures a
 corrections of the other rows for the number of designs; they only serve the selection.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -184,7 +182,7 @@ def _origin(run: Run) -> str:
 def _drawing(runs: Mapping[str, Run], answers: Mapping[str, AnswersByKind]) -> Drawing:
     """Draw each design's picture beside its rate and its controls' rates."""
 
-    def draw(figure: Figure) -> None:
+    def draw(figure: "Figure") -> None:
         grid = figure.subplots(len(runs), 2, squeeze=False, width_ratios=(1, 5), sharex="col")
         for (picture, axes), (name, run) in zip(grid, runs.items(), strict=True):
             picture.imshow(run.design, interpolation="nearest")

@@ -3,8 +3,6 @@
 In: a user's choice. Out: `Compute`, whose fields a verb either uses or refuses by name.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from patchproof.base.errors import Refused
@@ -24,7 +22,7 @@ class Compute:
     jobs: int = 1
     cluster: str | None = None
 
-    def without(self, verb: str, *, device: bool = False, cluster: bool = False) -> Compute:
+    def without(self, verb: str, *, device: bool = False, cluster: bool = False) -> "Compute":
         """Return this object; refused if it names a device or cluster that `verb`, by the keywords, cannot use."""
         if device and self.device != "cpu":
             raise Refused(f'device = "cpu" for {verb}', f'"{self.device}"', "leave device out of Compute")

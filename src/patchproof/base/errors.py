@@ -13,8 +13,6 @@ contradicting files. Rejected photographs never stop a batch: they are listed in
 line prints the sentence of a `PatchproofError` and exits with 1. All survive pickling, to cross processes.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 from patchproof.base.text import printable
@@ -32,7 +30,7 @@ class Refused(PatchproofError, ValueError):
         expected, got, do = map(_shorten, self._parts)
         super().__init__(f"Expected {expected}, got {got}: {do.rstrip('.')}.")
 
-    def with_advice(self, advice: str) -> Refused:
+    def with_advice(self, advice: str) -> "Refused":
         """A copy of this error with `advice` appended to the instruction."""
         expected, got, do = self._parts
         return Refused(expected, got, f"{do.rstrip('.')}{advice}")

@@ -9,8 +9,6 @@ unless it runs in `run_in_child`. Timers exist on Linux and macOS, in a process'
 do not use. Within another time limit, or a profiler's timer, the outer one applies.
 """
 
-from __future__ import annotations
-
 import csv
 import faulthandler
 import hashlib
@@ -119,7 +117,7 @@ def read_csv(path: str | Path, expected: str) -> list[list[str]]:
 
 
 @contextmanager
-def open_image(source: Path | bytes, expected: str, do: str) -> Iterator[Image]:
+def open_image(source: Path | bytes, expected: str, do: str) -> "Iterator[Image]":
     """Open a Pillow image from a file or a file's bytes; every error in decoding it is refused with `do`."""
     name = "an image" if isinstance(source, bytes) else source.name
     try:
@@ -134,7 +132,7 @@ def open_image(source: Path | bytes, expected: str, do: str) -> Iterator[Image]:
         raise Refused(expected, f"{name} that cannot be read ({reason})", do) from error
 
 
-def open_lazily(source: Path | bytes) -> Image:
+def open_lazily(source: Path | bytes) -> "Image":
     """Open a picture with Pillow, which decodes it later; errors are Pillow's, and an OSError for what is no file."""
     from PIL import Image
 

@@ -10,8 +10,6 @@ Sources: Wilson, JASA 22 (1927); Newcombe, Statistics in Medicine 17 (1998) 873-
 (paired).
 """
 
-from __future__ import annotations
-
 import math
 import statistics
 from collections.abc import Sequence
@@ -50,7 +48,7 @@ def estimate_difference(a: list[bool], b: list[bool]) -> Estimate | None:
     return Estimate(value, low, high, len(a))
 
 
-def student_mean(values: Sequence[float] | np.ndarray) -> Estimate:
+def student_mean(values: "Sequence[float] | np.ndarray") -> Estimate:
     """Return the mean of at least two values, with Student's interval."""
     from scipy.stats import t
 
@@ -108,7 +106,7 @@ def rates_difference(
     return difference, (low, difference + math.hypot(high_a - rate_a, rate_b - low_b))
 
 
-def resampled_means(values: np.ndarray, draws: int) -> np.ndarray:
+def resampled_means(values: "np.ndarray", draws: int) -> "np.ndarray":
     """Return the means (`draws` × ...) of bootstrap resamples of n × ... values, drawn with a fixed seed."""
     import numpy as np
 

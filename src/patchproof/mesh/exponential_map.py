@@ -6,8 +6,6 @@ preserved; across them lengths change by K r²/6 at distance r, where the Gaussi
 Geometry of Curves and Surfaces, 1976, section 4-6). On a cylinder (a constant height) the map is exactly the unrolling.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -51,7 +49,7 @@ class SmoothSurface:
         local /= np.linalg.norm(local, axis=-1, keepdims=True)
         return self.chart.world(s, t, self.height(s, t)), local @ self.chart.axes
 
-    def raise_by(self, by_mm: float) -> SmoothSurface:
+    def raise_by(self, by_mm: float) -> "SmoothSurface":
         """Return the surface moved outward along the chart's normals."""
         coefficients = self.coefficients.copy()
         coefficients[0, 0] += by_mm

@@ -4,8 +4,6 @@ In: a scene with a piece, and its printer. Out: `Patch`: the first design, the a
 pixels that go to the printer. `render.designs` draws the whole piece on paper.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -99,7 +97,7 @@ class Patch:
         """The piece with these texels."""
         return PiecePicture(printed, self.design_px)
 
-    def with_printer(self, printer: Printer) -> Patch:
+    def with_printer(self, printer: Printer) -> "Patch":
         """This patch with another printer."""
         return replace(self, printer=printer)
 

@@ -4,8 +4,6 @@ In: a scene, the names of its classifiers and its printer. Out: `Problem`, from 
 `evaluate` get pictures of a design.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -103,18 +101,18 @@ class Problem:
         with torch.no_grad():
             return self.subject.appearance(self.subject.start())
 
-    def with_classifiers(self, numbers: Sequence[int]) -> Problem:
+    def with_classifiers(self, numbers: Sequence[int]) -> "Problem":
         """A copy with the classifiers of these numbers only."""
         classifiers, indices = (tuple(each[i] for i in numbers) for each in (self.classifiers, self.indices))
         return replace(self, classifiers=classifiers, indices=indices)
 
-    def with_training(self, optimize: OptimizeSettings, seed: int | None = None) -> Problem:
+    def with_training(self, optimize: OptimizeSettings, seed: int | None = None) -> "Problem":
         """A copy with these settings of the loop, and another seed of its draws."""
         settings = self.scene.settings.changed(optimize=optimize)
         scene = replace(self.scene, settings=settings, seed=self.scene.seed if seed is None else seed)
         return replace(self, scene=scene)
 
-    def with_piece_at(self, scene: PatchScene) -> Problem:
+    def with_piece_at(self, scene: PatchScene) -> "Problem":
         """A copy with the piece where `scene` has it; the object's tensors are shared."""
         stage = replace(self.stage, scene=scene, piece=piece_surface(scene, self.device))
         subject = Patch(scene, self.printer, scene.design_px(self.network_px), self.device)

@@ -5,8 +5,6 @@ network recognized the target, its confidence, and the loss. Views are rendered 
 as many processes as the problem has; the responses do not depend on how many.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -38,7 +36,7 @@ class Responses:
     confidence: np.ndarray
     loss: np.ndarray
 
-    def select(self, rows: np.ndarray) -> Responses:
+    def select(self, rows: np.ndarray) -> "Responses":
         """The responses under the conditions with these indices."""
         return Responses(self.recognized[:, rows], self.confidence[:, rows], self.loss[:, rows])
 

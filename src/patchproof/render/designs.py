@@ -5,8 +5,6 @@ texture, by rows) for textures. Out: an `Appearance` for `photograph`, different
 whole, with its printed markers, because that is what will hang there.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -56,7 +54,7 @@ class PrintedPiece:
 class LearnedTextures:
     """The object's textures with some texels free to change: those of the canvas's masks."""
 
-    canvas: Canvas
+    canvas: "Canvas"
     device: torch.device
 
     def appearance(self, design: Tensor, kind: str = "design") -> ObjectTextures:

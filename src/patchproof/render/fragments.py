@@ -1,7 +1,5 @@
 """The input and output of rasterizing: `Cameras`, `Fragments`."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -22,7 +20,7 @@ class Cameras:
     def __len__(self) -> int:
         return len(self.camera_from_world)
 
-    def __getitem__(self, rows: slice) -> Cameras:
+    def __getitem__(self, rows: slice) -> "Cameras":
         return Cameras(self.camera_from_world[rows], self.matrix_px[rows], self.size_px)
 
 
@@ -74,7 +72,7 @@ class Fragments:
         second.addcmul_(b[:, 2], total, value=-1).mul_(z)
         return stack_columns(-(first + second), first, second)
 
-    def where(self, keep: Tensor) -> Fragments:
+    def where(self, keep: Tensor) -> "Fragments":
         """Return the fragments for which `keep` (P, bool) is true."""
         index = keep.nonzero()[:, 0]
         names = ("pixel", "face", "barycentric", "depth", "front", "rank")

@@ -8,8 +8,6 @@ is walked, so that faces smaller than a pixel work as well). No part of a pictur
 sample. Left out on purpose: things thinner than a pixel that no pixel center sees.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch
@@ -37,7 +35,7 @@ class Outlines:
     source: Tensor
     share: Tensor
 
-    def part(self, views: range, pixels: int) -> Outlines:
+    def part(self, views: range, pixels: int) -> "Outlines":
         """Return those of some views, of `pixels` pixels each, equal to the outlines of these views alone."""
         first = views.start * pixels
         low, high = torch.searchsorted(self.pixel, self.pixel.new_tensor([first, views.stop * pixels])).tolist()

@@ -5,8 +5,6 @@ positions if light needs them. The piece's edge is antialiased in its own millim
 along each of the piece's sides, that lies within the cut line.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -50,7 +48,7 @@ class PiecePicture:
     size_px: tuple[int, int]
 
     @classmethod
-    def of(cls, srgb: Tensor) -> PiecePicture:
+    def of(cls, srgb: Tensor) -> "PiecePicture":
         """Return the piece that looks like H×W×3."""
         return cls(texel_table([srgb], wrap=False), (srgb.shape[1], srgb.shape[0]))
 
@@ -87,7 +85,7 @@ class ObjectPixels:
     color: Tensor  # P×3: multiplies the texture
     normal: Tensor
 
-    def part(self, views: range, pixels: int) -> ObjectPixels:
+    def part(self, views: range, pixels: int) -> "ObjectPixels":
         """Return those of some views, of `pixels` pixels each, equal to those of these views alone."""
         rows = _rows(self.pixel, views, pixels)
         pixel, view = self.pixel[rows] - views.start * pixels, self.view[rows] - views.start
@@ -112,7 +110,7 @@ class PiecePixels:
     back_share: Tensor
     box_px: np.ndarray
 
-    def part(self, views: range, pixels: int) -> PiecePixels:
+    def part(self, views: range, pixels: int) -> "PiecePixels":
         """Return those of some views, of `pixels` pixels each, equal to those of these views alone."""
         rows, back = (_rows(pixel, views, pixels) for pixel in (self.pixel, self.back_pixel))
         pixel, view = self.pixel[rows] - views.start * pixels, self.view[rows] - views.start

@@ -4,8 +4,6 @@ In: a scene of any kind. Out: `Stage`: the piece as a surface of millimeters; fo
 its textures; and the rendering of designs. Scenes made of pictures have no object.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -32,7 +30,7 @@ class Stage:
     piece: PieceSurface | None
 
     @property
-    def camera(self) -> Camera | None:
+    def camera(self) -> "Camera | None":
         """The scene's calibrated camera, if any."""
         return self.scene.camera
 

@@ -11,8 +11,6 @@ along the longer side (Feline, McCormack et al., 1999) left an optimized design 
 pixel, this one 33 to 57. Left out on purpose: weights other than the pixel's own square.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
@@ -61,7 +59,7 @@ class Footprint:
     groups: tuple[TapGroup, ...]
     fragments: int
 
-    def part(self, first: int, last: int) -> Footprint:
+    def part(self, first: int, last: int) -> "Footprint":
         """Return the footprint of the fragments from `first` up to `last`."""
         groups = []
         for group in self.groups:

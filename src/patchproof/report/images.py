@@ -4,8 +4,6 @@ In: uint8 sRGB H×W×3, float cells, or functions that draw with matplotlib. Out
 All reports share the map's scale, so that two can be compared.
 """
 
-from __future__ import annotations
-
 import hashlib
 import io
 from collections.abc import Callable, Mapping
@@ -85,7 +83,7 @@ def delta_map(delta_e00: np.ndarray, longer_px: int = 192) -> np.ndarray:
     return np.repeat(np.repeat(colors, zoom, axis=0), zoom, axis=1)
 
 
-def _make_drawable(figure: Figure) -> None:
+def _make_drawable(figure: "Figure") -> None:
     """Let installed fonts stand in for characters that the figure's font lacks; those that no font has are escaped."""
     from matplotlib import font_manager
     from matplotlib.text import Text
@@ -114,7 +112,7 @@ def _make_drawable(figure: Figure) -> None:
         text.set(text=shown(text.get_text()), family=fonts)
 
 
-def draw_figure(draw: Callable[[Figure], None], size_in: tuple[float, float], kind: str, **options: Any) -> bytes:
+def draw_figure(draw: "Callable[[Figure], None]", size_in: tuple[float, float], kind: str, **options: Any) -> bytes:
     """Draw a figure and encode it as "png" or "svg"; `options` are those of matplotlib's `savefig`."""
     import matplotlib
     from matplotlib.figure import Figure

@@ -4,8 +4,6 @@ In: entries of a report as plain data. Out: SVG text. Points of recognition lie 
 the line is a running share over neighboring photographs, drawn from 24 photographs on.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
@@ -112,8 +110,8 @@ def _draw(axes, x, y, promised_x, promised_y, label) -> None:
     axes.set_yticks([0, 0.5, 1], ["not recognized", "50 %", "recognized"])
 
 
-def _svg(draw: Callable[[Axes], None]) -> str:
-    def fill(figure: Figure) -> None:
+def _svg(draw: "Callable[[Axes], None]") -> str:
+    def fill(figure: "Figure") -> None:
         axes = figure.add_subplot()
         draw(axes)
         axes.spines[["top", "right"]].set_visible(False)

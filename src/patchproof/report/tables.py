@@ -5,8 +5,6 @@ NAME.json, a CSV per table with numbers in full, a PNG per figure, and one self-
 or lines. The same input gives the same bytes.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -44,7 +42,7 @@ class Drawing:
 
     name: str
     title: str
-    draw: Callable[[Figure], None]
+    draw: "Callable[[Figure], None]"
     size_in: tuple[float, float] = (7.0, 4.0)
     about: str = ""
 

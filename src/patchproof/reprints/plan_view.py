@@ -5,8 +5,6 @@ object's edges or, for bent paper, along its surface. The picture is rendered fr
 length, at which perspective moves nothing by more than 1 % of the object's depth.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -80,7 +78,7 @@ def draw_plan_view(scene: PatchScene, template: Template) -> PlacementPicture:
 
 
 def _spans(
-    tapes: Sequence[TapeMeasurement], project: Callable[[np.ndarray], np.ndarray]
+    tapes: "Sequence[TapeMeasurement]", project: Callable[[np.ndarray], np.ndarray]
 ) -> tuple[tuple[DimensionSpan, ...], tuple[DimensionSpan, ...]]:
     """Split tapes into those that run across the picture, from the left, and those that run down, from the top."""
     spans: tuple[list[DimensionSpan], list[DimensionSpan]] = ([], [])

@@ -7,8 +7,6 @@ object (`PhotoScene`) or a folder of images (`ImageScene`). Each has its own mod
 without one. N is the number of conditions.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -72,7 +70,7 @@ class Scene(ABC):
     sheet_id: str
     notes: tuple[str, ...] = field(default=(), kw_only=True)  # warnings about the files that were read
     known: Mapping[str, str] = field(default_factory=dict, kw_only=True)  # enters the sheet id beside the settings
-    camera: Camera | None = field(default=None, kw_only=True)  # a calibrated camera
+    camera: "Camera | None" = field(default=None, kw_only=True)  # a calibrated camera
     mesh_glb: bytes | None = field(default=None, kw_only=True)  # the mesh, if it was given in Python
     given_models: Mapping[str, Any] = field(default_factory=dict, kw_only=True)  # networks given in Python, by name
     inputs: Mapping[str, str] = field(default_factory=dict, kw_only=True)  # fingerprints by settings key
@@ -170,7 +168,7 @@ class Scene(ABC):
         """
         return np.zeros(len(conditions)), np.zeros(len(conditions))
 
-    def object_canvas(self) -> Canvas:
+    def object_canvas(self) -> "Canvas":
         """Return the object's texture, if that is what may change; refused for any other scene."""
         refuse_without_place(self)
         raise Refused("a scene of the object's own texture", "a scene of a patch", 'set patch.kind = "texture"')
@@ -233,7 +231,7 @@ class PieceScene(Scene):
         """True if piece and lens are flat, so that photographs are homographies of the sheet."""
         return True
 
-    def with_print_scale(self, scale: tuple[float, float]) -> PieceScene:
+    def with_print_scale(self, scale: tuple[float, float]) -> "PieceScene":
         """Return the scene with its piece printed at `scale` (x, y) about its middle; its millimeters stay."""
         if scale == (1.0, 1.0):
             return self

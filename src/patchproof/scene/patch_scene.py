@@ -4,8 +4,6 @@ In: settings. Out: a `PatchScene`, which knows its sheet id (a hash of settings 
 layout of the printed piece (the design and its markers, whose size follows from the views) and the piece's placement.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
@@ -106,7 +104,7 @@ class PatchScene(PieceScene, MeshScene):
         poses = self.camera_from_world(conditions) @ self.placement.world_from_piece
         return np.array([geometry.view_angles(pose, middle)[0] for pose in poses])
 
-    def tape_measurements(self) -> tuple[TapeMeasurement, ...]:
+    def tape_measurements(self) -> "tuple[TapeMeasurement, ...]":
         """Return tape measurements beside the piece, as one faces its side; none for a card, whose edges do."""
         return ()
 

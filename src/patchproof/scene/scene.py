@@ -4,8 +4,6 @@ Each kind is built by its own module, which is imported only when a scene is of 
 nothing of textures, bent paper, photographs or images.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -43,7 +41,7 @@ def load_scene(path: str | Path, seed: int | None = None, steps: int | None = No
 
 def make_scene(
     settings: SceneSettings | Mapping[str, Any],
-    mesh: trimesh.Trimesh | trimesh.Scene | None = None,
+    mesh: "trimesh.Trimesh | trimesh.Scene | None" = None,
     base: str | Path = ".",
     seed: int | None = None,
 ) -> Scene:

@@ -5,8 +5,6 @@ Verification knows of a design only its manifest, which therefore holds the desi
 SHA-256 over the raw RGB bytes, row by row.
 """
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import json
@@ -73,7 +71,7 @@ class Marker(StrictModel):
     page: PageNumber
 
     @model_validator(mode="after")
-    def _is_plausible(self) -> Marker:
+    def _is_plausible(self) -> "Marker":
         if self.id >= int(self.dictionary.rpartition("_")[2]):
             raise ValueError(f"marker {self.id} is not in {self.dictionary}")
         for i in range(4):  # twice the area of each corner's triangle, y down
@@ -101,7 +99,7 @@ class Tile(StrictModel):
     cut_mm: Rect  # on the page: the part that is visible when the piece is assembled
 
     @model_validator(mode="after")
-    def _invertible(self) -> Tile:
+    def _invertible(self) -> "Tile":
         (a, b, _), (c, d, _) = self.page_from_design_mm
         if not 0.5 < a * d - b * c < 2:  # both are millimeters
             raise ValueError(f"must have page_from_design_mm of determinant 1, not {a * d - b * c:g}")
@@ -171,7 +169,7 @@ class Promise(StrictModel):
     conditions: tuple[ConditionClaim, ...]
 
     @model_validator(mode="after")
-    def _lists_all_conditions(self) -> Promise:
+    def _lists_all_conditions(self) -> "Promise":
         if len(self.conditions) != self.n:
             raise ValueError(f"must list all of its {self.n} conditions, not {len(self.conditions)}")
         return self
@@ -268,7 +266,7 @@ class Manifest(StrictModel):
         return settings
 
     @model_validator(mode="after")
-    def _design_fills_the_piece(self) -> Manifest:
+    def _design_fills_the_piece(self) -> "Manifest":
         if self.design is not None and self.design.rect_mm != self.cut_mm:
             raise ValueError("make the sheet again: design.rect_mm is not cut_mm, and a design fills its piece")
         return self

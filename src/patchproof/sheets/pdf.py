@@ -8,8 +8,6 @@ viewers not to scale. Nothing depends on time, machine or hash order: equal inpu
 and `pdf_raster` know PDF points (1/72 inch, y up).
 """
 
-from __future__ import annotations
-
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -81,7 +79,7 @@ def _draw_pages(pages: Sequence[PdfPage], title: str) -> bytes:
     return buffer.getvalue()
 
 
-def _draw_page(canvas: Canvas, page: PdfPage) -> None:
+def _draw_page(canvas: "Canvas", page: PdfPage) -> None:
     layout, height = page.layout, page.layout.page_mm[1]
     _draw_parts(canvas, page.pictures, layout.swatches, layout.markers, height)
     for rects in (layout.qr_mm, layout.squares_mm):
@@ -113,7 +111,7 @@ def _draw_page(canvas: Canvas, page: PdfPage) -> None:
         canvas.drawString(line.at_mm[0], height - line.at_mm[1], drawable_text(line.text, line.bold))
 
 
-def _draw_parts(canvas: Canvas, pictures, swatches, markers, height: float) -> None:
+def _draw_parts(canvas: "Canvas", pictures, swatches, markers, height: float) -> None:
     from PIL import Image
     from reportlab.lib.utils import ImageReader
 
@@ -125,7 +123,7 @@ def _draw_parts(canvas: Canvas, pictures, swatches, markers, height: float) -> N
         _fill_rects(canvas, marker_rects_mm(marker), (0.0, 0.0, 0.0), height)
 
 
-def _fill_rects(canvas: Canvas, rects: Any, srgb: Srgb, height: float) -> None:
+def _fill_rects(canvas: "Canvas", rects: Any, srgb: Srgb, height: float) -> None:
     path = canvas.beginPath()
     for x, y, w, h in rects:
         path.rect(x, height - y - h, w, h)

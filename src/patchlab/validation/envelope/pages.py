@@ -5,8 +5,6 @@ beyond the sweep is called “holds”, and an interval that ends at the sweep's
 stops gaining over its controls, whatever label the network gives beyond.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from itertools import groupby
@@ -37,7 +35,7 @@ _CONTROL = "the better of the bare object and a gray piece in the same markers, 
 _PAGE_IN = (11.69, 8.27)  # A4, landscape
 
 
-def tables(settings: Any, results: Sequence[Result]) -> Sequence[Table]:
+def tables(settings: Any, results: "Sequence[Result]") -> Sequence[Table]:
     """Tables of breaking points, codes beyond them, points of sweeps, points of maps."""
     sweeps, maps = _split_results(results)
     ends = ("axis", "unit", "easy", "hard")
@@ -79,7 +77,7 @@ def tables(settings: Any, results: Sequence[Result]) -> Sequence[Table]:
     return tuple(table for table in all_tables if table.rows)
 
 
-def figures(settings: Any, results: Sequence[Result]) -> Sequence[Drawing]:
+def figures(settings: Any, results: "Sequence[Result]") -> Sequence[Drawing]:
     """The operating envelope as one page to print."""
     sweeps, maps = _split_results(results)
     page = Drawing(
@@ -95,7 +93,7 @@ def figures(settings: Any, results: Sequence[Result]) -> Sequence[Drawing]:
     return (page,)
 
 
-def _split_results(results: Sequence[Result]) -> tuple[list[Result], list[Result]]:
+def _split_results(results: "Sequence[Result]") -> "tuple[list[Result], list[Result]]":
     sweeps, maps = ([each for each in results if ("y" in each.cell.values) == is_map] for is_map in (False, True))
     return sweeps, maps
 
@@ -112,7 +110,7 @@ def gains_in(answers: Mapping[str, Any]) -> list[Estimate]:
     return gains_over_controls(np.array(answers["recognized"], bool), controls)
 
 
-def _break_row(result: Result) -> tuple[Value, ...]:
+def _break_row(result: "Result") -> tuple[Value, ...]:
     x, answers = result.cell.values["x"], result.answers
     axis, breaks = AXES[x["axis"]], answers["breaks"]
     rising = [f"{STAGES[name]} (p = {b['monotone_p']:.3f})" for name, b in breaks.items() if _is_not_monotone(b)]
@@ -140,7 +138,7 @@ def _axis_value(x: EndValues, position: float) -> float:
     return AXES[x["axis"]].value(x["easy"], x["hard"], min(position, 1.0))
 
 
-def _beyond_row(result: Result) -> tuple[Value, ...]:
+def _beyond_row(result: "Result") -> tuple[Value, ...]:
     x, answers = result.cell.values["x"], result.answers
     where = answers["breaks"]["measured"]["value"]
     positions = np.linspace(0, 1, x["points"])
@@ -154,7 +152,7 @@ def _count_codes(codes: Sequence[str | None]) -> str:
     return ", ".join(f"{code} {count}" for code, count in Counter(code for code in codes if code).most_common())
 
 
-def _point_rows(result: Result) -> list[tuple[Value, ...]]:
+def _point_rows(result: "Result") -> list[tuple[Value, ...]]:
     name, answers = result.cell.values["x"]["axis"], result.answers
     rows = []
     for i, (point, rates) in enumerate(zip(answers["points"], _rates(answers), strict=True)):
@@ -164,7 +162,7 @@ def _point_rows(result: Result) -> list[tuple[Value, ...]]:
     return rows
 
 
-def _map_rows(result: Result) -> list[tuple[Value, ...]]:
+def _map_rows(result: "Result") -> list[tuple[Value, ...]]:
     (x, y), answers = (result.cell.values[key]["axis"] for key in ("x", "y")), result.answers
     points = zip(answers["points"], _rates(answers), strict=True)
     return [(AXES[x].title, AXES[y].title, point[x], point[y], *rates) for point, rates in points]
@@ -184,7 +182,7 @@ def _rates(answers: Mapping[str, Any]) -> list[tuple[Value, ...]]:
     ]
 
 
-def _draw_page(figure: Figure, sweeps: Sequence[Result], maps: Sequence[Result]) -> None:
+def _draw_page(figure: "Figure", sweeps: "Sequence[Result]", maps: "Sequence[Result]") -> None:
     first = (sweeps or maps)[0].answers
     goal = "seen as" if Goal(first["goal"]).sign > 0 else "not seen as"
     figure.suptitle(f"Operating envelope of sheet {first['sheet']}: {goal} {first['label']} by {first['model']}")
@@ -206,7 +204,7 @@ def _draw_page(figure: Figure, sweeps: Sequence[Result], maps: Sequence[Result])
         )
 
 
-def _draw_bars(axes: Axes, sweeps: Sequence[Result]) -> None:
+def _draw_bars(axes: "Axes", sweeps: "Sequence[Result]") -> None:
     for row, result in enumerate(sweeps):
         x = result.cell.values["x"]
         for k, (stage, color) in enumerate(_COLORS.items()):
@@ -224,7 +222,7 @@ def _draw_bars(axes: Axes, sweeps: Sequence[Result]) -> None:
     axes.legend(ncols=3, loc="upper center", bbox_to_anchor=(0.55, 1.04), frameon=False, fontsize=8)
 
 
-def _draw_without(axes: Axes, y: float, gains: Sequence[bool], color: str) -> None:
+def _draw_without(axes: "Axes", y: float, gains: Sequence[bool], color: str) -> None:
     """Draw where the design has no effect beyond its breaking point, and where it gains again."""
     ends = [0.0, *((np.arange(len(gains) - 1) + 0.5) / (len(gains) - 1)).tolist(), 1.0]  # half way between the points
     for gaining, run in groupby(range(len(gains)), lambda i: gains[i]):
@@ -236,7 +234,7 @@ def _draw_without(axes: Axes, y: float, gains: Sequence[bool], color: str) -> No
             axes.barh(y, right - left, left=left, height=0.2, color=color, alpha=0.75)
 
 
-def _draw_bar(axes: Axes, y: float, x: EndValues, break_: BreakValues, color: str, label: str | None) -> None:
+def _draw_bar(axes: "Axes", y: float, x: EndValues, break_: BreakValues, color: str, label: str | None) -> None:
     value, low, high = (break_[name] for name in ("value", "low", "high"))
     axes.barh(y, min(value or 0.0, 1.0), height=0.2, color=color, alpha=0.75, label=label)
     of_sheet = break_["monotone_p"] is not None
@@ -259,7 +257,7 @@ def _short_number(value: float) -> str:
     return f"{value:.2g}" if abs(value) < 100 else f"{value:.0f}"
 
 
-def _draw_map(axes: Axes, result: Result) -> None:
+def _draw_map(axes: "Axes", result: "Result") -> None:
     x, y = result.cell.values["x"], result.cell.values["y"]
     shape = (y["points"], x["points"])
     share = np.mean(result.answers["recognized"], 1).reshape(shape)
