@@ -1,5 +1,6 @@
 """The command line `patchlab`: run studies and benchmarks, harden images, print keys and stored figures."""
 
+import re
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -19,6 +20,15 @@ from patchproof.app.cli.console import (
     say_study,
     version_option,
 )
+from patchproof.base.errors import Refused
+from patchproof.base.validation import spelling_hint
+
+app = typer.Typer(
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    help="Studies and benchmarks that produce the figures which patchproof's documents quote.",
+)
+_PAGE = Path(__file__).parent / "results/measured.md"
 
 
 def harden(
@@ -118,7 +128,7 @@ def keys(name: Annotated[str | None, typer.Argument(help="A study; without one, 
 
 def table(name: Annotated[str | None, typer.Argument(help="A word of the heading; without one, all.")] = None) -> None:
     """Print the current figures with their dates, commands and stored data, as Markdown."""
-    from patchlab.results.figures import figures_page
+    from patchlab.cli import figures_page
 
     print(figures_page(name), end="")
 
@@ -141,11 +151,6 @@ def bench(
         say(f"page: {out / results.name}.html")
 
 
-app = typer.Typer(
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    help="Studies and benchmarks that produce the figures which patchproof's documents quote.",
-)
 app.command(cls=StudyCommand)(as_command(study))
 for _verb in (bench, harden, table, keys):
     app.command()(as_command(_verb))
@@ -155,3 +160,18 @@ app.callback()(version_option)
 def main() -> None:
     """Run the command line of the laboratory."""
     run_command_line(app)
+
+
+def figures_page(name: str | None = None) -> str:
+    """The whole page as Markdown, or its sections whose heading holds `name`; refused where none does."""
+    page = _PAGE.read_text(encoding="utf-8")
+    if name is None:
+        return page
+    sections = re.split(r"^(?=## )", page, flags=re.MULTILINE)[1:]
+    found = [section for section in sections if name.lower() in section.partition("\n")[0].lower()]
+    if not found:
+        headings = [section.partition("\n")[0].removeprefix("## ") for section in sections]
+        raise Refused(
+            f"a word of one of the headings {', '.join(headings)}", f'"{name}"', spelling_hint(name, headings)
+        )
+    return "".join(found)

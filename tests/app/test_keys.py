@@ -12,8 +12,7 @@ from console import lab_command
 import patchlab
 import patchproof
 from patchlab.keys import HEAD, documents
-from patchproof.app.files_page import files_page
-from patchproof.app.keys import DOCUMENTS, keys_page, meanings, tables
+from patchproof.app.keys import DOCUMENTS, files_page, keys_page, meanings, tables
 from patchproof.base.errors import Refused
 from patchproof.base.validation import StrictModel
 from patchproof.sheets.template import QrCode

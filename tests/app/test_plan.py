@@ -16,10 +16,9 @@ from PIL import Image
 from patchproof.app import cli
 from patchproof.app.plan import errors
 from patchproof.app.plan.cost import measure_cost
-from patchproof.app.plan.errors import measure_terms
+from patchproof.app.plan.errors import Setup, measure_terms, scene_terms
 from patchproof.app.plan.lines import geometry_lines, measured_lines
 from patchproof.app.plan.plan import Plan, marker_plan, measured_plan, plan_geometry, resolution_plan, sample_plan
-from patchproof.app.plan.terms import Setup, scene_terms
 from patchproof.base.errors import Refused
 from patchproof.base.settings import SceneSettings
 from patchproof.base.validation import validate_model

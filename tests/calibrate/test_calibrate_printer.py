@@ -16,8 +16,8 @@ import typer
 from PIL import Image, ImageCms
 
 from patchlab.bench import printer as bench_printer
-from patchlab.bench.chart_page import chart_manifest, printed_page
 from patchlab.bench.inkjets import DRIVERS, draw_inkjet
+from patchlab.bench.printer import chart_manifest, printed_page
 from patchproof.app import cli
 from patchproof.base.color import linear_from_srgb, srgb_from_linear
 from patchproof.base.errors import Refused

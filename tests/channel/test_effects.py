@@ -12,7 +12,7 @@ from tolerances import BY_TABLE, FLOAT32
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from patchlab.validation import ablation
-from patchproof.app.plan.terms import PRINTER, Setup, scene_terms
+from patchproof.app.plan.errors import PRINTER, Setup, scene_terms
 from patchproof.base.settings import CameraSettings, LightSettings, PrinterSettings
 from patchproof.channel.effects import (
     EFFECT_BY_NAME,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from patchproof.app.plan.terms import Setup, scene_terms
+from patchproof.app.plan.errors import Setup, scene_terms
 from patchproof.optimizer import loop
 from patchproof.optimizer.problem import set_problem
 from patchproof.render.photograph import expose, photograph

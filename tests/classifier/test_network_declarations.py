@@ -14,7 +14,7 @@ import torch
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from patchproof.app.files_page import declarations
+from patchproof.app.keys import declarations
 from patchproof.base.errors import Refused
 from patchproof.classifier import Classifier, center_square, load_classifier
 from patchproof.classifier.declarations import DECLARED

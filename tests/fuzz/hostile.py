@@ -951,7 +951,7 @@ def prepared() -> None:
     late += " patchproof.optimizer.imported_design patchlab.harden.harden_study patchlab.paper.image_classes"
     late += " patchproof.calibrate.boards patchproof.scene.image_scene patchproof.scene.photo_scene matplotlib.pyplot"
     late += " matplotlib.backends.backend_agg jinja2 pikepdf pypdfium2 scipy.spatial"
-    late += " patchproof.mesh.gltf patchproof.mesh.obj patchproof.mesh.ply patchproof.mesh.stl"
+    late += " patchproof.mesh.gltf patchproof.mesh.obj patchproof.mesh.ply patchproof.mesh.load_mesh"
     for module in late.split():
         importlib.import_module(module)
     readers.prepared(), manifests(), honest_photo(), small_problem(), readers.profile()

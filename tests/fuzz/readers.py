@@ -578,7 +578,7 @@ TEMPLATES = ("a4", "blank_a4", "chart_a4", "charuco_a4", "a4_tiles")
 def template_toml(rng: Rng, folder: Path) -> Read:
     from patchproof.base.packaged import packaged_path
     from patchproof.sheets.blank import blank_page
-    from patchproof.sheets.page_limits import refuse_larger_than_page
+    from patchproof.sheets.page import refuse_larger_than_page
     from patchproof.sheets.piece import lay_out_piece
     from patchproof.sheets.template import load_template
 

@@ -15,8 +15,8 @@ from PIL import Image
 from patchlab.bench import chart as charts
 from patchlab.bench import measure, run
 from patchlab.bench.chart import Chart, ChartPoint, Check, all_checks, pareto_mask, points_table
-from patchlab.bench.demo_problem import demo_problem
 from patchlab.bench.render import resolution_chart
+from patchlab.bench.train import demo_problem
 from patchproof.base.intervals import Estimate
 
 

@@ -9,8 +9,8 @@ import pytest
 
 from patchlab.bench import effort, evidence, train
 from patchlab.bench.chart import Chart, ChartPoint, all_checks
-from patchlab.bench.demo_problem import demo_problem
 from patchlab.bench.paper_photos import PIECE_MM, corners_mm, draw_sheet
+from patchlab.bench.train import demo_problem
 from patchproof.base.intervals import Estimate
 from patchproof.base.settings import OptimizeSettings
 from patchproof.optimizer import expectation, loop

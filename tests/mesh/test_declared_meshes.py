@@ -12,7 +12,7 @@ import pytest
 from mesh_files import SQUARE, SQUARE_FACES, SQUARE_UV, GltfFile, data_uri
 from PIL import Image
 
-from patchproof.app.files_page import declarations
+from patchproof.app.keys import declarations
 from patchproof.base.color import linear_from_srgb
 from patchproof.base.errors import Refused
 from patchproof.mesh.load_mesh import load_mesh

@@ -12,12 +12,12 @@ import trimesh
 from mesh_files import SQUARE_UV, GltfFile
 from PIL import Image
 
+import patchproof.mesh.load_mesh as mesh_loader
 from patchproof.base.color import linear_from_srgb
 from patchproof.base.errors import Refused
-from patchproof.mesh import assets, mesh_file
-from patchproof.mesh.load_mesh import load_mesh
+from patchproof.mesh import assets
+from patchproof.mesh.load_mesh import load_mesh, read_parts
 from patchproof.mesh.mesh import Material, MeshPart, mesh_from_parts
-from patchproof.mesh.mesh_file import read_parts
 
 DATA = os.environ.get("PATCHPROOF_DATA")
 needs_data = pytest.mark.skipif(not DATA, reason="PATCHPROOF_DATA is unset: no meshes from outside")
@@ -503,7 +503,7 @@ def test_long_words_and_long_headers_take_neither_memory_nor_minutes(tmp_path):
 
 
 def test_an_outline_that_has_few_ears_ends(tmp_path, monkeypatch):
-    monkeypatch.setattr(mesh_file, "SECONDS", 0.5)
+    monkeypatch.setattr(mesh_loader, "SECONDS", 0.5)
     corners = np.random.default_rng(0).random((999, 2))
     text = "".join(f"v {x} {y} 0\n" for x, y in corners) + f"f {' '.join(map(str, range(1, 1000)))}\n" * 20
     refused(write(tmp_path, "a.obj", text), "a.obj", "processor time")

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from patchproof.optimizer.pyramid import MIN_COARSEST_BLOCKS, build_pyramid, collapse_pyramid, level_count
+from patchproof.optimizer.subject import MIN_COARSEST_BLOCKS, build_pyramid, collapse_pyramid, level_count
 
 
 @pytest.mark.parametrize(("size", "count"), [((1, 5), 1), ((8, 8), 1), ((15, 40), 1), ((16, 16), 2), ((64, 80), 4)])

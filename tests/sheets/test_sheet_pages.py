@@ -27,8 +27,7 @@ from patchproof.sheets.content import SheetContent
 from patchproof.sheets.layout import Box, check_layout
 from patchproof.sheets.manifest import load_manifest
 from patchproof.sheets.multi_design import write_several
-from patchproof.sheets.page import largest_piece_mm
-from patchproof.sheets.page_limits import refuse_larger_than_page
+from patchproof.sheets.page import largest_piece_mm, refuse_larger_than_page
 from patchproof.sheets.pdf_raster import attached_manifest, rasterize_page, rasterize_piece
 from patchproof.sheets.piece import lay_out_piece, marker_image
 from patchproof.sheets.plan_page import PlanPage

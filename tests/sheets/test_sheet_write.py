@@ -14,12 +14,11 @@ from PIL import Image, ImageCms
 
 from patchproof.base.color import linear_from_srgb
 from patchproof.base.errors import Refused
-from patchproof.sheets.content import SheetContent
+from patchproof.sheets.content import SheetContent, piece_words
 from patchproof.sheets.manifest import dump_manifest, load_manifest
 from patchproof.sheets.pdf import srgb_profile
 from patchproof.sheets.pdf_raster import attached_manifest, rasterize_page, rasterize_piece
 from patchproof.sheets.piece import control_design, lay_out_piece, marker_image
-from patchproof.sheets.piece_words import piece_words
 from patchproof.sheets.print_advice import pdf_advice, sheet_advice
 from patchproof.sheets.template import load_template
 from patchproof.sheets.write import write_sheet

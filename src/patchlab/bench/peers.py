@@ -23,7 +23,7 @@ from patchlab.bench.measure import time_call
 from patchlab.bench.methods import METHODS, load_art
 from patchlab.paper.patch3d import patch_cells
 from patchlab.study.estimates import cluster_mean, median, paired_means
-from patchlab.study.figures import picture_sheet
+from patchlab.study.figures import contact_sheet, enlarge_design, photographs, picture_sheet
 from patchlab.study.grid import (
     GridSettings,
     PositiveInt,
@@ -34,7 +34,6 @@ from patchlab.study.grid import (
     problem_of,
     with_changes,
 )
-from patchlab.study.pictures import contact_sheet, enlarge_design, photographs
 from patchlab.study.record import gain_of, hardest_control, rate_of, to_record
 from patchlab.study.study import Cell, Result, Study
 from patchproof.app.demo import demo_scene

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from patchlab.bench.chart import Chart, ChartPoint
-from patchlab.bench.demo_problem import optimize_demo_design
 from patchlab.bench.measure import time_calls, time_ratio
+from patchlab.bench.train import optimize_demo_design
 from patchproof.base.intervals import student_mean
 from patchproof.base.output import image_pixels
 from patchproof.base.progress import Progress

@@ -7,19 +7,30 @@ measures the time of a view.
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 from torch import Tensor
 
 from patchlab.bench.chart import Chart, ChartPoint
-from patchlab.bench.demo_problem import demo_problem
 from patchlab.study.estimates import paired_means
+from patchproof.app.demo import demo_scene
 from patchproof.base.progress import Progress
 from patchproof.base.settings import OptimizeSettings
-from patchproof.optimizer.loop import SELECT_AFTER, SELECT_VIEWS, State, is_selection_step, steps, views_per_network
+from patchproof.optimizer.loop import (
+    SELECT_AFTER,
+    SELECT_VIEWS,
+    State,
+    is_selection_step,
+    start,
+    steps,
+    views_per_network,
+)
 from patchproof.optimizer.pixels import as_pixels, from_pixels
-from patchproof.optimizer.problem import Problem
+from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.optimizer.responses import responses
+from patchproof.scene.scene import load_scene
 
 STEP_VIEWS, QUICK_STEP_VIEWS = (2, 4, 8, 12, 24), (2, 4, 12)
 ADAM_STEP_SIZES, QUICK_ADAM_STEP_SIZES = (0.0075, 0.015, 0.03, 0.06, 0.12), (0.0075, 0.015, 0.03)  # step sizes
@@ -104,3 +115,19 @@ def designs_after(problem: Problem, numbers: Sequence[int]) -> list[Tensor]:
     """The best designs, as printed, after these numbers of steps (rising)."""
     states: dict[int, State] = {step.state.number: step.state for step in steps(problem)}
     return [from_pixels(as_pixels(states[number].best)) for number in numbers]
+
+
+def optimize_demo_design(count: int, progress: Progress) -> tuple[Problem, Tensor]:
+    """The demo's problem, and the best design 3×h×w of `count` optimizer steps."""
+    problem = demo_problem().with_training(OptimizeSettings(steps=count))
+    state = start(problem)
+    for step in steps(problem, state):
+        state = step.state
+        progress("design", state.number, count)
+    return problem, from_pixels(as_pixels(state.best))
+
+
+def demo_problem() -> Problem:
+    """Build the demo's scene and set its problem."""
+    with TemporaryDirectory() as folder:
+        return set_problem(load_scene(demo_scene(Path(folder))))

@@ -25,9 +25,8 @@ import torch
 
 from patchlab.paper.image_classes import ImageClass, PastedSettings, class_scene, list_classes
 from patchlab.study.estimates import cluster_mean
-from patchlab.study.figures import picture_sheet
+from patchlab.study.figures import contact_sheet, enlarge_design, photographs, picture_sheet
 from patchlab.study.grid import Names, PositiveInt, Seeds, by_values, group_by, make_cell, scene_values, short_name
-from patchlab.study.pictures import contact_sheet, enlarge_design, photographs
 from patchlab.study.record import parse_hits, to_record
 from patchlab.study.study import Cell, Result, Study
 from patchproof.base.errors import Refused

@@ -26,7 +26,7 @@ from pydantic import Field
 from patchlab.harden.labeled_photos import write_labels
 from patchlab.paper.image_classes import write_renders
 from patchlab.study.estimates import cluster_mean
-from patchlab.study.figures import picture_sheet
+from patchlab.study.figures import contact_sheet, enlarge_design, photographs, picture_sheet
 from patchlab.study.grid import (
     GridSettings,
     PositiveInt,
@@ -38,7 +38,6 @@ from patchlab.study.grid import (
     group_by,
     problem_of,
 )
-from patchlab.study.pictures import contact_sheet, enlarge_design, photographs
 from patchlab.study.record import Record, parse_hits, to_record
 from patchlab.study.study import Cell, Result, Study
 from patchproof.base.errors import Refused

@@ -35,9 +35,8 @@ from patchlab.paper.stress_map import (
     spread_over_cells,
     worst_cells,
 )
-from patchlab.study.figures import picture_sheet
+from patchlab.study.figures import contact_sheet, photographs, picture_sheet
 from patchlab.study.grid import GridSettings, PositiveInt, cell_key, problem_of
-from patchlab.study.pictures import contact_sheet, photographs
 from patchlab.study.record import hits_text, parse_hits
 from patchlab.study.study import Cell, Result, Study
 from patchproof.base.intervals import estimate_difference, paired_difference, rate

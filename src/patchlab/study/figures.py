@@ -1,6 +1,7 @@
-"""Figures that several studies draw: stored pictures of cells, and grids of numbers.
+"""Pictures that a study's cells store, and figures that several studies draw.
 
-In: files of pictures; arrays of numbers. Out: `Drawing`s for a study's page, or images on axes.
+In: a problem and an appearance, or pixels; files of pictures; arrays of numbers. Out: tensors N×3×S×S in [0, 1] and PNG
+bytes; `Drawing`s for a study's page, or images on axes.
 """
 
 from collections.abc import Sequence
@@ -8,13 +9,22 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
 
+from patchproof.optimizer.pixels import as_pixels, from_pixels
+from patchproof.optimizer.problem import Problem
+from patchproof.render.photograph import Appearance, expose
+from patchproof.report.images import png
 from patchproof.report.tables import Drawing
+from patchproof.scene.conditions import Conditions
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from matplotlib.image import AxesImage
+
 
 EMPTY_COLOR = "#dddddd"  # of cells without an effect
 
@@ -72,3 +82,25 @@ def number_grid(
 
 def _middles(length: int, parts: int) -> list[float]:
     return [length * (i + 0.5) / parts for i in range(parts)]
+
+
+def photographs(problem: Problem, shown: Appearance, conditions: Conditions, side_px: int) -> Tensor:
+    """N×3×S×S square photographs of one appearance; None is the bare object."""
+    with torch.no_grad():
+        return expose(problem.see(shown, conditions, side_px), shown)
+
+
+def contact_sheet(rows: Sequence[Sequence[Tensor] | Tensor]) -> bytes:
+    """One PNG of rows of pictures 3×S×S."""
+    return png(as_pixels(torch.cat([torch.cat(list(row), 2) for row in rows], 1)))
+
+
+def enlarge_design(pixels: np.ndarray, side_px: int) -> Tensor:
+    """A design H×W×3 enlarged, without smoothing, in the middle of a white square 3×S×S."""
+    height, width = pixels.shape[:2]
+    scale = side_px / max(height, width)
+    size = (round(width * scale), round(height * scale))
+    tile = Image.new("RGB", (side_px, side_px), "white")
+    large = Image.fromarray(pixels).resize(size, Image.Resampling.NEAREST)
+    tile.paste(large, ((side_px - size[0]) // 2, (side_px - size[1]) // 2))
+    return from_pixels(np.asarray(tile))

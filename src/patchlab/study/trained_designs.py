@@ -11,8 +11,8 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
+from patchlab.study.figures import contact_sheet, photographs
 from patchlab.study.grid import GridSettings, Names, SceneChanges, make_cell, scene_values, short_name, with_changes
-from patchlab.study.pictures import contact_sheet, photographs
 from patchlab.study.record import to_record
 from patchlab.study.study import Cell, Result
 from patchproof.base.intervals import Estimate

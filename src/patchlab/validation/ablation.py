@@ -26,7 +26,7 @@ from patchlab.study.estimates import mean
 from patchlab.study.grid import CellValues, GridSettings, Names, by_values, cell_key, grid_cells, group_by, problem_of
 from patchlab.study.record import parse_hits, to_record
 from patchlab.study.study import Cell, Result, Study
-from patchproof.app.plan.terms import PRINTER, Setup, effect_terms, scene_terms
+from patchproof.app.plan.errors import PRINTER, Setup, effect_terms, scene_terms
 from patchproof.base.errors import Refused
 from patchproof.base.intervals import Estimate
 from patchproof.base.sessions import count_by_session, rate_posterior

@@ -1,7 +1,9 @@
-"""Write every key of scene files and page templates as one Markdown page, read from the settings classes.
+"""Write every key of scene files and page templates, or what files may declare, as one Markdown page.
 
-Out: per table a row per key: type and range, unit, default, meaning. The meaning is the comment at the end of the
-field's last line or, without one, the comment above the field, so that it is written only once, in the code.
+In: the settings classes; the readers' own lists of declarations. Out: per table a row per key: type and range, unit,
+default, meaning; a table for each kind of input. The meaning is the comment at the end of the field's last line or,
+without one, the comment above the field, so that it is written only once, in the code. What is in no list is not read:
+such as sidecar files, or the comments in a file.
 """
 
 import ast
@@ -10,6 +12,7 @@ import json
 from collections.abc import Iterator, Mapping
 from enum import Enum
 from functools import lru_cache, partial
+from importlib import import_module
 from itertools import takewhile
 from types import UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
@@ -17,6 +20,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 from pydantic import AfterValidator, BaseModel
 from pydantic.fields import FieldInfo
 
+from patchproof.base.declared import Declaration
 from patchproof.base.errors import Refused
 from patchproof.base.settings import SceneSettings
 from patchproof.base.validation import StrictModel, check_ordered, models_in, spelling_hint
@@ -37,6 +41,21 @@ DOCUMENTS: Documents = {
     "scene": ("A scene file: `patchproof optimize`, `plan`.", SceneSettings),
     "template": ("A page template: `patchproof sheet --template FILE.toml`.", Template),
     "board": ("A page template with a board that calibrates cameras.", BoardTemplate),
+}
+FILES_HEAD = """# What files declare
+
+Printed by `patchproof keys --files` from the lists of the readers. *used*: taken as the file says. *refused*: one
+sentence, exit code 1 (a photograph: rejected with its code). *said*: left aside, with a line in the command's output,
+the preview and the report.
+"""
+# the kinds of input, and the modules whose DECLARED lists what they can declare
+READERS: dict[str, tuple[str, ...]] = {
+    "Meshes": ("mesh.declarations",),
+    "Networks": ("classifier.declarations",),
+    "Photographs and pictures": ("photo.declarations",),
+    "PDFs": ("sheets.declarations",),
+    "Settings and text files": ("base.declarations",),
+    "Boxes": ("evidence.declarations",),
 }
 
 
@@ -170,3 +189,17 @@ def _bounds(checks: tuple[Any, ...]) -> list[tuple[str, Any]]:
             names = ("ge", "gt", "le", "lt", "min_length")
             bounds += [(name, getattr(limit, name)) for name in names if hasattr(limit, name)]
     return bounds
+
+
+def declarations(reader: str) -> tuple[Declaration, ...]:
+    """The lists of one kind of input in `READERS`, joined."""
+    return tuple(entry for module in READERS[reader] for entry in import_module(f"patchproof.{module}").DECLARED)
+
+
+def files_page() -> str:
+    """Write the page of all kinds of input as Markdown."""
+    lines = [FILES_HEAD]
+    for reader in READERS:
+        lines += [f"## {reader}", "", "| file | declares | answer | how |", "|---|---|---|---|"]
+        lines += [f"| {' | '.join(entry)} |" for entry in declarations(reader)] + [""]
+    return "\n".join(lines)

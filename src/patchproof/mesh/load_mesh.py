@@ -1,12 +1,16 @@
-"""Load a mesh by its name: a file (`mesh_file`), a procedural object (`primitives`), or a mesh given in Python.
+"""Load a mesh by its name: a file, a procedural object (`primitives`), or a mesh given in Python.
 
-In: a path, `primitive:NAME` or `python:NAME`, and the object's longest extent. Out: a `Mesh` in the scene's frame.
-Textures larger than any photograph shows are reduced. A mesh in memory goes through GLB and the reader of files, so
-that it equals what its run's folder will hold.
+In: a path of an OBJ (with MTL), GLB, glTF, PLY or STL file, `primitive:NAME` or `python:NAME`, and the object's longest
+extent. Out: a `Mesh` in the scene's frame, with warnings about what is not shown as declared (`declarations`). Refused:
+a file that cannot be parsed, and a texture that it names but that is missing or broken. Textures larger than any
+photograph shows are reduced. A mesh in memory goes through GLB and the reader of files, so that it equals what its
+run's folder will hold.
 """
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Literal
@@ -14,14 +18,20 @@ from typing import Literal
 import numpy as np
 
 from patchproof.base.errors import Refused
+from patchproof.base.input import is_file, run_within_seconds
 from patchproof.base.resample import downscale
-from patchproof.mesh.mesh import Material, Mesh, MeshPart, mesh_from_parts
+from patchproof.mesh.assets import Assets
+from patchproof.mesh.mesh import Material, Mesh, MeshPart, mesh_from_parts, topology_warnings, transform_part
 
 PYTHON_PREFIX = "python:"
 
 # Larger textures are reduced: 8192 × 8192 took 4 GB and 5 s to set up, more detail than any photograph shows.
 LARGEST_TEXTURE_PX = 4096
 _Y_UP_FROM_Z_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+SECONDS = 40.0  # of processor time to read a mesh, and more for long files, of which text takes longest:
+_BYTES_PER_SECOND = 500_000
+FORMATS = {".obj": "obj", ".glb": "gltf", ".gltf": "gltf", ".ply": "ply", ".stl": "stl"}
+_FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
 
 def load_mesh(path: str | Path, length_mm: float, up: Literal["y", "z"] = "z", mesh_glb: bytes | None = None) -> Mesh:
@@ -36,8 +46,6 @@ def load_mesh(path: str | Path, length_mm: float, up: Literal["y", "z"] = "z", m
 
         mesh = primitives.build(str(path).removeprefix("primitive:"), 0)
         return replace(mesh, vertices=mesh.vertices * (length_mm / np.ptp(mesh.vertices, axis=0).max()))
-    from patchproof.mesh.mesh_file import read_parts
-
     with TemporaryDirectory() as folder:
         if is_given := str(path).startswith(PYTHON_PREFIX):
             if mesh_glb is None:
@@ -62,3 +70,46 @@ def _reduce_textures(parts: Sequence[MeshPart]) -> tuple[list[MeshPart], list[st
             old_size, new_size = (f"{pixels.shape[1]} × {pixels.shape[0]}" for pixels in (texture, small))
             warnings.append(f"the texture of {old_size} of {material.name} is reduced to {new_size}")
     return [replace(part, material=reduced_materials.get(part.material, part.material)) for part in parts], warnings
+
+
+def read_parts(path: Path, world_from_file: np.ndarray) -> tuple[list[MeshPart], list[str], list[Path]]:
+    """Read every placed geometry with faces, its vertices and normals turned by `world_from_file` 3×3; warnings; and
+    the files that were read.
+    """
+    if not is_file(path) or not path.stat().st_size:  # some files of the system are empty, and never end
+        raise Refused("a mesh file", f"no file at {path}, or an empty one", "check the path")
+    kind = FORMATS.get(path.suffix.lower())
+    if kind is None:
+        raise Refused(f"a mesh file ({', '.join(FORMATS)})", path.name, "export the mesh in one of these formats")
+    try:
+        assets = Assets(path)
+        read = read_stl if kind == "stl" else getattr(import_module(f"patchproof.mesh.{kind}"), f"read_{kind}")
+        parts = run_within_seconds(SECONDS + len(assets.data) / _BYTES_PER_SECOND, lambda: read(assets))
+        world_from_file = np.column_stack([world_from_file, np.zeros(3)])
+        parts = [transform_part(part, world_from_file) for part in parts if len(part.faces)]
+        if not parts:
+            raise Refused("a mesh with faces", f"no face in {path.name}", "export the object as triangles")
+        return parts, [*assets.warnings, *topology_warnings(parts)], assets.files
+    except Refused:
+        raise
+    except Exception as error:  # broken files raise many types of error
+        got = f"{path.name} that cannot be read ({f'{type(error).__name__}: {error}'[:120]})"
+        raise Refused(f"a mesh as {path.suffix[1:].upper()}", got, "export it again") from error
+
+
+def read_stl(assets: Assets) -> list[MeshPart]:
+    """Read an STL file, text or binary, as one part; several solids are one object, and colors are left out, which
+    programs write in different ways.
+    """
+    data = assets.data
+    if len(data) >= 84 and len(data) == 84 + _FACET.itemsize * int.from_bytes(data[80:84], "little"):
+        facets = np.frombuffer(data, _FACET, offset=84)
+        corners = facets["corners"].reshape(-1, 3).astype(float)
+        if facets["attribute"].any() or b"COLOR=" in data[:80]:
+            assets.say("colors in the STL file are left out")
+    elif b"endsolid" in data.lower():
+        rows = re.findall(rb"\bvertex\s+(\S+)\s+(\S+)\s+(\S+)", data.lower())
+        corners = np.array([[*map(float, row)] for row in rows]).reshape(-1, 3)
+    else:
+        raise ValueError("neither text nor of the size that it states")
+    return [MeshPart(corners, np.arange(len(corners)).reshape(-1, 3), assets.gray())]

@@ -18,10 +18,9 @@ from torch import Tensor
 from patchproof.base.errors import Refused
 from patchproof.base.output import image_bytes
 from patchproof.channel.printer import Printer
-from patchproof.optimizer import pyramid
 from patchproof.optimizer.losses import total_variation
 from patchproof.optimizer.pixels import as_pixels
-from patchproof.optimizer.subject import DESIGN_FILE, Grid, read_png, write_png
+from patchproof.optimizer.subject import DESIGN_FILE, Grid, build_pyramid, collapse_pyramid, read_png, write_png
 from patchproof.render.designs import PrintedPiece
 from patchproof.render.pixels import PiecePicture
 from patchproof.scene.interface import PieceScene, Scene, require_piece
@@ -61,11 +60,11 @@ class Patch:
 
     def gradient_levels(self, gradient: Tensor) -> tuple[Tensor, ...]:
         """The gradient's pyramid."""
-        return pyramid.build_pyramid(gradient)
+        return build_pyramid(gradient)
 
     def combine_levels(self, updates: Sequence[Tensor]) -> Tensor:
         """Combine the updates of the pyramid's levels into one update of the design."""
-        return pyramid.collapse_pyramid(updates)
+        return collapse_pyramid(updates)
 
     def penalty(self, design: Tensor) -> Tensor | float:
         """The penalty of a design by the scene's settings: total variation, colors that the printer misses."""

@@ -3,8 +3,15 @@
 In: a scene. Out: a `Subject`, which gives the first design, the allowed designs, their penalty and appearance, and the
 files a run stores. A design is a float tensor 3×h×w in [0, 1], its `pixels` are uint8 h×w×3. Patches and textures have
 a module each; a scene loads the one it needs.
+
+The gradient's pyramid moves large parts of a design as readily as single pixels: the optimizer scales its levels, means
+over blocks of 1, 2, 4 … pixels, each on its own, and adds them. The gradient of a pixel is mostly that of the few views
+it was drawn from; the mean over a block shares it with every view, so that color and large shapes, which count in small
+and blurred views, come first. Laplacian pyramid normalization of DeepDream (Mordvintsev et al., TensorFlow tutorial,
+2015) scales levels likewise, by their spread instead of Adam's.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import import_module
@@ -16,6 +23,7 @@ import numpy as np
 import torch
 from PIL import Image
 from torch import Tensor
+from torch.nn.functional import avg_pool2d, interpolate
 
 from patchproof.base.input import open_image
 from patchproof.base.output import write_atomically
@@ -24,6 +32,7 @@ from patchproof.render.pixels import Appearance
 from patchproof.scene.interface import Scene
 
 DESIGN_FILE, OBJECT_FILE, TEXTURE_FILES, MASK_FILE = "design.png", "object.glb", "texture_*.png", "mask.png"
+MIN_COARSEST_BLOCKS = 8  # blocks along the shorter side of the coarsest level
 
 
 @dataclass(frozen=True)
@@ -46,35 +55,27 @@ class Subject(Protocol):
 
     def start(self) -> Tensor:
         """The design before the first step."""
-        ...
 
     def clip(self, design: Tensor) -> Tensor:
         """The nearest design that is allowed."""
-        ...
 
     def gradient_levels(self, gradient: Tensor) -> tuple[Tensor, ...]:
         """The gradient's pyramid."""
-        ...
 
     def combine_levels(self, updates: Sequence[Tensor]) -> Tensor:
         """Combine the updates of the pyramid's levels into one update of the design."""
-        ...
 
     def penalty(self, design: Tensor) -> Tensor | float:
         """The penalty of a design by the scene's settings."""
-        ...
 
     def pixels(self, design: Tensor) -> np.ndarray:
         """The pixels of a design that are printed or stored."""
-        ...
 
     def control(self, kind: str, pixels: np.ndarray) -> np.ndarray:
         """The pixels of the control of this kind, in place of the design's."""
-        ...
 
     def appearance(self, design: Tensor, kind: str = "design") -> Appearance:
         """The appearance of a design, or of a control with the markers of its own sheet; differentiable."""
-        ...
 
     def print_design(self, design: Tensor) -> Tensor:
         """The print that all pictures of a design share, made once a step; differentiable. A texture is not printed."""
@@ -91,15 +92,12 @@ class Subject(Protocol):
     @property
     def grid(self) -> Grid:
         """The resolution of designs."""
-        ...
 
     def save(self, pixels: np.ndarray, folder: Path) -> None:
         """Write the design's files into a run's folder; earlier ones are replaced only by complete ones."""
-        ...
 
     def file(self, pixels: np.ndarray) -> tuple[str, bytes]:
         """A file name's suffix, and the one file that shows the design to others."""
-        ...
 
 
 def subject_of(scene: Scene, printer: Printer, network_px: int, device: torch.device) -> Subject:
@@ -127,3 +125,32 @@ def read_png(path: Path, max_side_px: int = 1 << 16) -> np.ndarray:
         if max(image.size) > max_side_px:
             raise ValueError(f"{image.width} × {image.height} pixels, more than {max_side_px} along a side")
         return np.asarray(image.convert("RGB"))
+
+
+def build_pyramid(gradient: Tensor, mask: Tensor | None = None) -> tuple[Tensor, ...]:
+    """C×H×W → C×⌈H/2ˡ⌉×⌈W/2ˡ⌉ for l = 0, 1, …: means over the pixels of a block that lie in picture and mask.
+
+    `mask` is H×W, 1 where the picture may change; the gradient is 0 elsewhere.
+    """
+    weights = None if mask is None else mask[None, None].to(gradient)
+    pooled = []
+    for level in range(1, level_count(gradient.shape[1:])):
+        mean = avg_pool2d(gradient[None], 2**level, ceil_mode=True)[0]
+        if weights is not None:
+            mean = mean / avg_pool2d(weights, 2**level, ceil_mode=True)[0].clamp(min=1e-6)
+        pooled.append(mean)
+    return (gradient, *pooled)
+
+
+def level_count(size_px: Sequence[int]) -> int:
+    """The number of levels for a picture of that size, the full size included."""
+    return 1 + max(0, int(math.log2(max(1, min(size_px)) / MIN_COARSEST_BLOCKS)))
+
+
+def collapse_pyramid(updates: Sequence[Tensor]) -> Tensor:
+    """The levels' sum at the finest's size; divided by √count, so that independent levels add up to one step."""
+    finest, total = updates[0], updates[0]
+    for level, update in enumerate(updates[1:], 1):
+        large = interpolate(update[None], scale_factor=2**level, mode="bilinear", align_corners=False)[0]
+        total = total + large[:, : finest.shape[1], : finest.shape[2]]
+    return total / math.sqrt(len(updates))

@@ -23,9 +23,19 @@ from patchproof.base.errors import Refused
 from patchproof.base.output import write_atomically
 from patchproof.channel.printer import Printer
 from patchproof.mesh.export import write_glb
-from patchproof.optimizer import pyramid
 from patchproof.optimizer.pixels import as_pixels, from_pixels
-from patchproof.optimizer.subject import MASK_FILE, OBJECT_FILE, TEXTURE_FILES, Grid, Subject, read_png, write_png
+from patchproof.optimizer.subject import (
+    MASK_FILE,
+    OBJECT_FILE,
+    TEXTURE_FILES,
+    Grid,
+    Subject,
+    build_pyramid,
+    collapse_pyramid,
+    level_count,
+    read_png,
+    write_png,
+)
 from patchproof.render.designs import LearnedTextures
 from patchproof.render.pixels import ObjectTextures
 from patchproof.scene.canvas import Canvas
@@ -59,14 +69,14 @@ class Texture(Subject):
 
     def gradient_levels(self, gradient: Tensor) -> tuple[Tensor, ...]:
         """The gradient's pyramids, texture by texture."""
-        return tuple(chain(*map(pyramid.build_pyramid, self.surface.images(gradient), self.surface.masks)))
+        return tuple(chain(*map(build_pyramid, self.surface.images(gradient), self.surface.masks)))
 
     def combine_levels(self, updates: Sequence[Tensor]) -> Tensor:
         """Combine the updates of the pyramids' levels into one update of the design."""
         parts, remaining = [], iter(updates)
         for mask in self.surface.masks:
-            levels = list(islice(remaining, pyramid.level_count(mask.shape)))
-            parts.append(pyramid.collapse_pyramid(levels)[:, mask])
+            levels = list(islice(remaining, level_count(mask.shape)))
+            parts.append(collapse_pyramid(levels)[:, mask])
         return torch.cat(parts, 1)[:, None]
 
     def penalty(self, design: Tensor) -> Tensor | float:

@@ -33,7 +33,7 @@ from patchproof.scene.conditions import Conditions, Stream
 from patchproof.scene.interface import PX_PER_MODULE, READABLE_SHARE, SceneSource
 from patchproof.scene.picture_scene import BasePicture, PictureScene
 from patchproof.sheets.markers import MARKER_MODULES
-from patchproof.sheets.page_limits import refuse_larger_than_page
+from patchproof.sheets.page import refuse_larger_than_page
 from patchproof.sheets.piece import Piece, lay_out_piece, marker_size_mm
 from patchproof.sheets.template import load_template
 

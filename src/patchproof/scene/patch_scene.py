@@ -19,7 +19,7 @@ from patchproof.scene.interface import SCALE_VIEWS, PieceScene, Scene, SceneSour
 from patchproof.scene.mesh_scene import MeshScene, camera_poses, load_bare
 from patchproof.scene.placement import Placement, PlacementMethod, patch_frame, place_card
 from patchproof.sheets.markers import MARKER_MODULES
-from patchproof.sheets.page_limits import refuse_larger_than_page
+from patchproof.sheets.page import refuse_larger_than_page
 from patchproof.sheets.piece import Piece, lay_out_piece, marker_size_mm, smallest_piece_mm
 from patchproof.sheets.template import load_template
 

@@ -40,7 +40,7 @@ from patchproof.scene.picture_scene import BasePicture, PictureScene
 from patchproof.sheets.blank import blank_piece
 from patchproof.sheets.manifest import Manifest, load_manifest
 from patchproof.sheets.markers import DICTIONARY
-from patchproof.sheets.page_limits import refuse_larger_than_page
+from patchproof.sheets.page import refuse_larger_than_page
 from patchproof.sheets.piece import Piece, with_ids
 from patchproof.sheets.template import load_template
 

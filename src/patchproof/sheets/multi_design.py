@@ -16,13 +16,12 @@ from itertools import chain
 from pathlib import Path
 
 from patchproof.base.errors import Refused
-from patchproof.sheets.content import SheetContent
+from patchproof.sheets.content import SheetContent, piece_words
 from patchproof.sheets.layout import PageLayout
 from patchproof.sheets.manifest import Manifest, design_sha256
 from patchproof.sheets.page import lay_out_parts, piece_name, place_pieces
 from patchproof.sheets.pdf import PdfPage
 from patchproof.sheets.piece import hash_order, move_marker, sheet_id
-from patchproof.sheets.piece_words import piece_words
 from patchproof.sheets.plan_page import PlanPage, lay_out_plan
 from patchproof.sheets.rects import RectMm, size_text
 from patchproof.sheets.template import Template

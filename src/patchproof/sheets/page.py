@@ -11,11 +11,10 @@ from dataclasses import replace
 
 from patchproof.base.errors import Refused
 from patchproof.sheets.chart import chart_swatches
-from patchproof.sheets.content import SheetContent
+from patchproof.sheets.content import SheetContent, piece_words
 from patchproof.sheets.layout import Box, PageLayout, PageParts, check_layout, quiet_zone_rect, ruler_parts, text_box
 from patchproof.sheets.markers import MARKER_MODULES
 from patchproof.sheets.piece import Piece, black_runs, marker_ids, marker_rect, move_marker, square_marker
-from patchproof.sheets.piece_words import piece_words
 from patchproof.sheets.rects import PointMm, RectMm, grow_rect, round_rect, shift_rect, size_text
 from patchproof.sheets.template import AnyTemplate, Template, TextLine, template_names
 
@@ -159,3 +158,15 @@ def _fill_placeholders(line: TextLine, words: dict[str, str]) -> TextLine:
         return words[match[1]]
 
     return line.changed(text=re.sub(r"\{(.*?)\}", value, line.text))
+
+
+def refuse_larger_than_page(template: Template, piece: Piece) -> None:
+    """Refuse a piece of which no sheet can be made: too large, or with more markers than there are ids."""
+    others = len(template.marker.corners_mm)
+    if template.tiles is None:
+        place_pieces(template, [piece])
+    else:
+        from patchproof.sheets.tiles import MARKERS_PER_TILE, plan_tiles
+
+        others += MARKERS_PER_TILE * len(plan_tiles(template, piece))
+    marker_ids("", "design", len(piece.markers) + others)

@@ -17,14 +17,13 @@ from itertools import pairwise
 
 from patchproof.base.errors import Refused
 from patchproof.sheets import layout
-from patchproof.sheets.content import SheetContent
+from patchproof.sheets.content import SheetContent, piece_words
 from patchproof.sheets.layout import Box, Line, PageLayout, PageParts, PieceWindow
 from patchproof.sheets.manifest import Manifest, Marker, Tile
 from patchproof.sheets.markers import MARKER_MODULES
 from patchproof.sheets.page import CUT_LINE_MM, MAX_TILES, lay_out_parts, piece_zone_mm
 from patchproof.sheets.pdf import PdfPage
 from patchproof.sheets.piece import Piece, manifest_marker, marker_ids, marker_rect, move_marker, square_marker
-from patchproof.sheets.piece_words import piece_words
 from patchproof.sheets.rects import PointMm, RectMm, grow_rect, rect_contains, rects_overlap, shift_rect, size_text
 from patchproof.sheets.template import Template, TextLine, TileGrid, template_names
 

@@ -113,7 +113,7 @@ def guess_length_mm(path: Path) -> float:
 
 def file_length(path: Path) -> float:
     """The longest extent in the file's own unit."""
-    from patchproof.mesh.mesh_file import read_parts
+    from patchproof.mesh.load_mesh import read_parts
 
     parts, *_ = read_parts(path, np.eye(3))
     corners = np.concatenate([part.vertices[part.faces].reshape(-1, 3) for part in parts])

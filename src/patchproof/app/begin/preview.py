@@ -17,8 +17,16 @@ import numpy as np
 import torch
 
 from patchproof.app.begin.guess import lying_hint, other_axis
-from patchproof.app.begin.sample_views import SampleView, sample_views
-from patchproof.app.begin.sides import SIDE_NAMES, gap_colors, ramp_colors, side_of, side_views, turntable
+from patchproof.app.begin.sides import (
+    SIDE_NAMES,
+    SampleView,
+    gap_colors,
+    ramp_colors,
+    sample_views,
+    side_of,
+    side_views,
+    turntable,
+)
 from patchproof.base.color import codes_from_srgb
 from patchproof.base.errors import Refused
 from patchproof.base.output import base64_uri, image_bytes, new_folder, write_atomically

@@ -1,20 +1,30 @@
-"""Pictures of an object from its six sides, with ground line, scale bar and piece; and from all around.
+"""Pictures of an object from its six sides, with ground line, scale bar and piece; from all around; and sample views.
 
 In: a stage with a mesh, with a piece on it or without. Out: `SideView`s at one scale; pictures at one scale from a ring
 of directions, for a page that turns the object by a slider; the piece's gap and stretch as colors. The sides are those
 of `patch.side`; front and back are along z, as in glTF's standard and after `object.up = "z"` turned the y of other
 programs there. The ring is seen from far away, in even light, and from above or below if the piece is on top or below.
+Sample views are drawn from the train stream as optimizing draws them, and have the networks' answers beside them.
 """
 
+import math
 from dataclasses import dataclass
+from pathlib import Path
 from typing import get_args
 
 import numpy as np
+import torch
+from torch import Tensor
 
-from patchproof.base.geometry import UP, orbit
+from patchproof.base.geometry import UP, orbit, rect_border
 from patchproof.base.validation import Side
+from patchproof.classifier.network import Classifier
+from patchproof.optimizer.pixels import as_pixels
+from patchproof.render.photograph import photograph
 from patchproof.render.stage import Stage
 from patchproof.reprints.plan_view import plan_picture
+from patchproof.scene.conditions import Conditions
+from patchproof.scene.interface import PieceScene
 from patchproof.scene.mesh_scene import MeshScene, require_mesh
 from patchproof.scene.patch_scene import PatchScene
 from patchproof.scene.placement import Placement, SurfaceFrame, gap_limit_mm, side_frame
@@ -28,6 +38,11 @@ _BAR_SHARE = 0.35  # of the picture's width at most
 # five colors of viridis, legible to the color-blind; and a color for no surface that is none of them
 RAMP_RGB = ((68, 1, 84), (59, 82, 139), (33, 145, 140), (94, 201, 98), (253, 231, 37))
 NO_SURFACE_RGB = (230, 0, 90)
+
+
+_VIEWS, _TOP = 8, 5
+_LEAST_PX = 200  # of a view's side: people see little in smaller ones
+_EDGE_POINTS = 8  # bent paper has bent edges
 
 
 @dataclass(frozen=True)
@@ -120,3 +135,66 @@ def _picture(stage: Stage, side: Side, half_mm: float) -> np.ndarray:
     if isinstance(scene, PatchScene) and (scene.placement.normals @ frame.normal).max() > 1e-6:
         colors = gap_colors(scene.placement)
     return plan_picture(stage, frame, np.array([half_mm, half_mm]), PICTURE_PX, colors)
+
+
+@dataclass(frozen=True)
+class NetworkAnswer:
+    """A network's most likely labels of one picture with their confidences; `recognized` if it sees the target."""
+
+    network: str
+    labels: tuple[tuple[str, float], ...]
+    recognized: bool
+
+
+@dataclass(frozen=True)
+class SampleView:
+    """One view: uint8 S×S×3, and the piece's outline M×2 in its pixels (None if the piece is turned away)."""
+
+    picture: np.ndarray
+    outline_px: np.ndarray | None
+    azimuth_deg: float
+    elevation_deg: float
+    distance_mm: float
+    answers: tuple[NetworkAnswer, ...]
+
+
+def sample_views(stage: Stage, classifiers: list[Classifier], indices: list[tuple[int, ...]]) -> tuple[SampleView, ...]:
+    """Render 8 views of the bare object and classify them; `indices` are the target's in each network (empty: none)."""
+    network_px = max(classifier.input_px for classifier in classifiers)
+    side_px = network_px * math.ceil(_LEAST_PX / network_px)
+    conditions = stage.scene.draw("train", _VIEWS)
+    with torch.no_grad():
+        pictures = photograph(stage, None, conditions, (side_px, side_px), jpeg=False)
+        logits = [classifier.logits(pictures, stage.scene.boxes(conditions)) for classifier in classifiers]
+    pose = conditions.pose
+    return tuple(
+        SampleView(
+            picture=as_pixels(pictures[i]),
+            outline_px=_outline(stage, conditions[[i]], side_px),
+            azimuth_deg=float(pose.azimuth_deg[i]),
+            elevation_deg=float(pose.elevation_deg[i]),
+            distance_mm=float(pose.distance_mm[i]),
+            answers=tuple(
+                _answer(classifier, network_logits[i], target)
+                for classifier, network_logits, target in zip(classifiers, logits, indices, strict=True)
+            ),
+        )
+        for i in range(_VIEWS)
+    )
+
+
+def _answer(classifier: Classifier, logits: Tensor, target: tuple[int, ...]) -> NetworkAnswer:
+    best = classifier.probabilities(logits[None])[0].topk(min(_TOP, len(classifier.labels)))
+    labels = tuple((classifier.labels[index], share) for share, index in zip(*map(Tensor.tolist, best), strict=True))
+    recognized = bool(target) and bool(classifier.recognized(logits[None], target)[0])
+    return NetworkAnswer(Path(classifier.name).name, labels, recognized)
+
+
+def _outline(stage: Stage, conditions: Conditions, side_px: int) -> np.ndarray | None:
+    """The piece's cut line in pixels of the photograph's centered square; None if it is turned away."""
+    scene = stage.scene
+    if not isinstance(scene, PieceScene) or not scene.facing(conditions)[0]:
+        return None
+    border, photo_px = rect_border((0, 0, *scene.piece.size_mm), _EDGE_POINTS), np.array(scene.photo_px)
+    points = (scene.piece_px(conditions, border) - (photo_px - photo_px.min()) / 2) * side_px / photo_px.min()
+    return points if np.isfinite(points).all() else None

@@ -83,7 +83,6 @@ def keys(
     files: Annotated[bool, Option("--files", help="What files may declare, and what is done with it.")] = False,
 ) -> None:
     """All keys of scene files and page templates: range, unit, default and meaning, as Markdown."""
-    from patchproof.app.files_page import files_page
-    from patchproof.app.keys import DOCUMENTS, keys_page
+    from patchproof.app.keys import DOCUMENTS, files_page, keys_page
 
     print(files_page() if files else keys_page(DOCUMENTS, name), end="")

@@ -185,9 +185,8 @@ def reprint(
     """Print the PDF in simulation, put it back on the object, and photograph it."""
     from patchproof.optimizer.run import load_run
     from patchproof.reprints.mounted_sheet import ReprintSetup
-    from patchproof.reprints.page_photos import reprint_pages
+    from patchproof.reprints.page_photos import reprint_pages, scan
     from patchproof.reprints.reprint import reprint as reprint_sheet
-    from patchproof.reprints.scan import scan
 
     scale = console.pair_of(print_scale, "--print-scale")
     if scan_dpi is not None and control is not None:
