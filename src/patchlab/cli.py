@@ -7,19 +7,7 @@ from typing import Annotated, Literal
 import typer
 from typer.core import TyperCommand
 
-from patchproof.app.cli.console import (
-    Cluster,
-    Jobs,
-    Overwrite,
-    Resume,
-    as_command,
-    names_of,
-    progress,
-    run_command_line,
-    say,
-    say_study,
-    version_option,
-)
+from patchproof.app.cli import console
 from patchproof.base.errors import Refused
 from patchproof.base.validation import spelling_hint
 
@@ -44,10 +32,10 @@ def harden(
     judges: Annotated[str | None, typer.Option(help="Comma-separated classifiers that only judge.")] = None,
     evaluate: Annotated[str, typer.Option(help="Attacks to withstand: fgsm, pgd.")] = "",
     attack_eps: Annotated[str, typer.Option(help="Values of ε of these attacks.")] = "0.01,0.02,0.04",
-    resume: Resume = False,
-    overwrite: Overwrite = False,
-    jobs: Jobs = None,
-    cluster: Cluster = None,
+    resume: console.Resume = False,
+    overwrite: console.Overwrite = False,
+    jobs: console.Jobs = None,
+    cluster: console.Cluster = None,
 ) -> None:
     """Change labeled images so that classifiers recognize them better, and attack them."""
     from patchlab.harden.harden_study import HardenSettings, harden_images
@@ -57,22 +45,22 @@ def harden(
     options = {
         "images": str(images),
         "labels": str(labels),
-        "models": names_of(model),
+        "models": console.names_of(model),
         "together": True,
-        "judges": names_of(judges) or (),
+        "judges": console.names_of(judges) or (),
         "methods": (method,),
         "epsilons": (eps,),
         "steps": steps,
         "step_size": step_size,
         "through": through,
-        "attacks": names_of(evaluate),
-        "attack_epsilons": names_of(attack_eps),
+        "attacks": console.names_of(evaluate),
+        "attack_epsilons": console.names_of(attack_eps),
     }
-    with progress() as bar:
+    with console.progress() as bar:
         work = Work(resume, overwrite, jobs or 1, cluster, lambda done, total: bar("harden", done, total))
         finished = harden_images(validate_model(HardenSettings, options, "the options"), out, work)
-    say_study(finished)
-    say(f"images: {out}, tables: {out / 'harden.html'}")
+    console.say_study(finished)
+    console.say(f"images: {out}, tables: {out / 'harden.html'}")
     raise typer.Exit(0 if finished.results else 1)
 
 
@@ -84,8 +72,8 @@ class StudyCommand(TyperCommand):
         from patchlab.study.study import STUDIES, module_summary
 
         super().format_help(ctx, formatter)
-        say("Studies (all keys of a config: patchlab keys NAME):")
-        say(*(f"  {name:<10} {module_summary(module)}" for name, module in STUDIES.items()))
+        console.say("Studies (all keys of a config: patchlab keys NAME):")
+        console.say(*(f"  {name:<10} {module_summary(module)}" for name, module in STUDIES.items()))
 
 
 def study(
@@ -94,10 +82,10 @@ def study(
     out: Annotated[Path | None, typer.Option(help="Folder for tables, figures and the page.")] = None,
     keys: Annotated[bool, typer.Option("--keys", help="Print its keys, as patchlab keys NAME does.")] = False,
     example: Annotated[bool, typer.Option("--example", help="Print a config to start from.")] = False,
-    resume: Resume = False,
-    overwrite: Overwrite = False,
-    jobs: Jobs = None,
-    cluster: Cluster = None,
+    resume: console.Resume = False,
+    overwrite: console.Overwrite = False,
+    jobs: console.Jobs = None,
+    cluster: console.Cluster = None,
 ) -> None:
     """Run an experiment of the paper or a test of the tool: tables with intervals, figures and one page."""
     from patchlab.keys import documents, example_config
@@ -110,11 +98,11 @@ def study(
     if config is None or out is None:
         missing = "--config" if config is None else "--out"
         raise typer.BadParameter("missing; a config to start from: --example", param_hint=missing)
-    with progress() as bar:
+    with console.progress() as bar:
         work = Work(resume, overwrite, jobs or 1, cluster, lambda done, total: bar("cells", done, total))
         finished = run_study(name, config, out, work)
-    say_study(finished)
-    say(f"page: {out / name}.html")
+    console.say_study(finished)
+    console.say(f"page: {out / name}.html")
     raise typer.Exit(0 if finished.results else 1)
 
 
@@ -139,27 +127,27 @@ def bench(
     ] = "all",
     quick: Annotated[bool, typer.Option("--quick", help="Three minutes: fewer views, rounds and sizes.")] = False,
     out: Annotated[Path, typer.Option(help="Folder for charts, tables and pages.")] = Path("patchlab-bench"),
-    overwrite: Overwrite = False,
+    overwrite: console.Overwrite = False,
 ) -> None:
     """Chart speed against accuracy of each setting on this machine: charts, tables and a page."""
     from patchlab.bench.run import run_bench
 
-    with progress() as bar:
+    with console.progress() as bar:
         written = run_bench(name, out, quick=quick, overwrite=overwrite, progress=bar)
     for results in written:
-        say_study(results)
-        say(f"page: {out / results.name}.html")
+        console.say_study(results)
+        console.say(f"page: {out / results.name}.html")
 
 
-app.command(cls=StudyCommand)(as_command(study))
+app.command(cls=StudyCommand)(console.as_command(study))
 for _verb in (bench, harden, table, keys):
-    app.command()(as_command(_verb))
-app.callback()(version_option)
+    app.command()(console.as_command(_verb))
+app.callback()(console.version_option)
 
 
 def main() -> None:
     """Run the command line of the laboratory."""
-    run_command_line(app)
+    console.run_command_line(app)
 
 
 def figures_page(name: str | None = None) -> str:

@@ -11,8 +11,7 @@ import torch
 
 from patchlab.study.study import run_study
 from patchlab.validation.envelope.axes import AXES, conditions_at, scene_at
-from patchlab.validation.envelope.fit import BEYOND_SWEEP
-from patchlab.validation.envelope.gains import gain_break, gains_over_controls, has_effect
+from patchlab.validation.envelope.fit import BEYOND_SWEEP, gain_break, gains_over_controls, has_effect
 from patchlab.validation.envelope.pages import figures
 from patchlab.validation.envelope.simulation import (
     Measurement,

@@ -10,12 +10,18 @@ import pytest
 import torch
 
 from patchlab.paper import deceive, transfer
-from patchlab.paper.object_views import mean_color, views_from, views_in_drawn_light
 from patchlab.study.estimates import mean
 from patchlab.study.grid import short_name
 from patchlab.study.record import Record
 from patchlab.study.study import Cell, Result, run_study
-from patchlab.study.trained_designs import TrainedSettings, gain_word, trained_cells
+from patchlab.study.trained_designs import (
+    TrainedSettings,
+    gain_word,
+    mean_color,
+    trained_cells,
+    views_from,
+    views_in_drawn_light,
+)
 from patchproof.base.errors import Refused
 from patchproof.base.intervals import Estimate
 from patchproof.base.validation import validate_model

@@ -22,18 +22,9 @@ from patchlab.bench.chart import Chart, ChartPoint
 from patchlab.bench.measure import time_call
 from patchlab.bench.methods import METHODS, load_art
 from patchlab.paper.patch3d import patch_cells
+from patchlab.study import grid
 from patchlab.study.estimates import cluster_mean, median, paired_means
 from patchlab.study.figures import contact_sheet, enlarge_design, photographs, picture_sheet
-from patchlab.study.grid import (
-    GridSettings,
-    PositiveInt,
-    Seeds,
-    by_values,
-    cell_key,
-    group_by,
-    problem_of,
-    with_changes,
-)
 from patchlab.study.record import gain_of, hardest_control, rate_of, to_record
 from patchlab.study.study import Cell, Result, Study
 from patchproof.app.demo import demo_scene
@@ -57,13 +48,13 @@ _TILE_PX = 192
 QUICK_STEPS, QUICK_VIEWS = 30, 40
 
 
-class PeersSettings(GridSettings):
+class PeersSettings(grid.GridSettings):
     """Scenes, networks, seeds and peers; each scene's [optimize] sets the passes of every method."""
 
-    seeds: Seeds = (0, 1, 2)  # of the scenes' draws
+    seeds: grid.Seeds = (0, 1, 2)  # of the scenes' draws
     # Compared with ours: signed steps; a patch pasted flat; that of ART (`pip install "patchproof[lab]"`).
     peers: Annotated[tuple[Peer, ...], Field(min_length=1)] = PEERS
-    n: PositiveInt = 400  # conditions per cell, of the evaluate stream
+    n: grid.PositiveInt = 400  # conditions per cell, of the evaluate stream
 
     @property
     def methods(self) -> tuple[str, ...]:
@@ -80,7 +71,7 @@ def cells(settings: PeersSettings, base: Path) -> list[Cell]:
 
 def run(settings: PeersSettings, base: Path, cell: Cell) -> dict[str, Any]:
     """Make every method's design for one object, network and seed, and show them in the same views."""
-    problem = problem_of(base, cell.values)
+    problem = grid.problem_of(base, cell.values)
     made = {name: time_call(partial(METHODS[name], problem)) for name in settings.methods}
     pixels = {name: design.pixels for name, (design, _) in made.items()}
     controls = pictures_with_controls(problem, pixels["ours"], CONTROLS)
@@ -109,7 +100,7 @@ def _pooled(settings: PeersSettings, results: Sequence[Result]) -> Table:
         leads = [gain_of(result, "ours", name) for result in results]
         by_pair = [
             float(np.mean([gain_of(result, "ours", name) for result in group]))
-            for group in group_by(results, by_values("name", "network")).values()
+            for group in grid.group_by(results, grid.by_values("name", "network")).values()
         ]
         rows.append(
             (
@@ -133,13 +124,13 @@ def _pooled(settings: PeersSettings, results: Sequence[Result]) -> Table:
 
 def _by_cell(settings: PeersSettings, results: Sequence[Result]) -> Table:
     names = (*CONTROLS, *settings.methods)
-    rows = tuple((*cell_key(result), *(rate_of(result, name) for name in names)) for result in results)
+    rows = tuple((*grid.cell_key(result), *(rate_of(result, name) for name in names)) for result in results)
     return Table("cells", "Rates, cell by cell", ("object", "network", "seed", *names), rows)
 
 
 def figures(settings: PeersSettings, results: Sequence[Result]) -> list[Drawing]:
     """A scatter plot of ours against each peer, and pictures of designs (first seeds)."""
-    firsts = [group[0] for group in group_by(results, by_values("name", "network")).values()]
+    firsts = [group[0] for group in grid.group_by(results, grid.by_values("name", "network")).values()]
     return [
         Drawing(
             "scatter", "Ours against each peer, a point per cell", partial(_scatter, settings, results), (4.4, 4.2)
@@ -181,7 +172,7 @@ def charts(quick: bool, progress: Progress) -> Iterator[Chart]:
         results = []
         for cell in cells(settings, base):
             if quick:
-                cell = replace(cell, values=with_changes(dict(cell.values), {"optimize": {"steps": QUICK_STEPS}}))
+                cell = replace(cell, values=grid.with_changes(dict(cell.values), {"optimize": {"steps": QUICK_STEPS}}))
             with use_threads(1):
                 results.append(Result(cell, run(settings, base, cell), base))
             progress("cells", len(results), len(settings.seeds))

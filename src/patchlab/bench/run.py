@@ -8,8 +8,7 @@ from collections.abc import Callable, Iterator
 from importlib import import_module
 from pathlib import Path
 
-from patchlab.bench.chart import Chart, checks_table, failed_checks, points_table
-from patchlab.bench.chart_figure import chart_drawing
+from patchlab.bench.chart import Chart, chart_drawing, checks_table, failed_checks, points_table
 from patchlab.bench.measure import machine_details, machine_line
 from patchproof.base.errors import Refused
 from patchproof.base.output import new_folder

@@ -18,15 +18,7 @@ from patchlab.study.estimates import paired_means
 from patchproof.app.demo import demo_scene
 from patchproof.base.progress import Progress
 from patchproof.base.settings import OptimizeSettings
-from patchproof.optimizer.loop import (
-    SELECT_AFTER,
-    SELECT_VIEWS,
-    State,
-    is_selection_step,
-    start,
-    steps,
-    views_per_network,
-)
+from patchproof.optimizer import loop
 from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.optimizer.responses import responses
@@ -72,7 +64,7 @@ def runs_chart(
     series: dict[int, list[ChartPoint]] = {end: [] for end in sorted({end for _, _, end in columns})}
     table = np.array([losses[run, end] for _, run, end in columns]).T
     for (setting, run, end), loss in zip(columns, paired_means(table), strict=True):
-        cost = views_per_network(run.changed(steps=end // run.views))
+        cost = loop.views_per_network(run.changed(steps=end // run.views))
         series[end].append(ChartPoint(setting, cost, loss, run == DEFAULT_SETTINGS and end == effort.views))
     return Chart(
         name=name,
@@ -81,7 +73,7 @@ def runs_chart(
         error=f"loss of the kept design on {effort.judged} new conditions",
         series={f"trained on {end} views": points for end, points in series.items()},
         about=f"{effort.seeds} seeds. Intervals are for comparing settings: what all settings of a seed share is taken "
-        f"out. A selection set of {SELECT_VIEWS} views is seen every {SELECT_AFTER} training views.",
+        f"out. A selection set of {loop.SELECT_VIEWS} views is seen every {loop.SELECT_AFTER} training views.",
         one_front=True,
     )
 
@@ -89,7 +81,7 @@ def runs_chart(
 def charted_ends(run: OptimizeSettings, effort: TrainingEffort) -> list[int]:
     """Training views after which a run is charted, where the selection set has just been seen."""
     whole = run.changed(steps=effort.views // run.views)
-    return [end for end in (effort.views // 2, effort.views) if is_selection_step(whole, end // run.views)]
+    return [end for end in (effort.views // 2, effort.views) if loop.is_selection_step(whole, end // run.views)]
 
 
 def train_and_judge(
@@ -113,15 +105,15 @@ def train_and_judge(
 
 def designs_after(problem: Problem, numbers: Sequence[int]) -> list[Tensor]:
     """The best designs, as printed, after these numbers of steps (rising)."""
-    states: dict[int, State] = {step.state.number: step.state for step in steps(problem)}
+    states: dict[int, loop.State] = {step.state.number: step.state for step in loop.steps(problem)}
     return [from_pixels(as_pixels(states[number].best)) for number in numbers]
 
 
 def optimize_demo_design(count: int, progress: Progress) -> tuple[Problem, Tensor]:
     """The demo's problem, and the best design 3×h×w of `count` optimizer steps."""
     problem = demo_problem().with_training(OptimizeSettings(steps=count))
-    state = start(problem)
-    for step in steps(problem, state):
+    state = loop.start(problem)
+    for step in loop.steps(problem, state):
         state = step.state
         progress("design", state.number, count)
     return problem, from_pixels(as_pixels(state.best))

@@ -15,20 +15,12 @@ from typing import Any
 
 from pydantic import Field
 
-from patchlab.paper.object_views import views_from_sides
+from patchlab.study import trained_designs
 from patchlab.study.figures import picture_sheet
 from patchlab.study.grid import by_values, group_by, problem_of, short_name
 from patchlab.study.record import Record
 from patchlab.study.study import Cell, Result, Study
-from patchlab.study.trained_designs import (
-    NamePart,
-    SceneVariant,
-    TrainedSettings,
-    test_and_draw,
-    tested_networks,
-    trained_cells,
-    with_trainers,
-)
+from patchlab.study.trained_designs import views_from_sides
 from patchproof.optimizer.loop import best_design
 from patchproof.optimizer.promise import pictures_with_controls
 from patchproof.report.tables import Drawing, Table
@@ -38,11 +30,11 @@ _SHOWN_KINDS = ("design", *CONTROLS)
 _SHEET_PX, _SHEET_VIEWS = 160, 4
 
 
-class DeceiveSettings(TrainedSettings):
+class DeceiveSettings(trained_designs.TrainedSettings):
     """Settings of a study of trained designs in which each network trains alone and all networks test."""
 
     # By name: tables of the scene file with the keys that change.
-    ways: dict[NamePart, SceneVariant] = Field(
+    ways: dict[trained_designs.NamePart, trained_designs.SceneVariant] = Field(
         {"free": {"patch": {"kind": "texture"}}, "within_8": {"patch": {"kind": "texture", "epsilon": 8 / 255}}},
         min_length=1,
     )
@@ -50,17 +42,19 @@ class DeceiveSettings(TrainedSettings):
 
 def cells(settings: DeceiveSettings, base: Path) -> list[Cell]:
     """A cell per scene, way, network and seed; the goal is `deceive`, whatever the scene file says."""
-    return trained_cells(settings, base, variants=[({"target": {"goal": "deceive"}}, {})])
+    return trained_designs.trained_cells(settings, base, variants=[({"target": {"goal": "deceive"}}, {})])
 
 
 def run(settings: DeceiveSettings, base: Path, cell: Cell) -> dict[str, Any]:
     """Train against one network, and show the design and its controls to all networks."""
     problem = problem_of(base, cell.values)
-    design = best_design(with_trainers(problem, cell))
+    design = best_design(trained_designs.with_trainers(problem, cell))
     things = pictures_with_controls(problem, design, CONTROLS)
     suffix, content = problem.subject.file(design)
     sheet = views_from_sides(problem, _SHEET_VIEWS), _SHEET_PX
-    return test_and_draw(problem, cell.name, things, settings.n, sheet) | {f"{cell.name}.{suffix}": content}
+    return trained_designs.test_and_draw(problem, cell.name, things, settings.n, sheet) | {
+        f"{cell.name}.{suffix}": content
+    }
 
 
 def tables(settings: DeceiveSettings, results: Sequence[Result]) -> list[Table]:
@@ -68,7 +62,7 @@ def tables(settings: DeceiveSettings, results: Sequence[Result]) -> list[Table]:
     rates, differences = [], []
     for design, of_design in group_by(results, by_values("name", "way", "row")).items():
         records = {kind: Record(of_design, kind) for kind in _SHOWN_KINDS}
-        for network in tested_networks(of_design):
+        for network in trained_designs.tested_networks(of_design):
             start = (*design, short_name(network))
             levels = [record.level(network) for record in records.values()]
             rates.append((*start, *(level[0] for level in levels), levels[0][1]))

@@ -25,19 +25,9 @@ from pydantic import Field
 
 from patchlab.harden.labeled_photos import write_labels
 from patchlab.paper.image_classes import write_renders
+from patchlab.study import grid
 from patchlab.study.estimates import cluster_mean
 from patchlab.study.figures import contact_sheet, enlarge_design, photographs, picture_sheet
-from patchlab.study.grid import (
-    GridSettings,
-    PositiveInt,
-    Seeds,
-    by_scene,
-    by_values,
-    cell_key,
-    grid_cells,
-    group_by,
-    problem_of,
-)
 from patchlab.study.record import Record, parse_hits, to_record
 from patchlab.study.study import Cell, Result, Study
 from patchproof.base.errors import Refused
@@ -64,11 +54,11 @@ _TILE_PX = 192
 _SIZE_QUANTILES = (0.05, 0.95)  # of the design's sizes in 3D views; its sizes in 2D lie between them
 
 
-class Patch3dSettings(GridSettings):
+class Patch3dSettings(grid.GridSettings):
     """Scenes, networks, seeds and the 2D patch; each scene's [optimize] sets the training."""
 
-    seeds: Seeds = (0, 1, 2)  # of the scenes' draws
-    n: PositiveInt = 200  # conditions per cell, of the evaluate stream
+    seeds: grid.Seeds = (0, 1, 2)  # of the scenes' draws
+    n: grid.PositiveInt = 200  # conditions per cell, of the evaluate stream
     renders: Annotated[int, Field(ge=2)] = 64  # images of the clean object; half of 20 or more are held out
     roll_deg: Range = (-22.5, 22.5)  # roll of the 2D patch, as in Brown et al.'s program
     erasing: Share = 0.5  # chance of Random Erasing in 2D training
@@ -81,11 +71,11 @@ def cells(settings: Patch3dSettings, base: Path) -> list[Cell]:
     return patch_cells(settings, base)
 
 
-def patch_cells(settings: GridSettings, base: Path) -> list[Cell]:
+def patch_cells(settings: grid.GridSettings, base: Path) -> list[Cell]:
     """A cell per scene, network and seed; refuses scenes without a mesh or a printed patch. All objects with the first
     seed come first, so that an unfinished study covers each.
     """
-    cells = grid_cells(settings, base)
+    cells = grid.grid_cells(settings, base)
     for cell in cells:
         scene, do = cell.values["scene"], 'give object.mesh and patch.kind = "patch"'
         if scene["object"]["mesh"] is None or scene["patch"]["kind"] != "patch":
@@ -95,7 +85,7 @@ def patch_cells(settings: GridSettings, base: Path) -> list[Cell]:
 
 def run(settings: Patch3dSettings, base: Path, cell: Cell) -> dict[str, Any]:
     """Optimize for one object, network and seed in 3D and in 2D, and measure both designs in both."""
-    problem = problem_of(base, cell.values)
+    problem = grid.problem_of(base, cell.values)
     with tempfile.TemporaryDirectory() as folder:
         twin = flat_twin(problem, settings, Path(folder))
     designs = {"3d": best_design(problem), "2d": best_design(twin)}
@@ -186,7 +176,7 @@ def tables(settings: Patch3dSettings, results: Sequence[Result]) -> list[Table]:
 
 
 def _pooled(results: Sequence[Result]) -> Table:
-    groups = group_by(results, by_values("name", "network"))
+    groups = grid.group_by(results, grid.by_values("name", "network"))
     hard = {key: group for key, group in groups.items() if _mean_rate(group, "bare") <= MAX_MISREAD_RATE}
     rows = []
     for a, b in (("3d", "2d"), ("3d", "gray"), ("3d", "noise"), ("2d", "gray"), ("2d", "noise"), ("3d", "bare")):
@@ -202,7 +192,7 @@ def _pooled(results: Sequence[Result]) -> Table:
 
 def _by_object(results: Sequence[Result], pair: tuple[str, str], where: str | None) -> tuple[tuple, ...]:
     rows = []
-    for name, group in by_scene(results).items():
+    for name, group in grid.by_scene(results).items():
         records = {kind: Record(group, kind, where) for kind in KINDS}
         rates = (record.level()[0] for record in records.values())
         rows.append((name, *rates, records[pair[0]].gain(records[pair[1]])[0]))
@@ -231,7 +221,7 @@ def _by_cell(results: Sequence[Result]) -> Table:
         gain = Record([result], "3d").gain(Record([result], "2d"))[0]
         passes = result.answers["passes"]
         rows.append(
-            (*cell_key(result), *(_mean_rate([result], kind) for kind in KINDS), gain, passes["3d"], passes["2d"])
+            (*grid.cell_key(result), *(_mean_rate([result], kind) for kind in KINDS), gain, passes["3d"], passes["2d"])
         )
     head = ("object", "network", "seed", *KINDS, "3d minus 2d", "passes 3d", "passes 2d")
     return Table("cells", "Cell by cell", head, tuple(rows), "Passes are views that the network saw in training.")
@@ -239,7 +229,7 @@ def _by_cell(results: Sequence[Result]) -> Table:
 
 def figures(settings: Patch3dSettings, results: Sequence[Result]) -> list[Drawing]:
     """Pictures of the designs (first network and seed of each object)."""
-    firsts = [group[0] for group in by_scene(results).values()]
+    firsts = [group[0] for group in grid.by_scene(results).values()]
     return [
         picture_sheet(
             "designs",

@@ -14,21 +14,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 from pydantic import Field
 
-from patchlab.paper.object_views import mean_color, views_from_sides
+from patchlab.study import trained_designs
 from patchlab.study.figures import picture_sheet
 from patchlab.study.grid import by_values, group_by, problem_of, short_name
 from patchlab.study.record import Record
 from patchlab.study.study import Cell, Result, Study
-from patchlab.study.trained_designs import (
-    NamePart,
-    SceneVariant,
-    TrainedSettings,
-    gain_word,
-    test_and_draw,
-    tested_networks,
-    trained_cells,
-    with_trainers,
-)
+from patchlab.study.trained_designs import mean_color, views_from_sides
 from patchproof.base.color import linear_from_srgb, srgb_from_linear
 from patchproof.optimizer.loop import best_design
 from patchproof.optimizer.pixels import from_pixels
@@ -41,12 +32,14 @@ _SHEET_PX, _TURN_VIEWS, _SHEET_VIEWS = 160, 8, 3
 _KINDS = ("start", "design")
 
 
-class RobustSettings(TrainedSettings):
+class RobustSettings(trained_designs.TrainedSettings):
     """Settings: each network trains alone for each class, and all networks test."""
 
     classes: Annotated[tuple[str | int, ...], Field(min_length=1)]  # in place of the scene's label
     # By name: tables of the scene file with the keys that change.
-    ways: dict[NamePart, SceneVariant] = Field({"free": {"patch": {"kind": "texture", "start": "gray"}}}, min_length=1)
+    ways: dict[trained_designs.NamePart, trained_designs.SceneVariant] = Field(
+        {"free": {"patch": {"kind": "texture", "start": "gray"}}}, min_length=1
+    )
 
 
 def cells(settings: RobustSettings, base: Path) -> list[Cell]:
@@ -55,19 +48,21 @@ def cells(settings: RobustSettings, base: Path) -> list[Cell]:
         ({"target": {"label": label, "accept": [], "goal": "assist"}}, {"class": str(label)})
         for label in settings.classes
     ]
-    return trained_cells(settings, base, variants=variants)
+    return trained_designs.trained_cells(settings, base, variants=variants)
 
 
 def run(settings: RobustSettings, base: Path, cell: Cell) -> dict[str, Any]:
     """Train for one class on one network; record rates on all networks, pictures and mean color."""
     problem = problem_of(base, cell.values)
     subject = problem.subject
-    design = best_design(with_trainers(problem, cell))
+    design = best_design(trained_designs.with_trainers(problem, cell))
     pixels = (subject.start(), from_pixels(design, problem.device))
     things = {kind: subject.appearance(each) for kind, each in zip(_KINDS, pixels, strict=True)}
     suffix, content = subject.file(design)
     return {
-        **test_and_draw(problem, cell.name, things, settings.n, (views_from_sides(problem, _SHEET_VIEWS), _SHEET_PX)),
+        **trained_designs.test_and_draw(
+            problem, cell.name, things, settings.n, (views_from_sides(problem, _SHEET_VIEWS), _SHEET_PX)
+        ),
         "color": mean_color(problem, things["design"], _TURN_VIEWS, _SHEET_PX),
         f"{cell.name}.{suffix}": content,
     }
@@ -86,10 +81,10 @@ def tables(settings: RobustSettings, results: Sequence[Result]) -> list[Table]:
     rates, colors = [], []
     for key, of_key in _by_design(results).items():
         design, start = Record(of_key, "design"), Record(of_key, "start")
-        for network in tested_networks(of_key):
+        for network in trained_designs.tested_networks(of_key):
             gain = design.gain(start, network)[0]
             levels = start.level(network)[0], *design.level(network)
-            rates.append((*key, short_name(network), *levels, gain, gain_word(gain)))
+            rates.append((*key, short_name(network), *levels, gain, trained_designs.gain_word(gain)))
         codes = _mean_codes(of_key)
         colors.append((*key, _hex(codes), *codes))
     about = f"Over {settings.n} unseen conditions per seed, paired with the untrained start."

@@ -18,23 +18,7 @@ import numpy as np
 from pydantic import Field
 from torch import Tensor
 
-from patchlab.paper.stress_map import (
-    LIGHT_FIELDS,
-    POSE_FIELDS,
-    MapCell,
-    MapSettings,
-    axes_values,
-    clean_responses,
-    combine_conditions,
-    field_title,
-    heat_map,
-    map_axes,
-    map_ticks,
-    measure_map,
-    mesh_cells,
-    spread_over_cells,
-    worst_cells,
-)
+from patchlab.paper import stress_map
 from patchlab.study.figures import contact_sheet, photographs, picture_sheet
 from patchlab.study.grid import GridSettings, PositiveInt, cell_key, problem_of
 from patchlab.study.record import hits_text, parse_hits
@@ -74,21 +58,22 @@ class WorstCaseSettings(StrictModel):
 class StressSettings(GridSettings):
     """Scenes, networks, seeds and the three tests."""
 
-    maps: tuple[MapSettings, ...] = (MapSettings(),)  # of pose × light
+    maps: tuple[stress_map.MapSettings, ...] = (stress_map.MapSettings(),)  # of pose × light
     occlusion: OcclusionSettings = OcclusionSettings()  # a black square over the picture
     search: WorstCaseSettings = WorstCaseSettings()  # for the worst pose and light
 
 
 def cells(settings: StressSettings, base: Path) -> list[Cell]:
     """A cell per scene, network and seed."""
-    return mesh_cells(settings, base)
+    return stress_map.mesh_cells(settings, base)
 
 
 def run(settings: StressSettings, base: Path, cell: Cell) -> dict[str, Any]:
     """Run all tests of one scene and one network."""
     problem, seed = problem_of(base, cell.values), cell.values["seed"]
     (pose, of_pose), (light, of_light) = (
-        find_worst_case(problem, names, settings.search, seed) for names in (POSE_FIELDS, LIGHT_FIELDS)
+        find_worst_case(problem, names, settings.search, seed)
+        for names in (stress_map.POSE_FIELDS, stress_map.LIGHT_FIELDS)
     )
     occlusion, hidden = measure_occlusion(problem, settings.occlusion, seed)
     typical = problem.scene.draw("select", 1, seed)
@@ -108,7 +93,7 @@ def _photographs(problem: Problem, conditions: Conditions) -> Tensor:
 
 def _measure_again(problem: Problem, there: Conditions, anywhere: Conditions) -> dict[str, Any]:
     """Measure the clean object in the worst condition found, and under the same draws without it."""
-    worst, usual = clean_responses(problem, there), clean_responses(problem, anywhere)
+    worst, usual = stress_map.clean_responses(problem, there), stress_map.clean_responses(problem, anywhere)
     return {
         "hits": hits_text(worst.recognized[0]),
         "confidence": float(worst.confidence.mean()),
@@ -117,18 +102,18 @@ def _measure_again(problem: Problem, there: Conditions, anywhere: Conditions) ->
     }
 
 
-def _measure_map(problem: Problem, options: MapSettings, seed: int) -> dict[str, Any]:
-    axes = map_axes(problem.scene.settings, options)
-    hits, confidence, alone = measure_map(problem, axes, problem.scene.draw("select", options.n, seed))
-    worst = worst_cells(hits, confidence, problem.scene.settings.target.goal)
+def _measure_map(problem: Problem, options: stress_map.MapSettings, seed: int) -> dict[str, Any]:
+    axes = stress_map.map_axes(problem.scene.settings, options)
+    hits, confidence, alone = stress_map.measure_map(problem, axes, problem.scene.draw("select", options.n, seed))
+    worst = stress_map.worst_cells(hits, confidence, problem.scene.settings.target.goal)
     fresh = problem.scene.draw("evaluate", options.n * len(worst), seed + _FRESH_SEED_OFFSET)
     return {
-        "axes": axes_values(axes),
+        "axes": stress_map.axes_values(axes),
         "hits": [[hits_text(place) for place in column] for column in hits],
         "alone": [[hits_text(place) for place in column] for column in alone],
         "confidence": confidence.mean(2).tolist(),
         "worst": [list(place) for place in worst],
-        "again": _measure_again(problem, spread_over_cells(fresh, axes, worst), fresh),
+        "again": _measure_again(problem, stress_map.spread_over_cells(fresh, axes, worst), fresh),
     }
 
 
@@ -193,7 +178,9 @@ def find_worst_case(
         # the ranges are a box, so points between two of its points lie in it
         fields = fields_of(drawn)
         drawn = with_values(drawn, **{n: v + 0.5**number * (fields[n] - v) for n, v in best.items()})
-        losses = clean_responses(problem, combine_conditions(drawn, rest, names), problem.training_px).loss.mean(0)
+        losses = stress_map.clean_responses(
+            problem, stress_map.combine_conditions(drawn, rest, names), problem.training_px
+        ).loss.mean(0)
         losses = losses.reshape(settings.tries, settings.draws).mean(1)
         if losses.max() > best_loss:
             best_loss, row = float(losses.max()), int(losses.argmax())
@@ -246,13 +233,13 @@ def _worst_rows(result: Result) -> Iterator[tuple]:
 
     for test in ("pose", "light"):
         of_test = result.answers[test]
-        where = ", ".join(f"{field_title(name)} {value:.4g}" for name, value in of_test["condition"].items())
+        where = ", ".join(f"{stress_map.field_title(name)} {value:.4g}" for name, value in of_test["condition"].items())
         yield row(f"worst {test}", where, of_test["hits"], of_test["hits_anywhere"], of_test["confidence"])
     hidden = result.answers["occlusion"]
     where = "column {}, row {} of the grid".format(*(number + 1 for number in hidden["worst"]))
     yield row("black square", where, hidden["worst_again"], hidden["clean_again"], None)
     for map_ in result.answers["maps"]:
-        where = f"{len(map_['worst'])} worst cells of {' × '.join(map(field_title, map_['axes']['names']))}"
+        where = f"{len(map_['worst'])} worst cells of {' × '.join(map(stress_map.field_title, map_['axes']['names']))}"
         again = map_["again"]
         yield row("map", where, again["hits"], again["hits_anywhere"], again["confidence"])
 
@@ -268,7 +255,7 @@ def _map_rows(result: Result, map_: Mapping[str, Any]) -> Iterator[tuple]:
             yield (*cell_key(result), *place, rate(hits), *beside, map_["confidence"][i][j])
 
 
-def _empty_cells(map_: Mapping[str, Any]) -> list[MapCell]:
+def _empty_cells(map_: Mapping[str, Any]) -> list[stress_map.MapCell]:
     """Cells in which the object is not shown to be recognized more often than the background alone."""
     return [
         (i, j)
@@ -290,8 +277,8 @@ def _figures(settings: StressSettings, result: Result) -> Iterator[Drawing]:
         caption = (
             f"rate, n = {options.n} draws per cell; framed: the worst tenth\ngray: no effect over background alone"
         )
-        ticks, empty = map_ticks(map_["axes"]), _empty_cells(map_)
-        yield heat_map(f"map{number}_{name}", (title, caption), rates, map_["worst"], ticks, empty=empty)
+        ticks, empty = stress_map.map_ticks(map_["axes"]), _empty_cells(map_)
+        yield stress_map.heat_map(f"map{number}_{name}", (title, caption), rates, map_["worst"], ticks, empty=empty)
     hidden, options = result.answers["occlusion"], settings.occlusion
     grid = np.reshape([np.mean(parse_hits(hits)) for hits in hidden["hits"]], (options.positions, options.positions)).T
     middles = [
@@ -300,7 +287,9 @@ def _figures(settings: StressSettings, result: Result) -> Iterator[Drawing]:
     labels = ("middle of the square, from the left", "from the top")
     ticks = [(label, range(options.positions), middles) for label in labels]
     caption = f"black square, {options.share:.0%} of the side; n = {options.n}"
-    yield heat_map(f"occlusion_{name}", (title, caption), grid.tolist(), [hidden["worst"]], ticks, upward=False)
+    yield stress_map.heat_map(
+        f"occlusion_{name}", (title, caption), grid.tolist(), [hidden["worst"]], ticks, upward=False
+    )
     files = [("", result.file(f"{name}.png"))]
     yield picture_sheet(f"views_{name}", title, files, (2.1 * len(_VIEW_TITLES), 2.4), columns=_VIEW_TITLES)
 

@@ -20,7 +20,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pydantic import Field, model_validator
 
-from patchlab.paper.object_views import views_from_sides, views_in_drawn_light
 from patchlab.study.estimates import mean
 from patchlab.study.figures import number_grid, picture_sheet
 from patchlab.study.grid import Names, PositiveInt, by_values, group_by, problem_of, short_name
@@ -35,6 +34,8 @@ from patchlab.study.trained_designs import (
     test_and_draw,
     tested_networks,
     trained_cells,
+    views_from_sides,
+    views_in_drawn_light,
     with_trainers,
 )
 from patchproof.base.intervals import rate

@@ -7,6 +7,10 @@ progress. Rendered pictures can be stored in a folder for later trainings.
 import argparse
 import copy
 import dataclasses
+import datetime
+import json
+import platform
+import shlex
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -18,7 +22,12 @@ import torch
 from torch import Tensor, nn
 
 from patchlab.training.pictures import HELD_OUT_SEED, Pictures, load_or_render, render_pictures
+from patchproof.mesh import primitives
 from patchproof.scene import patterns
+
+
+Epochs = Iterator[tuple[int, float, nn.Module]]  # after each epoch: its number, its mean loss, the network
+HELD_OUT_TEXT = "renders of other shapes, textures, backgrounds and conditions of the same kinds; nothing real"
 
 
 @dataclass(frozen=True)
@@ -37,7 +46,6 @@ class TrainingRecipe:
 
 
 RecipeType = TypeVar("RecipeType", bound=TrainingRecipe)
-Epochs = Iterator[tuple[int, float, nn.Module]]  # after each epoch: its number, its mean loss, the network
 
 
 class Seconds(NamedTuple):
@@ -137,3 +145,50 @@ def fold_batch_norm(trained: nn.Module) -> nn.Module:
                 conv_and_norm: list[Any] = list(child.children())
                 parent.register_module(name, torch.nn.utils.fuse_conv_bn_eval(*conv_and_norm))
     return plain
+
+
+def class_names() -> list[str]:
+    """Labels of the procedural objects, with spaces in place of underscores."""
+    return [name.replace("_", " ") for name in primitives.primitive_names()]
+
+
+def store_float16(network: nn.Module, path: Path) -> int:
+    """Write the weights as float16, load them back into the network, and return their number."""
+    from safetensors.torch import save_file
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    weights = {name: tensor.half().contiguous() for name, tensor in network.state_dict().items()}
+    save_file(weights, path)
+    network.load_state_dict({name: tensor.float() for name, tensor in weights.items()})
+    return sum(tensor.numel() for tensor in weights.values())
+
+
+def export_onnx(network: nn.Module, path: Path, input_px: int) -> int:
+    """Write the network as an ONNX file for batches of any size, and return the number of weights."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    photos, any_number = torch.rand(2, 3, input_px, input_px), {0: torch.export.Dim("n")}
+    options: dict[str, Any] = {"dynamo": True, "external_data": False, "verbose": False}
+    torch.onnx.export(network.eval(), (photos,), path, dynamic_shapes=(any_number,), **options)
+    return sum(weights.numel() for weights in network.parameters())
+
+
+def write_card(path: Path, figures: dict[str, Any], module: str, recipe: TrainingRecipe, seconds: Seconds) -> None:
+    """Write the labels, the figures and the command that makes the network again."""
+    changed = [field for field in dataclasses.fields(recipe) if getattr(recipe, field.name) != field.default]
+    options = [f"--{field.name.replace('_', '-')} {shlex.quote(str(getattr(recipe, field.name)))}" for field in changed]
+    card = {
+        "labels": class_names(),
+        **figures,
+        "held_out": HELD_OUT_TEXT,
+        "command": " ".join([f"python -m patchlab.training.{module} --out DIR", *options]),
+        "recipe": dataclasses.asdict(recipe),
+        "seconds": seconds._asdict(),
+        "date": datetime.date.today().isoformat(),
+        "machine": f"{platform.machine()}, torch {torch.__version__}, {recipe.threads} thread(s)",
+    }
+    path.write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
+
+
+def round_by_class(figures: Any) -> dict[str, float]:
+    """By class name a figure, rounded to four digits."""
+    return {name: round(float(figure), 4) for name, figure in zip(class_names(), figures, strict=True)}

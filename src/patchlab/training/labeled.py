@@ -15,7 +15,7 @@ from PIL import Image
 from torch import Tensor
 
 from patchlab.harden.labeled_photos import write_labels
-from patchlab.training.card import class_names
+from patchlab.training.fit import class_names
 from patchlab.training.pictures import HELD_OUT_SEED, randomize_materials, render_mesh
 from patchproof.base.color import codes_from_srgb
 from patchproof.base.output import check_folder, make_folder

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from patchlab.training import fit
-from patchlab.training.card import export_onnx, round_by_class, store_float16, write_card
+from patchlab.training.fit import export_onnx, round_by_class, store_float16, write_card
 from patchlab.training.pictures import Pictures, augment, shrink_pictures
 from patchproof.classifier.builtin import DEVIATION, INPUT_PX, MEAN, SmallNetwork
 from patchproof.classifier.zoo import Normalized

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from patchlab.training import fit
-from patchlab.training.card import round_by_class, store_float16, write_card
+from patchlab.training.fit import round_by_class, store_float16, write_card
 from patchlab.training.pictures import Pictures, augment
 from patchproof.classifier.average_precision import Detection, average_precision, find_detections
 from patchproof.classifier.builtin_detector import INPUT_PX, SmallDetector, centers_px

@@ -17,21 +17,13 @@ from patchlab.study.estimates import mean
 from patchlab.study.grid import by_scene
 from patchlab.study.record import parse_hits
 from patchlab.study.study import Cell, Result, Study
-from patchlab.validation.photo_sessions import (
-    SessionsSettings,
-    cells,
-    make_run_and_sheet,
-    promise_posterior,
-    record_promise,
-    take_photos,
-    verify_photos,
-)
+from patchlab.validation import photo_sessions
 from patchproof.base.intervals import rate, wilson
 from patchproof.evidence.forecast import forecast_of
 from patchproof.report.tables import Drawing, Table
 
 
-class ForecastsSettings(SessionsSettings):
+class ForecastsSettings(photo_sessions.SessionsSettings):
     """Settings of sessions, and the control that is photographed in place of each design."""
 
     control: Literal["mean", "gray", "noise"] | None = "gray"  # photographed under the same conditions
@@ -44,16 +36,16 @@ def run(settings: ForecastsSettings, base: Path, cell: Cell) -> dict[str, Any]:
 
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        patch_run = make_run_and_sheet(base, cell, folder)
-        photos, controls = take_photos(settings, cell, patch_run, folder), None
+        patch_run = photo_sessions.make_run_and_sheet(base, cell, folder)
+        photos, controls = photo_sessions.take_photos(settings, cell, patch_run, folder), None
         if settings.control is not None:
-            controls = take_photos(settings, cell, patch_run, folder, settings.control)
+            controls = photo_sessions.take_photos(settings, cell, patch_run, folder, settings.control)
         forecast, sessions = photo_forecaster(patch_run, load_manifest(folder / "sheet.json")), []
         for name in sorted(path.name for path in photos.iterdir() if path.is_dir()) or [""]:  # one has no folder
             of_control = None if controls is None else controls / name
-            report = verify_photos(photos / name, folder, base, cell, forecast, controls=of_control)
+            report = photo_sessions.verify_photos(photos / name, folder, base, cell, forecast, controls=of_control)
             sessions.append(_record_session(report, settings.control))
-    return record_promise(patch_run) | {"sessions": sessions}
+    return photo_sessions.record_promise(patch_run) | {"sessions": sessions}
 
 
 def _record_session(report: Any, control: str | None) -> dict[str, Any]:
@@ -97,7 +89,10 @@ def _forecast_row(group: Sequence[Result]) -> tuple:
     chances, hits = np.array(pairs, float).T
     held, widths, held_promise, widths_promise, promised = [], [], [], [], []
     for result in group:
-        posterior, level = promise_posterior(result), float(np.mean(parse_hits(result.answers["promised"])))
+        posterior, level = (
+            photo_sessions.promise_posterior(result),
+            float(np.mean(parse_hits(result.answers["promised"]))),
+        )
         for session in result.answers["sessions"]:
             if not session["forecast"]:
                 continue
@@ -182,4 +177,4 @@ def figures(settings: ForecastsSettings, results: Sequence[Result]) -> tuple[Dra
     return (Drawing("reliability", "Forecast and seen", draw, (5.0, 4.5), about),)
 
 
-STUDY = Study("forecasts", ForecastsSettings, cells, run, tables, figures)
+STUDY = Study("forecasts", ForecastsSettings, photo_sessions.cells, run, tables, figures)

@@ -15,17 +15,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
+from patchlab.study import grid
 from patchlab.study.estimates import clustered_median, mean
-from patchlab.study.grid import (
-    GridSettings,
-    PositiveInt,
-    cell_key,
-    grid_cells,
-    group_by,
-    network_names,
-    scene_of,
-    with_changes,
-)
 from patchlab.study.record import Record, corner_error_mm, gain_of, hardest_control, to_record
 from patchlab.study.study import Cell, Result, Study
 from patchlab.validation.mounted_sheets import mount_content
@@ -74,11 +65,11 @@ _LAYOUTS = {
 }
 
 
-class LayoutsSettings(GridSettings):
+class LayoutsSettings(grid.GridSettings):
     """Settings: a design for each scene, network, seed and layout."""
 
     layouts: dict[str, Layout] = Field(_LAYOUTS, min_length=1)  # by name; the others are compared with the first
-    n: PositiveInt = 400  # unseen conditions that measure
+    n: grid.PositiveInt = 400  # unseen conditions that measure
     photos: Annotated[int, Field(ge=0)] = 40  # photographs of each design's sheet
 
 
@@ -118,10 +109,10 @@ def with_layout(scene: PatchScene, layout: Layout) -> PatchScene:
 def cells(settings: LayoutsSettings, base: Path) -> list[Cell]:
     """A cell per scene, network, seed and layout."""
     ways = [(name, layout.scene, layout.model_dump()) for name, layout in settings.layouts.items()]
-    return grid_cells(
+    return grid.grid_cells(
         settings,
         base,
-        lambda values: ((with_changes(values, scene) | {"layout": a, "how": how}, (a,)) for a, scene, how in ways),
+        lambda values: ((grid.with_changes(values, scene) | {"layout": a, "how": how}, (a,)) for a, scene, how in ways),
     )
 
 
@@ -142,7 +133,7 @@ def run(settings: LayoutsSettings, base: Path, cell: Cell) -> dict[str, Any]:
 
 
 def _build_cell_problem(base: Path, cell: Cell) -> Problem:
-    scene, networks = scene_of(base, cell.values), network_names(base, cell.values)
+    scene, networks = grid.scene_of(base, cell.values), grid.network_names(base, cell.values)
     if isinstance(scene, UnplacedScene):
         place = choose_place(scene, models=networks)
         scene = scene.with_piece_at(place.at, place.spin_deg)
@@ -185,8 +176,8 @@ def _gain_over_controls(result: Result) -> float:
 
 def tables(settings: LayoutsSettings, results: Sequence[Result]) -> Sequence[Table]:
     """Tables of costs and gains by layout, and of every cell."""
-    by_layout = group_by(results, lambda result: result.cell.values["layout"])
-    first = {cell_key(result): _gain_over_controls(result) for result in next(iter(by_layout.values()))}
+    by_layout = grid.group_by(results, lambda result: result.cell.values["layout"])
+    first = {grid.cell_key(result): _gain_over_controls(result) for result in next(iter(by_layout.values()))}
     rows = [(name, *_layout_figures(group, first)) for name, group in by_layout.items()]
     head = ("layout", "share for the design", "gain over the best control", "beside the first layout")
     head = (*head, "identified", "measured", "corner error, mm", "uncertainty holds", "ΔE00")
@@ -196,7 +187,7 @@ def tables(settings: LayoutsSettings, results: Sequence[Result]) -> Sequence[Tab
     about += "of the worst of the piece's four; gains are over scenes, networks and seeds"
     every = [
         (
-            *cell_key(r),
+            *grid.cell_key(r),
             r.cell.values["layout"],
             _gain_over_controls(r),
             *(Record([r], thing).level()[0] for thing in ("design", *CONTROLS)),
@@ -220,7 +211,9 @@ def _layout_figures(group: Sequence[Result], first: dict) -> tuple:
         if word == "measured"
     ]
     errors = [(m["error_mm"], m["uncertainty_mm"]) for m in measured if m["error_mm"] is not None]
-    beside = [_gain_over_controls(result) - first[cell_key(result)] for result in group if cell_key(result) in first]
+    beside = [
+        _gain_over_controls(result) - first[grid.cell_key(result)] for result in group if grid.cell_key(result) in first
+    ]
     return (
         float(np.mean([result.answers["free"] for result in group])),
         _mean_or_single([_gain_over_controls(result) for result in group]),

@@ -13,16 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import Field
 
-from patchlab.study.grid import (
-    GridSettings,
-    Names,
-    PositiveInt,
-    grid_cells,
-    network_names,
-    scene_of,
-    short_name,
-    with_changes,
-)
+from patchlab.study import grid
 from patchlab.study.record import hits_text, parse_hits
 from patchlab.study.study import Cell, Result
 from patchproof.base.sessions import RatePosterior, count_by_session, rate_posterior
@@ -35,23 +26,23 @@ if TYPE_CHECKING:
     from patchproof.optimizer.run import Run
 
 
-class SessionsSettings(GridSettings):
+class SessionsSettings(grid.GridSettings):
     """Settings: a run for each scene, network, printer and seed, and sessions of photographs of each."""
 
-    printers: Names = ("coated",)  # printers of the designs, which optimizing knows
-    sessions: PositiveInt = 4  # sessions of each print
+    printers: grid.Names = ("coated",)  # printers of the designs, which optimizing knows
+    sessions: grid.PositiveInt = 4  # sessions of each print
     photos: Annotated[int, Field(ge=5, le=1000)] = 20  # photographs of each session
     path_traced: bool = True  # photograph with Mitsuba 3, else with our renderer
 
 
 def cells(settings: SessionsSettings, base: Path) -> list[Cell]:
     """A cell per scene, network, printer and seed, with the whole scene in it."""
-    profiles = {short_name(name): {"printer": {"profile": name}} for name in settings.printers}
-    return grid_cells(
+    profiles = {grid.short_name(name): {"printer": {"profile": name}} for name in settings.printers}
+    return grid.grid_cells(
         settings,
         base,
         lambda values: (
-            (with_changes(values, {"target": {"models": values["networks"]}, **table}), (printer,))
+            (grid.with_changes(values, {"target": {"models": values["networks"]}, **table}), (printer,))
             for printer, table in profiles.items()
         ),
     )
@@ -63,8 +54,8 @@ def make_run_and_sheet(base: Path, cell: Cell, folder: Path) -> "Run":
     from patchproof.optimizer.run import optimize
     from patchproof.reprints.run_sheet import sheet as sheet_of
 
-    scene = scene_of(base, cell.values)
-    scene = replace(scene, settings=scene.settings.changed(target={"models": network_names(base, cell.values)}))
+    scene = grid.scene_of(base, cell.values)
+    scene = replace(scene, settings=scene.settings.changed(target={"models": grid.network_names(base, cell.values)}))
     # a page needs one control only, and all of them would take most of a promise's time
     if (picture := cell.values.get("picture")) is None:
         patch_run = optimize(scene, folder / "run", promise=PromiseOptions(controls=("bare",)))
@@ -104,7 +95,7 @@ def verify_photos(
     from patchproof.evidence.gather import gather_evidence
     from patchproof.sheets.manifest import load_manifest
 
-    sheet, networks = folder / "sheet.json", network_names(base, cell.values)
+    sheet, networks = folder / "sheet.json", grid.network_names(base, cell.values)
     manifest = load_manifest(sheet)
     changed = replace(options_of(sheet, manifest, networks, None), **options)
     return gather_evidence(photos, manifest, changed, forecast=forecast)

@@ -25,15 +25,7 @@ from patchlab.study.estimates import mean
 from patchlab.study.grid import Names, by_scene, short_name
 from patchlab.study.record import hits_text, parse_hits
 from patchlab.study.study import Cell, Result, Study
-from patchlab.validation.photo_sessions import (
-    SessionsSettings,
-    cells,
-    make_run_and_sheet,
-    promise_posterior,
-    record_promise,
-    take_photos,
-    verify_photos,
-)
+from patchlab.validation import photo_sessions
 from patchproof.base.errors import Refused
 from patchproof.base.intervals import rate
 from patchproof.base.sessions import TAIL, RatePosterior, count_by_session, rate_posterior
@@ -52,7 +44,7 @@ if TYPE_CHECKING:
 _MIN_SESSIONS = 20  # fewest sessions for which the best width is estimated
 
 
-class PromisesSettings(SessionsSettings):
+class PromisesSettings(photo_sessions.SessionsSettings):
     """Settings of sessions, and views by our renderer without paper, also in places that the promise does not know."""
 
     rendered: Annotated[int, Field(ge=0, le=1000)] = 0  # sessions of as many views as photographs
@@ -63,7 +55,7 @@ class PromisesSettings(SessionsSettings):
 
 def promise_cells(settings: PromisesSettings, base: Path) -> list[Cell]:
     """A cell per combination and picture."""
-    optimized = cells(settings, base)
+    optimized = photo_sessions.cells(settings, base)
     if not settings.pictures:
         return optimized
     names = {cell.values["name"] for cell in optimized}
@@ -80,10 +72,12 @@ def run(settings: PromisesSettings, base: Path, cell: Cell) -> dict[str, Any]:
     """Promise, photograph and verify one combination."""
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        patch_run = make_run_and_sheet(base, cell, folder)
-        report = verify_photos(take_photos(settings, cell, patch_run, folder), folder, base, cell, ledger_photos=0)
+        patch_run = photo_sessions.make_run_and_sheet(base, cell, folder)
+        report = photo_sessions.verify_photos(
+            photo_sessions.take_photos(settings, cell, patch_run, folder), folder, base, cell, ledger_photos=0
+        )
     sessions = [(session.recognized, session.judged) for session in report.summary.sessions]
-    answers = record_promise(patch_run) | {"sessions": sessions, "verdict": report.summary.verdict}
+    answers = photo_sessions.record_promise(patch_run) | {"sessions": sessions, "verdict": report.summary.verdict}
     return answers | _measure_views(settings, patch_run)
 
 
@@ -144,7 +138,7 @@ class JudgedSession:
 def count_sessions(result: Result, sessions: str = "sessions") -> list[JudgedSession]:
     """A run's sessions of photographs, or of "rendered" views, that have judged photographs."""
     hits = parse_hits(result.answers["promised"])
-    about = sum(hits) / len(hits), promise_posterior(result), rate_posterior(*count_by_session(hits, 1))
+    about = sum(hits) / len(hits), photo_sessions.promise_posterior(result), rate_posterior(*count_by_session(hits, 1))
     return [JudgedSession(recognized, judged, *about) for recognized, judged in result.answers[sessions] if judged]
 
 
@@ -206,7 +200,7 @@ def _session_table(results: Sequence[Result]) -> Table:
 def _elsewhere_table(settings: PromisesSettings, results: Sequence[Result]) -> Table:
     rows = []
     for result in results:
-        values, (low, high) = result.cell.values, promise_posterior(result).rate_interval
+        values, (low, high) = result.cell.values, photo_sessions.promise_posterior(result).rate_interval
         shown, promised = rate(parse_hits(result.answers["elsewhere"])), parse_hits(result.answers["promised"])
         within = shown is not None and low <= shown.value <= high
         about = (values["name"], values["network"], values["seed"])

@@ -21,19 +21,12 @@ import numpy as np
 import torch
 from pydantic import BaseModel, Field
 
+from patchproof.base import output
 from patchproof.base.compute import Compute
 from patchproof.base.errors import Refused
 from patchproof.base.fingerprint import refuse_other_inputs
 from patchproof.base.folder_lock import lock_folder
 from patchproof.base.input import is_file, read_file, read_json
-from patchproof.base.output import (
-    check_folder,
-    clear_folder,
-    make_folder,
-    refuse_inputs_in,
-    refuse_other_files,
-    write_atomically,
-)
 from patchproof.base.progress import Advance, Progress, no_progress
 from patchproof.base.settings import SceneSettings
 from patchproof.base.validation import refuse_untrusted, validate_model
@@ -121,10 +114,10 @@ def optimize(
     out, compute = Path(out), compute.without("optimize", cluster=True)
     with lock_folder(out):
         if resume and any(is_file(out / name) for name in (CHECKPOINT_FILE, _LOG_FILE, "place.json")):
-            refuse_other_files(out, ("*",))  # links, that is: no other file is written to
+            output.refuse_other_files(out, ("*",))  # links, that is: no other file is written to
         else:
             unfinished = is_file(out / CHECKPOINT_FILE) and not is_file(out / RUN_FILE)
-            check_folder(out, RUN_FILE_PATTERNS, overwrite, unfinished=unfinished, inputs=(scene,))
+            output.check_folder(out, RUN_FILE_PATTERNS, overwrite, unfinished=unfinished, inputs=(scene,))
         scene = resolve_scene(scene, seed)
         save_place, searched = None, {}
         if not scene.HAS_PLACE:
@@ -132,10 +125,10 @@ def optimize(
             scene, save_place, searched = _choose_place(scene, out, resume, search_options)
         problem = set_problem(scene, compute.device, models, loss, compute.jobs)
         refuse_other_inputs(searched, problem.inputs, out, scene.settings.model_dump())
-        refuse_inputs_in(out, named_paths(scene).values())
+        output.refuse_inputs_in(out, named_paths(scene).values())
         if not resume:
-            clear_folder(out)  # everything that the new run needs has been read
-        make_folder(out)
+            output.clear_folder(out)  # everything that the new run needs has been read
+        output.make_folder(out)
         if save_place is not None:
             save_place()
         state = load_checkpoint(out, problem) if resume else start(problem)
@@ -182,13 +175,13 @@ def finish_run(
     problem.subject.save(design, out)
     promise = promise_of(problem, design, options, partial(progress, "promise"))
     if scene.mesh_glb is not None:
-        write_atomically(out / _MESH_FILE, scene.mesh_glb)
+        output.write_atomically(out / _MESH_FILE, scene.mesh_glb)
     details = _details(problem, promise, out) | ({} if imported is None else {"imported": dict(imported)})
     return _write(Run(out, scene, design, promise, details))
 
 
 def _write(run: Run) -> Run:
-    write_atomically(run.folder / RUN_FILE, json.dumps(run.details, indent=1) + "\n")
+    output.write_atomically(run.folder / RUN_FILE, json.dumps(run.details, indent=1) + "\n")
     return run
 
 
@@ -274,7 +267,7 @@ def _run_steps(problem: Problem, state: State, out: Path, advance: Advance) -> n
     count = min(state.number, settings.steps) if is_file(path) and path.stat().st_size else 0
     with open(path if count else os.devnull, "rb") as log:
         lines = [log.readline(_MAX_LINE_BYTES) for _ in range(count)]
-    write_atomically(path, b"".join(lines))
+    output.write_atomically(path, b"".join(lines))
     with open(path, "a", encoding="utf-8") as log:
         for step in steps(problem, state):
             state, names = step.state, ["loss", "confidence", "rate", "gradient"]

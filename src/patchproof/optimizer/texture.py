@@ -23,19 +23,8 @@ from patchproof.base.errors import Refused
 from patchproof.base.output import write_atomically
 from patchproof.channel.printer import Printer
 from patchproof.mesh.export import write_glb
+from patchproof.optimizer import subject
 from patchproof.optimizer.pixels import as_pixels, from_pixels
-from patchproof.optimizer.subject import (
-    MASK_FILE,
-    OBJECT_FILE,
-    TEXTURE_FILES,
-    Grid,
-    Subject,
-    build_pyramid,
-    collapse_pyramid,
-    level_count,
-    read_png,
-    write_png,
-)
 from patchproof.render.designs import LearnedTextures
 from patchproof.render.pixels import ObjectTextures
 from patchproof.scene.canvas import Canvas
@@ -44,7 +33,7 @@ from patchproof.sheets.piece import CELLS, control_design
 
 
 @dataclass(frozen=True, eq=False)
-class Texture(Subject):
+class Texture(subject.Subject):
     """Designs are 3×1×M in [0, 1]: the texels that may change, texture by texture, by rows."""
 
     # Larger steps suit only the networks that train: a fourth network recognized a letter box made for three in 60 % of
@@ -69,14 +58,14 @@ class Texture(Subject):
 
     def gradient_levels(self, gradient: Tensor) -> tuple[Tensor, ...]:
         """The gradient's pyramids, texture by texture."""
-        return tuple(chain(*map(build_pyramid, self.surface.images(gradient), self.surface.masks)))
+        return tuple(chain(*map(subject.build_pyramid, self.surface.images(gradient), self.surface.masks)))
 
     def combine_levels(self, updates: Sequence[Tensor]) -> Tensor:
         """Combine the updates of the pyramids' levels into one update of the design."""
         parts, remaining = [], iter(updates)
         for mask in self.surface.masks:
-            levels = list(islice(remaining, level_count(mask.shape)))
-            parts.append(collapse_pyramid(levels)[:, mask])
+            levels = list(islice(remaining, subject.level_count(mask.shape)))
+            parts.append(subject.collapse_pyramid(levels)[:, mask])
         return torch.cat(parts, 1)[:, None]
 
     def penalty(self, design: Tensor) -> Tensor | float:
@@ -128,22 +117,22 @@ class Texture(Subject):
     def save(self, pixels: np.ndarray, folder: Path) -> None:
         """Write the object with its new textures, each texture, and masks one below the other, white if changeable."""
         textures, masks = self.surface.textures(pixels), self.canvas.mask
-        write_atomically(folder / OBJECT_FILE, lambda path: write_glb(self.canvas.mesh, textures, path))
+        write_atomically(folder / subject.OBJECT_FILE, lambda path: write_glb(self.canvas.mesh, textures, path))
         for i, texture in enumerate(textures):
-            write_png(folder / TEXTURE_FILES.replace("*", f"{i}"), texture)
+            subject.write_png(folder / subject.TEXTURE_FILES.replace("*", f"{i}"), texture)
         width = max(mask.shape[1] for mask in masks)
         wide = [np.pad(mask, ((0, 0), (0, width - mask.shape[1]))) for mask in masks]
-        write_png(folder / MASK_FILE, np.concatenate(wide).astype(np.uint8) * 255)
+        subject.write_png(folder / subject.MASK_FILE, np.concatenate(wide).astype(np.uint8) * 255)
 
     def file(self, pixels: np.ndarray) -> tuple[str, bytes]:
         """The object with its new textures as GLB."""
         with TemporaryDirectory() as folder:
-            path = Path(folder) / OBJECT_FILE
+            path = Path(folder) / subject.OBJECT_FILE
             write_glb(self.canvas.mesh, self.surface.textures(pixels), path)
             return "glb", path.read_bytes()
 
     @property
-    def grid(self) -> Grid:
+    def grid(self) -> subject.Grid:
         """The resolution of the textures, per millimeter of the surface on average."""
         mesh, masks = self.canvas.mesh, self.canvas.mask
         sizes = np.array([mask.shape[1::-1] for mask in masks])
@@ -152,7 +141,7 @@ class Texture(Subject):
         a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
         area_mm2 = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
         texels = int(sum(mask.sum() for mask in masks))
-        return Grid(None, None, None, texels, float(np.sqrt(flat / area_mm2)))
+        return subject.Grid(None, None, None, texels, float(np.sqrt(flat / area_mm2)))
 
     @cached_property
     def surface(self) -> LearnedTextures:
@@ -172,7 +161,7 @@ def subject_of(scene: Scene, printer: Printer, network_px: int, device: torch.de
 def read_design(scene: Scene, folder: Path) -> np.ndarray:
     """Implements `subject.read_design`: reads the changeable texels of the textures."""
     canvas = scene.object_canvas()
-    textures = [read_png(folder / TEXTURE_FILES.replace("*", f"{i}")) for i in range(len(canvas.mask))]
+    textures = [subject.read_png(folder / subject.TEXTURE_FILES.replace("*", f"{i}")) for i in range(len(canvas.mask))]
     for texture, mask in zip(textures, canvas.mask, strict=True):
         if texture.shape[:2] != mask.shape:
             height, width = texture.shape[:2]

@@ -13,17 +13,10 @@ from typing import Any
 
 from patchproof.base.output import make_folder, write_atomically
 from patchproof.base.text import csv_lines
+from patchproof.report import words
 from patchproof.report.images import DELTA_TOP, data_uri, saved_pictures
 from patchproof.report.page import render_page
 from patchproof.report.plots import ledger_plot, recognition_plot, scale_plot
-from patchproof.report.words import (
-    VERDICTS,
-    benefit_sentence,
-    headline_of,
-    looks_sentence,
-    recognition_meaning,
-    remarks,
-)
 
 _EFFECTS = {
     "shown": "The patch itself makes the difference: it did better than every control.",
@@ -70,12 +63,12 @@ def report_html(report: Mapping, manifest: Mapping, encoded: Mapping[str, Mappin
         manifest=manifest,
         promise=promise,
         primary=primary,
-        headline=headline_of(summary),
-        worth=benefit_sentence(summary),
-        looks=looks_sentence(summary),
-        meaning=recognition_meaning(promise["models"][0]) if promise else "",
+        headline=words.headline_of(summary),
+        worth=words.benefit_sentence(summary),
+        looks=words.looks_sentence(summary),
+        meaning=words.recognition_meaning(promise["models"][0]) if promise else "",
         word=(summary["worth"] or {}).get("word", "not_shown"),
-        verdict=VERDICTS[summary["verdict"]],
+        verdict=words.VERDICTS[summary["verdict"]],
         effect=_EFFECTS["estimated" if estimated else summary["effect"]],
         bars=_bars(summary, promise, report["controls"]),
         controls=report["controls"],
@@ -84,7 +77,7 @@ def report_html(report: Mapping, manifest: Mapping, encoded: Mapping[str, Mappin
         plots=[(svg, about) for svg, about in plots if svg],
         sized=any(photo["scale_x"] is not None for photo in photos),
         cards=[{"photo": photo, "pictures": pictures.get(photo["file"], {})} for photo in photos],
-        remarks=remarks(photos),
+        remarks=words.remarks(photos),
         delta_top=DELTA_TOP,
         settings=json.dumps(manifest["settings"], indent=1, ensure_ascii=False),
         origin=report["origin"],

@@ -7,7 +7,7 @@ It asks for `pip install "patchproof[lab]"`, which has onnx and onnxscript.
 import json
 from pathlib import Path
 
-from patchlab.training.card import export_onnx
+from patchlab.training.fit import export_onnx
 from patchproof.classifier.builtin import INPUT_PX, load_builtin
 from patchproof.classifier.custom import classifier_of
 from patchproof.classifier.network import Classifier

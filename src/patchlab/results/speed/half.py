@@ -19,15 +19,9 @@ from patchlab.bench.measure import call_in_turn, time_call
 from patchlab.results.rows import write_rows
 from patchproof.base.workers import keep_freed_memory
 from patchproof.classifier.network import Classifier
+from patchproof.optimizer import promise
 from patchproof.optimizer.loop import best_design
 from patchproof.optimizer.problem import set_problem
-from patchproof.optimizer.promise import (
-    CONTROLS,
-    PROMISE_VIEWS,
-    VIEWS_PER_SESSION,
-    _control_mask,
-    pictures_with_controls,
-)
 from patchproof.optimizer.responses import responses
 
 ROUNDS = 3
@@ -43,9 +37,9 @@ def rounded(self, squares, windows):
 def measured(path: str) -> list[dict]:
     """The lines of one scene."""
     problem = set_problem(pp.load_scene(path))
-    shown = pictures_with_controls(problem, best_design(problem), CONTROLS)
-    conditions = problem.scene.draw("promise", PROMISE_VIEWS, per_session=VIEWS_PER_SESSION)
-    control_mask = _control_mask(PROMISE_VIEWS, VIEWS_PER_SESSION)
+    shown = promise.pictures_with_controls(problem, best_design(problem), promise.CONTROLS)
+    conditions = problem.scene.draw("promise", promise.PROMISE_VIEWS, per_session=promise.VIEWS_PER_SESSION)
+    control_mask = promise._control_mask(promise.PROMISE_VIEWS, promise.VIEWS_PER_SESSION)
 
     def told(way):
         Classifier._asked = way

@@ -13,12 +13,13 @@ Sources: Efron and Tibshirani, An Introduction to the Bootstrap, 1993, 13.3 (per
 Robertson, Wright and Dykstra, Order Restricted Statistical Inference, 1988, 1.4 (the nearest falling rates).
 """
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 
-from patchproof.base.intervals import wilson
+from patchproof.base.intervals import Estimate, paired_difference, wilson
 
 BOOTSTRAP_SAMPLES = 200
 LIKELIHOOD_TOLERANCE = 0.1  # of log-likelihood: curves this near to the best count as equally good
@@ -26,6 +27,9 @@ MAX_P_NOT_MONOTONE = 0.01  # 0.01, since each sweep tests two curves
 MIN_EASY_RATE = 0.05  # Wilson's lower end of the rate there; below it nothing worked
 MIN_LOST_SHARE = 0.25  # of the rate at the easy end; a curve that loses less holds
 BEYOND_SWEEP = 2.0  # stands for a breaking point beyond the sweep
+
+
+CONTROLS = ("bare", "gray")  # of a promise's controls; a noise design would need a draw
 
 
 @dataclass(frozen=True)
@@ -113,3 +117,31 @@ def _fit_curves(counts: np.ndarray, n: int, positions: np.ndarray) -> tuple[np.n
     likelihood = counts.astype(np.float32) @ odds + none
     good = likelihood >= likelihood.max(1, keepdims=True) - LIKELIHOOD_TOLERANCE  # curves are sorted by breaking point
     return lost[good.argmax(1)], lost[::-1][good[:, ::-1].argmax(1)], curves[likelihood.argmax(1)]
+
+
+def gains_over_controls(design: np.ndarray, controls: Mapping[str, np.ndarray]) -> list[Estimate]:
+    """Per point the rate of `design` P×N minus that of the best control there, each P×N."""
+    gains = []
+    for point, hits in enumerate(design):
+        best = max((worked[point] for worked in controls.values()), key=np.sum)
+        value, (low, high) = paired_difference(hits.tolist(), best.tolist())
+        gains.append(Estimate(value, low, high, len(hits)))
+    return gains
+
+
+def has_effect(gain: Estimate) -> bool:
+    """True if the gain's interval lies above 0."""
+    return gain.low > 0
+
+
+def gain_break(gains: Sequence[Estimate], positions: np.ndarray) -> Break:
+    """The break between the first point without a gain and the one before it, positions P in [0, 1] from easy to hard;
+    `rates` are the gains at both ends.
+    """
+    ends, lost = (gains[0].value, gains[-1].value), [i for i, gain in enumerate(gains) if not has_effect(gain)]
+    if not lost:
+        return Break(BEYOND_SWEEP, BEYOND_SWEEP, BEYOND_SWEEP, None, ends)
+    if lost[0] == 0:
+        return Break(None, None, None, None, ends)
+    low, high = float(positions[lost[0] - 1]), float(positions[lost[0]])
+    return Break((low + high) / 2, low, high, None, ends)

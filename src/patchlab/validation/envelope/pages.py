@@ -14,8 +14,14 @@ import numpy as np
 
 from patchlab.study.figures import EMPTY_COLOR, number_grid
 from patchlab.validation.envelope.axes import AXES
-from patchlab.validation.envelope.fit import BEYOND_SWEEP, MAX_P_NOT_MONOTONE, MIN_LOST_SHARE
-from patchlab.validation.envelope.gains import CONTROLS, gains_over_controls, has_effect
+from patchlab.validation.envelope.fit import (
+    BEYOND_SWEEP,
+    CONTROLS,
+    MAX_P_NOT_MONOTONE,
+    MIN_LOST_SHARE,
+    gains_over_controls,
+    has_effect,
+)
 from patchproof.base.goal import Goal
 from patchproof.base.intervals import Estimate, rate
 from patchproof.report.tables import Drawing, Table, Value

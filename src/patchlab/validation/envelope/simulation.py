@@ -19,7 +19,7 @@ from torch import Tensor
 
 from patchlab.study.record import corner_error_mm
 from patchlab.validation.envelope.axes import GEOMETRY_AXES, SweepPoint, conditions_at, scene_at
-from patchlab.validation.envelope.gains import CONTROLS
+from patchlab.validation.envelope.fit import CONTROLS
 from patchlab.validation.envelope.window import RenderedWindow, paste_on_plain, piece_window
 from patchlab.validation.mounted_sheets import mount_run_sheet
 from patchproof.base import geometry

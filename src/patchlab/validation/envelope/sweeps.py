@@ -20,8 +20,7 @@ from pydantic import Field
 
 from patchlab.study.study import Cell, Study
 from patchlab.validation.envelope.axes import AXES, DEFAULT_MAPS, is_possible
-from patchlab.validation.envelope.fit import find_break
-from patchlab.validation.envelope.gains import gain_break
+from patchlab.validation.envelope.fit import find_break, gain_break
 from patchlab.validation.envelope.pages import figures, found_and_measured, gains_in, tables
 from patchlab.validation.envelope.simulation import measure_photos, open_simulation, recognize_target
 from patchproof.base.errors import Refused
