@@ -47,8 +47,8 @@ from patchproof.render.stage import set_stage
 from patchproof.reprints.page_photos import photograph_page
 from patchproof.scene.conditions import with_values
 from patchproof.scene.scene import make_scene
-from patchproof.sheets.chart import chart_colors
 from patchproof.sheets.manifest import dump_manifest, load_manifest
+from patchproof.sheets.page import chart_colors
 
 UNSEEN = np.random.default_rng(8).random((500, 3))
 WHITE = np.ones((1, 3))

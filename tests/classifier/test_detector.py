@@ -24,7 +24,7 @@ from patchproof.classifier.average_precision import average_precision, find_dete
 from patchproof.classifier.builtin_detector import INPUT_PX, WEIGHTS_FOLDER
 from patchproof.classifier.detector import NO_BOX_LOGIT, Detector, iou
 from patchproof.classifier.load import load_classifier
-from patchproof.optimizer.losses import target_loss
+from patchproof.optimizer.subject import target_loss
 from patchproof.render.stage import set_stage
 from patchproof.render.views import render_views
 

@@ -267,7 +267,7 @@ def run_pictures(place: Place, number: int) -> Use:
 
 
 def checkpoint(place: Place, number: int) -> Use:
-    from patchproof.optimizer.checkpoint import CHECKPOINT_FILE, load_checkpoint
+    from patchproof.optimizer.loop import CHECKPOINT_FILE, load_checkpoint
 
     path = place.given / CHECKPOINT_FILE
     head = json.dumps({"a": {"dtype": "F32", "shape": [2**40], "data_offsets": [0, 2**42]}}).encode()

@@ -243,7 +243,7 @@ def small_problem():
 
 
 def checkpoint(rng: Rng, folder: Path) -> Read:
-    from patchproof.optimizer.checkpoint import CHECKPOINT_FILE, load_checkpoint
+    from patchproof.optimizer.loop import CHECKPOINT_FILE, load_checkpoint
 
     data, problem = (finished_run() / CHECKPOINT_FILE).read_bytes(), small_problem()
     size = int.from_bytes(data[:8], "little")
@@ -264,7 +264,7 @@ def checkpoint(rng: Rng, folder: Path) -> Read:
 
 def other_tensors(rng: Rng, folder: Path) -> Read:
     """A checkpoint with whole tensors of other shapes, types and values."""
-    from patchproof.optimizer.checkpoint import CHECKPOINT_FILE, load_checkpoint
+    from patchproof.optimizer.loop import CHECKPOINT_FILE, load_checkpoint
 
     problem = small_problem()
     names = ["design", "best", *(f"{kind}{n}" for kind in ("mean", "square") for n in range(4))]

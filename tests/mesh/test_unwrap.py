@@ -16,8 +16,7 @@ from patchproof.base.settings import PatchSettings
 from patchproof.mesh import unwrap as unwrapping
 from patchproof.mesh.load_mesh import load_mesh
 from patchproof.mesh.mesh import Material, MeshPart, mesh_from_parts
-from patchproof.mesh.unwrap import has_usable_uv, unwrap
-from patchproof.mesh.uv_coverage import coverage
+from patchproof.mesh.unwrap import coverage, has_usable_uv, unwrap
 from patchproof.render.photograph import photograph
 from patchproof.render.stage import set_stage
 from patchproof.scene.canvas import texture_canvas

@@ -22,15 +22,15 @@ from patchproof.base.settings import SceneSettings
 from patchproof.base.validation import validate_model
 from patchproof.base.workers import Workers, can_fork, use_threads
 from patchproof.classifier.network import Classifier
-from patchproof.optimizer import loop, run, training_views
+from patchproof.optimizer import expectation, loop, run
 from patchproof.optimizer.loop import start, steps, take_step
-from patchproof.optimizer.losses import target_loss, total_variation
 from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.problem import set_problem
 from patchproof.optimizer.promise import CONTROLS, PromiseOptions, make_promise
 from patchproof.optimizer.responses import responses
 from patchproof.optimizer.run import load_run, promise_run
 from patchproof.optimizer.run import optimize as optimize_scene
+from patchproof.optimizer.subject import target_loss, total_variation
 from patchproof.render.photograph import photograph
 from patchproof.scene.conditions import fields_of, with_values
 from patchproof.scene.scene import build_scene
@@ -370,49 +370,49 @@ def test_the_number_of_processes_changes_no_byte(tmp_path, few_views, a_small_se
     """Steps of 5 views, the selection, promise and controls, and the search for a place among three; nor does it what
     of the five poses a process keeps.
     """
-    monkeypatch.setattr(training_views, "MIN_POSES", 5)
+    monkeypatch.setattr(expectation, "MIN_POSES", 5)
     scene = toml(tmp_path / "scene.toml", optimize__steps=2, optimize__views=5, patch__place="auto")
     files = ("design.png", "steps.jsonl", "views.png", "place.json", "run.json")
     with use_threads(1):
-        for jobs, kept_px in ((2, training_views.CACHE_PX), (1, 0)):
-            monkeypatch.setattr(training_views, "CACHE_PX", kept_px)
+        for jobs, kept_px in ((2, expectation.CACHE_PX), (1, 0)):
+            monkeypatch.setattr(expectation, "CACHE_PX", kept_px)
             optimize_scene(scene, tmp_path / str(jobs), compute=Compute(jobs=jobs), promise=BESIDE_BARE)
     assert same_files(tmp_path / "1", tmp_path / "2", files)
 
 
 def test_poses_come_round_with_other_backgrounds_light_print_and_camera(tmp_path, monkeypatch):
-    monkeypatch.setattr(training_views, "MIN_POSES", 6)
+    monkeypatch.setattr(expectation, "MIN_POSES", 6)
     scene = scene_with(tmp_path, optimize__steps=10)
-    drawn, trained = scene.draw("train", 40), training_views.training_conditions(scene)
-    assert training_views.new_pose_share(scene) == 12 / 40  # a quarter of 40 views, in whole steps of four
+    drawn, trained = scene.draw("train", 40), expectation.training_conditions(scene)
+    assert expectation.new_pose_share(scene) == 12 / 40  # a quarter of 40 views, in whole steps of four
     for name, rounds in (("azimuth_deg", True), ("distance_mm", True), ("background", False)):
         values, own = getattr(trained.pose, name), getattr(drawn.pose, name)
         assert np.array_equal(values[:12], own[:12]) and np.array_equal(values[36:], own[:4] if rounds else own[36:])
     trained, drawn = fields_of(trained), fields_of(drawn)
     alike = {name for name, values in drawn.items() if np.array_equal(trained[name], values)}
     assert alike >= {"ambient", "light_azimuth_deg", "dot_gain", "exposure_ev", "noise_seed", "background"}
-    assert training_views.new_pose_share(SimpleNamespace(HAS_OBJECT=False, settings=scene.settings)) == 1, (
+    assert expectation.new_pose_share(SimpleNamespace(HAS_OBJECT=False, settings=scene.settings)) == 1, (
         "pictures are all of a view"
     )
-    monkeypatch.setattr(training_views, "MIN_POSES", 240)
-    assert training_views.new_pose_share(scene) == 1
-    assert np.array_equal(training_views.training_conditions(scene).pose.azimuth_deg, drawn["azimuth_deg"])
+    monkeypatch.setattr(expectation, "MIN_POSES", 240)
+    assert expectation.new_pose_share(scene) == 1
+    assert np.array_equal(expectation.training_conditions(scene).pose.azimuth_deg, drawn["azimuth_deg"])
 
 
 def test_only_views_that_fit_are_kept(tmp_path, monkeypatch):
     problem = set_problem(scene_with(tmp_path))
-    monkeypatch.setattr(training_views, "MIN_POSES", 24)
-    monkeypatch.setattr(training_views, "CACHE_PX", 5 * training_views.VIEWS_PER_TASK * problem.training_px**2)
+    monkeypatch.setattr(expectation, "MIN_POSES", 24)
+    monkeypatch.setattr(expectation, "CACHE_PX", 5 * expectation.VIEWS_PER_TASK * problem.training_px**2)
     drawn, seen = problem.scene.draw("train", 24), []
     monkeypatch.setattr(
-        training_views,
+        expectation,
         "training_views",
         lambda problem, drawn: seen.append(len(drawn)) or problem.see(None, drawn, 16),
     )
-    cache = training_views.ViewCache(problem, drawn)
+    cache = expectation.ViewCache(problem, drawn)
     for first in (0, 4, 8, 12, 16, 20, 0, 4, 8, 12, 16, 20):
         cache.views(first, drawn[first : first + 2])
-    assert seen == [2 * training_views.STEPS_AHEAD, 4, 2], "the last pair is seen twice"
+    assert seen == [2 * expectation.STEPS_AHEAD, 4, 2], "the last pair is seen twice"
     assert not cache._ahead, "what is not kept is seen once"
 
 

@@ -12,7 +12,7 @@ from collections import Counter
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from patchproof.optimizer import loop, training_views
+from patchproof.optimizer import expectation, loop
 from patchproof.optimizer.expectation import gradient_in_views
 from patchproof.optimizer.problem import set_problem
 from test_optimize import scene_with
@@ -43,15 +43,15 @@ class Counted(TorchDispatchMode):
 
 
 def test_a_step_keeps_within_its_budget_of_operations_and_waits(tmp_path, monkeypatch):
-    monkeypatch.setattr(training_views, "MIN_POSES", 32)
+    monkeypatch.setattr(expectation, "MIN_POSES", 32)
     problem = set_problem(scene_with(tmp_path, optimize__steps=16))
-    state, drawn = loop.start(problem), training_views.training_conditions(problem.scene)
-    cache = training_views.ViewCache(problem, drawn)
+    state, drawn = loop.start(problem), expectation.training_conditions(problem.scene)
+    cache = expectation.ViewCache(problem, drawn)
 
     def steps(first: int) -> None:
         """Four, which is how many are seen ahead."""
         for step in range(first, first + 16, 4):
-            tasks = training_views.task_conditions(drawn[step : step + 4])
+            tasks = expectation.task_conditions(drawn[step : step + 4])
             views = [cache.views((step + at) % 32, rows) for at, rows in tasks]
             loop._descend(problem, state, gradient_in_views(problem, state.design, views))
 

@@ -12,17 +12,18 @@ from patchproof.base.errors import Refused
 from patchproof.base.sessions import count_by_session, rate_posterior
 from patchproof.base.settings import BackgroundSettings
 from patchproof.scene import backgrounds as backgrounds_module
+from patchproof.scene import backgrounds as module
 from patchproof.scene import patterns
-from patchproof.scene import procedural_places as module
 from patchproof.scene.backgrounds import (
     ENOUGH_FILES,
     FEW_PICTURES,
     PLACE_NUMBERS,
+    PLACE_PX,
     VIEWS_PER_FILE,
     FileLevels,
     load_backgrounds,
+    procedural_place,
 )
-from patchproof.scene.procedural_places import PLACE_PX, procedural_place
 from patchproof.scene.scene import make_scene
 
 STREAMS = ("train", "select", "promise", "evaluate")

@@ -7,7 +7,7 @@ import pytest
 
 from patchproof.base.errors import Refused
 from patchproof.base.packaged import packaged_path
-from patchproof.sheets.chart import CORNERS, GRAYS, chart_colors, chart_swatches, sobol
+from patchproof.sheets.page import CORNERS, GRAYS, chart_colors, chart_swatches, sobol
 from patchproof.sheets.template import load_template, template_names
 
 A4 = packaged_path("print_templates", "a4.toml")

@@ -412,7 +412,7 @@ def test_a_manifest_of_another_form_is_refused_by_its_key(tmp_path, sheet):
 
 def test_the_package_imports_without_heavy_libraries():
     code = (
-        "import sys; from patchproof.sheets import chart, page, pdf, piece, pdf_raster, template, write; "
+        "import sys; from patchproof.sheets import page, pdf, piece, pdf_raster, template, write; "
         "print([m for m in ('torch', 'scipy', 'cv2', 'reportlab', 'pikepdf', 'pypdfium2') if m in sys.modules])"
     )
     run = subprocess.run(

@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from matplotlib.transforms import Bbox
 
 MAX_EXCESS_PERCENT = 5.0  # % by which a default's error may exceed the front's at its cost, if the intervals are apart
-
-
 _COLORS = ("#1f5fa8", "#c2571a", "#2a8f62", "#8a4fa3", "#6b6b6b")
 _LABEL_CHARACTERS = 60  # characters of an axis label in one line
 _DECADES_ONLY_RATIO = 2000  # largest over smallest figure from which on only decades get ticks

@@ -122,6 +122,6 @@ def models_chart(count: int, progress: Progress) -> Chart:
         error="largest error on the design, mm (median)",
         series=series,
         about=f"{count} photographs with eight markers; rolled: radius {near:g} to {far:g} mm, either "
-        f"way; lens: k1 {paper_photos.LENS_TERMS[0]:g}. What pays: the robust plane, unless its residual is halved by a lens or a "
-        "cylinder; no focal length known.",
+        f"way; lens: k1 {paper_photos.LENS_TERMS[0]:g}. What pays: the robust plane, unless its residual is halved by "
+        "a lens or a cylinder; no focal length known.",
     )

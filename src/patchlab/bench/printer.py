@@ -26,9 +26,9 @@ from patchproof.calibrate.chart_photo import read_chart
 from patchproof.calibrate.color_ladder import ColorMap, average_repeats, choose_map, color_difference, map_kinds
 from patchproof.report.tables import Table
 from patchproof.reprints.page_photos import PX_PER_MM, PrintFunction, Shot, page_light, photograph_page
-from patchproof.sheets.chart import chart_colors
 from patchproof.sheets.manifest import Manifest
 from patchproof.sheets.markers import DICTIONARY, marker_cells
+from patchproof.sheets.page import chart_colors
 from patchproof.sheets.piece import hash_order, manifest_marker, square_marker
 
 SWATCHES = (6, 48, 96)

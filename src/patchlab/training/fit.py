@@ -25,7 +25,6 @@ from patchlab.training.pictures import HELD_OUT_SEED, Pictures, load_or_render, 
 from patchproof.mesh import primitives
 from patchproof.scene import patterns
 
-
 Epochs = Iterator[tuple[int, float, nn.Module]]  # after each epoch: its number, its mean loss, the network
 HELD_OUT_TEXT = "renders of other shapes, textures, backgrounds and conditions of the same kinds; nothing real"
 

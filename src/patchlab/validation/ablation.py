@@ -110,7 +110,7 @@ def simplify_problem(problem: Problem, effect: str) -> Problem:
         )
     subject = problem.subject
     if PRINTER in on:
-        subject = subject.with_printer(identity_printer())
+        subject = replace(problem.patch, printer=identity_printer())
     changes = tuple(terms[name].change for name in on if name != PRINTER)
     return SimplifiedProblem(**vars(replace(problem, subject=subject)), changes=changes)
 

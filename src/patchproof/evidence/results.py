@@ -325,7 +325,7 @@ class Report(StrictModel):
 
     def _repr_html_(self) -> str:
         """The verdict in a notebook."""
-        from patchproof.base.notebook import notebook_html, rate_text
+        from patchproof.base.output import notebook_html, rate_text
 
         summary = self.summary
         rows = {"photographs": f"{summary.photos}, judged {summary.judged}, measured {summary.measured}"}

@@ -18,8 +18,7 @@ from patchproof.base.color import linear_from_srgb
 from patchproof.base.errors import Refused
 from patchproof.base.validation import summarize_names
 from patchproof.mesh.assets import VERTEX_COLORS, WHITE, Assets, Wrap, draw_out_textures
-from patchproof.mesh.mesh import Material, MeshPart
-from patchproof.mesh.polygons import triangulate
+from patchproof.mesh.mesh import Material, MeshPart, triangulate
 
 _MAPS = ("map_", "bump", "norm", "disp", "decal", "refl")
 _MOST_NUMBERS = {"-mm": 2, "-s": 3, "-o": 3, "-t": 3}  # after an option; others have one word

@@ -14,8 +14,7 @@ import numpy as np
 from patchproof.base.errors import Refused
 from patchproof.base.validation import summarize_names
 from patchproof.mesh.assets import VERTEX_COLORS, WHITE, Assets
-from patchproof.mesh.mesh import Material, MeshPart
-from patchproof.mesh.polygons import triangulate
+from patchproof.mesh.mesh import Material, MeshPart, triangulate
 
 _NAMES = "char uchar short ushort int uint float double int8 uint8 int16 uint16 int32 uint32 float32 float64".split()
 _TYPES: dict[str, str] = dict(zip(_NAMES, "i1 u1 i2 u2 i4 u4 f4 f8".split() * 2, strict=True))

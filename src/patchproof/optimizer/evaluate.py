@@ -17,8 +17,7 @@ from patchproof.base.compute import Compute
 from patchproof.base.errors import Refused
 from patchproof.base.folder_lock import lock_folder
 from patchproof.base.input import is_file
-from patchproof.base.notebook import notebook_html, rate_text
-from patchproof.base.output import write_atomically
+from patchproof.base.output import notebook_html, rate_text, write_atomically
 from patchproof.base.progress import Advance, Progress, no_advance, no_progress
 from patchproof.base.validation import StrictModel
 from patchproof.base.workers import Workers, open_workers

@@ -1,27 +1,34 @@
 """The loop: draw conditions, compute the gradient, descend, select.
 
-In: a `Problem` and, to resume, a `State`. Out: a generator of `TrainingStep`s; saving, progress and plots are left to
-its caller. The design starts at mid-gray. Adam on every level of the gradient's pyramid, or signed steps as in FGSM and
-PGD (Goodfellow et al. 2015, Madry et al. 2018), always clipped to [0, 1]. Every 240 views the design is tried on a
-fixed selection set, and the best one is kept, so that a design that suited only its last views is not printed. The
-promise set is never used here.
+In: a `Problem` and, to resume, a `State`. Out: a generator of `TrainingStep`s, and the checkpoint, which holds a state
+and is replaced as a whole; when to save it, progress and plots are left to the caller. The design starts at mid-gray.
+Adam on every level of the gradient's pyramid, or signed steps as in FGSM and PGD (Goodfellow et al. 2015, Madry et al.
+2018), always clipped to [0, 1]. Every 240 views the design is tried on a fixed selection set, and the best one is kept,
+so that a design that suited only its last views is not printed. The promise set is never used here.
 
 A step depends only on the state and its own number, so that a resumed run gives the same bytes.
 """
 
+import json
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
 import torch
+from pydantic import Field
 from torch import Tensor
 
 from patchproof.base.errors import Refused
+from patchproof.base.fingerprint import refuse_other_inputs
+from patchproof.base.input import is_file
+from patchproof.base.output import write_atomically
 from patchproof.base.settings import OptimizeSettings
-from patchproof.optimizer.expectation import Answer, expectation, gradient_in_views
+from patchproof.base.validation import StrictModel
+from patchproof.optimizer.expectation import Answer, expectation, gradient_in_views, task_conditions, training_views
 from patchproof.optimizer.problem import Problem
-from patchproof.optimizer.training_views import task_conditions, training_views
 from patchproof.scene.conditions import Conditions
 
 # Training views. When designs were tried twice as often, 28 of 30 runs still kept their last design, and two kept one
@@ -30,6 +37,7 @@ SELECT_AFTER = 240
 SAVE_AFTER = 120  # training views that a kill can lose
 SELECT_VIEWS = 64
 _BETAS, _EPSILON = (0.9, 0.999), 1e-8  # Adam's own defaults
+CHECKPOINT_FILE = "checkpoint.safetensors"
 
 
 @dataclass(frozen=True)
@@ -163,3 +171,62 @@ def _select(step: TrainingStep, loss: float, rate: float) -> TrainingStep:
     if loss < state.best_loss:
         state = replace(state, best=state.design, best_loss=loss)
     return replace(step, state=state, select_loss=loss, select_rate=rate)
+
+
+def save_checkpoint(state: State, problem: Problem, out: Path) -> None:
+    """Replace the checkpoint of the run in `out`."""
+    from safetensors.torch import save_file
+
+    tensors = {"design": state.design, "best": state.best}
+    tensors |= {f"mean{level}": one for level, one in enumerate(state.mean)}
+    tensors |= {f"square{level}": one for level, one in enumerate(state.square)}
+    tensors = {name: tensor.cpu().contiguous().clone() for name, tensor in tensors.items()}
+    # text keeps every bit of the loss; the sheet id identifies scene and seed
+    note = {"number": state.number, "best_loss": state.best_loss.hex(), "sheet_id": problem.scene.sheet_id}
+    note |= {"inputs": problem.inputs}
+    # a single key, since safetensors writes several in undefined order
+    metadata = {"state": json.dumps(note)}
+    write_atomically(out / CHECKPOINT_FILE, lambda path: save_file(tensors, path, metadata=metadata))
+
+
+def load_checkpoint(out: Path, problem: Problem) -> State:
+    """The checkpoint's state, or the start where there is no checkpoint; refused where scene or seed differ."""
+    path, start_state = out / CHECKPOINT_FILE, start(problem)
+    if not is_file(path):
+        return start_state
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, framework="pt", device=str(problem.device)) as file:
+            note = _Note.model_validate_json((file.metadata() or {})["state"])
+            if note.sheet_id != problem.scene.sheet_id:
+                do = "resume with the same scene file and seed, or start in another folder"
+                got = f"a checkpoint of sheet {note.sheet_id} in {out}, not {problem.scene.sheet_id}"
+                raise Refused("the checkpoint of this scene and seed", got, do)
+            refuse_other_inputs(note.inputs, problem.inputs, out, problem.scene.settings.model_dump())
+            design, best = _tensor(file, "design", start_state.design), _tensor(file, "best", start_state.design)
+            mean = tuple(_tensor(file, f"mean{n}", level) for n, level in enumerate(start_state.mean))
+            square = tuple(_tensor(file, f"square{n}", level) for n, level in enumerate(start_state.square))
+        return State(note.number, design, mean, square, best, float.fromhex(note.best_loss))
+    except Refused:
+        raise
+    except (SafetensorError, OSError, LookupError, ValueError, ArithmeticError) as error:
+        got = f"{path} that cannot be read ({str(error)[:100]})"
+        raise Refused("a checkpoint", got, "start in another folder") from error
+
+
+class _Note(StrictModel):
+    number: Annotated[int, Field(ge=0)]
+    best_loss: str
+    sheet_id: str
+    inputs: dict[str, str]
+
+
+def _tensor(file: Any, name: str, start: torch.Tensor) -> torch.Tensor:
+    """The tensor of that name; refused unless it has the size and type of `start` and is finite."""
+    if file.get_slice(name).get_shape() != list(start.shape):
+        raise ValueError(f"{name} of another size than the scene's design")
+    tensor = file.get_tensor(name)
+    if tensor.dtype != start.dtype or not bool(torch.isfinite(tensor).all()):
+        raise ValueError(f"{name} of type {tensor.dtype} or with infinite values")
+    return tensor.clone()  # the file's memory is mapped, and Windows does not replace mapped files

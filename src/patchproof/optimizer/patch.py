@@ -6,7 +6,7 @@ pixels that go to the printer. `render.designs` draws the whole piece on paper.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import ClassVar
@@ -18,9 +18,16 @@ from torch import Tensor
 from patchproof.base.errors import Refused
 from patchproof.base.output import image_bytes
 from patchproof.channel.printer import Printer
-from patchproof.optimizer.losses import total_variation
 from patchproof.optimizer.pixels import as_pixels
-from patchproof.optimizer.subject import DESIGN_FILE, Grid, build_pyramid, collapse_pyramid, read_png, write_png
+from patchproof.optimizer.subject import (
+    DESIGN_FILE,
+    Grid,
+    build_pyramid,
+    collapse_pyramid,
+    read_png,
+    total_variation,
+    write_png,
+)
 from patchproof.render.designs import PrintedPiece
 from patchproof.render.pixels import PiecePicture
 from patchproof.scene.interface import PieceScene, Scene, require_piece
@@ -95,10 +102,6 @@ class Patch:
     def appearance_of_print(self, printed: Tensor) -> PiecePicture:
         """The piece with these texels."""
         return PiecePicture(printed, self.design_px)
-
-    def with_printer(self, printer: Printer) -> "Patch":
-        """This patch with another printer."""
-        return replace(self, printer=printer)
 
     def save(self, pixels: np.ndarray, folder: Path) -> None:
         """Write `design.png`."""

@@ -26,14 +26,13 @@ from patchproof.base.settings import OptimizeSettings
 from patchproof.base.validation import Side, StrictModel
 from patchproof.base.workers import fork_workers
 from patchproof.classifier.network import Classifier
-from patchproof.optimizer.expectation import gradient_in_views
+from patchproof.optimizer.expectation import gradient_in_views, training_views
 from patchproof.optimizer.loop import draft, start, views_per_network
-from patchproof.optimizer.losses import Loss
 from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.optimizer.promise import min_promise_passes
 from patchproof.optimizer.responses import responses
-from patchproof.optimizer.training_views import training_views
+from patchproof.optimizer.subject import Loss
 from patchproof.render.pixels import Appearance
 from patchproof.scene.candidate_places import MIN_DISTANCE_SHARE, CandidatePlace, PlaceFinder
 from patchproof.scene.conditions import Conditions

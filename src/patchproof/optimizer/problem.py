@@ -23,9 +23,8 @@ from patchproof.classifier.labels import find_labels
 from patchproof.classifier.load import load_classifier
 from patchproof.classifier.network import Classifier
 from patchproof.networks.batches import BatchedNetwork
-from patchproof.optimizer.losses import Loss, target_loss
 from patchproof.optimizer.patch import Patch
-from patchproof.optimizer.subject import Subject, subject_of
+from patchproof.optimizer.subject import Loss, Subject, subject_of, target_loss
 from patchproof.render.pixels import PHOTO_SAMPLING, Appearance, TextureSampling
 from patchproof.render.stage import Stage, set_stage
 from patchproof.render.surfaces import piece_surface

@@ -32,13 +32,28 @@ from patchproof.base.settings import SceneSettings
 from patchproof.base.validation import refuse_untrusted, validate_model
 from patchproof.base.version import __version__
 from patchproof.classifier.network import Classifier
-from patchproof.optimizer.checkpoint import CHECKPOINT_FILE, load_checkpoint, save_checkpoint
-from patchproof.optimizer.loop import SELECT_AFTER, State, is_save_step, start, steps
-from patchproof.optimizer.losses import Loss
+from patchproof.optimizer.loop import (
+    CHECKPOINT_FILE,
+    SELECT_AFTER,
+    State,
+    is_save_step,
+    load_checkpoint,
+    save_checkpoint,
+    start,
+    steps,
+)
 from patchproof.optimizer.pixels import side_by_side
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.optimizer.promise import PROMISE_VIEWS, VIEWS_PER_SESSION, PromiseOptions, make_promise
-from patchproof.optimizer.subject import DESIGN_FILE, MASK_FILE, OBJECT_FILE, TEXTURE_FILES, read_design, write_png
+from patchproof.optimizer.subject import (
+    DESIGN_FILE,
+    MASK_FILE,
+    OBJECT_FILE,
+    TEXTURE_FILES,
+    Loss,
+    read_design,
+    write_png,
+)
 from patchproof.scene.interface import Scene
 from patchproof.scene.patch_scene import PatchScene
 from patchproof.scene.scene import build_scene, load_scene, named_paths
@@ -68,10 +83,8 @@ class Run:
 
     def _repr_html_(self) -> str:
         """The promise and the design in a notebook; a texture is not one picture."""
-        from patchproof.base.notebook import notebook_html
-
         picture = self.design if self.scene.HAS_PIECE else None
-        return notebook_html(self.promise.headline, {"run": str(self.folder), **self.promise.figures()}, picture)
+        return output.notebook_html(self.promise.headline, {"run": str(self.folder), **self.promise.figures()}, picture)
 
 
 def optimize(

@@ -9,15 +9,19 @@ over blocks of 1, 2, 4 … pixels, each on its own, and adds them. The gradient 
 it was drawn from; the mean over a block shares it with every view, so that color and large shapes, which count in small
 and blurred views, come first. Laplacian pyramid normalization of DeepDream (Mordvintsev et al., TensorFlow tutorial,
 2015) scales levels likewise, by their spread instead of Adam's.
+
+The loss is the cross-entropy of the *summed* probability of all accepted labels, the quantity that is reported as
+confidence; for `deceive`, of its complement. The paper's printed update Θ + α∇L raises the loss (Pestana et al.,
+Algorithm 1); recognition needs the descent done here. TV: Mahendran and Vedaldi, CVPR 2015.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
-from typing import ClassVar, Protocol, Self
+from typing import ClassVar, Protocol
 
 import numpy as np
 import torch
@@ -25,14 +29,19 @@ from PIL import Image
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
+from patchproof.base.goal import Goal
 from patchproof.base.input import open_image
 from patchproof.base.output import write_atomically
 from patchproof.channel.printer import Printer
+from patchproof.classifier.network import Odds
 from patchproof.render.pixels import Appearance
 from patchproof.scene.interface import Scene
 
 DESIGN_FILE, OBJECT_FILE, TEXTURE_FILES, MASK_FILE = "design.png", "object.glb", "texture_*.png", "mask.png"
 MIN_COARSEST_BLOCKS = 8  # blocks along the shorter side of the coarsest level
+
+
+Loss = Callable[[Tensor, Sequence[int]], Tensor]  # (logits N×K, label indices) -> N losses to descend on
 
 
 @dataclass(frozen=True)
@@ -84,10 +93,6 @@ class Subject(Protocol):
     def appearance_of_print(self, printed: Tensor) -> Appearance:
         """The appearance of a print; differentiable."""
         return self.appearance(printed)
-
-    def with_printer(self, printer: Printer) -> Self:
-        """This subject with another printer."""
-        return self
 
     @property
     def grid(self) -> Grid:
@@ -154,3 +159,14 @@ def collapse_pyramid(updates: Sequence[Tensor]) -> Tensor:
         large = interpolate(update[None], scale_factor=2**level, mode="bilinear", align_corners=False)[0]
         total = total + large[:, : finest.shape[1], : finest.shape[2]]
     return total / math.sqrt(len(updates))
+
+
+def target_loss(odds: Odds, goal: Goal) -> Tensor:
+    """N losses: -log of the confidence (`assist`) or of 1 minus it (`deceive`), in float64 so that none saturates."""
+    return -(odds.log_confidence if goal.sign > 0 else odds.log_complement)
+
+
+def total_variation(design_srgb: Tensor) -> Tensor:
+    """Mean absolute difference of neighboring pixels of a 3×h×w design."""
+    across = (design_srgb[:, :, 1:] - design_srgb[:, :, :-1]).abs().mean()
+    return across + (design_srgb[:, 1:] - design_srgb[:, :-1]).abs().mean()

@@ -22,8 +22,7 @@ from torch import Tensor
 
 from patchproof.base.errors import Refused
 from patchproof.base.geometry import cross, dot
-from patchproof.render.clip import GUARD_PX, clip_triangles
-from patchproof.render.fragments import Cameras, Fragments, stack_columns
+from patchproof.render.fragments import GUARD_PX, Cameras, Fragments, clip_triangles, stack_columns
 
 SUBPIXELS = 256  # corners snap to this fraction of a pixel
 # Faces, rows or fragments held at a time. Sixteen views of 20k faces took 1.9 times as long with 2^20, whose

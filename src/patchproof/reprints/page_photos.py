@@ -33,8 +33,6 @@ PrintFunction = Callable[[np.ndarray], np.ndarray]  # N×3 sRGB sent → N×3 li
 
 PX_PER_MM = 8
 PHOTO_PX = (1600, 1200)
-
-
 SCAN_QUALITY, SCAN_BLUR_PX = 95, 0.8  # a flatbed's JPEG and its softness, in pixels of twice the scan's resolution
 
 

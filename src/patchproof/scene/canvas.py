@@ -19,8 +19,7 @@ from patchproof.base.input import is_file, open_image, read_text
 from patchproof.base.settings import PatchSettings
 from patchproof.base.validation import expand_path, spelling_hint
 from patchproof.mesh.mesh import Material, Mesh, position_numbers
-from patchproof.mesh.unwrap import has_usable_uv, unwrap
-from patchproof.mesh.uv_coverage import coverage, texels_per_face
+from patchproof.mesh.unwrap import coverage, has_usable_uv, texels_per_face, unwrap
 
 TEXELS = 1024  # side of a new texture: 0.7 mm per texel over a cube of 300 mm
 GUTTER_TEXELS = 1.5  # every texel that a face touches and one more, for bilinear look-ups within the face

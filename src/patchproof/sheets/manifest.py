@@ -18,6 +18,7 @@ from pydantic import Field, create_model, field_validator, model_validator
 from patchproof.base.errors import Refused
 from patchproof.base.goal import Goal
 from patchproof.base.input import open_image, read_json
+from patchproof.base.output import notebook_html, rate_text
 from patchproof.base.sessions import RatePosterior, count_by_session, rate_posterior
 from patchproof.base.validation import Finite, NotNegativeRange, Share, StrictModel, validate_model
 
@@ -216,16 +217,12 @@ class Promise(StrictModel):
 
     def figures(self) -> dict[str, str]:
         """The target, rate, interval and controls as text, in the order to be read."""
-        from patchproof.base.notebook import rate_text
-
         rows = {"target": f"{self.target.goal} {self.target.label}", "network": self.models[0].name}
         rows |= {f"recognized in {self.n} views": rate_text(self.rate, self.interval)}
         return rows | {kind: rate_text(claim.rate, claim.interval) for kind, claim in self.controls.items()}
 
     def _repr_html_(self) -> str:
         """The promise in a notebook."""
-        from patchproof.base.notebook import notebook_html
-
         return notebook_html(self.headline, self.figures())
 
 

@@ -14,11 +14,11 @@ import patchproof as pp
 from patchlab.bench.effort import object_scene
 from patchlab.results.rows import write_rows
 from patchproof.base.workers import keep_freed_memory
+from patchproof.optimizer.expectation import training_conditions
 from patchproof.optimizer.loop import start, take_step
 from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.problem import set_problem
 from patchproof.optimizer.responses import responses
-from patchproof.optimizer.training_views import training_conditions
 
 LABELS, SEEDS, JUDGED = ("box truck", "chair", "mailbox"), range(6), 300
 

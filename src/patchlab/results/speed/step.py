@@ -20,7 +20,7 @@ import patchproof as pp
 from patchlab.bench.measure import call_in_turn, time_call
 from patchlab.results.rows import write_rows
 from patchproof.base.workers import keep_freed_memory
-from patchproof.optimizer import loop, training_views
+from patchproof.optimizer import expectation, loop
 from patchproof.optimizer.problem import set_problem
 
 ROUNDS, STEPS = 16, 4  # the first is to warm up
@@ -74,7 +74,7 @@ def measured(name: str, scene: str, processes: int) -> dict:
     asked = pp.load_scene(f"{scene}.toml").settings.changed(optimize={"steps": ROUNDS * STEPS})
     scene = pp.make_scene(asked)
     problem = replace(set_problem(scene, models=models), jobs=processes)
-    training_views.MIN_POSES = 0  # a quarter of the views
+    expectation.MIN_POSES = 0  # a quarter of the views
     pictures = torch.rand(4, 3, problem.training_px, problem.training_px)
     problem.see(None, scene.draw("train", 256), 16)  # makes the places that training knows, once
     running = loop.steps(problem)

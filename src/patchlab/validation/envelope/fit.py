@@ -27,8 +27,6 @@ MAX_P_NOT_MONOTONE = 0.01  # 0.01, since each sweep tests two curves
 MIN_EASY_RATE = 0.05  # Wilson's lower end of the rate there; below it nothing worked
 MIN_LOST_SHARE = 0.25  # of the rate at the easy end; a curve that loses less holds
 BEYOND_SWEEP = 2.0  # stands for a breaking point beyond the sweep
-
-
 CONTROLS = ("bare", "gray")  # of a promise's controls; a noise design would need a draw
 
 

@@ -38,8 +38,6 @@ _BAR_SHARE = 0.35  # of the picture's width at most
 # five colors of viridis, legible to the color-blind; and a color for no surface that is none of them
 RAMP_RGB = ((68, 1, 84), (59, 82, 139), (33, 145, 140), (94, 201, 98), (253, 231, 37))
 NO_SURFACE_RGB = (230, 0, 90)
-
-
 _VIEWS, _TOP = 8, 5
 _LEAST_PX = 200  # of a view's side: people see little in smaller ones
 _EDGE_POINTS = 8  # bent paper has bent edges

@@ -14,8 +14,8 @@ from torch import Tensor
 
 from patchproof.base.progress import Advance, no_advance
 from patchproof.base.validation import StrictModel
+from patchproof.optimizer.expectation import new_pose_share
 from patchproof.optimizer.problem import Problem
-from patchproof.optimizer.training_views import new_pose_share
 from patchproof.render.photograph import affected_windows, expose
 from patchproof.render.pixels import Appearance
 from patchproof.render.raster import rasterize

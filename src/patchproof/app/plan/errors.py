@@ -104,7 +104,7 @@ def _without_effect(setup: Setup, effect: ViewEffect) -> Setup | None:
 def _without_printer(problem: Problem, design: Tensor, setup: Setup) -> Setup | None:
     if problem.printer.name == "identity":
         return None
-    return replace(setup, appearance=problem.subject.with_printer(identity_printer()).appearance(design))
+    return replace(setup, appearance=replace(problem.patch, printer=identity_printer()).appearance(design))
 
 
 def _without_part(setup: Setup, part: SceneTerm) -> Setup | None:
