@@ -159,7 +159,6 @@ def figures_page(name: str | None = None) -> str:
     found = [section for section in sections if name.lower() in section.partition("\n")[0].lower()]
     if not found:
         headings = [section.partition("\n")[0].removeprefix("## ") for section in sections]
-        raise Refused(
-            f"a word of one of the headings {', '.join(headings)}", f'"{name}"', spelling_hint(name, headings)
-        )
+        expected = f"a word of one of the headings {', '.join(headings)}"
+        raise Refused(expected, f'"{name}"', spelling_hint(name, headings))
     return "".join(found)

@@ -221,9 +221,8 @@ def _write_settings(figure: "Figure", axes: "Axes", chart: Chart) -> None:
     points_px = axes.transData.transform([p.center for p, _ in named])
     taken = [Bbox([xy - 6, xy + 6]) for xy in points_px]
     for point, color in named:
-        text = axes.annotate(
-            point.setting, point.center, xytext=(0, 0), textcoords="offset points", color=color, fontsize=8
-        )
+        style = {"textcoords": "offset points", "color": color, "fontsize": 8}
+        text = axes.annotate(point.setting, point.center, xytext=(0, 0), **style)
         text.set_in_layout(False)
 
         def move(right: bool, up: bool, text=text) -> "Bbox":

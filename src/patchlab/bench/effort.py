@@ -7,6 +7,7 @@ thread, so that efforts compare. All designs of an object are judged in the same
 
 import tomllib
 from collections.abc import Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import perf_counter
@@ -62,9 +63,8 @@ def effort_chart(
             progress("runs", len(series) * len(efforts) + len(runs), len(labels) * len(efforts))
         missed = _missed_shares({name: run for name, (run, _) in runs.items()}, judged)
         seconds = {name: taken for name, (_, taken) in runs.items()}
-        series[label] = [
-            ChartPoint(name, seconds[name] / seconds[DEFAULT], missed[name], name == DEFAULT) for name in efforts
-        ]
+        costs = {name: taken / seconds[DEFAULT] for name, taken in seconds.items()}
+        series[label] = [ChartPoint(name, costs[name], missed[name], name == DEFAULT) for name in efforts]
         for name, (run, taken) in runs.items():
             low, high = run.promise.interval
             best = max(claim.rate for claim in run.promise.controls.values())
@@ -94,9 +94,8 @@ def object_scene(label: str, steps: int) -> Scene:
 
 def _timed_run(scene: Scene, views: int | None) -> tuple[Run, float]:
     with TemporaryDirectory() as folder, use_threads(1):
-        run, ms = time_call(
-            lambda: optimize_scene(scene, Path(folder) / "run", promise=PromiseOptions(views)), perf_counter
-        )
+        work = partial(optimize_scene, scene, Path(folder) / "run", promise=PromiseOptions(views))
+        run, ms = time_call(work, perf_counter)
         return run, ms / 1000
 
 

@@ -131,10 +131,9 @@ def _by_cell(settings: PeersSettings, results: Sequence[Result]) -> Table:
 def figures(settings: PeersSettings, results: Sequence[Result]) -> list[Drawing]:
     """A scatter plot of ours against each peer, and pictures of designs (first seeds)."""
     firsts = [group[0] for group in grid.group_by(results, grid.by_values("name", "network")).values()]
+    scatter = partial(_scatter, settings, results)
     return [
-        Drawing(
-            "scatter", "Ours against each peer, a point per cell", partial(_scatter, settings, results), (4.4, 4.2)
-        ),
+        Drawing("scatter", "Ours against each peer, a point per cell", scatter, (4.4, 4.2)),
         picture_sheet(
             "designs",
             "Designs and how they look on the object: first seed of each object and network",

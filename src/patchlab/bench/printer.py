@@ -95,14 +95,10 @@ def _checks(swatches: int, trials: list[PrinterTrial]) -> list[Check]:
         fitted = np.mean([trial.chosen not in ("identity", "white_black", "prior") for trial in trials])
         return [Check(f"{swatches} swatches: share of choices with anything fitted", float(fitted), 0.0)]
     chosen = float(np.mean([trial.errors[trial.chosen] for trial in trials]))
+    near = float((excess <= NEAR_DELTA_E).mean())
     return [
         Check(f"{swatches} swatches: mean ΔE00 of the chosen rung", chosen, MAX_DELTA_E[swatches]),
-        Check(
-            f"{swatches} swatches: share chosen within {NEAR_DELTA_E} of the best",
-            float((excess <= NEAR_DELTA_E).mean()),
-            0.9,
-            True,
-        ),
+        Check(f"{swatches} swatches: share chosen within {NEAR_DELTA_E} of the best", near, 0.9, True),
         Check(f"{swatches} swatches: largest distance from the best", float(excess.max()), MAX_DELTA_E_LOSS),
     ]
 
@@ -116,9 +112,8 @@ def _choices(trials: list[PrinterTrial]) -> Table:
         picked = ", ".join(f"{name} {names.count(name)}" for name in sorted(set(names), key=names.count)[::-1])
         rows.append((driver, mean(errors), max(errors), near, picked))
     head = ("printer", "ΔE00 of the chosen", "worst", f"within {NEAR_DELTA_E} of the best", "chosen")
-    return Table(
-        f"{trials[0].swatches}_swatches_chosen", f"Chosen with {trials[0].swatches} swatches", head, tuple(rows)
-    )
+    count = trials[0].swatches
+    return Table(f"{count}_swatches_chosen", f"Chosen with {count} swatches", head, tuple(rows))
 
 
 def try_printer(seed: int, swatches: int) -> PrinterTrial:
@@ -197,9 +192,8 @@ def printed_page(manifest: Manifest, shows: PrintFunction) -> np.ndarray:
     page = np.full((height, width, 3), 255, np.uint8)
     for marker, code in zip(manifest.markers, marker_cells(DICTIONARY, [m.id for m in manifest.markers]), strict=True):
         side = round(MARKER_MM * PX_PER_MM)
-        _fill(
-            page, (*marker.corners_mm[0], MARKER_MM, MARKER_MM), 255 * cv2.resize(code, (side, side), interpolation=0)
-        )
+        picture = 255 * cv2.resize(code, (side, side), interpolation=0)
+        _fill(page, (*marker.corners_mm[0], MARKER_MM, MARKER_MM), picture)
     for line, y_mm in enumerate((14, 20, 26, 124, 131, 138)):
         position = (30 * PX_PER_MM, y_mm * PX_PER_MM)
         cv2.putText(page, f"{line} what stands beside a chart is not white paper", position, 0, 0.9, (0, 0, 0), 2)

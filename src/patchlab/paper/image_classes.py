@@ -98,9 +98,8 @@ def labels_with_images(folder: Path, table: Path) -> list[str]:
     """The different labels, in lower case, of the images in `folder` that the CSV `table` names."""
     found = list(dict.fromkeys(label for name, label in read_labels(table) if is_file(folder / name)))
     if not found:
-        raise Refused(
-            f"the images that {table.name} names in {folder}", "a folder that holds none of them", "copy them there"
-        )
+        expected = f"the images that {table.name} names in {folder}"
+        raise Refused(expected, "a folder that holds none of them", "copy them there")
     return found
 
 
@@ -124,11 +123,9 @@ def scene_settings(
     low, high = (settings.shown_px * factor / classifier.input_px for factor in settings.scale)
     largest = largest_share(settings.roll_deg)
     if high > largest:
-        raise Refused(
-            f"a patch of at most {largest * classifier.input_px:.0f} pixels before a network of {classifier.input_px}",
-            f"shown_px = {settings.shown_px:g} times {settings.scale[1]:g}",
-            "show it smaller",
-        )
+        most, got = largest * classifier.input_px, f"shown_px = {settings.shown_px:g} times {settings.scale[1]:g}"
+        expected = f"a patch of at most {most:.0f} pixels before a network of {classifier.input_px}"
+        raise Refused(expected, got, "show it smaller")
     return SceneSettings(
         object=ObjectSettings(images=images, labels=table),
         patch=PatchSettings(width_mm=side, height_mm=side),

@@ -68,9 +68,8 @@ def cells(settings: Patch2dSettings, base: Path) -> list[Cell]:
     targets = settings.targets or tuple(dict.fromkeys(known))
     for target in targets:
         if target not in known:
-            raise Refused(
-                "a target that there are images of", f'"{target}"', spelling_hint(str(target), map(str, known))
-            )
+            hint = spelling_hint(str(target), map(str, known))
+            raise Refused("a target that there are images of", f'"{target}"', hint)
     cells = []
     for seed, (i, target), network in itertools.product(settings.seeds, enumerate(targets), settings.networks):
         name = short_name(network)

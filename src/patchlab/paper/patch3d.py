@@ -89,15 +89,14 @@ def run(settings: Patch3dSettings, base: Path, cell: Cell) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         twin = flat_twin(problem, settings, Path(folder))
     designs = {"3d": best_design(problem), "2d": best_design(twin)}
-    conditions, in_images = (world.scene.draw("evaluate", settings.n) for world in (problem, twin))
+    worlds = {"3d": problem, "2d": twin}
+    conditions, in_images = (world.scene.draw("evaluate", settings.n) for world in worlds.values())
     return {
         **to_record(responses(problem, appearances_by_kind(problem, designs), conditions)),
         "in_images": to_record(responses(twin, appearances_by_kind(twin, designs), in_images)),
         "azimuth_deg": conditions.pose.azimuth_deg.tolist(),
         "azimuth_range_deg": problem.scene.settings.view.azimuth_deg,
-        "passes": {
-            name: views_per_network(world.scene.settings.optimize) for name, world in (("3d", problem), ("2d", twin))
-        },
+        "passes": {name: views_per_network(world.scene.settings.optimize) for name, world in worlds.items()},
         "share": twin.scene.settings.view.patch_share,
         "warnings": list(problem.scene.warnings),
         f"{cell.name}.png": compose_picture(problem, twin, designs),
@@ -220,9 +219,8 @@ def _by_cell(results: Sequence[Result]) -> Table:
     for result in results:
         gain = Record([result], "3d").gain(Record([result], "2d"))[0]
         passes = result.answers["passes"]
-        rows.append(
-            (*grid.cell_key(result), *(_mean_rate([result], kind) for kind in KINDS), gain, passes["3d"], passes["2d"])
-        )
+        rates = (_mean_rate([result], kind) for kind in KINDS)
+        rows.append((*grid.cell_key(result), *rates, gain, passes["3d"], passes["2d"]))
     head = ("object", "network", "seed", *KINDS, "3d minus 2d", "passes 3d", "passes 2d")
     return Table("cells", "Cell by cell", head, tuple(rows), "Passes are views that the network saw in training.")
 

@@ -129,9 +129,8 @@ def responses_and_background(problem: Problem, conditions: Conditions) -> tuple[
         for part in in_chunks(conditions):
             views = problem.see(None, part, problem.figure_px)
             shown = {"clean": views, "alone": replace(views, object=None)}
-            parts.append(
-                {name: ask_networks(problem, expose(each, None), problem.boxes(part)) for name, each in shown.items()}
-            )
+            pictures = {name: expose(each, None) for name, each in shown.items()}
+            parts.append({name: ask_networks(problem, each, problem.boxes(part)) for name, each in pictures.items()})
     answers = merge_responses(parts)
     return answers["clean"], answers["alone"]
 
@@ -141,9 +140,8 @@ def measure_map(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Hits (bool) and confidence of the clean object, and hits of the background alone, each poses × lights × draws."""
     shape = (len(axes[0]), len(axes[1]), len(drawn))
-    answers = [
-        responses_and_background(problem, move_into_cell(drawn, axes, place)) for place in np.ndindex(*shape[:2])
-    ]
+    cells = (move_into_cell(drawn, axes, place) for place in np.ndindex(*shape[:2]))
+    answers = [responses_and_background(problem, cell) for cell in cells]
     hits, confidence = ([getattr(clean, name)[0] for clean, _ in answers] for name in ("recognized", "confidence"))
     alone = [background.recognized[0] for _, background in answers]
     return np.reshape(hits, shape), np.reshape(confidence, shape), np.reshape(alone, shape)

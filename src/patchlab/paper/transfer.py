@@ -165,9 +165,8 @@ def _gain_table(
 ) -> Table:
     """A table of gains from one figure per object and seed, the mean over rows and networks of one name."""
     group_of = by_values("way", "name", "seed")
-    originals = {
-        group_of(result): Record([result], "design") for result in results if not result.cell.values["trained"]
-    }
+    untrained = (result for result in results if not result.cell.values["trained"])
+    originals = {group_of(result): Record([result], "design") for result in untrained}
     figures: dict[tuple, dict[tuple, list[tuple[float, float]]]] = {}
     for result, network in product(results, tested_networks(results)):
         trained, group = result.cell.values["trained"], group_of(result)
@@ -265,9 +264,8 @@ def _heat_map(figure: "Figure", by_row: Mapping[str, Sequence[Result]], networks
             for x, network in enumerate(networks):
                 level, gain = record.level(network)[which], record.gain(original, network)[which]
                 values[y, x] = np.nan if level is None else level.value
-                texts[y].append(
-                    f"{values[y, x]:.2f}" + ("" if row == ORIGINAL or gain is None else f"\n{gain.value:+.2f}")
-                )
+                below = "" if row == ORIGINAL or gain is None else f"\n{gain.value:+.2f}"
+                texts[y].append(f"{values[y, x]:.2f}{below}")
         number_grid(axes, values, texts, fontsize=6)
         axes.set_xticks(range(len(networks)), [short_name(name) for name in networks], rotation=25, ha="right")
         axes.set_yticks(range(len(records)), list(records))

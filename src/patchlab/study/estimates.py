@@ -33,11 +33,8 @@ def paired_means(values: np.ndarray) -> list[Estimate]:
     """
     seeds, settings = values.shape
     centered = values - values.mean(1, keepdims=True)
-    half = (
-        float(t.ppf(_INTERVAL_QUANTILES[1], seeds - 1))
-        * centered.std(0, ddof=1)
-        * math.sqrt(settings / (settings - 1) / seeds)
-    )
+    spread = centered.std(0, ddof=1) * math.sqrt(settings / (settings - 1) / seeds)
+    half = float(t.ppf(_INTERVAL_QUANTILES[1], seeds - 1)) * spread
     return [Estimate(float(m), float(m - h), float(m + h), seeds) for m, h in zip(values.mean(0), half, strict=True)]
 
 
@@ -64,7 +61,5 @@ def clustered_mean(values: Sequence[float]) -> tuple[float, tuple[float, float]]
 def clustered_median(values: np.ndarray) -> Estimate:
     """The median of n × ... values with a percentile bootstrap over the n rows; repeatable."""
     rows = np.random.default_rng(0).integers(0, len(values), (1000, len(values)))
-    low, high = np.quantile(
-        [np.median(values[picked]) for picked in rows], ((1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2)
-    )
+    low, high = np.quantile([np.median(values[picked]) for picked in rows], _INTERVAL_QUANTILES)
     return Estimate(float(np.median(values)), float(low), float(high), len(values))

@@ -13,7 +13,6 @@ import ast
 import json
 import re
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
@@ -161,7 +160,8 @@ def _run_locked(study: Study, settings: StrictModel, base: Path, out: Path, work
         refuse_other_files(out, ("*",))
     else:
         unfinished = (out / f"{study.name}.json").is_file() and not (out / f"{study.name}.html").is_file()
-        check_folder(out, _owned_patterns(study), work.overwrite, unfinished)
+        own_files = (f"{study.name}.json", f"{study.name}.html", f"{study.name}_*", "cells", *study.own_files)
+        check_folder(out, own_files, work.overwrite, unfinished)
     cells = tuple(study.cells(settings, base))
     _check_cells(study, cells)
     with open_workers(work.jobs, work.cluster) as workers:
@@ -170,10 +170,13 @@ def _run_locked(study: Study, settings: StrictModel, base: Path, out: Path, work
         todo = [cell for cell in cells if cell.name not in found]
         failed: dict[str, str] = {}
         work.on_cell(len(found), len(cells))
-        task = partial(_run_cell, study.run, settings, base)
+        task = partial(_run_cell, study, settings, base)
         for done, (number, future) in enumerate(workers.completed(task, todo), len(found) + 1):
             cell = todo[number]
-            values, files, error = _future_outcome(future)
+            try:
+                values, files, error = result_of(future)
+            except Exception as failure:  # a worker that died
+                values, files, error = {}, {}, _error_text(failure)
             if error is None:
                 found[cell.name] = _save_cell(study, out, cell, values, files)
             else:
@@ -203,13 +206,8 @@ def _check_cells(study: Study, cells: Sequence[Cell]) -> None:
     if bad:
         raise ValueError(f"cells of {study.name} need unique names that files can have, got {bad[0]!r}")
     if not cells:
-        raise Refused(
-            f"settings that give the study {study.name} something to do", "settings without cells", "ask for more"
-        )
-
-
-def _owned_patterns(study: Study) -> tuple[str, ...]:
-    return (f"{study.name}.json", f"{study.name}.html", f"{study.name}_*", "cells", *study.own_files)
+        expected = f"settings that give the study {study.name} something to do"
+        raise Refused(expected, "settings without cells", "ask for more")
 
 
 def _prepare_folder(study: Study, settings: StrictModel, out: Path, resume: bool) -> None:
@@ -249,28 +247,18 @@ def _load_finished(out: Path, cell: Cell) -> dict[str, Any] | None:
     return stored["found"]
 
 
-Outcome = tuple[
-    dict[str, Any], dict[str, bytes], str | None
-]  # (JSON values, bytes by file name, None), or ({}, {}, the error)
+# (JSON values, bytes by file name, None), or ({}, {}, the error)
+Outcome = tuple[dict[str, Any], dict[str, bytes], str | None]
 
 
-def _run_cell(
-    run: Callable[[Any, Path, Cell], dict[str, Any]], settings: StrictModel, base: Path, cell: Cell
-) -> Outcome:
+def _run_cell(study: Study, settings: StrictModel, base: Path, cell: Cell) -> Outcome:
     """Run a cell and return its outcome; errors become text, since not every exception can be pickled."""
     try:
         with use_threads(1):
-            answers = run(settings, base, cell)
+            answers = study.run(settings, base, cell)
         files = {key: value for key, value in answers.items() if isinstance(value, bytes)}
         return _as_json_values({key: value for key, value in answers.items() if key not in files}), files, None
     except Exception as error:  # including those of a user's network
-        return {}, {}, _error_text(error)
-
-
-def _future_outcome(future: Future) -> Outcome:
-    try:
-        return result_of(future)
-    except Exception as error:  # a worker that died
         return {}, {}, _error_text(error)
 
 

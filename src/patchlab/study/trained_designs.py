@@ -73,9 +73,8 @@ def test_and_draw(
 ) -> dict[str, Any]:
     """Record all networks' answers to `things` in n unseen conditions; draw a contact sheet (views, side in px)."""
     answers = to_record(responses(problem, things, problem.scene.draw("evaluate", n)))
-    return answers | {
-        f"{name}.sheet.png": contact_sheet([photographs(problem, each, *sheet) for each in things.values()])
-    }
+    pictures = [photographs(problem, each, *sheet) for each in things.values()]
+    return answers | {f"{name}.sheet.png": contact_sheet(pictures)}
 
 
 def tested_networks(results: Sequence[Result]) -> list[str]:

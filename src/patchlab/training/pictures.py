@@ -46,7 +46,8 @@ def render_pictures(per_class: int, seed: int, size_px: int) -> Pictures:
     for label, name in enumerate(primitives.primitive_names()):
         for shape in range(-(-per_class // VIEWS_PER_SHAPE)):
             rng = np.random.default_rng([seed, label, shape])
-            shape_images, shape_boxes = _render_shape(name, seed + shape, rng, size_px)
+            mesh = randomize_materials(primitives.build(name, seed + shape), rng)
+            shape_images, shape_boxes = render_mesh(mesh, VIEWS_PER_SHAPE, rng, size_px)
             images.append(shape_images)
             boxes.append(shape_boxes)
             labels += [label] * VIEWS_PER_SHAPE
@@ -69,13 +70,8 @@ def load_or_render(folder: Path, per_class: int, seed: int, size_px: int) -> Pic
 def shrink_pictures(pictures: Pictures, size_px: int) -> Pictures:
     """Downscale pictures to `size_px`; labels and boxes stay."""
     parts = pictures.images.split(1024)
-    return pictures._replace(
-        images=torch.cat([codes_from_srgb(center_square(part.float() / 255, size_px)) for part in parts])
-    )
-
-
-def _render_shape(name: str, seed: int, rng: np.random.Generator, size_px: int) -> tuple[Tensor, Tensor]:
-    return render_mesh(randomize_materials(primitives.build(name, seed), rng), VIEWS_PER_SHAPE, rng, size_px)
+    small = [codes_from_srgb(center_square(part.float() / 255, size_px)) for part in parts]
+    return pictures._replace(images=torch.cat(small))
 
 
 def render_mesh(mesh: Mesh, count: int, rng: np.random.Generator, size_px: int) -> tuple[Tensor, Tensor]:
@@ -163,22 +159,19 @@ def augment(
     boxes = _transform_boxes(boxes, torch.from_numpy(matrix))
     gain = torch.from_numpy(np.exp(rng.normal(0, [[0.25], [0.07], [0.07], [0.07]], (4, n))).astype(np.float32))
     x = (x - 0.45) * gain[0, :, None, None, None] + 0.45
-    x = (
-        x * gain[1:].T[:, :, None, None] + torch.from_numpy(rng.normal(0, 0.05, (n, 1, 1, 1)).astype(np.float32))
-    ).clamp(0, 1)
+    offset = torch.from_numpy(rng.normal(0, 0.05, (n, 1, 1, 1)).astype(np.float32))
+    x = (x * gain[1:].T[:, :, None, None] + offset).clamp(0, 1)
     for i in np.flatnonzero(rng.random(n) < pasted):
         height, width = (int(v) for v in (rng.integers(12, 44, 2) * size_px) // 96)
         top, left = int(rng.integers(0, size_px - height)), int(rng.integers(0, size_px - width))
         card = cards[int(rng.integers(len(cards)))][None]
-        x[i, :, top : top + height, left : left + width] = torch.nn.functional.interpolate(
-            card, (height, width), mode="bilinear", antialias=True
-        )[0] * float(rng.uniform(0.4, 1.0))
+        small = torch.nn.functional.interpolate(card, (height, width), mode="bilinear", antialias=True)[0]
+        x[i, :, top : top + height, left : left + width] = small * float(rng.uniform(0.4, 1.0))
     return x, boxes
 
 
 def _transform_boxes(boxes: Tensor, matrix: Tensor) -> Tensor:
     """Transform boxes N×4 with pictures that were sampled by matrices N×2×3 on [-1, 1]; clipped to the picture."""
-    corners = ((2 * boxes - 1).view(-1, 2, 2) - matrix[:, None, :, 2]) / torch.stack(
-        [matrix[:, 0, 0], matrix[:, 1, 1]], 1
-    )[:, None]
+    scale = torch.stack([matrix[:, 0, 0], matrix[:, 1, 1]], 1)[:, None]
+    corners = ((2 * boxes - 1).view(-1, 2, 2) - matrix[:, None, :, 2]) / scale
     return torch.cat([corners.amin(1), corners.amax(1)], 1).add(1).div(2).clamp(0, 1)

@@ -83,27 +83,17 @@ def accuracy_by_class(network: torch.nn.Module, pictures: Pictures) -> np.ndarra
     """Share of correct answers by class."""
     was_training = network.training
     network.eval()
-    right = (
-        torch.cat([network(batch.float() / 255).argmax(1) for batch in pictures.images.split(256)]) == pictures.labels
-    )
+    answers = torch.cat([network(batch.float() / 255).argmax(1) for batch in pictures.images.split(256)])
     network.train(was_training)
-    return np.array(
-        [right[pictures.labels == label].float().mean().item() for label in range(int(pictures.labels.max()) + 1)]
-    )
+    right, labels = answers == pictures.labels, range(int(pictures.labels.max()) + 1)
+    return np.array([right[pictures.labels == label].float().mean().item() for label in labels])
 
 
 def main() -> None:
     """Render, train, measure, and write the network with its card."""
     about = "Train a network to name objects in procedural renders."
-    fit.run(
-        ClassifierRecipe,
-        about,
-        INPUT_PX,
-        train,
-        accuracy_by_class,
-        write,
-        lambda pictures, recipe: shrink_pictures(pictures, recipe.input_px),
-    )
+    prepare = lambda pictures, recipe: shrink_pictures(pictures, recipe.input_px)  # noqa: E731
+    fit.run(ClassifierRecipe, about, INPUT_PX, train, accuracy_by_class, write, prepare)
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ one (Li et al., Generalized focal loss, NeurIPS 2020), their boxes follow the ge
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import chain
 from pathlib import Path
 
@@ -44,9 +45,8 @@ def train(pictures: Pictures, recipe: DetectorRecipe) -> fit.Epochs:
         images, labels, boxes = with_mosaics(images, pictures.labels[rows], boxes, recipe.mosaics, rng)
         return detector_loss(network(images.contiguous(memory_format=torch.channels_last)), labels, boxes * INPUT_PX)
 
-    return fit.train_epochs(
-        lambda: SmallDetector(len(primitives.primitive_names()), batch_norm=True), pictures, recipe, learn
-    )
+    make = partial(SmallDetector, len(primitives.primitive_names()), batch_norm=True)
+    return fit.train_epochs(make, pictures, recipe, learn)
 
 
 def with_mosaics(
@@ -162,9 +162,8 @@ def best_score(found: Iterable[Detection], objects: int) -> float:
 
 def main() -> None:
     """Render, train, measure, and write the network with its card."""
-    fit.run(
-        DetectorRecipe, "Train the built-in detector from procedural renders.", INPUT_PX, train, score_network, write
-    )
+    about = "Train the built-in detector from procedural renders."
+    fit.run(DetectorRecipe, about, INPUT_PX, train, score_network, write)
 
 
 if __name__ == "__main__":

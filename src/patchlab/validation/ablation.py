@@ -105,9 +105,8 @@ def simplify_problem(problem: Problem, effect: str) -> Problem:
     setup = Setup(problem.stage, problem.subject.appearance(problem.subject.start()), problem.scene.draw("select", 64))
     on = [name for name in names if terms[name].change(setup) is not None]
     if not on:
-        raise Refused(
-            f"a scene with {effect} in it", "a scene in which it is off", f"give {terms[names[0]].key} a range"
-        )
+        do = f"give {terms[names[0]].key} a range"
+        raise Refused(f"a scene with {effect} in it", "a scene in which it is off", do)
     subject = problem.subject
     if PRINTER in on:
         subject = replace(problem.patch, printer=identity_printer())
@@ -164,10 +163,8 @@ def tables(settings: AblationSettings, results: Sequence[Result]) -> tuple[Table
     about = f"trained with all effects minus without: positive is what the effect earned; {settings.n} conditions and "
     about += f"{settings.photos} photographs for each design; intervals over groups of scene, network and seed"
     missed_about = "the same design, trained without the effect, in the same sessions: the whole world minus the world "
-    missed_about += (
-        "without it; “half width” is the mean of the promises' own 95 % intervals, “outside” counts designs "
-    )
-    missed_about += "whose rate in the whole world lies outside of them"
+    missed_about += "without it; “half width” is the mean of the promises' own 95 % intervals, “outside” counts "
+    missed_about += "designs whose rate in the whole world lies outside of them"
     earned, missed, designs, groups = [], [], [], _group_by_effect(results)
     for group in groups:
         designs += [_design_row(result) for result in group.values()]
@@ -235,13 +232,8 @@ def _world_means(result: Result) -> list[float | None]:
 
 def _mean_differences(compared: Sequence[tuple[Result, Result]]) -> list[Estimate | None]:
     """Mean differences, first minus second of each pair: rate and confidence in each world."""
-    differences = [
-        [
-            None if a is None or b is None else a - b
-            for a, b in zip(_world_means(whole), _world_means(less), strict=True)
-        ]
-        for whole, less in compared
-    ]
+    pairs = [zip(_world_means(whole), _world_means(less), strict=True) for whole, less in compared]
+    differences = [[None if a is None or b is None else a - b for a, b in pair] for pair in pairs]
     columns = ([value for value in column if value is not None] for column in zip(*differences, strict=True))
     return [mean(column) for column in columns]
 

@@ -74,21 +74,17 @@ def fit_board(srgb: np.ndarray, pose: BoardPose) -> BoardFit:
         raise PhotoRejected("too_small", int(mask.sum()), _MIN_PIXELS, "the board has too few pixels")
     clipped_share = float(clipped[mask].mean())
     if clipped_share > _MAX_CLIPPED_SHARE:
-        raise PhotoRejected(
-            "clipped", clipped_share, _MAX_CLIPPED_SHARE, f"{clipped_share:.0%} of the board is overexposed"
-        )
+        advice = f"{clipped_share:.0%} of the board is overexposed"
+        raise PhotoRejected("clipped", clipped_share, _MAX_CLIPPED_SHARE, advice)
     known = np.random.default_rng(0).permutation(known)[:_MAX_PIXELS]  # a fixed seed, so that figures are repeatable
     places = _pixel_centers(srgb.shape)
-    terms, light = (
-        _quadratic(places, srgb.shape)[known],
-        LINEAR_FLOAT32_FROM_CODE[srgb].reshape(-1, 3)[known].astype(float),
-    )
+    terms = _quadratic(places, srgb.shape)[known]
+    light = LINEAR_FLOAT32_FROM_CODE[srgb].reshape(-1, 3)[known].astype(float)
     bend, prints, share = np.zeros((10, 2)), pose.prints, paper_share(pose.prints, srgb.shape)
     shade, blur = _best_blur(share, known, terms, light, _Shade(np.zeros((3, 6)), np.full(3, 0.03)), None)
     for _ in range(_ROUNDS):
-        bend = bend + _fit_shift(
-            _blur_share(share, _BLURS_PX[blur]), known, places[known], srgb.shape, shade, terms, light
-        )
+        soft = _blur_share(share, _BLURS_PX[blur])
+        bend = bend + _fit_shift(soft, known, places[known], srgb.shape, shade, terms, light)
         prints = shift_squares(pose.prints, lambda at, bend=bend: _cubic(at, srgb.shape) @ bend)
         share = paper_share(prints, srgb.shape)
         shade, blur = _best_blur(share, known, terms, light, shade, blur)

@@ -125,11 +125,8 @@ def run(settings: LayoutsSettings, base: Path, cell: Cell) -> dict[str, Any]:
     design = best_design(problem)
     shown = pictures_with_controls(problem, design, CONTROLS)
     answers = responses(problem, shown, scene.draw("evaluate", settings.n))
-    return (
-        to_record(answers)
-        | {"free": _free_share(scene.piece)}
-        | _photograph_and_measure(problem, scene, design, settings.photos)
-    )
+    measured = _photograph_and_measure(problem, scene, design, settings.photos)
+    return to_record(answers) | {"free": _free_share(scene.piece)} | measured
 
 
 def _build_cell_problem(base: Path, cell: Cell) -> Problem:
@@ -181,24 +178,21 @@ def tables(settings: LayoutsSettings, results: Sequence[Result]) -> Sequence[Tab
     rows = [(name, *_layout_figures(group, first)) for name, group in by_layout.items()]
     head = ("layout", "share for the design", "gain over the best control", "beside the first layout")
     head = (*head, "identified", "measured", "corner error, mm", "uncertainty holds", "ΔE00")
-    about = (
-        f"{settings.n} unseen conditions and {settings.photos} photographs of each design; corner errors are medians "
-    )
-    about += "of the worst of the piece's four; gains are over scenes, networks and seeds"
+    about = f"{settings.n} unseen conditions and {settings.photos} photographs of each design; corner errors are "
+    about += "medians of the worst of the piece's four; gains are over scenes, networks and seeds"
+    things = ("design", *CONTROLS)
     every = [
         (
             *grid.cell_key(r),
             r.cell.values["layout"],
             _gain_over_controls(r),
-            *(Record([r], thing).level()[0] for thing in ("design", *CONTROLS)),
+            *(Record([r], thing).level()[0] for thing in things),
         )
         for r in results
     ]
     return (
         Table("layouts", "What layouts cost and buy", head, tuple(rows), about),
-        Table(
-            "cells", "Every design", ("scene", "network", "seed", "layout", "gain", "design", *CONTROLS), tuple(every)
-        ),
+        Table("cells", "Every design", ("scene", "network", "seed", "layout", "gain", *things), tuple(every)),
     )
 
 

@@ -109,10 +109,8 @@ class _PhotoSetup:
 
     def views(self, conditions: Conditions) -> list[Views]:
         """Render the views of conditions once; print, light and camera are changed later."""
-        each = range(len(conditions))
-        return [
-            render_views(self.sheet.stage, self.sheet.piece, conditions[i : i + 1], self.scene.photo_px) for i in each
-        ]
+        stage, piece, each = self.sheet.stage, self.sheet.piece, range(len(conditions))
+        return [render_views(stage, piece, conditions[i : i + 1], self.scene.photo_px) for i in each]
 
     def take(self, views: Sequence[Views], conditions: Conditions, printed: TensorPrinter | None = None) -> list[bytes]:
         """Photograph the piece, printed by `printed` or by default as promised: a JPEG file for each condition."""
@@ -189,9 +187,8 @@ def _draw_wrong_printer(rng: np.random.Generator, setup: _PhotoSetup) -> tuple[s
         inkjet = draw_inkjet(seed)
         name, light = f"inkjet {seed}", lambda srgb: inkjet(srgb)
     else:
-        shares = (
-            rng.uniform(_MIN_DYE_SHARE, 1, 3) if rng.random() < 0.5 else np.full(3, rng.uniform(_MIN_DYE_SHARE, 0.5))
-        )
+        least = _MIN_DYE_SHARE
+        shares = rng.uniform(least, 1, 3) if rng.random() < 0.5 else np.full(3, rng.uniform(least, 0.5))
         name, light = f"faded {shares.round(2)}", lambda srgb: _faded_light(setup.sheet.printer, shares, srgb)
 
     def printed(pixels: Tensor) -> Tensor:

@@ -179,12 +179,10 @@ def _printed_square(
 
 
 def _loose_markers(board: BoardSettings, corners_px: Mapping[int, np.ndarray]) -> tuple[PrintedSquare, ...]:
-    ids, prints = sorted(corners_px), []
+    ids, prints, side = sorted(corners_px), [], 1 + 2 * _QUIET_ZONE
     for number, cells in zip(ids, marker_cells(board.dictionary, ids), strict=True):
         px_from_unit = fit_homography(UNIT_SQUARE, corners_px[number])
-        area = apply_homography(
-            px_from_unit, rect_corners((-_QUIET_ZONE, -_QUIET_ZONE, 1 + 2 * _QUIET_ZONE, 1 + 2 * _QUIET_ZONE))
-        )
+        area = apply_homography(px_from_unit, rect_corners((-_QUIET_ZONE, -_QUIET_ZONE, side, side)))
         prints.append(PrintedSquare(cells, px_from_unit, area[None]))
     return tuple(prints)
 

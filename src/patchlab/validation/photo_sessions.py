@@ -57,12 +57,11 @@ def make_run_and_sheet(base: Path, cell: Cell, folder: Path) -> "Run":
     scene = grid.scene_of(base, cell.values)
     scene = replace(scene, settings=scene.settings.changed(target={"models": grid.network_names(base, cell.values)}))
     # a page needs one control only, and all of them would take most of a promise's time
+    promise = PromiseOptions(controls=("bare",))
     if (picture := cell.values.get("picture")) is None:
-        patch_run = optimize(scene, folder / "run", promise=PromiseOptions(controls=("bare",)))
+        patch_run = optimize(scene, folder / "run", promise=promise)
     else:
-        patch_run = import_patch(
-            expand_path(picture, base), scene, folder / "run", promise=PromiseOptions(controls=("bare",))
-        )
+        patch_run = import_patch(expand_path(picture, base), scene, folder / "run", promise=promise)
     sheet_of(patch_run, folder / "sheet.pdf")
     return patch_run
 

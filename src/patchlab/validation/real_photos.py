@@ -189,10 +189,8 @@ def _by_board(settings: RealSettings, results: Sequence[Result]) -> Table:
     rows = []
     for board in settings.boards:
         for key, words in _FIGURES.items():
-            values = [
-                result.answers[key] for result in _used_results(results, board) if result.answers[key] is not None
-            ]
-            if values:
+            values = [result.answers[key] for result in _used_results(results, board)]
+            if values := [value for value in values if value is not None]:
                 rows.append((board, words, statistics.median(values), min(values), max(values), len(values)))
     head = ("board", "figure", "median", "least", "most", "photographs")
     return Table("boards", "By board and camera", head, tuple(rows), "photographs by one camera are one case")
@@ -250,9 +248,8 @@ def figures(settings: RealSettings, results: Sequence[Result]) -> Sequence[Drawi
     used = _used_results(results)
     if not used:
         return ()
-    drawings = [
-        Drawing("ranges", "What scenes draw from (gray), and photographs", _range_plot(settings, used), (9.0, 3.0))
-    ]
+    title = "What scenes draw from (gray), and photographs"
+    drawings = [Drawing("ranges", title, _range_plot(settings, used), (9.0, 3.0))]
     columns = ("photograph", "our rendering in its place", f"difference × {_DIFFERENCE_GAIN}, gray where equal")
     for first in range(0, len(used), _PHOTOS_PER_SHEET):
         some = used[first : first + _PHOTOS_PER_SHEET]

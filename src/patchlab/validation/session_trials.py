@@ -25,7 +25,7 @@ from patchproof.evidence.results import PhotoEntry, Trace
 from patchproof.evidence.same_session import USUAL_SPREAD, merge_folders
 from patchproof.evidence.verdict import Look, judge, required_rate, watched
 from patchproof.photo.quality import FrameLight
-from patchproof.report.tables import Drawing, Table
+from patchproof.report.tables import Table
 
 _DEALS = ("one each", "runs of 3", "mixed 5", "true")
 _BETWEEN = np.array([0.03, 0.03, 0.6, 0.6, 0.4])  # spread of light and background between sessions of the demo
@@ -76,10 +76,8 @@ def _control_trials(trials: int, rho: float, sessions: int, a: float, b: float, 
         sides: list[dict[int, list[bool]]] = []
         n = rng.integers(3, 21, sessions)
         for i, rate in enumerate((a, b)):
-            rates, n = (
-                _session_rates(rng, rate, rho, (sessions,)),
-                n if way == "pairs" else rng.integers(3, 21, sessions),
-            )
+            rates = _session_rates(rng, rate, rho, (sessions,))
+            n = n if way == "pairs" else rng.integers(3, 21, sessions)
             first = i * sessions if way == "other" else 0
             sides.append({first + j: list(rng.random(n[j]) < rates[j]) for j in range(sessions)})
         hits = [(sum(map(sum, side.values())), sum(map(len, side.values()))) for side in sides]
@@ -142,11 +140,8 @@ def _look_trials(settings: SessionTrialsSettings, rho: float, way: str, rng, mos
         found = np.zeros((2, trials), bool)
         for n in stops if way != "one look" else (10 * 4,):
             sizes = (10,) * (n // 10) + ((n % 10,) if n % 10 else ())
-            looks = (
-                watched(sizes, promise) if way == "watched" else Look(len(sizes) if way == "each session" else 1),
-                Look(),
-            )
-            for i, look in enumerate(looks):
+            limit = watched(sizes, promise) if way == "watched" else Look(len(sizes) if way == "each session" else 1)
+            for i, look in enumerate((limit, Look())):
                 words = np.array([_is_kept(k, sizes, promise, look) for k in range(n + 1)])
                 found[i] |= words[counts[:, n - 1]]
         kept, unlimited = kept + int(found[0].sum()), unlimited + int(found[1].sum())
@@ -174,18 +169,12 @@ def tables(settings: SessionTrialsSettings, results: Sequence[Result]) -> tuple[
         for rho, each in pairs
         for row in each["folders"]
     ]
-    looks = [
-        (rho, row[0], _share(row[2], row[1]), _share(row[3], row[1])) for rho, each in pairs for row in each["looks"]
-    ]
+    look_rows = [(rho, row) for rho, each in pairs for row in each["looks"]]
+    looks = [(rho, way, _share(kept, n), _share(unlimited, n)) for rho, (way, n, kept, unlimited) in look_rows]
     head = ("correlation", "sessions", "patch", "control", "sessions of both", "called better", "by photographs")
+    about = "3 to 20 photographs a session"
     return (
-        Table(
-            "controls",
-            "Called better than a photographed control",
-            head,
-            tuple(controls),
-            "3 to 20 photographs a session",
-        ),
+        Table("controls", "Called better than a photographed control", head, tuple(controls), about),
         Table(
             "folders",
             "Kept at the rate just asked for, from 60 photographs",
@@ -203,9 +192,4 @@ def tables(settings: SessionTrialsSettings, results: Sequence[Result]) -> tuple[
     )
 
 
-def figures(settings: SessionTrialsSettings, results: Sequence[Result]) -> tuple[Drawing, ...]:
-    """None: the tables say it."""
-    return ()
-
-
-STUDY = Study("session-trials", SessionTrialsSettings, cells, run, tables, figures)
+STUDY = Study("session-trials", SessionTrialsSettings, cells, run, tables)

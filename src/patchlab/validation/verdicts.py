@@ -38,12 +38,8 @@ class VerdictsSettings(StrictModel):
     # correlation of two photographs of one session
     correlations: Annotated[tuple[Annotated[Positive, Field(le=0.9)], ...], Field(min_length=1)] = (0.02, 0.05, 0.1)
     photos: PositiveInt = 40  # photographs of the print, in all
-    sessions: Annotated[tuple[PositiveInt, ...], Field(min_length=1)] = (
-        1,
-        2,
-        4,
-        8,
-    )  # numbers of sessions that photographs are spread over
+    # numbers of sessions that photographs are spread over
+    sessions: Annotated[tuple[PositiveInt, ...], Field(min_length=1)] = (1, 2, 4, 8)
     below: tuple[Share, ...] = (0.0, 0.1, 0.15, 0.2)  # how far true rates lie under the promised one
     promises: PositiveInt = 20  # promises drawn for each correlation
 
@@ -107,9 +103,8 @@ def tables(settings: VerdictsSettings, results: Sequence[Result]) -> tuple[Table
         f"{settings.photos} photographs, {settings.rate:.0%} promised, the best control at {settings.control:.0%}; "
         f"means over {settings.promises} promises"
     )
-    return (
-        Table("verdicts", "Chances of verdicts", ("correlation", "sessions", "true rate", *_VERDICTS), rows, about),
-    )
+    head = ("correlation", "sessions", "true rate", *_VERDICTS)
+    return (Table("verdicts", "Chances of verdicts", head, rows, about),)
 
 
 def figures(settings: VerdictsSettings, results: Sequence[Result]) -> tuple[Drawing, ...]:

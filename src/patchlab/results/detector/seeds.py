@@ -22,9 +22,8 @@ def main(seeds: list[int]) -> None:
         for seed in seeds:
             for name in OBJECTS:
                 with TemporaryDirectory() as folder:
-                    promise = pp.optimize(
-                        f"{name}.toml", Path(folder) / "run", seed=seed, compute=pp.Compute(jobs=2)
-                    ).promise
+                    run = pp.optimize(f"{name}.toml", Path(folder) / "run", seed=seed, compute=pp.Compute(jobs=2))
+                promise = run.promise
                 best = promise.controls[promise.best_control]
                 figures = promise.rate, best.rate, best.difference, *best.difference_interval
                 rate, beside, *gain = (round(figure, 4) for figure in figures)

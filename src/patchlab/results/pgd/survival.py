@@ -107,9 +107,8 @@ def measured(name: str, folders: list[Path]) -> dict:
 
     def hardened(pictures: Tensor, epsilon: float, method="pgd", steps=STEPS, through=None) -> Tensor:
         photos = list((pictures * 255).round().byte().permute(0, 2, 3, 1).numpy())
-        return center_squares(
-            harden(photos, [labels], [classifier], method, epsilon, steps, through=through), classifier
-        )
+        pictures = harden(photos, [labels], [classifier], method, epsilon, steps, through=through)
+        return center_squares(pictures, classifier)
 
     def keep(table: str, key: str, alive: Tensor, pictures: Tensor | None = None) -> None:
         kept = {"hits": "".join("01"[int(hit)] for hit in alive)}
@@ -214,9 +213,8 @@ def draw() -> None:
         words = [key.replace("as it is", "40 steps of ε/4: as it is").replace("1 steps", "1 step") for key in OTHERWISE]
         bars.set_yticks(rows, words if column == 0 else [""] * len(words), fontsize=8)
         bars.set(xlim=(0, 1), xlabel="recognized; hardened within 0.04, ε of the attack 0.01")
-    figure.legend(
-        *plots[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=4, fontsize=8, frameon=False
-    )
+    handles = plots[0, 0].get_legend_handles_labels()
+    figure.legend(*handles, loc="outside upper center", ncols=4, fontsize=8, frameon=False)
     figure.savefig(HERE.parent / "pgd.png", dpi=100)
 
 

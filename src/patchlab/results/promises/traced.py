@@ -37,9 +37,8 @@ def measured(name: str) -> list[dict]:
                 pictures = photograph(problem.stage, shown, one, size_px), photograph_traced(problem.stage, shown, one)
                 logits = classifier.logits(torch.cat(pictures))
             indices = problem.indices[0]
-            answers.append(
-                np.stack([classifier.confidence(logits, indices), classifier.recognized(logits, indices)], 1)
-            )
+            kinds = classifier.confidence(logits, indices), classifier.recognized(logits, indices)
+            answers.append(np.stack(kinds, 1))
         ours, traced = np.array(answers).transpose(1, 0, 2)
         row = {"scene": name, "shown": thing, "n": N}
         row |= {"ours_rate": ours[:, 1].mean(), "traced_rate": traced[:, 1].mean()}

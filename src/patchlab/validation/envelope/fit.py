@@ -51,16 +51,14 @@ def find_break(worked: np.ndarray, positions: np.ndarray, seed: int = 0) -> Brea
     weights = rng.multinomial(n, np.full(n, 1 / n), BOOTSTRAP_SAMPLES)
     counts = weights @ worked.astype(float)
     p = monotone_p(worked.mean(0), counts / n)
-    first, last = curve_at(
-        _fit_curves(worked.sum(0, keepdims=True).astype(float), n, positions)[2][0], np.array([0.0, 1.0])
-    ).tolist()
+    best_curve = _fit_curves(worked.sum(0, keepdims=True).astype(float), n, positions)[2][0]
+    first, last = curve_at(best_curve, np.array([0.0, 1.0])).tolist()
     if wilson(int(worked[:, 0].sum()), n)[0] < MIN_EASY_RATE:
         return Break(None, None, None, p, (first, last))
     low, high, _ = _fit_curves(counts, n, positions)
     middle = np.where(high < BEYOND_SWEEP, (low + high) / 2, low)
-    value, low, high = (
-        float(np.quantile(drawn, q, method="inverted_cdf")) for drawn, q in ((middle, 0.5), (low, 0.025), (high, 0.975))
-    )
+    quantiles = (middle, 0.5), (low, 0.025), (high, 0.975)
+    value, low, high = (float(np.quantile(drawn, q, method="inverted_cdf")) for drawn, q in quantiles)
     return Break(value, low, high, p, (first, last))
 
 
@@ -98,9 +96,8 @@ def _curve_grid() -> tuple[np.ndarray, np.ndarray]:
     center, width, top, share = (a.ravel() for a in np.meshgrid(centers, widths, tops, floors, indexing="ij"))
     curves = np.stack([center, width, top, share * top], 1)
     first, last = (curve_at(curves.T, np.full(1, end)) for end in (0.0, 1.0))
-    level = (((first + last) / 2 - curves[:, 3]) / (top * (1 - share))).clip(
-        1e-9, 1 - 1e-9
-    )  # for flat curves it rounds to 1
+    level = ((first + last) / 2 - curves[:, 3]) / (top * (1 - share))
+    level = level.clip(1e-9, 1 - 1e-9)  # for flat curves it rounds to 1
     lost = center - width * np.log(level / (1 - level))
     lost = np.where(first - last >= MIN_LOST_SHARE * first, lost.clip(0, 1), BEYOND_SWEEP)
     order = np.argsort(lost, kind="stable")

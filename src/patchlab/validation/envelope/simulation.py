@@ -79,9 +79,8 @@ def open_simulation(folder: Path, other_printer: str | None) -> Simulation:
     profile = run.scene.settings.printer.profile
     other = other_printer or ("coated" if profile == "uncoated" else "uncoated")
     sheet, printer = mount_run_sheet(run), load_printer(other, run.scene.base)
-    return Simulation(
-        run, set_problem(run.scene), sheet, mount_run_sheet(run, "gray"), surface_of(sheet.manifest), printer
-    )
+    gray, surface = mount_run_sheet(run, "gray"), surface_of(sheet.manifest)
+    return Simulation(run, set_problem(run.scene), sheet, gray, surface, printer)
 
 
 def piece_at(world: Simulation, point: SweepPoint, first_corner: int, gray: bool = False) -> PiecePicture:
@@ -125,9 +124,8 @@ def recognize_target(world: Simulation, points: Sequence[SweepPoint], conditions
             size = 1 if as_file else CHUNK_VIEWS
             for rows in (every[i : i + size] for i in range(0, len(every), size)):
                 boxes = first_network.boxes(conditions[rows])
-                views = _ViewCache(
-                    world, conditions[rows], first, lambda point, _: RenderedWindow(stages.at(point), (side, side))
-                )
+                frame_of = lambda point, _: RenderedWindow(stages.at(point), (side, side))  # noqa: E731
+                views = _ViewCache(world, conditions[rows], first, frame_of)
                 for i, kind in product(_by_cost(points), out):
                     file = views.file(points[i], kind)[0] if as_file else None
                     pictures = views.at(points[i], kind) if file is None else from_pixels(file)[None]
@@ -141,9 +139,8 @@ def measure_photos(world: Simulation, points: Sequence[SweepPoint], conditions: 
     stages = _StageCache(world)
     with torch.inference_mode():
         for n in range(len(conditions)):
-            views = _ViewCache(
-                world, conditions[[n]], n % 4, lambda point, drawn: piece_window(stages.at(point), drawn)
-            )
+            frame_of = lambda point, drawn: piece_window(stages.at(point), drawn)  # noqa: E731
+            views = _ViewCache(world, conditions[[n]], n % 4, frame_of)
             for i in _by_cost(points):
                 srgb, origin_px = views.file(points[i])
                 if "curl" in points[i]:  # measuring rolled paper needs the picture's middle

@@ -93,9 +93,8 @@ def _sweep_values(sweep: Sweep, scene, settings: EnvelopeSettings) -> dict[str, 
     easy, hard = axis.ends(scene)
     easy, hard = easy if sweep.easy is None else sweep.easy, hard if sweep.hard is None else sweep.hard
     if easy == hard or (axis.ratio and (easy <= 0 or hard <= 0)):
-        raise Refused(
-            f"two different ends of {axis.title}, above 0 where it multiplies", f"{easy:g} and {hard:g}", "change them"
-        )
+        expected = f"two different ends of {axis.title}, above 0 where it multiplies"
+        raise Refused(expected, f"{easy:g} and {hard:g}", "change them")
     points = 5 if sweep.axis == "hidden" and sweep.points is None else sweep.points or settings.points
     return {"x": {"axis": sweep.axis, "easy": easy, "hard": hard, "points": points}}
 
@@ -139,9 +138,8 @@ def run(settings: EnvelopeSettings, base: Path, cell: Cell) -> dict[str, Any]:
     if is_map:
         return answers
     positions = np.linspace(0, 1, len(points))
-    of_sheet = {
-        stage: find_break(hits.T, positions, settings.seed) for stage, hits in found_and_measured(answers).items()
-    }
+    stages = found_and_measured(answers).items()
+    of_sheet = {stage: find_break(hits.T, positions, settings.seed) for stage, hits in stages}
     breaks = {"gains": gain_break(gains_in(answers), positions)} | of_sheet
     return answers | {"breaks": {stage: vars(each) for stage, each in breaks.items()}}
 
