@@ -5,7 +5,7 @@ In: scene files in which the effects of interest are on, networks, seeds. Out: f
 confidence that designs trained without it lose against designs trained with all, under the same conditions, by our
 renderer and in path-traced photographs (`path_traced`), whose light is not ours. And the design's rate in the full
 world minus that in the world without the effect, which would be its promise: same design, same sessions.
-An effect is replaced as `plan` does it (`plan.terms`): even light for the sun, not darkness. Effects joined by " + "
+An effect is replaced as `plan` does it (`plan.errors`): even light for the sun, not darkness. Effects joined by " + "
 are left out together; a scene in which all of them are off is skipped.
 
 All designs of a scene, network and seed share their draws, but designs differ by chance, so intervals of earned rates

@@ -1,4 +1,4 @@
-"""Simulate photographs of a printed sheet on its object (scans of the uncut page: see `scan`).
+"""Simulate photographs of a printed sheet on its object (scans of the uncut page: see `page_photos`).
 
 In: a sheet's PDF and the run it was made from. Out: a folder of JPEG photographs of that piece on the object,
 `truth.json` with each one's homography, marker corners and conditions, and `coco.json` with boxes of object and piece.

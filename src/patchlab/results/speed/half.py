@@ -42,11 +42,11 @@ def measured(path: str) -> list[dict]:
     control_mask = promise._control_mask(promise.PROMISE_VIEWS, promise.VIEWS_PER_SESSION)
 
     def told(way):
-        Classifier._asked = way
+        Classifier._call_network = way
         return time_call(lambda: responses(problem, shown, conditions, control_mask=control_mask))
 
     rounds, rows = call_in_turn({way: partial(told, way) for way in (asked, rounded)}, ROUNDS), []
-    Classifier._asked, (wholes, halves) = asked, rounds.values()
+    Classifier._call_network, (wholes, halves) = asked, rounds.values()
     share = statistics.median(half_ms / ms for (_, ms), (_, half_ms) in zip(wholes, halves, strict=True))
     for thing in ("design", "bare"):
         whole, half = wholes[-1][0][thing], halves[-1][0][thing]
