@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from patchlab.study.study import Cell, Result
-from patchlab.validation import forecasts
+from patchlab.validation import forecasts, photo_sessions
 from test_study_promises import small_study
 
 SETTINGS = forecasts.ForecastsSettings(scenes=("a",), networks=("builtin",))
@@ -59,12 +59,16 @@ def test_photographs_of_one_session_are_verified_too(tmp_path, monkeypatch):
     for folder in folders.values():
         folder.mkdir()
         (folder / "photo_0001.jpg").write_bytes(b"")
-    monkeypatch.setattr(forecasts, "make_run_and_sheet", lambda base, cell, folder: None)
-    monkeypatch.setattr(forecasts, "take_photos", lambda settings, cell, run, folder, control=None: folders[control])
+    monkeypatch.setattr(photo_sessions, "make_run_and_sheet", lambda base, cell, folder: None)
+    monkeypatch.setattr(
+        photo_sessions, "take_photos", lambda settings, cell, run, folder, control=None: folders[control]
+    )
     monkeypatch.setattr("patchproof.reprints.photo_forecast.photo_forecaster", lambda run, manifest: None)
     monkeypatch.setattr("patchproof.sheets.manifest.load_manifest", lambda path: None)
-    monkeypatch.setattr(forecasts, "verify_photos", lambda photos, *rest, controls: verified.append((photos, controls)))
+    monkeypatch.setattr(
+        photo_sessions, "verify_photos", lambda photos, *rest, controls: verified.append((photos, controls))
+    )
     monkeypatch.setattr(forecasts, "_record_session", lambda report, control: session([]))
-    monkeypatch.setattr(forecasts, "record_promise", lambda run: {})
+    monkeypatch.setattr(photo_sessions, "record_promise", lambda run: {})
     answers = forecasts.run(SETTINGS, tmp_path, Cell("a", {}))
     assert len(answers["sessions"]) == 1 and verified == [(folders[None], folders["gray"])]
