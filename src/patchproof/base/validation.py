@@ -112,9 +112,8 @@ def refuse_untrusted(source: str | Path, networks: Iterable[str] = (), settings:
     for name in networks:
         is_local = ":" not in name or name.startswith(("file:", "python:"))
         if not is_local and (name.startswith("clip:") or not NETWORK_FILE.fullmatch(name)):
-            raise Refused(
-                f"networks in {source} that are files, not code or downloads", name, f"{do} (--models '{name}')"
-            )
+            expected = f"networks in {source} that are files, not code or downloads"
+            raise Refused(expected, name, f"{do} (--models '{name}')")
     for text in (*networks, *_texts(settings)):
         if "${" in text:
             raise Refused(f"names in {source} without variables of your environment", text, do)

@@ -64,27 +64,35 @@ class Subject(Protocol):
 
     def start(self) -> Tensor:
         """The design before the first step."""
+        ...
 
     def clip(self, design: Tensor) -> Tensor:
         """The nearest design that is allowed."""
+        ...
 
     def gradient_levels(self, gradient: Tensor) -> tuple[Tensor, ...]:
         """The gradient's pyramid."""
+        ...
 
     def combine_levels(self, updates: Sequence[Tensor]) -> Tensor:
         """Combine the updates of the pyramid's levels into one update of the design."""
+        ...
 
     def penalty(self, design: Tensor) -> Tensor | float:
         """The penalty of a design by the scene's settings."""
+        ...
 
     def pixels(self, design: Tensor) -> np.ndarray:
         """The pixels of a design that are printed or stored."""
+        ...
 
     def control(self, kind: str, pixels: np.ndarray) -> np.ndarray:
         """The pixels of the control of this kind, in place of the design's."""
+        ...
 
     def appearance(self, design: Tensor, kind: str = "design") -> Appearance:
         """The appearance of a design, or of a control with the markers of its own sheet; differentiable."""
+        ...
 
     def print_design(self, design: Tensor) -> Tensor:
         """The print that all pictures of a design share, made once a step; differentiable. A texture is not printed."""
@@ -97,12 +105,15 @@ class Subject(Protocol):
     @property
     def grid(self) -> Grid:
         """The resolution of designs."""
+        ...
 
     def save(self, pixels: np.ndarray, folder: Path) -> None:
         """Write the design's files into a run's folder; earlier ones are replaced only by complete ones."""
+        ...
 
     def file(self, pixels: np.ndarray) -> tuple[str, bytes]:
         """A file name's suffix, and the one file that shows the design to others."""
+        ...
 
 
 def subject_of(scene: Scene, printer: Printer, network_px: int, device: torch.device) -> Subject:

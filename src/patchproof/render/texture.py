@@ -224,9 +224,8 @@ def _taps(
         per_cell = 1 / (step_x * step_x + step_y * step_y).sqrt().clamp(1e-6, 1)[:, :, None, None]
         share = torch.addcmul(0.5 - 0.5 * per_cell, share, per_cell).clamp_(0, 1)
     x, y = share.unbind(1)
-    stride = (
-        size[:, 0].int() + 1 if layout.pitch is None else torch.full_like(size[:, 0], layout.pitch, dtype=torch.int)
-    )
+    width, pitch = size[:, 0], layout.pitch
+    stride = width.int() + 1 if pitch is None else torch.full_like(width, pitch, dtype=torch.int)
     texel = torch.empty(len(center), 4, rows, columns, dtype=torch.int, device=center.device)
     low = low.int()
     first = torch.add(low[:, 1] * stride, low[:, 0] + offset[:, None, None].int(), out=texel[:, 0])

@@ -53,11 +53,9 @@ def plan_shots(promise: Promise) -> ShotPlan:
     """Compute the counts for a promise; those for an effect follow from the control that is hardest to beat."""
     best = promise.best_control
     better, worse = (promise.rate, promise.controls[best].rate)[:: promise.target.goal.sign]
-    splits = [(counts, split_evenly(*counts)) for counts in SHOT_COUNTS]
+    of_counts, splits = promise.posterior.count_interval, [(c, split_evenly(*c)) for c in SHOT_COUNTS]
     return ShotPlan(
-        options=tuple(
-            ShotOption(*c, promise.posterior.count_interval(p), verdict.kept_chance(promise, p)) for c, p in splits
-        ),
+        options=tuple(ShotOption(*c, of_counts(p), verdict.kept_chance(promise, p)) for c, p in splits),
         sessions=verdict.sessions_needed(promise),
         control=best,
         paired=fewest_photos(lambda n: paired_power(better, worse, n) >= POWER),

@@ -115,10 +115,8 @@ def build(source: SceneSource) -> ImageScene:
     if len(images) < MIN_IMAGES_TO_SPLIT:
         warnings.append("the promise is made on the same image that the patch is optimized on")
     elif len(images) < FEW_IMAGES:
-        promised = len(images) - len(images) // 2
-        warnings.append(
-            f"the promise is made on {promised} images, and says little of others: give {FEW_IMAGES} or more"
-        )
+        half = len(images) - len(images) // 2
+        warnings.append(f"the promise is made on {half} images, and says little of others: give {FEW_IMAGES} or more")
     inputs = {"object.images": files_sha256(files, whole=False)}
     return ImageScene(settings, base, source.seed, identity, piece, images, notes=tuple(warnings), inputs=inputs)
 

@@ -107,9 +107,7 @@ class PhotoScene(PictureScene):
     def pictures(self, conditions: Conditions, size_px: tuple[int, int]) -> np.ndarray:
         """Return N×H×W×3 uint8 sRGB: the photographs, turned, zoomed and shifted, with the blank sheet on them."""
         views = zip(self._chosen_photos(conditions), self._view_from_photo(conditions), strict=True)
-        pictures = [
-            picture_scene.warp_picture(photo.picture, matrix, self.photo_px, size_px) for photo, matrix in views
-        ]
+        pictures = [picture_scene.warp_picture(shot.picture, matrix, self.photo_px, size_px) for shot, matrix in views]
         return np.stack(pictures)
 
     def piece_light(self, conditions: Conditions) -> np.ndarray:
