@@ -30,7 +30,7 @@ README, NOTEBOOK, CONTRIBUTING = (
     ROOT / ".github" / "CONTRIBUTING.md",
 )
 PACKAGE = ROOT / "src" / "patchproof"
-PRINTERS = ("coated", "uncoated")
+PRINTERS = ("coated", "office", "uncoated")
 
 
 def blocks(language: str) -> list[str]:

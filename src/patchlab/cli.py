@@ -79,6 +79,9 @@ class StudyCommand(TyperCommand):
 def study(
     name: Annotated[str, typer.Argument(help="One of the studies below.")],
     config: Annotated[Path | None, typer.Option(help="What to vary: a TOML file.")] = None,
+    cells: Annotated[
+        Path | None, typer.Option(help="real-prints: other cells of known color (NPZ), held against the stored config.")
+    ] = None,
     out: Annotated[Path | None, typer.Option(help="Folder for tables, figures and the page.")] = None,
     keys: Annotated[bool, typer.Option("--keys", help="Print its keys, as patchlab keys NAME does.")] = False,
     example: Annotated[bool, typer.Option("--example", help="Print a config to start from.")] = False,
@@ -95,12 +98,16 @@ def study(
     if keys or example:
         print(keys_page(documents(), name) if keys else example_config(name), end="")
         return
+    if cells is not None:
+        config = config or Path(__file__).parent / "results" / "real_prints" / "real-prints.toml"
+        out = out or Path("real-prints")
     if config is None or out is None:
         missing = "--config" if config is None else "--out"
         raise typer.BadParameter("missing; a config to start from: --example", param_hint=missing)
     with console.progress() as bar:
         work = Work(resume, overwrite, jobs or 1, cluster, lambda done, total: bar("cells", done, total))
-        finished = run_study(name, config, out, work)
+        changed = None if cells is None else {"cells": str(cells.resolve()), "left_out": "nothing"}
+        finished = run_study(name, config, out, work, changed)
     console.say_study(finished)
     console.say(f"page: {out / name}.html")
     raise typer.Exit(0 if finished.results else 1)

@@ -28,7 +28,14 @@ from patchproof.scene.conditions import draw
 
 
 def sensor(n, **camera):
-    quiet = {"exposure_ev": [0, 0], "white_balance": 0, "blur_px": [0, 0], "noise": [0, 0], "jpeg": [95, 95]}
+    quiet = {
+        "exposure_ev": [0, 0],
+        "white_balance": 0,
+        "blur_px": [0, 0],
+        "noise": [0, 0],
+        "jpeg": [95, 95],
+        "tone": [0, 0],
+    }
     settings = {
         "object": {"mesh": "primitive:mug", "length_mm": 100},
         "patch": {"width_mm": 9, "height_mm": 9},

@@ -50,7 +50,7 @@ def test_print_terms_let_gradients_pass(tmp_path):
 
 
 def test_the_plan_names_each_print_term_and_takes_it_out(tmp_path):
-    names = {"dot gain", "ink density", "printed black", "print scale"}
+    names = {"dot gain", "ink density", "veil", "chroma", "print scale"}
     for tables, off in (({"printer__scale": [0.95, 1]}, set()), ({}, {"print scale"})):
         problem = set_problem(scene_with(tmp_path, **tables))
         shown = problem.subject.appearance(problem.subject.start())

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from patchproof.base.color import ciede2000, lab_from_linear, lab_from_srgb, linear_from_srgb
+from patchproof.base.color import LUMINANCE, ciede2000, lab_from_linear, lab_from_srgb, linear_from_srgb
 from patchproof.base.errors import Refused
 from patchproof.base.packaged import packaged_path
 from patchproof.base.settings import PrinterSettings
@@ -225,7 +225,7 @@ def test_tables_outside_srgb_are_clipped():
 def test_unknown_names_say_the_nearest():
     with pytest.raises(Refused, match='got "coatet": did you mean "coated"'):
         load_printer("coatet")
-    with pytest.raises(Refused, match="coated, uncoated, identity"):
+    with pytest.raises(Refused, match="coated, office, uncoated, identity"):
         load_printer("x")
     with pytest.raises(Refused, match="no file at"):
         load_printer("folder/none.npz")
@@ -269,37 +269,42 @@ def test_broken_files_are_refused_in_one_sentence(tmp_path, break_it):
 
 def test_no_change_leaves_colors_and_paper_stays_white():
     light = torch.rand(2, 5, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
-    torch.testing.assert_close(vary_print(light, torch.zeros(3)), light)
-    draws = torch.rand(4, 3, generator=torch.Generator().manual_seed(2))
+    torch.testing.assert_close(vary_print(light, torch.zeros(6)), light)
+    draws = torch.rand(4, 6, generator=torch.Generator().manual_seed(2))
     torch.testing.assert_close(vary_print(torch.ones(4, 3), draws), torch.ones(4, 3))
 
 
-def test_variation_has_the_size_of_print_to_print_differences():
+def test_ink_variation_has_the_size_of_print_to_print_differences():
     seen = colors_of(load_printer("coated").apply(image(random_8bit())))
-    draws = torch.rand(64, 1, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64) * 2 - 1
-    draws *= torch.tensor([PrinterSettings().dot_gain[1], PrinterSettings().density[1], PrinterSettings().black[1]])
+    draws = torch.rand(64, 1, 2, generator=torch.Generator().manual_seed(2), dtype=torch.float64) * 2 - 1
+    draws *= torch.tensor([PrinterSettings().dot_gain[1], PrinterSettings().density[1]])
+    draws = torch.nn.functional.pad(draws, (0, 4))
     varied = lab_from_linear(vary_print(torch.tensor(linear_from_srgb(seen)), draws).numpy())
     error = ciede2000(varied, lab_from_srgb(seen)[None])
     assert 0.5 < error.mean() < 2 and error.max() < 6
 
 
 def test_variation_by_hand():
-    half_covered = torch.full((3, 3), 0.5)
-    gained, dense, lifted = vary_print(half_covered, torch.diag(torch.tensor([0.04, 0.05, 0.004]))).mean(1).tolist()
-    assert gained == pytest.approx(0.46)  # coverage 50 % grows by the dot gain of 4 points
-    assert dense == pytest.approx(0.5**1.05) and lifted == pytest.approx(0.502)
+    change = torch.diag(torch.tensor([0.04, 0.05, 0.3, 0.1, 0.0, 0.0]))[:4]
+    gained, dense, gray, veiled = vary_print(torch.full((4, 3), 0.5), change)
+    assert gained.tolist() == pytest.approx([0.46] * 3)  # coverage 50 % grows by the dot gain of 4 points
+    assert dense.tolist() == pytest.approx([0.5**1.05] * 3) and gray.tolist() == pytest.approx([0.5] * 3)
+    assert veiled.tolist() == pytest.approx([0.55, 0.5, 0.5])
+    red = vary_print(torch.tensor([0.5, 0.1, 0.1]), torch.tensor([0, 0, -0.5, 0, 0, 0])).tolist()
+    luminance = 0.1 + 0.4 * LUMINANCE[0]
+    assert red == pytest.approx([(0.5 + luminance) / 2, (0.1 + luminance) / 2, (0.1 + luminance) / 2])
 
 
 def test_each_row_has_its_own_draw():
-    light, draws = torch.rand(6, 3), torch.rand(6, 3)
+    light, draws = torch.rand(6, 3), torch.rand(6, 6)
     rows = torch.stack([vary_print(light[i], draws[i]) for i in range(6)])
     torch.testing.assert_close(vary_print(light, draws), rows)
 
 
 def test_variation_has_finite_true_gradients():
     light = torch.tensor([[0.05, 0.4, 0.9]], dtype=torch.float64, requires_grad=True)
-    draw = torch.tensor([[0.1, 0.9, 0.7]], dtype=torch.float64)
+    draw = torch.tensor([[0.1, 0.9, 0.2, 0.1, 0.2, 0.7]], dtype=torch.float64)
     assert torch.autograd.gradcheck(lambda x: vary_print(x, draw), (light,))
     ends = torch.tensor([0.0, 1.0])[:, None].expand(2, 3).clone().requires_grad_(True)
-    vary_print(ends, torch.tensor([-0.04, -0.05, 0.004])).sum().backward()
+    vary_print(ends, torch.tensor([-0.04, -0.05, 0.1, 0.004, 0.004, 0.004])).sum().backward()
     assert torch.isfinite(ends.grad).all()

@@ -110,7 +110,7 @@ def photos(tmp_path_factory):
     (folder / "small_blank.toml").write_text(text, encoding="utf-8")
     assert command("sheet", "--template", folder / "small_blank.toml", "--out", folder / "BLANK.pdf") == 0
     world = hang(build_scene(WORLD, folder, 3), load_manifest(folder / "BLANK.json"))
-    conditions = draw(WORLD, "promise", PHOTOS, 3)
+    conditions = with_values(draw(WORLD, "promise", PHOTOS, 3), tone=0)
     shoot(world, folder / "BLANK.pdf", conditions, folder / "photos")
     return optimized(folder, world, conditions, 'photos = "photos"\nsheet = "BLANK.json"', "", "assist")
 
@@ -158,7 +158,7 @@ def as_taken(scene, n: int):
     background[:, 0], background[:, 1] = (np.arange(n) + 0.5) / n, np.log(1 / low) / np.log(high / low)
     still = {"background": background, "roll_deg": none, "look_at_offset": np.zeros((n, 3)), "jpeg": none + 95}
     camera = {"exposure_ev": none, "white_balance": one, "blur_px": none, "noise": none}
-    return with_values(drawn, **still, **camera, dot_gain=none, density=none, black=none)
+    return with_values(drawn, **still, **camera, dot_gain=none, density=none, chroma=none, veil=0 * one, tone=none)
 
 
 def design_pixels(homography, scene, size_px) -> np.ndarray:

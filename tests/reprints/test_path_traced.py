@@ -84,7 +84,7 @@ def test_levels_are_ours_where_nothing_is_in_the_way(scene, lights, monkeypatch)
     pytest.importorskip("mitsuba")
     monkeypatch.setattr(path_traced, "PASSES", 1)
     conditions, stage = facing(scene, **lights), set_stage(scene)
-    for name in ("dot_gain", "density", "black"):
+    for name in ("dot_gain", "density", "chroma", "veil"):
         conditions = with_values(conditions, **{name: 0.0})
     piece = plain(scene, 0.5)
     ours = photograph(stage, piece, conditions, (200, 150), jpeg=False)[0].numpy()

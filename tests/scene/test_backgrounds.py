@@ -162,7 +162,7 @@ def test_a_session_s_photographs_share_print_light_camera_and_place_and_nothing_
     drawn = scene.draw("promise", 12, per_session=4)
     alone = scene.draw("promise", 12)
     of_session = [getattr(drawn.light, name) for name in vars(drawn.light)]
-    of_session += [getattr(drawn.print, name) for name in ("dot_gain", "density", "black")]
+    of_session += [getattr(drawn.print, name) for name in ("dot_gain", "density", "veil")]
     of_session += [drawn.sensor.white_balance, drawn.sensor.jpeg]
     of_session += [drawn.pose.background[:, [0, 1, 4]]]
     for values in of_session:

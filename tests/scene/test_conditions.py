@@ -93,7 +93,7 @@ def test_motion_and_light_fill_their_ranges():
 
 def test_terms_that_are_on_leave_the_other_draws_as_they_were():
     on, off = (fields_of(draw(settings, "promise", 50, 3)) for settings in (EVERYTHING, SETTINGS))
-    for name in ("azimuth_deg", "ambient", "background", "dot_gain", "black", "jpeg", "noise_seed"):
+    for name in ("azimuth_deg", "ambient", "background", "dot_gain", "veil", "jpeg", "noise_seed"):
         np.testing.assert_array_equal(on[name], off[name])
 
 

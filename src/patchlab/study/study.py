@@ -43,6 +43,7 @@ STUDIES: dict[str, str] = {
     "peers": "patchlab.bench.peers",
     "promises": "patchlab.validation.promises",
     "real": "patchlab.validation.real_photos",
+    "real-prints": "patchlab.validation.real_prints",
     "robust": "patchlab.paper.robust",
     "session-trials": "patchlab.validation.session_trials",
     "stress": "patchlab.paper.stress",
@@ -140,10 +141,12 @@ class Work:
 DEFAULT_WORK = Work()  # in this process, into a new folder
 
 
-def run_study(name: str, config: str | Path, out: str | Path, work: Work = DEFAULT_WORK) -> FinishedStudy:
-    """Run the study that the TOML file describes into the folder `out`."""
+def run_study(
+    name: str, config: str | Path, out: str | Path, work: Work = DEFAULT_WORK, changed: Mapping[str, Any] | None = None
+) -> FinishedStudy:
+    """Run the study that the TOML file describes, with some keys `changed`, into the folder `out`."""
     study = load_study(name)
-    settings = validate_model(study.settings, read_toml(config), str(config))
+    settings = validate_model(study.settings, {**read_toml(config), **(changed or {})}, str(config))
     return run_cells(study, settings, Path(config).resolve().parent, out, work)
 
 

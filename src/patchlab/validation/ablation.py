@@ -49,7 +49,7 @@ from patchproof.scene.conditions import without_effect as drawn_without
 
 ALL_EFFECTS = "all"
 # effects left out together, because each alone is too small to measure
-_EFFECT_GROUPS = ("dot gain + ink density + printed black", "blur + motion blur")
+_EFFECT_GROUPS = ("dot gain + ink density + chroma + veil", "blur + motion blur")
 _INVISIBLE_EFFECT = "JPEG"  # training views are too small to show it
 
 

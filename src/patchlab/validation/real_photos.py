@@ -272,7 +272,7 @@ def _range_plot(settings: RealSettings, used: Sequence[Result]):
     ranges = {
         "blur_px": camera.blur_px,
         "noise": camera.noise,
-        "black": (black + printer.black[0], black + printer.black[1]),
+        "black": tuple(black + veil * (1 - black) for veil in printer.veil),
     }
 
     def draw(figure: "Figure") -> None:

@@ -183,11 +183,12 @@ class BackgroundSettings(StrictModel):
 class PrinterSettings(StrictModel):
     """The printer's appearance model (a name in calibration/printers, or a file), and how prints vary about it."""
 
-    profile: str = "coated"  # coated, uncoated, or a file that `calibrate printer` wrote
+    profile: str = "office"  # office, coated, uncoated, or a file that `calibrate printer` wrote
     # From print to print, ΔE00 1 to 3 together. Assumed, from the tolerances of ISO 12647-2; it costs no time.
     dot_gain: Annotated[Range, within(-0.25, 0.25)] = (-0.04, 0.04)  # added tone value at 50 %
     density: Annotated[Range, within(-0.9, 3)] = (-0.05, 0.05)  # added ink, as a share of the ink's own
-    black: Annotated[Range, within(-0.1, 0.5)] = (-0.004, 0.004)  # added light of printed black; paper is 1
+    chroma: Annotated[Range, within(-1, 1)] = (-0.3, 0.15)  # added by a photograph, as a share of the print's own
+    veil: Annotated[ShareRange, within(0, 0.5)] = (0.0, 0.05)  # light of its place that a print mirrors; paper is 1
     # Off: sheets ask for 100 % and are measured. 0.97 to 1.03 moved the demo's confidence by 0.01, 0.94 by 0.05.
     scale: Annotated[PositiveRange, within(0.5, 2)] = (1.0, 1.0)  # printed size over the intended one
 
@@ -199,6 +200,7 @@ class CameraSettings(StrictModel):
     photo_px: tuple[Annotated[int, Field(ge=64, le=20000)], Annotated[int, Field(ge=64, le=20000)]] = (1600, 1200)
     exposure_ev: Range = (-0.5, 0.5)  # stops; at 0, white paper in light 1 is sRGB white
     white_balance: Annotated[Share, Field(le=0.5)] = 0.05  # largest error of the red and of the blue gain
+    tone: Annotated[Range, within(-0.24, 0.24)] = (-0.06, 0.06)  # added to middle gray by a phone's tone mapping
     blur_px: NotNegativeRange = (0.0, 1.0)  # standard deviation of a Gaussian at photo_px
     noise: ShareRange = (0.0, 0.01)  # standard deviation at white, at photo_px
     # Off: cameras are held still. Handheld at night, 2 to 12 px took 3.4 points [1.5, 5.2] off rates promised without

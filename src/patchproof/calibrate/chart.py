@@ -155,14 +155,15 @@ def combine_light(readings: Sequence[np.ndarray], robust: bool = True) -> np.nda
     return np.where(missing, np.nan, middle)
 
 
-_PRINT_CHANGE = (0.04, 0.05, 0.004)  # typical differences of dot gain, density and black between prints
+_PRINT_CHANGE = (0.04, 0.05, 0.004)  # typical differences of dot gain, density and veil between prints
 
 
 def print_variation(prints: Sequence[np.ndarray]) -> dict[str, Any] | None:
     """Standard deviations between the light N×3 of several prints; None for a single print.
 
-    Each print is described by `vary_print`'s three numbers relative to the mean of all; the swatches' ΔE00 from that
-    mean is given too. Two prints give a rough figure, and differences between photographs are included.
+    Each print is described by `vary_print`'s dot gain, density and a gray veil relative to the mean of all; the
+    swatches' ΔE00 from that mean is given too.
+    Two prints give a rough figure, and differences between photographs are included.
     """
     if len(prints) < 2:
         return None
@@ -175,7 +176,8 @@ def print_variation(prints: Sequence[np.ndarray]) -> dict[str, Any] | None:
         target = srgb_from_linear(light[readable])
 
         def residuals(change: np.ndarray, target: np.ndarray = target) -> np.ndarray:
-            return (srgb_from_linear(vary_print(middle, torch.tensor(change)).numpy()) - target).ravel()
+            varied = vary_print(middle, torch.tensor([*change[:2], 0.0, *change[[2, 2, 2]]]))
+            return (srgb_from_linear(varied.numpy()) - target).ravel()
 
         changes.append(least_squares(residuals, np.zeros(3), x_scale=_PRINT_CHANGE).x)
         distances.append(color_difference(target, srgb_from_linear(mean[readable])).mean())

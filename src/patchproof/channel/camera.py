@@ -2,7 +2,7 @@
 
 In: N×3×H×W linear light and a `Sensor`. Out: N×3×H×W sRGB in [0, 1], differentiable. Order: blur (optics, focus,
 straight motion), exposure and white balance, shot and read noise, clipping, tone curve (sRGB's, or that of a calibrated
-camera). The lens's distortion has its own module.
+camera), the photograph's own tone. The lens's distortion has its own module.
 
 Blur, motion, noise and JPEG are given for the photograph's full size. A picture rendered at `scale` times that size
 gets the part of them that remains after averaging: they shrink with `scale`, and effects below the threshold of
@@ -48,6 +48,7 @@ def develop(linear: Tensor, sensor: Sensor, scale: float, jpeg: bool = True, cam
     light = motion_blur(light, tensor(sensor.motion_px * scale), sensor.motion_deg)
     light = light * gains(sensor, linear)[:, :, None, None]
     picture = encode_light(add_noise(light, tensor(sensor.noise * scale), sensor.noise_seed), camera)
+    picture = lift_tone(picture, tensor(sensor.tone)[:, None, None, None])
     return compress_jpeg(picture, tensor(sensor.jpeg)) if _has_jpeg(sensor, scale, jpeg) else picture
 
 
@@ -84,6 +85,12 @@ def gains(sensor: Sensor, like: Tensor) -> Tensor:
 def encode_light(linear: Tensor, camera: Camera | None = None) -> Tensor:
     """Return clipped light as code values in [0, 1]."""
     return codes_of_light(clamp_to_unit(linear), camera)
+
+
+def lift_tone(codes: Tensor, tone: Tensor) -> Tensor:
+    """Return code values after a phone's tone mapping: middle gray rises by `tone`, black and white stay."""
+    rise = 4 * tone
+    return codes * (1 + rise - rise * codes)  # codes + 4·tone·codes·(1 - codes)
 
 
 def encode_light_by_table(linear: Tensor, camera: Camera | None = None) -> Tensor:

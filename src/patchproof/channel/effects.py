@@ -27,6 +27,7 @@ from patchproof.base.settings import SceneSettings
 _MIN_COSINE = 0.2  # a sun that has to light the patch alone becomes at most five times as strong
 # For settings of one number the range is ± the result of this function.
 _HALF_RANGE: dict[str, Callable[[float], float]] = {"view.look_at_jitter": float, "camera.white_balance": np.log1p}
+_VEIL_TINT = (-0.34, 0.34)  # logarithm of a veil's red and blue over its green: bluish by a window, reddish by wood
 
 FacingCosine = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """Returns N cosines between the patch's normal and directions (azimuths, elevations); 0 from behind."""
@@ -85,11 +86,12 @@ class Light(Draws):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Print(Draws):
-    """Deviations of one print from the printer's table (see `channel.printer`)."""
+    """Deviations of one print, as a photograph shows it, from the printer's table (`channel.printer.vary_print`)."""
 
-    dot_gain: np.ndarray = off()  # these three: see `channel.printer.vary_print`
+    dot_gain: np.ndarray = off()
     density: np.ndarray = off()
-    black: np.ndarray = off()
+    chroma: np.ndarray = off()
+    veil: np.ndarray = off((0.0, 0.0, 0.0))  # N×3 red, green, blue
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -101,6 +103,7 @@ class Sensor(Draws):
     blur_px: np.ndarray = off()  # Gaussian sigma
     noise: np.ndarray = off()  # standard deviation at white, in linear light
     noise_seed: np.ndarray = off(0)  # int64
+    tone: np.ndarray = off()  # added to middle gray's code value by a phone's tone mapping
     jpeg: np.ndarray = off(0)  # quality; 0 is no JPEG, for all views or for none
     motion_px: np.ndarray = off()
     motion_deg: np.ndarray = off()  # in [0, 180), counter-clockwise from the picture's x
@@ -180,6 +183,10 @@ def _gains(red: np.ndarray, blue: np.ndarray) -> np.ndarray:
     return np.exp(np.stack([red, np.zeros_like(red), blue], 1))
 
 
+def _tinted(strength: np.ndarray, red: np.ndarray, blue: np.ndarray) -> np.ndarray:
+    return strength[:, None] * _gains(red, blue)
+
+
 def _int64(numbers: np.ndarray) -> np.ndarray:
     return numbers.round().astype(np.int64)
 
@@ -201,6 +208,7 @@ _VIEW = {name: f"view.{name}" for name in ("azimuth_deg", "elevation_deg", "dist
 _CROP: dict[str, tuple[float, float]] = dict.fromkeys(("picture", "size", "x", "y", "mirrored"), (0.0, 1.0))
 _JITTER = dict.fromkeys("xyz", "view.look_at_jitter")
 _BALANCE: dict[str, str] = dict.fromkeys(("red", "blue"), "camera.white_balance")
+_VEIL: dict[str, str | tuple[float, float]] = {"strength": "printer.veil", "red": _VEIL_TINT, "blue": _VEIL_TINT}
 _SUN = {"light_azimuth_deg": "light.azimuth_deg", "light_elevation_deg": "light.elevation_deg"}
 _MOTION: dict[str, str | tuple[float, float]] = {"motion_px": "camera.motion_px", "motion_deg": (0.0, 180.0)}
 
@@ -211,10 +219,12 @@ EFFECTS: tuple[ViewEffect, ...] = (
     ViewEffect("ambient light", {"ambient": "light.ambient"}, 7, replacement=_sun_alone),
     ViewEffect("dot gain", {"dot_gain": "printer.dot_gain"}, 22),
     ViewEffect("ink density", {"density": "printer.density"}, 23),
-    ViewEffect("printed black", {"black": "printer.black"}, 24),
+    ViewEffect("veil", _VEIL, None, ("veil",), _tinted),
+    ViewEffect("chroma", {"chroma": "printer.chroma"}, per_photo="all"),
     ViewEffect("print scale", {"printed_scale": "printer.scale"}, 48),
     ViewEffect("exposure", {"exposure_ev": "camera.exposure_ev"}, 16, per_photo="all"),
     ViewEffect("white balance", _BALANCE, 17, ("white_balance",), _gains),
+    ViewEffect("tone", {"tone": "camera.tone"}, per_photo="all"),
     ViewEffect("motion blur", _MOTION, 40, per_photo="all", needs_whole_photo=True),
     ViewEffect("blur", {"blur_px": "camera.blur_px"}, 19, per_photo="all", needs_whole_photo=True),
     ViewEffect("noise", {"noise": "camera.noise"}, 20, per_photo="all", needs_whole_photo=True),

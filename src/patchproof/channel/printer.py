@@ -24,11 +24,12 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from patchproof.base.color import clamp_to_unit
+from patchproof.base.color import LUMINANCE, clamp_to_unit
 from patchproof.base.errors import Refused
 from patchproof.base.input import read_file, read_json
 from patchproof.base.packaged import packaged_path
 from patchproof.base.validation import Finite, StrictModel, spelling_hint, validate_model
+from patchproof.channel.effects import Print
 
 # 8-bit values that exist, so that a table baked by an 8-bit engine is exact at its nodes: 0, 8, ..., 248, 255
 NODES_8BIT = (*range(0, 249, 8), 255)
@@ -103,17 +104,24 @@ def identity_printer() -> Printer:
 
 
 def vary_print(seen_linear: Tensor, change: Tensor) -> Tensor:
-    """Return the light `... × 3` of another print of the same file, given that of this one; channels last, unlike an
-    image.
+    """Return the light `... × 3` of another print of the same file in another photograph, given that of this one;
+    channels last, unlike an image.
 
-    `change` `... × 3` broadcasts against it: dot gain g, ink density d, black b; 0 changes nothing. Bare paper stays 1.
-    With reflectance R: coverage 1 - R (Murray-Davies) grows by 4·g·R·(1 - R); density makes R^(1+d); light from the
-    surface itself makes b + (1 - b)·R.
+    `change` `... × 6` broadcasts against it: dot gain g, ink density d, chroma c, and a veil of light v in red, green
+    and blue; 0 changes nothing. Bare paper stays 1. With reflectance R: coverage 1 - R (Murray-Davies) grows by
+    4·g·R·(1 - R); density makes R^(1+d); chroma makes Y + (1+c)·(R - Y) about the luminance Y; light that the surface
+    itself sends to the camera makes v + (1 - v)·R.
     """
-    gain, density, black = change.to(seen_linear).split(1, -1)
+    gain, density, chroma, veil = change.to(seen_linear).split((1, 1, 1, 3), -1)
     light = seen_linear * (1 - 4 * gain * (1 - seen_linear))
     light = light * light.clamp_min(1e-3) ** density  # the floor keeps the slope finite at black
-    return clamp_to_unit(light + black * (1 - light))
+    luminance = light @ light.new_tensor(LUMINANCE)[:, None]
+    return clamp_to_unit(luminance.lerp(light, 1 + chroma).lerp(torch.ones_like(light), veil))
+
+
+def print_change(variation: Print) -> np.ndarray:
+    """Return N×6: the numbers of N prints as `vary_print` takes them."""
+    return np.column_stack([variation.dot_gain, variation.density, variation.chroma, variation.veil])
 
 
 def load_printer(name_or_file: str, base: Path | None = None) -> Printer:

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from patchproof.base.color import linear_from_srgb, srgb_from_linear
 from patchproof.channel import camera as camera_model
-from patchproof.channel.camera import add_noise, develop, encode_light, gaussian_blur, is_pointwise, reach_px
-from patchproof.channel.printer import vary_print
+from patchproof.channel.camera import add_noise, develop, gaussian_blur, is_pointwise, reach_px
+from patchproof.channel.printer import print_change, vary_print
 from patchproof.render.pixels import Appearance, ObjectTextures, PiecePicture
 from patchproof.render.stage import Stage
 from patchproof.render.surfaces import light_texels
@@ -75,10 +75,10 @@ def expose(views: Views, appearance: Appearance, jpeg: bool = True) -> Tensor:
     if appearance is not None:
         # if each pixel is developed alone, only the piece's pixels differ from the bare object's photograph
         piece, pixels = views.on_piece, views.frame_px[0] * views.frame_px[1]
-        back = encode_light(PAPER_BACK_LINEAR * views.exposure(piece.back_pixel // pixels), camera)
+        back = views.encode(torch.full((1, 1), PAPER_BACK_LINEAR).to(image), piece.back_pixel // pixels)
         image = _blend(image, piece.back_pixel, piece.back_share, back, False)
-        light = _piece_light(views, appearance) * views.exposure(piece.view)
-        image = _blend(image, piece.pixel, piece.share, encode_light(light, camera), False)
+        light = _piece_light(views, appearance)
+        image = _blend(image, piece.pixel, piece.share, views.encode(light, piece.view), False)
     return _smooth(views, image, by_code=False)
 
 
@@ -114,7 +114,7 @@ def _piece_light(views: Views, picture: PiecePicture) -> Tensor:
     reflectance = look_up(piece.texels, picture.codes if views.reduced else picture.light)
     if views.reduced:
         reflectance = linear_from_srgb(reflectance)
-    change = torch.as_tensor(np.stack([variation.dot_gain, variation.density, variation.black], 1)).to(reflectance)
+    change = torch.as_tensor(print_change(variation)).to(reflectance)
     return vary_print(reflectance, change.index_select(0, piece.view)) * views.piece_white
 
 

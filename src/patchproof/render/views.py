@@ -21,7 +21,7 @@ from torch import Tensor
 
 from patchproof.base.color import LINEAR_FROM_CODE
 from patchproof.base.geometry import camera_centers
-from patchproof.channel.camera import encode_light, encode_light_by_table, gains
+from patchproof.channel.camera import encode_light, encode_light_by_table, gains, lift_tone
 from patchproof.channel.light import Lighting, irradiance, lighting_of
 from patchproof.channel.render_frame import Frame
 from patchproof.render import pixels
@@ -113,19 +113,26 @@ class Views:
         camera = self.stage.camera
         # the background has 256 codes per view and channel, which are exposed as a table
         light = torch.tensor(LINEAR_FROM_CODE)[:, None] * self._gains[:, None].cpu().double()
-        image = _look_up_codes(self.background, encode_light(light, camera).numpy(), self.stage.device)
+        codes = lift_tone(encode_light(light, camera), self._tone.cpu().double()[:, None, None])
+        image = _look_up_codes(self.background, codes.numpy(), self.stage.device)
         if self.object is None:
             return image
-        color = self._object_color() * self.exposure(self.object.view)
-        return image.index_copy_(0, self.object.pixel, encode_light_by_table(color, camera))
+        view = self.object.view
+        color = encode_light_by_table(self._object_color() * self._gains.index_select(0, view), camera)
+        return image.index_copy_(0, self.object.pixel, lift_tone(color, self._tone.index_select(0, view)[:, None]))
 
-    def exposure(self, view: Tensor) -> Tensor:
-        """Return the camera's factors of the light in views P, P×3."""
-        return self._gains.index_select(0, view)
+    def encode(self, light: Tensor, view: Tensor) -> Tensor:
+        """Return the code values P×3 of light at pixels of the views P, in a camera without blur and noise."""
+        codes = encode_light(light * self._gains.index_select(0, view), self.stage.camera)
+        return lift_tone(codes, self._tone.index_select(0, view)[:, None])
 
     @cached_property
     def _gains(self) -> Tensor:
         return gains(self.conditions.sensor, torch.zeros(0, device=self.stage.device))
+
+    @cached_property
+    def _tone(self) -> Tensor:
+        return torch.as_tensor(self.conditions.sensor.tone, dtype=torch.float32, device=self.stage.device)
 
     @cached_property
     def piece_white(self) -> Tensor:

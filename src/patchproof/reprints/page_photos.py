@@ -19,6 +19,7 @@ from patchproof.base.color import linear_from_srgb, photo_codes_from_srgb
 from patchproof.base.geometry import MM_PER_INCH, apply_homography
 from patchproof.base.output import image_bytes, image_pixels, new_folder
 from patchproof.base.resample import index_homography
+from patchproof.base.settings import PrinterSettings
 from patchproof.channel.camera import develop
 from patchproof.channel.effects import Sensor
 from patchproof.channel.lens import Camera
@@ -74,7 +75,7 @@ def reprint_pages(
     """Write n photographs of the pages of a PDF, in turn, lying flat: for pages that belong to no run, such as blank
     ones, charts and boards. `how` names their printer (None: coated) and the print's scale.
     """
-    printer = load_printer(how.printer or "coated")
+    printer = load_printer(how.printer or PrinterSettings().profile)
 
     def apply_printer(colors: np.ndarray) -> np.ndarray:
         sent = torch.tensor(colors.T[None, :, :, None], dtype=torch.float32)

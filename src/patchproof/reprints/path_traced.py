@@ -25,7 +25,7 @@ from patchproof.base.color import LINEAR_FROM_CODE, linear_from_srgb
 from patchproof.base.errors import Refused
 from patchproof.channel.camera import develop
 from patchproof.channel.effects import Light, Print
-from patchproof.channel.printer import vary_print
+from patchproof.channel.printer import print_change, vary_print
 from patchproof.channel.render_frame import Frame
 from patchproof.mesh.mesh import Mesh
 from patchproof.render.photograph import PAPER_BACK_LINEAR
@@ -207,7 +207,7 @@ def _piece(mi: ModuleType, scene: MeshScene, picture: PiecePicture, conditions: 
 
 def _print_light(picture: PiecePicture, variation: Print) -> np.ndarray:
     """Light (H×W×3) of a print with this variation, relative to white paper."""
-    change = torch.tensor([variation.dot_gain[0], variation.density[0], variation.black[0]]).to(picture.srgb)
+    change = torch.tensor(print_change(variation)[0]).to(picture.srgb)
     return vary_print(linear_from_srgb(picture.srgb), change).numpy()
 
 

@@ -1,0 +1,148 @@
+"""Separate a printer's inks from the light and camera of the photographs that show its known colors.
+
+In: cells of known color in photographs of several places, N×3 sRGB sent and N×3 light over white paper. Out: one map
+from the color sent to the light of the ink, and for each photograph what its place and camera did to that light: veil,
+gains, tone and chroma, by the channel's own formulas. The map is a quadratic in sRGB's code values after a known
+printer, which takes colors that were never printed from that printer.
+
+Ink and photographs are told apart only as far as photographs differ: what all of them share (one phone's tone curve, a
+veil that is in every place) is in the map. Photographs of one place share their veil's color but not its strength, for
+the angle to the lamp changes it. Left out on purpose: light that changes within a photograph.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from patchproof.base.color import ciede2000, lab_from_linear, linear_from_srgb, srgb_from_linear
+from patchproof.calibrate.printer_files import printer_from_table
+from patchproof.channel.camera import lift_tone
+from patchproof.channel.printer import Printer, node_colors, vary_print
+
+_CENTER = (0.025, 0.025, 0.025, 0.0, 0.0, 0.0, 0.0, -0.075)  # of the terms in the default conditions
+_CENTERED = 100.0  # of the mean terms' squared distance from there: what all photographs share is in the ink
+_RIDGE = 0.05  # of the photographs' terms, per squared unit: keeps what cells cannot tell near its default
+_STEPS = 150
+_ROBUST_DELTA_E = 1.0  # CIELAB distances below count by their square
+
+
+@dataclass(frozen=True)
+class PhotoColors:
+    """One photograph's terms: veil (3,) and gains (3,) by channel, tone and chroma; 0 changes nothing, gains as log."""
+
+    veil: np.ndarray
+    log_gains: np.ndarray
+    tone: float
+    chroma: float
+
+
+@dataclass(frozen=True)
+class KnownColors:
+    """Light of cells of known color: N×3 uint8 sRGB sent, N×3 light over paper, and each cell's photograph."""
+
+    code: np.ndarray
+    light: np.ndarray
+    photo: np.ndarray
+
+    def of(self, photos: np.ndarray) -> KnownColors:
+        """The cells of some photographs."""
+        keep = np.isin(self.photo, photos)
+        return KnownColors(self.code[keep], self.light[keep], self.photo[keep])
+
+
+def ink_terms(printed: Tensor) -> Tensor:
+    """Return N×10: the quadratic's terms of sRGB values N×3."""
+    r, g, b = printed.unbind(1)
+    return torch.stack([torch.ones_like(r), r, g, b, r * r, g * g, b * b, r * g, r * b, g * b], 1)
+
+
+def ink_light(printed: Tensor, ink: Tensor) -> Tensor:
+    """Return the light N×3 of the ink over paper; `printed` is the sRGB that the known printer shows."""
+    return linear_from_srgb((ink_terms(printed) @ ink).clamp(0, 1))
+
+
+def photo_light(light: Tensor, terms: Tensor) -> Tensor:
+    """Return the light N×3 that photographs show; `terms` N×8 (veil, log gains, tone, chroma)."""
+    veil, log_gains, tone, chroma = terms.split((3, 3, 1, 1), 1)
+    none = torch.zeros_like(tone)
+    seen = vary_print(light, torch.cat([none, none, chroma, veil], 1)) * log_gains.exp()
+    return linear_from_srgb(lift_tone(srgb_from_linear(seen.clamp(1e-6, 1)), tone))
+
+
+def separate_ink(cells: KnownColors, printer: Printer) -> tuple[Tensor, dict[int, PhotoColors]]:
+    """Fit the ink's quadratic 10×3 after `printer` and the terms of every photograph."""
+    photos, index = np.unique(cells.photo, return_inverse=True)
+    printed, seen = _printed(cells.code, printer), _tensor(cells.light).clamp(0, 1)
+    ink, terms = torch.zeros(10, 3, dtype=torch.float64), torch.zeros(len(photos), 8, dtype=torch.float64)
+    ink[1:4] = torch.eye(3)
+    ink.requires_grad_()
+    terms.requires_grad_()
+    rows, center = torch.tensor(index), torch.tensor(_CENTER, dtype=torch.float64)
+
+    def predict() -> Tensor:
+        return photo_light(ink_light(printed, ink), terms.index_select(0, rows))
+
+    _minimize(
+        [ink, terms],
+        lambda: (
+            _distance(predict(), seen) + _RIDGE * (terms**2).sum() + _CENTERED * ((terms.mean(0) - center) ** 2).sum()
+        ),
+    )
+    found = {int(photo): _photo_colors(row) for photo, row in zip(photos, terms.detach(), strict=True)}
+    return ink.detach(), found
+
+
+def fit_photo(cells: KnownColors, printer: Printer, ink: Tensor) -> tuple[PhotoColors, np.ndarray]:
+    """Fit one photograph's terms to its cells; returns the light N×3 that they predict, too."""
+    light, seen = ink_light(_printed(cells.code, printer), ink), _tensor(cells.light).clamp(0, 1)
+    terms = torch.zeros(1, 8, dtype=torch.float64, requires_grad=True)
+    _minimize(
+        [terms], lambda: _distance(photo_light(light, terms.expand(len(light), 8)), seen) + 1e-3 * (terms**2).sum()
+    )
+    with torch.no_grad():
+        return _photo_colors(terms[0].detach()), photo_light(light, terms.expand(len(light), 8)).numpy()
+
+
+def printer_of_ink(name: str, start: Printer, ink: Tensor, provenance: dict[str, Any]) -> Printer:
+    """Return the printer of an ink after `start`; its white is paper."""
+    nodes = node_colors().reshape(-1, 3)
+    lut = srgb_from_linear(ink_light(_printed(nodes * 255, start), ink)).numpy().reshape(node_colors().shape)
+    lut = (lut / lut[-1, -1, -1]).clip(0, 1)
+    distance = ciede2000(*(lab_from_linear(linear_from_srgb(each)) for each in (lut, node_colors())))
+    return printer_from_table(name, "measured", lut, distance, None, provenance)
+
+
+def _printed(code: np.ndarray, printer: Printer) -> Tensor:
+    return printer.apply(_tensor(code / 255).T[None, :, :, None])[0, :, :, 0].T.contiguous()
+
+
+def _distance(light: Tensor, seen: Tensor) -> Tensor:
+    apart = lab_from_linear(light.clamp(1e-6, 1)) - lab_from_linear(seen)
+    return ((apart**2).sum(1) + _ROBUST_DELTA_E**2).sqrt().mean()
+
+
+def _minimize(parameters: list[Tensor], loss: Callable[[], Tensor]) -> None:
+    search = torch.optim.LBFGS(parameters, max_iter=_STEPS, history_size=20, line_search_fn="strong_wolfe")
+
+    def closure() -> Tensor:
+        search.zero_grad()
+        value = loss()
+        value.backward()
+        return value
+
+    search.step(closure)
+
+
+def _photo_colors(terms: Tensor) -> PhotoColors:
+    values = terms.numpy()
+    return PhotoColors(values[:3], values[3:6], float(values[6]), float(values[7]))
+
+
+def _tensor(values: np.ndarray) -> Tensor:
+    return torch.as_tensor(np.asarray(values, float))

@@ -1,0 +1,342 @@
+"""Hold default conditions and their promises against colors that real printers and cameras made.
+
+In: cells of known color in photographs of prints (sRGB sent, light over white paper; an NPZ with `photographs.csv`
+beside it, which names print and place), and scenes with networks. Out: for each photograph the distance to the default
+printer in the best of its conditions, and the share of cells within what the conditions can make; for each scene and
+network, promises beside sessions of twins: the same design under the scene's views in the colors of one photograph.
+A twin is a cubic from code to light through all cells of its photograph, and what the cubic leaves, cell by cell.
+
+With `left_out` the default printer is made again without the photographs of a place, or of a print, that it is held
+against: for photographs that it was made from. `former` are the conditions that promises are compared with. Left out on
+purpose: blur and light that changes over a print, which lie within the default ranges.
+"""
+
+from __future__ import annotations
+
+import csv
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations_with_replacement
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import torch
+from pydantic import Field
+
+from patchlab.study.estimates import mean, median
+from patchlab.study.grid import GridSettings, PositiveInt, cell_key, grid_cells, network_names, scene_of
+from patchlab.study.study import Cell, Result, Study
+from patchlab.validation.known_colors import KnownColors, fit_photo, printer_of_ink, separate_ink
+from patchproof.base.color import ciede2000, lab_from_linear, linear_from_srgb, srgb_from_linear
+from patchproof.base.errors import Refused
+from patchproof.base.input import read_file
+from patchproof.base.sessions import count_by_session, rate_posterior
+from patchproof.base.settings import CameraSettings, PrinterSettings, SceneSettings
+from patchproof.base.validation import expand_path
+from patchproof.calibrate.printer_files import printer_output, save_printer
+from patchproof.channel.camera import lift_tone
+from patchproof.channel.effects import EFFECT_BY_NAME, Print
+from patchproof.channel.printer import Printer, identity_printer, load_printer, print_change, vary_print
+from patchproof.optimizer.loop import best_design
+from patchproof.optimizer.patch import Patch
+from patchproof.optimizer.pixels import from_pixels
+from patchproof.optimizer.problem import Problem, set_problem
+from patchproof.optimizer.promise import VIEWS_PER_SESSION
+from patchproof.render.photograph import expose
+from patchproof.render.pixels import PiecePicture
+from patchproof.report.tables import Table
+from patchproof.scene.conditions import Conditions
+from patchproof.scene.interface import Scene
+
+Tables = Mapping[str, Mapping[str, Any]]
+FORMER: Tables = {
+    "printer": {
+        "profile": "coated",
+        "chroma": (0, 0),
+        "veil": (0, 0.004),
+    },
+    "camera": {"tone": (0, 0)},
+}
+"""Default conditions before real prints were measured; black that differed by ±0.004 is a veil of at most that."""
+_STILL: Tables = {
+    "printer": dict.fromkeys(("dot_gain", "density", "chroma", "veil"), (0, 0)),
+    "camera": {"tone": (0, 0)},
+}
+_BLOCKS = 24  # along a piece's sides: each has what is left of one cell of a twin's photograph
+_CHUNK = 4  # views rendered at a time
+_BASE = "coated"  # the printer that an ink is told apart from
+
+
+class RealPrintsSettings(GridSettings):
+    """Cells of known color, and scenes whose promises are held against twins of their photographs."""
+
+    scenes: tuple[str, ...] = ()  # scene files; without them, colors only
+    cells: str = "${PATCHPROOF_DATA}/real_prints/cells.npz"
+    left_out: Literal["nothing", "place", "print"] = "nothing"  # of the default printer, for what it is held against
+    draws: Annotated[int, Field(ge=20)] = 150  # of the conditions, for what they can make
+    per_photo: Annotated[int, Field(ge=20)] = 350  # cells of each photograph that inks and conditions are held against
+    views: Annotated[int, Field(ge=2 * VIEWS_PER_SESSION)] = 200  # of a promise
+    sessions: PositiveInt = 2  # of each twin
+    photos: PositiveInt = 10  # of each session
+
+
+@dataclass(frozen=True)
+class Cells:
+    """Cells of photographs: N×3 uint8 sRGB sent, N×3 light over paper, each one's photograph; names of photographs."""
+
+    known: KnownColors
+    places: tuple[str, ...]
+    prints: tuple[str, ...]
+
+    def groups(self, left_out: str) -> tuple[str, ...]:
+        """The name of the group of each photograph that is left out together."""
+        return {"place": self.places, "print": self.prints}.get(left_out, ("",) * len(self.places))
+
+
+def load_cells(path: Path) -> Cells:
+    """Read cells of known color and, beside them, `photographs.csv` with the columns print and place."""
+    table = path.with_name("photographs.csv")
+    rows = list(csv.DictReader(read_file(table, "photographs of known colors").decode("utf-8-sig").splitlines()))
+    with np.load(path, allow_pickle=False) as file:
+        code, light, photo = file["code"], file["light"].astype(float), file["photo"].astype(int)
+    if photo.max() >= len(rows):
+        raise Refused(
+            f"a row for each photograph in {table}", f"{len(rows)} rows, {photo.max() + 1} photographs", "add rows"
+        )
+    prints = tuple(row["print"] for row in rows)
+    # a place of one maker's prints: another's has another phone
+    places = tuple(f"{row['print'][:1]} {row['place']}" for row in rows)
+    return Cells(KnownColors(code, np.clip(light, 0, 1), photo), places, prints)
+
+
+def cells(settings: RealPrintsSettings, base: Path) -> list[Cell]:
+    """A cell for the colors, and one for each scene and network."""
+    pairs = grid_cells(settings, base) if settings.scenes else []
+    return [Cell("colors", {"cells": expand_path(settings.cells, base)}), *pairs]
+
+
+def run(settings: RealPrintsSettings, base: Path, cell: Cell) -> dict[str, Any]:
+    """Hold the default conditions against colors, or a scene's promises against twins."""
+    every = load_cells(Path(expand_path(settings.cells, base)))
+    if cell.name == "colors":
+        return {"photographs": list(_colors(settings, every))}
+    return _hold_promises(settings, base, cell, every)
+
+
+def _some(settings: RealPrintsSettings, known: KnownColors) -> KnownColors:
+    """As many cells of each photograph, at random."""
+    rng = np.random.default_rng(0)
+    rows = [np.flatnonzero(known.photo == photo) for photo in np.unique(known.photo)]
+    keep = np.concatenate([rng.choice(each, min(settings.per_photo, len(each)), False) for each in rows])
+    return KnownColors(known.code[keep], known.light[keep], known.photo[keep])
+
+
+def _printers(settings: RealPrintsSettings, every: Cells) -> dict[str, tuple[Printer, list[int]]]:
+    """By group of photographs, the default printer made without them, and the group's photographs."""
+    groups, some = every.groups(settings.left_out), _some(settings, every.known)
+    found = {}
+    for group in dict.fromkeys(groups):
+        held = [i for i, name in enumerate(groups) if name == group]
+        if settings.left_out == "nothing":
+            printer = load_printer(PrinterSettings().profile)
+        else:
+            others = np.setdiff1d(np.unique(some.photo), held)
+            start = load_printer(_BASE)
+            printer = printer_of_ink("left-out", start, separate_ink(some.of(others), start)[0], {"source": "a study"})
+        found[group] = printer, held
+    return found
+
+
+def _colors(settings: RealPrintsSettings, every: Cells) -> Iterator[dict[str, Any]]:
+    """Of each photograph: ΔE00 of its median cell in the best conditions, share of cells within what they can make."""
+    some = _some(settings, every.known)
+    unchanged = torch.zeros(10, 3, dtype=torch.float64)
+    unchanged[1:4] = torch.eye(3)
+    for printer, held in _printers(settings, every).values():
+        for photo in held:
+            seen = some.of(np.array([photo]))
+            best = fit_photo(seen, printer, unchanged)[1]
+            distance = ciede2000(lab_from_linear(np.clip(best, 0, 1)), lab_from_linear(seen.light))
+            light = linear_from_srgb(printer_output(printer, seen.code / 255))
+            yield {
+                "place": every.places[photo],
+                "print": every.prints[photo],
+                "distance": float(np.median(distance)),
+                "within": _share_within(torch.as_tensor(light), seen.light, settings.draws),
+            }
+
+
+def _share_within(light: torch.Tensor, seen: np.ndarray, draws: int) -> float:
+    """The share of cells whose three channels lie between the least and the most that default conditions make."""
+    defaults, rng = SceneSettings.model_construct(printer=PrinterSettings(), camera=CameraSettings()), _rng(1)
+    drawn: dict[str, np.ndarray] = {}
+    for effect in map(EFFECT_BY_NAME.__getitem__, ("dot gain", "ink density", "chroma", "veil", "tone")):
+        drawn |= effect.sample(defaults, rng.random((draws, len(effect.columns))), np.arange(draws))
+    tone = torch.as_tensor(drawn.pop("tone"))
+    change = torch.as_tensor(print_change(Print(**drawn)))
+    made = [vary_print(light, each) for each in change]
+    shown = torch.stack([lift_tone(srgb_from_linear(m), t) for m, t in zip(made, tone, strict=True)]).numpy()
+    codes = srgb_from_linear(seen)
+    return float(((codes >= shown.min(0) - 1e-3) & (codes <= shown.max(0) + 1e-3)).all(1).mean())
+
+
+def _rng(seed: int) -> np.random.Generator:
+    return np.random.default_rng(seed)
+
+
+@dataclass(frozen=True)
+class Twin:
+    """Colors of one photograph: a cubic 20×3 from sRGB sent to sRGB seen, and what it leaves of each cell."""
+
+    cubic: np.ndarray
+    left: np.ndarray
+
+    @classmethod
+    def of(cls, known: KnownColors) -> Twin:
+        """The least-squares cubic through the cells of one photograph; paper is white."""
+        sent, seen = known.code / 255, srgb_from_linear(known.light)
+        white = np.ones((len(sent) // 10, 3))
+        terms = _cubic_terms(np.concatenate([sent, white]))
+        cubic = np.linalg.lstsq(terms, np.concatenate([seen, white]), rcond=None)[0]
+        return cls(cubic, seen - _cubic_terms(sent) @ cubic)
+
+    def show(self, piece: PiecePicture, rng: np.random.Generator) -> PiecePicture:
+        """The piece in these colors, each block with what is left of some cell."""
+        sent = piece.srgb.numpy()
+        left = self.left[rng.integers(0, len(self.left), (_BLOCKS, _BLOCKS))]
+        rows, columns = (np.arange(n) * _BLOCKS // n for n in sent.shape[:2])
+        seen = (_cubic_terms(sent.reshape(-1, 3)) @ self.cubic).reshape(sent.shape) + left[rows][:, columns]
+        return PiecePicture.of(torch.tensor(np.clip(seen, 0, 1), dtype=torch.float32))
+
+
+def _cubic_terms(sent: np.ndarray) -> np.ndarray:
+    powers = [np.prod(sent[:, list(each)], 1) for n in range(4) for each in combinations_with_replacement(range(3), n)]
+    return np.stack(powers, 1)
+
+
+def _hold_promises(settings: RealPrintsSettings, base: Path, cell: Cell, every: Cells) -> dict[str, Any]:
+    """Promises by former and by default conditions beside twins, for a design by each: effects, hits by session."""
+    scene, names = scene_of(base, cell.values), network_names(base, cell.values)
+    answers: dict[str, Any] = {}
+    with tempfile.TemporaryDirectory() as temporary:
+        conditions = {"former": [(_problem(scene, names, FORMER), list(range(len(every.places))))], "default": []}
+        for i, (printer, held) in enumerate(_printers(settings, every).values()):
+            file = save_printer(replace(printer, name=f"printer{i}"), Path(temporary))
+            conditions["default"].append((_problem(scene, names, {"printer": {"profile": str(file)}}), held))
+        still = _problem(scene, names, _STILL)
+        twins = [Twin.of(every.known.of(np.array([photo]))) for photo in range(len(every.places))]
+        designs = {
+            by: best_design(_problem(scene, names, tables)) for by, tables in (("former", FORMER), ("default", {}))
+        }
+        for by, pixels in designs.items():
+            promised = {
+                way: [(held, _promise(settings, problem, pixels)) for problem, held in each]
+                for way, each in conditions.items()
+                if by == "former" or way == "default"
+            }
+            answers[by] = {"promised": promised, "twins": _twins(settings, still, pixels, twins)}
+    return answers
+
+
+def _problem(scene: Scene, names: Sequence[str], tables: Tables) -> Problem:
+    return set_problem(replace(scene, settings=scene.settings.changed(**tables)), models=names)
+
+
+def _promise(settings: RealPrintsSettings, problem: Problem, pixels: np.ndarray) -> dict[str, Any]:
+    """The effect beside gray on the target's logit, and the numbers recognized in each session."""
+    conditions = problem.scene.draw("promise", settings.views, per_session=VIEWS_PER_SESSION)
+    shown = [problem.subject.appearance(from_pixels(each)) for each in (pixels, np.full_like(pixels, 128))]
+    effect, hits = _effect(problem, shown, conditions)
+    return {"effect": effect, "sessions": count_by_session(hits, VIEWS_PER_SESSION)}
+
+
+def _twins(
+    settings: RealPrintsSettings, problem: Problem, pixels: np.ndarray, twins: Sequence[Twin]
+) -> list[dict[str, Any]]:
+    """The effect and the numbers recognized in sessions of each twin."""
+    plain = Patch(problem.patch.scene, identity_printer(), problem.patch.design_px, problem.device)
+    sent = [plain.appearance(from_pixels(each)) for each in (pixels, np.full_like(pixels, 128))]
+    found = []
+    for number, twin in enumerate(twins):
+        n = settings.sessions * settings.photos
+        views = problem.scene.draw("reprint", (number + 1) * n, per_session=settings.photos)[number * n :]
+        effect, hits = _effect(problem, [twin.show(each, _rng(number)) for each in sent], views)
+        found.append({"effect": effect, "sessions": count_by_session(hits, settings.photos)})
+    return found
+
+
+@torch.no_grad()
+def _effect(problem: Problem, shown: Sequence[PiecePicture], conditions: Conditions) -> tuple[float, list[bool]]:
+    """The first picture's mean logit of the target over the second's, and where the first is recognized."""
+    classifier, indices, logits, hits = problem.classifiers[0], list(problem.indices[0]), [[], []], []
+    for first in range(0, len(conditions), _CHUNK):
+        views = problem.see(shown[0], conditions[first : first + _CHUNK], problem.figure_px)
+        for i, picture in enumerate(shown):
+            answer = classifier.logits(expose(views, picture), None)
+            logits[i] += answer[:, indices].max(1).values.tolist()
+            if i == 0:
+                hits += classifier.recognized(answer, indices).tolist()
+    return float(np.mean(logits[0]) - np.mean(logits[1])), hits
+
+
+def tables(settings: RealPrintsSettings, results: Sequence[Result]) -> tuple[Table, ...]:
+    """Colors by photograph; promises beside twins, by scene and network; designs on twins."""
+    colors = [each for result in results for each in result.answers.get("photographs", ())]
+    pairs = [result for result in results if "photographs" not in result.answers]
+    return (*_color_tables(settings, colors), *((_promise_table(pairs), _design_table(pairs)) if pairs else ()))
+
+
+def _color_tables(settings: RealPrintsSettings, photos: Sequence[Mapping[str, Any]]) -> Iterator[Table]:
+    about = f"{len(photos)} photographs; left out of the default printer: {settings.left_out}"
+    head = ("photographs", "ΔE00 in the best conditions", "cells within the conditions")
+    groups = {"all": list(photos)}
+    for key in ("place", "print"):
+        for photo in photos:
+            groups.setdefault(f"{key} {photo[key]}", []).append(photo)
+    rows = [(name, *(median([p[k] for p in some]) for k in ("distance", "within"))) for name, some in groups.items()]
+    yield Table("colors", "Colors of the median photograph", head, tuple(rows), about)
+
+
+def _of_twins(promised: Mapping[str, Any], twins: Sequence[Mapping[str, Any]]) -> list[tuple[float, float, float]]:
+    """Of each twin: bias of the effect as a share of the twins' mean, bias of the rate, share of sessions inside."""
+    rows, size = [], abs(np.mean([twin["effect"] for twin in twins]))
+    for held, promise in promised:
+        posterior, promised_rate = rate_posterior(*promise["sessions"]), np.divide(*map(sum, promise["sessions"]))
+        for twin in (twins[i] for i in held):
+            seen = list(zip(*twin["sessions"], strict=True))
+            inside = [low <= k <= high for k, n in seen for low, high in [posterior.count_interval((n,))]]
+            rate_bias = promised_rate - np.divide(*map(sum, twin["sessions"]))
+            rows.append(((promise["effect"] - twin["effect"]) / size, float(rate_bias), float(np.mean(inside))))
+    return rows
+
+
+def _promise_table(pairs: Sequence[Result]) -> Table:
+    head = ("scene", "network", "seed", "conditions", "promised", "on twins", "bias of the effect", "bias of the rate")
+    rows = []
+    for result in pairs:
+        answers = result.answers["former"]
+        on_twins = [np.divide(*map(sum, twin["sessions"])) for twin in answers["twins"]]
+        for way, promised in answers["promised"].items():
+            effect, bias, inside = zip(*_of_twins(promised, answers["twins"]), strict=True)
+            promised_rate = np.mean([np.divide(*map(sum, each["sessions"])) for _, each in promised])
+            figures = float(promised_rate), mean(on_twins), mean(effect), mean(bias), mean(inside)
+            rows.append((*cell_key(result), way, *figures))
+    about = "the design by former conditions; shares of the twins' mean effect; twins of one print and place are alike"
+    return Table("promises", "Promises beside twins", (*head, "sessions inside"), tuple(rows), about)
+
+
+def _design_table(pairs: Sequence[Result]) -> Table:
+    rows = []
+    for result in pairs:
+        former, default = (
+            np.array([np.divide(*map(sum, twin["sessions"])) for twin in result.answers[by]["twins"]])
+            for by in ("former", "default")
+        )
+        rows.append((*cell_key(result), mean(former), mean(default), mean(default - former)))
+    head = ("scene", "network", "seed", "by former conditions", "by default conditions", "gain")
+    return Table("designs", "Designs on twins", head, tuple(rows), "each twin counts as one; rates")
+
+
+STUDY = Study("real-prints", RealPrintsSettings, cells, run, tables)

@@ -1,0 +1,58 @@
+"""The study of real prints on made cells: conditions hold what they make, a twin shows its photograph's colors."""
+
+import numpy as np
+import pytest
+import torch
+
+from patchlab.study.study import run_study
+from patchlab.validation import real_prints
+from patchlab.validation.known_colors import KnownColors
+from patchproof.base.color import linear_from_srgb, srgb_from_linear
+from patchproof.base.errors import Refused
+from patchproof.calibrate.printer_files import printer_output
+from patchproof.channel.camera import lift_tone
+from patchproof.channel.printer import load_printer, vary_print
+from patchproof.render.pixels import PiecePicture
+
+CODES = np.random.default_rng(0).integers(0, 256, (60, 3)).astype(np.uint8)
+
+
+def seen(veil, chroma, tone):
+    """Light of the cells in the default printer, in conditions."""
+    light = torch.tensor(linear_from_srgb(printer_output(load_printer("office"), CODES / 255)))
+    light = vary_print(light, torch.tensor([0.0, 0.0, chroma, *veil]))
+    return linear_from_srgb(lift_tone(srgb_from_linear(light), torch.tensor(tone)).numpy())
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Two photographs within the default conditions, and one in a veil that is far beyond them."""
+    photos = [seen([0.02] * 3, -0.1, 0.03), seen([0.03, 0.03, 0.04], 0.1, -0.03), seen([0.3] * 3, 0.0, 0.0)]
+    photo = np.repeat(np.arange(3), len(CODES)).astype(np.uint8)
+    np.savez(tmp_path / "cells.npz", code=np.tile(CODES, (3, 1)), light=np.concatenate(photos), photo=photo)
+    rows = "A-one,desk\nA-one,window\nB-two,door\n"
+    (tmp_path / "photographs.csv").write_text("print,place\n" + rows, encoding="utf-8")
+    (tmp_path / "s.toml").write_text('cells = "cells.npz"\nper_photo = 60\n', encoding="utf-8")
+    return tmp_path
+
+
+def test_conditions_hold_the_photographs_that_they_make_and_no_others(folder):
+    (colors,) = run_study("real-prints", folder / "s.toml", folder / "out").tables
+    distance, within = ({row[0]: row[i].value for row in colors.rows} for i in (1, 2))
+    assert distance["place A desk"] < 0.5 and distance["place A window"] < 0.5
+    assert within["print A-one"] > 0.9 and within["print B-two"] < 0.3
+
+
+def test_photographs_without_a_row_are_refused(folder):
+    (folder / "photographs.csv").write_text("print,place\nA-one,desk\n", encoding="utf-8")
+    with pytest.raises(Refused, match="1 rows, 3 photographs"):
+        real_prints.load_cells(folder / "cells.npz")
+
+
+def test_a_twin_shows_the_colors_of_its_photograph():
+    light = seen([0.02] * 3, -0.1, 0.03)
+    twin = real_prints.Twin.of(KnownColors(CODES, light, np.zeros(len(CODES), int)))
+    piece = PiecePicture.of(torch.tensor(CODES[:36].reshape(6, 6, 3) / 255, dtype=torch.float32))
+    shown = twin.show(piece, np.random.default_rng(0)).srgb.numpy().reshape(-1, 3)
+    error = np.abs(shown - srgb_from_linear(light[:36]))
+    assert np.median(error) < 0.03 and np.abs(twin.left).max() > 0
