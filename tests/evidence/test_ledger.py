@@ -12,12 +12,13 @@ import torch
 from synthetic_photos import CONDITION, make_manifest, noisy_design, page_raster, photograph, save, view
 
 from patchproof.base.color import ciede2000, lab_from_linear, linear_from_srgb
+from patchproof.channel.print_colors import ShownColors, add_ink
 from patchproof.channel.printer import identity_printer, load_printer
 from patchproof.classifier import Classifier
 from patchproof.evidence.classify import square_of
 from patchproof.evidence.gather import gather_evidence
 from patchproof.evidence.ledger import _ledger, shapley
-from patchproof.evidence.print_fit import LEAST_CELLS, fit_print
+from patchproof.evidence.print_fit import LEAST_CELLS, PhotographedDesign, fit_print
 from patchproof.evidence.reproject import (
     PhotoSquare,
     Reference,
@@ -29,6 +30,8 @@ from patchproof.evidence.reproject import (
 )
 from patchproof.evidence.surface import PromisedColors, piece_picture, promised_of, surface_of
 from patchproof.evidence.task import Options
+from patchproof.photo.colorfit import invert_affine
+from patchproof.photo.design_cells import cell_means
 from patchproof.photo.pattern_light import pattern_light
 from patchproof.photo.quality import FrameLight
 from patchproof.report.plots import ledger_plot
@@ -84,6 +87,7 @@ def delta(a: np.ndarray, b: np.ndarray) -> float:
 
 
 INK = np.zeros((1, 1, 3))
+LOOKS = ((0.0, 0.8, 0.0, 0.0), (0.04, 0.6, -0.08, -0.2), (0.02, 0.9, -0.04, 0.1))  # veil, paper, tone, chroma
 PRINTS = {
     "same": lambda srgb: shown_by("coated", srgb),
     "uncoated": lambda srgb: shown_by("uncoated", srgb),
@@ -98,16 +102,23 @@ def cells_of_print(light: np.ndarray, seed: int) -> np.ndarray:
     return cells + np.random.default_rng(seed).normal(0, 0.004, cells.shape)
 
 
+def fitted(cells, promised: np.ndarray, seen_ink, ink):
+    """The print's map from photographs in light 1 without blur; None if there is none."""
+    light = FrameLight(np.ones(3), np.asarray(seen_ink), 1.0, 0.0)
+    fit = fit_print([PhotographedDesign(c, 0.0, light) for c in cells], PromisedColors(promised, ink))
+    return fit and functools.partial(add_ink, ink=fit[0])
+
+
 @pytest.mark.parametrize(
     ("change", "before", "after"),
-    [("same", 0.0, 0.3), ("uncoated", 5.0, 2.0), ("dot_gain", 3.1, 1.8), ("weak_ink", 9.5, 1.6)],
+    [("same", 0.0, 0.3), ("uncoated", 5.0, 2.0), ("dot_gain", 3.1, 2.4), ("weak_ink", 9.5, 1.9)],
 )
 def test_a_known_print_is_read_from_a_noisy_design(change, before, after):
     """ΔE00 in the mean over the design's own pixels, finer than any cell; other designs of that print as well."""
     printed, (sent, other) = PRINTS[change], (noisy_design(seed) for seed in (0, 1))
     promised, ink = shown_by("coated", sent), shown_by("coated", INK)[0, 0]
     cells = [cells_of_print(printed(sent), i) for i in range(3)]
-    as_printed = fit_print(cells, promised.astype(np.float32), printed(INK)[0, 0], ink)
+    as_printed = fitted(cells, promised.astype(np.float32), printed(INK)[0, 0], ink)
     assert delta(printed(sent), promised) == pytest.approx(before, abs=0.1)
     assert delta(printed(sent), as_printed(promised)) < after
     assert delta(printed(other), as_printed(shown_by("coated", other))) < after
@@ -115,10 +126,28 @@ def test_a_known_print_is_read_from_a_noisy_design(change, before, after):
     assert ends == pytest.approx(np.stack([np.ones(3), printed(INK)[0, 0]]), abs=0.015)
 
 
+def test_a_print_of_small_blocks_is_read_through_each_photographs_own_veil_tone_and_chroma():
+    """70 × 70 blocks, whose 16 × 16 means are alike. ΔE00 of cells as one photograph shows them, halved."""
+    sent = np.random.default_rng(0).random((70, 70, 3)).repeat(2, 0).repeat(2, 1)
+    promised, ink = shown_by("coated", sent).astype(np.float32), shown_by("coated", INK)[0, 0]
+    terms = [np.array([v, v, v, *np.log(paper) * np.ones(3), t, c]) for v, paper, t, c in LOOKS]
+    looks = [ShownColors.of_terms(t) for t in terms]
+    light, end = (cell_means(np.moveaxis(x, -1, 0), (70, 70), 0.0) for x in (shown_by("uncoated", sent), promised))
+    seen_ink = shown_by("uncoated", INK)[0, 0]
+    photos = [
+        PhotographedDesign(look.show(light), 0.0, FrameLight(look.show(np.ones(3)), look.show(seen_ink), 1.0, 0.0))
+        for look in looks
+    ]
+    ink_map, fits = fit_print(photos, PromisedColors(promised, ink))
+    for look, fit in zip(looks, fits, strict=True):
+        truth = look.show(light)
+        assert delta(fit.show(add_ink(end, ink_map)), truth) < 2.05 < 4.1 < delta(look.show(np.ones(3)) * end, truth)
+
+
 def test_black_that_is_lighter_in_photographs_is_print():
     sent = noisy_design()
     ink = np.full(3, 0.02)
-    as_printed = fit_print([cells_of_print(sent, 0)], sent.astype(np.float32), np.full(3, 0.1), ink)
+    as_printed = fitted([cells_of_print(sent, 0)], sent.astype(np.float32), np.full(3, 0.1), ink)
     assert as_printed(ink[None]) == pytest.approx(np.full((1, 3), 0.1), abs=0.03)
 
 
@@ -129,9 +158,9 @@ def test_cells_too_few_or_too_much_alike_do_not_say_what_the_print_is():
         cells = np.full_like(few, np.nan)
         rows, columns = np.divmod(np.arange(readable), 14)
         cells[rows + 1, columns + 1] = few[rows + 1, columns + 1]
-        assert (fit_print([cells, cells], colorful.astype(np.float32), ink, ink) is not None) == told
-    assert fit_print([cells_of_print(gray, 0)], gray.astype(np.float32), ink, ink) is None
-    assert fit_print([], colorful.astype(np.float32), ink, ink) is None
+        assert (fitted([cells, cells], colorful.astype(np.float32), ink, ink) is not None) == told
+    assert fitted([cells_of_print(gray, 0)], gray.astype(np.float32), ink, ink) is None
+    assert fitted([], colorful.astype(np.float32), ink, ink) is None
 
 
 @pytest.mark.parametrize(
@@ -293,8 +322,9 @@ def test_a_piece_put_into_a_photograph_is_what_a_photograph_of_it_shows():
         "a", taken, np.array(geometry.homography_px_from_mm), geometry.blur_px, photo.light, surface, 240
     )
     drawn, fit = piece_picture(surface, promised.design), light_fit(shot, promised)
-    put = reprojected_squares(shot, {(): drawn}, surface.rect_mm, fit, fit, Reference(0.5, 0.3, 0.0))
-    assert np.array_equal(put[True, True], reprojected_square(shot, drawn, surface.rect_mm, fit))
+    shown = ShownColors(invert_affine(fit.matrix))
+    put = reprojected_squares(shot, {(): drawn}, surface.rect_mm, fit, shown, Reference(0.5, 0.3, 0.0))
+    assert put[True, True] == pytest.approx(reprojected_square(shot, drawn, surface.rect_mm, shown), abs=1e-6)
     for on, expected in ((True, other), (False, promised_one)):
         off = np.abs(put[on, on] - square_of(expected)[0] / 255).mean()
         assert off < 0.009  # the print that was taken is 0.036 off and more

@@ -17,11 +17,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from patchproof.base.intervals import paired_difference
+from patchproof.channel.print_colors import ShownColors
 from patchproof.evidence.classify import Judges, predict, squares_of
 from patchproof.evidence.reproject import PhotoSquare, fit_print_and_lights, reprojected_square
 from patchproof.evidence.results import EffectEstimate, EstimatedControl
 from patchproof.evidence.surface import Surface, piece_picture, printed_colors
-from patchproof.photo.colorfit import ColorFit
 from patchproof.sheets.manifest import Manifest
 from patchproof.sheets.piece import control_design
 
@@ -67,7 +67,7 @@ def estimate_effect(
     return EffectEstimate(photos=len(original), agree=agree, controls=tuple(controls))
 
 
-def _recognized(shot: PhotoSquare, look: np.ndarray, surface: Surface, light: ColorFit, judges: Judges) -> bool:
+def _recognized(shot: PhotoSquare, look: np.ndarray, surface: Surface, light: ShownColors, judges: Judges) -> bool:
     """Classify the photograph with a piece of this look by the primary network."""
     codes = np.rint(255 * reprojected_square(shot, look, surface.rect_mm, light)).astype(np.uint8)
     model = judges.primary

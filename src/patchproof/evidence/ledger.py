@@ -14,10 +14,9 @@ Games, 1953):
 explains. Shares sum to the whole, v(nothing on) - v(photograph), and may be negative. With an effect off, light and
 blur are those of one of the promise's conditions, so that what the promise already contains is no loss.
 
-Light and camera are the gains and the veil that take paper white and marker black to their promised values; the rest of
-a color difference is print. Ink lighter than promised and a veil of stray light look alike, but a veil lies over the
-whole photograph: lightening up to that of the darkest place counts as light, more as ink. If the design's colors are
-too few or too alike to fit the print, print and light are one step.
+Light and camera are what differs from photograph to photograph: gains, a veil, tone and chroma. What all photographs
+share is print: a veil in all of them looks like lighter ink. Around the piece, stray light is undone up to that of the
+darkest place. If the design's colors are too few or too alike to fit the print, print and light are one step.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import cv2
 import numpy as np
@@ -22,21 +22,22 @@ import numpy as np
 from patchproof.base.color import LUMINANCE, srgb_from_linear
 from patchproof.base.geometry import apply_homography, rect_corners
 from patchproof.base.resample import index_homography
+from patchproof.channel.print_colors import ShownColors, add_ink, lift_codes, lower_light
 from patchproof.evidence.appearance import fit_cells
 from patchproof.evidence.classify import BoxEdges, square_of
-from patchproof.evidence.print_fit import fit_print
+from patchproof.evidence.print_fit import PhotographedDesign, fit_print
 from patchproof.evidence.surface import PromisedColors, Surface
 from patchproof.photo.colorfit import ColorFit, invert_affine, white_black
+from patchproof.photo.design_cells import design_cells
 from patchproof.photo.detect import LINEAR_FLOAT32_FROM_CODE
 from patchproof.photo.pattern_light import pattern_light
-from patchproof.photo.quality import CLIPPED_CODE, FrameLight
-from patchproof.photo.rectify import rectify, region_around
+from patchproof.photo.quality import FrameLight
+from patchproof.photo.rectify import region_around
 from patchproof.sheets.manifest import Rect
 
 Switches = tuple[bool, ...]  # which effects are on
 MAX_OVERSAMPLING = 3  # times the network's input size; finer detail is averaged away before the network sees it
 _READ_SHARE_SQUARE = 1 / 16  # of noise at white, as the camera model has it
-_CELLS_ALONG_SIDE = 16  # of the design's shorter side, in which its colors are read
 _LEAST_BLUR_PX = 0.1
 _LEAST_AGREEMENT = 0.6  # of marker cells with the print; correct homographies reach 0.9 and more
 _LEAST_NOISE = 0.004  # of linear light: code values and JPEG
@@ -49,9 +50,9 @@ _SUPERSAMPLE = 2
 class PhotoSquare:
     """A photograph's centered square: uint8 W×W×3, page millimeters to its pixels, blur in pixels, noise in light.
 
-    `cells` h×w×3 are the design's linear light as photographed, NaN where clipped; `scale` is W over the photograph's
-    shorter side; `matrix_px` is the camera's for the square (None: focal length unknown); `box` is the object's, for
-    detectors.
+    `cells` h×w×3 are the design's linear light as photographed, NaN where clipped, `blur_cells` their blur in cells;
+    `scale` is W over the photograph's shorter side; `matrix_px` is the camera's for the square (None: focal length
+    unknown); `box` is the object's, for detectors.
     """
 
     file: str
@@ -64,6 +65,7 @@ class PhotoSquare:
     scale: float
     matrix_px: np.ndarray | None = None
     box: BoxEdges | None = None
+    blur_cells: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -102,18 +104,9 @@ def photo_square(
             return None
         light, blur_px = replace(light, paper=unmixed.paper, ink=unmixed.ink), unmixed.blur_px
     square, matrix = np.ascontiguousarray(square), None if matrix_px is None else to_square @ matrix_px
-    cells = _design_cells(square, to_square @ px_from_mm, surface)
-    noise = noise_of(square)
-    return PhotoSquare(file, square, to_square @ px_from_mm, light, blur_px * scale, noise, cells, scale, matrix)
-
-
-def _design_cells(square: np.ndarray, px_from_mm: np.ndarray, surface: Surface) -> np.ndarray:
-    """Read the design's coarse colors in linear light; NaN if clipped."""
-    cells_per_mm = _CELLS_ALONG_SIDE / min(surface.rect_mm[2:])
-    cells = rectify(LINEAR_FLOAT32_FROM_CODE[square], px_from_mm, surface.rect_mm, cells_per_mm).astype(float)
-    full = (square.max(-1, keepdims=True) >= CLIPPED_CODE).astype(np.float32)
-    clipped = rectify(full, px_from_mm, surface.rect_mm, cells_per_mm).reshape(cells.shape[:2]) > 0.05
-    return np.where(clipped[..., None], np.nan, cells)
+    to_square, blur_px, noise = to_square @ px_from_mm, blur_px * scale, noise_of(square)
+    cells, blur_cells = design_cells(square, to_square, surface.rect_mm, blur_px)
+    return PhotoSquare(file, square, to_square, light, blur_px, noise, cells, scale, matrix, blur_cells=blur_cells)
 
 
 def noise_of(srgb: np.ndarray) -> float:
@@ -128,31 +121,39 @@ def noise_of(srgb: np.ndarray) -> float:
     return float(np.quantile(detail, 0.2) / 0.2533 / 6)
 
 
-def light_fit(shot: PhotoSquare, promised: PromisedColors) -> ColorFit:
-    """Fit photographed to media-relative light by paper white and the veil of stray light over the photograph.
+def light_fit(shot: PhotoSquare, promised: PromisedColors, tone: float = 0.0) -> ColorFit:
+    """Fit a photograph's light before its `tone` to media-relative light by paper white and a veil of stray light.
 
     A veil lightens all pixels alike: it is at most the darkest place's light, and at most what takes marker black to
     its promised value. Any other difference of ink is print.
     """
-    paper, ink = shot.light.paper, shot.light.ink
+    paper, ink = lower_light(shot.light.paper, tone), lower_light(shot.light.ink, tone)
     # of local means: noise that is clipped at zero lightens them as it lightens dark ink
-    means = cv2.blur(LINEAR_FLOAT32_FROM_CODE[shot.square], (_AVERAGE_PX, _AVERAGE_PX)).reshape(-1, 3)
+    means = cv2.blur(_light_before(shot, tone), (_AVERAGE_PX, _AVERAGE_PX)).reshape(-1, 3)
     darkest = np.quantile(means, _DARKEST_SHARE, axis=0)
     veil = np.clip((ink - paper * promised.ink) / (1 - promised.ink), 0, darkest)
     return white_black(paper, veil + (paper - veil) * promised.ink, promised.ink)
 
 
+def _light_before(shot: PhotoSquare, tone: float) -> np.ndarray:
+    """The square's linear light before the photograph's tone, float32 W×W×3."""
+    return lower_light(LINEAR_FLOAT32_FROM_CODE, tone).astype(np.float32)[shot.square]
+
+
 def fit_print_and_lights(
     shots: Sequence[PhotoSquare], promised: PromisedColors
-) -> tuple[Callable[[np.ndarray], np.ndarray] | None, list[ColorFit], list[ColorFit]]:
-    """Fit the print's map of promised light from several photographs, each one's light, and each one's light after the
-    print's map. If the colors are too few or too alike to fit a print, its map is None, and the last fits contain it.
+) -> tuple[Callable[[np.ndarray], np.ndarray] | None, list[ColorFit], list[ShownColors]]:
+    """Fit the print's map of promised light from several photographs, each one's light, for what surrounds the print,
+    and what each makes of the print's light. If the colors are too few or too alike to fit a print, its map is None,
+    and the last fits contain it.
     """
-    lights = [light_fit(shot, promised) for shot in shots]
-    relative = [fit.apply(shot.cells) for fit, shot in zip(lights, shots, strict=True)]
-    inks = [fit.apply(shot.light.ink) for fit, shot in zip(lights, shots, strict=True)]
-    apply_print = fit_print(relative, promised.design, np.median(inks, axis=0), promised.ink)
-    return apply_print, lights, lights if apply_print is not None else [design_fit(shot, promised) for shot in shots]
+    fit = fit_print([PhotographedDesign(shot.cells, shot.blur_cells, shot.light) for shot in shots], promised)
+    if fit is None:
+        lights = [ShownColors(invert_affine(design_fit(shot, promised).matrix)) for shot in shots]
+        return None, [light_fit(shot, promised) for shot in shots], lights
+    ink, lights = fit
+    undo = [light_fit(shot, promised, light.tone) for shot, light in zip(shots, lights, strict=True)]
+    return partial(add_ink, ink=ink), undo, lights
 
 
 def design_fit(shot: PhotoSquare, promised: PromisedColors) -> ColorFit:
@@ -170,24 +171,24 @@ def reprojected_squares(
     looks: Mapping[Switches, np.ndarray],
     rect_mm: Rect,
     undo: ColorFit,
-    print_light: ColorFit,
+    print_light: ShownColors,
     reference: Reference,
 ) -> dict[Switches, np.ndarray]:
     """Render the piece into the square with each effect on and off: float32 sRGB W×W×3 by the switches of (look, light,
     blur).
 
     `looks` are the media-relative linear light of the piece at `rect_mm` by their own switches. `undo` takes
-    photographed light to media-relative; the inverse of `print_light` takes a look to the photograph's light.
+    photographed light before its tone to media-relative; `print_light` takes a look to the photograph's light.
     """
     box = _affected_part(shot, rect_mm)
-    photo = LINEAR_FLOAT32_FROM_CODE[shot.square]
+    photo, tone = _light_before(shot, print_light.tone), print_light.tone
     surroundings = {}
     for blur, picture in ((True, photo), (False, change_blur(photo, shot.blur_px, reference.blur_px, shot.noise))):
         surroundings[True, blur] = picture
         surroundings[False, blur] = np.clip(reference.white * undo.apply(picture), 0, 1).astype(np.float32)
-    srgb = {key: srgb_from_linear(picture) for key, picture in surroundings.items()}
+    srgb = {key: _codes(picture, tone if key[0] else 0.0) for key, picture in surroundings.items()}
     promised_light = np.column_stack([np.eye(3) * reference.white, np.zeros(3)])
-    lights = {True: invert_affine(print_light.matrix), False: promised_light}
+    lights = {True: print_light.matrix, False: promised_light}
     squares = {}
     for switches, look in looks.items():
         sharp = _layer(look, shot.px_from_mm, rect_mm, box)
@@ -196,19 +197,23 @@ def reprojected_squares(
             for light, matrix in lights.items():
                 part = _compose(layer, matrix, surroundings[light, blur][box], shot.noise, noise)
                 picture = squares[(*switches, light, blur)] = srgb[light, blur].copy()
-                picture[box] = srgb_from_linear(part)
+                picture[box] = _codes(part, tone if light else 0.0)
     return squares
 
 
-def reprojected_square(shot: PhotoSquare, look: np.ndarray, rect_mm: Rect, light: ColorFit) -> np.ndarray:
-    """Render a piece of this look (media-relative light) into the square under the photograph's own blur and light, of
-    which `light` is the fit to media-relative: float32 sRGB W×W×3.
+def reprojected_square(shot: PhotoSquare, look: np.ndarray, rect_mm: Rect, light: ShownColors) -> np.ndarray:
+    """Render a piece of this look (media-relative light) into the square under the photograph's own blur and light:
+    float32 sRGB W×W×3.
     """
-    box, photo = _affected_part(shot, rect_mm), LINEAR_FLOAT32_FROM_CODE[shot.square]
+    box, photo = _affected_part(shot, rect_mm), _light_before(shot, light.tone)
     layer = _blur(_layer(look, shot.px_from_mm, rect_mm, box), shot.blur_px)
-    picture = srgb_from_linear(photo)
-    picture[box] = srgb_from_linear(_compose(layer, invert_affine(light.matrix), photo[box], shot.noise))
+    picture = shot.square.astype(np.float32) / 255
+    picture[box] = _codes(_compose(layer, light.matrix, photo[box], shot.noise), light.tone)
     return picture
+
+
+def _codes(linear: np.ndarray, tone: float) -> np.ndarray:
+    return lift_codes(srgb_from_linear(linear), tone) if tone else srgb_from_linear(linear)
 
 
 def _affected_part(shot: PhotoSquare, rect_mm: Rect) -> tuple[slice, slice]:

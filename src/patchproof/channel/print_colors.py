@@ -1,0 +1,209 @@
+"""Separate a printer's inks from the light and camera of the photographs that show its known colors.
+
+In: cells of photographs, each with the light that a known printer would have made of it, and its light as seen; where
+cells lie and how they were found does not matter. Out: the print's ink, a quadratic in code values that is added to the
+known printer's light, and for each photograph what its place and camera did to that light: veil, gains, tone, chroma,
+by the channel's own formulas. The ink is linear in its coefficients, so a cell of many colors has the mean of its
+colors' terms, and what cells do not determine stays the known printer's.
+
+Ink and photographs are told apart only as far as photographs differ: what all of them share (one phone's tone curve, a
+veil that is in every place) may be either. Paper stays paper: its light is a photograph's. Left out on purpose: light
+that changes within a photograph.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from patchproof.base.color import LUMINANCE, lab_from_linear, linear_from_srgb, srgb_from_linear
+
+INK_TERMS = 9
+_MOST_CELLS = 600  # of a photograph enter the fit
+_EVEN_SHARE = 0.7  # of the cells
+_CELLS_PER_ANCHOR = 8  # paper and ink each enter once for so many: a design's colors do not fix white and black
+MAX_TONE = 0.2  # from 0.25 on a tone curve is not monotonic
+_INK_RIDGE = 3e-4  # of the mean square of a term
+_TERMS_RIDGE = 0.05  # of a photograph's terms, per squared unit: keeps what cells cannot tell near its start
+_STEPS = 4  # of a photograph's fit in each round
+_LAB_NOISE = 1.0  # CIELAB distances below count by their square
+_LIGHT_NOISE = 0.02  # likewise for light, in the eye's steps
+_PROBE = 1e-4  # of finite differences
+_FARTHEST = np.array([0.5] * 3 + [2.0] * 3 + [MAX_TONE, 0.8])  # what terms may move from their start
+
+
+@dataclass(frozen=True)
+class CellColors:
+    """Cells of one photograph: `promised` light N×3 of the known printer, its mean `terms` N×9, light as `seen` N×3.
+
+    `start` (8,) are the photograph's terms as far as they are known: veil and log gains by channel, tone, chroma.
+    """
+
+    promised: np.ndarray
+    terms: np.ndarray
+    seen: np.ndarray
+    start: np.ndarray
+
+    def ink_light(self, ink: np.ndarray) -> np.ndarray:
+        """Return the cells' light N×3 in this ink."""
+        return np.clip(self.promised + self.terms @ ink, 0, 1)
+
+
+@dataclass(frozen=True)
+class ShownColors:
+    """What a photograph makes of a print's light: `matrix` (3×4) maps it, then middle gray rises by `tone`."""
+
+    matrix: np.ndarray
+    tone: float = 0.0
+
+    @staticmethod
+    def of_terms(terms: np.ndarray) -> ShownColors:
+        """Colors by veil (3), log gains (3), tone and chroma; zeros change nothing."""
+        veil, gains, (tone, chroma) = terms[:3], np.exp(terms[3:6]), terms[6:]
+        mixing = (1 + chroma) * np.eye(3) - chroma * np.array(LUMINANCE)
+        return ShownColors(np.column_stack([(gains * (1 - veil))[:, None] * mixing, gains * veil]), float(tone))
+
+    def show(self, light: np.ndarray) -> np.ndarray:
+        """Return the light `... × 3` that the photograph shows of a print's light."""
+        return lift_light(light @ self.matrix[:, :3].T + self.matrix[:, 3], self.tone)
+
+    def undo(self, seen: np.ndarray) -> np.ndarray:
+        """Return the print's light `... × 3` of light in the photograph."""
+        return (lower_light(seen, self.tone) - self.matrix[:, 3]) @ np.linalg.inv(self.matrix[:, :3]).T
+
+
+def lift_light(light: np.ndarray, tone: float) -> np.ndarray:
+    """Return light after a photograph's tone."""
+    return linear_from_srgb(lift_codes(srgb_from_linear(light), tone)) if tone else light
+
+
+def lift_codes(codes: np.ndarray, tone: float) -> np.ndarray:
+    """Return code values after a photograph's tone; black and white stay."""
+    return codes + 4 * tone * codes * (1 - codes)
+
+
+def lower_light(light: np.ndarray, tone: float) -> np.ndarray:
+    """Invert `lift_light`."""
+    codes, slope = srgb_from_linear(light), 1 + 4 * tone
+    codes = 2 * codes / (slope + np.sqrt(np.maximum(slope**2 - 16 * tone * codes, 0)))
+    return linear_from_srgb(codes) if tone else light
+
+
+def added_terms(promised: np.ndarray) -> np.ndarray:
+    """Return the quadratic's terms `9 × ...` of linear light `... × 3`, each contiguous; 0 for bare paper."""
+    r, g, b = 1 - np.moveaxis(srgb_from_linear(np.clip(promised, 0, 1)), -1, 0)
+    terms = np.empty((INK_TERMS, *r.shape), promised.dtype)
+    for into, term in zip(terms, (r, g, b, r * r, g * g, b * b, r * g, g * b, b * r), strict=True):
+        into[...] = term
+    return terms
+
+
+def add_ink(promised: np.ndarray, ink: np.ndarray) -> np.ndarray:
+    """Return the light of a print in this ink, `... × 3` of the same type, from the known printer's light."""
+    terms = added_terms(promised)
+    added = ink.T.astype(promised.dtype) @ terms.reshape(INK_TERMS, -1)
+    return np.clip(promised + added.T.reshape(promised.shape), 0, 1)
+
+
+def choose_cells(
+    seen: np.ndarray, means: np.ndarray, paper: np.ndarray, seen_ink: np.ndarray, ink: np.ndarray
+) -> CellColors:
+    """Choose cells of one photograph: `seen` h×w×3, NaN where unread, `means` h×w×12 of the promised light and of its
+    terms. Paper and marker ink, promised as `ink`, are added.
+    """
+    inner = np.zeros(seen.shape[:2], bool)  # blur mixes what lies around the print into the rim
+    inner[1:-1, 1:-1] = np.isfinite(seen[1:-1, 1:-1]).all(-1)
+    # errors of place and blur count less where neighbors are alike
+    uneven = np.abs(means[..., :3] - cv2.blur(means[..., :3], (3, 3))).sum(-1)[inner]
+    chosen = np.flatnonzero(inner)[uneven <= np.quantile(uneven, _EVEN_SHARE)] if uneven.size else np.zeros(0, int)
+    if len(chosen) > _MOST_CELLS:
+        chosen = np.random.default_rng(0).choice(chosen, _MOST_CELLS, replace=False)
+    means, anchors = means.reshape(-1, means.shape[-1])[chosen], max(len(chosen) // _CELLS_PER_ANCHOR, 1)
+    ends, seen_ends = np.repeat([np.ones(3), ink], anchors, 0), np.repeat([paper, seen_ink], anchors, 0)
+    return CellColors(
+        np.concatenate([means[:, :3], ends]),
+        np.concatenate([means[:, 3:], added_terms(ends).T]),
+        np.concatenate([seen.reshape(-1, 3)[chosen], seen_ends]),
+        np.concatenate([np.zeros(3), np.log(np.maximum(paper, 1e-3)), np.zeros(2)]),
+    )
+
+
+def fit_ink_and_photos(
+    photos: Sequence[CellColors], rounds: int = 8, shared_is_ink: bool = False
+) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Fit the print's ink 9×3 and each photograph's terms (8,), in turn.
+
+    If `shared_is_ink`, terms that all photographs share are moved to the ink, as far as its form can hold them.
+    """
+    terms = [cells.start for cells in photos]
+    promised, rows = (np.concatenate([getattr(cells, name) for cells in photos]) for name in ("promised", "terms"))
+    ink = np.zeros((INK_TERMS, 3))
+    # each photograph counts as much as any other
+    share = np.concatenate([np.full(len(cells.seen), 1 / max(len(cells.seen), 1)) for cells in photos])
+    for _ in range(rounds):
+        if shared_is_ink:
+            shared = np.mean([t - cells.start for cells, t in zip(photos, terms, strict=True)], 0)
+            shared[:3] = np.min(terms, 0)[:3]  # no veil takes light away: only what all have in common may be ink
+            terms = [t - shared for t in terms]
+        seen = [ShownColors.of_terms(t).undo(cells.seen) for cells, t in zip(photos, terms, strict=True)]
+        ink = _fit_ink(promised, rows, np.concatenate(seen), share, ink)
+        light = [cells.ink_light(ink) for cells in photos]
+        terms = [_fit_terms(*pair, t) for pair, t in zip(zip(light, photos, strict=True), terms, strict=True)]
+    return ink, terms
+
+
+def fit_shown_colors(cells: CellColors, ink: np.ndarray) -> ShownColors:
+    """Fit one photograph's colors to its cells in a known ink."""
+    return ShownColors.of_terms(_fit_terms(cells.ink_light(ink), cells, cells.start, 3 * _STEPS))
+
+
+def _fit_ink(
+    promised: np.ndarray, rows: np.ndarray, light: np.ndarray, share: np.ndarray, ink: np.ndarray
+) -> np.ndarray:
+    """Fit the coefficients to light N×3, robustly from `ink` on; errors are weighted as the eye sees them."""
+    eye = 1 / (promised.mean(1) + 0.03) ** 0.667
+    for _ in range(2):
+        miss = eye * np.linalg.norm(light - promised - rows @ ink, axis=1) / _LIGHT_NOISE
+        weight = (share * eye**2 / np.sqrt(1 + miss**2))[:, None]
+        square = (rows * weight).T @ rows
+        ridge = _INK_RIDGE * np.trace(square) / INK_TERMS * np.eye(INK_TERMS)
+        ink = np.linalg.solve(square + ridge, (rows * weight).T @ (light - promised))
+    return ink
+
+
+def _fit_terms(light: np.ndarray, cells: CellColors, terms: np.ndarray, steps: int = _STEPS) -> np.ndarray:
+    """Fit the terms that take a print's light to a photograph's: damped Gauss-Newton on robust CIELAB distances."""
+    seen, damping = _lab(cells.seen), 1e-3
+
+    def miss(terms: np.ndarray) -> np.ndarray:
+        return _lab(ShownColors.of_terms(terms).show(light)) - seen
+
+    def cost(apart: np.ndarray, terms: np.ndarray) -> float:
+        distance = np.sqrt((apart**2).sum(1) + _LAB_NOISE**2).mean()
+        return float(distance + _TERMS_RIDGE * ((terms - cells.start) ** 2).sum())
+
+    apart = miss(terms)
+    best = cost(apart, terms)
+    for _ in range(steps):
+        slopes = np.stack([(miss(terms + _PROBE * axis) - apart) / _PROBE for axis in np.eye(8)])
+        weight = 1 / np.sqrt((apart**2).sum(1) + _LAB_NOISE**2)[:, None] / len(light)
+        flat, weighted = slopes.reshape(8, -1), (slopes * weight).reshape(8, -1)
+        square = weighted @ flat.T + 2 * _TERMS_RIDGE * np.eye(8)
+        slope = weighted @ apart.ravel() + 2 * _TERMS_RIDGE * (terms - cells.start)
+        step = np.linalg.solve(square + damping * np.diag(np.diag(square)), slope)
+        moved = cells.start + np.clip(terms - step - cells.start, -_FARTHEST, _FARTHEST)
+        moved_apart = miss(moved)
+        if (moved_cost := cost(moved_apart, moved)) >= best:
+            damping *= 10
+            continue
+        gained, terms, apart, best, damping = best - moved_cost, moved, moved_apart, moved_cost, damping / 3
+        if gained < 1e-3:
+            break
+    return terms
+
+
+def _lab(light: np.ndarray) -> np.ndarray:
+    return lab_from_linear(np.clip(light, 1e-6, 1))
