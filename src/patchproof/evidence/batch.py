@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from datetime import datetime
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import cv2
 import numpy as np
@@ -41,6 +41,9 @@ from patchproof.photo.quality import FrameLight, is_featureless
 from patchproof.photo.read import read_photo
 from patchproof.photo.rejection import PhotoRejected
 
+if TYPE_CHECKING:
+    from patchproof.photo.corners import DesignCorners
+
 MAX_PICTURED_PHOTOS = 120  # photographs whose pictures are on the page; the rest is listed. Keeps it below some 15 MB
 _THUMBNAIL_PX = 560  # longer side: enough for a phone's width at twice its density, some 40 kB as JPEG
 _DESIGN_COLOR, _MARKER_COLOR = (255, 64, 129), (0, 200, 140)
@@ -58,7 +61,7 @@ LightLevel = Annotated[Finite, Field(ge=-4, le=4)]
 @dataclass(frozen=True)
 class PhotoItem:
     """A photograph to measure: its name in the report, the control that it shows (None: the patch), whether the page
-    shows its pictures, and the object's drawn box in shares of the upright photograph's sides.
+    shows its pictures, the object's drawn box in shares of the upright photograph's sides, and the design's corners.
     """
 
     path: Path
@@ -66,6 +69,7 @@ class PhotoItem:
     control: str | None = None
     with_pictures: bool = False
     box: BoxEdges | None = None
+    corners: DesignCorners | None = None
 
     @property
     def name(self) -> str:
@@ -171,7 +175,11 @@ def _measure(task: Task, item: PhotoItem) -> MeasuredPhoto:
         entry = PhotoEntry(file=item.file, status="judged", box=box, said=photo.said)
         return MeasuredPhoto(entry, True, squares=squares, trace=_trace(item.path, photo.srgb))
     view = pinhole_photo(photo, task.camera)
-    measured = measure(view, item.file, task.surface, task.promised, task.ranges, task.scan_dpi, item.with_pictures)
+    corners = item.corners
+    if corners is not None and view.calibrated and task.camera is not None:
+        corners = replace(corners, px=task.camera.undistort_points(corners.px, size_px))
+    parts = task.surface, task.promised, task.ranges, task.scan_dpi
+    measured = measure(view, item.file, *parts, item.with_pictures, corners)
     entry, pictures = measured.entry, {}
     # a crop or a screenshot by EXIF or its name, or by a shape that neither cameras nor the promise have
     if measured.counted and entry.code is None and (photo.is_crop or not has_camera_shape(size_px, task.photo_px)):
@@ -230,10 +238,11 @@ def reread_square(task: Task, size_px: int, item: tuple[Path, MeasuredPhoto]) ->
     if not reliable or geometry is None or geometry.homography_px_from_mm is None or light is None:
         return None
     px_from_mm, blur_px = np.array(geometry.homography_px_from_mm), geometry.blur_px
+    surface = task.surface if geometry.located == "markers" else task.surface.without_markers
 
     def shot() -> PhotoSquare | None:
         view = pinhole_photo(read_photo(path), task.camera)
-        shot = photo_square(entry.file, view.srgb, px_from_mm, blur_px, light, task.surface, size_px, view.matrix_px)
+        shot = photo_square(entry.file, view.srgb, px_from_mm, blur_px, light, surface, size_px, view.matrix_px)
         return shot and replace(shot, box=measured.entry.box)
 
     try:

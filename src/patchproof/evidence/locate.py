@@ -22,7 +22,7 @@ from patchproof.photo import pose as sheet_pose
 from patchproof.photo.detect import MarkersInView
 from patchproof.photo.known_page import is_in_picture
 from patchproof.photo.print_ratio import x_over_y
-from patchproof.photo.quality import FrameLight, blur_px
+from patchproof.photo.quality import FrameLight
 from patchproof.photo.rectify import PageFit, corner_uncertainty_mm, fit_page
 from patchproof.photo.registration import Registration, register
 from patchproof.photo.rejection import PhotoRejected
@@ -132,6 +132,7 @@ def geometry_of(
     location: LocatedSheet,
     detected: MarkersInView,
     light: FrameLight,
+    blur: float,
     surface: Surface,
     colors: PromisedColors | None,
 ) -> tuple[Geometry, int, tuple[float, int]]:
@@ -140,11 +141,11 @@ def geometry_of(
     """
     fit, unrolled = location.fit, location.unrolled
     px_per_mm, tilt_deg = sheet_pose.scale_and_tilt(location.px, location.parameters, surface.center_mm)
-    blur, shift, corners, found = blur_px(detected.markers.values()), None, 4, (1.0, 0)
+    shift, corners, found = None, 4, (1.0, 0)
     uncertainty = unrolled.uncertainty_mm if unrolled else corner_uncertainty_mm(fit, surface.rect_mm)
     uncertainty = float(np.hypot(uncertainty, _OUTLIER_FACTOR * fit.outlier_mm))
     # one page of a piece in tiles has none of the piece's markers, or some of them
-    if colors is not None and surface.piece_ids:
+    if colors is not None and surface.is_piece:
         cells = register(location.srgb, fit.px_from_mm, surface.rect_mm, colors.design, px_per_mm, blur)
         shift, corners, corner_shift = _shifts(cells, _absent_markers(view, location, detected, surface), surface)
         free = ~surface.on_marker(cells.middle_mm, cells.size_mm / 2)

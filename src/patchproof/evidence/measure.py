@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -25,9 +26,12 @@ from patchproof.evidence.surface import PromisedColors, Surface
 from patchproof.photo.detect import MarkersInView, find_markers, is_mirrored
 from patchproof.photo.known_page import complete_markers, find_sheet
 from patchproof.photo.page_code import read_page_code, refuse_other_page
-from patchproof.photo.quality import FrameLight, frame_light
+from patchproof.photo.quality import FrameLight, blur_px, frame_light
 from patchproof.photo.rectify import PageFit
 from patchproof.photo.rejection import PhotoRejected
+
+if TYPE_CHECKING:
+    from patchproof.photo.corners import DesignCorners
 
 MOST_BLUR = 0.5  # modules of Gaussian sigma: beyond it, borders of neighboring cells merge
 SMALLEST_DESIGN_PX = 24.0  # shorter side: fewer pixels cannot tell a design from its mean color
@@ -60,6 +64,8 @@ _OTHER_DPI_ADVICE = (
     "it cannot be a scan at {:g} dpi, where its print would be {:.3f} × {:.3f} of its size, so no scale was measured: "
     "give --scan-dpi the scan's own, the same in both directions"
 )
+_NO_CORNERS_ADVICE = "this print has no markers, and nothing says where it is: name its corners in --corners FILE"
+_PLAIN_ADVICE = "without markers a design without structure cannot be told from another one: print it with markers"
 _HIDDEN_ADVICE = "a corner of the design is covered, folded away or out of the picture: show all of it"
 
 
@@ -85,21 +91,31 @@ def measure(
     ranges: PromisedRanges,
     scan_dpi: float | None = None,
     with_pictures: bool = True,
+    corners: DesignCorners | None = None,
 ) -> MeasuredPhoto:
-    """Measure one readable photograph; color only if the sheet has `promised` colors."""
+    """Measure one readable photograph; color only if the sheet has `promised` colors. The design's `corners` locate it
+    where no marker can be read.
+    """
+    size_px, placed = view.srgb.shape[1::-1], None
     try:
         detected, surface = identify_sheet(view.srgb, surface)
     except PhotoRejected as rejection:
-        return MeasuredPhoto(PhotoEntry(file=name, status="rejected", remark=Remark.of(rejection)), False)
-    size_px = view.srgb.shape[1], view.srgb.shape[0]
+        if corners is None or promised is None or rejection.code not in ("too_few_markers", "no_corners"):
+            return MeasuredPhoto(PhotoEntry(file=name, status="rejected", remark=Remark.of(rejection)), False)
+        from patchproof.photo.corners import place_design
+
+        detected, surface = MarkersInView({}, (), ()), surface.without_markers
+        placed = place_design(view.srgb, corners, surface.rect_mm, promised.design, promised.ink)
     entry = partial(PhotoEntry, file=name, photo_px=size_px, markers_found=len(detected.markers))
-    location = locate_sheet(view, detected, surface)
+    location = LocatedSheet(view.srgb, placed.fit, None) if placed else locate_sheet(view, detected, surface)
     if location is None:
         trouble = PhotoRejected("too_few_markers", len(detected.markers), 1, _DISTORTED_ADVICE)
         return MeasuredPhoto(entry(status="judged", remark=Remark.of(trouble)), True)
-    light = frame_light(view.srgb, detected.markers.values())
+    markers = detected.markers.values()
+    light, blur = (placed.light, placed.blur_px) if placed else (frame_light(view.srgb, markers), blur_px(markers))
     fit = location.fit
-    geometry, corners, found = geometry_of(view, location, detected, light, surface, promised)
+    geometry, found_corners, found = geometry_of(view, location, detected, light, blur, surface, promised)
+    geometry = geometry.changed(located=corners.located) if placed and corners else geometry
     pose, focal = camera_pose(view, location, surface)
     # a stretched print, a squeezed picture or a rolling shutter tilts a sheet that stands straight
     contradicted = {"tilt_deg": None, "tilt_uncertainty_deg": None} if focal == "contradicted" else {}
@@ -108,7 +124,7 @@ def measure(
     page_check = _is_uncut(location, detected, surface)
     scale = None if scan_dpi is None else _scan_scale(fit.px_from_mm, surface, scan_dpi)
     counted = not page_check and scale is None
-    trouble = _trouble(geometry, fit, detected, surface, corners)
+    trouble = _trouble(geometry, fit, detected, surface, found_corners)
     color, pictures, match = None, {}, DesignMatch()
     try:
         if page_check and surface.page_mm is not None:
@@ -116,12 +132,14 @@ def measure(
         if counted and (outside := ranges.violated(entry(status="judged"), trust_angles=trouble is None)) is not None:
             raise outside
         # one page of a piece in tiles has none of the piece's markers, or some of them
-        if promised is not None and surface.piece_ids:
+        if promised is not None and surface.is_piece:
             seen = location.srgb, fit.px_from_mm, surface, promised, light, geometry, with_pictures and trouble is None
             color, pictures, match = appearance(*seen)
             if trouble is None and color.clipped_share > MOST_CLIPPED:
                 advice = "the patch is overexposed: lower the exposure by one or two steps"
                 trouble = PhotoRejected("clipped", color.clipped_share, MOST_CLIPPED, advice)
+            if placed and match.likeness is None and match.trouble is None:
+                raise PhotoRejected("other_design", None, None, _PLAIN_ADVICE)
             trouble = match.trouble_beside(trouble, *found)
     except PhotoRejected as rejection:
         return MeasuredPhoto(entry(status="rejected", remark=Remark.of(rejection)), False)
@@ -142,6 +160,8 @@ def identify_sheet(srgb: np.ndarray, surface: Surface) -> tuple[MarkersInView, S
     Raises `PhotoRejected` if no marker is readable, or if markers of another sheet or of several are in view.
     """
     marker_ids = surface.piece_ids or surface.page_ids
+    if not marker_ids:
+        raise PhotoRejected("no_corners", None, None, _NO_CORNERS_ADVICE)
     if surface.pages:
         pages = [frozenset(page.corners_mm) for page in surface.pages]
         detected = find_markers(srgb, marker_ids, surface.all_ids, surface.dictionary, pages)
@@ -179,6 +199,8 @@ def _page_in_view(detected: MarkersInView, surface: Surface) -> Surface:
 
 def _is_uncut(location: LocatedSheet, detected: MarkersInView, surface: Surface) -> bool:
     """Check whether markers of the page lie about where an uncut page has them; it may curl around the piece."""
+    if not surface.corners_mm:
+        return False
     if set(location.fit.inlier_ids) & surface.page_ids or not detected.markers.keys() & surface.piece_ids:
         return True
     x, y, w, h = surface.rect_mm
@@ -198,10 +220,11 @@ def _trouble(
     """
     tilt, blur, residual = geometry.tilt_deg or 0.0, geometry.blur_px, geometry.residual_mm
     side_mm, uncertainty = min(surface.rect_mm[2:]), geometry.corner_uncertainty_mm
-    most_blur = MOST_BLUR * float(np.median([b.module_px for b in detected.markers.values()]))
+    modules_px = [b.module_px for b in detected.markers.values()]
+    most_blur = MOST_BLUR * float(np.median(modules_px)) if modules_px else np.inf  # then the design's cells decide
     side_px, most_residual = side_mm * geometry.px_per_mm, MOST_RESIDUAL * side_mm
     agreeing, markers = len(fit.inlier_ids), len(detected.markers)
-    least = min(_LEAST_AGREEING, len(surface.piece_ids) or 1)
+    least = min(_LEAST_AGREEING, len(surface.piece_ids) or bool(surface.corners_mm))
     bent = residual > most_residual or agreeing < 0.5 * markers
     flat = geometry.homography_px_from_mm is not None
     bend, most_bend = geometry.bend_mm, (MOST_BEND if flat else MOST_BEND_UNROLLED) * side_mm
@@ -222,7 +245,7 @@ def _trouble(
         (bend > most_bend, "curled", bend, most_bend, bent_advice),
         (fit.outlier_mm > MOST_OUTLIER * side_mm, "curled", fit.outlier_mm, MOST_OUTLIER * side_mm, bent_advice),
         (shift > most_shift, "curled", shift, most_shift, _SHIFTED_ADVICE),
-        (uncertain and markers < 3, "too_few_markers", markers, 3, _FEW_MARKERS_ADVICE),
+        (uncertain and 0 < markers < 3, "too_few_markers", markers, 3, _FEW_MARKERS_ADVICE),
         (uncertain, "too_small", uncertainty, most_uncertainty, uncertain_advice),
         (corners < 4, "too_few_markers", corners, 4, _HIDDEN_ADVICE),
     ):

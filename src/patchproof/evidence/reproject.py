@@ -98,7 +98,7 @@ def photo_square(
         square = cv2.resize(square, (work, work), interpolation=cv2.INTER_AREA)
     to_square = np.array([[scale, 0, -left * scale], [0, scale, -top * scale], [0, 0, 1.0]])
     on_piece = {i: surface.corners_mm[i] for i in surface.piece_ids}
-    unmixed = pattern_light(srgb, px_from_mm, on_piece, surface.dictionary, blur_px)
+    unmixed = pattern_light(srgb, px_from_mm, on_piece, surface.dictionary, blur_px) if on_piece else None
     if unmixed is not None:
         if unmixed.agreement < _LEAST_AGREEMENT:
             return None

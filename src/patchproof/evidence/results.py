@@ -26,6 +26,8 @@ _Row = tuple[Finite, Finite, Finite]
 # of another size or shape, and is not used. unknown: there is none.
 FocalSource = Literal["calibrated", "confirmed", "unchecked", "contradicted", "cropped", "unknown"]
 
+Located = Literal["markers", "corners", "found"]  # by the print's markers, by named corners, or by the design's pixels
+
 
 class Prediction(StrictModel):
     """One network's answer to one photograph; `target_confidence` sums over the accepted labels."""
@@ -51,6 +53,7 @@ class Geometry(StrictModel):
     bend_mm: Finite = 0.0  # the part of the residual that is no noise: of paper that no plane and no cylinder explains
     design_shift_mm: Finite | None = None  # of the design's own cells, 90 % point; null where it shows no texture
     focal: FocalSource = "unknown"
+    located: Located = "markers"
 
 
 class CameraPose(StrictModel):
@@ -97,7 +100,7 @@ class Remark(StrictModel):
 _PARTS = {"geometry": Geometry, "pose": CameraPose, "scale": Scale, "color": Color, "remark": Remark}
 # one photograph in report.json, in this order
 PHOTO_KEYS = """
-    file status sha256 photo_px code figure threshold advice markers_found residual_mm px_per_mm scale_x scale_y
+    file status sha256 photo_px code figure threshold advice located markers_found residual_mm px_per_mm scale_x scale_y
     scale_x_over_y tilt_deg tilt_uncertainty_deg azimuth_deg azimuth_uncertainty_deg distance_mm
     distance_uncertainty_mm focal contrast blur_px corner_uncertainty_mm bend_mm design_shift_mm
     curl_radius_mm delta_e00_mean delta_e00_p95 color_fit clipped_share glossy_share homography_px_from_mm box forecast

@@ -7,7 +7,7 @@ millimeters of the design's page; each of its uncut pages is another surface, to
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import cv2
@@ -19,7 +19,7 @@ from patchproof.base.geometry import rect_corners
 from patchproof.base.resample import downscale
 from patchproof.photo.page_code import PageCode, manifest_page_code
 from patchproof.sheets.manifest import Manifest, Rect
-from patchproof.sheets.markers import MARKER_MODULES
+from patchproof.sheets.markers import DICTIONARY, MARKER_MODULES
 from patchproof.sheets.piece import Piece, marker_image, marker_rect, square_marker
 
 if TYPE_CHECKING:
@@ -47,6 +47,16 @@ class Surface:
     fov_deg: float = 45.0  # of the promised photographs, for those whose focal length is not known
 
     @property
+    def without_markers(self) -> Surface:
+        """The surface of the same piece for photographs in which it is located by its design."""
+        return replace(self, corners_mm={}, piece_ids=frozenset(), pages=())
+
+    @property
+    def is_piece(self) -> bool:
+        """False for a page of a piece in tiles that has none of the piece's markers."""
+        return bool(self.piece_ids) or not self.corners_mm
+
+    @property
     def center_mm(self) -> tuple[float, float]:
         """The middle of the design."""
         x, y, w, h = self.rect_mm
@@ -64,6 +74,8 @@ class Surface:
 
     def on_marker(self, points_mm: np.ndarray, margin_mm: float) -> np.ndarray:
         """True for points N×2 within a marker of the piece, its quiet zone or the margin about it."""
+        if not self.piece_ids:
+            return np.zeros(len(points_mm), bool)
         markers = np.stack([self.corners_mm[i] for i in sorted(self.piece_ids)])
         margin = np.ptp(markers, axis=1) / MARKER_MODULES + margin_mm
         low, high = markers.min(1) - margin, markers.max(1) + margin
@@ -82,6 +94,8 @@ def surface_of(manifest: Manifest) -> Surface:
     """The surface of the design's page, or without a design of the first page with markers; its rectangle is the cut.
     Refused if the design's page has no markers, or is none of the tiles.
     """
+    if not manifest.markers:
+        return _surface(manifest, {}, frozenset(), manifest.cut_mm)
     pages = {tile.page for tile in manifest.tiles} or set(_corners_by_page(manifest))
     page = manifest.design.page if manifest.design else min(pages)
     if page not in pages:
@@ -116,7 +130,7 @@ def _assembled(manifest: Manifest) -> Surface:
 def _surface(manifest: Manifest, corners, piece_ids, rect_mm, pages=()) -> Surface:
     (left, top, *_), outermost = manifest.cut_mm, manifest.promise and manifest.promise.outermost_mm
     return Surface(
-        dictionary=manifest.markers[0].dictionary,
+        dictionary=manifest.markers[0].dictionary if manifest.markers else DICTIONARY,
         corners_mm=corners,
         piece_ids=piece_ids,
         rect_mm=rect_mm,

@@ -30,6 +30,7 @@ CORNER_NOISE_PX = 0.045  # per coordinate, of fitted corners in noisy JPEGs of f
 UNSEEN_NOISE_PX = 0.2  # assumed for one marker, whose residual is always 0: more than sharp photographs have
 _BEND_FACTOR = 3.0  # error of the design's corners per bend of markers: 2 to 4.5 on wavy, wobbly and folded paper
 _LEAST_CORNERS = 3  # inlier corners of an inlier marker
+_ROUNDS = 6  # of weights
 _MAX_SIDE_PX = 3000  # of an oversampled patch before it is averaged down
 
 
@@ -65,6 +66,26 @@ def fit_page(corners_px: Quads, corners_mm: Quads) -> PageFit:
     counts = inlier.reshape(-1, 4).sum(1)
     inlier_ids = tuple(i for i, count in zip(ids, counts, strict=True) if count >= _LEAST_CORNERS)
     return _page_fit(homography, mm, px, inlier, inlier_ids)
+
+
+def fit_points(mm: np.ndarray, px: np.ndarray, sigma_px: np.ndarray, start: np.ndarray | None = None) -> PageFit:
+    """Fit the homography page mm → photo px to N ≥ 4 points N×2 with standard deviations N of a coordinate. With more
+    than four, those off by more than three deviations from the fit begun at `start` lose their weight.
+    """
+    homography, weight = fit_homography(mm, px) if start is None else start, np.ones(len(mm))
+    for _ in range(_ROUNDS if len(mm) > 4 else 1):
+        off = np.linalg.norm(px - apply_homography(homography, mm), axis=1) / sigma_px
+        weight = np.minimum(1, (3 * max(1.0, float(np.median(off))) / np.maximum(off, 1e-9)) ** 2)
+        root = np.repeat(np.sqrt(weight) / sigma_px, 2)
+        for _ in range(3):
+            jacobian, residual = _jacobian(homography, mm), (px - apply_homography(homography, mm)).ravel()
+            scale = np.linalg.norm(jacobian, axis=0)
+            step = np.linalg.lstsq(jacobian / scale * root[:, None], residual * root, rcond=None)[0] / scale
+            homography = normalize_homography(homography + np.append(step, 0).reshape(3, 3))
+    residual = px - apply_homography(homography, mm)
+    spread = float(np.sqrt(np.sum((residual.ravel() * root) ** 2) / max(2 * len(mm) - 8, 1)))
+    covariance = covariance_of(_jacobian(homography, mm) * root[:, None], max(1.0, spread))
+    return PageFit(homography, covariance, rms_length_mm(_mm_by_px(homography, mm), residual * weight[:, None]), ())
 
 
 def common_corners(corners_px: Quads, corners_mm: Quads) -> tuple[tuple[int, ...], np.ndarray, np.ndarray]:

@@ -11,7 +11,7 @@ from patchproof.base.text import printable
 REJECTION_CODES = (
     *("unreadable", "too_costly", "empty", "too_few_markers", "blurred", "clipped", "too_small", "tilted"),
     *("out_of_range", "scale_off", "wrong_sheet", "several_sheets", "mirrored", "curled", "cropped", "copy"),
-    *("other_design", "wrong_ink"),
+    *("other_design", "wrong_ink", "no_corners"),
 )
 
 
