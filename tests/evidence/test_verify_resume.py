@@ -20,7 +20,7 @@ from patchproof.base.errors import Refused, WorkerDied
 from patchproof.base.workers import can_fork
 from patchproof.channel.printer import identity_printer
 from patchproof.classifier import Classifier
-from patchproof.evidence import batch, locate, measure
+from patchproof.evidence import batch, measure
 from patchproof.evidence.gather import gather_evidence
 from patchproof.evidence.journal import Journal, file_sha256
 from patchproof.evidence.task import Options, task_of
@@ -167,9 +167,9 @@ def test_a_figure_that_is_no_number_costs_one_photograph(folder, monkeypatch):
         names.append(name)
         return measure.measure(view, name, *rest)
 
-    blur_px = locate.blur_px
+    blur_px = measure.blur_px
     monkeypatch.setattr(batch, "measure", wrong)
-    monkeypatch.setattr(locate, "blur_px", lambda m: float("nan") if names[-1] == "b3.jpg" else blur_px(m))
+    monkeypatch.setattr(measure, "blur_px", lambda m: float("nan") if names[-1] == "b3.jpg" else blur_px(m))
     options = Options([NET], identity_printer(), ledger_photos=0)
     found = gather_evidence(folder, make_manifest(promise()), options).photos
     assert [p.file for p in found if p.status == "rejected"] == ["a.JPG", "b3.jpg"]

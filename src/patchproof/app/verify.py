@@ -66,12 +66,14 @@ class CaptureInfo:
         scan_dpi: resolution of flat scans of the uncut page; None for photographs.
         ruler_mm: lengths (x, y) of the two printed 100 mm rulers as measured on the print, in millimeters.
         boxes: COCO JSON with the object's box in photographs, for detectors, if the sheet does not tell.
+        corners: CSV or COCO JSON with the design's four corners in photographs of a print whose markers cannot be read.
     """
 
     camera: str | Path | None = None
     scan_dpi: float | None = None
     ruler_mm: tuple[float, float] | None = None
     boxes: str | Path | None = None
+    corners: str | Path | None = None
 
 
 def verify(
@@ -100,7 +102,7 @@ def verify(
         models: networks besides the sheet's first: names, or classifiers in memory. Code (`module:`) and downloads that
             the sheet or the run names are used only where they are among them.
         controls: folder with a folder of photographs for each control ("bare", "mean", ...).
-        capture: camera, scan resolution, measured rulers, the object's boxes.
+        capture: camera, scan resolution, measured rulers, the object's boxes, the design's corners.
         run: the run that the sheet was made from; each photograph then gets a forecast at its measured view.
         trust: use what sheet and run name without naming it in `models`, also variables of the environment.
         ledger_photos: photographs at most in the gap ledger and the estimated effect, 0 for neither; each costs 16
@@ -122,7 +124,9 @@ def verify(
     """
     out, manifest, compute = Path(out), load_manifest(sheet), compute.without("verify", device=True)
     with lock_folder(out):
-        _check_out(out, resume, overwrite, (photos, sheet, controls, run, capture.camera, capture.boxes))
+        _check_out(
+            out, resume, overwrite, (photos, sheet, controls, run, capture.camera, capture.boxes, capture.corners)
+        )
         look_at = _look_at(out, manifest)
         if isinstance(photos, str | Path) and is_file(Path(photos) / JOURNAL_FILE):
             look_at = lambda entries: None  # noqa: E731  # `capture` showed the answers while they were taken
@@ -137,6 +141,10 @@ def verify(
             from patchproof.evidence.boxes import load_boxes
 
             options = replace(options, boxes=load_boxes(boxes, manifest.promise.target.label))
+        if capture.corners is not None:
+            from patchproof.evidence.corner_files import load_corners
+
+            options = replace(options, corners=load_corners(capture.corners))
         forecast = None
         if run is not None:
             from patchproof.reprints.photo_forecast import photo_forecaster  # imports scene, renderer and optimizer
@@ -151,7 +159,10 @@ def verify(
         on_pictures = partial(save_pictures, out / "pictures")
         report = gather(photos, manifest, options, on_pictures=on_pictures, advance=partial(progress, "verify"))
         parameters |= {"camera": capture.camera and Path(capture.camera).name}
-        parameters |= {"boxes": boxes and Path(boxes).name, "ledger_photos": ledger_photos}
+        parameters |= {
+            name: path and Path(path).name for name, path in (("boxes", boxes), ("corners", capture.corners))
+        }
+        parameters |= {"ledger_photos": ledger_photos}
         hashes = {f"network {each.name}": each.sha256 for each in options.models}
         hashes = {"manifest": file_sha256(Path(sheet)), **hashes}
         report = report.changed(origin=Origin(options=parameters, sha256=hashes, versions=versions_of(_LIBRARIES)))
@@ -179,7 +190,7 @@ def _boxes(report: Report, manifest: Manifest, camera: Camera | None) -> str:
         outlines = {PATCH: apply_homography(np.array(px_from_mm), corners)} if known else {}
         if entry.box is not None and not bends:
             outlines[label] = box_corners_px(entry.box, entry.photo_px)
-        photos.append(LabeledPhoto(entry.file, entry.photo_px, outlines))
+        photos.append(LabeledPhoto(entry.file, entry.photo_px, outlines, entry.located if known else None))
     return coco_json(photos, label, f"photographs of sheet {manifest.sheet_id}")
 
 

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from patchproof.base.goal import Goal
 from patchproof.base.validation import (
@@ -29,6 +29,8 @@ from patchproof.base.validation import (
     validate_model,
     within,
 )
+
+NO_PAGE = "none"  # as a template: of a print that exists, or is made elsewhere
 
 
 class ObjectSettings(StrictModel):
@@ -123,9 +125,20 @@ class PatchSettings(StrictModel):
 
 
 class SheetSettings(StrictModel):
-    """The page that the piece is printed on."""
+    """The page that the piece is printed on, or none: then the print exists, or is made elsewhere, at any size."""
 
-    template: str = "a4"  # a shipped template's name, or a TOML file
+    template: str = "a4"  # a shipped template's name, a TOML file, or "none": no page is made
+    markers: bool = True  # False: piece and page have none, and the piece is located by its design's corners
+
+    @model_validator(mode="after")
+    def _no_page_no_markers(self):
+        if self.template == NO_PAGE and self.markers:
+            raise ValueError('takes markers = false with template = "none"')
+        return self
+
+    @model_serializer(mode="wrap")
+    def _without_default(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        return {name: value for name, value in serialize(self).items() if (name, value) != ("markers", True)}
 
 
 class TargetSettings(StrictModel):
@@ -264,6 +277,10 @@ class SceneSettings(StrictModel):
             raise ValueError(message)
         if self.patch.kind == "patch" and self.object.photos is None and self.patch.width_mm is None:
             raise ValueError("add patch.width_mm and patch.height_mm")
+        if self.object.photos is not None and not self.sheet.markers:
+            raise ValueError(
+                "leave out sheet.markers with object.photos: the print has the markers of their blank sheet"
+            )
         return self
 
 

@@ -50,6 +50,8 @@ _DESIGN_COLOR, _MARKER_COLOR = (255, 64, 129), (0, 200, 140)
 _DIED_ADVICE = "measuring it ended its process each time, for want of memory: save it smaller"
 _EMPTY_ADVICE = "it shows one tone or noise and nothing else: take it again"
 _CROP_ADVICE = "it is a crop or a screenshot by its shape, its name or EXIF: it counts, but use the camera's own file"
+_MOST_OUTSIDE = 0.01  # of the picture's longer side, for corners on its edge
+_OUTSIDE_ADVICE = "its corners lie outside of it: name pixels of the upright picture, which has {} × {}"
 _OTHER_DPI = "resolutions of scans by their files, {:.0f} × {:.0f} dpi, where --scan-dpi says {:g}"
 # codes of photographs whose homography is still accurate enough to put pieces into them
 MEASURABLE_CODES = (None, "clipped", "blurred", "too_small", "cropped", "weak_ink")
@@ -73,8 +75,13 @@ class PhotoItem:
 
     @property
     def name(self) -> str:
-        """The name in the journal, which tells a control's photograph from one of the patch with the same file name."""
+        """The name that tells a control's photograph from one of the patch with the same file name."""
         return self.file if self.control is None else f"{self.control}/{self.file}"
+
+    @property
+    def journal_name(self) -> str:
+        """The name in the journal: photographs are measured again if their corners change."""
+        return self.name if self.corners is None else f"{self.name} {self.corners.px.tolist()}"
 
 
 def measure_all(
@@ -89,7 +96,7 @@ def measure_all(
     """Measure every photograph, in order; the journal's are not opened again. `step` gets (done, total)."""
     photos: dict[int, MeasuredPhoto] = {}
     for number, item in enumerate(items):
-        line = None if journal is None else journal.find(item.name, item.path)
+        line = None if journal is None else journal.find(item.journal_name, item.path)
         if line is not None and (photo := _parse(line, item, judges)) is not None:
             photos[number] = photo
     todo = [number for number in range(len(items)) if number not in photos]
@@ -107,7 +114,7 @@ def measure_all(
             on_pictures(item.file, measured.pictures)
         line = _serialize(replace(measured, entry=entry), item.with_pictures)
         if journal is not None:
-            journal.add(item.name, sha256, line)
+            journal.add(item.journal_name, sha256, line)
         photos[number] = _JournalPhoto.model_validate(line).photo  # read back, so that a resumed run cannot differ
         step(len(photos), len(items))
     return [photos[number] for number in range(len(items))]
@@ -176,6 +183,11 @@ def _measure(task: Task, item: PhotoItem) -> MeasuredPhoto:
         return MeasuredPhoto(entry, True, squares=squares, trace=_trace(item.path, photo.srgb))
     view = pinhole_photo(photo, task.camera)
     corners = item.corners
+    if corners is not None:
+        outside = float(np.maximum(-corners.px, corners.px - size_px).max())
+        if outside > _MOST_OUTSIDE * max(size_px):
+            advice = _OUTSIDE_ADVICE.format(*size_px)
+            return _rejected(item, Remark(code="no_corners", figure=outside, threshold=0.0, advice=advice))
     if corners is not None and view.calibrated and task.camera is not None:
         corners = replace(corners, px=task.camera.undistort_points(corners.px, size_px))
     parts = task.surface, task.promised, task.ranges, task.scan_dpi

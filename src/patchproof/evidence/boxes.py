@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import warnings
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from pydantic import BaseModel, PositiveInt
@@ -28,8 +28,12 @@ from patchproof.photo.read import allow_heic
 _ORIENTATION, _TIFF_WIDTH, _TIFF_HEIGHT = 0x0112, 0x0100, 0x0101  # tags
 _SLACK = 0.01  # of a side: copies have whole pixels, and boxes end a little outside
 
+Drawn = TypeVar("Drawn")
 
-class _Image(BaseModel):
+
+class CocoImage(BaseModel):
+    """A picture that COCO JSON lists, with its size."""
+
     id: int
     file_name: str
     width: PositiveInt
@@ -51,7 +55,7 @@ class _Annotation(BaseModel):
 
 
 class _Coco(BaseModel):
-    images: tuple[_Image, ...]
+    images: tuple[CocoImage, ...]
     categories: tuple[_Category, ...]
     annotations: tuple[_Annotation, ...]
 
@@ -78,10 +82,7 @@ def load_boxes(path: str | Path, label: str) -> dict[str, DrawnBox]:
         raise Refused(f'a category "{label}" of boxes in {path}', got, spelling_hint(label, names))
     annotations = [annotation for annotation in coco.annotations if annotation.category_id in category_ids]
     images = {image.id: image for image in coco.images}
-    names = {id: printable(image.file_name.replace("\\", "/")) for id, image in images.items()}
-    if len(set(names.values())) < len(coco.images):
-        (name, count), *_ = Counter(image.file_name for image in coco.images).most_common()
-        raise Refused(f"each image once in {path}", f"{name} {count} times, or one id twice", "remove the others")
+    names = image_names(coco.images, path)
     counts, boxes = Counter(annotation.image_id for annotation in annotations), {}
     for a in annotations:
         if a.image_id not in names or counts[a.image_id] > 1 or a.iscrowd or a.attributes.get("rotation"):
@@ -95,9 +96,23 @@ def load_boxes(path: str | Path, label: str) -> dict[str, DrawnBox]:
     _refuse_outside(boxes, str(path))
     if outlines := sum(bool(annotation.segmentation) for annotation in annotations):
         warnings.warn(f"{outlines} outlines (segmentation) in {path} are left aside: boxes count", stacklevel=2)
-    last_parts = {name: PurePosixPath(name).name for name in boxes}
+    return with_last_parts(boxes)
+
+
+def image_names(images: Sequence[CocoImage], path: str | Path) -> dict[int, str]:
+    """Names of images by id, with slashes between folders; refused if one is listed twice."""
+    names = {image.id: printable(image.file_name.replace("\\", "/")) for image in images}
+    if len(set(names.values())) < len(images):
+        (name, count), *_ = Counter(image.file_name for image in images).most_common()
+        raise Refused(f"each image once in {path}", f"{name} {count} times, or one id twice", "remove the others")
+    return names
+
+
+def with_last_parts(drawn: dict[str, Drawn]) -> dict[str, Drawn]:
+    """What was drawn in photographs by name, and by the last part of the name where that is unique."""
+    last_parts = {name: PurePosixPath(name).name for name in drawn}
     uses = Counter(last_parts.values())
-    return {last_parts[name]: box for name, box in boxes.items() if uses[last_parts[name]] == 1} | boxes
+    return {last_parts[name]: each for name, each in drawn.items() if uses[last_parts[name]] == 1} | drawn
 
 
 def _refuse_outside(boxes: Mapping[str, DrawnBox], source: str) -> None:
@@ -127,14 +142,14 @@ def box_of_photo(boxes: Mapping[str, DrawnBox], name: str, path: Path) -> BoxEdg
     """
     drawn = boxes.get(name, boxes.get(PurePosixPath(name).name))
     try:
-        return None if drawn is None else _shares(drawn, name, *run_limited(_read_orientation, path))
+        return None if drawn is None else _shares(drawn, name, *run_limited(read_orientation, path))
     except Refused:
         raise
     except Exception:  # it is rejected as unreadable later
         return None
 
 
-def _read_orientation(path: Path) -> tuple[tuple[int, int], int]:
+def read_orientation(path: Path) -> tuple[tuple[int, int], int]:
     """The size (width, height) that a photograph is stored in, and its EXIF orientation."""
     allow_heic(path)
     with warnings.catch_warnings(action="ignore"), open_lazily(path) as image:
@@ -146,8 +161,8 @@ def _read_orientation(path: Path) -> tuple[tuple[int, int], int]:
 def _shares(drawn: DrawnBox, name: str, stored_px: tuple[int, int], orientation: int) -> BoxEdges:
     upright_px = (stored_px[1], stored_px[0]) if orientation in (5, 6, 7, 8) else stored_px
     x, y = (np.clip(np.divide(drawn.edges[axis::2], drawn.size_px[axis]), 0, 1) for axis in (0, 1))
-    if not _is_same_shape(drawn.size_px, upright_px):
-        if not _is_same_shape(drawn.size_px, stored_px):
+    if not is_same_shape(drawn.size_px, upright_px):
+        if not is_same_shape(drawn.size_px, stored_px):
             (width, height), (w, h) = upright_px, drawn.size_px
             expected = f"boxes in {name} of {width} × {height} pixels, or in a copy of all of it"
             raise Refused(expected, f"boxes in a picture of {w} × {h}", "draw them in the photographs themselves")
@@ -156,7 +171,7 @@ def _shares(drawn: DrawnBox, name: str, stored_px: tuple[int, int], orientation:
     return float(x[0]), float(y[0]), float(x[1]), float(y[1])
 
 
-def _is_same_shape(size_px: tuple[int, int], other_px: tuple[int, int]) -> bool:
+def is_same_shape(size_px: tuple[int, int], other_px: tuple[int, int]) -> bool:
     """Check that one is a copy of the other at another size, to a pixel or a hundredth."""
     products = size_px[0] * other_px[1], size_px[1] * other_px[0]
     return max(products) - min(products) <= max(_SLACK * max(products), *other_px)

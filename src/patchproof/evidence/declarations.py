@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from patchproof.base.declared import Declaration
 
-_FILE = "COCO JSON"
+_FILE, _CORNERS = "COCO JSON", "COCO JSON (corners)"
 DECLARED: tuple[Declaration, ...] = (
     Declaration(_FILE, "`width`, `height`", "used", "boxes are scaled from a copy to the photograph"),
     Declaration(_FILE, "size of the photograph as stored, which EXIF turns", "used", "the box is turned along"),
@@ -18,4 +18,8 @@ DECLARED: tuple[Declaration, ...] = (
     Declaration(_FILE, "`category_id`", "used", "of the target's label, or the only one; others are other things"),
     Declaration(_FILE, "`file_name` in folders, also with backslashes", "used", "or its last part, if it is unique"),
     Declaration(_FILE, "`file_name` or `id` of an image twice", "refused", "boxes could not be told apart"),
+    Declaration(_CORNERS, "`keypoints`, or a `segmentation` of four points", "used", "others are refused"),
+    Declaration(
+        _CORNERS, "`width`, `height`", "used", "of the upright picture or a copy of it; another shape is refused"
+    ),
 )

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing, nullcontext
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 
@@ -25,6 +25,7 @@ from patchproof.base.progress import Advance, no_advance
 from patchproof.base.sessions import TAIL
 from patchproof.base.settings import background_summary
 from patchproof.base.text import printable
+from patchproof.base.validation import summarize_names
 from patchproof.base.workers import open_workers
 from patchproof.evidence.batch import MAX_PICTURED_PHOTOS, PhotoItem, measure_all, reread_square
 from patchproof.evidence.benefit import benefit_of
@@ -53,6 +54,8 @@ from patchproof.evidence.verdict import (
 )
 from patchproof.photo.read import list_images, list_skipped_files, summarize_said
 from patchproof.sheets.manifest import Manifest
+
+_UNLOCATED_CODES = ("too_few_markers", "no_corners")
 
 
 def gather_evidence(
@@ -93,6 +96,18 @@ def gather_evidence(
             do = "name the images in the boxes' file as the photographs"
             got = f"boxes of {next(iter(options.boxes))} and {len(options.boxes) - 1} more"
             raise Refused("boxes of these photographs", got, do)
+    if options.corners:
+        from patchproof.evidence.corner_files import corners_of_photo
+
+        found = [None if item.control else corners_of_photo(options.corners, item.name, item.path) for item in items]
+        items = [replace(item, corners=corners) for item, corners in zip(items, found, strict=True)]
+        names = {name for item in items if item.control is None for name in (item.name, item.path.name)}
+        if not any(item.corners for item in items):
+            got = f"corners in {summarize_names(list(options.corners))}"
+            raise Refused("corners of these photographs", got, "name the files as the photographs")
+        unused = [name for name in options.corners if PurePosixPath(name).name not in names]
+    else:
+        unused = []
     journal_file = closing(Journal(journal, settings_key(manifest, options), resume)) if journal else nullcontext()
     with journal_file as open_journal, open_workers(compute.jobs, compute.cluster) as workers:
         results = measure_all(task, items, judges, workers, open_journal, on_pictures, advance)
@@ -119,6 +134,7 @@ def gather_evidence(
     if controls_folder:
         skipped = list_skipped_files(controls_folder, depth=2)
         left_out += [f"{printable(controls_folder.name)}: {text}" for text in skipped]
+    left_out += [f"corners of {len(unused)} other photographs ({summarize_names(unused)})"] if unused else []
     left_out += summarize_said((item.name, result.entry.said) for item, result in zip(items, results, strict=True))
     for item, result in zip(items, results, strict=True):
         if item.control is not None:
@@ -134,6 +150,8 @@ def gather_evidence(
     missing = {}
     if options.scan_dpi and not any(photo.entry.scale for photo in patch_photos):
         missing["the print's scale"] = f"no photograph is a flat scan at {options.scan_dpi:g} dpi"
+    if placed := sum(photo.entry.located not in ("markers", None) for photo in patch_photos):
+        missing["bend, and where paper was cut"] = f"{placed} photographs were located by the design alone"
     if judges and task.promised and options.ledger_photos and (ledger is None or estimate is None):
         missing["where the rate was lost, what controls would show"] = "too few photographs can be measured"
     summary = report.summary.changed(estimated=estimate, left_out=tuple(left_out), not_measured=missing)
@@ -198,7 +216,7 @@ def report_of(
         promise, primary = manifest.promise, judges.primary.name
         rates = {model.name: _rate(_recognized(counted, model.name)) for model in judges.models}
         rate, recognized = rates[primary], _recognized(counted, primary)
-        without_markers = sum(e.code == "too_few_markers" and e.status == "rejected" for e in entries)
+        without_markers = sum(e.code in _UNLOCATED_CODES and e.status == "rejected" for e in entries)
         goal = promise.target.goal
         sessions = _sessions(grouping, photos, recognized)
         numbers = dict(zip((entry.file for entry in entries), grouping.merged, strict=True))

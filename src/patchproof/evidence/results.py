@@ -134,6 +134,11 @@ class PhotoEntry(StrictModel):
         """The code of what is wrong with the photograph; None if nothing is."""
         return None if self.remark is None else self.remark.code
 
+    @property
+    def located(self) -> Located | None:
+        """How the print was located; None if it was not."""
+        return None if self.geometry is None else self.geometry.located
+
     @model_validator(mode="before")
     @classmethod
     def _group_figures(cls, data: Any) -> Any:

@@ -79,7 +79,7 @@ def judge(
     recognized: int, photos: Sequence[int], promise: Promise, without_markers: int = 0, look: Look = PLANNED_LOOK
 ) -> Verdict:
     """Judge the promise by `photos` (how many in each session), of which `recognized` were recognized;
-    `without_markers` more are readable and show no marker. Looks besides the planned one ask for more proof.
+    `without_markers` more are readable and not located. Looks besides the planned one ask for more proof.
     """
     judged, goal = sum(photos), promise.target.goal
     if judged == 0:
@@ -90,7 +90,9 @@ def judge(
     allowed = f"the promise allows for {low} to {high} in {sessions}"
     share = _share_without_markers(judged, without_markers)
     if share > MOST_WITHOUT_MARKERS:
-        reason = f"{without_markers} readable photographs show no marker ({share:.0%}, at most 10 % are allowed)."
+        reason = (
+            f"{without_markers} readable photographs show no marker or corners ({share:.0%}, at most 10 % are allowed)."
+        )
         return Verdict("cannot_tell", (low, high), reason)
     if judged < LEAST_JUDGED:
         return Verdict("cannot_tell", (low, high), f"Only {judged} photographs could be judged; at least 5 are needed.")

@@ -24,6 +24,7 @@ from patchproof.base.geometry import MM_PER_INCH
 from patchproof.base.input import hash_file, is_file, read_json
 from patchproof.base.output import check_folder, new_folder
 from patchproof.base.progress import Progress, no_progress
+from patchproof.base.settings import NO_PAGE
 from patchproof.base.text import printable
 from patchproof.base.validation import summarize_names
 from patchproof.classifier.network import Classifier
@@ -35,7 +36,7 @@ from patchproof.photo.detect import find_markers
 from patchproof.photo.read import list_photos, read_photo
 from patchproof.photo.rejection import PhotoRejected
 from patchproof.scene.interface import PieceScene, Scene, require_piece
-from patchproof.scene.scene import named_paths
+from patchproof.scene.scene import build_scene, named_paths
 from patchproof.sheets.manifest import design_sha256
 from patchproof.sheets.piece import Piece, marker_image
 
@@ -68,6 +69,7 @@ def import_patch(
     scene: str | Path | Scene,
     out: str | Path,
     *,
+    as_printed: tuple[float, float] | None = None,
     models: Sequence[str | Classifier] | None = None,
     seed: int | None = None,
     promise: PromiseOptions = PromiseOptions(),
@@ -81,6 +83,7 @@ def import_patch(
         picture: a file, or uint8 H×W×3 sRGB; its proportions are the piece's within 2 %.
         scene: a scene with a printed piece, or the path of a scene file.
         out: the run's folder, new or empty.
+        as_printed: width and height in mm of a print that exists: it has no page and no markers.
         models, seed, promise, compute, overwrite: as in `optimize`.
         progress: called with the stage "promise" (views).
 
@@ -89,7 +92,13 @@ def import_patch(
     """
     out, compute = Path(out), compute.without("import_patch", cluster=True)
     check_folder(out, RUN_FILE_PATTERNS, overwrite, inputs=(picture, scene))
-    (file, sha256, pixels, said), scene = _read_picture(picture), require_piece(resolve_scene(scene, seed), _NO_TEXTURE)
+    (file, sha256, pixels, said), scene = _read_picture(picture), resolve_scene(scene, seed)
+    if as_printed is not None:
+        patch, sheet = dict(zip(("width_mm", "height_mm"), as_printed, strict=True)), {"template": NO_PAGE}
+        settings = scene.settings.changed(patch=patch, sheet=sheet | {"markers": False})
+        built = build_scene(settings, scene.base, scene.seed, mesh_glb=scene.mesh_glb)
+        scene = replace(built, given_models=scene.given_models)
+    scene = require_piece(scene, _NO_TEXTURE)
     fitted, scene = fit_to_piece(pixels, scene), scene.for_design(sha256)
     problem = set_problem(scene, compute.device, models, jobs=compute.jobs)
     problem = replace(problem, subject=replace(problem.patch, design_px=fitted.shape[1::-1]))
@@ -231,7 +240,8 @@ def _resolution_notes(design: np.ndarray, picture: np.ndarray, scene: PieceScene
 
 def _marker_notes(design: np.ndarray, piece: Piece) -> Iterator[str]:
     """Note a marker that is found in the flat piece besides its own; refused with more, or if its own are not found."""
-    ids = {marker.id for marker in piece.markers}
+    if not (ids := {marker.id for marker in piece.markers}):
+        return
     factor = math.ceil(_FLAT_MODULE_PX / (piece.module_mm * design.shape[1] / piece.size_mm[0]))
     large = design.repeat(factor, 0).repeat(factor, 1)
     markers, reserved = marker_image(piece, large.shape[1::-1])

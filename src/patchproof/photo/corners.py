@@ -106,9 +106,8 @@ def _gain_and_veil(printed: np.ndarray, seen: np.ndarray) -> tuple[float, np.nda
     """Fit seen ≈ veil + gain · printed by channel to N×3 pixels, with less weight on what lies over the design; the
     mean absolute error comes first.
     """
-    gain, veil = np.median(seen, 0) / np.maximum(np.median(printed, 0), 1e-3), np.zeros(3)
-    known = printed.std(0) >= _LEAST_SPREAD
-    weight = np.ones(len(seen))
+    known, weight = printed.std(0) >= _LEAST_SPREAD, np.ones(len(seen))
+    gain, veil, error = np.ones(3), np.zeros(3), np.zeros(len(seen))
     for _ in range(4):
         total = weight.sum()
         x, y = (weight @ values / total for values in (printed, seen))

@@ -73,6 +73,7 @@ def fit_points(mm: np.ndarray, px: np.ndarray, sigma_px: np.ndarray, start: np.n
     than four, those off by more than three deviations from the fit begun at `start` lose their weight.
     """
     homography, weight = fit_homography(mm, px) if start is None else start, np.ones(len(mm))
+    root = np.repeat(1 / sigma_px, 2)
     for _ in range(_ROUNDS if len(mm) > 4 else 1):
         off = np.linalg.norm(px - apply_homography(homography, mm), axis=1) / sigma_px
         weight = np.minimum(1, (3 * max(1.0, float(np.median(off))) / np.maximum(off, 1e-9)) ** 2)
@@ -85,7 +86,10 @@ def fit_points(mm: np.ndarray, px: np.ndarray, sigma_px: np.ndarray, start: np.n
     residual = px - apply_homography(homography, mm)
     spread = float(np.sqrt(np.sum((residual.ravel() * root) ** 2) / max(2 * len(mm) - 8, 1)))
     covariance = covariance_of(_jacobian(homography, mm) * root[:, None], max(1.0, spread))
-    return PageFit(homography, covariance, rms_length_mm(_mm_by_px(homography, mm), residual * weight[:, None]), ())
+    # a corner that was named wrongly says nothing of the paper, a vague point little
+    share = np.where(weight == weight.max(), 1 / sigma_px, 0.0)
+    residual = residual * (share / np.sqrt(np.mean(share**2)))[:, None]
+    return PageFit(homography, covariance, rms_length_mm(_mm_by_px(homography, mm), residual), ())
 
 
 def common_corners(corners_px: Quads, corners_mm: Quads) -> tuple[tuple[int, ...], np.ndarray, np.ndarray]:

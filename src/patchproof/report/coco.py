@@ -21,12 +21,13 @@ _LEAST_PX = 1.0  # of a box's sides; smaller boxes are left out
 @dataclass(frozen=True, eq=False)
 class LabeledPhoto:
     """A photograph: its file, (width, height), and outlines N×2 in its pixels by category; those with NaN (a part is
-    behind the camera) are left out.
+    behind the camera) are left out; and how the patch was located.
     """
 
     file: str
     size_px: tuple[int, int]
     outlines: Mapping[str, np.ndarray] = field(default_factory=dict)
+    located: str | None = None
 
 
 def coco_json(photos: Sequence[LabeledPhoto], label: str, about: str) -> str:
@@ -40,7 +41,8 @@ def coco_json(photos: Sequence[LabeledPhoto], label: str, about: str) -> str:
             shape = _annotation(outline, photo.size_px, name == PATCH)
             if shape is not None:
                 ids = {"id": len(annotations) + 1, "image_id": number, "category_id": categories[name]}
-                annotations.append(ids | shape)
+                extra = {"attributes": {"located": photo.located}} if photo.located and name == PATCH else {}
+                annotations.append(ids | shape | extra)
     data = {
         "info": {"description": about},
         "images": images,

@@ -20,6 +20,7 @@ from patchproof.base.color import photo_codes_from_srgb
 from patchproof.base.errors import Refused
 from patchproof.base.geometry import MM_PER_INCH
 from patchproof.base.output import image_bytes
+from patchproof.base.settings import NO_PAGE
 from patchproof.channel.object_box import project_box
 from patchproof.channel.printer import Printer, load_printer
 from patchproof.evidence.surface import surface_of
@@ -31,14 +32,14 @@ from patchproof.report.coco import PATCH
 from patchproof.scene.conditions import Conditions, fields_of
 from patchproof.scene.interface import PieceScene, Scene, require_piece
 from patchproof.scene.patch_scene import PatchScene
-from patchproof.sheets.manifest import Manifest
+from patchproof.sheets.manifest import Manifest, load_manifest
 from patchproof.sheets.pdf_raster import attached_manifest, rasterize_piece
 
 # The print is rasterized this much finer than the closest view resolves. Rasterizers of pages average code values: fine
 # patterns of strong colors became 2 to 5 % too dark at 1.25, within 1 % at 2.5 and at 5.
 OVERSAMPLING = 2.5
 DPI_RANGE = (100.0, 400.0)
-_SIDE_POINTS = 8
+SIDE_POINTS = 8
 _FULL_FRAME_DIAGONAL_MM = 43.2666  # of 36 × 24 mm, to which EXIF's 35 mm focal length refers
 
 
@@ -145,7 +146,7 @@ class MountedSheet:
             box = geometry.rect_corners((left, top, end[0] - left, end[1] - top))
             outlines[str(scene.settings.target.label)] = box
         if self.piece is not None and scene.facing(conditions)[0]:
-            border = geometry.rect_border((0, 0, *scene.piece.size_mm), _SIDE_POINTS)
+            border = geometry.rect_border((0, 0, *scene.piece.size_mm), SIDE_POINTS)
             outlines[PATCH] = scene.piece_px(conditions, border)
         return outlines
 
@@ -167,7 +168,12 @@ def mount_sheet(pdf_path: str | Path, run: Run, how: ReprintSetup = DEFAULT_SETU
 
 def sheet_scene(pdf_path: str | Path, run: Run) -> tuple[Manifest, Scene]:
     """Read a sheet's manifest, and set its run's scene to the sheet's template; refused if it is not of this run."""
-    manifest = attached_manifest(pdf_path, run.scene.sheet_id)
+    is_manifest = Path(pdf_path).suffix == ".json"  # of a print without a page
+    manifest = load_manifest(pdf_path) if is_manifest else attached_manifest(pdf_path, run.scene.sheet_id)
+    if is_manifest and (manifest.design is None or manifest.settings.get("sheet", {}).get("template") != NO_PAGE):
+        raise Refused(
+            "a PDF of a sheet, or the manifest of a print without a page", str(pdf_path), "name the PDF beside it"
+        )
     default = run.scene.settings.sheet.template
     scene = run.scene.with_template(manifest.settings.get("sheet", {}).get("template", default))
     if manifest.sheet_id != scene.sheet_id:
@@ -177,7 +183,11 @@ def sheet_scene(pdf_path: str | Path, run: Run) -> tuple[Manifest, Scene]:
 
 
 def sent_pixels(pdf_path: str | Path, manifest: Manifest, scene: Scene) -> Tensor:
-    """Rasterize the piece of a PDF to 1×3×H×W sRGB, finer than the closest view resolves."""
+    """Rasterize the piece of a PDF to 1×3×H×W sRGB, finer than the closest view resolves; a print without a page has
+    the design's own pixels.
+    """
+    if Path(pdf_path).suffix == ".json" and manifest.design is not None:
+        return torch.tensor(manifest.design.pixels()).permute(2, 0, 1)[None] / 255
     finest = scene.closest_px_per_mm(scene.settings.camera.photo_px)
     dpi = float(np.clip(OVERSAMPLING * finest * MM_PER_INCH, *DPI_RANGE))
     return torch.tensor(rasterize_piece(pdf_path, manifest, dpi)).permute(2, 0, 1)[None] / 255

@@ -1,7 +1,8 @@
 """Simulate photographs of a printed sheet on its object (scans of the uncut page: see `page_photos`).
 
 In: a sheet's PDF and the run it was made from. Out: a folder of JPEG photographs of that piece on the object,
-`truth.json` with each one's homography, marker corners and conditions, and `coco.json` with boxes of object and piece.
+`truth.json` with each one's homography, marker corners and conditions, `coco.json` with boxes of object and piece, and
+for a print without markers `corners.csv`, which `verify --corners` takes.
 Conditions come from the reprint stream, which nothing else uses: one print, photographed in one or several sessions,
 each with its own place, light, camera and folder.
 """
@@ -20,12 +21,19 @@ from patchproof.base.output import make_folder, new_folder
 from patchproof.base.progress import Progress, no_progress
 from patchproof.base.workers import Workers, fork_workers, open_workers, result_of
 from patchproof.optimizer.run import Run, load_run
-from patchproof.report.coco import LabeledPhoto, coco_json
-from patchproof.reprints.mounted_sheet import DEFAULT_SETUP, PhotoTruth, ReprintSetup, mount_sheet, sheet_scene
+from patchproof.report.coco import PATCH, LabeledPhoto, coco_json
+from patchproof.reprints.mounted_sheet import (
+    DEFAULT_SETUP,
+    SIDE_POINTS,
+    PhotoTruth,
+    ReprintSetup,
+    mount_sheet,
+    sheet_scene,
+)
 from patchproof.reprints.run_sheet import sheet as sheet_of
 from patchproof.scene.conditions import Conditions
 
-REPRINT_FILES = ("photo_*.jpg", "session_*", "scan_*.jpg", "truth.json", "coco.json")
+REPRINT_FILES = ("photo_*.jpg", "session_*", "scan_*.jpg", "truth.json", "coco.json", "corners.csv")
 
 
 @dataclass(frozen=True)
@@ -95,6 +103,12 @@ def reprint(
             (folder / "coco.json").write_text(text, encoding="utf-8")
             truth = dict(zip(names, map(sheet.truth, views), strict=True))
             write_truth(folder, truth)
+            if not sheet.manifest.markers:
+                from patchproof.evidence.corner_files import CORNERS_FILE, corners_csv
+
+                shown = {photo.file: photo.outlines[PATCH] for photo in photos if PATCH in photo.outlines}
+                text = corners_csv({name: outline[::SIDE_POINTS] for name, outline in shown.items()})
+                (folder / CORNERS_FILE).write_text(text, encoding="utf-8")
     return Reprint(Path(out), truth)
 
 
@@ -115,8 +129,9 @@ def _pdf_to_mount(pdf_path: str | Path, run: Run, control: str | None, out: Path
     make_folder(out.resolve().parent)
     with TemporaryDirectory(dir=out.resolve().parent, prefix=".control.") as folder:
         template = sheet_scene(pdf_path, run)[1].settings.sheet.template
-        sheet_of(run, Path(folder) / "control.pdf", template=template, control=control)
-        yield Path(folder) / "control.pdf"
+        path = Path(folder) / f"control{Path(pdf_path).suffix}"
+        sheet_of(run, path, template=template, control=control)
+        yield path
 
 
 def _take_photo(pdf: Path, run_folder: Path, how: ReprintSetup, conditions: Conditions) -> bytes:

@@ -19,7 +19,7 @@ from patchproof.sheets.manifest import Manifest
 from patchproof.sheets.piece import control_design, with_ids
 from patchproof.sheets.plan_page import PlacementPicture, PlanPage, edge_distances_mm
 from patchproof.sheets.rects import size_text
-from patchproof.sheets.template import Template, load_template
+from patchproof.sheets.template import Template, load_template, page_template
 from patchproof.sheets.write import write_sheet
 
 
@@ -30,7 +30,7 @@ def sheet(
 
     Args:
         run: a run with a printed piece.
-        pdf_path: SHEET.pdf; the manifest is SHEET.json.
+        pdf_path: SHEET.pdf; the manifest is SHEET.json, and all there is of a print without a page.
         template: a template's name or file, in place of the scene's.
         control: print this in place of the design: "mean", "gray", "noise", "shuffled" or "blank".
         copies: pages with the same content, for label rolls.
@@ -39,8 +39,8 @@ def sheet(
         Refused: where the piece does not fit the page.
     """
     content, scene = content_of(run, template, control)
-    page = load_template(scene.settings.sheet.template)
-    plan = plan_of(scene, page, content) if page.plan_page else None
+    page = page_template(scene.settings.sheet.template)
+    plan = plan_of(scene, page, content) if page and page.plan_page else None
     if control == "blank":
         content = replace(content, design_srgb8=None)
     return write_sheet(pdf_path, page, content, plan, copies)

@@ -35,7 +35,7 @@ from patchproof.scene.picture_scene import BasePicture, PictureScene
 from patchproof.sheets.markers import MARKER_MODULES
 from patchproof.sheets.page import refuse_larger_than_page
 from patchproof.sheets.piece import Piece, lay_out_piece, marker_size_mm
-from patchproof.sheets.template import load_template
+from patchproof.sheets.template import page_template
 
 MIN_IMAGES_TO_SPLIT = 2
 FEW_IMAGES = 20  # half of fewer images say little about other images
@@ -217,6 +217,7 @@ def _piece(settings: SceneSettings, identity: str) -> Piece:
         raise Refused(expected, got, f"lower it to {largest:g}")
     smallest = low * (high / low) ** (1 - READABLE_SHARE)
     needed_mm = MARKER_MODULES * PX_PER_MODULE * max(size_mm) / (smallest * min(settings.camera.photo_px))
-    piece = lay_out_piece(size_mm, marker_size_mm(needed_mm, size_mm), identity, "design")
-    refuse_larger_than_page(load_template(template), piece)
+    marker_mm = marker_size_mm(needed_mm, size_mm) if settings.sheet.markers else 0.0
+    piece = lay_out_piece(size_mm, marker_mm, identity, "design")
+    refuse_larger_than_page(page_template(template), piece)
     return piece

@@ -21,7 +21,7 @@ from patchproof.scene.placement import Placement, PlacementMethod, patch_frame, 
 from patchproof.sheets.markers import MARKER_MODULES
 from patchproof.sheets.page import refuse_larger_than_page
 from patchproof.sheets.piece import Piece, lay_out_piece, marker_size_mm, smallest_piece_mm
-from patchproof.sheets.template import load_template
+from patchproof.sheets.template import page_template
 
 if TYPE_CHECKING:
     from patchproof.scene.tape_measure import TapeMeasurement
@@ -151,10 +151,10 @@ def _place_piece(scene: MeshScene, lay: PlacementMethod) -> tuple[Piece, Placeme
         got = f"{SCALE_VIEWS} views from behind it"
         raise Refused("views from which the patch can be seen", got, "turn azimuth_deg towards the patch")
     needed_mm = float(MARKER_MODULES * interface.PX_PER_MODULE / np.quantile(scales, 1 - interface.READABLE_SHARE))
-    marker_mm = marker_size_mm(needed_mm, patch.size_mm)
+    marker_mm = marker_size_mm(needed_mm, patch.size_mm) if settings.sheet.markers else 0.0
     piece = lay_out_piece(patch.size_mm, marker_mm, scene.sheet_id, "design", patch.bend)
-    refuse_larger_than_page(load_template(settings.sheet.template), piece)  # before hours of optimizing
-    unreadable = float((scales * piece.module_mm < interface.PX_PER_MODULE * 0.999).mean())
+    refuse_larger_than_page(page_template(settings.sheet.template), piece)  # before hours of optimizing
+    unreadable = float((scales * piece.module_mm < interface.PX_PER_MODULE * 0.999).mean()) if piece.markers else 0.0
     notes = (*mesh.warnings, *scene.backgrounds.notes, *placement.warnings)
     if unreadable > 1 - interface.READABLE_SHARE:
         notes += (

@@ -42,7 +42,7 @@ from patchproof.sheets.manifest import Manifest, load_manifest
 from patchproof.sheets.markers import DICTIONARY
 from patchproof.sheets.page import refuse_larger_than_page
 from patchproof.sheets.piece import Piece, with_ids
-from patchproof.sheets.template import load_template
+from patchproof.sheets.template import page_template
 
 MIN_PHOTOS = 6
 _MAX_BLUR_MODULES = 0.4  # Gaussian sigma: up to here it is measured within a tenth, beyond it too small
@@ -80,7 +80,7 @@ class PhotoScene(PictureScene):
         return f"{len(self.photos)} photographs"
 
     def _laid_out(self) -> Self:
-        refuse_larger_than_page(load_template(self.settings.sheet.template), self.piece)
+        refuse_larger_than_page(page_template(self.settings.sheet.template), self.piece)
         return replace(self, piece=with_ids(self.piece, self.sheet_id, "design"))
 
     def without(self, term: SceneTerm) -> Self | None:
@@ -152,7 +152,7 @@ def build(source: SceneSource) -> PhotoScene:
     known = {"blank": manifest.sheet_id, "photos": _digest(folder)}
     identity = replace(source, settings=settings).sheet_id(known)
     piece = with_ids(blank, identity, "design")
-    refuse_larger_than_page(load_template(settings.sheet.template), piece)
+    refuse_larger_than_page(page_template(settings.sheet.template), piece)
     base_photos, rejected = _load_all(folder, manifest, piece, settings.camera.photo_px)
     warnings = [f"{name} is left out: {reason}" for name, reason in rejected.items()]
     uneven = ((photo.name, photo.light.unevenness) for photo in base_photos if photo.light.unevenness > _UNEVEN_SHARE)

@@ -70,6 +70,8 @@ class PictureScene(PieceScene):
     @property
     def unreadable_share(self) -> float:
         """The share of views in which a marker's module is under `PX_PER_MODULE` along its foreshortened side."""
+        if not self.piece.markers:
+            return 0.0
         scales = self.piece_scales(self.draw("select", VIEWS_TRIED, 0), self.photo_px, shorter=True)
         return float((scales * self.piece.module_mm < PX_PER_MODULE * 0.999).mean())
 

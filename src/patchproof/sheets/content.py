@@ -76,7 +76,7 @@ class SheetContent:
         """The design at `rect_mm` as the pictures of a page; none for white paper."""
         return () if self.design_srgb8 is None else ((rect_mm, self.design_srgb8),)
 
-    def manifest(self, page: PageLayout, template: Template, cut_mm: RectMm, design_page: int = 1) -> Manifest:
+    def manifest(self, page: PageLayout, template: Template | None, cut_mm: RectMm, design_page: int = 1) -> Manifest:
         """The manifest of the page, with the design within the cut line."""
         fields = {"sheet_id": self.sheet_id, "kind": self.kind, "settings": self.settings}
         manifest = page_manifest(page, template, cut_mm, **fields)
@@ -87,8 +87,10 @@ class SheetContent:
         return manifest.changed(design=design, promise=self.promise)
 
 
-def page_manifest(page: PageLayout, template: AnyTemplate, cut_mm: RectMm, **fields: Any) -> Manifest:
-    """The manifest of a page without a design; `fields` are its sheet_id, kind and settings."""
+def page_manifest(page: PageLayout, template: AnyTemplate | None, cut_mm: RectMm, **fields: Any) -> Manifest:
+    """The manifest of a page without a design; `fields` are its sheet_id, kind and settings. Without a template the
+    print's own sides are the rulers.
+    """
     return Manifest(
         version=2,
         page_mm=page.page_mm,
@@ -96,7 +98,7 @@ def page_manifest(page: PageLayout, template: AnyTemplate, cut_mm: RectMm, **fie
         markers=tuple(manifest_marker(marker) for marker in page.markers),
         chart=tuple(Swatch(rect_mm=rect, srgb=srgb, page=1) for rect, srgb in page.swatches),
         cut_mm=cut_mm,
-        ruler_mm=(template.ruler.length_mm, template.ruler.length_mm),
+        ruler_mm=(template.ruler.length_mm, template.ruler.length_mm) if template else page.page_mm,
         promise=None,
         **fields,
     )
@@ -111,6 +113,8 @@ def piece_words(content: SheetContent, corner: PointMm, holder: str = "piece") -
     """An arrow and "TOP" above the top-left marker, the sheet's id above the top-right one, and as much of the name as
     fits below the bottom-left one; `holder` is the name of the part of the page that contains them.
     """
+    if not content.piece.markers:  # the design fills the piece
+        return PageParts()
     top_left, top_right, _, bottom_left = content.piece.reserved_mm[:4]
     lines, texts, boxes = [], [], []
     for rect, text in ((top_left, "TOP"), (top_right, content.sheet_id), (bottom_left, content.name.upper())):

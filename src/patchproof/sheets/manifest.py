@@ -233,7 +233,7 @@ _VerifiedSettings = _table(
     printer=(_table("_Printer", profile=(str, "")) | None, None),
     camera=(_table("_Camera", noise=(NotNegativeRange, ()), photo_px=(tuple[Count, Count] | None, None)), None),
     target=(_table("_Target", label=(str | int, ""), accept=(tuple[str | int, ...], ())), None),
-    sheet=(_table("_Sheet", template=(str, "")), None),
+    sheet=(_table("_Sheet", template=(str, ""), markers=(bool, True)), None),
     imported=(_table("_Imported", file=str, sha256=str) | None, None),  # a design that was made elsewhere
 )
 
@@ -246,7 +246,7 @@ class Manifest(StrictModel):
     kind: str  # "design", or a control: "mean", "gray", "noise", "shuffled", "blank"
     page_mm: tuple[SizeMm, SizeMm]
     design: Design | None
-    markers: Annotated[tuple[Marker, ...], Field(min_length=1)]
+    markers: tuple[Marker, ...]  # none with sheet.markers = false
     chart: tuple[Swatch, ...]
     cut_mm: Rect
     ruler_mm: tuple[SizeMm, SizeMm]
@@ -266,6 +266,10 @@ class Manifest(StrictModel):
     def _design_fills_the_piece(self) -> "Manifest":
         if self.design is not None and self.design.rect_mm != self.cut_mm:
             raise ValueError("make the sheet again: design.rect_mm is not cut_mm, and a design fills its piece")
+        if not self.markers and self.settings.get("sheet", {}).get("markers", True):
+            raise ValueError(
+                "make the sheet again: it has no markers, and sheet.markers = false is not in its settings"
+            )
         return self
 
     def page_from_design_page(self, page: int) -> np.ndarray:

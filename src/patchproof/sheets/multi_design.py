@@ -64,7 +64,8 @@ def write_several(
 
 def _page_ids(designs: Sequence[SheetContent], template: Template) -> list[int]:
     """Ids for the page's own markers that no piece uses."""
-    used = {marker.id for design in designs for marker in design.piece.markers}
+    if not (used := {marker.id for design in designs for marker in design.piece.markers}):
+        return []
     order = hash_order(" ".join(design.sheet_id for design in designs), 1000)
     return [i for i in order if i not in used][: len(template.marker.corners_mm)]
 
@@ -80,5 +81,6 @@ def _manifest(template: Template, page: PageLayout, design: SheetContent, cut_mm
     piece_markers = [move_marker(marker, cut_mm[:2]) for marker in design.piece.markers]
     counts = Counter(marker.id for marker in page.markers)
     others = [marker for marker in page.markers if counts[marker.id] == 1 and marker not in piece_markers]
+    others = others if piece_markers else []
     design_page = replace(page, markers=(*piece_markers, *others))
     return design.manifest(design_page, template, cut_mm)

@@ -32,6 +32,7 @@ DUPLICATES: tuple[Srgb, ...] = (CORNERS[0], CORNERS[7], GRAYS[1], GRAYS[4], (1.0
 SHUFFLE_NUMBERS = {(12, 6): 184, (8, 12): 19, (16, 6): 81, (12, 4): 80, (6, 8): 172}
 
 _BITS = 32  # of the integers in Sobol's sequence
+MIN_PRINT_MM, MAX_PRINT_MM = 5.0, 20_000.0  # of prints without a page: a sticker, a wall
 CUT_LINE_MM = 0.2  # drawn outside the cut, so that no ink of it stays on the piece
 PIECE_GAP_MM = 4.0  # of white paper between pieces, for scissors
 MAX_TILES = 30  # with 5 markers each, beside the piece's and the page's, out of the 166 ids of a kind
@@ -97,7 +98,8 @@ def largest_piece_mm(template: Template) -> tuple[float, float]:
 def lay_out_page(template: Template, content: SheetContent) -> PageLayout:
     """Lay out the page of one piece; refused if the piece is too large."""
     pieces, used_ids = place_pieces(template, [content.piece]), len(content.piece.markers)
-    ids = marker_ids(content.sheet_id, content.kind, used_ids + len(template.marker.corners_mm))[used_ids:]
+    page_ids = len(template.marker.corners_mm) if used_ids else 0
+    ids = marker_ids(content.sheet_id, content.kind, used_ids + page_ids)[used_ids:]
     labels = [piece_words(content, pieces[0][1], piece_name(0))]
     return lay_out_parts(template, pieces, ids, content.code, content.words, labels)
 
@@ -111,10 +113,10 @@ def lay_out_parts(
     extra_parts: Sequence[PageParts] = (),
 ) -> PageLayout:
     """Lay out a page with any number of (piece, top-left corner); `ids` are those of the page's own markers, `words`
-    the values of the placeholders in the template's text.
+    (none for a page without markers), `words` the values of the placeholders in the template's text.
     """
-    size = template.marker.size_mm
-    page_markers = [square_marker(i, corner, size) for i, corner in zip(ids, template.marker.corners_mm, strict=True)]
+    size, corners_mm = template.marker.size_mm, template.marker.corners_mm if ids else ()
+    page_markers = [square_marker(i, corner, size) for i, corner in zip(ids, corners_mm, strict=True)]
     page_mm, margin_mm = template.page_mm, template.margin_mm
     quiet = [quiet_zone_rect(marker_rect(m), size / MARKER_MODULES, page_mm, margin_mm) for m in page_markers]
     chart = [(round_rect(rect), srgb) for rect, srgb in chart_swatches(template.chart)]
@@ -214,8 +216,17 @@ def _fill_placeholders(line: TextLine, words: dict[str, str]) -> TextLine:
     return line.changed(text=re.sub(r"\{(.*?)\}", value, line.text))
 
 
-def refuse_larger_than_page(template: Template, piece: Piece) -> None:
-    """Refuse a piece of which no sheet can be made: too large, or with more markers than there are ids."""
+def refuse_larger_than_page(template: Template | None, piece: Piece) -> None:
+    """Refuse a piece of which no sheet can be made: too large, with more markers than there are ids, or in tiles
+    without any. Without a page it may have any size from `MIN_PRINT_MM` to `MAX_PRINT_MM`.
+    """
+    if template is None:
+        if not MIN_PRINT_MM <= min(piece.size_mm) <= max(piece.size_mm) <= MAX_PRINT_MM:
+            expected = f"a print of {MIN_PRINT_MM:g} mm to {MAX_PRINT_MM / 1000:g} m along each side"
+            raise Refused(expected, f"{size_text(piece.size_mm)} mm", "state its width and height in millimeters")
+        return
+    if template.tiles is not None and not piece.markers:
+        raise Refused("markers on a piece in tiles", "sheet.markers = false", 'name a page of one piece, or "none"')
     others = len(template.marker.corners_mm)
     if template.tiles is None:
         place_pieces(template, [piece])

@@ -111,7 +111,11 @@ def smallest_piece_mm(marker_mm: float = SMALLEST_MARKER_MM) -> int:
 def lay_out_piece(
     piece_mm: tuple[float, float], marker_mm: float, sheet_id: str, kind: str, bends: bool = False
 ) -> Piece:
-    """Lay out a piece with a marker in each corner, and along sides that are long or bent."""
+    """Lay out a piece with a marker in each corner, and along sides that are long or bent; without any if `marker_mm`
+    is 0.
+    """
+    if not marker_mm:
+        return Piece(piece_mm, (), 0.0)
     module = marker_mm / MARKER_MODULES
     edge = SCISSORS_MM + module
     (left, right), (top, bottom) = ((edge, side - edge - marker_mm) for side in piece_mm)

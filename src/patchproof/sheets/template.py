@@ -14,6 +14,7 @@ from pydantic import Field
 from patchproof.base import validation
 from patchproof.base.errors import Refused
 from patchproof.base.packaged import packaged_path
+from patchproof.base.settings import NO_PAGE
 from patchproof.base.validation import Finite, NotNegative, Positive, Share, StrictModel
 
 PagePoint = tuple[Finite, Finite]
@@ -133,6 +134,11 @@ def load_template(name_or_file: str | Path) -> Template:
     if swatches < 48:
         raise Refused(f"at least 48 swatches in the chart of {path}", f"{swatches}", "add columns or rows")
     return template
+
+
+def page_template(name_or_file: str | Path) -> Template | None:
+    """Load a template; None for a print without a page."""
+    return None if name_or_file == NO_PAGE else load_template(name_or_file)
 
 
 def template_data(name_or_file: str | Path) -> tuple[Path, dict[str, Any]]:

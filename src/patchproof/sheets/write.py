@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from patchproof.base.errors import Refused
-from patchproof.base.output import write_files_atomically
+from patchproof.base.output import write_atomically, write_files_atomically
 from patchproof.sheets.content import SheetContent, page_manifest
 from patchproof.sheets.layout import PageLayout
 from patchproof.sheets.manifest import Manifest, dump_manifest
@@ -23,11 +23,23 @@ from patchproof.sheets.template import AnyTemplate, Template
 
 
 def write_sheet(
-    pdf_path: str | Path, template: Template, content: SheetContent, plan: PlanPage | None = None, copies: int = 1
+    pdf_path: str | Path,
+    template: Template | None,
+    content: SheetContent,
+    plan: PlanPage | None = None,
+    copies: int = 1,
 ) -> Manifest:
     """Write SHEET.pdf and SHEET.json beside it. `plan` becomes the last page; `copies` repeats the page with the piece,
-    and is refused for a template with tiles, which has a page for each tile.
+    and is refused for a template with tiles, which has a page for each tile. Without a template only SHEET.json is.
     """
+    if template is None:
+        if Path(pdf_path).suffix != ".json":
+            expected = "a file name that ends in .json, since this print has no page"
+            raise Refused(expected, f'"{pdf_path}"', "name it PRINT.json, or a template for a page")
+        size_mm = content.piece.size_mm
+        manifest = content.manifest(PageLayout(size_mm), None, (0.0, 0.0, *size_mm))
+        write_atomically(Path(pdf_path), dump_manifest(manifest))
+        return manifest
     pdf_path = check_pdf_path(pdf_path)
     if template.tiles is None:
         page = lay_out_page(template, content)

@@ -179,7 +179,7 @@ def _facts(scene: Scene, settings: SceneSettings) -> list[tuple[str, str]]:
         )
         facts.append(("piece", f"{placement['family']}, {size}, facing {SIDE_NAMES[side]} ({side}): {fit}"))
         readable = f"unreadable in {scene.unreadable_share:.0%} of views"
-        facts.append(("markers", f"{scene.piece.marker_mm:.1f} mm, {readable}"))
+        facts.append(("markers", f"{scene.piece.marker_mm:.1f} mm, {readable}" if scene.piece.markers else "none"))
     else:
         facts.append(("piece", "not placed" if isinstance(scene, UnplacedScene) else f"{size}: {placement['reason']}"))
     if isinstance(scene, TextureScene):

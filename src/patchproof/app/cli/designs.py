@@ -16,6 +16,9 @@ def import_picture(
     out: Annotated[Path, Option(help="Folder for the run, or for the runs.")],
     resume: Annotated[bool, Option("--resume", help="Of a folder: keep the runs that are finished.")] = False,
     overwrite: Overwrite = False,
+    as_printed: Annotated[
+        str | None, Option(help="It is printed already, in this size in mm, such as 594x841: no page, no markers.")
+    ] = None,
     draft: Annotated[bool, Option("--draft", help="A first look: promised from few views.")] = False,
     promise: Annotated[int | None, Option(min=8, help="Views to promise from; of under 400: a draft.")] = None,
     device: Device = "cpu",
@@ -35,6 +38,10 @@ def import_picture(
         warn(loaded.warnings)
         options: dict[str, Any] = {"promise": PromiseOptions(views), "compute": Compute(device, jobs or 1)}
         options |= {"overwrite": overwrite, "progress": bar}
+        if as_printed is not None:
+            if picture.is_dir():
+                raise BadParameter("is of one picture, not of a folder", param_hint="--as-printed")
+            options["as_printed"] = console.pair_of(as_printed, "--as-printed")
         if picture.is_dir():
             runs = import_folder(picture, loaded, out, resume=resume, **options)
         else:

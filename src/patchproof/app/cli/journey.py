@@ -164,7 +164,7 @@ def sheet(
 
 
 def reprint(
-    pdf: Annotated[Path, Argument(help="A sheet's PDF.")],
+    pdf: Annotated[Path, Argument(help="A sheet's PDF, or the manifest of a print without a page.")],
     n: Annotated[int, Option("--n", min=1, help="Photographs to take.")],
     out: Annotated[Path, Option(help="Folder for the photographs.")],
     run: Annotated[Path | None, Option(help="The run it was made from; none for blank, chart and board pages.")] = None,
@@ -221,6 +221,9 @@ def verify(
     ruler_mm: Annotated[str | None, Option(help="The printed rulers as measured, e.g. 97.1x97.3 (x, y).")] = None,
     camera: Annotated[str | None, Option(help="The camera that took them: a camera file or its name.")] = None,
     boxes: Annotated[Path | None, Option(help="The object's boxes in photographs (COCO JSON), for detectors.")] = None,
+    corners: Annotated[
+        Path | None, Option(help="The design's four corners in photographs without markers (CSV or COCO JSON).")
+    ] = None,
     require: Annotated[
         Literal["kept", "helps"] | None,
         Option(
@@ -248,7 +251,7 @@ def verify(
     with progress() as bar:
         ruler = console.pair_of(ruler_mm, "--ruler-mm") if ruler_mm else None
         options: dict[str, Any] = {"models": console.names_of(models), "controls": controls, "run": run, "trust": trust}
-        options |= {"capture": CaptureInfo(camera, scan_dpi, ruler, boxes), "ledger_photos": ledger}
+        options |= {"capture": CaptureInfo(camera, scan_dpi, ruler, boxes, corners), "ledger_photos": ledger}
         options |= {"compute": Compute(jobs=jobs or 1, cluster=cluster), "resume": resume, "overwrite": overwrite}
         report = verify_photos(photos, sheet, out, **options, progress=bar)
     say(*verdict_lines(report), f"report: {out / 'report.html'}")

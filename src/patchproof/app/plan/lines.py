@@ -67,6 +67,8 @@ def _resolution_lines(views: Resolution) -> list[str]:
 
 
 def _marker_lines(markers: Markers) -> list[str]:
+    if not markers.printed_mm:
+        return ["  none: photographs are located by the design's corners"]
     note = "" if markers.printed_mm > 0.95 * markers.needed_mm else " (all that page, object or blank allows)"
     return [
         f"  needed {markers.needed_mm:.1f} mm ({PX_PER_MODULE:g} px per module at the {READABLE_SHARE:.0%} point of "

@@ -1,0 +1,229 @@
+"""Prints without markers, located by the corners of their design: named exactly or not, and where that breaks."""
+
+from __future__ import annotations
+
+import json
+from contextlib import closing
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import synthetic_photos as paper
+from console import command
+from PIL import Image
+from pypdfium2 import PdfDocument
+
+from patchproof.app.verify import CaptureInfo, verify
+from patchproof.base.errors import Refused
+from patchproof.base.geometry import apply_homography, rect_corners
+from patchproof.channel.printer import load_printer
+from patchproof.evidence.camera import pinhole_photo
+from patchproof.evidence.corner_files import CORNER_SIGMA_PX, corners_csv, corners_of_photo, load_corners
+from patchproof.evidence.measure import measure
+from patchproof.evidence.ranges import promised_ranges
+from patchproof.evidence.surface import printed_colors, surface_of
+from patchproof.optimizer.imported_design import import_patch
+from patchproof.optimizer.promise import PromiseOptions
+from patchproof.photo.corners import DesignCorners
+from patchproof.photo.read import Photo
+from patchproof.reprints.reprint import reprint
+from patchproof.reprints.run_sheet import sheet as sheet_of
+from patchproof.sheets.content import SheetContent
+from patchproof.sheets.manifest import Manifest, load_manifest
+from patchproof.sheets.page import refuse_larger_than_page
+from patchproof.sheets.template import load_template, page_template
+from patchproof.sheets.write import write_sheet
+from test_optimize import scene_with, toml
+
+SIZE_PX, DRAFT = (480, 360), PromiseOptions(views=8, controls=("bare",))
+PX_FROM_MM = paper.view(25, 15, 480, size_px=SIZE_PX)
+CORNERS_PX = apply_homography(PX_FROM_MM, rect_corners(paper.DESIGN_MM))
+DIRECTIONS = np.array([[1, 1], [-1, 1], [1, -1], [1, 0.2]]) / 2**0.5
+
+
+def without_markers(design) -> Manifest:
+    data = paper.make_manifest(design=design).model_dump()
+    return Manifest.model_validate(data | {"markers": (), "settings": {"sheet": {"markers": False}}})
+
+
+def design_of(seed: int) -> np.ndarray:
+    return (255 * paper.noisy_design(seed)).astype(np.uint8)
+
+
+def colors_of(design):
+    return printed_colors(design, surface_of(without_markers(design)), load_printer("coated"))
+
+
+@pytest.fixture(scope="module")
+def photo():
+    """A photograph of the piece as the promise's printer prints it, before gray."""
+    page = np.full((2000, 1750, 3), 0.2, np.float32)
+    page[600:, 350:] = colors_of(design_of(0)).design.repeat(10, 0).repeat(10, 1)
+    return paper.photograph(page, PX_FROM_MM, SIZE_PX, blur_px=0.8, noise=0.004, fine=2)
+
+
+def entry_of(srgb, corners_px, design=None, sigma_px=CORNER_SIGMA_PX):
+    design = design_of(0) if design is None else design
+    surface, promised = surface_of(without_markers(design)), colors_of(design)
+    corners = None if corners_px is None else DesignCorners(np.array(corners_px), sigma_px)
+    view = pinhole_photo(Photo(srgb, None), None)
+    return measure(view, "a.jpg", surface, promised, promised_ranges(()), with_pictures=False, corners=corners).entry
+
+
+@pytest.mark.parametrize("off_px", [0, 1, 3, 10])
+def test_corners_that_are_off_are_corrected_by_the_design(photo, off_px):
+    """Up to 7 % of its side here, of 135 px; beyond 15 % see below."""
+    entry = entry_of(photo, CORNERS_PX + off_px * DIRECTIONS)
+    assert entry.status == "measured" and entry.located == "corners" and entry.markers_found == 0
+    found = apply_homography(np.array(entry.geometry.homography_px_from_mm), rect_corners(paper.DESIGN_MM))
+    error_px = np.linalg.norm(found - CORNERS_PX, axis=1).max()
+    assert error_px < 0.7 and error_px / entry.geometry.px_per_mm < entry.geometry.corner_uncertainty_mm
+    assert 0.4 < entry.geometry.blur_px < 1.5
+    assert entry.geometry.contrast == pytest.approx(0.8, rel=0.1), "of light 0.8 on paper, read from the design"
+
+
+@pytest.mark.parametrize("wrong", ["far off", "another corner first", "another design", "one color"])
+def test_what_the_corners_do_not_show_is_said(photo, wrong):
+    corners = {"far off": CORNERS_PX + 40 * DIRECTIONS, "another corner first": np.roll(CORNERS_PX, 1, 0)}
+    design = {"another design": design_of(5), "one color": np.full((140, 140, 3), 90, np.uint8)}
+    seen, sigma_px = (np.full_like(photo, 90), 0.5) if wrong == "one color" else (photo, CORNER_SIGMA_PX)
+    entry = entry_of(seen, corners.get(wrong, CORNERS_PX), design.get(wrong), sigma_px)
+    assert (entry.status, entry.code) == ("rejected", "other_design") and entry.color is None
+
+
+def test_without_corners_nothing_says_where_it_is(photo):
+    entry = entry_of(photo, None)
+    assert (entry.status, entry.code) == ("rejected", "no_corners") and "--corners" in entry.remark.advice
+
+
+def test_a_sheet_without_markers_says_so_in_its_settings():
+    with pytest.raises(ValueError, match="it has no markers"):
+        Manifest.model_validate(paper.make_manifest().model_dump() | {"markers": ()})
+
+
+def coco(path, corners, size=(480, 360), **more):
+    """COCO JSON with a polygon, or keypoints if `more` says so, in a.jpg."""
+    numbers = np.round(corners, 3).ravel().tolist()
+    image = {"id": 1, "file_name": "s\\a.jpg", "width": size[0], "height": size[1]}
+    annotation = {"image_id": 1, "segmentation": [numbers]} | more
+    path.write_text(json.dumps({"images": [image], "annotations": [annotation, {"image_id": 1, "bbox": [0, 0, 1, 1]}]}))
+    return path
+
+
+def test_corners_are_read_from_csv_and_coco(tmp_path):
+    picture = tmp_path / "a.jpg"
+    exif = Image.Exif()
+    exif[0x0112] = 6  # stored lying, shown upright: 480 × 360
+    Image.new("RGB", (360, 480)).save(picture, exif=exif)
+    (tmp_path / "c.csv").write_text(corners_csv({"s/a.jpg": CORNERS_PX}))
+    keypoints = [v for x, y in CORNERS_PX.tolist() for v in (x, y, 2)]
+    for path, precision in (
+        (tmp_path / "c.csv", 0.006),
+        (coco(tmp_path / "p.json", CORNERS_PX), 0.001),
+        (coco(tmp_path / "k.json", CORNERS_PX, keypoints=keypoints), 0.001),
+        (coco(tmp_path / "h.json", CORNERS_PX / 2, size=(240, 180)), 0.001),
+    ):
+        corners = load_corners(path)
+        for name in ("s/a.jpg", "a.jpg", "elsewhere/a.jpg"):
+            assert corners_of_photo(corners, name, picture).px == pytest.approx(CORNERS_PX, abs=precision)
+        assert corners_of_photo(corners, "b.jpg", picture) is None
+    with pytest.raises(Refused, match="upright, 480 × 360 pixels, got corners in a picture of 360 × 480"):
+        corners_of_photo(load_corners(coco(tmp_path / "t.json", CORNERS_PX, size=(360, 480))), "a.jpg", picture)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("a.jpg,0,0,9,0,9,9,0,9", "that begins with"),
+        ("HEAD\na.jpg,0,0,9,0,9,9", "3 points of a.jpg"),
+        ("HEAD\na.jpg,0,0,9,0,9,nan,0,9", "not convex"),
+        ("HEAD\na.jpg,0,0,9,0,x,9,0,9", "eight numbers"),
+        ("HEAD\na.jpg,9,0,0,0,0,9,9,9", "mirrored"),
+        ("HEAD\na.jpg,0,0,9,9,9,0,0,9", "not convex"),
+        ("HEAD\na.jpg,0,0,9,0,9,9,0,9\na.jpg,0,0,9,0,9,9,0,9", "two rows of a.jpg"),
+    ],
+)
+def test_what_is_not_four_corners_is_refused(tmp_path, text, message):
+    path = tmp_path / "c.csv"
+    path.write_text(text.replace("HEAD", "file,x1,y1,x2,y2,x3,y3,x4,y4"))
+    with pytest.raises(Refused, match=message):
+        load_corners(path)
+    with pytest.raises(Refused, match=r"2.5 points|4.5 points|four points"):
+        load_corners(coco(tmp_path / "p.json", CORNERS_PX, segmentation=[[0, 0, 9, 0, 9]]))
+
+
+@pytest.fixture(scope="module")
+def printed(tmp_path_factory):
+    """A print that exists, larger than its scene's page: run/, print.json, and photographs with corners.csv."""
+    folder = tmp_path_factory.mktemp("printed")
+    toml(folder / "scene.toml", camera__photo_px=[480, 360])
+    run = import_patch(design_of(0), folder / "scene.toml", folder / "run", as_printed=(160, 160), promise=DRAFT)
+    sheet_of(run, folder / "print.json")
+    reprint(folder / "print.json", run, 4, folder / "photos", sessions=2)
+    return folder, run
+
+
+def judged(folder, corners, out):
+    options = {"models": ["module:fake_networks.red_against_blue"], "ledger_photos": 2}
+    capture = CaptureInfo(corners=corners)
+    return verify(folder / "photos", folder / "print.json", folder / out, capture=capture, **options)
+
+
+def test_a_print_that_exists_is_promised_photographed_and_judged(printed):
+    folder, run = printed
+    manifest, text = load_manifest(folder / "print.json"), (folder / "photos" / "corners.csv").read_text()
+    assert manifest.markers == () and manifest.page_mm == manifest.cut_mm[2:] == manifest.ruler_mm == (160, 160)
+    assert (manifest.design.pixels() == run.design).all() and run.scene.sheet_id == manifest.sheet_id
+    rows = text.splitlines()
+    (folder / "some.csv").write_text("\n".join([rows[0], *rows[1:4], rows[4].replace("photo", "other")]))
+    report = judged(folder, folder / "some.csv", "report")
+    assert [photo.status for photo in report.photos] == ["measured"] * 3 + ["rejected"]
+    assert report.photos[3].code == "no_corners" and report.summary.judged == 3
+    assert any("corners of 2 other" in line or "corners of 1 other" in line for line in report.summary.left_out)
+    assert "3 photographs were located by the design alone" in "".join(report.summary.not_measured.values())
+    data = json.loads((folder / "report" / "coco.json").read_text())
+    assert {a["attributes"]["located"] for a in data["annotations"] if "attributes" in a} == {"corners"}
+    assert "named corners" in (folder / "report" / "report.html").read_text()
+    assert json.loads((folder / "report" / "report.json").read_text())["photos"][0]["located"] == "corners"
+    for corners, message in (("c.csv", "corners of these photographs"),):
+        (folder / corners).write_text(corners_csv({"x.jpg": CORNERS_PX}))
+        with pytest.raises(Refused, match=message):
+            judged(folder, folder / corners, "none")
+
+
+def test_corners_outside_of_the_picture_are_said(printed):
+    folder = printed[0]
+    head, first, *_ = (folder / "photos" / "corners.csv").read_text().splitlines()
+    name = first.split(",")[0]
+    (folder / "out.csv").write_text(f"{head}\n{name},-90,0,300,0,300,300,0,300")
+    photo = judged(folder, folder / "out.csv", "outside").photos[0]
+    assert (photo.code, photo.remark.figure) == ("no_corners", 90) and "480 × 360" in photo.remark.advice
+
+
+@pytest.mark.parametrize("size", ["1x1", "1e9x1e9"])
+def test_absurd_sizes_are_refused(printed, size, capsys):
+    folder, _ = printed
+    picture = folder / "p.png"
+    Image.fromarray(design_of(0)).save(picture)
+    assert command("import", picture, folder / "scene.toml", "--as-printed", size, "--out", folder / "absurd") != 0
+    assert "Expected" in capsys.readouterr().err and not (folder / "absurd").exists()
+
+
+def test_a_page_without_markers_keeps_its_cut_its_rulers_and_the_design_s_pixels(tmp_path):
+    scene, bare = scene_with(tmp_path), scene_with(tmp_path, sheet__markers=False)
+    assert scene.piece.markers and not bare.piece.markers and bare.unreadable_share == 0.0
+    assert scene.sheet_id != bare.sheet_id and "markers" not in scene.settings.model_dump()["sheet"]
+    content = SheetContent(bare.piece, bare.sheet_id, "design", design_of(0), settings=bare.settings.model_dump())
+    manifest = write_sheet(tmp_path / "b.pdf", load_template("a4"), content)
+    with_markers = write_sheet(tmp_path / "m.pdf", load_template("a4"), replace(content, piece=scene.piece))
+    assert manifest.markers == () and with_markers.markers and with_markers.cut_mm == manifest.cut_mm
+    assert (manifest.design.pixels() == design_of(0)).all(), "none is white for a marker"
+    with closing(PdfDocument(tmp_path / "b.pdf")) as pdf:
+        assert "100" in pdf[0].get_textpage().get_text_range(), "the rulers' digits"
+    for template, message in (("a4_tiles", "markers on a piece in tiles"), ("none", "a print of 5 mm to 20 m")):
+        with pytest.raises(Refused, match=message):
+            refuse_larger_than_page(page_template(template), replace(bare.piece, size_mm=(4.0, 250.0)))
+    with pytest.raises(Refused, match="takes markers"):
+        bare.settings.changed(sheet={"template": "none", "markers": True})
+    with pytest.raises(Refused, match="ends in"):
+        write_sheet(tmp_path / "n.pdf", None, content)
