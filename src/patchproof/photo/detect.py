@@ -14,13 +14,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence, Set
 from dataclasses import dataclass, replace
+from functools import lru_cache, partial
 
 import cv2
 import numpy as np
 
 from patchproof.base.color import LINEAR_FROM_CODE, LUMINANCE
 from patchproof.base.input import remaining_seconds
-from patchproof.base.resample import downscale
 from patchproof.photo.edges import Borders, fit_borders
 from patchproof.photo.limits import count_squares
 from patchproof.photo.rectify import region_around
@@ -33,12 +33,14 @@ UPSCALE_BELOW_PX = 4_000_000
 LARGEST_LEVEL_PX = 25_000_000  # searched in one level: a second of work and 0.3 GB; larger pictures are halved
 MOST_SQUARES = 2000  # photographs have some hundreds at most
 _SQUARE_S = 0.004  # to examine one, which cannot be interrupted
-MIRROR_PX = 3000  # longer side of the picture that is searched for a mirrored sheet
 DARK_CODE = 70  # median code value below which local contrast helps; in bright photos it hurts sharp markers
 # Margin of light about a marker's rough corners: `edges` may move borders by 1 px and 0.6 modules (of 7 in a marker),
 # and samples 10 px farther.
 _MARGIN_PX, _MARGIN_SHARE = 16.0, 0.2
 SMALLEST_MARKER_PX = 9.0  # side at its level: 7 modules of 1.3 px are the smallest that has been read
+# Of a side: the detector also tries squares inside, as of a marker in a quiet zone or shadow; one had 0.55
+_INSETS = (1.0, 0.93, 0.86, 0.79, 0.72, 0.66, 0.6, 0.54)
+_LEAST_CONTRAST_CODES, _MOST_BORDER_ERRORS = 6, 0.4  # of a square that can be a marker
 # A reduced picture is searched with one window of the detector's threshold, a full one with all three, which takes
 # twice the time: markers missed with one are found at their predicted places, or at a finer level.
 _REDUCED_WINDOW_PX = 5
@@ -107,8 +109,19 @@ def fit_detections(
 
 def is_mirrored(srgb: np.ndarray, expected: Ids, dictionary: str = DICTIONARY) -> bool:
     """True if the flipped picture shows the sheet: selfie cameras and scans through the back mirror it."""
-    mirrored = np.ascontiguousarray(downscale(srgb, MIRROR_PX)[:, ::-1])
-    return bool(find_markers(mirrored, expected, frozenset(), dictionary).markers)
+    mirrored = np.ascontiguousarray(srgb[:, ::-1])
+    if not _is_large(srgb):
+        return bool(find_markers(mirrored, expected, frozenset(), dictionary).markers)
+    detections: Detections = {}
+    for level in pyramid_levels(mirrored, full_region(mirrored)):
+        if level.scale < 1:
+            search_level(mirrored, full_region(mirrored), level, aruco_dictionary(dictionary), detections)
+    return bool(fit_detections(mirrored, detections, expected, dictionary).markers)
+
+
+def _is_large(picture: np.ndarray) -> bool:
+    """True for pictures whose full size is searched in linear light with one window only, which takes a third."""
+    return picture.shape[0] * picture.shape[1] > UPSCALE_BELOW_PX
 
 
 def is_plausible_quad(corners: np.ndarray) -> bool:
@@ -136,13 +149,15 @@ def pyramid_levels(srgb: np.ndarray, region: ImageRegion, coarsest_px: int = COA
     for n in range(halvings, 0, -1):
         yield Level(0.5**n, light_picture, reduced[n])
     yield Level(1.0, light_picture)
-    yield Level(1.0, code_picture)
+    large = _is_large(srgb[region])
+    fallback = partial(Level, 0.5, reduced=reduced[1]) if large and halvings else partial(Level, 1.0)
+    yield fallback(code_picture)
     codes = code_picture
     part, step = srgb[region], max(1, max(srgb.shape) // 512)
     if float(np.median(code_picture(np.ascontiguousarray(part[::step, ::step])))) < DARK_CODE:
         codes = contrast_picture
-        yield Level(1.0, contrast_picture)
-    if part.shape[0] * part.shape[1] < UPSCALE_BELOW_PX:
+        yield fallback(contrast_picture)
+    if not large:
         yield from (Level(2.0, to_gray) for to_gray in (light_picture, codes))
 
 
@@ -217,7 +232,7 @@ def _detect(
     also squares in which none is read (None).
     """
     settings = detector_settings()
-    if is_reduced:
+    if is_reduced or _is_large(picture):
         settings.adaptiveThreshWinSizeMin = settings.adaptiveThreshWinSizeMax = _REDUCED_WINDOW_PX
     settings.minDistanceToBorder = 0
     settings.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
@@ -236,13 +251,58 @@ def _detect(
 def detect_markers(picture: np.ndarray, aruco, settings: cv2.aruco.DetectorParameters):
     """OpenCV's (corners, ids or None, other squares) of one uint8 gray picture; raises `PhotoRejected("too_costly")` if
     it shows so many possible markers that the detector would not end in time.
+
+    OpenCV compares a square with every code of the dictionary, which takes a millisecond: 20 s for a block design. So
+    it gets a dictionary of one code first, and then one of the codes that any of the squares resembles.
     """
     max_squares = int(min(MOST_SQUARES, remaining_seconds() / _SQUARE_S))
     squares = count_squares(picture, settings.minMarkerPerimeterRate * max(picture.shape), max_squares)
     if squares > max_squares:
         advice = f"it shows {squares} squares that could be markers: photograph less of that pattern"
         raise PhotoRejected("too_costly", squares, max_squares, advice)
-    return cv2.aruco.ArucoDetector(aruco, settings).detectMarkers(picture)
+    kind = aruco.markerSize, aruco.maxCorrectionBits
+    one = cv2.aruco.Dictionary(aruco.bytesList[:1].copy(), *kind)
+    corners, ids, others = cv2.aruco.ArucoDetector(one, settings).detectMarkers(picture)
+    similar = _similar_ids(picture, np.array([*corners, *others], float).reshape(-1, 4, 2), aruco)
+    if not set(similar) - {0}:
+        return corners, ids, others
+    some = cv2.aruco.Dictionary(aruco.bytesList[similar].copy(), *kind)
+    corners, ids, others = cv2.aruco.ArucoDetector(some, settings).detectMarkers(picture)
+    return corners, None if ids is None else np.array(similar)[np.asarray(ids).ravel()], others
+
+
+def _similar_ids(picture: np.ndarray, quads: np.ndarray, aruco) -> list[int]:
+    """Ids whose codes resemble what a gray picture shows within corners Q×4×2, or within the squares round their middle
+    that the detector tries, too.
+    """
+    size = aruco.markerSize
+    side, codes = size + 2, _codes(aruco.bytesList.tobytes(), size)
+    cells = (np.indices((side, side))[::-1].reshape(2, -1).T + 0.5) / side - 0.5
+    corners = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]], np.float32)
+    is_border = np.abs(cells).max(1) > 0.5 - 1 / side
+    rows = []
+    for quad in quads.astype(np.float32):
+        to_px = cv2.getPerspectiveTransform(corners, quad)
+        rows.append(cv2.perspectiveTransform(np.concatenate([inset * cells for inset in _INSETS])[None], to_px)[0])
+    if not rows:
+        return []
+    px = np.array(rows, np.float32)
+    light = cv2.remap(picture, px, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).reshape(-1, side * side)
+    low, high = np.percentile(light, (5, 95), axis=1)
+    bits = light > (low + high)[:, None] / 2
+    bits = bits[(high - low > _LEAST_CONTRAST_CODES) & (bits[:, is_border].mean(1) < _MOST_BORDER_ERRORS)]
+    wrong = size * size - (2.0 * bits[:, ~is_border] - 1) @ codes
+    likely = (wrong <= 2 * (aruco.maxCorrectionBits + 1)).any(0)
+    return np.unique(np.flatnonzero(likely) % len(aruco.bytesList)).tolist()
+
+
+@lru_cache(maxsize=4)
+def _codes(data: bytes, size: int) -> np.ndarray:
+    """The inner cells of a dictionary's codes, 1 for paper and -1 for ink: size² × 4N, all in one turn after another."""
+    every = np.frombuffer(data, np.uint8).reshape(-1, -(-size * size // 8), 4)
+    bits = [cv2.aruco.Dictionary.getBitsFromByteList(code[None], size) for code in every]
+    turned = np.concatenate([np.rot90(bits, turn, (1, 2)) for turn in range(4)])
+    return 2.0 * turned.reshape(-1, size * size).T - 1
 
 
 def fit_marker_borders(srgb: np.ndarray, rough: np.ndarray, cells: np.ndarray) -> list[Borders]:

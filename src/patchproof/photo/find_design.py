@@ -1,0 +1,319 @@
+"""Find a print by its own design in a photograph: no markers, nobody who names corners.
+
+In: uint8 sRGB pixels, the design's pixels, its size on the page. Out: `DesignCorners` with their standard deviation, or
+a `PhotoRejected` with the deciding figure. Two sources propose places: SIFT features of the design, drawn at several
+sizes, whose matches vote for a place, size and angle (blocks look alike, so that a feature's own match is often wrong);
+and, where these fail, the correlation of a small design with the photograph over sizes, angles and slants, which
+smooth designs need. Each place is refined on intensities with their surroundings subtracted, per channel under gain
+and offset, since prints and phones change tone and color. A place is accepted by its correlation at the resolution of
+the photograph, in units of what chance gives a design of so much structure: other pictures fit smooth designs well.
+Left out on purpose: bent paper, prints smaller than `SMALLEST_PRINT_PX` in the picture of `SEARCHED_PX` that is
+searched, and smooth prints turned by more than 50 degrees, whose templates would double the time.
+
+Sources: Lowe, Distinctive Image Features from Scale-Invariant Keypoints, IJCV 2004 (features, votes); Barath et al.,
+MAGSAC++, CVPR 2020; Baker and Matthews, Lucas-Kanade 20 Years On, IJCV 2004 (inverse compositional refinement).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from patchproof.base.geometry import apply_homography, fit_homography, rect_corners
+from patchproof.base.resample import downscale, halving_pyramid, index_homography
+from patchproof.photo.corners import DesignCorners
+from patchproof.photo.detect import is_plausible_quad
+from patchproof.photo.known_page import is_in_picture
+from patchproof.photo.rejection import PhotoRejected
+
+SEARCHED_PX = 1600  # longer side of the picture in which places are proposed
+SMALLEST_PRINT_PX = 60.0  # of the design's shorter side there
+LEAST_LIKENESS, LEAST_SIGNIFICANCE = 0.6, 6.0
+_FEATURE_SIZES_PX = (64, 128, 256, 512)  # of the drawn design's longer side
+_NEIGHBORS = 3  # photograph's features that may be a feature of the design
+_MOST_MATCHES = 2000
+_VOTE_SHARE, _VOTE_LOG_SIZE, _VOTE_RAD = 0.25, 0.4, 0.5  # matches that agree: of the print's side, size, angle
+_LEAST_VOTES = 4
+_MOST_PLACES = 8  # of each source, refined
+_REFINED_PX = (24, 48, 128)  # of the design's longer side, from coarse to fine
+_SURROUNDINGS = 1 / 6  # of the longer side: standard deviation of the mean that is subtracted
+_STEPS = 30
+_TEMPLATE_PX, _TEMPLATE_STEP = 24, 1.2
+_TURNS_DEG, _SLANTS = (0, -15, 15, -30, 30, -45, 45), (1.0, 0.75, 0.55)
+_NOT_FOUND_ADVICE = (
+    "the design was not found: show all of it, flat and sharp, on a twentieth of the picture's width or more, or name "
+    "its corners in --corners FILE"
+)
+_SMALL_ADVICE = "the design is too small to be found with certainty: come closer"
+_MIRRORED_ADVICE = "the photo is mirrored: switch off the camera's mirror setting and save it again"
+_SEVERAL_ADVICE = "more than one print of the design is in view: photograph one at a time"
+
+
+@dataclass(frozen=True)
+class FoundPlace:
+    """A place of the design: its corners 4×2 px, correlation with the photograph there, the same in units of chance,
+    and the standard deviation of a corner's coordinate in px.
+    """
+
+    corners_px: np.ndarray
+    likeness: float
+    significance: float
+    sigma_px: float
+
+    @property
+    def accepted(self) -> bool:
+        """True if no other picture looks so much like the design."""
+        return self.likeness > LEAST_LIKENESS and self.significance > LEAST_SIGNIFICANCE
+
+    def overlaps(self, other: FoundPlace) -> bool:
+        """True if the middle of either lies in the other."""
+        pairs = (self.corners_px, other.corners_px), (other.corners_px, self.corners_px)
+        return any(cv2.pointPolygonTest(a.astype(np.float32), b.mean(0).tolist(), False) > 0 for a, b in pairs)
+
+
+def find_design(srgb: np.ndarray, design: np.ndarray, size_mm: tuple[float, float]) -> DesignCorners:
+    """Find the one print of a design (uint8 H×W×3, `size_mm` wide and high) in a uint8 photograph.
+
+    Raises `PhotoRejected`: "no_corners" without a print, "too_small", "several_sheets", "mirrored".
+    """
+    places = find_places(srgb, design, size_mm)
+    found = [place for place in places if place.accepted]
+    if not found:
+        mirrored = find_places(srgb, np.ascontiguousarray(design[:, ::-1]), size_mm, by_templates=False)
+        if any(place.accepted for place in mirrored):
+            raise PhotoRejected("mirrored", None, None, _MIRRORED_ADVICE)
+        best = max((place.likeness for place in places), default=0.0)
+        raise PhotoRejected("no_corners", best, LEAST_LIKENESS, _NOT_FOUND_ADVICE)
+    if len(found) > 1:
+        raise PhotoRejected("several_sheets", len(found), 1, _SEVERAL_ADVICE)
+    scale = min(1.0, SEARCHED_PX / max(srgb.shape[:2]))
+    side_px = scale * float(np.sqrt(cv2.contourArea(found[0].corners_px.astype(np.float32))))
+    side_px *= float(np.sqrt(min(size_mm) / max(size_mm)))
+    if side_px < SMALLEST_PRINT_PX:
+        raise PhotoRejected("too_small", side_px, SMALLEST_PRINT_PX, _SMALL_ADVICE)
+    return DesignCorners(found[0].corners_px, found[0].sigma_px, "found")
+
+
+def find_places(
+    srgb: np.ndarray, design: np.ndarray, size_mm: tuple[float, float], by_templates: bool = True
+) -> list[FoundPlace]:
+    """Places of a design in a photograph that do not overlap, the most significant first, accepted or not."""
+    searched = downscale(srgb, SEARCHED_PX)
+    scale = np.array(srgb.shape[1::-1]) / searched.shape[1::-1]
+    refiner = _Refiner(srgb, design, size_mm)
+    places = _distinct(map(refiner.refine, (quad * scale for quad in _places_by_features(searched, design, size_mm))))
+    if by_templates and not (places and places[0].accepted):
+        by_template = (quad * scale for quad in _places_by_templates(searched, design, size_mm))
+        places = _distinct([*places, *map(refiner.refine, by_template)])
+    return places
+
+
+def _distinct(places: Iterable[FoundPlace | None]) -> list[FoundPlace]:
+    kept: list[FoundPlace] = []
+    for place in sorted((p for p in places if p is not None), key=lambda p: -p.significance):
+        if not any(place.overlaps(other) for other in kept):
+            kept.append(place)
+    return kept
+
+
+def _draw(design: np.ndarray, size_mm: tuple[float, float], longer_px: float) -> np.ndarray:
+    """The design in its printed shape with a longer side of `longer_px`; pixels are squares, as printers print them."""
+    width, height = (max(4, round(longer_px * side / max(size_mm))) for side in size_mm)
+    zoom = max(1, -(-2 * max(width, height) // min(design.shape[:2])))
+    large = design if min(design.shape[:2]) >= 2 * max(width, height) else design.repeat(zoom, 0).repeat(zoom, 1)
+    return cv2.resize(large, (width, height), interpolation=cv2.INTER_AREA)
+
+
+def _features(gray: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """SIFT features N×4 (x, y with centers at .5, diameter, angle in radians) and descriptors N×128 (root of L1)."""
+    points, descriptors = cv2.SIFT_create(nfeatures=6000, contrastThreshold=0.02).detectAndCompute(gray, None)
+    if descriptors is None:
+        return np.zeros((0, 4)), np.zeros((0, 128), np.float32)
+    table = [(p.pt[0] + 0.5, p.pt[1] + 0.5, p.size, np.radians(p.angle)) for p in points]
+    return np.array(table), np.sqrt(descriptors / np.maximum(descriptors.sum(1, keepdims=True), 1e-6))
+
+
+def _places_by_features(srgb: np.ndarray, design: np.ndarray, size_mm: tuple[float, float]) -> Iterator[np.ndarray]:
+    """Yield corners 4×2 px, those of most agreeing matches first."""
+    seen, seen_descriptors = _features(cv2.cvtColor(srgb, cv2.COLOR_RGB2GRAY))
+    if len(seen) < 8:
+        return
+    source, target, angles, sizes, quality = [], [], [], [], []
+    matcher = cv2.BFMatcher(cv2.NORM_L2)
+    for longer_px in _FEATURE_SIZES_PX:
+        drawn = cv2.cvtColor(_draw(design, size_mm, longer_px), cv2.COLOR_RGB2GRAY)
+        margin = 8
+        own, own_descriptors = _features(cv2.copyMakeBorder(drawn, *[margin] * 4, cv2.BORDER_REPLICATE))
+        if not len(own):
+            continue
+        pairs = matcher.knnMatch(own_descriptors, seen_descriptors, _NEIGHBORS)
+        mean = float(np.mean([pair[0].distance for pair in pairs]))
+        for pair in pairs:
+            for match in pair:
+                a, b = own[match.queryIdx], seen[match.trainIdx]
+                source.append((a[:2] - margin) / longer_px)
+                target.append(b[:2])
+                angles.append(b[3] - a[3])
+                sizes.append(np.log(b[2] / a[2] * longer_px))
+                quality.append(match.distance / min(pair[-1].distance + 1e-6, mean))
+    best = np.argsort(quality, kind="stable")[:_MOST_MATCHES]
+    if not len(best):
+        return
+    source, target, angle, size = (np.array(v)[best] for v in (source, target, angles, sizes))
+    shape = np.array(size_mm) / max(size_mm)
+    arm = (shape / 2 - source) * np.exp(size)[:, None]
+    cosine, sine = np.cos(angle), np.sin(angle)
+    middle = target + np.column_stack([cosine * arm[:, 0] - sine * arm[:, 1], sine * arm[:, 0] + cosine * arm[:, 1]])
+    apart = np.hypot(*(middle[:, None] - middle).astype(np.float32).transpose(2, 0, 1))
+    agree = apart < _VOTE_SHARE * np.exp(np.minimum(size[:, None], size)).astype(np.float32)
+    agree &= np.abs(size[:, None] - size) < _VOTE_LOG_SIZE
+    agree &= np.cos(angle[:, None] - angle) > np.cos(_VOTE_RAD)
+    for _ in range(_MOST_PLACES):
+        votes = agree.sum(1)
+        leader = int(votes.argmax())
+        if votes[leader] < _LEAST_VOTES:
+            return
+        members = np.flatnonzero(agree[leader])
+        agree[:, members] = False
+        agree[members] = False
+        middle_size = np.exp(np.median(size[members]))
+        homography, _ = cv2.findHomography(
+            source[members], target[members], cv2.USAC_MAGSAC, float(max(2.0, 0.02 * middle_size)), maxIters=2000
+        )
+        corners = rect_corners((0, 0, *shape))
+        quad = None if homography is None else apply_homography(homography, corners)
+        if quad is not None and is_plausible_quad(quad):
+            yield quad
+        turn = np.median(cosine[members]), np.median(sine[members])
+        matrix = middle_size * np.array([[turn[0], turn[1]], [-turn[1], turn[0]]])
+        yield (corners - shape / 2) @ matrix + np.median(middle[members], 0)
+
+
+def _places_by_templates(srgb: np.ndarray, design: np.ndarray, size_mm: tuple[float, float]) -> list[np.ndarray]:
+    """Corners 4×2 px where a small design correlates best with the picture, over sizes, angles and slants."""
+    found: list[tuple[float, np.ndarray]] = []
+    height, width = srgb.shape[:2]
+    longer_px = SMALLEST_PRINT_PX * 0.8 * max(size_mm) / min(size_mm)
+    drawn = _draw(design, size_mm, 4 * _TEMPLATE_PX)
+    while longer_px < 0.95 * max(height, width):
+        scale = _TEMPLATE_PX / longer_px
+        small = cv2.resize(srgb, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        middle = np.array(small.shape[1::-1]) / 2
+        for turn in _TURNS_DEG:
+            matrix = cv2.getRotationMatrix2D(tuple(middle - 0.5), turn, 1.0)
+            turned = cv2.warpAffine(small, matrix, small.shape[1::-1], borderMode=cv2.BORDER_REPLICATE)
+            for slant in _SLANTS:
+                size = max(6, round(drawn.shape[1] / 4 * slant)), max(6, round(drawn.shape[0] / 4))
+                if size[0] >= small.shape[1] or size[1] >= small.shape[0]:
+                    continue
+                template = cv2.resize(drawn, size, interpolation=cv2.INTER_AREA)
+                likeness = cv2.matchTemplate(turned, template, cv2.TM_CCOEFF_NORMED)
+                _, peak, _, (x, y) = cv2.minMaxLoc(likeness)
+                quad = rect_corners((x, y, *size)) - middle
+                angle = np.radians(turn)
+                back = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+                found.append((float(peak), (quad @ back + middle) / scale))
+        longer_px *= _TEMPLATE_STEP
+    found.sort(key=lambda pair: -pair[0])
+    kept: list[np.ndarray] = []
+    for _, quad in found:
+        side = np.ptp(quad, axis=0).max()
+        if all(np.abs(quad - other).max() > 0.25 * side for other in kept):
+            kept.append(quad)
+    return kept[:_MOST_PLACES]
+
+
+class _Refiner:
+    """Refine places of a design on intensities; holds the photograph's pyramid and the design at each size."""
+
+    def __init__(self, srgb: np.ndarray, design: np.ndarray, size_mm: tuple[float, float]):
+        self.levels = halving_pyramid(srgb)
+        self.srgb, self.design, self.size_mm = srgb, design, size_mm
+        self.templates: dict[int, _Template] = {}
+
+    def refine(self, quad: np.ndarray) -> FoundPlace | None:
+        """The refined place; None if it is none that a camera can see."""
+        for longer_px in _REFINED_PX:
+            side_px = float(np.sqrt(abs(cv2.contourArea(quad.astype(np.float32))))) if np.isfinite(quad).all() else 0.0
+            if side_px < 16 or not is_plausible_quad(quad) or not is_in_picture(quad, self.srgb):
+                return None
+            most = max(24, 2 * round(0.5 * side_px * np.sqrt(max(self.size_mm) / min(self.size_mm))))
+            size = min(longer_px, most)
+            template = self.templates.setdefault(size, _Template(_draw(self.design, self.size_mm, size)))
+            level = int(np.clip(np.log2(max(side_px / size, 1)), 0, len(self.levels) - 1))
+            scale = np.array(self.srgb.shape[1::-1]) / self.levels[level].shape[1::-1]
+            refined, likeness, sigma = template.align(self.levels[level], quad / scale)
+            quad = refined * scale
+            if size == most:
+                break
+        if not is_plausible_quad(quad) or not is_in_picture(quad, self.srgb):
+            return None
+        significance = float(np.arctanh(np.clip(likeness, -0.999, 0.999)) * np.sqrt(template.freedom))
+        return FoundPlace(quad, likeness, significance, sigma * float(scale.max()))
+
+
+class _Template:
+    """A drawn design, its surroundings subtracted, with the derivatives of its pixels by a homography's eight terms."""
+
+    def __init__(self, drawn: np.ndarray):
+        self.height, self.width = drawn.shape[:2]
+        self.sigma = _SURROUNDINGS * max(self.width, self.height)
+        codes = self._less_surroundings(drawn)
+        self.weight = codes.std((0, 1)) / max(float(codes.std((0, 1)).sum()), 1e-6)
+        self.codes = codes / np.maximum(codes.std((0, 1)), 1e-3)
+        power = np.abs(np.fft.fft2((self.codes * self.weight).sum(2))) ** 2
+        self.freedom = float(power.sum() ** 2 / max((power**2).sum(), 1e-12))  # independent pixels, as it were
+        half = np.array([self.width, self.height]) / 2
+        self.corners = rect_corners((-1, -1, 2, 2)) * 1.0
+        self.index_from_unit = np.array([[half[0], 0, half[0]], [0, half[1], half[1]], [0, 0, 1.0]])
+        u, v = ((np.arange(n) + 0.5) / n * 2 - 1 for n in (self.width, self.height))
+        u, v = (a[..., None] for a in np.meshgrid(u, v))
+        by_v, by_u = np.gradient(self.codes, axis=(0, 1))
+        by_u, by_v = by_u * half[0], by_v * half[1]
+        along = u * by_u + v * by_v
+        terms = u * by_u, v * by_u, by_u, u * by_v, v * by_v, by_v, -u * along, -v * along
+        self.by_term = np.stack([(t * self.weight).ravel() for t in terms], 1).astype(np.float32)
+        self.hessian = self.by_term.T @ np.stack([t.ravel() for t in terms], 1)
+        self.hessian += 1e-7 * np.trace(self.hessian) / 8 * np.eye(8)
+
+    def _less_surroundings(self, codes: np.ndarray) -> np.ndarray:
+        codes = cv2.GaussianBlur(codes.astype(np.float32), (0, 0), 0.8)
+        codes -= cv2.GaussianBlur(codes, (0, 0), self.sigma, borderType=cv2.BORDER_REPLICATE)
+        return codes - codes.mean((0, 1))
+
+    def align(self, srgb: np.ndarray, quad: np.ndarray) -> tuple[np.ndarray, float, float]:
+        """Refine corners 4×2 px in a picture; with the correlation there and the standard deviation of a corner."""
+        px_from_unit, best = fit_homography(self.corners, quad), (-1.0, quad)
+        for _ in range(_STEPS):
+            index = index_homography(px_from_unit @ np.linalg.inv(self.index_from_unit))
+            flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+            seen = cv2.warpPerspective(srgb, index, (self.width, self.height), None, flags, cv2.BORDER_REPLICATE)
+            seen = self._less_surroundings(seen)
+            seen /= np.maximum(seen.std((0, 1)), 0.5)
+            likeness = float((self.weight * (seen * self.codes).mean((0, 1))).sum())
+            if likeness > best[0]:
+                best = likeness, apply_homography(px_from_unit, self.corners)
+            error = np.clip(seen - likeness * self.codes, -1.5, 1.5)
+            step = np.linalg.solve(self.hessian, self.by_term.T @ error.ravel()) / max(likeness, 0.3)
+            a, b, c, d, e, f, g, h = np.clip(step, -0.2, 0.2)
+            px_from_unit = px_from_unit @ np.linalg.inv([[1 + a, b, c], [d, 1 + e, f], [g, h, 1]])
+            if np.abs(step).max() < 2e-4 or not np.isfinite(px_from_unit).all():
+                break
+        likeness, corners = best
+        noise = np.sqrt(max(1 / max(likeness, 0.1) ** 2 - 1, 0) * self.by_term.shape[0] / 3 / max(self.freedom, 1.0))
+        covariance = np.linalg.inv(self.hessian) * noise**2
+        return corners, likeness, self._corner_sigma(px_from_unit, covariance)
+
+    def _corner_sigma(self, px_from_unit: np.ndarray, covariance: np.ndarray) -> float:
+        """The standard deviation in px of a corner's coordinate, rms over the four."""
+        u, v = self.corners.T
+        zero, one = np.zeros(4), np.ones(4)
+        by_x = np.stack([u, v, one, zero, zero, zero, -u * u, -u * v], 1)
+        by_y = np.stack([zero, zero, zero, u, v, one, -u * v, -v * v], 1)
+        by_corner = np.concatenate([by_x, by_y])
+        variance = float(np.mean(np.einsum("ij,jk,ik->i", by_corner, covariance, by_corner)))
+        unit_px = float(np.sqrt(abs(np.linalg.det(px_from_unit[:2, :2] / px_from_unit[2, 2]))))
+        return max(0.05, unit_px * np.sqrt(max(variance, 0.0)))
