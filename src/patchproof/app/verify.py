@@ -67,6 +67,7 @@ class CaptureInfo:
         ruler_mm: lengths (x, y) of the two printed 100 mm rulers as measured on the print, in millimeters.
         boxes: COCO JSON with the object's box in photographs, for detectors, if the sheet does not tell.
         corners: CSV or COCO JSON with the design's four corners in photographs of a print whose markers cannot be read.
+        find: search photographs without readable markers and named corners for the design itself.
     """
 
     camera: str | Path | None = None
@@ -74,6 +75,7 @@ class CaptureInfo:
     ruler_mm: tuple[float, float] | None = None
     boxes: str | Path | None = None
     corners: str | Path | None = None
+    find: bool = False
 
 
 def verify(
@@ -132,7 +134,7 @@ def verify(
             look_at = lambda entries: None  # noqa: E731  # `capture` showed the answers while they were taken
         boxes = capture.boxes
         options = options_of(sheet, manifest, models, capture.camera, trust)
-        parameters: dict[str, Any] = {"scan_dpi": capture.scan_dpi, "ruler_mm": capture.ruler_mm}
+        parameters: dict[str, Any] = {"scan_dpi": capture.scan_dpi, "ruler_mm": capture.ruler_mm, "find": capture.find}
         options = replace(options, **parameters, controls=controls, ledger_photos=ledger_photos)
         if boxes is not None:
             if manifest.promise is None or not any(model.LOOKS_AT_BOXES for model in options.models):

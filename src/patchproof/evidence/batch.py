@@ -191,7 +191,7 @@ def _measure(task: Task, item: PhotoItem) -> MeasuredPhoto:
     if corners is not None and view.calibrated and task.camera is not None:
         corners = replace(corners, px=task.camera.undistort_points(corners.px, size_px))
     parts = task.surface, task.promised, task.ranges, task.scan_dpi
-    measured = measure(view, item.file, *parts, item.with_pictures, corners)
+    measured = measure(view, item.file, *parts, item.with_pictures, corners, task.find)
     entry, pictures = measured.entry, {}
     # a crop or a screenshot by EXIF or its name, or by a shape that neither cameras nor the promise have
     if measured.counted and entry.code is None and (photo.is_crop or not has_camera_shape(size_px, task.photo_px)):

@@ -77,6 +77,7 @@ def settings_key(manifest: Manifest, options: Options) -> str:
         "scan_dpi": options.scan_dpi,
         "camera": options.camera and options.camera.model_dump(mode="json"),
         "boxes": dict(options.boxes),
+        "find": options.find,
     }
     return value_sha256(settings)
 

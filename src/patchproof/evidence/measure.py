@@ -66,6 +66,7 @@ _OTHER_DPI_ADVICE = (
 )
 _NO_CORNERS_ADVICE = "this print has no markers, and nothing says where it is: name its corners in --corners FILE"
 _PLAIN_ADVICE = "without markers a design without structure cannot be told from another one: print it with markers"
+_UNLOCATED_CODES = ("too_few_markers", "no_corners")
 _HIDDEN_ADVICE = "a corner of the design is covered, folded away or out of the picture: show all of it"
 
 
@@ -92,15 +93,18 @@ def measure(
     scan_dpi: float | None = None,
     with_pictures: bool = True,
     corners: DesignCorners | None = None,
+    find: np.ndarray | None = None,
 ) -> MeasuredPhoto:
-    """Measure one readable photograph; color only if the sheet has `promised` colors. The design's `corners` locate it
-    where no marker can be read.
+    """Measure one readable photograph; color only if the sheet has `promised` colors. Where no marker can
+    be read the design's `corners` locate it, or a search for its pixels `find`.
     """
     size_px, placed = view.srgb.shape[1::-1], None
     try:
         detected, surface = identify_sheet(view.srgb, surface)
     except PhotoRejected as rejection:
-        if corners is None or promised is None or rejection.code not in ("too_few_markers", "no_corners"):
+        if corners is None and find is not None and rejection.code in _UNLOCATED_CODES:
+            corners, rejection = _search(view.srgb, find, surface, rejection)
+        if corners is None or promised is None or rejection.code not in _UNLOCATED_CODES:
             return MeasuredPhoto(PhotoEntry(file=name, status="rejected", remark=Remark.of(rejection)), False)
         from patchproof.photo.corners import place_design
 
@@ -152,6 +156,18 @@ def measure(
         scale = scale if scale is not None and _SCALE_RANGE[0] < _worst(scale) < _SCALE_RANGE[1] else None
         entry = partial(entry, status="measured", scale=scale, remark=remark)
     return MeasuredPhoto(entry(color=color), counted, pictures, light)
+
+
+def _search(
+    srgb: np.ndarray, design: np.ndarray, surface: Surface, rejection: PhotoRejected
+) -> tuple[DesignCorners | None, PhotoRejected]:
+    """The design's corners by its pixels, and the reason for the search; or None and why they were not found."""
+    from patchproof.photo.find_design import find_design
+
+    try:
+        return find_design(srgb, design, surface.rect_mm[2:]), rejection
+    except PhotoRejected as not_found:
+        return None, not_found
 
 
 def identify_sheet(srgb: np.ndarray, surface: Surface) -> tuple[MarkersInView, Surface]:

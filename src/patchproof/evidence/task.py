@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from patchproof.evidence.classify import Judges
 from patchproof.evidence.ranges import PromisedRanges, promised_ranges, promised_side_px
 from patchproof.evidence.surface import PromisedColors, Surface, promised_of, surface_of
@@ -30,7 +32,7 @@ class Options:
     lens distortion. `ruler_mm` are the printed rulers (x, y) as measured by hand. `controls` is a folder of photographs
     of controls. At most `ledger_photos` photographs, evenly spread, go into the gap ledger (0: no ledger). `boxes` are
     those that somebody drew round the object (`boxes.load_boxes`), `corners` the design's that somebody named
-    (`corner_files.load_corners`), by photograph.
+    (`corner_files.load_corners`), by photograph. `find`: search for the design itself where no marker can be read.
     """
 
     models: Sequence[Classifier]
@@ -42,6 +44,7 @@ class Options:
     ledger_photos: int = LEDGER_PHOTOS
     boxes: Mapping[str, DrawnBox] = field(default_factory=dict)
     corners: Mapping[str, NamedCorners] = field(default_factory=dict)
+    find: bool = False
 
 
 @dataclass(frozen=True)
@@ -55,6 +58,7 @@ class Task:
     scan_dpi: float | None
     camera: Camera | None
     photo_px: tuple[int, int] | None  # of the promised photographs
+    find: np.ndarray | None = None  # the design's pixels, to be searched for
 
 
 def task_of(manifest: Manifest, options: Options, judges: Judges | None) -> Task:
@@ -64,4 +68,6 @@ def task_of(manifest: Manifest, options: Options, judges: Judges | None) -> Task
     ranges = promised_ranges(manifest.promise.conditions if manifest.promise else (), promised_side_px(manifest))
     sizes = tuple(sorted({model.input_px for model in judges.models})) if judges else ()
     photo_px = manifest.settings.get("camera", {}).get("photo_px")
-    return Task(surface, promised, ranges, sizes, options.scan_dpi, options.camera, photo_px and tuple(photo_px))
+    camera = options.scan_dpi, options.camera, photo_px and tuple(photo_px)
+    find = manifest.design.pixels() if options.find and manifest.design else None
+    return Task(surface, promised, ranges, sizes, *camera, find)

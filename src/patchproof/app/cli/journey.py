@@ -224,6 +224,7 @@ def verify(
     corners: Annotated[
         Path | None, Option(help="The design's four corners in photographs without markers (CSV or COCO JSON).")
     ] = None,
+    find: Annotated[bool, Option("--find", help="Search for the design itself where no marker can be read.")] = False,
     require: Annotated[
         Literal["kept", "helps"] | None,
         Option(
@@ -251,7 +252,7 @@ def verify(
     with progress() as bar:
         ruler = console.pair_of(ruler_mm, "--ruler-mm") if ruler_mm else None
         options: dict[str, Any] = {"models": console.names_of(models), "controls": controls, "run": run, "trust": trust}
-        options |= {"capture": CaptureInfo(camera, scan_dpi, ruler, boxes, corners), "ledger_photos": ledger}
+        options |= {"capture": CaptureInfo(camera, scan_dpi, ruler, boxes, corners, find), "ledger_photos": ledger}
         options |= {"compute": Compute(jobs=jobs or 1, cluster=cluster), "resume": resume, "overwrite": overwrite}
         report = verify_photos(photos, sheet, out, **options, progress=bar)
     say(*verdict_lines(report), f"report: {out / 'report.html'}")

@@ -1,0 +1,122 @@
+"""A print without markers is found by its design: the smallest that is, and what is rejected by name."""
+
+from __future__ import annotations
+
+import time
+
+import cv2
+import numpy as np
+import pytest
+import synthetic_photos as paper
+
+from patchproof.base.geometry import apply_homography, rect_corners
+from patchproof.channel.printer import load_printer
+from patchproof.evidence.camera import pinhole_photo
+from patchproof.evidence.measure import measure
+from patchproof.evidence.ranges import promised_ranges
+from patchproof.evidence.surface import printed_colors, surface_of
+from patchproof.photo import detect
+from patchproof.photo.find_design import SMALLEST_PRINT_PX, find_design
+from patchproof.photo.read import Photo
+from patchproof.photo.rejection import PhotoRejected
+from patchproof.sheets.markers import aruco_dictionary
+
+SIZE_PX = (480, 360)
+
+
+def blocks(seed: int) -> np.ndarray:
+    """Blocks of few colors, which look alike."""
+    rng = np.random.default_rng(seed)
+    return rng.integers(0, 256, (6, 3), np.uint8)[rng.integers(0, 6, (12, 12))]
+
+
+def smooth(seed: int) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return cv2.resize(rng.integers(0, 256, (5, 5, 3), np.uint8), (64, 64), interpolation=cv2.INTER_CUBIC)
+
+
+def photograph(*prints: tuple[np.ndarray, np.ndarray], seed: int = 0) -> np.ndarray:
+    """Designs at corners 4×2 px on a rough wall: paler, darker, with another tone and less chroma, blurred and noisy."""
+    rng, fine = np.random.default_rng(seed), 3
+    walls = [cv2.resize(rng.uniform(60, 190, (n, n, 3)), SIZE_PX, interpolation=cv2.INTER_CUBIC) for n in (6, 30, 120)]
+    picture = cv2.resize(np.mean(walls, 0), None, fx=fine, fy=fine)
+    for design, corners_px in prints:
+        codes = cv2.resize(design, (240, 240), interpolation=cv2.INTER_NEAREST) / 255.0
+        codes = 255 * (0.12 + 0.7 * (0.6 * codes + 0.4 * codes.mean(2, keepdims=True)) ** 1.4)
+        outline = np.array([[0, 0], [240, 0], [240, 240], [0, 240]], np.float32)
+        to_px = cv2.getPerspectiveTransform(outline - 0.5, (fine * corners_px - 0.5).astype(np.float32))
+        size = picture.shape[1::-1]
+        inside = cv2.warpPerspective(np.ones((240, 240), np.float32), to_px, size)[..., None]
+        picture = picture * (1 - inside) + inside * cv2.warpPerspective(codes, to_px, size, borderMode=1)
+    picture = cv2.GaussianBlur(cv2.resize(picture, SIZE_PX, interpolation=cv2.INTER_AREA), (0, 0), 0.7)
+    return np.clip(picture + rng.normal(0, 2, picture.shape), 0, 255).round().astype(np.uint8)
+
+
+def corners(side_px: float, middle=(230, 180), turn_deg: float = 12.0) -> np.ndarray:
+    """A square of about this side, turned and seen from aside."""
+    quad = side_px * np.array([[-0.5, -0.47], [0.5, -0.53], [0.5, 0.53], [-0.5, 0.47]])
+    c, s = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
+    return quad @ np.array([[c, s], [-s, c]]) + middle
+
+
+def rejection_of(srgb: np.ndarray, design: np.ndarray) -> PhotoRejected:
+    with pytest.raises(PhotoRejected) as caught:
+        find_design(srgb, design, (100.0, 100.0))
+    return caught.value
+
+
+@pytest.mark.parametrize(("design", "side_px"), [(blocks(1), 64), (blocks(2), 170), (smooth(1), 110)])
+def test_a_design_is_found_to_a_pixel(design, side_px):
+    expected = corners(side_px)
+    found = find_design(photograph((design, expected)), design, (100.0, 100.0))
+    assert found.located == "found"
+    off_px = np.abs(found.px - expected)
+    assert off_px.max() < 1 and off_px.max() < 4 * found.sigma_px
+
+
+def test_the_first_bad_size_says_so():
+    trouble = rejection_of(photograph((blocks(1), corners(55))), blocks(1))
+    assert trouble.code == "too_small" and trouble.figure == pytest.approx(55, abs=2)
+    assert trouble.threshold == SMALLEST_PRINT_PX
+
+
+def test_a_print_upside_down_is_found():
+    expected = corners(120, turn_deg=170)
+    assert np.abs(find_design(photograph((blocks(3), expected)), blocks(3), (100.0, 100.0)).px - expected).max() < 1
+
+
+def test_other_designs_mirrored_ones_and_two_prints_are_rejected_by_name():
+    assert rejection_of(photograph((blocks(4), corners(140))), blocks(5)).code == "no_corners"
+    assert rejection_of(photograph((blocks(4)[:, ::-1], corners(140))), blocks(4)).code == "mirrored"
+    two = photograph((blocks(4), corners(110, (110, 170))), (blocks(4), corners(110, (330, 180))))
+    assert rejection_of(two, blocks(4)).code == "several_sheets"
+
+
+def test_a_print_that_was_found_is_measured_like_one_whose_corners_were_named():
+    design = (255 * paper.noisy_design(0)).astype(np.uint8)
+    surface = surface_of(paper.make_manifest(design=design)).without_markers
+    promised = printed_colors(design, surface, load_printer("coated"))
+    page = np.full((2000, 1750, 3), 0.2, np.float32)
+    page[600:, 350:] = promised.design.repeat(10, 0).repeat(10, 1)
+    px_from_mm = paper.view(25, 15, 480, size_px=SIZE_PX)
+    view = pinhole_photo(Photo(paper.photograph(page, px_from_mm, SIZE_PX, blur_px=0.8, noise=0.004, fine=2), None), None)
+    parts = "a.jpg", surface, promised, promised_ranges(())
+    entry = measure(view, *parts, with_pictures=False, find=design).entry
+    assert (entry.status, entry.located) == ("measured", "found")
+    found = apply_homography(np.array(entry.geometry.homography_px_from_mm), rect_corners(paper.DESIGN_MM))
+    assert np.abs(found - apply_homography(px_from_mm, rect_corners(paper.DESIGN_MM))).max() < 0.7
+    other = measure(view, *parts, with_pictures=False, find=blocks(1)).entry
+    assert (other.status, other.code) == ("rejected", "no_corners")
+
+
+def test_squares_without_codes_cost_a_fraction_of_reading_each():
+    """A block design of 40 × 30, which OpenCV compares with 1000 codes square by square."""
+    cells = np.random.default_rng(0).integers(0, 256, (30, 40), np.uint8)
+    picture, aruco = cells.repeat(24, 0).repeat(24, 1), aruco_dictionary(detect.DICTIONARY)
+    seconds = []
+    for read in (detect.detect_markers, lambda *parts: cv2.aruco.ArucoDetector(*parts[1:]).detectMarkers(parts[0])):
+        before = time.process_time()
+        _, ids, squares = read(picture, aruco, detect.detector_settings())
+        seconds.append(time.process_time() - before)
+        assert ids is None and len(squares) > 200
+    assert 3 * seconds[0] < seconds[1]
