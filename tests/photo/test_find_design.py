@@ -32,7 +32,7 @@ def blocks(seed: int) -> np.ndarray:
 
 def smooth(seed: int) -> np.ndarray:
     rng = np.random.default_rng(seed)
-    return cv2.resize(rng.integers(0, 256, (5, 5, 3), np.uint8), (64, 64), interpolation=cv2.INTER_CUBIC)
+    return cv2.resize(rng.integers(0, 256, (8, 8, 3), np.uint8), (64, 64), interpolation=cv2.INTER_CUBIC)
 
 
 def photograph(*prints: tuple[np.ndarray, np.ndarray], seed: int = 0) -> np.ndarray:

@@ -40,7 +40,7 @@ _LEAST_VOTES = 4
 _MOST_PLACES = 8  # of each source, refined
 _REFINED_PX = (24, 48, 128)  # of the design's longer side, from coarse to fine
 _SURROUNDINGS = 1 / 6  # of the longer side: standard deviation of the mean that is subtracted
-_STEPS = 30
+_STEPS, _COLOR_STEPS, _MOST_COLOR_SIGMAS = 30, 10, 2.0
 _TEMPLATE_PX, _TEMPLATE_STEP = 24, 1.2
 _TURNS_DEG, _SLANTS = (0, -15, 15, -30, 30, -45, 45), (1.0, 0.75, 0.55)
 _NOT_FOUND_ADVICE = (
@@ -246,6 +246,10 @@ class _Refiner:
             level = int(np.clip(np.log2(max(side_px / size, 1)), 0, len(self.levels) - 1))
             scale = np.array(self.srgb.shape[1::-1]) / self.levels[level].shape[1::-1]
             refined, likeness, sigma = template.align(self.levels[level], quad / scale)
+            if size in (most, _REFINED_PX[-1]) and likeness > LEAST_LIKENESS:
+                by_color = template.align_colors(self.levels[level], refined)
+                # where a part of a design is plain, mixtures of colors imitate shifts
+                refined = by_color if np.abs(by_color - refined).max() < _MOST_COLOR_SIGMAS * sigma else refined
             quad = refined * scale
             if size == most:
                 break
@@ -253,6 +257,12 @@ class _Refiner:
             return None
         significance = float(np.arctanh(np.clip(likeness, -0.999, 0.999)) * np.sqrt(template.freedom))
         return FoundPlace(quad, likeness, significance, sigma * float(scale.max()))
+
+
+def _moved(px_from_unit: np.ndarray, step: np.ndarray) -> np.ndarray:
+    """Compose a homography with the inverse of a small one."""
+    a, b, c, d, e, f, g, h = np.clip(step, -0.2, 0.2)
+    return px_from_unit @ np.linalg.inv([[1 + a, b, c], [d, 1 + e, f], [g, h, 1]])
 
 
 class _Template:
@@ -275,6 +285,7 @@ class _Template:
         by_u, by_v = by_u * half[0], by_v * half[1]
         along = u * by_u + v * by_v
         terms = u * by_u, v * by_u, by_u, u * by_v, v * by_v, by_v, -u * along, -v * along
+        self.drawn, self.u, self.v = drawn, u, v
         self.by_term = np.stack([(t * self.weight).ravel() for t in terms], 1).astype(np.float32)
         self.hessian = self.by_term.T @ np.stack([t.ravel() for t in terms], 1)
         self.hessian += 1e-7 * np.trace(self.hessian) / 8 * np.eye(8)
@@ -288,24 +299,55 @@ class _Template:
         """Refine corners 4×2 px in a picture; with the correlation there and the standard deviation of a corner."""
         px_from_unit, best = fit_homography(self.corners, quad), (-1.0, quad)
         for _ in range(_STEPS):
-            index = index_homography(px_from_unit @ np.linalg.inv(self.index_from_unit))
-            flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-            seen = cv2.warpPerspective(srgb, index, (self.width, self.height), None, flags, cv2.BORDER_REPLICATE)
-            seen = self._less_surroundings(seen)
-            seen /= np.maximum(seen.std((0, 1)), 0.5)
+            seen = self._seen(srgb, px_from_unit)
             likeness = float((self.weight * (seen * self.codes).mean((0, 1))).sum())
             if likeness > best[0]:
                 best = likeness, apply_homography(px_from_unit, self.corners)
             error = np.clip(seen - likeness * self.codes, -1.5, 1.5)
             step = np.linalg.solve(self.hessian, self.by_term.T @ error.ravel()) / max(likeness, 0.3)
-            a, b, c, d, e, f, g, h = np.clip(step, -0.2, 0.2)
-            px_from_unit = px_from_unit @ np.linalg.inv([[1 + a, b, c], [d, 1 + e, f], [g, h, 1]])
+            px_from_unit = _moved(px_from_unit, step)
             if np.abs(step).max() < 2e-4 or not np.isfinite(px_from_unit).all():
                 break
         likeness, corners = best
         noise = np.sqrt(max(1 / max(likeness, 0.1) ** 2 - 1, 0) * self.by_term.shape[0] / 3 / max(self.freedom, 1.0))
         covariance = np.linalg.inv(self.hessian) * noise**2
         return corners, likeness, self._corner_sigma(px_from_unit, covariance)
+
+    def _seen(self, srgb: np.ndarray, px_from_unit: np.ndarray) -> np.ndarray:
+        """The picture under a homography, its surroundings subtracted, with a standard deviation of 1 by channel."""
+        index = index_homography(px_from_unit @ np.linalg.inv(self.index_from_unit))
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        seen = cv2.warpPerspective(srgb, index, (self.width, self.height), None, flags, cv2.BORDER_REPLICATE)
+        seen = self._less_surroundings(seen)
+        return seen / np.maximum(seen.std((0, 1)), 0.5)
+
+    def align_colors(self, srgb: np.ndarray, quad: np.ndarray) -> np.ndarray:
+        """Refine corners 4×2 px further, with each channel a mixture of the design's and their squares: inks, veils and
+        tone curves move edges between colors by up to a pixel where gain and offset are all that may change.
+        """
+        squares = self._less_surroundings(self.drawn.astype(np.float32) ** 2 / 255)
+        colors = np.concatenate([self.codes, squares / np.maximum(squares.std((0, 1)), 1e-3)], 2)
+        by_v, by_u = np.gradient(colors, axis=(0, 1))
+        by_u, by_v = by_u * (self.width / 2), by_v * (self.height / 2)
+        along = self.u * by_u + self.v * by_v
+        rows = self.u * by_u, self.v * by_u, by_u, self.u * by_v, self.v * by_v, by_v, -self.u * along, -self.v * along
+        by_term = np.stack(rows, -1).reshape(-1, 6, 8).astype(np.float32)
+        colors = colors.reshape(-1, 6)
+        ridge = 1e-3 * len(colors) * np.eye(6)
+        px_from_unit = fit_homography(self.corners, quad)
+        for _ in range(_COLOR_STEPS):
+            seen = self._seen(srgb, px_from_unit).reshape(-1, 3)
+            mixture = np.linalg.solve(colors.T @ colors + ridge, colors.T @ seen)
+            error = np.clip(seen - colors @ mixture, -1, 1) * self.weight
+            slopes = np.einsum("nft,fc->nct", by_term, mixture.astype(np.float32))
+            weighted = (slopes * self.weight[:, None]).reshape(-1, 8)
+            hessian = weighted.T @ slopes.reshape(-1, 8)
+            step = np.linalg.solve(hessian + 1e-7 * np.trace(hessian) * np.eye(8), slopes.reshape(-1, 8).T @ error.ravel())
+            px_from_unit = _moved(px_from_unit, step)
+            if np.abs(step).max() < 2e-4:
+                break
+        moved = apply_homography(px_from_unit, self.corners)
+        return moved if np.isfinite(moved).all() else quad
 
     def _corner_sigma(self, px_from_unit: np.ndarray, covariance: np.ndarray) -> float:
         """The standard deviation in px of a corner's coordinate, rms over the four."""
