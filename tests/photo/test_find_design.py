@@ -36,7 +36,7 @@ def smooth(seed: int) -> np.ndarray:
 
 
 def photograph(*prints: tuple[np.ndarray, np.ndarray], seed: int = 0) -> np.ndarray:
-    """Designs at corners 4×2 px on a rough wall: paler, darker, with another tone and less chroma, blurred and noisy."""
+    """Designs at corners 4×2 px on a rough wall: paler, in another tone, with less chroma, blurred and noisy."""
     rng, fine = np.random.default_rng(seed), 3
     walls = [cv2.resize(rng.uniform(60, 190, (n, n, 3)), SIZE_PX, interpolation=cv2.INTER_CUBIC) for n in (6, 30, 120)]
     picture = cv2.resize(np.mean(walls, 0), None, fx=fine, fy=fine)
@@ -99,7 +99,9 @@ def test_a_print_that_was_found_is_measured_like_one_whose_corners_were_named():
     page = np.full((2000, 1750, 3), 0.2, np.float32)
     page[600:, 350:] = promised.design.repeat(10, 0).repeat(10, 1)
     px_from_mm = paper.view(25, 15, 480, size_px=SIZE_PX)
-    view = pinhole_photo(Photo(paper.photograph(page, px_from_mm, SIZE_PX, blur_px=0.8, noise=0.004, fine=2), None), None)
+    view = pinhole_photo(
+        Photo(paper.photograph(page, px_from_mm, SIZE_PX, blur_px=0.8, noise=0.004, fine=2), None), None
+    )
     parts = "a.jpg", surface, promised, promised_ranges(())
     entry = measure(view, *parts, with_pictures=False, find=design).entry
     assert (entry.status, entry.located) == ("measured", "found")

@@ -285,14 +285,12 @@ def _similar_ids(picture: np.ndarray, quads: np.ndarray, aruco) -> list[int]:
     cells = (np.indices((side, side))[::-1].reshape(2, -1).T + 0.5) / side - 0.5
     corners = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]], np.float32)
     is_border = np.abs(cells).max(1) > 0.5 - 1 / side
-    rows = []
+    px = []
     for quad in quads.astype(np.float32):
         to_px = cv2.getPerspectiveTransform(corners, quad)
-        rows.append(cv2.perspectiveTransform(np.concatenate([inset * cells for inset in _INSETS])[None], to_px)[0])
-    if not rows:
-        return []
-    px = np.array(rows, np.float32)
-    light = cv2.remap(picture, px, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).reshape(-1, side * side)
+        px.append(cv2.perspectiveTransform(np.concatenate([inset * cells for inset in _INSETS])[None], to_px)[0])
+    x, y = np.array(px, np.float32).transpose(2, 0, 1)
+    light = cv2.remap(picture, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).reshape(-1, side * side)
     low, high = np.percentile(light, (5, 95), axis=1)
     bits = light > (low + high)[:, None] / 2
     bits = bits[(high - low > _LEAST_CONTRAST_CODES) & (bits[:, is_border].mean(1) < _MOST_BORDER_ERRORS)]
@@ -303,7 +301,7 @@ def _similar_ids(picture: np.ndarray, quads: np.ndarray, aruco) -> list[int]:
 
 @lru_cache(maxsize=4)
 def _codes(data: bytes, size: int) -> np.ndarray:
-    """The inner cells of a dictionary's codes, 1 for paper and -1 for ink: size² × 4N, all in one turn after another."""
+    """The inner cells of a dictionary's codes, 1 for paper and -1 for ink: size² × 4N."""
     every = np.frombuffer(data, np.uint8).reshape(-1, -(-size * size // 8), 4)
     bits = [cv2.aruco.Dictionary.getBitsFromByteList(code[None], size) for code in every]
     turned = np.concatenate([np.rot90(bits, turn, (1, 2)) for turn in range(4)])

@@ -41,6 +41,7 @@ _MOST_PLACES = 8  # of each source, refined
 _REFINED_PX = (24, 48, 128)  # of the design's longer side, from coarse to fine
 _SURROUNDINGS = 1 / 6  # of the longer side: standard deviation of the mean that is subtracted
 _STEPS, _COLOR_STEPS, _MOST_COLOR_SIGMAS = 30, 10, 2.0
+_UNIT = np.array([[-1.0, -1], [1, -1], [1, 1], [-1, 1]])  # corners of a design in its own coordinates
 _TEMPLATE_PX, _TEMPLATE_STEP = 24, 1.2
 _TURNS_DEG, _SLANTS = (0, -15, 15, -30, 30, -45, 45), (1.0, 0.75, 0.55)
 _NOT_FOUND_ADVICE = (
@@ -129,7 +130,7 @@ def _draw(design: np.ndarray, size_mm: tuple[float, float], longer_px: float) ->
 
 def _features(gray: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """SIFT features N×4 (x, y with centers at .5, diameter, angle in radians) and descriptors N×128 (root of L1)."""
-    points, descriptors = cv2.SIFT_create(nfeatures=6000, contrastThreshold=0.02).detectAndCompute(gray, None)
+    points, descriptors = cv2.SIFT.create(nfeatures=6000, contrastThreshold=0.02).detectAndCompute(gray, None)
     if descriptors is None:
         return np.zeros((0, 4)), np.zeros((0, 128), np.float32)
     table = [(p.pt[0] + 0.5, p.pt[1] + 0.5, p.size, np.radians(p.angle)) for p in points]
@@ -146,7 +147,9 @@ def _places_by_features(srgb: np.ndarray, design: np.ndarray, size_mm: tuple[flo
     for longer_px in _FEATURE_SIZES_PX:
         drawn = cv2.cvtColor(_draw(design, size_mm, longer_px), cv2.COLOR_RGB2GRAY)
         margin = 8
-        own, own_descriptors = _features(cv2.copyMakeBorder(drawn, *[margin] * 4, cv2.BORDER_REPLICATE))
+        own, own_descriptors = _features(
+            cv2.copyMakeBorder(drawn, margin, margin, margin, margin, cv2.BORDER_REPLICATE)
+        )
         if not len(own):
             continue
         pairs = matcher.knnMatch(own_descriptors, seen_descriptors, _NEIGHBORS)
@@ -236,126 +239,101 @@ class _Refiner:
 
     def refine(self, quad: np.ndarray) -> FoundPlace | None:
         """The refined place; None if it is none that a camera can see."""
+        place = None
         for longer_px in _REFINED_PX:
-            side_px = float(np.sqrt(abs(cv2.contourArea(quad.astype(np.float32))))) if np.isfinite(quad).all() else 0.0
-            if side_px < 16 or not is_plausible_quad(quad) or not is_in_picture(quad, self.srgb):
+            if not is_plausible_quad(quad) or not is_in_picture(quad, self.srgb):
                 return None
+            side_px = float(np.sqrt(abs(cv2.contourArea(quad.astype(np.float32)))))
             most = max(24, 2 * round(0.5 * side_px * np.sqrt(max(self.size_mm) / min(self.size_mm))))
             size = min(longer_px, most)
-            template = self.templates.setdefault(size, _Template(_draw(self.design, self.size_mm, size)))
+            if size not in self.templates:
+                self.templates[size] = _Template(_draw(self.design, self.size_mm, size))
             level = int(np.clip(np.log2(max(side_px / size, 1)), 0, len(self.levels) - 1))
-            scale = np.array(self.srgb.shape[1::-1]) / self.levels[level].shape[1::-1]
+            scale, template = self.srgb.shape[1] / self.levels[level].shape[1], self.templates[size]
             refined, likeness, sigma = template.align(self.levels[level], quad / scale)
             if size in (most, _REFINED_PX[-1]) and likeness > LEAST_LIKENESS:
-                by_color = template.align_colors(self.levels[level], refined)
+                mixed = template.align(self.levels[level], refined, mixes=True)[0]
                 # where a part of a design is plain, mixtures of colors imitate shifts
-                refined = by_color if np.abs(by_color - refined).max() < _MOST_COLOR_SIGMAS * sigma else refined
+                refined = mixed if np.abs(mixed - refined).max() < _MOST_COLOR_SIGMAS * sigma else refined
             quad = refined * scale
+            significance = float(np.arctanh(np.clip(likeness, -0.999, 0.999)) * np.sqrt(template.freedom))
+            place = FoundPlace(quad, likeness, significance, sigma * scale)
             if size == most:
                 break
-        if not is_plausible_quad(quad) or not is_in_picture(quad, self.srgb):
-            return None
-        significance = float(np.arctanh(np.clip(likeness, -0.999, 0.999)) * np.sqrt(template.freedom))
-        return FoundPlace(quad, likeness, significance, sigma * float(scale.max()))
-
-
-def _moved(px_from_unit: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """Compose a homography with the inverse of a small one."""
-    a, b, c, d, e, f, g, h = np.clip(step, -0.2, 0.2)
-    return px_from_unit @ np.linalg.inv([[1 + a, b, c], [d, 1 + e, f], [g, h, 1]])
+        return place if is_plausible_quad(quad) and is_in_picture(quad, self.srgb) else None
 
 
 class _Template:
-    """A drawn design, its surroundings subtracted, with the derivatives of its pixels by a homography's eight terms."""
+    """A drawn design, its surroundings subtracted, with the derivatives of its colors by a homography's eight terms.
+
+    Colors are three channels and their squares: inks, veils and tone curves mix them, which moves edges between colors
+    by up to a pixel where gain and offset are all that may change.
+    """
 
     def __init__(self, drawn: np.ndarray):
-        self.height, self.width = drawn.shape[:2]
-        self.sigma = _SURROUNDINGS * max(self.width, self.height)
+        self.size = drawn.shape[1], drawn.shape[0]
         codes = self._less_surroundings(drawn)
         self.weight = codes.std((0, 1)) / max(float(codes.std((0, 1)).sum()), 1e-6)
-        self.codes = codes / np.maximum(codes.std((0, 1)), 1e-3)
-        power = np.abs(np.fft.fft2((self.codes * self.weight).sum(2))) ** 2
+        squares = self._less_surroundings(drawn.astype(np.float32) ** 2 / 255)
+        colors = np.concatenate([part / np.maximum(part.std((0, 1)), 1e-3) for part in (codes, squares)], 2)
+        power = np.abs(np.fft.fft2((colors[..., :3] * self.weight).sum(2))) ** 2
         self.freedom = float(power.sum() ** 2 / max((power**2).sum(), 1e-12))  # independent pixels, as it were
-        half = np.array([self.width, self.height]) / 2
-        self.corners = rect_corners((-1, -1, 2, 2)) * 1.0
+        half = np.array(self.size) / 2
         self.index_from_unit = np.array([[half[0], 0, half[0]], [0, half[1], half[1]], [0, 0, 1.0]])
-        u, v = ((np.arange(n) + 0.5) / n * 2 - 1 for n in (self.width, self.height))
-        u, v = (a[..., None] for a in np.meshgrid(u, v))
-        by_v, by_u = np.gradient(self.codes, axis=(0, 1))
+        u, v = (a[..., None] for a in np.meshgrid(*((np.arange(n) + 0.5) / n * 2 - 1 for n in self.size)))
+        by_v, by_u = np.gradient(colors, axis=(0, 1))
         by_u, by_v = by_u * half[0], by_v * half[1]
         along = u * by_u + v * by_v
         terms = u * by_u, v * by_u, by_u, u * by_v, v * by_v, by_v, -u * along, -v * along
-        self.drawn, self.u, self.v = drawn, u, v
-        self.by_term = np.stack([(t * self.weight).ravel() for t in terms], 1).astype(np.float32)
-        self.hessian = self.by_term.T @ np.stack([t.ravel() for t in terms], 1)
-        self.hessian += 1e-7 * np.trace(self.hessian) / 8 * np.eye(8)
+        self.by_term = np.stack(terms, -1).reshape(-1, 6, 8).astype(np.float32)
+        self.colors = colors.reshape(-1, 6)
 
     def _less_surroundings(self, codes: np.ndarray) -> np.ndarray:
         codes = cv2.GaussianBlur(codes.astype(np.float32), (0, 0), 0.8)
-        codes -= cv2.GaussianBlur(codes, (0, 0), self.sigma, borderType=cv2.BORDER_REPLICATE)
+        sigma = _SURROUNDINGS * max(self.size)
+        codes -= cv2.GaussianBlur(codes, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
         return codes - codes.mean((0, 1))
 
-    def align(self, srgb: np.ndarray, quad: np.ndarray) -> tuple[np.ndarray, float, float]:
-        """Refine corners 4×2 px in a picture; with the correlation there and the standard deviation of a corner."""
-        px_from_unit, best = fit_homography(self.corners, quad), (-1.0, quad)
-        for _ in range(_STEPS):
-            seen = self._seen(srgb, px_from_unit)
-            likeness = float((self.weight * (seen * self.codes).mean((0, 1))).sum())
-            if likeness > best[0]:
-                best = likeness, apply_homography(px_from_unit, self.corners)
-            error = np.clip(seen - likeness * self.codes, -1.5, 1.5)
-            step = np.linalg.solve(self.hessian, self.by_term.T @ error.ravel()) / max(likeness, 0.3)
-            px_from_unit = _moved(px_from_unit, step)
+    def align(self, srgb: np.ndarray, quad: np.ndarray, mixes: bool = False) -> tuple[np.ndarray, float, float]:
+        """Refine corners 4×2 px in a picture, if `mixes` with mixed colors; with the correlation of the channels there
+        and the standard deviation of a corner's coordinate.
+        """
+        px_from_unit, best, hessian = fit_homography(_UNIT, quad), (-1.0, quad), np.eye(8)
+        for _ in range(_COLOR_STEPS if mixes else _STEPS):
+            index = index_homography(px_from_unit @ np.linalg.inv(self.index_from_unit))
+            flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+            seen = self._less_surroundings(
+                cv2.warpPerspective(srgb, index, self.size, None, flags, cv2.BORDER_REPLICATE)
+            )
+            seen = (seen / np.maximum(seen.std((0, 1)), 0.5)).reshape(-1, 3)
+            likeness = float((self.weight * (seen * self.colors[:, :3]).mean(0)).sum())
+            if likeness > best[0] or mixes:
+                best = likeness, apply_homography(px_from_unit, _UNIT)
+            mixture = np.eye(6, 3) * max(likeness, 0.3)
+            if mixes:
+                ridge = 1e-3 * len(seen) * np.eye(6)
+                mixture = np.linalg.solve(self.colors.T @ self.colors + ridge, self.colors.T @ seen)
+            error = np.clip(seen - self.colors @ mixture, -1.5, 1.5) * self.weight
+            slopes = np.einsum("nft,fc->nct", self.by_term, mixture.astype(np.float32))
+            hessian = np.einsum("nct,ncs,c->ts", slopes, slopes, self.weight, optimize=True)
+            hessian += 1e-7 * np.trace(hessian) * np.eye(8)
+            step = np.linalg.solve(hessian, slopes.reshape(-1, 8).T @ error.ravel())
+            a, b, c, d, e, f, g, h = np.clip(step, -0.2, 0.2)
+            px_from_unit = px_from_unit @ np.linalg.inv([[1 + a, b, c], [d, 1 + e, f], [g, h, 1]])
             if np.abs(step).max() < 2e-4 or not np.isfinite(px_from_unit).all():
                 break
         likeness, corners = best
-        noise = np.sqrt(max(1 / max(likeness, 0.1) ** 2 - 1, 0) * self.by_term.shape[0] / 3 / max(self.freedom, 1.0))
-        covariance = np.linalg.inv(self.hessian) * noise**2
-        return corners, likeness, self._corner_sigma(px_from_unit, covariance)
+        variance = max(1 - likeness**2, 0.0) * len(self.colors) / max(self.freedom, 1.0)
+        return corners, likeness, _corner_sigma(px_from_unit, np.linalg.inv(hessian) * variance)
 
-    def _seen(self, srgb: np.ndarray, px_from_unit: np.ndarray) -> np.ndarray:
-        """The picture under a homography, its surroundings subtracted, with a standard deviation of 1 by channel."""
-        index = index_homography(px_from_unit @ np.linalg.inv(self.index_from_unit))
-        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        seen = cv2.warpPerspective(srgb, index, (self.width, self.height), None, flags, cv2.BORDER_REPLICATE)
-        seen = self._less_surroundings(seen)
-        return seen / np.maximum(seen.std((0, 1)), 0.5)
 
-    def align_colors(self, srgb: np.ndarray, quad: np.ndarray) -> np.ndarray:
-        """Refine corners 4×2 px further, with each channel a mixture of the design's and their squares: inks, veils and
-        tone curves move edges between colors by up to a pixel where gain and offset are all that may change.
-        """
-        squares = self._less_surroundings(self.drawn.astype(np.float32) ** 2 / 255)
-        colors = np.concatenate([self.codes, squares / np.maximum(squares.std((0, 1)), 1e-3)], 2)
-        by_v, by_u = np.gradient(colors, axis=(0, 1))
-        by_u, by_v = by_u * (self.width / 2), by_v * (self.height / 2)
-        along = self.u * by_u + self.v * by_v
-        rows = self.u * by_u, self.v * by_u, by_u, self.u * by_v, self.v * by_v, by_v, -self.u * along, -self.v * along
-        by_term = np.stack(rows, -1).reshape(-1, 6, 8).astype(np.float32)
-        colors = colors.reshape(-1, 6)
-        ridge = 1e-3 * len(colors) * np.eye(6)
-        px_from_unit = fit_homography(self.corners, quad)
-        for _ in range(_COLOR_STEPS):
-            seen = self._seen(srgb, px_from_unit).reshape(-1, 3)
-            mixture = np.linalg.solve(colors.T @ colors + ridge, colors.T @ seen)
-            error = np.clip(seen - colors @ mixture, -1, 1) * self.weight
-            slopes = np.einsum("nft,fc->nct", by_term, mixture.astype(np.float32))
-            weighted = (slopes * self.weight[:, None]).reshape(-1, 8)
-            hessian = weighted.T @ slopes.reshape(-1, 8)
-            step = np.linalg.solve(hessian + 1e-7 * np.trace(hessian) * np.eye(8), slopes.reshape(-1, 8).T @ error.ravel())
-            px_from_unit = _moved(px_from_unit, step)
-            if np.abs(step).max() < 2e-4:
-                break
-        moved = apply_homography(px_from_unit, self.corners)
-        return moved if np.isfinite(moved).all() else quad
-
-    def _corner_sigma(self, px_from_unit: np.ndarray, covariance: np.ndarray) -> float:
-        """The standard deviation in px of a corner's coordinate, rms over the four."""
-        u, v = self.corners.T
-        zero, one = np.zeros(4), np.ones(4)
-        by_x = np.stack([u, v, one, zero, zero, zero, -u * u, -u * v], 1)
-        by_y = np.stack([zero, zero, zero, u, v, one, -u * v, -v * v], 1)
-        by_corner = np.concatenate([by_x, by_y])
-        variance = float(np.mean(np.einsum("ij,jk,ik->i", by_corner, covariance, by_corner)))
-        unit_px = float(np.sqrt(abs(np.linalg.det(px_from_unit[:2, :2] / px_from_unit[2, 2]))))
-        return max(0.05, unit_px * np.sqrt(max(variance, 0.0)))
+def _corner_sigma(px_from_unit: np.ndarray, covariance: np.ndarray) -> float:
+    """The standard deviation in px of a corner's coordinate, rms over the four."""
+    u, v = _UNIT.T
+    zero, one = np.zeros(4), np.ones(4)
+    by_x = np.stack([u, v, one, zero, zero, zero, -u * u, -u * v], 1)
+    by_y = np.stack([zero, zero, zero, u, v, one, -u * v, -v * v], 1)
+    by_corner = np.concatenate([by_x, by_y])
+    variance = float(np.mean(np.einsum("ij,jk,ik->i", by_corner, covariance, by_corner)))
+    unit_px = float(np.sqrt(abs(np.linalg.det(px_from_unit[:2, :2] / px_from_unit[2, 2]))))
+    return max(0.05, unit_px * np.sqrt(max(variance, 0.0)))
