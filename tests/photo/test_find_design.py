@@ -107,8 +107,6 @@ def test_a_print_that_was_found_is_measured_like_one_whose_corners_were_named():
     assert (entry.status, entry.located) == ("measured", "found")
     found = apply_homography(np.array(entry.geometry.homography_px_from_mm), rect_corners(paper.DESIGN_MM))
     assert np.abs(found - apply_homography(px_from_mm, rect_corners(paper.DESIGN_MM))).max() < 0.7
-    other = measure(view, *parts, with_pictures=False, find=blocks(1)).entry
-    assert (other.status, other.code) == ("rejected", "no_corners")
 
 
 def test_squares_without_codes_cost_a_fraction_of_reading_each():

@@ -273,7 +273,11 @@ def detect_markers(picture: np.ndarray, aruco, settings: cv2.aruco.DetectorParam
         return corners, ids, others
     some = cv2.aruco.Dictionary(aruco.bytesList[similar].copy(), *kind)
     corners, ids, others = cv2.aruco.ArucoDetector(some, settings).detectMarkers(picture)
-    return corners, None if ids is None else np.array(similar)[np.asarray(ids).ravel()], others
+    return (
+        corners,
+        None if ids is None else np.array([[similar[int(i)]] for i in np.asarray(ids).ravel()], np.int32),
+        others,
+    )
 
 
 def _similar_ids(picture: np.ndarray, quads: np.ndarray, aruco) -> list[int]:
