@@ -64,7 +64,7 @@ _OTHER_DPI_ADVICE = (
     "it cannot be a scan at {:g} dpi, where its print would be {:.3f} × {:.3f} of its size, so no scale was measured: "
     "give --scan-dpi the scan's own, the same in both directions"
 )
-_NO_CORNERS_ADVICE = "this print has no markers, and nothing says where it is: name its corners in --corners FILE"
+_NO_CORNERS_ADVICE = "this print has no markers, and nothing says where it is: add --find or --corners FILE"
 _PLAIN_ADVICE = "without markers a design without structure cannot be told from another one: print it with markers"
 _UNLOCATED_CODES = ("too_few_markers", "no_corners")
 _HIDDEN_ADVICE = "a corner of the design is covered, folded away or out of the picture: show all of it"

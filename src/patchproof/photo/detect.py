@@ -5,9 +5,9 @@ from the code's top-left) with the blur of their borders, ids of the same dictio
 found at two places. The detector gets linear light: in code values blurred paper spreads over ink, and at a blur of 0.3
 modules it read 5 of 48 markers where it read 45 in linear light. The pyramid starts below 1000 px and stops at the
 level where every expected id has been found; only if some are missing it tries code values, local contrast (CLAHE) in
-dark photos, and twice the size where less than 4 megapixels are searched. Corners of all levels are then fitted in the
-full photograph (`edges`). If the page's millimeters are known, `known_page.find_sheet` needs fewer levels. Only
-OpenCV's class API is used, so 4.11 to 5.x will do.
+dark photos, and twice the size where less than 4 megapixels are searched; larger pictures get these two at half their
+size. Corners of all levels are then fitted in the full photograph (`edges`). If the page's millimeters are known,
+`known_page.find_sheet` needs fewer levels. Only OpenCV's class API is used, so 4.11 to 5.x will do.
 """
 
 from __future__ import annotations
