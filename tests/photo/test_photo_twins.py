@@ -219,3 +219,17 @@ def test_a_finer_level_is_searched_only_in_squares_beside_the_print(piece, surfa
     found = find_sheet(photo, IDS, surface.corners_mm)
     assert found.markers.keys() == IDS and bool(found.doubled) == second
     assert sizes[0] == 600 * 800 and sum(sizes[1:]) < 600 * 800
+
+
+@pytest.mark.parametrize(("marker_px", "seen"), [(10, True), (6, False)])
+def test_a_second_print_is_seen_whose_markers_are_too_small_to_be_read(piece, surface, monkeypatch, marker_px, seen):
+    near = photograph(piece, view(0, 0, 500, 0, (600, 450)), (600, 450), blur_px=0.4)
+    first = find_sheet(near, IDS, surface.corners_mm)
+    assert first.markers.keys() == IDS and not first.doubled
+    side = np.mean([np.linalg.norm(np.diff(quad[:2], axis=0)) for quad in first.corners_px.values()])
+    second = cv2.resize(near, None, fx=marker_px / side, fy=marker_px / side, interpolation=cv2.INTER_AREA)
+    photo = np.full((450, 1000, 3), 128, np.uint8)
+    photo[:, :600], photo[20 : 20 + len(second), 640 : 640 + second.shape[1]] = near, cv2.blur(second, (2, 2))
+    assert bool(find_sheet(photo, IDS, surface.corners_mm).doubled) == seen
+    monkeypatch.setattr(known_page, "find_second_print", lambda *given: ())
+    assert not find_sheet(photo, IDS, surface.corners_mm).doubled

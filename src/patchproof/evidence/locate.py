@@ -37,7 +37,7 @@ _SURE_SIGMAS = 2.0
 _OFFSET_SIGMAS, _LEAST_OFFSET_CELLS = 1.25, 9
 _OUTLIER_FACTOR = 2.0  # the design's corner beside an outlier marker may lie off by more than the marker
 # 95 % errors beyond which a figure is "not measured": the x:y ratio's, the azimuth's (beyond some 10° a view from the
-# left cannot be told from one from the right), and the distance's
+# left cannot be told from one from the right) beside what an unconfirmed focal length adds, and the distance's
 MOST_RATIO_ERROR, MOST_AZIMUTH_ERROR_DEG, MOST_DISTANCE_ERROR = 0.005, 10.0, 0.2
 
 
@@ -244,9 +244,10 @@ def camera_pose(view: PinholePhoto, location: LocatedSheet, surface: Surface) ->
         ratio, uncertainty = x_over_y(location.fit, view.matrix_px, FOCAL_ERROR)
         ratio = ratio if uncertainty <= MOST_RATIO_ERROR else None
     far = length > MOST_DISTANCE_ERROR * stance.distance_mm
+    unconfirmed = 0.0 if stance.focal_agrees or view.calibrated else sheet_pose.UNCONFIRMED_DEG
     pose = CameraPose(
         azimuth_uncertainty_deg=angle,
-        azimuth_deg=stance.azimuth_deg if angle <= MOST_AZIMUTH_ERROR_DEG else None,
+        azimuth_deg=stance.azimuth_deg if angle <= np.hypot(MOST_AZIMUTH_ERROR_DEG, unconfirmed) else None,
         distance_mm=None if far else stance.distance_mm,
         distance_uncertainty_mm=None if far else length,
         scale_x_over_y=ratio,

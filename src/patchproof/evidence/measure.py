@@ -26,6 +26,7 @@ from patchproof.evidence.surface import PromisedColors, Surface
 from patchproof.photo.detect import MarkersInView, find_markers, is_mirrored
 from patchproof.photo.known_page import complete_markers, find_sheet
 from patchproof.photo.page_code import read_page_code, refuse_other_page
+from patchproof.photo.pose import UNCONFIRMED_DEG
 from patchproof.photo.quality import FrameLight, blur_px, frame_light
 from patchproof.photo.rectify import PageFit
 from patchproof.photo.rejection import PhotoRejected
@@ -121,9 +122,12 @@ def measure(
     geometry, found_corners, found = geometry_of(view, location, detected, light, blur, surface, promised)
     geometry = geometry.changed(located=corners.located) if placed and corners else geometry
     pose, focal = camera_pose(view, location, surface)
-    # a stretched print, a squeezed picture or a rolling shutter tilts a sheet that stands straight
-    contradicted = {"tilt_deg": None, "tilt_uncertainty_deg": None} if focal == "contradicted" else {}
-    told = geometry.changed(focal=focal, **contradicted)
+    told = geometry.changed(focal=focal)
+    if focal == "contradicted":
+        # a stretched print, a squeezed picture or a rolling shutter tilts a sheet that stands straight
+        told = told.changed(tilt_deg=None, tilt_uncertainty_deg=None)
+    elif focal not in ("confirmed", "calibrated"):
+        told = told.changed(tilt_uncertainty_deg=float(np.hypot(geometry.tilt_uncertainty_deg or 0, UNCONFIRMED_DEG)))
     entry = partial(entry, geometry=told, pose=pose, box=object_box(view, location, surface))
     page_check = _is_uncut(location, detected, surface)
     scale = None if scan_dpi is None else _scan_scale(fit.px_from_mm, surface, scan_dpi)

@@ -9,6 +9,8 @@ most; they search only where markers are still missing. Prediction never identif
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 
@@ -18,6 +20,7 @@ from patchproof.photo.detect import COARSEST_PX, Detections, Ids, ImageRegion, M
 from patchproof.photo.edges import Borders, sample
 from patchproof.photo.rectify import PageFit, Quads, fit_page, region_around
 from patchproof.photo.rejection import PhotoRejected
+from patchproof.photo.second_print import find_second_print
 from patchproof.sheets.markers import DICTIONARY, aruco_dictionary, marker_cells
 
 # of the light with the printed cells; wrong codes of the dictionary stay below 0.6, blur lowers it to 0.8
@@ -64,7 +67,9 @@ def find_sheet(
             regions = [] if shown else _regions_beside(srgb, view, corners_mm, unread)
             if not regions:
                 break
-    return view
+    if view.doubled:
+        return view
+    return replace(view, doubled=find_second_print(srgb, view.corners_px, corners_mm, dictionary))
 
 
 def _regions_beside(srgb: np.ndarray, view: MarkersInView, corners_mm, squares: list[np.ndarray]) -> list[ImageRegion]:
