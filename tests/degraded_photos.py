@@ -382,6 +382,17 @@ def _banded(dyes: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return dyes * (1 - missing[:, None, None] * (np.arange(3) == ink))
 
 
+def _flat_far(d: Draw) -> Draw:
+    """A whole flat card whose markers are 11 to 17 px across."""
+    rng = d.rng
+    return replace(
+        d,
+        bends=bool(rng.random() < 0.5),
+        camera_from_page=camera(rng.uniform(-40, 40), rng.uniform(-15, 20), rng.uniform(1000, 1500), 0, (40, 20)),
+        noise=float(rng.choice([0.004, 0.008, 0.012])),
+    )
+
+
 MILD = ("plain", "defocus_1", "noise_mild", "jpeg_60", "motion_2", "shadow", "far", "lens_mild", "roll_300_1000_bends")
 KINDS: dict[str, Callable[[Draw], Draw]] = {
     "plain": lambda d: d,
@@ -459,6 +470,7 @@ KINDS: dict[str, Callable[[Draw], Draw]] = {
     "draft_gray": _inks(lambda dyes, rng: dyes.mean(-1, keepdims=True) * np.full(3, rng.uniform(0.5, 1.0))),
     "corner_cut": partial(_corner_cut, eared=False),
     "corner_cut_ear": partial(_corner_cut, eared=True),
+    "flat_far": _flat_far,
 }
 
 

@@ -20,7 +20,7 @@ from patchproof.evidence.results import CameraPose, FocalSource, Geometry
 from patchproof.evidence.surface import PromisedColors, Surface
 from patchproof.photo import pose as sheet_pose
 from patchproof.photo.detect import MarkersInView
-from patchproof.photo.known_page import is_in_picture
+from patchproof.photo.known_page import is_in_picture, shows_code
 from patchproof.photo.print_ratio import x_over_y
 from patchproof.photo.quality import FrameLight
 from patchproof.photo.rectify import PageFit, corner_uncertainty_mm, fit_page
@@ -195,11 +195,17 @@ def _offset_mm(cells: Registration, free: np.ndarray, surface: Surface) -> float
 def _absent_markers(
     view: PinholePhoto, location: LocatedSheet, detected: MarkersInView, surface: Surface
 ) -> dict[int, bool]:
-    """The piece's markers that were not found, and whether each lies partly beyond the picture's edge."""
+    """The piece's markers that were not found, and whether each lies partly beyond the picture's edge. Left out are
+    those whose cells show in their places, only too few pixels wide for their borders to be fitted.
+    """
     quads = {
         i: location.px(location.parameters, surface.corners_mm[i]) for i in surface.piece_ids - detected.markers.keys()
     }
-    return {i: not is_in_picture(quad, view.srgb) for i, quad in quads.items()}
+    return {
+        i: not is_in_picture(quad, view.srgb)
+        for i, quad in quads.items()
+        if not shows_code(view.srgb, quad, i, surface.dictionary)
+    }
 
 
 def _shifts(

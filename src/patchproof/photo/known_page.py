@@ -20,7 +20,7 @@ from patchproof.photo.detect import COARSEST_PX, Detections, Ids, ImageRegion, M
 from patchproof.photo.edges import Borders, sample
 from patchproof.photo.rectify import PageFit, Quads, fit_page, region_around
 from patchproof.photo.rejection import PhotoRejected
-from patchproof.photo.second_print import find_second_print
+from patchproof.photo.second_print import find_second_print, find_small_markers
 from patchproof.sheets.markers import DICTIONARY, aruco_dictionary, marker_cells
 
 # of the light with the printed cells; wrong codes of the dictionary stay below 0.6, blur lowers it to 0.8
@@ -34,6 +34,7 @@ READABLE_PX = 28.0
 # px of a marker's side from which reduced pictures show a second print: of 36 photographs with one, at up to twice the
 # distance, the level at which the first print is complete shows 20, the level that this asks for 35
 SECOND_PRINT_PX = 17.0
+_LEAST_MARKERS = 3  # with less, flat paper cannot be told from bent
 _LARGEST_SQUARE = 1.5  # of a marker's side: with its quiet zone it has 9 / 7
 
 
@@ -67,6 +68,14 @@ def find_sheet(
             regions = [] if shown else _regions_beside(srgb, view, corners_mm, unread)
             if not regions:
                 break
+    fitted = sum(b.fitted for b in view.markers.values())
+    if view.markers and fitted < min(max(_LEAST_MARKERS, len(expected) / 2), len(expected)):
+        # those of a print far away that are read identify it
+        small = find_small_markers(srgb, view.corners_px, {i: corners_mm[i] for i in expected}, dictionary)
+        detected = detect.fit_detections(
+            srgb, {i: [q] for i, q in small.items()} | detections, set(corners_mm), dictionary
+        )
+        view = complete_markers(srgb, detected, corners_mm, dictionary)
     if view.doubled:
         return view
     return replace(view, doubled=find_second_print(srgb, view.corners_px, corners_mm, dictionary))
@@ -160,6 +169,12 @@ def _fit(corners_px: Quads, corners_mm: Quads) -> PageFit | None:
 def is_in_picture(quad: np.ndarray, srgb: np.ndarray) -> bool:
     """True if corners 4×2 px lie in a picture, with two pixels to its edge."""
     return bool((quad > 2).all() and (quad < [srgb.shape[1] - 2, srgb.shape[0] - 2]).all())
+
+
+def shows_code(srgb: np.ndarray, quad: np.ndarray, marker_id: int, dictionary: str) -> bool:
+    """True if the light in corners 4×2 px, which lie in the picture, resembles a marker's cells."""
+    code = marker_cells(dictionary, [marker_id])[0]
+    return is_in_picture(quad, srgb) and _correlation(srgb, quad, code, _TRIAL_OFFSETS) > LEAST_CORRELATION
 
 
 def _side_px(quad: np.ndarray) -> float:

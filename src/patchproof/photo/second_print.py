@@ -7,7 +7,7 @@ squares are compared with the known codes, and count where two or three lie as o
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator
 from itertools import combinations
 
 import cv2
@@ -23,8 +23,9 @@ from patchproof.sheets.markers import marker_cells
 _FIRST_PX, _MOST_SCALE, _MOST_PIXELS = 70.0, 2.0, 4_500_000
 _LEAST_PX, _LARGEST_SHARE, _MOST_SQUARES = 9.0, 1.2, 300  # sides of squares there; of the first print's markers
 _OFFSETS = np.array([(x, y) for x in (-0.5, 0.0, 0.5) for y in (-0.5, 0.0, 0.5)])  # in modules
-_LEAST_CORRELATION = {2: 0.7, 3: 0.5}  # of the cells' light with the codes, by the number of markers that show a print
+_LEAST_CORRELATION = {3: 0.5, 2: 0.7}  # of the cells' light with the codes, by the number of markers that show a print
 _SQUARES_PER_MARKER = 3  # those most like it
+_SAME_PX = 4.0  # between the middles of a marker that was read and of its square
 _MOST_MISFIT = 0.15  # rms of corners as an affine map of the sheet has them, in sides of a marker
 
 Match = tuple[int, float, np.ndarray]
@@ -37,25 +38,41 @@ def find_second_print(srgb: np.ndarray, corners_px: Quads, corners_mm: Quads, di
         return ()
     first = np.concatenate([corners_px[i] for i in sorted(corners_px)])
     side = max(float(np.sqrt(cv2.contourArea(q.astype(np.float32)))) for q in corners_px.values())
-    scale = min(_FIRST_PX / max(side, 1.0), _MOST_SCALE, float(np.sqrt(_MOST_PIXELS / srgb[..., 0].size)))
-    scale = scale if scale >= 1 else 1 / np.ceil(1 / scale)  # a whole number of pixels is averaged 20 times as fast
-    light = _scaled_light(srgb, scale)
+    light, scale = _scaled_light(srgb, _FIRST_PX / max(side, 1.0))
     hull = cv2.convexHull((first * scale).astype(np.float32))
     quads = [q for q in _dark_squares(light, _LARGEST_SHARE * side * scale) if _is_outside(hull, q.mean(0))]
-    matches = _matches(light, quads[:_MOST_SQUARES], sorted(corners_px), dictionary)
+    groups = _groups(_matches(light, quads, sorted(corners_px), dictionary), corners_mm)
+    return tuple(sorted(next(groups, {})))
+
+
+def find_small_markers(srgb: np.ndarray, read: Quads, corners_mm: Quads, dictionary: str) -> dict[int, np.ndarray]:
+    """Rough corners 4×2 by id of markers too small to be read that lie with those in `read` as on the sheet."""
+    light, scale = _scaled_light(srgb, _MOST_SCALE)
+    matches = _matches(light, _dark_squares(light, _FIRST_PX), sorted(corners_mm), dictionary)
+    found = {i: quad * scale for i, quad in read.items()}
+    for group in _groups(matches, corners_mm):
+        if any(np.linalg.norm((group[i] - found[i]).mean(0)) < _SAME_PX for i in group.keys() & found.keys()):
+            found = group | found
+    return {i: found[i] / scale for i in found.keys() - read.keys()}
+
+
+def _groups(matches: list[Match], corners_mm: Quads) -> Iterator[dict[int, np.ndarray]]:
+    """Corners by id of markers that lie as on the sheet: three, then two that resemble their codes more."""
     for count, least in _LEAST_CORRELATION.items():
         for group in combinations([match for match in matches if match[1] > least], count):
-            ids = {match[0] for match in group}
-            if len(ids) == count and _misfit(group, corners_mm) < _MOST_MISFIT:
-                return tuple(sorted(ids))
-    return ()
+            quads = {marker_id: quad for marker_id, _, quad in group}
+            if len(quads) == count and _misfit(quads, corners_mm) < _MOST_MISFIT:
+                yield quads
 
 
-def _scaled_light(srgb: np.ndarray, scale: float) -> np.ndarray:
+def _scaled_light(srgb: np.ndarray, scale: float) -> tuple[np.ndarray, float]:
+    """The picture's light at about this scale, and the scale."""
+    scale = min(scale, _MOST_SCALE, float(np.sqrt(_MOST_PIXELS / srgb[..., 0].size)))
+    scale = scale if scale >= 1 else 1 / float(np.ceil(1 / scale))  # whole pixels are averaged 20 times as fast
     size = max(1, round(srgb.shape[1] * scale)), max(1, round(srgb.shape[0] * scale))
     if scale < 1:
-        return light_picture(cv2.resize(srgb, size, interpolation=cv2.INTER_AREA))
-    return cv2.resize(light_picture(srgb), size, interpolation=cv2.INTER_CUBIC)
+        return light_picture(cv2.resize(srgb, size, interpolation=cv2.INTER_AREA)), scale
+    return cv2.resize(light_picture(srgb), size, interpolation=cv2.INTER_CUBIC), scale
 
 
 def _is_outside(hull: np.ndarray, point: np.ndarray) -> bool:
@@ -76,6 +93,7 @@ def _dark_squares(light: np.ndarray, most_px: float) -> list[np.ndarray]:
 
 def _matches(light: np.ndarray, quads: list[np.ndarray], ids: list[int], dictionary: str) -> list[Match]:
     """The squares most like each marker, turned by any quarter turns and shifted by half a module at most."""
+    quads = quads[:_MOST_SQUARES]
     if len(quads) < 2:
         return []
     cells = marker_cells(dictionary, ids)
@@ -105,8 +123,8 @@ def _normalized(values: np.ndarray, count: int) -> np.ndarray:
     return rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-6)
 
 
-def _misfit(group: Sequence[Match], corners_mm: Quads) -> float:
-    mm, px = (np.concatenate(each) for each in ([corners_mm[i] for i, _, _ in group], [quad for _, _, quad in group]))
+def _misfit(quads: Quads, corners_mm: Quads) -> float:
+    mm, px = (np.concatenate([corners[i] for i in quads]) for corners in (corners_mm, quads))
     rows = np.column_stack([mm, np.ones(len(mm))])
     affine = np.linalg.lstsq(rows, px, rcond=None)[0]
     side_px = np.linalg.norm(mm[1] - mm[0]) * np.sqrt(abs(np.linalg.det(affine[:2])))
