@@ -20,7 +20,7 @@ from patchproof.evidence.results import CameraPose, FocalSource, Geometry
 from patchproof.evidence.surface import PromisedColors, Surface
 from patchproof.photo import pose as sheet_pose
 from patchproof.photo.detect import MarkersInView
-from patchproof.photo.known_page import is_in_picture, shows_code
+from patchproof.photo.known_page import is_in_picture, shows_small_code
 from patchproof.photo.print_ratio import x_over_y
 from patchproof.photo.quality import FrameLight
 from patchproof.photo.rectify import PageFit, corner_uncertainty_mm, fit_page
@@ -204,7 +204,7 @@ def _absent_markers(
     return {
         i: not is_in_picture(quad, view.srgb)
         for i, quad in quads.items()
-        if not shows_code(view.srgb, quad, i, surface.dictionary)
+        if not shows_small_code(view.srgb, quad, i, surface.dictionary)
     }
 
 

@@ -162,16 +162,12 @@ def pyramid_levels(srgb: np.ndarray, region: ImageRegion, coarsest_px: int = COA
         yield from (Level(2.0, to_gray) for to_gray in (light_picture, codes))
 
 
-def search_level(
-    srgb: np.ndarray, region: ImageRegion, level: Level, aruco, detections: Detections
-) -> list[np.ndarray]:
-    """Search a region of the photograph at one level; corners, in full pixels, are added to `detections` by id. Returns
-    those of squares in which a reduced picture shows no marker that can be read.
-    """
-    part, unread = srgb[region], []
+def search_level(srgb: np.ndarray, region: ImageRegion, level: Level, aruco, detections: Detections) -> None:
+    """Search a region of the photograph at one level; corners, in full pixels, are added to `detections` by id."""
+    part = srgb[region]
     height, width = part.shape[:2]
     if width * height * level.scale**2 > LARGEST_LEVEL_PX:
-        return unread
+        return
     size = _scaled_size(part, level.scale)
     if level.scale < 1:
         is_full = level.reduced is not None and part.shape == srgb.shape
@@ -181,15 +177,10 @@ def search_level(
         picture = cv2.resize(picture, size, interpolation=cv2.INTER_CUBIC)
     to_full, start = np.array([width / size[0], height / size[1]]), [region[1].start, region[0].start]
     for marker_id, quad in _detect(picture, aruco, level.scale * max(srgb.shape), level.scale < 1):
-        corners = quad * to_full + start
-        if marker_id is None:
-            unread.append(corners)
-            continue
-        others = detections.setdefault(marker_id, [])
+        corners, others = quad * to_full + start, detections.setdefault(marker_id, [])
         min_distance = 0.5 * np.linalg.norm(corners[2] - corners[0])  # nearer, it is the marker of another level
         if all(np.linalg.norm(corners.mean(0) - other.mean(0)) > min_distance for other in others):
             others.append(corners)
-    return unread
 
 
 def _scaled_size(srgb: np.ndarray, scale: float) -> tuple[int, int]:
@@ -226,12 +217,8 @@ def detector_settings() -> cv2.aruco.DetectorParameters:
     return settings
 
 
-def _detect(
-    picture: np.ndarray, aruco, full_px: float, is_reduced: bool = False
-) -> Iterator[tuple[int | None, np.ndarray]]:
-    """Ids and corners in a gray picture, which is part of one whose longer side has `full_px` pixels; in a reduced one
-    also squares in which none is read (None).
-    """
+def _detect(picture: np.ndarray, aruco, full_px: float, is_reduced: bool = False) -> Iterator[tuple[int, np.ndarray]]:
+    """Ids and corners in a gray picture, which is part of one whose longer side has `full_px` pixels."""
     settings = detector_settings()
     if is_reduced or _is_large(picture):
         settings.adaptiveThreshWinSizeMin = settings.adaptiveThreshWinSizeMax = _REDUCED_WINDOW_PX
@@ -239,14 +226,12 @@ def _detect(
     settings.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     settings.relativeCornerRefinmentWinSize = 0.3
     settings.minMarkerPerimeterRate = min(0.03 * full_px, 4 * SMALLEST_MARKER_PX) / max(picture.shape)
-    corners, ids, others = detect_markers(picture, aruco, settings)
-    unread = others if is_reduced else ()
-    ids = [] if ids is None else list(map(int, np.asarray(ids).ravel()))
-    for marker_id, quad in zip([*ids, *[None] * len(unread)], [*corners, *unread], strict=True):
+    corners, ids, _ = detect_markers(picture, aruco, settings)
+    for marker_id, quad in zip([] if ids is None else np.asarray(ids).ravel(), corners, strict=True):
         # in the detector's coordinates pixel centers lie at whole numbers: its 0 is our .5
         quad = np.asarray(quad, float).reshape(4, 2) + 0.5
         if is_plausible_quad(quad):
-            yield marker_id, quad
+            yield int(marker_id), quad
 
 
 def detect_markers(picture: np.ndarray, aruco, settings: cv2.aruco.DetectorParameters):

@@ -31,11 +31,7 @@ _MIN_TRIAL_CORRELATION = 0.5
 _TRIAL_OFFSETS = tuple((x, y) for x in (-0.4, 0.0, 0.4) for y in (-0.4, 0.0, 0.4))
 # px of a marker's side, 4 per module: the detector reads 0.99 of these, so one that is missing must be covered
 READABLE_PX = 28.0
-# px of a marker's side from which reduced pictures show a second print: of 36 photographs with one, at up to twice the
-# distance, the level at which the first print is complete shows 20, the level that this asks for 35
-SECOND_PRINT_PX = 17.0
 _LEAST_MARKERS = 3  # with less, flat paper cannot be told from bent
-_LARGEST_SQUARE = 1.5  # of a marker's side: with its quiet zone it has 9 / 7
 
 
 def find_sheet(
@@ -44,30 +40,25 @@ def find_sheet(
     """Find the markers of `corners_mm` (page mm by id) in a uint8 photograph.
 
     The search ends when each of `expected` is found, out of the picture or covered, unless a finer level could decide
-    about a single foreign marker, or show a second print at twice the distance: in squares beside the first one.
+    about a single foreign marker. Prints beside the first one are sought last.
     """
     aruco = aruco_dictionary(dictionary)
     detections: Detections = {}
     borders: dict[int, Borders] = {}
-    whole, view = detect.full_region(srgb), MarkersInView({}, (), ())
-    regions = [whole]
-    for level in detect.pyramid_levels(srgb, whole, coarsest_px):
+    region, view = detect.full_region(srgb), MarkersInView({}, (), ())
+    for level in detect.pyramid_levels(srgb, region, coarsest_px):
         count, foreign = sum(map(len, detections.values())), view.foreign
-        unread = [q for region in regions for q in detect.search_level(srgb, region, level, aruco, detections)]
+        detect.search_level(srgb, region, level, aruco, detections)
         if sum(map(len, detections.values())) != count:
             detected = detect.fit_detections(srgb, detections, set(corners_mm), dictionary, borders)
             view = complete_markers(srgb, detected, corners_mm, dictionary)
         missing = expected - view.markers.keys()
-        regions = [whole]
         if missing and view.markers:
-            missing, regions[0] = _findable(srgb, missing, view, corners_mm, level.scale)
+            missing, region = _findable(srgb, missing, view, corners_mm, level.scale)
         # one marker of another sheet is either clutter or the first one read of it, which a finer level can tell
         unclear = len(view.foreign) == 1 and view.foreign != foreign
         if not missing and not unclear:
-            shown = level.scale >= 1 or _shows_half_size(view, level.scale)
-            regions = [] if shown else _regions_beside(srgb, view, corners_mm, unread)
-            if not regions:
-                break
+            break
     fitted = sum(b.fitted for b in view.markers.values())
     if view.markers and fitted < min(max(_LEAST_MARKERS, len(expected) / 2), len(expected)):
         # those of a print far away that are read identify it
@@ -76,29 +67,12 @@ def find_sheet(
             srgb, {i: [q] for i, q in small.items()} | detections, set(corners_mm), dictionary
         )
         view = complete_markers(srgb, detected, corners_mm, dictionary)
-    if view.doubled:
+    if view.doubled or len(view.foreign) > 1:
         return view
-    return replace(view, doubled=find_second_print(srgb, view.corners_px, corners_mm, dictionary))
-
-
-def _regions_beside(srgb: np.ndarray, view: MarkersInView, corners_mm, squares: list[np.ndarray]) -> list[ImageRegion]:
-    """The surroundings of squares no larger than the print's markers and not between them, where these agree that they
-    are of one print; all of the picture if the surroundings are larger.
-    """
-    corners_px = view.corners_px
-    largest = _LARGEST_SQUARE * max(map(_side_px, corners_px.values()), default=0.0)
-    fit = _fit(corners_px, corners_mm)
-    if fit is not None and len(fit.inlier_ids) == len(corners_px):
-        hull = cv2.convexHull(np.concatenate(list(corners_px.values())).astype(np.float32))
-        squares = [q for q in squares if cv2.pointPolygonTest(hull, q.mean(0).tolist(), False) < 0]
-    regions = [region_around(q, _side_px(q), srgb.shape) for q in squares if _side_px(q) < largest]
-    area = sum((rows.stop - rows.start) * (columns.stop - columns.start) for rows, columns in regions)
-    return regions if 2 * area < srgb.shape[0] * srgb.shape[1] else [detect.full_region(srgb)]
-
-
-def _shows_half_size(view: MarkersInView, scale: float) -> bool:
-    """True if a second print, twice as far away as this one, could be read at this scale."""
-    return scale * max((_side_px(b.corners_px) for b in view.markers.values()), default=0.0) > 2 * SECOND_PRINT_PX
+    fit = _fit(view.corners_px, corners_mm)
+    agree = fit is not None and len(fit.inlier_ids) == len(view.markers)
+    doubled, foreign = find_second_print(srgb, view.corners_px, corners_mm, dictionary, agree)
+    return replace(view, doubled=doubled, foreign=tuple(sorted({*view.foreign, *foreign})))
 
 
 def _findable(srgb, missing: Ids, view: MarkersInView, corners_mm, scale: float) -> tuple[Ids, ImageRegion]:
@@ -171,10 +145,11 @@ def is_in_picture(quad: np.ndarray, srgb: np.ndarray) -> bool:
     return bool((quad > 2).all() and (quad < [srgb.shape[1] - 2, srgb.shape[0] - 2]).all())
 
 
-def shows_code(srgb: np.ndarray, quad: np.ndarray, marker_id: int, dictionary: str) -> bool:
-    """True if the light in corners 4×2 px, which lie in the picture, resembles a marker's cells."""
+def shows_small_code(srgb: np.ndarray, quad: np.ndarray, marker_id: int, dictionary: str) -> bool:
+    """True if corners 4×2 px lie in the picture, are too small for borders to be fitted, and resemble a marker."""
     code = marker_cells(dictionary, [marker_id])[0]
-    return is_in_picture(quad, srgb) and _correlation(srgb, quad, code, _TRIAL_OFFSETS) > LEAST_CORRELATION
+    is_small = is_in_picture(quad, srgb) and _side_px(quad) < READABLE_PX / 2
+    return is_small and _correlation(srgb, quad, code, _TRIAL_OFFSETS) > LEAST_CORRELATION
 
 
 def _side_px(quad: np.ndarray) -> float:

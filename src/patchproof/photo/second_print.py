@@ -17,13 +17,14 @@ from patchproof.base.geometry import apply_homography
 from patchproof.photo.detect import light_picture
 from patchproof.photo.edges import sample
 from patchproof.photo.rectify import Quads
-from patchproof.sheets.markers import marker_cells
+from patchproof.sheets.markers import aruco_dictionary, marker_cells
 
 # The picture is scaled until the first print's markers are as large; those of one four times as far away are 17 px then
 _FIRST_PX, _MOST_SCALE, _MOST_PIXELS = 70.0, 2.0, 4_500_000
 _LEAST_PX, _LARGEST_SHARE, _MOST_SQUARES = 9.0, 1.2, 300  # sides of squares there; of the first print's markers
 _OFFSETS = np.array([(x, y) for x in (-0.5, 0.0, 0.5) for y in (-0.5, 0.0, 0.5)])  # in modules
 _LEAST_CORRELATION = {3: 0.5, 2: 0.7}  # of the cells' light with the codes, by the number of markers that show a print
+_LEAST_OF_ONE = 0.85
 _SQUARES_PER_MARKER = 3  # those most like it
 _SAME_PX = 4.0  # between the middles of a marker that was read and of its square
 _MOST_MISFIT = 0.15  # rms of corners as an affine map of the sheet has them, in sides of a marker
@@ -32,17 +33,44 @@ Match = tuple[int, float, np.ndarray]
 """A marker's id, how well a square's light correlates with its code, and the square from the code's top-left corner."""
 
 
-def find_second_print(srgb: np.ndarray, corners_px: Quads, corners_mm: Quads, dictionary: str) -> tuple[int, ...]:
-    """Ids of two or three markers of `corners_px` that a second print shows beside the first; none if there is none."""
+def find_second_print(
+    srgb: np.ndarray, corners_px: Quads, corners_mm: Quads, dictionary: str, agree: bool
+) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Ids of markers beside `corners_px` (outside of all of them if these `agree` that they are of one print) and no
+    larger: the two or three that show a second print of the sheet, and those that are read and not in `corners_mm`.
+    """
     if len(corners_px) < 2:
-        return ()
+        return (), ()
     first = np.concatenate([corners_px[i] for i in sorted(corners_px)])
     side = max(float(np.sqrt(cv2.contourArea(q.astype(np.float32)))) for q in corners_px.values())
     light, scale = _scaled_light(srgb, _FIRST_PX / max(side, 1.0))
     hull = cv2.convexHull((first * scale).astype(np.float32))
-    quads = [q for q in _dark_squares(light, _LARGEST_SHARE * side * scale) if _is_outside(hull, q.mean(0))]
-    groups = _groups(_matches(light, quads, sorted(corners_px), dictionary), corners_mm)
-    return tuple(sorted(next(groups, {})))
+    middles = scale * first.reshape(-1, 4, 2).mean(1)
+    quads = [
+        q
+        for q in _dark_squares(light, _LARGEST_SHARE * side * scale)
+        if np.linalg.norm(middles - q.mean(0), axis=1).min() > side * scale / 2
+        and not (agree and cv2.pointPolygonTest(hull, q.mean(0).tolist(), False) >= 0)
+    ]
+    matches = _matches(light, quads, sorted(corners_px), dictionary)
+    # where markers of two prints were found as one, a single one may be left
+    single = {i for i, correlation, _ in matches if not agree and correlation > _LEAST_OF_ONE}
+    doubled = single or next(_groups(matches, corners_mm), {})
+    return tuple(sorted(doubled)), tuple(sorted(_read(light, quads, dictionary) - corners_mm.keys()))
+
+
+def _read(light: np.ndarray, quads: list[np.ndarray], dictionary: str) -> set[int]:
+    """Ids of the dictionary whose code squares show without an error."""
+    aruco, found = aruco_dictionary(dictionary), set()
+    n = aruco.markerSize
+    square = 4 * np.array([[-1, -1], [n + 1, -1], [n + 1, n + 1], [-1, n + 1]], np.float32) - 0.5
+    for quad in quads[:_MOST_SQUARES]:
+        to_cells = cv2.getPerspectiveTransform(quad.astype(np.float32) - 0.5, square)
+        cells = cv2.resize(cv2.warpPerspective(light, to_cells, (4 * n, 4 * n)), (n, n), interpolation=cv2.INTER_AREA)
+        low, high = int(cells.min()), int(cells.max())
+        is_read, marker_id, _ = aruco.identify((cells > (low + high) / 2).astype(np.uint8), 0.0)
+        found |= {marker_id} if is_read and high > 1.5 * low else set()
+    return found
 
 
 def find_small_markers(srgb: np.ndarray, read: Quads, corners_mm: Quads, dictionary: str) -> dict[int, np.ndarray]:
@@ -73,10 +101,6 @@ def _scaled_light(srgb: np.ndarray, scale: float) -> tuple[np.ndarray, float]:
     if scale < 1:
         return light_picture(cv2.resize(srgb, size, interpolation=cv2.INTER_AREA)), scale
     return cv2.resize(light_picture(srgb), size, interpolation=cv2.INTER_CUBIC), scale
-
-
-def _is_outside(hull: np.ndarray, point: np.ndarray) -> bool:
-    return cv2.pointPolygonTest(hull, point.tolist(), False) < 0
 
 
 def _dark_squares(light: np.ndarray, most_px: float) -> list[np.ndarray]:
