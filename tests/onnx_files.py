@@ -31,7 +31,7 @@ def constants() -> dict[str, np.ndarray]:
     return arrays | {"P": np.exp(arrays["P"]), "Zero": np.zeros((), "f"), "Two": np.full((), 2, "f")}
 
 
-def model(body: str, opset: int = 20, batch: str = "N", side: str = "8") -> onnx.ModelProto:
+def model(body: str, opset: int = 20, batch: str = "N", sizes: str = "3,8,8") -> onnx.ModelProto:
     """A graph from x, float32 of N×3×8×8, to y: nodes as onnx writes them, in whose inputs `[1, 2]` is a constant, too,
     `[1, 2.5]` one of fractions, and capital letters are the arrays above.
     """
@@ -45,7 +45,7 @@ def model(body: str, opset: int = 20, batch: str = "N", side: str = "8") -> onnx
         return re.sub(r"\[.*?\]", lambda _: f"list{next(count)}", inputs[0])
 
     nodes = re.sub(r"\([^()]*\)", named, body)
-    head = f'<ir_version: 8, opset_import: ["" : {opset}]> g (float[{batch},3,{side},{side}] x) => (float[K] y)'
+    head = f'<ir_version: 8, opset_import: ["" : {opset}]> g (float[{batch},{sizes}] x) => (float[K] y)'
     made = parser.parse_model(f"{head} {{ {''.join(lists)} {nodes} }}")
     used = {name for node in made.graph.node for name in node.input}
     made.graph.initializer.extend(

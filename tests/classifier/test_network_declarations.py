@@ -117,15 +117,24 @@ NAMES = metadata(names="{0: 'red'}", imgsz="[8, 8]", task="classify", license="M
 CASES: dict[str, tuple[Any, ...]] = {
     "opset": (
         *(lambda at: answers(at, onnx_files.model(onnx_files.SMALL, 13)), truth()),
-        *(lambda at: answers(at, onnx_files.model(onnx_files.SMALL, 12)), "opset 12, not one from 13"),
+        *(lambda at: answers(at, onnx_files.model(onnx_files.SMALL, 6)), "opset 6, not one from 7"),
     ),
     "attributes of operators": (
         lambda at: answers(at, tall()),
         nn.functional.conv2d(nn.functional.pad(PHOTOS, (0, 1, 2, 1)), W, F, (2, 1)).relu().mean((2, 3)),
     ),
-    "attributes of a value that torch has no like for": (
-        lambda at: answers(at, onnx_files.model('a = Conv<auto_pad="SAME_UPPER">(x, W) y = ReduceMean<keepdims=0>(a)')),
-        r"depend on the size \(auto_pad\)",
+    "attributes that contradict each other or the weights": (
+        lambda at: answers(at, onnx_files.model('y = Conv<auto_pad="VALID", pads=[1, 1, 1, 1]>(x, W)')),
+        "an auto_pad 'VALID' with the pads",
+    ),
+    "pictures of N×S×S×3": (
+        lambda at: answers(
+            at,
+            onnx_files.model(
+                f"z = Transpose<perm=[0,3,1,2]>(x) {onnx_files.SMALL.replace('(x', '(z')}", 13, sizes="8,8,3"
+            ),
+        ),
+        truth(),
     ),
     "fields and attributes that the reader does not know": (
         lambda at: answers(at, changed(lambda made: made.graph.node[1].attribute.add(name="slope", type=1, f=0.5))),
@@ -169,7 +178,7 @@ CASES: dict[str, tuple[Any, ...]] = {
     ),
     "input_px": (
         *(
-            lambda at: answers(at, onnx_files.model(onnx_files.SMALL, 13, side="S"), input_px=16),
+            lambda at: answers(at, onnx_files.model(onnx_files.SMALL, 13, sizes="3,S,S"), input_px=16),
             truth(center_square(PHOTOS, 16)),
         ),
         *(lambda at: answers(at, onnx_files.small(), input_px=16), "fails on 3×3×16×16"),

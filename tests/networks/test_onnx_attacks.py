@@ -216,9 +216,9 @@ HOSTILE: dict[str, tuple[Callable[[], ModelProto | bytes], str]] = {
     "two inputs": (lambda: changed(lambda m: m.graph.input.add(name="x2")), "2 inputs, not one of N×3×S×S"),
     "two outputs": (lambda: changed(lambda m: m.graph.output.add(name="b")), "2 outputs, not one of N×K"),
     "a weight for a result": (lambda: changed(lambda m: setattr(m.graph.output[0], "name", "F")), "1 outputs, not"),
-    "no opset": (lambda: changed(lambda m: m.ClearField("opset_import")), "opset , not one from 13"),
-    "an opset of long ago": (lambda: model(SMALL, 9), "opset 9, not one from 13 to 28"),
-    "an opset of the future": (lambda: model(SMALL, 29), "opset 29, not one from 13 to 28"),
+    "no opset": (lambda: changed(lambda m: m.ClearField("opset_import")), "opset , not one from 7"),
+    "an opset of long ago": (lambda: model(SMALL, 6), "opset 6, not one from 7 to 28"),
+    "an opset of the future": (lambda: model(SMALL, 29), "opset 29, not one from 7 to 28"),
     "bytes for pictures": (
         lambda: changed(lambda m: setattr(m.graph.input[0].type.tensor_type, "elem_type", 2)),
         "an input that is not float32",

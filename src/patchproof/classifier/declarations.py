@@ -5,13 +5,13 @@ from __future__ import annotations
 from patchproof.base.declared import Declaration
 
 DECLARED: tuple[Declaration, ...] = (
-    Declaration("ONNX", "opset", "used", "13 to 28 of the standard domain; others are refused"),
+    Declaration("ONNX", "opset", "used", "7 to 28 of the standard domain; others are refused"),
     Declaration("ONNX", "attributes of operators", "used", "as onnxruntime does"),
-    Declaration("ONNX", "attributes of a value that torch has no like for", "refused", "auto_pad by size, antialias"),
+    Declaration("ONNX", "attributes that contradict each other or the weights", "refused", "such as auto_pad and pads"),
     Declaration(
         "ONNX", "fields and attributes that the reader does not know", "refused", "names, comments and hints apart"
     ),
-    Declaration("ONNX", "operators of other domains, functions, subgraphs", "refused", "such as If, Loop"),
+    Declaration("ONNX", "operators of other domains, functions, subgraphs", "refused", "the operators below; If, Loop"),
     Declaration("ONNX", "training mode and steps", "refused", "of BatchNormalization, Dropout, the model"),
     Declaration("ONNX", "sparse or quantized tensors", "refused", "also QuantizeLinear and its kind"),
     Declaration("ONNX", "location, offset, length of weights", "used", "of files in the same folder"),
@@ -19,7 +19,8 @@ DECLARED: tuple[Declaration, ...] = (
     Declaration("ONNX", "checksum of weights", "used", "SHA-1, compared"),
     Declaration("ONNX", "default value of an input", "used", "as a constant"),
     Declaration("ONNX", "number of pictures", "used", "called with that number"),
-    Declaration("ONNX", "type and dimensions of the input", "refused", "other than float32, N×3×S×S"),
+    Declaration("ONNX", "type and dimensions of the input", "refused", "other than float32, N×3×S×S, N×S×S×3"),
+    Declaration("ONNX", "pictures of N×S×S×3", "used", "as TensorFlow and Keras write them"),
     Declaration("ONNX", "several outputs", "refused", "one of N×K, or a detector's N×A×(4+K)"),
     Declaration(
         "ONNX", "metadata: how pictures are prepared", "refused", "other than sRGB in [0, 1]: BGR, mean, range"

@@ -51,7 +51,7 @@ def load_network(path: Path) -> Classifier:
     try:
         program, batch, metadata = read_onnx(stored, read_data)
     except UnsupportedNetwork as error:
-        do = "export it in evaluation mode, without custom operators and control flow, opset 13 or later"
+        do = "export it in evaluation mode, without custom operators and control flow, opset_version=18"
         raise Refused("an ONNX file of plain tensors and operators", f"{path} with {error}", do) from error
     except Refused:
         raise
@@ -65,6 +65,7 @@ def load_network(path: Path) -> Classifier:
 
 def _beside(path: Path, location: str) -> Path:
     """The file of weights that an ONNX file names; refused unless it lies in the same folder."""
+    location = location.removeprefix("./")
     beside = path.parent / location
     is_named = location not in ("", ".", "..") and not set("/\\:\0") & set(location)
     if not is_named or os.path.dirname(os.path.realpath(beside)) != os.path.realpath(path.parent):

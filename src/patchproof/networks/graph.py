@@ -90,7 +90,7 @@ def _shape_of_first(compute: Callable[..., Any]) -> Callable[..., Any]:
 
     def result_shape(first: Any, *others: Any, **keywords: Any) -> Any:
         tensors = [first, *(other for other in others if isinstance(other, Tensor))]
-        if all(isinstance(tensor, Tensor) and tensor.dtype == torch.float32 for tensor in tensors):
+        if all(isinstance(tensor, Tensor) and tensor.is_meta and tensor.dtype == torch.float32 for tensor in tensors):
             if np.broadcast_shapes(*(tensor.shape for tensor in tensors)) == first.shape:
                 return first.new_empty_strided(first.shape, first.stride())
         return compute(first, *others, **keywords)
@@ -159,5 +159,5 @@ _TERMS: dict[Any, Callable[..., int]] = {
     **{operator.default: lambda a, *_: a.shape[-1] for operator in (_ATEN.mm, _ATEN.bmm)},
     **{operator.default: lambda _, a, *__: a.shape[-1] for operator in (_ATEN.addmm, _ATEN.baddbmm)},
     **{operator.default: lambda _, kernel, *__: math.prod(kernel) for operator in _POOLS},
-    _ATEN.convolution.default: lambda _, weight, *__: weight[0].numel(),
+    _ATEN.convolution.default: lambda _, weight, *others: weight[:, 0].numel() if others[4] else weight[0].numel(),
 }

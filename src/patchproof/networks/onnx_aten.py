@@ -31,7 +31,7 @@ def aten_calls(
             return []
         return _conv(*inputs[1:], **attributes)
     if name == "Clip" and numbers[0] is not None:
-        return _clip(*inputs[1:])
+        return _clip(*inputs[1:], **attributes)
     if name == "Relu" and numbers[0] is not None:
         return [(_ATEN.relu.default, [])]
     if name == "Add" and all(number in of_four for number in numbers):
@@ -50,8 +50,11 @@ def _conv(w, b=None, *, auto_pad="NOTSET", dilations=None, group=1, pads=None, s
     return [uneven, (_ATEN.convolution.default, [w, b, strides or [1, 1], [0, 0], *others])]
 
 
-def _clip(low=None, high=None) -> AtenCalls:
+def _clip(min=None, max=None) -> AtenCalls:
     """A hardtanh if both limits are known; unlike torch.clamp, its gradient is 0 at the limits, as ReLU6's is."""
-    tensors = (end for end in (low, high) if isinstance(end, Tensor) and end.is_floating_point() and not end.dim())
-    limits = [float(end) for end in tensors]
+    limits = [float(end) for end in (min, max) if isinstance(end, float) or _is_scalar(end)]
     return [(_ATEN.hardtanh.default, limits)] if len(limits) == 2 and limits[0] <= limits[1] else []
+
+
+def _is_scalar(value: Any) -> bool:
+    return isinstance(value, Tensor) and value.is_floating_point() and not value.dim()

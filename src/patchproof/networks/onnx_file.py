@@ -4,7 +4,7 @@ In: its bytes, and a function that reads the files where exporters put large wei
 Program of numbered steps (graph.py), how many pictures it takes, and the file's metadata; anything unsupported raises
 UnsupportedNetwork, and so does every field and attribute that nothing here takes. Nothing of the file is executed.
 Left out on purpose: subgraphs (If, Loop), functions of the file, operators of other domains, sparse and quantized
-weights, opsets before 13, which onnx.version_converter converts to newer ones.
+weights, opsets before 7, which onnx.version_converter converts to newer ones.
 
 Source: github.com/onnx/onnx, onnx.proto (IR version 13).
 """
@@ -26,12 +26,12 @@ from patchproof.networks import bounds
 from patchproof.networks.bounds import UnsupportedNetwork, checked_integer, quote
 from patchproof.networks.graph import Program
 from patchproof.networks.onnx_aten import AtenCalls, aten_calls
-from patchproof.networks.onnx_operators import DTYPES, OPERATORS
+from patchproof.networks.onnx_operators import DTYPES, RESULTS, find_operator
 from patchproof.networks.onnx_shapes import MAX_SIZES
 from patchproof.networks.protobuf import read_message, read_schemas
 from patchproof.networks.steps import InputDevice, Step, ValueRef, mark_last_uses
 
-OPSETS = (13, 28)
+OPSETS = (7, 28)
 _EXTERNAL = {"location", "offset", "length", "checksum"}  # what says where a weight lies in another file
 _STANDARD = ("", "ai.onnx")  # the domain
 MAX_SCALARS = 8  # floats that stay on the CPU; a Resize has up to eight factors
@@ -41,7 +41,7 @@ entry: 1 key text; 2 value text.
 tensor: 1 dims int*; 2 data_type int; 3 segment never; 4 floats bytes*; 5 ints int*; 6 strings never; 7 longs int*;
   8 name text; 9 raw bytes; 10 doubles bytes*; 11 unsigned never; 13 external entry*; 14 place int; 12,16 skipped.
 attribute: 1 name text; 2 f float; 3 i int; 4 s text; 5 t tensor; 6 a graph within the graph never; 7 floats float*;
-  8 ints int*; 20 type int; 13 skipped; 9,10,11,14,15,21,22,23 an attribute of an unusual kind never.
+  8 ints int*; 9 strings text*; 20 type int; 13 skipped; 10,11,14,15,21,22,23 an attribute of an unusual kind never.
 node: 1 input text*; 2 output text*; 4 op_type text; 5 attribute attribute*; 7 domain text; 8 overload never;
   3,6,9 skipped.
 size: 1 value int; 2 symbol text; 3 denotation text.
@@ -57,7 +57,8 @@ model: 7 graph graph; 8 opset opset*; 14 metadata entry*; 20 training steps neve
   1,2,3,4,5,6 skipped.
 """)
 # an attribute's type, as the file states it: where its value is, and the value where none is written
-_ATTRIBUTE_TYPES = {1: ("f", 0.0), 2: ("i", 0), 3: ("s", ""), 4: ("t", None), 6: ("floats", []), 7: ("ints", [])}
+_ATTRIBUTE_TYPES = {1: ("f", 0.0), 2: ("i", 0), 3: ("s", ""), 4: ("t", None)}
+_ATTRIBUTE_TYPES |= {6: ("floats", []), 7: ("ints", []), 8: ("strings", [])}
 _DENOTATIONS = ("DATA_BATCH", "DATA_CHANNEL", "DATA_FEATURE", "DATA_FEATURE")  # of a picture's dimensions
 
 
@@ -70,7 +71,7 @@ def read_onnx(stored: bytes, read_data: Callable[[str], bytes]) -> tuple[Program
     if len(versions) != 1 or not OPSETS[0] <= versions[0] <= OPSETS[1]:
         raise UnsupportedNetwork(f"opset {quote(versions)[1:-1]}, not one from {OPSETS[0]} to {OPSETS[1]}")
     metadata = {entry.get("key", ""): entry.get("value", "") for entry in model.get("metadata", [])}
-    return *_GraphReader(model["graph"], _Weights(read_data)).read(), metadata
+    return *_GraphReader(model["graph"], _Weights(read_data), versions[0]).read(), metadata
 
 
 class _Weights:
@@ -127,8 +128,10 @@ def _from_bytes(stored: Any, dtype: torch.dtype) -> Tensor:
 class _GraphReader:
     """Turns one file's graph into steps; a name is defined once, as a numbered value or a small constant."""
 
-    def __init__(self, graph: dict[str, Any], weights: _Weights):
-        self.graph, self.nodes = graph, graph.get("node", [])
+    def __init__(self, graph: dict[str, Any], weights: _Weights, opset: int):
+        self.graph, self.nodes, self.opset = graph, graph.get("node", []), opset
+        self.used = {name for node in self.nodes for name in node.get("input", [])}
+        self.used |= {output["name"] for output in graph["output"]}
         self.weights: list[Tensor] = []
         self.count = 0  # numbered values so far
         # values known to have four dimensions; of weights the last two
@@ -143,24 +146,33 @@ class _GraphReader:
         inputs = [place for place in self.graph["input"] if place["name"] not in self.values]
         for node in self.nodes:
             if node["op_type"] == "Constant":
-                ((_, value),) = self._attributes(node).items()
-                self._constant(node["output"][0], value)
+                ((kind, value),) = self._attributes(node).items()
+                dtype = torch.int64 if kind in ("value_int", "value_ints") else torch.float32
+                self._constant(
+                    node["output"][0], value if isinstance(value, Tensor) else torch.tensor(value, dtype=dtype)
+                )
         if len(inputs) != 1:
             raise UnsupportedNetwork(f"{len(inputs)} inputs, not one of N×3×S×S")
-        batch, sizes = _shape(inputs[0]["type"]["tensor"])
+        batch, sizes, colors_last = _shape(inputs[0]["type"]["tensor"])
         self.count = len(self.weights)
         self.of_four |= {i: list(weight.shape[2:]) for i, weight in enumerate(self.weights) if weight.dim() == 4}
-        self._new(inputs[0]["name"])
-        steps = [step for node in self.nodes for step in self._steps(node)]
+        photos = self._new(f"{inputs[0]['name']} N×3×S×S" if colors_last else inputs[0]["name"])
+        steps: list[Step] = []
+        if colors_last:  # as TensorFlow's are
+            steps.append(
+                Step(torch.permute, [ValueRef(photos), (0, 2, 3, 1)], {}, [self._new(inputs[0]["name"])], False, [])
+            )
+        self.of_photos = {photos, self.count - 1}  # computed from pictures
+        for node in self.nodes:
+            steps.extend(self._steps(node))
         outputs = [self._known(place["name"]) for place in self.graph["output"]]
         if len(outputs) != 1 or not isinstance(outputs[0], ValueRef):
             raise UnsupportedNetwork(f"{len(outputs)} outputs, not one of N×K, or N×A×(4+K) of a detector")
         mark_last_uses(steps, {*range(len(self.weights) + 1), outputs[0].number})
         return Program(self.weights, steps, outputs[0].number, sizes), batch
 
-    def _constant(self, name: str, value: Any) -> None:
+    def _constant(self, name: str, tensor: Tensor) -> None:
         """Number a weight, so that it moves with the network; keep short lists of sizes and factors on the CPU."""
-        tensor = value if isinstance(value, Tensor) else torch.tensor(value)
         if tensor.numel() > (MAX_SCALARS if tensor.is_floating_point() else MAX_SIZES):
             self.weights.append(tensor)
             self._name(name, ValueRef(len(self.weights) - 1))
@@ -173,7 +185,8 @@ class _GraphReader:
         self.values[name] = value
 
     def _new(self, name: str) -> int:
-        self._name(name, ValueRef(self.count))
+        if name:
+            self._name(name, ValueRef(self.count))
         self.count += 1
         return self.count - 1
 
@@ -185,26 +198,33 @@ class _GraphReader:
     def _steps(self, node: dict[str, Any]) -> list[Step]:
         """The steps that compute a node; none for a constant or an alias."""
         name, domain, outputs = node["op_type"], node.get("domain", ""), node["output"]
-        if domain not in _STANDARD or name not in (*OPERATORS, "Constant", "Identity"):
-            raise UnsupportedNetwork(f"the operator {quote(f'{domain}.{name}'.lstrip('.'))}")
-        is_split = name == "Split"  # the operator of several results
+        if domain not in _STANDARD:
+            raise UnsupportedNetwork(f"the operator {quote(f'{domain}.{name}')}")
         if name == "Identity" and node.get("attribute"):
             raise UnsupportedNetwork("an attribute of Identity")
-        if len(outputs) != 1 and not is_split:
-            raise UnsupportedNetwork(f"{len(outputs)} results of {name}, where only the first is supported")
         inputs = [self._known(word) for word in node.get("input", [])]
         if name == "Identity":
             self._name(outputs[0], *inputs)
         if name in ("Constant", "Identity"):
             return []
-        operator, attributes = OPERATORS[name], self._attributes(node)
-        if is_split and len(inputs) == 1:
+        operator, attributes = find_operator(name, self.opset), self._attributes(node)
+        count = len(outputs) if name == "Split" else RESULTS.get(name, 1)
+        if self.used.intersection(outputs[count:]) - {""}:
+            raise UnsupportedNetwork(f"{len(outputs)} results of {name}, where only {count} can be used")
+        outputs = outputs[:count]
+        if name == "Split" and len(inputs) == 1:
             attributes.setdefault("num_outputs", len(outputs))
         operator.check(inputs, attributes)
+        of_photos = any(isinstance(value, ValueRef) and value.number in self.of_photos for value in inputs)
+        if of_photos and name == "BatchNormalization" and attributes.get("training_mode"):
+            raise UnsupportedNetwork("the attribute training_mode = 1")
         if calls := aten_calls(name, inputs, attributes, self.of_four):
-            return self._aten_steps(calls, name, inputs[0], outputs[0])
-        results = [self._new(word) for word in outputs]
-        return [Step(operator, [InputDevice, *inputs], attributes, results, is_split, [])]
+            steps = self._aten_steps(calls, name, inputs[0], outputs[0])
+        else:
+            results = [self._new(word) for word in [*outputs, *[""] * (count - len(outputs))]]
+            steps = [Step(operator, [InputDevice, *inputs], attributes, results, name == "Split" or count > 1, [])]
+        self.of_photos.update(number for step in steps for number in step.results if of_photos)
+        return steps
 
     def _aten_steps(self, calls: AtenCalls, name: str, value: Any, output: str) -> list[Step]:
         steps, is_four = [], name == "Conv" or value.number in self.of_four
@@ -237,17 +257,19 @@ class _GraphReader:
         return content
 
 
-def _shape(tensor: dict[str, Any]) -> tuple[int | None, list[int | None]]:
-    """The batch size and the input's sizes; None where any size is allowed."""
+def _shape(tensor: dict[str, Any]) -> tuple[int | None, list[int | None], bool]:
+    """The batch size and the sizes of pictures N×3×S×S, None where any is allowed; True if they come as N×S×S×3."""
     if tensor["kind"] != 1:
         raise UnsupportedNetwork("an input that is not float32")
     dimensions = tensor["shape"].get("dim", [])
     sizes = [size.get("value") for size in dimensions]
     if len(sizes) != 4:
         raise UnsupportedNetwork(f"an input of {len(sizes)} dimensions, not N×3×S×S")
+    if colors_last := sizes[3] == 3 and sizes[1] != 3:
+        dimensions, sizes = ([values[i] for i in (0, 3, 1, 2)] for values in (dimensions, sizes))
     stated = [size.get("denotation") or right for size, right in zip(dimensions, _DENOTATIONS, strict=True)]
     if stated != list(_DENOTATIONS):
         raise UnsupportedNetwork(f"an input of the dimensions {quote(stated)}, not N×3×S×S")
     fixed = [None if size is None else checked_integer(size, 1, 1 << 16) for size in sizes]
     batch = None if fixed[0] is None else checked_integer(fixed[0], 1, bounds.MAX_BATCH)
-    return batch, [None, *fixed[1:]]
+    return batch, [None, *fixed[1:]], colors_last

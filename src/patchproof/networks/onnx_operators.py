@@ -5,9 +5,9 @@ numbers; a name that is not in the table is refused. In a signature, inputs befo
 sizes or axes; these and what follows `*` may be attributes of that name. Data are sent to the pictures' device, which
 has no memory during the dry run in graph.py; only for the operators in `_ON_SIZES`, whose results are no larger than
 their inputs allow, a few numbers stay on the CPU, so that sizes can be computed.
-Left out on purpose: control flow, sequences, text, random numbers, quantized and recurrent networks, boxes.
+What is left out on purpose, and why, is in `REFUSED`.
 
-Source: onnx.ai/onnx/operators, opsets 13 to 28; where two differ, both forms are read.
+Source: onnx.ai/onnx/operators, opsets 7 to 28; where two differ, both forms are read.
 """
 
 from __future__ import annotations
@@ -23,30 +23,29 @@ from torch import Tensor
 from torch.nn import functional as F
 
 import patchproof.networks.onnx_shapes as shapes
+import patchproof.networks.onnx_windows as windows
 from patchproof.networks.bounds import UnsupportedNetwork, quote
+from patchproof.networks.onnx_layers import attention, recurrent
+from patchproof.networks.onnx_resize import resize, upsample
 from patchproof.networks.onnx_shapes import MAX_SIZES, numbers
 
 # the numbers of TensorProto.DataType
 _INTEGERS = {2: torch.uint8, 3: torch.int8, 5: torch.int16, 6: torch.int32, 7: torch.int64}
 DTYPES = _INTEGERS | {1: torch.float32, 9: torch.bool, 10: torch.float16, 11: torch.float64, 16: torch.bfloat16}
 _ON_SIZES = frozenset(
-    "Abs Add And Cast Ceil Concat ConstantOfShape Div Equal Expand Floor Gather Greater GreaterOrEqual Less Mod Mul "
-    "LessOrEqual Neg Not Or Pow Range Reciprocal ReduceProd Reshape ScatterND Slice Split Sqrt Squeeze Sub Transpose "
-    "Unsqueeze Where".split()
+    "Abs Add And Cast CastLike Ceil Clip Concat ConstantOfShape CumSum Div Equal Expand Flatten Floor Gather "
+    "GatherElements GatherND Greater GreaterOrEqual Less LessOrEqual Max Min Mod Mul Neg NonZero Not OneHot Or Pow "
+    "Range Reciprocal ReduceMax ReduceMin ReduceProd ReduceSum Reshape Round ScatterElements ScatterND Sign Slice "
+    "Split Sqrt Squeeze Sub Sum Transpose Unsqueeze Where Xor".split()
 )
 # attributes that have to have this value, or (None) that change nothing here
 FIXED_ATTRIBUTES: dict[str, dict[str, Any]] = {
-    "AveragePool": {"dilations": [1, 1]},
-    "BatchNormalization": {"training_mode": 0, "momentum": None},
-    "Cast": {"saturate": None},  # 8-bit floats
+    "Attention": {"qk_matmul_output_mode": None, "softmax_precision": None, "softcap": 0.0},
+    "BatchNormalization": {"momentum": None, "spatial": 1},
+    **{name: {"round_mode": None, "saturate": None} for name in ("Cast", "CastLike")},  # 8-bit floats
     "Dropout": {"seed": None},
-    **{name: {"stash_type": 1} for name in ("GroupNormalization", "LayerNormalization")},
+    **{name: {"stash_type": 1} for name in ("GroupNormalization", "LayerNormalization", "RMSNormalization")},
     "MaxPool": {"storage_order": None},  # of the second result
-    "Resize": {
-        **{"antialias": 0, "cubic_coeff_a": -0.75, "exclude_outside": 0, "keep_aspect_ratio_policy": "stretch"},
-        "extrapolation_value": None,  # of crops
-    },
-    "ScatterND": {"reduction": "none"},
 }
 
 
@@ -85,51 +84,7 @@ class Operator:
         return self.compute(*(x if x is None else x.to(device) for x in data), *rest, **attributes)
 
 
-# --- windows and products ---
-
-
-def _pad_unevenly(x: Tensor, pads: list[int] | None, limits: Sequence[float], fill: float) -> tuple[Tensor, list[int]]:
-    """The input and the padding left for torch, which pads both ends alike and pools by half a window at most."""
-    n = x.dim() - 2
-    before, after = list(pads or [0] * n)[:n], list(pads or [0] * n)[-n:]
-    if before == after and all(pad <= limit for pad, limit in zip(before, limits, strict=True)):
-        return x, before
-    return F.pad(x, shapes.in_torchs_order(list(zip(before, after, strict=True))), value=fill), [0] * n
-
-
-def _check_auto_pad(auto_pad: str, pads: list[int] | None) -> None:
-    if auto_pad not in ("NOTSET", "VALID") or (auto_pad == "VALID" and any(pads or [])):
-        raise ValueError("paddings that depend on the size (auto_pad)")
-
-
-def _conv(x, w, b=None, /, *, auto_pad="NOTSET", dilations=None, group=1, kernel_shape=None, pads=None, strides=None):
-    _check_auto_pad(auto_pad, pads)
-    if kernel_shape not in (None, list(w.shape[2:])):
-        raise ValueError(f"weights of {tuple(w.shape)} for kernel_shape = {kernel_shape}")
-    ones = [1] * (x.dim() - 2)
-    x, padding = _pad_unevenly(x, pads, [math.inf] * len(ones), 0.0)
-    return torch.convolution(x, w, b, strides or ones, padding, dilations or ones, False, [0] * len(ones), group)
-
-
-def _max_pool(x, /, *, kernel_shape, auto_pad="NOTSET", ceil_mode=0, dilations=None, pads=None, strides=None):
-    _check_auto_pad(auto_pad, pads)
-    pads, strides = pads or [0] * 4, strides or [1, 1]
-    if any(pad >= size for pad, size in zip(pads, kernel_shape * 2, strict=True)):
-        raise ValueError(f"a MaxPool of kernel_shape = {kernel_shape} with windows in its padding")
-    padded, padding = _pad_unevenly(x, pads, [size // 2 for size in kernel_shape], -math.inf)
-    pooled = F.max_pool2d(padded, kernel_shape, strides, padding, dilations or [1, 1], bool(ceil_mode))
-    if ceil_mode:  # no window begins in the padding at the end, which torch does not know where it was padded above
-        ends = [math.ceil((x.shape[2 + i] + pads[i]) / strides[i]) for i in (0, 1)]
-        pooled = pooled[..., : ends[0], : ends[1]]
-    return pooled
-
-
-def _average_pool(x, /, *, kernel_shape, auto_pad="NOTSET", ceil_mode=0, count_include_pad=0, pads=None, strides=None):
-    _check_auto_pad(auto_pad, pads)
-    padded, padding = _pad_unevenly(x, pads, [size // 2 for size in kernel_shape], 0.0)
-    if padded is not x and (ceil_mode or not count_include_pad):
-        raise ValueError("an AveragePool with different paddings before and after")
-    return F.avg_pool2d(padded, kernel_shape, strides or [1, 1], padding, bool(ceil_mode), bool(count_include_pad))
+# --- products ---
 
 
 def _gemm(a, b, c=None, /, *, alpha=1.0, beta=1.0, transA=0, transB=0):
@@ -138,6 +93,18 @@ def _gemm(a, b, c=None, /, *, alpha=1.0, beta=1.0, transA=0, transB=0):
 
 
 # --- normalization ---
+
+
+def _batch_norm(x, scale, b, mean, variance, /, *, epsilon=1e-5, training_mode=0):
+    if training_mode:  # of weights: onnx_file.py refuses it of what comes from pictures
+        mean = variance = None
+    return F.batch_norm(x, mean, variance, scale, b, bool(training_mode), 0.0, epsilon)
+
+
+def _mean_variance(x, /, *, axes=(0, 2, 3)):
+    """Subtract the mean along `axes` and divide by the standard deviation."""
+    variance, mean = torch.var_mean(x, tuple(axes), correction=0, keepdim=True)
+    return (x - mean) / (variance.sqrt() + 1e-9)
 
 
 def _group_norm(x, scale, b, /, *, num_groups, epsilon=1e-5):
@@ -184,34 +151,96 @@ def _product(x: Tensor, dims: list[int], keepdim: bool) -> Tensor:
     return x if keepdim else x.squeeze(dims)
 
 
+def _of_rows(compute: Callable[..., Tensor]) -> Callable[..., Tensor]:
+    """A softmax as before opset 13: of rows that hold all axes from `axis` on."""
+    return lambda x, /, *, axis=1: compute(x.reshape(math.prod(x.shape[:axis]), -1), -1).reshape(x.shape)
+
+
+def _hardmax(x: Tensor, axis: int) -> Tensor:
+    return torch.zeros_like(x).scatter(axis, x.argmax(axis, keepdim=True), 1.0)
+
+
+def _shrink(x, /, *, lambd=0.5, bias=0.0):
+    return torch.where(x < -lambd, x + bias, torch.where(x > lambd, x - bias, 0.0))
+
+
+def _is_infinite(x, /, *, detect_negative=1, detect_positive=1):
+    return (x.isposinf() & bool(detect_positive)) | (x.isneginf() & bool(detect_negative))
+
+
+def _extreme_place(compute: Callable[..., Tensor]) -> Callable[..., Tensor]:
+    """The index of an extreme, the first or with `select_last_index` the last one."""
+
+    def computed(x, /, *, axis=0, keepdims=1, select_last_index=0):
+        found = compute(x.flip(axis) if select_last_index else x, axis, keepdim=bool(keepdims))
+        return x.shape[axis] - 1 - found if select_last_index else found
+
+    return computed
+
+
+def _top(x, /, k, *, axis=-1, largest=1, sorted=1):
+    """The `k` largest or smallest and their indices; of equal ones the first."""
+    ordered, indices = x.sort(stable=True, dim=axis, descending=bool(largest))
+    return ordered.narrow(axis, 0, numbers(k)[0]), indices.narrow(axis, 0, numbers(k)[0])
+
+
+def _cumulative_sum(x, /, axis, *, exclusive=0, reverse=0):
+    (along,) = numbers(axis)
+    x = x.flip(along) if reverse else x
+    sums = x.cumsum(along, dtype=x.dtype)
+    sums = sums - x if exclusive else sums
+    return sums.flip(along) if reverse else sums
+
+
+def _grid_sample(x, grid, /, *, align_corners=0, mode="linear", padding_mode="zeros"):
+    kind = {"linear": "bilinear", "cubic": "bicubic"}.get(mode, mode)  # opset 16 has torch's words
+    return F.grid_sample(x, grid, kind, padding_mode, bool(align_corners))
+
+
+# names of the standard, and torch's for the same where they differ
+_UNARY = """Abs Acos Acosh Asin Asinh Atan Atanh BitwiseNot:bitwise_not Ceil Cos Cosh Det Erf Exp Floor IsNaN Log Neg
+Not:logical_not Reciprocal Relu Round Sigmoid Sign Sin Sinh Sqrt Tan Tanh"""
+_BINARY = """Add And:logical_and BitwiseAnd:bitwise_and BitwiseOr:bitwise_or BitwiseXor:bitwise_xor Equal:eq Greater
+GreaterOrEqual:ge Less LessOrEqual:le MatMul Mul Or:logical_or Sub Xor:logical_xor"""
+
+
+def _named(words: str, module: Any, kind: Callable[..., Any]) -> dict[str, Callable[..., Any]]:
+    pairs = (word.partition(":")[::2] for word in words.split())
+    return {name: kind(getattr(module, of or name.lower())) for name, of in pairs}
+
+
 _TABLE: dict[str, Callable[..., Any]] = {
     # of one input
-    **{name: _unary(getattr(torch, name.lower())) for name in "Abs Ceil Cos Erf Exp Floor Log Neg Reciprocal".split()},
-    **{name: _unary(getattr(torch, name.lower())) for name in "IsNaN Relu Sigmoid Sign Sin Sqrt Tanh".split()},
-    **{name: _unary(getattr(F, name.lower())) for name in ("HardSwish", "Mish", "Softplus")},
-    "Not": _unary(torch.logical_not),
+    **_named(_UNARY, torch, _unary),
+    **_named("HardSwish Mish Softplus Softsign", F, _unary),
     "GlobalAveragePool": _unary(lambda x: x.mean(tuple(range(2, x.dim())), keepdim=True)),
     "GlobalMaxPool": _unary(lambda x: x.amax(tuple(range(2, x.dim())), keepdim=True)),
+    "GlobalLpPool": lambda x, /, *, p=2: torch.linalg.vector_norm(x, p, tuple(range(2, x.dim())), keepdim=True),
+    "Celu": lambda x, /, *, alpha=1.0: F.celu(x, alpha),
     "Elu": lambda x, /, *, alpha=1.0: F.elu(x, alpha),
+    "Selu": lambda x, /, *, alpha=1.67326319217681884765625, gamma=1.05070102214813232421875: gamma * F.elu(x, alpha),
     "LeakyRelu": lambda x, /, *, alpha=0.01: F.leaky_relu(x, alpha),
+    "ThresholdedRelu": lambda x, /, *, alpha=1.0: torch.where(x > alpha, x, 0.0),
+    "Shrink": _shrink,
+    "Swish": lambda x, /, *, alpha=1.0: x * (alpha * x).sigmoid(),
     "HardSigmoid": lambda x, /, *, alpha=0.2, beta=0.5: (alpha * x + beta).clamp(0, 1),
     "Gelu": lambda x, /, *, approximate="none": F.gelu(x, approximate=approximate),
     "Softmax": lambda x, /, *, axis=-1: x.softmax(axis),
     "LogSoftmax": lambda x, /, *, axis=-1: x.log_softmax(axis),
+    "Hardmax": lambda x, /, *, axis=-1: _hardmax(x, axis),
+    "IsInf": _is_infinite,
     "Cast": lambda x, /, *, to: x.to(DTYPES[to]),
     # of two or more
-    **{name: _binary(getattr(torch, name.lower())) for name in "Add Sub Mul MatMul Greater Less".split()},
-    **{
-        name: _binary(getattr(torch, of))
-        for name, of in (("Equal", "eq"), ("GreaterOrEqual", "ge"), ("LessOrEqual", "le"))
-    },
-    **{name: _binary(getattr(torch, f"logical_{name.lower()}")) for name in ("And", "Or")},
+    **_named(_BINARY, torch, _binary),
+    "BitShift": lambda x, by, /, *, direction: x << by if direction == "LEFT" else x >> by,
+    "CastLike": _binary(lambda x, like: x.to(like.dtype)),
     "Div": _binary(lambda a, b: a / b if a.is_floating_point() else torch.div(a, b, rounding_mode="trunc")),
     "Mod": lambda a, b, /, *, fmod=0: torch.fmod(a, b) if fmod else torch.remainder(a, b),
     "Pow": _binary(lambda x, y: torch.pow(x, y).to(x.dtype)),
     "PRelu": _binary(lambda x, slope: torch.where(x < 0, slope * x, x)),
     "Where": lambda condition, x, y, /: torch.where(condition, x, y),
-    "Clip": lambda x, low=None, high=None, /: x if low is None and high is None else torch.clamp(x, low, high),
+    "Clip": lambda x, /, min=None, max=None: x if min is None and max is None else torch.clamp(x, min, max),
+    "Mean": lambda *tensors: functools.reduce(torch.add, tensors) / len(tensors),
     **{"Max": _variadic(torch.maximum), "Min": _variadic(torch.minimum), "Sum": _variadic(torch.add)},
     "Gemm": _gemm,
     "Einsum": lambda *tensors, equation: torch.einsum(equation, *tensors),
@@ -219,18 +248,36 @@ _TABLE: dict[str, Callable[..., Any]] = {
     **{f"Reduce{name}": _reduction(getattr(torch, name.lower())) for name in ("Mean", "Sum")},
     **{f"Reduce{name}": _reduction(getattr(torch, f"a{name.lower()}")) for name in ("Max", "Min")},
     "ReduceProd": _reduction(_product),
+    "ReduceL1": _reduction(lambda x, along, keepdim: x.abs().sum(along, keepdim), torch.abs),
+    "ReduceSumSquare": _reduction(lambda x, along, keepdim: x.square().sum(along, keepdim), torch.square),
+    "ReduceLogSum": _reduction(lambda x, along, keepdim: x.sum(along, keepdim).log(), torch.log),
+    "ReduceLogSumExp": _reduction(torch.logsumexp),
     "ReduceL2": _reduction(lambda x, along, keepdim: torch.linalg.vector_norm(x, 2, along, keepdim), torch.abs),
+    **{"ArgMax": _extreme_place(torch.argmax), "ArgMin": _extreme_place(torch.argmin)},
+    "TopK": _top,
+    "CumSum": _cumulative_sum,
+    "LpNormalization": lambda x, /, *, axis=-1, p=2: F.normalize(x, p, axis, 1e-37),
     # windows and norms
-    "Conv": _conv,
-    "MaxPool": _max_pool,
-    "AveragePool": _average_pool,
-    "BatchNormalization": lambda x, s, b, mean, var, /, *, epsilon=1e-5: F.batch_norm(x, mean, var, s, b, eps=epsilon),
+    "Conv": windows.conv,
+    "ConvTranspose": windows.conv_transpose,
+    "MaxPool": windows.max_pool,
+    "AveragePool": windows.average_pool,
+    "LpPool": windows.lp_pool,
+    "LRN": windows.lrn,
+    "Col2Im": windows.col2im,
+    "BatchNormalization": _batch_norm,
+    "MeanVarianceNormalization": _mean_variance,
+    "RMSNormalization": lambda x, s, /, *, axis=-1, epsilon=1e-5: F.rms_norm(x, x.shape[axis:], s, epsilon),
     "LayerNormalization": lambda x, s, b=None, /, *, axis=-1, epsilon=1e-5: F.layer_norm(
         x, x.shape[axis:], s, b, epsilon
     ),
     "GroupNormalization": _group_norm,
     "InstanceNormalization": lambda x, a, b, /, *, epsilon=1e-5: F.instance_norm(x, None, None, a, b, eps=epsilon),
     "Dropout": _dropout,
+    "Attention": attention,
+    "LSTM": recurrent("LSTM", torch.lstm, [0, 2, 3, 1], ["Sigmoid", "Tanh", "Tanh"]),
+    "GRU": recurrent("GRU", torch.gru, [1, 0, 2], ["Sigmoid", "Tanh"]),
+    "RNN": recurrent("RNN", torch.rnn_tanh, [0], ["Tanh"]),
     # shapes
     "Reshape": shapes.reshape,
     "Flatten": lambda x, /, *, axis=1: x.reshape(math.prod(x.shape[:axis]), math.prod(x.shape[axis:])),
@@ -241,13 +288,61 @@ _TABLE: dict[str, Callable[..., Any]] = {
     "Split": shapes.split,
     "Slice": shapes.slice_along,
     "Gather": shapes.gather,
+    "GatherElements": shapes.gather_elements,
+    "GatherND": shapes.gather_nd,
+    **{name: shapes.scatter_elements for name in ("ScatterElements", "Scatter")},
     "ScatterND": shapes.scatter_nd,
+    "OneHot": shapes.one_hot,
+    "NonZero": shapes.non_zero,
+    "Trilu": lambda x, /, k=None, *, upper=1: (torch.triu if upper else torch.tril)(x, *numbers(k)),
+    "EyeLike": lambda x, /, *, dtype=None, k=0: torch.ones_like(x, dtype=dtype and DTYPES[dtype]).triu(k).tril(k),
+    "DepthToSpace": shapes.depth_to_space,
+    "SpaceToDepth": shapes.space_to_depth,
+    "CenterCropPad": shapes.center_crop_pad,
     "Expand": lambda x, /, shape: x.expand(torch.broadcast_shapes(x.shape, numbers(shape))),
     "Tile": lambda x, /, repeats: x.tile(numbers(repeats)),
     "Pad": shapes.pad,
-    "Resize": shapes.resize,
+    **{"Resize": resize, "Upsample": upsample},
+    "GridSample": _grid_sample,
+    "AffineGrid": lambda theta, /, size, *, align_corners=0: F.affine_grid(theta, numbers(size), bool(align_corners)),
+    "Size": lambda x, /: torch.tensor(x.numel()),
     "Shape": lambda x, /, *, start=0, end=None: torch.tensor(x.shape[start:end], dtype=torch.int64),
     "Range": shapes.arange,
     "ConstantOfShape": lambda shape, *, value=None: (torch.zeros(1) if value is None else value).expand(numbers(shape)),
 }
 OPERATORS = {name: Operator(name, compute) for name, compute in _TABLE.items()}
+# operators that did something else before an opset
+_FORMER = {
+    "Softmax": (13, Operator("Softmax", _of_rows(torch.softmax))),
+    "LogSoftmax": (13, Operator("LogSoftmax", _of_rows(torch.log_softmax))),
+    "Hardmax": (13, Operator("Hardmax", _of_rows(_hardmax))),
+    "Resize": (11, Operator("Upsample", upsample)),
+}
+RESULTS = {"TopK": 2, "LSTM": 3, "GRU": 2, "RNN": 2}  # how many, where there are several
+# operators of the standard that are left out, by the reason
+REFUSED = {
+    "draws random numbers": "Bernoulli Multinomial RandomNormal RandomNormalLike RandomUniform RandomUniformLike",
+    "has results whose size depends on the pictures' content": "Compress NonMaxSuppression Unique",
+    "runs parts of the file again or not at all": "If Loop Scan",
+    "is of quantized numbers, which have no gradient": "ConvInteger DequantizeLinear DynamicQuantizeLinear "
+    "MatMulInteger QLinearConv QLinearMatMul QuantizeLinear",
+    "keeps numbers between calls": "TensorScatter",
+    "torch has no like for": "DeformConv MaxRoiPool MaxUnpool RoiAlign",
+    "is of lists, texts or files": "ConcatFromSequence ImageDecoder Optional OptionalGetElement OptionalHasElement "
+    "RegexFullMatch ReverseSequence SequenceAt SequenceConstruct SequenceEmpty SequenceErase SequenceInsert "
+    "SequenceLength SequenceMap SplitToSequence StringConcat StringNormalizer StringSplit TfIdfVectorizer",
+    "is of sounds or texts": "BlackmanWindow DFT HammingWindow HannWindow MelWeightMatrix RotaryEmbedding STFT",
+    "is a loss": "NegativeLogLikelihoodLoss SoftmaxCrossEntropyLoss",
+    "is of training": "Adagrad Adam Gradient Momentum",
+}
+
+
+def find_operator(name: str, opset: int) -> Operator:
+    """The operator as the opset defines it; refused with the reason if it is not in the table."""
+    until, former = _FORMER.get(name, (0, None))
+    if opset < until and former:
+        return former
+    if name not in OPERATORS:
+        reasons = [f", which {reason}" for reason, names in REFUSED.items() if name in names.split()]
+        raise UnsupportedNetwork(f"the operator {quote(name)}{''.join(reasons)}")
+    return OPERATORS[name]

@@ -15,6 +15,7 @@ from torch.nn import functional as F
 
 from patchproof.networks.bounds import MAX_DIMENSIONS
 
+Sides = list[tuple[int, int]]  # of each dimension, numbers added before and after
 MAX_SIZES = 64  # numbers on the CPU in one value: an outer product of three such values has 262 thousand
 
 
@@ -24,7 +25,7 @@ def numbers(values: Any) -> list[Any]:
         if values.is_meta:
             raise ValueError("sizes in it depend on the pictures' content, or on a list that is too long")
         return values.reshape(-1).tolist()
-    return values or []
+    return [values] if isinstance(values, float | int) else values or []
 
 
 def reshape(x, /, shape, *, allowzero=0):
@@ -67,9 +68,82 @@ def gather(x, indices, /, *, axis=0):
     return x.index_select(axis, positions.reshape(-1)).reshape(x.shape[:axis] + indices.shape + x.shape[axis + 1 :])
 
 
-def scatter_nd(x, indices, updates, /):
-    """Put `updates` in the places that `indices` name."""
-    return x.index_put(tuple(indices.unbind(-1)), updates)
+def gather_nd(x, indices, /, *, batch_dims=0):
+    """Pick what the last dimension of `indices` points to, behind `batch_dims` dimensions that both have."""
+    batch = [
+        torch.arange(size, device=x.device).reshape(-1, *[1] * (indices.dim() - 2 - axis))
+        for axis, size in enumerate(x.shape[:batch_dims])
+    ]
+    return x[(*batch, *indices.unbind(-1))]
+
+
+def gather_elements(x, indices, /, *, axis=0):
+    """Pick one number for each index, at the index's own place on the other axes."""
+    return x.gather(axis, torch.where(indices < 0, indices + x.shape[axis], indices))
+
+
+_REDUCTIONS = {"add": "sum", "mul": "prod", "max": "amax", "min": "amin"}  # of scatters, in torch's words
+
+
+def scatter_elements(x, indices, updates, /, *, axis=0, reduction="none"):
+    """Put each update at its index along `axis`, or combine it with what is there."""
+    positions = torch.where(indices < 0, indices + x.shape[axis], indices)
+    if reduction == "none":
+        return x.scatter(axis, positions, updates)
+    return x.scatter_reduce(axis, positions, updates, _REDUCTIONS[reduction])
+
+
+def scatter_nd(x, indices, updates, /, *, reduction="none"):
+    """Put `updates` in the places that `indices` name, or combine them with what is there."""
+    places = tuple(indices.unbind(-1))
+    if reduction in ("none", "add"):
+        return x.index_put(places, updates, accumulate=reduction == "add")
+    numbered = torch.arange(math.prod(x.shape[: len(places)]), device=x.device).reshape(x.shape[: len(places)])
+    rows, flat = numbered[places].reshape(-1, 1), x.reshape(numbered.numel(), -1)
+    updates = updates.reshape(len(rows), -1)
+    return flat.scatter_reduce(0, rows.expand_as(updates), updates, _REDUCTIONS[reduction]).reshape(x.shape)
+
+
+def one_hot(indices, /, depth, values, *, axis=-1, device):
+    """The second one of `values` at each index along a new axis, the first one elsewhere."""
+    count = int(numbers(depth)[0])
+    indices = indices if count <= MAX_SIZES else indices.to(device)
+    places = torch.arange(count, device=indices.device)
+    hot = torch.where(indices < 0, indices + count, indices)[..., None] == places
+    off, on = values.to(indices.device).unbind()
+    return torch.where(hot, on, off).movedim(-1, axis)
+
+
+def non_zero(x, /):
+    """The places of numbers other than zero, of few numbers that follow from sizes."""
+    if x.device.type != "cpu" or x.numel() > MAX_SIZES:
+        raise ValueError("places of numbers that are not zero, which depend on the pictures' content")
+    return x.nonzero().T
+
+
+def depth_to_space(x, /, *, blocksize, mode="DCR"):
+    """Move channels into blocks of pixels; the block's pixels come before (DCR) or after the channels that remain."""
+    if mode == "CRD":
+        return F.pixel_shuffle(x, blocksize)
+    n, channels, height, width = x.shape
+    blocks = x.reshape(n, blocksize, blocksize, channels // blocksize**2, height, width)
+    return blocks.permute(0, 3, 4, 1, 5, 2).reshape(n, -1, height * blocksize, width * blocksize)
+
+
+def space_to_depth(x, /, *, blocksize):
+    """Move blocks of pixels into channels, the block's pixels before the former channels."""
+    n, channels, height, width = x.shape
+    blocks = x.reshape(n, channels, height // blocksize, blocksize, width // blocksize, blocksize)
+    return blocks.permute(0, 3, 5, 1, 2, 4).reshape(n, -1, height // blocksize, width // blocksize)
+
+
+def center_crop_pad(x, /, shape, *, axes=None):
+    """Crop or pad both ends alike to `shape`, an odd number at the end."""
+    sides = [(0, 0)] * x.dim()
+    for axis, size in zip(axes or range(x.dim()), numbers(shape), strict=True):
+        more = size - x.shape[axis]
+        sides[axis] = (int(more / 2), more - int(more / 2))
+    return pad_sides(x, sides)
 
 
 def pad(x, /, pads, value=None, axes=None, *, mode="constant"):
@@ -78,14 +152,22 @@ def pad(x, /, pads, value=None, axes=None, *, mode="constant"):
     sides = [(0, 0)] * x.dim()
     for axis, *side in zip(listed_axes, pads[: len(listed_axes)], pads[len(listed_axes) :], strict=True):
         sides[axis] = (side[0], side[1])
-    first = next((axis for axis, side in enumerate(sides) if any(side)), x.dim())
-    kind = {"constant": "constant", "reflect": "reflect", "edge": "replicate"}[mode]
-    return F.pad(x, in_torchs_order(sides[first:]), kind, *(numbers(value) if kind == "constant" else []))
+    if mode == "constant":
+        return pad_sides(x, sides, *numbers(value))
+    x = pad_sides(x, [(min(before, 0), min(after, 0)) for before, after in sides])
+    for axis, side in enumerate(sides):
+        before, after = max(side[0], 0), max(side[1], 0)
+        if before or after:
+            places, last = torch.arange(-before, x.shape[axis] + after, device=x.device), x.shape[axis] - 1
+            if mode == "reflect":
+                places = last - (places % max(2 * last, 1) - last).abs()
+            x = x.index_select(axis, {"edge": places.clamp(0, last), "wrap": places % (last + 1)}.get(mode, places))
+    return x
 
 
-def in_torchs_order(sides: list[tuple[int, int]]) -> list[int]:
-    """Flatten paddings (before, after) of each dimension, the last dimension first."""
-    return [pad for side in reversed(sides) for pad in side]
+def pad_sides(x: Tensor, sides: Sides, fill: float = 0.0) -> Tensor:
+    """Pad the last dimensions with `fill`, or crop them where a number is negative."""
+    return F.pad(x, [pad for side in reversed(sides) for pad in side], value=fill) if any(map(any, sides)) else x
 
 
 def arange(start, limit, delta, *, device):
@@ -93,35 +175,3 @@ def arange(start, limit, delta, *, device):
     first, end, step = (numbers(number)[0] for number in (start, limit, delta))
     is_short = math.ceil((end - first) / step) <= MAX_SIZES
     return torch.arange(first, end, step, dtype=start.dtype, device="cpu" if is_short else device)
-
-
-_PIXEL_GRIDS = ("half_pixel", "pytorch_half_pixel", "align_corners")
-_RESIZED = {
-    ("nearest", "asymmetric", "floor"): "nearest",
-    **{("nearest", "half_pixel", f"round_prefer_{end}"): "nearest-exact" for end in ("floor", "ceil")},
-    **{("linear", grid): "bilinear" for grid in _PIXEL_GRIDS},
-    **{("cubic", grid): "bicubic" for grid in _PIXEL_GRIDS},
-}
-
-
-def resize(
-    x, /, roi=None, scales=None, sizes=None, *, mode="nearest", coordinate_transformation_mode="half_pixel",
-    nearest_mode="round_prefer_floor"
-):  # fmt: skip
-    """Resize pictures by factors or sizes for all four dimensions; refused where torch would take the other one of two
-    equally near pixels, or another place for a result of one pixel.
-    """
-    corners = coordinate_transformation_mode
-    kind = _RESIZED.get((mode, corners, nearest_mode) if mode == "nearest" else (mode, corners))
-    factors, target = numbers(scales), numbers(sizes)
-    keeps_batch = factors[:2] == [1, 1] if factors else target[:2] == list(x.shape[:2])
-    after = target[2:] or [int(size * factor) for size, factor in zip(x.shape[2:], factors[2:], strict=True)]
-    ratios = factors[2:] or [new / old for new, old in zip(after, x.shape[2:], strict=True)]
-    lone = any(new == 1 < old for new, old in zip(after, x.shape[2:], strict=True))
-    differs = corners == "pytorch_half_pixel" and lone
-    if mode == "nearest":
-        differs = nearest_mode == "round_prefer_floor" and any(ratio % 1 for ratio in ratios)
-    if kind is None or not keeps_batch or differs:
-        raise ValueError(f"a Resize of an unsupported kind ({mode}, {corners})")
-    options: dict[str, Any] = {} if mode == "nearest" else {"align_corners": corners == "align_corners"}
-    return F.interpolate(x, target[2:] or None, factors[2:] or None, kind, **options)

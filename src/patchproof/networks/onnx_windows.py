@@ -1,0 +1,147 @@
+"""ONNX operators that slide a window over pictures, written with torch; see onnx_operators.py for the rules.
+
+In: data N×C×sizes of one to three dimensions, and attributes as ONNX writes them. Out: tensors. torch's own padding is
+used where it is the same: alike at both ends, and in pools at most half a window.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from patchproof.networks.onnx_shapes import Sides, numbers, pad_sides
+
+
+def _sides(auto_pad: str, pads: list[int] | None, totals: Sequence[int]) -> Sides:
+    """What is added at both ends; by `auto_pad`, `totals` are divided, an odd number at the end first if SAME_UPPER."""
+    if auto_pad in ("SAME_UPPER", "SAME_LOWER"):
+        halves = [(max(total, 0) // 2, max(total, 0) - max(total, 0) // 2) for total in totals]
+        return halves if auto_pad == "SAME_UPPER" else [(after, before) for before, after in halves]
+    if auto_pad not in ("NOTSET", "VALID") or (auto_pad == "VALID" and any(pads or [])):
+        raise ValueError(f"an auto_pad {auto_pad!r} with the pads {pads}")
+    n = len(totals)
+    return list(zip((pads or [0] * n)[:n], (pads or [0] * n)[-n:], strict=True))
+
+
+class _Windows:
+    """Where the windows of an operator lie on `x`: their kernel, steps and sides, one number for each dimension."""
+
+    def __init__(
+        self, x: Tensor, kernel_shape, auto_pad="NOTSET", dilations=None, pads=None, strides=None, ceil_mode=0
+    ):
+        self.n, self.kernel, self.sizes = len(kernel_shape), list(kernel_shape), list(x.shape[2:])
+        self.strides, self.dilations = strides or [1] * self.n, dilations or [1] * self.n
+        self.spans = [(k - 1) * d + 1 for k, d in zip(self.kernel, self.dilations, strict=True)]
+        both = list(zip(self.sizes, self.spans, self.strides, strict=True))
+        totals = [(math.ceil(size / stride) - 1) * stride + span - size for size, span, stride in both]
+        self.sides = self.filled_sides = _sides(auto_pad, pads, totals)
+        if ceil_mode:  # a last window may reach past the padding, but not begin there
+            self.filled_sides = []
+            for (before, after), (size, span, stride) in zip(self.sides, both, strict=True):
+                count = math.ceil((size + before + after - span) / stride) + 1
+                count = min(count, math.ceil((size + before) / stride))
+                self.filled_sides.append((before, (count - 1) * stride + span - size - before))
+
+    def is_plain(self, limits: Sequence[float]) -> bool:
+        """True if torch pads like that: alike at both ends, at most by `limits`."""
+        return all(a == b and 0 <= a <= limit for (a, b), limit in zip(self.sides, limits, strict=True))
+
+    def padded(self, x: Tensor, fill: float = 0.0) -> Tensor:
+        """The input with its sides, for windows without padding."""
+        return pad_sides(x, self.filled_sides, fill)
+
+    def sums(self, padded: Tensor) -> Tensor:
+        """The sum of each window of each channel, of any sides and dilations."""
+        rows, zeros = padded.reshape(-1, 1, *padded.shape[2:]), [0] * self.n
+        ones = rows.new_ones(1, 1, *self.kernel)
+        summed = torch.convolution(rows, ones, None, self.strides, zeros, self.dilations, False, zeros, 1)
+        return summed.reshape(*padded.shape[:2], *summed.shape[2:])
+
+
+def conv(x, w, b=None, /, *, auto_pad="NOTSET", dilations=None, group=1, kernel_shape=None, pads=None, strides=None):
+    """torch.convolution with ONNX's paddings."""
+    _check_kernel(w, kernel_shape)
+    windows = _Windows(x, w.shape[2:], auto_pad, dilations, pads, strides)
+    plain, zeros = windows.is_plain([math.inf] * windows.n), [0] * windows.n
+    padding = [before for before, _ in windows.sides] if plain else zeros
+    x = x if plain else windows.padded(x)
+    return torch.convolution(x, w, b, windows.strides, padding, windows.dilations, False, zeros, group)
+
+
+def _check_kernel(w: Tensor, kernel_shape: list[int] | None) -> None:
+    if kernel_shape not in (None, list(w.shape[2:])):
+        raise ValueError(f"weights of {tuple(w.shape)} for kernel_shape = {kernel_shape}")
+
+
+def conv_transpose(
+    x, w, b=None, /, *, auto_pad="NOTSET", dilations=None, group=1, kernel_shape=None, output_padding=None,
+    output_shape=None, pads=None, strides=None
+):  # fmt: skip
+    """A transposed convolution, cut or widened to the size that its paddings or `output_shape` say."""
+    _check_kernel(w, kernel_shape)
+    n = x.dim() - 2
+    ones, extra = [1] * n, output_padding or [0] * n
+    strides, dilations = strides or ones, dilations or ones
+    whole = torch.convolution(x, w, None, strides, [0] * n, dilations, True, [0] * n, group)
+    targets = list(output_shape or [])[-n:]
+    if not targets and auto_pad.startswith("SAME"):
+        targets = [size * stride for size, stride in zip(x.shape[2:], strides, strict=True)]
+    if targets:
+        totals = [size + more - target for size, more, target in zip(whole.shape[2:], extra, targets, strict=True)]
+        extra = [more - min(total, 0) for more, total in zip(extra, totals, strict=True)]
+        sides = _sides(auto_pad if auto_pad == "SAME_UPPER" else "SAME_LOWER", None, totals)
+    else:
+        sides = _sides(auto_pad, pads, ones)
+    result = pad_sides(whole, [(-before, more - after) for (before, after), more in zip(sides, extra, strict=True)])
+    return result if b is None else result + b.reshape(-1, *ones)
+
+
+def max_pool(x, /, *, kernel_shape, auto_pad="NOTSET", ceil_mode=0, dilations=None, pads=None, strides=None):
+    """The largest number in each window; padding is never the largest."""
+    windows = _Windows(x, kernel_shape, auto_pad, dilations, pads, strides, ceil_mode)
+    if any(max(side) >= span for side, span in zip(windows.sides, windows.spans, strict=True)):
+        raise ValueError(f"a MaxPool of kernel_shape = {kernel_shape} with windows in its padding")
+    plain = windows.is_plain([size // 2 for size in kernel_shape])
+    padding = [before for before, _ in windows.sides] if plain else [0] * windows.n
+    padded, pool = x if plain else windows.padded(x, -math.inf), getattr(F, f"max_pool{windows.n}d")
+    return pool(padded, kernel_shape, windows.strides, padding, windows.dilations, bool(ceil_mode and plain))
+
+
+def average_pool(
+    x, /, *, kernel_shape, auto_pad="NOTSET", ceil_mode=0, count_include_pad=0, dilations=None, pads=None, strides=None
+):
+    """The mean of each window, of the picture's numbers or with `count_include_pad` of the padding's, too."""
+    windows = _Windows(x, kernel_shape, auto_pad, dilations, pads, strides, ceil_mode)
+    if set(windows.dilations) == {1} and windows.is_plain([size // 2 for size in kernel_shape]):
+        pool, padding = getattr(F, f"avg_pool{windows.n}d"), [before for before, _ in windows.sides]
+        return pool(x, kernel_shape, windows.strides, padding, bool(ceil_mode), bool(count_include_pad))
+    counted = pad_sides(torch.ones_like(x[:1, :1]), windows.sides, float(count_include_pad))
+    beyond = [(0, end - after) for (_, end), (_, after) in zip(windows.filled_sides, windows.sides, strict=True)]
+    return windows.sums(windows.padded(x)) / windows.sums(pad_sides(counted, beyond))
+
+
+def lp_pool(x, /, *, kernel_shape, p=2, auto_pad="NOTSET", ceil_mode=0, dilations=None, pads=None, strides=None):
+    """The Lp norm of each window."""
+    windows = _Windows(x, kernel_shape, auto_pad, dilations, pads, strides, ceil_mode)
+    return windows.sums(windows.padded(x).abs() ** p) ** (1 / p)
+
+
+def lrn(x, /, *, size, alpha=1e-4, beta=0.75, bias=1.0):
+    """Divide by the sum of squares of `size` neighboring channels; an even number has one more behind the channel."""
+    before = (size - 1) // 2
+    squares = pad_sides(x.square().flatten(2), [(before, size - 1 - before), (0, 0)])
+    sums = F.avg_pool2d(squares[:, None], (size, 1), 1, divisor_override=1)
+    return x / (bias + alpha / size * sums.reshape(x.shape)) ** beta
+
+
+def col2im(x, /, image_shape, block_shape, *, dilations=None, pads=None, strides=None):
+    """Add up blocks N×(C·block)×places into pictures N×C×H×W."""
+    sizes, block = numbers(image_shape), numbers(block_shape)
+    top, left, bottom, right = pads or [0] * 4
+    sides = [sizes[0] + top + bottom, sizes[1] + left + right]
+    whole = F.fold(x, sides, block, dilations or 1, 0, strides or 1)
+    return pad_sides(whole, [(-top, -bottom), (-left, -right)])
