@@ -189,7 +189,7 @@ HOSTILE: dict[str, tuple[Callable[[], ModelProto | bytes], str]] = {
     "a value from nowhere": (lambda: changed(lambda m: node(m).input.__setitem__(0, "q")), "'q' before it is computed"),
     "one name for two values": (lambda: changed(lambda m: node(m).output.__setitem__(0, "b")), "'b' twice"),
     "an operator of Python's": (lambda: changed(lambda m: setattr(node(m), "op_type", "__import__")), "'__import__'"),
-    "an operator of no list": (lambda: changed(lambda m: setattr(node(m), "op_type", "NonZero")), "operator 'NonZero'"),
+    "an operator of no list": (lambda: changed(lambda m: setattr(node(m), "op_type", "Unique")), "operator 'Unique'"),
     "random numbers": (lambda: ending("y = RandomNormalLike(z)"), "the operator 'RandomNormalLike'"),
     "another domain": (lambda: changed(lambda m: setattr(node(m), "domain", "com.evil")), "operator 'com.evil.Reduce"),
     "a branch": (lambda: nested(1), "a graph within the graph, which is not supported"),

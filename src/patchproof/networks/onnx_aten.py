@@ -50,11 +50,8 @@ def _conv(w, b=None, *, auto_pad="NOTSET", dilations=None, group=1, pads=None, s
     return [uneven, (_ATEN.convolution.default, [w, b, strides or [1, 1], [0, 0], *others])]
 
 
-def _clip(min=None, max=None) -> AtenCalls:
+def _clip(min: Any = None, max: Any = None) -> AtenCalls:
     """A hardtanh if both limits are known; unlike torch.clamp, its gradient is 0 at the limits, as ReLU6's is."""
-    limits = [float(end) for end in (min, max) if isinstance(end, float) or _is_scalar(end)]
+    ends = [torch.tensor(end) if isinstance(end, float) else end for end in (min, max)]
+    limits = [float(end) for end in ends if isinstance(end, Tensor) and end.is_floating_point() and not end.dim()]
     return [(_ATEN.hardtanh.default, limits)] if len(limits) == 2 and limits[0] <= limits[1] else []
-
-
-def _is_scalar(value: Any) -> bool:
-    return isinstance(value, Tensor) and value.is_floating_point() and not value.dim()

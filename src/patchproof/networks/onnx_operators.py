@@ -25,7 +25,7 @@ from torch.nn import functional as F
 import patchproof.networks.onnx_shapes as shapes
 import patchproof.networks.onnx_windows as windows
 from patchproof.networks.bounds import UnsupportedNetwork, quote
-from patchproof.networks.onnx_layers import attention, recurrent
+from patchproof.networks.onnx_recurrent import recurrent
 from patchproof.networks.onnx_resize import resize, upsample
 from patchproof.networks.onnx_shapes import MAX_SIZES, numbers
 
@@ -40,12 +40,12 @@ _ON_SIZES = frozenset(
 )
 # attributes that have to have this value, or (None) that change nothing here
 FIXED_ATTRIBUTES: dict[str, dict[str, Any]] = {
-    "Attention": {"qk_matmul_output_mode": None, "softmax_precision": None, "softcap": 0.0},
     "BatchNormalization": {"momentum": None, "spatial": 1},
     **{name: {"round_mode": None, "saturate": None} for name in ("Cast", "CastLike")},  # 8-bit floats
     "Dropout": {"seed": None},
     **{name: {"stash_type": 1} for name in ("GroupNormalization", "LayerNormalization", "RMSNormalization")},
     "MaxPool": {"storage_order": None},  # of the second result
+    **{name: {"layout": 0} for name in ("LSTM", "GRU", "RNN")},
 }
 
 
@@ -258,7 +258,7 @@ _TABLE: dict[str, Callable[..., Any]] = {
     "CumSum": _cumulative_sum,
     "LpNormalization": lambda x, /, *, axis=-1, p=2: F.normalize(x, p, axis, 1e-37),
     # windows and norms
-    "Conv": windows.conv,
+    "Conv": windows.padded_conv,
     "ConvTranspose": windows.conv_transpose,
     "MaxPool": windows.max_pool,
     "AveragePool": windows.average_pool,
@@ -274,7 +274,6 @@ _TABLE: dict[str, Callable[..., Any]] = {
     "GroupNormalization": _group_norm,
     "InstanceNormalization": lambda x, a, b, /, *, epsilon=1e-5: F.instance_norm(x, None, None, a, b, eps=epsilon),
     "Dropout": _dropout,
-    "Attention": attention,
     "LSTM": recurrent("LSTM", torch.lstm, [0, 2, 3, 1], ["Sigmoid", "Tanh", "Tanh"]),
     "GRU": recurrent("GRU", torch.gru, [1, 0, 2], ["Sigmoid", "Tanh"]),
     "RNN": recurrent("RNN", torch.rnn_tanh, [0], ["Tanh"]),
@@ -323,17 +322,15 @@ RESULTS = {"TopK": 2, "LSTM": 3, "GRU": 2, "RNN": 2}  # how many, where there ar
 REFUSED = {
     "draws random numbers": "Bernoulli Multinomial RandomNormal RandomNormalLike RandomUniform RandomUniformLike",
     "has results whose size depends on the pictures' content": "Compress NonMaxSuppression Unique",
-    "runs parts of the file again or not at all": "If Loop Scan",
-    "is of quantized numbers, which have no gradient": "ConvInteger DequantizeLinear DynamicQuantizeLinear "
-    "MatMulInteger QLinearConv QLinearMatMul QuantizeLinear",
-    "keeps numbers between calls": "TensorScatter",
-    "torch has no like for": "DeformConv MaxRoiPool MaxUnpool RoiAlign",
-    "is of lists, texts or files": "ConcatFromSequence ImageDecoder Optional OptionalGetElement OptionalHasElement "
-    "RegexFullMatch ReverseSequence SequenceAt SequenceConstruct SequenceEmpty SequenceErase SequenceInsert "
-    "SequenceLength SequenceMap SplitToSequence StringConcat StringNormalizer StringSplit TfIdfVectorizer",
-    "is of sounds or texts": "BlackmanWindow DFT HammingWindow HannWindow MelWeightMatrix RotaryEmbedding STFT",
-    "is a loss": "NegativeLogLikelihoodLoss SoftmaxCrossEntropyLoss",
-    "is of training": "Adagrad Adam Gradient Momentum",
+    "runs parts of the file several times or not at all": "If Loop Scan SequenceMap",
+    "rounds to a few bits, which has no gradient": "ConvInteger DequantizeLinear DynamicQuantizeLinear MatMulInteger "
+    "QLinearConv QLinearMatMul QuantizeLinear",
+    "has no like in torch": "DeformConv MaxRoiPool MaxUnpool RoiAlign",
+    "is of lists, texts, sounds, files, former calls or training": """Adagrad Adam Attention BlackmanWindow
+    ConcatFromSequence DFT Gradient HammingWindow HannWindow ImageDecoder MelWeightMatrix Momentum
+    NegativeLogLikelihoodLoss Optional OptionalGetElement OptionalHasElement RegexFullMatch ReverseSequence
+    RotaryEmbedding STFT SequenceAt SequenceConstruct SequenceEmpty SequenceErase SequenceInsert SequenceLength
+    SoftmaxCrossEntropyLoss SplitToSequence StringConcat StringNormalizer StringSplit TensorScatter TfIdfVectorizer""",
 }
 
 

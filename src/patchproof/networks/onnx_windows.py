@@ -62,7 +62,9 @@ class _Windows:
         return summed.reshape(*padded.shape[:2], *summed.shape[2:])
 
 
-def conv(x, w, b=None, /, *, auto_pad="NOTSET", dilations=None, group=1, kernel_shape=None, pads=None, strides=None):
+def padded_conv(
+    x, w, b=None, /, *, auto_pad="NOTSET", dilations=None, group=1, kernel_shape=None, pads=None, strides=None
+):
     """torch.convolution with ONNX's paddings."""
     _check_kernel(w, kernel_shape)
     windows = _Windows(x, w.shape[2:], auto_pad, dilations, pads, strides)
@@ -140,8 +142,8 @@ def lrn(x, /, *, size, alpha=1e-4, beta=0.75, bias=1.0):
 
 def col2im(x, /, image_shape, block_shape, *, dilations=None, pads=None, strides=None):
     """Add up blocks N×(C·block)×places into pictures N×C×H×W."""
-    sizes, block = numbers(image_shape), numbers(block_shape)
+    sizes, block = numbers(image_shape), tuple(numbers(block_shape))
     top, left, bottom, right = pads or [0] * 4
-    sides = [sizes[0] + top + bottom, sizes[1] + left + right]
+    sides = (sizes[0] + top + bottom, sizes[1] + left + right)
     whole = F.fold(x, sides, block, dilations or 1, 0, strides or 1)
     return pad_sides(whole, [(-top, -bottom), (-left, -right)])

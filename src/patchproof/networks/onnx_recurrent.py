@@ -1,14 +1,10 @@
-"""ONNX operators that are whole layers: recurrent ones and attention; see onnx_operators.py for the rules.
-
-Source: onnx.ai/onnx/operators, LSTM, GRU, RNN and Attention.
-"""
+"""ONNX's LSTM, GRU and RNN, written with torch; see onnx_operators.py for the rules."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from typing import Any
 
-import torch
 from torch import Tensor
 
 MAX_STEPS = 1 << 12  # of a sequence, one after the other
@@ -45,35 +41,3 @@ def recurrent(
         return (y, *last)
 
     return computed
-
-
-def attention(
-    q,
-    k,
-    v,
-    mask=None,
-    past_key=None,
-    past_value=None,
-    /,
-    *,
-    is_causal=0,
-    kv_num_heads=None,
-    q_num_heads=None,
-    scale=None,
-):
-    """Attention of N×heads×L×E, or N×L×(heads·E); fewer heads of keys and values are shared."""
-    if past_key is not None or past_value is not None:
-        raise ValueError("an Attention with keys of former calls")
-    packed = q.dim() == 3
-    if packed:
-        heads = zip((q, k, v), (q_num_heads, kv_num_heads, kv_num_heads), strict=True)
-        q, k, v = (x.unflatten(2, (count, -1)).transpose(1, 2) for x, count in heads)
-    k, v = (x.repeat_interleave(q.shape[1] // x.shape[1], 1) for x in (k, v))
-    root = (q.shape[-1] ** -0.5 if scale is None else scale) ** 0.5
-    scores = (root * q) @ (root * k).mT
-    if is_causal:
-        scores = scores.masked_fill(torch.ones_like(scores, dtype=torch.bool).triu(1), -torch.inf)
-    if mask is not None:
-        scores = scores.masked_fill(~mask, -torch.inf) if mask.dtype == torch.bool else scores + mask
-    result = scores.softmax(-1) @ v
-    return result.transpose(1, 2).flatten(2) if packed else result
