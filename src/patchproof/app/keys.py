@@ -9,6 +9,7 @@ such as sidecar files, or the comments in a file.
 import ast
 import inspect
 import json
+import textwrap
 from collections.abc import Iterator, Mapping
 from enum import Enum
 from functools import lru_cache, partial
@@ -202,4 +203,9 @@ def files_page() -> str:
     for reader in READERS:
         lines += [f"## {reader}", "", "| file | declares | answer | how |", "|---|---|---|---|"]
         lines += [f"| {' | '.join(entry)} |" for entry in declarations(reader)] + [""]
+    from patchproof.networks.onnx_operators import OPERATORS, REFUSED
+
+    computed = ", ".join(sorted({*OPERATORS, "Constant", "Identity"}))
+    lines += ["## ONNX operators", "", *textwrap.wrap(f"Computed, with gradients: {computed}.", 120), ""]
+    lines += [f"Refused is what {reason}: {', '.join(names.split())}.\n" for reason, names in REFUSED.items()]
     return "\n".join(lines)

@@ -1,7 +1,5 @@
 """ONNX's LSTM, GRU and RNN, written with torch; see onnx_operators.py for the rules."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -7,8 +7,6 @@ is the same, it is used, which is faster.
 Source: onnx.ai/onnx/operators/onnx__Resize.html, opsets 10 to 19; R. Keys, 1981, for the cubic kernel.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any

@@ -4,8 +4,6 @@ In: data N×C×sizes of one to three dimensions, and attributes as ONNX writes t
 used where it is the same: alike at both ends, and in pools at most half a window.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

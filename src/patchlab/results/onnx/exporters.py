@@ -2,11 +2,8 @@
 
 `python exporters.py` measures every network that exporters.json lists and writes that file again; names behind it
 measure these only: `python exporters.py timm:levit_128s`. It asks for `pip install "patchproof[models,lab]"` and
-onnxruntime. Weights are random and as initialized; those of the stored figures' networks were drawn, too, where the
-initial ones hide a branch ("drawn").
+onnxruntime. Weights are as initialized.
 """
-
-from __future__ import annotations
 
 import json
 import sys
