@@ -73,7 +73,7 @@ class RealPrintsSettings(GridSettings):
     """Cells of known color, and scenes whose promises are held against twins of their photographs."""
 
     scenes: tuple[str, ...] = ()  # scene files; without them, colors only
-    cells: str = "${PATCHPROOF_DATA}/real_prints/cells.npz"
+    cells: str = "${PATCHPROOF_DATA}/real_prints/cells.npz"  # NPZ with photographs.csv beside it
     left_out: Literal["nothing", "place", "print"] = "nothing"  # of the default printer, for what it is held against
     draws: Annotated[int, Field(ge=20)] = 150  # of the conditions, for what they can make
     per_photo: Annotated[int, Field(ge=20)] = 350  # cells of each photograph that inks and conditions are held against
