@@ -134,7 +134,9 @@ class _Block(nn.Module):
     def __init__(self, tensors: dict[str, Tensor], prefix: str, side_px: int, stride: int):
         super().__init__()
         has_expansion = f"{prefix}_expand_conv.weight" in tensors
-        self.expand = _Convolution(tensors, f"{prefix}_expand_conv", f"{prefix}_bn0", side_px) if has_expansion else None
+        self.expand = (
+            _Convolution(tensors, f"{prefix}_expand_conv", f"{prefix}_bn0", side_px) if has_expansion else None
+        )
         self.depthwise = _Convolution(tensors, f"{prefix}_depthwise_conv", f"{prefix}_bn1", side_px, stride)
         self.project = _Convolution(tensors, f"{prefix}_project_conv", f"{prefix}_bn2", side_px)
         first = self.expand or self.depthwise

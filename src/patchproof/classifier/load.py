@@ -113,7 +113,13 @@ def _prepare(classifier: Classifier, device: torch.device | str, is_own: bool = 
     def check_and_tune() -> Classifier:
         check_network(classifier, device, is_own)
         pictures = smooth_pictures(classifier.input_px).to(device)
-        return replace(classifier, network=tune_batches(classifier.network, pictures))
+        tuned = replace(classifier, network=tune_batches(classifier.network, pictures))
+        if classifier.name.startswith(("file:", "module:", "python:")):  # wrapped by others
+            from patchproof.classifier.wrapping import LEAST_LABELS, check_wrapping
+
+            if len(classifier.labels) >= LEAST_LABELS:
+                check_wrapping(tuned)
+        return tuned
 
     use_full_precision(device)
     if isinstance(classifier.network, torch.nn.Module):

@@ -19,6 +19,7 @@ from patchproof.base.input import is_file, is_folder
 from patchproof.base.output import check_file, write_atomically
 from patchproof.base.settings import SceneSettings
 from patchproof.base.validation import NETWORK_FILE, validate_model
+from patchproof.classifier.imagenet import has_imagenet
 from patchproof.classifier.labels import find_labels
 from patchproof.classifier.load import load_classifier
 from patchproof.mesh.load_mesh import load_mesh
@@ -40,13 +41,16 @@ def new_scene(
     label: str | None = None,
     length_mm: float | None = None,
     up: UpAxis | None = None,
-    models: Sequence[str] = ("builtin",),
+    models: Sequence[str] | None = None,
     overwrite: bool = False,
 ) -> list[str]:
     """Write the scene file `out` for a mesh or a folder; returns lines with the guesses and warnings. `length_mm` and
-    `up` replace those of the mesh's file.
+    `up` replace those of the mesh's file. Without `models`, `imagenet` where it is installed, but `builtin` for
+    a primitive.
     """
     out = Path(out)
+    if models is None:  # the built-in network knows primitives and nothing else
+        models = ("builtin",) if thing.startswith("primitive:") or not has_imagenet() else ("imagenet",)
     check_file(out, overwrite, (thing,))
     base = out.resolve().parent
     if thing.startswith("primitive:") or not is_folder(Path(thing)):

@@ -25,13 +25,15 @@ def new(
     up: Annotated[
         Literal["y", "z"] | None, Option(help="The file's axis that points up; by its format without.")
     ] = None,
-    models: Annotated[str, Option(help="Comma-separated classifiers.")] = "builtin",
+    models: Annotated[
+        str | None, Option(help="Comma-separated classifiers; without, imagenet where it is installed, else builtin.")
+    ] = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Write a commented scene for an object, photographs of it, or a folder of images."""
     from patchproof.app.begin.new import new_scene
 
-    network_names = names_of(models) or ()
+    network_names = names_of(models)
     lines = new_scene(thing, out, label=label, length_mm=length_mm, up=up, models=network_names, overwrite=overwrite)
     say(*lines, f"scene: {out}", f"next: patchproof preview {out}")
 

@@ -31,14 +31,20 @@ def demo(
         "patchproof-demo"
     ),
     detector: Annotated[bool, Option("--detector", help="Before the built-in detector, not classifier.")] = False,
+    imagenet: Annotated[
+        bool, Option("--imagenet", help='Before a network of photographs: pip install "patchproof[imagenet]".')
+    ] = False,
     jobs: Jobs = None,
     overwrite: Overwrite = False,
 ) -> None:
     """The whole journey, offline, on a built-in object and network."""
     from patchproof.app.demo import run_demo
 
+    if detector and imagenet:
+        raise BadParameter("is a classifier; leave --detector out", param_hint="--imagenet")
+    network = "imagenet" if imagenet else "builtin-detector" if detector else "builtin"
     with progress() as bar:
-        summary = run_demo(out, detector=detector, jobs=jobs or 1, overwrite=overwrite, progress=bar)
+        summary = run_demo(out, network=network, jobs=jobs or 1, overwrite=overwrite, progress=bar)
     say(*summary)
 
 
