@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import hashlib
+import io
 import json
 import re
 import sys
@@ -25,7 +26,7 @@ from patchproof.base.validation import expand_path, refuse_untrusted
 from patchproof.classifier import imagenet, load_classifier, wrapping
 from patchproof.classifier.network import Classifier
 
-VARIANT = imagenet._Variant("small.pth", "", 32, (1, 2))
+VARIANT = imagenet._Variant("", 32, (1, 2))
 NAMES = tuple(f"thing {index}, object {index}" for index in range(320))
 
 
@@ -82,16 +83,19 @@ def packages(tmp_path, monkeypatch):
         folder.mkdir(parents=True)
     for folder in (model, labels):
         (folder / "__init__.py").write_text("raise SystemExit('imported')\n")
-    torch.save(weights(), model / "models" / "small.pth")
-    stored = (model / "models" / "small.pth").read_bytes()
+    buffer = io.BytesIO()
+    torch.save(weights(), buffer)
+    stored = buffer.getvalue()
     text = json.dumps({str(index): f"thing {index}" for index in range(5)}).encode()
     (labels / "imagenet1k_label_to_names.json").write_bytes(text)
     known = VARIANT._replace(sha256=hashlib.sha256(stored).hexdigest())
+    path = model / "models" / f"efficientnet-lite0-{known.sha256[:8]}.pth"
+    path.write_bytes(stored)
     monkeypatch.setattr(imagenet, "_VARIANTS", {"lite0": known, "absent": known})
     monkeypatch.setattr(imagenet, "_STRIDES", (1, 2))
     monkeypatch.setattr(imagenet, "_LABELS_SHA256", hashlib.sha256(text).hexdigest())
     monkeypatch.syspath_prepend(tmp_path)
-    return model / "models" / "small.pth"
+    return path
 
 
 def test_the_network_computes_what_its_weights_say_and_no_package_is_imported(packages):
@@ -167,7 +171,7 @@ def test_a_network_wrapped_rightly_passes_without_a_word(reference):
     ):
         with warnings.catch_warnings():
             warnings.simplefilter("error")
-            wrapping.check_wrapping(classifier)
+            wrapping.check_wrapping(classifier, "cpu")
 
 
 WRONG = {
@@ -183,7 +187,7 @@ def test_a_network_wrapped_wrongly_is_told_what_fits_better(reference, words):
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         try:
-            wrapping.check_wrapping(wrapped(reference, WRONG[words]))
+            wrapping.check_wrapping(wrapped(reference, WRONG[words]), "cpu")
         except Refused as refused:
             assert f"{words}: wrap it with" in str(refused)
             return
@@ -194,10 +198,10 @@ def test_a_network_wrapped_wrongly_is_told_what_fits_better(reference, words):
 def test_labels_moved_by_one_place_are_refused_and_shuffled_ones_warned_about(reference):
     for labels, words in (((*NAMES[1:], "end"), "output before"), (("background", *NAMES[:-1]), "output behind")):
         with pytest.raises(Refused, match=f"each label moved to the {words}"):
-            wrapping.check_wrapping(wrapped(reference, labels=labels))
+            wrapping.check_wrapping(wrapped(reference, labels=labels), "cpu")
     shuffled = [NAMES[index] for index in np.random.default_rng(0).permutation(len(NAMES))]
     with pytest.warns(UserWarning, match="do its labels have another order"):
-        wrapping.check_wrapping(wrapped(reference, labels=tuple(shuffled)))
+        wrapping.check_wrapping(wrapped(reference, labels=tuple(shuffled)), "cpu")
 
 
 @pytest.mark.skipif(not imagenet.has_imagenet(), reason='needs pip install "patchproof[imagenet]"')

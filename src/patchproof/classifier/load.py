@@ -118,7 +118,7 @@ def _prepare(classifier: Classifier, device: torch.device | str, is_own: bool = 
             from patchproof.classifier.wrapping import LEAST_LABELS, check_wrapping
 
             if len(classifier.labels) >= LEAST_LABELS:
-                check_wrapping(tuned)
+                check_wrapping(tuned, device)
         return tuned
 
     use_full_precision(device)

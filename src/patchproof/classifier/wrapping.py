@@ -13,7 +13,7 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Callable, Sequence
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -44,27 +44,23 @@ _RANGES: dict[str, Callable[[Tensor], Tensor]] = {
 _MOVES = {0: "", 1: "each label moved to the output before", -1: "each label moved to the output behind"}
 
 
-def check_wrapping(classifier: Classifier) -> None:
+def check_wrapping(classifier: Classifier, device: torch.device | str) -> None:
     """Warn or refuse where a classifier of ImageNet labels answers better to changed pictures or with moved labels."""
     from patchproof.classifier.imagenet import has_imagenet
 
     if classifier.LOOKS_AT_BOXES or not has_imagenet():
         return
     labels, expected = _reference()
-    matched = _same_labels(classifier.labels, labels)
-    if len(matched) < LEAST_LABELS:
+    if len(matched := _same_labels(classifier.labels, labels)) < LEAST_LABELS:
         return
-    pictures = center_square(_pictures(), classifier.input_px).to(_device(classifier))
-    started = time.process_time()
-    agreements = _agreements(classifier, _AS_WRAPPED, pictures, matched, expected)
+    pictures = center_square(_pictures(), classifier.input_px).to(device)
+    compare = partial(_agreements, classifier, pictures, matched, expected)
+    started, agreements = time.process_time(), compare(_AS_WRAPPED)
     if time.process_time() - started < MAX_PASS_S * torch.get_num_threads():
         for name in list(_RANGES)[1:]:
-            agreements |= _agreements(classifier, name, pictures, matched, expected)
-    ranges = sorted({name for name, _ in agreements}, key=lambda name: -agreements[name, 0])[:3]
-    for name in ranges:
-        agreements |= _agreements(
-            classifier, f"{name} and {_SWAPPED}" if name else _SWAPPED, pictures, matched, expected
-        )
+            agreements |= compare(name)
+    for name in sorted({name for name, _ in agreements}, key=lambda name: -agreements[name, 0])[:3]:
+        agreements |= compare(f"{name} and {_SWAPPED}" if name else _SWAPPED)
     told, (best, move) = agreements[_AS_WRAPPED, 0], max(agreements, key=lambda key: agreements[key])
     gain, who = agreements[best, move] - told, f"the network {classifier.name}"
     change = " and ".join(text for text in (best, _MOVES[move]) if text)
@@ -80,7 +76,7 @@ def check_wrapping(classifier: Classifier) -> None:
 
 
 def _agreements(
-    classifier: Classifier, name: str, pictures: Tensor, matched: np.ndarray, expected: Tensor
+    classifier: Classifier, pictures: Tensor, matched: np.ndarray, expected: Tensor, name: str
 ) -> dict[tuple[str, int], float]:
     """The agreement after one change of the pictures, by its name and the move of the labels."""
     changed = _RANGES[name.removesuffix(_SWAPPED).removesuffix(" and ")](pictures)
@@ -105,16 +101,10 @@ def _correlation(logits: Tensor, expected: Tensor) -> float:
 
 
 def _same_labels(labels: Sequence[str], others: Sequence[str]) -> np.ndarray:
-    """Indices M×2 of labels in both lists with the same first name or whole entry, where these are in each once."""
-    by_name: list[dict[str, int | None]] = []
-    for entries in (labels, others):
-        known: dict[str, int | None] = {}
-        for index, entry in enumerate(entries):
-            name = folded_name(entry.split(",")[0])
-            known[name] = None if name in known else index
-        by_name.append(known)
-    pairs = [(by_name[0][name], by_name[1].get(name)) for name in by_name[0]]
-    return np.array([pair for pair in pairs if None not in pair], int).reshape(-1, 2)
+    """Indices M×2 of labels in both lists with the same first name, where it is in each once."""
+    first, second = ([folded_name(entry.split(",")[0]) for entry in entries] for entries in (labels, others))
+    once = [name for name in first if first.count(name) == second.count(name) == 1]
+    return np.array([(first.index(name), second.index(name)) for name in once], int).reshape(-1, 2)
 
 
 @cache
@@ -137,10 +127,3 @@ def _reference() -> tuple[tuple[str, ...], Tensor]:
     network = load_imagenet()
     with torch.no_grad():
         return network.labels, network.square_logits(center_square(_pictures(), network.input_px)).double()
-
-
-def _device(classifier: Classifier) -> torch.device:
-    """The device of the network's tensors; the CPU for plain functions."""
-    network = classifier.network
-    tensors = [*network.parameters(), *network.buffers()] if isinstance(network, torch.nn.Module) else []
-    return tensors[0].device if tensors else torch.device("cpu")
