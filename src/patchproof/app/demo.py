@@ -7,7 +7,6 @@ dim, oblique and in cluttered places, so that the bare object and the controls a
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
 
 from patchproof.app.verify import verify
 from patchproof.base.compute import Compute
@@ -60,28 +59,20 @@ views = 4
 seed = 1
 """
 
-DemoNetwork = Literal["builtin", "builtin-detector", "imagenet"]
-# a carton from in front, which a network of photographs takes for an envelope as often
 _IMAGENET_CHANGES = {
-    "# A toy truck seen from a drone, dim and over clutter. The built-in classifier knows trucks from the side.": (
-        "# A carton in dim and cluttered places. EfficientNet-Lite0 takes it for an envelope or a Band Aid as often."
-    ),
+    SCENE.splitlines()[0]: "# A carton in dim and cluttered places. The network takes it for an envelope as often.",
     "primitive:box_truck": "primitive:carton",
     'side = "+y"\noffset_mm = [0, 45]\nwidth_mm = 147\nheight_mm = 147': 'side = "+z"\nwidth_mm = 130\nheight_mm = 130',
     '"box truck"': '"carton"',
-    "[-35, 35]": "[-50, 50]",
+    "[-35, 35]": "[-40, 40]",
     "[-25, 25]": "[2, 35]",
+    "[520, 900]": "[650, 950]",
     "steps = 240": "steps = 120",
 }
 
 
 def run_demo(
-    out: str | Path,
-    *,
-    network: DemoNetwork = "builtin",
-    jobs: int = 1,
-    overwrite: bool = False,
-    progress: Progress = no_progress,
+    out: Path, network: str = "builtin", *, jobs: int = 1, overwrite: bool = False, progress: Progress = no_progress
 ) -> list[str]:
     """Run every step into the folder `out`, before that network; returns the summary's lines."""
     compute = Compute(jobs=jobs)
@@ -99,7 +90,7 @@ def run_demo(
     ]
 
 
-def demo_scene(folder: Path, network: DemoNetwork = "builtin") -> Path:
+def demo_scene(folder: Path, network: str = "builtin") -> Path:
     """Write scene.toml into a folder and return its path."""
     scene, text = folder / "scene.toml", SCENE
     for old, new in _IMAGENET_CHANGES.items() if network == "imagenet" else ():

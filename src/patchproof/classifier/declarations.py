@@ -38,9 +38,7 @@ DECLARED: tuple[Declaration, ...] = (
     Declaration("safetensors", "format", "refused", "other than pt: weights in another order"),
     Declaration("safetensors", "other metadata", "said", "left aside"),
     Declaration("outputs", "probabilities, percent, 8 bits", "refused", "in place of logits, a detector's too"),
-    Declaration(
-        "outputs", "of ImageNet labels, unlike `imagenet`'s", "said", "if changed pictures or moved labels fit better"
-    ),
+    Declaration("outputs", "of ImageNet labels, unlike `imagenet`'s", "said", "with the change that fits better"),
     Declaration("outputs", "values from 0 to 1 that may be logits", "said", "from an untrained network, say"),
     Declaration("outputs", "candidates of another shape", "refused", "than N×A×(4+K) for a detector"),
     Declaration(

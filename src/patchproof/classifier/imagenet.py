@@ -120,8 +120,7 @@ class _Block(nn.Module):
         self.depthwise = _Convolution(tensors, f"{prefix}_depthwise_conv", f"{prefix}_bn1", side_px, stride)
         self.project = _Convolution(tensors, f"{prefix}_project_conv", f"{prefix}_bn2", side_px)
         first = self.expand or self.depthwise
-        is_same = len(self.project.bias) == first.weight.shape[1] * first.groups
-        self.is_residual = stride == 1 and is_same
+        self.is_residual = stride == 1 and len(self.project.bias) == first.weight.shape[1] * first.groups
 
     def forward(self, x: Tensor) -> Tensor:
         """N×C×H×W → N×C'×H'×W'."""

@@ -22,10 +22,7 @@ def find_words(labels: Sequence[str], text: str, whole: bool = False) -> int:
     """The index of the label with these words: "mug" finds "coffee mug", whose last word it is. With `whole`, the words
     must be a label's whole name or its last words. Refused where several labels or none match.
     """
-    words, names = (
-        folded_name(text).split(),
-        [[folded_name(name).split() for name in (e, *e.split(","))] for e in labels],
-    )
+    words, names = _folded(text).split(), [[_folded(name).split() for name in (e, *e.split(","))] for e in labels]
     ranks = (
         lambda name: name == words,
         lambda name: name[-len(words) :] == words,
@@ -48,9 +45,7 @@ def _find(labels: Sequence[str], label: str | int) -> int:
         if not 0 <= label < len(labels):
             raise Refused(f"a label index from 0 to {len(labels) - 1}", str(label), "use one of those, or a name")
         return label
-    matches = [
-        i for i, entry in enumerate(labels) if folded_name(label) in map(folded_name, [entry, *entry.split(",")])
-    ]
+    matches = [i for i, entry in enumerate(labels) if _folded(label) in map(_folded, [entry, *entry.split(",")])]
     if len(matches) == 1:
         return matches[0]
     if matches:
@@ -59,8 +54,7 @@ def _find(labels: Sequence[str], label: str | int) -> int:
     raise Refused("a label that the network knows", f'"{label}"', _nearest(labels, label))
 
 
-def folded_name(text: str) -> str:
-    """The name in lower case, with single spaces for underscores and longer gaps."""
+def _folded(text: str) -> str:
     return " ".join(text.casefold().replace("_", " ").split())
 
 
@@ -72,6 +66,6 @@ def _nearest(labels: Sequence[str], label: str) -> str:
 
 def nearest_names(word: str, names: Sequence[str], otherwise: str) -> str:
     """Advice about an unknown name: up to three similar names, or else the text `otherwise`."""
-    by_folded = {folded_name(name): name for name in names}
-    near = difflib.get_close_matches(folded_name(word), by_folded, 3, 0.6)
+    by_folded = {_folded(name): name for name in names}
+    near = difflib.get_close_matches(_folded(word), by_folded, 3, 0.6)
     return "did you mean " + " or ".join(f'"{by_folded[name]}"' for name in near) if near else otherwise

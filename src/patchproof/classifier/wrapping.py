@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import time
 import warnings
+from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import cache, partial
 from pathlib import Path
@@ -21,7 +22,6 @@ import torch
 from torch import Tensor
 
 from patchproof.base.errors import Refused
-from patchproof.classifier.labels import folded_name
 from patchproof.classifier.network import Classifier, center_square
 
 LEAST_LABELS = 300
@@ -102,9 +102,10 @@ def _correlation(logits: Tensor, expected: Tensor) -> float:
 
 def _same_labels(labels: Sequence[str], others: Sequence[str]) -> np.ndarray:
     """Indices M×2 of labels in both lists with the same first name, where it is in each once."""
-    first, second = ([folded_name(entry.split(",")[0]) for entry in entries] for entries in (labels, others))
-    once = [name for name in first if first.count(name) == second.count(name) == 1]
-    return np.array([(first.index(name), second.index(name)) for name in once], int).reshape(-1, 2)
+    first, second = ([" ".join(entry.split(",")[0].casefold().split()) for entry in each] for each in (labels, others))
+    counts, where = (Counter(first), Counter(second)), {name: index for index, name in enumerate(second)}
+    pairs = [(index, where[name]) for index, name in enumerate(first) if all(each[name] == 1 for each in counts)]
+    return np.array(pairs, int).reshape(-1, 2)
 
 
 @cache

@@ -44,7 +44,7 @@ def demo(
         raise BadParameter("is a classifier; leave --detector out", param_hint="--imagenet")
     network = "imagenet" if imagenet else "builtin-detector" if detector else "builtin"
     with progress() as bar:
-        summary = run_demo(out, network=network, jobs=jobs or 1, overwrite=overwrite, progress=bar)
+        summary = run_demo(out, network, jobs=jobs or 1, overwrite=overwrite, progress=bar)
     say(*summary)
 
 
