@@ -27,7 +27,7 @@ from patchproof.classifier.network import Classifier, center_square
 LEAST_LABELS = 300
 GAIN = 0.01  # in agreement, from which a change is said to fit better
 CHANCE, CERTAIN = 0.1, 0.2  # a network that agrees by less than the first, and by the second more after a change
-MAX_PASS_S = 0.5  # for the pictures, from which on only a swap of colors and the labels are tried
+MAX_PASS_S = 1.0  # for the pictures, from which on only a swap of colors and the labels are tried
 _ROWS, _COLUMNS = 3, 4
 _MEAN, _DEVIATION = (torch.tensor(each).view(3, 1, 1) for each in ((0.485, 0.456, 0.406), (0.229, 0.224, 0.225)))
 _AS_WRAPPED, _SWAPPED = "", "red and blue swapped"
