@@ -1,4 +1,4 @@
-"""Check what `patchproof demo` left behind: `python tests/check_demo.py FOLDER`, and the least share that is measured."""
+"""Check what `patchproof demo` left behind: `python tests/check_demo.py FOLDER [LEAST SHARE MEASURED]`."""
 
 from __future__ import annotations
 
