@@ -65,7 +65,7 @@ _IMAGENET_CHANGES = {
     'side = "+y"\noffset_mm = [0, 45]\nwidth_mm = 147\nheight_mm = 147': 'side = "+z"\nwidth_mm = 130\nheight_mm = 130',
     '"box truck"': '"carton"',
     "[-35, 35]": "[-40, 40]",
-    "[-25, 25]": "[2, 35]",
+    "[-25, 25]": "[2, 25]",
     "[520, 900]": "[650, 950]",
     "steps = 240": "steps = 120",
 }
