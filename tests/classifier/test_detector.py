@@ -3,6 +3,7 @@
 import importlib
 import json
 import math
+import re
 from pathlib import Path
 
 import cv2
@@ -283,8 +284,13 @@ def test_detectors_carry_a_run_from_scene_to_verdict(tmp_path, two_stage, monkey
     report = pp.verify(
         tmp_path / "photos", tmp_path / "sheet.json", tmp_path / "report", run=run, models=names, ledger_photos=1
     )
-    said = "recognized is what it finds in a box of score 0.4 or more that overlaps the object&#39;s own by half"
-    assert said in (tmp_path / "report" / "report.html").read_text("utf-8")
+    page = (tmp_path / "report" / "report.html").read_text("utf-8")
+    rule = "recognized is a photograph with a box of “box truck”, of score 0.4 or more, over the piece&#39;s object"
+    assert rule in page.split('<ul class="tally')[0]  # on the first screen
+    counts = re.findall("counts from 40[^<]* on, in a box over the object; surest there: ", page)
+    assert len(counts) == 4 and page.count('aria-label="the object') == 2  # networks and photographs; the object's box
+    shown = re.findall(r'ink\)">([^<]*) <span[^<]*</span></span><span>((?:not )?recognized)', page)
+    assert shown and {label for label, _ in shown} == {"box truck"}
     truth = scene.boxes(scene.draw("reprint", 2))
     for name in names:
         found = evaluated[name].ap50

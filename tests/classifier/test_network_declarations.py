@@ -101,6 +101,20 @@ def candidates(boxes: list[list[float]], network: Callable[[Tensor], Tensor] | N
     return forward
 
 
+def raw_detector(folder: Path, head: Any) -> Tensor:
+    """The first box of a set of two, in shares, beside logits that tell a background."""
+    body = """m = GlobalAveragePool(x) s = Gather<axis=1>(m, [0, 1, 2, 0, 1]) t = Squeeze(s, [3])
+        l = Transpose<perm=[0,2,1]>(t)
+        logits = Concat<axis=1>(l, l) n = Shape<end=1>(x) e = Concat<axis=0>(n, [2, 4])
+        b = Reshape([0.5, 0.5, 0.5, 0.5, 0.25, 0.5, 0.5, 0.5], [1, 2, 4]) y = Expand(b, e)"""
+    made = onnx_files.model(body)
+    made.graph.output.add(name="logits")
+    path = onnx_files.save(folder, made)
+    card = {"input_px": 8, "labels": onnx_files.LABELS, "kind": "detector"} | ({"head": head} if head else {})
+    path.with_suffix(".json").write_text(json.dumps(card))
+    return load_classifier(f"file:{path}", folder).network(PHOTOS)[0, :1, :4]
+
+
 GRID = [[2.0 * column, 2.0 * row, 2.0 * column + 2, 2.0 * row + 2] for row in range(4) for column in range(4)]
 
 
@@ -189,7 +203,15 @@ CASES: dict[str, tuple[Any, ...]] = {
     ),
     "kind": (
         lambda at: answers(at, onnx_files.small(), kind="detector"),
-        r"a detector's candidates 3×A×8: left, top, .* got \(3, 4\) .*: decode its heads",
+        r"outputs of a detector's head for 4 labels, got N×4 from .*small\.onnx: write \"head\" into its JSON",
+    ),
+    "head": (
+        *(lambda at: raw_detector(at, "detr"), torch.tensor([[2.0, 2, 6, 6]])),
+        *(lambda at: raw_detector(at, "dert"), r"the name of a head .*, got 'dert': did you mean \"detr\""),
+        *(
+            lambda at: raw_detector(at, {"name": "detr", "unit": "inch"}),
+            r"a usable \"unit\" in \"head\" in .*, got inch",
+        ),
     ),
     "mean, std, channels, range": (
         lambda at: answers(at, onnx_files.small(), mean=[103.9, 116.8, 123.7]),
@@ -213,11 +235,15 @@ CASES: dict[str, tuple[Any, ...]] = {
     ),
     "candidates of another shape": (
         lambda at: checked(lambda x: candidates(GRID)(x).mT, Detector),
-        r"got \(3, 7, 16\) for 3 .*: swap the last two dimensions",
+        r"got \(3, 7, 16\) for 3 .*: write \"head\" into its JSON",
+    ),
+    "those of a detector's head that is not told": (
+        lambda at: raw_detector(at, None),
+        r'small\.onnx gives N×2×4 and N×2×5, read as the head "detr": write "head" into its JSON',
     ),
     "boxes in 0 to 1, (center, size), corners reversed": (
         lambda at: checked(candidates([[x / 8 for x in box] for box in GRID]), Detector),
-        r"none that reaches beyond 1 px from the network it \(such as \(0, 0, 0\.25, 0\.25\)\): multiply .* = 8",
+        r'none that reaches beyond 1 px .* it \(such as \(0, 0, 0\.25, 0\.25\)\): write .*"unit": "share"',
     ),
     "boxes (top, left, bottom, right)": (
         lambda at: checked(candidates([[y, x, bottom, right] for x, y, right, bottom in GRID]), Detector),
@@ -327,7 +353,7 @@ def test_rows_that_fill_up_a_table_are_no_boxes():
     ("change", "sentence"),
     [
         (lambda b: [b[2], b[3], b[0], b[1]], "100% with right <= left .*: put the upper left corner first"),
-        (lambda b: [(b[0] + b[2]) / 2, (b[1] + b[3]) / 2, 2.0, 2.0], r"\d+% with right <= left .*: turn \(center"),
+        (lambda b: [(b[0] + b[2]) / 2, (b[1] + b[3]) / 2, 2.0, 2.0], "% with right <= left .*ultralytics"),
         (lambda b: [4.0, 4.0, 4.0, 4.0], r"such as \(4, 4, 4, 4\)"),
     ],
 )

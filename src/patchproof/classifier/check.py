@@ -38,7 +38,7 @@ def check_network(classifier: Classifier, device: torch.device | str = "cpu", is
                 check_shape(output, classifier)
             batches = (photos.clone(), photos[1:2], photos.flip(1))
             again, alone, swapped = map(classifier.square_logits, batches)
-    except Refused:
+    except (Refused, Warning):  # a warning where they are errors
         raise
     except Exception as error:  # the network is the user's program and may raise anything
         reason = f"{type(error).__name__}: {error_summary(error)}"

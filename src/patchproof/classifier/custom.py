@@ -17,9 +17,12 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.utils._pytree import keystr, tree_flatten_with_path
 
 from patchproof.base.errors import Refused
 from patchproof.classifier.detector import Detector
+from patchproof.classifier.head_decoder import HeadDecoder, spread_labels
+from patchproof.classifier.heads import head_of
 from patchproof.classifier.network import NO_BOX_LOGIT, Classifier, weights_sha256
 
 MAX_DETECTIONS = 1000  # boxes in a picture, for networks that find any number of them
@@ -43,8 +46,9 @@ def labeled_module(module: object, name: str) -> Classifier:
         do = "give it input_px (an int) and labels (a list of names), or wrap it with classifier_of"
         got = f"an object of type {type(module).__name__}"
         raise Refused(f"a torch.nn.Module with input_px and labels as {name}", got, do)
-    make = detector_of if getattr(module, "kind", "") == Detector.KIND else classifier_of
-    return make(module, input_px, labels, name)
+    if getattr(module, "kind", "") == Detector.KIND:
+        return detector_of(module, input_px, labels, name, getattr(module, "head", None))
+    return classifier_of(module, input_px, labels, name)
 
 
 def classifier_of(
@@ -69,14 +73,16 @@ def classifier_of(
 
 
 def detector_of(
-    network: Callable[[Tensor], Any], input_px: int, labels: Sequence[str], name: str = "python:detector"
+    network: Callable[..., Any], input_px: int, labels: Sequence[str], name: str = "python:detector", head: Any = None
 ) -> Detector:
     """A detector in memory: it takes N×3×S×S sRGB in [0, 1] and returns candidates N×A×(4+K), boxes in pixels and
-    logits of the K labels, or for each picture a dictionary of `boxes` M×4, `labels` M and `scores` M, as torchvision
-    has them. Best before suppression and with low scores among them: only what is found can be made surer.
+    logits of the K labels; what a `head` of `heads.HEADS` gives, as a tensor, a list or a dictionary; or for each
+    picture a dictionary of `boxes` M×4, `labels` M and `scores` M, as torchvision has them. Best before suppression and
+    with low scores among them: only what is found can be made surer.
     """
     _check_callable(network)
-    candidates = AsCandidates(_in_evaluation_mode(network), len(labels))
+    decoder = HeadDecoder(name, len(labels), input_px, head_of(head, name) if isinstance(head, str | dict) else None)
+    candidates = AsCandidates(_in_evaluation_mode(network), decoder)
     return Detector(name, weights_sha256(network), input_px, tuple(map(str, labels)), candidates)
 
 
@@ -99,28 +105,26 @@ def _in_evaluation_mode(network: Callable[[Tensor], Tensor]) -> Callable[[Tensor
 
 
 class AsCandidates(torch.nn.Module):
-    """Turns a detector's output of either kind into candidates N×A×(4+K)."""
+    """Turns a detector's outputs of any kind into candidates N×A×(4+K)."""
 
-    def __init__(self, network: Callable[[Tensor], Any], labels: int):
+    def __init__(self, network: Callable[[Tensor], Any], decoder: HeadDecoder):
         super().__init__()
-        self.network, self.labels = network, labels
+        self.network, self.decoder = network, decoder
 
     def forward(self, photos: Tensor) -> Tensor:
         """N×3×S×S → N×A×(4+K)."""
         output = self.network(photos)
-        if isinstance(output, Tensor):
-            return output
-        return torch.stack([self._rows(each["boxes"], each["labels"], each["scores"]) for each in output])
+        if isinstance(output, list) and len(output) == len(photos) and isinstance(output[0], dict):
+            return torch.stack([self._rows(each["boxes"], each["labels"], each["scores"]) for each in output])
+        named, _ = tree_flatten_with_path(output)
+        return self.decoder([keystr(path) for path, _ in named], *(value for _, value in named))
 
     def _rows(self, boxes: Tensor, labels: Tensor, scores: Tensor) -> Tensor:
         """`MAX_DETECTIONS`×(4+K) of one picture, the surest first; unused rows have an empty box and no score."""
         surest = scores.argsort(descending=True)[:MAX_DETECTIONS]
-        all_logits = scores.new_full((MAX_DETECTIONS, self.labels), NO_BOX_LOGIT)
-        logits = torch.logit(scores[surest].clamp(1e-6, 1 - 1e-6))
-        rows = torch.arange(len(surest), device=scores.device)
-        all_logits = all_logits.index_put((rows, labels[surest]), logits)
-        all_boxes = torch.nn.functional.pad(boxes[surest], (0, 0, 0, MAX_DETECTIONS - len(surest)))
-        return torch.cat([all_boxes, all_logits], 1)
+        rows = spread_labels(boxes[surest], labels[surest], scores[surest], self.decoder.labels)
+        unused = MAX_DETECTIONS - len(surest)
+        return torch.cat([rows, rows.new_tensor([[0.0] * 4 + [NO_BOX_LOGIT] * self.decoder.labels]).expand(unused, -1)])
 
 
 def _factory(dotted: str, base: Path):

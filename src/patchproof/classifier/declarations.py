@@ -21,7 +21,7 @@ DECLARED: tuple[Declaration, ...] = (
     Declaration("ONNX", "number of pictures", "used", "called with that number"),
     Declaration("ONNX", "type and dimensions of the input", "refused", "other than float32, N×3×S×S, N×S×S×3"),
     Declaration("ONNX", "pictures of N×S×S×3", "used", "as TensorFlow and Keras write them"),
-    Declaration("ONNX", "several outputs", "refused", "one of N×K, or a detector's N×A×(4+K)"),
+    Declaration("ONNX", "several outputs", "refused", "of a classifier; those of a detector are its head's"),
     Declaration(
         "ONNX", "metadata: how pictures are prepared", "refused", "other than sRGB in [0, 1]: BGR, mean, range"
     ),
@@ -29,6 +29,7 @@ DECLARED: tuple[Declaration, ...] = (
     Declaration("NAME.json", "input_px", "used", "the square's side; refused if the network takes another"),
     Declaration("NAME.json", "labels", "used", "by the order of outputs; refused if their number differs"),
     Declaration("NAME.json", "kind", "used", "classifier or detector"),
+    Declaration("NAME.json", "head", "used", "how a detector's outputs become boxes and scores"),
     Declaration("NAME.json", "mean, std, channels, range", "refused", "other than sRGB in [0, 1] and no normalization"),
     Declaration(
         "NAME.json", "resize, crop, interpolation, activation", "said", "the whole square is seen; other keys are notes"
@@ -40,7 +41,8 @@ DECLARED: tuple[Declaration, ...] = (
     Declaration("outputs", "probabilities, percent, 8 bits", "refused", "in place of logits, a detector's too"),
     Declaration("outputs", "of ImageNet labels, unlike `imagenet`'s", "said", "with the change that fits better"),
     Declaration("outputs", "values from 0 to 1 that may be logits", "said", "from an untrained network, say"),
-    Declaration("outputs", "candidates of another shape", "refused", "than N×A×(4+K) for a detector"),
+    Declaration("outputs", "candidates of another shape", "refused", "than N×A×(4+K) or a usual head's"),
+    Declaration("outputs", "those of a detector's head that is not told", "said", "read by their shapes"),
     Declaration(
         "outputs", "boxes in 0 to 1, (center, size), corners reversed", "refused", "not left, top, right, bottom"
     ),

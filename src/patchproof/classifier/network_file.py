@@ -2,7 +2,8 @@
 
 The JSON holds `input_px`, the side of the square that the network takes, and `labels`: a list, or the name of a JSON
 file beside it that holds one. The network takes N×3×S×S sRGB in [0, 1], its normalization inside, and gives N×K logits;
-with `"kind": "detector"` in the JSON, candidates N×A×(4+K), boxes in pixels before the logits (detector.py).
+with `"kind": "detector"` in the JSON, candidates N×A×(4+K), boxes in pixels before the logits (detector.py), or
+what the head in `"head"` gives (heads.py).
 Nothing of the file is executed: protobuf.py reads its fields, onnx_file.py the graph from them, and graph.py computes
 its operators, which are on the list in onnx_operators.py. Weights may lie in files beside it that NAME.onnx names.
 """
@@ -21,6 +22,8 @@ from patchproof.base.errors import Refused
 from patchproof.base.input import read_file, read_json
 from patchproof.base.validation import summarize_names
 from patchproof.classifier.detector import Detector
+from patchproof.classifier.head_decoder import HeadDecoder
+from patchproof.classifier.heads import Head, head_of
 from patchproof.classifier.network import Classifier
 from patchproof.networks.batches import BatchedNetwork
 from patchproof.networks.bounds import UnsupportedNetwork, quote
@@ -40,6 +43,9 @@ def load_network(path: Path) -> Classifier:
     stored = network_bytes(path)  # read once, so that the hash is of the bytes that are loaded
     card = read_card(path.with_suffix(".json"))
     digest, other_bytes = hashlib.sha256(stored), len(stored)
+    digest.update(card.head.model_dump_json().encode() if card.head else b"")  # its answers depend on it
+    is_detector = card.kind == Detector.KIND
+    join = HeadDecoder(f"file:{path}", len(card.labels), card.input_px, card.head) if is_detector else None
 
     def read_data(location: str) -> bytes:
         nonlocal other_bytes
@@ -49,7 +55,7 @@ def load_network(path: Path) -> Classifier:
         return data
 
     try:
-        program, batch, metadata = read_onnx(stored, read_data)
+        program, batch, metadata = read_onnx(stored, read_data, join)
     except UnsupportedNetwork as error:
         do = "export it in evaluation mode, without custom operators and control flow, opset_version=18"
         raise Refused("an ONNX file of plain tensors and operators", f"{path} with {error}", do) from error
@@ -59,7 +65,7 @@ def load_network(path: Path) -> Classifier:
         got = f"{path}, whose description cannot be read ({type(error).__name__})"
         raise Refused("an ONNX file", got, "export it again with torch.onnx.export") from error
     check_entries(metadata, path)
-    make = Detector if card.kind == Detector.KIND else Classifier
+    make = Detector if is_detector else Classifier
     return make(f"file:{path}", digest.hexdigest(), card.input_px, card.labels, BatchedNetwork(program, batch))
 
 
@@ -114,6 +120,7 @@ class Card(NamedTuple):
     input_px: int
     labels: tuple[str, ...]
     kind: str
+    head: Head | None = None  # of a detector, where the JSON says
 
 
 def read_card(path: Path) -> Card:
@@ -128,8 +135,8 @@ def read_card(path: Path) -> Card:
         raise Refused("input_px, a whole number of pixels from 8 to 4096", f"{input_px!r} in {path}", do)
     if not isinstance(labels, list) or len(labels) < 2 or {*map(type, labels)} != {str}:
         raise Refused("labels, a list of two or more names", f"{str(labels)[:60]} in {path}", do)
-    kind = card.get("kind", Classifier.KIND)
+    kind = card.get("kind", Detector.KIND if "head" in card else Classifier.KIND)
     if kind not in (Classifier.KIND, Detector.KIND):
         raise Refused(f'kind, "{Classifier.KIND}" or "{Detector.KIND}"', f"{kind!r} in {path}", "write one of these")
     check_entries(card, path, _CARD_NOTES)
-    return Card(input_px, tuple(labels), kind)
+    return Card(input_px, tuple(labels), kind, head_of(card["head"], str(path)) if "head" in card else None)

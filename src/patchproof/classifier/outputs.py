@@ -37,15 +37,14 @@ def check_shape(output: Any, classifier: Classifier) -> None:
         if len(shape) == 3 and shape[0] == 3 and shape[1] > 0 and shape[2] == 4 + classes:
             return
         expected = f"a detector's candidates 3×A×{4 + classes}: left, top, right, bottom in pixels, {classes} logits"
-        do = "decode its heads inside of the network"
-        do = "swap the last two dimensions before the export" if shape[1:2] == (4 + classes,) else do
-        do = "leave the column of objectness out, or name its label" if shape[2:] == (5 + classes,) else do
+        do = 'write "head" into its JSON, or decode its heads inside of the network'
     else:
         if shape == (3, classes):
             return
         expected = f"{classes} logits for each picture, one a label"
         do = "give it as many labels as it has outputs, a background's among them"
-        do += ', or write "kind": "detector"' if len(shape) == 3 else ""
+        if not is_tensor or len(shape) > 2:
+            do = 'if it is a detector, write "kind": "detector" into its JSON, and "head" where its boxes are raw'
     got = f"{shape if is_tensor else type(output).__name__} for 3 pictures from the network {classifier.name}"
     raise Refused(expected, got, do)
 
@@ -58,6 +57,7 @@ def check_values(classifier: Classifier, photos: Tensor, output: Tensor) -> None
         _check_boxes(classifier, output)
     scores = output[..., 4:] if classifier.LOOKS_AT_BOXES else output
     name, do = f"the network {classifier.name}", "leave its last Softmax or Sigmoid out"
+    do += ', or write "head": {"name": "boxes", "scores": "probabilities"}' if classifier.LOOKS_AT_BOXES else ""
     if bool((scores == scores.round()).all()) and bool((scores != scores[:1]).any()):
         got = f"whole numbers from {float(scores.min()):g} to {float(scores.max()):g} from {name}"
         raise Refused("logits, which are fractions", got, f"export it without quantization, and {do}")
@@ -113,13 +113,14 @@ def _check_boxes(classifier: Classifier, candidates: Tensor) -> None:
     expected = "boxes as left, top, right, bottom in pixels"
     if boxes.abs().max() <= 2:
         got = f"none that reaches beyond {float(boxes.max()):.2g} px from {name} ({first})"
-        raise Refused(expected, got, f"multiply them by input_px = {classifier.input_px} inside of the network")
+        raise Refused(expected, got, 'write "head": {"name": "boxes", "unit": "share"} into its JSON')
     size = boxes[:, 2:] - boxes[:, :2]
     share = float((size <= 0).any(1).double().mean())
     seen = f"{share:.0%} with right <= left or bottom <= top"
     if share > 0.5:
         both = bool((size < 0).all())
-        do = "put the upper left corner first" if both else "turn (center or corner, size) into corners in the network"
+        do = 'write "head": {"name": "boxes", "boxes": "cxcywh"} (or "xywh") into its JSON, or "ultralytics"'
+        do = "put the upper left corner first" if both else do
         raise Refused(expected, f"{seen} from {name} ({first})", do)
     if share > 0.02:
         warnings.warn(f"{name} gives boxes, {seen}: are they (center, size)?", stacklevel=3)

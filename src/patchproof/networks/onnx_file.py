@@ -62,16 +62,19 @@ _ATTRIBUTE_TYPES |= {6: ("floats", []), 7: ("ints", []), 8: ("strings", [])}
 _DENOTATIONS = ("DATA_BATCH", "DATA_CHANNEL", "DATA_FEATURE", "DATA_FEATURE")  # of a picture's dimensions
 
 
-def read_onnx(stored: bytes, read_data: Callable[[str], bytes]) -> tuple[Program, int | None, dict[str, str]]:
+def read_onnx(
+    stored: bytes, read_data: Callable[[str], bytes], join: Callable[..., Tensor] | None = None
+) -> tuple[Program, int | None, dict[str, str]]:
     """The network, the number of pictures it takes (None: any), and its metadata. `read_data` reads the file of weights
-    that a location names, each at most once.
+    that a location names, each at most once. With `join`, called with the outputs' names and values, the network gives
+    its result, and may have several outputs.
     """
     model = read_message(stored, _SCHEMAS["model"])
     versions = [opset.get("version", 0) for opset in model.get("opset", []) if opset.get("domain", "") in _STANDARD]
     if len(versions) != 1 or not OPSETS[0] <= versions[0] <= OPSETS[1]:
         raise UnsupportedNetwork(f"opset {quote(versions)[1:-1]}, not one from {OPSETS[0]} to {OPSETS[1]}")
     metadata = {entry.get("key", ""): entry.get("value", "") for entry in model.get("metadata", [])}
-    return *_GraphReader(model["graph"], _Weights(read_data), versions[0]).read(), metadata
+    return *_GraphReader(model["graph"], _Weights(read_data), versions[0]).read(join), metadata
 
 
 class _Weights:
@@ -139,7 +142,7 @@ class _GraphReader:
         self.values: dict[str, ValueRef | Tensor | None] = {"": None}  # an omitted input
         self.tensor = weights.tensor
 
-    def read(self) -> tuple[Program, int | None]:
+    def read(self, join: Callable[..., Tensor] | None = None) -> tuple[Program, int | None]:
         """Return the program and its batch size, see `read_onnx`."""
         for initializer in self.graph.get("initializer", []):
             self._constant(initializer.get("name", ""), self.tensor(initializer))
@@ -165,9 +168,13 @@ class _GraphReader:
         self.of_photos = {photos, self.count - 1}  # computed from pictures
         for node in self.nodes:
             steps.extend(self._steps(node))
-        outputs = [self._known(place["name"]) for place in self.graph["output"]]
+        names = [place["name"] for place in self.graph["output"]]
+        outputs = [self._known(name) for name in names]
+        if join is not None and outputs:
+            steps.append(Step(functools.partial(join, names), outputs, {}, [self.count], False, []))
+            outputs = [ValueRef(self.count)]
         if len(outputs) != 1 or not isinstance(outputs[0], ValueRef):
-            raise UnsupportedNetwork(f"{len(outputs)} outputs, not one of N×K, or N×A×(4+K) of a detector")
+            raise UnsupportedNetwork(f'{len(outputs)} outputs, not one (of a detector: write "kind": "detector")')
         mark_last_uses(steps, {*range(len(self.weights) + 1), outputs[0].number})
         return Program(self.weights, steps, outputs[0].number, sizes), batch
 

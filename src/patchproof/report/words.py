@@ -73,20 +73,20 @@ def remarks(photos: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, int, st
     return sorted(rows, key=lambda row: (-row[2], row[:2]))
 
 
-def recognition_meaning(model: Mapping[str, Any]) -> str:
+def recognition_meaning(model: Mapping[str, Any], label: str) -> str:
     """Explain when a detector of a promise recognizes the object; empty for a classifier."""
     if model["least_score"] is None:
         return ""
     return (
-        f"{model['name']} is a detector: recognized is what it finds in a box of score {model['least_score']:g} or "
-        "more that overlaps the object's own by half."
+        f"{model['name']} is a detector: recognized is a photograph with a box of “{label}”, of score "
+        f"{model['least_score']:g} or more, over the piece's object: the box and the object's own share half or more."
     )
 
 
 def promise_lines(promise: Any, background: str = "") -> list[str]:
     """Sum up a promise: the rate, the background of its views, and the difference to each control."""
     (low, high), target, (first, *more_models) = promise.interval, promise.target, promise.models
-    meaning = recognition_meaning(first.model_dump())
+    meaning = recognition_meaning(first.model_dump(), target.label)
     return [
         promise.headline,
         f'promise ({target.goal} "{target.label}"): recognized in {promise.rate:.1%} of {promise.n} unseen conditions '
