@@ -27,7 +27,8 @@ SETTINGS = {
     "view": {"azimuth_deg": [-30, 30], "distance_mm": [450, 700]},
     "background": {"color": [0.4, 0.5, 0.4]},
     "camera": {"photo_px": [96, 72]},
-    "optimize": {"steps": 3, "views": 2},
+    "printer": {"profile": "coated"},
+    "optimize": {"steps": 12, "views": 4},
 }
 
 

@@ -47,7 +47,7 @@ def refusal(path) -> str:
 def test_the_shortest_scene_has_the_documented_defaults(tmp_path):
     read = load_scene_settings(scene(tmp_path))
     assert read.object.up == "z" and read.patch.side == "+x" and read.sheet.template == "a4"
-    assert read.view.azimuth_deg == (-60, 60) and read.camera.jpeg == (60, 95) and read.printer.profile == "coated"
+    assert read.view.azimuth_deg == (-60, 60) and read.camera.jpeg == (60, 95) and read.printer.profile == "office"
     assert (read.optimize.steps, read.optimize.views, read.target.goal) == (240, 4, "assist")
     with pytest.raises(Exception, match="frozen"):
         read.object.up = "y"

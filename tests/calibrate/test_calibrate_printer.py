@@ -325,7 +325,8 @@ def test_readings_are_combined_without_the_one_that_is_off():
 def test_print_to_print_variation_is_found():
     light = torch.tensor(linear_from_srgb(printer_output(load_printer("coated"), chart(72))))
     draws = np.random.default_rng(5).uniform(-1, 1, (12, 3)) * [0.04, 0.05, 0.004]
-    prints = [vary_print(light, torch.tensor(draw)).numpy() for draw in draws]
+    changes = [torch.tensor([gain, density, 0.0, *[lift] * 3]) for gain, density, lift in draws]
+    prints = [vary_print(light, change).numpy() for change in changes]
     found = print_variation(prints)
     expected = draws.std(0, ddof=1)
     got = [found[key] for key in ("dot_gain_sd", "density_sd", "black_lift_sd")]
@@ -384,7 +385,7 @@ def test_a_scene_s_camera_writes_with_its_own_tone_curve(tmp_path):
     toned, plain = (set_stage(replace(scene, camera=each)) for each in (camera, camera.changed(tone_light=None)))
     design, views = torch.full((3, 8, 8), 0.5), scene.draw("evaluate", 2)
     for sharp in (True, False):
-        drawn = with_values(views, noise=0, blur_px=0 if sharp else 40, jpeg=0)
+        drawn = with_values(views, tone=0, noise=0, blur_px=0 if sharp else 40, jpeg=0)
         own, usual = (photograph(stage, design, drawn, (64, 64)) for stage in (toned, plain))
         light = linear_from_srgb(usual.double())
         torch.testing.assert_close(own.double(), codes_of_light(light, camera), atol=2e-3, rtol=0)

@@ -8,6 +8,7 @@ import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import pytest
 import torch
@@ -16,7 +17,7 @@ from torch import Tensor, nn
 
 from patchproof.app.keys import declarations
 from patchproof.base.errors import Refused
-from patchproof.classifier import Classifier, center_square, load_classifier
+from patchproof.classifier import Classifier, center_square, imagenet, load_classifier, wrapping
 from patchproof.classifier.declarations import DECLARED
 from patchproof.classifier.detector import Detector
 from patchproof.classifier.zoo import load_weights, read_weights
@@ -25,6 +26,8 @@ pytest.importorskip("onnx", reason='needs onnx, of the extra "test"')
 
 import onnx_files
 from onnx import ModelProto, TensorProto, helper
+
+import test_imagenet
 
 PHOTOS = torch.rand(3, 3, 8, 8, generator=torch.Generator().manual_seed(7))
 W, F = (torch.from_numpy(onnx_files.constants()[name]) for name in "WF")
@@ -125,10 +128,21 @@ def weights(folder: Path, declared: dict[str, str] | None = None, **changes: Any
     load_weights(network, read_weights(folder / "w.safetensors"), "linear", "check the name")
 
 
+def unlike_imagenet() -> None:
+    """Check a network that takes red for blue beside another in the place of `imagenet`."""
+    reference = Classifier("imagenet", None, 32, test_imagenet.NAMES, test_imagenet.Colors())
+    swapped = Classifier("it", None, 32, test_imagenet.NAMES, lambda x: reference.network(x.flip(1)))
+    wrapping._reference.cache_clear()
+    with mock.patch.multiple(imagenet, has_imagenet=lambda: True, load_imagenet=lambda: reference):
+        wrapping.check_wrapping(swapped, "cpu")
+    wrapping._reference.cache_clear()
+
+
 SHA1 = hashlib.sha1(bytes(8) + W.numpy().tobytes() + bytes(4)).hexdigest()
 NAMES = metadata(names="{0: 'red'}", imgsz="[8, 8]", task="classify", license="MIT")
 # by entry of the list: calls, each with the logits that it has to return or the sentence that it ends in
 CASES: dict[str, tuple[Any, ...]] = {
+    "of ImageNet labels, unlike `imagenet`'s": (lambda at: unlike_imagenet(), "red and blue swapped"),
     "opset": (
         *(lambda at: answers(at, onnx_files.model(onnx_files.SMALL, 13)), truth()),
         *(lambda at: answers(at, onnx_files.model(onnx_files.SMALL, 6)), "opset 6, not one from 7"),

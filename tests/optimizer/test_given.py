@@ -184,7 +184,7 @@ def test_pictures_are_read_like_photographs(tmp_path, kind):
 def test_gamut_is_the_printers_own_table(tmp_path):
     picture = np.full((64, 64, 3), (0, 255, 0), np.uint8)
     record = import_patch(picture, scene_with(tmp_path, **SMALL), tmp_path / "run", **DRAFT).details
-    green = float(load_printer("coated").gamut[0, -1, 0])
+    green = float(load_printer("office").gamut[0, -1, 0])
     assert green > 2 and record["imported"]["out_of_gamut"] == 1
     assert record["imported"]["delta_e00"] == pytest.approx(green, abs=0.01)
     exact = scene_with(tmp_path, **SMALL, printer__profile="identity")

@@ -241,7 +241,7 @@ def test_a_design_survives_its_own_pixels():
 
 
 def test_the_promise_counts_what_was_recognized(tmp_path):
-    problem = set_problem(scene_with(tmp_path, target__label="blue"))
+    problem = set_problem(scene_with(tmp_path, target__label="blue", printer__profile="coated"))
     blue = np.zeros((*problem.subject.printed_px[::-1], 3), np.uint8)
     blue[..., 2] = 255
     promise = make_promise(problem, blue, problem.scene.draw("promise", 24))

@@ -34,7 +34,9 @@ from test_verify_verdict import promise_of
 @pytest.fixture
 def promised(tmp_path):
     """Promises a blue design's rate on up to 40 views in sessions of four; counts are told to `told`."""
-    problem = set_problem(scene_with(tmp_path, target__label="blue", printer__veil=[0, 0], camera__tone=[0, 0]))
+    problem = set_problem(
+        scene_with(tmp_path, target__label="blue", printer__profile="coated", printer__veil=[0, 0], camera__tone=[0, 0])
+    )
     blue = np.zeros((*problem.subject.printed_px[::-1], 3), np.uint8)
     blue[..., 2] = 255
     conditions = problem.scene.draw("promise", 40, per_session=VIEWS_PER_SESSION)

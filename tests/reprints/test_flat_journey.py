@@ -138,7 +138,7 @@ def shoot(world: PatchScene, pdf: Path | None, conditions, folder: Path) -> None
     stage, piece = set_stage(world), None
     if pdf is not None:
         manifest = load_manifest(pdf.with_suffix(".json"))
-        piece = MountedSheet(stage, manifest, sent_pixels(pdf, manifest, world), load_printer("coated")).piece
+        piece = MountedSheet(stage, manifest, sent_pixels(pdf, manifest, world), load_printer("office")).piece
     for i in range(len(conditions)):
         (folder / f"photo_{i}.jpg").write_bytes(take_photo(stage, piece, conditions[i : i + 1]))
 

@@ -173,7 +173,7 @@ def _run_locked(study: Study, settings: StrictModel, base: Path, out: Path, work
         todo = [cell for cell in cells if cell.name not in found]
         failed: dict[str, str] = {}
         work.on_cell(len(found), len(cells))
-        task = partial(_run_cell, study, settings, base)
+        task = partial(_run_cell, study.run, settings, base)
         for done, (number, future) in enumerate(workers.completed(task, todo), len(found) + 1):
             cell = todo[number]
             try:
@@ -254,11 +254,13 @@ def _load_finished(out: Path, cell: Cell) -> dict[str, Any] | None:
 Outcome = tuple[dict[str, Any], dict[str, bytes], str | None]
 
 
-def _run_cell(study: Study, settings: StrictModel, base: Path, cell: Cell) -> Outcome:
+def _run_cell(
+    run: Callable[[Any, Path, Cell], dict[str, Any]], settings: StrictModel, base: Path, cell: Cell
+) -> Outcome:
     """Run a cell and return its outcome; errors become text, since not every exception can be pickled."""
     try:
         with use_threads(1):
-            answers = study.run(settings, base, cell)
+            answers = run(settings, base, cell)
         files = {key: value for key, value in answers.items() if isinstance(value, bytes)}
         return _as_json_values({key: value for key, value in answers.items() if key not in files}), files, None
     except Exception as error:  # including those of a user's network

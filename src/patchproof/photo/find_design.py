@@ -236,7 +236,7 @@ class _Refiner:
     def __init__(self, srgb: np.ndarray, design: np.ndarray, size_mm: tuple[float, float]):
         self.levels = halving_pyramid(srgb)
         self.srgb, self.design, self.size_mm = srgb, design, size_mm
-        self.templates: dict[int, _Template] = {}
+        self.templates: dict[int, _SmallDesign] = {}
 
     def refine(self, quad: np.ndarray) -> FoundPlace | None:
         """The refined place; None if it is none that a camera can see."""
@@ -248,7 +248,7 @@ class _Refiner:
             most = max(24, 2 * round(0.5 * side_px * np.sqrt(max(self.size_mm) / min(self.size_mm))))
             size = min(longer_px, most)
             if size not in self.templates:
-                self.templates[size] = _Template(_draw(self.design, self.size_mm, size))
+                self.templates[size] = _SmallDesign(_draw(self.design, self.size_mm, size))
             level = int(np.clip(np.log2(max(side_px / size, 1)), 0, len(self.levels) - 1))
             scale, template = self.srgb.shape[1] / self.levels[level].shape[1], self.templates[size]
             refined, likeness, sigma = template.align(self.levels[level], quad / scale)
@@ -264,7 +264,7 @@ class _Refiner:
         return place if is_plausible_quad(quad) and is_in_picture(quad, self.srgb) else None
 
 
-class _Template:
+class _SmallDesign:
     """A drawn design, its surroundings subtracted, with the derivatives of its colors by a homography's eight terms.
 
     Colors are three channels and their squares: inks, veils and tone curves mix them, which moves edges between colors
