@@ -35,7 +35,7 @@ class Lamps(torch.nn.Module):
         with torch.no_grad():
             color, side = torch.tensor([1.0, 0, -1]).view(1, 3, 1, 1), torch.tensor([1.0, 1, -1, -1])
             self.beside.weight.copy_(color * side.expand(1, 1, 4, 4) / 8)
-            self.beside.bias.fill_(-0.35)
+            self.beside.bias.fill_(-0.33)
             self.head.weight.copy_(torch.tensor([[40.0], [-40], [-20]]))
             self.head.bias.copy_(torch.tensor([-1.6, 1.6, -1]))
 
@@ -50,7 +50,7 @@ HOUR = (
     ("preview scene.toml", 0),
     ("optimize scene.toml --draft --out run", 0),
     ("sheet run --out sheet.pdf", 0),
-    ("reprint sheet.pdf --run run --n 8 --sessions 4 --out photos", 0),
+    ("reprint sheet.pdf --run run --n 12 --sessions 6 --out photos", 0),
     ("verify photos --sheet sheet.json --out report", 1),
     (f"verify photos --sheet sheet.json --out report --models {MODEL}", 0),
 )
@@ -70,7 +70,7 @@ def prepared(folder: Path) -> None:
 
 def messed_up(photos: Path) -> None:
     """What collects in such folders: thumbnails, copies, a screenshot, a video, a raw file, notes, droppings."""
-    first, second, third, _ = sorted(path for path in photos.iterdir() if path.is_dir())
+    first, second, third, *_ = sorted(path for path in photos.iterdir() if path.is_dir())
     (first / "thumbnails").mkdir()
     shot, other = sorted(first.glob("*.jpg"))[0], sorted(second.glob("*.jpg"))[0]
     with Image.open(shot) as picture:
