@@ -4,8 +4,6 @@ In: which network. Out: scene.toml run/ sheet.pdf sheet.json photos/ report/. It
 dim, oblique and in cluttered places, so that the bare object and the controls are often misread and a patch can help.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from patchproof.app.verify import verify

@@ -6,8 +6,6 @@ finished photograph, from which `resume` continues. The promise's primary networ
 named. Scene, renderer and optimizer are imported only if a run is given.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -86,7 +84,7 @@ def verify(
     models: Sequence[str | Classifier] | None = None,
     controls: str | Path | None = None,
     capture: CaptureInfo = CaptureInfo(),
-    run: str | Path | Run | None = None,
+    run: "str | Path | Run | None" = None,
     trust: bool = False,
     ledger_photos: int = LEDGER_PHOTOS,
     compute: Compute = Compute(),
@@ -177,7 +175,7 @@ def verify(
     return report
 
 
-def _boxes(report: Report, manifest: Manifest, camera: Camera | None) -> str:
+def _boxes(report: Report, manifest: Manifest, camera: "Camera | None") -> str:
     """Write the photographs as COCO JSON, with the piece's outline where it is flat and not rejected, and for detectors
     the part of the object's box in the centered square, if it is known.
     """

@@ -4,8 +4,6 @@ In: a TOML file whose keys are the fields below. Out: `SceneSettings`, frozen an
 its reason stands beside it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal

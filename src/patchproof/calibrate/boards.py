@@ -7,8 +7,6 @@ calibrated as the mean of both. Corners are saddle points, symmetric under half 
 curve shifts them. Pixel centers are at .5.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -41,7 +39,7 @@ class BoardView:
     px: np.ndarray
     size_px: tuple[int, int]
 
-    def select(self, keep: np.ndarray) -> BoardView:
+    def select(self, keep: np.ndarray) -> "BoardView":
         """A copy with the corners in the mask `keep` only."""
         return replace(self, ids=self.ids[keep], board_mm=self.board_mm[keep], px=self.px[keep])
 

@@ -9,8 +9,6 @@ point every way where none is; a photograph that stands out was moved or shows a
 Left out on purpose: fisheye lenses, and how flat the board is, which shows in the residuals only.
 """
 
-from __future__ import annotations
-
 import io
 import json
 from collections.abc import Mapping, Sequence

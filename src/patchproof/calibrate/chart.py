@@ -10,8 +10,6 @@ sRGB. Both curves are one product in a photograph, and nothing on the page separ
 own, and the table is the printer's. Either describes the paper under the light it was photographed in.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial

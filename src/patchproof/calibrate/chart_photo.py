@@ -8,8 +8,6 @@ lines on the paper are outliers of that surface, and the robust fit ignores them
 Left out on purpose: lens distortion (a swatch's core is far from its border), and gloss: photograph it without shine.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

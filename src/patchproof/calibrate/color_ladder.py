@@ -13,8 +13,6 @@ where it only mixes inks.
 Source: Duchon, Splines minimizing rotation-invariant semi-norms in Sobolev spaces, 1977.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

@@ -8,8 +8,6 @@ on coated, 14 on uncoated paper). A bake measures its table against the exact ch
 Left out on purpose: black point compensation, in which drivers differ.
 """
 
-from __future__ import annotations
-
 import hashlib
 import io
 from collections.abc import Callable

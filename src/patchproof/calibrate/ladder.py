@@ -8,8 +8,6 @@ Sources: Breiman, Friedman, Olshen, Stone, Classification and Regression Trees, 
 error); Hastie, Tibshirani, Friedman, The Elements of Statistical Learning, 2nd ed., 7.10 (cross-validation).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -10,8 +10,6 @@ photographs share a bent board, and corners of one photograph are not independen
 Source: Zhang, A Flexible New Technique for Camera Calibration, PAMI 2000.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 

@@ -3,8 +3,6 @@
 Nothing is written before the printer is complete, and existing files are replaced only on request.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Make a printer from its tables, and write its two files, which `channel.printer` reads."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -10,8 +10,6 @@ visibility are skipped, because they would cost time and change nothing. At full
 JPEG by the code that writes the file.
 """
 
-from __future__ import annotations
-
 from functools import lru_cache, partial
 from typing import TYPE_CHECKING
 
@@ -37,7 +35,7 @@ READ_SHARE = 0.25
 _TABLE_STEPS = 1 << 18  # of light in `encode_light_by_table`
 
 
-def develop(linear: Tensor, sensor: Sensor, scale: float, jpeg: bool = True, camera: Camera | None = None) -> Tensor:
+def develop(linear: Tensor, sensor: Sensor, scale: float, jpeg: bool = True, camera: "Camera | None" = None) -> Tensor:
     """Return the pictures that a camera makes of linear light, one row of `sensor` per picture. The tone curve is that
     of `camera` if it has one, else sRGB's.
 
@@ -82,7 +80,7 @@ def gains(sensor: Sensor, like: Tensor) -> Tensor:
     return torch.as_tensor(2 ** sensor.exposure_ev[:, None] * sensor.white_balance).to(like)
 
 
-def encode_light(linear: Tensor, camera: Camera | None = None) -> Tensor:
+def encode_light(linear: Tensor, camera: "Camera | None" = None) -> Tensor:
     """Return clipped light as code values in [0, 1]."""
     return codes_of_light(clamp_to_unit(linear), camera)
 
@@ -93,7 +91,7 @@ def lift_tone(codes: Tensor, tone: Tensor) -> Tensor:
     return codes * (1 + rise - rise * codes)  # codes + 4·tone·codes·(1 - codes)
 
 
-def encode_light_by_table(linear: Tensor, camera: Camera | None = None) -> Tensor:
+def encode_light_by_table(linear: Tensor, camera: "Camera | None" = None) -> Tensor:
     """Encode light by a table, within 1/100 of an 8-bit step, in a seventh of the time; not differentiable."""
     index = (linear * _TABLE_STEPS).add_(0.5).clamp_(0, _TABLE_STEPS).int()
     # pyright cannot know that frozen models have a hash
@@ -102,7 +100,7 @@ def encode_light_by_table(linear: Tensor, camera: Camera | None = None) -> Tenso
 
 
 @lru_cache(maxsize=4)
-def _code_table(camera: Camera | None, device: torch.device) -> Tensor:
+def _code_table(camera: "Camera | None", device: torch.device) -> Tensor:
     return encode_light(torch.linspace(0, 1, _TABLE_STEPS + 1, dtype=torch.float64, device=device), camera).float()
 
 

@@ -1,7 +1,5 @@
 """Load a calibrated camera only if one is named: `lens` is imported with the first camera file."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,7 +9,7 @@ if TYPE_CHECKING:
 
 def load_optional_camera(
     name_or_file: str | Path | None, base: Path | None = None, photo_px: tuple[int, int] | None = None
-) -> Camera | None:
+) -> "Camera | None":
     """Return the camera of that name or file, as `lens.load_camera` reads it; None if no camera is named."""
     if name_or_file is None:
         return None

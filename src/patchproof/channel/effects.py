@@ -14,8 +14,6 @@ that applies it. Its numbers come from a generator of its own, keyed by its name
 stay as they were.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal, Self

@@ -12,8 +12,6 @@ models, and chromatic aberration. Lenses that bend so far that one direction wou
 Source: Brown, Close-Range Camera Calibration, 1971; OpenCV's documentation of calib3d.
 """
 
-from __future__ import annotations
-
 import math
 from functools import lru_cache
 from pathlib import Path
@@ -96,7 +94,7 @@ class Camera(StrictModel):
         matrix = matrix + np.array([[0, 0, left], [0, 0, top], [0, 0, 0]])
         return Frame((size_px[0] + left + right, size_px[1] + top + bottom), matrix, left, top, right, bottom)
 
-    def distort_pictures(self, pictures: Tensor, size_px: tuple[int, int]) -> Tensor:
+    def distort_pictures(self, pictures: "Tensor", size_px: tuple[int, int]) -> "Tensor":
         """Bend pinhole pictures N×C×H×W of `pinhole_frame(...).size_px` as the lens does, to pictures of `size_px`.
 
         Differentiable. The input should be linear light, which is what passes through a lens.

@@ -13,8 +13,6 @@ promised for glossy paper half a meter from a lamp, in 9 pairs of scene and netw
 Source: Lambert.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import partial
 

@@ -5,8 +5,6 @@ whole object counts, including what a piece or another of its parts hides: the b
 out on purpose: things that stand in front of the object.
 """
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -43,7 +41,7 @@ def project_box(
     camera_from_world: np.ndarray,
     matrix_px: np.ndarray,
     size_px: tuple[int, int],
-    camera: Camera | None = None,
+    camera: "Camera | None" = None,
 ) -> np.ndarray:
     """Return the box (4,) around world points P×3 in a picture of `size_px`, seen through a calibrated lens if one is
     given. Points behind the camera do not count; the box is all zeros if no point is in the picture.

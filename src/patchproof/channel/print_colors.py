@@ -11,8 +11,6 @@ veil that is in every place) may be either. Paper stays paper: its light is a ph
 that changes within a photograph.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -60,7 +58,7 @@ class ShownColors:
     tone: float = 0.0
 
     @staticmethod
-    def of_terms(terms: np.ndarray) -> ShownColors:
+    def of_terms(terms: np.ndarray) -> "ShownColors":
         """Colors by veil (3), log gains (3), tone and chroma; zeros change nothing."""
         veil, gains, (tone, chroma) = terms[:3], np.exp(terms[3:6]), terms[6:]
         mixing = (1 + chroma) * np.eye(3) - chroma * np.array(LUMINANCE)

@@ -8,8 +8,6 @@ them too. Print-to-print variation is a small function on top, `vary_print`. Lef
 what a camera resolves beyond 0.2 mm per pixel) and ink spread.
 """
 
-from __future__ import annotations
-
 import hashlib
 import io
 import math

@@ -1,7 +1,5 @@
 """The frame in which a picture is rendered before the lens bends it; needs nothing of lenses."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -5,8 +5,6 @@ of codes and codes of light, both in [0, 1]; a camera without a curve encodes as
 that differ between channels, and pictures that a phone tone-maps differently from region to region.
 """
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,14 +17,14 @@ if TYPE_CHECKING:
     from patchproof.channel.lens import Camera
 
 
-def light_of_codes(codes: np.ndarray, camera: Camera | None) -> np.ndarray:
+def light_of_codes(codes: np.ndarray, camera: "Camera | None") -> np.ndarray:
     """Return the linear light of the code values that a camera wrote."""
     if camera is None or camera.tone_light is None:
         return linear_from_srgb(codes)
     return np.interp(codes, np.linspace(0, 1, len(camera.tone_light)), camera.tone_light)
 
 
-def codes_of_light(linear: Tensor, camera: Camera | None) -> Tensor:
+def codes_of_light(linear: Tensor, camera: "Camera | None") -> Tensor:
     """Return the code values that a camera writes for linear light in [0, 1]; differentiable."""
     if camera is None or camera.tone_light is None:
         return srgb_from_linear(linear)

@@ -6,8 +6,6 @@ precision over the recalls reached, each precision the best at that recall or a 
 every point).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 

@@ -6,8 +6,6 @@ name a torchvision, timm or exported model. Convolutions and ReLUs only: BatchNo
 before saving, which is faster and leaves nothing that depends on the batch. Weights are stored as float16.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Callable

@@ -6,8 +6,6 @@ predicts the label of the object that it lies on and the distances to its four s
 from features of two sizes (Lin et al., feature pyramids, CVPR 2017).
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import torch

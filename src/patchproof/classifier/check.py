@@ -5,8 +5,6 @@ on the batch, no gradient, not for pictures in [0, 1]; what outputs.py finds); a
 odd. Source of the idea: Croce et al., "Flags", github.com/fra31/auto-attack, checks.py.
 """
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Iterator
 

@@ -9,8 +9,6 @@ Left out on purpose: means over several prompts of a label (write the one that c
 Source: Radford et al., Learning Transferable Visual Models From Natural Language Supervision, ICML 2021, section 3.1.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import torch

@@ -6,8 +6,6 @@ N×3×S×S sRGB in [0, 1], its normalization inside, and returns N×K logits; on
 `detector_of` describes them. Modules beside the scene file are found, too.
 """
 
-from __future__ import annotations
-
 import importlib
 import sys
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """What files of networks can declare, and what load_classifier does with each declaration."""
 
-from __future__ import annotations
-
 from patchproof.base.declared import Declaration
 
 DECLARED: tuple[Declaration, ...] = (

@@ -8,8 +8,6 @@ score. Where the object's box is not known, any candidate in the square counts.
 Left out on purpose: suppression. It leaves the best candidate of an object, which alone decides here.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence  # noqa: F401 (Callable: of the annotations of the inherited __init__)
 from dataclasses import dataclass
 

@@ -5,8 +5,6 @@ own; and its head, or none: then shapes decide, which a warning says. Out: candi
 Left out on purpose: suppression (detector.py); clipping to the picture; masks, keypoints, boxes that are turned.
 """
 
-from __future__ import annotations
-
 import math
 import re
 import warnings

@@ -7,8 +7,6 @@ Sources: github.com/ultralytics/ultralytics (the exports, DFL), pjreddie.com/dar
 RetinaNet, FCOS), Tian et al., "FCOS", Carion et al., "End-to-End Object Detection with Transformers".
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from itertools import pairwise

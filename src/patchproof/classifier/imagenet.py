@@ -7,8 +7,6 @@ github.com/tensorflow/tpu/tree/master/models/official/efficientnet/lite: no sque
 TensorFlow. Batch normalization is folded into the convolutions.
 """
 
-from __future__ import annotations
-
 import hashlib
 import io
 import json

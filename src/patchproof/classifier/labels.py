@@ -5,8 +5,6 @@ an underscore is a space. The whole entry counts as a name too. A name that is i
 indices, an absent one with the nearest names.
 """
 
-from __future__ import annotations
-
 import difflib
 from collections.abc import Sequence
 

@@ -15,8 +15,6 @@ Paths are relative to the scene file's folder and may hold `${VAR}`. Networks co
 gradients. Several names give several classifiers.
 """
 
-from __future__ import annotations
-
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path

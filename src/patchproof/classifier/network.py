@@ -6,8 +6,6 @@ see the same. Recognized means that the top-1 label is among the target's indice
 Left out on purpose: labels' meaning (labels.py), loading (load.py), ensembles (a tuple of classifiers is one).
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -51,7 +49,7 @@ class Classifier:
         """SHA-256 of what its answers depend on: weights, input size, labels; code is not among it."""
         return value_sha256([self.KIND, self.sha256, self.input_px, self.labels])
 
-    def with_least_score(self, least_score: float | None) -> Classifier:
+    def with_least_score(self, least_score: float | None) -> "Classifier":
         """A copy with that `least_score`; the classifier itself if the score is None or it needs none."""
         return self if None in (least_score, self.least_score) else replace(self, least_score=least_score)
 

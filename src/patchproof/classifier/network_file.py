@@ -8,8 +8,6 @@ Nothing of the file is executed: protobuf.py reads its fields, onnx_file.py the 
 its operators, which are on the list in onnx_operators.py. Weights may lie in files beside it that NAME.onnx names.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 import re

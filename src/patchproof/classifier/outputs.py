@@ -6,8 +6,6 @@ else, a warning where they look like it. A Sigmoid or Softmax is known by its na
 and by its behavior: pictures far outside of [0, 1] drive it to its ends, and logits beyond them.
 """
 
-from __future__ import annotations
-
 import re
 import warnings
 from typing import Any

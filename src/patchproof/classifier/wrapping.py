@@ -8,8 +8,6 @@ networks from 52, so that they agree by at least 0.05 less after any of these ch
 Left out on purpose: other label sets, detectors, and networks where `imagenet` is not installed.
 """
 
-from __future__ import annotations
-
 import warnings
 from collections import Counter
 from collections.abc import Callable, Sequence

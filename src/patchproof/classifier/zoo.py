@@ -7,8 +7,6 @@ and normalization are the library's own; the latter is put inside the network.
 Left out on purpose: the libraries' resize-then-crop. Here every network sees the whole centered square.
 """
 
-from __future__ import annotations
-
 import hashlib
 import importlib
 import json

@@ -8,8 +8,6 @@ cells, and cells with gloss (light added to all three channels in one place), wh
 fitted to the design's cells, paper and ink; each cell is compared after a map that was fitted to other cells.
 """
 
-from __future__ import annotations
-
 from functools import partial
 
 import cv2

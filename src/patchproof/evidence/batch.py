@@ -6,8 +6,6 @@ ends its process each time, becomes a rejected entry, and the batch continues. P
 classified, since a bare object carries no marker; one that shows a single tone or noise is rejected.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -71,7 +69,7 @@ class PhotoItem:
     control: str | None = None
     with_pictures: bool = False
     box: BoxEdges | None = None
-    corners: DesignCorners | None = None
+    corners: "DesignCorners | None" = None
 
     @property
     def name(self) -> str:

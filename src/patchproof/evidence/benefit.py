@@ -12,8 +12,6 @@ with gain and loss mirrored for `deceive`. The verdict on the promise is indepen
 useless, and is, keeps its promise.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from patchproof.base.intervals import rates_difference

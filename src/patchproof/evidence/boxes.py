@@ -6,8 +6,6 @@ or of copies of another size, upright or as stored. Out: by photograph's name it
 Left out on purpose: objects in several parts, and annotations of other things.
 """
 
-from __future__ import annotations
-
 import warnings
 from collections import Counter
 from collections.abc import Mapping, Sequence

@@ -6,8 +6,6 @@ matrix follows from EXIF's focal length with the principal point in the middle, 
 upright photographs, as those of a camera that was turned by 90° clockwise, as most phones are.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -37,7 +35,7 @@ class PinholePhoto:
     cropped: bool = False
 
 
-def pinhole_photo(photo: Photo, camera: Camera | None) -> PinholePhoto:
+def pinhole_photo(photo: Photo, camera: "Camera | None") -> PinholePhoto:
     """Remove the distortion by the camera file; use EXIF if there is no file, or if it is of another picture size."""
     height, width = photo.srgb.shape[:2]
     if camera is not None and width != height:
@@ -50,14 +48,14 @@ def pinhole_photo(photo: Photo, camera: Camera | None) -> PinholePhoto:
     return PinholePhoto(photo.srgb, matrix, False, photo.focal_spread, photo.focal_rejected)
 
 
-def _turn_clockwise(camera: Camera) -> Camera:
+def _turn_clockwise(camera: "Camera") -> "Camera":
     """Turn a camera's pictures by 90° clockwise: (x, y) becomes (height - y, x)."""
     (width, height), cx, cy = camera.image_px, camera.cx, camera.cy
     turned = camera.changed(image_px=(height, width), fx=camera.fy, fy=camera.fx, cx=height - cy, cy=cx)
     return turned.changed(p1=camera.p2, p2=-camera.p1)
 
 
-def _undistort(srgb: np.ndarray, camera: Camera, matrix: np.ndarray) -> np.ndarray:
+def _undistort(srgb: np.ndarray, camera: "Camera", matrix: np.ndarray) -> np.ndarray:
     """Resample a picture as a pinhole of the same matrix takes it."""
     if not camera.has_distortion:
         return srgb

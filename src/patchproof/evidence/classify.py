@@ -5,8 +5,6 @@ network's own list; the promise fixes them for its primary network. There are no
 figures depended by 2e-5 on the photographs beside it, and on a CPU they are no faster.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -31,16 +29,16 @@ BoxEdges = tuple[float, float, float, float]  # left, top, right, bottom as shar
 class Judges:
     """Networks, the labels of each that count as recognized, and the one that the promise was made for."""
 
-    models: Sequence[Classifier]
+    models: "Sequence[Classifier]"
     indices: dict[str, tuple[int, ...]]
-    primary: Classifier
+    primary: "Classifier"
 
     def predictions(self, squares: Mapping[int, np.ndarray], box: BoxEdges | None) -> dict[str, Prediction]:
         """Classify one photograph with the object in `box` by every network: predictions by network's name."""
         return {m.name: predict(m, self.indices[m.name], squares[m.input_px], box) for m in self.models}
 
 
-def judges_of(models: Sequence[Classifier], manifest: Manifest) -> Judges | None:
+def judges_of(models: "Sequence[Classifier]", manifest: Manifest) -> Judges | None:
     """Combine the networks with the sheet's target; None if the sheet has no promise. Refused are networks without the
     promise's own one, and another file under its name.
     """
@@ -131,7 +129,7 @@ def _strip_weights(side: int, size: int) -> list[tuple[slice, csr_array]]:
     return strips
 
 
-def target_indices(model: Classifier, promise: Promise, settings: Mapping[str, Any]) -> tuple[int, ...]:
+def target_indices(model: "Classifier", promise: Promise, settings: Mapping[str, Any]) -> tuple[int, ...]:
     """Indices of the labels that count as recognized; for the promise's primary network, the promise's own."""
     from patchproof.classifier import find_labels
 
@@ -142,7 +140,7 @@ def target_indices(model: Classifier, promise: Promise, settings: Mapping[str, A
     return find_labels(model.labels, target_settings.get("label", target.label), target_settings.get("accept", ()))
 
 
-def predict(model: Classifier, indices: tuple[int, ...], square: np.ndarray, box: BoxEdges | None) -> Prediction:
+def predict(model: "Classifier", indices: tuple[int, ...], square: np.ndarray, box: BoxEdges | None) -> Prediction:
     """Classify one square of the network's input size, float32 3×S×S, with the object in `box`."""
     import torch
 

@@ -7,8 +7,6 @@ or two, an aim that is off by a hundredth of the picture, exposures that differ 
 Left out on purpose: pictures without a readable sheet that differ in their bytes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -6,8 +6,6 @@ or as a polygon, and says of which size the picture was: points in a copy are sc
 Left out on purpose: points in pictures as stored, which EXIF turns; corners that the picture's edge cuts off.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """What COCO JSON with the object's boxes can declare, and what `boxes` does with it."""
 
-from __future__ import annotations
-
 from patchproof.base.declared import Declaration
 
 _FILE, _CORNERS = "COCO JSON", "COCO JSON (corners)"

@@ -7,8 +7,6 @@ ink's contrast: on 29 photographs of real prints the weakest had 0.32 of the str
 Left out on purpose: bands of clogged nozzles, and inks that only a composite black would show.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2

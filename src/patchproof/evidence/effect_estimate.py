@@ -9,8 +9,6 @@ Left out on purpose: the bare object, whose surface behind the piece no photogra
 piece, with which rendering the design back fails, too.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
@@ -37,7 +35,7 @@ def estimate_effect(
     shots: Sequence[PhotoSquare],
     manifest: Manifest,
     surface: Surface,
-    printer: Printer,
+    printer: "Printer",
     judges: Judges,
     recognized: Mapping[str, bool],
 ) -> EffectEstimate | None:

@@ -5,8 +5,6 @@ In: the chance of every photograph, its answer, the promised rate. Out: a `Forec
 print and camera is the same in all photographs of a session.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

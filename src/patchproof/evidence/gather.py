@@ -6,8 +6,6 @@ own (over processes if `jobs` > 1), classified and freed, so that memory does no
 journal, finished photographs survive a kill.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing, nullcontext

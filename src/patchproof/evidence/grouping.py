@@ -5,8 +5,6 @@ Without folders, EXIF decides: another camera, or a pause of half an hour, begin
 one session: the cautious assumption, since photographs of one session count for less.
 """
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass

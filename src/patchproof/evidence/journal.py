@@ -6,8 +6,6 @@ broken lines are dropped, so that a photograph is measured again if it, a networ
 The reader validates the results themselves.
 """
 
-from __future__ import annotations
-
 import io
 import json
 from collections.abc import Iterator
@@ -67,7 +65,7 @@ class Journal:
         self._file.close()
 
 
-def settings_key(manifest: Manifest, options: Options) -> str:
+def settings_key(manifest: "Manifest", options: "Options") -> str:
     """SHA-256 of all that a photograph's result depends on besides its bytes; of the user's networks their names."""
     settings = {
         "versions": (__version__, cv2.__version__, np.__version__),

@@ -19,8 +19,6 @@ share is print: a veil in all of them looks like lighter ink. Around the piece, 
 darkest place. If the design's colors are too few or too alike to fit the print, print and light are one step.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from itertools import product
 from math import factorial

@@ -5,8 +5,6 @@ own pixels are checked, too: markers in a piece's corners fit a plane even if th
 rolled paper are those of the tangent plane at the design's middle.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 

@@ -7,8 +7,6 @@ identified but geometry or color cannot be trusted, it is `judged`: recognition 
 views fail first and leaving them out would raise the rate.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING
@@ -93,7 +91,7 @@ def measure(
     ranges: PromisedRanges,
     scan_dpi: float | None = None,
     with_pictures: bool = True,
-    corners: DesignCorners | None = None,
+    corners: "DesignCorners | None" = None,
     find: np.ndarray | None = None,
 ) -> MeasuredPhoto:
     """Measure one readable photograph; color only if the sheet has `promised` colors. Where no marker can
@@ -164,7 +162,7 @@ def measure(
 
 def _search(
     srgb: np.ndarray, design: np.ndarray, surface: Surface, rejection: PhotoRejected
-) -> tuple[DesignCorners | None, PhotoRejected]:
+) -> "tuple[DesignCorners | None, PhotoRejected]":
     """The design's corners by its pixels, and the reason for the search; or None and why they were not found."""
     from patchproof.photo.find_design import find_design
 

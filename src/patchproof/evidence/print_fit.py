@@ -5,8 +5,6 @@ colors and what each photograph makes of its light (`channel.print_colors`), or 
 or too alike to fit them. All photographs show one print: light and noise differ from photo to photo, ink does not.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -5,8 +5,6 @@ margin of 10 %), and `matched_rate`, the promised rate at the conditions nearest
 every photograph at one size, so pixels of a photograph are scaled to the size of the promised photographs.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 

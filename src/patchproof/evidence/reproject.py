@@ -9,8 +9,6 @@ Left out on purpose: JPEG, whose blocks are smaller than a network's pixel in a 
 and uneven light, which the ledger counts as `photo`.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -4,8 +4,6 @@ Lengths in mm and px as named, angles in degrees, rates in [0, 1]; null is "not 
 except in page checks.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -92,7 +90,7 @@ class Remark(StrictModel):
     threshold: Finite | None = None
 
     @classmethod
-    def of(cls, rejection: PhotoRejected) -> Remark:
+    def of(cls, rejection: PhotoRejected) -> "Remark":
         """Make the remark that explains a rejection."""
         return cls(code=rejection.code, figure=rejection.figure, threshold=rejection.threshold, advice=rejection.advice)
 

@@ -7,8 +7,6 @@ background make one session: folders' means differ by no more than photographs w
 Left out on purpose: dividing folders, which are somebody's word.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import combinations

@@ -5,8 +5,6 @@ paper is 1). Only the page that carries the design counts. A piece in tiles is o
 millimeters of the design's page; each of its uncut pages is another surface, to recognize scans and photographs of it.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -41,13 +39,13 @@ class Surface:
     rect_mm: Rect
     label: PageCode  # the content of the page's code
     page_mm: tuple[float, float] | None  # None if the code is on another page than the design
-    pages: tuple[Surface, ...] = ()  # of a piece in tiles: each uncut page, which carries no piece ids
+    pages: "tuple[Surface, ...]" = ()  # of a piece in tiles: each uncut page, which carries no piece ids
     bent: bool = False  # True if the piece was made to follow a curved surface
     outermost_mm: np.ndarray | None = None  # the object's outermost points P×3, for its box; z into the paper
     fov_deg: float = 45.0  # of the promised photographs, for those whose focal length is not known
 
     @property
-    def without_markers(self) -> Surface:
+    def without_markers(self) -> "Surface":
         """The surface of the same piece for photographs in which it is located by its design."""
         return replace(self, corners_mm={}, piece_ids=frozenset(), pages=())
 
@@ -143,12 +141,12 @@ def _surface(manifest: Manifest, corners, piece_ids, rect_mm, pages=()) -> Surfa
     )
 
 
-def promised_of(manifest: Manifest, surface: Surface, printer: Printer) -> PromisedColors | None:
+def promised_of(manifest: Manifest, surface: Surface, printer: "Printer") -> PromisedColors | None:
     """The promised colors of the sheet's design and ink; None without a design."""
     return None if manifest.design is None else printed_colors(manifest.design.pixels(), surface, printer)
 
 
-def printed_colors(pixels: np.ndarray, surface: Surface, printer: Printer) -> PromisedColors:
+def printed_colors(pixels: np.ndarray, surface: Surface, printer: "Printer") -> PromisedColors:
     """Colors that the printer model makes of a design (uint8 pixels H×W×3) in the sheet's place, and of its ink."""
     import torch
 

@@ -1,7 +1,5 @@
 """Options of a verification, and the `Task` that every photograph is measured against, made of them and a manifest."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -35,15 +33,15 @@ class Options:
     (`corner_files.load_corners`), by photograph. `find`: search for the design itself where no marker can be read.
     """
 
-    models: Sequence[Classifier]
-    printer: Printer
-    camera: Camera | None = None
+    models: "Sequence[Classifier]"
+    printer: "Printer"
+    camera: "Camera | None" = None
     scan_dpi: float | None = None
     ruler_mm: tuple[float, float] | None = None
     controls: str | Path | None = None
     ledger_photos: int = LEDGER_PHOTOS
-    boxes: Mapping[str, DrawnBox] = field(default_factory=dict)
-    corners: Mapping[str, NamedCorners] = field(default_factory=dict)
+    boxes: "Mapping[str, DrawnBox]" = field(default_factory=dict)
+    corners: "Mapping[str, NamedCorners]" = field(default_factory=dict)
     find: bool = False
 
 
@@ -56,7 +54,7 @@ class Task:
     ranges: PromisedRanges
     sizes_px: tuple[int, ...]  # of the networks' squares
     scan_dpi: float | None
-    camera: Camera | None
+    camera: "Camera | None"
     photo_px: tuple[int, int] | None  # of the promised photographs
     find: np.ndarray | None = None  # the design's pixels, to be searched for
 

@@ -13,8 +13,6 @@ or all in one place, can prove nothing. Looking again after each session until i
 18 % of trials: looks are counted, and the bound of those that were not planned is stricter (see `Look`).
 """
 
-from __future__ import annotations
-
 from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace

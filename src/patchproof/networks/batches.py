@@ -8,8 +8,6 @@ remains is 0.45 with MobileNetV2 at 224 px, 0.60 with SqueezeNet 1.1, 0.72 with 
 are faster in one batch and stay so. A gradient that is needed in windows only costs less (cuts.py).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -35,7 +33,7 @@ class BatchedNetwork(torch.nn.Module):
         self.network, self.size, self.max_pictures, self.memory_format = network, size, size, torch.contiguous_format
         self.sample: Tensor | None = None  # on a CPU, two of the pictures given for tuning
 
-    def train(self, mode: bool = True) -> BatchedNetwork:
+    def train(self, mode: bool = True) -> "BatchedNetwork":
         """Change nothing: networks stay in the mode they came in."""
         return self
 
@@ -58,7 +56,7 @@ class BatchedNetwork(torch.nn.Module):
         return cut.answers(photos, windows)
 
     @cached_property
-    def cut(self) -> Cut | None:
+    def cut(self) -> "Cut | None":
         """The split after the first layers, searched for on first access; None if windows would save nothing."""
         if self.sample is None or not worth_cutting(self, self.sample):
             return None

@@ -1,7 +1,5 @@
 """Limits on what a network's file may ask for, and the error for what exceeds them."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from patchproof.base.errors import PatchproofError

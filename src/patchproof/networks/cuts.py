@@ -11,8 +11,6 @@ Left out on purpose: further cuts, each computed again by itself, which gained n
 take as long as large ones; networks that torch.fx cannot follow.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any

@@ -5,8 +5,6 @@ numbers and no names; the only functions called are the operators of the steps. 
 computed, a file's steps run once on tensors without memory, to refuse values of absurd size and wrong inputs.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from typing import Any

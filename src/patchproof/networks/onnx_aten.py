@@ -6,8 +6,6 @@ node. Without them MobileNetV2 took 1.46 times as long for its answers and 1.85 
 core, November 2026).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 

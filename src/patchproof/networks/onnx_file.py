@@ -9,8 +9,6 @@ weights, opsets before 7, which onnx.version_converter converts to newer ones.
 Source: github.com/onnx/onnx, onnx.proto (IR version 13).
 """
 
-from __future__ import annotations
-
 import functools
 import hashlib
 import math

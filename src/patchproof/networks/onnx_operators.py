@@ -10,8 +10,6 @@ What is left out on purpose, and why, is in `REFUSED`.
 Source: onnx.ai/onnx/operators, opsets 7 to 28; where two differ, both forms are read.
 """
 
-from __future__ import annotations
-
 import functools
 import inspect
 import math

@@ -4,8 +4,6 @@ In: data before `/`, sizes and axes after it, as an attribute's list or as a ten
 from sizes and constants alone, since tensors without memory have no values.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -7,8 +7,6 @@ makes 810 MB of a hostile file of 10 MB. A field that the schema does not name i
 Source: protobuf.dev/programming-guides/encoding.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 

@@ -5,8 +5,6 @@ On a CPU, copies take most of a small network's time, and these steps make fewer
 on one core, torch 2.13, November 2026.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """A program as numbered steps: made by onnx_file.py from a file or by tracing.py from a module, run by graph.py."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any

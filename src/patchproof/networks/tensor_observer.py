@@ -1,7 +1,5 @@
 """Observe every tensor that operators create, also inside other operators."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from typing import Any
 

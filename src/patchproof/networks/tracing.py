@@ -5,8 +5,6 @@ the pictures or steps cannot hold its arguments. torch.fx follows what a module 
 check that the steps compute the same.
 """
 
-from __future__ import annotations
-
 import operator
 from functools import reduce
 from typing import Any

@@ -1,7 +1,5 @@
 """Windows: where pictures may differ, and whether a network is large enough to compute there only (see `cuts`)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -28,7 +26,7 @@ class Windows:
     px: np.ndarray
     cache: dict[Any, Any] | None = None
 
-    def part(self, first: int, last: int) -> Windows:
+    def part(self, first: int, last: int) -> "Windows":
         """The windows of the views from `first` to before `last`."""
         return Windows(self.px[first:last], None if self.cache is None else self.cache.setdefault(first, {}))
 

@@ -5,8 +5,6 @@ that cHRM and gAMA; elsewhere a profile precedes nclx and EXIF. ColorSpace 65535
 with interoperability R03 alone, since some phones write it over sRGB. Colors outside of sRGB are clipped.
 """
 
-from __future__ import annotations
-
 import io
 from collections.abc import Callable, Sequence
 from functools import lru_cache

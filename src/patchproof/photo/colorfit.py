@@ -6,8 +6,6 @@ per channel from paper and ink. Both remove the effects of light and camera; the
 remains, and that is what a color difference should measure.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -9,8 +9,6 @@ Without white paper and black ink of markers, light is a gain and a veil per cha
 photographed ones. A channel without contrast leaves its veil unknown, which is taken as none.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

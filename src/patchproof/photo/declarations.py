@@ -1,7 +1,5 @@
 """List what pictures can declare, and what `photo.read` does with it; the tests hold a file for each entry."""
 
-from __future__ import annotations
-
 from patchproof.base.declared import Declaration
 
 _ANY = "any picture"

@@ -4,8 +4,6 @@
 10, 12 or 14 bits in TIFF's tags is the depth; other maxima are statistics.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

@@ -4,8 +4,6 @@ In: a photograph's light, its homography, or maps over the design. Out: the mean
 photograph and of the maps blurred as the photograph is.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 import cv2

@@ -10,8 +10,6 @@ size. Corners of all levels are then fitted in the full photograph (`edges`). If
 `known_page.find_sheet` needs fewer levels. Only OpenCV's class API is used, so 4.11 to 5.x will do.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence, Set
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial

@@ -10,8 +10,6 @@ s along the border in [-1, 1], t outwards in px; fitted by damped Gauss-Newton o
 because a lens blurs light and not code values. Stretches that do not follow the model (a thumb, a glare) are excluded.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -127,7 +125,7 @@ class _BorderModel:
     half_px: np.ndarray
     cells: np.ndarray
 
-    def select(self, borders: np.ndarray) -> _BorderModel:
+    def select(self, borders: np.ndarray) -> "_BorderModel":
         """The model of some of the borders."""
         return _BorderModel(self.s, self.t[borders], self.module[borders], self.half_px[borders], self.cells[borders])
 

@@ -7,8 +7,6 @@ larger spread. A crop that keeps the shape and updates EXIF leaves no trace; the
 `is_crop` has other rules: a picture that was downscaled, or zoomed by its camera, is still a whole photograph.
 """
 
-from __future__ import annotations
-
 import math
 import re
 import struct

@@ -14,8 +14,6 @@ Sources: Lowe, Distinctive Image Features from Scale-Invariant Keypoints, IJCV 2
 MAGSAC++, CVPR 2020; Baker and Matthews, Lucas-Kanade 20 Years On, IJCV 2004 (inverse compositional refinement).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
@@ -70,7 +68,7 @@ class FoundPlace:
         """True if no other picture looks so much like the design."""
         return self.likeness > LEAST_LIKENESS and self.significance > LEAST_SIGNIFICANCE
 
-    def overlaps(self, other: FoundPlace) -> bool:
+    def overlaps(self, other: "FoundPlace") -> bool:
         """True if the middle of either lies in the other."""
         pairs = (self.corners_px, other.corners_px), (other.corners_px, self.corners_px)
         return any(cv2.pointPolygonTest(a.astype(np.float32), b.mean(0).tolist(), False) > 0 for a, b in pairs)

@@ -7,8 +7,6 @@ code of zeros is not that of a flat block, where one scan holds all (chroma alon
 Bytes that change within one block leave no trace.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import tempfile

@@ -7,8 +7,6 @@ needs no contours, so it works for small, blurred or partly covered markers, and
 most; they search only where markers are still missing. Prediction never identifies a sheet by itself.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2

@@ -4,8 +4,6 @@ A call into a library cannot be interrupted (`input.run_within_seconds`), so cal
 avoided if `count_squares` or `count_finder_lines` count too many.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 from typing import ParamSpec

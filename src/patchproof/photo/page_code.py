@@ -6,8 +6,6 @@ seed share them, and only the code tells which of the two was printed. It lies o
 object has none.
 """
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 

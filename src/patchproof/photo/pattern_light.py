@@ -6,8 +6,6 @@ light = ink + (paper - ink) · pattern. At a blur of half a module no place show
 border are off by a quarter of the contrast; the regression is unbiased as long as the blur is known.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

@@ -16,8 +16,6 @@ uncertain; paper that misses its markers by more than noise is uncertain, too.
 Source: Hartley and Zisserman, Multiple View Geometry, 2nd ed., 8.1.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -8,8 +8,6 @@ with sin² of the tilt, so this needs a calibrated camera.
 Source: Hartley and Zisserman, Multiple View Geometry, 2nd ed., 8.1.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from patchproof.photo.rectify import PageFit

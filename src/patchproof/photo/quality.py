@@ -4,8 +4,6 @@ In: a photograph and its fitted markers. Out: `FrameLight`. Paper and ink are sa
 of every border and corrected for their mixture by the blur, per channel in linear light.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 

@@ -7,8 +7,6 @@ the memory; above `WHOLE_PX` four pixels become one, since measuring takes up to
 Ignored on purpose: sidecar files, dates and places, what a camera's maker notes say of its lens.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import warnings
@@ -202,7 +200,7 @@ def allow_heic(path: Path) -> None:
         pillow_heif.register_heif_opener()
 
 
-def _declared_space(image, head: bytes) -> tuple[ColorSpace | None, tuple[str, ...]]:
+def _declared_space(image, head: bytes) -> "tuple[ColorSpace | None, tuple[str, ...]]":
     """See `color_space`, which is loaded only for pictures that may declare another space than sRGB."""
     if image.format in ("JPEG", "MPO", "PNG") and image.mode != "CMYK" and "icc_profile" not in image.info:
         space, adobe = exif_tags(image, EXIF_IFD).get(0xA001), exif_tags(image, 0xA005).get(1) == "R03"
@@ -257,7 +255,7 @@ def _jpeg_codes(image, path: Path) -> np.ndarray | None:
     return None if inks or pixels is None or pixels.shape[1::-1] != image.size else pixels
 
 
-def _opaque_srgb(image, space: ColorSpace | None) -> np.ndarray:
+def _opaque_srgb(image, space: "ColorSpace | None") -> np.ndarray:
     """uint8 sRGB H×W×3 of a part of a picture, on white where it is transparent."""
     from PIL import Image
 

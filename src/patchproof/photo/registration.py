@@ -9,8 +9,6 @@ Source of a peak's uncertainty: Lucas and Kanade, An Iterative Image Registratio
 cell's light are not independent from pixel to pixel (other inks, a shadow), so they count as `_INDEPENDENT_ERRORS`.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2

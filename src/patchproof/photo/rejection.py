@@ -3,8 +3,6 @@
 The codes are those of report.json. A `PhotoRejected` never stops a batch: the report lists the photograph with it.
 """
 
-from __future__ import annotations
-
 from patchproof.base.errors import PatchproofError
 from patchproof.base.text import printable
 

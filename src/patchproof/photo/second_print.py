@@ -5,8 +5,6 @@ squares are compared with the known codes, and count where two or three lie as o
 8 px across on in sharp pictures, from 10 px on at a blur of 0.9 px, where it is read from 14 px on.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from itertools import combinations
 

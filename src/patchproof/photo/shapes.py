@@ -7,8 +7,6 @@ Source of the cylinder: paper bends without stretching, so a sheet with straight
 (do Carmo, Differential Geometry of Curves and Surfaces, 5-8).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 

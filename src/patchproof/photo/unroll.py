@@ -8,8 +8,6 @@ residual is less than half of the plane's; a photograph with too much residual b
 `curled`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

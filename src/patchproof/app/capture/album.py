@@ -7,8 +7,6 @@ names, and tell their kind by their first bytes; a file appears once it is compl
 twice. No link is followed. Left out on purpose: removing photographs, since a selection by answers proves nothing.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 import re
@@ -93,7 +91,7 @@ class Album:
             make_folder(self.folder / last)
         return last
 
-    def incoming(self, into: str) -> Incoming:
+    def incoming(self, into: str) -> "Incoming":
         """Prepare for one more photograph in the session, or of the control, of that name."""
         folder = self.folder / (CONTROLS_FOLDER if into in CONTROLS else "") / into
         if into in CONTROLS:
@@ -130,7 +128,7 @@ class Incoming:
             self._discard()
             number += 1
 
-    def __enter__(self) -> Incoming:
+    def __enter__(self) -> "Incoming":
         return self
 
     def __exit__(self, *error: object) -> None:

@@ -10,8 +10,6 @@ send them again. An answer ends its connection, and one that has not shown the t
 later, so that silent ones cannot keep the owner out.
 """
 
-from __future__ import annotations
-
 import asyncio
 import hmac
 import secrets
@@ -86,7 +84,7 @@ def server_config(collection: PhotoCollection, token: str) -> uvicorn.Config:
     )
 
 
-def capture_app(collection: PhotoCollection, token: str, admit: Callable[[_Client], object]) -> ASGIApp:
+def capture_app(collection: PhotoCollection, token: str, admit: Callable[[_Client], object]) -> "ASGIApp":
     """Make the application for a collection of photographs; it answers requests with the token only, and calls `admit`
     with the address of each client that has shown it.
     """
@@ -105,11 +103,11 @@ def capture_app(collection: PhotoCollection, token: str, admit: Callable[[_Clien
 class _TokenCheck:
     """Check the token, in constant time, before anything else of a request is read, and add headers to responses."""
 
-    def __init__(self, app: ASGIApp, token: str, admit: Callable[[_Client], object]):
+    def __init__(self, app: "ASGIApp", token: str, admit: Callable[[_Client], object]):
         self._app, self._token, self._admit = app, token.encode(), admit
 
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        async def with_headers(message: Message) -> None:
+    async def __call__(self, scope: "Scope", receive: "Receive", send: "Send") -> None:
+        async def with_headers(message: "Message") -> None:
             if message["type"] == "http.response.start":
                 headers = [(name.lower().encode(), value.encode()) for name, value in _HEADERS.items()]
                 message = {**message, "headers": [*message["headers"], *headers]}

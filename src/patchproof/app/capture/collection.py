@@ -6,8 +6,6 @@ finished ones are in the album's journal, so that a restart measures only new on
 and the estimated effect, which take longer than a person waits.
 """
 
-from __future__ import annotations
-
 import signal
 from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache, partial

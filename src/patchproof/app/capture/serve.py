@@ -6,8 +6,6 @@ encrypted: in a network of strangers serve this machine only. Left out on purpos
 to encrypted pages only.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 import secrets

@@ -4,8 +4,6 @@ In: a collection of photographs. Out: JSON values. Every sentence about a photog
 remarks' advice, the verdict's reason, the plan page's counts.
 """
 
-from __future__ import annotations
-
 from itertools import pairwise
 from pathlib import Path
 from typing import Any

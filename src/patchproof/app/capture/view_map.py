@@ -5,8 +5,6 @@ and of distance (1 over pixels per millimeter); a cell needs photographs in prop
 Distance itself is not on the map: only cameras of known focal length measure it, and a network does not see it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
