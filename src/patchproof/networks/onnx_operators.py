@@ -23,7 +23,7 @@ from torch.nn import functional as F
 import patchproof.networks.onnx_shapes as shapes
 import patchproof.networks.onnx_windows as windows
 from patchproof.networks.bounds import UnsupportedNetwork, quote
-from patchproof.networks.onnx_recurrent import recurrent
+from patchproof.networks.onnx_recurrent import lstm
 from patchproof.networks.onnx_resize import resize, upsample
 from patchproof.networks.onnx_shapes import MAX_SIZES, numbers
 
@@ -43,7 +43,7 @@ FIXED_ATTRIBUTES: dict[str, dict[str, Any]] = {
     "Dropout": {"seed": None},
     **{name: {"stash_type": 1} for name in ("GroupNormalization", "LayerNormalization", "RMSNormalization")},
     "MaxPool": {"storage_order": None},  # of the second result
-    **{name: {"layout": 0} for name in ("LSTM", "GRU", "RNN")},
+    "LSTM": {"layout": 0},
 }
 
 
@@ -99,12 +99,6 @@ def _batch_norm(x, scale, b, mean, variance, /, *, epsilon=1e-5, training_mode=0
     return F.batch_norm(x, mean, variance, scale, b, bool(training_mode), 0.0, epsilon)
 
 
-def _mean_variance(x, /, *, axes=(0, 2, 3)):
-    """Subtract the mean along `axes` and divide by the standard deviation."""
-    variance, mean = torch.var_mean(x, tuple(axes), correction=0, keepdim=True)
-    return (x - mean) / (variance.sqrt() + 1e-9)
-
-
 def _group_norm(x, scale, b, /, *, num_groups, epsilon=1e-5):
     repeats = x.shape[1] // len(scale)  # before opset 21, there is one scale for each group
     return F.group_norm(x, num_groups, scale.repeat_interleave(repeats), b.repeat_interleave(repeats), epsilon)
@@ -152,10 +146,6 @@ def _product(x: Tensor, dims: list[int], keepdim: bool) -> Tensor:
 def _of_rows(compute: Callable[..., Tensor]) -> Callable[..., Tensor]:
     """A softmax as before opset 13: of rows that hold all axes from `axis` on."""
     return lambda x, /, *, axis=1: compute(x.reshape(math.prod(x.shape[:axis]), -1), -1).reshape(x.shape)
-
-
-def _hardmax(x: Tensor, axis: int) -> Tensor:
-    return torch.zeros_like(x).scatter(axis, x.argmax(axis, keepdim=True), 1.0)
 
 
 def _shrink(x, /, *, lambd=0.5, bias=0.0):
@@ -213,7 +203,6 @@ _TABLE: dict[str, Callable[..., Any]] = {
     **_named("HardSwish Mish Softplus Softsign", F, _unary),
     "GlobalAveragePool": _unary(lambda x: x.mean(tuple(range(2, x.dim())), keepdim=True)),
     "GlobalMaxPool": _unary(lambda x: x.amax(tuple(range(2, x.dim())), keepdim=True)),
-    "GlobalLpPool": lambda x, /, *, p=2: torch.linalg.vector_norm(x, p, tuple(range(2, x.dim())), keepdim=True),
     "Celu": lambda x, /, *, alpha=1.0: F.celu(x, alpha),
     "Elu": lambda x, /, *, alpha=1.0: F.elu(x, alpha),
     "Selu": lambda x, /, *, alpha=1.67326319217681884765625, gamma=1.05070102214813232421875: gamma * F.elu(x, alpha),
@@ -225,7 +214,6 @@ _TABLE: dict[str, Callable[..., Any]] = {
     "Gelu": lambda x, /, *, approximate="none": F.gelu(x, approximate=approximate),
     "Softmax": lambda x, /, *, axis=-1: x.softmax(axis),
     "LogSoftmax": lambda x, /, *, axis=-1: x.log_softmax(axis),
-    "Hardmax": lambda x, /, *, axis=-1: _hardmax(x, axis),
     "IsInf": _is_infinite,
     "Cast": lambda x, /, *, to: x.to(DTYPES[to]),
     # of two or more
@@ -260,11 +248,9 @@ _TABLE: dict[str, Callable[..., Any]] = {
     "ConvTranspose": windows.conv_transpose,
     "MaxPool": windows.max_pool,
     "AveragePool": windows.average_pool,
-    "LpPool": windows.lp_pool,
     "LRN": windows.lrn,
     "Col2Im": windows.col2im,
     "BatchNormalization": _batch_norm,
-    "MeanVarianceNormalization": _mean_variance,
     "RMSNormalization": lambda x, s, /, *, axis=-1, epsilon=1e-5: F.rms_norm(x, x.shape[axis:], s, epsilon),
     "LayerNormalization": lambda x, s, b=None, /, *, axis=-1, epsilon=1e-5: F.layer_norm(
         x, x.shape[axis:], s, b, epsilon
@@ -272,9 +258,7 @@ _TABLE: dict[str, Callable[..., Any]] = {
     "GroupNormalization": _group_norm,
     "InstanceNormalization": lambda x, a, b, /, *, epsilon=1e-5: F.instance_norm(x, None, None, a, b, eps=epsilon),
     "Dropout": _dropout,
-    "LSTM": recurrent("LSTM", torch.lstm, [0, 2, 3, 1], ["Sigmoid", "Tanh", "Tanh"]),
-    "GRU": recurrent("GRU", torch.gru, [1, 0, 2], ["Sigmoid", "Tanh"]),
-    "RNN": recurrent("RNN", torch.rnn_tanh, [0], ["Tanh"]),
+    "LSTM": lstm,
     # shapes
     "Reshape": shapes.reshape,
     "Flatten": lambda x, /, *, axis=1: x.reshape(math.prod(x.shape[:axis]), math.prod(x.shape[axis:])),
@@ -295,7 +279,6 @@ _TABLE: dict[str, Callable[..., Any]] = {
     "EyeLike": lambda x, /, *, dtype=None, k=0: torch.ones_like(x, dtype=dtype and DTYPES[dtype]).triu(k).tril(k),
     "DepthToSpace": shapes.depth_to_space,
     "SpaceToDepth": shapes.space_to_depth,
-    "CenterCropPad": shapes.center_crop_pad,
     "Expand": lambda x, /, shape: x.expand(torch.broadcast_shapes(x.shape, numbers(shape))),
     "Tile": lambda x, /, repeats: x.tile(numbers(repeats)),
     "Pad": shapes.pad,
@@ -312,10 +295,9 @@ OPERATORS = {name: Operator(name, compute) for name, compute in _TABLE.items()}
 _FORMER = {
     "Softmax": (13, Operator("Softmax", _of_rows(torch.softmax))),
     "LogSoftmax": (13, Operator("LogSoftmax", _of_rows(torch.log_softmax))),
-    "Hardmax": (13, Operator("Hardmax", _of_rows(_hardmax))),
     "Resize": (11, Operator("Upsample", upsample)),
 }
-RESULTS = {"TopK": 2, "LSTM": 3, "GRU": 2, "RNN": 2}  # how many, where there are several
+RESULTS = {"TopK": 2, "LSTM": 3}  # how many, where there are several
 # operators of the standard that are left out, by the reason
 REFUSED = {
     "draws random numbers": "Bernoulli Multinomial RandomNormal RandomNormalLike RandomUniform RandomUniformLike",
@@ -324,6 +306,7 @@ REFUSED = {
     "rounds to a few bits, which has no gradient": "ConvInteger DequantizeLinear DynamicQuantizeLinear MatMulInteger "
     "QLinearConv QLinearMatMul QuantizeLinear",
     "has no like in torch": "DeformConv MaxRoiPool MaxUnpool RoiAlign",
+    "no known network of pictures has": "CenterCropPad GRU GlobalLpPool Hardmax LpPool MeanVarianceNormalization RNN",
     "is of lists, texts, sounds, files, former calls or training": """Adagrad Adam Attention BlackmanWindow
     ConcatFromSequence DFT Gradient HammingWindow HannWindow ImageDecoder MelWeightMatrix Momentum
     NegativeLogLikelihoodLoss Optional OptionalGetElement OptionalHasElement RegexFullMatch ReverseSequence

@@ -135,15 +135,6 @@ def space_to_depth(x, /, *, blocksize):
     return blocks.permute(0, 3, 5, 1, 2, 4).reshape(n, -1, height // blocksize, width // blocksize)
 
 
-def center_crop_pad(x, /, shape, *, axes=None):
-    """Crop or pad both ends alike to `shape`, an odd number at the end."""
-    sides = [(0, 0)] * x.dim()
-    for axis, size in zip(axes or range(x.dim()), numbers(shape), strict=True):
-        more = size - x.shape[axis]
-        sides[axis] = (int(more / 2), more - int(more / 2))
-    return pad_sides(x, sides)
-
-
 def pad(x, /, pads, value=None, axes=None, *, mode="constant"):
     """Pad both ends of each axis; a negative number crops."""
     pads, listed_axes = numbers(pads), numbers(axes) or range(x.dim())

@@ -124,12 +124,6 @@ def average_pool(
     return windows.sums(windows.padded(x)) / windows.sums(pad_sides(counted, beyond))
 
 
-def lp_pool(x, /, *, kernel_shape, p=2, auto_pad="NOTSET", ceil_mode=0, dilations=None, pads=None, strides=None):
-    """The Lp norm of each window."""
-    windows = _Windows(x, kernel_shape, auto_pad, dilations, pads, strides, ceil_mode)
-    return windows.sums(windows.padded(x).abs() ** p) ** (1 / p)
-
-
 def lrn(x, /, *, size, alpha=1e-4, beta=0.75, bias=1.0):
     """Divide by the sum of squares of `size` neighboring channels; an even number has one more behind the channel."""
     before = (size - 1) // 2
