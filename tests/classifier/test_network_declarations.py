@@ -164,7 +164,7 @@ CASES: dict[str, tuple[Any, ...]] = {
         ),
         truth(),
     ),
-    "fields and attributes that the reader does not know": (
+    "fields and attributes that are not known": (
         lambda at: answers(at, changed(lambda made: made.graph.node[1].attribute.add(name="slope", type=1, f=0.5))),
         "unsupported inputs or attributes .*slope",
     ),
@@ -196,7 +196,7 @@ CASES: dict[str, tuple[Any, ...]] = {
         "an input that is not float32",
     ),
     "several outputs": (lambda at: answers(at, changed(lambda m: m.graph.output.add(name="b"))), "2 outputs, not one"),
-    "metadata: how pictures are prepared": (
+    "metadata: preparation of pictures": (
         lambda at: answers(at, metadata(Image__BitmapPixelFormat="Bgr8")),
         r"takes sRGB in \[0, 1\], got Image\.BitmapPixelFormat = 'Bgr8' in .*small\.onnx: prepare",
     ),
@@ -255,7 +255,7 @@ CASES: dict[str, tuple[Any, ...]] = {
         lambda at: raw_detector(at, None),
         r'small\.onnx gives N×2×4 and N×2×5, read as the head "detr": write "head" into its JSON',
     ),
-    "boxes in 0 to 1, (center, size), corners reversed": (
+    "boxes in 0 to 1, (center, size), reversed": (
         lambda at: checked(candidates([[x / 8 for x in box] for box in GRID]), Detector),
         r'none that reaches beyond 1 px .* it \(such as \(0, 0, 0\.25, 0\.25\)\): write .*"unit": "share"',
     ),

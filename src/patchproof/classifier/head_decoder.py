@@ -29,9 +29,8 @@ MAX_QUERIES = 1000  # of a set of boxes; anchors are more
 _GUESSES = "ultralytics nanodet nanodet-plus yolov8-raw retinanet ssd300 ssdlite320 fcos torchvision-fcos detr".split()
 _WORDS = {"boxes": "box|reg|loc|dis|delta", "objectness": "obj|cent|ctr", "scores": "score|cls|class|conf|logit|prob"}
 OutputShape = tuple[int, ...]  # without the number of pictures
-OutputLayout = tuple[
-    tuple[int, ...], tuple[str, ...], tuple[int, ...]
-]  # a table's order of dimensions, columns, numbers
+Shapes = tuple[OutputShape, ...]
+OutputLayout = tuple[OutputShape, tuple[str, ...], OutputShape]  # a table's order of dimensions, columns, numbers
 
 
 @dataclass(frozen=True)
@@ -67,7 +66,7 @@ class HeadDecoder:
         boxes = boxes * self.input_px if head.unit == "share" else boxes
         return torch.cat([boxes, _logits(scores, objectness, head, self.labels)], -1)
 
-    def refusal(self, expected: str, shapes: Sequence[OutputShape], do: str = "") -> Refused:
+    def refusal(self, expected: str, shapes: Shapes, do: str = "") -> Refused:
         """The error for outputs of these shapes."""
         do = do or f'write "head" into its JSON, a name or a table with a name and what differs: {", ".join(HEADS)}'
         return Refused(expected, f"{_shapes_text(shapes)} from the network {self.network}", do)
@@ -80,14 +79,12 @@ def spread_labels(boxes: Tensor, labels: Tensor, scores: Tensor, count: int) -> 
     return torch.cat([boxes, logits.scatter(-1, labels.long().clamp(0, count - 1)[..., None], score)], -1)
 
 
-def _shapes_text(shapes: Sequence[OutputShape]) -> str:
+def _shapes_text(shapes: Shapes) -> str:
     return " and ".join("N×" + "×".join(map(str, shape)) for shape in shapes)
 
 
 @lru_cache(maxsize=64)
-def _plan(
-    decoder: HeadDecoder, names: tuple, shapes: tuple[OutputShape, ...]
-) -> tuple[Head, list[OutputLayout], list[np.ndarray]]:
+def _plan(decoder: HeadDecoder, names: tuple, shapes: Shapes) -> tuple[Head, list[OutputLayout], list[np.ndarray]]:
     """The head, each output's layout, and the cells (see `_cells`)."""
     head = decoder.head or _guess(decoder, names, shapes)
     layouts = _layouts(decoder, head, names, shapes)
@@ -109,7 +106,7 @@ def _plan(
     return head, layouts, _cells(head, sides, strides, decoder.input_px)
 
 
-def _guess(decoder: HeadDecoder, names: tuple[str, ...], shapes: tuple[OutputShape, ...]) -> Head:
+def _guess(decoder: HeadDecoder, names: tuple[str, ...], shapes: Shapes) -> Head:
     """The head that the shapes fit, said in a warning unless it is that of decoded boxes."""
     is_table, by_level = len(shapes) == 1 and len(shapes[0]) == 2, len(shapes[0]) > 2
     if is_table and shapes[0][1] == 4 + decoder.labels:
@@ -125,9 +122,7 @@ def _guess(decoder: HeadDecoder, names: tuple[str, ...], shapes: tuple[OutputSha
     raise decoder.refusal(f"the outputs of a detector's head for {decoder.labels} labels", shapes)
 
 
-def _layouts(
-    decoder: HeadDecoder, head: Head, names: Sequence[str], shapes: Sequence[OutputShape]
-) -> list[OutputLayout]:
+def _layouts(decoder: HeadDecoder, head: Head, names: Sequence[str], shapes: Shapes) -> list[OutputLayout]:
     """Each output's layout: the one that its shape allows; of several, what no other output holds, or its name says."""
     options = [_options(head, decoder.labels, shape, len(shapes) == 1) for shape in shapes]
     if not all(options):
@@ -162,9 +157,8 @@ def _options(head: Head, labels: int, shape: OutputShape, is_alone: bool) -> lis
         tables = [[("boxes", 4), ("scores", 1), ("labels", 1)] if is_row else two, other, *parts]
         sizes = {shape[order[-1] - 1] / count for count in (per_cell if len(shape) == 3 else {1})}
         if fitting := [table for table in tables if sum(count for _, count in table) in sizes]:
-            return list(
-                dict.fromkeys((order, tuple(r for r, _ in each), tuple(n for _, n in each)) for each in fitting)
-            )
+            columns = (tuple(zip(*each, strict=True)) for each in fitting)
+            return list(dict.fromkeys((order, roles, widths) for roles, widths in columns))
     return []
 
 

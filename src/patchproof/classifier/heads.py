@@ -36,9 +36,7 @@ class Head(StrictModel):
     strides: tuple[Positive, ...] = ()  # pixels between the cells of each level; by default the outputs'
     floor: bool = False  # strides are input_px over the number of cells, rounded down, as torchvision has them
     center: Finite = 0.5  # of the first cell, in strides
-    anchors: tuple[
-        Annotated[tuple[Sizes, ...], Field(min_length=1)], ...
-    ] = ()  # (width, height) of a cell's, in pixels, by level
+    anchors: tuple[Annotated[tuple[Sizes, ...], Field(min_length=1)], ...] = ()  # of a cell, in pixels, by level
     scale_xy: tuple[Positive, ...] = (1.0,)  # of all levels, or of each
     variances: Sizes = (1.0, 1.0)  # of centers and sizes
 
@@ -56,9 +54,8 @@ def _ssd_anchors(size: float, scales: Sequence[float], ratios: Sequence[int]) ->
 def _retina_anchors() -> list[list[Sizes]]:
     """(width, height) at each level, whole pixels: height / width of 1/2, 1, 2, three sizes each."""
     levels = [[int(side * 2 ** (third / 3)) for third in range(3)] for side in (32, 64, 128, 256, 512)]
-    return [
-        [(2 * round(s / r / 2), 2 * round(s * r / 2)) for r in (0.5**0.5, 1, 2**0.5) for s in each] for each in levels
-    ]
+    roots = 0.5**0.5, 1, 2**0.5
+    return [[(2 * round(side / r / 2), 2 * round(side * r / 2)) for r in roots for side in each] for each in levels]
 
 
 def _levels(numbers: str, per_level: int = 3) -> list[list[Sizes]]:

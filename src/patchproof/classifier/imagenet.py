@@ -111,10 +111,9 @@ class _Block(nn.Module):
 
     def __init__(self, tensors: dict[str, Tensor], prefix: str, side_px: int, stride: int):
         super().__init__()
-        has_expansion = f"{prefix}_expand_conv.weight" in tensors
-        self.expand = (
-            _Convolution(tensors, f"{prefix}_expand_conv", f"{prefix}_bn0", side_px) if has_expansion else None
-        )
+        self.expand = None
+        if f"{prefix}_expand_conv.weight" in tensors:
+            self.expand = _Convolution(tensors, f"{prefix}_expand_conv", f"{prefix}_bn0", side_px)
         self.depthwise = _Convolution(tensors, f"{prefix}_depthwise_conv", f"{prefix}_bn1", side_px, stride)
         self.project = _Convolution(tensors, f"{prefix}_project_conv", f"{prefix}_bn2", side_px)
         first = self.expand or self.depthwise
@@ -135,9 +134,8 @@ class _Convolution(nn.Module):
     def __init__(self, tensors: dict[str, Tensor], name: str, norm: str, side_px: int, stride: int = 1):
         super().__init__()
         weight = tensors[f"{name}.weight"].double()
-        mean, variance, gain, shift = (
-            tensors[f"{norm}.{part}"].double() for part in ("running_mean", "running_var", "weight", "bias")
-        )
+        parts = "running_mean", "running_var", "weight", "bias"
+        mean, variance, gain, shift = (tensors[f"{norm}.{part}"].double() for part in parts)
         gain = gain / (variance + _NORM_EPSILON).sqrt()
         missing = (-(-side_px // stride) - 1) * stride + weight.shape[-1] - side_px
         before, behind = missing // 2, missing - missing // 2

@@ -16,14 +16,12 @@ from collections.abc import Sequence
 
 from patchproof.base.intervals import rates_difference
 from patchproof.evidence.results import Benefit, BenefitWord, Control
-from patchproof.sheets.manifest import Promise
+from patchproof.sheets.manifest import Interval, Promise
 
 LEAST_GAIN = 0.10  # below which a patch is no better
 
 
-def benefit_of(
-    rate: float, interval: tuple[float, float], controls: Sequence[Control], promise: Promise
-) -> Benefit | None:
+def benefit_of(rate: float, interval: Interval, controls: Sequence[Control], promise: Promise) -> Benefit | None:
     """Compare the patch's rate with its controls'; None if there are none, photographed or promised."""
     sign, rows = promise.target.goal.sign, []
     for control in controls:

@@ -93,9 +93,7 @@ def _refuse_twisted(named: NamedCorners, name: str, path: str | Path) -> None:
     following = np.roll(sides, -1, axis=0)
     turns = sides[:, 0] * following[:, 1] - sides[:, 1] * following[:, 0]  # twice the area of each corner's triangle
     if not (turns > 1).all():
-        got = (
-            "a photograph or order that is mirrored" if (turns < -1).all() else "corners of a shape that is not convex"
-        )
+        got = "a photograph or order that is mirrored" if (turns < -1).all() else "a shape that is not convex"
         got += f" ({', '.join(f'{number:g}' for number in named.numbers)} in {name})"
         raise Refused(f"corners that run clockwise in {path}", got, _ORDER)
 

@@ -17,7 +17,5 @@ DECLARED: tuple[Declaration, ...] = (
     Declaration(_FILE, "`file_name` in folders, also with backslashes", "used", "or its last part, if it is unique"),
     Declaration(_FILE, "`file_name` or `id` of an image twice", "refused", "boxes could not be told apart"),
     Declaration(_CORNERS, "`keypoints`, or a `segmentation` of four points", "used", "others are refused"),
-    Declaration(
-        _CORNERS, "`width`, `height`", "used", "of the upright picture or a copy of it; another shape is refused"
-    ),
+    Declaration(_CORNERS, "`width`, `height`", "used", "of the upright picture or a copy; another shape is refused"),
 )

@@ -34,7 +34,7 @@ from patchproof.evidence.forecast import forecast_of
 from patchproof.evidence.grouping import Grouping, group_sessions, subfolders
 from patchproof.evidence.journal import Journal, settings_key
 from patchproof.evidence.ledger import ledger_of
-from patchproof.evidence.measure import MeasuredPhoto
+from patchproof.evidence.measure import UNLOCATED_CODES, MeasuredPhoto
 from patchproof.evidence.ranges import matched_rate, promised_side_px
 from patchproof.evidence.reproject import PhotoSquare
 from patchproof.evidence.results import Ledger, ModelRate, PhotoEntry, Report, Scale, SessionCount, Summary
@@ -52,8 +52,6 @@ from patchproof.evidence.verdict import (
 )
 from patchproof.photo.read import list_images, list_skipped_files, summarize_said
 from patchproof.sheets.manifest import Manifest
-
-_UNLOCATED_CODES = ("too_few_markers", "no_corners")
 
 
 def gather_evidence(
@@ -214,7 +212,7 @@ def report_of(
         promise, primary = manifest.promise, judges.primary.name
         rates = {model.name: _rate(_recognized(counted, model.name)) for model in judges.models}
         rate, recognized = rates[primary], _recognized(counted, primary)
-        without_markers = sum(e.code in _UNLOCATED_CODES and e.status == "rejected" for e in entries)
+        without_markers = sum(e.code in UNLOCATED_CODES and e.status == "rejected" for e in entries)
         goal = promise.target.goal
         sessions = _sessions(grouping, photos, recognized)
         numbers = dict(zip((entry.file for entry in entries), grouping.merged, strict=True))
@@ -271,9 +269,7 @@ def report_of(
     return Report(sheet_id=sheet_id, photos=tuple(entries), summary=summary, controls=tuple(comparisons), ledger=ledger)
 
 
-def _sessions(
-    grouping: Grouping, photos: Sequence[MeasuredPhoto], hits: Mapping[str, bool]
-) -> tuple[SessionCount, ...]:
+def _sessions(grouping: Grouping, photos: Sequence[MeasuredPhoto], hits: dict[str, bool]) -> tuple[SessionCount, ...]:
     """Count the judged and recognized photographs of each session, or of each folder that is part of one."""
     answers: list[list[bool]] = [[] for _ in grouping.names]
     for number, photo in zip(grouping.session, photos, strict=True):

@@ -196,14 +196,12 @@ def _absent_markers(
     """The piece's markers that were not found, and whether each lies partly beyond the picture's edge. Left out are
     those whose cells show in their places, only too few pixels wide for their borders to be fitted.
     """
-    quads = {
-        i: location.px(location.parameters, surface.corners_mm[i]) for i in surface.piece_ids - detected.markers.keys()
-    }
-    return {
-        i: not is_in_picture(quad, view.srgb)
-        for i, quad in quads.items()
-        if not shows_small_code(view.srgb, quad, i, surface.dictionary)
-    }
+    absent: dict[int, bool] = {}
+    for i in surface.piece_ids - detected.markers.keys():
+        quad = location.px(location.parameters, surface.corners_mm[i])
+        if not shows_small_code(view.srgb, quad, i, surface.dictionary):
+            absent[i] = not is_in_picture(quad, view.srgb)
+    return absent
 
 
 def _shifts(

@@ -65,7 +65,7 @@ _OTHER_DPI_ADVICE = (
 )
 _NO_CORNERS_ADVICE = "this print has no markers, and nothing says where it is: add --find or --corners FILE"
 _PLAIN_ADVICE = "without markers a design without structure cannot be told from another one: print it with markers"
-_UNLOCATED_CODES = ("too_few_markers", "no_corners")
+UNLOCATED_CODES = ("too_few_markers", "no_corners")
 _HIDDEN_ADVICE = "a corner of the design is covered, folded away or out of the picture: show all of it"
 
 
@@ -101,9 +101,9 @@ def measure(
     try:
         detected, surface = identify_sheet(view.srgb, surface)
     except PhotoRejected as rejection:
-        if corners is None and find is not None and rejection.code in _UNLOCATED_CODES:
+        if corners is None and find is not None and rejection.code in UNLOCATED_CODES:
             corners, rejection = _search(view.srgb, find, surface, rejection)
-        if corners is None or promised is None or rejection.code not in _UNLOCATED_CODES:
+        if corners is None or promised is None or rejection.code not in UNLOCATED_CODES:
             return MeasuredPhoto(PhotoEntry(file=name, status="rejected", remark=Remark.of(rejection)), False)
         from patchproof.photo.corners import place_design
 

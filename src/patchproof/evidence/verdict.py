@@ -88,10 +88,8 @@ def judge(
     allowed = f"the promise allows for {low} to {high} in {sessions}"
     share = _share_without_markers(judged, without_markers)
     if share > MOST_WITHOUT_MARKERS:
-        reason = (
-            f"{without_markers} readable photographs show no marker or corners ({share:.0%}, at most 10 % are allowed)."
-        )
-        return Verdict("cannot_tell", (low, high), reason)
+        found = f"{without_markers} readable photographs show no marker or corners"
+        return Verdict("cannot_tell", (low, high), f"{found} ({share:.0%}, at most 10 % are allowed).")
     if judged < LEAST_JUDGED:
         return Verdict("cannot_tell", (low, high), f"Only {judged} photographs could be judged; at least 5 are needed.")
     counts = f"{recognized} of {judged} photographs were recognized"

@@ -149,9 +149,8 @@ class _GraphReader:
             if node["op_type"] == "Constant":
                 ((kind, value),) = self._attributes(node).items()
                 dtype = torch.int64 if kind in ("value_int", "value_ints") else torch.float32
-                self._constant(
-                    node["output"][0], value if isinstance(value, Tensor) else torch.tensor(value, dtype=dtype)
-                )
+                tensor = value if isinstance(value, Tensor) else torch.tensor(value, dtype=dtype)
+                self._constant(node["output"][0], tensor)
         if len(inputs) != 1:
             raise UnsupportedNetwork(f"{len(inputs)} inputs, not one of N×3×S×S")
         batch, sizes, colors_last = _shape(inputs[0]["type"]["tensor"])
@@ -160,9 +159,8 @@ class _GraphReader:
         photos = self._new(f"{inputs[0]['name']} N×3×S×S" if colors_last else inputs[0]["name"])
         steps: list[Step] = []
         if colors_last:  # as TensorFlow's are
-            steps.append(
-                Step(torch.permute, [ValueRef(photos), (0, 2, 3, 1)], {}, [self._new(inputs[0]["name"])], False, [])
-            )
+            results = [self._new(inputs[0]["name"])]
+            steps.append(Step(torch.permute, [ValueRef(photos), (0, 2, 3, 1)], {}, results, False, []))
         self.of_photos = {photos, self.count - 1}  # computed from pictures
         for node in self.nodes:
             steps.extend(self._steps(node))

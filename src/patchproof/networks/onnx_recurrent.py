@@ -1,7 +1,6 @@
 """ONNX's LSTM, written with torch; see onnx_operators.py for the rules."""
 
 import torch
-from torch import Tensor
 
 MAX_STEPS = 1 << 12  # of a sequence, one after the other
 _GATES = [0, 2, 3, 1]  # torch's in ONNX's order
@@ -21,14 +20,11 @@ def lstm(
         raise ValueError(f"a sequence of {len(x)} steps")
     zeros = x.new_zeros(directions, x.shape[1], hidden_size)
     states = [zeros if state is None else state for state in (h, c)]
-    parts = [_in_torchs_order(part) for part in (w, r, *(() if b is None else b.chunk(2, 1)))]
+    parts = w, r, *(() if b is None else b.chunk(2, 1))
+    parts = [part.unflatten(1, (4, -1))[:, _GATES].flatten(1, 2) for part in parts]
     weights = [part[direction] for direction in range(directions) for part in parts]
     backward = direction == "reverse"
     options = (b is not None, 1, 0.0, False, directions == 2, False)
     y, *last = torch.lstm(x.flip(0) if backward else x, states, weights, *options)
     y = (y.flip(0) if backward else y).unflatten(2, (directions, hidden_size)).transpose(1, 2)
     return (y, *last)
-
-
-def _in_torchs_order(weights: Tensor) -> Tensor:
-    return weights.unflatten(1, (4, -1))[:, _GATES].flatten(1, 2)

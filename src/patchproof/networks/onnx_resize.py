@@ -57,10 +57,9 @@ def resize(
             options: dict[str, Any] = {} if mode == "nearest" else {"align_corners": grid == "align_corners"}
             scale, size = zip(*(changes.get(axis, (1.0, x.shape[axis])) for axis in (2, 3)), strict=True)
             return F.interpolate(x, None if scaled else size, scale if scaled else None, kind, **options)
-    regions = (numbers(roi) if grid == "tf_crop_and_resize" else []) or [0.0] * len(along) + [1.0] * len(along)
-    for axis, new, factor, *region in zip(
-        along, after, factors, regions[: len(along)], regions[len(along) :], strict=True
-    ):
+    n = len(along)
+    regions = (numbers(roi) if grid == "tf_crop_and_resize" else []) or [0.0] * n + [1.0] * n
+    for axis, new, factor, *region in zip(along, after, factors, regions[:n], regions[n:], strict=True):
         size = x.shape[axis]
         if new == size and factor == 1 and region == [0.0, 1.0]:
             continue

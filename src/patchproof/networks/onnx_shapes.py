@@ -68,10 +68,8 @@ def gather(x, indices, /, *, axis=0):
 
 def gather_nd(x, indices, /, *, batch_dims=0):
     """Pick what the last dimension of `indices` points to, behind `batch_dims` dimensions that both have."""
-    batch = [
-        torch.arange(size, device=x.device).reshape(-1, *[1] * (indices.dim() - 2 - axis))
-        for axis, size in enumerate(x.shape[:batch_dims])
-    ]
+    counted = [torch.arange(size, device=x.device) for size in x.shape[:batch_dims]]
+    batch = [each.reshape(-1, *[1] * (indices.dim() - 2 - axis)) for axis, each in enumerate(counted)]
     return x[(*batch, *indices.unbind(-1))]
 
 

@@ -24,11 +24,8 @@ def deep_codes(
     tags, said = getattr(image, "tag_v2", {}), ()
     bits, signed = tags.get(_BITS, (16,))[0], tags.get(_SIGNED, (1,))[0] == 2
     if image.mode == "F":
-        codes, space, said = (
-            np.nan_to_num(np.asarray(image), posinf=1.0),
-            rgb_space(SRGB_PRIMARIES, None, 1.0),
-            (LINEAR_LIGHT,),
-        )
+        codes = np.nan_to_num(np.asarray(image), posinf=1.0)
+        space, said = rgb_space(SRGB_PRIMARIES, None, 1.0), (LINEAR_LIGHT,)
         top = max(1.0, float(codes.max(initial=0)))
     elif image.mode.startswith("I"):
         codes, top = np.asarray(image), (1 << bits - signed) - 1

@@ -224,7 +224,7 @@ def _detect(picture: np.ndarray, aruco, full_px: float, is_reduced: bool = False
     settings.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     settings.relativeCornerRefinmentWinSize = 0.3
     settings.minMarkerPerimeterRate = min(0.03 * full_px, 4 * SMALLEST_MARKER_PX) / max(picture.shape)
-    corners, ids, _ = detect_markers(picture, aruco, settings)
+    corners, ids = detect_markers(picture, aruco, settings)
     for marker_id, quad in zip([] if ids is None else np.asarray(ids).ravel(), corners, strict=True):
         # in the detector's coordinates pixel centers lie at whole numbers: its 0 is our .5
         quad = np.asarray(quad, float).reshape(4, 2) + 0.5
@@ -233,7 +233,7 @@ def _detect(picture: np.ndarray, aruco, full_px: float, is_reduced: bool = False
 
 
 def detect_markers(picture: np.ndarray, aruco, settings: cv2.aruco.DetectorParameters):
-    """OpenCV's (corners, ids or None, other squares) of one uint8 gray picture; raises `PhotoRejected("too_costly")` if
+    """OpenCV's (corners, ids or None) of one uint8 gray picture; raises `PhotoRejected("too_costly")` if
     it shows so many possible markers that the detector would not end in time.
 
     OpenCV compares a square with every code of the dictionary, which takes a millisecond: 20 s for a block design. So
@@ -250,17 +250,13 @@ def detect_markers(picture: np.ndarray, aruco, settings: cv2.aruco.DetectorParam
     corners, ids, others = cv2.aruco.ArucoDetector(one, settings).detectMarkers(picture)
     quads = np.array([*corners, *others], float).reshape(-1, 4, 2)
     if len(quads) <= _FEW_SQUARES:
-        return cv2.aruco.ArucoDetector(aruco, settings).detectMarkers(picture) if len(quads) else (corners, ids, others)
+        return cv2.aruco.ArucoDetector(aruco, settings).detectMarkers(picture)[:2] if len(quads) else (corners, ids)
     similar = _similar_ids(picture, quads, aruco)
     if not set(similar) - {0}:
-        return corners, ids, others
+        return corners, ids
     some = cv2.aruco.Dictionary(aruco.bytesList[similar].copy(), *kind)
-    corners, ids, others = cv2.aruco.ArucoDetector(some, settings).detectMarkers(picture)
-    return (
-        corners,
-        None if ids is None else np.array([[similar[int(i)]] for i in np.asarray(ids).ravel()], np.int32),
-        others,
-    )
+    corners, ids, _ = cv2.aruco.ArucoDetector(some, settings).detectMarkers(picture)
+    return corners, None if ids is None else np.array(similar, np.int32)[np.asarray(ids, int).ravel()][:, None]
 
 
 def _similar_ids(picture: np.ndarray, quads: np.ndarray, aruco) -> list[int]:

@@ -146,9 +146,7 @@ def _places_by_features(srgb: np.ndarray, design: np.ndarray, size_mm: tuple[flo
     for longer_px in _FEATURE_SIZES_PX:
         drawn = cv2.cvtColor(_draw(design, size_mm, longer_px), cv2.COLOR_RGB2GRAY)
         margin = 8
-        own, own_descriptors = _features(
-            cv2.copyMakeBorder(drawn, margin, margin, margin, margin, cv2.BORDER_REPLICATE)
-        )
+        own, own_descriptors = _features(np.pad(drawn, margin, mode="edge"))
         if not len(own):
             continue
         pairs = matcher.knnMatch(own_descriptors, seen_descriptors, _NEIGHBORS)
@@ -182,9 +180,8 @@ def _places_by_features(srgb: np.ndarray, design: np.ndarray, size_mm: tuple[flo
         agree[:, members] = False
         agree[members] = False
         middle_size = np.exp(np.median(size[members]))
-        homography, _ = cv2.findHomography(
-            source[members], target[members], cv2.USAC_MAGSAC, float(max(2.0, 0.02 * middle_size)), maxIters=2000
-        )
+        pairs, most_px = (source[members], target[members]), float(max(2.0, 0.02 * middle_size))
+        homography, _ = cv2.findHomography(*pairs, cv2.USAC_MAGSAC, most_px, maxIters=2000)
         corners = rect_corners((0, 0, *shape))
         quad = None if homography is None else apply_homography(homography, corners)
         if quad is not None and is_plausible_quad(quad):
@@ -219,9 +216,8 @@ def _places_by_templates(srgb: np.ndarray, design: np.ndarray, size_mm: tuple[fl
                 back = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
                 found.append((float(peak), (quad @ back + middle) / scale))
         longer_px *= _TEMPLATE_STEP
-    found.sort(key=lambda pair: -pair[0])
     kept: list[np.ndarray] = []
-    for _, quad in found:
+    for _, quad in sorted(found, key=lambda pair: -pair[0]):
         side = np.ptp(quad, axis=0).max()
         if all(np.abs(quad - other).max() > 0.25 * side for other in kept):
             kept.append(quad)
@@ -301,9 +297,8 @@ class _SmallDesign:
         for _ in range(_COLOR_STEPS if mixes else _STEPS):
             index = index_homography(px_from_unit @ np.linalg.inv(self.index_from_unit))
             flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-            seen = self._less_surroundings(
-                cv2.warpPerspective(srgb, index, self.size, None, flags, cv2.BORDER_REPLICATE)
-            )
+            seen = cv2.warpPerspective(srgb, index, self.size, None, flags, cv2.BORDER_REPLICATE)
+            seen = self._less_surroundings(seen)
             seen = (seen / np.maximum(seen.std((0, 1)), 0.5)).reshape(-1, 3)
             likeness = float((self.weight * (seen * self.colors[:, :3]).mean(0)).sum())
             if likeness > best[0] or mixes:

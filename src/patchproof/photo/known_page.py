@@ -61,9 +61,8 @@ def find_sheet(
     if view.markers and fitted < min(max(_LEAST_MARKERS, len(expected) / 2), len(expected)):
         # those of a print far away that are read identify it
         small = find_small_markers(srgb, view.corners_px, {i: corners_mm[i] for i in expected}, dictionary)
-        detected = detect.fit_detections(
-            srgb, {i: [q] for i, q in small.items()} | detections, set(corners_mm), dictionary
-        )
+        detections = {i: [quad] for i, quad in small.items()} | detections
+        detected = detect.fit_detections(srgb, detections, set(corners_mm), dictionary)
         view = complete_markers(srgb, detected, corners_mm, dictionary)
     if view.doubled or len(view.foreign) > 1:
         return view
@@ -124,11 +123,8 @@ def _predict_corners(srgb, view: MarkersInView, missing: Ids, corners_mm) -> dic
     if fit is None:
         return None
     quads = {i: apply_homography(fit.px_from_mm, corners_mm[i]) for i in missing}
-    return {
-        i: quad
-        for i, quad in quads.items()
-        if detect.is_plausible_quad(quad) and is_in_picture(quad, srgb) and _side_px(quad) >= 10
-    }
+    seen = {i: quad for i, quad in quads.items() if detect.is_plausible_quad(quad) and is_in_picture(quad, srgb)}
+    return {i: quad for i, quad in seen.items() if _side_px(quad) >= 10}
 
 
 def _fit(corners_px: Quads, corners_mm: Quads) -> PageFit | None:

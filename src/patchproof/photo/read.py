@@ -88,9 +88,8 @@ def read_photo(path: str | Path) -> Photo:
 def _decode(path: Path) -> tuple[Photo, int]:
     """A photograph as it is stored, above `WHOLE_PX` at half size, and its orientation."""
     if (size := path.stat().st_size) > MOST_BYTES:
-        raise PhotoRejected(
-            "too_costly", size, MOST_BYTES, f"a file of {size / 1e9:.1f} GB is too large: save it smaller"
-        )
+        advice = f"a file of {size / 1e9:.1f} GB is too large: save it smaller"
+        raise PhotoRejected("too_costly", size, MOST_BYTES, advice)
     with warnings.catch_warnings(action="ignore"), open_lazily(path) as image:  # of large pictures and of unusual EXIF
         if (pixels := image.width * image.height) > MAX_IMAGE_PX:
             advice = f"{pixels / 1e6:.0f} megapixels are too many: save it smaller"

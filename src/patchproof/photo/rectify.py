@@ -76,11 +76,7 @@ def fit_points(mm: np.ndarray, px: np.ndarray, sigma_px: np.ndarray, start: np.n
         off = np.linalg.norm(px - apply_homography(homography, mm), axis=1) / sigma_px
         weight = np.minimum(1, (3 * max(1.0, float(np.median(off))) / np.maximum(off, 1e-9)) ** 2)
         root = np.repeat(np.sqrt(weight) / sigma_px, 2)
-        for _ in range(3):
-            jacobian, residual = _jacobian(homography, mm), (px - apply_homography(homography, mm)).ravel()
-            scale = np.linalg.norm(jacobian, axis=0)
-            step = np.linalg.lstsq(jacobian / scale * root[:, None], residual * root, rcond=None)[0] / scale
-            homography = normalize_homography(homography + np.append(step, 0).reshape(3, 3))
+        homography = _gauss_newton(homography, mm, px, root, 3)
     residual = px - apply_homography(homography, mm)
     spread = float(np.sqrt(np.sum((residual.ravel() * root) ** 2) / max(2 * len(mm) - 8, 1)))
     covariance = covariance_of(_jacobian(homography, mm) * root[:, None], max(1.0, spread))
@@ -201,13 +197,14 @@ def _outward_shift(homography, mm, px, inlier) -> np.ndarray:
     return outward * (residual[inlier].sum() / (outward[inlier] ** 2).sum())
 
 
-def _gauss_newton(homography, mm, px) -> np.ndarray:
-    """Refine a homography to the least squared reprojection error."""
-    for _ in range(10):
+def _gauss_newton(homography, mm, px, root: np.ndarray | float = 1.0, steps: int = 10) -> np.ndarray:
+    """Refine a homography to the least squared reprojection error, 2N coordinates weighted by the square of `root`."""
+    root = np.broadcast_to(root, 2 * len(mm))
+    for _ in range(steps):
         residual = (px - apply_homography(homography, mm)).ravel()
         jacobian = _jacobian(homography, mm)
         scale = np.linalg.norm(jacobian, axis=0)
-        step = np.linalg.lstsq(jacobian / scale, residual, rcond=None)[0] / scale
+        step = np.linalg.lstsq(jacobian / scale * root[:, None], residual * root, rcond=None)[0] / scale
         homography = homography + np.append(step, 0).reshape(3, 3)
         if np.abs(jacobian @ step).max() < 1e-7:
             break
