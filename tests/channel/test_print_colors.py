@@ -8,7 +8,7 @@ import torch
 
 from patchproof.base.color import linear_from_srgb, srgb_from_linear
 from patchproof.channel.camera import lift_tone
-from patchproof.channel.print_colors import CellColors, ShownColors, added_terms, fit_ink_and_photos, fit_shown_colors
+from patchproof.channel.print_colors import CellColors, ShownColors, added_terms, fit_ink_and_photos
 from patchproof.channel.printer import vary_print
 
 TERMS = np.array([0.03, 0.02, 0.04, -0.2, -0.1, -0.3, -0.08, -0.2])  # veil, log gains, tone, chroma
@@ -39,4 +39,3 @@ def test_ink_and_photographs_are_told_apart_as_far_as_they_differ():
         assert np.abs(ShownColors.of_terms(term).show(cells.ink_light(found)) - cells.seen).mean() < 0.006
     veils = np.array(terms)[:, :3].mean(1)
     assert veils - veils[0] == pytest.approx([0, 0.05, 0.02, 0.03], abs=0.012)
-    assert np.abs(fit_shown_colors(photos[1], found).show(photos[1].ink_light(found)) - photos[1].seen).mean() < 0.006

@@ -34,9 +34,8 @@ def read_schemas(text: str) -> dict[str, Schema]:
         for field in fields.split(";"):
             numbers, *name, kind = field.split()
             plain = kind.removesuffix("*")
-            schema |= {
-                int(number): (" ".join(name), schemas.get(plain, plain), plain != kind) for number in numbers.split(",")
-            }
+            entry = " ".join(name), schemas.get(plain, plain), plain != kind
+            schema |= {int(number): entry for number in numbers.split(",")}
     return schemas
 
 

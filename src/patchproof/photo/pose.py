@@ -22,7 +22,7 @@ import numpy as np
 
 from patchproof.base.geometry import plane_pose, scaling_about, view_angles
 from patchproof.photo.print_ratio import cosine, gradient, log_ratio
-from patchproof.photo.rectify import PageFit, root_of
+from patchproof.photo.rectify import PageFit, root_of, root_of_scaled
 from patchproof.photo.shapes import Project, Shape
 
 # one σ of errors that are no noise of corners: of |r1| = |r2|, printers' errors of proportion; of both equations, of
@@ -159,12 +159,6 @@ def _stretch(px: Project, parameters: np.ndarray, point_mm) -> np.ndarray:
     step = 0.05 * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
     right, left, below, above = px(parameters, np.asarray(point_mm, float) + step)
     return np.stack([right - left, below - above], 1) / 0.1
-
-
-def root_of_scaled(covariance: np.ndarray) -> np.ndarray:
-    """`root_of` for parameters of different units, which are scaled first."""
-    spread = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
-    return spread[:, None] * root_of(covariance / np.outer(spread, spread))
 
 
 def _position(figures, parameters, root, agrees, matrix_is_known) -> CameraPosition:

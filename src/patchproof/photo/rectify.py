@@ -282,3 +282,9 @@ def root_of(covariance: np.ndarray) -> np.ndarray:
     """A matrix R with R Rᵀ = covariance, which may be singular."""
     values, vectors = np.linalg.eigh(covariance)
     return vectors * np.sqrt(np.maximum(values, 0))
+
+
+def root_of_scaled(covariance: np.ndarray) -> np.ndarray:
+    """`root_of` for parameters of different units, which are scaled first."""
+    spread = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+    return spread[:, None] * root_of(covariance / np.outer(spread, spread))

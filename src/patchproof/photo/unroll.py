@@ -134,8 +134,8 @@ def _uncertainty_mm(shape: Shape, corners: np.ndarray) -> float:
         step = np.zeros(len(spread))
         step[i] = 0.1 * sigma
         rows.append((shape.project(shape.parameters + step, corners) - px).ravel() / (0.1 * sigma))
-    root = spread[:, None] * rectify.root_of(shape.covariance / np.outer(spread, spread))
-    return rectify.largest_shift_mm(root, np.array(rows), _mm_by_px(shape.px, corners))
+    root, mm_by_px = rectify.root_of_scaled(shape.covariance), _mm_by_px(shape.px, corners)
+    return rectify.largest_shift_mm(root, np.array(rows), mm_by_px)
 
 
 def _mm_by_px(project: Callable[[np.ndarray], np.ndarray], mm: np.ndarray) -> np.ndarray:

@@ -30,7 +30,7 @@ OVERHANG_LIMIT = 0.1  # of the area: paper with nothing to stick to does not kee
 
 _REMEDY = "make the patch smaller, move it, or leave out bend"
 _FIT_GRID = 33  # heights are fitted on this many points along each edge
-_PIECE_GRID = 33  # vertices of a bent piece along each edge; odd, so that one is the middle
+PIECE_GRID = 33  # vertices of a bent piece along each edge; odd, so that one is the middle
 _DEGREE = 4
 
 
@@ -76,24 +76,6 @@ def place_bent(mesh: Mesh, frame: SurfaceFrame, size_mm: tuple[float, float], sp
         f" mm off on average, where the best cylinder would stand {rolled.gap_mean_mm:.1f} mm off"
     )
     return replace(mapped, reason=reason)
-
-
-def curl_card(card: Placement, radius_mm: float) -> Placement:
-    """Curl the left and right edges of a flat card off the object, on a cylinder that touches it along its middle.
-
-    Nothing is fitted to the surface, and no gap is refused: badly glued paper does this.
-    """
-    if not card.is_flat:
-        raise Refused("a flat card to curl", f"a piece on a {card.family}", "leave out bend")
-    across, inward = card.world_from_piece[:3, [0, 2]].T
-    points, width = piece_grid(card.size_mm, _PIECE_GRID) * [1, -1] + np.array(card.size_mm) / 2, card.size_mm[0]
-    scale = float(np.linalg.norm(across))  # a print may be larger than its millimeters say
-    angle = (points[:, :1] - width / 2) * scale / radius_mm
-    flat = np.concatenate([width / 2 + radius_mm / scale * np.sin(angle), points[:, 1:]], 1)
-    offsets = radius_mm * (1 - np.cos(angle)) * inward
-    normals = -np.sin(angle) * across / scale - np.cos(angle) * inward
-    curled = replace(card, vertices_mm=card.world(flat) - offsets, faces=_grid_faces(_PIECE_GRID), normals=normals)
-    return replace(curled, family="curled", piece_mm=points, reason=f"curled to a radius of {radius_mm:.0f} mm")
 
 
 def _turn_frame(frame: SurfaceFrame, normal: np.ndarray, origin_mm: np.ndarray) -> SurfaceFrame:
@@ -199,7 +181,7 @@ def _fit_polynomial(chart: SurfaceChart, near: np.ndarray, size_mm) -> SmoothSur
 def _lay_on(surface: SmoothSurface, near: np.ndarray, frame: SurfaceFrame, size_mm, spin_deg: float) -> Placement:
     """Place the piece on a smooth surface, raised until it is LIFT_MM clear of the triangles under it."""
     surface_h = _surface_heights(surface.chart, near, size_mm, GRID)
-    faces = _grid_faces(_PIECE_GRID)
+    faces = grid_faces(PIECE_GRID)
     surface = surface.raise_by(_highest(surface, near, surface_h, size_mm) + LIFT_MM)
     _, st = _map_grid(surface, frame, size_mm, spin_deg)
     paper = surface_chart.surface_heights(surface.chart, surface.points_and_normals(*st.T)[0][faces], size_mm, GRID)
@@ -212,13 +194,13 @@ def _lay_on(surface: SmoothSurface, near: np.ndarray, frame: SurfaceFrame, size_
     # a cell's chords end short of a round surface's edge
     clearance = np.where(np.isfinite(paper), paper, surface.height(*grid_st.T)) - surface_h
     gaps = clearance[np.isfinite(clearance) & np.isfinite(paper)] - LIFT_MM
-    stretches = grid_stretch(surface, st, size_mm, _PIECE_GRID)
+    stretches = grid_stretch(surface, st, size_mm, PIECE_GRID)
     return Placement(
         family="exponential",
         size_mm=tuple(size_mm),
         vertices_mm=vertices,
         faces=faces,
-        piece_mm=piece_grid(size_mm, _PIECE_GRID) * [1, -1] + np.array(size_mm) / 2,
+        piece_mm=piece_grid(size_mm, PIECE_GRID) * [1, -1] + np.array(size_mm) / 2,
         normals=normals,
         world_from_piece=world_from_piece,
         gap_mm=float(gaps.max()),
@@ -246,13 +228,13 @@ def _map_grid(surface: SmoothSurface, frame: SurfaceFrame, size_mm, spin_deg: fl
     middle, normal = (a[0] for a in surface.points_and_normals(np.zeros(1), np.zeros(1)))
     right, up = spun_axes(_turn_frame(frame, normal, middle), spin_deg)
     with np.errstate(all="ignore"):
-        st = exponential_map(surface, piece_grid(size_mm, _PIECE_GRID), right, up)
+        st = exponential_map(surface, piece_grid(size_mm, PIECE_GRID), right, up)
     if not (np.abs(st) < 2 * np.hypot(*size_mm)).all():
         raise Refused("a surface that paper can follow", "a surface that folds under the piece", _REMEDY)
     return piece_pose(right, up, normal, middle, size_mm), st
 
 
-def _grid_faces(n: int) -> np.ndarray:
+def grid_faces(n: int) -> np.ndarray:
     """Return two triangles per cell of an n×n grid by rows from the top, counter-clockwise as one faces it."""
     corner = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).reshape(-1, 1)
     return np.concatenate([corner + np.array([0, n, n + 1]), corner + np.array([0, n + 1, 1])])

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from patchproof.scene.bend import curl_card
+from patchlab.validation.envelope.curl import curl_card
 from patchproof.scene.conditions import Conditions, with_values
 from patchproof.scene.interface import Scene
 from patchproof.scene.patch_scene import require_patch
