@@ -5,6 +5,7 @@ tables that group by what was trained. Left out on purpose: promises, which belo
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from typing import Annotated, Any
@@ -65,7 +66,9 @@ def trained_cells(
 
 def with_trainers(problem: Problem, cell: Cell) -> Problem:
     """The problem with the cell's training networks only."""
-    return problem.with_classifiers([cell.values["networks"].index(name) for name in cell.values["trained"]])
+    numbers = [cell.values["networks"].index(name) for name in cell.values["trained"]]
+    classifiers, indices = (tuple(each[i] for i in numbers) for each in (problem.classifiers, problem.indices))
+    return replace(problem, classifiers=classifiers, indices=indices)
 
 
 def test_and_draw(

@@ -6,12 +6,10 @@ predicts the label of the object that it lies on and the distances to its four s
 from features of two sizes (Lin et al., feature pyramids, CVPR 2017).
 """
 
-from pathlib import Path
-
 import torch
 from torch import Tensor, nn
 
-from patchproof.classifier.builtin import WEIGHTS_FOLDER, WIDTHS, Backbone, conv, load_stored_network
+from patchproof.classifier.builtin import WIDTHS, Backbone, conv, load_stored_network
 from patchproof.classifier.detector import Detector
 
 INPUT_PX, CELL_PX = 128, 16
@@ -52,7 +50,7 @@ def _boxes(sides: Tensor) -> Tensor:
     return torch.cat([centers - distances[..., :2], centers + distances[..., 2:]], -1)
 
 
-def load_builtin_detector(folder: Path = WEIGHTS_FOLDER) -> Detector:
+def load_builtin_detector() -> Detector:
     """The detector from `builtin_detector.safetensors` with the labels of `builtin_detector.json`."""
-    sha256, card, network = load_stored_network(SmallDetector, "builtin_detector", folder)
+    sha256, card, network = load_stored_network(SmallDetector, "builtin_detector")
     return Detector("builtin-detector", sha256, INPUT_PX, tuple(card["labels"]), network, card["least_score"])

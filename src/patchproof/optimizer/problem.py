@@ -100,11 +100,6 @@ class Problem:
         with torch.no_grad():
             return self.subject.appearance(self.subject.start())
 
-    def with_classifiers(self, numbers: Sequence[int]) -> "Problem":
-        """A copy with the classifiers of these numbers only."""
-        classifiers, indices = (tuple(each[i] for i in numbers) for each in (self.classifiers, self.indices))
-        return replace(self, classifiers=classifiers, indices=indices)
-
     def with_training(self, optimize: OptimizeSettings, seed: int | None = None) -> "Problem":
         """A copy with these settings of the loop, and another seed of its draws."""
         settings = self.scene.settings.changed(optimize=optimize)

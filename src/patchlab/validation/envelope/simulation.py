@@ -8,7 +8,7 @@ the window around the piece (`piece_window`).
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import product
 from pathlib import Path
@@ -117,7 +117,8 @@ def recognize_target(world: Simulation, points: Sequence[SweepPoint], conditions
     out = {kind: np.zeros((len(points), len(conditions)), bool) for kind in ("design", *CONTROLS)}
     as_file = any("jpeg" in point for point in points)
     side = min(world.scene.settings.camera.photo_px) if as_file else world.problem.figure_px
-    stages, first_network = _StageCache(world), world.problem.with_classifiers([0])
+    stages, problem = _StageCache(world), world.problem
+    first_network = replace(problem, classifiers=problem.classifiers[:1], indices=problem.indices[:1])
     with torch.inference_mode():
         for first in range(4):  # the corner that is hidden first; each goes with a quarter of the conditions
             every = np.arange(first, len(conditions), 4)

@@ -23,7 +23,6 @@ from torch import Tensor
 
 from patchproof.app.plan.cost import Cost, measure_cost
 from patchproof.app.plan.errors import Terms, measure_terms
-from patchproof.base.compute import Compute
 from patchproof.base.intervals import wilson
 from patchproof.base.progress import Progress, no_progress
 from patchproof.base.validation import StrictModel
@@ -122,15 +121,13 @@ class Plan(GeometryPlan):
     not_measured: dict[str, str]  # reasons by figure
 
 
-def plan_geometry(
-    scene_path: str | Path, *, device: str = "cpu", progress: Progress = no_progress
-) -> tuple[GeometryPlan, Problem]:
+def plan_geometry(scene_path: str | Path, *, progress: Progress = no_progress) -> tuple[GeometryPlan, Problem]:
     """Compute how the piece of a scene lies and how well views resolve it; also returns the problem to measure."""
     scene, place = load_scene(scene_path), None
     if isinstance(scene, UnplacedScene):
-        place = choose_place(scene, compute=Compute(device), progress=progress)
+        place = choose_place(scene, progress=progress)
         scene = scene.with_piece_at(place.at, place.spin_deg)
-    problem, target = set_problem(scene, device), scene.settings.target
+    problem, target = set_problem(scene), scene.settings.target
     _, sentence = placement_with_other_bend(scene)
     geometry = GeometryPlan(
         scene=Path(scene_path).name,
