@@ -197,7 +197,9 @@ def blue_run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("blue")
     scene = conftest.SCENE.replace('"carton"\nmodels = ["builtin"]', BLUE).replace("[800, 600]", "[96, 96]")
     scene = scene.replace("steps = 3", STRIDES).replace("[500, 900]", "[330, 340]")
-    (folder / "scene.toml").write_text(scene + '\n[printer]\nprofile = "coated"\nveil = [0, 0]\nchroma = [0, 0]\n', encoding="utf-8")
+    (folder / "scene.toml").write_text(
+        scene + '\n[printer]\nprofile = "coated"\nveil = [0, 0]\nchroma = [0, 0]\n', encoding="utf-8"
+    )
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("patchproof.optimizer.run.PROMISE_VIEWS", 8)
         patch.setattr("patchproof.optimizer.loop.SELECT_VIEWS", 4)
