@@ -1,5 +1,8 @@
 """The study of real prints on made cells: conditions hold what they make, a twin shows its photograph's colors."""
 
+import csv
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -56,3 +59,19 @@ def test_a_twin_shows_the_colors_of_its_photograph():
     shown = twin.show(piece, np.random.default_rng(0)).srgb.numpy().reshape(-1, 3)
     error = np.abs(shown - srgb_from_linear(light[:36]))
     assert np.median(error) < 0.03 and np.abs(twin.left).max() > 0
+
+
+def test_figures_in_the_notebook_are_the_stored_ones():
+    results = Path(real_prints.__file__).parents[1] / "results"
+    stored = {
+        name: (results / "real_prints" / f"real-prints_{name}.csv").read_text("utf-8")
+        for name in ("colors", "promises")
+    }
+    rows = {name: list(csv.DictReader(text.splitlines())) for name, text in stored.items()}
+    page = (results / "measured.md").read_text("utf-8")
+    every = rows["colors"][0]
+    assert f"| {100 * float(every['cells within the conditions']):.1f} % [" in page
+    assert f"| {float(every['ΔE00 in the best conditions']):.2f} [" in page
+    for way, words in (("former", "{} % with the former default"), ("default", "{} % now")):
+        biases = [float(row["bias of the effect"]) for row in rows["promises"] if row["conditions"] == way]
+        assert words.format(" / ".join(f"{100 * bias:.0f}" for bias in biases)) in page
