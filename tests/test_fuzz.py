@@ -62,7 +62,16 @@ def test_the_watch_sees_what_it_is_for(watch, tmp_path):
 # numbers that are quick; the rest runs by `--hostile`
 OF_KINDS = {"sheet: names": 1, "sheet: no file": 1, "pdf: bombs": 12, "run: names": 3, "run: pictures": 3, "printer": 1}
 OF_KINDS |= {"checkpoint": 7, "import": 3, "photographs: links": 1, "backgrounds": 3, "scene": 4, "camera": 1, "icc": 0}
-OF_KINDS |= {"mask, faces": 1, "labels": 7, "boxes": 2, "mesh": 12, "network: files": 2, "weights": 1, "album": 4}
+OF_KINDS |= {
+    "mask, faces": 1,
+    "labels": 7,
+    "boxes": 2,
+    "corners": 0,
+    "mesh": 12,
+    "network: files": 2,
+    "weights": 1,
+    "album": 4,
+}
 needs_linux = pytest.mark.skipif(sys.platform != "linux", reason="processes that are forked and limited")
 
 

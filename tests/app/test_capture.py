@@ -28,7 +28,7 @@ pytest.importorskip("uvicorn")
 
 import uvicorn
 from browser import Browser
-from synthetic_photos import make_manifest, save
+from synthetic_photos import make_manifest, noisy_design, photograph, save
 
 from patchproof.app.capture import album as album_module
 from patchproof.app.capture import app as app_module
@@ -38,15 +38,18 @@ from patchproof.app.capture.app import server_config
 from patchproof.app.capture.collection import PhotoCollection
 from patchproof.app.capture.state import answer_of, state_of
 from patchproof.app.capture.view_map import map_views
-from patchproof.app.verify import options_of
+from patchproof.app.verify import CaptureInfo, options_of
 from patchproof.app.verify import verify as verify_photos
 from patchproof.base import input
 from patchproof.base.errors import Refused
 from patchproof.base.workers import open_workers
+from patchproof.evidence.corner_files import load_corners
 from patchproof.evidence.measure import MeasuredPhoto
 from patchproof.evidence.results import CameraPose, Geometry, PhotoEntry, Prediction
-from patchproof.sheets.manifest import ConditionClaim, dump_manifest, load_manifest
+from patchproof.evidence.verdict import sessions_needed
+from patchproof.sheets.manifest import ConditionClaim, Manifest, dump_manifest, load_manifest
 from test_copies import seen
+from test_corners import CORNERS_PX, PX_FROM_MM, SIZE_PX
 from test_verify_run import NET, promise, shot
 
 pytestmark = pytest.mark.filterwarnings("ignore:the network net:UserWarning")  # it sees no color
@@ -609,3 +612,109 @@ def test_400_photographs_are_answered_at_once_and_as_from_scratch(tmp_path, shee
         other._measured, other.album = dict(gathered._measured), gathered.album
         assert (state_of(other, 3), answer_of(other, paths[-1])) == (state, answer)
         assert 300 < state["judged"] < state["photos"] == 402
+
+
+@pytest.fixture(scope="module")
+def bare(tmp_path_factory) -> tuple[Path, Path]:
+    """A sheet without markers, and a photograph of its print."""
+    folder, design = tmp_path_factory.mktemp("bare"), noisy_design(0)
+    codes = (255 * design).astype(np.uint8)
+    data = make_manifest(promise([condition(20.0, 1.0)]), design=codes).model_dump()
+    manifest = Manifest.model_validate(data | {"markers": (), "settings": {"sheet": {"markers": False}}})
+    (folder / "sheet.json").write_text(dump_manifest(manifest), encoding="utf-8")
+    page = np.full((2000, 1750, 3), 0.2, np.float32)
+    page[600:, 350:] = 0.02 + 0.8 * design.repeat(10, 0).repeat(10, 1) ** 2
+    return folder / "sheet.json", save(photograph(page, PX_FROM_MM, SIZE_PX, noise=0.004, fine=2), folder / "a.jpg")
+
+
+def tapped(points, of="session_01/photo_0001.jpg", size=SIZE_PX) -> str:
+    return f"corners?{urlencode({'of': of, 'numbers': ','.join(map(str, [*np.ravel(points), *size]))})}"
+
+
+def test_tapped_corners_are_measured_by_kept_and_taken_by_verify(tmp_path, bare):
+    sheet, photo = bare
+    folder, file = tmp_path / "photos", tmp_path / "photos" / "corners.csv"
+    with gathered_in(folder, sheet) as gathered, listening(gathered) as address:
+        client = Client(address)
+        sent = client.send(photo.read_bytes()).json["photo"]
+        assert sent["code"] == "no_corners" and sent["tap"] and "--corners" in sent["advice"]
+        assert client.ask("POST", f"/x/{tapped(CORNERS_PX)}").status == 403
+        for hostile in (
+            tapped(CORNERS_PX[::-1]),
+            tapped(CORNERS_PX[[0, 2, 1, 3]]),
+            tapped(CORNERS_PX - 300),
+            tapped(CORNERS_PX + 300),
+            tapped(CORNERS_PX * np.nan),
+            tapped(CORNERS_PX[:3]),
+            tapped(CORNERS_PX / 2, size=(480, 180)),
+            tapped(CORNERS_PX, size=(0, 0)),
+            tapped(CORNERS_PX, size=("9" * 5000, 1)),
+            tapped(CORNERS_PX, of="../../etc/passwd"),
+            tapped(["x"] * 8),
+            "corners",
+        ):
+            answered = client.post(hostile)
+            assert answered.status == 422 and "Expected" in answered.json["refused"], hostile
+        assert not file.exists() and client.get("state").json["latest"][0]["code"] == "no_corners"
+        wrong = client.post(tapped(np.roll(CORNERS_PX, 1, 0))).json["photo"]
+        assert wrong["code"] == "other_design" and wrong["tap"]  # on another corner first: may be corrected
+        right = client.post(tapped(CORNERS_PX / 2 + 0.5, size=(240, 180))).json  # off by a finger, in a smaller copy
+        assert right["photo"]["code"] is None and not right["photo"]["tap"] and right["state"]["judged"] == 1
+        assert right["photo"]["picture"].startswith("data:image/jpeg")
+        assert client.post(tapped(CORNERS_PX / 2 + 0.5, size=(240, 180))).json["state"] == right["state"]
+        assert client.post(tapped(CORNERS_PX)).json["state"] == right["state"]  # what is counted stays as it is
+    assert load_corners(file)["session_01/photo_0001.jpg"].numbers == pytest.approx((CORNERS_PX + 1).ravel(), abs=0.01)
+    with gathered_in(folder, sheet) as gathered:  # after a restart, without measuring
+        assert json.loads(json.dumps(state_of(gathered, sessions_needed(gathered.manifest.promise)))) == right["state"]
+    options = {"models": [NET], "ledger_photos": 0, "capture": CaptureInfo(corners=file, find=True)}
+    report = verify_photos(folder, sheet, tmp_path / "report", **options)
+    assert report.summary.judged == 1 and report.photos[0].located == "corners"
+    assert (report.summary.verdict, report.summary.reason) == (right["state"]["verdict"], right["state"]["reason"])
+
+
+def test_corners_are_tapped_only_where_nothing_else_can_locate_a_print(client, photos, tmp_path):
+    assert not client.send(photos[5]).json["photo"]["tap"]  # no piece, on a sheet with markers
+    before = client.get("state").json
+    assert client.post(tapped(CORNERS_PX, size=(800, 600))).json["state"] == before
+    assert files_in(tmp_path) == ["photos/photos.jsonl", "photos/session_01/photo_0001.jpg"]
+
+
+@pytest.mark.parametrize("markers", [True, False])
+def test_a_design_without_markers_is_searched_for_first(tmp_path, sheet, bare, monkeypatch, markers):
+    found = []
+    monkeypatch.setattr(serve, "options_of", lambda sheet, manifest, *_: options_of(sheet, manifest, [NET]))
+    monkeypatch.setattr(serve, "open_workers", lambda *_, **__: open_workers(1))
+    monkeypatch.setattr(serve, "prepare_worker", lambda _: None)
+    monkeypatch.setattr(
+        serve, "PhotoCollection", lambda album, manifest, options, *_: found.append(options.find) or 1 / 0
+    )
+    with pytest.raises(ZeroDivisionError):
+        serve.serve_capture(sheet if markers else bare[0], tmp_path / "photos")
+    assert found == [not markers]
+
+
+def test_a_finger_drags_the_corners_of_a_photograph(tmp_path, bare):
+    sheet, photo = bare
+    with gathered_in(tmp_path / "photos", sheet) as gathered, listening(gathered) as address:
+        with Browser(tmp_path) as browser:
+            browser.call("Page.navigate", url=address)
+            browser.wait_for("document.querySelector('#into') && document.querySelector('#into').value")
+            assert browser.evaluate("document.querySelector('#corners').hidden")
+            browser.choose("#camera", photo)
+            browser.wait_for("document.querySelector('#tap img').naturalWidth == 480")
+            browser.evaluate("document.querySelector('#tap').scrollIntoView({block: 'center'})")
+            sides = browser.evaluate("(b => [b.left, b.top, b.width, b.height])(shown.getBoundingClientRect())")
+            corner, size = np.array(sides[:2]) + 9, np.array(sides[2:])  # touched beside the points
+            starts = corner + np.array([[0.25, 0.25], [0.75, 0.25], [0.75, 0.75], [0.25, 0.75]]) * size
+            for start, target in zip(starts, corner + CORNERS_PX / SIZE_PX * size, strict=True):
+                for kind, places in (("Start", [start]), ("Move", [start + 5]), ("Move", [target]), ("End", [])):
+                    touched = [{"x": x, "y": y} for x, y in places]
+                    browser.call("Input.dispatchTouchEvent", type=f"touch{kind}", touchPoints=touched)
+                    assert browser.evaluate("document.querySelector('#loupe').hidden") == (kind == "End")
+            assert browser.evaluate("document.documentElement.scrollWidth") == 390
+            browser.evaluate("document.querySelector('#send').click()")
+            browser.wait_for("document.querySelector('#corners').hidden")
+            said = browser.evaluate("document.querySelector('#answer').innerText")
+            assert said.startswith("recognized as bright") and not browser.troubles
+    numbers = load_corners(tmp_path / "photos" / "corners.csv")["session_01/photo_0001.jpg"].numbers
+    assert numbers == pytest.approx(CORNERS_PX.ravel(), abs=2.0)

@@ -25,7 +25,9 @@ from fuzz.pdf_bombs import PDF_BOMBS
 from fuzz.readers import (
     CAMERA,
     CARD,
+    CORNERS,
     broken_message,
+    corners_coco,
     finished_run,
     honest_photo,
     manifests,
@@ -604,6 +606,34 @@ def boxes(place: Place, number: int) -> Use:
     return lambda: load_boxes(path, "bright")
 
 
+def corners(place: Place, number: int) -> Use:
+    from patchproof.evidence.corner_files import corners_of_photo, load_corners
+
+    path, rng = place.given / of(number, ("c.csv", "c.json")), np.random.default_rng(number)
+    points = (
+        "0,0,9,0,9,9,0,9",
+        "1e308,-1e308,1e308,1e308,nan,inf,1e999,0",
+        "=cmd|' /c'!A1,2,3,4,5,6,7,8",
+        "9" * 100_000,
+    )
+    if number % 4 > 1:
+        endless(path, of(number // 4, ENDLESS))
+    elif path.suffix == ".json":
+        path.write_bytes(huge_json(rng, corners_coco()))
+    else:
+        head, *_ = CORNERS.splitlines()
+        names = ("../outside/secret.txt", "${OUTSIDE}/secret.txt", "a.jpg" * 5000)
+        rows = (f"{name},{of(number // 4, points)}\n" for name in names)
+        path.write_text(f"{head}\n{''.join(rows) * (1 if number < 16 else 100_000)}")
+
+    def use() -> None:
+        named = load_corners(path)
+        for name in list(named)[:9]:
+            corners_of_photo(named, name, place.given / name[:200])
+
+    return use
+
+
 # --- meshes ---
 
 
@@ -988,6 +1018,7 @@ KINDS: dict[str, tuple[Callable[[Place, int], Use], int]] = {
     "labels": (labels, 8),
     "harden": (harden, 7),
     "boxes": (boxes, 8),
+    "corners": (corners, 20),
     "mesh": (mesh, len(MESHES)),
     "mesh: no file": (mesh_files, 8),
     "network: chains": (network_chain, len(CHAINS)),

@@ -417,6 +417,37 @@ def labels_csv(rng: Rng, folder: Path) -> Read:
     )
 
 
+CORNERS = "file,x1,y1,x2,y2,x3,y3,x4,y4\ns/a.jpg,10,10,90,12,88,70,9,66\nb.jpg,1.5,2,30,2,30,40,1,40\n"
+
+
+def corners_coco() -> dict[str, object]:
+    """Corners as annotation tools write them: a polygon, and keypoints."""
+    names = enumerate(("a.jpg", "s/b.jpg"))
+    images = [{"id": i, "file_name": name, "width": 400, "height": 300} for i, name in names]
+    keypoints = [1, 2, 2, 30, 2, 2, 30, 40, 2, 1, 40, 1]
+    polygon = [10, 10, 90, 12, 88, 70, 9, 66]
+    return {
+        "images": images,
+        "annotations": [{"image_id": 0, "segmentation": [polygon]}, {"image_id": 1, "keypoints": keypoints}],
+    }
+
+
+def corners(rng: Rng, folder: Path) -> Read:
+    from patchproof.evidence.corner_files import corners_of_photo, load_corners
+
+    is_csv = rng.random() < 0.5
+    path = folder / ("c.csv" if is_csv else "c.json")
+    path.write_bytes(broken_lines(rng, CORNERS) if is_csv else broken_json(rng, corners_coco()))
+    Image.new("RGB", (400, 300)).save(folder / "a.jpg")
+
+    def read() -> None:
+        named = load_corners(path)
+        for name in named:
+            corners_of_photo(named, name, folder / "a.jpg")
+
+    return read
+
+
 def faces_txt(rng: Rng, folder: Path) -> Read:
     from patchproof.scene.canvas import _read_faces
 
@@ -747,6 +778,7 @@ READERS: dict[str, tuple[Callable[[Rng, Path], Read], int]] = {
     "icc": (icc, 2),
     "labels.csv": (labels_csv, 4),
     "faces.txt": (faces_txt, 3),
+    "corners": (corners, 3),
     "network card": (card_json, 3),
     "onnx": (onnx_file, 4),
     "mask, background": (mask, 4),

@@ -130,17 +130,16 @@ def verify(
         look_at = _look_at(out, manifest)
         if isinstance(photos, str | Path) and is_file(Path(photos) / JOURNAL_FILE):
             look_at = lambda entries: None  # noqa: E731  # `capture` showed the answers while they were taken
-        boxes = capture.boxes
         options = options_of(sheet, manifest, models, capture.camera, trust)
         parameters: dict[str, Any] = {"scan_dpi": capture.scan_dpi, "ruler_mm": capture.ruler_mm, "find": capture.find}
         options = replace(options, **parameters, controls=controls, ledger_photos=ledger_photos)
-        if boxes is not None:
+        if capture.boxes is not None:
             if manifest.promise is None or not any(model.LOOKS_AT_BOXES for model in options.models):
                 got = f"the classifiers {', '.join(model.name for model in options.models) or '(none)'}"
                 raise Refused("a detector, since classifiers use no boxes", got, "leave boxes out")
             from patchproof.evidence.boxes import load_boxes
 
-            options = replace(options, boxes=load_boxes(boxes, manifest.promise.target.label))
+            options = replace(options, boxes=load_boxes(capture.boxes, manifest.promise.target.label))
         if capture.corners is not None:
             from patchproof.evidence.corner_files import load_corners
 
@@ -158,13 +157,10 @@ def verify(
         gather = partial(gather_evidence, compute=compute, journal=journal, resume=resume, forecast=forecast, **look)
         on_pictures = partial(save_pictures, out / "pictures")
         report = gather(photos, manifest, options, on_pictures=on_pictures, advance=partial(progress, "verify"))
-        parameters |= {"camera": capture.camera and Path(capture.camera).name}
-        parameters |= {
-            name: path and Path(path).name for name, path in (("boxes", boxes), ("corners", capture.corners))
-        }
-        parameters |= {"ledger_photos": ledger_photos}
-        hashes = {f"network {each.name}": each.sha256 for each in options.models}
-        hashes = {"manifest": file_sha256(Path(sheet)), **hashes}
+        files = {"camera": capture.camera, "boxes": capture.boxes, "corners": capture.corners}
+        parameters |= {name: path and Path(path).name for name, path in files.items()}
+        parameters["ledger_photos"] = ledger_photos
+        hashes = {"manifest": file_sha256(Path(sheet))} | {f"network {m.name}": m.sha256 for m in options.models}
         report = report.changed(origin=Origin(options=parameters, sha256=hashes, versions=versions_of(_LIBRARIES)))
         stems = {stem_of(photo.file) for photo in report.photos[:MAX_PICTURED_PHOTOS]}
         # but for pictures of photographs that this report does not show

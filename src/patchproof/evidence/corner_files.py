@@ -60,7 +60,7 @@ def load_corners(path: str | Path) -> dict[str, NamedCorners]:
         if name in corners or len(named.numbers) != 8:
             got = "two rows" if name in corners else f"{len(named.numbers) / 2:g} points"
             raise Refused(f"four points in each photograph of {path}", f"{got} of {name}", _ORDER)
-        _refuse_twisted(named, name, path)
+        refuse_twisted(named, name, path)
         corners[name] = named
     return with_last_parts(corners)
 
@@ -88,7 +88,8 @@ def _read_coco(path: str | Path) -> Iterator[tuple[str, NamedCorners]]:
             yield names[each.image_id], NamedCorners(numbers, (image.width, image.height))
 
 
-def _refuse_twisted(named: NamedCorners, name: str, path: str | Path) -> None:
+def refuse_twisted(named: NamedCorners, name: str, path: str | Path) -> None:
+    """Refuse corners of the photograph `name` that do not run clockwise round a convex shape; they came from `path`."""
     sides = np.diff(np.reshape(named.numbers, (4, 2))[[0, 1, 2, 3, 0]], axis=0)
     following = np.roll(sides, -1, axis=0)
     turns = sides[:, 0] * following[:, 1] - sides[:, 1] * following[:, 0]  # twice the area of each corner's triangle

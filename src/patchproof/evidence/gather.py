@@ -92,6 +92,7 @@ def gather_evidence(
             do = "name the images in the boxes' file as the photographs"
             got = f"boxes of {next(iter(options.boxes))} and {len(options.boxes) - 1} more"
             raise Refused("boxes of these photographs", got, do)
+    unused: list[str] = []
     if options.corners:
         from patchproof.evidence.corner_files import corners_of_photo
 
@@ -102,8 +103,6 @@ def gather_evidence(
             got = f"corners in {summarize_names(list(options.corners))}"
             raise Refused("corners of these photographs", got, "name the files as the photographs")
         unused = [name for name in options.corners if PurePosixPath(name).name not in names]
-    else:
-        unused = []
     journal_file = closing(Journal(journal, settings_key(manifest, options), resume)) if journal else nullcontext()
     with journal_file as open_journal, open_workers(compute.jobs, compute.cluster) as workers:
         results = measure_all(task, items, judges, workers, open_journal, on_pictures, advance)

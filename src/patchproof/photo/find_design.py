@@ -45,7 +45,7 @@ _TEMPLATE_PX, _TEMPLATE_STEP = 24, 1.2
 _TURNS_DEG, _SLANTS = (0, -15, 15, -30, 30, -45, 45), (1.0, 0.75, 0.55)
 _NOT_FOUND_ADVICE = (
     "the design was not found: show all of it, flat and sharp, on a twentieth of the picture's width or more, or name "
-    "its corners in --corners FILE"
+    "its corners, in --corners FILE or with a finger on the page of capture"
 )
 _SMALL_ADVICE = "the design is too small to be found with certainty: come closer"
 _MIRRORED_ADVICE = "the photo is mirrored: switch off the camera's mirror setting and save it again"

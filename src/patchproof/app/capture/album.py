@@ -1,6 +1,6 @@
 """The folder that uploads are written to: a subfolder for each session and for each control.
 
-    OUT/session_01/photo_0001.jpg  ...  OUT/controls/mean/photo_0017.jpg  ...
+    OUT/session_01/photo_0001.jpg  ...  OUT/controls/mean/photo_0017.jpg  ...  OUT/photos.jsonl  OUT/corners.csv
 
 In: bytes from anybody who has the address. Out: files that `verify OUT --controls OUT/controls` reads. We choose their
 names, and tell their kind by their first bytes; a file appears once it is complete, and the same bytes are not stored
@@ -16,6 +16,7 @@ from typing import Any
 
 from patchproof.base.errors import Refused
 from patchproof.base.output import make_folder, refuse_other_files
+from patchproof.evidence.corner_files import CORNERS_FILE
 from patchproof.evidence.journal import JOURNAL_FILE
 from patchproof.photo.read import list_images
 
@@ -23,7 +24,7 @@ CONTROLS_FOLDER = "controls"
 CONTROLS = ("bare", "mean", "gray", "noise", "shuffled", "blank")
 MOST_BYTES = 40_000_000  # phones' largest JPEGs, of 108 and 200 megapixels, have some 30
 MOST_PHOTOS = 1000
-_OWN = ("session_*", CONTROLS_FOLDER, JOURNAL_FILE, ".capture.json")  # the last is never read: it may be a sender's
+_OWN = ("session_*", CONTROLS_FOLDER, JOURNAL_FILE, CORNERS_FILE, ".capture.json")  # the last, a sender's, is not read
 _HEAD = 12  # bytes that tell the kind of a file
 # by suffix: where the bytes begin that tell a kind, and which they are
 _KINDS = {

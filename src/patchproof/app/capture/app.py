@@ -2,6 +2,7 @@
 
     GET /TOKEN/            the page           POST /TOKEN/photos?into=NAME   one photograph, its bytes as the body
     GET /TOKEN/state       JSON               POST /TOKEN/sessions           begin a new session
+    POST /TOKEN/corners?of=FOLDER/NAME&numbers=X,Y,...,WIDTH,HEIGHT          the design's corners that a person tapped
 
 In: requests of anybody who reaches the port. Out: the page, `state_of`, `answer_of`, or a refusal in one sentence. A
 photograph is the whole body, without a name that would have to be trusted; a body that stops or stalls leaves no file.
@@ -94,6 +95,7 @@ def capture_app(collection: PhotoCollection, token: str, admit: Callable[[_Clien
         Route(f"/{token}/state", handlers.state, methods=["GET"]),
         Route(f"/{token}/photos", handlers.photo, methods=["POST"]),
         Route(f"/{token}/sessions", handlers.session, methods=["POST"]),
+        Route(f"/{token}/corners", handlers.corners, methods=["POST"]),
     ]
     app = Starlette(routes=routes, exception_handlers={Refused: _refuse, OSError: _refuse})
     app.router.redirect_slashes = False
@@ -140,7 +142,7 @@ class _Handlers:
         html = render_page("page.html.j2", Path(__file__).parent, **values)
         policy = (
             f"default-src 'none'; script-src 'nonce-{nonce}'; style-src 'nonce-{nonce}'; connect-src 'self'; "
-            "img-src data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+            "img-src data: blob:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
         )
         return HTMLResponse(html, headers={"Content-Security-Policy": policy})
 
@@ -165,8 +167,17 @@ class _Handlers:
             except (ClientDisconnect, TimeoutError):
                 return _refusal(408, "Expected a whole photograph, got only a part of it: send it again.")
         async with self._one_at_a_time:
-            answer = await anyio.to_thread.run_sync(self._measure, path)
-        return JSONResponse({"photo": answer, "state": self._state})
+            return JSONResponse(await anyio.to_thread.run_sync(self._measure, path))
+
+    async def corners(self, request: Request) -> Response:
+        """Measure a photograph again by the design's corners, which a person tapped in a picture of it, and answer."""
+        file, numbers = request.query_params.get("of", ""), request.query_params.get("numbers", "")
+        async with self._one_at_a_time:
+            try:
+                path = await anyio.to_thread.run_sync(self._collection.name_corners, file, numbers)
+            except Refused as error:
+                return _refusal(422, str(error))
+            return JSONResponse(await anyio.to_thread.run_sync(self._measure, path))
 
     async def _receive(self, request: Request) -> Path:
         with self._collection.album.incoming(request.query_params.get("into", "")) as incoming:
@@ -183,7 +194,7 @@ class _Handlers:
         collection, pictures = self._collection, []
         collection.measure([path], on_pictures=lambda file, kinds: pictures.append(kinds.get("photo")))
         self._state = state_of(collection, self._planned_sessions)
-        return answer_of(collection, path, pictures[0] if pictures else None)
+        return {"photo": answer_of(collection, path, pictures[0] if pictures else None), "state": self._state}
 
 
 async def _refuse(request: Request, error: Exception) -> Response:

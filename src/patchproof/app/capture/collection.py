@@ -2,10 +2,11 @@
 
 In: an album, a manifest, the options of a verification. Out: a `Report`, as `verify` makes it of the same folder.
 Photographs are measured one at a time, in the single process of the workers, where limits of time and memory apply;
-finished ones are in the album's journal, so that a restart measures only new ones. Left out on purpose: the gap ledger
-and the estimated effect, which take longer than a person waits.
+finished ones are in the album's journal, so that a restart measures only new ones, tapped corners in `corners.csv`.
+Left out on purpose: the gap ledger and the estimated effect, which take longer than a person waits.
 """
 
+import re
 import signal
 from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache, partial
@@ -14,8 +15,12 @@ from pathlib import Path
 import numpy as np
 
 from patchproof.app.capture.album import CONTROLS_FOLDER, Album
+from patchproof.base.errors import Refused
+from patchproof.base.input import is_file
+from patchproof.base.output import write_atomically
 from patchproof.base.progress import Advance, no_advance
 from patchproof.base.workers import Workers
+from patchproof.evidence import corner_files
 from patchproof.evidence.batch import PhotoItem, measure_all, reread_square
 from patchproof.evidence.classify import judges_of
 from patchproof.evidence.copies import reject_copies
@@ -27,8 +32,11 @@ from patchproof.evidence.reproject import PhotoSquare
 from patchproof.evidence.results import Report
 from patchproof.evidence.same_session import merge_folders
 from patchproof.evidence.task import Options, Task, task_of
+from patchproof.photo.corners import DesignCorners
 from patchproof.sheets.manifest import Manifest, load_manifest
 
+_CORNER_CODES = ("no_corners", "other_design", "several_sheets")  # of photographs in which a person may tap corners
+_TEN_NUMBERS = re.compile(r"(\d{1,6}(\.\d{1,20})?(,(?!$)|$)){10}")
 # the folder of a run, its sheet's manifest, and what the user said of the run's networks (see `load_run`)
 RunAndSheet = tuple[Path, Path, bool, tuple[str, ...]]
 
@@ -46,6 +54,9 @@ class PhotoCollection:
         self._journal = Journal(album.folder / JOURNAL_FILE, settings_key(manifest, options), resume=True)
         self._measured: dict[Path, MeasuredPhoto] = {}
         self._photos: dict[Path, MeasuredPhoto] | None = None  # those of `photos` once they were asked for
+        self._corners_file = file = album.folder / corner_files.CORNERS_FILE
+        named = corner_files.load_corners(file) if is_file(file) else {}  # by "FOLDER/NAME", and by shorter names
+        self._corners = {name: np.reshape(each.numbers, (4, 2)) for name, each in named.items() if "/" in name}
 
     @property
     def side_px(self) -> float | None:
@@ -75,6 +86,30 @@ class PhotoCollection:
         """Add a measured photograph of the album."""
         self._measured[path], self._photos = photo, None
         self.album.remember(path, photo.entry.sha256)
+
+    def wants_corners(self, path: Path) -> bool:
+        """Tell whether a person may tap corners: of a print without markers, until the photograph is counted."""
+        photo, named = self._measured[path], _name_of(path) in self._corners
+        able = not self.manifest.markers and self.control_of(path) is None and not photo.counted
+        return able and (named or photo.entry.code in _CORNER_CODES)
+
+    def name_corners(self, file: str, numbers: str) -> Path:
+        """Keep the corners that a person tapped in a picture of the photograph `file`, which is then to be measured
+        again, and return its path; `numbers` are "x1,y1,...,x4,y4,width,height". Nothing changes where none are wanted.
+        """
+        path = next((path for path in self._measured if _name_of(path) == file), None)
+        pairs = np.array(numbers.split(",") if _TEN_NUMBERS.fullmatch(numbers) else [], float).reshape(-1, 2)
+        if path is None or not len(pairs) or (pairs > pairs[-1]).any():
+            raise Refused("four corners inside of a photograph", f"{numbers} in {file}"[:160], "load the page again")
+        size_px = int(pairs[-1, 0]), int(pairs[-1, 1])
+        named = corner_files.NamedCorners(tuple(pairs[:4].ravel().tolist()), size_px)
+        corner_files.refuse_twisted(named, file, "the page")
+        corners = corner_files.corners_of_photo({file: named}, file, path)
+        if self.wants_corners(path) and corners is not None:
+            self._corners[file] = np.round(corners.px, 2)
+            write_atomically(self._corners_file, corner_files.corners_csv(self._corners))
+            self._measured.pop(path)
+        return path
 
     @property
     def photos(self) -> dict[Path, MeasuredPhoto]:
@@ -113,8 +148,14 @@ class PhotoCollection:
 
     def _item(self, path: Path) -> PhotoItem:
         control = self.control_of(path)
-        file = path.name if control is not None else f"{path.parent.name}/{path.name}"
-        return PhotoItem(path, file, control, with_pictures=control is None)
+        file = path.name if control is not None else _name_of(path)
+        px = self._corners.get(file)
+        corners = None if px is None else DesignCorners(px, corner_files.CORNER_SIGMA_PX)
+        return PhotoItem(path, file, control, with_pictures=control is None, corners=corners)
+
+
+def _name_of(path: Path) -> str:
+    return f"{path.parent.name}/{path.name}"
 
 
 def prepare_worker(_: object) -> None:

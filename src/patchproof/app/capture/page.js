@@ -3,8 +3,9 @@
 // which is no second photograph since the server knows its bytes.
 const $ = id => document.getElementById(id);
 const mostBytes = Number(document.body.dataset.mostBytes);
-const queue = [];
-let sending = false, into = null, known = "";
+const queue = [], taps = new Map(), points = [], loupeZoom = 4;
+const shown = $("tap").querySelector("img"), handles = [...$("tap").querySelectorAll("button")];
+let sending = false, into = null, known = "", tapped;
 
 function make(tag, text, kind) {
   const made = document.createElement(tag);
@@ -13,15 +14,15 @@ function make(tag, text, kind) {
   return made;
 }
 
-function add(files) {
-  for (const file of files) {
-    const row = make("li", "waiting");
-    $("queue").append(row);
-    if (file.size > mostBytes) refuse(row, `Expected a photograph of at most ${mostBytes / 1e6} MB, got a larger file.`);
-    else queue.push({file, into: $("into").value, row});
-  }
+function enqueue(path, file, body) {
+  const row = make("li", "waiting");
+  $("queue").append(row);
+  if (file.size > mostBytes) refuse(row, `Expected a photograph of at most ${mostBytes / 1e6} MB, got a larger file.`);
+  else queue.push({path, file, body, row});
   send();
 }
+
+const enqueuePhoto = file => enqueue(`photos?into=${encodeURIComponent($("into").value)}`, file, file);
 
 function refuse(row, sentence) {
   row.textContent = sentence;
@@ -33,16 +34,16 @@ async function send() {
   sending = true;
   let wait = 1;
   while (queue.length) {
-    const {file, into, row} = queue[0];
+    const {path, file, body, row} = queue[0];
     row.textContent = "sending and measuring …";
     try {
-      const answered = await fetch(`photos?into=${encodeURIComponent(into)}`, {method: "POST", body: file});
+      const answered = await fetch(path, {method: "POST", body});
       if ([408, 502, 503, 504, 507].includes(answered.status)) throw new Error((await answered.json()).refused);
       const said = await answered.json();
       queue.shift();
       if (!answered.ok) { refuse(row, said.refused); continue; }
       row.remove();
-      answer(said.photo);
+      answer(said.photo, file);
       show(said.state);
       wait = 1;
     } catch (error) {
@@ -65,9 +66,11 @@ function lines(photo) {
   return box;
 }
 
-function answer(photo) {
+function answer(photo, file) {
+  if (photo.tap) taps.set(photo.file, {file, preview: photo.picture});
+  else taps.delete(photo.file);
   const parts = [lines(photo)];
-  if (photo.picture) {
+  if (photo.picture && !photo.tap) {
     const picture = make("img");
     picture.src = photo.picture;
     picture.alt = "the photograph with what was found of the piece";
@@ -75,7 +78,38 @@ function answer(photo) {
   }
   $("answer").replaceChildren(...parts);
   $("answer").hidden = false;
+  nextTap();
 }
+
+// Photographs wait in `taps` for the design's corners, shares of their sides; where a browser shows no HEIC its preview is.
+function nextTap() {
+  const [name, {file, preview} = {}] = taps.entries().next().value || [];
+  $("corners").hidden = !name;
+  if (name === tapped || !(tapped = name)) return;
+  shown.onerror = () => { shown.onerror = null; shown.src = preview || "data:,"; };
+  shown.src = URL.createObjectURL(file);
+  [[.25, .25], [.75, .25], [.75, .75], [.25, .75]].forEach((at, i) => movePoint(i, ...at));
+}
+
+function movePoint(i, ...at) {
+  const [x, y] = points[i] = at.map(share => Math.min(1, Math.max(0, share))), loupe = $("loupe").style;
+  Object.assign(handles[i].style, {left: `${100 * x}%`, top: `${100 * y}%`});
+  $("outline").setAttribute("points", points.join(" "));
+  const [width, height] = [loupeZoom * shown.width, loupeZoom * shown.height], middle = $("loupe").clientWidth / 2;
+  loupe.background = `${middle - x * width}px ${middle - y * height}px / ${width}px ${height}px no-repeat url("${shown.src}") #000`;
+  loupe.left = x < .5 ? "auto" : ".4rem";
+}
+
+handles.forEach((handle, i) => {
+  handle.onpointerdown = ({clientX, clientY, pointerId}) => {
+    const [x, y] = points[i];  // the finger keeps its distance to the point, which it would cover
+    handle.setPointerCapture(pointerId);
+    handle.onpointermove = to => movePoint(i, x + (to.clientX - clientX) / shown.width, y + (to.clientY - clientY) / shown.height);
+    $("loupe").hidden = false;
+    movePoint(i, x, y);
+  };
+  handle.onlostpointercapture = () => { handle.onpointermove = null; $("loupe").hidden = true; };
+});
 
 function show(state) {
   const text = JSON.stringify(state);
@@ -147,7 +181,7 @@ async function refresh() {
 }
 
 for (const id of ["camera", "choose"]) {
-  $(id).addEventListener("change", event => { add([...event.target.files]); event.target.value = ""; });
+  $(id).addEventListener("change", event => { [...event.target.files].forEach(enqueuePhoto); event.target.value = ""; });
 }
 $("into").addEventListener("change", event => { into = event.target.value; });
 $("session").addEventListener("click", async () => {
@@ -157,6 +191,11 @@ $("session").addEventListener("click", async () => {
     show(begun.state);
   } catch { refresh(); }
 });
+$("send").addEventListener("click", () => {
+  const size = [shown.naturalWidth, shown.naturalHeight], pixels = points.flat().map((share, i) => (share * size[i % 2]).toFixed(2));
+  enqueue(`corners?${new URLSearchParams({of: tapped, numbers: [...pixels, ...size]})}`, taps.get(tapped).file);
+});
+$("skip").addEventListener("click", () => { taps.delete(tapped); nextTap(); });
 addEventListener("beforeunload", event => { if (queue.length) event.preventDefault(); });
 addEventListener("online", refresh);
 refresh();

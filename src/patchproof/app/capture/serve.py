@@ -12,6 +12,7 @@ import secrets
 import socket
 from collections.abc import Callable, Sequence
 from contextlib import closing, suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -66,7 +67,7 @@ def serve_capture(
     if manifest.promise is None:
         got = f"the {manifest.kind} sheet {manifest.sheet_id}"
         raise Refused("a sheet that promises something", got, "photograph it with any camera")
-    options = options_of(sheet, manifest, models, camera, trust)
+    options = replace(options_of(sheet, manifest, models, camera, trust), find=not manifest.markers)
     forecast = None if run is None else (Path(run).resolve(), Path(sheet).resolve(), trust, tuple(models or ()))
     with lock_folder(out), open_workers(1, spawn=True) as workers:
         album = Album(Path(out))

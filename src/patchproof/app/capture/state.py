@@ -62,6 +62,7 @@ def answer_of(collection: PhotoCollection, path: Path, picture: np.ndarray | Non
         "file": f"{path.parent.name}/{path.name}",
         "answer": answer,
         "control": collection.control_of(path),
+        "tap": collection.wants_corners(path),
         "label": prediction and f"{prediction.label} {prediction.confidence:.0%}",
         "code": entry.code,
         "advice": "; ".join(filter(None, (entry.remark and entry.remark.advice, *entry.said))) or None,

@@ -27,7 +27,9 @@ def capture(
 
     from patchproof.app.capture.album import CONTROLS_FOLDER
     from patchproof.app.capture.serve import serve_capture
+    from patchproof.evidence.corner_files import CORNERS_FILE
     from patchproof.report.words import verdict_lines
+    from patchproof.sheets.manifest import load_manifest
 
     def show(address: str) -> None:
         segno.make(address, error="l").terminal(compact=True)
@@ -39,4 +41,6 @@ def capture(
         )
         report = serve(progress=lambda stage, done, total: bar(stage, done, total) if total else None, on_address=show)
     controls = f" --controls {out / CONTROLS_FOLDER}" if report.controls else ""
+    if not load_manifest(sheet).markers:
+        controls += " --find" + f" --corners {out / CORNERS_FILE}" * (out / CORNERS_FILE).is_file()
     say(*verdict_lines(report), f"report: patchproof verify {out} --sheet {sheet}{controls} --out report")
