@@ -25,8 +25,8 @@ MAY_IMPORT = {
     "networks": {"base"},
     "classifier": {"base", "networks"},
     "optimizer": {"base", "sheets", "photo", "channel", "mesh", "scene", "render", "networks", "classifier"},
-    "calibrate": {"base", "sheets", "photo", "channel"},
     "evidence": {"base", "sheets", "photo", "channel", "classifier"},
+    "calibrate": {"base", "sheets", "photo", "channel", "evidence"},
     "report": {"base"},
     "reprints": {
         *("base", "sheets", "photo", "channel", "mesh", "scene", "render", "optimizer", "evidence", "report"),

@@ -7,16 +7,20 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
 
 from patchproof.base.errors import Refused
 from patchproof.base.output import check_file, write_files_atomically
 from patchproof.base.progress import Progress, no_progress
-from patchproof.calibrate.chart import calibrate_chart, prints_of, summary_lines
+from patchproof.calibrate.chart import PRIORS, calibrate_chart, prints_of, summary_lines
 from patchproof.calibrate.icc import bake
 from patchproof.calibrate.printer_files import save_printer
 from patchproof.channel.lens import load_camera
 from patchproof.channel.printer import Printer
 from patchproof.sheets.manifest import load_manifest
+
+if TYPE_CHECKING:
+    from patchproof.evidence.task import Options
 
 
 def printer_from_icc(
@@ -47,6 +51,19 @@ def printer_from_chart(
     lens = None if camera is None else load_camera(camera)
     result = calibrate_chart(prints_of(photos), load_manifest(sheet), out.stem, lens, partial(progress, "chart"))
     return [*summary_lines(result), _write_files(result.printer, out)], result.warnings
+
+
+def printer_from_design(
+    photos: Sequence[Path], sheet: Path, out: Path, options: Options, known: str | None, overwrite: bool, bar: Progress
+) -> tuple[list[str], tuple[str, ...]]:
+    """Write the printer measured from photographs of a known design; returns the summary and warnings."""
+    from patchproof.calibrate.known_design import calibrate_design
+
+    out, names = _new_file(out, overwrite), (known,) if known else ("office", *PRIORS)
+    groups, advance = prints_of(photos), partial(bar, "photographs")
+    printer, warnings = calibrate_design(groups, load_manifest(sheet), out.stem, options, names, advance)
+    lines = [f"{key}: {value}" for key, value in printer.provenance.items() if isinstance(value, str)]
+    return [*lines, _write_files(printer, out)], warnings
 
 
 def _new_file(out: Path, overwrite: bool) -> Path:

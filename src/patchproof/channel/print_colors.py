@@ -107,10 +107,10 @@ def add_ink(promised: np.ndarray, ink: np.ndarray) -> np.ndarray:
 
 
 def choose_cells(
-    seen: np.ndarray, means: np.ndarray, paper: np.ndarray, seen_ink: np.ndarray, ink: np.ndarray
+    seen: np.ndarray, means: np.ndarray, paper: np.ndarray, seen_ink: np.ndarray, ink: np.ndarray | None
 ) -> CellColors:
     """Choose cells of one photograph: `seen` h×w×3, NaN where unread, `means` h×w×12 of the promised light and of its
-    terms. Paper and marker ink, promised as `ink`, are added.
+    terms. Paper and marker ink, promised as `ink`, are added unless that is None.
     """
     inner = np.zeros(seen.shape[:2], bool)  # blur mixes what lies around the print into the rim
     inner[1:-1, 1:-1] = np.isfinite(seen[1:-1, 1:-1]).all(-1)
@@ -120,6 +120,7 @@ def choose_cells(
     if len(chosen) > _MOST_CELLS:
         chosen = np.random.default_rng(0).choice(chosen, _MOST_CELLS, replace=False)
     means, anchors = means.reshape(-1, means.shape[-1])[chosen], max(len(chosen) // _CELLS_PER_ANCHOR, 1)
+    anchors, ink = (0, paper) if ink is None else (anchors, ink)
     ends, seen_ends = np.repeat([np.ones(3), ink], anchors, 0), np.repeat([paper, seen_ink], anchors, 0)
     return CellColors(
         np.concatenate([means[:, :3], ends]),

@@ -95,16 +95,28 @@ def photo_square(
     if scale < 1:
         square = cv2.resize(square, (work, work), interpolation=cv2.INTER_AREA)
     to_square = np.array([[scale, 0, -left * scale], [0, scale, -top * scale], [0, 0, 1.0]])
-    on_piece = {i: surface.corners_mm[i] for i in surface.piece_ids}
-    unmixed = pattern_light(srgb, px_from_mm, on_piece, surface.dictionary, blur_px) if on_piece else None
-    if unmixed is not None:
-        if unmixed.agreement < _LEAST_AGREEMENT:
-            return None
-        light, blur_px = replace(light, paper=unmixed.paper, ink=unmixed.ink), unmixed.blur_px
+    unmixed = unmix_markers(srgb, px_from_mm, blur_px, light, surface)
+    if unmixed is None:
+        return None
+    light, blur_px = unmixed
     square, matrix = np.ascontiguousarray(square), None if matrix_px is None else to_square @ matrix_px
     to_square, blur_px, noise = to_square @ px_from_mm, blur_px * scale, noise_of(square)
     cells, blur_cells = design_cells(square, to_square, surface.rect_mm, blur_px)
     return PhotoSquare(file, square, to_square, light, blur_px, noise, cells, scale, matrix, blur_cells=blur_cells)
+
+
+def unmix_markers(
+    srgb: np.ndarray, px_from_mm: np.ndarray, blur_px: float, light: FrameLight, surface: Surface
+) -> tuple[FrameLight, float] | None:
+    """Read paper, ink and blur from all cells of the piece's markers, as far as it has any; None if they disagree with
+    the homography.
+    """
+    on_piece = {i: surface.corners_mm[i] for i in surface.piece_ids}
+    unmixed = pattern_light(srgb, px_from_mm, on_piece, surface.dictionary, blur_px) if on_piece else None
+    if unmixed is None:
+        return light, blur_px
+    light = replace(light, paper=unmixed.paper, ink=unmixed.ink)
+    return None if unmixed.agreement < _LEAST_AGREEMENT else (light, unmixed.blur_px)
 
 
 def noise_of(srgb: np.ndarray) -> float:

@@ -20,20 +20,41 @@ def printer(
     chart: Annotated[
         list[Path] | None, Option(help="Photographs of the printed chart; a folder holds those of one print.")
     ] = None,
-    sheet: Annotated[Path | None, Option(help="The manifest of the chart's page.")] = None,
+    design: Annotated[
+        list[Path] | None, Option(help="Photographs of any print of known pixels; a folder holds those of one place.")
+    ] = None,
+    corners: Annotated[Path | None, Option(help="CSV or COCO JSON with the design's four corners.")] = None,
+    find: Annotated[bool, Option("--find", help="Search for the design where no marker can be read.")] = False,
+    known: Annotated[
+        Literal["office", "coated", "uncoated"] | None, Option(help="For colors that the design lacks; else the best.")
+    ] = None,
+    sheet: Annotated[Path | None, Option(help="The manifest of the chart's page, or of the design.")] = None,
     camera: Annotated[str | None, Option(help="A camera file with a tone curve.")] = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """A printer from its ICC profile, or from photographs of its printed chart."""
-    from patchproof.calibrate.printer import printer_from_chart, printer_from_icc
+    """A printer from its ICC profile, or from photographs of its printed chart or of any design."""
+    from patchproof.calibrate.printer import printer_from_chart, printer_from_design, printer_from_icc
 
-    photos = [*(chart or []), *(more or [])]
-    if (icc is None) == (chart is None) or (more and chart is None):
-        raise BadParameter("give either --icc FILE or --chart PHOTO...", param_hint="--icc / --chart")
+    photos = [*(chart or design or []), *(more or [])]
+    if sum(way is not None for way in (icc, chart, design)) != 1 or (more and icc):
+        ways = "--icc / --chart / --design"
+        raise BadParameter("give either --icc FILE, --chart PHOTO... or --design PHOTO...", param_hint=ways)
+    if design is None and (corners or find or known):
+        raise BadParameter("--corners, --find and --known are for --design PHOTO...", param_hint="--design")
     if icc is not None:
         lines, warnings = printer_from_icc(icc, out, intent == "perceptual", licence, source, overwrite), ()
     elif sheet is None:
-        raise BadParameter("name the JSON that was written beside the chart's PDF", param_hint="--sheet")
+        raise BadParameter("name the JSON that was written beside the PDF", param_hint="--sheet")
+    elif design is not None:
+        from patchproof.channel.cameras import load_optional_camera
+        from patchproof.channel.printer import load_printer
+        from patchproof.evidence.corner_files import load_corners
+        from patchproof.evidence.task import Options
+
+        named = {} if corners is None else load_corners(corners)
+        options = Options((), load_printer(known or "office"), load_optional_camera(camera), corners=named, find=find)
+        with progress() as bar:
+            lines, warnings = printer_from_design(photos, sheet, out, options, known, overwrite, bar)
     else:
         with progress() as bar:
             lines, warnings = printer_from_chart(photos, sheet, out, camera, overwrite, bar)
