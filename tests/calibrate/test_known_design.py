@@ -166,4 +166,4 @@ def test_readmes_line_writes_a_printer_and_ways_that_contradict_each_other_are_r
     assert load_printer("mine.npz").provenance["source"].startswith("2 photographs of a known design")
     start, end = ("calibrate", "printer", "--out", "mine", "--sheet", "sheet.json"), ("--chart", "desk")
     for options in (("--design", "desk", *end), ("--design", "desk", "--icc", "sheet.json"), (*end, "--find")):
-        assert command(*start, *options) == 2 and "--design PHOTO..." in capsys.readouterr().err
+        assert command(*start, *options) == 2 and "--design" in capsys.readouterr().err

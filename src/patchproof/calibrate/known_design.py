@@ -94,7 +94,7 @@ def calibrate_design(
     veils = [_SHARED_VEIL * np.exp(c.start[3:6]) for c in photos]
     veiled = _ink([replace(c, seen=(c.seen - v) / (1 - _SHARED_VEIL)) for c, v in zip(photos, veils, strict=True)])
     ends = linear_from_srgb(printer_output(prior, np.array([[0.0] * 3, [0.5] * 3])))
-    black, gray = ciede2000(lab_from_linear(add_ink(ends, ink)), lab_from_linear(add_ink(ends, veiled)))
+    black, gray = ciede2000(*(lab_from_linear(add_ink(ends, each)) for each in (ink, veiled)))
 
     seen = np.concatenate([c.promised for c in photos])
     light = np.concatenate([ShownColors.of_terms(t).undo(c.seen) for c, t in zip(photos, terms, strict=True)])
@@ -171,7 +171,7 @@ def _nearby(lab: np.ndarray, seen: np.ndarray, values: np.ndarray) -> tuple[np.n
     _, bins, counts = np.unique(np.round(colors / _LAB_BIN), axis=0, return_inverse=True, return_counts=True)
     sums = np.stack([np.bincount(bins.ravel(), column) for column in np.hstack([colors, values]).T], 1)
     colors = sums[:, :3] / counts[:, None]
-    index = KDTree(colors).query(lab, range(1, min(_NEIGHBORS, len(colors)) + 1))[1]
+    index = np.reshape(KDTree(colors).query(lab, min(_NEIGHBORS, len(colors)))[1], (len(lab), -1))
     apart = ciede2000(lab[:, None], colors[index])
     weight = np.exp(-((apart / _LIKE_DELTA_E00) ** 2) / 2)
     total = (weight * counts[index]).sum(1)[:, None] + _LIKE_CELLS
