@@ -114,7 +114,7 @@ def calibrate_design(
         "known_printer": best,
         "delta_e00_of_known_printers_alone": ", ".join(f"{each} {error:.2f}" for each, error in alone.items()),
         "covered_share": round(covered, 3),
-        "covered": f"{covered:.0%} of {best}'s colors, within ΔE00 {COVERED_DELTA_E00:g} of a seen one; others stay",
+        "covered": f"{covered:.0%} of {best}'s colors, within ΔE00 {COVERED_DELTA_E00:g} of a seen one; others fade",
         "ambiguity": f"a shared veil of {_SHARED_VEIL} would change black by ΔE00 {black:.1f}, mid gray by {gray:.1f}",
         "uncertainty": f"ΔE00 {np.median(left_out or errors):.1f} of cells in the median photograph"
         + (" of a place that was left out" if left_out else "; one place does not show how places differ"),
