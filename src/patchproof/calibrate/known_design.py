@@ -6,8 +6,6 @@ chroma are fitted by `channel.print_colors`; what is left of cells is averaged o
 share is put into the ink, though it may be the phone's or the light's.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path

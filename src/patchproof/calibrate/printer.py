@@ -54,7 +54,13 @@ def printer_from_chart(
 
 
 def printer_from_design(
-    photos: Sequence[Path], sheet: Path, out: Path, options: Options, known: str | None, overwrite: bool, bar: Progress
+    photos: Sequence[Path],
+    sheet: Path,
+    out: Path,
+    options: "Options",
+    known: str | None,
+    overwrite: bool,
+    bar: Progress,
 ) -> tuple[list[str], tuple[str, ...]]:
     """Write the printer measured from photographs of a known design; returns the summary and warnings."""
     from patchproof.calibrate.known_design import calibrate_design

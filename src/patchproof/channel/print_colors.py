@@ -154,6 +154,11 @@ def fit_ink_and_photos(
     return ink, terms
 
 
+def fit_shown_colors(cells: CellColors, ink: np.ndarray) -> ShownColors:
+    """Fit one photograph's colors to its cells in a known ink."""
+    return ShownColors.of_terms(_fit_terms(cells.ink_light(ink), cells, cells.start, 3 * _STEPS))
+
+
 def _fit_ink(
     promised: np.ndarray, rows: np.ndarray, light: np.ndarray, share: np.ndarray, ink: np.ndarray
 ) -> np.ndarray:
@@ -168,7 +173,7 @@ def _fit_ink(
     return ink
 
 
-def _fit_terms(light: np.ndarray, cells: CellColors, terms: np.ndarray) -> np.ndarray:
+def _fit_terms(light: np.ndarray, cells: CellColors, terms: np.ndarray, steps: int = _STEPS) -> np.ndarray:
     """Fit the terms that take a print's light to a photograph's: damped Gauss-Newton on robust CIELAB distances."""
     seen, damping = _lab(cells.seen), 1e-3
 
@@ -181,7 +186,7 @@ def _fit_terms(light: np.ndarray, cells: CellColors, terms: np.ndarray) -> np.nd
 
     apart = miss(terms)
     best = cost(apart, terms)
-    for _ in range(_STEPS):
+    for _ in range(steps):
         slopes = np.stack([(miss(terms + _PROBE * axis) - apart) / _PROBE for axis in np.eye(8)])
         weight = 1 / np.sqrt((apart**2).sum(1) + _LAB_NOISE**2)[:, None] / len(light)
         flat, weighted = slopes.reshape(8, -1), (slopes * weight).reshape(8, -1)
