@@ -247,7 +247,7 @@ def _problem(scene: Scene, names: Sequence[str], tables: Tables) -> Problem:
 def _promise(settings: RealPrintsSettings, problem: Problem, pixels: np.ndarray) -> dict[str, Any]:
     """The effect beside gray on the target's logit, and the numbers recognized in each session."""
     conditions = problem.scene.draw("promise", settings.views, per_session=VIEWS_PER_SESSION)
-    shown = [problem.subject.appearance(from_pixels(each)) for each in (pixels, np.full_like(pixels, 128))]
+    shown = [problem.patch.appearance(from_pixels(each)) for each in (pixels, np.full_like(pixels, 128))]
     effect, hits = _effect(problem, shown, conditions)
     return {"effect": effect, "sessions": count_by_session(hits, VIEWS_PER_SESSION)}
 
@@ -299,16 +299,23 @@ def _color_tables(settings: RealPrintsSettings, photos: Sequence[Mapping[str, An
     yield Table("colors", "Colors of the median photograph", head, tuple(rows), about)
 
 
-def _of_twins(promised: Mapping[str, Any], twins: Sequence[Mapping[str, Any]]) -> list[tuple[float, float, float]]:
+def _rate(answer: Mapping[str, Any]) -> float:
+    hits, photos = map(sum, answer["sessions"])
+    return hits / photos
+
+
+def _of_twins(
+    promised: Sequence[tuple[list[int], Mapping[str, Any]]], twins: Sequence[Mapping[str, Any]]
+) -> list[tuple[float, float, float]]:
     """Of each twin: bias of the effect as a share of the twins' mean, bias of the rate, share of sessions inside."""
     rows, size = [], abs(np.mean([twin["effect"] for twin in twins]))
     for held, promise in promised:
-        posterior, promised_rate = rate_posterior(*promise["sessions"]), np.divide(*map(sum, promise["sessions"]))
+        posterior = rate_posterior(*promise["sessions"])
         for twin in (twins[i] for i in held):
             seen = list(zip(*twin["sessions"], strict=True))
             inside = [low <= k <= high for k, n in seen for low, high in [posterior.count_interval((n,))]]
-            rate_bias = promised_rate - np.divide(*map(sum, twin["sessions"]))
-            rows.append(((promise["effect"] - twin["effect"]) / size, float(rate_bias), float(np.mean(inside))))
+            effect_bias = (promise["effect"] - twin["effect"]) / float(size)
+            rows.append((effect_bias, _rate(promise) - _rate(twin), float(np.mean(inside))))
     return rows
 
 
@@ -317,11 +324,11 @@ def _promise_table(pairs: Sequence[Result]) -> Table:
     rows = []
     for result in pairs:
         answers = result.answers["former"]
-        on_twins = [np.divide(*map(sum, twin["sessions"])) for twin in answers["twins"]]
+        on_twins = [_rate(twin) for twin in answers["twins"]]
         for way, promised in answers["promised"].items():
             effect, bias, inside = zip(*_of_twins(promised, answers["twins"]), strict=True)
-            promised_rate = np.mean([np.divide(*map(sum, each["sessions"])) for _, each in promised])
-            figures = float(promised_rate), mean(on_twins), mean(effect), mean(bias), mean(inside)
+            promised_rate = float(np.mean([_rate(each) for _, each in promised]))
+            figures = promised_rate, mean(on_twins), mean(effect), mean(bias), mean(inside)
             rows.append((*cell_key(result), way, *figures))
     about = "the design by former conditions; shares of the twins' mean effect; twins of one print and place are alike"
     return Table("promises", "Promises beside twins", (*head, "sessions inside"), tuple(rows), about)
@@ -330,11 +337,9 @@ def _promise_table(pairs: Sequence[Result]) -> Table:
 def _design_table(pairs: Sequence[Result]) -> Table:
     rows = []
     for result in pairs:
-        former, default = (
-            np.array([np.divide(*map(sum, twin["sessions"])) for twin in result.answers[by]["twins"]])
-            for by in ("former", "default")
-        )
-        rows.append((*cell_key(result), mean(former), mean(default), mean(default - former)))
+        former, default = ([_rate(twin) for twin in result.answers[by]["twins"]] for by in ("former", "default"))
+        gains = [new - old for new, old in zip(default, former, strict=True)]
+        rows.append((*cell_key(result), mean(former), mean(default), mean(gains)))
     head = ("scene", "network", "seed", "by former conditions", "by default conditions", "gain")
     return Table("designs", "Designs on twins", head, tuple(rows), "each twin counts as one; rates")
 

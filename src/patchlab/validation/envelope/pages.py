@@ -35,7 +35,8 @@ if TYPE_CHECKING:
 STAGES = {"gains": "design gains", "found": "sheet found", "measured": "measured"}
 _COLORS = {"gains": "#2a6f97", "found": "#e09f3e", "measured": "#2a9d6f"}
 _RATE_HEADINGS = ("recognized", *CONTROLS, "gain", "effect", "sheet found", "measured")
-EndValues = BreakValues = Mapping[str, Any]  # a cell's axis with both ends; a stage's `Break` in its answers
+EndValues = Mapping[str, Any]  # a cell's axis with both ends
+BreakValues = Mapping[str, Any]  # a stage's `Break` in its answers
 HOLDS, NEVER, EFFECT, NO_EFFECT = "holds", "never worked", "gains", "no effect"
 _CONTROL = "the better of the bare object and a gray piece in the same markers, on the same conditions"
 _PAGE_IN = (11.69, 8.27)  # A4, landscape
