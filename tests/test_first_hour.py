@@ -143,7 +143,7 @@ def test_a_first_hour_says_at_each_step_what_to_do_next(tmp_path, monkeypatch):
     assert "Helps beside simulated controls" in verify and re.search(
         r"Take at least 10 photographs in each of|No 150 photographs are likely to prove", verify
     )
-    assert "photographs: 11, judged 9, measured 9" in verify  # 8, two copies and a screenshot
+    assert "photographs: 15, judged 13, measured 12" in verify  # 12, two copies and a screenshot
     for named in ("copy: 2", "cropped: 1", "IMG_0007.MOV", "IMG_0008.CR2", "thumbnails"):
         assert named in verify, named
     assert not any(word in verify for word in ("notes.txt", ".DS_Store", "._photo.jpg"))

@@ -22,7 +22,8 @@ from patchproof.base.geometry import intrinsics, project
 from patchproof.base.goal import Goal
 from patchproof.channel.object_box import MOST_POINTS, hull_points, project_box
 from patchproof.classifier.average_precision import average_precision, find_detections, suppress_overlaps
-from patchproof.classifier.builtin_detector import INPUT_PX, WEIGHTS_FOLDER
+from patchproof.classifier.builtin import WEIGHTS_FOLDER
+from patchproof.classifier.builtin_detector import INPUT_PX
 from patchproof.classifier.detector import NO_BOX_LOGIT, Detector, iou
 from patchproof.classifier.load import load_classifier
 from patchproof.optimizer.subject import target_loss
