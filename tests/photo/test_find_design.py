@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-
 import cv2
 import numpy as np
 import pytest
@@ -109,14 +107,13 @@ def test_a_print_that_was_found_is_measured_like_one_whose_corners_were_named():
     assert np.abs(found - apply_homography(px_from_mm, rect_corners(paper.DESIGN_MM))).max() < 0.7
 
 
-def test_squares_without_codes_cost_a_fraction_of_reading_each():
-    """A block design of 40 × 30, which OpenCV compares with 1000 codes square by square."""
+def test_among_many_squares_a_marker_is_read_as_opencv_reads_it():
+    """In a block design of 40 × 30, whose squares are compared only with codes that some of them resemble."""
     cells = np.random.default_rng(0).integers(0, 256, (30, 40), np.uint8)
     picture, aruco = cells.repeat(24, 0).repeat(24, 1), aruco_dictionary(detect.DICTIONARY)
-    seconds = []
-    for read in (detect.detect_markers, lambda *parts: cv2.aruco.ArucoDetector(*parts[1:]).detectMarkers(parts[0])):
-        before = time.process_time()
-        quads, ids, *_ = read(picture, aruco, detect.detector_settings())
-        seconds.append(time.process_time() - before)
-        assert ids is None and not len(quads)
-    assert 3 * seconds[0] < seconds[1]
+    assert detect.detect_markers(picture, aruco, detect.detector_settings())[1] is None
+    picture[200:400, 200:400] = 255
+    picture[230:370, 230:370] = cv2.aruco.generateImageMarker(aruco, 7, 140)
+    quads, ids, *_ = detect.detect_markers(picture, aruco, detect.detector_settings())
+    theirs, _, _ = cv2.aruco.ArucoDetector(aruco, detect.detector_settings()).detectMarkers(picture)
+    assert ids.ravel().tolist() == [7] and np.allclose(quads[0], theirs[0], atol=1e-3)
