@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from patchproof.base.color import linear_from_srgb, srgb_from_linear
-from patchproof.channel.camera import lift_tone
+from patchproof.base.color import lift_tone, linear_from_srgb, srgb_from_linear
 from patchproof.channel.print_colors import CellColors, ShownColors, added_terms, fit_ink_and_photos
 from patchproof.channel.printer import vary_print
 

@@ -10,10 +10,9 @@ import torch
 from patchlab.study.study import run_study
 from patchlab.validation import real_prints
 from patchlab.validation.known_colors import KnownColors
-from patchproof.base.color import linear_from_srgb, srgb_from_linear
+from patchproof.base.color import lift_tone, linear_from_srgb, srgb_from_linear
 from patchproof.base.errors import Refused
 from patchproof.calibrate.printer_files import printer_output
-from patchproof.channel.camera import lift_tone
 from patchproof.channel.printer import load_printer, vary_print
 from patchproof.render.pixels import PiecePicture
 

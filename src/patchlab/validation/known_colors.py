@@ -20,9 +20,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from patchproof.base.color import ciede2000, lab_from_linear, linear_from_srgb, srgb_from_linear
+from patchproof.base.color import ciede2000, lab_from_linear, lift_tone, linear_from_srgb, srgb_from_linear
 from patchproof.calibrate.printer_files import printer_from_table
-from patchproof.channel.camera import lift_tone
 from patchproof.channel.printer import Printer, node_colors, vary_print
 
 _CENTER = (0.025, 0.025, 0.025, 0.0, 0.0, 0.0, 0.0, -0.075)  # of the terms in the default conditions

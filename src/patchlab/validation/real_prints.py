@@ -29,14 +29,13 @@ from patchlab.study.estimates import mean, median
 from patchlab.study.grid import GridSettings, PositiveInt, cell_key, grid_cells, network_names, scene_of
 from patchlab.study.study import Cell, Result, Study
 from patchlab.validation.known_colors import KnownColors, fit_photo, printer_of_ink, separate_ink
-from patchproof.base.color import ciede2000, lab_from_linear, linear_from_srgb, srgb_from_linear
+from patchproof.base.color import ciede2000, lab_from_linear, lift_tone, linear_from_srgb, srgb_from_linear
 from patchproof.base.errors import Refused
 from patchproof.base.input import read_file
 from patchproof.base.sessions import count_by_session, rate_posterior
 from patchproof.base.settings import CameraSettings, PrinterSettings, SceneSettings
 from patchproof.base.validation import expand_path
 from patchproof.calibrate.printer_files import printer_output, save_printer
-from patchproof.channel.camera import lift_tone
 from patchproof.channel.effects import EFFECT_BY_NAME, Print
 from patchproof.channel.printer import Printer, identity_printer, load_printer, print_change, vary_print
 from patchproof.optimizer.loop import best_design

@@ -37,6 +37,12 @@ def srgb_from_linear(linear: ArrayOrTensor) -> ArrayOrTensor:
     return xp.sign(linear) * xp.where(size <= 0.0031308, 12.92 * size, curved)
 
 
+def lift_tone(codes, tone):
+    """Return code values after a phone's tone mapping: middle gray rises by `tone`, black and white stay."""
+    rise = 4 * tone
+    return codes * (1 + rise - rise * codes)  # codes + 4·tone·codes·(1 - codes)
+
+
 def clamp_to_unit(values):
     """Clip values to [0, 1] with a gradient of 1 at 0 and 1 themselves. `torch.clamp` has gradient 0 there since 2.14,
     and a fully black or white pixel could never change again.

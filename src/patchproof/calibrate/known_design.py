@@ -21,7 +21,14 @@ from patchproof.base.text import printable
 from patchproof.base.workers import open_workers
 from patchproof.calibrate.chart import printer_of
 from patchproof.calibrate.printer_files import printer_output
-from patchproof.channel.print_colors import CellColors, ShownColors, add_ink, fit_ink_and_photos, fit_shown_colors
+from patchproof.channel.print_colors import (
+    INK_TERMS,
+    CellColors,
+    ShownColors,
+    add_ink,
+    fit_ink_and_photos,
+    fit_shown_colors,
+)
 from patchproof.channel.printer import Printer, load_printer, node_colors
 from patchproof.evidence.batch import PhotoItem, measure_all
 from patchproof.evidence.camera import pinhole_photo
@@ -81,7 +88,7 @@ def calibrate_design(
             colors = len(np.unique(pixels.reshape(-1, 3) // 32, axis=0))
             do = "photograph a print of more colors, or the chart (patchproof sheet --template chart_a4)"
             raise Refused("a design of enough colors to tell a printer", f"{colors} that differ by an eighth", do)
-    alone = {each: float(np.median(_errors(photos, np.zeros((9, 3))))) for each, photos in cells.items()}
+    alone = {each: float(np.median(_errors(photos, np.zeros((INK_TERMS, 3))))) for each, photos in cells.items()}
     best = min(alone, key=lambda each: alone[each])
     photos, prior, count = cells[best], load_printer(best), len(set(numbers))
     ink, terms = fit_ink_and_photos(photos, shared_is_ink=True)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from patchproof.base.color import clamp_to_unit
+from patchproof.base.color import clamp_to_unit, lift_tone
 from patchproof.channel.effects import Sensor
 from patchproof.channel.tone import codes_of_light
 
@@ -83,12 +83,6 @@ def gains(sensor: Sensor, like: Tensor) -> Tensor:
 def encode_light(linear: Tensor, camera: "Camera | None" = None) -> Tensor:
     """Return clipped light as code values in [0, 1]."""
     return codes_of_light(clamp_to_unit(linear), camera)
-
-
-def lift_tone(codes: Tensor, tone: Tensor) -> Tensor:
-    """Return code values after a phone's tone mapping: middle gray rises by `tone`, black and white stay."""
-    rise = 4 * tone
-    return codes * (1 + rise - rise * codes)  # codes + 4·tone·codes·(1 - codes)
 
 
 def encode_light_by_table(linear: Tensor, camera: "Camera | None" = None) -> Tensor:

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from patchproof.base.color import LUMINANCE, lab_from_linear, linear_from_srgb, srgb_from_linear
+from patchproof.base.color import LUMINANCE, lab_from_linear, lift_tone, linear_from_srgb, srgb_from_linear
 
 INK_TERMS = 9
 _MOST_CELLS = 600  # of a photograph enter the fit
@@ -75,12 +75,7 @@ class ShownColors:
 
 def lift_light(light: np.ndarray, tone: float) -> np.ndarray:
     """Return light after a photograph's tone."""
-    return linear_from_srgb(lift_codes(srgb_from_linear(light), tone)) if tone else light
-
-
-def lift_codes(codes: np.ndarray, tone: float) -> np.ndarray:
-    """Return code values after a photograph's tone; black and white stay."""
-    return codes + 4 * tone * codes * (1 - codes)
+    return linear_from_srgb(lift_tone(srgb_from_linear(light), tone)) if tone else light
 
 
 def lower_light(light: np.ndarray, tone: float) -> np.ndarray:

@@ -17,10 +17,10 @@ from functools import lru_cache, partial
 import cv2
 import numpy as np
 
-from patchproof.base.color import LUMINANCE, srgb_from_linear
+from patchproof.base.color import LUMINANCE, lift_tone, srgb_from_linear
 from patchproof.base.geometry import apply_homography, rect_corners
 from patchproof.base.resample import index_homography
-from patchproof.channel.print_colors import ShownColors, add_ink, lift_codes, lower_light
+from patchproof.channel.print_colors import ShownColors, add_ink, lower_light
 from patchproof.evidence.appearance import fit_cells
 from patchproof.evidence.classify import BoxEdges, square_of
 from patchproof.evidence.print_fit import PhotographedDesign, fit_print
@@ -223,7 +223,7 @@ def reprojected_square(shot: PhotoSquare, look: np.ndarray, rect_mm: Rect, light
 
 
 def _codes(linear: np.ndarray, tone: float) -> np.ndarray:
-    return lift_codes(srgb_from_linear(linear), tone) if tone else srgb_from_linear(linear)
+    return lift_tone(srgb_from_linear(linear), tone) if tone else srgb_from_linear(linear)
 
 
 def _affected_part(shot: PhotoSquare, rect_mm: Rect) -> tuple[slice, slice]:
