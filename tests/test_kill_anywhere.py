@@ -3,6 +3,7 @@
 `python tests/test_kill_anywhere.py --kills N [--seed S] [--job NAME]` kills N times. A process imports once and forks
 for every run; a fork dies at its n-th change to the file system, or after a share of its processor time. `optimize`,
 `verify` and `study` are resumed, `sheet` and `reprint` done again.
+`--interrupts N` presses Ctrl-C N times, at any moment of the commands that take long, and finishes each.
 """
 
 from __future__ import annotations
@@ -13,8 +14,10 @@ import json
 import os
 import shutil
 import signal
+import subprocess
 import sys
 import tempfile
+import time
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -206,14 +209,83 @@ def kills(base: Path, count: int, seed: int = 0, job: str | None = None) -> Iter
             yield next(lines[i % len(lines)])
 
 
+SWALLOWS = "import time\nwhile True:\n    try:\n        time.sleep(9)\n    except BaseException:\n        pass"
+SETUP = "from patchproof.app import interrupt; interrupt.STOP_AFTER_S = 0.1; interrupt.handle_interrupts(); "
+
+
+@pytest.mark.parametrize("work", [SWALLOWS, "import swallows"], ids=["a library", "an import"])
+def test_ctrl_c_stops_what_swallows_it(work, tmp_path):
+    (tmp_path / "swallows.py").write_text(SWALLOWS)
+    code = f"{SETUP}print(flush=True)\n{work}"
+    with subprocess.Popen([sys.executable, "-c", code], cwd=tmp_path, stdout=-1, stderr=-1) as process:
+        assert process.stdout and process.stdout.readline()
+        time.sleep(0.05)
+        process.send_signal(signal.SIGINT)
+        _, error = process.communicate(timeout=2)
+    assert process.returncode == 130 and error == b"Stopped: nothing was written.\n"
+
+
+VERBS = {  # each with what it writes
+    "optimize": ("optimize scene.toml --out made --steps 20 --promise 8", "made"),
+    "promise": ("promise run --n 16", "run"),
+    "reprint": ("reprint sheet.pdf --run run --n 4 --out taken", "taken"),
+    "verify": ("verify photos --sheet sheet.json --out report", "report"),
+    "evaluate": ("evaluate run --n 16 --overwrite", "run"),
+}
+
+
+def interrupts(base: Path, count: int, seed: int) -> Iterator[str]:
+    """Interrupt the commands of `VERBS` in turn at random moments, and finish each; a line for each moment."""
+
+    def start(line: str, **options) -> subprocess.Popen[bytes]:
+        return subprocess.Popen([sys.executable, "-m", "patchproof", *line.split()], cwd=base, **options)
+
+    (base / "scene.toml").write_text(
+        'object = {mesh = "primitive:box_truck", length_mm = 400}\npatch = {width_mm = 90, height_mm = 90}\n'
+        'target = {label = "box truck", models = ["builtin"]}'
+    )
+    for line in (
+        "optimize scene.toml --out run --steps 4 --promise 16",
+        "sheet run --out sheet.pdf",
+        "reprint sheet.pdf --run run --n 4 --out photos",
+        "evaluate run --n 16",
+    ):
+        assert start(line).wait() == 0, line
+    rng, seconds, unbroken = np.random.default_rng(seed), {}, {}
+    for verb, (line, out) in VERBS.items():
+        begin = time.monotonic()
+        assert start(line).wait() == 0, line
+        seconds[verb], unbroken[verb] = time.monotonic() - begin, contents(base / out)
+        if out != "run":
+            shutil.rmtree(base / out)
+    for number in range(count):
+        verb = list(VERBS)[number % len(VERBS)]
+        line, out = VERBS[verb]
+        moment = float(rng.uniform(0.1, seconds[verb]))
+        process = start(line, stderr=-1, start_new_session=True)
+        time.sleep(moment)
+        os.killpg(process.pid, signal.SIGINT)
+        begin = time.monotonic()
+        _, error = process.communicate()
+        took, code = time.monotonic() - begin, process.returncode
+        again = " --resume" if "--resume" in error.decode() else ""
+        assert code == 0 or start(line + again).wait() == 0, (verb, moment, error)
+        same = contents(base / out) == unbroken[verb]
+        if out != "run":
+            shutil.rmtree(base / out)
+        yield f"{verb}: at {moment:.2f} of {seconds[verb]:.2f} s, code {code} after {took:.2f} s, same bytes: {same}"
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kills", type=int, default=20)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--job", choices=JOBS)
+    parser.add_argument("--interrupts", type=int, default=0)
     chosen = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
-        for line in kills(Path(name), chosen.kills, chosen.seed, chosen.job):
+        done = kills(Path(name), chosen.kills, chosen.seed, chosen.job)
+        for line in interrupts(Path(name), chosen.interrupts, chosen.seed) if chosen.interrupts else done:
             print(line, flush=True)
 
 

@@ -269,7 +269,8 @@ def run_pictures(place: Place, number: int) -> Use:
 
 
 def checkpoint(place: Place, number: int) -> Use:
-    from patchproof.optimizer.loop import CHECKPOINT_FILE, load_checkpoint
+    from patchproof.base.run_files import CHECKPOINT_FILE
+    from patchproof.optimizer.loop import load_checkpoint
 
     path = place.given / CHECKPOINT_FILE
     head = json.dumps({"a": {"dtype": "F32", "shape": [2**40], "data_offsets": [0, 2**42]}}).encode()

@@ -23,6 +23,7 @@ from patchproof.base.validation import (
     Side,
     StrictModel,
     check_ordered,
+    expand_path,
     read_toml,
     validate_model,
     within,
@@ -301,3 +302,13 @@ def load_scene_settings(path: str | Path) -> SceneSettings:
 def identity_settings(settings: StrictModel) -> dict[str, Any]:
     """The settings that a sheet id is computed from: no defaults, so that a new key with one changes no sheet id."""
     return settings.model_dump(mode="json", exclude={"promise"}, exclude_defaults=True)
+
+
+def named_paths(settings: SceneSettings, base: Path) -> dict[str, Path]:
+    """The files and folders that a scene's settings name, by key; relative ones are in `base`."""
+    thing, patch = settings.object, settings.patch
+    names = {f"object.{name}": getattr(thing, name) for name in ("mesh", "photos", "sheet", "images", "labels")}
+    names |= {"patch.mask": patch.mask, "patch.faces": patch.faces}
+    names |= {"background.images": settings.background.images}
+    names |= {"patch.search.keep_off_faces": patch.search.keep_off_faces}
+    return {key: Path(expand_path(name, base)) for key, name in names.items() if name is not None}

@@ -6,6 +6,7 @@ Out: text without characters that move a cursor or turn the direction of reading
 import csv
 import io
 import re
+import shlex
 import unicodedata
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -20,6 +21,11 @@ def printable(text: str) -> str:
     if text.isprintable():
         return text
     return "".join(_escape(c) if unicodedata.category(c) in _UNSEEN and c not in _JOINERS else c for c in text)
+
+
+def command_text(verb: str, *words: object) -> str:
+    """A command as a shell takes it, words with spaces in quotes."""
+    return shlex.join(["patchproof", verb, *map(str, words)])
 
 
 def drawable(text: str, has_glyph: Callable[[str], bool]) -> str:

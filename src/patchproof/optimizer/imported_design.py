@@ -24,19 +24,20 @@ from patchproof.base.geometry import MM_PER_INCH
 from patchproof.base.input import hash_file, is_file, read_json
 from patchproof.base.output import check_folder, new_folder
 from patchproof.base.progress import Progress, no_progress
-from patchproof.base.settings import NO_PAGE
+from patchproof.base.run_files import RUN_FILE
+from patchproof.base.settings import NO_PAGE, named_paths
 from patchproof.base.text import printable
 from patchproof.base.validation import summarize_names
 from patchproof.classifier.network import Classifier
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.optimizer.promise import PROMISE_VIEWS, PromiseOptions
-from patchproof.optimizer.run import RUN_FILE, RUN_FILE_PATTERNS, Run, finish_run, load_run, resolve_scene
+from patchproof.optimizer.run import RUN_FILE_PATTERNS, Run, finish_run, load_run, resolve_scene
 from patchproof.photo.detect import find_markers
 from patchproof.photo.read import list_photos, read_photo
 from patchproof.photo.rejection import PhotoRejected
 from patchproof.scene.interface import PieceScene, Scene, require_piece
-from patchproof.scene.scene import build_scene, named_paths
+from patchproof.scene.scene import build_scene
 from patchproof.sheets.manifest import design_sha256
 from patchproof.sheets.piece import Piece, marker_image
 
@@ -104,7 +105,7 @@ def import_patch(
     problem = replace(problem, subject=replace(problem.patch, design_px=fitted.shape[1::-1]))
     design = problem.patch.pixels(from_pixels(fitted, problem.device))
     record = asdict(_import_record(problem, file, sha256, pixels, fitted, design))
-    with new_folder(out, RUN_FILE_PATTERNS, overwrite, named_paths(scene).values()) as folder:
+    with new_folder(out, RUN_FILE_PATTERNS, overwrite, named_paths(scene.settings, scene.base).values()) as folder:
         run = finish_run(problem, design, folder, promise, progress, record | {"notes": said + record["notes"]})
     return replace(run, folder=out)
 

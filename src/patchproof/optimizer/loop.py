@@ -25,6 +25,7 @@ from patchproof.base.errors import Refused
 from patchproof.base.fingerprint import refuse_other_inputs
 from patchproof.base.input import is_file
 from patchproof.base.output import write_atomically
+from patchproof.base.run_files import CHECKPOINT_FILE
 from patchproof.base.settings import OptimizeSettings
 from patchproof.base.validation import StrictModel
 from patchproof.optimizer.expectation import Answer, expectation, gradient_in_views, task_conditions, training_views
@@ -37,7 +38,6 @@ SELECT_AFTER = 240
 SAVE_AFTER = 120  # training views that a kill can lose
 SELECT_VIEWS = 64
 _BETAS, _EPSILON = (0.9, 0.999), 1e-8  # Adam's own defaults
-CHECKPOINT_FILE = "checkpoint.safetensors"
 
 
 @dataclass(frozen=True)

@@ -28,12 +28,12 @@ from patchproof.base.fingerprint import refuse_other_inputs
 from patchproof.base.folder_lock import lock_folder
 from patchproof.base.input import is_file, read_file, read_json
 from patchproof.base.progress import Advance, Progress, no_progress
-from patchproof.base.settings import SceneSettings
+from patchproof.base.run_files import CHECKPOINT_FILE, RUN_FILE, require_finished_run
+from patchproof.base.settings import SceneSettings, named_paths
 from patchproof.base.validation import refuse_untrusted, validate_model
 from patchproof.base.version import __version__
 from patchproof.classifier.network import Classifier
 from patchproof.optimizer.loop import (
-    CHECKPOINT_FILE,
     SELECT_AFTER,
     State,
     is_save_step,
@@ -56,10 +56,10 @@ from patchproof.optimizer.subject import (
 )
 from patchproof.scene.interface import Scene
 from patchproof.scene.patch_scene import PatchScene
-from patchproof.scene.scene import build_scene, load_scene, named_paths
+from patchproof.scene.scene import build_scene, load_scene
 from patchproof.sheets.manifest import Promise
 
-_LOG_FILE, RUN_FILE, _VIEWS_FILE = ("steps.jsonl", "run.json", "views.png")
+_LOG_FILE, _VIEWS_FILE = "steps.jsonl", "views.png"
 _MAX_LINE_BYTES = 4096  # of the log
 _MESH_FILE = "given.glb"  # the mesh of a scene that was made in Python
 _STEP_FILES = (CHECKPOINT_FILE, _LOG_FILE, RUN_FILE, _VIEWS_FILE, _MESH_FILE, "place.*")
@@ -138,7 +138,7 @@ def optimize(
             scene, save_place, searched = _choose_place(scene, out, resume, search_options)
         problem = set_problem(scene, compute.device, models, loss, compute.jobs)
         refuse_other_inputs(searched, problem.inputs, out, scene.settings.model_dump())
-        output.refuse_inputs_in(out, named_paths(scene).values())
+        output.refuse_inputs_in(out, named_paths(scene.settings, scene.base).values())
         if not resume:
             output.clear_folder(out)  # everything that the new run needs has been read
         output.make_folder(out)
@@ -227,10 +227,7 @@ def load_run(folder: str | Path, trust: bool = False, named: Iterable[str] = ())
     loaded if they are code (`module:`) or downloads, unless they are all `named`.
     """
     folder = Path(folder)
-    if not is_file(folder / RUN_FILE):
-        has_checkpoint = is_file(folder / CHECKPOINT_FILE)
-        do = "finish it with --resume" if has_checkpoint else "name the folder that optimize wrote"
-        raise Refused("a finished run", f"{'an unfinished one' if has_checkpoint else 'none'} at {folder}", do)
+    require_finished_run(folder)
     details = read_json(folder / RUN_FILE, "a finished run", "optimize again")
     record = validate_model(_Record, details, str(folder / RUN_FILE))
     settings, promise = record.settings, record.promise

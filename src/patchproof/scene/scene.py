@@ -17,8 +17,8 @@ from patchproof.base.errors import Refused
 from patchproof.base.fingerprint import files_sha256, value_sha256
 from patchproof.base.input import is_file
 from patchproof.base.output import write_pictures
-from patchproof.base.settings import SceneSettings, load_scene_settings
-from patchproof.base.validation import expand_path, validate_model
+from patchproof.base.settings import SceneSettings, load_scene_settings, named_paths
+from patchproof.base.validation import validate_model
 from patchproof.channel.printer import load_printer
 from patchproof.scene.interface import Scene, SceneSource
 
@@ -126,18 +126,8 @@ def _fingerprints(scene: Scene) -> dict[str, str]:
     found = {"printer.profile": load_printer(scene.settings.printer.profile, scene.base).sha256}
     if scene.camera is not None:
         found["camera.file"] = value_sha256(scene.camera.model_dump(mode="json"))
-    paths = {key: path for key, path in named_paths(scene).items() if key not in scene.inputs}
+    paths = {key: path for key, path in named_paths(scene.settings, scene.base).items() if key not in scene.inputs}
     return found | {key: files_sha256([path]) for key, path in paths.items() if is_file(path)}
-
-
-def named_paths(scene: Scene) -> dict[str, Path]:
-    """Return the files and folders that a scene's settings name, by key."""
-    thing, patch = scene.settings.object, scene.settings.patch
-    names = {f"object.{name}": getattr(thing, name) for name in ("mesh", "photos", "sheet", "images", "labels")}
-    names |= {"patch.mask": patch.mask, "patch.faces": patch.faces}
-    names |= {"background.images": scene.settings.background.images}
-    names |= {"patch.search.keep_off_faces": patch.search.keep_off_faces}
-    return {key: Path(expand_path(name, scene.base)) for key, name in names.items() if name is not None}
 
 
 def module_of(settings: SceneSettings) -> str:

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 from typer import Argument, Exit, Option
 
 from patchproof.app.cli.console import Overwrite, names_of, progress, say, warn
+from patchproof.base.text import command_text
 
 SceneFile = Annotated[Path, Argument(help="The scene file (TOML).")]
 
@@ -31,11 +32,15 @@ def new(
     overwrite: Overwrite = False,
 ) -> None:
     """Write a commented scene for an object, photographs of it, or a folder of images."""
+    from patchproof.app.cli.files import require_path
+
+    if not thing.startswith("primitive:"):
+        require_path("a mesh file, primitive:NAME or a folder of pictures", thing)
     from patchproof.app.begin.new import new_scene
 
     network_names = names_of(models)
     lines = new_scene(thing, out, label=label, length_mm=length_mm, up=up, models=network_names, overwrite=overwrite)
-    say(*lines, f"scene: {out}", f"next: patchproof preview {out}")
+    say(*lines, f"scene: {out}", f"next: {command_text('preview', out)}")
 
 
 def preview(
@@ -52,7 +57,7 @@ def preview(
     if result.refused:
         print(result.refused, file=sys.stderr)
         raise Exit(1)
-    say(f"next: patchproof optimize {scene} --out run (--draft for a first look)")
+    say(f"next: {command_text('optimize', scene, '--out', 'run')} (--draft for a first look)")
 
 
 def plan(

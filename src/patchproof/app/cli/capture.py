@@ -7,6 +7,7 @@ from typing import Annotated
 from typer import Argument, Option
 
 from patchproof.app.cli.console import Models, Trust, names_of, progress, say
+from patchproof.base.text import command_text
 
 
 def capture(
@@ -40,7 +41,7 @@ def capture(
             serve_capture, sheet, out, run=run, models=names_of(models), camera=camera, lan=lan, trust=trust
         )
         report = serve(progress=lambda stage, done, total: bar(stage, done, total) if total else None, on_address=show)
-    controls = f" --controls {out / CONTROLS_FOLDER}" if report.controls else ""
+    words = [out, "--sheet", sheet, *(["--controls", out / CONTROLS_FOLDER] if report.controls else [])]
     if not load_manifest(sheet).markers:
-        controls += " --find" + f" --corners {out / CORNERS_FILE}" * (out / CORNERS_FILE).is_file()
-    say(*verdict_lines(report), f"report: patchproof verify {out} --sheet {sheet}{controls} --out report")
+        words += ["--find", *(["--corners", out / CORNERS_FILE] if (out / CORNERS_FILE).is_file() else [])]
+    say(*verdict_lines(report), f"report: {command_text('verify', *words, '--out', 'report')}")

@@ -11,12 +11,14 @@ import time
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from functools import wraps
+from functools import partial, wraps
 from pathlib import Path
 from typing import Annotated, Any
 
 from typer import BadParameter, Exit, Option, Typer
 
+from patchproof.app import interrupt
+from patchproof.app.cli.files import check_files
 from patchproof.base.errors import Refused
 from patchproof.base.output import disk_is_full
 from patchproof.base.text import printable
@@ -91,11 +93,13 @@ def as_command(verb: Callable[..., None]) -> Callable[..., None]:
 
     @wraps(verb)
     def command(**arguments: Any) -> None:
+        interrupt.stop_sentence[:] = [partial(_stop_sentence, arguments)]
         try:
+            check_files(arguments)
             with _on_free_cores(arguments):
                 verb(**arguments)
         except KeyboardInterrupt:
-            print(_stop_sentence(arguments), file=sys.stderr)
+            interrupt.say_stopped()
             raise Exit(130) from None
 
     return command

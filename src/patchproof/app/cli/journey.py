@@ -21,6 +21,7 @@ from patchproof.app.cli.console import (
     warn,
 )
 from patchproof.base.compute import Compute
+from patchproof.base.text import command_text
 
 PrintableControl = Literal["mean", "gray", "noise", "shuffled", "blank"]  # that can be printed
 PhotographedControl = Literal["bare", "mean", "gray", "noise"]  # that can hang on the object in place of the design
@@ -93,7 +94,7 @@ def optimize(
             say(*place_lines(place))
     say(f"run: {out}")
     if run.scene.settings.patch.kind == "patch":
-        say(f"next: patchproof sheet {out} --out sheet.pdf")
+        say(f"next: {command_text('sheet', out, '--out', 'sheet.pdf')}")
     raise Exit(1 if require == "better" and run.promise.comparison != "better" else 0)
 
 
@@ -113,7 +114,8 @@ def promise(
         finished_run = promise_run(run, views=n, trust=trust, compute=Compute(device, jobs or 1), progress=bar)
     say(*promise_lines(finished_run.promise, background_summary(finished_run.scene.settings.model_dump())))
     if finished_run.scene.settings.patch.kind == "patch":
-        say(f"next: patchproof sheet {run} --out sheet.pdf (a page that was written before has the former promise)")
+        hint = command_text("sheet", run, "--out", "sheet.pdf")
+        say(f"next: {hint} (a page that was written before has the former promise)")
 
 
 def sheet(

@@ -1,0 +1,56 @@
+"""Check the files that a command names before torch is imported, which takes seconds: a wrong path, a missing file or a
+wrong setting is answered at once. What a file holds is checked where it is read.
+"""
+
+import os
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from patchproof.base.errors import Refused
+from patchproof.base.run_files import require_finished_run
+from patchproof.base.settings import load_scene_settings, named_paths
+
+
+def check_files(arguments: Mapping[str, Any]) -> None:
+    """Refuse the first of a command's arguments whose file is missing, and settings and manifests that are wrong."""
+    for name, value in arguments.items():
+        check = _CHECKS.get(name)
+        paths = value if isinstance(value, list) else [value]
+        for path in paths if check is not None else ():
+            if isinstance(path, Path):
+                check(path)
+
+
+def require_path(expected: str, path: str | Path) -> None:
+    """Refuse a path at which there is neither a file nor a folder."""
+    if not os.path.exists(path):
+        raise Refused(expected, f"no file at {path}", "check the path")
+
+
+def _check_scene(path: Path) -> None:
+    settings = load_scene_settings(path)
+    paths = named_paths(settings, path.resolve().parent)
+    if Path(settings.printer.profile).suffix in (".npz", ".json"):
+        paths |= {"printer.profile": path.resolve().parent / settings.printer.profile}
+    for key, named in paths.items():
+        if ":" not in str(named.name):  # primitive:NAME
+            require_path(f"the file that {key} in {path} names", named)
+
+
+def _check_manifest(path: Path) -> None:
+    from patchproof.sheets.manifest import load_manifest
+
+    load_manifest(path)
+
+
+_CHECKS: Mapping[str, Callable[[Path], None]] = {
+    **dict.fromkeys(("run", "runs"), require_finished_run),
+    **dict.fromkeys(("photos", "more", "chart", "design"), partial(require_path, "photographs")),
+    **{name: partial(require_path, f"a file for --{name}") for name in ("icc", "corners", "boxes", "controls")},
+    "scene": _check_scene,
+    "sheet": _check_manifest,
+    "pdf": partial(require_path, "a sheet's PDF"),
+    "picture": partial(require_path, "a picture"),
+}

@@ -1,0 +1,56 @@
+"""Ctrl-C ends a command within two seconds, at any moment.
+
+A KeyboardInterrupt removes unfinished files on its way. But libraries swallow it while they are imported, or abort, and
+it waits for long calls into them. So within an import the process ends at once, and elsewhere a thread ends it
+after `STOP_AFTER_S`. That loses no more than a kill, which leaves nothing half done under a final name.
+"""
+
+import os
+import signal
+import socket
+import sys
+import threading
+import time
+from collections.abc import Callable
+from types import FrameType
+
+STOP_AFTER_S = 1.0
+stop_sentence: list[Callable[[], str]] = [lambda: "Stopped: nothing was written."]  # empty once it was said
+
+
+def handle_interrupts() -> None:
+    """Set up this process, before anything else is imported."""
+    receiver, sender = socket.socketpair()
+    sender.setblocking(False)
+    signal.set_wakeup_fd(sender.fileno(), warn_on_full_buffer=False)  # written to even while Python waits for a library
+    threading.Thread(target=_watch, args=(receiver, sender), daemon=True).start()
+    signal.signal(signal.SIGINT, _interrupt)
+
+
+def say_stopped() -> None:
+    """Print once what was kept, and show the cursor again, which a progress bar hides."""
+    if stop_sentence:
+        show_cursor = "\x1b[?25h" if sys.stderr.isatty() else ""
+        print(f"{show_cursor}{stop_sentence.pop()()}", file=sys.stderr, flush=True)
+
+
+def _interrupt(_: int, frame: FrameType | None) -> None:
+    while frame is not None:
+        if frame.f_code.co_filename.startswith("<frozen importlib"):
+            _end()
+        frame = frame.f_back
+    raise KeyboardInterrupt
+
+
+def _watch(receiver: socket.socket, _: socket.socket) -> None:
+    while signal.SIGINT not in receiver.recv(64):
+        pass
+    time.sleep(STOP_AFTER_S)
+    _end()
+
+
+def _end() -> None:
+    try:
+        say_stopped()
+    finally:
+        os._exit(130)
