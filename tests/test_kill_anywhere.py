@@ -238,6 +238,7 @@ def interrupts(base: Path, count: int, seed: int) -> Iterator[str]:
     """Interrupt the commands of `VERBS` in turn at random moments, and finish each; a line for each moment."""
 
     def start(line: str, **options) -> subprocess.Popen[bytes]:
+        options = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL} | options
         return subprocess.Popen([sys.executable, "-m", "patchproof", *line.split()], cwd=base, **options)
 
     (base / "scene.toml").write_text(

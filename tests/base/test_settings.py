@@ -10,7 +10,7 @@ from patchproof.base import packaged
 from patchproof.base.errors import Refused
 from patchproof.base.goal import Goal
 from patchproof.base.packaged import packaged_path
-from patchproof.base.settings import SceneSettings, identity_settings, load_scene_settings
+from patchproof.base.settings import SceneSettings, content_identity, identity_settings, load_scene_settings
 from patchproof.base.validation import StrictModel, expand_path, spelling_hint, validate_model
 from patchproof.sheets.manifest import Target
 
@@ -233,6 +233,29 @@ def test_only_what_differs_from_a_default_names_a_sheet(tmp_path):
     plain, spelled = (load_scene_settings(scene(tmp_path, extra=text)) for text in ("", "[optimize]\nsteps = 240"))
     other = load_scene_settings(scene(tmp_path, extra="[optimize]\nsteps = 241"))
     assert identity_settings(plain) == identity_settings(spelled) != identity_settings(other)
+
+
+def test_a_sheet_is_named_by_what_files_hold_and_not_by_how_their_paths_are_spelled(tmp_path):
+    """The printer's two files are one printer; a network, a camera and a mesh may lie anywhere."""
+    (tmp_path / "inner").mkdir()
+    for name, content in (("p.npz", "1"), ("p.json", "2"), ("c.json", "3"), ("n.onnx", "4"), ("m.obj", "5")):
+        (tmp_path / name).write_text(content)
+        (tmp_path / "inner" / name).write_text(content)
+
+    def identity(folder: str, printer: str) -> dict:
+        data = {
+            "object": {"mesh": f"{folder}m.obj", "length_mm": 100},
+            "patch": {"width_mm": 50, "height_mm": 50},
+            "target": {"label": "red", "models": [f"file:{folder}n.onnx", "builtin"]},
+            "printer": {"profile": f"{folder}{printer}"},
+            "camera": {"file": f"{folder}c.json"},
+        }
+        return content_identity(SceneSettings.model_validate(data), tmp_path)
+
+    first = identity("", "p.json")
+    assert first == identity("inner/", "p.npz") == identity("inner/../", "p.npz") == identity(f"{tmp_path}/", "p.json")
+    (tmp_path / "inner" / "p.npz").write_text("another")
+    assert identity("inner/", "p.json") != first and identity("inner/", "p.json")["target"]["models"][1] == "builtin"
 
 
 def test_settings_change_through_a_door_that_checks(tmp_path):

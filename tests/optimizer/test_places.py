@@ -13,6 +13,7 @@ from fake_networks import Bright
 from trimesh.triangles import closest_point
 
 import patchproof as pp
+from patchproof.app.compare import _views_of
 from patchproof.app.plan.lines import geometry_lines, measured_lines
 from patchproof.app.plan.plan import measured_plan, plan_geometry
 from patchproof.base.errors import Refused
@@ -311,6 +312,9 @@ def test_the_picture_shows_the_places_and_the_chosen_outline(tmp_path):
     picture = place_files._picture(place, scene.with_piece_at(place.at, 0)).getcolors(1 << 20)
     shown = {color for _, color in picture}
     assert {(253, 231, 37), (33, 145, 140), (68, 1, 84), (230, 0, 90)} <= shown
+    pixels = np.asarray(place_files._picture(place, scene.with_piece_at(place.at, 0)))
+    legend = {*map(tuple, pixels[-place_files._LEGEND_PX :].reshape(-1, 3))}
+    assert {(253, 231, 37), (68, 1, 84), (230, 0, 90), (255, 255, 255)} <= legend
 
 
 def test_plan_reports_the_search(tmp_path, monkeypatch, a_small_run):
@@ -321,7 +325,23 @@ def test_plan_reports_the_search(tmp_path, monkeypatch, a_small_run):
     assert f"chosen: at_mm = [{plan.place.at[0]:g}" in lines[lines.index("place") + 1]
 
 
-def test_middles_of_sides_that_views_face_are_places_however_the_piece_stands_there():
+def test_the_middle_of_a_side_keeps_to_the_limits_of_other_places():
+    """A step of 40 mm goes through the middle of the front: a card there would stand off by as much."""
+    step = trimesh.util.concatenate([trimesh.creation.box((150, 300, 20)), trimesh.creation.box((150, 300, 100))])
+    step.vertices[:8, 0] -= 75
+    step.vertices[8:, 0] += 75
+    spots = PlaceFinder(open_scene(mesh=step)).candidates(8)
+    assert spots and all(spot.placement.gap_mm <= 0.15 * 60 for spot in spots)
+
+
+def test_a_searched_place_and_the_default_side_have_the_same_views():
+    scene = open_scene()
+    default = scene.settings.changed(patch={"place": "given"})
+    side = pp.make_scene(default, trimesh.creation.box(PLATE), ".", 0)
+    assert _views_of(scene.with_piece_at((0.0, 20.0, 10.0), 0.0), True) == _views_of(side, True)
+
+
+def test_middles_of_sides_that_views_face_are_places_where_the_piece_fits():
     scene = open_scene()
     spots = PlaceFinder(scene).candidates(12)
     named = [spot for spot in spots if isinstance(spot.at, str)]

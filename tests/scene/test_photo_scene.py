@@ -14,7 +14,7 @@ from patchproof.base.color import LINEAR_FROM_CODE, srgb_from_linear
 from patchproof.base.errors import Refused
 from patchproof.base.geometry import apply_homography, intrinsics, look_at, plane_homography, rect_corners
 from patchproof.base.packaged import packaged_path
-from patchproof.base.settings import SceneSettings, identity_settings
+from patchproof.base.settings import SceneSettings, content_identity
 from patchproof.photo.rejection import PhotoRejected
 from patchproof.scene.conditions import with_values
 from patchproof.scene.paper_light import paper_light, quadratic_terms
@@ -163,7 +163,7 @@ def test_the_piece_is_the_blank_s_with_ids_of_its_own(world, scene):
     assert all("unreadable" in warning for warning in scene.warnings)
     # the id follows from the settings with the blank's size filled in, as a run keeps them, and from the photographs
     digest = _digest(scene.base / scene.settings.object.photos)
-    known = identity_settings(scene.settings) | {"blank": world.manifest.sheet_id, "photos": digest}
+    known = content_identity(scene.settings, scene.base) | {"blank": world.manifest.sheet_id, "photos": digest}
     assert sheet_id(known, 0) == scene.sheet_id != sheet_id(known, 1)
 
 
@@ -295,7 +295,10 @@ def test_photographs_that_cannot_be_used_are_named(world, tmp_path):
         build_scene(settings_of(world, object=object_), tmp_path, 0)
     (tmp_path / "sessions").mkdir()
     (tmp_path / "mixed").rename(tmp_path / "sessions" / "first")
-    with pytest.raises(Refused, match=r"0 usable of 0 in .*; 7 more in subfolders, which are not searched"):
+    told = (
+        r"got 5 usable of 7 in .*\(first/broken.jpg: unreadable; first/empty.png"  # a folder a place, as `verify` has
+    )
+    with pytest.raises(Refused, match=told):
         build_scene(settings_of(world, object={"photos": "sessions", "sheet": "BLANK.json"}), tmp_path, 0)
 
 

@@ -14,7 +14,7 @@ from patchproof.sheets.write import write_sheet
 
 def mount_run_sheet(run: Run, control: str | None = None) -> MountedSheet:
     """Mount the run's sheet, or a printed control's, without the page of instructions."""
-    return mount_content(set_stage(run.scene), content_of(run, None, control)[0])
+    return mount_content(set_stage(run.scene), content_of(run, None, control, run.folder)[0])
 
 
 def mount_content(stage: Stage, content: SheetContent) -> MountedSheet:

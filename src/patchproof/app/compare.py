@@ -14,6 +14,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from patchproof.base.compute import Compute
 from patchproof.base.errors import Refused
 from patchproof.base.intervals import estimate_difference, rate
@@ -28,6 +30,7 @@ from patchproof.optimizer.responses import Responses
 from patchproof.optimizer.run import Run, load_run
 from patchproof.report.tables import Drawing, Results, Table, Value, write_results
 from patchproof.scene.interface import Scene, require_piece
+from patchproof.scene.mesh_scene import MeshScene
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -127,6 +130,8 @@ def _views_of(scene: Scene, with_networks: bool) -> tuple[Any, ...]:
     settings = scene.settings.model_dump(mode="json", exclude={"patch", "optimize", "sheet"})
     if not with_networks:
         del settings["target"]["models"]
+    if isinstance(scene, MeshScene):  # a side and the patch in its middle are one front
+        settings["view"]["front"] = np.round([scene.frame.normal, scene.frame.up], 6).tolist()
     return settings, scene.base.resolve(), scene.mesh_glb
 
 

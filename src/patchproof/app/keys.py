@@ -100,7 +100,7 @@ def _document(name: str, about: str, settings: type[StrictModel], places: dict[t
             continue
         places[model] = f"{name}: `{path}`" if path else name
         lines += [_cell(model.__doc__ or ""), "", "| key | value | unit | default | meaning |", "|---|---|---|---|---|"]
-        lines += [_row(model, key, field) for key, field in model.model_fields.items()] + [""]
+        lines += [_row(model, key, field, path) for key, field in model.model_fields.items()] + [""]
     return "\n".join(lines)
 
 
@@ -114,11 +114,19 @@ def tables(model: type[BaseModel], path: str = "") -> Iterator[tuple[str, type[B
             yield from tables(inner, f"[[{inner_path}]]" if is_array else f"[{inner_path}]")
 
 
-def _row(model: type[BaseModel], key: str, field: FieldInfo) -> str:
-    kind = _kind(get_type_hints(model, include_extras=True)[key])
-    meaning = meanings(model).get(key, "its own table" if kind.startswith("table") else "")
+def _row(model: type[BaseModel], key: str, field: FieldInfo, path: str) -> str:
+    hint = get_type_hints(model, include_extras=True)[key]
+    kind, inner = _kind(hint), next(models_in(hint), None)
+    meaning = meanings(model).get(key, "" if inner is None else _example(inner, f"{path.strip('[]')}.{key}".strip(".")))
     cells = (f"`{key}`", kind, _UNITS.get(key.rpartition("_")[2], ""), default_text(field), meaning)
     return "| " + " | ".join(map(_cell, cells)) + " |"
+
+
+def _example(model: type[BaseModel], path: str) -> str:
+    """Where a table is described, and a line of it: its first key with a default to show."""
+    defaults = {key: default_text(field) for key, field in model.model_fields.items()}
+    shown = (f", as `{path}.{key} = {text[1:]}" for key, text in defaults.items() if text[0] == "`" and text != "`[]`")
+    return f"the table `[{path}]`{next(shown, '')}"
 
 
 def _cell(text: str) -> str:

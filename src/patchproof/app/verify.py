@@ -30,7 +30,7 @@ from patchproof.base.output import (
 from patchproof.base.progress import Progress, no_progress
 from patchproof.base.validation import refuse_untrusted
 from patchproof.channel.cameras import load_optional_camera
-from patchproof.channel.printer import load_printer
+from patchproof.channel.printer import printer_of_settings
 from patchproof.classifier.load import load_classifier
 from patchproof.classifier.network import Classifier
 from patchproof.evidence.batch import MAX_PICTURED_PHOTOS
@@ -204,7 +204,7 @@ def options_of(
         refuse_untrusted(sheet, [name for name in networks if isinstance(name, str) and name not in _by_name(models)])
     return Options(
         models=[load_classifier(each, base).with_least_score(least_score) for each in networks],
-        printer=load_printer((manifest.settings.get("printer") or {}).get("profile", "coated"), base),
+        printer=printer_of_settings(manifest.settings, base),
         camera=load_optional_camera(camera),
     )
 

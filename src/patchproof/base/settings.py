@@ -10,8 +10,11 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
+from patchproof.base.fingerprint import files_sha256, value_sha256
 from patchproof.base.goal import Goal
+from patchproof.base.input import is_file, is_folder
 from patchproof.base.validation import (
+    NETWORK_FILE,
     Finite,
     NotNegative,
     NotNegativeRange,
@@ -40,7 +43,7 @@ class ObjectSettings(StrictModel):
     mesh: str | None = None  # a file (OBJ, GLB, glTF, PLY, STL) or primitive:NAME
     length_mm: Positive | None = None  # a mesh's longest extent
     up: Literal["y", "z"] = "z"  # the axis of the mesh file that points up
-    photos: str | None = None  # a folder of photographs of the object with a blank sheet on it
+    photos: str | None = None  # a folder of photographs, or of folders, of the object with a blank sheet on it
     sheet: str | None = None  # the blank sheet's manifest
     images: str | None = None  # a folder of labeled images
     labels: str | None = None  # CSV: file name, label
@@ -312,3 +315,37 @@ def named_paths(settings: SceneSettings, base: Path) -> dict[str, Path]:
     names |= {"background.images": settings.background.images}
     names |= {"patch.search.keep_off_faces": patch.search.keep_off_faces}
     return {key: Path(expand_path(name, base)) for key, name in names.items() if name is not None}
+
+
+def content_identity(settings: SceneSettings, base: Path) -> dict[str, Any]:
+    """The identity of a scene's settings with a hash of the content of each file in place of its name: a draw does not
+    depend on how a path is spelled. Of a folder the names and sizes of its files are hashed.
+    """
+    identity = identity_settings(settings)
+    contents = {key: [path] for key, path in named_paths(settings, base).items()}
+    contents["sheet.template"] = [Path(settings.sheet.template)]
+    if settings.camera.file is not None:
+        contents["camera.file"] = [base / settings.camera.file]
+    if len(Path(settings.printer.profile).parts) > 1 or Path(settings.printer.profile).suffix:
+        printer = base / settings.printer.profile
+        contents["printer.profile"] = [printer.with_suffix(".npz"), printer.with_suffix(".json")]
+    for key, paths in contents.items():
+        *tables, name = key.split(".")
+        table = identity
+        for each in tables:
+            table = table.get(each, {})
+        if name in table:
+            table[name] = _content_sha256(paths) or table[name]
+    names = settings.target.models
+    networks = (NETWORK_FILE.fullmatch(expand_path(name, base)) for name in names)
+    shas = [match and _content_sha256([Path(match[2])]) for match in networks]
+    identity["target"]["models"] = [sha256 or name for name, sha256 in zip(names, shas, strict=True)]
+    return identity
+
+
+def _content_sha256(paths: list[Path]) -> str | None:
+    """A hash of files, or of one folder's names and sizes; None if there is none."""
+    if is_folder(paths[0]):
+        files = (path for path in paths[0].rglob("*") if path.is_file())
+        return value_sha256(sorted((path.relative_to(paths[0]).as_posix(), path.stat().st_size) for path in files))
+    return files_sha256(paths) if is_file(paths[0]) else None

@@ -2,7 +2,7 @@
 
 In: a `Place` and the scene with the piece there. Out: both files, and the place read back. The picture shows the object
 from four directions across the scene's azimuths, each place as a small square from yellow (the best) to purple (the
-worst), the drafted ones with their rank, and the chosen piece's outline at its size.
+worst), the drafted ones with their rank, and the chosen piece's outline at its size; a legend says so.
 """
 
 from collections.abc import Iterator
@@ -34,6 +34,7 @@ from patchproof.scene.unplaced_scene import UnplacedScene
 
 _RECORD_FILE, _PICTURE_FILE = "place.json", "place.png"
 _DIRECTIONS, _SIDE_PX = 4, 420
+_LEGEND_PX = 30  # height of the legend
 _MARGIN = 1.05  # times the object's diagonal
 _SQUARE_SHARE = 0.3  # a square's side, of the piece's
 _IN_FRONT_MM = 2.0  # a square's middle at most this deep behind the surface is visible
@@ -86,7 +87,18 @@ def _picture(place: Place, scene: PatchScene) -> Image.Image:
         if scene.placement.normal @ (geometry.camera_centers(pose[None])[0] - scene.placement.center_mm) > 0:
             draw.line([*map(tuple, geometry.project(scene.matrix_px(size), pose, outline))], _CHOSEN_COLOR, 4, "curve")
         panels.append(np.asarray(panel))
-    return Image.fromarray(np.concatenate(panels, 1))
+    picture = Image.fromarray(np.pad(np.concatenate(panels, 1), [(0, _LEGEND_PX), (0, 0), (0, 0)], constant_values=255))
+    draw, x = ImageDraw.Draw(picture), _LEGEND_PX // 2
+    count, drafted = len(place.candidates), sum(candidate.draft is not None for candidate in place.candidates)
+    entries = [(_color(0), f"best of {count} places"), (_color(0.5), "middle"), (_color(1), "worst")]
+    entries += [(None, f"1 to {drafted}: drafted, by rank")] if drafted else []
+    for color, words in [*entries, (_CHOSEN_COLOR, "outline: the piece where it goes")]:
+        if color is not None:
+            draw.rectangle((x, _SIDE_PX + 8, x + _LEGEND_PX - 16, _SIDE_PX + _LEGEND_PX - 8), color, (0, 0, 0))
+        at, font = (x + _LEGEND_PX, _SIDE_PX + _LEGEND_PX / 2), ImageFont.load_default(14)
+        draw.text(at, words, (0, 0, 0), font, "lm")
+        x = int(at[0] + font.getlength(words)) + _LEGEND_PX
+    return picture
 
 
 def _even_scene(scene: PatchScene) -> tuple[PatchScene, Conditions]:

@@ -28,7 +28,8 @@ from patchproof.optimizer.run import Run
 from patchproof.photo.read import Photo
 from patchproof.reprints.mounted_sheet import DEFAULT_SETUP, PhotoTruth, ReprintSetup, sheet_scene
 from patchproof.reprints.reprint import REPRINT_FILES, Reprint, write_truth
-from patchproof.sheets.pdf_raster import page_count, rasterize_page
+from patchproof.sheets.blank import BLANK
+from patchproof.sheets.pdf_raster import attached_manifest, page_count, rasterize_page
 
 PrintFunction = Callable[[np.ndarray], np.ndarray]  # N×3 sRGB sent → N×3 light of the print
 
@@ -73,7 +74,8 @@ def reprint_pages(
     pdf: str | Path, n: int, out: str | Path, how: ReprintSetup, *, seed: int | None = None, overwrite: bool = False
 ) -> None:
     """Write n photographs of the pages of a PDF, in turn, lying flat: for pages that belong to no run, such as blank
-    ones, charts and boards. `how` names their printer (None: coated) and the print's scale.
+    ones, charts and boards. `how` names their printer (None: coated) and the print's scale. Of a blank sheet only the
+    piece is photographed, since the rest is cut off: its markers would stand beside the later print's.
     """
     printer = load_printer(how.printer or PrinterSettings().profile)
 
@@ -82,9 +84,13 @@ def reprint_pages(
         return linear_from_srgb(printer.apply(sent)[0, :, :, 0].T.numpy())
 
     with new_folder(out, ("photo_*.jpg",), overwrite, (pdf,)) as folder:
-        pages = []
+        pages, manifest = [], attached_manifest(pdf)
         for number in range(page_count(pdf)):
-            light = page_light(rasterize_page(pdf, number + 1, PX_PER_MM * MM_PER_INCH), apply_printer)
+            pixels = rasterize_page(pdf, number + 1, PX_PER_MM * MM_PER_INCH)
+            if manifest.kind == BLANK:
+                x, y, width, height = (round(PX_PER_MM * side) for side in manifest.cut_mm)
+                pixels = pixels[y : y + height, x : x + width]
+            light = page_light(pixels, apply_printer)
             pages.append(cv2.resize(light, None, fx=how.print_scale[0], fy=how.print_scale[1]))
         for i in range(n):
             shot = photograph_page(pages[i % len(pages)], (seed or 0) + i)

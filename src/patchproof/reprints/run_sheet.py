@@ -5,10 +5,14 @@ The piece is the same on every template that has room for it, except for the ids
 template with `plan_page` says where the piece goes and how to photograph it. Pages without a run: see `sheets.blank`.
 """
 
-from collections.abc import Sequence
+import os
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+from patchproof.base.validation import NETWORK_FILE
+from patchproof.channel.printer import stored_printer
 from patchproof.optimizer.run import Run
 from patchproof.reprints.plan_view import draw_plan_view
 from patchproof.reprints.shot_plan import shot_sections
@@ -38,7 +42,7 @@ def sheet(
     Raises:
         Refused: where the piece does not fit the page.
     """
-    content, scene = content_of(run, template, control)
+    content, scene = content_of(run, template, control, Path(pdf_path).parent)
     page = page_template(scene.settings.sheet.template)
     plan = plan_of(scene, page, content) if page and page.plan_page else None
     if control == "blank":
@@ -53,26 +57,52 @@ def sheet_of_several(
     another is named.
     """
     name = template or runs[0].scene.settings.sheet.template
-    page, contents = load_template(name), [content_of(run, name, control) for run in runs]
+    page, contents = load_template(name), [content_of(run, name, control, Path(pdf_path).parent) for run in runs]
     plans = [plan_of(scene, page, content) for content, scene in contents] if page.plan_page else []
     from patchproof.sheets.multi_design import write_several
 
     return write_several(pdf_path, page, [content for content, _ in contents], plans)
 
 
-def content_of(run: Run, template: str | None, control: str | None) -> tuple[SheetContent, PieceScene]:
-    """Make the piece's content on that template: the run's design with its promise, or a control; and the scene."""
+def content_of(run: Run, template: str | None, control: str | None, folder: Path) -> tuple[SheetContent, PieceScene]:
+    """Make the piece's content on that template: the run's design with its promise, or a control; and the scene. The
+    sheet, in `folder`, carries a printer that has no name, and says where networks lie from there.
+    """
     scene = require_piece(run.scene)
     scene = scene if template is None else scene.with_template(template)
     settings = scene.settings.model_dump(mode="json") | {"seed": scene.seed, "printer_model": run.details["printer"]}
     if (imported := run.details.get("imported")) is not None:
         settings["imported"] = {name: imported[name] for name in ("file", "sha256")}
+    if (printer := stored_printer(scene.settings.printer.profile, scene.base)) is not None:
+        settings["printer_file"] = printer
+
+    def from_sheet(name: str) -> str:
+        match = NETWORK_FILE.fullmatch(name)
+        if match is None or "${" in name or Path(scene.base / match[2]).drive != folder.resolve().drive:
+            return name
+        return match[1] + Path(os.path.relpath(scene.base / match[2], folder)).as_posix()
+
+    settings = _without_folders(settings, from_sheet) | {"sheet": settings["sheet"]}
+    models = tuple(model.changed(name=from_sheet(model.name)) for model in run.promise.models)
     piece, bent = scene.piece, isinstance(scene, PatchScene) and not scene.placement.is_flat
     if control is not None:
         piece = with_ids(piece, scene.sheet_id, control)
         design = control_design(control, run.design, scene.sheet_id, piece)
         return SheetContent(piece, scene.sheet_id, control, design, settings=settings, bent=bent), scene
-    return SheetContent(piece, scene.sheet_id, "design", run.design, run.promise, settings, bent), scene
+    return SheetContent(
+        piece, scene.sheet_id, "design", run.design, run.promise.changed(models=models), settings, bent
+    ), scene
+
+
+def _without_folders(value: Any, from_sheet: Callable[[str], str]) -> Any:
+    """Copy settings without the folders of this machine: files by their names, networks as seen from the sheet."""
+    if isinstance(value, dict):
+        return {key: _without_folders(each, from_sheet) for key, each in value.items()}
+    if isinstance(value, list):
+        return [_without_folders(each, from_sheet) for each in value]
+    if not isinstance(value, str):
+        return value
+    return Path(value).name if Path(value).is_absolute() else from_sheet(value)
 
 
 def plan_of(scene: PieceScene, template: Template, content: SheetContent) -> PlanPage | None:

@@ -83,12 +83,11 @@ class PlaceFinder:
         return (0.0, 45.0) if np.isclose(width, height) else (0.0, 90.0, 45.0, 135.0)
 
     def _middle_of(self, side: Side) -> CandidatePlace | None:
-        """Return the middle of a side that views face, where a piece hangs by default; only `gap_mm` limits its gap."""
-        frame, patch = self._frame_at(side), self.scene.settings.patch
+        """Return the middle of a side that views face, where a piece hangs by default, if it fits."""
+        frame = self._frame_at(side)
         if self._facing(frame.origin_mm[None], frame.normal[None])[0] < _FACING_SHARE:
             return None
-        gap_mm = np.inf if patch.search.gap_mm is None else patch.search.gap_mm
-        return self._candidate(side, frame, 0.0, gap_mm, 1.0)
+        return self._candidate(side, frame, 0.0)
 
     def _facing(self, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
         """Return M shares of the views that face the points M×3."""
@@ -110,14 +109,12 @@ class PlaceFinder:
         frame_there = self._frame_at(at_mm)
         if frame_there.normal @ frame.normal < _SAME_SIDE_COSINE:
             return None
-        return self._candidate(at_mm, frame_there, spin_deg, self._gap_mm, placement.WARN_OVERHANG_SHARE)
+        return self._candidate(at_mm, frame_there, spin_deg)
 
-    def _candidate(
-        self, at: PiecePosition, frame: SurfaceFrame, spin_deg: float, gap_mm: float, overhang_share: float
-    ) -> CandidatePlace | None:
-        """Return the piece at a frame; None if it exceeds these limits or lies on a part that is to be kept free."""
+    def _candidate(self, at: PiecePosition, frame: SurfaceFrame, spin_deg: float) -> CandidatePlace | None:
+        """Return the piece at a frame; None if it stands off, overhangs or lies on a part that is to be kept free."""
         lay = placement_method(self.scene.settings.patch.bend)
-        piece = place_if_close(self.scene.mesh, frame, self.size_mm, spin_deg, lay, gap_mm, overhang_share)
+        piece = place_if_close(self.scene.mesh, frame, self.size_mm, spin_deg, lay, self._gap_mm)
         return None if piece is None or self._touches_forbidden(piece) else CandidatePlace(at, spin_deg, piece)
 
     def _move_to_level(self, frame: SurfaceFrame, spin_deg: float) -> np.ndarray | None:

@@ -32,17 +32,16 @@ def place_if_close(
     spin_deg: float,
     lay: PlacementMethod,
     gap_mm: float | None = None,
-    overhang_share: float = placement.WARN_OVERHANG_SHARE,
 ) -> Placement | None:
     """Place the piece with its middle at the frame's origin. None if that is refused, if the piece stands off farther
-    than `gap_mm` (by default the limit of the warning), or if more than `overhang_share` of it overhangs.
+    than `gap_mm` (by default the limit of the warning), or if it overhangs by more than the limit of the warning.
     """
     try:
         piece = lay(mesh, frame, size_mm, spin_deg)
     except Refused:
         return None
     limit_mm = placement.gap_limit_mm(size_mm) if gap_mm is None else gap_mm
-    return piece if piece.gap_mm <= limit_mm and piece.overhang_share <= overhang_share else None
+    return piece if piece.gap_mm <= limit_mm and piece.overhang_share <= placement.WARN_OVERHANG_SHARE else None
 
 
 def placement_advice(mesh: Mesh, patch: PatchSettings, lay: PlacementMethod, least_mm: float) -> str:

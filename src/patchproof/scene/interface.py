@@ -17,7 +17,7 @@ import numpy as np
 
 from patchproof.base.errors import Refused
 from patchproof.base.geometry import apply_homography, local_scales
-from patchproof.base.settings import SceneSettings, identity_settings
+from patchproof.base.settings import SceneSettings, content_identity
 from patchproof.channel.effects import ViewEffect
 from patchproof.scene.conditions import Conditions, Stream, draw
 from patchproof.sheets.piece import Piece, sheet_id
@@ -46,7 +46,7 @@ class SceneSource:
 
     def sheet_id(self, known: Mapping[str, str]) -> str:
         """Return the sheet id of the print, if any, else that of settings, seed and the `known` facts beside them."""
-        return self.printed_sheet_id or sheet_id(identity_settings(self.settings) | dict(known), self.seed)
+        return self.printed_sheet_id or sheet_id(content_identity(self.settings, self.base) | dict(known), self.seed)
 
 
 @dataclass(frozen=True)
@@ -147,7 +147,7 @@ class Scene(ABC):
 
     def _identified(self, settings: SceneSettings, known: Mapping[str, str]) -> Self:
         """Return the scene with the sheet id of these settings and other known facts."""
-        identity = sheet_id(identity_settings(settings) | dict(known), self.seed)
+        identity = sheet_id(content_identity(settings, self.base) | dict(known), self.seed)
         return replace(self, settings=settings, known=known, sheet_id=identity)._laid_out()
 
     def _laid_out(self) -> Self:

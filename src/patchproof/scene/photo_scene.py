@@ -181,7 +181,8 @@ def measure_photo(path: Path, manifest: Manifest, piece: Piece, photo_px: tuple[
 
 
 def _files(folder: Path) -> list[Path]:
-    inside = folder.iterdir() if is_folder(folder) else ()
+    """List a folder's photographs and those of the folders in it, which hold sessions as for `verify`."""
+    inside = (*folder.iterdir(), *folder.glob("*/*")) if is_folder(folder) else ()
     return sorted(path for path in inside if path.suffix.lower() in SUFFIXES and is_file(path))
 
 
@@ -200,20 +201,13 @@ def _load_all(folder: Path, manifest: Manifest, piece: Piece, photo_px) -> tuple
         try:
             photos.append(run_limited(measure_photo, path, manifest, piece, photo_px))
         except PhotoRejected as rejection:
-            rejected[path.name] = rejection.code
+            rejected[path.relative_to(folder).as_posix()] = rejection.code
     if len(photos) < MIN_PHOTOS:
         reasons = f" ({'; '.join(f'{name}: {code}' for name, code in rejected.items())})" if rejected else ""
         expected = f"at least {MIN_PHOTOS} photographs of the blank sheet on the object"
-        got = "; ".join([f"{len(photos)} usable of {len(files)} in {folder}{reasons}", *_subfolder_note(folder)])
+        got = f"{len(photos)} usable of {len(files)} in {folder}{reasons}"
         raise Refused(expected, got, "take more, sharp, with the whole flat sheet in view")
     return tuple(photos), rejected
-
-
-def _subfolder_note(folder: Path) -> list[str]:
-    """Mention photographs in subfolders, which hold sessions of a print for `verify`."""
-    folders = [p for p in folder.iterdir() if is_folder(p)] if is_folder(folder) else []
-    count = sum(len(_files(subfolder)) for subfolder in folders)
-    return [f"{count} more in subfolders, which are not searched (put all into one folder)"] if count else []
 
 
 def _locate(srgb: np.ndarray, manifest: Manifest, side_mm: float) -> tuple[PageFit, float]:

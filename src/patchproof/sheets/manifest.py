@@ -234,6 +234,7 @@ _VerifiedSettings = _table(
     camera=(_table("_Camera", noise=(NotNegativeRange, ()), photo_px=(tuple[Count, Count] | None, None)), None),
     target=(_table("_Target", label=(str | int, ""), accept=(tuple[str | int, ...], ())), None),
     sheet=(_table("_Sheet", template=(str, ""), markers=(bool, True)), None),
+    printer_file=(_table("_PrinterFile", npz=str, head=dict[str, Any]) | None, None),  # of a printer without a name
     imported=(_table("_Imported", file=str, sha256=str) | None, None),  # a design that was made elsewhere
 )
 

@@ -34,7 +34,7 @@ _GLTF = (".glb", ".gltf")
 UpAxis = Literal["y", "z"]
 _USUAL_UP: dict[str, UpAxis] = {".obj": "y", ".stl": "z", ".ply": "z"}
 _MM_PER_M = 1000.0
-_LENGTH_RANGE_MM = (5.0, 30_000.0)  # of objects that people put paper on
+_LENGTH_RANGE_MM = (5.0, 6_000.0)  # of objects that people put paper on, up to a van; a mug of 12 m has other units
 _GROUND_SHARE = 0.005  # of the object's height: lower points touch the ground
 _LEAST_FOOTING = 0.25  # of the footprint: a lying cylinder touches 14 % of it by these rules, a standing one 79 %
 _FOOTING_RATIO = 2.0  # from which on the other axis is clearly better
@@ -107,7 +107,8 @@ def guess_length_mm(path: Path) -> float:
     length_mm = file_length(path) * _MM_PER_M
     low, high = _LENGTH_RANGE_MM
     if not low <= length_mm <= high:
-        raise Refused(f"an object of {low:g} mm to {high / 1000:g} m", f"{length_mm:.3g} mm by the file's units", do)
+        got = f"{length_mm:.4g} mm by the units of {path.name}"
+        raise Refused(f"an object of {low:g} mm to {high / 1000:g} m", got, f"{do}: {length_mm:.4g} if that is right")
     return float(f"{length_mm:.3g}")
 
 

@@ -200,6 +200,8 @@ def measure_terms(
         if small_terms:
             (pictures,) = _squares(problem, photo_px, setup, [], add_views)
             together = float((_confidence(problem, pictures, boxes) - confidence).abs().mean())
+        else:
+            add_views(len(conditions))  # the third look, of all that can go, is of nothing
     views, mean = len(conditions), float(confidence.mean())
     return Terms(views=views, confidence=mean, threshold=threshold, errors=tuple(errors.values()), together=together)
 
