@@ -23,6 +23,7 @@ from patchproof.evidence.results import (
     PHOTO_KEYS,
     Control,
     LedgerShare,
+    ModelRate,
     Origin,
     PhotoEntry,
     Prediction,
@@ -329,3 +330,10 @@ def test_what_was_not_measured_how_often_was_looked_and_which_folders_are_one_is
     result = Evaluation(n=1, seed=0, models={}, not_measured={"AP50 of net": "no box"})
     assert evaluation_lines(result.model_dump()) == ["not measured: AP50 of net (no box)"]
     assert json.loads(result.to_json())["not_measured"] == {"AP50 of net": "no box"}
+
+
+def test_networks_that_were_named_stand_below_the_promise_s_own():
+    rates = {"builtin": ModelRate(rate=0.5, interval=(0.4, 0.6)), "detector": ModelRate(rate=0.25, interval=(0.1, 0.4))}
+    summary = some_report().summary.changed(models=rates)
+    lines = verdict_lines(some_report().changed(summary=summary))
+    assert "  also detector: 25.0% [10.0%, 40.0%]" in lines and not any("also builtin" in line for line in lines)

@@ -139,6 +139,8 @@ def verdict_lines(report: Any) -> list[str]:
         lines.append(looks_sentence(data))
     if summary.rate is not None:
         lines.append("recognized: {:.1%} [{:.1%}, {:.1%}]".format(summary.rate, *summary.interval))
+    others = [item for item in list(summary.models.items())[1:] if item[1].rate is not None]
+    lines += ["  also {}: {:.1%} [{:.1%}, {:.1%}]".format(name, rate.rate, *rate.interval) for name, rate in others]
     if summary.prediction_interval is not None:
         lines.append("promised: {} to {} of {}".format(*summary.prediction_interval, summary.judged))
     if (forecast := summary.forecast) is not None:

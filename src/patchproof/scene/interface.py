@@ -274,6 +274,14 @@ class PieceScene(Scene):
         return {"piece_mm": piece.size_mm, "marker_mm": piece.marker_mm, "unreadable_share": self.unreadable_share}
 
 
+def measurable_text(unreadable_share: float, marker_mm: float) -> str:
+    """Say how many of a user's photographs can be measured."""
+    return (
+        f"about {1 - unreadable_share:.0%} of photographs can be measured: in others markers of {marker_mm:.1f} mm are "
+        "too small or turned away"
+    )
+
+
 def require_piece(scene: Scene, do: str = "take object.glb and textures from the run") -> PieceScene:
     """Return the scene as one with a printed piece; refused if only the object's own texture changes."""
     if isinstance(scene, PieceScene):

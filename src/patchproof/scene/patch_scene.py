@@ -147,32 +147,45 @@ def _place_piece(scene: MeshScene, lay: PlacementMethod) -> tuple[Piece, Placeme
     except Refused as refused:
         raise refused.with_advice(placement_advice(mesh, patch, lay, smallest_piece_mm())) from refused
     scales = _smallest_scales(scene, placement)
-    if not len(scales):
+    if not (facing := scales[scales > 0]).size:
         got = f"{SCALE_VIEWS} views from behind it"
         raise Refused("views from which the patch can be seen", got, "turn azimuth_deg towards the patch")
-    needed_mm = float(MARKER_MODULES * interface.PX_PER_MODULE / np.quantile(scales, 1 - interface.READABLE_SHARE))
+    needed_mm = float(MARKER_MODULES * interface.PX_PER_MODULE / np.quantile(facing, 1 - interface.READABLE_SHARE))
     marker_mm = marker_size_mm(needed_mm, patch.size_mm) if settings.sheet.markers else 0.0
     piece = lay_out_piece(patch.size_mm, marker_mm, scene.sheet_id, "design", patch.bend)
     refuse_larger_than_page(page_template(settings.sheet.template), piece)  # before hours of optimizing
+    if piece.markers and not placement.is_flat:  # paper is unrolled by all markers; on a card one tells the others
+        scales = _smallest_scales_of_markers(scene, placement, piece)
     unreadable = float((scales * piece.module_mm < interface.PX_PER_MODULE * 0.999).mean()) if piece.markers else 0.0
     notes = (*mesh.warnings, *scene.backgrounds.notes, *placement.warnings)
     if unreadable > 1 - interface.READABLE_SHARE:
-        notes += (
-            f"markers of {marker_mm:.1f} mm, the largest that fit, will be unreadable in {unreadable:.0%} of the "
-            f"views: view.distance_mm and camera.photo_px ask for {needed_mm:.1f} mm, and those for a piece of "
-            f"{smallest_piece_mm(needed_mm)} mm or more; come nearer, or take larger photographs",
-        )
+        advice = "narrow view.azimuth_deg and view.elevation_deg, or make the piece smaller"
+        if needed_mm > marker_mm + 0.05:
+            advice = (
+                f"view.distance_mm and camera.photo_px ask for {needed_mm:.1f} mm, and those for a piece of "
+                f"{smallest_piece_mm(needed_mm)} mm or more; come nearer, or take larger photographs"
+            )
+        notes += (f"{interface.measurable_text(unreadable, marker_mm)}: {advice}",)
     return piece, placement, unreadable, notes
 
 
 def _smallest_scales(scene: MeshScene, card: Placement) -> np.ndarray:
-    """Return px per mm at the card's middle, along the foreshortened direction, over views that face it."""
+    """Return px per mm at the card's middle, along the foreshortened direction, in each view; 0 from behind."""
     conditions = scene.draw("select", SCALE_VIEWS, 0)
     center_mm, matrix = card.center_mm, scene.matrix_px(scene.photo_px)
     poses = camera_poses(scene, center_mm, conditions.pose)
-    poses = poses[(geometry.camera_centers(poses) - center_mm) @ card.normal > 0]
-    if not len(poses):
-        return np.zeros(0)
+    faces = (geometry.camera_centers(poses) - center_mm) @ card.normal > 0
     planes = geometry.plane_homography(matrix, poses, card.world_from_piece)
     mean, tilt_deg = geometry.local_scales(planes, np.array(card.size_mm) / 2).T
-    return mean * np.sqrt(np.cos(np.radians(tilt_deg)))
+    return np.where(faces, mean * np.sqrt(np.cos(np.radians(tilt_deg))), 0.0)
+
+
+def _smallest_scales_of_markers(scene: MeshScene, placement: Placement, piece: Piece) -> np.ndarray:
+    """Return the px per mm of each view at the worst marker, along the foreshortened direction; 0 from behind."""
+    middles_mm = np.array([np.mean(marker.corners_mm, 0) for marker in piece.markers])
+    vertices = np.linalg.norm(placement.piece_mm - middles_mm[:, None], axis=2).argmin(1)
+    poses = camera_poses(scene, placement.center_mm, scene.draw("select", SCALE_VIEWS, 0).pose)
+    rays = geometry.camera_centers(poses)[:, None] - placement.world(middles_mm)
+    distances = np.linalg.norm(rays, axis=2)
+    cosines = (rays * placement.normals[vertices]).sum(2) / distances
+    return (scene.matrix_px(scene.photo_px)[0, 0] * cosines.clip(0) / distances).min(1)

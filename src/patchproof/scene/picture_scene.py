@@ -21,7 +21,7 @@ from patchproof.base.geometry import rect_corners, scaling_about
 from patchproof.base.resample import halving_pyramid, index_homography
 from patchproof.base.settings import SceneSettings
 from patchproof.scene.conditions import Conditions, Stream
-from patchproof.scene.interface import PX_PER_MODULE, READABLE_SHARE, PieceScene
+from patchproof.scene.interface import PX_PER_MODULE, READABLE_SHARE, PieceScene, measurable_text
 from patchproof.sheets.piece import Piece
 
 VIEWS_TRIED = 256  # for statistics over a scene's views
@@ -81,7 +81,7 @@ class PictureScene(PieceScene):
         share = self.unreadable_share
         if share <= 1 - READABLE_SHARE:
             return self.notes
-        return (*self.notes, f"markers of {self.piece.marker_mm:.1f} mm will be unreadable in {share:.0%} of the views")
+        return (*self.notes, measurable_text(share, self.piece.marker_mm))
 
 
 @dataclass(frozen=True)

@@ -104,12 +104,12 @@ def guess_length_mm(path: Path) -> float:
     if path.suffix.lower() not in _GLTF:
         got = f"{path.name}, which has no units"
         raise Refused("a file that says how large the object is", got, f"{do}: {file_length(path):.3g} if it is in mm")
-    length_mm = file_length(path) * _MM_PER_M
+    length_mm = float(f"{file_length(path) * _MM_PER_M:.3g}")
     low, high = _LENGTH_RANGE_MM
     if not low <= length_mm <= high:
-        got = f"{length_mm:.4g} mm by the units of {path.name}"
-        raise Refused(f"an object of {low:g} mm to {high / 1000:g} m", got, f"{do}: {length_mm:.4g} if that is right")
-    return float(f"{length_mm:.3g}")
+        got = f"{length_mm:g} mm by the units of {path.name}"
+        raise Refused(f"an object of {low:g} mm to {high / 1000:g} m", got, f"{do}: {length_mm:g} if that is right")
+    return length_mm
 
 
 def file_length(path: Path) -> float:

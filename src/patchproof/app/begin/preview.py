@@ -178,7 +178,7 @@ def _facts(scene: Scene, settings: SceneSettings) -> list[tuple[str, str]]:
             f"{placement['overhang_share']:.0%} overhangs; stretch {placement['stretch']:.2%}"
         )
         facts.append(("piece", f"{placement['family']}, {size}, facing {SIDE_NAMES[side]} ({side}): {fit}"))
-        readable = f"unreadable in {scene.unreadable_share:.0%} of views"
+        readable = f"about {1 - scene.unreadable_share:.0%} of photographs can be measured"
         facts.append(("markers", f"{scene.piece.marker_mm:.1f} mm, {readable}" if scene.piece.markers else "none"))
     else:
         facts.append(("piece", "not placed" if isinstance(scene, UnplacedScene) else f"{size}: {placement['reason']}"))

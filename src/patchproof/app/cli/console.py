@@ -41,7 +41,7 @@ Cluster = Annotated[str | None, Option(help="A Dask scheduler's address, in plac
 Trust = Annotated[
     bool, Option("--trust", help="Use code, downloads and variables that the run or sheet names: you know who made it.")
 ]
-Models = Annotated[str | None, Option(help="Comma-separated classifiers in place of the sheet's own.")]
+Models = Annotated[str | None, Option(help="Comma-separated classifiers; a sheet's first one still judges.")]
 
 # how torch, OpenCV and the system say that there is none; numpy and Python raise a MemoryError
 _NO_MEMORY = re.compile(

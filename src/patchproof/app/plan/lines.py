@@ -72,7 +72,8 @@ def _marker_lines(markers: Markers) -> list[str]:
     note = "" if markers.printed_mm > 0.95 * markers.needed_mm else " (all that page, object or blank allows)"
     return [
         f"  needed {markers.needed_mm:.1f} mm ({PX_PER_MODULE:g} px per module at the {READABLE_SHARE:.0%} point of "
-        f"the views), printed {markers.printed_mm:.1f} mm{note}; unreadable in {markers.unreadable_share:.0%} of views"
+        f"the views), printed {markers.printed_mm:.1f} mm{note}; "
+        f"about {1 - markers.unreadable_share:.0%} of photographs can be measured"
     ]
 
 
