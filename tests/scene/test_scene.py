@@ -17,7 +17,7 @@ from patchproof.render.pixels import PiecePicture
 from patchproof.render.stage import set_stage
 from patchproof.render.views import render_views
 from patchproof.scene.conditions import with_values
-from patchproof.scene.scene import load_scene
+from patchproof.scene.scene import load_scene, make_scene
 from patchproof.sheets.markers import MARKER_MODULES
 from patchproof.sheets.piece import marker_image, with_ids
 
@@ -56,6 +56,24 @@ def test_markers_follow_from_the_views(tmp_path):
     assert near.unreadable_share <= 0.05 < far.unreadable_share
     assert far.piece.marker_mm == pytest.approx(19.5)  # 0.29 × 90 = 26.1 mm for a corner; (26.1 - 1) × 7/9 = 19.52
     assert any("can be measured: in others markers of 19.5 mm are too small" in warning for warning in far.warnings)
+
+
+def test_the_outer_markers_of_bent_paper_turn_away_before_its_middle_does():
+    """Paper over 100° of a can: from 60° to a side its far markers face 110° away, its middle is seen."""
+    can = trimesh.creation.cylinder(40, 120, sections=48)
+
+    def unreadable(azimuth_deg: list[float]) -> float:
+        settings = {
+            "object": {"mesh": can, "length_mm": 120},
+            "patch": {"width_mm": 70, "height_mm": 70, "bend": True},
+            "target": {"label": "mug", "models": ["builtin"]},
+            "view": {"distance_mm": [300, 310], "azimuth_deg": azimuth_deg, "elevation_deg": [0, 5]},
+            "background": {"color": [0, 0, 0]},
+            "camera": {"photo_px": [4000, 3000]},
+        }
+        return make_scene(settings).unreadable_share
+
+    assert unreadable([-10, 10]) == 0 and unreadable([50, 60]) == 1
 
 
 def test_another_template_is_the_scene_made_for_it_and_nothing_is_loaded_again(tmp_path, monkeypatch):

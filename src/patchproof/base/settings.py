@@ -321,25 +321,19 @@ def content_identity(settings: SceneSettings, base: Path) -> dict[str, Any]:
     """The identity of a scene's settings with a hash of the content of each file in place of its name: a draw does not
     depend on how a path is spelled. Of a folder the names and sizes of its files are hashed.
     """
-    identity = identity_settings(settings)
+    identity, printer, file = identity_settings(settings), settings.printer.profile, settings.camera.file
     contents = {key: [path] for key, path in named_paths(settings, base).items()}
-    contents["sheet.template"] = [Path(settings.sheet.template)]
-    if settings.camera.file is not None:
-        contents["camera.file"] = [base / settings.camera.file]
-    if len(Path(settings.printer.profile).parts) > 1 or Path(settings.printer.profile).suffix:
-        printer = base / settings.printer.profile
-        contents["printer.profile"] = [printer.with_suffix(".npz"), printer.with_suffix(".json")]
+    contents |= {} if file is None else {"camera.file": [base / file]}
+    if Path(printer).suffix:
+        contents["printer.profile"] = [(base / printer).with_suffix(suffix) for suffix in (".npz", ".json")]
     for key, paths in contents.items():
         *tables, name = key.split(".")
         table = identity
         for each in tables:
-            table = table.get(each, {})
-        if name in table:
-            table[name] = _content_sha256(paths) or table[name]
-    names = settings.target.models
-    networks = (NETWORK_FILE.fullmatch(expand_path(name, base)) for name in names)
-    shas = [match and _content_sha256([Path(match[2])]) for match in networks]
-    identity["target"]["models"] = [sha256 or name for name, sha256 in zip(names, shas, strict=True)]
+            table = table[each]
+        table[name] = _content_sha256(paths) or table[name]
+    matches = {name: NETWORK_FILE.fullmatch(expand_path(name, base)) for name in settings.target.models}
+    identity["target"]["models"] = [(match and _content_sha256([Path(match[2])])) or n for n, match in matches.items()]
     return identity
 
 

@@ -8,12 +8,10 @@ them too. Print-to-print variation is a small function on top, `vary_print`. Lef
 what a camera resolves beyond 0.2 mm per pixel) and ink spread.
 """
 
-import base64
 import hashlib
 import io
 import math
 import zipfile
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -141,47 +139,26 @@ def load_printer(name_or_file: str, base: Path | None = None) -> Printer:
     return _read(packaged_path("calibration", "printers", f"{name_or_file}.npz"))
 
 
-def stored_printer(name_or_file: str, base: Path) -> dict[str, Any] | None:
-    """Return both files of a printer as JSON values, to carry it by value; None for a printer that has a name."""
-    path = base / name_or_file
-    if path.suffix.lower() not in {".npz", ".json"} and len(Path(name_or_file).parts) == 1:
-        return None
-    tables, head = _files(path)
-    return {"npz": base64.b64encode(tables).decode(), "head": head}
-
-
-def printer_of_settings(settings: Mapping[str, Any], base: Path) -> Printer:
-    """Return the printer of a sheet's settings: the one that they carry, or else the one that they name."""
-    if (stored := settings.get("printer_file")) is not None:
-        try:
-            tables = base64.b64decode(stored["npz"], validate=True)
-        except ValueError as error:
-            raise Refused("a printer's tables in base64", f"other text ({error})", "make the sheet again") from error
-        return _printer(tables, stored["head"], "the sheet's printer")
-    return load_printer((settings.get("printer") or {}).get("profile", "coated"), base)
-
-
 def _read(path: Path) -> Printer:
-    return _printer(*_files(path), str(path))
+    return printer_of_files(*printer_files(path), path)
 
 
-def _files(path: Path) -> tuple[bytes, Any]:
-    """Return a printer's NAME.npz, and NAME.json as JSON values."""
-    expected = "a printer as NAME.npz with NAME.json beside it"
-    return read_file(path.with_suffix(".npz"), expected), read_json(
-        path.with_suffix(".json"), expected, "calibrate again"
-    )
+def printer_files(path: Path) -> tuple[bytes, Any]:
+    """Return what a printer's NAME.npz and NAME.json hold."""
+    expected, text = "a printer as NAME.npz with NAME.json beside it", path.with_suffix(".json")
+    return read_file(path.with_suffix(".npz"), expected), read_json(text, expected, "calibrate again")
 
 
-def _printer(stored: bytes, description: Any, source: str) -> Printer:
-    head = validate_model(PrinterHead, description, source)
+def printer_of_files(stored: bytes, description: Any, path: str | Path) -> Printer:
+    """Make a printer of what its two files hold; `path` names them in a refusal."""
+    head = validate_model(PrinterHead, description, str(path))
     try:
         with zipfile.ZipFile(io.BytesIO(stored)) as archive:
             lut = _array(archive, "lut", (SIZE, SIZE, SIZE, 3), (np.uint8, np.uint16))
             gamut = _array(archive, "gamut", (SIZE, SIZE, SIZE), (np.uint8,))
     except Exception as error:  # zip, deflate, LZMA and NumPy's header: each fails in its own way
         reason = " ".join(str(error).split()).rstrip(".")[:100]
-        raise Refused("a printer's tables", f"{source} that cannot be read ({reason})", "calibrate again") from error
+        raise Refused("a printer's tables", f"{path} that cannot be read ({reason})", "calibrate again") from error
     lut_srgb = torch.tensor(lut / np.iinfo(lut.dtype).max, dtype=torch.float32)
     distances = torch.tensor(gamut / GAMUT_STEPS, dtype=torch.float32)
     return Printer(head.name, head.method, lut_srgb, distances, head.paper, head.provenance)

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 from patchproof.base.validation import NETWORK_FILE
-from patchproof.channel.printer import stored_printer
 from patchproof.optimizer.run import Run
 from patchproof.reprints.plan_view import draw_plan_view
 from patchproof.reprints.shot_plan import shot_sections
@@ -73,8 +72,10 @@ def content_of(run: Run, template: str | None, control: str | None, folder: Path
     settings = scene.settings.model_dump(mode="json") | {"seed": scene.seed, "printer_model": run.details["printer"]}
     if (imported := run.details.get("imported")) is not None:
         settings["imported"] = {name: imported[name] for name in ("file", "sha256")}
-    if (printer := stored_printer(scene.settings.printer.profile, scene.base)) is not None:
-        settings["printer_file"] = printer
+    if Path(profile := scene.settings.printer.profile).suffix:
+        from patchproof.channel.carried_printer import carried_printer
+
+        settings["printer_file"] = carried_printer(scene.base / profile)
 
     def from_sheet(name: str) -> str:
         match = NETWORK_FILE.fullmatch(name)

@@ -3,13 +3,17 @@
 from dataclasses import dataclass
 from typing import ClassVar
 
+import numpy as np
+
+from patchproof.base import geometry
 from patchproof.base.errors import Refused
 from patchproof.scene.bend import place_bent, placement_method
-from patchproof.scene.interface import Scene, SceneSource
-from patchproof.scene.mesh_scene import load_bare
+from patchproof.scene.interface import SCALE_VIEWS, Scene, SceneSource
+from patchproof.scene.mesh_scene import MeshScene, camera_poses, load_bare
 from patchproof.scene.patch_scene import PatchScene
 from patchproof.scene.placement import Placement, PlacementMethod, patch_frame
 from patchproof.scene.tape_measure import TapeMeasurement, measure_tapes
+from patchproof.sheets.piece import Piece
 
 
 @dataclass(frozen=True)
@@ -46,3 +50,14 @@ def placement_with_other_bend(scene: Scene) -> tuple[Placement | None, str | Non
         return None, f"bend = {flag} would be a card, too: leave bend out"
     gaps = f"{other.gap_mean_mm:.2f} mm off the surface on average, here {placement.gap_mean_mm:.2f} mm"
     return other, f"bend = {flag} would be a {other.family} (stretch {other.stretch:.2%}), {gaps}"
+
+
+def smallest_marker_scales(scene: MeshScene, placement: Placement, piece: Piece) -> np.ndarray:
+    """Return the px per mm of each view at the worst marker, along the foreshortened direction; 0 from behind."""
+    middles_mm = np.array([np.mean(marker.corners_mm, 0) for marker in piece.markers])
+    vertices = np.linalg.norm(placement.piece_mm - middles_mm[:, None], axis=2).argmin(1)
+    poses = camera_poses(scene, placement.center_mm, scene.draw("select", SCALE_VIEWS, 0).pose)
+    rays = geometry.camera_centers(poses)[:, None] - placement.world(middles_mm)
+    distances = np.linalg.norm(rays, axis=2)
+    cosines = (rays * placement.normals[vertices]).sum(2) / distances
+    return (scene.matrix_px(scene.photo_px)[0, 0] * cosines.clip(0) / distances).min(1)

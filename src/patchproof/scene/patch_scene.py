@@ -155,7 +155,9 @@ def _place_piece(scene: MeshScene, lay: PlacementMethod) -> tuple[Piece, Placeme
     piece = lay_out_piece(patch.size_mm, marker_mm, scene.sheet_id, "design", patch.bend)
     refuse_larger_than_page(page_template(settings.sheet.template), piece)  # before hours of optimizing
     if piece.markers and not placement.is_flat:  # paper is unrolled by all markers; on a card one tells the others
-        scales = _smallest_scales_of_markers(scene, placement, piece)
+        from patchproof.scene.bent_scene import smallest_marker_scales
+
+        scales = smallest_marker_scales(scene, placement, piece)
     unreadable = float((scales * piece.module_mm < interface.PX_PER_MODULE * 0.999).mean()) if piece.markers else 0.0
     notes = (*mesh.warnings, *scene.backgrounds.notes, *placement.warnings)
     if unreadable > 1 - interface.READABLE_SHARE:
@@ -166,6 +168,8 @@ def _place_piece(scene: MeshScene, lay: PlacementMethod) -> tuple[Piece, Placeme
                 f"{smallest_piece_mm(needed_mm)} mm or more; come nearer, or take larger photographs"
             )
         notes += (f"{interface.measurable_text(unreadable, marker_mm)}: {advice}",)
+    if placement.family == "exponential":  # of 15 photographs of a mug that showed all markers, none was measured
+        notes += ("paper that bends in two directions can rarely be measured: its photographs count, without figures",)
     return piece, placement, unreadable, notes
 
 
@@ -178,14 +182,3 @@ def _smallest_scales(scene: MeshScene, card: Placement) -> np.ndarray:
     planes = geometry.plane_homography(matrix, poses, card.world_from_piece)
     mean, tilt_deg = geometry.local_scales(planes, np.array(card.size_mm) / 2).T
     return np.where(faces, mean * np.sqrt(np.cos(np.radians(tilt_deg))), 0.0)
-
-
-def _smallest_scales_of_markers(scene: MeshScene, placement: Placement, piece: Piece) -> np.ndarray:
-    """Return the px per mm of each view at the worst marker, along the foreshortened direction; 0 from behind."""
-    middles_mm = np.array([np.mean(marker.corners_mm, 0) for marker in piece.markers])
-    vertices = np.linalg.norm(placement.piece_mm - middles_mm[:, None], axis=2).argmin(1)
-    poses = camera_poses(scene, placement.center_mm, scene.draw("select", SCALE_VIEWS, 0).pose)
-    rays = geometry.camera_centers(poses)[:, None] - placement.world(middles_mm)
-    distances = np.linalg.norm(rays, axis=2)
-    cosines = (rays * placement.normals[vertices]).sum(2) / distances
-    return (scene.matrix_px(scene.photo_px)[0, 0] * cosines.clip(0) / distances).min(1)

@@ -18,7 +18,6 @@ from typing import Annotated, Any
 from typer import BadParameter, Exit, Option, Typer
 
 from patchproof.app import interrupt
-from patchproof.app.cli.files import check_files
 from patchproof.base.errors import Refused
 from patchproof.base.output import disk_is_full
 from patchproof.base.text import printable
@@ -47,6 +46,7 @@ Models = Annotated[str | None, Option(help="Comma-separated classifiers; a sheet
 _NO_MEMORY = re.compile(
     r"(?i)can(no|')t (allocate memory|start new thread)|(insufficient|out of) memory|failed to map seg"
 )
+NAMING_FILES = ("scene", "run", "runs", "sheet", "pdf", "picture", "photos", "chart")  # arguments that do
 LINE_EVERY_S = 30.0  # of progress, if standard error is not a terminal
 
 
@@ -95,7 +95,10 @@ def as_command(verb: Callable[..., None]) -> Callable[..., None]:
     def command(**arguments: Any) -> None:
         interrupt.stop_sentence[:] = [partial(_stop_sentence, arguments)]
         try:
-            check_files(arguments)
+            if not arguments.keys().isdisjoint(NAMING_FILES):
+                from patchproof.app.cli.files import check_files
+
+                check_files(arguments)
             with _on_free_cores(arguments):
                 verb(**arguments)
         except KeyboardInterrupt:

@@ -11,16 +11,15 @@ from typing import Any
 from patchproof.base.errors import Refused
 from patchproof.base.run_files import require_finished_run
 from patchproof.base.settings import load_scene_settings, named_paths
+from patchproof.sheets.manifest import load_manifest
 
 
 def check_files(arguments: Mapping[str, Any]) -> None:
     """Refuse the first of a command's arguments whose file is missing, and settings and manifests that are wrong."""
     for name, value in arguments.items():
-        check = _CHECKS.get(name)
-        paths = value if isinstance(value, list) else [value]
-        for path in paths if check is not None else ():
-            if isinstance(path, Path):
-                check(path)
+        for path in value if isinstance(value, list) else [value]:
+            if isinstance(path, Path) and name in _CHECKS:
+                _CHECKS[name](path)
 
 
 def require_path(expected: str, path: str | Path) -> None:
@@ -30,27 +29,18 @@ def require_path(expected: str, path: str | Path) -> None:
 
 
 def _check_scene(path: Path) -> None:
-    settings = load_scene_settings(path)
-    paths = named_paths(settings, path.resolve().parent)
+    settings, base = load_scene_settings(path), path.resolve().parent
+    paths = named_paths(settings, base)
     if Path(settings.printer.profile).suffix in (".npz", ".json"):
-        paths |= {"printer.profile": path.resolve().parent / settings.printer.profile}
+        paths["printer.profile"] = base / settings.printer.profile
     for key, named in paths.items():
-        if ":" not in str(named.name):  # primitive:NAME
+        if ":" not in named.name:  # primitive:NAME
             require_path(f"the file that {key} in {path} names", named)
 
 
-def _check_manifest(path: Path) -> None:
-    from patchproof.sheets.manifest import load_manifest
-
-    load_manifest(path)
-
-
-_CHECKS: Mapping[str, Callable[[Path], None]] = {
-    **dict.fromkeys(("run", "runs"), require_finished_run),
-    **dict.fromkeys(("photos", "more", "chart", "design"), partial(require_path, "photographs")),
+_CHECKS: Mapping[str, Callable[[Path], object]] = {
     **{name: partial(require_path, f"a file for --{name}") for name in ("icc", "corners", "boxes", "controls")},
-    "scene": _check_scene,
-    "sheet": _check_manifest,
-    "pdf": partial(require_path, "a sheet's PDF"),
-    "picture": partial(require_path, "a picture"),
+    **dict.fromkeys(("photos", "more", "chart", "design"), partial(require_path, "photographs")),
+    **{"run": require_finished_run, "runs": require_finished_run, "scene": _check_scene, "sheet": load_manifest},
+    **{"pdf": partial(require_path, "a sheet's PDF"), "picture": partial(require_path, "a picture")},
 }
