@@ -311,11 +311,12 @@ def test_photographs_beside_two_blanks_ask_which_one_hangs_there(tmp_path):
 
 
 def test_a_length_that_makes_no_sense_is_refused(tmp_path):
-    trimesh.creation.box((31, 1, 1)).export(tmp_path / "hall.glb")
-    trimesh.creation.box((30, 1, 1)).export(tmp_path / "yard.glb")
-    assert guess_length_mm(tmp_path / "yard.glb") == 30_000
-    with pytest.raises(Refused, match=r"of 5 mm to 30 m, got 3\.1e\+04 mm by the file's units: add --length-mm"):
-        guess_length_mm(tmp_path / "hall.glb")
+    for length_m, name in ((6, "van.glb"), (6.1, "hall.glb"), (12.3, "mug.glb")):
+        trimesh.creation.box((length_m, 0.1, 0.1)).export(tmp_path / name)
+    assert guess_length_mm(tmp_path / "van.glb") == 6000
+    for name, length in (("hall", 6100), ("mug", 12300)):
+        with pytest.raises(Refused, match=rf"to 6 m, got {length} mm by the units of {name}.glb: add --length-mm"):
+            guess_length_mm(tmp_path / f"{name}.glb")
 
 
 def test_a_box_stands_on_all_of_its_footprint():

@@ -8,11 +8,8 @@ import sys
 from pathlib import Path
 
 import pytest
-import trimesh
 from console import command
 
-from patchproof.app.begin.guess import guess_length_mm
-from patchproof.base.errors import Refused
 from patchproof.base.text import command_text
 
 TABLES = {
@@ -129,16 +126,6 @@ def test_each_is_one_sentence_before_torch_is_there(lines):
 def test_a_missing_mesh_is_named_and_no_label_is_asked_for(lines, capsys):
     (line,) = (line for line in lines if line[0] == "new" and line[-1].endswith("no.glb"))
     assert command(*line) == 1 and f"no file at {line[-1]}: check the path" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(("length_m", "plausible"), [(0.12, True), (5.9, True), (6.1, False), (12.3, False)])
-def test_a_mesh_in_other_units_than_meters_is_doubted(length_m, plausible, tmp_path):
-    trimesh.creation.box((length_m, 0.1, 0.1)).export(path := tmp_path / "mug.glb")
-    if plausible:
-        assert guess_length_mm(path) == pytest.approx(1000 * length_m, rel=0.01)
-    else:
-        with pytest.raises(Refused, match=rf"got {1000 * length_m:g} mm by the units of mug.glb: add --length-mm"):
-            guess_length_mm(path)
 
 
 def test_hints_quote_what_a_shell_would_split():

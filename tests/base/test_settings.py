@@ -7,10 +7,11 @@ from pathlib import Path
 import pytest
 
 from patchproof.base import packaged
+from patchproof.base.content_identity import content_identity
 from patchproof.base.errors import Refused
 from patchproof.base.goal import Goal
 from patchproof.base.packaged import packaged_path
-from patchproof.base.settings import SceneSettings, content_identity, identity_settings, load_scene_settings
+from patchproof.base.settings import SceneSettings, identity_settings, load_scene_settings
 from patchproof.base.validation import StrictModel, expand_path, spelling_hint, validate_model
 from patchproof.sheets.manifest import Target
 

@@ -15,7 +15,7 @@ from patchproof.channel.carried_printer import carried_printer
 from patchproof.channel.printer import load_printer
 from patchproof.reprints import page_photos
 from patchproof.reprints.mounted_sheet import DEFAULT_SETUP
-from patchproof.reprints.run_sheet import _without_folders
+from patchproof.reprints.portable import without_folders
 from patchproof.sheets.blank import blank_sheet
 
 
@@ -38,7 +38,7 @@ def test_settings_of_a_sheet_name_no_folder_of_this_machine(tmp_path):
         "models": [f"file:{tmp_path}/n.onnx", "builtin"],
         "px": [1, 2],
     }
-    portable = _without_folders(settings, lambda name: name.replace(str(tmp_path), "../scene"))
+    portable = without_folders(settings, lambda name: name.replace(str(tmp_path), "../scene"))
     assert portable == {"object": {"mesh": "mug.glb"}, "models": ["file:../scene/n.onnx", "builtin"], "px": [1, 2]}
 
 

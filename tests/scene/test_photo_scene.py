@@ -11,10 +11,11 @@ import pytest
 from PIL import Image
 
 from patchproof.base.color import LINEAR_FROM_CODE, srgb_from_linear
+from patchproof.base.content_identity import content_identity
 from patchproof.base.errors import Refused
 from patchproof.base.geometry import apply_homography, intrinsics, look_at, plane_homography, rect_corners
 from patchproof.base.packaged import packaged_path
-from patchproof.base.settings import SceneSettings, content_identity
+from patchproof.base.settings import SceneSettings
 from patchproof.photo.rejection import PhotoRejected
 from patchproof.scene.conditions import with_values
 from patchproof.scene.paper_light import paper_light, quadratic_terms

@@ -55,7 +55,7 @@ def test_markers_follow_from_the_views(tmp_path):
     assert near.piece.module_mm * MARKER_MODULES < far.piece.module_mm * MARKER_MODULES
     assert near.unreadable_share <= 0.05 < far.unreadable_share
     assert far.piece.marker_mm == pytest.approx(19.5)  # 0.29 × 90 = 26.1 mm for a corner; (26.1 - 1) × 7/9 = 19.52
-    assert any("can be measured: in others markers of 19.5 mm are too small" in warning for warning in far.warnings)
+    assert any("can be measured: others show markers of 19.5 mm too small" in warning for warning in far.warnings)
 
 
 def test_the_outer_markers_of_bent_paper_turn_away_before_its_middle_does():

@@ -11,11 +11,9 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Callable
 from types import FrameType
 
 STOP_AFTER_S = 1.0
-stop_sentence: list[Callable[[], str]] = [lambda: "Stopped: nothing was written."]  # empty once it was said
 
 
 def handle_interrupts() -> None:
@@ -25,13 +23,6 @@ def handle_interrupts() -> None:
     signal.set_wakeup_fd(sender.fileno(), warn_on_full_buffer=False)  # written to even while Python waits for a library
     threading.Thread(target=_watch, args=(receiver, sender), daemon=True).start()
     signal.signal(signal.SIGINT, _interrupt)
-
-
-def say_stopped() -> None:
-    """Print once what was kept, and show the cursor again, which a progress bar hides."""
-    if stop_sentence:
-        show_cursor = "\x1b[?25h" if sys.stderr.isatty() else ""
-        print(f"{show_cursor}{stop_sentence.pop()()}", file=sys.stderr, flush=True)
 
 
 def _interrupt(_: int, frame: FrameType | None) -> None:
@@ -50,7 +41,11 @@ def _watch(receiver: socket.socket, _: socket.socket) -> None:
 
 
 def _end() -> None:
+    console = sys.modules.get("patchproof.app.cli.console")  # a library may be importing: nothing more is imported
     try:
-        say_stopped()
+        if hasattr(console, "say_stopped"):
+            console.say_stopped()
+        else:
+            print("Stopped: nothing was written.", file=sys.stderr, flush=True)
     finally:
         os._exit(130)

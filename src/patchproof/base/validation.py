@@ -114,17 +114,17 @@ def refuse_untrusted(source: str | Path, networks: Iterable[str] = (), settings:
         if not is_local and (name.startswith("clip:") or not NETWORK_FILE.fullmatch(name)):
             expected = f"networks in {source} that are files, not code or downloads"
             raise Refused(expected, name, f"{do} (--models '{name}')")
-    for text in (*networks, *_texts(settings)):
+    for text in (*networks, *texts_in(settings)):
         if "${" in text:
             raise Refused(f"names in {source} without variables of your environment", text, do)
 
 
-def _texts(value: Any) -> Iterator[str]:
+def texts_in(value: Any) -> Iterator[str]:
     """All text in nested tables and lists."""
     if isinstance(value, str):
         yield value
     for each in value.values() if isinstance(value, Mapping) else value if isinstance(value, list | tuple) else ():
-        yield from _texts(each)
+        yield from texts_in(each)
 
 
 def spelling_hint(word: str, known_words: Iterable[str]) -> str:

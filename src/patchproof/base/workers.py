@@ -266,7 +266,7 @@ def _init_worker(parent: int, function: _Task | None) -> None:
 
     def end_with_parent() -> None:
         while os.getppid() == parent:
-            time.sleep(1)
+            time.sleep(0.25)
         os._exit(1)
 
     threading.Thread(target=end_with_parent, daemon=True).start()

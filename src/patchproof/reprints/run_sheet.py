@@ -5,13 +5,11 @@ The piece is the same on every template that has room for it, except for the ids
 template with `plan_page` says where the piece goes and how to photograph it. Pages without a run: see `sheets.blank`.
 """
 
-import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
-from patchproof.base.validation import NETWORK_FILE
+from patchproof.base.validation import texts_in
 from patchproof.optimizer.run import Run
 from patchproof.reprints.plan_view import draw_plan_view
 from patchproof.reprints.shot_plan import shot_sections
@@ -69,41 +67,20 @@ def content_of(run: Run, template: str | None, control: str | None, folder: Path
     """
     scene = require_piece(run.scene)
     scene = scene if template is None else scene.with_template(template)
-    settings = scene.settings.model_dump(mode="json") | {"seed": scene.seed, "printer_model": run.details["printer"]}
+    settings, promise = scene.settings.model_dump(mode="json"), run.promise
+    if any("." in text or "/" in text for text in texts_in(settings)):  # files, which the sheet leaves behind
+        from patchproof.reprints.portable import portable_content
+
+        settings, promise = portable_content(settings, promise, scene, folder)
+    settings |= {"seed": scene.seed, "printer_model": run.details["printer"]}
     if (imported := run.details.get("imported")) is not None:
         settings["imported"] = {name: imported[name] for name in ("file", "sha256")}
-    if Path(profile := scene.settings.printer.profile).suffix:
-        from patchproof.channel.carried_printer import carried_printer
-
-        settings["printer_file"] = carried_printer(scene.base / profile)
-
-    def from_sheet(name: str) -> str:
-        match = NETWORK_FILE.fullmatch(name)
-        if match is None or "${" in name or Path(scene.base / match[2]).drive != folder.resolve().drive:
-            return name
-        return match[1] + Path(os.path.relpath(scene.base / match[2], folder)).as_posix()
-
-    settings = _without_folders(settings, from_sheet) | {"sheet": settings["sheet"]}
-    models = tuple(model.changed(name=from_sheet(model.name)) for model in run.promise.models)
     piece, bent = scene.piece, isinstance(scene, PatchScene) and not scene.placement.is_flat
     if control is not None:
         piece = with_ids(piece, scene.sheet_id, control)
         design = control_design(control, run.design, scene.sheet_id, piece)
         return SheetContent(piece, scene.sheet_id, control, design, settings=settings, bent=bent), scene
-    return SheetContent(
-        piece, scene.sheet_id, "design", run.design, run.promise.changed(models=models), settings, bent
-    ), scene
-
-
-def _without_folders(value: Any, from_sheet: Callable[[str], str]) -> Any:
-    """Copy settings without the folders of this machine: files by their names, networks as seen from the sheet."""
-    if isinstance(value, dict):
-        return {key: _without_folders(each, from_sheet) for key, each in value.items()}
-    if isinstance(value, list):
-        return [_without_folders(each, from_sheet) for each in value]
-    if not isinstance(value, str):
-        return value
-    return Path(value).name if Path(value).is_absolute() else from_sheet(value)
+    return SheetContent(piece, scene.sheet_id, "design", run.design, promise, settings, bent), scene
 
 
 def plan_of(scene: PieceScene, template: Template, content: SheetContent) -> PlanPage | None:

@@ -17,7 +17,8 @@ import numpy as np
 
 from patchproof.base.errors import Refused
 from patchproof.base.geometry import apply_homography, local_scales
-from patchproof.base.settings import SceneSettings, content_identity
+from patchproof.base.settings import SceneSettings, identity_settings
+from patchproof.base.validation import texts_in
 from patchproof.channel.effects import ViewEffect
 from patchproof.scene.conditions import Conditions, Stream, draw
 from patchproof.sheets.piece import Piece, sheet_id
@@ -46,7 +47,7 @@ class SceneSource:
 
     def sheet_id(self, known: Mapping[str, str]) -> str:
         """Return the sheet id of the print, if any, else that of settings, seed and the `known` facts beside them."""
-        return self.printed_sheet_id or sheet_id(content_identity(self.settings, self.base) | dict(known), self.seed)
+        return self.printed_sheet_id or _sheet_id(self.settings, self.base, known, self.seed)
 
 
 @dataclass(frozen=True)
@@ -147,7 +148,7 @@ class Scene(ABC):
 
     def _identified(self, settings: SceneSettings, known: Mapping[str, str]) -> Self:
         """Return the scene with the sheet id of these settings and other known facts."""
-        identity = sheet_id(content_identity(settings, self.base) | dict(known), self.seed)
+        identity = _sheet_id(settings, self.base, known, self.seed)
         return replace(self, settings=settings, known=known, sheet_id=identity)._laid_out()
 
     def _laid_out(self) -> Self:
@@ -274,12 +275,19 @@ class PieceScene(Scene):
         return {"piece_mm": piece.size_mm, "marker_mm": piece.marker_mm, "unreadable_share": self.unreadable_share}
 
 
-def measurable_text(unreadable_share: float, marker_mm: float) -> str:
-    """Say how many of a user's photographs can be measured."""
-    return (
-        f"about {1 - unreadable_share:.0%} of photographs can be measured: in others markers of {marker_mm:.1f} mm are "
-        "too small or turned away"
-    )
+def _sheet_id(settings: SceneSettings, base: Path, known: Mapping[str, str], seed: int) -> str:
+    identity = identity_settings(settings)
+    is_primitive = (settings.object.mesh or "").startswith("primitive:") and settings.background.images is None
+    if not is_primitive or any("." in text or "/" in text for text in texts_in(identity)):  # a file's name
+        from patchproof.base.content_identity import content_identity
+
+        identity = content_identity(settings, base)
+    return sheet_id(identity | dict(known), seed)
+
+
+def measurable_text(share: float, mm: float) -> str:
+    """Say how many photographs can be measured."""
+    return f"about {1 - share:.0%} of photographs can be measured: others show markers of {mm:.1f} mm too small"
 
 
 def require_piece(scene: Scene, do: str = "take object.glb and textures from the run") -> PieceScene:

@@ -116,17 +116,10 @@ def _mesh_scene(
     doubt = f"; {up.doubt}: if the preview shows it lying, {_rewrite_advice(up)}" if up.doubt else ""
     return text, [
         f'up: "{up.axis}", {up.reason}{doubt}',
-        f"length: {length_mm:g} mm, {source}{_length_doubt(length_mm, source)}",
+        f"length: {length_mm:g} mm, {source}",
         f"piece: {width:g} × {height:g} mm, {piece.words}",
         f'label: "{target}" ({models[0]})',
     ]
-
-
-def _length_doubt(length_mm: float, source: str) -> str:
-    """Doubt a file's units that make a thing of the desk as large as a table: they may be inches, or none."""
-    return (
-        f" (add --length-mm if {length_mm / 1000:.3g} m is not right)" if length_mm > 1000 and "units" in source else ""
-    )
 
 
 def _doubt_lines(up: UpGuess) -> list[str]:

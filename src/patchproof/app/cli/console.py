@@ -11,13 +11,12 @@ import time
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from functools import partial, wraps
+from functools import wraps
 from pathlib import Path
 from typing import Annotated, Any
 
 from typer import BadParameter, Exit, Option, Typer
 
-from patchproof.app import interrupt
 from patchproof.base.errors import Refused
 from patchproof.base.output import disk_is_full
 from patchproof.base.text import printable
@@ -93,7 +92,7 @@ def as_command(verb: Callable[..., None]) -> Callable[..., None]:
 
     @wraps(verb)
     def command(**arguments: Any) -> None:
-        interrupt.stop_sentence[:] = [partial(_stop_sentence, arguments)]
+        _running[:] = [arguments]
         try:
             if not arguments.keys().isdisjoint(NAMING_FILES):
                 from patchproof.app.cli.files import check_files
@@ -102,7 +101,7 @@ def as_command(verb: Callable[..., None]) -> Callable[..., None]:
             with _on_free_cores(arguments):
                 verb(**arguments)
         except KeyboardInterrupt:
-            interrupt.say_stopped()
+            say_stopped()
             raise Exit(130) from None
 
     return command
@@ -118,6 +117,16 @@ def _on_free_cores(arguments: dict[str, Any]) -> AbstractContextManager[None]:
     if arguments["jobs"] is None:
         arguments["jobs"] = available_cores() if by_processes and arguments.get("cluster") is None else 1
     return use_threads(1) if by_processes else nullcontext()
+
+
+_running: list[dict[str, Any]] = [{}]  # the arguments of the command; empty once it was said that it stopped
+
+
+def say_stopped() -> None:
+    """Print once what a stopped command kept, and show the cursor again, which a progress bar hides."""
+    if _running:
+        show_cursor = "\x1b[?25h" if sys.stderr.isatty() else ""
+        print(f"{show_cursor}{_stop_sentence(_running.pop())}", file=sys.stderr, flush=True)
 
 
 def _stop_sentence(arguments: dict[str, Any]) -> str:
@@ -171,7 +180,7 @@ def run_command_line(app: Typer) -> None:
         print(sentence, file=sys.stderr)
         raise SystemExit(1) from None
     except KeyboardInterrupt:
-        print("Stopped.", file=sys.stderr)
+        say_stopped()
         raise SystemExit(130) from None
 
 
