@@ -13,13 +13,14 @@ from PIL import Image
 from patchproof.base.color import LINEAR_FROM_CODE, srgb_from_linear
 from patchproof.base.content_identity import content_identity
 from patchproof.base.errors import Refused
+from patchproof.base.fingerprint import files_sha256
 from patchproof.base.geometry import apply_homography, intrinsics, look_at, plane_homography, rect_corners
 from patchproof.base.packaged import packaged_path
 from patchproof.base.settings import SceneSettings
 from patchproof.photo.rejection import PhotoRejected
 from patchproof.scene.conditions import with_values
 from patchproof.scene.paper_light import paper_light, quadratic_terms
-from patchproof.scene.photo_scene import _digest, measure_photo
+from patchproof.scene.photo_scene import measure_photo, photos_in
 from patchproof.scene.picture_scene import BasePicture
 from patchproof.scene.scene import build_scene
 from patchproof.sheets.blank import blank_sheet
@@ -163,7 +164,7 @@ def test_the_piece_is_the_blank_s_with_ids_of_its_own(world, scene):
     assert (scene.settings.patch.width_mm, scene.settings.patch.height_mm) == (162.0, 162.0)
     assert all("can be measured" in warning for warning in scene.warnings)
     # the id follows from the settings with the blank's size filled in, as a run keeps them, and from the photographs
-    digest = _digest(scene.base / scene.settings.object.photos)
+    digest = files_sha256(photos_in(scene.base / scene.settings.object.photos))
     known = content_identity(scene.settings, scene.base) | {"blank": world.manifest.sheet_id, "photos": digest}
     assert sheet_id(known, 0) == scene.sheet_id != sheet_id(known, 1)
 

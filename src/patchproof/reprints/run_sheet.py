@@ -68,7 +68,8 @@ def content_of(run: Run, template: str | None, control: str | None, folder: Path
     scene = require_piece(run.scene)
     scene = scene if template is None else scene.with_template(template)
     settings, promise = scene.settings.model_dump(mode="json"), run.promise
-    if any("." in text or "/" in text for text in texts_in(settings)):  # files, which the sheet leaves behind
+    names = texts_in([settings, [model.name for model in promise.models]])
+    if any("." in name or "/" in name for name in names):  # of files, which the sheet leaves behind
         from patchproof.reprints.portable import portable_content
 
         settings, promise = portable_content(settings, promise, scene, folder)

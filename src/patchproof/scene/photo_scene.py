@@ -14,7 +14,6 @@ the printer makes it), and whatever stood in front of the piece. Photographs tha
 that a judged photograph would get.
 """
 
-import hashlib
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
@@ -22,7 +21,8 @@ from typing import Any, Self
 import numpy as np
 
 from patchproof.base.errors import Refused
-from patchproof.base.input import hash_file, is_file, is_folder
+from patchproof.base.fingerprint import files_sha256
+from patchproof.base.input import is_file, is_folder
 from patchproof.base.settings import SceneSettings
 from patchproof.base.validation import expand_path
 from patchproof.photo.detect import find_markers
@@ -149,7 +149,7 @@ def build(source: SceneSource) -> PhotoScene:
     blank = blank_piece(manifest)
     settings = _with_size(settings, blank.size_mm)
     folder = Path(expand_path(photos, base))
-    known = {"blank": manifest.sheet_id, "photos": _digest(folder)}
+    known = {"blank": manifest.sheet_id, "photos": files_sha256(photos_in(folder))}
     identity = replace(source, settings=settings).sheet_id(known)
     piece = with_ids(blank, identity, "design")
     refuse_larger_than_page(page_template(settings.sheet.template), piece)
@@ -180,23 +180,15 @@ def measure_photo(path: Path, manifest: Manifest, piece: Piece, photo_px: tuple[
     return BasePhoto(path.name, picture, photo_from_piece, light, blur, photo.said)
 
 
-def _files(folder: Path) -> list[Path]:
+def photos_in(folder: Path) -> list[Path]:
     """List a folder's photographs and those of the folders in it, which hold sessions as for `verify`."""
     inside = (*folder.iterdir(), *folder.glob("*/*")) if is_folder(folder) else ()
     return sorted(path for path in inside if path.suffix.lower() in SUFFIXES and is_file(path))
 
 
-def _digest(folder: Path) -> str:
-    """Return a hash of the photographs, so that a run cannot be continued with others."""
-    digest = hashlib.sha256()
-    for path in _files(folder):
-        digest.update(bytes.fromhex(hash_file(path)))
-    return digest.hexdigest()
-
-
 def _load_all(folder: Path, manifest: Manifest, piece: Piece, photo_px) -> tuple[tuple[BasePhoto, ...], dict[str, str]]:
     """Return the usable photographs of a folder in the order of their names, and the rejection codes of the others."""
-    files, photos, rejected = _files(folder), [], {}
+    files, photos, rejected = photos_in(folder), [], {}
     for path in files:
         try:
             photos.append(run_limited(measure_photo, path, manifest, piece, photo_px))

@@ -83,6 +83,7 @@ def _mesh_scene(
     if piece.side == "+y":
         azimuth, elevation = "of the camera to left and right of straight above", "from there toward the back"
     bend_comment = "paper follows the surface" if piece.bend else "a flat card lies close enough"
+    other_up = _line(f'# up = "{other_axis(up.axis)}"', f"in its place if the preview shows it lying: {up.doubt}")
     text = "\n".join(
         [
             *_HEAD,
@@ -90,7 +91,7 @@ def _mesh_scene(
             f"mesh = {_quoted(thing if primitive else _path(path, base))}",
             _line(f"length_mm = {length_mm:g}", f"its longest extent, {source}"),
             _line(f'up = "{up.axis}"', f"the file's axis that points up: {up.reason}"),
-            *_doubt_lines(up),
+            *([] if up.doubt is None else [other_up, f"# Best of all {_rewrite_advice(up)}."]),
             "",
             "[patch]",
             *_size(*piece.size_mm),
@@ -120,14 +121,6 @@ def _mesh_scene(
         f"piece: {width:g} × {height:g} mm, {piece.words}",
         f'label: "{target}" ({models[0]})',
     ]
-
-
-def _doubt_lines(up: UpGuess) -> list[str]:
-    """The other axis as a comment, if the up axis is doubted."""
-    if up.doubt is None:
-        return []
-    line = _line(f'# up = "{other_axis(up.axis)}"', f"in its place if the preview shows it lying: {up.doubt}")
-    return [line, f"# Best of all {_rewrite_advice(up)}."]
 
 
 def _rewrite_advice(up: UpGuess) -> str:
