@@ -2,7 +2,7 @@
 
 A KeyboardInterrupt removes unfinished files on its way. But libraries swallow it while they are imported, or abort, and
 it waits for long calls into them. So within an import the process ends at once, and elsewhere a thread ends it
-after `STOP_AFTER_S`. That loses no more than a kill, which leaves nothing half done under a final name.
+after `STOP_AFTER_S`, unless a command has put another handler in place. That loses no more than a kill, which leaves nothing half done under a final name.
 """
 
 import os
@@ -13,7 +13,7 @@ import threading
 import time
 from types import FrameType
 
-STOP_AFTER_S = 1.0
+STOP_AFTER_S = 0.5
 
 
 def handle_interrupts() -> None:
@@ -34,7 +34,7 @@ def _interrupt(_: int, frame: FrameType | None) -> None:
 
 
 def _watch(receiver: socket.socket, _: socket.socket) -> None:
-    while signal.SIGINT not in receiver.recv(64):
+    while signal.SIGINT not in receiver.recv(64) or signal.getsignal(signal.SIGINT) is not _interrupt:
         pass
     time.sleep(STOP_AFTER_S)
     _end()

@@ -1,5 +1,6 @@
 """The verb capture: photographs from a phone."""
 
+import signal
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -26,6 +27,7 @@ def capture(
     """Receive photographs from a phone's browser, each measured and judged at once."""
     import segno
 
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # it ends the server, and the verdict follows
     from patchproof.app.capture.album import CONTROLS_FOLDER
     from patchproof.app.capture.serve import serve_capture
     from patchproof.evidence.corner_files import CORNERS_FILE
