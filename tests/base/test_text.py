@@ -6,9 +6,10 @@ import warnings
 
 import pytest
 
+from patchproof.base.csv_file import read_csv
 from patchproof.base.declarations import DECLARED
 from patchproof.base.errors import Refused
-from patchproof.base.input import read_csv, read_json
+from patchproof.base.input import read_json
 from patchproof.base.text import csv_lines, printable
 from patchproof.base.validation import StrictModel, read_toml, validate_model
 from patchproof.report.images import draw_figure

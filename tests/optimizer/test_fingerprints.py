@@ -183,7 +183,7 @@ def test_an_optimization_is_not_resumed_with_another_network(made, tmp_path, mon
 def test_a_sheet_refuses_other_networks_than_its_own(made, tmp_path):
     """Any of its promise, not the first alone."""
     run = load_run(made / "run")
-    manifest, models = sheet(run, tmp_path / "sheet.pdf"), set_problem(run.scene).classifiers
+    manifest, models = sheet(run, made / "sheet.pdf"), set_problem(run.scene).classifiers
     assert judges_of(models, manifest) is not None
     for number in (0, 1):
         changed = [replace(each, sha256="0" * 64) if i == number else each for i, each in enumerate(models)]

@@ -15,6 +15,7 @@ from patchproof.base.settings import SceneSettings
 from patchproof.base.validation import validate_model
 from patchproof.evidence.verdict import MOST_PHOTOS, PHOTOS_PER_SESSION, sessions_needed
 from patchproof.optimizer import promise, run
+from patchproof.optimizer.evaluate import promise_run
 from patchproof.optimizer.problem import set_problem
 from patchproof.optimizer.promise import (
     CONTROL_VIEWS,
@@ -26,7 +27,6 @@ from patchproof.optimizer.promise import (
     make_promise,
 )
 from patchproof.optimizer.responses import Responses
-from patchproof.optimizer.run import promise_run
 from test_optimize import scene_with
 from test_verify_verdict import promise_of
 

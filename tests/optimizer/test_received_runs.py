@@ -17,11 +17,11 @@ from console import command
 
 from patchproof.app.verify import verify
 from patchproof.base.errors import Refused
-from patchproof.optimizer.evaluate import evaluate
+from patchproof.optimizer.evaluate import evaluate, promise_run
 from patchproof.optimizer.imported_design import import_patch
 from patchproof.optimizer.problem import set_problem
 from patchproof.optimizer.promise import PromiseOptions
-from patchproof.optimizer.run import load_run, promise_run
+from patchproof.optimizer.run import load_run
 from patchproof.reprints.run_sheet import sheet
 from patchproof.sheets.manifest import load_manifest
 from test_optimize import toml

@@ -8,10 +8,9 @@ import shutil
 import numpy as np
 import pytest
 
-from patchproof.app.verify import _printer
 from patchproof.base.errors import Refused
 from patchproof.base.packaged import packaged_path
-from patchproof.channel.carried_printer import carried_printer
+from patchproof.channel.carried_printer import carried_printer, printer_of_sheet
 from patchproof.channel.printer import load_printer
 from patchproof.reprints import page_photos
 from patchproof.reprints.mounted_sheet import DEFAULT_SETUP
@@ -23,13 +22,12 @@ def test_a_printer_without_a_name_goes_with_the_sheet(tmp_path):
     for suffix in (".npz", ".json"):
         shutil.copy(packaged_path("calibration", "printers", f"uncoated{suffix}"), tmp_path / f"mine{suffix}")
     mine = load_printer("mine.json", tmp_path)
-    settings = json.loads(json.dumps({"printer_file": carried_printer(tmp_path / "mine.npz")}))
+    carried = json.loads(json.dumps(carried_printer(tmp_path / "mine.npz")))
     shutil.rmtree(tmp_path)
-    assert _printer(tmp_path / "sheet.json", settings | {"printer": {"profile": "mine.json"}}).sha256 == mine.sha256
-    assert _printer(tmp_path / "sheet.json", {"printer": {"profile": "coated"}}).name == "coated"
-    for text, sentence in (("é", "base64, got .*sheet.json with other text"), ("AAAA", "printer's tables, got")):
+    assert printer_of_sheet(carried, "sheet.json").sha256 == mine.sha256
+    for text, sentence in (("é", "base64, got sheet.json with other text"), ("AAAA", "printer's tables, got")):
         with pytest.raises(Refused, match=sentence):
-            _printer(tmp_path / "sheet.json", {"printer_file": settings["printer_file"] | {"npz": text}})
+            printer_of_sheet(carried | {"npz": text}, "sheet.json")
 
 
 def test_settings_of_a_sheet_name_no_folder_of_this_machine(tmp_path):

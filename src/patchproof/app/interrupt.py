@@ -2,7 +2,8 @@
 
 A KeyboardInterrupt removes unfinished files on its way. But libraries swallow it while they are imported, or abort, and
 it waits for long calls into them. So within an import the process ends at once, and elsewhere a thread ends it
-after `STOP_AFTER_S`, unless a command has put another handler in place. That loses no more than a kill, which leaves nothing half done under a final name.
+after `STOP_AFTER_S`, unless a command has put another handler in place. That loses no more than a kill, which leaves
+nothing half done under a final name.
 """
 
 import os

@@ -30,7 +30,7 @@ from patchproof.base.output import (
 from patchproof.base.progress import Progress, no_progress
 from patchproof.base.validation import refuse_untrusted
 from patchproof.channel.cameras import load_optional_camera
-from patchproof.channel.printer import Printer, load_printer
+from patchproof.channel.printer import load_printer
 from patchproof.classifier.load import load_classifier
 from patchproof.classifier.network import Classifier
 from patchproof.evidence.batch import MAX_PICTURED_PHOTOS
@@ -202,20 +202,17 @@ def options_of(
     least_score, networks = None if promise is None else promise.models[0].least_score, _networks(manifest, models)
     if not trust:
         refuse_untrusted(sheet, [name for name in networks if isinstance(name, str) and name not in _by_name(models)])
-    return Options(
-        models=[load_classifier(each, base).with_least_score(least_score) for each in networks],
-        printer=_printer(sheet, manifest.settings),
-        camera=load_optional_camera(camera),
-    )
-
-
-def _printer(sheet: str | Path, settings: dict[str, Any]) -> Printer:
-    """Return the printer that the sheet carries, or else the one that it names."""
-    if (carried := settings.get("printer_file")) is not None:
+    if (carried := manifest.settings.get("printer_file")) is None:
+        printer = load_printer((manifest.settings.get("printer") or {}).get("profile", "coated"), base)
+    else:
         from patchproof.channel.carried_printer import printer_of_sheet
 
-        return printer_of_sheet(carried, sheet)
-    return load_printer((settings.get("printer") or {}).get("profile", "coated"), Path(sheet).resolve().parent)
+        printer = printer_of_sheet(carried, sheet)
+    return Options(
+        models=[load_classifier(each, base).with_least_score(least_score) for each in networks],
+        printer=printer,
+        camera=load_optional_camera(camera),
+    )
 
 
 def _look_at(out: Path, manifest: Manifest) -> Callable[[Sequence[PhotoEntry]], Look]:

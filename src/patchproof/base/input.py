@@ -9,7 +9,6 @@ unless it runs in `run_in_child`. Timers exist on Linux and macOS, in a process'
 do not use. Within another time limit, or a profiler's timer, the outer one applies.
 """
 
-import csv
 import faulthandler
 import hashlib
 import io
@@ -26,7 +25,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 from patchproof.base.errors import Refused, TimeLimitExceeded
-from patchproof.base.text import strip_apostrophe
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -101,19 +99,6 @@ def read_json(path: str | Path, expected: str, do: str, missing: str = "check th
         return json.loads(text)
     except (ValueError, RecursionError, MemoryError) as error:  # RecursionError: thousands of nested lists
         raise Refused(expected, f"{path} that cannot be read ({error})", do) from error
-
-
-def read_csv(path: str | Path, expected: str) -> list[list[str]]:
-    """Read rows that are not empty, without the apostrophes of `csv_lines`; refused if another separator is used."""
-    text = read_text(path, expected)
-    try:
-        rows = [row for row in csv.reader(io.StringIO(text, newline=""), skipinitialspace=True) if any(row)]
-    except csv.Error as error:
-        raise Refused(expected, f"{path} that cannot be read ({error})", "mend it") from error
-    for separator, name in ((";", "semicolons"), ("\t", "tabs")):
-        if rows and all(separator in row[0] for row in rows):
-            raise Refused(f"{expected}, separated by commas", f"{path} with {name}", "save it with commas")
-    return [[strip_apostrophe(cell) for cell in row] for row in rows]
 
 
 @contextmanager

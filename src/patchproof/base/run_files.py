@@ -1,4 +1,4 @@
-"""Files of a run's folder that tell how far the run got, and the refusal of a folder without a finished run."""
+"""The files that tell how far a run got."""
 
 from pathlib import Path
 

@@ -11,7 +11,7 @@ import unicodedata
 from collections.abc import Callable, Iterable
 from typing import Any
 
-_FORMULA = re.compile(r"\s*[=+@＝＋－＠-]|[\t\r\n]")  # what a spreadsheet computes, after an apostrophe does not
+FORMULA = re.compile(r"\s*[=+@＝＋－＠-]|[\t\r\n]")  # what a spreadsheet computes, after an apostrophe does not
 _UNSEEN = ("Cc", "Cf", "Cs", "Zl", "Zp")  # control, format, surrogate, line and paragraph separators
 _JOINERS = "\u200c\u200d"  # invisible, and needed within words and emoji
 
@@ -41,13 +41,8 @@ def csv_lines(rows: Iterable[Iterable[Any]]) -> str:
     """Write rows as CSV, their text `printable`, and with an apostrophe where a spreadsheet would see a formula."""
 
     def cell(value: Any) -> Any:
-        return "'" * bool(_FORMULA.match(value)) + printable(value) if isinstance(value, str) else value
+        return "'" * bool(FORMULA.match(value)) + printable(value) if isinstance(value, str) else value
 
     buffer = io.StringIO()
     csv.writer(buffer, lineterminator="\n").writerows(map(cell, row) for row in rows)
     return buffer.getvalue()
-
-
-def strip_apostrophe(cell: str) -> str:
-    """Undo the apostrophe of `csv_lines`."""
-    return cell[1:] if cell.startswith("'") and _FORMULA.match(cell, 1) else cell

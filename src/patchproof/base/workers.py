@@ -35,7 +35,6 @@ _Item = tuple[int, Any]  # its number, and the item
 MAX_TRIES = 3  # of an item whose worker dies each time
 MAX_QUEUED_ITEMS = 1000  # on a cluster at a time: enough to keep it busy, and for its scheduler to plan ahead
 _QUOTA = Path("/sys/fs/cgroup/cpu.max")  # of a container: microseconds of processor time per period
-_CONNECT_TIMEOUT_S = 10
 
 
 class Workers:
@@ -126,7 +125,9 @@ def open_workers(jobs: int = 1, cluster: str | None = None, spawn: bool = False)
         return
     if jobs > 1:
         raise Refused("--jobs or --cluster", "both", "leave one out: a cluster has its own number of workers")
-    with closing(_client(cluster)) as client:
+    from patchproof.base.cluster import connect_client
+
+    with closing(connect_client(cluster)) as client:
         yield Workers(partial(client.get_executor, pure=False), MAX_QUEUED_ITEMS, True)
 
 
@@ -270,19 +271,6 @@ def _init_worker(parent: int, function: _Task | None) -> None:
         os._exit(1)
 
     threading.Thread(target=end_with_parent, daemon=True).start()
-
-
-def _client(address: str) -> Any:
-    try:
-        from distributed import Client
-    except ImportError:
-        raise Refused("dask.distributed for --cluster", "none", 'pip install "patchproof[cluster]"') from None
-    try:
-        return Client(address, timeout=_CONNECT_TIMEOUT_S, set_as_default=False)
-    except (OSError, ValueError, TimeoutError) as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
-        do = "start dask scheduler there, or correct the address"
-        raise Refused("a Dask scheduler, such as tcp://host:8786", f"{address} ({reason})", do) from error
 
 
 def _has_dead_worker(future: Future) -> bool:

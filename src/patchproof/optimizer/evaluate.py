@@ -7,6 +7,7 @@ uses. They are evaluated a few at a time, by this process or by others, each of 
 
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import lru_cache, partial
 from pathlib import Path
 
@@ -24,9 +25,16 @@ from patchproof.base.workers import Workers, open_workers
 from patchproof.classifier.average_precision import Detection, average_precision, find_detections
 from patchproof.classifier.network import Classifier, center_square
 from patchproof.optimizer.problem import Problem, set_problem
-from patchproof.optimizer.promise import CONTROLS, PROMISE_VIEWS, control_claims, model_claims, pictures_with_controls
+from patchproof.optimizer.promise import (
+    CONTROLS,
+    PROMISE_VIEWS,
+    PromiseOptions,
+    control_claims,
+    model_claims,
+    pictures_with_controls,
+)
 from patchproof.optimizer.responses import CHUNK_VIEWS, Responses, in_chunks, merge_responses, responses
-from patchproof.optimizer.run import Run, load_run
+from patchproof.optimizer.run import Run, load_run, promise_of, write_run
 from patchproof.render.photograph import Appearance, expose
 from patchproof.scene.conditions import Conditions
 from patchproof.sheets.manifest import ControlClaim, ModelClaim
@@ -185,3 +193,25 @@ def _detections(problem: Problem, appearances: Mapping[str, Appearance], conditi
             candidates = ((kind, network.network(square)) for kind, square in squares)
             detections[network.name] = {k: find_detections(c, indices, boxes_px, shows) for k, c in candidates}
     return detections
+
+
+def promise_run(
+    run_folder: str | Path,
+    *,
+    views: int | None = None,
+    trust: bool = False,
+    compute: Compute = Compute(),
+    progress: Progress = no_progress,
+) -> Run:
+    """Promise the rate of a finished run's design again, from `views` views and with the run's own controls; the run is
+    the same to the byte as if `optimize` had been given these views. A sheet keeps its promise until it is written
+    again. For `trust` see `load_run`.
+    """
+    compute, options = compute.without("promise", cluster=True), PromiseOptions(views)
+    with lock_folder(run_folder):
+        run = load_run(run_folder, trust)
+        options = replace(options, controls=tuple(run.promise.controls))
+        problem = set_problem(run.scene, compute.device, jobs=compute.jobs)
+        promise = promise_of(problem, run.design, options, partial(progress, "promise"))
+        details = run.details | {"promise": promise.model_dump(mode="json")}
+        return write_run(replace(run, promise=promise, details=details))

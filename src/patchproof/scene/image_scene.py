@@ -20,10 +20,11 @@ from typing import Self
 
 import numpy as np
 
+from patchproof.base.csv_file import read_csv
 from patchproof.base.errors import Refused
 from patchproof.base.fingerprint import files_sha256
 from patchproof.base.geometry import rotated_extent
-from patchproof.base.input import is_file, read_csv
+from patchproof.base.input import is_file
 from patchproof.base.settings import SceneSettings
 from patchproof.base.validation import expand_path
 from patchproof.photo.read import read_photo, summarize_said

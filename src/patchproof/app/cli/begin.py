@@ -32,10 +32,6 @@ def new(
     overwrite: Overwrite = False,
 ) -> None:
     """Write a commented scene for an object, photographs of it, or a folder of images."""
-    from patchproof.app.cli.files import require_path
-
-    if not thing.startswith("primitive:"):
-        require_path("a mesh file, primitive:NAME or a folder of pictures", thing)
     from patchproof.app.begin.new import new_scene
 
     network_names = names_of(models)

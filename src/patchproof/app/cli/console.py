@@ -45,7 +45,6 @@ Models = Annotated[str | None, Option(help="Comma-separated classifiers; a sheet
 _NO_MEMORY = re.compile(
     r"(?i)can(no|')t (allocate memory|start new thread)|(insufficient|out of) memory|failed to map seg"
 )
-NAMING_FILES = ("scene", "run", "runs", "sheet", "pdf", "picture", "photos", "chart")  # arguments that do
 LINE_EVERY_S = 30.0  # of progress, if standard error is not a terminal
 
 
@@ -94,7 +93,7 @@ def as_command(verb: Callable[..., None]) -> Callable[..., None]:
     def command(**arguments: Any) -> None:
         _running[:] = [arguments]
         try:
-            if not arguments.keys().isdisjoint(NAMING_FILES):
+            if verb.__name__ not in ("demo", "keys"):
                 from patchproof.app.cli.files import check_files
 
                 check_files(arguments)

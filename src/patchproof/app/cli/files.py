@@ -16,6 +16,8 @@ from patchproof.sheets.manifest import load_manifest
 
 def check_files(arguments: Mapping[str, Any]) -> None:
     """Refuse the first of a command's arguments whose file is missing, and settings and manifests that are wrong."""
+    if not (thing := arguments.get("thing", "primitive:")).startswith("primitive:"):
+        require_path("a mesh file, primitive:NAME or a folder of pictures", thing)
     for name, value in arguments.items():
         for path in value if isinstance(value, list) else [value]:
             if isinstance(path, Path) and name in _CHECKS:

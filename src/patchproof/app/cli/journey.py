@@ -107,7 +107,7 @@ def promise(
 ) -> None:
     """Promise a finished run's rate again: in full after a draft, or from more views."""
     from patchproof.base.settings import background_summary
-    from patchproof.optimizer.run import promise_run
+    from patchproof.optimizer.evaluate import promise_run
     from patchproof.report.words import promise_lines
 
     with progress() as bar:
@@ -155,7 +155,7 @@ def sheet(
     else:
         from patchproof.optimizer.run import load_run
         from patchproof.reprints.run_sheet import sheet as sheet_of
-        from patchproof.reprints.run_sheet import sheet_of_several
+        from patchproof.reprints.shared_page import sheet_of_several
 
         first, *others = loaded = [load_run(folder, trust) for folder in runs]
         if others:
