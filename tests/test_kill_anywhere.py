@@ -253,6 +253,7 @@ def interrupts(base: Path, count: int, seed: int) -> Iterator[str]:
     ):
         assert start(line).wait() == 0, line
     rng, seconds, unbroken = np.random.default_rng(seed), {}, {}
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # what a shell starts in the background inherits none
     for verb, (line, out) in VERBS.items():
         begin = time.monotonic()
         assert start(line).wait() == 0, line
