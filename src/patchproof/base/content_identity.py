@@ -1,5 +1,6 @@
 """Identity of a scene by what its files hold, not by how their paths are spelled."""
 
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,11 @@ def content_identity(settings: SceneSettings, base: Path) -> dict[str, Any]:
 def _content_sha256(paths: list[Path]) -> str | None:
     """A hash of files, or of one folder's names and sizes; None if there is none."""
     if is_folder(paths[0]):
-        files = (path for path in paths[0].rglob("*") if path.is_file())
-        return value_sha256(sorted((path.relative_to(paths[0]).as_posix(), path.stat().st_size) for path in files))
+        return _folder_sha256(paths[0], paths[0].stat().st_mtime_ns)
     return files_sha256(paths) if is_file(paths[0]) else None
+
+
+@lru_cache(maxsize=100)  # once a process: a search for a place asks a hundred times
+def _folder_sha256(folder: Path, changed_ns: int) -> str:
+    files = (path for path in folder.rglob("*") if path.is_file())
+    return value_sha256(sorted((path.relative_to(folder).as_posix(), path.stat().st_size) for path in files))
