@@ -136,8 +136,8 @@ def test_a_stopped_run_says_what_is_kept_and_a_second_try_how_to_go_on(tmp_path,
     assert capsys.readouterr().err.splitlines()[-1] == f"Stopped: {out} keeps what was finished. Go on with: {again}"
     assert command("optimize", scene_file, "--out", out) == 1
     assert "which is unfinished: continue with --resume" in capsys.readouterr().err
-    monkeypatch.setattr("patchproof.optimizer.evaluate.evaluate", stop)
-    assert command("evaluate", out) == 130 and capsys.readouterr().err == "Stopped: nothing was written.\n"
+    monkeypatch.setattr("patchproof.app.plan.plan.plan_geometry", stop)
+    assert command("plan", scene_file) == 130 and capsys.readouterr().err == "Stopped: nothing was written.\n"
 
 
 def test_an_unfinished_study_is_gone_on_with(tmp_path):

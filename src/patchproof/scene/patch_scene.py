@@ -168,7 +168,9 @@ def _place_piece(scene: MeshScene, lay: PlacementMethod) -> tuple[Piece, Placeme
                 f"{smallest_piece_mm(needed_mm)} mm or more; come nearer, or take larger photographs"
             )
         notes += (f"{interface.measurable_text(unreadable, marker_mm)}: {advice}",)
-    if placement.family == "exponential":  # of 15 photographs of a mug that showed all markers, none was measured
+    if (
+        piece.markers and placement.family == "exponential"
+    ):  # of 15 photographs of a mug that showed all markers, none was measured
         notes += ("paper that bends in two directions can rarely be measured: its photographs count, without figures",)
     return piece, placement, unreadable, notes
 
