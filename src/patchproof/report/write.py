@@ -18,12 +18,6 @@ from patchproof.report.images import DELTA_TOP, data_uri, saved_pictures
 from patchproof.report.page import render_page
 from patchproof.report.plots import ledger_plot, recognition_plot, scale_plot
 
-_EFFECTS = {
-    "shown": "The patch itself makes the difference: it did better than every control.",
-    "not_shown": "That the patch itself makes a difference was not shown: it did not clearly beat every control.",
-    "not_tested": "Whether the patch itself makes a difference was not tested: there were no control photographs.",
-    "estimated": "There were no control photographs. What they would have shown was estimated from these.",
-}
 _FIRST = ("file", "status", "code", "figure", "threshold", "advice")
 _PLOTS = (("tilt_deg", "tilt in degrees"), ("px_per_mm", "pixels per millimeter"))
 
@@ -54,7 +48,6 @@ def report_html(report: Mapping, manifest: Mapping, encoded: Mapping[str, Mappin
             (recognition_plot(judged, primary, name, label, promise["conditions"]), f"chart of recognition by {label}")
             for name, label in _PLOTS
         ]
-    estimated = summary["effect"] == "not_tested" and (summary["estimated"] or {}).get("controls")
     pictures = {file: {kind: data_uri(data) for kind, data in kinds.items()} for file, kinds in encoded.items()}
     return render_page(
         "page.html.j2",
@@ -68,9 +61,9 @@ def report_html(report: Mapping, manifest: Mapping, encoded: Mapping[str, Mappin
         looks=words.looks_sentence(summary),
         meaning=words.recognition_meaning(promise["models"][0], promise["target"]["label"]) if promise else "",
         rules={model["name"]: model["least_score"] for model in (promise["models"] if promise else ())},
-        word=(summary["worth"] or {}).get("word", "not_shown"),
+        word=(summary["worth"] or {}).get("word", "cannot_tell"),
         verdict=words.VERDICTS[summary["verdict"]],
-        effect=_EFFECTS["estimated" if estimated else summary["effect"]],
+        effect="" if report["controls"] else "There were no control photographs.",
         bars=_bars(summary, promise, report["controls"]),
         controls=report["controls"],
         ledger=ledger,
@@ -92,19 +85,19 @@ def _bars(summary: Mapping, promise: Mapping | None, controls: Sequence[Mapping]
         rows.append(("These photographs", summary["rate"], summary["interval"], "seen"))
     if promise:
         rows.append(("Promised", promise["rate"], promise["interval"], "promised"))
-    if summary["matched_rate"] is not None:
-        rows.append(("Promised at these views", summary["matched_rate"], None, "promised"))
+    if summary["matched_rate"] is not None and not summary["forecast"]:  # which says the same, from each very view
+        rows.append(("Promised at views like these", summary["matched_rate"], None, "promised"))
     if summary["prediction_interval"] and judged:
         allowed = [count / judged for count in summary["prediction_interval"]]
         rows.append((f"Allowed for {judged} photographs", None, allowed, "allowed"))
     if forecast := summary["forecast"]:
         n, allowed = forecast["photos"], [count / forecast["photos"] for count in forecast["interval"]]
-        rows.append((f"Expected of {n} at their views", forecast["expected"] / n, allowed, "promised"))
+        rows.append((f"Expected of {n} at their own views", forecast["expected"] / n, allowed, "promised"))
     for c in controls:
         if c["n"]:
             rows.append((f"Control: {c['name']}", c["recognized"] / c["n"], c["interval"], "control"))
     for name, claim in (promise["controls"] if promise else {}).items():
-        rows.append((f"Promised control: {name}", claim["rate"], claim["interval"], "control"))
+        rows.append((f"Simulated control: {name}", claim["rate"], claim["interval"], "control"))
     return [dict(zip(("name", "rate", "interval", "kind"), row, strict=True)) for row in rows]
 
 
