@@ -10,7 +10,7 @@ from synthetic_photos import make_manifest
 
 from patchproof.app.verify import _look_at
 from patchproof.base.sessions import TAIL
-from patchproof.evidence.ranges import matched_rate, promised_ranges, promised_side_px
+from patchproof.evidence.ranges import promised_ranges, promised_side_px
 from patchproof.evidence.results import CameraPose, Geometry, PhotoEntry
 from patchproof.evidence.verdict import (
     Look,
@@ -229,15 +229,6 @@ def test_an_azimuth_leaves_the_range_only_where_it_is_sure_to():
     ]
     assert ranges.violated(at[0], True).code == "out_of_range"
     assert ranges.violated(at[1], True) is None
-
-
-def test_the_matched_rate_is_that_of_the_nearest_conditions():
-    near, far = [1 + i / 1000 for i in range(20)], [5 + i / 1000 for i in range(20)]
-    claims = conditions(near + far, [True] * 20 + [False] * 20)
-    assert matched_rate([entry(px_per_mm=1.0)], claims) == 1.0
-    assert matched_rate([entry(px_per_mm=1.0), entry(px_per_mm=5.0)], claims) == 0.5
-    assert matched_rate([entry()], claims) is None and matched_rate([], claims) is None
-    assert matched_rate([entry(px_per_mm=1.0)], conditions([None], [True])) is None
 
 
 @pytest.mark.parametrize(("earlier", "seen", "number"), [(None, "a", 1), (2, "a", 2), (2, "b", 3), ("x", "a", 1)])

@@ -34,7 +34,6 @@ from patchproof.evidence.grouping import Grouping, group_sessions, subfolders
 from patchproof.evidence.journal import Journal, settings_key
 from patchproof.evidence.ledger import ledger_of
 from patchproof.evidence.measure import UNLOCATED_CODES, MeasuredPhoto
-from patchproof.evidence.ranges import matched_rate, promised_side_px
 from patchproof.evidence.reproject import PhotoSquare
 from patchproof.evidence.results import (
     EffectEstimate,
@@ -223,7 +222,7 @@ def report_of(
     Without a `look` the photographs were watched while they were taken.
     """
     entries, counted = [photo.entry for photo in photos], [photo.entry for photo in photos if photo.counted]
-    verdict, matched = Verdict("cannot_tell", None, "The sheet promises nothing."), None
+    verdict = Verdict("cannot_tell", None, "The sheet promises nothing.")
     comparisons, rates, rate, interval, sessions, forecast, do, worth = [], {}, _rate({}), None, (), None, "", None
     if judges and manifest.promise:
         promise, primary = manifest.promise, judges.primary.name
@@ -237,8 +236,6 @@ def report_of(
         verdict = judge(*counts, promise, without_markers, look)
         if recognized:
             interval = promise.posterior.rate_given(*counts)
-        measured = (entry for entry in counted if entry.status == "measured")
-        matched = matched_rate(measured, promise.conditions, promised_side_px(manifest))
         pairs = [(e.forecast, recognized[e.file]) for e in counted if e.forecast is not None and e.file in recognized]
         if pairs:
             forecast = forecast_of([p for p, _ in pairs], [answer for _, answer in pairs], promise.rate)
@@ -263,7 +260,6 @@ def report_of(
         looks_planned=(look or PLANNED_LOOK).planned,
         prediction_interval=verdict.prediction_interval,
         verdict=verdict.verdict,
-        matched_rate=matched,
         ledger=ledger and ledger.shares,
         culprit=ledger and ledger.culprit,
         reason=verdict.reason,

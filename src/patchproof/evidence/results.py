@@ -283,7 +283,6 @@ class Summary(StrictModel):
     interval: tuple[Finite, Finite] | None
     prediction_interval: tuple[int, int] | None
     verdict: VerdictWord
-    matched_rate: Finite | None
     ledger: dict[str, LedgerShare] | None = None
     culprit: str | None = None
     reason: str = ""  # for the verdict, in a sentence

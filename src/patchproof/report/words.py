@@ -96,10 +96,9 @@ def promise_lines(promise: Any, settings: Mapping[str, Any], run: str = "RUN") -
     the difference to each control. `settings` are the scene's as plain data, `run` is the run's folder.
     """
     (low, high), target, (first, *more_models) = promise.interval, promise.target, promise.models
-    meaning = recognition_meaning(first.model_dump(), target.label)
-    background = background_summary(settings)
+    meaning, background = recognition_meaning(first.model_dump(), target.label), background_summary(settings)
     return [
-        " ".join(filter(None, (promise.headline, promise_advice(promise, settings, run)))),
+        promise_summary(promise, settings, run),
         f'promise ({target.goal} "{target.label}"): recognized in {promise.rate:.1%} of {promise.n} unseen conditions '
         f"in {promise.sessions} sessions "
         f"[{low:.1%}, {high:.1%}] by {first.name}{background and f', simulated {background}'}",
@@ -109,37 +108,36 @@ def promise_lines(promise: Any, settings: Mapping[str, Any], run: str = "RUN") -
     ]
 
 
-def promise_advice(promise: Any, settings: Mapping[str, Any], run: str = "RUN") -> str:
-    """Say which command tells, where a promise cannot; what to change, where the design does not help; else ""."""
-    if promise.answer == "cannot_tell":
-        return f"What tells: {_promise_command(promise, run)}."
-    if promise.answer == "helps":
-        return ""
-    patch, placed = settings.get("patch") or {}, (settings.get("object") or {}).get("mesh") is not None
-    change = "place, size or seed" if placed else "size or seed"
-    if patch.get("kind", "patch") != "patch":
+def promise_summary(promise: Any, settings: Mapping[str, Any], run: str = "RUN") -> str:
+    """Say whether the design helps, which command tells if a promise cannot, what to change if it does not help."""
+    change = "place, size or seed" if (settings.get("object") or {}).get("mesh") else "size or seed"
+    if (settings.get("patch") or {}).get("kind", "patch") != "patch":
         change = "seed, or let more of the surface change"
     elif settings.get("imported"):
-        change = "picture, place or size" if placed else "picture or size"
-    return f"{_NO_GAIN} Try another {change}, before printing it." if change else _NO_GAIN
+        change = change.replace("seed", "picture")
+    advice = {
+        "helps": "",
+        "does_not_help": f" {_NO_GAIN} Try another {change}.",
+        "cannot_tell": f" What tells: {_promise_command(promise, run)}.",
+    }
+    return promise.headline + advice[promise.answer]
 
 
 def _promise_command(promise: Any, run: str) -> str:
-    more = "" if promise.draft else f" --n {4 * promise.n}"
-    return f"patchproof promise {shlex.quote(run)}{more}"
+    return f"patchproof promise {shlex.quote(run)}" + ("" if promise.draft else f" --n {4 * promise.n}")
 
 
 def run_lines(run: Any) -> list[str]:
     """Sum up a finished run, and say which command comes next."""
-    promise, folder, settings = run.promise, shlex.quote(str(run.folder)), run.scene.settings.model_dump()
-    imported = run.details.get("imported")
-    following = f"patchproof sheet {folder} --out sheet.{'json' if settings['sheet']['template'] == NO_PAGE else 'pdf'}"
+    folder, settings = str(run.folder), run.scene.settings.model_dump()
+    page = "json" if settings["sheet"]["template"] == NO_PAGE else "pdf"
+    following = f"patchproof sheet {shlex.quote(folder)} --out sheet.{page}"
     if settings["patch"]["kind"] != "patch":
-        following = f"patchproof evaluate {folder}"
-    if promise.answer == "cannot_tell":
-        following = _promise_command(promise, str(run.folder))
-    lines = [*promise_lines(promise, settings | {"imported": imported}, str(run.folder)), f"run: {run.folder}"]
-    return lines if promise.answer == "does_not_help" else [*lines, f"next: {following}"]
+        following = f"patchproof evaluate {shlex.quote(folder)}"
+    if run.promise.answer == "cannot_tell":
+        following = _promise_command(run.promise, folder)
+    lines = promise_lines(run.promise, settings | {"imported": run.details.get("imported")}, folder)
+    return [*lines, f"run: {folder}", *([f"next: {following}"] if run.promise.answer != "does_not_help" else [])]
 
 
 def imported_lines(imported: Mapping[str, Any]) -> list[str]:
@@ -210,19 +208,9 @@ def _estimated_lines(estimated: Any) -> list[str]:
     agree = f"re-rendering gave the original answer in {estimated.agree:.0%} of {estimated.photos} photographs"
     if not estimated.controls:
         return [f"controls not rendered into these photographs: {agree}"]
-    head = f"controls rendered into these photographs ({agree}):"
-    rows = (
-        {
-            "rate": c.rates[1],
-            "difference": c.difference,
-            "difference_interval": c.difference_interval,
-            "n": c.n,
-            "name": c.name,
-        }
-        for c in estimated.controls
-        if c.rates
-    )
-    return [head, *_control_lines({row["name"]: row for row in rows})]
+    names = ("n", "difference", "difference_interval")
+    rows = {c.name: {"rate": c.rates[1], **{name: getattr(c, name) for name in names}} for c in estimated.controls}
+    return [f"controls rendered into these photographs ({agree}):", *_control_lines(rows)]
 
 
 def _control_lines(controls: Mapping[str, Mapping[str, Any]]) -> list[str]:

@@ -85,8 +85,6 @@ def _bars(summary: Mapping, promise: Mapping | None, controls: Sequence[Mapping]
         rows.append(("These photographs", summary["rate"], summary["interval"], "seen"))
     if promise:
         rows.append(("Promised", promise["rate"], promise["interval"], "promised"))
-    if summary["matched_rate"] is not None and not summary["forecast"]:  # which says the same, from each very view
-        rows.append(("Promised at views like these", summary["matched_rate"], None, "promised"))
     if summary["prediction_interval"] and judged:
         allowed = [count / judged for count in summary["prediction_interval"]]
         rows.append((f"Allowed for {judged} photographs", None, allowed, "allowed"))

@@ -7,78 +7,55 @@ sessions, the counts that the promise allows for, the chance that they prove it,
 beside as many photographs of a control in the same places.
 """
 
-from dataclasses import dataclass
-
 from patchproof.base.sessions import split_evenly
 from patchproof.base.settings import SceneSettings, background_summary
 from patchproof.evidence import verdict
 from patchproof.optimizer.promise import PROMISE_VIEWS
-from patchproof.report.words import promise_advice
+from patchproof.report.words import promise_summary
 from patchproof.sheets.manifest import Promise
 
 SHOT_COUNTS = ((40, 1), (40, 2), (40, 4), (40, 8), (80, 8))  # photographs, sessions
 
 
-@dataclass(frozen=True)
-class ShotOption:
-    """A number of photographs and sessions, the counts that the promise allows for, the chance to prove it, and the
-    least gain that they show (None: no gain).
-    """
-
-    photos: int
-    sessions: int
-    allowed: tuple[int, int]
-    chance: float
-    gain: float | None
-
-
-def plan_shots(promise: Promise) -> tuple[ShotOption, ...]:
-    """Compute what photographs can prove of a promise."""
-    splits = [(*counts, split_evenly(*counts)) for counts in SHOT_COUNTS]
-    allowed, gain = promise.posterior.count_interval, verdict.provable_gain
-    return tuple(
-        ShotOption(n, s, allowed(split), verdict.kept_chance(promise, split), gain(promise, s, n // s))
-        for n, s, split in splits
-    )
-
-
 def shot_sections(promise: Promise, settings: SceneSettings) -> tuple[tuple[str, tuple[str, ...]], ...]:
     """Say how many photographs to take, and from where, as (heading, lines)."""
     data = settings.model_dump()
-    sentences = promise.headline, promise_advice(promise, data), f"Promise simulated {background_summary(data)}."
-    counts = (" ".join(filter(None, sentences)), *_count_lines(promise))
+    summary = f"{promise_summary(promise, data)} Promise simulated {background_summary(data)}."
+    counts = (summary, *_count_lines(promise))
     return (("How many photographs", counts), ("From where", _view_lines(settings)))
 
 
 def _count_lines(promise: Promise) -> tuple[str, ...]:
-    best = promise.best_control
-    lines = [
+    needed = verdict.photos_line(promise, (), promise.best_control)
+    promised = (
         f"Promised: {promise.rate:.1%} recognized as {promise.target.label}, of {promise.n} views in "
         f"{promise.sessions} sessions, each with a place, light, camera and print of its own."
-    ]
-    if promise.answer == "does_not_help":
-        return (*lines, verdict.photos_line(promise, (), best))
-    options = (
-        f"{o.photos} in {verdict.places_text(o.sessions)}: {o.allowed[0]} to {o.allowed[1]} ({o.chance:.0%}; "
-        f"{'no gain' if o.gain is None else f'{o.gain:.0%}'})"
-        for o in plan_shots(promise)
     )
-    lines.append(
+    if promise.answer == "does_not_help":
+        return promised, needed
+    proofs = (
         f"A verdict asks the photographs to prove a rate of {verdict.required_rate(promise):.0%}. What they will show "
         "if the promise holds (the chance that it is enough; the least gain that they show beside as many photographs "
-        f"of a control in the same places): {'; '.join(options)}."
+        f"of a control in the same places): {'; '.join(_proof(promise, *counts) for counts in SHOT_COUNTS)}."
     )
-    lines.append(verdict.photos_line(promise, (), best))
-    if promise.n < PROMISE_VIEWS and not promise.draft:
-        lines.append(
-            f"A promise of {PROMISE_VIEWS} views (patchproof promise RUN --n {PROMISE_VIEWS}, then this page again) "
-            "knows better how much places differ, and often asks for fewer of them."
-        )
-    lines.append(
+    short = promise.n < PROMISE_VIEWS and not promise.draft
+    more = (
+        f"A promise of {PROMISE_VIEWS} views (patchproof promise RUN --n {PROMISE_VIEWS}, then this page again) "
+        "knows better how much places differ, and often asks for fewer of them."
+    )
+    pairs = (
         "Take each view twice, with the patch and with the control, under equal file names, each control in a folder "
         "of its own: pairs tell more. A patch helps only if it beats every control that you photograph."
     )
-    return tuple(lines)
+    return promised, proofs, needed, *([more] if short else []), pairs
+
+
+def _proof(promise: Promise, photos: int, sessions: int) -> str:
+    """What so many photographs prove: the counts allowed for, the chance of `kept`, and the least gain they show."""
+    split, gain = split_evenly(photos, sessions), verdict.provable_gain(promise, sessions, photos // sessions)
+    low, high = promise.posterior.count_interval(split)
+    chance, shown = verdict.kept_chance(promise, split), "no gain" if gain is None else f"{gain:.0%}"
+    return f"{photos} in {verdict.places_text(sessions)}: {low} to {high} ({chance:.0%}; {shown})"
 
 
 def _view_lines(settings: SceneSettings) -> tuple[str, ...]:

@@ -197,19 +197,13 @@ class Promise(StrictModel):
         return self.target.goal.answer(self.controls[self.best_control].difference_interval)
 
     @property
-    def draft_prefix(self) -> str:
-        """The beginning of sentences about a draft; "" for a full promise."""
-        return f"Draft of {self.n} views (preliminary): " if self.draft else ""
-
-    @property
     def headline(self) -> str:
         """A sentence that compares the design with its best control in the views that were rendered of both."""
-        name, answer = self.best_control, self.target.goal.words[self.answer]
-        control = self.controls[name]
+        control, draft = self.controls[self.best_control], f"Draft of {self.n} views (preliminary): " * self.draft
         rate = control.rate + control.difference
+        beside = f"{control.rate:.1%} with its best control ({self.best_control}) in the same views"
         points = points_text(rate, control.rate, control.difference_interval)
-        rates = f"{rate:.1%} recognized, {control.rate:.1%} with its best control ({name}) in the same views"
-        return f"{self.draft_prefix}{answer}: {rates}: {points}."
+        return f"{draft}{self.target.goal.words[self.answer]}: {rate:.1%} recognized, {beside}: {points}."
 
     def figures(self) -> dict[str, str]:
         """The target, rate, interval and controls as text, in the order to be read."""

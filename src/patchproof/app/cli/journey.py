@@ -106,7 +106,7 @@ def promise(
 
     with progress() as bar:
         finished_run = promise_run(run, views=n, trust=trust, compute=Compute(device, jobs or 1), progress=bar)
-    say("A page that was written before has the former promise.", *run_lines(finished_run))
+    say(*run_lines(finished_run), "A page that was written before has the former promise.")
 
 
 def sheet(
@@ -126,7 +126,7 @@ def sheet(
     """Write the page: design, markers, chart and rulers at true size."""
     from patchproof.base.output import check_file
     from patchproof.base.settings import background_summary
-    from patchproof.report.words import promise_advice
+    from patchproof.report.words import promise_summary
     from patchproof.sheets.blank import blank_page
     from patchproof.sheets.print_advice import pdf_advice, sheet_advice
     from patchproof.sheets.template import template_summaries
@@ -156,8 +156,8 @@ def sheet(
             manifests = [sheet_of(first, out, template=template, control=control, copies=copies)]
     for manifest, path in zip(manifests, paths, strict=True):
         if manifest.promise is not None:
-            say(f"{manifest.promise.headline} {promise_advice(manifest.promise, manifest.settings)}".strip())
-            say(f"promise simulated {background_summary(manifest.settings)}")
+            lines = promise_summary(manifest.promise, manifest.settings), background_summary(manifest.settings)
+            say(lines[0], f"promise simulated {lines[1]}")
         say(f"sheet {manifest.sheet_id} ({manifest.kind}): {out}, {path.name}")
     if check:
         lines = (line for manifest in manifests for line in sheet_advice(manifest))
