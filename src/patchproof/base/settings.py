@@ -177,7 +177,7 @@ class LightSettings(StrictModel):
 
 
 class BackgroundSettings(StrictModel):
-    """The background of the object: pictures, a color, or by default procedural rooms."""
+    """The background of the object: pictures, a color, or by default synthetic rooms."""
 
     # A folder of photographs, divided among training, selection, promise and evaluation; or a picture of a known place.
     images: str | None = None

@@ -187,8 +187,8 @@ def photos_line(
     sessions, each = max(kept or 0, shown), PHOTOS_PER_SESSION
     places, total, what = places_text(sessions), each * sessions, ""
     if control:
-        command = "" if control == "bare" else f" (patchproof sheet RUN --control {control})"
-        what = f" of the patch and {each} of {'the bare object' if control == 'bare' else control}{command}"
+        printed = f"its {control} control (patchproof sheet RUN --control {control})"
+        what = f" of the patch and {each} of {'the bare object' if control == 'bare' else printed}"
     so_far = f" So far: {sum(photos)} of {total}, in {places_text(len(photos))} of {sessions}." if photos else ""
     if sum(photos) >= total and len(photos) >= sessions:
         so_far = f" So far: {sum(photos)} of the patch, in {places_text(len(photos))}."
