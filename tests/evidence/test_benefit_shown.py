@@ -186,12 +186,12 @@ def test_who_cannot_tell_is_told_how_many_photographs_the_plan_asks_for():
     worth = benefit_of(40, 0.5, (0.3, 0.7), [beside("gray", 18)], HELPFUL)
     assert needs((40,), "kept") == needs((40,), "kept", worth=worth.changed(word="does_not_help")) == ""
     both = needs((6,), "kept", worth=worth)
-    assert (
-        f"{each} of its gray control (patchproof sheet RUN --control gray) in each of {sessions_to_show(promise)} places"
-        in both
-    )
+    printed = f"{each} of its gray control (patchproof sheet RUN --control gray)"
+    assert f"{printed} in each of {sessions_to_show(promise)} places" in both
     lost = needs((6,), worth=worth, promise=USELESS)  # one sentence, and no "take more" beside it
     assert lost == "No 150 photographs are likely to show that it helps: make a design that gains more."
+    draft = promise_beside(0.4, {"bare": (0.38, -0.2, 0.24)}).changed(draft=True)
+    assert "promise it again first (patchproof promise RUN), or" in needs((6,), worth=worth, promise=draft)
     report = some_report().changed(summary=some_report().summary.changed(next_step="Take 10."))
     assert "Take 10." in verdict_lines(report)
 

@@ -16,8 +16,8 @@ from enum import StrEnum
 from typing import Literal
 
 GainWord = Literal["helps", "does_not_help", "cannot_tell"]
-# The least gain worth having: one view in ten. Photographs can hardly show less, 150 of patch and control each 16 points
-# (the demo's promise, in 80 % of trials), and a full promise's differences have intervals of ± 5 to 10 points.
+# The least gain worth having: one view in ten. Photographs hardly show less (150 of patch and control each: 16 points,
+# by the demo's promise), and a full promise's differences have intervals of ± 5 to 10 points.
 LEAST_GAIN = 0.10
 
 
@@ -51,8 +51,8 @@ class Goal(StrEnum):
         return "does_not_help" if high < LEAST_GAIN else "helps" if low > 0 else "cannot_tell"
 
     def hardest(self, differences: Mapping[str, tuple[float, float]]) -> str:
-        """The name of the control that decides: one that rules a gain out before one that cannot tell, and that before
-        those that are beaten; the bare object first among the former two, then the least gain.
+        """The control that decides: one that rules a gain out, else one that cannot tell, else the least gain. Of controls
+        that are not beaten the bare object comes first.
         """
 
         def order(name: str) -> tuple[bool, bool, bool, tuple[float, float]]:

@@ -132,9 +132,8 @@ def sessions_needed(promise: Promise) -> int | None:
 
 
 def provable_gain(promise: Promise, sessions: int, photos: int) -> float | None:
-    """The least gain over a control that photographs of a patch of the promised rate show with a chance of
-    `MIN_KEPT_CHANCE`, by `photos` in each of `sessions` places, and as many of the control; None if none is large
-    enough. Student's bound with as many degrees of freedom as sessions.
+    """The least gain that `photos` in each of `sessions` places, and as many of a control, show with a chance of
+    `MIN_KEPT_CHANCE`; None if none is large enough. Student's bound with as many degrees of freedom as sessions.
     """
     from scipy.special import stdtrit
 
@@ -150,7 +149,7 @@ def provable_gain(promise: Promise, sessions: int, photos: int) -> float | None:
 
 def sessions_to_show(promise: Promise) -> int | None:
     """The number of sessions of `PHOTOS_PER_SESSION` photographs of the patch, and as many of its best control, that
-    show the promised gain; None if that takes more than `MOST_PHOTOS` of each, or if no gain worth having is promised.
+    show the promised gain; None if `MOST_PHOTOS` of each do not, or if no gain worth having is promised.
     """
     if not promise.controls or promise.answer == "does_not_help":
         return None
@@ -162,9 +161,7 @@ def sessions_to_show(promise: Promise) -> int | None:
 def still_needed(
     promise: Promise, photos: Sequence[int], without_markers: int, verdict: VerdictWord, worth: Benefit | None
 ) -> str:
-    """Say what photographs (`photos` judged in each session) still lack to tell; "" if they tell both whether the
-    promise held and whether the patch helps.
-    """
+    """Say what is still needed, after `photos` judged in each session, to tell both answers; "" if they are told."""
     control = worth.control if worth is not None and worth.word == "cannot_tell" else ""
     if verdict != "cannot_tell" and not control:
         return ""
@@ -183,7 +180,9 @@ def photos_line(
     kept, shown = sessions_needed(promise) if for_promise else 0, sessions_to_show(promise) if control else 0
     if shown is None or (kept is None and not control):
         proves = f"show that it {promise.target.goal.words['helps']}" if control else "prove this promise"
-        return f"No {MOST_PHOTOS} photographs are likely to {proves}: make a design that gains more."
+        unsure = control and promise.controls and promise.answer == "cannot_tell"
+        first = f"promise it again first ({promise.command()}), or " if unsure else ""
+        return f"No {MOST_PHOTOS} photographs are likely to {proves}: {first}make a design that gains more."
     sessions, each = max(kept or 0, shown), PHOTOS_PER_SESSION
     places, total, what = places_text(sessions), each * sessions, ""
     if control:
@@ -212,8 +211,7 @@ def _share_without_markers(judged: int, without_markers: int) -> float:
 
 def compare_with_control(patch: Answers, name: str, control: Answers, promise: Promise) -> Control:
     """Compare answers to the patch with those to a control, both by session and photograph; equal keys are pairs, if at
-    least half of either are. `shown` says whether the patch changes recognition in the goal's direction, at 95 % over
-    sessions, which differ as much as the promise says.
+    least half of either are. `shown` says whether the patch gains at all, at 95 % over sessions.
     """
     counts = sum(control.values()), len(control)
     row = Control(name, *counts, wilson(*counts))
@@ -224,10 +222,9 @@ def compare_with_control(patch: Answers, name: str, control: Answers, promise: P
     a, b = (_by_session(answers, keys if paired else sorted(answers)) for answers in (patch, control))
     difference, interval = sessions_difference(a, b, paired)
     (rate, ours), (control_rate, theirs) = (_rate_of(hits, promise) for hits in (a, b))
-    row = replace(row, interval=theirs, rates=(rate, control_rate), patch_interval=ours)
-    shown, count = promise.target.goal.gains(interval)[0] > 0, min(len(a), len(b))
-    row = replace(row, pairs=len(keys) if paired else 0, difference=difference, difference_interval=interval)
-    row = replace(row, sessions=count, shown=shown)
+    row = replace(row, interval=theirs, rates=(rate, control_rate), patch_interval=ours, difference=difference)
+    count, pairs, shown = min(len(a), len(b)), len(keys) if paired else 0, promise.target.goal.gains(interval)[0] > 0
+    row = replace(row, sessions=count, pairs=pairs, difference_interval=interval, shown=shown)
     return row if count >= LEAST_SESSIONS else replace(row, advice=ONE_SESSION_ADVICE)
 
 

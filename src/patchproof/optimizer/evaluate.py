@@ -120,8 +120,7 @@ def evaluate(
     seed, why = run.scene.seed if seed is None else seed, "the object's box in these views is not known"
     boxless = (net.name for net in problem.classifiers if net.LOOKS_AT_BOXES and evaluations[net.name].ap50 is None)
     reasons = {f"AP50 of {name}": why for name in boxless}
-    goal = run.promise.target.goal
-    result = Evaluation(n=n, seed=seed, goal=goal, models=evaluations, not_measured=reasons)
+    result = Evaluation(n=n, seed=seed, goal=run.promise.target.goal, models=evaluations, not_measured=reasons)
     with lock_folder(run.folder):
         write_atomically(run.folder / "evaluate.json", result.to_json())
     return result

@@ -1,12 +1,10 @@
 """Render an HTML page from a template; values are escaped, and a missing one is an error."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
 
-from patchproof.base.goal import points_text
 from patchproof.base.intervals import Estimate
 from patchproof.base.text import printable
 
@@ -18,7 +16,7 @@ def render_page(template: str, folder: Path = Path(__file__).parent, **values: o
     options = {"trim_blocks": True, "lstrip_blocks": True, "undefined": StrictUndefined, "finalize": _printable_lines}
     environment = Environment(autoescape=True, **options)
     environment.loader = FileSystemLoader(folder)
-    environment.filters |= {"percent": _percent, "figure": _figure, "points": _points}
+    environment.filters |= {"percent": _percent, "figure": _figure}
     environment.tests["figure"] = lambda value: isinstance(value, (int, float, Estimate)) or value is None
     return environment.get_template(template).render(values)
 
@@ -34,11 +32,6 @@ def _percent(share: float | None) -> str:
 
 def _figure(value: float | None, digits: int = 2) -> str:
     return "not measured" if value is None else f"{value:.{digits}f}"
-
-
-def _points(control: Mapping[str, Any]) -> str:
-    rate, control_rate = control["rates"]
-    return points_text(rate, control_rate, control["difference_interval"])
 
 
 def versions_of(libraries: Iterable[str]) -> dict[str, str]:

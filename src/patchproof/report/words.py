@@ -21,25 +21,20 @@ _CONTROLS = {
     "gray": "a plain gray patch",
     "noise": "a patch of noise",
 }
-SOURCES = {
-    "photographed": "controls photographed",
-    "rendered": "controls rendered into these photographs",
-    "simulated": "controls simulated",
-}
 _NO_GAIN = f"A gain of {100 * LEAST_GAIN:.0f} points or more is ruled out."
 
 
 def headline_of(summary: Mapping[str, Any]) -> str:
-    """Say whether the patch helps, as a headline."""
+    """Say whether the patch helps, as a headline, and by which evidence."""
     worth = summary["worth"]
     if worth is None:
         return "Cannot be told yet"
-    words = Goal(worth["goal"]).words[worth["word"]]
-    return f"{words[0].upper()}{words[1:]} ({SOURCES[worth['source']]})"
+    words, where = Goal(worth["goal"]).words[worth["word"]], " into these photographs" * (worth["source"] == "rendered")
+    return f"{words[0].upper()}{words[1:]} (controls {worth['source']}{where})"
 
 
 def benefit_sentence(summary: Mapping[str, Any]) -> str:
-    """Say the figures behind the headline, and the kind of evidence."""
+    """Say the figures behind the headline."""
     worth = summary["worth"]
     if worth is None:
         return "There is nothing to compare the photographs with."
@@ -118,13 +113,9 @@ def promise_summary(promise: Any, settings: Mapping[str, Any], run: str = "RUN")
     advice = {
         "helps": "",
         "does_not_help": f" {_NO_GAIN} Try another {change}.",
-        "cannot_tell": f" What tells: {_promise_command(promise, run)}.",
+        "cannot_tell": f" What tells: {promise.command(run)}.",
     }
     return promise.headline + advice[promise.answer]
-
-
-def _promise_command(promise: Any, run: str) -> str:
-    return f"patchproof promise {shlex.quote(run)}" + ("" if promise.draft else f" --n {4 * promise.n}")
 
 
 def run_lines(run: Any) -> list[str]:
@@ -135,7 +126,7 @@ def run_lines(run: Any) -> list[str]:
     if settings["patch"]["kind"] != "patch":
         following = f"patchproof evaluate {shlex.quote(folder)}"
     if run.promise.answer == "cannot_tell":
-        following = _promise_command(run.promise, folder)
+        following = run.promise.command(folder)
     lines = promise_lines(run.promise, settings | {"imported": run.details.get("imported")}, folder)
     return [*lines, f"run: {folder}", *([f"next: {following}"] if run.promise.answer != "does_not_help" else [])]
 
@@ -157,11 +148,10 @@ def evaluation_lines(result: Mapping[str, Any]) -> list[str]:
     for name, rates in result["models"].items():
         low, high = rates["interval"]
         ends = {kind: claim["difference_interval"] for kind, claim in rates["controls"].items()}
-        answer = goal.words[goal.answer(ends[goal.hardest(ends)])]
-        if "cannot" in answer:
-            answer += f" (what tells: --n {4 * result['n']})"
-        share = f"recognized in {rates['rate']:.1%} of {result['n']} conditions [{low:.1%}, {high:.1%}]"
-        lines.append(f"{name}: {answer}; {share}")
+        word = goal.answer(ends[goal.hardest(ends)])
+        told = goal.words[word] + f" (what tells: --n {4 * result['n']})" * (word == "cannot_tell")
+        share = f"{rates['rate']:.1%} of {result['n']} conditions [{low:.1%}, {high:.1%}]"
+        lines.append(f"{name}: {told}; recognized in {share}")
         lines += _control_lines(rates["controls"])
         if rates["ap50"] is not None:
             lines.append("  AP50 " + ", ".join(f"{kind} {share:.3f}" for kind, share in rates["ap50"].items()))

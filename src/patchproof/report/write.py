@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from patchproof.base.goal import points_text
 from patchproof.base.output import make_folder, write_atomically
 from patchproof.base.text import csv_lines
 from patchproof.report import words
@@ -72,6 +73,7 @@ def report_html(report: Mapping, manifest: Mapping, encoded: Mapping[str, Mappin
         sized=any(photo["scale_x"] is not None for photo in photos),
         cards=[{"photo": photo, "pictures": pictures.get(photo["file"], {})} for photo in photos],
         remarks=words.remarks(photos),
+        points=points_text,
         delta_top=DELTA_TOP,
         settings=json.dumps(manifest["settings"], indent=1, ensure_ascii=False),
         origin=report["origin"],

@@ -8,6 +8,7 @@ SHA-256 over the raw RGB bytes, row by row.
 import base64
 import hashlib
 import json
+import shlex
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -195,6 +196,10 @@ class Promise(StrictModel):
     def answer(self) -> GainWord:
         """The answer to whether the design helps, from its difference to its best control."""
         return self.target.goal.answer(self.controls[self.best_control].difference_interval)
+
+    def command(self, run: str = "RUN") -> str:
+        """The command for a promise that tells more: in full after a draft, else from four times the views."""
+        return f"patchproof promise {shlex.quote(run)}" + ("" if self.draft else f" --n {4 * self.n}")
 
     @property
     def headline(self) -> str:
