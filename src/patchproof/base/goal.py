@@ -51,8 +51,8 @@ class Goal(StrEnum):
         return "does_not_help" if high < LEAST_GAIN else "helps" if low > 0 else "cannot_tell"
 
     def hardest(self, differences: Mapping[str, tuple[float, float]]) -> str:
-        """The control that decides: one that rules a gain out, else one that cannot tell, else the least gain. Of controls
-        that are not beaten the bare object comes first.
+        """The control that decides: one that rules a gain out, else one that cannot tell, else that of the least gain;
+        of controls that are not beaten, the bare object.
         """
 
         def order(name: str) -> tuple[bool, bool, bool, tuple[float, float]]:
