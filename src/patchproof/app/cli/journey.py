@@ -126,7 +126,6 @@ def sheet(
     """Write the page: design, markers, chart and rulers at true size."""
     from patchproof.base.output import check_file
     from patchproof.base.settings import background_summary
-    from patchproof.report.words import promise_summary
     from patchproof.sheets.blank import blank_page
     from patchproof.sheets.print_advice import pdf_advice, sheet_advice
     from patchproof.sheets.template import template_summaries
@@ -156,6 +155,8 @@ def sheet(
             manifests = [sheet_of(first, out, template=template, control=control, copies=copies)]
     for manifest, path in zip(manifests, paths, strict=True):
         if manifest.promise is not None:
+            from patchproof.report.words import promise_summary
+
             lines = promise_summary(manifest.promise, manifest.settings), background_summary(manifest.settings)
             say(lines[0], f"promise simulated {lines[1]}")
         say(f"sheet {manifest.sheet_id} ({manifest.kind}): {out}, {path.name}")
