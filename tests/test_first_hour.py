@@ -137,10 +137,10 @@ def test_a_first_hour_says_at_each_step_what_to_do_next(tmp_path, monkeypatch):
     assert 'add --label with what it is to be recognized as: "lamp", "vase", "stone"' in asked
     assert "length: 340 mm, by the file's units" in new and "next: patchproof preview scene.toml" in new
     assert '"lamp" first in ' in preview and "next: patchproof optimize scene.toml" in preview
-    assert "Draft of" in optimize and ": better than its best control" in optimize
+    assert "Draft of" in optimize and "(preliminary): helps" in optimize
     assert "next: patchproof sheet run --out sheet.pdf" in optimize and "sheet.json" in sheet
     assert f"or name the networks yourself (--models '{MODEL}')" in refused
-    assert "Helps beside simulated controls" in verify and re.search(
+    assert "Helps (controls " in verify and re.search(
         r"Take at least 10 photographs in each of|No 150 photographs are likely to prove", verify
     )
     assert "photographs: 15, judged 13, measured 12" in verify  # 12, two copies and a screenshot

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 from synthetic_photos import promised_conditions
@@ -36,26 +38,58 @@ def test_the_headline_compares_the_views_that_both_were_shown_in():
     promise = promise_of(0.825, {"bare": (0.95, -0.24, 0.13)})
     claim = promise.controls["bare"].changed(difference=-0.05)
     headline = promise.changed(controls={"bare": claim}).headline
-    assert "90.0% beside 95.0% recognized in the same views, -5.0 points" in headline and "82.5" not in headline
-    assert "40.0% beside 20.0% recognized, +20.0 points" in promise_of(0.4, {"bare": (0.2, 0.1, 0.3)}).headline
+    assert (
+        "90.0% recognized, 95.0% with its best control (bare) in the same views: -5.0 points" in headline
+        and "82.5" not in headline
+    )
+
+
+@pytest.mark.parametrize(("rate", "control"), [(0.875, 0.5417), (0.8125, 0.5724), (0.0046, 0.0012)])
+def test_a_printed_difference_is_that_of_the_printed_rates(rate, control):
+    printed = re.findall(r"[-+]?\d+\.\d", promise_of(rate, {"bare": (control, 0.1, 0.3)}).headline)
+    assert float(printed[2]) == pytest.approx(float(printed[0]) - float(printed[1]), abs=1e-9)
 
 
 @pytest.mark.parametrize(
     ("controls", "goal", "best", "worth"),
     [
-        ({"bare": (0.4, 0.05, 0.2), "gray": (0.1, 0.3, 0.5)}, "assist", "bare", "better"),
-        ({"bare": (0.4, 0.0, 0.2), "gray": (0.1, 0.3, 0.5)}, "assist", "bare", "no better"),
-        ({"bare": (0.6, -0.2, -0.01), "gray": (0.1, 0.3, 0.5)}, "assist", "bare", "worse"),
-        ({"bare": (0.8, -0.4, -0.2), "gray": (0.6, -0.2, -0.05)}, "deceive", "gray", "better"),
-        ({"bare": (0.8, -0.4, -0.2), "gray": (0.4, 0.05, 0.2)}, "deceive", "gray", "worse"),
+        ({"bare": (0.4, 0.05, 0.2), "gray": (0.1, 0.3, 0.5)}, "assist", "bare", "helps"),
+        ({"bare": (0.4, 0.0, 0.2), "gray": (0.1, 0.3, 0.5)}, "assist", "bare", "cannot_tell"),
+        ({"bare": (0.4, -0.4, 0.1), "gray": (0.1, -0.6, 0.5)}, "assist", "bare", "cannot_tell"),  # as drafts are
+        ({"bare": (0.4, 0.01, 0.09), "gray": (0.1, 0.3, 0.5)}, "assist", "bare", "does_not_help"),  # too little
+        ({"bare": (0.4, 0.0, 0.2), "gray": (0.1, -0.3, 0.09)}, "assist", "gray", "does_not_help"),
+        ({"bare": (0.6, -0.2, -0.01), "gray": (0.1, 0.3, 0.5)}, "assist", "bare", "does_not_help"),
+        ({"bare": (0.8, -0.4, -0.2), "gray": (0.6, -0.2, -0.05)}, "deceive", "gray", "helps"),
+        ({"bare": (0.8, -0.4, -0.2), "gray": (0.4, 0.05, 0.2)}, "deceive", "gray", "does_not_help"),
     ],
 )
 def test_the_hardest_control_decides_and_its_interval_says_the_word(controls, goal, best, worth):
     promise = promise_of(0.5, controls, goal)
-    assert (promise.best_control, promise.comparison) == (best, worth)
-    first = promise_lines(promise)[0]
-    assert first.startswith(f"{worth} than its best control ({best}): 50.0%")
-    assert ("before printing it" in first) == (worth != "better")
+    assert (promise.best_control, promise.answer) == (best, worth)
+    first = promise_lines(promise, {}, "my run")[0]
+    verb = "help" if goal == "assist" else "deceive"
+    words = {"helps": f"{verb}s", "does_not_help": f"does not {verb}", "cannot_tell": "cannot be told yet"}
+    assert first.startswith(f"{words[worth]}: 50.0% recognized, ") and f"({best})" in first
+    assert ("Try another" in first) == (worth == "does_not_help")
+    assert ("What tells: patchproof promise 'my run' --n 1600." in first) == (worth == "cannot_tell")
+
+
+@pytest.mark.parametrize(
+    ("settings", "change"),
+    [
+        ({"object": {"mesh": "a"}}, "place, size or seed"),
+        ({"object": {"mesh": "a"}, "patch": {"kind": "texture"}}, "seed, or let more of the surface change"),
+        ({"object": {"images": "a"}}, "size or seed"),
+        ({"object": {"mesh": "a"}, "imported": {"file": "a.png"}}, "place, size or picture"),
+    ],
+)
+def test_a_draft_that_cannot_tell_names_the_command_and_advice_fits_the_kind(settings, change):
+    draft = promise_of(0.5, {"bare": (0.3, -0.05, 0.45)}).changed(draft=True)
+    said = promise_lines(draft, settings, "r")[0]
+    assert said.startswith("Draft of 400 views (preliminary): cannot be told yet") and "Try another" not in said
+    assert said.endswith("What tells: patchproof promise r.")
+    useless = promise_of(0.3, {"bare": (0.3, -0.05, 0.05)})
+    assert f"10 points or more is ruled out. Try another {change}." in promise_lines(useless, settings)[0]
 
 
 def test_the_page_says_so_in_its_first_line():
@@ -65,10 +99,10 @@ def test_the_page_says_so_in_its_first_line():
         SheetContent(piece, "A" * 10, "design", design, promise_of(0.5, {"bare": ends})).words["kind"]
         for ends in ((0.4, 0.05, 0.2), (0.5, -0.1, 0.1), (0.6, -0.2, -0.05))
     ]
-    assert kinds == ["design", "design, no better than bare", "design, worse than bare"]
+    assert kinds == ["design", "design, effect unknown", "design, does not help"]
 
 
-def test_a_design_that_is_not_better_exits_with_1_only_where_that_is_asked(tmp_path, monkeypatch):
+def test_a_design_that_is_not_known_to_help_exits_with_1_only_where_that_is_asked(tmp_path, monkeypatch):
     monkeypatch.setattr("patchproof.optimizer.run.PROMISE_VIEWS", 8)
     monkeypatch.setattr("patchproof.optimizer.loop.SELECT_VIEWS", 4)
     scene = tmp_path / "scene.toml"
@@ -81,8 +115,9 @@ def test_a_design_that_is_not_better_exits_with_1_only_where_that_is_asked(tmp_p
     def run(name, *more):
         return CliRunner().invoke(app, ["optimize", str(scene), "--out", str(tmp_path / name), *more])
 
-    asked = run("a", "--require", "better")
-    assert asked.exit_code == 1 and "no better than its best control" in asked.stdout
+    asked = run("a", "--require", "helps")
+    assert asked.exit_code == 1 and "next: patchproof sheet" not in asked.stdout
+    assert re.search(r"cannot be told yet.*What tells: patchproof promise|does not help.*ruled out", asked.stdout)
     assert (tmp_path / "a" / "run.json").is_file()
     assert run("b").exit_code == 0
-    assert run("c", "--require", "kept").exit_code == 2
+    assert run("c", "--require", "better").exit_code == 2

@@ -333,7 +333,7 @@ def test_a_folder_is_listed_in_full_and_counted_as_the_contract_says(folder):
     summary = report.summary
     assert (summary.photos, summary.judged, summary.measured, summary.rate) == (8, 6, 6, 1.0)
     # one of seven readable photographs shows no marker: more than 10 %
-    assert (summary.verdict, summary.effect, summary.ledger) == ("cannot_tell", "not_tested", None)
+    assert (summary.verdict, summary.worth.word, summary.ledger) == ("cannot_tell", "cannot_tell", None)
     assert calls[-1] == (8, 8)
     prediction = report.photos[1].predictions["net"]
     assert prediction.label == "bright" and prediction.recognized
@@ -389,7 +389,7 @@ def test_controls_of_one_session_are_paired_and_cannot_decide_the_effect(folder,
     for i in range(6):
         save(half_lit(20 + i), tmp_path / f"b{i}.jpg")
     evidence = verified(folder, controls=tmp_path)
-    assert evidence.summary.effect == "not_shown" and not evidence.summary.meets("helps")
+    assert evidence.summary.worth.word != "helps" and not evidence.summary.meets("helps")
     (control,) = evidence.controls
     assert (control.recognized, control.n, control.pairs, control.sessions) == (0, 6, 6, 1)
     assert "two places" in control.advice and "This cannot tell" in "".join(verdict_lines(evidence))
@@ -416,7 +416,7 @@ def test_controls_that_show_nothing_never_count_and_are_named(few, tmp_path):
     (tmp_path / "b9.jpg").write_bytes(b"no picture")
     evidence = verified(few, controls=tmp_path)
     (control,) = evidence.controls
-    assert (control.n, control.shown, evidence.summary.effect) == (0, None, "not_tested")
+    assert (control.n, control.shown, control.rates) == (0, None, None)
     said = evidence.summary.left_out
     assert sum("one tone or noise" in sentence for sentence in said) == 4 and any("b9.jpg" in each for each in said)
     save(half_lit(20), tmp_path / "b4.jpg")  # beside one of something

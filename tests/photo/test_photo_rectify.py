@@ -49,6 +49,17 @@ def test_markers_that_lie_are_left_out(wrong):
     assert fit.inlier_ids == PIECE_IDS[wrong:]
 
 
+def test_three_markers_whose_corners_agree_but_for_noise_all_count_and_a_moved_one_does_not():
+    true, ids = view(45, 5, 900), [PIECE_IDS[0], PIECE_IDS[2], PIECE_IDS[5]]
+    inliers, moved = [], []
+    for seed in range(100):
+        corners = {i: c for i, c in noisy_corners(true, 0.12, seed).items() if i in ids}
+        inliers.append(len(fit_page(corners, marker_corners()).inlier_ids))
+        corners[ids[0]] = corners[ids[0]] + [8.0, -5.0]
+        moved.append(len(fit_page(corners, marker_corners()).inlier_ids))
+    assert inliers.count(3) == 100 and moved.count(3) == 0
+
+
 def test_when_most_markers_lie_the_residual_or_the_ids_show_it():
     # the breaking point of least median of squares: beyond half nothing can be told apart, but it is not silent
     true = view(30, 5, 500)

@@ -55,10 +55,10 @@ def some_report(verdict="kept"):
     )
     summary = Summary(
         photos=4, judged=3, measured=3, rate=1.0, interval=(0.44, 1.0), prediction_interval=(2, 3), verdict=verdict,
-        effect="not_tested", matched_rate=None, reason="3 of 3 photographs were recognized.",
+        reason="3 of 3 photographs were recognized.",
     )  # fmt: skip
     origin = Origin(options={"ruler_mm": (97.1, 97.3)}, sha256={"network net": "e" * 64}, versions={"numpy": "1"})
-    controls = (Control("gray", 1, 3, (0.06, 0.79), 3, 0.67, (0.1, 0.9), 2, "", False),)
+    controls = (Control("gray", 1, 3, (0.06, 0.79), 3, 0.67, (0.1, 0.9), 2, "", False, (1.0, 0.333)),)
     return Report(sheet_id="TESTSHEET0", photos=tuple(photos), summary=summary, controls=controls, origin=origin)
 
 
@@ -128,7 +128,7 @@ def test_the_page_says_what_the_report_says_and_escapes_it(shown):
         "e" * 64,
         "f" * 64,
         "numpy 1",
-        "+67 points",
+        "+66.7 points",
     ):
         assert words in text
     assert "<b>bright" not in text and "Promise broken" not in text
@@ -185,7 +185,6 @@ def test_the_same_report_has_the_same_bytes(shown, tmp_path):
 def test_a_sheet_without_a_promise_has_a_page_too(tmp_path):
     summary = Summary(
         photos=0, judged=0, measured=0, rate=None, interval=None, prediction_interval=None, verdict="cannot_tell",
-        effect="not_tested", matched_rate=None,
     )  # fmt: skip
     report = Report(sheet_id="TESTSHEET0", photos=(), summary=summary)
     page = write_report(report.model_dump(mode="json"), make_manifest().model_dump(mode="json"), tmp_path)
@@ -318,7 +317,7 @@ def test_what_was_not_measured_how_often_was_looked_and_which_folders_are_one_is
     changes = {"not_measured": missing, "sessions_note": note, "sessions": sessions, "looks": 3}
     report = some_report().changed(summary=some_report().summary.changed(**changes))
     lines = "\n".join(verdict_lines(report))
-    for text in ("not measured: the scale of the print (no scan)", "sessions: 2", note, "looks: 3, counted in"):
+    for text in ("not measured: the scale of the print (no scan)", "2 sessions", note, "looks: 3, counted in"):
         assert text in lines
     page = report_html(
         report.model_dump(mode="json"),
@@ -327,7 +326,7 @@ def test_what_was_not_measured_how_often_was_looked_and_which_folders_are_one_is
         None,
     )
     assert "Not measured: the scale of the print (no scan)." in page and note in page
-    result = Evaluation(n=1, seed=0, models={}, not_measured={"AP50 of net": "no box"})
+    result = Evaluation(n=1, seed=0, goal="assist", models={}, not_measured={"AP50 of net": "no box"})
     assert evaluation_lines(result.model_dump()) == ["not measured: AP50 of net (no box)"]
     assert json.loads(result.to_json())["not_measured"] == {"AP50 of net": "no box"}
 

@@ -242,7 +242,7 @@ def test_fresh_photographs_of_the_print_are_judged(photos, tmp_path):
     assert control["pairs"] == control["n"] == PHOTOS
     assert control["difference"] == pytest.approx(report["summary"]["rate"] - control["recognized"] / PHOTOS)
     # six pairs show an effect only where all of them differ: p = 2 / 2^6
-    assert report["summary"]["effect"] == ("shown" if control["difference"] == 1 else "not_shown")
+    assert report["summary"]["worth"]["source"] == "photographed"
 
 
 @pytest.mark.parametrize("kind", ["photos", "images"])

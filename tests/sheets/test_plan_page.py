@@ -146,12 +146,17 @@ def test_a_piece_that_ends_behind_the_outline_is_measured_where_it_can_be_seen(t
     assert set(found) == {"top", "bottom"} and found["top"][0] == pytest.approx(70, abs=0.3)
 
 
-@pytest.mark.parametrize(("draft", "start"), [(False, "The design is better than"), (True, "Draft of 400 views, no ")])
+@pytest.mark.parametrize(
+    ("draft", "start"), [(False, "helps: 90.0%"), (True, "Draft of 400 views (preliminary): helps")]
+)
 def test_the_first_line_is_a_sentence_of_what_the_design_is_worth(scene_file, draft, start):
     promise = promise_with(0.9, 0.4, 0.42, 0.57).changed(draft=draft)
     first = shot_sections(promise, load_scene_settings(scene_file))[0][1][0]
-    assert first.startswith(start) and "better than its best control (bare): 90.0% beside 40.0% recognized" in first
-    assert ". Promised before ONE PLAIN COLOR" in first and first.endswith(".") and ".." not in first
+    assert (
+        first.startswith(start)
+        and "90.0% recognized, 40.0% with its best control (bare) in the same views: +50.0 points" in first
+    )
+    assert ". Promise simulated before ONE PLAIN COLOR" in first and first.endswith(".") and ".." not in first
 
 
 def test_a_promise_that_stopped_early_says_that_a_full_one_may_save_photographs(scene_file):

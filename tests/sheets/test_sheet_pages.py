@@ -303,7 +303,7 @@ def words_on(path, page):
 @pytest.mark.parametrize("name", template_names("piece"))
 @pytest.mark.parametrize("bent", [False, True])
 def test_the_longest_words_fit_every_page(tmp_path, name, bent):
-    """A draft that is no better than noise, on a piece of the most digits, with the widest id and a long label."""
+    """A draft whose effect is unknown, on a piece of the most digits, with the widest id and a long label."""
     template = load_template(name)
     promise = promise_of(0.5, {"noise": (0.5, -0.1, 0.1)}).changed(draft=True)
     widest, highest = largest_piece_mm(template)
@@ -314,7 +314,7 @@ def test_the_longest_words_fit_every_page(tmp_path, name, bent):
     write_sheet(tmp_path / "s.pdf", template, content, PlanPage(None, (("Here", ("First.",)),)))
     words = words_on(tmp_path / "s.pdf", 1)
     assert ("Wrap the piece smoothly round" in words) == (bent and template.plan_page and not template.tiles)
-    assert "draft design, no better than noise" in words or template.blank is not None
+    assert "draft design, effect unknown" in words or template.blank is not None
 
 
 def test_two_times_is_the_same_bytes(tmp_path):

@@ -10,7 +10,6 @@ from patchproof.app.verify import verify
 from patchproof.base.compute import Compute
 from patchproof.base.output import new_folder
 from patchproof.base.progress import Progress, no_progress
-from patchproof.base.settings import background_summary
 from patchproof.optimizer.run import optimize
 from patchproof.report.words import promise_lines, verdict_lines
 from patchproof.reprints.reprint import reprint
@@ -82,7 +81,7 @@ def run_demo(
         judgment = verify(photos, folder / "sheet.json", report, compute=compute, progress=progress)
     return [
         "Hard conditions on purpose (far, dim, oblique, cluttered): bare object and controls are often misread.",
-        *promise_lines(run.promise, background_summary(run.scene.settings.model_dump())),
+        *promise_lines(run.promise, run.scene.settings.model_dump(), str(run.folder)),
         *verdict_lines(judgment),
         *(f"{out}/{name}" for name in ("run/design.png", "sheet.pdf", "sheet.json", "photos/", "report/report.html")),
     ]

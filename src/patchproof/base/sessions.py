@@ -72,6 +72,10 @@ class RatePosterior:
         """The largest rate at which `recognized` photographs or fewer are recognized with a chance of `tail`."""
         return 1 - self.least_rate(sum(photos) - recognized, photos, tail)
 
+    def rate_given(self, recognized: int, photos: Sequence[int]) -> tuple[float, float]:
+        """The 95 % interval of a rate by new sessions' photographs, which differ as much as the posterior says."""
+        return self.least_rate(recognized, photos, TAIL), self.most_rate(recognized, photos, TAIL)
+
     def _marginal(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
         """The marginal posterior of the correlation: values and weights."""
         values, inverse = np.unique(self.correlations, return_inverse=True)

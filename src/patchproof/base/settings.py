@@ -178,7 +178,7 @@ class LightSettings(StrictModel):
 
 
 class BackgroundSettings(StrictModel):
-    """The background of the object: pictures, a color, or by default procedural rooms."""
+    """The background of the object: pictures, a color, or by default synthetic rooms."""
 
     # A folder of photographs, divided among training, selection, promise and evaluation; or a picture of a known place.
     images: str | None = None
@@ -284,14 +284,14 @@ class SceneSettings(StrictModel):
 
 
 def background_summary(settings: Mapping[str, Any]) -> str:
-    """Describe the background in words, from a scene's settings as plain data; "" if they hold none."""
+    """Describe in words where views are simulated, from a scene's settings as plain data; "" if they hold no scene."""
     if (settings.get("object") or {}).get("mesh") is None:
-        return "the scene's own pictures" if "object" in settings else ""
+        return "in the scene's own pictures" if "object" in settings else ""
     background = settings.get("background") or {}
     if background.get("color") is not None:
-        return "ONE PLAIN COLOR, before which patches gain far more than in real places"
+        return "before ONE PLAIN COLOR, where patches gain far more than in real places"
     images = background.get("images")
-    return "procedural rooms" if images is None else f"pictures ({Path(images).name})"
+    return "in synthetic rooms" if images is None else f"before pictures ({Path(images).name})"
 
 
 def load_scene_settings(path: str | Path) -> SceneSettings:

@@ -1,59 +1,48 @@
-"""The verdict on the patch's benefit: is the object recognized better with it than with the hardest control?
+"""Does the patch help? One comparison answers it: that with the hardest control, by the strongest evidence there is.
 
-In: the photographs' rate, photographs of controls or, without any, the controls that the promise simulated. Out:
-`Benefit` against the control that is hardest to beat, the bare object first:
+In: photographs of controls, the effect estimated from the patch's photographs, the promise. Out: `Benefit`, which the
+headline, the page and `--require helps` all use. Photographed controls decide alone, if there are any. Else those
+decide that were rendered into the patch's own photographs, with the bare object as the promise simulated it, since the
+paper hides it. Else it is the promise's controls. The patch has to beat all that decide; which one is named, and which
+of the three answers it gives, says `base.goal`.
 
-    helps      every control was beaten, at 95 %
-    worse      the interval of the difference to that control lies below zero
-    no_better  neither; the promise expected no more, or a gain of 10 points is ruled out
-    not_shown  neither; such a gain is not ruled out, and the promise expected more or all were taken in one session
-
-with gain and loss mirrored for `deceive`. The verdict on the promise is independent: a patch that was promised to be
-useless, and is, keeps its promise.
+The verdict on the promise is independent: a patch that was promised to be useless, and is, keeps its promise.
 """
 
 from collections.abc import Sequence
 
 from patchproof.base.intervals import rates_difference
-from patchproof.evidence.results import Benefit, BenefitWord, Control
+from patchproof.evidence.results import Benefit, Control, ControlSource, EffectEstimate
 from patchproof.sheets.manifest import Interval, Promise
 
-LEAST_GAIN = 0.10  # below which a patch is no better
+Rate = tuple[float, tuple[float, float]]  # with its interval
 
 
-def benefit_of(rate: float, interval: Interval, controls: Sequence[Control], promise: Promise) -> Benefit | None:
-    """Compare the patch's rate with its controls'; None if there are none, photographed or promised."""
-    sign, rows = promise.target.goal.sign, []
-    for control in controls:
-        if control.difference is not None and control.difference_interval is not None:
-            ends = control.difference_interval
-            rows.append((control.name, control.recognized / control.n, control.difference, ends))
-    photographed = bool(rows)
-    for name, claim in () if photographed else promise.controls.items():
-        rows.append((name, claim.rate, *rates_difference(rate, interval, claim.rate, claim.interval)))
-    if not rows:
-        return None
+def benefit_of(
+    photos: int,
+    rate: float,
+    interval: Interval,
+    controls: Sequence[Control],
+    promise: Promise,
+    estimate: EffectEstimate | None = None,
+) -> Benefit | None:
+    """Compare the patch, recognized at `rate` in `photos` photographs, with its controls; None if there are none."""
+    goal, rows = promise.target.goal, dict[str, Benefit]()
 
-    def gain_interval(row) -> tuple[float, float]:
-        low, high = sorted(sign * end for end in row[3])
-        return low, high
+    def add(name: str, source: ControlSource, count: int, ours: Rate, theirs: Rate, points: Rate, advice: str = ""):
+        comparison = {"difference": points[0], "difference_interval": points[1], "photos": count, "advice": advice}
+        sides = {"rate": ours[0], "interval": ours[1], "control_rate": theirs[0], "control_interval": theirs[1]}
+        rows[name] = Benefit(goal=goal, word=goal.answer(points[1]), control=name, source=source, **comparison, **sides)
 
-    unbeaten = [row for row in rows if gain_interval(row)[0] <= 0]
-    row = min(unbeaten or rows, key=lambda row: (bool(unbeaten) and row[0] != "bare", gain_interval(row)))
-    (low, high), (name, control_rate, difference, ends) = gain_interval(row), row
-    word: BenefitWord = "helps" if low > 0 else "worse" if high < 0 else "no_better"
-    advice = next((each.advice for each in controls if each.advice and photographed), "")
-    if word == "helps" and advice:
-        word = "not_shown"
-    if word == "no_better" and (advice or (promise.controls and promise.comparison == "better")) and high >= LEAST_GAIN:
-        word = "not_shown"
-    return Benefit(
-        word=word,
-        goal=promise.target.goal,
-        control=name,
-        control_rate=control_rate,
-        difference=difference,
-        difference_interval=ends,
-        photographed=photographed,
-        advice=advice,
-    )
+    photographed = any(c.rates for c in controls)
+    for c in controls if photographed else estimate.controls if estimate else ():
+        if c.rates and c.difference is not None and c.difference_interval and c.patch_interval:
+            count = c.pairs or (photos if photographed else c.n)
+            ours, theirs = (c.rates[0], c.patch_interval), (c.rates[1], c.interval)
+            source = "photographed" if photographed else "rendered"
+            add(c.name, source, count, ours, theirs, (c.difference, c.difference_interval), c.advice)
+    simulated = {name: claim for name, claim in promise.controls.items() if name == "bare" or not rows}
+    for name, claim in () if photographed else simulated.items():
+        points = rates_difference(rate, interval, claim.rate, claim.interval)
+        add(name, "simulated", photos, (rate, interval), (claim.rate, claim.interval), points)
+    return rows[goal.hardest({name: row.difference_interval for name, row in rows.items()})] if rows else None

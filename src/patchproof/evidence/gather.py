@@ -20,7 +20,6 @@ from patchproof.base.errors import Refused
 from patchproof.base.input import is_folder
 from patchproof.base.intervals import wilson
 from patchproof.base.progress import Advance, no_advance
-from patchproof.base.sessions import TAIL
 from patchproof.base.settings import background_summary
 from patchproof.base.text import printable
 from patchproof.base.validation import summarize_names
@@ -35,19 +34,27 @@ from patchproof.evidence.grouping import Grouping, group_sessions, subfolders
 from patchproof.evidence.journal import Journal, settings_key
 from patchproof.evidence.ledger import ledger_of
 from patchproof.evidence.measure import UNLOCATED_CODES, MeasuredPhoto
-from patchproof.evidence.ranges import matched_rate, promised_side_px
 from patchproof.evidence.reproject import PhotoSquare
-from patchproof.evidence.results import Ledger, ModelRate, PhotoEntry, Report, Scale, SessionCount, Summary
+from patchproof.evidence.results import (
+    EffectEstimate,
+    Ledger,
+    ModelRate,
+    PhotoEntry,
+    Report,
+    Scale,
+    SessionCount,
+    Summary,
+)
 from patchproof.evidence.same_session import control_keys, merge_folders
 from patchproof.evidence.task import Options, task_of
 from patchproof.evidence.verdict import (
+    MOST_PHOTOS,
     PLANNED_LOOK,
     Look,
     Verdict,
     compare_with_control,
-    effect_of,
     judge,
-    next_step,
+    still_needed,
     watched,
 )
 from patchproof.photo.read import list_images, list_skipped_files, summarize_said
@@ -111,16 +118,19 @@ def gather_evidence(
         ledger, estimate = None, None
         if judges and task.promised:
             originals = [number for number, photo in enumerate(patch_photos) if photo.entry.code != COPY_CODE]
-            most, name = min(len(originals), options.ledger_photos), judges.primary.name
-            numbers = [originals[number * len(originals) // most] for number in range(most)]  # evenly spread
-            read_shot = partial(reread_square, task, judges.primary.input_px)
-            shots = workers.map(read_shot, [(paths[number], patch_photos[number]) for number in numbers])
-            shots = [shot for shot in shots if shot is not None]
+            name, read_shot = judges.primary.name, partial(reread_square, task, judges.primary.input_px)
+            numbers = _spread(originals, MOST_PHOTOS if options.ledger_photos else 0)
+            squares = workers.map(read_shot, [(paths[number], patch_photos[number]) for number in numbers])
+            shots = [shot for shot in _spread(list(squares), options.ledger_photos) if shot is not None]
             entries = [photo.entry for photo in patch_photos if photo.entry.predictions]
             confidence = {entry.file: entry.predictions[name].target_confidence for entry in entries}
             ledger = ledger_of(shots, manifest, task.surface, task.promised, judges, confidence)
             recognized = _recognized(entries, name)
-            estimate = estimate_effect(shots, manifest, task.surface, options.printer, judges, recognized)
+            pairs = zip(patch_photos, grouping.merged, strict=True)
+            session = {photo.entry.file: number for photo, number in pairs if photo.counted}
+            shots = [shot for shot in squares if shot is not None and shot.file in session]
+            scene = task.surface, options.printer, judges
+            estimate = estimate_effect(shots, manifest, *scene, recognized, session)
             if forecast is not None:
                 pairs = zip(paths, patch_photos, strict=True)
                 patch_photos = [with_forecast(read_shot, forecast, path, photo) for path, photo in pairs]
@@ -141,7 +151,7 @@ def gather_evidence(
                 left_out.append(f"{name}/{entry.file} does not count: {entry.remark.advice}")
     controls = {name: list(photos.values()) for name, photos in by_sha256.items()}
     look = look_at([photo.entry for photo in patch_photos])
-    report = report_of(manifest, judges, patch_photos, grouping, controls, ledger, options.ruler_mm, look)
+    report = report_of(manifest, judges, patch_photos, grouping, controls, ledger, options.ruler_mm, look, estimate)
     missing = {}
     if options.scan_dpi and not any(photo.entry.scale for photo in patch_photos):
         missing["the print's scale"] = f"no photograph is a flat scan at {options.scan_dpi:g} dpi"
@@ -149,8 +159,14 @@ def gather_evidence(
         missing["bend, and where paper was cut"] = f"{placed} photographs were located by the design alone"
     if judges and task.promised and options.ledger_photos and (ledger is None or estimate is None):
         missing["where the rate was lost, what controls would show"] = "too few photographs can be measured"
-    summary = report.summary.changed(estimated=estimate, left_out=tuple(left_out), not_measured=missing)
+    summary = report.summary.changed(left_out=tuple(left_out), not_measured=missing)
     return report.changed(summary=summary)
+
+
+def _spread(items: list, most: int) -> list:
+    """At most `most` of the items, evenly spread."""
+    count = min(len(items), most)
+    return [items[number * len(items) // count] for number in range(count)]
 
 
 def with_forecast(
@@ -200,29 +216,26 @@ def report_of(
     ledger: Ledger | None = None,
     ruler_mm: tuple[float, float] | None = None,
     look: Look | None = PLANNED_LOOK,
+    estimate: EffectEstimate | None = None,
 ) -> Report:
-    """Sum up all photographs; with a promise and `judges` also verdict, rates, forecast and the controls' effect.
+    """Sum up all photographs; with a promise and `judges` also verdict, rates, forecast and whether the patch helps.
     Without a `look` the photographs were watched while they were taken.
     """
     entries, counted = [photo.entry for photo in photos], [photo.entry for photo in photos if photo.counted]
-    verdict, matched = Verdict("cannot_tell", None, "The sheet promises nothing."), None
+    verdict = Verdict("cannot_tell", None, "The sheet promises nothing.")
     comparisons, rates, rate, interval, sessions, forecast, do, worth = [], {}, _rate({}), None, (), None, "", None
     if judges and manifest.promise:
         promise, primary = manifest.promise, judges.primary.name
         rates = {model.name: _rate(_recognized(counted, model.name)) for model in judges.models}
         rate, recognized = rates[primary], _recognized(counted, primary)
         without_markers = sum(e.code in UNLOCATED_CODES and e.status == "rejected" for e in entries)
-        goal = promise.target.goal
         sessions = _sessions(grouping, photos, recognized)
         numbers = dict(zip((entry.file for entry in entries), grouping.merged, strict=True))
         counts = sum(recognized.values()), list(Counter(numbers[file] for file in recognized).values())
         look = look or watched(counts[1], promise)
         verdict = judge(*counts, promise, without_markers, look)
         if recognized:
-            posterior = promise.posterior
-            interval = posterior.least_rate(*counts, TAIL), posterior.most_rate(*counts, TAIL)
-        measured = (entry for entry in counted if entry.status == "measured")
-        matched = matched_rate(measured, promise.conditions, promised_side_px(manifest))
+            interval = promise.posterior.rate_given(*counts)
         pairs = [(e.forecast, recognized[e.file]) for e in counted if e.forecast is not None and e.file in recognized]
         if pairs:
             forecast = forecast_of([p for p, _ in pairs], [answer for _, answer in pairs], promise.rate)
@@ -230,11 +243,10 @@ def report_of(
         for name, control in controls.items():
             keys, hits = control_keys(grouping, photos, control), _recognized((p.entry for p in control), primary)
             hits_by_key = {keys[file]: hit for file, hit in hits.items()}
-            comparisons.append(compare_with_control(answers, name, hits_by_key, goal))
-        if verdict.verdict == "cannot_tell":
-            do = next_step(promise, counts[1], without_markers)
+            comparisons.append(compare_with_control(answers, name, hits_by_key, promise))
         if rate.rate is not None and interval is not None:
-            worth = benefit_of(rate.rate, interval, comparisons, promise)
+            worth = benefit_of(len(recognized), rate.rate, interval, comparisons, promise, estimate)
+        do = still_needed(promise, counts[1], without_markers, verdict.verdict, worth)
     summary = Summary(
         photos=len(entries),
         judged=len(counted),
@@ -248,13 +260,12 @@ def report_of(
         looks_planned=(look or PLANNED_LOOK).planned,
         prediction_interval=verdict.prediction_interval,
         verdict=verdict.verdict,
-        effect=effect_of(comparisons),
-        matched_rate=matched,
         ledger=ledger and ledger.shares,
         culprit=ledger and ledger.culprit,
         reason=verdict.reason,
         next_step=do,
         worth=worth,
+        estimated=estimate,
         background=background_summary(manifest.settings),
         draft_views=manifest.promise.n if manifest.promise is not None and manifest.promise.draft else 0,
         models=rates,

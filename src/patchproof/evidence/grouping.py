@@ -45,7 +45,7 @@ class Grouping:
         return f"{folder}/{name}" if parent == folder and self.known_from == BY_FOLDERS else name
 
 
-BY_FOLDERS, BY_TIMES, BY_GUESS = "folders", "cameras and times", "nothing said so: taken as one"
+BY_FOLDERS, BY_TIMES, BY_GUESS = "folders", "cameras and times", "no folders or times"
 
 
 def group_sessions(folder: str | Path, without: Path | None = None) -> Grouping:

@@ -242,7 +242,9 @@ def _trouble(
     most_blur = MOST_BLUR * float(np.median(modules_px)) if modules_px else np.inf  # then the design's cells decide
     side_px, most_residual = side_mm * geometry.px_per_mm, MOST_RESIDUAL * side_mm
     agreeing, markers = len(fit.inlier_ids), len(detected.markers)
-    least = min(_LEAST_AGREEING, len(surface.piece_ids) or bool(surface.corners_mm))
+    # two markers fit a plane on bent paper, too; then the design's own pixels say that it is flat up to its corners
+    confirmed = corners == 4 and geometry.design_shift_mm is not None
+    least = min(_LEAST_AGREEING - confirmed, len(surface.piece_ids) or bool(surface.corners_mm))
     bent = residual > most_residual or agreeing < 0.5 * markers
     flat = geometry.homography_px_from_mm is not None
     bend, most_bend = geometry.bend_mm, (MOST_BEND if flat else MOST_BEND_UNROLLED) * side_mm

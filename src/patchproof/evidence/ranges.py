@@ -1,14 +1,12 @@
-"""The ranges of view that the promise covers, and the promised rate near the views of photographs.
+"""The ranges of view that the promise covers.
 
 In: the promise's conditions, as far as a photograph can show them. Out: `PromisedRanges` (smallest and largest with a
-margin of 10 %), and `matched_rate`, the promised rate at the conditions nearest to the photographs. A network sees
-every photograph at one size, so pixels of a photograph are scaled to the size of the promised photographs.
+margin of 10 %). A network sees every photograph at one size, so pixels of a photograph are scaled to the size of the
+promised photographs.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-
-import numpy as np
 
 from patchproof.evidence.results import PhotoEntry
 from patchproof.photo.rejection import PhotoRejected
@@ -17,7 +15,6 @@ from patchproof.sheets.manifest import ConditionClaim, Manifest
 MARGIN = 0.10  # of the range's width
 _LEAST_ANGLE_MARGIN_DEG = 3.0  # a nearly frontal view's tilt is no better known than this
 _LEAST_SCALE_MARGIN = 0.10  # of the value itself
-_NEAREST = 15  # conditions per photo: enough to smooth single draws, few enough to stay near
 _ADVICE = {
     "px_per_mm": ("come closer", "step back"),
     "tilt_deg": ("look more from the side", "look less from the side"),
@@ -71,18 +68,6 @@ def promised_ranges(conditions: Sequence[ConditionClaim], side_px: float | None 
     return PromisedRanges(limits, side_px)
 
 
-def matched_rate(
-    entries: Iterable[PhotoEntry], conditions: Sequence[ConditionClaim], side_px: float | None = None
-) -> float | None:
-    """Average over photos the rate at their nearest promised conditions; None if none can be compared."""
-    points = [figures for entry in entries if (figures := figures_of(entry, side_px))]
-    # photographs know few different sets of figures, and each takes a table of all conditions
-    tables = {names: _table_of(names, conditions) for names in {tuple(point) for point in points}}
-    near = (_rate_near(np.array(list(point.values())), *tables[tuple(point)]) for point in points)
-    rates = [rate for rate in near if rate is not None]
-    return float(np.mean(rates)) if rates else None
-
-
 def figures_of(entry: PhotoEntry, side_px: float | None) -> dict[str, float]:
     """Figures of a photo that conditions have, too, if known; pixels are scaled to a shorter side of `side_px`."""
     geometry, azimuth_deg = entry.geometry, entry.pose and entry.pose.azimuth_deg
@@ -93,20 +78,3 @@ def figures_of(entry: PhotoEntry, side_px: float | None) -> dict[str, float]:
     figures |= {} if geometry.tilt_deg is None else {"tilt_deg": geometry.tilt_deg}
     figures |= {} if azimuth_deg is None else {"azimuth_deg": azimuth_deg}
     return figures | {"contrast": geometry.contrast, "blur_px": scale * geometry.blur_px}
-
-
-def _table_of(names: Sequence[str], conditions: Sequence[ConditionClaim]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The figures that are compared of those named (as a mask), by condition, and which conditions are recognized."""
-    table = np.array([[getattr(c, name) for name in names] for c in conditions], float).reshape(-1, len(names))
-    known, used = np.isfinite(table), np.ones(len(names), bool)
-    if 2 * known.all(1).sum() < len(table):  # most conditions lack some figure: use those that most conditions have
-        used = 2 * known.sum(0) > len(table)
-    complete = known[:, used].all(1)
-    return used, table[complete][:, used], np.array([c.recognized for c in conditions])[complete]
-
-
-def _rate_near(point: np.ndarray, used: np.ndarray, table: np.ndarray, recognized: np.ndarray) -> float | None:
-    if not used.any() or not len(table):
-        return None
-    distance = np.linalg.norm((table - point[used]) / np.maximum(table.std(0), 1e-9), axis=1)
-    return float(np.mean(recognized[np.argsort(distance, kind="stable")[:_NEAREST]]))

@@ -9,14 +9,15 @@ from typing import Any, Literal
 
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
-from patchproof.base.goal import Goal
+from patchproof.base.goal import GainWord, Goal
 from patchproof.base.validation import Finite, StrictModel
 from patchproof.photo.rejection import PhotoRejected
 
 Status = Literal["judged", "measured", "rejected"]
 VerdictWord = Literal["kept", "broken", "cannot_tell"]
-BenefitWord = Literal["helps", "no_better", "worse", "not_shown"]
-Effect = Literal["shown", "not_shown", "not_tested"]
+# How a control was compared, the strongest evidence first: photographed as the patch was; its pixels rendered into the
+# patch's own photographs; simulated for the promise.
+ControlSource = Literal["photographed", "rendered", "simulated"]
 Required = Literal["kept", "helps"]  # what a script may require of a verification to continue
 _Row = tuple[Finite, Finite, Finite]
 # Source of the focal length. calibrated: a camera file. confirmed, unchecked, contradicted: EXIF, which the sheet's
@@ -194,23 +195,36 @@ class Ledger(StrictModel):
     photos: int
 
 
-class EstimatedControl(StrictModel):
-    """A control rendered into photographs of the patch: its rate, and the patch's rate minus that, with 95 %."""
+@dataclass(frozen=True)
+class Control:
+    """Photographs of one control, compared with those of the patch (null: nothing to compare). `difference` is patch
+    minus control over `sessions`, of the `rates` of both there; `pairs` is 0 if photographs are not paired, `advice`
+    says why nothing can be told.
+    """
 
     name: str
-    rate: Finite
-    difference: Finite
-    difference_interval: tuple[Finite, Finite]
+    recognized: int
+    n: int
+    interval: tuple[float, float]
+    pairs: int = 0
+    difference: float | None = None
+    difference_interval: tuple[float, float] | None = None
+    sessions: int = 0
+    advice: str = ""
+    shown: bool | None = None
+    rates: tuple[float, float] | None = None
+    patch_interval: tuple[float, float] | None = None
 
 
 class EffectEstimate(StrictModel):
     """The patch's effect as estimated by rendering controls into its photographs. With the design itself rendered into
-    them, a share `agree` got the original answer; if that is too small, there are no controls.
+    them, a share `agree` got the original answer; only these are compared, and if they are too few, there are no
+    controls.
     """
 
     photos: int
     agree: Finite
-    controls: tuple[EstimatedControl, ...] = ()
+    controls: tuple[Control, ...] = ()
 
 
 class Forecast(StrictModel):
@@ -238,17 +252,21 @@ class SessionCount(StrictModel):
 
 
 class Benefit(StrictModel):
-    """The patch's benefit over the control that decided it, whose rate was promised or, if so, `photographed`; `advice`
-    says why such photographs cannot tell.
+    """The answer to whether the patch helps: the comparison with the control that decides it. Its rate is that in the
+    `photos` photographs of the patch that are compared; `advice` says why they cannot tell.
     """
 
-    word: BenefitWord
+    word: GainWord
     goal: Goal
+    source: ControlSource
+    photos: int
+    rate: Finite
+    interval: tuple[Finite, Finite]
     control: str
     control_rate: Finite
+    control_interval: tuple[Finite, Finite]
     difference: Finite
     difference_interval: tuple[Finite, Finite]
-    photographed: bool
     advice: str = ""
 
 
@@ -265,13 +283,11 @@ class Summary(StrictModel):
     interval: tuple[Finite, Finite] | None
     prediction_interval: tuple[int, int] | None
     verdict: VerdictWord
-    effect: Effect
-    matched_rate: Finite | None
     ledger: dict[str, LedgerShare] | None = None
     culprit: str | None = None
     reason: str = ""  # for the verdict, in a sentence
-    next_step: str = ""  # advice if the photographs cannot tell
-    worth: Benefit | None = None  # over its controls; null if there is nothing to compare
+    next_step: str = ""  # what is still needed, if the photographs cannot tell
+    worth: Benefit | None = None  # by the strongest evidence; null if there is nothing to compare
     left_out: tuple[str, ...] = ()
     background: str = ""  # of the views that the promise was made from
     draft_views: int = 0  # that a draft of a promise was made from; 0 for a full promise
@@ -291,24 +307,6 @@ class Summary(StrictModel):
         """
         helps = self.worth is not None and self.worth.word == "helps"
         return self.verdict == "kept" and (helps or required == "kept")
-
-
-@dataclass(frozen=True)
-class Control:
-    """Photographs of one control, compared with those of the patch (null: nothing to compare). `difference` is patch
-    minus control over `sessions`; `pairs` is 0 if photographs are not paired, `advice` says why nothing can be told.
-    """
-
-    name: str
-    recognized: int
-    n: int
-    interval: tuple[float, float]
-    pairs: int = 0
-    difference: float | None = None
-    difference_interval: tuple[float, float] | None = None
-    sessions: int = 0
-    advice: str = ""
-    shown: bool | None = None
 
 
 class Origin(StrictModel):
@@ -338,6 +336,6 @@ class Report(StrictModel):
         if summary.rate is not None and summary.interval is not None:
             rows["recognized"] = rate_text(summary.rate, summary.interval)
         if summary.prediction_interval is not None:
-            rows["promised"] = "{} to {} of {}".format(*summary.prediction_interval, summary.judged)
+            rows["expected"] = "{} to {} of {}".format(*summary.prediction_interval, summary.judged)
         rows |= {"reason": summary.reason, "next": summary.next_step or ""}
         return notebook_html(f"verdict: {summary.verdict}", {key: text for key, text in rows.items() if text})

@@ -1,7 +1,7 @@
-"""Derive the verdict on a promise, and the effect of the patch, from counts. Pure functions.
+"""Derive the verdict on a promise from counts, compare the patch with photographed controls, say what is still needed.
 
 In: how many photographs of each session were recognized, the promise, counts of controls. Out: `kept`, `broken` or
-`cannot_tell` with the prediction interval that decided it, and the effect (`shown` or not). For `assist`:
+`cannot_tell` with the prediction interval that decided it; differences; how many photographs would tell. For `assist`:
 
     broken       fewer are recognized than the 95 % prediction interval allows for in these sessions
     kept         the photographs' 97.5 % lower bound of the rate, which accounts for differences between sessions, is at
@@ -17,11 +17,12 @@ from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from patchproof.base.goal import Goal
+import numpy as np
+
 from patchproof.base.intervals import wilson
-from patchproof.base.sessions import LEAST_SESSIONS, TAIL, sessions_difference
-from patchproof.evidence.results import Control, Effect, VerdictWord
-from patchproof.sheets.manifest import Promise
+from patchproof.base.sessions import LEAST_SESSIONS, TAIL, HitsBySession, sessions_difference
+from patchproof.evidence.results import Benefit, Control, VerdictWord
+from patchproof.sheets.manifest import Interval, Promise
 
 LEAST_JUDGED = 5
 MOST_WITHOUT_MARKERS = 0.10
@@ -98,8 +99,10 @@ def judge(
     ends = posterior.least_rate if goal.sign > 0 else posterior.most_rate
     proved, required = ends(recognized, photos, look.tail), required_rate(promise)
     side = "at least" if goal.sign > 0 else "at most"
-    certain = "" if look.tail == TAIL else f" (with {1 - look.tail:.2%} certainty, as for look {look.number})"
-    proof = f"They prove a rate of {side} {proved:.0%}{certain}, and {side} {required:.0%} is asked for."
+    certain = "" if look.tail == TAIL else f" with {1 - look.tail:.2%} certainty, as for look {look.number}"
+    proof = f"True rate {side} {proved:.0%}{certain} (needed: {required:.0%})."
+    if goal.sign * required <= min(goal.sign, 0):
+        proof += " The promise is useless: any photographs keep it."
     word: VerdictWord = "kept" if goal.sign * (proved - required) >= 0 else "cannot_tell"
     return Verdict(word, (low, high), f"{counts}; {allowed}. {proof}")
 
@@ -128,26 +131,73 @@ def sessions_needed(promise: Promise) -> int | None:
     return next((s for s in counts if kept_chance(promise, (PHOTOS_PER_SESSION,) * s) >= MIN_KEPT_CHANCE), None)
 
 
-def next_step(promise: Promise, photos: Sequence[int], without_markers: int = 0) -> str:
-    """Advise what to do if photographs (`photos` judged in each session) cannot tell."""
+def provable_gain(promise: Promise, sessions: int, photos: int) -> float | None:
+    """The least gain that `photos` in each of `sessions` places, and as many of a control, show with a chance of
+    `MIN_KEPT_CHANCE`; None if none is large enough. Student's bound with as many degrees of freedom as sessions.
+    """
+    from scipy.special import stdtrit
+
+    sign, correlation = promise.target.goal.sign, promise.posterior.correlation[0]
+    quantiles = stdtrit(sessions, 1 - TAIL) + stdtrit(sessions, MIN_KEPT_CHANCE)
+    for gain in np.arange(1, 101) / 100 if sessions >= LEAST_SESSIONS else ():
+        mean = promise.rate - sign * gain / 2
+        variance = 2 * mean * (1 - mean) * (1 / photos + correlation) / sessions
+        if 0 <= promise.rate - sign * gain <= 1 and gain >= quantiles * variance**0.5:
+            return float(gain)
+    return None
+
+
+def sessions_to_show(promise: Promise) -> int | None:
+    """The number of sessions of `PHOTOS_PER_SESSION` photographs of the patch, and as many of its best control, that
+    show the promised gain; None if `MOST_PHOTOS` of each do not, or if no gain worth having is promised.
+    """
+    if not promise.controls or promise.answer == "does_not_help":
+        return None
+    gain, each = promise.target.goal.sign * promise.controls[promise.best_control].difference, PHOTOS_PER_SESSION
+    counts = range(LEAST_SESSIONS, MOST_PHOTOS // each + 1)
+    return next((s for s in counts if gain >= (provable_gain(promise, s, each) or 1.0)), None)
+
+
+def still_needed(
+    promise: Promise, photos: Sequence[int], without_markers: int, verdict: VerdictWord, worth: Benefit | None
+) -> str:
+    """Say what is still needed, after `photos` judged in each session, to tell both answers; "" if they are told."""
+    control = worth.control if worth is not None and worth.word == "cannot_tell" else ""
+    if verdict != "cannot_tell" and not control:
+        return ""
     if _share_without_markers(sum(photos), without_markers) > MOST_WITHOUT_MARKERS:
         return "Leave out pictures that do not show the piece, and take again those whose markers cannot be read."
-    return photos_line(sessions_needed(promise), photos)
+    again = worth is None or worth.source == "photographed"
+    return photos_line(promise, photos, control, verdict == "cannot_tell", again)
 
 
-def photos_line(sessions: int | None, photos: Sequence[int] = ()) -> str:
-    """Advise how many photographs to take for `sessions` (None: no number would do), after `photos` in each so far."""
-    if sessions is None:
-        return f"No {MOST_PHOTOS} photographs are likely to prove this promise: make a design that gains more."
-    each, places, total = PHOTOS_PER_SESSION, places_text(sessions), PHOTOS_PER_SESSION * sessions
+def photos_line(
+    promise: Promise, photos: Sequence[int] = (), control: str = "", for_promise: bool = True, again: bool = False
+) -> str:
+    """Say how many photographs to take in all, after `photos` in each session so far: for a verdict on the promise, and
+    with the name of a control to tell whether the patch helps; `again` if it was photographed so far.
+    """
+    kept, shown = sessions_needed(promise) if for_promise else 0, sessions_to_show(promise) if control else 0
+    if shown is None or (kept is None and not control):
+        proves = f"show that it {promise.target.goal.words['helps']}" if control else "prove this promise"
+        unsure = control and promise.controls and promise.answer == "cannot_tell"
+        first = f"promise it again first ({promise.command()}), or " if unsure else ""
+        return f"No {MOST_PHOTOS} photographs are likely to {proves}: {first}make a design that gains more."
+    sessions, each = max(kept or 0, shown), PHOTOS_PER_SESSION
+    places, total, what = places_text(sessions), each * sessions, ""
+    if control:
+        printed = f"its {control} control (patchproof sheet RUN --control {control})"
+        what = f" of the patch and {each} of {'the bare object' if control == 'bare' else printed}"
+    so_far = f" So far: {sum(photos)} of {total}, in {places_text(len(photos))} of {sessions}." if photos else ""
     if sum(photos) >= total and len(photos) >= sessions:
-        return f"Take {total} more, {each} in each of {places} that are new."
+        so_far = f" So far: {sum(photos)} of the patch, in {places_text(len(photos))}."
+        if again or not control:
+            return f"Take {total} more{what and ' of each'}, {each} in each of {places} that are new."
     needed = (
-        f"Take at least {each} photographs in each of {places}, with other light in each, and keep those of each place "
-        "in a folder of their own."
+        f"Take at least {each} photographs{what} in each of {places}, with other light in each, and keep those of each "
+        "place in a folder of their own."
     )
-    so_far = f" So far: {sum(photos)} of {total}, in {places_text(len(photos))} of {sessions}."
-    return needed + so_far if photos else needed
+    return needed + so_far + ("" if kept is not None else " The promise itself is too little above its best control.")
 
 
 def places_text(count: int) -> str:
@@ -159,10 +209,9 @@ def _share_without_markers(judged: int, without_markers: int) -> float:
     return without_markers / max(judged + without_markers, 1)
 
 
-def compare_with_control(patch: Answers, name: str, control: Answers, goal: Goal) -> Control:
+def compare_with_control(patch: Answers, name: str, control: Answers, promise: Promise) -> Control:
     """Compare answers to the patch with those to a control, both by session and photograph; equal keys are pairs, if at
-    least half of either are. `shown` says whether the patch changes recognition in the goal's direction, at 95 % over
-    sessions.
+    least half of either are. `shown` says whether the patch gains at all, at 95 % over sessions.
     """
     counts = sum(control.values()), len(control)
     row = Control(name, *counts, wilson(*counts))
@@ -172,18 +221,17 @@ def compare_with_control(patch: Answers, name: str, control: Answers, goal: Goal
     paired = len(keys) >= max(LEAST_PAIRS, LEAST_PAIRED * len(patch), LEAST_PAIRED * len(control))
     a, b = (_by_session(answers, keys if paired else sorted(answers)) for answers in (patch, control))
     difference, interval = sessions_difference(a, b, paired)
-    shown = min(goal.sign * end for end in interval) > 0
-    count, pairs = min(len(a), len(b)), len(keys) if paired else 0
-    row = replace(row, sessions=count, pairs=pairs, difference=difference, difference_interval=interval, shown=shown)
+    (rate, ours), (control_rate, theirs) = (_rate_of(hits, promise) for hits in (a, b))
+    row = replace(row, interval=theirs, rates=(rate, control_rate), patch_interval=ours, difference=difference)
+    count, pairs, shown = min(len(a), len(b)), len(keys) if paired else 0, promise.target.goal.gains(interval)[0] > 0
+    row = replace(row, sessions=count, pairs=pairs, difference_interval=interval, shown=shown)
     return row if count >= LEAST_SESSIONS else replace(row, advice=ONE_SESSION_ADVICE)
+
+
+def _rate_of(hits: HitsBySession, promise: Promise) -> tuple[float, Interval]:
+    counts = sum(map(sum, hits.values())), [len(each) for each in hits.values()]
+    return counts[0] / sum(counts[1]), promise.posterior.rate_given(*counts)
 
 
 def _by_session(answers: Answers, keys: Sequence[PhotoKey]) -> dict[int, list[bool]]:
     return {session: [answers[key] for key in keys if key[0] == session] for session, _ in keys}
-
-
-def effect_of(controls: Sequence[Control]) -> Effect:
-    """The effect is `shown` if every control was beaten; one without a judged photograph was not."""
-    if all(control.shown is None for control in controls):
-        return "not_tested"
-    return "shown" if all(control.shown for control in controls) else "not_shown"

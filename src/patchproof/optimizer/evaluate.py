@@ -17,6 +17,7 @@ from pydantic import Field
 from patchproof.base.compute import Compute
 from patchproof.base.errors import Refused
 from patchproof.base.folder_lock import lock_folder
+from patchproof.base.goal import Goal
 from patchproof.base.input import is_file
 from patchproof.base.output import notebook_html, rate_text, write_atomically
 from patchproof.base.progress import Advance, Progress, no_advance, no_progress
@@ -57,6 +58,7 @@ class Evaluation(StrictModel):
 
     n: int
     seed: int
+    goal: Goal
     models: dict[str, ModelEvaluation]
     not_measured: dict[str, str] = Field(default_factory=dict)  # reasons by figure
 
@@ -74,7 +76,8 @@ class Evaluation(StrictModel):
         for each in models.values():
             if each["ap50"] is None:  # of classifiers
                 del each["ap50"]
-        values = {"n": self.n, "seed": self.seed, "models": models, "not_measured": self.not_measured}
+        values = self.model_dump(mode="json", exclude={"models", "not_measured"})
+        values |= {"models": models, "not_measured": self.not_measured}
         return json.dumps(values, indent=1) + "\n"
 
 
@@ -125,7 +128,7 @@ def evaluate(
     seed, why = run.scene.seed if seed is None else seed, "the object's box in these views is not known"
     boxless = (net.name for net in problem.classifiers if net.LOOKS_AT_BOXES and evaluations[net.name].ap50 is None)
     reasons = {f"AP50 of {name}": why for name in boxless}
-    result = Evaluation(n=n, seed=seed, models=evaluations, not_measured=reasons)
+    result = Evaluation(n=n, seed=seed, goal=run.promise.target.goal, models=evaluations, not_measured=reasons)
     with lock_folder(run.folder):
         write_atomically(run.folder / "evaluate.json", result.to_json())
     return result

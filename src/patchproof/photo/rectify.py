@@ -28,6 +28,7 @@ CORNER_NOISE_PX = 0.045  # per coordinate, of fitted corners in noisy JPEGs of f
 UNSEEN_NOISE_PX = 0.2  # assumed for one marker, whose residual is always 0: more than sharp photographs have
 _BEND_FACTOR = 3.0  # error of the design's corners per bend of markers: 2 to 4.5 on wavy, wobbly and folded paper
 _LEAST_CORNERS = 3  # inlier corners of an inlier marker
+_CHANCE_PX = 0.5  # a corner's error up to which it may be chance
 _ROUNDS = 6  # of weights
 _MAX_SIDE_PX = 3000  # of an oversampled patch before it is averaged down
 
@@ -57,7 +58,7 @@ def fit_page(corners_px: Quads, corners_mm: Quads) -> PageFit:
             px = px - _outward_shift(homography, mm, px, inlier)
             homography = _gauss_newton(homography, mm[inlier], px[inlier])
         error = np.linalg.norm(apply_homography(homography, mm) - px, axis=1)
-        new_inlier = error < np.maximum(4 * np.sqrt(np.mean(error[inlier] ** 2)), 0.5)
+        new_inlier = error < max(4 * np.sqrt(np.mean(error[inlier] ** 2)), _CHANCE_PX)
         if len(ids) < 3 or (new_inlier == inlier).all():
             break
         inlier = new_inlier
@@ -175,12 +176,16 @@ def region_around(points_px: np.ndarray, margin_px: float, shape: tuple[int, ...
 
 def _find_inliers(mm, px) -> np.ndarray:
     """True for corners that fit the homography of the majority (least median of squares)."""
+    if len(px) == 12:  # a majority of three markers is hardly more than one, which extrapolates to the others
+        error = np.linalg.norm(apply_homography(fit_homography(mm, px), mm) - px, axis=1)
+        if error.max() < _CHANCE_PX:
+            return np.ones(12, bool)
     homography, _ = cv2.findHomography(mm, px, cv2.LMEDS)
     if homography is None:
         return np.ones(len(px), bool)
     error = np.linalg.norm(apply_homography(homography, mm) - px, axis=1)
     sigma = 1.4826 * np.median(error)
-    inlier = error < max(4 * sigma, 0.5)  # half a pixel or less may be chance
+    inlier = error < max(4 * sigma, _CHANCE_PX)
     return inlier if inlier.sum() >= 8 else np.ones(len(px), bool)
 
 

@@ -1,36 +1,36 @@
 """Sentences for terminal and page that sum up a promise, an evaluation or a verification.
 
 In: a promise, an evaluation or a report, or a report's summary as plain data. Out: lines for the terminal; and a
-headline that says whether the patch helps, a sentence with its figures, and the verdict on the promise.
+headline that says whether the patch helps, a sentence with its figures, and the verdict on the promise. A summary's
+`worth` is the one comparison behind them, its `next_step` what is still needed to tell.
 """
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from patchproof.base.goal import LEAST_GAIN, Goal, points_text
+from patchproof.base.output import rate_text
+from patchproof.base.settings import NO_PAGE, background_summary
+from patchproof.base.text import command_text
 from patchproof.base.validation import not_measured_lines, summarize_names
 
 VERDICTS = {"kept": "Promise kept", "broken": "Promise broken", "cannot_tell": "Promise neither broken nor proved"}
 _CONTROLS = {
     "bare": "the bare object",
-    "mean": "a piece in its mean color",
-    "gray": "a plain gray piece",
-    "noise": "a piece of noise",
+    "mean": "a plain patch in the design's average color",
+    "gray": "a plain gray patch",
+    "noise": "a patch of noise",
 }
-_HELPS = {"assist": "help", "deceive": "deceive"}
+_NO_GAIN = f"A gain of {100 * LEAST_GAIN:.0f} points or more is ruled out."
 
 
 def headline_of(summary: Mapping[str, Any]) -> str:
-    """Say whether the patch helps, as a headline."""
+    """Say whether the patch helps, as a headline, and by which evidence."""
     worth = summary["worth"]
     if worth is None:
-        return "Cannot tell whether it helps"
-    does, against = _HELPS[worth["goal"]], control_words(worth["control"])
-    return {
-        "helps": f"{does.capitalize()}s" + ("" if worth["photographed"] else " beside simulated controls"),
-        "no_better": f"No better than {against}",
-        "worse": f"Worse than {against}",
-        "not_shown": f"Not shown to {does}",
-    }[worth["word"]]
+        return "Cannot be told yet"
+    words, where = Goal(worth["goal"]).words[worth["word"]], " into these photographs" * (worth["source"] == "rendered")
+    return f"{words[0].upper()}{words[1:]} (controls {worth['source']}{where})"
 
 
 def benefit_sentence(summary: Mapping[str, Any]) -> str:
@@ -38,11 +38,14 @@ def benefit_sentence(summary: Mapping[str, Any]) -> str:
     worth = summary["worth"]
     if worth is None:
         return "There is nothing to compare the photographs with."
-    low, high = (100 * end for end in worth["difference_interval"])
-    source = "as photographed" if worth["photographed"] else "as simulated for the promise, not photographed"
+    ours = rate_text(worth["rate"], worth["interval"])
+    theirs = rate_text(worth["control_rate"], worth["control_interval"])
+    points = points_text(worth["rate"], worth["control_rate"], worth["difference_interval"])
+    shown = "these" if worth["photos"] == summary["judged"] else f"{worth['photos']} of these"
     return (
-        f"Recognized in {summary['rate']:.1%} of {summary['judged']} photographs, {control_words(worth['control'])} in "
-        f"{worth['control_rate']:.1%} ({source}): {100 * worth['difference']:+.1f} points [{low:+.1f}, {high:+.1f}]."
+        f"Recognized in {ours} of {shown} {summary['judged']} photographs, {control_words(worth['control'])} in "
+        f"{theirs}: {points}."
+        + (f" {_NO_GAIN}" if worth["word"] == "does_not_help" else "")
         + (f" This cannot tell: {worth['advice']}." if worth["advice"] else "")
     )
 
@@ -83,19 +86,49 @@ def recognition_meaning(model: Mapping[str, Any], label: str) -> str:
     )
 
 
-def promise_lines(promise: Any, background: str = "") -> list[str]:
-    """Sum up a promise: the rate, the background of its views, and the difference to each control."""
+def promise_lines(promise: Any, settings: Mapping[str, Any], run: str = "RUN") -> list[str]:
+    """Sum up a promise: whether the design helps and what to do about it, the rate, the background of its views, and
+    the difference to each control. `settings` are the scene's as plain data, `run` is the run's folder.
+    """
     (low, high), target, (first, *more_models) = promise.interval, promise.target, promise.models
-    meaning = recognition_meaning(first.model_dump(), target.label)
+    meaning, background = recognition_meaning(first.model_dump(), target.label), background_summary(settings)
     return [
-        promise.headline,
+        promise_summary(promise, settings, run),
         f'promise ({target.goal} "{target.label}"): recognized in {promise.rate:.1%} of {promise.n} unseen conditions '
         f"in {promise.sessions} sessions "
-        f"[{low:.1%}, {high:.1%}] by {first.name}{background and f', before {background}'}",
+        f"[{low:.1%}, {high:.1%}] by {first.name}{background and f', simulated {background}'}",
         *(f"  also {m.name}: {m.rate:.1%} [{m.interval[0]:.1%}, {m.interval[1]:.1%}]" for m in more_models),
         *([meaning] if meaning else []),
         *_control_lines({kind: claim.model_dump() for kind, claim in promise.controls.items()}),
     ]
+
+
+def promise_summary(promise: Any, settings: Mapping[str, Any], run: str = "RUN") -> str:
+    """Say whether the design helps, which command tells if a promise cannot, what to change if it does not help."""
+    change = "place, size or seed" if (settings.get("object") or {}).get("mesh") else "size or seed"
+    if (settings.get("patch") or {}).get("kind", "patch") != "patch":
+        change = "seed, or let more of the surface change"
+    elif settings.get("imported"):
+        change = change.replace("seed", "picture")
+    advice = {
+        "helps": "",
+        "does_not_help": f" {_NO_GAIN} Try another {change}.",
+        "cannot_tell": f" What tells: {promise.command(run)}.",
+    }
+    return promise.headline + advice[promise.answer]
+
+
+def run_lines(run: Any) -> list[str]:
+    """Sum up a finished run, and say which command comes next."""
+    folder, settings = str(run.folder), run.scene.settings.model_dump()
+    page = "json" if settings["sheet"]["template"] == NO_PAGE else "pdf"
+    following = command_text("sheet", folder, "--out", f"sheet.{page}")
+    if settings["patch"]["kind"] != "patch":
+        following = command_text("evaluate", folder)
+    if run.promise.answer == "cannot_tell":
+        following = run.promise.command(folder)
+    lines = promise_lines(run.promise, settings | {"imported": run.details.get("imported")}, folder)
+    return [*lines, f"run: {folder}", *([f"next: {following}"] if run.promise.answer != "does_not_help" else [])]
 
 
 def imported_lines(imported: Mapping[str, Any]) -> list[str]:
@@ -110,11 +143,15 @@ def imported_lines(imported: Mapping[str, Any]) -> list[str]:
 
 
 def evaluation_lines(result: Mapping[str, Any]) -> list[str]:
-    """Sum up an evaluation: each network's rate and controls."""
-    lines = []
+    """Sum up an evaluation: whether the design helps, by each network, its rate and controls."""
+    lines, goal = [], Goal(result["goal"])
     for name, rates in result["models"].items():
         low, high = rates["interval"]
-        lines.append(f"{name}: recognized in {rates['rate']:.1%} of {result['n']} conditions [{low:.1%}, {high:.1%}]")
+        ends = {kind: claim["difference_interval"] for kind, claim in rates["controls"].items()}
+        word = goal.answer(ends[goal.hardest(ends)])
+        told = goal.words[word] + f" (what tells: --n {4 * result['n']})" * (word == "cannot_tell")
+        share = f"{rates['rate']:.1%} of {result['n']} conditions [{low:.1%}, {high:.1%}]"
+        lines.append(f"{name}: {told}; recognized in {share}")
         lines += _control_lines(rates["controls"])
         if rates["ap50"] is not None:
             lines.append("  AP50 " + ", ".join(f"{kind} {share:.3f}" for kind, share in rates["ap50"].items()))
@@ -126,15 +163,16 @@ def verdict_lines(report: Any) -> list[str]:
     summary = report.summary
     data = summary.model_dump()
     lines = [f"{headline_of(data)}. {benefit_sentence(data)}"]
-    lines.append(f"verdict: {summary.verdict} (effect: {summary.effect}). {summary.reason}".strip())
+    untested = "" if report.controls else " (no control photographs)"
+    lines.append(f"verdict: {summary.verdict}{untested}. {summary.reason}".strip())
     lines += [summary.next_step] if summary.next_step else []
     if summary.background:
-        hint = f", a draft of {summary.draft_views} views and no more than a hint" if summary.draft_views else ""
-        lines.append(f"promised before {summary.background}{hint}")
+        hint = f"; a draft of {summary.draft_views} views, preliminary" if summary.draft_views else ""
+        lines.append(f"promise simulated {summary.background}{hint}")
     lines.append(f"photographs: {summary.photos}, judged {summary.judged}, measured {summary.measured}")
     if summary.sessions:
         count = sum(session.same_as is None for session in summary.sessions)
-        lines.append(f"sessions: {count} ({summary.sessions_known_from})")
+        lines.append(f"{count} session{'s' * (count > 1)} ({summary.sessions_known_from})")
         lines += [f"  {summary.sessions_note}"] if summary.sessions_note else []
         lines.append(looks_sentence(data))
     if summary.rate is not None:
@@ -142,7 +180,7 @@ def verdict_lines(report: Any) -> list[str]:
     others = [item for item in list(summary.models.items())[1:] if item[1].rate is not None]
     lines += ["  also {}: {:.1%} [{:.1%}, {:.1%}]".format(name, rate.rate, *rate.interval) for name, rate in others]
     if summary.prediction_interval is not None:
-        lines.append("promised: {} to {} of {}".format(*summary.prediction_interval, summary.judged))
+        lines.append("expected: {} to {} of {}".format(*summary.prediction_interval, summary.judged))
     if (forecast := summary.forecast) is not None:
         head = f"expected at the measured views: {forecast.expected:.1f} of {forecast.photos}"
         lines.append(f"{head} [{forecast.interval[0]}, {forecast.interval[1]}], recognized {forecast.recognized}")
@@ -159,20 +197,18 @@ def verdict_lines(report: Any) -> list[str]:
 
 def _estimated_lines(estimated: Any) -> list[str]:
     """Sum up the effect as estimated by rendering controls into the photographs."""
+    agree = f"re-rendering gave the original answer in {estimated.agree:.0%} of {estimated.photos} photographs"
     if not estimated.controls:
-        return [
-            f"effect not estimated: the network gives the original answer in {estimated.agree:.0%} of "
-            f"{estimated.photos} photographs when the design is rendered back into them"
-        ]
-    head = f"estimated by rendering controls into {estimated.photos} photographs ({estimated.agree:.0%} agree):"
-    return [head, *_control_lines({control.name: control.model_dump() for control in estimated.controls})]
+        return [f"controls not rendered into these photographs: {agree}"]
+    names = ("n", "difference", "difference_interval")
+    rows = {c.name: {"rate": c.rates[1], **{name: getattr(c, name) for name in names}} for c in estimated.controls}
+    return [f"controls rendered into these photographs ({agree}):", *_control_lines(rows)]
 
 
 def _control_lines(controls: Mapping[str, Mapping[str, Any]]) -> list[str]:
     rows = []
     for kind, claim in controls.items():
-        low, high = (100 * bound for bound in claim["difference_interval"])
-        of_count = f" of {claim['n']}" if claim.get("n") else ""
-        difference = f"difference {100 * claim['difference']:+.1f} points [{low:+.1f}, {high:+.1f}]"
-        rows.append(f"  {kind:>6}: {claim['rate']:6.1%}{of_count}   {difference}")
+        rate, of_count = claim["rate"], f" of {claim['n']}" if claim.get("n") else ""
+        points = points_text(rate + claim["difference"], rate, claim["difference_interval"])
+        rows.append(f"  {kind:>6}: {rate:6.1%}{of_count}   difference {points}")
     return rows

@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from patchproof.base.goal import points_text
 from patchproof.base.output import make_folder, write_atomically
 from patchproof.base.text import csv_lines
 from patchproof.report import words
@@ -18,12 +19,6 @@ from patchproof.report.images import DELTA_TOP, data_uri, saved_pictures
 from patchproof.report.page import render_page
 from patchproof.report.plots import ledger_plot, recognition_plot, scale_plot
 
-_EFFECTS = {
-    "shown": "The patch itself makes the difference: it did better than every control.",
-    "not_shown": "That the patch itself makes a difference was not shown: it did not clearly beat every control.",
-    "not_tested": "Whether the patch itself makes a difference was not tested: there were no control photographs.",
-    "estimated": "There were no control photographs. What they would have shown was estimated from these.",
-}
 _FIRST = ("file", "status", "code", "figure", "threshold", "advice")
 _PLOTS = (("tilt_deg", "tilt in degrees"), ("px_per_mm", "pixels per millimeter"))
 
@@ -54,7 +49,6 @@ def report_html(report: Mapping, manifest: Mapping, encoded: Mapping[str, Mappin
             (recognition_plot(judged, primary, name, label, promise["conditions"]), f"chart of recognition by {label}")
             for name, label in _PLOTS
         ]
-    estimated = summary["effect"] == "not_tested" and (summary["estimated"] or {}).get("controls")
     pictures = {file: {kind: data_uri(data) for kind, data in kinds.items()} for file, kinds in encoded.items()}
     return render_page(
         "page.html.j2",
@@ -68,9 +62,9 @@ def report_html(report: Mapping, manifest: Mapping, encoded: Mapping[str, Mappin
         looks=words.looks_sentence(summary),
         meaning=words.recognition_meaning(promise["models"][0], promise["target"]["label"]) if promise else "",
         rules={model["name"]: model["least_score"] for model in (promise["models"] if promise else ())},
-        word=(summary["worth"] or {}).get("word", "not_shown"),
+        word=(summary["worth"] or {}).get("word", "cannot_tell"),
         verdict=words.VERDICTS[summary["verdict"]],
-        effect=_EFFECTS["estimated" if estimated else summary["effect"]],
+        effect="" if report["controls"] else "There were no control photographs.",
         bars=_bars(summary, promise, report["controls"]),
         controls=report["controls"],
         ledger=ledger,
@@ -79,6 +73,7 @@ def report_html(report: Mapping, manifest: Mapping, encoded: Mapping[str, Mappin
         sized=any(photo["scale_x"] is not None for photo in photos),
         cards=[{"photo": photo, "pictures": pictures.get(photo["file"], {})} for photo in photos],
         remarks=words.remarks(photos),
+        points=points_text,
         delta_top=DELTA_TOP,
         settings=json.dumps(manifest["settings"], indent=1, ensure_ascii=False),
         origin=report["origin"],
@@ -92,19 +87,17 @@ def _bars(summary: Mapping, promise: Mapping | None, controls: Sequence[Mapping]
         rows.append(("These photographs", summary["rate"], summary["interval"], "seen"))
     if promise:
         rows.append(("Promised", promise["rate"], promise["interval"], "promised"))
-    if summary["matched_rate"] is not None:
-        rows.append(("Promised at these views", summary["matched_rate"], None, "promised"))
     if summary["prediction_interval"] and judged:
         allowed = [count / judged for count in summary["prediction_interval"]]
         rows.append((f"Allowed for {judged} photographs", None, allowed, "allowed"))
     if forecast := summary["forecast"]:
         n, allowed = forecast["photos"], [count / forecast["photos"] for count in forecast["interval"]]
-        rows.append((f"Expected of {n} at their views", forecast["expected"] / n, allowed, "promised"))
+        rows.append((f"Expected of {n} at their own views", forecast["expected"] / n, allowed, "promised"))
     for c in controls:
         if c["n"]:
             rows.append((f"Control: {c['name']}", c["recognized"] / c["n"], c["interval"], "control"))
     for name, claim in (promise["controls"] if promise else {}).items():
-        rows.append((f"Promised control: {name}", claim["rate"], claim["interval"], "control"))
+        rows.append((f"Simulated control: {name}", claim["rate"], claim["interval"], "control"))
     return [dict(zip(("name", "rate", "interval", "kind"), row, strict=True)) for row in rows]
 
 

@@ -65,8 +65,9 @@ class SheetContent:
     def words(self) -> dict[str, str]:
         """Values of the placeholders in a template's text."""
         size, kind = size_text(self.piece.size_mm), self.kind
-        if self.promise is not None and self.promise.comparison != "better":
-            kind = f"{kind}, {self.promise.comparison} than {self.promise.best_control}"
+        if self.promise is not None and self.promise.answer != "helps":
+            does_not = self.promise.target.goal.words["does_not_help"]
+            kind = f"{kind}, {does_not if self.promise.answer == 'does_not_help' else 'effect unknown'}"
         if self.promise is not None and self.promise.draft:
             kind = f"draft {kind}"
         fix = "Wrap the piece smoothly round the object" if self.bent else "Fix the piece flat on the object"

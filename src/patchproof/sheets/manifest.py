@@ -16,10 +16,11 @@ import numpy as np
 from pydantic import Field, create_model, field_validator, model_validator
 
 from patchproof.base.errors import Refused
-from patchproof.base.goal import Goal
+from patchproof.base.goal import GainWord, Goal, points_text
 from patchproof.base.input import open_image, read_json
 from patchproof.base.output import notebook_html, rate_text
 from patchproof.base.sessions import RatePosterior, count_by_session, rate_posterior
+from patchproof.base.text import command_text
 from patchproof.base.validation import Finite, NotNegativeRange, Share, StrictModel, validate_model
 
 Mm = Annotated[Finite, Field(ge=-1e5, le=1e5)]
@@ -28,7 +29,6 @@ Point = tuple[Mm, Mm]
 Rect = tuple[Mm, Mm, SizeMm, SizeMm]
 Interval = tuple[Share, Share]
 SignedInterval = tuple[Finite, Finite]
-Comparison = Literal["better", "no better", "worse"]
 PAGE_CODE_PATTERN = "^patchproof:([0-9A-Z]{10}):([0-9a-z]+)$"  # text of a page's QR code
 _MIN_MARKER_MM = 1.0
 PageNumber = Annotated[int, Field(ge=1, le=1000)]
@@ -190,30 +190,25 @@ class Promise(StrictModel):
     @property
     def best_control(self) -> str:
         """The name of the control that is hardest to beat."""
-        return max(self.controls, key=lambda name: self.target.goal.sign * self.controls[name].rate)
+        return self.target.goal.hardest({name: claim.difference_interval for name, claim in self.controls.items()})
 
     @property
-    def comparison(self) -> Comparison:
-        """The design's rate compared with the best control's; "no better" if their difference's interval holds 0."""
-        ends = [self.target.goal.sign * end for end in self.controls[self.best_control].difference_interval]
-        return "better" if min(ends) > 0 else "worse" if max(ends) < 0 else "no better"
+    def answer(self) -> GainWord:
+        """The answer to whether the design helps, from its difference to its best control."""
+        return self.target.goal.answer(self.controls[self.best_control].difference_interval)
 
-    @property
-    def draft_prefix(self) -> str:
-        """The beginning of sentences about a draft; "" for a full promise."""
-        return f"Draft of {self.n} views, no more than a hint: " if self.draft else ""
+    def command(self, run: str = "RUN") -> str:
+        """The command for a promise that tells more: in full after a draft, else from four times the views."""
+        return command_text("promise", run, *([] if self.draft else ["--n", 4 * self.n]))
 
     @property
     def headline(self) -> str:
         """A sentence that compares the design with its best control in the views that were rendered of both."""
-        control = self.controls[self.best_control]
-        low, high = (100 * end for end in control.difference_interval)
-        advice = "" if self.comparison == "better" else " Try another place, size or seed before printing it."
+        control, draft = self.controls[self.best_control], f"Draft of {self.n} views (preliminary): " * self.draft
         rate = control.rate + control.difference
-        shared = "" if abs(rate - self.rate) < 5e-4 else " in the same views"
-        points = f"{100 * control.difference:+.1f} points [{low:+.1f}, {high:+.1f}]"
-        rates = f"{rate:.1%} beside {control.rate:.1%} recognized{shared}, {points}"
-        return f"{self.draft_prefix}{self.comparison} than its best control ({self.best_control}): {rates}.{advice}"
+        beside = f"{control.rate:.1%} with its best control ({self.best_control}) in the same views"
+        points = points_text(rate, control.rate, control.difference_interval)
+        return f"{draft}{self.target.goal.words[self.answer]}: {rate:.1%} recognized, {beside}: {points}."
 
     def figures(self) -> dict[str, str]:
         """The target, rate, interval and controls as text, in the order to be read."""

@@ -109,7 +109,7 @@ def _mesh_scene(
             _line("elevation_deg = [2, 27]", elevation),
             "",
             "# [background]",
-            _line('# images = "places"', "a folder of photographs of places; procedural rooms without"),
+            _line('# images = "places"', "a folder of photographs of places; synthetic rooms without"),
             "",
         ]
     )

@@ -15,7 +15,7 @@ from patchproof.app.capture.collection import PhotoCollection
 from patchproof.app.capture.view_map import map_views
 from patchproof.base.output import image_bytes
 from patchproof.evidence.results import PhotoEntry
-from patchproof.evidence.verdict import PHOTOS_PER_SESSION, photos_line
+from patchproof.evidence.verdict import PHOTOS_PER_SESSION
 from patchproof.report.images import data_uri
 from patchproof.report.words import VERDICTS, benefit_sentence, headline_of
 
@@ -44,7 +44,7 @@ def state_of(collection: PhotoCollection, sessions: int | None) -> dict[str, Any
         "prediction_interval": summary.prediction_interval,
         "sessions": rows,
         "each": PHOTOS_PER_SESSION,
-        "plan": summary.next_step or (photos_line(sessions) if promise is not None else ""),
+        "plan": summary.next_step,
         "controls": [{"name": each.name, "photos": each.n, "recognized": each.recognized} for each in report.controls],
         "controls_known": [name for name in CONTROLS if name in promised] or CONTROLS,
         "map": _map(collection, PHOTOS_PER_SESSION * (sessions or _USUAL_SESSIONS)),

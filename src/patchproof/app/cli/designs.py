@@ -26,11 +26,10 @@ def import_picture(
     jobs: Jobs = None,
 ) -> None:
     """Make a run of a picture that was made elsewhere: its promise, as of a design of ours."""
-    from patchproof.base.settings import background_summary
     from patchproof.optimizer.imported_design import import_folder, import_patch
     from patchproof.optimizer.promise import PromiseOptions
     from patchproof.optimizer.run import DRAFT_EFFORT
-    from patchproof.report.words import imported_lines, promise_lines
+    from patchproof.report.words import imported_lines, run_lines
     from patchproof.scene.scene import load_scene
 
     with progress() as bar:
@@ -47,8 +46,7 @@ def import_picture(
         else:
             runs = [import_patch(picture, loaded, out, **options)]
     for run in runs:
-        say(*imported_lines(run.details["imported"]))
-        say(*promise_lines(run.promise, background_summary(run.scene.settings.model_dump())), f"run: {run.folder}")
+        say(*imported_lines(run.details["imported"]), *run_lines(run))
 
 
 def evaluate(

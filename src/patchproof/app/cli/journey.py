@@ -62,16 +62,15 @@ def optimize(
     seed: Seed = None,
     jobs: Jobs = None,
     require: Annotated[
-        Literal["better"] | None,
-        Option(help='"better" makes a design exit with 1 that is not better than its best control.'),
+        Literal["helps"] | None,
+        Option(help='"helps" makes a design exit with 1 that does not help, or of which it cannot be told yet.'),
     ] = None,
 ) -> None:
     """Optimize the patch of a scene and promise its rate."""
-    from patchproof.base.settings import background_summary
     from patchproof.optimizer.promise import PromiseOptions
     from patchproof.optimizer.run import DRAFT_EFFORT, THOROUGH_EFFORT
     from patchproof.optimizer.run import optimize as optimize_scene
-    from patchproof.report.words import promise_lines
+    from patchproof.report.words import run_lines
     from patchproof.scene.scene import load_scene
 
     if draft and thorough:
@@ -85,17 +84,14 @@ def optimize(
         options: dict[str, Any] = {"promise": PromiseOptions(promise), "compute": Compute(device, jobs or 1)}
         run = optimize_scene(loaded, out, **options, resume=resume, overwrite=overwrite, progress=bar)
     warn(tuple(text for text in run.scene.warnings if text not in loaded.warnings))  # of the place that was found
-    say(*promise_lines(run.promise, background_summary(run.scene.settings.model_dump())))
     if (out / "place.json").is_file():  # only then import the search's modules
         from patchproof.optimizer.place_files import read_place
         from patchproof.optimizer.place_search import place_lines
 
         if (place := read_place(out)) is not None:
             say(*place_lines(place))
-    say(f"run: {out}")
-    if run.scene.settings.patch.kind == "patch":
-        say(f"next: {command_text('sheet', out, '--out', 'sheet.pdf')}")
-    raise Exit(1 if require == "better" and run.promise.comparison != "better" else 0)
+    say(*run_lines(run))
+    raise Exit(1 if require is not None and run.promise.answer != require else 0)
 
 
 def promise(
@@ -106,16 +102,12 @@ def promise(
     jobs: Jobs = None,
 ) -> None:
     """Promise a finished run's rate again: in full after a draft, or from more views."""
-    from patchproof.base.settings import background_summary
     from patchproof.optimizer.evaluate import promise_run
-    from patchproof.report.words import promise_lines
+    from patchproof.report.words import run_lines
 
     with progress() as bar:
         finished_run = promise_run(run, views=n, trust=trust, compute=Compute(device, jobs or 1), progress=bar)
-    say(*promise_lines(finished_run.promise, background_summary(finished_run.scene.settings.model_dump())))
-    if finished_run.scene.settings.patch.kind == "patch":
-        hint = command_text("sheet", run, "--out", "sheet.pdf")
-        say(f"next: {hint} (a page that was written before has the former promise)")
+    say(*run_lines(finished_run), "A page that was written before has the former promise.")
 
 
 def sheet(
@@ -164,7 +156,10 @@ def sheet(
             manifests = [sheet_of(first, out, template=template, control=control, copies=copies)]
     for manifest, path in zip(manifests, paths, strict=True):
         if manifest.promise is not None:
-            say(manifest.promise.headline, f"promised before {background_summary(manifest.settings)}")
+            from patchproof.report.words import promise_summary
+
+            lines = promise_summary(manifest.promise, manifest.settings), background_summary(manifest.settings)
+            say(lines[0], f"promise simulated {lines[1]}")
         say(f"sheet {manifest.sheet_id} ({manifest.kind}): {out}, {path.name}")
     if check:
         lines = (line for manifest in manifests for line in sheet_advice(manifest))
@@ -237,11 +232,11 @@ def verify(
         Literal["kept", "helps"] | None,
         Option(
             help='What else than exits with 1: "kept", a promise that held, however little it promised; "helps", one '
-            "that held of a patch that beats every control."
+            "that held of a patch that helps, as the first line says."
         ),
     ] = None,
     ledger: Annotated[
-        int, Option(min=0, help="Photographs in gap ledger and estimated effect at most; 0 for none.")
+        int, Option(min=0, help="Photographs in the gap ledger at most; 0: no ledger, and no rendered controls.")
     ] = 24,
     run: Annotated[
         Path | None, Option(help="The run that the sheet is of: forecasts each photograph at its measured view.")
