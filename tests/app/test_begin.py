@@ -480,8 +480,8 @@ def test_a_refused_piece_is_told_what_would_fit(patch, advice):
 
 def test_markers_say_what_asks_for_their_size():
     sharp = {"photo_px": (1600, 1200)}
-    (note,) = [note for note in box(width_mm=45, height_mm=45, **sharp).warnings if "unreadable" in note]
+    (note,) = [note for note in box(width_mm=45, height_mm=45, **sharp).warnings if "too small" in note]
     needed, least = re.search(r"camera.photo_px ask for ([\d.]+) mm, and those for a piece of (\d+) mm", note).groups()
     enough = box(width_mm=int(least), height_mm=int(least), **sharp)
-    assert not [note for note in enough.warnings if "unreadable" in note]
+    assert not [note for note in enough.warnings if "too small" in note]
     assert float(needed) == pytest.approx(enough.piece.marker_mm, abs=0.06)
