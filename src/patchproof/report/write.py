@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from patchproof.base.goal import points_text
 from patchproof.base.output import make_folder, write_atomically
 from patchproof.base.text import csv_lines
 from patchproof.report import words
@@ -71,6 +72,7 @@ def report_html(report: Mapping, manifest: Mapping, encoded: Mapping[str, Mappin
         cards=cards,
         remarks=words.remarks(photos),
         times=Counter(text for photo in photos for text in (photo["advice"], *photo.get("said", ()))),
+        points=points_text,
         delta_top=DELTA_TOP,
         settings=json.dumps(manifest["settings"], indent=1, ensure_ascii=False),
         origin=report["origin"],
