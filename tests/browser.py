@@ -17,6 +17,19 @@ FLAGS = """--headless --no-sandbox --disable-gpu --no-first-run --remote-debuggi
     --disable-component-update --disable-sync --disable-quic""".split()
 
 
+# what is cut or too wide, text too small to read, and pictures that did not load
+PROBE = """(screen => {
+const all = [...document.querySelectorAll("main *")].filter(e => !e.closest("svg") && e.getClientRects().length);
+const names = elements => elements.map(e => e.tagName);
+return {
+  wide: names(all.filter(e => e.getBoundingClientRect().right > screen + 1 || e.scrollWidth > e.clientWidth + 1
+    && getComputedStyle(e).overflowX != "visible" && getComputedStyle(e).textOverflow != "ellipsis")),
+  small: all.filter(e => e.innerText && parseFloat(getComputedStyle(e).fontSize) < 11).length,
+  broken: [...document.images].filter(i => i.loading != "lazy" && (!i.complete || !i.naturalWidth)).length,
+  images: document.images.length, width: document.scrollingElement.scrollWidth, inner: innerWidth};
+})"""
+
+
 class Browser:
     """One page of it, as wide as a phone; a context that ends the browser. `said` are its events and errors."""
 
@@ -69,6 +82,17 @@ class Browser:
     def evaluate(self, expression: str) -> Any:
         """The JSON value of a script."""
         return self.call("Runtime.evaluate", expression=expression, returnByValue=True)["result"].get("value")
+
+    def look_at(self, page: Path, width_px: int) -> dict[str, Any]:
+        """What `PROBE` and the console say of the page on a screen of that width, and what it asked for."""
+        mobile, self.said = width_px < 500, []
+        screen = {"width": width_px, "height": 844, "deviceScaleFactor": 1, "mobile": mobile}
+        self.call("Emulation.setDeviceMetricsOverride", **screen)
+        self.call("Page.navigate", url=page.as_uri())
+        self.wait_for("document.readyState == 'complete'")
+        asked = [url for url in self.requested if not url.startswith("data:") and url != page.as_uri()]
+        errors = [event for event in self.troubles if event.get("entry", {}).get("source") != "network"]
+        return self.evaluate(f"{PROBE}({width_px})") | {"errors": errors, "fetched": asked}
 
     def wait_for(self, expression: str, seconds: float = 60) -> Any:
         """The script's value once it is true."""

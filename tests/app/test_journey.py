@@ -57,6 +57,15 @@ def report(journey):
     return json.loads((journey / "report" / "report.json").read_text())
 
 
+def test_the_demo_ends_with_the_page_to_open_and_opens_it(monkeypatch, tmp_path, capsys):
+    opened = []
+    monkeypatch.setattr("webbrowser.open", opened.append)
+    monkeypatch.setattr("patchproof.app.demo.run_demo", lambda out, *_, **__: [f"open this in a browser: {out}"])
+    for flag in ((), ("--open",)):
+        command("demo", "--out", tmp_path, *flag)
+    assert opened == [(tmp_path / "report" / "report.html").as_uri()]
+
+
 def test_every_file_of_the_contract_is_there(journey):
     for name in ("design.png", "run.json", "steps.jsonl", "views.png", "checkpoint.safetensors"):
         assert (journey / "run" / name).stat().st_size > 0, name

@@ -162,7 +162,7 @@ def test_the_study_writes_breaks_points_codes_and_one_page(world, tmp_path):
     (broken,) = rows_of(tmp_path / "out/envelope_breaks.csv")
     assert 0.5 <= float(broken["measured_low"]) <= float(broken["measured"]) <= float(broken["measured_high"]) <= 16
     maps = rows_of(tmp_path / "out/envelope_maps.csv")
-    assert len(maps) == 9 and {row["effect"] for row in maps} <= {"gains", "no effect"}
+    assert len(maps) == 9 and {row["effect"] for row in maps} <= {"gains", "no gain shown"}
     assert (tmp_path / "out/envelope_page.png").is_file()
 
 
@@ -211,7 +211,7 @@ STRIDES = 'steps = 4\noptimizer = "sign"\nstep_size = 0.15'
 BLUE = '"blue"\nmodels = ["module:fake_networks.red_against_blue"]'
 
 
-def test_where_nothing_is_left_of_the_object_the_page_says_no_effect_whatever_is_recognized(
+def test_where_nothing_is_left_of_the_object_the_page_says_no_gain_whatever_is_recognized(
     blue_run, tmp_path, monkeypatch
 ):
     unseen = Measurement("rejected", "too_few_markers", None)  # a search of noise for markers takes seconds
@@ -229,15 +229,15 @@ def test_where_nothing_is_left_of_the_object_the_page_says_no_effect_whatever_is
     noise, blur = np.reshape(rows_of(out / "envelope_sweeps.csv"), (2, 3))
     for easy, _, hard in (noise, blur):
         assert easy["effect"] == "gains" and float(easy["gain_low"]) > 0
-        assert hard["effect"] == "no effect" and float(hard["gain_low"]) <= 0 <= float(hard["gain_high"])
+        assert hard["effect"] == "no gain shown" and float(hard["gain_low"]) <= 0 <= float(hard["gain_high"])
     assert 0.2 < float(noise[2]["recognized"]) < 0.8
     for row in rows_of(out / "envelope_breaks.csv"):
-        assert float(row["design gains_high"]) <= float(row["hard"]) and row["no effect at"]
+        assert float(row["design gains_high"]) <= float(row["hard"]) and row["no gain shown at"]
     cells = rows_of(out / "envelope_maps.csv")
-    assert {row["effect"] for row in cells if float(row["at x"]) == 16} == {"no effect"}
+    assert {row["effect"] for row in cells if float(row["at x"]) == 16} == {"no gain shown"}
     (page,) = figures(None, finished.results)
-    assert drawing_of(page.draw, (8, 6), "svg").decode().count("no effect<") == 2
-    assert "no effect" in (out / "envelope.html").read_text("utf-8")
+    assert drawing_of(page.draw, (8, 6), "svg").decode().count("no gain shown<") == 3  # two bars, and what gray means
+    assert "no gain shown" in (out / "envelope.html").read_text("utf-8")
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,7 @@ from patchproof.classifier.network import Classifier
 from patchproof.optimizer import expectation, loop, run
 from patchproof.optimizer.evaluate import promise_run
 from patchproof.optimizer.loop import start, steps, take_step
-from patchproof.optimizer.pixels import as_pixels, from_pixels
+from patchproof.optimizer.pixels import as_pixels, from_pixels, side_by_side
 from patchproof.optimizer.problem import set_problem
 from patchproof.optimizer.promise import CONTROLS, PromiseOptions, make_promise
 from patchproof.optimizer.responses import responses
@@ -287,6 +287,14 @@ def test_the_same_seed_gives_the_same_bytes_and_another_does_not(tmp_path, few_v
     assert same_files(tmp_path / "a", tmp_path / "b")
     assert (tmp_path / "a" / "run.json").read_bytes() == (tmp_path / "b" / "run.json").read_bytes()
     assert not same_files(tmp_path / "a", tmp_path / "c", ("design.png",))
+
+
+def test_views_stand_over_what_the_network_says_of_them():
+    views = torch.rand(5, 3, 20, 60)
+    plain, labeled = (side_by_side(views, [text] * 5).astype(int) for text in ("", "Ü 92 %"))
+    assert plain.shape == labeled.shape == (2 * (20 + 13), 4 * 60, 3)
+    changed = (plain != labeled).any(2).reshape(2, 33, 4, 60)
+    assert not changed[:, :20].any() and changed[:, 20:].any((1, 3)).tolist() == [[True] * 4, [True, *[False] * 3]]
 
 
 @pytest.mark.parametrize(

@@ -2,31 +2,29 @@
 
 from __future__ import annotations
 
+import base64
 import csv
-import functools
-import html
-import http.server
 import io
 import json
 import re
-import shutil
-import subprocess
-import threading
 from html.parser import HTMLParser
 
 import numpy as np
 import pytest
+from browser import Browser
 from synthetic_photos import make_manifest
 
 from patchproof.base.intervals import Estimate
 from patchproof.evidence.results import (
     PHOTO_KEYS,
+    Benefit,
     Control,
     LedgerShare,
     ModelRate,
     Origin,
     PhotoEntry,
     Prediction,
+    Remark,
     Report,
     SessionCount,
     Summary,
@@ -56,6 +54,9 @@ def some_report(verdict="kept"):
     summary = Summary(
         photos=4, judged=3, measured=3, rate=1.0, interval=(0.44, 1.0), prediction_interval=(2, 3), verdict=verdict,
         reason="3 of 3 photographs were recognized.",
+        worth=Benefit(word="helps", goal="assist", source="photographed", photos=3, rate=1.0, interval=(0.44, 1.0),
+                      control="gray", control_rate=1 / 3, control_interval=(0.06, 0.79), difference=0.67,
+                      difference_interval=(0.1, 0.9)),
     )  # fmt: skip
     origin = Origin(options={"ruler_mm": (97.1, 97.3)}, sha256={"network net": "e" * 64}, versions={"numpy": "1"})
     controls = (Control("gray", 1, 3, (0.06, 0.79), 3, 0.67, (0.1, 0.9), 2, "", False, (1.0, 0.333)),)
@@ -139,7 +140,7 @@ def test_an_answer_about_a_photograph_that_does_not_count_is_not_called_recogniz
     report = some_report()
     rejected = report.photos[-1].changed(predictions=report.photos[0].predictions)
     manifest = make_manifest(promise()).model_dump(mode="json")
-    words = "<span>recognized</span>", "<span>not counted</span>"
+    words = "<br>recognized", "<br>not counted"
     for photos, word in ((report.photos[:1], words[0]), ((rejected,), words[1])):
         write_report(report.changed(photos=photos).model_dump(mode="json"), manifest, tmp_path, None)
         page = (tmp_path / "report.html").read_text("utf-8")
@@ -198,61 +199,41 @@ def test_difference_maps_have_one_scale_and_show_what_was_not_measured():
     assert colors[1, 1, 3] == 0 and colors[0, 0, 3] == 255
 
 
-PROBE = """<script>addEventListener("load", () => {  // before the frame's own: by now every fetch has ended
-const all = [...document.querySelectorAll("main *")].filter(e => !e.closest("pre, svg, .scroll > *"));
-const wide = all.filter(e => e.getBoundingClientRect().right > innerWidth + 1).map(e => e.tagName);
-const small = all.filter(e => e.innerText && parseFloat(getComputedStyle(e).fontSize) < 11).length;
-const broken = [...document.images].filter(i => i.loading != "lazy" && (!i.complete || !i.naturalWidth)).length;
-const fetched = performance.getEntriesByType("resource").map(r => r.name).filter(n => !n.startsWith("data:"));
-document.title = JSON.stringify({wide, small, broken, fetched, width: document.documentElement.scrollWidth,
-  inner: innerWidth, images: document.images.length, errors: window.troubles});
-});</script></body>"""
-EARLY = "<head><script>window.troubles = []; window.onerror = m => { window.troubles.push(String(m)) }</script>"
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    with Browser(tmp_path_factory.mktemp("browser")) as browser:
+        yield browser
 
 
-class Quiet(http.server.SimpleHTTPRequestHandler):
-    def log_message(self, *arguments):
-        pass
+FINE = {"wide": [], "small": 0, "broken": 0, "errors": [], "fetched": []}
 
 
-def seen_in_browser(page, width_px, tmp_path):
-    """What a browser says of the page in a frame of that width, since a headless window is never narrower than 500."""
-    browser = shutil.which("chromium") or shutil.which("google-chrome")
-    if browser is None:
-        pytest.skip("no Chromium here to look at the page")
-    probe = page.read_text(encoding="utf-8").replace("<head>", EARLY, 1).replace("</body>", PROBE)
-    (tmp_path / "probe.html").write_text(probe, encoding="utf-8")
-    (tmp_path / "frame.html").write_text(
-        f"<link rel=icon href='data:,'><iframe src='probe.html' width='{width_px}' height='800' style='border:0'"
-        " onload='document.title = this.contentDocument.title'></iframe>"
-    )
-    flags = f"--headless --no-sandbox --disable-gpu --no-first-run --user-data-dir={tmp_path / 'user'} --dump-dom"
-    flags += " --disable-background-networking --disable-component-update --disable-sync --disable-quic"
-    handler = functools.partial(Quiet, directory=tmp_path)
-    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:  # of a file: page, failed loads are lost
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        address = f"http://127.0.0.1:{server.server_port}/frame.html"
-        done = subprocess.run([browser, *flags.split(), address], capture_output=True, timeout=60)
-        server.shutdown()
-    title = re.search(r"<title>(\{.*?\})</title>", done.stdout.decode())
-    assert title is not None, done.stderr.decode()[-500:]
-    return json.loads(html.unescape(title[1]))
+@pytest.mark.parametrize("width_px", [390, 1280])
+def test_no_page_scrolls_sideways_cuts_anything_or_asks_anybody(shown, browser, tmp_path, width_px):
+    for page, images in ((shown, 6), (results_page(tmp_path), 2)):
+        seen = browser.look_at(page, width_px)
+        assert seen == FINE | {"images": images, "inner": width_px, "width": seen["width"]}
+        assert seen["width"] <= width_px
 
 
-def test_a_browser_shows_it_on_a_phone_without_scrolling_sideways_or_asking_anybody(shown, tmp_path):
-    seen = seen_in_browser(shown, 390, tmp_path)
-    assert seen["inner"] == 390 and seen["width"] <= 390 and seen["wide"] == []
-    assert seen["images"] == 5 and seen["broken"] == 0 and seen["small"] == 0
-    assert seen["errors"] == [] and seen["fetched"] == []
-
-
-def test_the_browser_sees_what_is_too_wide_fetched_or_in_error(shown, tmp_path):
+def test_the_browser_sees_what_is_too_wide_fetched_or_in_error(shown, browser, tmp_path):
     page = tmp_path / "report.html"
     bad = "<div style='width:900px'>x</div><img src='gone.png'><script>nothing.at.all</script></main>"
     page.write_text(shown.read_text(encoding="utf-8").replace("</main>", bad), encoding="utf-8")
-    seen = seen_in_browser(page, 390, tmp_path)
+    seen = browser.look_at(page, 390)
     assert seen["width"] > 390 and seen["wide"] == ["DIV"] and seen["broken"] == 1
     assert len(seen["errors"]) == 1 and len(seen["fetched"]) == 1
+
+
+@pytest.mark.parametrize("width_px", [390, 1280])
+def test_the_first_screen_has_a_picture_with_its_answer_and_both_bars(shown, browser, width_px):
+    browser.look_at(shown, width_px)
+    parts = "[...document.querySelectorAll('.first .view img, .first .said, .first .bar, .first b')]"
+    bottoms = browser.evaluate(parts + ".map(e => e.getBoundingClientRect().bottom)")
+    assert len(bottoms) >= 5 and max(bottoms) <= 844
+    text = browser.evaluate("document.querySelector('.first').innerText")
+    for words in ("80 % · recognized", "44 % to 100 %", "Best control: gray, photographed", "6 % to 79 %", "p0.jpg"):
+        assert words in text
 
 
 class Alternatives(HTMLParser):
@@ -266,18 +247,21 @@ class Alternatives(HTMLParser):
 
 
 def results_page(folder):
-    """A study's page with two figures of one title and a wide table."""
-    head = ("object", *(f"setting {i}" for i in range(12)))
-    table = Table("cells", "Every cell", head, tuple(("mug", *[Estimate(0.5, 0.4, 0.6, 100)] * 12) for _ in range(40)))
+    """A study's page with two figures of one title, a wide table and a wider one, and a long name."""
+    tables = []
+    for count in (12, 30):
+        row = "/home/somebody/scenes/" * 5, "too_few_markers 1", *[Estimate(-0.512, -0.423, 0.61, 100)] * count
+        head = ("object", "said", *(f"recognized {i}" for i in range(count)))
+        tables.append(Table(f"cells{count}", "Every cell", head, (row,) * 3))
     figures = [Drawing(name, "Rates", lambda figure: figure.subplots().plot([1, 2])) for name in "ab"]
-    write_results(folder, Results("study", "toy", "Toys.", "40 cells", {}, [table], figures, {}, {}))
+    write_results(folder, Results("study", "toy", "Toys.", "40 cells", {"key": "a" * 900}, tables, figures, {}, {}))
     return folder / "toy.html"
 
 
 def test_every_picture_has_words_of_its_own(tmp_path):
     kinds = pictures()["p0.jpg"]
     save_pictures(tmp_path / "pictures", "p1.jpg", kinds)
-    for page, count in ((written(tmp_path), 10), (results_page(tmp_path), 2)):
+    for page, count in ((written(tmp_path), 11), (results_page(tmp_path), 2)):
         tags = Alternatives()
         tags.feed(page.read_text())
         assert len(tags.texts) == len(set(tags.texts)) == count and all(tags.texts)
@@ -286,27 +270,24 @@ def test_every_picture_has_words_of_its_own(tmp_path):
     assert len(named) == len(set(named)) == text.count("<svg") == 4
 
 
-def test_a_studys_page_begins_with_its_figure_and_its_wide_table_scrolls_on_a_phone(tmp_path):
-    page = results_page(tmp_path)
-    text = page.read_text()
+def test_a_studys_page_begins_with_its_figure(tmp_path):
+    text = results_page(tmp_path).read_text()
     assert text.index("<img") < text.index("<table")
-    seen = seen_in_browser(page, 390, tmp_path)
-    assert seen["inner"] == 390 and seen["width"] <= 390 and seen["wide"] == [] and seen["broken"] == 0
 
 
-def test_a_report_of_fifty_photographs_prints_on_a_few_pages(tmp_path):
-    browser = shutil.which("chromium") or shutil.which("google-chrome")
-    if browser is None:
-        pytest.skip("no Chromium here to print the page")
+def test_a_report_of_fifty_photographs_prints_on_a_few_pages_and_says_a_remark_once(browser, tmp_path):
     report = some_report()
-    photos = [report.photos[0].changed(file=f"{i}.jpg", sha256=f"{i:064x}") for i in range(50)]
+    remark = Remark(code="cropped", advice="use the file of the camera")
+    one = report.photos[0].changed(remark=remark, said=["a second page"])
+    photos = [one.changed(file=f"{i}.jpg", sha256=f"{i:064x}") for i in range(50)]
     manifest = make_manifest(promise()).model_dump(mode="json")
     page = write_report(report.changed(photos=tuple(photos)).model_dump(mode="json"), manifest, tmp_path)
-    flags = f"--headless --no-sandbox --disable-gpu --no-first-run --user-data-dir={tmp_path / 'user'}"
-    out = tmp_path / "printed.pdf"
-    subprocess.run([browser, *flags.split(), f"--print-to-pdf={out}", page.as_uri()], capture_output=True, timeout=60)
-    pages = len(re.findall(rb"/Type\s*/Page\b", out.read_bytes()))
-    assert 2 <= pages <= 6
+    text = page.read_text(encoding="utf-8")
+    assert text.count("use the file of the camera") == text.count("a second page") == 1
+    assert text.count("<code>cropped</code>") == 50
+    browser.look_at(page, 1280)
+    printed = base64.b64decode(browser.call("Page.printToPDF")["data"])
+    assert 2 <= len(re.findall(rb"/Type\s*/Page\b", printed)) <= 6
 
 
 def test_what_was_not_measured_how_often_was_looked_and_which_folders_are_one_is_said():

@@ -188,7 +188,7 @@ def _drawing(runs: Mapping[str, Run], answers: Mapping[str, AnswersByKind]) -> D
     """Draw each design's picture beside its rate and its controls' rates."""
 
     def draw(figure: "Figure") -> None:
-        grid = figure.subplots(len(runs), 2, squeeze=False, width_ratios=(1, 5), sharex="col")
+        grid = figure.subplots(len(runs), 2, squeeze=False, width_ratios=(1, 3), sharex="col")
         for (picture, axes), (name, run) in zip(grid, runs.items(), strict=True):
             picture.imshow(run.design, interpolation="nearest")
             picture.set_axis_off()
@@ -199,10 +199,10 @@ def _drawing(runs: Mapping[str, Run], answers: Mapping[str, AnswersByKind]) -> D
                 if estimate is not None:
                     axes.hlines(height, estimate.low, estimate.high, colors=color, linewidth=3, alpha=0.4)
                     axes.plot(estimate.value, height, "o", color=color, markersize=4)
-            axes.set_yticks(range(len(kinds)), kinds, fontsize=6)
+            axes.set_yticks(range(len(kinds)), kinds, fontsize=7)
             axes.set(xlim=(-0.01, 1.01), ylim=(-0.7, len(kinds) - 0.3))
             axes.set_title(name, fontsize=9, loc="left")
         grid[-1][1].set_xlabel("recognized by the first network")
 
     about = "Bars are 95 % intervals of the rate under the conditions that all designs share."
-    return Drawing("designs", "The designs, best first", draw, (7.0, 1.3 * len(runs) + 0.4), about)
+    return Drawing("designs", "The designs, best first", draw, (4.8, 1.3 * len(runs) + 0.4), about)

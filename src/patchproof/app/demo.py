@@ -83,7 +83,8 @@ def run_demo(
         "Hard conditions on purpose (far, dim, oblique, cluttered): bare object and controls are often misread.",
         *promise_lines(run.promise, run.scene.settings.model_dump(), str(run.folder)),
         *verdict_lines(judgment),
-        *(f"{out}/{name}" for name in ("run/design.png", "sheet.pdf", "sheet.json", "photos/", "report/report.html")),
+        *(f"{out}/{name}" for name in ("run/design.png", "sheet.pdf", "sheet.json", "photos/")),
+        f"open this in a browser: {out}/report/report.html",
     ]
 
 

@@ -51,12 +51,21 @@ class Detector(Classifier):
 
     def square_logits(self, squares: Tensor, boxes: np.ndarray | None = None, windows: Windows | None = None) -> Tensor:
         """N×K logits of the best candidates on the object; `boxes` N×4 are shares of the square."""
-        candidates = self._call_network(squares, windows)
+        return self._on_object(self._call_network(squares, windows), boxes).amax(1)
+
+    def target_box(self, square: Tensor, indices: Sequence[int], boxes: np.ndarray | None) -> tuple[float, ...] | None:
+        """The surest box of the labels in `indices` on the object, in shares of the square; None if there is none."""
+        candidates = self._call_network(square, None)
+        score, best = self._on_object(candidates, boxes)[0, :, list(indices)].amax(1).max(0)
+        return tuple((candidates[0, best, :4] / self.input_px).tolist()) if float(score) > NO_BOX_LOGIT else None
+
+    def _on_object(self, candidates: Tensor, boxes: np.ndarray | None) -> Tensor:
+        """N×A×K logits of the candidates, those that do not lie on the object masked."""
         logits = candidates[..., 4:]
         if boxes is not None:
-            overlap = iou(candidates[..., :4].detach(), torch.as_tensor(boxes).to(squares) * self.input_px)
+            overlap = iou(candidates[..., :4].detach(), torch.as_tensor(boxes).to(candidates) * self.input_px)
             logits = logits.masked_fill((overlap < MIN_IOU)[..., None], NO_BOX_LOGIT)
-        return logits.amax(1)
+        return logits
 
 
 def iou(boxes: Tensor, truth: Tensor) -> Tensor:

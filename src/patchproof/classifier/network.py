@@ -96,6 +96,9 @@ class Classifier:
         """N bool: the largest logit is one of `indices`."""
         return torch.isin(logits.argmax(1), torch.tensor(list(indices), device=logits.device))
 
+    def target_box(self, square: Tensor, indices: Sequence[int], boxes: np.ndarray | None) -> tuple[float, ...] | None:
+        """The surest box of the labels in `indices` in one square, in shares of its side; None without boxes."""
+
     def square_logits(self, squares: Tensor, boxes: np.ndarray | None = None, windows: Windows | None = None) -> Tensor:
         """N×K logits of squares of the network's input size, not checked for NaN."""
         return self._call_network(squares, windows)

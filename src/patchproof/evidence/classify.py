@@ -145,8 +145,11 @@ def predict(model: "Classifier", indices: tuple[int, ...], square: np.ndarray, b
     import torch
 
     with torch.inference_mode():
-        logits = model.logits(torch.from_numpy(square)[None], boxes_of(box)).cpu()
+        squares = torch.from_numpy(square)[None]
+        logits = model.logits(squares, boxes_of(box)).cpu()
+        target_box = model.target_box(squares, indices, boxes_of(box))
     likely = model.probabilities(logits)[0]
     best, target_confidence = int(likely.argmax()), float(model.confidence(logits, indices)[0])
-    figures = {"confidence": float(likely[best]), "target_confidence": target_confidence}
-    return Prediction(label=model.labels[best], recognized=bool(model.recognized(logits, indices)[0]), **figures)
+    figures = {"confidence": float(likely[best]), "target_confidence": target_confidence, "target_box": target_box}
+    is_target = bool(model.recognized(logits, indices)[0])
+    return Prediction(label=model.labels[best], recognized=is_target, least_score=model.least_score, **figures)

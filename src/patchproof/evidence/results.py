@@ -29,12 +29,16 @@ Located = Literal["markers", "corners", "found"]  # by the print's markers, by n
 
 
 class Prediction(StrictModel):
-    """One network's answer to one photograph; `target_confidence` sums over the accepted labels."""
+    """One network's answer to one photograph; `target_confidence` sums over the accepted labels. A detector's has the
+    score from which its boxes count, and the surest box of the target.
+    """
 
     label: str
     confidence: Finite
     target_confidence: Finite
     recognized: bool
+    least_score: Finite | None = None
+    target_box: tuple[Finite, Finite, Finite, Finite] | None = None  # in shares of the photograph's centered square
 
 
 class Geometry(StrictModel):

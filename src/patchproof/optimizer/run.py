@@ -265,13 +265,22 @@ def _run_steps(problem: Problem, state: State, out: Path, advance: Advance) -> n
             log.write(json.dumps(line) + "\n")
             log.flush()
             if state.number == settings.steps and step.pictures is not None:
-                write_png(out / _VIEWS_FILE, side_by_side(step.pictures))
+                write_png(out / _VIEWS_FILE, side_by_side(step.pictures, _answers(problem, step.pictures)))
             if is_save_step(settings, state.number):  # after the views, which a resumed last step would not write
                 save_checkpoint(state, problem, out)
             largest_gradient = max(step.gradient, largest_gradient or 0.0)
             advance(state.number, settings.steps)
     _warn_if_unchanged(float((state.best - start(problem).design).abs().max()), largest_gradient)
     return problem.subject.pixels(state.best)
+
+
+def _answers(problem: Problem, pictures: torch.Tensor) -> list[str]:
+    """What the first network calls each picture N×3×h×w, as "label 92 %"."""
+    network = problem.classifiers[0]
+    with torch.inference_mode():
+        logits = map(network.logits, pictures.to(problem.stage.device).split(1))
+        answers = [network.probabilities(each)[0].max(0) for each in logits]
+    return [f"{network.labels[int(best)]} {100 * float(share):.0f} %" for share, best in answers]
 
 
 def _warn_if_unchanged(change: float, gradient: float | None) -> None:

@@ -5,7 +5,7 @@ the line is a running share over neighboring photographs, drawn from 24 photogra
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -13,7 +13,6 @@ from patchproof.report.images import draw_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 _INK = "#010203"  # stands for the page's own text color and is replaced in the SVG
 _YES, _NO = "#2a9d6f", "#d1495b"
@@ -53,8 +52,7 @@ def _draw_scales(axes, scales: np.ndarray) -> None:
     reach = max(0.02, 1.2 * float(np.abs(scales - 1).max()))
     axes.set(ylim=(1 - reach, 1 + reach), xlim=(0.5, len(scales) + 0.5), xticks=[])
     axes.set(xlabel="photographs that show the print's size", ylabel="print scale")
-    axes.yaxis.label.set_color(_INK)
-    axes.legend(frameon=False, labelcolor=_INK)
+    axes.legend(frameon=False)
 
 
 def _draw_ledger(axes, ledger: Mapping) -> None:
@@ -76,7 +74,7 @@ def _draw_ledger(axes, ledger: Mapping) -> None:
         f"{100 * levels_after[-1]:.0f} %",
     ]
     for row, level in enumerate(levels):
-        axes.text(1.02, row, level, color=_INK, va="center", transform=axes.get_yaxis_transform())
+        axes.text(1.02, row, level, va="center", transform=axes.get_yaxis_transform())
     axes.set_yticks([0, *rows, len(costs) + 1], ["ideal", *(_STEPS.get(s, s) for s in shares), "photographs"])
     axes.invert_yaxis()
     axes.set_xlabel("confidence in the target")
@@ -111,15 +109,13 @@ def _draw(axes, x, y, promised_x, promised_y, label) -> None:
 
 
 def _svg(draw: "Callable[[Axes], None]") -> str:
-    def fill(figure: "Figure") -> None:
-        axes = figure.add_subplot()
-        draw(axes)
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.spines[:].set_color(_INK)
-        axes.tick_params(colors=_INK)
-        axes.xaxis.label.set_color(_INK)
+    import matplotlib
 
-    metadata = {"Date": None, "Creator": None}
-    text = draw_figure(fill, (4.2, 2.3), "svg", transparent=True, metadata=metadata).decode()
+    settings: Any = dict.fromkeys(
+        ("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color"), _INK
+    )
+    with matplotlib.rc_context(settings | {"axes.spines.top": False, "axes.spines.right": False}):
+        options = {"transparent": True, "metadata": {"Date": None, "Creator": None}}
+        text = draw_figure(lambda figure: draw(figure.add_subplot()), (4.2, 2.3), "svg", **options).decode()
     text = text[text.index("<svg") :]
     return text.replace(_INK, "currentColor").replace("font-family: 'DejaVu Sans', sans-serif", "font-family: inherit")

@@ -7,6 +7,7 @@ empty cell. The same input gives the same bytes.
 """
 
 import json
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -50,6 +51,7 @@ def report_html(report: Mapping, manifest: Mapping, encoded: Mapping[str, Mappin
             for name, label in _PLOTS
         ]
     pictures = {file: {kind: data_uri(data) for kind, data in kinds.items()} for file, kinds in encoded.items()}
+    cards = [{"photo": photo, "pictures": pictures.get(photo["file"], {})} for photo in photos]
     return render_page(
         "page.html.j2",
         report=report,
@@ -59,20 +61,17 @@ def report_html(report: Mapping, manifest: Mapping, encoded: Mapping[str, Mappin
         primary=primary,
         headline=words.headline_of(summary),
         worth=words.benefit_sentence(summary),
+        example=_median_card([card for card in cards if card["photo"] in judged], primary),
         looks=words.looks_sentence(summary),
         meaning=words.recognition_meaning(promise["models"][0], promise["target"]["label"]) if promise else "",
-        rules={model["name"]: model["least_score"] for model in (promise["models"] if promise else ())},
-        word=(summary["worth"] or {}).get("word", "cannot_tell"),
         verdict=words.VERDICTS[summary["verdict"]],
-        effect="" if report["controls"] else "There were no control photographs.",
-        bars=_bars(summary, promise, report["controls"]),
-        controls=report["controls"],
         ledger=ledger,
         waterfall=ledger_plot(ledger) if ledger else "",
         plots=[(svg, about) for svg, about in plots if svg],
         sized=any(photo["scale_x"] is not None for photo in photos),
-        cards=[{"photo": photo, "pictures": pictures.get(photo["file"], {})} for photo in photos],
+        cards=cards,
         remarks=words.remarks(photos),
+        times=Counter(text for photo in photos for text in (photo["advice"], *photo.get("said", ()))),
         points=points_text,
         delta_top=DELTA_TOP,
         settings=json.dumps(manifest["settings"], indent=1, ensure_ascii=False),
@@ -80,25 +79,11 @@ def report_html(report: Mapping, manifest: Mapping, encoded: Mapping[str, Mappin
     )
 
 
-def _bars(summary: Mapping, promise: Mapping | None, controls: Sequence[Mapping]) -> list[dict]:
-    """Rows of the chart of rates: name, rate, interval, and the kind of bar."""
-    rows, judged = [], summary["judged"]
-    if summary["rate"] is not None:
-        rows.append(("These photographs", summary["rate"], summary["interval"], "seen"))
-    if promise:
-        rows.append(("Promised", promise["rate"], promise["interval"], "promised"))
-    if summary["prediction_interval"] and judged:
-        allowed = [count / judged for count in summary["prediction_interval"]]
-        rows.append((f"Allowed for {judged} photographs", None, allowed, "allowed"))
-    if forecast := summary["forecast"]:
-        n, allowed = forecast["photos"], [count / forecast["photos"] for count in forecast["interval"]]
-        rows.append((f"Expected of {n} at their own views", forecast["expected"] / n, allowed, "promised"))
-    for c in controls:
-        if c["n"]:
-            rows.append((f"Control: {c['name']}", c["recognized"] / c["n"], c["interval"], "control"))
-    for name, claim in (promise["controls"] if promise else {}).items():
-        rows.append((f"Simulated control: {name}", claim["rate"], claim["interval"], "control"))
-    return [dict(zip(("name", "rate", "interval", "kind"), row, strict=True)) for row in rows]
+def _median_card(cards: Sequence[Mapping], model: str | None) -> Mapping | None:
+    """The counted photograph of median confidence in the target, of those with a picture; None without any."""
+    seen = [c for c in cards if "photo" in c["pictures"] and model in c["photo"]["predictions"]]
+    seen.sort(key=lambda card: card["photo"]["predictions"][model]["target_confidence"])
+    return seen[len(seen) // 2] if seen else None
 
 
 def photos_csv(photos: Sequence[Mapping[str, Any]]) -> str:
@@ -115,7 +100,8 @@ def _csv_row(photo: Mapping[str, Any]) -> dict[str, Any]:
             numbers = [None] * 9 if value is None else [number for line in value for number in line]
             row |= {f"{name}_{i // 3}{i % 3}": number for i, number in enumerate(numbers)}
         elif name == "predictions":
-            row |= {f"{model} {key}": figure for model, answer in value.items() for key, figure in answer.items()}
+            keys = ("label", "confidence", "target_confidence", "recognized")
+            row |= {f"{model} {key}": answer[key] for model, answer in value.items() for key in keys}
         else:
             row[name] = value
     return row

@@ -37,7 +37,7 @@ _COLORS = {"gains": "#2a6f97", "found": "#e09f3e", "measured": "#2a9d6f"}
 _RATE_HEADINGS = ("recognized", *CONTROLS, "gain", "effect", "sheet found", "measured")
 EndValues = Mapping[str, Any]  # a cell's axis with both ends
 BreakValues = Mapping[str, Any]  # a stage's `Break` in its answers
-HOLDS, NEVER, EFFECT, NO_EFFECT = "holds", "never worked", "gains", "no effect"
+HOLDS, NEVER, EFFECT, NO_EFFECT = "holds", "never worked", "gains", "no gain shown"
 _CONTROL = "the better of the bare object and a gray piece in the same markers, on the same conditions"
 _PAGE_IN = (11.69, 8.27)  # A4, landscape
 
@@ -70,7 +70,8 @@ def tables(settings: Any, results: "Sequence[Result]") -> Sequence[Table]:
             "All points",
             ("axis", "value", *_RATE_HEADINGS, "median error mm", "largest error mm", "said"),
             tuple(row for result in sweeps for row in _point_rows(result)),
-            f"Gain: over {_CONTROL} (Newcombe). “{NO_EFFECT}”: none is shown. Errors are the largest of the design's "
+            f"Gain: over {_CONTROL} (Newcombe). “{NO_EFFECT}”: its interval holds 0. "
+            "Errors are the largest of the design's "
             "four corners, against the simulation's truth, where a flat sheet was measured. Intervals: Wilson.",
         ),
         Table(
@@ -92,7 +93,7 @@ def figures(settings: Any, results: "Sequence[Result]") -> Sequence[Drawing]:
         "Operating envelope",
         lambda figure: _draw_page(figure, sweeps, maps),
         _PAGE_IN,
-        f"The design gains where it does better than {_CONTROL} (95 %); beyond, it has no effect, whatever the "
+        f"The design gains where it does better than {_CONTROL} (95 %); beyond, no gain is shown, whatever the "
         "network answers. Beside its bar: the last point with a gain and the first without, in brackets the gains "
         "at both ends. Bars of the sheet run to where half of what the sweep takes is lost; whiskers: 95 % intervals; "
         "→: it holds; !: not monotone; in brackets the fitted rates at both ends.",
@@ -134,7 +135,7 @@ def _is_not_monotone(break_: BreakValues) -> bool:
 
 def _break_value(x: EndValues, break_: BreakValues, n: int) -> Value:
     if break_["value"] is None:
-        return NEVER
+        return NO_EFFECT if break_["monotone_p"] is None else NEVER
     if break_["value"] >= BEYOND_SWEEP:
         return HOLDS
     ends = [_axis_value(x, break_[name]) for name in ("low", "high")]
@@ -205,7 +206,7 @@ def _draw_page(figure: "Figure", sweeps: "Sequence[Result]", maps: "Sequence[Res
         for axes in right.axes[len(maps) :]:
             axes.set_axis_off()
         right.supxlabel(
-            f"above: share recognized, %; below: gain over the better control; gray: {NO_EFFECT} shown\n"
+            f"above: share recognized, %; below: gain over the better control; gray: {NO_EFFECT}\n"
             "×: fewer than half of the photographs can be measured",
             fontsize=7,
         )

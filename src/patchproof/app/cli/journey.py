@@ -1,6 +1,7 @@
 """The verbs from a scene to a verdict: demo, optimize, promise, sheet, reprint, verify."""
 
 import sys
+import webbrowser
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -35,6 +36,7 @@ def demo(
     imagenet: Annotated[
         bool, Option("--imagenet", help='Before a network of photographs: pip install "patchproof[imagenet]".')
     ] = False,
+    open_report: Annotated[bool, Option("--open", help="Open the report in the browser at the end.")] = False,
     jobs: Jobs = None,
     overwrite: Overwrite = False,
 ) -> None:
@@ -47,6 +49,8 @@ def demo(
     with progress() as bar:
         summary = run_demo(out, network, jobs=jobs or 1, overwrite=overwrite, progress=bar)
     say(*summary)
+    if open_report:
+        webbrowser.open((out / "report" / "report.html").resolve().as_uri())
 
 
 def optimize(
