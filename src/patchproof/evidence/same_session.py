@@ -34,34 +34,34 @@ def merge_folders(grouping: Grouping, photos: Sequence[MeasuredPhoto]) -> Groupi
     """Merge the folders that look like one session; `photos` are those of the grouping's paths."""
     if grouping.known_from != BY_FOLDERS or len(grouping.names) < 2:
         return grouping
-    folders: list[list[MeasuredPhoto]] = [[] for _ in grouping.names]
+    looks: list[list[np.ndarray]] = [[] for _ in grouping.names]
+    timed: list[tuple[str, float, int]] = []
     for photo, number in zip(photos, grouping.session, strict=True):
-        folders[number].append(photo)
-    looks = [np.array([look for photo in folder if (look := _look(photo)) is not None]) for folder in folders]
-    several = [each for each in looks if len(each) > 1]
+        looks[number] += [look] if (look := _look(photo)) is not None else []
+        if photo.trace is not None and photo.trace.minute is not None:
+            timed.append((photo.trace.camera, photo.trace.minute, number))
+    several = [np.array(each) for each in looks if len(each) > 1]
     freedom = USUAL_WEIGHT + sum(len(each) - 1 for each in several)
     variance = (USUAL_WEIGHT * USUAL_SPREAD**2 + sum(len(each) * each.var(0) for each in several)) / freedom
-    looked = np.array([look.mean(0) if len(look) else np.full(len(variance), np.nan) for look in looks])
-    shares = partial(_distance_shares, looked, np.array([len(look) for look in looks]), variance, freedom)
-    traces = [(photo.trace, number) for photo, number in zip(photos, grouping.session, strict=True)]
-    timed = sorted((t.camera, t.minute, number) for t, number in traces if t is not None and t.minute is not None)
-    same_as, unknown, gaps = np.arange(len(folders)), set(), _minutes_apart(timed)
+    means = np.array([np.mean(look, 0) if look else np.full(len(variance), np.nan) for look in looks])
+    shares = partial(_distance_shares, means, np.array([len(look) for look in looks]), variance, freedom)
+    same_as, unknown, gaps = np.arange(len(looks)), set(), _minutes_apart(sorted(timed))
     if gaps:
         for (i, j), gap, share in zip(gaps, gaps.values(), shares(*np.transpose(list(gaps))), strict=True):
             apart = share > APART and min(len(looks[i]), len(looks[j])) > 1
             if (gap <= MOVE_MINUTES and not apart) or share <= ALIKE:
                 _join(same_as, [i, j])
-    for i in sorted(set(range(len(folders))) - {number for *_, number in timed}):
-        share = shares(i, np.arange(len(folders)))
+    for i in sorted(set(range(len(looks))) - {number for *_, number in timed}):
+        share = shares(i, np.arange(len(looks)))
         share[i] = 0
         unknown |= {i, *np.flatnonzero(np.isnan(share)).tolist()} if np.isnan(share).any() else set()
         _join(same_as, share <= ALIKE)
     same_as = same_as.tolist()
-    count, names = len(set(same_as)), [name or "(no folder)" for name in grouping.names]
-    notes = []
-    if count < len(names):
-        groups = ([name for name, number in zip(names, same_as, strict=True) if number == i] for i in set(same_as))
-        text = "; ".join(sorted(summarize_names(group) for group in groups if len(group) > 1))
+    names, groups, notes = [name or "(no folder)" for name in grouping.names], dict[int, list[str]](), []
+    for name, number in zip(names, same_as, strict=True):
+        groups.setdefault(number, []).append(name)
+    if (count := len(groups)) < len(names):
+        text = "; ".join(sorted(summarize_names(group) for group in groups.values() if len(group) > 1))
         notes.append(f"{len(names)} folders look like {count} sessions, by times, light and background: {text}")
     if unknown:
         text = summarize_names([names[i] for i in sorted(unknown)])

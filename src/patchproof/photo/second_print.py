@@ -66,7 +66,8 @@ def _read(light: np.ndarray, quads: list[np.ndarray], dictionary: str) -> set[in
         to_cells = cv2.getPerspectiveTransform(quad.astype(np.float32) - 0.5, square)
         cells = cv2.resize(cv2.warpPerspective(light, to_cells, (4 * n, 4 * n)), (n, n), interpolation=cv2.INTER_AREA)
         low, high = int(cells.min()), int(cells.max())
-        marker_id = known.get(_code_of((cells > (low + high) / 2).astype(np.uint8)))
+        code = cv2.aruco.Dictionary.getByteListFromBits((cells > (low + high) / 2).astype(np.uint8))
+        marker_id = known.get(code.reshape(4, -1)[0].tobytes())
         found |= {marker_id} if marker_id is not None and high > 1.5 * low else set()
     return found
 
@@ -77,10 +78,6 @@ def _ids_by_code(dictionary: str) -> dict[bytes, int]:
     codes = aruco_dictionary(dictionary).bytesList  # ids × bytes of a code × rotations, which lie one after another
     ids = reversed(range(len(codes)))  # as there, the lowest id of equal codes
     return {code.tobytes(): marker_id for marker_id in ids for code in codes[marker_id].reshape(4, -1)}
-
-
-def _code_of(cells: np.ndarray) -> bytes:
-    return cv2.aruco.Dictionary.getByteListFromBits(cells).reshape(4, -1)[0].tobytes()
 
 
 def find_small_markers(srgb: np.ndarray, read: Quads, corners_mm: Quads, dictionary: str) -> dict[int, np.ndarray]:
