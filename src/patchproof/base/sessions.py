@@ -103,7 +103,8 @@ def _rate_posterior(recognized: tuple[int, ...], photos: tuple[int, ...]) -> Rat
 def _chances_of(posterior: RatePosterior, photos: tuple[int, ...]) -> np.ndarray:
     """`RatePosterior.chances`, cached because many counts are judged by the same chances."""
     parts = _blocks(len(posterior.rates), sum(photos))
-    chances = sum(posterior.weights[p] @ _chances(posterior.rates[p], posterior.correlations[p], photos) for p in parts)
+    rows = (posterior.weights[p] @ _chances(posterior.rates[p], posterior.correlations[p], photos) for p in parts)
+    chances = np.sum(list(rows), axis=0)
     chances.flags.writeable = False
     return chances
 

@@ -11,9 +11,9 @@ from bisect import bisect, insort
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from patchproof.base.validation import summarize_names
 from patchproof.evidence.grouping import BY_FOLDERS, PAUSE_MINUTES, Grouping
@@ -110,8 +110,9 @@ def control_keys(
 
 def _times_of(trace: Trace | None, taken: dict[str, list]) -> tuple[float, list]:
     """A photograph's minute, and the list of its camera in `taken`; a new list if its time is unknown."""
-    known = trace is not None and trace.minute is not None
-    return (trace.minute, taken.setdefault(trace.camera, [])) if known else (0.0, [])
+    if trace is None or trace.minute is None:
+        return 0.0, []
+    return trace.minute, taken.setdefault(trace.camera, [])
 
 
 def _minutes_apart(timed: Sequence[tuple[str, float, int]]) -> dict[tuple[int, int], float]:
@@ -145,7 +146,7 @@ def _look(photo: MeasuredPhoto) -> np.ndarray | None:
 
 
 def _distance_shares(
-    looks: np.ndarray, photos: np.ndarray, variance: np.ndarray, freedom: int, i: ArrayLike, j: ArrayLike
+    looks: np.ndarray, photos: np.ndarray, variance: np.ndarray, freedom: int, i: Any, j: Any
 ) -> np.ndarray:
     """The shares of pairs of parts of one session that are more alike than folders `i` and `j`; NaN if unknown.
     `looks` are the folders' means, of so many `photos`.

@@ -148,13 +148,14 @@ def measured_plan(
     problem: Problem,
     *,
     timing: bool = True,
+    views: int = TERM_VIEWS,
     progress: Progress = no_progress,
 ) -> Plan:
     """Measure the rest of a plan: a draft of the design, the terms and, with `timing`, the cost of a step."""
     scene = problem.scene
     other, _ = placement_with_other_bend(scene)
     design, draft = _draft(problem, progress)
-    conditions = scene.draw("select", TERM_VIEWS)
+    conditions = scene.draw("select", views)
     terms = measure_terms(problem, design, conditions, SELECT_VIEWS, other, partial(progress, "terms"))
     reasons = {
         "terms that can go": terms.unknown,
