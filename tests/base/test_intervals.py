@@ -1,12 +1,15 @@
 """Claims: published figures, and intervals that cover as often as they say."""
 
+import sys
+
 import numpy as np
 import pytest
-from scipy.stats import binom, multinomial
+from scipy.stats import binom, multinomial, t
 
 from patchproof.base.intervals import (
     independent_difference,
     paired_difference,
+    student_mean,
     wilson,
 )
 
@@ -15,6 +18,12 @@ def pairs(both: int, only_a: int, only_b: int, neither: int) -> tuple[list[bool]
     a = [True] * (both + only_a) + [False] * (only_b + neither)
     b = [True] * both + [False] * only_a + [True] * only_b + [False] * neither
     return a, b
+
+
+def test_student_s_interval_is_scipy_s_without_importing_its_distributions(monkeypatch):
+    half = t.ppf(0.975, 3) * np.std([1, 2, 4, 9], ddof=1) / 2
+    monkeypatch.setitem(sys.modules, "scipy.stats", None)
+    assert student_mean([1, 2, 4, 9]).low == pytest.approx(4 - half, rel=1e-12)
 
 
 def test_wilson_by_hand():

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import betabinom
 
+from patchproof.base import sessions
 from patchproof.base.intervals import wilson
 from patchproof.base.sessions import (
     TAIL,
@@ -96,3 +97,16 @@ def test_differences_are_wider_where_sessions_differ():
 def test_sessions_are_cut_in_order_and_dealt_evenly():
     assert count_by_session([True, True, False, True, False], 2) == ([2, 1, 0], [2, 2, 1])
     assert split_evenly(11, 4) == (3, 3, 3, 2) and split_evenly(3, 4) == (1, 1, 1, 0)
+
+
+def test_chances_of_many_photographs_are_computed_in_blocks_that_do_not_grow(monkeypatch):
+    few, sizes, chances = alone(7, 9), [], sessions._chances
+    whole = few.chances((4,) * 30), few.least_rate(70, (4,) * 30, TAIL)
+    monkeypatch.setattr(sessions, "_BLOCK_NUMBERS", 1 << 13)
+    monkeypatch.setattr(sessions, "_chances", lambda *given: (sizes.append((c := chances(*given)).size), c)[1])
+    sessions._chances_of.cache_clear()
+    sessions._least_rates.cache_clear()
+    assert few.chances((4,) * 30) == pytest.approx(whole[0], abs=1e-15)
+    assert few.least_rate(70, (4,) * 30, TAIL) == whole[1]
+    sessions._least_rates((0.1, 0.2), (0.5, 0.5), (5,) * 100, TAIL)
+    assert max(sizes) < 1.1 * (1 << 13)

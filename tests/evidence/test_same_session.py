@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from patchproof.evidence import same_session
 from patchproof.evidence.grouping import BY_FOLDERS, BY_TIMES, Grouping
 from patchproof.evidence.measure import MeasuredPhoto
 from patchproof.evidence.results import PhotoEntry, Trace
@@ -98,3 +101,32 @@ def test_a_control_s_own_sessions_are_told_apart_by_folder_and_time():
     keys = control_keys(grouping, [photo("p", 0)], [photo(*each) for each in files])
     sessions = [keys[file][0] for file, _ in files]
     assert sessions[0] == sessions[1] and sessions[3] == sessions[4] and len(set(sessions)) == 4 and max(sessions) < 0
+
+
+def test_a_folder_whose_first_photograph_has_no_time_has_those_of_the_others():
+    assert merged([(None, None), (0, None)], at(1, 2))[0] == (0, 0)
+    assert merged([(None, None), (0, None)], at(100, 101)) == ((0, 1), "")
+
+
+def calls(count, minutes):
+    """Python's function calls for so many folders of two photographs, so far apart, each with one of a control."""
+    photos, names = [photo(f"f{i // 2}/{i}", i * minutes / 2, 0) for i in range(2 * count)], map(str, range(count))
+    grouping = Grouping((Path(),) * len(photos), tuple(i // 2 for i in range(2 * count)), tuple(names), BY_FOLDERS)
+    controls, number = [photo(f"c{i}", i * minutes) for i in range(count)], itertools.count()
+    sys.setprofile(lambda frame, event, argument: event == "call" and next(number))
+    try:
+        control_keys(merge_folders(grouping, photos), photos, controls)
+    finally:
+        sys.setprofile(None)
+    return next(number)
+
+
+def test_the_work_for_sessions_grows_with_photographs_and_not_with_their_square():
+    assert calls(48, 40.0) < 4.5 * calls(12, 40.0)
+
+
+def test_folders_without_times_are_compared_in_one_step_each(monkeypatch):
+    sizes, shares = [], same_session._distance_shares
+    monkeypatch.setattr(same_session, "_distance_shares", lambda *given: sizes.append(1) or shares(*given))
+    merged(*(at(None, None, place=place % 4) for place in range(12)))
+    assert len(sizes) == 12

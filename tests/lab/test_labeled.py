@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from patchlab.harden import labeled_photos
 from patchlab.harden.labeled_photos import list_labeled_files
 from patchlab.training.labeled import DEFAULT_SEED, render_procedural, render_scenes, write_labeled
 from patchlab.training.pictures import HELD_OUT_SEED
@@ -30,3 +31,20 @@ def test_a_scenes_bare_object_is_seen_in_its_views_with_its_label(scene_file, tm
     assert (tmp_path / "a/labels.csv").read_text().split() == ["file,label", "00000.png,carton", "00001.png,carton"]
     first, second, again = (read_photo(tmp_path / name).srgb for name in ("a/00000.png", "a/00001.png", "b/00000.png"))
     assert first.shape == (48, 48, 3) and (first != second).any() and (first == again).all()
+
+
+def test_lines_of_a_labeled_folder_are_compared_with_few_others(tmp_path, monkeypatch):
+    compared = []
+
+    class Name(str):
+        __hash__ = str.__hash__
+
+        def __eq__(self, other):
+            compared.append(1)
+            return str.__eq__(self, other)
+
+    rows = [(Name(f"{i}.png"), "a") for i in range(60)]
+    monkeypatch.setattr(labeled_photos, "read_labels", lambda table: rows)
+    monkeypatch.setattr(labeled_photos, "is_file", lambda path: True)
+    assert [png for _, png, _ in list_labeled_files(tmp_path, tmp_path / "labels.csv")] == [name for name, _ in rows]
+    assert len(compared) < 5 * len(rows)

@@ -16,7 +16,7 @@ from patchproof.evidence.classify import squares_of
 from patchproof.evidence.measure import identify_sheet, measure
 from patchproof.evidence.ranges import promised_ranges
 from patchproof.evidence.surface import promised_of, surface_of
-from patchproof.photo import colorfit, detect, edges, known_page
+from patchproof.photo import colorfit, detect, edges, known_page, second_print
 from patchproof.photo.detect import LINEAR_FLOAT32_FROM_CODE, find_markers, fit_marker_borders, luminance
 from patchproof.photo.edges import fit_borders
 from patchproof.photo.known_page import find_sheet
@@ -25,7 +25,7 @@ from patchproof.photo.quality import CLIPPED_CODE
 from patchproof.photo.read import Photo
 from patchproof.photo.registration import _shift_per_error
 from patchproof.photo.rejection import PhotoRejected
-from patchproof.sheets.markers import marker_cells
+from patchproof.sheets.markers import aruco_dictionary, marker_cells
 
 IDS = frozenset(PIECE_IDS)
 
@@ -219,3 +219,14 @@ def test_a_second_print_is_seen_whose_markers_are_too_small_to_be_read(piece, su
     assert bool(find_sheet(photo, IDS, surface.corners_mm).doubled) == seen
     monkeypatch.setattr(known_page, "find_second_print", lambda *given: ((), ()))
     assert not find_sheet(photo, IDS, surface.corners_mm).doubled
+
+
+def test_a_code_in_any_turn_has_the_id_that_opencv_finds():
+    rng, dictionary = np.random.default_rng(0), "DICT_4X4_50"
+    known, aruco = second_print._ids_by_code(dictionary), aruco_dictionary(dictionary)
+    codes = [np.rot90(cells, k)[1:-1, 1:-1] for k, cells in enumerate(marker_cells(dictionary, range(0, 50, 7)))]
+    for cells in (np.ascontiguousarray(code, np.uint8) for code in (*codes, *rng.integers(0, 2, (40, 4, 4)))):
+        is_read, marker_id, _ = aruco.identify(cells, 0.0)
+        code = aruco.getByteListFromBits(cells).reshape(4, -1)[0].tobytes()
+        assert known.get(code) == (marker_id if is_read else None)
+    assert len(second_print._ids_by_code("DICT_5X5_1000")) == 4000

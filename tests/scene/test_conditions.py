@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import qmc
 
 from patchproof.base.settings import SceneSettings
 from patchproof.base.validation import validate_model
-from patchproof.scene.conditions import draw, fields_of
+from patchproof.scene.conditions import draw, fields_of, scrambled_sobol
 
 SETTINGS = validate_model(
     SceneSettings,
@@ -120,3 +122,12 @@ def test_poses_are_kept_while_the_rest_is_drawn_anew():
         assert not np.array_equal(values, other[name]), name
     with pytest.raises(ValueError, match=r"\[3, 12\] rows"):
         replace(new, pose=poses[:3].pose)
+
+
+@pytest.mark.parametrize("count", [1, 3, 64])
+def test_sobol_s_points_are_scipy_s_without_its_import(count, monkeypatch):
+    points = scrambled_sobol(count, np.random.default_rng((3, 0)).spawn(1)[0])
+    sampler = qmc.Sobol(points.shape[1], rng=np.random.default_rng((3, 0)))  # which spawns a generator of its own
+    assert np.array_equal(points, sampler.random_base2(6)[:count])
+    monkeypatch.setitem(sys.modules, "scipy.stats", None)
+    draw(SETTINGS, "train", count, 0)

@@ -178,13 +178,15 @@ def _accuracy_rows(
         for side, word in enumerate(("original", "hardened"))
     }
     label = {photo["file"]: photo["label"] for photo in _photos_of(results, variant)}
-    classes = [[i for i, file in enumerate(files) if label[file] == each] for each in dict.fromkeys(label.values())]
+    classes: dict[str, list[int]] = {}
+    for i, file in enumerate(files):
+        classes.setdefault(label[file], []).append(i)
     group, *how = _variant_texts(variant)
     start = (short_name(name), "itself" if variant["models"] == [name] else group, *how)
     return [
         (
             *(*start, words, rate(old), rate(new), estimate_difference(new, old)),
-            cluster_mean([float(np.mean([new[i] - old[i] for i in rows])) for rows in classes if rows]),
+            cluster_mean([float(np.mean([new[i] - old[i] for i in rows])) for rows in classes.values()]),
             ", ".join(word for word, counts in survivors.items() if attack_failed(condition, counts)),
         )
         for (words, condition), (old, new) in zip(conditions.items(), pairs.values(), strict=True)

@@ -4,6 +4,7 @@ In: a folder and a CSV of file names and labels. Out: rows with the name of each
 skipped; missing files and files named twice are refused.
 """
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePath
 
@@ -33,12 +34,13 @@ def list_labeled_files(folder: Path, table: Path) -> list[tuple[str, str, str]]:
     if missing or not rows:
         got = f"{len(missing)} missing ({missing[0]})" if missing else "a table without rows"
         raise Refused(f"the images that {table.name} names in {folder}", got, "copy them there, or mend the table")
-    twice = next((file for file in (f for f, _ in rows) if [f for f, _ in rows].count(file) > 1), None)
+    twice = next((file for file, count in Counter(file for file, _ in rows).items() if count > 1), None)
     if twice:
         raise Refused(f"each file once in {table}", f"{twice} twice", "remove a line")
     stems = [Path(file).with_suffix("").as_posix() for file, _ in rows]
+    counts = Counter(stems)
     return [
-        (file, (stem if stems.count(stem) == 1 else file) + ".png", label)
+        (file, (stem if counts[stem] == 1 else file) + ".png", label)
         for (file, label), stem in zip(rows, stems, strict=True)
     ]
 

@@ -12,6 +12,7 @@ Left out on purpose: cells that depend on one another (one cell trains and tests
 import ast
 import json
 import re
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -205,7 +206,8 @@ def _run_locked(study: Study, settings: StrictModel, base: Path, out: Path, work
 
 def _check_cells(study: Study, cells: Sequence[Cell]) -> None:
     names = [cell.name for cell in cells]
-    bad = [name for name in names if not _CELL_NAME.fullmatch(name) or names.count(name) > 1]
+    counts = Counter(names)
+    bad = [name for name in names if not _CELL_NAME.fullmatch(name) or counts[name] > 1]
     if bad:
         raise ValueError(f"cells of {study.name} need unique names that files can have, got {bad[0]!r}")
     if not cells:

@@ -102,7 +102,8 @@ def list_file(path: Path) -> None:
     """List a file that is about to be written in each locked folder that it lies in."""
     real = path.parent.resolve() / path.name
     for folder, listed in [*_OPEN.items()]:
-        if real.is_relative_to(folder) and (name := real.relative_to(folder).as_posix()) not in {LISTING_FILE, *listed}:
+        name = real.relative_to(folder).as_posix() if real.is_relative_to(folder) else LISTING_FILE
+        if name != LISTING_FILE and name not in listed:
             listed.add(name)
             append_listing(folder, [name])
 

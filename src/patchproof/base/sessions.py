@@ -28,6 +28,7 @@ TAIL = (1 - CONFIDENCE) / 2
 LEAST_SESSIONS = 2  # one session cannot tell what a patch does from what its place does
 _RATES, _CORRELATIONS = 240, 36
 _MAX_CORRELATION = 0.95
+_BLOCK_NUMBERS = 1 << 20  # chances that are computed at a time, in 30 MB
 _NEGLIGIBLE = 1e-6  # weight, as a share of the posterior's heaviest point
 _INDEPENDENT = 1e-7  # the correlation of independent photographs, which must not be 0 exactly
 
@@ -105,7 +106,9 @@ def _rate_posterior(recognized: tuple[int, ...], photos: tuple[int, ...]) -> Rat
 @lru_cache(maxsize=32)
 def _chances_of(posterior: RatePosterior, photos: tuple[int, ...]) -> np.ndarray:
     """`RatePosterior.chances`, cached because many counts are judged by the same chances."""
-    chances = posterior.weights @ _chances(posterior.rates, posterior.correlations, photos)
+    parts = _blocks(len(posterior.rates), sum(photos))
+    rows = (posterior.weights[p] @ _chances(posterior.rates[p], posterior.correlations[p], photos) for p in parts)
+    chances = np.sum(list(rows), axis=0)
     chances.flags.writeable = False
     return chances
 
@@ -215,6 +218,12 @@ def _chances(rates: np.ndarray, correlations: np.ndarray, photos: Sequence[int])
     return np.clip(np.fft.irfft(transform, length)[:, :counts], 0, 1)
 
 
+def _blocks(rows: int, columns: int) -> list[slice]:
+    """Split `rows` so that memory does not grow with the number of photographs; one block up to 120 of them."""
+    size = max(1, _BLOCK_NUMBERS // max(columns, 1))
+    return [slice(first, first + size) for first in range(0, rows, size)]
+
+
 def _beta_binomial(n: int, alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:
     """The chances P×(n + 1) of 0 to n by the ratios of successive ones; SciPy takes 17 times as long at n = 100."""
     k, log = np.arange(n), np.zeros((len(alpha), n + 1))
@@ -229,10 +238,12 @@ def _least_rates(
     correlations: tuple[float, ...], weights: tuple[float, ...], photos: tuple[int, ...], tail: float
 ) -> tuple[float, ...]:
     """`RatePosterior.least_rate` of every count."""
-    rates = _grid()[0]
-    rate, correlation = (part.ravel() for part in np.meshgrid(rates, correlations, indexing="ij"))
-    chances = _chances(rate, correlation, photos).reshape(len(rates), len(correlations), -1)
-    chances = np.einsum("rcn,c->rn", chances, np.array(weights))
+    rates, rows = _grid()[0], []
+    for part in _blocks(len(rates), len(correlations) * sum(photos)):
+        rate, correlation = (each.ravel() for each in np.meshgrid(rates[part], correlations, indexing="ij"))
+        chances = _chances(rate, correlation, photos).reshape(-1, len(correlations), sum(photos) + 1)
+        rows.append(np.einsum("rcn,c->rn", chances, np.array(weights)))
+    chances = np.concatenate(rows)
     at_least = chances[:, ::-1].cumsum(1)[:, ::-1] - chances / 2
     return tuple(float(np.interp(tail, tails, rates, left=0.0, right=1.0)) for tails in at_least.T)
 

@@ -7,8 +7,9 @@ or two, an aim that is off by a hundredth of the picture, exposures that differ 
 Left out on purpose: pictures without a readable sheet that differ in their bytes.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 
@@ -30,18 +31,23 @@ _FIGURES = 16  # of a view: session, scale, tilt, light in three colors, the mid
 def reject_copies(photos: Sequence[MeasuredPhoto], session: Sequence[int], rect_mm: Rect) -> list[MeasuredPhoto]:
     """Reject every photograph that repeats an earlier one; the design lies at `rect_mm` of the page."""
     first_by_sha256: dict[str, PhotoEntry] = {}
-    originals, results = np.full((len(photos), _FIGURES), np.inf), []  # infinite: not an original with a known view
+    rows_by_cell: dict[tuple[float, ...], list[int]] = {}  # so that a view is compared with those near it alone
+    originals, results = np.empty((len(photos), _FIGURES)), []
     for row, (photo, number) in enumerate(zip(photos, session, strict=True)):
         entry, view = photo.entry, _view(photo, number, rect_mm)
         first = None if entry.sha256 is None else first_by_sha256.get(entry.sha256)
         advice = "its bytes are those of {}, which counts once: leave it out"
         if first is None and view is not None:
-            same = _find_same_view(view, originals[:row])
-            first = None if same is None else photos[same].entry
+            own_cell, *cells = _cells_near(view)
+            rows = sorted(row for cell in (own_cell, *cells) for row in rows_by_cell.get(cell, ()))
+            same = _find_same_view(view, originals[rows])
+            first = None if same is None else photos[rows[same]].entry
             advice = "it shows what {} shows, from there and in its light, and counts once: take another view"
+            if first is None:
+                originals[row] = view
+                rows_by_cell.setdefault(own_cell, []).append(row)
         if first is None:
             first_by_sha256 |= {} if entry.sha256 is None else {entry.sha256: entry}
-            originals[row] = np.inf if view is None else view
         else:
             remark = Remark(code=COPY_CODE, advice=advice.format(first.file))
             photo = replace(photo, entry=entry.changed(status="rejected", remark=remark), counted=False)
@@ -66,6 +72,12 @@ def _view(photo: MeasuredPhoto, session: int, rect_mm: Rect) -> np.ndarray | Non
     side = geometry.px_per_mm * max(rect_mm[2:]) / max(size_px)
     shape = (corners - middle) / side / SHAPE_TOLERANCE
     return np.array([2 * session, scale, tilt, *light, *(middle / AIM_TOLERANCE), *shape.ravel()])
+
+
+def _cells_near(view: np.ndarray) -> Iterator[tuple[float, ...]]:
+    """The cells of session, scale and the middle's place where views like this one may lie; its own is the first."""
+    own = np.floor(np.nan_to_num(view[[1, 6, 7]]) / 1.01)  # a cell is wider than a tolerance
+    return ((float(view[0]), *(own + offset).tolist()) for offset in product((0, -1, 1), repeat=3))
 
 
 def _find_same_view(view: np.ndarray, others: np.ndarray) -> int | None:

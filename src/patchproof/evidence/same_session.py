@@ -7,9 +7,11 @@ background make one session: folders' means differ by no more than photographs w
 Left out on purpose: dividing folders, which are somebody's word.
 """
 
+from bisect import bisect, insort
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import combinations
+from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -32,31 +34,34 @@ def merge_folders(grouping: Grouping, photos: Sequence[MeasuredPhoto]) -> Groupi
     """Merge the folders that look like one session; `photos` are those of the grouping's paths."""
     if grouping.known_from != BY_FOLDERS or len(grouping.names) < 2:
         return grouping
-    folders: list[list[MeasuredPhoto]] = [[] for _ in grouping.names]
+    looks: list[list[np.ndarray]] = [[] for _ in grouping.names]
+    timed: list[tuple[str, float, int]] = []
     for photo, number in zip(photos, grouping.session, strict=True):
-        folders[number].append(photo)
-    looks = [np.array([look for photo in folder if (look := _look(photo)) is not None]) for folder in folders]
-    several = [each for each in looks if len(each) > 1]
+        looks[number] += [look] if (look := _look(photo)) is not None else []
+        if photo.trace is not None and photo.trace.minute is not None:
+            timed.append((photo.trace.camera, photo.trace.minute, number))
+    several = [np.array(each) for each in looks if len(each) > 1]
     freedom = USUAL_WEIGHT + sum(len(each) - 1 for each in several)
     variance = (USUAL_WEIGHT * USUAL_SPREAD**2 + sum(len(each) * each.var(0) for each in several)) / freedom
-    same_as, unknown = list(range(len(folders))), set()
-    for i, j in combinations(same_as.copy(), 2):
-        share = _distance_share(looks[i], looks[j], variance, freedom)
-        gap = min((_minutes_between(a.trace, b.trace) for a in folders[i] for b in folders[j]), default=np.nan)
-        if np.isnan(gap):
-            one = share is not None and share <= ALIKE
-            unknown |= {i, j} if share is None else set()
-        else:
-            apart = share is not None and share > APART and min(len(looks[i]), len(looks[j])) > 1
-            one = (gap <= MOVE_MINUTES and not apart) or (gap <= PAUSE_MINUTES and share is not None and share <= ALIKE)
-        if one:
-            old, new = max(same_as[i], same_as[j]), min(same_as[i], same_as[j])
-            same_as = [new if number == old else number for number in same_as]
-    count, names = len(set(same_as)), [name or "(no folder)" for name in grouping.names]
-    notes = []
-    if count < len(names):
-        groups = ([name for name, number in zip(names, same_as, strict=True) if number == i] for i in set(same_as))
-        text = "; ".join(sorted(summarize_names(group) for group in groups if len(group) > 1))
+    means = np.array([np.mean(look, 0) if look else np.full(len(variance), np.nan) for look in looks])
+    shares = partial(_distance_shares, means, np.array([len(look) for look in looks]), variance, freedom)
+    same_as, unknown, gaps = np.arange(len(looks)), set(), _minutes_apart(sorted(timed))
+    if gaps:
+        for (i, j), gap, share in zip(gaps, gaps.values(), shares(*np.transpose(list(gaps))), strict=True):
+            apart = share > APART and min(len(looks[i]), len(looks[j])) > 1
+            if (gap <= MOVE_MINUTES and not apart) or share <= ALIKE:
+                _join(same_as, [i, j])
+    for i in sorted(set(range(len(looks))) - {number for *_, number in timed}):
+        share = shares(i, np.arange(len(looks)))
+        share[i] = 0
+        unknown |= {i, *np.flatnonzero(np.isnan(share)).tolist()} if np.isnan(share).any() else set()
+        _join(same_as, share <= ALIKE)
+    same_as = same_as.tolist()
+    names, groups, notes = [name or "(no folder)" for name in grouping.names], dict[int, list[str]](), []
+    for name, number in zip(names, same_as, strict=True):
+        groups.setdefault(number, []).append(name)
+    if (count := len(groups)) < len(names):
+        text = "; ".join(sorted(summarize_names(group) for group in groups.values() if len(group) > 1))
         notes.append(f"{len(names)} folders look like {count} sessions, by times, light and background: {text}")
     if unknown:
         text = summarize_names([names[i] for i in sorted(unknown)])
@@ -71,8 +76,13 @@ def control_keys(
     It belongs to the patch's session whose folder has the name of its folder, which has the only photograph of its
     name, or one of its camera within half an hour; else to one of its own, by folder and time (numbers below 0).
     """
-    pairs = list(zip(photos, grouping.merged, strict=True))
-    numbers, taken = ({photo.entry.file: n for photo, n in pairs}, [(photo.trace, n) for photo, n in pairs])
+    numbers: dict[str, int] = {}
+    taken: dict[str, list[tuple[float, int, int]]] = {}  # by camera: minute, place in the order taken here, session
+    for place, (photo, session) in enumerate(zip(photos, grouping.merged, strict=True)):
+        numbers[photo.entry.file] = session
+        minute, rows = _times_of(photo.trace, taken)
+        insort(rows, (minute, place, session))
+    own: dict[str, int] = {}  # by folder: the control's first session of its own
     by_name: dict[str, list[str]] = {}
     for file in numbers:
         by_name.setdefault(file.rpartition("/")[2], []).append(file)
@@ -81,26 +91,50 @@ def control_keys(
     for photo in sorted(controls, key=lambda photo: photo.trace.minute or 0.0 if photo.trace else 0.0):
         file, folder, name = photo.entry.file, *photo.entry.file.rpartition("/")[::2]
         partners = [file] if folder and file in numbers else [] if folder else by_name.get(name, [])
-        near = [number for other, number in taken if _minutes_between(photo.trace, other) <= PAUSE_MINUTES]
+        minute, rows = _times_of(photo.trace, taken)
+        near = rows[bisect(rows, (minute - PAUSE_MINUTES,)) : bisect(rows, (minute + PAUSE_MINUTES, np.inf))]
         if folder in folders and folder:
             session = folders[folder]
         elif len(partners) == 1:
             session = numbers[partners[0]]
         else:
-            earlier = (key[0] for other, key in keys.items() if key[0] < 0 and other.rpartition("/")[0] == folder)
             lone = folder or photo.trace is None or photo.trace.minute is None
-            new = next(earlier, None) if lone else None
-            session = near[-1] if near else new or -1 - sum(1 for _ in keys)
-        taken.append((photo.trace, session))
+            new = own.get(folder) if lone else None
+            session = max(near, key=lambda row: row[1])[2] if near else new or -1 - len(keys)
+        if session < 0:
+            own.setdefault(folder, session)
+        insort(rows, (minute, len(photos) + len(keys), session))
         keys[file] = session, partners[0] if len(partners) == 1 else f"/{file}"
     return keys
 
 
-def _minutes_between(trace: Trace | None, other: Trace | None) -> float:
-    """Minutes between photographs of one camera: infinity for two cameras, NaN if times are unknown."""
-    if trace is None or other is None or trace.minute is None or other.minute is None:
-        return np.nan
-    return abs(trace.minute - other.minute) if trace.camera == other.camera else np.inf
+def _times_of(trace: Trace | None, taken: dict[str, list]) -> tuple[float, list]:
+    """A photograph's minute, and the list of its camera in `taken`; a new list if its time is unknown."""
+    if trace is None or trace.minute is None:
+        return 0.0, []
+    return trace.minute, taken.setdefault(trace.camera, [])
+
+
+def _minutes_apart(timed: Sequence[tuple[str, float, int]]) -> dict[tuple[int, int], float]:
+    """Minutes between the nearest photographs of one camera in two folders, where they are at most `PAUSE_MINUTES`;
+    `timed` are cameras, minutes and folders in order.
+    """
+    gaps, last, former = {}, {}, None
+    for camera, minute, number in timed:
+        near = last.items() if camera == former else ()
+        last, former = {other: time for other, time in near if minute - time <= PAUSE_MINUTES}, camera
+        for other in last.keys() - {number}:
+            pair = min(number, other), max(number, other)
+            gaps[pair] = min(gaps.get(pair, np.inf), minute - last[other])
+        last[number] = minute
+    return gaps
+
+
+def _join(same_as: np.ndarray, folders: list[int] | np.ndarray) -> None:
+    """Make one session, named by its first folder, of all that these folders are part of."""
+    numbers = same_as[folders]
+    if (numbers != numbers[0]).any():
+        same_as[np.isin(same_as, numbers)] = numbers.min()
 
 
 def _look(photo: MeasuredPhoto) -> np.ndarray | None:
@@ -111,11 +145,14 @@ def _look(photo: MeasuredPhoto) -> np.ndarray | None:
     return np.array([*(paper - paper[1])[::2], *(frame - frame[1])[::2], frame[1] - paper[1]])
 
 
-def _distance_share(a: np.ndarray, b: np.ndarray, variance: np.ndarray, freedom: int) -> float | None:
-    """The share of pairs of parts of one session that are more alike than two folders' looks; None if unknown."""
+def _distance_shares(
+    looks: np.ndarray, photos: np.ndarray, variance: np.ndarray, freedom: int, i: Any, j: Any
+) -> np.ndarray:
+    """The shares of pairs of parts of one session that are more alike than folders `i` and `j`; NaN if unknown.
+    `looks` are the folders' means, of so many `photos`.
+    """
     from scipy.special import fdtr
 
-    if not len(a) or not len(b):
-        return None
-    ratio = float(((a.mean(0) - b.mean(0)) ** 2 / variance).mean()) / (1 / len(a) + 1 / len(b))
-    return float(fdtr(len(variance), freedom, ratio))
+    with np.errstate(divide="ignore"):  # of folders without looks, which are NaN
+        noise = 1 / photos[i] + 1 / photos[j]
+    return fdtr(len(variance), freedom, ((looks[i] - looks[j]) ** 2 / variance).mean(-1) / noise)

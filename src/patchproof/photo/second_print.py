@@ -6,6 +6,7 @@ squares are compared with the known codes, and count where two or three lie as o
 """
 
 from collections.abc import Iterator
+from functools import lru_cache
 from itertools import combinations
 
 import cv2
@@ -59,16 +60,24 @@ def find_second_print(
 
 def _read(light: np.ndarray, quads: list[np.ndarray], dictionary: str) -> set[int]:
     """Ids of the dictionary whose code squares show without an error."""
-    aruco, found = aruco_dictionary(dictionary), set()
-    n = aruco.markerSize
+    known, found, n = _ids_by_code(dictionary), set(), aruco_dictionary(dictionary).markerSize
     square = 4 * np.array([[-1, -1], [n + 1, -1], [n + 1, n + 1], [-1, n + 1]], np.float32) - 0.5
     for quad in quads[:_MOST_SQUARES]:
         to_cells = cv2.getPerspectiveTransform(quad.astype(np.float32) - 0.5, square)
         cells = cv2.resize(cv2.warpPerspective(light, to_cells, (4 * n, 4 * n)), (n, n), interpolation=cv2.INTER_AREA)
         low, high = int(cells.min()), int(cells.max())
-        is_read, marker_id, _ = aruco.identify((cells > (low + high) / 2).astype(np.uint8), 0.0)
-        found |= {marker_id} if is_read and high > 1.5 * low else set()
+        code = cv2.aruco.Dictionary.getByteListFromBits((cells > (low + high) / 2).astype(np.uint8))
+        marker_id = known.get(code.reshape(4, -1)[0].tobytes())
+        found |= {marker_id} if marker_id is not None and high > 1.5 * low else set()
     return found
+
+
+@lru_cache(maxsize=4)
+def _ids_by_code(dictionary: str) -> dict[bytes, int]:
+    """Ids by code, in all four rotations: OpenCV's `identify` compares with every marker, 4 ms for each square."""
+    codes = aruco_dictionary(dictionary).bytesList  # ids × bytes of a code × rotations, which lie one after another
+    ids = reversed(range(len(codes)))  # as there, the lowest id of equal codes
+    return {code.tobytes(): marker_id for marker_id in ids for code in codes[marker_id].reshape(4, -1)}
 
 
 def find_small_markers(srgb: np.ndarray, read: Quads, corners_mm: Quads, dictionary: str) -> dict[int, np.ndarray]:

@@ -61,11 +61,7 @@ def sample_fields(
     number, stop = _STREAMS.index(stream), start + n
     key = (seed, number, zlib.crc32(salt.encode())) if salt else (seed, number)
     if stream in _SOBOL:
-        from scipy.stats import qmc
-
-        # the first points do not depend on the number of points
-        points = qmc.Sobol(_DIMENSIONS, rng=np.random.default_rng(key)).random_base2(max(stop - 1, 1).bit_length())
-        sequence = points[:stop]
+        sequence = scrambled_sobol(stop, np.random.default_rng(key).spawn(1)[0])
     else:
         sequence = np.random.default_rng(key).random((stop, _DIMENSIONS))
     shared_columns = np.concatenate([sequence, np.random.default_rng((*key, 1)).random((stop, _PRINT_DIMENSIONS))], 1)
@@ -83,6 +79,23 @@ def sample_fields(
         shared_by_session = [effect.per_photo != "all" and name not in effect.per_photo for name in effect.columns]
         values |= effect.sample(settings, np.where(shared_by_session, unit[session_start], unit[start:]), noise_seeds)
     return values
+
+
+def scrambled_sobol(count: int, rng: np.random.Generator) -> np.ndarray:
+    """The first `count` points (count×43) of Sobol's sequence, scrambled by random lower triangular matrices and a
+    shift: those of scipy.stats.qmc, whose import takes longer than a preview's pictures.
+    """
+    from torch.quasirandom import SobolEngine
+
+    directions = SobolEngine(_DIMENSIONS).sobolstate.numpy()  # Joe and Kuo's (2008), as in SciPy
+    bits = directions.shape[1]
+    weights = 1 << np.arange(bits)
+    shift = rng.integers(2, size=(_DIMENSIONS, bits), dtype=np.uint32) @ weights
+    lower = np.tril(rng.integers(2, size=(_DIMENSIONS, bits, bits), dtype=np.uint32), -1) + np.eye(bits, dtype=int)
+    columns = directions[..., None] >> np.arange(bits)[::-1] & 1
+    directions = (columns @ lower.swapaxes(1, 2) & 1) @ weights[::-1]
+    lowest_zeros = [(~i & i + 1).bit_length() - 1 for i in range(count - 1)]  # by which successive points differ
+    return np.bitwise_xor.accumulate(np.concatenate([shift[None], directions[:, lowest_zeros].T])) / 2**bits
 
 
 def fields_of(conditions: Conditions) -> dict[str, np.ndarray]:

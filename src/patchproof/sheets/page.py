@@ -61,11 +61,8 @@ def sobol(count: int) -> np.ndarray:
         third.append(third[-1] << 1 ^ third[-2] << 2 ^ third[-2])  # polynomial x² + x + 1
     shifts = np.arange(_BITS - 1, -1, -1)[:, None]
     directions = np.array([first, second, third]).T << shifts
-    points = np.zeros((count, 3), np.int64)
-    for number in range(1, count):
-        lowest_zero = (~(number - 1) & number).bit_length() - 1
-        points[number] = points[number - 1] ^ directions[lowest_zero]
-    return points / 2**_BITS
+    lowest_zeros = [(~number & number + 1).bit_length() - 1 for number in range(count - 1)]
+    return np.bitwise_xor.accumulate(np.concatenate([np.zeros((1, 3), int), directions[lowest_zeros]])) / 2**_BITS
 
 
 def chart_swatches(grid: ChartGrid) -> tuple[SwatchRect, ...]:

@@ -18,10 +18,8 @@ from typing import Annotated, Any
 from typer import BadParameter, Exit, Option, Typer
 
 from patchproof.base.errors import Refused
-from patchproof.base.output import disk_is_full
 from patchproof.base.text import printable
 from patchproof.base.version import __version__
-from patchproof.base.workers import available_cores, can_fork, keep_freed_memory, use_threads
 
 Overwrite = Annotated[bool, Option("--overwrite", help="Replace this command's earlier output.")]
 Device = Annotated[str, Option(help="cpu or cuda.")]
@@ -107,9 +105,12 @@ def as_command(verb: Callable[..., None]) -> Callable[..., None]:
 
 
 def _on_free_cores(arguments: dict[str, Any]) -> AbstractContextManager[None]:
-    """Set `jobs` by default to the free cores, each process with one thread, if processes can be forked; with a GPU, a
-    cluster or processes that would have to import everything, to one with this process's threads.
+    """Keep freed memory, and set `jobs` by default to the free cores, each process with one thread, if processes can be
+    forked; with a GPU, a cluster or processes that would have to import everything, to one with this process's threads.
     """
+    from patchproof.base.workers import available_cores, can_fork, keep_freed_memory, use_threads
+
+    keep_freed_memory()
     if "jobs" not in arguments:
         return nullcontext()
     by_processes = can_fork() and arguments.get("device", "cpu") == "cpu"
@@ -161,11 +162,12 @@ def run_command_line(app: Typer) -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # Windows gives pipes its code page, which has no ε
             stream.reconfigure(encoding="utf-8")
-    keep_freed_memory()
     warnings.formatwarning = lambda message, *where: f"warning: {printable(' '.join(str(message).split()))}\n"
     try:
         app()
     except Exception as error:
+        from patchproof.base.output import disk_is_full
+
         if isinstance(error, Refused):
             sentence = str(error)
         elif disk_is_full(error):
