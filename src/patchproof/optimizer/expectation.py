@@ -122,7 +122,7 @@ class _ViewsAnswer(NamedTuple):
     pictures: np.ndarray | Tensor | None
 
 
-class _ViewsTask(NamedTuple):
+class _Job(NamedTuple):
     """Printed texels, and training views: their first pose, conditions, and whether to send pictures back. Without
     conditions, selection views from number `first` on.
     """
@@ -147,9 +147,7 @@ class Expectation:
 
         def ask(printed: Tensor) -> list[_ViewsAnswer]:
             texels = _to_send(printed)
-            return self._ask(
-                [_ViewsTask(texels, (step * views + row) % self._poses, rows, pictures) for row, rows in tasks]
-            )
+            return self._ask([_Job(texels, (step * views + row) % self._poses, rows, pictures) for row, rows in tasks])
 
         return _mean_answer(self._problem, design, ask)
 
@@ -157,7 +155,7 @@ class Expectation:
         """Mean loss and rate of a design in the selection views, rounded to the 8-bit pixels that go to the printer."""
         pixels = from_pixels(as_pixels(design), self._problem.device)
         texels = _to_send(self._problem.subject.print_design(pixels))
-        answers = self._ask([_ViewsTask(texels, first) for first in range(0, self._selection_views, SELECT_CHUNK)])
+        answers = self._ask([_Job(texels, first) for first in range(0, self._selection_views, SELECT_CHUNK)])
         loss, rate = (sum(values) / len(values) for values in zip(*answers, strict=True))
         return loss, rate
 
@@ -169,7 +167,7 @@ def expectation(problem: Problem, selection: Conditions) -> Iterator[Expectation
     cache = ViewCache(problem, conditions)  # each process keeps the views it has rendered
     selection_views = lru_cache(lambda first: training_views(problem, selection[first : first + SELECT_CHUNK]))
 
-    def answer(task: _ViewsTask) -> _ViewsAnswer | tuple[float, float]:
+    def answer(task: _Job) -> _ViewsAnswer | tuple[float, float]:
         printed = torch.as_tensor(task.printed, device=problem.device)
         if task.conditions is not None:
             return _views_answer(problem, printed, cache.views(task.first, task.conditions), task.pictures)
