@@ -227,7 +227,8 @@ def _views_answer(problem: Problem, printed: Tensor, views: Views, pictures: boo
     loss, figures = score(problem, photos, views.conditions, affected_windows(views))
     (gradient,) = torch.autograd.grad(loss, printed)
     shown = _to_send(photos.detach()) if pictures else None
-    return _ViewsAnswer(len(photos), *figures.tolist(), _to_send(gradient), shown)
+    mean_loss, confidence, rate = figures.tolist()
+    return _ViewsAnswer(len(photos), mean_loss, confidence, rate, _to_send(gradient), shown)
 
 
 def _to_send(tensor: Tensor) -> np.ndarray | Tensor:

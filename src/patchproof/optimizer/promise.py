@@ -222,9 +222,8 @@ def control_claims(by_kind: Mapping[str, Responses], model: int, per_session: in
 
 def _condition_claims(problem: Problem, conditions: Conditions, recognized: np.ndarray) -> tuple[ConditionClaim, ...]:
     """The measurable properties of each condition; None where the patch's face is turned away or there is no piece."""
-    n = len(conditions)
     names = ("px_per_mm", "tilt_deg", "azimuth_deg", "contrast")
-    properties: dict[str, np.ndarray] = dict.fromkeys(names, np.full(n, np.nan))
+    properties: dict[str, np.ndarray] = dict.fromkeys(names, np.full(len(conditions), np.nan))
     if problem.scene.HAS_PIECE:
         scene = require_piece(problem.scene)
         scale, tilt = scene.scales_and_tilts(conditions, scene.photo_px).T
