@@ -100,12 +100,17 @@ def test_a_share_has_what_its_function_refers_to_also_after_a_worker_died(tmp_pa
 def test_items_in_turn_go_to_the_process_that_had_the_one_so_many_before(tmp_path):
     had = {}
 
-    def before(i: int) -> tuple[int, int]:
+    def before(i: int | str) -> tuple[int, int] | None:
+        if i == "":
+            return None
         had.setdefault(i % 3, []).append(i)
         return os.getpid(), len(had[i % 3])
 
     with fork_workers(before, 3, in_turn=True) as (crew, share):
-        answers = [answer for _ in range(4) for answer in crew.map(share, range(6))]
+        answers = []
+        for _ in range(4):
+            answers += crew.map(share, range(6))
+            crew.map(share, [""])  # of however many: the first process gets the first of the next call, too
     assert len({pid for pid, _ in answers}) == 3
     assert [times for _, times in answers] == [at // 3 + 1 for at in range(24)]
 

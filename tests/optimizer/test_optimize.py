@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+import os
+import shutil
 import warnings
 from dataclasses import replace
 from types import SimpleNamespace
@@ -389,6 +391,34 @@ def test_the_number_of_processes_changes_no_byte(tmp_path, few_views, a_small_se
     assert same_files(tmp_path / "1", tmp_path / "2", files)
 
 
+@pytest.mark.skipif(not can_fork(), reason="processes are forked on Linux without a GPU")
+def test_more_processes_than_cores_change_no_byte_and_see_no_view_twice(tmp_path, monkeypatch):
+    """Each view of a step can have a process of its own; a pose that comes round comes to the one that has seen it."""
+    seen, see = tmp_path / "seen", expectation.training_views
+
+    def noting(problem, drawn):
+        with open(seen / str(os.getpid()), "a") as file:
+            file.write("v" * len(drawn))
+        return see(problem, drawn)
+
+    monkeypatch.setattr(expectation, "training_views", noting)
+    monkeypatch.setattr(expectation, "MIN_POSES", 4)
+    monkeypatch.setattr(loop, "SELECT_VIEWS", 12)
+    settings = {"optimize__steps": 2, "optimize__views_per_batch": 1, "camera__photo_px": [64, 64]}
+    problem = set_problem(scene_with(tmp_path, **settings))
+    ends = []
+    with use_threads(1):
+        for jobs in (1, 2, 4, 8):
+            shutil.rmtree(seen, ignore_errors=True)
+            seen.mkdir()
+            (*_, last) = loop.steps(replace(problem, jobs=jobs))
+            ends.append((last.state.design.numpy().tobytes(), last.loss, last.select_loss))
+            views = [file.stat().st_size for file in seen.iterdir()]
+            assert sum(views) == 4 + 12, "4 poses and 12 views of the selection set, each once"
+            assert len(views) == min(jobs, 4), "a view of each step for every process"
+    assert len(set(ends)) == 1
+
+
 def test_poses_come_round_with_other_backgrounds_light_print_and_camera(tmp_path, monkeypatch):
     monkeypatch.setattr(expectation, "MIN_POSES", 6)
     scene = scene_with(tmp_path, optimize__steps=10)
@@ -411,7 +441,7 @@ def test_poses_come_round_with_other_backgrounds_light_print_and_camera(tmp_path
 def test_only_views_that_fit_are_kept(tmp_path, monkeypatch):
     problem = set_problem(scene_with(tmp_path))
     monkeypatch.setattr(expectation, "MIN_POSES", 24)
-    monkeypatch.setattr(expectation, "CACHE_PX", 5 * expectation.VIEWS_PER_TASK * problem.training_px**2)
+    monkeypatch.setattr(expectation, "CACHE_PX", 5 * 2 * problem.training_px**2)
     drawn, seen = problem.scene.draw("train", 24), []
     monkeypatch.setattr(
         expectation,
@@ -421,7 +451,7 @@ def test_only_views_that_fit_are_kept(tmp_path, monkeypatch):
     cache = expectation.ViewCache(problem, drawn)
     for first in (0, 4, 8, 12, 16, 20, 0, 4, 8, 12, 16, 20):
         cache.views(first, drawn[first : first + 2])
-    assert seen == [2 * expectation.STEPS_AHEAD, 4, 2], "the last pair is seen twice"
+    assert seen == [expectation.VIEWS_AHEAD, 4, 2], "the last pair is seen twice"
     assert not cache._ahead, "what is not kept is seen once"
 
 

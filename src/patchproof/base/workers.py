@@ -69,6 +69,8 @@ class Workers:
     def _run(self, function, items: Iterable[_Item], in_flight: int, lost: list[_Item]) -> Iterator[tuple[int, Future]]:
         """Keep `in_flight` items running; those whose workers died are appended to `lost`."""
         todo, running = iter(items), {}
+        if isinstance(self._executor, _RotatingExecutor):
+            self._executor.rewind()
         while True:
             while len(running) < in_flight and (item := next(todo, None)) is not None:
                 running[self._submit(function, item[1])] = item
@@ -137,8 +139,8 @@ def fork_workers(function: _Task, jobs: int, in_turn: bool = False) -> Iterator[
     callable to give them in its place. Only items and results are sent.
 
     One job runs in this process, as does work within a forked worker; a system that cannot fork (`can_fork`) runs it
-    here on `jobs` threads. With `in_turn` the processes get the items in rotation, so that each finds what it cached
-    for an earlier one; otherwise the first free process takes the next item.
+    here on `jobs` threads. With `in_turn` every call deals its items to the processes in rotation from the first on, so
+    that each finds what it cached for an earlier one; otherwise the first free process takes the next item.
     """
     in_process = jobs == 1 or _function is not None
     if in_process or not can_fork():
@@ -225,10 +227,14 @@ def _process_pool(jobs: int, forks: bool, function: _Task | None = None) -> Exec
 
 
 class _RotatingExecutor(Executor):
-    """Single processes that get items in rotation."""
+    """Single processes that get items in rotation, from the first one after each `rewind`."""
 
     def __init__(self, jobs: int, forks: bool, function: _Task):
         self._executors = [_process_pool(1, forks, function) for _ in range(jobs)]
+        self.rewind()
+
+    def rewind(self) -> None:
+        """Give the next item to the first process."""
         self._next = cycle(self._executors)
 
     def submit(self, fn, /, *args, **kwargs) -> Future:

@@ -105,7 +105,9 @@ def fit_camera(
     rungs, fit = choose_lens_model(views, lambda fit: _is_usable(fit, size_px), advance)
     _refuse_undetermined(fit)
     about = f"{len(views)} photographs of board {board.sheet_id}" + (f", camera {camera}" if camera else "")
-    fitted = _camera(fit, name, size_px, about, _uncertainty(fit))
+    parts = ", ".join(f"{n} {s:.2g}" for n, s in zip(PARAMETERS, fit.sd, strict=True) if s > 0)
+    errors = f"standard deviations {parts}; {fit.rms_px:.2g} px rms are left; a board that is not flat is not in it"
+    fitted = _camera(fit, name, size_px, about, errors)
     check_camera(fitted, "this calibration")
     return CameraCalibration(fitted, rungs, fit, tuple(views), left_out, board)
 
@@ -219,11 +221,6 @@ def _camera(fit: LensFit, name: str, size_px: tuple[int, int], instrument: str, 
     description = {"instrument": instrument, "uncertainty": uncertainty, "when": date.today().isoformat()}
     numbers = {n: round(float(v), 6) for n, v in zip(PARAMETERS, fit.numbers, strict=True)}
     return Camera.model_validate({"name": name, "method": "measured", "image_px": size_px} | description | numbers)
-
-
-def _uncertainty(fit: LensFit) -> str:
-    parts = ", ".join(f"{n} {s:.2g}" for n, s in zip(PARAMETERS, fit.sd, strict=True) if s > 0)
-    return f"standard deviations {parts}; {fit.rms_px:.2g} px rms are left; a board that is not flat is not in it"
 
 
 def _residual_picture(views: Sequence[BoardView], rungs: Sequence[Rung], fit: LensFit) -> bytes:

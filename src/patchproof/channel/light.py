@@ -14,8 +14,8 @@ Source: Lambert.
 """
 
 from dataclasses import dataclass
-from functools import partial
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -34,9 +34,10 @@ class Lighting:
 
 def lighting_of(light: Light, forward, up, device: torch.device | str = "cpu") -> Lighting:
     """Return the light of N views on a patch whose printed side faces `forward`."""
-    tensor = partial(torch.as_tensor, dtype=torch.float32, device=device)
     toward = geometry.orbit(light.light_azimuth_deg, light.light_elevation_deg, forward, up)
-    return Lighting(tensor(light.ambient), tensor(light.directional), tensor(toward))
+    values = np.column_stack([light.ambient, light.directional, toward]).astype(np.float32)  # sent to a device at once
+    ambient, directional, *direction = torch.as_tensor(values.T.copy(), device=device)
+    return Lighting(ambient, directional, torch.stack(direction, 1))
 
 
 def irradiance(normal: Tensor, view: Tensor, light: Lighting) -> Tensor:

@@ -13,7 +13,7 @@ import io
 import math
 import zipfile
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -186,11 +186,16 @@ def _bordered(table: Tensor) -> Tensor:
     return torch.from_numpy(bordered).permute(3, 0, 1, 2)[None].contiguous()
 
 
+@lru_cache(maxsize=8)
+def _moved(table: Tensor, device: torch.device, dtype: torch.dtype) -> Tensor:
+    return table.to(device, dtype)  # half a megabyte, not sent with every step
+
+
 def _look_up(table: Tensor, srgb: Tensor) -> Tensor:
     colors = srgb if srgb.dtype == torch.float64 else srgb.float()  # half precision cannot address 33 nodes finely
     levels = 255 * clamp_to_unit(colors)
     position = torch.where(levels <= 248, levels / 8, 31 + (levels - 248) / 7)  # the last step is 7 wide
     grid = (2 * (position + 1) / (SIZE + 1) - 1).movedim(1, -1).flip(-1)  # grid_sample wants (x, y, z) = (b, g, r)
-    sample = torch.nn.functional.grid_sample
-    values = sample(table.to(colors), grid[None], mode="bilinear", padding_mode="border", align_corners=True)
+    sample, table = torch.nn.functional.grid_sample, _moved(table, colors.device, colors.dtype)
+    values = sample(table, grid[None], mode="bilinear", padding_mode="border", align_corners=True)
     return values[0].movedim(0, 1).to(srgb.dtype)

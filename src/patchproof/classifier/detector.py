@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from patchproof.classifier.network import NO_BOX_LOGIT, Classifier, Odds
+from patchproof.classifier.network import NO_BOX_LOGIT, Classifier, Odds, columns
 from patchproof.networks.windows import Windows
 
 MIN_IOU = 0.5  # as in PASCAL VOC's and COCO's AP50
@@ -38,12 +38,12 @@ class Detector(Classifier):
 
     def odds(self, logits: Tensor, indices: Sequence[int]) -> Odds:
         """The logarithms of the best score among the labels in `indices`, and of 1 minus that score."""
-        best = logits[:, list(indices)].amax(1).double()
+        best = columns(logits, indices).amax(1).double()
         return Odds(torch.nn.functional.logsigmoid(best), torch.nn.functional.logsigmoid(-best))
 
     def confidence(self, logits: Tensor, indices: Sequence[int]) -> Tensor:
         """N best scores of the labels in `indices`."""
-        return self.probabilities(logits)[:, list(indices)].amax(1)
+        return columns(self.probabilities(logits), indices).amax(1)
 
     def recognized(self, logits: Tensor, indices: Sequence[int]) -> Tensor:
         """N bool: the object was found under one of these labels with a sufficient score."""

@@ -9,6 +9,7 @@ Left out on purpose: labels' meaning (labels.py), loading (load.py), ensembles (
 import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -84,17 +85,16 @@ class Classifier:
     def odds(self, logits: Tensor, indices: Sequence[int]) -> Odds:
         """Logarithms of the summed softmax of the labels in `indices` and of all others."""
         log_p = torch.log_softmax(logits.double(), 1)
-        chosen = torch.zeros(logits.shape[1], dtype=torch.bool, device=logits.device)
-        chosen[list(indices)] = True
-        return Odds(torch.logsumexp(log_p[:, chosen], 1), torch.logsumexp(log_p[:, ~chosen], 1))
+        chosen, others = sorted(indices), [i for i in range(logits.shape[1]) if i not in indices]
+        return Odds(*(torch.logsumexp(columns(log_p, which), 1) for which in (chosen, others)))
 
     def confidence(self, logits: Tensor, indices: Sequence[int]) -> Tensor:
         """N confidences in the labels of `indices`."""
-        return self.probabilities(logits)[:, list(indices)].sum(1)
+        return columns(self.probabilities(logits), indices).sum(1)
 
     def recognized(self, logits: Tensor, indices: Sequence[int]) -> Tensor:
         """N bool: the largest logit is one of `indices`."""
-        return torch.isin(logits.argmax(1), torch.tensor(list(indices), device=logits.device))
+        return torch.isin(logits.argmax(1), _on_device(tuple(indices), logits.device))
 
     def target_box(self, square: Tensor, indices: Sequence[int], boxes: np.ndarray | None) -> tuple[float, ...] | None:
         """The surest box of the labels in `indices` in one square, in shares of its side; None without boxes."""
@@ -108,6 +108,17 @@ class Classifier:
         if windows is not None and isinstance(self.network, BatchedNetwork):
             return self.network(squares, windows)
         return self.network(squares)
+
+
+def columns(values: Tensor, indices: Sequence[int]) -> Tensor:
+    """Columns of N×K values by number; a device gets the numbers once, not with every picture."""
+    return values.index_select(1, _on_device(tuple(indices), values.device))
+
+
+@lru_cache(maxsize=64)
+def _on_device(indices: tuple[int, ...], device: torch.device) -> Tensor:
+    with torch.inference_mode(False):  # whose tensors no gradient could pass later
+        return torch.tensor(indices, dtype=torch.int64, device=device)
 
 
 def center_square(photos_srgb: Tensor, size_px: int) -> Tensor:

@@ -28,13 +28,12 @@ from patchproof.render.views import Views, split_views
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.interface import Scene
 
-VIEWS_PER_TASK = 2  # views of a step that one process renders together; one by one took 1.4 times as long
-STEPS_AHEAD = 4  # steps whose views a process renders together; one by one took 1.4 times as long
+VIEWS_AHEAD = 8  # views of the next steps that a process renders together; two by two took 1.4 times as long
 # A run has this many poses, or a quarter as many as views if that is more. Over 18 pairs of object and seed, the loss
 # was 0.7 % [-0.2, 1.5] higher than with one pose for each view, and as many views were recognized. With one background
 # for each pose, too, it was 2 % higher; with one pose for four steps in a row, 25 to 33 %.
 MIN_POSES, VIEWS_PER_POSE = 240, 4
-CACHE_PX = 240 * 224**2  # of the views that a process keeps, at 20 to 60 bytes a pixel
+CACHE_PX = 480 * 224**2  # of the views that all processes keep, at 20 to 60 bytes a pixel
 SELECT_CHUNK = 4  # selection views that a process renders together
 
 
@@ -52,9 +51,8 @@ def pose_count(scene: Scene) -> int:
     """The number of poses in a run, a multiple of a step's views; scenes of pictures have one pose per view."""
     settings = scene.settings.optimize
     views = settings.steps * settings.views
-    if not scene.HAS_OBJECT:
-        return views
-    return math.ceil(max(MIN_POSES, views / VIEWS_PER_POSE) / settings.views) * settings.views
+    steps = math.ceil(max(MIN_POSES, views / VIEWS_PER_POSE) / settings.views)
+    return steps * settings.views if scene.HAS_OBJECT else views
 
 
 def new_pose_share(scene: Scene) -> float:
@@ -63,9 +61,10 @@ def new_pose_share(scene: Scene) -> float:
     return min(1.0, pose_count(scene) / (settings.steps * settings.views))
 
 
-def task_conditions(conditions: Conditions) -> list[tuple[int, Conditions]]:
-    """A step's conditions in tasks of VIEWS_PER_TASK, each with the row that it begins at."""
-    return [(row, conditions[row : row + VIEWS_PER_TASK]) for row in range(0, len(conditions), VIEWS_PER_TASK)]
+def in_batches(problem: Problem, conditions: Conditions) -> list[tuple[int, Conditions]]:
+    """A step's conditions in batches that one process renders, each with the row that it begins at."""
+    size = problem.scene.settings.optimize.views_per_batch
+    return [(row, conditions[row : row + size]) for row in range(0, len(conditions), size)]
 
 
 def training_views(problem: Problem, conditions: Conditions) -> Views:
@@ -80,8 +79,9 @@ class ViewCache:
         self._problem, self._conditions = problem, conditions
         self._poses = min(pose_count(problem.scene), len(conditions))
         self._stored, self._ahead = dict[int, Views](), dict[int, Views]()
-        repeats = new_pose_share(problem.scene) < 1
-        self._capacity = CACHE_PX // (VIEWS_PER_TASK * problem.training_px**2) if repeats else 0
+        settings, repeats = problem.scene.settings.optimize, new_pose_share(problem.scene) < 1
+        processes = min(problem.jobs, math.ceil(settings.views / settings.views_per_batch))
+        self._capacity = CACHE_PX // (processes * settings.views_per_batch * problem.training_px**2) if repeats else 0
 
     def views(self, pose: int, conditions: Conditions) -> Views:
         """The views of a task's conditions, whose poses begin with the run's pose number `pose`."""
@@ -94,7 +94,7 @@ class ViewCache:
 
     def _render_ahead(self, pose: int, count: int) -> None:
         step = self._problem.scene.settings.optimize.views
-        poses = range(pose, self._poses, step)[:STEPS_AHEAD]
+        poses = range(pose, self._poses, step)[: max(1, VIEWS_AHEAD // count)]
         rows = np.concatenate([np.arange(first, first + count) for first in poses])
         together = training_views(self._problem, self._conditions[rows])
         self._ahead |= zip(poses, split_views(together, [count] * len(poses)), strict=True)
@@ -118,24 +118,19 @@ class _ViewsAnswer(NamedTuple):
     loss: float
     confidence: float
     rate: float
-    gradient: np.ndarray
-    pictures: np.ndarray | None
+    gradient: np.ndarray | Tensor
+    pictures: np.ndarray | Tensor | None
 
 
-class _TrainTask(NamedTuple):
-    """Printed texels and training views: their first pose, their conditions, and whether to send pictures back."""
+class _Job(NamedTuple):
+    """Printed texels, and training views: their first pose, conditions, and whether to send pictures back. Without
+    conditions, selection views from number `first` on.
+    """
 
-    printed: np.ndarray
-    pose: int
-    conditions: Conditions
-    pictures: bool
-
-
-class _SelectTask(NamedTuple):
-    """Printed texels, and the number of the first of some selection views."""
-
-    printed: np.ndarray
+    printed: np.ndarray | Tensor
     first: int
+    conditions: Conditions | None = None
+    pictures: bool = False
 
 
 class Expectation:
@@ -148,20 +143,19 @@ class Expectation:
     def gradient(self, design: Tensor, step: int, pictures: bool = False) -> Answer:
         """The mean loss and its gradient at a design 3×h×w, in the views of step number `step`, counted from 0."""
         views = self._problem.scene.settings.optimize.views
-        tasks = task_conditions(self._conditions[step * views : (step + 1) * views])
+        tasks = in_batches(self._problem, self._conditions[step * views : (step + 1) * views])
 
         def ask(printed: Tensor) -> list[_ViewsAnswer]:
-            texels = printed.cpu().numpy()
-            poses = [(step * views + row) % self._poses for row, _ in tasks]
-            return self._ask([_TrainTask(texels, p, rows, pictures) for p, (_, rows) in zip(poses, tasks, strict=True)])
+            texels = _to_send(printed)
+            return self._ask([_Job(texels, (step * views + row) % self._poses, rows, pictures) for row, rows in tasks])
 
         return _mean_answer(self._problem, design, ask)
 
     def selection(self, design: Tensor) -> tuple[float, float]:
         """Mean loss and rate of a design in the selection views, rounded to the 8-bit pixels that go to the printer."""
         pixels = from_pixels(as_pixels(design), self._problem.device)
-        texels = self._problem.subject.print_design(pixels).cpu().numpy()
-        answers = self._ask([_SelectTask(texels, first) for first in range(0, self._selection_views, SELECT_CHUNK)])
+        texels = _to_send(self._problem.subject.print_design(pixels))
+        answers = self._ask([_Job(texels, first) for first in range(0, self._selection_views, SELECT_CHUNK)])
         loss, rate = (sum(values) / len(values) for values in zip(*answers, strict=True))
         return loss, rate
 
@@ -173,15 +167,15 @@ def expectation(problem: Problem, selection: Conditions) -> Iterator[Expectation
     cache = ViewCache(problem, conditions)  # each process keeps the views it has rendered
     selection_views = lru_cache(lambda first: training_views(problem, selection[first : first + SELECT_CHUNK]))
 
-    def answer(task: _TrainTask | _SelectTask) -> _ViewsAnswer | tuple[float, float]:
+    def answer(task: _Job) -> _ViewsAnswer | tuple[float, float]:
         printed = torch.as_tensor(task.printed, device=problem.device)
-        if isinstance(task, _TrainTask):
-            return _views_answer(problem, printed, cache.views(task.pose, task.conditions), task.pictures)
+        if task.conditions is not None:
+            return _views_answer(problem, printed, cache.views(task.first, task.conditions), task.pictures)
         views = selection_views(task.first)
         with torch.no_grad():
             photos = expose(views, problem.subject.appearance_of_print(printed))
-            loss, _, rate = score(problem, photos, views.conditions)
-        return float(loss), rate
+            loss, _, rate = score(problem, photos, views.conditions)[1].tolist()
+        return loss, rate
 
     with fork_workers(answer, problem.jobs, in_turn=True) as (workers, share):
         yield Expectation(problem, conditions, len(selection), lambda tasks: workers.map(share, tasks))
@@ -194,18 +188,18 @@ def gradient_in_views(problem: Problem, design: Tensor, views: Sequence[Views]) 
 
 def score(
     problem: Problem, pictures: Tensor, conditions: Conditions, windows: np.ndarray | None = None
-) -> tuple[Tensor, float, float]:
-    """Mean loss, confidence and rate over classifiers and pictures N×3×H×W of these conditions. Outside of `windows`,
-    N×4 pixels (left, top, right, bottom), the pictures' gradient is not needed.
+) -> tuple[Tensor, Tensor]:
+    """The mean loss, differentiable, and mean loss, confidence and rate in float64, over classifiers and pictures
+    N×3×H×W. Outside of `windows`, N×4 pixels (left, top, right, bottom), the pictures' gradient is not needed.
     """
-    losses, confidence, rate, boxes = [], 0.0, 0.0, problem.boxes(conditions)
+    losses, figures, boxes = [], [], problem.boxes(conditions)
     for classifier, indices in zip(problem.classifiers, problem.indices, strict=True):
         logits = classifier.logits(pictures, boxes, windows)
         losses.append(problem.losses(classifier, logits, indices).mean())
-        confidence += float(classifier.confidence(logits.detach(), indices).mean())
-        rate += float(classifier.recognized(logits.detach(), indices).double().mean())
-    count = len(losses)
-    return torch.stack(losses).mean(), confidence / count, rate / count
+        told = classifier.confidence(logits.detach(), indices), classifier.recognized(logits.detach(), indices)
+        figures.append(torch.stack([each.double().mean() for each in told]))
+    loss = torch.stack(losses).mean()
+    return loss, torch.cat([loss.detach().double()[None], torch.stack(figures).mean(0)])
 
 
 def _mean_answer(problem: Problem, design: Tensor, ask: Callable[[Tensor], Sequence[_ViewsAnswer]]) -> Answer:
@@ -230,7 +224,13 @@ def _views_answer(problem: Problem, printed: Tensor, views: Views, pictures: boo
     """Photograph the print in these views, run the networks, and differentiate their mean loss."""
     printed = printed.detach().requires_grad_()
     photos = expose(views, problem.subject.appearance_of_print(printed))
-    loss, confidence, rate = score(problem, photos, views.conditions, affected_windows(views))
+    loss, figures = score(problem, photos, views.conditions, affected_windows(views))
     (gradient,) = torch.autograd.grad(loss, printed)
-    sent_pictures = photos.detach().cpu().numpy() if pictures else None
-    return _ViewsAnswer(len(photos), float(loss.detach()), confidence, rate, gradient.cpu().numpy(), sent_pictures)
+    shown = _to_send(photos.detach()) if pictures else None
+    mean_loss, confidence, rate = figures.tolist()
+    return _ViewsAnswer(len(photos), mean_loss, confidence, rate, _to_send(gradient), shown)
+
+
+def _to_send(tensor: Tensor) -> np.ndarray | Tensor:
+    """What processes exchange: on a CPU an array; a GPU's only process leaves everything where it is."""
+    return tensor.numpy() if tensor.device.type == "cpu" else tensor

@@ -28,7 +28,7 @@ from patchproof.base.output import write_atomically
 from patchproof.base.run_files import CHECKPOINT_FILE
 from patchproof.base.settings import OptimizeSettings
 from patchproof.base.validation import StrictModel
-from patchproof.optimizer.expectation import Answer, expectation, gradient_in_views, task_conditions, training_views
+from patchproof.optimizer.expectation import Answer, expectation, gradient_in_views, in_batches, training_views
 from patchproof.optimizer.problem import Problem
 from patchproof.scene.conditions import Conditions
 
@@ -78,7 +78,10 @@ def steps(problem: Problem, state: State | None = None) -> Iterator[TrainingStep
             answer = expected.gradient(state.design, state.number, pictures=last)
             step = _descend(problem, state, answer)
             if is_selection_step(settings, step.state.number):
-                step = _select(step, *expected.selection(step.state.design))
+                loss, rate = expected.selection(step.state.design)
+                if loss < step.state.best_loss:
+                    step = replace(step, state=replace(step.state, best=step.state.design, best_loss=loss))
+                step = replace(step, select_loss=loss, select_rate=rate)
             state = step.state
             yield step
 
@@ -92,7 +95,7 @@ def start(problem: Problem) -> State:
 
 def take_step(problem: Problem, state: State, conditions: Conditions) -> TrainingStep:
     """One step on these conditions, in this process."""
-    views = [training_views(problem, rows) for _, rows in task_conditions(conditions)]
+    views = [training_views(problem, rows) for _, rows in in_batches(problem, conditions)]
     return _descend(problem, state, gradient_in_views(problem, state.design, views))
 
 
@@ -163,14 +166,6 @@ def _update(problem: Problem, state: State, gradient: Tensor) -> State:
     ]
     design = clipped(state.design - step_size * problem.subject.combine_levels(updates))
     return replace(state, number=number, design=design, mean=mean, square=square)
-
-
-def _select(step: TrainingStep, loss: float, rate: float) -> TrainingStep:
-    """Keep the step's design if it is the best so far on the selection set."""
-    state = step.state
-    if loss < state.best_loss:
-        state = replace(state, best=state.design, best_loss=loss)
-    return replace(step, state=state, select_loss=loss, select_rate=rate)
 
 
 def save_checkpoint(state: State, problem: Problem, out: Path) -> None:

@@ -26,7 +26,7 @@ from patchproof.optimizer.problem import Problem
 from patchproof.optimizer.responses import Responses, merge_responses, open_responses
 from patchproof.render.pixels import Appearance
 from patchproof.scene.conditions import Conditions
-from patchproof.scene.interface import PieceScene, require_piece
+from patchproof.scene.interface import require_piece
 from patchproof.scene.patch_scene import PatchScene
 from patchproof.sheets.manifest import ConditionClaim, ControlClaim, ModelClaim, Promise, Target
 
@@ -222,27 +222,19 @@ def control_claims(by_kind: Mapping[str, Responses], model: int, per_session: in
 
 def _condition_claims(problem: Problem, conditions: Conditions, recognized: np.ndarray) -> tuple[ConditionClaim, ...]:
     """The measurable properties of each condition; None where the patch's face is turned away or there is no piece."""
-    n = len(conditions)
     names = ("px_per_mm", "tilt_deg", "azimuth_deg", "contrast")
-    properties: dict[str, np.ndarray] = dict.fromkeys(names, np.full(n, np.nan))
+    properties: dict[str, np.ndarray] = dict.fromkeys(names, np.full(len(conditions), np.nan))
     if problem.scene.HAS_PIECE:
         scene = require_piece(problem.scene)
         scale, tilt = scene.scales_and_tilts(conditions, scene.photo_px).T
         azimuth = scene.piece_azimuth_deg(conditions)
-        values = scale, tilt, azimuth, _contrasts(problem, scene, conditions)
+        white = scene.white_light(conditions) * 2**conditions.sensor.exposure_ev
+        black = float(linear_from_srgb(problem.printer.apply(torch.zeros(1, 3, 1, 1))).mean())
+        contrast = np.minimum(white, 1) - np.minimum(white * black, 1)  # of what is printed, in the photograph's light
+        values = scale, tilt, azimuth, contrast
         turned_away = np.abs(azimuth) >= 90  # NaN, an unknown angle, counts as facing the camera
         properties = dict(zip(names, np.where(turned_away, np.nan, values), strict=True))
     properties["blur_px"] = conditions.sensor.blur_px
-    rows = [{name: _rounded(value[i]) for name, value in properties.items()} for i in range(n)]
-    return tuple(ConditionClaim(**row, recognized=bool(recognized[i])) for i, row in enumerate(rows))
-
-
-def _contrasts(problem: Problem, scene: PieceScene, conditions: Conditions) -> np.ndarray:
-    """Paper white minus printed black in the photograph's linear light."""
-    exposed = scene.white_light(conditions) * 2**conditions.sensor.exposure_ev
-    black = float(linear_from_srgb(problem.printer.apply(torch.zeros(1, 3, 1, 1))).mean())
-    return np.minimum(exposed, 1) - np.minimum(exposed * black, 1)
-
-
-def _rounded(value: float) -> float | None:
-    return round(float(value), 4) if math.isfinite(value) else None
+    columns = ([round(float(v), 4) if math.isfinite(v) else None for v in value] for value in properties.values())
+    rows = (dict(zip(properties, row, strict=True)) for row in zip(*columns, strict=True))
+    return tuple(ConditionClaim(**row, recognized=bool(hit)) for row, hit in zip(rows, recognized, strict=True))

@@ -75,7 +75,7 @@ def expose(views: Views, appearance: Appearance, jpeg: bool = True) -> Tensor:
     if appearance is not None:
         # if each pixel is developed alone, only the piece's pixels differ from the bare object's photograph
         piece, pixels = views.on_piece, views.frame_px[0] * views.frame_px[1]
-        back = views.encode(torch.full((1, 1), PAPER_BACK_LINEAR).to(image), piece.back_pixel // pixels)
+        back = views.encode(image.new_full((1, 1), PAPER_BACK_LINEAR), piece.back_pixel // pixels)
         image = _blend(image, piece.back_pixel, piece.back_share, back, False)
         light = _piece_light(views, appearance)
         image = _blend(image, piece.pixel, piece.share, views.encode(light, piece.view), False)
@@ -122,7 +122,7 @@ def _paste_piece(views: Views, image: Tensor, light: Tensor, blur_px: np.ndarray
     """Put the piece into photographs with blur and noise of their own, which the photographs around it have already."""
     piece = views.on_piece
     values = torch.cat([light, light.new_ones(len(light), 1)], 1) * piece.share
-    layer = _as_pictures(views, torch.zeros(len(image), 4).to(image).index_copy(0, piece.pixel, values))
+    layer = _as_pictures(views, image.new_zeros(len(image), 4).index_copy(0, piece.pixel, values))
     layer = gaussian_blur(layer, torch.as_tensor(blur_px).to(image))
     share = layer[:, 3:]
     pictures = _as_pictures(views, image) * (1 - share) + layer[:, :3]

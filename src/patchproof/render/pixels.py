@@ -147,7 +147,9 @@ def piece_pixels(
     front, back = ((is_covered & side).nonzero()[:, 0] for side in (fragments.front, ~fragments.front))
     mm, mm_dx, mm_dy = (values.index_select(0, front) for values in (mm, mm_dx, mm_dy))
     back_pixel = fragments.pixel.index_select(0, back)
-    texels = _piece_footprint(piece, mm / size, mm_dx * look.side / size, mm_dy * look.side / size, look.piece_taps)
+    layout, only = texel_layout([piece.size_px], wrap=False, device=mm.device), mm.new_zeros(len(mm), dtype=torch.long)
+    uv, uv_dx, uv_dy = mm / size, mm_dx * look.side / size, mm_dy * look.side / size
+    texels = footprint(layout, only, uv, uv_dx, uv_dy, taps=look.piece_taps, blocks=True)
     normal = torch.nn.functional.normalize(_interpolate(surface.corner_normal, visible), dim=-1)
     white = None if white_coefficients is None else _paper_light(white_coefficients[visible.view], 2 * mm / size - 1)
     front_share, back_share = (share.index_select(0, side)[:, None] for side in (front, back))
@@ -162,12 +164,6 @@ def _boxes(pixel: Tensor, shape: tuple[int, int, int]) -> np.ndarray:
     row, size = view[:, None].expand(-1, 2), xy.new_tensor([width, height]).repeat(views, 1)
     low, high = size.scatter_reduce(0, row, xy, "amin"), (size * 0).scatter_reduce(0, row, xy + 1, "amax")
     return torch.cat([torch.minimum(low, high), high], 1).cpu().numpy()
-
-
-def _piece_footprint(piece: PiecePicture, uv: Tensor, uv_dx: Tensor, uv_dy: Tensor, taps: int) -> Footprint:
-    """Return the texels of the piece's picture that are seen; `uv` P×2 from 0 to 1 across the piece."""
-    layout = texel_layout([piece.size_px], wrap=False, device=uv.device)
-    return footprint(layout, uv.new_zeros(len(uv), dtype=torch.long), uv, uv_dx, uv_dy, taps=taps, blocks=True)
 
 
 def object_pixels(

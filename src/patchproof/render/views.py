@@ -112,27 +112,31 @@ class Views:
         """The bare object, its outlines jagged, in a camera without blur and noise, N·H·W × 3 sRGB."""
         camera = self.stage.camera
         # the background has 256 codes per view and channel, which are exposed as a table
-        light = torch.tensor(LINEAR_FROM_CODE)[:, None] * self._gains[:, None].cpu().double()
-        codes = lift_tone(encode_light(light, camera), self._tone.cpu().double()[:, None, None])
+        gain, tone = self._sensor_values.double().split([3, 1], 1)
+        light = torch.tensor(LINEAR_FROM_CODE)[:, None] * gain[:, None]
+        codes = lift_tone(encode_light(light, camera), tone[:, None])
         image = _look_up_codes(self.background, codes.numpy(), self.stage.device)
         if self.object is None:
             return image
         view = self.object.view
-        color = encode_light_by_table(self._object_color() * self._gains.index_select(0, view), camera)
-        return image.index_copy_(0, self.object.pixel, lift_tone(color, self._tone.index_select(0, view)[:, None]))
+        gain, tone = self._sensor_on_device.index_select(0, view).split([3, 1], 1)
+        color = encode_light_by_table(self._object_color() * gain, camera)
+        return image.index_copy_(0, self.object.pixel, lift_tone(color, tone))
 
     def encode(self, light: Tensor, view: Tensor) -> Tensor:
         """Return the code values P×3 of light at pixels of the views P, in a camera without blur and noise."""
-        codes = encode_light(light * self._gains.index_select(0, view), self.stage.camera)
-        return lift_tone(codes, self._tone.index_select(0, view)[:, None])
+        gain, tone = self._sensor_on_device.index_select(0, view).split([3, 1], 1)
+        return lift_tone(encode_light(light * gain, self.stage.camera), tone)
 
     @cached_property
-    def _gains(self) -> Tensor:
-        return gains(self.conditions.sensor, torch.zeros(0, device=self.stage.device))
+    def _sensor_values(self) -> Tensor:
+        """Each view's gains and tone, N×4, here: a device is not waited for."""
+        tone = torch.as_tensor(self.conditions.sensor.tone, dtype=torch.float32)
+        return torch.cat([gains(self.conditions.sensor, tone), tone[:, None]], 1)
 
     @cached_property
-    def _tone(self) -> Tensor:
-        return torch.as_tensor(self.conditions.sensor.tone, dtype=torch.float32, device=self.stage.device)
+    def _sensor_on_device(self) -> Tensor:
+        return self._sensor_values.to(self.stage.device)
 
     @cached_property
     def piece_white(self) -> Tensor:

@@ -16,7 +16,8 @@ def render_page(template: str, folder: Path = Path(__file__).parent, **values: o
     options = {"trim_blocks": True, "lstrip_blocks": True, "undefined": StrictUndefined, "finalize": _printable_lines}
     environment = Environment(autoescape=True, **options)
     environment.loader = FileSystemLoader(folder)
-    environment.filters |= {"percent": _percent, "figure": _figure}
+    environment.filters["percent"] = lambda share: "–" if share is None else f"{100 * share:.0f} %"
+    environment.filters["figure"] = lambda value, digits=2: "not measured" if value is None else f"{value:.{digits}f}"
     environment.tests["figure"] = lambda value: isinstance(value, (int, float, Estimate)) or value is None
     return environment.get_template(template).render(values)
 
@@ -24,14 +25,6 @@ def render_page(template: str, folder: Path = Path(__file__).parent, **values: o
 def _printable_lines(value: object) -> object:
     """Make text `printable`, but for its line ends; what is markup is our own."""
     return "\n".join(map(printable, value.split("\n"))) if type(value) is str else value
-
-
-def _percent(share: float | None) -> str:
-    return "–" if share is None else f"{100 * share:.0f} %"
-
-
-def _figure(value: float | None, digits: int = 2) -> str:
-    return "not measured" if value is None else f"{value:.{digits}f}"
 
 
 def versions_of(libraries: Iterable[str]) -> dict[str, str]:

@@ -215,7 +215,9 @@ def _shares(mesh: Mesh, chosen_faces: np.ndarray, masks: tuple[np.ndarray, ...])
     Of faces that lie on one another (a front and a back, as some programs export) one stands for all: they show one
     place.
     """
-    area, first_of_place, has_uv = _areas(mesh), _is_first_at_place(mesh), has_usable_uv(mesh)
+    a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+    first_of_place, has_uv = _is_first_at_place(mesh), has_usable_uv(mesh)
     changeable, repeated, palette, unnamed = np.zeros((4, len(area)))  # shares of each face
     for index, mask in enumerate(masks):
         faces = has_uv & (mesh.face_material == index)
@@ -244,8 +246,3 @@ def _is_first_at_place(mesh: Mesh) -> np.ndarray:
     """Return the faces for which no earlier face has the same three corners in space."""
     first = np.unique(np.sort(position_numbers(mesh.vertices)[mesh.faces], axis=1), axis=0, return_index=True)[1]
     return np.isin(np.arange(len(mesh.faces)), first)
-
-
-def _areas(mesh: Mesh) -> np.ndarray:
-    a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
-    return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
