@@ -38,8 +38,7 @@ def pytest_collection_modifyitems(items):
 def one_core():
     """What takes all free cores where nothing is said takes one: the others have tests of their own."""
     with pytest.MonkeyPatch.context() as patch:
-        for module in ("base.workers", "app.cli.console"):  # the latter has a name of its own for it
-            patch.setattr(f"patchproof.{module}.available_cores", lambda: 1)
+        patch.setattr("patchproof.base.workers.available_cores", lambda: 1)
         yield
 
 

@@ -1,3 +1,5 @@
+from .app.begin.preview import Preview as Preview
+from .app.begin.preview import preview as preview
 from .app.compare import compare as compare
 from .app.verify import CaptureInfo as CaptureInfo
 from .app.verify import verify as verify
@@ -6,6 +8,7 @@ from .base.errors import PatchproofError as PatchproofError
 from .base.errors import Refused as Refused
 from .base.goal import Goal as Goal
 from .base.progress import Progress as Progress
+from .base.progress import progress_bar as progress_bar
 from .base.settings import SceneSettings as SceneSettings
 from .base.version import __version__ as __version__
 from .channel.printer import Printer as Printer
@@ -25,6 +28,7 @@ from .optimizer.promise import PromiseOptions as PromiseOptions
 from .optimizer.run import Run as Run
 from .optimizer.run import load_run as load_run
 from .optimizer.run import optimize as optimize
+from .optimizer.run import promise_run as promise_run
 from .photo.rejection import PhotoRejected as PhotoRejected
 from .render.photograph import photograph as photograph
 from .render.stage import Stage as Stage

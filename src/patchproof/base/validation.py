@@ -19,6 +19,7 @@ from pydantic_core import ErrorDetails
 
 from patchproof.base.errors import Refused
 from patchproof.base.input import read_text
+from patchproof.base.text import short_repr
 
 MAX_TOML_BYTES = 1 << 16  # shipped files have 3 kB; the time for a key of many parts grows with their square
 
@@ -52,6 +53,7 @@ class StrictModel(BaseModel):
     """Base of frozen settings that refuse unknown keys."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
+    __repr__ = short_repr
 
     def changed(self, **values: Any) -> Self:
         """A copy with some values replaced, checked as a file is. A dictionary replaces single keys of a table:

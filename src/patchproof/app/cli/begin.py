@@ -6,7 +6,8 @@ from typing import Annotated, Literal
 
 from typer import Argument, Exit, Option
 
-from patchproof.app.cli.console import Overwrite, names_of, progress, say, warn
+from patchproof.app.cli.console import Overwrite, names_of, say, warn
+from patchproof.base.progress import progress_bar
 
 SceneFile = Annotated[Path, Argument(help="The scene file (TOML).")]
 
@@ -44,7 +45,7 @@ def preview(
     overwrite: Overwrite = False,
 ) -> None:
     """A page that shows the object, the piece on it, and what networks see now; in seconds."""
-    from patchproof.app.begin.preview import preview_scene
+    from patchproof.app.begin.preview import preview as preview_scene
 
     result = preview_scene(scene, out, overwrite=overwrite)
     warn(result.warnings)
@@ -68,12 +69,12 @@ def plan(
 
     if out is not None:
         check_file(out, overwrite)
-    with progress() as bar:
+    with progress_bar() as bar:
         geometry, problem = plan_geometry(scene, progress=bar)
     warn(geometry.warnings)
     say(*geometry_lines(geometry))
     sys.stdout.flush()  # what follows takes minutes
-    with progress() as bar:
+    with progress_bar() as bar:
         full_plan = measured_plan(geometry, problem, timing=not no_timing, progress=bar)
     say(*measured_lines(full_plan))
     if out is not None:
