@@ -1,5 +1,6 @@
 """The verbs before anything is optimized: new, preview, plan, keys."""
 
+import shlex
 import sys
 from pathlib import Path
 from typing import Annotated, Literal
@@ -79,6 +80,22 @@ def plan(
     say(*measured_lines(full_plan))
     if out is not None:
         write_atomically(out, full_plan.model_dump_json(indent=1) + "\n")
+
+
+def examples(folder: Annotated[Path, Argument(help="The folder to copy them to, new or empty.")]) -> None:
+    """Copy five programs and their scenes: a patch on a box, your network, photographs, a detector, a print."""
+    from patchproof.base.errors import Refused
+    from patchproof.base.output import make_folder, write_atomically
+
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        got = f"{folder}, which {'has files' if folder.is_dir() else 'is a file'}"
+        raise Refused("a new or empty folder", got, "name another")
+    make_folder(folder)
+    for path in sorted((Path(__file__).parents[1] / "examples").glob("*.*")):
+        write_atomically(folder / path.name, path.read_bytes())
+        if path.suffix == ".py":
+            say(f"{path.name}: {path.read_text(encoding='utf-8').splitlines()[0].strip(chr(34))}")
+    say(f"next: cd {shlex.quote(str(folder))} && python box.py")
 
 
 def keys(
