@@ -7,7 +7,7 @@ from typing import Any
 
 from patchproof.base.text import printable
 
-_MAX_CHARACTERS, _MAX_ITEMS = 120, 4  # of what is shown as it is
+_MAX_CHARACTERS, _MAX_ITEMS = 100, 4  # of what is shown as it is
 
 
 def describe_value(value: object) -> str:

@@ -145,6 +145,7 @@ class Scene(ABC):
         if stream not in get_args(Stream) or not all(isinstance(value, Integral) and value >= 0 for value in (n, seed)):
             expected = f"a stream ({', '.join(get_args(Stream))}), n and a seed as whole numbers"
             raise Refused(expected, f"{stream}, {n!r}, {seed!r}", "correct these")
+        n, seed, start = map(int, (n, seed, start))  # NumPy's numbers, too
         return draw(self.settings, stream, n, seed, start, per_session, self.sheet_id if stream == "promise" else "")
 
     def with_template(self, name: str) -> Self:
