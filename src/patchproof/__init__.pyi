@@ -25,10 +25,10 @@ from .optimizer.imported_design import import_patch as import_patch
 from .optimizer.place_search import Place as Place
 from .optimizer.place_search import choose_place as choose_place
 from .optimizer.promise import PromiseOptions as PromiseOptions
+from .optimizer.promise_again import promise_run as promise_run
 from .optimizer.run import Run as Run
 from .optimizer.run import load_run as load_run
 from .optimizer.run import optimize as optimize
-from .optimizer.run import promise_run as promise_run
 from .photo.rejection import PhotoRejected as PhotoRejected
 from .render.photograph import photograph as photograph
 from .render.stage import Stage as Stage

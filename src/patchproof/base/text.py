@@ -34,11 +34,11 @@ def brief(value: object) -> str:
     return describe_value(value)
 
 
-def short_repr(thing: Any) -> str:
+def short_repr(self: Any) -> str:
     """Describe an object in a line, as "Name(key=value, ...)"; see `base.describe`."""
     from patchproof.base.describe import describe_object
 
-    return describe_object(thing)
+    return describe_object(self)
 
 
 def _escape(character: str) -> str:

@@ -214,34 +214,13 @@ def finish_run(
     if scene.mesh_glb is not None:
         output.write_atomically(out / _MESH_FILE, scene.mesh_glb)
     details = _details(problem, promise, out) | ({} if imported is None else {"imported": dict(imported)})
-    return _write(Run(out, scene, design, promise, details))
+    return write_run(Run(out, scene, design, promise, details))
 
 
-def _write(run: Run) -> Run:
+def write_run(run: Run) -> Run:
+    """Write run.json, and return the run."""
     output.write_atomically(run.folder / RUN_FILE, json.dumps(run.details, indent=1) + "\n")
     return run
-
-
-def promise_run(
-    run_folder: str | Path | Run,
-    *,
-    views: int | None = None,
-    trust: bool = False,
-    compute: Compute = Compute(),
-    progress: Progress = no_progress,
-) -> Run:
-    """Promise the rate of a finished run's design again, from `views` views and with the run's own controls; the run is
-    the same to the byte as if `optimize` had been given these views. A sheet keeps its promise until it is written
-    again. For `trust` see `load_run`.
-    """
-    compute, options = compute.without("promise", cluster=True), PromiseOptions(views)
-    with lock_folder(run_folder):
-        run = load_run(run_folder, trust)
-        options = replace(options, controls=tuple(run.promise.controls))
-        problem = set_problem(run.scene, compute.device, jobs=compute.jobs)
-        promise = promise_of(problem, run.design, options, partial(progress, "promise"))
-        details = run.details | {"promise": promise.model_dump(mode="json")}
-        return _write(replace(run, promise=promise, details=details))
 
 
 def load_run(folder: str | Path, trust: bool = False, named: Iterable[str] = ()) -> Run:

@@ -99,7 +99,7 @@ def promise(
     jobs: Jobs = None,
 ) -> None:
     """Promise a finished run's rate again: in full after a draft, or from more views."""
-    from patchproof.optimizer.run import promise_run
+    from patchproof.optimizer.promise_again import promise_run
     from patchproof.report.words import run_lines
 
     with progress_bar() as bar:
@@ -144,7 +144,7 @@ def sheet(
     else:
         from patchproof.optimizer.run import load_run
         from patchproof.reprints.run_sheet import sheet as sheet_of
-        from patchproof.reprints.run_sheet import sheet_of_several
+        from patchproof.reprints.several_designs import sheet_of_several
 
         first, *others = loaded = [load_run(folder, trust) for folder in runs]
         if others:
