@@ -44,6 +44,6 @@ def nearest_hint(labels: Sequence[str], label: str) -> str:
 
 def nearest_names(word: str, names: Sequence[str], otherwise: str) -> str:
     """Advice about an unknown name: up to three similar names, or else the text `otherwise`."""
-    byfolded = {folded(name): name for name in names}
-    near = difflib.get_close_matches(folded(word), byfolded, 3, 0.6)
-    return "did you mean " + " or ".join(f'"{byfolded[name]}"' for name in near) if near else otherwise
+    by_folded = {folded(name): name for name in names}
+    near = difflib.get_close_matches(folded(word), by_folded, 3, 0.6)
+    return "did you mean " + " or ".join(f'"{by_folded[name]}"' for name in near) if near else otherwise
