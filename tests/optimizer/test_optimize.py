@@ -27,8 +27,9 @@ from patchproof.optimizer.loop import start, steps, take_step
 from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.problem import set_problem
 from patchproof.optimizer.promise import CONTROLS, PromiseOptions, make_promise
+from patchproof.optimizer.promise_again import promise_run
 from patchproof.optimizer.responses import responses
-from patchproof.optimizer.run import load_run, promise_run
+from patchproof.optimizer.run import load_run
 from patchproof.optimizer.run import optimize as optimize_scene
 from patchproof.optimizer.subject import target_loss, total_variation
 from patchproof.render.photograph import photograph

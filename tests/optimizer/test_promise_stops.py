@@ -25,8 +25,8 @@ from patchproof.optimizer.promise import (
     control_claims,
     make_promise,
 )
+from patchproof.optimizer.promise_again import promise_run
 from patchproof.optimizer.responses import Responses
-from patchproof.optimizer.run import promise_run
 from test_optimize import scene_with
 from test_verify_verdict import promise_of
 

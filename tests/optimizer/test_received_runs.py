@@ -21,7 +21,8 @@ from patchproof.optimizer.evaluate import evaluate
 from patchproof.optimizer.imported_design import import_patch
 from patchproof.optimizer.problem import set_problem
 from patchproof.optimizer.promise import PromiseOptions
-from patchproof.optimizer.run import load_run, promise_run
+from patchproof.optimizer.promise_again import promise_run
+from patchproof.optimizer.run import load_run
 from patchproof.reprints.run_sheet import sheet
 from patchproof.sheets.manifest import load_manifest
 from test_optimize import toml

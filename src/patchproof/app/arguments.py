@@ -114,10 +114,8 @@ def _checked_value(value: Any, hint: Any, key: str, owner: str) -> Any:
     if key in _LEAST and isinstance(value, int) and value < _LEAST[key]:
         raise Refused(f"{key} of {owner} of {_LEAST[key]} or more", f"{value}", "give a larger one")
     if (kind := type(value).__name__) in _OPTIONS:
-        fields = get_type_hints(type(value))
-        return replace(
-            value, **{name: _checked_value(getattr(value, name), fields[name], name, kind) for name in fields}
-        )
+        fields = {name: (getattr(value, name), part) for name, part in get_type_hints(type(value)).items()}
+        return type(value)(**{name: _checked_value(field, part, name, kind) for name, (field, part) in fields.items()})
     return value
 
 
