@@ -250,7 +250,7 @@ def judged_report(folder: Path) -> pp.Report:
     (folder / "pictures").mkdir()
     Image.new("RGB", (16, 12)).save(folder / "pictures" / "a.photo.jpg")
     counts = {"photos": 9, "judged": 9, "measured": 9, "rate": 6 / 9, "interval": (0.3, 0.9)}
-    words = {"prediction_interval": (4, 9), "verdict": "kept", "effect": "shown", "matched_rate": None}
+    words = {"prediction_interval": (4, 9), "verdict": "kept"}
     control = {"name": "bare", "recognized": 2, "n": 9, "interval": (0.05, 0.6)}
     values = {"sheet_id": "0" * 10, "photos": [], "summary": counts | words, "controls": [control], "folder": folder}
     return pp.Report.model_validate(values)

@@ -16,6 +16,7 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
+from patchproof.report.run_words import evaluation_lines
 from synthetic_photos import make_manifest
 
 from patchproof.base.intervals import Estimate
@@ -32,7 +33,6 @@ from patchproof.evidence.results import (
 )
 from patchproof.optimizer.evaluate import Evaluation
 from patchproof.report.images import delta_map, save_pictures
-from patchproof.report.run_words import evaluation_lines
 from patchproof.report.tables import Drawing, Results, Table, write_results
 from patchproof.report.words import verdict_lines
 from patchproof.report.write import photos_csv, report_html, write_report

@@ -22,7 +22,7 @@ def report_in_notebook(report: Report) -> str:
     summary = report.summary
     rows = {"photographs": f"{summary.photos}, judged {summary.judged}, measured {summary.measured}"}
     if summary.prediction_interval is not None:
-        rows["promised"] = "{} to {} of {}".format(*summary.prediction_interval, summary.judged)
+        rows["expected"] = "{} to {} of {}".format(*summary.prediction_interval, summary.judged)
     rows |= {"reason": summary.reason, "next": summary.next_step}
     rows = {key: text for key, text in rows.items() if text}
     return notebook_html(f"verdict: {summary.verdict}", rows, _rates(report), _photo(report))
@@ -37,8 +37,8 @@ def _rates(report: Report) -> Rates:
     for each in report.controls:
         if each.n:
             rates[f"{each.name}, {each.n} photographs"] = each.recognized / each.n, each.interval
-    if worth is not None and not worth.photographed:
-        rates[f"{worth.control}, in simulation"] = worth.control_rate, (worth.control_rate, worth.control_rate)
+    if worth is not None and worth.source != "photographed":
+        rates[f"{worth.control}, {worth.source}"] = worth.control_rate, worth.control_interval
     return rates
 
 
