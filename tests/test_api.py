@@ -14,8 +14,10 @@ from PIL import Image
 
 import patchproof as pp
 import patchproof.base.errors
+import patchproof.optimizer.run as run_module
 from patchproof.app.capture.album import UploadRefused
 from patchproof.base.errors import TimeLimitExceeded, WorkerDied
+from patchproof.base.workers import use_threads
 from patchproof.networks.bounds import UnsupportedNetwork
 from patchproof.optimizer.problem import set_problem
 from patchproof.optimizer.promise import PROMISE_VIEWS
@@ -226,5 +228,57 @@ def test_errors_are_one_tree_and_cross_processes():
 
 
 def test_results_show_themselves_in_a_notebook(run):
-    assert f"{run.promise.rate:.1%}" in run.promise._repr_html_() and "data:image/png" in run._repr_html_()
-    assert html.escape(run.promise.headline) in run._repr_html_()
+    shown = run.promise._repr_html_()
+    assert f"{run.promise.rate:.1%}" in shown and shown.count("<svg") == 1 + len(run.promise.controls)
+    assert "data:image/png" in run._repr_html_() and html.escape(run.promise.headline) in run._repr_html_()
+    assert [step["step"] for step in run.history] == list(range(1, 13)) and "loss" in run.history[0]
+
+
+def test_everything_public_has_a_short_repr(run, tmp_path):
+    """A line that says what it is, however large it is."""
+    manifest, report = pp.sheet(run, tmp_path / "sheet.pdf"), judged_report(tmp_path)
+    things = [run, run.scene, run.scene.settings, run.promise, manifest, report, report.summary, network()]
+    things += [pp.set_stage(run.scene), run.scene.draw("train", 9), pp.load_printer("coated"), pp.Compute()]
+    things += [pp.Reprint(tmp_path, dict.fromkeys("abcdefgh")), pp.Preview(tmp_path, ("line",) * 9, (), None)]
+    for thing in things:
+        assert repr(thing).startswith(f"{type(thing).__name__}(") and len(repr(thing)) < 800 and "\n" not in repr(thing)
+    assert f"rate={run.promise.rate:.4g}" in repr(run) and "label='box'" in repr(run.scene)
+
+
+def judged_report(folder: Path) -> pp.Report:
+    """Of 9 photographs, 6 recognized, beside a control's 2 of 9, with a picture of one."""
+    (folder / "pictures").mkdir()
+    Image.new("RGB", (16, 12)).save(folder / "pictures" / "a.photo.jpg")
+    counts = {"photos": 9, "judged": 9, "measured": 9, "rate": 6 / 9, "interval": (0.3, 0.9)}
+    words = {"prediction_interval": (4, 9), "verdict": "kept"}
+    control = {"name": "bare", "recognized": 2, "n": 9, "interval": (0.05, 0.6)}
+    values = {"sheet_id": "0" * 10, "photos": [], "summary": counts | words, "controls": [control], "folder": folder}
+    return pp.Report.model_validate(values)
+
+
+def test_a_report_is_drawn_with_its_rates_and_a_photograph(tmp_path):
+    report = judged_report(tmp_path)
+    picture, bars = report.plot().axes
+    assert len(picture.images) == 1 and [bar.get_width() for bar in bars.patches] == pytest.approx([200 / 3, 200 / 9])
+    shown = report._repr_html_()
+    assert shown.count("<svg") == 2 and "66.7%" in shown and "data:image" in shown and "4 to 9 of 9" in shown
+    assert "folder" not in report.model_dump()
+
+
+def test_a_draft_in_python_is_that_of_the_command_line(tmp_path, monkeypatch):
+    """In steps and views, and as thoroughly as it shares the cores: one thread in each process."""
+    monkeypatch.setattr("patchproof.optimizer.run.DRAFT_EFFORT", (2, 8))
+    monkeypatch.setattr("patchproof.base.workers.available_cores", lambda: 2)
+    monkeypatch.setattr("patchproof.optimizer.loop.SELECT_VIEWS", 4)
+    seen, whole = [], run_module.set_problem
+
+    def problem_of(*arguments):
+        seen.append((torch.get_num_threads(), arguments[-1]))
+        return whole(*arguments)
+
+    monkeypatch.setattr(run_module, "set_problem", problem_of)
+    with use_threads(2):
+        run = pp.optimize(scene(), tmp_path / "run", models=[network()], draft=True)
+        assert torch.get_num_threads() == 2
+    assert (run.scene.settings.optimize.steps, run.promise.n, run.promise.draft) == (2, 8, True)
+    assert seen == [(1, 2)] and pickle.loads(pickle.dumps(pp.optimize)) is pp.optimize

@@ -58,7 +58,7 @@ def named(nodes: list[ast.Import | ast.ImportFrom], package: str = "patchproof")
 def tool() -> dict[Path, tuple[set[str], set[str]]]:
     """By module of the tool, from its folder on: the tool's and the laboratory's rooms that it imports."""
     found = {}
-    for path in TOOL.rglob("*.py"):
+    for path in {*TOOL.rglob("*.py")} - {*TOOL.glob("app/examples/*")}:  # users' programs
         nodes = imports_in(path.read_text(encoding="utf-8"))
         found[path.relative_to(TOOL)] = named(nodes), named(nodes, "patchlab")
     return found

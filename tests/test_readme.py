@@ -95,18 +95,18 @@ def test_the_studies_that_are_quoted_can_be_run_again(folder, name, count):
     assert len({cell.name for cell in study.cells(settings, path.parent)}) == count
 
 
-def test_python(tmp_path, monkeypatch, capsys):
+def test_python(here, monkeypatch, capsys):
     (code,) = blocks("python")
-    assert sum(bool(line.strip()) for line in code.splitlines()) <= 30
-    monkeypatch.chdir(tmp_path)
-    names: dict = {}
-    fewer = code.replace('run, 6, "photos"', 'run, 2, "photos"')
+    assert sum(bool(line.strip()) for line in code.splitlines()) <= 8
+    monkeypatch.chdir(here)
+    fewer = code.replace("8,", "4,")
     assert fewer != code
-    exec(compile(fewer, "README.md", "exec"), names)
-    gradient, difference = (float(value) for value in re.findall(r"tensor\((\S+?)[,)]", capsys.readouterr().out)[:2])
-    # float32 pictures of 2 × 96 × 96 pixels, summed, and a difference over 0.04
-    assert gradient == pytest.approx(difference, rel=0.02) and gradient != 0
-    assert names["report"].summary.photos == 2
+    for name in ("run", "sheet.pdf", "photos", "report"):
+        fewer = fewer.replace(f'"{name}"', f'"python-{name}"')
+    fewer = fewer.replace("sheet.json", "python-sheet.json")
+    monkeypatch.setattr("patchproof.optimizer.run.DRAFT_EFFORT", (1, 8))
+    exec(compile(fewer, "README.md", "exec"), {})
+    assert capsys.readouterr().out.strip() in ("kept", "broken", "cannot_tell")
 
 
 def words(path: Path) -> str:

@@ -50,6 +50,10 @@ corners: dict[int, np.ndarray] = next(iter(taken.photos.values())).marker_corner
 evaluation: pp.Evaluation = pp.evaluate("run", n=8)
 share: float = evaluation.models["builtin"].controls["bare"].rate
 compared = pp.compare(["run", "imported"], "compared")
+shown: pp.Preview = pp.preview(made, "preview", overwrite=True)
+with pp.progress_bar() as bar:
+    run = pp.promise_run(run.folder, views=400, progress=bar)
+steps: list = run.history
 report: pp.Report = pp.verify("photos", "sheet.json", "report", capture=pp.CaptureInfo(ruler_mm=(97.1, 97.3)))
 verdict: str = report.summary.verdict
 goal: pp.Goal = scene.settings.target.goal

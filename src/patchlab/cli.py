@@ -9,6 +9,7 @@ from typer.core import TyperCommand
 
 from patchproof.app.cli import console
 from patchproof.base.errors import Refused
+from patchproof.base.progress import progress_bar
 from patchproof.base.validation import spelling_hint
 
 app = typer.Typer(
@@ -56,7 +57,7 @@ def harden(
         "attacks": console.names_of(evaluate),
         "attack_epsilons": console.names_of(attack_eps),
     }
-    with console.progress() as bar:
+    with progress_bar() as bar:
         work = Work(resume, overwrite, jobs or 1, cluster, lambda done, total: bar("harden", done, total))
         finished = harden_images(validate_model(HardenSettings, options, "the options"), out, work)
     console.say_study(finished)
@@ -104,7 +105,7 @@ def study(
     if config is None or out is None:
         missing = "--config" if config is None else "--out"
         raise typer.BadParameter("missing; a config to start from: --example", param_hint=missing)
-    with console.progress() as bar:
+    with progress_bar() as bar:
         work = Work(resume, overwrite, jobs or 1, cluster, lambda done, total: bar("cells", done, total))
         changed = None if cells is None else {"cells": str(cells.resolve()), "left_out": "nothing"}
         finished = run_study(name, config, out, work, changed)
@@ -139,7 +140,7 @@ def bench(
     """Chart speed against accuracy of each setting on this machine: charts, tables and a page."""
     from patchlab.bench.run import run_bench
 
-    with console.progress() as bar:
+    with progress_bar() as bar:
         written = run_bench(name, out, quick=quick, overwrite=overwrite, progress=bar)
     for results in written:
         console.say_study(results)

@@ -5,6 +5,18 @@ The public names tell the story in order: scene → optimize → sheet → photo
 `patchproof --help` stay quick.
 """
 
+from types import FunctionType
+from typing import Any
+
 import lazy_loader
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+_import_name, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+
+
+def __getattr__(name: str) -> Any:
+    value = _import_name(name)
+    if name in __all__ and isinstance(value, FunctionType):
+        from patchproof.app.arguments import checked
+
+        value = globals()[name] = checked(value, name)
+    return value

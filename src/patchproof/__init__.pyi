@@ -1,3 +1,5 @@
+from .app.begin.preview import Preview as Preview
+from .app.begin.preview import preview as preview
 from .app.compare import compare as compare
 from .app.verify import CaptureInfo as CaptureInfo
 from .app.verify import verify as verify
@@ -6,6 +8,7 @@ from .base.errors import PatchproofError as PatchproofError
 from .base.errors import Refused as Refused
 from .base.goal import Goal as Goal
 from .base.progress import Progress as Progress
+from .base.progress import progress_bar as progress_bar
 from .base.settings import SceneSettings as SceneSettings
 from .base.version import __version__ as __version__
 from .channel.printer import Printer as Printer
@@ -18,6 +21,7 @@ from .classifier.network import Classifier as Classifier
 from .evidence.results import Report as Report
 from .optimizer.evaluate import Evaluation as Evaluation
 from .optimizer.evaluate import evaluate as evaluate
+from .optimizer.evaluate import promise_run as promise_run
 from .optimizer.imported_design import import_patch as import_patch
 from .optimizer.place_search import Place as Place
 from .optimizer.place_search import choose_place as choose_place

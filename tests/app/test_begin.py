@@ -15,7 +15,8 @@ from console import command
 
 from patchproof.app.begin.guess import footing, guess_label, guess_length_mm, guess_up
 from patchproof.app.begin.new import new_scene
-from patchproof.app.begin.preview import OBJECT, PAGE, _unprintable, _up_warning, preview_scene
+from patchproof.app.begin.preview import OBJECT, PAGE, _unprintable, _up_warning
+from patchproof.app.begin.preview import preview as preview_scene
 from patchproof.app.begin.sides import (
     NO_SURFACE_RGB,
     PICTURE_PX,

@@ -20,6 +20,7 @@ from safetensors import torch as safetensors_torch
 from patchlab.study.study import STUDIES, load_study, run_study
 from patchproof.app.cli import console
 from patchproof.base.errors import Refused
+from patchproof.base.progress import progress_bar
 from patchproof.base.validation import validate_model
 from patchproof.base.version import __version__
 from patchproof.optimizer import run as run_module
@@ -169,7 +170,7 @@ def test_a_full_disk_is_one_sentence(error, tmp_path, scene_file, monkeypatch, c
 def test_progress_in_a_file_is_a_line_now_and_then(monkeypatch, capsys):
     now = [0.0]
     monkeypatch.setattr(time, "monotonic", lambda: now[0])
-    with console.progress() as bar:
+    with progress_bar() as bar:
         for done in range(1, 101):
             now[0] += 1
             bar("optimize", done, 100)

@@ -31,8 +31,9 @@ from patchproof.evidence.results import (
 )
 from patchproof.optimizer.evaluate import Evaluation
 from patchproof.report.images import delta_map, save_pictures
+from patchproof.report.run_words import evaluation_lines
 from patchproof.report.tables import Drawing, Results, Table, write_results
-from patchproof.report.words import evaluation_lines, verdict_lines
+from patchproof.report.words import verdict_lines
 from patchproof.report.write import photos_csv, report_html, write_report
 from test_verify_run import promise
 

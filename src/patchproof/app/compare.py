@@ -41,7 +41,7 @@ AnswersByKind = Mapping[str, Responses]  # to a design and each of its controls
 
 
 def compare(
-    runs: Sequence[str | Path],
+    runs: Sequence[str | Path | Run],
     out: str | Path,
     *,
     models: Sequence[str | Classifier] | None = None,
@@ -55,7 +55,7 @@ def compare(
     """Compare the designs of several runs under the same conditions, and the two best of them under as many fresh ones.
 
     Args:
-        runs: folders of finished runs of one scene, two or more.
+        runs: finished runs of one scene, or their folders, two or more.
         out: folder for designs.html, designs.json and the tables.
         models, trust, compute, overwrite, progress: as in `evaluate`.
         n: conditions for each comparison.
@@ -108,7 +108,7 @@ def compare(
     return results
 
 
-def _load_runs(runs: Sequence[str | Path], with_networks: bool, trust: bool) -> dict[str, Run]:
+def _load_runs(runs: Sequence[str | Path | Run], with_networks: bool, trust: bool) -> dict[str, Run]:
     """Load runs by their folders' names, or by full paths if two names are equal; refused if their views differ."""
     paths = [Path(run).resolve() for run in runs]
     if len(set(paths)) < max(len(paths), 2):

@@ -161,7 +161,8 @@ def verify(
         parameters |= {name: path and Path(path).name for name, path in files.items()}
         parameters["ledger_photos"] = ledger_photos
         hashes = {"manifest": file_sha256(Path(sheet))} | {f"network {m.name}": m.sha256 for m in options.models}
-        report = report.changed(origin=Origin(options=parameters, sha256=hashes, versions=versions_of(_LIBRARIES)))
+        origin = Origin(options=parameters, sha256=hashes, versions=versions_of(_LIBRARIES))
+        report = report.changed(origin=origin, folder=out)
         stems = {stem_of(photo.file) for photo in report.photos[:MAX_PICTURED_PHOTOS]}
         # but for pictures of photographs that this report does not show
         clear_folder(out, lambda name: not name.startswith("pictures/") or name[9:].rsplit(".", 2)[0] in stems)

@@ -7,7 +7,6 @@ names all of its files can be overwritten: neither a mistyped path nor a receive
 
 import base64
 import errno
-import html
 import io
 import os
 import shutil
@@ -22,10 +21,8 @@ import numpy as np
 from patchproof.base.errors import Refused
 from patchproof.base.folder_lock import LISTING_FILE, append_listing, list_file, listed_names, lock_folder
 from patchproof.base.input import is_file, is_folder
-from patchproof.base.text import printable
 
 _ANOTHER = "choose another --out"
-_PICTURE_PX = 160  # side at which a design is shown; its own pixels are larger blocks
 
 
 @contextmanager
@@ -252,18 +249,6 @@ def image_pixels(content: bytes) -> np.ndarray:
 
     with Image.open(io.BytesIO(content)) as image:
         return np.asarray(image.convert("RGB"))
-
-
-def notebook_html(heading: str, rows: Mapping[str, str], picture: np.ndarray | None = None) -> str:
-    """Return a heading and a table of `rows`, with `picture` (uint8 H×W×3 sRGB) beside it."""
-    escaped = ((html.escape(printable(key)), html.escape(printable(value))) for key, value in rows.items())
-    cells = "".join(f"<tr><th>{key}</th><td>{value}</td></tr>" for key, value in escaped)
-    image = ""
-    if picture is not None:
-        uri = base64_uri(image_bytes(picture, "PNG"), "image/png")
-        style = f"height:{_PICTURE_PX}px;image-rendering:pixelated"
-        image = f'<img alt="design" src="{uri}" style="{style}">'
-    return f"<div><b>{html.escape(printable(heading))}</b><table>{cells}</table>{image}</div>"
 
 
 def rate_text(rate: float, interval: tuple[float, float]) -> str:

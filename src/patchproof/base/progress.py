@@ -1,11 +1,15 @@
 """Progress callbacks of long work.
 
-In: nothing. Out: the type of the `progress` parameter of every long public function, and its default, which reports
-nothing. Functions below a public one take an `advance` callback, for the stage that their caller named.
+In: nothing. Out: `progress_bar`; the type of the `progress` parameter of every long public function, and its default,
+which reports nothing. Functions below a public one take an `advance` callback, for the stage that their caller named.
 """
 
-from collections.abc import Callable
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
+LINE_EVERY_S = 30.0  # of progress, if standard error is not a terminal
 Progress = Callable[[str, int, int], None]
 """Called as `progress(stage, done, total)`: a stage's name ("optimize", "promise", ...), items done, items in all."""
 
@@ -19,3 +23,46 @@ def no_progress(stage: str, done: int, total: int) -> None:
 
 def no_advance(done: int, total: int) -> None:
     """Report nothing within a stage."""
+
+
+@contextmanager
+def progress_bar() -> Iterator[Progress]:
+    """Show progress on standard error: yields the function to pass as `progress`. A terminal or notebook gets a bar
+    with the time left, a file or pipe a line every 30 s.
+
+    Examples:
+        ```python
+        with pp.progress_bar() as bar:
+            run = pp.optimize("scene.toml", "run", progress=bar)
+        ```
+    """
+    in_notebook = "ipykernel" in sys.modules
+    if not sys.stderr.isatty() and not in_notebook:
+        yield _print_lines()
+        return
+    from rich import progress as rich
+    from rich.console import Console
+
+    times = rich.TimeElapsedColumn(), rich.TimeRemainingColumn()
+    columns = rich.TextColumn("{task.description:>12}"), rich.BarColumn(), rich.MofNCompleteColumn(), *times
+    with rich.Progress(*columns, console=Console(stderr=not in_notebook)) as progress:
+        tasks: dict[str, rich.TaskID] = {}
+
+        def advance(stage: str, done: int, total: int) -> None:
+            if stage not in tasks:
+                tasks[stage] = progress.add_task(stage, total=total)
+            progress.update(tasks[stage], completed=done, total=total)
+
+        yield advance
+
+
+def _print_lines() -> Progress:
+    last = time.monotonic()
+
+    def advance(stage: str, done: int, total: int) -> None:
+        nonlocal last
+        if done >= total or time.monotonic() - last >= LINE_EVERY_S:
+            last = time.monotonic()
+            print(f"{stage}: {done} of {total}", file=sys.stderr, flush=True)
+
+    return advance

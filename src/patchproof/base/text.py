@@ -33,6 +33,20 @@ def drawable(text: str, has_glyph: Callable[[str], bool]) -> str:
     return "".join(c if has_glyph(c) else _escape(c) for c in printable(text))
 
 
+def brief(value: object) -> str:
+    """Describe a value in a few words; see `base.describe`, which is loaded for this only."""
+    from patchproof.base.describe import describe_value
+
+    return describe_value(value)
+
+
+def short_repr(self: Any) -> str:
+    """Describe an object in a line, as "Name(key=value, ...)"; see `base.describe`."""
+    from patchproof.base.describe import describe_object
+
+    return describe_object(self)
+
+
 def _escape(character: str) -> str:
     return character.encode("unicode_escape").decode()
 

@@ -19,6 +19,7 @@ from pydantic_core import ErrorDetails
 
 from patchproof.base.errors import Refused
 from patchproof.base.input import read_text
+from patchproof.base.text import brief, short_repr
 
 MAX_TOML_BYTES = 1 << 16  # shipped files have 3 kB; the time for a key of many parts grows with their square
 
@@ -52,6 +53,7 @@ class StrictModel(BaseModel):
     """Base of frozen settings that refuse unknown keys."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
+    __repr__ = short_repr
 
     def changed(self, **values: Any) -> Self:
         """A copy with some values replaced, checked as a file is. A dictionary replaces single keys of a table:
@@ -162,7 +164,8 @@ def _explain(model: type[BaseModel], error: ErrorDetails, source: str) -> Refuse
         return Refused(f"only known keys in {source}", f'"{key}"', hint)
     if error["type"] == "missing":
         return Refused(f'the key "{key}" in {source}', "none", f"add {key}")
-    value = str(error.get("input"))
+    value = error.get("input")
+    value = brief(value) if callable(value) or hasattr(value, "shape") else str(value)
     value = value if len(value) < 80 else value[:77] + "..."
     reason = error["msg"].removeprefix("Value error, ").rstrip(".")
     reason = reason[0].lower() + reason[1:]

@@ -173,6 +173,21 @@ def available_cores() -> int:
     return cores if quota == "max" else max(1, min(cores, int(quota) // int(period)))
 
 
+@contextmanager
+def share_cores(jobs: int | None, device: str = "cpu", cluster: str | None = None) -> Iterator[int]:
+    """Yield `jobs`, by default one for each free core, and compute on one thread within the block, if processes can be
+    forked; with a GPU, a cluster, or processes that would have to import everything, one with this process's threads.
+    """
+    import multiprocessing
+
+    by_processes = can_fork() and device == "cpu"
+    if jobs is None:
+        may_fork = by_processes and cluster is None and not multiprocessing.current_process().daemon
+        jobs = available_cores() if may_fork else 1
+    with use_threads(1) if by_processes else nullcontext():
+        yield jobs
+
+
 def result_of(future: Future) -> Any:
     """Return a finished future's result or raise its exception; refused if the cluster itself was lost."""
     try:

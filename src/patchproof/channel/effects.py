@@ -21,6 +21,7 @@ from typing import Any, Literal, Self
 import numpy as np
 
 from patchproof.base.settings import SceneSettings
+from patchproof.base.text import short_repr
 
 _MIN_COSINE = 0.2  # a sun that has to light the patch alone becomes at most five times as strong
 # For settings of one number the range is ± the result of this function.
@@ -34,6 +35,11 @@ FacingCosine = Callable[[np.ndarray, np.ndarray], np.ndarray]
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Draws:
     """N draws: every field has N rows. A field of one row is repeated; any other mixture of lengths is a ValueError."""
+
+    __repr__ = short_repr
+
+    def __init_subclass__(cls):
+        cls.__repr__ = short_repr  # a dataclass would list all rows
 
     def __post_init__(self):
         counts = {len(values) for values in vars(self).values()} - {1}

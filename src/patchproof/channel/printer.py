@@ -26,6 +26,7 @@ from patchproof.base.color import LUMINANCE, clamp_to_unit
 from patchproof.base.errors import Refused
 from patchproof.base.input import read_file, read_json
 from patchproof.base.packaged import packaged_path
+from patchproof.base.text import short_repr
 from patchproof.base.validation import Finite, StrictModel, spelling_hint, validate_model
 from patchproof.channel.effects import Print
 
@@ -62,6 +63,7 @@ class Printer:
     gamut: Tensor  # float32 33×33×33, ΔE00 between sent and seen
     paper: Paper = field(default_factory=Paper)
     provenance: dict[str, Any] = field(default_factory=dict)
+    __repr__ = short_repr
 
     def apply(self, srgb: Tensor) -> Tensor:
         """Return the sRGB N×3×H×W that is seen when this sRGB is sent; values outside [0, 1] are clamped. Trilinear."""
@@ -74,7 +76,7 @@ class Printer:
     @cached_property
     def sha256(self) -> str:
         """Return the SHA-256 of everything that the printer's appearance depends on."""
-        digest = hashlib.sha256(repr(self.paper).encode())
+        digest = hashlib.sha256(f"Paper({self.paper.__repr_str__(', ')})".encode())
         for table in (self.lut, self.gamut):
             digest.update(table.detach().cpu().contiguous().numpy().tobytes())
         return digest.hexdigest()

@@ -16,47 +16,27 @@ def find_labels(labels: Sequence[str], label: str | int, accept: Sequence[str | 
     return tuple(dict.fromkeys(_find(labels, word) for word in (label, *accept)))
 
 
-def find_words(labels: Sequence[str], text: str, whole: bool = False) -> int:
-    """The index of the label with these words: "mug" finds "coffee mug", whose last word it is. With `whole`, the words
-    must be a label's whole name or its last words. Refused where several labels or none match.
-    """
-    words, names = _folded(text).split(), [[_folded(name).split() for name in (e, *e.split(","))] for e in labels]
-    ranks = (
-        lambda name: name == words,
-        lambda name: name[-len(words) :] == words,
-        lambda name: not whole and set(words) <= set(name),
-    )
-    for rank in ranks:
-        matches = [i for i, entry_names in enumerate(names) if words and any(map(rank, entry_names))]
-        if len(matches) == 1:
-            return matches[0]
-        if matches:
-            shown = ", ".join(f'"{labels[i].split(",")[0]}"' for i in matches[:6])
-            more = ", ..." if len(matches) > 6 else ""
-            got = f'"{text}", which is in {len(matches)} labels'
-            raise Refused("words of one label", got, f"choose {shown}{more}")
-    raise Refused("a label that the network knows", f'"{text}"', _nearest(labels, text))
-
-
 def _find(labels: Sequence[str], label: str | int) -> int:
     if isinstance(label, int):
         if not 0 <= label < len(labels):
             raise Refused(f"a label index from 0 to {len(labels) - 1}", str(label), "use one of those, or a name")
         return label
-    matches = [i for i, entry in enumerate(labels) if _folded(label) in map(_folded, [entry, *entry.split(",")])]
+    matches = [i for i, entry in enumerate(labels) if folded(label) in map(folded, [entry, *entry.split(",")])]
     if len(matches) == 1:
         return matches[0]
     if matches:
         do = "use the index " + " or ".join(f'{i} ("{labels[i]}")' for i in matches)
         raise Refused("a label that names one class", f'"{label}", which is in {len(matches)} labels', do)
-    raise Refused("a label that the network knows", f'"{label}"', _nearest(labels, label))
+    raise Refused("a label that the network knows", f'"{label}"', nearest_hint(labels, label))
 
 
-def _folded(text: str) -> str:
+def folded(text: str) -> str:
+    """Fold case and underscores."""
     return " ".join(text.casefold().replace("_", " ").split())
 
 
-def _nearest(labels: Sequence[str], label: str) -> str:
+def nearest_hint(labels: Sequence[str], label: str) -> str:
+    """Return advice with the labels nearest to a word."""
     names = list(dict.fromkeys(name.strip() for entry in labels for name in entry.split(",")))
     shown = ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
     return nearest_names(label, names, f"use an index below {len(labels)} or one of its {len(labels)} labels ({shown})")
@@ -64,6 +44,6 @@ def _nearest(labels: Sequence[str], label: str) -> str:
 
 def nearest_names(word: str, names: Sequence[str], otherwise: str) -> str:
     """Advice about an unknown name: up to three similar names, or else the text `otherwise`."""
-    by_folded = {_folded(name): name for name in names}
-    near = difflib.get_close_matches(_folded(word), by_folded, 3, 0.6)
+    by_folded = {folded(name): name for name in names}
+    near = difflib.get_close_matches(folded(word), by_folded, 3, 0.6)
     return "did you mean " + " or ".join(f'"{by_folded[name]}"' for name in near) if near else otherwise

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from patchproof.base.errors import Refused
 from patchproof.base.fingerprint import value_sha256
+from patchproof.base.text import brief, short_repr
 from patchproof.networks.batches import BatchedNetwork
 from patchproof.networks.windows import Windows
 
@@ -44,6 +45,10 @@ class Classifier:
 
     KIND: ClassVar[str] = "classifier"
     LOOKS_AT_BOXES: ClassVar[bool] = False  # whether the object's box matters
+    __repr__ = short_repr
+
+    def __init_subclass__(cls):
+        cls.__repr__ = short_repr  # a dataclass would list all layers
 
     @property
     def fingerprint(self) -> str:
@@ -69,6 +74,8 @@ class Classifier:
         `cache` as well, no gradient is computed: outside of the windows, the photographs equal the first ones that were
         passed with this cache.
         """
+        if not isinstance(photos_srgb, Tensor) or photos_srgb.dim() != 4 or photos_srgb.shape[1] != 3:
+            raise Refused("photographs as a tensor N×3×H×W", brief(photos_srgb), "stack them, channels first")
         squares, square_windows = center_square(photos_srgb, self.input_px), None
         if windows is not None:
             square_windows = Windows(_windows_in_square(windows, photos_srgb.shape[-2:], self.input_px), cache)

@@ -5,13 +5,17 @@ except in page checks.
 """
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from patchproof.base.goal import GainWord, Goal
 from patchproof.base.validation import Finite, StrictModel
 from patchproof.photo.rejection import PhotoRejected
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 Status = Literal["judged", "measured", "rejected"]
 VerdictWord = Literal["kept", "broken", "cannot_tell"]
@@ -322,7 +326,7 @@ class Origin(StrictModel):
 
 
 class Report(StrictModel):
-    """The content of report.json, and the ledger for its chart, which is not written there."""
+    """The content of report.json, and the ledger for its chart and the report's folder, which are not written there."""
 
     sheet_id: str
     photos: tuple[PhotoEntry, ...]
@@ -330,16 +334,16 @@ class Report(StrictModel):
     controls: tuple[Control, ...] = ()
     origin: Origin = Origin()
     ledger: Ledger | None = Field(None, exclude=True)
+    folder: Path | None = Field(None, exclude=True)
+    SHOWN: ClassVar[tuple[str, ...]] = ("sheet_id", "summary.verdict", "summary.rate", "summary.interval", "photos")
+
+    def plot(self) -> "Figure":
+        """Draw the rates as bars with their intervals beside a photograph, as a matplotlib figure."""
+        from patchproof.evidence.shown_report import report_figure
+
+        return report_figure(self)
 
     def _repr_html_(self) -> str:
-        """The verdict in a notebook."""
-        from patchproof.base.output import notebook_html, rate_text
+        from patchproof.evidence.shown_report import report_in_notebook
 
-        summary = self.summary
-        rows = {"photographs": f"{summary.photos}, judged {summary.judged}, measured {summary.measured}"}
-        if summary.rate is not None and summary.interval is not None:
-            rows["recognized"] = rate_text(summary.rate, summary.interval)
-        if summary.prediction_interval is not None:
-            rows["expected"] = "{} to {} of {}".format(*summary.prediction_interval, summary.judged)
-        rows |= {"reason": summary.reason, "next": summary.next_step or ""}
-        return notebook_html(f"verdict: {summary.verdict}", {key: text for key, text in rows.items() if text})
+        return report_in_notebook(self)

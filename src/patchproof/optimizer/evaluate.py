@@ -19,7 +19,7 @@ from patchproof.base.errors import Refused
 from patchproof.base.folder_lock import lock_folder
 from patchproof.base.goal import Goal
 from patchproof.base.input import is_file
-from patchproof.base.output import notebook_html, rate_text, write_atomically
+from patchproof.base.output import write_atomically
 from patchproof.base.progress import Advance, Progress, no_advance, no_progress
 from patchproof.base.validation import StrictModel
 from patchproof.base.workers import Workers, open_workers
@@ -63,12 +63,13 @@ class Evaluation(StrictModel):
     not_measured: dict[str, str] = Field(default_factory=dict)  # reasons by figure
 
     def _repr_html_(self) -> str:
-        """The rates in a notebook."""
-        rows = {}
+        from patchproof.base.notebook import notebook_html
+
+        rates = {}
         for name, each in self.models.items():
-            rows |= {name: rate_text(each.rate, each.interval)}
-            rows |= {f"{name}, {kind}": rate_text(claim.rate, claim.interval) for kind, claim in each.controls.items()}
-        return notebook_html(f"recognized in {self.n} fresh conditions", rows)
+            claims = {name: each} | {f"{name}, {kind}": claim for kind, claim in each.controls.items()}
+            rates |= {key: (claim.rate, claim.interval) for key, claim in claims.items()}
+        return notebook_html(f"recognized in {self.n} fresh conditions", {}, rates)
 
     def to_json(self) -> str:
         """Return the text of evaluate.json."""
@@ -82,7 +83,7 @@ class Evaluation(StrictModel):
 
 
 def evaluate(
-    run_folder: str | Path,
+    run_folder: str | Path | Run,
     *,
     models: Sequence[str | Classifier] | None = None,
     n: int = PROMISE_VIEWS,
@@ -95,7 +96,7 @@ def evaluate(
     """Evaluate a run's design and controls under fresh conditions, and write the result to RUN/evaluate.json.
 
     Args:
-        run_folder: a finished run.
+        run_folder: a finished run, or its folder.
         models: networks in place of the run's: names, or classifiers in memory, which other processes cannot load.
         n: conditions, 1 or more.
         seed: of the conditions, in place of the scene's.

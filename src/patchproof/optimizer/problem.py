@@ -140,16 +140,19 @@ def set_problem(
     """The problem of a scene; `models` replaces the scene's classifiers, `loss` that of its goal. `jobs` processes
     share its views on a CPU, one does on a GPU.
     """
-    _check_device(device)
+    check_device(device)
     settings = scene.settings
-    names, least_score = models or settings.target.models, settings.target.least_score
+    names, least_score = models or scene.networks, settings.target.least_score
     if scene.received is not None and not models:
         refuse_untrusted(scene.received, settings.target.models)
-    names = [scene.given_models.get(name, name) if isinstance(name, str) else name for name in names]
     classifiers = tuple(load_classifier(name, scene.base, device).with_least_score(least_score) for name in names)
     indices = tuple(find_labels(c.labels, settings.target.label, settings.target.accept) for c in classifiers)
     printer = load_printer(settings.printer.profile, scene.base)
     stage = set_stage(scene, device)
+    if loss is not None:
+        from patchproof.optimizer.custom_loss import check_loss
+
+        check_loss(loss, classifiers[0], indices[0], stage.device)
     subject = subject_of(scene, printer, max(classifier.input_px for classifier in classifiers), stage.device)
     jobs = jobs if stage.device.type == "cpu" else 1
     if jobs > 1:
@@ -165,7 +168,8 @@ def set_problem(
     return problem
 
 
-def _check_device(device: str) -> None:
+def check_device(device: torch.device | str) -> None:
+    """Refuse a device that this torch lacks."""
     try:
         torch.zeros(1, device=device)
     except (RuntimeError, AssertionError) as error:

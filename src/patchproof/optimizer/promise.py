@@ -54,9 +54,11 @@ class PromiseOptions:
     controls: tuple[str, ...] = CONTROLS
 
     def __post_init__(self):
-        if self.views is not None and self.views < 2 * VIEWS_PER_SESSION:
+        if isinstance(self.views, int) and self.views < 2 * VIEWS_PER_SESSION:
             expected = f"a promise of {2 * VIEWS_PER_SESSION} views, two sessions, at least"
             raise Refused(expected, f"{self.views} views", "ask for more")
+        if not self.controls:
+            raise Refused("one control at least", "none", f"name some of {', '.join(CONTROLS)}")
 
 
 def make_promise(

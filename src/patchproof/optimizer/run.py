@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 import torch
@@ -26,10 +26,11 @@ from patchproof.base.compute import Compute
 from patchproof.base.errors import Refused
 from patchproof.base.fingerprint import refuse_other_inputs
 from patchproof.base.folder_lock import lock_folder
-from patchproof.base.input import is_file, read_file, read_json
+from patchproof.base.input import is_file, read_file, read_json, read_text
 from patchproof.base.progress import Advance, Progress, no_progress
 from patchproof.base.run_files import CHECKPOINT_FILE, RUN_FILE, require_finished_run
 from patchproof.base.settings import SceneSettings, named_paths
+from patchproof.base.text import short_repr
 from patchproof.base.validation import refuse_untrusted, validate_model
 from patchproof.base.version import __version__
 from patchproof.classifier.network import Classifier
@@ -80,11 +81,21 @@ class Run:
     design: np.ndarray  # uint8 h×w×3; of a texture run 1×M×3, as in `optimize.texture.Texture`
     promise: Promise
     details: dict[str, Any]
+    SHOWN: ClassVar[tuple[str, ...]] = ("folder", "scene.settings.target.label", "design", "promise")
+    __repr__ = short_repr
+
+    def __fspath__(self) -> str:
+        return str(self.folder)
+
+    @property
+    def history(self) -> list[dict[str, Any]]:
+        """One dictionary a step, as steps.jsonl has them: step, loss, confidence, rate, gradient; [] without steps."""
+        path = self.folder / _LOG_FILE
+        lines = read_text(path, "a log of steps").splitlines() if is_file(path) else ()
+        return [json.loads(line) for line in lines]
 
     def _repr_html_(self) -> str:
-        """The promise and the design in a notebook; a texture is not one picture."""
-        picture = self.design if self.scene.HAS_PIECE else None
-        return output.notebook_html(self.promise.headline, {"run": str(self.folder), **self.promise.figures()}, picture)
+        return self.promise.html(self.design if self.scene.HAS_PIECE else None)  # a texture is not one picture
 
 
 def optimize(
@@ -96,6 +107,8 @@ def optimize(
     seed: int | None = None,
     promise: PromiseOptions = PromiseOptions(),
     compute: Compute = Compute(),
+    draft: bool = False,
+    thorough: bool = False,
     resume: bool = False,
     overwrite: bool = False,
     progress: Progress = no_progress,
@@ -110,6 +123,8 @@ def optimize(
         seed: of all random draws, in place of the scene file's `optimize.seed`; a scene in memory has its own.
         promise: how many views the promise takes, and its controls.
         compute: device and processes; refuses a cluster.
+        draft: a first look, in few steps and promised from few views.
+        thorough: for a print that counts, three times the steps and four times the views.
         resume: continue from the folder's checkpoint, at the place that was chosen there.
         overwrite: delete an earlier run in the folder first.
         progress: called with the stages "place" (where the scene searches one), "optimize" (steps) and "promise"
@@ -131,7 +146,8 @@ def optimize(
         else:
             unfinished = is_file(out / CHECKPOINT_FILE) and not is_file(out / RUN_FILE)
             output.check_folder(out, RUN_FILE_PATTERNS, overwrite, unfinished=unfinished, inputs=(scene,))
-        scene = resolve_scene(scene, seed)
+        steps, views = effort_of(draft, thorough, None, promise.views)
+        scene, promise = resolve_scene(scene, seed).with_steps(steps), replace(promise, views=views)
         save_place, searched = None, {}
         if not scene.HAS_PLACE:
             search_options = {"models": models, "loss": loss, "compute": compute, "progress": progress}
@@ -147,6 +163,14 @@ def optimize(
         state = load_checkpoint(out, problem) if resume else start(problem)
         design = _run_steps(problem, state, out, partial(progress, "optimize"))
         return finish_run(problem, design, out, promise, progress)
+
+
+def effort_of(draft: bool, thorough: bool, steps: int | None, views: int | None) -> tuple[int | None, int | None]:
+    """Return steps and promised views of a first look or of a print that counts, where they are not given."""
+    if draft and thorough:
+        raise Refused("a draft or a thorough run", "both", "leave one out")
+    effort = DRAFT_EFFORT if draft else THOROUGH_EFFORT if thorough else (None, None)
+    return steps or effort[0], views or effort[1]
 
 
 def resolve_scene(scene: str | Path | Scene, seed: int | None) -> Scene:

@@ -10,6 +10,8 @@ import torch
 from torch import Tensor
 
 from patchproof.base.color import linear_from_srgb, srgb_from_linear
+from patchproof.base.errors import Refused
+from patchproof.base.text import brief
 from patchproof.channel import camera as camera_model
 from patchproof.channel.camera import add_noise, develop, gaussian_blur, is_pointwise, reach_px
 from patchproof.channel.printer import print_change, vary_print
@@ -38,6 +40,13 @@ def photograph(
     the pictures are differentiable, or its uint8 pixels h×w×3. A square size gives the photograph's centered square.
     `jpeg` has the meaning that it has in `channel.camera.develop`.
     """
+    if min(size_px) < 1:
+        raise Refused("size_px of 1 pixel at least", f"{size_px}", "give (width, height)")
+    if isinstance(shown, np.ndarray | Tensor):
+        is_pixels = isinstance(shown, np.ndarray)
+        if shown.ndim != 3 or shown.shape[-1 if is_pixels else 0] != 3 or (is_pixels and shown.dtype != np.uint8):
+            expected = "a design as uint8 pixels h×w×3, or as a float tensor 3×h×w in [0, 1]"
+            raise Refused(expected, brief(shown), "convert it")
     if isinstance(shown, np.ndarray):
         shown = torch.tensor(shown, dtype=torch.float32, device=stage.device).permute(2, 0, 1) / 255
     if isinstance(shown, Tensor):

@@ -6,10 +6,11 @@ its textures; and the rendering of designs. Scenes made of pictures have no obje
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import torch
 
+from patchproof.base.text import short_repr
 from patchproof.channel.printer import load_printer
 from patchproof.render.designs import LearnedTextures, PrintedPiece
 from patchproof.render.surfaces import ObjectSurface, PieceSurface, object_surface, piece_surface
@@ -28,6 +29,8 @@ class Stage:
     device: torch.device
     object: ObjectSurface | None
     piece: PieceSurface | None
+    SHOWN: ClassVar[tuple[str, ...]] = ("scene", "device")
+    __repr__ = short_repr
 
     @property
     def camera(self) -> "Camera | None":

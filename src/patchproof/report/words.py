@@ -99,7 +99,7 @@ def promise_lines(promise: Any, settings: Mapping[str, Any], run: str = "RUN") -
         f"[{low:.1%}, {high:.1%}] by {first.name}{background and f', simulated {background}'}",
         *(f"  also {m.name}: {m.rate:.1%} [{m.interval[0]:.1%}, {m.interval[1]:.1%}]" for m in more_models),
         *([meaning] if meaning else []),
-        *_control_lines({kind: claim.model_dump() for kind, claim in promise.controls.items()}),
+        *control_lines({kind: claim.model_dump() for kind, claim in promise.controls.items()}),
     ]
 
 
@@ -129,33 +129,6 @@ def run_lines(run: Any) -> list[str]:
         following = run.promise.command(folder)
     lines = promise_lines(run.promise, settings | {"imported": run.details.get("imported")}, folder)
     return [*lines, f"run: {folder}", *([f"next: {following}"] if run.promise.answer != "does_not_help" else [])]
-
-
-def imported_lines(imported: Mapping[str, Any]) -> list[str]:
-    """Sum up an imported picture: its size in print, and how far the printer misses its colors."""
-    width, height = imported["picture_px"]
-    return [
-        f"{imported['file']}: {width} × {height} pixels, printed at {imported['dpi']:.0f} dpi; {imported['printer']} "
-        f"misses its colors by {imported['delta_e00']:.1f} ΔE00 in the mean, {imported['out_of_gamut']:.0%} of them "
-        "visibly",
-        *(f"  {note}" for note in imported["notes"]),
-    ]
-
-
-def evaluation_lines(result: Mapping[str, Any]) -> list[str]:
-    """Sum up an evaluation: whether the design helps, by each network, its rate and controls."""
-    lines, goal = [], Goal(result["goal"])
-    for name, rates in result["models"].items():
-        low, high = rates["interval"]
-        ends = {kind: claim["difference_interval"] for kind, claim in rates["controls"].items()}
-        word = goal.answer(ends[goal.hardest(ends)])
-        told = goal.words[word] + f" (what tells: --n {4 * result['n']})" * (word == "cannot_tell")
-        share = f"{rates['rate']:.1%} of {result['n']} conditions [{low:.1%}, {high:.1%}]"
-        lines.append(f"{name}: {told}; recognized in {share}")
-        lines += _control_lines(rates["controls"])
-        if rates["ap50"] is not None:
-            lines.append("  AP50 " + ", ".join(f"{kind} {share:.3f}" for kind, share in rates["ap50"].items()))
-    return lines + not_measured_lines(result["not_measured"])
 
 
 def verdict_lines(report: Any) -> list[str]:
@@ -202,10 +175,10 @@ def _estimated_lines(estimated: Any) -> list[str]:
         return [f"controls not rendered into these photographs: {agree}"]
     names = ("n", "difference", "difference_interval")
     rows = {c.name: {"rate": c.rates[1], **{name: getattr(c, name) for name in names}} for c in estimated.controls}
-    return [f"controls rendered into these photographs ({agree}):", *_control_lines(rows)]
+    return [f"controls rendered into these photographs ({agree}):", *control_lines(rows)]
 
 
-def _control_lines(controls: Mapping[str, Mapping[str, Any]]) -> list[str]:
+def control_lines(controls: Mapping[str, Mapping[str, Any]]) -> list[str]:
     rows = []
     for kind, claim in controls.items():
         rate, of_count = claim["rate"], f" of {claim['n']}" if claim.get("n") else ""

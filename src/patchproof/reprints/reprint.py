@@ -19,6 +19,7 @@ from patchproof.base.compute import Compute
 from patchproof.base.errors import Refused
 from patchproof.base.output import make_folder, new_folder
 from patchproof.base.progress import Progress, no_progress
+from patchproof.base.text import short_repr
 from patchproof.base.workers import Workers, fork_workers, open_workers, result_of
 from patchproof.optimizer.run import Run, load_run
 from patchproof.report.coco import PATCH, LabeledPhoto, coco_json
@@ -42,6 +43,7 @@ class Reprint:
 
     folder: Path
     photos: dict[str, PhotoTruth]
+    __repr__ = short_repr
 
 
 def reprint(

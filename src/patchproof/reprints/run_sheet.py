@@ -8,6 +8,7 @@ template with `plan_page` says where the piece goes and how to photograph it. Pa
 from dataclasses import replace
 from pathlib import Path
 
+from patchproof.base.output import check_file
 from patchproof.base.validation import texts_in
 from patchproof.optimizer.run import Run
 from patchproof.reprints.plan_view import draw_plan_view
@@ -24,7 +25,13 @@ from patchproof.sheets.write import write_sheet
 
 
 def sheet(
-    run: Run, pdf_path: str | Path, *, template: str | None = None, control: str | None = None, copies: int = 1
+    run: Run,
+    pdf_path: str | Path,
+    *,
+    template: str | None = None,
+    control: str | None = None,
+    copies: int = 1,
+    overwrite: bool = False,
 ) -> Manifest:
     """Write the page of a run's design as a PDF at true size, and its manifest beside it.
 
@@ -34,10 +41,13 @@ def sheet(
         template: a template's name or file, in place of the scene's.
         control: print this in place of the design: "mean", "gray", "noise", "shuffled" or "blank".
         copies: pages with the same content, for label rolls.
+        overwrite: replace an earlier page and manifest.
 
     Raises:
         Refused: where the piece does not fit the page.
     """
+    for path in (Path(pdf_path), Path(pdf_path).with_suffix(".json")):
+        check_file(path, overwrite)
     content, scene = content_of(run, template, control, Path(pdf_path).parent)
     page = page_template(scene.settings.sheet.template)
     plan = plan_of(scene, page, content) if page and page.plan_page else None

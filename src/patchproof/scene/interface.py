@@ -10,14 +10,16 @@ without one. N is the number of conditions.
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from numbers import Integral
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self, get_args
 
 import numpy as np
 
 from patchproof.base.errors import Refused
 from patchproof.base.geometry import apply_homography, local_scales
 from patchproof.base.settings import SceneSettings, identity_settings
+from patchproof.base.text import short_repr
 from patchproof.base.validation import texts_in
 from patchproof.channel.effects import ViewEffect
 from patchproof.scene.conditions import Conditions, Stream, draw
@@ -84,6 +86,10 @@ class Scene(ABC):
     EFFECT_TABLES: ClassVar[tuple[str, ...]] = ("printer", "camera")  # of the settings: their effects show here
     TERMS: ClassVar[tuple[SceneTerm, ...]] = ()
     OMITTED: ClassVar[tuple[str, ...]] = ()  # effects that are not modeled
+    SHOWN: ClassVar[tuple[str, ...]] = ("description", "settings.target.label", "sheet_id", "seed")
+
+    def __init_subclass__(cls):
+        cls.__repr__ = short_repr  # a dataclass would list all fields, a mesh among them
 
     @abstractmethod
     def description(self) -> str:
@@ -112,6 +118,11 @@ class Scene(ABC):
         return None
 
     @property
+    def networks(self) -> list[Any]:
+        """The networks that its settings name: those given in Python, and names of the others."""
+        return [self.given_models.get(name, name) for name in self.settings.target.models]
+
+    @property
     def warnings(self) -> tuple[str, ...]:
         """Warnings for whoever reads results of the scene."""
         return self.notes
@@ -132,6 +143,10 @@ class Scene(ABC):
         who tries one change after the other does not meet the same few conditions each time.
         """
         seed = self.seed if seed is None else seed
+        if stream not in get_args(Stream) or not all(isinstance(value, Integral) and value >= 0 for value in (n, seed)):
+            expected = f"a stream ({', '.join(get_args(Stream))}), n and a seed as whole numbers"
+            raise Refused(expected, f"{stream}, {n!r}, {seed!r}", "correct these")
+        n, seed, start = map(int, (n, seed, start))  # NumPy's numbers, too
         return draw(self.settings, stream, n, seed, start, per_session, self.sheet_id if stream == "promise" else "")
 
     def with_template(self, name: str) -> Self:
@@ -139,6 +154,10 @@ class Scene(ABC):
         if name == self.settings.sheet.template:
             return self
         return self._identified(self.settings.changed(sheet={"template": name}), self.known)
+
+    def with_steps(self, steps: int | None) -> Self:
+        """Return the scene with another number of optimizer steps; the scene itself if it is None."""
+        return self._identified(self.settings.changed(optimize={"steps": steps}), self.known) if steps else self
 
     def for_design(self, sha256: str) -> Self:
         """Return the scene of a design that exists before its run. The design decides its sheet id, and thus its

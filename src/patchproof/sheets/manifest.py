@@ -10,7 +10,7 @@ import hashlib
 import json
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field, create_model, field_validator, model_validator
@@ -18,7 +18,6 @@ from pydantic import Field, create_model, field_validator, model_validator
 from patchproof.base.errors import Refused
 from patchproof.base.goal import GainWord, Goal, points_text
 from patchproof.base.input import open_image, read_json
-from patchproof.base.output import notebook_html, rate_text
 from patchproof.base.sessions import RatePosterior, count_by_session, rate_posterior
 from patchproof.base.text import command_text
 from patchproof.base.validation import Finite, NotNegativeRange, Share, StrictModel, validate_model
@@ -168,6 +167,7 @@ class Promise(StrictModel):
     outermost_mm: Annotated[tuple[tuple[Mm, Mm, Mm], ...], Field(max_length=2000)] = ()
     controls: dict[str, ControlClaim]
     conditions: tuple[ConditionClaim, ...]
+    SHOWN: ClassVar[tuple[str, ...]] = ("target.label", "rate", "interval", "n", "best_control")
 
     @model_validator(mode="after")
     def _lists_all_conditions(self) -> "Promise":
@@ -210,15 +210,16 @@ class Promise(StrictModel):
         points = points_text(rate, control.rate, control.difference_interval)
         return f"{draft}{self.target.goal.words[self.answer]}: {rate:.1%} recognized, {beside}: {points}."
 
-    def figures(self) -> dict[str, str]:
-        """The target, rate, interval and controls as text, in the order to be read."""
-        rows = {"target": f"{self.target.goal} {self.target.label}", "network": self.models[0].name}
-        rows |= {f"recognized in {self.n} views": rate_text(self.rate, self.interval)}
-        return rows | {kind: rate_text(claim.rate, claim.interval) for kind, claim in self.controls.items()}
+    def html(self, picture: np.ndarray | None = None) -> str:
+        """Return the promise as a notebook shows it: bars of the design's rate and its controls', and a picture."""
+        from patchproof.base.notebook import notebook_html
 
-    def _repr_html_(self) -> str:
-        """The promise in a notebook."""
-        return notebook_html(self.headline, self.figures())
+        rows = {"target": f"{self.target.goal} {self.target.label}", "network": self.models[0].name}
+        rates = {f"design, {self.n} views": (self.rate, self.interval)}
+        rates |= {kind: (claim.rate, claim.interval) for kind, claim in self.controls.items()}
+        return notebook_html(self.headline, rows, rates, picture)
+
+    _repr_html_ = html
 
 
 _table: Any = create_model  # the stub of create_model lacks unions
@@ -251,6 +252,10 @@ class Manifest(StrictModel):
     tiles: tuple[Tile, ...] = ()
     promise: Promise | None
     settings: dict[str, Any]
+    SHOWN: ClassVar[tuple[str, ...]] = ("sheet_id", "kind", "page_mm", "promise")
+
+    def _repr_html_(self) -> str | None:
+        return self.promise and self.promise.html(self.design and self.design.pixels())
 
     @field_validator("settings")
     @classmethod

@@ -22,7 +22,7 @@ import numpy as np
 from patchproof.app.begin.sides import SIDE_NAMES
 from patchproof.base.errors import Refused
 from patchproof.base.validation import Side
-from patchproof.classifier.labels import find_labels, find_words
+from patchproof.classifier.labels import find_labels, folded, nearest_hint
 from patchproof.mesh.load_mesh import load_mesh
 from patchproof.mesh.mesh import Mesh
 from patchproof.scene.bend import placement_method
@@ -125,12 +125,12 @@ def file_length(path: Path) -> float:
 def guess_label(labels: Sequence[str], words: str | None, path: str) -> str | int:
     """Find the label for a scene file by the user's words, or by those of the file's name; refused if none fits."""
     if words is not None:
-        return _scene_label(labels, find_words(labels, words))
+        return _scene_label(labels, _find_words(labels, words))
     stem = re.split(r"[/\\:]", path)[-1].rsplit(".", 1)[0].casefold()
     parts = [part for part in re.split(r"[^a-z]+", stem) if part]
     for text in (" ".join(parts), *parts):
         try:
-            return _scene_label(labels, find_words(labels, text, whole=True))
+            return _scene_label(labels, _find_words(labels, text, whole=True))
         except Refused:
             continue
     known = ": " + ", ".join(f'"{label}"' for label in labels) if len(labels) <= _MOST_LISTED_LABELS else ""
@@ -198,3 +198,25 @@ def _fit_on_side(mesh: Mesh, side: Side, size_mm: tuple[float, float], bend: boo
     frame, lay = side_frame(mesh, side), placement_method(bend)
     fitted_mm = largest_fitting_size(size_mm, lambda mm: place_if_close(mesh, frame, mm, 0.0, lay), smallest_piece_mm())
     return None if fitted_mm is None else PieceGuess(side, fitted_mm, bend)
+
+
+def _find_words(labels: Sequence[str], text: str, whole: bool = False) -> int:
+    """The index of the label with these words: "mug" finds "coffee mug", whose last word it is. With `whole`, the words
+    must be a label's whole name or its last words. Refused where several labels or none match.
+    """
+    words, names = folded(text).split(), [[folded(name).split() for name in (e, *e.split(","))] for e in labels]
+    ranks = (
+        lambda name: name == words,
+        lambda name: name[-len(words) :] == words,
+        lambda name: not whole and set(words) <= set(name),
+    )
+    for rank in ranks:
+        matches = [i for i, entry_names in enumerate(names) if words and any(map(rank, entry_names))]
+        if len(matches) == 1:
+            return matches[0]
+        if matches:
+            shown = ", ".join(f'"{labels[i].split(",")[0]}"' for i in matches[:6])
+            more = ", ..." if len(matches) > 6 else ""
+            got = f'"{text}", which is in {len(matches)} labels'
+            raise Refused("words of one label", got, f"choose {shown}{more}")
+    raise Refused("a label that the network knows", f'"{text}"', nearest_hint(labels, text))

@@ -7,6 +7,7 @@ on a design, which `plan` shows; layouts of texture coordinates to draw masks on
 export.
 """
 
+import html
 import warnings as python_warnings
 from collections import Counter
 from collections.abc import Sequence
@@ -32,6 +33,7 @@ from patchproof.base.errors import Refused
 from patchproof.base.output import base64_uri, image_bytes, new_folder, write_atomically
 from patchproof.base.resample import downscale
 from patchproof.base.settings import SceneSettings, load_scene_settings
+from patchproof.base.text import short_repr
 from patchproof.channel.printer import identity_printer
 from patchproof.classifier.labels import find_labels
 from patchproof.classifier.load import load_classifier
@@ -65,16 +67,25 @@ class Preview:
     lines: tuple[str, ...]
     warnings: tuple[str, ...]
     refused: str | None
+    __repr__ = short_repr
+
+    def _repr_html_(self) -> str:
+        page = html.escape(self.page.read_text(encoding="utf-8"))
+        return f'<iframe srcdoc="{page}" style="width:100%;height:600px;border:0"></iframe>'
 
 
-def preview_scene(scene_path: str | Path, out: str | Path, *, overwrite: bool = False) -> Preview:
-    """Write the preview of a scene file into the folder `out`; unreadable files and unusable networks are refused."""
-    path = Path(scene_path)
-    settings = load_scene_settings(path)
-    with new_folder(out, (PAGE, OBJECT), overwrite, (scene_path,)) as folder:
-        scene, refused = _scene(settings, path.resolve().parent)
+def preview(scene: str | Path | Scene, out: str | Path, *, overwrite: bool = False) -> Preview:
+    """Write the preview of a scene, or of a scene file, into the folder `out`; a notebook shows the page.
+
+    Raises:
+        Refused: for files that cannot be read, and networks that cannot be used.
+    """
+    path = Path("scene") if isinstance(scene, Scene) else Path(scene)
+    settings = scene.settings if isinstance(scene, Scene) else load_scene_settings(path)
+    with new_folder(out, (PAGE, OBJECT), overwrite, (scene,)) as folder:
+        scene, refused = (scene, None) if isinstance(scene, Scene) else _scene(settings, path.resolve().parent)
         with python_warnings.catch_warnings(action="always", record=True) as said:
-            classifiers = [load_classifier(name, scene.base) for name in settings.target.models]
+            classifiers = [load_classifier(net, scene.base) for net in scene.networks]
         indices, unknown = _indices(settings, [classifier.labels for classifier in classifiers])
         stage = set_stage(scene)
         views = sample_views(stage, classifiers, indices)

@@ -6,7 +6,7 @@ code 1.
 
 import typer
 
-from patchproof.app.cli.begin import keys, new, plan, preview
+from patchproof.app.cli.begin import examples, keys, new, plan, preview
 from patchproof.app.cli.calibrate import camera, printer
 from patchproof.app.cli.capture import capture
 from patchproof.app.cli.console import as_command, run_command_line, version_option
@@ -20,7 +20,7 @@ app = typer.Typer(
 )
 _calibrate = typer.Typer(no_args_is_help=True, help="Models of a printer or a camera, from photographs and profiles.")
 
-for _verb in (demo, new, preview, plan, optimize):
+for _verb in (demo, examples, new, preview, plan, optimize):
     app.command()(as_command(_verb))
 app.command("import")(as_command(import_picture))
 for _verb in (promise, evaluate, sheet, reprint, capture, verify):

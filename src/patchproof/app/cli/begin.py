@@ -1,12 +1,14 @@
 """The verbs before anything is optimized: new, preview, plan, keys."""
 
+import shlex
 import sys
 from pathlib import Path
 from typing import Annotated, Literal
 
 from typer import Argument, Exit, Option
 
-from patchproof.app.cli.console import Overwrite, names_of, progress, say, warn
+from patchproof.app.cli.console import Overwrite, names_of, say, warn
+from patchproof.base.progress import progress_bar
 from patchproof.base.text import command_text
 
 SceneFile = Annotated[Path, Argument(help="The scene file (TOML).")]
@@ -45,7 +47,7 @@ def preview(
     overwrite: Overwrite = False,
 ) -> None:
     """A page that shows the object, the piece on it, and what networks see now; in seconds."""
-    from patchproof.app.begin.preview import preview_scene
+    from patchproof.app.begin.preview import preview as preview_scene
 
     result = preview_scene(scene, out, overwrite=overwrite)
     warn(result.warnings)
@@ -69,16 +71,23 @@ def plan(
 
     if out is not None:
         check_file(out, overwrite)
-    with progress() as bar:
+    with progress_bar() as bar:
         geometry, problem = plan_geometry(scene, progress=bar)
     warn(geometry.warnings)
     say(*geometry_lines(geometry))
     sys.stdout.flush()  # what follows takes minutes
-    with progress() as bar:
+    with progress_bar() as bar:
         full_plan = measured_plan(geometry, problem, timing=not no_timing, progress=bar)
     say(*measured_lines(full_plan))
     if out is not None:
         write_atomically(out, full_plan.model_dump_json(indent=1) + "\n")
+
+
+def examples(folder: Annotated[Path, Argument(help="The folder to copy them to, new or empty.")]) -> None:
+    """Copy five programs and their scenes: a patch on a box, your network, photographs, a detector, a print."""
+    from patchproof.app.begin.copy_examples import copy_examples
+
+    say(*copy_examples(folder), f"next: cd {shlex.quote(str(folder))} && python box.py")
 
 
 def keys(

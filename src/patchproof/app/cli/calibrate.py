@@ -5,7 +5,8 @@ from typing import Annotated, Literal
 
 from typer import Argument, BadParameter, Option
 
-from patchproof.app.cli.console import Overwrite, pair_of, progress, say, warn
+from patchproof.app.cli.console import Overwrite, pair_of, say, warn
+from patchproof.base.progress import progress_bar
 
 
 def printer(
@@ -53,10 +54,10 @@ def printer(
 
         named = {} if corners is None else load_corners(corners)
         options = Options((), load_printer(known or "office"), load_optional_camera(camera), corners=named, find=find)
-        with progress() as bar:
+        with progress_bar() as bar:
             lines, warnings = printer_from_design(photos, sheet, out, options, known, overwrite, bar)
     else:
-        with progress() as bar:
+        with progress_bar() as bar:
             lines, warnings = printer_from_chart(photos, sheet, out, camera, overwrite, bar)
     warn(warnings)
     say(*lines)
@@ -75,6 +76,6 @@ def camera(
     from patchproof.calibrate.camera import calibrate_camera, calibration_lines
 
     ruler = None if ruler_mm is None else pair_of(ruler_mm, "--ruler-mm")
-    with progress() as bar:
+    with progress_bar() as bar:
         fitted_camera = calibrate_camera(photos, board, out, ruler_mm=ruler, overwrite=overwrite, progress=bar)
     say(*calibration_lines(fitted_camera), f"camera: {out}")

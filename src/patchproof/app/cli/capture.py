@@ -7,7 +7,8 @@ from typing import Annotated
 
 from typer import Argument, Option
 
-from patchproof.app.cli.console import Models, Trust, names_of, progress, say
+from patchproof.app.cli.console import Models, Trust, names_of, say
+from patchproof.base.progress import progress_bar
 from patchproof.base.text import command_text
 
 
@@ -38,7 +39,7 @@ def capture(
         segno.make(address, error="l").terminal(compact=True)
         say(address, "" if lan else "Only this machine can open it; --lan lets a phone.", "Ctrl-C ends it.")
 
-    with progress() as bar:
+    with progress_bar() as bar:
         serve = partial(
             serve_capture, sheet, out, run=run, models=names_of(models), camera=camera, lan=lan, trust=trust
         )

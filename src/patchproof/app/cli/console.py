@@ -7,10 +7,8 @@ import io
 import re
 import shlex
 import sys
-import time
 import warnings
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from collections.abc import Callable
 from functools import wraps
 from pathlib import Path
 from typing import Annotated, Any
@@ -43,43 +41,6 @@ Models = Annotated[str | None, Option(help="Comma-separated classifiers; a sheet
 _NO_MEMORY = re.compile(
     r"(?i)can(no|')t (allocate memory|start new thread)|(insufficient|out of) memory|failed to map seg"
 )
-LINE_EVERY_S = 30.0  # of progress, if standard error is not a terminal
-
-
-@contextmanager
-def progress() -> Iterator[Callable[[str, int, int], None]]:
-    """Show progress on standard error: yields a function of a stage's name, the number done, and the total. A terminal
-    gets a bar with the time left, a file or pipe a line every 30 s.
-    """
-    if not sys.stderr.isatty():
-        yield _print_lines()
-        return
-    from rich import progress as rich
-    from rich.console import Console
-
-    times = rich.TimeElapsedColumn(), rich.TimeRemainingColumn()
-    columns = rich.TextColumn("{task.description:>12}"), rich.BarColumn(), rich.MofNCompleteColumn(), *times
-    with rich.Progress(*columns, console=Console(stderr=True)) as progress:
-        tasks: dict[str, rich.TaskID] = {}
-
-        def advance(stage: str, done: int, total: int) -> None:
-            if stage not in tasks:
-                tasks[stage] = progress.add_task(stage, total=total)
-            progress.update(tasks[stage], completed=done, total=total)
-
-        yield advance
-
-
-def _print_lines() -> Callable[[str, int, int], None]:
-    last = time.monotonic()
-
-    def advance(stage: str, done: int, total: int) -> None:
-        nonlocal last
-        if done >= total or time.monotonic() - last >= LINE_EVERY_S:
-            last = time.monotonic()
-            print(f"{stage}: {done} of {total}", file=sys.stderr, flush=True)
-
-    return advance
 
 
 def as_command(verb: Callable[..., None]) -> Callable[..., None]:
@@ -95,28 +56,19 @@ def as_command(verb: Callable[..., None]) -> Callable[..., None]:
                 from patchproof.app.cli.files import check_files
 
                 check_files(arguments)
-            with _on_free_cores(arguments):
-                verb(**arguments)
+            from patchproof.base.workers import keep_freed_memory, share_cores
+
+            keep_freed_memory()
+            if "jobs" not in arguments:
+                return verb(**arguments)
+            device, cluster = arguments.get("device", "cpu"), arguments.get("cluster")
+            with share_cores(arguments["jobs"], device, cluster) as jobs:
+                verb(**arguments | {"jobs": jobs})
         except KeyboardInterrupt:
             say_stopped()
             raise Exit(130) from None
 
     return command
-
-
-def _on_free_cores(arguments: dict[str, Any]) -> AbstractContextManager[None]:
-    """Keep freed memory, and set `jobs` by default to the free cores, each process with one thread, if processes can be
-    forked; with a GPU, a cluster or processes that would have to import everything, to one with this process's threads.
-    """
-    from patchproof.base.workers import available_cores, can_fork, keep_freed_memory, use_threads
-
-    keep_freed_memory()
-    if "jobs" not in arguments:
-        return nullcontext()
-    by_processes = can_fork() and arguments.get("device", "cpu") == "cpu"
-    if arguments["jobs"] is None:
-        arguments["jobs"] = available_cores() if by_processes and arguments.get("cluster") is None else 1
-    return use_threads(1) if by_processes else nullcontext()
 
 
 _running: list[dict[str, Any]] = [{}]  # the arguments of the command; empty once it was said that it stopped

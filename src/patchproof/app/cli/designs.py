@@ -6,8 +6,9 @@ from typing import Annotated, Any
 from typer import Argument, BadParameter, Option
 
 from patchproof.app.cli import console
-from patchproof.app.cli.console import Cluster, Device, Jobs, Models, Overwrite, Seed, Trust, progress, say, warn
+from patchproof.app.cli.console import Cluster, Device, Jobs, Models, Overwrite, Seed, Trust, say, warn
 from patchproof.base.compute import Compute
+from patchproof.base.progress import progress_bar
 
 
 def import_picture(
@@ -29,10 +30,11 @@ def import_picture(
     from patchproof.optimizer.imported_design import import_folder, import_patch
     from patchproof.optimizer.promise import PromiseOptions
     from patchproof.optimizer.run import DRAFT_EFFORT
-    from patchproof.report.words import imported_lines, run_lines
+    from patchproof.report.run_words import imported_lines
+    from patchproof.report.words import run_lines
     from patchproof.scene.scene import load_scene
 
-    with progress() as bar:
+    with progress_bar() as bar:
         loaded, views = load_scene(scene, seed), promise or (DRAFT_EFFORT[1] if draft else None)
         warn(loaded.warnings)
         options: dict[str, Any] = {"promise": PromiseOptions(views), "compute": Compute(device, jobs or 1)}
@@ -64,11 +66,11 @@ def evaluate(
     """Rates on fresh conditions, with controls, on any classifiers; of several runs side by side."""
     from patchproof.app.compare import compare
     from patchproof.optimizer.evaluate import evaluate as evaluate_run
-    from patchproof.report.words import evaluation_lines
+    from patchproof.report.run_words import evaluation_lines
 
     if (out is None) != (len(runs) == 1):
         raise BadParameter("is for several runs, and they need it; one has its own folder", param_hint="--out")
-    with progress() as bar:
+    with progress_bar() as bar:
         options: dict[str, Any] = {"models": console.names_of(models), "n": n, "seed": seed, "overwrite": overwrite}
         options |= {"trust": trust, "compute": Compute(device, jobs or 1, cluster), "progress": bar}
         if out is None:

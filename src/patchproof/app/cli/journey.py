@@ -17,12 +17,11 @@ from patchproof.app.cli.console import (
     Resume,
     Seed,
     Trust,
-    progress,
     say,
     warn,
 )
 from patchproof.base.compute import Compute
-from patchproof.base.text import command_text
+from patchproof.base.progress import progress_bar
 
 PrintableControl = Literal["mean", "gray", "noise", "shuffled", "blank"]  # that can be printed
 PhotographedControl = Literal["bare", "mean", "gray", "noise"]  # that can hang on the object in place of the design
@@ -46,7 +45,7 @@ def demo(
     if detector and imagenet:
         raise BadParameter("is a classifier; leave --detector out", param_hint="--imagenet")
     network = "imagenet" if imagenet else "builtin-detector" if detector else "builtin"
-    with progress() as bar:
+    with progress_bar() as bar:
         summary = run_demo(out, network, jobs=jobs or 1, overwrite=overwrite, progress=bar)
     say(*summary)
     if open_report:
@@ -72,17 +71,15 @@ def optimize(
 ) -> None:
     """Optimize the patch of a scene and promise its rate."""
     from patchproof.optimizer.promise import PromiseOptions
-    from patchproof.optimizer.run import DRAFT_EFFORT, THOROUGH_EFFORT
+    from patchproof.optimizer.run import effort_of
     from patchproof.optimizer.run import optimize as optimize_scene
     from patchproof.report.words import run_lines
     from patchproof.scene.scene import load_scene
 
     if draft and thorough:
         raise BadParameter("is the opposite of --draft; leave one out", param_hint="--thorough")
-    if draft or thorough:
-        effort = DRAFT_EFFORT if draft else THOROUGH_EFFORT
-        steps, promise = steps or effort[0], promise or effort[1]
-    with progress() as bar:
+    steps, promise = effort_of(draft, thorough, steps, promise)
+    with progress_bar() as bar:
         loaded = load_scene(scene, seed, steps)
         warn(loaded.warnings)
         options: dict[str, Any] = {"promise": PromiseOptions(promise), "compute": Compute(device, jobs or 1)}
@@ -109,7 +106,7 @@ def promise(
     from patchproof.optimizer.evaluate import promise_run
     from patchproof.report.words import run_lines
 
-    with progress() as bar:
+    with progress_bar() as bar:
         finished_run = promise_run(run, views=n, trust=trust, compute=Compute(device, jobs or 1), progress=bar)
     say(*run_lines(finished_run), "A page that was written before has the former promise.")
 
@@ -157,7 +154,7 @@ def sheet(
         if others:
             manifests = sheet_of_several(loaded, out, template=template, control=control)
         else:
-            manifests = [sheet_of(first, out, template=template, control=control, copies=copies)]
+            manifests = [sheet_of(first, out, template=template, control=control, copies=copies, overwrite=overwrite)]
     for manifest, path in zip(manifests, paths, strict=True):
         if manifest.promise is not None:
             from patchproof.report.words import promise_summary
@@ -211,7 +208,7 @@ def reprint(
     if scan_dpi is not None:
         taken = scan(pdf, finished_run, n, out, scan_dpi, how, overwrite=overwrite)
     else:
-        with progress() as bar:
+        with progress_bar() as bar:
             options: dict[str, Any] = {"sessions": sessions, "seed": seed, "overwrite": overwrite, "progress": bar}
             compute = Compute(jobs=jobs or 1, cluster=cluster)
             taken = reprint_sheet(pdf, finished_run, n, out, how, compute=compute, **options)
@@ -256,7 +253,7 @@ def verify(
     from patchproof.app.verify import verify as verify_photos
     from patchproof.report.words import verdict_lines
 
-    with progress() as bar:
+    with progress_bar() as bar:
         ruler = console.pair_of(ruler_mm, "--ruler-mm") if ruler_mm else None
         options: dict[str, Any] = {"models": console.names_of(models), "controls": controls, "run": run, "trust": trust}
         options |= {"capture": CaptureInfo(camera, scan_dpi, ruler, boxes, corners, find), "ledger_photos": ledger}
