@@ -128,7 +128,7 @@ def bar(*good: int, silent: int = 0) -> breaks.Bar:
     points = [
         {"value": i, "good": n, "silent": silent, "said": [["blurred", 10 - n - silent]]} for i, n in enumerate(good)
     ]
-    return breaks.Bar("markers", "blur", range(len(good)), 10, points)
+    return breaks.Bar("markers", "blur", range(len(good)), 10, 0.8, points)
 
 
 def test_the_last_good_point_stands_before_the_first_bad_one():

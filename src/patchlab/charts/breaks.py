@@ -2,9 +2,9 @@
 
 In: the demo's scene, and nothing of a run: the sheet's design is noise. A cell is one method along one axis, from easy
 to hard, all else easy; photographs by our renderer are measured as `verify` does and held against the renderer's truth,
-verdicts and promises against sessions drawn at a known rate. A point is good where `MIN_SHARE` of its trials are. Out:
-both points, the most frequent code of the bad trials, and how many of them nothing was said about. A cell ends at the
-second bad point.
+verdicts and promises against sessions drawn at a known rate. A point is good where `MIN_SHARE` of its trials are, of
+promises `MIN_COVERAGE`. Out: both points, the most frequent code of the bad trials, and how many of them nothing was
+said about. A cell ends at the second bad point.
 """
 
 from collections import Counter
@@ -47,7 +47,7 @@ from patchproof.scene.patch_scene import PatchScene, require_patch
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-MIN_SHARE = 0.8
+MIN_SHARE, MIN_COVERAGE = 0.8, 0.9  # of trials; of promises, whose intervals are 95 %
 MAX_DELTA_E = 4.0  # mean ΔE00 of a print that is as promised, after the fit of its light
 _EASY = {"tilt": 20.0, "module_px": 5.0, "blur": 0.1, "noise": 0.005, "darkness": 0.0, "jpeg": 95.0}
 _PHOTO_PX = (800, 600)
@@ -76,7 +76,8 @@ class Probe:
     axis: str
     values: tuple[float, ...]
     trials: Callable[[float, int], Mapping[str, Trial]]
-    drawn: bool = False  # its trials are promises, not photographs
+    drawn: bool = False  # its trials are verdicts or promises, not photographs
+    share: float = MIN_SHARE  # of good trials at a good point
 
 
 class MeasuredShot(NamedTuple):
@@ -129,7 +130,8 @@ def _shoot(axis: str, values: Mapping[str, float], number: int) -> MeasuredShot:
     true_px = placed.piece_px(drawn, corners - sheet.manifest.cut_mm[:2])
     error = corner_error_mm(entry.geometry, corners, true_px) if entry.geometry else None
     _, tilt_deg = local_scale(fit_homography(corners, true_px), surface.center_mm)
-    return MeasuredShot(entry, error, tilt_deg, float(drawn.pose.distance_mm[0]))
+    middle_mm = placed.camera_from_print(drawn)[0] @ [*placed.placement.center_mm, 1]
+    return MeasuredShot(entry, error, tilt_deg, float(np.linalg.norm(middle_mm[:3])))
 
 
 def _found(shot: MeasuredShot) -> Trial:
@@ -196,12 +198,12 @@ PROBES = (
     _photographed(
         *("distance, px per module", "module_px", (5, 3.5, 2.5, 2, 1.7, 1.4, 1.2, 1, 0.8)), "markers", "rectification"
     ),
-    _photographed("distance, px per module", "module_px", (10, 7, 5, 3.5, 2.5, 2, 1.5), "pose", tilt=50.0),
+    _photographed("distance, px per module", "module_px", (5, 3.5, 2.5, 2, 1.7, 1.4, 1.2), "pose", tilt=50.0),
     _photographed("tilt, °", "tilt", (0, 30, 50, 60, 66, 72, 76, 80, 84), "markers", "rectification"),
-    _photographed("tilt, ° (from the side to square)", "tilt", (60, 50, 40, 30, 20, 10), "pose", module_px=8.0),
+    _photographed("tilt, ° (from the side to square)", "tilt", (60, 50, 40, 30, 20, 10), "pose", module_px=4.0),
     _photographed("blur, modules (sigma)", "blur", (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1), "markers", "rectification"),
     _photographed("hidden share", "hidden", (0, 0.1, 0.2, 0.3, 0.6, 0.8, 0.9, 1), "markers", "rectification"),
-    _photographed("curl, radius in widths", "curl", (8, 4, 2, 1.2, 0.8, 0.6, 0.45, 0.35), "rectification"),
+    _photographed("curl, radius in widths", "curl", (100, 50, 25, 12, 6, 3, 1.5, 0.8, 0.4), "rectification"),
     _photographed("darkness, stops", "darkness", (0, 2, 3, 4, 5, 6, 7, 8), "markers", "light fit"),
     _photographed("overexposure, stops", "brightness", (0, 1, 1.5, 2, 2.5, 3, 4), "color"),
     _photographed("noise, of white", "noise", (0.005, 0.02, 0.05, 0.1, 0.2, 0.4), "markers", "color"),
@@ -210,9 +212,21 @@ PROBES = (
     Probe(
         "points under the promise", (0, 3, 6, 9, 12, 16, 20), lambda v, i: {"verdict": _kept(i, below=v / 100)}, True
     ),
-    Probe("sessions behind it", (100, 50, 25, 12, 6, 3), lambda v, i: {"promise": _covers(i, v)}, True),
-    Probe("copies of each session", (1, 2, 4, 8, 16), lambda v, i: {"promise": _covers(i, copies=int(v))}, True),
-    Probe("places off by, points", (0, 3, 6, 9, 12, 16), lambda v, i: {"promise": _covers(i, moved=v / 100)}, True),
+    Probe("sessions behind it", (100, 50, 25, 12, 6, 3), lambda v, i: {"promise": _covers(i, v)}, True, MIN_COVERAGE),
+    Probe(
+        "copies of each session",
+        (1, 2, 4, 8, 16),
+        lambda v, i: {"promise": _covers(i, copies=int(v))},
+        True,
+        MIN_COVERAGE,
+    ),
+    Probe(
+        "places off by, points",
+        (0, 3, 6, 9, 12, 16),
+        lambda v, i: {"promise": _covers(i, moved=v / 100)},
+        True,
+        MIN_COVERAGE,
+    ),
 )
 
 
@@ -234,9 +248,9 @@ def run(settings: BreaksSettings, base: Path, cell: Cell) -> dict[str, Any]:
             said = Counter(code for code in bad if code).most_common()
             point = {"value": value, "good": count - len(bad), "silent": bad.count(None), "said": said}
             points.setdefault(method, []).append(point)
-        if all(sum(p["good"] < MIN_SHARE * count for p in some) >= 2 for some in points.values()):
+        if all(sum(p["good"] < probe.share * count for p in some) >= 2 for some in points.values()):
             break
-    return {"n": count, "points": points}
+    return {"n": count, "share": probe.share, "points": points}
 
 
 @dataclass(frozen=True)
@@ -247,12 +261,13 @@ class Bar:
     axis: str
     values: Sequence[float]
     n: int
+    share: float
     points: Sequence[Mapping[str, Any]]
 
     @property
     def first_bad(self) -> int | None:
         """Index of the first bad point; None if all that were tried are good."""
-        return next((i for i, point in enumerate(self.points) if point["good"] < MIN_SHARE * self.n), None)
+        return next((i for i, point in enumerate(self.points) if point["good"] < self.share * self.n), None)
 
     @property
     def last_good(self) -> int | None:
@@ -269,7 +284,7 @@ class Bar:
         counts = Counter[str]()
         for point in self._bad:
             counts.update(dict(point["said"]))
-        return ", ".join(code for code, _ in counts.most_common(2))
+        return ", ".join(code for code, _ in counts.most_common(1 if self.silent else 2))
 
     @property
     def silent(self) -> int:
@@ -284,7 +299,14 @@ class Bar:
 def _bars(results: Sequence[Result]) -> list[Bar]:
     """All bars, those of a method together."""
     bars = [
-        Bar(method, result.cell.values["axis"], result.cell.values["values"], result.answers["n"], points)
+        Bar(
+            method,
+            result.cell.values["axis"],
+            result.cell.values["values"],
+            result.answers["n"],
+            result.answers["share"],
+            points,
+        )
         for result in results
         for method, points in result.answers["points"].items()
     ]
@@ -302,9 +324,11 @@ def tables(settings: BreaksSettings, results: Sequence[Result]) -> tuple[Table, 
         for p in b.points
     ]
     about = (
-        f"good: {MIN_SHARE:.0%} of {settings.photos} photographs, or of {settings.draws} promises; silent: bad trials "
+        f"good: {MIN_SHARE:.0%} of {settings.photos} photographs or {settings.draws} verdicts, {MIN_COVERAGE:.0%} of "
     )
-    about += "that nothing was said about, at the bad points that were tried"
+    about += (
+        f"{settings.draws} promises; silent: bad trials that nothing was said about, at the bad points that were tried"
+    )
     head = ("method", "axis", "last good", "first bad", "said there", "silent", "trials a point")
     points = Table("points", "Every point", ("method", "axis", "value", "good", "silent", "said"), tuple(every))
     return Table("breaks", "Where it breaks, and what is said there", head, tuple(rows), about), points
@@ -331,7 +355,7 @@ def _draw_bars(bars: Sequence[Bar], figure: "Figure") -> None:
         if last is not None and good > 0.12:
             axes.text(good - 0.01, row, f"{bar.values[last]:g}", va="center", ha="right", fontsize=8.5, color="white")
     axes.set_yticks(range(len(bars)), [f"{bar.method}: {bar.axis}" for bar in bars], fontsize=9)
-    axes.set(xlim=(0, 1.75), ylim=(len(bars) - 0.4, -0.6), xticks=[])
+    axes.set(xlim=(0, 1.8), ylim=(len(bars) - 0.4, -0.6), xticks=[])
     axes.spines[:].set_visible(False)
     axes.tick_params(length=0)
     title = (
