@@ -48,7 +48,7 @@ def test_pixels_and_paper_are_each_other_s_inverse(kind):
 
 
 def test_fitted_borders_beat_plain_corners_on_known_photographs():
-    ours, plain = (detect.try_finder(name, 2, (640, 480)) for name in ("ours", "ArUco"))
+    ours, plain = (detect.try_finder(name, 2, (1200, 900)) for name in ("ours", "ArUco"))
     assert len(ours.milliseconds) == 2 and len(ours.errors_px) == 8
     assert np.median(ours.errors_px) < 0.1 and np.median(ours.errors_px) < 0.7 * np.median(plain.errors_px)
 
