@@ -260,7 +260,7 @@ def _draw_methods(figure: "Figure", axes: "Axes", table: Table, ceiling: Table) 
     if ceiling.rows and default is not None:
         level = default + 100 * float(np.mean([row[3] for row in rows_of(ceiling)]))
         axes.axhline(level, color="0.25", lw=1.2, ls=":")
-        text = f"ceiling (ten times the steps, {len(ceiling.rows)} pairs)"
+        text = f"ceiling (ten times the steps, {len(ceiling.rows)} of the pairs)"
         axes.annotate(text, (0.02, level), xycoords=("axes fraction", "data"), va="bottom", fontsize=9)
     log_axis(axes, "x", [x for x, *_ in points])
     axes.set(xlabel="seconds of the whole run, one core", ylabel="recognition gained, points")
