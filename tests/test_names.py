@@ -17,7 +17,6 @@ TWICE: dict[str, str] = {}  # a class or alias that may be defined twice, with t
 INTERFACES = {
     *("build", "subject_of", "read_design"),  # kinds of scenes, and of what is optimized
     *("cells", "run", "tables", "figures"),  # studies
-    "charts",  # benchmarks
     *("main", "train", "write"),  # programs
 }
 COMMANDS = {"cli"}  # verbs of a command line are called as the public functions behind them

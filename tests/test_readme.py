@@ -14,7 +14,6 @@ import pytest
 from console import command
 from test_imports import MAY_IMPORT
 
-from patchlab.bench.run import BENCHES
 from patchlab.study.record import parse_hits
 from patchlab.study.study import load_study
 from patchproof.base.intervals import student_mean
@@ -451,27 +450,6 @@ def test_looks_of_views_are_the_stored_ones():
     told = [look for look, each in off.items() if f"| {' | '.join([*look, *each])} |" in page]
     chosen = str(FIGURE_SCALE), str(FIGURE_SAMPLING.side), str(FIGURE_SAMPLING.taps)
     assert len(told) == 9 and f"| {' | '.join([f'**{value}**' for value in chosen] + off[chosen])} |" in page
-
-
-def test_figures_of_effort_are_the_stored_ones():
-    page, rows = words(NOTEBOOK), stored("bench/effort.json")["tables"]["effort_runs"]["rows"]
-    for runs in (rows[first : first + 3] for first in range(0, 15, 3)):
-        cells = [f"{run[2]:.0f} s, {100 * run[6]:.1f} %, ± {100 * run[4]:.1f}" for run in runs]
-        assert [run[1] for run in runs] == ["draft", "default", "thorough"]
-        assert f"| {runs[0][0]} | {100 * runs[2][5]:.1f} % | {' | '.join(cells)} |" in page
-
-
-def test_figures_of_all_benchmarks_are_the_stored_ones():
-    for name in BENCHES:
-        assert not stored(f"bench/{name}.json")["failed"] and not stored(f"bench/{name}.json")["settings"]["quick"]
-    behind = {row[0]: row[3] for row in stored("bench/peers.json")["tables"]["pooled"]["rows"][1:]}
-    sign, flat = (interval(*(behind[name][end] for end in ("value", "low", "high"))) for name in ("sign", "flat"))
-    told = f"minus signed steps {sign}, minus a design made without a scene {flat}".replace(" [", " points [", 1)
-    assert told.replace("+", "") in words(NOTEBOOK)
-    losses = {tuple(row[:2]): row[3] for row in stored("bench/train.json")["tables"]["optimizer"]["rows"]}
-    sizes = (losses["trained on 960 views", f"adam {size}"] for size in ("0.06", "0.015", "0.12"))
-    told = [f"{loss['value']:.2f} [{loss['low']:.2f}, {loss['high']:.2f}]" for loss in sizes]
-    assert f"a loss, {told[0]} beside {told[1]}, eight times (0.12) {told[2]}" in words(NOTEBOOK)
 
 
 def test_figures_of_verdicts_are_the_stored_ones():

@@ -1,4 +1,4 @@
-"""The laboratory: studies, benchmarks and training runs that produce the figures which patchproof's documents quote.
+"""The laboratory: studies, charts and training runs that produce the figures which patchproof's documents quote.
 
 In: configs and stored results in `results/`, and the tool, which it imports; the tool never imports it. Out: tables,
 charts and pages of its command, `patchlab`. Left out on purpose: everything that a user with an object, a

@@ -1,4 +1,4 @@
-"""The command line `patchlab`: run studies and benchmarks, harden images, print keys and stored figures."""
+"""The command line `patchlab`: run studies, make charts, harden images, print keys and stored figures."""
 
 import re
 from pathlib import Path
@@ -15,7 +15,7 @@ from patchproof.base.validation import spelling_hint
 app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
-    help="Studies and benchmarks that produce the figures which patchproof's documents quote.",
+    help="Studies and charts that produce the figures which patchproof's documents quote.",
 )
 _PAGE = Path(__file__).parent / "results/measured.md"
 
@@ -129,26 +129,29 @@ def table(name: Annotated[str | None, typer.Argument(help="A word of the heading
     print(figures_page(name), end="")
 
 
-def bench(
-    name: Annotated[
-        str, typer.Argument(help="A benchmark: render, train, effort, printer, detect, evidence, peers, or all.")
-    ] = "all",
-    quick: Annotated[bool, typer.Option("--quick", help="Three minutes: fewer views, rounds and sizes.")] = False,
-    out: Annotated[Path, typer.Option(help="Folder for charts, tables and pages.")] = Path("patchlab-bench"),
+def charts(
+    name: Annotated[str, typer.Argument(help="A chart: speed, breaks, terms, or all.")] = "all",
+    quick: Annotated[bool, typer.Option("--quick", help="Five minutes: a tenth of everything, to try it.")] = False,
+    out: Annotated[Path, typer.Option(help="Folder for pictures, tables and pages.")] = Path("patchlab-charts"),
+    resume: console.Resume = False,
     overwrite: console.Overwrite = False,
+    jobs: console.Jobs = None,
 ) -> None:
-    """Chart speed against accuracy of each setting on this machine: charts, tables and a page."""
-    from patchlab.bench.run import run_bench
+    """Make the README's charts on this machine: speed against accuracy, where it breaks, what each term is worth."""
+    from patchlab.charts.make import make_charts
+    from patchlab.study.study import Work
 
     with progress_bar() as bar:
-        written = run_bench(name, out, quick=quick, overwrite=overwrite, progress=bar)
-    for results in written:
-        console.say_study(results)
-        console.say(f"page: {out / results.name}.html")
+        work = Work(resume, overwrite, jobs or 1, on_cell=lambda done, total: bar("cells", done, total))
+        finished = make_charts(name, out, quick, work)
+    for each, study in finished.items():
+        console.say_study(study)
+        console.say(f"picture: {out / each / each}_chart.png")
+    raise typer.Exit(0 if all(study.results for study in finished.values()) else 1)
 
 
 app.command(cls=StudyCommand)(console.as_command(study))
-for _verb in (bench, harden, table, keys):
+for _verb in (charts, harden, table, keys):
     app.command()(console.as_command(_verb))
 app.callback()(console.version_option)
 

@@ -15,9 +15,15 @@ import torch
 import typer
 from PIL import Image, ImageCms
 
-from patchlab.bench import printer as bench_printer
-from patchlab.bench.inkjets import DRIVERS, draw_inkjet
-from patchlab.bench.printer import chart_manifest, printed_page
+from drawn_printers import (
+    camera_colors,
+    chart_manifest,
+    draw_held_out_colors,
+    draw_printer,
+    printed_page,
+    relative_to_paper,
+)
+from patchlab.validation.inkjets import DRIVERS, draw_inkjet
 from patchproof.app import cli
 from patchproof.base.color import linear_from_srgb, srgb_from_linear
 from patchproof.base.errors import Refused
@@ -347,16 +353,16 @@ def toned_camera() -> Camera:
 
 def printer_errors(seed: int, swatches: int, camera: Camera) -> tuple[float, float]:
     """Error of the chosen rung against the printer itself, without and with the camera's file."""
-    _, shows, priors = bench_printer.draw_printer(seed)
-    manifest, colors = chart_manifest(swatches), bench_printer.draw_held_out_colors()
+    _, shows, priors = draw_printer(seed)
+    manifest, colors = chart_manifest(swatches), draw_held_out_colors()
     shot = photograph_page(printed_page(manifest, shows), seed, camera)
-    truth, errors = bench_printer.camera_colors(shows, shot, colors), []
+    truth, errors = camera_colors(shows, shot, colors), []
     for known in (None, camera):
         light = read_chart(shot.photo, manifest, known).light
         usable = np.isfinite(light).all(1)
         sent = np.array([s.srgb for s in manifest.chart])[usable]
         choice = choose_map(map_kinds(priors), sent, srgb_from_linear(light[usable]))
-        errors.append(float(color_difference(bench_printer.relative_to_paper(choice.predict, colors), truth).mean()))
+        errors.append(float(color_difference(relative_to_paper(choice.predict, colors), truth).mean()))
     return errors[0], errors[1]
 
 
@@ -408,30 +414,12 @@ def test_a_camera_file_tells_printer_and_camera_apart():
     assert with_file < 1.5 and without > with_file + 1
 
 
-# ------------------------------------------------------------------------------------------------ the benchmark
-
-
-def test_the_bench_holds_choices_against_the_best_rung():
-    def one(chosen, driver):
-        errors = {"white_black": 5.0, "affine": 2.0, "spline": 1.0}
-        return bench_printer.PrinterTrial(
-            driver, 48, errors, {"white_black": 0.1, "affine": 0.2, "spline": 0.4}, chosen
-        )
-
-    trials = [one("spline", "plain"), one("spline", "plain"), one("affine", "matching")]
-    drawn = bench_printer.ladder_chart(trials)
-    points = {point.setting: point for point in drawn.series["rungs"]}
-    assert points["spline"].cost.value == pytest.approx(4) and points["spline"].default
-    assert points["affine"].error.value == 2
-    mean, share, worst = drawn.checks
-    assert mean.figure == pytest.approx(4 / 3) and mean.holds
-    assert share.figure == pytest.approx(2 / 3) and not share.holds
-    assert worst.figure == pytest.approx(1) and not worst.holds
+# ------------------------------------------------------------------------------------------ drawn printers
 
 
 def test_a_printer_is_never_its_own_prior():
     for seed in (5, 11):
-        driver, shows, priors = bench_printer.draw_printer(seed)
+        driver, shows, priors = draw_printer(seed)
         assert driver == "the other profile" and len(priors) == 1
         prior = next(iter(priors.values()))
         assert color_difference(prior(UNSEEN), shown(shows, UNSEEN)).mean() > 3

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from patchlab.study.estimates import mean, median, paired_means
+from patchlab.study.estimates import mean, median
 
 
 def test_intervals_of_medians_are_order_statistics():
@@ -18,12 +18,3 @@ def test_means_have_student_s_interval_and_one_value_has_none():
     # by hand: deviation 1, /√3, t of 2 degrees 4.303
     assert mean([1.0, 2.0, 3.0]).high == pytest.approx(2 + 4.303 / 3**0.5, rel=1e-3)
     assert mean([1.0]) is None
-
-
-def test_paired_intervals_leave_out_what_settings_share():
-    seeds, own = np.array([0.0, 10, 20]), np.array([[1, 2], [1, 2], [1, 2.0]])
-    a, b = paired_means(own + seeds[:, None])
-    assert (a.value, b.value) == (11, 12) and (a.low, a.high) == pytest.approx((11, 11))
-    # by hand: what is left of a is ±0.5, its deviation 0.5, times √2 for two settings, /√3, t of 2 degrees 4.303
-    c, _ = paired_means(np.array([[1, 0], [0, 1], [0.5, 0.5]]))
-    assert (c.high - c.low) / 2 == pytest.approx(4.303 * 0.5 * (2 / 3) ** 0.5, rel=1e-3)

@@ -149,20 +149,17 @@ def test_points_see_common_conditions_whatever_their_neighbors_are(world, drawn)
 def test_the_study_writes_breaks_points_codes_and_one_page(world, tmp_path):
     config = tmp_path / "envelope.toml"
     config.write_text(
-        f'run = "{world.run.folder}"\nn = 4\nphotos = 2\nmap_n = 4\nmap_photos = 1\n'
+        f'run = "{world.run.folder}"\nn = 4\nphotos = 2\n'
         'sweeps = [{axis = "blur", easy = 0.5, hard = 16, points = 3}]\n'
-        'maps = [{x = "hidden", y = "mismatch", points = 3}]\n'
     )
     finished = run_study("envelope", config, tmp_path / "out")
     assert not finished.failed
-    assert [table.name for table in finished.tables] == ["breaks", "beyond", "sweeps", "maps"]
+    assert [table.name for table in finished.tables] == ["breaks", "beyond", "sweeps"]
     rows = rows_of(tmp_path / "out/envelope_sweeps.csv")
     assert [float(row["value"]) for row in rows] == pytest.approx([0.5, 8**0.5, 16])
     assert float(rows[0]["measured"]) == 1 and float(rows[2]["measured"]) == 0
     (broken,) = rows_of(tmp_path / "out/envelope_breaks.csv")
     assert 0.5 <= float(broken["measured_low"]) <= float(broken["measured"]) <= float(broken["measured_high"]) <= 16
-    maps = rows_of(tmp_path / "out/envelope_maps.csv")
-    assert len(maps) == 9 and {row["effect"] for row in maps} <= {"gains", "no gain shown"}
     assert (tmp_path / "out/envelope_page.png").is_file()
 
 
@@ -220,9 +217,8 @@ def test_where_nothing_is_left_of_the_object_the_page_says_no_gain_whatever_is_r
     )
     config, out = tmp_path / "envelope.toml", tmp_path / "out"
     config.write_text(
-        f'run = "{blue_run}"\nn = 8\nphotos = 1\nmap_n = 4\nmap_photos = 1\n'
+        f'run = "{blue_run}"\nn = 8\nphotos = 1\n'
         'sweeps = [{axis = "noise", points = 3}, {axis = "blur", easy = 0.1, hard = 60, points = 3}]\n'
-        'maps = [{x = "noise", y = "mismatch", points = 3}]\n'
     )
     finished = run_study("envelope", config, out)
     assert not finished.failed
@@ -233,10 +229,8 @@ def test_where_nothing_is_left_of_the_object_the_page_says_no_gain_whatever_is_r
     assert 0.2 < float(noise[2]["recognized"]) < 0.8
     for row in rows_of(out / "envelope_breaks.csv"):
         assert float(row["design gains_high"]) <= float(row["hard"]) and row["no gain shown at"]
-    cells = rows_of(out / "envelope_maps.csv")
-    assert {row["effect"] for row in cells if float(row["at x"]) == 16} == {"no gain shown"}
     (page,) = figures(None, finished.results)
-    assert drawing_of(page.draw, (8, 6), "svg").decode().count("no gain shown<") == 3  # two bars, and what gray means
+    assert drawing_of(page.draw, (8, 6), "svg").decode().count("no gain shown<") == 2
     assert "no gain shown" in (out / "envelope.html").read_text("utf-8")
 
 
@@ -245,7 +239,6 @@ def test_where_nothing_is_left_of_the_object_the_page_says_no_gain_whatever_is_r
     [
         ({"sweeps": ({"axis": "tlit"},)}, 'did you mean "tilt"'),
         ({"sweeps": ({"axis": "blur", "easy": 0.0},)}, "above 0"),
-        ({"maps": ({"x": "blur", "y": "blur"},)}, "two different axes"),
     ],
 )
 def test_axes_and_ends_that_make_no_sense_are_refused(world, changed, match):
@@ -254,7 +247,6 @@ def test_axes_and_ends_that_make_no_sense_are_refused(world, changed, match):
         cells(settings, world.run.folder)
 
 
-def test_every_axis_has_a_sweep_and_every_default_map_its_axes(world):
+def test_every_axis_has_a_sweep(world):
     named = [cell.name for cell in cells(EnvelopeSettings(run="run"), world.run.folder.parent)]
-    assert [name for name in named if name.startswith("sweep-")] == [f"sweep-{name}" for name in AXES]
-    assert len(named) == len(AXES) + 6
+    assert named == [f"sweep-{name}" for name in AXES]

@@ -1,14 +1,10 @@
-"""Estimates of means, medians and clusters, for tables of studies and benchmarks.
+"""Estimates of means, medians and clusters, for tables of studies."""
 
-Source: Morey, Tutorials in Quantitative Methods for Psychology 4 (2008) 61-64 (several settings on the same seeds).
-"""
-
-import math
 import statistics
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.stats import binom, t
+from scipy.stats import binom
 
 from patchproof.base.intervals import CONFIDENCE, MIN_CLUSTERS, Estimate, resampled_means, student_mean
 
@@ -25,17 +21,6 @@ def median(values: Sequence[float] | np.ndarray) -> Estimate:
     ordered, n = sorted(map(float, values)), len(values)
     skipped = max(int(binom.ppf(_INTERVAL_QUANTILES[0], n, 0.5)) - 1, 0)
     return Estimate(statistics.median(ordered), ordered[skipped], ordered[n - 1 - skipped], n)
-
-
-def paired_means(values: np.ndarray) -> list[Estimate]:
-    """Means of the columns of S×K (K settings, each with S seeds), with intervals for comparing settings: the mean of
-    each seed is subtracted, and the remainder gets Student's interval (Morey 2008).
-    """
-    seeds, settings = values.shape
-    centered = values - values.mean(1, keepdims=True)
-    spread = centered.std(0, ddof=1) * math.sqrt(settings / (settings - 1) / seeds)
-    half = float(t.ppf(_INTERVAL_QUANTILES[1], seeds - 1)) * spread
-    return [Estimate(float(m), float(m - h), float(m + h), seeds) for m, h in zip(values.mean(0), half, strict=True)]
 
 
 def cluster_mean(values: Sequence[float]) -> Estimate | float | None:

@@ -41,7 +41,6 @@ STUDIES: dict[str, str] = {
     "ledger": "patchlab.validation.ledger_trials",
     "patch2d": "patchlab.paper.patch2d",
     "patch3d": "patchlab.paper.patch3d",
-    "peers": "patchlab.bench.peers",
     "promises": "patchlab.validation.promises",
     "real": "patchlab.validation.real_photos",
     "real-prints": "patchlab.validation.real_prints",

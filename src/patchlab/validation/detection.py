@@ -82,7 +82,7 @@ def cells(settings: DetectionSettings, base: Path) -> list[Cell]:
 
 def run(settings: DetectionSettings, base: Path, cell: Cell) -> dict[str, Any]:
     """Take one photograph and measure it; corner errors are None without a homography."""
-    (sheet, scene), number = _mounted_sheet(str(base / settings.scene), settings.seed), cell.values["number"]
+    (sheet, scene), number = mount_noise_sheet(str(base / settings.scene), settings.seed), cell.values["number"]
     surface = surface_of(sheet.manifest)
     conditions = scene.draw("reprint", 1, settings.seed, number)
     rng = np.random.default_rng([settings.seed, number])
@@ -130,7 +130,8 @@ def _photograph_sheet(sheet: MountedSheet, conditions: Conditions, truth, rng, h
 
 
 @lru_cache(maxsize=1)
-def _mounted_sheet(scene_path: str, seed: int) -> tuple[MountedSheet, PatchScene]:
+def mount_noise_sheet(scene_path: str, seed: int) -> tuple[MountedSheet, PatchScene]:
+    """Mount a sheet whose design is noise; returns its scene, too."""
     scene = require_patch(load_scene(scene_path, seed), "a scene of an object with a flat patch")
     if not scene.is_flat:
         raise Refused("a scene of an object with a flat patch", "a bent patch", "leave bend out")

@@ -21,8 +21,8 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from patchlab.bench.inkjets import draw_inkjet
 from patchlab.study.study import Cell, Result, Study
+from patchlab.validation.inkjets import draw_inkjet
 from patchlab.validation.mounted_sheets import mount_run_sheet
 from patchproof.base.color import linear_from_srgb, srgb_from_linear
 from patchproof.base.intervals import rate

@@ -67,7 +67,7 @@ _STEP_FILES = (CHECKPOINT_FILE, _LOG_FILE, RUN_FILE, _VIEWS_FILE, _MESH_FILE, "p
 RUN_FILE_PATTERNS = (*_STEP_FILES, DESIGN_FILE, OBJECT_FILE, TEXTURE_FILES, MASK_FILE, "evaluate.json")
 
 # (steps, promised views) of a first look, whose interval is some four times as wide, and of a print that counts, with
-# three times the default's steps and an interval half as wide (`bench effort`).
+# three times the default's steps and an interval half as wide (`patchlab charts speed`).
 DRAFT_EFFORT, THOROUGH_EFFORT = (40, 40), (720, 1600)
 MIN_DESIGN_CHANGE = 1.5 / 255  # a design that moved by less is printed as its start
 

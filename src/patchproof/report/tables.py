@@ -1,4 +1,4 @@
-"""Tables and figures of comparisons, studies and benchmarks, written to files or as lines for a terminal.
+"""Tables and figures of comparisons, studies and charts, written to files or as lines for a terminal.
 
 In: rows of plain values and `Estimate`s, drawings for matplotlib, failures, and the settings to repeat it. Out:
 NAME.json, a CSV per table with numbers in full, a PNG per figure, and one self-contained HTML page, each written whole;

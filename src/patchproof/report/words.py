@@ -179,6 +179,7 @@ def _estimated_lines(estimated: Any) -> list[str]:
 
 
 def control_lines(controls: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Write a line per control: its rate and the difference from the design's."""
     rows = []
     for kind, claim in controls.items():
         rate, of_count = claim["rate"], f" of {claim['n']}" if claim.get("n") else ""

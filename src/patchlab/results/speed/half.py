@@ -15,8 +15,8 @@ import numpy as np
 import torch
 
 import patchproof as pp
-from patchlab.bench.measure import call_in_turn, time_call
 from patchlab.results.rows import write_rows
+from patchlab.study.measure import call_in_turn, time_call
 from patchproof.base.workers import keep_freed_memory
 from patchproof.classifier.network import Classifier
 from patchproof.optimizer import promise

@@ -11,8 +11,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import patchproof as pp
-from patchlab.bench.measure import run_in_checkout
 from patchlab.results.rows import write_rows
+from patchlab.study.measure import run_in_checkout
 
 TIMED = """
 import json, sys, time

@@ -17,8 +17,8 @@ import torch
 from torch import nn
 
 import patchproof as pp
-from patchlab.bench.measure import call_in_turn, time_call
 from patchlab.results.rows import write_rows
+from patchlab.study.measure import call_in_turn, time_call
 from patchproof.base.workers import keep_freed_memory
 from patchproof.optimizer import expectation, loop
 from patchproof.optimizer.problem import set_problem

@@ -9,8 +9,8 @@ import sys
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from patchlab.bench.measure import run_in_checkout
 from patchlab.results.rows import write_rows
+from patchlab.study.measure import run_in_checkout
 
 RUN = """
 import json, sys, time

@@ -15,8 +15,8 @@ from time import perf_counter
 import numpy as np
 import torch
 
-from patchlab.bench.measure import call_in_turn, time_call
 from patchlab.results.rows import write_rows
+from patchlab.study.measure import call_in_turn, time_call
 from patchproof.base.workers import keep_freed_memory
 from patchproof.classifier import load_classifier
 from patchproof.networks.windows import Windows

@@ -78,14 +78,6 @@ AXES: dict[str, Axis] = {
 }
 # Axes that move the camera or the paper: views of other values have to be rasterized again.
 GEOMETRY_AXES = ("tilt", "distance", "curl", "gap", "size")
-DEFAULT_MAPS = (
-    ("tilt", "distance"),
-    ("blur", "darkness"),
-    ("hidden", "size"),
-    ("noise", "darkness"),
-    ("gap", "curl"),
-    ("mismatch", "size"),
-)
 
 
 def is_possible(scene: Scene, name: str) -> bool:

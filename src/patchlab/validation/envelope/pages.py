@@ -1,4 +1,4 @@
-"""Tables and figures of an operating envelope: breaking points, points of sweeps, codes beyond them, maps.
+"""Tables and figures of an operating envelope: breaking points, points of sweeps, codes beyond them.
 
 In: finished cells. Out: tables, and a page to print beside the patch. Breaking points are values of their axis; one
 beyond the sweep is called “holds”, and an interval that ends at the sweep's end is open there. A design breaks where it
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from patchlab.study.figures import EMPTY_COLOR, number_grid
+from patchlab.study.figures import EMPTY_COLOR
 from patchlab.validation.envelope.axes import AXES
 from patchlab.validation.envelope.fit import (
     BEYOND_SWEEP,
@@ -43,15 +43,14 @@ _PAGE_IN = (11.69, 8.27)  # A4, landscape
 
 
 def tables(settings: Any, results: "Sequence[Result]") -> Sequence[Table]:
-    """Tables of breaking points, codes beyond them, points of sweeps, points of maps."""
-    sweeps, maps = _split_results(results)
+    """Tables of breaking points, codes beyond them, points of sweeps."""
     ends = ("axis", "unit", "easy", "hard")
     all_tables = (
         Table(
             "breaks",
             "Breaking points",
             (*ends, *STAGES.values(), "not monotone", f"{NO_EFFECT} at"),
-            tuple(_break_row(result) for result in sweeps),
+            tuple(_break_row(result) for result in results),
             f"The design gains up to where it does no more than {_CONTROL}: the last point at which the 95 % interval "
             "of the difference lies above 0, and the first at which it does not. For the sheet, where a fitted falling "
             "curve has lost half of what it loses over the sweep: median of the bootstrap over conditions, 95 % "
@@ -62,24 +61,16 @@ def tables(settings: Any, results: "Sequence[Result]") -> Sequence[Table]:
             "beyond",
             "What the tool says beyond",
             ("axis", "photographs", "measured all the same", "said of the others"),
-            tuple(_beyond_row(result) for result in sweeps),
+            tuple(_beyond_row(result) for result in results),
             "Photographs at points harder than the breaking point of measuring, or at the hardest point.",
         ),
         Table(
             "sweeps",
             "All points",
             ("axis", "value", *_RATE_HEADINGS, "median error mm", "largest error mm", "said"),
-            tuple(row for result in sweeps for row in _point_rows(result)),
-            f"Gain: over {_CONTROL} (Newcombe). “{NO_EFFECT}”: its interval holds 0. "
-            "Errors are the largest of the design's "
+            tuple(row for result in results for row in _point_rows(result)),
+            f"Gain: over {_CONTROL} (Newcombe). “{NO_EFFECT}”: its interval holds 0. Errors are the largest of the design's "
             "four corners, against the simulation's truth, where a flat sheet was measured. Intervals: Wilson.",
-        ),
-        Table(
-            "maps",
-            "Maps",
-            ("x", "y", "at x", "at y", *_RATE_HEADINGS),
-            tuple(row for result in maps for row in _map_rows(result)),
-            f"n per point: {settings.map_n} recognized, {settings.map_photos} photographed.",
         ),
     )
     return tuple(table for table in all_tables if table.rows)
@@ -87,11 +78,10 @@ def tables(settings: Any, results: "Sequence[Result]") -> Sequence[Table]:
 
 def figures(settings: Any, results: "Sequence[Result]") -> Sequence[Drawing]:
     """The operating envelope as one page to print."""
-    sweeps, maps = _split_results(results)
     page = Drawing(
         "page",
         "Operating envelope",
-        lambda figure: _draw_page(figure, sweeps, maps),
+        lambda figure: _draw_page(figure, results),
         _PAGE_IN,
         f"The design gains where it does better than {_CONTROL} (95 %); beyond, no gain is shown, whatever the "
         "network answers. Beside its bar: the last point with a gain and the first without, in brackets the gains "
@@ -99,11 +89,6 @@ def figures(settings: Any, results: "Sequence[Result]") -> Sequence[Drawing]:
         "→: it holds; !: not monotone; in brackets the fitted rates at both ends.",
     )
     return (page,)
-
-
-def _split_results(results: "Sequence[Result]") -> "tuple[list[Result], list[Result]]":
-    sweeps, maps = ([each for each in results if ("y" in each.cell.values) == is_map] for is_map in (False, True))
-    return sweeps, maps
 
 
 def found_and_measured(answers: Mapping[str, Any]) -> dict[str, np.ndarray]:
@@ -170,12 +155,6 @@ def _point_rows(result: "Result") -> list[tuple[Value, ...]]:
     return rows
 
 
-def _map_rows(result: "Result") -> list[tuple[Value, ...]]:
-    (x, y), answers = (result.cell.values[key]["axis"] for key in ("x", "y")), result.answers
-    points = zip(answers["points"], _rates(answers), strict=True)
-    return [(AXES[x].title, AXES[y].title, point[x], point[y], *rates) for point, rates in points]
-
-
 def _rates(answers: Mapping[str, Any]) -> list[tuple[Value, ...]]:
     shown = [answers["recognized"], *(answers["controls"][kind] for kind in CONTROLS)]
     sheet = found_and_measured(answers).values()
@@ -190,26 +169,11 @@ def _rates(answers: Mapping[str, Any]) -> list[tuple[Value, ...]]:
     ]
 
 
-def _draw_page(figure: "Figure", sweeps: "Sequence[Result]", maps: "Sequence[Result]") -> None:
-    first = (sweeps or maps)[0].answers
+def _draw_page(figure: "Figure", sweeps: "Sequence[Result]") -> None:
+    first = sweeps[0].answers
     goal = "seen as" if Goal(first["goal"]).sign > 0 else "not seen as"
     figure.suptitle(f"Operating envelope of sheet {first['sheet']}: {goal} {first['label']} by {first['model']}")
-    left, right = figure, figure
-    if sweeps and maps:
-        left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=(1.15, 1))[0]
-    if sweeps:
-        _draw_bars(left.add_subplot(), sweeps)
-    if maps:
-        rows = -(-len(maps) // 2)
-        for axes, result in zip(right.subplots(rows, 2, squeeze=False).flat, maps, strict=False):
-            _draw_map(axes, result)
-        for axes in right.axes[len(maps) :]:
-            axes.set_axis_off()
-        right.supxlabel(
-            f"above: share recognized, %; below: gain over the better control; gray: {NO_EFFECT}\n"
-            "×: fewer than half of the photographs can be measured",
-            fontsize=7,
-        )
+    _draw_bars(figure.add_subplot(), sweeps)
 
 
 def _draw_bars(axes: "Axes", sweeps: "Sequence[Result]") -> None:
@@ -263,20 +227,3 @@ def _draw_bar(axes: "Axes", y: float, x: EndValues, break_: BreakValues, color: 
 
 def _short_number(value: float) -> str:
     return f"{value:.2g}" if abs(value) < 100 else f"{value:.0f}"
-
-
-def _draw_map(axes: "Axes", result: "Result") -> None:
-    x, y = result.cell.values["x"], result.cell.values["y"]
-    shape = (y["points"], x["points"])
-    share = np.mean(result.answers["recognized"], 1).reshape(shape)
-    can, gains = found_and_measured(result.answers)["measured"].mean(1).reshape(shape), gains_in(result.answers)
-    gain = np.reshape([100 * each.value for each in gains], shape)
-    without = [divmod(i, x["points"]) for i, each in enumerate(gains) if not has_effect(each)]
-    texts = np.vectorize(lambda a, b, c: f"{100 * a:.0f}{'×' if c < 0.5 else ''}\n{b:+.0f}")(share, gain, can)
-    number_grid(axes, gain / 100, texts, colors="Greens", fontsize=6, empty=without)
-    axes.invert_yaxis()
-    for drawn, end in ((axes.xaxis, x), (axes.yaxis, y)):
-        axis = AXES[end["axis"]]
-        values = axis.values(end["easy"], end["hard"], end["points"])
-        drawn.set_ticks(range(end["points"]), [_short_number(v) for v in values], fontsize=6)
-        drawn.set_label_text(f"{axis.title}, {axis.unit}", fontsize=7)

@@ -2,7 +2,7 @@
 
 This is the patch's operating envelope, with the tool's codes beyond. The design is judged by its gain over the bare
 object and a gray piece under the same conditions, since a network may give the target's label where nothing is visible.
-In: a run, sweeps of one axis and maps of two (`envelope.axes`; by default all that the scene allows). Out: tables and
+In: a run, and sweeps of one axis each (`envelope.axes`; by default all that the scene allows). Out: tables and
 a page to print beside the patch. All points share their draws of everything that is not varied, so that differences
 between them are not due to chance. Draws cover the ranges evenly (scrambled Sobol points of a seed of their own);
 intervals treat them as independent, which is cautious.
@@ -19,7 +19,7 @@ import numpy as np
 from pydantic import Field
 
 from patchlab.study.study import Cell, Study
-from patchlab.validation.envelope.axes import AXES, DEFAULT_MAPS, is_possible
+from patchlab.validation.envelope.axes import AXES, is_possible
 from patchlab.validation.envelope.fit import find_break, gain_break
 from patchlab.validation.envelope.pages import figures, found_and_measured, gains_in, tables
 from patchlab.validation.envelope.simulation import measure_photos, open_simulation, recognize_target
@@ -42,14 +42,6 @@ class Sweep(StrictModel):
     points: PointCount | None = None  # values; by default the study's
 
 
-class AxisPair(StrictModel):
-    """Two axes against each other, each from its easy to its hard end."""
-
-    x: str  # the axis across
-    y: str  # the axis upwards
-    points: PointCount = 4  # values of each axis
-
-
 class EnvelopeSettings(StrictModel):
     """The run, and how finely its envelope is sampled. Over a control at 55 %, a gain of 20 points is shown by 32
     conditions, one of 10 by 96, where 3 % of them go the other way.
@@ -60,32 +52,21 @@ class EnvelopeSettings(StrictModel):
     n: ConditionCount = 96  # conditions per point that the network sees; a quarter where JPEG is varied
     photos: ConditionCount = 6  # of them photographed in full and measured
     points: PointCount = 6  # values of each swept axis
-    map_n: ConditionCount = 32  # n for points of maps
-    map_photos: ConditionCount = 3  # photos for points of maps
     sweeps: tuple[Sweep, ...] | None = None  # by default every axis that suits the scene
-    maps: tuple[AxisPair, ...] | None = None  # by default those that suit the scene; [] for none
     other_printer: str | None = None  # `mismatch` goes from the run's printer towards this one
 
 
 def cells(settings: EnvelopeSettings, base: Path) -> Sequence[Cell]:
-    """A cell per sweep and per map; refuses an axis that the scene does not have."""
+    """A cell per sweep; refuses an axis that the scene does not have."""
     scene = require_piece(load_run(base / settings.run, trust=True).scene, "name the run of a printed patch")
     possible = [name for name in AXES if is_possible(scene, name)]
     sweeps = settings.sweeps
     if sweeps is None:
         sweeps = tuple(Sweep(axis=name) for name in possible)
-    maps = settings.maps
-    if maps is None:
-        maps = tuple(AxisPair(x=x, y=y) for x, y in DEFAULT_MAPS if x in possible and y in possible)
-    for name in [sweep.axis for sweep in sweeps] + [name for pair in maps for name in (pair.x, pair.y)]:
+    for name in (sweep.axis for sweep in sweeps):
         if name not in possible:
             raise Refused("an axis along which this scene can be varied", f'"{name}"', spelling_hint(name, possible))
-    if any(pair.x == pair.y for pair in maps):
-        raise Refused("two different axes for a map", "a map with one axis twice", "name another axis")
-    return [
-        *(Cell(f"sweep-{sweep.axis}", _sweep_values(sweep, scene, settings)) for sweep in sweeps),
-        *(Cell(f"map-{pair.x}-{pair.y}", _map_values(pair, scene)) for pair in maps),
-    ]
+    return [Cell(f"sweep-{sweep.axis}", _sweep_values(sweep, scene, settings)) for sweep in sweeps]
 
 
 def _sweep_values(sweep: Sweep, scene, settings: EnvelopeSettings) -> dict[str, Any]:
@@ -99,25 +80,13 @@ def _sweep_values(sweep: Sweep, scene, settings: EnvelopeSettings) -> dict[str, 
     return {"x": {"axis": sweep.axis, "easy": easy, "hard": hard, "points": points}}
 
 
-def _map_values(pair: AxisPair, scene) -> dict[str, Any]:
-    ends = {key: (name, *AXES[name].ends(scene)) for key, name in (("x", pair.x), ("y", pair.y))}
-    return {
-        key: {"axis": name, "easy": easy, "hard": hard, "points": pair.points}
-        for key, (name, easy, hard) in ends.items()
-    }
-
-
 def run(settings: EnvelopeSettings, base: Path, cell: Cell) -> dict[str, Any]:
-    """Hits per point and condition, status and code of each photograph; of sweeps also the breaks."""
+    """Hits per point and condition, status and code of each photograph, and the breaks."""
     world = open_simulation(base / settings.run, settings.other_printer)
-    is_map = "y" in cell.values
-    n, photos = (settings.map_n, settings.map_photos) if is_map else (settings.n, settings.photos)
+    n, photos = settings.n, settings.photos
     drawn = world.scene.draw("select", max(n, photos), _FIRST_SEED + settings.seed)
     x, along = _values(cell.values["x"])
     points = [{x: value} for value in along]
-    if is_map:
-        y, across = _values(cell.values["y"])
-        points = [point | {y: value} for value in across for point in points]
     shown = max(n // 4, photos) if "jpeg" in points[0] else n
     as_target = recognize_target(world, points, drawn[:shown])
     photographed = measure_photos(world, points, drawn[:photos])
@@ -135,8 +104,6 @@ def run(settings: EnvelopeSettings, base: Path, cell: Cell) -> dict[str, Any]:
         "code": [[photo.code for photo in row] for row in photographed],
         "error_mm": [[photo.error_mm for photo in row] for row in photographed],
     }
-    if is_map:
-        return answers
     positions = np.linspace(0, 1, len(points))
     stages = found_and_measured(answers).items()
     of_sheet = {stage: find_break(hits.T, positions, settings.seed) for stage, hits in stages}

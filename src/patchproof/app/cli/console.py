@@ -144,7 +144,7 @@ def say(*lines: str) -> None:
 
 
 def say_study(finished) -> None:
-    """Print a study's or benchmark's tables, and its failures on standard error."""
+    """Print a study's or chart's tables, and its failures on standard error."""
     from patchproof.report.tables import text_lines
 
     for table in finished.tables:

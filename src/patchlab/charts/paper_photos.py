@@ -96,10 +96,10 @@ def draw_sheet(
     return Sheet(pose, matrix, size_px, terms, float(curvature)), rng
 
 
-def photograph_paper(sheet: Sheet, rng: np.random.Generator) -> np.ndarray:
-    """uint8 H×W×3 photograph of the sheet on a blurred background."""
+def photograph_paper(sheet: Sheet, rng: np.random.Generator, dictionary: str = DICTIONARY) -> np.ndarray:
+    """uint8 H×W×3 photograph of the sheet with markers of a dictionary, on a blurred background."""
     clutter = rng.uniform(0.05, 0.6, (24, 32)).astype(np.float32)
-    picture, raster = cv2.resize(clutter, sheet.size_px, interpolation=cv2.INTER_CUBIC), _draw_raster(rng)
+    picture, raster = cv2.resize(clutter, sheet.size_px, interpolation=cv2.INTER_CUBIC), _draw_raster(rng, dictionary)
     border = sheet.px(np.concatenate([PIECE_MM * np.linspace(a, b, 50) for a, b in pairwise(_OUTLINE)]))
     left, top = np.clip(np.floor(border.min(0)).astype(int) - 2, 0, sheet.size_px)
     right, bottom = np.clip(np.ceil(border.max(0)).astype(int) + 2, 0, sheet.size_px)
@@ -116,7 +116,7 @@ def photograph_paper(sheet: Sheet, rng: np.random.Generator) -> np.ndarray:
     return _develop(picture, rng)
 
 
-def _draw_raster(rng: np.random.Generator) -> np.ndarray:
+def _draw_raster(rng: np.random.Generator, dictionary: str) -> np.ndarray:
     """Draw the piece's light H×W: markers, and a smooth random design."""
     side, marker_px = (round(mm * _RASTER_PX_PER_MM) for mm in (PIECE_MM, MARKER_MM))
     raster = np.full((side, side), 0.95, np.float32)
@@ -125,7 +125,7 @@ def _draw_raster(rng: np.random.Generator) -> np.ndarray:
     raster[y : y + height, x : x + width] = cv2.resize(design, (width, height), interpolation=cv2.INTER_LINEAR)
     for marker_id, corners in corners_mm().items():
         column, row = np.round(corners[0] * _RASTER_PX_PER_MM).astype(int)
-        code = cv2.aruco.generateImageMarker(aruco_dictionary(DICTIONARY), marker_id, marker_px) / 255
+        code = cv2.aruco.generateImageMarker(aruco_dictionary(dictionary), marker_id, marker_px) / 255
         raster[row : row + marker_px, column : column + marker_px] = 0.03 + 0.92 * code
     return raster
 

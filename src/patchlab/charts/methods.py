@@ -8,6 +8,8 @@ tutorial does: it pastes the design at random places, sizes and angles into phot
 descends by Adam. `art` gives the same photographs to the Adversarial Robustness Toolbox (Nicolae et al.,
 arXiv:1807.01069), whose `AdversarialPatchPyTorch` follows Brown et al. (Adversarial Patch, 2017) likewise. The
 photographs show conditions that `ours` trains under, too; designs are as large in them as in its views.
+`unadversarial` is the loop with the renderer of Salman et al. (Unadversarial Examples, NeurIPS 2021): the object turns
+before backgrounds under constant light, nothing is printed or photographed, and steps go along the gradient's sign.
 
 Left out on purpose: printer, paper, light and perspective in `flat` and `art`, which is the comparison, and a selection
 set, which neither has: both train with the passes that ours spends on it.
@@ -24,6 +26,8 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from patchlab.paper.patch3d import design_shares
+from patchlab.validation.ablation import simplify_problem
+from patchproof.app.plan.errors import scene_terms
 from patchproof.base.errors import Refused
 from patchproof.classifier.network import Classifier
 from patchproof.optimizer.loop import best_design, views_per_network
@@ -32,7 +36,7 @@ from patchproof.optimizer.responses import in_chunks
 from patchproof.render.photograph import expose
 from patchproof.scene.patch_scene import require_patch
 
-SIGN_STEP = 0.01  # as the paper has it
+SIGN_STEP, UNADVERSARIAL_STEP = 0.01, 0.005  # as the papers' programs have them
 # Best of 0.02, 0.05 and 0.1 for `flat` and, of 255 code values, 5 (ART's default), 13 and 25 for `art`: mean rates of
 # two seeds of the demo in 512 views were 0.609, 0.579, 0.571 and 0.568, 0.597, 0.579, those of `ours` 0.806.
 FLAT_STEP, ART_STEP = 0.02, 13.0
@@ -54,10 +58,17 @@ def optimize_design(problem: Problem) -> MadeDesign:
     return MadeDesign(best_design(problem), pass_budget(problem))
 
 
-def optimize_by_sign(problem: Problem) -> MadeDesign:
+def optimize_by_sign(problem: Problem, step: float = SIGN_STEP) -> MadeDesign:
     """Optimize with signed steps of the paper's size."""
-    settings = problem.scene.settings.changed(optimize={"optimizer": "sign", "step_size": SIGN_STEP})
+    settings = problem.scene.settings.changed(optimize={"optimizer": "sign", "step_size": step})
     return optimize_design(replace(problem, scene=replace(problem.scene, settings=settings)))
+
+
+def optimize_unadversarially(problem: Problem) -> MadeDesign:
+    """Optimize with signed steps through geometry alone: even light, and neither printer nor camera."""
+    terms = scene_terms(problem, problem.subject.start(), None)
+    names = [term.name for term in terms if term.modeled and term.key.split(".")[0] in ("light", "printer", "camera")]
+    return optimize_by_sign(simplify_problem(problem, " + ".join(names)), UNADVERSARIAL_STEP)
 
 
 def paste_and_optimize(problem: Problem) -> MadeDesign:
@@ -122,6 +133,7 @@ METHODS: dict[str, Callable[[Problem], MadeDesign]] = {
     "sign": optimize_by_sign,
     "flat": paste_and_optimize,
     "art": train_with_art,
+    "unadversarial": optimize_unadversarially,
 }
 
 
@@ -130,7 +142,7 @@ def load_art() -> tuple[Any, Any]:
     try:
         attack, wrapper = import_module("art.attacks.evasion"), import_module("art.estimators.classification")
     except (ImportError, RuntimeError):  # the latter of a torchvision that was built for another torch
-        do = 'pip install "patchproof[lab]", or leave art out of peers'
+        do = 'pip install "patchproof[lab]", or choose another method'
         raise Refused("the Adversarial Robustness Toolbox", "none that can be imported", do) from None
     return attack.AdversarialPatchPyTorch, wrapper.PyTorchClassifier
 

@@ -1,4 +1,4 @@
-"""Ours beside other methods: what they are given, what they spend, and tables by hand."""
+"""Methods that ours is charted beside: what they are given, and what they spend."""
 
 from __future__ import annotations
 
@@ -9,16 +9,13 @@ from types import ModuleType, SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 
-from patchlab.bench import methods, peers
-from patchlab.bench.chart import all_checks
-from patchlab.study.grid import scene_values
-from patchlab.study.record import hits_text
-from patchlab.study.study import Cell, Result, run_study
+from patchlab.charts import methods
 from patchproof.base.errors import Refused
 from patchproof.optimizer import loop
 from patchproof.optimizer.problem import set_problem
+from patchproof.render.photograph import expose
+from patchproof.scene.conditions import with_values
 from patchproof.scene.scene import load_scene
 from patchproof.sheets.piece import marker_image
 
@@ -189,97 +186,22 @@ def test_art_itself_goes_where_the_goal_is(scene_file):
     assert np.array_equal(made.pixels, methods.train_with_art(problem).pixels)
 
 
-def test_a_missing_art_is_said_before_anything_is_trained(scene_file, without_art, tmp_path):
-    config = tmp_path / "study.toml"
-    config.write_text('scenes = ["scene.toml"]\n')
-    with pytest.raises(Refused, match=r'Toolbox, got none.*patchproof\[lab\]", or leave art out of peers'):
-        run_study("peers", config, tmp_path / "out")
-    assert not (tmp_path / "out" / "cells").exists()
+def test_a_missing_art_is_refused_with_what_installs_it(scene_file, without_art):
+    with pytest.raises(Refused, match=r'Toolbox, got none.*patchproof\[lab\]", or choose another method'):
+        methods.train_with_art(set_problem(load_scene(red_scene(scene_file))))
 
 
-# The study
-
-
-def test_all_designs_hang_in_the_same_piece_in_the_same_views(scene_file, without_art, tmp_path):
-    red_scene(scene_file)
-    config = tmp_path / "study.toml"
-    config.write_text('scenes = ["scene.toml"]\nseeds = [3]\nn = 6\npeers = ["sign", "flat"]\n')
-    finished = run_study("peers", config, tmp_path / "out")
-    assert not finished.failed
-    (result,), (pooled, cells) = finished.results, finished.tables
-    assert list(result.answers["hits"]) == ["bare", "gray", "ours", "sign", "flat"]
-    assert {len(hits[0]) for hits in result.answers["hits"].values()} == {6}
-    assert [row[0] for row in pooled.rows] == ["ours", "sign", "flat"] and pooled.rows[0][1] == 1
-    assert {row[-2] for row in pooled.rows} == {4 * 4 + 8} and all(row[-1] > 0 for row in pooled.rows)
-    assert cells.head == ("object", "network", "seed", "bare", "gray", "ours", "sign", "flat")
-    shapes = set()
-    for name in ("ours", "sign", "flat"):
-        with Image.open(tmp_path / f"out/files/scene.fake_networks.red_against_blue.3-{name}.png") as image:
-            shapes.add(image.size)
-    assert len(shapes) == 1
-    with Image.open(tmp_path / "out/peers_designs.png") as image:
-        assert np.asarray(image.convert("L")).std() > 5
-
-
-def test_a_texture_is_refused(scene_file, without_art, tmp_path):
-    scene_file.write_text(scene_file.read_text().replace("width_mm = 90\nheight_mm = 90", 'kind = "texture"'))
-    settings = peers.PeersSettings(scenes=("scene.toml",), peers=("flat",))
-    with pytest.raises(Refused, match="a mesh and a printed patch, got"):
-        peers.cells(settings, tmp_path)
-
-
-def result_of(scene_file, network, seed, goal="assist", **hits):
-    """A result whose things were recognized in so many of four views."""
-    values = scene_values(scene_file.name, scene_file.parent, {"target": {"goal": goal}})
-    values |= {"networks": [network], "network": network, "seed": seed}
-    answers = {
-        "hits": {name: [hits_text(i < count for i in range(4))] for name, count in hits.items()},
-        "passes": dict.fromkeys(("ours", "flat"), 100),
-        "seconds": {"ours": 2.0, "flat": 3.0},
-    }
-    return Result(Cell(f"{network}-{seed}", values), answers, Path())
-
-
-def settings_of(**more):
-    return peers.PeersSettings(scenes=("scene.toml",), peers=("flat",), n=4, **more)
-
-
-def test_ours_minus_a_peer_counts_cells_and_pairs(scene_file):
-    results = [result_of(scene_file, f"m{m}", s, bare=1, gray=2, ours=4, flat=2 + s) for m in range(3) for s in (0, 1)]
-    pooled, cells = peers.tables(settings_of(), results)
-    ours, flat = pooled.rows
-    assert ours[:2] == ("ours", 1.0) and flat[1] == pytest.approx(0.625)
-    assert ours[2].value == pytest.approx(0.5) and flat[2].value == pytest.approx(0.125)  # gray is the best control
-    assert ours[3:5] == (None, None)
-    assert flat[3].value == pytest.approx(0.375) and flat[3].n == 6 and flat[3].low < 0.375 < flat[3].high
-    assert flat[4] == pytest.approx(0.375)  # three pairs: no interval
-    assert flat[5:] == (100, 3.0)
-    assert cells.rows[0] == ("scene", "m0", 0, 0.25, 0.5, 1.0, 0.5)
-
-
-def test_what_deceives_gains_by_what_is_lost(scene_file):
-    results = [result_of(scene_file, "m", 0, "deceive", bare=4, gray=3, ours=0, flat=1)]
-    (ours, flat), _ = (table.rows for table in peers.tables(settings_of(), results))
-    assert ours[1:3] == (0.0, 0.75) and flat[1:4] == (0.25, 0.5, 0.25)
-
-
-def test_the_chart_holds_ours_against_the_front(scene_file):
-    results = [result_of(scene_file, "m", s, bare=1, gray=2, ours=3 + s, flat=4 - s) for s in (0, 1)]
-    chart = peers.peers_chart(settings_of(), results)
-    (ours, flat), (check,) = chart.series["methods"], all_checks(chart)
-    assert (ours.setting, ours.default, flat.default) == ("ours", True, False)
-    assert ours.cost.value == 1 and flat.cost.value == 1.5
-    assert ours.error.value == flat.error.value == pytest.approx(0.125) and check.holds
-    assert "ART is not installed" in chart.about
-
-
-def test_the_benchmark_runs_on_the_demo_s_scene_without_art(without_art, monkeypatch):
-    monkeypatch.setattr(peers, "QUICK_STEPS", 1)
-    monkeypatch.setattr(peers, "QUICK_VIEWS", 2)
-    stages = []
-    (chart,) = peers.charts(True, lambda *stage: stages.append(stage))
-    assert [point.setting for point in chart.series["methods"]] == ["ours", "sign", "flat"]
-    assert stages == [("cells", 1, 2), ("cells", 2, 2)] and [table.name for table in chart.tables] == [
-        "pooled",
-        "cells",
-    ]
+def test_the_unadversarial_way_knows_neither_printer_nor_camera(scene_file, monkeypatch):
+    """It is the loop by signed steps in a world whose pictures no camera changes; light is the mean of all."""
+    seen = []
+    monkeypatch.setattr(methods, "optimize_by_sign", lambda problem, step: seen.append((problem, step)))
+    problem = set_problem(load_scene(red_scene(scene_file)))
+    methods.optimize_unadversarially(problem)
+    ((simple, step),) = seen
+    drawn = problem.scene.draw("train", 2)
+    dark = with_values(drawn, exposure_ev=-1.0, white_balance=0.5, noise=0.1)
+    for world, alike in ((simple, True), (problem, False)):
+        shown = world.subject.appearance(problem.subject.start())
+        pictures = [expose(world.see(shown, each, 96), shown) for each in (drawn, dark)]
+        assert torch.equal(*pictures) == alike
+    assert step == methods.UNADVERSARIAL_STEP and simple.subject.printer.name == "identity"

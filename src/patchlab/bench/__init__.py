@@ -1,1 +1,0 @@
-"""Benchmarks: speed against accuracy of every setting."""

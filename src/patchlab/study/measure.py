@@ -1,0 +1,47 @@
+"""Measure time: calls in turn within one run, and calls by the code of another checkout.
+
+In: calls. Out: milliseconds. Seconds of one machine mean little on another, so times are compared only
+within a run.
+"""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Hashable, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+from patchproof.base.progress import Advance, no_advance
+
+Name = TypeVar("Name", bound=Hashable)
+ReturnValue = TypeVar("ReturnValue")
+
+
+def call_in_turn(
+    calls: Mapping[Name, Callable[[], ReturnValue]], rounds: int, advance: Advance = no_advance
+) -> dict[Name, list[ReturnValue]]:
+    """By name the results of each call in `rounds` rounds; every round makes all calls in turn; one before warms up."""
+    answers: dict[Name, list[ReturnValue]] = {name: [] for name in calls}
+    for number in range(rounds + 1):
+        for name, call in calls.items():
+            answers[name].append(call())
+        advance(number + 1, rounds + 1)
+    return {name: values[1:] for name, values in answers.items()}
+
+
+def time_call(
+    call: Callable[[], ReturnValue], clock: Callable[[], float] = time.process_time
+) -> tuple[ReturnValue, float]:
+    """(the call's result, milliseconds); by default processor time, which other work on the machine leaves alone."""
+    begin = clock()
+    return call(), 1000 * (clock() - begin)
+
+
+def run_in_checkout(source: Path, code: str, *arguments: str) -> tuple[str, Any]:
+    """Run code that imports from a checkout's `src`: (short commit, JSON in the last line that it prints)."""
+    command, environment = [sys.executable, "-c", code, *arguments], {**os.environ, "PYTHONPATH": str(source.resolve())}
+    output = subprocess.run(command, env=environment, stdout=subprocess.PIPE, check=True).stdout
+    commit = subprocess.run(["git", "-C", source, "rev-parse", "--short", "HEAD"], stdout=subprocess.PIPE, text=True)
+    return commit.stdout.strip(), json.loads(output.splitlines()[-1])
