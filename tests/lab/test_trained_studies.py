@@ -74,6 +74,7 @@ def test_a_design_helps_the_network_that_agrees_and_harms_the_one_that_reads_the
     assert sum(before) == 1
     views = table(finished, "views")
     assert {row["design"].n for row in views} == {2} and {row["azimuth (deg)"] for row in views} > {0.0}
+    assert {row["seen"]: row["design"].value for row in views if row["trained on"] != "all"} == {"yes": 1, "no": 0}
     assert not any(one.name == "left_out" for one in finished.tables)  # one network would be left: a row already
 
 

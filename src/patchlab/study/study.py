@@ -41,6 +41,7 @@ STUDIES: dict[str, str] = {
     "patch2d": "patchlab.paper.patch2d",
     "patch3d": "patchlab.paper.patch3d",
     "peers": "patchlab.bench.peers",
+    "printed": "patchlab.paper.printed",
     "promises": "patchlab.validation.promises",
     "real": "patchlab.validation.real_photos",
     "real-prints": "patchlab.validation.real_prints",
