@@ -185,7 +185,7 @@ def verdict(spec: RowSpec, ours: Estimate | float | None) -> str:
 def write_paper_page(tables: Sequence[Table], out: Path, source: Path) -> None:
     """Write the page as HTML, JSON and CSV into `out`."""
     make_folder(out)
-    words = [row[-1].partition(",")[0] for table in tables for row in table.rows]
+    words = [str(row[-1]).partition(",")[0] for table in tables for row in table.rows]
     extent = ", ".join(f"{words.count(word)} × {word}" for word in dict.fromkeys(words))
     about = "The paper's tables and claims beside our figures."
     write_results(

@@ -78,16 +78,15 @@ def run(settings: PrintedSettings, base: Path, cell: Cell) -> dict[str, Any]:
 
 def tables(settings: PrintedSettings, results: Sequence[Result]) -> tuple[Table, ...]:
     """Tables of gains before and after printing, of the ledger's steps, and of every cell."""
-    head = ("gain", "digital", "on paper", "lost", "pairs")
-    rows = []
+    head, rows = ("gain", "digital", "on paper", "lost", "pairs"), []
     for better, worse in (("3d", "bare"), ("2d", "bare"), ("3d", "2d")):
-        pairs = [
-            (_gain(some, better, worse, _digital), _gain(some, better, worse, _on_paper)) for some in _pairs(results)
-        ]
-        pairs = [(digital, paper) for digital, paper in pairs if paper is not None]
-        gains = ([each[i] for each in pairs] for i in (0, 1))
-        lost = cluster_mean([digital - paper for digital, paper in pairs])
-        rows.append((f"{better} minus {worse}", *map(cluster_mean, gains), lost, len(pairs)))
+        digital, paper = [], []
+        for some in _pairs(results):
+            if (on_paper := _gain(some, better, worse, _on_paper)) is not None:
+                digital.append(_gain(some, better, worse, _digital) or 0.0)
+                paper.append(on_paper)
+        lost = np.subtract(digital, paper).tolist()
+        rows.append((f"{better} minus {worse}", *map(cluster_mean, (digital, paper, lost)), len(paper)))
     about = (
         "Differences of rates: digital over the study's unseen views, on paper over photographs that could be judged."
         " Intervals: a bootstrap over pairs of object and network, each with all its seeds; fewer than 5 get none."
