@@ -64,6 +64,7 @@ def test_verdicts_are_those_of_intervals():
     assert page.verdict(spec(claim="below"), Estimate(0.1, -0.1, 0.3, 9)).endswith("the interval holds 0")
     assert page.verdict(spec(range=(0, 1)), 0.5).startswith("cannot be told, because too few")
     assert page.verdict(spec(), ours).endswith("the paper has no figure")
+    assert page.verdict(spec(), None, was_run=True) == "cannot be told, because the study gave no such figure"
     assert page.verdict(spec(range=(0, 1), because="no mesh"), None) == "cannot be told, because no mesh"
 
 

@@ -119,8 +119,10 @@ def page_tables(folder: Path) -> list[Table]:
     head = ("row", "the paper", "ours", "verdict")
     tables = []
     for spec in page_specs():
-        ours = [our_figure(folder, row) for row in spec.rows]
-        rows = ((row.row, row.paper, one, verdict(row, one)) for row, one in zip(spec.rows, ours, strict=True))
+        rows = []
+        for row in spec.rows:
+            ours, was_run = our_figure(folder, row), bool(stored_rows(folder, row.table, {}))
+            rows.append((row.row, row.paper, ours, verdict(row, ours, was_run)))
         tables.append(Table(spec.name, spec.title, head, tuple(rows), spec.about))
     return tables
 
@@ -161,12 +163,12 @@ def _cluster_means(rows: Sequence[Mapping[str, str]], by: Sequence[str], column:
     return {key: fmean(values) for key, values in groups.items()}
 
 
-def verdict(spec: RowSpec, ours: Estimate | float | None) -> str:
+def verdict(spec: RowSpec, ours: Estimate | float | None, was_run: bool = False) -> str:
     """The verdict on our figure in a sentence."""
     if spec.because:
         return f"cannot be told, because {spec.because}"
     if ours is None:
-        return "not run yet"
+        return "cannot be told, because the study gave no such figure" if was_run else "not run yet"
     if not isinstance(ours, Estimate):
         return "cannot be told, because too few objects and networks give no interval"
     if spec.claim:
