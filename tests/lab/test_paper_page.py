@@ -178,7 +178,6 @@ def test_both_designs_are_printed_and_the_bare_object_photographed_once(tmp_path
     answers = printed.run(settings, tmp_path, cell)
     assert pictures == [(f"patches/files/suv.net.0-{kind}.png", 64) for kind in ("3d", "2d")]
     assert photographed == [("3d", None), ("3d", "bare"), ("2d", None)]
-    gains, steps, cells = printed.tables(settings, [Result(cell, answers, tmp_path)])
+    gains, steps = printed.tables(settings, [Result(cell, answers, tmp_path)])
     assert gains.rows[0] == ("3d minus bare", 0.75, pytest.approx(0.5), pytest.approx(0.25), 1)
     assert gains.rows[2][1:4] == (0.5, 0, 0.5) and steps.rows == (("3d", "print", 0.1, 1),)
-    assert cells.rows[0][3:] == (0, 0.75, 0.25, 0.1, 0.6, 0.6, 10)

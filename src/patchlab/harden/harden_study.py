@@ -148,9 +148,8 @@ def _judge(
             outcomes.append(survives_fgsm(network, views, truth, epsilon))
             continue
         how = settings.attack_steps, settings.attack_step_size, settings.restarts
-        first, alive = pgd_outcomes(network, views, truth, epsilon, *how)
-        lost.append(first)
-        outcomes.append(alive)
+        for record, found in zip((lost, outcomes), pgd_outcomes(network, views, truth, epsilon, *how), strict=True):
+            record.append(found)
     return outcomes, lost
 
 

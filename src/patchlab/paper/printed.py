@@ -77,7 +77,7 @@ def run(settings: PrintedSettings, base: Path, cell: Cell) -> dict[str, Any]:
 
 
 def tables(settings: PrintedSettings, results: Sequence[Result]) -> tuple[Table, ...]:
-    """Tables of gains before and after printing, of the ledger's steps, and of every cell."""
+    """Tables of gains before and after printing, and of the ledger's steps."""
     head, rows = ("gain", "digital", "on paper", "lost", "pairs"), []
     for better, worse in (("3d", "bare"), ("2d", "bare"), ("3d", "2d")):
         digital, paper = [], []
@@ -91,31 +91,7 @@ def tables(settings: PrintedSettings, results: Sequence[Result]) -> tuple[Table,
         "Differences of rates: digital over the study's unseen views, on paper over photographs that could be judged."
         " Intervals: a bootstrap over pairs of object and network, each with all its seeds; fewer than 5 get none."
     )
-    return (
-        Table("gains", "What is left of the gain on paper", head, tuple(rows), about),
-        _steps(results),
-        Table(
-            "cells",
-            "Cell by cell",
-            (
-                "object",
-                "network",
-                "seed",
-                *(f"{kind} digital" for kind in ("bare", *KINDS)),
-                *("bare", *KINDS),
-                "judged",
-            ),
-            tuple(
-                (
-                    *grid.cell_key(one),
-                    *(_digital(one, k) for k in ("bare", *KINDS)),
-                    *(_on_paper(one, k) for k in ("bare", *KINDS)),
-                    one.answers["3d"]["judged"],
-                )
-                for one in results
-            ),
-        ),
-    )
+    return Table("gains", "What is left of the gain on paper", head, tuple(rows), about), _steps(results)
 
 
 def _design(settings: PrintedSettings, cell_name: str, kind: str) -> str:

@@ -22,7 +22,7 @@ from pydantic import Field, model_validator
 
 from patchlab.study.estimates import mean
 from patchlab.study.figures import number_grid, picture_sheet
-from patchlab.study.grid import Names, PositiveInt, by_values, group_by, problem_of, short_name
+from patchlab.study.grid import Names, PositiveInt, by_values, group_by, short_name
 from patchlab.study.record import Record, to_record
 from patchlab.study.study import Cell, Result, Study
 from patchlab.study.trained_designs import (
@@ -34,6 +34,7 @@ from patchlab.study.trained_designs import (
     test_and_draw,
     tested_networks,
     trained_cells,
+    trained_problem,
     views_from_sides,
     views_in_drawn_light,
     with_trainers,
@@ -94,7 +95,7 @@ def cells(settings: TransferSettings, base: Path) -> list[Cell]:
 
 def run(settings: TransferSettings, base: Path, cell: Cell) -> dict[str, Any]:
     """Train if the cell names training networks, then test on all."""
-    problem = problem_of(base, cell.values)
+    problem = trained_problem(settings, base, cell)
     if cell.values["way"] in settings.vertex_colors:
         from patchlab.paper.vertex_colors import vertex_problem
 

@@ -11,7 +11,6 @@ Source: Pestana et al., supplement algorithms 3 and 4, with a one-dimensional ma
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import ClassVar
 
 import numpy as np
 import torch
@@ -36,7 +35,6 @@ class VertexColors(Texture):
     """Designs are 3×1×V in [0, 1]: the colors of `vertices`."""
 
     vertices: np.ndarray  # V numbers of vertices of the canvas's mesh
-    STAGE_NAME: ClassVar[str] = "vertex colors"
 
     def start(self) -> Tensor:
         """The mean color of the texels at each vertex, or gray where the scene starts from gray."""

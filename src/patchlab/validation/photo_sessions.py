@@ -54,9 +54,7 @@ def cells(settings: SessionsSettings, base: Path) -> list[Cell]:
 
 
 def make_run_and_sheet(base: Path, cell: Cell, folder: Path, views: int | None = None) -> "Run":
-    """Optimize or import the cell's design into folder/run, and write its sheet to folder/sheet.pdf; `views` are those
-    of the promise.
-    """
+    """Optimize or import the cell's design into folder/run, promise it by `views`, and write folder/sheet.pdf."""
     from patchproof.optimizer.imported_design import import_patch
     from patchproof.optimizer.run import optimize
     from patchproof.reprints.run_sheet import sheet as sheet_of
