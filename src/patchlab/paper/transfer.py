@@ -233,8 +233,7 @@ def _view_tables(settings: TransferSettings, groups: ResultsByRow) -> list[Table
                 before, after = (np.reshape(record.hits(network), (-1, 3, settings.lights)) for record in records)
                 for i, azimuth in enumerate(of_row[0].answers["azimuths"]):
                     rates = (rate(hits[:, i].ravel().tolist()) for hits in (before, after))
-                    seen = "yes" if network in trained else "no"
-                    rows.append((*key, row, short_name(network), seen, azimuth, *rates))
+                    rows.append((*key, row, short_name(network), ("no", "yes")[network in trained], azimuth, *rates))
     head = ("scene", "way", "trained on", "tested on", "seen", "azimuth (deg)", "original", "design")
     about = f"Three fixed views, {settings.lights} drawn lights, backgrounds and cameras each."
     return [Table("views", "Three views in changed light", head, tuple(rows), about)] if rows else []

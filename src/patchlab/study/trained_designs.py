@@ -34,6 +34,7 @@ from patchproof.channel.effects import EFFECT_BY_NAME, Light, Pose, Sensor
 from patchproof.mesh.mesh import Material
 from patchproof.optimizer.problem import Problem
 from patchproof.optimizer.responses import responses
+from patchproof.optimizer.texture import Texture
 from patchproof.render.photograph import Appearance, shade
 from patchproof.render.stage import set_stage
 from patchproof.scene.canvas import texture_canvas
@@ -94,7 +95,7 @@ def trained_problem(settings: TrainedSettings, base: Path, cell: Cell) -> Proble
     mesh = replace(scene.mesh, materials=tuple(map(small, scene.mesh.materials)))
     canvas = texture_canvas(mesh, scene.settings.patch, scene.base, most)
     scene = replace(scene, mesh=canvas.mesh, canvas=canvas)
-    subject = replace(problem.subject, scene=scene, canvas=canvas)
+    subject = Texture(scene, canvas, problem.device)
     return replace(problem, scene=scene, stage=set_stage(scene, problem.device), subject=subject)
 
 
