@@ -122,11 +122,42 @@ def keys(name: Annotated[str | None, typer.Argument(help="A study; without one, 
     print(keys_page(documents(), name, HEAD), end="")
 
 
-def table(name: Annotated[str | None, typer.Argument(help="A word of the heading; without one, all.")] = None) -> None:
-    """Print the current figures with their dates, commands and stored data, as Markdown."""
-    from patchlab.cli import figures_page
+def table(
+    name: Annotated[str | None, typer.Argument(help="A word of the heading, or paper; without one, all.")] = None,
+    run: Annotated[Path | None, typer.Option(help="paper: run or resume its studies in this folder first.")] = None,
+    part: Annotated[str | None, typer.Option(help="paper: comma-separated parts to run; by default all.")] = None,
+    photos: Annotated[Path | None, typer.Option(help="paper: labeled photographs, with labels.csv.")] = None,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="paper: run tiny forms that only show that all works.")
+    ] = False,
+    out: Annotated[Path | None, typer.Option(help="paper: folder for the page as HTML, JSON and CSV.")] = None,
+    jobs: console.Jobs = None,
+    cluster: console.Cluster = None,
+) -> None:
+    """Print the current figures with their dates, commands and stored data, as Markdown; `paper`: one page of the
+    paper's tables and claims beside ours.
+    """
+    if name != "paper":
+        print(figures_page(name), end="")
+        return
+    from patchlab.paper import page
+    from patchlab.study.study import Work
 
-    print(figures_page(name), end="")
+    failed = {}
+    if run is not None:
+        parts = console.names_of(part) or tuple(page.PARTS)
+        with console.progress() as bar:
+            work = Work(True, False, jobs or 1, cluster, lambda done, total: bar("cells", done, total))
+            finished = page.run_parts(run, parts, quick, photos, work)
+        failed = {f"{part} {cell}": text for part, each in finished.items() for cell, text in each.failed.items()}
+    source = page.STORED if run is None else run
+    tables = page.page_tables(source)
+    print(page.as_markdown(tables), end="")
+    if out is not None:
+        page.write_paper_page(tables, out, source)
+    for cell, text in failed.items():
+        console.say(f"failed: {cell}: {text}")
+    raise typer.Exit(1 if failed else 0)
 
 
 def charts(

@@ -34,6 +34,7 @@ _EXAMPLES = {
     "images": "images",
     "labels": "labels.csv",
     "photos": ("photos",),
+    "patches": "patches",
     "kind": "charuco",
 }
 

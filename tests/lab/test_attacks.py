@@ -8,14 +8,15 @@ import warnings
 import pytest
 import torch
 
-from patchlab.harden import attacks
 from patchlab.harden.attacks import (
     balanced_loss,
     cross_entropy,
     fgsm,
     is_correct,
+    lost_at,
     margin,
     pgd,
+    pgd_outcomes,
     survives_fgsm,
     survives_pgd,
 )
@@ -149,7 +150,6 @@ def test_pictures_are_attacked_each_on_its_own():
     together = survives_pgd(network, pictures, labels, 0.003, steps=5)
     alone = torch.cat([survives_pgd(network, pictures[i : i + 1], labels[i : i + 1], 0.003, steps=5) for i in range(4)])
     assert together.tolist() == alone.tolist()
-    assert attacks.ATTACKS.keys() == {"fgsm", "pgd"}
 
 
 def test_a_picture_that_was_lost_on_the_way_is_lost():
@@ -166,3 +166,25 @@ def test_a_picture_that_was_lost_on_the_way_is_lost():
     assert survives_pgd(network, pictures, labels, 0.005).tolist() == [True, False]  # does not reach it
     # what is read wrongly to begin with survives nothing
     assert survives_fgsm(network, pictures, labels, 0.001).tolist() == [True, False]
+
+
+def test_an_attack_that_stops_early_leaves_what_the_whole_one_takes():
+    network, pictures, labels = Shouting(10), torch.full((2, 3, 2, 2), 0.52), torch.tensor([0, 1])
+    # steps of 0.0075 from 0.52: 0.5125, 0.505, 0.4975; the second picture is wrong before any
+    assert lost_at(network, pictures, labels, 0.03, cross_entropy).tolist() == [3, 0]
+    first, alive = pgd_outcomes(network, pictures, labels, 0.03, steps=2)
+    assert first.tolist() == [3, 0] and alive.tolist() == [True, False]
+    assert lost_at(network, pictures, labels, 0.0199, margin).tolist() == [41, 0]  # does not reach ½
+
+
+def test_a_random_start_leaves_a_plateau():
+    def network(pictures):
+        x = pictures[:, 0, 0, 0]
+        score = 1 - 100 * torch.relu((x - 0.52).abs() - 0.002)  # no slope at the picture itself
+        return torch.stack([score, -score], 1)
+
+    pictures, labels = torch.full((2, 3, 2, 2), 0.52), torch.tensor([0, 0])
+    kept, lost = (pgd_outcomes(network, pictures, labels, 0.03, restarts=count) for count in (0, 1))
+    assert kept[1].all() and not lost[1].any() and lost[0].tolist() == [41, 41]
+    alone = pgd_outcomes(network, pictures[:1], labels[:1], 0.03, restarts=1)
+    assert alone[1].tolist() == lost[1].tolist()[:1]

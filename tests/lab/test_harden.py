@@ -164,13 +164,28 @@ def test_the_study_varies_networks_and_epsilons(folder, tmp_path):
     assert json.loads((tmp_path / "out/harden.json").read_text())["settings"]["epsilons"][2] is None
 
 
+def test_pgd_is_told_at_early_stops_on_photographs_spread_over_the_table(folder, tmp_path):
+    changed = {"epsilons": [0.1], "attacks": ["pgd"], "attack_epsilons": [0.3], "attack_steps": 6}
+    settings = options(folder, **changed, photos=2, keep_images=False, restarts=1)
+    finished = harden_images(settings, tmp_path / "out")
+    assert [photo["file"] for photo in finished.results[0].cell.values["photos"]] == ["a.jpg", "b.png"]
+    assert not list((tmp_path / "out").glob("*.png"))
+    early = next(table for table in finished.tables if table.name == "early")
+    at = early.head.index("after 1")
+    for row in early.rows:
+        rates = [each.value for each in row[at:]]
+        assert rates == sorted(rates, reverse=True) and rates[-1] == 0  # the ball reaches over the boundary
+    before, after = early.rows
+    assert after[at].value > before[at].value and after[at].n == 2
+
+
 def test_gains_by_class_are_means_of_the_classes_means(folder, tmp_path):
     settings = options(folder, epsilons=[0.1], attacks=["fgsm"])
     labels, before, after = "aaabcde", [0, 0, 0, 1, 1, 0, 0], [1, 1, 1, 1, 0, 0, 1]
 
     def result(hits, values):
         rows = [
-            {"file": str(i), "label": label, "right": {FAKE: [True, bool(hit)]}, "rms": 0.0, "ssim": 1.0}
+            {"file": str(i), "label": label, "right": {FAKE: [True, bool(hit)]}, "lost_at": {}, "rms": 0.0, "ssim": 1.0}
             for i, (label, hit) in enumerate(zip(labels, hits, strict=True))
         ]
         return Result(Cell("cell", values), {"photos": rows, "unread": []}, tmp_path)

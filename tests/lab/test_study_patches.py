@@ -114,6 +114,10 @@ def result3d(scene, model, seed, **kinds):
     answers = {
         **record,
         "in_images": record,
+        "three": {
+            "hits": {kind: ["110" if kind == "3d" else "100"] for kind in patch3d.KINDS},
+            "confidence": {kind: [[0.9, 0.5, 0.1]] for kind in patch3d.KINDS},
+        },
         "azimuth_deg": [-30.0, -5.0, 5.0, 30.0],
         "azimuth_range_deg": (-45.0, 45.0),
         "passes": {"3d": 1, "2d": 1},
@@ -125,7 +129,7 @@ def result3d(scene, model, seed, **kinds):
 def test_clusters_are_objects_before_networks_and_hard_ones_are_told_apart():
     easy = [result3d("a.toml", f"m{m}", s, **{"bare": 3, "2d": 3, "3d": 4}) for m in range(5) for s in (0, 1)]
     hard = [result3d("b.toml", f"m{m}", s, **{"bare": 0, "2d": 1, "3d": 3}) for m in range(5) for s in (0, 1)]
-    pooled, meshes, views, _, cells = patch3d.tables(patch3d.Patch3dSettings(scenes=("a.toml",)), easy + hard)
+    pooled, meshes, views, three, _, cells = patch3d.tables(patch3d.Patch3dSettings(scenes=("a.toml",)), easy + hard)
     label, whole, misread = pooled.rows[0]
     assert label == "3d minus 2d" and whole.n == 10 and misread.n == 5
     assert whole.value == pytest.approx((0.25 + 0.5) / 2) and misread.value == pytest.approx(0.5)
@@ -136,6 +140,9 @@ def test_clusters_are_objects_before_networks_and_hard_ones_are_told_apart():
     left = next(row for row in views.rows if row[:2] == ("m0", "left"))
     assert left[-1].value == pytest.approx(0) and left[-1].n == 4
     assert sum(row[-1].n for row in views.rows) == 80
+    rows = {row[:3]: row[3:] for row in three.rows}
+    assert rows["a.toml", "m0", "3d"][:7] == (2, 2, 2, 0, 0.9, 0.5, pytest.approx(0.1))
+    assert rows["a.toml", "m0", "2d"][-1].value == pytest.approx(1 / 3) and len(rows) == 30
 
 
 def test_views_may_be_named():
@@ -178,7 +185,7 @@ def two_classes(tmp_path, scene_file, more=""):
 
 
 def test_gain_and_harm_of_a_2d_patch(scene_file, short_loop, tmp_path):
-    config = two_classes(tmp_path, scene_file, 'targets = ["carton"]')
+    config = two_classes(tmp_path, scene_file, 'targets = ["carton"]\nunrestricted = true')
     finished = run_study("patch2d", config, tmp_path / "out")
     assert not finished.failed
     pooled, gain, harm = finished.tables
@@ -187,6 +194,7 @@ def test_gain_and_harm_of_a_2d_patch(scene_file, short_loop, tmp_path):
     called = finished.results[0].answers["classes"][2]
     assert called["same"] and all(own == target for own, target in called["hits"].values())
     assert isinstance(pooled.rows[0][1], float)  # one cluster: no interval
+    assert pooled.head[-1] == "patch minus unrestricted" and called["hits"].keys() == {*patch2d.KINDS, "unrestricted"}
 
 
 def test_classes_are_those_of_the_table_that_have_images_and_of_the_scenes(scene_file, tmp_path):

@@ -19,6 +19,7 @@ from patchlab.study.trained_designs import (
     gain_word,
     mean_color,
     trained_cells,
+    trained_problem,
     views_from,
     views_in_drawn_light,
 )
@@ -74,6 +75,7 @@ def test_a_design_helps_the_network_that_agrees_and_harms_the_one_that_reads_the
     assert sum(before) == 1
     views = table(finished, "views")
     assert {row["design"].n for row in views} == {2} and {row["azimuth (deg)"] for row in views} > {0.0}
+    assert {row["seen"]: row["design"].value for row in views if row["trained on"] != "all"} == {"yes": 1, "no": 0}
     assert not any(one.name == "left_out" for one in finished.tables)  # one network would be left: a row already
 
 
@@ -212,6 +214,19 @@ def test_the_mean_color_of_an_object_of_one_color_is_that_color(tmp_path):
     problem = set_problem(load_scene(tmp_path / "texture.toml"))
     design = torch.tensor([200, 100, 30]).view(3, 1, 1) / 255 * torch.ones_like(problem.subject.start())
     assert mean_color(problem, problem.subject.appearance(design), 4, 64) == (200, 100, 30)
+
+
+def test_small_textures_are_those_of_original_and_design_alike(tmp_path):
+    written(tmp_path)
+    settings = TrainedSettings(scenes=("texture.toml",), networks=(RED,), texture_px=16)
+    (cell,) = trained_cells(settings, tmp_path)
+    problem = trained_problem(settings, tmp_path, cell)
+    assert {max(mask.shape) for mask in problem.scene.canvas.mask} == {16}
+    sizes = {max(material.texture_srgb.shape[:2]) for material in problem.scene.mesh.materials}
+    texels = sum(int(mask.sum()) for mask in problem.scene.canvas.mask)
+    assert sizes == {16} and problem.subject.start().shape == (3, 1, texels)
+    whole = trained_problem(settings.changed(texture_px=None), tmp_path, cell)
+    assert whole.subject.start().shape[2] > 2 * texels
 
 
 def test_fixed_views_keep_their_pose_and_change_their_light(tmp_path):

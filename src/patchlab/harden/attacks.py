@@ -4,8 +4,8 @@ In: a network, pictures N×3×S×S in [0, 1] of its input size, their labels, ε
 on the network's own input; one on the photograph's pixels by at most ε would be no stronger, since downsampling
 averages. On hardened pictures a saturated softmax leaves no gradient, and an overconfident network would pass for a
 robust one. So losses come from float64 logits, their gradient is scaled before it goes back through a float32 network,
-and a picture survives only if it does so under both the cross-entropy and a margin loss. Left out on purpose: random
-starts (results would differ by chance) and attacks without gradients.
+and a picture survives only if it does so under both the cross-entropy and a margin loss, from every start. Random
+starts have fixed seeds. Left out on purpose: attacks without gradients.
 
 Sources: Goodfellow et al., Explaining and Harnessing Adversarial Examples, ICLR 2015 (FGSM); Madry et al., Towards Deep
 Learning Models Resistant to Adversarial Attacks, ICLR 2018 (PGD); Carlini and Wagner, Towards Evaluating the Robustness
@@ -75,7 +75,11 @@ def pgd_step(
     step: float = PGD_STEP,
 ) -> Tensor:
     """One PGD step: clip(Π(x + `step` ε sign ∇L)), Π the projection onto the ε-ball around the pictures."""
-    x = x + step * epsilon * _gradient(network, x, labels, loss).sign()
+    return _moved(x, _gradient(network, x, labels, loss), pictures, epsilon, step)
+
+
+def _moved(x: Tensor, gradient: Tensor, pictures: Tensor, epsilon: float, step: float) -> Tensor:
+    x = x.detach() + step * epsilon * gradient.sign()
     return torch.clamp(x, pictures - epsilon, pictures + epsilon).clamp(0, 1)
 
 
@@ -89,22 +93,62 @@ def survives_fgsm(network: Logits, pictures: Tensor, labels: Tensor, epsilon: fl
     return alive
 
 
+def pgd_outcomes(
+    network: Logits,
+    pictures: Tensor,
+    labels: Tensor,
+    epsilon: float,
+    steps: int = PGD_STEPS,
+    step: float = PGD_STEP,
+    restarts: int = 0,
+) -> tuple[Tensor, Tensor]:
+    """Attack along both losses, from the pictures and from `restarts` random starts; a lost picture stops.
+
+    Returns N steps after which the cross-entropy attack from the picture itself has won (0: it was wrong before,
+    steps + 1: never), and N bool: correct before any attack and after every step of all of them.
+    """
+    first = lost_at(network, pictures, labels, epsilon, cross_entropy, steps, step)
+    alive = first > steps
+    for number in range(restarts + 1):
+        for loss in LOSSES[number == 0 :]:
+            if len(rows := alive.nonzero()[:, 0]):
+                start, generator = pictures[rows], torch.Generator().manual_seed(number)
+                if number:  # one noise for all pictures, so that none depends on its company
+                    noise = 2 * torch.rand(start.shape[1:], generator=generator) - 1
+                    start = (start + epsilon * noise.to(start)).clamp(0, 1)
+                alive[rows] = lost_at(network, pictures[rows], labels[rows], epsilon, loss, steps, step, start) > steps
+    return first, alive
+
+
 def survives_pgd(network: Logits, pictures: Tensor, labels: Tensor, epsilon: float, steps: int = PGD_STEPS) -> Tensor:
-    """N bool: correct before the attack and after every step along either loss's gradient; a lost picture stops."""
-    alive = _predicts_label(network, pictures, labels)
-    for loss in LOSSES:
-        rows, x = alive.nonzero()[:, 0], pictures[alive]
-        for _ in range(steps):
-            if not len(rows):
+    """N bool: correct before the attack and after every step along either loss's gradient."""
+    return pgd_outcomes(network, pictures, labels, epsilon, steps)[1]
+
+
+def lost_at(
+    network: Logits,
+    pictures: Tensor,
+    labels: Tensor,
+    epsilon: float,
+    loss: PictureLoss,
+    steps: int = PGD_STEPS,
+    step: float = PGD_STEP,
+    start: Tensor | None = None,
+) -> Tensor:
+    """N numbers of PGD steps after which a picture is first wrong; steps + 1 where it never is."""
+    lost, rows = torch.full((len(pictures),), steps + 1), torch.arange(len(pictures))
+    x = pictures if start is None else start
+    for number in range(steps + 1):
+        x = x.detach().requires_grad_(True)
+        with torch.enable_grad():
+            logits = network(x)
+            wrong = ~is_correct(logits, labels[rows])
+            lost[rows[wrong]] = number
+            if number == steps or bool(wrong.all()):
                 break
-            x = pgd_step(network, x, pictures[rows], labels[rows], epsilon, loss)
-            correct = _predicts_label(network, x, labels[rows])
-            alive[rows[~correct]] = False
-            rows, x = rows[correct], x[correct]
-    return alive
-
-
-ATTACKS = {"fgsm": survives_fgsm, "pgd": survives_pgd}
+            gradient = torch.autograd.grad(balanced_loss([logits], [labels[rows]], loss), x)[0]
+        x, rows = _moved(x, gradient, pictures[rows], epsilon, step)[~wrong], rows[~wrong]
+    return lost
 
 
 def balanced_loss(logits: Sequence[Tensor], labels: Sequence[Tensor], loss: PictureLoss) -> Tensor:

@@ -3,7 +3,8 @@
 In: images, a CSV of file names and labels, networks. Out: PNGs under the images' names at their own sizes, and tables:
 accuracy clean and attacked, hardened beside original on the same photographs, per network, with 95 % intervals; how far
 the images moved. The 8-bit PNGs are judged as a reader of the file gets them. A cell of the table is flagged where
-a stronger attack leaves more than a weaker one: there the attack failed.
+a stronger attack leaves more than a weaker one: there the attack failed. How many steps PGD takes to win stands in a
+table of its own: an attack that is stopped early leaves what only an unfinished one leaves.
 
 `harden_images` runs the command's single variant; the study `harden` varies networks, methods and ε, and writes its
 PNGs to `images/`. Originals are judged in separate cells, once per network.
@@ -19,7 +20,7 @@ import numpy as np
 import torch
 from pydantic import Field
 
-from patchlab.harden.attacks import ATTACKS, is_correct
+from patchlab.harden.attacks import PGD_STEP, PGD_STEPS, is_correct, pgd_outcomes, survives_fgsm
 from patchlab.harden.hardening import Epsilon, HardenMethod, center_squares, epsilon_text, harden, image_change
 from patchlab.harden.labeled_photos import list_labeled_files, read_large_enough, split_into_blocks
 from patchlab.study.estimates import cluster_mean
@@ -40,6 +41,7 @@ Attack = Literal["fgsm", "pgd"]
 Condition = tuple[str, float]  # an attack and its ε
 CLEAN: Condition = ("clean", 0.0)
 _ATTACK_RANKS = {"clean": 0, "fgsm": 1, "pgd": 2}
+EARLY_STOPS = (1, 2, 5, 10, 20, 40)  # steps after which the attack is looked at
 
 
 class HardenSettings(StrictModel):
@@ -59,6 +61,11 @@ class HardenSettings(StrictModel):
     through: Annotated[Share, Field(gt=0)] | None = None
     attacks: tuple[Attack, ...] = ("fgsm", "pgd")  # attacks to withstand
     attack_epsilons: tuple[Annotated[Share, Field(gt=0)], ...] = (0.01, 0.02, 0.04)  # the attacks' largest change
+    attack_steps: PositiveInt = PGD_STEPS  # steps of PGD
+    attack_step_size: Positive = PGD_STEP  # of PGD, as a share of ε
+    restarts: Annotated[int, Field(ge=0)] = 0  # random starts of PGD besides the photograph itself
+    photos: PositiveInt | None = None  # so many at most, evenly spread over the lines of `labels`
+    keep_images: bool = True  # store the hardened PNGs
 
 
 def harden_images(settings: HardenSettings, out: str | Path, work: Work = DEFAULT_WORK) -> FinishedStudy:
@@ -77,6 +84,8 @@ def cells(settings: HardenSettings, base: Path) -> list[Cell]:
     """Cells of originals by network and of every variant, in blocks of photographs; checks networks and labels."""
     folder = Path(expand_path(settings.images, base))
     rows = list_labeled_files(folder, Path(expand_path(settings.labels, base)))
+    if (most := settings.photos or len(rows)) < len(rows):
+        rows = [rows[i * len(rows) // most] for i in range(most)]
     names = tuple(dict.fromkeys((*settings.models, *settings.judges)))
     for name in names:
         _label_indices(name, base, [label for _, _, label in rows])
@@ -101,7 +110,7 @@ def run(settings: HardenSettings, base: Path, cell: Cell) -> dict[str, Any]:
     for photo in values["photos"]:
         try:
             originals.append(read_large_enough(folder / photo["file"]))
-            photos.append(photo | {"right": {}})
+            photos.append(photo | {"right": {}, "lost_at": {}})
         except PhotoRejected as error:
             unread.append({"file": photo["file"], "reason": error.advice})
     labels, pictures, files = [photo["label"] for photo in photos], originals, {}
@@ -114,33 +123,43 @@ def run(settings: HardenSettings, base: Path, cell: Cell) -> dict[str, Any]:
         steps = settings.steps, settings.step_size, settings.through
         pictures = harden(originals, truth, networks, *how, *steps)
         for photo, original, picture in zip(photos, originals, pictures, strict=True):
-            files[values["folder"] + photo["png"]] = image_bytes(picture, "PNG")
+            if settings.keep_images:
+                files[values["folder"] + photo["png"]] = image_bytes(picture, "PNG")
             photo["rms"], photo["ssim"] = image_change(original, picture)
     for name in values["judges"] if photos else ():
         truth = torch.tensor(_label_indices(name, base, labels))
-        outcomes = _judge(settings, _classifier(name, base), pictures, truth)
+        outcomes, lost = _judge(settings, _classifier(name, base), pictures, truth)
         for i, photo in enumerate(photos):
             photo["right"][name] = [bool(outcome[i]) for outcome in outcomes]
+            photo["lost_at"][name] = [int(steps[i]) for steps in lost]
     return {"photos": photos, "unread": unread} | files
 
 
 def _judge(
     settings: HardenSettings, classifier: Classifier, pictures: Sequence[np.ndarray], truth: torch.Tensor
-) -> list[torch.Tensor]:
-    """Per condition N bool: the network is correct about the photographs."""
-    views, network = center_squares(pictures, classifier), classifier.network
+) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
+    """Per condition N bool: the network is correct about the photographs; per PGD attack N steps until it wins."""
+    views, network, lost = center_squares(pictures, classifier), classifier.network, []
     with torch.no_grad():
         outcomes = [is_correct(network(views), truth)]
     _, *attacks = _attack_conditions(settings).values()
-    return outcomes + [ATTACKS[attack](network, views, truth, epsilon) for attack, epsilon in attacks]
+    for attack, epsilon in attacks:
+        if attack == "fgsm":
+            outcomes.append(survives_fgsm(network, views, truth, epsilon))
+            continue
+        how = settings.attack_steps, settings.attack_step_size, settings.restarts
+        for record, found in zip((lost, outcomes), pgd_outcomes(network, views, truth, epsilon, *how), strict=True):
+            record.append(found)
+    return outcomes, lost
 
 
 def tables(settings: HardenSettings, results: Sequence[Result]) -> list[Table]:
     """Tables of accuracy with intervals and flags, of changes to the images, and of unreadable files."""
-    rows, distances = [], []
+    rows, early, distances = [], [], []
     for variant in _variants(settings):
         for name in dict.fromkeys((*variant["models"], *settings.judges)):
             rows += _accuracy_rows(settings, results, variant, name)
+            early += _early_rows(settings, results, variant, name)
         if photos := list(_photos_of(results, variant)):
             rms, ssim = ([photo[kind] for photo in photos] for kind in ("rms", "ssim"))
             row = (len(photos), float(np.mean(rms)), max(rms), float(np.mean(ssim)), min(ssim))
@@ -157,6 +176,10 @@ def tables(settings: HardenSettings, results: Sequence[Result]) -> list[Table]:
         Table("accuracy", "Accuracy, hardened beside original", head, tuple(rows), about),
         Table("moved", "How far the images moved", moved_head, tuple(distances), "RMS of values in [0, 1]."),
     ]
+    if early:
+        early_head = (*head[:5], "pictures", *(f"after {steps}" for steps in EARLY_STOPS))
+        about = "Share recognized after each of so many steps along the cross-entropy, from the picture itself."
+        all_tables.append(Table("early", "PGD stopped early", early_head, tuple(early), about))
     if unread := {(photo["file"], photo["reason"]) for result in results for photo in result.answers["unread"]}:
         all_tables.append(Table("unread", "What could not be read", ("file", "reason"), tuple(sorted(unread))))
     return all_tables
@@ -165,7 +188,7 @@ def tables(settings: HardenSettings, results: Sequence[Result]) -> list[Table]:
 def _accuracy_rows(
     settings: HardenSettings, results: Sequence[Result], variant: Mapping[str, Any], name: str
 ) -> list[tuple]:
-    before, after = _outcomes_by_file(results, None, name), _outcomes_by_file(results, variant, name)
+    before, after = (_by_file(results, each, name, "right") for each in (None, variant))
     if not (files := [file for file in after if file in before]):
         return []
     conditions = _attack_conditions(settings)
@@ -181,8 +204,7 @@ def _accuracy_rows(
     classes: dict[str, list[int]] = {}
     for i, file in enumerate(files):
         classes.setdefault(label[file], []).append(i)
-    group, *how = _variant_texts(variant)
-    start = (short_name(name), "itself" if variant["models"] == [name] else group, *how)
+    start = _row_start(variant, name)
     return [
         (
             *(*start, words, rate(old), rate(new), estimate_difference(new, old)),
@@ -191,6 +213,23 @@ def _accuracy_rows(
         )
         for (words, condition), (old, new) in zip(conditions.items(), pairs.values(), strict=True)
     ]
+
+
+def _row_start(variant: Mapping[str, Any], name: str) -> tuple[str, ...]:
+    group, *how = _variant_texts(variant)
+    return short_name(name), "itself" if variant["models"] == [name] else group, *how
+
+
+def _early_rows(
+    settings: HardenSettings, results: Sequence[Result], variant: Mapping[str, Any], name: str
+) -> list[tuple]:
+    rows, attacks = [], [words for words, (attack, _) in _attack_conditions(settings).items() if attack == "pgd"]
+    for word, which in (("original", None), ("hardened", variant)):
+        lost = _by_file(results, which, name, "lost_at").values()
+        for words, steps in zip(attacks, zip(*lost, strict=True), strict=False):
+            rates = (rate([one > min(stop, settings.attack_steps) for one in steps]) for stop in EARLY_STOPS)
+            rows.append((*_row_start(variant, name), words, word, *rates))
+    return rows
 
 
 def attack_failed(condition: Condition, survivors: Mapping[Condition, int]) -> bool:
@@ -244,8 +283,8 @@ def _photos_of(results: Sequence[Result], variant: Mapping[str, Any] | None) -> 
             yield from result.answers["photos"]
 
 
-def _outcomes_by_file(
-    results: Sequence[Result], variant: Mapping[str, Any] | None, name: str
-) -> dict[str, Sequence[bool]]:
-    """By file: if the network is correct, one bool per condition."""
-    return {photo["file"]: photo["right"][name] for photo in _photos_of(results, variant) if name in photo["right"]}
+def _by_file(
+    results: Sequence[Result], variant: Mapping[str, Any] | None, name: str, kind: str
+) -> dict[str, Sequence[Any]]:
+    """By file: what is recorded under "right" (a bool per condition) or "lost_at" (steps per PGD attack)."""
+    return {photo["file"]: photo[kind][name] for photo in _photos_of(results, variant) if name in photo[kind]}

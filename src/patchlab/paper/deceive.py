@@ -17,7 +17,7 @@ from pydantic import Field
 
 from patchlab.study import trained_designs
 from patchlab.study.figures import picture_sheet
-from patchlab.study.grid import by_values, group_by, problem_of, short_name
+from patchlab.study.grid import by_values, group_by, short_name
 from patchlab.study.record import Record
 from patchlab.study.study import Cell, Result, Study
 from patchlab.study.trained_designs import views_from_sides
@@ -47,7 +47,7 @@ def cells(settings: DeceiveSettings, base: Path) -> list[Cell]:
 
 def run(settings: DeceiveSettings, base: Path, cell: Cell) -> dict[str, Any]:
     """Train against one network, and show the design and its controls to all networks."""
-    problem = problem_of(base, cell.values)
+    problem = trained_designs.trained_problem(settings, base, cell)
     design = best_design(trained_designs.with_trainers(problem, cell))
     things = pictures_with_controls(problem, design, CONTROLS)
     suffix, content = problem.subject.file(design)

@@ -5,7 +5,8 @@ seeds. A cell is a target, a network and a seed: a patch of `made_px` texels a s
 only, at random places, sizes and angles, with Random Erasing of the picture below it, and shown `shown_px` wide at the
 network's input size. Out: recognition with and without it, paired on the same images and places, for the target, and
 for each other class by its labels, with the rate at which the patch makes it the target: an assistive patch must not
-become an adversarial one. Gray and noise of the same size are the controls.
+become an adversarial one. Gray and noise of the same size are the controls. With `unrestricted`, a second patch is made
+on images of all classes, to tell what the restriction saves the others.
 
 Unlike a printed piece, this patch has no frame of markers. A class with fewer than `MIN_IMAGES_TO_SPLIT` images is
 measured on those that the patch was made with, and the table says so.
@@ -48,6 +49,7 @@ from patchproof.scene.image_scene import MIN_IMAGES_TO_SPLIT, ImageScene
 from patchproof.scene.interface import Scene
 
 KINDS = ("bare", "gray", "noise", "patch")
+UNRESTRICTED = "unrestricted"  # a patch made on images of all classes
 OWN_LABEL, TARGET_LABEL = 0, 1  # whose labels hits count for: the image's class, or the patch's target
 _TILE_PX = 192
 
@@ -59,6 +61,7 @@ class Patch2dSettings(PastedSettings):
     networks: Names  # networks, each of which trains alone
     seeds: Seeds = (0,)  # of draws
     n: PositiveInt = 200  # conditions per class and cell
+    unrestricted: bool = False  # make a second patch on images of all classes, as Brown et al. do
 
 
 def cells(settings: Patch2dSettings, base: Path) -> list[Cell]:
@@ -89,6 +92,12 @@ def run(settings: Patch2dSettings, base: Path, cell: Cell) -> dict[str, Any]:
     problem = flat_problem(settings, base, scenes[target], classifier, classes[target])
     design = best_design(problem)
     shown = pasted_by_kind(problem, design)
+    if settings.unrestricted:
+        training = tuple(image for scene in scenes for image in scene.images[: max(len(scene.images) // 2, 1)])
+        # twice: an image scene holds out the second half of its images
+        everything = replace(scenes[target], images=2 * training)
+        other = best_design(flat_problem(settings, base, everything, classifier, classes[target]))
+        shown[UNRESTRICTED] = problem.subject.appearance(from_pixels(other))
     pairs = zip(classes, scenes, strict=True)
     return {
         "classes": [_ask_about_class(problem, each, scene, shown, settings.n) for each, scene in pairs],
@@ -151,7 +160,7 @@ ClassAnswers = Mapping[str, Any]  # a cell's answers about one class
 
 def tables(settings: Patch2dSettings, results: Sequence[Result]) -> list[Table]:
     """Tables of gain on targets, harm on other classes, and both over all cells."""
-    return [_pooled(results), _gains(results), _harm(results)]
+    return [_pooled(settings, results), _gains(results), _harm(results)]
 
 
 def _gains(results: Sequence[Result]) -> Table:
@@ -193,7 +202,8 @@ def _harm(results: Sequence[Result]) -> Table:
     return Table("harm", "Harm on each other class", head, tuple(rows), about)
 
 
-def _pooled(results: Sequence[Result]) -> Table:
+def _pooled(settings: Patch2dSettings, results: Sequence[Result]) -> Table:
+    controls = (*KINDS[:3], UNRESTRICTED) if settings.unrestricted else KINDS[:3]
     groups = _by_target(results).values()
     targets = [[_target_answers(result) for result in group] for group in groups]
     others = [[each for result in group for each in result.answers["classes"] if not each["same"]] for group in groups]
@@ -203,13 +213,13 @@ def _pooled(results: Sequence[Result]) -> Table:
         ("other classes recognized", others, OWN_LABEL),
         ("other classes called the target", others, TARGET_LABEL),
     ):
-        controls = ([_rate_difference(some, which, control) for some in clusters if some] for control in KINDS[:3])
-        rows.append((name, *map(cluster_mean, controls)))
+        gains = ([_rate_difference(some, which, control) for some in clusters if some] for control in controls)
+        rows.append((name, *map(cluster_mean, gains)))
     about = (
         "Mean differences of rates over targets and networks; the interval is a bootstrap over these clusters, each"
         " with all its seeds, images and other classes; n counts clusters, and fewer than 5 get none."
     )
-    head = ("rate", "patch minus bare", "patch minus gray", "patch minus noise")
+    head = ("rate", *(f"patch minus {control}" for control in controls))
     return Table("pooled", "Over all targets and networks", head, tuple(rows), about)
 
 

@@ -5,7 +5,8 @@ does, and again as the classic 2D patch: pasted flat at a random place, size and
 object over the same backgrounds (renders, since most objects have no photographs), with Random Erasing. Design grid,
 frame, printer, camera and number of classifier passes are the same; sizes in pixels come from the 3D views. Then both
 are shown on the object, under conditions of the evaluate stream, beside the bare object, gray and noise.
-Out: paired differences per condition, pooled, by mesh, and by network and view (where the camera stands).
+Out: paired differences per condition, pooled, by mesh, and by network and view (where the camera stands); confidences
+in three fixed views, each in a light of its own, as in the paper's table.
 
 Left out on purpose: the 2D patch knows neither light nor place, since images do not tell them. Both designs are also
 shown in held-out images, which tells if the 2D patch is weak there, too.
@@ -30,6 +31,7 @@ from patchlab.study.estimates import cluster_mean
 from patchlab.study.figures import contact_sheet, enlarge_design, photographs, picture_sheet
 from patchlab.study.record import Record, parse_hits, to_record
 from patchlab.study.study import Cell, Result, Study
+from patchlab.study.trained_designs import views_in_drawn_light
 from patchproof.base.errors import Refused
 from patchproof.base.intervals import estimate_difference, rate
 from patchproof.base.settings import ObjectSettings, PatchSettings, SceneSettings, ViewSettings
@@ -59,6 +61,7 @@ class Patch3dSettings(grid.GridSettings):
 
     seeds: grid.Seeds = (0, 1, 2)  # of the scenes' draws
     n: grid.PositiveInt = 200  # conditions per cell, of the evaluate stream
+    n_in_images: grid.PositiveInt | None = None  # images per cell with a patch pasted in; by default as many
     renders: Annotated[int, Field(ge=2)] = 64  # images of the clean object; half of 20 or more are held out
     roll_deg: Range = (-22.5, 22.5)  # roll of the 2D patch, as in Brown et al.'s program
     erasing: Share = 0.5  # chance of Random Erasing in 2D training
@@ -90,9 +93,12 @@ def run(settings: Patch3dSettings, base: Path, cell: Cell) -> dict[str, Any]:
         twin = flat_twin(problem, settings, Path(folder))
     designs = {"3d": best_design(problem), "2d": best_design(twin)}
     worlds = {"3d": problem, "2d": twin}
-    conditions, in_images = (world.scene.draw("evaluate", settings.n) for world in worlds.values())
+    conditions = problem.scene.draw("evaluate", settings.n)
+    in_images = twin.scene.draw("evaluate", settings.n_in_images or settings.n)
+    on_object = appearances_by_kind(problem, designs)
     return {
-        **to_record(responses(problem, appearances_by_kind(problem, designs), conditions)),
+        **to_record(responses(problem, on_object, conditions)),
+        "three": to_record(responses(problem, on_object, views_in_drawn_light(problem, 1))),
         "in_images": to_record(responses(twin, appearances_by_kind(twin, designs), in_images)),
         "azimuth_deg": conditions.pose.azimuth_deg.tolist(),
         "azimuth_range_deg": problem.scene.settings.view.azimuth_deg,
@@ -169,6 +175,7 @@ def tables(settings: Patch3dSettings, results: Sequence[Result]) -> list[Table]:
         _pooled(results),
         Table("meshes", "By object", ("object", *KINDS, "3d minus 2d"), objects, about),
         _by_view(settings, results),
+        _in_three_views(results),
         Table("images", "Pasted into images", ("object", *KINDS, "2d minus gray"), images, in_images),
         _by_cell(results),
     ]
@@ -212,6 +219,20 @@ def _by_view(settings: Patch3dSettings, results: Sequence[Result]) -> Table:
     )
     about = "All objects and seeds; a view is a range of the camera's azimuth, right of the patch's side positive."
     return Table("views", "By network and view", ("network", "view", *KINDS, "3d minus 2d"), rows, about)
+
+
+def _in_three_views(results: Sequence[Result]) -> Table:
+    rows = []
+    for key, group in grid.group_by(results, grid.by_values("name", "network")).items():
+        for kind in ("bare", "2d", "3d"):
+            record = Record(group, kind, "three")
+            right, sure = (np.reshape(each, (-1, 3)) for each in (record.hits(), record.confidences()))
+            seen = *map(int, right.sum(0)), *map(float, sure.mean(0)), rate(right.ravel().tolist())
+            rows.append((*key, kind, len(right), *seen))
+    places = ("left", "middle", "right")
+    head = ("object", "network", "shown", "seeds", *(f"{place} right" for place in places), *places, "recognized")
+    about = "Three fixed views, each in a light of its own by seed: seeds that recognize it, and the mean confidence."
+    return Table("three", "Three views with a light each", head, tuple(rows), about)
 
 
 def _by_cell(results: Sequence[Result]) -> Table:

@@ -16,7 +16,7 @@ from pydantic import Field
 
 from patchlab.study import trained_designs
 from patchlab.study.figures import picture_sheet
-from patchlab.study.grid import by_values, group_by, problem_of, short_name
+from patchlab.study.grid import by_values, group_by, short_name
 from patchlab.study.record import Record
 from patchlab.study.study import Cell, Result, Study
 from patchlab.study.trained_designs import mean_color, views_from_sides
@@ -53,7 +53,7 @@ def cells(settings: RobustSettings, base: Path) -> list[Cell]:
 
 def run(settings: RobustSettings, base: Path, cell: Cell) -> dict[str, Any]:
     """Train for one class on one network; record rates on all networks, pictures and mean color."""
-    problem = problem_of(base, cell.values)
+    problem = trained_designs.trained_problem(settings, base, cell)
     subject = problem.subject
     design = best_design(trained_designs.with_trainers(problem, cell))
     pixels = (subject.start(), from_pixels(design, problem.device))

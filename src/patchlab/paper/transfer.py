@@ -6,8 +6,8 @@ design was not trained on; three fixed views in changed light; heat maps and con
 Where no gain is shown, its interval stands in the table. If networks have families, ensembles leave out whole families,
 and another table has the gains from family to family.
 
-Source: Pestana et al., algorithm "Full Texture" and table "Transferability". Their ε is the signed step, here
-`optimize.step_size`; a ball around the start is `patch.epsilon`. Intervals are over conditions, for the designs that
+Source: Pestana et al., algorithm "Full Texture" and table "Transferability". Their ε may be the signed step, here
+`optimize.step_size`, or a ball around the start, `patch.epsilon`. Intervals are over conditions, for the designs that
 were trained: another seed's design may do better or worse. Only intervals over objects take one figure per object and
 seed.
 """
@@ -22,7 +22,7 @@ from pydantic import Field, model_validator
 
 from patchlab.study.estimates import mean
 from patchlab.study.figures import number_grid, picture_sheet
-from patchlab.study.grid import Names, PositiveInt, by_values, group_by, problem_of, short_name
+from patchlab.study.grid import Names, PositiveInt, by_values, group_by, short_name
 from patchlab.study.record import Record, to_record
 from patchlab.study.study import Cell, Result, Study
 from patchlab.study.trained_designs import (
@@ -34,6 +34,7 @@ from patchlab.study.trained_designs import (
     test_and_draw,
     tested_networks,
     trained_cells,
+    trained_problem,
     views_from_sides,
     views_in_drawn_light,
     with_trainers,
@@ -60,12 +61,15 @@ class TransferSettings(TrainedSettings):
     # is a family.
     families: dict[NamePart, Names] = Field({})
     lights: PositiveInt = 20  # lights in each of three fixed views
+    vertex_colors: tuple[NamePart, ...] = ()  # ways whose design is the colors of vertices; faces mask the vertices
 
     @model_validator(mode="after")
     def _know_every_family(self):
         members = [name for family in self.families.values() for name in family]
         if self.families and sorted(members) != sorted(self.networks):
             raise ValueError("takes families in which each of networks is once, and no other network")
+        if unknown := set(self.vertex_colors) - set(self.ways):
+            raise ValueError(f"takes vertex_colors among ways; {', '.join(sorted(unknown))} is none")
         return self
 
     def family_of(self, network: str) -> str:
@@ -91,7 +95,11 @@ def cells(settings: TransferSettings, base: Path) -> list[Cell]:
 
 def run(settings: TransferSettings, base: Path, cell: Cell) -> dict[str, Any]:
     """Train if the cell names training networks, then test on all."""
-    problem = problem_of(base, cell.values)
+    problem = trained_problem(settings, base, cell)
+    if cell.values["way"] in settings.vertex_colors:
+        from patchlab.paper.vertex_colors import vertex_problem
+
+        problem = vertex_problem(problem)
     answers: dict[str, Any] = {}
     things: dict[str, Appearance] = {"design": None}
     if cell.values["trained"]:
@@ -219,14 +227,15 @@ def _view_tables(settings: TransferSettings, groups: ResultsByRow) -> list[Table
     rows = []
     for key, by_row in groups.items():
         for row, of_row in by_row.items():
-            for network in of_row[0].cell.values["trained"] if "views" in of_row[0].answers else ():
+            trained = of_row[0].cell.values["trained"]
+            for network in tested_networks(of_row) if trained and "views" in of_row[0].answers else ():
                 records = (Record(some, "design", "views") for some in (by_row.get(ORIGINAL, ()), of_row))
                 before, after = (np.reshape(record.hits(network), (-1, 3, settings.lights)) for record in records)
                 for i, azimuth in enumerate(of_row[0].answers["azimuths"]):
                     rates = (rate(hits[:, i].ravel().tolist()) for hits in (before, after))
-                    rows.append((*key, row, short_name(network), azimuth, *rates))
-    head = ("scene", "way", "trained on", "tested on", "azimuth (deg)", "original", "design")
-    about = f"Three fixed views, {settings.lights} drawn lights, backgrounds and cameras each, on training networks."
+                    rows.append((*key, row, short_name(network), ("no", "yes")[network in trained], azimuth, *rates))
+    head = ("scene", "way", "trained on", "tested on", "seen", "azimuth (deg)", "original", "design")
+    about = f"Three fixed views, {settings.lights} drawn lights, backgrounds and cameras each."
     return [Table("views", "Three views in changed light", head, tuple(rows), about)] if rows else []
 
 

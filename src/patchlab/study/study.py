@@ -41,6 +41,7 @@ STUDIES: dict[str, str] = {
     "ledger": "patchlab.validation.ledger_trials",
     "patch2d": "patchlab.paper.patch2d",
     "patch3d": "patchlab.paper.patch3d",
+    "printed": "patchlab.paper.printed",
     "promises": "patchlab.validation.promises",
     "real": "patchlab.validation.real_photos",
     "real-prints": "patchlab.validation.real_prints",

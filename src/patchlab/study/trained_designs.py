@@ -15,16 +15,31 @@ import torch
 from pydantic import Field
 
 from patchlab.study.figures import contact_sheet, photographs
-from patchlab.study.grid import GridSettings, Names, SceneChanges, make_cell, scene_values, short_name, with_changes
+from patchlab.study.grid import (
+    GridSettings,
+    Names,
+    SceneChanges,
+    make_cell,
+    problem_of,
+    scene_values,
+    short_name,
+    with_changes,
+)
 from patchlab.study.record import to_record
 from patchlab.study.study import Cell, Result
 from patchproof.base.color import srgb_from_linear
 from patchproof.base.intervals import Estimate
+from patchproof.base.resample import downscale
 from patchproof.channel.effects import EFFECT_BY_NAME, Light, Pose, Sensor
+from patchproof.mesh.mesh import Material
 from patchproof.optimizer.problem import Problem
 from patchproof.optimizer.responses import responses
+from patchproof.optimizer.texture import Texture
 from patchproof.render.photograph import Appearance, shade
+from patchproof.render.stage import set_stage
+from patchproof.scene.canvas import texture_canvas
 from patchproof.scene.conditions import Conditions, with_values
+from patchproof.scene.texture_scene import TextureScene
 
 SceneVariant = dict[str, dict[str, Any]]  # tables of a scene file with the keys that change
 NamePart = Annotated[str, Field(pattern=r"^[\w=+,-]{1,24}$")]  # part of a file's name
@@ -38,6 +53,8 @@ class TrainedSettings(GridSettings):
     # By name: tables of the scene file with the keys that change.
     ways: dict[NamePart, SceneVariant] = Field({"as_is": {}}, min_length=1)
     n: Annotated[int, Field(ge=2)] = 400  # unseen conditions that measure
+    # Longest side of the object's textures, original and design alike, when they are the design; by default the mesh's.
+    texture_px: Annotated[int, Field(ge=16)] | None = None
 
 
 def single_network_rows(networks: Sequence[str]) -> dict[str, Sequence[str]]:
@@ -62,6 +79,24 @@ def trained_cells(
             networks_of_cell = {"trained": list(trained), "networks": list(networks), "of_scene": False}
             cells.append(make_cell(values | row_values | networks_of_cell, seed, *words))
     return cells
+
+
+def trained_problem(settings: TrainedSettings, base: Path, cell: Cell) -> Problem:
+    """The problem of a cell, its textures at most `texture_px` wide and high: a step costs as much as its texels."""
+    problem = problem_of(base, cell.values)
+    scene, most = problem.scene, settings.texture_px
+    if most is None or not isinstance(scene, TextureScene):
+        return problem
+
+    def small(material: Material) -> Material:
+        texture = material.texture_srgb
+        return material if texture is None else replace(material, texture_srgb=downscale(texture, most))
+
+    mesh = replace(scene.mesh, materials=tuple(map(small, scene.mesh.materials)))
+    canvas = texture_canvas(mesh, scene.settings.patch, scene.base, most)
+    scene = replace(scene, mesh=canvas.mesh, canvas=canvas)
+    subject = Texture(scene, canvas, problem.device)
+    return replace(problem, scene=scene, stage=set_stage(scene, problem.device), subject=subject)
 
 
 def with_trainers(problem: Problem, cell: Cell) -> Problem:

@@ -17,7 +17,7 @@ from patchlab.study import grid
 from patchlab.study.record import hits_text, parse_hits
 from patchlab.study.study import Cell, Result
 from patchproof.base.sessions import RatePosterior, count_by_session, rate_posterior
-from patchproof.base.validation import expand_path
+from patchproof.base.validation import StrictModel, expand_path
 from patchproof.optimizer.promise import PromiseOptions
 
 if TYPE_CHECKING:
@@ -26,13 +26,18 @@ if TYPE_CHECKING:
     from patchproof.optimizer.run import Run
 
 
-class SessionsSettings(grid.GridSettings):
-    """Settings: a run for each scene, network, printer and seed, and sessions of photographs of each."""
+class PhotosSettings(StrictModel):
+    """Settings of simulated photographs of a print."""
 
-    printers: grid.Names = ("coated",)  # printers of the designs, which optimizing knows
     sessions: grid.PositiveInt = 4  # sessions of each print
     photos: Annotated[int, Field(ge=5, le=1000)] = 20  # photographs of each session
     path_traced: bool = True  # photograph with Mitsuba 3, else with our renderer
+
+
+class SessionsSettings(grid.GridSettings, PhotosSettings):
+    """Settings: a run for each scene, network, printer and seed, and sessions of photographs of each."""
+
+    printers: grid.Names = ("coated",)  # printers of the designs, which optimizing knows
 
 
 def cells(settings: SessionsSettings, base: Path) -> list[Cell]:
@@ -48,8 +53,8 @@ def cells(settings: SessionsSettings, base: Path) -> list[Cell]:
     )
 
 
-def make_run_and_sheet(base: Path, cell: Cell, folder: Path) -> "Run":
-    """Optimize or import the cell's design into folder/run, and write its sheet to folder/sheet.pdf."""
+def make_run_and_sheet(base: Path, cell: Cell, folder: Path, views: int | None = None) -> "Run":
+    """Optimize or import the cell's design into folder/run, promise it by `views`, and write folder/sheet.pdf."""
     from patchproof.optimizer.imported_design import import_patch
     from patchproof.optimizer.run import optimize
     from patchproof.reprints.run_sheet import sheet as sheet_of
@@ -57,7 +62,7 @@ def make_run_and_sheet(base: Path, cell: Cell, folder: Path) -> "Run":
     scene = grid.scene_of(base, cell.values)
     scene = replace(scene, settings=scene.settings.changed(target={"models": grid.network_names(base, cell.values)}))
     # a page needs one control only, and all of them would take most of a promise's time
-    promise = PromiseOptions(controls=("bare",))
+    promise = PromiseOptions(views, controls=("bare",))
     if (picture := cell.values.get("picture")) is None:
         patch_run = optimize(scene, folder / "run", promise=promise)
     else:
@@ -67,7 +72,7 @@ def make_run_and_sheet(base: Path, cell: Cell, folder: Path) -> "Run":
 
 
 def take_photos(
-    settings: SessionsSettings, cell: Cell, patch_run: "Run", folder: Path, control: str | None = None
+    settings: PhotosSettings, cell: Cell, patch_run: "Run", folder: Path, control: str | None = None
 ) -> Path:
     """Photograph folder/sheet.pdf, or a control under the same conditions; returns the folder of sessions."""
     from patchproof.reprints.mounted_sheet import ReprintSetup

@@ -10,16 +10,19 @@ time in turn. Run in this folder: python cores.py
 import math
 import pickle
 import statistics
+import tomllib
 from functools import partial
 from itertools import product
 
 import torch
 
-from patchlab.bench.measure import call_in_turn, time_call
-from patchlab.bench.train import demo_problem
+import patchproof as pp
 from patchlab.results.rows import write_rows
+from patchlab.study.measure import call_in_turn, time_call
+from patchproof.app.demo import SCENE
 from patchproof.base.workers import keep_freed_memory
 from patchproof.optimizer import expectation, loop
+from patchproof.optimizer.problem import set_problem
 from patchproof.render.views import split_views
 
 BATCHES, STEP_VIEWS, CORES, ROUNDS = (1, 2, 4), (4, 8, 16), (1, 2, 4, 8, 16), 12
@@ -27,7 +30,7 @@ BATCHES, STEP_VIEWS, CORES, ROUNDS = (1, 2, 4), (4, 8, 16), (1, 2, 4, 8, 16), 12
 
 def parts_ms() -> dict[int | str, float]:
     """Milliseconds of a batch by its views, of what is done once in a step, and of sending a batch and its answer."""
-    problem = demo_problem()
+    problem = set_problem(pp.make_scene(tomllib.loads(SCENE)))
     state, whole = loop.start(problem), expectation.training_views(problem, problem.scene.draw("train", sum(BATCHES)))
     parts = dict(zip(BATCHES, split_views(whole, BATCHES), strict=True))
     printed = problem.subject.print_design(state.design).detach()
