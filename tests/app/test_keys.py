@@ -12,7 +12,7 @@ from console import lab_command
 import patchlab
 import patchproof
 from patchlab.keys import HEAD, documents
-from patchproof.app.keys import DOCUMENTS, files_page, keys_page, meanings, tables
+from patchproof.app.keys import DOCUMENTS, codes_table, files_page, keys_page, meanings, tables
 from patchproof.base.errors import Refused
 from patchproof.base.validation import StrictModel
 from patchproof.sheets.template import QrCode
@@ -35,6 +35,11 @@ def test_the_stored_page_is_what_is_printed(pages):
     for page, printed in pages.items():
         stored = (ROOT / f".readme/{page}.md").read_text(encoding="utf-8")
         assert stored == printed, f"print {page}.md again: patchproof keys [--files], patchlab keys"
+
+
+def test_the_questions_end_with_every_code():
+    stored = (ROOT / ".readme/faq.md").read_text(encoding="utf-8")
+    assert stored.endswith(codes_table()), "print the table again: patchproof keys --codes"
 
 
 def test_every_key_says_what_it_means():

@@ -1,4 +1,4 @@
-"""Write every key of scene files and page templates, or what files may declare, as one Markdown page.
+"""Write every key of scene files and page templates, what files may declare, or photographs' codes, as Markdown.
 
 In: the settings classes; the readers' own lists of declarations. Out: per table a row per key: type and range, unit,
 default, meaning; a table for each kind of input. The meaning is the comment at the end of the field's last line or,
@@ -25,6 +25,7 @@ from patchproof.base.declared import Declaration
 from patchproof.base.errors import Refused
 from patchproof.base.settings import SceneSettings
 from patchproof.base.validation import StrictModel, check_ordered, models_in, spelling_hint
+from patchproof.photo.rejection import REJECTION_CODES
 from patchproof.sheets.board import BoardTemplate
 from patchproof.sheets.template import Template
 
@@ -203,6 +204,12 @@ def _bounds(checks: tuple[Any, ...]) -> list[tuple[str, Any]]:
 def declarations(reader: str) -> tuple[Declaration, ...]:
     """The lists of one kind of input in `READERS`, joined."""
     return tuple(entry for module in READERS[reader] for entry in import_module(f"patchproof.{module}").DECLARED)
+
+
+def codes_table() -> str:
+    """Write the codes of rejected and judged photographs as a Markdown table."""
+    rows = [f"| `{code}` | {meaning} | {remedy} |" for code, (meaning, remedy) in REJECTION_CODES.items()]
+    return "\n".join(["| code | it says | what helps |", "|---|---|---|", *rows, ""])
 
 
 def files_page() -> str:

@@ -6,11 +6,37 @@ The codes are those of report.json. A `PhotoRejected` never stops a batch: the r
 from patchproof.base.errors import PatchproofError
 from patchproof.base.text import printable
 
-REJECTION_CODES = (
-    *("unreadable", "too_costly", "empty", "too_few_markers", "blurred", "clipped", "too_small", "tilted"),
-    *("out_of_range", "scale_off", "wrong_sheet", "several_sheets", "mirrored", "curled", "cropped", "copy"),
-    *("other_design", "wrong_ink", "no_corners"),
-)
+# what each code says of a photograph, and what helps; printed for users by `patchproof keys --codes`
+REJECTION_CODES = {
+    "unreadable": (
+        "no picture, damaged, or of a color space that is not read",
+        "save it as JPEG or PNG",
+    ),
+    "too_costly": ("the picture is larger than limits of size and time allow", "save it smaller"),
+    "empty": ("the picture holds no pixels, or one color", "take it again"),
+    "too_few_markers": ("too little of the piece can be read to know where it lies", "show all of it, sharp and lit"),
+    "blurred": (
+        "motion or focus merges neighboring cells of markers",
+        "hold still, focus on the piece, use more light",
+    ),
+    "clipped": ("highlights are cut off, so colors cannot be compared", "expose one or two stops less"),
+    "too_small": ("the piece has too few pixels for its corners or its cells", "come closer, use the full resolution"),
+    "tilted": ("the piece is foreshortened to less than a fifth", "look at it less from the side"),
+    "out_of_range": ("the view lies outside of what the promise covers", "stay within the ranges of the scene"),
+    "scale_off": ("a scan shows another size than the page's", 'print again at 100 %, not "fit to page"'),
+    "wrong_sheet": ("markers or QR code are those of another sheet", "name that sheet's JSON"),
+    "several_sheets": ("more than one print is in view", "photograph one at a time"),
+    "mirrored": ("the picture is mirrored", "switch the camera's mirror setting off"),
+    "curled": (
+        "paper or design lie neither in a plane nor on rolled paper",
+        "press it flat, glue it down",
+    ),
+    "cropped": ("a crop that was not told moved the picture's middle", "use the photograph as the camera wrote it"),
+    "copy": ("another file shows the same photograph", "leave one of them"),
+    "other_design": ("what is printed between the markers is not this design", "name the sheet that was printed"),
+    "wrong_ink": ("an ink is missing or another one", "print again with all inks"),
+    "no_corners": ("a print without markers was not found", "add --find or --corners"),
+}
 
 
 class PhotoRejected(PatchproofError, ValueError):

@@ -93,8 +93,9 @@ def examples(folder: Annotated[Path, Argument(help="The folder to copy them to, 
 def keys(
     name: Annotated[str | None, Argument(help="scene, template or board; without one, all.")] = None,
     files: Annotated[bool, Option("--files", help="What files may declare, and what is done with it.")] = False,
+    codes: Annotated[bool, Option("--codes", help="What photographs' codes say, and what helps.")] = False,
 ) -> None:
     """All keys of scene files and page templates: range, unit, default and meaning, as Markdown."""
-    from patchproof.app.keys import DOCUMENTS, files_page, keys_page
+    from patchproof.app.keys import DOCUMENTS, codes_table, files_page, keys_page
 
-    print(files_page() if files else keys_page(DOCUMENTS, name), end="")
+    print(codes_table() if codes else files_page() if files else keys_page(DOCUMENTS, name), end="")
