@@ -69,8 +69,8 @@ def tables(settings: Any, results: "Sequence[Result]") -> Sequence[Table]:
             "All points",
             ("axis", "value", *_RATE_HEADINGS, "median error mm", "largest error mm", "said"),
             tuple(row for result in results for row in _point_rows(result)),
-            f"Gain: over {_CONTROL} (Newcombe). “{NO_EFFECT}”: its interval holds 0. Errors are the largest of "
-            "the design's four corners, against the simulation's truth, where a flat sheet was measured. Intervals: Wilson.",
+            f"Gain: over {_CONTROL} (Newcombe). “{NO_EFFECT}”: its interval holds 0. Errors are the largest "
+            "of the design's four corners, against the simulation's truth, of flat sheets. Intervals: Wilson.",
         ),
     )
     return tuple(table for table in all_tables if table.rows)
