@@ -146,7 +146,7 @@ def table(
     failed = {}
     if run is not None:
         parts = console.names_of(part) or tuple(page.PARTS)
-        with console.progress() as bar:
+        with progress_bar() as bar:
             work = Work(True, False, jobs or 1, cluster, lambda done, total: bar("cells", done, total))
             finished = page.run_parts(run, parts, quick, photos, work)
         failed = {f"{part} {cell}": text for part, each in finished.items() for cell, text in each.failed.items()}

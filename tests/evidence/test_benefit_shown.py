@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from dataclasses import replace
 
@@ -78,6 +79,7 @@ def test_a_useless_patch_keeps_its_promise_and_is_not_taken_for_one_that_helps(p
 def test_scripts_can_ask_for_more_than_a_useless_promise_that_held(exits, how, monkeypatch, tmp_path):
     useless = some_report().changed(summary=summary_of(0, 40, USELESS))
     monkeypatch.setattr("patchproof.app.verify.verify", lambda *_, **__: useless)
+    monkeypatch.setattr("patchproof.app.cli.files.check_files", lambda arguments: None)
     done = CliRunner().invoke(app, ["verify", "photos", "--sheet", "a.json", "--out", str(tmp_path), *how])
     assert done.exit_code == exits and done.stdout.startswith("Does not help (controls simulated).")
     assert ("--require helps asks for both" in done.stderr) == ("kept" in how)
@@ -106,7 +108,7 @@ def test_terminal_and_page_begin_with_what_the_patch_is_worth(promise, recognize
     manifest = {"promise": promise.model_dump(mode="json"), "settings": {}, "kind": "design", "page_mm": (210, 297)}
     page = report_html(report.model_dump(mode="json"), manifest | {"design": None}, {}, None)
     assert f'<h1 class="{word}">{headline}</h1>' in page and page.index(headline) < page.index("Promise ")
-    assert ".helps { color:var(--yes) }" in page and f'<b class="{verdict}">Promise ' in page
+    assert re.search(r"\.helps\b[^{]*\{ color:var\(--yes\)", page) and f'<b class="{verdict}">Promise ' in page
 
 
 def beside(name, recognized, half=0.2, n=40):

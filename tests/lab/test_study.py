@@ -46,7 +46,7 @@ def test_a_study_leaves_json_csv_figures_and_a_page(tmp_path):
     assert data["cells"]["n3"]["found"] == {"square": 9, "parts": [1, 2], "n3.txt": "files/n3.txt"}
     assert (tmp_path / "files/n3.txt").read_text() == "3"
     page = (tmp_path / "toy.html").read_text()
-    assert "1.000 [0.510, 1.000]" in page and "data:image/png" in page and "http" not in page
+    assert "1.000 <small>[0.510, 1.000]</small>" in page and "data:image/png" in page and "http" not in page
 
 
 def test_cells_that_fail_are_reported_and_the_rest_goes_on(tmp_path):

@@ -74,7 +74,7 @@ def test_what_is_promised_was_not_optimized_on(tmp_path):
     seen = {s: numbers(scene.pictures(scene.draw(s, 128), (24, 24))) for s in ("train", "select", "promise", "reprint")}
     assert seen["train"] == seen["select"] and seen["promise"] == seen["reprint"]
     assert not seen["train"] & seen["promise"] and len(seen["train"] | seen["promise"]) == FEW_IMAGES
-    assert all("unreadable" in warning for warning in scene.warnings)
+    assert all("too small" in warning for warning in scene.warnings)
     few = build_scene(settings_of("cup"), folder_of_few(tmp_path), 0)
     assert few.warnings[0] == "the promise is made on 2 images, and says little of others: give 20 or more"
     pictures = {stream: few.draw(stream, 64).pose.background[:, 0] for stream in ("train", "promise")}
@@ -204,7 +204,7 @@ def test_markers_are_as_large_as_views_need_and_pictures_hold(tmp_path):
     assert 8 <= large.piece.module_mm * 7 < 8.75 and large.unreadable_share <= 0.06
     small = build_scene(settings_of(), folder, 0)
     assert small.piece.marker_mm == pytest.approx(8.2)  # 0.29 × 40 = 11.6 mm for a corner; (11.6 - 1) × 7/9 = 8.24
-    assert small.unreadable_share > 0.5 and "unreadable" in small.warnings[-1]
+    assert small.unreadable_share > 0.5 and "too small" in small.warnings[-1]
     whole = build_scene(settings_of(view={"patch_share": (0.1, 1.0), "roll_deg": (0, 0)}), folder, 0)
     assert whole.piece.size_mm == small.piece.size_mm == (60, 40)  # up to the whole square the piece stays as asked
     with pytest.raises(Refused, match=r"at least 39 mm, which has room for 8 mm markers, got 60 × 38\.9 mm"):

@@ -54,10 +54,10 @@ NAMES = {
 class Ceiling(StrictModel):
     """Designs of the ceiling: the first `pairs`, so many steps, seeds, and places (the first is the scene's own)."""
 
-    pairs: int = 4
-    steps: int = 2400
-    seeds: int = 3
-    places: int = 3
+    pairs: int = 4  # of the scenes, the first ones
+    steps: int = 2400  # of each design
+    seeds: int = 3  # of each place
+    places: int = 3  # the scene's own, then the best of a search
 
 
 class SpeedSettings(grid.GridSettings):
@@ -66,11 +66,11 @@ class SpeedSettings(grid.GridSettings):
     efforts: dict[str, tuple[int, int | None]] = Field(
         {"draft": DRAFT_EFFORT, DEFAULT: (240, None), "thorough": THOROUGH_EFFORT}
     )  # steps, and views of the promise (None: as many as the scene's half width needs)
-    methods: tuple[str, ...] = ("sign", "flat", "art", "unadversarial")
+    methods: tuple[str, ...] = ("sign", "flat", "art", "unadversarial")  # beside ours
     n: grid.PositiveInt = 300  # fresh views
     ceiling: Ceiling = Ceiling()
-    photos: grid.PositiveInt = 24
-    sizes_px: tuple[tuple[int, int], ...] = ((1600, 1200), (4000, 3000))
+    photos: grid.PositiveInt = 24  # for each detector and size
+    sizes_px: tuple[tuple[int, int], ...] = ((1600, 1200), (4000, 3000))  # of photographs
 
 
 def cells(settings: SpeedSettings, base: Path) -> list[Cell]:

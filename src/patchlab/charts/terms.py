@@ -43,7 +43,7 @@ _STAYED = ("motion blur",)  # of the terms there
 class TermsSettings(grid.GridSettings):
     """Pairs, and the size of everything that is tried on them."""
 
-    steps: grid.PositiveInt = 240
+    steps: grid.PositiveInt = 240  # of each design
     n: grid.PositiveInt = 400  # views of a promise
     rounds: grid.PositiveInt = 24  # of a step with and without each term
 

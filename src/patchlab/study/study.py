@@ -32,6 +32,7 @@ from patchproof.report.tables import Drawing, Results, Table, write_json, write_
 # by name: the module with the STUDY; the first line of its docstring describes the study
 STUDIES: dict[str, str] = {
     "ablation": "patchlab.validation.ablation",
+    "breaks": "patchlab.charts.breaks",
     "deceive": "patchlab.paper.deceive",
     "detection": "patchlab.validation.detection",
     "envelope": "patchlab.validation.envelope.sweeps",
@@ -47,7 +48,9 @@ STUDIES: dict[str, str] = {
     "real-prints": "patchlab.validation.real_prints",
     "robust": "patchlab.paper.robust",
     "session-trials": "patchlab.validation.session_trials",
+    "speed": "patchlab.charts.speed",
     "stress": "patchlab.paper.stress",
+    "terms": "patchlab.charts.terms",
     "transfer": "patchlab.paper.transfer",
     "verdicts": "patchlab.validation.verdicts",
 }

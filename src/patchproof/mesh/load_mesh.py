@@ -13,15 +13,17 @@ from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from patchproof.base.errors import Refused
 from patchproof.base.input import is_file, run_within_seconds
 from patchproof.base.resample import downscale
-from patchproof.mesh.assets import Assets
 from patchproof.mesh.mesh import Material, Mesh, MeshPart, mesh_from_parts, topology_warnings, transform_part
+
+if TYPE_CHECKING:
+    from patchproof.mesh.assets import Assets
 
 PYTHON_PREFIX = "python:"
 
@@ -81,6 +83,8 @@ def read_parts(path: Path, world_from_file: np.ndarray) -> tuple[list[MeshPart],
     kind = FORMATS.get(path.suffix.lower())
     if kind is None:
         raise Refused(f"a mesh file ({', '.join(FORMATS)})", path.name, "export the mesh in one of these formats")
+    from patchproof.mesh.assets import Assets
+
     try:
         assets = Assets(path)
         read = read_stl if kind == "stl" else getattr(import_module(f"patchproof.mesh.{kind}"), f"read_{kind}")
@@ -97,7 +101,7 @@ def read_parts(path: Path, world_from_file: np.ndarray) -> tuple[list[MeshPart],
         raise Refused(f"a mesh as {path.suffix[1:].upper()}", got, "export it again") from error
 
 
-def read_stl(assets: Assets) -> list[MeshPart]:
+def read_stl(assets: "Assets") -> list[MeshPart]:
     """Read an STL file, text or binary, as one part; several solids are one object, and colors are left out, which
     programs write in different ways.
     """

@@ -52,7 +52,7 @@ def as_command(verb: Callable[..., None]) -> Callable[..., None]:
     def command(**arguments: Any) -> None:
         _running[:] = [arguments]
         try:
-            if verb.__name__ not in ("demo", "keys"):
+            if verb.__name__ not in ("demo", "keys") and verb.__module__.startswith("patchproof."):
                 from patchproof.app.cli.files import check_files
 
                 check_files(arguments)
