@@ -57,7 +57,7 @@ def whole_photo(rng: Rng, kind, size: tuple[int, int] = (32, 24)) -> bytes:
 
 def mutated(rng: Rng, data: bytes) -> bytes:
     """Cut, overwritten, with a piece doubled or dropped, or with huge numbers in its header."""
-    data, how = bytearray(data), rng.integers(6)
+    data, how = bytearray(data or b"\0"), rng.integers(6)
     at = int(rng.integers(len(data)))
     if how == 0:
         return bytes(data[:at])
