@@ -654,11 +654,11 @@ def broken_glb(rng: Rng, data: bytes) -> bytes:
     tree, binary = json.loads(data[20 : 20 + size]), data[20 + size :]
     for _ in range(rng.integers(1, 4)):
         part = str(rng.choice(list(tree)))
-        if part == "nodes" and rng.random() < 0.6:
+        if part == "nodes" and tree["nodes"] and rng.random() < 0.6:
             tree["nodes"][int(rng.integers(len(tree["nodes"])))]["children"] = rng.integers(
                 0, len(tree["nodes"]), 2
             ).tolist()
-        elif part == "accessors" and rng.random() < 0.6:
+        elif part == "accessors" and tree["accessors"] and rng.random() < 0.6:
             accessor = tree["accessors"][int(rng.integers(len(tree["accessors"])))]
             accessor["count"] = int(rng.choice([0, 1, 10**12, -3, 7]))
             if rng.random() < 0.3:
