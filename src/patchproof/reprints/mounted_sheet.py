@@ -169,13 +169,17 @@ def mount_sheet(pdf_path: str | Path, run: Run, how: ReprintSetup = DEFAULT_SETU
 def sheet_scene(pdf_path: str | Path, run: Run) -> tuple[Manifest, Scene]:
     """Read a sheet's manifest, and set its run's scene to the sheet's template; refused if it is not of this run."""
     is_manifest = Path(pdf_path).suffix == ".json"  # of a print without a page
-    manifest = load_manifest(pdf_path) if is_manifest else attached_manifest(pdf_path, run.scene.sheet_id)
+    default = run.scene.settings.sheet.template
+
+    def scene_on(manifest: Manifest) -> Scene:
+        return run.scene.with_template(manifest.settings.get("sheet", {}).get("template", default))
+
+    manifest = load_manifest(pdf_path) if is_manifest else attached_manifest(pdf_path, lambda each: each.sheet_id == scene_on(each).sheet_id)
     if is_manifest and (manifest.design is None or manifest.settings.get("sheet", {}).get("template") != NO_PAGE):
         raise Refused(
             "a PDF of a sheet, or the manifest of a print without a page", str(pdf_path), "name the PDF beside it"
         )
-    default = run.scene.settings.sheet.template
-    scene = run.scene.with_template(manifest.settings.get("sheet", {}).get("template", default))
+    scene = scene_on(manifest)
     if manifest.sheet_id != scene.sheet_id:
         expected, do = f"a sheet of this run ({scene.sheet_id})", "name the run that it was made from"
         raise Refused(expected, f"sheet {manifest.sheet_id}", do)

@@ -78,9 +78,10 @@ def optimize(
 
     if draft and thorough:
         raise BadParameter("is the opposite of --draft; leave one out", param_hint="--thorough")
-    steps, promise = effort_of(draft, thorough, steps, promise)
     with progress_bar() as bar:
-        loaded = load_scene(scene, seed, steps)
+        loaded = load_scene(scene, seed)
+        steps, promise = effort_of(loaded, draft, thorough, steps, promise)
+        loaded = loaded.with_steps(steps)
         warn(loaded.warnings)
         options: dict[str, Any] = {"promise": PromiseOptions(promise), "compute": Compute(device, jobs or 1)}
         run = optimize_scene(loaded, out, **options, resume=resume, overwrite=overwrite, progress=bar)
