@@ -174,7 +174,11 @@ def sheet_scene(pdf_path: str | Path, run: Run) -> tuple[Manifest, Scene]:
     def scene_on(manifest: Manifest) -> Scene:
         return run.scene.with_template(manifest.settings.get("sheet", {}).get("template", default))
 
-    manifest = load_manifest(pdf_path) if is_manifest else attached_manifest(pdf_path, lambda each: each.sheet_id == scene_on(each).sheet_id)
+    manifest = (
+        load_manifest(pdf_path)
+        if is_manifest
+        else attached_manifest(pdf_path, lambda each: each.sheet_id == scene_on(each).sheet_id)
+    )
     if is_manifest and (manifest.design is None or manifest.settings.get("sheet", {}).get("template") != NO_PAGE):
         raise Refused(
             "a PDF of a sheet, or the manifest of a print without a page", str(pdf_path), "name the PDF beside it"
