@@ -174,9 +174,7 @@ def effort_of(
     """
     if draft and thorough:
         raise Refused("a draft or a thorough run", "both", "leave one out")
-    if not draft and not thorough:
-        return steps, views
-    limit, effort = (min, DRAFT_EFFORT) if draft else (max, THOROUGH_EFFORT)
+    limit, effort = (min, DRAFT_EFFORT) if draft else (max, THOROUGH_EFFORT if thorough else (1, None))
     return steps or limit(effort[0], scene.settings.optimize.steps), views or effort[1]
 
 

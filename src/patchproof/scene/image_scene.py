@@ -185,9 +185,7 @@ def _files_of_class(settings: SceneSettings, base: Path) -> list[Path]:
 
 
 def read_labels(table: Path, folder: Path) -> list[tuple[str, str]]:
-    """Return (file name, label in small letters) of each line but a heading; commas after the first belong to the
-    label. The files are in `folder`.
-    """
+    """Return (name in `folder`, label in small letters) of each line but a heading; later commas are the label's."""
     rows = read_csv(table, "a CSV of file names and labels (object.labels)")
     short = next((row for row in rows if len(row) < 2), None)
     if short is not None:

@@ -156,8 +156,10 @@ class Scene(ABC):
         return self._identified(self.settings.changed(sheet={"template": name}), self.known)
 
     def with_steps(self, steps: int | None) -> Self:
-        """Return the scene with another number of optimizer steps; the scene itself if it is None."""
-        return self._identified(self.settings.changed(optimize={"steps": steps}), self.known) if steps else self
+        """Return the scene with another number of optimizer steps; the scene itself for None and its own."""
+        if steps in (None, self.settings.optimize.steps):
+            return self
+        return self._identified(self.settings.changed(optimize={"steps": steps}), self.known)
 
     def for_design(self, sha256: str) -> Self:
         """Return the scene of a design that exists before its run. The design decides its sheet id, and thus its

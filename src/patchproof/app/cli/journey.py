@@ -162,7 +162,7 @@ def sheet(
 
             lines = promise_summary(manifest.promise, manifest.settings), background_summary(manifest.settings)
             say(lines[0], f"promise simulated {lines[1]}")
-        say(f"sheet {manifest.sheet_id} ({manifest.kind}): {out}, {path.name}")
+        say(f"sheet {manifest.sheet_id} ({manifest.kind}): {out}{'' if path == out else f', {path.name}'}")
     if check:
         lines = (line for manifest in manifests for line in sheet_advice(manifest))
         say(*dict.fromkeys(lines), *pdf_advice(out))  # lines that several designs share are printed once
