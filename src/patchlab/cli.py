@@ -106,7 +106,7 @@ def study(
         missing = "--config" if config is None else "--out"
         raise typer.BadParameter("missing; a config to start from: --example", param_hint=missing)
     with progress_bar() as bar:
-        work = Work(resume, overwrite, jobs or 1, cluster, lambda done, total: bar("cells", done, total))
+        work = Work(resume, overwrite, jobs or 1, cluster, lambda done, total: bar("cells", done, total), console.say)
         changed = None if cells is None else {"cells": str(cells.resolve()), "left_out": "nothing"}
         finished = run_study(name, config, out, work, changed)
     console.say_study(finished)

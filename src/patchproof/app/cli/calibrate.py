@@ -40,6 +40,7 @@ def printer(
     """A printer from its ICC profile, or from photographs of its printed chart or of any design."""
     from patchproof.calibrate.printer import printer_from_chart, printer_from_design, printer_from_icc
 
+    photos = photos or []
     if chart:
         raise BadParameter("a chart needs no option: PHOTO... --sheet chart.json", param_hint="--chart")
     if (icc is None) != bool(photos):
