@@ -169,9 +169,7 @@ def optimize(
 def effort_of(
     scene: Scene, draft: bool, thorough: bool, steps: int | None, views: int | None
 ) -> tuple[int | None, int | None]:
-    """Return steps and promised views, where they are not given, of a first look, in no more steps than the scene's,
-    or of a print that counts, in no fewer.
-    """
+    """Return steps and promised views, if not given: of a draft no more steps than the scene's, else no fewer."""
     if draft and thorough:
         raise Refused("a draft or a thorough run", "both", "leave one out")
     limit, effort = (min, DRAFT_EFFORT) if draft else (max, THOROUGH_EFFORT if thorough else (1, None))

@@ -21,10 +21,6 @@ _CONTROLS = {
     "gray": "a plain gray patch",
     "noise": "a patch of noise",
 }
-OWN_VIEWS = (
-    "The promised rate is the mean over all views that the scene allows; photographs that were taken nearer, brighter "
-    "or more from the front than these are expected to do better, others worse."
-)
 _NO_GAIN = f"A gain of {100 * LEAST_GAIN:.0f} points or more is ruled out."
 
 
@@ -159,9 +155,8 @@ def verdict_lines(report: Any) -> list[str]:
     if summary.prediction_interval is not None:
         lines.append("expected: {} to {} of {}".format(*summary.prediction_interval, summary.judged))
     if (forecast := summary.forecast) is not None:
-        head = f"expected at the measured views: {forecast.expected:.1f} of {forecast.photos}"
+        head = f"expected at their own views (promised: over all views): {forecast.expected:.1f} of {forecast.photos}"
         lines.append(f"{head} [{forecast.interval[0]}, {forecast.interval[1]}], recognized {forecast.recognized}")
-        lines.append(f"  {OWN_VIEWS}")
     if summary.estimated is not None:
         lines += _estimated_lines(summary.estimated)
     if summary.culprit is not None:

@@ -63,7 +63,6 @@ def report_html(report: Mapping, manifest: Mapping, encoded: Mapping[str, Mappin
         worth=words.benefit_sentence(summary),
         example=_median_card([card for card in cards if card["photo"] in judged], primary),
         looks=words.looks_sentence(summary),
-        own_views=words.OWN_VIEWS,
         meaning=words.recognition_meaning(promise["models"][0], promise["target"]["label"]) if promise else "",
         verdict=words.VERDICTS[summary["verdict"]],
         ledger=ledger,

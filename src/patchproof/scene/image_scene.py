@@ -190,8 +190,8 @@ def read_labels(table: Path, folder: Path) -> list[tuple[str, str]]:
     short = next((row for row in rows if len(row) < 2), None)
     if short is not None:
         raise Refused(f"a file name and a label in each line of {table}", f'"{short[0]}"', "add the label")
-    if rows and rows[0][0].strip().casefold() in _HEADING_NAMES and not is_file(folder / rows[0][0].strip()):
-        rows = rows[1:]
+    first = rows[0][0].strip() if rows else ""
+    rows = rows[first.casefold() in _HEADING_NAMES and not is_file(folder / first) :]
     return [(row[0].strip(), ",".join(row[1:]).strip().casefold()) for row in rows]
 
 

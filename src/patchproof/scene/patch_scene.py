@@ -26,6 +26,7 @@ from patchproof.sheets.template import page_template
 if TYPE_CHECKING:
     from patchproof.scene.tape_measure import TapeMeasurement
 
+MIN_ROLLED_MM = 100  # of rolled paper's shorter side, below which few of its photographs are measured
 PiecePosition = tuple[float, float, float] | Side  # a point of the scene in millimeters, or the middle of a side
 
 
@@ -160,6 +161,9 @@ def _place_piece(scene: MeshScene, lay: PlacementMethod) -> tuple[Piece, Placeme
         scales = smallest_marker_scales(scene, placement, piece)
     unreadable = float((scales * piece.module_mm < interface.PX_PER_MODULE * 0.999).mean()) if piece.markers else 0.0
     notes = (*mesh.warnings, *scene.backgrounds.notes, *placement.warnings)
+    measurable = interface.measurable_text(unreadable, placement.family)
+    if piece.markers and placement.family == "exponential":
+        return piece, placement, unreadable, (*notes, f"{measurable}: paper that bends in two directions only counts")
     if unreadable > 1 - interface.READABLE_SHARE:
         advice = "narrow view.azimuth_deg and view.elevation_deg, or make the piece smaller"
         if needed_mm > marker_mm + 0.05:
@@ -167,11 +171,9 @@ def _place_piece(scene: MeshScene, lay: PlacementMethod) -> tuple[Piece, Placeme
                 f"view.distance_mm and camera.photo_px ask for {needed_mm:.1f} mm, and those for a piece of "
                 f"{smallest_piece_mm(needed_mm)} mm or more; come nearer, or take larger photographs"
             )
-        notes += (f"{interface.measurable_text(unreadable, marker_mm)}: {advice}",)
-    if (
-        piece.markers and placement.family == "exponential"
-    ):  # of 15 photographs of a mug that showed all markers, none was measured
-        notes += ("paper that bends in two directions can rarely be measured: its photographs count, without figures",)
+        notes += (f"{measurable}: others show markers of {marker_mm:.1f} mm too small: {advice}",)
+    if piece.markers and placement.family == "cylinder" and min(patch.size_mm) < MIN_ROLLED_MM:
+        notes += (f"few photographs of rolled paper under {MIN_ROLLED_MM} mm can be measured: the others only count",)
     return piece, placement, unreadable, notes
 
 

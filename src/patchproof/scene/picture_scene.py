@@ -81,7 +81,8 @@ class PictureScene(PieceScene):
         share = self.unreadable_share
         if share <= 1 - READABLE_SHARE:
             return self.notes
-        return (*self.notes, measurable_text(share, self.piece.marker_mm))
+        text = measurable_text(share, "plane")
+        return (*self.notes, f"{text}: others show markers of {self.piece.marker_mm:.1f} mm too small")
 
 
 @dataclass(frozen=True)

@@ -24,14 +24,14 @@ from torch import Tensor
 from patchproof.app.plan.cost import Cost, measure_cost
 from patchproof.app.plan.errors import Terms, measure_terms
 from patchproof.base.intervals import wilson
-from patchproof.base.progress import Progress, no_progress
+from patchproof.base.progress import Advance, Progress, no_progress
 from patchproof.base.validation import StrictModel
 from patchproof.evidence.verdict import photos_line
 from patchproof.optimizer.loop import SELECT_VIEWS, start, steps
 from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.place_search import Place, choose_place
 from patchproof.optimizer.problem import Problem, set_problem
-from patchproof.optimizer.promise import PROMISE_VIEWS, VIEWS_PER_SESSION, make_promise
+from patchproof.optimizer.promise import CONTROLS, PROMISE_VIEWS, VIEWS_PER_SESSION, make_promise
 from patchproof.scene.bent_scene import placement_with_other_bend
 from patchproof.scene.interface import PX_PER_MODULE, READABLE_SHARE, PieceScene, require_piece
 from patchproof.scene.scene import load_scene
@@ -171,7 +171,7 @@ def measured_plan(
         draft=draft,
         terms=terms,
         samples=sample_plan(draft.rate, terms.threshold),
-        photographs=_photographs_needed(problem, design, progress) if scene.HAS_PIECE else "",
+        photographs=_photographs_needed(problem, design, partial(progress, "photographs")) if scene.HAS_PIECE else "",
         omitted=scene.OMITTED,
         cost=measure_cost(problem, design, partial(progress, "cost")) if timing else None,
     )
@@ -217,11 +217,10 @@ def sample_plan(rate: float, standard_error: float) -> tuple[Sample, ...]:
     )
 
 
-def _photographs_needed(problem: Problem, design: Tensor, progress: Progress) -> str:
+def _photographs_needed(problem: Problem, design: Tensor, advance: Advance) -> str:
     """Say how many photographs, in how many places, prove a promise of the draft."""
     conditions = problem.scene.draw("select", PROOF_VIEWS, per_session=VIEWS_PER_SESSION)
-    advance = partial(progress, "photographs")
-    promise = make_promise(problem, as_pixels(design), conditions, advance=advance, per_session=VIEWS_PER_SESSION)
+    promise = make_promise(problem, as_pixels(design), conditions, CONTROLS, advance, VIEWS_PER_SESSION)
     return f"To prove a promise of {promise.rate:.0%}, as of this draft: {photos_line(promise)}"
 
 
