@@ -117,8 +117,8 @@ def test_what_was_not_measured_has_a_reason(plan):
 
 
 def test_a_plan_says_how_many_photographs_prove_what_its_draft_promises(plan):
-    line = plan_lines(plan)[plan_lines(plan).index("photographs of such a draft") + 1]
-    pattern = r"  To prove a promise of \d+%, as of this draft: (No 150|Take at least \d+) photographs .*\."
+    line = plan_lines(plan)[plan_lines(plan).index("photographs") + 1]
+    pattern = r"  To prove a promise of such a draft: (No 150|Take at least \d+) photographs .*\."
     assert re.fullmatch(pattern, line), line
 
 

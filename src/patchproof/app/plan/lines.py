@@ -27,7 +27,7 @@ def measured_lines(plan: Plan) -> list[str]:
         f"  {s.name:27} {s.n:4d} samples leave ±{s.half_width:.3f}, {s.next_n} would ±{s.next_half_width:.3f}"
         for s in plan.samples
     ]
-    lines += ["photographs of such a draft", f"  {plan.photographs}"] if plan.photographs else []
+    lines += ["photographs", f"  {plan.photographs}"] if plan.photographs else []
     lines += ["not modeled", *(f"  {text}" for text in plan.omitted)]
     if (cost := plan.cost) is not None:
         views = f"{cost.views} views of {cost.side_px} px, {cost.threads} threads"

@@ -221,7 +221,7 @@ def _photographs_needed(problem: Problem, design: Tensor, advance: Advance) -> s
     """Say how many photographs, in how many places, prove a promise of the draft."""
     conditions = problem.scene.draw("select", PROOF_VIEWS, per_session=VIEWS_PER_SESSION)
     promise = make_promise(problem, as_pixels(design), conditions, CONTROLS, advance, VIEWS_PER_SESSION)
-    return f"To prove a promise of {promise.rate:.0%}, as of this draft: {photos_line(promise)}"
+    return f"To prove a promise of such a draft: {photos_line(promise)}"
 
 
 def _quantiles(values: np.ndarray) -> tuple[float, float]:
