@@ -146,6 +146,8 @@ def again(journey, controls, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("patchproof.reprints.photo_forecast.DRAWS", 6)
         assert command("verify", journey / "photos", "--sheet", sheet, *with_run) == 0
+    page = (folder / "report" / "report.html").read_text("utf-8")
+    assert "“Promised” is a mean over all views that the scene allows, “expected” one over the views of these" in page
     return json.loads((folder / "report" / "report.json").read_text())
 
 

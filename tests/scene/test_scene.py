@@ -77,7 +77,7 @@ def test_the_outer_markers_of_bent_paper_turn_away_before_its_middle_does():
     front, side = around_can([-10, 10]), around_can([50, 60])
     assert front.unreadable_share == 0 and side.unreadable_share == 1
     few = "few photographs of rolled paper under 100 mm can be measured: the others only count"
-    assert front.warnings[-1] == side.warnings[-1] == few and side.warnings[-2].startswith("at most 0% of photographs")
+    assert front.warnings[-1] == side.warnings[-2] == few and side.warnings[-1].startswith("at most 0% of photographs")
 
 
 def test_another_template_is_the_scene_made_for_it_and_nothing_is_loaded_again(tmp_path, monkeypatch):

@@ -114,8 +114,8 @@ def required_rate(promise: Promise) -> float:
 
 def useless_note(promise: Promise) -> str:
     """Say that a promise asks for nothing, as one of 15 % over controls at 0 %; "" if it asks for something."""
-    sign, note = promise.target.goal.sign, " The promise is useless: any photographs keep it."
-    return note if sign * required_rate(promise) <= min(sign, 0) else ""
+    is_empty = (sign := promise.target.goal.sign) * required_rate(promise) <= min(sign, 0)
+    return " The promise is useless: any photographs keep it." * is_empty
 
 
 def kept_chance(promise: Promise, photos: Sequence[int]) -> float:

@@ -146,8 +146,7 @@ def optimize(
         else:
             unfinished = is_file(out / CHECKPOINT_FILE) and not is_file(out / RUN_FILE)
             output.check_folder(out, RUN_FILE_PATTERNS, overwrite, unfinished=unfinished, inputs=(scene,))
-        scene = resolve_scene(scene, seed)
-        steps, views = effort_of(scene, draft, thorough, None, promise.views)
+        steps, views = effort_of(scene := resolve_scene(scene, seed), draft, thorough, None, promise.views)
         scene, promise = scene.with_steps(steps), replace(promise, views=views)
         save_place, searched = None, {}
         if not scene.HAS_PLACE:
@@ -168,7 +167,7 @@ def optimize(
 
 def effort_of(
     scene: Scene, draft: bool, thorough: bool, steps: int | None, views: int | None
-) -> tuple[int | None, int | None]:
+) -> tuple[int, int | None]:
     """Return steps and promised views, if not given: of a draft no more steps than the scene's, else no fewer."""
     if draft and thorough:
         raise Refused("a draft or a thorough run", "both", "leave one out")

@@ -306,10 +306,7 @@ def _sheet_id(settings: SceneSettings, base: Path, known: Mapping[str, str], see
 
 
 def measurable_text(unreadable_share: float, family: str) -> str:
-    """Say how many photographs can be measured. Corners on rolled paper also have to fit a roll, to a share of its
-    size: of pieces of 140 mm, 9 of 16 photographs did where 64 % were readable, of 40 to 90 mm 26 of 168 where 21 to
-    100 % were; of paper bent in two directions 0 of 63.
-    """
+    """Say how many photographs of a piece on a surface of that family can be measured; see `bent_scene.bent_notes`."""
     if family == "exponential":
         return "hardly any photograph can be measured"
     return f"{'at most' if family == 'cylinder' else 'about'} {1 - unreadable_share:.0%} of photographs can be measured"

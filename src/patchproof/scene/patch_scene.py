@@ -26,7 +26,6 @@ from patchproof.sheets.template import page_template
 if TYPE_CHECKING:
     from patchproof.scene.tape_measure import TapeMeasurement
 
-MIN_ROLLED_MM = 100  # of rolled paper's shorter side, below which few of its photographs are measured
 PiecePosition = tuple[float, float, float] | Side  # a point of the scene in millimeters, or the middle of a side
 
 
@@ -155,25 +154,21 @@ def _place_piece(scene: MeshScene, lay: PlacementMethod) -> tuple[Piece, Placeme
     marker_mm = marker_size_mm(needed_mm, patch.size_mm) if settings.sheet.markers else 0.0
     piece = lay_out_piece(patch.size_mm, marker_mm, scene.sheet_id, "design", patch.bend)
     refuse_larger_than_page(page_template(settings.sheet.template), piece)  # before hours of optimizing
-    if piece.markers and not placement.is_flat:  # paper is unrolled by all markers; on a card one tells the others
-        from patchproof.scene.bent_scene import smallest_marker_scales
-
-        scales = smallest_marker_scales(scene, placement, piece)
-    unreadable = float((scales * piece.module_mm < interface.PX_PER_MODULE * 0.999).mean()) if piece.markers else 0.0
     notes = (*mesh.warnings, *scene.backgrounds.notes, *placement.warnings)
-    measurable = interface.measurable_text(unreadable, placement.family)
-    if piece.markers and placement.family == "exponential":
-        return piece, placement, unreadable, (*notes, f"{measurable}: paper that bends in two directions only counts")
-    if unreadable > 1 - interface.READABLE_SHARE:
+    if piece.markers and not placement.is_flat:  # paper is unrolled by all markers; on a card one tells the others
+        from patchproof.scene.bent_scene import bent_notes, smallest_marker_scales
+
+        scales, notes = smallest_marker_scales(scene, placement, piece), (*notes, *bent_notes(placement))
+    unreadable = float((scales * piece.module_mm < interface.PX_PER_MODULE * 0.999).mean()) if piece.markers else 0.0
+    if unreadable > 1 - interface.READABLE_SHARE and placement.family != "exponential":
         advice = "narrow view.azimuth_deg and view.elevation_deg, or make the piece smaller"
         if needed_mm > marker_mm + 0.05:
             advice = (
                 f"view.distance_mm and camera.photo_px ask for {needed_mm:.1f} mm, and those for a piece of "
                 f"{smallest_piece_mm(needed_mm)} mm or more; come nearer, or take larger photographs"
             )
+        measurable = interface.measurable_text(unreadable, placement.family)
         notes += (f"{measurable}: others show markers of {marker_mm:.1f} mm too small: {advice}",)
-    if piece.markers and placement.family == "cylinder" and min(patch.size_mm) < MIN_ROLLED_MM:
-        notes += (f"few photographs of rolled paper under {MIN_ROLLED_MM} mm can be measured: the others only count",)
     return piece, placement, unreadable, notes
 
 

@@ -81,8 +81,7 @@ class PictureScene(PieceScene):
         share = self.unreadable_share
         if share <= 1 - READABLE_SHARE:
             return self.notes
-        text = measurable_text(share, "plane")
-        return (*self.notes, f"{text}: others show markers of {self.piece.marker_mm:.1f} mm too small")
+        return (*self.notes, f"{measurable_text(share, 'plane')}: {self.piece.marker_mm:.1f} mm markers are too small")
 
 
 @dataclass(frozen=True)

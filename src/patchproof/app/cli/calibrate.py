@@ -14,10 +14,7 @@ _NEXT = f"next: {command_text('optimize', 'scene.toml', '--out', 'run')}, with"
 
 def printer(
     out: Annotated[Path, Option(help="NAME.npz; NAME.json is written beside it.")],
-    photos: Annotated[
-        list[Path] | None,
-        Argument(metavar="[PHOTO]...", help="Photographs; a folder holds those of one print, or of one place."),
-    ] = None,
+    photos: Annotated[list[Path] | None, Argument(metavar="[PHOTO]...", help="A folder: of one print, place.")] = None,
     icc: Annotated[Path | None, Option(help="An RGB or CMYK output profile.")] = None,
     intent: Annotated[
         Literal["relative", "perceptual"], Option(help="The profile's intent that the driver is set to.")
