@@ -191,6 +191,14 @@ def test_a_print_that_exists_is_promised_photographed_and_judged(printed):
             judged(folder, folder / corners, "none")
 
 
+def test_the_one_file_of_a_print_without_a_page_is_named_once(printed, tmp_path, capsys):
+    assert command("sheet", printed[1].folder, "--out", tmp_path / "print.json") == 0
+    assert (
+        capsys.readouterr().out.splitlines()[-1]
+        == f"sheet {printed[1].scene.sheet_id} (design): {tmp_path / 'print.json'}"
+    )
+
+
 def test_corners_outside_of_the_picture_are_said(printed):
     folder = printed[0]
     head, first, *_ = (folder / "photos" / "corners.csv").read_text().splitlines()
