@@ -192,11 +192,9 @@ def test_a_print_that_exists_is_promised_photographed_and_judged(printed):
 
 
 def test_the_one_file_of_a_print_without_a_page_is_named_once(printed, tmp_path, capsys):
-    assert command("sheet", printed[1].folder, "--out", tmp_path / "print.json") == 0
-    assert (
-        capsys.readouterr().out.splitlines()[-1]
-        == f"sheet {printed[1].scene.sheet_id} (design): {tmp_path / 'print.json'}"
-    )
+    (_, run), out = printed, tmp_path / "print.json"
+    assert command("sheet", run.folder, "--out", out) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == f"sheet {run.scene.sheet_id} (design): {out}"
 
 
 def test_corners_outside_of_the_picture_are_said(printed):
