@@ -23,7 +23,7 @@ _PAGE = Path(__file__).parent / "results/measured.md"
 def harden(
     images: Annotated[Path, typer.Argument(help="A folder of images.")],
     labels: Annotated[Path, typer.Option(help="CSV: file name, label.")],
-    model: Annotated[str, typer.Option(help="Comma-separated classifiers to harden for, all together.")],
+    models: Annotated[str, typer.Option(help="Comma-separated classifiers to harden for, all together.")],
     out: Annotated[Path, typer.Option(help="Folder for the PNGs and the tables.")],
     method: Annotated[Literal["pgd", "fgsm", "adam"], typer.Option(help="How to step.")] = "pgd",
     eps: Annotated[str, typer.Option(help='Largest change of a value in [0, 1]: 0.03, 8/255 or "none".')] = "8/255",
@@ -46,7 +46,7 @@ def harden(
     options = {
         "images": str(images),
         "labels": str(labels),
-        "models": console.names_of(model),
+        "models": console.names_of(models),
         "together": True,
         "judges": console.names_of(judges) or (),
         "methods": (method,),
@@ -106,7 +106,7 @@ def study(
         missing = "--config" if config is None else "--out"
         raise typer.BadParameter("missing; a config to start from: --example", param_hint=missing)
     with progress_bar() as bar:
-        work = Work(resume, overwrite, jobs or 1, cluster, lambda done, total: bar("cells", done, total))
+        work = Work(resume, overwrite, jobs or 1, cluster, lambda done, total: bar("cells", done, total), console.say)
         changed = None if cells is None else {"cells": str(cells.resolve()), "left_out": "nothing"}
         finished = run_study(name, config, out, work, changed)
     console.say_study(finished)

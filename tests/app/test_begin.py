@@ -24,6 +24,7 @@ from patchproof.app.begin.sides import (
     gap_colors,
     ramp_colors,
     round_length,
+    sample_views,
     side_of,
     side_views,
     turntable,
@@ -383,6 +384,25 @@ def test_a_new_scene_of_images_takes_their_most_frequent_label(tmp_path):
     html = (tmp_path / "out" / PAGE).read_text(encoding="utf-8")
     assert preview.refused is None and html.count("<ol") == 8 and "Turn it" not in html
     assert not (tmp_path / "out" / OBJECT).exists()
+
+
+def test_a_table_of_indices_gives_a_scene_its_index_and_no_preview_erased_boxes(tmp_path):
+    from PIL import Image
+
+    folder = tmp_path / "images"
+    folder.mkdir()
+    for i in range(3):
+        Image.new("RGB", (64, 64), (90, 90, 90)).save(folder / f"{i}.png")
+    (folder / "labels.csv").write_text("filename,label\n0.png,7\n1.png,7\n2.png,0")
+    for label in (None, "carton"):
+        new_scene(str(folder), tmp_path / "scene.toml", label=label, models=("builtin",), overwrite=True)
+        assert load_scene_settings(tmp_path / "scene.toml").target.label == 7
+    text = (tmp_path / "scene.toml").read_text().replace("label = 7", 'label = "carton"')
+    (tmp_path / "named.toml").write_text(text)
+    with pytest.raises(Refused, match=r'got 3 images with other .*: write the index of "carton" as target.label'):
+        load_scene(tmp_path / "named.toml")
+    stage = set_stage(load_scene(tmp_path / "scene.toml"))
+    assert all(np.ptp(look.picture) < 60 for look in sample_views(stage, [load_classifier("builtin")], [(7,)]))
 
 
 def test_a_preview_of_a_texture_says_how_many_texels_a_mask_is_drawn_for(tmp_path, few_turns):

@@ -27,6 +27,7 @@ from patchproof.optimizer import run as run_module
 from patchproof.optimizer.promise import PromiseOptions
 from patchproof.optimizer.run import load_run
 from patchproof.optimizer.run import optimize as optimize_scene
+from patchproof.reprints.mounted_sheet import sheet_scene
 from patchproof.reprints.shared_page import sheet_of_several
 from patchproof.scene.scene import load_scene
 from patchproof.sheets.manifest import load_manifest
@@ -110,6 +111,16 @@ def test_efforts_are_steps_and_views(tmp_path, scene_file, capsys, monkeypatch):
     assert (made.scene.settings.optimize.steps, made.promise.n, made.scene.seed) == (3, 12, 5)
 
 
+def test_a_draft_takes_no_more_steps_than_its_scene_and_a_thorough_run_no_fewer(scene_file):
+    of_three = load_scene(scene_file)
+    draft_steps, thorough_steps = run_module.DRAFT_EFFORT[0], run_module.THOROUGH_EFFORT[0]
+    for steps, expected in ((3, (3, thorough_steps)), (9999, (draft_steps, 9999))):
+        scene = of_three.with_steps(steps)
+        efforts = [run_module.effort_of(scene, draft, not draft, None, None) for draft in (True, False)]
+        assert tuple(count for count, _ in efforts) == expected
+    assert run_module.effort_of(of_three, True, False, 50, 8) == (50, 8)  # as it was asked for
+
+
 def test_a_draft_says_that_it_is_one(tmp_path, scene_file, capsys):
     run = tmp_path / "run"
     assert command("optimize", scene_file, "--out", run, "--steps", 2, "--draft", "--promise", 8) == 0
@@ -118,9 +129,10 @@ def test_a_draft_says_that_it_is_one(tmp_path, scene_file, capsys):
     assert made.scene.settings.optimize.steps == 2 and (made.promise.n, made.promise.draft) == (8, True)
     assert command("sheet", run, "--out", tmp_path / "s.pdf") == 0 and "Draft of 8 views" in capsys.readouterr().out
     assert load_manifest(tmp_path / "s.json").promise.draft
-    other = replace(made, scene=load_scene(scene_file, seed=5, steps=2))
+    other = replace(made, scene=load_scene(scene_file, seed=5).with_steps(2))
     several = sheet_of_several([made, other], tmp_path / "two.pdf", template="a3")
     assert [manifest.plan_page for manifest in several] == [2, 3] and page_count(tmp_path / "two.pdf") == 3
+    assert [sheet_scene(tmp_path / "two.pdf", each)[0] for each in (made, other)] == several  # on another's template
     with pytest.raises(Refused, match="promise of 8 views, two sessions, at least, got 7"):
         optimize_scene(scene_file, tmp_path / "other", promise=PromiseOptions(views=7))
 

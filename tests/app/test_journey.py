@@ -15,7 +15,7 @@ from patchproof.base import geometry
 from patchproof.base.packaged import packaged_path
 from patchproof.optimizer import run as run_module
 from patchproof.sheets.manifest import load_manifest
-from patchproof.sheets.pdf_raster import attached_manifest
+from patchproof.sheets.pdf_raster import attached_manifests
 
 PHOTOS = 6
 # libraries of the demo and of `verify`, which a process of both imports once
@@ -72,7 +72,7 @@ def test_every_file_of_the_contract_is_there(journey):
     assert (journey / "report" / "report.html").stat().st_size > 10_000
     assert len(list((journey / "photos").glob("*.jpg"))) == PHOTOS
     manifest = load_manifest(journey / "sheet.json")
-    assert attached_manifest(journey / "sheet.pdf") == manifest
+    assert attached_manifests(journey / "sheet.pdf")[0] == manifest
     assert str(journey) not in (journey / "sheet.json").read_text()
     assert str(journey).encode() not in (journey / "sheet.pdf").read_bytes()
 
@@ -146,6 +146,8 @@ def again(journey, controls, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("patchproof.reprints.photo_forecast.DRAWS", 6)
         assert command("verify", journey / "photos", "--sheet", sheet, *with_run) == 0
+    page = (folder / "report" / "report.html").read_text("utf-8")
+    assert "“Promised” is a mean over all views that the scene allows, “expected” one over the views of these" in page
     return json.loads((folder / "report" / "report.json").read_text())
 
 

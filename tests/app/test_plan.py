@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import sys
 from dataclasses import replace
 
@@ -79,9 +80,11 @@ def quick_plan(path) -> Plan:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(loop, "SELECT_VIEWS", 4)
         patch.setattr(errors, "_chunks", lambda views, side_px: [slice(0, 2), slice(2, views)])
+        patch.setattr("patchproof.app.plan.plan.PROOF_VIEWS", 8)
         calls = []
         plan = measured_plan(*plan_geometry(path), timing=False, views=3, progress=lambda *call: calls.append(call))
-    assert {name for name, _, _ in calls} == {"draft", "terms"} and all(done <= total for _, done, total in calls)
+    assert {name for name, _, _ in calls} == {"draft", "terms", "photographs"}
+    assert all(done <= total for _, done, total in calls)
     return plan
 
 
@@ -111,6 +114,12 @@ def test_what_can_go_adds_up_to_less_than_selection_can_tell(plan):
 def test_what_was_not_measured_has_a_reason(plan):
     assert plan.not_measured == {"the cost of a step": "left out by --no-timing"}
     assert "not measured: the cost of a step (left out by --no-timing)" in plan_lines(plan)
+
+
+def test_a_plan_says_how_many_photographs_prove_what_its_draft_promises(plan):
+    line = plan_lines(plan)[plan_lines(plan).index("photographs") + 1]
+    pattern = r"  To prove a promise of such a draft: (No 150|Take at least \d+) photographs .*\."
+    assert re.fullmatch(pattern, line), line
 
 
 def test_a_classifier_that_answers_alike_to_every_view_lets_no_term_go(tmp_path, monkeypatch):

@@ -79,7 +79,7 @@ COMMANDS = """
     verify folder --sheet no.json --out o | verify folder --sheet broken.json --out o
     verify folder --sheet list.json --out o | verify folder --sheet old.json --out o | capture no.json
     calibrate camera no | calibrate printer --out p.npz --icc no.icc
-    calibrate printer --out p.npz --chart no.jpg --sheet no.json | new no.glb | new no/ | new no.obj --length-mm 90
+    calibrate printer --out p.npz no.jpg --sheet no.json | new no.glb | new no/ | new no.obj --length-mm 90
 """
 
 

@@ -282,7 +282,7 @@ def test_a_printer_is_calibrated_stored_and_loaded(shots, tmp_path, capsys):
         Image.fromarray(shot.photo.srgb).save(tmp_path / f"{i}.png")
     (tmp_path / "bad.jpg").write_bytes(b"no picture")
     command = ["calibrate", "printer", "--sheet", str(tmp_path / "chart.json"), "--out", str(tmp_path / "mine.npz")]
-    command += ["--chart", *(str(tmp_path / name) for name in ("0.png", "1.png", "bad.jpg"))]
+    command += [*(str(tmp_path / name) for name in ("0.png", "1.png", "bad.jpg"))]
     with pytest.raises(SystemExit) as ended:
         cli.app(command)
     told = capsys.readouterr()

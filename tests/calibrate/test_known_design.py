@@ -155,11 +155,13 @@ def test_readmes_line_writes_a_printer_and_ways_that_contradict_each_other_are_r
     monkeypatch.chdir(photos[0][0].parents[1])
     Path("sheet.json").write_text(dump_manifest(manifest), "utf-8")
     readme = Path(patchproof.__file__).parents[2] / "README.md"
-    line = re.search(r"`patchproof (calibrate printer --design [^`]*)`", readme.read_text("utf-8"))
+    line = re.search(r"`patchproof (calibrate printer [^`]* --design [^`]*)`", readme.read_text("utf-8"))
     assert line and command(*line[1].split(), "--known", "coated") == 0
     said = capsys.readouterr().out
     assert "covered: " in said and "ambiguity: " in said and "uncertainty: " in said
     assert load_printer("mine.npz").provenance["source"].startswith("2 photographs of a known design")
-    start, end = ("calibrate", "printer", "--out", "mine", "--sheet", "sheet.json"), ("--chart", "desk")
-    for options in (("--design", "desk", *end), ("--design", "desk", "--icc", "sheet.json"), (*end, "--find")):
-        assert command(*start, *options) == 2 and "--design" in capsys.readouterr().err
+    assert 'with profile = "mine.npz" in its [printer]' in said
+    start = "calibrate", "printer", "--out", "mine", "--sheet", "sheet.json", "desk"
+    for option, sentence in (("--chart", "a chart needs no option"), ("--find", "--known are for")):
+        assert command(*start, option) == 2 and sentence in capsys.readouterr().err
+    assert command(*start, "--icc", "sheet.json") == 2 == command(*start[:-1]) and "--icc" in capsys.readouterr().err

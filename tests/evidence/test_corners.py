@@ -191,6 +191,12 @@ def test_a_print_that_exists_is_promised_photographed_and_judged(printed):
             judged(folder, folder / corners, "none")
 
 
+def test_the_one_file_of_a_print_without_a_page_is_named_once(printed, tmp_path, capsys):
+    (_, run), out = printed, tmp_path / "print.json"
+    assert command("sheet", run.folder, "--out", out) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == f"sheet {run.scene.sheet_id} (design): {out}"
+
+
 def test_corners_outside_of_the_picture_are_said(printed):
     folder = printed[0]
     head, first, *_ = (folder / "photos" / "corners.csv").read_text().splitlines()

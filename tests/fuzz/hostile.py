@@ -191,7 +191,7 @@ def sheet_files(place: Place, number: int) -> Use:
 
 
 def pdf(place: Place, number: int) -> Use:
-    from patchproof.sheets.pdf_raster import attached_manifest, page_count, rasterize_page
+    from patchproof.sheets.pdf_raster import attached_manifests, page_count, rasterize_page
     from patchproof.sheets.print_advice import pdf_advice
 
     names = list(PDF_BOMBS)
@@ -199,15 +199,15 @@ def pdf(place: Place, number: int) -> Use:
     path.write_bytes(PDF_BOMBS[of(number, names)]())
     return of(
         number // len(names),
-        [lambda: rasterize_page(path), lambda: (attached_manifest(path), pdf_advice(path), page_count(path))],
+        [lambda: rasterize_page(path), lambda: (attached_manifests(path), pdf_advice(path), page_count(path))],
     )
 
 
 def pdf_files(place: Place, number: int) -> Use:
-    from patchproof.sheets.pdf_raster import attached_manifest, rasterize_page
+    from patchproof.sheets.pdf_raster import attached_manifests, rasterize_page
 
     path = endless(place.given / "sheet.pdf", of(number, ENDLESS))
-    return of(number // len(ENDLESS), [lambda: rasterize_page(path), lambda: attached_manifest(path)])
+    return of(number // len(ENDLESS), [lambda: rasterize_page(path), lambda: attached_manifests(path)])
 
 
 # --- runs ---
@@ -553,7 +553,7 @@ def labels(place: Place, number: int) -> Use:
         path.write_bytes(of(number // 2, lines))
     else:
         endless(path, of(number // 2, ENDLESS))
-    read = of(number // 4, [lambda: read_labels(path), lambda: labels_with_images(place.given, path)])
+    read = of(number // 4, [lambda: read_labels(path, path.parent), lambda: labels_with_images(place.given, path)])
     return read
 
 

@@ -709,7 +709,7 @@ def page() -> bytes:
 def pdf(rng: Rng, folder: Path) -> Read:
     import pikepdf
 
-    from patchproof.sheets.pdf_raster import attached_manifest, rasterize_page
+    from patchproof.sheets.pdf_raster import attached_manifests, rasterize_page
     from patchproof.sheets.print_advice import pdf_advice
 
     path = folder / "s.pdf"
@@ -735,7 +735,7 @@ def pdf(rng: Rng, folder: Path) -> Read:
             opened.save(buffer)
         data = buffer.getvalue()
     path.write_bytes(mutated(rng, data) if rng.random() < 0.6 else data)
-    reads = [lambda: attached_manifest(path), lambda: pdf_advice(path), lambda: rasterize_page(path, 1, 20.0)]
+    reads = [lambda: attached_manifests(path), lambda: pdf_advice(path), lambda: rasterize_page(path, 1, 20.0)]
     return reads[rng.integers(3)]
 
 
@@ -749,11 +749,12 @@ def long_path(rng: Rng, folder: Path) -> Read:
     from patchproof.photo.read import list_photos
     from patchproof.scene.image_scene import read_labels
     from patchproof.sheets.manifest import load_manifest
-    from patchproof.sheets.pdf_raster import attached_manifest, rasterize_page
+    from patchproof.sheets.pdf_raster import attached_manifests, rasterize_page
 
     name = str(rng.choice(["x" * 300, "a\0b", "d/" * 2500, "ä" * 200, "\udcff" * 200, "."]))
-    readers = [load_manifest, list_photos, attached_manifest, rasterize_page, read_labels, pp.load_run, pp.load_scene]
+    readers = [load_manifest, list_photos, attached_manifests, rasterize_page, pp.load_run, pp.load_scene]
     readers += [
+        lambda p: read_labels(p, folder),
         lambda p: load_printer(f"{p}.npz"),
         lambda p: load_camera(f"{p}.json"),
         lambda p: load_mesh(f"{p}.obj", 1.0),

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from patchlab.study.study import run_study
+from patchlab.study.study import Work, run_study
 from patchlab.validation.envelope.axes import AXES, conditions_at, scene_at
 from patchlab.validation.envelope.fit import BEYOND_SWEEP, gain_break, gains_over_controls, has_effect
 from patchlab.validation.envelope.pages import figures
@@ -152,8 +152,10 @@ def test_the_study_writes_breaks_points_codes_and_one_page(world, tmp_path):
         f'run = "{world.run.folder}"\nn = 4\nphotos = 2\n'
         'sweeps = [{axis = "blur", easy = 0.5, hard = 16, points = 3}]\n'
     )
-    finished = run_study("envelope", config, tmp_path / "out")
+    said: list[str] = []
+    finished = run_study("envelope", config, tmp_path / "out", Work(on_start=said.append))
     assert not finished.failed
+    assert said == ["this renders 36 views for the network, and 6 whole photographs to measure"]
     assert [table.name for table in finished.tables] == ["breaks", "beyond", "sweeps"]
     rows = rows_of(tmp_path / "out/envelope_sweeps.csv")
     assert [float(row["value"]) for row in rows] == pytest.approx([0.5, 8**0.5, 16])

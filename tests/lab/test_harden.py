@@ -99,7 +99,7 @@ def options(folder, **changed):
 
 def test_the_command_keeps_names_and_sizes_and_writes_a_table(folder, tmp_path, capsys):
     out = tmp_path / "out"
-    arguments = ["harden", str(folder), "--labels", str(folder / "labels.csv"), "--model", FAKE, "--out", str(out)]
+    arguments = ["harden", str(folder), "--labels", str(folder / "labels.csv"), "--models", FAKE, "--out", str(out)]
     arguments += ["--eps", "8/255", "--steps", "3", "--evaluate", "fgsm,pgd", "--attack-eps", "0.01"]
     with pytest.raises(SystemExit) as left:
         cli.app(arguments)

@@ -44,7 +44,7 @@ def test_lines_of_a_labeled_folder_are_compared_with_few_others(tmp_path, monkey
             return str.__eq__(self, other)
 
     rows = [(Name(f"{i}.png"), "a") for i in range(60)]
-    monkeypatch.setattr(labeled_photos, "read_labels", lambda table: rows)
+    monkeypatch.setattr(labeled_photos, "read_labels", lambda table, folder: rows)
     monkeypatch.setattr(labeled_photos, "is_file", lambda path: True)
     assert [png for _, png, _ in list_labeled_files(tmp_path, tmp_path / "labels.csv")] == [name for name, _ in rows]
     assert len(compared) < 5 * len(rows)

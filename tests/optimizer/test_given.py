@@ -26,7 +26,7 @@ from patchproof.report.coco import PATCH
 from patchproof.reprints.run_sheet import sheet as sheet_of
 from patchproof.sheets.manifest import load_manifest
 from patchproof.sheets.markers import DICTIONARY
-from patchproof.sheets.pdf_raster import attached_manifest
+from patchproof.sheets.pdf_raster import attached_manifests
 from patchproof.sheets.piece import marker_image
 from test_optimize import scene_with, toml
 
@@ -86,7 +86,7 @@ def test_sheet_plan_and_report_say_that_it_was_imported(journey):
     assert record["file"] == "picture.png" and len(record["sha256"]) == 64
     origin = {"file": record["file"], "sha256": record["sha256"]}
     manifest = load_manifest(journey / "sheet.json")
-    assert manifest.settings["imported"] == origin and attached_manifest(journey / "sheet.pdf") == manifest
+    assert manifest.settings["imported"] == origin and attached_manifests(journey / "sheet.pdf")[0] == manifest
     with closing(PdfDocument(journey / "sheet.pdf")) as pdf:
         text = pdf[manifest.plan_page - 1].get_textpage().get_text_bounded()
     assert "Imported from picture.png (SHA-256" in text and "it was not optimized here" in text

@@ -44,6 +44,12 @@ def test_a_provable_gain_is_found_by_the_judge_s_own_comparison(sessions, photos
     assert 0.65 <= found / trials <= 0.98  # 80 % are meant, three standard errors of 60 trials are 15 points
 
 
+def test_a_page_says_before_it_is_printed_that_its_promise_asks_for_nothing():
+    asks_nothing, asks = promise_of(0.15, 0.0), promise_of(0.85, 0.2)
+    said = [" ".join(shot_sections(promise, SETTINGS)[0][1]) for promise in (asks_nothing, asks)]
+    assert ["useless: any photographs keep it" in text for text in said] == [True, False]
+
+
 def test_the_plan_s_sessions_are_enough_and_one_less_is_not():
     promise = promise_of(0.85, 0.2, correlation=0.1)
     sessions = sessions_needed(promise)

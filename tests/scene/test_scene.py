@@ -17,6 +17,7 @@ from patchproof.render.pixels import PiecePicture
 from patchproof.render.stage import set_stage
 from patchproof.render.views import render_views
 from patchproof.scene.conditions import with_values
+from patchproof.scene.interface import Scene
 from patchproof.scene.scene import load_scene, make_scene
 from patchproof.sheets.markers import MARKER_MODULES
 from patchproof.sheets.piece import marker_image, with_ids
@@ -62,7 +63,7 @@ def test_the_outer_markers_of_bent_paper_turn_away_before_its_middle_does():
     """Paper over 100° of a can: from 60° to a side its far markers face 110° away, its middle is seen."""
     can = trimesh.creation.cylinder(40, 120, sections=48)
 
-    def unreadable(azimuth_deg: list[float]) -> float:
+    def around_can(azimuth_deg: list[float]) -> Scene:
         settings = {
             "object": {"mesh": can, "length_mm": 120},
             "patch": {"width_mm": 70, "height_mm": 70, "bend": True},
@@ -71,9 +72,12 @@ def test_the_outer_markers_of_bent_paper_turn_away_before_its_middle_does():
             "background": {"color": [0, 0, 0]},
             "camera": {"photo_px": [4000, 3000]},
         }
-        return make_scene(settings).unreadable_share
+        return make_scene(settings)
 
-    assert unreadable([-10, 10]) == 0 and unreadable([50, 60]) == 1
+    front, side = around_can([-10, 10]), around_can([50, 60])
+    assert front.unreadable_share == 0 and side.unreadable_share == 1
+    few = "few photographs of rolled paper under 100 mm can be measured: the others only count"
+    assert front.warnings[-1] == side.warnings[-2] == few and side.warnings[-1].startswith("at most 0% of photographs")
 
 
 def test_another_template_is_the_scene_made_for_it_and_nothing_is_loaded_again(tmp_path, monkeypatch):

@@ -6,7 +6,7 @@ import pytest
 from patchproof.base.errors import Refused
 from patchproof.base.packaged import packaged_path
 from patchproof.sheets.blank import blank_piece, blank_sheet
-from patchproof.sheets.pdf_raster import attached_manifest, rasterize_piece
+from patchproof.sheets.pdf_raster import attached_manifests, rasterize_piece
 from patchproof.sheets.piece import lay_out_piece
 from patchproof.sheets.template import load_template
 from test_sheet_write import words_px
@@ -31,7 +31,7 @@ def other(tmp_path, old, new):
 def test_all_but_the_markers_stays_white_paper(blank):
     path, manifest = blank
     assert manifest.design is None and manifest.promise is None and manifest.kind == "blank"
-    assert attached_manifest(path) == manifest and manifest.cut_mm[2:] == (162.0, 162.0)
+    assert attached_manifests(path)[0] == manifest and manifest.cut_mm[2:] == (162.0, 162.0)
     pixels, scale = rasterize_piece(path, manifest, 200), 200 / 25.4
     dark = (pixels < 30).all(-1).mean()
     for marker in blank_piece(manifest).markers:

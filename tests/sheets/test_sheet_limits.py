@@ -22,7 +22,7 @@ from patchproof.sheets import pdf_raster
 from patchproof.sheets.blank import blank_sheet
 from patchproof.sheets.declarations import DECLARED
 from patchproof.sheets.manifest import Manifest
-from patchproof.sheets.pdf_raster import attached_manifest, rasterize_page
+from patchproof.sheets.pdf_raster import attached_manifests, rasterize_page
 from patchproof.sheets.print_advice import pdf_advice
 
 needs_timer = pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="there are no such timers on Windows")
@@ -79,7 +79,7 @@ def test_kilobytes_that_unpack_to_gigabytes_are_refused_by_every_reader_of_pdfs(
     (tmp_path / "bomb.pdf").write_bytes(PDF_BOMBS[bomb]())
     before = peak_bytes(reset=True)
     with pytest.raises(Refused):
-        (rasterize_page if bomb == "object stream" else attached_manifest)(tmp_path / "bomb.pdf")
+        (rasterize_page if bomb == "object stream" else attached_manifests)(tmp_path / "bomb.pdf")
     with contextlib.suppress(Refused):  # they need not look into every stream
         pdf_advice(tmp_path / "bomb.pdf")
     assert peak_bytes() - before < 50_000_000
@@ -105,7 +105,7 @@ def declaring(path: Path, **entries) -> Path:
 def is_refused(path: Path) -> bool:
     """True if the first page, or the manifest in the file, is not read."""
     try:
-        attached_manifest(path)
+        attached_manifests(path)[0]
         rasterize_page(path, 1, 20)
     except Refused:
         return True
@@ -144,16 +144,16 @@ def inheriting(path: Path, **boxes: list[int]) -> Path:
 
 
 def more_pages(path: Path) -> bool:
-    before = attached_manifest(declaring(path))
+    before = attached_manifests(declaring(path))[0]
     with pikepdf.open(path, allow_overwriting_input=True) as pdf:
         pdf.add_blank_page()
         pdf.save(path)
-    return attached_manifest(path) == before and not is_refused(path)
+    return attached_manifests(path)[0] == before and not is_refused(path)
 
 
 CASES = {  # by what is declared: True if the answer is that of the list
     "attached manifest": lambda path: (
-        attached_manifest(declaring(path)) == Manifest.model_validate_json(one_sheet("json"))
+        attached_manifests(declaring(path))[0] == Manifest.model_validate_json(one_sheet("json"))
     ),
     "pages": more_pages,
     "MediaBox": shifted,

@@ -17,7 +17,7 @@ from patchproof.base.errors import Refused
 from patchproof.sheets.content import SheetContent, piece_words
 from patchproof.sheets.manifest import dump_manifest, load_manifest
 from patchproof.sheets.pdf import srgb_profile
-from patchproof.sheets.pdf_raster import attached_manifest, rasterize_page, rasterize_piece
+from patchproof.sheets.pdf_raster import attached_manifests, rasterize_page, rasterize_piece
 from patchproof.sheets.piece import control_design, lay_out_piece, marker_image
 from patchproof.sheets.print_advice import pdf_advice, sheet_advice
 from patchproof.sheets.template import load_template
@@ -210,7 +210,7 @@ def test_attachment_is_the_json_file(sheet):
         assert list(pdf.attachments) == ["sheet.json"]
         attached = pdf.attachments["sheet.json"].get_file().read_bytes()
     assert attached == path.with_suffix(".json").read_bytes() == dump_manifest(manifest).encode()
-    assert attached_manifest(path) == load_manifest(path.with_suffix(".json")) == manifest
+    assert attached_manifests(path)[0] == load_manifest(path.with_suffix(".json")) == manifest
     free = ~reserved_px(manifest)
     assert np.array_equal(manifest.design.pixels()[free], sample_design()[free])
 
@@ -365,7 +365,7 @@ def test_read_only_folder_is_refused(tmp_path):
 def test_what_is_no_sheet_is_refused(tmp_path, sheet):
     broken = tmp_path / "broken.pdf"
     broken.write_bytes(b"%PDF-1.7\nnot really")
-    for read in (rasterize_page, attached_manifest):
+    for read in (rasterize_page, attached_manifests):
         with pytest.raises(Refused, match="cannot be read"):
             read(broken)
         with pytest.raises(Refused, match="no file at"):
@@ -379,7 +379,7 @@ def test_what_is_no_sheet_is_refused(tmp_path, sheet):
         pdf.add_blank_page()
         pdf.save(plain)
     with pytest.raises(Refused, match=r"sheet\.json attached"):
-        attached_manifest(plain)
+        attached_manifests(plain)
 
 
 def test_a_tampered_attachment_is_refused(tmp_path, sheet):
@@ -390,7 +390,7 @@ def test_a_tampered_attachment_is_refused(tmp_path, sheet):
         pdf.attachments["sheet.json"] = pikepdf.AttachedFileSpec(pdf, json.dumps(data).encode(), filename="sheet.json")
         pdf.save(path)
     with pytest.raises(Refused, match="page_mm"):
-        attached_manifest(path)
+        attached_manifests(path)
 
 
 def test_a_manifest_of_another_form_is_refused_by_its_key(tmp_path, sheet):

@@ -19,14 +19,11 @@ from patchproof.scene.image_scene import read_labels
 
 MAX_BLOCK_PHOTOS, MAX_BLOCK_PX = 8, 4_000_000  # of photographs hardened together: some 200 MB with gradients
 MIN_SIDE_PX = 8  # of a photograph's shorter side
-_HEADING_NAMES = {"file", "filename", "file_name", "image", "name"}
 
 
 def list_labeled_files(folder: Path, table: Path) -> list[tuple[str, str, str]]:
     """(file, its PNG's name, label) of every line; files that share a stem keep their suffixes in the PNG's name."""
-    rows = read_labels(table)
-    if rows and rows[0][0].casefold() in _HEADING_NAMES and not is_file(folder / rows[0][0]):
-        rows = rows[1:]
+    rows = read_labels(table, folder)
     outside = next((file for file, _ in rows if PurePath(file).is_absolute() or ".." in PurePath(file).parts), None)
     if outside is not None:  # results are written under these names
         raise Refused(f"names of files within {folder} in {table}", f'"{outside}"', "copy it there, and name it so")

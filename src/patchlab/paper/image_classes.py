@@ -96,7 +96,7 @@ def list_classes(images: str | None, table: str | None, scenes: Sequence[CellVal
 
 def labels_with_images(folder: Path, table: Path) -> list[str]:
     """The different labels, in lower case, of the images in `folder` that the CSV `table` names."""
-    found = list(dict.fromkeys(label for name, label in read_labels(table) if is_file(folder / name)))
+    found = list(dict.fromkeys(label for name, label in read_labels(table, folder) if is_file(folder / name)))
     if not found:
         expected = f"the images that {table.name} names in {folder}"
         raise Refused(expected, "a folder that holds none of them", "copy them there")

@@ -101,6 +101,7 @@ class Study:
     figures: Callable[[Any, Sequence[Result]], Sequence[Drawing]] = lambda settings, results: ()
     files: str = "files"  # folder for files of cells' bytes; "." is the study's folder
     own_files: tuple[str, ...] = ("files",)  # patterns of more names that --overwrite may replace
+    extent: Callable[[Any, Sequence[Cell]], str] = lambda settings, cells: ""  # of the work, said before it starts
 
     @property
     def about(self) -> str:
@@ -133,13 +134,16 @@ def module_summary(module: str) -> str:
 
 @dataclass(frozen=True)
 class Work:
-    """How a study is run: folder, and workers (see `open_workers`); `on_cell` is called with (done, all)."""
+    """How a study is run: folder, and workers (see `open_workers`); `on_cell` is called with (done, all), `on_start`
+    with the extent of the work, where a study says it.
+    """
 
     resume: bool = False
     overwrite: bool = False
     jobs: int = 1
     cluster: str | None = None
     on_cell: Callable[[int, int], None] = lambda done, total: None
+    on_start: Callable[[str], None] = lambda extent: None
 
 
 DEFAULT_WORK = Work()  # in this process, into a new folder
@@ -176,6 +180,8 @@ def _run_locked(study: Study, settings: StrictModel, base: Path, out: Path, work
         found = {cell.name: answers for cell in cells if (answers := _load_finished(out, cell)) is not None}
         todo = [cell for cell in cells if cell.name not in found]
         failed: dict[str, str] = {}
+        if todo and (extent := study.extent(settings, todo)):
+            work.on_start(extent)
         work.on_cell(len(found), len(cells))
         task = partial(_run_cell, study.run, settings, base)
         for done, (number, future) in enumerate(workers.completed(task, todo), len(found) + 1):

@@ -100,9 +100,7 @@ def judge(
     proved, required = ends(recognized, photos, look.tail), required_rate(promise)
     side = "at least" if goal.sign > 0 else "at most"
     certain = "" if look.tail == TAIL else f" with {1 - look.tail:.2%} certainty, as for look {look.number}"
-    proof = f"True rate {side} {proved:.0%}{certain} (needed: {required:.0%})."
-    if goal.sign * required <= min(goal.sign, 0):
-        proof += " The promise is useless: any photographs keep it."
+    proof = f"True rate {side} {proved:.0%}{certain} (needed: {required:.0%}).{useless_note(promise)}"
     word: VerdictWord = "kept" if goal.sign * (proved - required) >= 0 else "cannot_tell"
     return Verdict(word, (low, high), f"{counts}; {allowed}. {proof}")
 
@@ -112,6 +110,12 @@ def required_rate(promise: Promise) -> float:
     sign = promise.target.goal.sign
     controls = (sign * control.rate for control in promise.controls.values())
     return sign * max([sign * promise.rate - RATE_SLACK, *controls])
+
+
+def useless_note(promise: Promise) -> str:
+    """Say that a promise asks for nothing, as one of 15 % over controls at 0 %; "" if it asks for something."""
+    is_empty = (sign := promise.target.goal.sign) * required_rate(promise) <= min(sign, 0)
+    return " The promise is useless: any photographs keep it." * is_empty
 
 
 def kept_chance(promise: Promise, photos: Sequence[int]) -> float:

@@ -146,8 +146,8 @@ def optimize(
         else:
             unfinished = is_file(out / CHECKPOINT_FILE) and not is_file(out / RUN_FILE)
             output.check_folder(out, RUN_FILE_PATTERNS, overwrite, unfinished=unfinished, inputs=(scene,))
-        steps, views = effort_of(draft, thorough, None, promise.views)
-        scene, promise = resolve_scene(scene, seed).with_steps(steps), replace(promise, views=views)
+        steps, views = effort_of(scene := resolve_scene(scene, seed), draft, thorough, None, promise.views)
+        scene, promise = scene.with_steps(steps), replace(promise, views=views)
         save_place, searched = None, {}
         if not scene.HAS_PLACE:
             search_options = {"models": models, "loss": loss, "compute": compute, "progress": progress}
@@ -165,12 +165,14 @@ def optimize(
         return finish_run(problem, design, out, promise, progress)
 
 
-def effort_of(draft: bool, thorough: bool, steps: int | None, views: int | None) -> tuple[int | None, int | None]:
-    """Return steps and promised views of a first look or of a print that counts, where they are not given."""
+def effort_of(
+    scene: Scene, draft: bool, thorough: bool, steps: int | None, views: int | None
+) -> tuple[int, int | None]:
+    """Return steps and promised views, if not given: of a draft no more steps than the scene's, else no fewer."""
     if draft and thorough:
         raise Refused("a draft or a thorough run", "both", "leave one out")
-    effort = DRAFT_EFFORT if draft else THOROUGH_EFFORT if thorough else (None, None)
-    return steps or effort[0], views or effort[1]
+    limit, effort = (min, DRAFT_EFFORT) if draft else (max, THOROUGH_EFFORT if thorough else (1, None))
+    return steps or limit(effort[0], scene.settings.optimize.steps), views or effort[1]
 
 
 def resolve_scene(scene: str | Path | Scene, seed: int | None) -> Scene:

@@ -33,7 +33,7 @@ from patchproof.scene.conditions import Conditions, fields_of
 from patchproof.scene.interface import PieceScene, Scene, require_piece
 from patchproof.scene.patch_scene import PatchScene
 from patchproof.sheets.manifest import Manifest, load_manifest
-from patchproof.sheets.pdf_raster import attached_manifest, rasterize_piece
+from patchproof.sheets.pdf_raster import attached_manifests, rasterize_piece
 
 # The print is rasterized this much finer than the closest view resolves. Rasterizers of pages average code values: fine
 # patterns of strong colors became 2 to 5 % too dark at 1.25, within 1 % at 2.5 and at 5.
@@ -169,13 +169,14 @@ def mount_sheet(pdf_path: str | Path, run: Run, how: ReprintSetup = DEFAULT_SETU
 def sheet_scene(pdf_path: str | Path, run: Run) -> tuple[Manifest, Scene]:
     """Read a sheet's manifest, and set its run's scene to the sheet's template; refused if it is not of this run."""
     is_manifest = Path(pdf_path).suffix == ".json"  # of a print without a page
-    manifest = load_manifest(pdf_path) if is_manifest else attached_manifest(pdf_path, run.scene.sheet_id)
+    manifests = [load_manifest(pdf_path)] if is_manifest else attached_manifests(pdf_path)
+    default = run.scene.settings.sheet.template
+    scene = run.scene.with_template(manifests[0].settings.get("sheet", {}).get("template", default))
+    manifest = next((each for each in manifests if each.sheet_id == scene.sheet_id), manifests[0])
     if is_manifest and (manifest.design is None or manifest.settings.get("sheet", {}).get("template") != NO_PAGE):
         raise Refused(
             "a PDF of a sheet, or the manifest of a print without a page", str(pdf_path), "name the PDF beside it"
         )
-    default = run.scene.settings.sheet.template
-    scene = run.scene.with_template(manifest.settings.get("sheet", {}).get("template", default))
     if manifest.sheet_id != scene.sheet_id:
         expected, do = f"a sheet of this run ({scene.sheet_id})", "name the run that it was made from"
         raise Refused(expected, f"sheet {manifest.sheet_id}", do)

@@ -29,7 +29,7 @@ from patchproof.photo.read import Photo
 from patchproof.reprints.mounted_sheet import DEFAULT_SETUP, PhotoTruth, ReprintSetup, sheet_scene
 from patchproof.reprints.reprint import REPRINT_FILES, Reprint, write_truth
 from patchproof.sheets.blank import BLANK
-from patchproof.sheets.pdf_raster import attached_manifest, page_count, rasterize_page
+from patchproof.sheets.pdf_raster import attached_manifests, page_count, rasterize_page
 
 PrintFunction = Callable[[np.ndarray], np.ndarray]  # N×3 sRGB sent → N×3 light of the print
 
@@ -84,7 +84,7 @@ def reprint_pages(
         return linear_from_srgb(printer.apply(sent)[0, :, :, 0].T.numpy())
 
     with new_folder(out, ("photo_*.jpg",), overwrite, (pdf,)) as folder:
-        pages, manifest = [], attached_manifest(pdf)
+        pages, manifest = [], attached_manifests(pdf)[0]
         for number in range(page_count(pdf)):
             pixels = rasterize_page(pdf, number + 1, PX_PER_MM * MM_PER_INCH)
             if manifest.kind == BLANK:

@@ -37,6 +37,7 @@ def _count_lines(promise: Promise) -> tuple[str, ...]:
         f"A verdict asks the photographs to prove a rate of {verdict.required_rate(promise):.0%}. What they will show "
         "if the promise holds (the chance that it is enough; the least gain that they show beside as many photographs "
         f"of a control in the same places): {'; '.join(_proof(promise, *counts) for counts in SHOT_COUNTS)}."
+        f"{verdict.useless_note(promise)}"
     )
     short = promise.n < PROMISE_VIEWS and not promise.draft
     more = (

@@ -42,6 +42,7 @@ MIN_IMAGES_TO_SPLIT = 2
 FEW_IMAGES = 20  # half of fewer images say little about other images
 _OPTIMIZED_ON = {"train", "select"}
 ERASED_AREA, ERASED_ASPECT = (0.02, 0.33), (0.3, 3.3)  # shares of the centered square; height over width
+_HEADING_NAMES = {"file", "filename", "file_name", "image", "name"}
 _ERASED_CELLS = 224  # random values per side of the centered square: one a pixel at networks' usual size
 
 
@@ -165,7 +166,7 @@ def _files_of_class(settings: SceneSettings, base: Path) -> list[Path]:
     """Return the files with the target's label, in an order that depends on nothing but their names."""
     names = (settings.object.images or "", settings.object.labels or "")
     folder, table = (Path(expand_path(name, base)) for name in names)
-    rows = read_labels(table)
+    rows = read_labels(table, folder)
     target = settings.target
     labels = {str(label).strip().casefold() for label in (target.label, *target.accept)}
     file_names = [name for name, label in rows if labels & {label, *(part.strip() for part in label.split(","))}]
@@ -173,6 +174,8 @@ def _files_of_class(settings: SceneSettings, base: Path) -> list[Path]:
         others = ", ".join(sorted({label for _, label in rows})[:5])
         got = f"{len(rows)} images with other labels ({others} ...)"
         remedy = "give the target the name or index that it has in this file"
+        if isinstance(target.label, str) and all(label.isdigit() for _, label in rows):
+            remedy = f'write the index of "{target.label}" as target.label, because this file has indices'
         raise Refused(f'images labeled "{target.label}" in {table}', got, remedy)
     missing = [name for name in file_names if not is_file(folder / name)]
     if missing:
@@ -181,12 +184,14 @@ def _files_of_class(settings: SceneSettings, base: Path) -> list[Path]:
     return [folder / name for name in sorted(set(file_names), key=lambda name: hashlib.sha256(name.encode()).digest())]
 
 
-def read_labels(table: Path) -> list[tuple[str, str]]:
-    """Return (file name, label in small letters) of each line; commas after the first belong to the label."""
+def read_labels(table: Path, folder: Path) -> list[tuple[str, str]]:
+    """Return (name in `folder`, label in small letters) of each line but a heading; later commas are the label's."""
     rows = read_csv(table, "a CSV of file names and labels (object.labels)")
     short = next((row for row in rows if len(row) < 2), None)
     if short is not None:
         raise Refused(f"a file name and a label in each line of {table}", f'"{short[0]}"', "add the label")
+    first = rows[0][0].strip() if rows else ""
+    rows = rows[first.casefold() in _HEADING_NAMES and not is_file(folder / first) :]
     return [(row[0].strip(), ",".join(row[1:]).strip().casefold()) for row in rows]
 
 

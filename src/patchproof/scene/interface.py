@@ -156,8 +156,9 @@ class Scene(ABC):
         return self._identified(self.settings.changed(sheet={"template": name}), self.known)
 
     def with_steps(self, steps: int | None) -> Self:
-        """Return the scene with another number of optimizer steps; the scene itself if it is None."""
-        return self._identified(self.settings.changed(optimize={"steps": steps}), self.known) if steps else self
+        """Return the scene with another number of optimizer steps; the scene itself for None and its own."""
+        is_same = steps in (None, self.settings.optimize.steps)
+        return self if is_same else self._identified(self.settings.changed(optimize={"steps": steps}), self.known)
 
     def for_design(self, sha256: str) -> Self:
         """Return the scene of a design that exists before its run. The design decides its sheet id, and thus its
@@ -304,9 +305,11 @@ def _sheet_id(settings: SceneSettings, base: Path, known: Mapping[str, str], see
     return sheet_id(identity | dict(known), seed)
 
 
-def measurable_text(share: float, mm: float) -> str:
-    """Say how many photographs can be measured."""
-    return f"about {1 - share:.0%} of photographs can be measured: others show markers of {mm:.1f} mm too small"
+def measurable_text(unreadable_share: float, family: str) -> str:
+    """Say how many photographs of a piece on a surface of that family can be measured; see `bent_scene.bent_notes`."""
+    if family == "exponential":
+        return "hardly any photograph can be measured"
+    return f"{'at most' if family == 'cylinder' else 'about'} {1 - unreadable_share:.0%} of photographs can be measured"
 
 
 def require_piece(scene: Scene, do: str = "take object.glb and textures from the run") -> PieceScene:

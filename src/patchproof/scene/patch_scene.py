@@ -154,24 +154,21 @@ def _place_piece(scene: MeshScene, lay: PlacementMethod) -> tuple[Piece, Placeme
     marker_mm = marker_size_mm(needed_mm, patch.size_mm) if settings.sheet.markers else 0.0
     piece = lay_out_piece(patch.size_mm, marker_mm, scene.sheet_id, "design", patch.bend)
     refuse_larger_than_page(page_template(settings.sheet.template), piece)  # before hours of optimizing
-    if piece.markers and not placement.is_flat:  # paper is unrolled by all markers; on a card one tells the others
-        from patchproof.scene.bent_scene import smallest_marker_scales
-
-        scales = smallest_marker_scales(scene, placement, piece)
-    unreadable = float((scales * piece.module_mm < interface.PX_PER_MODULE * 0.999).mean()) if piece.markers else 0.0
     notes = (*mesh.warnings, *scene.backgrounds.notes, *placement.warnings)
-    if unreadable > 1 - interface.READABLE_SHARE:
+    if piece.markers and not placement.is_flat:  # paper is unrolled by all markers; on a card one tells the others
+        from patchproof.scene.bent_scene import bent_notes, smallest_marker_scales
+
+        scales, notes = smallest_marker_scales(scene, placement, piece), (*notes, *bent_notes(placement))
+    unreadable = float((scales * piece.module_mm < interface.PX_PER_MODULE * 0.999).mean()) if piece.markers else 0.0
+    if unreadable > 1 - interface.READABLE_SHARE and placement.family != "exponential":
         advice = "narrow view.azimuth_deg and view.elevation_deg, or make the piece smaller"
         if needed_mm > marker_mm + 0.05:
             advice = (
                 f"view.distance_mm and camera.photo_px ask for {needed_mm:.1f} mm, and those for a piece of "
                 f"{smallest_piece_mm(needed_mm)} mm or more; come nearer, or take larger photographs"
             )
-        notes += (f"{interface.measurable_text(unreadable, marker_mm)}: {advice}",)
-    if (
-        piece.markers and placement.family == "exponential"
-    ):  # of 15 photographs of a mug that showed all markers, none was measured
-        notes += ("paper that bends in two directions can rarely be measured: its photographs count, without figures",)
+        measurable = interface.measurable_text(unreadable, placement.family)
+        notes += (f"{measurable}: others show markers of {marker_mm:.1f} mm too small: {advice}",)
     return piece, placement, unreadable, notes
 
 

@@ -81,7 +81,7 @@ class PictureScene(PieceScene):
         share = self.unreadable_share
         if share <= 1 - READABLE_SHARE:
             return self.notes
-        return (*self.notes, measurable_text(share, self.piece.marker_mm))
+        return (*self.notes, f"{measurable_text(share, 'plane')}: {self.piece.marker_mm:.1f} mm markers are too small")
 
 
 @dataclass(frozen=True)

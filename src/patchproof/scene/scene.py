@@ -26,17 +26,14 @@ if TYPE_CHECKING:
     import trimesh
 
 
-def load_scene(path: str | Path, seed: int | None = None, steps: int | None = None) -> Scene:
-    """Load the scene of a file; `seed` and the `steps` of its optimization replace those in the file.
+def load_scene(path: str | Path, seed: int | None = None) -> Scene:
+    """Load the scene of a file; `seed` replaces that in the file.
 
     Raises:
         Refused: for a file that is missing, has unknown or contradicting settings, or names files that cannot be read.
     """
     path = Path(path)
-    settings = load_scene_settings(path)
-    if steps is not None:
-        settings = settings.changed(optimize={"steps": steps})
-    return build_scene(settings, path.resolve().parent, seed)
+    return build_scene(load_scene_settings(path), path.resolve().parent, seed)
 
 
 def make_scene(

@@ -70,12 +70,11 @@ def _part_pixels(pdf_path: str | Path, number: int, rect_mm: tuple, size_px: tup
     return _render(pdf_path, number, lambda *_: ((x, y, w, h), size_px))
 
 
-def attached_manifest(pdf_path: str | Path, sheet_id: str | None = None) -> Manifest:
-    """Read the manifest attached to a sheet's PDF; on a page of several designs that of `sheet_id`, else the first."""
+def attached_manifests(pdf_path: str | Path) -> list[Manifest]:
+    """Read the manifests attached to a sheet's PDF, one for each design on its page."""
     if not (texts := call_within_limits(pdf_path, partial(_attached_texts, pdf_path))):
         raise Refused(_EXPECTED, f"{pdf_path} without one", "make the sheet again")
-    manifests = [validate_model(Manifest, data, f"{name} of {pdf_path}") for name, data in texts.items()]
-    return next((manifest for manifest in manifests if manifest.sheet_id == sheet_id), manifests[0])
+    return [validate_model(Manifest, data, f"{name} of {pdf_path}") for name, data in texts.items()]
 
 
 def _attached_texts(pdf_path: str | Path) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from pydantic import Field
 
 from patchlab.study.study import Cell, Study
 from patchlab.validation.envelope.axes import AXES, is_possible
-from patchlab.validation.envelope.fit import find_break, gain_break
+from patchlab.validation.envelope.fit import CONTROLS, find_break, gain_break
 from patchlab.validation.envelope.pages import figures, found_and_measured, gains_in, tables
 from patchlab.validation.envelope.simulation import measure_photos, open_simulation, recognize_target
 from patchproof.base.errors import Refused
@@ -87,8 +87,7 @@ def run(settings: EnvelopeSettings, base: Path, cell: Cell) -> dict[str, Any]:
     drawn = world.scene.draw("select", max(n, photos), _FIRST_SEED + settings.seed)
     x, along = _values(cell.values["x"])
     points = [{x: value} for value in along]
-    shown = max(n // 4, photos) if "jpeg" in points[0] else n
-    as_target = recognize_target(world, points, drawn[:shown])
+    as_target = recognize_target(world, points, drawn[: _conditions_shown(settings, x)])
     photographed = measure_photos(world, points, drawn[:photos])
     wanted = world.scene.settings.target.goal.sign > 0
     works = {kind: (hits == wanted).astype(int).tolist() for kind, hits in as_target.items()}
@@ -115,4 +114,16 @@ def _values(axis: dict) -> tuple[str, list[float]]:
     return axis["axis"], AXES[axis["axis"]].values(axis["easy"], axis["hard"], axis["points"]).tolist()
 
 
-STUDY = Study("envelope", EnvelopeSettings, cells, run, tables, figures)
+def _extent(settings: EnvelopeSettings, sweeps: Sequence[Cell]) -> str:
+    """Say how many pictures the sweeps render: minutes, as a rule."""
+    points = {cell.values["x"]["axis"]: cell.values["x"]["points"] for cell in sweeps}
+    views = sum(count * _conditions_shown(settings, axis) for axis, count in points.items()) * (1 + len(CONTROLS))
+    photos = sum(points.values()) * settings.photos
+    return f"this renders {views:,} views for the network, and {photos:,} whole photographs to measure"
+
+
+def _conditions_shown(settings: EnvelopeSettings, axis: str) -> int:
+    return max(settings.n // 4, settings.photos) if axis == "jpeg" else settings.n
+
+
+STUDY = Study("envelope", EnvelopeSettings, cells, run, tables, figures, extent=_extent)

@@ -146,10 +146,15 @@ def _folder_scene(folder: Path, base: Path, label: str | None, models) -> tuple[
         source = f"photographs: {folder}, with the blank of {manifests[0].name}"
         return text, [source, f'label: "{target}" ({models[0]})']
     table = next((path for path in tables if path.stem == "labels"), tables[0])
-    counts = Counter(words for name, words in read_labels(table) if is_file(folder / name))
+    counts = Counter(words for name, words in read_labels(table, folder) if is_file(folder / name))
     if not counts:
         raise Refused(f"images that {table.name} names in {folder}", "none", "write their file names there")
-    target = guess_label(_labels(models, base), label or counts.most_common(1)[0][0], folder.name)
+    network_labels, words = _labels(models, base), label or counts.most_common(1)[0][0]
+    if words.isdigit() and int(words) < len(network_labels):
+        words = network_labels[int(words)]
+    target = guess_label(network_labels, words, folder.name)
+    if str(index := find_labels(network_labels, target)[0]) in counts:
+        target = index  # as the table has it, by which images are chosen
     lines = ["[object]", f"images = {_quoted(_path(folder, base))}", f"labels = {_quoted(_path(table, base))}", ""]
     lines += ["[patch]", *_size(100, 100), "", *_target(target, models, base), "", "[view]"]
     lines += [_line("patch_share = [0.2, 0.3]", "the piece's longer side over the picture's shorter one"), ""]

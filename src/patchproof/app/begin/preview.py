@@ -45,7 +45,7 @@ from patchproof.report.images import data_uri, jpeg, png
 from patchproof.report.page import render_page
 from patchproof.scene.bend import STRETCH_LIMIT
 from patchproof.scene.canvas import bake_base_colors
-from patchproof.scene.interface import Scene
+from patchproof.scene.interface import Scene, measurable_text
 from patchproof.scene.mesh_scene import MeshScene, require_mesh
 from patchproof.scene.patch_scene import PatchScene
 from patchproof.scene.placement import gap_limit_mm
@@ -189,7 +189,7 @@ def _facts(scene: Scene, settings: SceneSettings) -> list[tuple[str, str]]:
             f"{placement['overhang_share']:.0%} overhangs; stretch {placement['stretch']:.2%}"
         )
         facts.append(("piece", f"{placement['family']}, {size}, facing {SIDE_NAMES[side]} ({side}): {fit}"))
-        readable = f"about {1 - scene.unreadable_share:.0%} of photographs can be measured"
+        readable = measurable_text(scene.unreadable_share, scene.placement.family)
         facts.append(("markers", f"{scene.piece.marker_mm:.1f} mm, {readable}" if scene.piece.markers else "none"))
     else:
         facts.append(("piece", "not placed" if isinstance(scene, UnplacedScene) else f"{size}: {placement['reason']}"))

@@ -160,7 +160,7 @@ def sample_views(stage: Stage, classifiers: list[Classifier], indices: list[tupl
     """Render 8 views of the bare object and classify them; `indices` are the target's in each network (empty: none)."""
     network_px = max(classifier.input_px for classifier in classifiers)
     side_px = network_px * math.ceil(_LEAST_PX / network_px)
-    conditions = stage.scene.draw("train", _VIEWS)
+    conditions = stage.scene.draw("select", _VIEWS)  # in which nothing is erased
     with torch.no_grad():
         pictures = photograph(stage, None, conditions, (side_px, side_px), jpeg=False)
         logits = [classifier.logits(pictures, stage.scene.boxes(conditions)) for classifier in classifiers]

@@ -7,23 +7,24 @@ from typer import Argument, BadParameter, Option
 
 from patchproof.app.cli.console import Overwrite, pair_of, say, warn
 from patchproof.base.progress import progress_bar
+from patchproof.base.text import command_text
+
+_NEXT = f"next: {command_text('optimize', 'scene.toml', '--out', 'run')}, with"
 
 
 def printer(
     out: Annotated[Path, Option(help="NAME.npz; NAME.json is written beside it.")],
-    more: Annotated[list[Path] | None, Argument(metavar="[PHOTO]...", help="More photographs.")] = None,
+    photos: Annotated[list[Path] | None, Argument(metavar="[PHOTO]...", help="A folder: of one print, place.")] = None,
     icc: Annotated[Path | None, Option(help="An RGB or CMYK output profile.")] = None,
     intent: Annotated[
         Literal["relative", "perceptual"], Option(help="The profile's intent that the driver is set to.")
     ] = "relative",
     licence: Annotated[str, Option(help="Of the profile, for the record.")] = "unknown",
     source: Annotated[str, Option(help="Where the profile is from, for the record.")] = "unknown",
-    chart: Annotated[
-        list[Path] | None, Option(help="Photographs of the printed chart; a folder holds those of one print.")
-    ] = None,
+    chart: Annotated[bool, Option("--chart", hidden=True)] = False,
     design: Annotated[
-        list[Path] | None, Option(help="Photographs of any print of known pixels; a folder holds those of one place.")
-    ] = None,
+        bool, Option("--design", help="They show a print of known pixels, that of --sheet; else a printed chart.")
+    ] = False,
     corners: Annotated[Path | None, Option(help="CSV or COCO JSON with the design's four corners.")] = None,
     find: Annotated[bool, Option("--find", help="Search for the design where no marker can be read.")] = False,
     known: Annotated[
@@ -36,17 +37,18 @@ def printer(
     """A printer from its ICC profile, or from photographs of its printed chart or of any design."""
     from patchproof.calibrate.printer import printer_from_chart, printer_from_design, printer_from_icc
 
-    photos = [*(chart or design or []), *(more or [])]
-    if sum(way is not None for way in (icc, chart, design)) != 1 or (more and icc):
-        ways = "--icc / --chart / --design"
-        raise BadParameter("give either --icc FILE, --chart PHOTO... or --design PHOTO...", param_hint=ways)
-    if design is None and (corners or find or known):
-        raise BadParameter("--corners, --find and --known are for --design PHOTO...", param_hint="--design")
+    photos = photos or []
+    if chart:
+        raise BadParameter("a chart needs no option: PHOTO... --sheet chart.json", param_hint="--chart")
+    if (icc is None) != bool(photos):
+        raise BadParameter("give either --icc FILE or PHOTO...", param_hint="--icc / PHOTO...")
+    if not design and (corners or find or known):
+        raise BadParameter("--corners, --find and --known are for PHOTO... --design", param_hint="--design")
     if icc is not None:
         lines, warnings = printer_from_icc(icc, out, intent == "perceptual", licence, source, overwrite), ()
     elif sheet is None:
         raise BadParameter("name the JSON that was written beside the PDF", param_hint="--sheet")
-    elif design is not None:
+    elif design:
         from patchproof.channel.cameras import load_optional_camera
         from patchproof.channel.printer import load_printer
         from patchproof.evidence.corner_files import load_corners
@@ -60,7 +62,7 @@ def printer(
         with progress_bar() as bar:
             lines, warnings = printer_from_chart(photos, sheet, out, camera, overwrite, bar)
     warn(warnings)
-    say(*lines)
+    say(*lines, f'{_NEXT} profile = "{out.with_suffix(".npz")}" in its [printer]')
 
 
 def camera(
@@ -78,4 +80,4 @@ def camera(
     ruler = None if ruler_mm is None else pair_of(ruler_mm, "--ruler-mm")
     with progress_bar() as bar:
         fitted_camera = calibrate_camera(photos, board, out, ruler_mm=ruler, overwrite=overwrite, progress=bar)
-    say(*calibration_lines(fitted_camera), f"camera: {out}")
+    say(*calibration_lines(fitted_camera), f"camera: {out}", f'{_NEXT} file = "{out}" in its [camera]')

@@ -42,7 +42,7 @@ def _check_scene(path: Path) -> None:
 
 _CHECKS: Mapping[str, Callable[[Path], object]] = {
     **{name: partial(require_path, f"a file for --{name}") for name in ("icc", "corners", "boxes", "controls")},
-    **dict.fromkeys(("photos", "more", "chart", "design"), partial(require_path, "a folder of photographs")),
     **{"run": require_finished_run, "runs": require_finished_run, "scene": _check_scene, "sheet": load_manifest},
     **{"pdf": partial(require_path, "a sheet's PDF"), "picture": partial(require_path, "a picture")},
+    "photos": partial(require_path, "a folder of photographs"),
 }

@@ -78,9 +78,10 @@ def optimize(
 
     if draft and thorough:
         raise BadParameter("is the opposite of --draft; leave one out", param_hint="--thorough")
-    steps, promise = effort_of(draft, thorough, steps, promise)
     with progress_bar() as bar:
-        loaded = load_scene(scene, seed, steps)
+        loaded = load_scene(scene, seed)
+        steps, promise = effort_of(loaded, draft, thorough, steps, promise)
+        loaded = loaded.with_steps(steps)
         warn(loaded.warnings)
         options: dict[str, Any] = {"promise": PromiseOptions(promise), "compute": Compute(device, jobs or 1)}
         run = optimize_scene(loaded, out, **options, resume=resume, overwrite=overwrite, progress=bar)
@@ -161,7 +162,7 @@ def sheet(
 
             lines = promise_summary(manifest.promise, manifest.settings), background_summary(manifest.settings)
             say(lines[0], f"promise simulated {lines[1]}")
-        say(f"sheet {manifest.sheet_id} ({manifest.kind}): {out}, {path.name}")
+        say(f"sheet {manifest.sheet_id} ({manifest.kind}): {out}{'' if path == out else f', {path.name}'}")
     if check:
         lines = (line for manifest in manifests for line in sheet_advice(manifest))
         say(*dict.fromkeys(lines), *pdf_advice(out))  # lines that several designs share are printed once

@@ -4,7 +4,7 @@ from patchproof.app.plan.errors import TermError
 from patchproof.app.plan.plan import GeometryPlan, Markers, Plan, Resolution, SurfacePlan
 from patchproof.base.validation import not_measured_lines
 from patchproof.optimizer.place_search import place_lines
-from patchproof.scene.interface import PX_PER_MODULE, READABLE_SHARE
+from patchproof.scene.interface import PX_PER_MODULE, READABLE_SHARE, measurable_text
 
 
 def geometry_lines(plan: GeometryPlan) -> list[str]:
@@ -15,7 +15,7 @@ def geometry_lines(plan: GeometryPlan) -> list[str]:
     lines += ["surface", *_surface_lines(plan.surface)]
     lines += ["resolution", *_resolution_lines(plan.resolution)]
     if plan.markers is not None:
-        lines += ["markers", *_marker_lines(plan.markers)]
+        lines += ["markers", *_marker_lines(plan.markers, plan.surface.family)]
     return lines
 
 
@@ -27,6 +27,7 @@ def measured_lines(plan: Plan) -> list[str]:
         f"  {s.name:27} {s.n:4d} samples leave ±{s.half_width:.3f}, {s.next_n} would ±{s.next_half_width:.3f}"
         for s in plan.samples
     ]
+    lines += ["photographs", f"  {plan.photographs}"] if plan.photographs else []
     lines += ["not modeled", *(f"  {text}" for text in plan.omitted)]
     if (cost := plan.cost) is not None:
         views = f"{cost.views} views of {cost.side_px} px, {cost.threads} threads"
@@ -66,14 +67,13 @@ def _resolution_lines(views: Resolution) -> list[str]:
     ]
 
 
-def _marker_lines(markers: Markers) -> list[str]:
+def _marker_lines(markers: Markers, family: str) -> list[str]:
     if not markers.printed_mm:
         return ["  none: photographs are located by the design's corners"]
     note = "" if markers.printed_mm > 0.95 * markers.needed_mm else " (all that page, object or blank allows)"
     return [
         f"  needed {markers.needed_mm:.1f} mm ({PX_PER_MODULE:g} px per module at the {READABLE_SHARE:.0%} point of "
-        f"the views), printed {markers.printed_mm:.1f} mm{note}; "
-        f"about {1 - markers.unreadable_share:.0%} of photographs can be measured"
+        f"the views), printed {markers.printed_mm:.1f} mm{note}; {measurable_text(markers.unreadable_share, family)}"
     ]
 
 

@@ -7,8 +7,8 @@ Terms are measured with a draft of a few steps, since a classifier that ignores 
 
 Sampling errors are the half-widths of 95 % intervals of selection and promise, with the numbers of views that they use,
 and with four times as many: errors shrink with the root of the number, cost grows with it. The promise's interval is
-Wilson's, of views that share no session. What photographs can prove depends on how much sessions differ, which the
-promise measures: the sheet's plan page says it.
+Wilson's, of views that share no session. What photographs can prove depends on how much sessions differ, which a small
+promise of the draft measures; the sheet's plan page says it of the design.
 
 Left out on purpose: deciding for the user. The plan says which terms can go; the scene file decides.
 """
@@ -24,13 +24,14 @@ from torch import Tensor
 from patchproof.app.plan.cost import Cost, measure_cost
 from patchproof.app.plan.errors import Terms, measure_terms
 from patchproof.base.intervals import wilson
-from patchproof.base.progress import Progress, no_progress
+from patchproof.base.progress import Advance, Progress, no_progress
 from patchproof.base.validation import StrictModel
+from patchproof.evidence.verdict import photos_line
 from patchproof.optimizer.loop import SELECT_VIEWS, start, steps
 from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.place_search import Place, choose_place
 from patchproof.optimizer.problem import Problem, set_problem
-from patchproof.optimizer.promise import PROMISE_VIEWS
+from patchproof.optimizer.promise import CONTROLS, PROMISE_VIEWS, VIEWS_PER_SESSION, make_promise
 from patchproof.scene.bent_scene import placement_with_other_bend
 from patchproof.scene.interface import PX_PER_MODULE, READABLE_SHARE, PieceScene, require_piece
 from patchproof.scene.scene import load_scene
@@ -38,7 +39,7 @@ from patchproof.scene.unplaced_scene import UnplacedScene
 from patchproof.sheets.markers import MARKER_MODULES
 from patchproof.sheets.piece import SMALLEST_MARKER_MM
 
-TERM_VIEWS = 16
+TERM_VIEWS, PROOF_VIEWS = 16, 40
 DRAFT_VIEWS = 120  # that the draft is trained on
 _NEXT_FACTOR = 4  # of the number of samples
 
@@ -116,6 +117,7 @@ class Plan(GeometryPlan):
     draft: Draft
     terms: Terms
     samples: tuple[Sample, ...]
+    photographs: str  # how many prove a promise of the draft
     omitted: tuple[str, ...]
     cost: Cost | None
     not_measured: dict[str, str]  # reasons by figure
@@ -169,6 +171,7 @@ def measured_plan(
         draft=draft,
         terms=terms,
         samples=sample_plan(draft.rate, terms.threshold),
+        photographs=_photographs_needed(problem, design, partial(progress, "photographs")) if scene.HAS_PIECE else "",
         omitted=scene.OMITTED,
         cost=measure_cost(problem, design, partial(progress, "cost")) if timing else None,
     )
@@ -212,6 +215,13 @@ def sample_plan(rate: float, standard_error: float) -> tuple[Sample, ...]:
         Sample(name=name, n=n, half_width=width, next_n=_NEXT_FACTOR * n, next_half_width=next_width)
         for name, n, (width, next_width) in rows
     )
+
+
+def _photographs_needed(problem: Problem, design: Tensor, advance: Advance) -> str:
+    """Say how many photographs, in how many places, prove a promise of the draft."""
+    conditions = problem.scene.draw("select", PROOF_VIEWS, per_session=VIEWS_PER_SESSION)
+    promise = make_promise(problem, as_pixels(design), conditions, CONTROLS, advance, VIEWS_PER_SESSION)
+    return f"To prove a promise of such a draft: {photos_line(promise)}"
 
 
 def _quantiles(values: np.ndarray) -> tuple[float, float]:
