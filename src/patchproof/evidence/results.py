@@ -334,7 +334,7 @@ class Report(StrictModel):
     controls: tuple[Control, ...] = ()
     origin: Origin = Origin()
     ledger: Ledger | None = Field(None, exclude=True)
-    folder: Path | None = Field(None, exclude=True)
+    folder: Path | None = Field(default=None, exclude=True)
     SHOWN: ClassVar[tuple[str, ...]] = ("sheet_id", "summary.verdict", "summary.rate", "summary.interval", "photos")
 
     def plot(self) -> "Figure":
