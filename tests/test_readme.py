@@ -641,6 +641,13 @@ def test_figures_of_hardened_renders_are_the_stored_ones(name, network, stored_a
     assert f"| {network} | RMS moved, SSIM | | {' | '.join(moved)} |" in lines
 
 
+@pytest.mark.parametrize("name", ["breaks", "terms"])
+def test_charts_say_of_themselves_what_is_stored(name):
+    """The notebook quotes each chart's own line, and its picture is in the README."""
+    first = next(iter(stored(f"charts/{name}.json")["tables"].values()))
+    assert first["about"] in words(NOTEBOOK) and f"results/charts/{name}_chart.png" in README.read_text("utf-8")
+
+
 def test_figures_of_benchmarks_and_cards_are_the_stored_ones():
     points = {row[1]: row[2:4] for row in stored("bench/detect.json")["tables"]["levels_12mp"]["rows"]}
     (cost, fitted), (_, theirs) = points["1000 px, fitted"], points["1000 px, OpenCV's"]
