@@ -641,7 +641,7 @@ def test_figures_of_hardened_renders_are_the_stored_ones(name, network, stored_a
     assert f"| {network} | RMS moved, SSIM | | {' | '.join(moved)} |" in lines
 
 
-@pytest.mark.parametrize("name", ["breaks", "terms"])
+@pytest.mark.parametrize("name", ["speed", "breaks", "terms"])
 def test_charts_say_of_themselves_what_is_stored(name):
     """The notebook quotes each chart's own line, and its picture is in the README."""
     first = next(iter(stored(f"charts/{name}.json")["tables"].values()))
