@@ -18,7 +18,6 @@ from patchlab.harden.attacks import (
     pgd,
     pgd_outcomes,
     survives_fgsm,
-    survives_pgd,
 )
 from patchlab.harden.hardening import center_squares
 from patchproof.classifier.builtin import load_builtin
@@ -104,7 +103,7 @@ def test_a_network_that_shouts_is_not_taken_for_a_robust_one():
         assert bool(is_correct(network(fgsm(network, pictures, labels, epsilon, float32)), labels)) is holds32
         assert bool(is_correct(network(fgsm(network, pictures, labels, epsilon, cross_entropy)), labels)) is holds64
         assert not survives_fgsm(network, pictures, labels, epsilon)
-        assert not survives_pgd(network, pictures, labels, epsilon)
+        assert not pgd_outcomes(network, pictures, labels, epsilon)[1]
 
 
 def test_even_loss_has_the_direction_of_the_mean_loss():
@@ -119,8 +118,10 @@ def test_even_loss_has_the_direction_of_the_mean_loss():
 
 def test_where_epsilon_does_not_reach_all_survive():
     network, pictures, labels = Shouting(10), torch.full((1, 3, 2, 2), 0.52), torch.zeros(1, dtype=torch.long)
-    assert survives_fgsm(network, pictures, labels, 0.0199) and survives_pgd(network, pictures, labels, 0.0199)
-    assert not survives_fgsm(network, pictures, labels, 0.0201) and not survives_pgd(network, pictures, labels, 0.0201)
+    assert survives_fgsm(network, pictures, labels, 0.0199) and pgd_outcomes(network, pictures, labels, 0.0199)[1]
+    assert (
+        not survives_fgsm(network, pictures, labels, 0.0201) and not pgd_outcomes(network, pictures, labels, 0.0201)[1]
+    )
 
 
 def test_losses_are_what_they_say():
@@ -147,8 +148,10 @@ def test_pictures_are_attacked_each_on_its_own():
     pictures = torch.rand(4, 3, 64, 64, generator=torch.Generator().manual_seed(1))
     with torch.no_grad():
         labels = network(pictures).argmax(1)
-    together = survives_pgd(network, pictures, labels, 0.003, steps=5)
-    alone = torch.cat([survives_pgd(network, pictures[i : i + 1], labels[i : i + 1], 0.003, steps=5) for i in range(4)])
+    together = pgd_outcomes(network, pictures, labels, 0.003, steps=5)[1]
+    alone = torch.cat(
+        [pgd_outcomes(network, pictures[i : i + 1], labels[i : i + 1], 0.003, steps=5)[1] for i in range(4)]
+    )
     assert together.tolist() == alone.tolist()
 
 
@@ -162,8 +165,8 @@ def test_a_picture_that_was_lost_on_the_way_is_lost():
     pictures, labels = torch.full((2, 3, 2, 2), 0.52), torch.tensor([0, 1])
     *_, last = pgd(network, pictures, labels, 0.03, margin)
     assert is_correct(network(last), labels).tolist() == [True, False]
-    assert survives_pgd(network, pictures, labels, 0.03).tolist() == [False, False]
-    assert survives_pgd(network, pictures, labels, 0.005).tolist() == [True, False]  # does not reach it
+    assert pgd_outcomes(network, pictures, labels, 0.03)[1].tolist() == [False, False]
+    assert pgd_outcomes(network, pictures, labels, 0.005)[1].tolist() == [True, False]  # does not reach it
     # what is read wrongly to begin with survives nothing
     assert survives_fgsm(network, pictures, labels, 0.001).tolist() == [True, False]
 

@@ -13,7 +13,7 @@ from fake_networks import RedAgainstBlue
 from PIL import Image
 
 from patchlab import cli
-from patchlab.harden.attacks import margin, survives_pgd
+from patchlab.harden.attacks import margin, pgd_outcomes
 from patchlab.harden.harden_study import HardenSettings, attack_failed, harden_images, tables
 from patchlab.harden.hardening import center_squares, harden, image_change
 from patchlab.study.study import Cell, Result, Work, run_study
@@ -260,7 +260,7 @@ def test_through_the_attack_steps_go_where_the_attacked_loss_falls():
     )
     assert abs(near.mean().item() - 0.6) < 0.01 and far.mean().item() > 0.75
     labels = torch.tensor([0])
-    assert not survives_pgd(peaked, near, labels, 0.05) and survives_pgd(peaked, far, labels, 0.05)
+    assert not pgd_outcomes(peaked, near, labels, 0.05)[1] and pgd_outcomes(peaked, far, labels, 0.05)[1]
 
 
 @pytest.mark.parametrize("through", [0, 1.5])

@@ -120,11 +120,6 @@ def pgd_outcomes(
     return first, alive
 
 
-def survives_pgd(network: Logits, pictures: Tensor, labels: Tensor, epsilon: float, steps: int = PGD_STEPS) -> Tensor:
-    """N bool: correct before the attack and after every step along either loss's gradient."""
-    return pgd_outcomes(network, pictures, labels, epsilon, steps)[1]
-
-
 def lost_at(
     network: Logits,
     pictures: Tensor,
