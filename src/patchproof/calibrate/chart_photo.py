@@ -21,7 +21,7 @@ from patchproof.photo.quality import CLIPPED_CODE, blur_px
 from patchproof.photo.read import Photo
 from patchproof.photo.rectify import fit_page
 from patchproof.photo.rejection import PhotoRejected
-from patchproof.sheets.manifest import Manifest, Marker
+from patchproof.sheets.manifest import Manifest
 from patchproof.sheets.rects import RectMm, rect_contains
 
 MIN_CORE_PX = 4.0  # a swatch's side between blurred borders
@@ -96,7 +96,7 @@ def _find_page(srgb: np.ndarray, manifest: Manifest) -> _Page:
     markers = [marker for marker in manifest.markers if marker.dictionary == dictionary]
     detected = find_markers(srgb, {marker.id for marker in markers}, dictionary=dictionary)
     if not detected.markers:
-        raise _no_sheet(srgb, detected, markers, dictionary)
+        raise _no_sheet(srgb, detected, dictionary)
     pages = [marker.page for marker in markers if marker.id in detected.markers]
     numbers = [page for page in pages if chart_rows(manifest, page)] or pages[:1]
     number = max(sorted(set(numbers)), key=numbers.count)
@@ -116,8 +116,8 @@ def _find_page(srgb: np.ndarray, manifest: Manifest) -> _Page:
     return _Page(number, fit.px_from_mm, blur_px(detected.markers.values()), float(scale))
 
 
-def _no_sheet(srgb: np.ndarray, detected: MarkersInView, markers: list[Marker], dictionary: str) -> PhotoRejected:
-    if is_mirrored(srgb, {marker.id for marker in markers}, dictionary):
+def _no_sheet(srgb: np.ndarray, detected: MarkersInView, dictionary: str) -> PhotoRejected:
+    if is_mirrored(srgb, detected, dictionary):
         return PhotoRejected("mirrored", None, None, "the photo is mirrored: switch off the camera's mirror setting")
     if detected.foreign:
         advice = "these are the markers of another sheet: name that sheet's JSON, or leave the photo out"
