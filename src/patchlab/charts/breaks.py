@@ -21,9 +21,9 @@ import torch
 from patchlab.study.grid import PositiveInt
 from patchlab.study.record import corner_error_mm
 from patchlab.study.study import Cell, Result, Study
-from patchlab.validation.detection import mount_noise_sheet
 from patchlab.validation.envelope.axes import conditions_at, scene_at
-from patchlab.validation.verdicts import VerdictsSettings, draw_promise
+from patchlab.validation.mounted_sheets import mount_content
+from patchlab.validation.session_trials import draw_promise
 from patchproof.app.demo import SCENE
 from patchproof.base.geometry import fit_homography, local_scale, rect_corners
 from patchproof.base.output import image_pixels
@@ -43,6 +43,9 @@ from patchproof.report.tables import Drawing, Table
 from patchproof.reprints.mounted_sheet import MountedSheet, jpeg_of
 from patchproof.scene.conditions import with_values
 from patchproof.scene.patch_scene import PatchScene, require_patch
+from patchproof.scene.scene import load_scene
+from patchproof.sheets.content import SheetContent
+from patchproof.sheets.piece import control_design
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -52,7 +55,8 @@ MAX_DELTA_E = 4.0  # mean ΔE00 of a print that is as promised, after the fit of
 _EASY = {"tilt": 20.0, "module_px": 5.0, "blur": 0.1, "noise": 0.005, "darkness": 0.0, "jpeg": 95.0}
 _PHOTO_PX = (800, 600)
 _TAPE_SRGB = 0.45  # color of the tape that hides a part of the piece
-_RATE, _CORRELATION, _SESSIONS, _PER_SESSION = 0.85, 0.05, 8, 12  # of promises, and of photographs of their prints
+_RATE, _CONTROL_RATE, _CORRELATION = 0.85, 0.3, 0.05  # of promises
+_SESSIONS, _PER_SESSION = 8, 12  # of photographs of their prints
 
 
 class BreaksSettings(StrictModel):
@@ -94,7 +98,11 @@ def _sheet() -> tuple[MountedSheet, PatchScene]:
     with TemporaryDirectory() as folder:
         path = Path(folder) / "scene.toml"
         path.write_text(SCENE.replace("[camera]", f"[camera]\nphoto_px = {list(_PHOTO_PX)}"), encoding="utf-8")
-        return mount_noise_sheet(str(path), 0)
+        scene = require_patch(load_scene(path, 0))
+    (width, height), piece = scene.piece.size_mm, scene.piece
+    blank = np.zeros((240, round(240 * width / height), 3), np.uint8)
+    noise = control_design("noise", blank, scene.sheet_id, piece)
+    return mount_content(set_stage(scene), SheetContent(piece, scene.sheet_id, "design", noise)), scene
 
 
 @lru_cache(maxsize=2)
@@ -164,8 +172,8 @@ def _colored(shot: MeasuredShot) -> Trial:
 
 def _kept(number: int, sessions: float = _SESSIONS, below: float = 0.0) -> Trial:
     """Photographs of a print whose rate is so far `below` its promise are called kept."""
-    rng, settings = np.random.default_rng([number, 1]), VerdictsSettings(rate=_RATE)
-    promise, strength = draw_promise(settings, _CORRELATION, rng), 1 / _CORRELATION - 1
+    rng, strength = np.random.default_rng([number, 1]), 1 / _CORRELATION - 1
+    promise = draw_promise(_RATE, _CONTROL_RATE, _CORRELATION, rng)
     parts, true = split_evenly(_SESSIONS * _PER_SESSION, round(sessions)), _RATE - below
     counts = rng.binomial(parts, rng.beta(true * strength, (1 - true) * strength, len(parts)))
     word = judge(int(counts.sum()), parts, promise).verdict
