@@ -21,7 +21,6 @@ from patchproof.photo.rejection import PhotoRejected
 from patchproof.sheets.markers import DICTIONARY, aruco_dictionary
 
 APRILTAG = "DICT_APRILTAG_36h11"
-_WIDE_AZIMUTH_DEG = 50.0
 
 KnownPhoto = tuple[np.ndarray, Sheet]  # a photograph, and the sheet that it shows
 
@@ -36,7 +35,7 @@ class DetectionTrial:
 
 def photograph_sheet(size_px: tuple[int, int], seed: int, dictionary: str = DICTIONARY) -> KnownPhoto:
     """A photograph of flat paper, drawn from the seed, with its sheet."""
-    sheet, rng = draw_sheet("flat", seed, size_px, _WIDE_AZIMUTH_DEG)
+    sheet, rng = draw_sheet(seed, size_px)
     return photograph_paper(sheet, rng, dictionary), sheet
 
 
