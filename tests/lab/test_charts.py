@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from patchlab.charts import breaks, detect, make, speed, terms
+from patchlab.charts.bars import Bar, BarPoint
 from patchlab.charts.drawing import pareto_mask
 from patchlab.charts.paper_photos import PIECE_MM, corners_mm, draw_sheet
 from patchlab.study import measure
@@ -123,11 +124,9 @@ def test_pairs_of_missing_data_art_and_apriltag_are_left_out(monkeypatch):
 # Breaking points
 
 
-def bar(*good: int, silent: int = 0) -> breaks.Bar:
-    points = [
-        {"value": i, "good": n, "silent": silent, "said": [["blurred", 10 - n - silent]]} for i, n in enumerate(good)
-    ]
-    return breaks.Bar("markers", "blur", range(len(good)), 10, 0.8, points)
+def bar(*good: int, silent: int = 0) -> Bar:
+    points = [BarPoint(n >= 8, [("blurred", 10 - n - silent)], silent) for n in good]
+    return Bar("markers", "blur", range(len(good)), points, 10)
 
 
 def test_the_last_good_point_stands_before_the_first_bad_one():
