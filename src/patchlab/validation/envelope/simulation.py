@@ -117,9 +117,8 @@ def recognize_target(
     out = {kind: np.zeros((len(values), len(conditions)), bool) for kind in ("design", *CONTROLS)}
     for i, value in enumerate(values):
         problem = replace(world.problem, stage=_stage_at(world, axis, value))
-        for first in range(
-            min(4, len(conditions))
-        ):  # the corner that is hidden first; each goes with a quarter of the conditions
+        # the corner that is hidden first; each goes with a quarter of the conditions
+        for first in range(min(4, len(conditions))):
             rows = np.arange(first, len(conditions), 4)
             design, gray = (piece_at(world, axis, value, first, is_gray) for is_gray in (False, True))
             drawn, shown = conditions_at(world.scene, conditions[rows], {axis: value}), (design, None, gray)

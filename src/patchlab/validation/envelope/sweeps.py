@@ -145,17 +145,13 @@ def _all_bars(results: Sequence[Result]) -> list[Bar]:
 def tables(settings: EnvelopeSettings, results: Sequence[Result]) -> tuple[Table, ...]:
     """A table of the last good and the first bad point of each stage along each axis, and one of all points."""
     about = f"The design gains where the 95 % interval of its rate minus that of {_CONTROL} lies above 0; the sheet is "
-    about += (
-        f"found, or measured, where {MIN_SHARE:.0%} of the photographs are. “{NO_GAIN}”: whatever the network answers."
-    )
+    about += f"found, or measured, where {MIN_SHARE:.0%} of the photographs are. “{NO_GAIN}”: whatever is answered."
     rows = tuple(bar.row for bar in _all_bars(results))
     head = ("axis", "value", "recognized", *CONTROLS, "gain", "effect", "sheet found", "measured")
     head = (*head, "median error mm", "largest error mm", "said")
     points = tuple(row for result in results for row in _point_rows(result))
-    about_points = (
-        f"Gain: over {_CONTROL} (Newcombe). Errors are the largest of the design's four corners, against the "
-    )
-    about_points += "simulation's truth, of flat sheets. Intervals: Wilson."
+    about_points = f"Gain: over {_CONTROL} (Newcombe). Errors are the largest of the design's four corners, against "
+    about_points += "the simulation's truth, of flat sheets. Intervals: Wilson."
     return (
         Table("breaks", "Where it breaks, and what is said there", BAR_HEAD, rows, about),
         Table("sweeps", "All points", head, points, about_points),
