@@ -10,7 +10,7 @@ import math
 import cv2
 import numpy as np
 
-from patchlab.validation.inkjets import DRIVERS, draw_inkjet
+from inkjets import DRIVERS, draw_inkjet
 from patchproof.base.color import codes_from_srgb, linear_from_srgb, srgb_from_linear
 from patchproof.calibrate.chart import known_printers
 from patchproof.calibrate.color_ladder import ColorMap

@@ -23,7 +23,7 @@ from drawn_printers import (
     printed_page,
     relative_to_paper,
 )
-from patchlab.validation.inkjets import DRIVERS, draw_inkjet
+from inkjets import DRIVERS, draw_inkjet
 from patchproof.app import cli
 from patchproof.base.color import linear_from_srgb, srgb_from_linear
 from patchproof.base.errors import Refused
