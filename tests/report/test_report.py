@@ -59,7 +59,12 @@ def some_report(verdict="kept"):
                       control="gray", control_rate=1 / 3, control_interval=(0.06, 0.79), difference=0.67,
                       difference_interval=(0.1, 0.9)),
     )  # fmt: skip
-    origin = Origin(options={"ruler_mm": (97.1, 97.3)}, sha256={"network net": "e" * 64}, versions={"numpy": "1"})
+    origin = Origin(
+        options={"ruler_mm": (97.1, 97.3)},
+        sha256={"network net": "e" * 64},
+        versions={"numpy": "1"},
+        notes=("it is odd",),
+    )
     controls = (Control("gray", 1, 3, (0.06, 0.79), 3, 0.67, (0.1, 0.9), 2, "", False, (1.0, 0.333)),)
     return Report(sheet_id="TESTSHEET0", photos=tuple(photos), summary=summary, controls=controls, origin=origin)
 
@@ -130,6 +135,7 @@ def test_the_page_says_what_the_report_says_and_escapes_it(shown):
         "e" * 64,
         "f" * 64,
         "numpy 1",
+        "it is odd.",
         "+66.7 points",
     ):
         assert words in text

@@ -161,7 +161,8 @@ def verify(
         parameters |= {name: path and Path(path).name for name, path in files.items()}
         parameters["ledger_photos"] = ledger_photos
         hashes = {"manifest": file_sha256(Path(sheet))} | {f"network {m.name}": m.sha256 for m in options.models}
-        origin = Origin(options=parameters, sha256=hashes, versions=versions_of(_LIBRARIES))
+        notes = tuple(note for model in options.models for note in model.notes)
+        origin = Origin(options=parameters, sha256=hashes, versions=versions_of(_LIBRARIES), notes=notes)
         report = report.changed(origin=origin, folder=out)
         stems = {stem_of(photo.file) for photo in report.photos[:MAX_PICTURED_PHOTOS]}
         # but for pictures of photographs that this report does not show
