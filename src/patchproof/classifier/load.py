@@ -110,18 +110,14 @@ def _prepare(classifier: Classifier, device: torch.device | str, is_own: bool = 
     """
 
     def check_and_tune() -> Classifier:
-        check_network(classifier, device, is_own)
-        pictures = smooth_pictures(classifier.input_px).to(device)
-        tuned = replace(classifier, network=tune_batches(classifier.network, pictures))
-        if classifier.name.startswith(("file:", "module:", "python:")):  # wrapped by others
-            from patchproof.classifier.wrapping import check_wrapping
-
-            check_wrapping(tuned, device)
-        return tuned
-
-    def check_and_note() -> Classifier:
         with warnings.catch_warnings(action="always", record=True) as said:
-            tuned = check_and_tune()
+            check_network(classifier, device, is_own)
+            pictures = smooth_pictures(classifier.input_px).to(device)
+            tuned = replace(classifier, network=tune_batches(classifier.network, pictures))
+            if classifier.name.startswith(("file:", "module:", "python:")):  # wrapped by others
+                from patchproof.classifier.wrapping import check_wrapping
+
+                check_wrapping(tuned, device)
         notes = tuple(dict.fromkeys(str(each.message) for each in said))
         for note in notes:
             warnings.warn(note, stacklevel=4)
@@ -131,13 +127,13 @@ def _prepare(classifier: Classifier, device: torch.device | str, is_own: bool = 
     if isinstance(classifier.network, torch.nn.Module):
         freeze(classifier.network).to(device)
     if not classifier.name.startswith("file:"):
-        return check_and_note()
+        return check_and_tune()
     threads, network = torch.get_num_threads(), classifier.network
     stored_bytes = sum(weight.nbytes for weight in network.buffers()) if isinstance(network, torch.nn.Module) else 0
     max_bytes = CHECK_BYTES + CHECK_BYTES_PER_BYTE * stored_bytes + CHECK_BYTES_PER_THREAD * threads
     try:
         with limit_memory(max_bytes) if torch.device(device).type == "cpu" else nullcontext():
-            return run_within_seconds(CHECK_S * threads, check_and_note)
+            return run_within_seconds(CHECK_S * threads, check_and_tune)
     except TimeLimitExceeded as error:
         expected, got = "a network that three pictures can be tried with", f"{classifier.name}, which takes {error}"
         raise Refused(expected, got, "use a smaller one, or more threads") from error
