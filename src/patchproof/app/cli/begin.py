@@ -61,10 +61,11 @@ def preview(
 def plan(
     scene: SceneFile,
     out: Annotated[Path | None, Option(help="Write the plan as JSON, too.")] = None,
-    no_timing: Annotated[bool, Option("--no-timing", help="Leave out the cost of a step.")] = False,
     overwrite: Overwrite = False,
 ) -> None:
     """Show what is modeled, what is not, and why: first how the piece lies, then what is measured."""
+    from pydantic_core import to_json
+
     from patchproof.app.plan.lines import geometry_lines, measured_lines
     from patchproof.app.plan.plan import measured_plan, plan_geometry
     from patchproof.base.output import check_file, write_atomically
@@ -73,14 +74,14 @@ def plan(
         check_file(out, overwrite)
     with progress_bar() as bar:
         geometry, problem = plan_geometry(scene, progress=bar)
-    warn(geometry.warnings)
+    warn(geometry["warnings"])
     say(*geometry_lines(geometry))
     sys.stdout.flush()  # what follows takes minutes
     with progress_bar() as bar:
-        full_plan = measured_plan(geometry, problem, timing=not no_timing, progress=bar)
+        full_plan = measured_plan(geometry, problem, progress=bar)
     say(*measured_lines(full_plan))
     if out is not None:
-        write_atomically(out, full_plan.model_dump_json(indent=1) + "\n")
+        write_atomically(out, to_json(full_plan, indent=1) + b"\n")
 
 
 def examples(folder: Annotated[Path, Argument(help="The folder to copy them to, new or empty.")]) -> None:
