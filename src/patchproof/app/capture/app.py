@@ -42,13 +42,13 @@ _MOST_UPLOADS = 8  # at once; more wait before their body is read
 TOKEN_SHOWN_S = 10.0  # from a connection to the end of a request's head; whoever takes longer loses its place
 MOST_STRANGERS, _MOST_CONNECTIONS = 32, 64  # connections that have not shown the token, and all
 _Client = tuple[str, int] | None
-_HEADERS = {
-    "Cache-Control": "no-store",
-    "Referrer-Policy": "no-referrer",
-    "X-Content-Type-Options": "nosniff",
-    "Cross-Origin-Resource-Policy": "same-origin",
-    "Connection": "close",
-}
+_HEADERS = (
+    (b"cache-control", b"no-store"),
+    (b"referrer-policy", b"no-referrer"),
+    (b"x-content-type-options", b"nosniff"),
+    (b"cross-origin-resource-policy", b"same-origin"),
+    (b"connection", b"close"),
+)
 
 
 def server_config(collection: PhotoCollection, token: str) -> uvicorn.Config:
@@ -99,30 +99,25 @@ def capture_app(collection: PhotoCollection, token: str, admit: Callable[[_Clien
     ]
     app = Starlette(routes=routes, exception_handlers={Refused: _refuse, OSError: _refuse})
     app.router.redirect_slashes = False
-    return _TokenCheck(app, token, admit)
 
+    async def check_token(scope: "Scope", receive: "Receive", send: "Send") -> None:
+        """Check the token, in constant time, before anything else of a request is read; add headers to responses."""
 
-class _TokenCheck:
-    """Check the token, in constant time, before anything else of a request is read, and add headers to responses."""
-
-    def __init__(self, app: "ASGIApp", token: str, admit: Callable[[_Client], object]):
-        self._app, self._token, self._admit = app, token.encode(), admit
-
-    async def __call__(self, scope: "Scope", receive: "Receive", send: "Send") -> None:
         async def with_headers(message: "Message") -> None:
             if message["type"] == "http.response.start":
-                headers = [(name.lower().encode(), value.encode()) for name, value in _HEADERS.items()]
-                message = {**message, "headers": [*message["headers"], *headers]}
+                message = {**message, "headers": [*message["headers"], *_HEADERS]}
             await send(message)
 
         if scope["type"] != "http":
             return
-        token = scope["path"].lstrip("/").partition("/")[0]
-        if not hmac.compare_digest(token.encode("utf-8", "surrogateescape"), self._token):
+        shown = scope["path"].lstrip("/").partition("/")[0]
+        if not hmac.compare_digest(shown.encode("utf-8", "surrogateescape"), token.encode()):
             sentence = "Expected the address that the terminal shows, got one without its token: open that address."
             return await _refusal(403, sentence)(scope, receive, with_headers)
-        self._admit(scope["client"])
-        await self._app(scope, receive, with_headers)
+        admit(scope["client"])
+        await app(scope, receive, with_headers)
+
+    return check_token
 
 
 class _Handlers:
@@ -197,7 +192,7 @@ class _Handlers:
         return {"photo": answer_of(collection, path, pictures[0] if pictures else None), "state": self._state}
 
 
-async def _refuse(request: Request, error: Exception) -> Response:
+async def _refuse(_: Request, error: Exception) -> Response:
     """Answer with a refusal's sentence, or with that of a disk that takes no more."""
     if isinstance(error, OSError):
         error = Refused("room for a photograph", error.strerror or str(error), "make room and send it again")

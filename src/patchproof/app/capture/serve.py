@@ -44,7 +44,6 @@ def serve_capture(
     sheet: str | Path,
     out: str | Path,
     *,
-    run: str | Path | None = None,
     models: Sequence[str] | None = None,
     camera: str | None = None,
     trust: bool = False,
@@ -55,7 +54,7 @@ def serve_capture(
     """Serve the page and receive photographs into the folder `out` until interrupted; returns the report on them.
 
     `progress` is called with the stage "measure" for photographs that are there already, `on_address` with the address
-    once the server listens. `run`, `models`, `camera` and `trust` are those of `verify`.
+    once the server listens. `models`, `camera` and `trust` are those of `verify`.
     """
     try:
         import uvicorn
@@ -68,25 +67,23 @@ def serve_capture(
         got = f"the {manifest.kind} sheet {manifest.sheet_id}"
         raise Refused("a sheet that promises something", got, "photograph it with any camera")
     options = replace(options_of(sheet, manifest, models, camera, trust), find=not manifest.markers)
-    forecast = None if run is None else (Path(run).resolve(), Path(sheet).resolve(), trust, tuple(models or ()))
     with lock_folder(out), open_workers(1, spawn=True) as workers:
         album = Album(Path(out))
         workers.map(prepare_worker, [None])
-        with closing(PhotoCollection(album, manifest, options, workers, forecast)) as collection:
+        with closing(PhotoCollection(album, manifest, options, workers)) as collection:
             collection.measure(album.photos(), partial(progress, "measure"))
             path = _address_file(album.folder)
             address = _stored_address(path)
-            with _listen(_host(lan), address.port) as listener:
+            # never at all the addresses that this machine has
+            with _listen(_network_address() if lan else "127.0.0.1", address.port) as listener:
                 host, port = listener.getsockname()
                 with suppress(Refused):  # without a place for it, the next server has a new address
                     make_folder(path.parent)
                     path.parent.chmod(0o700)
                     write_atomically(path, address.changed(port=port).model_dump_json())
                 on_address(f"http://{host}:{port}/{address.token}/")
-                try:
+                with suppress(KeyboardInterrupt):  # the way to end the server
                     uvicorn.Server(server_config(collection, address.token)).run(sockets=[listener])
-                except KeyboardInterrupt:  # the way to end the server
-                    pass
             return collection.report()
 
 
@@ -105,11 +102,6 @@ def _listen(host: str, port: int) -> socket.socket:
                 got = f"an error on {host}: {error.strerror}"
                 raise Refused("a port to listen at", got, "free a port, or check the network") from error
     raise AssertionError("port 0 is always tried")
-
-
-def _host(lan: bool) -> str:
-    """The one address to serve at; never all that this machine has."""
-    return _network_address() if lan else "127.0.0.1"
 
 
 def _network_address() -> str:

@@ -1,9 +1,8 @@
 """The verb capture: photographs from a phone."""
 
 import signal
-from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from typer import Argument, Option
 
@@ -15,9 +14,6 @@ from patchproof.base.text import command_text
 def capture(
     sheet: Annotated[Path, Argument(help="The manifest that was written beside the PDF.")],
     out: Annotated[Path, Option(help="Folder for the photographs; an existing one is continued.")] = Path("photos"),
-    run: Annotated[
-        Path | None, Option(help="The run that the sheet is of: forecasts each photograph at its measured view.")
-    ] = None,
     models: Models = None,
     camera: Annotated[str | None, Option(help="The camera that takes them: a camera file or its name.")] = None,
     trust: Trust = False,
@@ -40,10 +36,9 @@ def capture(
         say(address, "" if lan else "Only this machine can open it; --lan lets a phone.", "Ctrl-C ends it.")
 
     with progress_bar() as bar:
-        serve = partial(
-            serve_capture, sheet, out, run=run, models=names_of(models), camera=camera, lan=lan, trust=trust
-        )
-        report = serve(progress=lambda stage, done, total: bar(stage, done, total) if total else None, on_address=show)
+        progress = lambda stage, done, total: bar(stage, done, total) if total else None  # noqa: E731
+        options: dict[str, Any] = {"models": names_of(models), "camera": camera, "lan": lan, "trust": trust}
+        report = serve_capture(sheet, out, **options, progress=progress, on_address=show)
     words = [out, "--sheet", sheet, *(["--controls", out / CONTROLS_FOLDER] if report.controls else [])]
     if not load_manifest(sheet).markers:
         words += ["--find", *(["--corners", out / CORNERS_FILE] if (out / CORNERS_FILE).is_file() else [])]

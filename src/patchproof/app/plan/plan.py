@@ -87,9 +87,7 @@ def measured_plan(
     return geometry | {
         "draft": draft,
         "terms": terms,
-        "photographs": _photographs_needed(problem, design, partial(progress, "photographs"))
-        if scene.HAS_PIECE
-        else "",
+        "photographs": _photographs_needed(problem, design, progress) if scene.HAS_PIECE else "",
         "omitted": scene.OMITTED,
         "cost": measure_cost(problem, design, partial(progress, "cost")),
         "not_measured": {figure: reason for figure, reason in reasons.items() if reason},
