@@ -31,9 +31,8 @@ from patchproof.evidence.results import (
 )
 from patchproof.optimizer.evaluate import Evaluation
 from patchproof.report.images import delta_map, save_pictures
-from patchproof.report.run_words import evaluation_lines
 from patchproof.report.tables import Drawing, Results, Table, write_results
-from patchproof.report.words import verdict_lines
+from patchproof.report.words import evaluation_lines, verdict_lines
 from patchproof.report.write import photos_csv, report_html, write_report
 from test_verify_run import promise
 
@@ -134,7 +133,7 @@ def test_the_page_says_what_the_report_says_and_escapes_it(shown):
     ):
         assert words in text
     assert "<b>bright" not in text and "Promise broken" not in text
-    assert text.count("<svg") == 4  # tilt, pixels per mm, print scale, ledger
+    assert text.count("<svg") == 3  # tilt, pixels per mm, ledger
 
 
 def test_an_answer_about_a_photograph_that_does_not_count_is_not_called_recognized(tmp_path):

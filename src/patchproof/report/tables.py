@@ -8,7 +8,7 @@ or lines. The same input gives the same bytes.
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -61,7 +61,7 @@ class Results:
     tables: Sequence[Table]
     figures: Sequence[Drawing]
     failed: Mapping[str, str]
-    more: Mapping[str, Any]
+    more: Mapping[str, Any] = field(default_factory=dict)
     program: str = "patchproof"
 
 

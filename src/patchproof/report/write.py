@@ -18,7 +18,7 @@ from patchproof.base.text import csv_lines
 from patchproof.report import words
 from patchproof.report.images import DELTA_TOP, data_uri, saved_pictures
 from patchproof.report.page import render_page
-from patchproof.report.plots import ledger_plot, recognition_plot, scale_plot
+from patchproof.report.plots import ledger_plot, recognition_plot
 
 _FIRST = ("file", "status", "code", "figure", "threshold", "advice")
 _PLOTS = (("tilt_deg", "tilt in degrees"), ("px_per_mm", "pixels per millimeter"))
@@ -43,10 +43,10 @@ def report_html(report: Mapping, manifest: Mapping, encoded: Mapping[str, Mappin
     """Render the page's HTML; `encoded` are JPEG or PNG bytes by photo and kind."""
     promise, summary, photos = manifest.get("promise"), report["summary"], report["photos"]
     judged = [photo for photo in photos if photo["status"] != "rejected"]
-    plots, primary = [(scale_plot(judged), "chart of the print's scale")], None
+    plots, primary = [], None
     if promise:
         primary = promise["models"][0]["name"]
-        plots[:0] = [
+        plots = [
             (recognition_plot(judged, primary, name, label, promise["conditions"]), f"chart of recognition by {label}")
             for name, label in _PLOTS
         ]

@@ -24,7 +24,7 @@ CONTROLS_FOLDER = "controls"
 CONTROLS = ("bare", "mean", "gray", "noise", "shuffled", "blank")
 MOST_BYTES = 40_000_000  # phones' largest JPEGs, of 108 and 200 megapixels, have some 30
 MOST_PHOTOS = 1000
-_OWN = ("session_*", CONTROLS_FOLDER, JOURNAL_FILE, CORNERS_FILE, ".capture.json")  # the last, a sender's, is not read
+_OWN = ("session_*", CONTROLS_FOLDER, JOURNAL_FILE, CORNERS_FILE)
 _HEAD = 12  # bytes that tell the kind of a file
 # by suffix: where the bytes begin that tell a kind, and which they are
 _KINDS = {

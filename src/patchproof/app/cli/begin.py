@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 from typer import Argument, Exit, Option
 
 from patchproof.app.cli.console import Overwrite, names_of, say, warn
+from patchproof.base.errors import Refused
 from patchproof.base.progress import progress_bar
 from patchproof.base.text import command_text
 
@@ -86,9 +87,17 @@ def plan(
 
 def examples(folder: Annotated[Path, Argument(help="The folder to copy them to, new or empty.")]) -> None:
     """Copy five programs and their scenes: a patch on a box, your network, photographs, a detector, a print."""
-    from patchproof.app.begin.copy_examples import copy_examples
+    from patchproof.base.output import make_folder, write_atomically
 
-    say(*copy_examples(folder), f"next: cd {shlex.quote(str(folder))} && python box.py")
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        got = f"{folder}, which {'has files' if folder.is_dir() else 'is a file'}"
+        raise Refused("a new or empty folder", got, "name another")
+    make_folder(folder)
+    for path in sorted((Path(__file__).parents[1] / "examples").glob("*.*")):
+        write_atomically(folder / path.name, path.read_bytes())
+        if path.suffix == ".py":
+            say(f"{path.name}: {path.read_text(encoding='utf-8').splitlines()[0].strip(chr(34))}")
+    say(f"next: cd {shlex.quote(str(folder))} && python box.py")
 
 
 def keys(

@@ -21,7 +21,6 @@ def printer(
     ] = "relative",
     licence: Annotated[str, Option(help="Of the profile, for the record.")] = "unknown",
     source: Annotated[str, Option(help="Where the profile is from, for the record.")] = "unknown",
-    chart: Annotated[bool, Option("--chart", hidden=True)] = False,
     design: Annotated[
         bool, Option("--design", help="They show a print of known pixels, that of --sheet; else a printed chart.")
     ] = False,
@@ -38,8 +37,6 @@ def printer(
     from patchproof.calibrate.printer import printer_from_chart, printer_from_design, printer_from_icc
 
     photos = photos or []
-    if chart:
-        raise BadParameter("a chart needs no option: PHOTO... --sheet chart.json", param_hint="--chart")
     if (icc is None) != bool(photos):
         raise BadParameter("give either --icc FILE or PHOTO...", param_hint="--icc / PHOTO...")
     if not design and (corners or find or known):
