@@ -17,8 +17,15 @@ from PIL import Image
 from patchproof.app import cli
 from patchproof.app.plan import errors
 from patchproof.app.plan.errors import Setup, measure_terms, scene_terms
-from patchproof.app.plan.lines import geometry_lines, measured_lines
-from patchproof.app.plan.plan import marker_plan, measure_cost, measured_plan, plan_geometry, resolution_plan
+from patchproof.app.plan.plan import (
+    geometry_lines,
+    marker_plan,
+    measure_cost,
+    measured_lines,
+    measured_plan,
+    plan_geometry,
+    resolution_plan,
+)
 from patchproof.base.errors import Refused
 from patchproof.base.settings import SceneSettings
 from patchproof.base.validation import validate_model

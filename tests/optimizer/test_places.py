@@ -14,8 +14,7 @@ from trimesh.triangles import closest_point
 
 import patchproof as pp
 from patchproof.app.compare import _views_of
-from patchproof.app.plan.lines import geometry_lines, measured_lines
-from patchproof.app.plan.plan import measured_plan, plan_geometry
+from patchproof.app.plan.plan import geometry_lines, measured_lines, measured_plan, plan_geometry
 from patchproof.base.errors import Refused
 from patchproof.base.settings import SceneSettings
 from patchproof.base.validation import validate_model

@@ -267,7 +267,7 @@ def test_every_picture_has_words_of_its_own(tmp_path):
         assert len(tags.texts) == len(set(tags.texts)) == count and all(tags.texts)
     text = (tmp_path / "report.html").read_text()
     named = re.findall(r'<div role="img" aria-label="([^"]+)"><svg', text)
-    assert len(named) == len(set(named)) == text.count("<svg") == 4
+    assert len(named) == len(set(named)) == text.count("<svg") == 3
 
 
 def test_a_studys_page_begins_with_its_figure(tmp_path):

@@ -10,6 +10,7 @@ corrections of the other rows for the number of designs; they only serve the sel
 """
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -57,16 +58,17 @@ def compare(
     Args:
         runs: finished runs of one scene, or their folders, two or more.
         out: folder for designs.html, designs.json and the tables.
-        models, trust, compute, overwrite, progress: as in `evaluate`.
+        models, trust, compute, overwrite: as in `evaluate`.
         n: conditions for each comparison.
         seed: of the conditions, in place of the first run's.
+        progress: called with a design's name as the stage (conditions), for the two best once more.
 
     Raises:
         Refused: for runs of different scenes.
     """
     networks, loaded = None if models is None else tuple(models), _load_runs(runs, models is None, trust)
     refuse_networks_in_memory(networks, compute)
-    scene, total, views_done = next(iter(loaded.values())).scene, n * (len(loaded) + 2), 0
+    scene = next(iter(loaded.values())).scene
     target = scene.settings.target
     judges = networks or target.models
     names = tuple(each.name if isinstance(each, Classifier) else each for each in judges)
@@ -75,17 +77,9 @@ def compare(
     with new_folder(out, COMPARISON_FILES, overwrite, runs) as folder, opening as workers:
 
         def ask(name: str, start: int) -> AnswersByKind:
-            nonlocal views_done
-            run, start_count = loaded[name], views_done
-            conditions = run.scene.draw("evaluate", n, seed, start)
-
-            def advance(count: int, _: int) -> None:
-                progress("evaluate", start_count + count, total)
-
+            conditions, advance = loaded[name].scene.draw("evaluate", n, seed, start), partial(progress, name)
             options = networks, compute.device, trust, advance
-            answers, _ = run_responses(run.folder.resolve(), conditions, workers, *options)
-            views_done += n
-            return answers
+            return run_responses(loaded[name].folder.resolve(), conditions, workers, *options)[0]
 
         try:
             by_design = {name: ask(name, 0) for name in loaded}

@@ -50,14 +50,14 @@ Printed by `patchproof keys --files` from the lists of the readers. *used*: take
 sentence, exit code 1 (a photograph: rejected with its code). *said*: left aside, with a line in the command's output,
 the preview and the report.
 """
-# the kinds of input, and the modules whose DECLARED lists what they can declare
-READERS: dict[str, tuple[str, ...]] = {
-    "Meshes": ("mesh.declarations",),
-    "Networks": ("classifier.declarations",),
-    "Photographs and pictures": ("photo.declarations",),
-    "PDFs": ("sheets.declarations",),
-    "Settings and text files": ("base.declarations",),
-    "Boxes": ("evidence.declarations",),
+# the kinds of input, and the rooms in whose `declarations` DECLARED lists what they can declare
+READERS = {
+    "Meshes": "mesh",
+    "Networks": "classifier",
+    "Photographs and pictures": "photo",
+    "PDFs": "sheets",
+    "Settings and text files": "base",
+    "Boxes": "evidence",
 }
 
 
@@ -195,8 +195,8 @@ def _bounds(checks: tuple[Any, ...]) -> list[tuple[str, Any]]:
 
 
 def declarations(reader: str) -> tuple[Declaration, ...]:
-    """The lists of one kind of input in `READERS`, joined."""
-    return tuple(entry for module in READERS[reader] for entry in import_module(f"patchproof.{module}").DECLARED)
+    """The list of one kind of input in `READERS`."""
+    return import_module(f"patchproof.{READERS[reader]}.declarations").DECLARED
 
 
 def codes_table() -> str:

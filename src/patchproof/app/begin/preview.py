@@ -20,14 +20,11 @@ import torch
 from patchproof.app.begin.guess import lying_hint, other_axis
 from patchproof.app.begin.sides import (
     SIDE_NAMES,
-    gap_colors,
-    ramp_colors,
     sample_views,
     side_of,
     side_views,
     turntable,
 )
-from patchproof.base.color import codes_from_srgb
 from patchproof.base.errors import Refused
 from patchproof.base.output import base64_uri, image_bytes, new_folder, write_atomically
 from patchproof.base.settings import SceneSettings, load_scene_settings
@@ -36,10 +33,9 @@ from patchproof.channel.printer import identity_printer
 from patchproof.classifier.labels import find_labels
 from patchproof.classifier.load import load_classifier
 from patchproof.optimizer.subject import subject_of
-from patchproof.render.stage import Stage, set_stage
+from patchproof.render.stage import set_stage
 from patchproof.report.images import data_uri, jpeg, png
 from patchproof.report.page import render_page
-from patchproof.scene.bend import STRETCH_LIMIT
 from patchproof.scene.interface import Scene, measurable_text
 from patchproof.scene.mesh_scene import MeshScene
 from patchproof.scene.patch_scene import PatchScene
@@ -50,7 +46,6 @@ from patchproof.scene.unplaced_scene import UnplacedScene
 
 PAGE = "preview.html"
 _FIRST_DEG = 30  # to the right of the front: shown before the slider is moved
-_DESIGN_PX = 256  # of the gray design on the piece, along its longer side
 
 
 @dataclass(frozen=True)
@@ -84,10 +79,10 @@ def preview(scene: str | Path | Scene, out: str | Path, *, overwrite: bool = Fal
         stage = set_stage(scene)
         views = sample_views(stage, classifiers, indices)
         warnings = (*scene.warnings, *_up_warning(scene, settings), *(str(each.message) for each in said))
-        sides, scale, turns, maps = {}, {}, [], _maps(scene) if isinstance(scene, PatchScene) else []
+        sides, scale, turns = {}, {}, []
         if isinstance(scene, MeshScene):
             sides, scale = side_views(stage)
-            for azimuth_deg, picture in turntable(stage, _gray_design(stage)).items():
+            for azimuth_deg, picture in turntable(stage).items():
                 webp = image_bytes(picture, "WEBP", {"quality": 80})  # 3 to 10 kB: as JPEG it would be twice as large
                 turns.append((azimuth_deg, picture.shape[:2], base64_uri(webp, "image/webp")))
         facts, summaries = _facts(scene, settings), _answers(settings, views)
@@ -103,7 +98,7 @@ def preview(scene: str | Path | Scene, out: str | Path, *, overwrite: bool = Fal
             sides=[(side, SIDE_NAMES[side], data_uri(png(picture))) for side, picture in sides.items()],
             scale=scale,
             holder=side_of(scene.placement.normal) if isinstance(scene, PatchScene) else None,
-            maps=maps,
+            gap_limit_mm=gap_limit_mm(scene.placement.size_mm) if isinstance(scene, PatchScene) else None,
             turns=turns,
             first_deg=_FIRST_DEG,
             looks=[(look, data_uri(jpeg(look["picture"]))) for look in views],
@@ -210,27 +205,3 @@ def _answers(settings: SceneSettings, views: Sequence[Mapping[str, Any]]) -> lis
             f'object; most often "{most}" ({times})'
         )
     return lines
-
-
-def _maps(scene: PatchScene) -> list[dict[str, str]]:
-    """Pictures of the piece's gap and stretch, each with the words at the ends of its scale."""
-    placement = scene.placement
-    limit = f"{gap_limit_mm(placement.size_mm):.2g} mm: too much"
-    rows = [("gap to the surface", gap_colors(placement), "0 mm", limit)]
-    if not placement.is_flat:
-        stretches = ramp_colors(placement.stretches / STRETCH_LIMIT)
-        rows.append(("stretch of the paper", stretches, "0 %", f"{STRETCH_LIMIT:.0%}: refused"))
-    shape = "{:g} / {:g}".format(*placement.size_mm)
-    return [
-        {"title": title, "shape": shape, "picture": data_uri(png(colors)), "low": low, "high": high}
-        for title, colors, low, high in rows
-    ]
-
-
-def _gray_design(stage: Stage) -> np.ndarray | None:
-    """Make the printed piece with a gray design, uint8 h×w×3; None if the object has no piece."""
-    if not isinstance(stage.scene, PatchScene):
-        return None
-    size_mm = stage.scene.piece.size_mm
-    width, height = (max(8, round(side * _DESIGN_PX / max(size_mm))) for side in size_mm)
-    return codes_from_srgb(stage.design_renderer.appearance(torch.full((3, height, width), 0.5)).srgb).cpu().numpy()

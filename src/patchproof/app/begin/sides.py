@@ -1,7 +1,7 @@
 """Pictures of an object from its six sides, with ground line, scale bar and piece; from all around; and sample views.
 
 In: a stage with a mesh, with a piece on it or without. Out: pictures of the sides at one scale; pictures at one scale
-from a ring of directions, for a page that turns the object by a slider; the piece's gap and stretch as colors. The
+from a ring of directions, for a page that turns the object by a slider; the piece's gap as colors. The
 sides are those of `patch.side`; front and back are along z, as in glTF's standard and after `object.up = "z"` turned
 the y of other programs there. The ring is seen from far away, in even light, and from above or below if the piece is on
 top or below. Sample views are drawn from the train stream as optimizing draws them, and have the networks' answers
@@ -59,10 +59,10 @@ def side_views(stage: Stage) -> tuple[dict[Side, np.ndarray], dict[str, float]]:
     return pictures, {"bar_mm": bar_mm, "bar_px": bar_mm * px_per_mm, "ground_px": ground_px}
 
 
-def turntable(stage: Stage, on_piece: np.ndarray | None) -> dict[int, np.ndarray]:
+def turntable(stage: Stage) -> dict[int, np.ndarray]:
     """Render the object from a ring of directions, 180° down to -165° to the right of the side of the piece or of the
-    scene's front: uint8 H×W×3 by degrees. From one to the next, what faces the camera moves to the right. `on_piece`
-    are colors (uint8 h×w×3) of the scene's piece.
+    scene's front, the piece colored by its gap: uint8 H×W×3 by degrees. From one to the next, what faces the camera
+    moves to the right.
     """
     scene = require_mesh(stage.scene)
     x, y, z = scene.normal
@@ -73,7 +73,8 @@ def turntable(stage: Stage, on_piece: np.ndarray | None) -> dict[int, np.ndarray
     frames = {azimuth: _upright(orbit(azimuth, elevation_deg, front), scene.frame) for azimuth in ring}
     points = _points_mm(scene)
     half_mm = _ROOM * np.max([np.abs(points @ np.stack([f.right, f.up], 1)).max(0) for f in frames.values()], axis=0)
-    return {azimuth: plan_picture(stage, frame, half_mm, PICTURE_PX, on_piece) for azimuth, frame in frames.items()}
+    colors = gap_colors(scene.placement) if isinstance(scene, PatchScene) else None
+    return {azimuth: plan_picture(stage, frame, half_mm, PICTURE_PX, colors) for azimuth, frame in frames.items()}
 
 
 def side_of(direction: np.ndarray) -> Side:
@@ -90,16 +91,11 @@ def round_length(most_mm: float) -> float:
 
 def gap_colors(placement: Placement) -> np.ndarray:
     """Color the piece's gaps, uint8 N×N×3: 0 to `gap_limit_mm` from dark to light, `NO_SURFACE_RGB` off the surface."""
-    colors = ramp_colors(placement.gaps_mm / gap_limit_mm(placement.size_mm))
+    shares, stops = placement.gaps_mm / gap_limit_mm(placement.size_mm), np.linspace(0, 1, len(RAMP_RGB))
+    channels = [np.interp(np.nan_to_num(shares), stops, column) for column in np.array(RAMP_RGB, float).T]
+    colors = np.stack(channels, -1).round().astype(np.uint8)
     colors[np.isnan(placement.gaps_mm)] = NO_SURFACE_RGB
     return colors
-
-
-def ramp_colors(shares: np.ndarray) -> np.ndarray:
-    """Color shares in [0, 1] by `RAMP_RGB`, uint8 ...×3; shares beyond get the colors of the ends."""
-    stops = np.linspace(0, 1, len(RAMP_RGB))
-    channels = [np.interp(np.nan_to_num(shares), stops, column) for column in np.array(RAMP_RGB, float).T]
-    return np.stack(channels, -1).round().astype(np.uint8)
 
 
 def _points_mm(scene: MeshScene) -> np.ndarray:

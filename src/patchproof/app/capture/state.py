@@ -35,7 +35,10 @@ def state_of(collection: PhotoCollection, sessions: int | None) -> dict[str, Any
     counts = {row["name"]: row for row in data["sessions"]}
     rows = [counts.get(name, {"name": name, "judged": 0, "recognized": 0}) for name in collection.album.sessions]
     promised = promise.controls if promise is not None else ()
-    names = sorted(collection.photos, key=lambda path: path.name)  # in the order of arrival
+    photos, width_mm = collection.photos, collection.manifest.cut_mm[2]
+    counted = [photo.entry for path, photo in photos.items() if photo.counted and collection.control_of(path) is None]
+    wanted = PHOTOS_PER_SESSION * (sessions or _USUAL_SESSIONS)
+    names = sorted(photos, key=lambda path: path.name)  # in the order of arrival
     return {
         "verdict": summary.verdict,
         "headline": VERDICTS[summary.verdict],
@@ -48,7 +51,7 @@ def state_of(collection: PhotoCollection, sessions: int | None) -> dict[str, Any
         "plan": summary.next_step,
         "controls": [{"name": each.name, "photos": each.n, "recognized": each.recognized} for each in report.controls],
         "controls_known": [name for name in CONTROLS if name in promised] or CONTROLS,
-        "map": _map(collection, PHOTOS_PER_SESSION * (sessions or _USUAL_SESSIONS)),
+        "map": map_views(promise.conditions if promise else (), counted, wanted, collection.side_px, width_mm),
         "latest": [answer_of(collection, path) for path in names[-_LATEST_PHOTOS:][::-1]],
     }
 
@@ -81,14 +84,6 @@ def _view_words(entry: PhotoEntry) -> str:
     if geometry is not None and geometry.tilt_deg is not None:
         parts.append(f"tilt {geometry.tilt_deg:.0f}°")
     return ", ".join(parts)
-
-
-def _map(collection: PhotoCollection, wanted: int) -> dict[str, Any] | None:
-    """The map of views that the photographs show; None without a promise."""
-    promise, photos = collection.manifest.promise, collection.photos
-    counted = [photo.entry for path, photo in photos.items() if photo.counted and collection.control_of(path) is None]
-    cut_mm = collection.manifest.cut_mm[2]
-    return promise and map_views(promise.conditions, counted, wanted, collection.side_px, cut_mm)
 
 
 def map_views(

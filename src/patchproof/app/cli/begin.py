@@ -67,8 +67,7 @@ def plan(
     """Show what is modeled, what is not, and why: first how the piece lies, then what is measured."""
     from pydantic_core import to_json
 
-    from patchproof.app.plan.lines import geometry_lines, measured_lines
-    from patchproof.app.plan.plan import measured_plan, plan_geometry
+    from patchproof.app.plan.plan import geometry_lines, measured_lines, measured_plan, plan_geometry
     from patchproof.base.output import check_file, write_atomically
 
     if out is not None:

@@ -65,9 +65,7 @@ def printer(
 def camera(
     photos: Annotated[Path, Argument(help="A folder of photographs of a board.")],
     board: Annotated[str, Option(help="The board's template, or the BOARD.json beside its PDF.")] = "charuco_a4",
-    out: Annotated[Path, Option(help="The camera file; its figures and a picture are written beside it.")] = Path(
-        "camera.json"
-    ),
+    out: Annotated[Path, Option(help="The camera file, with figures and a picture.")] = Path("camera.json"),
     ruler_mm: Annotated[str | None, Option(help="The printed rulers as measured, e.g. 97.1x97.3 (x, y).")] = None,
     overwrite: Overwrite = False,
 ) -> None:

@@ -8,18 +8,7 @@ from typing import Annotated, Any, Literal
 from typer import Argument, BadParameter, Exit, Option
 
 from patchproof.app.cli import console
-from patchproof.app.cli.console import (
-    Cluster,
-    Device,
-    Jobs,
-    Models,
-    Overwrite,
-    Resume,
-    Seed,
-    Trust,
-    say,
-    warn,
-)
+from patchproof.app.cli.console import Cluster, Device, Jobs, Models, Overwrite, Resume, Seed, Trust, say, warn
 from patchproof.base.compute import Compute
 from patchproof.base.progress import progress_bar
 
@@ -28,9 +17,7 @@ PhotographedControl = Literal["bare", "mean", "gray", "noise"]  # that can hang 
 
 
 def demo(
-    out: Annotated[Path, Option(help="Folder for the run, the sheet, the photographs and the report.")] = Path(
-        "patchproof-demo"
-    ),
+    out: Annotated[Path, Option(help="Folder for all of it.")] = Path("patchproof-demo"),
     detector: Annotated[bool, Option("--detector", help="Before the built-in detector, not classifier.")] = False,
     imagenet: Annotated[
         bool, Option("--imagenet", help='Before a network of photographs: pip install "patchproof[imagenet]".')
@@ -64,10 +51,7 @@ def optimize(
     device: Device = "cpu",
     seed: Seed = None,
     jobs: Jobs = None,
-    require: Annotated[
-        Literal["helps"] | None,
-        Option(help='"helps" makes a design exit with 1 that does not help, or of which it cannot be told yet.'),
-    ] = None,
+    require: Annotated[Literal["helps"] | None, Option(help='"helps": exit with 1 unless it helps.')] = None,
 ) -> None:
     """Optimize the patch of a scene and promise its rate."""
     from patchproof.optimizer.promise import PromiseOptions
@@ -151,17 +135,17 @@ def sheet(
         from patchproof.reprints.run_sheet import sheet as sheet_of
         from patchproof.reprints.shared_page import sheet_of_several
 
-        first, *others = loaded = [load_run(folder, trust) for folder in runs]
-        if others:
-            manifests = sheet_of_several(loaded, out, template=template, control=control)
+        loaded, content = [load_run(folder, trust) for folder in runs], {"template": template, "control": control}
+        if len(runs) > 1:
+            manifests = sheet_of_several(loaded, out, **content)
         else:
-            manifests = [sheet_of(first, out, template=template, control=control, copies=copies, overwrite=overwrite)]
+            manifests = [sheet_of(loaded[0], out, **content, copies=copies, overwrite=overwrite)]
     for manifest, path in zip(manifests, paths, strict=True):
         if manifest.promise is not None:
             from patchproof.report.words import promise_summary
 
-            lines = promise_summary(manifest.promise, manifest.settings), background_summary(manifest.settings)
-            say(lines[0], f"promise simulated {lines[1]}")
+            settings = manifest.settings
+            say(promise_summary(manifest.promise, settings), f"promise simulated {background_summary(settings)}")
         say(f"sheet {manifest.sheet_id} ({manifest.kind}): {out}{'' if path == out else f', {path.name}'}")
     if check:
         lines = (line for manifest in manifests for line in sheet_advice(manifest))
@@ -179,9 +163,7 @@ def reprint(
     print_scale: Annotated[str, Option(help="Size of the print, 0.97 or 0.97x0.98 (x, y).")] = "1",
     control: Annotated[PhotographedControl | None, Option(help="Photograph a control in place of the design.")] = None,
     scan_dpi: Annotated[float | None, Option(min=30, max=1200, help="Scan the uncut page flat instead.")] = None,
-    path_traced: Annotated[
-        bool, Option("--path-traced", help="Render with Mitsuba 3 in place of our renderer (slow).")
-    ] = False,
+    path_traced: Annotated[bool, Option("--path-traced", help="Render with Mitsuba 3 (slow).")] = False,
     jobs: Jobs = None,
     cluster: Cluster = None,
     trust: Trust = False,
@@ -194,10 +176,9 @@ def reprint(
     from patchproof.reprints.reprint import reprint as reprint_sheet
 
     scale = console.pair_of(print_scale, "--print-scale")
-    if scan_dpi is not None and control is not None:
-        raise BadParameter("a scan is of the PDF itself; leave --control out", param_hint="--scan-dpi")
-    if path_traced and scan_dpi is not None:
-        raise BadParameter("is of the piece on its object; leave --scan-dpi out", param_hint="--path-traced")
+    if scan_dpi is not None and (control is not None or path_traced):
+        only = "a scan is of the PDF itself; leave --control and --path-traced out"
+        raise BadParameter(only, param_hint="--scan-dpi")
     how = ReprintSetup(printer, scale, control, path_traced)
     if run is None:
         if scan_dpi is not None or control is not None or path_traced or sessions > 1:
@@ -262,8 +243,7 @@ def verify(
         report = verify_photos(photos, sheet, out, **options, progress=bar)
     say(*verdict_lines(report), f"report: {out / 'report.html'}")
     summary = report.summary
-    nothing = summary.judged == 0 and summary.measured == 0
-    if nothing:
+    if nothing := summary.judged == 0 and summary.measured == 0:
         see = "Expected photographs that can be judged or measured, got none: see the codes in the report."
         print(see, file=sys.stderr)
     if require == "kept" and summary.meets("kept") and not summary.meets("helps"):

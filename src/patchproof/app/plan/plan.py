@@ -1,11 +1,11 @@
 """`plan`: which parts of a scene are modeled and which are not, each with the figure that decided it.
 
-In: a scene file. Out: the plan as plain data: where the piece lies (after a search, if the scene asks for one) and how
-a simpler or richer surface would differ, the pixels that views have for design and markers, the error of leaving out
-each term of light, camera and renderer, how many photographs prove a promise, and the cost of a step. All figures come
-from the code that optimizes. Terms are measured with a draft of a few steps, since a classifier that ignores the design
-would miss none of them. What photographs can prove depends on how much sessions differ, which a small promise of the
-draft measures; the sheet's plan page says it of the design.
+In: a scene file. Out: the plan as plain data, and as lines: where the piece lies (after a search, if the scene asks for
+one) and how a simpler or richer surface would differ, the pixels that views have for design and markers, the error of
+leaving out each term of light, camera and renderer, how many photographs prove a promise, and the cost of a step. All
+figures come from the code that optimizes. Terms are measured with a draft of a few steps, since a classifier that
+ignores the design would miss none of them. What photographs can prove depends on how much sessions differ, which a
+small promise of the draft measures; the sheet's plan page says it of the design.
 
 Left out on purpose: deciding for the user. The plan says which terms can go; the scene file decides.
 """
@@ -13,7 +13,6 @@ Left out on purpose: deciding for the user. The plan says which terms can go; th
 import math
 import statistics
 import time
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,17 +23,18 @@ from torch import Tensor
 
 from patchproof.app.plan.errors import measure_terms
 from patchproof.base.progress import Advance, Progress, no_advance, no_progress
+from patchproof.base.validation import not_measured_lines
 from patchproof.evidence.verdict import photos_line
 from patchproof.optimizer.expectation import new_pose_share
 from patchproof.optimizer.loop import SELECT_VIEWS, start, steps
 from patchproof.optimizer.pixels import as_pixels, from_pixels
-from patchproof.optimizer.place_search import choose_place
+from patchproof.optimizer.place_search import choose_place, place_lines
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.optimizer.promise import CONTROLS, VIEWS_PER_SESSION, make_promise
 from patchproof.render.photograph import affected_windows, expose
 from patchproof.scene.bent_scene import placement_with_other_bend
 from patchproof.scene.conditions import Conditions
-from patchproof.scene.interface import PX_PER_MODULE, READABLE_SHARE, PieceScene, require_piece
+from patchproof.scene.interface import PX_PER_MODULE, READABLE_SHARE, PieceScene, measurable_text, require_piece
 from patchproof.scene.scene import load_scene
 from patchproof.scene.unplaced_scene import UnplacedScene
 from patchproof.sheets.markers import MARKER_MODULES
@@ -79,6 +79,14 @@ def measured_plan(
     design, draft = _draft(problem, progress)
     conditions, surface = scene.draw("select", views), geometry["surface"]
     terms = measure_terms(problem, design, conditions, SELECT_VIEWS, other, partial(progress, "terms"))
+    needed = ""
+    if scene.HAS_PIECE:
+        sessions, advance = (
+            scene.draw("select", PROOF_VIEWS, per_session=VIEWS_PER_SESSION),
+            partial(progress, "photographs"),
+        )
+        promise = make_promise(problem, as_pixels(design), sessions, CONTROLS, advance, VIEWS_PER_SESSION)
+        needed = f"To prove a promise of such a draft: {photos_line(promise)}"
     reasons = {
         "terms that can go": terms["unknown"],
         "the size of markers": "" if geometry["markers"] else "the scene has no printed piece",
@@ -87,7 +95,7 @@ def measured_plan(
     return geometry | {
         "draft": draft,
         "terms": terms,
-        "photographs": _photographs_needed(problem, design, progress) if scene.HAS_PIECE else "",
+        "photographs": needed,
         "omitted": scene.OMITTED,
         "cost": measure_cost(problem, design, partial(progress, "cost")),
         "not_measured": {figure: reason for figure, reason in reasons.items() if reason},
@@ -130,14 +138,6 @@ def marker_plan(scene: PieceScene) -> dict[str, float]:
     }
 
 
-def _photographs_needed(problem: Problem, design: Tensor, progress: Progress) -> str:
-    """Say how many photographs, in how many places, prove a promise of the draft."""
-    conditions = problem.scene.draw("select", PROOF_VIEWS, per_session=VIEWS_PER_SESSION)
-    advance = partial(progress, "photographs")
-    promise = make_promise(problem, as_pixels(design), conditions, CONTROLS, advance, VIEWS_PER_SESSION)
-    return f"To prove a promise of such a draft: {photos_line(promise)}"
-
-
 def _draft(problem: Problem, progress: Progress) -> tuple[Tensor, PlanData]:
     """Optimize a design for a few steps: its 8-bit colors, and its steps and rate on the selection set."""
     settings = problem.scene.settings.optimize
@@ -169,36 +169,111 @@ def _step_ms(problem: Problem, design: Tensor, conditions: Conditions) -> dict[s
     rasterization.
     """
     design = design.clone().requires_grad_()
-    appearance, lap = problem.subject.appearance(design.detach()), _stopwatch(problem.device)
+    appearance, ends = problem.subject.appearance(design.detach()), {"": time.perf_counter()}
     views = problem.see(appearance, conditions, problem.training_px)
-    parts = {"rasterize object, piece and background": lap() * new_pose_share(problem.scene)}
+    ends["rasterize object, piece and background"] = time.perf_counter()
     appearance = problem.subject.appearance(design)
-    parts[problem.subject.STAGE_NAME] = lap()
+    ends[problem.subject.STAGE_NAME] = time.perf_counter()
     pictures = expose(views, appearance)
-    parts["light, piece and camera"] = lap()
+    ends["light, piece and camera"] = time.perf_counter()
     leaf, boxes, windows = pictures.detach().requires_grad_(), problem.boxes(conditions), affected_windows(views)
     losses = [
         problem.losses(classifier, classifier.logits(leaf, boxes, windows), indices).mean()
         for classifier, indices in zip(problem.classifiers, problem.indices, strict=True)
     ]
     loss = torch.stack(losses).mean()
-    parts["classifier forward"] = lap()
+    ends["classifier forward"] = time.perf_counter()
     (gradient,) = torch.autograd.grad(loss, leaf)
-    parts["classifier backward"] = lap()
+    ends["classifier backward"] = time.perf_counter()
     torch.autograd.grad((pictures * gradient).sum() + problem.subject.penalty(design), design)
-    parts["design backward"] = lap()
-    return parts
+    ends["design backward"] = time.perf_counter()
+    ms = 1000 * np.diff([*ends.values()])
+    ms[0] *= new_pose_share(problem.scene)
+    return dict(zip([*ends][1:], ms.tolist(), strict=True))
 
 
-def _stopwatch(device: torch.device) -> Callable[[], float]:
-    """A function that waits for the device and returns the milliseconds since its last call."""
-    last = time.perf_counter()
+def geometry_lines(plan: PlanData) -> list[str]:
+    """Format the part of a plan that is known before anything is measured."""
+    lines = [f"{plan['scene']}: {plan['target']}, {plan['kind']}, seen by {', '.join(plan['models'])}"]
+    if plan["place"] is not None:
+        lines += ["place", *(f"  {line}" for line in place_lines(plan["place"]))]
+    lines += ["surface", *_surface_lines(plan["surface"])]
+    lines += ["resolution", *_resolution_lines(plan["resolution"])]
+    if plan["markers"] is not None:
+        lines += ["markers", _marker_line(plan["markers"], plan["surface"]["family"])]
+    return lines
 
-    def lap() -> float:
-        nonlocal last
-        if device.type == "cuda":
-            torch.cuda.synchronize(device)
-        start, last = last, time.perf_counter()
-        return 1000 * (last - start)
 
-    return lap
+def measured_lines(plan: PlanData) -> list[str]:
+    """Format the part of a plan that was measured."""
+    lines, cost = _term_lines(plan["terms"], plan["draft"]), plan["cost"]
+    lines += ["photographs", f"  {plan['photographs']}"] if plan["photographs"] else []
+    lines += ["not modeled", *(f"  {text}" for text in plan["omitted"])]
+    views = f"{cost['views']} views of {cost['side_px']} px, {cost['threads']} threads"
+    lines += [f"cost of a step ({views}): {cost['ms']:.0f} ms"]
+    lines += [f"  {name:38} {ms:7.0f} ms {ms / cost['ms']:6.1%}" for name, ms in cost["parts"].items()]
+    return lines + not_measured_lines(plan["not_measured"])
+
+
+def _surface_lines(surface: PlanData) -> list[str]:
+    width, height = surface["size_mm"]
+    lines = [f"  {surface['family']}, {width:.0f} × {height:.0f} mm: {surface['reason']}"]
+    if surface.get("gap_mm") is not None:
+        gap, overhang, stretch = surface["gap_mm"], surface["overhang_share"], surface["stretch"]
+        lines.append(
+            f"  gap {gap:.2f} mm ({gap / min(width, height):.1%} of the shorter edge), mean "
+            f"{surface['gap_mean_mm']:.2f} mm; overhang {overhang * width * height:.0f} mm² ({overhang:.1%}); stretch "
+            f"{stretch * max(width, height):.2f} mm ({stretch:.2%})"
+        )
+    return lines + ([f"  {surface['other']}"] if surface["other"] else [])
+
+
+def _resolution_lines(views: PlanData) -> list[str]:
+    (far, near), (far_photo, near_photo) = views["px_per_mm_network"], views["px_per_mm_photo"]
+    width, height = views["photo_px"]
+    line = (
+        f"  {far:.2f} to {near:.2f} px/mm at the network's {views['network_px']} px, {far_photo:.2f} to "
+        f"{near_photo:.2f} in photographs of {width} × {height} px (5 % and 95 % of the views)"
+    )
+    density = f"{views['texels_per_px']:.1f} per pixel along a side in the closest"
+    if views["design_px"] is None:
+        return [line, f"  {views['texels']} texels may change, {density} view"]
+    return [
+        line,
+        "  design {} × {} texels, ".format(*views["design_px"])
+        + f"{density} possible view ({views['closest_px_per_mm']:.2f} px/mm)",
+        "  printed as {} × {} px, ".format(*views["printed_px"]) + f"{views['printed_px_per_mm']:.1f} per mm",
+    ]
+
+
+def _marker_line(markers: PlanData, family: str) -> str:
+    needed, printed = markers["needed_mm"], markers["printed_mm"]
+    if not printed:
+        return "  none: photographs are located by the design's corners"
+    note = "" if printed > 0.95 * needed else " (all that page, object or blank allows)"
+    return (
+        f"  needed {needed:.1f} mm ({PX_PER_MODULE:g} px per module at the {READABLE_SHARE:.0%} point of the views), "
+        f"printed {printed:.1f} mm{note}; {measurable_text(markers['unreadable_share'], family)}"
+    )
+
+
+def _term_lines(terms: PlanData, draft: PlanData) -> list[str]:
+    lines = [
+        f"error that leaving a term out leaves ({terms['views']} views of a draft of {draft['steps']} steps, rate "
+        f"{draft['rate']:.0%}, before the first classifier)",
+        f"  {'':23} {'codes: mean':>11} {'95 %':>6}   {'confidence':<15}  (what adds up to less than "
+        f"{terms['threshold']:.3f} can go: selection cannot tell)",
+    ]
+    on = {name: error for name, error in terms["errors"].items() if error["verdict"] != "off"}
+    off = [f"{name} ({error['key'] or 'no setting'})" for name, error in terms["errors"].items() if name not in on]
+    lines += [_term_line(name, error) for name, error in on.items()]
+    return [*lines, *([f"  off: {', '.join(off)}"] if off else [])]
+
+
+def _term_line(name: str, error: PlanData) -> str:
+    words = {"missing": "missing in training", "left out": "rightly left out"}
+    verdict, key = words.get(error["verdict"], error["verdict"]), f" ({error['key']})" if error["key"] else ""
+    verdict = "matters little" if verdict == "can go" and not key else verdict
+    unseen = "; training's views do not show it" if error.get("in_training") is False else ""
+    codes = f"{error['codes_mean']:11.2f} {error['codes_p95']:6.1f}"
+    return f"  {name:23} {codes}   {error['confidence']:.3f} ({error['bias']:+.3f})   {verdict}{key}{unseen}"
