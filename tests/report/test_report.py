@@ -30,7 +30,7 @@ from patchproof.evidence.results import (
     Summary,
 )
 from patchproof.optimizer.evaluate import Evaluation
-from patchproof.report.images import delta_map, save_pictures
+from patchproof.report.page import delta_map, save_pictures
 from patchproof.report.tables import Drawing, Results, Table, write_results
 from patchproof.report.words import evaluation_lines, verdict_lines
 from patchproof.report.write import photos_csv, report_html, write_report

@@ -112,16 +112,10 @@ def tables(model: type[BaseModel], path: str = "") -> Iterator[tuple[str, type[B
 def _row(model: type[BaseModel], key: str, field: FieldInfo, path: str) -> str:
     hint = get_type_hints(model, include_extras=True)[key]
     kind, inner = _kind(hint), next(models_in(hint), None)
-    meaning = meanings(model).get(key, "" if inner is None else _example(inner, f"{path.strip('[]')}.{key}".strip(".")))
+    table = "" if inner is None else f"the table `[{path.strip('[]')}.{key}]`".replace("[.", "[")
+    meaning = meanings(model).get(key, table)
     cells = (f"`{key}`", kind, _UNITS.get(key.rpartition("_")[2], ""), default_text(field), meaning)
     return "| " + " | ".join(map(_cell, cells)) + " |"
-
-
-def _example(model: type[BaseModel], path: str) -> str:
-    """Where a table is described, and a line of it: its first key with a default to show."""
-    defaults = {key: default_text(field) for key, field in model.model_fields.items()}
-    shown = (f", as `{path}.{key} = {text[1:]}" for key, text in defaults.items() if text[0] == "`" and text != "`[]`")
-    return f"the table `[{path}]`{next(shown, '')}"
 
 
 def _cell(text: str) -> str:

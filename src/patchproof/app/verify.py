@@ -41,8 +41,7 @@ from patchproof.evidence.results import Origin, PhotoEntry, Report
 from patchproof.evidence.task import LEDGER_PHOTOS, Options
 from patchproof.evidence.verdict import Look
 from patchproof.report.coco import PATCH, LabeledPhoto, coco_json
-from patchproof.report.images import save_pictures, stem_of
-from patchproof.report.page import versions_of
+from patchproof.report.page import save_pictures, stem_of, versions_of
 from patchproof.report.write import write_report
 from patchproof.sheets.manifest import Manifest, load_manifest
 

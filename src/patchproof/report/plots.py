@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from patchproof.report.images import draw_figure
+from patchproof.report.page import draw_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING, Any
 from patchproof.base.intervals import Estimate
 from patchproof.base.output import write_atomically
 from patchproof.base.text import csv_lines
-from patchproof.report.images import data_uri, draw_figure
-from patchproof.report.page import render_page, versions_of
+from patchproof.report.page import data_uri, draw_figure, render_page, versions_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -16,8 +16,7 @@ from patchproof.base.goal import points_text
 from patchproof.base.output import make_folder, write_atomically
 from patchproof.base.text import csv_lines
 from patchproof.report import words
-from patchproof.report.images import DELTA_TOP, data_uri, saved_pictures
-from patchproof.report.page import render_page
+from patchproof.report.page import DELTA_TOP, data_uri, render_page, saved_pictures
 from patchproof.report.plots import ledger_plot, recognition_plot
 
 _FIRST = ("file", "status", "code", "figure", "threshold", "advice")
@@ -27,7 +26,7 @@ _PLOTS = (("tilt_deg", "tilt in degrees"), ("px_per_mm", "pixels per millimeter"
 def write_report(report: Mapping, manifest: Mapping, out_dir: str | Path, ledger: Mapping | None = None) -> Path:
     """Write report.json, report.csv and report.html into `out_dir`; returns the page's path.
 
-    `report` and `manifest` are `model_dump()`s. Pictures are those of `images.save_pictures` in `out_dir`/pictures:
+    `report` and `manifest` are `model_dump()`s. Pictures are those of `page.save_pictures` in `out_dir`/pictures:
     `photo`, `seen`, `fitted`, `promised` and `delta_e00`. `ledger` is that of `plots.ledger_plot`.
     """
     out = Path(out_dir)

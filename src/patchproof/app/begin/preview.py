@@ -34,9 +34,8 @@ from patchproof.classifier.labels import find_labels
 from patchproof.classifier.load import load_classifier
 from patchproof.optimizer.subject import subject_of
 from patchproof.render.stage import set_stage
-from patchproof.report.images import data_uri, jpeg, png
-from patchproof.report.page import render_page
-from patchproof.scene.interface import Scene, measurable_text
+from patchproof.report.page import data_uri, jpeg, png, render_page
+from patchproof.scene.interface import Scene, fit_text, measurable_text
 from patchproof.scene.mesh_scene import MeshScene
 from patchproof.scene.patch_scene import PatchScene
 from patchproof.scene.placement import gap_limit_mm
@@ -173,11 +172,8 @@ def _facts(scene: Scene, settings: SceneSettings) -> list[tuple[str, str]]:
     size = "{:g} × {:g} mm".format(*placement["size_mm"])
     if isinstance(scene, PatchScene):
         side = side_of(scene.placement.normal)
-        fit = (
-            f"gap {placement['gap_mm']:.1f} mm at most, {placement['gap_mean_mm']:.1f} mm on average; "
-            f"{placement['overhang_share']:.0%} overhangs; stretch {placement['stretch']:.2%}"
-        )
-        facts.append(("piece", f"{placement['family']}, {size}, facing {SIDE_NAMES[side]} ({side}): {fit}"))
+        lies = f"{placement['family']}, {size}, facing {SIDE_NAMES[side]} ({side})"
+        facts.append(("piece", f"{lies}: {fit_text(placement)}"))
         readable = measurable_text(scene.unreadable_share, scene.placement.family)
         facts.append(("markers", f"{scene.piece.marker_mm:.1f} mm, {readable}" if scene.piece.markers else "none"))
     else:

@@ -38,10 +38,11 @@ _TEN_NUMBERS = re.compile(r"(\d{1,6}(\.\d{1,20})?(,(?!$)|$)){10}")
 
 
 class PhotoCollection:
-    """An album's measured photographs; not thread-safe."""
+    """An album's measured photographs of a sheet that promises something; not thread-safe."""
 
     def __init__(self, album: Album, manifest: Manifest, options: Options, workers: Workers):
-        self.album, self.manifest, self._workers = album, manifest, workers
+        assert manifest.promise is not None  # else the sheet is refused
+        self.album, self.manifest, self.promise, self._workers = album, manifest, manifest.promise, workers
         self._judges = judges_of(options.models, manifest)
         self._task = task_of(manifest, options, self._judges)
         self._journal = Journal(album.folder / JOURNAL_FILE, settings_key(manifest, options), resume=True)

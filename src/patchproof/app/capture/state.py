@@ -18,7 +18,7 @@ from patchproof.app.capture.collection import PhotoCollection
 from patchproof.evidence.ranges import figures_of
 from patchproof.evidence.results import PhotoEntry
 from patchproof.evidence.verdict import PHOTOS_PER_SESSION
-from patchproof.report.images import data_uri, jpeg
+from patchproof.report.page import data_uri, jpeg
 from patchproof.report.words import VERDICTS, benefit_sentence, headline_of
 from patchproof.sheets.manifest import ConditionClaim
 
@@ -31,10 +31,9 @@ _LEAST_COLUMN_DEG = 12.0  # about the error of a person who aims a phone by hand
 def state_of(collection: PhotoCollection, sessions: int | None) -> dict[str, Any]:
     """Everything that the page shows, except for single answers; `sessions` (None: 4) are planned on the map."""
     report = collection.report()
-    summary, data, promise = report.summary, report.summary.model_dump(), collection.manifest.promise
+    summary, data, promise = report.summary, report.summary.model_dump(), collection.promise
     counts = {row["name"]: row for row in data["sessions"]}
     rows = [counts.get(name, {"name": name, "judged": 0, "recognized": 0}) for name in collection.album.sessions]
-    promised = promise.controls if promise is not None else ()
     photos, width_mm = collection.photos, collection.manifest.cut_mm[2]
     counted = [photo.entry for path, photo in photos.items() if photo.counted and collection.control_of(path) is None]
     wanted = PHOTOS_PER_SESSION * (sessions or _USUAL_SESSIONS)
@@ -50,17 +49,17 @@ def state_of(collection: PhotoCollection, sessions: int | None) -> dict[str, Any
         "each": PHOTOS_PER_SESSION,
         "plan": summary.next_step,
         "controls": [{"name": each.name, "photos": each.n, "recognized": each.recognized} for each in report.controls],
-        "controls_known": [name for name in CONTROLS if name in promised] or CONTROLS,
-        "map": map_views(promise.conditions if promise else (), counted, wanted, collection.side_px, width_mm),
+        "controls_known": [name for name in CONTROLS if name in promise.controls] or CONTROLS,
+        "map": map_views(promise.conditions, counted, wanted, collection.side_px, width_mm),
         "latest": [answer_of(collection, path) for path in names[-_LATEST_PHOTOS:][::-1]],
     }
 
 
 def answer_of(collection: PhotoCollection, path: Path, picture: np.ndarray | None = None) -> dict[str, Any]:
     """The answer to one measured photograph, with advice; `picture` (uint8 H×W×3) is included as a data URI."""
-    photo, promise = collection.photos[path], collection.manifest.promise
-    entry, is_counted = photo.entry, promise is not None and photo.counted
-    prediction = entry.predictions.get(promise.models[0].name) if promise is not None and is_counted else None
+    photo, name = collection.photos[path], collection.promise.models[0].name
+    entry = photo.entry
+    prediction = entry.predictions.get(name) if photo.counted else None
     answer = "not counted" if prediction is None else "recognized" if prediction.recognized else "not recognized"
     return {
         "file": f"{path.parent.name}/{path.name}",

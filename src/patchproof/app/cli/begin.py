@@ -20,18 +20,10 @@ def new(
         str, Argument(metavar="MESH|PHOTOS|IMAGES", help="A mesh file, primitive:NAME, or a folder of pictures.")
     ],
     out: Annotated[Path, Option(help="The scene file to write.")] = Path("scene.toml"),
-    label: Annotated[
-        str | None, Option(help="What networks should see: words of a label; from the file's name without.")
-    ] = None,
-    length_mm: Annotated[
-        float | None, Option(min=1e-3, help="The object's longest extent; from the file's units without.")
-    ] = None,
-    up: Annotated[
-        Literal["y", "z"] | None, Option(help="The file's axis that points up; by its format without.")
-    ] = None,
-    models: Annotated[
-        str | None, Option(help="Comma-separated classifiers; without, imagenet where it is installed, else builtin.")
-    ] = None,
+    label: Annotated[str | None, Option(help="Words of the target's label; else of the file's name.")] = None,
+    length_mm: Annotated[float | None, Option(min=1e-3, help="The longest extent; else by the file's units.")] = None,
+    up: Annotated[Literal["y", "z"] | None, Option(help="The file's axis that points up.")] = None,
+    models: Annotated[str | None, Option(help="Comma-separated classifiers; else imagenet or builtin.")] = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Write a commented scene for an object, photographs of it, or a folder of images."""

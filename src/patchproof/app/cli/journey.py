@@ -1,5 +1,6 @@
-"""The verbs from a scene to a verdict: demo, optimize, promise, sheet, reprint, verify."""
+"""The verbs from a scene to a verdict: demo, optimize, promise, sheet, reprint, capture, verify."""
 
+import signal
 import sys
 import webbrowser
 from pathlib import Path
@@ -11,6 +12,7 @@ from patchproof.app.cli import console
 from patchproof.app.cli.console import Cluster, Device, Jobs, Models, Overwrite, Resume, Seed, Trust, say, warn
 from patchproof.base.compute import Compute
 from patchproof.base.progress import progress_bar
+from patchproof.base.text import command_text
 
 PrintableControl = Literal["mean", "gray", "noise", "shuffled", "blank"]  # that can be printed
 PhotographedControl = Literal["bare", "mean", "gray", "noise"]  # that can hang on the object in place of the design
@@ -19,9 +21,7 @@ PhotographedControl = Literal["bare", "mean", "gray", "noise"]  # that can hang 
 def demo(
     out: Annotated[Path, Option(help="Folder for all of it.")] = Path("patchproof-demo"),
     detector: Annotated[bool, Option("--detector", help="Before the built-in detector, not classifier.")] = False,
-    imagenet: Annotated[
-        bool, Option("--imagenet", help='Before a network of photographs: pip install "patchproof[imagenet]".')
-    ] = False,
+    imagenet: Annotated[bool, Option("--imagenet", help="Before a network of photographs.")] = False,
     open_report: Annotated[bool, Option("--open", help="Open the report in the browser at the end.")] = False,
     jobs: Jobs = None,
     overwrite: Overwrite = False,
@@ -197,6 +197,38 @@ def reprint(
     say(f"{len(taken.photos)} photographs: {out}")
 
 
+def capture(
+    sheet: Annotated[Path, Argument(help="The manifest that was written beside the PDF.")],
+    out: Annotated[Path, Option(help="Folder for the photographs; an existing one is continued.")] = Path("photos"),
+    models: Models = None,
+    camera: Annotated[str | None, Option(help="The camera that takes them: a camera file or its name.")] = None,
+    trust: Trust = False,
+    lan: Annotated[bool, Option("--lan", help="Listen on the local network, for a phone.")] = False,
+) -> None:
+    """Receive photographs from a phone's browser, each measured and judged at once."""
+    import segno
+
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # it ends the server, and the verdict follows
+    from patchproof.app.capture.album import CONTROLS_FOLDER
+    from patchproof.app.capture.serve import serve_capture
+    from patchproof.evidence.corner_files import CORNERS_FILE
+    from patchproof.report.words import verdict_lines
+    from patchproof.sheets.manifest import load_manifest
+
+    def show(address: str) -> None:
+        segno.make(address, error="l").terminal(compact=True)
+        say(address, "" if lan else "Only this machine can open it; --lan lets a phone.", "Ctrl-C ends it.")
+
+    with progress_bar() as bar:
+        progress = lambda stage, done, total: bar(stage, done, total) if total else None  # noqa: E731
+        options: dict[str, Any] = {"models": console.names_of(models), "camera": camera, "lan": lan, "trust": trust}
+        report = serve_capture(sheet, out, **options, progress=progress, on_address=show)
+    words = [out, "--sheet", sheet, *(["--controls", out / CONTROLS_FOLDER] if report.controls else [])]
+    if not load_manifest(sheet).markers:
+        words += ["--find", *(["--corners", out / CORNERS_FILE] if (out / CORNERS_FILE).is_file() else [])]
+    say(*verdict_lines(report), f"report: {command_text('verify', *words, '--out', 'report')}")
+
+
 def verify(
     photos: Annotated[Path, Argument(help="A folder of photographs, or of folders: one for each place.")],
     sheet: Annotated[Path, Option(help="The manifest that was written beside the PDF.")],
@@ -207,9 +239,7 @@ def verify(
     ruler_mm: Annotated[str | None, Option(help="The printed rulers as measured, e.g. 97.1x97.3 (x, y).")] = None,
     camera: Annotated[str | None, Option(help="The camera that took them: a camera file or its name.")] = None,
     boxes: Annotated[Path | None, Option(help="The object's boxes in photographs (COCO JSON), for detectors.")] = None,
-    corners: Annotated[
-        Path | None, Option(help="The design's four corners in photographs without markers (CSV or COCO JSON).")
-    ] = None,
+    corners: Annotated[Path | None, Option(help="CSV or COCO JSON with the design's four corners.")] = None,
     find: Annotated[bool, Option("--find", help="Search for the design itself where no marker can be read.")] = False,
     require: Annotated[
         Literal["kept", "helps"] | None,
@@ -221,9 +251,7 @@ def verify(
     ledger: Annotated[
         int, Option(min=0, help="Photographs in the gap ledger at most; 0: no ledger, and no rendered controls.")
     ] = 24,
-    run: Annotated[
-        Path | None, Option(help="The run that the sheet is of: forecasts each photograph at its measured view.")
-    ] = None,
+    run: Annotated[Path | None, Option(help="The sheet's run: forecasts each photograph at its view.")] = None,
     trust: Trust = False,
     jobs: Jobs = None,
     cluster: Cluster = None,

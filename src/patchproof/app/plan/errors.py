@@ -60,20 +60,16 @@ class Term:
 def scene_terms(problem: Problem, design: Tensor, other_surface: Placement | None) -> tuple[Term, ...]:
     """The terms that a problem's kind of scene has."""
     scene = problem.scene
-    light, ink, camera = (
-        [term for term in effect_terms(table) if scene.models(EFFECT_BY_NAME[term.name])]
-        for table in ("light", "printer", "camera")
-    )
-    parts = [Term(p.name, p.key, partial(_without_part, part=p), True, p.needs_whole_photo) for p in scene.TERMS]
-    terms = (*light, *(term for term in parts if not term.key))
+    effects = [term for table in ("light", "printer", "camera") for term in effect_terms(table)]
+    terms = [term for term in effects if scene.models(EFFECT_BY_NAME[term.name])]
+    terms += [Term(p.name, p.key, partial(_without_part, part=p), True, p.needs_whole_photo) for p in scene.TERMS]
     if scene.HAS_PIECE:
-        terms = (*terms, Term(PRINTER, "printer.profile", partial(_without_printer, problem, design)))
-    terms = (*terms, *ink, *camera, *(term for term in parts if term.key))
+        terms.append(Term(PRINTER, "printer.profile", partial(_without_printer, problem, design)))
     if other_surface is not None:
         placement, change = require_patch(scene).placement, partial(_on_surface, placement=other_surface)
         name = "bent piece" if placement.is_flat else f"{placement.family}, not a card"
-        terms = (*terms, Term(name, "patch.bend", change, modeled=not placement.is_flat))
-    return terms
+        terms.append(Term(name, "patch.bend", change, modeled=not placement.is_flat))
+    return tuple(terms)
 
 
 def effect_terms(table: str) -> tuple[Term, ...]:

@@ -34,7 +34,14 @@ from patchproof.optimizer.promise import CONTROLS, VIEWS_PER_SESSION, make_promi
 from patchproof.render.photograph import affected_windows, expose
 from patchproof.scene.bent_scene import placement_with_other_bend
 from patchproof.scene.conditions import Conditions
-from patchproof.scene.interface import PX_PER_MODULE, READABLE_SHARE, PieceScene, measurable_text, require_piece
+from patchproof.scene.interface import (
+    PX_PER_MODULE,
+    READABLE_SHARE,
+    PieceScene,
+    fit_text,
+    measurable_text,
+    require_piece,
+)
 from patchproof.scene.scene import load_scene
 from patchproof.scene.unplaced_scene import UnplacedScene
 from patchproof.sheets.markers import MARKER_MODULES
@@ -218,13 +225,7 @@ def measured_lines(plan: PlanData) -> list[str]:
 def _surface_lines(surface: PlanData) -> list[str]:
     width, height = surface["size_mm"]
     lines = [f"  {surface['family']}, {width:.0f} × {height:.0f} mm: {surface['reason']}"]
-    if surface.get("gap_mm") is not None:
-        gap, overhang, stretch = surface["gap_mm"], surface["overhang_share"], surface["stretch"]
-        lines.append(
-            f"  gap {gap:.2f} mm ({gap / min(width, height):.1%} of the shorter edge), mean "
-            f"{surface['gap_mean_mm']:.2f} mm; overhang {overhang * width * height:.0f} mm² ({overhang:.1%}); stretch "
-            f"{stretch * max(width, height):.2f} mm ({stretch:.2%})"
-        )
+    lines += [f"  {fit_text(surface)}"] if surface.get("gap_mm") is not None else []
     return lines + ([f"  {surface['other']}"] if surface["other"] else [])
 
 
