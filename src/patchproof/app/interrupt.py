@@ -44,8 +44,8 @@ def _watch(receiver: socket.socket, _: socket.socket) -> None:
 def _end() -> None:
     console = sys.modules.get("patchproof.app.cli.console")  # a library may be importing: nothing more is imported
     try:
-        if hasattr(console, "say_stopped"):
-            console.say_stopped()
+        if say := getattr(console, "say_stopped", None):
+            say()
         else:
             print("Stopped: nothing was written.", file=sys.stderr, flush=True)
     finally:
