@@ -18,13 +18,7 @@ import numpy as np
 import torch
 
 from patchproof.app.begin.guess import lying_hint, other_axis
-from patchproof.app.begin.sides import (
-    SIDE_NAMES,
-    sample_views,
-    side_of,
-    side_views,
-    turntable,
-)
+from patchproof.app.begin.sides import SIDE_NAMES, sample_views, side_of, side_views, turntable
 from patchproof.base.errors import Refused
 from patchproof.base.output import base64_uri, image_bytes, new_folder, write_atomically
 from patchproof.base.settings import SceneSettings, load_scene_settings

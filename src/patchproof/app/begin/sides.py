@@ -1,11 +1,10 @@
 """Pictures of an object from its six sides, with ground line, scale bar and piece; from all around; and sample views.
 
 In: a stage with a mesh, with a piece on it or without. Out: pictures of the sides at one scale; pictures at one scale
-from a ring of directions, for a page that turns the object by a slider; the piece's gap as colors. The
-sides are those of `patch.side`; front and back are along z, as in glTF's standard and after `object.up = "z"` turned
-the y of other programs there. The ring is seen from far away, in even light, and from above or below if the piece is on
-top or below. Sample views are drawn from the train stream as optimizing draws them, and have the networks' answers
-beside them.
+from a ring of directions, for a page that turns the object by a slider; the piece's gap as colors. The sides are those
+of `patch.side`; front and back are along z, as in glTF's standard and after `object.up = "z"` turned the y of other
+programs there. The ring is seen from far away, in even light, and from above or below if the piece is on top or below.
+Sample views are drawn from the train stream as optimizing draws them, and have the networks' answers beside them.
 """
 
 import math

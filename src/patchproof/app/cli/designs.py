@@ -19,7 +19,6 @@ def import_picture(
     as_printed: Annotated[
         str | None, Option(help="It is printed already, in this size in mm, such as 594x841: no page, no markers.")
     ] = None,
-    draft: Annotated[bool, Option("--draft", help="A first look: promised from few views.")] = False,
     promise: Annotated[int | None, Option(min=8, help="Views to promise from; of under 400: a draft.")] = None,
     device: Device = "cpu",
     seed: Seed = None,
@@ -28,14 +27,13 @@ def import_picture(
     """Make a run of a picture that was made elsewhere: its promise, as of a design of ours."""
     from patchproof.optimizer.imported_design import import_patch
     from patchproof.optimizer.promise import PromiseOptions
-    from patchproof.optimizer.run import DRAFT_EFFORT
     from patchproof.report.words import imported_lines, run_lines
     from patchproof.scene.scene import load_scene
 
     with progress_bar() as bar:
-        loaded, views = load_scene(scene, seed), promise or (DRAFT_EFFORT[1] if draft else None)
+        loaded = load_scene(scene, seed)
         warn(loaded.warnings)
-        options: dict[str, Any] = {"promise": PromiseOptions(views), "compute": Compute(device, jobs or 1)}
+        options: dict[str, Any] = {"promise": PromiseOptions(promise), "compute": Compute(device, jobs or 1)}
         size_mm = None if as_printed is None else console.pair_of(as_printed, "--as-printed")
         run = import_patch(picture, loaded, out, as_printed=size_mm, **options, overwrite=overwrite, progress=bar)
     say(*imported_lines(run.details["imported"]), *run_lines(run))

@@ -243,10 +243,7 @@ def verify(
     find: Annotated[bool, Option("--find", help="Search for the design itself where no marker can be read.")] = False,
     require: Annotated[
         Literal["kept", "helps"] | None,
-        Option(
-            help='What else than exits with 1: "kept", a promise that held, however little it promised; "helps", one '
-            "that held of a patch that helps, as the first line says."
-        ),
+        Option(help='Exit with 1 unless the promise held ("kept"), and the patch helps, too ("helps").'),
     ] = None,
     ledger: Annotated[
         int, Option(min=0, help="Photographs in the gap ledger at most; 0: no ledger, and no rendered controls.")

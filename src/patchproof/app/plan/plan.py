@@ -138,11 +138,7 @@ def marker_plan(scene: PieceScene) -> dict[str, float]:
     """Apply the rule for the markers' size (PX_PER_MODULE in READABLE_SHARE of the views) to this scene's views."""
     px_per_mm = float(np.quantile(scene.px_per_mm(scene.photo_px, shorter=True), 1 - READABLE_SHARE))
     needed_mm = max(MARKER_MODULES * PX_PER_MODULE / px_per_mm, SMALLEST_MARKER_MM)
-    return {
-        "needed_mm": needed_mm,
-        "printed_mm": scene.piece.marker_mm,
-        "unreadable_share": scene.unreadable_share,
-    }
+    return {"needed_mm": needed_mm, "printed_mm": scene.piece.marker_mm, "unreadable_share": scene.unreadable_share}
 
 
 def _draft(problem: Problem, progress: Progress) -> tuple[Tensor, PlanData]:
