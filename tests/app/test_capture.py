@@ -418,7 +418,7 @@ def test_served_until_interrupted_and_begun_again(tmp_path, sheet, photos, monke
         reports = [capture()]
     reports.append(capture())
     assert [report.summary.judged for report in reports] == [1, 2] and measured == [(0, 0), (1, 1)]
-    assert answers == [200, 200] and files_in(tmp_path / "photos")[0] == "photos.jsonl"
+    assert answers == [200, 200] and "photos.jsonl" in files_in(tmp_path / "photos")
 
 
 @pytest.fixture
