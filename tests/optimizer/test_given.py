@@ -268,7 +268,7 @@ def several(tmp_path_factory):
     return folder
 
 
-def test_a_folder_of_pictures_is_compared_on_the_same_conditions(several, capsys):
+def test_several_designs_are_compared_on_the_same_conditions(several, capsys):
     runs, out = [several / "runs" / name for name in ("blue", "gray", "red")], several / "compared"
     assert command("evaluate", *runs, "--out", out, "--n", 6, "--trust") == 0
     assert "The best two, under conditions that had no say in choosing them" in capsys.readouterr().out

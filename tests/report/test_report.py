@@ -29,10 +29,9 @@ from patchproof.evidence.results import (
     SessionCount,
     Summary,
 )
-from patchproof.optimizer.evaluate import Evaluation
 from patchproof.report.page import delta_map, save_pictures
 from patchproof.report.tables import Drawing, Results, Table, write_results
-from patchproof.report.words import evaluation_lines, verdict_lines
+from patchproof.report.words import verdict_lines
 from patchproof.report.write import photos_csv, report_html, write_report
 from test_verify_run import promise
 
@@ -313,9 +312,6 @@ def test_what_was_not_measured_how_often_was_looked_and_which_folders_are_one_is
         None,
     )
     assert "Not measured: the scale of the print (no scan)." in page and note in page
-    result = Evaluation(n=1, seed=0, goal="assist", models={}, not_measured={"AP50 of net": "no box"})
-    assert evaluation_lines(result.model_dump()) == ["not measured: AP50 of net (no box)"]
-    assert json.loads(result.to_json())["not_measured"] == {"AP50 of net": "no box"}
 
 
 def test_networks_that_were_named_stand_below_the_promise_s_own():

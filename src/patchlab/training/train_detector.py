@@ -20,9 +20,9 @@ import torch
 from torch import Tensor
 
 from patchlab.training import fit
+from patchlab.training.average_precision import Detection, average_precision, find_detections
 from patchlab.training.fit import round_by_class, store_float16, write_card
 from patchlab.training.pictures import Pictures, augment
-from patchproof.classifier.average_precision import Detection, average_precision, find_detections
 from patchproof.classifier.builtin_detector import INPUT_PX, SmallDetector, centers_px
 from patchproof.classifier.detector import iou
 from patchproof.mesh import primitives

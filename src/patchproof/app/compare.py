@@ -23,9 +23,8 @@ from patchproof.base.intervals import estimate_difference, rate
 from patchproof.base.output import new_folder
 from patchproof.base.progress import Progress, no_progress
 from patchproof.base.validation import summarize_names
-from patchproof.base.workers import open_workers
 from patchproof.classifier.network import Classifier
-from patchproof.optimizer.evaluate import close_run, refuse_networks_in_memory, run_responses
+from patchproof.optimizer.evaluate import run_responses
 from patchproof.optimizer.promise import CONTROLS, PROMISE_VIEWS
 from patchproof.optimizer.responses import Responses
 from patchproof.optimizer.run import Run, load_run
@@ -66,28 +65,22 @@ def compare(
     Raises:
         Refused: for runs of different scenes.
     """
-    networks, loaded = None if models is None else tuple(models), _load_runs(runs, models is None, trust)
-    refuse_networks_in_memory(networks, compute)
+    compute, loaded = compute.without("compare", cluster=True), _load_runs(runs, models is None, trust)
     scene = next(iter(loaded.values())).scene
     target = scene.settings.target
-    judges = networks or target.models
+    judges = models or target.models
     names = tuple(each.name if isinstance(each, Classifier) else each for each in judges)
     seed = scene.seed if seed is None else seed
-    opening = open_workers(compute.jobs, compute.cluster)
-    with new_folder(out, COMPARISON_FILES, overwrite, runs) as folder, opening as workers:
+    with new_folder(out, COMPARISON_FILES, overwrite, runs) as folder:
 
         def ask(name: str, start: int) -> AnswersByKind:
-            conditions, advance = loaded[name].scene.draw("evaluate", n, seed, start), partial(progress, name)
-            options = networks, compute.device, trust, advance
-            return run_responses(loaded[name].folder.resolve(), conditions, workers, *options)[0]
+            run, advance = loaded[name], partial(progress, name)
+            return run_responses(run, run.scene.draw("evaluate", n, seed, start), models, compute, advance)[1]
 
-        try:
-            by_design = {name: ask(name, 0) for name in loaded}
-            order = sorted(loaded, key=lambda name: _goal_score(by_design[name]["design"], target.goal))[::-1]
-            by_design = {name: by_design[name] for name in order}
-            fresh = {name: ask(name, n) for name in order[:2]}
-        finally:
-            close_run()
+        by_design = {name: ask(name, 0) for name in loaded}
+        order = sorted(loaded, key=lambda name: _goal_score(by_design[name]["design"], target.goal))[::-1]
+        by_design = {name: by_design[name] for name in order}
+        fresh = {name: ask(name, n) for name in order[:2]}
         results = Results(
             kind="comparison",
             name="designs",

@@ -201,6 +201,4 @@ def evaluation_lines(result: Mapping[str, Any]) -> list[str]:
         share = f"{rates['rate']:.1%} of {result['n']} conditions [{low:.1%}, {high:.1%}]"
         lines.append(f"{name}: {told}; recognized in {share}")
         lines += control_lines(controls)
-        if rates["ap50"] is not None:
-            lines.append("  AP50 " + ", ".join(f"{kind} {share:.3f}" for kind, share in rates["ap50"].items()))
-    return lines + not_measured_lines(result["not_measured"])
+    return lines

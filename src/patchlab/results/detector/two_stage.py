@@ -11,7 +11,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor, nn
 
-from patchproof.classifier.average_precision import suppress_overlaps
+from patchlab.training.average_precision import suppress_overlaps
 from patchproof.classifier.builtin import INPUT_PX as CROP_PX
 from patchproof.classifier.builtin import load_builtin
 from patchproof.classifier.builtin_detector import INPUT_PX as PROPOSED_PX

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 from typer import Argument, BadParameter, Option
 
 from patchproof.app.cli import console
-from patchproof.app.cli.console import Cluster, Device, Jobs, Models, Overwrite, Seed, Trust, say, warn
+from patchproof.app.cli.console import Device, Jobs, Models, Overwrite, Seed, Trust, say, warn
 from patchproof.base.compute import Compute
 from patchproof.base.progress import progress_bar
 
@@ -47,7 +47,6 @@ def evaluate(
     seed: Seed = None,
     device: Device = "cpu",
     jobs: Jobs = None,
-    cluster: Cluster = None,
     trust: Trust = False,
     overwrite: Overwrite = False,
 ) -> None:
@@ -60,7 +59,7 @@ def evaluate(
         raise BadParameter("is for several runs, and they need it; one has its own folder", param_hint="--out")
     with progress_bar() as bar:
         options: dict[str, Any] = {"models": console.names_of(models), "n": n, "seed": seed, "overwrite": overwrite}
-        options |= {"trust": trust, "compute": Compute(device, jobs or 1, cluster), "progress": bar}
+        options |= {"trust": trust, "compute": Compute(device, jobs or 1), "progress": bar}
         if out is None:
             result = evaluate_run(runs[0], **options)
             say(*evaluation_lines(result.model_dump()), f"written: {runs[0] / 'evaluate.json'}")
