@@ -12,9 +12,9 @@ Source: Athalye et al. 2018, "Synthesizing robust adversarial examples", eq. 2 a
 import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -100,37 +100,24 @@ class ViewCache:
         self._ahead |= zip(poses, split_views(together, [count] * len(poses)), strict=True)
 
 
-@dataclass(frozen=True)
-class Answer:
-    """Means over a step's views, and the gradient 3×h×w of their mean loss at the design, without the penalty."""
-
-    gradient: Tensor
-    loss: float
-    confidence: float
-    rate: float
-    pictures: Tensor | None = field(default=None, repr=False)
-
-
-class _ViewsAnswer(NamedTuple):
-    """Means over some of a step's views, and the gradient at the printed texels."""
+class Answer(NamedTuple):
+    """Means over some views, and the gradient of their mean loss, without the penalty: a tensor at the design 3×h×w, or
+    at the printed texels as processes exchange it (`_to_send`).
+    """
 
     views: int
     loss: float
     confidence: float
     rate: float
-    gradient: np.ndarray | Tensor
-    pictures: np.ndarray | Tensor | None
+    gradient: Any
 
 
 class _Job(NamedTuple):
-    """Printed texels, and training views: their first pose, conditions, and whether to send pictures back. Without
-    conditions, selection views from number `first` on.
-    """
+    """Printed texels, and training views: their first pose, and conditions; else selection views from `first` on."""
 
     printed: np.ndarray | Tensor
     first: int
     conditions: Conditions | None = None
-    pictures: bool = False
 
 
 class Expectation:
@@ -140,14 +127,14 @@ class Expectation:
         self._problem, self._conditions, self._selection_views = problem, conditions, selection_views
         self._ask, self._poses = ask, pose_count(problem.scene)
 
-    def gradient(self, design: Tensor, step: int, pictures: bool = False) -> Answer:
+    def gradient(self, design: Tensor, step: int) -> Answer:
         """The mean loss and its gradient at a design 3×h×w, in the views of step number `step`, counted from 0."""
         views = self._problem.scene.settings.optimize.views
         tasks = in_batches(self._problem, self._conditions[step * views : (step + 1) * views])
 
-        def ask(printed: Tensor) -> list[_ViewsAnswer]:
+        def ask(printed: Tensor) -> list[Answer]:
             texels = _to_send(printed)
-            return self._ask([_Job(texels, (step * views + row) % self._poses, rows, pictures) for row, rows in tasks])
+            return self._ask([_Job(texels, (step * views + row) % self._poses, rows) for row, rows in tasks])
 
         return _mean_answer(self._problem, design, ask)
 
@@ -167,10 +154,10 @@ def expectation(problem: Problem, selection: Conditions) -> Iterator[Expectation
     cache = ViewCache(problem, conditions)  # each process keeps the views it has rendered
     selection_views = lru_cache(lambda first: training_views(problem, selection[first : first + SELECT_CHUNK]))
 
-    def answer(task: _Job) -> _ViewsAnswer | tuple[float, float]:
+    def answer(task: _Job) -> Answer | tuple[float, float]:
         printed = torch.as_tensor(task.printed, device=problem.device)
         if task.conditions is not None:
-            return _views_answer(problem, printed, cache.views(task.first, task.conditions), task.pictures)
+            return _views_answer(problem, printed, cache.views(task.first, task.conditions))
         views = selection_views(task.first)
         with torch.no_grad():
             photos = expose(views, problem.subject.appearance_of_print(printed))
@@ -179,6 +166,13 @@ def expectation(problem: Problem, selection: Conditions) -> Iterator[Expectation
 
     with fork_workers(answer, problem.jobs, in_turn=True) as (workers, share):
         yield Expectation(problem, conditions, len(selection), lambda tasks: workers.map(share, tasks))
+
+
+def last_pictures(problem: Problem, design: Tensor) -> Tensor:
+    """Pictures N×3×H×W of a design in the views of a run's last step."""
+    conditions = training_conditions(problem.scene)[-problem.scene.settings.optimize.views :]
+    with torch.no_grad():
+        return expose(training_views(problem, conditions), problem.subject.appearance(design))
 
 
 def gradient_in_views(problem: Problem, design: Tensor, views: Sequence[Views]) -> Answer:
@@ -202,12 +196,13 @@ def score(
     return loss, torch.cat([loss.detach().double()[None], torch.stack(figures).mean(0)])
 
 
-def _mean_answer(problem: Problem, design: Tensor, ask: Callable[[Tensor], Sequence[_ViewsAnswer]]) -> Answer:
+def _mean_answer(problem: Problem, design: Tensor, ask: Callable[[Tensor], Sequence[Answer]]) -> Answer:
     """Print the design once, get the answers of views, and propagate their mean gradient back through the printer."""
     design = design.detach().requires_grad_()
     printed = problem.subject.print_design(design)
     answers = ask(printed.detach())
-    shares = [answer.views / sum(each.views for each in answers) for answer in answers]
+    views = sum(answer.views for answer in answers)
+    shares = [answer.views / views for answer in answers]
 
     def mean(values):
         return sum(share * value for share, value in zip(shares, values, strict=True))
@@ -215,20 +210,18 @@ def _mean_answer(problem: Problem, design: Tensor, ask: Callable[[Tensor], Seque
     print_gradient = torch.as_tensor(mean(answer.gradient for answer in answers), device=problem.device)
     # differentiating a product, since torch imports SymPy for grad_outputs (networks/cuts.py)
     (gradient,) = torch.autograd.grad((printed * print_gradient).sum(), design)
-    pictures = [torch.as_tensor(answer.pictures) for answer in answers if answer.pictures is not None]
     loss, confidence, rate = (mean(getattr(a, name) for a in answers) for name in ("loss", "confidence", "rate"))
-    return Answer(gradient, loss, confidence, rate, torch.cat(pictures) if pictures else None)
+    return Answer(views, loss, confidence, rate, gradient)
 
 
-def _views_answer(problem: Problem, printed: Tensor, views: Views, pictures: bool = False) -> _ViewsAnswer:
+def _views_answer(problem: Problem, printed: Tensor, views: Views) -> Answer:
     """Photograph the print in these views, run the networks, and differentiate their mean loss."""
     printed = printed.detach().requires_grad_()
     photos = expose(views, problem.subject.appearance_of_print(printed))
     loss, figures = score(problem, photos, views.conditions, affected_windows(views))
     (gradient,) = torch.autograd.grad(loss, printed)
-    shown = _to_send(photos.detach()) if pictures else None
     mean_loss, confidence, rate = figures.tolist()
-    return _ViewsAnswer(len(photos), mean_loss, confidence, rate, _to_send(gradient), shown)
+    return Answer(len(photos), mean_loss, confidence, rate, _to_send(gradient))
 
 
 def _to_send(tensor: Tensor) -> np.ndarray | Tensor:

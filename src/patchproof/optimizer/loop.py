@@ -12,7 +12,7 @@ A step depends only on the state and its own number, so that a resumed run gives
 import json
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -65,7 +65,6 @@ class TrainingStep:
     gradient: float  # the classifiers' largest, without penalties; 0 means that they no longer distinguish designs
     select_loss: float | None = None
     select_rate: float | None = None
-    pictures: Tensor | None = field(default=None, repr=False)
 
 
 def steps(problem: Problem, state: State | None = None) -> Iterator[TrainingStep]:
@@ -74,9 +73,7 @@ def steps(problem: Problem, state: State | None = None) -> Iterator[TrainingStep
     settings = problem.scene.settings.optimize
     with expectation(problem, problem.scene.draw("select", SELECT_VIEWS)) as expected:
         while state.number < settings.steps:
-            last = state.number + 1 == settings.steps
-            answer = expected.gradient(state.design, state.number, pictures=last)
-            step = _descend(problem, state, answer)
+            step = _descend(problem, state, expected.gradient(state.design, state.number))
             if is_selection_step(settings, step.state.number):
                 loss, rate = expected.selection(step.state.design)
                 if loss < step.state.best_loss:
@@ -148,7 +145,7 @@ def _descend(problem: Problem, state: State, answer: Answer) -> TrainingStep:
         gradient = gradient + torch.autograd.grad(penalty, design)[0]
         penalty = float(penalty.detach())
     updated, loss = _update(problem, state, gradient), answer.loss + penalty
-    return TrainingStep(updated, loss, answer.confidence, answer.rate, largest, pictures=answer.pictures)
+    return TrainingStep(updated, loss, answer.confidence, answer.rate, largest)
 
 
 def _update(problem: Problem, state: State, gradient: Tensor) -> State:

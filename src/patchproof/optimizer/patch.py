@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 import torch
@@ -21,16 +20,14 @@ from patchproof.channel.printer import Printer
 from patchproof.optimizer.pixels import as_pixels
 from patchproof.optimizer.subject import (
     DESIGN_FILE,
-    Grid,
     build_pyramid,
     collapse_pyramid,
-    read_png,
     total_variation,
     write_png,
 )
 from patchproof.render.designs import PrintedPiece
 from patchproof.render.pixels import PiecePicture
-from patchproof.scene.interface import PieceScene, Scene, require_piece
+from patchproof.scene.interface import PieceScene
 from patchproof.sheets.manifest import MAX_PRINTED_PX
 from patchproof.sheets.piece import control_design, whiten_marker_pixels
 
@@ -47,7 +44,6 @@ class Patch:
     printer: Printer
     design_px: tuple[int, int]
     device: torch.device
-    STAGE_NAME: ClassVar[str] = "printer"
 
     def __post_init__(self) -> None:
         if max(self.printed_px) > MAX_PRINTED_PX:  # what no manifest holds is refused before it is optimized
@@ -112,11 +108,9 @@ class Patch:
         return "png", image_bytes(pixels, "PNG", {"optimize": True})
 
     @property
-    def grid(self) -> Grid:
-        """The resolution of designs."""
-        (width, height), (printed, _) = self.design_px, self.printed_px
-        width_mm = self.scene.piece.size_mm[0]
-        return Grid(self.design_px, self.printed_px, printed / width_mm, width * height, width / width_mm)
+    def texels_per_mm(self) -> float:
+        """The resolution of the optimized grid."""
+        return self.design_px[0] / self.scene.piece.size_mm[0]
 
     @property
     def printed_px(self) -> tuple[int, int]:
@@ -129,14 +123,3 @@ class Patch:
     @cached_property
     def _printed(self) -> PrintedPiece:
         return PrintedPiece(self.scene.piece, self.scene.sheet_id, self.printer, self.device)
-
-
-def subject_of(scene: Scene, printer: Printer, network_px: int, device: torch.device) -> Patch:
-    """Implements `subject.subject_of`: the design of the scene's piece, no finer than networks can see it."""
-    piece_scene = require_piece(scene)
-    return Patch(piece_scene, printer, piece_scene.design_px(network_px), device)
-
-
-def read_design(scene: Scene, folder: Path) -> np.ndarray:
-    """Implements `subject.read_design`: reads `design.png`."""
-    return read_png(folder / DESIGN_FILE, MAX_PRINTED_PX)

@@ -8,6 +8,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -24,14 +25,17 @@ from patchproof.classifier.load import load_classifier
 from patchproof.classifier.network import Classifier
 from patchproof.networks.batches import BatchedNetwork
 from patchproof.optimizer.patch import Patch
-from patchproof.optimizer.subject import Loss, Subject, subject_of, target_loss
+from patchproof.optimizer.subject import Loss, target_loss
 from patchproof.render.pixels import PHOTO_SAMPLING, Appearance, TextureSampling
 from patchproof.render.stage import Stage, set_stage
 from patchproof.render.surfaces import piece_surface
 from patchproof.render.views import Views, relight_and_replace_background, render_views
 from patchproof.scene.conditions import Conditions
-from patchproof.scene.interface import Scene
+from patchproof.scene.interface import Scene, require_piece
 from patchproof.scene.patch_scene import PatchScene
+
+if TYPE_CHECKING:
+    from patchproof.optimizer.texture import Texture
 
 # Figures come from views of FIGURE_SCALE times the largest input's side, which a network reduces like photographs,
 # and of MIN_FIGURE_PX at least, since each pixel takes one sample. Averaging textures over 0.8 of a pixel keeps them
@@ -51,7 +55,7 @@ class Problem:
     printer: Printer
     classifiers: tuple[Classifier, ...]
     indices: tuple[tuple[int, ...], ...]
-    subject: Subject
+    subject: "Patch | Texture"
     custom_loss: Loss | None  # in place of the goal's
     jobs: int = 1  # processes that share the views
 
@@ -166,6 +170,18 @@ def set_problem(
     if not models:
         refuse_other_inputs(scene.recorded, problem.inputs, f"the run of sheet {scene.sheet_id}", settings.model_dump())
     return problem
+
+
+def subject_of(scene: Scene, printer: Printer, network_px: int, device: torch.device) -> "Patch | Texture":
+    """What a scene leaves open: the design of its piece, no finer than networks whose largest input has side
+    `network_px` can see it, or the object's texture.
+    """
+    if scene.HAS_PIECE:
+        scene = require_piece(scene)
+        return Patch(scene, printer, scene.design_px(network_px), device)
+    from patchproof.optimizer.texture import Texture
+
+    return Texture(scene, scene.object_canvas(), device)
 
 
 def check_device(device: torch.device | str) -> None:

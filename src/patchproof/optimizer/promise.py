@@ -23,7 +23,7 @@ from patchproof.base.progress import Advance, no_advance
 from patchproof.base.sessions import count_by_session, rate_posterior, session_difference
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import Problem
-from patchproof.optimizer.responses import Responses, merge_responses, open_responses
+from patchproof.optimizer.responses import Responses, merge_responses, responses
 from patchproof.render.pixels import Appearance
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.interface import require_piece
@@ -108,21 +108,21 @@ def _responses_until_settled(
     by_kind: dict[str, Responses] = {}
     unsettled, n = list(appearances), len(conditions)
     looks = [0, n] if half_width is None else _look_positions(n, per_session)
-    with open_responses(problem, appearances, conditions) as respond:
-        for first, last in pairwise(looks):
-            rows, mask = np.arange(first, last), _control_mask(last - first, per_session)
-            answers = respond(unsettled, rows, mask, lambda done, _, first=first: advance(first + done, n))
-            by_kind = merge_responses([by_kind, answers]) if by_kind else answers
-            if half_width is None or last == n:
-                break
-            claims = _paired_claims(by_kind, per_session)
-            settled = {kind for kind, claim in claims.items() if _is_settled(claim, half_width)}
-            unsettled = [kind for kind in unsettled if kind not in settled]
-            places = _place_numbers(conditions[:last], per_session)
-            counts = count_by_session(by_kind["design"].recognized[0], per_session, places)
-            if unsettled == ["design"] and np.ptp(rate_posterior(*counts).rate_interval) <= 2 * half_width:
-                advance(last, last)  # a progress bar that stays at half would look broken
-                break
+    for first, last in pairwise(looks):
+        shown, mask = {kind: appearances[kind] for kind in unsettled}, _control_mask(last - first, per_session)
+        part = conditions[first:last]
+        answers = responses(problem, shown, part, None, mask, lambda done, _, first=first: advance(first + done, n))
+        by_kind = merge_responses([by_kind, answers]) if by_kind else answers
+        if half_width is None or last == n:
+            break
+        claims = _paired_claims(by_kind, per_session)
+        settled = {kind for kind, claim in claims.items() if _is_settled(claim, half_width)}
+        unsettled = [kind for kind in unsettled if kind not in settled]
+        places = _place_numbers(conditions[:last], per_session)
+        counts = count_by_session(by_kind["design"].recognized[0], per_session, places)
+        if unsettled == ["design"] and np.ptp(rate_posterior(*counts).rate_interval) <= 2 * half_width:
+            advance(last, last)  # a progress bar that stays at half would look broken
+            break
     return by_kind
 
 

@@ -5,12 +5,10 @@ network recognized the target, its confidence, and the loss. Views are rendered 
 as many processes as the problem has; the responses do not depend on how many.
 """
 
-import math
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain, zip_longest
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -53,57 +51,29 @@ def responses(
     `figure_px`). With `control_mask`, all but the first thing are shown only under conditions in the mask. `advance`
     is called with the number of views done and their total.
     """
-    with open_responses(problem, appearances, conditions, side_px) as respond:
-        return respond(list(appearances), np.arange(len(conditions)), control_mask, advance)
-
-
-@contextmanager
-def open_responses(
-    problem: Problem, appearances: Mapping[Thing, Appearance], conditions: Conditions, side_px: int | None = None
-) -> Iterator[Callable[..., dict[Thing, Responses]]]:
-    """A function like `responses` for some things and, by index array, some conditions; processes serve every call."""
-    first_appearance = next((thing for thing in appearances.values() if thing is not None), None)
+    things, first_appearance = list(appearances), next((a for a in appearances.values() if a is not None), None)
+    mask = np.ones(len(conditions), bool) if control_mask is None else control_mask
+    # chunks of one session go to one process, which draws their background once
+    pairs = zip_longest(in_chunks(np.flatnonzero(mask)), in_chunks(np.flatnonzero(~mask)))
+    tasks = [[part for part in zip(pair, (things, things[:1]), strict=True) if part[0] is not None] for pair in pairs]
 
     @torch.no_grad()
-    def respond_to_chunks(task: Sequence[_Chunk[Thing]]) -> list[dict[Thing, Responses]]:
-        answers, drawn_conditions = [], conditions[np.concatenate([part.rows for part in task])]
+    def respond(task: Sequence[tuple[np.ndarray, Sequence[Thing]]]) -> list[dict[Thing, Responses]]:
+        answers, drawn_conditions = [], conditions[np.concatenate([rows for rows, _ in task])]
         together = problem.see(first_appearance, drawn_conditions, side_px or problem.figure_px)
-        for part, views in zip(task, split_views(together, [len(part.rows) for part in task]), strict=True):
-            boxes, windows, cache = problem.boxes(views.conditions), None, {}
-            if len(part.things) > 1:
-                windows = affected_windows(views)
-            pictures = ((thing, expose(views, appearances[thing])) for thing in part.things)
+        for (_, shown), views in zip(task, split_views(together, [len(rows) for rows, _ in task]), strict=True):
+            boxes, cache = problem.boxes(views.conditions), {}
+            windows = affected_windows(views) if len(shown) > 1 else None
+            pictures = ((thing, expose(views, appearances[thing])) for thing in shown)
             answers.append({thing: ask_networks(problem, photos, boxes, windows, cache) for thing, photos in pictures})
         return answers
 
-    def respond(
-        things: Sequence[Thing], rows: np.ndarray, control_mask: np.ndarray | None = None, advance: Advance = no_advance
-    ) -> dict[Thing, Responses]:
-        with_controls = np.ones(len(rows), bool) if control_mask is None else control_mask
-        all_things = [_Chunk(part, things) for part in in_chunks(rows[with_controls])]
-        first_thing = [_Chunk(part, things[:1]) for part in in_chunks(rows[~with_controls])]
-        # chunks of one session go to one process, which draws their background once; the last ones go separately, the
-        # shortest last, so that no process waits long for another
-        tasks = [[part for part in pair if part is not None] for pair in zip_longest(all_things, first_thing)]
-        last = sorted(chain(*tasks[-problem.jobs :]), key=lambda part: -len(part.things))
-        tasks[-problem.jobs :] = [[part] for part in last]
-        views_done = np.cumsum([sum(len(part.rows) for part in task) for task in tasks])
-        chunk_responses = workers.map(share, tasks, lambda done, _: advance(int(views_done[done - 1]), len(rows)))
-        parts = list(zip(chain(*tasks), chain(*chunk_responses), strict=True))  # the first chunk has all things
-        merged = merge_responses([answers for _, answers in parts])
-        merged[things[0]] = merged[things[0]].select(np.argsort(np.concatenate([part.rows for part, _ in parts])))
-        return merged
-
-    jobs = min(problem.jobs, math.ceil(len(conditions) / CHUNK_VIEWS))
-    with fork_workers(respond_to_chunks, jobs) as (workers, share):
-        yield respond
-
-
-class _Chunk(NamedTuple, Generic[Thing]):
-    """Indices of some conditions, and the things shown under them."""
-
-    rows: np.ndarray
-    things: Sequence[Thing]
+    views_done = np.cumsum([sum(len(rows) for rows, _ in task) for task in tasks])
+    with fork_workers(respond, min(problem.jobs, len(tasks))) as (workers, share):
+        answers = workers.map(share, tasks, lambda done, _: advance(int(views_done[done - 1]), len(conditions)))
+    merged = merge_responses(list(chain(*answers)))  # the first chunk has all things
+    rows = np.concatenate([rows for rows, _ in chain(*tasks)])
+    return merged | {things[0]: merged[things[0]].select(np.argsort(rows))}
 
 
 def in_chunks(conditions: Chunked) -> Iterator[Chunked]:

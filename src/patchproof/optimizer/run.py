@@ -34,6 +34,7 @@ from patchproof.base.text import short_repr
 from patchproof.base.validation import refuse_untrusted, validate_model
 from patchproof.base.version import __version__
 from patchproof.classifier.network import Classifier
+from patchproof.optimizer.expectation import last_pictures
 from patchproof.optimizer.loop import (
     SELECT_AFTER,
     State,
@@ -52,13 +53,13 @@ from patchproof.optimizer.subject import (
     OBJECT_FILE,
     TEXTURE_FILES,
     Loss,
-    read_design,
+    read_png,
     write_png,
 )
 from patchproof.scene.interface import Scene
 from patchproof.scene.patch_scene import PatchScene
 from patchproof.scene.scene import build_scene, load_scene
-from patchproof.sheets.manifest import Promise
+from patchproof.sheets.manifest import MAX_PRINTED_PX, Promise
 
 _LOG_FILE, _VIEWS_FILE = "steps.jsonl", "views.png"
 _MAX_LINE_BYTES = 4096  # of the log
@@ -250,7 +251,12 @@ def load_run(folder: str | Path, trust: bool = False, named: Iterable[str] = ())
             scene = replace(scene, received=folder / RUN_FILE)
         if record.imported is not None:
             scene = replace(scene, known={**scene.known, "design": record.imported.sha256})
-        design = read_design(scene, folder)
+        if scene.HAS_PIECE:
+            design = read_png(folder / DESIGN_FILE, MAX_PRINTED_PX)
+        else:
+            from patchproof.optimizer.texture import read_texels
+
+            design = read_texels(scene, folder)
     except Refused:
         raise
     except (OSError, ValueError, RuntimeError) as error:
@@ -290,13 +296,13 @@ def _run_steps(problem: Problem, state: State, out: Path, advance: Advance) -> n
             line = {"step": state.number} | {name: getattr(step, name) for name in names}
             log.write(json.dumps(line) + "\n")
             log.flush()
-            if state.number == settings.steps and step.pictures is not None:
-                write_png(out / _VIEWS_FILE, side_by_side(step.pictures, _answers(problem, step.pictures)))
-            if is_save_step(settings, state.number):  # after the views, which a resumed last step would not write
+            if is_save_step(settings, state.number):
                 save_checkpoint(state, problem, out)
             largest_gradient = max(step.gradient, largest_gradient or 0.0)
             advance(state.number, settings.steps)
     _warn_if_unchanged(float((state.best - start(problem).design).abs().max()), largest_gradient)
+    pictures = last_pictures(problem, state.best)
+    write_png(out / _VIEWS_FILE, side_by_side(pictures, _answers(problem, pictures)))
     return problem.subject.pixels(state.best)
 
 

@@ -1,8 +1,8 @@
-"""The subject of optimization: the design of a printed piece, or the object's own texture.
+"""What the subjects of optimization share: the design of a printed piece (`patch.Patch`), the object's own texture
+(`texture.Texture`). A scene loads the one it needs.
 
-In: a scene. Out: a `Subject`, which gives the first design, the allowed designs, their penalty and appearance, and the
-files a run stores. A design is a float tensor 3×h×w in [0, 1], its `pixels` are uint8 h×w×3. Patches and textures have
-a module each; a scene loads the one it needs.
+A subject gives the first design, the allowed designs, their penalty and appearance, and the files that a run stores. A
+design is a float tensor 3×h×w in [0, 1], its `pixels` are uint8 h×w×3.
 
 The gradient's pyramid moves large parts of a design as readily as single pixels: the optimizer scales its levels, means
 over blocks of 1, 2, 4 … pixels, each on its own, and adds them. The gradient of a pixel is mostly that of the few views
@@ -17,14 +17,9 @@ Algorithm 1); recognition needs the descent done here. TV: Mahendran and Vedaldi
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
-from types import ModuleType
-from typing import ClassVar, Protocol
 
 import numpy as np
-import torch
 from PIL import Image
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
@@ -32,102 +27,13 @@ from torch.nn.functional import avg_pool2d, interpolate
 from patchproof.base.goal import Goal
 from patchproof.base.input import open_image
 from patchproof.base.output import write_atomically
-from patchproof.channel.printer import Printer
 from patchproof.classifier.network import Odds
-from patchproof.render.pixels import Appearance
-from patchproof.scene.interface import Scene
 
 DESIGN_FILE, OBJECT_FILE, TEXTURE_FILES, MASK_FILE = "design.png", "object.glb", "texture_*.png", "mask.png"
 MIN_COARSEST_BLOCKS = 8  # blocks along the shorter side of the coarsest level
 
 
 Loss = Callable[[Tensor, Sequence[int]], Tensor]  # (logits N×K, label indices) -> N losses to descend on
-
-
-@dataclass(frozen=True)
-class Grid:
-    """The resolution of a design: its pixels as optimized and as printed (None for textures, which keep their own sizes
-    and are not printed), and their number, in all and per millimeter of a side.
-    """
-
-    design_px: tuple[int, int] | None
-    printed_px: tuple[int, int] | None
-    printed_px_per_mm: float | None
-    texels: int
-    texels_per_mm: float
-
-
-class Subject(Protocol):
-    """The interface of a patch or texture to the loop, the promise and studies."""
-
-    STAGE_NAME: ClassVar[str]  # the stage that turns a design into its appearance, in timings
-
-    def start(self) -> Tensor:
-        """The design before the first step."""
-        ...
-
-    def clip(self, design: Tensor) -> Tensor:
-        """The nearest design that is allowed."""
-        ...
-
-    def gradient_levels(self, gradient: Tensor) -> tuple[Tensor, ...]:
-        """The gradient's pyramid."""
-        ...
-
-    def combine_levels(self, updates: Sequence[Tensor]) -> Tensor:
-        """Combine the updates of the pyramid's levels into one update of the design."""
-        ...
-
-    def penalty(self, design: Tensor) -> Tensor | float:
-        """The penalty of a design by the scene's settings."""
-        ...
-
-    def pixels(self, design: Tensor) -> np.ndarray:
-        """The pixels of a design that are printed or stored."""
-        ...
-
-    def control(self, kind: str, pixels: np.ndarray) -> np.ndarray:
-        """The pixels of the control of this kind, in place of the design's."""
-        ...
-
-    def appearance(self, design: Tensor, kind: str = "design") -> Appearance:
-        """The appearance of a design, or of a control with the markers of its own sheet; differentiable."""
-        ...
-
-    def print_design(self, design: Tensor) -> Tensor:
-        """The print that all pictures of a design share, made once a step; differentiable. A texture is not printed."""
-        return design
-
-    def appearance_of_print(self, printed: Tensor) -> Appearance:
-        """The appearance of a print; differentiable."""
-        return self.appearance(printed)
-
-    @property
-    def grid(self) -> Grid:
-        """The resolution of designs."""
-        ...
-
-    def save(self, pixels: np.ndarray, folder: Path) -> None:
-        """Write the design's files into a run's folder; earlier ones are replaced only by complete ones."""
-        ...
-
-    def file(self, pixels: np.ndarray) -> tuple[str, bytes]:
-        """A file name's suffix, and the one file that shows the design to others."""
-        ...
-
-
-def subject_of(scene: Scene, printer: Printer, network_px: int, device: torch.device) -> Subject:
-    """The subject that a scene leaves open, for networks whose largest input has side `network_px`."""
-    return _module_of(scene).subject_of(scene, printer, network_px, device)
-
-
-def read_design(scene: Scene, folder: Path) -> np.ndarray:
-    """Read the pixels that `Subject.save` wrote, to the bit; refused where they do not fit the scene."""
-    return _module_of(scene).read_design(scene, folder)
-
-
-def _module_of(scene: Scene) -> ModuleType:
-    return import_module(f"patchproof.optimizer.{'patch' if scene.HAS_PIECE else 'texture'}")
 
 
 def write_png(path: Path, pixels: np.ndarray) -> None:

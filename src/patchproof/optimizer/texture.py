@@ -13,7 +13,6 @@ from functools import cached_property
 from itertools import chain, islice
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import ClassVar
 
 import numpy as np
 import torch
@@ -21,7 +20,6 @@ from torch import Tensor
 
 from patchproof.base.errors import Refused
 from patchproof.base.output import write_atomically
-from patchproof.channel.printer import Printer
 from patchproof.mesh.export import write_glb
 from patchproof.optimizer import subject
 from patchproof.optimizer.pixels import as_pixels, from_pixels
@@ -33,12 +31,11 @@ from patchproof.sheets.piece import CELLS, control_design
 
 
 @dataclass(frozen=True, eq=False)
-class Texture(subject.Subject):
+class Texture:
     """Designs are 3×1×M in [0, 1]: the texels that may change, texture by texture, by rows."""
 
     # Larger steps suit only the networks that train: a fourth network recognized a letter box made for three in 60 % of
     # views as it came, 60, 70, 76 % with steps of 0.1, 0.03, 0.015 (96 views), 81 % with twice as many of 0.015.
-    STAGE_NAME: ClassVar[str] = "textures"
     scene: Scene
     canvas: Canvas
     device: torch.device
@@ -114,6 +111,14 @@ class Texture(subject.Subject):
         """The object's textures with a design; differentiable."""
         return self.surface.appearance(design)
 
+    def print_design(self, design: Tensor) -> Tensor:
+        """The design itself: it is not printed."""
+        return design
+
+    def appearance_of_print(self, printed: Tensor) -> ObjectTextures:
+        """The object's textures with the design."""
+        return self.appearance(printed)
+
     def save(self, pixels: np.ndarray, folder: Path) -> None:
         """Write the object with its new textures, each texture, and masks one below the other, white if changeable."""
         textures, masks = self.surface.textures(pixels), self.canvas.mask
@@ -132,7 +137,7 @@ class Texture(subject.Subject):
             return "glb", path.read_bytes()
 
     @property
-    def grid(self) -> subject.Grid:
+    def texels_per_mm(self) -> float:
         """The resolution of the textures, per millimeter of the surface on average."""
         mesh, masks = self.canvas.mesh, self.canvas.mask
         sizes = np.array([mask.shape[1::-1] for mask in masks])
@@ -140,8 +145,7 @@ class Texture(subject.Subject):
         flat = np.abs(np.linalg.det(uv[:, 1:] - uv[:, :1])).sum()
         a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
         area_mm2 = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
-        texels = int(sum(mask.sum() for mask in masks))
-        return subject.Grid(None, None, None, texels, float(np.sqrt(flat / area_mm2)))
+        return float(np.sqrt(flat / area_mm2))
 
     @cached_property
     def surface(self) -> LearnedTextures:
@@ -153,13 +157,8 @@ class Texture(subject.Subject):
         return self.start()
 
 
-def subject_of(scene: Scene, printer: Printer, network_px: int, device: torch.device) -> Texture:
-    """Implements `subject.subject_of`: the scene's own texture, for any printer and networks."""
-    return Texture(scene, scene.object_canvas(), device)
-
-
-def read_design(scene: Scene, folder: Path) -> np.ndarray:
-    """Implements `subject.read_design`: reads the changeable texels of the textures."""
+def read_texels(scene: Scene, folder: Path) -> np.ndarray:
+    """Read the changeable texels of the textures that `Texture.save` wrote; refused where they do not fit the scene."""
     canvas = scene.object_canvas()
     textures = [subject.read_png(folder / subject.TEXTURE_FILES.replace("*", f"{i}")) for i in range(len(canvas.mask))]
     for texture, mask in zip(textures, canvas.mask, strict=True):

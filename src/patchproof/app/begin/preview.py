@@ -26,10 +26,10 @@ from patchproof.base.text import short_repr
 from patchproof.channel.printer import identity_printer
 from patchproof.classifier.labels import find_labels
 from patchproof.classifier.load import load_classifier
-from patchproof.optimizer.subject import subject_of
+from patchproof.optimizer.patch import Patch
 from patchproof.render.stage import set_stage
 from patchproof.report.page import data_uri, jpeg, png, render_page
-from patchproof.scene.interface import Scene, fit_text, measurable_text
+from patchproof.scene.interface import Scene, fit_text, measurable_text, require_piece
 from patchproof.scene.mesh_scene import MeshScene
 from patchproof.scene.patch_scene import PatchScene
 from patchproof.scene.placement import gap_limit_mm
@@ -114,7 +114,8 @@ def _unprintable(scene: Scene, network_px: int) -> str | None:
     """The refusal of a piece that `optimize` would refuse for its size."""
     try:
         if scene.HAS_PIECE and scene.HAS_PLACE:
-            subject_of(scene, identity_printer(), network_px, torch.device("cpu"))
+            piece_scene = require_piece(scene)
+            Patch(piece_scene, identity_printer(), piece_scene.design_px(network_px), torch.device("cpu"))
     except Refused as refused:
         return str(refused)
     return None

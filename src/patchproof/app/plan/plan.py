@@ -27,6 +27,7 @@ from patchproof.base.validation import not_measured_lines
 from patchproof.evidence.verdict import photos_line
 from patchproof.optimizer.expectation import new_pose_share
 from patchproof.optimizer.loop import SELECT_VIEWS, start, steps
+from patchproof.optimizer.patch import Patch
 from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.place_search import choose_place, place_lines
 from patchproof.optimizer.problem import Problem, set_problem
@@ -113,7 +114,8 @@ def resolution_plan(problem: Problem) -> PlanData:
     """Compute how finely views and print resolve the design: pixels per millimeter at the 5 % and 95 % points of the
     views, in the closest view that the settings allow, and in print. Textures keep their own sizes (None).
     """
-    scene, grid = problem.scene, problem.subject.grid
+    scene, subject = problem.scene, problem.subject
+    patch = subject if isinstance(subject, Patch) else None
     network_px = max(classifier.input_px for classifier in problem.classifiers)
     network, photo = (
         np.quantile(scene.px_per_mm(size_px), [1 - READABLE_SHARE, READABLE_SHARE]).tolist()
@@ -126,11 +128,11 @@ def resolution_plan(problem: Problem) -> PlanData:
         "px_per_mm_network": network,
         "px_per_mm_photo": photo,
         "closest_px_per_mm": closest,  # at the network's size
-        "design_px": grid.design_px,
-        "printed_px": grid.printed_px,
-        "printed_px_per_mm": grid.printed_px_per_mm,
-        "texels": grid.texels,
-        "texels_per_px": grid.texels_per_mm / closest,  # along a side, in the closest view
+        "design_px": patch and patch.design_px,
+        "printed_px": patch and patch.printed_px,
+        "printed_px_per_mm": patch and patch.printed_px[0] / patch.scene.piece.size_mm[0],
+        "texels": subject.start()[0].numel(),
+        "texels_per_px": subject.texels_per_mm / closest,  # along a side, in the closest view
     }
 
 
@@ -176,7 +178,7 @@ def _step_ms(problem: Problem, design: Tensor, conditions: Conditions) -> dict[s
     views = problem.see(appearance, conditions, problem.training_px)
     ends["rasterize object, piece and background"] = time.perf_counter()
     appearance = problem.subject.appearance(design)
-    ends[problem.subject.STAGE_NAME] = time.perf_counter()
+    ends["printer" if problem.scene.HAS_PIECE else "textures"] = time.perf_counter()
     pictures = expose(views, appearance)
     ends["light, piece and camera"] = time.perf_counter()
     leaf, boxes, windows = pictures.detach().requires_grad_(), problem.boxes(conditions), affected_windows(views)
