@@ -218,7 +218,7 @@ def test_a_cluster_gives_the_same_also_when_workers_die(tmp_path):
 @pytest.mark.filterwarnings("ignore")
 def test_a_cluster_that_does_not_answer_is_refused_in_a_sentence(monkeypatch):
     pytest.importorskip("distributed", reason="needs dask: pip install 'patchproof[cluster]'")
-    monkeypatch.setattr("patchproof.base.cluster._CONNECT_TIMEOUT_S", 1)
+    monkeypatch.setattr("patchproof.base.workers._CONNECT_TIMEOUT_S", 1)
     for address in ("tcp://127.0.0.1:9", "not an address"):
         with pytest.raises(Refused, match="a Dask scheduler"), open_workers(cluster=address):
             pass

@@ -12,11 +12,9 @@ from small_networks import ConvNeXt, ResNet, ViT, seeded
 from patchproof.classifier.builtin import load_builtin
 from patchproof.classifier.custom import classifier_of
 from patchproof.classifier.network import Classifier, _windows_in_square, center_square
-from patchproof.networks import cuts, windows
-from patchproof.networks.batches import tune_batches
-from patchproof.networks.graph import Program
-from patchproof.networks.steps import Step, ValueRef, mark_last_uses
-from patchproof.networks.windows import Windows
+from patchproof.networks import batches, cuts
+from patchproof.networks.batches import Windows, tune_batches
+from patchproof.networks.graph import Program, Step, ValueRef, mark_last_uses
 from patchproof.optimizer.loop import best_design
 from patchproof.optimizer.problem import set_problem
 from patchproof.optimizer.promise import CONTROLS, pictures_with_controls
@@ -29,7 +27,7 @@ SIZE = 128
 
 @pytest.fixture(autouse=True)
 def small_networks_save_too(monkeypatch):
-    monkeypatch.setattr(windows, "CUT_COST", 0)
+    monkeypatch.setattr(batches, "CUT_COST", 0)
 
 
 def program(*lines, sizes=(None, 3, None, None)) -> Program:
@@ -554,15 +552,15 @@ unwanted = {{"torch._dynamo", "sympy", "onnx"}}
 assert not unwanted & sys.modules.keys(), "imported by a file"
 import numpy as np, torch
 import patchproof as pp
-from patchproof.networks import windows
+from patchproof.networks import batches
 from patchproof.optimizer import loop
 from patchproof.optimizer.problem import set_problem
 from patchproof.optimizer.promise import CONTROLS, pictures_with_controls
 from patchproof.optimizer.responses import responses
 problem = set_problem(pp.load_scene({str(scene)!r}))
-windows.CUT_COST = 0  # the network is small
+batches.CUT_COST = 0  # the network is small
 network, photos = problem.classifiers[0].network, torch.rand(2, 3, 96, 96).requires_grad_()
-network(photos, windows.Windows(np.array([[40, 40, 50, 50]] * 2))).sum().backward()
+network(photos, batches.Windows(np.array([[40, 40, 50, 50]] * 2))).sum().backward()
 assert network.cut and not photos.grad[..., 0].any()
 next(loop.steps(problem))
 assert not unwanted & sys.modules.keys(), "imported by a gradient"

@@ -126,8 +126,7 @@ def test_more_zeros_on_one_side_are_zeros_in_small_weights(sides):
     top, left, bottom, right = sides[:4]
     name = "D" if "group" in options else "W"
     network = program(f"y = Conv<pads=[{top},{left},{bottom},{right}], {options}>(x, {name})")
-    assert names(network) == ["constant_pad_nd.default", "convolution.default"]
-    assert (network.steps[0].arguments[0].number < network.photos) == within
+    assert names(network) == ["constant_pad_nd.default"] * (not within) + ["convolution.default"]
     (kernel,) = weights(name)
     stride, dilation = ([2, 2] if "[2,2]" in options and word in options else [1, 1] for word in ("stri", "dila"))
     stride = [1, 2] if "[1,2]" in options else stride

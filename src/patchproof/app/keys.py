@@ -21,7 +21,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 from pydantic import AfterValidator, BaseModel
 from pydantic.fields import FieldInfo
 
-from patchproof.base.declared import Declaration
+from patchproof.base.declarations import Declaration
 from patchproof.base.errors import Refused
 from patchproof.base.settings import SceneSettings
 from patchproof.base.validation import StrictModel, check_ordered, models_in, spelling_hint

@@ -1,6 +1,20 @@
-"""What settings and text files can declare, and what `input` and `validation` do with it."""
+"""The lists that readers of files keep: what a format can declare, and what the reader does with it.
 
-from patchproof.base.declared import Declaration
+`DECLARED` is that of settings and text files; other readers' lists stand in `declarations.py` of their rooms. From all
+of them `patchproof keys --files` makes one page, and for each entry the tests hold a file.
+"""
+
+from typing import Literal, NamedTuple
+
+
+class Declaration(NamedTuple):
+    """One thing that files of a kind can declare: "used" as declared, "refused", or left aside and "said"."""
+
+    file: str  # the kind of file, such as "TIFF"
+    declares: str  # such as "orientation (tag 274)"
+    answer: Literal["used", "refused", "said"]
+    how: str  # what is done with it, in a few words
+
 
 _FILES = "TOML, JSON, CSV"
 DECLARED: tuple[Declaration, ...] = (

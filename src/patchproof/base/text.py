@@ -1,6 +1,7 @@
 """Text that others wrote, such as names and labels, made fit for terminals, pages and spreadsheets.
 
-Out: text without characters that move a cursor or turn the direction of reading; CSV without formulas.
+Out: text without characters that move a cursor or turn the direction of reading; CSV without formulas; values and
+objects in a line, for notebooks and refusals.
 """
 
 import csv
@@ -8,12 +9,15 @@ import io
 import re
 import shlex
 import unicodedata
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from operator import attrgetter
+from types import MethodType
 from typing import Any
 
 FORMULA = re.compile(r"\s*[=+@＝＋－＠-]|[\t\r\n]")  # what a spreadsheet computes, after an apostrophe does not
 _UNSEEN = ("Cc", "Cf", "Cs", "Zl", "Zp")  # control, format, surrogate, line and paragraph separators
 _JOINERS = "\u200c\u200d"  # invisible, and needed within words and emoji
+_MAX_CHARACTERS, _MAX_ITEMS = 100, 4  # of a value that is shown as it is
 
 
 def printable(text: str) -> str:
@@ -34,17 +38,31 @@ def drawable(text: str, has_glyph: Callable[[str], bool]) -> str:
 
 
 def brief(value: object) -> str:
-    """Describe a value in a few words; see `base.describe`, which is loaded for this only."""
-    from patchproof.base.describe import describe_value
-
-    return describe_value(value)
+    """Describe a value: text and numbers as they are, arrays by type and shape, long text and lists by their length."""
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(shape := getattr(value, "shape", None), tuple):
+        return f"{getattr(value, 'dtype', type(value).__name__)} {'×'.join(map(str, shape)) or 'without shape'}"
+    if isinstance(value, tuple) and len(value) <= _MAX_ITEMS:
+        return f"({', '.join(map(brief, value))})"
+    is_text = isinstance(value, str | bytes)
+    if isinstance(value, Mapping | Sequence) and len(value) > (_MAX_CHARACTERS if is_text else _MAX_ITEMS):
+        kind = "a dictionary" if isinstance(value, Mapping) else "text" if is_text else "a list"
+        return f"{kind} of {len(value):,} {'characters' if is_text else 'items'}"
+    text = printable(repr(value))
+    return text if len(text) <= _MAX_CHARACTERS and " at 0x" not in text else type(value).__name__
 
 
 def short_repr(self: Any) -> str:
-    """Describe an object in a line, as "Name(key=value, ...)"; see `base.describe`."""
-    from patchproof.base.describe import describe_object
-
-    return describe_object(self)
+    """Describe an object in a line, as "Name(key=value, ...)", by the attributes in its class's `SHOWN` (dotted names,
+    methods are called), else by its fields.
+    """
+    kind, parts = type(self), []
+    for name in getattr(kind, "SHOWN", None) or getattr(kind, "__dataclass_fields__", None) or kind.model_fields:
+        value = attrgetter(name)(self)
+        text = brief(value() if isinstance(value, MethodType) else value)
+        parts.append(f"{name.rpartition('.')[2]}={text}")
+    return f"{kind.__name__}({', '.join(parts)})"
 
 
 def _escape(character: str) -> str:

@@ -23,7 +23,6 @@ from concurrent import futures
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
 from contextlib import closing, contextmanager, nullcontext
 from functools import partial
-from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +33,7 @@ _Task = Callable[[Any], Any]
 _Item = tuple[int, Any]  # its number, and the item
 MAX_TRIES = 3  # of an item whose worker dies each time
 MAX_QUEUED_ITEMS = 1000  # on a cluster at a time: enough to keep it busy, and for its scheduler to plan ahead
+_CONNECT_TIMEOUT_S = 10  # to a cluster's scheduler
 _QUOTA = Path("/sys/fs/cgroup/cpu.max")  # of a container: microseconds of processor time per period
 
 
@@ -42,9 +42,9 @@ class Workers:
     threads, for workers that were not started here.
     """
 
-    def __init__(self, start: Callable[[], Executor], in_flight: int, one_thread: bool = False):
+    def __init__(self, start: Callable[[], Executor], in_flight: int, one_thread: bool = False, executors: int = 1):
         self._start, self._in_flight, self._one_thread = start, in_flight, one_thread
-        self._executor = start()
+        self._executors = [start() for _ in range(executors)]  # of several, each gets items in its turn
 
     def completed(self, function: _Task, items: Iterable[Any]) -> Iterator[tuple[int, Future]]:
         """Yield (number of the item, its finished future) as they finish; items are taken only as they are needed."""
@@ -64,16 +64,15 @@ class Workers:
 
     def close(self) -> None:
         """Stop the workers; items that have not begun are dropped."""
-        self._executor.shutdown(wait=True, cancel_futures=True)
+        for executor in self._executors:
+            executor.shutdown(wait=True, cancel_futures=True)
 
     def _run(self, function, items: Iterable[_Item], in_flight: int, lost: list[_Item]) -> Iterator[tuple[int, Future]]:
         """Keep `in_flight` items running; those whose workers died are appended to `lost`."""
         todo, running = iter(items), {}
-        if isinstance(self._executor, _RotatingExecutor):
-            self._executor.rewind()
         while True:
             while len(running) < in_flight and (item := next(todo, None)) is not None:
-                running[self._submit(function, item[1])] = item
+                running[self._submit(function, item)] = item
             if not running:
                 return
             finished = futures.wait(running, return_when=futures.FIRST_COMPLETED).done
@@ -87,8 +86,8 @@ class Workers:
                 else:
                     yield numbered_item[0], future
             if broken:
-                self._executor.shutdown(wait=True)
-                self._executor = self._start()
+                self.close()
+                self._executors = [self._start() for _ in self._executors]
 
     def _run_alone(self, function, suspect: _Item) -> Iterator[tuple[int, Future]]:
         for _ in range(MAX_TRIES):
@@ -101,10 +100,11 @@ class Workers:
         future.set_exception(error)
         yield suspect[0], future
 
-    def _submit(self, function, item) -> Future:
+    def _submit(self, function, numbered_item: _Item) -> Future:
+        number, item = numbered_item
         call = partial(_call_on_one_thread, function) if self._one_thread else function
         try:
-            return self._executor.submit(call, item)
+            return self._executors[number % len(self._executors)].submit(call, item)
         except BrokenExecutor as error:  # a process died between two waits
             future: Future = Future()
             future.set_exception(error)
@@ -127,10 +127,22 @@ def open_workers(jobs: int = 1, cluster: str | None = None, spawn: bool = False)
         return
     if jobs > 1:
         raise Refused("--jobs or --cluster", "both", "leave one out: a cluster has its own number of workers")
-    from patchproof.base.cluster import connect_client
-
-    with closing(connect_client(cluster)) as client:
+    with closing(_connect_client(cluster)) as client:
         yield Workers(partial(client.get_executor, pure=False), MAX_QUEUED_ITEMS, True)
+
+
+def _connect_client(address: str) -> Any:
+    """A client of the scheduler at an address; refused if there is none."""
+    try:
+        from distributed import Client
+    except ImportError:
+        raise Refused("dask.distributed for --cluster", "none", 'pip install "patchproof[cluster]"') from None
+    try:
+        return Client(address, timeout=_CONNECT_TIMEOUT_S, set_as_default=False)
+    except (OSError, ValueError, TimeoutError) as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        do = "start dask scheduler there, or correct the address"
+        raise Refused("a Dask scheduler, such as tcp://host:8786", f"{address} ({reason})", do) from error
 
 
 @contextmanager
@@ -147,8 +159,8 @@ def fork_workers(function: _Task, jobs: int, in_turn: bool = False) -> Iterator[
         with nullcontext() if in_process else use_threads(jobs):
             yield Workers(_InProcessExecutor, 1), function
         return
-    start = partial(_RotatingExecutor if in_turn else _process_pool, jobs, True, function)
-    with use_threads(1), closing(Workers(start, 2 * jobs)) as workers:
+    start = partial(_process_pool, 1 if in_turn else jobs, True, function)
+    with use_threads(1), closing(Workers(start, 2 * jobs, executors=jobs if in_turn else 1)) as workers:
         yield workers, _call_shared_function
 
 
@@ -239,25 +251,6 @@ def _process_pool(jobs: int, forks: bool, function: _Task | None = None) -> Exec
 
     context = multiprocessing.get_context("fork" if forks else "spawn")
     return _QuietProcessPool(jobs, context, _init_worker, (os.getpid(), function))
-
-
-class _RotatingExecutor(Executor):
-    """Single processes that get items in rotation, from the first one after each `rewind`."""
-
-    def __init__(self, jobs: int, forks: bool, function: _Task):
-        self._executors = [_process_pool(1, forks, function) for _ in range(jobs)]
-        self.rewind()
-
-    def rewind(self) -> None:
-        """Give the next item to the first process."""
-        self._next = cycle(self._executors)
-
-    def submit(self, fn, /, *args, **kwargs) -> Future:
-        return next(self._next).submit(fn, *args, **kwargs)
-
-    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        for executor in self._executors:
-            executor.shutdown(wait, cancel_futures=cancel_futures)
 
 
 class _QuietProcessPool(futures.ProcessPoolExecutor):

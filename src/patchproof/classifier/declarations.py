@@ -1,6 +1,6 @@
 """What files of networks can declare, and what load_classifier does with each declaration."""
 
-from patchproof.base.declared import Declaration
+from patchproof.base.declarations import Declaration
 
 DECLARED: tuple[Declaration, ...] = (
     Declaration("ONNX", "opset", "used", "7 to 28 of the standard domain; others are refused"),

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from patchproof.classifier.network import NO_BOX_LOGIT, Classifier, Odds, columns
-from patchproof.networks.windows import Windows
+from patchproof.networks.batches import Windows
 
 MIN_IOU = 0.5  # as in PASCAL VOC's and COCO's AP50
 

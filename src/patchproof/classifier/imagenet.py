@@ -151,5 +151,5 @@ class _Convolution(nn.Module):
 
 
 def _clamp(x: Tensor) -> Tensor:
-    """ReLU6, as the operator that `networks.rewrites` computes in place."""
+    """ReLU6, as the operator that `networks.graph` computes in place."""
     return _ATEN.hardtanh.default(x, 0.0, 6.0)

@@ -19,8 +19,7 @@ from torch import Tensor
 from patchproof.base.errors import Refused
 from patchproof.base.fingerprint import value_sha256
 from patchproof.base.text import brief, short_repr
-from patchproof.networks.batches import BatchedNetwork
-from patchproof.networks.windows import Windows
+from patchproof.networks.batches import BatchedNetwork, Windows
 
 NO_BOX_LOGIT = -20.0  # the logit where no candidate of a detector lies on the object: a score of 2e-9
 

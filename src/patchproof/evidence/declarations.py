@@ -1,6 +1,6 @@
 """What COCO JSON with the object's boxes can declare, and what `boxes` does with it."""
 
-from patchproof.base.declared import Declaration
+from patchproof.base.declarations import Declaration
 
 _FILE, _CORNERS = "COCO JSON", "COCO JSON (corners)"
 DECLARED: tuple[Declaration, ...] = (

@@ -3,7 +3,7 @@
 The reader of glTF looks extensions up by their names; those not listed are refused where required, else said.
 """
 
-from patchproof.base.declared import Declaration
+from patchproof.base.declarations import Declaration
 
 _CONVERT = "convert it first, such as with `gltf-transform cp IN.glb OUT.glb`, which writes it without compression"
 _EXTENSION, _GLTF, _OBJ, _PLY, _STL = "glTF extension", "glTF", "OBJ", "PLY", "STL"

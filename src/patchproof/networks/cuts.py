@@ -19,9 +19,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from patchproof.networks.batches import Windows, numbers_saved
 from patchproof.networks.graph import Program, compute
 from patchproof.networks.tracing import trace_module
-from patchproof.networks.windows import Windows, numbers_saved
 
 STRIDES = (2, 4, 8)  # in values deeper than these, one pixel reaches most entries
 STEP_PX = 16  # sides of rectangles are multiples of it, since each new size costs 3 ms once

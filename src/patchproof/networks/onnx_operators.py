@@ -23,10 +23,11 @@ from torch.nn import functional as F
 import patchproof.networks.onnx_shapes as shapes
 import patchproof.networks.onnx_windows as windows
 from patchproof.networks.bounds import UnsupportedNetwork, quote
-from patchproof.networks.onnx_recurrent import lstm
 from patchproof.networks.onnx_resize import resize, upsample
 from patchproof.networks.onnx_shapes import MAX_SIZES, numbers
 
+MAX_STEPS = 1 << 12  # of a sequence, one after the other
+_GATES = [0, 2, 3, 1]  # torch's in ONNX's order
 # the numbers of TensorProto.DataType
 _INTEGERS = {2: torch.uint8, 3: torch.int8, 5: torch.int16, 6: torch.int32, 7: torch.int64}
 DTYPES = _INTEGERS | {1: torch.float32, 9: torch.bool, 10: torch.float16, 11: torch.float64, 16: torch.bfloat16}
@@ -185,6 +186,33 @@ def _grid_sample(x, grid, /, *, align_corners=0, mode="linear", padding_mode="ze
     return F.grid_sample(x, grid, kind, padding_mode, bool(align_corners))
 
 
+# --- sequences ---
+
+
+def _lstm(
+    x, w, r, b=None, lengths=None, h=None, c=None, peepholes=None, /, *, hidden_size, activations=None,
+    direction="forward", input_forget=0
+):  # fmt: skip
+    """A long short-term memory of one or two directions."""
+    directions = len(w)
+    if activations not in (None, ["Sigmoid", "Tanh", "Tanh"] * directions) or input_forget:
+        raise ValueError(f"an LSTM with {activations}")
+    if lengths is not None or peepholes is not None:
+        raise ValueError("an LSTM with lengths or peepholes")
+    if len(x) > MAX_STEPS:
+        raise ValueError(f"a sequence of {len(x)} steps")
+    zeros = x.new_zeros(directions, x.shape[1], hidden_size)
+    states = [zeros if state is None else state for state in (h, c)]
+    parts = w, r, *(() if b is None else b.chunk(2, 1))
+    parts = [part.unflatten(1, (4, -1))[:, _GATES].flatten(1, 2) for part in parts]
+    weights = [part[direction] for direction in range(directions) for part in parts]
+    backward = direction == "reverse"
+    options = (b is not None, 1, 0.0, False, directions == 2, False)
+    y, *last = torch.lstm(x.flip(0) if backward else x, states, weights, *options)
+    y = (y.flip(0) if backward else y).unflatten(2, (directions, hidden_size)).transpose(1, 2)
+    return (y, *last)
+
+
 # names of the standard, and torch's for the same where they differ
 _UNARY = """Abs Acos Acosh Asin Asinh Atan Atanh BitwiseNot:bitwise_not Ceil Cos Cosh Det Erf Exp Floor IsNaN Log Neg
 Not:logical_not Reciprocal Relu Round Sigmoid Sign Sin Sinh Sqrt Tan Tanh"""
@@ -258,7 +286,7 @@ _TABLE: dict[str, Callable[..., Any]] = {
     "GroupNormalization": _group_norm,
     "InstanceNormalization": lambda x, a, b, /, *, epsilon=1e-5: F.instance_norm(x, None, None, a, b, eps=epsilon),
     "Dropout": _dropout,
-    "LSTM": lstm,
+    "LSTM": _lstm,
     # shapes
     "Reshape": shapes.reshape,
     "Flatten": lambda x, /, *, axis=1: x.reshape(math.prod(x.shape[:axis]), math.prod(x.shape[axis:])),

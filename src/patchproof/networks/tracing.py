@@ -12,8 +12,7 @@ from typing import Any
 import torch
 from torch.fx import Node, Tracer, map_arg
 
-from patchproof.networks.graph import Program
-from patchproof.networks.steps import Step, ValueRef, mark_last_uses, value_numbers
+from patchproof.networks.graph import Program, Step, ValueRef, mark_last_uses, value_numbers
 
 
 def trace_module(network: torch.nn.Module) -> Program | None:

@@ -1,6 +1,6 @@
 """List what pictures can declare, and what `photo.read` does with it; the tests hold a file for each entry."""
 
-from patchproof.base.declared import Declaration
+from patchproof.base.declarations import Declaration
 
 _ANY = "any picture"
 DECLARED: tuple[Declaration, ...] = (

@@ -1,6 +1,6 @@
 """List what sheets' PDFs can declare, and what `sheets.pdf_raster` does with it."""
 
-from patchproof.base.declared import Declaration
+from patchproof.base.declarations import Declaration
 
 DECLARED: tuple[Declaration, ...] = (
     Declaration("PDF", "attached manifest", "used", "checked as sheet.json; of several designs that of the run"),

@@ -19,7 +19,7 @@ from patchlab.results.rows import write_rows
 from patchlab.study.measure import call_in_turn, time_call
 from patchproof.base.workers import keep_freed_memory
 from patchproof.classifier import load_classifier
-from patchproof.networks.windows import Windows
+from patchproof.networks.batches import Windows
 
 NETWORKS = ("mobilenet_v2_1.0_224", "squeezenet1.1_224", "mobilenet_v1_0.75_192", "mobilenet_v1_0.25_128")
 SHARES = (0.2, 0.3, 0.4, 0.5, 0.6, 0.8)
