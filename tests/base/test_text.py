@@ -6,11 +6,11 @@ import warnings
 
 import pytest
 
-from patchproof.base.csv_file import read_csv
+from patchproof.base.csv_file import csv_lines, read_csv
 from patchproof.base.declarations import DECLARED
 from patchproof.base.errors import Refused
 from patchproof.base.input import read_json
-from patchproof.base.text import csv_lines, printable
+from patchproof.base.text import printable
 from patchproof.base.validation import StrictModel, read_toml, validate_model
 from patchproof.report.page import draw_figure, render_page
 from patchproof.sheets.layout import drawable_text

@@ -288,9 +288,8 @@ PLACE = {
     "front": "+z",
     "at": [1.0, 2.0, 3.0],
     "spin_deg": 0.0,
-    "lead": {"value": 0.1, "interval": [0.0, 0.2], "sure": False},
+    "lead": {"value": 0.1, "low": 0.0, "high": 0.2, "n": 24},
     "passes": 10,
-    "run_share": 0.2,
     "candidates": [
         {
             "at": "+z",

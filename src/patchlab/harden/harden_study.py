@@ -26,10 +26,10 @@ from patchlab.harden.labeled_photos import list_labeled_files, read_large_enough
 from patchlab.study.estimates import cluster_mean
 from patchlab.study.grid import Names, PositiveInt, short_name
 from patchlab.study.study import DEFAULT_WORK, Cell, FinishedStudy, Result, Study, Work, run_cells
+from patchproof.base.csv_file import csv_lines
 from patchproof.base.folder_lock import lock_folder
 from patchproof.base.intervals import estimate_difference, rate
 from patchproof.base.output import image_bytes, refuse_inputs_in, write_atomically
-from patchproof.base.text import csv_lines
 from patchproof.base.validation import Positive, Share, StrictModel, expand_path
 from patchproof.classifier.labels import find_labels
 from patchproof.classifier.load import load_classifier

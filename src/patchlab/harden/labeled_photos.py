@@ -10,9 +10,9 @@ from pathlib import Path, PurePath
 
 import numpy as np
 
+from patchproof.base.csv_file import csv_lines
 from patchproof.base.errors import Refused
 from patchproof.base.input import is_file, open_lazily
-from patchproof.base.text import csv_lines
 from patchproof.photo.read import read_photo
 from patchproof.photo.rejection import PhotoRejected
 from patchproof.scene.image_scene import read_labels

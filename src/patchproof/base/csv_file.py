@@ -1,12 +1,17 @@
-"""Read CSV files, with the apostrophes that `text.csv_lines` writes before formulas."""
+"""Read and write CSV files, with apostrophes before what a spreadsheet would take for formulas."""
 
 import csv
 import io
+import re
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 from patchproof.base.errors import Refused
 from patchproof.base.input import read_text
-from patchproof.base.text import FORMULA
+from patchproof.base.text import printable
+
+_FORMULA = re.compile(r"\s*[=+@＝＋－＠-]|[\t\r\n]")  # what a spreadsheet computes, after an apostrophe does not
 
 
 def read_csv(path: str | Path, expected: str) -> list[list[str]]:
@@ -19,9 +24,15 @@ def read_csv(path: str | Path, expected: str) -> list[list[str]]:
     for separator, name in ((";", "semicolons"), ("\t", "tabs")):
         if rows and all(separator in row[0] for row in rows):
             raise Refused(f"{expected}, separated by commas", f"{path} with {name}", "save it with commas")
-    return [[strip_apostrophe(cell) for cell in row] for row in rows]
+    return [[cell[1:] if cell.startswith("'") and _FORMULA.match(cell, 1) else cell for cell in row] for row in rows]
 
 
-def strip_apostrophe(cell: str) -> str:
-    """Undo the apostrophe of `csv_lines`."""
-    return cell[1:] if cell.startswith("'") and FORMULA.match(cell, 1) else cell
+def csv_lines(rows: Iterable[Iterable[Any]]) -> str:
+    """Write rows as CSV, their text `printable`, and with an apostrophe where a spreadsheet would see a formula."""
+
+    def cell(value: Any) -> Any:
+        return "'" * bool(_FORMULA.match(value)) + printable(value) if isinstance(value, str) else value
+
+    buffer = io.StringIO()
+    csv.writer(buffer, lineterminator="\n").writerows(map(cell, row) for row in rows)
+    return buffer.getvalue()

@@ -1,20 +1,16 @@
-"""Text that others wrote, such as names and labels, made fit for terminals, pages and spreadsheets.
+"""Text that others wrote, such as names and labels, made fit for terminals, pages.
 
-Out: text without characters that move a cursor or turn the direction of reading; CSV without formulas; values and
-objects in a line, for notebooks and refusals.
+Out: text without characters that move a cursor or turn the direction of reading; values and objects in a
+line, for notebooks and refusals.
 """
 
-import csv
-import io
-import re
 import shlex
 import unicodedata
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from operator import attrgetter
 from types import MethodType
 from typing import Any
 
-FORMULA = re.compile(r"\s*[=+@＝＋－＠-]|[\t\r\n]")  # what a spreadsheet computes, after an apostrophe does not
 _UNSEEN = ("Cc", "Cf", "Cs", "Zl", "Zp")  # control, format, surrogate, line and paragraph separators
 _JOINERS = "\u200c\u200d"  # invisible, and needed within words and emoji
 _MAX_CHARACTERS, _MAX_ITEMS = 100, 4  # of a value that is shown as it is
@@ -67,14 +63,3 @@ def short_repr(self: Any) -> str:
 
 def _escape(character: str) -> str:
     return character.encode("unicode_escape").decode()
-
-
-def csv_lines(rows: Iterable[Iterable[Any]]) -> str:
-    """Write rows as CSV, their text `printable`, and with an apostrophe where a spreadsheet would see a formula."""
-
-    def cell(value: Any) -> Any:
-        return "'" * bool(FORMULA.match(value)) + printable(value) if isinstance(value, str) else value
-
-    buffer = io.StringIO()
-    csv.writer(buffer, lineterminator="\n").writerows(map(cell, row) for row in rows)
-    return buffer.getvalue()

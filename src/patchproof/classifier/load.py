@@ -7,7 +7,7 @@
     file:NAME.onnx         an ONNX file with NAME.json beside it (network_file.py)
     torchvision:NAME       a torchvision or timm model with its published weights, which are downloaded (zoo.py);
     timm:NAME              with @FILE.safetensors behind the name, weights are read from that file
-    clip:NAME@FILE         a network of pictures and text, whose labels are the prompts of a file (clip.py)
+    clip:NAME@FILE         a network of pictures and text, whose labels are the prompts of a file (zoo.py)
     module:package.factory the user's own code, which is imported and called (custom.py)
     python:...             a Classifier given in Python beside the scene (custom.classifier_of)
 
@@ -18,6 +18,7 @@ gradients. Several names give several classifiers.
 import warnings
 from contextlib import nullcontext
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 
 import torch
@@ -30,6 +31,14 @@ from patchproof.classifier.check import check_network, smooth_pictures
 from patchproof.classifier.network import Classifier, freeze
 from patchproof.networks.batches import tune_batches
 
+_LOADERS = {  # by the word before the colon: module and function
+    "imagenet": "imagenet.load_imagenet",
+    "file": "network_file.load_network",
+    "torchvision": "zoo.load_torchvision",
+    "timm": "zoo.load_timm",
+    "clip": "zoo.load_clip",
+    "module": "custom.load_custom",
+}
 # Processor time on each thread, and memory beside the network, a thread's stack and heap: a transformer as large as
 # ViT-L (1.2 GB) takes 32 s and 1 GB for three pictures of 224 px and their gradient.
 CHECK_S = 50.0
@@ -72,36 +81,18 @@ def load_classifier(
         from patchproof.classifier.builtin_detector import load_builtin_detector
 
         return _prepare(load_builtin_detector(), device, is_own=True)
-    if kind == "imagenet":
-        from patchproof.classifier.imagenet import load_imagenet
-
-        classifier = load_imagenet(rest or "lite0")
-    elif kind == "file":
-        from patchproof.classifier.network_file import load_network
-
-        classifier = load_network(Path(rest))
-    elif kind in ("torchvision", "timm"):
-        from patchproof.classifier.zoo import load_timm, load_torchvision
-
-        classifier = load_torchvision(rest) if kind == "torchvision" else load_timm(rest)
-    elif kind == "clip":
-        from patchproof.classifier.clip import load_clip
-
-        classifier = load_clip(rest)
-    elif kind == "module":
-        from patchproof.classifier.custom import load_custom
-
-        classifier = load_custom(rest, Path(base))
-    elif kind == "python":
+    if kind in _LOADERS:
+        module, _, function = _LOADERS[kind].partition(".")
+        load = getattr(import_module(f"patchproof.classifier.{module}"), function)  # imported only for its networks
+        return _prepare(replace(load(rest, Path(base)) if kind == "module" else load(rest), name=name), device)
+    if kind == "python":
         raise Refused("the network itself, which was given in Python", name, "give it again: models=[...]")
-    else:
-        from patchproof.classifier.network_file import EXPORT_ADVICE
+    from patchproof.classifier.network_file import EXPORT_ADVICE
 
-        names = "builtin, builtin-detector, imagenet, torchvision:NAME, timm:NAME, clip:NAME@FILE, file:NAME.onnx"
-        words = {".onnx": f'write "file:{name}"', ".pt2": EXPORT_ADVICE}
-        do = words.get(Path(name).suffix, "write one of these")
-        raise Refused(f"a model named {names} or module:package.factory", f'"{name}"', do)
-    return _prepare(replace(classifier, name=name), device)
+    names = "builtin, builtin-detector, imagenet, torchvision:NAME, timm:NAME, clip:NAME@FILE, file:NAME.onnx"
+    words = {".onnx": f'write "file:{name}"', ".pt2": EXPORT_ADVICE}
+    do = words.get(Path(name).suffix, "write one of these")
+    raise Refused(f"a model named {names} or module:package.factory", f'"{name}"', do)
 
 
 def _prepare(classifier: Classifier, device: torch.device | str, is_own: bool = False) -> Classifier:

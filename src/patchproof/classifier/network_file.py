@@ -34,9 +34,9 @@ EXPORT_ADVICE = (
 )
 
 
-def load_network(path: Path) -> Classifier:
+def load_network(path: str | Path) -> Classifier:
     """The ONNX file and its card as a Classifier; other kinds of files are refused by their suffix."""
-    if path.suffix != ".onnx":
+    if (path := Path(path)).suffix != ".onnx":
         raise Refused("a network as an ONNX file, file:NAME.onnx", f"{path}", EXPORT_ADVICE)
     stored = network_bytes(path)  # read once, so that the hash is of the bytes that are loaded
     card = read_card(path.with_suffix(".json"))

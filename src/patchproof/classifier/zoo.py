@@ -1,10 +1,15 @@
-"""`torchvision:NAME` and `timm:NAME`: published networks with their published weights, or with those of a file.
+"""`torchvision:NAME`, `timm:NAME`, `clip:MODEL@FILE`: published networks with their published weights, or a file's.
 
 The weights are downloaded by these libraries, and only because the scene file names the model; `timm:hf-hub:ORG/NAME`
 is a model of the Hugging Face hub. With `NAME@FILE.safetensors` the weights are read from the file as numbers, never as
 a pickle; for a network trained with other labels, FILE.json beside it holds them and the input size. Input size, labels
 and normalization are the library's own; the latter is put inside the network.
-Left out on purpose: the libraries' resize-then-crop. Here every network sees the whole centered square.
+A CLIP model is one that open_clip knows, with its weights in FILE.safetensors, or MODEL/PRETRAINED with the weights
+published under that name and prompts in FILE.json; either way FILE.json is a network's card, whose labels are prompts.
+Left out on purpose: the libraries' resize-then-crop, here every network sees the whole centered square; means over
+several prompts of a label (write the one that counts); networks that write captions.
+
+Source: Radford et al., Learning Transferable Visual Models From Natural Language Supervision, ICML 2021, section 3.1.
 """
 
 import hashlib
@@ -187,6 +192,51 @@ def load_weights(network: Any, local: LocalWeights, name: str, advice: str) -> N
         have, want = (shapes.get(key, "absent") for shapes in (file_shapes, network_shapes))
         raise Refused(f"weights of {name}", f"{local.path}, where {key} is {have} instead of {want}", advice)
     network.load_state_dict({key: local.tensors[key] for key in network_shapes}, strict=False)
+
+
+class Prompted(nn.Module):
+    """The image half of a CLIP model, with K prompts as unit vectors K×E; `scale` multiplies the cosines."""
+
+    def __init__(self, sees: nn.Module, prompts: Tensor, scale: Tensor):
+        super().__init__()
+        self.sees = sees
+        self.prompts = nn.Buffer(prompts.detach().clone())
+        self.scale = nn.Buffer(scale.detach().clone())
+
+    def forward(self, photos: Tensor) -> Tensor:
+        """N×3×S×S normalized pictures → N×K logits."""
+        return self.scale * nn.functional.normalize(self.sees(photos), dim=-1) @ self.prompts.T
+
+
+def load_clip(name: str) -> Classifier:
+    """The classifier of pictures and text that `name`, MODEL@FILE, stands for: a logit is the cosine between picture
+    and prompt, times the network's own scale. The text half of the network encodes the prompts once and is not kept.
+    """
+    open_clip = import_library("open_clip", "clip", "clip")
+    model, _, file = name.rpartition("@")
+    path, (architecture, _, published) = Path(file), model.partition("/")
+    if not model or path.suffix not in (".safetensors", ".json"):
+        expected = "prompts, as clip:MODEL@WEIGHTS.safetensors with WEIGHTS.json or clip:MODEL/PRETRAINED@PROMPTS.json"
+        raise Refused(expected, f'"clip:{name}"', 'write {"input_px": 224, "labels": ["a photo of a mug", ...]} there')
+    if architecture not in open_clip.list_models():
+        do = nearest_names(architecture, open_clip.list_models(), "choose one of open_clip.list_models()")
+        raise Refused("a model of open_clip", f'"{architecture}"', do)
+    card = read_card(path.with_suffix(".json"))
+    if path.suffix == ".json":
+        options = {"pretrained": published or None, "require_pretrained": True}
+        network = download(f"clip:{model}", lambda: open_clip.create_model(architecture, **options))
+    else:
+        network = open_clip.create_model(architecture)
+        load_weights(network, read_weights(path), f"clip:{architecture}", "check the model's name")
+    view, size = network.visual.preprocess_cfg, network.visual.image_size
+    side_px = int(size if isinstance(size, int) else min(size))
+    if side_px != card.input_px:
+        do = f'write "input_px": {side_px} into it'
+        raise Refused(f"the input size of clip:{architecture}", f"{card.input_px} in {path.with_suffix('.json')}", do)
+    with torch.no_grad():
+        prompts = network.eval().encode_text(open_clip.get_tokenizer(architecture)(list(card.labels)), normalize=True)
+    sees = Prompted(network.visual, prompts, network.logit_scale.exp())
+    return classifier_of(Normalized(sees, view["mean"], view["std"]), side_px, card.labels, f"clip:{name}")
 
 
 @contextmanager

@@ -13,10 +13,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from pydantic import BaseModel
 
-from patchproof.base.csv_file import read_csv
+from patchproof.base.csv_file import csv_lines, read_csv
 from patchproof.base.errors import Refused
 from patchproof.base.input import read_json
-from patchproof.base.text import csv_lines, printable
+from patchproof.base.text import printable
 from patchproof.base.validation import Finite, validate_model
 from patchproof.evidence.boxes import CocoImage, image_names, is_same_shape, read_orientation, with_last_parts
 from patchproof.photo.corners import DesignCorners

@@ -10,8 +10,9 @@ Left out on purpose: cropping and padding, which make another design; textures; 
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -46,21 +47,6 @@ OUT_OF_GAMUT = 2.0  # ΔE00 that is just visible side by side
 VISIBLE_DETAIL_RATIO = 2.0  # times the closest photograph's resolution; finer detail is lost on any camera of the scene
 _NO_TEXTURE = 'leave patch.kind out, or "patch"'
 _FLAT_MODULE_PX = 8  # pixels per module of the flat piece in which markers are searched for
-
-
-@dataclass(frozen=True)
-class ImportRecord:
-    """Where a design comes from, and its quality on this piece."""
-
-    file: str
-    sha256: str  # of the file's bytes, or of an array's pixels
-    picture_px: tuple[int, int]
-    design_px: tuple[int, int]
-    dpi: float  # as printed
-    printer: str
-    out_of_gamut: float  # the share of its colors that the printer misses by more than `OUT_OF_GAMUT`
-    delta_e00: float  # the mean miss of all of them
-    notes: tuple[str, ...]
 
 
 def import_patch(
@@ -102,9 +88,9 @@ def import_patch(
     problem = set_problem(scene, compute.device, models, jobs=compute.jobs)
     problem = replace(problem, subject=replace(problem.patch, design_px=fitted.shape[1::-1]))
     design = problem.patch.pixels(from_pixels(fitted, problem.device))
-    record = asdict(_import_record(problem, file, sha256, pixels, fitted, design))
+    record: dict[str, Any] = {"file": file, "sha256": sha256} | _import_record(problem, pixels, fitted, design)
     with new_folder(out, RUN_FILE_PATTERNS, overwrite, named_paths(scene.settings, scene.base).values()) as folder:
-        run = finish_run(problem, design, folder, promise, progress, record | {"notes": said + record["notes"]})
+        run = finish_run(problem, design, folder, promise, progress, record | {"notes": (*said, *record["notes"])})
     return replace(run, folder=out)
 
 
@@ -153,24 +139,22 @@ def _read_picture(picture: str | Path | np.ndarray) -> tuple[str, str, np.ndarra
     return printable(path.name), hash_file(path), photo.srgb, photo.said
 
 
-def _import_record(
-    problem: Problem, file: str, sha256: str, picture: np.ndarray, fitted: np.ndarray, design: np.ndarray
-) -> ImportRecord:
-    """The record of a picture: as it came, as it fits the piece, and as it is printed."""
+def _import_record(problem: Problem, picture: np.ndarray, fitted: np.ndarray, design: np.ndarray) -> dict[str, Any]:
+    """The quality of a picture on its piece: as it came, as it fits the piece, and as it is printed; `out_of_gamut` is
+    the share of its colors that the printer misses by more than `OUT_OF_GAMUT`, `delta_e00` the mean miss of all.
+    """
     scene = require_piece(problem.scene)
     not_markers = ~marker_image(scene.piece, design.shape[1::-1])[1]
     errors = problem.printer.gamut_distance(from_pixels(design)[None])[0, 0].numpy()[not_markers]
-    return ImportRecord(
-        file=file,
-        sha256=sha256,
-        picture_px=picture.shape[1::-1],
-        design_px=fitted.shape[1::-1],
-        dpi=round(MM_PER_INCH * _px_per_mm(fitted, scene), 1),
-        printer=problem.printer.name,
-        out_of_gamut=round(float((errors > OUT_OF_GAMUT).mean()), 4),
-        delta_e00=round(float(errors.mean()), 2),
-        notes=(*_resolution_notes(fitted, picture, scene, problem.network_px), *_marker_notes(design, scene.piece)),
-    )
+    return {
+        "picture_px": picture.shape[1::-1],
+        "design_px": fitted.shape[1::-1],
+        "dpi": round(MM_PER_INCH * _px_per_mm(fitted, scene), 1),
+        "printer": problem.printer.name,
+        "out_of_gamut": round(float((errors > OUT_OF_GAMUT).mean()), 4),
+        "delta_e00": round(float(errors.mean()), 2),
+        "notes": (*_resolution_notes(fitted, picture, scene, problem.network_px), *_marker_notes(design, scene.piece)),
+    }
 
 
 def _px_per_mm(design: np.ndarray, scene: PieceScene) -> float:

@@ -2,16 +2,16 @@
 
 In: a `Place` and the scene with the piece there. Out: both files, and the place read back. The picture shows the object
 from four directions across the scene's azimuths, each place as a small square from yellow (the best) to purple (the
-worst), the drafted ones with their rank, and the chosen piece's outline at its size; a legend says so.
+worst), the drafted ones with their rank, and the chosen piece's outline at its size; the title says so.
 """
 
-from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from PIL import Image, ImageDraw, ImageFont
 
 from patchproof.base import geometry
 from patchproof.base.color import photo_codes_from_srgb, srgb_from_linear
@@ -21,32 +21,32 @@ from patchproof.base.output import write_atomically
 from patchproof.base.settings import BackgroundSettings
 from patchproof.base.validation import validate_model
 from patchproof.channel.effects import Light, Pose
-from patchproof.optimizer.place_search import Candidate, Place
+from patchproof.optimizer.place_search import Place
 from patchproof.render.photograph import shade
 from patchproof.render.raster import rasterize
 from patchproof.render.stage import Stage, set_stage
 from patchproof.render.views import cameras, near_mm, render_views
 from patchproof.scene.backgrounds import load_backgrounds
 from patchproof.scene.conditions import Conditions
-from patchproof.scene.patch_scene import PatchScene
-from patchproof.scene.placement import patch_frame, side_frame, spun_axes
+from patchproof.scene.patch_scene import PatchScene, PiecePosition
+from patchproof.scene.placement import SurfaceFrame, patch_frame, side_frame
 from patchproof.scene.unplaced_scene import UnplacedScene
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _RECORD_FILE, _PICTURE_FILE = "place.json", "place.png"
 _DIRECTIONS, _SIDE_PX = 4, 420
-_LEGEND_PX = 30  # height of the legend
 _MARGIN = 1.05  # times the object's diagonal
-_SQUARE_SHARE = 0.3  # a square's side, of the piece's
 _IN_FRONT_MM = 2.0  # a square's middle at most this deep behind the surface is visible
-_COLORS = np.array([(253, 231, 37), (33, 145, 140), (68, 1, 84)], float)  # of viridis, legible to the color-blind
-_CHOSEN_COLOR = (230, 0, 90)
+_CHOSEN_COLOR = "#e6005a"
 
 
 def save_place(place: Place, scene: PatchScene, folder: Path) -> None:
     """Write both files; `scene` has the piece at the place."""
     write_atomically(folder / _RECORD_FILE, place.model_dump_json(indent=1) + "\n")
-    picture = _picture(place, scene)
-    write_atomically(folder / _PICTURE_FILE, lambda path: picture.save(path, "PNG"))
+    figure = _draw(place, scene)
+    write_atomically(folder / _PICTURE_FILE, lambda path: figure.savefig(path, format="png"))
 
 
 def read_place(folder: Path, scene: UnplacedScene | None = None) -> Place | None:
@@ -63,42 +63,42 @@ def read_place(folder: Path, scene: UnplacedScene | None = None) -> Place | None
     return place
 
 
-def _picture(place: Place, scene: PatchScene) -> Image.Image:
+def _draw(place: Place, scene: PatchScene) -> "Figure":
+    """Draw the object with all candidates and the piece's outline, from four directions."""
+    from matplotlib.figure import Figure
+
     scene, conditions = _even_scene(scene)
     stage, size, poses = set_stage(scene), (_SIDE_PX, _SIDE_PX), scene.camera_from_world(conditions)
     with torch.no_grad():
         light = shade(render_views(stage, None, conditions, size), None)
     pictures = photo_codes_from_srgb(srgb_from_linear(light.clamp(0, 1)).permute(0, 2, 3, 1).numpy())
-    panels = []
-    for pose, picture in zip(poses, pictures, strict=True):
-        panel, depth = Image.fromarray(picture), _depth(stage, scene, pose)
-        draw = ImageDraw.Draw(panel)
-        for rank, candidate, corners in _squares(place, scene):
-            if _is_visible(scene, pose, depth, corners):
-                color = _color(rank / max(len(place.candidates) - 1, 1))
-                quad = geometry.project(scene.matrix_px(size), pose, corners)
-                draw.polygon([*map(tuple, quad)], color, (0, 0, 0))
-                if candidate.draft is not None:
-                    x, y = quad.mean(0)
-                    font, white = ImageFont.load_default(18), (255, 255, 255)
-                    draw.text((x, y), f"{rank + 1}", (0, 0, 0), font, "mm", stroke_width=2, stroke_fill=white)
-        border = geometry.rect_border((0, 0, *scene.placement.size_mm), 16)  # bent paper has bent edges
-        outline = scene.placement.world(np.concatenate([border, border[:1]]))
-        if scene.placement.normal @ (geometry.camera_centers(pose[None])[0] - scene.placement.center_mm) > 0:
-            draw.line([*map(tuple, geometry.project(scene.matrix_px(size), pose, outline))], _CHOSEN_COLOR, 4, "curve")
-        panels.append(np.asarray(panel))
-    picture = Image.fromarray(np.pad(np.concatenate(panels, 1), [(0, _LEGEND_PX), (0, 0), (0, 0)], constant_values=255))
-    draw, x = ImageDraw.Draw(picture), _LEGEND_PX // 2
-    count, drafted = len(place.candidates), sum(candidate.draft is not None for candidate in place.candidates)
-    entries = [(_color(0), f"best of {count} places"), (_color(0.5), "middle"), (_color(1), "worst")]
-    entries += [(None, f"1 to {drafted}: drafted, by rank")] if drafted else []
-    for color, words in [*entries, (_CHOSEN_COLOR, "outline: the piece where it goes")]:
-        if color is not None:
-            draw.rectangle((x, _SIDE_PX + 8, x + _LEGEND_PX - 16, _SIDE_PX + _LEGEND_PX - 8), color, (0, 0, 0))
-        at, font = (x + _LEGEND_PX, _SIDE_PX + _LEGEND_PX / 2), ImageFont.load_default(14)
-        draw.text(at, words, (0, 0, 0), font, "lm")
-        x = int(at[0] + font.getlength(words)) + _LEGEND_PX
-    return picture
+    placement, frames = scene.placement, [_frame(scene, each.at) for each in place.candidates]
+    border = geometry.rect_border((0, 0, *placement.size_mm), 16)  # bent paper has bent edges
+    outline = placement.world(np.concatenate([border, border[:1]]))
+    figure = Figure(figsize=(4 * _DIRECTIONS, 4.4), layout="constrained")
+    drafted = sum(candidate.draft is not None for candidate in place.candidates)
+    numbers = f"1 to {drafted}: drafted, by rank; " if drafted else ""
+    ranks = f"{len(frames)} places from yellow (the best) to purple (the worst)"
+    figure.suptitle(f"{ranks}; {numbers}outline: the piece where it goes")
+    for axes, pose, picture in zip(figure.subplots(1, _DIRECTIONS), poses, pictures, strict=True):
+        axes.imshow(picture, extent=(0, _SIDE_PX, _SIDE_PX, 0))
+        axes.set_axis_off()
+        project, eye = partial(geometry.project, scene.matrix_px(size), pose), geometry.camera_centers(pose[None])[0]
+        depth = _depth(stage, scene, pose)
+        visible = [i for i, each in enumerate(frames) if _is_visible(project, pose, depth, eye, each)][::-1]
+        x, y = project(np.array([frames[i].origin_mm for i in visible]).reshape(-1, 3)).T
+        looks = {"marker": "s", "cmap": "viridis_r", "edgecolors": "black"}
+        axes.scatter(x, y, 200, visible, vmin=0, vmax=max(len(frames) - 1, 1), **looks)
+        for k, i in ((k, i) for k, i in enumerate(visible) if i < drafted):
+            axes.text(x[k], y[k], f"{i + 1}", ha="center", va="center")
+        if placement.normal @ (eye - placement.center_mm) > 0:
+            axes.plot(*project(outline).T, color=_CHOSEN_COLOR, linewidth=3)
+    return figure
+
+
+def _frame(scene: PatchScene, at: PiecePosition) -> SurfaceFrame:
+    patch = scene.settings.patch
+    return side_frame(scene.mesh, at) if isinstance(at, str) else patch_frame(scene.mesh, patch.changed(at_mm=at))
 
 
 def _even_scene(scene: PatchScene) -> tuple[PatchScene, Conditions]:
@@ -119,25 +119,13 @@ def _even_scene(scene: PatchScene) -> tuple[PatchScene, Conditions]:
     return replace(scene, settings=settings, backgrounds=white, camera=None), Conditions(pose=pose, light=light)
 
 
-def _squares(place: Place, scene: PatchScene) -> Iterator[tuple[int, Candidate, np.ndarray]]:
-    """(rank from 0, candidate, 4×3 corners of its small square in the world), the worst first."""
-    half_mm, patch = _SQUARE_SHARE / 2 * min(scene.placement.size_mm), scene.settings.patch
-    for rank, candidate in reversed([*enumerate(place.candidates)]):
-        at = candidate.at
-        frame = side_frame(scene.mesh, at) if isinstance(at, str) else patch_frame(scene.mesh, patch.changed(at_mm=at))
-        right, up = spun_axes(frame, candidate.spin_deg)
-        signs = np.array([(-1, 1), (1, 1), (1, -1), (-1, -1)])
-        yield rank, candidate, frame.origin_mm + half_mm * signs @ np.stack([right, up])
-
-
-def _is_visible(scene: PatchScene, pose: np.ndarray, depth: np.ndarray, corners: np.ndarray) -> bool:
-    """True if the middle of a square faces the camera and nothing is in front of it."""
-    middle, normal = corners.mean(0), np.cross(corners[0] - corners[1], corners[2] - corners[1])
-    if normal @ (geometry.camera_centers(pose[None])[0] - middle) <= 0:
+def _is_visible(project: Any, pose: np.ndarray, depth: np.ndarray, eye: np.ndarray, frame: SurfaceFrame) -> bool:
+    """True if a place faces the camera and nothing is in front of it."""
+    if frame.normal @ (eye - frame.origin_mm) <= 0:
         return False
-    x, y = np.floor(geometry.project(scene.matrix_px(depth.shape[::-1]), pose, middle[None])[0]).astype(int)
+    x, y = np.floor(project(frame.origin_mm[None])[0]).astype(int)
     inside = 0 <= x < depth.shape[1] and 0 <= y < depth.shape[0]
-    return inside and bool((pose[:3] @ [*middle, 1])[2] < depth[y, x] + _IN_FRONT_MM)
+    return inside and bool((pose[:3] @ [*frame.origin_mm, 1])[2] < depth[y, x] + _IN_FRONT_MM)
 
 
 def _depth(stage: Stage, scene: PatchScene, pose: np.ndarray) -> np.ndarray:
@@ -148,9 +136,3 @@ def _depth(stage: Stage, scene: PatchScene, pose: np.ndarray) -> np.ndarray:
     depth = np.full(_SIDE_PX * _SIDE_PX, np.inf)
     depth[fragments.pixel.numpy()] = fragments.depth.numpy()
     return depth.reshape(_SIDE_PX, _SIDE_PX)
-
-
-def _color(share: float) -> tuple[int, int, int]:
-    """Yellow at 0, purple at 1."""
-    red, green, blue = (round(float(np.interp(share, (0, 0.5, 1), column))) for column in _COLORS.T)
-    return red, green, blue

@@ -20,17 +20,15 @@ from pydantic import Field
 
 from patchproof.base.compute import Compute
 from patchproof.base.errors import Refused
-from patchproof.base.intervals import student_mean
+from patchproof.base.intervals import Estimate, student_mean
 from patchproof.base.progress import Advance, Progress, no_progress
-from patchproof.base.settings import OptimizeSettings
 from patchproof.base.validation import Side, StrictModel
 from patchproof.base.workers import fork_workers
 from patchproof.classifier.network import Classifier
 from patchproof.optimizer.expectation import gradient_in_views, training_views
-from patchproof.optimizer.loop import draft, start, views_per_network
+from patchproof.optimizer.loop import draft, start
 from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.problem import Problem, set_problem
-from patchproof.optimizer.promise import min_promise_passes
 from patchproof.optimizer.responses import responses
 from patchproof.optimizer.subject import Loss
 from patchproof.render.pixels import Appearance
@@ -64,20 +62,10 @@ class Candidate(StrictModel):
     draft: float | None = None
 
 
-class Lead(StrictModel):
-    """The difference of the runner-up's loss and the chosen draft's in the same held-out views, with its 95 % interval;
-    `sure` if that interval lies above 0.
-    """
-
-    value: float
-    interval: tuple[float, float]
-    sure: bool
-
-
 class Place(StrictModel):
     """The chosen place, in the form of the keys `patch.at_mm` (or `patch.side`), `patch.spin_deg` and `view.front`.
-    Candidates run from the best to the worst. `passes` counts one network's passes, `run_share` is their share of a
-    default run's.
+    Candidates run from the best to the worst. `lead` is the difference of the runner-up's loss and the chosen draft's
+    in the same held-out views, `passes` counts one network's passes.
     """
 
     sheet_id: str  # of the scene that was searched
@@ -85,9 +73,8 @@ class Place(StrictModel):
     front: Side
     at: PiecePosition
     spin_deg: float
-    lead: Lead | None  # None if no other place was drafted
+    lead: Estimate | None  # None if no other place was drafted
     passes: int
-    run_share: float
     candidates: tuple[Candidate, ...]
 
 
@@ -139,9 +126,8 @@ def choose_place(
         front=scene.settings.patch.side,
         at=candidates[0].at,
         spin_deg=candidates[0].spin_deg,
-        lead=_lead(drafts[ranking[1]] - drafts[ranking[0]]) if len(ranking) > 1 else None,
+        lead=student_mean(drafts[ranking[1]] - drafts[ranking[0]]) if len(ranking) > 1 else None,
         passes=search.passes,
-        run_share=search.passes / default_run_passes(),
         candidates=tuple(candidates),
     )
 
@@ -151,19 +137,12 @@ def place_lines(place: Place) -> list[str]:
     at = f'side = "{place.at}"' if isinstance(place.at, str) else f"at_mm = [{', '.join(f'{v:g}' for v in place.at)}]"
     where = f'{at}, spin_deg = {place.spin_deg:g}, view.front = "{place.front}"'
     draft_count = sum(candidate.draft is not None for candidate in place.candidates)
-    cost = f"{len(place.candidates)} tried, {draft_count} drafted, {place.run_share:.0%} of a default run's passes"
+    cost = f"{len(place.candidates)} tried, {draft_count} drafted, in {place.passes} passes of a network"
     if place.lead is None:
         return [f"chosen: {where}", f"the only place; {cost}"]
-    low, high = place.lead.interval
-    sure = "surely" if place.lead.sure else "not surely"
-    lead = f"{sure} better than the next: loss lower by {place.lead.value:.2f} [{low:.2f}, {high:.2f}]"
-    return [f"chosen: {where}", f"{lead}; {cost}"]
-
-
-def default_run_passes() -> int:
-    """A network's passes in a default run: all views, the training views once more, and a short promise."""
-    settings = OptimizeSettings()
-    return views_per_network(settings) + settings.steps * settings.views + min_promise_passes()
+    lead, sure = place.lead, "surely" if place.lead.low > 0 else "not surely"
+    better = f"{sure} better than the next: loss lower by {lead.value:.2f} [{lead.low:.2f}, {lead.high:.2f}]"
+    return [f"chosen: {where}", f"{better}; {cost}"]
 
 
 class _Search:
@@ -266,11 +245,6 @@ def _thin_out(trials: Sequence[_ScreenedPlace], distance_mm: float) -> list[_Scr
         if not np.logical_and(is_near, same_side).any():
             remaining.append(trial)
     return remaining
-
-
-def _lead(differences: np.ndarray) -> Lead:
-    mean = student_mean(differences)
-    return Lead(value=mean.value, interval=(mean.low, mean.high), sure=mean.low > 0)
 
 
 def _candidate(trial: _ScreenedPlace, draft_loss: float | None = None) -> Candidate:

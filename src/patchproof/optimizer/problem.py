@@ -17,6 +17,7 @@ from torch import Tensor
 from patchproof.base.errors import Refused
 from patchproof.base.fingerprint import refuse_other_inputs
 from patchproof.base.settings import OptimizeSettings
+from patchproof.base.text import brief
 from patchproof.base.validation import refuse_untrusted
 from patchproof.base.workers import use_threads
 from patchproof.channel.printer import Printer, load_printer
@@ -154,9 +155,7 @@ def set_problem(
     printer = load_printer(settings.printer.profile, scene.base)
     stage = set_stage(scene, device)
     if loss is not None:
-        from patchproof.optimizer.custom_loss import check_loss
-
-        check_loss(loss, classifiers[0], indices[0], stage.device)
+        _check_loss(loss, classifiers[0], indices[0], stage.device)
     subject = subject_of(scene, printer, max(classifier.input_px for classifier in classifiers), stage.device)
     jobs = jobs if stage.device.type == "cpu" else 1
     if jobs > 1:
@@ -191,3 +190,19 @@ def check_device(device: torch.device | str) -> None:
     except (RuntimeError, AssertionError) as error:
         reason = str(error).splitlines()[0]
         raise Refused("a device that this torch can use", f"{device} ({reason})", "use --device cpu") from error
+
+
+def _check_loss(loss: Loss, classifier: Classifier, indices: tuple[int, ...], device: torch.device) -> None:
+    """Refuse a loss that fails, or that is not one differentiable number for each photograph."""
+    generator = torch.Generator().manual_seed(0)
+    logits = torch.randn(3, len(classifier.labels), generator=generator).to(device).requires_grad_()
+    expected = f"loss(logits N×{len(classifier.labels)}, indices) to return N losses, a tensor of shape ({3},) here"
+    try:
+        losses = loss(logits, indices)
+    except Exception as error:  # the user's code may raise anything
+        got = f"{type(error).__name__} ({error})"
+        raise Refused(expected, got, "take the logits and the target's label indices") from error
+    if not isinstance(losses, Tensor) or losses.shape != logits.shape[:1]:
+        raise Refused(expected, brief(losses), "return one loss for each row: no mean, no sum over the rows")
+    if losses.grad_fn is None:
+        raise Refused(f"{expected}, with a gradient", "one without", "compute it with torch, without detach or no_grad")

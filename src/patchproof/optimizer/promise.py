@@ -154,12 +154,6 @@ def _look_positions(total: int, per_session: int) -> list[int]:
     return [0, *sorted({min(total, math.ceil(sessions * part) * per_session) for part in (0.5, 0.75, 1)})]
 
 
-def min_promise_passes() -> int:
-    """The pictures that a network sees in a promise that stops at its first look."""
-    views = _look_positions(PROMISE_VIEWS, VIEWS_PER_SESSION)[1]
-    return views + len(CONTROLS) * int(_control_mask(views, VIEWS_PER_SESSION).sum())
-
-
 def _outermost_mm(problem: Problem) -> tuple[tuple[float, float, float], ...]:
     """The object's outermost points in the frame of its piece, if a network uses its box in photographs."""
     scene = problem.scene

@@ -12,9 +12,9 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from patchproof.base.csv_file import csv_lines
 from patchproof.base.intervals import Estimate
 from patchproof.base.output import write_atomically
-from patchproof.base.text import csv_lines
 from patchproof.report.page import data_uri, draw_figure, render_page, versions_of
 
 if TYPE_CHECKING:

@@ -12,9 +12,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from patchproof.base.csv_file import csv_lines
 from patchproof.base.goal import points_text
 from patchproof.base.output import make_folder, write_atomically
-from patchproof.base.text import csv_lines
 from patchproof.report import words
 from patchproof.report.page import DELTA_TOP, data_uri, render_page, saved_pictures
 from patchproof.report.plots import ledger_plot, recognition_plot

@@ -165,7 +165,6 @@ def reprint(
     scan_dpi: Annotated[float | None, Option(min=30, max=1200, help="Scan the uncut page flat instead.")] = None,
     path_traced: Annotated[bool, Option("--path-traced", help="Render with Mitsuba 3 (slow).")] = False,
     jobs: Jobs = None,
-    cluster: Cluster = None,
     trust: Trust = False,
     overwrite: Overwrite = False,
 ) -> None:
@@ -192,7 +191,7 @@ def reprint(
     else:
         with progress_bar() as bar:
             options: dict[str, Any] = {"sessions": sessions, "seed": seed, "overwrite": overwrite, "progress": bar}
-            compute = Compute(jobs=jobs or 1, cluster=cluster)
+            compute = Compute(jobs=jobs or 1)
             taken = reprint_sheet(pdf, finished_run, n, out, how, compute=compute, **options)
     say(f"{len(taken.photos)} photographs: {out}")
 
