@@ -1,6 +1,6 @@
 """Confidence intervals of rates, of means, and of differences between rates.
 
-In: counts and figures. Out: intervals and `Estimate`s for tables, at 95 % unless another confidence is passed.
+In: counts and figures. Out: intervals and `Estimate`s for tables, at 95 %.
 A rate from n images gets Wilson's interval; `sessions` predicts what photographs of new sessions will show.
 Differences on the same conditions are paired (Newcombe 1998b, method 10); those on different conditions follow Newcombe
 1998a, method 10.
@@ -14,7 +14,6 @@ import math
 import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -23,6 +22,7 @@ if TYPE_CHECKING:
 CONFIDENCE = 0.95
 MIN_CLUSTERS = 5
 _TAIL = (1 - CONFIDENCE) / 2
+_Z = statistics.NormalDist().inv_cdf(0.5 + CONFIDENCE / 2)
 
 
 @dataclass(frozen=True)
@@ -57,12 +57,11 @@ def student_mean(values: "Sequence[float] | np.ndarray") -> Estimate:
     return Estimate(value, value - half, value + half, n)
 
 
-def wilson(successes: int, n: int, confidence: float = CONFIDENCE) -> tuple[float, float]:
+def wilson(successes: int, n: int) -> tuple[float, float]:
     """Return Wilson's interval (low, high) of a rate; (0, 1) if n is 0."""
     if n == 0:
         return 0.0, 1.0
-    z = _z(confidence)
-    rate = successes / n
+    z, rate = _Z, successes / n
     center = (rate + z * z / (2 * n)) / (1 + z * z / n)
     half = z * math.sqrt(rate * (1 - rate) / n + z * z / (4 * n * n)) / (1 + z * z / n)
     # at 0 and n successes the formula gives 0 and 1 up to rounding
@@ -111,8 +110,3 @@ def resampled_means(values: "np.ndarray", draws: int) -> "np.ndarray":
     import numpy as np
 
     return values[np.random.default_rng(0).integers(0, len(values), (draws, len(values)))].mean(1)
-
-
-@lru_cache(maxsize=8)
-def _z(confidence: float) -> float:
-    return statistics.NormalDist().inv_cdf(0.5 + confidence / 2)

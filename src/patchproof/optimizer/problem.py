@@ -105,11 +105,9 @@ class Problem:
         with torch.no_grad():
             return self.subject.appearance(self.subject.start())
 
-    def with_training(self, optimize: OptimizeSettings, seed: int | None = None) -> "Problem":
-        """A copy with these settings of the loop, and another seed of its draws."""
-        settings = self.scene.settings.changed(optimize=optimize)
-        scene = replace(self.scene, settings=settings, seed=self.scene.seed if seed is None else seed)
-        return replace(self, scene=scene)
+    def with_training(self, optimize: OptimizeSettings) -> "Problem":
+        """A copy with these settings of the loop."""
+        return replace(self, scene=replace(self.scene, settings=self.scene.settings.changed(optimize=optimize)))
 
     def with_piece_at(self, scene: PatchScene) -> "Problem":
         """A copy with the piece where `scene` has it; the object's tensors are shared."""
