@@ -138,6 +138,15 @@ def test_more_zeros_on_one_side_are_zeros_in_small_weights(sides):
     check_alike(network, truth, torch.randn(2, 3, 8, 8))
 
 
+@pytest.mark.parametrize("second", ["D", "d", "e"])
+def test_weights_that_several_convolutions_share_stay_as_they_are(second):
+    """Also under other names."""
+    network = program(f"""d = Identity(D) e = Identity(D) a = Conv<pads=[0,0,1,1], group=3>(x, d)
+        b = Conv<pads=[0,0,1,1], group=3>(x, {second}) y = Add(a, b)""")
+    (kernel,) = weights("D")
+    check_alike(network, lambda x: 2 * F.conv2d(F.pad(x, (0, 1, 0, 1)), kernel, groups=3), torch.randn(2, 3, 8, 8))
+
+
 def test_even_zeros_are_a_convolutions_own():
     assert names(program("y = Conv<pads=[2,1,2,1]>(x, W)")) == ["convolution.default"]
 

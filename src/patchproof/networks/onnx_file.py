@@ -155,7 +155,7 @@ class _GraphReader:
         if len(inputs) != 1:
             raise UnsupportedNetwork(f"{len(inputs)} inputs, not one of N×3×S×S")
         batch, sizes, colors_last = _shape(inputs[0]["type"]["tensor"])
-        self.count = len(self.weights)
+        self.count, self.constants = len(self.weights), {*self.values}  # before aliases of them
         self.of_four |= {i: list(weight.shape[2:]) for i, weight in enumerate(self.weights) if weight.dim() == 4}
         photos = self._new(f"{inputs[0]['name']} N×3×S×S" if colors_last else inputs[0]["name"])
         steps: list[Step] = []
@@ -222,8 +222,8 @@ class _GraphReader:
         of_photos = any(isinstance(value, ValueRef) and value.number in self.of_photos for value in inputs)
         if of_photos and name == "BatchNormalization" and attributes.get("training_mode"):
             raise UnsupportedNetwork("the attribute training_mode = 1")
-        own = self.weights if name == "Conv" and self.uses[node["input"][1]] == 1 else []
-        if calls := _aten_calls(name, inputs, attributes, self.of_four, own):
+        is_own = name == "Conv" and (word := node["input"][1]) in self.constants and self.uses[word] == 1
+        if calls := _aten_calls(name, inputs, attributes, self.of_four, self.weights if is_own else []):
             steps = self._aten_steps(calls, name, inputs[0], outputs[0])
         else:
             results = [self._new(word) for word in [*outputs, *[""] * (count - len(outputs))]]

@@ -170,8 +170,8 @@ def set_problem(
 
 
 def subject_of(scene: Scene, printer: Printer, network_px: int, device: torch.device) -> "Patch | Texture":
-    """What a scene leaves open: the design of its piece, no finer than networks whose largest input has side
-    `network_px` can see it, or the object's texture.
+    """Make the subject of optimization: the design of a scene's piece, no finer than networks whose largest input has
+    side `network_px` can see it, or the object's texture.
     """
     if scene.HAS_PIECE:
         scene = require_piece(scene)
@@ -194,7 +194,7 @@ def _check_loss(loss: Loss, classifier: Classifier, indices: tuple[int, ...], de
     """Refuse a loss that fails, or that is not one differentiable number for each photograph."""
     generator = torch.Generator().manual_seed(0)
     logits = torch.randn(3, len(classifier.labels), generator=generator).to(device).requires_grad_()
-    expected = f"loss(logits N×{len(classifier.labels)}, indices) to return N losses, a tensor of shape ({3},) here"
+    expected = f"loss(logits N×{len(classifier.labels)}, indices) to return N losses, a tensor of shape (3,) here"
     try:
         losses = loss(logits, indices)
     except Exception as error:  # the user's code may raise anything
