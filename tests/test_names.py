@@ -15,7 +15,7 @@ RESULTS = Path(patchlab.__file__).parent / "results"  # programs that each made 
 TWICE: dict[str, str] = {}  # a class or alias that may be defined twice, with the reason; five at most
 # Functions by which several modules answer one question; their callers take the module as a parameter.
 INTERFACES = {
-    *("build", "subject_of", "read_design"),  # kinds of scenes, and of what is optimized
+    "build",  # kinds of scenes
     *("cells", "run", "tables", "figures"),  # studies
     *("main", "train", "write"),  # programs
 }
