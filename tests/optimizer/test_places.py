@@ -309,8 +309,8 @@ def test_the_picture_shows_the_places_and_the_chosen_outline(tmp_path):
     save_place(place, scene.with_piece_at(place.at, 0), tmp_path)
     assert read_place(tmp_path, scene) == place
     shown = {color for _, color in Image.open(tmp_path / "place.png").convert("RGB").getcolors(1 << 20)}
-    ranks = {tuple(color[:3].tolist()) for color in colormaps["viridis_r"]([0.0, 0.5, 1.0], bytes=True)}
-    assert ranks | {(230, 0, 90)} <= shown
+    ranks = np.rint(255 * colormaps["viridis_r"]([0.0, 0.5, 1.0]))[:, :3].astype(int).tolist()
+    assert {*map(tuple, ranks), (230, 0, 90)} <= shown
 
 
 def test_plan_reports_the_search(tmp_path, monkeypatch, a_small_run):
