@@ -13,7 +13,6 @@ from loaded import Step, loaded_by
 
 from patchproof.base import geometry
 from patchproof.base.packaged import packaged_path
-from patchproof.optimizer import run as run_module
 from patchproof.sheets.manifest import load_manifest
 from patchproof.sheets.pdf_raster import attached_manifests
 
@@ -140,26 +139,11 @@ def controls(journey, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def again(journey, controls, tmp_path_factory):
-    """The report of the same photographs with the run at hand, beside the controls'."""
+    """The report of the same photographs beside the controls'."""
     folder, sheet = tmp_path_factory.mktemp("again"), journey / "sheet.json"
-    with_run = ("--run", journey / "run", "--controls", controls, "--out", folder / "report")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("patchproof.reprints.photo_forecast.DRAWS", 6)
-        assert command("verify", journey / "photos", "--sheet", sheet, *with_run) == 0
-    page = (folder / "report" / "report.html").read_text("utf-8")
-    assert "“Promised” is a mean over all views that the scene allows, “expected” one over the views of these" in page
+    given = ("--controls", controls, "--out", folder / "report")
+    assert command("verify", journey / "photos", "--sheet", sheet, *given) == 0
     return json.loads((folder / "report" / "report.json").read_text())
-
-
-def test_forecasts_at_measured_views_are_what_photographs_show(report, again):
-    chances = np.array([photo["forecast"] for photo in again["photos"]])
-    seen = np.array([photo["predictions"]["builtin"]["recognized"] for photo in again["photos"]])
-    assert ((chances > 0) & (chances < 1)).all() and (np.abs(chances - seen) > 0.5).sum() <= 1
-    summary = again["summary"]["forecast"]
-    assert summary["photos"] == PHOTOS and summary["recognized"] == seen.sum()
-    assert summary["interval"][0] <= summary["recognized"] <= summary["interval"][1]
-    assert summary["brier"] == pytest.approx(np.mean((chances - seen) ** 2))
-    assert all(photo["forecast"] is None for photo in report["photos"]) and report["summary"]["forecast"] is None
 
 
 def test_an_effect_estimated_from_photographs_is_that_of_the_photographed_control(again):
@@ -170,19 +154,6 @@ def test_an_effect_estimated_from_photographs_is_that_of_the_photographed_contro
     gray = estimated["gray"]
     assert abs(gray["rates"][1] - photographed["recognized"] / photographed["n"]) <= 1 / PHOTOS
     assert gray["difference_interval"][0] <= photographed["difference"] <= gray["difference_interval"][1]
-
-
-def test_another_runs_forecasts_are_refused(journey, tmp_path, capsys):
-    scene = (journey / "scene.toml").read_text().replace("width_mm = 90", "width_mm = 91")
-    (tmp_path / "scene.toml").write_text(scene.replace("steps = 3", "steps = 1"), encoding="utf-8")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(run_module, "PROMISE_VIEWS", 8)
-        assert command("optimize", tmp_path / "scene.toml", "--out", tmp_path / "run") == 0
-    capsys.readouterr()
-    sheet, run = journey / "sheet.json", tmp_path / "run"
-    assert command("verify", journey / "photos", "--sheet", sheet, "--run", run, "--out", tmp_path / "report") == 1
-    said = capsys.readouterr().err
-    assert "Expected the run of sheet" in said and not (tmp_path / "report").exists()
 
 
 def test_the_promise_predicts_the_photographs_it_is_a_promise_of(journey, report):

@@ -3,7 +3,7 @@
 In: a folder of photographs (or of folders, one a session) and SHEET.json. Out: REPORT/ with report.json, report.csv,
 report.html, pictures, coco.json with places of the piece and of a detected object, and photos.jsonl, one line per
 finished photograph, from which `resume` continues. The promise's primary network always judges, also if others are
-named. Scene, renderer and optimizer are imported only if a run is given.
+named. Scene, renderer and optimizer are never imported.
 """
 
 from collections.abc import Callable, Sequence
@@ -48,7 +48,6 @@ from patchproof.sheets.manifest import Manifest, load_manifest
 
 if TYPE_CHECKING:
     from patchproof.channel.lens import Camera
-    from patchproof.optimizer.run import Run
 
 _PHOTOS = "photos"
 REPORT_FILES = ("report.json", "report.csv", "report.html", "coco.json", "pictures", _PHOTOS, JOURNAL_FILE)
@@ -84,7 +83,6 @@ def verify(
     models: Sequence[str | Classifier] | None = None,
     controls: str | Path | None = None,
     capture: CaptureInfo = CaptureInfo(),
-    run: "str | Path | Run | None" = None,
     trust: bool = False,
     ledger_photos: int = LEDGER_PHOTOS,
     compute: Compute = Compute(),
@@ -100,11 +98,10 @@ def verify(
         sheet: the manifest, SHEET.json; its folder is where its models and printers are looked up.
         out: folder for the report, new or empty.
         models: networks besides the sheet's first: names, or classifiers in memory. Code (`module:`) and downloads that
-            the sheet or the run names are used only where they are among them.
+            the sheet names are used only where they are among them.
         controls: folder with a folder of photographs for each control ("bare", "mean", ...).
         capture: camera, scan resolution, measured rulers, the object's boxes, the design's corners.
-        run: the run that the sheet was made from; each photograph then gets a forecast at its measured view.
-        trust: use what sheet and run name without naming it in `models`, also variables of the environment.
+        trust: use what the sheet names without naming it in `models`, also variables of the environment.
         ledger_photos: photographs at most in the gap ledger and the estimated effect, 0 for neither; each costs 16
             classifications.
         compute: processes or cluster; photographs are judged on the CPU, and another device is refused.
@@ -124,9 +121,7 @@ def verify(
     """
     out, manifest, compute = Path(out), load_manifest(sheet), compute.without("verify", device=True)
     with lock_folder(out):
-        _check_out(
-            out, resume, overwrite, (photos, sheet, controls, run, capture.camera, capture.boxes, capture.corners)
-        )
+        _check_out(out, resume, overwrite, (photos, sheet, controls, capture.camera, capture.boxes, capture.corners))
         look_at = _look_at(out, manifest)
         if isinstance(photos, str | Path) and is_file(Path(photos) / JOURNAL_FILE):
             look_at = lambda entries: None  # noqa: E731  # `capture` showed the answers while they were taken
@@ -144,17 +139,12 @@ def verify(
             from patchproof.evidence.corner_files import load_corners
 
             options = replace(options, corners=load_corners(capture.corners))
-        forecast = None
-        if run is not None:
-            from patchproof.reprints.photo_forecast import photo_forecaster  # imports scene, renderer and optimizer
-
-            forecast = photo_forecaster(run, manifest, trust, _by_name(models))
         if not resume:
             clear_folder(out)
         if not isinstance(photos, str | Path):
             photos = write_pictures(photos, out / _PHOTOS)
         journal, look = out / JOURNAL_FILE, {"look_at": look_at}
-        gather = partial(gather_evidence, compute=compute, journal=journal, resume=resume, forecast=forecast, **look)
+        gather = partial(gather_evidence, compute=compute, journal=journal, resume=resume, **look)
         on_pictures = partial(save_pictures, out / "pictures")
         report = gather(photos, manifest, options, on_pictures=on_pictures, advance=partial(progress, "verify"))
         files = {"camera": capture.camera, "boxes": capture.boxes, "corners": capture.corners}

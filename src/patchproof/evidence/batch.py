@@ -251,8 +251,8 @@ def reread_square(task: Task, size_px: int, item: tuple[Path, MeasuredPhoto]) ->
     surface = task.surface if geometry.located == "markers" else task.surface.without_markers
 
     def shot() -> PhotoSquare | None:
-        view = pinhole_photo(read_photo(path), task.camera)
-        shot = photo_square(entry.file, view.srgb, px_from_mm, blur_px, light, surface, size_px, view.matrix_px)
+        srgb = pinhole_photo(read_photo(path), task.camera).srgb
+        shot = photo_square(entry.file, srgb, px_from_mm, blur_px, light, surface, size_px)
         return shot and replace(shot, box=measured.entry.box)
 
     try:

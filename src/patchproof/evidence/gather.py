@@ -29,12 +29,10 @@ from patchproof.evidence.benefit import benefit_of
 from patchproof.evidence.classify import Judges, judges_of
 from patchproof.evidence.copies import COPY_CODE, reject_copies
 from patchproof.evidence.effect_estimate import estimate_effect
-from patchproof.evidence.forecast import forecast_of
 from patchproof.evidence.grouping import Grouping, group_sessions, subfolders
 from patchproof.evidence.journal import Journal, settings_key
 from patchproof.evidence.ledger import ledger_of
 from patchproof.evidence.measure import UNLOCATED_CODES, MeasuredPhoto
-from patchproof.evidence.reproject import PhotoSquare
 from patchproof.evidence.results import (
     EffectEstimate,
     Ledger,
@@ -69,7 +67,6 @@ def gather_evidence(
     compute: Compute = Compute(),
     journal: Path | None = None,
     resume: bool = False,
-    forecast: Callable[[PhotoSquare], float | None] | None = None,
     look_at: Callable[[Sequence[PhotoEntry]], Look | None] = lambda entries: PLANNED_LOOK,
     on_pictures: Callable[[str, Mapping[str, np.ndarray]], None] = lambda file, pictures: None,
     advance: Advance = no_advance,
@@ -78,11 +75,10 @@ def gather_evidence(
     sessions (see `grouping`).
 
     Photographs are measured by the processes or the cluster of `compute`. The file `journal` records
-    finished photographs; with `resume` those of an earlier run are not measured again. `forecast` computes the chance
-    that a photograph is recognized, without its pixels of the piece. `look_at` tells the look from the entries, see
-    `report_of`. `on_pictures` gets a name and pictures by kind (`photo`, and `seen`, `fitted`, `promised`, `delta_e00`
-    of a measured one) of the first `batch.MAX_PICTURED_PHOTOS` photographs when each is measured; `advance` is called
-    with (done, total).
+    finished photographs; with `resume` those of an earlier run are not measured again. `look_at` tells the look from
+    the entries, see `report_of`. `on_pictures` gets a name and pictures by kind (`photo`, and `seen`, `fitted`,
+    `promised`, `delta_e00` of a measured one) of the first `batch.MAX_PICTURED_PHOTOS` photographs when each is
+    measured; `advance` is called with (done, total).
     """
     controls_folder = None if options.controls is None else Path(options.controls)
     grouping = group_sessions(photos, controls_folder)
@@ -131,9 +127,6 @@ def gather_evidence(
             shots = [shot for shot in squares if shot is not None and shot.file in session]
             scene = task.surface, options.printer, judges
             estimate = estimate_effect(shots, manifest, *scene, recognized, session)
-            if forecast is not None:
-                pairs = zip(paths, patch_photos, strict=True)
-                patch_photos = [with_forecast(read_shot, forecast, path, photo) for path, photo in pairs]
     by_sha256: dict[str, dict[str, MeasuredPhoto]] = {}
     left_out = list_skipped_files(Path(photos), controls_folder and controls_folder.resolve())
     if controls_folder:
@@ -167,18 +160,6 @@ def _spread(items: list, most: int) -> list:
     """At most `most` of the items, evenly spread."""
     count = min(len(items), most)
     return [items[number * len(items) // count] for number in range(count)]
-
-
-def with_forecast(
-    read_shot: Callable[[tuple[Path, MeasuredPhoto]], PhotoSquare | None],
-    forecast: Callable[[PhotoSquare], float | None],
-    path: Path,
-    photo: MeasuredPhoto,
-) -> MeasuredPhoto:
-    """Add the forecast to a photograph; None if it was not classified or cannot be read again."""
-    shot = read_shot((path, photo)) if photo.entry.predictions else None
-    chance = None if shot is None else forecast(shot)
-    return replace(photo, entry=photo.entry.changed(forecast=chance))
 
 
 def _list_controls(folder: Path | None, sessions: Sequence[str]) -> dict[str, dict[str, Path]]:
@@ -218,12 +199,12 @@ def report_of(
     look: Look | None = PLANNED_LOOK,
     estimate: EffectEstimate | None = None,
 ) -> Report:
-    """Sum up all photographs; with a promise and `judges` also verdict, rates, forecast and whether the patch helps.
+    """Sum up all photographs; with a promise and `judges` also verdict, rates and whether the patch helps.
     Without a `look` the photographs were watched while they were taken.
     """
     entries, counted = [photo.entry for photo in photos], [photo.entry for photo in photos if photo.counted]
     verdict = Verdict("cannot_tell", None, "The sheet promises nothing.")
-    comparisons, rates, rate, interval, sessions, forecast, do, worth = [], {}, _rate({}), None, (), None, "", None
+    comparisons, rates, rate, interval, sessions, do, worth = [], {}, _rate({}), None, (), "", None
     if judges and manifest.promise:
         promise, primary = manifest.promise, judges.primary.name
         rates = {model.name: _rate(_recognized(counted, model.name)) for model in judges.models}
@@ -236,9 +217,6 @@ def report_of(
         verdict = judge(*counts, promise, without_markers, look)
         if recognized:
             interval = promise.posterior.rate_given(*counts)
-        pairs = [(e.forecast, recognized[e.file]) for e in counted if e.forecast is not None and e.file in recognized]
-        if pairs:
-            forecast = forecast_of([p for p, _ in pairs], [answer for _, answer in pairs], promise.rate)
         answers = {(numbers[file], file): answer for file, answer in recognized.items()}
         for name, control in controls.items():
             keys, hits = control_keys(grouping, photos, control), _recognized((p.entry for p in control), primary)
@@ -269,7 +247,6 @@ def report_of(
         background=background_summary(manifest.settings),
         draft_views=manifest.promise.n if manifest.promise is not None and manifest.promise.draft else 0,
         models=rates,
-        forecast=forecast,
     )
     if ruler_mm is not None:
         x, y = np.divide(ruler_mm, manifest.ruler_mm).tolist()

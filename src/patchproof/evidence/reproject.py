@@ -49,8 +49,7 @@ class PhotoSquare:
     """A photograph's centered square: uint8 W×W×3, page millimeters to its pixels, blur in pixels, noise in light.
 
     `cells` h×w×3 are the design's linear light as photographed, NaN where clipped, `blur_cells` their blur in cells;
-    `scale` is W over the photograph's shorter side; `matrix_px` is the camera's for the square (None: focal length
-    unknown); `box` is the object's, for detectors.
+    `scale` is W over the photograph's shorter side; `box` is the object's, for detectors.
     """
 
     file: str
@@ -61,7 +60,6 @@ class PhotoSquare:
     noise: float
     cells: np.ndarray
     scale: float
-    matrix_px: np.ndarray | None = None
     box: BoxEdges | None = None
     blur_cells: float = 0.0
 
@@ -83,7 +81,6 @@ def photo_square(
     light: FrameLight,
     surface: Surface,
     size_px: int,
-    matrix_px: np.ndarray | None = None,
 ) -> PhotoSquare | None:
     """Prepare an uint8 photograph to render other pieces into it, for a network of input size `size_px`.
 
@@ -99,10 +96,10 @@ def photo_square(
     if unmixed is None:
         return None
     light, blur_px = unmixed
-    square, matrix = np.ascontiguousarray(square), None if matrix_px is None else to_square @ matrix_px
+    square = np.ascontiguousarray(square)
     to_square, blur_px, noise = to_square @ px_from_mm, blur_px * scale, noise_of(square)
     cells, blur_cells = design_cells(square, to_square, surface.rect_mm, blur_px)
-    return PhotoSquare(file, square, to_square, light, blur_px, noise, cells, scale, matrix, blur_cells=blur_cells)
+    return PhotoSquare(file, square, to_square, light, blur_px, noise, cells, scale, blur_cells=blur_cells)
 
 
 def unmix_markers(

@@ -154,9 +154,6 @@ def verdict_lines(report: Any) -> list[str]:
     lines += ["  also {}: {:.1%} [{:.1%}, {:.1%}]".format(name, rate.rate, *rate.interval) for name, rate in others]
     if summary.prediction_interval is not None:
         lines.append("expected: {} to {} of {}".format(*summary.prediction_interval, summary.judged))
-    if (forecast := summary.forecast) is not None:
-        head = f"expected at their own views (promised: over all views): {forecast.expected:.1f} of {forecast.photos}"
-        lines.append(f"{head} [{forecast.interval[0]}, {forecast.interval[1]}], recognized {forecast.recognized}")
     if summary.estimated is not None:
         lines += _estimated_lines(summary.estimated)
     if summary.culprit is not None:

@@ -61,8 +61,7 @@ function lines(photo) {
   head.append(make("b", photo.answer, photo.answer.replace(" ", "-")), photo.label ? ` as ${photo.label}` : "");
   box.append(head);
   if (photo.advice) box.append(make("p", photo.advice, "advice"));
-  const expected = photo.forecast === null ? "" : `, expected ${Math.round(100 * photo.forecast)} %`;
-  box.append(make("p", `${photo.file}${photo.view ? ": " + photo.view : ""}${expected}`, "soft"));
+  box.append(make("p", `${photo.file}${photo.view ? ": " + photo.view : ""}`, "soft"));
   return box;
 }
 

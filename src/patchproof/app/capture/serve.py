@@ -44,7 +44,6 @@ def serve_capture(
     sheet: str | Path,
     out: str | Path,
     *,
-    run: str | Path | None = None,
     models: Sequence[str] | None = None,
     camera: str | None = None,
     trust: bool = False,
@@ -55,7 +54,7 @@ def serve_capture(
     """Serve the page and receive photographs into the folder `out` until interrupted; returns the report on them.
 
     `progress` is called with the stage "measure" for photographs that are there already, `on_address` with the address
-    once the server listens. `run`, `models`, `camera` and `trust` are those of `verify`.
+    once the server listens. `models`, `camera` and `trust` are those of `verify`.
     """
     try:
         import uvicorn
@@ -68,11 +67,10 @@ def serve_capture(
         got = f"the {manifest.kind} sheet {manifest.sheet_id}"
         raise Refused("a sheet that promises something", got, "photograph it with any camera")
     options = replace(options_of(sheet, manifest, models, camera, trust), find=not manifest.markers)
-    forecast = None if run is None else (Path(run).resolve(), Path(sheet).resolve(), trust, tuple(models or ()))
     with lock_folder(out), open_workers(1, spawn=True) as workers:
         album = Album(Path(out))
         workers.map(prepare_worker, [None])
-        with closing(PhotoCollection(album, manifest, options, workers, forecast)) as collection:
+        with closing(PhotoCollection(album, manifest, options, workers)) as collection:
             collection.measure(album.photos(), partial(progress, "measure"))
             path = _address_file(album.folder)
             address = _stored_address(path)

@@ -67,7 +67,6 @@ def answer_of(collection: PhotoCollection, path: Path, picture: np.ndarray | Non
         "code": entry.code,
         "advice": "; ".join(filter(None, (entry.remark and entry.remark.advice, *entry.said))) or None,
         "view": _view_words(entry),
-        "forecast": entry.forecast,
         "picture": None if picture is None else data_uri(image_bytes(picture, "JPEG", _PREVIEW_OPTIONS)),
     }
 

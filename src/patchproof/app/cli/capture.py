@@ -15,9 +15,6 @@ from patchproof.base.text import command_text
 def capture(
     sheet: Annotated[Path, Argument(help="The manifest that was written beside the PDF.")],
     out: Annotated[Path, Option(help="Folder for the photographs; an existing one is continued.")] = Path("photos"),
-    run: Annotated[
-        Path | None, Option(help="The run that the sheet is of: forecasts each photograph at its measured view.")
-    ] = None,
     models: Models = None,
     camera: Annotated[str | None, Option(help="The camera that takes them: a camera file or its name.")] = None,
     trust: Trust = False,
@@ -40,9 +37,7 @@ def capture(
         say(address, "" if lan else "Only this machine can open it; --lan lets a phone.", "Ctrl-C ends it.")
 
     with progress_bar() as bar:
-        serve = partial(
-            serve_capture, sheet, out, run=run, models=names_of(models), camera=camera, lan=lan, trust=trust
-        )
+        serve = partial(serve_capture, sheet, out, models=names_of(models), camera=camera, lan=lan, trust=trust)
         report = serve(progress=lambda stage, done, total: bar(stage, done, total) if total else None, on_address=show)
     words = [out, "--sheet", sheet, *(["--controls", out / CONTROLS_FOLDER] if report.controls else [])]
     if not load_manifest(sheet).markers:

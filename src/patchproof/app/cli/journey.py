@@ -240,9 +240,6 @@ def verify(
     ledger: Annotated[
         int, Option(min=0, help="Photographs in the gap ledger at most; 0: no ledger, and no rendered controls.")
     ] = 24,
-    run: Annotated[
-        Path | None, Option(help="The run that the sheet is of: forecasts each photograph at its measured view.")
-    ] = None,
     trust: Trust = False,
     jobs: Jobs = None,
     cluster: Cluster = None,
@@ -256,7 +253,7 @@ def verify(
 
     with progress_bar() as bar:
         ruler = console.pair_of(ruler_mm, "--ruler-mm") if ruler_mm else None
-        options: dict[str, Any] = {"models": console.names_of(models), "controls": controls, "run": run, "trust": trust}
+        options: dict[str, Any] = {"models": console.names_of(models), "controls": controls, "trust": trust}
         options |= {"capture": CaptureInfo(camera, scan_dpi, ruler, boxes, corners, find), "ledger_photos": ledger}
         options |= {"compute": Compute(jobs=jobs or 1, cluster=cluster), "resume": resume, "overwrite": overwrite}
         report = verify_photos(photos, sheet, out, **options, progress=bar)
