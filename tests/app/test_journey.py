@@ -5,18 +5,21 @@ from __future__ import annotations
 import json
 import shutil
 
+import cv2
 import numpy as np
 import pytest
 from conftest import SCENE
 from console import command
 from loaded import Step, loaded_by
+from PIL import Image
 
 from patchproof.base import geometry
 from patchproof.base.packaged import packaged_path
+from patchproof.base.resample import index_homography
 from patchproof.sheets.manifest import load_manifest
-from patchproof.sheets.pdf_raster import attached_manifests
+from patchproof.sheets.pdf_raster import attached_manifests, rasterize_page
 
-PHOTOS = 6
+PHOTOS, SCAN_DPI = 6, 100
 # libraries of the demo and of `verify`, which a process of both imports once
 BOTH_LOAD = ("torch", "cv2", "scipy.stats", "scipy.optimize", "matplotlib.backends.backend_svg", "jinja2", "pydantic")
 
@@ -197,6 +200,20 @@ def test_distance_and_angle_come_from_the_focal_length_in_exif(journey, report):
             assert photo["distance_mm"] is None
 
 
+def scan(pdf, manifest, folder, scale=1.0) -> dict[str, dict]:
+    """Scan each page with markers, printed at `scale`; returns the truth as `reprint` writes it, by file."""
+    folder.mkdir()
+    truth = {}
+    for page in sorted({marker.page for marker in manifest.markers}):
+        pixels = rasterize_page(pdf, page, SCAN_DPI)
+        matrix = index_homography(np.diag([scale, scale, 1.0]))[:2]
+        picture = cv2.warpAffine(pixels, matrix, pixels.shape[1::-1], borderValue=(255, 255, 255))
+        Image.fromarray(picture).save(folder / f"scan_{page}.png")
+        px_from_mm = np.diag([scale * SCAN_DPI / 25.4, scale * SCAN_DPI / 25.4, 1.0])
+        truth[f"scan_{page}.png"] = {"homography_px_from_mm": px_from_mm @ manifest.page_from_design_page(page)}
+    return truth
+
+
 def test_scans_of_tiles_are_page_checks_that_lie_where_the_truth_says(journey, tmp_path):
     small = packaged_path("print_templates", "a4_tiles.toml").read_text(encoding="utf-8")
     assert "177.0, 262.4]" in small
@@ -205,12 +222,10 @@ def test_scans_of_tiles_are_page_checks_that_lie_where_the_truth_says(journey, t
     # a control, for which no promise is made anew
     assert command("sheet", run, "--out", pdf, "--template", tmp_path / "small.toml", "--control", "mean") == 0
     manifest = load_manifest(tmp_path / "tiles.json")
-    scans, given = tmp_path / "scans", ("--scan-dpi", 100)
-    assert command("reprint", pdf, "--run", run, "--n", 1, "--out", scans, *given) == 0
+    scans, truth = tmp_path / "scans", scan(pdf, manifest, tmp_path / "scans")
     sheet = ("--sheet", tmp_path / "tiles.json", "--models", "builtin", "--ledger", 0)
-    assert command("verify", scans, *sheet, "--out", tmp_path / "report", *given) == 0
+    assert command("verify", scans, *sheet, "--out", tmp_path / "report", "--scan-dpi", SCAN_DPI) == 0
     photos = json.loads((tmp_path / "report" / "report.json").read_text())["photos"]
-    truth = json.loads((scans / "truth.json").read_text())
     assert len(photos) == len(manifest.tiles) + 1 >= 3
     for photo, tile in zip(photos[1:], manifest.tiles, strict=True):
         assert photo["status"] == "measured" and photo["scale_x"] == pytest.approx(1, abs=0.003)
@@ -220,14 +235,13 @@ def test_scans_of_tiles_are_page_checks_that_lie_where_the_truth_says(journey, t
             geometry.apply_homography(np.array(one["homography_px_from_mm"]), corners)
             for one in (photo, truth[photo["file"]])
         ]
-        assert np.abs(at[0] - at[1]).max() / 100 * 25.4 < 0.25
+        assert np.abs(at[0] - at[1]).max() / SCAN_DPI * 25.4 < 0.25
 
 
 def test_a_page_printed_too_small_shows_in_a_scan_and_in_the_ruler(journey, tmp_path):
-    sheet, run = journey / "sheet.json", journey / "run"
-    arguments = ("--run", run, "--n", 1, "--out", tmp_path / "scans", "--scan-dpi", 100, "--print-scale", "0.97")
-    assert command("reprint", journey / "sheet.pdf", *arguments) == 0
-    judged = ("--sheet", sheet, "--ledger", 0, "--out", tmp_path / "scan", "--scan-dpi", 100)
+    sheet = journey / "sheet.json"
+    scan(journey / "sheet.pdf", load_manifest(sheet), tmp_path / "scans", 0.97)
+    judged = ("--sheet", sheet, "--ledger", 0, "--out", tmp_path / "scan", "--scan-dpi", SCAN_DPI)
     assert command("verify", tmp_path / "scans", *judged) == 0
     scanned = json.loads((tmp_path / "scan" / "report.json").read_text())
     (photo,) = scanned["photos"]

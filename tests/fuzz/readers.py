@@ -433,7 +433,7 @@ def corners_coco() -> dict[str, object]:
 
 
 def corners(rng: Rng, folder: Path) -> Read:
-    from patchproof.evidence.corner_files import corners_of_photo, load_corners
+    from patchproof.evidence.annotations import corners_of_photo, load_corners
 
     is_csv = rng.random() < 0.5
     path = folder / ("c.csv" if is_csv else "c.json")

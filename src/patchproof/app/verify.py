@@ -132,11 +132,11 @@ def verify(
             if manifest.promise is None or not any(model.LOOKS_AT_BOXES for model in options.models):
                 got = f"the classifiers {', '.join(model.name for model in options.models) or '(none)'}"
                 raise Refused("a detector, since classifiers use no boxes", got, "leave boxes out")
-            from patchproof.evidence.boxes import load_boxes
+            from patchproof.evidence.annotations import load_boxes
 
             options = replace(options, boxes=load_boxes(capture.boxes, manifest.promise.target.label))
         if capture.corners is not None:
-            from patchproof.evidence.corner_files import load_corners
+            from patchproof.evidence.annotations import load_corners
 
             options = replace(options, corners=load_corners(capture.corners))
         if not resume:
@@ -156,8 +156,7 @@ def verify(
         stems = {stem_of(photo.file) for photo in report.photos[:MAX_PICTURED_PHOTOS]}
         # but for pictures of photographs that this report does not show
         clear_folder(out, lambda name: not name.startswith("pictures/") or name[9:].rsplit(".", 2)[0] in stems)
-        ledger = report.ledger and report.ledger.model_dump()
-        write_report(report.model_dump(mode="json"), manifest.model_dump(mode="json"), out, ledger)
+        write_report(report.model_dump(mode="json"), manifest.model_dump(mode="json"), out)
         write_atomically(out / "coco.json", _boxes(report, manifest, options.camera))
     return report
 

@@ -278,8 +278,7 @@ class Summary(StrictModel):
     interval: tuple[Finite, Finite] | None
     prediction_interval: tuple[int, int] | None
     verdict: VerdictWord
-    ledger: dict[str, LedgerShare] | None = None
-    culprit: str | None = None
+    ledger: Ledger | None = None
     reason: str = ""  # for the verdict, in a sentence
     next_step: str = ""  # what is still needed, if the photographs cannot tell
     worth: Benefit | None = None  # by the strongest evidence; null if there is nothing to compare
@@ -312,14 +311,13 @@ class Origin(StrictModel):
 
 
 class Report(StrictModel):
-    """The content of report.json, and the ledger for its chart and the report's folder, which are not written there."""
+    """The content of report.json, and the report's folder, which is not written there."""
 
     sheet_id: str
     photos: tuple[PhotoEntry, ...]
     summary: Summary
     controls: tuple[Control, ...] = ()
     origin: Origin = Origin()
-    ledger: Ledger | None = Field(None, exclude=True)
     folder: Path | None = Field(default=None, exclude=True)
     SHOWN: ClassVar[tuple[str, ...]] = ("sheet_id", "summary.verdict", "summary.rate", "summary.interval", "photos")
 

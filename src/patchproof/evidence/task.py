@@ -16,8 +16,7 @@ if TYPE_CHECKING:
     from patchproof.channel.lens import Camera
     from patchproof.channel.printer import Printer
     from patchproof.classifier import Classifier
-    from patchproof.evidence.boxes import DrawnBox
-    from patchproof.evidence.corner_files import NamedCorners
+    from patchproof.evidence.annotations import DrawnBox, NamedCorners
 
 LEDGER_PHOTOS = 24  # each costs 16 classifications; 24 leave intervals of some ± 5 points
 
@@ -29,8 +28,8 @@ class Options:
     `printer` is the printer model that the promise was made with. `camera` replaces the EXIF focal length and removes
     lens distortion. `ruler_mm` are the printed rulers (x, y) as measured by hand. `controls` is a folder of photographs
     of controls. At most `ledger_photos` photographs, evenly spread, go into the gap ledger (0: no ledger). `boxes` are
-    those that somebody drew round the object (`boxes.load_boxes`), `corners` the design's that somebody named
-    (`corner_files.load_corners`), by photograph. `find`: search for the design itself where no marker can be read.
+    those that somebody drew round the object (`annotations.load_boxes`), `corners` the design's that somebody named
+    (`annotations.load_corners`), by photograph. `find`: search for the design itself where no marker can be read.
     """
 
     models: "Sequence[Classifier]"

@@ -156,9 +156,9 @@ def verdict_lines(report: Any) -> list[str]:
         lines.append("expected: {} to {} of {}".format(*summary.prediction_interval, summary.judged))
     if summary.estimated is not None:
         lines += _estimated_lines(summary.estimated)
-    if summary.culprit is not None:
-        share = summary.ledger[summary.culprit].share
-        lines.append(f"costs the most: {summary.culprit.replace('_', ' ')} ({100 * share:.0f} points of confidence)")
+    if summary.ledger is not None and (culprit := summary.ledger.culprit) is not None:
+        share = summary.ledger.shares[culprit].share
+        lines.append(f"costs the most: {culprit.replace('_', ' ')} ({100 * share:.0f} points of confidence)")
     lines += not_measured_lines(summary.not_measured)
     rows = remarks([photo.model_dump() for photo in report.photos])
     lines += [f"  {code}: {count} ({files}): {advice}" for code, advice, count, files in rows]

@@ -50,7 +50,7 @@ class PhotoTruth:
     Attributes:
         homography_px_from_mm: 3×3 from page millimeters to pixels; None where the piece is bent or absent.
         marker_corners_px: 4×2 pixels (x right, y down) by marker id.
-        conditions: drawn values by name, as in `truth.json`; of a scan its `scan_dpi` and `print_scale`.
+        conditions: drawn values by name, as in `truth.json`.
     """
 
     homography_px_from_mm: np.ndarray | None

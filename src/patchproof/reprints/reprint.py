@@ -1,4 +1,4 @@
-"""Simulate photographs of a printed sheet on its object (scans of the uncut page: see `page_photos`).
+"""Simulate photographs of a printed sheet on its object (of pages that belong to no run: see `page_photos`).
 
 In: a sheet's PDF and the run it was made from. Out: a folder of JPEG photographs of that piece on the object,
 `truth.json` with each one's homography, marker corners and conditions, `coco.json` with boxes of object and piece, and
@@ -8,10 +8,9 @@ each with its own place, light, camera and folder.
 """
 
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -20,8 +19,8 @@ from patchproof.base.errors import Refused
 from patchproof.base.output import make_folder, new_folder
 from patchproof.base.progress import Progress, no_progress
 from patchproof.base.text import short_repr
-from patchproof.base.workers import Workers, fork_workers, open_workers, result_of
-from patchproof.optimizer.run import Run, load_run
+from patchproof.base.workers import fork_workers, result_of
+from patchproof.optimizer.run import Run
 from patchproof.report.coco import PATCH, LabeledPhoto, coco_json
 from patchproof.reprints.mounted_sheet import (
     DEFAULT_SETUP,
@@ -32,14 +31,13 @@ from patchproof.reprints.mounted_sheet import (
     sheet_scene,
 )
 from patchproof.reprints.run_sheet import sheet as sheet_of
-from patchproof.scene.conditions import Conditions
 
-REPRINT_FILES = ("photo_*.jpg", "session_*", "scan_*.jpg", "truth.json", "coco.json", "corners.csv")
+REPRINT_FILES = ("photo_*.jpg", "session_*", "truth.json", "coco.json", "corners.csv")
 
 
 @dataclass(frozen=True)
 class Reprint:
-    """Simulated photographs or scans in a folder, with the truth about each by file name."""
+    """Simulated photographs in a folder, with the truth about each by file name."""
 
     folder: Path
     photos: dict[str, PhotoTruth]
@@ -69,14 +67,14 @@ def reprint(
         how: printer, print scale, a control in place of the design, and the renderer.
         sessions: places to photograph in, 1 to n, each with a light and camera of its own.
         seed: of the conditions, in place of the scene's.
-        compute: processes or cluster; the renderer runs on the CPU, and another device is refused.
+        compute: processes; the renderer runs on this machine's CPU, and another device or a cluster is refused.
         overwrite: delete earlier photographs in `out` first.
         progress: called with the stage "photograph".
 
     Raises:
         Refused: where the PDF is not of this run.
     """
-    compute = compute.without("reprint", device=True)
+    compute = compute.without("reprint", device=True, cluster=True)
     if not 1 <= sessions <= n:
         raise Refused(f"1 to {n} sessions of {n} photographs", f"{sessions}", "ask for fewer")
     with _pdf_to_mount(pdf_path, run, how.control, Path(out)) as pdf:
@@ -90,9 +88,7 @@ def reprint(
         names = [f"photo_{i + 1:04d}.jpg" for i in range(n)]
         if sessions > 1:
             names = [f"session_{i // each + 1:02d}/{name}" for i, name in enumerate(names)]
-        take_photo = partial(_take_photo, Path(pdf).resolve(), run.folder.resolve(), how)
-        jobs, cluster = compute.jobs, compute.cluster
-        opening = _cluster_workers(take_photo, jobs, cluster) if cluster else fork_workers(sheet.photograph, jobs)
+        opening = fork_workers(sheet.photograph, compute.jobs)
         with new_folder(out, REPRINT_FILES, overwrite, (pdf_path, run.folder)) as folder, opening as (workers, take):
             for i, photo in workers.completed(take, views):
                 make_folder((folder / names[i]).parent)
@@ -104,9 +100,10 @@ def reprint(
             text = coco_json(photos, label, f"simulated photographs of sheet {sheet.manifest.sheet_id}")
             (folder / "coco.json").write_text(text, encoding="utf-8")
             truth = dict(zip(names, map(sheet.truth, views), strict=True))
-            write_truth(folder, truth)
+            entries = {name: photo.to_json() for name, photo in truth.items()}
+            (folder / "truth.json").write_text(json.dumps(entries, indent=1) + "\n", encoding="utf-8")
             if not sheet.manifest.markers:
-                from patchproof.evidence.corner_files import CORNERS_FILE, corners_csv
+                from patchproof.evidence.annotations import CORNERS_FILE, corners_csv
 
                 shown = {photo.file: photo.outlines[PATCH] for photo in photos if PATCH in photo.outlines}
                 text = corners_csv({name: outline[::SIDE_POINTS] for name, outline in shown.items()})
@@ -115,38 +112,13 @@ def reprint(
 
 
 @contextmanager
-def _cluster_workers(take: Callable, jobs: int, cluster: str) -> Iterator[tuple[Workers, Callable]]:
-    """Open a cluster's workers, each of which mounts the sheet itself; yields them and their function."""
-    with open_workers(jobs, cluster) as workers:
-        yield workers, take
-
-
-@contextmanager
 def _pdf_to_mount(pdf_path: str | Path, run: Run, control: str | None, out: Path) -> Iterator[str | Path]:
     """Yield the PDF to mount: the given one, or a control's in a temporary folder."""
     if control in (None, "bare"):
         yield pdf_path
         return
-    # beside the photographs, since other machines can read that folder, too
-    make_folder(out.resolve().parent)
-    with TemporaryDirectory(dir=out.resolve().parent, prefix=".control.") as folder:
+    with TemporaryDirectory() as folder:
         template = sheet_scene(pdf_path, run)[1].settings.sheet.template
         path = Path(folder) / f"control{Path(pdf_path).suffix}"
         sheet_of(run, path, template=template, control=control)
         yield path
-
-
-def _take_photo(pdf: Path, run_folder: Path, how: ReprintSetup, conditions: Conditions) -> bytes:
-    return _photographer(pdf, run_folder, how)(conditions)
-
-
-@lru_cache(maxsize=1)
-def _photographer(pdf: Path, run_folder: Path, how: ReprintSetup) -> Callable[[Conditions], bytes]:
-    """Mount the sheet in another process, once."""
-    return mount_sheet(pdf, load_run(run_folder, trust=True), how).photograph  # it was loaded before
-
-
-def write_truth(folder: Path, truth: Mapping[str, PhotoTruth]) -> None:
-    """Write truth.json into a folder of photographs or scans."""
-    entries = {name: photo.to_json() for name, photo in truth.items()}
-    (folder / "truth.json").write_text(json.dumps(entries, indent=1) + "\n", encoding="utf-8")

@@ -28,7 +28,7 @@ def capture(
     signal.signal(signal.SIGINT, signal.default_int_handler)  # it ends the server, and the verdict follows
     from patchproof.app.capture.album import CONTROLS_FOLDER
     from patchproof.app.capture.serve import serve_capture
-    from patchproof.evidence.corner_files import CORNERS_FILE
+    from patchproof.evidence.annotations import CORNERS_FILE
     from patchproof.report.words import verdict_lines
     from patchproof.sheets.manifest import load_manifest
 

@@ -178,41 +178,31 @@ def reprint(
     printer: Annotated[str | None, Option(help="Another printer than the scene's: a name or a file.")] = None,
     print_scale: Annotated[str, Option(help="Size of the print, 0.97 or 0.97x0.98 (x, y).")] = "1",
     control: Annotated[PhotographedControl | None, Option(help="Photograph a control in place of the design.")] = None,
-    scan_dpi: Annotated[float | None, Option(min=30, max=1200, help="Scan the uncut page flat instead.")] = None,
     path_traced: Annotated[
         bool, Option("--path-traced", help="Render with Mitsuba 3 in place of our renderer (slow).")
     ] = False,
     jobs: Jobs = None,
-    cluster: Cluster = None,
     trust: Trust = False,
     overwrite: Overwrite = False,
 ) -> None:
     """Print the PDF in simulation, put it back on the object, and photograph it."""
     from patchproof.optimizer.run import load_run
     from patchproof.reprints.mounted_sheet import ReprintSetup
-    from patchproof.reprints.page_photos import reprint_pages, scan
+    from patchproof.reprints.page_photos import reprint_pages
     from patchproof.reprints.reprint import reprint as reprint_sheet
 
     scale = console.pair_of(print_scale, "--print-scale")
-    if scan_dpi is not None and control is not None:
-        raise BadParameter("a scan is of the PDF itself; leave --control out", param_hint="--scan-dpi")
-    if path_traced and scan_dpi is not None:
-        raise BadParameter("is of the piece on its object; leave --scan-dpi out", param_hint="--path-traced")
     how = ReprintSetup(printer, scale, control, path_traced)
     if run is None:
-        if scan_dpi is not None or control is not None or path_traced or sessions > 1:
-            only = "scans, controls, sessions and path tracing are of a run's sheet; name the run"
+        if control is not None or path_traced or sessions > 1:
+            only = "controls, sessions and path tracing are of a run's sheet; name the run"
             raise BadParameter(only, param_hint="--run")
         reprint_pages(pdf, n, out, how, seed=seed, overwrite=overwrite)
         return say(f"{n} photographs: {out}")
     finished_run = load_run(run, trust)
-    if scan_dpi is not None:
-        taken = scan(pdf, finished_run, n, out, scan_dpi, how, overwrite=overwrite)
-    else:
-        with progress_bar() as bar:
-            options: dict[str, Any] = {"sessions": sessions, "seed": seed, "overwrite": overwrite, "progress": bar}
-            compute = Compute(jobs=jobs or 1, cluster=cluster)
-            taken = reprint_sheet(pdf, finished_run, n, out, how, compute=compute, **options)
+    with progress_bar() as bar:
+        options: dict[str, Any] = {"sessions": sessions, "seed": seed, "overwrite": overwrite, "progress": bar}
+        taken = reprint_sheet(pdf, finished_run, n, out, how, compute=Compute(jobs=jobs or 1), **options)
     say(f"{len(taken.photos)} photographs: {out}")
 
 
