@@ -6,6 +6,7 @@ ends its process each time, becomes a rejected entry, and the batch continues. P
 classified, since a bare object carries no marker; one that shows a single tone or noise is rejected.
 """
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -19,14 +20,14 @@ from numpy.typing import ArrayLike
 from pydantic import Field, ValidationError
 
 from patchproof.base.color import linear_from_srgb
-from patchproof.base.errors import WorkerDied
+from patchproof.base.errors import TimeLimitExceeded, WorkerDied
 from patchproof.base.geometry import apply_homography, rect_corners
+from patchproof.base.input import open_lazily
 from patchproof.base.resample import downscaled_size, to_sixteenths
 from patchproof.base.validation import Finite, Share, StrictModel
 from patchproof.base.workers import Workers, result_of
 from patchproof.evidence.camera import pinhole_photo
 from patchproof.evidence.classify import BoxEdges, Judges, box_in_square, square_of, squares_of
-from patchproof.evidence.grouping import time_and_camera
 from patchproof.evidence.journal import Journal, file_sha256
 from patchproof.evidence.measure import MeasuredPhoto, measure
 from patchproof.evidence.reproject import PhotoSquare, photo_square
@@ -44,6 +45,7 @@ if TYPE_CHECKING:
 
 MAX_PICTURED_PHOTOS = 120  # photographs whose pictures are on the page; the rest is listed. Keeps it below some 15 MB
 _THUMBNAIL_PX = 560  # longer side: enough for a phone's width at twice its density, some 40 kB as JPEG
+_EXIF_IFD, _TIME_TAG, _SERIAL_TAG, _MODEL_TAG = 0x8769, 0x9003, 0xA431, 0x0110
 _DESIGN_COLOR, _MARKER_COLOR = (255, 64, 129), (0, 200, 140)
 _DIED_ADVICE = "measuring it ended its process each time, for want of memory: save it smaller"
 _EMPTY_ADVICE = "it shows one tone or noise and nothing else: take it again"
@@ -212,9 +214,23 @@ def _trace(path: Path, srgb: np.ndarray) -> Trace:
     small = linear_from_srgb(cv2.resize(sampled, (32, 32), interpolation=cv2.INTER_AREA) / 255)
     frame = np.pad(np.zeros((24, 24), bool), 4, constant_values=True)
     red, green, blue = map(float, small[frame].mean(0))
-    time, camera = time_and_camera(path) or (None, "")
-    minute = time and (time - datetime.min).total_seconds() / 60
+    minute, camera = time_and_camera(path)
     return Trace(minute=minute, camera=camera, frame=(red, green, blue))
+
+
+def time_and_camera(path: Path) -> tuple[float | None, str]:
+    """Time, in minutes since the year 1, and camera by the file's EXIF data; None if either is missing."""
+    try:
+        with warnings.catch_warnings(action="ignore"), open_lazily(path) as image:
+            exif = image.getexif()
+            details = exif.get_ifd(_EXIF_IFD)
+        time = datetime.strptime(str(details.get(_TIME_TAG)).strip("\0 "), "%Y:%m:%d %H:%M:%S")
+        camera = f"{exif.get(_MODEL_TAG) or ''} {details.get(_SERIAL_TAG) or ''}"
+        return (time - datetime.min).total_seconds() / 60, " ".join(camera.split())[:40]
+    except TimeLimitExceeded:
+        raise
+    except Exception:  # of whatever a damaged file makes of its data
+        return None, ""
 
 
 def _thumbnail(srgb: np.ndarray, px_from_mm: ArrayLike | None, surface: Surface) -> np.ndarray:

@@ -29,7 +29,7 @@ from patchproof.evidence.benefit import benefit_of
 from patchproof.evidence.classify import Judges, judges_of
 from patchproof.evidence.copies import COPY_CODE, reject_copies
 from patchproof.evidence.effect_estimate import estimate_effect
-from patchproof.evidence.grouping import Grouping, group_sessions, subfolders
+from patchproof.evidence.grouping import Grouping, control_keys, group_sessions, merge_folders, subfolders
 from patchproof.evidence.journal import Journal, settings_key
 from patchproof.evidence.ledger import ledger_of
 from patchproof.evidence.measure import UNLOCATED_CODES, MeasuredPhoto
@@ -43,7 +43,6 @@ from patchproof.evidence.results import (
     SessionCount,
     Summary,
 )
-from patchproof.evidence.same_session import control_keys, merge_folders
 from patchproof.evidence.task import Options, task_of
 from patchproof.evidence.verdict import (
     MOST_PHOTOS,

@@ -24,11 +24,10 @@ from patchproof.evidence.batch import PhotoItem, measure_all
 from patchproof.evidence.classify import judges_of
 from patchproof.evidence.copies import reject_copies
 from patchproof.evidence.gather import report_of
-from patchproof.evidence.grouping import BY_FOLDERS, Grouping
+from patchproof.evidence.grouping import BY_FOLDERS, Grouping, merge_folders
 from patchproof.evidence.journal import JOURNAL_FILE, Journal, settings_key
 from patchproof.evidence.measure import MeasuredPhoto
 from patchproof.evidence.results import Report
-from patchproof.evidence.same_session import merge_folders
 from patchproof.evidence.task import Options, task_of
 from patchproof.photo.corners import DesignCorners
 from patchproof.sheets.manifest import Manifest
