@@ -12,23 +12,21 @@ from dataclasses import dataclass, replace
 from datetime import datetime
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import Field, ValidationError
 
 from patchproof.base.color import linear_from_srgb
 from patchproof.base.errors import TimeLimitExceeded, WorkerDied
 from patchproof.base.geometry import apply_homography, rect_corners
 from patchproof.base.input import open_lazily
 from patchproof.base.resample import downscaled_size, to_sixteenths
-from patchproof.base.validation import Finite, Share, StrictModel
 from patchproof.base.workers import Workers, result_of
 from patchproof.evidence.camera import pinhole_photo
 from patchproof.evidence.classify import BoxEdges, Judges, box_in_square, square_of, squares_of
-from patchproof.evidence.journal import Journal, file_sha256
+from patchproof.evidence.journal import FinishedPhoto, Journal, file_sha256
 from patchproof.evidence.measure import MeasuredPhoto, measure
 from patchproof.evidence.reproject import PhotoSquare, photo_square
 from patchproof.evidence.results import PhotoEntry, Remark, Trace
@@ -36,7 +34,7 @@ from patchproof.evidence.surface import Surface
 from patchproof.evidence.task import Task
 from patchproof.photo.exif import has_camera_shape
 from patchproof.photo.limits import run_limited
-from patchproof.photo.quality import FrameLight, is_featureless
+from patchproof.photo.quality import is_featureless
 from patchproof.photo.read import read_photo
 from patchproof.photo.rejection import PhotoRejected
 
@@ -55,9 +53,6 @@ _OUTSIDE_ADVICE = "its corners lie outside of it: name pixels of the upright pic
 _OTHER_DPI = "resolutions of scans by their files, {:.0f} × {:.0f} dpi, where --scan-dpi says {:g}"
 # codes of photographs whose homography is still accurate enough to put pieces into them
 MEASURABLE_CODES = (None, "clipped", "blurred", "too_small", "cropped", "weak_ink", "noisy")
-
-# linear light of paper and ink, within the bounds of `frame_light`; negative where a print is lighter than its paper
-LightLevel = Annotated[Finite, Field(ge=-4, le=4)]
 
 
 @dataclass(frozen=True)
@@ -94,11 +89,12 @@ def measure_all(
     step: Callable[[int, int], None],
 ) -> list[MeasuredPhoto]:
     """Measure every photograph, in order; the journal's are not opened again. `step` gets (done, total)."""
-    photos: dict[int, MeasuredPhoto] = {}
+    photos, networks = dict[int, MeasuredPhoto](), {model.name for model in judges.models} if judges else set()
     for number, item in enumerate(items):
-        line = None if journal is None else journal.find(item.journal_name, item.path)
-        if line is not None and (photo := _parse(line, item, judges)) is not None:
-            photos[number] = photo
+        found = None if journal is None else journal.find(item.journal_name, item.path)
+        if found is not None and found.entry.file == item.file and found.pictures >= item.with_pictures:
+            if set(found.entry.predictions) in (set(), networks):
+                photos[number] = found.photo
     todo = [number for number in range(len(items)) if number not in photos]
     step(len(photos), len(items))
     for position, future in workers.completed(partial(_measure_or_reject, task), [items[number] for number in todo]):
@@ -112,53 +108,12 @@ def measure_all(
         entry = entry.changed(sha256=sha256, predictions=predictions)
         if item.control is None:
             on_pictures(item.file, measured.pictures)
-        line = _serialize(replace(measured, entry=entry), item.with_pictures)
+        finished = FinishedPhoto.of(replace(measured, entry=entry), item.with_pictures)
         if journal is not None:
-            journal.add(item.journal_name, sha256, line)
-        photos[number] = _JournalPhoto.model_validate(line).photo  # read back, so that a resumed run cannot differ
+            journal.add(item.journal_name, sha256, finished)
+        photos[number] = finished.photo
         step(len(photos), len(items))
     return [photos[number] for number in range(len(items))]
-
-
-class _Light(StrictModel):
-    paper: tuple[LightLevel, LightLevel, LightLevel]
-    ink: tuple[LightLevel, LightLevel, LightLevel]
-    contrast: Finite
-    clipped: Share
-
-
-class _JournalPhoto(StrictModel):
-    """A photograph's result in the journal."""
-
-    entry: PhotoEntry
-    counted: bool
-    light: _Light | None
-    pictures: bool
-    trace: Trace | None = None
-
-    @property
-    def photo(self) -> MeasuredPhoto:
-        light = self.light
-        if light is not None:
-            light = FrameLight(np.array(light.paper), np.array(light.ink), light.contrast, light.clipped)
-        return MeasuredPhoto(self.entry, self.counted, light=light, trace=self.trace)
-
-
-def _serialize(measured: MeasuredPhoto, pictures: bool) -> dict[str, Any]:
-    light = measured.light and {key: np.asarray(value).tolist() for key, value in vars(measured.light).items()}
-    entry, trace = measured.entry.model_dump(mode="json"), measured.trace and measured.trace.model_dump()
-    return {"entry": entry, "counted": measured.counted, "light": light, "pictures": pictures, "trace": trace}
-
-
-def _parse(line: Mapping[str, Any], item: PhotoItem, judges: Judges | None) -> MeasuredPhoto | None:
-    """Read a journal line; None if it is another photograph's, or lacks predictions or pictures that this run needs."""
-    try:
-        result = _JournalPhoto.model_validate(line)
-    except ValidationError:
-        return None
-    entry, names = result.entry, {model.name for model in judges.models} if judges else set()
-    complete = entry.file == item.file and set(entry.predictions) in (set(), names)
-    return result.photo if complete and (result.pictures or not item.with_pictures) else None
 
 
 def _measure_or_reject(task: Task, item: PhotoItem) -> MeasuredPhoto:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from patchproof.evidence.classify import Judges
-from patchproof.evidence.ranges import PromisedRanges, promised_ranges, promised_side_px
+from patchproof.evidence.ranges import PromisedRanges, promised_ranges
 from patchproof.evidence.surface import PromisedColors, Surface, promised_of, surface_of
 from patchproof.sheets.manifest import Manifest
 
@@ -62,9 +62,11 @@ def task_of(manifest: Manifest, options: Options, judges: Judges | None) -> Task
     """Make the task of a verification; without `judges` photographs are not classified."""
     surface = surface_of(manifest)
     promised = promised_of(manifest, surface, options.printer)
-    ranges = promised_ranges(manifest.promise.conditions if manifest.promise else (), promised_side_px(manifest))
+    photo_px, conditions = manifest.settings.get("camera", {}).get("photo_px"), ()
+    if manifest.promise is not None:
+        conditions = manifest.promise.conditions
+    ranges = promised_ranges(conditions, float(min(photo_px)) if photo_px else None)
     sizes = tuple(sorted({model.input_px for model in judges.models})) if judges else ()
-    photo_px = manifest.settings.get("camera", {}).get("photo_px")
     camera = options.scan_dpi, options.camera, photo_px and tuple(photo_px)
     find = manifest.design.pixels() if options.find and manifest.design else None
     return Task(surface, promised, ranges, sizes, *camera, find)

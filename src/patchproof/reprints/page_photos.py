@@ -1,8 +1,8 @@
 """Simulate photographs of a page that lies flat: any printer, uneven light, and the reprint's camera.
 
 In: a page as pixels, a printer as a function from sRGB to light, a seed. Out: pages as light, photographs as JPEG
-files. Their light is less even than that of scenes, so that readers of charts have to correct it: a lamp stands near
-the page, and the picture's corners are darker. Blur, noise and clipping are those of `channel`.
+files. Their light is less even than that of scenes, so that readers of charts have to correct it. Blur, noise and
+clipping are those of `channel`.
 """
 
 from collections.abc import Callable
@@ -33,16 +33,6 @@ PrintFunction = Callable[[np.ndarray], np.ndarray]  # N×3 sRGB sent → N×3 li
 
 PX_PER_MM = 8
 PHOTO_PX = (1600, 1200)
-
-
-@dataclass(frozen=True)
-class _Sources:
-    """Light on a page: ambient, the sun's, and a lamp's on a surface that faces it in the page's middle."""
-
-    ambient: float
-    sun: float
-    lamp: float
-    lamp_mm: np.ndarray  # (3,) from the page's middle; z runs away from the camera
 
 
 @dataclass(frozen=True)
@@ -104,13 +94,9 @@ def photograph_page(page: np.ndarray, seed: int, camera: Camera | None = None) -
     flat = np.eye(4)
     flat[:2, 3] = -page_mm / 2
     px_from_mm = geometry.plane_homography(geometry.intrinsics(50, PHOTO_PX), pose, flat)
-    sources = _draw_sources(rng)
-    white_balance = 1 + rng.uniform(-0.15, 0.15, 3)
-    corners = geometry.rect_corners((0, 0, *page_mm))
-    middle_light, corner_light = (_light_at(mm - page_mm / 2, sources) for mm in (corners.mean(0)[None], corners))
-    exposure = rng.uniform(0.5, 0.85) / (corner_light.max() * white_balance.max())
-    light = _light_in_picture(px_from_mm, page_mm / 2, sources)
-    raw = _warp_page(page, px_from_mm) * (light * _vignetting(rng.uniform(0, 0.2)))[..., None]
+    light, white_balance = _uneven_light(page.shape, rng), 1 + rng.uniform(-0.15, 0.15, 3)
+    exposure = rng.uniform(0.5, 0.85) / (light.max() * white_balance.max())
+    raw = _warp_page(page * light[..., None], px_from_mm)
     ranges = {"blur_px": (0, 1), "noise": (0, 0.01), "jpeg": (60, 95)}
     drawn = {name: np.array([rng.uniform(*ends)]) for name, ends in ranges.items()}
     exposure_ev, noise_seed = np.array([np.log2(exposure)]), np.array([seed])
@@ -118,39 +104,14 @@ def photograph_page(page: np.ndarray, seed: int, camera: Camera | None = None) -
     picture = torch.tensor(raw.transpose(2, 0, 1)[None], dtype=torch.float32)
     codes = develop(picture, sensor, 1.0, jpeg=False, camera=camera)[0].permute(1, 2, 0).numpy().astype(float)
     file = image_bytes(photo_codes_from_srgb(codes), "JPEG", {"quality": int(sensor.jpeg[0])})
-    return Shot(file, middle_light * exposure * white_balance)
+    return Shot(file, exposure * white_balance)
 
 
-def _draw_sources(rng: np.random.Generator) -> _Sources:
-    """Draw the sources; the lamp is 300 to 600 mm away, so that one side of the page is up to twice as bright."""
-    front, up = (0, 0, -1.0), (0, -1.0, 0)
-    lamp = geometry.orbit(rng.uniform(-60, 60), rng.uniform(-60, 60), front, up) * rng.uniform(300, 600)
-    toward = geometry.orbit(rng.uniform(-50, 50), rng.uniform(-50, 50), front, up)
-    lamp_light = rng.uniform(0.2, 0.8)
-    return _Sources(rng.uniform(0.3, 0.7), rng.uniform(0, 0.5) * -toward[2], lamp_light, lamp)
-
-
-def _light_at(from_middle_mm: np.ndarray, sources: _Sources) -> np.ndarray:
-    """Light (N) at points N×2 of the page's plane; the lamp's falls with the square of its distance."""
-    to_lamp = sources.lamp_mm - np.column_stack([from_middle_mm, np.zeros(len(from_middle_mm))])
-    distance = np.linalg.norm(to_lamp, axis=1)
-    lamp = sources.lamp * (np.linalg.norm(sources.lamp_mm) / distance) ** 2 * -to_lamp[:, 2] / distance
-    return sources.ambient + sources.sun + lamp
-
-
-def _vignetting(loss: float) -> np.ndarray:
-    """Factors H×W of a picture's light, which falls as cos⁴ of an angle does, down to 1 - `loss` in the corners."""
-    x, y = (np.arange(side) + 0.5 - side / 2 for side in PHOTO_PX)
-    square = (y[:, None] ** 2 + x**2) * 4 / (PHOTO_PX[0] ** 2 + PHOTO_PX[1] ** 2)
-    return (1 + ((1 - loss) ** -0.5 - 1) * square) ** -2
-
-
-def _light_in_picture(px_from_mm: np.ndarray, middle_mm: np.ndarray, sources: _Sources) -> np.ndarray:
-    """Light on the page's plane at each pixel of the photograph, H×W; computed at every 8th, since it is smooth."""
-    width, height = PHOTO_PX
-    x, y = np.meshgrid(np.arange(4.0, width, 8), np.arange(4.0, height, 8))
-    mm = geometry.apply_homography(np.linalg.inv(px_from_mm), np.stack([x.ravel(), y.ravel()], 1))
-    return cv2.resize(_light_at(mm - middle_mm, sources).reshape(x.shape), PHOTO_PX, interpolation=cv2.INTER_LINEAR)
+def _uneven_light(shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
+    """Light H×W on a page, 1 in its middle, that falls from one side to the other, to half of it at most."""
+    y, x = np.mgrid[-1 : 1 : shape[0] * 1j, -1 : 1 : shape[1] * 1j]
+    turn, fall = rng.uniform(0, 2 * np.pi), rng.uniform(0, 1 / 3)
+    return (1 + fall * (np.cos(turn) * x + np.sin(turn) * y) / 2**0.5).astype(np.float32)
 
 
 def _warp_page(page: np.ndarray, px_from_mm: np.ndarray) -> np.ndarray:
