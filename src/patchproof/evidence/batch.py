@@ -133,7 +133,7 @@ def _measure(task: Task, item: PhotoItem) -> MeasuredPhoto:
     box = None if item.box is None else box_in_square(item.box, size_px)
     if item.control is not None:
         if is_featureless(square_of(photo.srgb)[0]):
-            return _rejected(item, Remark(code="empty", advice=_EMPTY_ADVICE))
+            raise PhotoRejected("empty", None, None, _EMPTY_ADVICE)
         entry = PhotoEntry(file=item.file, status="judged", box=box, said=photo.said)
         return MeasuredPhoto(entry, True, squares=squares, trace=_trace(item.path, photo.srgb))
     view = pinhole_photo(photo, task.camera)
@@ -141,10 +141,9 @@ def _measure(task: Task, item: PhotoItem) -> MeasuredPhoto:
     if corners is not None:
         outside = float(np.maximum(-corners.px, corners.px - size_px).max())
         if outside > _MOST_OUTSIDE * max(size_px):
-            advice = _OUTSIDE_ADVICE.format(*size_px)
-            return _rejected(item, Remark(code="no_corners", figure=outside, threshold=0.0, advice=advice))
-    if corners is not None and view.calibrated and task.camera is not None:
-        corners = replace(corners, px=task.camera.undistort_points(corners.px, size_px))
+            raise PhotoRejected("no_corners", outside, 0.0, _OUTSIDE_ADVICE.format(*size_px))
+        if view.calibrated and task.camera is not None:
+            corners = replace(corners, px=task.camera.undistort_points(corners.px, size_px))
     parts = task.surface, task.promised, task.ranges, task.scan_dpi
     measured = measure(view, item.file, *parts, item.with_pictures, corners, task.find)
     entry, pictures = measured.entry, {}

@@ -28,10 +28,9 @@ from patchproof.evidence.batch import MAX_PICTURED_PHOTOS, PhotoItem, measure_al
 from patchproof.evidence.benefit import benefit_of
 from patchproof.evidence.classify import Judges, judges_of
 from patchproof.evidence.copies import COPY_CODE, reject_copies
-from patchproof.evidence.effect_estimate import estimate_effect
 from patchproof.evidence.grouping import Grouping, control_keys, group_sessions, merge_folders, subfolders
 from patchproof.evidence.journal import Journal, settings_key
-from patchproof.evidence.ledger import ledger_of
+from patchproof.evidence.ledger import estimate_effect, ledger_of
 from patchproof.evidence.measure import UNLOCATED_CODES, MeasuredPhoto
 from patchproof.evidence.results import (
     EffectEstimate,
