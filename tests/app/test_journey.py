@@ -273,9 +273,9 @@ def test_a_smaller_print_looks_like_a_farther_one(journey, tmp_path):
         json.loads((folder / "truth.json").read_text())["photo_0001.jpg"]
         for folder in (journey / "photos", tmp_path / "photos")
     )
-    sides = []
+    marker, sides = load_manifest(journey / "sheet.json").markers[0], []
     for photo in (full, small):
-        corners = np.array(next(iter(photo["marker_corners_px"].values())))
+        corners = geometry.apply_homography(np.array(photo["homography_px_from_mm"]), np.array(marker.corners_mm))
         sides.append(np.linalg.norm(corners[0] - corners[1]))
     assert sides[1] / sides[0] == pytest.approx(0.9, rel=0.02)
 

@@ -1,8 +1,8 @@
 """Simulate photographs of a printed sheet on its object (of pages that belong to no run: see `page_photos`).
 
 In: a sheet's PDF and the run it was made from. Out: a folder of JPEG photographs of that piece on the object,
-`truth.json` with each one's homography, marker corners and conditions, `coco.json` with boxes of object and piece, and
-for a print without markers `corners.csv`, which `verify --corners` takes.
+`truth.json` with each one's homography and conditions, `coco.json` with boxes of object and piece, and for a print
+without markers `corners.csv`, which `verify --corners` takes.
 Conditions come from the reprint stream, which nothing else uses: one print, photographed in one or several sessions,
 each with its own place, light, camera and folder.
 """
