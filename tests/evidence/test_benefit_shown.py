@@ -15,10 +15,10 @@ from patchproof.base.goal import Goal
 from patchproof.base.intervals import wilson
 from patchproof.base.sessions import session_difference
 from patchproof.base.settings import SceneSettings, background_summary
-from patchproof.evidence.benefit import benefit_of
 from patchproof.evidence.results import Control, EffectEstimate
 from patchproof.evidence.verdict import (
     PHOTOS_PER_SESSION,
+    benefit_of,
     judge,
     photos_line,
     sessions_needed,

@@ -25,7 +25,6 @@ from patchproof.base.text import printable
 from patchproof.base.validation import summarize_names
 from patchproof.base.workers import open_workers
 from patchproof.evidence.batch import MAX_PICTURED_PHOTOS, PhotoItem, measure_all, reread_square
-from patchproof.evidence.benefit import benefit_of
 from patchproof.evidence.classify import Judges, judges_of
 from patchproof.evidence.copies import COPY_CODE, reject_copies
 from patchproof.evidence.grouping import Grouping, control_keys, group_sessions, merge_folders, subfolders
@@ -48,6 +47,7 @@ from patchproof.evidence.verdict import (
     PLANNED_LOOK,
     Look,
     Verdict,
+    benefit_of,
     compare_with_control,
     judge,
     still_needed,
