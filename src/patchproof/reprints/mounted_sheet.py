@@ -184,7 +184,7 @@ def sent_pixels(pdf_path: str | Path, manifest: Manifest, scene: Scene) -> Tenso
 
 
 def take_photo(stage: Stage, piece: PiecePicture | None, conditions: Conditions) -> bytes:
-    """Take a JPEG photograph of one view with the piece (None: of the bare object), as `MountedSheet.photograph` does."""
+    """Take a JPEG photograph of one view with the piece (None: of the bare object), by our own renderer."""
     with torch.no_grad():
         picture = photograph(stage, piece, conditions, stage.scene.settings.camera.photo_px, jpeg=False)
     return _camera_file(picture, stage.scene, conditions)
