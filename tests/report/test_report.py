@@ -145,7 +145,7 @@ def test_an_answer_about_a_photograph_that_does_not_count_is_not_called_recogniz
     manifest = make_manifest(promise()).model_dump(mode="json")
     words = "<br>recognized", "<br>not counted"
     for photos, word in ((report.photos[:1], words[0]), ((rejected,), words[1])):
-        write_report(report.changed(photos=photos).model_dump(mode="json"), manifest, tmp_path, None)
+        write_report(report.changed(photos=photos).model_dump(mode="json"), manifest, tmp_path)
         page = (tmp_path / "report.html").read_text("utf-8")
         assert [each for each in words if each in page] == [word]
 
@@ -307,7 +307,6 @@ def test_what_was_not_measured_how_often_was_looked_and_which_folders_are_one_is
         report.model_dump(mode="json"),
         {"settings": {}, "promise": None, "design": None, "kind": "blank", "page_mm": (210, 297)},
         {},
-        None,
     )
     assert "Not measured: the scale of the print (no scan)." in page and note in page
     result = Evaluation(n=1, seed=0, goal="assist", models={}, not_measured={"AP50 of net": "no box"})
