@@ -5,8 +5,14 @@ pictures. Both sides are averaged over the same coarse cells, and the promise is
 resolution is not mistaken for color: a cell is at least two photo pixels, twice the blur and four times the corner
 uncertainty wide. Left out: the outermost ring of cells, into which blur mixes the surroundings of the piece; clipped
 cells, and cells with gloss (light added to all three channels in one place), which are counted. The color map is
-from patchproof.base.geometry import apply_homography, rect_corners
-from patchproof.evidence.results import Color, Geometry, Remark
+fitted to the design's cells, paper and ink; each cell is compared after a map that was fitted to other cells. What the
+photograph's noise and codes alone would make of a right print is measured, too.
+
+Whether the print shows the sheet's design is told by cells as the square root of light over paper, less the mean of
+their surroundings: shadows, veils and a print's usual errors of color leave that structure, and another design lacks
+it. How a channel follows the promised one, where the others do not, is its ink's contrast: on 29 photographs of real
+prints the weakest had 0.32 of the strongest's, on prints without it 0.14. Left out on purpose: bands of clogged
+nozzles, and inks that only a composite black would show.
 """
 
 from dataclasses import dataclass
@@ -17,9 +23,6 @@ import numpy as np
 
 from patchproof.base.color import ciede2000, lab_from_linear, photo_codes_from_srgb, srgb_from_linear
 from patchproof.base.geometry import apply_homography, rect_corners
-from patchproof.evidence.design_match import DesignMatch, match_design
-from patchproof.evidence.results import Color, Geometry
-from patchproof.base.geometry import rect_corners
 from patchproof.evidence.results import Color, Geometry, Remark
 from patchproof.evidence.surface import PromisedColors, Surface
 from patchproof.photo.colorfit import ColorFit, affine12, white_black
