@@ -21,7 +21,7 @@ from patchproof.base.color import LUMINANCE, lift_tone, srgb_from_linear
 from patchproof.base.geometry import apply_homography, rect_corners
 from patchproof.base.resample import index_homography
 from patchproof.channel.print_colors import ShownColors, add_ink, lower_light
-from patchproof.evidence.appearance import fit_cells
+from patchproof.evidence.appearance import fit_cells, noise_of
 from patchproof.evidence.classify import BoxEdges, square_of
 from patchproof.evidence.print_fit import PhotographedDesign, fit_print
 from patchproof.evidence.surface import PromisedColors, Surface
@@ -97,7 +97,8 @@ def photo_square(
         return None
     light, blur_px = unmixed
     square = np.ascontiguousarray(square)
-    to_square, blur_px, noise = to_square @ px_from_mm, blur_px * scale, noise_of(square)
+    luminance = LINEAR_FLOAT32_FROM_CODE[square] @ np.array(LUMINANCE, np.float32)
+    to_square, blur_px, noise = to_square @ px_from_mm, blur_px * scale, float(noise_of(luminance))
     cells, blur_cells = design_cells(square, to_square, surface.rect_mm, blur_px)
     return PhotoSquare(file, square, to_square, light, blur_px, noise, cells, scale, blur_cells=blur_cells)
 
@@ -114,18 +115,6 @@ def unmix_markers(
         return light, blur_px
     light = replace(light, paper=unmixed.paper, ink=unmixed.ink)
     return None if unmixed.agreement < _LEAST_AGREEMENT else (light, unmixed.blur_px)
-
-
-def noise_of(srgb: np.ndarray) -> float:
-    """Estimate the standard deviation of an uint8 picture's luminance noise, in linear light, where it is smooth.
-
-    Immerkaer, Fast Noise Variance Estimation, CVIU 64 (1996) 300-302, with a low quantile in place of the mean: a
-    fifth of most photographs is smooth, and in a mean texture would count as noise.
-    """
-    luminance = (LINEAR_FLOAT32_FROM_CODE[srgb] @ np.array(LUMINANCE, np.float32)).astype(np.float32)
-    mask = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)  # multiplies white noise by 6
-    detail = np.abs(cv2.filter2D(luminance, -1, mask)[1:-1, 1:-1])
-    return float(np.quantile(detail, 0.2) / 0.2533 / 6)
 
 
 def light_fit(shot: PhotoSquare, promised: PromisedColors, tone: float = 0.0) -> ColorFit:
