@@ -37,13 +37,13 @@ _TEN_NUMBERS = re.compile(r"(\d{1,6}(\.\d{1,20})?(,(?!$)|$)){10}")
 
 
 class PhotoCollection:
-    """An album's measured photographs; not thread-safe."""
+    """An album's measured photographs of a sheet that promises something; not thread-safe."""
 
     def __init__(self, album: Album, manifest: Manifest, options: Options, workers: Workers):
-        self.album, self.manifest = album, manifest
+        assert manifest.promise is not None  # else the sheet is refused
+        self.album, self.manifest, self.promise, self._workers = album, manifest, manifest.promise, workers
         self._judges = judges_of(options.models, manifest)
         self._task = task_of(manifest, options, self._judges)
-        self._workers = workers
         self._journal = Journal(album.folder / JOURNAL_FILE, settings_key(manifest, options), resume=True)
         self._measured: dict[Path, MeasuredPhoto] = {}
         self._photos: dict[Path, MeasuredPhoto] | None = None  # those of `photos` once they were asked for

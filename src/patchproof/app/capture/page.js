@@ -176,7 +176,7 @@ async function refresh() {
     const answered = await fetch("state");
     if (answered.ok) show(await answered.json());
     $("soon").textContent = answered.ok ? "" : "This address is not valid any more: open the one that the terminal shows.";
-  } catch { $("soon").textContent = "No connection: photographs are kept here until it is back."; }
+  } catch { $("soon").textContent = "No connection: photographs are kept here until it is back, at this address."; }
 }
 
 for (const id of ["camera", "choose"]) {

@@ -21,7 +21,6 @@ def printer(
     ] = "relative",
     licence: Annotated[str, Option(help="Of the profile, for the record.")] = "unknown",
     source: Annotated[str, Option(help="Where the profile is from, for the record.")] = "unknown",
-    chart: Annotated[bool, Option("--chart", hidden=True)] = False,
     design: Annotated[
         bool, Option("--design", help="They show a print of known pixels, that of --sheet; else a printed chart.")
     ] = False,
@@ -38,8 +37,6 @@ def printer(
     from patchproof.calibrate.printer import printer_from_chart, printer_from_design, printer_from_icc
 
     photos = photos or []
-    if chart:
-        raise BadParameter("a chart needs no option: PHOTO... --sheet chart.json", param_hint="--chart")
     if (icc is None) != bool(photos):
         raise BadParameter("give either --icc FILE or PHOTO...", param_hint="--icc / PHOTO...")
     if not design and (corners or find or known):
@@ -68,9 +65,7 @@ def printer(
 def camera(
     photos: Annotated[Path, Argument(help="A folder of photographs of a board.")],
     board: Annotated[str, Option(help="The board's template, or the BOARD.json beside its PDF.")] = "charuco_a4",
-    out: Annotated[Path, Option(help="The camera file; its figures and a picture are written beside it.")] = Path(
-        "camera.json"
-    ),
+    out: Annotated[Path, Option(help="The camera file, with figures and a picture.")] = Path("camera.json"),
     ruler_mm: Annotated[str | None, Option(help="The printed rulers as measured, e.g. 97.1x97.3 (x, y).")] = None,
     overwrite: Overwrite = False,
 ) -> None:
