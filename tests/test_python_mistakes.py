@@ -110,7 +110,6 @@ MISTAKES: dict[str, tuple[Callable[[], object], str]] = {
     ),
     "verify: controls": (lambda: verify(controls={"mean": "photos"}), "controls of verify"),
     "verify: a list of paths": (lambda: verify(photos=[Path("a.jpg")]), "at index 0"),
-    "verify: a run": (lambda: verify(run=3), "run of verify"),
     "evaluate: none": (lambda: pp.evaluate("run", n=0), "1 or more"),
     "compare: one name": (lambda: pp.compare("run", "out"), r'\["run"\]'),
     "classifier_of: one label": (lambda: pp.classifier_of(MODULE, 32, "box"), r'\["box"\]'),

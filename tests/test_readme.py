@@ -477,16 +477,8 @@ def test_gains_of_the_readme_are_those_of_the_chart():
     assert "6 pairs of object and network" in tables["methods"]["about"]
 
 
-def test_figures_of_forecasts_and_effects_are_the_stored_ones():
-    photos, effects = (rows_of(f"forecasts/forecasts_{name}.csv")[-1] for name in ("forecasts", "effects"))
-    page = words(NOTEBOOK)
-    scores = f"{float(photos['Brier']):.3f} | {float(photos['Brier of the promise']):.3f}"
-    assert f"| Brier score, {photos['photographs']} photographs | {scores} |" in page
-    held = [float(photos[name]) * int(photos[f"{name}_n"]) for name in ("counts held", "the promise's counts held")]
-    assert f"95 % interval | {held[0]:.0f} of 30 | {held[1]:.0f} of 30 |" in page
-    widths = [100 * float(photos[name]) for name in ("width", "the promise's width")]
-    assert "| {:.0f} % | {:.0f} % |".format(*widths) in page
-    assert f"The calibration slope is {float(photos['calibration slope']):.2f} " in page
+def test_figures_of_effects_are_the_stored_ones():
+    page, effects = words(NOTEBOOK), rows_of("effects/effects_effects.csv")[-1]
     off = (100 * float(effects[f"estimated minus photographed{end}"]) for end in ("", "_low", "_high"))
     assert "by {:.1f} points [{:.1f}, {:.1f}] of".format(*off) in page
     assert f"of an effect of {100 * float(effects['photographed effect']):.0f};" in page

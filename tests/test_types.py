@@ -46,7 +46,7 @@ rate: float = said.rate
 manifest: pp.Manifest = pp.sheet(run, "sheet.pdf")
 manifest = pp.load_manifest("sheet.json")
 taken: pp.Reprint = pp.reprint("sheet.pdf", run, 6, "photos", pp.ReprintSetup(printer="uncoated"), compute=compute)
-corners: dict[int, np.ndarray] = next(iter(taken.photos.values())).marker_corners_px
+px_from_mm: np.ndarray | None = next(iter(taken.photos.values())).homography_px_from_mm
 evaluation: pp.Evaluation = pp.evaluate("run", n=8)
 share: float = evaluation.models["builtin"].controls["bare"].rate
 compared = pp.compare(["run", "imported"], "compared")

@@ -42,7 +42,7 @@ from patchproof.app.verify import verify as verify_photos
 from patchproof.base import input
 from patchproof.base.errors import Refused
 from patchproof.base.workers import open_workers
-from patchproof.evidence.corner_files import load_corners
+from patchproof.evidence.annotations import load_corners
 from patchproof.evidence.measure import MeasuredPhoto
 from patchproof.evidence.results import CameraPose, Geometry, PhotoEntry, Prediction
 from patchproof.evidence.verdict import sessions_needed

@@ -5,19 +5,21 @@ from __future__ import annotations
 import json
 import shutil
 
+import cv2
 import numpy as np
 import pytest
 from conftest import SCENE
 from console import command
 from loaded import Step, loaded_by
+from PIL import Image
 
 from patchproof.base import geometry
 from patchproof.base.packaged import packaged_path
-from patchproof.optimizer import run as run_module
+from patchproof.base.resample import index_homography
 from patchproof.sheets.manifest import load_manifest
-from patchproof.sheets.pdf_raster import attached_manifests
+from patchproof.sheets.pdf_raster import attached_manifests, rasterize_page
 
-PHOTOS = 6
+PHOTOS, SCAN_DPI = 6, 100
 # libraries of the demo and of `verify`, which a process of both imports once
 BOTH_LOAD = ("torch", "cv2", "scipy.stats", "scipy.optimize", "matplotlib.backends.backend_svg", "jinja2", "pydantic")
 
@@ -140,26 +142,11 @@ def controls(journey, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def again(journey, controls, tmp_path_factory):
-    """The report of the same photographs with the run at hand, beside the controls'."""
+    """The report of the same photographs beside the controls'."""
     folder, sheet = tmp_path_factory.mktemp("again"), journey / "sheet.json"
-    with_run = ("--run", journey / "run", "--controls", controls, "--out", folder / "report")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("patchproof.reprints.photo_forecast.DRAWS", 6)
-        assert command("verify", journey / "photos", "--sheet", sheet, *with_run) == 0
-    page = (folder / "report" / "report.html").read_text("utf-8")
-    assert "“Promised” is a mean over all views that the scene allows, “expected” one over the views of these" in page
+    given = ("--controls", controls, "--out", folder / "report")
+    assert command("verify", journey / "photos", "--sheet", sheet, *given) == 0
     return json.loads((folder / "report" / "report.json").read_text())
-
-
-def test_forecasts_at_measured_views_are_what_photographs_show(report, again):
-    chances = np.array([photo["forecast"] for photo in again["photos"]])
-    seen = np.array([photo["predictions"]["builtin"]["recognized"] for photo in again["photos"]])
-    assert ((chances > 0) & (chances < 1)).all() and (np.abs(chances - seen) > 0.5).sum() <= 1
-    summary = again["summary"]["forecast"]
-    assert summary["photos"] == PHOTOS and summary["recognized"] == seen.sum()
-    assert summary["interval"][0] <= summary["recognized"] <= summary["interval"][1]
-    assert summary["brier"] == pytest.approx(np.mean((chances - seen) ** 2))
-    assert all(photo["forecast"] is None for photo in report["photos"]) and report["summary"]["forecast"] is None
 
 
 def test_an_effect_estimated_from_photographs_is_that_of_the_photographed_control(again):
@@ -170,19 +157,6 @@ def test_an_effect_estimated_from_photographs_is_that_of_the_photographed_contro
     gray = estimated["gray"]
     assert abs(gray["rates"][1] - photographed["recognized"] / photographed["n"]) <= 1 / PHOTOS
     assert gray["difference_interval"][0] <= photographed["difference"] <= gray["difference_interval"][1]
-
-
-def test_another_runs_forecasts_are_refused(journey, tmp_path, capsys):
-    scene = (journey / "scene.toml").read_text().replace("width_mm = 90", "width_mm = 91")
-    (tmp_path / "scene.toml").write_text(scene.replace("steps = 3", "steps = 1"), encoding="utf-8")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(run_module, "PROMISE_VIEWS", 8)
-        assert command("optimize", tmp_path / "scene.toml", "--out", tmp_path / "run") == 0
-    capsys.readouterr()
-    sheet, run = journey / "sheet.json", tmp_path / "run"
-    assert command("verify", journey / "photos", "--sheet", sheet, "--run", run, "--out", tmp_path / "report") == 1
-    said = capsys.readouterr().err
-    assert "Expected the run of sheet" in said and not (tmp_path / "report").exists()
 
 
 def test_the_promise_predicts_the_photographs_it_is_a_promise_of(journey, report):
@@ -226,6 +200,20 @@ def test_distance_and_angle_come_from_the_focal_length_in_exif(journey, report):
             assert photo["distance_mm"] is None
 
 
+def scan(pdf, manifest, folder, scale=1.0) -> dict[str, dict]:
+    """Scan each page with markers, printed at `scale`; returns the truth as `reprint` writes it, by file."""
+    folder.mkdir()
+    truth = {}
+    for page in sorted({marker.page for marker in manifest.markers}):
+        pixels = rasterize_page(pdf, page, SCAN_DPI)
+        matrix = index_homography(np.diag([scale, scale, 1.0]))[:2]
+        picture = cv2.warpAffine(pixels, matrix, pixels.shape[1::-1], borderValue=(255, 255, 255))
+        Image.fromarray(picture).save(folder / f"scan_{page}.png")
+        px_from_mm = np.diag([scale * SCAN_DPI / 25.4, scale * SCAN_DPI / 25.4, 1.0])
+        truth[f"scan_{page}.png"] = {"homography_px_from_mm": px_from_mm @ manifest.page_from_design_page(page)}
+    return truth
+
+
 def test_scans_of_tiles_are_page_checks_that_lie_where_the_truth_says(journey, tmp_path):
     small = packaged_path("print_templates", "a4_tiles.toml").read_text(encoding="utf-8")
     assert "177.0, 262.4]" in small
@@ -234,12 +222,10 @@ def test_scans_of_tiles_are_page_checks_that_lie_where_the_truth_says(journey, t
     # a control, for which no promise is made anew
     assert command("sheet", run, "--out", pdf, "--template", tmp_path / "small.toml", "--control", "mean") == 0
     manifest = load_manifest(tmp_path / "tiles.json")
-    scans, given = tmp_path / "scans", ("--scan-dpi", 100)
-    assert command("reprint", pdf, "--run", run, "--n", 1, "--out", scans, *given) == 0
+    scans, truth = tmp_path / "scans", scan(pdf, manifest, tmp_path / "scans")
     sheet = ("--sheet", tmp_path / "tiles.json", "--models", "builtin", "--ledger", 0)
-    assert command("verify", scans, *sheet, "--out", tmp_path / "report", *given) == 0
+    assert command("verify", scans, *sheet, "--out", tmp_path / "report", "--scan-dpi", SCAN_DPI) == 0
     photos = json.loads((tmp_path / "report" / "report.json").read_text())["photos"]
-    truth = json.loads((scans / "truth.json").read_text())
     assert len(photos) == len(manifest.tiles) + 1 >= 3
     for photo, tile in zip(photos[1:], manifest.tiles, strict=True):
         assert photo["status"] == "measured" and photo["scale_x"] == pytest.approx(1, abs=0.003)
@@ -249,14 +235,13 @@ def test_scans_of_tiles_are_page_checks_that_lie_where_the_truth_says(journey, t
             geometry.apply_homography(np.array(one["homography_px_from_mm"]), corners)
             for one in (photo, truth[photo["file"]])
         ]
-        assert np.abs(at[0] - at[1]).max() / 100 * 25.4 < 0.25
+        assert np.abs(at[0] - at[1]).max() / SCAN_DPI * 25.4 < 0.25
 
 
 def test_a_page_printed_too_small_shows_in_a_scan_and_in_the_ruler(journey, tmp_path):
-    sheet, run = journey / "sheet.json", journey / "run"
-    arguments = ("--run", run, "--n", 1, "--out", tmp_path / "scans", "--scan-dpi", 100, "--print-scale", "0.97")
-    assert command("reprint", journey / "sheet.pdf", *arguments) == 0
-    judged = ("--sheet", sheet, "--ledger", 0, "--out", tmp_path / "scan", "--scan-dpi", 100)
+    sheet = journey / "sheet.json"
+    scan(journey / "sheet.pdf", load_manifest(sheet), tmp_path / "scans", 0.97)
+    judged = ("--sheet", sheet, "--ledger", 0, "--out", tmp_path / "scan", "--scan-dpi", SCAN_DPI)
     assert command("verify", tmp_path / "scans", *judged) == 0
     scanned = json.loads((tmp_path / "scan" / "report.json").read_text())
     (photo,) = scanned["photos"]
@@ -288,9 +273,9 @@ def test_a_smaller_print_looks_like_a_farther_one(journey, tmp_path):
         json.loads((folder / "truth.json").read_text())["photo_0001.jpg"]
         for folder in (journey / "photos", tmp_path / "photos")
     )
-    sides = []
+    marker, sides = load_manifest(journey / "sheet.json").markers[0], []
     for photo in (full, small):
-        corners = np.array(next(iter(photo["marker_corners_px"].values())))
+        corners = geometry.apply_homography(np.array(photo["homography_px_from_mm"]), np.array(marker.corners_mm))
         sides.append(np.linalg.norm(corners[0] - corners[1]))
     assert sides[1] / sides[0] == pytest.approx(0.9, rel=0.02)
 

@@ -22,7 +22,7 @@ from patchproof.calibrate.known_design import COVERED_DELTA_E00, UNTOUCHED_DELTA
 from patchproof.calibrate.printer_files import printer_output
 from patchproof.channel.print_colors import ShownColors
 from patchproof.channel.printer import load_printer, vary_print
-from patchproof.evidence.corner_files import NamedCorners
+from patchproof.evidence.annotations import NamedCorners
 from patchproof.evidence.surface import surface_of, with_markers
 from patchproof.evidence.task import Options
 from patchproof.sheets.manifest import Manifest, dump_manifest

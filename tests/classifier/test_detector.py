@@ -232,7 +232,6 @@ def test_crops_are_opencv_s(two_stage):
 
 def test_detectors_carry_a_run_from_scene_to_verdict(tmp_path, two_stage, monkeypatch):
     monkeypatch.setattr("patchproof.optimizer.loop.SELECT_VIEWS", 2)
-    monkeypatch.setattr("patchproof.reprints.photo_forecast.DRAWS", 2)
     names = ["builtin-detector", "module:two_stage.rcnn"]
     scene = pp.make_scene(
         {
@@ -250,9 +249,8 @@ def test_detectors_carry_a_run_from_scene_to_verdict(tmp_path, two_stage, monkey
     pp.sheet(run, tmp_path / "sheet.pdf")
     pp.reprint(tmp_path / "sheet.pdf", run, 2, tmp_path / "photos")
     assert [*pp.evaluate(run.folder, n=2, trust=True).models] == names
-    report = pp.verify(
-        tmp_path / "photos", tmp_path / "sheet.json", tmp_path / "report", run=run, models=names, ledger_photos=1
-    )
+    sheet, out = tmp_path / "sheet.json", tmp_path / "report"
+    report = pp.verify(tmp_path / "photos", sheet, out, models=names, ledger_photos=1)
     page = (tmp_path / "report" / "report.html").read_text("utf-8")
     rule = "recognized is a photograph with a box of “box truck”, of score 0.4 or more, over the piece&#39;s object"
     assert rule in page.split("<h2>")[0]

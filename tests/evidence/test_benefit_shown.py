@@ -15,10 +15,10 @@ from patchproof.base.goal import Goal
 from patchproof.base.intervals import wilson
 from patchproof.base.sessions import session_difference
 from patchproof.base.settings import SceneSettings, background_summary
-from patchproof.evidence.benefit import benefit_of
 from patchproof.evidence.results import Control, EffectEstimate
 from patchproof.evidence.verdict import (
     PHOTOS_PER_SESSION,
+    benefit_of,
     judge,
     photos_line,
     sessions_needed,
@@ -106,7 +106,7 @@ def test_terminal_and_page_begin_with_what_the_patch_is_worth(promise, recognize
     assert second.startswith(f"verdict: {verdict} (no control photographs). ")
     assert ("A gain of 10 points or more is ruled out." in first) == (word == "does_not_help")
     manifest = {"promise": promise.model_dump(mode="json"), "settings": {}, "kind": "design", "page_mm": (210, 297)}
-    page = report_html(report.model_dump(mode="json"), manifest | {"design": None}, {}, None)
+    page = report_html(report.model_dump(mode="json"), manifest | {"design": None}, {})
     assert f'<h1 class="{word}">{headline}</h1>' in page and page.index(headline) < page.index("Promise ")
     assert re.search(r"\.helps\b[^{]*\{ color:var\(--yes\)", page) and f'<b class="{verdict}">Promise ' in page
 
@@ -230,7 +230,7 @@ def test_what_stood_behind_the_object_is_said_and_a_plain_color_loudly():
         "ONE PLAIN COLOR" in line for line in promise_lines(HELPFUL, scene | {"background": {"color": (0.5, 0.5, 0.5)}})
     )
     manifest = {"promise": HELPFUL.model_dump(mode="json"), "settings": {}, "kind": "design", "page_mm": (210, 297)}
-    assert "ONE PLAIN COLOR" in report_html(report.model_dump(mode="json"), manifest | {"design": None}, {}, None)
+    assert "ONE PLAIN COLOR" in report_html(report.model_dump(mode="json"), manifest | {"design": None}, {})
 
 
 @pytest.mark.parametrize("views", [0, 48])
@@ -239,7 +239,7 @@ def test_that_the_promise_is_a_draft_is_said(views):
     report = some_report().changed(summary=summary)
     promise = HELPFUL.changed(draft=views > 0)
     manifest = {"promise": promise.model_dump(mode="json"), "settings": {}, "kind": "design", "page_mm": (210, 297)}
-    page = report_html(report.model_dump(mode="json"), manifest | {"design": None}, {}, None)
+    page = report_html(report.model_dump(mode="json"), manifest | {"design": None}, {})
     assert ("The promise is a draft of 48 views (preliminary)." in page) == (views > 0)
     line = "promise simulated in synthetic rooms"
     hint = f"{line}; a draft of 48 views, preliminary"

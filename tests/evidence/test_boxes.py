@@ -14,7 +14,7 @@ from PIL import Image
 import patchproof as pp
 from patchproof.base.errors import Refused
 from patchproof.classifier.detector import iou
-from patchproof.evidence.boxes import box_of_photo, load_boxes
+from patchproof.evidence.annotations import box_of_photo, load_boxes
 from patchproof.evidence.classify import box_in_square
 from patchproof.evidence.declarations import DECLARED
 

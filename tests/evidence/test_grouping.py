@@ -6,7 +6,10 @@ import pytest
 from PIL import Image
 
 from patchproof.base.errors import Refused
-from patchproof.evidence.grouping import BY_FOLDERS, BY_GUESS, BY_TIMES, group_sessions
+from patchproof.evidence.batch import time_and_camera
+from patchproof.evidence.grouping import BY_FOLDERS, BY_GUESS, BY_TIMES, Grouping, group_sessions, merge_folders
+from patchproof.evidence.measure import MeasuredPhoto
+from patchproof.evidence.results import PhotoEntry, Trace
 
 
 def photo(path, taken=None, camera="A"):
@@ -16,6 +19,16 @@ def photo(path, taken=None, camera="A"):
         exif.get_ifd(0x8769)[0x9003] = taken
         exif[0x0110] = camera
     Image.new("RGB", (8, 8)).save(path, exif=exif)
+
+
+def grouped_by_time(folder) -> Grouping:
+    """The sessions of photographs without folders; files that cannot be read have no trace."""
+    grouping, photos = group_sessions(folder), []
+    for path in grouping.paths:
+        minute, camera = time_and_camera(path)
+        trace = Trace(minute=minute, camera=camera, frame=(0, 0, 0)) if path.read_bytes() != b"no picture" else None
+        photos.append(MeasuredPhoto(PhotoEntry(file=path.name, status="judged"), True, trace=trace))
+    return merge_folders(grouping, photos)
 
 
 def test_folders_in_the_folder_are_sessions_and_controls_are_none(tmp_path):
@@ -34,7 +47,7 @@ def test_folders_in_the_folder_are_sessions_and_controls_are_none(tmp_path):
 def test_a_pause_of_more_than_half_an_hour_begins_another_session(tmp_path, second, sessions):
     photo(tmp_path / "b.jpg", "2026:05:01 10:00:00")
     photo(tmp_path / "a.jpg", second)
-    grouping = group_sessions(tmp_path)
+    grouping = grouped_by_time(tmp_path)
     assert len(grouping.names) == sessions and grouping.known_from == BY_TIMES
     assert grouping.session == ((1, 0) if sessions == 2 else (0, 0))  # in the order of names; numbered by time
 
@@ -43,19 +56,24 @@ def test_another_camera_is_another_session(tmp_path):
     photo(tmp_path / "a.jpg", "2026:05:01 10:00:00", "A")
     photo(tmp_path / "b.jpg", "2026:05:01 10:00:00", "B")
     photo(tmp_path / "c.jpg", "2026:05:01 10:01:00", "A")
-    assert group_sessions(tmp_path).session == (0, 1, 0)
+    assert grouped_by_time(tmp_path).session == (0, 1, 0)
 
 
 @pytest.mark.parametrize("taken", [None, "yesterday", "0000:00:00 00:00:00"])
 def test_photographs_that_do_not_all_say_their_time_are_taken_as_one_session(tmp_path, taken):
     photo(tmp_path / "a.jpg", "2026:05:01 10:00:00")
     photo(tmp_path / "b.jpg", taken)
-    assert group_sessions(tmp_path).known_from == BY_GUESS and group_sessions(tmp_path).session == (0, 0)
+    grouping = grouped_by_time(tmp_path)
+    assert grouping.known_from == BY_GUESS and grouping.session == (0, 0)
 
 
 def test_files_that_are_no_pictures_are_a_guess_and_no_photographs_are_refused(tmp_path):
     (tmp_path / "a.jpg").write_bytes(b"no picture")
-    assert group_sessions(tmp_path).known_from == BY_GUESS
+    assert grouped_by_time(tmp_path).known_from == BY_GUESS
+    photo(tmp_path / "b.jpg", "2026:05:01 10:00:00")
+    grouping = grouped_by_time(tmp_path)  # a damaged file does not hide what the others say
+    assert grouping.known_from == BY_TIMES and grouping.names == ("2026-05-01 10:00 A",)
+    (tmp_path / "b.jpg").unlink()
     (tmp_path / "a.jpg").rename(tmp_path / "a.txt")
     with pytest.raises(Refused, match=r"photographs .*got none"):
         group_sessions(tmp_path)

@@ -9,11 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from patchproof.evidence import same_session
-from patchproof.evidence.grouping import BY_FOLDERS, BY_TIMES, Grouping
+from patchproof.evidence import grouping as grouping_module
+from patchproof.evidence.grouping import BY_FOLDERS, BY_TIMES, Grouping, control_keys, merge_folders
 from patchproof.evidence.measure import MeasuredPhoto
 from patchproof.evidence.results import PhotoEntry, Trace
-from patchproof.evidence.same_session import control_keys, merge_folders
 from patchproof.photo.quality import FrameLight
 
 PLACES = ((0.3, 0.25, 0.2), (0.2, 0.3, 0.45), (0.05, 0.2, 0.1), (0.6, 0.2, 0.3))
@@ -126,7 +125,7 @@ def test_the_work_for_sessions_grows_with_photographs_and_not_with_their_square(
 
 
 def test_folders_without_times_are_compared_in_one_step_each(monkeypatch):
-    sizes, shares = [], same_session._distance_shares
-    monkeypatch.setattr(same_session, "_distance_shares", lambda *given: sizes.append(1) or shares(*given))
+    sizes, shares = [], grouping_module._distance_shares
+    monkeypatch.setattr(grouping_module, "_distance_shares", lambda *given: sizes.append(1) or shares(*given))
     merged(*(at(None, None, place=place % 4) for place in range(12)))
     assert len(sizes) == 12

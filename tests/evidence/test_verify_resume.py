@@ -22,7 +22,8 @@ from patchproof.channel.printer import identity_printer
 from patchproof.classifier import Classifier
 from patchproof.evidence import batch, measure
 from patchproof.evidence.gather import gather_evidence
-from patchproof.evidence.journal import Journal, file_sha256
+from patchproof.evidence.journal import FinishedPhoto, Journal, file_sha256
+from patchproof.evidence.results import PhotoEntry
 from patchproof.evidence.task import Options, task_of
 from patchproof.photo.read import read_photo
 from patchproof.sheets.manifest import dump_manifest
@@ -177,13 +178,15 @@ def test_a_figure_that_is_no_number_costs_one_photograph(folder, monkeypatch):
 
 def test_a_journal_forgets_other_keys_and_other_bytes(tmp_path):
     photo, path = tmp_path / "a.jpg", tmp_path / "photos.jsonl"
+    entry = PhotoEntry(file="a.jpg", status="judged", sha256="a" * 64)
+    finished = FinishedPhoto(entry=entry, counted=True, light=None, pictures=False)
     photo.write_bytes(b"one")
     for key, again in (("k", True), ("other", False)):
         journal = Journal(path, "k", resume=False)
-        journal.add("a.jpg", file_sha256(photo), {"x": 1.25})
+        journal.add("a.jpg", file_sha256(photo), finished)
         journal.close()
         journal = Journal(path, key, resume=True)
-        assert (journal.find("a.jpg", photo) == {"x": 1.25}) is again
+        assert (journal.find("a.jpg", photo) == finished) is again
         journal.close()
     photo.write_bytes(b"two")
     journal = Journal(path, "k", resume=True)

@@ -10,7 +10,7 @@ from synthetic_photos import make_manifest
 
 from patchproof.app.verify import _look_at
 from patchproof.base.sessions import TAIL
-from patchproof.evidence.ranges import promised_ranges, promised_side_px
+from patchproof.evidence.ranges import promised_ranges
 from patchproof.evidence.results import CameraPose, Geometry, PhotoEntry
 from patchproof.evidence.verdict import (
     Look,
@@ -214,7 +214,6 @@ def test_a_photograph_with_more_pixels_is_compared_at_the_promised_size():
     assert ranges.violated(entry(px_per_mm=7.5, photo_px=(4000, 3000)), True) is None  # 3.0 at 1200 px
     cannot = ranges.violated(entry(px_per_mm=9.0, photo_px=(3000, 4000)), True)
     assert cannot.figure == pytest.approx(3.6) and "1200 px" in cannot.advice
-    assert promised_side_px(make_manifest()) is None
 
 
 def test_an_azimuth_leaves_the_range_only_where_it_is_sure_to():

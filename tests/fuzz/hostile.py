@@ -588,7 +588,7 @@ def harden(place: Place, number: int) -> Use:
 
 
 def boxes(place: Place, number: int) -> Use:
-    from patchproof.evidence.boxes import load_boxes
+    from patchproof.evidence.annotations import load_boxes
 
     coco = {
         "images": [{"id": 1, "file_name": "a.jpg", "width": 400, "height": 300}],
@@ -608,7 +608,7 @@ def boxes(place: Place, number: int) -> Use:
 
 
 def corners(place: Place, number: int) -> Use:
-    from patchproof.evidence.corner_files import corners_of_photo, load_corners
+    from patchproof.evidence.annotations import corners_of_photo, load_corners
 
     path, rng = place.given / of(number, ("c.csv", "c.json")), np.random.default_rng(number)
     points = (

@@ -76,9 +76,7 @@ def largest_photo(rng: Rng, folder: Path) -> Read:
 def measured(path: Path) -> None:
     """As `verify` measures a photograph; what it is rejected for is refused here, so that it can be seen in counts."""
     from patchproof.evidence.batch import PhotoItem, _measure_or_reject
-    from patchproof.evidence.grouping import group_sessions
 
-    group_sessions(path.parent)
     entry = _measure_or_reject(small_task(), PhotoItem(path, path.name, with_pictures=True)).entry
     assert (entry.status == "rejected") <= bool(entry.remark.advice)
     if entry.code not in (None, "too_few_markers"):
@@ -432,7 +430,7 @@ def corners_coco() -> dict[str, object]:
 
 
 def corners(rng: Rng, folder: Path) -> Read:
-    from patchproof.evidence.corner_files import corners_of_photo, load_corners
+    from patchproof.evidence.annotations import corners_of_photo, load_corners
 
     is_csv = rng.random() < 0.5
     path = folder / ("c.csv" if is_csv else "c.json")

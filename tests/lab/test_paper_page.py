@@ -169,9 +169,9 @@ def test_both_designs_are_printed_and_the_bare_object_photographed_once(tmp_path
     def verify(photos, folder, base, cell, ledger_photos, controls):
         share = SimpleNamespace(share=0.1)
         ledger = None if folder.name == "2d" else SimpleNamespace(ideal=0.9, shares={"print": share})
-        summary = SimpleNamespace(sessions=[SimpleNamespace(recognized=3, judged=5)] * 2)
+        summary = SimpleNamespace(sessions=[SimpleNamespace(recognized=3, judged=5)] * 2, ledger=ledger)
         control = SimpleNamespace(recognized=1, n=10)
-        return SimpleNamespace(ledger=ledger, summary=summary, controls=[control])
+        return SimpleNamespace(summary=summary, controls=[control])
 
     for name, fake in {"make_run_and_sheet": make, "take_photos": take, "verify_photos": verify}.items():
         monkeypatch.setattr(photo_sessions, name, fake)

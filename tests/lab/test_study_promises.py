@@ -12,7 +12,6 @@ from patchproof.base.errors import Refused
 from patchproof.base.sessions import rate_posterior
 from patchproof.optimizer import loop, run
 from patchproof.optimizer.promise import VIEWS_PER_SESSION
-from patchproof.reprints import photo_forecast
 from test_optimize import SCENE
 
 
@@ -59,7 +58,6 @@ def small_study(study, tmp_path, monkeypatch, sessions, more=""):
     """A finished study of that name: one cell, sessions of five photographs by our own renderer."""
     monkeypatch.setattr(run, "PROMISE_VIEWS", 8)
     monkeypatch.setattr(loop, "SELECT_VIEWS", 4)
-    monkeypatch.setattr(photo_forecast, "DRAWS", 2)
     data = {key: dict(value) for key, value in SCENE.items()} | {"camera": {"photo_px": [440, 330]}}
     data |= {"background": {"color": [0.5, 0.5, 0.5]}, "optimize": data["optimize"] | {"steps": 2, "views": 2}}
     lines = [

@@ -99,8 +99,7 @@ def test_a_run_does_not_choose_variables_in_paths(received, key):
 
 def test_every_verb_asks(received, made, tmp_path, capsys):
     """Those that load networks refuse code, and all refuse variables."""
-    pdf, photos = made / "sheet.pdf", tmp_path / "photos"
-    photos.mkdir()
+    pdf = made / "sheet.pdf"
 
     def refused(run: Path, *verbs: tuple[object, ...]) -> None:
         before = sorted(path.name for path in tmp_path.rglob("*"))
@@ -110,15 +109,8 @@ def test_every_verb_asks(received, made, tmp_path, capsys):
         assert sorted(path.name for path in tmp_path.rglob("*")) == before
 
     run, out = tmp_path / "run", tmp_path / "out"
-    judge = ("verify", photos, "--sheet", tmp_path / "sheet.json", "--out", out, "--run", run)
     other = shutil.copytree(made / "run", tmp_path / "other")
-    shutil.copy(made / "sheet.json", tmp_path)
-    loading = (
-        ("promise", run),
-        ("evaluate", run),
-        ("evaluate", run, other, "--out", out),
-        (*judge, "--models", "builtin"),
-    )
+    loading = (("promise", run), ("evaluate", run), ("evaluate", run, other, "--out", out))
     refused(received(), *loading)
     others = (("sheet", run, "--out", tmp_path / "page.pdf"), ("reprint", pdf, "--n", 1, "--run", run, "--out", out))
     refused(received(background__color=None, background__images="${SECRET}"), *loading, *others)

@@ -19,6 +19,7 @@ from patchproof.evidence.results import (
     PHOTO_KEYS,
     Benefit,
     Control,
+    Ledger,
     LedgerShare,
     ModelRate,
     Origin,
@@ -53,6 +54,7 @@ def some_report(verdict="kept"):
     summary = Summary(
         photos=4, judged=3, measured=3, rate=1.0, interval=(0.44, 1.0), prediction_interval=(2, 3), verdict=verdict,
         reason="3 of 3 photographs were recognized.",
+        ledger=some_ledger(),
         worth=Benefit(word="helps", goal="assist", source="photographed", photos=3, rate=1.0, interval=(0.44, 1.0),
                       control="gray", control_rate=1 / 3, control_interval=(0.06, 0.79), difference=0.67,
                       difference_interval=(0.1, 0.9)),
@@ -70,10 +72,10 @@ def some_report(verdict="kept"):
 def some_ledger():
     steps = ("gamut", "print", "light_and_camera", "blur_and_noise", "photo")
     shares = {
-        step: LedgerShare(share=share, interval=(share - 0.02, share + 0.02)).model_dump()
+        step: LedgerShare(share=share, interval=(share - 0.02, share + 0.02))
         for step, share in zip(steps, (0.01, 0.2, 0.05, -0.02, 0.03), strict=True)
     }
-    return {"shares": shares, "ideal": 0.9, "photo": 0.63, "photos": 12, "culprit": "print"}
+    return Ledger(shares=shares, ideal=0.9, photo=0.63, photos=12, culprit="print")
 
 
 def pictures():
@@ -89,7 +91,7 @@ def written(out, verdict="kept"):
     manifest = make_manifest(promise(claims)).model_dump(mode="json")
     for file, kinds in pictures().items():
         save_pictures(out / "pictures", file, kinds)
-    return write_report(some_report(verdict).model_dump(mode="json"), manifest, out, some_ledger())
+    return write_report(some_report(verdict).model_dump(mode="json"), manifest, out)
 
 
 @pytest.fixture(scope="module")
@@ -147,7 +149,7 @@ def test_an_answer_about_a_photograph_that_does_not_count_is_not_called_recogniz
     manifest = make_manifest(promise()).model_dump(mode="json")
     words = "<br>recognized", "<br>not counted"
     for photos, word in ((report.photos[:1], words[0]), ((rejected,), words[1])):
-        write_report(report.changed(photos=photos).model_dump(mode="json"), manifest, tmp_path, None)
+        write_report(report.changed(photos=photos).model_dump(mode="json"), manifest, tmp_path)
         page = (tmp_path / "report.html").read_text("utf-8")
         assert [each for each in words if each in page] == [word]
 
@@ -309,7 +311,6 @@ def test_what_was_not_measured_how_often_was_looked_and_which_folders_are_one_is
         report.model_dump(mode="json"),
         {"settings": {}, "promise": None, "design": None, "kind": "blank", "page_mm": (210, 297)},
         {},
-        None,
     )
     assert "Not measured: the scale of the print (no scan)." in page and note in page
 

@@ -14,7 +14,7 @@ from patchproof.channel.carried_printer import carried_printer, printer_of_sheet
 from patchproof.channel.printer import load_printer
 from patchproof.reprints import page_photos
 from patchproof.reprints.mounted_sheet import DEFAULT_SETUP
-from patchproof.reprints.portable import without_folders
+from patchproof.reprints.run_sheet import without_folders
 from patchproof.sheets.blank import blank_sheet
 
 

@@ -65,7 +65,7 @@ def run(settings: PrintedSettings, base: Path, cell: Cell) -> dict[str, Any]:
             bare = bare or photo_sessions.take_photos(settings, cell, patch_run, folder, "bare")
             most = settings.sessions * settings.photos
             report = photo_sessions.verify_photos(photos, folder, base, cell, ledger_photos=most, controls=bare)
-            ledger, counts = report.ledger, report.summary.sessions
+            ledger, counts = report.summary.ledger, report.summary.sessions
             answers[kind] = {
                 "recognized": sum(session.recognized for session in counts),
                 "judged": sum(session.judged for session in counts),

@@ -35,7 +35,7 @@ STUDIES: dict[str, str] = {
     "breaks": "patchlab.charts.breaks",
     "deceive": "patchlab.paper.deceive",
     "envelope": "patchlab.validation.envelope.sweeps",
-    "forecasts": "patchlab.validation.forecasts",
+    "effects": "patchlab.validation.effects",
     "harden": "patchlab.harden.harden_study",
     "patch2d": "patchlab.paper.patch2d",
     "patch3d": "patchlab.paper.patch3d",

@@ -233,7 +233,7 @@ def flat_white(fit: BoardFit, srgb: np.ndarray) -> np.ndarray:
 
 def white_noise(fit: BoardFit, srgb: np.ndarray) -> tuple[float | None, float | None]:
     """(noise, unevenness) of flat white paper; None if there is too little. Noise is that of `camera.noise`: the
-    standard deviation at white in linear light, by Immerkaer's filter (see `evidence.reproject.noise_of`), without the
+    standard deviation at white in linear light, by Immerkaer's filter (see `evidence.appearance.noise_of`), without the
     part of rounding to codes. Unevenness is the root mean square residual of the quadratic, as a share of the light.
     """
     flat = flat_white(fit, srgb)

@@ -6,7 +6,6 @@ but no report is written.
 """
 
 import zlib
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -21,7 +20,6 @@ from patchproof.base.validation import StrictModel, expand_path
 from patchproof.optimizer.promise import PromiseOptions
 
 if TYPE_CHECKING:
-    from patchproof.evidence.reproject import PhotoSquare
     from patchproof.evidence.results import Report
     from patchproof.optimizer.run import Run
 
@@ -86,14 +84,7 @@ def take_photos(
     return out
 
 
-def verify_photos(
-    photos: Path,
-    folder: Path,
-    base: Path,
-    cell: Cell,
-    forecast: "Callable[[PhotoSquare], float | None] | None" = None,
-    **options: Any,
-) -> "Report":
+def verify_photos(photos: Path, folder: Path, base: Path, cell: Cell, **options: Any) -> "Report":
     """Verify photographs of folder/sheet.pdf without writing a report; `options` replace fields of `Options`."""
     from patchproof.app.verify import options_of
     from patchproof.evidence.gather import gather_evidence
@@ -102,7 +93,7 @@ def verify_photos(
     sheet, networks = folder / "sheet.json", grid.network_names(base, cell.values)
     manifest = load_manifest(sheet)
     changed = replace(options_of(sheet, manifest, networks, None), **options)
-    return gather_evidence(photos, manifest, changed, forecast=forecast)
+    return gather_evidence(photos, manifest, changed)
 
 
 def record_promise(patch_run: "Run") -> dict[str, Any]:

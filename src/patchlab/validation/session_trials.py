@@ -19,10 +19,9 @@ from patchproof.base.goal import Goal
 from patchproof.base.intervals import Estimate, independent_difference, wilson
 from patchproof.base.sessions import sessions_difference
 from patchproof.base.validation import Share, StrictModel
-from patchproof.evidence.grouping import BY_FOLDERS, Grouping
+from patchproof.evidence.grouping import BY_FOLDERS, USUAL_SPREAD, Grouping, merge_folders
 from patchproof.evidence.measure import MeasuredPhoto
 from patchproof.evidence.results import PhotoEntry, Trace
-from patchproof.evidence.same_session import USUAL_SPREAD, merge_folders
 from patchproof.evidence.verdict import Look, judge, required_rate, watched
 from patchproof.optimizer.promise import PROMISE_VIEWS, VIEWS_PER_SESSION
 from patchproof.photo.quality import FrameLight

@@ -3,7 +3,7 @@
 In: a folder of photographs (or of folders, one a session) and SHEET.json. Out: REPORT/ with report.json, report.csv,
 report.html, pictures, coco.json with places of the piece and of a detected object, and photos.jsonl, one line per
 finished photograph, from which `resume` continues. The promise's primary network always judges, also if others are
-named. Scene, renderer and optimizer are imported only if a run is given.
+named. Scene, renderer and optimizer are never imported.
 """
 
 from collections.abc import Callable, Sequence
@@ -47,7 +47,6 @@ from patchproof.sheets.manifest import Manifest, load_manifest
 
 if TYPE_CHECKING:
     from patchproof.channel.lens import Camera
-    from patchproof.optimizer.run import Run
 
 _PHOTOS = "photos"
 REPORT_FILES = ("report.json", "report.csv", "report.html", "coco.json", "pictures", _PHOTOS, JOURNAL_FILE)
@@ -83,7 +82,6 @@ def verify(
     models: Sequence[str | Classifier] | None = None,
     controls: str | Path | None = None,
     capture: CaptureInfo = CaptureInfo(),
-    run: "str | Path | Run | None" = None,
     trust: bool = False,
     ledger_photos: int = LEDGER_PHOTOS,
     compute: Compute = Compute(),
@@ -99,11 +97,10 @@ def verify(
         sheet: the manifest, SHEET.json; its folder is where its models and printers are looked up.
         out: folder for the report, new or empty.
         models: networks besides the sheet's first: names, or classifiers in memory. Code (`module:`) and downloads that
-            the sheet or the run names are used only where they are among them.
+            the sheet names are used only where they are among them.
         controls: folder with a folder of photographs for each control ("bare", "mean", ...).
         capture: camera, scan resolution, measured rulers, the object's boxes, the design's corners.
-        run: the run that the sheet was made from; each photograph then gets a forecast at its measured view.
-        trust: use what sheet and run name without naming it in `models`, also variables of the environment.
+        trust: use what the sheet names without naming it in `models`, also variables of the environment.
         ledger_photos: photographs at most in the gap ledger and the estimated effect, 0 for neither; each costs 16
             classifications.
         compute: processes or cluster; photographs are judged on the CPU, and another device is refused.
@@ -124,7 +121,7 @@ def verify(
     out, manifest, compute = Path(out), load_manifest(sheet), compute.without("verify", device=True)
     with lock_folder(out):
         files = {"camera": capture.camera, "boxes": capture.boxes, "corners": capture.corners}
-        _check_out(out, resume, overwrite, (photos, sheet, controls, run, *files.values()))
+        _check_out(out, resume, overwrite, (photos, sheet, controls, *files.values()))
         look_at = _look_at(out, manifest)
         if isinstance(photos, str | Path) and is_file(Path(photos) / JOURNAL_FILE):
             look_at = lambda entries: None  # noqa: E731  # `capture` showed the answers while they were taken
@@ -135,24 +132,19 @@ def verify(
             if manifest.promise is None or not any(model.LOOKS_AT_BOXES for model in options.models):
                 got = f"the classifiers {', '.join(model.name for model in options.models) or '(none)'}"
                 raise Refused("a detector, since classifiers use no boxes", got, "leave boxes out")
-            from patchproof.evidence.boxes import load_boxes
+            from patchproof.evidence.annotations import load_boxes
 
             options = replace(options, boxes=load_boxes(capture.boxes, manifest.promise.target.label))
         if capture.corners is not None:
-            from patchproof.evidence.corner_files import load_corners
+            from patchproof.evidence.annotations import load_corners
 
             options = replace(options, corners=load_corners(capture.corners))
-        forecast = None
-        if run is not None:
-            from patchproof.reprints.photo_forecast import photo_forecaster  # imports scene, renderer and optimizer
-
-            forecast = photo_forecaster(run, manifest, trust, _by_name(models))
         if not resume:
             clear_folder(out)
         if not isinstance(photos, str | Path):
             photos = write_pictures(photos, out / _PHOTOS)
         on_pictures, advance = partial(save_pictures, out / "pictures"), partial(progress, "verify")
-        how: dict[str, Any] = {"on_pictures": on_pictures, "advance": advance, "forecast": forecast, "look_at": look_at}
+        how: dict[str, Any] = {"on_pictures": on_pictures, "advance": advance, "look_at": look_at}
         how |= {"compute": compute, "journal": out / JOURNAL_FILE, "resume": resume}
         report = gather_evidence(photos, manifest, options, **how)
         parameters |= {name: path and Path(path).name for name, path in files.items()}
@@ -164,8 +156,7 @@ def verify(
         stems = {stem_of(photo.file) for photo in report.photos[:MAX_PICTURED_PHOTOS]}
         # but for pictures of photographs that this report does not show
         clear_folder(out, lambda name: not name.startswith("pictures/") or name[9:].rsplit(".", 2)[0] in stems)
-        ledger = report.ledger and report.ledger.model_dump()
-        write_report(report.model_dump(mode="json"), manifest.model_dump(mode="json"), out, ledger)
+        write_report(report.model_dump(mode="json"), manifest.model_dump(mode="json"), out)
         write_atomically(out / "coco.json", _boxes(report, manifest, options.camera))
     return report
 

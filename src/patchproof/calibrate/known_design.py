@@ -30,9 +30,9 @@ from patchproof.channel.print_colors import (
     fit_shown_colors,
 )
 from patchproof.channel.printer import Printer, load_printer, node_colors
+from patchproof.evidence.annotations import corners_of_photo
 from patchproof.evidence.batch import PhotoItem, measure_all
 from patchproof.evidence.camera import pinhole_photo
-from patchproof.evidence.corner_files import corners_of_photo
 from patchproof.evidence.measure import MeasuredPhoto
 from patchproof.evidence.print_fit import LEAST_CELLS, PhotographedDesign, choose_photo_cells
 from patchproof.evidence.ranges import promised_ranges

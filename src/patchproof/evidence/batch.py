@@ -6,28 +6,27 @@ ends its process each time, becomes a rejected entry, and the batch continues. P
 classified, since a bare object carries no marker; one that shows a single tone or noise is rejected.
 """
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import Field, ValidationError
 
 from patchproof.base.color import linear_from_srgb
-from patchproof.base.errors import WorkerDied
+from patchproof.base.errors import TimeLimitExceeded, WorkerDied
 from patchproof.base.geometry import apply_homography, rect_corners
+from patchproof.base.input import open_lazily
 from patchproof.base.resample import downscaled_size, to_sixteenths
-from patchproof.base.validation import Finite, Share, StrictModel
 from patchproof.base.workers import Workers, result_of
 from patchproof.evidence.camera import pinhole_photo
 from patchproof.evidence.classify import BoxEdges, Judges, box_in_square, square_of, squares_of
-from patchproof.evidence.grouping import time_and_camera
-from patchproof.evidence.journal import Journal, file_sha256
+from patchproof.evidence.journal import FinishedPhoto, Journal, file_sha256
 from patchproof.evidence.measure import MeasuredPhoto, measure
 from patchproof.evidence.reproject import PhotoSquare, photo_square
 from patchproof.evidence.results import PhotoEntry, Remark, Trace
@@ -35,7 +34,7 @@ from patchproof.evidence.surface import Surface
 from patchproof.evidence.task import Task
 from patchproof.photo.exif import has_camera_shape
 from patchproof.photo.limits import run_limited
-from patchproof.photo.quality import FrameLight, is_featureless
+from patchproof.photo.quality import is_featureless
 from patchproof.photo.read import read_photo
 from patchproof.photo.rejection import PhotoRejected
 
@@ -44,6 +43,7 @@ if TYPE_CHECKING:
 
 MAX_PICTURED_PHOTOS = 120  # photographs whose pictures are on the page; the rest is listed. Keeps it below some 15 MB
 _THUMBNAIL_PX = 560  # longer side: enough for a phone's width at twice its density, some 40 kB as JPEG
+_EXIF_IFD, _TIME_TAG, _SERIAL_TAG, _MODEL_TAG = 0x8769, 0x9003, 0xA431, 0x0110
 _DESIGN_COLOR, _MARKER_COLOR = (255, 64, 129), (0, 200, 140)
 _DIED_ADVICE = "measuring it ended its process each time, for want of memory: save it smaller"
 _EMPTY_ADVICE = "it shows one tone or noise and nothing else: take it again"
@@ -53,9 +53,6 @@ _OUTSIDE_ADVICE = "its corners lie outside of it: name pixels of the upright pic
 _OTHER_DPI = "resolutions of scans by their files, {:.0f} × {:.0f} dpi, where --scan-dpi says {:g}"
 # codes of photographs whose homography is still accurate enough to put pieces into them
 MEASURABLE_CODES = (None, "clipped", "blurred", "too_small", "cropped", "weak_ink", "noisy")
-
-# linear light of paper and ink, within the bounds of `frame_light`; negative where a print is lighter than its paper
-LightLevel = Annotated[Finite, Field(ge=-4, le=4)]
 
 
 @dataclass(frozen=True)
@@ -92,11 +89,12 @@ def measure_all(
     step: Callable[[int, int], None],
 ) -> list[MeasuredPhoto]:
     """Measure every photograph, in order; the journal's are not opened again. `step` gets (done, total)."""
-    photos: dict[int, MeasuredPhoto] = {}
+    photos, networks = dict[int, MeasuredPhoto](), {model.name for model in judges.models} if judges else set()
     for number, item in enumerate(items):
-        line = None if journal is None else journal.find(item.journal_name, item.path)
-        if line is not None and (photo := _parse(line, item, judges)) is not None:
-            photos[number] = photo
+        found = None if journal is None else journal.find(item.journal_name, item.path)
+        if found is not None and found.entry.file == item.file and found.pictures >= item.with_pictures:
+            if set(found.entry.predictions) in (set(), networks):
+                photos[number] = found.photo
     todo = [number for number in range(len(items)) if number not in photos]
     step(len(photos), len(items))
     for position, future in workers.completed(partial(_measure_or_reject, task), [items[number] for number in todo]):
@@ -110,53 +108,12 @@ def measure_all(
         entry = entry.changed(sha256=sha256, predictions=predictions)
         if item.control is None:
             on_pictures(item.file, measured.pictures)
-        line = _serialize(replace(measured, entry=entry), item.with_pictures)
+        finished = FinishedPhoto.of(replace(measured, entry=entry), item.with_pictures)
         if journal is not None:
-            journal.add(item.journal_name, sha256, line)
-        photos[number] = _JournalPhoto.model_validate(line).photo  # read back, so that a resumed run cannot differ
+            journal.add(item.journal_name, sha256, finished)
+        photos[number] = finished.photo
         step(len(photos), len(items))
     return [photos[number] for number in range(len(items))]
-
-
-class _Light(StrictModel):
-    paper: tuple[LightLevel, LightLevel, LightLevel]
-    ink: tuple[LightLevel, LightLevel, LightLevel]
-    contrast: Finite
-    clipped: Share
-
-
-class _JournalPhoto(StrictModel):
-    """A photograph's result in the journal."""
-
-    entry: PhotoEntry
-    counted: bool
-    light: _Light | None
-    pictures: bool
-    trace: Trace | None = None
-
-    @property
-    def photo(self) -> MeasuredPhoto:
-        light = self.light
-        if light is not None:
-            light = FrameLight(np.array(light.paper), np.array(light.ink), light.contrast, light.clipped)
-        return MeasuredPhoto(self.entry, self.counted, light=light, trace=self.trace)
-
-
-def _serialize(measured: MeasuredPhoto, pictures: bool) -> dict[str, Any]:
-    light = measured.light and {key: np.asarray(value).tolist() for key, value in vars(measured.light).items()}
-    entry, trace = measured.entry.model_dump(mode="json"), measured.trace and measured.trace.model_dump()
-    return {"entry": entry, "counted": measured.counted, "light": light, "pictures": pictures, "trace": trace}
-
-
-def _parse(line: Mapping[str, Any], item: PhotoItem, judges: Judges | None) -> MeasuredPhoto | None:
-    """Read a journal line; None if it is another photograph's, or lacks predictions or pictures that this run needs."""
-    try:
-        result = _JournalPhoto.model_validate(line)
-    except ValidationError:
-        return None
-    entry, names = result.entry, {model.name for model in judges.models} if judges else set()
-    complete = entry.file == item.file and set(entry.predictions) in (set(), names)
-    return result.photo if complete and (result.pictures or not item.with_pictures) else None
 
 
 def _measure_or_reject(task: Task, item: PhotoItem) -> MeasuredPhoto:
@@ -176,7 +133,7 @@ def _measure(task: Task, item: PhotoItem) -> MeasuredPhoto:
     box = None if item.box is None else box_in_square(item.box, size_px)
     if item.control is not None:
         if is_featureless(square_of(photo.srgb)[0]):
-            return _rejected(item, Remark(code="empty", advice=_EMPTY_ADVICE))
+            raise PhotoRejected("empty", None, None, _EMPTY_ADVICE)
         entry = PhotoEntry(file=item.file, status="judged", box=box, said=photo.said)
         return MeasuredPhoto(entry, True, squares=squares, trace=_trace(item.path, photo.srgb))
     view = pinhole_photo(photo, task.camera)
@@ -184,10 +141,9 @@ def _measure(task: Task, item: PhotoItem) -> MeasuredPhoto:
     if corners is not None:
         outside = float(np.maximum(-corners.px, corners.px - size_px).max())
         if outside > _MOST_OUTSIDE * max(size_px):
-            advice = _OUTSIDE_ADVICE.format(*size_px)
-            return _rejected(item, Remark(code="no_corners", figure=outside, threshold=0.0, advice=advice))
-    if corners is not None and view.calibrated and task.camera is not None:
-        corners = replace(corners, px=task.camera.undistort_points(corners.px, size_px))
+            raise PhotoRejected("no_corners", outside, 0.0, _OUTSIDE_ADVICE.format(*size_px))
+        if view.calibrated and task.camera is not None:
+            corners = replace(corners, px=task.camera.undistort_points(corners.px, size_px))
     parts = task.surface, task.promised, task.ranges, task.scan_dpi
     measured = measure(view, item.file, *parts, item.with_pictures, corners, task.find)
     entry, pictures = measured.entry, {}
@@ -212,9 +168,23 @@ def _trace(path: Path, srgb: np.ndarray) -> Trace:
     small = linear_from_srgb(cv2.resize(sampled, (32, 32), interpolation=cv2.INTER_AREA) / 255)
     frame = np.pad(np.zeros((24, 24), bool), 4, constant_values=True)
     red, green, blue = map(float, small[frame].mean(0))
-    time, camera = time_and_camera(path) or (None, "")
-    minute = time and (time - datetime.min).total_seconds() / 60
+    minute, camera = time_and_camera(path)
     return Trace(minute=minute, camera=camera, frame=(red, green, blue))
+
+
+def time_and_camera(path: Path) -> tuple[float | None, str]:
+    """Time, in minutes since the year 1, and camera by the file's EXIF data; None if either is missing."""
+    try:
+        with warnings.catch_warnings(action="ignore"), open_lazily(path) as image:
+            exif = image.getexif()
+            details = exif.get_ifd(_EXIF_IFD)
+        time = datetime.strptime(str(details.get(_TIME_TAG)).strip("\0 "), "%Y:%m:%d %H:%M:%S")
+        camera = f"{exif.get(_MODEL_TAG) or ''} {details.get(_SERIAL_TAG) or ''}"
+        return (time - datetime.min).total_seconds() / 60, " ".join(camera.split())[:40]
+    except TimeLimitExceeded:
+        raise
+    except Exception:  # of whatever a damaged file makes of its data
+        return None, ""
 
 
 def _thumbnail(srgb: np.ndarray, px_from_mm: ArrayLike | None, surface: Surface) -> np.ndarray:
@@ -251,8 +221,8 @@ def reread_square(task: Task, size_px: int, item: tuple[Path, MeasuredPhoto]) ->
     surface = task.surface if geometry.located == "markers" else task.surface.without_markers
 
     def shot() -> PhotoSquare | None:
-        view = pinhole_photo(read_photo(path), task.camera)
-        shot = photo_square(entry.file, view.srgb, px_from_mm, blur_px, light, surface, size_px, view.matrix_px)
+        srgb = pinhole_photo(read_photo(path), task.camera).srgb
+        shot = photo_square(entry.file, srgb, px_from_mm, blur_px, light, surface, size_px)
         return shot and replace(shot, box=measured.entry.box)
 
     try:

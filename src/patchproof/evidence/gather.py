@@ -25,16 +25,12 @@ from patchproof.base.text import printable
 from patchproof.base.validation import summarize_names
 from patchproof.base.workers import open_workers
 from patchproof.evidence.batch import MAX_PICTURED_PHOTOS, PhotoItem, measure_all, reread_square
-from patchproof.evidence.benefit import benefit_of
 from patchproof.evidence.classify import Judges, judges_of
 from patchproof.evidence.copies import COPY_CODE, reject_copies
-from patchproof.evidence.effect_estimate import estimate_effect
-from patchproof.evidence.forecast import forecast_of
-from patchproof.evidence.grouping import Grouping, group_sessions, subfolders
+from patchproof.evidence.grouping import Grouping, control_keys, group_sessions, merge_folders, subfolders
 from patchproof.evidence.journal import Journal, settings_key
-from patchproof.evidence.ledger import ledger_of
+from patchproof.evidence.ledger import estimate_effect, ledger_of
 from patchproof.evidence.measure import UNLOCATED_CODES, MeasuredPhoto
-from patchproof.evidence.reproject import PhotoSquare
 from patchproof.evidence.results import (
     EffectEstimate,
     Ledger,
@@ -45,13 +41,13 @@ from patchproof.evidence.results import (
     SessionCount,
     Summary,
 )
-from patchproof.evidence.same_session import control_keys, merge_folders
 from patchproof.evidence.task import Options, task_of
 from patchproof.evidence.verdict import (
     MOST_PHOTOS,
     PLANNED_LOOK,
     Look,
     Verdict,
+    benefit_of,
     compare_with_control,
     judge,
     still_needed,
@@ -69,7 +65,6 @@ def gather_evidence(
     compute: Compute = Compute(),
     journal: Path | None = None,
     resume: bool = False,
-    forecast: Callable[[PhotoSquare], float | None] | None = None,
     look_at: Callable[[Sequence[PhotoEntry]], Look | None] = lambda entries: PLANNED_LOOK,
     on_pictures: Callable[[str, Mapping[str, np.ndarray]], None] = lambda file, pictures: None,
     advance: Advance = no_advance,
@@ -78,79 +73,64 @@ def gather_evidence(
     sessions (see `grouping`).
 
     Photographs are measured by the processes or the cluster of `compute`. The file `journal` records
-    finished photographs; with `resume` those of an earlier run are not measured again. `forecast` computes the chance
-    that a photograph is recognized, without its pixels of the piece. `look_at` tells the look from the entries, see
-    `report_of`. `on_pictures` gets a name and pictures by kind (`photo`, and `seen`, `fitted`, `promised`, `delta_e00`
-    of a measured one) of the first `batch.MAX_PICTURED_PHOTOS` photographs when each is measured; `advance` is called
-    with (done, total).
+    finished photographs; with `resume` those of an earlier run are not measured again. `look_at` tells the look from
+    the entries, see `report_of`. `on_pictures` gets a name and pictures by kind (`photo`, and `seen`, `fitted`,
+    `promised`, `delta_e00` of a measured one) of the first `batch.MAX_PICTURED_PHOTOS` photographs when each is
+    measured; `advance` is called with (done, total).
     """
     controls_folder = None if options.controls is None else Path(options.controls)
     grouping = group_sessions(photos, controls_folder)
     by_control, paths = _list_controls(controls_folder, grouping.names), grouping.paths
-    judges = judges_of(options.models, manifest)
+    judges, count = judges_of(options.models, manifest), len(paths)
     task = task_of(manifest, options, judges)
     items = [PhotoItem(path, grouping.file(i), with_pictures=i < MAX_PICTURED_PHOTOS) for i, path in enumerate(paths)]
     items += [PhotoItem(path, file, name) for name, files in by_control.items() for file, path in files.items()]
-    if options.boxes:
-        from patchproof.evidence.boxes import box_of_photo
+    left_out = list_skipped_files(Path(photos), controls_folder and controls_folder.resolve())
+    if options.boxes or options.corners:
+        from patchproof.evidence.annotations import box_of_photo, corners_of_photo, find_in_photos
 
-        items = [replace(item, box=box_of_photo(options.boxes, item.name, item.path)) for item in items]
-        if not any(item.box for item in items):
-            do = "name the images in the boxes' file as the photographs"
-            got = f"boxes of {next(iter(options.boxes))} and {len(options.boxes) - 1} more"
-            raise Refused("boxes of these photographs", got, do)
-    unused: list[str] = []
-    if options.corners:
-        from patchproof.evidence.corner_files import corners_of_photo
-
-        found = [None if item.control else corners_of_photo(options.corners, item.name, item.path) for item in items]
-        items = [replace(item, corners=corners) for item, corners in zip(items, found, strict=True)]
-        names = {name for item in items if item.control is None for name in (item.name, item.path.name)}
-        if not any(item.corners for item in items):
-            got = f"corners in {summarize_names(list(options.corners))}"
-            raise Refused("corners of these photographs", got, "name the files as the photographs")
-        unused = [name for name in options.corners if PurePosixPath(name).name not in names]
+        sources = [(item.name, item.path) for item in items]
+        if options.boxes:
+            boxes = find_in_photos("boxes", options.boxes, box_of_photo, sources)
+            items = [replace(item, box=box) for item, box in zip(items, boxes, strict=True)]
+        if options.corners:
+            corners = find_in_photos("corners", options.corners, corners_of_photo, sources[:count])
+            items[:count] = [replace(item, corners=px) for item, px in zip(items[:count], corners, strict=True)]
+            known = {name for file, path in sources[:count] for name in (file, path.name)}
+            if unused := [name for name in options.corners if PurePosixPath(name).name not in known]:
+                left_out.append(f"corners of {len(unused)} other photographs ({summarize_names(unused)})")
     journal_file = closing(Journal(journal, settings_key(manifest, options), resume)) if journal else nullcontext()
     with journal_file as open_journal, open_workers(compute.jobs, compute.cluster) as workers:
         results = measure_all(task, items, judges, workers, open_journal, on_pictures, advance)
-        grouping = merge_folders(grouping, results[: len(paths)])
-        patch_photos = reject_copies(results[: len(paths)], grouping.merged, task.surface.rect_mm)
+        grouping = merge_folders(grouping, results[:count])
+        patch_photos = reject_copies(results[:count], grouping.merged, task.surface.rect_mm)
         ledger, estimate = None, None
         if judges and task.promised:
             originals = [number for number, photo in enumerate(patch_photos) if photo.entry.code != COPY_CODE]
             name, read_shot = judges.primary.name, partial(reread_square, task, judges.primary.input_px)
             numbers = _spread(originals, MOST_PHOTOS if options.ledger_photos else 0)
-            squares = workers.map(read_shot, [(paths[number], patch_photos[number]) for number in numbers])
-            shots = [shot for shot in _spread(list(squares), options.ledger_photos) if shot is not None]
+            squares = list(workers.map(read_shot, [(paths[number], patch_photos[number]) for number in numbers]))
+            shots = [shot for shot in _spread(squares, options.ledger_photos) if shot is not None]
             entries = [photo.entry for photo in patch_photos if photo.entry.predictions]
             confidence = {entry.file: entry.predictions[name].target_confidence for entry in entries}
             ledger = ledger_of(shots, manifest, task.surface, task.promised, judges, confidence)
-            recognized = _recognized(entries, name)
             pairs = zip(patch_photos, grouping.merged, strict=True)
             session = {photo.entry.file: number for photo, number in pairs if photo.counted}
             shots = [shot for shot in squares if shot is not None and shot.file in session]
             scene = task.surface, options.printer, judges
-            estimate = estimate_effect(shots, manifest, *scene, recognized, session)
-            if forecast is not None:
-                for number, photo in enumerate(patch_photos):
-                    shot = read_shot((paths[number], photo)) if photo.entry.predictions else None
-                    chance = None if shot is None else forecast(shot)
-                    patch_photos[number] = replace(photo, entry=photo.entry.changed(forecast=chance))
-    by_sha256: dict[str, dict[str, MeasuredPhoto]] = {}
-    left_out = list_skipped_files(Path(photos), controls_folder and controls_folder.resolve())
+            estimate = estimate_effect(shots, manifest, *scene, _recognized(entries, name), session)
     if controls_folder:
         skipped = list_skipped_files(controls_folder, depth=2)
         left_out += [f"{printable(controls_folder.name)}: {text}" for text in skipped]
-    left_out += [f"corners of {len(unused)} other photographs ({summarize_names(unused)})"] if unused else []
     left_out += summarize_said((item.name, result.entry.said) for item, result in zip(items, results, strict=True))
-    for item, result in zip(items, results, strict=True):
-        if item.control is not None:
-            name, entry = item.control, result.entry
-            first = by_sha256.setdefault(name, {}).setdefault(entry.sha256 or item.name, result).entry
-            if first is not entry:
-                left_out.append(f"{name}/{entry.file} has the bytes of {name}/{first.file}, which counts once")
-            elif entry.status == "rejected" and entry.remark is not None:
-                left_out.append(f"{name}/{entry.file} does not count: {entry.remark.advice}")
+    by_sha256: dict[str, dict[str, MeasuredPhoto]] = {}
+    for item, result in zip(items[count:], results[count:], strict=True):
+        name, entry = item.control or "", result.entry
+        first = by_sha256.setdefault(name, {}).setdefault(entry.sha256 or item.name, result).entry
+        if first is not entry:
+            left_out.append(f"{name}/{entry.file} has the bytes of {name}/{first.file}, which counts once")
+        elif entry.status == "rejected" and entry.remark is not None:
+            left_out.append(f"{name}/{entry.file} does not count: {entry.remark.advice}")
     controls = {name: list(photos.values()) for name, photos in by_sha256.items()}
     look = look_at([photo.entry for photo in patch_photos])
     report = report_of(manifest, judges, patch_photos, grouping, controls, ledger, options.ruler_mm, look, estimate)
@@ -161,8 +141,7 @@ def gather_evidence(
         missing["bend, and where paper was cut"] = f"{placed} photographs were located by the design alone"
     if judges and task.promised and options.ledger_photos and (ledger is None or estimate is None):
         missing["where the rate was lost, what controls would show"] = "too few photographs can be measured"
-    summary = report.summary.changed(left_out=tuple(left_out), not_measured=missing)
-    return report.changed(summary=summary)
+    return report.changed(summary=report.summary.changed(left_out=tuple(left_out), not_measured=missing))
 
 
 def _spread(items: list, most: int) -> list:
@@ -208,12 +187,12 @@ def report_of(
     look: Look | None = PLANNED_LOOK,
     estimate: EffectEstimate | None = None,
 ) -> Report:
-    """Sum up all photographs; with a promise and `judges` also verdict, rates, forecast and whether the patch helps.
+    """Sum up all photographs; with a promise and `judges` also verdict, rates and whether the patch helps.
     Without a `look` the photographs were watched while they were taken.
     """
     entries, counted = [photo.entry for photo in photos], [photo.entry for photo in photos if photo.counted]
     verdict = Verdict("cannot_tell", None, "The sheet promises nothing.")
-    comparisons, rates, rate, interval, sessions, forecast, do, worth = [], {}, _rate({}), None, (), None, "", None
+    comparisons, rates, rate, interval, sessions, do, worth = [], {}, _rate({}), None, (), "", None
     if judges and manifest.promise:
         promise, primary = manifest.promise, judges.primary.name
         rates = {model.name: _rate(_recognized(counted, model.name)) for model in judges.models}
@@ -226,9 +205,6 @@ def report_of(
         verdict = judge(*counts, promise, without_markers, look)
         if recognized:
             interval = promise.posterior.rate_given(*counts)
-        pairs = [(e.forecast, recognized[e.file]) for e in counted if e.forecast is not None and e.file in recognized]
-        if pairs:
-            forecast = forecast_of([p for p, _ in pairs], [answer for _, answer in pairs], promise.rate)
         answers = {(numbers[file], file): answer for file, answer in recognized.items()}
         for name, control in controls.items():
             keys, hits = control_keys(grouping, photos, control), _recognized((p.entry for p in control), primary)
@@ -250,8 +226,7 @@ def report_of(
         looks_planned=(look or PLANNED_LOOK).planned,
         prediction_interval=verdict.prediction_interval,
         verdict=verdict.verdict,
-        ledger=ledger and ledger.shares,
-        culprit=ledger and ledger.culprit,
+        ledger=ledger,
         reason=verdict.reason,
         next_step=do,
         worth=worth,
@@ -259,14 +234,12 @@ def report_of(
         background=background_summary(manifest.settings),
         draft_views=manifest.promise.n if manifest.promise is not None and manifest.promise.draft else 0,
         models=rates,
-        forecast=forecast,
     )
     if ruler_mm is not None:
         x, y = np.divide(ruler_mm, manifest.ruler_mm).tolist()
         scale = Scale(scale_x=x, scale_y=y)
         entries = [entry if entry.scale else entry.changed(scale=scale) for entry in entries]
-    sheet_id = manifest.sheet_id
-    return Report(sheet_id=sheet_id, photos=tuple(entries), summary=summary, controls=tuple(comparisons), ledger=ledger)
+    return Report(sheet_id=manifest.sheet_id, photos=tuple(entries), summary=summary, controls=tuple(comparisons))
 
 
 def _sessions(grouping: Grouping, photos: Sequence[MeasuredPhoto], hits: dict[str, bool]) -> tuple[SessionCount, ...]:

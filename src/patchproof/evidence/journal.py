@@ -3,7 +3,6 @@
 In: a file of JSON lines and a key that stands for everything a result depends on besides the photograph itself. Out:
 the result of an earlier run for a photograph of the same name and bytes under the same key. Lines of other keys and
 broken lines are dropped, so that a photograph is measured again if it, a network, the sheet or an option changed.
-The reader validates the results themselves.
 """
 
 import io
@@ -11,18 +10,22 @@ import json
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, Annotated, TextIO
 
 import cv2
 import numpy as np
+from pydantic import Field
 
 from patchproof.base.errors import Refused
 from patchproof.base.fingerprint import value_sha256
 from patchproof.base.input import MAX_JSON_BYTES, hash_file, is_file, read_file
 from patchproof.base.output import make_folder, write_atomically
-from patchproof.base.validation import StrictModel, validate_model
+from patchproof.base.validation import Finite, Share, StrictModel, validate_model
 from patchproof.base.version import __version__
+from patchproof.evidence.measure import MeasuredPhoto
+from patchproof.evidence.results import PhotoEntry, Trace
 from patchproof.photo.limits import MOST_BYTES
+from patchproof.photo.quality import FrameLight
 
 if TYPE_CHECKING:
     from patchproof.evidence.task import Options
@@ -32,11 +35,52 @@ JOURNAL_FILE = "photos.jsonl"
 MAX_JOURNAL_BYTES = 128 << 20  # of 10,000 photographs
 
 
+# linear light of paper and ink, within the bounds of `frame_light`; negative where a print is lighter than its paper
+LightLevel = Annotated[Finite, Field(ge=-4, le=4)]
+
+
+class _Light(StrictModel):
+    paper: tuple[LightLevel, LightLevel, LightLevel]
+    ink: tuple[LightLevel, LightLevel, LightLevel]
+    contrast: Finite
+    clipped: Share
+
+
+class FinishedPhoto(StrictModel):
+    """A measured photograph without pixels; `pictures` says whether those for the page were made."""
+
+    entry: PhotoEntry
+    counted: bool
+    light: _Light | None
+    pictures: bool
+    trace: Trace | None = None
+
+    @classmethod
+    def of(cls, measured: MeasuredPhoto, pictures: bool) -> "FinishedPhoto":
+        """Make it by way of JSON, so that a resumed run, which reads it, cannot differ."""
+        light = measured.light and {key: np.asarray(value).tolist() for key, value in vars(measured.light).items()}
+        entry, trace = measured.entry.model_dump(mode="json"), measured.trace and measured.trace.model_dump()
+        values = {"entry": entry, "counted": measured.counted, "light": light, "pictures": pictures, "trace": trace}
+        return cls.model_validate(values)
+
+    @property
+    def photo(self) -> MeasuredPhoto:
+        """The measured photograph."""
+        light = self.light
+        if light is not None:
+            light = FrameLight(np.array(light.paper), np.array(light.ink), light.contrast, light.clipped)
+        return MeasuredPhoto(self.entry, self.counted, light=light, trace=self.trace)
+
+
 class _Line(StrictModel):
     file: str
     sha256: str | None
     key: str
-    result: dict[str, Any]
+    result: FinishedPhoto
+
+    @property
+    def text(self) -> str:
+        return json.dumps(self.model_dump(mode="json"), allow_nan=False) + "\n"
 
 
 class Journal:
@@ -46,18 +90,17 @@ class Journal:
         make_folder(path.parent)
         lines = [line for line in _read_lines(path) if line.key == key] if resume else []
         self._key, self._lines_by_name = key, {line.file: line for line in lines}
-        write_atomically(path, "".join(json.dumps(line.model_dump()) + "\n" for line in self._lines_by_name.values()))
+        write_atomically(path, "".join(line.text for line in self._lines_by_name.values()))
         self._file: TextIO = open(path, "a", encoding="utf-8")
 
-    def find(self, name: str, photo: Path) -> Any:
+    def find(self, name: str, photo: Path) -> FinishedPhoto | None:
         """Result of the photograph of that name; None if there is none, or if the file's bytes have changed."""
         line = self._lines_by_name.get(name)
         return line.result if line is not None and line.sha256 == file_sha256(photo) else None
 
-    def add(self, name: str, sha256: str | None, result: Any) -> None:
-        """Write the result (JSON values) of a photograph of that name and SHA-256, and flush it."""
-        line = {"file": name, "sha256": sha256, "key": self._key, "result": result}
-        self._file.write(json.dumps(line, allow_nan=False) + "\n")
+    def add(self, name: str, sha256: str | None, result: FinishedPhoto) -> None:
+        """Write the result of a photograph of that name and SHA-256, and flush it."""
+        self._file.write(_Line(file=name, sha256=sha256, key=self._key, result=result).text)
         self._file.flush()
 
     def close(self) -> None:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from patchproof.evidence.results import PhotoEntry
 from patchproof.photo.rejection import PhotoRejected
-from patchproof.sheets.manifest import ConditionClaim, Manifest
+from patchproof.sheets.manifest import ConditionClaim
 
 MARGIN = 0.10  # of the range's width
 _LEAST_ANGLE_MARGIN_DEG = 3.0  # a nearly frontal view's tilt is no better known than this
@@ -49,12 +49,6 @@ class PromisedRanges:
         return None
 
 
-def promised_side_px(manifest: Manifest) -> float | None:
-    """Pixels of the shorter side of the promised photographs; None if the settings do not say."""
-    sides = manifest.settings.get("camera", {}).get("photo_px")
-    return float(min(sides)) if sides else None
-
-
 def promised_ranges(conditions: Sequence[ConditionClaim], side_px: float | None = None) -> PromisedRanges:
     """Compute the spans of the promised conditions, each with its margin."""
     limits = {}
@@ -69,12 +63,11 @@ def promised_ranges(conditions: Sequence[ConditionClaim], side_px: float | None 
 
 
 def figures_of(entry: PhotoEntry, side_px: float | None) -> dict[str, float]:
-    """Figures of a photo that conditions have, too, if known; pixels are scaled to a shorter side of `side_px`."""
+    """Figures of a photo that promises have ranges of, if known; pixels are scaled to a shorter side of `side_px`."""
     geometry, azimuth_deg = entry.geometry, entry.pose and entry.pose.azimuth_deg
     if geometry is None:
         return {}
     scale = 1.0 if side_px is None or entry.photo_px is None else side_px / min(entry.photo_px)
     figures = {"px_per_mm": scale * geometry.px_per_mm}
     figures |= {} if geometry.tilt_deg is None else {"tilt_deg": geometry.tilt_deg}
-    figures |= {} if azimuth_deg is None else {"azimuth_deg": azimuth_deg}
-    return figures | {"contrast": geometry.contrast, "blur_px": scale * geometry.blur_px}
+    return figures | ({} if azimuth_deg is None else {"azimuth_deg": azimuth_deg})

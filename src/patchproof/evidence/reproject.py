@@ -21,7 +21,7 @@ from patchproof.base.color import LUMINANCE, lift_tone, srgb_from_linear
 from patchproof.base.geometry import apply_homography, rect_corners
 from patchproof.base.resample import index_homography
 from patchproof.channel.print_colors import ShownColors, add_ink, lower_light
-from patchproof.evidence.appearance import fit_cells
+from patchproof.evidence.appearance import fit_cells, noise_of
 from patchproof.evidence.classify import BoxEdges, square_of
 from patchproof.evidence.print_fit import PhotographedDesign, fit_print
 from patchproof.evidence.surface import PromisedColors, Surface
@@ -49,8 +49,7 @@ class PhotoSquare:
     """A photograph's centered square: uint8 W×W×3, page millimeters to its pixels, blur in pixels, noise in light.
 
     `cells` h×w×3 are the design's linear light as photographed, NaN where clipped, `blur_cells` their blur in cells;
-    `scale` is W over the photograph's shorter side; `matrix_px` is the camera's for the square (None: focal length
-    unknown); `box` is the object's, for detectors.
+    `scale` is W over the photograph's shorter side; `box` is the object's, for detectors.
     """
 
     file: str
@@ -61,7 +60,6 @@ class PhotoSquare:
     noise: float
     cells: np.ndarray
     scale: float
-    matrix_px: np.ndarray | None = None
     box: BoxEdges | None = None
     blur_cells: float = 0.0
 
@@ -83,7 +81,6 @@ def photo_square(
     light: FrameLight,
     surface: Surface,
     size_px: int,
-    matrix_px: np.ndarray | None = None,
 ) -> PhotoSquare | None:
     """Prepare an uint8 photograph to render other pieces into it, for a network of input size `size_px`.
 
@@ -99,10 +96,11 @@ def photo_square(
     if unmixed is None:
         return None
     light, blur_px = unmixed
-    square, matrix = np.ascontiguousarray(square), None if matrix_px is None else to_square @ matrix_px
-    to_square, blur_px, noise = to_square @ px_from_mm, blur_px * scale, noise_of(square)
+    square = np.ascontiguousarray(square)
+    luminance = LINEAR_FLOAT32_FROM_CODE[square] @ np.array(LUMINANCE, np.float32)
+    to_square, blur_px, noise = to_square @ px_from_mm, blur_px * scale, float(noise_of(luminance))
     cells, blur_cells = design_cells(square, to_square, surface.rect_mm, blur_px)
-    return PhotoSquare(file, square, to_square, light, blur_px, noise, cells, scale, matrix, blur_cells=blur_cells)
+    return PhotoSquare(file, square, to_square, light, blur_px, noise, cells, scale, blur_cells=blur_cells)
 
 
 def unmix_markers(
@@ -117,18 +115,6 @@ def unmix_markers(
         return light, blur_px
     light = replace(light, paper=unmixed.paper, ink=unmixed.ink)
     return None if unmixed.agreement < _LEAST_AGREEMENT else (light, unmixed.blur_px)
-
-
-def noise_of(srgb: np.ndarray) -> float:
-    """Estimate the standard deviation of an uint8 picture's luminance noise, in linear light, where it is smooth.
-
-    Immerkaer, Fast Noise Variance Estimation, CVIU 64 (1996) 300-302, with a low quantile in place of the mean: a
-    fifth of most photographs is smooth, and in a mean texture would count as noise.
-    """
-    luminance = (LINEAR_FLOAT32_FROM_CODE[srgb] @ np.array(LUMINANCE, np.float32)).astype(np.float32)
-    mask = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)  # multiplies white noise by 6
-    detail = np.abs(cv2.filter2D(luminance, -1, mask)[1:-1, 1:-1])
-    return float(np.quantile(detail, 0.2) / 0.2533 / 6)
 
 
 def light_fit(shot: PhotoSquare, promised: PromisedColors, tone: float = 0.0) -> ColorFit:

@@ -111,7 +111,7 @@ PHOTO_KEYS = """
     file status sha256 photo_px code figure threshold advice located markers_found residual_mm px_per_mm scale_x scale_y
     scale_x_over_y tilt_deg tilt_uncertainty_deg azimuth_deg azimuth_uncertainty_deg distance_mm
     distance_uncertainty_mm focal contrast blur_px corner_uncertainty_mm bend_mm design_shift_mm
-    curl_radius_mm delta_e00_mean delta_e00_p95 color_fit clipped_share glossy_share homography_px_from_mm box forecast
+    curl_radius_mm delta_e00_mean delta_e00_p95 color_fit clipped_share glossy_share homography_px_from_mm box
     predictions""".split()
 
 
@@ -133,7 +133,6 @@ class PhotoEntry(StrictModel):
     remark: Remark | None = None
     # the object's, for detectors: left, top, right, bottom as shares of the centered square
     box: tuple[Finite, Finite, Finite, Finite] | None = None
-    forecast: Finite | None = None  # the chance of being recognized, by rendering the run's scene at its measured view
     said: tuple[str, ...] = ()  # what its file declares and was left aside; in JSON only where there is something
     predictions: dict[str, Prediction] = Field(default_factory=dict)
 
@@ -236,19 +235,6 @@ class EffectEstimate(StrictModel):
     controls: tuple[Control, ...] = ()
 
 
-class Forecast(StrictModel):
-    """Forecast and result of photographs at their own measured views: counts, and Brier scores of the forecast chances
-    and of the promised rate in their place.
-    """
-
-    photos: int
-    expected: Finite
-    interval: tuple[int, int]
-    recognized: int
-    brier: Finite
-    brier_promise: Finite
-
-
 class SessionCount(StrictModel):
     """One session's judged photographs, and how many of them were recognized; `same_as` names the session that a folder
     is part of (null: its own).
@@ -292,8 +278,7 @@ class Summary(StrictModel):
     interval: tuple[Finite, Finite] | None
     prediction_interval: tuple[int, int] | None
     verdict: VerdictWord
-    ledger: dict[str, LedgerShare] | None = None
-    culprit: str | None = None
+    ledger: Ledger | None = None
     reason: str = ""  # for the verdict, in a sentence
     next_step: str = ""  # what is still needed, if the photographs cannot tell
     worth: Benefit | None = None  # by the strongest evidence; null if there is nothing to compare
@@ -308,7 +293,6 @@ class Summary(StrictModel):
     looks_planned: int = 1
     estimated: EffectEstimate | None = None
     not_measured: dict[str, str] = Field(default_factory=dict)  # reasons by figure
-    forecast: Forecast | None = None
 
     def meets(self, required: Required) -> bool:
         """True if the promise held; for "helps" the patch must also help, since a useless patch can keep a promise to
@@ -328,14 +312,13 @@ class Origin(StrictModel):
 
 
 class Report(StrictModel):
-    """The content of report.json, and the ledger for its chart and the report's folder, which are not written there."""
+    """The content of report.json, and the report's folder, which is not written there."""
 
     sheet_id: str
     photos: tuple[PhotoEntry, ...]
     summary: Summary
     controls: tuple[Control, ...] = ()
     origin: Origin = Origin()
-    ledger: Ledger | None = Field(None, exclude=True)
     folder: Path | None = Field(default=None, exclude=True)
     SHOWN: ClassVar[tuple[str, ...]] = ("sheet_id", "summary.verdict", "summary.rate", "summary.interval", "photos")
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from patchproof.base.color import linear_from_srgb
 from patchproof.base.errors import Refused
-from patchproof.base.geometry import rect_corners
+from patchproof.base.geometry import apply_homography, rect_corners
 from patchproof.base.resample import downscale
 from patchproof.photo.page_code import PageCode, manifest_page_code
 from patchproof.sheets.manifest import Manifest, Rect
@@ -110,13 +110,13 @@ def _assembled(manifest: Manifest) -> Surface:
     """The surface of a piece glued together, in millimeters of the design's page, or without a design of the first
     tile's.
     """
-    to_page = {tile.page: np.linalg.inv(manifest.page_from_design_page(tile.page))[:2] for tile in manifest.tiles}
+    to_page = {tile.page: np.linalg.inv(manifest.page_from_design_page(tile.page)) for tile in manifest.tiles}
     cuts, corners = {tile.page: tile.cut_mm for tile in manifest.tiles}, _corners_by_page(manifest)
     piece, pages = {}, []
     for number, cut in cuts.items():
-        page_corners = {i: _transform(to_page[number], c) for i, c in corners.get(number, {}).items()}
+        page_corners = {i: apply_homography(to_page[number], c) for i, c in corners.get(number, {}).items()}
         piece |= {i: page_corners[i] for i, c in corners.get(number, {}).items() if _inside(cut, c)}
-        (x0, y0), _, (x1, y1), _ = _transform(to_page[number], rect_corners(cut)).tolist()
+        (x0, y0), _, (x1, y1), _ = apply_homography(to_page[number], rect_corners(cut)).tolist()
         pages.append(_surface(manifest, page_corners, frozenset(), (x0, y0, x1 - x0, y1 - y0)))
     for number in sorted(corners.keys() - cuts.keys()):  # the page with the chart
         points = np.concatenate(list(corners[number].values()))
@@ -198,7 +198,3 @@ def _corners_by_page(manifest: Manifest) -> dict[int, dict[int, np.ndarray]]:
 def _inside(rect: Rect, points: np.ndarray) -> bool:
     x, y, w, h = rect
     return bool((points >= [x, y]).all() and (points <= [x + w, y + h]).all())
-
-
-def _transform(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
-    return points @ matrix[:, :2].T + matrix[:, 2]

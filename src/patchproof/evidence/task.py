@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from patchproof.evidence.classify import Judges
-from patchproof.evidence.ranges import PromisedRanges, promised_ranges, promised_side_px
+from patchproof.evidence.ranges import PromisedRanges, promised_ranges
 from patchproof.evidence.surface import PromisedColors, Surface, promised_of, surface_of
 from patchproof.sheets.manifest import Manifest
 
@@ -16,8 +16,7 @@ if TYPE_CHECKING:
     from patchproof.channel.lens import Camera
     from patchproof.channel.printer import Printer
     from patchproof.classifier import Classifier
-    from patchproof.evidence.boxes import DrawnBox
-    from patchproof.evidence.corner_files import NamedCorners
+    from patchproof.evidence.annotations import DrawnBox, NamedCorners
 
 LEDGER_PHOTOS = 24  # each costs 16 classifications; 24 leave intervals of some ± 5 points
 
@@ -29,8 +28,8 @@ class Options:
     `printer` is the printer model that the promise was made with. `camera` replaces the EXIF focal length and removes
     lens distortion. `ruler_mm` are the printed rulers (x, y) as measured by hand. `controls` is a folder of photographs
     of controls. At most `ledger_photos` photographs, evenly spread, go into the gap ledger (0: no ledger). `boxes` are
-    those that somebody drew round the object (`boxes.load_boxes`), `corners` the design's that somebody named
-    (`corner_files.load_corners`), by photograph. `find`: search for the design itself where no marker can be read.
+    those that somebody drew round the object (`annotations.load_boxes`), `corners` the design's that somebody named
+    (`annotations.load_corners`), by photograph. `find`: search for the design itself where no marker can be read.
     """
 
     models: "Sequence[Classifier]"
@@ -63,9 +62,11 @@ def task_of(manifest: Manifest, options: Options, judges: Judges | None) -> Task
     """Make the task of a verification; without `judges` photographs are not classified."""
     surface = surface_of(manifest)
     promised = promised_of(manifest, surface, options.printer)
-    ranges = promised_ranges(manifest.promise.conditions if manifest.promise else (), promised_side_px(manifest))
+    photo_px, conditions = manifest.settings.get("camera", {}).get("photo_px"), ()
+    if manifest.promise is not None:
+        conditions = manifest.promise.conditions
+    ranges = promised_ranges(conditions, float(min(photo_px)) if photo_px else None)
     sizes = tuple(sorted({model.input_px for model in judges.models})) if judges else ()
-    photo_px = manifest.settings.get("camera", {}).get("photo_px")
     camera = options.scan_dpi, options.camera, photo_px and tuple(photo_px)
     find = manifest.design.pixels() if options.find and manifest.design else None
     return Task(surface, promised, ranges, sizes, *camera, find)

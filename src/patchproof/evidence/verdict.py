@@ -1,4 +1,4 @@
-"""Derive the verdict on a promise from counts, compare the patch with photographed controls, say what is still needed.
+"""Derive the verdict on a promise from counts, tell whether the patch helps, say what is still needed.
 
 In: how many photographs of each session were recognized, the promise, counts of controls. Out: `kept`, `broken` or
 `cannot_tell` with the prediction interval that decided it; differences; how many photographs would tell. For `assist`:
@@ -11,6 +11,13 @@ In: how many photographs of each session were recognized, the promise, counts of
 mirrored for `deceive`, where a rate too high breaks the promise. `kept` is proved by the photographs; too few of them,
 or all in one place, can prove nothing. Looking again after each session until it fits would find `kept` falsely in 9 to
 18 % of trials: looks are counted, and the bound of those that were not planned is stricter (see `Look`).
+
+Whether the patch helps is another question: a patch that was promised to be useless, and is, keeps its promise. One
+comparison answers it, that with the hardest control by the strongest evidence there is, which the headline, the page
+and `--require helps` all use. Photographed controls decide alone, if there are any. Else those decide that were
+rendered into the patch's own photographs, with the bare object as the promise simulated it, since the paper hides it.
+Else it is the promise's controls. The patch has to beat all that decide; which of the three answers it gives, says
+`base.goal`.
 """
 
 from bisect import bisect_left
@@ -19,9 +26,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from patchproof.base.intervals import wilson
+from patchproof.base.intervals import rates_difference, wilson
 from patchproof.base.sessions import LEAST_SESSIONS, TAIL, HitsBySession, sessions_difference
-from patchproof.evidence.results import Benefit, Control, VerdictWord
+from patchproof.evidence.results import Benefit, Control, ControlSource, EffectEstimate, VerdictWord
 from patchproof.sheets.manifest import Interval, Promise
 
 LEAST_JUDGED = 5
@@ -39,6 +46,7 @@ ONE_SESSION_ADVICE = (
 
 PhotoKey = tuple[int, str]  # the number of a session, and a photograph's name in it
 Answers = Mapping[PhotoKey, bool]
+Rate = tuple[float, tuple[float, float]]  # with its interval
 
 
 @dataclass(frozen=True)
@@ -239,3 +247,33 @@ def _rate_of(hits: HitsBySession, promise: Promise) -> tuple[float, Interval]:
 
 def _by_session(answers: Answers, keys: Sequence[PhotoKey]) -> dict[int, list[bool]]:
     return {session: [answers[key] for key in keys if key[0] == session] for session, _ in keys}
+
+
+def benefit_of(
+    photos: int,
+    rate: float,
+    interval: Interval,
+    controls: Sequence[Control],
+    promise: Promise,
+    estimate: EffectEstimate | None = None,
+) -> Benefit | None:
+    """Compare the patch, recognized at `rate` in `photos` photographs, with its controls; None if there are none."""
+    goal, rows = promise.target.goal, dict[str, Benefit]()
+
+    def add(name: str, source: ControlSource, count: int, ours: Rate, theirs: Rate, points: Rate, advice: str = ""):
+        comparison = {"difference": points[0], "difference_interval": points[1], "photos": count, "advice": advice}
+        sides = {"rate": ours[0], "interval": ours[1], "control_rate": theirs[0], "control_interval": theirs[1]}
+        rows[name] = Benefit(goal=goal, word=goal.answer(points[1]), control=name, source=source, **comparison, **sides)
+
+    photographed = any(c.rates for c in controls)
+    for c in controls if photographed else estimate.controls if estimate else ():
+        if c.rates and c.difference is not None and c.difference_interval and c.patch_interval:
+            count = c.pairs or (photos if photographed else c.n)
+            ours, theirs = (c.rates[0], c.patch_interval), (c.rates[1], c.interval)
+            source = "photographed" if photographed else "rendered"
+            add(c.name, source, count, ours, theirs, (c.difference, c.difference_interval), c.advice)
+    simulated = {name: claim for name, claim in promise.controls.items() if name == "bare" or not rows}
+    for name, claim in () if photographed else simulated.items():
+        points = rates_difference(rate, interval, claim.rate, claim.interval)
+        add(name, "simulated", photos, (rate, interval), (claim.rate, claim.interval), points)
+    return rows[goal.hardest({name: row.difference_interval for name, row in rows.items()})] if rows else None

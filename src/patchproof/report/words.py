@@ -146,14 +146,11 @@ def verdict_lines(report: Any) -> list[str]:
     lines += [f"  also {name}: {rate_text(model.rate, model.interval)}" for name, model in others]
     if summary.prediction_interval is not None:
         lines.append("expected: {} to {} of {}".format(*summary.prediction_interval, summary.judged))
-    if (forecast := summary.forecast) is not None:
-        head = f"expected at their own views (promised: over all views): {forecast.expected:.1f} of {forecast.photos}"
-        lines.append(f"{head} [{forecast.interval[0]}, {forecast.interval[1]}], recognized {forecast.recognized}")
     if summary.estimated is not None:
         lines += _estimated_lines(summary.estimated)
-    if summary.culprit is not None:
-        share = summary.ledger[summary.culprit].share
-        lines.append(f"costs the most: {summary.culprit.replace('_', ' ')} ({100 * share:.0f} points of confidence)")
+    if summary.ledger is not None and (culprit := summary.ledger.culprit) is not None:
+        share = summary.ledger.shares[culprit].share
+        lines.append(f"costs the most: {culprit.replace('_', ' ')} ({100 * share:.0f} points of confidence)")
     lines += not_measured_lines(summary.not_measured)
     rows = remarks([photo.model_dump() for photo in report.photos])
     lines += [f"  {code}: {count} ({files}): {advice}" for code, advice, count, files in rows]

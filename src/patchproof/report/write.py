@@ -23,22 +23,22 @@ _FIRST = ("file", "status", "code", "figure", "threshold", "advice")
 _PLOTS = (("tilt_deg", "tilt in degrees"), ("px_per_mm", "pixels per millimeter"))
 
 
-def write_report(report: Mapping, manifest: Mapping, out_dir: str | Path, ledger: Mapping | None = None) -> Path:
+def write_report(report: Mapping, manifest: Mapping, out_dir: str | Path) -> Path:
     """Write report.json, report.csv and report.html into `out_dir`; returns the page's path.
 
     `report` and `manifest` are `model_dump()`s. Pictures are those of `page.save_pictures` in `out_dir`/pictures:
-    `photo`, `seen`, `fitted`, `promised` and `delta_e00`. `ledger` is that of `plots.ledger_plot`.
+    `photo`, `seen`, `fitted`, `promised` and `delta_e00`.
     """
     out = Path(out_dir)
     make_folder(out)
     pictures = {photo["file"]: saved_pictures(out / "pictures", photo["file"]) for photo in report["photos"]}
     write_atomically(out / "report.json", json.dumps(report, indent=1, allow_nan=False) + "\n")
     write_atomically(out / "report.csv", photos_csv(report["photos"]))
-    write_atomically(out / "report.html", report_html(report, manifest, pictures, ledger))
+    write_atomically(out / "report.html", report_html(report, manifest, pictures))
     return out / "report.html"
 
 
-def report_html(report: Mapping, manifest: Mapping, encoded: Mapping[str, Mapping], ledger: Mapping | None) -> str:
+def report_html(report: Mapping, manifest: Mapping, encoded: Mapping[str, Mapping]) -> str:
     """Render the page's HTML; `encoded` are JPEG or PNG bytes by photo and kind."""
     promise, summary, photos = manifest.get("promise"), report["summary"], report["photos"]
     judged = [photo for photo in photos if photo["status"] != "rejected"]
@@ -64,8 +64,7 @@ def report_html(report: Mapping, manifest: Mapping, encoded: Mapping[str, Mappin
         looks=words.looks_sentence(summary),
         meaning=words.recognition_meaning(promise["models"][0], promise["target"]["label"]) if promise else "",
         verdict=words.VERDICTS[summary["verdict"]],
-        ledger=ledger,
-        waterfall=ledger_plot(ledger) if ledger else "",
+        waterfall=ledger_plot(summary["ledger"]) if summary["ledger"] else "",
         plots=[(svg, about) for svg, about in plots if svg],
         sized=any(photo["scale_x"] is not None for photo in photos),
         cards=cards,

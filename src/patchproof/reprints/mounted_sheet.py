@@ -23,7 +23,6 @@ from patchproof.base.output import image_bytes
 from patchproof.base.settings import NO_PAGE
 from patchproof.channel.object_box import project_box
 from patchproof.channel.printer import Printer, load_printer
-from patchproof.evidence.surface import surface_of
 from patchproof.optimizer.run import Run
 from patchproof.render.photograph import photograph
 from patchproof.render.pixels import PiecePicture
@@ -48,23 +47,19 @@ class PhotoTruth:
     """Ground truth of a simulated photograph.
 
     Attributes:
-        homography_px_from_mm: 3×3 from page millimeters to pixels; None where the piece is bent or absent.
-        marker_corners_px: 4×2 pixels (x right, y down) by marker id.
-        conditions: drawn values by name, as in `truth.json`; of a scan its `scan_dpi` and `print_scale`.
+        homography_px_from_mm: 3×3 from page millimeters to pixels (x right, y down); None where the piece is bent or
+            absent.
+        conditions: drawn values by name, as in `truth.json`.
     """
 
     homography_px_from_mm: np.ndarray | None
-    marker_corners_px: dict[int, np.ndarray]
     conditions: dict[str, Any]
 
     def to_json(self) -> dict[str, Any]:
         """Return the photograph's entry in `truth.json`."""
         homography = self.homography_px_from_mm
-        return {
-            "homography_px_from_mm": None if homography is None else homography.tolist(),
-            "marker_corners_px": {str(i): corners.tolist() for i, corners in self.marker_corners_px.items()},
-            "conditions": self.conditions,
-        }
+        rows = None if homography is None else homography.tolist()
+        return {"homography_px_from_mm": rows, "conditions": self.conditions}
 
 
 @dataclass(frozen=True)
@@ -122,18 +117,12 @@ class MountedSheet:
         return take_photo(self.stage, self.piece, conditions)
 
     def truth(self, conditions: Conditions) -> PhotoTruth:
-        """Compute the homography from page millimeters to one view's photograph, marker corners, and its conditions."""
+        """Compute the homography from page millimeters to one view's photograph, and its conditions."""
         values: dict[str, Any] = {name: values[0].tolist() for name, values in fields_of(conditions).items()}
         values["print_scale"] = [scale * float(conditions.pose.printed_scale[0]) for scale in self.how.print_scale]
-        if self.piece is None:
-            return PhotoTruth(None, {}, values)
-        surface, homography, cut = surface_of(self.manifest), self.px_from_page(conditions), self.manifest.cut_mm[:2]
-        on_piece = {i: page_mm for i, page_mm in surface.corners_mm.items() if i in surface.piece_ids}
-        if not self.scene.is_flat:
-            corners = {i: self.scene.piece_px(conditions, page_mm - cut) for i, page_mm in on_piece.items()}
-            return PhotoTruth(None, corners, values)
-        corners = {i: geometry.apply_homography(homography, page_mm) for i, page_mm in on_piece.items()}
-        return PhotoTruth(geometry.normalize_homography(homography), corners, values)
+        if self.piece is None or not self.scene.is_flat:
+            return PhotoTruth(None, values)
+        return PhotoTruth(geometry.normalize_homography(self.px_from_page(conditions)), values)
 
     def outlines(self, conditions: Conditions) -> dict[str, np.ndarray]:
         """Outlines N×2 in pixels of one view: corners of the object's box, if it has a mesh, and the piece's border, if
@@ -195,7 +184,7 @@ def sent_pixels(pdf_path: str | Path, manifest: Manifest, scene: Scene) -> Tenso
 
 
 def take_photo(stage: Stage, piece: PiecePicture | None, conditions: Conditions) -> bytes:
-    """Take a JPEG photograph of one view with the piece (None: of the bare object), as `HungSheet.photograph` does."""
+    """Take a JPEG photograph of one view with the piece (None: of the bare object), by our own renderer."""
     with torch.no_grad():
         picture = photograph(stage, piece, conditions, stage.scene.settings.camera.photo_px, jpeg=False)
     return _camera_file(picture, stage.scene, conditions)

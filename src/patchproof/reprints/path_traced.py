@@ -24,7 +24,7 @@ from patchproof.base import geometry
 from patchproof.base.color import LINEAR_FROM_CODE, linear_from_srgb
 from patchproof.base.errors import Refused
 from patchproof.channel.camera import develop
-from patchproof.channel.effects import Light, Print
+from patchproof.channel.effects import Light
 from patchproof.channel.printer import print_change, vary_print
 from patchproof.channel.render_frame import Frame
 from patchproof.mesh.mesh import Mesh
@@ -198,17 +198,13 @@ def _piece(mi: ModuleType, scene: MeshScene, picture: PiecePicture, conditions: 
     placement = require_patch(scene).placement
     scale = geometry.scaling_about(scene.middle_mm, conditions.pose.printed_scale[0])
     vertices = placement.vertices_mm @ scale[:3, :3].T + scale[:3, 3]
-    front = _diffuse(_texture(mi, _print_light(picture, conditions.print), "clamp"))
+    change = torch.tensor(print_change(conditions.print)[0]).to(picture.srgb)
+    light = vary_print(linear_from_srgb(picture.srgb), change).numpy()  # relative to white paper
+    front = _diffuse(_texture(mi, light, "clamp"))
     back = _diffuse({"type": "rgb", "value": PAPER_BACK_LINEAR * PAPER_REFLECTANCE})
     uv = placement.piece_mm / np.array(placement.size_mm)
     bsdf = {"type": "twosided", "front": front, "back": back}
     return _mesh(mi, "piece", vertices, placement.faces, placement.normals, uv, bsdf)
-
-
-def _print_light(picture: PiecePicture, variation: Print) -> np.ndarray:
-    """Light (H×W×3) of a print with this variation, relative to white paper."""
-    change = torch.tensor(print_change(variation)[0]).to(picture.srgb)
-    return vary_print(linear_from_srgb(picture.srgb), change).numpy()
 
 
 def _object(mi: ModuleType, mesh: Mesh) -> list:

@@ -1,14 +1,14 @@
-"""Simulate photographs of a printed sheet on its object (scans of the uncut page: see `page_photos`).
+"""Simulate photographs of a printed sheet on its object (of pages that belong to no run: see `page_photos`).
 
 In: a sheet's PDF and the run it was made from. Out: a folder of JPEG photographs of that piece on the object,
-`truth.json` with each one's homography, marker corners and conditions, `coco.json` with boxes of object and piece, and
-for a print without markers `corners.csv`, which `verify --corners` takes.
+`truth.json` with each one's homography and conditions, `coco.json` with boxes of object and piece, and for a print
+without markers `corners.csv`, which `verify --corners` takes.
 Conditions come from the reprint stream, which nothing else uses: one print, photographed in one or several sessions,
 each with its own place, light, camera and folder.
 """
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -32,12 +32,12 @@ from patchproof.reprints.mounted_sheet import (
 )
 from patchproof.reprints.run_sheet import sheet as sheet_of
 
-REPRINT_FILES = ("photo_*.jpg", "session_*", "scan_*.jpg", "truth.json", "coco.json", "corners.csv")
+REPRINT_FILES = ("photo_*.jpg", "session_*", "truth.json", "coco.json", "corners.csv")
 
 
 @dataclass(frozen=True)
 class Reprint:
-    """Simulated photographs or scans in a folder, with the truth about each by file name."""
+    """Simulated photographs in a folder, with the truth about each by file name."""
 
     folder: Path
     photos: dict[str, PhotoTruth]
@@ -100,9 +100,10 @@ def reprint(
             text = coco_json(photos, label, f"simulated photographs of sheet {sheet.manifest.sheet_id}")
             (folder / "coco.json").write_text(text, encoding="utf-8")
             truth = dict(zip(names, map(sheet.truth, views), strict=True))
-            write_truth(folder, truth)
+            entries = {name: photo.to_json() for name, photo in truth.items()}
+            (folder / "truth.json").write_text(json.dumps(entries, indent=1) + "\n", encoding="utf-8")
             if not sheet.manifest.markers:
-                from patchproof.evidence.corner_files import CORNERS_FILE, corners_csv
+                from patchproof.evidence.annotations import CORNERS_FILE, corners_csv
 
                 shown = {photo.file: photo.outlines[PATCH] for photo in photos if PATCH in photo.outlines}
                 text = corners_csv({name: outline[::SIDE_POINTS] for name, outline in shown.items()})
@@ -116,15 +117,8 @@ def _pdf_to_mount(pdf_path: str | Path, run: Run, control: str | None, out: Path
     if control in (None, "bare"):
         yield pdf_path
         return
-    make_folder(out.resolve().parent)
-    with TemporaryDirectory(dir=out.resolve().parent, prefix=".control.") as folder:
+    with TemporaryDirectory() as folder:
         template = sheet_scene(pdf_path, run)[1].settings.sheet.template
         path = Path(folder) / f"control{Path(pdf_path).suffix}"
         sheet_of(run, path, template=template, control=control)
         yield path
-
-
-def write_truth(folder: Path, truth: Mapping[str, PhotoTruth]) -> None:
-    """Write truth.json into a folder of photographs or scans."""
-    entries = {name: photo.to_json() for name, photo in truth.items()}
-    (folder / "truth.json").write_text(json.dumps(entries, indent=1) + "\n", encoding="utf-8")

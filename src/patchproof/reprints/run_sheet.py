@@ -5,22 +5,25 @@ The piece is the same on every template that has room for it, except for the ids
 template with `plan_page` says where the piece goes and how to photograph it. Pages without a run: see `sheets.blank`.
 """
 
+import os
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from patchproof.base.output import check_file
-from patchproof.base.validation import texts_in
+from patchproof.base.validation import NETWORK_FILE
 from patchproof.optimizer.run import Run
 from patchproof.reprints.plan_view import draw_plan_view
 from patchproof.reprints.shot_plan import shot_sections
-from patchproof.scene.interface import PieceScene, require_piece
+from patchproof.scene.interface import PieceScene, Scene, require_piece
 from patchproof.scene.patch_scene import PatchScene, require_patch
 from patchproof.sheets.content import SheetContent
-from patchproof.sheets.manifest import Manifest
+from patchproof.sheets.manifest import Manifest, Promise
 from patchproof.sheets.piece import control_design, with_ids
 from patchproof.sheets.plan_page import PlacementPicture, PlanPage, edge_distances_mm
 from patchproof.sheets.rects import size_text
-from patchproof.sheets.template import Template, page_template
+from patchproof.sheets.template import Template, load_template, page_template
 from patchproof.sheets.write import write_sheet
 
 
@@ -56,18 +59,27 @@ def sheet(
     return write_sheet(pdf_path, page, content, plan, copies)
 
 
+def sheet_of_several(
+    runs: Sequence[Run], pdf_path: str | Path, *, template: str | None = None, control: str | None = None
+) -> list[Manifest]:
+    """Write one page with the designs of several runs, and a manifest for each; on the first run's template unless
+    another is named.
+    """
+    from patchproof.sheets.multi_design import write_several
+
+    name = template or runs[0].scene.settings.sheet.template
+    page, contents = load_template(name), [content_of(run, name, control, Path(pdf_path).parent) for run in runs]
+    plans = [plan_of(scene, page, content) for content, scene in contents] if page.plan_page else []
+    return write_several(pdf_path, page, [content for content, _ in contents], plans)
+
+
 def content_of(run: Run, template: str | None, control: str | None, folder: Path) -> tuple[SheetContent, PieceScene]:
     """Make the piece's content on that template: the run's design with its promise, or a control; and the scene. The
     sheet, in `folder`, carries a printer that has no name, and says where networks lie from there.
     """
     scene = require_piece(run.scene)
     scene = scene if template is None else scene.with_template(template)
-    settings, promise = scene.settings.model_dump(mode="json"), run.promise
-    names = texts_in([settings, [model.name for model in promise.models]])
-    if any("." in name or "/" in name for name in names):  # of files, which the sheet leaves behind
-        from patchproof.reprints.portable import portable_content
-
-        settings, promise = portable_content(settings, promise, scene, folder)
+    settings, promise = _portable(scene.settings.model_dump(mode="json"), run.promise, scene, folder)
     settings |= {"seed": scene.seed, "printer_model": run.details["printer"]}
     if (imported := run.details.get("imported")) is not None:
         settings["imported"] = {name: imported[name] for name in ("file", "sha256")}
@@ -77,6 +89,37 @@ def content_of(run: Run, template: str | None, control: str | None, folder: Path
         design = control_design(control, run.design, scene.sheet_id, piece)
         return SheetContent(piece, scene.sheet_id, control, design, settings=settings, bent=bent), scene
     return SheetContent(piece, scene.sheet_id, "design", run.design, promise, settings, bent), scene
+
+
+def _portable(settings: dict[str, Any], promise: Promise, scene: Scene, folder: Path) -> tuple[dict[str, Any], Promise]:
+    """Return settings and promise without the folders of this machine, for a sheet in `folder`: files by their names,
+    networks as seen from there, a printer that has no name by value.
+    """
+
+    def from_sheet(name: str) -> str:
+        match = NETWORK_FILE.fullmatch(name)
+        if match is None or "${" in name or Path(scene.base / match[2]).drive != folder.resolve().drive:
+            return name
+        return match[1] + Path(os.path.relpath(scene.base / match[2], folder)).as_posix()
+
+    carried = {"sheet": settings["sheet"]}
+    if Path(profile := scene.settings.printer.profile).suffix:
+        from patchproof.channel.carried_printer import carried_printer
+
+        carried["printer_file"] = carried_printer(scene.base / profile)
+    models = tuple(model.changed(name=from_sheet(model.name)) for model in promise.models)
+    return without_folders(settings, from_sheet) | carried, promise.changed(models=models)
+
+
+def without_folders(value: Any, from_sheet: Callable[[str], str]) -> Any:
+    """Copy settings, absolute paths as file names, other texts as `from_sheet` has them."""
+    if isinstance(value, dict):
+        return {key: without_folders(each, from_sheet) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [without_folders(each, from_sheet) for each in value]
+    if not isinstance(value, str):
+        return value
+    return Path(value).name if Path(value).is_absolute() else from_sheet(value)
 
 
 def plan_of(scene: PieceScene, template: Template, content: SheetContent) -> PlanPage | None:

@@ -3,7 +3,7 @@
 In: an album, a manifest, the options of a verification. Out: a `Report`, as `verify` makes it of the same folder.
 Photographs are measured one at a time, in the single process of the workers, where limits of time and memory apply;
 finished ones are in the album's journal, so that a restart measures only new ones, tapped corners in `corners.csv`.
-Left out on purpose: the gap ledger, the estimated effect and forecasts, which take longer than a person waits.
+Left out on purpose: the gap ledger and the estimated effect, which take longer than a person waits.
 """
 
 import re
@@ -19,16 +19,15 @@ from patchproof.base.input import is_file
 from patchproof.base.output import write_atomically
 from patchproof.base.progress import Advance, no_advance
 from patchproof.base.workers import Workers
-from patchproof.evidence import corner_files
+from patchproof.evidence import annotations
 from patchproof.evidence.batch import PhotoItem, measure_all
 from patchproof.evidence.classify import judges_of
 from patchproof.evidence.copies import reject_copies
 from patchproof.evidence.gather import report_of
-from patchproof.evidence.grouping import BY_FOLDERS, Grouping
+from patchproof.evidence.grouping import BY_FOLDERS, Grouping, merge_folders
 from patchproof.evidence.journal import JOURNAL_FILE, Journal, settings_key
 from patchproof.evidence.measure import MeasuredPhoto
 from patchproof.evidence.results import Report
-from patchproof.evidence.same_session import merge_folders
 from patchproof.evidence.task import Options, task_of
 from patchproof.photo.corners import DesignCorners
 from patchproof.sheets.manifest import Manifest
@@ -48,8 +47,8 @@ class PhotoCollection:
         self._journal = Journal(album.folder / JOURNAL_FILE, settings_key(manifest, options), resume=True)
         self._measured: dict[Path, MeasuredPhoto] = {}
         self._photos: dict[Path, MeasuredPhoto] | None = None  # those of `photos` once they were asked for
-        self._corners_file = file = album.folder / corner_files.CORNERS_FILE
-        named = corner_files.load_corners(file) if is_file(file) else {}  # by "FOLDER/NAME", and by shorter names
+        self._corners_file = file = album.folder / annotations.CORNERS_FILE
+        named = annotations.load_corners(file) if is_file(file) else {}  # by "FOLDER/NAME", and by shorter names
         self._corners = {name: np.reshape(each.numbers, (4, 2)) for name, each in named.items() if "/" in name}
 
     @property
@@ -90,12 +89,12 @@ class PhotoCollection:
         if path is None or not len(pairs) or (pairs > pairs[-1]).any():
             raise Refused("four corners inside of a photograph", f"{numbers} in {file}"[:160], "load the page again")
         size_px = int(pairs[-1, 0]), int(pairs[-1, 1])
-        named = corner_files.NamedCorners(tuple(pairs[:4].ravel().tolist()), size_px)
-        corner_files.refuse_twisted(named, file, "the page")
-        corners = corner_files.corners_of_photo({file: named}, file, path)
+        named = annotations.NamedCorners(tuple(pairs[:4].ravel().tolist()), size_px)
+        annotations.refuse_twisted(named, file, "the page")
+        corners = annotations.corners_of_photo({file: named}, file, path)
         if self.wants_corners(path) and corners is not None:
             self._corners[file] = np.round(corners.px, 2)
-            write_atomically(self._corners_file, corner_files.corners_csv(self._corners))
+            write_atomically(self._corners_file, annotations.corners_csv(self._corners))
             self._measured.pop(path)
         return path
 
@@ -138,7 +137,7 @@ class PhotoCollection:
         control = self.control_of(path)
         file = path.name if control is not None else _name_of(path)
         px = self._corners.get(file)
-        corners = None if px is None else DesignCorners(px, corner_files.CORNER_SIGMA_PX)
+        corners = None if px is None else DesignCorners(px, annotations.CORNER_SIGMA_PX)
         return PhotoItem(path, file, control, with_pictures=control is None, corners=corners)
 
 

@@ -48,7 +48,7 @@ def printer(
     elif design:
         from patchproof.channel.cameras import load_optional_camera
         from patchproof.channel.printer import load_printer
-        from patchproof.evidence.corner_files import load_corners
+        from patchproof.evidence.annotations import load_corners
         from patchproof.evidence.task import Options
 
         named = {} if corners is None else load_corners(corners)

@@ -133,7 +133,7 @@ def sheet(
     else:
         from patchproof.optimizer.run import load_run
         from patchproof.reprints.run_sheet import sheet as sheet_of
-        from patchproof.reprints.shared_page import sheet_of_several
+        from patchproof.reprints.run_sheet import sheet_of_several
 
         loaded, content = [load_run(folder, trust) for folder in runs], {"template": template, "control": control}
         if len(runs) > 1:
@@ -162,7 +162,6 @@ def reprint(
     printer: Annotated[str | None, Option(help="Another printer than the scene's: a name or a file.")] = None,
     print_scale: Annotated[str, Option(help="Size of the print, 0.97 or 0.97x0.98 (x, y).")] = "1",
     control: Annotated[PhotographedControl | None, Option(help="Photograph a control in place of the design.")] = None,
-    scan_dpi: Annotated[float | None, Option(min=30, max=1200, help="Scan the uncut page flat instead.")] = None,
     path_traced: Annotated[bool, Option("--path-traced", help="Render with Mitsuba 3 (slow).")] = False,
     jobs: Jobs = None,
     trust: Trust = False,
@@ -171,28 +170,21 @@ def reprint(
     """Print the PDF in simulation, put it back on the object, and photograph it."""
     from patchproof.optimizer.run import load_run
     from patchproof.reprints.mounted_sheet import ReprintSetup
-    from patchproof.reprints.page_photos import reprint_pages, scan
+    from patchproof.reprints.page_photos import reprint_pages
     from patchproof.reprints.reprint import reprint as reprint_sheet
 
     scale = console.pair_of(print_scale, "--print-scale")
-    if scan_dpi is not None and (control is not None or path_traced):
-        only = "a scan is of the PDF itself; leave --control and --path-traced out"
-        raise BadParameter(only, param_hint="--scan-dpi")
     how = ReprintSetup(printer, scale, control, path_traced)
     if run is None:
-        if scan_dpi is not None or control is not None or path_traced or sessions > 1:
-            only = "scans, controls, sessions and path tracing are of a run's sheet; name the run"
+        if control is not None or path_traced or sessions > 1:
+            only = "controls, sessions and path tracing are of a run's sheet; name the run"
             raise BadParameter(only, param_hint="--run")
         reprint_pages(pdf, n, out, how, seed=seed, overwrite=overwrite)
         return say(f"{n} photographs: {out}")
     finished_run = load_run(run, trust)
-    if scan_dpi is not None:
-        taken = scan(pdf, finished_run, n, out, scan_dpi, how, overwrite=overwrite)
-    else:
-        with progress_bar() as bar:
-            options: dict[str, Any] = {"sessions": sessions, "seed": seed, "overwrite": overwrite, "progress": bar}
-            compute = Compute(jobs=jobs or 1)
-            taken = reprint_sheet(pdf, finished_run, n, out, how, compute=compute, **options)
+    with progress_bar() as bar:
+        options: dict[str, Any] = {"sessions": sessions, "seed": seed, "overwrite": overwrite, "progress": bar}
+        taken = reprint_sheet(pdf, finished_run, n, out, how, compute=Compute(jobs=jobs or 1), **options)
     say(f"{len(taken.photos)} photographs: {out}")
 
 
@@ -210,7 +202,7 @@ def capture(
     signal.signal(signal.SIGINT, signal.default_int_handler)  # it ends the server, and the verdict follows
     from patchproof.app.capture.album import CONTROLS_FOLDER
     from patchproof.app.capture.serve import serve_capture
-    from patchproof.evidence.corner_files import CORNERS_FILE
+    from patchproof.evidence.annotations import CORNERS_FILE
     from patchproof.report.words import verdict_lines
     from patchproof.sheets.manifest import load_manifest
 
@@ -247,7 +239,6 @@ def verify(
     ledger: Annotated[
         int, Option(min=0, help="Photographs in the gap ledger at most; 0: no ledger, and no rendered controls.")
     ] = 24,
-    run: Annotated[Path | None, Option(help="The sheet's run: forecasts each photograph at its view.")] = None,
     trust: Trust = False,
     jobs: Jobs = None,
     cluster: Cluster = None,
@@ -261,7 +252,7 @@ def verify(
 
     with progress_bar() as bar:
         ruler = console.pair_of(ruler_mm, "--ruler-mm") if ruler_mm else None
-        options: dict[str, Any] = {"models": console.names_of(models), "controls": controls, "run": run, "trust": trust}
+        options: dict[str, Any] = {"models": console.names_of(models), "controls": controls, "trust": trust}
         options |= {"capture": CaptureInfo(camera, scan_dpi, ruler, boxes, corners, find), "ledger_photos": ledger}
         options |= {"compute": Compute(jobs=jobs or 1, cluster=cluster), "resume": resume, "overwrite": overwrite}
         report = verify_photos(photos, sheet, out, **options, progress=bar)
