@@ -192,14 +192,13 @@ def sheet_files(place: Place, number: int) -> Use:
 
 def pdf(place: Place, number: int) -> Use:
     from patchproof.sheets.pdf_raster import attached_manifests, page_count, rasterize_page
-    from patchproof.sheets.print_advice import pdf_advice
 
     names = list(PDF_BOMBS)
     path = place.given / "sheet.pdf"
     path.write_bytes(PDF_BOMBS[of(number, names)]())
     return of(
         number // len(names),
-        [lambda: rasterize_page(path), lambda: (attached_manifests(path), pdf_advice(path), page_count(path))],
+        [lambda: rasterize_page(path), lambda: (attached_manifests(path), page_count(path))],
     )
 
 

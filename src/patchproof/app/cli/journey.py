@@ -130,7 +130,7 @@ def sheet(
     from patchproof.base.output import check_file
     from patchproof.base.settings import background_summary
     from patchproof.sheets.blank import blank_page
-    from patchproof.sheets.print_advice import pdf_advice, sheet_advice
+    from patchproof.sheets.print_advice import SHOP_ADVICE, sheet_advice
     from patchproof.sheets.template import template_summaries
     from patchproof.sheets.write import manifest_paths
 
@@ -165,7 +165,7 @@ def sheet(
         say(f"sheet {manifest.sheet_id} ({manifest.kind}): {out}{'' if path == out else f', {path.name}'}")
     if check:
         lines = (line for manifest in manifests for line in sheet_advice(manifest))
-        say(*dict.fromkeys(lines), *pdf_advice(out))  # lines that several designs share are printed once
+        say(*dict.fromkeys(lines), *SHOP_ADVICE)  # lines that several designs share are printed once
 
 
 def reprint(
