@@ -19,9 +19,8 @@ from patchproof.base.errors import Refused
 from patchproof.base.geometry import apply_homography, rect_corners
 from patchproof.base.progress import no_advance
 from patchproof.calibrate.known_design import COVERED_DELTA_E00, UNTOUCHED_DELTA_E00, calibrate_design
-from patchproof.calibrate.printer_files import printer_output
 from patchproof.channel.print_colors import ShownColors
-from patchproof.channel.printer import load_printer, vary_print
+from patchproof.channel.printer import load_printer, printer_output, vary_print
 from patchproof.evidence.corner_files import NamedCorners
 from patchproof.evidence.surface import surface_of, with_markers
 from patchproof.evidence.task import Options

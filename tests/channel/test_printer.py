@@ -12,17 +12,19 @@ import torch
 
 from patchproof.base.color import LUMINANCE, ciede2000, lab_from_linear, lab_from_srgb, linear_from_srgb
 from patchproof.base.errors import Refused
+from patchproof.base.output import write_files_atomically
 from patchproof.base.packaged import packaged_path
 from patchproof.base.settings import PrinterSettings
 from patchproof.calibrate import icc
 from patchproof.calibrate.printer import printer_from_icc
-from patchproof.calibrate.printer_files import printer_from_table, save_printer
 from patchproof.channel.printer import (
     NODES_8BIT,
     Printer,
     identity_printer,
     load_printer,
     node_colors,
+    printer_contents,
+    printer_from_table,
     vary_print,
 )
 
@@ -204,7 +206,7 @@ def test_cut_and_gutted_profiles(tmp_path):
 def test_saving_and_loading_keep_a_measured_printer(tmp_path):
     lut = np.random.default_rng(1).random((33, 33, 33, 3))
     printer = printer_from_table("mine", "measured", lut, 30 * lut[..., 0], (94.0, 1.0, -3.0), {"chart": "a4"})
-    save_printer(printer, tmp_path)
+    write_files_atomically(printer_contents(printer, tmp_path / "mine.npz"))
     again = load_printer("mine.npz", tmp_path)
     torch.testing.assert_close(again.lut, printer.lut, atol=1e-5, rtol=0)  # 16 bits
     torch.testing.assert_close(again.gamut, printer.gamut, atol=0.063, rtol=0)  # eighths

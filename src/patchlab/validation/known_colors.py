@@ -21,8 +21,7 @@ import torch
 from torch import Tensor
 
 from patchproof.base.color import ciede2000, lab_from_linear, lift_tone, linear_from_srgb, srgb_from_linear
-from patchproof.calibrate.printer_files import printer_from_table
-from patchproof.channel.printer import Printer, node_colors, vary_print
+from patchproof.channel.printer import Printer, node_colors, printer_from_table, vary_print
 
 _CENTER = (0.025, 0.025, 0.025, 0.0, 0.0, 0.0, 0.0, -0.075)  # of the terms in the default conditions
 _CENTERED = 100.0  # of the mean terms' squared distance from there: what all photographs share is in the ink

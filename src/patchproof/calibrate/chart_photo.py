@@ -1,6 +1,6 @@
 """Read the printed chart in one photograph: the light of each swatch relative to bare paper at the same place.
 
-In: a photograph, the sheet's manifest, the camera if it is known. Out: `ChartPhoto`. The page is found by its markers;
+In: a photograph, the sheet's manifest. Out: `ChartPhoto`. The page is found by its markers;
 swatches are read in their unblurred cores, in linear light. Illumination differs from place to place, so white paper
 around the chart and the chart's own white swatches are read, too, and a smooth surface through them gives the light of
 bare paper under each swatch: dividing by it cancels gradients, vignetting, exposure and white balance at once. Text and
@@ -12,16 +12,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from patchproof.base.color import LINEAR_FROM_CODE
 from patchproof.base.geometry import apply_homography, local_scale, rect_corners
-from patchproof.channel.lens import Camera
-from patchproof.channel.tone import light_of_codes
-from patchproof.photo.detect import MarkersInView, find_markers, is_mirrored
-from patchproof.photo.known_page import complete_markers
+from patchproof.photo.detect import Ids, MarkersInView, is_mirrored
+from patchproof.photo.known_page import find_sheet
 from patchproof.photo.quality import CLIPPED_CODE, blur_px
 from patchproof.photo.read import Photo
 from patchproof.photo.rectify import fit_page
 from patchproof.photo.rejection import PhotoRejected
-from patchproof.sheets.manifest import Manifest, Marker
+from patchproof.sheets.manifest import Manifest
 from patchproof.sheets.rects import RectMm, rect_contains
 
 MIN_CORE_PX = 4.0  # a swatch's side between blurred borders
@@ -37,35 +36,27 @@ _PATCHES_PER_TERM = 5
 
 @dataclass(frozen=True)
 class ChartPhoto:
-    """`light` N×3 relative to paper, one row per swatch of the manifest's chart, NaN where it could not be read.
-
-    `paper` is the light of bare paper under the chart (1 = the camera's full white), `unevenness` the ratio of that
-    light under the lightest and the darkest place, `misfit` the rms deviation of bare paper from the smooth surface, as
-    a share.
+    """`light` N×3 relative to paper, one row per swatch of the manifest's chart, NaN where it could not be read, and
+    the light of bare `paper` under the chart (1 = the camera's full white).
     """
 
     light: np.ndarray
     paper: tuple[float, float, float]
-    unevenness: float
-    misfit: float
-    px_per_mm: float
 
 
 @dataclass(frozen=True)
 class _Page:
-    """A photographed page: its number, the homography to pixels, blur, and pixels per mm at the chart."""
+    """The chart's page in a photograph: the homography to pixels, blur, and pixels per mm at the chart."""
 
-    number: int
     px_from_mm: np.ndarray
     blur_px: float
     px_per_mm: float
 
 
-def read_chart(photo: Photo, manifest: Manifest, camera: Camera | None = None) -> ChartPhoto:
+def read_chart(photo: Photo, manifest: Manifest) -> ChartPhoto:
     """Read the chart's swatches; raises `PhotoRejected` where there is none, or none that can be trusted."""
     page = _find_page(photo.srgb, manifest)
-    rows = chart_rows(manifest, page.number)
-    found = {row: _core(manifest.chart[row].rect_mm, page, photo.srgb.shape) for row in rows}
+    found = {row: _core(swatch.rect_mm, page, photo.srgb.shape) for row, swatch in enumerate(manifest.chart)}
     cores = {row: core for row, core in found.items() if core is not None}
     if not cores:
         advice = "come closer to the chart, hold still and show all of it"
@@ -73,54 +64,40 @@ def read_chart(photo: Photo, manifest: Manifest, camera: Camera | None = None) -
     patches = _bare_patches(manifest, page, photo.srgb.shape)
     whites = [core for row, core in cores.items() if min(manifest.chart[row].srgb) == 1]
     patches = np.concatenate([patches, np.reshape(whites, (-1, 4))])
-    paper_light_at, misfit = _paper(photo.srgb, page, patches, camera)
+    paper_light_at = _paper(photo.srgb, page, patches)
     light = np.full((len(manifest.chart), 3), np.nan)
     paper_light = paper_light_at(np.array([[x + w / 2, y + h / 2] for x, y, w, h in cores.values()]))
     for (row, core), paper in zip(cores.items(), paper_light, strict=True):
         codes = _codes(photo.srgb, page, core)
         if (codes >= CLIPPED_CODE).any(-1).mean() <= MAX_CLIPPED_SHARE:
-            light[row] = light_of_codes(codes / 255, camera).mean(0) / paper
-    level = paper_light.mean(1)
+            light[row] = LINEAR_FROM_CODE[codes].mean(0) / paper
     red, green, blue = np.median(paper_light, 0).tolist()
-    return ChartPhoto(light, (red, green, blue), float(level.max() / level.min()), misfit, page.px_per_mm)
-
-
-def chart_rows(manifest: Manifest, page: int) -> list[int]:
-    """Indices of the swatches of a page's chart."""
-    return [i for i, swatch in enumerate(manifest.chart) if swatch.page == page]
+    return ChartPhoto(light, (red, green, blue))
 
 
 def _find_page(srgb: np.ndarray, manifest: Manifest) -> _Page:
-    """Find the page in view by the markers beside the chart; the piece's markers help where it is not cut out."""
-    dictionary = manifest.markers[0].dictionary
-    markers = [marker for marker in manifest.markers if marker.dictionary == dictionary]
-    detected = find_markers(srgb, {marker.id for marker in markers}, dictionary=dictionary)
-    if not detected.markers:
-        raise _no_sheet(srgb, detected, markers, dictionary)
-    pages = [marker.page for marker in markers if marker.id in detected.markers]
-    numbers = [page for page in pages if chart_rows(manifest, page)] or pages[:1]
-    number = max(sorted(set(numbers)), key=numbers.count)
-    corners_mm = {marker.id: np.array(marker.corners_mm) for marker in markers if marker.page == number}
-    detected = complete_markers(srgb, detected, corners_mm, dictionary)
-    corners_px = {i: borders.corners_px for i, borders in detected.markers.items() if i in corners_mm}
-    rects_mm = {i: _bounding_rect(corners_mm[i]) for i in corners_px}
-    beside_chart = {i: px for i, px in corners_px.items() if not rect_contains(manifest.cut_mm, rects_mm[i])}
-    fit = fit_page(beside_chart if len(beside_chart) > 1 else corners_px, corners_mm)
-    all_fit = fit_page(corners_px, corners_mm)
-    if set(beside_chart) <= set(all_fit.inlier_ids):
-        fit = all_fit
-    rects = np.array([manifest.chart[i].rect_mm for i in chart_rows(manifest, number)]).reshape(-1, 4)
-    if not len(rects):
-        raise PhotoRejected("too_few_markers", 0, 1, "there is no chart on this page: photograph the one that has it")
+    """Find the chart's page by the markers beside the piece; the piece's own help where it is not cut out."""
+    dictionary, rects = manifest.markers[0].dictionary, np.array([swatch.rect_mm for swatch in manifest.chart])
+    on_page = [marker for marker in manifest.markers if marker.page == manifest.chart[0].page]
+    corners_mm = {marker.id: np.array(marker.corners_mm) for marker in on_page}
+    detected = find_sheet(srgb, corners_mm.keys(), corners_mm, dictionary)
+    corners_px = detected.corners_px
+    if not corners_px:
+        raise _no_sheet(srgb, detected, corners_mm.keys(), dictionary)
+    is_beside = {i: not rect_contains(manifest.cut_mm, _bounding_rect(corners_mm[i])) for i in corners_px}
+    beside = {i: px for i, px in corners_px.items() if is_beside[i]}
+    fit = fit_page(corners_px, corners_mm)
+    if len(beside) > 1 and not set(beside) <= set(fit.inlier_ids):
+        fit = fit_page(beside, corners_mm)
     scale, _ = local_scale(fit.px_from_mm, tuple((rects[:, :2] + rects[:, 2:] / 2).mean(0)))
-    return _Page(number, fit.px_from_mm, blur_px(detected.markers.values()), float(scale))
+    return _Page(fit.px_from_mm, blur_px(detected.markers.values()), float(scale))
 
 
-def _no_sheet(srgb: np.ndarray, detected: MarkersInView, markers: list[Marker], dictionary: str) -> PhotoRejected:
-    if is_mirrored(srgb, {marker.id for marker in markers}, dictionary):
+def _no_sheet(srgb: np.ndarray, detected: MarkersInView, ids: Ids, dictionary: str) -> PhotoRejected:
+    if is_mirrored(srgb, ids, dictionary):
         return PhotoRejected("mirrored", None, None, "the photo is mirrored: switch off the camera's mirror setting")
     if detected.foreign:
-        advice = "these are the markers of another sheet: name that sheet's JSON, or leave the photo out"
+        advice = "these are the markers of another sheet or page: name that sheet's JSON, or leave the photo out"
         return PhotoRejected("wrong_sheet", len(detected.foreign), 0, advice)
     return PhotoRejected("too_few_markers", 0, 1, "no marker is readable: show the page sharp and well lit")
 
@@ -139,15 +116,15 @@ def _core(rect: RectMm, page: _Page, shape) -> RectMm | None:
 
 def _bare_patches(manifest: Manifest, page: _Page, shape) -> np.ndarray:
     """Small squares K×4 mm around the chart on which nothing is printed, as far as the manifest knows."""
-    rows = np.array([manifest.chart[i].rect_mm for i in chart_rows(manifest, page.number)])
+    rows = np.array([swatch.rect_mm for swatch in manifest.chart])
     clear = _CLEARANCE_MM + 2 * page.blur_px / page.px_per_mm
     low = np.maximum(rows[:, :2].min(0) - _SEARCH_MM, clear)
     high = np.minimum((rows[:, :2] + rows[:, 2:]).max(0) + _SEARCH_MM, np.array(manifest.page_mm) - clear) - _PATCH_MM
     steps = [np.arange(a, b + 1e-9, _PITCH_MM) if b > a else np.array([a]) for a, b in zip(low, high, strict=True)]
     corner = np.stack(np.meshgrid(*steps), -1).reshape(-1, 2)
-    printed = [swatch.rect_mm for swatch in manifest.chart if swatch.page == page.number]
-    printed += [_bounding_rect(marker.corners_mm) for marker in manifest.markers if marker.page == page.number]
-    if chart_rows(manifest, page.number) and any(not rect_contains(manifest.cut_mm, rect) for rect in rows):
+    on_page = (marker for marker in manifest.markers if marker.page == manifest.chart[0].page)
+    printed = [*rows, *(_bounding_rect(marker.corners_mm) for marker in on_page)]
+    if any(not rect_contains(manifest.cut_mm, rect) for rect in rows):
         printed.append(manifest.cut_mm)
     bare = np.ones(len(corner), bool)
     for x, y, w, h in printed:
@@ -158,8 +135,8 @@ def _bare_patches(manifest: Manifest, page: _Page, shape) -> np.ndarray:
     return squares[np.array(inside, bool)]
 
 
-def _paper(srgb: np.ndarray, page: _Page, patches: np.ndarray, camera: Camera | None):
-    """(function points N×2 mm → light of bare paper, misfit): exp of a polynomial per channel, fitted robustly."""
+def _paper(srgb: np.ndarray, page: _Page, patches: np.ndarray):
+    """The function points N×2 mm → light of bare paper: exp of a polynomial per channel, fitted robustly."""
     if not len(patches):
         raise PhotoRejected("too_small", 0, 1, "no bare paper is in view: show the white paper around the chart")
     codes = _codes(srgb, page, patches.T, 5)
@@ -167,7 +144,7 @@ def _paper(srgb: np.ndarray, page: _Page, patches: np.ndarray, camera: Camera | 
     if clipped > MAX_CLIPPED_SHARE:
         advice = "the paper is overexposed: lower the exposure by one step"
         raise PhotoRejected("clipped", clipped, MAX_CLIPPED_SHARE, advice)
-    light = np.log(np.maximum(light_of_codes(codes / 255, camera).mean(1), 1e-4))
+    light = np.log(np.maximum(LINEAR_FROM_CODE[codes].mean(1), 1e-4))
     centers = patches[:, :2] + patches[:, 2:] / 2
     middle, reach = centers.mean(0), max(float(np.ptp(centers, 0).max()), 1.0) / 2
     count = next(n for n in (6, 3, 1) if len(patches) >= _PATCHES_PER_TERM * n or n == 1)
@@ -177,15 +154,14 @@ def _paper(srgb: np.ndarray, page: _Page, patches: np.ndarray, camera: Camera | 
         return np.stack([x**i * y**j for i, j in _POWERS[:count]], 1)
 
     patch_powers = powers(centers)
-    weight, error, surface = np.ones(len(patches)), np.zeros(len(patches)), np.zeros((count, 3))
+    weight, surface = np.ones(len(patches)), np.zeros((count, 3))
     for _ in range(30):
         root = np.sqrt(weight)[:, None]
         surface = np.linalg.lstsq(patch_powers * root, light * root, rcond=None)[0]
         error = np.abs(light - patch_powers @ surface).max(1)
         spread = max(1.4826 * float(np.median(error)), 2e-3)
         weight = np.maximum(1 - (error / (4.7 * spread)) ** 2, 0) ** 2  # Tukey's biweight: none for printed patches
-    misfit = float(np.sqrt((weight * error**2).sum() / weight.sum()))
-    return lambda points_mm: np.exp(powers(points_mm) @ surface), misfit
+    return lambda points_mm: np.exp(powers(points_mm) @ surface)
 
 
 def _codes(srgb: np.ndarray, page: _Page, rect, samples: int = _SAMPLES) -> np.ndarray:

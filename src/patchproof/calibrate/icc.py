@@ -19,8 +19,7 @@ import numpy as np
 from patchproof.base.color import ciede2000, codes_from_srgb, lab_from_srgb
 from patchproof.base.errors import Refused
 from patchproof.base.input import read_file
-from patchproof.calibrate.printer_files import printer_from_table, printer_output
-from patchproof.channel.printer import NODES_8BIT, Printer, node_colors
+from patchproof.channel.printer import NODES_8BIT, Printer, node_colors, printer_from_table, printer_output
 
 MAX_PROFILE_BYTES = 32 * 2**20  # the largest printer profiles in use are a few MB
 _D50 = np.array([0.9642, 1.0, 0.8249])  # the profile connection space's white, ICC.1
@@ -31,8 +30,8 @@ _INTENTS = {
 }
 
 
-def bake(profile_path: Path, name: str, licence: str, source: str, perceptual: bool = False) -> Printer:
-    """The printer of a profile; `licence` and `source` go into provenance, `perceptual` is the intent towards paper."""
+def bake(profile_path: Path, name: str, perceptual: bool = False) -> Printer:
+    """The printer of a profile; `perceptual` is the intent towards paper."""
     data = _profile_bytes(profile_path)
     show, profile = _chain(data, profile_path.name, perceptual)
     nodes = codes_from_srgb(node_colors())
@@ -45,8 +44,7 @@ def bake(profile_path: Path, name: str, licence: str, source: str, perceptual: b
     printer = printer_from_table(name, "icc", lut / 255, gamut, _paper_white(profile), {})
     printer.provenance.update(
         {
-            "source": source,
-            "licence": licence,
+            "source": profile_path.name,
             "profile": _description(profile),
             "profile_sha256": hashlib.sha256(data).hexdigest(),
             "profile_colors": profile.xcolor_space.strip(),

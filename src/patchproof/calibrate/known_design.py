@@ -20,7 +20,6 @@ from patchproof.base.progress import Advance
 from patchproof.base.text import printable
 from patchproof.base.workers import open_workers
 from patchproof.calibrate.chart import printer_of
-from patchproof.calibrate.printer_files import printer_output
 from patchproof.channel.print_colors import (
     INK_TERMS,
     CellColors,
@@ -29,7 +28,7 @@ from patchproof.channel.print_colors import (
     fit_ink_and_photos,
     fit_shown_colors,
 )
-from patchproof.channel.printer import Printer, load_printer, node_colors
+from patchproof.channel.printer import Printer, load_printer, node_colors, printer_output
 from patchproof.evidence.batch import PhotoItem, measure_all
 from patchproof.evidence.camera import pinhole_photo
 from patchproof.evidence.corner_files import corners_of_photo

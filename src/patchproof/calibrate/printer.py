@@ -6,7 +6,6 @@ Nothing is written before the printer is complete, and existing files are replac
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 from patchproof.base.errors import Refused
@@ -14,21 +13,17 @@ from patchproof.base.output import check_file, write_files_atomically
 from patchproof.base.progress import Progress, no_progress
 from patchproof.calibrate.chart import PRIORS, calibrate_chart, prints_of, summary_lines
 from patchproof.calibrate.icc import bake
-from patchproof.calibrate.printer_files import save_printer
-from patchproof.channel.lens import load_camera
-from patchproof.channel.printer import Printer
+from patchproof.channel.printer import Printer, printer_contents
 from patchproof.sheets.manifest import load_manifest
 
 if TYPE_CHECKING:
     from patchproof.evidence.task import Options
 
 
-def printer_from_icc(
-    profile: Path, out: Path, perceptual: bool, licence: str, source: str, overwrite: bool = False
-) -> list[str]:
+def printer_from_icc(profile: Path, out: Path, perceptual: bool, overwrite: bool = False) -> list[str]:
     """Write the printer of an ICC output profile; returns the summary."""
     out = _new_file(out, overwrite)
-    printer = bake(profile, out.stem, licence, source, perceptual)
+    printer = bake(profile, out.stem, perceptual)
     error = printer.provenance["delta_e00_to_exact_chain"]
     return [
         f"{printer.provenance['profile']} ({printer.provenance['profile_colors']}), {printer.provenance['intents']}",
@@ -39,17 +34,11 @@ def printer_from_icc(
 
 
 def printer_from_chart(
-    photos: Sequence[Path],
-    sheet: Path,
-    out: Path,
-    camera: str | None = None,
-    overwrite: bool = False,
-    progress: Progress = no_progress,
+    photos: Sequence[Path], sheet: Path, out: Path, overwrite: bool = False, progress: Progress = no_progress
 ) -> tuple[list[str], tuple[str, ...]]:
     """Write the printer measured from photographs of a chart; returns the summary and warnings."""
     out = _new_file(out, overwrite)
-    lens = None if camera is None else load_camera(camera)
-    result = calibrate_chart(prints_of(photos), load_manifest(sheet), out.stem, lens, partial(progress, "chart"))
+    result = calibrate_chart(prints_of(photos), load_manifest(sheet), out.stem, partial(progress, "chart"))
     return [*summary_lines(result), _write_files(result.printer, out)], result.warnings
 
 
@@ -83,8 +72,5 @@ def _new_file(out: Path, overwrite: bool) -> Path:
 
 
 def _write_files(printer: Printer, out: Path) -> str:
-    with TemporaryDirectory() as folder:
-        path = save_printer(printer, Path(folder))
-        files = {out.with_suffix(suffix): path.with_suffix(suffix).read_bytes() for suffix in (".npz", ".json")}
-        write_files_atomically(files)
+    write_files_atomically(printer_contents(printer, out))
     return f"written: {out}, {out.with_suffix('.json').name}"

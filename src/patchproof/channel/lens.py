@@ -23,7 +23,7 @@ from pydantic import Field
 from patchproof.base.errors import Refused
 from patchproof.base.input import is_file, read_json
 from patchproof.base.packaged import packaged_path
-from patchproof.base.validation import Finite, Positive, Share, StrictModel, spelling_hint, validate_model
+from patchproof.base.validation import Finite, Positive, StrictModel, spelling_hint, validate_model
 from patchproof.channel.render_frame import Frame
 
 if TYPE_CHECKING:
@@ -52,7 +52,6 @@ class Camera(StrictModel):
     p1: Finite = 0.0
     p2: Finite = 0.0
     k3: Finite = 0.0
-    tone_light: Annotated[tuple[Share, ...], Field(min_length=5, max_length=4096)] | None = None  # see `tone`
 
     @property
     def has_distortion(self) -> bool:
@@ -123,16 +122,12 @@ def load_camera(name_or_file: str | Path, base: Path | None = None, photo_px: tu
 
 
 def check_camera(camera: Camera, where: str) -> None:
-    """Refuse a principal point outside the picture, a tone curve that does not rise, irreversible distortion."""
-    (width, height), light = camera.image_px, camera.tone_light
+    """Refuse a principal point outside the picture, and irreversible distortion."""
+    width, height = camera.image_px
     if not (0 < camera.cx < width and 0 < camera.cy < height):
         expected = f"a principal point inside the picture of {width} × {height} px in {where}"
         got = f"({camera.cx:g}, {camera.cy:g})"
         raise Refused(expected, got, "give cx, cy and image_px in the same pixels")
-    if light is not None and not (light[0] == 0 and light[-1] == 1 and (np.diff(light) > 0).all()):
-        got = f"{len(light)} values from {light[0]:g} to {light[-1]:g} that do not"
-        remedy = "give the light at evenly spaced code values, or leave it out for sRGB's curve"
-        raise Refused(f"a tone_light in {where} that grows from 0 to 1 at every step", got, remedy)
     _refuse_irreversible(camera, where)
 
 

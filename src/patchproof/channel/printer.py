@@ -10,6 +10,7 @@ what a camera resolves beyond 0.2 mm per pixel) and ink spread.
 
 import hashlib
 import io
+import json
 import math
 import zipfile
 from dataclasses import dataclass, field
@@ -22,7 +23,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from patchproof.base.color import LUMINANCE, clamp_to_unit
+from patchproof.base.color import LUMINANCE, clamp_to_unit, lab_from_srgb
 from patchproof.base.errors import Refused
 from patchproof.base.input import read_file, read_json
 from patchproof.base.packaged import packaged_path
@@ -103,6 +104,21 @@ def identity_printer() -> Printer:
     return Printer("identity", "assumed", lut, torch.zeros(lut.shape[:3]), Paper(black_L=0.0), note)
 
 
+def printer_from_table(
+    name: str, method: Method, lut: np.ndarray, gamut: np.ndarray, white_lab, provenance: dict[str, Any]
+) -> Printer:
+    """Return a printer of tables 33×33×33×3 (clipped to [0, 1]) and 33×33×33, with its own black."""
+    lut = np.clip(np.asarray(lut, np.float64), 0, 1)
+    paper = Paper(white_lab=white_lab, black_L=round(float(lab_from_srgb(lut[0, 0, 0])[0]), 2))
+    distances = torch.tensor(np.asarray(gamut, np.float64), dtype=torch.float32)
+    return Printer(name, method, torch.tensor(lut, dtype=torch.float32), distances, paper, provenance)
+
+
+def printer_output(printer: Printer, colors: np.ndarray) -> np.ndarray:
+    """Return the sRGB colors N×3 of a print of N×3 sRGB sent."""
+    return printer.apply(torch.tensor(np.asarray(colors, float).T[None, :, :, None]))[0, :, :, 0].T.numpy()
+
+
 def vary_print(seen_linear: Tensor, change: Tensor) -> Tensor:
     """Return the light `... × 3` of another print of the same file in another photograph, given that of this one;
     channels last, unlike an image.
@@ -149,6 +165,18 @@ def printer_files(path: Path) -> tuple[bytes, Any]:
     """Return what a printer's NAME.npz and NAME.json hold."""
     expected, text = "a printer as NAME.npz with NAME.json beside it", path.with_suffix(".json")
     return read_file(path.with_suffix(".npz"), expected), read_json(text, expected, "calibrate again")
+
+
+def printer_contents(printer: Printer, path: Path) -> dict[Path, bytes]:
+    """Return the contents of NAME.npz, which is `path`, and of NAME.json; a printer always gives the same bytes."""
+    lut = printer.lut.double().numpy()
+    in_8_bits = np.abs(lut * 255 - np.round(lut * 255)).max() < 1e-4  # tables from an 8-bit engine lose nothing
+    levels, dtype = (255, np.uint8) if in_8_bits else (65535, np.uint16)
+    gamut = np.round(printer.gamut.double().numpy() * GAMUT_STEPS).clip(0, 255).astype(np.uint8)
+    np.savez_compressed(tables := io.BytesIO(), lut=np.round(lut * levels).astype(dtype), gamut=gamut)
+    head = PrinterHead(name=printer.name, method=printer.method, paper=printer.paper, provenance=printer.provenance)
+    text = json.dumps(head.model_dump(), indent=1, ensure_ascii=False) + "\n"
+    return {path: tables.getvalue(), path.with_suffix(".json"): text.encode()}
 
 
 def printer_of_files(stored: bytes, description: Any, path: str | Path) -> Printer:

@@ -22,7 +22,6 @@ from patchproof.base.resample import index_homography
 from patchproof.base.settings import PrinterSettings
 from patchproof.channel.camera import develop
 from patchproof.channel.effects import Sensor
-from patchproof.channel.lens import Camera
 from patchproof.channel.printer import Printer, load_printer
 from patchproof.optimizer.run import Run
 from patchproof.photo.read import Photo
@@ -97,7 +96,7 @@ def reprint_pages(
             (folder / f"photo_{i + 1:04d}.jpg").write_bytes(shot.file)
 
 
-def photograph_page(page: np.ndarray, seed: int, camera: Camera | None = None) -> Shot:
+def photograph_page(page: np.ndarray, seed: int) -> Shot:
     """Photograph a page that lies flat, from above within 25° to each side; the seed determines all conditions."""
     rng = np.random.default_rng([seed, 4])
     page_mm = np.array(page.shape[1::-1]) / PX_PER_MM
@@ -119,7 +118,7 @@ def photograph_page(page: np.ndarray, seed: int, camera: Camera | None = None) -
     exposure_ev, noise_seed = np.array([np.log2(exposure)]), np.array([seed])
     sensor = Sensor(exposure_ev=exposure_ev, white_balance=white_balance[None], noise_seed=noise_seed, **drawn)
     picture = torch.tensor(raw.transpose(2, 0, 1)[None], dtype=torch.float32)
-    codes = develop(picture, sensor, 1.0, jpeg=False, camera=camera)[0].permute(1, 2, 0).numpy().astype(float)
+    codes = develop(picture, sensor, 1.0, jpeg=False)[0].permute(1, 2, 0).numpy().astype(float)
     file = image_bytes(photo_codes_from_srgb(codes), "JPEG", {"quality": int(sensor.jpeg[0])})
     return Shot(file, middle_light * exposure * white_balance)
 

@@ -72,7 +72,7 @@ def photograph_traced(
     light = traced_light(stage, piece, conditions, draw_optics(conditions) if optics is None else optics)
     if stage.camera is not None:
         light = stage.camera.distort_pictures(light, stage.scene.settings.camera.photo_px)
-    return develop(light, conditions.sensor, 1.0, jpeg=False, camera=stage.camera)
+    return develop(light, conditions.sensor, 1.0, jpeg=False)
 
 
 def traced_light(stage: Stage, piece: PiecePicture | None, conditions: Conditions, optics: Optics) -> Tensor:

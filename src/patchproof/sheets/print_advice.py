@@ -10,8 +10,8 @@ from patchproof.base.geometry import MM_PER_INCH
 from patchproof.sheets.manifest import Manifest
 
 SHOP_ADVICE = (
-    "The PDF has its true size (1:1), a trim box and a bleed box; no ink reaches the edge, so no bleed and no crop marks "
-    "are needed.",
+    "The PDF has its true size (1:1), a trim box and a bleed box; no ink reaches the edge, so no bleed and no crop "
+    "marks are needed.",
     "The file asks viewers not to scale it (PrintScaling None); still check that 100 % is set.",
     "All fonts are embedded; texts, markers and swatches are vector graphics, RGB with an sRGB profile (DefaultRGB).",
     "Total ink is not limited in the file: it is RGB, so the printer's own profile decides; black is RGB 0 0 0.",

@@ -19,8 +19,6 @@ def printer(
     intent: Annotated[
         Literal["relative", "perceptual"], Option(help="The profile's intent that the driver is set to.")
     ] = "relative",
-    licence: Annotated[str, Option(help="Of the profile, for the record.")] = "unknown",
-    source: Annotated[str, Option(help="Where the profile is from, for the record.")] = "unknown",
     chart: Annotated[bool, Option("--chart", hidden=True)] = False,
     design: Annotated[
         bool, Option("--design", help="They show a print of known pixels, that of --sheet; else a printed chart.")
@@ -31,7 +29,7 @@ def printer(
         Literal["office", "coated", "uncoated"] | None, Option(help="For colors that the design lacks; else the best.")
     ] = None,
     sheet: Annotated[Path | None, Option(help="The manifest of the chart's page, or of the design.")] = None,
-    camera: Annotated[str | None, Option(help="A camera file with a tone curve.")] = None,
+    camera: Annotated[str | None, Option(help="The camera that took photographs of a design.")] = None,
     overwrite: Overwrite = False,
 ) -> None:
     """A printer from its ICC profile, or from photographs of its printed chart or of any design."""
@@ -42,10 +40,11 @@ def printer(
         raise BadParameter("a chart needs no option: PHOTO... --sheet chart.json", param_hint="--chart")
     if (icc is None) != bool(photos):
         raise BadParameter("give either --icc FILE or PHOTO...", param_hint="--icc / PHOTO...")
-    if not design and (corners or find or known):
-        raise BadParameter("--corners, --find and --known are for PHOTO... --design", param_hint="--design")
+    if not design and (corners or find or known or camera):
+        only = "--corners, --find, --known and --camera are for PHOTO... --design"
+        raise BadParameter(only, param_hint="--design")
     if icc is not None:
-        lines, warnings = printer_from_icc(icc, out, intent == "perceptual", licence, source, overwrite), ()
+        lines, warnings = printer_from_icc(icc, out, intent == "perceptual", overwrite), ()
     elif sheet is None:
         raise BadParameter("name the JSON that was written beside the PDF", param_hint="--sheet")
     elif design:
@@ -60,7 +59,7 @@ def printer(
             lines, warnings = printer_from_design(photos, sheet, out, options, known, overwrite, bar)
     else:
         with progress_bar() as bar:
-            lines, warnings = printer_from_chart(photos, sheet, out, camera, overwrite, bar)
+            lines, warnings = printer_from_chart(photos, sheet, out, overwrite, bar)
     warn(warnings)
     say(*lines, f'{_NEXT} profile = "{out.with_suffix(".npz")}" in its [printer]')
 
