@@ -1,29 +1,24 @@
 """Calibrate a camera from photographs of a board: choose photographs and lens model, write a file that scenes can read.
 
-In: photographs and a board. Out: `CameraCalibration`, and three files: NAME.json in the form of calibration/cameras,
-NAME.fit.json with all figures (the ladder, deviations, every photograph), NAME.residuals.png. Photographs that cannot
-determine a camera are refused: too few of them, boards that all face the same way (a plane's picture then hardly
-depends on the focal length), a focal length known to no better than 1 %. The print's size does not matter, its
-proportions do: rulers that differ are typed in. In the picture, arrows show a pattern where a lens term is missing, and
-point every way where none is; a photograph that stands out was moved or shows a bent board.
+In: photographs and a board. Out: `CameraCalibration`, and NAME.json in the form of calibration/cameras. Photographs
+that cannot determine a camera are refused: too few of them, boards that all face the same way (a plane's picture then
+hardly depends on the focal length), a focal length known to no better than 1 %. The print's size does not matter, its
+proportions do: rulers that differ are typed in. A photograph that stands out was moved or shows a bent board.
 Left out on purpose: fisheye lenses, and how flat the board is, which shows in the residuals only.
 """
 
-import io
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import date
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from patchproof.base.errors import Refused
-from patchproof.base.output import check_file, write_files_atomically
+from patchproof.base.output import check_file, write_atomically
 from patchproof.base.progress import Advance, Progress, no_advance, no_progress
-from patchproof.base.validation import not_measured_lines
 from patchproof.calibrate.boards import MIN_CORNERS, BoardView, find_boards
 from patchproof.calibrate.ladder import Rung
 from patchproof.calibrate.lens_ladder import PARAMETERS, LensFit, choose_lens_model, fit_rung
@@ -41,20 +36,13 @@ _ODD_PHOTO_RATIO, _ODD_CORNER_RATIO, _ODD_PX = 3.0, 5.0, 0.5  # ratios to the me
 
 @dataclass(frozen=True)
 class CameraCalibration:
-    """A camera, the ladder with its fit, the views used, reasons for photographs left out, and the board."""
+    """A camera, the ladder with its fit, the views used, and reasons for photographs left out."""
 
     camera: Camera
     rungs: tuple[Rung, ...]
     fit: LensFit
     views: tuple[BoardView, ...]
     left_out: Mapping[str, str]
-    board: Board
-
-    @property
-    def not_measured(self) -> dict[str, str]:
-        """Reasons by lens model that has no held-out error."""
-        why = "no usable fit to these photographs, or to parts of them"
-        return {f"lens model {rung.name}": why for rung in self.rungs if not np.isfinite(rung.error)}
 
     @property
     def coverage(self) -> float:
@@ -72,19 +60,15 @@ def calibrate_camera(
     overwrite: bool = False,
     progress: Progress = no_progress,
 ) -> CameraCalibration:
-    """Calibrate and write the three files; `board` is a template or BOARD.json, `ruler_mm` its rulers as measured."""
+    """Calibrate and write the camera file; `board` is a template or BOARD.json, `ruler_mm` its rulers as measured."""
     out = Path(out)
     if out.suffix.lower() != ".json":
         raise Refused("a file name that ends in .json", f'"{out}"', "name the camera CAMERA.json")
-    figures, picture = out.with_suffix(".fit.json"), out.with_suffix(".residuals.png")
-    for path in (out, figures, picture):
-        check_file(path, overwrite)
+    check_file(out, overwrite)
     template = load_board(board)
     views, left_out, camera = find_boards(photos, template, ruler_mm, partial(progress, "find corners"))
     result = fit_camera(views, left_out, template, out.stem, camera, partial(progress, "lens models"))
-    residuals = _residual_picture(result.views, result.rungs, result.fit)
-    files = {figures: _text(_fit_figures(result)), picture: residuals, out: _text(result.camera.model_dump())}
-    write_files_atomically(files)
+    write_atomically(out, json.dumps(result.camera.model_dump(), indent=1, allow_nan=False) + "\n")
     return result
 
 
@@ -109,42 +93,14 @@ def fit_camera(
     errors = f"standard deviations {parts}; {fit.rms_px:.2g} px rms are left; a board that is not flat is not in it"
     fitted = _camera(fit, name, size_px, about, errors)
     check_camera(fitted, "this calibration")
-    return CameraCalibration(fitted, rungs, fit, tuple(views), left_out, board)
-
-
-def _fit_figures(result: CameraCalibration) -> dict:
-    """All figures as plain data; lengths in px of `image_px`, null where a rung found no fit."""
-    fit = result.fit
-    figure = lambda value: round(value, 5) if np.isfinite(value) else None  # noqa: E731
-    tilts = [round(float(tilt), 2) for tilt in fit.tilts_deg]
-    photos: list[dict[str, Any]] = [
-        {"file": view.file, "status": "used", "corners": len(view.ids), "rms_px": figure(rms), "tilt_deg": tilt}
-        for view, rms, tilt in zip(result.views, fit.photo_rms_px, tilts, strict=True)
-    ]
-    photos += [{"file": file, "status": "left out", "reason": reason} for file, reason in result.left_out.items()]
-    names = {"held_out_px": "error", "worse_by_px": "worse_by", "standard_error_px": "standard_error"}
-    return {
-        "board": result.board.sheet_id,
-        "rung": fit.rung,
-        "ladder": [
-            {"rung": rung.name} | {key: figure(getattr(rung, name)) for key, name in names.items()}
-            for rung in result.rungs
-        ],
-        "numbers": {
-            n: {"value": float(v), "standard_deviation": float(s)}
-            for n, v, s in zip(PARAMETERS, fit.numbers, fit.sd, strict=True)
-        },
-        "not_measured": result.not_measured,
-        "rms_px": figure(fit.rms_px),
-        "coverage": round(result.coverage, 3),
-        "photos": sorted(photos, key=lambda photo: photo["file"]),
-    }
+    return CameraCalibration(fitted, rungs, fit, tuple(views), left_out)
 
 
 def calibration_lines(result: CameraCalibration) -> list[str]:
     """The result in a few lines for the terminal."""
     fit, camera = result.fit, result.camera
-    steps = ", ".join(f"{rung.name} {rung.error:.3f}" for rung in result.rungs if np.isfinite(rung.error))
+    # infinite where no fit to these photographs, or to parts of them, is usable
+    steps = ", ".join(f"{rung.name} {rung.error:.3f}" for rung in result.rungs).replace(" inf", " not measured")
     lines = [
         f"lens: {fit.rung} (held-out error in px: {steps})",
         f"focal length {camera.fx:.1f} ± {fit.sd[0]:.1f} × {camera.fy:.1f} ± {fit.sd[1]:.1f} px "
@@ -153,7 +109,6 @@ def calibration_lines(result: CameraCalibration) -> list[str]:
         f"{len(result.views)} photographs leave {fit.rms_px:.3f} px rms; tilts {fit.tilts_deg.min():.0f} to "
         f"{fit.tilts_deg.max():.0f}°",
     ]
-    lines += not_measured_lines(result.not_measured)
     lines += [f"left out: {file}: {reason}" for file, reason in result.left_out.items()]
     if result.coverage < GOOD_COVERAGE:
         lines.append(
@@ -221,38 +176,3 @@ def _camera(fit: LensFit, name: str, size_px: tuple[int, int], instrument: str, 
     description = {"instrument": instrument, "uncertainty": uncertainty, "when": date.today().isoformat()}
     numbers = {n: round(float(v), 6) for n, v in zip(PARAMETERS, fit.numbers, strict=True)}
     return Camera.model_validate({"name": name, "method": "measured", "image_px": size_px} | description | numbers)
-
-
-def _residual_picture(views: Sequence[BoardView], rungs: Sequence[Rung], fit: LensFit) -> bytes:
-    """A PNG of three panels: residuals over the picture, RMS of each photograph, held-out error of each rung."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(12, 3.8), layout="constrained")
-    FigureCanvasAgg(figure)
-    where, photos, ladder = figure.subplots(1, 3, width_ratios=(1.5, 1.2, 1))
-    places, residuals = np.concatenate([view.px for view in views]), np.concatenate(fit.residuals_px)
-    (width, height), lengths = views[0].size_px, np.linalg.norm(residuals, axis=1)
-    times = 0.02 * width / max(float(np.median(lengths)), 1e-6)
-    style = {"angles": "xy", "scale_units": "xy", "scale": 1 / times, "width": 0.0025, "cmap": "viridis"}
-    where.quiver(*places.T, *residuals.T, lengths, **style)
-    where.set(xlim=(0, width), ylim=(height, 0), aspect="equal", title=f"residuals, {times:.0f} times as long")
-    photos.bar(range(1, len(views) + 1), fit.photo_rms_px, color="#4477aa")
-    photos.set(xlabel="photograph, in the order of names", ylabel="rms [px]", title=f"{fit.rms_px:.3f} px in all")
-    rungs = [rung for rung in rungs if np.isfinite(rung.error)]
-    names, errors = [rung.name for rung in rungs], [rung.error for rung in rungs]
-    # bars are the standard error of the difference from the best rung
-    ladder.errorbar(range(len(rungs)), errors, [rung.standard_error for rung in rungs], fmt="o-", color="#4477aa")
-    chosen = names.index(fit.rung)
-    ladder.plot(chosen, errors[chosen], "o", markersize=12, fillstyle="none", color="#cc3311")
-    if max(errors) > 10 * min(errors):
-        ladder.set_yscale("log")
-    ladder.set_xticks(range(len(rungs)), [name.replace(" p1 p2", "\np1 p2") for name in names], fontsize=8)
-    ladder.set(ylabel="held-out error [px]", title=f"chosen: {fit.rung}")
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=110, metadata={"Software": None})
-    return buffer.getvalue()
-
-
-def _text(data: dict) -> bytes:
-    return (json.dumps(data, indent=1, allow_nan=False) + "\n").encode()

@@ -54,11 +54,6 @@ class LensFit:
         return float(np.sqrt((np.concatenate(self.residuals_px) ** 2).sum(1).mean()))
 
     @property
-    def photo_rms_px(self) -> list[float]:
-        """Root mean square of the residuals' lengths in each view."""
-        return [float(np.sqrt((residual**2).sum(1).mean())) for residual in self.residuals_px]
-
-    @property
     def tilts_deg(self) -> np.ndarray:
         """The angle by which each board is turned away from facing the camera."""
         return np.degrees(np.arccos(np.clip(np.abs(self.normals[:, 2]), 0, 1)))

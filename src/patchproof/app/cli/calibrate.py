@@ -19,7 +19,6 @@ def printer(
     intent: Annotated[
         Literal["relative", "perceptual"], Option(help="The profile's intent that the driver is set to.")
     ] = "relative",
-    chart: Annotated[bool, Option("--chart", hidden=True)] = False,
     design: Annotated[
         bool, Option("--design", help="They show a print of known pixels, that of --sheet; else a printed chart.")
     ] = False,
@@ -36,12 +35,10 @@ def printer(
     from patchproof.calibrate.printer import printer_from_chart, printer_from_design, printer_from_icc
 
     photos = photos or []
-    if chart:
-        raise BadParameter("a chart needs no option: PHOTO... --sheet chart.json", param_hint="--chart")
     if (icc is None) != bool(photos):
         raise BadParameter("give either --icc FILE or PHOTO...", param_hint="--icc / PHOTO...")
     if not design and (corners or find or known or camera):
-        only = "--corners, --find, --known and --camera are for PHOTO... --design"
+        only = "--corners, --find, --camera and --known are for PHOTO... --design"
         raise BadParameter(only, param_hint="--design")
     if icc is not None:
         lines, warnings = printer_from_icc(icc, out, intent == "perceptual", overwrite), ()
@@ -67,9 +64,7 @@ def printer(
 def camera(
     photos: Annotated[Path, Argument(help="A folder of photographs of a board.")],
     board: Annotated[str, Option(help="The board's template, or the BOARD.json beside its PDF.")] = "charuco_a4",
-    out: Annotated[Path, Option(help="The camera file; its figures and a picture are written beside it.")] = Path(
-        "camera.json"
-    ),
+    out: Annotated[Path, Option(help="The camera file.")] = Path("camera.json"),
     ruler_mm: Annotated[str | None, Option(help="The printed rulers as measured, e.g. 97.1x97.3 (x, y).")] = None,
     overwrite: Overwrite = False,
 ) -> None:
