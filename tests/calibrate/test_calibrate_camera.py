@@ -15,7 +15,7 @@ from patchproof.calibrate.boards import BoardView, corner_positions_mm, find_boa
 from patchproof.calibrate.camera import calibrate_camera, calibration_lines, fit_camera
 from patchproof.calibrate.ladder import compare_rungs, simplest_rung
 from patchproof.channel.lens import load_camera
-from patchproof.sheets.board import board_sheet, load_board
+from patchproof.sheets.blank import board_sheet, load_board
 from patchproof.sheets.pdf_raster import rasterize_page
 
 SIZE = (1600, 1200)

@@ -379,7 +379,7 @@ def photo_pictures(place: Place, number: int) -> Use:
 def calibrated_photos(place: Place, number: int) -> Use:
     from patchproof.calibrate.boards import find_boards
     from patchproof.photo.read import list_photos
-    from patchproof.sheets.board import load_board
+    from patchproof.sheets.blank import load_board
 
     endless(place.given / "a.jpg", of(number, ENDLESS))
     (place.given / "b.png").write_bytes(of(number, PICTURES)())

@@ -30,7 +30,7 @@ from patchproof.photo.limits import count_finder_lines, count_squares, run_limit
 from patchproof.photo.page_code import read_page_code
 from patchproof.photo.read import read_photo
 from patchproof.photo.rejection import PhotoRejected
-from patchproof.sheets.board import load_board
+from patchproof.sheets.blank import load_board
 from patchproof.sheets.markers import aruco_dictionary
 
 needs_timer = pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="there are no such timers on Windows")

@@ -21,8 +21,7 @@ from patchproof.evidence.ranges import promised_ranges
 from patchproof.evidence.surface import surface_of
 from patchproof.photo.page_code import manifest_page_code, read_page_code
 from patchproof.photo.read import Photo
-from patchproof.sheets.blank import chart_sheet
-from patchproof.sheets.board import board_sheet, is_board
+from patchproof.sheets.blank import BOARD, board_sheet, chart_sheet
 from patchproof.sheets.content import SheetContent
 from patchproof.sheets.layout import Box, check_layout
 from patchproof.sheets.manifest import load_manifest
@@ -32,7 +31,7 @@ from patchproof.sheets.pdf_raster import attached_manifests, rasterize_page, ras
 from patchproof.sheets.piece import lay_out_piece, marker_image
 from patchproof.sheets.plan_page import PlanPage
 from patchproof.sheets.print_advice import sheet_advice
-from patchproof.sheets.template import load_template, template_names
+from patchproof.sheets.template import load_template, template_data, template_names
 from patchproof.sheets.tiles import plan_tiles
 from patchproof.sheets.write import write_sheet
 from test_benefit import promise_of
@@ -46,7 +45,7 @@ PIECE = lay_out_piece((680, 680), 30, ID, "design", bends=True)  # in tiles
 
 
 def write(path, name, piece_mm=None, marker_mm=None, design=DESIGN, **more):
-    if is_board(name):
+    if BOARD in template_data(name)[1]:
         return board_sheet(name, path)
     template = load_template(name)
     if template.piece is None:

@@ -22,7 +22,7 @@ from patchproof.photo.detect import detect_markers, detector_settings, luminance
 from patchproof.photo.limits import run_limited
 from patchproof.photo.read import list_photos, read_photo
 from patchproof.photo.rejection import PhotoRejected
-from patchproof.sheets.board import Board
+from patchproof.sheets.blank import Board
 from patchproof.sheets.markers import DICTIONARY, aruco_dictionary
 
 MIN_CORNERS = 12  # in one photograph: a pose has six unknowns, twelve corners give twenty-four numbers

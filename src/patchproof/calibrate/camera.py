@@ -23,7 +23,7 @@ from patchproof.calibrate.boards import MIN_CORNERS, BoardView, find_boards
 from patchproof.calibrate.ladder import Rung
 from patchproof.calibrate.lens_ladder import PARAMETERS, LensFit, choose_lens_model, fit_rung
 from patchproof.channel.lens import Camera, check_camera
-from patchproof.sheets.board import Board, load_board
+from patchproof.sheets.blank import Board, load_board
 
 MIN_PHOTOS = 6
 MIN_TURN_DEG = 10.0  # between the two boards that differ most; users are asked for tilts of 20 to 45°

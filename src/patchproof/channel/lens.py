@@ -24,7 +24,7 @@ from patchproof.base.errors import Refused
 from patchproof.base.input import is_file, read_json
 from patchproof.base.packaged import packaged_path
 from patchproof.base.validation import Finite, Positive, StrictModel, spelling_hint, validate_model
-from patchproof.channel.render_frame import Frame
+from patchproof.channel.cameras import Frame
 
 if TYPE_CHECKING:
     from torch import Tensor

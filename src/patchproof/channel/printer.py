@@ -8,11 +8,13 @@ them too. Print-to-print variation is a small function on top, `vary_print`. Lef
 what a camera resolves beyond 0.2 mm per pixel) and ink spread.
 """
 
+import base64
 import hashlib
 import io
 import json
 import math
 import zipfile
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -192,6 +194,21 @@ def printer_of_files(stored: bytes, description: Any, path: str | Path) -> Print
     lut_srgb = torch.tensor(lut / np.iinfo(lut.dtype).max, dtype=torch.float32)
     distances = torch.tensor(gamut / GAMUT_STEPS, dtype=torch.float32)
     return Printer(head.name, head.method, lut_srgb, distances, head.paper, head.provenance)
+
+
+def carried_printer(path: Path) -> dict[str, Any]:
+    """Return both files of a printer as JSON values: a sheet carries one without a name, since it may lie anywhere."""
+    tables, head = printer_files(path)
+    return {"npz": base64.b64encode(tables).decode(), "head": head}
+
+
+def printer_of_sheet(carried: Mapping[str, Any], source: str | Path) -> Printer:
+    """Return a printer from what `carried_printer` made of it; `source` names the sheet in a refusal."""
+    try:
+        tables = base64.b64decode(carried["npz"], validate=True)
+    except ValueError as error:
+        raise Refused("a printer's tables in base64", f"{source} with other text", "make the sheet again") from error
+    return printer_of_files(tables, carried["head"], source)
 
 
 def _array(archive: zipfile.ZipFile, name: str, shape: tuple[int, ...], kinds: tuple[type, ...]) -> np.ndarray:

@@ -160,7 +160,7 @@ def geometry_of(
         contrast=light.contrast,
         blur_px=blur,
         corner_uncertainty_mm=uncertainty,
-        curl_radius_mm=unrolled and unrolled.radius_mm,
+        curl_radius_mm=unrolled and unrolled.shape.radius_mm,
         bend_mm=fit.bend_mm,
         design_shift_mm=shift,
         # no homography maps a page that was unrolled to the photograph

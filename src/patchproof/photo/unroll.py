@@ -36,11 +36,6 @@ class UnrolledSheet:
     uncertainty_mm: float
     shape: Shape
 
-    @property
-    def radius_mm(self) -> float | None:
-        """The radius of the shape; see `Shape`."""
-        return self.shape.radius_mm
-
 
 @dataclass(frozen=True)
 class ShapeFit:

@@ -22,8 +22,8 @@ from torch import Tensor
 from patchproof.base.color import LINEAR_FROM_CODE, lift_tone
 from patchproof.base.geometry import camera_centers
 from patchproof.channel.camera import encode_light, encode_light_by_table, gains
+from patchproof.channel.cameras import Frame
 from patchproof.channel.light import Lighting, irradiance, lighting_of
-from patchproof.channel.render_frame import Frame
 from patchproof.render import pixels
 from patchproof.render.fragments import Cameras
 from patchproof.render.outlines import Outlines, find_outlines

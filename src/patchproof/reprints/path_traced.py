@@ -24,9 +24,9 @@ from patchproof.base import geometry
 from patchproof.base.color import LINEAR_FROM_CODE, linear_from_srgb
 from patchproof.base.errors import Refused
 from patchproof.channel.camera import develop
+from patchproof.channel.cameras import Frame
 from patchproof.channel.effects import Light, Print
 from patchproof.channel.printer import print_change, vary_print
-from patchproof.channel.render_frame import Frame
 from patchproof.mesh.mesh import Mesh
 from patchproof.render.photograph import PAPER_BACK_LINEAR
 from patchproof.render.pixels import PiecePicture

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from patchproof.base.validation import NETWORK_FILE
-from patchproof.channel.carried_printer import carried_printer
+from patchproof.channel.printer import carried_printer
 from patchproof.scene.interface import Scene
 from patchproof.sheets.manifest import Promise
 
