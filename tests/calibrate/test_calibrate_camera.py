@@ -183,7 +183,7 @@ def test_photographs_give_a_camera_file_that_scenes_can_read(photos, tmp_path):
     assert found.fit.rms_px < 0.15 and "fx" in camera.uncertainty
     assert len(found.views) == 7 and set(found.left_out) == {"none.png", "small.png"}
     assert "0 markers" in found.left_out["none.png"]
-    assert "400 × 300 px where most have 640 × 480" in found.left_out["small.png"]
+    assert "a picture of 400 × 300 px where most have a picture of 640 × 480 px" in found.left_out["small.png"]
     first, *_ = lines = calibration_lines(found)
     assert "held-out error in px: pinhole 1." in first and first.count(",") == 4
     assert sum(line.startswith("left out: ") for line in lines) == 2

@@ -57,7 +57,7 @@ def test_identity_changes_nothing_and_is_in_gamut():
 
 def test_nodes_are_exact_and_axes_are_red_green_blue():
     lut = np.random.default_rng(1).random((33, 33, 33, 3))
-    printer = printer_from_table("noise", "assumed", lut, lut[..., 0], None, {})
+    printer = printer_from_table("noise", "assumed", lut, lut[..., 0], {})
     i, j, k = np.random.default_rng(2).integers(0, 33, (3, 500))
     sent = np.array(NODES_8BIT)[np.stack([i, j, k], 1)] / 255
     np.testing.assert_allclose(colors_of(printer.apply(image(sent))), lut[i, j, k], atol=1e-6)
@@ -70,7 +70,7 @@ def test_trilinear_twin():
     lut = np.random.default_rng(1).random((33, 33, 33, 3))
     sent = np.random.default_rng(3).random((2000, 3))
     slow = RegularGridInterpolator((np.array(NODES_8BIT) / 255,) * 3, lut)(sent)
-    fast = colors_of(printer_from_table("noise", "assumed", lut, lut[..., 0], None, {}).apply(image(sent)))
+    fast = colors_of(printer_from_table("noise", "assumed", lut, lut[..., 0], {}).apply(image(sent)))
     np.testing.assert_allclose(fast, slow, atol=1e-5)
 
 
@@ -205,7 +205,7 @@ def test_cut_and_gutted_profiles(tmp_path):
 
 def test_saving_and_loading_keep_a_measured_printer(tmp_path):
     lut = np.random.default_rng(1).random((33, 33, 33, 3))
-    printer = printer_from_table("mine", "measured", lut, 30 * lut[..., 0], (94.0, 1.0, -3.0), {"chart": "a4"})
+    printer = printer_from_table("mine", "measured", lut, 30 * lut[..., 0], {"chart": "a4"})
     write_files_atomically(printer_contents(printer, tmp_path / "mine.npz"))
     again = load_printer("mine.npz", tmp_path)
     torch.testing.assert_close(again.lut, printer.lut, atol=1e-5, rtol=0)  # 16 bits
@@ -220,7 +220,7 @@ def test_saving_and_loading_keep_a_measured_printer(tmp_path):
 
 
 def test_tables_outside_srgb_are_clipped():
-    printer = printer_from_table("wide", "assumed", node_colors() * 1.2 - 0.1, np.zeros((33, 33, 33)), None, {})
+    printer = printer_from_table("wide", "assumed", node_colors() * 1.2 - 0.1, np.zeros((33, 33, 33)), {})
     assert printer.lut.min() == 0 and printer.lut.max() == 1
 
 

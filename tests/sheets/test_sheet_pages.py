@@ -19,7 +19,7 @@ from patchproof.evidence.camera import pinhole_photo
 from patchproof.evidence.measure import measure
 from patchproof.evidence.ranges import promised_ranges
 from patchproof.evidence.surface import surface_of
-from patchproof.photo.page_code import manifest_page_code, read_page_code
+from patchproof.photo.page_code import read_page_code
 from patchproof.photo.read import Photo
 from patchproof.sheets.blank import BOARD, board_sheet, chart_sheet
 from patchproof.sheets.content import SheetContent
@@ -78,7 +78,7 @@ def test_every_page_has_its_markers_within_a_tenth_of_a_millimeter_its_code_and_
             assert np.abs(found[marker.id] / PX_PER_MM - np.array(marker.corners_mm)).max() < 0.1
         assert_nothing_lies_over(pixels, manifest, number, margin)
         if number == 1:
-            assert read_page_code(pixels) == manifest_page_code(manifest)
+            assert read_page_code(pixels) == manifest.code
     assert attached_manifests(path)[0] == load_manifest(path.with_suffix(".json")) == manifest
 
 

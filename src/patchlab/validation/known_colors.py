@@ -113,7 +113,7 @@ def printer_of_ink(name: str, start: Printer, ink: Tensor, provenance: dict[str,
     lut = srgb_from_linear(ink_light(_printed(nodes * 255, start), ink)).numpy().reshape(node_colors().shape)
     lut = (lut / lut[-1, -1, -1]).clip(0, 1)
     distance = ciede2000(*(lab_from_linear(linear_from_srgb(each)) for each in (lut, node_colors())))
-    return printer_from_table(name, "measured", lut, distance, None, provenance)
+    return printer_from_table(name, "measured", lut, distance, provenance)
 
 
 def _printed(code: np.ndarray, printer: Printer) -> Tensor:

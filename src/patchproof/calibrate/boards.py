@@ -26,7 +26,7 @@ from patchproof.sheets.blank import Board
 from patchproof.sheets.markers import DICTIONARY, aruco_dictionary
 
 MIN_CORNERS = 12  # in one photograph: a pose has six unknowns, twelve corners give twenty-four numbers
-_ORIENTATION, _MAKE, _MODEL = 0x0112, 0x010F, 0x0110
+_STATE_TAGS = 0x010F, 0x0110, 0x0112  # maker, model, orientation
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ def find_boards(
         try:
             view, focal_px = run_limited(_read_view, path, board, positions_mm)
             views.append(view)
-            states.append((view.size_px, _camera_tags(path), focal_px and round(focal_px)))
+            states.append((view.size_px, *_camera_tags(path), focal_px and round(focal_px)))
         except PhotoRejected as rejection:
             left_out[path.name] = rejection.advice
         advance(number, len(paths))
@@ -67,7 +67,7 @@ def find_boards(
     common = Counter(states).most_common(1)[0][0]
     pairs = list(zip(views, states, strict=True))
     left_out |= {view.file: _other_state(state, common) for view, state in pairs if state != common}
-    return [view for view, state in pairs if state == common], left_out, common[1][1]
+    return [view for view, state in pairs if state == common], left_out, common[1]
 
 
 def corner_positions_mm(board: Board, ruler_mm: tuple[float, float] | None = None) -> np.ndarray:
@@ -108,25 +108,20 @@ def find_corners(srgb: np.ndarray, board: Board) -> tuple[np.ndarray, np.ndarray
     return np.asarray(ids).reshape(-1), np.asarray(corners, float).reshape(-1, 2) + 0.5, len(quads)
 
 
-def _camera_tags(path: Path) -> tuple[int, str]:
-    """(EXIF orientation, maker and model) as the file has them."""
+def _camera_tags(path: Path) -> tuple[str, str]:
+    """(maker and model, orientation) as EXIF has them."""
     try:
         with open_lazily(path) as image:
             exif = image.getexif()
-            words = [str(exif.get(tag, "")).strip("\0 ") for tag in (_MAKE, _MODEL)]
-            return int(exif.get(_ORIENTATION, 1)), " ".join(word for word in words if word)
+            make, model, orientation = (str(exif.get(tag, "")).strip("\0 ") for tag in _STATE_TAGS)
+            return f"{make} {model}".strip(), orientation
     except Exception:  # the picture has been read; its tags are optional
-        return 1, ""
+        return "", ""
 
 
 def _other_state(state, common) -> str:
     """Describe the first difference of a photograph's camera state from the most common one."""
-    (size, (orientation, camera), focal), (most_size, (_, most_camera), _) = state, common
-    if size != most_size:
-        got, most_size_px = f"{size[0]} × {size[1]} px", f"{most_size[0]} × {most_size[1]}"
-        return f"{got} where most have {most_size_px}: hold the camera one way and keep its picture size"
-    if camera != most_camera:
-        return f"taken with another camera ({camera or 'unnamed'}): calibrate one camera at a time"
-    if orientation != common[1][0]:
-        return "the camera was held another way round: the picture's middle is elsewhere then"
-    return f"another focal length ({focal or 'unknown'} px): keep the zoom and the lens"
+    names = "a picture of {0[0]} × {0[1]} px", "a camera {0!r}", "an orientation {0!r}", "a focal length of {0} px"
+    name, own, most = next(each for each in zip(names, state, common, strict=True) if each[1] != each[2])
+    do = "keep one camera, its picture size, zoom and lens, and hold it one way"
+    return f"{name.format(own)} where most have {name.format(most)}: {do}"

@@ -115,7 +115,7 @@ def printer_of(name: str, predict: ColorMap, provenance: Mapping[str, Any]) -> P
     white = np.maximum(light[-1], 0.1)
     lut = srgb_from_linear(np.clip(light / white, 0, 1)).reshape(nodes.shape)
     gamut = color_difference(nodes.reshape(-1, 3), lut.reshape(-1, 3)).reshape(nodes.shape[:3])
-    return printer_from_table(name, "measured", lut, gamut, None, dict(provenance))
+    return printer_from_table(name, "measured", lut, gamut, dict(provenance))
 
 
 def combine_light(readings: Sequence[np.ndarray], robust: bool = True) -> np.ndarray:

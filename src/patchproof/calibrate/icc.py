@@ -22,7 +22,6 @@ from patchproof.base.input import read_file
 from patchproof.channel.printer import NODES_8BIT, Printer, node_colors, printer_from_table, printer_output
 
 MAX_PROFILE_BYTES = 32 * 2**20  # the largest printer profiles in use are a few MB
-_D50 = np.array([0.9642, 1.0, 0.8249])  # the profile connection space's white, ICC.1
 _CHECKED_COLORS = 10_000
 _INTENTS = {
     False: "relative colorimetric both ways, no black point compensation",
@@ -41,7 +40,7 @@ def bake(profile_path: Path, name: str, perceptual: bool = False) -> Printer:
         got = f"sRGB white printed as {white.tolist()}"
         raise Refused("a profile that leaves white paper bare", got, "use another one")
     gamut = ciede2000(lab_from_srgb(nodes / 255), lab_from_srgb(lut / 255))
-    printer = printer_from_table(name, "icc", lut / 255, gamut, _paper_white(profile), {})
+    printer = printer_from_table(name, "icc", lut / 255, gamut, {})
     printer.provenance.update(
         {
             "source": profile_path.name,
@@ -78,7 +77,6 @@ def _chain(data: bytes, file_name: str, perceptual: bool) -> tuple[Callable[[np.
         tags: Any = profile.profile
         kind, colors = tags.device_class.strip(), tags.xcolor_space.strip()
         _description(tags)  # reading tags shows damage
-        _paper_white(tags)
     except (OSError, ImageCms.PyCMSError, ValueError, TypeError, AttributeError) as error:
         got = f"{file_name} ({' '.join(str(error).split())[:100]})"
         raise Refused("an ICC profile that can be read", got, "use another one") from error
@@ -104,16 +102,6 @@ def _chain(data: bytes, file_name: str, perceptual: bool) -> tuple[Callable[[np.
 
 def _description(profile) -> str:
     return (profile.profile_description or "").strip()
-
-
-def _paper_white(profile) -> tuple[float, float, float] | None:
-    """CIELAB (D50) of the bare paper from the profile's media white point."""
-    if not profile.media_white_point:
-        return None
-    t = np.array(profile.media_white_point[0]) / _D50
-    f = np.where(t > (6 / 29) ** 3, np.cbrt(t), t / (3 * (6 / 29) ** 2) + 4 / 29)
-    lightness, a, b = (round(float(v), 2) + 0.0 for v in (116 * f[1] - 16, 500 * (f[0] - f[1]), 200 * (f[1] - f[2])))
-    return lightness, a, b
 
 
 def _table_error(printer: Printer, show: Callable[[np.ndarray], np.ndarray]) -> dict[str, float]:

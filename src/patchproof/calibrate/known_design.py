@@ -90,7 +90,7 @@ def calibrate_design(
     alone = {each: float(np.median(_errors(photos, np.zeros((INK_TERMS, 3))))) for each, photos in cells.items()}
     best = min(alone, key=lambda each: alone[each])
     photos, prior, count = cells[best], load_printer(best), len(set(numbers))
-    ink, terms = fit_ink_and_photos(photos, shared_is_ink=True)
+    ink, terms = fit_ink_and_photos(photos)
     errors, left_out = _errors(photos, ink), []
     for place in set(numbers) if count > 1 else ():
         others = [c for c, number in zip(photos, numbers, strict=True) if number != place]
@@ -152,7 +152,7 @@ def _read_cells(task: Task, path: Path, measured: MeasuredPhoto) -> Photographed
 
 
 def _ink(photos: Sequence[CellColors]) -> np.ndarray:
-    return fit_ink_and_photos(photos, shared_is_ink=True)[0]
+    return fit_ink_and_photos(photos)[0]
 
 
 def _errors(photos: Sequence[CellColors], ink: np.ndarray) -> list[float]:

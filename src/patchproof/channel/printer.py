@@ -107,11 +107,11 @@ def identity_printer() -> Printer:
 
 
 def printer_from_table(
-    name: str, method: Method, lut: np.ndarray, gamut: np.ndarray, white_lab, provenance: dict[str, Any]
+    name: str, method: Method, lut: np.ndarray, gamut: np.ndarray, provenance: dict[str, Any]
 ) -> Printer:
     """Return a printer of tables 33×33×33×3 (clipped to [0, 1]) and 33×33×33, with its own black."""
     lut = np.clip(np.asarray(lut, np.float64), 0, 1)
-    paper = Paper(white_lab=white_lab, black_L=round(float(lab_from_srgb(lut[0, 0, 0])[0]), 2))
+    paper = Paper(black_L=round(float(lab_from_srgb(lut[0, 0, 0])[0]), 2))
     distances = torch.tensor(np.asarray(gamut, np.float64), dtype=torch.float32)
     return Printer(name, method, torch.tensor(lut, dtype=torch.float32), distances, paper, provenance)
 

@@ -50,7 +50,7 @@ def fit_print(
     read = choose_photo_cells(photos, promised)
     if read is None:
         return None
-    ink, terms = fit_ink_and_photos(read, _ROUNDS, shared_is_ink=True)
+    ink, terms = fit_ink_and_photos(read, _ROUNDS)
     return ink, [ShownColors.of_terms(t) for t in terms]
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from patchproof.base.geometry import apply_homography
 from patchproof.photo import detect
-from patchproof.photo.detect import COARSEST_PX, Detections, Ids, ImageRegion, MarkersInView
+from patchproof.photo.detect import Detections, Ids, ImageRegion, MarkersInView
 from patchproof.photo.edges import Borders, sample
 from patchproof.photo.rectify import PageFit, Quads, fit_page, region_around
 from patchproof.photo.rejection import PhotoRejected
@@ -32,9 +32,7 @@ READABLE_PX = 28.0
 _LEAST_MARKERS = 3  # with less, flat paper cannot be told from bent
 
 
-def find_sheet(
-    srgb: np.ndarray, expected: Ids, corners_mm: Quads, dictionary: str = DICTIONARY, coarsest_px: int = COARSEST_PX
-) -> MarkersInView:
+def find_sheet(srgb: np.ndarray, expected: Ids, corners_mm: Quads, dictionary: str = DICTIONARY) -> MarkersInView:
     """Find the markers of `corners_mm` (page mm by id) in a uint8 photograph.
 
     The search ends when each of `expected` is found, out of the picture or covered, unless a finer level could decide
@@ -44,7 +42,7 @@ def find_sheet(
     detections: Detections = {}
     borders: dict[int, Borders] = {}
     region, view = detect.full_region(srgb), MarkersInView({}, (), ())
-    for level in detect.pyramid_levels(srgb, region, coarsest_px):
+    for level in detect.pyramid_levels(srgb, region):
         count, foreign = sum(map(len, detections.values())), view.foreign
         detect.search_level(srgb, region, level, aruco, detections)
         if sum(map(len, detections.values())) != count:

@@ -273,6 +273,14 @@ class Manifest(StrictModel):
             )
         return self
 
+    @property
+    def code(self) -> str:
+        """The text of the page's QR code: the sheet's id, and 16 digits of the design's SHA-256, or the kind without
+        one. A page of several designs has an id of its own, and digits of a hash over theirs.
+        """
+        content = self.design.sha256[:16] if self.design else self.kind
+        return self.page_code or f"patchproof:{self.sheet_id}:{content}"
+
     def page_from_design_page(self, page: int) -> np.ndarray:
         """Map 3×3 from millimeters of the design's page (without a design: the first tile's) to those of another
         tile's page; the identity for pages without a tile.
