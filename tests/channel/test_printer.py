@@ -154,10 +154,9 @@ def test_the_table_follows_the_exact_chain(name):
 
 @needs_data
 def test_baking_gives_the_shipped_bytes_twice(tmp_path):
-    source = load_printer("coated").provenance["source"]
     profile = Path(DATA) / "icc" / PROFILES["coated"]
     for folder in ("a", "b"):
-        printer_from_icc(profile, tmp_path / folder / "coated.npz", False, "CC0", source)
+        printer_from_icc(profile, tmp_path / folder / "coated.npz", False)
     for suffix in (".npz", ".json"):
         one, two = ((tmp_path / f / f"coated{suffix}").read_bytes() for f in "ab")
         assert one == two
@@ -168,7 +167,7 @@ def test_baking_gives_the_shipped_bytes_twice(tmp_path):
 
 def refused_profile(path, *words):
     with pytest.raises(Refused) as error:
-        icc.bake(path, "x", "CC0", "test")
+        icc.bake(path, "x")
     text = str(error.value)
     assert "\n" not in text and all(word in text for word in words), text
 

@@ -94,9 +94,11 @@ def calibrate_design(
     errors, left_out = _errors(photos, ink), []
     for place in set(numbers) if count > 1 else ():
         others = [c for c, number in zip(photos, numbers, strict=True) if number != place]
-        left_out += _errors([c for c, n in zip(photos, numbers, strict=True) if n == place], _ink(others))
+        own = [c for c, number in zip(photos, numbers, strict=True) if number == place]
+        left_out += _errors(own, fit_ink_and_photos(others)[0])
     veils = [_SHARED_VEIL * np.exp(c.start[3:6]) for c in photos]
-    veiled = _ink([replace(c, seen=(c.seen - v) / (1 - _SHARED_VEIL)) for c, v in zip(photos, veils, strict=True)])
+    less_veil = [replace(c, seen=(c.seen - v) / (1 - _SHARED_VEIL)) for c, v in zip(photos, veils, strict=True)]
+    veiled, _ = fit_ink_and_photos(less_veil)
     ends = linear_from_srgb(printer_output(prior, np.array([[0.0] * 3, [0.5] * 3])))
     black, gray = ciede2000(*(lab_from_linear(add_ink(ends, each)) for each in (ink, veiled)))
 
@@ -149,10 +151,6 @@ def _read_cells(task: Task, path: Path, measured: MeasuredPhoto) -> Photographed
     part, to_part = crop_around(srgb, px_from_mm, rect_corners(rect), 4)
     design = PhotographedDesign(*design_cells(part, to_part, rect, unmixed[1]), unmixed[0], anchored)
     return design if design.readable >= LEAST_CELLS else f"only {design.readable} of its cells can be read"
-
-
-def _ink(photos: Sequence[CellColors]) -> np.ndarray:
-    return fit_ink_and_photos(photos)[0]
 
 
 def _errors(photos: Sequence[CellColors], ink: np.ndarray) -> list[float]:

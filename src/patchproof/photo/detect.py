@@ -19,6 +19,7 @@ import numpy as np
 
 from patchproof.base.color import LINEAR_FROM_CODE, LUMINANCE
 from patchproof.base.input import remaining_seconds
+from patchproof.base.resample import downscale
 from patchproof.photo.edges import Borders, fit_borders
 from patchproof.photo.limits import count_squares
 from patchproof.photo.rectify import region_around
@@ -29,6 +30,7 @@ LINEAR_FLOAT32_FROM_CODE = LINEAR_FROM_CODE.astype(np.float32)
 COARSEST_PX = 1000  # longer side of the coarsest level at most
 UPSCALE_BELOW_PX = 4_000_000
 LARGEST_LEVEL_PX = 25_000_000  # searched in one level: a second of work and 0.3 GB; larger pictures are halved
+_MIRRORED_PX = 2000  # longer side of a picture that is flipped: most have no marker either way
 MOST_SQUARES = 2000  # photographs have some hundreds at most
 _SQUARE_S = 0.004  # to examine one, which cannot be interrupted
 DARK_CODE = 70  # median code value below which local contrast helps; in bright photos it hurts sharp markers
@@ -108,14 +110,8 @@ def fit_detections(
 
 def is_mirrored(srgb: np.ndarray, expected: Ids, dictionary: str = DICTIONARY) -> bool:
     """True if the flipped picture shows the sheet: selfie cameras and scans through the back mirror it."""
-    mirrored = np.ascontiguousarray(srgb[:, ::-1])
-    if not _is_large(srgb):
-        return bool(find_markers(mirrored, expected, frozenset(), dictionary).markers)
-    detections: Detections = {}
-    for level in pyramid_levels(mirrored, full_region(mirrored)):
-        if level.scale < 1:
-            search_level(mirrored, full_region(mirrored), level, aruco_dictionary(dictionary), detections)
-    return bool(fit_detections(mirrored, detections, expected, dictionary).markers)
+    mirrored = np.ascontiguousarray(downscale(srgb, _MIRRORED_PX)[:, ::-1])
+    return bool(find_markers(mirrored, expected, frozenset(), dictionary).markers)
 
 
 def _is_large(picture: np.ndarray) -> bool:

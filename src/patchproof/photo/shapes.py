@@ -15,7 +15,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from patchproof.base.geometry import apply_homography, plane_pose
-from patchproof.photo.rectify import CORNER_NOISE_PX, covariance_of, noise_and_bend
+from patchproof.photo.rectify import CORNER_NOISE_PX, covariance_of, homography_jacobian, noise_and_bend
 
 UNKNOWN_FOCAL = 0.5  # spread of the focal length's logarithm if no file states one
 _TYPICAL_FOCAL = 0.7  # of the picture's diagonal, between a phone's 26 mm (0.6) and 35 mm (0.8)
@@ -136,12 +136,9 @@ def _starts(flat, mm, px, camera, center, half_mm) -> list[tuple[float, float]]:
     x, y = from_center.T / half_mm
     form = [by_depth * (term * half_mm)[:, None] for term in (x * x, x * y, y * y)]
     flat_px = apply_homography(flat, mm)
-    residual = px - flat_px
-    u, v = ((flat_px - flat_px.mean(0)) / np.ptp(flat_px, axis=0).max()).T
-    ones, no = np.ones_like(u), np.zeros_like(u)
-    plane = [ones, u, v, no, no, no, u * u, u * v], [no, no, no, ones, u, v, u * v, v * v]  # changes of homography
-    columns = [np.column_stack([np.array(plane[i]).T, *[f[:, i] for f in form]]) for i in (0, 1)]
-    xx, xy, yy = np.linalg.lstsq(np.concatenate(columns), residual.T.ravel(), rcond=1e-6)[0][8:]
+    plane = homography_jacobian(np.eye(3), (flat_px - flat_px.mean(0)) / np.ptp(flat_px, axis=0).max())
+    columns = np.column_stack([plane, *(each.ravel() for each in form)])
+    xx, xy, yy = np.linalg.lstsq(columns, (px - flat_px).ravel(), rcond=1e-6)[0][8:]
     values, vectors = np.linalg.eigh([[xx, xy / 2], [xy / 2, yy]])
     order = np.argsort(-np.abs(values))
     starts = []

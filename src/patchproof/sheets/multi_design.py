@@ -12,7 +12,7 @@ import hashlib
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import chain
+from itertools import chain, islice
 from pathlib import Path
 
 from patchproof.base.errors import Refused
@@ -44,12 +44,16 @@ def write_several(
         raise Refused("designs of different runs", f"sheet {repeated[0][0]} twice", "use --copies to repeat a design")
     pieces = place_pieces(template, [design.piece for design in designs])
     identity = sheet_id({"sheets": [[design.sheet_id, design.kind] for design in designs]}, 0)
-    code = _page_code(identity, designs)
+    hashes = "".join(design_sha256(each.design_srgb8) for each in designs if each.design_srgb8 is not None)
+    code = f"patchproof:{identity}:{hashlib.sha256(hashes.encode()).hexdigest()[:16]}"
     labels = [piece_words(design, pieces[i][1], piece_name(i)) for i, design in enumerate(designs)]
     sizes = " and ".join(sorted({size_text(design.piece.size_mm) for design in designs}))
     fix = "Put each piece on its object as its own plan page shows"
     words = {"sheet_id": identity, "kind": f"{len(designs)} designs", "design": sizes, "piece": sizes, "fix": fix}
-    page = lay_out_parts(template, pieces, _page_ids(designs, template), code, words, labels)
+    used = {marker.id for design in designs for marker in design.piece.markers}
+    free = (i for i in hash_order(" ".join(design.sheet_id for design in designs), 1000) if i not in used)
+    page_ids = list(islice(free, len(template.marker.corners_mm))) if used else []
+    page = lay_out_parts(template, pieces, page_ids, code, words, labels)
     cuts = zip(designs, page.cuts_mm, strict=True)
     manifests = [_manifest(template, page, design, cut_mm).changed(page_code=code) for design, cut_mm in cuts]
     pages = [PdfPage(page, tuple(chain(*map(SheetContent.pictures, designs, page.cuts_mm))))]
@@ -60,20 +64,6 @@ def write_several(
     paths = manifest_paths(pdf_path, len(designs))
     save_sheets(pdf_path, pages, dict(zip(paths, manifests, strict=True)))
     return manifests
-
-
-def _page_ids(designs: Sequence[SheetContent], template: Template) -> list[int]:
-    """Ids for the page's own markers that no piece uses."""
-    if not (used := {marker.id for design in designs for marker in design.piece.markers}):
-        return []
-    order = hash_order(" ".join(design.sheet_id for design in designs), 1000)
-    return [i for i in order if i not in used][: len(template.marker.corners_mm)]
-
-
-def _page_code(identity: str, designs: Sequence[SheetContent]) -> str:
-    """The text of the page's QR code: its id, and 16 digits of a SHA-256 over those of its designs."""
-    hashes = [design_sha256(design.design_srgb8) for design in designs if design.design_srgb8 is not None]
-    return f"patchproof:{identity}:{hashlib.sha256(''.join(hashes).encode()).hexdigest()[:16]}"
 
 
 def _manifest(template: Template, page: PageLayout, design: SheetContent, cut_mm: RectMm) -> Manifest:
