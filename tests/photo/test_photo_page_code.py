@@ -19,11 +19,10 @@ from patchproof.photo.page_code import read_page_code
 from patchproof.photo.read import Photo
 from patchproof.sheets.blank import blank_sheet
 from patchproof.sheets.content import SheetContent
-from patchproof.sheets.multi_design import write_several
 from patchproof.sheets.pdf_raster import rasterize_page
 from patchproof.sheets.piece import lay_out_piece
 from patchproof.sheets.template import load_template
-from patchproof.sheets.write import write_sheet
+from patchproof.sheets.write import write_several, write_sheet
 
 DPI = 100
 

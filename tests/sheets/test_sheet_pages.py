@@ -25,7 +25,6 @@ from patchproof.sheets.blank import BOARD, board_sheet, chart_sheet
 from patchproof.sheets.content import SheetContent
 from patchproof.sheets.layout import Box, check_layout
 from patchproof.sheets.manifest import load_manifest
-from patchproof.sheets.multi_design import write_several
 from patchproof.sheets.page import largest_piece_mm, refuse_larger_than_page
 from patchproof.sheets.pdf_raster import attached_manifests, rasterize_page, rasterize_piece
 from patchproof.sheets.piece import lay_out_piece, marker_image
@@ -33,7 +32,7 @@ from patchproof.sheets.plan_page import PlanPage
 from patchproof.sheets.print_advice import sheet_advice
 from patchproof.sheets.template import load_template, template_data, template_names
 from patchproof.sheets.tiles import plan_tiles
-from patchproof.sheets.write import write_sheet
+from patchproof.sheets.write import write_several, write_sheet
 from test_benefit import promise_of
 from test_sheet_write import DPI, ID, PX_PER_MM, detect, sample_design
 

@@ -22,7 +22,7 @@ from patchproof.base.resample import index_homography
 from patchproof.base.settings import PrinterSettings
 from patchproof.channel.camera import develop
 from patchproof.channel.effects import Sensor
-from patchproof.channel.printer import Printer, load_printer
+from patchproof.channel.printer import Printer, load_printer, printer_output
 from patchproof.optimizer.run import Run
 from patchproof.photo.read import Photo
 from patchproof.reprints.mounted_sheet import DEFAULT_SETUP, PhotoTruth, ReprintSetup, sheet_scene
@@ -77,11 +77,6 @@ def reprint_pages(
     piece is photographed, since the rest is cut off: its markers would stand beside the later print's.
     """
     printer = load_printer(how.printer or PrinterSettings().profile)
-
-    def apply_printer(colors: np.ndarray) -> np.ndarray:
-        sent = torch.tensor(colors.T[None, :, :, None], dtype=torch.float32)
-        return linear_from_srgb(printer.apply(sent)[0, :, :, 0].T.numpy())
-
     with new_folder(out, ("photo_*.jpg",), overwrite, (pdf,)) as folder:
         pages, manifest = [], attached_manifests(pdf)[0]
         for number in range(page_count(pdf)):
@@ -89,7 +84,7 @@ def reprint_pages(
             if manifest.kind == BLANK:
                 x, y, width, height = (round(PX_PER_MM * side) for side in manifest.cut_mm)
                 pixels = pixels[y : y + height, x : x + width]
-            light = page_light(pixels, apply_printer)
+            light = page_light(pixels, lambda colors: linear_from_srgb(printer_output(printer, colors)))
             pages.append(cv2.resize(light, None, fx=how.print_scale[0], fy=how.print_scale[1]))
         for i in range(n):
             shot = photograph_page(pages[i % len(pages)], (seed or 0) + i)

@@ -39,7 +39,7 @@ def sheet(
         run: a run with a printed piece.
         pdf_path: SHEET.pdf; the manifest is SHEET.json, and all there is of a print without a page.
         template: a template's name or file, in place of the scene's.
-        control: print this in place of the design: "mean", "gray", "noise", "shuffled" or "blank".
+        control: print this in place of the design: "mean", "gray", "noise" or "blank".
         copies: pages with the same content, for label rolls.
         overwrite: replace an earlier page and manifest.
 

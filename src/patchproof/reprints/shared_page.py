@@ -6,8 +6,8 @@ from pathlib import Path
 from patchproof.optimizer.run import Run
 from patchproof.reprints.run_sheet import content_of, plan_of
 from patchproof.sheets.manifest import Manifest
-from patchproof.sheets.multi_design import write_several
 from patchproof.sheets.template import load_template
+from patchproof.sheets.write import write_several
 
 
 def sheet_of_several(

@@ -240,7 +240,7 @@ class Manifest(StrictModel):
 
     version: Literal[2]
     sheet_id: Annotated[str, Field(pattern="^[0-9A-Z]{10}$")]
-    kind: str  # "design", or a control: "mean", "gray", "noise", "shuffled", "blank"
+    kind: str  # "design", or a control: "mean", "gray", "noise", "blank"
     page_mm: tuple[SizeMm, SizeMm]
     design: Design | None
     markers: tuple[Marker, ...]  # none with sheet.markers = false

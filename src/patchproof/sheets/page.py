@@ -35,7 +35,7 @@ _BITS = 32  # of the integers in Sobol's sequence
 MIN_PRINT_MM, MAX_PRINT_MM = 5.0, 20_000.0  # of prints without a page: a sticker, a wall
 CUT_LINE_MM = 0.2  # drawn outside the cut, so that no ink of it stays on the piece
 PIECE_GAP_MM = 4.0  # of white paper between pieces, for scissors
-MAX_TILES = 30  # with 5 markers each, beside the piece's and the page's, out of the 166 ids of a kind
+MAX_TILES = 30  # with 5 markers each, beside the piece's and the page's, out of a kind's ids
 QR_QUIET_MODULES = 4  # white on each side of a QR code (ISO/IEC 18004)
 
 
@@ -85,10 +85,8 @@ def piece_zone_mm(template: Template) -> RectMm:
 
 
 def largest_piece_mm(template: Template) -> tuple[float, float]:
-    """The largest width and height of a piece on this template."""
+    """The largest width and height of a piece on one page of this template."""
     _, _, w, h = piece_zone_mm(template)
-    if template.tiles is not None:  # the largest number of tiles in one row or column; `tiles` counts exactly
-        _, _, w, h = (MAX_TILES * side for side in template.tiles.zone_mm)
     return w - 2 * CUT_LINE_MM, h - 2 * CUT_LINE_MM
 
 

@@ -23,7 +23,7 @@ from patchproof.app.cli.console import (
 from patchproof.base.compute import Compute
 from patchproof.base.progress import progress_bar
 
-PrintableControl = Literal["mean", "gray", "noise", "shuffled", "blank"]  # that can be printed
+PrintableControl = Literal["mean", "gray", "noise", "blank"]  # that can be printed
 PhotographedControl = Literal["bare", "mean", "gray", "noise"]  # that can hang on the object in place of the design
 
 
