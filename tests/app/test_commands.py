@@ -28,7 +28,7 @@ from patchproof.optimizer.promise import PromiseOptions
 from patchproof.optimizer.run import load_run
 from patchproof.optimizer.run import optimize as optimize_scene
 from patchproof.reprints.mounted_sheet import sheet_scene
-from patchproof.reprints.shared_page import sheet_of_several
+from patchproof.reprints.run_sheet import sheet_of_several
 from patchproof.scene.scene import load_scene
 from patchproof.sheets.manifest import load_manifest
 from patchproof.sheets.pdf_raster import page_count

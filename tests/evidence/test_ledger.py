@@ -18,7 +18,7 @@ from patchproof.classifier import Classifier
 from patchproof.evidence.classify import square_of
 from patchproof.evidence.gather import gather_evidence
 from patchproof.evidence.ledger import _ledger, shapley
-from patchproof.evidence.print_fit import LEAST_CELLS, PhotographedDesign, fit_print
+from patchproof.evidence.print_fit import LEAST_CELLS, PhotographedDesign, cell_means, fit_print
 from patchproof.evidence.reproject import (
     PhotoSquare,
     Reference,
@@ -31,7 +31,6 @@ from patchproof.evidence.reproject import (
 from patchproof.evidence.surface import PromisedColors, piece_picture, promised_of, surface_of
 from patchproof.evidence.task import Options
 from patchproof.photo.colorfit import invert_affine
-from patchproof.photo.design_cells import cell_means
 from patchproof.photo.pattern_light import pattern_light
 from patchproof.photo.quality import FrameLight
 from patchproof.report.plots import ledger_plot

@@ -33,12 +33,11 @@ from patchproof.evidence.batch import PhotoItem, measure_all
 from patchproof.evidence.camera import pinhole_photo
 from patchproof.evidence.corner_files import corners_of_photo
 from patchproof.evidence.measure import MeasuredPhoto
-from patchproof.evidence.print_fit import LEAST_CELLS, PhotographedDesign, choose_photo_cells
+from patchproof.evidence.print_fit import LEAST_CELLS, PhotographedDesign, choose_photo_cells, design_cells
 from patchproof.evidence.ranges import promised_ranges
 from patchproof.evidence.reproject import unmix_markers
 from patchproof.evidence.surface import printed_colors
 from patchproof.evidence.task import Options, Task, task_of
-from patchproof.photo.design_cells import design_cells
 from patchproof.photo.read import read_photo
 from patchproof.photo.rectify import crop_around
 from patchproof.sheets.manifest import Manifest

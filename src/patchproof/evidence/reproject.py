@@ -23,10 +23,9 @@ from patchproof.base.resample import index_homography
 from patchproof.channel.print_colors import ShownColors, add_ink, lower_light
 from patchproof.evidence.appearance import fit_cells
 from patchproof.evidence.classify import BoxEdges, square_of
-from patchproof.evidence.print_fit import PhotographedDesign, fit_print
+from patchproof.evidence.print_fit import PhotographedDesign, design_cells, fit_print
 from patchproof.evidence.surface import PromisedColors, Surface
 from patchproof.photo.colorfit import ColorFit, invert_affine, white_black
-from patchproof.photo.design_cells import design_cells
 from patchproof.photo.detect import LINEAR_FLOAT32_FROM_CODE
 from patchproof.photo.pattern_light import pattern_light
 from patchproof.photo.quality import FrameLight

@@ -22,7 +22,7 @@ import numpy as np
 
 from patchproof.base.geometry import plane_pose, scaling_about, view_angles
 from patchproof.photo.rectify import PageFit, root_of, root_of_scaled
-from patchproof.photo.shapes import Project, Shape
+from patchproof.photo.unroll import Project, Shape
 
 # one σ of errors that are no noise of corners: of |r1| = |r2|, printers' errors of proportion; of both equations, of
 # angles in radians and of lengths, paper that is not quite flat or round, and lenses

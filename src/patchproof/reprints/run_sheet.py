@@ -5,6 +5,7 @@ The piece is the same on every template that has room for it, except for the ids
 template with `plan_page` says where the piece goes and how to photograph it. Pages without a run: see `sheets.blank`.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,8 +21,8 @@ from patchproof.sheets.manifest import Manifest
 from patchproof.sheets.piece import control_design, with_ids
 from patchproof.sheets.plan_page import PlacementPicture, PlanPage, edge_distances_mm
 from patchproof.sheets.rects import size_text
-from patchproof.sheets.template import Template, page_template
-from patchproof.sheets.write import write_sheet
+from patchproof.sheets.template import Template, load_template, page_template
+from patchproof.sheets.write import write_several, write_sheet
 
 
 def sheet(
@@ -54,6 +55,18 @@ def sheet(
     if control == "blank":
         content = replace(content, design_srgb8=None)
     return write_sheet(pdf_path, page, content, plan, copies)
+
+
+def sheet_of_several(
+    runs: Sequence[Run], pdf_path: str | Path, *, template: str | None = None, control: str | None = None
+) -> list[Manifest]:
+    """Write one page with the designs of several runs, and a manifest for each; on the first run's template unless
+    another is named.
+    """
+    name = template or runs[0].scene.settings.sheet.template
+    page, contents = load_template(name), [content_of(run, name, control, Path(pdf_path).parent) for run in runs]
+    plans = [plan_of(scene, page, content) for content, scene in contents] if page.plan_page else []
+    return write_several(pdf_path, page, [content for content, _ in contents], plans)
 
 
 def content_of(run: Run, template: str | None, control: str | None, folder: Path) -> tuple[SheetContent, PieceScene]:

@@ -31,14 +31,7 @@ from patchproof.sheets.piece import (
     square_marker,
 )
 from patchproof.sheets.rects import RectMm, rect_contains
-from patchproof.sheets.template import (
-    BoardGrid,
-    BoardTemplate,
-    Template,
-    load_template,
-    template_data,
-    template_names,
-)
+from patchproof.sheets.template import BoardGrid, BoardTemplate, Template, load_template, template_data, template_names
 from patchproof.sheets.write import write_page, write_sheet
 
 BLANK, CHART, BOARD = "blank", "chart", "board"

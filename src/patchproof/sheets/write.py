@@ -1,9 +1,9 @@
 """Write SHEET.pdf and SHEET.json: both complete, or neither.
 
 In: a piece with its design and promise, or several, and a template. Out: files with the same stem; a manifest is also
-attached to the PDF, with the same bytes. All are first written beside their places and then moved there, so that a
-full disk or a crash leaves the old files. A page of several designs has SHEET_1.json, SHEET_2.json... in their order, an
-id of its own and one QR code for all designs, since a code that lists three or more is too fine to be read at 150 dpi.
+attached to the PDF, with the same bytes. All are first written beside their places and then moved there, so that a full
+disk or a crash leaves the old files. A page of several designs has SHEET_1.json, SHEET_2.json... in their order, an id
+of its own and one QR code for all designs, since a code that lists three or more is too fine to be read at 150 dpi.
 Pieces keep the marker ids with which they were promised. These are 1000 ids ordered by hash, so two sheets may share
 one; the page's own markers avoid all of them. A design's manifest lists the other designs' markers with those of the
 page if their id is unique on it, so that a photograph of the uncut page can be recognized.

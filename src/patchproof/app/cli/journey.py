@@ -149,7 +149,7 @@ def sheet(
     else:
         from patchproof.optimizer.run import load_run
         from patchproof.reprints.run_sheet import sheet as sheet_of
-        from patchproof.reprints.shared_page import sheet_of_several
+        from patchproof.reprints.run_sheet import sheet_of_several
 
         first, *others = loaded = [load_run(folder, trust) for folder in runs]
         if others:
