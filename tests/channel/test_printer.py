@@ -16,7 +16,6 @@ from patchproof.base.output import write_files_atomically
 from patchproof.base.packaged import packaged_path
 from patchproof.base.settings import PrinterSettings
 from patchproof.calibrate import icc
-from patchproof.calibrate.printer import printer_from_icc
 from patchproof.channel.printer import (
     NODES_8BIT,
     Printer,
@@ -156,7 +155,7 @@ def test_the_table_follows_the_exact_chain(name):
 def test_baking_gives_the_shipped_bytes_twice(tmp_path):
     profile = Path(DATA) / "icc" / PROFILES["coated"]
     for folder in ("a", "b"):
-        printer_from_icc(profile, tmp_path / folder / "coated.npz", False)
+        write_files_atomically(printer_contents(icc.bake(profile, "coated"), tmp_path / folder / "coated.npz"))
     for suffix in (".npz", ".json"):
         one, two = ((tmp_path / f / f"coated{suffix}").read_bytes() for f in "ab")
         assert one == two

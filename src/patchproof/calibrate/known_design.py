@@ -19,7 +19,7 @@ from patchproof.base.geometry import rect_corners
 from patchproof.base.progress import Advance
 from patchproof.base.text import printable
 from patchproof.base.workers import open_workers
-from patchproof.calibrate.chart import printer_of
+from patchproof.calibrate.chart import PRIORS, printer_of
 from patchproof.channel.print_colors import (
     INK_TERMS,
     CellColors,
@@ -43,6 +43,7 @@ from patchproof.photo.rectify import crop_around
 from patchproof.sheets.manifest import Manifest
 from patchproof.sheets.markers import MARKER_MODULES
 
+KNOWN_PRINTERS = ("office", *PRIORS)
 COVERED_DELTA_E00, UNTOUCHED_DELTA_E00 = 10.0, 15.0  # from a seen color; between them the ink fades
 _SHARED_VEIL = 0.03  # assumed to be in every place, for a figure
 _LEAST_MODULE_PX = 1.75  # of markers: of paper beside 1.4 px, ink took a third of the light
