@@ -11,8 +11,14 @@ import pytest
 from PIL import Image
 
 from patchproof.base.errors import Refused
-from patchproof.calibrate.boards import BoardView, corner_positions_mm, find_boards
-from patchproof.calibrate.camera import calibrate_camera, calibration_lines, fit_camera
+from patchproof.calibrate.camera import (
+    BoardView,
+    calibrate_camera,
+    calibration_lines,
+    corner_positions_mm,
+    find_boards,
+    fit_camera,
+)
 from patchproof.calibrate.ladder import compare_rungs, simplest_rung
 from patchproof.channel.lens import load_camera
 from patchproof.sheets.blank import board_sheet, load_board

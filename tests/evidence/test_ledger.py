@@ -31,8 +31,7 @@ from patchproof.evidence.reproject import (
 from patchproof.evidence.surface import PromisedColors, piece_picture, promised_of, surface_of
 from patchproof.evidence.task import Options
 from patchproof.photo.colorfit import invert_affine
-from patchproof.photo.pattern_light import pattern_light
-from patchproof.photo.quality import FrameLight
+from patchproof.photo.quality import FrameLight, pattern_light
 from patchproof.report.plots import ledger_plot
 from patchproof.sheets.manifest import Manifest
 from test_verify_run import measured

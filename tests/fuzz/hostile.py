@@ -377,7 +377,7 @@ def photo_pictures(place: Place, number: int) -> Use:
 
 
 def calibrated_photos(place: Place, number: int) -> Use:
-    from patchproof.calibrate.boards import find_boards
+    from patchproof.calibrate.camera import find_boards
     from patchproof.photo.read import list_photos
     from patchproof.sheets.blank import load_board
 
@@ -979,7 +979,7 @@ def prepared() -> None:
         "patchproof.app.verify patchproof.app.capture.serve patchproof.optimizer.evaluate patchproof.reprints.run_sheet"
     )
     late += " patchproof.optimizer.imported_design patchlab.harden.harden_study patchlab.paper.image_classes"
-    late += " patchproof.calibrate.boards patchproof.scene.image_scene patchproof.scene.photo_scene matplotlib.pyplot"
+    late += " patchproof.calibrate.camera patchproof.scene.image_scene patchproof.scene.photo_scene matplotlib.pyplot"
     late += " matplotlib.backends.backend_agg jinja2 pikepdf pypdfium2 scipy.spatial"
     late += " patchproof.mesh.gltf patchproof.mesh.obj patchproof.mesh.ply patchproof.mesh.load_mesh"
     for module in late.split():

@@ -19,8 +19,8 @@ from PIL import Image
 from patchproof.base import input as bounds
 from patchproof.base.errors import Refused
 from patchproof.base.input import limit_memory
-from patchproof.calibrate import boards
-from patchproof.calibrate.boards import BoardView, find_boards, find_corners
+from patchproof.calibrate import camera as boards
+from patchproof.calibrate.camera import BoardView, find_boards, find_corners
 from patchproof.evidence.batch import PhotoItem, _measure_or_reject
 from patchproof.evidence.camera import pinhole_photo
 from patchproof.evidence.measure import measure

@@ -18,7 +18,6 @@ import numpy as np
 
 from patchproof.base.errors import Refused
 from patchproof.base.progress import Advance, no_advance
-from patchproof.calibrate.boards import BoardView
 from patchproof.calibrate.ladder import Rung, compare_rungs, simplest_rung
 
 FOLDS = 5
@@ -33,6 +32,21 @@ RUNGS = {
     "k1 k2 p1 p2 k3": (0, 9),
 }
 _STOP = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 60, 1e-10)
+
+
+@dataclass(frozen=True)
+class BoardView:
+    """One photograph's corners: `ids` N on the board, `board_mm` N×2 as printed, `px` N×2 of `size_px` (w, h)."""
+
+    file: str
+    ids: np.ndarray
+    board_mm: np.ndarray
+    px: np.ndarray
+    size_px: tuple[int, int]
+
+    def select(self, keep: np.ndarray) -> "BoardView":
+        """A copy with the corners in the mask `keep` only."""
+        return replace(self, ids=self.ids[keep], board_mm=self.board_mm[keep], px=self.px[keep])
 
 
 @dataclass(frozen=True)

@@ -27,8 +27,7 @@ from patchproof.evidence.print_fit import PhotographedDesign, design_cells, fit_
 from patchproof.evidence.surface import PromisedColors, Surface
 from patchproof.photo.colorfit import ColorFit, invert_affine, white_black
 from patchproof.photo.detect import LINEAR_FLOAT32_FROM_CODE
-from patchproof.photo.pattern_light import pattern_light
-from patchproof.photo.quality import FrameLight
+from patchproof.photo.quality import FrameLight, pattern_light
 from patchproof.photo.rectify import region_around
 from patchproof.sheets.manifest import Rect
 
