@@ -21,9 +21,9 @@ import numpy as np
 from pydantic import Field
 
 from patchproof.base.errors import Refused
-from patchproof.base.input import is_file, read_json
-from patchproof.base.packaged import packaged_path
-from patchproof.base.validation import Finite, Positive, StrictModel, spelling_hint, validate_model
+from patchproof.base.input import read_json
+from patchproof.base.packaged import named_path, packaged_path
+from patchproof.base.validation import Finite, Positive, StrictModel, validate_model
 from patchproof.channel.cameras import Frame
 
 if TYPE_CHECKING:
@@ -110,7 +110,7 @@ class Camera(StrictModel):
 
 def load_camera(name_or_file: str | Path, base: Path | None = None, photo_px: tuple[int, int] | None = None) -> Camera:
     """Load a shipped camera by name, or a JSON file relative to `base`; refused if it cannot have taken `photo_px`."""
-    path = _path(name_or_file, base)
+    path = named_path(name_or_file, base, "a camera", packaged_path("calibration", "cameras"), (".json",))
     camera = validate_model(Camera, read_json(path, "a camera file (JSON)", "calibrate again"), str(path))
     check_camera(camera, str(path))
     width, height = camera.image_px
@@ -177,19 +177,6 @@ def _edge_px(size_px: tuple[int, int]) -> np.ndarray:
     x, y = np.arange(width) + 0.5, np.arange(height) + 0.5
     sides = [(x, 0.5), (x, height - 0.5), (0.5, y), (width - 0.5, y)]
     return np.concatenate([np.stack(np.broadcast_arrays(*side), 1) for side in sides])
-
-
-def _path(name_or_file: str | Path, base: Path | None) -> Path:
-    path = Path(name_or_file)
-    if path.suffix.lower() == ".json" or len(path.parts) > 1:
-        path = (base or Path()) / path
-        if not is_file(path):
-            raise Refused("a camera file (JSON)", f"no file at {path}", "check the path")
-        return path
-    shipped = sorted(file.stem for file in packaged_path("calibration", "cameras").glob("*.json"))
-    if (name := str(name_or_file)) not in shipped:
-        raise Refused("a camera's name or file", f'"{name_or_file}"', spelling_hint(name, shipped))
-    return packaged_path("calibration", "cameras", f"{name}.json")
 
 
 def _refuse_irreversible(camera: Camera, where: str) -> None:

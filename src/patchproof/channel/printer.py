@@ -28,9 +28,9 @@ from torch import Tensor
 from patchproof.base.color import LUMINANCE, clamp_to_unit, lab_from_srgb
 from patchproof.base.errors import Refused
 from patchproof.base.input import read_file, read_json
-from patchproof.base.packaged import packaged_path
+from patchproof.base.packaged import named_path, packaged_path
 from patchproof.base.text import short_repr
-from patchproof.base.validation import Finite, StrictModel, spelling_hint, validate_model
+from patchproof.base.validation import Finite, StrictModel, validate_model
 from patchproof.channel.effects import Print
 
 # 8-bit values that exist, so that a table baked by an 8-bit engine is exact at its nodes: 0, 8, ..., 248, 255
@@ -146,20 +146,11 @@ def load_printer(name_or_file: str, base: Path | None = None) -> Printer:
     """Load a shipped printer by name, `identity`, or NAME.npz or NAME.json relative to `base`; else it is refused."""
     if name_or_file == "identity":
         return identity_printer()
-    suffix = Path(name_or_file).suffix.lower()
-    if suffix in {".icc", ".icm"}:
+    if Path(name_or_file).suffix.lower() in {".icc", ".icm"}:
         remedy = "bake the profile into one with patchproof calibrate printer"
         raise Refused("a printer model (.npz)", f"the ICC profile {name_or_file}", remedy)
-    if suffix in {".npz", ".json"} or len(Path(name_or_file).parts) > 1:
-        return _read((base or Path()) / name_or_file)
-    shipped = sorted(path.stem for path in packaged_path("calibration", "printers").glob("*.npz"))
-    if name_or_file not in shipped:
-        hint = spelling_hint(name_or_file, [*shipped, "identity"])
-        raise Refused("a printer's name or file", f'"{name_or_file}"', hint)
-    return _read(packaged_path("calibration", "printers", f"{name_or_file}.npz"))
-
-
-def _read(path: Path) -> Printer:
+    folder = packaged_path("calibration", "printers")
+    path = named_path(name_or_file, base, "a printer", folder, (".npz", ".json"), ("identity",))
     return printer_of_files(*printer_files(path), path)
 
 
