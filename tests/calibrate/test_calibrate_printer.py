@@ -276,7 +276,7 @@ def test_a_printer_is_calibrated_stored_and_loaded(shots, tmp_path, capsys):
     assert ended.value.code == 0 and "chosen" in told.out and "appearance" in told.out and "bad.jpg" in told.err
     mine = load_printer(str(tmp_path / "mine.npz"))
     assert mine.method == "measured" and mine.provenance["chosen"] == "spline"
-    assert [row["rung"] for row in mine.provenance["ladder"]] == [rung.name for rung in map_kinds({"x": None})]
+    assert [row["name"] for row in mine.provenance["ladder"]] == [rung.name for rung in map_kinds({"x": None})]
     assert len(mine.provenance["photographs"]) == 2 and "this camera" in mine.provenance["model_of"]
     assert mine.provenance["delta_e00_of_prints"] is None and "how prints differ is not measured" in told.out
     np.testing.assert_allclose(mine.lut[-1, -1, -1], 1, atol=1e-6)

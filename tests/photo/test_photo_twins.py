@@ -11,12 +11,13 @@ from synthetic_photos import PIECE_IDS, make_manifest, page_raster, photograph, 
 from patchproof.channel.printer import identity_printer
 from patchproof.classifier import center_square
 from patchproof.evidence import appearance
+from patchproof.evidence import appearance as colorfit
 from patchproof.evidence.camera import pinhole_photo
 from patchproof.evidence.classify import squares_of
 from patchproof.evidence.measure import identify_sheet, measure
 from patchproof.evidence.ranges import promised_ranges
 from patchproof.evidence.surface import promised_of, surface_of
-from patchproof.photo import colorfit, detect, edges, known_page, second_print
+from patchproof.photo import detect, edges, known_page, second_print
 from patchproof.photo.detect import LINEAR_FLOAT32_FROM_CODE, find_markers, fit_marker_borders, luminance
 from patchproof.photo.edges import fit_borders
 from patchproof.photo.known_page import find_sheet

@@ -10,7 +10,7 @@ it was photographed in.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -80,7 +80,8 @@ def calibrate_chart(
         "sheet_id": manifest.sheet_id,
         "relative_to": "paper: sRGB white is seen as bare paper",
         "chosen": choice.chosen.name,
-        "ladder": ladder_table(choice),
+        "ladder": [asdict(rung) for rung in choice.rungs],
+        "not_tried": list(choice.left_out),
         "swatches": {"colors": choice.colors, "held_out": choice.held_out, "unreadable": int((~usable).sum())},
         "delta_e00_of_duplicates": _duplicates(sent[usable], light[usable]),
         "delta_e00_of_prints": between if count > 1 else None,
@@ -134,28 +135,16 @@ def _difference(light: np.ndarray, mean: np.ndarray) -> float | None:
     return round(float(color_difference(*pair).mean()), 2) if readable.any() else None
 
 
-def ladder_table(choice: MapChoice) -> list[dict[str, Any]]:
-    """Each rung's figures as stored; rungs that had too few colors have a reason instead."""
-    figures = {"delta_e00": "error", "worse_by": "worse_by", "standard_error": "standard_error"}
-    rows: list[dict[str, Any]] = [
-        {"rung": rung.name} | {key: round(getattr(rung, name), 3) for key, name in figures.items()}
-        for rung in choice.rungs
-    ]
-    reason = "swatches too few or too much alike"
-    return rows + [{"rung": name, "delta_e00": None, "reason": reason} for name in choice.left_out]
-
-
 def summary_lines(calibration: PrinterCalibration) -> list[str]:
     """The choice with every rung's figure, for the terminal."""
     choice, provenance = calibration.choice, calibration.printer.provenance
     lines = [f"{provenance['source']}; {provenance['model_of']}"]
     chosen = "  <- chosen: the simplest within one standard error of the best"
-    for row in provenance["ladder"]:
-        mark = chosen if row["rung"] == choice.chosen.name else ""
-        figure = row.get("reason")
-        if figure is None:
-            figure = f"ΔE00 {row['delta_e00']:5.2f}  (+{row['worse_by']:.2f} ± {row['standard_error']:.2f})"
-        lines.append(f"  {row['rung']:20s} {figure}{mark}")
+    for rung in choice.rungs:
+        difference = f"(+{rung.worse_by:.2f} ± {rung.standard_error:.2f}){chosen * (rung == choice.chosen)}"
+        lines.append(f"  {rung.name:20s} ΔE00 {rung.error:5.2f}  {difference}")
+    if choice.left_out:
+        lines.append(f"not tried, since swatches are too few or too much alike: {', '.join(choice.left_out)}")
     lines.append(f"held out: {choice.held_out} of {choice.colors} colors in turn")
     differ = f"prints differ from their mean by ΔE00 {provenance['delta_e00_of_prints']}"
     lines.append(differ if provenance["delta_e00_of_prints"] else "how prints differ is not measured: there is one")
