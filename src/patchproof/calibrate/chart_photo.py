@@ -22,6 +22,7 @@ from patchproof.photo.read import Photo
 from patchproof.photo.rectify import fit_page
 from patchproof.photo.rejection import PhotoRejected
 from patchproof.sheets.manifest import Manifest
+from patchproof.sheets.piece import marker_rect
 from patchproof.sheets.rects import RectMm, rect_contains
 
 MIN_CORE_PX = 4.0  # a swatch's side between blurred borders
@@ -66,14 +67,13 @@ def _find_page(srgb: np.ndarray, manifest: Manifest) -> tuple[np.ndarray, float]
     homography from millimeters to pixels, and the blur in pixels.
     """
     dictionary = manifest.markers[0].dictionary
-    on_page = [marker for marker in manifest.markers if marker.page == manifest.chart[0].page]
-    corners_mm = {marker.id: np.array(marker.corners_mm) for marker in on_page}
+    on_page = {marker.id: marker for marker in manifest.markers if marker.page == manifest.chart[0].page}
+    corners_mm = {i: np.array(marker.corners_mm) for i, marker in on_page.items()}
     detected = find_sheet(srgb, corners_mm.keys(), corners_mm, dictionary)
     corners_px = detected.corners_px
     if not corners_px:
         raise _no_sheet(srgb, detected, corners_mm.keys(), dictionary)
-    is_beside = {i: not rect_contains(manifest.cut_mm, _bounding_rect(corners_mm[i])) for i in corners_px}
-    beside = {i: px for i, px in corners_px.items() if is_beside[i]}
+    beside = {i: px for i, px in corners_px.items() if not rect_contains(manifest.cut_mm, marker_rect(on_page[i]))}
     fit = fit_page(corners_px, corners_mm)
     if len(beside) > 1 and not set(beside) <= set(fit.inlier_ids):
         fit = fit_page(beside, corners_mm)
@@ -108,7 +108,7 @@ def _paper_at(points_mm, srgb: np.ndarray, manifest: Manifest, px_from_mm: np.nd
     low = np.maximum(rects[:, :2].min(0) - _SEARCH_MM, 0)
     high = np.minimum((rects[:, :2] + rects[:, 2:]).max(0) + _SEARCH_MM, manifest.page_mm)
     printed = [swatch.rect_mm for swatch in manifest.chart if min(swatch.srgb) < 1]
-    printed += [_bounding_rect(m.corners_mm) for m in manifest.markers if m.page == manifest.chart[0].page]
+    printed += [marker_rect(m) for m in manifest.markers if m.page == manifest.chart[0].page]
     if any(not rect_contains(manifest.cut_mm, swatch.rect_mm) for swatch in manifest.chart):
         printed.append(manifest.cut_mm)
     area = (*low.tolist(), *(high - low).tolist())
@@ -128,8 +128,3 @@ def _codes(srgb: np.ndarray, px_from_mm: np.ndarray, rect: RectMm) -> np.ndarray
     px = np.floor(apply_homography(px_from_mm, rect[:2] + np.multiply(rect[2:], step))).astype(int)
     column, line = np.clip(px, 0, [srgb.shape[1] - 1, srgb.shape[0] - 1]).T
     return srgb[line, column]
-
-
-def _bounding_rect(corners) -> RectMm:
-    (x0, y0), (x1, y1) = np.min(corners, 0), np.max(corners, 0)
-    return x0, y0, x1 - x0, y1 - y0

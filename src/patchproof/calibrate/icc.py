@@ -44,7 +44,7 @@ def bake(profile_path: Path, name: str, perceptual: bool = False) -> Printer:
     printer.provenance.update(
         {
             "source": profile_path.name,
-            "profile": _description(profile),
+            "profile": (profile.profile_description or "").strip(),
             "profile_sha256": hashlib.sha256(data).hexdigest(),
             "profile_colors": profile.xcolor_space.strip(),
             "intents": _INTENTS[perceptual],
@@ -76,7 +76,7 @@ def _chain(data: bytes, file_name: str, perceptual: bool) -> tuple[Callable[[np.
         profile = ImageCms.ImageCmsProfile(io.BytesIO(data))
         tags: Any = profile.profile
         kind, colors = tags.device_class.strip(), tags.xcolor_space.strip()
-        _description(tags)  # reading tags shows damage
+        _ = tags.profile_description  # reading tags shows damage
     except (OSError, ImageCms.PyCMSError, ValueError, TypeError, AttributeError) as error:
         got = f"{file_name} ({' '.join(str(error).split())[:100]})"
         raise Refused("an ICC profile that can be read", got, "use another one") from error
@@ -98,10 +98,6 @@ def _chain(data: bytes, file_name: str, perceptual: bool) -> tuple[Callable[[np.
         return np.asarray(ImageCms.applyTransform(image, chain)).reshape(srgb_8bit.shape)
 
     return show, tags
-
-
-def _description(profile) -> str:
-    return (profile.profile_description or "").strip()
 
 
 def _table_error(printer: Printer, show: Callable[[np.ndarray], np.ndarray]) -> dict[str, float]:

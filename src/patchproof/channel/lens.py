@@ -122,13 +122,22 @@ def load_camera(name_or_file: str | Path, base: Path | None = None, photo_px: tu
 
 
 def check_camera(camera: Camera, where: str) -> None:
-    """Refuse a principal point outside the picture, and irreversible distortion."""
+    """Refuse a principal point outside the picture, and distortion that cannot be undone. Where undistorting closes,
+    neighbors keep their order and stay within twice their distance, so that no direction is seen twice.
+    """
     width, height = camera.image_px
     if not (0 < camera.cx < width and 0 < camera.cy < height):
         expected = f"a principal point inside the picture of {width} × {height} px in {where}"
         got = f"({camera.cx:g}, {camera.cy:g})"
         raise Refused(expected, got, "give cx, cy and image_px in the same pixels")
-    _refuse_irreversible(camera, where)
+    x, y = np.meshgrid(*(np.linspace(0.5, side - 0.5, 65) for side in camera.image_px))
+    points = _to_unit(camera.matrix_px(camera.image_px), np.stack([x.ravel(), y.ravel()], 1))
+    with np.errstate(over="ignore", invalid="ignore"):
+        error_px = np.abs((_distort(camera, _undistort(camera, points)) - points) * [camera.fx, camera.fy]).max()
+    if not error_px < _MAX_ERROR_PX:  # true also for NaN
+        got = f"k1 k2 k3 = {camera.k1:g} {camera.k2:g} {camera.k3:g}, p1 p2 = {camera.p1:g} {camera.p2:g}"
+        remedy = "calibrate again with the board in the picture's corners, or with fewer terms"
+        raise Refused(f"distortion that can be undone in the whole picture in {where}", got, remedy)
 
 
 @lru_cache(maxsize=4)
@@ -177,17 +186,3 @@ def _edge_px(size_px: tuple[int, int]) -> np.ndarray:
     x, y = np.arange(width) + 0.5, np.arange(height) + 0.5
     sides = [(x, 0.5), (x, height - 0.5), (0.5, y), (width - 0.5, y)]
     return np.concatenate([np.stack(np.broadcast_arrays(*side), 1) for side in sides])
-
-
-def _refuse_irreversible(camera: Camera, where: str) -> None:
-    """Refuse distortion that cannot be undone. Where undistorting closes, neighbors keep their order and stay within
-    twice their distance, so that no direction is seen twice.
-    """
-    x, y = np.meshgrid(*(np.linspace(0.5, side - 0.5, 65) for side in camera.image_px))
-    points = _to_unit(camera.matrix_px(camera.image_px), np.stack([x.ravel(), y.ravel()], 1))
-    with np.errstate(over="ignore", invalid="ignore"):
-        error_px = np.abs((_distort(camera, _undistort(camera, points)) - points) * [camera.fx, camera.fy]).max()
-    if not error_px < _MAX_ERROR_PX:  # true also for NaN
-        got = f"k1 k2 k3 = {camera.k1:g} {camera.k2:g} {camera.k3:g}, p1 p2 = {camera.p1:g} {camera.p2:g}"
-        remedy = "calibrate again with the board in the picture's corners, or with fewer terms"
-        raise Refused(f"distortion that can be undone in the whole picture in {where}", got, remedy)

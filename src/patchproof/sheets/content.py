@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from patchproof.base.errors import Refused
 from patchproof.base.output import image_bytes
 from patchproof.sheets.layout import CAP_HEIGHT, Box, Line, PageLayout, PageParts, text_width_mm
 from patchproof.sheets.manifest import Design, Manifest, Promise, Swatch, design_sha256
@@ -29,8 +28,8 @@ _ARROW_MM = 0.9  # width of the arrow and the space after it
 
 @dataclass(frozen=True, eq=False)
 class SheetContent:
-    """A piece and its design. `design_srgb8` is uint8 H×W×3, or None for white paper; other arrays are refused, and
-    pixels that belong to the markers become white. `kind` is "design", or the name of a control.
+    """A piece and its design. `design_srgb8` is uint8 H×W×3, or None for white paper; pixels that belong to the
+    markers become white. `kind` is "design", or the name of a control.
     """
 
     piece: Piece
@@ -42,12 +41,8 @@ class SheetContent:
     bent: bool = False  # it is wrapped around the object
 
     def __post_init__(self):
-        pixels = self.design_srgb8
-        if pixels is None:
-            return
-        if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] != 3 or not pixels.size:
-            raise Refused("a design of uint8 H×W×3 pixels", f"{pixels.dtype} {pixels.shape}", "convert it to 8-bit RGB")
-        object.__setattr__(self, "design_srgb8", whiten_marker_pixels(pixels, self.piece))
+        if self.design_srgb8 is not None:
+            object.__setattr__(self, "design_srgb8", whiten_marker_pixels(self.design_srgb8, self.piece))
 
     @property
     def code(self) -> str:

@@ -151,7 +151,6 @@ def add_template_parts(template: AnyTemplate, page: PageLayout, qr_text: str, wo
 
 def qr_rects_mm(text: str, corner_mm: PointMm, size_mm: float) -> tuple[RectMm, ...]:
     """The dark runs, from the top down, of a QR code with error correction M in a square of `size_mm`."""
-    import numpy as np
     import segno
 
     dark = np.array([list(row) for row in segno.make_qr(text, error="m").matrix], bool)

@@ -170,7 +170,7 @@ def manifest_marker(marker: PieceMarker, page: int = 1) -> Marker:
     return Marker(dictionary=DICTIONARY, id=marker.id, corners_mm=marker.corners_mm, page=page)
 
 
-def marker_rect(marker: PieceMarker) -> RectMm:
+def marker_rect(marker: PieceMarker | Marker) -> RectMm:
     """The marker's black square."""
     (x, y), (x1, _) = marker.corners_mm[:2]
     return x, y, x1 - x, x1 - x
@@ -179,7 +179,7 @@ def marker_rect(marker: PieceMarker) -> RectMm:
 def marker_rects_mm(marker: PieceMarker) -> list[RectMm]:
     """The marker's black area as rectangles that touch but do not overlap: one for each run of black modules."""
     x, y, side, _ = marker_rect(marker)
-    return black_runs(_marker_modules(marker.id), (x, y), side / MARKER_MODULES)
+    return black_runs(marker_cells(DICTIONARY, [marker.id])[0] == 0, (x, y), side / MARKER_MODULES)
 
 
 def black_runs(dark: np.ndarray, corner_mm: PointMm, module_mm: float) -> list[RectMm]:
@@ -251,12 +251,6 @@ def _noise_cells(height: int, width: int, sheet_id: str) -> np.ndarray:
     cells = np.frombuffer(data, np.uint8).reshape(rows, columns, 3)
     y, x = (np.arange(height) / cell).astype(int), (np.arange(width) / cell).astype(int)
     return cells[y[:, None], x]
-
-
-@lru_cache(maxsize=256)
-def _marker_modules(id_: int) -> np.ndarray:
-    """The marker's modules 7×7, True for black."""
-    return marker_cells(DICTIONARY, [id_])[0] == 0
 
 
 def _add_coverage(coverage: np.ndarray, box: tuple[float, float, float, float]) -> None:

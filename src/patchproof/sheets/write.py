@@ -76,8 +76,6 @@ def write_several(
     if template.tiles is not None:
         raise Refused("a template of one page for several designs", "one with tiles", "make a sheet of each")
     repeated = [key for key, count in Counter((d.sheet_id, d.kind) for d in designs).items() if count > 1]
-    if len(designs) < 2:
-        raise Refused("several designs", f"{len(designs)}", "use write_sheet for one")
     if repeated:
         raise Refused("designs of different runs", f"sheet {repeated[0][0]} twice", "use --copies to repeat a design")
     pieces = place_pieces(template, [design.piece for design in designs])
