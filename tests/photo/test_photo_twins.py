@@ -17,7 +17,7 @@ from patchproof.evidence.classify import squares_of
 from patchproof.evidence.measure import identify_sheet, measure
 from patchproof.evidence.ranges import promised_ranges
 from patchproof.evidence.surface import promised_of, surface_of
-from patchproof.photo import detect, edges, known_page, second_print
+from patchproof.photo import detect, edges, known_page
 from patchproof.photo.detect import LINEAR_FLOAT32_FROM_CODE, find_markers, fit_marker_borders, luminance
 from patchproof.photo.edges import fit_borders
 from patchproof.photo.known_page import find_sheet
@@ -229,6 +229,6 @@ def test_a_code_in_any_turn_has_the_id_that_opencv_finds():
     for cells in (np.ascontiguousarray(code, np.uint8) for code in (*codes, *rng.integers(0, 2, (40, 4, 4)))):
         is_read, marker_id, _ = aruco.identify(cells, 0.0)
         light = np.kron(np.pad(40 + 200 * cells, 1, constant_values=40), np.ones((8, 8))).astype(np.uint8)
-        seen = second_print._read(np.pad(light, 2, constant_values=240), [square], dictionary)
+        seen = known_page._read_codes(np.pad(light, 2, constant_values=240), [square], dictionary)
         assert seen == ({marker_id} if is_read else set())
     assert detect.marker_codes(aruco_dictionary("DICT_5X5_1000").bytesList.tobytes(), 5).shape == (25, 4000)
