@@ -33,7 +33,6 @@ from patchproof.sheets.manifest import Manifest
 PRIORS = ("coated", "uncoated")
 MIN_SWATCHES = 4  # paper, black and two others
 MAX_PHOTO_DELTA_E00 = 5.0  # from its print's other photographs: more than light or camera can explain
-APPEARANCE = "appearance: printer and camera tone together, as this camera shows the print"
 
 
 @dataclass(frozen=True)
@@ -76,14 +75,13 @@ def calibrate_chart(
     count, between = len(by_print), [_difference(each, light) for each in by_print.values()]
     provenance = {
         "source": f"{len(photographs)} photographs of {count} print{'s' * (count > 1)} of a chart",
-        "model_of": APPEARANCE,
+        "model_of": "appearance: printer and camera tone together, as this camera shows the print",
         "sheet_id": manifest.sheet_id,
         "relative_to": "paper: sRGB white is seen as bare paper",
         "chosen": choice.chosen.name,
         "ladder": [asdict(rung) for rung in choice.rungs],
         "not_tried": list(choice.left_out),
         "swatches": {"colors": choice.colors, "held_out": choice.held_out, "unreadable": int((~usable).sum())},
-        "delta_e00_of_duplicates": _duplicates(sent[usable], light[usable]),
         "delta_e00_of_prints": between if count > 1 else None,
         "photographs": photographs,
         "uncertainty": f"mean ΔE00 {choice.chosen.error:.2f} of {choice.held_out} held-out colors of the chart",
@@ -175,11 +173,3 @@ def _read_all(
         expected = "photographs in which the chart can be read"
         raise Refused(expected, f"none of {len(numbered)}", f"see the first: {first}")
     return readings, warnings + summarize_said(said)
-
-
-def _duplicates(sent: np.ndarray, light: np.ndarray) -> float | None:
-    """Mean ΔE00 between swatches of the same color at different places: the error of reading."""
-    colors, index = np.unique(sent, axis=0, return_inverse=True)
-    pairs = [np.flatnonzero(index.reshape(-1) == i)[:2] for i in range(len(colors))]
-    pairs = np.array([pair for pair in pairs if len(pair) == 2])
-    return _difference(light[pairs[:, 0]], light[pairs[:, 1]]) if len(pairs) else None

@@ -66,20 +66,16 @@ class ShownColors:
 
     def show(self, light: np.ndarray) -> np.ndarray:
         """Return the light `... × 3` that the photograph shows of a print's light."""
-        return lift_light(light @ self.matrix[:, :3].T + self.matrix[:, 3], self.tone)
+        shown = light @ self.matrix[:, :3].T + self.matrix[:, 3]
+        return linear_from_srgb(lift_tone(srgb_from_linear(shown), self.tone)) if self.tone else shown
 
     def undo(self, seen: np.ndarray) -> np.ndarray:
         """Return the print's light `... × 3` of light in the photograph."""
         return (lower_light(seen, self.tone) - self.matrix[:, 3]) @ np.linalg.inv(self.matrix[:, :3]).T
 
 
-def lift_light(light: np.ndarray, tone: float) -> np.ndarray:
-    """Return light after a photograph's tone."""
-    return linear_from_srgb(lift_tone(srgb_from_linear(light), tone)) if tone else light
-
-
 def lower_light(light: np.ndarray, tone: float) -> np.ndarray:
-    """Invert `lift_light`."""
+    """Return light before a photograph's tone."""
     codes, slope = srgb_from_linear(light), 1 + 4 * tone
     codes = 2 * codes / (slope + np.sqrt(np.maximum(slope**2 - 16 * tone * codes, 0)))
     return linear_from_srgb(codes) if tone else light

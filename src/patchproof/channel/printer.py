@@ -106,9 +106,7 @@ def identity_printer() -> Printer:
     return Printer("identity", "assumed", lut, torch.zeros(lut.shape[:3]), Paper(black_L=0.0), note)
 
 
-def printer_from_table(
-    name: str, method: Method, lut: np.ndarray, gamut: np.ndarray, provenance: dict[str, Any]
-) -> Printer:
+def printer_from_table(name: str, method: Method, lut: np.ndarray, gamut: np.ndarray, provenance: dict) -> Printer:
     """Return a printer of tables 33×33×33×3 (clipped to [0, 1]) and 33×33×33, with its own black."""
     lut = np.clip(np.asarray(lut, np.float64), 0, 1)
     paper = Paper(black_L=round(float(lab_from_srgb(lut[0, 0, 0])[0]), 2))
