@@ -11,7 +11,6 @@ from synthetic_photos import PIECE_IDS, make_manifest, page_raster, photograph, 
 from patchproof.channel.printer import identity_printer
 from patchproof.classifier import center_square
 from patchproof.evidence import appearance
-from patchproof.evidence import appearance
 from patchproof.evidence.camera import pinhole_photo
 from patchproof.evidence.classify import squares_of
 from patchproof.evidence.measure import identify_sheet, measure
