@@ -452,54 +452,29 @@ def test_looks_of_views_are_the_stored_ones():
     assert len(told) == 9 and f"| {' | '.join([f'**{value}**' for value in chosen] + off[chosen])} |" in page
 
 
-def test_figures_of_verdicts_are_the_stored_ones():
-    kept = {
-        (float(row["correlation"]), int(row["sessions"]), round(float(row["true rate"]), 2)): row
-        for row in rows_of("verdicts/verdicts_verdicts.csv")
+def test_figures_of_verdicts_are_those_of_the_chart():
+    good = {
+        (row[1], row[2]): f"{100 * row[3]:.0f} %"
+        for row in stored("charts/breaks.json")["tables"]["points"]["rows"]
+        if row[0] == "verdict"
     }
-    for correlation, sessions in {key[:2] for key in kept} - {key[:2] for key in kept if key[1] == 2}:
-        chances = [float(kept[correlation, sessions, rate]["kept"]) for rate in (0.85, 0.75, 0.7, 0.65)]
-        chances.append(float(kept[correlation, sessions, 0.65]["broken"]))
-        cells = " | ".join(f"{100 * chance:.0f} %" for chance in chances)
-        assert f"| {correlation:g} | {sessions} | {cells} |" in words(NOTEBOOK)
+    by_sessions = (good["sessions of 96 photographs", count] for count in (8, 4, 3))
+    assert "it in {} of 200 draws in 8 sessions, {} in 4 and {} in 3".format(*by_sessions) in words(NOTEBOOK)
+    below = (good["points under the promise", points] for points in (3, 6))
+    assert "3 points under the promise in {}, 6 points under it in {}".format(*below) in words(NOTEBOOK)
 
 
-def test_figures_of_smaller_pieces_are_the_stored_ones():
-    cells = rows_of("layouts/smaller_cells.csv")
-    for scene, name in (("postbox_025", "letter box"), ("light_025", "traffic light"), ("suv_025", "SUV")):
-        rates = [
-            100 * np.mean([float(row["design"]) for row in cells if (row["scene"], row["layout"]) == (scene, size)])
-            for size in ("85 mm", "100 mm", "115 mm", "130 mm")
-        ]
-        said = " | ".join(f"{rate:.0f}" for rate in rates)
-        assert any(line.startswith(f"| {name} |") and said in line for line in NOTEBOOK.read_text("utf-8").splitlines())
-
-
-def test_figures_of_layouts_are_the_stored_ones():
-    with (NOTEBOOK.parent / "layouts" / "layouts_layouts.csv").open(encoding="utf-8") as file:
-        whole, framed = csv.DictReader(file)
-
-    def points(row: dict[str, str], key: str, ends=("", "_low", "_high"), sign: float = 100) -> list[str]:
-        return [f"{sign * float(row[key + end]):.1f}" for end in ends]
-
-    gains = [points(row, "gain over the best control") for row in (whole, framed)]
-    texts = [f"+{value} points [{low}, {high}]" for value, low, high in gains]
-    assert f"{texts[0]} in place of {texts[1].replace(' points', '')}" in words(NOTEBOOK)
-    value, high, low = points(framed, "beside the first layout", sign=-100)
-    assert f"{value} more [{low}, {high}] over 18 designs" in words(NOTEBOOK)
-    measured = [points(row, "measured") for row in (whole, framed)]
-    (a, a_low, a_high), (b, b_low, b_high) = measured
-    assert f"{a} % [{a_low}, {a_high}] were measured ({b} % [{b_low}, {b_high}])" in words(NOTEBOOK)
-    with (NOTEBOOK.parent / "layouts" / "layouts_cells.csv").open(encoding="utf-8") as file:
-        cells = [row for row in csv.DictReader(file) if row["scene"] == "postbox_025"]
-    rates = {
-        layout: 100 * np.mean([float(row["design"]) for row in cells if row["layout"] == layout])
-        for layout in ("whole", "framed, step 0.05")
+def test_gains_of_the_readme_are_those_of_the_chart():
+    tables = stored("charts/speed.json")["tables"]
+    gains = {
+        name: "{:.1f}".format(100 * gain["value"]) + " [{:.1f}, {:.1f}]".format(100 * gain["low"], 100 * gain["high"])
+        for name, _, gain, _ in tables["methods"]["rows"]
     }
-    row = next(
-        line for line in NOTEBOOK.read_text(encoding="utf-8").splitlines() if "letter box, MobileNet v1 0.25" in line
-    )
-    assert f"| {rates['framed, step 0.05']:.0f} | {rates['whole']:.0f} |" in row
+    assert f"--thorough 112 s and {gains['--thorough']}" in words(NOTEBOOK)
+    assert f"the default 32 s and {gains['default']}" in words(NOTEBOOK)
+    default = gains["default"].replace(" [", " points [")
+    assert f"In six pairs of object and network designs gain {default}" in words(README)
+    assert "6 pairs of object and network" in tables["methods"]["about"]
 
 
 def test_figures_of_forecasts_and_effects_are_the_stored_ones():
@@ -529,46 +504,6 @@ def test_sessions_and_rates_in_other_places_are_the_stored_ones():
     within = sum(row[7] for row in rates)
     assert f"rate's 95 % interval in {within} of {len(rates)} runs;" in words(NOTEBOOK)
     assert {row[6]["n"] for row in rates} == {800} and "rate in 800 places" in words(NOTEBOOK)
-
-
-def test_figures_of_peers_are_the_stored_ones():
-    for row in rows_of("layouts/peers_cells.csv"):
-        rates = " | ".join(f"{100 * float(row[key]):.1f}" for key in ("bare", "gray", "ours", "sign", "flat", "art"))
-        assert f"| {rates} |" in words(NOTEBOOK)
-    for row in rows_of("layouts/peers_pooled.csv")[1:]:
-        value, low, high = (f"{100 * float(row[f'ours minus it{end}']):.1f}" for end in ("", "_low", "_high"))
-        assert re.search(rf"{value}( points)?( more)? \[{low}, {high}\]", words(NOTEBOOK)), row["method"]
-
-
-def test_figures_of_places_are_the_stored_ones():
-    rates: dict[str, dict[str, float]] = {}
-    for row in rows_of("layouts/places_cells.csv"):
-        rates.setdefault(row["scene"], {})[row["layout"]] = 100 * float(row["design"])
-    assert len(rates) == 4
-    for scene in rates.values():
-        auto, default = scene.pop("auto"), scene.pop("+x")
-        assert f"({default:.1f}, {max(scene.values()):.1f})" in words(NOTEBOOK).replace("default side ", "").replace(
-            "best other ", ""
-        )
-        assert f" {auto:.1f} " in words(NOTEBOOK)
-
-
-def test_figures_of_all_pairs_are_the_stored_ones():
-    gains: dict[str, dict[str, list[float]]] = {}
-    for row in rows_of("layouts/layouts_cells.csv") + rows_of("layouts/pieces_cells.csv"):
-        gains.setdefault(row["scene"], {}).setdefault(row["layout"], []).append(float(row["gain"]))
-    by_layout = [
-        np.array([np.mean(pair[layout]) for pair in gains.values()]) for layout in ("whole", "framed, step 0.05")
-    ]
-    told = []
-    for values in (*by_layout, by_layout[0] - by_layout[1]):
-        over = student_mean((100 * values).tolist())
-        told.append((over.value, f"[{over.low:.1f}, {over.high:.1f}]"))
-    (whole, of_whole), (framed, of_framed), (more, of_more) = told
-    assert len(gains) == 10
-    assert f"gain {whole:.1f} points {of_whole} in place of {framed:.1f} {of_framed}" in words(NOTEBOOK)
-    assert f"{more:.1f} more {of_more}" in words(NOTEBOOK)
-    assert f"In ten pairs of object and network designs gain {whole:.1f} points {of_whole}" in words(README)
 
 
 def test_figures_of_the_ablation_are_the_stored_ones():

@@ -24,8 +24,6 @@ def documents() -> Documents:
 # example values of required keys: files that a user has or can make
 _EXAMPLES = {
     "scenes": ("scene.toml",),
-    "scene": "scene.toml",
-    "runs": ("run",),
     "run": "run",
     "networks": ("builtin",),
     "models": ("builtin",),

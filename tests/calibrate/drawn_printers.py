@@ -10,7 +10,7 @@ import math
 import cv2
 import numpy as np
 
-from patchlab.validation.inkjets import DRIVERS, draw_inkjet
+from inkjets import DRIVERS, draw_inkjet
 from patchproof.base.color import codes_from_srgb, linear_from_srgb
 from patchproof.calibrate.chart import known_printers
 from patchproof.reprints.page_photos import PX_PER_MM, PrintFunction, page_light

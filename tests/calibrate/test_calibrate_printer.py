@@ -18,7 +18,7 @@ from drawn_printers import (
     draw_printer,
     printed_page,
 )
-from patchlab.validation.inkjets import DRIVERS, draw_inkjet
+from inkjets import DRIVERS, draw_inkjet
 from patchproof.app import cli
 from patchproof.base.color import linear_from_srgb, srgb_from_linear
 from patchproof.base.errors import Refused

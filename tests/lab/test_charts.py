@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from patchlab.charts import breaks, detect, make, speed, terms
+from patchlab.charts.bars import Bar, BarPoint
 from patchlab.charts.drawing import pareto_mask
 from patchlab.charts.paper_photos import PIECE_MM, corners_mm, draw_sheet
 from patchlab.study import measure
@@ -40,9 +41,8 @@ def test_waiting_is_not_counted_as_work():
 # Photographs of paper, and detectors
 
 
-@pytest.mark.parametrize("kind", ["flat", "lens", "rolled"])
-def test_pixels_and_paper_are_each_other_s_inverse(kind):
-    sheet, rng = draw_sheet(kind, 1)
+def test_pixels_and_paper_are_each_other_s_inverse():
+    sheet, rng = draw_sheet(1, (1200, 900))
     mm = rng.uniform(0, PIECE_MM, (50, 2))
     assert sheet.mm(sheet.px(mm)) == pytest.approx(mm, abs=1e-6)
 
@@ -61,7 +61,7 @@ def test_a_detector_that_finds_nothing_is_infinitely_wrong(monkeypatch):
 @pytest.mark.parametrize("turn", range(4))
 def test_corners_of_a_library_that_counts_them_otherwise_are_put_in_order(monkeypatch, turn):
     """Its tags begin at any corner and run the other way round."""
-    sheet, _ = draw_sheet("flat", 3)
+    sheet, _ = draw_sheet(3, (1600, 1200))
     tags = [SimpleNamespace(tag_id=i, corners=np.roll(sheet.px(mm), turn, 0)[::-1]) for i, mm in corners_mm().items()]
     tags.append(SimpleNamespace(tag_id=3, corners=np.zeros((4, 2))))
     monkeypatch.setattr(detect, "_tag_detector", lambda: SimpleNamespace(detect=lambda gray: tags))
@@ -124,11 +124,9 @@ def test_pairs_of_missing_data_art_and_apriltag_are_left_out(monkeypatch):
 # Breaking points
 
 
-def bar(*good: int, silent: int = 0) -> breaks.Bar:
-    points = [
-        {"value": i, "good": n, "silent": silent, "said": [["blurred", 10 - n - silent]]} for i, n in enumerate(good)
-    ]
-    return breaks.Bar("markers", "blur", range(len(good)), 10, 0.8, points)
+def bar(*good: int, silent: int = 0) -> Bar:
+    points = [BarPoint(n >= 8, [("blurred", 10 - n - silent)], silent) for n in good]
+    return Bar("markers", "blur", range(len(good)), points, 10)
 
 
 def test_the_last_good_point_stands_before_the_first_bad_one():

@@ -1,33 +1,29 @@
-"""The operating envelope of a small scene: axes do what they say, windows are the photographs, the study is written."""
+"""The operating envelope of a small scene: axes do what they say, gains are over controls, the study is written."""
 
 from __future__ import annotations
 
 import csv
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from patchlab.study.study import Work, run_study
+from patchlab.study.study import Cell, Result, Work, run_study
 from patchlab.validation.envelope.axes import AXES, conditions_at, scene_at
-from patchlab.validation.envelope.fit import BEYOND_SWEEP, gain_break, gains_over_controls, has_effect
-from patchlab.validation.envelope.pages import figures
 from patchlab.validation.envelope.simulation import (
     Measurement,
-    _StageCache,
     measure_photos,
     open_simulation,
     piece_at,
     recognize_target,
 )
-from patchlab.validation.envelope.sweeps import EnvelopeSettings, cells
-from patchlab.validation.envelope.window import piece_window
+from patchlab.validation.envelope.sweeps import EnvelopeSettings, cells, figures, gains_in, sweep_bars
 from patchproof.base import geometry
 from patchproof.base.errors import Refused
-from patchproof.base.intervals import Estimate, paired_difference
+from patchproof.base.intervals import paired_difference
 from patchproof.optimizer.run import optimize
-from patchproof.render.photograph import photograph
 from patchproof.report.images import draw_figure as drawing_of
 from patchproof.scene.conditions import with_values
 
@@ -98,52 +94,42 @@ def test_gap_moves_the_piece_along_its_normal_and_size_shrinks_it(world):
 
 @pytest.mark.parametrize("quarters", [0.0, 1.0, 2.5, 4.0])
 def test_hidden_corners_cover_their_share_of_the_piece(world, quarters):
-    bare, hidden = (piece_at(world, {"hidden": q}, 1).srgb for q in (0.0, quarters))
+    bare, hidden = (piece_at(world, "hidden", q, 1).srgb for q in (0.0, quarters))
     assert float((hidden != bare).any(-1).float().mean()) == pytest.approx(quarters / 4, abs=0.01)
 
 
 def test_mismatch_begins_at_the_run_s_printer_and_is_the_other_one_at_one(world):
-    assert torch.equal(piece_at(world, {"mismatch": 0.0}, 0).srgb, piece_at(world, {}, 0).srgb)
+    assert torch.equal(piece_at(world, "mismatch", 0.0, 0).srgb, piece_at(world, "blur", 3.0, 0).srgb)
     other = world.other.apply(world.sheet.sent_srgb)[0].permute(1, 2, 0)
-    assert torch.allclose(piece_at(world, {"mismatch": 1.0}, 0).srgb, other, atol=1e-6)
+    assert torch.allclose(piece_at(world, "mismatch", 1.0, 0).srgb, other, atol=1e-6)
 
 
 def test_the_gray_piece_is_the_printed_control_and_suffers_what_the_design_does(world):
-    design, gray = piece_at(world, {}, 0).srgb, piece_at(world, {}, 0, gray=True).srgb
+    design, gray = (piece_at(world, "blur", 1.0, 0, gray=is_gray).srgb for is_gray in (False, True))
     middle = gray[len(gray) // 2, len(gray) // 2]
     assert gray.shape == design.shape and float(middle.max() - middle.min()) < 0.05  # as this printer makes gray
-    assert not torch.equal(piece_at(world, {"mismatch": 1.0}, 0, gray=True).srgb, gray)
-    taped = [piece_at(world, {"hidden": 4.0}, 0, gray=is_gray).srgb for is_gray in (False, True)]
+    assert not torch.equal(piece_at(world, "mismatch", 1.0, 0, gray=True).srgb, gray)
+    taped = [piece_at(world, "hidden", 4.0, 0, gray=is_gray).srgb for is_gray in (False, True)]
     assert torch.equal(*taped)
 
 
-def test_a_window_shows_what_the_whole_photograph_shows_there(world, drawn):
-    one = with_values(drawn[:1], noise=0.0, blur_px=0.0)
-    stage, shown = _StageCache(world).at({}), piece_at(world, {}, 0)
-    frame = piece_window(stage, one)
-    (x, y), (width, height) = frame.origin_px, frame.size_px
-    assert width * height < 800 * 600 / 2 and x % 16 == y % 16 == 0
-    whole = photograph(stage, shown, one, (800, 600), jpeg=False)[..., y : y + height, x : x + width]
-    part = photograph(frame.stage, shown, one, frame.size_px, jpeg=False)
-    assert float((whole - part).abs().max()) < 1e-3
-
-
 def test_measuring_works_at_the_easy_end_and_says_why_not_at_the_hard_one(world, drawn):
-    points = [{}, {"tilt": 86.0}, {"blur": 12.0}, {"hidden": 4.0}]
-    plain, tilted, blurred, hidden = measure_photos(world, points, drawn[:2])
-    assert all(one.status == "measured" and one.error_mm < 0.3 for one in plain)
+    (hidden,) = measure_photos(world, "hidden", [4.0], drawn[:2])
+    sharp, blurred = measure_photos(world, "blur", [0.1, 12.0], drawn[:1])
+    (tilted,) = measure_photos(world, "tilt", [86.0], drawn[:1])
+    assert all(one.status == "measured" and one.error_mm < 0.3 for one in sharp)
     for row in (tilted, blurred, hidden):
         assert all(one.status != "measured" and one.code for one in row)
     assert {one.code for one in hidden} == {"too_few_markers"}
 
 
 def test_points_see_common_conditions_whatever_their_neighbors_are(world, drawn):
-    points = [{"blur": 20.0}, {}, {"distance": 4000.0}, {"blur": 3.0}]
-    together = recognize_target(world, points, drawn)
-    alone = [recognize_target(world, [point], drawn) for point in points]
-    assert list(together) == ["design", "bare", "gray"]
-    for kind, hits in together.items():
-        assert np.array_equal(hits, np.concatenate([each[kind] for each in alone]))
+    for axis, values, some in (("distance", (600.0, 4000.0), drawn), ("jpeg", (90.0, 2.0), drawn[:1])):
+        together = recognize_target(world, axis, values, some)
+        alone = [recognize_target(world, axis, [value], some) for value in values]
+        assert list(together) == ["design", "bare", "gray"]
+        for kind, hits in together.items():
+            assert np.array_equal(hits, np.concatenate([each[kind] for each in alone]))
 
 
 def test_the_study_writes_breaks_points_codes_and_one_page(world, tmp_path):
@@ -156,36 +142,51 @@ def test_the_study_writes_breaks_points_codes_and_one_page(world, tmp_path):
     finished = run_study("envelope", config, tmp_path / "out", Work(on_start=said.append))
     assert not finished.failed
     assert said == ["this renders 36 views for the network, and 6 whole photographs to measure"]
-    assert [table.name for table in finished.tables] == ["breaks", "beyond", "sweeps"]
+    assert [table.name for table in finished.tables] == ["breaks", "sweeps"]
     rows = rows_of(tmp_path / "out/envelope_sweeps.csv")
     assert [float(row["value"]) for row in rows] == pytest.approx([0.5, 8**0.5, 16])
     assert float(rows[0]["measured"]) == 1 and float(rows[2]["measured"]) == 0
-    (broken,) = rows_of(tmp_path / "out/envelope_breaks.csv")
-    assert 0.5 <= float(broken["measured_low"]) <= float(broken["measured"]) <= float(broken["measured_high"]) <= 16
+    gains, found, measured = rows_of(tmp_path / "out/envelope_breaks.csv")
+    assert [row["method"] for row in (gains, found, measured)] == ["design gains", "sheet found", "measured"]
+    assert 0.5 <= float(measured["last good"]) < float(measured["first bad"]) <= 16
+    assert measured["said there"] and "too_few_markers" in found["said there"]
     assert (tmp_path / "out/envelope_page.png").is_file()
 
 
 # ------------------------------------------------------------------------------------------------ beside controls
 
 
+def sweep(design, bare, gray, *statuses: str) -> Result:
+    """A sweep of four values of blur; photographs with a code of their own where they are not measured."""
+    controls = {kind: np.array(hits, int).tolist() for kind, hits in (("bare", bare), ("gray", gray))}
+    status = [list(each) for each in statuses or ["m"] * len(design)]
+    words = {"m": ("measured", None), "j": ("judged", "blurred"), "r": ("rejected", "too_few_markers")}
+    told = [[[words[letter][i] for letter in row] for row in status] for i in (0, 1)]
+    answers = {"recognized": np.array(design, int).tolist(), "controls": controls, "status": told[0], "code": told[1]}
+    return Result(Cell("a", {"x": {"axis": "blur"}}), answers | {"values": [1.0, 2.0, 4.0, 8.0][: len(design)]}, Path())
+
+
 def test_a_gain_is_over_the_control_that_is_hardest_to_beat_at_that_point():
     design = np.array([[1] * 20, [1] * 20, [1] * 20], bool)
     bare = np.array([[0] * 20, [0] * 15 + [1] * 5, [1] * 20], bool)
     gray = np.array([[0] * 10 + [1] * 10, [0] * 20, [0] * 20], bool)
-    gains = gains_over_controls(design, {"bare": bare, "gray": gray})
-    assert [gain.value for gain in gains] == [0.5, 0.75, 0.0] and [has_effect(gain) for gain in gains] == [1, 1, 0]
+    gains = gains_in(sweep(design, bare, gray).answers)
+    assert [gain.value for gain in gains] == [0.5, 0.75, 0.0]
     assert (gains[0].low, gains[0].high) == pytest.approx(paired_difference(design[0].tolist(), gray[0].tolist())[1])
+    gaining, *_ = sweep_bars(sweep(design, bare, gray))
+    assert (gaining.last_good, gaining.first_bad, gaining.said) == (1, 2, "no gain shown")
     # last that shows a gain and first that does not: of 20 conditions 5 more, and 3 more
-    assert has_effect(gains_over_controls(design[:1], {"bare": bare[1:2] | (np.arange(20) >= 5)})[0])
-    assert not has_effect(gains_over_controls(design[:1], {"bare": np.arange(20)[None] >= 3})[0])
-    assert not has_effect(gains_over_controls(bare[:1], {"bare": design[:1]})[0])  # it does harm
+    for more, shown in ((5, True), (3, False)):
+        other = np.arange(20)[None] >= more
+        assert sweep_bars(sweep(design[:1], other, other))[0].points[0].good == shown
+    assert not sweep_bars(sweep(bare[:1], design[:1], design[:1]))[0].points[0].good  # it does harm
 
 
-def test_a_gain_ends_between_the_last_point_with_one_and_the_first_without():
-    at, some, none = np.linspace(0, 1, 5), Estimate(0.3, 0.1, 0.5, 50), Estimate(0.1, 0.0, 0.2, 50)
-    ends = gain_break([some, some, none, none, some], at)
-    assert (ends.low, ends.value, ends.high, ends.rates) == (0.25, 0.375, 0.5, (0.3, 0.3))
-    assert gain_break([some] * 5, at).value == BEYOND_SWEEP and gain_break([none, *[some] * 4], at).value is None
+def test_a_sheet_is_good_where_four_of_five_photographs_are_and_codes_of_the_others_are_said():
+    hits = np.ones((4, 4), bool)
+    _, found, measured = sweep_bars(sweep(hits, ~hits, ~hits, "mmmmm", "mmmmj", "mmmjj", "mrrrj"))
+    assert (found.last_good, found.first_bad, found.said, found.n) == (2, 3, "too_few_markers", 5)
+    assert (measured.last_good, measured.first_bad, measured.said) == (1, 2, "blurred, too_few_markers")
 
 
 @pytest.fixture(scope="module")
@@ -215,7 +216,7 @@ def test_where_nothing_is_left_of_the_object_the_page_says_no_gain_whatever_is_r
 ):
     unseen = Measurement("rejected", "too_few_markers", None)  # a search of noise for markers takes seconds
     monkeypatch.setattr(
-        "patchlab.validation.envelope.sweeps.measure_photos", lambda _, points, __: [[unseen]] * len(points)
+        "patchlab.validation.envelope.sweeps.measure_photos", lambda _, __, values, ___: [[unseen]] * len(values)
     )
     config, out = tmp_path / "envelope.toml", tmp_path / "out"
     config.write_text(
@@ -229,8 +230,8 @@ def test_where_nothing_is_left_of_the_object_the_page_says_no_gain_whatever_is_r
         assert easy["effect"] == "gains" and float(easy["gain_low"]) > 0
         assert hard["effect"] == "no gain shown" and float(hard["gain_low"]) <= 0 <= float(hard["gain_high"])
     assert 0.2 < float(noise[2]["recognized"]) < 0.8
-    for row in rows_of(out / "envelope_breaks.csv"):
-        assert float(row["design gains_high"]) <= float(row["hard"]) and row["no gain shown at"]
+    for row in rows_of(out / "envelope_breaks.csv")[:2]:
+        assert row["method"] == "design gains" and row["last good"] and row["said there"] == "no gain shown"
     (page,) = figures(None, finished.results)
     assert drawing_of(page.draw, (8, 6), "svg").decode().count("no gain shown<") == 2
     assert "no gain shown" in (out / "envelope.html").read_text("utf-8")

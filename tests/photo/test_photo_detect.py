@@ -124,8 +124,9 @@ def test_the_same_marker_twice_is_doubled(piece):
 def test_a_flipped_photo_is_known_as_mirrored(piece):
     photo = photograph(piece, view(20, 5, 500, size_px=(800, 600)), (800, 600))
     flipped = np.ascontiguousarray(photo[:, ::-1])
-    assert not find_markers(flipped, IDS).markers
-    assert is_mirrored(flipped, IDS) and not is_mirrored(photo, IDS)
+    seen = find_markers(flipped, IDS)
+    assert not seen.markers and is_mirrored(flipped, seen)
+    assert not is_mirrored(photo, find_markers(photo, IDS)) and not is_mirrored(photo, seen)
 
 
 def test_quadrilaterals_that_no_square_can_make_are_impossible():
@@ -195,3 +196,20 @@ def test_real_photographs_of_printed_markers_are_read(data, pattern, dictionary,
         assert not found.foreign and not found.doubled
         seen.append(len(found.markers))
     assert seen == counts
+
+
+def test_squares_of_real_photographs_resemble_all_codes_that_opencv_reads(data):
+    """In both searches of small photographs: several windows, and one."""
+    photos = sorted((data / "markers" / "grid_6x6").glob("*.jpg"))[:4]
+    aruco, read = detect.aruco_dictionary("DICT_6X6_250"), 0
+    for path in photos:
+        for window in (None, 5):
+            settings = detect.detector_settings()
+            if window:
+                settings.adaptiveThreshWinSizeMin = settings.adaptiveThreshWinSizeMax = window
+            gray = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+            theirs = cv2.aruco.ArucoDetector(aruco, settings).detectMarkers(gray)[1]
+            ours = detect.detect_markers(gray, aruco, settings)[1]
+            assert sorted(ours.ravel()) == sorted(theirs.ravel())
+            read += len(ours)
+    assert read > 40

@@ -16,11 +16,11 @@ from patchproof.evidence.classify import squares_of
 from patchproof.evidence.measure import identify_sheet, measure
 from patchproof.evidence.ranges import promised_ranges
 from patchproof.evidence.surface import promised_of, surface_of
-from patchproof.photo import detect, edges, known_page
+from patchproof.photo import detect, edges, known_page, limits
 from patchproof.photo.detect import LINEAR_FLOAT32_FROM_CODE, find_markers, fit_marker_borders, luminance
 from patchproof.photo.edges import fit_borders
 from patchproof.photo.known_page import find_sheet
-from patchproof.photo.limits import count_edges, count_squares
+from patchproof.photo.limits import count_edges, find_squares
 from patchproof.photo.quality import CLIPPED_CODE
 from patchproof.photo.read import Photo
 from patchproof.photo.registration import _shift_per_error
@@ -108,16 +108,15 @@ def test_outlines_have_no_more_points_than_pixels_have_edges():
     assert count_edges(np.ones((3, 4), np.uint8)) == 14
 
 
-def test_squares_among_noise_are_counted_as_without_taking_its_specks_off():
+def test_squares_among_noise_are_found_as_without_taking_its_specks_off(monkeypatch):
     y, x = np.mgrid[:400, :400] % 40
     picture = np.where((abs(y - 20) < 10) & (abs(x - 20) < 10), 40, 200) + np.random.default_rng(1).normal(
         0, 6, y.shape
     )
     picture = np.clip(picture, 0, 255).astype(np.uint8)
-    count = count_squares(picture)
-    assert (
-        count > 60 and count_squares(picture, max_count=10) == count and count_squares(picture, max_count=20_000) == 0
-    )
+    count = len(find_squares(picture))
+    monkeypatch.setattr(limits, "_NOISE_EDGES", 0)
+    assert count > 60 and len(find_squares(picture)) == count
 
 
 @pytest.mark.parametrize("step", [1, 3])

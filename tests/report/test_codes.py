@@ -8,6 +8,7 @@ from synthetic_photos import PIECE_IDS, make_manifest, view
 
 from patchproof.base.geometry import intrinsics
 from patchproof.evidence import measure
+from patchproof.evidence.appearance import MOST_NOISE
 from patchproof.evidence.camera import FOCAL_ERROR, PinholePhoto
 from patchproof.evidence.locate import LocatedSheet, camera_pose
 from patchproof.evidence.results import Geometry, Scale
@@ -136,3 +137,18 @@ def test_half_of_the_design_may_be_clipped():
     assert measured(shot(light=2.0)).entry.code is None
     entry = measured(shot(light=3.0)).entry
     assert entry.code == "clipped" and entry.remark.figure > entry.remark.threshold == measure.MOST_CLIPPED
+
+
+@pytest.mark.parametrize(("light", "noise", "code"), [(0.5, 0.01, None), (0.5, 0.08, "noisy"), (0.01, 0.0005, "noisy")])
+def test_colors_that_noise_or_darkness_made_are_not_stated(light, noise, code):
+    """Of a right print: what is stated is small."""
+    entry = measured(shot(light=light, noise=noise)).entry
+    assert (entry.status, entry.code, entry.color.delta_e00_mean is None) == ("measured", code, code is not None)
+    assert entry.color.noise_delta_e00 > MOST_NOISE if code else entry.color.delta_e00_mean < 2
+
+
+@pytest.mark.parametrize("light", [2.2, np.array([3, 1, 0.5])])
+def test_paper_at_full_white_does_not_turn_the_map_of_colors(light):
+    """With it as the fit's reference for white these state 3.5 and 6.6."""
+    entry = measured(shot(light=light)).entry
+    assert entry.code is None and entry.color.delta_e00_mean < 1

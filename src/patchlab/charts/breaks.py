@@ -13,17 +13,18 @@ from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 
+from patchlab.charts.bars import BAR_HEAD, ROW_IN, Bar, BarPoint, draw_bars, said_text
 from patchlab.study.grid import PositiveInt
 from patchlab.study.record import corner_error_mm
 from patchlab.study.study import Cell, Result, Study
-from patchlab.validation.detection import mount_noise_sheet
 from patchlab.validation.envelope.axes import conditions_at, scene_at
-from patchlab.validation.verdicts import VerdictsSettings, draw_promise
+from patchlab.validation.mounted_sheets import mount_content
+from patchlab.validation.session_trials import draw_promise
 from patchproof.app.demo import SCENE
 from patchproof.base.geometry import fit_homography, local_scale, rect_corners
 from patchproof.base.output import image_pixels
@@ -43,16 +44,17 @@ from patchproof.report.tables import Drawing, Table
 from patchproof.reprints.mounted_sheet import MountedSheet, jpeg_of
 from patchproof.scene.conditions import with_values
 from patchproof.scene.patch_scene import PatchScene, require_patch
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from patchproof.scene.scene import load_scene
+from patchproof.sheets.content import SheetContent
+from patchproof.sheets.piece import control_design
 
 MIN_SHARE, MIN_COVERAGE = 0.8, 0.9  # of trials; of promises, whose intervals are 95 %
 MAX_DELTA_E = 4.0  # mean ΔE00 of a print that is as promised, after the fit of its light
 _EASY = {"tilt": 20.0, "module_px": 5.0, "blur": 0.1, "noise": 0.005, "darkness": 0.0, "jpeg": 95.0}
 _PHOTO_PX = (800, 600)
 _TAPE_SRGB = 0.45  # color of the tape that hides a part of the piece
-_RATE, _CORRELATION, _SESSIONS, _PER_SESSION = 0.85, 0.05, 8, 12  # of promises, and of photographs of their prints
+_RATE, _CONTROL_RATE, _CORRELATION = 0.85, 0.3, 0.05  # of promises
+_SESSIONS, _PER_SESSION = 8, 12  # of photographs of their prints
 
 
 class BreaksSettings(StrictModel):
@@ -94,7 +96,11 @@ def _sheet() -> tuple[MountedSheet, PatchScene]:
     with TemporaryDirectory() as folder:
         path = Path(folder) / "scene.toml"
         path.write_text(SCENE.replace("[camera]", f"[camera]\nphoto_px = {list(_PHOTO_PX)}"), encoding="utf-8")
-        return mount_noise_sheet(str(path), 0)
+        scene = require_patch(load_scene(path, 0))
+    (width, height), piece = scene.piece.size_mm, scene.piece
+    blank = np.zeros((240, round(240 * width / height), 3), np.uint8)
+    noise = control_design("noise", blank, scene.sheet_id, piece)
+    return mount_content(set_stage(scene), SheetContent(piece, scene.sheet_id, "design", noise)), scene
 
 
 @lru_cache(maxsize=2)
@@ -164,8 +170,8 @@ def _colored(shot: MeasuredShot) -> Trial:
 
 def _kept(number: int, sessions: float = _SESSIONS, below: float = 0.0) -> Trial:
     """Photographs of a print whose rate is so far `below` its promise are called kept."""
-    rng, settings = np.random.default_rng([number, 1]), VerdictsSettings(rate=_RATE)
-    promise, strength = draw_promise(settings, _CORRELATION, rng), 1 / _CORRELATION - 1
+    rng, strength = np.random.default_rng([number, 1]), 1 / _CORRELATION - 1
+    promise = draw_promise(_RATE, _CONTROL_RATE, _CORRELATION, rng)
     parts, true = split_evenly(_SESSIONS * _PER_SESSION, round(sessions)), _RATE - below
     counts = rng.binomial(parts, rng.beta(true * strength, (1 - true) * strength, len(parts)))
     word = judge(int(counts.sum()), parts, promise).verdict
@@ -184,6 +190,7 @@ def _covers(number: int, sessions: float = 100, copies: int = 1, moved: float = 
 
 
 _CHECKS = {"markers": _found, "rectification": _rectified, "pose": _placed, "color": _colored, "light fit": _colored}
+_ORDER = [*_CHECKS, "verdict", "promise"]  # of methods in tables
 
 
 def _photographed(axis: str, key: str, values: tuple[float, ...], *methods: str, **easy: float) -> Probe:
@@ -253,115 +260,48 @@ def run(settings: BreaksSettings, base: Path, cell: Cell) -> dict[str, Any]:
     return {"n": count, "share": probe.share, "points": points}
 
 
-@dataclass(frozen=True)
-class Bar:
-    """A method along an axis, its points, and which of them is the last good one and which the first bad one."""
-
-    method: str
-    axis: str
-    values: Sequence[float]
-    n: int
-    share: float
-    points: Sequence[Mapping[str, Any]]
-
-    @property
-    def first_bad(self) -> int | None:
-        """Index of the first bad point; None if all that were tried are good."""
-        return next((i for i, point in enumerate(self.points) if point["good"] < self.share * self.n), None)
-
-    @property
-    def last_good(self) -> int | None:
-        """Index of the point before it; None if the first point is bad."""
-        return ((len(self.points) if self.first_bad is None else self.first_bad) - 1) if self.first_bad != 0 else None
-
-    def value_at(self, index: int | None) -> float | None:
-        """The axis' value at an index."""
-        return None if index is None else self.values[index]
-
-    @property
-    def said(self) -> str:
-        """What is said at the bad points, the two most frequent codes."""
-        counts = Counter[str]()
-        for point in self._bad:
-            counts.update(dict(point["said"]))
-        return ", ".join(code for code, _ in counts.most_common(1 if self.silent else 2))
-
-    @property
-    def silent(self) -> int:
-        """Bad trials at the bad points that nothing was said about."""
-        return sum(point["silent"] for point in self._bad)
-
-    @property
-    def _bad(self) -> Sequence[Mapping[str, Any]]:
-        return () if self.first_bad is None else self.points[self.first_bad :]
-
-
 def _bars(results: Sequence[Result]) -> list[Bar]:
     """All bars, those of a method together."""
-    bars = [
-        Bar(
-            method,
-            result.cell.values["axis"],
-            result.cell.values["values"],
-            result.answers["n"],
-            result.answers["share"],
-            points,
-        )
-        for result in results
-        for method, points in result.answers["points"].items()
-    ]
-    methods = [*_CHECKS, "verdict", "promise"]
-    return sorted(bars, key=lambda bar: methods.index(bar.method))
+    bars = []
+    for result in results:
+        axis, values, n = *(result.cell.values[key] for key in ("axis", "values")), result.answers["n"]
+        for method, points in result.answers["points"].items():
+            tried = [BarPoint(p["good"] >= result.answers["share"] * n, p["said"], p["silent"]) for p in points]
+            bars.append(Bar(method, axis, values, tried, n))
+    return sorted(bars, key=lambda bar: _ORDER.index(bar.method))
 
 
 def tables(settings: BreaksSettings, results: Sequence[Result]) -> tuple[Table, ...]:
     """A table of both points by method and axis, and one of all points."""
-    bars = _bars(results)
-    rows = [(b.method, b.axis, b.value_at(b.last_good), b.value_at(b.first_bad), b.said, b.silent, b.n) for b in bars]
+    rows = tuple(bar.row for bar in _bars(results))
     every = [
-        (b.method, b.axis, p["value"], p["good"] / b.n, p["silent"], ", ".join(f"{c} {n}" for c, n in p["said"]))
-        for b in bars
-        for p in b.points
+        (
+            method,
+            result.cell.values["axis"],
+            p["value"],
+            p["good"] / result.answers["n"],
+            p["silent"],
+            said_text(p["said"]),
+        )
+        for result in results
+        for method, points in result.answers["points"].items()
+        for p in points
     ]
+    every.sort(key=lambda row: _ORDER.index(row[0]))
     about = (
         f"good: {MIN_SHARE:.0%} of {settings.photos} photographs or {settings.draws} verdicts, {MIN_COVERAGE:.0%} of "
     )
     about += (
         f"{settings.draws} promises; silent: bad trials that nothing was said about, at the bad points that were tried"
     )
-    head = ("method", "axis", "last good", "first bad", "said there", "silent", "trials a point")
     points = Table("points", "Every point", ("method", "axis", "value", "good", "silent", "said"), tuple(every))
-    return Table("breaks", "Where it breaks, and what is said there", head, tuple(rows), about), points
+    return Table("breaks", "Where it breaks, and what is said there", BAR_HEAD, rows, about), points
 
 
 def figures(settings: BreaksSettings, results: Sequence[Result]) -> tuple[Drawing, ...]:
     """The chart: a bar per method and axis."""
     about, bars = tables(settings, results)[0].about, _bars(results)
-    return (Drawing("chart", "Where it breaks", partial(_draw_bars, bars), (8.3, 0.8 + 0.26 * len(bars)), about),)
-
-
-def _draw_bars(bars: Sequence[Bar], figure: "Figure") -> None:
-    axes = figure.add_subplot()
-    for row, bar in enumerate(bars):
-        last, first = bar.last_good, bar.first_bad
-        good = 0.0 if last is None else last / (len(bar.values) - 1)
-        end = 1.0 if first is None else first / (len(bar.values) - 1)
-        axes.barh(row, 1.0, color="0.92", height=0.72)
-        axes.barh(row, end - good, left=good, color="#e69f00", height=0.72)
-        axes.barh(row, good, color="#0072b2", height=0.72)
-        words = "holds" if first is None else f"{bar.values[first]:g}: {bar.said or 'nothing is said'}"
-        words += f" ({bar.silent} silent)" if bar.silent and bar.said else ""
-        axes.text(1.02, row, words, va="center", fontsize=9)
-        if last is not None and good > 0.12:
-            axes.text(good - 0.01, row, f"{bar.values[last]:g}", va="center", ha="right", fontsize=8.5, color="white")
-    axes.set_yticks(range(len(bars)), [f"{bar.method}: {bar.axis}" for bar in bars], fontsize=9)
-    axes.set(xlim=(0, 1.8), ylim=(len(bars) - 0.4, -0.6), xticks=[])
-    axes.spines[:].set_visible(False)
-    axes.tick_params(length=0)
-    title = (
-        "Blue: good, up to the value in it. Orange: up to the first bad value, to the right with what is said there."
-    )
-    figure.suptitle(title, fontsize=9.5, x=0.01, ha="left")
+    return (Drawing("chart", "Where it breaks", partial(draw_bars, bars), (8.3, 0.8 + ROW_IN * len(bars)), about),)
 
 
 STUDY = Study("breaks", BreaksSettings, cells, run, tables, figures)

@@ -21,9 +21,6 @@ from patchproof.photo.rejection import PhotoRejected
 from patchproof.sheets.markers import DICTIONARY, aruco_dictionary
 
 APRILTAG = "DICT_APRILTAG_36h11"
-_WIDE_AZIMUTH_DEG = 50.0
-
-KnownPhoto = tuple[np.ndarray, Sheet]  # a photograph, and the sheet that it shows
 
 
 @dataclass(frozen=True)
@@ -32,12 +29,6 @@ class DetectionTrial:
 
     milliseconds: list[float]
     errors_px: np.ndarray
-
-
-def photograph_sheet(size_px: tuple[int, int], seed: int, dictionary: str = DICTIONARY) -> KnownPhoto:
-    """A photograph of flat paper, drawn from the seed, with its sheet."""
-    sheet, rng = draw_sheet("flat", seed, size_px, _WIDE_AZIMUTH_DEG)
-    return photograph_paper(sheet, rng, dictionary), sheet
 
 
 def find_fitted_corners(srgb: np.ndarray) -> MarkerCorners:
@@ -89,7 +80,8 @@ def try_finder(name: str, count: int, size_px: tuple[int, int]) -> DetectionTria
     find, dictionary = FINDERS[name]
     milliseconds, errors = [], []
     for seed in range(count):
-        photo, sheet = photograph_sheet(size_px, seed, dictionary)
+        sheet, rng = draw_sheet(seed, size_px)
+        photo = photograph_paper(sheet, rng, dictionary)
         if not seed:
             find(photo)
         corners, ms = time_call(partial(find, photo))

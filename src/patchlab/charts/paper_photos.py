@@ -1,75 +1,43 @@
-"""Simulated photographs of paper whose true position is known: flat, through a distorting lens, or rolled.
+"""Simulated photographs of flat paper whose true position is known.
 
 In: a seed. Out: `Sheet`s and photographs. OpenCV draws a frame of eight markers; every pixel is traced back to the
-paper by OpenCV's lens model and a ray that meets a cylinder, then developed by this module (area-averaged look-up,
-Gaussian blur and noise in linear light, JPEG). So our renderer, our page and our models of a sheet do not judge
-themselves.
+paper, then developed by this module (area-averaged look-up, Gaussian blur and noise in linear light, JPEG). So our
+renderer and our page do not judge themselves.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import pairwise
-from typing import Literal
 
 import cv2
 import numpy as np
 
 from patchproof.base.color import photo_codes_from_srgb, srgb_from_linear
-from patchproof.base.geometry import intrinsics, look_at, rect_corners
+from patchproof.base.geometry import apply_homography, intrinsics, look_at, rect_corners
 from patchproof.sheets.markers import DICTIONARY, aruco_dictionary
 
-Kind = Literal["flat", "lens", "rolled"]
 MarkerCorners = Mapping[int, np.ndarray]  # corners 4×2 by marker
 PIECE_MM, MARKER_MM = 140.0, 14.0
 DESIGN_MM = (20.0, 20.0, 100.0, 100.0)
-SIZE_PX = (1600, 1200)
-LENS_TERMS = np.array([-0.12, 0.03, 5e-4, -5e-4, 0.0])  # k1 k2 p1 p2 k3: a wide phone camera
-RADII_MM = (100.0, 400.0)
-MAX_AZIMUTH_DEG = 35.0  # beyond it, rolled paper hides a part of itself
+_ASIDE_DEG = np.array([50.0, 30.0])  # of the camera, to either side and up or down
 _RASTER_PX_PER_MM = 10
 _SAMPLES = 3  # along each side of a pixel
-_OUTLINE = np.array([[0, 0], [1, 0], [1, 1], [0, 1], [0, 0]])  # the piece's corners, as shares of it
 
 
 @dataclass(frozen=True)
 class Sheet:
-    """Paper seen by a camera (mm, z into the paper): flat if `curvature` (1/mm) is 0, else rolled about its middle."""
+    """Flat paper seen by a camera."""
 
-    camera_from_piece: np.ndarray
-    matrix_px: np.ndarray
+    px_from_mm: np.ndarray
     size_px: tuple[int, int]
-    terms: np.ndarray
-    curvature: float
 
     def px(self, mm: np.ndarray) -> np.ndarray:
         """Pixels N×2 of points N×2 in mm on the paper."""
-        x, y = np.asarray(mm, float).T
-        along, k = x - PIECE_MM / 2, self.curvature
-        away = (1 - np.cos(k * along)) / k if k else 0 * x
-        points = np.column_stack([PIECE_MM / 2 + (np.sin(k * along) / k if k else along), y, away])
-        turn, move = cv2.Rodrigues(self.camera_from_piece[:3, :3])[0], self.camera_from_piece[:3, 3]
-        return cv2.projectPoints(points, turn, move, self.matrix_px, self.terms)[0].reshape(-1, 2)
+        return apply_homography(self.px_from_mm, np.asarray(mm, float))
 
     def mm(self, px: np.ndarray) -> np.ndarray:
-        """Points N×2 in mm on the paper at pixels N×2; NaN where there is no paper."""
-        stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-9)
-        bent = px.reshape(-1, 1, 2), self.matrix_px, self.terms
-        before_5 = getattr(cv2, "undistortPointsIter", None)  # what OpenCV 4 calls it with a criterion
-        straight = before_5(*bent, None, None, stop) if before_5 else cv2.undistortPoints(*bent, criteria=stop)
-        ray = straight.reshape(-1, 2)
-        rotation, k = self.camera_from_piece[:3, :3], self.curvature
-        ray = np.column_stack([ray, np.ones(len(ray))]) @ rotation
-        eye = -rotation.T @ self.camera_from_piece[:3, 3] - [PIECE_MM / 2, 0, 0]
-        if not k:
-            points = eye - ray * (eye[2] / ray[:, 2])[:, None]
-            return points[:, :2] + [PIECE_MM / 2, 0]
-        radius = 1 / k
-        a, b = (ray[:, [0, 2]] ** 2).sum(1), ray[:, 0] * eye[0] + ray[:, 2] * (eye[2] - radius)
-        rest = b * b - a * (eye[0] ** 2 + (eye[2] - radius) ** 2 - radius**2)
-        far = (-b - np.sign(radius) * np.sqrt(np.where(rest > 0, rest, np.nan))) / a
-        x, y, z = (eye[i] + far * ray[:, i] for i in range(3))
-        return np.column_stack([radius * np.arctan2(x * k, 1 - z * k) + PIECE_MM / 2, y])
+        """Points N×2 in mm on the paper at pixels N×2."""
+        return apply_homography(np.linalg.inv(self.px_from_mm), px)
 
 
 @lru_cache(maxsize=1)
@@ -80,34 +48,30 @@ def corners_mm() -> dict[int, np.ndarray]:
     return {100 + i: rect_corners([x, y, MARKER_MM, MARKER_MM]) for i, (x, y) in enumerate(places)}
 
 
-def draw_sheet(
-    kind: Kind, seed: int, size_px: tuple[int, int] = SIZE_PX, aside_deg: float = MAX_AZIMUTH_DEG
-) -> tuple[Sheet, np.random.Generator]:
+def draw_sheet(seed: int, size_px: tuple[int, int]) -> tuple[Sheet, np.random.Generator]:
     """A sheet that fills about a third of a photograph's height, and the generator that draws its photograph."""
     rng = np.random.default_rng([seed, 1])
-    azimuth, elevation = np.radians(rng.uniform([-aside_deg, -30], [aside_deg, 30]))
+    azimuth, elevation = np.radians(rng.uniform(-_ASIDE_DEG, _ASIDE_DEG))
     toward = [np.cos(elevation) * np.sin(azimuth), np.sin(elevation), np.cos(elevation) * np.cos(azimuth)]
     world_from_piece = np.diag([1.0, -1.0, -1.0, 1.0])
     world_from_piece[:2, 3] = [-PIECE_MM / 2, PIECE_MM / 2]
     camera_from_world = look_at(rng.uniform(350, 700) * np.array(toward), [0, 0, 0], rng.uniform(-20, 20))
-    curvature = rng.choice([-1, 1]) / rng.uniform(*RADII_MM) if kind == "rolled" else 0.0
-    terms = LENS_TERMS if kind == "lens" else np.zeros(5)
-    pose, matrix = camera_from_world @ world_from_piece, intrinsics(50.0, size_px)
-    return Sheet(pose, matrix, size_px, terms, float(curvature)), rng
+    piece_plane = (camera_from_world @ world_from_piece)[:3, [0, 1, 3]]
+    return Sheet(intrinsics(50.0, size_px) @ piece_plane, size_px), rng
 
 
 def photograph_paper(sheet: Sheet, rng: np.random.Generator, dictionary: str = DICTIONARY) -> np.ndarray:
     """uint8 H×W×3 photograph of the sheet with markers of a dictionary, on a blurred background."""
     clutter = rng.uniform(0.05, 0.6, (24, 32)).astype(np.float32)
     picture, raster = cv2.resize(clutter, sheet.size_px, interpolation=cv2.INTER_CUBIC), _draw_raster(rng, dictionary)
-    border = sheet.px(np.concatenate([PIECE_MM * np.linspace(a, b, 50) for a, b in pairwise(_OUTLINE)]))
+    border = sheet.px(rect_corners([0, 0, PIECE_MM, PIECE_MM]))
     left, top = np.clip(np.floor(border.min(0)).astype(int) - 2, 0, sheet.size_px)
     right, bottom = np.clip(np.ceil(border.max(0)).astype(int) + 2, 0, sheet.size_px)
     y, x = np.mgrid[top:bottom, left:right] + 0.5
     mm = sheet.mm(np.column_stack([x.ravel(), y.ravel()])).reshape(*x.shape, 2)
     # the map from pixels to paper is smooth: between pixels it is linear to a thousandth of a pixel
     fine = (_SAMPLES * (right - left), _SAMPLES * (bottom - top))
-    points = cv2.resize(np.nan_to_num(mm, nan=-1e3).astype(np.float32), fine, interpolation=cv2.INTER_LINEAR)
+    points = cv2.resize(mm.astype(np.float32), fine, interpolation=cv2.INTER_LINEAR)
     inside = np.asarray(((points > 0) & (points < PIECE_MM)).all(2), np.float32)
     column, row = cv2.split(points * _RASTER_PX_PER_MM - 0.5)
     light = cv2.multiply(inside, cv2.remap(raster, column, row, cv2.INTER_NEAREST))

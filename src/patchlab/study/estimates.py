@@ -41,10 +41,3 @@ def clustered_mean(values: Sequence[float]) -> tuple[float, tuple[float, float]]
     means = resampled_means(np.asarray(values, float), 10_000)
     low, high = np.quantile(means, _INTERVAL_QUANTILES)
     return float(np.mean(values)), (float(low), float(high))
-
-
-def clustered_median(values: np.ndarray) -> Estimate:
-    """The median of n × ... values with a percentile bootstrap over the n rows; repeatable."""
-    rows = np.random.default_rng(0).integers(0, len(values), (1000, len(values)))
-    low, high = np.quantile([np.median(values[picked]) for picked in rows], _INTERVAL_QUANTILES)
-    return Estimate(float(np.median(values)), float(low), float(high), len(values))

@@ -13,7 +13,6 @@ import numpy as np
 from patchlab.study.estimates import mean
 from patchlab.study.study import Result
 from patchproof.base.geometry import apply_homography
-from patchproof.base.goal import Goal
 from patchproof.base.intervals import Estimate, estimate_difference, rate
 from patchproof.evidence.results import Geometry
 from patchproof.optimizer.responses import Responses
@@ -35,21 +34,6 @@ def hits_text(hits: Sequence[bool] | np.ndarray) -> str:
 def parse_hits(text: str) -> list[bool]:
     """Read hits from a text of 0 and 1."""
     return [digit == "1" for digit in text]
-
-
-def rate_of(result: Result, thing: str) -> float:
-    """The rate of a shown thing with the first of its cell's networks."""
-    return float(np.mean(parse_hits(result.answers["hits"][thing][0])))
-
-
-def gain_of(result: Result, thing: str, other: str) -> float:
-    """The rate of a thing minus another's, in the direction of the scene's goal."""
-    return Goal(result.cell.values["scene"]["target"]["goal"]).sign * (rate_of(result, thing) - rate_of(result, other))
-
-
-def hardest_control(result: Result, controls: Sequence[str]) -> str:
-    """The control that is hardest to beat."""
-    return max(controls, key=lambda name: gain_of(result, name, controls[0]))
 
 
 def corner_error_mm(geometry: Geometry, corners_mm: np.ndarray, true_px: np.ndarray) -> float | None:

@@ -34,12 +34,9 @@ STUDIES: dict[str, str] = {
     "ablation": "patchlab.validation.ablation",
     "breaks": "patchlab.charts.breaks",
     "deceive": "patchlab.paper.deceive",
-    "detection": "patchlab.validation.detection",
     "envelope": "patchlab.validation.envelope.sweeps",
     "forecasts": "patchlab.validation.forecasts",
     "harden": "patchlab.harden.harden_study",
-    "layouts": "patchlab.validation.layouts",
-    "ledger": "patchlab.validation.ledger_trials",
     "patch2d": "patchlab.paper.patch2d",
     "patch3d": "patchlab.paper.patch3d",
     "printed": "patchlab.paper.printed",
@@ -52,7 +49,6 @@ STUDIES: dict[str, str] = {
     "stress": "patchlab.paper.stress",
     "terms": "patchlab.charts.terms",
     "transfer": "patchlab.paper.transfer",
-    "verdicts": "patchlab.validation.verdicts",
 }
 _CELL_NAME = re.compile(r"[\w=+.,-]{1,120}")
 

@@ -15,17 +15,19 @@ from pydantic import Field
 
 from patchlab.study.grid import PositiveInt
 from patchlab.study.study import Cell, Result, Study
-from patchlab.validation.verdicts import VerdictsSettings, draw_promise
+from patchproof.base.goal import Goal
 from patchproof.base.intervals import Estimate, independent_difference, wilson
 from patchproof.base.sessions import sessions_difference
-from patchproof.base.validation import Share
+from patchproof.base.validation import Share, StrictModel
 from patchproof.evidence.grouping import BY_FOLDERS, Grouping
 from patchproof.evidence.measure import MeasuredPhoto
 from patchproof.evidence.results import PhotoEntry, Trace
 from patchproof.evidence.same_session import USUAL_SPREAD, merge_folders
 from patchproof.evidence.verdict import Look, judge, required_rate, watched
+from patchproof.optimizer.promise import PROMISE_VIEWS, VIEWS_PER_SESSION
 from patchproof.photo.quality import FrameLight
 from patchproof.report.tables import Table
+from patchproof.sheets.manifest import ConditionClaim, ControlClaim, ModelClaim, Promise, Target
 
 _DEALS = ("one each", "runs of 3", "mixed 5", "true")
 _BETWEEN = np.array([0.03, 0.03, 0.6, 0.6, 0.4])  # spread of light and background between sessions of the demo
@@ -33,10 +35,15 @@ _PAUSE_S, _PAUSE_FACTOR = 12, 2.5  # median pause between photographs of a sessi
 _MOVE_S, _MOVE_FACTOR = 300, 2.2  # the same between sessions
 
 
-class SessionTrialsSettings(VerdictsSettings):
-    """Settings of verdicts, numbers of trials, and of photographs of each session."""
+class SessionTrialsSettings(StrictModel):
+    """A promise that might be made, rates and sessions of photographs that might be taken, and numbers of trials."""
 
+    rate: Share = 0.85  # promised rate
+    control: Share = 0.3  # the best control's rate
+    promises: PositiveInt = 20  # promises drawn for each correlation
+    # correlation of two photographs of one session
     correlations: Annotated[tuple[Annotated[Share, Field(le=0.9)], ...], Field(min_length=1)] = (0, 0.05, 0.1, 0.2, 0.3)
+    # numbers of sessions that photographs are spread over
     sessions: Annotated[tuple[PositiveInt, ...], Field(min_length=1)] = (2, 3, 4, 6, 8, 12)
     rates: tuple[Share, ...] = (0.05, 0.3, 0.5, 0.8, 0.95)  # of patch and control, which are the same
     effects: tuple[tuple[Share, Share], ...] = ((0.6, 0.3), (0.8, 0.4), (0.9, 0.3))  # rates of patch and control
@@ -62,6 +69,28 @@ def run(settings: SessionTrialsSettings, base: Path, cell: Cell) -> dict[str, An
         "folders": [[d, t, *_folder_trials(settings, rho, d, t, rng)] for d in _DEALS for t in (True, False)],
         "looks": [[way, *_look_trials(settings, rho, way, rng)] for way in ("one look", "each session", "watched")],
     }
+
+
+def draw_promise(promised: float, of_control: float, correlation: float, rng: np.random.Generator) -> Promise:
+    """Draw a promise with as many sessions as real ones, whose rates have that correlation."""
+    sessions = PROMISE_VIEWS // VIEWS_PER_SESSION
+    rates = _session_rates(rng, promised, max(correlation, 1e-3), (sessions, 1))
+    hits = (rng.random((sessions, VIEWS_PER_SESSION)) < rates).ravel()
+    rate, whole = float(hits.mean()), (0.0, 1.0)
+    control = ControlClaim(
+        n=len(hits), rate=of_control, interval=whole, confidence=0, difference=0, difference_interval=(-1, 1)
+    )
+    unknown = dict.fromkeys(("px_per_mm", "tilt_deg", "azimuth_deg", "contrast", "blur_px"))
+    return Promise(
+        target=Target(label="", indices=(0,), goal=Goal.assist),
+        models=(ModelClaim(name="", sha256=None, rate=rate, interval=whole, confidence=0),),
+        rate=rate,
+        interval=whole,
+        n=len(hits),
+        per_session=VIEWS_PER_SESSION,
+        controls={"bare": control},
+        conditions=tuple(ConditionClaim(recognized=bool(hit), **unknown) for hit in hits),
+    )
 
 
 def _session_rates(rng: np.random.Generator, rate: float, rho: float, shape: tuple[int, ...]) -> np.ndarray:
@@ -93,7 +122,7 @@ def _folder_trials(settings: SessionTrialsSettings, rho: float, deal: str, timed
     each, count = (10, 6) if deal == "true" else (20, 3)
     found, kept = [], np.zeros(3, int)
     for _ in range(settings.deals):
-        promise = draw_promise(settings, max(rho, 1e-3), rng)
+        promise = draw_promise(settings.rate, settings.control, rho, rng)
         photos = _records(rng, count, each, timed)
         hits = (rng.random((count, each)) < _session_rates(rng, required_rate(promise), rho, (count, 1))).ravel()
         order = rng.permutation(60) if deal == "mixed 5" else np.arange(60)
@@ -133,7 +162,7 @@ def _look_trials(settings: SessionTrialsSettings, rho: float, way: str, rng, mos
     """
     trials, kept, unlimited = 200, 0, 0
     for _ in range(settings.promises):
-        promise = draw_promise(settings, max(rho, 1e-3), rng)
+        promise = draw_promise(settings.rate, settings.control, rho, rng)
         rates = _session_rates(rng, required_rate(promise), rho, (trials, most, 1))
         counts = (rng.random((trials, most, 10)) < rates).reshape(trials, -1).cumsum(1)
         stops = range(1, 10 * most + 1) if way == "watched" else range(10, 10 * most + 1, 10)

@@ -181,7 +181,7 @@ def find_corners(srgb: np.ndarray, board: Board) -> tuple[np.ndarray, np.ndarray
     """
     dictionary = aruco_dictionary(DICTIONARY)
     light = photo_codes_from_srgb(luminance(srgb))
-    quads, names = detect_markers(light, dictionary, detector_settings())
+    quads, names, _ = detect_markers(light, dictionary, detector_settings())
     none = np.zeros(0, int), np.zeros((0, 2)), len(quads)
     if names is None:
         return none

@@ -14,7 +14,7 @@ import numpy as np
 
 from patchproof.base.color import LINEAR_FROM_CODE
 from patchproof.base.geometry import apply_homography, rect_corners
-from patchproof.photo.detect import Ids, MarkersInView, is_mirrored
+from patchproof.photo.detect import MarkersInView, is_mirrored
 from patchproof.photo.known_page import find_sheet
 from patchproof.photo.paper_light import paper_light, quadratic_terms
 from patchproof.photo.quality import CLIPPED_CODE, blur_px
@@ -72,7 +72,7 @@ def _find_page(srgb: np.ndarray, manifest: Manifest) -> tuple[np.ndarray, float]
     detected = find_sheet(srgb, corners_mm.keys(), corners_mm, dictionary)
     corners_px = detected.corners_px
     if not corners_px:
-        raise _no_sheet(srgb, detected, corners_mm.keys(), dictionary)
+        raise _no_sheet(srgb, detected, dictionary)
     beside = {i: px for i, px in corners_px.items() if not rect_contains(manifest.cut_mm, marker_rect(on_page[i]))}
     fit = fit_page(corners_px, corners_mm)
     if len(beside) > 1 and not set(beside) <= set(fit.inlier_ids):
@@ -80,8 +80,8 @@ def _find_page(srgb: np.ndarray, manifest: Manifest) -> tuple[np.ndarray, float]
     return fit.px_from_mm, blur_px(detected.markers.values())
 
 
-def _no_sheet(srgb: np.ndarray, detected: MarkersInView, ids: Ids, dictionary: str) -> PhotoRejected:
-    if is_mirrored(srgb, ids, dictionary):
+def _no_sheet(srgb: np.ndarray, detected: MarkersInView, dictionary: str) -> PhotoRejected:
+    if is_mirrored(srgb, detected, dictionary):
         return PhotoRejected("mirrored", None, None, "the photo is mirrored: switch off the camera's mirror setting")
     if detected.foreign:
         advice = "these are the markers of another sheet or page: name that sheet's JSON, or leave the photo out"

@@ -5,7 +5,8 @@ pictures. Both sides are averaged over the same coarse cells, and the promise is
 resolution is not mistaken for color: a cell is at least two photo pixels, twice the blur and four times the corner
 uncertainty wide. Left out: the outermost ring of cells, into which blur mixes the surroundings of the piece; clipped
 cells, and cells with gloss (light added to all three channels in one place), which are counted. The color map is
-fitted to the design's cells, paper and ink; each cell is compared after a map that was fitted to other cells.
+fitted to the design's cells, paper and ink; each cell is compared after a map that was fitted to other cells. What the
+photograph's noise and codes alone would make of a right print is measured, too.
 
 With at least eight usable colors the map is a full affine one in linear light, media-relative (12 numbers: gains,
 channel mixing and a veil), fitted robustly; otherwise one per channel from paper and ink. Both remove the effects of
@@ -20,7 +21,7 @@ import cv2
 import numpy as np
 
 from patchproof.base.color import ciede2000, lab_from_linear, photo_codes_from_srgb, srgb_from_linear
-from patchproof.base.geometry import rect_corners
+from patchproof.base.geometry import apply_homography, rect_corners
 from patchproof.evidence.design_match import DesignMatch, match_design
 from patchproof.evidence.results import Color, Geometry
 from patchproof.evidence.surface import PromisedColors, Surface
@@ -39,6 +40,9 @@ _STRIP_PX = 100_000  # 1.6 MB as light: caches hold it
 _LIGHT_TABLE = np.repeat(LINEAR_FLOAT32_FROM_CODE[None, :, None], 3, 2)
 _CELLS_PER_ANCHOR = 8  # paper and ink each enter the fit once for so many cells
 _GLOSS_LIGHT = 0.15  # linear light, paper = 1
+MOST_NOISE = 3.0  # ΔE00 that the photograph alone makes
+_CODE_ERROR = 0.8  # of a cell, by rounding and JPEG: from 2 to 5 stops too dark it explains what a right print measures
+_LAPLACIANS = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)  # multiplies white noise by 6
 
 
 @dataclass(frozen=True)
@@ -93,8 +97,15 @@ def appearance(
     if fit.name == "white_black" and light.clipped > _MOST_CLIPPED_PAPER:
         share = 1.0  # overexposed paper is no reference
     valid_delta = delta[usable] if share <= MOST_CLIPPED else delta[:0]
-    color = Color(color_fit=fit.name, clipped_share=share, glossy_share=float(glossy[inner].mean()))
-    if valid_delta.size:
+    pixels = cv2.contourArea(apply_homography(px_from_mm, rect_corners(surface.rect_mm)).astype(np.float32))
+    noise = _noise_delta(linear[..., :3], photographed, fit, max(pixels / usable.size, 1.0))
+    color = Color(
+        color_fit=fit.name,
+        clipped_share=share,
+        glossy_share=float(glossy[inner].mean()),
+        noise_delta_e00=float(noise[usable].mean()) if usable.any() else None,
+    )
+    if valid_delta.size and (color.noise_delta_e00 or 0) <= MOST_NOISE:
         p95 = float(np.percentile(valid_delta, 95))
         color = color.changed(delta_e00_mean=float(valid_delta.mean()), delta_e00_p95=p95)
     if not with_pictures:
@@ -123,10 +134,25 @@ def _reduced_light(srgb: np.ndarray, step: int) -> np.ndarray:
     return means
 
 
+def _noise_delta(linear: np.ndarray, cells: np.ndarray, fit: ColorFit, pixels: float) -> np.ndarray:
+    """ΔE00 (H×W) that noise of the photograph's light and errors of its codes make in cells of so many pixels.
+
+    Noise is estimated as by Immerkaer (Fast Noise Variance Estimation, CVIU 1996) where the photograph is smooth.
+    """
+    detail = np.abs(cv2.filter2D(linear, -1, _LAPLACIANS)[1:-1, 1:-1]).reshape(-1, 3)
+    sigma = np.quantile(detail, 0.2, axis=0) / 0.2533 / 6  # a fifth of a normal variable is nearer to 0 than 0.2533 σ
+    of_code = np.maximum(2.4 / 1.055 * np.clip(cells, 0, 1) ** (1 - 1 / 2.4), 1 / 12.92) / 255  # light
+    error = np.hypot(sigma / np.sqrt(pixels), _CODE_ERROR * of_code)
+    noisy = cells + error * np.random.default_rng(0).normal(size=cells.shape)
+    return ciede2000(lab_from_linear(fit.apply(cells)), lab_from_linear(fit.apply(noisy)))
+
+
 def fit_cells(photographed: np.ndarray, promised: np.ndarray, light: FrameLight, ink: np.ndarray) -> ColorFit:
     """Fit a color map to N×3 cells, paper and ink; to paper and ink alone if the cells are too few or too alike."""
     anchors = max(len(photographed) // _CELLS_PER_ANCHOR, 1)  # the design's colors alone do not fix white and black
-    ends_by_side = [[light.paper] * anchors, [light.ink] * anchors], [[np.ones(3)] * anchors, [ink] * anchors]
+    ends_by_side = [[light.ink] * anchors, [light.paper] * anchors], [[ink] * anchors, [np.ones(3)] * anchors]
+    if light.clipped > _MOST_CLIPPED_PAPER:  # overexposed paper is no reference
+        ends_by_side = [ends[:1] for ends in ends_by_side]
     sides = zip((photographed, promised), ends_by_side, strict=True)
     fit = affine12(*(np.concatenate([cells, *ends]) for cells, ends in sides))
     return fit or white_black(light.paper, light.ink, ink)

@@ -52,7 +52,7 @@ _MOST_OUTSIDE = 0.01  # of the picture's longer side, for corners on its edge
 _OUTSIDE_ADVICE = "its corners lie outside of it: name pixels of the upright picture, which has {} × {}"
 _OTHER_DPI = "resolutions of scans by their files, {:.0f} × {:.0f} dpi, where --scan-dpi says {:g}"
 # codes of photographs whose homography is still accurate enough to put pieces into them
-MEASURABLE_CODES = (None, "clipped", "blurred", "too_small", "cropped", "weak_ink")
+MEASURABLE_CODES = (None, "clipped", "blurred", "too_small", "cropped", "weak_ink", "noisy")
 
 # linear light of paper and ink, within the bounds of `frame_light`; negative where a print is lighter than its paper
 LightLevel = Annotated[Finite, Field(ge=-4, le=4)]

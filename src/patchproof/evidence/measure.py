@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from patchproof.base.geometry import MM_PER_INCH, apply_homography, rect_corners
-from patchproof.evidence.appearance import MOST_CLIPPED, appearance
+from patchproof.evidence.appearance import MOST_CLIPPED, MOST_NOISE, appearance
 from patchproof.evidence.camera import PinholePhoto
 from patchproof.evidence.design_match import DesignMatch
 from patchproof.evidence.locate import MOST_SHIFT, LocatedSheet, camera_pose, geometry_of, locate_sheet, object_box
 from patchproof.evidence.ranges import PromisedRanges
-from patchproof.evidence.results import Geometry, PhotoEntry, Remark, Scale, Trace
+from patchproof.evidence.results import Color, Geometry, PhotoEntry, Remark, Scale, Trace
 from patchproof.evidence.surface import PromisedColors, Surface
 from patchproof.photo.detect import MarkersInView, find_markers, is_mirrored
 from patchproof.photo.known_page import complete_markers, find_sheet
@@ -66,6 +66,7 @@ _OTHER_DPI_ADVICE = (
 _NO_CORNERS_ADVICE = "this print has no markers, and nothing says where it is: add --find or --corners FILE"
 _PLAIN_ADVICE = "without markers a design without structure cannot be told from another one: print it with markers"
 UNLOCATED_CODES = ("too_few_markers", "no_corners")
+_NOISY_ADVICE = "too dark or noisy to compare colors; the rest counts: use more light, or come closer"
 _HIDDEN_ADVICE = "a corner of the design is covered, folded away or out of the picture: show all of it"
 
 
@@ -154,10 +155,16 @@ def measure(
     if trouble is not None:
         entry = partial(entry, status="judged", remark=Remark.of(trouble))
     else:
-        remark = _print_check(page_check, scale, scan_dpi) or match.weak_ink
+        remark = _print_check(page_check, scale, scan_dpi) or match.weak_ink or _noise_remark(color)
         scale = scale if scale is not None and _SCALE_RANGE[0] < _worst(scale) < _SCALE_RANGE[1] else None
         entry = partial(entry, status="measured", scale=scale, remark=remark)
     return MeasuredPhoto(entry(color=color), counted, pictures, light)
+
+
+def _noise_remark(color: Color | None) -> Remark | None:
+    if color is None or color.noise_delta_e00 is None or color.noise_delta_e00 <= MOST_NOISE:
+        return None
+    return Remark(code="noisy", figure=color.noise_delta_e00, threshold=MOST_NOISE, advice=_NOISY_ADVICE)
 
 
 def _search(
@@ -186,7 +193,7 @@ def identify_sheet(srgb: np.ndarray, surface: Surface) -> tuple[MarkersInView, S
     else:
         detected = find_sheet(srgb, marker_ids, surface.corners_mm, surface.dictionary)
     if not detected.markers:
-        if is_mirrored(srgb, surface.all_ids, surface.dictionary):
+        if is_mirrored(srgb, detected, surface.dictionary):
             advice = "the photo is mirrored: switch off the camera's mirror setting and save it again"
             raise PhotoRejected("mirrored", None, None, advice)
         label = read_page_code(srgb)

@@ -80,11 +80,12 @@ class Scale(StrictModel):
 
 
 class Color(StrictModel):
-    """Color difference of the design from its promise after a color fit; null if too much of it is clipped."""
+    """Color difference of the design from its promise after a color fit; null if too much is clipped, or too noisy."""
 
     color_fit: str
     clipped_share: Finite  # of the design
     glossy_share: Finite
+    noise_delta_e00: Finite | None = None  # that the photograph alone makes of a right print
     delta_e00_mean: Finite | None = None
     delta_e00_p95: Finite | None = None
 

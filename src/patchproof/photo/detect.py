@@ -19,9 +19,8 @@ import numpy as np
 
 from patchproof.base.color import LINEAR_FROM_CODE, LUMINANCE
 from patchproof.base.input import remaining_seconds
-from patchproof.base.resample import downscale
 from patchproof.photo.edges import Borders, fit_borders
-from patchproof.photo.limits import count_squares
+from patchproof.photo.limits import find_squares
 from patchproof.photo.rectify import region_around
 from patchproof.photo.rejection import PhotoRejected
 from patchproof.sheets.markers import DICTIONARY, aruco_dictionary, marker_cells
@@ -30,21 +29,19 @@ LINEAR_FLOAT32_FROM_CODE = LINEAR_FROM_CODE.astype(np.float32)
 COARSEST_PX = 1000  # longer side of the coarsest level at most
 UPSCALE_BELOW_PX = 4_000_000
 LARGEST_LEVEL_PX = 25_000_000  # searched in one level: a second of work and 0.3 GB; larger pictures are halved
-_MIRRORED_PX = 2000  # longer side of a picture that is flipped: most have no marker either way
-MOST_SQUARES = 2000  # photographs have some hundreds at most
+MOST_SQUARES = 1500  # photographs have some hundreds at most
 _SQUARE_S = 0.004  # to examine one, which cannot be interrupted
 DARK_CODE = 70  # median code value below which local contrast helps; in bright photos it hurts sharp markers
 # Margin of light about a marker's rough corners: `edges` may move borders by 1 px and 0.6 modules (of 7 in a marker),
 # and samples 10 px farther.
 _MARGIN_PX, _MARGIN_SHARE = 16.0, 0.2
 SMALLEST_MARKER_PX = 9.0  # side at its level: 7 modules of 1.3 px are the smallest that has been read
-_FEW_SQUARES = 64  # are all compared with all codes
 # Of a side: the detector also tries squares inside, as of a marker in a quiet zone or shadow; one had 0.55
 _INSETS = (1.0, 0.93, 0.86, 0.79, 0.72, 0.66, 0.6, 0.54)
 _LEAST_CONTRAST_CODES, _MOST_BORDER_ERRORS = 6, 0.4  # of a square that can be a marker
 # A reduced picture is searched with one window of the detector's threshold, a full one with all three, which takes
 # twice the time: markers missed with one are found at their predicted places, or at a finer level.
-_REDUCED_WINDOW_PX = 5
+_REDUCED_WINDOW_PX, _WINDOW_STEP_PX = 5, 10
 
 ImageRegion = tuple[slice, slice]
 """Rows and columns of a part of the photograph."""
@@ -55,11 +52,14 @@ Detections = dict[int, list[np.ndarray]]
 
 @dataclass(frozen=True)
 class MarkersInView:
-    """A sheet's markers by id; `foreign` ids of the same dictionary; `doubled` ids of the sheet found in two places."""
+    """A sheet's markers by id; `foreign` ids of the same dictionary; `doubled` ids of the sheet found in two places;
+    `mirrored` ids of the sheet whose codes some squares resemble in a mirror.
+    """
 
     markers: dict[int, Borders]
     foreign: tuple[int, ...]
     doubled: tuple[int, ...]
+    mirrored: frozenset[int] = frozenset()
 
     @property
     def corners_px(self) -> dict[int, np.ndarray]:
@@ -88,11 +88,13 @@ def find_markers(
     """Find markers of `expected` and `also` in a uint8 photo, until `expected` or a set in `or_all_of` is complete."""
     aruco = aruco_dictionary(dictionary)
     detections: Detections = {}
+    mirrored: set[int] = set()
     for level in pyramid_levels(srgb, full_region(srgb)):
-        search_level(srgb, full_region(srgb), level, aruco, detections)
+        mirrored |= search_level(srgb, full_region(srgb), level, aruco, detections)
         if any(ids <= detections.keys() for ids in (expected, *or_all_of)):
             break
-    return fit_detections(srgb, detections, set(expected) | set(also), dictionary)
+    sheet_ids = set(expected) | set(also)
+    return replace(fit_detections(srgb, detections, sheet_ids, dictionary), mirrored=frozenset(mirrored & sheet_ids))
 
 
 def fit_detections(
@@ -108,10 +110,19 @@ def fit_detections(
     return MarkersInView(markers, foreign, tuple(i for i in ids if len(detections[i]) > 1))
 
 
-def is_mirrored(srgb: np.ndarray, expected: Ids, dictionary: str = DICTIONARY) -> bool:
-    """True if the flipped picture shows the sheet: selfie cameras and scans through the back mirror it."""
-    mirrored = np.ascontiguousarray(downscale(srgb, _MIRRORED_PX)[:, ::-1])
-    return bool(find_markers(mirrored, expected, frozenset(), dictionary).markers)
+def is_mirrored(srgb: np.ndarray, view: MarkersInView, dictionary: str = DICTIONARY) -> bool:
+    """True if no marker is in `view`, but the flipped picture shows one: selfie cameras and scans through the back."""
+    expected = view.mirrored
+    if view.markers or not expected:
+        return False
+    mirrored = np.ascontiguousarray(srgb[:, ::-1])
+    if not _is_large(srgb):
+        return bool(find_markers(mirrored, expected, frozenset(), dictionary).markers)
+    detections: Detections = {}
+    for level in pyramid_levels(mirrored, full_region(mirrored)):
+        if level.scale < 1:
+            search_level(mirrored, full_region(mirrored), level, aruco_dictionary(dictionary), detections)
+    return bool(fit_detections(mirrored, detections, expected, dictionary).markers)
 
 
 def _is_large(picture: np.ndarray) -> bool:
@@ -156,12 +167,14 @@ def pyramid_levels(srgb: np.ndarray, region: ImageRegion) -> Iterator[Level]:
         yield from (Level(2.0, to_gray) for to_gray in (light_picture, codes))
 
 
-def search_level(srgb: np.ndarray, region: ImageRegion, level: Level, aruco, detections: Detections) -> None:
-    """Search a region of the photograph at one level; corners, in full pixels, are added to `detections` by id."""
+def search_level(srgb: np.ndarray, region: ImageRegion, level: Level, aruco, detections: Detections) -> Ids:
+    """Search a region of the photograph at one level; corners, in full pixels, are added to `detections` by id. Returns
+    the ids whose codes some squares resemble in a mirror.
+    """
     part = srgb[region]
     height, width = part.shape[:2]
     if width * height * level.scale**2 > LARGEST_LEVEL_PX:
-        return
+        return set()
     size = _scaled_size(part, level.scale)
     if level.scale < 1:
         is_full = level.reduced is not None and part.shape == srgb.shape
@@ -170,11 +183,13 @@ def search_level(srgb: np.ndarray, region: ImageRegion, level: Level, aruco, det
     if level.scale > 1:
         picture = cv2.resize(picture, size, interpolation=cv2.INTER_CUBIC)
     to_full, start = np.array([width / size[0], height / size[1]]), [region[1].start, region[0].start]
-    for marker_id, quad in _detect(picture, aruco, level.scale * max(srgb.shape), level.scale < 1):
+    found, mirrored = _detect(picture, aruco, level.scale * max(srgb.shape), level.scale < 1)
+    for marker_id, quad in found:
         corners, others = quad * to_full + start, detections.setdefault(marker_id, [])
         min_distance = 0.5 * np.linalg.norm(corners[2] - corners[0])  # nearer, it is the marker of another level
         if all(np.linalg.norm(corners.mean(0) - other.mean(0)) > min_distance for other in others):
             others.append(corners)
+    return mirrored
 
 
 def _scaled_size(srgb: np.ndarray, scale: float) -> tuple[int, int]:
@@ -207,12 +222,17 @@ def detector_settings() -> cv2.aruco.DetectorParameters:
     settings = cv2.aruco.DetectorParameters()
     settings.perspectiveRemovePixelPerCell = 8
     settings.perspectiveRemoveIgnoredMarginPerCell = 0.3
-    settings.adaptiveThreshConstant = 3
+    settings.adaptiveThreshConstant = 3  # `find_squares` has the same
+    settings.adaptiveThreshWinSizeStep = _WINDOW_STEP_PX
     return settings
 
 
-def _detect(picture: np.ndarray, aruco, full_px: float, is_reduced: bool = False) -> Iterator[tuple[int, np.ndarray]]:
-    """Ids and corners in a gray picture, which is part of one whose longer side has `full_px` pixels."""
+def _detect(
+    picture: np.ndarray, aruco, full_px: float, is_reduced: bool = False
+) -> tuple[list[tuple[int, np.ndarray]], Ids]:
+    """Ids and corners in a gray picture, which is part of one whose longer side has `full_px` pixels; and the ids whose
+    codes some squares resemble in a mirror.
+    """
     settings = detector_settings()
     if is_reduced or _is_large(picture):
         settings.adaptiveThreshWinSizeMin = settings.adaptiveThreshWinSizeMax = _REDUCED_WINDOW_PX
@@ -220,44 +240,41 @@ def _detect(picture: np.ndarray, aruco, full_px: float, is_reduced: bool = False
     settings.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     settings.relativeCornerRefinmentWinSize = 0.3
     settings.minMarkerPerimeterRate = min(0.03 * full_px, 4 * SMALLEST_MARKER_PX) / max(picture.shape)
-    corners, ids = detect_markers(picture, aruco, settings)
-    for marker_id, quad in zip([] if ids is None else np.asarray(ids).ravel(), corners, strict=True):
-        # in the detector's coordinates pixel centers lie at whole numbers: its 0 is our .5
-        quad = np.asarray(quad, float).reshape(4, 2) + 0.5
-        if is_plausible_quad(quad):
-            yield int(marker_id), quad
+    corners, ids, mirrored = detect_markers(picture, aruco, settings)
+    # in the detector's coordinates pixel centers lie at whole numbers: its 0 is our .5
+    quads = np.array(corners, float).reshape(-1, 4, 2) + 0.5
+    found = zip([] if ids is None else np.asarray(ids).ravel().tolist(), quads, strict=True)
+    return [(marker_id, quad) for marker_id, quad in found if is_plausible_quad(quad)], mirrored
 
 
 def detect_markers(picture: np.ndarray, aruco, settings: cv2.aruco.DetectorParameters):
-    """OpenCV's (corners, ids or None) of one uint8 gray picture; raises `PhotoRejected("too_costly")` if
-    it shows so many possible markers that the detector would not end in time.
+    """OpenCV's (corners, ids or None) of one uint8 gray picture, and the set of ids whose codes some squares resemble
+    in a mirror; raises `PhotoRejected("too_costly")` if it shows so many possible markers that the detector would not
+    end in time.
 
     OpenCV compares a square with every code of the dictionary, which takes a millisecond: 20 s for a block design. So
-    it gets a dictionary of one code first, and where there are many squares then one of the codes that any of them
-    resembles. Of 2,016 markers in photographs, those of boards among them, none was lost by that.
+    it gets a dictionary of the codes that any square resembles, or no picture if there is none.
     """
     max_squares = int(min(MOST_SQUARES, remaining_seconds() / _SQUARE_S))
-    squares = count_squares(picture, settings.minMarkerPerimeterRate * max(picture.shape), max_squares)
-    if squares > max_squares:
+    windows = range(settings.adaptiveThreshWinSizeMin, settings.adaptiveThreshWinSizeMax + 1, _WINDOW_STEP_PX)
+    perimeter_px = settings.minMarkerPerimeterRate * max(picture.shape)
+    quads_of = [find_squares(picture, perimeter_px, window) for window in windows]
+    if (squares := max(map(len, quads_of))) > max_squares:
         advice = f"it shows {squares} squares that could be markers: photograph less of that pattern"
         raise PhotoRejected("too_costly", squares, max_squares, advice)
-    kind = aruco.markerSize, aruco.maxCorrectionBits
-    one = cv2.aruco.Dictionary(aruco.bytesList[:1].copy(), *kind)
-    corners, ids, others = cv2.aruco.ArucoDetector(one, settings).detectMarkers(picture)
-    quads = np.array([*corners, *others], float).reshape(-1, 4, 2)
-    if len(quads) <= _FEW_SQUARES:
-        return cv2.aruco.ArucoDetector(aruco, settings).detectMarkers(picture)[:2] if len(quads) else (corners, ids)
-    similar = _similar_ids(picture, quads, aruco)
-    if not set(similar) - {0}:
-        return corners, ids
-    some = cv2.aruco.Dictionary(aruco.bytesList[similar].copy(), *kind)
+    quads = np.concatenate(quads_of)
+    similar, mirrored = _similar_ids(picture, quads, aruco) if len(quads) else ([], [])
+    if not similar:
+        return (), None, set(mirrored)
+    some = cv2.aruco.Dictionary(aruco.bytesList[similar].copy(), aruco.markerSize, aruco.maxCorrectionBits)
     corners, ids, _ = cv2.aruco.ArucoDetector(some, settings).detectMarkers(picture)
-    return corners, None if ids is None else np.array(similar, np.int32)[np.asarray(ids, int).ravel()][:, None]
+    ids = None if ids is None else np.array(similar, np.int32)[np.asarray(ids, int).ravel()][:, None]
+    return corners, ids, set(mirrored)
 
 
-def _similar_ids(picture: np.ndarray, quads: np.ndarray, aruco) -> list[int]:
+def _similar_ids(picture: np.ndarray, quads: np.ndarray, aruco) -> tuple[list[int], list[int]]:
     """Ids whose codes resemble what a gray picture shows within corners Q×4×2, or within the squares round their middle
-    that the detector tries, too.
+    that the detector tries, too; and ids that are resembled in a mirror.
     """
     size = aruco.markerSize
     side, codes = size + 2, marker_codes(aruco.bytesList.tobytes(), size)
@@ -273,9 +290,14 @@ def _similar_ids(picture: np.ndarray, quads: np.ndarray, aruco) -> list[int]:
     low, high = np.percentile(light, (5, 95), axis=1)
     bits = light > (low + high)[:, None] / 2
     bits = bits[(high - low > _LEAST_CONTRAST_CODES) & (bits[:, is_border].mean(1) < _MOST_BORDER_ERRORS)]
-    wrong = size * size - (2.0 * bits[:, ~is_border] - 1) @ codes
-    likely = (wrong <= 2 * (aruco.maxCorrectionBits + 1)).any(0)
-    return np.unique(np.flatnonzero(likely) % len(aruco.bytesList)).tolist()
+    cells = (2 * bits[:, ~is_border] - np.float32(1)).reshape(-1, size, size)
+
+    def resembled(cells: np.ndarray) -> list[int]:
+        wrong = size * size - cells.reshape(-1, size * size) @ codes
+        likely = (wrong <= 2 * (aruco.maxCorrectionBits + 1)).any(0)
+        return np.unique(np.flatnonzero(likely) % len(aruco.bytesList)).tolist()
+
+    return resembled(cells), resembled(cells[:, :, ::-1])
 
 
 @lru_cache(maxsize=4)
@@ -284,7 +306,7 @@ def marker_codes(data: bytes, size: int) -> np.ndarray:
     every = np.frombuffer(data, np.uint8).reshape(-1, -(-size * size // 8), 4)
     bits = [cv2.aruco.Dictionary.getBitsFromByteList(code[None], size) for code in every]
     turned = np.concatenate([np.rot90(bits, turn, (1, 2)) for turn in range(4)])
-    return 2.0 * turned.reshape(-1, size * size).T - 1
+    return 2 * turned.reshape(-1, size * size).T - np.float32(1)
 
 
 def fit_marker_borders(srgb: np.ndarray, rough: np.ndarray, cells: np.ndarray) -> list[Borders]:

@@ -58,10 +58,11 @@ def find_sheet(srgb: np.ndarray, expected: Ids, corners_mm: Quads, dictionary: s
     aruco = aruco_dictionary(dictionary)
     detections: Detections = {}
     borders: dict[int, Borders] = {}
+    mirrored: set[int] = set()
     region, view = detect.full_region(srgb), MarkersInView({}, (), ())
     for level in detect.pyramid_levels(srgb, region):
         count, foreign = sum(map(len, detections.values())), view.foreign
-        detect.search_level(srgb, region, level, aruco, detections)
+        mirrored |= detect.search_level(srgb, region, level, aruco, detections)
         if sum(map(len, detections.values())) != count:
             detected = detect.fit_detections(srgb, detections, set(corners_mm), dictionary, borders)
             view = complete_markers(srgb, detected, corners_mm, dictionary)
@@ -79,6 +80,7 @@ def find_sheet(srgb: np.ndarray, expected: Ids, corners_mm: Quads, dictionary: s
         detections = {i: [quad] for i, quad in small.items()} | detections
         detected = detect.fit_detections(srgb, detections, set(corners_mm), dictionary)
         view = complete_markers(srgb, detected, corners_mm, dictionary)
+    view = replace(view, mirrored=frozenset(mirrored & corners_mm.keys()))
     if view.doubled or len(view.foreign) > 1:
         return view
     fit = _fit(view.corners_px, corners_mm)

@@ -1,7 +1,7 @@
 """Limit the work on a photograph to ten seconds of processor time.
 
 A call into a library cannot be interrupted (`input.run_within_seconds`), so calls that a picture could make endless are
-avoided if `count_squares` or `count_finder_lines` count too many.
+avoided if `find_squares` or `count_finder_lines` count too many.
 """
 
 from collections.abc import Callable
@@ -20,7 +20,7 @@ Params = ParamSpec("Params")
 
 MOST_BYTES = 1_000_000_000  # of a file, and of memory to read it: 119 megapixels take 0.5 GB
 _ROW_STEP = 4  # rows of which one is examined
-_NOISE_FACTOR = 4  # with four times as many edges as the squares have, most of them are noise
+_NOISE_EDGES = 2_600_000  # with more, taking specks off costs less than following their outlines
 
 
 def run_limited(work: Callable[Params, ReturnType], *args: Params.args, **kwargs: Params.kwargs) -> ReturnType:
@@ -32,23 +32,22 @@ def run_limited(work: Callable[Params, ReturnType], *args: Params.args, **kwargs
         raise PhotoRejected("too_costly", None, error.seconds, advice) from None
 
 
-def count_squares(gray: np.ndarray, perimeter_px: float = 36, max_count: int = 0) -> int:
-    """Count the squares in uint8 H×W that a marker detector would examine; 0 if so few edges allow only `max_count`."""
-    dark = cv2.adaptiveThreshold(gray, 255, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY_INV, 13, 3)
-    edges = count_edges(dark)
-    if edges <= max_count * perimeter_px:
-        return 0
-    # most outlines of noise are those of specks, too short for a square; removing specks pays off if there are many
-    if max_count and edges > _NOISE_FACTOR * max_count * perimeter_px:
+def find_squares(gray: np.ndarray, perimeter_px: float = 36, window_px: int = 13) -> np.ndarray:
+    """Corners Q×4×2 px, clockwise, of the squares in uint8 H×W that a marker detector would examine with a threshold
+    of this window.
+    """
+    dark = cv2.adaptiveThreshold(gray, 255, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY_INV, window_px, 3)
+    if count_edges(dark) > _NOISE_EDGES:  # most outlines of noise are those of specks, too short for a square
         _, labels, stats, _ = cv2.connectedComponentsWithStats(dark)
         large = np.asarray(stats)[:, cv2.CC_STAT_AREA] >= perimeter_px / 2
         large[0] = False  # the background
         dark = large.view(np.uint8)[labels.astype(np.int32, copy=False)]
-        if count_edges(dark) <= max_count * perimeter_px:
-            return 0
     outlines, _ = cv2.findContours(dark, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     polygons = (cv2.approxPolyDP(o, 0.03 * len(o), True) for o in outlines if len(o) >= perimeter_px)
-    return sum(len(polygon) == 4 for polygon in polygons)
+    quads = np.array([polygon for polygon in polygons if len(polygon) == 4], float).reshape(-1, 4, 2)
+    diagonals = quads[:, 2:] - quads[:, :2]
+    clockwise = diagonals[:, 0, 0] * diagonals[:, 1, 1] > diagonals[:, 0, 1] * diagonals[:, 1, 0]
+    return np.where(clockwise[:, None, None], quads, quads[:, ::-1])
 
 
 def count_edges(mask: np.ndarray) -> int:

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from patchproof.base.resample import downscale
-from patchproof.photo.limits import count_finder_lines, count_squares
+from patchproof.photo.limits import count_finder_lines, find_squares
 from patchproof.photo.rectify import rectify
 from patchproof.photo.rejection import PhotoRejected
 from patchproof.sheets.manifest import PAGE_CODE_PATTERN
@@ -26,7 +26,7 @@ def read_page_code(srgb: np.ndarray) -> str | None:
     """Read the code in a uint8 picture; None without one. A detector that would take too long is skipped."""
     gray = cv2.cvtColor(downscale(srgb, _LARGEST_PX), cv2.COLOR_RGB2GRAY)
     # of 7 oblique pages of A4 they read 6 and 1, of 7 labels 5 and 7: neither detector is enough
-    by_squares = cv2.QRCodeDetectorAruco, count_squares, _MAX_SQUARES
+    by_squares = cv2.QRCodeDetectorAruco, lambda gray: len(find_squares(gray)), _MAX_SQUARES
     by_lines = cv2.QRCodeDetector, count_finder_lines, _MAX_LINES
     for detector, count, max_count in (by_squares, by_lines):
         if count(gray) > max_count:

@@ -17,6 +17,7 @@ REJECTION_CODES = {
         "hold still, focus on the piece, use more light",
     ),
     "clipped": ("highlights are cut off, so colors cannot be compared", "expose one or two stops less"),
+    "noisy": ("noise or darkness alone would change colors too much", "use more light, come closer"),
     "too_small": ("the piece has too few pixels for its corners or its cells", "come closer, use the full resolution"),
     "tilted": ("the piece is foreshortened to less than a fifth", "look at it less from the side"),
     "out_of_range": ("the view lies outside of what the promise covers", "stay within the ranges of the scene"),

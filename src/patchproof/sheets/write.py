@@ -106,10 +106,8 @@ def _manifest(template: Template, page: PageLayout, design: SheetContent, cut_mm
     """One design's manifest: the markers of its piece, then all others on the page whose id is unique."""
     piece_markers = [move_marker(marker, cut_mm[:2]) for marker in design.piece.markers]
     counts = Counter(marker.id for marker in page.markers)
-    others = [marker for marker in page.markers if counts[marker.id] == 1 and marker not in piece_markers]
-    others = others if piece_markers else []
-    design_page = replace(page, markers=(*piece_markers, *others))
-    return design.manifest(design_page, template, cut_mm)
+    others = [m for m in page.markers if piece_markers and counts[m.id] == 1 and m not in piece_markers]
+    return design.manifest(replace(page, markers=(*piece_markers, *others)), template, cut_mm)
 
 
 def write_page(pdf_path: str | Path, page: PageLayout, template: AnyTemplate, cut_mm: RectMm, kind: str) -> Manifest:

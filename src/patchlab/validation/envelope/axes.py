@@ -10,10 +10,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from patchlab.validation.envelope.curl import curl_card
+from patchproof.base.errors import Refused
+from patchproof.mesh.surface_chart import piece_grid
+from patchproof.scene.bend import PIECE_GRID, grid_faces
 from patchproof.scene.conditions import Conditions, with_values
 from patchproof.scene.interface import Scene
 from patchproof.scene.patch_scene import require_patch
+from patchproof.scene.placement import Placement
 
 SweepPoint = Mapping[str, float]
 """Values by axis; all others are as drawn, or as the run has them."""
@@ -34,10 +37,6 @@ class Axis:
     def values(self, easy: float, hard: float, points: int) -> np.ndarray:
         """Evenly spaced values from easy to hard, geometrically if `ratio`."""
         return np.geomspace(easy, hard, points) if self.ratio else np.linspace(easy, hard, points)
-
-    def value(self, easy: float, hard: float, position: float) -> float:
-        """The value at a position from 0 (easy) to 1 (hard)."""
-        return float(easy * (hard / easy) ** position if self.ratio else easy + (hard - easy) * position)
 
 
 def _distances(scene: Scene) -> tuple[float, float]:
@@ -76,8 +75,7 @@ AXES: dict[str, Axis] = {
     "mismatch": Axis("print mismatch", "× other printer", lambda scene: (0.0, 6.0), needs_mesh=False),
     "size": Axis("patch size", "× its own", lambda scene: (1.0, 0.1), ratio=True),
 }
-# Axes that move the camera or the paper: views of other values have to be rasterized again.
-GEOMETRY_AXES = ("tilt", "distance", "curl", "gap", "size")
+PAPER_AXES = ("size", "curl", "gap")  # axes that change the piece or its place on the object
 
 
 def is_possible(scene: Scene, name: str) -> bool:
@@ -104,13 +102,13 @@ _FIELD_OF_AXIS = {"distance": "distance_mm", "blur": "blur_px", "noise": "noise"
 
 def scene_at(scene: Scene, point: SweepPoint) -> Scene:
     """The scene with its piece printed smaller, moved off the surface, or curled, as the point says."""
-    if not {"size", "curl", "gap"} & point.keys():
+    if not point.keys() & PAPER_AXES:
         return scene
     size = point.get("size", 1.0)
     scene = require_patch(scene).with_print_scale((size, size))
     placement = scene.placement
     if "curl" in point:
-        placement = curl_card(placement, point["curl"])
+        placement = _curl_card(placement, point["curl"])
     if "gap" in point:
         off, frame = point["gap"] * placement.normal, placement.world_from_piece.copy()
         frame[:3, 3] += off
@@ -128,3 +126,21 @@ def _tilt_cameras(conditions: Conditions, tilt_deg: float) -> Conditions:
     elevation = np.degrees(np.arcsin(up.clip(-1, 1)))
     azimuth = np.degrees(np.arctan2(right, np.cos(tilt)))
     return with_values(conditions, azimuth_deg=azimuth, elevation_deg=elevation)
+
+
+def _curl_card(card: Placement, radius_mm: float) -> Placement:
+    """Curl the left and right edges of a flat card off the object, on a cylinder that touches it along its middle.
+
+    Nothing is fitted to the surface, and no gap is refused: badly glued paper does this.
+    """
+    if not card.is_flat:
+        raise Refused("a flat card to curl", f"a piece on a {card.family}", "leave out bend")
+    across, inward = card.world_from_piece[:3, [0, 2]].T
+    points, width = piece_grid(card.size_mm, PIECE_GRID) * [1, -1] + np.array(card.size_mm) / 2, card.size_mm[0]
+    scale = float(np.linalg.norm(across))  # a print may be larger than its millimeters say
+    angle = (points[:, :1] - width / 2) * scale / radius_mm
+    flat = np.concatenate([width / 2 + radius_mm / scale * np.sin(angle), points[:, 1:]], 1)
+    offsets = radius_mm * (1 - np.cos(angle)) * inward
+    normals = -np.sin(angle) * across / scale - np.cos(angle) * inward
+    curled = replace(card, vertices_mm=card.world(flat) - offsets, faces=grid_faces(PIECE_GRID), normals=normals)
+    return replace(curled, family="curled", piece_mm=points, reason=f"curled to a radius of {radius_mm:.0f} mm")
