@@ -16,10 +16,16 @@ from PIL import Image
 
 from patchproof.app import cli
 from patchproof.app.plan import errors
-from patchproof.app.plan.cost import measure_cost
 from patchproof.app.plan.errors import Setup, measure_terms, scene_terms
-from patchproof.app.plan.lines import geometry_lines, measured_lines
-from patchproof.app.plan.plan import Plan, marker_plan, measured_plan, plan_geometry, resolution_plan, sample_plan
+from patchproof.app.plan.plan import (
+    geometry_lines,
+    marker_plan,
+    measure_cost,
+    measured_lines,
+    measured_plan,
+    plan_geometry,
+    resolution_plan,
+)
 from patchproof.base.errors import Refused
 from patchproof.base.settings import SceneSettings
 from patchproof.base.validation import validate_model
@@ -68,52 +74,46 @@ def errors_of(scene, other=None):
     width, height = problem.subject.design_px
     pixels = np.random.default_rng(0).integers(0, 256, (height, width, 3), np.uint8)
     terms = measure_terms(problem, from_pixels(pixels), scene.draw("select", 2), 64, other)
-    return {error.name: error for error in terms.errors}, terms
+    return terms["errors"], terms
 
 
-def plan_lines(plan: Plan) -> list[str]:
+def plan_lines(plan: dict) -> list[str]:
     return [*geometry_lines(plan), *measured_lines(plan)]
 
 
-def quick_plan(path) -> Plan:
+def quick_plan(path) -> dict:
     """With a small selection set, rendered two views at a time."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(loop, "SELECT_VIEWS", 4)
         patch.setattr(errors, "_chunks", lambda views, side_px: [slice(0, 2), slice(2, views)])
         patch.setattr("patchproof.app.plan.plan.PROOF_VIEWS", 8)
+        patch.setattr("patchproof.app.plan.plan.REPEATS", 1)
         calls = []
-        plan = measured_plan(*plan_geometry(path), timing=False, views=3, progress=lambda *call: calls.append(call))
-    assert {name for name, _, _ in calls} == {"draft", "terms", "photographs"}
+        plan = measured_plan(*plan_geometry(path), views=3, progress=lambda *call: calls.append(call))
+    assert {name for name, _, _ in calls} == {"draft", "terms", "photographs", "cost"}
     assert all(done <= total for _, done, total in calls)
     return plan
 
 
 @pytest.fixture(scope="module")
-def plan(tmp_path_factory) -> Plan:
+def plan(tmp_path_factory) -> dict:
     path = tmp_path_factory.mktemp("plan") / "scene.toml"
     path.write_text(SCENE.replace("[800, 600]", "[400, 300]"), encoding="utf-8")
     return quick_plan(path)
 
 
-def test_a_plan_is_short_and_survives_json(plan):
+def test_a_plan_is_short(plan):
     lines = plan_lines(plan)
     assert len(lines) < 45 and max(len(line) for line in lines if not line.startswith("  off: ")) < 300
-    assert Plan.model_validate_json(plan.model_dump_json()) == plan
-    assert plan.surface.family == "card" and plan.draft.steps == 3 and plan.cost is None and plan.warnings
-    assert sum(line.startswith("  ") for line in lines) > 15
+    assert plan["surface"]["family"] == "card" and plan["draft"]["steps"] == 3 and plan["warnings"]
+    assert sum(line.startswith("  ") for line in lines) > 15 and plan["not_measured"] == {}
 
 
 def test_what_can_go_adds_up_to_less_than_selection_can_tell(plan):
-    errors = plan.terms.errors
-    gone = [error.confidence for error in errors if error.verdict == "can go" and error.key]
-    assert gone and sum(gone) < plan.terms.threshold
-    assert all(abs(error.bias) <= error.confidence + 1e-12 for error in errors if error.verdict != "off")
-    assert plan.terms.together is not None
-
-
-def test_what_was_not_measured_has_a_reason(plan):
-    assert plan.not_measured == {"the cost of a step": "left out by --no-timing"}
-    assert "not measured: the cost of a step (left out by --no-timing)" in plan_lines(plan)
+    errors = plan["terms"]["errors"].values()
+    gone = [error["confidence"] for error in errors if error["verdict"] == "can go" and error["key"]]
+    assert gone and sum(gone) < plan["terms"]["threshold"]
+    assert all(abs(error["bias"]) <= error["confidence"] + 1e-12 for error in errors if error["verdict"] != "off")
 
 
 def test_a_plan_says_how_many_photographs_prove_what_its_draft_promises(plan):
@@ -125,22 +125,12 @@ def test_a_plan_says_how_many_photographs_prove_what_its_draft_promises(plan):
 def test_a_classifier_that_answers_alike_to_every_view_lets_no_term_go(tmp_path, monkeypatch):
     monkeypatch.setattr(errors, "_confidence", lambda problem, pictures, boxes: torch.full((len(pictures),), 0.25))
     found, terms = errors_of(scene_with(tmp_path, camera__blur_px=[1, 1]))
-    assert {error.verdict for error in found.values()} <= {"off", "unknown"} and found["blur"].verdict == "unknown"
-    assert "is 0.25, whatever" in terms.unknown and terms.together is None
-
-
-def test_four_times_the_samples_would_halve_what_chance_leaves(plan):
-    selection, promise = plan.samples
-    assert (selection.n, promise.n) == (64, 400) and selection.half_width == pytest.approx(1.96 * plan.terms.threshold)
-    for one in plan.samples:
-        assert one.next_n == 4 * one.n and one.next_half_width <= one.half_width
-    _, promise = sample_plan(0.8, 0.02)
-    assert promise.half_width == pytest.approx(0.039, abs=1e-3)
-    assert promise.next_half_width == pytest.approx(0.0196, abs=1e-3)
+    assert {error["verdict"] for error in found.values()} <= {"off", "unknown"}
+    assert found["blur"]["verdict"] == "unknown" and "is 0.25, whatever" in terms["unknown"]
 
 
 def test_terms_that_are_off_are_named_with_the_key_that_turns_them_on(plan):
-    off = {error.name: error.key for error in plan.terms.errors if error.verdict == "off"}
+    off = {name: e["key"] for name, e in plan["terms"]["errors"].items() if e["verdict"] == "off"}
     drawn = draw(SETTINGS, "select", 4, 0)  # of the defaults
     assert off.pop("lens distortion") == "camera.file"
     switched = [(effect, getattr(drawn, RECORD_OF[effect.fields[0]])) for effect in EFFECTS if effect.can_be_off]
@@ -157,11 +147,11 @@ def test_pixels_per_millimeter_by_hand(tmp_path):
     away_mm = 500 - scene.placement.center_mm @ scene.frame.normal
     assert scene.px_per_mm((400, 300)) == pytest.approx(150 / away_mm, rel=0.02)  # the piece's middle is off the axis
     found = resolution_plan(set_problem(scene))
-    assert found.px_per_mm_photo == pytest.approx([150 / away_mm] * 2, rel=0.02)
-    assert found.px_per_mm_network == pytest.approx([16 / away_mm] * 2, rel=0.02) and found.network_px == 32
-    width = found.design_px[0]
-    assert found.texels_per_px == pytest.approx(width / 90 / found.closest_px_per_mm)
-    assert found.printed_px[0] % width == 0 and found.printed_px_per_mm >= 2
+    assert found["px_per_mm_photo"] == pytest.approx([150 / away_mm] * 2, rel=0.02)
+    assert found["px_per_mm_network"] == pytest.approx([16 / away_mm] * 2, rel=0.02) and found["network_px"] == 32
+    width = found["design_px"][0]
+    assert found["texels_per_px"] == pytest.approx(width / 90 / found["closest_px_per_mm"])
+    assert found["printed_px"][0] % width == 0 and found["printed_px_per_mm"] >= 2
 
 
 def test_the_marker_rule_by_hand(tmp_path):
@@ -169,11 +159,11 @@ def test_the_marker_rule_by_hand(tmp_path):
     scene = scene_with(tmp_path, **STRAIGHT, view__distance_mm=[400, 400], camera__photo_px=[1600, 1200])
     away_mm = 400 - scene.placement.center_mm @ scene.frame.normal
     markers = marker_plan(scene)
-    assert markers.needed_mm == pytest.approx(max(8, 7 * 2.5 * away_mm / 600), rel=0.03)
-    assert markers.printed_mm == pytest.approx(markers.needed_mm, rel=0.03) and markers.unreadable_share == 0
+    assert markers["needed_mm"] == pytest.approx(max(8, 7 * 2.5 * away_mm / 600), rel=0.03)
+    assert markers["printed_mm"] == pytest.approx(markers["needed_mm"], rel=0.03) and markers["unreadable_share"] == 0
     distant = scene_with(tmp_path, **STRAIGHT, view__distance_mm=[9000, 9000])
     far = marker_plan(distant)
-    assert far.printed_mm < far.needed_mm / 2 and far.unreadable_share == 1
+    assert far["printed_mm"] < far["needed_mm"] / 2 and far["unreadable_share"] == 1
 
 
 def test_stronger_terms_leave_more_and_small_views_may_not_show_them(tmp_path):
@@ -181,18 +171,18 @@ def test_stronger_terms_leave_more_and_small_views_may_not_show_them(tmp_path):
     weak, _ = errors_of(scene_with(tmp_path, camera__blur_px=[1, 1], camera__noise=[0.01, 0.01]))
     strong, _ = errors_of(scene_with(tmp_path, camera__blur_px=[3, 3], camera__noise=[0.1, 0.1]))
     for name in ("blur", "noise"):
-        assert strong[name].codes_mean > 2 * weak[name].codes_mean > 0
+        assert strong[name]["codes_mean"] > 2 * weak[name]["codes_mean"] > 0
     small = {"camera__photo_px": [800, 600], "camera__blur_px": [1, 1]}
     unseen, _ = errors_of(scene_with(tmp_path, **small))
-    assert weak["blur"].in_training is True and unseen["blur"].in_training is False
-    assert unseen["blur"].codes_mean > 0 and unseen["noise"].verdict == "off"
+    assert weak["blur"]["in_training"] is True and unseen["blur"]["in_training"] is False
+    assert unseen["blur"]["codes_mean"] > 0 and unseen["noise"]["verdict"] == "off"
 
 
 def test_a_term_that_the_classifier_lives_on_is_kept(tmp_path):
     """Red against blue has nothing but color to go by."""
     errors, terms = errors_of(scene_with(tmp_path, camera__white_balance=0.5))
-    assert errors["white balance"].verdict == "keep" and errors["white balance"].confidence > 0.05
-    assert terms.threshold < errors["white balance"].confidence
+    assert errors["white balance"]["verdict"] == "keep" and errors["white balance"]["confidence"] > 0.05
+    assert terms["threshold"] < errors["white balance"]["confidence"]
 
 
 def test_even_light_in_place_of_the_sun_is_as_strong_on_the_patch(tmp_path):
@@ -215,7 +205,7 @@ def test_bent_pieces_are_weighed_against_cards(tmp_path):
     assert card.is_flat and not bent.placement.is_flat and sentence.startswith("bend = false would be a card")
     errors, _ = errors_of(bent, card)
     (name,) = (name for name in errors if name.endswith("not a card"))
-    assert errors[name].codes_mean > 0.1 and errors[name].verdict in {"keep", "can go"}
+    assert errors[name]["codes_mean"] > 0.1 and errors[name]["verdict"] in {"keep", "can go"}
     flat = scene_with(tmp_path, **settings)
     other, sentence = placement_with_other_bend(flat)
     assert not other.is_flat and f"bend = true would be a {other.family}" in sentence
@@ -241,10 +231,12 @@ def test_scenes_of_images_have_no_light_of_ours(tmp_path):
     ]
     (tmp_path / "scene.toml").write_text("\n".join(lines))
     plan = quick_plan(tmp_path / "scene.toml")
-    names = {error.name for error in plan.terms.errors}
-    assert plan.surface.family == "plane" and plan.surface.other is None and plan.kind == "3 images"
+    names, surface = set(plan["terms"]["errors"]), plan["surface"]
+    assert surface["family"] == "plane" and surface["other"] is None and plan["kind"] == "3 images"
+    reason = "how the piece fits the object (pictures say nothing of a surface: the piece is a plane that"
+    assert any(line.startswith(f"not measured: {reason}") for line in plan_lines(plan))
     assert "blur" in names and not names & {"directional light", "lens distortion"}
-    assert len(plan_lines(plan)) < 45 and "pictures" in plan.omitted[0]
+    assert len(plan_lines(plan)) < 45 and "pictures" in plan["omitted"][0]
 
 
 def photo_scene(tmp_path, blur_px: float, noise: float) -> PhotoScene:
@@ -264,9 +256,9 @@ def photo_scene(tmp_path, blur_px: float, noise: float) -> PhotoScene:
 def test_photographs_have_light_blur_and_noise_of_their_own(tmp_path):
     own = ("uneven light on paper", "photographs' own blur", "photographs' own noise")
     errors, _ = errors_of(photo_scene(tmp_path, 1.5, 0.05))
-    assert all(errors[name].codes_mean > 0 and errors[name].verdict != "off" for name in own)
+    assert all(errors[name]["codes_mean"] > 0 and errors[name]["verdict"] != "off" for name in own)
     errors, _ = errors_of(photo_scene(tmp_path, 0.0, 0.0))
-    assert [errors[name].verdict == "off" for name in own] == [False, True, True]
+    assert [errors[name]["verdict"] == "off" for name in own] == [False, True, True]
 
 
 def test_textures_have_no_markers_and_no_printer(tmp_path):
@@ -278,29 +270,28 @@ def test_textures_have_no_markers_and_no_printer(tmp_path):
     terms = {term.name for term in scene_terms(problem, problem.subject.start(), None)}
     assert not terms & {"printer's colors", "dot gain"} and "directional light" in terms
     found = resolution_plan(problem)
-    assert found.design_px is None and found.texels == sum(int(mask.sum()) for mask in scene.canvas.mask)
+    assert found["design_px"] is None and found["texels"] == sum(int(mask.sum()) for mask in scene.canvas.mask)
     mean_mm = float(np.mean(scene.draw("select", 1024, 0).pose.distance_mm))
     focal_px = 48 / math.tan(math.radians(25))
-    assert found.px_per_mm_network[0] < focal_px / mean_mm < found.px_per_mm_network[1]
+    assert found["px_per_mm_network"][0] < focal_px / mean_mm < found["px_per_mm_network"][1]
 
 
 def test_the_parts_of_a_step_add_up(tmp_path):
     problem = set_problem(scene_with(tmp_path))
     cost = measure_cost(problem, problem.subject.start())
-    assert sum(part.ms for part in cost.parts) == pytest.approx(cost.ms)
-    assert sum(part.share for part in cost.parts) == pytest.approx(1) and min(part.ms for part in cost.parts) >= 0
+    assert sum(cost["parts"].values()) == pytest.approx(cost["ms"]) and min(cost["parts"].values()) >= 0
 
 
 def test_the_verb_prints_and_writes_and_does_not_overwrite(scene_file, tmp_path, monkeypatch, capsys, plan):
     import patchproof.app.plan.plan as study
 
     monkeypatch.setattr(study, "plan_geometry", lambda path, progress: (plan, None))
-    monkeypatch.setattr(study, "measured_plan", lambda geometry, problem, timing, progress: plan)
+    monkeypatch.setattr(study, "measured_plan", lambda geometry, problem, progress: plan)
     out = tmp_path / "plan.json"
-    monkeypatch.setattr(sys, "argv", ["patchproof", "plan", str(scene_file), "--out", str(out), "--no-timing"])
+    monkeypatch.setattr(sys, "argv", ["patchproof", "plan", str(scene_file), "--out", str(out)])
     with pytest.raises(SystemExit) as done:
         cli.main()
-    assert not done.value.code and Plan.model_validate(json.loads(out.read_text())) == plan
+    assert not done.value.code and json.loads(out.read_text()) == json.loads(json.dumps(plan))
     assert capsys.readouterr().out.splitlines() == plan_lines(plan)
     with pytest.raises(SystemExit) as done:
         cli.main()

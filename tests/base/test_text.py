@@ -12,8 +12,7 @@ from patchproof.base.errors import Refused
 from patchproof.base.input import read_json
 from patchproof.base.text import csv_lines, printable
 from patchproof.base.validation import StrictModel, read_toml, validate_model
-from patchproof.report.images import draw_figure
-from patchproof.report.page import render_page
+from patchproof.report.page import draw_figure, render_page
 from patchproof.sheets.layout import drawable_text
 
 TOML, JSON = 'label = "é"\n', '{"label": "é"}'

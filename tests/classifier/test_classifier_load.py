@@ -84,6 +84,13 @@ def test_doubts_are_warned_about_and_let_pass():
         check(lambda x: GOOD(x) * 1e3)
 
 
+def test_what_is_odd_about_a_network_stays_with_it():
+    classifier = Classifier("it", None, 16, LABELS, lambda x: GOOD(0.5 + x / 1e5))
+    with pytest.warns(UserWarning, match="hardly tells pictures apart"):
+        (note,) = load_classifier(classifier).notes
+    assert "hardly tells pictures apart" in note
+
+
 @pytest.mark.parametrize("name", ["resnet50", "", "torch:x", "models/a.onnx", "http://x/y.pt2", "Builtin"])
 def test_a_name_of_no_known_form_is_refused(name, tmp_path):
     with pytest.raises(Refused, match=r'file:NAME\.onnx or module:package\.factory, got "' + name):

@@ -5,6 +5,8 @@ from __future__ import annotations
 import itertools
 import json
 import math
+import re
+import warnings
 
 import numpy as np
 import pytest
@@ -285,6 +287,86 @@ def test_decoded_boxes_come_in_any_order_and_unit(boxes, change, unit):
     head = head_of({"name": "boxes", "boxes": boxes, "unit": unit, "scores": "probabilities"}, "here")
     assert_equal(decoded(64, [np.hstack([values, scores])], head), truth)
     assert_equal(decoded(64, [scores, values], head), truth)
+
+
+def grid_boxes():
+    """Boxes of a grid of 8×8 cells, of all sizes, with shares of a softmax over the labels and a background."""
+    y, x = np.mgrid[:8, :8].reshape(2, 64) * 8 + 4
+    sides = 4 + 20 * sigmoid(noise(64, 2))
+    shares = softmax(np.concatenate([noise(64, K), np.full((64, 1), 2.0)], 1))
+    return np.hstack([np.stack([x, y], 1) - sides / 2, np.stack([x, y], 1) + sides / 2]), shares
+
+
+def center_size(boxes):
+    return np.hstack([(boxes[:, :2] + boxes[:, 2:]) / 2, boxes[:, 2:] - boxes[:, :2]])
+
+
+def upper_size(boxes):
+    return np.hstack([boxes[:, :2], boxes[:, 2:] - boxes[:, :2]])
+
+
+def logit(share):
+    return np.log(share / (1 - share))
+
+
+S = np.s_[:, :K]  # the labels' columns
+UNTOLD = {  # by what is said: outputs from boxes b and shares p
+    "": (lambda b, p: [np.hstack([b, logit(p[S])])]),
+    '{"name": "boxes", "unit": "share"}': (lambda b, p: [np.hstack([b / 64, logit(p[S])])]),
+    '{"name": "boxes", "boxes": "yxyx", "scores": "probabilities"}': (
+        lambda b, p: [np.hstack([b[:, [1, 0, 3, 2]], p[S]])]
+    ),
+    '{"name": "boxes", "boxes": "xywh"}': (lambda b, p: [np.hstack([upper_size(b), logit(p[S])])]),
+    '{"name": "boxes", "columns": ["scores", "boxes"]}': (lambda b, p: [np.hstack([logit(p[S]), b])]),
+    '{"name": "ultralytics", "boxes": "xyxy"}': (lambda b, p: [np.hstack([b, p[S]]).T]),
+    '{"name": "ultralytics", "unit": "share", "scores": "logits"}': (
+        lambda b, p: [np.hstack([center_size(b) / 64, logit(p[S])]).T]
+    ),
+    '{"name": "ultralytics", "columns": ["scores", "boxes"]}': (lambda b, p: [np.hstack([p[S], center_size(b)]).T]),
+    '{"name": "ultralytics", "boxes": "xyxy", "background": "last"}': (lambda b, p: [np.hstack([b, p])]),
+    '{"name": "ultralytics", "boxes": "xyxy", "background": "first"}': (
+        lambda b, p: [np.hstack([b, np.roll(p, 1, 1)])]
+    ),
+    '{"name": "detr", "boxes": "xyxy", "unit": "pixels"}': (lambda b, p: [logit(p[S]).T, b]),
+    '{"name": "detr", "scores": "probabilities"}': (lambda b, p: [center_size(b) / 64, p]),
+    '{"name": "detr", "boxes": "yxyx", "background": "first"}': (
+        lambda b, p: [b[:, [1, 0, 3, 2]] / 64, np.roll(np.log(p), 1, 1)]
+    ),
+    '{"name": "detr", "unit": "pixels", "scores": "probabilities"}': (
+        lambda b, p: [p[S] / 0.9, np.full((64, 1), 0.9), center_size(b)]
+    ),
+}
+
+
+@pytest.mark.parametrize("words", UNTOLD)
+def test_decoded_boxes_of_an_untold_head_are_read_by_what_they_hold_and_said(words):
+    """What is said, written into the JSON, reads the same."""
+    boxes, shares = grid_boxes()
+    outputs, truth = UNTOLD[words](boxes, shares), np.hstack([boxes, shares[S]])
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        assert_equal(decoded(64, outputs), truth)
+    assert [re.sub(r'.*read as the head (.*): write "head" .*', r"\1", str(each.message)) for each in said] == (
+        [words] if words else []
+    )
+    if words:
+        assert_equal(decoded(64, outputs, head_of(json.loads(words), "here")), truth)
+
+
+def test_rows_of_detections_may_be_shares_and_in_another_order_are_refused():
+    size, (rows,), truth = end_to_end()
+    with pytest.warns(UserWarning, match=r'head \{"name": "ultralytics", "unit": "share"\}'):
+        assert_equal(decoded(size, [np.hstack([rows[:, :4] / size, rows[:, 4:]])]), truth)
+    with pytest.raises(Refused, match=r"rows of a box, a score and a label's number, got N×5×6"):
+        decoded(size, [rows[:, [5, 4, 0, 1, 2, 3]]])
+
+
+def test_a_column_that_may_be_a_background_or_an_objectness_is_refused():
+    boxes, shares = grid_boxes()
+    with pytest.raises(Refused, match=r"what stands beside 5 scores, got N×64×10 .*objectness, or .*background"):
+        decoded(64, [np.hstack([boxes, np.log(shares)])])
+    with pytest.raises(Refused, match="a detector's head for 5 labels, got N×64×4 and N×64 and N×"):
+        decoded(64, [boxes, shares[:, 0], np.array(64.0)])
 
 
 def test_outputs_of_one_shape_are_told_apart_by_name(monkeypatch):

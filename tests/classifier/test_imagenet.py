@@ -24,6 +24,8 @@ from patchproof.base.errors import Refused
 from patchproof.base.settings import load_scene_settings
 from patchproof.base.validation import expand_path, refuse_untrusted
 from patchproof.classifier import imagenet, load_classifier, wrapping
+from patchproof.classifier.builtin_detector import load_builtin_detector
+from patchproof.classifier.detector import Detector
 from patchproof.classifier.network import Classifier
 
 VARIANT = imagenet._Variant("", 32, (1, 2))
@@ -149,9 +151,9 @@ def reference(monkeypatch):
     network = Classifier("imagenet", None, 32, NAMES, Colors())
     monkeypatch.setattr(imagenet, "has_imagenet", lambda: True)
     monkeypatch.setattr(imagenet, "load_imagenet", lambda: network)
-    wrapping._reference.cache_clear()
+    wrapping._references.cache_clear()
     yield network
-    wrapping._reference.cache_clear()
+    wrapping._references.cache_clear()
 
 
 def wrapped(reference, prepare=lambda x: x, labels=NAMES):
@@ -202,6 +204,35 @@ def test_labels_moved_by_one_place_are_refused_and_shuffled_ones_warned_about(re
     shuffled = [NAMES[index] for index in np.random.default_rng(0).permutation(len(NAMES))]
     with pytest.warns(UserWarning, match="do its labels have another order"):
         wrapping.check_wrapping(wrapped(reference, labels=tuple(shuffled)), "cpu")
+
+
+@pytest.mark.parametrize(
+    ("prepare", "words"),
+    [
+        (lambda x: x, ""),
+        (lambda x: x.flip(1), "builtin-detector's by 0.91 as it is wrapped, 1.00 with red and blue swapped"),
+        (lambda x: x / 255, "pictures in 0 to 255"),
+    ],
+)
+def test_a_detector_is_compared_with_ours(prepare, words, monkeypatch):
+    monkeypatch.setattr(wrapping, "_RANGES", dict(list(wrapping._RANGES.items())[:2]))
+    own = load_builtin_detector()
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        wrapping.check_wrapping(replace(own, network=lambda x: own.network(prepare(x))), "cpu")
+    assert [str(each.message).endswith(words) for each in said] == [True] * bool(words)
+
+
+def test_a_detector_of_coco_s_labels_is_compared_with_two(monkeypatch):
+    """By its best box of each label, wherever that lies."""
+    monkeypatch.setattr(wrapping, "_RANGES", {"": wrapping._RANGES[""]})
+    reference = wrapping._references(True, False)[0]
+    found = torch.cat([torch.rand(12, 1, 4), reference.logits()[:, None].float()], -1)
+    right = Detector("it", None, 32, tuple(reference.labels), lambda x: found)
+    with warnings.catch_warnings(action="error"):
+        wrapping.check_wrapping(right, "cpu")
+    with pytest.warns(UserWarning, match=r"two COCO detectors' by 0\.2\d as .* each label moved to the output behind"):
+        wrapping.check_wrapping(replace(right, labels=("background", *reference.labels[:-1])), "cpu")
 
 
 @pytest.mark.skipif(not imagenet.has_imagenet(), reason='needs pip install "patchproof[imagenet]"')

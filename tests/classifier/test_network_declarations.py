@@ -132,17 +132,17 @@ def unlike_imagenet() -> None:
     """Check a network that takes red for blue beside another in the place of `imagenet`."""
     reference = Classifier("imagenet", None, 32, test_imagenet.NAMES, test_imagenet.Colors())
     swapped = Classifier("it", None, 32, test_imagenet.NAMES, lambda x: reference.network(x.flip(1)))
-    wrapping._reference.cache_clear()
+    wrapping._references.cache_clear()
     with mock.patch.multiple(imagenet, has_imagenet=lambda: True, load_imagenet=lambda: reference):
         wrapping.check_wrapping(swapped, "cpu")
-    wrapping._reference.cache_clear()
+    wrapping._references.cache_clear()
 
 
 SHA1 = hashlib.sha1(bytes(8) + W.numpy().tobytes() + bytes(4)).hexdigest()
 NAMES = metadata(names="{0: 'red'}", imgsz="[8, 8]", task="classify", license="MIT")
 # by entry of the list: calls, each with the logits that it has to return or the sentence that it ends in
 CASES: dict[str, tuple[Any, ...]] = {
-    "of ImageNet labels, unlike `imagenet`'s": (lambda at: unlike_imagenet(), "red and blue swapped"),
+    "of known labels, unlike those of a known network": (lambda at: unlike_imagenet(), "red and blue swapped"),
     "opset": (
         *(lambda at: answers(at, onnx_files.model(onnx_files.SMALL, 13)), truth()),
         *(lambda at: answers(at, onnx_files.model(onnx_files.SMALL, 6)), "opset 6, not one from 7"),
@@ -262,6 +262,10 @@ CASES: dict[str, tuple[Any, ...]] = {
     "boxes (top, left, bottom, right)": (
         lambda at: checked(candidates([[y, x, bottom, right] for x, y, right, bottom in GRID]), Detector),
         r"are they \(top, left, bottom, right\)",
+    ),
+    "boxes of pictures of another size": (
+        lambda at: checked(candidates([[10 * side for side in box] for box in GRID]), Detector),
+        r"boxes around \(\d+, \d+\) to \(\d+, \d+\) in squares of 8 px: are they of pictures of another size",
     ),
 }
 

@@ -16,7 +16,7 @@ from patchlab.charts.paper_photos import PIECE_MM, corners_mm, draw_sheet
 from patchlab.study import measure
 from patchlab.study.study import Cell, Result, Work
 from patchproof.base.errors import Refused
-from patchproof.report.images import draw_figure
+from patchproof.report.page import draw_figure
 
 OUT = Path()
 

@@ -24,7 +24,7 @@ from patchproof.base import geometry
 from patchproof.base.errors import Refused
 from patchproof.base.intervals import paired_difference
 from patchproof.optimizer.run import optimize
-from patchproof.report.images import draw_figure as drawing_of
+from patchproof.report.page import draw_figure as drawing_of
 from patchproof.scene.conditions import with_values
 
 

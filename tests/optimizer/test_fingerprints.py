@@ -20,7 +20,7 @@ from patchproof.base.packaged import packaged_path
 from patchproof.evidence.classify import judges_of
 from patchproof.optimizer import loop
 from patchproof.optimizer import run as run_module
-from patchproof.optimizer.imported_design import import_folder, import_patch
+from patchproof.optimizer.imported_design import import_patch
 from patchproof.optimizer.problem import set_problem
 from patchproof.optimizer.promise import PromiseOptions
 from patchproof.optimizer.run import load_run, optimize
@@ -120,19 +120,6 @@ def test_networks_that_the_user_names_are_not_those_of_the_run(made, tmp_path):
     assert set_problem(load_run(folder / "run").scene, models=["file:small.onnx"])
     with pytest.raises(Refused, match="got another"):
         set_problem(load_run(folder / "run").scene)
-
-
-def test_runs_of_pictures_are_kept_only_with_the_same_inputs(made, tmp_path):
-    folder = shutil.copytree(made, tmp_path / "copy")
-    (folder / "pictures").mkdir()
-    Image.fromarray(PICTURE).save(folder / "pictures" / "a.png")
-    options = {"promise": DRAFT, "resume": True}
-    scene, out = folder / "scene.toml", folder / "runs"
-    import_folder(folder / "pictures", scene, out, **options)
-    import_folder(folder / "pictures", scene, out, **options)
-    retrain(folder / "small.onnx")
-    with pytest.raises(Refused, match="empty or new folder"):
-        import_folder(folder / "pictures", scene, out, **options)
 
 
 def test_a_scene_of_files_in_the_run_is_not_optimized_over_them(made, tmp_path):

@@ -19,7 +19,7 @@ from patchproof.base.geometry import apply_homography, rect_corners
 from patchproof.channel.printer import load_printer
 from patchproof.optimizer import imported_design
 from patchproof.optimizer import run as run_module
-from patchproof.optimizer.imported_design import fit_to_piece, import_folder, import_patch
+from patchproof.optimizer.imported_design import fit_to_piece, import_patch
 from patchproof.optimizer.promise import PromiseOptions
 from patchproof.optimizer.run import load_run
 from patchproof.report.coco import PATCH
@@ -260,13 +260,11 @@ def test_a_stopped_import_leaves_an_earlier_run_as_it_was(tmp_path, monkeypatch)
 
 @pytest.fixture(scope="module")
 def several(tmp_path_factory):
-    """A folder with pictures/, scene.toml and runs/ of them: red, as the network wants it, gray and blue."""
+    """A folder with scene.toml and runs/ of pictures: red, as the network wants it, gray and blue."""
     folder = tmp_path_factory.mktemp("several")
-    (folder / "pictures").mkdir()
-    for name, color in (("red", (220, 30, 30)), ("gray", (128, 128, 128)), ("blue", (30, 30, 220))):
-        Image.new("RGB", (64, 64), color).save(folder / "pictures" / f"{name}.png")
     scene = toml(folder / "scene.toml")
-    assert command("import", folder / "pictures", scene, "--out", folder / "runs", "--promise", 8) == 0
+    for name, color in (("red", (220, 30, 30)), ("gray", (128, 128, 128)), ("blue", (30, 30, 220))):
+        import_patch(np.full((64, 64, 3), color, np.uint8), scene, folder / "runs" / name, **DRAFT)
     return folder
 
 
@@ -276,11 +274,11 @@ def test_a_folder_of_pictures_is_compared_on_the_same_conditions(several, capsys
     assert "The best two, under conditions that had no say in choosing them" in capsys.readouterr().out
     tables = json.loads((out / "designs.json").read_text())["tables"]
     order = [row[0] for row in tables["designs"]["rows"]]
-    assert order[0] == "red" and order[-1] == "blue" and all(row[1] == "elsewhere" for row in tables["designs"]["rows"])
-    assert [row[0] for row in tables["fresh"]["rows"]] == order[:2] and tables["fresh"]["rows"][0][6] is None
-    rates = {row[0]: row[3]["value"] for row in tables["designs"]["rows"]}
+    assert order[0] == "red" and order[-1] == "blue"
+    assert [row[0] for row in tables["fresh"]["rows"]] == order[:2] and tables["fresh"]["rows"][0][5] is None
+    rates = {row[0]: row[2]["value"] for row in tables["designs"]["rows"]}
     for row in tables["designs"]["rows"][1:]:
-        assert row[6]["value"] == pytest.approx(rates[row[0]] - rates["red"]) and row[6]["n"] == 6
+        assert row[5]["value"] == pytest.approx(rates[row[0]] - rates["red"]) and row[5]["n"] == 6
     assert "data:image/png" in (out / "designs.html").read_text("utf-8")
     assert command("evaluate", *runs) == 2 and "--out" in capsys.readouterr().err
     assert command("evaluate", runs[0], "--out", out) == 2
@@ -293,17 +291,3 @@ def test_runs_that_are_not_seen_alike_are_not_compared(several, tmp_path):
         compare_runs([several / "runs" / "red", tmp_path / "other"], tmp_path / "out", n=4)
     with pytest.raises(Refused, match="two runs or more to compare, each once"):
         compare_runs([several / "runs" / "red"] * 2, tmp_path / "out", n=4)
-
-
-def test_a_folder_goes_on_where_it_was_stopped(several, tmp_path, monkeypatch):
-    pictures, scene = several / "pictures", several / "scene.toml"
-    with pytest.raises(Refused, match="add --overwrite"):
-        import_folder(pictures, scene, several / "runs", promise=PromiseOptions(views=8))
-    monkeypatch.setattr(imported_design, "import_patch", lambda *_, **__: pytest.fail("imported again"))
-    kept = import_folder(pictures, scene, several / "runs", promise=PromiseOptions(views=8), resume=True)
-    assert [run.folder.name for run in kept] == ["blue", "gray", "red"]
-    (tmp_path / "alike").mkdir()
-    for kind in ("png", "bmp"):
-        Image.fromarray(noise(64, 64)).save(tmp_path / "alike" / f"a.{kind}")
-    with pytest.raises(Refused, match="names differ in more than their kind"):
-        import_folder(tmp_path / "alike", scene, tmp_path / "runs")

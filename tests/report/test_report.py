@@ -30,10 +30,9 @@ from patchproof.evidence.results import (
     Summary,
 )
 from patchproof.optimizer.evaluate import Evaluation
-from patchproof.report.images import delta_map, save_pictures
-from patchproof.report.run_words import evaluation_lines
+from patchproof.report.page import delta_map, save_pictures
 from patchproof.report.tables import Drawing, Results, Table, write_results
-from patchproof.report.words import verdict_lines
+from patchproof.report.words import evaluation_lines, verdict_lines
 from patchproof.report.write import photos_csv, report_html, write_report
 from test_verify_run import promise
 
@@ -59,7 +58,12 @@ def some_report(verdict="kept"):
                       control="gray", control_rate=1 / 3, control_interval=(0.06, 0.79), difference=0.67,
                       difference_interval=(0.1, 0.9)),
     )  # fmt: skip
-    origin = Origin(options={"ruler_mm": (97.1, 97.3)}, sha256={"network net": "e" * 64}, versions={"numpy": "1"})
+    origin = Origin(
+        options={"ruler_mm": (97.1, 97.3)},
+        sha256={"network net": "e" * 64},
+        versions={"numpy": "1"},
+        notes=("it is odd",),
+    )
     controls = (Control("gray", 1, 3, (0.06, 0.79), 3, 0.67, (0.1, 0.9), 2, "", False, (1.0, 0.333)),)
     return Report(sheet_id="TESTSHEET0", photos=tuple(photos), summary=summary, controls=controls, origin=origin)
 
@@ -130,11 +134,12 @@ def test_the_page_says_what_the_report_says_and_escapes_it(shown):
         "e" * 64,
         "f" * 64,
         "numpy 1",
+        "it is odd.",
         "+66.7 points",
     ):
         assert words in text
     assert "<b>bright" not in text and "Promise broken" not in text
-    assert text.count("<svg") == 4  # tilt, pixels per mm, print scale, ledger
+    assert text.count("<svg") == 3  # tilt, pixels per mm, ledger
 
 
 def test_an_answer_about_a_photograph_that_does_not_count_is_not_called_recognized(tmp_path):
@@ -268,7 +273,7 @@ def test_every_picture_has_words_of_its_own(tmp_path):
         assert len(tags.texts) == len(set(tags.texts)) == count and all(tags.texts)
     text = (tmp_path / "report.html").read_text()
     named = re.findall(r'<div role="img" aria-label="([^"]+)"><svg', text)
-    assert len(named) == len(set(named)) == text.count("<svg") == 4
+    assert len(named) == len(set(named)) == text.count("<svg") == 3
 
 
 def test_a_studys_page_begins_with_its_figure(tmp_path):

@@ -37,7 +37,7 @@ from patchproof.optimizer.responses import in_chunks
 from patchproof.render.photograph import shade
 from patchproof.render.stage import Stage, set_stage
 from patchproof.render.views import render_views
-from patchproof.report.images import png
+from patchproof.report.page import png
 from patchproof.scene.image_scene import ImageScene, build, largest_share, read_labels
 from patchproof.scene.interface import SceneSource
 from patchproof.sheets.piece import Piece

@@ -44,7 +44,7 @@ from patchproof.optimizer.promise import pictures_with_controls
 from patchproof.optimizer.responses import responses
 from patchproof.render.photograph import Appearance
 from patchproof.render.stage import set_stage
-from patchproof.report.images import png
+from patchproof.report.page import png
 from patchproof.report.tables import Drawing, Table
 from patchproof.scene.image_scene import build, largest_share
 from patchproof.scene.interface import SceneSource

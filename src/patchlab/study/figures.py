@@ -16,7 +16,7 @@ from torch import Tensor
 from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.problem import Problem
 from patchproof.render.photograph import Appearance, expose
-from patchproof.report.images import png
+from patchproof.report.page import png
 from patchproof.report.tables import Drawing
 from patchproof.scene.conditions import Conditions
 

@@ -36,7 +36,7 @@ from patchproof.optimizer.pixels import from_pixels
 from patchproof.photo.read import list_photos, read_photo
 from patchproof.photo.rectify import region_around
 from patchproof.photo.rejection import PhotoRejected
-from patchproof.report.images import png
+from patchproof.report.page import png
 from patchproof.report.tables import Drawing, Table
 
 if TYPE_CHECKING:

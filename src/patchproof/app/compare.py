@@ -18,6 +18,7 @@ import numpy as np
 
 from patchproof.base.compute import Compute
 from patchproof.base.errors import Refused
+from patchproof.base.goal import Goal
 from patchproof.base.intervals import estimate_difference, rate
 from patchproof.base.output import new_folder
 from patchproof.base.progress import Progress, no_progress
@@ -36,7 +37,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 COMPARISON_FILES = ("designs.html", "designs.json", "designs_*.csv", "designs_*.png")
-_HEAD = ("design", "made", "network", "rate", "best control", "minus it", "minus the best design")
+_HEAD = ("design", "network", "rate", "best control", "minus it", "minus the best design")
 AnswersByKind = Mapping[str, Responses]  # to a design and each of its controls
 
 
@@ -57,52 +58,45 @@ def compare(
     Args:
         runs: finished runs of one scene, or their folders, two or more.
         out: folder for designs.html, designs.json and the tables.
-        models, trust, compute, overwrite, progress: as in `evaluate`.
+        models, trust, compute, overwrite: as in `evaluate`.
         n: conditions for each comparison.
         seed: of the conditions, in place of the first run's.
+        progress: called with a design's name as the stage (conditions), for the two best once more.
 
     Raises:
         Refused: for runs of different scenes.
     """
     networks, loaded = None if models is None else tuple(models), _load_runs(runs, models is None, trust)
     refuse_networks_in_memory(networks, compute)
-    scene, total, views_done = next(iter(loaded.values())).scene, n * (len(loaded) + 2), 0
-    judges = networks or scene.settings.target.models
+    scene = next(iter(loaded.values())).scene
+    target = scene.settings.target
+    judges = networks or target.models
     names = tuple(each.name if isinstance(each, Classifier) else each for each in judges)
     seed = scene.seed if seed is None else seed
     opening = open_workers(compute.jobs, compute.cluster)
     with new_folder(out, COMPARISON_FILES, overwrite, runs) as folder, opening as workers:
 
         def ask(name: str, start: int) -> AnswersByKind:
-            nonlocal views_done
-            run, start_count = loaded[name], views_done
-            conditions = run.scene.draw("evaluate", n, seed, start)
-
-            def advance(count: int, _: int) -> None:
-                progress("evaluate", start_count + count, total)
-
+            conditions, advance = loaded[name].scene.draw("evaluate", n, seed, start), partial(progress, name)
             options = networks, compute.device, trust, advance
-            answers, _ = run_responses(run.folder.resolve(), conditions, workers, *options)
-            views_done += n
-            return answers
+            return run_responses(loaded[name].folder.resolve(), conditions, workers, *options)[0]
 
         try:
             by_design = {name: ask(name, 0) for name in loaded}
-            order = sorted(loaded, key=partial(_goal_score, by_design, scene))[::-1]
+            order = sorted(loaded, key=lambda name: _goal_score(by_design[name]["design"], target.goal))[::-1]
+            by_design = {name: by_design[name] for name in order}
             fresh = {name: ask(name, n) for name in order[:2]}
         finally:
             close_run()
         results = Results(
             kind="comparison",
             name="designs",
-            about=f"{len(loaded)} designs for {scene.settings.target.goal} "
-            f'"{scene.settings.target.label}", under the same conditions.',
+            about=f'{len(loaded)} designs for {target.goal} "{target.label}", under the same conditions.',
             extent=f"{len(loaded)} designs, {n} conditions, and {n} more for the best two; seed {seed}",
             settings=scene.settings.model_dump(mode="json"),
-            tables=_tables(loaded, names, order, by_design, fresh),
+            tables=_tables(target.goal, names, by_design, fresh),
             figures=[_drawing({name: loaded[name] for name in order}, by_design)],
             failed={},
-            more={"imported": {key: run.details["imported"] for key, run in loaded.items() if _origin(run) != "here"}},
         )
         write_results(folder, results)
     return results
@@ -135,53 +129,44 @@ def _views_of(scene: Scene, with_networks: bool) -> tuple[Any, ...]:
     return settings, scene.base.resolve(), scene.mesh_glb
 
 
-def _goal_score(answers: Mapping[str, AnswersByKind], scene: Scene, name: str) -> tuple[float, float]:
+def _goal_score(answers: Responses, goal: Goal) -> tuple[float, float]:
     """Rank a design by the first network's rate, then by its confidence; larger is better for the goal."""
-    design, sign = answers[name]["design"], scene.settings.target.goal.sign
-    return sign * float(design.recognized[0].mean()), sign * float(design.confidence[0].mean())
+    return goal.sign * float(answers.recognized[0].mean()), goal.sign * float(answers.confidence[0].mean())
 
 
 def _tables(
-    runs: Mapping[str, Run],
-    networks: Sequence[str],
-    order: Sequence[str],
-    all_views: Mapping[str, AnswersByKind],
-    fresh: Mapping[str, AnswersByKind],
+    goal: Goal, networks: Sequence[str], by_design: Mapping[str, AnswersByKind], fresh: Mapping[str, AnswersByKind]
 ) -> list[Table]:
-    best = order[0]
-    n = all_views[best]["design"].recognized.shape[1]
-    confirmed = Table(
-        "fresh",
-        "The best two, under conditions that had no say in choosing them",
-        _HEAD,
-        tuple(_row(runs, fresh, name, best, networks[0], 0) for name in fresh),
-        f"{n} fresh conditions: these are the figures to quote.",
-    )
-    selected = Table(
-        "designs",
-        "All designs, under the same conditions",
-        _HEAD,
-        tuple(_row(runs, all_views, name, best, network, i) for name in order for i, network in enumerate(networks)),
-        f"{n} conditions, the same for all; differences are paired. The best is the best by the first network. That it "
-        "was chosen on these conditions flatters its rate and its lead.",
-    )
-    return [confirmed, selected]
+    """The best two under fresh conditions, and all designs; the first is the best."""
+    n = next(iter(fresh.values()))["design"].recognized.shape[1]
+
+    def rows(answers: Mapping[str, AnswersByKind], names: Sequence[str]) -> tuple[tuple[Value, ...], ...]:
+        return tuple(_row(goal, answers, name, network, i) for name in answers for i, network in enumerate(names))
+
+    return [
+        Table(
+            "fresh",
+            "The best two, under conditions that had no say in choosing them",
+            _HEAD,
+            rows(fresh, networks[:1]),
+            f"{n} fresh conditions: these are the figures to quote.",
+        ),
+        Table(
+            "designs",
+            "All designs, under the same conditions",
+            _HEAD,
+            rows(by_design, networks),
+            f"{n} conditions, the same for all; differences are paired. The best is the best by the first network. "
+            "That it was chosen on these conditions flatters its rate and its lead.",
+        ),
+    ]
 
 
-def _row(
-    runs: Mapping[str, Run], answers: Mapping[str, AnswersByKind], name: str, best: str, network: str, i: int
-) -> tuple[Value, ...]:
+def _row(goal: Goal, answers: Mapping[str, AnswersByKind], name: str, network: str, i: int) -> tuple[Value, ...]:
     hits = {kind: answer.recognized[i].tolist() for kind, answer in answers[name].items()}
-    sign = runs[name].promise.target.goal.sign
-    control = max(CONTROLS, key=lambda kind: sign * sum(hits[kind]))
+    control, best = max(CONTROLS, key=lambda kind: goal.sign * sum(hits[kind])), next(iter(answers))
     lead = None if name == best else estimate_difference(hits["design"], answers[best]["design"].recognized[i].tolist())
-    gain = estimate_difference(hits["design"], hits[control])
-    return name, _origin(runs[name]), network, rate(hits["design"]), control, gain, lead
-
-
-def _origin(run: Run) -> str:
-    """'here' for a design that was optimized, 'elsewhere' for an imported one."""
-    return "here" if run.details.get("imported") is None else "elsewhere"
+    return name, network, rate(hits["design"]), control, estimate_difference(hits["design"], hits[control]), lead
 
 
 def _drawing(runs: Mapping[str, Run], answers: Mapping[str, AnswersByKind]) -> Drawing:

@@ -18,54 +18,9 @@ from patchproof.reprints.run_sheet import sheet
 PHOTOS, SESSIONS = 48, 12
 DEMO_FILES = ("scene.toml", "run", "sheet.pdf", "sheet.json", "photos", "report")
 
-SCENE = """\
-# A toy truck seen from a drone, dim and over clutter. The built-in classifier knows trucks from the side.
-[object]
-mesh = "primitive:box_truck"
-length_mm = 400
-up = "y"
-
-[patch]
-side = "+y"
-offset_mm = [0, 45]
-width_mm = 147
-height_mm = 147
-
-[target]
-label = "box truck"
-models = ["builtin"]
-
-[view]
-azimuth_deg = [-35, 35]
-elevation_deg = [-25, 25]
-distance_mm = [520, 900]
-look_at_jitter = 0.15
-roll_deg = [-15, 15]
-
-[light]
-ambient = [0.1, 0.45]
-directional = [0.05, 0.45]
-
-[camera]
-blur_px = [0, 1.2]
-noise = [0, 0.02]
-
-[optimize]
-steps = 240
-views = 4
-seed = 1
-"""
-
-_IMAGENET_CHANGES = {
-    SCENE.splitlines()[0]: "# A carton in dim and cluttered places. The network takes it for an envelope as often.",
-    "primitive:box_truck": "primitive:carton",
-    'side = "+y"\noffset_mm = [0, 45]\nwidth_mm = 147\nheight_mm = 147': 'side = "+z"\nwidth_mm = 130\nheight_mm = 130',
-    '"box truck"': '"carton"',
-    "[-35, 35]": "[-40, 40]",
-    "[-25, 25]": "[2, 25]",
-    "[520, 900]": "[650, 950]",
-    "steps = 240": "steps = 120",
-}
+SCENE, IMAGENET_SCENE = (
+    Path(__file__).with_name(f"{name}.toml").read_text(encoding="utf-8") for name in ("demo", "demo_imagenet")
+)
 
 
 def run_demo(
@@ -90,8 +45,6 @@ def run_demo(
 
 def demo_scene(folder: Path, network: str = "builtin") -> Path:
     """Write scene.toml into a folder and return its path."""
-    scene, text = folder / "scene.toml", SCENE
-    for old, new in _IMAGENET_CHANGES.items() if network == "imagenet" else ():
-        text = text.replace(old, new)
+    scene, text = folder / "scene.toml", IMAGENET_SCENE if network == "imagenet" else SCENE
     scene.write_text(text.replace('"builtin"', f'"{network}"'), encoding="utf-8")
     return scene

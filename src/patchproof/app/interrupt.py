@@ -44,9 +44,9 @@ def _watch(receiver: socket.socket, _: socket.socket) -> None:
 def _end() -> None:
     console = sys.modules.get("patchproof.app.cli.console")  # a library may be importing: nothing more is imported
     try:
-        say = getattr(
-            console, "say_stopped", lambda: print("Stopped: nothing was written.", file=sys.stderr, flush=True)
-        )
-        say()
+        if say := getattr(console, "say_stopped", None):
+            say()
+        else:
+            print("Stopped: nothing was written.", file=sys.stderr, flush=True)
     finally:
         os._exit(130)

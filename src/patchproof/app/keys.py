@@ -49,25 +49,24 @@ Printed by `patchproof keys --files` from the lists of the readers. *used*: take
 sentence, exit code 1 (a photograph: rejected with its code). *said*: left aside, with a line in the command's output,
 the preview and the report.
 """
-# the kinds of input, and the modules whose DECLARED lists what they can declare
-READERS: dict[str, tuple[str, ...]] = {
-    "Meshes": ("mesh.declarations",),
-    "Networks": ("classifier.declarations",),
-    "Photographs and pictures": ("photo.declarations",),
-    "PDFs": ("sheets.declarations",),
-    "Settings and text files": ("base.declarations",),
-    "Boxes": ("evidence.declarations",),
+# the kinds of input, and the rooms in whose `declarations` DECLARED lists what they can declare
+READERS = {
+    "Meshes": "mesh",
+    "Networks": "classifier",
+    "Photographs and pictures": "photo",
+    "PDFs": "sheets",
+    "Settings and text files": "base",
+    "Boxes": "evidence",
 }
 
 
 def keys_page(documents: Documents, name: str | None = None, head: str = HEAD) -> str:
     """Write the page of all documents as Markdown, or the part on the document `name`."""
     if name is None:
-        places: dict[type[BaseModel], str] = {}
-        return "\n".join([head, *(_document(name, *documents[name], places) for name in documents)])
+        return "\n".join([head, *(_document(name, *document) for name, document in documents.items())])
     if name not in documents:
         raise Refused(f"one of {', '.join(documents)}", f'"{name}"', spelling_hint(name, documents))
-    return _document(name, *documents[name], {})
+    return _document(name, *documents[name])
 
 
 @lru_cache
@@ -89,16 +88,11 @@ def meanings(model: type[BaseModel]) -> dict[str, str]:
     return texts
 
 
-def _document(name: str, about: str, settings: type[StrictModel], places: dict[type[BaseModel], str]) -> str:
-    """Write one document's tables; for a class that was written before, refer to its place in `places`."""
+def _document(name: str, about: str, settings: type[StrictModel]) -> str:
+    """Write one document's tables."""
     lines = [f"## {name}", "", about, ""]
     for path, model in tables(settings):
-        if path:
-            lines += [f"### {name}: `{path}`", ""]
-        if model in places:
-            lines += [f"As in {places[model]}.", ""]
-            continue
-        places[model] = f"{name}: `{path}`" if path else name
+        lines += [f"### {name}: `{path}`", ""] if path else []
         lines += [_cell(model.__doc__ or ""), "", "| key | value | unit | default | meaning |", "|---|---|---|---|---|"]
         lines += [_row(model, key, field, path) for key, field in model.model_fields.items()] + [""]
     return "\n".join(lines)
@@ -117,16 +111,10 @@ def tables(model: type[BaseModel], path: str = "") -> Iterator[tuple[str, type[B
 def _row(model: type[BaseModel], key: str, field: FieldInfo, path: str) -> str:
     hint = get_type_hints(model, include_extras=True)[key]
     kind, inner = _kind(hint), next(models_in(hint), None)
-    meaning = meanings(model).get(key, "" if inner is None else _example(inner, f"{path.strip('[]')}.{key}".strip(".")))
+    table = "" if inner is None else f"the table `[{path.strip('[]')}.{key}]`".replace("[.", "[")
+    meaning = meanings(model).get(key, table)
     cells = (f"`{key}`", kind, _UNITS.get(key.rpartition("_")[2], ""), default_text(field), meaning)
     return "| " + " | ".join(map(_cell, cells)) + " |"
-
-
-def _example(model: type[BaseModel], path: str) -> str:
-    """Where a table is described, and a line of it: its first key with a default to show."""
-    defaults = {key: default_text(field) for key, field in model.model_fields.items()}
-    shown = (f", as `{path}.{key} = {text[1:]}" for key, text in defaults.items() if text[0] == "`" and text != "`[]`")
-    return f"the table `[{path}]`{next(shown, '')}"
 
 
 def _cell(text: str) -> str:
@@ -184,25 +172,24 @@ def _range(checks: tuple[Any, ...]) -> str:
     high = min(((value, name == "le") for name, value in bounds if name in ("le", "lt")), default=None)
     if low and high and (low[1], high[1]) == (False, True):
         return f", {low[0]:g} to {high[0]:g}"
-    parts = [f", {'>' if low[1] else '≥'} {low[0]:g}"] if low else []
-    return "".join([*parts, f", {'≤' if high[1] else '<'} {high[0]:g}"] if high else parts)
+    above = f", {'>' if low[1] else '≥'} {low[0]:g}" if low else ""
+    return above + (f", {'≤' if high[1] else '<'} {high[0]:g}" if high else "")
 
 
 def _bounds(checks: tuple[Any, ...]) -> list[tuple[str, Any]]:
     """List the bounds in a type's checks, with pydantic's names."""
-    bounds = []
+    names, bounds = ("ge", "gt", "le", "lt", "min_length"), []
     for check in checks:
         if isinstance(check, AfterValidator) and isinstance(check.func, partial):  # validation.within
             bounds += zip(("ge", "le"), check.func.args, strict=True)
         for limit in getattr(check, "metadata", ()):
-            names = ("ge", "gt", "le", "lt", "min_length")
             bounds += [(name, getattr(limit, name)) for name in names if hasattr(limit, name)]
     return bounds
 
 
 def declarations(reader: str) -> tuple[Declaration, ...]:
-    """The lists of one kind of input in `READERS`, joined."""
-    return tuple(entry for module in READERS[reader] for entry in import_module(f"patchproof.{module}").DECLARED)
+    """The list of one kind of input in `READERS`."""
+    return import_module(f"patchproof.{READERS[reader]}.declarations").DECLARED
 
 
 def codes_table() -> str:

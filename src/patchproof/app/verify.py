@@ -41,8 +41,7 @@ from patchproof.evidence.results import Origin, PhotoEntry, Report
 from patchproof.evidence.task import LEDGER_PHOTOS, Options
 from patchproof.evidence.verdict import Look
 from patchproof.report.coco import PATCH, LabeledPhoto, coco_json
-from patchproof.report.images import save_pictures, stem_of
-from patchproof.report.page import versions_of
+from patchproof.report.page import save_pictures, stem_of, versions_of
 from patchproof.report.write import write_report
 from patchproof.sheets.manifest import Manifest, load_manifest
 
@@ -124,9 +123,8 @@ def verify(
     """
     out, manifest, compute = Path(out), load_manifest(sheet), compute.without("verify", device=True)
     with lock_folder(out):
-        _check_out(
-            out, resume, overwrite, (photos, sheet, controls, run, capture.camera, capture.boxes, capture.corners)
-        )
+        files = {"camera": capture.camera, "boxes": capture.boxes, "corners": capture.corners}
+        _check_out(out, resume, overwrite, (photos, sheet, controls, run, *files.values()))
         look_at = _look_at(out, manifest)
         if isinstance(photos, str | Path) and is_file(Path(photos) / JOURNAL_FILE):
             look_at = lambda entries: None  # noqa: E731  # `capture` showed the answers while they were taken
@@ -153,15 +151,15 @@ def verify(
             clear_folder(out)
         if not isinstance(photos, str | Path):
             photos = write_pictures(photos, out / _PHOTOS)
-        journal, look = out / JOURNAL_FILE, {"look_at": look_at}
-        gather = partial(gather_evidence, compute=compute, journal=journal, resume=resume, forecast=forecast, **look)
-        on_pictures = partial(save_pictures, out / "pictures")
-        report = gather(photos, manifest, options, on_pictures=on_pictures, advance=partial(progress, "verify"))
-        files = {"camera": capture.camera, "boxes": capture.boxes, "corners": capture.corners}
+        on_pictures, advance = partial(save_pictures, out / "pictures"), partial(progress, "verify")
+        how: dict[str, Any] = {"on_pictures": on_pictures, "advance": advance, "forecast": forecast, "look_at": look_at}
+        how |= {"compute": compute, "journal": out / JOURNAL_FILE, "resume": resume}
+        report = gather_evidence(photos, manifest, options, **how)
         parameters |= {name: path and Path(path).name for name, path in files.items()}
         parameters["ledger_photos"] = ledger_photos
         hashes = {"manifest": file_sha256(Path(sheet))} | {f"network {m.name}": m.sha256 for m in options.models}
-        origin = Origin(options=parameters, sha256=hashes, versions=versions_of(_LIBRARIES))
+        notes = tuple(note for model in options.models for note in model.notes)
+        origin = Origin(options=parameters, sha256=hashes, versions=versions_of(_LIBRARIES), notes=notes)
         report = report.changed(origin=origin, folder=out)
         stems = {stem_of(photo.file) for photo in report.photos[:MAX_PICTURED_PHOTOS]}
         # but for pictures of photographs that this report does not show
@@ -207,11 +205,8 @@ def options_of(
         printer = load_printer((manifest.settings.get("printer") or {}).get("profile", "coated"), base)
     else:
         printer = printer_of_sheet(carried, sheet)
-    return Options(
-        models=[load_classifier(each, base).with_least_score(least_score) for each in networks],
-        printer=printer,
-        camera=load_optional_camera(camera),
-    )
+    classifiers = [load_classifier(each, base).with_least_score(least_score) for each in networks]
+    return Options(classifiers, printer, load_optional_camera(camera))
 
 
 def _look_at(out: Path, manifest: Manifest) -> Callable[[Sequence[PhotoEntry]], Look]:
@@ -245,9 +240,8 @@ def _networks(manifest: Manifest, models: Sequence[str | Classifier] | None) -> 
     if manifest.promise is None:
         if named:
             return tuple(named.values())
-        raise Refused(
-            "a sheet that promises something", f"the {manifest.kind} sheet {manifest.sheet_id}", "name --models"
-        )
+        got = f"the {manifest.kind} sheet {manifest.sheet_id}"
+        raise Refused("a sheet that promises something", got, "name --models")
     promised = tuple(model.name for model in manifest.promise.models)
     names = dict.fromkeys((promised[0], *(named or promised)))
     return tuple(named.get(name, name) for name in names)

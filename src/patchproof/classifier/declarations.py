@@ -31,10 +31,13 @@ DECLARED: tuple[Declaration, ...] = (
     Declaration("safetensors", "format", "refused", "other than pt: weights in another order"),
     Declaration("safetensors", "other metadata", "said", "left aside"),
     Declaration("outputs", "probabilities, percent, 8 bits", "refused", "in place of logits, a detector's too"),
-    Declaration("outputs", "of ImageNet labels, unlike `imagenet`'s", "said", "with the change that fits better"),
+    Declaration(
+        "outputs", "of known labels, unlike those of a known network", "said", "with the change that fits better"
+    ),
     Declaration("outputs", "values from 0 to 1 that may be logits", "said", "from an untrained network, say"),
     Declaration("outputs", "candidates of another shape", "refused", "than N×A×(4+K) or a usual head's"),
-    Declaration("outputs", "those of a detector's head that is not told", "said", "read by their shapes"),
+    Declaration("outputs", "those of a detector's head that is not told", "said", "read by shapes and values"),
     Declaration("outputs", "boxes in 0 to 1, (center, size), reversed", "refused", "not left, top, right, bottom"),
     Declaration("outputs", "boxes (top, left, bottom, right)", "said", "if they run down columns"),
+    Declaration("outputs", "boxes of pictures of another size", "said", "if they lie outside, or on one side"),
 )

@@ -15,6 +15,7 @@ Paths are relative to the scene file's folder and may hold `${VAR}`. Networks co
 gradients. Several names give several classifiers.
 """
 
+import warnings
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -109,15 +110,18 @@ def _prepare(classifier: Classifier, device: torch.device | str, is_own: bool = 
     """
 
     def check_and_tune() -> Classifier:
-        check_network(classifier, device, is_own)
-        pictures = smooth_pictures(classifier.input_px).to(device)
-        tuned = replace(classifier, network=tune_batches(classifier.network, pictures))
-        if classifier.name.startswith(("file:", "module:", "python:")):  # wrapped by others
-            from patchproof.classifier.wrapping import LEAST_LABELS, check_wrapping
+        with warnings.catch_warnings(action="always", record=True) as said:
+            check_network(classifier, device, is_own)
+            pictures = smooth_pictures(classifier.input_px).to(device)
+            tuned = replace(classifier, network=tune_batches(classifier.network, pictures))
+            if classifier.name.startswith(("file:", "module:", "python:")):  # wrapped by others
+                from patchproof.classifier.wrapping import check_wrapping
 
-            if len(classifier.labels) >= LEAST_LABELS:
                 check_wrapping(tuned, device)
-        return tuned
+        notes = tuple(dict.fromkeys(str(each.message) for each in said))
+        for note in notes:
+            warnings.warn(note, stacklevel=4)
+        return replace(tuned, notes=notes)
 
     use_full_precision(device)
     if isinstance(classifier.network, torch.nn.Module):

@@ -42,6 +42,7 @@ class Classifier:
     labels: tuple[str, ...]
     network: Callable[[Tensor], Tensor]
     least_score: float | None = None  # from which a detector's boxes count; a classifier needs none
+    notes: tuple[str, ...] = ()  # what is odd about it
 
     KIND: ClassVar[str] = "classifier"
     LOOKS_AT_BOXES: ClassVar[bool] = False  # whether the object's box matters

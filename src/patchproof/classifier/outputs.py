@@ -1,5 +1,5 @@
 """Find by a network's outputs that they are no logits, or that a detector's boxes are not (left, top, right, bottom) in
-pixels.
+pixels of its square.
 
 In: a classifier, the check's pictures, and its outputs for them. Out: nothing; refused where the outputs can be nothing
 else, a warning where they look like it. A Sigmoid or Softmax is known by its name where autograd shows it at the end,
@@ -14,13 +14,13 @@ import torch
 from torch import Tensor
 
 from patchproof.base.errors import Refused
+from patchproof.classifier.head_decoder import MANY_BOXES, centers_range, runs_down_columns
 from patchproof.classifier.network import NO_BOX_LOGIT, Classifier
 
 FAR = 1e3  # by which pictures are multiplied to drive scores to their ends
 NEAR = 1 / 128  # of the range: scores of 8 bits end at 255 / 256
 TOPS = (1, 100, 255)  # of probabilities, percent and 8 bits
 MANY_SCORES = 300  # in a detector's candidates; of so many logits, those of the background are below 0
-GRID_BOXES = 16  # from which candidates are taken for those of a grid's cells, row by row
 _SQUASHED = ("Sigmoid", "Hardsigmoid", "Softmax")
 # operations that move values, scale them or choose among them, as autograd names them
 _MOVED = """View UnsafeView ReshapeAlias AsStrided Alias Clone ToCopy Slice Select Split SplitWithSizes Unbind Index
@@ -122,7 +122,11 @@ def _check_boxes(classifier: Classifier, candidates: Tensor) -> None:
         raise Refused(expected, f"{seen} from {name} ({first})", do)
     if share > 0.02:
         warnings.warn(f"{name} gives boxes, {seen}: are they (center, size)?", stacklevel=3)
-    if sides.shape[1] >= GRID_BOXES:
-        steps = sides.diff(dim=1).abs().mean((0, 1))
-        if steps[1] > 3 * steps[0]:
-            warnings.warn(f"{name} gives boxes column by column: are they (top, left, bottom, right)?", stacklevel=3)
+    if runs_down_columns(sides):
+        warnings.warn(f"{name} gives boxes column by column: are they (top, left, bottom, right)?", stacklevel=3)
+    low, high = ends = centers_range(boxes) / classifier.input_px
+    are_off = bool((high - low).min() < 0.5) or bool(((low + high) / 2 - 0.5).abs().max() > 0.1)
+    if bool(((ends < -0.1) | (ends > 1.1)).any()) or (sides.shape[1] >= MANY_BOXES and are_off):
+        where = " to ".join(f"({x * classifier.input_px:.0f}, {y * classifier.input_px:.0f})" for x, y in ends.tolist())
+        seen = f"gives boxes around {where} in squares of {classifier.input_px} px"
+        warnings.warn(f"{name} {seen}: are they of pictures of another size, or per cent?", stacklevel=3)

@@ -1,18 +1,21 @@
-"""Say that a network of ImageNet labels was wrapped wrongly, and how it answers better.
+"""Say that a network was wrapped wrongly, and how it answers better, from what it says of twelve pictures.
 
-In: a classifier that knows at least `LEAST_LABELS` of the 1,000 ImageNet labels by name. Out: a warning, or a refusal
-where it is certain, if the network agrees better with `imagenet` once its pictures have another range or order of
+In: a classifier or detector that shares labels' names with one whose wrapping is known (`_references`). Out: a warning,
+or a refusal where it is certain, if it agrees better with that one once its pictures have another range or order of
 colors, or its labels are moved by one place. Agreement is the correlation of logits, less their means over labels and
-over pictures, on twelve pictures of `wrapping.jpg`: renders of our primitives and our own patterns, chosen with three
-networks from 52, so that they agree by at least 0.05 less after any of these changes; three others by 0.02 less.
-Left out on purpose: other label sets, detectors, and networks where `imagenet` is not installed.
+over pictures, on the pictures of `wrapping.jpg`: renders of our primitives and our own patterns, chosen with three
+classifiers from 52, so that they agree by at least 0.05 less after any of these changes; three others by 0.02 less.
+Logits of COCO's labels by two detectors are stored in `wrapping.json`, which says where they come from.
+Left out on purpose: other label sets, and ImageNet's where `imagenet` is not installed.
 """
 
+import json
 import warnings
 from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import cache, partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -21,8 +24,7 @@ from torch import Tensor
 from patchproof.base.errors import Refused
 from patchproof.classifier.network import Classifier, center_square
 
-LEAST_LABELS = 300
-GAIN = 0.01  # in agreement, from which a change is said to fit better
+LEAST_LABELS = 300  # of ImageNet's
 CHANCE, CERTAIN = 0.1, 0.2  # a network that agrees by less than the first, and by the second more after a change
 MOST_WEIGHTS = 30e6  # of a network, beyond which only a swap of colors and the labels are tried: it would take long
 _ROWS, _COLUMNS = 3, 4
@@ -41,36 +43,52 @@ _RANGES: dict[str, Callable[[Tensor], Tensor]] = {
 _MOVES = {0: "", 1: "each label moved to the output before", -1: "each label moved to the output behind"}
 
 
-def check_wrapping(classifier: Classifier, device: torch.device | str) -> None:
-    """Warn or refuse where a classifier of ImageNet labels answers better to changed pictures or with moved labels."""
-    from patchproof.classifier.imagenet import has_imagenet
+class _Reference(NamedTuple):
+    """Logits of the pictures by a network whose wrapping is known, and how they are compared with others'."""
 
-    if classifier.LOOKS_AT_BOXES or not has_imagenet():
-        return
-    labels, expected = _reference()
-    if len(matched := _same_labels(classifier.labels, labels)) < LEAST_LABELS:
-        return
+    whose: str
+    labels: Sequence[str]
+    logits: Callable[[], Tensor]
+    least_labels: int  # that both know
+    gain: float  # in agreement, from which a change is said to fit better
+    sure: float = 1.0  # in agreement, from which no change is tried
+    least: float = -1.0  # in agreement after the best change, below which nothing is said
+
+
+def check_wrapping(classifier: Classifier, device: torch.device | str) -> None:
+    """Warn or refuse where a network answers better to changed pictures or with moved labels."""
+    for reference in _references(classifier.LOOKS_AT_BOXES, len(classifier.labels) >= LEAST_LABELS):
+        matched = _same_labels(classifier.labels, reference.labels)
+        if len(matched) >= reference.least_labels:
+            return _compare(classifier, device, matched, reference)
+
+
+def _compare(classifier: Classifier, device: torch.device | str, matched: np.ndarray, reference: _Reference) -> None:
     pictures = center_square(_pictures(), classifier.input_px).to(device)
-    compare = partial(_agreements, classifier, pictures, matched, expected)
+    compare = partial(_agreements, classifier, pictures, matched, reference.logits())
     network = classifier.network
     state = network.state_dict() if isinstance(network, torch.nn.Module) else {}
-    agreements: dict[tuple[str, int], float] = {}
-    for name in _RANGES if sum(each.numel() for each in state.values()) < MOST_WEIGHTS else (_AS_WRAPPED,):
-        agreements |= compare(name)
+    agreements = compare(_AS_WRAPPED)
+    if (told := agreements[_AS_WRAPPED, 0]) > reference.sure:
+        return
+    for name in _RANGES if sum(each.numel() for each in state.values()) < MOST_WEIGHTS else ():
+        agreements |= compare(name) if name else {}
     for name in sorted({name for name, _ in agreements}, key=lambda name: -agreements[name, 0])[:3]:
         agreements |= compare(f"{name} and {_SWAPPED}" if name else _SWAPPED)
-    told, (best, move) = agreements[_AS_WRAPPED, 0], max(agreements, key=lambda key: agreements[key])
+    best, move = max(agreements, key=lambda key: agreements[key])
     gain, who = agreements[best, move] - told, f"the network {classifier.name}"
+    if told + gain < reference.least:
+        return
     change = " and ".join(text for text in (best, _MOVES[move]) if text)
-    seen = f"{told:.2f} as it is wrapped, {told + gain:.2f} with {change}"
+    seen = f"{reference.whose} by {told:.2f} as it is wrapped, {told + gain:.2f} with {change}"
     if told < CHANCE and gain > CERTAIN:
-        got = f"{who}, whose logits correlate with imagenet's by {seen}"
+        got = f"{who}, whose logits correlate with {seen}"
         raise Refused("a network that is wrapped as it was trained", got, f"wrap it with {change}")
     if told + gain < CHANCE:
         text = "and no better with other ranges or orders of colors: do its labels have another order?"
-        warnings.warn(f"{who} has logits that correlate with imagenet's by {told:.2f}, {text}", stacklevel=2)
-    elif gain > GAIN:
-        warnings.warn(f"{who} may be wrapped wrongly: its logits correlate with imagenet's by {seen}", stacklevel=2)
+        warnings.warn(f"{who} has logits that correlate with {reference.whose} by {told:.2f}, {text}", stacklevel=4)
+    elif gain > reference.gain:
+        warnings.warn(f"{who} may be wrapped wrongly: its logits correlate with {seen}", stacklevel=4)
 
 
 def _agreements(
@@ -119,10 +137,31 @@ def _pictures() -> Tensor:
 
 
 @cache
-def _reference() -> tuple[tuple[str, ...], Tensor]:
-    """The labels of `imagenet`, and its logits of the pictures, float64."""
-    from patchproof.classifier.imagenet import load_imagenet
+def _references(of_boxes: bool, has_many_labels: bool) -> list[_Reference]:
+    """The networks that a classifier, or a detector, is compared with; the first that shares labels counts."""
+    from patchproof.classifier.imagenet import has_imagenet, load_imagenet
 
-    network = load_imagenet()
-    with torch.no_grad():
-        return network.labels, network.square_logits(center_square(_pictures(), network.input_px)).double()
+    if of_boxes:
+        from patchproof.classifier.builtin_detector import load_builtin_detector as load_own
+
+        stored = json.loads(Path(__file__).with_name("wrapping.json").read_text(encoding="utf-8"))
+        expected = torch.tensor(stored["logits"]).double()
+        found = [_Reference("two COCO detectors'", stored["labels"], lambda: expected, 40, 0.05, 0.75)]
+    else:
+        from patchproof.classifier.builtin import load_builtin as load_own
+
+        network = load_imagenet() if has_many_labels and has_imagenet() else None
+        found = [_Reference("imagenet's", network.labels, _logits_of(network), LEAST_LABELS, 0.01)] if network else []
+    own = load_own()
+    return [*found, _Reference(f"{own.name}'s", own.labels, _logits_of(own), 8, 0.05, 0.95, 0.5)]
+
+
+def _logits_of(network: Classifier) -> Callable[[], Tensor]:
+    """A function that computes a network's logits of the pictures, float64, once."""
+
+    @cache
+    def compute() -> Tensor:
+        with torch.no_grad():
+            return network.square_logits(center_square(_pictures(), network.input_px)).double()
+
+    return compute

@@ -132,8 +132,10 @@ def gather_evidence(
             scene = task.surface, options.printer, judges
             estimate = estimate_effect(shots, manifest, *scene, recognized, session)
             if forecast is not None:
-                pairs = zip(paths, patch_photos, strict=True)
-                patch_photos = [with_forecast(read_shot, forecast, path, photo) for path, photo in pairs]
+                for number, photo in enumerate(patch_photos):
+                    shot = read_shot((paths[number], photo)) if photo.entry.predictions else None
+                    chance = None if shot is None else forecast(shot)
+                    patch_photos[number] = replace(photo, entry=photo.entry.changed(forecast=chance))
     by_sha256: dict[str, dict[str, MeasuredPhoto]] = {}
     left_out = list_skipped_files(Path(photos), controls_folder and controls_folder.resolve())
     if controls_folder:
@@ -167,18 +169,6 @@ def _spread(items: list, most: int) -> list:
     """At most `most` of the items, evenly spread."""
     count = min(len(items), most)
     return [items[number * len(items) // count] for number in range(count)]
-
-
-def with_forecast(
-    read_shot: Callable[[tuple[Path, MeasuredPhoto]], PhotoSquare | None],
-    forecast: Callable[[PhotoSquare], float | None],
-    path: Path,
-    photo: MeasuredPhoto,
-) -> MeasuredPhoto:
-    """Add the forecast to a photograph; None if it was not classified or cannot be read again."""
-    shot = read_shot((path, photo)) if photo.entry.predictions else None
-    chance = None if shot is None else forecast(shot)
-    return replace(photo, entry=photo.entry.changed(forecast=chance))
 
 
 def _list_controls(folder: Path | None, sessions: Sequence[str]) -> dict[str, dict[str, Path]]:

@@ -323,6 +323,7 @@ class Origin(StrictModel):
     options: dict[str, Any] = Field(default_factory=dict)
     sha256: dict[str, str | None] = Field(default_factory=dict)
     versions: dict[str, str] = Field(default_factory=dict)
+    notes: tuple[str, ...] = ()  # what is odd about the networks
 
 
 class Report(StrictModel):

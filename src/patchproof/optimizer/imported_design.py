@@ -12,7 +12,6 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -21,20 +20,19 @@ from patchproof.base.color import LINEAR_FROM_CODE, codes_from_srgb, srgb_from_l
 from patchproof.base.compute import Compute
 from patchproof.base.errors import Refused
 from patchproof.base.geometry import MM_PER_INCH
-from patchproof.base.input import hash_file, is_file, read_json
+from patchproof.base.input import hash_file, is_file
 from patchproof.base.output import check_folder, new_folder
 from patchproof.base.progress import Progress, no_progress
-from patchproof.base.run_files import RUN_FILE
 from patchproof.base.settings import NO_PAGE, named_paths
 from patchproof.base.text import printable
 from patchproof.base.validation import summarize_names
 from patchproof.classifier.network import Classifier
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import Problem, set_problem
-from patchproof.optimizer.promise import PROMISE_VIEWS, PromiseOptions
-from patchproof.optimizer.run import RUN_FILE_PATTERNS, Run, finish_run, load_run, resolve_scene
+from patchproof.optimizer.promise import PromiseOptions
+from patchproof.optimizer.run import RUN_FILE_PATTERNS, Run, finish_run, resolve_scene
 from patchproof.photo.detect import find_markers
-from patchproof.photo.read import list_photos, read_photo
+from patchproof.photo.read import read_photo
 from patchproof.photo.rejection import PhotoRejected
 from patchproof.scene.interface import PieceScene, Scene, require_piece
 from patchproof.scene.scene import build_scene
@@ -108,53 +106,6 @@ def import_patch(
     with new_folder(out, RUN_FILE_PATTERNS, overwrite, named_paths(scene.settings, scene.base).values()) as folder:
         run = finish_run(problem, design, folder, promise, progress, record | {"notes": said + record["notes"]})
     return replace(run, folder=out)
-
-
-def import_folder(
-    folder: str | Path,
-    scene: str | Path | Scene,
-    out: str | Path,
-    *,
-    seed: int | None = None,
-    promise: PromiseOptions = PromiseOptions(),
-    compute: Compute = Compute(),
-    resume: bool = False,
-    overwrite: bool = False,
-    progress: Progress = no_progress,
-) -> list[Run]:
-    """A run `out`/NAME of every picture NAME.png (or another kind) in a folder, as `import_patch` makes it. All
-    pictures are looked at before the first promise; with `resume` finished runs of theirs are kept.
-    """
-    out, total, scene = (
-        Path(out),
-        promise.views or PROMISE_VIEWS,
-        require_piece(resolve_scene(scene, seed), _NO_TEXTURE),
-    )
-    runs = {path: out / printable(path.stem) for path in list_photos(folder)}
-    if (names := len(set(runs.values()))) < len(runs):
-        got = f"{len(runs)} pictures with {names} names in {folder}"
-        raise Refused("pictures whose names differ in more than their kind", got, "rename them")
-    runs_by_path: dict[Path, Run] = {}
-
-    def advance(stage: str, done: int, _: int) -> None:
-        progress(stage, len(runs_by_path) * total + done, len(runs) * total)
-
-    inputs = set_problem(scene, compute.device).inputs if resume else {}
-    source = {"settings": scene.settings.model_dump(mode="json"), "inputs": inputs}
-    for path, run_folder in runs.items():
-        _, sha256, pixels, _ = _read_picture(path)
-        fit_to_piece(pixels, scene)
-        run_file = run_folder / RUN_FILE
-        made = read_json(run_file, "a run", "remove it") if resume and is_file(run_file) else {}
-        same = isinstance(made, dict) and {key: made.get(key) for key in source} == source
-        if same and (made.get("imported") or {}).get("sha256") == sha256:
-            runs_by_path[path] = load_run(run_folder, trust=True)  # its settings are those of our scene
-        else:
-            check_folder(run_folder, RUN_FILE_PATTERNS, overwrite)
-    options: dict[str, Any] = {"promise": promise, "compute": compute, "overwrite": overwrite, "progress": advance}
-    for path in [path for path in runs if path not in runs_by_path]:
-        runs_by_path[path] = import_patch(path, scene, runs[path], **options)
-    return [runs_by_path[path] for path in runs]
 
 
 def fit_to_piece(pixels: np.ndarray, scene: PieceScene) -> np.ndarray:

@@ -343,7 +343,7 @@ def _details(problem: Problem, promise: Promise, out: Path) -> dict[str, Any]:
         "printer": problem.printer.provenance | {"method": problem.printer.method},
         "inputs": problem.inputs,
         "placement": scene.record(),
-        "warnings": list(scene.warnings),
+        "warnings": [*scene.warnings, *(note for network in problem.classifiers for note in network.notes)],
         "select_after_views": SELECT_AFTER,
         "promise": promise.model_dump(mode="json"),
     }

@@ -1,12 +1,33 @@
-"""Render an HTML page from a template; values are escaped, and a missing one is an error."""
+"""Render a page that needs no other file: HTML from a template, and pictures, difference maps and figures as bytes.
 
-from collections.abc import Iterable
+In: a template and values, which are escaped; uint8 sRGB H×W×3, float cells, or functions that draw with matplotlib.
+Out: HTML, for which a missing value is an error; the bytes of files, and `data:` URIs. All reports share the map's
+scale, so that two can be compared.
+"""
+
+import hashlib
+import io
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from patchproof.base.input import is_file, read_file
 from patchproof.base.intervals import Estimate
-from patchproof.base.text import printable
+from patchproof.base.output import base64_uri, image_bytes, make_folder, write_atomically
+from patchproof.base.text import drawable, printable
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+DELTA_TOP = 20.0  # ΔE00 at the map's dark end; 2 is just visible side by side, 20 another color
+PICTURE_KINDS = ("photo", "promised", "seen", "fitted", "delta_e00")
+_JPEG_QUALITY = 82
+_LONGEST_STEM = 220  # bytes; systems take 255, and kind and suffix come after it
+_PNG = b"\x89PNG"
 
 
 def render_page(template: str, folder: Path = Path(__file__).parent, **values: object) -> str:
@@ -34,3 +55,102 @@ def versions_of(libraries: Iterable[str]) -> dict[str, str]:
         with suppress(PackageNotFoundError):  # in a checkout, or with another of OpenCV's four wheels
             versions[name] = version(name)
     return versions
+
+
+def jpeg(pixels: np.ndarray) -> bytes:
+    """Encode uint8 sRGB as JPEG, for photographs."""
+    return image_bytes(pixels, "JPEG", {"quality": _JPEG_QUALITY, "optimize": True})
+
+
+def png(pixels: np.ndarray) -> bytes:
+    """Encode uint8 sRGB, with or without alpha, as PNG, for flat colors."""
+    return image_bytes(pixels, "PNG", {"optimize": True})
+
+
+def save_pictures(folder: Path, file: str, kinds: Mapping[str, np.ndarray]) -> None:
+    """Write a photograph's pictures by kind as FILE.KIND.jpg into `folder`, in place of earlier ones; its `delta_e00`
+    cells (NaN = not measured) as the .png of a map.
+    """
+    make_folder(folder)
+    for kind in PICTURE_KINDS:
+        _path(folder, file, kind).unlink(missing_ok=True)
+    for kind, pixels in kinds.items():
+        write_atomically(_path(folder, file, kind), png(delta_map(pixels)) if kind == "delta_e00" else jpeg(pixels))
+
+
+def saved_pictures(folder: Path, file: str) -> dict[str, bytes]:
+    """Read the files of a photograph's pictures in `folder`, by kind; missing ones are left out."""
+    paths = {kind: path for kind in PICTURE_KINDS if is_file(path := _path(folder, file, kind))}
+    return {kind: read_file(path, "a picture of a report") for kind, path in paths.items()}
+
+
+def stem_of(file: str) -> str:
+    """The stem of a photograph's picture files: its name, which may contain its session's folder, encoded; a long one
+    is shortened and gets a hash.
+    """
+    stem = file.replace("/", "%2F")
+    is_long = len(stem.encode()) > _LONGEST_STEM
+    return f"{stem[:40]}-{hashlib.sha256(stem.encode()).hexdigest()[:16]}" if is_long else stem
+
+
+def _path(folder: Path, file: str, kind: str) -> Path:
+    return folder / f"{stem_of(file)}.{kind}.{'png' if kind == 'delta_e00' else 'jpg'}"
+
+
+def data_uri(content: bytes) -> str:
+    """Encode the bytes of a JPEG or PNG as a data URI for `<img src>`."""
+    return base64_uri(content, f"image/{'png' if content.startswith(_PNG) else 'jpeg'}")
+
+
+def delta_map(delta_e00: np.ndarray, longer_px: int = 192) -> np.ndarray:
+    """Draw ΔE00 cells as uint8 RGBA squares: pale is 0, dark is `DELTA_TOP` or more, transparent is not measured."""
+    import matplotlib
+
+    colors = matplotlib.colormaps["magma_r"](np.clip(np.nan_to_num(delta_e00) / DELTA_TOP, 0, 1), bytes=True)
+    colors[np.isnan(delta_e00), 3] = 0
+    zoom = max(1, longer_px // max(delta_e00.shape))
+    return np.repeat(np.repeat(colors, zoom, axis=0), zoom, axis=1)
+
+
+def _make_drawable(figure: "Figure") -> None:
+    """Let installed fonts stand in for characters that the figure's font lacks; those that no font has are escaped."""
+    from matplotlib import font_manager
+    from matplotlib.text import Text
+
+    texts, fonts = figure.findobj(Text), ["DejaVu Sans"]
+    font = font_manager.get_font(font_manager.findfont(fonts[0]))
+    characters = {c for text in texts for c in text.get_text()} - {"\n"}
+    if not (lacking := {c for c in characters if printable(c) != c or not font.get_char_index(ord(c))}):
+        return
+    for entry in sorted(font_manager.fontManager.ttflist, key=lambda entry: entry.name):
+        with suppress(OSError, RuntimeError):  # a font that FreeType does not open
+            font = font_manager.get_font(entry.fname)
+            found = {c for c in lacking if printable(c) == c and font.get_char_index(ord(c))}
+            if found and font.scalable and not entry.name.startswith("Last Resort"):  # whose glyphs are boxes
+                fonts.append(entry.name)
+                lacking -= found
+
+    def shown(text: str) -> str:
+        return "\n".join(drawable(line, lambda c: c not in lacking) for line in text.split("\n"))
+
+    for axis in (axis for axes in figure.axes for axis in (axes.xaxis, axes.yaxis)):
+        labels = [label.get_text() for label in axis.get_ticklabels()]
+        if labels != list(map(shown, labels)):
+            axis.set_ticklabels(map(shown, labels))
+    for text in texts:
+        text.set(text=shown(text.get_text()), family=fonts)
+
+
+def draw_figure(draw: "Callable[[Figure], None]", size_in: tuple[float, float], kind: str, **options: Any) -> bytes:
+    """Draw a figure and encode it as "png" or "svg"; `options` are those of matplotlib's `savefig`."""
+    import matplotlib
+    from matplotlib.figure import Figure
+
+    # text stays text in the page's own font; ids follow from a fixed salt, so that reports have the same bytes
+    settings: Any = {"font.size": 9, "text.parse_math": False, "svg.fonttype": "none", "svg.hashsalt": "patchproof"}
+    with matplotlib.rc_context(settings):
+        figure, buffer = Figure(figsize=size_in, layout="constrained"), io.BytesIO()
+        draw(figure)
+        _make_drawable(figure)
+        figure.savefig(buffer, format=kind, **options)
+    return buffer.getvalue()

@@ -1,4 +1,4 @@
-"""Small plots of a report as inline SVG that follows the page's text color: recognition, print scale, gap ledger.
+"""Small plots of a report as inline SVG that follows the page's text color: recognition, gap ledger.
 
 In: entries of a report as plain data. Out: SVG text. Points of recognition lie at 0 or 1 with a little fixed scatter;
 the line is a running share over neighboring photographs, drawn from 24 photographs on.
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from patchproof.report.images import draw_figure
+from patchproof.report.page import draw_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -29,30 +29,12 @@ def recognition_plot(photos: PlotRows, model: str, figure: str, label: str, prom
     return _svg(lambda axes: _draw(axes, x, y, px, py, label))
 
 
-def scale_plot(photos: PlotRows) -> str | None:
-    """Plot the print's scale, across and down, of the photographs that measured it; None if none did."""
-    scales = [(photo["scale_x"], photo["scale_y"]) for photo in photos if photo.get("scale_x") is not None]
-    return _svg(lambda axes: _draw_scales(axes, np.array(scales))) if scales else None
-
-
 def ledger_plot(ledger: Mapping) -> str:
     """Plot the gap ledger as a waterfall from the ideal picture's confidence to the photographs', with 95 % intervals.
 
     `ledger` holds `shares` {step: {share, interval}}, `ideal` and `photo` (mean confidence).
     """
     return _svg(lambda axes: _draw_ledger(axes, ledger))
-
-
-def _draw_scales(axes, scales: np.ndarray) -> None:
-    axes.axhspan(0.99, 1.01, color=_YES, alpha=0.15, linewidth=0)
-    axes.axhline(1, color=_INK, linewidth=0.8)
-    number = np.arange(1, len(scales) + 1)
-    axes.plot(number, scales[:, 0], "o", color="#2457c5", markersize=5, label="across (x)")
-    axes.plot(number, scales[:, 1], "s", color="#b0713c", markersize=4, label="down (y)")
-    reach = max(0.02, 1.2 * float(np.abs(scales - 1).max()))
-    axes.set(ylim=(1 - reach, 1 + reach), xlim=(0.5, len(scales) + 0.5), xticks=[])
-    axes.set(xlabel="photographs that show the print's size", ylabel="print scale")
-    axes.legend(frameon=False)
 
 
 def _draw_ledger(axes, ledger: Mapping) -> None:

@@ -8,15 +8,14 @@ or lines. The same input gives the same bytes.
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from patchproof.base.intervals import Estimate
 from patchproof.base.output import write_atomically
 from patchproof.base.text import csv_lines
-from patchproof.report.images import data_uri, draw_figure
-from patchproof.report.page import render_page, versions_of
+from patchproof.report.page import data_uri, draw_figure, render_page, versions_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -61,7 +60,7 @@ class Results:
     tables: Sequence[Table]
     figures: Sequence[Drawing]
     failed: Mapping[str, str]
-    more: Mapping[str, Any]
+    more: Mapping[str, Any] = field(default_factory=dict)
     program: str = "patchproof"
 
 

@@ -42,12 +42,10 @@ def benefit_sentence(summary: Mapping[str, Any]) -> str:
     theirs = rate_text(worth["control_rate"], worth["control_interval"])
     points = points_text(worth["rate"], worth["control_rate"], worth["difference_interval"])
     shown = "these" if worth["photos"] == summary["judged"] else f"{worth['photos']} of these"
-    return (
-        f"Recognized in {ours} of {shown} {summary['judged']} photographs, {control_words(worth['control'])} in "
-        f"{theirs}: {points}."
-        + (f" {_NO_GAIN}" if worth["word"] == "does_not_help" else "")
-        + (f" This cannot tell: {worth['advice']}." if worth["advice"] else "")
-    )
+    control = _CONTROLS.get(worth["control"], f"the control “{worth['control']}”")
+    text = f"Recognized in {ours} of {shown} {summary['judged']} photographs, {control} in {theirs}: {points}."
+    text += f" {_NO_GAIN}" if worth["word"] == "does_not_help" else ""
+    return text + (f" This cannot tell: {worth['advice']}." if worth["advice"] else "")
 
 
 def looks_sentence(summary: Mapping[str, Any]) -> str:
@@ -57,11 +55,6 @@ def looks_sentence(summary: Mapping[str, Any]) -> str:
         return f"looks: watched while taken, so one for each session: {number}, {planned} planned"
     more = "; those in other folders are not known, and each one more asks for more proof"
     return f"looks: {number}, counted in the report's folder{more}"
-
-
-def control_words(name: str) -> str:
-    """Describe a control in plain words."""
-    return _CONTROLS.get(name, f"the control “{name}”")
 
 
 def remarks(photos: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, int, str]]:
@@ -95,9 +88,9 @@ def promise_lines(promise: Any, settings: Mapping[str, Any], run: str = "RUN") -
     return [
         promise_summary(promise, settings, run),
         f'promise ({target.goal} "{target.label}"): recognized in {promise.rate:.1%} of {promise.n} unseen conditions '
-        f"in {promise.sessions} sessions "
-        f"[{low:.1%}, {high:.1%}] by {first.name}{background and f', simulated {background}'}",
-        *(f"  also {m.name}: {m.rate:.1%} [{m.interval[0]:.1%}, {m.interval[1]:.1%}]" for m in more_models),
+        f"in {promise.sessions} sessions [{low:.1%}, {high:.1%}] by {first.name}"
+        f"{background and f', simulated {background}'}",
+        *(f"  also {model.name}: {rate_text(model.rate, model.interval)}" for model in more_models),
         *([meaning] if meaning else []),
         *control_lines({kind: claim.model_dump() for kind, claim in promise.controls.items()}),
     ]
@@ -133,10 +126,9 @@ def run_lines(run: Any) -> list[str]:
 
 def verdict_lines(report: Any) -> list[str]:
     """Sum up a report: the patch's benefit, the verdict on the promise, and the counts behind them."""
-    summary = report.summary
-    data = summary.model_dump()
-    lines = [f"{headline_of(data)}. {benefit_sentence(data)}"]
+    summary, data = report.summary, report.summary.model_dump()
     untested = "" if report.controls else " (no control photographs)"
+    lines = [f"{headline_of(data)}. {benefit_sentence(data)}"]
     lines.append(f"verdict: {summary.verdict}{untested}. {summary.reason}".strip())
     lines += [summary.next_step] if summary.next_step else []
     if summary.background:
@@ -149,9 +141,9 @@ def verdict_lines(report: Any) -> list[str]:
         lines += [f"  {summary.sessions_note}"] if summary.sessions_note else []
         lines.append(looks_sentence(data))
     if summary.rate is not None:
-        lines.append("recognized: {:.1%} [{:.1%}, {:.1%}]".format(summary.rate, *summary.interval))
+        lines.append(f"recognized: {rate_text(summary.rate, summary.interval)}")
     others = [item for item in list(summary.models.items())[1:] if item[1].rate is not None]
-    lines += ["  also {}: {:.1%} [{:.1%}, {:.1%}]".format(name, rate.rate, *rate.interval) for name, rate in others]
+    lines += [f"  also {name}: {rate_text(model.rate, model.interval)}" for name, model in others]
     if summary.prediction_interval is not None:
         lines.append("expected: {} to {} of {}".format(*summary.prediction_interval, summary.judged))
     if (forecast := summary.forecast) is not None:
@@ -173,16 +165,42 @@ def _estimated_lines(estimated: Any) -> list[str]:
     agree = f"re-rendering gave the original answer in {estimated.agree:.0%} of {estimated.photos} photographs"
     if not estimated.controls:
         return [f"controls not rendered into these photographs: {agree}"]
-    names = ("n", "difference", "difference_interval")
-    rows = {c.name: {"rate": c.rates[1], **{name: getattr(c, name) for name in names}} for c in estimated.controls}
+    rows = {control.name: vars(control) | {"rate": control.rates[1]} for control in estimated.controls}
     return [f"controls rendered into these photographs ({agree}):", *control_lines(rows)]
 
 
 def control_lines(controls: Mapping[str, Mapping[str, Any]]) -> list[str]:
     """Write a line per control: its rate and the difference from the design's."""
-    rows = []
+    lines = []
     for kind, claim in controls.items():
         rate, of_count = claim["rate"], f" of {claim['n']}" if claim.get("n") else ""
         points = points_text(rate + claim["difference"], rate, claim["difference_interval"])
-        rows.append(f"  {kind:>6}: {rate:6.1%}{of_count}   difference {points}")
-    return rows
+        lines.append(f"  {kind:>6}: {rate:6.1%}{of_count}   difference {points}")
+    return lines
+
+
+def imported_lines(imported: Mapping[str, Any]) -> list[str]:
+    """Sum up an imported picture: its size in print, and how far the printer misses its colors."""
+    width, height = imported["picture_px"]
+    return [
+        f"{imported['file']}: {width} × {height} pixels, printed at {imported['dpi']:.0f} dpi; {imported['printer']} "
+        f"misses its colors by {imported['delta_e00']:.1f} ΔE00 in the mean, {imported['out_of_gamut']:.0%} of them "
+        "visibly",
+        *(f"  {note}" for note in imported["notes"]),
+    ]
+
+
+def evaluation_lines(result: Mapping[str, Any]) -> list[str]:
+    """Sum up an evaluation: whether the design helps, by each network, its rate and controls."""
+    lines, goal = [], Goal(result["goal"])
+    for name, rates in result["models"].items():
+        (low, high), controls = rates["interval"], rates["controls"]
+        ends = {kind: claim["difference_interval"] for kind, claim in controls.items()}
+        word = goal.answer(ends[goal.hardest(ends)])
+        told = goal.words[word] + f" (what tells: --n {4 * result['n']})" * (word == "cannot_tell")
+        share = f"{rates['rate']:.1%} of {result['n']} conditions [{low:.1%}, {high:.1%}]"
+        lines.append(f"{name}: {told}; recognized in {share}")
+        lines += control_lines(controls)
+        if rates["ap50"] is not None:
+            lines.append("  AP50 " + ", ".join(f"{kind} {share:.3f}" for kind, share in rates["ap50"].items()))
+    return lines + not_measured_lines(result["not_measured"])

@@ -16,9 +16,8 @@ from patchproof.base.goal import points_text
 from patchproof.base.output import make_folder, write_atomically
 from patchproof.base.text import csv_lines
 from patchproof.report import words
-from patchproof.report.images import DELTA_TOP, data_uri, saved_pictures
-from patchproof.report.page import render_page
-from patchproof.report.plots import ledger_plot, recognition_plot, scale_plot
+from patchproof.report.page import DELTA_TOP, data_uri, render_page, saved_pictures
+from patchproof.report.plots import ledger_plot, recognition_plot
 
 _FIRST = ("file", "status", "code", "figure", "threshold", "advice")
 _PLOTS = (("tilt_deg", "tilt in degrees"), ("px_per_mm", "pixels per millimeter"))
@@ -27,7 +26,7 @@ _PLOTS = (("tilt_deg", "tilt in degrees"), ("px_per_mm", "pixels per millimeter"
 def write_report(report: Mapping, manifest: Mapping, out_dir: str | Path, ledger: Mapping | None = None) -> Path:
     """Write report.json, report.csv and report.html into `out_dir`; returns the page's path.
 
-    `report` and `manifest` are `model_dump()`s. Pictures are those of `images.save_pictures` in `out_dir`/pictures:
+    `report` and `manifest` are `model_dump()`s. Pictures are those of `page.save_pictures` in `out_dir`/pictures:
     `photo`, `seen`, `fitted`, `promised` and `delta_e00`. `ledger` is that of `plots.ledger_plot`.
     """
     out = Path(out_dir)
@@ -43,10 +42,10 @@ def report_html(report: Mapping, manifest: Mapping, encoded: Mapping[str, Mappin
     """Render the page's HTML; `encoded` are JPEG or PNG bytes by photo and kind."""
     promise, summary, photos = manifest.get("promise"), report["summary"], report["photos"]
     judged = [photo for photo in photos if photo["status"] != "rejected"]
-    plots, primary = [(scale_plot(judged), "chart of the print's scale")], None
+    plots, primary = [], None
     if promise:
         primary = promise["models"][0]["name"]
-        plots[:0] = [
+        plots = [
             (recognition_plot(judged, primary, name, label, promise["conditions"]), f"chart of recognition by {label}")
             for name, label in _PLOTS
         ]

@@ -194,7 +194,6 @@ def _lay_on(surface: SmoothSurface, near: np.ndarray, frame: SurfaceFrame, size_
     # a cell's chords end short of a round surface's edge
     clearance = np.where(np.isfinite(paper), paper, surface.height(*grid_st.T)) - surface_h
     gaps = clearance[np.isfinite(clearance) & np.isfinite(paper)] - LIFT_MM
-    stretches = grid_stretch(surface, st, size_mm, PIECE_GRID)
     return Placement(
         family="exponential",
         size_mm=tuple(size_mm),
@@ -207,8 +206,7 @@ def _lay_on(surface: SmoothSurface, near: np.ndarray, frame: SurfaceFrame, size_
         gap_mean_mm=float(gaps.mean()),
         gaps_mm=(clearance - LIFT_MM).reshape(GRID, GRID),
         overhang_share=1 - len(gaps) / int(np.isfinite(paper).sum()),
-        stretch=float(stretches.max()),
-        stretches=stretches,
+        stretch=float(grid_stretch(surface, st, size_mm, PIECE_GRID).max()),
         reason="",
     )
 

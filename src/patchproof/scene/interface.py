@@ -305,6 +305,12 @@ def _sheet_id(settings: SceneSettings, base: Path, known: Mapping[str, str], see
     return sheet_id(identity | dict(known), seed)
 
 
+def fit_text(fit: Mapping[str, Any]) -> str:
+    """Say how a piece lies on its surface, by the scene's `placement_summary`."""
+    gaps = f"gap {fit['gap_mm']:.2f} mm at most, {fit['gap_mean_mm']:.2f} mm on average"
+    return f"{gaps}; {fit['overhang_share']:.1%} overhangs; stretch {fit['stretch']:.2%}"
+
+
 def measurable_text(unreadable_share: float, family: str) -> str:
     """Say how many photographs of a piece on a surface of that family can be measured; see `bent_scene.bent_notes`."""
     if family == "exponential":

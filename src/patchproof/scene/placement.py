@@ -49,7 +49,6 @@ class Placement:
     gaps_mm: np.ndarray  # GRID×GRID by rows from the top: from the piece to the surface, NaN where there is none
     overhang_share: float  # of the piece's area with no object under it
     stretch: float  # largest relative change of length on the surface against the sheet
-    stretches: np.ndarray  # N×N by rows from the top: the stretch at each point of the piece
     reason: str
 
     def world(self, points_mm: np.ndarray) -> np.ndarray:
@@ -185,7 +184,6 @@ def lay_card(
         gaps_mm=(top - surface).reshape(GRID, GRID),
         overhang_share=float(1 - hit.mean()),
         stretch=0.0,
-        stretches=np.zeros((2, 2)),
         reason=f"a flat card stands at most {gap_mm:.1f} mm off the surface",
     )
 

@@ -1,8 +1,8 @@
 """Guess from a mesh file what a scene needs: the axis that is up, length, label, and where a piece goes.
 
-In: a mesh file and its name. Out: `UpGuess`, a length in millimeters, a label, and `PieceGuess`: the largest piece that
-fits in the middle of one of the sides. Each guess has the words for its comment in the scene file. If a length or a
-label cannot be guessed, that is refused. Left out on purpose: places other than middles, which the search for a place
+In: a mesh file and its name. Out: its up axis, a length in millimeters, a label, and `PieceGuess`: the largest piece
+that fits in the middle of one of the sides. Each guess has the words for its comment in the scene file. If a length or
+a label cannot be guessed, that is refused. Left out on purpose: places other than middles, which the search for a place
 covers.
 
 glTF has a standard: y up, meters. Other formats have conventions: OBJ is mostly written y up, printers' STL and
@@ -19,7 +19,6 @@ from typing import Literal
 
 import numpy as np
 
-from patchproof.app.begin.sides import SIDE_NAMES
 from patchproof.base.errors import Refused
 from patchproof.base.validation import Side
 from patchproof.classifier.labels import find_labels, folded, nearest_hint
@@ -32,7 +31,6 @@ from patchproof.sheets.piece import smallest_piece_mm
 
 _GLTF = (".glb", ".gltf")
 UpAxis = Literal["y", "z"]
-_USUAL_UP: dict[str, UpAxis] = {".obj": "y", ".stl": "z", ".ply": "z"}
 _MM_PER_M = 1000.0
 _LENGTH_RANGE_MM = (5.0, 6_000.0)  # of objects that people put paper on, up to a van; a mug of 12 m has other units
 _GROUND_SHARE = 0.005  # of the object's height: lower points touch the ground
@@ -48,25 +46,17 @@ _ENOUGH_AREA = 0.8  # of the largest wanted piece: for more than a flat card of 
 _SIDES: tuple[Side, ...] = ("+z", "+x", "-x", "-z", "+y")
 
 
-@dataclass(frozen=True)
-class UpGuess:
-    """The axis of the file that points up, the reason, and the words for a doubt about it, if there is one."""
-
-    axis: UpAxis
-    reason: str
-    doubt: str | None = None
-
-
-def guess_up(path: Path) -> UpGuess:
-    """Guess the up axis by the format's standard or convention. If the object would stand much better with the other
-    axis up, a convention is overruled, and a standard is doubted.
+def guess_up(path: Path) -> tuple[UpAxis, str, str | None]:
+    """Guess the up axis by the format's standard or convention: the axis, the reason, and the words for a doubt about
+    it. If the object would stand much better with the other axis up, a convention is overruled, and a standard is
+    doubted.
     """
     kind, name = path.suffix.lower(), path.suffix[1:].upper()
-    axis: UpAxis = "y" if kind in _GLTF else _USUAL_UP.get(kind, "z")
+    axis: UpAxis = "y" if kind in (*_GLTF, ".obj") else "z"
     doubt = lying_hint(load_mesh(path, 100.0, axis).vertices, axis)
     if doubt is not None and kind not in _GLTF:
-        return UpGuess(other_axis(axis), f"as it stands: {name} files say nothing")
-    return UpGuess(axis, "glTF's standard" if kind in _GLTF else f"the habit of {name} files", doubt)
+        return other_axis(axis), f"as it stands: {name} files say nothing", None
+    return axis, "glTF's standard" if kind in _GLTF else f"the habit of {name} files", doubt
 
 
 def lying_hint(vertices: np.ndarray, up: UpAxis) -> str | None:
@@ -164,12 +154,6 @@ class PieceGuess:
         weights: dict[Side | None, float] = {"+z": _PREFERENCE, "+y": _TOP_WEIGHT}
         return prod(self.size_mm) * (1 if self.bend else _PREFERENCE) * weights.get(self.side, 1)
 
-    @property
-    def words(self) -> str:
-        """Describe the place, for a sentence."""
-        place = "wherever the search finds" if self.side is None else f"on its {SIDE_NAMES[self.side]} ({self.side})"
-        return f"{'bent, ' if self.bend else ''}{place}"
-
 
 def guess_piece(mesh: Mesh, length_mm: float) -> PieceGuess:
     """Find the largest piece that fits in the middle of a side; if none does, the smallest, whose place is searched."""
@@ -177,8 +161,7 @@ def guess_piece(mesh: Mesh, length_mm: float) -> PieceGuess:
     flat = [piece for side, size in sides.items() if (piece := _fit_on_side(mesh, side, size, False))]
     if any(prod(piece.size_mm) >= _ENOUGH_AREA * max(map(prod, sides.values())) for piece in flat):
         return max(flat, key=lambda piece: piece.weighted_area)  # bending takes seconds to try
-    pieces = flat + [piece for side, size in sides.items() if (piece := _fit_on_side(mesh, side, size, True))]
-    if pieces:
+    if pieces := flat + [piece for side, size in sides.items() if (piece := _fit_on_side(mesh, side, size, True))]:
         return max(pieces, key=lambda piece: piece.weighted_area)
     least = smallest_piece_mm()
     if least > length_mm:

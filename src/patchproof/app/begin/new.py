@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
-from patchproof.app.begin.guess import UpAxis, UpGuess, guess_label, guess_length_mm, guess_piece, guess_up, other_axis
+from patchproof.app.begin.guess import UpAxis, guess_label, guess_length_mm, guess_piece, guess_up, other_axis
 from patchproof.app.begin.sides import SIDE_NAMES
 from patchproof.base.errors import Refused
 from patchproof.base.input import is_file, is_folder
@@ -73,25 +73,26 @@ def _mesh_scene(
     """The scene file's text for a mesh, and lines with the guesses."""
     target = guess_label(_labels(models, base), label, thing)
     path, primitive, source = Path(thing), thing.startswith("primitive:"), "as given"
-    up = UpGuess("y", "primitives are") if primitive else UpGuess(axis, source) if axis else guess_up(path)
+    up, reason, doubt = ("y", "primitives are", None) if primitive else (axis, source, None) if axis else guess_up(path)
     if length_mm is None:
         source = "the primitive's own" if primitive else "by the file's units, meters: measure it"
         length_mm = longest_mm(thing.partition(":")[2]) if primitive else guess_length_mm(path)
-    piece = guess_piece(load_mesh(thing, length_mm, up.axis), length_mm)
+    piece = guess_piece(load_mesh(thing, length_mm, up), length_mm)
     near, far = (float(f"{times * length_mm:.2g}") for times in (NEAR, FAR))
     azimuth, elevation = "of the camera about the vertical; 0 faces the piece", "above the horizontal"
     if piece.side == "+y":
         azimuth, elevation = "of the camera to left and right of straight above", "from there toward the back"
     bend_comment = "paper follows the surface" if piece.bend else "a flat card lies close enough"
-    other_up = _line(f'# up = "{other_axis(up.axis)}"', f"in its place if the preview shows it lying: {up.doubt}")
+    other_up = _line(f'# up = "{other_axis(up)}"', f"in its place if the preview shows it lying: {doubt}")
+    again = f"write the scene again with --up {other_axis(up)}: sides and sizes change with it"
     text = "\n".join(
         [
             *_HEAD,
             "[object]",
             f"mesh = {_quoted(thing if primitive else _path(path, base))}",
             _line(f"length_mm = {length_mm:g}", f"its longest extent, {source}"),
-            _line(f'up = "{up.axis}"', f"the file's axis that points up: {up.reason}"),
-            *([] if up.doubt is None else [other_up, f"# Best of all {_rewrite_advice(up)}."]),
+            _line(f'up = "{up}"', f"the file's axis that points up: {reason}"),
+            *([] if doubt is None else [other_up, f"# Best of all {again}."]),
             "",
             "[patch]",
             *_size(*piece.size_mm),
@@ -114,17 +115,14 @@ def _mesh_scene(
         ]
     )
     width, height = piece.size_mm
-    doubt = f"; {up.doubt}: if the preview shows it lying, {_rewrite_advice(up)}" if up.doubt else ""
+    lying = f"; {doubt}: if the preview shows it lying, {again}" if doubt else ""
+    place = f"on its {SIDE_NAMES[piece.side]} ({piece.side})" if piece.side else "wherever the search finds"
     return text, [
-        f'up: "{up.axis}", {up.reason}{doubt}',
+        f'up: "{up}", {reason}{lying}',
         f"length: {length_mm:g} mm, {source}",
-        f"piece: {width:g} × {height:g} mm, {piece.words}",
+        f"piece: {width:g} × {height:g} mm, {'bent, ' if piece.bend else ''}{place}",
         f'label: "{target}" ({models[0]})',
     ]
-
-
-def _rewrite_advice(up: UpGuess) -> str:
-    return f"write the scene again with --up {other_axis(up.axis)}: sides and sizes change with it"
 
 
 def _folder_scene(folder: Path, base: Path, label: str | None, models) -> tuple[str, list[str]]:

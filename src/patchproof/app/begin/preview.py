@@ -1,62 +1,44 @@
 """`preview`: show a scene as a page before anything is optimized, in seconds.
 
-In: a scene file. Out: a folder with `preview.html`, a self-contained page without requests, and for a mesh
-`preview.glb`. If the piece is refused, the page shows the object without it and the reason. A piece whose place is
-still to be searched is shown in the middle of the side that azimuth 0 faces. Left out on purpose: anything that depends
-on a design, which `plan` shows; layouts of texture coordinates to draw masks on, which 3D programs such as Blender
-export.
+In: a scene file. Out: a folder with `preview.html`, a self-contained page without requests. If the piece is refused,
+the page shows the object without it and the reason. A piece whose place is still to be searched is shown in the middle
+of the side that azimuth 0 faces. Left out on purpose: anything that depends on a design, which `plan` shows; layouts of
+texture coordinates to draw masks on, which 3D programs such as Blender export.
 """
 
 import html
 import warnings as python_warnings
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
 from patchproof.app.begin.guess import lying_hint, other_axis
-from patchproof.app.begin.sides import (
-    SIDE_NAMES,
-    SampleView,
-    gap_colors,
-    ramp_colors,
-    sample_views,
-    side_of,
-    side_views,
-    turntable,
-)
-from patchproof.base.color import codes_from_srgb
+from patchproof.app.begin.sides import SIDE_NAMES, sample_views, side_of, side_views, turntable
 from patchproof.base.errors import Refused
 from patchproof.base.output import base64_uri, image_bytes, new_folder, write_atomically
-from patchproof.base.resample import downscale
 from patchproof.base.settings import SceneSettings, load_scene_settings
 from patchproof.base.text import short_repr
 from patchproof.channel.printer import identity_printer
 from patchproof.classifier.labels import find_labels
 from patchproof.classifier.load import load_classifier
-from patchproof.mesh.export import write_glb
-from patchproof.mesh.mesh import Material, MeshPart
 from patchproof.optimizer.subject import subject_of
-from patchproof.render.stage import Stage, set_stage
-from patchproof.report.images import data_uri, jpeg, png
-from patchproof.report.page import render_page
-from patchproof.scene.bend import STRETCH_LIMIT
-from patchproof.scene.canvas import bake_base_colors
-from patchproof.scene.interface import Scene, measurable_text
-from patchproof.scene.mesh_scene import MeshScene, require_mesh
+from patchproof.render.stage import set_stage
+from patchproof.report.page import data_uri, jpeg, png, render_page
+from patchproof.scene.interface import Scene, fit_text, measurable_text
+from patchproof.scene.mesh_scene import MeshScene
 from patchproof.scene.patch_scene import PatchScene
 from patchproof.scene.placement import gap_limit_mm
 from patchproof.scene.scene import build_scene
 from patchproof.scene.texture_scene import TextureScene
 from patchproof.scene.unplaced_scene import UnplacedScene
 
-PAGE, OBJECT = "preview.html", "preview.glb"
-_TEXTURE_PX = 1024  # of the textures in the GLB file
+PAGE = "preview.html"
 _FIRST_DEG = 30  # to the right of the front: shown before the slider is moved
-_DESIGN_PX = 256  # of the gray design on the piece, along its longer side
 
 
 @dataclass(frozen=True)
@@ -82,7 +64,7 @@ def preview(scene: str | Path | Scene, out: str | Path, *, overwrite: bool = Fal
     """
     path = Path("scene") if isinstance(scene, Scene) else Path(scene)
     settings = scene.settings if isinstance(scene, Scene) else load_scene_settings(path)
-    with new_folder(out, (PAGE, OBJECT), overwrite, (scene,)) as folder:
+    with new_folder(out, (PAGE,), overwrite, (scene,)) as folder:
         scene, refused = (scene, None) if isinstance(scene, Scene) else _scene(settings, path.resolve().parent)
         with python_warnings.catch_warnings(action="always", record=True) as said:
             classifiers = [load_classifier(net, scene.base) for net in scene.networks]
@@ -90,12 +72,10 @@ def preview(scene: str | Path | Scene, out: str | Path, *, overwrite: bool = Fal
         stage = set_stage(scene)
         views = sample_views(stage, classifiers, indices)
         warnings = (*scene.warnings, *_up_warning(scene, settings), *(str(each.message) for each in said))
-        sides, turns = [], []
+        sides, scale, turns = {}, {}, []
         if isinstance(scene, MeshScene):
-            design = _gray_design(stage)
-            _write_object(stage, design, folder / OBJECT)
-            sides = [(view, data_uri(png(view.picture))) for view in side_views(stage)]
-            for azimuth_deg, picture in turntable(stage, design).items():
+            sides, scale = side_views(stage)
+            for azimuth_deg, picture in turntable(stage).items():
                 webp = image_bytes(picture, "WEBP", {"quality": 80})  # 3 to 10 kB: as JPEG it would be twice as large
                 turns.append((azimuth_deg, picture.shape[:2], base64_uri(webp, "image/webp")))
         facts, summaries = _facts(scene, settings), _answers(settings, views)
@@ -108,11 +88,13 @@ def preview(scene: str | Path | Scene, out: str | Path, *, overwrite: bool = Fal
             facts=facts,
             problems=problems,
             warnings=warnings,
-            sides=sides,
-            maps=_maps(scene) if isinstance(scene, PatchScene) else [],
+            sides=[(side, SIDE_NAMES[side], data_uri(png(picture))) for side, picture in sides.items()],
+            scale=scale,
+            holder=side_of(scene.placement.normal) if isinstance(scene, PatchScene) else None,
+            gap_limit_mm=gap_limit_mm(scene.placement.size_mm) if isinstance(scene, PatchScene) else None,
             turns=turns,
             first_deg=_FIRST_DEG,
-            looks=[(look, data_uri(jpeg(look.picture))) for look in views],
+            looks=[(look, data_uri(jpeg(look["picture"]))) for look in views],
             summaries=summaries,
         )
         write_atomically(folder / PAGE, text)
@@ -184,11 +166,8 @@ def _facts(scene: Scene, settings: SceneSettings) -> list[tuple[str, str]]:
     size = "{:g} × {:g} mm".format(*placement["size_mm"])
     if isinstance(scene, PatchScene):
         side = side_of(scene.placement.normal)
-        fit = (
-            f"gap {placement['gap_mm']:.1f} mm at most, {placement['gap_mean_mm']:.1f} mm on average; "
-            f"{placement['overhang_share']:.0%} overhangs; stretch {placement['stretch']:.2%}"
-        )
-        facts.append(("piece", f"{placement['family']}, {size}, facing {SIDE_NAMES[side]} ({side}): {fit}"))
+        lies = f"{placement['family']}, {size}, facing {SIDE_NAMES[side]} ({side})"
+        facts.append(("piece", f"{lies}: {fit_text(placement)}"))
         readable = measurable_text(scene.unreadable_share, scene.placement.family)
         facts.append(("markers", f"{scene.piece.marker_mm:.1f} mm, {readable}" if scene.piece.markers else "none"))
     else:
@@ -205,52 +184,14 @@ def _facts(scene: Scene, settings: SceneSettings) -> list[tuple[str, str]]:
     return facts
 
 
-def _answers(settings: SceneSettings, views: Sequence[SampleView]) -> list[str]:
+def _answers(settings: SceneSettings, views: Sequence[Mapping[str, Any]]) -> list[str]:
     """Say how often each network recognizes the bare object, and its most frequent label."""
     lines = []
-    for number, first in enumerate(views[0].answers):
-        answers = [look.answers[number] for look in views]
-        ((most, times),) = Counter(answer.labels[0][0] for answer in answers).most_common(1)
-        count = sum(answer.recognized for answer in answers)
+    for answers in zip(*(view["answers"] for view in views), strict=True):
+        ((most, times),) = Counter(answer["labels"][0][0] for answer in answers).most_common(1)
+        count = sum(answer["recognized"] for answer in answers)
         lines.append(
-            f'{first.network}: "{settings.target.label}" first in {count} of {len(views)} views of the bare object; '
-            f'most often "{most}" ({times})'
+            f'{answers[0]["network"]}: "{settings.target.label}" first in {count} of {len(views)} views of the bare '
+            f'object; most often "{most}" ({times})'
         )
     return lines
-
-
-def _maps(scene: PatchScene) -> list[dict[str, str]]:
-    """Pictures of the piece's gap and stretch, each with the words at the ends of its scale."""
-    placement = scene.placement
-    limit = f"{gap_limit_mm(placement.size_mm):.2g} mm: too much"
-    rows = [("gap to the surface", gap_colors(placement), "0 mm", limit)]
-    if not placement.is_flat:
-        stretches = ramp_colors(placement.stretches / STRETCH_LIMIT)
-        rows.append(("stretch of the paper", stretches, "0 %", f"{STRETCH_LIMIT:.0%}: refused"))
-    shape = "{:g} / {:g}".format(*placement.size_mm)
-    return [
-        {"title": title, "shape": shape, "picture": data_uri(png(colors)), "low": low, "high": high}
-        for title, colors, low, high in rows
-    ]
-
-
-def _write_object(stage: Stage, design: np.ndarray | None, path: Path) -> None:
-    """Write the object as a GLB file, with the scene's piece, if it has one, showing `design`."""
-    scene = require_mesh(stage.scene)
-    mesh = bake_base_colors(scene.mesh, np.zeros(len(scene.mesh.faces), bool))
-    textures = [downscale(m.texture_srgb, _TEXTURE_PX) for m in mesh.materials if m.texture_srgb is not None]
-    piece = None
-    if isinstance(scene, PatchScene):
-        placement, material = scene.placement, Material("piece", (1.0, 1.0, 1.0), design)
-        uv = placement.piece_mm / placement.size_mm
-        piece = MeshPart(placement.vertices_mm, placement.faces, material, uv, placement.normals)
-    write_atomically(path, lambda part: write_glb(mesh, textures, part, piece))
-
-
-def _gray_design(stage: Stage) -> np.ndarray | None:
-    """Make the printed piece with a gray design, uint8 h×w×3; None if the object has no piece."""
-    if not isinstance(stage.scene, PatchScene):
-        return None
-    size_mm = stage.scene.piece.size_mm
-    width, height = (max(8, round(side * _DESIGN_PX / max(size_mm))) for side in size_mm)
-    return codes_from_srgb(stage.design_renderer.appearance(torch.full((3, height, width), 0.5)).srgb).cpu().numpy()

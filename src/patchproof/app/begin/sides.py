@@ -1,16 +1,15 @@
 """Pictures of an object from its six sides, with ground line, scale bar and piece; from all around; and sample views.
 
-In: a stage with a mesh, with a piece on it or without. Out: `SideView`s at one scale; pictures at one scale from a ring
-of directions, for a page that turns the object by a slider; the piece's gap and stretch as colors. The sides are those
+In: a stage with a mesh, with a piece on it or without. Out: pictures of the sides at one scale; pictures at one scale
+from a ring of directions, for a page that turns the object by a slider; the piece's gap as colors. The sides are those
 of `patch.side`; front and back are along z, as in glTF's standard and after `object.up = "z"` turned the y of other
 programs there. The ring is seen from far away, in even light, and from above or below if the piece is on top or below.
 Sample views are drawn from the train stream as optimizing draws them, and have the networks' answers beside them.
 """
 
 import math
-from dataclasses import dataclass
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 import torch
@@ -43,38 +42,26 @@ _LEAST_PX = 200  # of a view's side: people see little in smaller ones
 _EDGE_POINTS = 8  # bent paper has bent edges
 
 
-@dataclass(frozen=True)
-class SideView:
-    """The object seen straight from one side, a square of `PICTURE_PX`."""
-
-    side: Side
-    name: str
-    picture: np.ndarray  # uint8
-    ground_px: float | None  # row of the ground under an upright view
-    bar_mm: float
-    bar_px: float
-    holds_piece: bool  # True for the side that the piece faces
-
-
-def side_views(stage: Stage) -> tuple[SideView, ...]:
-    """Render a stage's object from all six sides, front first, the piece colored by its gap."""
+def side_views(stage: Stage) -> tuple[dict[Side, np.ndarray], dict[str, float]]:
+    """Render a stage's object straight from all six sides, front first, the piece colored by its gap: uint8 squares of
+    `PICTURE_PX`; and their scale: a bar of `bar_mm` is `bar_px` long, the ground of upright views is at `ground_px`.
+    """
     scene = require_mesh(stage.scene)
     half_mm = _ROOM * float(np.abs(_points_mm(scene)).max())
-    bar_mm = round_length(2 * half_mm * _BAR_SHARE)
-    bar_px = bar_mm / (2 * half_mm) * PICTURE_PX
-    ground_px = PICTURE_PX * (0.5 - float(scene.mesh.vertices[:, 1].min()) / 2 / half_mm)
-    holder = side_of(scene.placement.normal) if isinstance(scene, PatchScene) else None
-    return tuple(
-        SideView(side, name, picture, None if side[1] == "y" else ground_px, bar_mm, bar_px, side == holder)
-        for side, name in SIDE_NAMES.items()
-        for picture in [_picture(stage, side, half_mm)]
-    )
+    bar_mm, px_per_mm, pictures = round_length(2 * half_mm * _BAR_SHARE), PICTURE_PX / (2 * half_mm), {}
+    for side in SIDE_NAMES:
+        frame, colors = side_frame(scene.mesh, side), None
+        if isinstance(scene, PatchScene) and (scene.placement.normals @ frame.normal).max() > 1e-6:
+            colors = gap_colors(scene.placement)
+        pictures[side] = plan_picture(stage, frame, np.array([half_mm, half_mm]), PICTURE_PX, colors)
+    ground_px = PICTURE_PX / 2 - float(scene.mesh.vertices[:, 1].min()) * px_per_mm
+    return pictures, {"bar_mm": bar_mm, "bar_px": bar_mm * px_per_mm, "ground_px": ground_px}
 
 
-def turntable(stage: Stage, on_piece: np.ndarray | None) -> dict[int, np.ndarray]:
+def turntable(stage: Stage) -> dict[int, np.ndarray]:
     """Render the object from a ring of directions, 180° down to -165° to the right of the side of the piece or of the
-    scene's front: uint8 H×W×3 by degrees. From one to the next, what faces the camera moves to the right. `on_piece`
-    are colors (uint8 h×w×3) of the scene's piece.
+    scene's front, the piece colored by its gap: uint8 H×W×3 by degrees. From one to the next, what faces the camera
+    moves to the right.
     """
     scene = require_mesh(stage.scene)
     x, y, z = scene.normal
@@ -85,7 +72,8 @@ def turntable(stage: Stage, on_piece: np.ndarray | None) -> dict[int, np.ndarray
     frames = {azimuth: _upright(orbit(azimuth, elevation_deg, front), scene.frame) for azimuth in ring}
     points = _points_mm(scene)
     half_mm = _ROOM * np.max([np.abs(points @ np.stack([f.right, f.up], 1)).max(0) for f in frames.values()], axis=0)
-    return {azimuth: plan_picture(stage, frame, half_mm, PICTURE_PX, on_piece) for azimuth, frame in frames.items()}
+    colors = gap_colors(scene.placement) if isinstance(scene, PatchScene) else None
+    return {azimuth: plan_picture(stage, frame, half_mm, PICTURE_PX, colors) for azimuth, frame in frames.items()}
 
 
 def side_of(direction: np.ndarray) -> Side:
@@ -102,16 +90,11 @@ def round_length(most_mm: float) -> float:
 
 def gap_colors(placement: Placement) -> np.ndarray:
     """Color the piece's gaps, uint8 N×N×3: 0 to `gap_limit_mm` from dark to light, `NO_SURFACE_RGB` off the surface."""
-    colors = ramp_colors(placement.gaps_mm / gap_limit_mm(placement.size_mm))
+    shares, stops = placement.gaps_mm / gap_limit_mm(placement.size_mm), np.linspace(0, 1, len(RAMP_RGB))
+    channels = [np.interp(np.nan_to_num(shares), stops, column) for column in np.array(RAMP_RGB, float).T]
+    colors = np.stack(channels, -1).round().astype(np.uint8)
     colors[np.isnan(placement.gaps_mm)] = NO_SURFACE_RGB
     return colors
-
-
-def ramp_colors(shares: np.ndarray) -> np.ndarray:
-    """Color shares in [0, 1] by `RAMP_RGB`, uint8 ...×3; shares beyond get the colors of the ends."""
-    stops = np.linspace(0, 1, len(RAMP_RGB))
-    channels = [np.interp(np.nan_to_num(shares), stops, column) for column in np.array(RAMP_RGB, float).T]
-    return np.stack(channels, -1).round().astype(np.uint8)
 
 
 def _points_mm(scene: MeshScene) -> np.ndarray:
@@ -127,65 +110,36 @@ def _upright(toward: np.ndarray, like: SurfaceFrame) -> SurfaceFrame:
     return SurfaceFrame(right, np.cross(toward, right), toward, like.origin_mm, like.extent_mm)
 
 
-def _picture(stage: Stage, side: Side, half_mm: float) -> np.ndarray:
-    scene, colors = require_mesh(stage.scene), None
-    frame = side_frame(scene.mesh, side)
-    if isinstance(scene, PatchScene) and (scene.placement.normals @ frame.normal).max() > 1e-6:
-        colors = gap_colors(scene.placement)
-    return plan_picture(stage, frame, np.array([half_mm, half_mm]), PICTURE_PX, colors)
+def sample_views(stage: Stage, classifiers: list[Classifier], indices: list[tuple[int, ...]]) -> list[dict[str, Any]]:
+    """Render 8 views of the bare object and classify them; `indices` are the target's in each network (empty: none).
 
-
-@dataclass(frozen=True)
-class NetworkAnswer:
-    """A network's most likely labels of one picture with their confidences; `recognized` if it sees the target."""
-
-    network: str
-    labels: tuple[tuple[str, float], ...]
-    recognized: bool
-
-
-@dataclass(frozen=True)
-class SampleView:
-    """One view: uint8 S×S×3, and the piece's outline M×2 in its pixels (None if the piece is turned away)."""
-
-    picture: np.ndarray
-    outline_px: np.ndarray | None
-    azimuth_deg: float
-    elevation_deg: float
-    distance_mm: float
-    answers: tuple[NetworkAnswer, ...]
-
-
-def sample_views(stage: Stage, classifiers: list[Classifier], indices: list[tuple[int, ...]]) -> tuple[SampleView, ...]:
-    """Render 8 views of the bare object and classify them; `indices` are the target's in each network (empty: none)."""
+    A view has its `picture` (uint8 S×S×3), the piece's `outline_px` M×2 in it (None if the piece is turned away), the
+    camera's place, and `answers`: by network its most likely `labels` with their confidences, and if it `recognized`
+    the target.
+    """
     network_px = max(classifier.input_px for classifier in classifiers)
     side_px = network_px * math.ceil(_LEAST_PX / network_px)
     conditions = stage.scene.draw("select", _VIEWS)  # in which nothing is erased
     with torch.no_grad():
         pictures = photograph(stage, None, conditions, (side_px, side_px), jpeg=False)
         logits = [classifier.logits(pictures, stage.scene.boxes(conditions)) for classifier in classifiers]
-    pose = conditions.pose
-    return tuple(
-        SampleView(
-            picture=as_pixels(pictures[i]),
-            outline_px=_outline(stage, conditions[[i]], side_px),
-            azimuth_deg=float(pose.azimuth_deg[i]),
-            elevation_deg=float(pose.elevation_deg[i]),
-            distance_mm=float(pose.distance_mm[i]),
-            answers=tuple(
-                _answer(classifier, network_logits[i], target)
-                for classifier, network_logits, target in zip(classifiers, logits, indices, strict=True)
-            ),
-        )
+    places = {name: getattr(conditions.pose, name) for name in ("azimuth_deg", "elevation_deg", "distance_mm")}
+    return [
+        {
+            "picture": as_pixels(pictures[i]),
+            "outline_px": _outline(stage, conditions[[i]], side_px),
+            **{name: float(values[i]) for name, values in places.items()},
+            "answers": [_answer(*each) for each in zip(classifiers, [row[i] for row in logits], indices, strict=True)],
+        }
         for i in range(_VIEWS)
-    )
+    ]
 
 
-def _answer(classifier: Classifier, logits: Tensor, target: tuple[int, ...]) -> NetworkAnswer:
+def _answer(classifier: Classifier, logits: Tensor, target: tuple[int, ...]) -> dict[str, Any]:
     best = classifier.probabilities(logits[None])[0].topk(min(_TOP, len(classifier.labels)))
-    labels = tuple((classifier.labels[index], share) for share, index in zip(*map(Tensor.tolist, best), strict=True))
+    labels = [(classifier.labels[index], share) for share, index in zip(*map(Tensor.tolist, best), strict=True)]
     recognized = bool(target) and bool(classifier.recognized(logits[None], target)[0])
-    return NetworkAnswer(Path(classifier.name).name, labels, recognized)
+    return {"network": Path(classifier.name).name, "labels": labels, "recognized": recognized}
 
 
 def _outline(stage: Stage, conditions: Conditions, side_px: int) -> np.ndarray | None:

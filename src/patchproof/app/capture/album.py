@@ -24,7 +24,7 @@ CONTROLS_FOLDER = "controls"
 CONTROLS = ("bare", "mean", "gray", "noise", "blank")
 MOST_BYTES = 40_000_000  # phones' largest JPEGs, of 108 and 200 megapixels, have some 30
 MOST_PHOTOS = 1000
-_OWN = ("session_*", CONTROLS_FOLDER, JOURNAL_FILE, CORNERS_FILE, ".capture.json")  # the last, a sender's, is not read
+_OWN = ("session_*", CONTROLS_FOLDER, JOURNAL_FILE, CORNERS_FILE)
 _HEAD = 12  # bytes that tell the kind of a file
 # by suffix: where the bytes begin that tell a kind, and which they are
 _KINDS = {
@@ -100,58 +100,45 @@ class Album:
         if into not in (*CONTROLS, *self.sessions) or folder.resolve() != folder:
             got = f'"{into[:40]}"'
             raise UploadRefused(404, "a session or a control of this folder", got, "load the page again")
-        return Incoming(folder, self._free_number(), self._by_sha256)
-
-    def _free_number(self) -> int:
         names = (match for path in self.folder.rglob("*photo_*") if (match := _NUMBERED.match(path.name)))
         number = 1 + max((int(match[1]) for match in names), default=0)
         if number > MOST_PHOTOS:
             expected = f"at most {MOST_PHOTOS} photographs in a folder"
             raise UploadRefused(507, expected, f"photograph {number}", "start with a new folder")
-        return number
+        return Incoming(folder / f"photo_{number:04d}", self._by_sha256)
 
 
 class Incoming:
     """One upload, as a context manager; without a call of `keep` its file is removed at the end."""
 
-    def __init__(self, folder: Path, number: int, by_sha256: dict[str, Path]):
-        self._folder, self._by_sha256, self._digest = folder, by_sha256, hashlib.sha256()
-        self._head, self._bytes = b"", 0
-        while True:
-            self._stem, self._part = f"photo_{number:04d}", folder / f".photo_{number:04d}.part"
-            try:
-                self._file = open(self._part, "xb")  # fails if another upload has this number
-            except FileExistsError:
-                number += 1
-                continue
-            if not list(folder.glob(f"{self._stem}.*")):
-                return
-            self._discard()
-            number += 1
+    def __init__(self, stem: Path, by_sha256: dict[str, Path]):
+        self._stem, self._part, self._by_sha256 = stem, stem.with_name(f".{stem.name}.part"), by_sha256
+        self._file, self._digest, self._head, self._bytes = open(self._part, "xb"), hashlib.sha256(), b"", 0
 
     def __enter__(self) -> "Incoming":
         return self
 
     def __exit__(self, *error: object) -> None:
-        self._discard()
+        with suppress(OSError):  # a full disk, which takes no byte of what is still to be written
+            self._file.close()
+        self._part.unlink(missing_ok=True)
 
     def write(self, chunk: bytes) -> None:
         """Write the next bytes; refused as soon as they are too many, or are not a photograph's."""
         refuse_size(self._bytes + len(chunk))
-        if len(self._head) < _HEAD:
-            self._head += chunk[: _HEAD - len(self._head)]
-            if len(self._head) == _HEAD:
-                _suffix_of(self._head)
+        self._head += chunk[: _HEAD - len(self._head)]
+        if len(self._head) == _HEAD:
+            _suffix_of(self._head)
         self._bytes += len(chunk)
         self._digest.update(chunk)
         self._file.write(chunk)
 
     def keep(self) -> Path:
         """Store the whole photograph and return its path, or that of the same bytes in the same folder."""
-        path, sha256 = self._folder / f"{self._stem}{_suffix_of(self._head)}", self._digest.hexdigest()
+        path, sha256 = self._stem.with_suffix(_suffix_of(self._head)), self._digest.hexdigest()
         earlier = self._by_sha256.get(sha256)
         if earlier is not None:
-            if earlier.parent != self._folder:
+            if earlier.parent != path.parent:
                 got = f"{earlier.parent.name}/{earlier.name} once more"
                 raise UploadRefused(409, "a photograph that is not here yet", got, "take a new one")
             return earlier
@@ -161,11 +148,6 @@ class Incoming:
         os.replace(self._part, path)
         self._by_sha256[sha256] = path
         return path
-
-    def _discard(self) -> None:
-        with suppress(OSError):  # a full disk, which takes no byte of what is still to be written
-            self._file.close()
-        self._part.unlink(missing_ok=True)
 
 
 def refuse_size(size: int) -> None:

@@ -14,7 +14,6 @@ later, so that silent ones cannot keep the owner out.
 import asyncio
 import hmac
 import secrets
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -34,7 +33,7 @@ from patchproof.evidence.verdict import sessions_needed
 from patchproof.report.page import render_page
 
 if TYPE_CHECKING:
-    from starlette.types import ASGIApp, Message, Receive, Scope, Send
+    from starlette.types import Receive, Scope, Send
 
 STALLED_S = 30.0  # without a byte: a phone out of reach does not close its connection
 LEAST_BYTES_PER_S = 20_000  # of a whole photograph, after `STALLED_S`
@@ -42,17 +41,17 @@ _MOST_UPLOADS = 8  # at once; more wait before their body is read
 TOKEN_SHOWN_S = 10.0  # from a connection to the end of a request's head; whoever takes longer loses its place
 MOST_STRANGERS, _MOST_CONNECTIONS = 32, 64  # connections that have not shown the token, and all
 _Client = tuple[str, int] | None
-_HEADERS = {
-    "Cache-Control": "no-store",
-    "Referrer-Policy": "no-referrer",
-    "X-Content-Type-Options": "nosniff",
-    "Cross-Origin-Resource-Policy": "same-origin",
-    "Connection": "close",
-}
+_HEADERS = [
+    ("Cache-Control", "no-store"),
+    ("Referrer-Policy", "no-referrer"),
+    ("X-Content-Type-Options", "nosniff"),
+    ("Cross-Origin-Resource-Policy", "same-origin"),
+    ("Connection", "close"),
+]
 
 
 def server_config(collection: PhotoCollection, token: str) -> uvicorn.Config:
-    """Settings of a server for a collection of photographs, with the application `capture_app`."""
+    """Settings of a server for a collection of photographs; it answers requests with the token only."""
     strangers: dict[_Client, asyncio.Transport] = {}  # the oldest first
 
     def expel(client: _Client, transport: asyncio.Transport) -> None:
@@ -71,9 +70,32 @@ def server_config(collection: PhotoCollection, token: str) -> uvicorn.Config:
             super().connection_lost(exc)
             strangers.pop(self.client, None)
 
+    handlers = _Handlers(collection)
+    routes = [
+        Route(f"/{token}/", handlers.page, methods=["GET"]),
+        Route(f"/{token}/state", handlers.state, methods=["GET"]),
+        Route(f"/{token}/photos", handlers.photo, methods=["POST"]),
+        Route(f"/{token}/sessions", handlers.session, methods=["POST"]),
+        Route(f"/{token}/corners", handlers.corners, methods=["POST"]),
+    ]
+    app = Starlette(routes=routes, exception_handlers={Refused: _refuse, OSError: _refuse})
+    app.router.redirect_slashes = False
+
+    async def check_token(scope: "Scope", receive: "Receive", send: "Send") -> None:
+        """Check the token, in constant time, before anything else of a request is read."""
+        if scope["type"] != "http":
+            return
+        shown = scope["path"].lstrip("/").partition("/")[0]
+        if not hmac.compare_digest(shown.encode("utf-8", "surrogateescape"), token.encode()):
+            sentence = "Expected the address that the terminal shows, got one without its token: open that address."
+            return await _refusal(403, sentence)(scope, receive, send)
+        strangers.pop(scope["client"], None)
+        await app(scope, receive, send)
+
     return uvicorn.Config(
-        capture_app(collection, token, lambda client: strangers.pop(client, None)),
+        check_token,
         http=Connection,
+        headers=_HEADERS,
         ws="none",
         lifespan="off",
         log_level="warning",
@@ -85,61 +107,19 @@ def server_config(collection: PhotoCollection, token: str) -> uvicorn.Config:
     )
 
 
-def capture_app(collection: PhotoCollection, token: str, admit: Callable[[_Client], object]) -> "ASGIApp":
-    """Make the application for a collection of photographs; it answers requests with the token only, and calls `admit`
-    with the address of each client that has shown it.
-    """
-    handlers = _Handlers(collection)
-    routes = [
-        Route(f"/{token}/", handlers.page, methods=["GET"]),
-        Route(f"/{token}/state", handlers.state, methods=["GET"]),
-        Route(f"/{token}/photos", handlers.photo, methods=["POST"]),
-        Route(f"/{token}/sessions", handlers.session, methods=["POST"]),
-        Route(f"/{token}/corners", handlers.corners, methods=["POST"]),
-    ]
-    app = Starlette(routes=routes, exception_handlers={Refused: _refuse, OSError: _refuse})
-    app.router.redirect_slashes = False
-    return _TokenCheck(app, token, admit)
-
-
-class _TokenCheck:
-    """Check the token, in constant time, before anything else of a request is read, and add headers to responses."""
-
-    def __init__(self, app: "ASGIApp", token: str, admit: Callable[[_Client], object]):
-        self._app, self._token, self._admit = app, token.encode(), admit
-
-    async def __call__(self, scope: "Scope", receive: "Receive", send: "Send") -> None:
-        async def with_headers(message: "Message") -> None:
-            if message["type"] == "http.response.start":
-                headers = [(name.lower().encode(), value.encode()) for name, value in _HEADERS.items()]
-                message = {**message, "headers": [*message["headers"], *headers]}
-            await send(message)
-
-        if scope["type"] != "http":
-            return
-        token = scope["path"].lstrip("/").partition("/")[0]
-        if not hmac.compare_digest(token.encode("utf-8", "surrogateescape"), self._token):
-            sentence = "Expected the address that the terminal shows, got one without its token: open that address."
-            return await _refusal(403, sentence)(scope, receive, with_headers)
-        self._admit(scope["client"])
-        await self._app(scope, receive, with_headers)
-
-
 class _Handlers:
     """The routes' handlers, and the state that they share."""
 
     def __init__(self, collection: PhotoCollection):
-        self._collection, promise = collection, collection.manifest.promise
-        self._planned_sessions = None if promise is None else sessions_needed(promise)
+        self._collection, self._planned_sessions = collection, sessions_needed(collection.promise)
         self._state = state_of(collection, self._planned_sessions)
         self._one_at_a_time, self._receiving = anyio.Lock(), anyio.Semaphore(_MOST_UPLOADS)
 
     async def page(self, request: Request) -> Response:
         """The page; its policy allows only its own scripts and styles, and requests to this server."""
-        manifest, nonce = self._collection.manifest, secrets.token_urlsafe(16)
-        target = manifest.promise and manifest.promise.target
-        values = {"nonce": nonce, "sheet_id": manifest.sheet_id, "target": target, "most_bytes": MOST_BYTES}
-        html = render_page("page.html.j2", Path(__file__).parent, **values)
+        sheet_id, target = self._collection.manifest.sheet_id, self._collection.promise.target
+        values = {"nonce": (nonce := secrets.token_urlsafe(16)), "sheet_id": sheet_id, "target": target}
+        html = render_page("page.html.j2", Path(__file__).parent, **values, most_bytes=MOST_BYTES)
         policy = (
             f"default-src 'none'; script-src 'nonce-{nonce}'; style-src 'nonce-{nonce}'; connect-src 'self'; "
             "img-src data: blob:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -197,7 +177,7 @@ class _Handlers:
         return {"photo": answer_of(collection, path, pictures[0] if pictures else None), "state": self._state}
 
 
-async def _refuse(request: Request, error: Exception) -> Response:
+async def _refuse(_: Request, error: Exception) -> Response:
     """Answer with a refusal's sentence, or with that of a disk that takes no more."""
     if isinstance(error, OSError):
         error = Refused("room for a photograph", error.strerror or str(error), "make room and send it again")

@@ -3,13 +3,12 @@
 In: an album, a manifest, the options of a verification. Out: a `Report`, as `verify` makes it of the same folder.
 Photographs are measured one at a time, in the single process of the workers, where limits of time and memory apply;
 finished ones are in the album's journal, so that a restart measures only new ones, tapped corners in `corners.csv`.
-Left out on purpose: the gap ledger and the estimated effect, which take longer than a person waits.
+Left out on purpose: the gap ledger, the estimated effect and forecasts, which take longer than a person waits.
 """
 
 import re
 import signal
 from collections.abc import Callable, Mapping, Sequence
-from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -21,36 +20,31 @@ from patchproof.base.output import write_atomically
 from patchproof.base.progress import Advance, no_advance
 from patchproof.base.workers import Workers
 from patchproof.evidence import corner_files
-from patchproof.evidence.batch import PhotoItem, measure_all, reread_square
+from patchproof.evidence.batch import PhotoItem, measure_all
 from patchproof.evidence.classify import judges_of
 from patchproof.evidence.copies import reject_copies
-from patchproof.evidence.gather import report_of, with_forecast
+from patchproof.evidence.gather import report_of
 from patchproof.evidence.grouping import BY_FOLDERS, Grouping
 from patchproof.evidence.journal import JOURNAL_FILE, Journal, settings_key
 from patchproof.evidence.measure import MeasuredPhoto
-from patchproof.evidence.reproject import PhotoSquare
 from patchproof.evidence.results import Report
 from patchproof.evidence.same_session import merge_folders
-from patchproof.evidence.task import Options, Task, task_of
+from patchproof.evidence.task import Options, task_of
 from patchproof.photo.corners import DesignCorners
-from patchproof.sheets.manifest import Manifest, load_manifest
+from patchproof.sheets.manifest import Manifest
 
 _CORNER_CODES = ("no_corners", "other_design", "several_sheets")  # of photographs in which a person may tap corners
 _TEN_NUMBERS = re.compile(r"(\d{1,6}(\.\d{1,20})?(,(?!$)|$)){10}")
-# the folder of a run, its sheet's manifest, and what the user said of the run's networks (see `load_run`)
-RunAndSheet = tuple[Path, Path, bool, tuple[str, ...]]
 
 
 class PhotoCollection:
-    """An album's measured photographs; not thread-safe. With a `run` each photograph gets its forecast."""
+    """An album's measured photographs of a sheet that promises something; not thread-safe."""
 
-    def __init__(
-        self, album: Album, manifest: Manifest, options: Options, workers: Workers, run: RunAndSheet | None = None
-    ):
-        self.album, self.manifest = album, manifest
+    def __init__(self, album: Album, manifest: Manifest, options: Options, workers: Workers):
+        assert manifest.promise is not None  # else the sheet is refused
+        self.album, self.manifest, self.promise, self._workers = album, manifest, manifest.promise, workers
         self._judges = judges_of(options.models, manifest)
         self._task = task_of(manifest, options, self._judges)
-        self._workers, self._forecast = workers, run
         self._journal = Journal(album.folder / JOURNAL_FILE, settings_key(manifest, options), resume=True)
         self._measured: dict[Path, MeasuredPhoto] = {}
         self._photos: dict[Path, MeasuredPhoto] | None = None  # those of `photos` once they were asked for
@@ -73,12 +67,6 @@ class PhotoCollection:
         paths = [path for path in paths if path not in self._measured]
         items = [self._item(path) for path in paths]
         results = measure_all(self._task, items, self._judges, self._workers, self._journal, on_pictures, advance)
-        if self._forecast is not None and self._judges is not None:
-            add_forecast = partial(_add_forecast, self._forecast, self._task, self._judges.primary.input_px)
-            numbers = [i for i, item in enumerate(items) if item.control is None]
-            photos = self._workers.map(add_forecast, [(paths[i], results[i]) for i in numbers])
-            for i, photo in zip(numbers, photos, strict=True):
-                results[i] = photo
         for path, photo in zip(paths, results, strict=True):
             self.add(path, photo)
 
@@ -161,14 +149,3 @@ def _name_of(path: Path) -> str:
 def prepare_worker(_: object) -> None:
     """Import the modules for measuring in the worker, and let it ignore interrupts: the server ends it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
-def _add_forecast(source: RunAndSheet, task: Task, size_px: int, item: tuple[Path, MeasuredPhoto]) -> MeasuredPhoto:
-    return with_forecast(partial(reread_square, task, size_px), _forecaster(*source), *item)
-
-
-@lru_cache(maxsize=1)
-def _forecaster(run: Path, sheet: Path, trust: bool, named: tuple[str, ...]) -> Callable[[PhotoSquare], float | None]:
-    from patchproof.reprints.photo_forecast import photo_forecaster  # brings scene, renderer and optimizer in
-
-    return photo_forecaster(run, load_manifest(sheet), trust, named)

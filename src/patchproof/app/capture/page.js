@@ -61,8 +61,7 @@ function lines(photo) {
   head.append(make("b", photo.answer, photo.answer.replace(" ", "-")), photo.label ? ` as ${photo.label}` : "");
   box.append(head);
   if (photo.advice) box.append(make("p", photo.advice, "advice"));
-  const expected = photo.forecast === null ? "" : `, expected ${Math.round(100 * photo.forecast)} %`;
-  box.append(make("p", `${photo.file}${photo.view ? ": " + photo.view : ""}${expected}`, "soft"));
+  box.append(make("p", `${photo.file}${photo.view ? ": " + photo.view : ""}`, "soft"));
   return box;
 }
 
@@ -177,7 +176,7 @@ async function refresh() {
     const answered = await fetch("state");
     if (answered.ok) show(await answered.json());
     $("soon").textContent = answered.ok ? "" : "This address is not valid any more: open the one that the terminal shows.";
-  } catch { $("soon").textContent = "No connection: photographs are kept here until it is back."; }
+  } catch { $("soon").textContent = "No connection: photographs are kept here until it is back, at this address."; }
 }
 
 for (const id of ["camera", "choose"]) {

@@ -1,9 +1,12 @@
 """The content of the capture page as plain data: verdict so far, map of views, sessions, photographs with advice.
 
 In: a collection of photographs. Out: JSON values. Every sentence about a photograph or the promise is the report's:
-remarks' advice, the verdict's reason, the plan page's counts.
+remarks' advice, the verdict's reason, the plan page's counts. On the map of views, cells are equal steps of azimuth and
+of distance (1 over pixels per millimeter), and need photographs in proportion to their shares of the conditions.
+Distance itself is not on it: only cameras of known focal length measure it, and a network does not see it.
 """
 
+from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -12,26 +15,29 @@ import numpy as np
 
 from patchproof.app.capture.album import CONTROLS
 from patchproof.app.capture.collection import PhotoCollection
-from patchproof.app.capture.view_map import map_views
-from patchproof.base.output import image_bytes
+from patchproof.evidence.ranges import figures_of
 from patchproof.evidence.results import PhotoEntry
 from patchproof.evidence.verdict import PHOTOS_PER_SESSION
-from patchproof.report.images import data_uri
+from patchproof.report.page import data_uri, jpeg
 from patchproof.report.words import VERDICTS, benefit_sentence, headline_of
+from patchproof.sheets.manifest import ConditionClaim
 
 _LATEST_PHOTOS = 12  # that are listed with advice
 _USUAL_SESSIONS = 4  # on the map, if no number of sessions would prove the promise
-_PREVIEW_OPTIONS = {"quality": 80}
+_ROWS, _MOST_COLUMNS = 3, 5
+_LEAST_COLUMN_DEG = 12.0  # about the error of a person who aims a phone by hand
 
 
 def state_of(collection: PhotoCollection, sessions: int | None) -> dict[str, Any]:
     """Everything that the page shows, except for single answers; `sessions` (None: 4) are planned on the map."""
     report = collection.report()
-    summary, data, promise = report.summary, report.summary.model_dump(), collection.manifest.promise
+    summary, data, promise = report.summary, report.summary.model_dump(), collection.promise
     counts = {row["name"]: row for row in data["sessions"]}
     rows = [counts.get(name, {"name": name, "judged": 0, "recognized": 0}) for name in collection.album.sessions]
-    promised = promise.controls if promise is not None else ()
-    names = sorted(collection.photos, key=lambda path: path.name)  # in the order of arrival
+    photos, width_mm = collection.photos, collection.manifest.cut_mm[2]
+    counted = [photo.entry for path, photo in photos.items() if photo.counted and collection.control_of(path) is None]
+    wanted = PHOTOS_PER_SESSION * (sessions or _USUAL_SESSIONS)
+    names = sorted(photos, key=lambda path: path.name)  # in the order of arrival
     return {
         "verdict": summary.verdict,
         "headline": VERDICTS[summary.verdict],
@@ -39,36 +45,31 @@ def state_of(collection: PhotoCollection, sessions: int | None) -> dict[str, Any
         "effect": f"{headline_of(data)}. {benefit_sentence(data)}",
         "photos": summary.photos,
         "judged": summary.judged,
-        "recognized": sum(row["recognized"] for row in rows),
-        "interval": summary.interval,
-        "prediction_interval": summary.prediction_interval,
         "sessions": rows,
         "each": PHOTOS_PER_SESSION,
         "plan": summary.next_step,
         "controls": [{"name": each.name, "photos": each.n, "recognized": each.recognized} for each in report.controls],
-        "controls_known": [name for name in CONTROLS if name in promised] or CONTROLS,
-        "map": _map(collection, PHOTOS_PER_SESSION * (sessions or _USUAL_SESSIONS)),
+        "controls_known": [name for name in CONTROLS if name in promise.controls] or CONTROLS,
+        "map": map_views(promise.conditions, counted, wanted, collection.side_px, width_mm),
         "latest": [answer_of(collection, path) for path in names[-_LATEST_PHOTOS:][::-1]],
     }
 
 
 def answer_of(collection: PhotoCollection, path: Path, picture: np.ndarray | None = None) -> dict[str, Any]:
     """The answer to one measured photograph, with advice; `picture` (uint8 H×W×3) is included as a data URI."""
-    photo, promise = collection.photos[path], collection.manifest.promise
-    entry, is_counted = photo.entry, promise is not None and photo.counted
-    prediction = entry.predictions.get(promise.models[0].name) if promise is not None and is_counted else None
+    photo, name = collection.photos[path], collection.promise.models[0].name
+    entry = photo.entry
+    prediction = entry.predictions.get(name) if photo.counted else None
     answer = "not counted" if prediction is None else "recognized" if prediction.recognized else "not recognized"
     return {
         "file": f"{path.parent.name}/{path.name}",
         "answer": answer,
-        "control": collection.control_of(path),
         "tap": collection.wants_corners(path),
         "label": prediction and f"{prediction.label} {prediction.confidence:.0%}",
         "code": entry.code,
         "advice": "; ".join(filter(None, (entry.remark and entry.remark.advice, *entry.said))) or None,
         "view": _view_words(entry),
-        "forecast": entry.forecast,
-        "picture": None if picture is None else data_uri(image_bytes(picture, "JPEG", _PREVIEW_OPTIONS)),
+        "picture": None if picture is None else data_uri(jpeg(picture)),
     }
 
 
@@ -84,26 +85,43 @@ def _view_words(entry: PhotoEntry) -> str:
     return ", ".join(parts)
 
 
-def _map(collection: PhotoCollection, wanted: int) -> dict[str, Any] | None:
-    """The map of views with names of its columns (degrees) and rows (the piece's share of the picture's shorter side,
-    or else pixels per millimeter); None if the promise has no views.
+def map_views(
+    conditions: Sequence[ConditionClaim],
+    entries: Sequence[PhotoEntry],
+    wanted: int,
+    side_px: float | None,
+    piece_mm: float,
+) -> dict[str, Any] | None:
+    """Map counted photographs, of which `wanted` are needed in total; None if the conditions have no views.
+
+    Columns run in degrees from left to right, rows from near to far (the share of a picture's shorter `side_px` that
+    the piece takes, or else pixels per millimeter); `next` is the (row, column) that lacks the most photographs,
+    `elsewhere` counts those whose view is unknown. Photographs beyond the edges, which the promise's margin allows,
+    count in the outermost cells.
     """
-    promise, side_px, photos = collection.manifest.promise, collection.side_px, collection.photos
-    counted = [photo.entry for path, photo in photos.items() if photo.counted and collection.control_of(path) is None]
-    views = promise and map_views(promise.conditions, counted, wanted, side_px)
-    if not views:
+    views = np.array([(c.azimuth_deg, c.px_per_mm) for c in conditions if c.azimuth_deg is not None and c.px_per_mm])
+    if not len(views):
         return None
-    rows = [f"{low:.1f}–{high:.1f} px/mm" for high, low in pairwise(views.px_per_mm)]
-    if side_px is not None:
-        share = 100 * collection.manifest.cut_mm[2] / side_px
-        rows = [f"{share * low:.0f}–{share * high:.0f} %" for high, low in pairwise(views.px_per_mm)]
+    (left, smallest), (right, largest) = views.min(0), views.max(0)
+    columns = int(np.clip((right - left) // _LEAST_COLUMN_DEG, 1, _MOST_COLUMNS))
+    azimuth_deg, distance = np.linspace(left, right, columns + 1), np.linspace(1 / largest, 1 / smallest, _ROWS + 1)
+
+    def counts(points: np.ndarray) -> np.ndarray:
+        inside = np.clip(1 / points[:, 1], *distance[[0, -1]]), np.clip(points[:, 0], left, right)
+        return np.histogram2d(*inside, (distance, azimuth_deg))[0]
+
+    figures = [figures_of(entry, side_px) for entry in entries]
+    photo_views = [(each.get("azimuth_deg"), each.get("px_per_mm")) for each in figures]
+    known_views = np.array([view for view in photo_views if None not in view]).reshape(-1, 2)
+    photos, needed = counts(known_views).astype(int), np.rint(wanted * counts(views) / len(views)).astype(int)
+    share, words = (1, "{:.1f}–{:.1f} px/mm") if side_px is None else (100 * piece_mm / side_px, "{:.0f}–{:.0f} %")
     return {
-        "columns": [_azimuth_words(low, high) for low, high in pairwise(views.azimuth_deg)],
-        "rows": rows,
-        "photos": views.photos,
-        "wanted": views.wanted,
-        "elsewhere": views.elsewhere,
-        "next": views.most_missing,
+        "columns": [_azimuth_words(low, high) for low, high in pairwise(azimuth_deg)],
+        "rows": [words.format(share * low, share * high) for high, low in pairwise(1 / distance)],
+        "photos": photos.tolist(),
+        "wanted": needed.tolist(),
+        "elsewhere": len(photo_views) - len(known_views),
+        "next": divmod(int((needed - photos).argmax()), columns) if (needed > photos).any() else None,
         "of_picture": side_px is not None,
     }
 

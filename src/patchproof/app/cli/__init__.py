@@ -8,10 +8,9 @@ import typer
 
 from patchproof.app.cli.begin import examples, keys, new, plan, preview
 from patchproof.app.cli.calibrate import camera, printer
-from patchproof.app.cli.capture import capture
 from patchproof.app.cli.console import as_command, run_command_line, version_option
 from patchproof.app.cli.designs import evaluate, import_picture
-from patchproof.app.cli.journey import demo, optimize, promise, reprint, sheet, verify
+from patchproof.app.cli.journey import capture, demo, optimize, promise, reprint, sheet, verify
 
 app = typer.Typer(
     no_args_is_help=True,

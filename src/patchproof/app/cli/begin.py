@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 from typer import Argument, Exit, Option
 
 from patchproof.app.cli.console import Overwrite, names_of, say, warn
+from patchproof.base.errors import Refused
 from patchproof.base.progress import progress_bar
 from patchproof.base.text import command_text
 
@@ -19,18 +20,10 @@ def new(
         str, Argument(metavar="MESH|PHOTOS|IMAGES", help="A mesh file, primitive:NAME, or a folder of pictures.")
     ],
     out: Annotated[Path, Option(help="The scene file to write.")] = Path("scene.toml"),
-    label: Annotated[
-        str | None, Option(help="What networks should see: words of a label; from the file's name without.")
-    ] = None,
-    length_mm: Annotated[
-        float | None, Option(min=1e-3, help="The object's longest extent; from the file's units without.")
-    ] = None,
-    up: Annotated[
-        Literal["y", "z"] | None, Option(help="The file's axis that points up; by its format without.")
-    ] = None,
-    models: Annotated[
-        str | None, Option(help="Comma-separated classifiers; without, imagenet where it is installed, else builtin.")
-    ] = None,
+    label: Annotated[str | None, Option(help="Words of the target's label; else of the file's name.")] = None,
+    length_mm: Annotated[float | None, Option(min=1e-3, help="The longest extent; else by the file's units.")] = None,
+    up: Annotated[Literal["y", "z"] | None, Option(help="The file's axis that points up.")] = None,
+    models: Annotated[str | None, Option(help="Comma-separated classifiers; else imagenet or builtin.")] = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Write a commented scene for an object, photographs of it, or a folder of images."""
@@ -61,33 +54,41 @@ def preview(
 def plan(
     scene: SceneFile,
     out: Annotated[Path | None, Option(help="Write the plan as JSON, too.")] = None,
-    no_timing: Annotated[bool, Option("--no-timing", help="Leave out the cost of a step.")] = False,
     overwrite: Overwrite = False,
 ) -> None:
     """Show what is modeled, what is not, and why: first how the piece lies, then what is measured."""
-    from patchproof.app.plan.lines import geometry_lines, measured_lines
-    from patchproof.app.plan.plan import measured_plan, plan_geometry
+    from pydantic_core import to_json
+
+    from patchproof.app.plan.plan import geometry_lines, measured_lines, measured_plan, plan_geometry
     from patchproof.base.output import check_file, write_atomically
 
     if out is not None:
         check_file(out, overwrite)
     with progress_bar() as bar:
         geometry, problem = plan_geometry(scene, progress=bar)
-    warn(geometry.warnings)
+    warn(geometry["warnings"])
     say(*geometry_lines(geometry))
     sys.stdout.flush()  # what follows takes minutes
     with progress_bar() as bar:
-        full_plan = measured_plan(geometry, problem, timing=not no_timing, progress=bar)
+        full_plan = measured_plan(geometry, problem, progress=bar)
     say(*measured_lines(full_plan))
     if out is not None:
-        write_atomically(out, full_plan.model_dump_json(indent=1) + "\n")
+        write_atomically(out, to_json(full_plan, indent=1) + b"\n")
 
 
 def examples(folder: Annotated[Path, Argument(help="The folder to copy them to, new or empty.")]) -> None:
     """Copy five programs and their scenes: a patch on a box, your network, photographs, a detector, a print."""
-    from patchproof.app.begin.copy_examples import copy_examples
+    from patchproof.base.output import make_folder, write_atomically
 
-    say(*copy_examples(folder), f"next: cd {shlex.quote(str(folder))} && python box.py")
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        got = f"{folder}, which {'has files' if folder.is_dir() else 'is a file'}"
+        raise Refused("a new or empty folder", got, "name another")
+    make_folder(folder)
+    for path in sorted((Path(__file__).parents[1] / "examples").glob("*.*")):
+        write_atomically(folder / path.name, path.read_bytes())
+        if path.suffix == ".py":
+            say(f"{path.name}: {path.read_text(encoding='utf-8').splitlines()[0].strip(chr(34))}")
+    say(f"next: cd {shlex.quote(str(folder))} && python box.py")
 
 
 def keys(

@@ -24,12 +24,7 @@ Device = Annotated[str, Option(help="cpu or cuda.")]
 Seed = Annotated[int | None, Option(min=0, help="In place of the scene's own seed.")]
 Resume = Annotated[bool, Option("--resume", help="Go on where a run that was stopped left off.")]
 Jobs = Annotated[
-    int | None,
-    Option(
-        min=1,
-        help="Local processes that share the work, by default one for each free core where they can be forked; any "
-        "number of them gives the same results.",
-    ),
+    int | None, Option(min=1, help="Local processes, one for each free core; any number gives the same results.")
 ]
 Cluster = Annotated[str | None, Option(help="A Dask scheduler's address, in place of local processes.")]
 Trust = Annotated[

@@ -12,43 +12,31 @@ from patchproof.base.progress import progress_bar
 
 
 def import_picture(
-    picture: Annotated[Path, Argument(help="A picture file, or a folder of them: a run in OUT for each.")],
+    picture: Annotated[Path, Argument(help="A picture file.")],
     scene: Annotated[Path, Argument(help="The scene file (TOML).")],
-    out: Annotated[Path, Option(help="Folder for the run, or for the runs.")],
-    resume: Annotated[bool, Option("--resume", help="Of a folder: keep the runs that are finished.")] = False,
+    out: Annotated[Path, Option(help="Folder for the run.")],
     overwrite: Overwrite = False,
     as_printed: Annotated[
         str | None, Option(help="It is printed already, in this size in mm, such as 594x841: no page, no markers.")
     ] = None,
-    draft: Annotated[bool, Option("--draft", help="A first look: promised from few views.")] = False,
     promise: Annotated[int | None, Option(min=8, help="Views to promise from; of under 400: a draft.")] = None,
     device: Device = "cpu",
     seed: Seed = None,
     jobs: Jobs = None,
 ) -> None:
     """Make a run of a picture that was made elsewhere: its promise, as of a design of ours."""
-    from patchproof.optimizer.imported_design import import_folder, import_patch
+    from patchproof.optimizer.imported_design import import_patch
     from patchproof.optimizer.promise import PromiseOptions
-    from patchproof.optimizer.run import DRAFT_EFFORT
-    from patchproof.report.run_words import imported_lines
-    from patchproof.report.words import run_lines
+    from patchproof.report.words import imported_lines, run_lines
     from patchproof.scene.scene import load_scene
 
     with progress_bar() as bar:
-        loaded, views = load_scene(scene, seed), promise or (DRAFT_EFFORT[1] if draft else None)
+        loaded = load_scene(scene, seed)
         warn(loaded.warnings)
-        options: dict[str, Any] = {"promise": PromiseOptions(views), "compute": Compute(device, jobs or 1)}
-        options |= {"overwrite": overwrite, "progress": bar}
-        if as_printed is not None:
-            if picture.is_dir():
-                raise BadParameter("is of one picture, not of a folder", param_hint="--as-printed")
-            options["as_printed"] = console.pair_of(as_printed, "--as-printed")
-        if picture.is_dir():
-            runs = import_folder(picture, loaded, out, resume=resume, **options)
-        else:
-            runs = [import_patch(picture, loaded, out, **options)]
-    for run in runs:
-        say(*imported_lines(run.details["imported"]), *run_lines(run))
+        options: dict[str, Any] = {"promise": PromiseOptions(promise), "compute": Compute(device, jobs or 1)}
+        size_mm = None if as_printed is None else console.pair_of(as_printed, "--as-printed")
+        run = import_patch(picture, loaded, out, as_printed=size_mm, **options, overwrite=overwrite, progress=bar)
+    say(*imported_lines(run.details["imported"]), *run_lines(run))
 
 
 def evaluate(
@@ -66,7 +54,7 @@ def evaluate(
     """Rates on fresh conditions, with controls, on any classifiers; of several runs side by side."""
     from patchproof.app.compare import compare
     from patchproof.optimizer.evaluate import evaluate as evaluate_run
-    from patchproof.report.run_words import evaluation_lines
+    from patchproof.report.words import evaluation_lines
 
     if (out is None) != (len(runs) == 1):
         raise BadParameter("is for several runs, and they need it; one has its own folder", param_hint="--out")

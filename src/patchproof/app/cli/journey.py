@@ -1,5 +1,6 @@
-"""The verbs from a scene to a verdict: demo, optimize, promise, sheet, reprint, verify."""
+"""The verbs from a scene to a verdict: demo, optimize, promise, sheet, reprint, capture, verify."""
 
+import signal
 import sys
 import webbrowser
 from pathlib import Path
@@ -8,33 +9,19 @@ from typing import Annotated, Any, Literal
 from typer import Argument, BadParameter, Exit, Option
 
 from patchproof.app.cli import console
-from patchproof.app.cli.console import (
-    Cluster,
-    Device,
-    Jobs,
-    Models,
-    Overwrite,
-    Resume,
-    Seed,
-    Trust,
-    say,
-    warn,
-)
+from patchproof.app.cli.console import Cluster, Device, Jobs, Models, Overwrite, Resume, Seed, Trust, say, warn
 from patchproof.base.compute import Compute
 from patchproof.base.progress import progress_bar
+from patchproof.base.text import command_text
 
 PrintableControl = Literal["mean", "gray", "noise", "blank"]  # that can be printed
 PhotographedControl = Literal["bare", "mean", "gray", "noise"]  # that can hang on the object in place of the design
 
 
 def demo(
-    out: Annotated[Path, Option(help="Folder for the run, the sheet, the photographs and the report.")] = Path(
-        "patchproof-demo"
-    ),
+    out: Annotated[Path, Option(help="Folder for all of it.")] = Path("patchproof-demo"),
     detector: Annotated[bool, Option("--detector", help="Before the built-in detector, not classifier.")] = False,
-    imagenet: Annotated[
-        bool, Option("--imagenet", help='Before a network of photographs: pip install "patchproof[imagenet]".')
-    ] = False,
+    imagenet: Annotated[bool, Option("--imagenet", help="Before a network of photographs.")] = False,
     open_report: Annotated[bool, Option("--open", help="Open the report in the browser at the end.")] = False,
     jobs: Jobs = None,
     overwrite: Overwrite = False,
@@ -64,10 +51,7 @@ def optimize(
     device: Device = "cpu",
     seed: Seed = None,
     jobs: Jobs = None,
-    require: Annotated[
-        Literal["helps"] | None,
-        Option(help='"helps" makes a design exit with 1 that does not help, or of which it cannot be told yet.'),
-    ] = None,
+    require: Annotated[Literal["helps"] | None, Option(help='"helps": exit with 1 unless it helps.')] = None,
 ) -> None:
     """Optimize the patch of a scene and promise its rate."""
     from patchproof.optimizer.promise import PromiseOptions
@@ -151,17 +135,17 @@ def sheet(
         from patchproof.reprints.run_sheet import sheet as sheet_of
         from patchproof.reprints.run_sheet import sheet_of_several
 
-        first, *others = loaded = [load_run(folder, trust) for folder in runs]
-        if others:
-            manifests = sheet_of_several(loaded, out, template=template, control=control)
+        loaded, content = [load_run(folder, trust) for folder in runs], {"template": template, "control": control}
+        if len(runs) > 1:
+            manifests = sheet_of_several(loaded, out, **content)
         else:
-            manifests = [sheet_of(first, out, template=template, control=control, copies=copies, overwrite=overwrite)]
+            manifests = [sheet_of(loaded[0], out, **content, copies=copies, overwrite=overwrite)]
     for manifest, path in zip(manifests, paths, strict=True):
         if manifest.promise is not None:
             from patchproof.report.words import promise_summary
 
-            lines = promise_summary(manifest.promise, manifest.settings), background_summary(manifest.settings)
-            say(lines[0], f"promise simulated {lines[1]}")
+            settings = manifest.settings
+            say(promise_summary(manifest.promise, settings), f"promise simulated {background_summary(settings)}")
         say(f"sheet {manifest.sheet_id} ({manifest.kind}): {out}{'' if path == out else f', {path.name}'}")
     if check:
         lines = (line for manifest in manifests for line in sheet_advice(manifest))
@@ -179,9 +163,7 @@ def reprint(
     print_scale: Annotated[str, Option(help="Size of the print, 0.97 or 0.97x0.98 (x, y).")] = "1",
     control: Annotated[PhotographedControl | None, Option(help="Photograph a control in place of the design.")] = None,
     scan_dpi: Annotated[float | None, Option(min=30, max=1200, help="Scan the uncut page flat instead.")] = None,
-    path_traced: Annotated[
-        bool, Option("--path-traced", help="Render with Mitsuba 3 in place of our renderer (slow).")
-    ] = False,
+    path_traced: Annotated[bool, Option("--path-traced", help="Render with Mitsuba 3 (slow).")] = False,
     jobs: Jobs = None,
     cluster: Cluster = None,
     trust: Trust = False,
@@ -194,10 +176,9 @@ def reprint(
     from patchproof.reprints.reprint import reprint as reprint_sheet
 
     scale = console.pair_of(print_scale, "--print-scale")
-    if scan_dpi is not None and control is not None:
-        raise BadParameter("a scan is of the PDF itself; leave --control out", param_hint="--scan-dpi")
-    if path_traced and scan_dpi is not None:
-        raise BadParameter("is of the piece on its object; leave --scan-dpi out", param_hint="--path-traced")
+    if scan_dpi is not None and (control is not None or path_traced):
+        only = "a scan is of the PDF itself; leave --control and --path-traced out"
+        raise BadParameter(only, param_hint="--scan-dpi")
     how = ReprintSetup(printer, scale, control, path_traced)
     if run is None:
         if scan_dpi is not None or control is not None or path_traced or sessions > 1:
@@ -216,6 +197,38 @@ def reprint(
     say(f"{len(taken.photos)} photographs: {out}")
 
 
+def capture(
+    sheet: Annotated[Path, Argument(help="The manifest that was written beside the PDF.")],
+    out: Annotated[Path, Option(help="Folder for the photographs; an existing one is continued.")] = Path("photos"),
+    models: Models = None,
+    camera: Annotated[str | None, Option(help="The camera that takes them: a camera file or its name.")] = None,
+    trust: Trust = False,
+    lan: Annotated[bool, Option("--lan", help="Listen on the local network, for a phone.")] = False,
+) -> None:
+    """Receive photographs from a phone's browser, each measured and judged at once."""
+    import segno
+
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # it ends the server, and the verdict follows
+    from patchproof.app.capture.album import CONTROLS_FOLDER
+    from patchproof.app.capture.serve import serve_capture
+    from patchproof.evidence.corner_files import CORNERS_FILE
+    from patchproof.report.words import verdict_lines
+    from patchproof.sheets.manifest import load_manifest
+
+    def show(address: str) -> None:
+        segno.make(address, error="l").terminal(compact=True)
+        say(address, "" if lan else "Only this machine can open it; --lan lets a phone.", "Ctrl-C ends it.")
+
+    with progress_bar() as bar:
+        progress = lambda stage, done, total: bar(stage, done, total) if total else None  # noqa: E731
+        options: dict[str, Any] = {"models": console.names_of(models), "camera": camera, "lan": lan, "trust": trust}
+        report = serve_capture(sheet, out, **options, progress=progress, on_address=show)
+    words = [out, "--sheet", sheet, *(["--controls", out / CONTROLS_FOLDER] if report.controls else [])]
+    if not load_manifest(sheet).markers:
+        words += ["--find", *(["--corners", out / CORNERS_FILE] if (out / CORNERS_FILE).is_file() else [])]
+    say(*verdict_lines(report), f"report: {command_text('verify', *words, '--out', 'report')}")
+
+
 def verify(
     photos: Annotated[Path, Argument(help="A folder of photographs, or of folders: one for each place.")],
     sheet: Annotated[Path, Option(help="The manifest that was written beside the PDF.")],
@@ -226,23 +239,16 @@ def verify(
     ruler_mm: Annotated[str | None, Option(help="The printed rulers as measured, e.g. 97.1x97.3 (x, y).")] = None,
     camera: Annotated[str | None, Option(help="The camera that took them: a camera file or its name.")] = None,
     boxes: Annotated[Path | None, Option(help="The object's boxes in photographs (COCO JSON), for detectors.")] = None,
-    corners: Annotated[
-        Path | None, Option(help="The design's four corners in photographs without markers (CSV or COCO JSON).")
-    ] = None,
+    corners: Annotated[Path | None, Option(help="CSV or COCO JSON with the design's four corners.")] = None,
     find: Annotated[bool, Option("--find", help="Search for the design itself where no marker can be read.")] = False,
     require: Annotated[
         Literal["kept", "helps"] | None,
-        Option(
-            help='What else than exits with 1: "kept", a promise that held, however little it promised; "helps", one '
-            "that held of a patch that helps, as the first line says."
-        ),
+        Option(help='Exit with 1 unless the promise held ("kept"), and the patch helps, too ("helps").'),
     ] = None,
     ledger: Annotated[
         int, Option(min=0, help="Photographs in the gap ledger at most; 0: no ledger, and no rendered controls.")
     ] = 24,
-    run: Annotated[
-        Path | None, Option(help="The run that the sheet is of: forecasts each photograph at its measured view.")
-    ] = None,
+    run: Annotated[Path | None, Option(help="The sheet's run: forecasts each photograph at its view.")] = None,
     trust: Trust = False,
     jobs: Jobs = None,
     cluster: Cluster = None,
@@ -262,8 +268,7 @@ def verify(
         report = verify_photos(photos, sheet, out, **options, progress=bar)
     say(*verdict_lines(report), f"report: {out / 'report.html'}")
     summary = report.summary
-    nothing = summary.judged == 0 and summary.measured == 0
-    if nothing:
+    if nothing := summary.judged == 0 and summary.measured == 0:
         see = "Expected photographs that can be judged or measured, got none: see the codes in the report."
         print(see, file=sys.stderr)
     if require == "kept" and summary.meets("kept") and not summary.meets("helps"):

@@ -1,39 +1,47 @@
 """`plan`: which parts of a scene are modeled and which are not, each with the figure that decided it.
 
-In: a scene file. Out: `Plan`: where the piece lies (after a search, if the scene asks for one) and how a simpler or
-richer surface would differ, the pixels that views have for design and markers, the error of leaving out each term of
-light, camera and renderer, sampling errors, and the cost of a step. All figures come from the code that optimizes.
-Terms are measured with a draft of a few steps, since a classifier that ignores the design would miss none of them.
-
-Sampling errors are the half-widths of 95 % intervals of selection and promise, with the numbers of views that they use,
-and with four times as many: errors shrink with the root of the number, cost grows with it. The promise's interval is
-Wilson's, of views that share no session. What photographs can prove depends on how much sessions differ, which a small
-promise of the draft measures; the sheet's plan page says it of the design.
+In: a scene file. Out: the plan as plain data, and as lines: where the piece lies (after a search, if the scene asks for
+one) and how a simpler or richer surface would differ, the pixels that views have for design and markers, the error of
+leaving out each term of light, camera and renderer, how many photographs prove a promise, and the cost of a step. All
+figures come from the code that optimizes. Terms are measured with a draft of a few steps, since a classifier that
+ignores the design would miss none of them. What photographs can prove depends on how much sessions differ, which a
+small promise of the draft measures; the sheet's plan page says it of the design.
 
 Left out on purpose: deciding for the user. The plan says which terms can go; the scene file decides.
 """
 
 import math
-from collections.abc import Callable
+import statistics
+import time
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import torch
 from torch import Tensor
 
-from patchproof.app.plan.cost import Cost, measure_cost
-from patchproof.app.plan.errors import Terms, measure_terms
-from patchproof.base.intervals import wilson
-from patchproof.base.progress import Advance, Progress, no_progress
-from patchproof.base.validation import StrictModel
+from patchproof.app.plan.errors import measure_terms
+from patchproof.base.progress import Advance, Progress, no_advance, no_progress
+from patchproof.base.validation import not_measured_lines
 from patchproof.evidence.verdict import photos_line
+from patchproof.optimizer.expectation import new_pose_share
 from patchproof.optimizer.loop import SELECT_VIEWS, start, steps
 from patchproof.optimizer.pixels import as_pixels, from_pixels
-from patchproof.optimizer.place_search import Place, choose_place
+from patchproof.optimizer.place_search import choose_place, place_lines
 from patchproof.optimizer.problem import Problem, set_problem
-from patchproof.optimizer.promise import CONTROLS, PROMISE_VIEWS, VIEWS_PER_SESSION, make_promise
+from patchproof.optimizer.promise import CONTROLS, VIEWS_PER_SESSION, make_promise
+from patchproof.render.photograph import affected_windows, expose
 from patchproof.scene.bent_scene import placement_with_other_bend
-from patchproof.scene.interface import PX_PER_MODULE, READABLE_SHARE, PieceScene, require_piece
+from patchproof.scene.conditions import Conditions
+from patchproof.scene.interface import (
+    PX_PER_MODULE,
+    READABLE_SHARE,
+    PieceScene,
+    fit_text,
+    measurable_text,
+    require_piece,
+)
 from patchproof.scene.scene import load_scene
 from patchproof.scene.unplaced_scene import UnplacedScene
 from patchproof.sheets.markers import MARKER_MODULES
@@ -41,196 +49,100 @@ from patchproof.sheets.piece import SMALLEST_MARKER_MM
 
 TERM_VIEWS, PROOF_VIEWS = 16, 40
 DRAFT_VIEWS = 120  # that the draft is trained on
-_NEXT_FACTOR = 4  # of the number of samples
+REPEATS = 5  # of a step that is timed
+PlanData = dict[str, Any]
 
 
-class SurfacePlan(StrictModel):
-    """The piece on the object; `other` says how it would lie with the opposite `patch.bend`."""
-
-    family: str
-    size_mm: tuple[float, float]
-    gap_mm: float | None = None
-    gap_mean_mm: float | None = None
-    overhang_share: float | None = None
-    stretch: float | None = None
-    reason: str
-    other: str | None = None
-
-
-class Resolution(StrictModel):
-    """Pixels per millimeter at the 5 % and 95 % points of the views, and of the design; null if unknown."""
-
-    network_px: int
-    photo_px: tuple[int, int]
-    px_per_mm_network: tuple[float, float]
-    px_per_mm_photo: tuple[float, float]
-    closest_px_per_mm: float  # at the network's size, in the closest view that the settings allow
-    design_px: tuple[int, int] | None  # None of textures, which keep their own sizes
-    printed_px: tuple[int, int] | None
-    printed_px_per_mm: float | None
-    texels: int
-    texels_per_px: float  # along a side, in the closest view
-
-
-class Markers(StrictModel):
-    """Markers needed by the rule (PX_PER_MODULE in READABLE_SHARE of the views) and printed."""
-
-    needed_mm: float
-    printed_mm: float
-    unreadable_share: float
-
-
-class Draft(StrictModel):
-    """The design that terms are measured with: the number of optimization steps, and the rate it reached."""
-
-    steps: int
-    rate: float
-
-
-class Sample(StrictModel):
-    """Half the width of a 95 % interval, of a mean confidence or a rate in [0, 1], from `n` and from `next_n`."""
-
-    name: str
-    n: int
-    half_width: float
-    next_n: int
-    next_half_width: float
-
-
-class GeometryPlan(StrictModel):
-    """The part of a plan that needs no design: computed in seconds, unless a place is searched for."""
-
-    scene: str
-    kind: str
-    target: str
-    models: tuple[str, ...]
-    place: Place | None  # the search for it, where the scene asks for one
-    surface: SurfacePlan
-    resolution: Resolution
-    markers: Markers | None
-    warnings: tuple[str, ...]
-
-
-class Plan(GeometryPlan):
-    """A whole plan: its geometry, and all that is measured with a draft of the design."""
-
-    draft: Draft
-    terms: Terms
-    samples: tuple[Sample, ...]
-    photographs: str  # how many prove a promise of the draft
-    omitted: tuple[str, ...]
-    cost: Cost | None
-    not_measured: dict[str, str]  # reasons by figure
-
-
-def plan_geometry(scene_path: str | Path, *, progress: Progress = no_progress) -> tuple[GeometryPlan, Problem]:
-    """Compute how the piece of a scene lies and how well views resolve it; also returns the problem to measure."""
+def plan_geometry(scene_path: str | Path, *, progress: Progress = no_progress) -> tuple[PlanData, Problem]:
+    """Compute how the piece of a scene lies and how well views resolve it, in seconds unless a place is searched for;
+    also returns the problem to measure.
+    """
     scene, place = load_scene(scene_path), None
     if isinstance(scene, UnplacedScene):
         place = choose_place(scene, progress=progress)
         scene = scene.with_piece_at(place.at, place.spin_deg)
     problem, target = set_problem(scene), scene.settings.target
-    _, sentence = placement_with_other_bend(scene)
-    geometry = GeometryPlan(
-        scene=Path(scene_path).name,
-        kind=scene.description(),
-        target=f"{target.goal} {target.label}",
-        models=tuple(classifier.name for classifier in problem.classifiers),
-        place=place,
-        surface=SurfacePlan(**scene.placement_summary(), other=sentence),
-        resolution=resolution_plan(problem),
-        markers=marker_plan(require_piece(scene)) if scene.HAS_PIECE else None,
-        warnings=scene.warnings,
-    )
+    geometry = {
+        "scene": Path(scene_path).name,
+        "kind": scene.description(),
+        "target": f"{target.goal} {target.label}",
+        "models": [classifier.name for classifier in problem.classifiers],
+        "place": place,
+        # `other` says how the piece would lie with the opposite `patch.bend`
+        "surface": {**scene.placement_summary(), "other": placement_with_other_bend(scene)[1]},
+        "resolution": resolution_plan(problem),
+        "markers": marker_plan(require_piece(scene)) if scene.HAS_PIECE else None,
+        "warnings": scene.warnings,
+    }
     return geometry, problem
 
 
 def measured_plan(
-    geometry: GeometryPlan,
-    problem: Problem,
-    *,
-    timing: bool = True,
-    views: int = TERM_VIEWS,
-    progress: Progress = no_progress,
-) -> Plan:
-    """Measure the rest of a plan: a draft of the design, the terms and, with `timing`, the cost of a step."""
+    geometry: PlanData, problem: Problem, *, views: int = TERM_VIEWS, progress: Progress = no_progress
+) -> PlanData:
+    """Measure the rest of a plan: a draft of the design, the terms in so many views, and the cost of a step."""
     scene = problem.scene
     other, _ = placement_with_other_bend(scene)
     design, draft = _draft(problem, progress)
-    conditions = scene.draw("select", views)
+    conditions, surface = scene.draw("select", views), geometry["surface"]
     terms = measure_terms(problem, design, conditions, SELECT_VIEWS, other, partial(progress, "terms"))
+    needed = ""
+    if scene.HAS_PIECE:
+        sessions, advance = (
+            scene.draw("select", PROOF_VIEWS, per_session=VIEWS_PER_SESSION),
+            partial(progress, "photographs"),
+        )
+        promise = make_promise(problem, as_pixels(design), sessions, CONTROLS, advance, VIEWS_PER_SESSION)
+        needed = f"To prove a promise of such a draft: {photos_line(promise)}"
     reasons = {
-        "terms that can go": terms.unknown,
-        "the size of markers": "" if geometry.markers else "the scene has no printed piece",
-        "how the piece fits the object": "" if geometry.surface.gap_mm is not None else geometry.surface.reason,
-        "the cost of a step": "" if timing else "left out by --no-timing",
+        "terms that can go": terms["unknown"],
+        "the size of markers": "" if geometry["markers"] else "the scene has no printed piece",
+        "how the piece fits the object": "" if surface.get("gap_mm") is not None else surface["reason"],
     }
-    return Plan(
-        **dict(geometry),
-        not_measured={figure: reason for figure, reason in reasons.items() if reason},
-        draft=draft,
-        terms=terms,
-        samples=sample_plan(draft.rate, terms.threshold),
-        photographs=_photographs_needed(problem, design, partial(progress, "photographs")) if scene.HAS_PIECE else "",
-        omitted=scene.OMITTED,
-        cost=measure_cost(problem, design, partial(progress, "cost")) if timing else None,
-    )
+    return geometry | {
+        "draft": draft,
+        "terms": terms,
+        "photographs": needed,
+        "omitted": scene.OMITTED,
+        "cost": measure_cost(problem, design, partial(progress, "cost")),
+        "not_measured": {figure: reason for figure, reason in reasons.items() if reason},
+    }
 
 
-def resolution_plan(problem: Problem) -> Resolution:
-    """Compute how finely views and print resolve the design."""
+def resolution_plan(problem: Problem) -> PlanData:
+    """Compute how finely views and print resolve the design: pixels per millimeter at the 5 % and 95 % points of the
+    views, in the closest view that the settings allow, and in print. Textures keep their own sizes (None).
+    """
     scene, grid = problem.scene, problem.subject.grid
     network_px = max(classifier.input_px for classifier in problem.classifiers)
+    network, photo = (
+        np.quantile(scene.px_per_mm(size_px), [1 - READABLE_SHARE, READABLE_SHARE]).tolist()
+        for size_px in ((network_px, network_px), scene.photo_px)
+    )
     closest = scene.closest_px_per_mm((network_px, network_px))
-    return Resolution(
-        network_px=network_px,
-        photo_px=scene.photo_px,
-        px_per_mm_network=_quantiles(scene.px_per_mm((network_px, network_px))),
-        px_per_mm_photo=_quantiles(scene.px_per_mm(scene.photo_px)),
-        closest_px_per_mm=closest,
-        design_px=grid.design_px,
-        printed_px=grid.printed_px,
-        printed_px_per_mm=grid.printed_px_per_mm,
-        texels=grid.texels,
-        texels_per_px=grid.texels_per_mm / closest,
-    )
+    return {
+        "network_px": network_px,
+        "photo_px": scene.photo_px,
+        "px_per_mm_network": network,
+        "px_per_mm_photo": photo,
+        "closest_px_per_mm": closest,  # at the network's size
+        "design_px": grid.design_px,
+        "printed_px": grid.printed_px,
+        "printed_px_per_mm": grid.printed_px_per_mm,
+        "texels": grid.texels,
+        "texels_per_px": grid.texels_per_mm / closest,  # along a side, in the closest view
+    }
 
 
-def marker_plan(scene: PieceScene) -> Markers:
-    """Apply the rule for the markers' size to this scene's views."""
-    px_per_mm = np.quantile(scene.px_per_mm(scene.photo_px, shorter=True), 1 - READABLE_SHARE)
-    return Markers(
-        needed_mm=max(MARKER_MODULES * PX_PER_MODULE / float(px_per_mm), SMALLEST_MARKER_MM),
-        printed_mm=scene.piece.marker_mm,
-        unreadable_share=scene.unreadable_share,
-    )
+def marker_plan(scene: PieceScene) -> dict[str, float]:
+    """Apply the rule for the markers' size (PX_PER_MODULE in READABLE_SHARE of the views) to this scene's views."""
+    px_per_mm = float(np.quantile(scene.px_per_mm(scene.photo_px, shorter=True), 1 - READABLE_SHARE))
+    needed_mm = max(MARKER_MODULES * PX_PER_MODULE / px_per_mm, SMALLEST_MARKER_MM)
+    return {"needed_mm": needed_mm, "printed_mm": scene.piece.marker_mm, "unreadable_share": scene.unreadable_share}
 
 
-def sample_plan(rate: float, standard_error: float) -> tuple[Sample, ...]:
-    """Compute the sampling errors at a rate; `standard_error` is that of the selection set's mean confidence."""
-    selection = [1.96 * standard_error / k**0.5 for k in (1, _NEXT_FACTOR)]
-    promise = [np.ptp(wilson(round(rate * n), n)) / 2 for n in (PROMISE_VIEWS, _NEXT_FACTOR * PROMISE_VIEWS)]
-    rows = (("selection: mean confidence", SELECT_VIEWS, selection), ("promise: rate", PROMISE_VIEWS, promise))
-    return tuple(
-        Sample(name=name, n=n, half_width=width, next_n=_NEXT_FACTOR * n, next_half_width=next_width)
-        for name, n, (width, next_width) in rows
-    )
-
-
-def _photographs_needed(problem: Problem, design: Tensor, advance: Advance) -> str:
-    """Say how many photographs, in how many places, prove a promise of the draft."""
-    conditions = problem.scene.draw("select", PROOF_VIEWS, per_session=VIEWS_PER_SESSION)
-    promise = make_promise(problem, as_pixels(design), conditions, CONTROLS, advance, VIEWS_PER_SESSION)
-    return f"To prove a promise of such a draft: {photos_line(promise)}"
-
-
-def _quantiles(values: np.ndarray) -> tuple[float, float]:
-    low, high = np.quantile(values, [1 - READABLE_SHARE, READABLE_SHARE])
-    return float(low), float(high)
-
-
-def _draft(problem: Problem, progress: Callable[[str, int, int], None]) -> tuple[Tensor, Draft]:
-    """Optimize a design for a few steps: its 8-bit colors, and its rate on the selection set."""
+def _draft(problem: Problem, progress: Progress) -> tuple[Tensor, PlanData]:
+    """Optimize a design for a few steps: its 8-bit colors, and its steps and rate on the selection set."""
     settings = problem.scene.settings.optimize
     count = min(settings.steps, math.ceil(DRAFT_VIEWS / settings.views))
     state, rate = start(problem), None
@@ -238,4 +150,127 @@ def _draft(problem: Problem, progress: Callable[[str, int, int], None]) -> tuple
         state, rate = step.state, step.select_rate
         progress("draft", state.number, count)
     assert rate is not None  # the last step ends with a selection
-    return from_pixels(as_pixels(state.design), problem.device), Draft(steps=count, rate=rate)
+    return from_pixels(as_pixels(state.design), problem.device), {"steps": count, "rate": rate}
+
+
+def measure_cost(problem: Problem, design: Tensor, advance: Advance = no_advance) -> PlanData:
+    """Time steps that show `design` on this machine, with all classifiers of the problem: the median milliseconds of
+    each part over a few steps' views, after a warm-up.
+    """
+    views, rows = problem.scene.settings.optimize.views, []
+    problem.see(None, problem.scene.draw("train", views), 16)  # loads the background pictures, which a run does once
+    for number in range(REPEATS + 1):  # the first one warms up
+        rows.append(_step_ms(problem, design, problem.scene.draw("train", views, start=number * views)))
+        advance(number + 1, REPEATS + 1)
+    parts = {name: statistics.median(row[name] for row in rows[1:]) for name in rows[0]}
+    figures = {"views": views, "side_px": problem.training_px, "threads": torch.get_num_threads()}
+    return {**figures, "ms": sum(parts.values()), "parts": parts}
+
+
+def _step_ms(problem: Problem, design: Tensor, conditions: Conditions) -> dict[str, float]:
+    """Time each part of one step in milliseconds, in the order of the loop, in which views of one pose share its
+    rasterization.
+    """
+    design = design.clone().requires_grad_()
+    appearance, ends = problem.subject.appearance(design.detach()), {"": time.perf_counter()}
+    views = problem.see(appearance, conditions, problem.training_px)
+    ends["rasterize object, piece and background"] = time.perf_counter()
+    appearance = problem.subject.appearance(design)
+    ends[problem.subject.STAGE_NAME] = time.perf_counter()
+    pictures = expose(views, appearance)
+    ends["light, piece and camera"] = time.perf_counter()
+    leaf, boxes, windows = pictures.detach().requires_grad_(), problem.boxes(conditions), affected_windows(views)
+    losses = [
+        problem.losses(classifier, classifier.logits(leaf, boxes, windows), indices).mean()
+        for classifier, indices in zip(problem.classifiers, problem.indices, strict=True)
+    ]
+    loss = torch.stack(losses).mean()
+    ends["classifier forward"] = time.perf_counter()
+    (gradient,) = torch.autograd.grad(loss, leaf)
+    ends["classifier backward"] = time.perf_counter()
+    torch.autograd.grad((pictures * gradient).sum() + problem.subject.penalty(design), design)
+    ends["design backward"] = time.perf_counter()
+    ms = 1000 * np.diff([*ends.values()])
+    ms[0] *= new_pose_share(problem.scene)
+    return dict(zip([*ends][1:], ms.tolist(), strict=True))
+
+
+def geometry_lines(plan: PlanData) -> list[str]:
+    """Format the part of a plan that is known before anything is measured."""
+    lines = [f"{plan['scene']}: {plan['target']}, {plan['kind']}, seen by {', '.join(plan['models'])}"]
+    if plan["place"] is not None:
+        lines += ["place", *(f"  {line}" for line in place_lines(plan["place"]))]
+    lines += ["surface", *_surface_lines(plan["surface"])]
+    lines += ["resolution", *_resolution_lines(plan["resolution"])]
+    if plan["markers"] is not None:
+        lines += ["markers", _marker_line(plan["markers"], plan["surface"]["family"])]
+    return lines
+
+
+def measured_lines(plan: PlanData) -> list[str]:
+    """Format the part of a plan that was measured."""
+    lines, cost = _term_lines(plan["terms"], plan["draft"]), plan["cost"]
+    lines += ["photographs", f"  {plan['photographs']}"] if plan["photographs"] else []
+    lines += ["not modeled", *(f"  {text}" for text in plan["omitted"])]
+    views = f"{cost['views']} views of {cost['side_px']} px, {cost['threads']} threads"
+    lines += [f"cost of a step ({views}): {cost['ms']:.0f} ms"]
+    lines += [f"  {name:38} {ms:7.0f} ms {ms / cost['ms']:6.1%}" for name, ms in cost["parts"].items()]
+    return lines + not_measured_lines(plan["not_measured"])
+
+
+def _surface_lines(surface: PlanData) -> list[str]:
+    width, height = surface["size_mm"]
+    lines = [f"  {surface['family']}, {width:.0f} × {height:.0f} mm: {surface['reason']}"]
+    lines += [f"  {fit_text(surface)}"] if surface.get("gap_mm") is not None else []
+    return lines + ([f"  {surface['other']}"] if surface["other"] else [])
+
+
+def _resolution_lines(views: PlanData) -> list[str]:
+    (far, near), (far_photo, near_photo) = views["px_per_mm_network"], views["px_per_mm_photo"]
+    width, height = views["photo_px"]
+    line = (
+        f"  {far:.2f} to {near:.2f} px/mm at the network's {views['network_px']} px, {far_photo:.2f} to "
+        f"{near_photo:.2f} in photographs of {width} × {height} px (5 % and 95 % of the views)"
+    )
+    density = f"{views['texels_per_px']:.1f} per pixel along a side in the closest"
+    if views["design_px"] is None:
+        return [line, f"  {views['texels']} texels may change, {density} view"]
+    return [
+        line,
+        "  design {} × {} texels, ".format(*views["design_px"])
+        + f"{density} possible view ({views['closest_px_per_mm']:.2f} px/mm)",
+        "  printed as {} × {} px, ".format(*views["printed_px"]) + f"{views['printed_px_per_mm']:.1f} per mm",
+    ]
+
+
+def _marker_line(markers: PlanData, family: str) -> str:
+    needed, printed = markers["needed_mm"], markers["printed_mm"]
+    if not printed:
+        return "  none: photographs are located by the design's corners"
+    note = "" if printed > 0.95 * needed else " (all that page, object or blank allows)"
+    return (
+        f"  needed {needed:.1f} mm ({PX_PER_MODULE:g} px per module at the {READABLE_SHARE:.0%} point of the views), "
+        f"printed {printed:.1f} mm{note}; {measurable_text(markers['unreadable_share'], family)}"
+    )
+
+
+def _term_lines(terms: PlanData, draft: PlanData) -> list[str]:
+    lines = [
+        f"error that leaving a term out leaves ({terms['views']} views of a draft of {draft['steps']} steps, rate "
+        f"{draft['rate']:.0%}, before the first classifier)",
+        f"  {'':23} {'codes: mean':>11} {'95 %':>6}   {'confidence':<15}  (what adds up to less than "
+        f"{terms['threshold']:.3f} can go: selection cannot tell)",
+    ]
+    on = {name: error for name, error in terms["errors"].items() if error["verdict"] != "off"}
+    off = [f"{name} ({error['key'] or 'no setting'})" for name, error in terms["errors"].items() if name not in on]
+    lines += [_term_line(name, error) for name, error in on.items()]
+    return [*lines, *([f"  off: {', '.join(off)}"] if off else [])]
+
+
+def _term_line(name: str, error: PlanData) -> str:
+    words = {"missing": "missing in training", "left out": "rightly left out"}
+    verdict, key = words.get(error["verdict"], error["verdict"]), f" ({error['key']})" if error["key"] else ""
+    verdict = "matters little" if verdict == "can go" and not key else verdict
+    unseen = "; training's views do not show it" if error.get("in_training") is False else ""
+    codes = f"{error['codes_mean']:11.2f} {error['codes_p95']:6.1f}"
+    return f"  {name:23} {codes}   {error['confidence']:.3f} ({error['bias']:+.3f})   {verdict}{key}{unseen}"
