@@ -485,7 +485,7 @@ def test_a_phone_shows_the_answer_and_sends_again_what_a_lost_connection_cost(tm
             }
             assert not [t for t in browser.troubles if "ERR_INTERNET_DISCONNECTED" not in json.dumps(t)]
     assert files_in(tmp_path / "photos")[1:] == ["session_01/photo_0001.jpg", "session_01/photo_0002.jpg"]
-    assert set(CONTROLS) == {"bare", "mean", "gray", "noise", "shuffled", "blank"}
+    assert set(CONTROLS) == {"bare", "mean", "gray", "noise", "blank"}
 
 
 def test_silent_and_slow_connections_do_not_keep_the_owner_out(client, photos, monkeypatch):

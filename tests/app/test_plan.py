@@ -33,9 +33,9 @@ from patchproof.channel.effects import EFFECTS, RECORD_OF
 from patchproof.optimizer import loop
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import set_problem
+from patchproof.photo.paper_light import PaperLight
 from patchproof.scene.bent_scene import placement_with_other_bend
 from patchproof.scene.conditions import draw
-from patchproof.scene.paper_light import PaperLight
 from patchproof.scene.photo_scene import BasePhoto, PhotoScene
 from patchproof.scene.picture_scene import BasePicture
 from patchproof.scene.scene import build_scene, load_scene

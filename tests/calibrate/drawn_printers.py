@@ -11,16 +11,14 @@ import cv2
 import numpy as np
 
 from inkjets import DRIVERS, draw_inkjet
-from patchproof.base.color import codes_from_srgb, linear_from_srgb, srgb_from_linear
+from patchproof.base.color import codes_from_srgb, linear_from_srgb
 from patchproof.calibrate.chart import known_printers
-from patchproof.calibrate.color_ladder import ColorMap
-from patchproof.reprints.page_photos import PX_PER_MM, PrintFunction, Shot, page_light
+from patchproof.reprints.page_photos import PX_PER_MM, PrintFunction, page_light
 from patchproof.sheets.manifest import Manifest
 from patchproof.sheets.markers import DICTIONARY, marker_cells
 from patchproof.sheets.page import chart_colors
 from patchproof.sheets.piece import hash_order, manifest_marker, square_marker
 
-HELD_OUT_COLORS = 1000
 PAGE_MM = (210.0, 148.0)
 MARKER_MM, _MARKERS_MM = 14.0, ((8.0, 8.0), (188.0, 8.0), (188.0, 126.0), (8.0, 126.0))
 _CHART_MM = (30.0, 34.0, 150.0, 84.0)
@@ -36,24 +34,6 @@ def draw_printer(seed: int) -> tuple[str, PrintFunction, dict]:
     name = ("coated", "uncoated")[seed // kinds % 2]
     profile = priors.pop(name)
     return "the other profile", lambda colors: linear_from_srgb(profile(colors)), priors
-
-
-def relative_to_paper(predict: ColorMap, colors: np.ndarray) -> np.ndarray:
-    """sRGB N×3 that a color map predicts for sRGB N×3, relative to paper as in the printer's table."""
-    light = linear_from_srgb(np.clip(predict(np.vstack([colors, np.ones((1, 3))])), 0, 1.2))
-    return srgb_from_linear(np.clip(light[:-1] / light[-1], 0, 1))
-
-
-def camera_colors(printer: PrintFunction, shot: Shot, colors: np.ndarray) -> np.ndarray:
-    """sRGB N×3 that a camera records of printed colors N×3 under even light, clipped at its exposure."""
-    white = np.ones((1, 3))
-    light = np.clip(printer(np.vstack([colors, white])) / printer(white) * shot.paper, 0, 1)
-    return srgb_from_linear(light[:-1] / light[-1])
-
-
-def draw_held_out_colors() -> np.ndarray:
-    """sRGB N×3, uniform over the cube."""
-    return np.random.default_rng(99).random((HELD_OUT_COLORS, 3))
 
 
 def chart_manifest(count: int) -> Manifest:

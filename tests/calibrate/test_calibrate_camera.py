@@ -5,19 +5,23 @@ Corners are projected by OpenCV or, once, found in rendered photographs; the len
 
 from __future__ import annotations
 
-import json
-
 import cv2
 import numpy as np
 import pytest
 from PIL import Image
 
 from patchproof.base.errors import Refused
-from patchproof.calibrate.boards import BoardView, corner_positions_mm, find_boards
-from patchproof.calibrate.camera import calibrate_camera, fit_camera
+from patchproof.calibrate.camera import (
+    BoardView,
+    calibrate_camera,
+    calibration_lines,
+    corner_positions_mm,
+    find_boards,
+    fit_camera,
+)
 from patchproof.calibrate.ladder import compare_rungs, simplest_rung
 from patchproof.channel.lens import load_camera
-from patchproof.sheets.board import board_sheet, load_board
+from patchproof.sheets.blank import board_sheet, load_board
 from patchproof.sheets.pdf_raster import rasterize_page
 
 SIZE = (1600, 1200)
@@ -183,13 +187,12 @@ def test_photographs_give_a_camera_file_that_scenes_can_read(photos, tmp_path):
     assert (camera.cx, camera.cy) == (pytest.approx(316, abs=1), pytest.approx(244, abs=1))
     assert found.fit.rung == "k1" and camera.k1 == pytest.approx(-0.12, abs=0.01)
     assert found.fit.rms_px < 0.15 and "fx" in camera.uncertainty
-    figures = json.loads((tmp_path / "mine.fit.json").read_text())
-    reasons = {photo["file"]: photo.get("reason") for photo in figures["photos"]}
-    assert len(reasons) == 9 and sum(reason is None for reason in reasons.values()) == 7
-    assert "0 markers" in reasons["none.png"] and "400 × 300 px where most have 640 × 480" in reasons["small.png"]
-    assert figures["ladder"][0]["rung"] == "pinhole" and len(figures["ladder"]) == 5
-    with Image.open(tmp_path / "mine.residuals.png") as picture:
-        assert picture.width > 1000
+    assert len(found.views) == 7 and set(found.left_out) == {"none.png", "small.png"}
+    assert "0 markers" in found.left_out["none.png"]
+    assert "a picture of 400 × 300 px where most have a picture of 640 × 480 px" in found.left_out["small.png"]
+    first, *_ = lines = calibration_lines(found)
+    assert "held-out error in px: pinhole 1." in first and first.count(",") == 4
+    assert sum(line.startswith("left out: ") for line in lines) == 2
     with pytest.raises(Refused, match="Expected a new file"):
         calibrate_camera(photos, "charuco_a4", out)
 

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -16,12 +14,9 @@ import typer
 from PIL import Image, ImageCms
 
 from drawn_printers import (
-    camera_colors,
     chart_manifest,
-    draw_held_out_colors,
     draw_printer,
     printed_page,
-    relative_to_paper,
 )
 from inkjets import DRIVERS, draw_inkjet
 from patchproof.app import cli
@@ -29,8 +24,8 @@ from patchproof.base.color import linear_from_srgb, srgb_from_linear
 from patchproof.base.errors import Refused
 from patchproof.calibrate import chart as chart_module
 from patchproof.calibrate import icc
-from patchproof.calibrate.chart import calibrate_chart, combine_light, print_variation, printer_of, prints_of
-from patchproof.calibrate.chart_photo import read_chart
+from patchproof.calibrate.chart import calibrate_chart, combine_light, printer_of, prints_of, summary_lines
+from patchproof.calibrate.chart_photo import ChartPhoto, read_chart
 from patchproof.calibrate.color_ladder import (
     MIN_WIDTH,
     average_repeats,
@@ -41,18 +36,10 @@ from patchproof.calibrate.color_ladder import (
     fit_white_black,
     map_kinds,
 )
-from patchproof.calibrate.printer_files import printer_output
-from patchproof.channel.camera import encode_light
-from patchproof.channel.lens import Camera, load_camera
-from patchproof.channel.printer import load_printer, vary_print
-from patchproof.channel.tone import codes_of_light, light_of_codes
+from patchproof.channel.printer import load_printer, printer_output
 from patchproof.photo.read import Photo, read_photo
 from patchproof.photo.rejection import PhotoRejected
-from patchproof.render.photograph import photograph
-from patchproof.render.stage import set_stage
 from patchproof.reprints.page_photos import photograph_page
-from patchproof.scene.conditions import with_values
-from patchproof.scene.scene import make_scene
 from patchproof.sheets.manifest import dump_manifest, load_manifest
 from patchproof.sheets.page import chart_colors
 
@@ -181,7 +168,7 @@ def test_a_chart_read_in_part_says_what_its_figure_is_worth(monkeypatch, tmp_pat
     by_light = light.sum(1).argsort()
     light[np.delete(by_light, np.linspace(0, 47, readable).round().astype(int))] = np.nan
     Image.new("RGB", (8, 8)).save(tmp_path / "a.png")
-    read = SimpleNamespace(light=light, paper=np.ones(3), unevenness=1.0, misfit=0.0, px_per_mm=5.0)
+    read = ChartPhoto(light, (1.0, 1.0, 1.0))
     monkeypatch.setattr(chart_module, "read_chart", lambda *_: read)
     if says == "refused":
         with pytest.raises(Refused, match="at least 4 readable swatches, got 3"):
@@ -227,7 +214,7 @@ def test_swatches_are_read_relative_to_paper_under_uneven_light(shots, readings)
     printer, manifest, both = shots
     sent = np.array([swatch.srgb for swatch in manifest.chart])
     for shot, read in zip(both, readings, strict=True):
-        assert np.isfinite(read.light).all() and read.unevenness > 1.05
+        assert np.isfinite(read.light).all()
         error = color_difference(srgb_from_linear(read.light), shown(printer, sent))
         assert error.mean() < 1.2 and error.max() < 4
         np.testing.assert_allclose(read.paper, shot.paper, rtol=0.06)
@@ -289,9 +276,9 @@ def test_a_printer_is_calibrated_stored_and_loaded(shots, tmp_path, capsys):
     assert ended.value.code == 0 and "chosen" in told.out and "appearance" in told.out and "bad.jpg" in told.err
     mine = load_printer(str(tmp_path / "mine.npz"))
     assert mine.method == "measured" and mine.provenance["chosen"] == "spline"
-    assert [row["rung"] for row in mine.provenance["ladder"]] == [rung.name for rung in map_kinds({"x": None})]
-    assert len(mine.provenance["photographs"]) == 2 and "no camera file" in mine.provenance["model_of"]
-    assert mine.provenance["not_measured"]["how prints differ"] == "there is one print"
+    assert [row["name"] for row in mine.provenance["ladder"]] == [rung.name for rung in map_kinds({"x": None})]
+    assert len(mine.provenance["photographs"]) == 2 and "this camera" in mine.provenance["model_of"]
+    assert mine.provenance["delta_e00_of_prints"] is None and "how prints differ is not measured" in told.out
     np.testing.assert_allclose(mine.lut[-1, -1, -1], 1, atol=1e-6)
     assert color_difference(printer_output(mine, UNSEEN), shown(printer, UNSEEN)).mean() < 2
     with pytest.raises(Refused, match="which exists"):
@@ -328,90 +315,21 @@ def test_readings_are_combined_without_the_one_that_is_off():
     assert np.isnan(combine_light([gap, gap])[3]).all()
 
 
-def test_print_to_print_variation_is_found():
-    light = torch.tensor(linear_from_srgb(printer_output(load_printer("coated"), chart(72))))
-    draws = np.random.default_rng(5).uniform(-1, 1, (12, 3)) * [0.04, 0.05, 0.004]
-    changes = [torch.tensor([gain, density, 0.0, *[lift] * 3]) for gain, density, lift in draws]
-    prints = [vary_print(light, change).numpy() for change in changes]
-    found = print_variation(prints)
-    expected = draws.std(0, ddof=1)
-    got = [found[key] for key in ("dot_gain_sd", "density_sd", "black_lift_sd")]
-    np.testing.assert_allclose(got, expected, rtol=0.15)
-    assert print_variation(prints[:1]) is None and print_variation(prints[:1] * 3)["delta_e00"] < 1e-4
-
-
-# ------------------------------------------------------------------------------------------------ cameras
-
-
-def toned_camera() -> Camera:
-    """A camera with a tone curve as phones have: lighter middle tones and a soft shoulder, steeper in the dark."""
-    codes = np.linspace(0, 1, 65)
-    light = linear_from_srgb(codes)
-    curve = 0.65 * light**1.15 + 0.35 * (codes**2 * (3 - 2 * codes)) ** 1.8
-    return load_camera("phone").changed(name="toned", tone_light=tuple((curve / curve[-1]).tolist()))
-
-
-def printer_errors(seed: int, swatches: int, camera: Camera) -> tuple[float, float]:
-    """Error of the chosen rung against the printer itself, without and with the camera's file."""
-    _, shows, priors = draw_printer(seed)
-    manifest, colors = chart_manifest(swatches), draw_held_out_colors()
-    shot = photograph_page(printed_page(manifest, shows), seed, camera)
-    truth, errors = camera_colors(shows, shot, colors), []
-    for known in (None, camera):
-        light = read_chart(shot.photo, manifest, known).light
-        usable = np.isfinite(light).all(1)
-        sent = np.array([s.srgb for s in manifest.chart])[usable]
-        choice = choose_map(map_kinds(priors), sent, srgb_from_linear(light[usable]))
-        errors.append(float(color_difference(relative_to_paper(choice.predict, colors), truth).mean()))
-    return errors[0], errors[1]
-
-
-def test_tone_curves_close_and_a_camera_without_one_is_srgb():
-    camera, codes = toned_camera(), np.linspace(0, 1, 200)
-    light = torch.tensor(light_of_codes(codes, camera))
-    np.testing.assert_allclose(codes_of_light(light, camera), codes, atol=1e-9)
-    np.testing.assert_allclose(light_of_codes(codes, load_camera("phone")), linear_from_srgb(codes))
-    np.testing.assert_allclose(encode_light(torch.tensor([2.0, -1.0]), camera), [1, 0])
-    middle = torch.linspace(0.05, 0.95, 7, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda x: codes_of_light(x, camera), middle)
-
-
-def test_a_scene_s_camera_writes_with_its_own_tone_curve(tmp_path):
-    """In both ways to expose: pixel by pixel, and with blur that needs the whole picture."""
-    camera = toned_camera()
-    scene = make_scene(
-        {
-            "object": {"mesh": "primitive:carton", "length_mm": 300},
-            "patch": {"width_mm": 120, "height_mm": 120},
-            "target": {"label": "carton", "models": ["builtin"]},
-            "background": {"color": [0.5, 0.5, 0.5]},
-            "camera": {"photo_px": camera.image_px},
-        }
-    )
-    toned, plain = (set_stage(replace(scene, camera=each)) for each in (camera, camera.changed(tone_light=None)))
-    design, views = torch.full((3, 8, 8), 0.5), scene.draw("evaluate", 2)
-    for sharp in (True, False):
-        drawn = with_values(views, tone=0, noise=0, blur_px=0 if sharp else 40, jpeg=0)
-        own, usual = (photograph(stage, design, drawn, (64, 64)) for stage in (toned, plain))
-        light = linear_from_srgb(usual.double())
-        torch.testing.assert_close(own.double(), codes_of_light(light, camera), atol=2e-3, rtol=0)
-
-
-def test_a_tone_curve_that_falls_is_refused(tmp_path):
-    data = json.loads(load_camera("phone").model_dump_json())
-    path = tmp_path / "camera.json"
-    path.write_text(json.dumps(data | {"tone_light": [0, 0.1, 0.3, 0.6, 1]}))
-    assert load_camera(str(path)).tone_light[2] == 0.3
-    for wrong in ([0, 0.3, 0.1, 0.6, 1], [0.1, 0.2, 0.3, 0.6, 1], [0, 0.1, 0.3, 0.6, 0.9]):
-        path.write_text(json.dumps(data | {"tone_light": wrong}))
-        with pytest.raises(Refused, match="grows from 0 to 1"):
-            load_camera(str(path))
-
-
-def test_a_camera_file_tells_printer_and_camera_apart():
-    camera = toned_camera()
-    without, with_file = printer_errors(0, 48, camera)
-    assert with_file < 1.5 and without > with_file + 1
+def test_how_prints_and_photographs_of_one_differ_is_said(shots, readings, monkeypatch, tmp_path):
+    """Two prints, the second with all its ink a tenth lighter; the second photograph of the first has a glare."""
+    light = readings[0].light
+    glare = np.where(np.arange(len(light))[:, None] < 40, light + 0.5, light)
+    paths = [tmp_path / name for name in "abc"]
+    for path in paths:
+        Image.new("RGB", (8, 8)).save(path, "PNG")
+    charts = iter(ChartPhoto(each, (1.0, 1.0, 1.0)) for each in (light, glare, light + 0.1 * (1 - light)))
+    monkeypatch.setattr(chart_module, "read_chart", lambda *_: next(charts))
+    found = calibrate_chart([paths[:2], paths[2:]], shots[1], "x")
+    assert [row["print"] for row in found.printer.provenance["photographs"]] == [1, 1, 2]
+    assert found.printer.provenance["photographs"][2]["delta_e00_from_print"] is None
+    assert all(1 < each < 9 for each in found.printer.provenance["delta_e00_of_prints"])
+    assert sum("glare" in warning for warning in found.warnings) == 2
+    assert any("prints differ from their mean" in line for line in summary_lines(found))
 
 
 # ------------------------------------------------------------------------------------------ drawn printers
@@ -457,7 +375,7 @@ def rgb_printer_profile(path: Path) -> Path:
 def test_an_rgb_profile_is_baked_with_both_intents(tmp_path):
     path = rgb_printer_profile(tmp_path / "rgb.icc")
     for perceptual, word in ((False, "relative"), (True, "perceptual")):
-        printer = icc.bake(path, "rgb", "none", "test", perceptual)
+        printer = icc.bake(path, "rgb", perceptual)
         assert printer.provenance["profile_colors"] == "RGB" and printer.provenance["intents"].startswith(word)
         assert color_difference(printer_output(printer, UNSEEN), UNSEEN).mean() < 0.3  # sRGB, in 8 bits
 
@@ -471,6 +389,6 @@ def test_damaged_profiles_never_end_in_anything_but_a_sentence(tmp_path):
             data[at] = rng.integers(256)
         (tmp_path / "damaged.icc").write_bytes(bytes(data))
         try:
-            icc.bake(tmp_path / "damaged.icc", "x", "none", "test")
+            icc.bake(tmp_path / "damaged.icc", "x")
         except Refused as error:
             assert "\n" not in str(error)

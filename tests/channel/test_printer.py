@@ -12,17 +12,18 @@ import torch
 
 from patchproof.base.color import LUMINANCE, ciede2000, lab_from_linear, lab_from_srgb, linear_from_srgb
 from patchproof.base.errors import Refused
+from patchproof.base.output import write_files_atomically
 from patchproof.base.packaged import packaged_path
 from patchproof.base.settings import PrinterSettings
 from patchproof.calibrate import icc
-from patchproof.calibrate.printer import printer_from_icc
-from patchproof.calibrate.printer_files import printer_from_table, save_printer
 from patchproof.channel.printer import (
     NODES_8BIT,
     Printer,
     identity_printer,
     load_printer,
     node_colors,
+    printer_contents,
+    printer_from_table,
     vary_print,
 )
 
@@ -55,7 +56,7 @@ def test_identity_changes_nothing_and_is_in_gamut():
 
 def test_nodes_are_exact_and_axes_are_red_green_blue():
     lut = np.random.default_rng(1).random((33, 33, 33, 3))
-    printer = printer_from_table("noise", "assumed", lut, lut[..., 0], None, {})
+    printer = printer_from_table("noise", "assumed", lut, lut[..., 0], {})
     i, j, k = np.random.default_rng(2).integers(0, 33, (3, 500))
     sent = np.array(NODES_8BIT)[np.stack([i, j, k], 1)] / 255
     np.testing.assert_allclose(colors_of(printer.apply(image(sent))), lut[i, j, k], atol=1e-6)
@@ -68,7 +69,7 @@ def test_trilinear_twin():
     lut = np.random.default_rng(1).random((33, 33, 33, 3))
     sent = np.random.default_rng(3).random((2000, 3))
     slow = RegularGridInterpolator((np.array(NODES_8BIT) / 255,) * 3, lut)(sent)
-    fast = colors_of(printer_from_table("noise", "assumed", lut, lut[..., 0], None, {}).apply(image(sent)))
+    fast = colors_of(printer_from_table("noise", "assumed", lut, lut[..., 0], {}).apply(image(sent)))
     np.testing.assert_allclose(fast, slow, atol=1e-5)
 
 
@@ -152,10 +153,9 @@ def test_the_table_follows_the_exact_chain(name):
 
 @needs_data
 def test_baking_gives_the_shipped_bytes_twice(tmp_path):
-    source = load_printer("coated").provenance["source"]
     profile = Path(DATA) / "icc" / PROFILES["coated"]
     for folder in ("a", "b"):
-        printer_from_icc(profile, tmp_path / folder / "coated.npz", False, "CC0", source)
+        write_files_atomically(printer_contents(icc.bake(profile, "coated"), tmp_path / folder / "coated.npz"))
     for suffix in (".npz", ".json"):
         one, two = ((tmp_path / f / f"coated{suffix}").read_bytes() for f in "ab")
         assert one == two
@@ -166,7 +166,7 @@ def test_baking_gives_the_shipped_bytes_twice(tmp_path):
 
 def refused_profile(path, *words):
     with pytest.raises(Refused) as error:
-        icc.bake(path, "x", "CC0", "test")
+        icc.bake(path, "x")
     text = str(error.value)
     assert "\n" not in text and all(word in text for word in words), text
 
@@ -203,8 +203,8 @@ def test_cut_and_gutted_profiles(tmp_path):
 
 def test_saving_and_loading_keep_a_measured_printer(tmp_path):
     lut = np.random.default_rng(1).random((33, 33, 33, 3))
-    printer = printer_from_table("mine", "measured", lut, 30 * lut[..., 0], (94.0, 1.0, -3.0), {"chart": "a4"})
-    save_printer(printer, tmp_path)
+    printer = printer_from_table("mine", "measured", lut, 30 * lut[..., 0], {"chart": "a4"})
+    write_files_atomically(printer_contents(printer, tmp_path / "mine.npz"))
     again = load_printer("mine.npz", tmp_path)
     torch.testing.assert_close(again.lut, printer.lut, atol=1e-5, rtol=0)  # 16 bits
     torch.testing.assert_close(again.gamut, printer.gamut, atol=0.063, rtol=0)  # eighths
@@ -218,7 +218,7 @@ def test_saving_and_loading_keep_a_measured_printer(tmp_path):
 
 
 def test_tables_outside_srgb_are_clipped():
-    printer = printer_from_table("wide", "assumed", node_colors() * 1.2 - 0.1, np.zeros((33, 33, 33)), None, {})
+    printer = printer_from_table("wide", "assumed", node_colors() * 1.2 - 0.1, np.zeros((33, 33, 33)), {})
     assert printer.lut.min() == 0 and printer.lut.max() == 1
 
 

@@ -15,10 +15,11 @@ from patchproof.base.color import ciede2000, lab_from_linear, linear_from_srgb
 from patchproof.channel.print_colors import ShownColors, add_ink
 from patchproof.channel.printer import identity_printer, load_printer
 from patchproof.classifier import Classifier
+from patchproof.evidence.appearance import invert_affine
 from patchproof.evidence.classify import square_of
 from patchproof.evidence.gather import gather_evidence
 from patchproof.evidence.ledger import _ledger, shapley
-from patchproof.evidence.print_fit import LEAST_CELLS, PhotographedDesign, fit_print
+from patchproof.evidence.print_fit import LEAST_CELLS, PhotographedDesign, cell_means, fit_print
 from patchproof.evidence.reproject import (
     PhotoSquare,
     Reference,
@@ -30,10 +31,7 @@ from patchproof.evidence.reproject import (
 )
 from patchproof.evidence.surface import PromisedColors, piece_picture, promised_of, surface_of
 from patchproof.evidence.task import Options
-from patchproof.photo.colorfit import invert_affine
-from patchproof.photo.design_cells import cell_means
-from patchproof.photo.pattern_light import pattern_light
-from patchproof.photo.quality import FrameLight
+from patchproof.photo.quality import FrameLight, pattern_light
 from patchproof.report.plots import ledger_plot
 from patchproof.sheets.manifest import Manifest
 from test_verify_run import measured

@@ -1,4 +1,4 @@
-"""A known camera gives the print's proportions from one photograph, and takes its lens out of the picture."""
+"""A known camera takes its lens out of the picture."""
 
 from __future__ import annotations
 
@@ -7,43 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from patchproof.base.geometry import apply_homography, intrinsics, look_at, normalize_homography, plane_homography
+from patchproof.base.geometry import normalize_homography
 from patchproof.channel import lens
 from patchproof.evidence.camera import _turn_clockwise, pinhole_photo
-from patchproof.photo.print_ratio import x_over_y
 from patchproof.photo.read import Photo
-from patchproof.photo.rectify import fit_page
-
-CORNERS = np.array([[x, y] for x in (10, 100, 190) for y in (10, 140, 280)], float)
-
-
-def page_fit(scale, tilt_deg, azimuth_deg=90.0):
-    """A fit to exact corners, with the noise that corners always have, and the matrix."""
-    matrix = intrinsics(50, (1600, 1200))
-    tilt, azimuth = np.radians([tilt_deg, azimuth_deg])
-    away = np.array([np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth), -np.cos(tilt)])
-    middle = np.array([100.0, 145.0, 0.0])
-    pose = look_at(middle + 500 * away, middle, 10, up=(0.3, -1.0, 0.0))
-    homography = plane_homography(matrix, pose, np.eye(4)) @ np.diag([*scale, 1.0])
-    quads = {i: CORNERS[i] + np.array([[0, 0], [14, 0], [14, 14], [0, 14]]) for i in range(len(CORNERS))}
-    return fit_page({i: apply_homography(homography, q) for i, q in quads.items()}, quads), matrix
-
-
-@pytest.mark.parametrize("tilt", [0.0, 20.0, 40.0])
-def test_the_proportions_follow_from_one_photograph(tilt):
-    fit, matrix = page_fit((0.95, 1.04), tilt)
-    ratio, uncertainty = x_over_y(fit, matrix, 0.005)
-    assert ratio == pytest.approx(0.95 / 1.04, rel=1e-4) and uncertainty < 0.005
-
-
-def test_a_wrong_focal_length_bends_the_proportions_by_sin_squared_of_the_tilt_and_is_in_the_uncertainty():
-    fit, matrix = page_fit((1.0, 1.0), 40)  # tilted about the page's x axis: y is the foreshortened one
-    wrong = matrix.copy()
-    wrong[[0, 1], [0, 1]] *= 1.03
-    ratio, uncertainty = x_over_y(fit, wrong, 0.04)
-    assert abs(ratio - 1) == pytest.approx(0.03 * np.sin(np.radians(40)) ** 2, rel=0.1)
-    assert abs(ratio - 1) < uncertainty
-
 
 PHONE = lens.load_camera("phone")
 

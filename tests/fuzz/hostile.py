@@ -192,14 +192,13 @@ def sheet_files(place: Place, number: int) -> Use:
 
 def pdf(place: Place, number: int) -> Use:
     from patchproof.sheets.pdf_raster import attached_manifests, page_count, rasterize_page
-    from patchproof.sheets.print_advice import pdf_advice
 
     names = list(PDF_BOMBS)
     path = place.given / "sheet.pdf"
     path.write_bytes(PDF_BOMBS[of(number, names)]())
     return of(
         number // len(names),
-        [lambda: rasterize_page(path), lambda: (attached_manifests(path), pdf_advice(path), page_count(path))],
+        [lambda: rasterize_page(path), lambda: (attached_manifests(path), page_count(path))],
     )
 
 
@@ -378,9 +377,9 @@ def photo_pictures(place: Place, number: int) -> Use:
 
 
 def calibrated_photos(place: Place, number: int) -> Use:
-    from patchproof.calibrate.boards import find_boards
+    from patchproof.calibrate.camera import find_boards
     from patchproof.photo.read import list_photos
-    from patchproof.sheets.board import load_board
+    from patchproof.sheets.blank import load_board
 
     endless(place.given / "a.jpg", of(number, ENDLESS))
     (place.given / "b.png").write_bytes(of(number, PICTURES)())
@@ -980,7 +979,7 @@ def prepared() -> None:
         "patchproof.app.verify patchproof.app.capture.serve patchproof.optimizer.evaluate patchproof.reprints.run_sheet"
     )
     late += " patchproof.optimizer.imported_design patchlab.harden.harden_study patchlab.paper.image_classes"
-    late += " patchproof.calibrate.boards patchproof.scene.image_scene patchproof.scene.photo_scene matplotlib.pyplot"
+    late += " patchproof.calibrate.camera patchproof.scene.image_scene patchproof.scene.photo_scene matplotlib.pyplot"
     late += " matplotlib.backends.backend_agg jinja2 pikepdf pypdfium2 scipy.spatial"
     late += " patchproof.mesh.gltf patchproof.mesh.obj patchproof.mesh.ply patchproof.mesh.load_mesh"
     for module in late.split():

@@ -12,8 +12,7 @@ from patchlab.validation import real_prints
 from patchlab.validation.known_colors import KnownColors
 from patchproof.base.color import lift_tone, linear_from_srgb, srgb_from_linear
 from patchproof.base.errors import Refused
-from patchproof.calibrate.printer_files import printer_output
-from patchproof.channel.printer import load_printer, vary_print
+from patchproof.channel.printer import load_printer, printer_output, vary_print
 from patchproof.render.pixels import PiecePicture
 
 CODES = np.random.default_rng(0).integers(0, 256, (60, 3)).astype(np.uint8)

@@ -19,8 +19,8 @@ from PIL import Image
 from patchproof.base import input as bounds
 from patchproof.base.errors import Refused
 from patchproof.base.input import limit_memory
-from patchproof.calibrate import boards
-from patchproof.calibrate.boards import BoardView, find_boards, find_corners
+from patchproof.calibrate import camera as boards
+from patchproof.calibrate.camera import BoardView, find_boards, find_corners
 from patchproof.evidence.batch import PhotoItem, _measure_or_reject
 from patchproof.evidence.camera import pinhole_photo
 from patchproof.evidence.measure import measure
@@ -30,7 +30,7 @@ from patchproof.photo.limits import count_finder_lines, find_squares, run_limite
 from patchproof.photo.page_code import read_page_code
 from patchproof.photo.read import read_photo
 from patchproof.photo.rejection import PhotoRejected
-from patchproof.sheets.board import load_board
+from patchproof.sheets.blank import load_board
 from patchproof.sheets.markers import aruco_dictionary
 
 needs_timer = pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="there are no such timers on Windows")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import cv2
 import numpy as np
 import pytest
@@ -12,15 +14,15 @@ from patchproof.evidence.camera import pinhole_photo
 from patchproof.evidence.measure import measure
 from patchproof.evidence.ranges import promised_ranges
 from patchproof.evidence.surface import promised_of, surface_of
-from patchproof.photo.page_code import PageCode, manifest_page_code, parse_page_code, read_page_code
+from patchproof.photo import page_code
+from patchproof.photo.page_code import read_page_code
 from patchproof.photo.read import Photo
 from patchproof.sheets.blank import blank_sheet
 from patchproof.sheets.content import SheetContent
-from patchproof.sheets.multi_design import write_several
 from patchproof.sheets.pdf_raster import rasterize_page
 from patchproof.sheets.piece import lay_out_piece
 from patchproof.sheets.template import load_template
-from patchproof.sheets.write import write_sheet
+from patchproof.sheets.write import write_several, write_sheet
 
 DPI = 100
 
@@ -62,20 +64,22 @@ def oblique(page):
 
 def test_every_page_carries_what_its_manifest_says(pages, tmp_path):
     for manifest, page in pages.values():
-        assert read_page_code(page) == manifest_page_code(manifest)
+        assert read_page_code(page) == manifest.code
     blank = blank_sheet("blank_a4", tmp_path / "blank.pdf")
     assert (
         read_page_code(rasterize_page(tmp_path / "blank.pdf", 1, DPI))
-        == manifest_page_code(blank)
-        == PageCode(blank.sheet_id, "blank")
+        == blank.code
+        == f"patchproof:{blank.sheet_id}:blank"
     )
 
 
 @pytest.mark.parametrize(
     "text", ["", "patchproof:", "https://example.org", "patchproof:short:00", "x patchproof:A1B2C3D4E5:0"]
 )
-def test_other_codes_are_none_of_ours(text):
-    assert parse_page_code(text) is None
+def test_other_codes_are_none_of_ours(text, monkeypatch):
+    for name in ("QRCodeDetectorAruco", "QRCodeDetector"):
+        monkeypatch.setattr(page_code.cv2, name, lambda: SimpleNamespace(detectAndDecode=lambda gray: (text,)))
+    assert read_page_code(np.zeros((80, 80, 3), np.uint8)) is None
 
 
 @pytest.mark.parametrize(("look", "scan_dpi"), [(lambda page: (page * 0.8).astype(np.uint8), DPI), (oblique, None)])
@@ -121,7 +125,7 @@ def test_a_page_of_several_designs_is_each_ones_own_and_nobody_elses(tmp_path):
         ]
         manifests = write_several(tmp_path / f"{name}.pdf", template, each)
         looks[name] = (rasterize_page(tmp_path / f"{name}.pdf", 1, DPI) * 0.8).astype(np.uint8)
-        assert {manifest_page_code(manifest) for manifest in manifests} == {read_page_code(looks[name])}
+        assert {manifest.code for manifest in manifests} == {read_page_code(looks[name])}
         return manifests
 
     ids, designs = ("A1B2C3D4E5", "B1B2C3D4E5", "C1B2C3D4E5"), [some_design(seed) for seed in range(4)]

@@ -16,7 +16,7 @@ from patchproof.evidence.classify import squares_of
 from patchproof.evidence.measure import identify_sheet, measure
 from patchproof.evidence.ranges import promised_ranges
 from patchproof.evidence.surface import promised_of, surface_of
-from patchproof.photo import colorfit, detect, edges, known_page, limits, second_print
+from patchproof.photo import detect, edges, known_page, limits
 from patchproof.photo.detect import LINEAR_FLOAT32_FROM_CODE, find_markers, fit_marker_borders, luminance
 from patchproof.photo.edges import fit_borders
 from patchproof.photo.known_page import find_sheet
@@ -178,9 +178,9 @@ def test_a_color_map_that_stops_where_it_settles_is_that_of_all_turns(monkeypatc
     seen = promised @ np.array([[0.6, 0.1, 0.02], [0.05, 0.7, 0.03], [0.01, 0.08, 0.5]]) + 0.03
     seen += rng.standard_t(2, seen.shape) * 0.01
     seen[:300] += 0.3  # gloss
-    stopped = colorfit.affine12(seen, promised)
-    monkeypatch.setattr(colorfit, "_CONVERGED", 0)
-    turned = colorfit.affine12(seen, promised)
+    stopped = appearance.affine12(seen, promised)
+    monkeypatch.setattr(appearance, "_CONVERGED", 0)
+    turned = appearance.affine12(seen, promised)
     assert stopped is not None and turned is not None
     np.testing.assert_allclose(stopped.apply(seen), turned.apply(seen), atol=5e-4)
 
@@ -222,10 +222,11 @@ def test_a_second_print_is_seen_whose_markers_are_too_small_to_be_read(piece, su
 
 def test_a_code_in_any_turn_has_the_id_that_opencv_finds():
     rng, dictionary = np.random.default_rng(0), "DICT_4X4_50"
-    known, aruco = second_print._ids_by_code(dictionary), aruco_dictionary(dictionary)
+    aruco, square = aruco_dictionary(dictionary), np.array([[2, 2], [50, 2], [50, 50], [2, 50]], float)
     codes = [np.rot90(cells, k)[1:-1, 1:-1] for k, cells in enumerate(marker_cells(dictionary, range(0, 50, 7)))]
     for cells in (np.ascontiguousarray(code, np.uint8) for code in (*codes, *rng.integers(0, 2, (40, 4, 4)))):
         is_read, marker_id, _ = aruco.identify(cells, 0.0)
-        code = aruco.getByteListFromBits(cells).reshape(4, -1)[0].tobytes()
-        assert known.get(code) == (marker_id if is_read else None)
-    assert len(second_print._ids_by_code("DICT_5X5_1000")) == 4000
+        light = np.kron(np.pad(40 + 200 * cells, 1, constant_values=40), np.ones((8, 8))).astype(np.uint8)
+        seen = known_page._read_codes(np.pad(light, 2, constant_values=240), [square], dictionary)
+        assert seen == ({marker_id} if is_read else set())
+    assert detect.marker_codes(aruco_dictionary("DICT_5X5_1000").bytesList.tobytes(), 5).shape == (25, 4000)

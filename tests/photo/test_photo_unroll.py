@@ -70,7 +70,7 @@ def unrolled(corners_px, focal_px=None):
 def test_the_radius_of_rolled_paper_is_found_without_a_focal_length(radius_mm):
     corners = {i: rolled_px(mm, 1 / radius_mm, pose()) for i, mm in markers_mm().items()}
     # exact corners, not where straight borders would meet: what that correction does to them is what remains
-    assert unrolled(corners).radius_mm == pytest.approx(radius_mm, rel=0.03)
+    assert unrolled(corners).shape.radius_mm == pytest.approx(radius_mm, rel=0.03)
 
 
 def test_flat_paper_is_left_alone_also_with_noise():

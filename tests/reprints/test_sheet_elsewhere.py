@@ -10,8 +10,7 @@ import pytest
 
 from patchproof.base.errors import Refused
 from patchproof.base.packaged import packaged_path
-from patchproof.channel.carried_printer import carried_printer, printer_of_sheet
-from patchproof.channel.printer import load_printer
+from patchproof.channel.printer import carried_printer, load_printer, printer_of_sheet
 from patchproof.reprints import page_photos
 from patchproof.reprints.mounted_sheet import DEFAULT_SETUP
 from patchproof.reprints.run_sheet import without_folders

@@ -17,16 +17,16 @@ from patchproof.base.fingerprint import files_sha256
 from patchproof.base.geometry import apply_homography, intrinsics, look_at, plane_homography, rect_corners
 from patchproof.base.packaged import packaged_path
 from patchproof.base.settings import SceneSettings
+from patchproof.photo.paper_light import paper_light, quadratic_terms
 from patchproof.photo.rejection import PhotoRejected
 from patchproof.scene.conditions import with_values
-from patchproof.scene.paper_light import paper_light, quadratic_terms
 from patchproof.scene.photo_scene import measure_photo, photos_in
 from patchproof.scene.picture_scene import BasePicture
 from patchproof.scene.scene import build_scene
 from patchproof.sheets.blank import blank_sheet
 from patchproof.sheets.manifest import Manifest, dump_manifest
 from patchproof.sheets.pdf_raster import rasterize_piece
-from patchproof.sheets.piece import lay_out_piece, sheet_id
+from patchproof.sheets.piece import lay_out_piece, marker_rect, sheet_id
 
 SIZE = (800, 600)
 FINE = 3  # samples per pixel and axis
@@ -264,15 +264,15 @@ def test_glare_and_shadow_do_not_move_the_light():
     picture[glare] = np.minimum(picture[glare] * 1.3, 0.95)
     picture[(columns < 0.3 * width) & (rows > 0.6 * height)] *= 0.6
     codes = np.round(srgb_from_linear(picture) * 255).astype(np.uint8)
-    found = paper_light(codes, px_from_piece, piece, 0.5)
+    area, printed = (0.0, 0.0, *piece.size_mm), map(marker_rect, piece.markers)
+    found = paper_light(codes, px_from_piece, area, printed, 0.5)
     assert np.abs((terms @ found.coefficients.T) / (terms @ light.T) - 1).max() < 0.02
     assert found.unevenness > 0.05  # and it shows
 
 
 def test_overexposed_paper_is_clipped():
-    piece = lay_out_piece((162.0, 162.0), 19.0, "A1B2C3D4E5", "blank")
     with pytest.raises(PhotoRejected, match="clipped: the paper is overexposed"):
-        paper_light(np.full((400, 400, 3), 255, np.uint8), np.diag([2.0, 2.0, 1.0]), piece, 0.5)
+        paper_light(np.full((400, 400, 3), 255, np.uint8), np.diag([2.0, 2.0, 1.0]), (0, 0, 162, 162), [], 0.5)
 
 
 def test_photographs_that_cannot_be_used_are_named(world, tmp_path):

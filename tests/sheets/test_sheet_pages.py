@@ -19,22 +19,20 @@ from patchproof.evidence.camera import pinhole_photo
 from patchproof.evidence.measure import measure
 from patchproof.evidence.ranges import promised_ranges
 from patchproof.evidence.surface import surface_of
-from patchproof.photo.page_code import manifest_page_code, read_page_code
+from patchproof.photo.page_code import read_page_code
 from patchproof.photo.read import Photo
-from patchproof.sheets.blank import chart_sheet
-from patchproof.sheets.board import board_sheet, is_board
+from patchproof.sheets.blank import BOARD, board_sheet, chart_sheet
 from patchproof.sheets.content import SheetContent
 from patchproof.sheets.layout import Box, check_layout
 from patchproof.sheets.manifest import load_manifest
-from patchproof.sheets.multi_design import write_several
 from patchproof.sheets.page import largest_piece_mm, refuse_larger_than_page
 from patchproof.sheets.pdf_raster import attached_manifests, rasterize_page, rasterize_piece
 from patchproof.sheets.piece import lay_out_piece, marker_image
 from patchproof.sheets.plan_page import PlanPage
 from patchproof.sheets.print_advice import sheet_advice
-from patchproof.sheets.template import load_template, template_names
+from patchproof.sheets.template import load_template, template_data, template_names
 from patchproof.sheets.tiles import plan_tiles
-from patchproof.sheets.write import write_sheet
+from patchproof.sheets.write import write_several, write_sheet
 from test_benefit import promise_of
 from test_sheet_write import DPI, ID, PX_PER_MM, detect, sample_design
 
@@ -46,7 +44,7 @@ PIECE = lay_out_piece((680, 680), 30, ID, "design", bends=True)  # in tiles
 
 
 def write(path, name, piece_mm=None, marker_mm=None, design=DESIGN, **more):
-    if is_board(name):
+    if BOARD in template_data(name)[1]:
         return board_sheet(name, path)
     template = load_template(name)
     if template.piece is None:
@@ -79,7 +77,7 @@ def test_every_page_has_its_markers_within_a_tenth_of_a_millimeter_its_code_and_
             assert np.abs(found[marker.id] / PX_PER_MM - np.array(marker.corners_mm)).max() < 0.1
         assert_nothing_lies_over(pixels, manifest, number, margin)
         if number == 1:
-            assert read_page_code(pixels) == manifest_page_code(manifest)
+            assert read_page_code(pixels) == manifest.code
     assert attached_manifests(path)[0] == load_manifest(path.with_suffix(".json")) == manifest
 
 

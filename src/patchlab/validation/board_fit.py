@@ -23,9 +23,9 @@ from patchlab.validation.marker_boards import BoardPose, PrintedSquare, paper_sh
 from patchproof.base.color import LINEAR_FROM_CODE, LUMINANCE, codes_from_srgb
 from patchproof.channel.camera import READ_SHARE, SMALLEST_BLUR_PX, encode_light, gaussian_blur
 from patchproof.photo.detect import LINEAR_FLOAT32_FROM_CODE
+from patchproof.photo.paper_light import quadratic_terms
 from patchproof.photo.quality import CLIPPED_CODE
 from patchproof.photo.rejection import PhotoRejected
-from patchproof.scene.paper_light import quadratic_terms
 
 # in px, up to 4.4; the channel skips blurs below 0.4
 _BLURS_PX = (0.0, *(SMALLEST_BLUR_PX * 1.05 ** np.arange(50)).tolist())

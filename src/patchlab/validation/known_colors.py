@@ -21,8 +21,7 @@ import torch
 from torch import Tensor
 
 from patchproof.base.color import ciede2000, lab_from_linear, lift_tone, linear_from_srgb, srgb_from_linear
-from patchproof.calibrate.printer_files import printer_from_table
-from patchproof.channel.printer import Printer, node_colors, vary_print
+from patchproof.channel.printer import Printer, node_colors, printer_from_table, vary_print
 
 _CENTER = (0.025, 0.025, 0.025, 0.0, 0.0, 0.0, 0.0, -0.075)  # of the terms in the default conditions
 _CENTERED = 100.0  # of the mean terms' squared distance from there: what all photographs share is in the ink
@@ -114,7 +113,7 @@ def printer_of_ink(name: str, start: Printer, ink: Tensor, provenance: dict[str,
     lut = srgb_from_linear(ink_light(_printed(nodes * 255, start), ink)).numpy().reshape(node_colors().shape)
     lut = (lut / lut[-1, -1, -1]).clip(0, 1)
     distance = ciede2000(*(lab_from_linear(linear_from_srgb(each)) for each in (lut, node_colors())))
-    return printer_from_table(name, "measured", lut, distance, None, provenance)
+    return printer_from_table(name, "measured", lut, distance, provenance)
 
 
 def _printed(code: np.ndarray, printer: Printer) -> Tensor:

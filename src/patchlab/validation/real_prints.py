@@ -32,12 +32,20 @@ from patchlab.validation.known_colors import KnownColors, fit_photo, printer_of_
 from patchproof.base.color import ciede2000, lab_from_linear, lift_tone, linear_from_srgb, srgb_from_linear
 from patchproof.base.errors import Refused
 from patchproof.base.input import read_file
+from patchproof.base.output import write_files_atomically
 from patchproof.base.sessions import count_by_session, rate_posterior
 from patchproof.base.settings import CameraSettings, PrinterSettings, SceneSettings
 from patchproof.base.validation import expand_path
-from patchproof.calibrate.printer_files import printer_output, save_printer
 from patchproof.channel.effects import EFFECT_BY_NAME, Print
-from patchproof.channel.printer import Printer, identity_printer, load_printer, print_change, vary_print
+from patchproof.channel.printer import (
+    Printer,
+    identity_printer,
+    load_printer,
+    print_change,
+    printer_contents,
+    printer_output,
+    vary_print,
+)
 from patchproof.optimizer.loop import best_design
 from patchproof.optimizer.patch import Patch
 from patchproof.optimizer.pixels import from_pixels
@@ -222,7 +230,8 @@ def _hold_promises(settings: RealPrintsSettings, base: Path, cell: Cell, every: 
     with tempfile.TemporaryDirectory() as temporary:
         conditions = {"former": [(_problem(scene, names, FORMER), list(range(len(every.places))))], "default": []}
         for i, (printer, held) in enumerate(_printers(settings, every).values()):
-            file = save_printer(replace(printer, name=f"printer{i}"), Path(temporary))
+            file = Path(temporary, f"printer{i}.npz")
+            write_files_atomically(printer_contents(replace(printer, name=file.stem), file))
             conditions["default"].append((_problem(scene, names, {"printer": {"profile": str(file)}}), held))
         still = _problem(scene, names, _STILL)
         twins = [Twin.of(every.known.of(np.array([photo]))) for photo in range(len(every.places))]

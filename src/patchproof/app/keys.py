@@ -26,8 +26,7 @@ from patchproof.base.errors import Refused
 from patchproof.base.settings import SceneSettings
 from patchproof.base.validation import StrictModel, check_ordered, models_in, spelling_hint
 from patchproof.photo.rejection import REJECTION_CODES
-from patchproof.sheets.board import BoardTemplate
-from patchproof.sheets.template import Template
+from patchproof.sheets.template import BoardTemplate, Template
 
 HEAD = """# All keys
 

@@ -30,7 +30,7 @@ from patchproof.base.output import (
 from patchproof.base.progress import Progress, no_progress
 from patchproof.base.validation import refuse_untrusted
 from patchproof.channel.cameras import load_optional_camera
-from patchproof.channel.printer import load_printer
+from patchproof.channel.printer import load_printer, printer_of_sheet
 from patchproof.classifier.load import load_classifier
 from patchproof.classifier.network import Classifier
 from patchproof.evidence.batch import MAX_PICTURED_PHOTOS
@@ -195,8 +195,6 @@ def options_of(
     if (carried := manifest.settings.get("printer_file")) is None:
         printer = load_printer((manifest.settings.get("printer") or {}).get("profile", "coated"), base)
     else:
-        from patchproof.channel.carried_printer import printer_of_sheet
-
         printer = printer_of_sheet(carried, sheet)
     classifiers = [load_classifier(each, base).with_least_score(least_score) for each in networks]
     return Options(classifiers, printer, load_optional_camera(camera))

@@ -1,35 +1,43 @@
 """Calibrate a camera from photographs of a board: choose photographs and lens model, write a file that scenes can read.
 
-In: photographs and a board. Out: `CameraCalibration`, and three files: NAME.json in the form of calibration/cameras,
-NAME.fit.json with all figures (the ladder, deviations, every photograph), NAME.residuals.png. Photographs that cannot
-determine a camera are refused: too few of them, boards that all face the same way (a plane's picture then hardly
-depends on the focal length), a focal length known to no better than 1 %. The print's size does not matter, its
-proportions do: rulers that differ are typed in. In the picture, arrows show a pattern where a lens term is missing, and
-point every way where none is; a photograph that stands out was moved or shows a bent board.
+In: photographs and a board. Out: `CameraCalibration`, and NAME.json in the form of calibration/cameras. All views come
+from one camera in one state: the picture size, orientation and focal length that most photographs share; otherwise a
+phone that switched lenses between two photographs would be calibrated as the mean of both. Corners are saddle points,
+symmetric under half a turn, so neither blur nor the tone curve shifts them. Photographs that cannot determine a camera
+are refused: too few of them, boards that all face the same way (a plane's picture then hardly depends on the focal
+length), a focal length known to no better than 1 %. The print's size does not matter, its proportions do: rulers that
+differ are typed in. A photograph that stands out was moved or shows a bent board.
 Left out on purpose: fisheye lenses, and how flat the board is, which shows in the residuals only.
 """
 
-import io
 import json
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import date
 from functools import partial
 from pathlib import Path
-from typing import Any
 
+import cv2
 import numpy as np
 
+from patchproof.base.color import photo_codes_from_srgb
 from patchproof.base.errors import Refused
-from patchproof.base.output import check_file, write_files_atomically
+from patchproof.base.input import open_lazily
+from patchproof.base.output import check_file, write_atomically
 from patchproof.base.progress import Advance, Progress, no_advance, no_progress
-from patchproof.base.validation import not_measured_lines
-from patchproof.calibrate.boards import MIN_CORNERS, BoardView, find_boards
 from patchproof.calibrate.ladder import Rung
-from patchproof.calibrate.lens_ladder import PARAMETERS, LensFit, choose_lens_model, fit_rung
+from patchproof.calibrate.lens_ladder import PARAMETERS, BoardView, LensFit, choose_lens_model, fit_rung
 from patchproof.channel.lens import Camera, check_camera
-from patchproof.sheets.board import Board, load_board
+from patchproof.photo.detect import detect_markers, detector_settings, luminance
+from patchproof.photo.limits import run_limited
+from patchproof.photo.read import list_photos, read_photo
+from patchproof.photo.rejection import PhotoRejected
+from patchproof.sheets.blank import Board, load_board
+from patchproof.sheets.markers import DICTIONARY, aruco_dictionary
 
+MIN_CORNERS = 12  # in one photograph: a pose has six unknowns, twelve corners give twenty-four numbers
+_STATE_TAGS = 0x010F, 0x0110, 0x0112  # maker, model, orientation
 MIN_PHOTOS = 6
 MIN_TURN_DEG = 10.0  # between the two boards that differ most; users are asked for tilts of 20 to 45°
 MAX_FOCAL_SHARE = 0.01  # one standard deviation of the focal length
@@ -41,20 +49,13 @@ _ODD_PHOTO_RATIO, _ODD_CORNER_RATIO, _ODD_PX = 3.0, 5.0, 0.5  # ratios to the me
 
 @dataclass(frozen=True)
 class CameraCalibration:
-    """A camera, the ladder with its fit, the views used, reasons for photographs left out, and the board."""
+    """A camera, the ladder with its fit, the views used, and reasons for photographs left out."""
 
     camera: Camera
     rungs: tuple[Rung, ...]
     fit: LensFit
     views: tuple[BoardView, ...]
     left_out: Mapping[str, str]
-    board: Board
-
-    @property
-    def not_measured(self) -> dict[str, str]:
-        """Reasons by lens model that has no held-out error."""
-        why = "no usable fit to these photographs, or to parts of them"
-        return {f"lens model {rung.name}": why for rung in self.rungs if not np.isfinite(rung.error)}
 
     @property
     def coverage(self) -> float:
@@ -72,19 +73,15 @@ def calibrate_camera(
     overwrite: bool = False,
     progress: Progress = no_progress,
 ) -> CameraCalibration:
-    """Calibrate and write the three files; `board` is a template or BOARD.json, `ruler_mm` its rulers as measured."""
+    """Calibrate and write the camera file; `board` is a template or BOARD.json, `ruler_mm` its rulers as measured."""
     out = Path(out)
     if out.suffix.lower() != ".json":
         raise Refused("a file name that ends in .json", f'"{out}"', "name the camera CAMERA.json")
-    figures, picture = out.with_suffix(".fit.json"), out.with_suffix(".residuals.png")
-    for path in (out, figures, picture):
-        check_file(path, overwrite)
+    check_file(out, overwrite)
     template = load_board(board)
     views, left_out, camera = find_boards(photos, template, ruler_mm, partial(progress, "find corners"))
     result = fit_camera(views, left_out, template, out.stem, camera, partial(progress, "lens models"))
-    residuals = _residual_picture(result.views, result.rungs, result.fit)
-    files = {figures: _text(_fit_figures(result)), picture: residuals, out: _text(result.camera.model_dump())}
-    write_files_atomically(files)
+    write_atomically(out, json.dumps(result.camera.model_dump(), indent=1, allow_nan=False) + "\n")
     return result
 
 
@@ -109,42 +106,14 @@ def fit_camera(
     errors = f"standard deviations {parts}; {fit.rms_px:.2g} px rms are left; a board that is not flat is not in it"
     fitted = _camera(fit, name, size_px, about, errors)
     check_camera(fitted, "this calibration")
-    return CameraCalibration(fitted, rungs, fit, tuple(views), left_out, board)
-
-
-def _fit_figures(result: CameraCalibration) -> dict:
-    """All figures as plain data; lengths in px of `image_px`, null where a rung found no fit."""
-    fit = result.fit
-    figure = lambda value: round(value, 5) if np.isfinite(value) else None  # noqa: E731
-    tilts = [round(float(tilt), 2) for tilt in fit.tilts_deg]
-    photos: list[dict[str, Any]] = [
-        {"file": view.file, "status": "used", "corners": len(view.ids), "rms_px": figure(rms), "tilt_deg": tilt}
-        for view, rms, tilt in zip(result.views, fit.photo_rms_px, tilts, strict=True)
-    ]
-    photos += [{"file": file, "status": "left out", "reason": reason} for file, reason in result.left_out.items()]
-    names = {"held_out_px": "error", "worse_by_px": "worse_by", "standard_error_px": "standard_error"}
-    return {
-        "board": result.board.sheet_id,
-        "rung": fit.rung,
-        "ladder": [
-            {"rung": rung.name} | {key: figure(getattr(rung, name)) for key, name in names.items()}
-            for rung in result.rungs
-        ],
-        "numbers": {
-            n: {"value": float(v), "standard_deviation": float(s)}
-            for n, v, s in zip(PARAMETERS, fit.numbers, fit.sd, strict=True)
-        },
-        "not_measured": result.not_measured,
-        "rms_px": figure(fit.rms_px),
-        "coverage": round(result.coverage, 3),
-        "photos": sorted(photos, key=lambda photo: photo["file"]),
-    }
+    return CameraCalibration(fitted, rungs, fit, tuple(views), left_out)
 
 
 def calibration_lines(result: CameraCalibration) -> list[str]:
     """The result in a few lines for the terminal."""
     fit, camera = result.fit, result.camera
-    steps = ", ".join(f"{rung.name} {rung.error:.3f}" for rung in result.rungs if np.isfinite(rung.error))
+    # infinite where no fit to these photographs, or to parts of them, is usable
+    steps = ", ".join(f"{rung.name} {rung.error:.3f}" for rung in result.rungs).replace(" inf", " not measured")
     lines = [
         f"lens: {fit.rung} (held-out error in px: {steps})",
         f"focal length {camera.fx:.1f} ± {fit.sd[0]:.1f} × {camera.fy:.1f} ± {fit.sd[1]:.1f} px "
@@ -153,7 +122,6 @@ def calibration_lines(result: CameraCalibration) -> list[str]:
         f"{len(result.views)} photographs leave {fit.rms_px:.3f} px rms; tilts {fit.tilts_deg.min():.0f} to "
         f"{fit.tilts_deg.max():.0f}°",
     ]
-    lines += not_measured_lines(result.not_measured)
     lines += [f"left out: {file}: {reason}" for file, reason in result.left_out.items()]
     if result.coverage < GOOD_COVERAGE:
         lines.append(
@@ -161,6 +129,89 @@ def calibration_lines(result: CameraCalibration) -> list[str]:
             "beyond, distortion is a guess: photograph the board there, too"
         )
     return lines
+
+
+def find_boards(
+    photos: str | Path, board: Board, ruler_mm: tuple[float, float] | None = None, advance: Advance = no_advance
+) -> tuple[list[BoardView], dict[str, str], str]:
+    """Read a folder's photographs: (views, reasons by the names of photographs left out, the camera's name).
+
+    `ruler_mm` are the printed rulers (x, y) as measured.
+    """
+    paths, views, left_out, states = list_photos(photos), [], {}, []
+    positions_mm = corner_positions_mm(board, ruler_mm)
+    for number, path in enumerate(paths, 1):
+        try:
+            view, focal_px = run_limited(_read_view, path, board, positions_mm)
+            views.append(view)
+            states.append((view.size_px, *_camera_tags(path), focal_px and round(focal_px)))
+        except PhotoRejected as rejection:
+            left_out[path.name] = rejection.advice
+        advance(number, len(paths))
+    if not views:
+        got = f"{len(paths)} photographs that do not show it"
+        raise Refused(f"photographs of the board {board.sheet_id}", got, "name the board with --board")
+    common = Counter(states).most_common(1)[0][0]
+    pairs = list(zip(views, states, strict=True))
+    left_out |= {view.file: _other_state(state, common) for view, state in pairs if state != common}
+    return [view for view, state in pairs if state == common], left_out, common[1]
+
+
+def corner_positions_mm(board: Board, ruler_mm: tuple[float, float] | None = None) -> np.ndarray:
+    """Inner corners M×2 by id, from the board's top-left corner, scaled to the rulers as measured."""
+    column, row = np.meshgrid(np.arange(1, board.grid.columns), np.arange(1, board.grid.rows))
+    nominal = np.column_stack([column.ravel(), row.ravel()]) * board.grid.square_mm
+    return nominal if ruler_mm is None else nominal * (np.array(ruler_mm) / board.ruler_mm)
+
+
+def _read_view(path: Path, board: Board, positions_mm: np.ndarray) -> tuple[BoardView, float | None]:
+    photo = read_photo(path)
+    ids, px, markers = find_corners(photo.srgb, board)
+    if len(ids) < MIN_CORNERS or np.linalg.matrix_rank(positions_mm[ids] - positions_mm[ids].mean(0)) < 2:
+        advice = f"{markers} markers and {len(ids)} corners of the board were read, {MIN_CORNERS} corners are needed"
+        raise PhotoRejected("too_few_markers", len(ids), MIN_CORNERS, f"{advice}: show more of it, sharp")
+    height, width = photo.srgb.shape[:2]
+    return BoardView(path.name, ids, positions_mm[ids], px, (width, height)), photo.focal_px
+
+
+def find_corners(srgb: np.ndarray, board: Board) -> tuple[np.ndarray, np.ndarray, int]:
+    """Find the board's inner corners in a picture: (ids N, pixels N×2, number of markers).
+
+    Markers are searched for in linear light, where blurred paper does not grow over ink; corners need no such care.
+    """
+    dictionary = aruco_dictionary(DICTIONARY)
+    light = photo_codes_from_srgb(luminance(srgb))
+    quads, names, _ = detect_markers(light, dictionary, detector_settings())
+    none = np.zeros(0, int), np.zeros((0, 2)), len(quads)
+    if names is None:
+        return none
+    grid = board.grid
+    pattern = cv2.aruco.CharucoBoard((grid.columns, grid.rows), grid.square_mm, grid.marker_mm, dictionary)
+    gray = cv2.cvtColor(srgb, cv2.COLOR_RGB2GRAY)
+    corners, ids, _, _ = cv2.aruco.CharucoDetector(pattern).detectBoard(gray, None, None, quads, names)
+    if ids is None or len(ids) == 0:
+        return none
+    # OpenCV 4 gives N×1 and N×1×2, OpenCV 5 gives N and N×2
+    return np.asarray(ids).reshape(-1), np.asarray(corners, float).reshape(-1, 2) + 0.5, len(quads)
+
+
+def _camera_tags(path: Path) -> tuple[str, str]:
+    """(maker and model, orientation) as EXIF has them."""
+    try:
+        with open_lazily(path) as image:
+            exif = image.getexif()
+            make, model, orientation = (str(exif.get(tag, "")).strip("\0 ") for tag in _STATE_TAGS)
+            return f"{make} {model}".strip(), orientation
+    except Exception:  # the picture has been read; its tags are optional
+        return "", ""
+
+
+def _other_state(state, common) -> str:
+    """Describe the first difference of a photograph's camera state from the most common one."""
+    names = "a picture of {0[0]} × {0[1]} px", "a camera {0!r}", "an orientation {0!r}", "a focal length of {0} px"
+    name, own, most = next(each for each in zip(names, state, common, strict=True) if each[1] != each[2])
+    do = "keep one camera, its picture size, zoom and lens, and hold it one way"
+    return f"{name.format(own)} where most have {name.format(most)}: {do}"
 
 
 def _refuse_too_few(views: Sequence[BoardView], left_out: Mapping[str, str]) -> None:
@@ -221,38 +272,3 @@ def _camera(fit: LensFit, name: str, size_px: tuple[int, int], instrument: str, 
     description = {"instrument": instrument, "uncertainty": uncertainty, "when": date.today().isoformat()}
     numbers = {n: round(float(v), 6) for n, v in zip(PARAMETERS, fit.numbers, strict=True)}
     return Camera.model_validate({"name": name, "method": "measured", "image_px": size_px} | description | numbers)
-
-
-def _residual_picture(views: Sequence[BoardView], rungs: Sequence[Rung], fit: LensFit) -> bytes:
-    """A PNG of three panels: residuals over the picture, RMS of each photograph, held-out error of each rung."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(12, 3.8), layout="constrained")
-    FigureCanvasAgg(figure)
-    where, photos, ladder = figure.subplots(1, 3, width_ratios=(1.5, 1.2, 1))
-    places, residuals = np.concatenate([view.px for view in views]), np.concatenate(fit.residuals_px)
-    (width, height), lengths = views[0].size_px, np.linalg.norm(residuals, axis=1)
-    times = 0.02 * width / max(float(np.median(lengths)), 1e-6)
-    style = {"angles": "xy", "scale_units": "xy", "scale": 1 / times, "width": 0.0025, "cmap": "viridis"}
-    where.quiver(*places.T, *residuals.T, lengths, **style)
-    where.set(xlim=(0, width), ylim=(height, 0), aspect="equal", title=f"residuals, {times:.0f} times as long")
-    photos.bar(range(1, len(views) + 1), fit.photo_rms_px, color="#4477aa")
-    photos.set(xlabel="photograph, in the order of names", ylabel="rms [px]", title=f"{fit.rms_px:.3f} px in all")
-    rungs = [rung for rung in rungs if np.isfinite(rung.error)]
-    names, errors = [rung.name for rung in rungs], [rung.error for rung in rungs]
-    # bars are the standard error of the difference from the best rung
-    ladder.errorbar(range(len(rungs)), errors, [rung.standard_error for rung in rungs], fmt="o-", color="#4477aa")
-    chosen = names.index(fit.rung)
-    ladder.plot(chosen, errors[chosen], "o", markersize=12, fillstyle="none", color="#cc3311")
-    if max(errors) > 10 * min(errors):
-        ladder.set_yscale("log")
-    ladder.set_xticks(range(len(rungs)), [name.replace(" p1 p2", "\np1 p2") for name in names], fontsize=8)
-    ladder.set(ylabel="held-out error [px]", title=f"chosen: {fit.rung}")
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=110, metadata={"Software": None})
-    return buffer.getvalue()
-
-
-def _text(data: dict) -> bytes:
-    return (json.dumps(data, indent=1, allow_nan=False) + "\n").encode()

@@ -1,10 +1,10 @@
 """Read the printed chart in one photograph: the light of each swatch relative to bare paper at the same place.
 
-In: a photograph, the sheet's manifest, the camera if it is known. Out: `ChartPhoto`. The page is found by its markers;
-swatches are read in their unblurred cores, in linear light. Illumination differs from place to place, so white paper
-around the chart and the chart's own white swatches are read, too, and a smooth surface through them gives the light of
-bare paper under each swatch: dividing by it cancels gradients, vignetting, exposure and white balance at once. Text and
-lines on the paper are outliers of that surface, and the robust fit ignores them.
+In: a photograph, the sheet's manifest. Out: `ChartPhoto`. The page is found by its markers;
+swatches are read in their unblurred cores, in linear light. Illumination differs from place to place, so `paper_light`
+fits a smooth surface to white paper around the chart and its white swatches, which gives the light of bare paper under
+each swatch: dividing by it cancels gradients, vignetting, exposure and white balance at once. Text and lines on the
+paper are outliers of that surface, and the robust fit ignores them.
 Left out on purpose: lens distortion (a swatch's core is far from its border), and gloss: photograph it without shine.
 """
 
@@ -12,16 +12,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from patchproof.base.geometry import apply_homography, local_scale, rect_corners
-from patchproof.channel.lens import Camera
-from patchproof.channel.tone import light_of_codes
-from patchproof.photo.detect import MarkersInView, find_markers, is_mirrored
-from patchproof.photo.known_page import complete_markers
+from patchproof.base.color import LINEAR_FROM_CODE
+from patchproof.base.geometry import apply_homography, rect_corners
+from patchproof.photo.detect import MarkersInView, is_mirrored
+from patchproof.photo.known_page import find_sheet
+from patchproof.photo.paper_light import paper_light, quadratic_terms
 from patchproof.photo.quality import CLIPPED_CODE, blur_px
 from patchproof.photo.read import Photo
 from patchproof.photo.rectify import fit_page
 from patchproof.photo.rejection import PhotoRejected
 from patchproof.sheets.manifest import Manifest
+from patchproof.sheets.piece import marker_rect
 from patchproof.sheets.rects import RectMm, rect_contains
 
 MIN_CORE_PX = 4.0  # a swatch's side between blurred borders
@@ -29,182 +30,101 @@ MAX_CLIPPED_SHARE = 0.05  # share of white paper at full white; beyond it, its l
 _CORE_MARGIN = 0.2  # of a swatch's side: the least margin on each side
 _SAMPLES = 15  # along each side of a core
 _SEARCH_MM = 60.0  # bare paper is searched for within this distance of the chart
-_PITCH_MM, _PATCH_MM = 2.5, 2.0  # distance between patches of bare paper, and the side of each
-_CLEARANCE_MM = 1.0  # between a patch and anything printed; twice the blur is added
-_POWERS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))  # of x and y in the logarithm of the paper's light
-_PATCHES_PER_TERM = 5
 
 
 @dataclass(frozen=True)
 class ChartPhoto:
-    """`light` N×3 relative to paper, one row per swatch of the manifest's chart, NaN where it could not be read.
-
-    `paper` is the light of bare paper under the chart (1 = the camera's full white), `unevenness` the ratio of that
-    light under the lightest and the darkest place, `misfit` the rms deviation of bare paper from the smooth surface, as
-    a share.
+    """`light` N×3 relative to paper, one row per swatch of the manifest's chart, NaN where it could not be read, and
+    the light of bare `paper` under the chart (1 = the camera's full white).
     """
 
     light: np.ndarray
     paper: tuple[float, float, float]
-    unevenness: float
-    misfit: float
-    px_per_mm: float
 
 
-@dataclass(frozen=True)
-class _Page:
-    """A photographed page: its number, the homography to pixels, blur, and pixels per mm at the chart."""
-
-    number: int
-    px_from_mm: np.ndarray
-    blur_px: float
-    px_per_mm: float
-
-
-def read_chart(photo: Photo, manifest: Manifest, camera: Camera | None = None) -> ChartPhoto:
+def read_chart(photo: Photo, manifest: Manifest) -> ChartPhoto:
     """Read the chart's swatches; raises `PhotoRejected` where there is none, or none that can be trusted."""
-    page = _find_page(photo.srgb, manifest)
-    rows = chart_rows(manifest, page.number)
-    found = {row: _core(manifest.chart[row].rect_mm, page, photo.srgb.shape) for row in rows}
+    srgb = photo.srgb
+    page = px_from_mm, _ = _find_page(srgb, manifest)
+    found = {row: _core(swatch.rect_mm, *page, srgb.shape) for row, swatch in enumerate(manifest.chart)}
     cores = {row: core for row, core in found.items() if core is not None}
     if not cores:
         advice = "come closer to the chart, hold still and show all of it"
-        raise PhotoRejected("too_small", page.px_per_mm, None, advice)
-    patches = _bare_patches(manifest, page, photo.srgb.shape)
-    whites = [core for row, core in cores.items() if min(manifest.chart[row].srgb) == 1]
-    patches = np.concatenate([patches, np.reshape(whites, (-1, 4))])
-    paper_light_at, misfit = _paper(photo.srgb, page, patches, camera)
+        raise PhotoRejected("too_small", 0, 1, advice)
     light = np.full((len(manifest.chart), 3), np.nan)
-    paper_light = paper_light_at(np.array([[x + w / 2, y + h / 2] for x, y, w, h in cores.values()]))
-    for (row, core), paper in zip(cores.items(), paper_light, strict=True):
-        codes = _codes(photo.srgb, page, core)
+    middles_mm = np.array([[x + w / 2, y + h / 2] for x, y, w, h in cores.values()])
+    by_swatch = _paper_at(middles_mm, srgb, manifest, *page)
+    for (row, core), paper in zip(cores.items(), by_swatch, strict=True):
+        codes = _codes(srgb, px_from_mm, core)
         if (codes >= CLIPPED_CODE).any(-1).mean() <= MAX_CLIPPED_SHARE:
-            light[row] = light_of_codes(codes / 255, camera).mean(0) / paper
-    level = paper_light.mean(1)
-    red, green, blue = np.median(paper_light, 0).tolist()
-    return ChartPhoto(light, (red, green, blue), float(level.max() / level.min()), misfit, page.px_per_mm)
+            light[row] = LINEAR_FROM_CODE[codes].mean(0) / paper
+    red, green, blue = np.median(by_swatch, 0).tolist()
+    return ChartPhoto(light, (red, green, blue))
 
 
-def chart_rows(manifest: Manifest, page: int) -> list[int]:
-    """Indices of the swatches of a page's chart."""
-    return [i for i, swatch in enumerate(manifest.chart) if swatch.page == page]
-
-
-def _find_page(srgb: np.ndarray, manifest: Manifest) -> _Page:
-    """Find the page in view by the markers beside the chart; the piece's markers help where it is not cut out."""
+def _find_page(srgb: np.ndarray, manifest: Manifest) -> tuple[np.ndarray, float]:
+    """Find the chart's page by the markers beside the piece; the piece's own help where it is not cut out. Returns the
+    homography from millimeters to pixels, and the blur in pixels.
+    """
     dictionary = manifest.markers[0].dictionary
-    markers = [marker for marker in manifest.markers if marker.dictionary == dictionary]
-    detected = find_markers(srgb, {marker.id for marker in markers}, dictionary=dictionary)
-    if not detected.markers:
+    on_page = {marker.id: marker for marker in manifest.markers if marker.page == manifest.chart[0].page}
+    corners_mm = {i: np.array(marker.corners_mm) for i, marker in on_page.items()}
+    detected = find_sheet(srgb, corners_mm.keys(), corners_mm, dictionary)
+    corners_px = detected.corners_px
+    if not corners_px:
         raise _no_sheet(srgb, detected, dictionary)
-    pages = [marker.page for marker in markers if marker.id in detected.markers]
-    numbers = [page for page in pages if chart_rows(manifest, page)] or pages[:1]
-    number = max(sorted(set(numbers)), key=numbers.count)
-    corners_mm = {marker.id: np.array(marker.corners_mm) for marker in markers if marker.page == number}
-    detected = complete_markers(srgb, detected, corners_mm, dictionary)
-    corners_px = {i: borders.corners_px for i, borders in detected.markers.items() if i in corners_mm}
-    rects_mm = {i: _bounding_rect(corners_mm[i]) for i in corners_px}
-    beside_chart = {i: px for i, px in corners_px.items() if not rect_contains(manifest.cut_mm, rects_mm[i])}
-    fit = fit_page(beside_chart if len(beside_chart) > 1 else corners_px, corners_mm)
-    all_fit = fit_page(corners_px, corners_mm)
-    if set(beside_chart) <= set(all_fit.inlier_ids):
-        fit = all_fit
-    rects = np.array([manifest.chart[i].rect_mm for i in chart_rows(manifest, number)]).reshape(-1, 4)
-    if not len(rects):
-        raise PhotoRejected("too_few_markers", 0, 1, "there is no chart on this page: photograph the one that has it")
-    scale, _ = local_scale(fit.px_from_mm, tuple((rects[:, :2] + rects[:, 2:] / 2).mean(0)))
-    return _Page(number, fit.px_from_mm, blur_px(detected.markers.values()), float(scale))
+    beside = {i: px for i, px in corners_px.items() if not rect_contains(manifest.cut_mm, marker_rect(on_page[i]))}
+    fit = fit_page(corners_px, corners_mm)
+    if len(beside) > 1 and not set(beside) <= set(fit.inlier_ids):
+        fit = fit_page(beside, corners_mm)
+    return fit.px_from_mm, blur_px(detected.markers.values())
 
 
 def _no_sheet(srgb: np.ndarray, detected: MarkersInView, dictionary: str) -> PhotoRejected:
     if is_mirrored(srgb, detected, dictionary):
         return PhotoRejected("mirrored", None, None, "the photo is mirrored: switch off the camera's mirror setting")
     if detected.foreign:
-        advice = "these are the markers of another sheet: name that sheet's JSON, or leave the photo out"
+        advice = "these are the markers of another sheet or page: name that sheet's JSON, or leave the photo out"
         return PhotoRejected("wrong_sheet", len(detected.foreign), 0, advice)
     return PhotoRejected("too_few_markers", 0, 1, "no marker is readable: show the page sharp and well lit")
 
 
-def _core(rect: RectMm, page: _Page, shape) -> RectMm | None:
+def _core(rect: RectMm, px_from_mm: np.ndarray, blur_px: float, shape) -> RectMm | None:
     """The part of a swatch that blur does not reach; None where there is none or it lies outside the picture."""
     x, y, w, h = rect
-    quad = apply_homography(page.px_from_mm, rect_corners(rect))
+    quad = apply_homography(px_from_mm, rect_corners(rect))
     sides = np.linalg.norm(np.roll(quad, -1, axis=0) - quad, axis=1)
     sides = np.array([min(sides[0], sides[2]), min(sides[1], sides[3])])
-    edge = np.maximum(_CORE_MARGIN, (0.75 + 1.5 * page.blur_px) / sides)
-    if (sides * (1 - 2 * edge) < MIN_CORE_PX).any() or not _in_picture(quad, shape):
+    edge = np.maximum(_CORE_MARGIN, (0.75 + 1.5 * blur_px) / sides)
+    in_picture = ((quad >= 0) & (quad <= [shape[1], shape[0]])).all()
+    if (sides * (1 - 2 * edge) < MIN_CORE_PX).any() or not in_picture:
         return None
     return x + w * edge[0], y + h * edge[1], w * (1 - 2 * edge[0]), h * (1 - 2 * edge[1])
 
 
-def _bare_patches(manifest: Manifest, page: _Page, shape) -> np.ndarray:
-    """Small squares K×4 mm around the chart on which nothing is printed, as far as the manifest knows."""
-    rows = np.array([manifest.chart[i].rect_mm for i in chart_rows(manifest, page.number)])
-    clear = _CLEARANCE_MM + 2 * page.blur_px / page.px_per_mm
-    low = np.maximum(rows[:, :2].min(0) - _SEARCH_MM, clear)
-    high = np.minimum((rows[:, :2] + rows[:, 2:]).max(0) + _SEARCH_MM, np.array(manifest.page_mm) - clear) - _PATCH_MM
-    steps = [np.arange(a, b + 1e-9, _PITCH_MM) if b > a else np.array([a]) for a, b in zip(low, high, strict=True)]
-    corner = np.stack(np.meshgrid(*steps), -1).reshape(-1, 2)
-    printed = [swatch.rect_mm for swatch in manifest.chart if swatch.page == page.number]
-    printed += [_bounding_rect(marker.corners_mm) for marker in manifest.markers if marker.page == page.number]
-    if chart_rows(manifest, page.number) and any(not rect_contains(manifest.cut_mm, rect) for rect in rows):
+def _paper_at(points_mm, srgb: np.ndarray, manifest: Manifest, px_from_mm: np.ndarray, blur_px: float) -> np.ndarray:
+    """The light N×3 of bare paper at points N×2, by the white paper around the chart and its white swatches."""
+    rects = np.array([swatch.rect_mm for swatch in manifest.chart])
+    low = np.maximum(rects[:, :2].min(0) - _SEARCH_MM, 0)
+    high = np.minimum((rects[:, :2] + rects[:, 2:]).max(0) + _SEARCH_MM, manifest.page_mm)
+    printed = [swatch.rect_mm for swatch in manifest.chart if min(swatch.srgb) < 1]
+    printed += [marker_rect(m) for m in manifest.markers if m.page == manifest.chart[0].page]
+    if any(not rect_contains(manifest.cut_mm, swatch.rect_mm) for swatch in manifest.chart):
         printed.append(manifest.cut_mm)
-    bare = np.ones(len(corner), bool)
-    for x, y, w, h in printed:
-        is_clear = (corner >= np.array([x + w, y + h]) + clear) | (corner + _PATCH_MM <= np.array([x, y]) - clear)
-        bare &= is_clear.any(1)
-    squares = np.column_stack([corner, np.full((len(corner), 2), _PATCH_MM)])[bare]
-    inside = [_in_picture(apply_homography(page.px_from_mm, rect_corners(square)), shape) for square in squares]
-    return squares[np.array(inside, bool)]
+    area = (*low.tolist(), *(high - low).tolist())
+    paper = paper_light(srgb, px_from_mm, area, printed, blur_px)
+    light = quadratic_terms(points_mm - low, area[2:]) @ paper.coefficients.T
+    if light.max() > (full := LINEAR_FROM_CODE[CLIPPED_CODE]) or light.min() <= 0:
+        advice = "the paper is overexposed, or its light too uneven: lower the exposure by one step, in even light"
+        raise PhotoRejected("clipped", float(light.max()), float(full), advice)
+    return light
 
 
-def _paper(srgb: np.ndarray, page: _Page, patches: np.ndarray, camera: Camera | None):
-    """(function points N×2 mm → light of bare paper, misfit): exp of a polynomial per channel, fitted robustly."""
-    if not len(patches):
-        raise PhotoRejected("too_small", 0, 1, "no bare paper is in view: show the white paper around the chart")
-    codes = _codes(srgb, page, patches.T, 5)
-    clipped = float(np.median((codes >= CLIPPED_CODE).any(-1).mean(1)))
-    if clipped > MAX_CLIPPED_SHARE:
-        advice = "the paper is overexposed: lower the exposure by one step"
-        raise PhotoRejected("clipped", clipped, MAX_CLIPPED_SHARE, advice)
-    light = np.log(np.maximum(light_of_codes(codes / 255, camera).mean(1), 1e-4))
-    centers = patches[:, :2] + patches[:, 2:] / 2
-    middle, reach = centers.mean(0), max(float(np.ptp(centers, 0).max()), 1.0) / 2
-    count = next(n for n in (6, 3, 1) if len(patches) >= _PATCHES_PER_TERM * n or n == 1)
-
-    def powers(points_mm: np.ndarray) -> np.ndarray:
-        x, y = ((points_mm - middle) / reach).T
-        return np.stack([x**i * y**j for i, j in _POWERS[:count]], 1)
-
-    patch_powers = powers(centers)
-    weight, error, surface = np.ones(len(patches)), np.zeros(len(patches)), np.zeros((count, 3))
-    for _ in range(30):
-        root = np.sqrt(weight)[:, None]
-        surface = np.linalg.lstsq(patch_powers * root, light * root, rcond=None)[0]
-        error = np.abs(light - patch_powers @ surface).max(1)
-        spread = max(1.4826 * float(np.median(error)), 2e-3)
-        weight = np.maximum(1 - (error / (4.7 * spread)) ** 2, 0) ** 2  # Tukey's biweight: none for printed patches
-    misfit = float(np.sqrt((weight * error**2).sum() / weight.sum()))
-    return lambda points_mm: np.exp(powers(points_mm) @ surface), misfit
-
-
-def _codes(srgb: np.ndarray, page: _Page, rect, samples: int = _SAMPLES) -> np.ndarray:
-    """uint8 `K × samples² × 3` (or `samples² × 3` of one rectangle) of pixels nearest to a grid in rectangles of mm.
-
-    Nearest pixels, not mixtures: the mean of their light is the light's mean, whatever the tone curve.
+def _codes(srgb: np.ndarray, px_from_mm: np.ndarray, rect: RectMm) -> np.ndarray:
+    """uint8 N×3 of the pixels nearest to a grid in a rectangle of mm. Nearest pixels, not mixtures: the mean of their
+    light is the light's mean, whatever the tone curve.
     """
-    x, y, w, h = (np.asarray(value, float)[..., None, None] for value in rect)
-    step = (np.arange(samples) + 0.5) / samples
-    points_mm = np.stack(np.broadcast_arrays(x + w * step, y + h * step[:, None]), -1)
-    px = np.floor(apply_homography(page.px_from_mm, points_mm.reshape(-1, 2))).astype(int)
+    step = (np.indices((_SAMPLES, _SAMPLES)).reshape(2, -1).T + 0.5) / _SAMPLES
+    px = np.floor(apply_homography(px_from_mm, rect[:2] + np.multiply(rect[2:], step))).astype(int)
     column, line = np.clip(px, 0, [srgb.shape[1] - 1, srgb.shape[0] - 1]).T
-    return srgb[line, column].reshape(*points_mm.shape[:-3], samples**2, 3)
-
-
-def _bounding_rect(corners) -> RectMm:
-    (x0, y0), (x1, y1) = np.min(corners, 0), np.max(corners, 0)
-    return x0, y0, x1 - x0, y1 - y0
-
-
-def _in_picture(points: np.ndarray, shape: tuple[int, ...]) -> bool:
-    return bool(((points >= 0) & (points <= [shape[1], shape[0]])).all())
+    return srgb[line, column]

@@ -19,11 +19,9 @@ import numpy as np
 from patchproof.base.color import ciede2000, codes_from_srgb, lab_from_srgb
 from patchproof.base.errors import Refused
 from patchproof.base.input import read_file
-from patchproof.calibrate.printer_files import printer_from_table, printer_output
-from patchproof.channel.printer import NODES_8BIT, Printer, node_colors
+from patchproof.channel.printer import NODES_8BIT, Printer, node_colors, printer_from_table, printer_output
 
 MAX_PROFILE_BYTES = 32 * 2**20  # the largest printer profiles in use are a few MB
-_D50 = np.array([0.9642, 1.0, 0.8249])  # the profile connection space's white, ICC.1
 _CHECKED_COLORS = 10_000
 _INTENTS = {
     False: "relative colorimetric both ways, no black point compensation",
@@ -31,8 +29,8 @@ _INTENTS = {
 }
 
 
-def bake(profile_path: Path, name: str, licence: str, source: str, perceptual: bool = False) -> Printer:
-    """The printer of a profile; `licence` and `source` go into provenance, `perceptual` is the intent towards paper."""
+def bake(profile_path: Path, name: str, perceptual: bool = False) -> Printer:
+    """The printer of a profile; `perceptual` is the intent towards paper."""
     data = _profile_bytes(profile_path)
     show, profile = _chain(data, profile_path.name, perceptual)
     nodes = codes_from_srgb(node_colors())
@@ -42,12 +40,11 @@ def bake(profile_path: Path, name: str, licence: str, source: str, perceptual: b
         got = f"sRGB white printed as {white.tolist()}"
         raise Refused("a profile that leaves white paper bare", got, "use another one")
     gamut = ciede2000(lab_from_srgb(nodes / 255), lab_from_srgb(lut / 255))
-    printer = printer_from_table(name, "icc", lut / 255, gamut, _paper_white(profile), {})
+    printer = printer_from_table(name, "icc", lut / 255, gamut, {})
     printer.provenance.update(
         {
-            "source": source,
-            "licence": licence,
-            "profile": _description(profile),
+            "source": profile_path.name,
+            "profile": (profile.profile_description or "").strip(),
             "profile_sha256": hashlib.sha256(data).hexdigest(),
             "profile_colors": profile.xcolor_space.strip(),
             "intents": _INTENTS[perceptual],
@@ -79,8 +76,7 @@ def _chain(data: bytes, file_name: str, perceptual: bool) -> tuple[Callable[[np.
         profile = ImageCms.ImageCmsProfile(io.BytesIO(data))
         tags: Any = profile.profile
         kind, colors = tags.device_class.strip(), tags.xcolor_space.strip()
-        _description(tags)  # reading tags shows damage
-        _paper_white(tags)
+        _ = tags.profile_description  # reading tags shows damage
     except (OSError, ImageCms.PyCMSError, ValueError, TypeError, AttributeError) as error:
         got = f"{file_name} ({' '.join(str(error).split())[:100]})"
         raise Refused("an ICC profile that can be read", got, "use another one") from error
@@ -102,20 +98,6 @@ def _chain(data: bytes, file_name: str, perceptual: bool) -> tuple[Callable[[np.
         return np.asarray(ImageCms.applyTransform(image, chain)).reshape(srgb_8bit.shape)
 
     return show, tags
-
-
-def _description(profile) -> str:
-    return (profile.profile_description or "").strip()
-
-
-def _paper_white(profile) -> tuple[float, float, float] | None:
-    """CIELAB (D50) of the bare paper from the profile's media white point."""
-    if not profile.media_white_point:
-        return None
-    t = np.array(profile.media_white_point[0]) / _D50
-    f = np.where(t > (6 / 29) ** 3, np.cbrt(t), t / (3 * (6 / 29) ** 2) + 4 / 29)
-    lightness, a, b = (round(float(v), 2) + 0.0 for v in (116 * f[1] - 16, 500 * (f[0] - f[1]), 200 * (f[1] - f[2])))
-    return lightness, a, b
 
 
 def _table_error(printer: Printer, show: Callable[[np.ndarray], np.ndarray]) -> dict[str, float]:

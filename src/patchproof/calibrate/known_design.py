@@ -19,8 +19,7 @@ from patchproof.base.geometry import rect_corners
 from patchproof.base.progress import Advance
 from patchproof.base.text import printable
 from patchproof.base.workers import open_workers
-from patchproof.calibrate.chart import printer_of
-from patchproof.calibrate.printer_files import printer_output
+from patchproof.calibrate.chart import PRIORS, printer_of
 from patchproof.channel.print_colors import (
     INK_TERMS,
     CellColors,
@@ -29,22 +28,22 @@ from patchproof.channel.print_colors import (
     fit_ink_and_photos,
     fit_shown_colors,
 )
-from patchproof.channel.printer import Printer, load_printer, node_colors
+from patchproof.channel.printer import Printer, load_printer, node_colors, printer_output
 from patchproof.evidence.annotations import corners_of_photo
 from patchproof.evidence.batch import PhotoItem, measure_all
 from patchproof.evidence.camera import pinhole_photo
 from patchproof.evidence.measure import MeasuredPhoto
-from patchproof.evidence.print_fit import LEAST_CELLS, PhotographedDesign, choose_photo_cells
+from patchproof.evidence.print_fit import LEAST_CELLS, PhotographedDesign, choose_photo_cells, design_cells
 from patchproof.evidence.ranges import promised_ranges
 from patchproof.evidence.reproject import unmix_markers
 from patchproof.evidence.surface import printed_colors
 from patchproof.evidence.task import Options, Task, task_of
-from patchproof.photo.design_cells import design_cells
 from patchproof.photo.read import read_photo
 from patchproof.photo.rectify import crop_around
 from patchproof.sheets.manifest import Manifest
 from patchproof.sheets.markers import MARKER_MODULES
 
+KNOWN_PRINTERS = ("office", *PRIORS)
 COVERED_DELTA_E00, UNTOUCHED_DELTA_E00 = 10.0, 15.0  # from a seen color; between them the ink fades
 _SHARED_VEIL = 0.03  # assumed to be in every place, for a figure
 _LEAST_MODULE_PX = 1.75  # of markers: of paper beside 1.4 px, ink took a third of the light
@@ -91,13 +90,15 @@ def calibrate_design(
     alone = {each: float(np.median(_errors(photos, np.zeros((INK_TERMS, 3))))) for each, photos in cells.items()}
     best = min(alone, key=lambda each: alone[each])
     photos, prior, count = cells[best], load_printer(best), len(set(numbers))
-    ink, terms = fit_ink_and_photos(photos, shared_is_ink=True)
+    ink, terms = fit_ink_and_photos(photos)
     errors, left_out = _errors(photos, ink), []
     for place in set(numbers) if count > 1 else ():
         others = [c for c, number in zip(photos, numbers, strict=True) if number != place]
-        left_out += _errors([c for c, n in zip(photos, numbers, strict=True) if n == place], _ink(others))
+        own = [c for c, number in zip(photos, numbers, strict=True) if number == place]
+        left_out += _errors(own, fit_ink_and_photos(others)[0])
     veils = [_SHARED_VEIL * np.exp(c.start[3:6]) for c in photos]
-    veiled = _ink([replace(c, seen=(c.seen - v) / (1 - _SHARED_VEIL)) for c, v in zip(photos, veils, strict=True)])
+    less_veil = [replace(c, seen=(c.seen - v) / (1 - _SHARED_VEIL)) for c, v in zip(photos, veils, strict=True)]
+    veiled, _ = fit_ink_and_photos(less_veil)
     ends = linear_from_srgb(printer_output(prior, np.array([[0.0] * 3, [0.5] * 3])))
     black, gray = ciede2000(*(lab_from_linear(add_ink(ends, each)) for each in (ink, veiled)))
 
@@ -150,10 +151,6 @@ def _read_cells(task: Task, path: Path, measured: MeasuredPhoto) -> Photographed
     part, to_part = crop_around(srgb, px_from_mm, rect_corners(rect), 4)
     design = PhotographedDesign(*design_cells(part, to_part, rect, unmixed[1]), unmixed[0], anchored)
     return design if design.readable >= LEAST_CELLS else f"only {design.readable} of its cells can be read"
-
-
-def _ink(photos: Sequence[CellColors]) -> np.ndarray:
-    return fit_ink_and_photos(photos, shared_is_ink=True)[0]
 
 
 def _errors(photos: Sequence[CellColors], ink: np.ndarray) -> list[float]:

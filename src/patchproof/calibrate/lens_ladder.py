@@ -18,22 +18,35 @@ import numpy as np
 
 from patchproof.base.errors import Refused
 from patchproof.base.progress import Advance, no_advance
-from patchproof.calibrate.boards import BoardView
 from patchproof.calibrate.ladder import Rung, compare_rungs, simplest_rung
 
 FOLDS = 5
 PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 _NO_K3, _NO_P = cv2.CALIB_FIX_K3, cv2.CALIB_ZERO_TANGENT_DIST
-RUNG_FLAGS = {
-    "pinhole": _NO_P | _NO_K3 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K1,
-    "k1": _NO_P | _NO_K3 | cv2.CALIB_FIX_K2,
-    "k1 k2": _NO_P | _NO_K3,
-    "k1 k2 p1 p2": _NO_K3,
-    "k1 k2 p1 p2 k3": 0,
+# each lens model's flags, and how many of PARAMETERS it fits
+RUNGS = {
+    "pinhole": (_NO_P | _NO_K3 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K1, 4),
+    "k1": (_NO_P | _NO_K3 | cv2.CALIB_FIX_K2, 5),
+    "k1 k2": (_NO_P | _NO_K3, 6),
+    "k1 k2 p1 p2": (_NO_K3, 8),
+    "k1 k2 p1 p2 k3": (0, 9),
 }
-# how many of PARAMETERS each rung fits
-FREE_PARAMETERS = {"pinhole": 4, "k1": 5, "k1 k2": 6, "k1 k2 p1 p2": 8, "k1 k2 p1 p2 k3": 9}
 _STOP = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 60, 1e-10)
+
+
+@dataclass(frozen=True)
+class BoardView:
+    """One photograph's corners: `ids` N on the board, `board_mm` N×2 as printed, `px` N×2 of `size_px` (w, h)."""
+
+    file: str
+    ids: np.ndarray
+    board_mm: np.ndarray
+    px: np.ndarray
+    size_px: tuple[int, int]
+
+    def select(self, keep: np.ndarray) -> "BoardView":
+        """A copy with the corners in the mask `keep` only."""
+        return replace(self, ids=self.ids[keep], board_mm=self.board_mm[keep], px=self.px[keep])
 
 
 @dataclass(frozen=True)
@@ -54,11 +67,6 @@ class LensFit:
         return float(np.sqrt((np.concatenate(self.residuals_px) ** 2).sum(1).mean()))
 
     @property
-    def photo_rms_px(self) -> list[float]:
-        """Root mean square of the residuals' lengths in each view."""
-        return [float(np.sqrt((residual**2).sum(1).mean())) for residual in self.residuals_px]
-
-    @property
     def tilts_deg(self) -> np.ndarray:
         """The angle by which each board is turned away from facing the camera."""
         return np.degrees(np.arccos(np.clip(np.abs(self.normals[:, 2]), 0, 1)))
@@ -74,23 +82,23 @@ def choose_lens_model(
 ) -> tuple[tuple[Rung, ...], LensFit]:
     """All rungs, with the photographs' RMS in px, and the chosen one's fit to all; a rung not `usable` is left out."""
     folds = [np.arange(len(views)) % min(FOLDS, len(views)) == k for k in range(min(FOLDS, len(views)))]
-    errors, fits, start = np.full((len(RUNG_FLAGS), len(views)), np.inf), {}, None
-    for number, name in enumerate(RUNG_FLAGS):
+    errors, fits, start = np.full((len(RUNGS), len(views)), np.inf), {}, None
+    for number, name in enumerate(RUNGS):
         fit = fit_rung(views, name, start)
         if fit is not None and usable(fit):
             errors[number], spread = _held_out(views, folds, fit)
             start = fits[name] = replace(fit, sd=np.maximum(fit.sd, spread))
-        advance(number + 1, len(RUNG_FLAGS))
+        advance(number + 1, len(RUNGS))
     if not np.isfinite(errors).all(1).any():
         do = "photograph the board, glued to something flat, from more directions"
         raise Refused("photographs of a board that a lens model fits", f"{len(views)} that none fits", do)
-    rungs = compare_rungs(list(RUNG_FLAGS), errors)
+    rungs = compare_rungs(list(RUNGS), errors)
     return rungs, fits[rungs[simplest_rung(rungs)].name]
 
 
 def fit_rung(views: Sequence[BoardView], name: str, start: LensFit | None = None) -> LensFit | None:
     """Fit one rung to all of these views, starting from a lower rung's `start`; None where OpenCV finds no fit."""
-    flags, matrix, distortion = RUNG_FLAGS[name], np.eye(3), np.zeros(5)
+    (flags, free), matrix, distortion = RUNGS[name], np.eye(3), np.zeros(5)
     if start is not None:
         flags |= cv2.CALIB_USE_INTRINSIC_GUESS
         matrix, distortion = matrix_and_distortion(start.numbers)
@@ -109,7 +117,7 @@ def fit_rung(views: Sequence[BoardView], name: str, start: LensFit | None = None
     rotations, translations = ([np.asarray(v, float).reshape(3) for v in vectors] for vectors in (rvecs, tvecs))
     poses = tuple(zip(rotations, translations, strict=True))
     residuals = tuple(_residual(view, numbers, pose) for view, pose in zip(views, poses, strict=True))
-    return LensFit(name, numbers, np.where(np.arange(9) < FREE_PARAMETERS[name], sd, 0.0), poses, residuals)
+    return LensFit(name, numbers, np.where(np.arange(9) < free, sd, 0.0), poses, residuals)
 
 
 def matrix_and_distortion(numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

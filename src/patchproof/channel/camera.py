@@ -1,8 +1,8 @@
 """The camera: linear light at the lens becomes a display-encoded picture.
 
 In: N×3×H×W linear light and a `Sensor`. Out: N×3×H×W sRGB in [0, 1], differentiable. Order: blur (optics, focus,
-straight motion), exposure and white balance, shot and read noise, clipping, tone curve (sRGB's, or that of a calibrated
-camera), the photograph's own tone. The lens's distortion has its own module.
+straight motion), exposure and white balance, shot and read noise, clipping, sRGB's curve, the photograph's own tone.
+The lens's distortion has its own module.
 
 Blur, motion, noise and JPEG are given for the photograph's full size. A picture rendered at `scale` times that size
 gets the part of them that remains after averaging: they shrink with `scale`, and effects below the threshold of
@@ -11,17 +11,12 @@ JPEG by the code that writes the file.
 """
 
 from functools import lru_cache, partial
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from patchproof.base.color import clamp_to_unit, lift_tone
+from patchproof.base.color import clamp_to_unit, lift_tone, srgb_from_linear
 from patchproof.channel.effects import Sensor
-from patchproof.channel.tone import codes_of_light
-
-if TYPE_CHECKING:
-    from patchproof.channel.lens import Camera
 
 # A blur below this sigma (pixels) is hidden by a pixel's averaging and by the blur of resampling.
 SMALLEST_BLUR_PX = 0.4
@@ -35,9 +30,8 @@ READ_SHARE = 0.25
 _TABLE_STEPS = 1 << 18  # of light in `encode_light_by_table`
 
 
-def develop(linear: Tensor, sensor: Sensor, scale: float, jpeg: bool = True, camera: "Camera | None" = None) -> Tensor:
-    """Return the pictures that a camera makes of linear light, one row of `sensor` per picture. The tone curve is that
-    of `camera` if it has one, else sRGB's.
+def develop(linear: Tensor, sensor: Sensor, scale: float, jpeg: bool = True) -> Tensor:
+    """Return the pictures that a camera makes of linear light, one row of `sensor` per picture.
 
     `scale` is the pictures' size divided by the photograph's. `jpeg=False` leaves JPEG to the writer of a real file.
     """
@@ -45,7 +39,7 @@ def develop(linear: Tensor, sensor: Sensor, scale: float, jpeg: bool = True, cam
     light = gaussian_blur(linear, tensor(sensor.blur_px * scale))
     light = motion_blur(light, tensor(sensor.motion_px * scale), sensor.motion_deg)
     light = light * gains(sensor, linear)[:, :, None, None]
-    picture = encode_light(add_noise(light, tensor(sensor.noise * scale), sensor.noise_seed), camera)
+    picture = encode_light(add_noise(light, tensor(sensor.noise * scale), sensor.noise_seed))
     picture = lift_tone(picture, tensor(sensor.tone)[:, None, None, None])
     return compress_jpeg(picture, tensor(sensor.jpeg)) if _has_jpeg(sensor, scale, jpeg) else picture
 
@@ -80,22 +74,20 @@ def gains(sensor: Sensor, like: Tensor) -> Tensor:
     return torch.as_tensor(2 ** sensor.exposure_ev[:, None] * sensor.white_balance).to(like)
 
 
-def encode_light(linear: Tensor, camera: "Camera | None" = None) -> Tensor:
+def encode_light(linear: Tensor) -> Tensor:
     """Return clipped light as code values in [0, 1]."""
-    return codes_of_light(clamp_to_unit(linear), camera)
+    return srgb_from_linear(clamp_to_unit(linear))
 
 
-def encode_light_by_table(linear: Tensor, camera: "Camera | None" = None) -> Tensor:
+def encode_light_by_table(linear: Tensor) -> Tensor:
     """Encode light by a table, within 1/100 of an 8-bit step, in a seventh of the time; not differentiable."""
     index = (linear * _TABLE_STEPS).add_(0.5).clamp_(0, _TABLE_STEPS).int()
-    # pyright cannot know that frozen models have a hash
-    table = _code_table(camera, linear.device)  # pyright: ignore[reportArgumentType]
-    return table.index_select(0, index.flatten()).view(linear.shape)
+    return _code_table(linear.device).index_select(0, index.flatten()).view(linear.shape)
 
 
 @lru_cache(maxsize=4)
-def _code_table(camera: "Camera | None", device: torch.device) -> Tensor:
-    return encode_light(torch.linspace(0, 1, _TABLE_STEPS + 1, dtype=torch.float64, device=device), camera).float()
+def _code_table(device: torch.device) -> Tensor:
+    return encode_light(torch.linspace(0, 1, _TABLE_STEPS + 1, dtype=torch.float64, device=device)).float()
 
 
 def gaussian_blur(linear: Tensor, sigma_px: Tensor) -> Tensor:

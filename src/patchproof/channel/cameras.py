@@ -1,7 +1,10 @@
-"""Load a calibrated camera only if one is named: `lens` is imported with the first camera file."""
+"""What pictures need of cameras where none is calibrated: `lens` is imported with the first camera file."""
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 if TYPE_CHECKING:
     from patchproof.channel.lens import Camera
@@ -16,3 +19,15 @@ def load_optional_camera(
     from patchproof.channel.lens import load_camera  # most photographs are of cameras that nobody calibrated
 
     return load_camera(name_or_file, base, photo_px)
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A pinhole picture to render before the lens bends it, and how many pixels it extends beyond each side."""
+
+    size_px: tuple[int, int]
+    matrix_px: np.ndarray
+    left: int
+    top: int
+    right: int
+    bottom: int

@@ -21,10 +21,10 @@ import numpy as np
 from pydantic import Field
 
 from patchproof.base.errors import Refused
-from patchproof.base.input import is_file, read_json
-from patchproof.base.packaged import packaged_path
-from patchproof.base.validation import Finite, Positive, Share, StrictModel, spelling_hint, validate_model
-from patchproof.channel.render_frame import Frame
+from patchproof.base.input import read_json
+from patchproof.base.packaged import named_path, packaged_path
+from patchproof.base.validation import Finite, Positive, StrictModel, validate_model
+from patchproof.channel.cameras import Frame
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -52,7 +52,6 @@ class Camera(StrictModel):
     p1: Finite = 0.0
     p2: Finite = 0.0
     k3: Finite = 0.0
-    tone_light: Annotated[tuple[Share, ...], Field(min_length=5, max_length=4096)] | None = None  # see `tone`
 
     @property
     def has_distortion(self) -> bool:
@@ -111,7 +110,7 @@ class Camera(StrictModel):
 
 def load_camera(name_or_file: str | Path, base: Path | None = None, photo_px: tuple[int, int] | None = None) -> Camera:
     """Load a shipped camera by name, or a JSON file relative to `base`; refused if it cannot have taken `photo_px`."""
-    path = _path(name_or_file, base)
+    path = named_path(name_or_file, base, "a camera", packaged_path("calibration", "cameras"), (".json",))
     camera = validate_model(Camera, read_json(path, "a camera file (JSON)", "calibrate again"), str(path))
     check_camera(camera, str(path))
     width, height = camera.image_px
@@ -123,17 +122,22 @@ def load_camera(name_or_file: str | Path, base: Path | None = None, photo_px: tu
 
 
 def check_camera(camera: Camera, where: str) -> None:
-    """Refuse a principal point outside the picture, a tone curve that does not rise, irreversible distortion."""
-    (width, height), light = camera.image_px, camera.tone_light
+    """Refuse a principal point outside the picture, and distortion that cannot be undone. Where undistorting closes,
+    neighbors keep their order and stay within twice their distance, so that no direction is seen twice.
+    """
+    width, height = camera.image_px
     if not (0 < camera.cx < width and 0 < camera.cy < height):
         expected = f"a principal point inside the picture of {width} × {height} px in {where}"
         got = f"({camera.cx:g}, {camera.cy:g})"
         raise Refused(expected, got, "give cx, cy and image_px in the same pixels")
-    if light is not None and not (light[0] == 0 and light[-1] == 1 and (np.diff(light) > 0).all()):
-        got = f"{len(light)} values from {light[0]:g} to {light[-1]:g} that do not"
-        remedy = "give the light at evenly spaced code values, or leave it out for sRGB's curve"
-        raise Refused(f"a tone_light in {where} that grows from 0 to 1 at every step", got, remedy)
-    _refuse_irreversible(camera, where)
+    x, y = np.meshgrid(*(np.linspace(0.5, side - 0.5, 65) for side in camera.image_px))
+    points = _to_unit(camera.matrix_px(camera.image_px), np.stack([x.ravel(), y.ravel()], 1))
+    with np.errstate(over="ignore", invalid="ignore"):
+        error_px = np.abs((_distort(camera, _undistort(camera, points)) - points) * [camera.fx, camera.fy]).max()
+    if not error_px < _MAX_ERROR_PX:  # true also for NaN
+        got = f"k1 k2 k3 = {camera.k1:g} {camera.k2:g} {camera.k3:g}, p1 p2 = {camera.p1:g} {camera.p2:g}"
+        remedy = "calibrate again with the board in the picture's corners, or with fewer terms"
+        raise Refused(f"distortion that can be undone in the whole picture in {where}", got, remedy)
 
 
 @lru_cache(maxsize=4)
@@ -182,30 +186,3 @@ def _edge_px(size_px: tuple[int, int]) -> np.ndarray:
     x, y = np.arange(width) + 0.5, np.arange(height) + 0.5
     sides = [(x, 0.5), (x, height - 0.5), (0.5, y), (width - 0.5, y)]
     return np.concatenate([np.stack(np.broadcast_arrays(*side), 1) for side in sides])
-
-
-def _path(name_or_file: str | Path, base: Path | None) -> Path:
-    path = Path(name_or_file)
-    if path.suffix.lower() == ".json" or len(path.parts) > 1:
-        path = (base or Path()) / path
-        if not is_file(path):
-            raise Refused("a camera file (JSON)", f"no file at {path}", "check the path")
-        return path
-    shipped = sorted(file.stem for file in packaged_path("calibration", "cameras").glob("*.json"))
-    if (name := str(name_or_file)) not in shipped:
-        raise Refused("a camera's name or file", f'"{name_or_file}"', spelling_hint(name, shipped))
-    return packaged_path("calibration", "cameras", f"{name}.json")
-
-
-def _refuse_irreversible(camera: Camera, where: str) -> None:
-    """Refuse distortion that cannot be undone. Where undistorting closes, neighbors keep their order and stay within
-    twice their distance, so that no direction is seen twice.
-    """
-    x, y = np.meshgrid(*(np.linspace(0.5, side - 0.5, 65) for side in camera.image_px))
-    points = _to_unit(camera.matrix_px(camera.image_px), np.stack([x.ravel(), y.ravel()], 1))
-    with np.errstate(over="ignore", invalid="ignore"):
-        error_px = np.abs((_distort(camera, _undistort(camera, points)) - points) * [camera.fx, camera.fy]).max()
-    if not error_px < _MAX_ERROR_PX:  # true also for NaN
-        got = f"k1 k2 k3 = {camera.k1:g} {camera.k2:g} {camera.k3:g}, p1 p2 = {camera.p1:g} {camera.p2:g}"
-        remedy = "calibrate again with the board in the picture's corners, or with fewer terms"
-        raise Refused(f"distortion that can be undone in the whole picture in {where}", got, remedy)

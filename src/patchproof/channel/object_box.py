@@ -5,6 +5,7 @@ whole object counts, including what a piece or another of its parts hides: the b
 out on purpose: things that stand in front of the object.
 """
 
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -24,10 +25,8 @@ def hull_points(vertices_mm: np.ndarray) -> np.ndarray:
     from scipy.spatial import ConvexHull, QhullError
 
     points = np.unique(vertices_mm, axis=0)
-    try:
+    with suppress(QhullError):  # a flat mesh is its own hull
         points = points[ConvexHull(points).vertices]
-    except QhullError:  # a flat mesh is its own hull
-        pass
     if len(points) <= MOST_POINTS:
         return points
     azimuth, height = np.arange(MOST_POINTS) * np.pi * (3 - 5**0.5), np.linspace(-1, 1, MOST_POINTS)

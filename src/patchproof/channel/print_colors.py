@@ -66,20 +66,16 @@ class ShownColors:
 
     def show(self, light: np.ndarray) -> np.ndarray:
         """Return the light `... × 3` that the photograph shows of a print's light."""
-        return lift_light(light @ self.matrix[:, :3].T + self.matrix[:, 3], self.tone)
+        shown = light @ self.matrix[:, :3].T + self.matrix[:, 3]
+        return linear_from_srgb(lift_tone(srgb_from_linear(shown), self.tone)) if self.tone else shown
 
     def undo(self, seen: np.ndarray) -> np.ndarray:
         """Return the print's light `... × 3` of light in the photograph."""
         return (lower_light(seen, self.tone) - self.matrix[:, 3]) @ np.linalg.inv(self.matrix[:, :3]).T
 
 
-def lift_light(light: np.ndarray, tone: float) -> np.ndarray:
-    """Return light after a photograph's tone."""
-    return linear_from_srgb(lift_tone(srgb_from_linear(light), tone)) if tone else light
-
-
 def lower_light(light: np.ndarray, tone: float) -> np.ndarray:
-    """Invert `lift_light`."""
+    """Return light before a photograph's tone."""
     codes, slope = srgb_from_linear(light), 1 + 4 * tone
     codes = 2 * codes / (slope + np.sqrt(np.maximum(slope**2 - 16 * tone * codes, 0)))
     return linear_from_srgb(codes) if tone else light
@@ -125,12 +121,9 @@ def choose_cells(
     )
 
 
-def fit_ink_and_photos(
-    photos: Sequence[CellColors], rounds: int = 8, shared_is_ink: bool = False
-) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Fit the print's ink 9×3 and each photograph's terms (8,), in turn.
-
-    If `shared_is_ink`, terms that all photographs share are moved to the ink, as far as its form can hold them.
+def fit_ink_and_photos(photos: Sequence[CellColors], rounds: int = 8) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Fit the print's ink 9×3 and each photograph's terms (8,), in turn. Terms that all photographs share are moved to
+    the ink, as far as its form can hold them.
     """
     terms = [cells.start for cells in photos]
     promised, rows = (np.concatenate([getattr(cells, name) for cells in photos]) for name in ("promised", "terms"))
@@ -138,10 +131,9 @@ def fit_ink_and_photos(
     # each photograph counts as much as any other
     share = np.concatenate([np.full(len(cells.seen), 1 / max(len(cells.seen), 1)) for cells in photos])
     for _ in range(rounds):
-        if shared_is_ink:
-            shared = np.mean([t - cells.start for cells, t in zip(photos, terms, strict=True)], 0)
-            shared[:3] = np.min(terms, 0)[:3]  # no veil takes light away: only what all have in common may be ink
-            terms = [t - shared for t in terms]
+        shared = np.mean([t - cells.start for cells, t in zip(photos, terms, strict=True)], 0)
+        shared[:3] = np.min(terms, 0)[:3]  # no veil takes light away: only what all have in common may be ink
+        terms = [t - shared for t in terms]
         seen = [ShownColors.of_terms(t).undo(cells.seen) for cells, t in zip(photos, terms, strict=True)]
         ink = _fit_ink(promised, rows, np.concatenate(seen), share, ink)
         light = [cells.ink_light(ink) for cells in photos]

@@ -8,10 +8,13 @@ them too. Print-to-print variation is a small function on top, `vary_print`. Lef
 what a camera resolves beyond 0.2 mm per pixel) and ink spread.
 """
 
+import base64
 import hashlib
 import io
+import json
 import math
 import zipfile
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -22,12 +25,12 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from patchproof.base.color import LUMINANCE, clamp_to_unit
+from patchproof.base.color import LUMINANCE, clamp_to_unit, lab_from_srgb
 from patchproof.base.errors import Refused
 from patchproof.base.input import read_file, read_json
-from patchproof.base.packaged import packaged_path
+from patchproof.base.packaged import named_path, packaged_path
 from patchproof.base.text import short_repr
-from patchproof.base.validation import Finite, StrictModel, spelling_hint, validate_model
+from patchproof.base.validation import Finite, StrictModel, validate_model
 from patchproof.channel.effects import Print
 
 # 8-bit values that exist, so that a table baked by an 8-bit engine is exact at its nodes: 0, 8, ..., 248, 255
@@ -103,6 +106,19 @@ def identity_printer() -> Printer:
     return Printer("identity", "assumed", lut, torch.zeros(lut.shape[:3]), Paper(black_L=0.0), note)
 
 
+def printer_from_table(name: str, method: Method, lut: np.ndarray, gamut: np.ndarray, provenance: dict) -> Printer:
+    """Return a printer of tables 33×33×33×3 (clipped to [0, 1]) and 33×33×33, with its own black."""
+    lut = np.clip(np.asarray(lut, np.float64), 0, 1)
+    paper = Paper(black_L=round(float(lab_from_srgb(lut[0, 0, 0])[0]), 2))
+    distances = torch.tensor(np.asarray(gamut, np.float64), dtype=torch.float32)
+    return Printer(name, method, torch.tensor(lut, dtype=torch.float32), distances, paper, provenance)
+
+
+def printer_output(printer: Printer, colors: np.ndarray) -> np.ndarray:
+    """Return the sRGB colors N×3 of a print of N×3 sRGB sent."""
+    return printer.apply(torch.tensor(np.asarray(colors, float).T[None, :, :, None]))[0, :, :, 0].T.numpy()
+
+
 def vary_print(seen_linear: Tensor, change: Tensor) -> Tensor:
     """Return the light `... × 3` of another print of the same file in another photograph, given that of this one;
     channels last, unlike an image.
@@ -128,20 +144,11 @@ def load_printer(name_or_file: str, base: Path | None = None) -> Printer:
     """Load a shipped printer by name, `identity`, or NAME.npz or NAME.json relative to `base`; else it is refused."""
     if name_or_file == "identity":
         return identity_printer()
-    suffix = Path(name_or_file).suffix.lower()
-    if suffix in {".icc", ".icm"}:
+    if Path(name_or_file).suffix.lower() in {".icc", ".icm"}:
         remedy = "bake the profile into one with patchproof calibrate printer"
         raise Refused("a printer model (.npz)", f"the ICC profile {name_or_file}", remedy)
-    if suffix in {".npz", ".json"} or len(Path(name_or_file).parts) > 1:
-        return _read((base or Path()) / name_or_file)
-    shipped = sorted(path.stem for path in packaged_path("calibration", "printers").glob("*.npz"))
-    if name_or_file not in shipped:
-        hint = spelling_hint(name_or_file, [*shipped, "identity"])
-        raise Refused("a printer's name or file", f'"{name_or_file}"', hint)
-    return _read(packaged_path("calibration", "printers", f"{name_or_file}.npz"))
-
-
-def _read(path: Path) -> Printer:
+    folder = packaged_path("calibration", "printers")
+    path = named_path(name_or_file, base, "a printer", folder, (".npz", ".json"), ("identity",))
     return printer_of_files(*printer_files(path), path)
 
 
@@ -149,6 +156,18 @@ def printer_files(path: Path) -> tuple[bytes, Any]:
     """Return what a printer's NAME.npz and NAME.json hold."""
     expected, text = "a printer as NAME.npz with NAME.json beside it", path.with_suffix(".json")
     return read_file(path.with_suffix(".npz"), expected), read_json(text, expected, "calibrate again")
+
+
+def printer_contents(printer: Printer, path: Path) -> dict[Path, bytes]:
+    """Return the contents of NAME.npz, which is `path`, and of NAME.json; a printer always gives the same bytes."""
+    lut = printer.lut.double().numpy()
+    in_8_bits = np.abs(lut * 255 - np.round(lut * 255)).max() < 1e-4  # tables from an 8-bit engine lose nothing
+    levels, dtype = (255, np.uint8) if in_8_bits else (65535, np.uint16)
+    gamut = np.round(printer.gamut.double().numpy() * GAMUT_STEPS).clip(0, 255).astype(np.uint8)
+    np.savez_compressed(tables := io.BytesIO(), lut=np.round(lut * levels).astype(dtype), gamut=gamut)
+    head = PrinterHead(name=printer.name, method=printer.method, paper=printer.paper, provenance=printer.provenance)
+    text = json.dumps(head.model_dump(), indent=1, ensure_ascii=False) + "\n"
+    return {path: tables.getvalue(), path.with_suffix(".json"): text.encode()}
 
 
 def printer_of_files(stored: bytes, description: Any, path: str | Path) -> Printer:
@@ -164,6 +183,21 @@ def printer_of_files(stored: bytes, description: Any, path: str | Path) -> Print
     lut_srgb = torch.tensor(lut / np.iinfo(lut.dtype).max, dtype=torch.float32)
     distances = torch.tensor(gamut / GAMUT_STEPS, dtype=torch.float32)
     return Printer(head.name, head.method, lut_srgb, distances, head.paper, head.provenance)
+
+
+def carried_printer(path: Path) -> dict[str, Any]:
+    """Return both files of a printer as JSON values: a sheet carries one without a name, since it may lie anywhere."""
+    tables, head = printer_files(path)
+    return {"npz": base64.b64encode(tables).decode(), "head": head}
+
+
+def printer_of_sheet(carried: Mapping[str, Any], source: str | Path) -> Printer:
+    """Return a printer from what `carried_printer` made of it; `source` names the sheet in a refusal."""
+    try:
+        tables = base64.b64decode(carried["npz"], validate=True)
+    except ValueError as error:
+        raise Refused("a printer's tables in base64", f"{source} with other text", "make the sheet again") from error
+    return printer_of_files(tables, carried["head"], source)
 
 
 def _array(archive: zipfile.ZipFile, name: str, shape: tuple[int, ...], kinds: tuple[type, ...]) -> np.ndarray:

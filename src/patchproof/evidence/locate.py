@@ -12,14 +12,13 @@ import numpy as np
 
 from patchproof.base.geometry import apply_homography, fit_homography, intrinsics, plane_pose, rect_corners
 from patchproof.channel.object_box import project_box
-from patchproof.evidence.camera import FOCAL_ERROR, PinholePhoto
+from patchproof.evidence.camera import PinholePhoto
 from patchproof.evidence.classify import BoxEdges
 from patchproof.evidence.results import CameraPose, FocalSource, Geometry
 from patchproof.evidence.surface import PromisedColors, Surface
 from patchproof.photo import pose as sheet_pose
 from patchproof.photo.detect import MarkersInView
 from patchproof.photo.known_page import is_in_picture, shows_small_code
-from patchproof.photo.print_ratio import x_over_y
 from patchproof.photo.quality import FrameLight
 from patchproof.photo.rectify import PageFit, corner_uncertainty_mm, fit_page
 from patchproof.photo.registration import Registration, register
@@ -34,9 +33,9 @@ _SURE_SIGMAS = 2.0
 # of a cell: up to 1.2 where another printer's colors displace a smooth design's corners, 0.3 for designs with detail
 _OFFSET_SIGMAS, _LEAST_OFFSET_CELLS = 1.25, 9
 _OUTLIER_FACTOR = 2.0  # the design's corner beside an outlier marker may lie off by more than the marker
-# 95 % errors beyond which a figure is "not measured": the x:y ratio's, the azimuth's (beyond some 10° a view from the
-# left cannot be told from one from the right) beside what an unconfirmed focal length adds, and the distance's
-MOST_RATIO_ERROR, MOST_AZIMUTH_ERROR_DEG, MOST_DISTANCE_ERROR = 0.005, 10.0, 0.2
+# 95 % errors beyond which a figure is "not measured": the azimuth's (beyond some 10° a view from the left cannot be
+# told from one from the right) beside what an unconfirmed focal length adds, and the distance's
+MOST_AZIMUTH_ERROR_DEG, MOST_DISTANCE_ERROR = 10.0, 0.2
 
 
 @dataclass(frozen=True)
@@ -161,7 +160,7 @@ def geometry_of(
         contrast=light.contrast,
         blur_px=blur,
         corner_uncertainty_mm=uncertainty,
-        curl_radius_mm=unrolled and unrolled.radius_mm,
+        curl_radius_mm=unrolled and unrolled.shape.radius_mm,
         bend_mm=fit.bend_mm,
         design_shift_mm=shift,
         # no homography maps a page that was unrolled to the photograph
@@ -241,10 +240,7 @@ def camera_pose(view: PinholePhoto, location: LocatedSheet, surface: Surface) ->
     # perspective cannot tell a stretched print from a wrong focal length: a camera file is trusted, EXIF is not
     if stance.focal_agrees is False and not view.calibrated:
         return None, "contradicted"
-    ratio, angle, length = None, stance.azimuth_uncertainty_deg, stance.distance_uncertainty_mm
-    if view.calibrated and location.unrolled is None:
-        ratio, uncertainty = x_over_y(location.fit, view.matrix_px, FOCAL_ERROR)
-        ratio = ratio if uncertainty <= MOST_RATIO_ERROR else None
+    angle, length = stance.azimuth_uncertainty_deg, stance.distance_uncertainty_mm
     far = length > MOST_DISTANCE_ERROR * stance.distance_mm
     unconfirmed = 0.0 if stance.focal_agrees or view.calibrated else sheet_pose.UNCONFIRMED_DEG
     pose = CameraPose(
@@ -252,6 +248,5 @@ def camera_pose(view: PinholePhoto, location: LocatedSheet, surface: Surface) ->
         azimuth_deg=stance.azimuth_deg if angle <= np.hypot(MOST_AZIMUTH_ERROR_DEG, unconfirmed) else None,
         distance_mm=None if far else stance.distance_mm,
         distance_uncertainty_mm=None if far else length,
-        scale_x_over_y=ratio,
     )
     return pose, "calibrated" if view.calibrated else "confirmed" if stance.focal_agrees else "unchecked"

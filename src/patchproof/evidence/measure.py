@@ -197,7 +197,7 @@ def identify_sheet(srgb: np.ndarray, surface: Surface) -> tuple[MarkersInView, S
             raise PhotoRejected("mirrored", None, None, advice)
         label = read_page_code(srgb)
         if detected.foreign or (label is not None and label != surface.label):
-            which = "another sheet" if label is None else f"sheet {label.sheet_id} ({label.content})"
+            which = "another sheet" if label is None else "sheet {} ({})".format(*label.split(":")[1:])
             advice = f"this shows {which}: name that sheet's JSON, or leave the photo out"
             raise PhotoRejected("wrong_sheet", len(detected.foreign), 0, advice)
         raise PhotoRejected("too_few_markers", 0, 1, "no marker is readable: show the whole patch, sharp and well lit")

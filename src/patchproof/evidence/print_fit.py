@@ -5,21 +5,28 @@ colors and what each photograph makes of its light (`channel.print_colors`), or 
 or too alike to fit them. All photographs show one print: light and noise differ from photo to photo, ink does not.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from patchproof.base.color import LUMINANCE
 from patchproof.channel.print_colors import CellColors, ShownColors, added_terms, choose_cells, fit_ink_and_photos
 from patchproof.evidence.surface import PromisedColors
-from patchproof.photo.design_cells import cell_means
-from patchproof.photo.quality import FrameLight
+from patchproof.photo.detect import LINEAR_FLOAT32_FROM_CODE
+from patchproof.photo.quality import CLIPPED_CODE, FrameLight
+from patchproof.photo.rectify import least_px_per_mm, rectify, resize_by_area
+from patchproof.sheets.manifest import Rect
 
 LEAST_CELLS = 30  # of a photograph: three for each coefficient of a channel
 # Terms of cells that mix few colors have as few dimensions; of the sixth, the least share of the first's spread.
 _LEAST_COLORS, _LEAST_SPREAD = 6, 1e-3
 _ROUNDS = 3
+_CELLS = (16, 96)  # least and most along the design's shorter side
+_LEAST_CELL_PX = 2.0
+_PIXEL_BLUR_PX = 0.7  # of a pixel's own area and of interpolating between pixels
+_MOST_CLIPPED = 0.05  # of a cell's pixels
 _LEAST_LIGHT = 0.3  # promised of cells that tell the light of paper where there is none
 
 
@@ -50,7 +57,7 @@ def fit_print(
     read = choose_photo_cells(photos, promised)
     if read is None:
         return None
-    ink, terms = fit_ink_and_photos(read, _ROUNDS, shared_is_ink=True)
+    ink, terms = fit_ink_and_photos(read, _ROUNDS)
     return ink, [ShownColors.of_terms(t) for t in terms]
 
 
@@ -81,3 +88,28 @@ def _paper_of_cells(seen: np.ndarray, promised: np.ndarray, paper: np.ndarray) -
             rows = np.column_stack([np.ones(light.sum()), 1 - promised[light, channel], darkness[light]])
             found[channel] = np.linalg.lstsq(rows, seen[light, channel] / promised[light, channel], rcond=None)[0][0]
     return np.clip(found, paper / 1.5, 1.5 * paper)
+
+
+def design_cells(srgb: np.ndarray, px_from_mm: np.ndarray, rect_mm: Rect, blur_px: float) -> tuple[np.ndarray, float]:
+    """Read the light of the cells h×w×3 at `rect_mm` in an uint8 photograph, NaN where clipped; and the photograph's
+    blur in cells.
+    """
+    px_per_mm, side_mm = least_px_per_mm(px_from_mm, rect_mm), min(rect_mm[2:])
+    cells_per_mm = float(np.clip(side_mm * px_per_mm / max(_LEAST_CELL_PX, 2 * blur_px), *_CELLS)) / side_mm
+    cells = rectify(LINEAR_FLOAT32_FROM_CODE[srgb], px_from_mm, rect_mm, cells_per_mm).astype(float)
+    full = (srgb.max(-1, keepdims=True) >= CLIPPED_CODE).astype(np.float32)
+    clipped = rectify(full, px_from_mm, rect_mm, cells_per_mm).reshape(cells.shape[:2]) > _MOST_CLIPPED
+    blur_cells = float(np.hypot(blur_px, _PIXEL_BLUR_PX)) * cells_per_mm / px_per_mm
+    return np.where(clipped[..., None], np.nan, cells), blur_cells
+
+
+def cell_means(maps: Iterable[np.ndarray], shape: tuple[int, ...], blur_cells: float) -> np.ndarray:
+    """Blur maps H×W of the design and average them to h×w cells, h×w×N."""
+    height, width = shape[:2]
+    means = []
+    for fine in maps:  # one at a time: OpenCV averages four channels at most
+        fine = resize_by_area(np.ascontiguousarray(fine), (2 * width, 2 * height))
+        if blur_cells > 0.15:
+            fine = cv2.GaussianBlur(fine, (0, 0), 2 * blur_cells, borderType=cv2.BORDER_REPLICATE)
+        means.append(resize_by_area(fine, (width, height)))
+    return np.stack(means, -1).astype(float)

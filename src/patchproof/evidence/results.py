@@ -70,7 +70,6 @@ class CameraPose(StrictModel):
     azimuth_deg: Finite | None = None  # null where the uncertainty is too large to tell left from right
     distance_mm: Finite | None = None
     distance_uncertainty_mm: Finite | None = None
-    scale_x_over_y: Finite | None = None  # the print's proportions alone, from a calibrated camera
 
 
 class Scale(StrictModel):
@@ -109,7 +108,7 @@ _PARTS = {"geometry": Geometry, "pose": CameraPose, "scale": Scale, "color": Col
 # one photograph in report.json, in this order
 PHOTO_KEYS = """
     file status sha256 photo_px code figure threshold advice located markers_found residual_mm px_per_mm scale_x scale_y
-    scale_x_over_y tilt_deg tilt_uncertainty_deg azimuth_deg azimuth_uncertainty_deg distance_mm
+    tilt_deg tilt_uncertainty_deg azimuth_deg azimuth_uncertainty_deg distance_mm
     distance_uncertainty_mm focal contrast blur_px corner_uncertainty_mm bend_mm design_shift_mm
     curl_radius_mm delta_e00_mean delta_e00_p95 color_fit clipped_share glossy_share homography_px_from_mm box
     predictions""".split()

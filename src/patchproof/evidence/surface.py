@@ -15,7 +15,6 @@ from patchproof.base.color import linear_from_srgb
 from patchproof.base.errors import Refused
 from patchproof.base.geometry import apply_homography, rect_corners
 from patchproof.base.resample import downscale
-from patchproof.photo.page_code import PageCode, manifest_page_code
 from patchproof.sheets.manifest import Manifest, Rect
 from patchproof.sheets.markers import DICTIONARY, MARKER_MODULES
 from patchproof.sheets.piece import Piece, marker_image, marker_rect, square_marker
@@ -37,7 +36,7 @@ class Surface:
     corners_mm: dict[int, np.ndarray]
     piece_ids: frozenset[int]
     rect_mm: Rect
-    label: PageCode  # the content of the page's code
+    label: str  # the text of the page's code
     page_mm: tuple[float, float] | None  # None if the code is on another page than the design
     pages: "tuple[Surface, ...]" = ()  # of a piece in tiles: each uncut page, which carries no piece ids
     bent: bool = False  # True if the piece was made to follow a curved surface
@@ -132,7 +131,7 @@ def _surface(manifest: Manifest, corners, piece_ids, rect_mm, pages=()) -> Surfa
         corners_mm=corners,
         piece_ids=piece_ids,
         rect_mm=rect_mm,
-        label=manifest_page_code(manifest),
+        label=manifest.code,
         page_mm=None if manifest.tiles else manifest.page_mm,
         pages=pages,
         bent=(manifest.settings.get("patch") or {}).get("bend") is True,

@@ -144,9 +144,9 @@ def full_region(srgb: np.ndarray) -> ImageRegion:
     return slice(0, srgb.shape[0]), slice(0, srgb.shape[1])
 
 
-def pyramid_levels(srgb: np.ndarray, region: ImageRegion, coarsest_px: int = COARSEST_PX) -> Iterator[Level]:
+def pyramid_levels(srgb: np.ndarray, region: ImageRegion) -> Iterator[Level]:
     """Yield half sizes in linear light up to the full size, then the fallbacks for a region of the photograph."""
-    halvings = max(0, int(np.ceil(np.log2(max(srgb.shape[:2]) / coarsest_px))))
+    halvings = max(0, int(np.ceil(np.log2(max(srgb.shape[:2]) / COARSEST_PX))))
     reduced = [srgb]  # repeated halving differs from direct reduction by a code value, and takes less time in total
     for n in range(1, halvings + 1):
         even = not any(side % 2 for side in reduced[-1].shape[:2])
@@ -277,7 +277,7 @@ def _similar_ids(picture: np.ndarray, quads: np.ndarray, aruco) -> tuple[list[in
     that the detector tries, too; and ids that are resembled in a mirror.
     """
     size = aruco.markerSize
-    side, codes = size + 2, _codes(aruco.bytesList.tobytes(), size)
+    side, codes = size + 2, marker_codes(aruco.bytesList.tobytes(), size)
     cells = (np.indices((side, side))[::-1].reshape(2, -1).T + 0.5) / side - 0.5
     corners = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]], np.float32)
     is_border = np.abs(cells).max(1) > 0.5 - 1 / side
@@ -301,7 +301,7 @@ def _similar_ids(picture: np.ndarray, quads: np.ndarray, aruco) -> tuple[list[in
 
 
 @lru_cache(maxsize=4)
-def _codes(data: bytes, size: int) -> np.ndarray:
+def marker_codes(data: bytes, size: int) -> np.ndarray:
     """The inner cells of a dictionary's codes, 1 for paper and -1 for ink: size² × 4N."""
     every = np.frombuffer(data, np.uint8).reshape(-1, -(-size * size // 8), 4)
     bits = [cv2.aruco.Dictionary.getBitsFromByteList(code[None], size) for code in every]

@@ -25,6 +25,7 @@ from patchproof.base.resample import downscale, halving_pyramid, index_homograph
 from patchproof.photo.corners import DesignCorners
 from patchproof.photo.detect import is_plausible_quad
 from patchproof.photo.known_page import is_in_picture
+from patchproof.photo.rectify import homography_jacobian
 from patchproof.photo.rejection import PhotoRejected
 
 SEARCHED_PX = 1600  # longer side of the picture in which places are proposed
@@ -275,12 +276,9 @@ class _SmallDesign:
         self.freedom = float(power.sum() ** 2 / max((power**2).sum(), 1e-12))  # independent pixels, as it were
         half = np.array(self.size) / 2
         self.index_from_unit = np.array([[half[0], 0, half[0]], [0, half[1], half[1]], [0, 0, 1.0]])
-        u, v = (a[..., None] for a in np.meshgrid(*((np.arange(n) + 0.5) / n * 2 - 1 for n in self.size)))
-        by_v, by_u = np.gradient(colors, axis=(0, 1))
-        by_u, by_v = by_u * half[0], by_v * half[1]
-        along = u * by_u + v * by_v
-        terms = u * by_u, v * by_u, by_u, u * by_v, v * by_v, by_v, -u * along, -v * along
-        self.by_term = np.stack(terms, -1).reshape(-1, 6, 8).astype(np.float32)
+        units = np.stack(np.meshgrid(*((np.arange(n) + 0.5) / n * 2 - 1 for n in self.size)), -1).reshape(-1, 2)
+        by_unit = np.stack(np.gradient(colors, axis=(1, 0)), -1).reshape(-1, 6, 2) * half
+        self.by_term = (by_unit @ homography_jacobian(np.eye(3), units).reshape(-1, 2, 8)).astype(np.float32)
         self.colors = colors.reshape(-1, 6)
 
     def _less_surroundings(self, codes: np.ndarray) -> np.ndarray:
@@ -323,11 +321,7 @@ class _SmallDesign:
 
 def _corner_sigma(px_from_unit: np.ndarray, covariance: np.ndarray) -> float:
     """The standard deviation in px of a corner's coordinate, rms over the four."""
-    u, v = _UNIT.T
-    zero, one = np.zeros(4), np.ones(4)
-    by_x = np.stack([u, v, one, zero, zero, zero, -u * u, -u * v], 1)
-    by_y = np.stack([zero, zero, zero, u, v, one, -u * v, -v * v], 1)
-    by_corner = np.concatenate([by_x, by_y])
+    by_corner = homography_jacobian(np.eye(3), _UNIT)
     variance = float(np.mean(np.einsum("ij,jk,ik->i", by_corner, covariance, by_corner)))
     unit_px = float(np.sqrt(abs(np.linalg.det(px_from_unit[:2, :2] / px_from_unit[2, 2]))))
     return max(0.05, unit_px * np.sqrt(max(variance, 0.0)))

@@ -21,9 +21,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from patchproof.base.geometry import plane_pose, scaling_about, view_angles
-from patchproof.photo.print_ratio import cosine, gradient, log_ratio
 from patchproof.photo.rectify import PageFit, root_of, root_of_scaled
-from patchproof.photo.shapes import Project, Shape
+from patchproof.photo.unroll import Project, Shape
 
 # one σ of errors that are no noise of corners: of |r1| = |r2|, printers' errors of proportion; of both equations, of
 # angles in radians and of lengths, paper that is not quite flat or round, and lenses
@@ -196,14 +195,17 @@ def _disagreement(fit: PageFit, matrix_px: np.ndarray) -> tuple[np.ndarray, np.n
     """
     entries = fit.px_from_mm.ravel()[:8]
 
-    def residuals(log_scale: float) -> np.ndarray:
-        inverse = np.linalg.inv(_scale_focal(matrix_px, log_scale))
-        return np.array([cosine(entries, inverse), log_ratio(entries, inverse)])
+    def errors(entries: np.ndarray, log_scale: float = 0.0) -> np.ndarray:
+        axes = (np.linalg.inv(_scale_focal(matrix_px, log_scale)) @ np.append(entries, 1.0).reshape(3, 3))[:, :2]
+        (x, y), lengths = axes.T, np.linalg.norm(axes, axis=0)
+        return np.array([x @ y / np.linalg.norm(x) / np.linalg.norm(y), np.log(lengths[0] / lengths[1])])
 
-    inverse = np.linalg.inv(matrix_px)
-    by_entries = np.stack([gradient(f, entries, inverse) for f in (cosine, log_ratio)])
+    # central differences, with steps in proportion to entries of different orders of magnitude
+    steps = 1e-6 * np.maximum(np.abs(entries), np.abs(entries).max() * 1e-6)
+    rows = [errors(entries + step) - errors(entries - step) for step in np.diag(steps)]
+    by_entries = np.array(rows).T / (2 * steps)
     covariance = by_entries @ fit.covariance @ by_entries.T
-    return residuals(0.0), covariance, (residuals(0.01) - residuals(-0.01)) / 0.02
+    return errors(entries), covariance, (errors(entries, 0.01) - errors(entries, -0.01)) / 0.02
 
 
 def _tilt_deg(stretch: np.ndarray) -> np.ndarray:

@@ -80,7 +80,7 @@ def fit_points(mm: np.ndarray, px: np.ndarray, sigma_px: np.ndarray, start: np.n
         homography = _gauss_newton(homography, mm, px, root, 3)
     residual = px - apply_homography(homography, mm)
     spread = float(np.sqrt(np.sum((residual.ravel() * root) ** 2) / max(2 * len(mm) - 8, 1)))
-    covariance = covariance_of(_jacobian(homography, mm) * root[:, None], max(1.0, spread))
+    covariance = covariance_of(homography_jacobian(homography, mm) * root[:, None], max(1.0, spread))
     # a corner that was named wrongly says nothing of the paper, a vague point little
     share = np.where(weight == weight.max(), 1 / sigma_px, 0.0)
     residual = residual * (share / np.sqrt(np.mean(share**2)))[:, None]
@@ -97,7 +97,7 @@ def common_corners(corners_px: Quads, corners_mm: Quads) -> tuple[tuple[int, ...
 def corner_uncertainty_mm(fit: PageFit, rect_mm) -> float:
     """The 95 % point of the largest error among the rectangle's corners, in page mm, by the fit's covariance."""
     corners = rect_corners(rect_mm)
-    jacobian = _jacobian(fit.px_from_mm, corners)
+    jacobian = homography_jacobian(fit.px_from_mm, corners)
     return largest_shift_mm(root_of(fit.covariance), jacobian.T, _mm_by_px(fit.px_from_mm, corners))
 
 
@@ -207,7 +207,7 @@ def _gauss_newton(homography, mm, px, root: np.ndarray | float = 1.0, steps: int
     root = np.broadcast_to(root, 2 * len(mm))
     for _ in range(steps):
         residual = (px - apply_homography(homography, mm)).ravel()
-        jacobian = _jacobian(homography, mm)
+        jacobian = homography_jacobian(homography, mm)
         scale = np.linalg.norm(jacobian, axis=0)
         step = np.linalg.lstsq(jacobian / scale * root[:, None], residual * root, rcond=None)[0] / scale
         homography = homography + np.append(step, 0).reshape(3, 3)
@@ -216,8 +216,8 @@ def _gauss_newton(homography, mm, px, root: np.ndarray | float = 1.0, steps: int
     return normalize_homography(homography)
 
 
-def _jacobian(homography, mm) -> np.ndarray:
-    """Derivatives 2N×8 of pixels by the first eight entries of a homography whose last is 1."""
+def homography_jacobian(homography, mm) -> np.ndarray:
+    """Derivatives 2N×8 of pixels (x, y of each point) by the first eight entries of a homography whose last is 1."""
     ones = np.column_stack([mm, np.ones(len(mm))])
     u, v, w = (ones @ homography.T).T
     zeros = np.zeros_like(ones)
@@ -241,7 +241,7 @@ def _page_fit(homography, mm, px, inlier, ids) -> PageFit:
     by_marker = inlier.reshape(-1, 4)
     if freedom > 0:
         noise, bend = noise_and_bend(residual, residuals.reshape(-1, 4, 2)[by_marker.all(1)], freedom)
-    covariance = covariance_of(_jacobian(homography, mm[inlier]), noise)
+    covariance = covariance_of(homography_jacobian(homography, mm[inlier]), noise)
     length = rms_length_mm(_mm_by_px(homography, mm[inlier]), residual)
     outlier = by_marker.sum(1) < _LEAST_CORNERS
     outlier_mm = [

@@ -50,7 +50,8 @@ def register(
     light = rectify(luminance(part)[..., None], to_part, rect_mm, scale)
     height, width = light.shape[:2]
     light = light.reshape(height, width)
-    printed = _blur(design @ np.array(LUMINANCE, np.float32), blur_px / px_per_mm * design.shape[1] / w)
+    printed, sigma_px = design @ np.array(LUMINANCE, np.float32), float(blur_px / px_per_mm * design.shape[1] / w)
+    printed = cv2.GaussianBlur(printed, (0, 0), sigma_px) if sigma_px > 0.3 else printed
     printed = resize_by_area(printed, (width, height))
     size = max(8, round(min(width, height) / _CELLS))
     search = max(3, round(_SEARCH_SHARE * size))
@@ -66,10 +67,6 @@ def register(
             rows.append([left + size / 2, top + size / 2, dx - search, dy - search, sigma])
     table = np.array(rows).reshape(-1, 5) / scale
     return Registration(table[:, :2] + [x, y], table[:, 2:4], table[:, 4], size / scale)
-
-
-def _blur(image: np.ndarray, sigma_px: float) -> np.ndarray:
-    return cv2.GaussianBlur(image, (0, 0), float(sigma_px)) if sigma_px > 0.3 else image
 
 
 def _cell_starts(length: int, size: int) -> np.ndarray:

@@ -8,10 +8,7 @@ from patchproof.base.text import printable
 
 # what each code says of a photograph, and what helps; printed for users by `patchproof keys --codes`
 REJECTION_CODES = {
-    "unreadable": (
-        "no picture, damaged, or of a color space that is not read",
-        "save it as JPEG or PNG",
-    ),
+    "unreadable": ("no picture, damaged, or of a color space that is not read", "save it as JPEG or PNG"),
     "too_costly": ("the picture is larger than limits of size and time allow", "save it smaller"),
     "empty": ("the picture holds no pixels, or one color", "take it again"),
     "too_few_markers": ("too little of the piece can be read to know where it lies", "show all of it, sharp and lit"),
@@ -28,10 +25,7 @@ REJECTION_CODES = {
     "wrong_sheet": ("markers or QR code are those of another sheet", "name that sheet's JSON"),
     "several_sheets": ("more than one print is in view", "photograph one at a time"),
     "mirrored": ("the picture is mirrored", "switch the camera's mirror setting off"),
-    "curled": (
-        "paper or design lie neither in a plane nor on rolled paper",
-        "press it flat, glue it down",
-    ),
+    "curled": ("paper or design lie neither in a plane nor on rolled paper", "press it flat, glue it down"),
     "cropped": ("a crop that was not told moved the picture's middle", "use the photograph as the camera wrote it"),
     "copy": ("another file shows the same photograph", "leave one of them"),
     "other_design": ("what is printed between the markers is not this design", "name the sheet that was printed"),

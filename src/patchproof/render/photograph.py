@@ -79,7 +79,7 @@ def expose(views: Views, appearance: Appearance, jpeg: bool = True) -> Tensor:
         light = shade(views, appearance)
         if camera is not None:
             light = camera.distort_pictures(light, views.size_px)
-        return develop(light, sensor, scale, jpeg, camera)
+        return develop(light, sensor, scale, jpeg)
     image = views.bare_exposed
     if appearance is not None:
         # if each pixel is developed alone, only the piece's pixels differ from the bare object's photograph

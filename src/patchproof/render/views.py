@@ -22,8 +22,8 @@ from torch import Tensor
 from patchproof.base.color import LINEAR_FROM_CODE, lift_tone
 from patchproof.base.geometry import camera_centers
 from patchproof.channel.camera import encode_light, encode_light_by_table, gains
+from patchproof.channel.cameras import Frame
 from patchproof.channel.light import Lighting, irradiance, lighting_of
-from patchproof.channel.render_frame import Frame
 from patchproof.render import pixels
 from patchproof.render.fragments import Cameras
 from patchproof.render.outlines import Outlines, find_outlines
@@ -110,23 +110,22 @@ class Views:
     @cached_property
     def bare_exposed(self) -> Tensor:
         """The bare object, its outlines jagged, in a camera without blur and noise, N·H·W × 3 sRGB."""
-        camera = self.stage.camera
         # the background has 256 codes per view and channel, which are exposed as a table
         gain, tone = self._sensor_values.double().split([3, 1], 1)
         light = torch.tensor(LINEAR_FROM_CODE)[:, None] * gain[:, None]
-        codes = lift_tone(encode_light(light, camera), tone[:, None])
+        codes = lift_tone(encode_light(light), tone[:, None])
         image = _look_up_codes(self.background, codes.numpy(), self.stage.device)
         if self.object is None:
             return image
         view = self.object.view
         gain, tone = self._sensor_on_device.index_select(0, view).split([3, 1], 1)
-        color = encode_light_by_table(self._object_color() * gain, camera)
+        color = encode_light_by_table(self._object_color() * gain)
         return image.index_copy_(0, self.object.pixel, lift_tone(color, tone))
 
     def encode(self, light: Tensor, view: Tensor) -> Tensor:
         """Return the code values P×3 of light at pixels of the views P, in a camera without blur and noise."""
         gain, tone = self._sensor_on_device.index_select(0, view).split([3, 1], 1)
-        return lift_tone(encode_light(light * gain, self.stage.camera), tone)
+        return lift_tone(encode_light(light * gain), tone)
 
     @cached_property
     def _sensor_values(self) -> Tensor:

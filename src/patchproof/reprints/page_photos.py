@@ -22,8 +22,7 @@ from patchproof.base.resample import index_homography
 from patchproof.base.settings import PrinterSettings
 from patchproof.channel.camera import develop
 from patchproof.channel.effects import Sensor
-from patchproof.channel.lens import Camera
-from patchproof.channel.printer import load_printer
+from patchproof.channel.printer import load_printer, printer_output
 from patchproof.photo.read import Photo
 from patchproof.reprints.mounted_sheet import ReprintSetup
 from patchproof.sheets.blank import BLANK
@@ -65,11 +64,6 @@ def reprint_pages(
     piece is photographed, since the rest is cut off: its markers would stand beside the later print's.
     """
     printer = load_printer(how.printer or PrinterSettings().profile)
-
-    def apply_printer(colors: np.ndarray) -> np.ndarray:
-        sent = torch.tensor(colors.T[None, :, :, None], dtype=torch.float32)
-        return linear_from_srgb(printer.apply(sent)[0, :, :, 0].T.numpy())
-
     with new_folder(out, ("photo_*.jpg",), overwrite, (pdf,)) as folder:
         pages, manifest = [], attached_manifests(pdf)[0]
         for number in range(page_count(pdf)):
@@ -77,14 +71,14 @@ def reprint_pages(
             if manifest.kind == BLANK:
                 x, y, width, height = (round(PX_PER_MM * side) for side in manifest.cut_mm)
                 pixels = pixels[y : y + height, x : x + width]
-            light = page_light(pixels, apply_printer)
+            light = page_light(pixels, lambda colors: linear_from_srgb(printer_output(printer, colors)))
             pages.append(cv2.resize(light, None, fx=how.print_scale[0], fy=how.print_scale[1]))
         for i in range(n):
             shot = photograph_page(pages[i % len(pages)], (seed or 0) + i)
             (folder / f"photo_{i + 1:04d}.jpg").write_bytes(shot.file)
 
 
-def photograph_page(page: np.ndarray, seed: int, camera: Camera | None = None) -> Shot:
+def photograph_page(page: np.ndarray, seed: int) -> Shot:
     """Photograph a page that lies flat, from above within 25° to each side; the seed determines all conditions."""
     rng = np.random.default_rng([seed, 4])
     page_mm = np.array(page.shape[1::-1]) / PX_PER_MM
@@ -102,7 +96,7 @@ def photograph_page(page: np.ndarray, seed: int, camera: Camera | None = None) -
     exposure_ev, noise_seed = np.array([np.log2(exposure)]), np.array([seed])
     sensor = Sensor(exposure_ev=exposure_ev, white_balance=white_balance[None], noise_seed=noise_seed, **drawn)
     picture = torch.tensor(raw.transpose(2, 0, 1)[None], dtype=torch.float32)
-    codes = develop(picture, sensor, 1.0, jpeg=False, camera=camera)[0].permute(1, 2, 0).numpy().astype(float)
+    codes = develop(picture, sensor, 1.0, jpeg=False)[0].permute(1, 2, 0).numpy().astype(float)
     file = image_bytes(photo_codes_from_srgb(codes), "JPEG", {"quality": int(sensor.jpeg[0])})
     return Shot(file, exposure * white_balance)
 

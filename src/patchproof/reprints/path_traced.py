@@ -24,9 +24,9 @@ from patchproof.base import geometry
 from patchproof.base.color import LINEAR_FROM_CODE, linear_from_srgb
 from patchproof.base.errors import Refused
 from patchproof.channel.camera import develop
+from patchproof.channel.cameras import Frame
 from patchproof.channel.effects import Light
 from patchproof.channel.printer import print_change, vary_print
-from patchproof.channel.render_frame import Frame
 from patchproof.mesh.mesh import Mesh
 from patchproof.render.photograph import PAPER_BACK_LINEAR
 from patchproof.render.pixels import PiecePicture
@@ -72,7 +72,7 @@ def photograph_traced(
     light = traced_light(stage, piece, conditions, draw_optics(conditions) if optics is None else optics)
     if stage.camera is not None:
         light = stage.camera.distort_pictures(light, stage.scene.settings.camera.photo_px)
-    return develop(light, conditions.sensor, 1.0, jpeg=False, camera=stage.camera)
+    return develop(light, conditions.sensor, 1.0, jpeg=False)
 
 
 def traced_light(stage: Stage, piece: PiecePicture | None, conditions: Conditions, optics: Optics) -> Tensor:

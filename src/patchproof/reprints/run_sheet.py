@@ -24,7 +24,7 @@ from patchproof.sheets.piece import control_design, with_ids
 from patchproof.sheets.plan_page import PlacementPicture, PlanPage, edge_distances_mm
 from patchproof.sheets.rects import size_text
 from patchproof.sheets.template import Template, load_template, page_template
-from patchproof.sheets.write import write_sheet
+from patchproof.sheets.write import write_several, write_sheet
 
 
 def sheet(
@@ -42,7 +42,7 @@ def sheet(
         run: a run with a printed piece.
         pdf_path: SHEET.pdf; the manifest is SHEET.json, and all there is of a print without a page.
         template: a template's name or file, in place of the scene's.
-        control: print this in place of the design: "mean", "gray", "noise", "shuffled" or "blank".
+        control: print this in place of the design: "mean", "gray", "noise" or "blank".
         copies: pages with the same content, for label rolls.
         overwrite: replace an earlier page and manifest.
 
@@ -65,8 +65,6 @@ def sheet_of_several(
     """Write one page with the designs of several runs, and a manifest for each; on the first run's template unless
     another is named.
     """
-    from patchproof.sheets.multi_design import write_several
-
     name = template or runs[0].scene.settings.sheet.template
     page, contents = load_template(name), [content_of(run, name, control, Path(pdf_path).parent) for run in runs]
     plans = [plan_of(scene, page, content) for content, scene in contents] if page.plan_page else []

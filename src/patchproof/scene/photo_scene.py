@@ -28,6 +28,7 @@ from patchproof.base.validation import expand_path
 from patchproof.photo.detect import find_markers
 from patchproof.photo.known_page import complete_markers
 from patchproof.photo.limits import run_limited
+from patchproof.photo.paper_light import PaperLight, paper_light
 from patchproof.photo.quality import blur_px
 from patchproof.photo.read import SUFFIXES, read_photo, summarize_said
 from patchproof.photo.rectify import PageFit, corner_uncertainty_mm, fit_page
@@ -35,13 +36,12 @@ from patchproof.photo.rejection import PhotoRejected
 from patchproof.scene import picture_scene
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.interface import SceneSource, SceneTerm
-from patchproof.scene.paper_light import PaperLight, paper_light
 from patchproof.scene.picture_scene import BasePicture, PictureScene
 from patchproof.sheets.blank import blank_piece
 from patchproof.sheets.manifest import Manifest, load_manifest
 from patchproof.sheets.markers import DICTIONARY
 from patchproof.sheets.page import refuse_larger_than_page
-from patchproof.sheets.piece import Piece, with_ids
+from patchproof.sheets.piece import Piece, marker_rect, with_ids
 from patchproof.sheets.template import page_template
 
 MIN_PHOTOS = 6
@@ -176,7 +176,8 @@ def measure_photo(path: Path, manifest: Manifest, piece: Piece, photo_px: tuple[
     blur = float(np.sqrt((blur * scale) ** 2 + max(0.0, scale**2 - 1) / 4))
     height, width = picture.srgb.shape[:2]
     picture_from_photo = np.linalg.inv(picture_scene.photo_from((width, height), photo_px))
-    light = paper_light(picture.srgb, picture_from_photo @ photo_from_piece, piece, blur)
+    area, printed = (0.0, 0.0, *piece.size_mm), map(marker_rect, piece.markers)
+    light = paper_light(picture.srgb, picture_from_photo @ photo_from_piece, area, printed, blur)
     return BasePhoto(path.name, picture, photo_from_piece, light, blur, photo.said)
 
 

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from patchproof.base.errors import Refused
 from patchproof.base.output import image_bytes
 from patchproof.sheets.layout import CAP_HEIGHT, Box, Line, PageLayout, PageParts, text_width_mm
 from patchproof.sheets.manifest import Design, Manifest, Promise, Swatch, design_sha256
@@ -23,14 +22,15 @@ from patchproof.sheets.template import AnyTemplate, Template, TextLine
 
 SIZE_MM = 0.95  # font size
 _CAPS_MM = SIZE_MM * CAP_HEIGHT
+_ABOVE_MM = (SCISSORS_MM - _CAPS_MM) / 2  # capitals, and below them
 _INSET_MM = 0.4  # from the sides of the white: ten of the widest letters still fit beside an 8 mm marker
 _ARROW_MM = 0.9  # width of the arrow and the space after it
 
 
 @dataclass(frozen=True, eq=False)
 class SheetContent:
-    """A piece and its design. `design_srgb8` is uint8 H×W×3, or None for white paper; other arrays are refused, and
-    pixels that belong to the markers become white. `kind` is "design", or the name of a control.
+    """A piece and its design. `design_srgb8` is uint8 H×W×3, or None for white paper; pixels that belong to the
+    markers become white. `kind` is "design", or the name of a control.
     """
 
     piece: Piece
@@ -42,12 +42,8 @@ class SheetContent:
     bent: bool = False  # it is wrapped around the object
 
     def __post_init__(self):
-        pixels = self.design_srgb8
-        if pixels is None:
-            return
-        if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] != 3 or not pixels.size:
-            raise Refused("a design of uint8 H×W×3 pixels", f"{pixels.dtype} {pixels.shape}", "convert it to 8-bit RGB")
-        object.__setattr__(self, "design_srgb8", whiten_marker_pixels(pixels, self.piece))
+        if self.design_srgb8 is not None:
+            object.__setattr__(self, "design_srgb8", whiten_marker_pixels(self.design_srgb8, self.piece))
 
     @property
     def code(self) -> str:
@@ -121,19 +117,15 @@ def piece_words(content: SheetContent, corner: PointMm, holder: str = "piece") -
     for rect, text in ((top_left, "TOP"), (top_right, content.sheet_id), (bottom_left, content.name.upper())):
         arrow_mm = _ARROW_MM if rect is top_left else 0
         text = _shorten(text, rect[2] - 2 * _INSET_MM - arrow_mm)
-        left, top = corner[0] + rect[0] + _INSET_MM, corner[1] + _text_top(rect)
+        # in the middle of the outer millimeter of the white at the cut line
+        y = _ABOVE_MM if rect[1] < SCISSORS_MM else rect[1] + rect[3] - _ABOVE_MM - _CAPS_MM
+        left, top = corner[0] + rect[0] + _INSET_MM, corner[1] + y
         if arrow_mm:
             lines += _arrow(left, top)
         start, width = left + arrow_mm, text_width_mm(text, SIZE_MM, True)
         texts.append(TextLine(at_mm=(start, top + _CAPS_MM), size_mm=SIZE_MM, text=text, bold=True, gray=0.2))
         boxes.append(Box(f'words "{text}" of {holder}', (left, top, start + width - left, _CAPS_MM), holder))
     return PageParts(tuple(lines), tuple(texts), tuple(boxes))
-
-
-def _text_top(rect: RectMm) -> float:
-    """The top of capitals in the middle of the outer millimeter of the white at the cut line."""
-    inset = (SCISSORS_MM - _CAPS_MM) / 2
-    return inset if rect[1] < SCISSORS_MM else rect[1] + rect[3] - inset - _CAPS_MM
 
 
 def _arrow(left: float, top: float) -> list[Line]:

@@ -240,7 +240,7 @@ class Manifest(StrictModel):
 
     version: Literal[2]
     sheet_id: Annotated[str, Field(pattern="^[0-9A-Z]{10}$")]
-    kind: str  # "design", or a control: "mean", "gray", "noise", "shuffled", "blank"
+    kind: str  # "design", or a control: "mean", "gray", "noise", "blank"
     page_mm: tuple[SizeMm, SizeMm]
     design: Design | None
     markers: tuple[Marker, ...]  # none with sheet.markers = false
@@ -272,6 +272,14 @@ class Manifest(StrictModel):
                 "make the sheet again: it has no markers, and sheet.markers = false is not in its settings"
             )
         return self
+
+    @property
+    def code(self) -> str:
+        """The text of the page's QR code: the sheet's id, and 16 digits of the design's SHA-256, or the kind without
+        one. A page of several designs has an id of its own, and digits of a hash over theirs.
+        """
+        content = self.design.sha256[:16] if self.design else self.kind
+        return self.page_code or f"patchproof:{self.sheet_id}:{content}"
 
     def page_from_design_page(self, page: int) -> np.ndarray:
         """Map 3×3 from millimeters of the design's page (without a design: the first tile's) to those of another

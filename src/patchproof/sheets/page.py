@@ -1,8 +1,8 @@
 """Lay out one page: pieces, chart, rulers, QR code, page markers and texts, without overlaps.
 
 In: a template and pieces. Out: a `PageLayout`, which `pdf` draws and `write` states in the manifest.
-The chart's colors are the 8 corners of the RGB cube, an 8-step gray ramp (6 between black and white), 6 duplicates for
-estimating measurement noise, and a low-discrepancy sample of the cube, all multiples of 1/255, so that every printer
+The chart's colors are the 8 corners of the RGB cube, an 8-step gray ramp (6 between black and white), 6 duplicates,
+whose readings are averaged, and a low-discrepancy sample of the cube, all multiples of 1/255, so that every printer
 driver gets the same numbers. Their places are shuffled in a fixed order, so that a gradient of light across the page is
 not mistaken for a color. Left out on purpose: automatic arrangement. The template places everything; only pieces are
 centered in their zone.
@@ -35,7 +35,7 @@ _BITS = 32  # of the integers in Sobol's sequence
 MIN_PRINT_MM, MAX_PRINT_MM = 5.0, 20_000.0  # of prints without a page: a sticker, a wall
 CUT_LINE_MM = 0.2  # drawn outside the cut, so that no ink of it stays on the piece
 PIECE_GAP_MM = 4.0  # of white paper between pieces, for scissors
-MAX_TILES = 30  # with 5 markers each, beside the piece's and the page's, out of the 166 ids of a kind
+MAX_TILES = 30  # with 5 markers each, beside the piece's and the page's, out of a kind's ids
 QR_QUIET_MODULES = 4  # white on each side of a QR code (ISO/IEC 18004)
 
 
@@ -85,10 +85,8 @@ def piece_zone_mm(template: Template) -> RectMm:
 
 
 def largest_piece_mm(template: Template) -> tuple[float, float]:
-    """The largest width and height of a piece on this template."""
+    """The largest width and height of a piece on one page of this template."""
     _, _, w, h = piece_zone_mm(template)
-    if template.tiles is not None:  # the largest number of tiles in one row or column; `tiles` counts exactly
-        _, _, w, h = (MAX_TILES * side for side in template.tiles.zone_mm)
     return w - 2 * CUT_LINE_MM, h - 2 * CUT_LINE_MM
 
 
@@ -153,7 +151,6 @@ def add_template_parts(template: AnyTemplate, page: PageLayout, qr_text: str, wo
 
 def qr_rects_mm(text: str, corner_mm: PointMm, size_mm: float) -> tuple[RectMm, ...]:
     """The dark runs, from the top down, of a QR code with error correction M in a square of `size_mm`."""
-    import numpy as np
     import segno
 
     dark = np.array([list(row) for row in segno.make_qr(text, error="m").matrix], bool)

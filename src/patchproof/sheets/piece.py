@@ -28,13 +28,14 @@ from patchproof.sheets.manifest import Marker
 from patchproof.sheets.markers import DICTIONARY, MARKER_MODULES, marker_cells
 from patchproof.sheets.rects import PointMm, RectMm, grow_rect
 
-SHEET_KINDS = ("design", "mean", "gray", "noise", "shuffled", "blank")
+SHEET_KINDS = ("design", "mean", "gray", "noise", "blank")
+IDS_PER_KIND = 166  # markers of one kind of a sheet, of the dictionary's thousand
 SCISSORS_MM = 1.0  # distance from a quiet zone to the cut line
 SMALLEST_MARKER_MM = 8.0
 MAX_CORNER_SHARE = 0.29  # of the shorter side, for a marker with its white: four leave 2/3 of a square to the design
 MAX_GAP = 12.0  # between two markers of a long side, in markers; on bent paper a side has one in its middle
 MIN_STRIP_MM = 2.0  # of design between a quiet zone and the cut line; narrower strips are white, too
-CELLS = 16  # of the noise and shuffled controls, along the shorter side
+CELLS = 16  # of the noise control, along the shorter side
 
 
 @dataclass(frozen=True)
@@ -78,10 +79,9 @@ def page_id(template: StrictModel) -> str:
 
 def marker_ids(sheet_id: str, kind: str, count: int) -> list[int]:
     """The first `count` marker ids of one kind of sheet; the kinds of one sheet id have no ids in common."""
-    block = 1000 // len(SHEET_KINDS)
-    if count > block:
-        raise Refused(f"at most {block} markers on one sheet", f"{count}", "use larger or fewer tiles")
-    start = SHEET_KINDS.index(_check_kind(kind)) * block
+    if count > IDS_PER_KIND:
+        raise Refused(f"at most {IDS_PER_KIND} markers on one sheet", f"{count}", "use larger or fewer tiles")
+    start = SHEET_KINDS.index(_check_kind(kind)) * IDS_PER_KIND
     return list(hash_order(sheet_id, 1000)[start : start + count])
 
 
@@ -170,7 +170,7 @@ def manifest_marker(marker: PieceMarker, page: int = 1) -> Marker:
     return Marker(dictionary=DICTIONARY, id=marker.id, corners_mm=marker.corners_mm, page=page)
 
 
-def marker_rect(marker: PieceMarker) -> RectMm:
+def marker_rect(marker: PieceMarker | Marker) -> RectMm:
     """The marker's black square."""
     (x, y), (x1, _) = marker.corners_mm[:2]
     return x, y, x1 - x, x1 - x
@@ -179,7 +179,7 @@ def marker_rect(marker: PieceMarker) -> RectMm:
 def marker_rects_mm(marker: PieceMarker) -> list[RectMm]:
     """The marker's black area as rectangles that touch but do not overlap: one for each run of black modules."""
     x, y, side, _ = marker_rect(marker)
-    return black_runs(_marker_modules(marker.id), (x, y), side / MARKER_MODULES)
+    return black_runs(marker_cells(DICTIONARY, [marker.id])[0] == 0, (x, y), side / MARKER_MODULES)
 
 
 def black_runs(dark: np.ndarray, corner_mm: PointMm, module_mm: float) -> list[RectMm]:
@@ -223,8 +223,7 @@ def control_design(kind: str, design: np.ndarray, sheet_id: str, piece: Piece | 
     markers are white.
 
     "mean": its mean color, averaged in light; "gray": sRGB 128; "noise": random cells, 16 along the shorter side;
-    "shuffled": the design's 16 × 16 cells in another order (cells with a marker's pixel stay, as do pixels beyond the
-    last whole cell at the right and bottom); "blank": white paper; "design": the design.
+    "blank": white paper; "design": the design.
     """
     height, width = design.shape[:2]
     free = np.ones((height, width), bool) if piece is None else ~marker_image(piece, (width, height))[1]
@@ -233,8 +232,6 @@ def control_design(kind: str, design: np.ndarray, sheet_id: str, piece: Piece | 
         control = np.broadcast_to(codes_from_srgb(srgb_from_linear(mean)), design.shape)
     elif kind == "noise":
         control = _noise_cells(height, width, sheet_id)
-    elif kind == "shuffled":
-        control = _shuffle_cells(design, free, sheet_id)
     else:
         control = design if kind == "design" else np.full_like(design, 128 if kind == "gray" else 255)
     return np.where(free[..., None], control, np.uint8(255))
@@ -254,27 +251,6 @@ def _noise_cells(height: int, width: int, sheet_id: str) -> np.ndarray:
     cells = np.frombuffer(data, np.uint8).reshape(rows, columns, 3)
     y, x = (np.arange(height) / cell).astype(int), (np.arange(width) / cell).astype(int)
     return cells[y[:, None], x]
-
-
-def _shuffle_cells(design: np.ndarray, free: np.ndarray, sheet_id: str) -> np.ndarray:
-    height, width = design.shape[:2]
-    rows, columns = min(CELLS, height), min(CELLS, width)
-    h, w = height // rows, width // columns
-
-    def cells(image: np.ndarray) -> np.ndarray:
-        """A view of the image as rows × columns × h × w (× 3)."""
-        return image[: rows * h, : columns * w].reshape(rows, h, columns, w, *image.shape[2:]).swapaxes(1, 2)
-
-    result, moving = design.copy(), np.argwhere(cells(free).all((2, 3)))
-    order = moving[list(hash_order(f"{sheet_id}:shuffled", len(moving)))]
-    cells(result)[tuple(moving.T)] = cells(design)[tuple(order.T)]
-    return result
-
-
-@lru_cache(maxsize=256)
-def _marker_modules(id_: int) -> np.ndarray:
-    """The marker's modules 7×7, True for black."""
-    return marker_cells(DICTIONARY, [id_])[0] == 0
 
 
 def _add_coverage(coverage: np.ndarray, box: tuple[float, float, float, float]) -> None:

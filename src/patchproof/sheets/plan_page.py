@@ -6,6 +6,7 @@ its surface. The picture is passed in; this module draws on paper only.
 """
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -129,11 +130,9 @@ def _edge_chains(placement: PlacementPicture) -> tuple[tuple[DimensionSpan, ...]
     (xs, ys), (x, y, w, h) = zip(*placement.outline_mm, strict=True), placement.object_mm
     across, down = (x, min(xs), max(xs), x + w), (y, min(ys), max(ys), y + h)
     names = ("from left edge", "piece", "from right edge"), ("from top", "piece", "from bottom")
-    return _spans(across, names[0]), _spans(down, names[1])
-
-
-def _spans(stops: tuple[float, ...], names: tuple[str, ...]) -> tuple[DimensionSpan, ...]:
-    return tuple(DimensionSpan((a, b), b - a, name) for a, b, name in zip(stops, stops[1:], names, strict=False))
+    chains = (zip(pairwise(stops), each, strict=True) for stops, each in zip((across, down), names, strict=True))
+    first, second = (tuple(DimensionSpan((a, b), b - a, name) for (a, b), name in chain) for chain in chains)
+    return first, second
 
 
 def _chain_above(spans: tuple[DimensionSpan, ...], to_page, rect: RectMm) -> tuple[list[Line], list[TextLine]]:

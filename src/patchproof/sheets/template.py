@@ -13,7 +13,7 @@ from pydantic import Field
 
 from patchproof.base import validation
 from patchproof.base.errors import Refused
-from patchproof.base.packaged import packaged_path
+from patchproof.base.packaged import named_path, packaged_path
 from patchproof.base.settings import NO_PAGE
 from patchproof.base.validation import Finite, NotNegative, Positive, Share, StrictModel
 
@@ -143,13 +143,7 @@ def page_template(name_or_file: str | Path) -> Template | None:
 
 def template_data(name_or_file: str | Path) -> tuple[Path, dict[str, Any]]:
     """A template's path and its unchecked data, whose tables tell the kind of page."""
-    path = Path(name_or_file)
-    if path.suffix != ".toml":
-        names = template_names()
-        if str(path) not in names:
-            do = validation.spelling_hint(str(path), names)
-            raise Refused("a print template's name or a .toml file", f'"{path}"', do)
-        path = packaged_path("print_templates", f"{path}.toml")
+    path = named_path(name_or_file, None, "a print template", packaged_path("print_templates"), (".toml",))
     return path, validation.read_toml(path)
 
 

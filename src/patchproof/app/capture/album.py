@@ -21,7 +21,7 @@ from patchproof.evidence.journal import JOURNAL_FILE
 from patchproof.photo.read import list_images
 
 CONTROLS_FOLDER = "controls"
-CONTROLS = ("bare", "mean", "gray", "noise", "shuffled", "blank")
+CONTROLS = ("bare", "mean", "gray", "noise", "blank")
 MOST_BYTES = 40_000_000  # phones' largest JPEGs, of 108 and 200 megapixels, have some 30
 MOST_PHOTOS = 1000
 _OWN = ("session_*", CONTROLS_FOLDER, JOURNAL_FILE, CORNERS_FILE)

@@ -1,5 +1,6 @@
 """The verbs of `calibrate`: printer, camera."""
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -19,8 +20,6 @@ def printer(
     intent: Annotated[
         Literal["relative", "perceptual"], Option(help="The profile's intent that the driver is set to.")
     ] = "relative",
-    licence: Annotated[str, Option(help="Of the profile, for the record.")] = "unknown",
-    source: Annotated[str, Option(help="Where the profile is from, for the record.")] = "unknown",
     design: Annotated[
         bool, Option("--design", help="They show a print of known pixels, that of --sheet; else a printed chart.")
     ] = False,
@@ -30,42 +29,60 @@ def printer(
         Literal["office", "coated", "uncoated"] | None, Option(help="For colors that the design lacks; else the best.")
     ] = None,
     sheet: Annotated[Path | None, Option(help="The manifest of the chart's page, or of the design.")] = None,
-    camera: Annotated[str | None, Option(help="A camera file with a tone curve.")] = None,
+    camera: Annotated[str | None, Option(help="The camera that took photographs of a design.")] = None,
     overwrite: Overwrite = False,
 ) -> None:
     """A printer from its ICC profile, or from photographs of its printed chart or of any design."""
-    from patchproof.calibrate.printer import printer_from_chart, printer_from_design, printer_from_icc
+    from patchproof.base.errors import Refused
+    from patchproof.base.output import check_file, write_files_atomically
+    from patchproof.channel.printer import load_printer, printer_contents
 
-    photos = photos or []
+    photos, lines, warnings = photos or [], [], ()
     if (icc is None) != bool(photos):
         raise BadParameter("give either --icc FILE or PHOTO...", param_hint="--icc / PHOTO...")
-    if not design and (corners or find or known):
-        raise BadParameter("--corners, --find and --known are for PHOTO... --design", param_hint="--design")
+    if not design and (corners or find or known or camera):
+        only = "--corners, --find, --camera and --known are for PHOTO... --design"
+        raise BadParameter(only, param_hint="--design")
+    if out.suffix.lower() not in {"", ".npz", ".json"}:
+        raise Refused("a printer file, NAME.npz", f"{out.name}", "choose another --out")
+    file = out.with_suffix(".npz")
+    for path in (file, out.with_suffix(".json")):
+        check_file(path, overwrite)
     if icc is not None:
-        lines, warnings = printer_from_icc(icc, out, intent == "perceptual", licence, source, overwrite), ()
+        from patchproof.calibrate.icc import bake
+
+        made = bake(icc, file.stem, intent == "perceptual")
     elif sheet is None:
         raise BadParameter("name the JSON that was written beside the PDF", param_hint="--sheet")
-    elif design:
-        from patchproof.channel.cameras import load_optional_camera
-        from patchproof.channel.printer import load_printer
-        from patchproof.evidence.annotations import load_corners
-        from patchproof.evidence.task import Options
-
-        named = {} if corners is None else load_corners(corners)
-        options = Options((), load_printer(known or "office"), load_optional_camera(camera), corners=named, find=find)
-        with progress_bar() as bar:
-            lines, warnings = printer_from_design(photos, sheet, out, options, known, overwrite, bar)
     else:
+        from patchproof.calibrate.chart import calibrate_chart, prints_of, summary_lines
+        from patchproof.sheets.manifest import load_manifest
+
+        groups, manifest = prints_of(photos), load_manifest(sheet)
         with progress_bar() as bar:
-            lines, warnings = printer_from_chart(photos, sheet, out, camera, overwrite, bar)
+            if design:
+                from patchproof.calibrate.known_design import KNOWN_PRINTERS, calibrate_design
+                from patchproof.channel.cameras import load_optional_camera
+                from patchproof.evidence.annotations import load_corners
+                from patchproof.evidence.task import Options
+
+                named, names = load_corners(corners) if corners else {}, (known,) if known else KNOWN_PRINTERS
+                camera_file, advance = load_optional_camera(camera), partial(bar, "photographs")
+                options = Options((), load_printer(names[0]), camera_file, corners=named, find=find)
+                made, warnings = calibrate_design(groups, manifest, file.stem, options, names, advance)
+            else:
+                result = calibrate_chart(groups, manifest, file.stem, partial(bar, "chart"))
+                made, warnings, lines = result.printer, result.warnings, summary_lines(result)
+    write_files_atomically(printer_contents(made, file))
     warn(warnings)
-    say(*lines, f'{_NEXT} profile = "{out.with_suffix(".npz")}" in its [printer]')
+    lines = lines or [f"{key}: {value}" for key, value in made.provenance.items() if not isinstance(value, list)]
+    say(*lines, f"written: {file}, {file.stem}.json", f'{_NEXT} profile = "{file}" in its [printer]')
 
 
 def camera(
     photos: Annotated[Path, Argument(help="A folder of photographs of a board.")],
     board: Annotated[str, Option(help="The board's template, or the BOARD.json beside its PDF.")] = "charuco_a4",
-    out: Annotated[Path, Option(help="The camera file, with figures and a picture.")] = Path("camera.json"),
+    out: Annotated[Path, Option(help="The camera file.")] = Path("camera.json"),
     ruler_mm: Annotated[str | None, Option(help="The printed rulers as measured, e.g. 97.1x97.3 (x, y).")] = None,
     overwrite: Overwrite = False,
 ) -> None:

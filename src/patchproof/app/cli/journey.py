@@ -14,7 +14,7 @@ from patchproof.base.compute import Compute
 from patchproof.base.progress import progress_bar
 from patchproof.base.text import command_text
 
-PrintableControl = Literal["mean", "gray", "noise", "shuffled", "blank"]  # that can be printed
+PrintableControl = Literal["mean", "gray", "noise", "blank"]  # that can be printed
 PhotographedControl = Literal["bare", "mean", "gray", "noise"]  # that can hang on the object in place of the design
 
 
@@ -114,7 +114,7 @@ def sheet(
     from patchproof.base.output import check_file
     from patchproof.base.settings import background_summary
     from patchproof.sheets.blank import blank_page
-    from patchproof.sheets.print_advice import pdf_advice, sheet_advice
+    from patchproof.sheets.print_advice import SHOP_ADVICE, sheet_advice
     from patchproof.sheets.template import template_summaries
     from patchproof.sheets.write import manifest_paths
 
@@ -149,7 +149,7 @@ def sheet(
         say(f"sheet {manifest.sheet_id} ({manifest.kind}): {out}{'' if path == out else f', {path.name}'}")
     if check:
         lines = (line for manifest in manifests for line in sheet_advice(manifest))
-        say(*dict.fromkeys(lines), *pdf_advice(out))  # lines that several designs share are printed once
+        say(*dict.fromkeys(lines), *SHOP_ADVICE)  # lines that several designs share are printed once
 
 
 def reprint(

@@ -1,13 +1,15 @@
 """Measure the light on a piece of paper where the paper is white.
 
-In: a photograph of a blank piece, its homography and its blur. Out: `PaperLight`: per channel a quadratic in piece
-coordinates of the linear light that white paper shows, the unexplained remainder, and the paper's grain. Pixels count
-if they lie on white paper, far enough from ink and cut line that blur brings nothing over; clipped pixels do not. The
+In: a photograph, the homography and blur of a page, a rectangle of it, and what is printed there. Out: `PaperLight`:
+per channel a quadratic in the rectangle of the linear light that white paper shows, the unexplained remainder, and the
+paper's grain. Pixels count if they lie on white paper, far enough from ink and the rectangle's edge that blur brings
+nothing over; clipped pixels do not. The
 fit is robust: least median of squares finds the light that most of the paper agrees on, and Tukey's weights ignore a
 highlight or a shadow's edge. A quadratic, because a lamp's fall-off over a flat piece is smooth: for a bare lamp twice
 the piece's size above its middle the error is within 1 %, above its edge within 4 %.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +18,7 @@ from patchproof.base.color import LINEAR_FROM_CODE
 from patchproof.base.geometry import apply_homography, local_scale, rect_corners
 from patchproof.photo.quality import CLIPPED_CODE
 from patchproof.photo.rejection import PhotoRejected
-from patchproof.sheets.piece import Piece, marker_rect
+from patchproof.sheets.rects import RectMm
 
 _CUT_SLACK_MM = 1.0  # scissors do not follow the line
 _MAX_CLIPPED = 0.5  # of the white paper
@@ -35,16 +37,20 @@ class PaperLight:
     noise: float
 
 
-def paper_light(srgb: np.ndarray, px_from_piece: np.ndarray, piece: Piece, blur_px: float) -> PaperLight:
-    """Measure the light on a blank piece in a uint8 photograph; `PhotoRejected` if it shows too little white paper."""
-    codes, mm = _white_pixels(srgb, px_from_piece, piece, blur_px)
+def paper_light(
+    srgb: np.ndarray, px_from_mm: np.ndarray, area_mm: RectMm, printed: Iterable[RectMm], blur_px: float
+) -> PaperLight:
+    """Measure the light on a rectangle of paper, white but for what is `printed`, in a uint8 photograph;
+    `PhotoRejected` if it shows too little white paper.
+    """
+    codes, mm = _white_pixels(srgb, px_from_mm, area_mm, printed, blur_px)
     if len(codes) < _MIN_PIXELS:
         raise PhotoRejected("too_small", len(codes), _MIN_PIXELS, "come closer: too little white paper is in view")
     clipped = (codes >= CLIPPED_CODE).any(1)
     if clipped.mean() > _MAX_CLIPPED:
         raise PhotoRejected("clipped", float(clipped.mean()), _MAX_CLIPPED, "the paper is overexposed: expose less")
     codes, mm = codes[~clipped], mm[~clipped]
-    light, terms = LINEAR_FROM_CODE[codes], quadratic_terms(mm, piece.size_mm)
+    light, terms = LINEAR_FROM_CODE[codes], quadratic_terms(mm - area_mm[:2], area_mm[2:])
     coefficients, weight = _robust_fit(terms, light)
     residual = light - terms @ coefficients.T
     white = light.mean(0)
@@ -54,26 +60,25 @@ def paper_light(srgb: np.ndarray, px_from_piece: np.ndarray, piece: Piece, blur_
 
 
 def quadratic_terms(mm: np.ndarray, size_mm: tuple[float, float]) -> np.ndarray:
-    """Return N×6 rows [1, u, v, u², uv, v²] of piece points."""
+    """Return N×6 rows [1, u, v, u², uv, v²] of points in a rectangle of this size."""
     u, v = (2 * mm / np.array(size_mm) - 1).T
     return np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], 1)
 
 
-def _white_pixels(srgb, px_from_piece, piece: Piece, blur_px: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return codes N×3 and piece millimeters N×2 of pixels that see nothing but white paper."""
-    piece_rect = (0.0, 0.0, *piece.size_mm)
-    corners_px = apply_homography(px_from_piece, rect_corners(piece_rect))
+def _white_pixels(srgb, px_from_mm, area_mm, printed, blur_px: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return codes N×3 and millimeters N×2 of pixels that see nothing but white paper."""
+    corners_px = apply_homography(px_from_mm, rect_corners(area_mm))
     limit = np.array([srgb.shape[1], srgb.shape[0]])
     low = np.clip(np.floor(corners_px.min(0)).astype(int), 0, limit)
     high = np.clip(np.ceil(corners_px.max(0)).astype(int), low, limit)
     stride = max(1, int(np.sqrt(np.prod(high - low) / (4 * _MAX_PIXELS))))  # about a quarter of the box is clear paper
     columns, rows = np.meshgrid(np.arange(low[0], high[0], stride), np.arange(low[1], high[1], stride))
-    mm = apply_homography(np.linalg.inv(px_from_piece), np.column_stack([columns.ravel(), rows.ravel()]) + 0.5)
-    scales = [local_scale(px_from_piece, corner) for corner in rect_corners(piece_rect)]
+    mm = apply_homography(np.linalg.inv(px_from_mm), np.column_stack([columns.ravel(), rows.ravel()]) + 0.5)
+    scales = [local_scale(px_from_mm, corner) for corner in rect_corners(area_mm)]
     px_per_mm = min(mean * np.sqrt(np.cos(np.radians(tilt))) for mean, tilt in scales)
     margin_mm = (1 + 3 * blur_px) / max(px_per_mm, 1e-6)
-    white = _inside(mm, piece_rect, -margin_mm - _CUT_SLACK_MM)
-    for rect in map(marker_rect, piece.markers):
+    white = _inside(mm, area_mm, -margin_mm - _CUT_SLACK_MM)
+    for rect in printed:
         white &= ~_inside(mm, rect, margin_mm)
     return srgb[rows.ravel()[white], columns.ravel()[white]], mm[white]
 
