@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +23,6 @@ from patchproof.app.begin.sides import (
     PICTURE_PX,
     RAMP_RGB,
     gap_colors,
-    ramp_colors,
     round_length,
     sample_views,
     side_of,
@@ -91,9 +91,8 @@ def test_gaps_are_drawn_where_they_are():
     assert nothing.mean() == pytest.approx(over.overhang_share) == pytest.approx(1 / 6, abs=0.02)
     assert nothing[:, -5:].all() and not nothing[:, :50].any()  # on the right as one faces it
     assert gap_limit_mm(over.size_mm) == pytest.approx(0.15 * 90)
-    assert (
-        ramp_colors(np.array([-1.0, 0, 1, 7])) == np.array([RAMP_RGB[0], RAMP_RGB[0], RAMP_RGB[-1], RAMP_RGB[-1]])
-    ).all()
+    stepped = replace(over, gaps_mm=np.array([[-1.0, 0, 13.5, 99]]))
+    assert (gap_colors(stepped)[0] == np.array([RAMP_RGB[0], RAMP_RGB[0], RAMP_RGB[-1], RAMP_RGB[-1]])).all()
 
 
 @pytest.mark.parametrize(("most", "length"), [(100, 100), (99, 50), (21, 20), (1.99, 1), (0.5, 0.5)])

@@ -19,7 +19,7 @@ from patchproof.base.geometry import camera_centers
 from patchproof.base.validation import Side
 from patchproof.mesh.surface_chart import SurfaceChart, piece_grid, surface_heights, triangles_near
 from patchproof.scene import placement
-from patchproof.scene.bend import placement_method
+from patchproof.scene.bent_scene import placement_method
 from patchproof.scene.canvas import select_faces
 from patchproof.scene.fitting import place_if_close
 from patchproof.scene.patch_scene import PiecePosition

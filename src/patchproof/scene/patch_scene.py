@@ -5,7 +5,7 @@ layout of the printed piece (the design and its markers, whose size follows from
 """
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
@@ -22,9 +22,6 @@ from patchproof.sheets.markers import MARKER_MODULES
 from patchproof.sheets.page import refuse_larger_than_page
 from patchproof.sheets.piece import Piece, lay_out_piece, marker_size_mm, smallest_piece_mm
 from patchproof.sheets.template import page_template
-
-if TYPE_CHECKING:
-    from patchproof.scene.tape_measure import TapeMeasurement
 
 PiecePosition = tuple[float, float, float] | Side  # a point of the scene in millimeters, or the middle of a side
 
@@ -47,7 +44,7 @@ class PatchScene(PieceScene, MeshScene):
 
     def placement_summary(self) -> dict[str, Any]:
         """Implement `Scene.placement_summary`."""
-        names = ("size_mm", "family", "reason", "gap_mm", "gap_mean_mm", "overhang_share", "stretch")
+        names = ("size_mm", "family", "reason", "gap_mm", "gap_mean_mm", "overhang_share")
         return {name: getattr(self.placement, name) for name in names}
 
     def record(self) -> dict[str, Any]:
@@ -104,10 +101,6 @@ class PatchScene(PieceScene, MeshScene):
         poses = self.camera_from_world(conditions) @ self.placement.world_from_piece
         return np.array([geometry.view_angles(pose, middle)[0] for pose in poses])
 
-    def tape_measurements(self) -> "tuple[TapeMeasurement, ...]":
-        """Return tape measurements beside the piece, as one faces its side; none for a card, whose edges do."""
-        return ()
-
     def white_light(self, conditions: Conditions) -> np.ndarray:
         """Return N: the light on white paper at the piece's middle."""
         light = conditions.light
@@ -160,7 +153,7 @@ def _place_piece(scene: MeshScene, lay: PlacementMethod) -> tuple[Piece, Placeme
 
         scales, notes = smallest_marker_scales(scene, placement, piece), (*notes, *bent_notes(placement))
     unreadable = float((scales * piece.module_mm < interface.PX_PER_MODULE * 0.999).mean()) if piece.markers else 0.0
-    if unreadable > 1 - interface.READABLE_SHARE and placement.family != "exponential":
+    if unreadable > 1 - interface.READABLE_SHARE:
         advice = "narrow view.azimuth_deg and view.elevation_deg, or make the piece smaller"
         if needed_mm > marker_mm + 0.05:
             advice = (

@@ -2,7 +2,7 @@
 
 In: a mesh (world mm), a named side or a point, a spin and the piece's size. Out: a `Placement`: the piece in the world,
 and how well paper and surface agree: the gap below the card and the overhang beyond the object, in mm and shares. A
-card wider or higher than the object's side, or with nothing under it, is refused. Bent pieces: see `bend`.
+card wider or higher than the object's side, or with nothing under it, is refused. Bent pieces: see `bent_scene`.
 """
 
 from collections.abc import Callable
@@ -37,7 +37,7 @@ _SIDES = {  # side: (up, normal); right is up × normal
 class Placement:
     """A piece at its place. Piece millimeters count from its top-left corner, x right, y down."""
 
-    family: str  # "card", "cylinder", "exponential" or "curled"
+    family: str  # "card", "cylinder" or "curled"
     size_mm: tuple[float, float]
     vertices_mm: np.ndarray  # float64 V×3 in the world: a card's corners clockwise from top-left, else a grid by rows
     faces: np.ndarray  # int64 F×3, counter-clockwise as one faces the printed side
@@ -48,8 +48,6 @@ class Placement:
     gap_mean_mm: float
     gaps_mm: np.ndarray  # GRID×GRID by rows from the top: from the piece to the surface, NaN where there is none
     overhang_share: float  # of the piece's area with no object under it
-    stretch: float  # largest relative change of length on the surface against the sheet
-    stretches: np.ndarray  # N×N by rows from the top: the stretch at each point of the piece
     reason: str
 
     def world(self, points_mm: np.ndarray) -> np.ndarray:
@@ -184,8 +182,6 @@ def lay_card(
         gap_mean_mm=float(gaps.mean()),
         gaps_mm=(top - surface).reshape(GRID, GRID),
         overhang_share=float(1 - hit.mean()),
-        stretch=0.0,
-        stretches=np.zeros((2, 2)),
         reason=f"a flat card stands at most {gap_mm:.1f} mm off the surface",
     )
 

@@ -22,7 +22,6 @@ from patchproof.app.begin.sides import (
     SIDE_NAMES,
     SampleView,
     gap_colors,
-    ramp_colors,
     sample_views,
     side_of,
     side_views,
@@ -43,7 +42,6 @@ from patchproof.optimizer.subject import subject_of
 from patchproof.render.stage import Stage, set_stage
 from patchproof.report.images import data_uri, jpeg, png
 from patchproof.report.page import render_page
-from patchproof.scene.bend import STRETCH_LIMIT
 from patchproof.scene.canvas import bake_base_colors
 from patchproof.scene.interface import Scene, measurable_text
 from patchproof.scene.mesh_scene import MeshScene, require_mesh
@@ -109,7 +107,7 @@ def preview(scene: str | Path | Scene, out: str | Path, *, overwrite: bool = Fal
             problems=problems,
             warnings=warnings,
             sides=sides,
-            maps=_maps(scene) if isinstance(scene, PatchScene) else [],
+            gap_map=_gap_map(scene) if isinstance(scene, PatchScene) else None,
             turns=turns,
             first_deg=_FIRST_DEG,
             looks=[(look, data_uri(jpeg(look.picture))) for look in views],
@@ -186,7 +184,7 @@ def _facts(scene: Scene, settings: SceneSettings) -> list[tuple[str, str]]:
         side = side_of(scene.placement.normal)
         fit = (
             f"gap {placement['gap_mm']:.1f} mm at most, {placement['gap_mean_mm']:.1f} mm on average; "
-            f"{placement['overhang_share']:.0%} overhangs; stretch {placement['stretch']:.2%}"
+            f"{placement['overhang_share']:.0%} overhangs"
         )
         facts.append(("piece", f"{placement['family']}, {size}, facing {SIDE_NAMES[side]} ({side}): {fit}"))
         readable = measurable_text(scene.unreadable_share, scene.placement.family)
@@ -219,19 +217,11 @@ def _answers(settings: SceneSettings, views: Sequence[SampleView]) -> list[str]:
     return lines
 
 
-def _maps(scene: PatchScene) -> list[dict[str, str]]:
-    """Pictures of the piece's gap and stretch, each with the words at the ends of its scale."""
+def _gap_map(scene: PatchScene) -> dict[str, str]:
+    """A picture of the piece's gap, its aspect ratio, and the words at the end of its scale."""
     placement = scene.placement
-    limit = f"{gap_limit_mm(placement.size_mm):.2g} mm: too much"
-    rows = [("gap to the surface", gap_colors(placement), "0 mm", limit)]
-    if not placement.is_flat:
-        stretches = ramp_colors(placement.stretches / STRETCH_LIMIT)
-        rows.append(("stretch of the paper", stretches, "0 %", f"{STRETCH_LIMIT:.0%}: refused"))
-    shape = "{:g} / {:g}".format(*placement.size_mm)
-    return [
-        {"title": title, "shape": shape, "picture": data_uri(png(colors)), "low": low, "high": high}
-        for title, colors, low, high in rows
-    ]
+    words = {"shape": "{:g} / {:g}".format(*placement.size_mm), "most": f"{gap_limit_mm(placement.size_mm):.2g} mm"}
+    return {"picture": data_uri(png(gap_colors(placement))), **words}
 
 
 def _write_object(stage: Stage, design: np.ndarray | None, path: Path) -> None:

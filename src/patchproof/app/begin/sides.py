@@ -1,7 +1,7 @@
 """Pictures of an object from its six sides, with ground line, scale bar and piece; from all around; and sample views.
 
 In: a stage with a mesh, with a piece on it or without. Out: `SideView`s at one scale; pictures at one scale from a ring
-of directions, for a page that turns the object by a slider; the piece's gap and stretch as colors. The sides are those
+of directions, for a page that turns the object by a slider; the piece's gap as colors. The sides are those
 of `patch.side`; front and back are along z, as in glTF's standard and after `object.up = "z"` turned the y of other
 programs there. The ring is seen from far away, in even light, and from above or below if the piece is on top or below.
 Sample views are drawn from the train stream as optimizing draws them, and have the networks' answers beside them.
@@ -102,16 +102,9 @@ def round_length(most_mm: float) -> float:
 
 def gap_colors(placement: Placement) -> np.ndarray:
     """Color the piece's gaps, uint8 N×N×3: 0 to `gap_limit_mm` from dark to light, `NO_SURFACE_RGB` off the surface."""
-    colors = ramp_colors(placement.gaps_mm / gap_limit_mm(placement.size_mm))
-    colors[np.isnan(placement.gaps_mm)] = NO_SURFACE_RGB
-    return colors
-
-
-def ramp_colors(shares: np.ndarray) -> np.ndarray:
-    """Color shares in [0, 1] by `RAMP_RGB`, uint8 ...×3; shares beyond get the colors of the ends."""
-    stops = np.linspace(0, 1, len(RAMP_RGB))
-    channels = [np.interp(np.nan_to_num(shares), stops, column) for column in np.array(RAMP_RGB, float).T]
-    return np.stack(channels, -1).round().astype(np.uint8)
+    gaps, stops = placement.gaps_mm, np.linspace(0, gap_limit_mm(placement.size_mm), len(RAMP_RGB))
+    channels = [np.interp(np.nan_to_num(gaps), stops, column) for column in np.array(RAMP_RGB, float).T]
+    return np.where(np.isnan(gaps)[..., None], NO_SURFACE_RGB, np.stack(channels, -1).round()).astype(np.uint8)
 
 
 def _points_mm(scene: MeshScene) -> np.ndarray:

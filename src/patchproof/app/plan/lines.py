@@ -39,13 +39,12 @@ def measured_lines(plan: Plan) -> list[str]:
 def _surface_lines(surface: SurfacePlan) -> list[str]:
     width, height = surface.size_mm
     lines = [f"  {surface.family}, {width:.0f} × {height:.0f} mm: {surface.reason}"]
-    if surface.gap_mm is not None and surface.overhang_share is not None and surface.stretch is not None:
+    if surface.gap_mm is not None and surface.overhang_share is not None:
         edge, area = min(width, height), width * height
         lines.append(
             f"  gap {surface.gap_mm:.2f} mm ({surface.gap_mm / edge:.1%} of the shorter edge), mean "
             f"{surface.gap_mean_mm:.2f} mm; overhang {surface.overhang_share * area:.0f} mm² "
-            f"({surface.overhang_share:.1%}); stretch {surface.stretch * max(width, height):.2f} mm "
-            f"({surface.stretch:.2%})"
+            f"({surface.overhang_share:.1%})"
         )
     return lines + ([f"  {surface.other}"] if surface.other else [])
 

@@ -52,7 +52,6 @@ class SurfacePlan(StrictModel):
     gap_mm: float | None = None
     gap_mean_mm: float | None = None
     overhang_share: float | None = None
-    stretch: float | None = None
     reason: str
     other: str | None = None
 
