@@ -17,8 +17,7 @@ import numpy as np
 from patchproof.base.color import linear_from_srgb
 from patchproof.base.errors import Refused
 from patchproof.base.validation import summarize_names
-from patchproof.mesh.assets import VERTEX_COLORS, WHITE, Assets, Wrap
-from patchproof.mesh.drawn_textures import draw_out_textures
+from patchproof.mesh.assets import VERTEX_COLORS, WHITE, Assets, Wrap, draw_out_textures
 from patchproof.mesh.mesh import Material, MeshPart, triangulate
 
 _MAPS = ("map_", "bump", "norm", "disp", "decal", "refl")

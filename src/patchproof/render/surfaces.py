@@ -15,7 +15,7 @@ from torch import Tensor
 from patchproof.base.color import linear_from_srgb
 from patchproof.mesh.mesh import Mesh
 from patchproof.render.atlas import atlas_layout, atlas_table
-from patchproof.render.edges import Edges, find_edges
+from patchproof.render.outlines import Edges, find_edges
 from patchproof.render.texture import TexelLayout, texel_layout, texel_table
 from patchproof.scene.interface import PieceScene
 

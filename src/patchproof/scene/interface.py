@@ -27,7 +27,7 @@ from patchproof.sheets.piece import Piece, sheet_id
 
 if TYPE_CHECKING:
     from patchproof.channel.lens import Camera
-    from patchproof.scene.canvas import Canvas
+    from patchproof.scene.texture_scene import Canvas
 
 SCALE_VIEWS = 1024  # for quantiles over the views; the rule for the markers' size uses the same
 PX_PER_MODULE = 2.5  # markers can be read from about this size on: 45 of 48 at 2.7 px with a blur of 0.7 px

@@ -14,10 +14,9 @@ from patchproof.base.errors import Refused
 from patchproof.base.validation import Side
 from patchproof.scene import interface
 from patchproof.scene.conditions import Conditions
-from patchproof.scene.fitting import placement_advice
 from patchproof.scene.interface import SCALE_VIEWS, PieceScene, Scene, SceneSource, refuse_without_place
 from patchproof.scene.mesh_scene import MeshScene, camera_poses, load_bare
-from patchproof.scene.placement import Placement, PlacementMethod, patch_frame, place_card
+from patchproof.scene.placement import Placement, PlacementMethod, patch_frame, place_card, placement_advice
 from patchproof.sheets.markers import MARKER_MODULES
 from patchproof.sheets.page import refuse_larger_than_page
 from patchproof.sheets.piece import Piece, lay_out_piece, marker_size_mm, smallest_piece_mm

@@ -3,10 +3,15 @@
 In: a mesh (world mm), a named side or a point, a spin and the piece's size. Out: a `Placement`: the piece in the world,
 and how well paper and surface agree: the gap below the card and the overhang beyond the object, in mm and shares. A
 card wider or higher than the object's side, or with nothing under it, is refused. Bent pieces: see `bent_scene`.
+
+A piece lies well if gap and overhang are below those that give a warning. The largest that does is found by bisection,
+on the assumption that a smaller piece fits where a larger one does, which only holes under its middle contradict.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import get_args
 
 import numpy as np
 
@@ -22,6 +27,9 @@ LIFT_MM = 0.15  # the paper's own thickness, which also keeps it clear of the su
 # Assumed: a card that stands off the object by more than this share of its shorter edge casts a visible shadow.
 WARN_GAP_SHARE = 0.15
 WARN_OVERHANG_SHARE = 0.02
+_STEP_SHARE = 0.25  # of the piece's shorter side between places that are tried
+_TRIES_FLAT, _TRIES_BENT = 120, 6  # one takes about 5 and 200 ms
+_HALVINGS = 5  # to 3 % of the wanted piece
 
 _SIDES = {  # side: (up, normal); right is up × normal
     "+x": ((0, 1, 0), (1, 0, 0)),
@@ -226,3 +234,70 @@ def _nearest_surface(mesh: Mesh, point: np.ndarray) -> tuple[np.ndarray, np.ndar
     points = closest_point(triangles, np.broadcast_to(point, (len(triangles), 3)))
     nearest = int(np.argmin(((points - point) ** 2).sum(1)))
     return points[nearest], normals(triangles[nearest : nearest + 1])[0][0]
+
+
+def place_if_close(
+    mesh: Mesh,
+    frame: SurfaceFrame,
+    size_mm: tuple[float, float],
+    spin_deg: float,
+    lay: PlacementMethod,
+) -> Placement | None:
+    """Place the piece with its middle at the frame's origin. None if that is refused, or if the piece stands off or
+    overhangs by more than the limits of the warnings.
+    """
+    try:
+        piece = lay(mesh, frame, size_mm, spin_deg)
+    except Refused:
+        return None
+    return None if piece.warnings else piece
+
+
+def placement_advice(mesh: Mesh, patch: PatchSettings, lay: PlacementMethod, least_mm: float) -> str:
+    """Suggest, as keys of a scene file, sizes and places at which a refused piece would lie well; empty if none was
+    found. Places are tried on the same side from the nearest on, then in the middles of the other sides.
+    """
+    frame, size_mm = patch_frame(mesh, patch), patch.size_mm
+    width, height = np.minimum(size_mm, frame.extent_mm).tolist()
+    fits = partial(place_if_close, mesh, frame, spin_deg=patch.spin_deg, lay=lay)
+    smaller = largest_fitting_size((width, height), fits, least_mm)
+    place = _nearest_place(mesh, patch, lay)
+    suggestions = [f"{smaller[0]:g} × {smaller[1]:g} mm lies well there"] if smaller is not None else []
+    suggestions += [f"{size_mm[0]:g} × {size_mm[1]:g} mm lies well with {place}"] if place is not None else []
+    return "".join(f"; {text}" for text in suggestions)
+
+
+def _nearest_place(mesh: Mesh, patch: PatchSettings, lay: PlacementMethod) -> str | None:
+    """Return the nearest place where the piece lies well, as a key of a scene file."""
+    fits = partial(place_if_close, mesh, size_mm=patch.size_mm, spin_deg=patch.spin_deg, lay=lay)
+    middle = patch_frame(mesh, patch.changed(offset_mm=(0.0, 0.0)))
+    step = max(1.0, round(_STEP_SHARE * min(patch.size_mm)))
+    (across, along), wanted_mm = (int(extent // (2 * step)) for extent in middle.extent_mm), np.array(patch.offset_mm)
+    offsets = [(x * step, y * step) for x in range(-across, across + 1) for y in range(-along, along + 1)]
+    offsets.sort(key=lambda offset: (float(np.hypot(*(offset - wanted_mm))), offset))
+    for x, y in offsets[: _TRIES_BENT if patch.bend else _TRIES_FLAT]:
+        if fits(replace(middle, origin_mm=middle.origin_mm + x * middle.right + y * middle.up)):
+            return f"offset_mm = [{x:g}, {y:g}]"
+    sides = sorted(get_args(Side), key=lambda side: (side == patch.side, side[1] == "y"))  # top and bottom last
+    side = next((side for side in sides if fits(side_frame(mesh, side))), None)
+    return None if side is None else f'side = "{side}"'
+
+
+def largest_fitting_size(
+    size_mm: tuple[float, float], fits: Callable[[tuple[float, float]], object], least_mm: float
+) -> tuple[float, float] | None:
+    """Return the largest piece of this shape that fits, in whole millimeters; None if `least_mm` does not."""
+    low, high = least_mm / min(size_mm), 1.0
+    if low > 1 or not fits(_scaled(size_mm, low)):
+        return None
+    if fits(_scaled(size_mm, high)):
+        return _scaled(size_mm, high)
+    for _ in range(_HALVINGS):
+        middle = (low + high) / 2
+        low, high = (middle, high) if fits(_scaled(size_mm, middle)) else (low, middle)
+    return _scaled(size_mm, low)
+
+
+def _scaled(size_mm: tuple[float, float], scale: float) -> tuple[float, float]:
+    width, height = (float(np.floor(side * scale + 1e-6)) for side in size_mm)
+    return width, height

@@ -42,13 +42,12 @@ from patchproof.optimizer.subject import subject_of
 from patchproof.render.stage import Stage, set_stage
 from patchproof.report.images import data_uri, jpeg, png
 from patchproof.report.page import render_page
-from patchproof.scene.canvas import bake_base_colors
 from patchproof.scene.interface import Scene, measurable_text
 from patchproof.scene.mesh_scene import MeshScene, require_mesh
 from patchproof.scene.patch_scene import PatchScene
 from patchproof.scene.placement import gap_limit_mm
 from patchproof.scene.scene import build_scene
-from patchproof.scene.texture_scene import TextureScene
+from patchproof.scene.texture_scene import TextureScene, bake_base_colors
 from patchproof.scene.unplaced_scene import UnplacedScene
 
 PAGE, OBJECT = "preview.html", "preview.glb"
