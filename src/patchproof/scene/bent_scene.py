@@ -183,7 +183,7 @@ def _roll(chart: SurfaceChart, near: np.ndarray, size_mm) -> Placement:
         family="cylinder",
         size_mm=tuple(size_mm),
         vertices_mm=chart.world(s, t, 0 * s),
-        faces=grid_faces(PIECE_GRID),
+        faces=surface_chart.grid_faces(PIECE_GRID, PIECE_GRID),
         piece_mm=piece_grid(size_mm, PIECE_GRID) * [1, -1] + half,
         normals=chart.cartesian(s, t)[1] @ chart.axes,
         world_from_piece=piece_pose(*chart.turn @ chart.axes[:2], chart.axes[2], origin_mm, size_mm),
@@ -193,12 +193,6 @@ def _roll(chart: SurfaceChart, near: np.ndarray, size_mm) -> Placement:
         overhang_share=float(np.isnan(heights).mean()),
         reason="",
     )
-
-
-def grid_faces(n: int) -> np.ndarray:
-    """Return two triangles per cell of an n×n grid by rows from the top, counter-clockwise as one faces it."""
-    corner = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).reshape(-1, 1)
-    return np.concatenate([corner + np.array([0, n, n + 1]), corner + np.array([0, n + 1, 1])])
 
 
 def _refuse_overhang(piece: Placement) -> None:

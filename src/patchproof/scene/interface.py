@@ -252,12 +252,6 @@ class PieceScene(Scene):
         """True if piece and lens are flat, so that photographs are homographies of the sheet."""
         return True
 
-    def with_print_scale(self, scale: tuple[float, float]) -> "PieceScene":
-        """Return the scene with its piece printed at `scale` (x, y) about its middle; its millimeters stay."""
-        if scale == (1.0, 1.0):
-            return self
-        raise Refused("a mesh, to change the print's size", self.description(), "leave --print-scale out")
-
     def facing(self, conditions: Conditions) -> np.ndarray:
         """Return N bool: the views that do not show the piece from behind; pictures with unknown angles do not."""
         return ~(np.abs(self.piece_azimuth_deg(conditions)) >= 90)

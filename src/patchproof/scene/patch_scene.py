@@ -88,11 +88,7 @@ class PatchScene(PieceScene, MeshScene):
 
     def paper(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Implement `PieceScene.paper`."""
-        placement, by_rows = self.placement, [0, 1, 3, 2]
-        if not placement.is_flat:
-            return placement.vertices_mm, placement.normals, placement.piece_mm
-        corners_mm = geometry.rect_corners((0, 0, *placement.size_mm))[by_rows]  # a card's corners run clockwise
-        return placement.vertices_mm[by_rows], np.broadcast_to(placement.normal, (4, 3)), corners_mm
+        return self.placement.vertices_mm, self.placement.normals, self.placement.piece_mm
 
     def piece_azimuth_deg(self, conditions: Conditions) -> np.ndarray:
         """Return N angles of the camera to the right of the piece's middle, beyond 90 if its face is turned away."""
@@ -106,9 +102,7 @@ class PatchScene(PieceScene, MeshScene):
         return light.ambient + light.directional * self.cosines(light.light_azimuth_deg, light.light_elevation_deg)
 
     def with_print_scale(self, scale: tuple[float, float]) -> Self:
-        """Implement `PieceScene.with_print_scale`."""
-        if scale == (1.0, 1.0):
-            return self
+        """Return the scene with its piece printed at `scale` (x, y) about its middle; its millimeters stay."""
         placement, factors = self.placement, np.array(scale)
         middle, scaling = np.array(placement.size_mm) / 2, np.eye(4)
         scaling[[0, 1], [0, 1]] = factors

@@ -20,7 +20,7 @@ from patchproof.base.geometry import rotated_extent
 from patchproof.base.settings import PatchSettings, SceneSettings
 from patchproof.base.validation import Side
 from patchproof.mesh.mesh import Mesh
-from patchproof.mesh.surface_chart import SurfaceChart, surface_heights
+from patchproof.mesh.surface_chart import SurfaceChart, grid_faces, surface_heights
 
 GRID = 65  # heights are sampled on this many points along each edge of the card
 LIFT_MM = 0.15  # the paper's own thickness, which also keeps it clear of the surface in the z-buffer
@@ -47,7 +47,7 @@ class Placement:
 
     family: str  # "card", "cylinder" or "curled"
     size_mm: tuple[float, float]
-    vertices_mm: np.ndarray  # float64 V×3 in the world: a card's corners clockwise from top-left, else a grid by rows
+    vertices_mm: np.ndarray  # float64 V×3 in the world: a grid by rows, of a card its corners
     faces: np.ndarray  # int64 F×3, counter-clockwise as one faces the printed side
     piece_mm: np.ndarray  # V×2: where each vertex lies on the flat piece
     normals: np.ndarray  # V×3 unit, out of the printed face
@@ -176,13 +176,13 @@ def lay_card(
     top = max(surface[hit].max(), peaks[inside, 2].max(initial=-np.inf))
     gaps = top - surface[hit]
     pose = piece_pose(right, up, frame.normal, frame.origin_mm + frame.normal * (top + LIFT_MM), size_mm)
-    corners = np.array([[0, 0], [width, 0], [width, height], [0, height]], float)
+    corners = np.array([[0, 0], [width, 0], [0, height], [width, height]], float)
     gap_mm = float(gaps.max())
     return Placement(
         family="card",
         size_mm=(width, height),
         vertices_mm=corners @ pose[:3, :2].T + pose[:3, 3],
-        faces=np.array([(0, 3, 2), (0, 2, 1)]),
+        faces=grid_faces(2, 2),
         piece_mm=corners,
         normals=np.tile(frame.normal, (4, 1)),
         world_from_piece=pose,
