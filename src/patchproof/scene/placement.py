@@ -237,11 +237,7 @@ def _nearest_surface(mesh: Mesh, point: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def place_if_close(
-    mesh: Mesh,
-    frame: SurfaceFrame,
-    size_mm: tuple[float, float],
-    spin_deg: float,
-    lay: PlacementMethod,
+    mesh: Mesh, frame: SurfaceFrame, size_mm: tuple[float, float], spin_deg: float, lay: PlacementMethod
 ) -> Placement | None:
     """Place the piece with its middle at the frame's origin. None if that is refused, or if the piece stands off or
     overhangs by more than the limits of the warnings.
