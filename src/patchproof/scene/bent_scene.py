@@ -232,15 +232,6 @@ def placement_with_other_bend(scene: Scene) -> tuple[Placement | None, str | Non
     return other, f"bend = {flag} would be a {other.family}, {gaps}"
 
 
-def bent_notes(placement: Placement) -> tuple[str, ...]:
-    """Warn of bent paper that is rarely measured. Corners on rolled paper have to fit a roll, to a share of its size:
-    of pieces of 140 mm, 9 of 16 photographs did where 64 % were readable, of 40 to 90 mm 26 of 168 where 21 to 100 %
-    were.
-    """
-    few = "few photographs of rolled paper under 100 mm can be measured: the others only count"
-    return (few,) if placement.family == "cylinder" and min(placement.size_mm) < 100 else ()
-
-
 def smallest_marker_scales(scene: MeshScene, placement: Placement, piece: Piece) -> np.ndarray:
     """Return the px per mm of each view at the worst marker, along the foreshortened direction; 0 from behind."""
     middles_mm = np.array([np.mean(marker.corners_mm, 0) for marker in piece.markers])

@@ -300,7 +300,7 @@ def _sheet_id(settings: SceneSettings, base: Path, known: Mapping[str, str], see
 
 
 def measurable_text(unreadable_share: float, family: str) -> str:
-    """Say how many photographs of a piece on a surface of that family can be measured; see `bent_scene.bent_notes`."""
+    """Say how many photographs of a piece on a surface of that family can be measured."""
     return f"{'at most' if family == 'cylinder' else 'about'} {1 - unreadable_share:.0%} of photographs can be measured"
 
 

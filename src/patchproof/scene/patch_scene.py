@@ -142,9 +142,13 @@ def _place_piece(scene: MeshScene, lay: PlacementMethod) -> tuple[Piece, Placeme
     refuse_larger_than_page(page_template(settings.sheet.template), piece)  # before hours of optimizing
     notes = (*mesh.warnings, *scene.backgrounds.notes, *placement.warnings)
     if piece.markers and not placement.is_flat:  # paper is unrolled by all markers; on a card one tells the others
-        from patchproof.scene.bent_scene import bent_notes, smallest_marker_scales
+        from patchproof.scene.bent_scene import smallest_marker_scales
 
-        scales, notes = smallest_marker_scales(scene, placement, piece), (*notes, *bent_notes(placement))
+        scales = smallest_marker_scales(scene, placement, piece)
+        # Corners have to fit a roll, to a share of its size: of pieces of 140 mm, 9 of 16 photographs did where 64 %
+        # were readable, of 40 to 90 mm 26 of 168 where 21 to 100 % were.
+        few = "few photographs of rolled paper under 100 mm can be measured: the others only count"
+        notes += (few,) if min(patch.size_mm) < 100 else ()
     unreadable = float((scales * piece.module_mm < interface.PX_PER_MODULE * 0.999).mean()) if piece.markers else 0.0
     if unreadable > 1 - interface.READABLE_SHARE:
         advice = "narrow view.azimuth_deg and view.elevation_deg, or make the piece smaller"

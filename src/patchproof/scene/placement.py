@@ -253,14 +253,12 @@ def placement_advice(mesh: Mesh, patch: PatchSettings, lay: PlacementMethod, lea
     """Suggest, as keys of a scene file, sizes and places at which a refused piece would lie well; empty if none was
     found. Places are tried on the same side from the nearest on, then in the middles of the other sides.
     """
-    frame, size_mm = patch_frame(mesh, patch), patch.size_mm
-    width, height = np.minimum(size_mm, frame.extent_mm).tolist()
+    frame, (width, height) = patch_frame(mesh, patch), patch.size_mm
+    largest = min(width, frame.extent_mm[0]), min(height, frame.extent_mm[1])
     fits = partial(place_if_close, mesh, frame, spin_deg=patch.spin_deg, lay=lay)
-    smaller = largest_fitting_size((width, height), fits, least_mm)
-    place = _nearest_place(mesh, patch, lay)
-    suggestions = [f"{smaller[0]:g} × {smaller[1]:g} mm lies well there"] if smaller is not None else []
-    suggestions += [f"{size_mm[0]:g} × {size_mm[1]:g} mm lies well with {place}"] if place is not None else []
-    return "".join(f"; {text}" for text in suggestions)
+    smaller, place = largest_fitting_size(largest, fits, least_mm), _nearest_place(mesh, patch, lay)
+    advice = "" if smaller is None else f"; {smaller[0]:g} × {smaller[1]:g} mm lies well there"
+    return advice if place is None else f"{advice}; {width:g} × {height:g} mm lies well with {place}"
 
 
 def _nearest_place(mesh: Mesh, patch: PatchSettings, lay: PlacementMethod) -> str | None:
