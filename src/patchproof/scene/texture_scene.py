@@ -2,11 +2,11 @@
 
 In: a mesh and the `[patch]` table of kind "texture" (everything) or "masked" (an image over UV space, material names,
 or a file of face numbers). Out: a scene with a `Canvas`: textures, the texels that may change, the mesh that shows
-them. Each material carries one texture that is its whole color: base colors are
-multiplied in (to 8-bit rounding the object looks as before), so that a texel reaches every color that paint can have.
-Faces without texture coordinates are unwrapped first (see `unwrap`). Warnings tell of texels that show at several
-places, palettes, vertex colors that go on multiplying, and faces that change although nobody named them. Left out on
-purpose: improving poor texture coordinates; textures keep their own sizes.
+them. Each material carries one texture that is its whole color: base colors are multiplied in (to 8-bit rounding the
+object looks as before), so that a texel reaches every color that paint can have. Faces without texture coordinates are
+unwrapped first (see `unwrap`). Warnings tell of texels that show at several places, palettes, vertex colors that go on
+multiplying, and faces that change although nobody named them. Left out on purpose: improving poor texture coordinates;
+textures keep their own sizes.
 """
 
 from dataclasses import dataclass, replace
