@@ -178,7 +178,7 @@ def _roll(chart: SurfaceChart, near: np.ndarray, size_mm) -> Placement:
     top += LIFT_MM + max(chart.curvature, 0) * cell_mm**2 / 8  # flat cells cut below a round surface
     origin_mm = chart.origin_mm + top * chart.axes[2]
     chart = replace(chart, origin_mm=origin_mm, curvature=chart.curvature / (1 + chart.curvature * top))
-    s, t = (piece_grid(size_mm, PIECE_GRID) @ chart.turn).T
+    (s, t), (right, up) = (piece_grid(size_mm, PIECE_GRID) @ chart.turn).T, chart.turn @ chart.axes[:2]
     return Placement(
         family="cylinder",
         size_mm=tuple(size_mm),
@@ -186,7 +186,7 @@ def _roll(chart: SurfaceChart, near: np.ndarray, size_mm) -> Placement:
         faces=surface_chart.grid_faces(PIECE_GRID, PIECE_GRID),
         piece_mm=piece_grid(size_mm, PIECE_GRID) * [1, -1] + half,
         normals=chart.cartesian(s, t)[1] @ chart.axes,
-        world_from_piece=piece_pose(*chart.turn @ chart.axes[:2], chart.axes[2], origin_mm, size_mm),
+        world_from_piece=piece_pose(right, up, chart.axes[2], origin_mm, size_mm),
         gap_mm=float(np.nanmax(gaps)),
         gap_mean_mm=gap_mean_mm,
         gaps_mm=gaps.reshape(GRID, GRID),
