@@ -33,8 +33,7 @@ from patchproof.base.settings import load_scene_settings
 from patchproof.classifier import load_classifier
 from patchproof.optimizer.problem import set_problem
 from patchproof.render.stage import set_stage
-from patchproof.scene.fitting import largest_fitting_size
-from patchproof.scene.placement import gap_limit_mm
+from patchproof.scene.placement import gap_limit_mm, largest_fitting_size
 from patchproof.scene.scene import load_scene, make_scene
 from patchproof.sheets.blank import blank_page
 

@@ -518,7 +518,7 @@ def icc(place: Place, number: int) -> Use:
 
 
 def mask(place: Place, number: int) -> Use:
-    from patchproof.scene.canvas import _read_faces, _read_mask
+    from patchproof.scene.texture_scene import _read_faces, _read_mask
 
     path = place.given / "m.png"
     if number % 2:

@@ -445,7 +445,7 @@ def corners(rng: Rng, folder: Path) -> Read:
 
 
 def faces_txt(rng: Rng, folder: Path) -> Read:
-    from patchproof.scene.canvas import _read_faces
+    from patchproof.scene.texture_scene import _read_faces
 
     (folder / "faces.txt").write_bytes(broken_lines(rng, FACES))
     return lambda: _read_faces(folder / "faces.txt", 12)
@@ -579,7 +579,7 @@ def onnx_file(rng: Rng, folder: Path) -> Read:
 def mask(rng: Rng, folder: Path) -> Read:
     from patchproof.base.settings import BackgroundSettings
     from patchproof.scene.backgrounds import load_backgrounds
-    from patchproof.scene.canvas import _read_mask
+    from patchproof.scene.texture_scene import _read_mask
 
     pictures = folder / "pictures"
     pictures.mkdir()

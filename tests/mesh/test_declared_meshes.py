@@ -15,7 +15,7 @@ from PIL import Image
 from patchproof.app.keys import declarations
 from patchproof.base.color import linear_from_srgb
 from patchproof.base.errors import Refused
-from patchproof.mesh.load_mesh import load_mesh
+from patchproof.mesh.load_mesh import load_mesh, read_parts
 from patchproof.mesh.mesh import Mesh
 
 Case = Callable[[Path], None]
@@ -169,7 +169,7 @@ def _(folder):
         faces = np.uint16([0, 1, index])[:, None]
         file.primitive(attributes={"POSITION": file.add(SQUARE)}, indices=file.add(faces))
         with pytest.raises(Refused, match=str(index)):
-            load(file.write(folder / "a.gltf"))
+            read_parts(file.write(folder / "a.gltf"), np.eye(3))
     raise Refused("", "", "")
 
 

@@ -13,7 +13,7 @@ import trimesh
 from patchproof.base.settings import PatchSettings
 from patchproof.mesh.export import write_glb
 from patchproof.mesh.load_mesh import load_mesh
-from patchproof.scene.canvas import texture_canvas
+from patchproof.scene.texture_scene import texture_canvas
 
 rng = np.random.default_rng(0)
 

@@ -19,8 +19,8 @@ from patchproof.mesh.mesh import Material, MeshPart, mesh_from_parts
 from patchproof.mesh.unwrap import coverage, has_usable_uv, unwrap
 from patchproof.render.photograph import photograph
 from patchproof.render.stage import set_stage
-from patchproof.scene.canvas import texture_canvas
 from patchproof.scene.scene import make_scene
+from patchproof.scene.texture_scene import texture_canvas
 
 SOUP = np.random.default_rng(0).normal(size=(90, 3))
 

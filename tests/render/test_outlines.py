@@ -15,9 +15,8 @@ from patchproof.base import geometry
 from patchproof.base.color import srgb_from_linear
 from patchproof.mesh.mesh import Material, MeshPart, mesh_from_parts
 from patchproof.render import outlines as module
-from patchproof.render.edges import find_edges
 from patchproof.render.fragments import Cameras
-from patchproof.render.outlines import find_outlines
+from patchproof.render.outlines import find_edges, find_outlines
 from patchproof.render.photograph import shade
 from patchproof.render.raster import rasterize
 from patchproof.render.stage import set_stage

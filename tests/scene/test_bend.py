@@ -1,4 +1,4 @@
-"""Paper on curved surfaces: which family, how far it stretches, how close it lies, and what paper cannot follow."""
+"""Paper on curved surfaces: which family, how close it lies, and what paper cannot follow."""
 
 from __future__ import annotations
 
@@ -9,11 +9,10 @@ import pytest
 
 from patchproof.base.errors import Refused
 from patchproof.base.settings import PatchSettings
-from patchproof.mesh.exponential_map import SmoothSurface, exponential_map, grid_stretch
 from patchproof.mesh.load_mesh import load_mesh
 from patchproof.mesh.mesh import Material, MeshPart, mesh_from_parts
 from patchproof.mesh.surface_chart import SurfaceChart, edge_points, piece_grid, surface_heights, triangles_near
-from patchproof.scene.bend import STRETCH_LIMIT, place_bent
+from patchproof.scene.bent_scene import GAP_LIMIT, place_bent
 from patchproof.scene.placement import LIFT_MM, patch_frame
 
 
@@ -58,7 +57,6 @@ def test_paper_rolls_around_a_can_without_stretch(can):
     """Points of a row are 2 R sin(d / 2R) apart in space, R the paper's radius; columns stay straight."""
     piece = bent(can, (60, 50), side="+z")
     assert piece.family == "cylinder" and not piece.is_flat and "radius 40 mm" in piece.reason
-    assert piece.stretch == pytest.approx(0, abs=1e-6)
     np.testing.assert_allclose(side_errors(piece), 0, atol=1e-3)
     row = piece.world(np.array([[0.0, 25], [30, 25], [60, 25]]))
     radius = np.hypot(row[:, 0], row[:, 2])
@@ -114,29 +112,27 @@ def test_the_inside_of_a_tube_is_a_cylinder_seen_from_inside():
     assert radius.max() < 40 * np.cos(np.pi / 128) - LIFT_MM * 0.5
 
 
-def test_a_small_piece_on_a_ball_stretches_by_the_circumference_defect(ball):
-    """At distance r from the middle, circles are shorter by sin(r/R) / (r/R); r is the half-diagonal."""
-    piece = bent(ball, (30, 30), side="+y")
-    r = 15 * np.sqrt(2) / 100
-    assert piece.family == "exponential"
-    assert piece.stretch == pytest.approx(1 - np.sin(r) / r, rel=0.03)
-    assert 0.001 < np.abs(side_errors(piece)).max() < 0.01
-    assert piece.gap_mm < 0.1 and f"{piece.stretch:.2%}" in piece.reason
+def test_paper_on_a_ball_is_rolled_and_stands_off_where_the_ball_falls_away(ball):
+    """Along the roll's axis paper is straight: the ball, of radius R, falls away by x² / 2R, on average w² / 24R."""
+    piece = bent(ball, (60, 60), side="+y")
+    assert piece.family == "cylinder" and piece.gap_mm == pytest.approx(30**2 / 200, rel=0.15)
+    assert piece.gap_mean_mm == pytest.approx(60**2 / 2400, rel=0.15)
+    np.testing.assert_allclose(side_errors(piece), 0, atol=1e-3)
 
 
-def test_a_larger_piece_on_a_ball_is_refused_with_its_stretch(ball):
-    """K r²/6 of a 60 mm square on a radius of 100: 3 %."""
-    with pytest.raises(Refused, match=r"stretch of at most 1%, got a surface curved both ways, which needs [23]\.\d%"):
-        bent(ball, (60, 60), side="+y")
+def test_a_larger_piece_on_a_ball_is_refused(ball):
+    """w / 24R is 2.7 % at 64 mm and 3.3 % at 80 mm."""
+    assert bent(ball, (64, 64), side="+y").gap_mean_mm <= GAP_LIMIT * 64
+    with pytest.raises(Refused, match=r"at most 3% .* got one curved both ways, or an edge, .* keeps it 2\.\d mm off"):
+        bent(ball, (80, 80), side="+y")
 
 
-def test_a_cone_is_followed_without_stretch():
-    """Paper can lie on a cone though no cylinder can."""
+def test_a_cone_is_followed_closely():
     import trimesh
 
     piece = bent(made(trimesh.creation.cone(80, 160, sections=256)), (60, 60), side="+z", offset_mm=(0, -20))
-    assert piece.family == "exponential" and piece.stretch < 2e-3
-    np.testing.assert_allclose(side_errors(piece), 0, atol=2e-3)
+    assert piece.family == "cylinder" and piece.gap_mean_mm < 0.02 * 60
+    np.testing.assert_allclose(side_errors(piece), 0, atol=1e-3)
 
 
 def test_flat_surfaces_get_a_card_also_where_they_are_tilted():
@@ -237,56 +233,23 @@ def test_edge_points_are_no_farther_apart_than_asked():
     np.testing.assert_allclose(points[:6, 0], [0, 2, 4, 6, 8, 10])
 
 
-def test_the_exponential_map_keeps_distances_from_the_middle():
-    """Lengths along each geodesic, summed in space, equal the sheet's; the surface is a bumpy cylinder."""
-    rng = np.random.default_rng(2)
-    chart = SurfaceChart(np.zeros(3), np.eye(3), 0.02, np.array([1.0, 0]))
-    coefficients = np.triu(rng.normal(size=(5, 5)))[::-1].copy()
-    coefficients[1, 0] = coefficients[0, 1] = 0  # level at the middle
-    surface = SmoothSurface(chart, coefficients, 30.0)
-    ends = rng.normal(size=(20, 2))
-    ends *= 20 / np.linalg.norm(ends, axis=1, keepdims=True)
-    shares = np.linspace(0, 1, 201)
-    paths = exponential_map(
-        surface, (shares[:, None, None] * ends).reshape(-1, 2), np.array([1.0, 0, 0]), np.array([0.0, 1, 0])
-    )
-    points = surface.points_and_normals(*paths.T)[0].reshape(201, 20, 3)
-    lengths = np.linalg.norm(np.diff(points, axis=0), axis=2)
-    np.testing.assert_allclose(lengths.sum(0), 20, rtol=1e-4)
-    np.testing.assert_allclose(lengths, 0.1, rtol=1e-3)  # at constant speed
-    # geodesics: what turns the line is normal to the surface, but for rounding
-    turn = np.diff(points, 2, axis=0)[99]
-    normals = surface.points_and_normals(*paths.reshape(201, 20, 2)[100].T)[1]
-    sideways = turn - (turn * normals).sum(1, keepdims=True) * normals
-    assert np.linalg.norm(sideways, axis=1).max() < 0.01 * np.linalg.norm(turn, axis=1).max()
-
-
-def test_stretch_is_the_largest_in_any_direction():
-    """On a plane whose grid is laid 1 % too long along a diagonal."""
-    chart = SurfaceChart(np.zeros(3), np.eye(3), 0.0, np.array([1.0, 0]))
-    flat = SmoothSurface(chart, np.zeros((1, 1)), 1.0)
-    laid = piece_grid((40, 30), 5) @ (np.eye(2) + 0.01 * np.full((2, 2), 0.5))
-    assert grid_stretch(flat, piece_grid((40, 30), 5), (40, 30), 5).max() == pytest.approx(0, abs=1e-12)
-    assert grid_stretch(flat, laid, (40, 30), 5).max() == pytest.approx(0.01, rel=1e-6)
-
-
 @pytest.mark.parametrize(
     ("name", "length", "up", "patch", "size", "family"),
     [
         ("mug_mujoco", 120, "y", {"side": "-x", "spin_deg": 20}, (60, 40), "cylinder"),
         ("mug_mujoco", 120, "y", {"side": "+z"}, (50, 50), "cylinder"),
         ("gz_cardboard_box", 500, "z", {"side": "+z"}, (100, 100), "card"),
-        ("banana_ycb", 190, "z", {"side": "+z"}, (15, 15), "exponential"),
-        ("teapot", 250, "y", {"side": "+z"}, (25, 25), "exponential"),
+        ("banana_ycb", 190, "z", {"side": "+z"}, (15, 15), "cylinder"),
+        ("teapot", 250, "y", {"side": "+z"}, (25, 25), "cylinder"),
     ],
 )
 def test_real_objects(data, name, length, up, patch, size, family):
     """Sides within 1 % of the sheet's, and nothing of the object over the paper."""
     mesh = load_mesh(data / "meshes" / f"{name}.glb", length, up)
     piece = bent(mesh, size, **patch)
-    assert piece.family == family and piece.stretch <= STRETCH_LIMIT
+    assert piece.family == family
     assert np.abs(side_errors(piece)).max() < 0.01
-    assert piece.overhang_share == 0 and piece.gap_mean_mm < 0.25
+    assert piece.overhang_share == 0 and piece.gap_mean_mm < 0.4
     assert _highest_over(mesh, piece) < -LIFT_MM / 2
 
 

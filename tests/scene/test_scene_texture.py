@@ -15,7 +15,7 @@ from patchproof.base.settings import PatchSettings
 from patchproof.mesh.load_mesh import load_mesh
 from patchproof.mesh.mesh import Material, MeshPart, mesh_from_parts
 from patchproof.mesh.unwrap import coverage, texels_per_face
-from patchproof.scene.canvas import texture_canvas
+from patchproof.scene.texture_scene import texture_canvas
 
 HERE = Path(".")
 WHOLE = PatchSettings(kind="texture")

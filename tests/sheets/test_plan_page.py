@@ -12,10 +12,7 @@ from conftest import SCENE
 from patchproof.base.errors import Refused
 from patchproof.base.settings import load_scene_settings
 from patchproof.reprints.plan_view import draw_plan_view
-from patchproof.reprints.run_sheet import _wrapping
 from patchproof.reprints.shot_plan import shot_sections
-from patchproof.scene.placement import patch_frame
-from patchproof.scene.tape_measure import measure_tapes
 from patchproof.sheets.plan_page import PlacementPicture, PlanPage, edge_distances_mm, lay_out_plan, wrap_text
 from patchproof.sheets.template import load_template
 from test_benefit_shown import promise_with
@@ -91,59 +88,20 @@ def test_words_that_do_not_fit_the_page_are_refused():
     assert wrap_text("one two three", 2.6, 8.0) == ["one", "two", "three"]
 
 
-def standing(tmp_path, mesh, width, height, bend, **patch):
-    """A mesh as it is, in millimeters and standing on y = 0, with a piece on its +z side."""
-    mesh.export(tmp_path / "object.ply")
-    lines = "\n".join(f"{key} = {value}" for key, value in patch.items())
-    text = SCENE.replace("primitive:carton", "object.ply").replace("= 300", f"= {mesh.extents.max()}")
-    text = text.replace("height_mm = 90", f"height_mm = {height}\nbend = {str(bend).lower()}\n{lines}")
-    return scene_of(tmp_path, text.replace("width_mm = 90", f"width_mm = {width}"))
-
-
-def measured(scene):
-    found = measure_tapes(scene.mesh, scene.placement, patch_frame(scene.mesh, scene.settings.patch).normal)
-    return {tape.edge: (tape.length_mm, tape.end) for tape in found}
-
-
-@pytest.mark.parametrize("spin", [0, 90])
-def test_tapes_on_a_can_run_to_its_rim_its_ground_and_round_to_its_outline(tmp_path, spin):
+def test_bent_paper_on_a_can_is_drawn_as_one_sees_it(tmp_path):
     can = trimesh.creation.cylinder(50, 200, sections=256)
     can.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0]))
-    scene = standing(tmp_path, can, 70, 60, True, offset_mm="[0, 20]", spin_deg=spin)
-    assert scene.placement.family == "cylinder"
-    across, along = (70, 60) if spin == 0 else (60, 70)
-    # the can's middle is 100 mm from rim and ground, the piece's 20 mm higher; a quarter of its girth is 78.5 mm
-    up, down, round_it = 80 - along / 2, 120 - along / 2, 50 * np.pi / 2 - across / 2
-    names = ("top", "right", "bottom", "left") if spin == 0 else ("left", "top", "right", "bottom")
-    lengths, ends, found = (up, round_it, down, round_it), ("top", "outline", "ground", "outline"), measured(scene)
-    for name, length, end in zip(names, lengths, ends, strict=True):
-        # the last step before the outline, a fifteenth of a millimeter in the picture, is 2.6 mm of the can
-        assert found[name][0] == pytest.approx(length, abs=3.0 if end == "outline" else 0.3), name
-        assert found[name][1] == f"to the {end}"
-    text = _wrapping(scene)
-    assert "Wrap the piece round the object" in text and f"{names[0]} {up:.0f} mm to the top" in text
-
-
-@pytest.mark.parametrize(("degrees", "length", "end"), [(30, 30 + 60, "to the top"), (50, 30, "to an edge")])
-def test_a_tape_goes_on_over_a_bend_and_ends_at_an_edge(tmp_path, degrees, length, end):
-    """A wall 160 mm wide, upright for 100 mm and leaning back for 60 more; the piece ends 30 mm below the bend."""
-    back, up = 60 * np.sin(np.radians(degrees)), 60 * np.cos(np.radians(degrees))
-    side = [(0, 0), (100, 0), (100 + up, -back), (100 + up, -120), (0, -120)]
-    wall = trimesh.PointCloud([(x, y, z) for x in (-80, 80) for y, z in side]).convex_hull
-    scene = standing(tmp_path, wall, 40, 40, False, offset_mm=f"[0, {50 - (100 + up) / 2}]")
-    assert measured(scene) == {
-        "top": (pytest.approx(length, abs=0.5), end),
-        "bottom": (pytest.approx(30, abs=0.2), "to the ground"),
-        "left": (pytest.approx(60, abs=0.2), "to the outline"),
-        "right": (pytest.approx(60, abs=0.2), "to the outline"),
-    }
-
-
-def test_a_piece_that_ends_behind_the_outline_is_measured_where_it_can_be_seen(tmp_path):
-    can = trimesh.creation.cylinder(30, 200, sections=128)
-    can.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0]))
-    found = measured(standing(tmp_path, can, 120, 60, True))  # round 229 degrees
-    assert set(found) == {"top", "bottom"} and found["top"][0] == pytest.approx(70, abs=0.3)
+    can.export(tmp_path / "object.ply")
+    text = (
+        SCENE.replace("primitive:carton", "object.ply")
+        .replace("= 300", "= 200")
+        .replace("width_mm = 90", "width_mm = 70")
+    )
+    text = text.replace("height_mm = 90", "height_mm = 60\nbend = true\noffset_mm = [0, 20]")
+    found = edge_distances_mm(draw_plan_view(scene_of(tmp_path, text), A4))
+    # the can's middle is 100 mm from rim and ground, the piece's 20 mm higher; it reaches 35 mm round a radius of 50
+    assert (found["top"], found["bottom"]) == (pytest.approx(50, abs=0.3), pytest.approx(90, abs=0.3))
+    assert (found["left"], found["right"]) == (pytest.approx(50 - 50 * np.sin(0.7), abs=0.3),) * 2
 
 
 @pytest.mark.parametrize(

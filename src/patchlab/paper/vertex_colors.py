@@ -24,8 +24,7 @@ from patchproof.optimizer.problem import Problem
 from patchproof.optimizer.texture import Texture
 from patchproof.render.pixels import ObjectTextures
 from patchproof.render.stage import set_stage
-from patchproof.scene.canvas import GUTTER_TEXELS, select_faces, texture_canvas
-from patchproof.scene.texture_scene import TextureScene
+from patchproof.scene.texture_scene import GUTTER_TEXELS, TextureScene, select_faces, texture_canvas
 
 _TEXELS = 512  # side of the texture that carries the colors
 

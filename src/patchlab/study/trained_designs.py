@@ -37,9 +37,8 @@ from patchproof.optimizer.responses import responses
 from patchproof.optimizer.texture import Texture
 from patchproof.render.photograph import Appearance, shade
 from patchproof.render.stage import set_stage
-from patchproof.scene.canvas import texture_canvas
 from patchproof.scene.conditions import Conditions, with_values
-from patchproof.scene.texture_scene import TextureScene
+from patchproof.scene.texture_scene import TextureScene, texture_canvas
 
 SceneVariant = dict[str, dict[str, Any]]  # tables of a scene file with the keys that change
 NamePart = Annotated[str, Field(pattern=r"^[\w=+,-]{1,24}$")]  # part of a file's name

@@ -57,15 +57,6 @@ class ObjectSettings(StrictModel):
         return self
 
 
-class SearchSettings(StrictModel):
-    """Where the piece may be placed with `place = "auto"`; it never overhangs the object by more than 2 %."""
-
-    upright: bool = False  # never rotate the piece in its plane
-    keep_off: tuple[str, ...] = ()  # names of materials that the piece may not cover
-    keep_off_faces: str | None = None  # a text file with the numbers of the faces that the piece may not cover
-    gap_mm: Positive | None = None  # largest distance from piece to surface; 15 % of the piece's shorter edge
-
-
 class PatchSettings(StrictModel):
     """The design to optimize. A patch has a size and a place; `offset_mm` is [right, up] for a viewer who faces the
     side. A texture covers the object's own UV map or vertices, `masked` only the part that mask, materials or faces
@@ -77,7 +68,6 @@ class PatchSettings(StrictModel):
     kind: Literal["patch", "texture", "masked"] = "patch"  # a printed piece, or the object's own texture
     # "given": set by side, offset_mm, at_mm and spin_deg; "auto": the place where drafts of the design do best.
     place: Literal["given", "auto"] = "given"
-    search: SearchSettings = SearchSettings()
     side: Side = "+x"  # the object's side that carries the patch; with place = "auto" the one that azimuth 0 faces
     offset_mm: tuple[Finite, Finite] = (0.0, 0.0)  # [right, up] from the side's middle for a viewer who faces it
     at_mm: tuple[Finite, Finite, Finite] | None = None  # a point in the scene instead of a side's middle
@@ -118,8 +108,6 @@ class PatchSettings(StrictModel):
                 raise ValueError('takes place = "auto" with kind = "patch" only')
             if self.at_mm is not None or any(self.offset_mm) or self.spin_deg:
                 raise ValueError('takes at_mm, offset_mm and spin_deg with place = "given" only')
-        elif self.search != SearchSettings():
-            raise ValueError('takes search with place = "auto" only')
         return self
 
 
@@ -313,5 +301,4 @@ def named_paths(settings: SceneSettings, base: Path) -> dict[str, Path]:
     names = {f"object.{name}": getattr(thing, name) for name in ("mesh", "photos", "sheet", "images", "labels")}
     names |= {"patch.mask": patch.mask, "patch.faces": patch.faces}
     names |= {"background.images": settings.background.images}
-    names |= {"patch.search.keep_off_faces": patch.search.keep_off_faces}
     return {key: Path(expand_path(name, base)) for key, name in names.items() if name is not None}

@@ -14,9 +14,8 @@ import numpy as np
 from patchproof.base.errors import Refused
 from patchproof.base.input import MAX_FILE_BYTES
 from patchproof.base.validation import summarize_names
-from patchproof.mesh.assets import VERTEX_COLORS, WHITE, Assets, Wrap
+from patchproof.mesh.assets import VERTEX_COLORS, WHITE, Assets, Wrap, draw_out_textures
 from patchproof.mesh.declarations import DECLARED
-from patchproof.mesh.drawn_textures import draw_out_textures
 from patchproof.mesh.mesh import MOST_FACES, Material, MeshPart, transform_part
 
 _TYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}

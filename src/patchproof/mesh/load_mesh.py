@@ -20,7 +20,7 @@ import numpy as np
 from patchproof.base.errors import Refused
 from patchproof.base.input import is_file, run_within_seconds
 from patchproof.base.resample import downscale
-from patchproof.mesh.mesh import Material, Mesh, MeshPart, mesh_from_parts, topology_warnings, transform_part
+from patchproof.mesh.mesh import Material, Mesh, MeshPart, mesh_from_parts, transform_part
 
 if TYPE_CHECKING:
     from patchproof.mesh.assets import Assets
@@ -93,7 +93,11 @@ def read_parts(path: Path, world_from_file: np.ndarray) -> tuple[list[MeshPart],
         parts = [transform_part(part, world_from_file) for part in parts if len(part.faces)]
         if not parts:
             raise Refused("a mesh with faces", f"no face in {path.name}", "export the object as triangles")
-        return parts, [*assets.warnings, *topology_warnings(parts)], assets.files
+        for part in parts:
+            if part.faces.min() < 0 or part.faces.max() >= len(part.vertices):
+                got, last = f"{part.faces.min()} to {part.faces.max()} in {path.name}", len(part.vertices) - 1
+                raise Refused(f"faces that name vertices 0 to {last}", got, "export the mesh again")
+        return parts, [*assets.warnings], assets.files
     except Refused:
         raise
     except Exception as error:  # broken files raise many types of error

@@ -97,10 +97,6 @@ def mesh_from_parts(parts: Sequence[MeshPart], length_mm: float, warnings: Seque
 
 def _join(parts: Sequence[MeshPart]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return all vertices, all faces as indices into them, and the part that each face belongs to."""
-    for part in parts:
-        if len(part.faces) and (part.faces.min() < 0 or part.faces.max() >= len(part.vertices)):
-            last = len(part.vertices) - 1
-            raise Refused(f"faces that name vertices 0 to {last}", f"{part.faces.max()}", "export the mesh again")
     starts = np.cumsum([0] + [len(part.vertices) for part in parts])
     vertices = np.concatenate([np.asarray(part.vertices, float) for part in parts])
     faces = np.concatenate([np.asarray(part.faces, np.int64) + s for part, s in zip(parts, starts, strict=False)])
@@ -151,24 +147,6 @@ def normal_transform(rotation: np.ndarray) -> np.ndarray:
     a, b, c = rotation
     cofactors = np.array([np.cross(b, c), np.cross(c, a), np.cross(a, b)])
     return -cofactors if np.linalg.det(rotation) < 0 else cofactors
-
-
-def topology_warnings(parts: Sequence[MeshPart]) -> list[str]:
-    """Warn of loose triangles and of edges of more than two faces; vertices at equal positions count as one."""
-    loose = crowded = edges = 0
-    for part in parts:
-        corners = position_numbers(part.vertices)[part.faces]
-        pairs = np.sort(np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]), axis=1)
-        count = np.unique(pairs[:, 0] * (len(part.vertices) + 1) + pairs[:, 1], return_counts=True)[1]
-        loose += np.count_nonzero(count == 1)
-        crowded += np.count_nonzero(count > 2)
-        edges += len(count)
-    warnings = []
-    if edges > 5 and loose > 0.9 * edges:  # more than two triangles that share hardly an edge
-        warnings.append("the mesh is a soup of loose triangles; each is drawn as it is")
-    if crowded:
-        warnings.append(f"{crowded} edges belong to more than two faces (not a manifold); faces are drawn as they are")
-    return warnings
 
 
 def position_numbers(vertices: np.ndarray) -> np.ndarray:

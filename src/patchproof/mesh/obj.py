@@ -8,7 +8,6 @@ used and others are said. Left out on purpose: curves, surfaces, smoothing group
 
 from array import array
 from collections import Counter, defaultdict
-from collections.abc import Sequence
 from itertools import takewhile
 from pathlib import Path
 
@@ -17,8 +16,7 @@ import numpy as np
 from patchproof.base.color import linear_from_srgb
 from patchproof.base.errors import Refused
 from patchproof.base.validation import summarize_names
-from patchproof.mesh.assets import VERTEX_COLORS, WHITE, Assets, Wrap
-from patchproof.mesh.drawn_textures import draw_out_textures
+from patchproof.mesh.assets import VERTEX_COLORS, WHITE, Assets, Wrap, draw_out_textures
 from patchproof.mesh.mesh import Material, MeshPart, triangulate
 
 _MAPS = ("map_", "bump", "norm", "disp", "decal", "refl")
@@ -26,6 +24,7 @@ _MOST_NUMBERS = {"-mm": 2, "-s": 3, "-o": 3, "-t": 3}  # after an option; others
 _OPTIONS_WITHOUT_EFFECT = ("-blendu on", "-blendv on", "-cc off", "-boost 0", "-t 0", "-t 0 0", "-t 0 0 0")
 _WIDTHS = {"v": 7, "vt": 2, "vn": 3}  # numbers that are kept of a row: v has x, y, z, and w or a color
 _WITHOUT_EFFECT = ("o", "g", "mg", "s")
+_Faces = tuple[dict[str, int], "array[int]", "array[int]"]
 
 
 def logical_lines(data: bytes) -> list[str]:
@@ -39,7 +38,7 @@ class MaterialLibrary:
 
     def __init__(self, assets: Assets):
         self.assets, self.wraps = assets, dict[Material, tuple[Wrap, Wrap]]()
-        self._entries: dict[str, tuple[Path | None, dict[str, str]]] = {}
+        self.entries: dict[str, tuple[Path | None, dict[str, str]]] = {}
         self._made: dict[tuple[str, bool], tuple[Material, np.ndarray, np.ndarray]] = {}
 
     def read(self, names: str) -> None:
@@ -51,19 +50,14 @@ class MaterialLibrary:
             for line in logical_lines(self.assets.read(name)) if path else ():
                 key, value = [*line.split(None, 1), "", ""][:2]
                 if key == "newmtl":
-                    values = self._entries.setdefault(value.strip(), (path and path.parent, {}))[1]
+                    values = self.entries.setdefault(value.strip(), (path and path.parent, {}))[1]
                 else:
                     values[key.lower()] = value.strip()
-
-    def check_names(self, names: Sequence[str]) -> None:
-        """Warn of materials that are used and that no file defines."""
-        if undefined := [name for name in dict.fromkeys(names) if name and name not in self._entries]:
-            self.assets.say(f"no MTL file defines {summarize_names(undefined)}")
 
     def material(self, name: str, has_uv: bool, has_colors: bool) -> tuple[Material, np.ndarray, np.ndarray]:
         """Return a material, made once, and the scale and shift of its texture coordinates."""
         if (name, has_uv) not in self._made:
-            folder, values = self._entries.get(name, (None, {}))
+            folder, values = self.entries.get(name, (None, {}))
             texture, (options, file_name) = None, _options(values.get("map_kd", ""))
             if file_name and has_uv:
                 base, gain = _numbers(options.get("-mm", "0 1"))
@@ -123,18 +117,13 @@ def _is_number(word: str) -> bool:
         return False
 
 
-class _Faces:
-    """Faces of one material: each different corner v/vt/vn by its number, and the polygons' corners, joined."""
-
-    def __init__(self):
-        self.numbers, self.corners, self.lengths = dict[str, int](), array("q"), array("q")
-
-
 def read_obj(assets: Assets) -> list[MeshPart]:
     """Read the parts of an OBJ file."""
     library, left_out, widths = MaterialLibrary(assets), Counter[str](), set[int]()
     rows = {key: array("d") for key in _WIDTHS}
-    groups = defaultdict[tuple[str, bool], _Faces](_Faces)  # by material, and if corners have texture coordinates
+    # by material, and if corners have texture coordinates: the numbers of different corners v/vt/vn, the polygons'
+    # corners, joined, and how many each has
+    groups = defaultdict[tuple[str, bool], _Faces](lambda: ({}, array("q"), array("q")))
     material, is_smooth = "", False
     for number, line in enumerate(logical_lines(assets.data), 1):
         key, rest = [*line.split(None, 1), "", ""][:2]
@@ -148,9 +137,9 @@ def read_obj(assets: Assets) -> list[MeshPart]:
                 raise Refused("faces with at least three corners", got, "the file may be cut short, export it again")
             if "-" in rest:
                 words = [_absolute(word, rows) for word in words]
-            faces = groups[material, "/" in words[0] and "//" not in rest]
-            faces.corners.extend([faces.numbers.setdefault(word, len(faces.numbers)) for word in words])
-            faces.lengths.append(len(words))
+            numbers, corners, lengths = groups[material, "/" in words[0] and "//" not in rest]
+            corners.extend([numbers.setdefault(word, len(numbers)) for word in words])
+            lengths.append(len(words))
         elif key == "usemtl":
             material = rest.strip()
         elif key == "mtllib":
@@ -165,7 +154,10 @@ def read_obj(assets: Assets) -> list[MeshPart]:
         assets.say("smoothing groups are left out: faces without normals are drawn flat")
     if widths - {3, 6, 7} or len(widths) > 1:
         assets.say("weights of vertices, and colors of only some vertices, are left out")
-    library.check_names([name for name, _ in groups])
+    if undefined := [
+        name for name in dict.fromkeys(name for name, _ in groups) if name and name not in library.entries
+    ]:
+        assets.say(f"no MTL file defines {summarize_names(undefined)}")
     # row 0 is for corners without a number
     tables = [np.insert(np.reshape(rows[key], (-1, width)), 0, np.nan, axis=0) for key, width in _WIDTHS.items()]
     if widths in ({6}, {7}):
@@ -182,14 +174,15 @@ def _absolute(corner: str, rows: dict[str, array]) -> str:
 
 def _part(key: tuple[str, bool], faces: _Faces, tables: list[np.ndarray], library: MaterialLibrary) -> MeshPart:
     """Return the part of some faces with one material; `tables` are those of v, vt and vn, and of colors if any."""
-    corners = np.array([[int(number or 0) for number in f"{corner}//".split("/")[:3]] for corner in faces.numbers])
+    numbers, polygons, lengths = faces
+    corners = np.array([[int(number or 0) for number in f"{corner}//".split("/")[:3]] for corner in numbers])
     for table, column, kind in zip(tables, corners.T, _WIDTHS, strict=False):
         low, high = column.min(), column.max()
         if low < (kind == "v") or high >= len(table):
             got = f"{high if high >= len(table) else low} in {library.assets.path.name}"
             raise Refused(f"faces that name {kind} 1 to {len(table) - 1}", got, "export the mesh again")
     vertices, uv, normals, *colors = (table[corners[:, i % 3]] for i, table in enumerate(tables))
-    triangles = triangulate(np.array(faces.corners), np.array(faces.lengths), vertices[:, :3])
+    triangles = triangulate(np.array(polygons), np.array(lengths), vertices[:, :3])
     material, scale, shift = library.material(*key, bool(colors))
     if colors and material.texture_srgb is not None:
         library.assets.say("vertex colors are left out where there is a texture")

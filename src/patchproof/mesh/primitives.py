@@ -21,16 +21,13 @@ def primitive_names() -> tuple[str, ...]:
 def build(name: str, seed: int = 0) -> Mesh:
     """Make one object; the same name and seed give the same arrays."""
     object_parts = parts(name, seed)
-    return mesh_from_parts(object_parts, _longest_extent(object_parts))
+    vertices = np.concatenate([part.vertices for part in object_parts])
+    return mesh_from_parts(object_parts, float(np.ptp(vertices, axis=0).max()))
 
 
 def longest_mm(name: str) -> float:
     """Return the longest extent of one object with seed 0, in whole millimeters."""
-    return float(round(_longest_extent(parts(name))))
-
-
-def _longest_extent(object_parts: list[MeshPart]) -> float:
-    return float(np.ptp(np.concatenate([part.vertices for part in object_parts]), axis=0).max())
+    return float(round(np.ptp(build(name).vertices, axis=0).max()))
 
 
 def parts(name: str, seed: int = 0) -> list[MeshPart]:

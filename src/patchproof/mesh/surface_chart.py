@@ -67,6 +67,12 @@ def piece_grid(size_mm: tuple[float, float], n: int) -> np.ndarray:
     return np.stack([across.ravel(), along.ravel()], 1)
 
 
+def grid_faces(columns: int, rows: int) -> np.ndarray:
+    """Return two triangles per cell of a grid by rows from the top, counter-clockwise as one faces it."""
+    a = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).reshape(-1, 1)
+    return np.concatenate([a + np.array([0, columns, columns + 1]), a + np.array([0, columns + 1, 1])])
+
+
 def surface_heights(
     chart: SurfaceChart, triangles: np.ndarray, size_mm, n: int, window=(-np.inf, np.inf)
 ) -> np.ndarray:

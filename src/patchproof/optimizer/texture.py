@@ -25,8 +25,8 @@ from patchproof.optimizer import subject
 from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.render.designs import LearnedTextures
 from patchproof.render.pixels import ObjectTextures
-from patchproof.scene.canvas import Canvas
 from patchproof.scene.interface import Scene
+from patchproof.scene.texture_scene import Canvas
 from patchproof.sheets.piece import CELLS, control_design
 
 

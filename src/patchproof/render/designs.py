@@ -19,7 +19,7 @@ from patchproof.render.pixels import ObjectTextures, PiecePicture
 from patchproof.sheets.piece import Piece, marker_image, with_ids
 
 if TYPE_CHECKING:
-    from patchproof.scene.canvas import Canvas
+    from patchproof.scene.texture_scene import Canvas
 
 
 @dataclass(frozen=True, eq=False)

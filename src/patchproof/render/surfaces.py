@@ -14,8 +14,9 @@ from torch import Tensor
 
 from patchproof.base.color import linear_from_srgb
 from patchproof.mesh.mesh import Mesh
+from patchproof.mesh.surface_chart import grid_faces
 from patchproof.render.atlas import atlas_layout, atlas_table
-from patchproof.render.edges import Edges, find_edges
+from patchproof.render.outlines import Edges, find_edges
 from patchproof.render.texture import TexelLayout, texel_layout, texel_table
 from patchproof.scene.interface import PieceScene
 
@@ -110,11 +111,8 @@ def piece_surface(scene: PieceScene, device: torch.device) -> PieceSurface:
     for axis, (side, count) in enumerate(zip(size_mm[::-1], (rows, columns), strict=True)):
         grid = _extend_grid(grid, axis, MARGIN_SHARE * side / (side / (count - 1)))
     rows, columns = grid.shape[:2]
-    corner = np.arange(rows * columns).reshape(rows, columns)
-    a, b, c, d = corner[:-1, :-1], corner[:-1, 1:], corner[1:, 1:], corner[1:, :-1]
-    faces = np.concatenate([np.stack(half, -1).reshape(-1, 3) for half in ((a, d, c), (a, c, b))])
     flat = torch.as_tensor(grid.reshape(-1, 8), device=device)
-    faces = torch.as_tensor(faces, device=device)
+    faces = torch.as_tensor(grid_faces(columns, rows), device=device)
     at_corners = flat.float()[faces]
     return PieceSurface(flat[:, :3].contiguous(), faces, at_corners[..., 6:], at_corners[..., 3:6], size_mm)
 

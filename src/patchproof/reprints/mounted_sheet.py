@@ -30,7 +30,7 @@ from patchproof.render.stage import Stage, set_stage
 from patchproof.report.coco import PATCH
 from patchproof.scene.conditions import Conditions, fields_of
 from patchproof.scene.interface import PieceScene, Scene, require_piece
-from patchproof.scene.patch_scene import PatchScene
+from patchproof.scene.patch_scene import PatchScene, require_patch
 from patchproof.sheets.manifest import Manifest, load_manifest
 from patchproof.sheets.pdf_raster import attached_manifests, rasterize_piece
 
@@ -151,8 +151,10 @@ def mount_sheet(pdf_path: str | Path, run: Run, how: ReprintSetup = DEFAULT_SETU
     """Mount the PDF's sheet on the object of its run; refused if the sheet is not of this run."""
     manifest, scene = sheet_scene(pdf_path, run)
     sent_srgb = sent_pixels(pdf_path, manifest, scene)
-    stage = set_stage(require_piece(scene).with_print_scale(how.print_scale))
-    return MountedSheet(stage, manifest, sent_srgb, how.printer_for(scene), how)
+    printed = require_piece(scene)
+    if how.print_scale != (1.0, 1.0):
+        printed = require_patch(scene, "a mesh, to change the print's size").with_print_scale(how.print_scale)
+    return MountedSheet(set_stage(printed), manifest, sent_srgb, how.printer_for(scene), how)
 
 
 def sheet_scene(pdf_path: str | Path, run: Run) -> tuple[Manifest, Scene]:

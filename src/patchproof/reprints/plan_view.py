@@ -1,14 +1,12 @@
 """Draw where the piece goes on the object: a picture of the object's side, and distances to its edges.
 
 In: a scene with a mesh and its piece. Out: a `PlacementPicture` for the sheet's last page, with millimeters to the
-object's edges or, for bent paper, along its surface. The picture is rendered from a distance of 60 times the object's
-length, at which perspective moves nothing by more than 1 % of the object's depth.
+object's edges. The picture is rendered from a distance of 60 times the object's length, at which perspective moves
+nothing by more than 1 % of the object's depth.
 """
 
-from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -27,11 +25,8 @@ from patchproof.scene.conditions import Conditions
 from patchproof.scene.mesh_scene import require_mesh
 from patchproof.scene.patch_scene import PatchScene
 from patchproof.scene.placement import SurfaceFrame, patch_frame
-from patchproof.sheets.plan_page import DimensionSpan, PlacementPicture
+from patchproof.sheets.plan_page import PlacementPicture
 from patchproof.sheets.template import Template
-
-if TYPE_CHECKING:
-    from patchproof.scene.tape_measure import TapeMeasurement
 
 DISTANCE_LENGTHS = 60.0  # of the camera, over the object's length
 PICTURE_PX = 600  # along the longer side
@@ -61,11 +56,6 @@ def draw_plan_view(scene: PatchScene, template: Template) -> PlacementPicture:
         corners = project(placement.world(rect_corners(tile.part_mm)))
         seams += [(tuple(corners[1]), tuple(corners[2])), (tuple(corners[2]), tuple(corners[3]))]
         names.append((tuple(corners.mean(0)), tile.name))
-    spans = None
-    if not placement.is_flat:
-        tapes = scene.tape_measurements()
-        spans = _spans(tapes, project)
-        seams += [tuple(map(tuple, project(tape.points_mm[[0, -1]]))) for tape in tapes]
     return PlacementPicture(
         picture=plan_picture(set_stage(scene), scene.frame, half),
         picture_mm=(-half[0], -half[1], 2 * half[0], 2 * half[1]),
@@ -73,22 +63,7 @@ def draw_plan_view(scene: PatchScene, template: Template) -> PlacementPicture:
         outline_mm=tuple(map(tuple, outline)),
         seams_mm=tuple(seams),
         names_mm=tuple(names),
-        dimension_chains=spans,
     )
-
-
-def _spans(
-    tapes: "Sequence[TapeMeasurement]", project: Callable[[np.ndarray], np.ndarray]
-) -> tuple[tuple[DimensionSpan, ...], tuple[DimensionSpan, ...]]:
-    """Split tapes into those that run across the picture, from the left, and those that run down, from the top."""
-    spans: tuple[list[DimensionSpan], list[DimensionSpan]] = ([], [])
-    for tape in tapes:
-        start, end = project(tape.points_mm[[0, -1]])
-        axis = int(np.abs(end - start).argmax())
-        ends = sorted((float(start[axis]), float(end[axis])))
-        spans[axis].append(DimensionSpan((ends[0], ends[1]), tape.length_mm, tape.end))
-    across, down = (tuple(sorted(each, key=lambda span: span.ends_mm)) for each in spans)
-    return across, down
 
 
 def plan_picture(

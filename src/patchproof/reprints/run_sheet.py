@@ -130,9 +130,11 @@ def plan_of(scene: PieceScene, template: Template, content: SheetContent) -> Pla
         picture = draw_plan_view(patch, template)
         facing = f"the object's {settings.side} side" if settings.at_mm is None else "the place where the piece goes"
         lines = [
-            f"Seen as you face {facing}. {_edge_distances(picture) if patch.placement.is_flat else _wrapping(patch)}",
+            f"Seen as you face {facing}. {_edge_distances(picture)}",
             f"The piece is {size_text(scene.piece.size_mm)} mm; {scene.placement_summary()['reason']}.",
         ]
+        if not patch.placement.is_flat:
+            lines.append("Wrap it round the object from its middle outwards, without folds or air under it.")
         if template.tiles is not None:
             lines.append(
                 "Glue from the top left to the bottom right on a flat table: each tile covers the white flaps of its "
@@ -151,13 +153,3 @@ def plan_of(scene: PieceScene, template: Template, content: SheetContent) -> Pla
 def _edge_distances(picture: PlacementPicture) -> str:
     edges = ", ".join(f"{name} {mm:.0f} mm" for name, mm in edge_distances_mm(picture).items())
     return f"From the piece's cut edge to the outermost edges of that side: {edges}."
-
-
-def _wrapping(scene: PatchScene) -> str:
-    """Say how bent paper goes on the object, with distances by tape measure."""
-    tapes = scene.tape_measurements()
-    text = "Wrap the piece round the object from its middle outwards, its top edge up, without folds or air under it."
-    if not tapes:
-        return text
-    lengths = ", ".join(f"{tape.edge} {tape.length_mm:.0f} mm {tape.end}" for tape in tapes)
-    return f"{text} Lay a tape on the surface, straight on from the middle of each of the piece's edges: {lengths}."

@@ -62,8 +62,6 @@ def procedural_place(number: int) -> np.ndarray:
 
 def _room(rng: np.random.Generator, px: int) -> np.ndarray:
     """Render the view of a pinhole camera that stands one unit above a floor."""
-    import cv2
-
     ray = _rays(rng, px)
     depth = np.full(ray.shape[1], _SKY_DISTANCE, np.float32)
     picture = (_paint(rng) * (1.2 - 0.5 * np.clip(ray[1, :, None], 0, 1))).astype(np.float32)

@@ -1,10 +1,10 @@
 """Candidate places for a piece, spread evenly over an object's surface.
 
-In: an `UnplacedScene`, whose `patch.search` holds the requirements. Out: `CandidatePlace`s for
-`UnplacedScene.with_piece_at`. Points are sampled evenly over the surface (the same for the same seed) and left out if
-hardly any view faces them. From each, the piece is moved until one level part of the surface lies under it, and placed
-there as a piece with a given place is. A piece that is refused, overhangs, stands off too far or lies on a part to be
-kept free is no candidate. Left out on purpose: objects in front of a place. The networks will tell.
+In: an `UnplacedScene`. Out: `CandidatePlace`s for `UnplacedScene.with_piece_at`. Points are sampled evenly over the
+surface (the same for the same seed) and left out if hardly any view faces them. From each, the piece is moved until one
+level part of the surface lies under it, and placed there as a piece with a given place is. A piece that is refused,
+overhangs or stands off too far is no candidate. Left out on purpose: objects in front of a place. The networks will
+tell.
 """
 
 from collections.abc import Sequence
@@ -18,12 +18,17 @@ from patchproof.base.errors import Refused
 from patchproof.base.geometry import camera_centers
 from patchproof.base.validation import Side
 from patchproof.mesh.surface_chart import SurfaceChart, piece_grid, surface_heights, triangles_near
-from patchproof.scene import placement
-from patchproof.scene.bend import placement_method
-from patchproof.scene.canvas import select_faces
-from patchproof.scene.fitting import place_if_close
+from patchproof.scene.bent_scene import placement_method
 from patchproof.scene.patch_scene import PiecePosition
-from patchproof.scene.placement import Placement, SurfaceFrame, patch_frame, spun_axes, surface_frame
+from patchproof.scene.placement import (
+    Placement,
+    SurfaceFrame,
+    gap_limit_mm,
+    patch_frame,
+    place_if_close,
+    spun_axes,
+    surface_frame,
+)
 from patchproof.scene.unplaced_scene import UnplacedScene
 
 MIN_DISTANCE_SHARE = 0.5  # of the piece's shorter edge, between two candidates
@@ -56,7 +61,7 @@ class PlaceFinder:
         candidates = sides + [spot for frame in self._frames_to_try if (spot := self._upright_first(frame)) is not None]
         if not candidates:
             expected = f"a place for a piece of {self.size_mm[0]:.0f} × {self.size_mm[1]:.0f} mm that views face"
-            remedy = "make it smaller, let it bend, or relax patch.search"
+            remedy = "make it smaller, or let it bend"
             raise Refused(expected, f"{len(self._frames_to_try)} places at which it does not fit", remedy)
         middles = np.array([spot.placement.center_mm for spot in candidates])
         normals = np.array([spot.placement.normal for spot in candidates])
@@ -78,8 +83,6 @@ class PlaceFinder:
     def _spins(self) -> tuple[float, ...]:
         """Spins that differ: a design may be drawn upside down, and on a square sideways, too."""
         width, height = self.size_mm
-        if self.scene.settings.patch.search.upright:
-            return (0.0,)
         return (0.0, 45.0) if np.isclose(width, height) else (0.0, 90.0, 45.0, 135.0)
 
     def _middle_of(self, side: Side) -> CandidatePlace | None:
@@ -112,10 +115,10 @@ class PlaceFinder:
         return self._candidate(at_mm, frame_there, spin_deg)
 
     def _candidate(self, at: PiecePosition, frame: SurfaceFrame, spin_deg: float) -> CandidatePlace | None:
-        """Return the piece at a frame; None if it stands off, overhangs or lies on a part that is to be kept free."""
+        """Return the piece at a frame; None if it stands off or overhangs."""
         lay = placement_method(self.scene.settings.patch.bend)
-        piece = place_if_close(self.scene.mesh, frame, self.size_mm, spin_deg, lay, self._gap_mm)
-        return None if piece is None or self._touches_forbidden(piece) else CandidatePlace(at, spin_deg, piece)
+        piece = place_if_close(self.scene.mesh, frame, self.size_mm, spin_deg, lay)
+        return None if piece is None else CandidatePlace(at, spin_deg, piece)
 
     def _move_to_level(self, frame: SurfaceFrame, spin_deg: float) -> np.ndarray | None:
         """Move the frame's origin until the surface under the piece is as high as its middle; None if that fails."""
@@ -127,7 +130,7 @@ class PlaceFinder:
         for _ in range(_MOVES):
             chart = SurfaceChart(origin, np.stack([right, up, frame.normal]), 0.0, np.array([1.0, 0.0]))
             surface = surface_heights(chart, near, self.size_mm, _NET, (-reach, reach))
-            level = np.abs(surface - surface[middle]) <= self._gap_mm
+            level = np.abs(surface - surface[middle]) <= gap_limit_mm(self.size_mm)
             lies_under = np.isfinite(surface) if self.scene.settings.patch.bend else level
             if lies_under.mean() >= 1 - _COARSE_OVERHANG:
                 return origin + surface[middle] * frame.normal
@@ -142,10 +145,6 @@ class PlaceFinder:
         """Return the frame of a piece at a position."""
         return patch_frame(self.scene.mesh, self.scene.settings_with_piece_at(position, 0.0).patch)
 
-    @property
-    def _gap_mm(self) -> float:
-        return self.scene.settings.patch.search.gap_mm or placement.gap_limit_mm(self.size_mm)
-
     @cached_property
     def _eyes(self) -> np.ndarray:
         """Positions of the cameras of `_VIEWS` views, which tell how many views face a point."""
@@ -156,8 +155,8 @@ class PlaceFinder:
         return self.scene.mesh.vertices[self.scene.mesh.faces]
 
     @cached_property
-    def _samples(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Points M×3 evenly over the surface, their faces' normals M×3 and numbers M."""
+    def _samples(self) -> tuple[np.ndarray, np.ndarray]:
+        """Points M×3 evenly over the surface, and their faces' normals M×3."""
         a, b, c = self._triangles.transpose(1, 0, 2)
         cross = np.cross(b - a, c - a)
         doubled = np.linalg.norm(cross, axis=1)
@@ -169,12 +168,12 @@ class PlaceFinder:
         u, v = rng.random((2, count, 1))
         u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
         points = a[face] + u * (b - a)[face] + v * (c - a)[face]
-        return points, (cross / doubled[:, None])[face], face
+        return points, (cross / doubled[:, None])[face]
 
     @cached_property
     def _frames_to_try(self) -> tuple[SurfaceFrame, ...]:
         """Frames of the points to try, starting next to the middle of the scene's front."""
-        points, normals, _ = self._samples
+        points, normals = self._samples
         visible = self._facing(points, normals) >= _FACING_SHARE
         points, normals = points[visible], normals[visible]
         if not len(points):
@@ -183,24 +182,6 @@ class PlaceFinder:
         edge_mm = min(self.size_mm)
         indices = _spread(points, normals, edge_mm, _POOL_DISTANCE_SHARE, _POOL, [first])
         return tuple(surface_frame(self.scene.mesh, points[i], normals[i]) for i in indices)
-
-    @cached_property
-    def _forbidden(self) -> np.ndarray:
-        """Mask of the sampled points that are to be kept free."""
-        search = self.scene.settings.patch.search
-        faces = select_faces(self.scene.mesh, search.keep_off, search.keep_off_faces, self.scene.base)
-        return faces[self._samples[2]]
-
-    def _touches_forbidden(self, piece: Placement) -> bool:
-        """True if a point of the piece is nearest to a sampled point, facing like it, that is to be kept free."""
-        from scipy.spatial import KDTree
-
-        points, normals, _ = self._samples
-        same_facing = normals @ piece.normal > 0
-        if not (self._forbidden & same_facing).any():
-            return False
-        paper = piece.world(piece_grid(self.size_mm, _NET) * [1, -1] + np.array(self.size_mm) / 2)
-        return bool(self._forbidden[same_facing][KDTree(points[same_facing]).query(paper)[1]].any())
 
 
 def _spread(

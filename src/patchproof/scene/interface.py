@@ -27,7 +27,7 @@ from patchproof.sheets.piece import Piece, sheet_id
 
 if TYPE_CHECKING:
     from patchproof.channel.lens import Camera
-    from patchproof.scene.canvas import Canvas
+    from patchproof.scene.texture_scene import Canvas
 
 SCALE_VIEWS = 1024  # for quantiles over the views; the rule for the markers' size uses the same
 PX_PER_MODULE = 2.5  # markers can be read from about this size on: 45 of 48 at 2.7 px with a blur of 0.7 px
@@ -252,12 +252,6 @@ class PieceScene(Scene):
         """True if piece and lens are flat, so that photographs are homographies of the sheet."""
         return True
 
-    def with_print_scale(self, scale: tuple[float, float]) -> "PieceScene":
-        """Return the scene with its piece printed at `scale` (x, y) about its middle; its millimeters stay."""
-        if scale == (1.0, 1.0):
-            return self
-        raise Refused("a mesh, to change the print's size", self.description(), "leave --print-scale out")
-
     def facing(self, conditions: Conditions) -> np.ndarray:
         """Return N bool: the views that do not show the piece from behind; pictures with unknown angles do not."""
         return ~(np.abs(self.piece_azimuth_deg(conditions)) >= 90)
@@ -308,13 +302,11 @@ def _sheet_id(settings: SceneSettings, base: Path, known: Mapping[str, str], see
 def fit_text(fit: Mapping[str, Any]) -> str:
     """Say how a piece lies on its surface, by the scene's `placement_summary`."""
     gaps = f"gap {fit['gap_mm']:.2f} mm at most, {fit['gap_mean_mm']:.2f} mm on average"
-    return f"{gaps}; {fit['overhang_share']:.1%} overhangs; stretch {fit['stretch']:.2%}"
+    return f"{gaps}; {fit['overhang_share']:.1%} overhangs"
 
 
 def measurable_text(unreadable_share: float, family: str) -> str:
-    """Say how many photographs of a piece on a surface of that family can be measured; see `bent_scene.bent_notes`."""
-    if family == "exponential":
-        return "hardly any photograph can be measured"
+    """Say how many photographs of a piece on a surface of that family can be measured."""
     return f"{'at most' if family == 'cylinder' else 'about'} {1 - unreadable_share:.0%} of photographs can be measured"
 
 

@@ -2,11 +2,16 @@
 
 In: a mesh (world mm), a named side or a point, a spin and the piece's size. Out: a `Placement`: the piece in the world,
 and how well paper and surface agree: the gap below the card and the overhang beyond the object, in mm and shares. A
-card wider or higher than the object's side, or with nothing under it, is refused. Bent pieces: see `bend`.
+card wider or higher than the object's side, or with nothing under it, is refused. Bent pieces: see `bent_scene`.
+
+A piece lies well if gap and overhang are below those that give a warning. The largest that does is found by bisection,
+on the assumption that a smaller piece fits where a larger one does, which only holes under its middle contradict.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import get_args
 
 import numpy as np
 
@@ -15,13 +20,16 @@ from patchproof.base.geometry import rotated_extent
 from patchproof.base.settings import PatchSettings, SceneSettings
 from patchproof.base.validation import Side
 from patchproof.mesh.mesh import Mesh
-from patchproof.mesh.surface_chart import SurfaceChart, surface_heights
+from patchproof.mesh.surface_chart import SurfaceChart, grid_faces, surface_heights
 
 GRID = 65  # heights are sampled on this many points along each edge of the card
 LIFT_MM = 0.15  # the paper's own thickness, which also keeps it clear of the surface in the z-buffer
 # Assumed: a card that stands off the object by more than this share of its shorter edge casts a visible shadow.
 WARN_GAP_SHARE = 0.15
 WARN_OVERHANG_SHARE = 0.02
+_STEP_SHARE = 0.25  # of the piece's shorter side between places that are tried
+_TRIES_FLAT, _TRIES_BENT = 120, 6  # one takes about 5 and 200 ms
+_HALVINGS = 5  # to 3 % of the wanted piece
 
 _SIDES = {  # side: (up, normal); right is up × normal
     "+x": ((0, 1, 0), (1, 0, 0)),
@@ -37,9 +45,9 @@ _SIDES = {  # side: (up, normal); right is up × normal
 class Placement:
     """A piece at its place. Piece millimeters count from its top-left corner, x right, y down."""
 
-    family: str  # "card", "cylinder", "exponential" or "curled"
+    family: str  # "card", "cylinder" or "curled"
     size_mm: tuple[float, float]
-    vertices_mm: np.ndarray  # float64 V×3 in the world: a card's corners clockwise from top-left, else a grid by rows
+    vertices_mm: np.ndarray  # float64 V×3 in the world: a grid by rows, of a card its corners
     faces: np.ndarray  # int64 F×3, counter-clockwise as one faces the printed side
     piece_mm: np.ndarray  # V×2: where each vertex lies on the flat piece
     normals: np.ndarray  # V×3 unit, out of the printed face
@@ -48,7 +56,6 @@ class Placement:
     gap_mean_mm: float
     gaps_mm: np.ndarray  # GRID×GRID by rows from the top: from the piece to the surface, NaN where there is none
     overhang_share: float  # of the piece's area with no object under it
-    stretch: float  # largest relative change of length on the surface against the sheet
     reason: str
 
     def world(self, points_mm: np.ndarray) -> np.ndarray:
@@ -169,13 +176,13 @@ def lay_card(
     top = max(surface[hit].max(), peaks[inside, 2].max(initial=-np.inf))
     gaps = top - surface[hit]
     pose = piece_pose(right, up, frame.normal, frame.origin_mm + frame.normal * (top + LIFT_MM), size_mm)
-    corners = np.array([[0, 0], [width, 0], [width, height], [0, height]], float)
+    corners = np.array([[0, 0], [width, 0], [0, height], [width, height]], float)
     gap_mm = float(gaps.max())
     return Placement(
         family="card",
         size_mm=(width, height),
         vertices_mm=corners @ pose[:3, :2].T + pose[:3, 3],
-        faces=np.array([(0, 3, 2), (0, 2, 1)]),
+        faces=grid_faces(2, 2),
         piece_mm=corners,
         normals=np.tile(frame.normal, (4, 1)),
         world_from_piece=pose,
@@ -183,7 +190,6 @@ def lay_card(
         gap_mean_mm=float(gaps.mean()),
         gaps_mm=(top - surface).reshape(GRID, GRID),
         overhang_share=float(1 - hit.mean()),
-        stretch=0.0,
         reason=f"a flat card stands at most {gap_mm:.1f} mm off the surface",
     )
 
@@ -228,3 +234,64 @@ def _nearest_surface(mesh: Mesh, point: np.ndarray) -> tuple[np.ndarray, np.ndar
     points = closest_point(triangles, np.broadcast_to(point, (len(triangles), 3)))
     nearest = int(np.argmin(((points - point) ** 2).sum(1)))
     return points[nearest], normals(triangles[nearest : nearest + 1])[0][0]
+
+
+def place_if_close(
+    mesh: Mesh, frame: SurfaceFrame, size_mm: tuple[float, float], spin_deg: float, lay: PlacementMethod
+) -> Placement | None:
+    """Place the piece with its middle at the frame's origin. None if that is refused, or if the piece stands off or
+    overhangs by more than the limits of the warnings.
+    """
+    try:
+        piece = lay(mesh, frame, size_mm, spin_deg)
+    except Refused:
+        return None
+    return None if piece.warnings else piece
+
+
+def placement_advice(mesh: Mesh, patch: PatchSettings, lay: PlacementMethod, least_mm: float) -> str:
+    """Suggest, as keys of a scene file, sizes and places at which a refused piece would lie well; empty if none was
+    found. Places are tried on the same side from the nearest on, then in the middles of the other sides.
+    """
+    frame, (width, height) = patch_frame(mesh, patch), patch.size_mm
+    largest = min(width, frame.extent_mm[0]), min(height, frame.extent_mm[1])
+    fits = partial(place_if_close, mesh, frame, spin_deg=patch.spin_deg, lay=lay)
+    smaller, place = largest_fitting_size(largest, fits, least_mm), _nearest_place(mesh, patch, lay)
+    advice = "" if smaller is None else f"; {smaller[0]:g} × {smaller[1]:g} mm lies well there"
+    return advice if place is None else f"{advice}; {width:g} × {height:g} mm lies well with {place}"
+
+
+def _nearest_place(mesh: Mesh, patch: PatchSettings, lay: PlacementMethod) -> str | None:
+    """Return the nearest place where the piece lies well, as a key of a scene file."""
+    fits = partial(place_if_close, mesh, size_mm=patch.size_mm, spin_deg=patch.spin_deg, lay=lay)
+    middle = patch_frame(mesh, patch.changed(offset_mm=(0.0, 0.0)))
+    step = max(1.0, round(_STEP_SHARE * min(patch.size_mm)))
+    (across, along), wanted_mm = (int(extent // (2 * step)) for extent in middle.extent_mm), np.array(patch.offset_mm)
+    offsets = [(x * step, y * step) for x in range(-across, across + 1) for y in range(-along, along + 1)]
+    offsets.sort(key=lambda offset: (float(np.hypot(*(offset - wanted_mm))), offset))
+    for x, y in offsets[: _TRIES_BENT if patch.bend else _TRIES_FLAT]:
+        if fits(replace(middle, origin_mm=middle.origin_mm + x * middle.right + y * middle.up)):
+            return f"offset_mm = [{x:g}, {y:g}]"
+    sides = sorted(get_args(Side), key=lambda side: (side == patch.side, side[1] == "y"))  # top and bottom last
+    side = next((side for side in sides if fits(side_frame(mesh, side))), None)
+    return None if side is None else f'side = "{side}"'
+
+
+def largest_fitting_size(
+    size_mm: tuple[float, float], fits: Callable[[tuple[float, float]], object], least_mm: float
+) -> tuple[float, float] | None:
+    """Return the largest piece of this shape that fits, in whole millimeters; None if `least_mm` does not."""
+    low, high = least_mm / min(size_mm), 1.0
+    if low > 1 or not fits(_scaled(size_mm, low)):
+        return None
+    if fits(_scaled(size_mm, high)):
+        return _scaled(size_mm, high)
+    for _ in range(_HALVINGS):
+        middle = (low + high) / 2
+        low, high = (middle, high) if fits(_scaled(size_mm, middle)) else (low, middle)
+    return _scaled(size_mm, low)
+
+
+def _scaled(size_mm: tuple[float, float], scale: float) -> tuple[float, float]:
+    width, height = (float(np.floor(side * scale + 1e-6)) for side in size_mm)
+    return width, height

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from patchproof.base.errors import Refused
-from patchproof.base.settings import SceneSettings, SearchSettings
+from patchproof.base.settings import SceneSettings
 from patchproof.scene.bent_scene import BentScene
 from patchproof.scene.interface import Scene, SceneSource
 from patchproof.scene.mesh_scene import MeshScene, load_bare
@@ -23,7 +23,7 @@ class UnplacedScene(MeshScene):
     def settings_with_piece_at(self, position: PiecePosition, spin_deg: float) -> SceneSettings:
         """Return the settings of a scene file that gives this place and keeps the views."""
         keys = {"side": position} if isinstance(position, str) else {"at_mm": position}
-        patch = {"place": "given", "search": SearchSettings(), "spin_deg": spin_deg} | keys
+        patch = {"place": "given", "spin_deg": spin_deg} | keys
         return self.settings.changed(patch=patch, view={"front": self.settings.patch.side})
 
     def with_piece_at(self, position: PiecePosition, spin_deg: float) -> PatchScene:

@@ -1,12 +1,11 @@
 """The plan, a sheet's last page: the place of the piece on the object, and how to photograph it.
 
 In: a `PlanPage`: a picture of the object with its millimeters, the piece's outline on it, and paragraphs. Out: the
-page. Dimension chains above and beside the picture run from edge to edge of the object's side, or state lengths along
-its surface. The picture is passed in; this module draws on paper only.
+page. Dimension chains above and beside the picture run from edge to edge of the object's side. The picture is passed
+in; this module draws on paper only.
 """
 
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 
@@ -22,15 +21,6 @@ HEADING_MM, TEXT_MM, LEADING = 3.2, 2.6, 1.45
 
 
 @dataclass(frozen=True)
-class DimensionSpan:
-    """A part of a dimension chain: two ends along one axis of the picture, and the length between them."""
-
-    ends_mm: tuple[float, float]
-    length_mm: float  # along the surface, where it may be longer than the distance of the ends
-    name: str
-
-
-@dataclass(frozen=True)
 class PlacementPicture:
     """A picture of the piece on the object, seen straight from its side; millimeters, x right, y down."""
 
@@ -40,8 +30,6 @@ class PlacementPicture:
     outline_mm: tuple[PointMm, ...]  # the piece's cut line
     seams_mm: tuple[tuple[PointMm, PointMm], ...] = ()  # thin lines
     names_mm: tuple[tuple[PointMm, str], ...] = ()
-    # across and down, in place of chains from edge to edge
-    dimension_chains: tuple[tuple[DimensionSpan, ...], tuple[DimensionSpan, ...]] | None = None
 
 
 @dataclass(frozen=True)
@@ -111,7 +99,8 @@ def _drawing(placement: PlacementPicture, area: RectMm):
         left_end = cx - text_width_mm(name, 2.8, True) / 2
         labels.append(TextLine(at_mm=(left_end, cy + 1.0), size_mm=2.8, text=name, bold=True))
     rect = (*corner, scale * wide, scale * high)
-    across, down = placement.dimension_chains or _edge_chains(placement)
+    (xs, ys), (x0, y0, w0, h0) = zip(*placement.outline_mm, strict=True), placement.object_mm
+    across, down = (x0, min(xs), max(xs), x0 + w0), (y0, min(ys), max(ys), y0 + h0)
     for more_lines, more_labels in (_chain_above(across, to_page, rect), _chain_beside(down, to_page, rect)):
         lines, labels = lines + more_lines, labels + more_labels
     box = (x, y, w, ABOVE_MM + scale * high)
@@ -125,39 +114,29 @@ def edge_distances_mm(placement: PlacementPicture) -> dict[str, float]:
     return {"left": min(xs) - x, "right": x + w - max(xs), "top": min(ys) - y, "bottom": y + h - max(ys)}
 
 
-def _edge_chains(placement: PlacementPicture) -> tuple[tuple[DimensionSpan, ...], tuple[DimensionSpan, ...]]:
-    """Dimension chains from edge to edge of the object's side, across and down."""
-    (xs, ys), (x, y, w, h) = zip(*placement.outline_mm, strict=True), placement.object_mm
-    across, down = (x, min(xs), max(xs), x + w), (y, min(ys), max(ys), y + h)
-    names = ("from left edge", "piece", "from right edge"), ("from top", "piece", "from bottom")
-    chains = (zip(pairwise(stops), each, strict=True) for stops, each in zip((across, down), names, strict=True))
-    first, second = (tuple(DimensionSpan((a, b), b - a, name) for (a, b), name in chain) for chain in chains)
-    return first, second
-
-
-def _chain_above(spans: tuple[DimensionSpan, ...], to_page, rect: RectMm) -> tuple[list[Line], list[TextLine]]:
+def _chain_above(stops: tuple[float, ...], to_page, rect: RectMm) -> tuple[list[Line], list[TextLine]]:
     row, lines, labels = rect[1] - 2.0, [], []
-    for i, span in enumerate(spans):
-        start, end = (to_page((x, 0))[0] for x in span.ends_mm)
+    for i, name in enumerate(("from left edge", "piece", "from right edge")):
+        start, end = (to_page((x, 0))[0] for x in stops[i : i + 2])
         lines += [Line((start, row, end, row), 0.2), *(Line((s, row - 1, s, row + 1), 0.2) for s in (start, end))]
-        text = f"{span.length_mm:.0f} mm {span.name}"
+        text = f"{stops[i + 1] - stops[i]:.0f} mm {name}"
         # each label has its own row, so that those of narrow parts do not overlap
         middle = (start + end) / 2 - text_width_mm(text, 2.3, False) / 2
         middle = min(max(middle, rect[0]), rect[0] + rect[2] + BESIDE_MM - text_width_mm(text, 2.3, False))
-        labels.append(TextLine(at_mm=(middle, row - 1.6 - (len(spans) - 1 - i) * 3.1), size_mm=2.3, text=text))
+        labels.append(TextLine(at_mm=(middle, row - 1.6 - (2 - i) * 3.1), size_mm=2.3, text=text))
     return lines, labels
 
 
-def _chain_beside(spans: tuple[DimensionSpan, ...], to_page, rect: RectMm) -> tuple[list[Line], list[TextLine]]:
+def _chain_beside(stops: tuple[float, ...], to_page, rect: RectMm) -> tuple[list[Line], list[TextLine]]:
     column = rect[0] + rect[2] + 2.0
     lines, labels, free = [], [], rect[1]
-    for span in spans:
-        start, end = (to_page((0, y))[1] for y in span.ends_mm)
+    for i, name in enumerate(("from top", "piece", "from bottom")):
+        start, end = (to_page((0, y))[1] for y in stops[i : i + 2])
         lines.append(Line((column, start, column, end), 0.2))
         lines += [Line((column - 1, s, column + 1, s), 0.2) for s in (start, end)]
-        text, middle = f"{span.length_mm:.0f} mm", max((start + end) / 2 - 1.2, free)
+        text, middle = f"{stops[i + 1] - stops[i]:.0f} mm", max((start + end) / 2 - 1.2, free)
         labels.append(TextLine(at_mm=(column + 2, middle + 2.3 * CAP_HEIGHT), size_mm=2.3, text=text))
         low = middle + 2.6 + 2.3 * CAP_HEIGHT
-        labels.append(TextLine(at_mm=(column + 2, low), size_mm=2.0, text=span.name, gray=0.35))
+        labels.append(TextLine(at_mm=(column + 2, low), size_mm=2.0, text=name, gray=0.35))
         free = middle + 2.6 + 2.3 * (CAP_HEIGHT + DESCENT) + 0.6
     return lines, labels

@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from patchproof.base.errors import Refused
-from patchproof.mesh.surface_chart import piece_grid
-from patchproof.scene.bend import PIECE_GRID, grid_faces
+from patchproof.mesh.surface_chart import grid_faces, piece_grid
+from patchproof.scene.bent_scene import PIECE_GRID
 from patchproof.scene.conditions import Conditions, with_values
 from patchproof.scene.interface import Scene
 from patchproof.scene.patch_scene import require_patch
@@ -142,5 +142,7 @@ def _curl_card(card: Placement, radius_mm: float) -> Placement:
     flat = np.concatenate([width / 2 + radius_mm / scale * np.sin(angle), points[:, 1:]], 1)
     offsets = radius_mm * (1 - np.cos(angle)) * inward
     normals = -np.sin(angle) * across / scale - np.cos(angle) * inward
-    curled = replace(card, vertices_mm=card.world(flat) - offsets, faces=grid_faces(PIECE_GRID), normals=normals)
+    curled = replace(
+        card, vertices_mm=card.world(flat) - offsets, faces=grid_faces(PIECE_GRID, PIECE_GRID), normals=normals
+    )
     return replace(curled, family="curled", piece_mm=points, reason=f"curled to a radius of {radius_mm:.0f} mm")

@@ -24,9 +24,8 @@ from patchproof.base.validation import Side
 from patchproof.classifier.labels import find_labels, folded, nearest_hint
 from patchproof.mesh.load_mesh import load_mesh
 from patchproof.mesh.mesh import Mesh
-from patchproof.scene.bend import placement_method
-from patchproof.scene.fitting import largest_fitting_size, place_if_close
-from patchproof.scene.placement import SurfaceFrame, side_frame
+from patchproof.scene.bent_scene import placement_method
+from patchproof.scene.placement import SurfaceFrame, largest_fitting_size, place_if_close, side_frame
 from patchproof.sheets.piece import smallest_piece_mm
 
 _GLTF = (".glb", ".gltf")
