@@ -145,7 +145,7 @@ def _fitted_head(decoder: HeadDecoder, head: Head, names: Sequence[str], outputs
     """The guessed head, of decoded boxes with the order, unit and scores that the outputs fit best; said in a warning
     unless it is what `Detector` takes.
     """
-    shapes = _shapes(outputs)
+    shapes, outputs = _shapes(outputs), [each.detach() for each in outputs]
     fitted = _fitted_values(decoder, head, names, outputs) if head.formula == "none" else head
     if fitted != head_of("boxes", "HEADS"):
         differs = {key: value for key, value in fitted.model_dump().items() if value != getattr(head, key)}
@@ -163,7 +163,7 @@ def _fitted_values(decoder: HeadDecoder, head: Head, names: Sequence[str], outpu
             parts, _ = decoder.parts(head.model_copy(update={"columns": columns}), names, outputs)
         except Refused:  # a table without room for an objectness
             continue
-        values, objectness, scores, numbers = (each if each is None else each.detach() for each in parts)
+        values, objectness, scores, numbers = parts
         unit = ("share", decoder.input_px) if float(values.abs().max()) <= MAX_SHARE else ("pixels", 1)
         fits = {"columns": columns, "unit": unit[0]}
         if numbers is not None:

@@ -10,7 +10,7 @@ RetinaNet, FCOS), Tian et al., "FCOS", Carion et al., "End-to-End Object Detecti
 import math
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field
 
@@ -39,6 +39,10 @@ class Head(StrictModel):
     anchors: tuple[Annotated[tuple[Sizes, ...], Field(min_length=1)], ...] = ()  # of a cell, in pixels, by level
     scale_xy: tuple[Positive, ...] = (1.0,)  # of all levels, or of each
     variances: Sizes = (1.0, 1.0)  # of centers and sizes
+
+    if TYPE_CHECKING:  # frozen models have one
+
+        def __hash__(self) -> int: ...
 
 
 def _ssd_anchors(size: float, scales: Sequence[float], ratios: Sequence[int]) -> list[list[Sizes]]:

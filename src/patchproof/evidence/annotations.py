@@ -20,10 +20,10 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from pydantic import BaseModel, PositiveInt
 
-from patchproof.base.csv_file import read_csv
+from patchproof.base.csv_file import csv_lines, read_csv
 from patchproof.base.errors import Refused
 from patchproof.base.input import open_lazily, read_json
-from patchproof.base.text import csv_lines, printable
+from patchproof.base.text import printable
 from patchproof.base.validation import Finite, Positive, spelling_hint, summarize_names, validate_model
 from patchproof.evidence.classify import BoxEdges
 from patchproof.photo.corners import DesignCorners

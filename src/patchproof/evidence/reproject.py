@@ -17,7 +17,7 @@ from functools import lru_cache, partial
 import cv2
 import numpy as np
 
-from patchproof.base.color import LUMINANCE, lift_tone, srgb_from_linear
+from patchproof.base.color import lift_tone, srgb_from_linear
 from patchproof.base.geometry import apply_homography, rect_corners
 from patchproof.base.resample import index_homography
 from patchproof.channel.print_colors import ShownColors, add_ink, lower_light
@@ -25,7 +25,7 @@ from patchproof.evidence.appearance import ColorFit, fit_cells, invert_affine, n
 from patchproof.evidence.classify import BoxEdges, square_of
 from patchproof.evidence.print_fit import PhotographedDesign, design_cells, fit_print
 from patchproof.evidence.surface import PromisedColors, Surface
-from patchproof.photo.detect import LINEAR_FLOAT32_FROM_CODE
+from patchproof.photo.detect import LINEAR_FLOAT32_FROM_CODE, luminance
 from patchproof.photo.quality import FrameLight, pattern_light
 from patchproof.photo.rectify import region_around
 from patchproof.sheets.manifest import Rect
@@ -94,8 +94,7 @@ def photo_square(
         return None
     light, blur_px = unmixed
     square = np.ascontiguousarray(square)
-    luminance = LINEAR_FLOAT32_FROM_CODE[square] @ np.array(LUMINANCE, np.float32)
-    to_square, blur_px, noise = to_square @ px_from_mm, blur_px * scale, float(noise_of(luminance))
+    to_square, blur_px, noise = to_square @ px_from_mm, blur_px * scale, float(noise_of(luminance(square)))
     cells, blur_cells = design_cells(square, to_square, surface.rect_mm, blur_px)
     return PhotoSquare(file, square, to_square, light, blur_px, noise, cells, scale, blur_cells=blur_cells)
 

@@ -277,7 +277,7 @@ class _SmallDesign:
         half = np.array(self.size) / 2
         self.index_from_unit = np.array([[half[0], 0, half[0]], [0, half[1], half[1]], [0, 0, 1.0]])
         units = np.stack(np.meshgrid(*((np.arange(n) + 0.5) / n * 2 - 1 for n in self.size)), -1).reshape(-1, 2)
-        by_unit = np.stack(np.gradient(colors, axis=(1, 0)), -1).reshape(-1, 6, 2) * half
+        by_unit = np.stack([*np.gradient(colors, axis=(1, 0))], -1).reshape(-1, 6, 2) * half
         self.by_term = (by_unit @ homography_jacobian(np.eye(3), units).reshape(-1, 2, 8)).astype(np.float32)
         self.colors = colors.reshape(-1, 6)
 

@@ -102,7 +102,7 @@ def _portable(settings: dict[str, Any], promise: Promise, scene: Scene, folder: 
 
     carried = {"sheet": settings["sheet"]}
     if Path(profile := scene.settings.printer.profile).suffix:
-        from patchproof.channel.carried_printer import carried_printer
+        from patchproof.channel.printer import carried_printer
 
         carried["printer_file"] = carried_printer(scene.base / profile)
     models = tuple(model.changed(name=from_sheet(model.name)) for model in promise.models)
