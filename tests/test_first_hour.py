@@ -1,15 +1,21 @@
-"""A new user's first hour: own mesh, own network, a messy folder of photographs; every step as it is typed.
+"""A new user's first two hours: every step as it is typed, what it says, and how it exits.
 
-`python tests/test_first_hour.py` prints what each step says and the processor time of its process; the test types the
-same lines into one process and looks at the words.
+`python tests/test_first_hour.py` types all of it into one fresh folder: an own mesh with an own network and a messy
+folder of photographs, the README's blocks one after the other, the examples, and the verbs that these leave out. It
+prints what each step says and the processor time of its process, and writes exit codes, answers and last lines into
+`first_hour.txt`; with words as arguments only journeys with one of these names, which replace their part of that file.
+The tests type the first into one process and look at the words, and compare the file with the README.
 """
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import io
 import os
+import re
 import resource
+import shlex
 import subprocess
 import sys
 import tempfile
@@ -117,11 +123,19 @@ def typed_here(line: str, folder: Path) -> tuple[int, str, float]:
 
 
 def typed_apart(line: str, folder: Path) -> tuple[int, str, float]:
-    """In a process of its own, on one core, and the time of it."""
+    """In a process of its own, on one core, and the time of it; a Python program in its own folder."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
-    command, env = [sys.executable, "-m", "patchproof", *line.split()], os.environ | {"OMP_NUM_THREADS": "1"}
+    program, *words = shlex.split(line)
+    if program == "python":
+        folder, words = (folder / words[0]).parent, [Path(words[0]).name]
+    command = [sys.executable, *words] if program == "python" else [sys.executable, "-m", program, *words]
     done = subprocess.run(
-        command, cwd=folder, env=env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, encoding="utf-8"
+        command,
+        cwd=folder,
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        encoding="utf-8",
     )
     return done.returncode, done.stdout, resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime - before
 
@@ -146,9 +160,109 @@ def test_a_first_hour_says_at_each_step_what_to_do_next(tmp_path, monkeypatch):
     assert not any(word in verify for word in ("notes.txt", ".DS_Store", "._photo.jpg"))
 
 
-if __name__ == "__main__":
-    with tempfile.TemporaryDirectory() as place:
-        hour = spent(Path(place), typed_apart)
+ROOT = Path(__file__).resolve().parents[1]
+README, RECORD = (ROOT / "README.md").read_text(encoding="utf-8"), Path(__file__).with_name("first_hour.txt")
+SECOND_HOUR = """
+patchproof new primitive:mug --out mug.toml
+patchproof preview mug.toml
+patchproof plan mug.toml
+patchproof optimize small.toml --draft --out small
+patchproof promise small
+patchproof evaluate small draft --n 40 --out compared
+patchproof sheet small --template letter --out small.pdf
+patchproof reprint small.pdf --run small --n 48 --sessions 12 --out shots
+patchproof verify shots --sheet small.json --run small --out small-report
+patchproof sheet small --control mean --out mean.pdf
+patchproof reprint mean.pdf --run small --n 48 --sessions 12 --out controls/mean
+patchproof verify shots --sheet small.json --controls controls --require helps --out decided
+patchproof sheet small draft --out two.pdf
+patchproof sheet small --out sheet.pdf --overwrite
+patchproof reprint sheet.pdf --run small --n 4 --seed 2 --out desk
+patchproof reprint sheet.pdf --run small --n 4 --seed 3 --out window
+patchproof calibrate printer desk window --design --sheet sheet.json --out mine
+patchproof sheet --template chart_a4 --out chart.pdf
+patchproof reprint chart.pdf --n 8 --out charts
+patchproof calibrate printer charts --sheet chart.json --out printer
+patchproof sheet --template charuco_a4 --out board.pdf
+patchproof reprint board.pdf --n 12 --out boards
+patchproof calibrate camera boards --board board.json --out camera.json
+patchproof keys
+patchlab table
+"""
+# the blank sheet on the object is photographed by the example of photographs
+PHOTOGRAPHS = """
+patchproof sheet --template blank_a4 --out blank.pdf
+cp programs/blank.json blank.json
+cp -r programs/blank-photos blanks
+patchproof optimize photographs.toml --out hung
+patchproof sheet hung --out hung.pdf
+patchproof reprint hung.pdf --run hung --n 48 --sessions 12 --out hangings
+patchproof verify hangings --sheet hung.json --controls blanks --out hung-report
+"""
+
+
+def blocks(language: str) -> list[str]:
+    """The README's blocks of a language."""
+    return re.findall(rf"```{language}\n(.*?)```", README, re.DOTALL)
+
+
+def journeys() -> dict[str, list[str]]:
+    """What is typed, by journey, in this order."""
+    import patchproof
+
+    programs = sorted((Path(patchproof.__file__).parent / "app" / "examples").glob("*.py"))
+    return {
+        "lantern": [],  # see `HOUR`
+        "README": ["python eight_lines.py", *blocks("console")[0].splitlines()],
+        "examples": ["patchproof examples programs", *(f"python programs/{path.name}" for path in programs)],
+        "second": SECOND_HOUR.split("\n")[1:-1],
+        "photographs": PHOTOGRAPHS.split("\n")[1:-1],
+        "demos": [
+            "patchproof demo",
+            "patchproof demo --detector --out boxes",
+            "patchproof demo --imagenet --out photos1k",
+        ],
+    }
+
+
+def write_files(folder: Path) -> None:
+    """The README's blocks as files, and its scene with smaller photographs."""
+    scene, photographs = blocks("toml")[:2]
+    small = f"{scene}[camera]\nphoto_px = [1040, 780]\n"
+    texts = {"scene.toml": scene, "photographs.toml": photographs, "small.toml": small}
+    for name, text in {**texts, "eight_lines.py": blocks("python")[0]}.items():
+        (folder / name).write_text(text, encoding="utf-8")
+
+
+def answers_of(text: str) -> list[str]:
+    """The lines that a reader looks for: the first, verdicts, what comes next, the last; no progress."""
+    lines = [line for line in text.splitlines() if line.strip() and not re.fullmatch(r"\w+: \d+ of \d+", line)]
+    told = re.compile(r"(verdict|next|Take|No \d|kept|broken|cannot_tell|warning)\b")
+    return [line for number, line in enumerate(lines) if number in (0, len(lines) - 1) or told.match(line)]
+
+
+def record_text(line: str, code: int, text: str) -> str:
+    """A line's part of `first_hour.txt`."""
+    return "\n".join([f"$ {line}", f"[{code}]", *answers_of(text)]) + "\n"
+
+
+def type_journey(lines: list[str], folder: Path) -> str:
+    """Type lines, print what they say, and return their part of `first_hour.txt`."""
+    said = ""
+    for line in lines:
+        if line.startswith("cp "):
+            subprocess.run(line.split(), cwd=folder, check=True)
+            continue
+        code, text, seconds = typed_apart(line, folder)
+        print(f"$ {line}   # {seconds:.1f} s\n{text}", flush=True)
+        said += record_text(line, code, text)
+    return said
+
+
+def type_lantern(folder: Path) -> str:
+    """Type `HOUR`, print what it says and the time of each step, and return its part of `first_hour.txt`."""
+    folder.mkdir()
+    hour = spent(folder, lambda line, folder: typed_apart(f"patchproof {line}", folder))
     for line, (text, seconds) in hour.items():
         print(f"$ patchproof {line}   # {seconds:.1f} s\n{text}")
     verbs = {}
@@ -159,3 +273,54 @@ if __name__ == "__main__":
     print("\n".join(f"| `{line}` | {seconds:.1f} s |" for line, (_, seconds) in hour.items()))
     print(f"| new, preview, optimize and sheet (asked: {SECONDS['all']}) | {whole:.1f} s |")
     print(f"| preview (asked: {SECONDS['preview']}) | {verbs['preview']:.1f} s |")
+    return "".join(record_text(f"patchproof {line}", code, hour[line][0]) for line, code in HOUR)
+
+
+def type_all(names: list[str], folder: Path) -> None:
+    """Type the named journeys, or all, and replace their parts of `first_hour.txt`."""
+    write_files(folder)
+    parts = record()
+    for name, lines in journeys().items():
+        if not names or name in names:
+            parts[name] = type_journey(lines, folder) if lines else type_lantern(folder / "lantern")
+            text = "\n".join(f"# {key}\n{parts[key].strip()}\n" for key in journeys() if key in parts)
+            RECORD.write_text(text, encoding="utf-8")
+
+
+def record() -> dict[str, str]:
+    """What was said, by journey."""
+    text = RECORD.read_text("utf-8") if RECORD.exists() else ""
+    return dict(re.findall(r"^# (\w+)\n(.*?)(?=^# |\Z)", text, re.DOTALL | re.MULTILINE))
+
+
+def test_the_record_holds_every_command_of_the_readme_and_each_journey_ends_in_an_answer():
+    """A verdict, or that it cannot be told yet and what tells; 0, but where `HOUR` says 1."""
+    entries = {}
+    for entry in "".join(record().values()).split("$ ")[1:]:
+        line, code, *answers = entry.strip().splitlines()
+        entries[line] = int(code.strip("[]")), answers
+    inline = [
+        line for line in re.findall(r"`(patchproof [a-z][^`]*)`", README) if not re.search(r"[A-Z]|mug\.glb", line)
+    ]
+    typed = [line for lines in journeys().values() for line in lines if not line.startswith("cp ")]
+    hour = {f"patchproof {line}": code for line, code in HOUR}
+    assert {*blocks("console")[0].splitlines(), *inline, *typed, *hour} <= {*entries} and len(inline) >= 4
+    verbs = {line.split()[1] for line in entries}
+    assert {*re.findall(r"`(\w+)[^`]*`", "".join(re.findall(r"^\| (.*?) \|", README, re.M)))} - verbs == {
+        *("capture", "patchlab", "camera")  # a phone's page; the other command; a word of calibrate
+    }
+    for line, (code, answers) in entries.items():
+        assert code == hour.get(line, 0) and answers, line
+        if line.split()[1] in ("verify",) or line.startswith("python"):
+            said = " ".join(answers)
+            assert re.search("kept|broken|cannot_tell", said) or code, line
+            assert "cannot" not in said or re.search(r"Take|No \d+ photographs|patchproof promise", said), line
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("names", nargs="*", help="journeys, by default all")
+    parser.add_argument("--folder", type=Path, help="where the journeys before these were typed")
+    chosen = parser.parse_args()
+    with tempfile.TemporaryDirectory() as place:
+        type_all(chosen.names, chosen.folder or Path(place))

@@ -1,4 +1,4 @@
-"""The command line `patchlab`: run studies, make charts, harden images, print keys and stored figures."""
+"""The command line `patchlab`: run studies, make charts and a gallery, harden images, print keys and figures."""
 
 import re
 from pathlib import Path
@@ -84,7 +84,6 @@ def study(
         Path | None, typer.Option(help="real-prints: other cells of known color (NPZ), held against the stored config.")
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Folder for tables, figures and the page.")] = None,
-    keys: Annotated[bool, typer.Option("--keys", help="Print its keys, as patchlab keys NAME does.")] = False,
     example: Annotated[bool, typer.Option("--example", help="Print a config to start from.")] = False,
     resume: console.Resume = False,
     overwrite: console.Overwrite = False,
@@ -92,12 +91,11 @@ def study(
     cluster: console.Cluster = None,
 ) -> None:
     """Run an experiment of the paper or a test of the tool: tables with intervals, figures and one page."""
-    from patchlab.keys import documents, example_config
+    from patchlab.keys import example_config
     from patchlab.study.study import Work, run_study
-    from patchproof.app.keys import keys_page
 
-    if keys or example:
-        print(keys_page(documents(), name) if keys else example_config(name), end="")
+    if example:
+        print(example_config(name), end="")
         return
     if cells is not None:
         config = config or Path(__file__).parent / "results" / "real_prints" / "real-prints.toml"
@@ -181,8 +179,23 @@ def charts(
     raise typer.Exit(0 if all(study.results for study in finished.values()) else 1)
 
 
+def gallery(
+    out: Annotated[Path, typer.Option(help="Folder for the page, and the objects' runs and sheets.")] = Path(
+        "patchlab-gallery"
+    ),
+    overwrite: console.Overwrite = False,
+    jobs: console.Jobs = None,
+) -> None:
+    """Draft designs for ten objects: a page of the designs, their sheets, and photographs of the prints."""
+    from patchlab.charts.gallery import make_gallery
+
+    with progress_bar() as bar:
+        page = make_gallery(out, jobs or 1, overwrite, bar)
+    console.say(f"page: {page}")
+
+
 app.command(cls=StudyCommand)(console.as_command(study))
-for _verb in (charts, harden, table, keys):
+for _verb in (charts, gallery, harden, table, keys):
     app.command()(console.as_command(_verb))
 app.callback()(console.version_option)
 

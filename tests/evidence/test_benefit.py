@@ -34,20 +34,23 @@ def promise_of(rate: float, controls: dict[str, tuple[float, float, float]], goa
 
 
 def test_the_headline_compares_the_views_that_both_were_shown_in():
-    """Controls are shown in some of the views; the whole promise's rate beside theirs contradicts the difference."""
+    """Controls are shown in some of the views, in which the design has another rate than the promised one: it stands
+    in each control's own line only.
+    """
     promise = promise_of(0.825, {"bare": (0.95, -0.24, 0.13)})
     claim = promise.controls["bare"].changed(difference=-0.05)
-    headline = promise.changed(controls={"bare": claim}).headline
-    assert (
-        "90.0% recognized, 95.0% with its best control (bare) in the same views: -5.0 points" in headline
-        and "82.5" not in headline
-    )
+    promise = promise.changed(controls={"bare": claim.changed(n=100)})
+    told = "-5.0 points [-24.0, +13.0]"
+    assert promise.headline == f"cannot be told yet: {told} beside its best control (bare) in the same 100 views."
+    _, rate, bare = promise_lines(promise, {})
+    assert "recognized in 82.5% of 400" in rate and bare == f"    bare:  95.0%, design 90.0% in the same 100: {told}"
 
 
 @pytest.mark.parametrize(("rate", "control"), [(0.875, 0.5417), (0.8125, 0.5724), (0.0046, 0.0012)])
 def test_a_printed_difference_is_that_of_the_printed_rates(rate, control):
-    printed = re.findall(r"[-+]?\d+\.\d", promise_of(rate, {"bare": (control, 0.1, 0.3)}).headline)
-    assert float(printed[2]) == pytest.approx(float(printed[0]) - float(printed[1]), abs=1e-9)
+    *_, line = promise_lines(promise_of(rate, {"bare": (control, 0.1, 0.3)}), {})
+    printed = re.findall(r"[-+]?\d+\.\d", line)
+    assert float(printed[2]) == pytest.approx(float(printed[1]) - float(printed[0]), abs=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -69,7 +72,7 @@ def test_the_hardest_control_decides_and_its_interval_says_the_word(controls, go
     first = promise_lines(promise, {}, "my run")[0]
     verb = "help" if goal == "assist" else "deceive"
     words = {"helps": f"{verb}s", "does_not_help": f"does not {verb}", "cannot_tell": "cannot be told yet"}
-    assert first.startswith(f"{words[worth]}: 50.0% recognized, ") and f"({best})" in first
+    assert first.startswith(f"{words[worth]}: ") and f"beside its best control ({best})" in first
     assert ("Try another" in first) == (worth == "does_not_help")
     assert ("What tells: patchproof promise 'my run' --n 1600." in first) == (worth == "cannot_tell")
 

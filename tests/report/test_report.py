@@ -30,7 +30,7 @@ from patchproof.evidence.results import (
     SessionCount,
     Summary,
 )
-from patchproof.report.page import delta_map, save_pictures
+from patchproof.report.page import delta_map, draw_figure, save_pictures
 from patchproof.report.tables import Drawing, Results, Table, write_results
 from patchproof.report.words import verdict_lines
 from patchproof.report.write import photos_csv, report_html, write_report
@@ -275,6 +275,22 @@ def test_every_picture_has_words_of_its_own(tmp_path):
     text = (tmp_path / "report.html").read_text()
     named = re.findall(r'<div role="img" aria-label="([^"]+)"><svg', text)
     assert len(named) == len(set(named)) == text.count("<svg") == 3
+
+
+def test_a_figure_for_a_phone_is_narrow_with_panels_one_below_the_other_and_whole_titles(tmp_path):
+    def draw(figure):
+        for axes in figure.subplots(1, 3, width_ratios=(1, 2, 1)):
+            axes.set_title("a title " * 12)
+        shown.append(figure)
+
+    shown, drawing = [], Drawing("a", "Rates", draw, (9.0, 3.0))
+    for each in (drawing, drawing.for_phone()):
+        draw_figure(each.draw, each.size_in, "png")
+    (left, *_), column = (figure.axes for figure in shown)
+    assert left.get_subplotspec().get_geometry()[:2] == (1, 3)
+    assert column[0].get_subplotspec().get_geometry()[:2] == (3, 1) and shown[1].get_figwidth() == 4
+    assert all(axes.get_title().count("\n") == 1 for axes in column) and shown[1].get_figheight() > 6
+    assert '<source media="(max-width:640px)" srcset="data:image/png' in results_page(tmp_path).read_text()
 
 
 def test_a_studys_page_begins_with_its_figure(tmp_path):

@@ -105,15 +105,13 @@ def test_bent_paper_on_a_can_is_drawn_as_one_sees_it(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("draft", "start"), [(False, "helps: 90.0%"), (True, "Draft of 400 views (preliminary): helps")]
+    ("draft", "start"),
+    [(False, "helps: +50.0 points ["), (True, "Draft of 400 views (preliminary): helps: +50.0 points [")],
 )
 def test_the_first_line_is_a_sentence_of_what_the_design_is_worth(scene_file, draft, start):
     promise = promise_with(0.9, 0.4, 0.42, 0.57).changed(draft=draft)
     first = shot_sections(promise, load_scene_settings(scene_file))[0][1][0]
-    assert (
-        first.startswith(start)
-        and "90.0% recognized, 40.0% with its best control (bare) in the same views: +50.0 points" in first
-    )
+    assert first.startswith(start) and "] beside its best control (bare) in the same 400 views" in first
     assert ". Promise simulated before ONE PLAIN COLOR" in first and first.endswith(".") and ".." not in first
 
 

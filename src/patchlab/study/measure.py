@@ -1,17 +1,11 @@
-"""Measure time: calls in turn within one run, and calls by the code of another checkout.
+"""Measure time: calls in turn within one run.
 
-In: calls. Out: milliseconds. Seconds of one machine mean little on another, so times are compared only
-within a run.
+In: calls. Out: milliseconds. Seconds of one machine mean little on another, so times are compared only within a run.
 """
 
-import json
-import os
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Hashable, Mapping
-from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from patchproof.base.progress import Advance, no_advance
 
@@ -37,11 +31,3 @@ def time_call(
     """(the call's result, milliseconds); by default processor time, which other work on the machine leaves alone."""
     begin = clock()
     return call(), 1000 * (clock() - begin)
-
-
-def run_in_checkout(source: Path, code: str, *arguments: str) -> tuple[str, Any]:
-    """Run code that imports from a checkout's `src`: (short commit, JSON in the last line that it prints)."""
-    command, environment = [sys.executable, "-c", code, *arguments], {**os.environ, "PYTHONPATH": str(source.resolve())}
-    output = subprocess.run(command, env=environment, stdout=subprocess.PIPE, check=True).stdout
-    commit = subprocess.run(["git", "-C", source, "rev-parse", "--short", "HEAD"], stdout=subprocess.PIPE, text=True)
-    return commit.stdout.strip(), json.loads(output.splitlines()[-1])

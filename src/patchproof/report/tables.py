@@ -8,8 +8,9 @@ or lines. The same input gives the same bytes.
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
 from patchproof.base.csv_file import csv_lines
@@ -20,6 +21,7 @@ from patchproof.report.page import data_uri, draw_figure, render_page, versions_
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+_PHONE_IN, _PHONE_LETTERS = 4.0, 58  # 9 points are 11 pixels of a screen 390 wide; of a line
 _LIBRARIES = ("patchproof", "torch", "numpy")
 Value = str | int | float | bool | None | Estimate
 
@@ -45,6 +47,26 @@ class Drawing:
     size_in: tuple[float, float] = (7.0, 4.0)
     about: str = ""
 
+    def for_phone(self) -> "Drawing":
+        """The drawing for a narrow screen, with text as large as on a wide one: panels side by side are stacked."""
+
+        def draw(figure: "Figure") -> None:
+            subplots: Any = figure.subplots
+
+            def stacked(rows: int = 1, columns: int = 1, **options: Any) -> Any:
+                if rows == 1 < columns and options.get("squeeze", True):
+                    figure.set_figheight(0.8 * columns * self.size_in[1])
+                    rows, columns, _ = columns, 1, options.pop("width_ratios", None)
+                return subplots(rows, columns, **options)
+
+            vars(figure)["subplots"] = stacked
+            self.draw(figure)
+            titles: Any = [title for axes in figure.axes for title in (axes.title, vars(axes)["_left_title"])]
+            for title in titles:
+                title.set_text("\n".join(fill(line, _PHONE_LETTERS) for line in title.get_text().split("\n")))
+
+        return replace(self, draw=draw, size_in=(min(_PHONE_IN, self.size_in[0]), self.size_in[1]))
+
 
 @dataclass(frozen=True)
 class Results:
@@ -67,16 +89,19 @@ class Results:
 def write_results(folder: Path, results: Results) -> None:
     """Write the page, its JSON, tables as CSV and figures as PNG into the folder."""
     versions = versions_of(_LIBRARIES)
-    options = {"dpi": 130, "metadata": {"Software": None}}  # without date or version
-    pictures = [(figure, draw_figure(figure.draw, figure.size_in, "png", **options)) for figure in results.figures]
+    pictures, narrow = (
+        # without date or version
+        [draw_figure(figure.draw, figure.size_in, "png", dpi=130, metadata={"Software": None}) for figure in figures]
+        for figures in (results.figures, [figure.for_phone() for figure in results.figures])
+    )
     for table in results.tables:
         write_atomically(folder / f"{results.name}_{table.name}.csv", csv_text(table))
-    for figure, content in pictures:
+    for figure, content in zip(results.figures, pictures, strict=True):
         write_atomically(folder / f"{results.name}_{figure.name}.png", content)
     text = render_page(
         "results.html.j2",
         results=results,
-        pictures=[(figure, data_uri(content)) for figure, content in pictures],
+        pictures=list(zip(results.figures, map(data_uri, pictures), map(data_uri, narrow), strict=True)),
         settings=json.dumps(results.settings, indent=1, ensure_ascii=False),
         versions=versions,
         cell_text=cell_text,

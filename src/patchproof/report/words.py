@@ -167,13 +167,13 @@ def _estimated_lines(estimated: Any) -> list[str]:
 
 
 def control_lines(controls: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Write a line per control: its rate and the difference from the design's."""
-    lines = []
+    """Write a line per control: its rate, the design's in as many of the same views or photographs, the difference."""
+    rows = []
     for kind, claim in controls.items():
-        rate, of_count = claim["rate"], f" of {claim['n']}" if claim.get("n") else ""
-        points = points_text(rate + claim["difference"], rate, claim["difference_interval"])
-        lines.append(f"  {kind:>6}: {rate:6.1%}{of_count}   difference {points}")
-    return lines
+        rate, ours = claim["rate"], claim["rate"] + claim["difference"]
+        points = points_text(ours, rate, claim["difference_interval"])
+        rows.append(f"  {kind:>6}: {rate:6.1%}, design {ours:.1%} in the same {claim['n']}: {points}")
+    return rows
 
 
 def imported_lines(imported: Mapping[str, Any]) -> list[str]:

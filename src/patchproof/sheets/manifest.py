@@ -203,12 +203,13 @@ class Promise(StrictModel):
 
     @property
     def headline(self) -> str:
-        """A sentence that compares the design with its best control in the views that were rendered of both."""
+        """A sentence with the design's difference to its best control, in the views that were rendered of both. The
+        design's rate in these is not in it: it is another figure than the promised rate, which is of more views.
+        """
         control, draft = self.controls[self.best_control], f"Draft of {self.n} views (preliminary): " * self.draft
-        rate = control.rate + control.difference
-        beside = f"{control.rate:.1%} with its best control ({self.best_control}) in the same views"
-        points = points_text(rate, control.rate, control.difference_interval)
-        return f"{draft}{self.target.goal.words[self.answer]}: {rate:.1%} recognized, {beside}: {points}."
+        points = points_text(control.rate + control.difference, control.rate, control.difference_interval)
+        beside = f"beside its best control ({self.best_control}) in the same {control.n} views"
+        return f"{draft}{self.target.goal.words[self.answer]}: {points} {beside}."
 
     def html(self, picture: np.ndarray | None = None) -> str:
         """Return the promise as a notebook shows it: bars of the design's rate and its controls', and a picture."""
