@@ -7,6 +7,7 @@ import json
 import re
 import shlex
 import tomllib
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -242,6 +243,15 @@ def shown_by_run(name: str) -> np.ndarray:
             for run in found
         ]
     ).T
+
+
+def test_what_drafts_answer_is_stored():
+    answers = Counter((row["is"], row["draft"]) for row in rows_of("promises/drafts.csv"))
+    for kind, said in (("helps", "that help"), ("does_not_help", "that do not")):
+        told = [answers[kind, word] for word in ("helps", "cannot_tell", "does_not_help")]
+        assert f"of {sum(told)} designs {said} {told[0]}, {told[1]} and {told[2]}" in words(NOTEBOOK)
+        assert sum(told) >= 20
+    assert answers["helps", "does_not_help"] == 0 and answers["does_not_help", "helps"] <= 1
 
 
 def test_what_jagged_outlines_cost_is_the_stored_figure():

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from console import lab_command
 
 from patchlab.charts import breaks, detect, make, speed, terms
 from patchlab.charts.bars import Bar, BarPoint
@@ -211,3 +212,13 @@ def test_charts_are_drawn_even_where_a_detector_found_nothing(study, results):
     (drawing,) = study.figures(settings, results)
     svg = draw_figure(drawing.draw, drawing.size_in, "svg").decode()
     assert ("ceiling" in svg) == (study is speed) and len(svg) > 5000
+
+
+def test_a_gallery_shows_design_page_and_photographs_of_each_object(tmp_path, monkeypatch):
+    monkeypatch.setattr("patchlab.charts.gallery.OBJECTS", ["carton"])
+    for constant, value in {"run.DRAFT_EFFORT": (1, 8), "loop.SELECT_VIEWS": 2}.items():
+        monkeypatch.setattr(f"patchproof.optimizer.{constant}", value)
+    assert lab_command("gallery", "--out", tmp_path / "all") == 0
+    text = (tmp_path / "all" / "gallery.html").read_text("utf-8")
+    assert text.count("<img") == 1 and "<h2>carton</h2>" in text and "beside its best control" in text
+    assert (tmp_path / "all" / "carton" / "sheet.pdf").is_file()

@@ -24,7 +24,7 @@ from patchproof.reprints.run_sheet import sheet
 from patchproof.sheets.pdf_raster import rasterize_page
 
 OBJECTS = "box_truck carton mailbox mug bottle traffic_cone street_sign table_lamp watering_can chair".split()
-_TILE_PX = 420
+LENGTH_MM, _TILE_PX = 400, 420  # models, of which a page covers enough to be seen
 
 
 def make_gallery(out: Path, jobs: int = 1, overwrite: bool = False, progress: Progress = no_progress) -> Path:
@@ -35,7 +35,7 @@ def make_gallery(out: Path, jobs: int = 1, overwrite: bool = False, progress: Pr
             progress("gallery", number, len(OBJECTS))
             place = folder / name
             place.mkdir()
-            new_scene(f"primitive:{name}", place / "scene.toml")
+            new_scene(f"primitive:{name}", place / "scene.toml", length_mm=LENGTH_MM)
             run = optimize(place / "scene.toml", place / "run", draft=True, compute=Compute(jobs=jobs))
             sheet(run, place / "sheet.pdf")
             drawing = Drawing(name, name.replace("_", " "), lambda figure: None, about=run.promise.headline)
@@ -44,7 +44,12 @@ def make_gallery(out: Path, jobs: int = 1, overwrite: bool = False, progress: Pr
         about = "Designs, the pages they are printed on, and photographs of the print on its object, all simulated."
         results = Results("gallery", "gallery", about, f"{len(shown)} objects, drafts", {}, (), (), {}, {}, "patchlab")
         text = render_page(
-            "results.html.j2", results=results, pictures=shown, settings="", versions={}, cell_text=cell_text
+            "results.html.j2",
+            results=results,
+            pictures=shown,
+            settings="patchlab gallery",
+            versions={},
+            cell_text=cell_text,
         )
         write_atomically(folder / "gallery.html", text)
     return out / "gallery.html"

@@ -258,7 +258,7 @@ def _marker_line(markers: PlanData, family: str) -> str:
 
 def _term_lines(terms: PlanData, draft: PlanData) -> list[str]:
     lines = [
-        f"error that leaving a term out leaves ({terms['views']} views of a draft of {draft['steps']} steps, rate "
+        f"error if not modeled ({terms['views']} views of a draft of {draft['steps']} steps, rate "
         f"{draft['rate']:.0%}, before the first classifier)",
         f"  {'':23} {'codes: mean':>11} {'95 %':>6}   {'confidence':<15}  (what adds up to less than "
         f"{terms['threshold']:.3f} can go: selection cannot tell)",
