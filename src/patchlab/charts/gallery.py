@@ -17,8 +17,7 @@ from patchproof.optimizer.pixels import as_pixels
 from patchproof.optimizer.run import Run, optimize
 from patchproof.render.photograph import photograph
 from patchproof.render.stage import set_stage
-from patchproof.report.images import data_uri, jpeg
-from patchproof.report.page import render_page
+from patchproof.report.page import data_uri, jpeg, render_page
 from patchproof.report.tables import Drawing, Results, cell_text
 from patchproof.reprints.run_sheet import sheet
 from patchproof.sheets.pdf_raster import rasterize_page

@@ -141,7 +141,7 @@ def verdict_lines(report: Any) -> list[str]:
         lines += [f"  {summary.sessions_note}"] if summary.sessions_note else []
         lines.append(looks_sentence(data))
     if summary.rate is not None:
-        lines.append(f"recognized: {rate_text(summary.rate, summary.interval)}")
+        lines.append(f"recognized: {rate_text(summary.rate, summary.interval)} of {summary.judged}")
     others = [item for item in list(summary.models.items())[1:] if item[1].rate is not None]
     lines += [f"  also {name}: {rate_text(model.rate, model.interval)}" for name, model in others]
     if summary.prediction_interval is not None:

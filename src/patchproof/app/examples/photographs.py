@@ -12,6 +12,6 @@ pp.reprint("blank.pdf", world, 6, "blank-photos")
 
 run = pp.optimize("photographs.toml", "photographs-run", draft=True)
 pp.sheet(run, "photographs.pdf")
-pp.reprint("photographs.pdf", run, 6, "print-photos")
+pp.reprint("photographs.pdf", run, 48, "print-photos", sessions=12)
 report = pp.verify("print-photos", "photographs.json", "photographs-report")
 print(report.summary.verdict, report.summary.reason, report.summary.next_step)
