@@ -170,7 +170,6 @@ patchproof optimize small.toml --draft --out small
 patchproof promise small
 patchproof sheet small --template letter --out small.pdf
 patchproof reprint small.pdf --run small --n 48 --sessions 12 --out shots
-patchproof verify shots --sheet small.json --run small --out small-report
 patchproof sheet small --control mean --out mean.pdf
 patchproof reprint mean.pdf --run small --n 48 --sessions 12 --out controls/mean
 patchproof verify shots --sheet small.json --controls controls --require helps --out decided
@@ -224,7 +223,7 @@ def write_files(folder: Path) -> None:
 def answers_of(text: str) -> list[str]:
     """The lines that a reader looks for: the first, verdicts, what comes next, the last; no progress."""
     lines = [line for line in text.splitlines() if line.strip() and not re.fullmatch(r"\w+: \d+ of \d+", line)]
-    told = re.compile(r"(verdict|next|Take|No \d|kept|broken|cannot_tell|warning)\b")
+    told = re.compile(r"(verdict|next|Take|No \d+|kept|broken|cannot_tell|warning)\b")
     return [line for number, line in enumerate(lines) if number in (0, len(lines) - 1) or told.match(line)]
 
 
@@ -288,7 +287,9 @@ def test_the_record_holds_the_readme_s_commands_and_each_journey_ends_in_an_answ
         line, code, *answers = entry.strip().splitlines()
         entries[line] = int(code.strip("[]")), answers
     typed = {name: {line for line in lines if not line.startswith("cp ")} for name, lines in journeys().items()}
-    assert typed["README"] <= {*entries} <= set().union(*typed.values())
+    assert {*entries} <= set().union(*typed.values())
+    # the search for a design without corners takes 4 s a photograph: it may be left out
+    assert all("--find" in line for line in typed["README"] - {*entries})
     for line, (code, answers) in entries.items():
         assert code == 0 and answers, line
         if line.split()[1] == "verify" or line.startswith("python"):

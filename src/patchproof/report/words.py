@@ -114,7 +114,7 @@ def promise_summary(promise: Any, settings: Mapping[str, Any], run: str = "RUN")
 def run_lines(run: Any) -> list[str]:
     """Sum up a finished run, and say which command comes next."""
     folder, settings = str(run.folder), run.scene.settings.model_dump()
-    page = f"{run.folder.name}.json" if settings["sheet"]["template"] == NO_PAGE else "sheet.pdf"
+    page = f"{run.folder.resolve().name}.json" if settings["sheet"]["template"] == NO_PAGE else "sheet.pdf"
     following = command_text("sheet", folder, "--out", page)
     if settings["patch"]["kind"] != "patch":
         following = command_text("evaluate", folder)

@@ -203,9 +203,7 @@ class Promise(StrictModel):
 
     @property
     def headline(self) -> str:
-        """A sentence with the design's difference to its best control, in the views that were rendered of both. The
-        design's rate in these is not in it: it is another figure than the promised rate, which is of more views.
-        """
+        """A sentence with the difference to the best control; rates in these views are not the promised one."""
         control, draft = self.controls[self.best_control], f"Draft of {self.n} views (preliminary): " * self.draft
         points = points_text(control.rate + control.difference, control.rate, control.difference_interval)
         beside = f"beside its best control ({self.best_control}) in the same {control.n} views"
