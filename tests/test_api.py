@@ -91,8 +91,8 @@ def test_sheet_evaluation_and_verdict_take_the_network_itself(run, tmp_path):
     assert manifest.sheet_id == run.scene.sheet_id and manifest.promise == run.promise
     result = pp.evaluate(run.folder, models=[network()], n=8)
     assert result.models["python:net"].sha256 == network().sha256
-    with pytest.raises(pp.Refused, match="a network in memory"):
-        pp.evaluate(run.folder, models=[network()], n=8, compute=pp.Compute(jobs=2))
+    both = pp.evaluate(run.folder, models=[network()], n=8, compute=pp.Compute(jobs=2), overwrite=True)
+    assert both.models["python:net"] == result.models["python:net"]
     pp.reprint(tmp_path / "sheet.pdf", run, 2, tmp_path / "photos")
     judge = [network(), network(1)]
     report = pp.verify(tmp_path / "photos", tmp_path / "sheet.json", tmp_path / "report", models=judge)

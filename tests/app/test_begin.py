@@ -245,7 +245,7 @@ def test_a_file_without_units_says_how_long_it_is_in_its_own(tmp_path):
 def standing(bottles):
     """The scene of the bottle that stands, and what `new` said of it."""
     path = bottles / "standing.toml"
-    return path, new_scene(str(bottles / "bottle.glb"), path)
+    return path, new_scene(str(bottles / "bottle.glb"), path, models=("builtin",))
 
 
 def test_an_object_that_may_lie_is_turned_by_one_word(tmp_path, few_turns):
@@ -256,7 +256,7 @@ def test_an_object_that_may_lie_is_turned_by_one_word(tmp_path, few_turns):
     column.export(tmp_path / "lying.glb")
     column.apply_transform(trimesh.transformations.rotation_matrix(-np.pi / 2, [1, 0, 0]))
     column.export(tmp_path / "standing.glb")
-    bottle = {"label": "bottle", "overwrite": True}
+    bottle = {"label": "bottle", "overwrite": True, "models": ("builtin",)}
     lines = new_scene(str(tmp_path / "lying.glb"), path, **bottle)
     assert "write the scene again with --up z" in lines[0] and load_scene_settings(path).object.up == "y"
     text = path.read_text(encoding="utf-8") + "[camera]\nphoto_px = [400, 300]\n[background]\ncolor = [0.5, 0.5, 0.5]\n"
@@ -268,7 +268,7 @@ def test_an_object_that_may_lie_is_turned_by_one_word(tmp_path, few_turns):
     assert warning.endswith('write up = "z" in [object]')
     lines = new_scene(str(tmp_path / "lying.glb"), path, up="z", **bottle)
     assert lines[0] == 'up: "z", as given' and "# up" not in path.read_text(encoding="utf-8")
-    new_scene(str(tmp_path / "standing.glb"), tmp_path / "standing.toml", label="bottle")
+    new_scene(str(tmp_path / "standing.glb"), tmp_path / "standing.toml", **bottle)
     assert load_scene_settings(path).patch == load_scene_settings(tmp_path / "standing.toml").patch
 
 

@@ -514,7 +514,7 @@ def icc(place: Place, number: int) -> Use:
         path.write_bytes(data)
     else:
         endless(path, of(number // 2, ENDLESS))
-    return lambda: bake(path, "p", "CC0", "test")
+    return lambda: bake(path, "p")
 
 
 def mask(place: Place, number: int) -> Use:
@@ -916,27 +916,21 @@ def weights(place: Place, number: int) -> Use:
 
 
 def album(place: Place, number: int) -> Use:
-    """A received folder of a capture: links, odd names, another's address."""
+    """A received folder of a capture: links, odd names."""
     from patchproof.app.capture.album import Album
-    from patchproof.app.capture.serve import _stored_address
 
     folder = place.out / "album"
     (folder / "session_01").mkdir(parents=True)
-    if number % 4 == 0:
+    if number % 3 == 0:
         (folder / "session_02").symlink_to(place.outside)
-    elif number % 4 == 1:
-        (folder / of(number // 4, ("session_x", "session_", "session_99999999999999999999", "session_02.5"))).mkdir()
-    elif number % 4 == 2:
-        (folder / ".capture.json").write_text(
-            json.dumps({"token": of(number // 4, ("A" * 22, "../" * 9, 1)), "port": 22})
-        )
+    elif number % 3 == 1:
+        (folder / of(number // 3, ("session_x", "session_", "session_99999999999999999999", "session_02.5"))).mkdir()
     else:
         (folder / "session_01" / ".photo_0001.part").symlink_to(place.outside / "holiday.jpg")
         (folder / "controls").symlink_to(place.outside)
 
     def use() -> None:
         loaded = Album(folder)
-        assert _stored_address(folder).token != "A" * 22, "the sender's token"
         for into in (loaded.new_session(), *loaded.sessions, "gray", "../outside"):
             with loaded.incoming(into) as incoming:
                 incoming.write(b"\xff\xd8\xff" + into.encode() + bytes(20))

@@ -390,7 +390,7 @@ def icc(rng: Rng, folder: Path) -> Read:
     from patchproof.calibrate.icc import bake
 
     (folder / "p.icc").write_bytes(mutated(rng, profile()))
-    return lambda: bake(folder / "p.icc", "p", "CC0", "test", bool(rng.random() < 0.5))
+    return lambda: bake(folder / "p.icc", "p", bool(rng.random() < 0.5))
 
 
 # --- text ---
@@ -754,7 +754,7 @@ def long_path(rng: Rng, folder: Path) -> Read:
         lambda p: load_camera(f"{p}.json"),
         lambda p: load_mesh(f"{p}.obj", 1.0),
     ]
-    readers += [lambda p: bake(p, "p", "", ""), lambda p: pp.verify(folder, folder / "no.json", p)]
+    readers += [lambda p: bake(p, "p"), lambda p: pp.verify(folder, folder / "no.json", p)]
     reader = readers[rng.integers(len(readers))]
     return lambda: reader(folder / name)
 

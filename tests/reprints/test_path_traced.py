@@ -35,7 +35,7 @@ def scene(scene_file):
 def facing(scene, **values):
     """One view with the lights in front of the piece and nothing random in the camera."""
     quiet = {"light_azimuth_deg": 20.0, "light_elevation_deg": 30.0, "noise": 0.0, "blur_px": 0.0, "exposure_ev": 0.0}
-    quiet |= {"distance_mm": 500.0, "look_at_offset": 0.0, "white_balance": 1.0}
+    quiet |= {"distance_mm": 500.0, "look_at_offset": 0.0, "white_balance": 1.0, "veil": 0.0}
     return with_values(scene.draw("reprint", 1), **quiet | values)
 
 
@@ -84,7 +84,7 @@ def test_levels_are_ours_where_nothing_is_in_the_way(scene, lights, monkeypatch)
     pytest.importorskip("mitsuba")
     monkeypatch.setattr(path_traced, "PASSES", 1)
     conditions, stage = facing(scene, **lights), set_stage(scene)
-    for name in ("dot_gain", "density", "chroma", "veil"):
+    for name in ("dot_gain", "density", "chroma"):
         conditions = with_values(conditions, **{name: 0.0})
     piece = plain(scene, 0.5)
     ours = photograph(stage, piece, conditions, (200, 150), jpeg=False)[0].numpy()
