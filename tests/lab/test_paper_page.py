@@ -59,7 +59,7 @@ def test_verdicts_are_those_of_intervals():
         (0.1, 0.39): "does not, ours is higher",
     }.items():
         assert page.verdict(spec(range=(low, high)), ours) == said
-    assert page.verdict(spec(claim="above"), ours) == "agrees"
+    assert page.verdict(spec(claim="above"), ours) == "agrees in sign"
     assert page.verdict(spec(claim="below"), ours) == "does not, ours is higher"
     assert page.verdict(spec(claim="below"), Estimate(0.1, -0.1, 0.3, 9)).endswith("the interval holds 0")
     assert page.verdict(spec(range=(0, 1)), 0.5).startswith("cannot be told, because too few")
@@ -86,6 +86,11 @@ def test_figures_come_from_stored_tables(tmp_path):
     assert page.our_figure(tmp_path, row) == Estimate(0.2, 0.1, 0.3, 800)
     page.write_paper_page(page.page_tables(tmp_path), tmp_path / "out", tmp_path)
     assert "not run yet" in (tmp_path / "out/paper.html").read_text() and (tmp_path / "out/paper_claims.csv").is_file()
+
+
+def test_the_page_in_the_results_is_that_of_the_stored_tables():
+    text = (page.CONFIGS.parent / "paper.md").read_text(encoding="utf-8")
+    assert text == page.as_markdown(page.page_tables(page.STORED)), "patchlab table paper > .../results/paper.md"
 
 
 def test_the_command_prints_the_page_and_runs_its_parts(tmp_path, capsys, monkeypatch):

@@ -3,7 +3,7 @@
 In: `results/paper_page/paper.toml`, a row for each figure and claim of the paper; a folder with a folder per part
 (`PARTS`), each with the CSV tables of its finished study. Out: tables of rows: the paper's figure, ours with its
 interval, and "agrees", "does not", "cannot be told" or "not run yet" with the reason. A figure agrees where our 95 %
-interval overlaps the paper's range; a claim on a sign where the interval lies on that side of 0, and it does not where
+interval overlaps the paper's range; a claim "in sign" where the interval lies on that side of 0, and it does not where
 it lies on the other. Our networks are not the paper's, but for MobileNet v2: what can agree is the pattern.
 """
 
@@ -180,7 +180,7 @@ def verdict(spec: RowSpec, ours: Estimate | float | None, was_run: bool = False)
     else:
         return "cannot be told, because the paper has no figure"
     if ours.low <= high and ours.high >= low:
-        return "agrees"
+        return "agrees in sign" if spec.claim else "agrees"
     return f"does not, ours is {'lower' if ours.high < low else 'higher'}"
 
 
