@@ -15,8 +15,8 @@ from patchproof.base.color import ciede2000, lab_from_linear, linear_from_srgb
 from patchproof.channel.print_colors import ShownColors, add_ink
 from patchproof.channel.printer import identity_printer, load_printer
 from patchproof.classifier import Classifier
-from patchproof.evidence.appearance import invert_affine
 from patchproof.evidence.classify import square_of
+from patchproof.evidence.color_fit import invert_affine
 from patchproof.evidence.gather import gather_evidence
 from patchproof.evidence.ledger import _ledger, shapley
 from patchproof.evidence.print_fit import LEAST_CELLS, PhotographedDesign, cell_means, fit_print

@@ -7,7 +7,7 @@ import pytest
 from synthetic_photos import DESIGN_MM, PIECE_IDS, make_manifest, page_raster, photograph, view
 
 from patchproof.base.geometry import apply_homography, intrinsics, plane_pose, rect_corners, view_angles
-from patchproof.evidence.appearance import affine12, white_black
+from patchproof.evidence.color_fit import affine12, white_black
 from patchproof.photo.detect import find_markers
 from patchproof.photo.known_page import complete_markers
 from patchproof.photo.pose import flat_sheet_position

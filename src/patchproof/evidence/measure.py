@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from patchproof.base.geometry import MM_PER_INCH, apply_homography, rect_corners
-from patchproof.evidence.appearance import MOST_CLIPPED, MOST_NOISE, DesignMatch, appearance
+from patchproof.evidence.appearance import MOST_CLIPPED, MOST_NOISE, appearance
 from patchproof.evidence.camera import PinholePhoto
+from patchproof.evidence.design_match import DesignMatch
 from patchproof.evidence.locate import MOST_SHIFT, LocatedSheet, camera_pose, geometry_of, locate_sheet, object_box
 from patchproof.evidence.ranges import PromisedRanges
 from patchproof.evidence.results import Color, Geometry, PhotoEntry, Remark, Scale, Trace

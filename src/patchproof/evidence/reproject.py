@@ -21,8 +21,9 @@ from patchproof.base.color import lift_tone, srgb_from_linear
 from patchproof.base.geometry import apply_homography, rect_corners
 from patchproof.base.resample import index_homography
 from patchproof.channel.print_colors import ShownColors, add_ink, lower_light
-from patchproof.evidence.appearance import ColorFit, fit_cells, invert_affine, noise_of, white_black
+from patchproof.evidence.appearance import fit_cells, noise_of
 from patchproof.evidence.classify import BoxEdges, square_of
+from patchproof.evidence.color_fit import ColorFit, invert_affine, white_black
 from patchproof.evidence.print_fit import PhotographedDesign, design_cells, fit_print
 from patchproof.evidence.surface import PromisedColors, Surface
 from patchproof.photo.detect import LINEAR_FLOAT32_FROM_CODE, luminance
