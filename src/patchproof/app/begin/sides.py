@@ -29,9 +29,9 @@ from patchproof.scene.patch_scene import PatchScene
 from patchproof.scene.placement import Placement, SurfaceFrame, gap_limit_mm, side_frame
 
 SIDE_NAMES: dict[Side, str] = {"+z": "front", "-z": "back", "-x": "left", "+x": "right", "+y": "top", "-y": "bottom"}
-PICTURE_PX = 320  # along the longer side: 24 from all around take 0.8 s, at 400 px 1.1 s of a preview's 4.5
+PICTURE_PX = 320  # along the longer side
 _ROOM = 1.12  # of the largest extent
-_STEP_DEG = 15
+_STEP_DEG = 30
 _ABOVE_DEG, _STEEPEST_DEG = 20.0, 55.0
 _BAR_SHARE = 0.35  # of the picture's width at most
 # five colors of viridis, legible to the color-blind; and a color for no surface that is none of them
@@ -59,7 +59,7 @@ def side_views(stage: Stage) -> tuple[dict[Side, np.ndarray], dict[str, float]]:
 
 
 def turntable(stage: Stage) -> dict[int, np.ndarray]:
-    """Render the object from a ring of directions, 180° down to -165° to the right of the side of the piece or of the
+    """Render the object from a ring of directions, 180° down to -150° to the right of the side of the piece or of the
     scene's front, the piece colored by its gap: uint8 H×W×3 by degrees. From one to the next, what faces the camera
     moves to the right.
     """
