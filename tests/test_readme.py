@@ -17,7 +17,7 @@ from test_imports import MAY_IMPORT
 
 from patchlab.study.record import parse_hits
 from patchlab.study.study import load_study
-from patchproof.base.intervals import student_mean
+from patchproof.base.intervals import student_mean, wilson
 from patchproof.base.settings import SceneSettings
 from patchproof.base.validation import read_toml, validate_model
 from patchproof.optimizer.problem import FIGURE_SAMPLING, FIGURE_SCALE
@@ -252,6 +252,21 @@ def test_what_drafts_answer_is_stored():
         assert f"of {sum(told)} designs {said} {told[0]}, {told[1]} and {told[2]}" in words(NOTEBOOK)
         assert sum(told) >= 20
     assert answers["helps", "does_not_help"] == 0 and answers["does_not_help", "helps"] <= 1
+
+
+def test_finds_of_prints_without_markers_are_the_stored_ones():
+    rows = rows_of("find/trials.csv")
+    shown = [row for row in rows if row["shown"] == "1"]
+    found = [row for row in shown if row["off_px"] and float(row["off_px"]) < 0.1 * float(row["width_px"])]
+    unsaid = sum(not row["said"] for row in shown) - len(found)
+    off = float(np.percentile([float(row["off_px"]) for row in found], 95))
+    low, high = (100 * bound for bound in wilson(len(found), len(shown)))
+    share = f"{len(found) / len(shown):.1%}".replace("%", " %")
+    said = f"{len(found)} of {len(shown)} prints are found ({share} [{low:.1f}, {high:.1f}]), "
+    said += f"{len(shown) - len(found) - unsaid} say that they were not, {unsaid} is found elsewhere than it lies. "
+    assert said + f"Their corners are off by at most {off:.2f} px in 95 %." in words(NOTEBOOK)
+    empty = [row["said"] for row in rows if row["shown"] == "0"]
+    assert f"In {len(empty)} pictures without the print" in words(NOTEBOOK) and set(empty) == {"no_corners"}
 
 
 def test_what_jagged_outlines_cost_is_the_stored_figure():
