@@ -58,7 +58,7 @@ def here(tmp_path_factory):
 def test_commands(here, monkeypatch, capsys):
     monkeypatch.chdir(here)
     # fewer than a user would ask for
-    lines = re.sub(r"--n \d+ --sessions \d+", "--n 4 --sessions 4", blocks("console")[0]).replace("--n 100", "--n 4")
+    lines = re.sub(r"--n \d+ --sessions \d+", "--n 2 --sessions 2", blocks("console")[0]).replace("--n 100", "--n 4")
     for line in lines.splitlines():
         program, *arguments = shlex.split(line)
         assert program == "patchproof"

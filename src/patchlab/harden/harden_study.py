@@ -12,7 +12,6 @@ PNGs to `images/`. Originals are judged in separate cells, once per network.
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -24,7 +23,7 @@ from patchlab.harden.attacks import PGD_STEP, PGD_STEPS, is_correct, pgd_outcome
 from patchlab.harden.hardening import Epsilon, HardenMethod, center_squares, epsilon_text, harden, image_change
 from patchlab.harden.labeled_photos import list_labeled_files, read_large_enough, split_into_blocks
 from patchlab.study.estimates import cluster_mean
-from patchlab.study.grid import Names, PositiveInt, short_name
+from patchlab.study.grid import Names, PositiveInt, cached_network, short_name
 from patchlab.study.study import DEFAULT_WORK, Cell, FinishedStudy, Result, Study, Work, run_cells
 from patchproof.base.csv_file import csv_lines
 from patchproof.base.folder_lock import lock_folder
@@ -32,7 +31,6 @@ from patchproof.base.intervals import estimate_difference, rate
 from patchproof.base.output import image_bytes, refuse_inputs_in, write_atomically
 from patchproof.base.validation import Positive, Share, StrictModel, expand_path
 from patchproof.classifier.labels import find_labels
-from patchproof.classifier.load import load_classifier
 from patchproof.classifier.network import Classifier
 from patchproof.photo.rejection import PhotoRejected
 from patchproof.report.tables import Table
@@ -117,7 +115,7 @@ def run(settings: HardenSettings, base: Path, cell: Cell) -> dict[str, Any]:
     if photos and "variant" in values:
         names, how = values["variant"]["models"], (values["variant"]["method"], values["variant"]["epsilon"])
         networks, truth = (
-            [_classifier(name, base) for name in names],
+            [cached_network(name, base) for name in names],
             [_label_indices(name, base, labels) for name in names],
         )
         steps = settings.steps, settings.step_size, settings.through
@@ -128,7 +126,7 @@ def run(settings: HardenSettings, base: Path, cell: Cell) -> dict[str, Any]:
             photo["rms"], photo["ssim"] = image_change(original, picture)
     for name in values["judges"] if photos else ():
         truth = torch.tensor(_label_indices(name, base, labels))
-        outcomes, lost = _judge(settings, _classifier(name, base), pictures, truth)
+        outcomes, lost = _judge(settings, cached_network(name, base), pictures, truth)
         for i, photo in enumerate(photos):
             photo["right"][name] = [bool(outcome[i]) for outcome in outcomes]
             photo["lost_at"][name] = [int(steps[i]) for steps in lost]
@@ -265,14 +263,9 @@ def _variant_texts(variant: Mapping[str, Any]) -> tuple[str, str, str]:
     return ", ".join(map(short_name, variant["models"])), variant["method"], epsilon_text(variant["epsilon"])
 
 
-@lru_cache(maxsize=4)  # a process works through one study: its networks stay loaded
-def _classifier(name: str, base: Path) -> Classifier:
-    return load_classifier(name, base)
-
-
 def _label_indices(name: str, base: Path, labels: Sequence[str]) -> list[int]:
     """A network's indices of labels; refused if it lacks one."""
-    known = _classifier(name, base).labels
+    known = cached_network(name, base).labels
     index = {label: find_labels(known, int(label) if label.isdigit() else label)[0] for label in dict.fromkeys(labels)}
     return [index[label] for label in labels]
 

@@ -27,7 +27,17 @@ import torch
 from patchlab.paper.image_classes import ImageClass, PastedSettings, class_scene, list_classes
 from patchlab.study.estimates import cluster_mean
 from patchlab.study.figures import contact_sheet, enlarge_design, photographs, picture_sheet
-from patchlab.study.grid import Names, PositiveInt, Seeds, by_values, group_by, make_cell, scene_values, short_name
+from patchlab.study.grid import (
+    Names,
+    PositiveInt,
+    Seeds,
+    by_values,
+    cached_network,
+    group_by,
+    make_cell,
+    scene_values,
+    short_name,
+)
 from patchlab.study.record import parse_hits, to_record
 from patchlab.study.study import Cell, Result, Study
 from patchproof.base.errors import Refused
@@ -35,7 +45,6 @@ from patchproof.base.intervals import estimate_difference, rate
 from patchproof.base.validation import expand_path, spelling_hint
 from patchproof.channel.printer import load_printer
 from patchproof.classifier.labels import find_labels
-from patchproof.classifier.load import load_classifier
 from patchproof.classifier.network import Classifier
 from patchproof.optimizer.loop import best_design
 from patchproof.optimizer.patch import Patch
@@ -84,7 +93,7 @@ def cells(settings: Patch2dSettings, base: Path) -> list[Cell]:
 def run(settings: Patch2dSettings, base: Path, cell: Cell) -> dict[str, Any]:
     """Make one patch, and show every class with and without it."""
     values, seed = cell.values, cell.values["seed"]
-    classifier = load_classifier(expand_path(values["networks"][0], base), base)
+    classifier = cached_network(expand_path(values["networks"][0], base), base)
     classes = list_classes(settings.images, settings.labels, values["renders"], base)
     target = [each.label for each in classes].index(values["target"])
     with tempfile.TemporaryDirectory() as folder:

@@ -9,6 +9,7 @@ and masked textures, bounded or free. Changes are checked like the file.
 
 import re
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -17,6 +18,8 @@ from pydantic import Field, model_validator
 from patchlab.study.study import Cell, Result
 from patchproof.base.settings import SceneSettings
 from patchproof.base.validation import StrictModel, expand_path, read_toml, validate_model
+from patchproof.classifier.load import load_classifier
+from patchproof.classifier.network import Classifier
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.scene.interface import Scene
 from patchproof.scene.scene import build_scene
@@ -105,7 +108,14 @@ def network_names(base: Path, values: Mapping[str, Any]) -> tuple[str, ...]:
 
 def problem_of(base: Path, values: Mapping[str, Any]) -> Problem:
     """The problem of the scene and networks in a cell's values."""
-    return set_problem(scene_of(base, values), models=network_names(base, values))
+    scene = scene_of(base, values)
+    return set_problem(scene, models=[cached_network(name, scene.base) for name in network_names(base, values)])
+
+
+@lru_cache(maxsize=8)
+def cached_network(name: str, base: Path) -> Classifier:
+    """Load a network once in a process, since to check it takes as long as many a cell."""
+    return load_classifier(name, base)
 
 
 def group_by(results: Iterable[Result], key: Callable[[Result], Key]) -> dict[Key, list[Result]]:

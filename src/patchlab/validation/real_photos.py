@@ -11,7 +11,6 @@ Left out on purpose: color, since boards are black and white; distances and angl
 
 import statistics
 from collections.abc import Sequence
-from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -21,6 +20,7 @@ import torch
 from pydantic import Field
 
 from patchlab.study.figures import picture_sheet
+from patchlab.study.grid import cached_network
 from patchlab.study.study import Cell, Result, Study
 from patchlab.validation.board_fit import BoardFit, edge_profile, fit_board, white_noise
 from patchlab.validation.marker_boards import BoardPose, BoardSettings, find_board
@@ -30,7 +30,6 @@ from patchproof.base.output import image_bytes, image_pixels
 from patchproof.base.settings import CameraSettings, PrinterSettings
 from patchproof.base.validation import StrictModel, expand_path
 from patchproof.channel.printer import load_printer
-from patchproof.classifier.load import load_classifier
 from patchproof.classifier.network import Classifier
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.photo.read import list_photos, read_photo
@@ -93,7 +92,7 @@ def run(settings: RealSettings, base: Path, cell: Cell) -> dict[str, Any]:
         return {"left_out": error.advice}
     ours = fit.rendered()
     pasted = np.where(fit.mask[..., None], ours, srgb)
-    networks = {name: _measure_changes(_network(name, str(base)), srgb, pasted) for name in settings.networks}
+    networks = {name: _measure_changes(cached_network(name, base), srgb, pasted) for name in settings.networks}
     answers = {"left_out": None, **_photo_figures(srgb, ours, pose, fit), "networks": networks}
     return answers | {f"{cell.name}.png": _compare_pictures(srgb, pasted, fit)}
 
@@ -120,11 +119,6 @@ def _photo_figures(srgb: np.ndarray, ours: np.ndarray, pose: BoardPose, fit: Boa
         "module_px": pose.module_px,
         "clipped": fit.clipped,
     }
-
-
-@lru_cache(maxsize=8)
-def _network(name: str, base: str) -> Classifier:
-    return load_classifier(name, Path(base))
 
 
 def _measure_changes(network: Classifier, srgb: np.ndarray, pasted: np.ndarray) -> dict[str, Any]:

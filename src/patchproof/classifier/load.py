@@ -70,7 +70,7 @@ def load_classifier(
 
         name = labeled_module(name, "python:network")
     if isinstance(name, Classifier):
-        return _prepare(name, device)
+        return name if name.checked_on == str(device) else _prepare(name, device)
     if not isinstance(name, str):
         got = f"an object of type {type(name).__name__}"
         raise Refused("a network's name, or a network in memory", got, "wrap it with classifier_of or detector_of")
@@ -112,7 +112,7 @@ def _prepare(classifier: Classifier, device: torch.device | str, is_own: bool = 
         notes = tuple(dict.fromkeys(str(each.message) for each in said))
         for note in notes:
             warnings.warn(note, stacklevel=4)
-        return replace(tuned, notes=notes)
+        return replace(tuned, notes=notes, checked_on=str(device))
 
     use_full_precision(device)
     if isinstance(classifier.network, torch.nn.Module):
