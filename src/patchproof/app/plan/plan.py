@@ -32,7 +32,7 @@ from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.place_search import choose_place, place_lines
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.optimizer.promise import CONTROLS, VIEWS_PER_SESSION, make_promise
-from patchproof.render.photograph import affected_windows, expose
+from patchproof.render.photograph import expose
 from patchproof.scene.bent_scene import placement_with_other_bend
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.interface import (
@@ -181,9 +181,9 @@ def _step_ms(problem: Problem, design: Tensor, conditions: Conditions) -> dict[s
     ends["printer" if problem.scene.HAS_PIECE else "textures"] = time.perf_counter()
     pictures = expose(views, appearance)
     ends["light, piece and camera"] = time.perf_counter()
-    leaf, boxes, windows = pictures.detach().requires_grad_(), problem.boxes(conditions), affected_windows(views)
+    leaf, boxes = pictures.detach().requires_grad_(), problem.boxes(conditions)
     losses = [
-        problem.losses(classifier, classifier.logits(leaf, boxes, windows), indices).mean()
+        problem.losses(classifier, classifier.logits(leaf, boxes), indices).mean()
         for classifier, indices in zip(problem.classifiers, problem.indices, strict=True)
     ]
     loss = torch.stack(losses).mean()
