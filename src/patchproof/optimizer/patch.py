@@ -15,7 +15,6 @@ import torch
 from torch import Tensor
 
 from patchproof.base.errors import Refused
-from patchproof.base.output import image_bytes
 from patchproof.channel.printer import Printer
 from patchproof.optimizer.pixels import as_pixels
 from patchproof.optimizer.subject import (
@@ -102,10 +101,6 @@ class Patch:
     def save(self, pixels: np.ndarray, folder: Path) -> None:
         """Write `design.png`."""
         write_png(folder / DESIGN_FILE, pixels)
-
-    def file(self, pixels: np.ndarray) -> tuple[str, bytes]:
-        """The design as PNG."""
-        return "png", image_bytes(pixels, "PNG", {"optimize": True})
 
     @property
     def texels_per_mm(self) -> float:
