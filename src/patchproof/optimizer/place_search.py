@@ -54,9 +54,6 @@ class Candidate(StrictModel):
 
     at: PiecePosition
     spin_deg: float
-    family: str
-    gap_mm: float
-    overhang_share: float
     gray: float
     outlook: float
     draft: float | None = None
@@ -248,14 +245,5 @@ def _thin_out(trials: Sequence[_ScreenedPlace], distance_mm: float) -> list[_Scr
 
 
 def _candidate(trial: _ScreenedPlace, draft_loss: float | None = None) -> Candidate:
-    placement = trial.spot.placement
-    return Candidate(
-        at=trial.spot.at,
-        spin_deg=trial.spot.spin_deg,
-        family=placement.family,
-        gap_mm=round(placement.gap_mm, 2),
-        overhang_share=round(placement.overhang_share, 4),
-        gray=trial.gray,
-        outlook=trial.outlook,
-        draft=draft_loss,
-    )
+    spot = trial.spot
+    return Candidate(at=spot.at, spin_deg=spot.spin_deg, gray=trial.gray, outlook=trial.outlook, draft=draft_loss)

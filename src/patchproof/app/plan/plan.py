@@ -13,6 +13,7 @@ Left out on purpose: deciding for the user. The plan says which terms can go; th
 import math
 import statistics
 import time
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -145,10 +146,11 @@ def marker_plan(scene: PieceScene) -> dict[str, float]:
 
 def _draft(problem: Problem, progress: Progress) -> tuple[Tensor, PlanData]:
     """Optimize a design for a few steps: its 8-bit colors, and its steps and rate on the selection set."""
-    settings = problem.scene.settings.optimize
-    count = min(settings.steps, math.ceil(DRAFT_VIEWS / settings.views))
+    settings = problem.scene.settings
+    count = min(settings.optimize.steps, math.ceil(DRAFT_VIEWS / settings.optimize.views))
+    short = replace(problem.scene, settings=settings.changed(optimize={"steps": count}))  # of the same sheet id
     state, rate = start(problem), None
-    for step in steps(problem.with_training(settings.changed(steps=count)), state):
+    for step in steps(replace(problem, scene=short), state):
         state, rate = step.state, step.select_rate
         progress("draft", state.number, count)
     assert rate is not None  # the last step ends with a selection
