@@ -23,8 +23,8 @@ from patchlab.study.record import Record
 from patchlab.study.study import Cell, Result, Study
 from patchlab.study.trained_designs import views_from_sides
 from patchproof.optimizer.loop import best_design
-from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.promise import pictures_with_controls
+from patchproof.optimizer.subject import from_pixels
 from patchproof.optimizer.texture import Texture
 from patchproof.report.tables import Drawing, Table
 from patchproof.sheets.piece import CELLS

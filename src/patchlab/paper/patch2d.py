@@ -39,9 +39,9 @@ from patchproof.classifier.load import load_classifier
 from patchproof.classifier.network import Classifier
 from patchproof.optimizer.loop import best_design
 from patchproof.optimizer.patch import Patch
-from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import Problem
 from patchproof.optimizer.responses import responses
+from patchproof.optimizer.subject import from_pixels
 from patchproof.render.photograph import Appearance
 from patchproof.render.stage import set_stage
 from patchproof.report.tables import Drawing, Table

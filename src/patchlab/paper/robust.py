@@ -22,7 +22,7 @@ from patchlab.study.study import Cell, Result, Study
 from patchlab.study.trained_designs import mean_color, views_from_sides
 from patchproof.base.color import linear_from_srgb, srgb_from_linear
 from patchproof.optimizer.loop import best_design
-from patchproof.optimizer.pixels import from_pixels
+from patchproof.optimizer.subject import from_pixels
 from patchproof.report.tables import Drawing, Table
 
 if TYPE_CHECKING:

@@ -20,8 +20,8 @@ from torch import Tensor
 from patchproof.base.errors import Refused
 from patchproof.mesh.mesh import Mesh
 from patchproof.mesh.unwrap import spans, unwrap
-from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.problem import Problem
+from patchproof.optimizer.subject import as_pixels, from_pixels
 from patchproof.optimizer.texture import Texture
 from patchproof.render.pixels import ObjectTextures
 from patchproof.render.stage import set_stage

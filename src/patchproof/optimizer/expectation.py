@@ -21,8 +21,8 @@ import torch
 from torch import Tensor
 
 from patchproof.base.workers import fork_workers
-from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.problem import Problem
+from patchproof.optimizer.subject import as_pixels, from_pixels
 from patchproof.render.photograph import expose
 from patchproof.render.views import Views, split_views
 from patchproof.scene.conditions import Conditions

@@ -16,9 +16,9 @@ from torch import Tensor
 
 from patchproof.base.errors import Refused
 from patchproof.channel.printer import Printer
-from patchproof.optimizer.pixels import as_pixels
 from patchproof.optimizer.subject import (
     DESIGN_FILE,
+    as_pixels,
     build_pyramid,
     collapse_pyramid,
     total_variation,

@@ -27,10 +27,9 @@ from patchproof.base.workers import fork_workers
 from patchproof.classifier.network import Classifier
 from patchproof.optimizer.expectation import gradient_in_views, training_views
 from patchproof.optimizer.loop import draft, start
-from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.optimizer.responses import responses
-from patchproof.optimizer.subject import Loss
+from patchproof.optimizer.subject import Loss, as_pixels, from_pixels
 from patchproof.render.pixels import Appearance
 from patchproof.scene.candidate_places import MIN_DISTANCE_SHARE, CandidatePlace, PlaceFinder
 from patchproof.scene.conditions import Conditions

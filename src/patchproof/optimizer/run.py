@@ -44,7 +44,6 @@ from patchproof.optimizer.loop import (
     start,
     steps,
 )
-from patchproof.optimizer.pixels import side_by_side
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.optimizer.promise import PROMISE_VIEWS, VIEWS_PER_SESSION, PromiseOptions, make_promise
 from patchproof.optimizer.subject import (
@@ -54,6 +53,7 @@ from patchproof.optimizer.subject import (
     TEXTURE_FILES,
     Loss,
     read_png,
+    side_by_side,
     write_png,
 )
 from patchproof.scene.interface import Scene

@@ -21,7 +21,7 @@ from patchproof.base.errors import Refused
 from patchproof.base.output import write_atomically
 from patchproof.mesh.export import write_glb
 from patchproof.optimizer import subject
-from patchproof.optimizer.pixels import as_pixels, from_pixels
+from patchproof.optimizer.subject import as_pixels, from_pixels
 from patchproof.render.designs import LearnedTextures
 from patchproof.render.pixels import ObjectTextures
 from patchproof.scene.interface import Scene

@@ -29,10 +29,10 @@ from patchproof.evidence.verdict import photos_line
 from patchproof.optimizer.expectation import new_pose_share
 from patchproof.optimizer.loop import SELECT_VIEWS, start, steps
 from patchproof.optimizer.patch import Patch
-from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.place_search import choose_place, place_lines
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.optimizer.promise import CONTROLS, VIEWS_PER_SESSION, make_promise
+from patchproof.optimizer.subject import as_pixels, from_pixels
 from patchproof.render.photograph import expose
 from patchproof.scene.bent_scene import placement_with_other_bend
 from patchproof.scene.conditions import Conditions
