@@ -23,7 +23,6 @@ from torch.nn import functional as F
 import patchproof.networks.onnx_shapes as shapes
 import patchproof.networks.onnx_windows as windows
 from patchproof.networks.bounds import UnsupportedNetwork, quote
-from patchproof.networks.onnx_resize import resize, upsample
 from patchproof.networks.onnx_shapes import MAX_SIZES, numbers
 
 MAX_STEPS = 1 << 12  # of a sequence, one after the other
@@ -321,7 +320,7 @@ _TABLE: dict[str, Callable[..., Any]] = {
     "Expand": lambda x, /, shape: x.expand(torch.broadcast_shapes(x.shape, numbers(shape))),
     "Tile": lambda x, /, repeats: x.tile(numbers(repeats)),
     "Pad": shapes.pad,
-    **{"Resize": resize, "Upsample": upsample},
+    **{"Resize": windows.resize, "Upsample": windows.upsample},
     "GridSample": _grid_sample,
     "AffineGrid": lambda theta, /, size, *, align_corners=0: F.affine_grid(theta, numbers(size), bool(align_corners)),
     "Size": lambda x, /: torch.tensor(x.numel()),
@@ -334,7 +333,7 @@ OPERATORS = {name: Operator(name, compute) for name, compute in _TABLE.items()}
 _FORMER = {
     "Softmax": (13, Operator("Softmax", _of_rows(torch.softmax))),
     "LogSoftmax": (13, Operator("LogSoftmax", _of_rows(torch.log_softmax))),
-    "Resize": (11, Operator("Upsample", upsample)),
+    "Resize": (11, Operator("Upsample", windows.upsample)),
 }
 RESULTS = {"TopK": 2, "LSTM": 3}  # how many, where there are several
 # operators of the standard that are left out, by the reason
