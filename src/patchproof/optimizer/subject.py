@@ -28,18 +28,12 @@ from torch.nn.functional import avg_pool2d, interpolate
 from patchproof.base.color import codes_from_srgb
 from patchproof.base.goal import Goal
 from patchproof.base.input import open_image
-from patchproof.base.output import write_atomically
 from patchproof.classifier.network import Odds
 
 DESIGN_FILE, OBJECT_FILE, TEXTURE_FILES, MASK_FILE = "design.png", "object.glb", "texture_*.png", "mask.png"
 MIN_COARSEST_BLOCKS = 8  # blocks along the shorter side of the coarsest level
 _COLUMNS, _CAPTION_PX = 4, 13  # of pictures side by side
 Loss = Callable[[Tensor, Sequence[int]], Tensor]  # (logits N×K, label indices) -> N losses to descend on
-
-
-def write_png(path: Path, pixels: np.ndarray) -> None:
-    """Replace a picture by uint8 pixels."""
-    write_atomically(path, lambda part: Image.fromarray(pixels).save(part, "PNG"))
 
 
 def read_png(path: Path, max_side_px: int = 1 << 16) -> np.ndarray:

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from patchproof.base.errors import Refused
-from patchproof.base.output import write_atomically
+from patchproof.base.output import image_bytes, write_atomically
 from patchproof.mesh.export import write_glb
 from patchproof.optimizer import subject
 from patchproof.optimizer.subject import as_pixels, from_pixels
@@ -105,10 +105,10 @@ class Texture:
         textures, masks = self.surface.textures(pixels), self.canvas.mask
         write_atomically(folder / subject.OBJECT_FILE, lambda path: write_glb(self.canvas.mesh, textures, path))
         for i, texture in enumerate(textures):
-            subject.write_png(folder / subject.TEXTURE_FILES.replace("*", f"{i}"), texture)
+            write_atomically(folder / subject.TEXTURE_FILES.replace("*", f"{i}"), image_bytes(texture, "PNG"))
         width = max(mask.shape[1] for mask in masks)
-        wide = [np.pad(mask, ((0, 0), (0, width - mask.shape[1]))) for mask in masks]
-        subject.write_png(folder / subject.MASK_FILE, np.concatenate(wide).astype(np.uint8) * 255)
+        wide = np.concatenate([np.pad(mask, ((0, 0), (0, width - mask.shape[1]))) for mask in masks])
+        write_atomically(folder / subject.MASK_FILE, image_bytes(wide.astype(np.uint8) * 255, "PNG"))
 
     @property
     def texels_per_mm(self) -> float:
