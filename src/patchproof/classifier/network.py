@@ -62,8 +62,7 @@ class Classifier:
         """N×K logits of the photographs' centered squares. Refused if any is not finite, since the largest of a row
         with NaN is the NaN and would pass for an answer.
 
-        `boxes` N×4 are the object's boxes as shares of the square's side (left, top, right, bottom); only detectors use
-        them.
+        `boxes` N×4 are the object's boxes as shares of the square's side (left, top, right, bottom), for detectors.
         """
         if not isinstance(photos_srgb, Tensor) or photos_srgb.dim() != 4 or photos_srgb.shape[1] != 3:
             raise Refused("photographs as a tensor N×3×H×W", brief(photos_srgb), "stack them, channels first")
