@@ -31,8 +31,8 @@ from patchproof.base.settings import SceneSettings
 from patchproof.base.validation import validate_model
 from patchproof.channel.effects import EFFECTS, RECORD_OF
 from patchproof.optimizer import loop
-from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import set_problem
+from patchproof.optimizer.subject import from_pixels
 from patchproof.photo.paper_light import PaperLight
 from patchproof.scene.bent_scene import placement_with_other_bend
 from patchproof.scene.conditions import draw

@@ -30,8 +30,8 @@ from patchproof.base.settings import SceneSettings
 from patchproof.base.validation import validate_model
 from patchproof.channel.effects import FIELDS
 from patchproof.optimizer import loop, run
-from patchproof.optimizer.pixels import as_pixels
 from patchproof.optimizer.problem import set_problem
+from patchproof.optimizer.subject import as_pixels
 from patchproof.scene.conditions import fields_of, with_values
 from patchproof.scene.scene import build_scene
 

@@ -27,13 +27,12 @@ from patchproof.classifier.network import Classifier
 from patchproof.optimizer import expectation, loop, run
 from patchproof.optimizer.evaluate import promise_run
 from patchproof.optimizer.loop import start, steps, take_step
-from patchproof.optimizer.pixels import as_pixels, from_pixels, side_by_side
 from patchproof.optimizer.problem import set_problem
 from patchproof.optimizer.promise import CONTROLS, PromiseOptions, make_promise
 from patchproof.optimizer.responses import responses
 from patchproof.optimizer.run import load_run
 from patchproof.optimizer.run import optimize as optimize_scene
-from patchproof.optimizer.subject import target_loss, total_variation
+from patchproof.optimizer.subject import as_pixels, from_pixels, side_by_side, target_loss, total_variation
 from patchproof.render.photograph import photograph
 from patchproof.scene.conditions import fields_of, with_values
 from patchproof.scene.scene import build_scene

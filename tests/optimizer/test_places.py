@@ -261,11 +261,7 @@ def test_a_run_keeps_its_place_and_neither_loads_nor_resumes_by_searching(tmp_pa
 def test_the_picture_shows_the_places_and_the_chosen_outline(tmp_path):
     scene = open_scene()
     spots = PlaceFinder(scene).candidates(3)
-    laid = [spot.placement for spot in spots]
-    candidates = tuple(
-        place_search.Candidate(at=s.at, spin_deg=0, family=p.family, gap_mm=0, overhang_share=0, gray=0, outlook=0)
-        for s, p in zip(spots, laid, strict=True)
-    )
+    candidates = tuple(place_search.Candidate(at=spot.at, spin_deg=0, gray=0, outlook=0) for spot in spots)
     place = place_search.Place(
         sheet_id=scene.sheet_id,
         front="+z",

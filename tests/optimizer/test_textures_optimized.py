@@ -13,11 +13,11 @@ from patchproof.mesh.export import write_glb
 from patchproof.mesh.mesh import Material, MeshPart, mesh_from_parts
 from patchproof.optimizer import loop, run
 from patchproof.optimizer.evaluate import evaluate as evaluate_run
-from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import set_problem
 from patchproof.optimizer.promise import PromiseOptions
 from patchproof.optimizer.run import load_run
 from patchproof.optimizer.run import optimize as optimize_scene
+from patchproof.optimizer.subject import from_pixels
 from patchproof.render.photograph import photograph
 from patchproof.render.stage import set_stage
 from patchproof.scene.conditions import with_values

@@ -25,9 +25,9 @@ from patchproof.base.packaged import packaged_path
 from patchproof.base.settings import SceneSettings
 from patchproof.channel.effects import Print
 from patchproof.channel.printer import load_printer
-from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import set_problem
 from patchproof.optimizer.run import Run, load_run
+from patchproof.optimizer.subject import from_pixels
 from patchproof.render.photograph import photograph
 from patchproof.render.stage import set_stage
 from patchproof.reprints.mounted_sheet import MountedSheet, sent_pixels, take_photo

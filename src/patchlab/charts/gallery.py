@@ -13,8 +13,8 @@ from patchproof.app.begin.new import new_scene
 from patchproof.base.compute import Compute
 from patchproof.base.output import new_folder, write_atomically
 from patchproof.base.progress import Progress, no_progress
-from patchproof.optimizer.pixels import as_pixels
 from patchproof.optimizer.run import Run, optimize
+from patchproof.optimizer.subject import as_pixels
 from patchproof.render.photograph import photograph
 from patchproof.render.stage import set_stage
 from patchproof.report.page import data_uri, jpeg, render_page

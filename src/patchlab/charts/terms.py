@@ -26,10 +26,10 @@ from patchlab.validation.ablation import simplify_problem
 from patchproof.app.plan.errors import PRINTER, Setup, scene_terms
 from patchproof.base.sessions import count_by_session, rate_posterior
 from patchproof.optimizer.loop import best_design
-from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import Problem
 from patchproof.optimizer.promise import VIEWS_PER_SESSION
 from patchproof.optimizer.responses import responses
+from patchproof.optimizer.subject import from_pixels
 from patchproof.render.photograph import expose
 from patchproof.report.tables import Drawing, Table
 

@@ -32,8 +32,8 @@ from patchproof.base.settings import (
 )
 from patchproof.base.validation import Positive, PositiveRange, Range, Share, StrictModel, expand_path
 from patchproof.classifier.network import Classifier
-from patchproof.optimizer.pixels import as_pixels
 from patchproof.optimizer.responses import in_chunks
+from patchproof.optimizer.subject import as_pixels
 from patchproof.render.photograph import shade
 from patchproof.render.stage import Stage, set_stage
 from patchproof.render.views import render_views

@@ -48,9 +48,9 @@ from patchproof.classifier.labels import find_labels
 from patchproof.classifier.network import Classifier
 from patchproof.optimizer.loop import best_design
 from patchproof.optimizer.patch import Patch
-from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import Problem
 from patchproof.optimizer.responses import responses
+from patchproof.optimizer.subject import from_pixels
 from patchproof.render.photograph import Appearance
 from patchproof.render.stage import set_stage
 from patchproof.report.tables import Drawing, Table

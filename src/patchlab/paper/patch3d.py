@@ -38,10 +38,10 @@ from patchproof.base.settings import ObjectSettings, PatchSettings, SceneSetting
 from patchproof.base.validation import Range, Share
 from patchproof.optimizer.loop import best_design, views_per_network
 from patchproof.optimizer.patch import Patch
-from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import Problem
 from patchproof.optimizer.promise import pictures_with_controls
 from patchproof.optimizer.responses import responses
+from patchproof.optimizer.subject import from_pixels
 from patchproof.render.photograph import Appearance
 from patchproof.render.stage import set_stage
 from patchproof.report.page import png

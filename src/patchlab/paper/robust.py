@@ -22,7 +22,7 @@ from patchlab.study.study import Cell, Result, Study
 from patchlab.study.trained_designs import mean_color, views_from_sides
 from patchproof.base.color import linear_from_srgb, srgb_from_linear
 from patchproof.optimizer.loop import best_design
-from patchproof.optimizer.pixels import from_pixels
+from patchproof.optimizer.subject import from_pixels
 from patchproof.report.tables import Drawing, Table
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ def run(settings: RobustSettings, base: Path, cell: Cell) -> dict[str, Any]:
     design = best_design(trained_designs.with_trainers(problem, cell))
     pixels = (subject.start(), from_pixels(design, problem.device))
     things = {kind: subject.appearance(each) for kind, each in zip(_KINDS, pixels, strict=True)}
-    suffix, content = subject.file(design)
+    suffix, content = trained_designs.design_file(problem, design)
     return {
         **trained_designs.test_and_draw(
             problem, cell.name, things, settings.n, (views_from_sides(problem, _SHEET_VIEWS), _SHEET_PX)

@@ -29,6 +29,7 @@ from patchlab.study.trained_designs import (
     ORIGINAL,
     NamePart,
     TrainedSettings,
+    design_file,
     gain_word,
     single_network_rows,
     test_and_draw,
@@ -105,7 +106,7 @@ def run(settings: TransferSettings, base: Path, cell: Cell) -> dict[str, Any]:
     if cell.values["trained"]:
         design = best_design(with_trainers(problem, cell))
         things = pictures_with_controls(problem, design, ())
-        suffix, content = problem.subject.file(design)
+        suffix, content = design_file(problem, design)
         answers[f"{cell.name}.{suffix}"] = content
     answers |= test_and_draw(problem, cell.name, things, settings.n, (views_from_sides(problem, 3), _SHEET_PX))
     if problem.scene.HAS_OBJECT:

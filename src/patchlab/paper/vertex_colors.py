@@ -11,6 +11,7 @@ Source: Pestana et al., supplement algorithms 3 and 4, with a one-dimensional ma
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -19,8 +20,8 @@ from torch import Tensor
 from patchproof.base.errors import Refused
 from patchproof.mesh.mesh import Mesh
 from patchproof.mesh.unwrap import spans, unwrap
-from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.problem import Problem
+from patchproof.optimizer.subject import as_pixels, from_pixels
 from patchproof.optimizer.texture import Texture
 from patchproof.render.pixels import ObjectTextures
 from patchproof.render.stage import set_stage
@@ -59,9 +60,9 @@ class VertexColors(Texture):
         """The object colored by a design; differentiable."""
         return self.surface.appearance(self.texels(design))
 
-    def file(self, pixels: np.ndarray) -> tuple[str, bytes]:
+    def save(self, pixels: np.ndarray, folder: Path) -> None:
         """The object with its new colors as GLB."""
-        return super().file(as_pixels(self.texels(from_pixels(pixels))))
+        super().save(as_pixels(self.texels(from_pixels(pixels))), folder)
 
     def texels(self, design: Tensor) -> Tensor:
         """The texels 3×1×M of a design 3×1×V; corners that may not change keep what their texels start from."""

@@ -13,8 +13,8 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.problem import Problem
+from patchproof.optimizer.subject import as_pixels, from_pixels
 from patchproof.render.photograph import Appearance, expose
 from patchproof.report.page import png
 from patchproof.report.tables import Drawing

@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated, Any
 
 import numpy as np
@@ -34,6 +35,7 @@ from patchproof.channel.effects import EFFECT_BY_NAME, Light, Pose, Sensor
 from patchproof.mesh.mesh import Material
 from patchproof.optimizer.problem import Problem
 from patchproof.optimizer.responses import responses
+from patchproof.optimizer.subject import DESIGN_FILE, OBJECT_FILE
 from patchproof.optimizer.texture import Texture
 from patchproof.render.photograph import Appearance, shade
 from patchproof.render.stage import set_stage
@@ -112,6 +114,14 @@ def test_and_draw(
     answers = to_record(responses(problem, things, problem.scene.draw("evaluate", n)))
     pictures = [photographs(problem, each, *sheet) for each in things.values()]
     return answers | {f"{name}.sheet.png": contact_sheet(pictures)}
+
+
+def design_file(problem: Problem, pixels: np.ndarray) -> tuple[str, bytes]:
+    """The suffix and the bytes of a design as a file: a PNG, or the object with its new textures as GLB."""
+    with TemporaryDirectory() as folder:
+        problem.subject.save(pixels, Path(folder))
+        path = Path(folder) / (DESIGN_FILE if problem.scene.HAS_PIECE else OBJECT_FILE)
+        return path.suffix[1:], path.read_bytes()
 
 
 def tested_networks(results: Sequence[Result]) -> list[str]:

@@ -35,10 +35,10 @@ from patchproof.base.validation import validate_model
 from patchproof.channel.effects import EFFECT_BY_NAME
 from patchproof.channel.printer import identity_printer
 from patchproof.optimizer.loop import best_design
-from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import Problem
 from patchproof.optimizer.promise import VIEWS_PER_SESSION
 from patchproof.optimizer.responses import ask_networks, merge_responses, responses
+from patchproof.optimizer.subject import from_pixels
 from patchproof.render.photograph import Appearance
 from patchproof.render.pixels import PiecePicture
 from patchproof.render.views import Views, relight_and_replace_background

@@ -31,7 +31,7 @@ from patchproof.base.settings import CameraSettings, PrinterSettings
 from patchproof.base.validation import StrictModel, expand_path
 from patchproof.channel.printer import load_printer
 from patchproof.classifier.network import Classifier
-from patchproof.optimizer.pixels import from_pixels
+from patchproof.optimizer.subject import from_pixels
 from patchproof.photo.read import list_photos, read_photo
 from patchproof.photo.rectify import region_around
 from patchproof.photo.rejection import PhotoRejected

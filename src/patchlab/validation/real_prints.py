@@ -48,9 +48,9 @@ from patchproof.channel.printer import (
 )
 from patchproof.optimizer.loop import best_design
 from patchproof.optimizer.patch import Patch
-from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.optimizer.promise import VIEWS_PER_SESSION
+from patchproof.optimizer.subject import from_pixels
 from patchproof.render.photograph import expose
 from patchproof.render.pixels import PiecePicture
 from patchproof.report.tables import Table

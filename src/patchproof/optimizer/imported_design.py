@@ -28,10 +28,10 @@ from patchproof.base.settings import NO_PAGE, named_paths
 from patchproof.base.text import printable
 from patchproof.base.validation import summarize_names
 from patchproof.classifier.network import Classifier
-from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.optimizer.promise import PromiseOptions
 from patchproof.optimizer.run import RUN_FILE_PATTERNS, Run, finish_run, resolve_scene
+from patchproof.optimizer.subject import from_pixels
 from patchproof.photo.detect import find_markers
 from patchproof.photo.read import read_photo
 from patchproof.photo.rejection import PhotoRejected

@@ -15,16 +15,9 @@ import torch
 from torch import Tensor
 
 from patchproof.base.errors import Refused
-from patchproof.base.output import image_bytes
+from patchproof.base.output import image_bytes, write_atomically
 from patchproof.channel.printer import Printer
-from patchproof.optimizer.pixels import as_pixels
-from patchproof.optimizer.subject import (
-    DESIGN_FILE,
-    build_pyramid,
-    collapse_pyramid,
-    total_variation,
-    write_png,
-)
+from patchproof.optimizer.subject import DESIGN_FILE, as_pixels, build_pyramid, collapse_pyramid, total_variation
 from patchproof.render.designs import PrintedPiece
 from patchproof.render.pixels import PiecePicture
 from patchproof.scene.interface import PieceScene
@@ -101,11 +94,7 @@ class Patch:
 
     def save(self, pixels: np.ndarray, folder: Path) -> None:
         """Write `design.png`."""
-        write_png(folder / DESIGN_FILE, pixels)
-
-    def file(self, pixels: np.ndarray) -> tuple[str, bytes]:
-        """The design as PNG."""
-        return "png", image_bytes(pixels, "PNG", {"optimize": True})
+        write_atomically(folder / DESIGN_FILE, image_bytes(pixels, "PNG"))
 
     @property
     def texels_per_mm(self) -> float:

@@ -27,10 +27,9 @@ from patchproof.base.workers import fork_workers
 from patchproof.classifier.network import Classifier
 from patchproof.optimizer.expectation import gradient_in_views, training_views
 from patchproof.optimizer.loop import draft, start
-from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.optimizer.responses import responses
-from patchproof.optimizer.subject import Loss
+from patchproof.optimizer.subject import Loss, as_pixels, from_pixels
 from patchproof.render.pixels import Appearance
 from patchproof.scene.candidate_places import MIN_DISTANCE_SHARE, CandidatePlace, PlaceFinder
 from patchproof.scene.conditions import Conditions
@@ -54,9 +53,6 @@ class Candidate(StrictModel):
 
     at: PiecePosition
     spin_deg: float
-    family: str
-    gap_mm: float
-    overhang_share: float
     gray: float
     outlook: float
     draft: float | None = None
@@ -248,14 +244,5 @@ def _thin_out(trials: Sequence[_ScreenedPlace], distance_mm: float) -> list[_Scr
 
 
 def _candidate(trial: _ScreenedPlace, draft_loss: float | None = None) -> Candidate:
-    placement = trial.spot.placement
-    return Candidate(
-        at=trial.spot.at,
-        spin_deg=trial.spot.spin_deg,
-        family=placement.family,
-        gap_mm=round(placement.gap_mm, 2),
-        overhang_share=round(placement.overhang_share, 4),
-        gray=trial.gray,
-        outlook=trial.outlook,
-        draft=draft_loss,
-    )
+    spot = trial.spot
+    return Candidate(at=spot.at, spin_deg=spot.spin_deg, gray=trial.gray, outlook=trial.outlook, draft=draft_loss)

@@ -16,7 +16,6 @@ from torch import Tensor
 
 from patchproof.base.errors import Refused
 from patchproof.base.fingerprint import refuse_other_inputs
-from patchproof.base.settings import OptimizeSettings
 from patchproof.base.text import brief
 from patchproof.base.validation import refuse_untrusted
 from patchproof.base.workers import use_threads
@@ -24,7 +23,6 @@ from patchproof.channel.printer import Printer, load_printer
 from patchproof.classifier.labels import find_labels
 from patchproof.classifier.load import load_classifier
 from patchproof.classifier.network import Classifier
-from patchproof.networks.batches import BatchedNetwork
 from patchproof.optimizer.patch import Patch
 from patchproof.optimizer.subject import Loss, target_loss
 from patchproof.render.pixels import PHOTO_SAMPLING, Appearance, TextureSampling
@@ -68,11 +66,8 @@ class Problem:
     @property
     def training_px(self) -> int:
         """The side at which views are rendered for training and selection."""
-        return (
-            self.figure_px
-            if self.network_px < MIN_TRAINING_PX
-            else min(self.network_px, *self.scene.settings.camera.photo_px)
-        )
+        photo_px = self.scene.settings.camera.photo_px
+        return self.figure_px if self.network_px < MIN_TRAINING_PX else min(self.network_px, *photo_px)
 
     @property
     def figure_px(self) -> int:
@@ -104,10 +99,6 @@ class Problem:
         """The first design's appearance; in views rendered with it, any other design can be shown."""
         with torch.no_grad():
             return self.subject.appearance(self.subject.start())
-
-    def with_training(self, optimize: OptimizeSettings) -> "Problem":
-        """A copy with these settings of the loop."""
-        return replace(self, scene=replace(self.scene, settings=self.scene.settings.changed(optimize=optimize)))
 
     def with_piece_at(self, scene: PatchScene) -> "Problem":
         """A copy with the piece where `scene` has it; the object's tensors are shared."""
@@ -154,31 +145,22 @@ def set_problem(
     stage = set_stage(scene, device)
     if loss is not None:
         _check_loss(loss, classifiers[0], indices[0], stage.device)
-    subject = subject_of(scene, printer, max(classifier.input_px for classifier in classifiers), stage.device)
+    if scene.HAS_PIECE:
+        scene = require_piece(scene)  # a design no finer than the networks can see it
+        design_px = scene.design_px(max(classifier.input_px for classifier in classifiers))
+        subject = Patch(scene, printer, design_px, stage.device)
+    else:
+        from patchproof.optimizer.texture import Texture
+
+        subject = Texture(scene, scene.object_canvas(), stage.device)
     jobs = jobs if stage.device.type == "cpu" else 1
-    if jobs > 1:
+    if jobs > 1 and stage.object is not None:
         with use_threads(1):  # before forking, on one thread like the forked processes, since two round differently
-            if stage.object is not None:
-                stage.object.texels(reduced=True, fixed=scene.HAS_PIECE)
-            for network in (classifier.network for classifier in classifiers if scene.HAS_PIECE):
-                if isinstance(network, BatchedNetwork):
-                    _ = network.cut  # computed on access
+            stage.object.texels(reduced=True, fixed=scene.HAS_PIECE)
     problem = Problem(scene, stage, printer, classifiers, indices, subject, loss, jobs)
     if not models:
         refuse_other_inputs(scene.recorded, problem.inputs, f"the run of sheet {scene.sheet_id}", settings.model_dump())
     return problem
-
-
-def subject_of(scene: Scene, printer: Printer, network_px: int, device: torch.device) -> "Patch | Texture":
-    """Make the subject of optimization: the design of a scene's piece, no finer than networks whose largest input has
-    side `network_px` can see it, or the object's texture.
-    """
-    if scene.HAS_PIECE:
-        scene = require_piece(scene)
-        return Patch(scene, printer, scene.design_px(network_px), device)
-    from patchproof.optimizer.texture import Texture
-
-    return Texture(scene, scene.object_canvas(), device)
 
 
 def check_device(device: torch.device | str) -> None:

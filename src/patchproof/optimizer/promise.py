@@ -21,9 +21,9 @@ from patchproof.base.color import linear_from_srgb
 from patchproof.base.errors import Refused
 from patchproof.base.progress import Advance, no_advance
 from patchproof.base.sessions import count_by_session, rate_posterior, session_difference
-from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import Problem
 from patchproof.optimizer.responses import Responses, merge_responses, responses
+from patchproof.optimizer.subject import from_pixels
 from patchproof.render.pixels import Appearance
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.interface import require_piece

@@ -44,7 +44,6 @@ from patchproof.optimizer.loop import (
     start,
     steps,
 )
-from patchproof.optimizer.pixels import side_by_side
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.optimizer.promise import PROMISE_VIEWS, VIEWS_PER_SESSION, PromiseOptions, make_promise
 from patchproof.optimizer.subject import (
@@ -54,7 +53,7 @@ from patchproof.optimizer.subject import (
     TEXTURE_FILES,
     Loss,
     read_png,
-    write_png,
+    side_by_side,
 )
 from patchproof.scene.interface import Scene
 from patchproof.scene.patch_scene import PatchScene
@@ -302,7 +301,8 @@ def _run_steps(problem: Problem, state: State, out: Path, advance: Advance) -> n
             advance(state.number, settings.steps)
     _warn_if_unchanged(float((state.best - start(problem).design).abs().max()), largest_gradient)
     pictures = last_pictures(problem, state.best)
-    write_png(out / _VIEWS_FILE, side_by_side(pictures, _answers(problem, pictures)))
+    labeled = side_by_side(pictures, _answers(problem, pictures))
+    output.write_atomically(out / _VIEWS_FILE, output.image_bytes(labeled, "PNG"))
     return problem.subject.pixels(state.best)
 
 

@@ -20,25 +20,20 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
+import torch
+from PIL import Image, ImageDraw
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
+from patchproof.base.color import codes_from_srgb
 from patchproof.base.goal import Goal
 from patchproof.base.input import open_image
-from patchproof.base.output import write_atomically
 from patchproof.classifier.network import Odds
 
 DESIGN_FILE, OBJECT_FILE, TEXTURE_FILES, MASK_FILE = "design.png", "object.glb", "texture_*.png", "mask.png"
 MIN_COARSEST_BLOCKS = 8  # blocks along the shorter side of the coarsest level
-
-
+_COLUMNS, _CAPTION_PX = 4, 13  # of pictures side by side
 Loss = Callable[[Tensor, Sequence[int]], Tensor]  # (logits N×K, label indices) -> N losses to descend on
-
-
-def write_png(path: Path, pixels: np.ndarray) -> None:
-    """Replace a picture by uint8 pixels."""
-    write_atomically(path, lambda part: Image.fromarray(pixels).save(part, "PNG"))
 
 
 def read_png(path: Path, max_side_px: int = 1 << 16) -> np.ndarray:
@@ -47,6 +42,31 @@ def read_png(path: Path, max_side_px: int = 1 << 16) -> np.ndarray:
         if max(image.size) > max_side_px:
             raise ValueError(f"{image.width} × {image.height} pixels, more than {max_side_px} along a side")
         return np.asarray(image.convert("RGB"))
+
+
+def as_pixels(design_srgb: Tensor) -> np.ndarray:
+    """A picture 3×h×w in [0, 1] as uint8 h×w×3."""
+    return codes_from_srgb(design_srgb.detach()).permute(1, 2, 0).cpu().numpy()
+
+
+def from_pixels(pixels: np.ndarray, device: torch.device | str = "cpu") -> Tensor:
+    """uint8 h×w×3 as 3×h×w in [0, 1]."""
+    return torch.tensor(pixels, dtype=torch.float32, device=device).permute(2, 0, 1) / 255
+
+
+def side_by_side(pictures: Tensor, captions: Sequence[str]) -> np.ndarray:
+    """Pictures N×3×h×w over their captions in rows of four, as one picture uint8 H×W×3; empty places are white."""
+    pixels = codes_from_srgb(pictures).permute(0, 2, 3, 1).cpu().numpy()
+    rows, (count, height, width) = -(-len(pixels) // _COLUMNS), pixels.shape[:3]
+    height += _CAPTION_PX
+    grid = np.full((rows * _COLUMNS, height, width, 3), 255, np.uint8)
+    grid[:count, :-_CAPTION_PX] = pixels
+    grid = grid.reshape(rows, _COLUMNS, height, width, 3)
+    page = Image.fromarray(grid.swapaxes(1, 2).reshape(rows * height, _COLUMNS * width, 3))
+    for i, caption in enumerate(captions):
+        at = i % _COLUMNS * width + 3, (i // _COLUMNS + 1) * height - _CAPTION_PX + 1
+        ImageDraw.Draw(page).text(at, caption.encode("latin-1", "replace").decode("latin-1"), fill="black")
+    return np.asarray(page)
 
 
 def build_pyramid(gradient: Tensor, mask: Tensor | None = None) -> tuple[Tensor, ...]:

@@ -12,22 +12,21 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain, islice
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from patchproof.base.errors import Refused
-from patchproof.base.output import write_atomically
+from patchproof.base.output import image_bytes, write_atomically
 from patchproof.mesh.export import write_glb
 from patchproof.optimizer import subject
-from patchproof.optimizer.pixels import as_pixels, from_pixels
+from patchproof.optimizer.subject import as_pixels, from_pixels
 from patchproof.render.designs import LearnedTextures
 from patchproof.render.pixels import ObjectTextures
 from patchproof.scene.interface import Scene
 from patchproof.scene.texture_scene import Canvas
-from patchproof.sheets.piece import CELLS, control_design
+from patchproof.sheets.piece import control_design
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,29 +82,11 @@ class Texture:
         return as_pixels(design)
 
     def control(self, kind: str, pixels: np.ndarray) -> np.ndarray:
-        """The texels of a control: one mean color, gray, or noise of 16 cells along each texture's shorter side;
-        "shuffled": the design's own, with such cells in another order.
-        """
-        if kind == "shuffled":
-            return self._shuffled(pixels)
+        """The texels of a control: one mean color, gray, or noise of 16 cells along each texture's shorter side."""
         if kind != "noise":
             return control_design(kind, pixels, self.scene.sheet_id)
         textures = [np.zeros((*mask.shape, 3), np.uint8) for mask in self.canvas.mask]
         return self.surface.texels([control_design(kind, texture, self.scene.sheet_id) for texture in textures])
-
-    def _shuffled(self, pixels: np.ndarray) -> np.ndarray:
-        """Each texture's texels moved cell by cell; cells that a mask cuts push the next ones along."""
-        rng = np.random.default_rng(int(self.scene.sheet_id, 36))
-        result, first = pixels.copy(), 0
-        for mask in self.canvas.mask:
-            rows, columns = np.nonzero(mask)
-            cell = max(min(mask.shape) / CELLS, 1)
-            number = (rows / cell).astype(int) * mask.shape[1] + (columns / cell).astype(int)
-            place = rng.permutation(number.max(initial=0) + 1)[number]
-            part = result[0, first : first + len(rows)]
-            part[np.argsort(number, kind="stable")] = part[np.argsort(place, kind="stable")]
-            first += len(rows)
-        return result
 
     def appearance(self, design: Tensor, kind: str = "design") -> ObjectTextures:
         """The object's textures with a design; differentiable."""
@@ -124,17 +105,10 @@ class Texture:
         textures, masks = self.surface.textures(pixels), self.canvas.mask
         write_atomically(folder / subject.OBJECT_FILE, lambda path: write_glb(self.canvas.mesh, textures, path))
         for i, texture in enumerate(textures):
-            subject.write_png(folder / subject.TEXTURE_FILES.replace("*", f"{i}"), texture)
+            write_atomically(folder / subject.TEXTURE_FILES.replace("*", f"{i}"), image_bytes(texture, "PNG"))
         width = max(mask.shape[1] for mask in masks)
-        wide = [np.pad(mask, ((0, 0), (0, width - mask.shape[1]))) for mask in masks]
-        subject.write_png(folder / subject.MASK_FILE, np.concatenate(wide).astype(np.uint8) * 255)
-
-    def file(self, pixels: np.ndarray) -> tuple[str, bytes]:
-        """The object with its new textures as GLB."""
-        with TemporaryDirectory() as folder:
-            path = Path(folder) / subject.OBJECT_FILE
-            write_glb(self.canvas.mesh, self.surface.textures(pixels), path)
-            return "glb", path.read_bytes()
+        wide = np.concatenate([np.pad(mask, ((0, 0), (0, width - mask.shape[1]))) for mask in masks])
+        write_atomically(folder / subject.MASK_FILE, image_bytes(wide.astype(np.uint8) * 255, "PNG"))
 
     @property
     def texels_per_mm(self) -> float:

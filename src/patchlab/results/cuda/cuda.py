@@ -22,9 +22,9 @@ import patchproof as pp
 from patchproof.base.workers import available_cores, keep_freed_memory
 from patchproof.optimizer import loop
 from patchproof.optimizer.expectation import gradient_in_views, training_views
-from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.optimizer.responses import responses
+from patchproof.optimizer.subject import as_pixels, from_pixels
 from patchproof.render.photograph import expose
 
 GPU = os.environ.get("GPU", "cuda")

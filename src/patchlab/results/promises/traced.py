@@ -15,8 +15,8 @@ import patchproof as pp
 from patchlab.results.rows import write_rows
 from patchproof.base.intervals import student_mean
 from patchproof.optimizer.loop import best_design
-from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import set_problem
+from patchproof.optimizer.subject import from_pixels
 from patchproof.render.photograph import photograph
 from patchproof.reprints.path_traced import photograph_traced
 

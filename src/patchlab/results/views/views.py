@@ -11,9 +11,9 @@ import patchproof as pp
 from patchlab.results.rows import write_rows
 from patchproof.base.intervals import student_mean
 from patchproof.optimizer.loop import best_design
-from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import set_problem
 from patchproof.optimizer.responses import concatenate_responses, responses
+from patchproof.optimizer.subject import from_pixels
 
 N, SEED = 200, 79
 

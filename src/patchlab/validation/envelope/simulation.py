@@ -25,10 +25,10 @@ from patchproof.evidence.camera import PinholePhoto
 from patchproof.evidence.measure import measure
 from patchproof.evidence.ranges import PromisedRanges
 from patchproof.evidence.surface import Surface, surface_of
-from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.optimizer.responses import Responses, ask_networks, merge_responses, responses
 from patchproof.optimizer.run import Run, load_run
+from patchproof.optimizer.subject import from_pixels
 from patchproof.render.photograph import Appearance, photograph
 from patchproof.render.pixels import PiecePicture
 from patchproof.render.stage import Stage, set_stage

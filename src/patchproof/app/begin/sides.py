@@ -18,7 +18,7 @@ from torch import Tensor
 from patchproof.base.geometry import UP, orbit, rect_border
 from patchproof.base.validation import Side
 from patchproof.classifier.network import Classifier
-from patchproof.optimizer.pixels import as_pixels
+from patchproof.optimizer.subject import as_pixels
 from patchproof.render.photograph import photograph
 from patchproof.render.stage import Stage
 from patchproof.reprints.plan_view import plan_picture

@@ -19,8 +19,8 @@ from patchproof.base.progress import Advance, no_advance
 from patchproof.channel.effects import EFFECT_BY_NAME, EFFECTS, ViewEffect
 from patchproof.channel.printer import identity_printer
 from patchproof.classifier.network import center_square
-from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.problem import Problem
+from patchproof.optimizer.subject import as_pixels, from_pixels
 from patchproof.render.photograph import expose
 from patchproof.render.pixels import Appearance
 from patchproof.render.stage import Stage, set_stage

@@ -13,6 +13,7 @@ Left out on purpose: deciding for the user. The plan says which terms can go; th
 import math
 import statistics
 import time
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -28,11 +29,11 @@ from patchproof.evidence.verdict import photos_line
 from patchproof.optimizer.expectation import new_pose_share
 from patchproof.optimizer.loop import SELECT_VIEWS, start, steps
 from patchproof.optimizer.patch import Patch
-from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.place_search import choose_place, place_lines
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.optimizer.promise import CONTROLS, VIEWS_PER_SESSION, make_promise
-from patchproof.render.photograph import affected_windows, expose
+from patchproof.optimizer.subject import as_pixels, from_pixels
+from patchproof.render.photograph import expose
 from patchproof.scene.bent_scene import placement_with_other_bend
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.interface import (
@@ -145,10 +146,11 @@ def marker_plan(scene: PieceScene) -> dict[str, float]:
 
 def _draft(problem: Problem, progress: Progress) -> tuple[Tensor, PlanData]:
     """Optimize a design for a few steps: its 8-bit colors, and its steps and rate on the selection set."""
-    settings = problem.scene.settings.optimize
-    count = min(settings.steps, math.ceil(DRAFT_VIEWS / settings.views))
+    settings = problem.scene.settings
+    count = min(settings.optimize.steps, math.ceil(DRAFT_VIEWS / settings.optimize.views))
+    short = replace(problem.scene, settings=settings.changed(optimize={"steps": count}))  # of the same sheet id
     state, rate = start(problem), None
-    for step in steps(problem.with_training(settings.changed(steps=count)), state):
+    for step in steps(replace(problem, scene=short), state):
         state, rate = step.state, step.select_rate
         progress("draft", state.number, count)
     assert rate is not None  # the last step ends with a selection
@@ -181,9 +183,9 @@ def _step_ms(problem: Problem, design: Tensor, conditions: Conditions) -> dict[s
     ends["printer" if problem.scene.HAS_PIECE else "textures"] = time.perf_counter()
     pictures = expose(views, appearance)
     ends["light, piece and camera"] = time.perf_counter()
-    leaf, boxes, windows = pictures.detach().requires_grad_(), problem.boxes(conditions), affected_windows(views)
+    leaf, boxes = pictures.detach().requires_grad_(), problem.boxes(conditions)
     losses = [
-        problem.losses(classifier, classifier.logits(leaf, boxes, windows), indices).mean()
+        problem.losses(classifier, classifier.logits(leaf, boxes), indices).mean()
         for classifier, indices in zip(problem.classifiers, problem.indices, strict=True)
     ]
     loss = torch.stack(losses).mean()
