@@ -3,18 +3,11 @@
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from patchproof.optimizer.run import Run
-from patchproof.render.stage import Stage, set_stage
+from patchproof.render.stage import Stage
 from patchproof.reprints.mounted_sheet import DEFAULT_SETUP, MountedSheet, sent_pixels
-from patchproof.reprints.run_sheet import content_of
 from patchproof.sheets.content import SheetContent
 from patchproof.sheets.template import load_template
 from patchproof.sheets.write import write_sheet
-
-
-def mount_run_sheet(run: Run, control: str | None = None) -> MountedSheet:
-    """Mount the run's sheet, or a printed control's, without the page of instructions."""
-    return mount_content(set_stage(run.scene), content_of(run, None, control, run.folder)[0])
 
 
 def mount_content(stage: Stage, content: SheetContent) -> MountedSheet:

@@ -62,17 +62,23 @@ class PhotoTruth:
         return {"homography_px_from_mm": rows, "conditions": self.conditions}
 
 
+def render_photo(stage: Stage, piece: PiecePicture | None, conditions: Conditions) -> Tensor:
+    """Render one view with the piece (None: of the bare object) at the camera's size: 1×3×H×W sRGB, without JPEG."""
+    with torch.no_grad():
+        return photograph(stage, piece, conditions, stage.scene.photo_px, jpeg=False)
+
+
 @dataclass(frozen=True)
 class ReprintSetup:
     """Options of printing and mounting a sheet: `printer` (a name or a file; None: the scene's), `print_scale` along x
-    and y, `control` in place of the design (mean, gray or noise on its own sheet, or bare: nothing), `path_traced` to
-    render photographs by Mitsuba (see `path_traced`).
+    and y, `control` in place of the design (mean, gray or noise on its own sheet, or bare: nothing), `render` for
+    another renderer than ours (a stage, the piece or None, and one view to 1×3×H×W sRGB).
     """
 
     printer: str | None = None
     print_scale: tuple[float, float] = (1.0, 1.0)
     control: str | None = None
-    path_traced: bool = False
+    render: Callable[[Stage, PiecePicture | None, Conditions], Tensor] = render_photo
 
     def printer_for(self, scene: Scene) -> Printer:
         """Load the printer, or the scene's if none is named."""
@@ -110,11 +116,13 @@ class MountedSheet:
 
     def photograph(self, conditions: Conditions) -> bytes:
         """Take a JPEG photograph of one view, of the drawn quality, with the camera's focal length in its EXIF data."""
-        if self.how.path_traced:
-            from patchproof.reprints.path_traced import photograph_traced  # which needs an optional dependency
+        from PIL import Image
 
-            return _camera_file(photograph_traced(self.stage, self.piece, conditions), self.scene, conditions)
-        return take_photo(self.stage, self.piece, conditions)
+        exif, focal_px = Image.Exif(), self.scene.focal_px
+        if focal_px is not None:
+            full_frame_mm = focal_px * _FULL_FRAME_DIAGONAL_MM / np.hypot(*self.scene.photo_px)
+            exif.get_ifd(0x8769)[0xA405] = round(full_frame_mm)  # FocalLengthIn35mmFilm
+        return jpeg_of(self.how.render(self.stage, self.piece, conditions), conditions, {"exif": exif})
 
     def truth(self, conditions: Conditions) -> PhotoTruth:
         """Compute the homography from page millimeters to one view's photograph, and its conditions."""
@@ -143,8 +151,7 @@ class MountedSheet:
         """3×3 from page millimeters to undistorted pixels of one view; for bent paper by its tangent plane."""
         x, y, *_ = self.manifest.cut_mm
         piece_from_page = np.array([[1, 0, -x], [0, 1, -y], [0, 0, 1.0]])
-        photo_px = self.scene.settings.camera.photo_px
-        return self.scene.piece_homographies(conditions, photo_px)[0] @ piece_from_page
+        return self.scene.piece_homographies(conditions, self.scene.photo_px)[0] @ piece_from_page
 
 
 def mount_sheet(pdf_path: str | Path, run: Run, how: ReprintSetup = DEFAULT_SETUP) -> MountedSheet:
@@ -183,24 +190,6 @@ def sent_pixels(pdf_path: str | Path, manifest: Manifest, scene: Scene) -> Tenso
     finest = scene.closest_px_per_mm(scene.settings.camera.photo_px)
     dpi = float(np.clip(OVERSAMPLING * finest * MM_PER_INCH, *DPI_RANGE))
     return torch.tensor(rasterize_piece(pdf_path, manifest, dpi)).permute(2, 0, 1)[None] / 255
-
-
-def take_photo(stage: Stage, piece: PiecePicture | None, conditions: Conditions) -> bytes:
-    """Take a JPEG photograph of one view with the piece (None: of the bare object), by our own renderer."""
-    with torch.no_grad():
-        picture = photograph(stage, piece, conditions, stage.scene.settings.camera.photo_px, jpeg=False)
-    return _camera_file(picture, stage.scene, conditions)
-
-
-def _camera_file(picture: Tensor, scene: Scene, conditions: Conditions) -> bytes:
-    """Encode a 1×3×H×W sRGB picture as the scene's camera does: JPEG, with its focal length in EXIF data."""
-    from PIL import Image
-
-    exif, photo_px = Image.Exif(), scene.settings.camera.photo_px
-    if scene.focal_px is not None:
-        details = exif.get_ifd(0x8769)
-        details[0xA405] = round(scene.focal_px * _FULL_FRAME_DIAGONAL_MM / np.hypot(*photo_px))  # FocalLengthIn35mmFilm
-    return jpeg_of(picture, conditions, {"exif": exif})
 
 
 def jpeg_of(picture: Tensor, conditions: Conditions, options: dict[str, Any] | None = None) -> bytes:

@@ -162,7 +162,6 @@ def reprint(
     printer: Annotated[str | None, Option(help="Another printer than the scene's: a name or a file.")] = None,
     print_scale: Annotated[str, Option(help="Size of the print, 0.97 or 0.97x0.98 (x, y).")] = "1",
     control: Annotated[PhotographedControl | None, Option(help="Photograph a control in place of the design.")] = None,
-    path_traced: Annotated[bool, Option("--path-traced", help="Render with Mitsuba 3 (slow).")] = False,
     jobs: Jobs = None,
     trust: Trust = False,
     overwrite: Overwrite = False,
@@ -174,11 +173,10 @@ def reprint(
     from patchproof.reprints.reprint import reprint as reprint_sheet
 
     scale = console.pair_of(print_scale, "--print-scale")
-    how = ReprintSetup(printer, scale, control, path_traced)
+    how = ReprintSetup(printer, scale, control)
     if run is None:
-        if control is not None or path_traced or sessions > 1:
-            only = "controls, sessions and path tracing are of a run's sheet; name the run"
-            raise BadParameter(only, param_hint="--run")
+        if control is not None or sessions > 1:
+            raise BadParameter("controls and sessions are of a run's sheet; name the run", param_hint="--run")
         reprint_pages(pdf, n, out, how, seed=seed, overwrite=overwrite)
         return say(f"{n} photographs: {out}")
     finished_run = load_run(run, trust)
