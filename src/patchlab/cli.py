@@ -206,8 +206,7 @@ def trace(
     """Photograph a run's sheet as `patchproof reprint` does, by the path tracer Mitsuba 3 (slow)."""
     from patchlab.validation.path_traced import photograph_traced
     from patchproof.optimizer.run import load_run
-    from patchproof.reprints.mounted_sheet import ReprintSetup
-    from patchproof.reprints.reprint import reprint
+    from patchproof.reprints.reprint import ReprintSetup, reprint
 
     setup = ReprintSetup(render=photograph_traced)
     with progress_bar() as bar:

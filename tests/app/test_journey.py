@@ -91,7 +91,7 @@ def test_a_page_without_a_design_needs_no_run(loaded):
 
 def test_a_flat_card_on_a_mesh_loads_no_other_kind_of_scene(loaded):
     found = loaded[1]["demo"]
-    others = {"bent_scene", "texture_scene", "unplaced_scene", "photo_scene", "image_scene"}
+    others = {"bent_scene", "texture_scene", "photo_scene", "image_scene"}
     others |= {"candidate_places"}
     assert not {f"patchproof.scene.{name}" for name in others} & found.names and "trimesh" not in found.names
     assert found.lines <= 21_800 and found.rooms >= {"optimizer", "scene", "mesh", "render", "reprints"}

@@ -19,7 +19,7 @@ from patchlab.validation.path_traced import photograph_traced
 from patchproof.app.begin.new import _model
 from patchproof.base.errors import Refused
 from patchproof.classifier import load_classifier, zoo
-from patchproof.reprints.mounted_sheet import ReprintSetup
+from patchproof.reprints.reprint import ReprintSetup
 
 pytestmark = pytest.mark.filterwarnings("ignore:the network")  # doubts: weights are noise
 

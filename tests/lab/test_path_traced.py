@@ -21,7 +21,7 @@ from patchproof.render.photograph import photograph
 from patchproof.render.pixels import PiecePicture
 from patchproof.render.stage import set_stage
 from patchproof.render.views import lens_frame
-from patchproof.reprints.mounted_sheet import MountedSheet, ReprintSetup
+from patchproof.reprints.reprint import MountedSheet, ReprintSetup
 from patchproof.scene.conditions import with_values
 from patchproof.scene.scene import load_scene
 

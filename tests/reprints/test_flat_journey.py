@@ -30,7 +30,7 @@ from patchproof.optimizer.problem import set_problem
 from patchproof.optimizer.run import Run, load_run
 from patchproof.render.photograph import photograph
 from patchproof.render.stage import set_stage
-from patchproof.reprints.mounted_sheet import MountedSheet, ReprintSetup, sent_pixels
+from patchproof.reprints.reprint import MountedSheet, ReprintSetup, sent_pixels
 from patchproof.reprints.run_sheet import sheet as sheet_of
 from patchproof.scene.conditions import draw, with_values
 from patchproof.scene.patch_scene import PatchScene

@@ -12,7 +12,7 @@ from patchproof.base.errors import Refused
 from patchproof.base.packaged import packaged_path
 from patchproof.channel.printer import carried_printer, load_printer, printer_of_sheet
 from patchproof.reprints import page_photos
-from patchproof.reprints.mounted_sheet import DEFAULT_SETUP
+from patchproof.reprints.reprint import DEFAULT_SETUP
 from patchproof.reprints.run_sheet import without_folders
 from patchproof.sheets.blank import blank_sheet
 

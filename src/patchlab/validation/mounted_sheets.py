@@ -4,7 +4,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from patchproof.render.stage import Stage
-from patchproof.reprints.mounted_sheet import DEFAULT_SETUP, MountedSheet, sent_pixels
+from patchproof.reprints.reprint import DEFAULT_SETUP, MountedSheet, sent_pixels
 from patchproof.sheets.content import SheetContent
 from patchproof.sheets.template import load_template
 from patchproof.sheets.write import write_sheet

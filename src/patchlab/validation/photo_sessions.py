@@ -74,8 +74,7 @@ def take_photos(
 ) -> Path:
     """Photograph folder/sheet.pdf, or a control under the same conditions; returns the folder of sessions."""
     from patchlab.validation.path_traced import photograph_traced
-    from patchproof.reprints.mounted_sheet import ReprintSetup, render_photo
-    from patchproof.reprints.reprint import reprint
+    from patchproof.reprints.reprint import ReprintSetup, render_photo, reprint
 
     out, n = folder / ("photos" if control is None else control), settings.sessions * settings.photos
     setup = ReprintSetup(control=control, render=photograph_traced if settings.path_traced else render_photo)

@@ -24,7 +24,7 @@ from patchproof.channel.camera import develop
 from patchproof.channel.effects import Sensor
 from patchproof.channel.printer import load_printer, printer_output
 from patchproof.photo.read import Photo
-from patchproof.reprints.mounted_sheet import ReprintSetup
+from patchproof.reprints.reprint import ReprintSetup
 from patchproof.sheets.blank import BLANK
 from patchproof.sheets.pdf_raster import attached_manifests, page_count, rasterize_page
 

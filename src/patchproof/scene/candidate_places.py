@@ -19,7 +19,7 @@ from patchproof.base.geometry import camera_centers
 from patchproof.base.validation import Side
 from patchproof.mesh.surface_chart import SurfaceChart, piece_grid, surface_heights, triangles_near
 from patchproof.scene.bent_scene import placement_method
-from patchproof.scene.patch_scene import PiecePosition
+from patchproof.scene.patch_scene import PiecePosition, UnplacedScene
 from patchproof.scene.placement import (
     Placement,
     SurfaceFrame,
@@ -29,7 +29,6 @@ from patchproof.scene.placement import (
     spun_axes,
     surface_frame,
 )
-from patchproof.scene.unplaced_scene import UnplacedScene
 
 MIN_DISTANCE_SHARE = 0.5  # of the piece's shorter edge, between two candidates
 _POOL_DISTANCE_SHARE, _POOL = 0.25, 96  # between points to try, and their greatest number

@@ -135,6 +135,4 @@ def module_of(settings: SceneSettings) -> str:
         return "image_scene"
     if settings.patch.kind != "patch":
         return "texture_scene"
-    if settings.patch.place == "auto":
-        return "unplaced_scene"
-    return "bent_scene" if settings.patch.bend else "patch_scene"
+    return "bent_scene" if settings.patch.bend and settings.patch.place == "given" else "patch_scene"

@@ -32,7 +32,7 @@ from patchproof.optimizer.run import Run, load_run
 from patchproof.render.photograph import Appearance, photograph
 from patchproof.render.pixels import PiecePicture
 from patchproof.render.stage import Stage, set_stage
-from patchproof.reprints.mounted_sheet import MountedSheet, jpeg_of
+from patchproof.reprints.reprint import MountedSheet, jpeg_of
 from patchproof.reprints.run_sheet import content_of
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.interface import Scene, require_piece

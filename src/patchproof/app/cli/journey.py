@@ -168,8 +168,8 @@ def reprint(
 ) -> None:
     """Print the PDF in simulation, put it back on the object, and photograph it."""
     from patchproof.optimizer.run import load_run
-    from patchproof.reprints.mounted_sheet import ReprintSetup
     from patchproof.reprints.page_photos import reprint_pages
+    from patchproof.reprints.reprint import ReprintSetup
     from patchproof.reprints.reprint import reprint as reprint_sheet
 
     scale = console.pair_of(print_scale, "--print-scale")
