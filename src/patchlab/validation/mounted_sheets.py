@@ -3,8 +3,9 @@
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from patchproof.channel.printer import load_printer
 from patchproof.render.stage import Stage
-from patchproof.reprints.reprint import DEFAULT_SETUP, MountedSheet, sent_pixels
+from patchproof.reprints.reprint import MountedSheet, sent_pixels
 from patchproof.sheets.content import SheetContent
 from patchproof.sheets.template import load_template
 from patchproof.sheets.write import write_sheet
@@ -17,4 +18,4 @@ def mount_content(stage: Stage, content: SheetContent) -> MountedSheet:
         pdf = Path(folder) / "sheet.pdf"
         manifest = write_sheet(pdf, template, content)
         sent = sent_pixels(pdf, manifest, stage.scene)
-    return MountedSheet(stage, manifest, sent, DEFAULT_SETUP.printer_for(stage.scene))
+    return MountedSheet(stage, manifest, sent, load_printer(stage.scene.settings.printer.profile, stage.scene.base))

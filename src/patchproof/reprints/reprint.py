@@ -55,22 +55,12 @@ _FULL_FRAME_DIAGONAL_MM = 43.2666  # of 36 × 24 mm, to which EXIF's 35 mm focal
 
 @dataclass(frozen=True)
 class PhotoTruth:
-    """Ground truth of a simulated photograph.
-
-    Attributes:
-        homography_px_from_mm: 3×3 from page millimeters to pixels (x right, y down); None where the piece is bent or
-            absent.
-        conditions: drawn values by name, as in `truth.json`.
+    """Ground truth of a simulated photograph: 3×3 from page millimeters to pixels (x right, y down), None where the
+    piece is bent or absent, and drawn values by name.
     """
 
     homography_px_from_mm: np.ndarray | None
     conditions: dict[str, Any]
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the photograph's entry in `truth.json`."""
-        homography = self.homography_px_from_mm
-        rows = None if homography is None else homography.tolist()
-        return {"homography_px_from_mm": rows, "conditions": self.conditions}
 
 
 def render_photo(stage: Stage, piece: PiecePicture | None, conditions: Conditions) -> Tensor:
@@ -90,12 +80,6 @@ class ReprintSetup:
     print_scale: tuple[float, float] = (1.0, 1.0)
     control: str | None = None
     render: Callable[[Stage, PiecePicture | None, Conditions], Tensor] = render_photo
-
-    def printer_for(self, scene: Scene) -> Printer:
-        """Load the printer, or the scene's if none is named."""
-        if self.printer is None:
-            return load_printer(scene.settings.printer.profile, scene.base)
-        return load_printer(self.printer)
 
 
 DEFAULT_SETUP = ReprintSetup()
@@ -172,7 +156,9 @@ def mount_sheet(pdf_path: str | Path, run: Run, how: ReprintSetup = DEFAULT_SETU
     printed = require_piece(scene)
     if how.print_scale != (1.0, 1.0):
         printed = require_patch(scene, "a mesh, to change the print's size").with_print_scale(how.print_scale)
-    return MountedSheet(set_stage(printed), manifest, sent_srgb, how.printer_for(scene), how)
+    profile = scene.settings.printer.profile
+    printer = load_printer(profile, scene.base) if how.printer is None else load_printer(how.printer)
+    return MountedSheet(set_stage(printed), manifest, sent_srgb, printer, how)
 
 
 def sheet_scene(pdf_path: str | Path, run: Run) -> tuple[Manifest, Scene]:
@@ -277,8 +263,8 @@ def reprint(
             text = coco_json(photos, label, f"simulated photographs of sheet {sheet.manifest.sheet_id}")
             (folder / "coco.json").write_text(text, encoding="utf-8")
             truth = dict(zip(names, map(sheet.truth, views), strict=True))
-            entries = {name: photo.to_json() for name, photo in truth.items()}
-            (folder / "truth.json").write_text(json.dumps(entries, indent=1) + "\n", encoding="utf-8")
+            text = json.dumps({name: vars(each) for name, each in truth.items()}, indent=1, default=np.ndarray.tolist)
+            (folder / "truth.json").write_text(text + "\n", encoding="utf-8")
             if not sheet.manifest.markers:
                 from patchproof.evidence.annotations import CORNERS_FILE, corners_csv
 

@@ -94,7 +94,12 @@ def texture_canvas(mesh: Mesh, patch: PatchSettings, base: Path, texels: int = T
     masks = _masks(mesh, chosen_faces)
     if patch.mask is not None:
         image = _read_mask(Path(expand_path(patch.mask, base)))
-        warnings += _size_warnings(image, masks)
+        height, width = image.shape
+        for texels_high, texels_wide in dict.fromkeys(m.shape for m in masks if m.any() and m.shape != image.shape):
+            warnings.append(
+                f"the mask of {width} × {height} pixels is laid over {texels_wide} × {texels_high} texels: a texel may"
+                " change where the mean of what lies over it is light"
+            )
         masks = tuple(mask & _stretch(image, mask.shape) for mask in masks)
     if not any(mask.any() for mask in masks):
         got = f"a mask that covers none of {np.count_nonzero(chosen_faces)} faces"
@@ -152,17 +157,6 @@ def _read_mask(path: Path) -> np.ndarray:
         got = f"no lighter gray than {gray.max():.0f} of 255 in {path.name}"
         raise Refused("a mask with white where the texture may change", got, "paint it white there")
     return gray
-
-
-def _size_warnings(gray: np.ndarray, masks: tuple[np.ndarray, ...]) -> list[str]:
-    """Return a sentence if a mask is of another size than a texture that it is laid over."""
-    sizes = dict.fromkeys(f"{m.shape[1]} × {m.shape[0]}" for m in masks if m.any() and m.shape != gray.shape)
-    if not sizes:
-        return []
-    return [
-        f"the mask of {gray.shape[1]} × {gray.shape[0]} pixels is laid over {' and '.join(sizes)} texels: a texel may"
-        " change where the mean of what lies over it is light"
-    ]
 
 
 def _stretch(gray: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
