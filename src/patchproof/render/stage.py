@@ -112,12 +112,11 @@ class LearnedTextures:
 
 @dataclass(frozen=True)
 class Stage:
-    """A scene on `device`; `object` is None for scenes made of pictures, `piece` if nothing hangs on the object."""
+    """A scene on `device`; `object` is None for scenes made of pictures."""
 
     scene: Scene
     device: torch.device
     object: ObjectSurface | None
-    piece: PieceSurface | None
     SHOWN: ClassVar[tuple[str, ...]] = ("scene", "device")
     __repr__ = short_repr
 
@@ -142,16 +141,14 @@ class Stage:
             raise ValueError("a scene made of pictures has no object's surface")
         return self.object
 
-    @property
+    @cached_property
     def piece_surface(self) -> PieceSurface:
-        """The piece's surface; a ValueError if nothing hangs on the object."""
-        if self.piece is None:
-            raise ValueError("nothing hangs on the object")
-        return self.piece
+        """The piece's surface; refused if nothing hangs on the object."""
+        return piece_surface(require_piece(self.scene), self.device)
 
 
 def set_stage(scene: Scene, device: torch.device | str = "cpu") -> Stage:
     """Move a scene's mesh, textures and piece to a device, "cpu" or "cuda"; torch raises RuntimeError without it."""
     device = torch.device(device)
     surface = object_surface(require_mesh(scene).mesh, device) if scene.HAS_OBJECT else None
-    return Stage(scene, device, surface, piece_surface(require_piece(scene), device) if scene.HAS_PIECE else None)
+    return Stage(scene, device, surface)

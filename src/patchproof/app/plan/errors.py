@@ -23,7 +23,7 @@ from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.problem import Problem
 from patchproof.render.photograph import expose
 from patchproof.render.pixels import Appearance
-from patchproof.render.stage import Stage, set_stage
+from patchproof.render.stage import Stage
 from patchproof.render.views import Views, relight, render_views
 from patchproof.scene.conditions import Conditions, without_effect
 from patchproof.scene.interface import SceneTerm
@@ -100,8 +100,7 @@ def _without_part(setup: Setup, part: SceneTerm) -> Setup | None:
 
 def _on_surface(setup: Setup, placement: Placement) -> Setup:
     scene = replace(require_patch(setup.stage.scene), placement=placement)
-    piece = set_stage(scene, setup.stage.device).piece
-    return replace(setup, stage=replace(setup.stage, scene=scene, piece=piece))
+    return replace(setup, stage=replace(setup.stage, scene=scene))
 
 
 def measure_terms(
