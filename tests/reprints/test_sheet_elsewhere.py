@@ -43,9 +43,9 @@ def test_of_a_blank_sheet_only_the_piece_is_photographed(tmp_path, monkeypatch):
     """Markers of its page would stand beside the print that hangs in its place: "several_sheets"."""
     sizes = []
 
-    def photograph(page: np.ndarray, seed: int) -> page_photos.Shot:
+    def photograph(page: np.ndarray, seed: int) -> tuple[bytes, np.ndarray]:
         sizes.append(page.shape[:2])
-        return page_photos.Shot(b"", np.ones(3))
+        return b"", np.ones(3)
 
     monkeypatch.setattr(page_photos, "PX_PER_MM", 2)
     monkeypatch.setattr(page_photos, "photograph_page", photograph)

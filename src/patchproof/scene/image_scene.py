@@ -32,7 +32,7 @@ from patchproof.photo.rejection import PhotoRejected
 from patchproof.scene import picture_scene
 from patchproof.scene.conditions import Conditions, Stream
 from patchproof.scene.interface import PX_PER_MODULE, READABLE_SHARE, SceneSource
-from patchproof.scene.picture_scene import BasePicture, PictureScene
+from patchproof.scene.picture_scene import PictureLevels, PictureScene
 from patchproof.sheets.markers import MARKER_MODULES
 from patchproof.sheets.page import refuse_larger_than_page
 from patchproof.sheets.piece import Piece, lay_out_piece, marker_size_mm
@@ -50,7 +50,7 @@ _ERASED_CELLS = 224  # random values per side of the centered square: one a pixe
 class ImageScene(PictureScene):
     """A scene whose base pictures are images of the target's class, in an order that their names decide."""
 
-    images: tuple[BasePicture, ...]
+    images: tuple[PictureLevels, ...]
 
     def description(self) -> str:
         """Return how many images there are."""
@@ -195,7 +195,7 @@ def read_labels(table: Path, folder: Path) -> list[tuple[str, str]]:
     return [(row[0].strip(), ",".join(row[1:]).strip().casefold()) for row in rows]
 
 
-def _read_all(files: list[Path], photo_px: tuple[int, int]) -> tuple[tuple[BasePicture, ...], list[str], list[str]]:
+def _read_all(files: list[Path], photo_px: tuple[int, int]) -> tuple[tuple[PictureLevels, ...], list[str], list[str]]:
     """(pictures, names of unreadable files, what files declare and was left aside)."""
     images, unread, said = [], [], []
     for path in files:
