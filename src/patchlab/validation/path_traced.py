@@ -84,7 +84,7 @@ def photograph_traced(stage: Stage, piece: PiecePicture | None, conditions: Cond
     inside *= 1 - total[..., 3:].clip(0, 1)
     inside += total[..., :3] / PAPER_REFLECTANCE
     traced = torch.tensor(light, dtype=torch.float32).permute(2, 0, 1)[None]
-    traced = stage.camera.distort_pictures(traced, photo_px) if stage.camera else traced
+    traced = stage.scene.camera.distort_pictures(traced, photo_px) if stage.scene.camera else traced
     return develop(traced, conditions.sensor, 1.0, jpeg=False)
 
 

@@ -71,7 +71,7 @@ def shade(views: Views, appearance: Appearance) -> Tensor:
 
 def expose(views: Views, appearance: Appearance, jpeg: bool = True) -> Tensor:
     """Return the photographs of rendered views."""
-    camera, sensor, scale = views.stage.camera, views.conditions.sensor, _scale(views)
+    camera, sensor, scale = views.stage.scene.camera, views.conditions.sensor, _scale(views)
     has_distortion = camera is not None and camera.has_distortion
     has_blur_or_noise = appearance is not None and _picture_blur_and_noise(views) is not None
     is_local = views.reduced and is_pointwise(sensor, scale, jpeg)
@@ -96,7 +96,7 @@ def affected_windows(views: Views) -> np.ndarray | None:
     views. None if that is unknown: for textures, through a lens with distortion, and if photographs have blur of their
     own.
     """
-    camera, scale = views.stage.camera, _scale(views)
+    camera, scale = views.stage.scene.camera, _scale(views)
     reach = reach_px(views.conditions.sensor, scale)
     has_distortion = views.frame_px != views.size_px or (camera is not None and camera.has_distortion)
     if views.piece is None or has_distortion or reach is None or _picture_blur_and_noise(views) is not None:

@@ -24,7 +24,6 @@ from patchproof.scene.mesh_scene import require_mesh
 from patchproof.sheets.piece import Piece, marker_image, with_ids
 
 if TYPE_CHECKING:
-    from patchproof.channel.lens import Camera
     from patchproof.scene.texture_scene import Canvas
 
 
@@ -119,11 +118,6 @@ class Stage:
     object: ObjectSurface | None
     SHOWN: ClassVar[tuple[str, ...]] = ("scene", "device")
     __repr__ = short_repr
-
-    @property
-    def camera(self) -> "Camera | None":
-        """The scene's calibrated camera, if any."""
-        return self.scene.camera
 
     @cached_property
     def design_renderer(self) -> PrintedPiece | LearnedTextures:

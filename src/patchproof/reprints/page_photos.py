@@ -56,7 +56,7 @@ def reprint_pages(
                 x, y, width, height = (round(PX_PER_MM * side) for side in manifest.cut_mm)
                 pixels = pixels[y : y + height, x : x + width]
             light = page_light(pixels, lambda colors: linear_from_srgb(printer_output(printer, colors)))
-            pages.append(cv2.resize(light, None, fx=how.print_scale[0], fy=how.print_scale[1]))
+            pages.append(cv2.resize(light, None, fx=how.print_scale, fy=how.print_scale))
         for i in range(n):
             file, _ = photograph_page(pages[i % len(pages)], (seed or 0) + i)
             (folder / f"photo_{i + 1:04d}.jpg").write_bytes(file)

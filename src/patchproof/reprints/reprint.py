@@ -41,7 +41,7 @@ from patchproof.report.coco import PATCH, LabeledPhoto, coco_json
 from patchproof.reprints.run_sheet import sheet as sheet_of
 from patchproof.scene.conditions import Conditions, fields_of
 from patchproof.scene.interface import PieceScene, Scene, require_piece
-from patchproof.scene.patch_scene import PatchScene, require_patch
+from patchproof.scene.patch_scene import PatchScene
 from patchproof.sheets.manifest import Manifest, load_manifest
 from patchproof.sheets.pdf_raster import attached_manifests, rasterize_piece
 
@@ -71,13 +71,13 @@ def render_photo(stage: Stage, piece: PiecePicture | None, conditions: Condition
 
 @dataclass(frozen=True)
 class ReprintSetup:
-    """Options of printing and mounting a sheet: `printer` (a name or a file; None: the scene's), `print_scale` along x
-    and y, `control` in place of the design (mean, gray or noise on its own sheet, or bare: nothing), `render` for
+    """Options of printing and mounting a sheet: `printer` (a name or a file; None: the scene's), the `print_scale` of
+    its sides, `control` in place of the design (mean, gray or noise on its own sheet, or bare: nothing), `render` for
     another renderer than ours (a stage, the piece or None, and one view to 1×3×H×W sRGB).
     """
 
     printer: str | None = None
-    print_scale: tuple[float, float] = (1.0, 1.0)
+    print_scale: float = 1.0
     control: str | None = None
     render: Callable[[Stage, PiecePicture | None, Conditions], Tensor] = render_photo
 
@@ -122,7 +122,6 @@ class MountedSheet:
     def truth(self, conditions: Conditions) -> PhotoTruth:
         """Compute the homography from page millimeters to one view's photograph, and its conditions."""
         values: dict[str, Any] = {name: values[0].tolist() for name, values in fields_of(conditions).items()}
-        values["print_scale"] = [scale * float(conditions.pose.printed_scale[0]) for scale in self.how.print_scale]
         if self.piece is None or not self.scene.is_flat:
             return PhotoTruth(None, values)
         return PhotoTruth(geometry.normalize_homography(self.px_from_page(conditions)), values)
@@ -153,12 +152,9 @@ def mount_sheet(pdf_path: str | Path, run: Run, how: ReprintSetup = DEFAULT_SETU
     """Mount the PDF's sheet on the object of its run; refused if the sheet is not of this run."""
     manifest, scene = sheet_scene(pdf_path, run)
     sent_srgb = sent_pixels(pdf_path, manifest, scene)
-    printed = require_piece(scene)
-    if how.print_scale != (1.0, 1.0):
-        printed = require_patch(scene, "a mesh, to change the print's size").with_print_scale(how.print_scale)
     profile = scene.settings.printer.profile
     printer = load_printer(profile, scene.base) if how.printer is None else load_printer(how.printer)
-    return MountedSheet(set_stage(printed), manifest, sent_srgb, printer, how)
+    return MountedSheet(set_stage(require_piece(scene)), manifest, sent_srgb, printer, how)
 
 
 def sheet_scene(pdf_path: str | Path, run: Run) -> tuple[Manifest, Scene]:
@@ -244,7 +240,7 @@ def reprint(
         sheet = mount_sheet(pdf, run, how)
         each, done = -(-n // sessions), 0
         conditions = sheet.scene.draw("reprint", n, seed, per_session=each)
-        scale = conditions.pose.printed_scale[[0] * n]  # one print, wherever it is photographed
+        scale = how.print_scale * conditions.pose.printed_scale[[0] * n]  # one print, wherever it is photographed
         pose = replace(conditions.pose, printed_scale=scale)
         conditions = replace(conditions, print=conditions.print[[0] * n], pose=pose)
         views = [conditions[i : i + 1] for i in range(n)]

@@ -27,7 +27,7 @@ from patchproof.scene.patch_scene import PatchScene, require_patch
 from patchproof.sheets.content import SheetContent
 from patchproof.sheets.manifest import Manifest, Promise
 from patchproof.sheets.piece import control_design, with_ids
-from patchproof.sheets.plan_page import PlacementPicture, PlanPage, edge_distances_mm
+from patchproof.sheets.plan_page import PlanPage, edge_distances_mm
 from patchproof.sheets.rects import size_text
 from patchproof.sheets.template import Template, load_template, page_template
 from patchproof.sheets.write import write_several, write_sheet
@@ -134,9 +134,10 @@ def plan_of(scene: PieceScene, template: Template, content: SheetContent) -> Pla
     if scene.HAS_OBJECT:
         patch, settings = require_patch(scene), scene.settings.patch
         picture = draw_plan_view(patch, template)
+        edges = ", ".join(f"{name} {mm:.0f} mm" for name, mm in edge_distances_mm(picture).items())
         facing = f"the object's {settings.side} side" if settings.at_mm is None else "the place where the piece goes"
         lines = [
-            f"Seen as you face {facing}. {_edge_distances(picture)}",
+            f"Seen as you face {facing}. From the piece's cut edge to the outermost edges of that side: {edges}.",
             f"The piece is {size_text(scene.piece.size_mm)} mm; {scene.placement_summary()['reason']}.",
         ]
         if not patch.placement.is_flat:
@@ -154,11 +155,6 @@ def plan_of(scene: PieceScene, template: Template, content: SheetContent) -> Pla
     if content.promise is not None:
         sections += shot_sections(content.promise, scene.settings)
     return PlanPage(picture, tuple(sections)) if sections else None
-
-
-def _edge_distances(picture: PlacementPicture) -> str:
-    edges = ", ".join(f"{name} {mm:.0f} mm" for name, mm in edge_distances_mm(picture).items())
-    return f"From the piece's cut edge to the outermost edges of that side: {edges}."
 
 
 SHOT_COUNTS = ((40, 1), (40, 2), (40, 4), (40, 8), (80, 8))  # photographs, sessions

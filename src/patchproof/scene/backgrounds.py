@@ -187,8 +187,6 @@ class Backgrounds:
     pictures: tuple[np.ndarray | int | FileLevels, ...]
     of_stream: Mapping[str, _Split] = field(default_factory=dict)  # the pictures it may show; other streams show all
     notes: tuple[str, ...] = ()
-    # of pictures, added as they come into use, so that a small view does not read megapixels
-    _halvings: dict[int, list[np.ndarray]] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def choose_for_stream(self, stream: str, choice: np.ndarray) -> np.ndarray:
         """Turn numbers in [0, 1) that choose among a stream's pictures into numbers that choose among all pictures."""
@@ -199,11 +197,11 @@ class Backgrounds:
 
     def picture(self, choice: np.ndarray, photo_px: tuple[int, int], size_px: tuple[int, int]) -> np.ndarray:
         """Return the background of a view of `size_px`: the whole photograph or, if square, its centered square."""
-        levels = self.pictures[number := int(choice[0] * len(self.pictures))]
+        levels = self.pictures[int(choice[0] * len(self.pictures))]
         if isinstance(levels, int):
             levels = _place_levels(levels)
         elif isinstance(levels, np.ndarray):
-            levels = self._halvings.get(number) or self._halvings.setdefault(number, halving_pyramid(levels))
+            levels = halving_pyramid(levels)
         shapes = levels.shapes if isinstance(levels, FileLevels) else [level.shape[:2] for level in levels]
         height, width = shapes[0]
         # a crop with the photograph's aspect

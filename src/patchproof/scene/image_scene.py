@@ -77,8 +77,9 @@ class ImageScene(PictureScene):
         """Return N×3×3 from piece millimeters to pixels."""
         to_size = picture_scene.size_from_photo(self.photo_px, size_px)
         side, photo, pose = min(self.photo_px), np.array(self.photo_px), conditions.pose
-        piece_mm, scales = np.array(self.piece.size_mm), px_per_mm(self.settings, self.piece, conditions)
-        matrices = []
+        # the piece's longer side takes the drawn share of the picture's shorter one
+        (low, high), piece_mm = self.settings.view.patch_share, np.array(self.piece.size_mm)
+        scales, matrices = low * (high / low) ** pose.background[:, 1] * side / piece_mm.max(), []
         for scale, roll, place in zip(scales, pose.roll_deg, pose.background[:, 2:4], strict=True):
             free_px = side - rotated_extent(piece_mm * scale, roll)
             middle = (photo - side) / 2 + side / 2 + (place - 0.5) * free_px
@@ -121,13 +122,6 @@ def build(source: SceneSource) -> ImageScene:
         warnings.append(f"the promise is made on {half} images, and says little of others: give {FEW_IMAGES} or more")
     inputs = {"object.images": files_sha256(files, whole=False)}
     return ImageScene(settings, base, source.seed, identity, piece, images, notes=tuple(warnings), inputs=inputs)
-
-
-def px_per_mm(settings: SceneSettings, piece: Piece, conditions: Conditions) -> np.ndarray:
-    """Return N scales at `photo_px`: the piece's longer side takes the drawn share of the picture's shorter one."""
-    low, high = settings.view.patch_share
-    shares = low * (high / low) ** conditions.pose.background[:, 1]
-    return shares * min(settings.camera.photo_px) / max(piece.size_mm)
 
 
 def largest_share(roll_deg: tuple[float, float]) -> float:

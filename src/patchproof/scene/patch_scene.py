@@ -5,7 +5,7 @@ In: settings. Out: a `PatchScene`, which knows its sheet id (a hash of settings 
 layout of the printed piece (the design and its markers, whose size follows from the views) and the piece's placement.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -102,16 +102,6 @@ class PatchScene(PieceScene, MeshScene):
         """Return N: the light on white paper at the piece's middle."""
         light = conditions.light
         return light.ambient + light.directional * self.cosines(light.light_azimuth_deg, light.light_elevation_deg)
-
-    def with_print_scale(self, scale: tuple[float, float]) -> Self:
-        """Return the scene with its piece printed at `scale` (x, y) about its middle; its millimeters stay."""
-        placement, factors = self.placement, np.array(scale)
-        middle, scaling = np.array(placement.size_mm) / 2, np.eye(4)
-        scaling[[0, 1], [0, 1]] = factors
-        scaling[:2, 3] = middle - factors * middle
-        vertices = placement.world(middle + (placement.piece_mm - middle) * factors)
-        frame = placement.world_from_piece @ scaling
-        return replace(self, placement=replace(placement, vertices_mm=vertices, world_from_piece=frame))
 
 
 @dataclass(frozen=True)

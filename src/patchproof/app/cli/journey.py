@@ -160,7 +160,7 @@ def reprint(
     sessions: Annotated[int, Option(min=1, help="Places to take them in, each with its light, camera and folder.")] = 1,
     seed: Seed = None,
     printer: Annotated[str | None, Option(help="Another printer than the scene's: a name or a file.")] = None,
-    print_scale: Annotated[str, Option(help="Size of the print, 0.97 or 0.97x0.98 (x, y).")] = "1",
+    print_scale: Annotated[float, Option(min=0.01, help="Size of the print beside the sheet's.")] = 1.0,
     control: Annotated[PhotographedControl | None, Option(help="Photograph a control in place of the design.")] = None,
     jobs: Jobs = None,
     trust: Trust = False,
@@ -172,8 +172,7 @@ def reprint(
     from patchproof.reprints.reprint import ReprintSetup
     from patchproof.reprints.reprint import reprint as reprint_sheet
 
-    scale = console.pair_of(print_scale, "--print-scale")
-    how = ReprintSetup(printer, scale, control)
+    how = ReprintSetup(printer, print_scale, control)
     if run is None:
         if control is not None or sessions > 1:
             raise BadParameter("controls and sessions are of a run's sheet; name the run", param_hint="--run")
