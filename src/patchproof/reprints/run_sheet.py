@@ -13,6 +13,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from patchproof.base.geometry import rect_border, rect_corners
 from patchproof.base.output import check_file
 from patchproof.base.sessions import split_evenly
 from patchproof.base.settings import SceneSettings, background_summary
@@ -20,17 +23,22 @@ from patchproof.base.validation import NETWORK_FILE
 from patchproof.evidence import verdict
 from patchproof.optimizer.promise import PROMISE_VIEWS
 from patchproof.optimizer.run import Run
+from patchproof.render.photograph import plan_picture
+from patchproof.render.stage import set_stage
 from patchproof.report.words import promise_summary
-from patchproof.reprints.plan_view import draw_plan_view
 from patchproof.scene.interface import PieceScene, Scene, require_piece
 from patchproof.scene.patch_scene import PatchScene, require_patch
+from patchproof.scene.placement import patch_frame
 from patchproof.sheets.content import SheetContent
 from patchproof.sheets.manifest import Manifest, Promise
 from patchproof.sheets.piece import control_design, with_ids
-from patchproof.sheets.plan_page import PlanPage, edge_distances_mm
+from patchproof.sheets.plan_page import PlacementPicture, PlanPage, edge_distances_mm
 from patchproof.sheets.rects import size_text
 from patchproof.sheets.template import Template, load_template, page_template
 from patchproof.sheets.write import write_several, write_sheet
+
+_PLAN_MARGIN = 1.06  # of the object's extent
+SHOT_COUNTS = ((40, 1), (40, 2), (40, 4), (40, 8), (80, 8))  # photographs, sessions
 
 
 def sheet(
@@ -157,7 +165,37 @@ def plan_of(scene: PieceScene, template: Template, content: SheetContent) -> Pla
     return PlanPage(picture, tuple(sections)) if sections else None
 
 
-SHOT_COUNTS = ((40, 1), (40, 2), (40, 4), (40, 8), (80, 8))  # photographs, sessions
+def draw_plan_view(scene: PatchScene, template: Template) -> PlacementPicture:
+    """Draw the object as seen from the piece's side, with the piece's outline and, in tiles, its seams."""
+    # cameras may count their angles from another side
+    scene = replace(scene, frame=patch_frame(scene.mesh, scene.settings.patch))
+    frame, placement = scene.frame, scene.placement
+    axes = np.stack([frame.right, -frame.up])  # millimeters right and down, from the middle of the object
+
+    def project(points: np.ndarray) -> np.ndarray:  # to the picture's plane
+        return np.asarray(points) @ axes.T
+
+    low, high = project(scene.mesh.vertices).min(0), project(scene.mesh.vertices).max(0)
+    outline = project(placement.world(rect_border((0, 0, *placement.size_mm), 16)))  # bent paper has bent edges
+    half = np.maximum(np.abs([low, high, outline.min(0), outline.max(0)]).max(0) * _PLAN_MARGIN, 1.0)
+    seams, names = [], []
+    tiles = []
+    if template.tiles is not None:
+        from patchproof.sheets.tiles import plan_tiles
+
+        tiles = plan_tiles(template, scene.piece)
+    for tile in tiles:
+        corners = project(placement.world(rect_corners(tile.part_mm)))
+        seams += [(tuple(corners[1]), tuple(corners[2])), (tuple(corners[2]), tuple(corners[3]))]
+        names.append((tuple(corners.mean(0)), tile.name))
+    return PlacementPicture(
+        picture=plan_picture(set_stage(scene), scene.frame, half),
+        picture_mm=(-half[0], -half[1], 2 * half[0], 2 * half[1]),
+        object_mm=(*low, *(high - low)),
+        outline_mm=tuple(map(tuple, outline)),
+        seams_mm=tuple(seams),
+        names_mm=tuple(names),
+    )
 
 
 def shot_sections(promise: Promise, settings: SceneSettings) -> tuple[tuple[str, tuple[str, ...]], ...]:

@@ -135,25 +135,19 @@ def erase(picture: np.ndarray, seed: int) -> None:
     same box and values at every size, and in photograph and square.
     """
     rng = np.random.default_rng(seed)
-    box = _erased_box(rng)
+    left = top = wide = high = 1.0
+    while left + wide > 1 or top + high > 1:  # boxes that do not fit are drawn again, as in the paper
+        area, aspect = rng.uniform(*ERASED_AREA), rng.uniform(*ERASED_ASPECT)
+        high, wide = np.sqrt(area * aspect), np.sqrt(area / aspect)
+        left, top = rng.random(2)
     values = rng.integers(0, 256, (_ERASED_CELLS, _ERASED_CELLS, 3), np.uint8)
     height, width = picture.shape[:2]
     side = min(height, width)
     x, y = ((np.arange(n) + 0.5 - (n - side) / 2) / side for n in (width, height))
-    columns = np.flatnonzero((x >= box[0]) & (x < box[0] + box[2]))
-    rows = np.flatnonzero((y >= box[1]) & (y < box[1] + box[3]))
+    columns = np.flatnonzero((x >= left) & (x < left + wide))
+    rows = np.flatnonzero((y >= top) & (y < top + high))
     cell_x, cell_y = ((v * _ERASED_CELLS).astype(int) for v in (x[columns], y[rows]))
     picture[np.ix_(rows, columns)] = values[np.ix_(cell_y, cell_x)]
-
-
-def _erased_box(rng: np.random.Generator) -> tuple[float, float, float, float]:
-    """Return x, y, width, height in shares of the square; boxes that do not fit are drawn again, as in the paper."""
-    while True:
-        area, aspect = rng.uniform(*ERASED_AREA), rng.uniform(*ERASED_ASPECT)
-        height, width = np.sqrt(area * aspect), np.sqrt(area / aspect)
-        x, y = rng.random(2)
-        if x + width <= 1 and y + height <= 1:
-            return x, y, width, height
 
 
 def _files_of_class(settings: SceneSettings, base: Path) -> list[Path]:

@@ -126,15 +126,8 @@ def _checks(rng: np.random.Generator, px: int) -> np.ndarray:
     return (np.floor(x) + np.floor(y)) % 2
 
 
-def _grain(rng: np.random.Generator, px: int) -> np.ndarray:
-    return rng.random((px, px))
-
-
-def _plain(rng: np.random.Generator, px: int) -> np.ndarray:
-    return np.zeros((px, px))
-
-
-_PATTERNS = (natural, _clouds, _cells, _bricks, _stripes, _checks, _grain, _plain)
+_PATTERNS = (natural, _clouds, _cells, _bricks, _stripes, _checks)
+_PATTERNS += (lambda rng, px: rng.random((px, px)), lambda rng, px: np.zeros((px, px)))  # grain, and none
 _SHARES = (0.25, 0.1, 0.15, 0.12, 0.1, 0.06, 0.07, 0.15)
 
 

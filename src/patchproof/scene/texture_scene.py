@@ -91,7 +91,8 @@ def texture_canvas(mesh: Mesh, patch: PatchSettings, base: Path, texels: int = T
             " unwrapped (xatlas) and keep their colors"
         )
     mesh = bake_base_colors(mesh, chosen_faces, texels)
-    masks = _masks(mesh, chosen_faces)
+    shown = (_corners(mesh, chosen_faces & (mesh.face_material == i)) for i in range(len(mesh.materials)))
+    masks = tuple(coverage(corners, _size(mesh, i), GUTTER_TEXELS) > 0 for i, corners in enumerate(shown))
     if patch.mask is not None:
         image = _read_mask(Path(expand_path(patch.mask, base)))
         height, width = image.shape
@@ -181,14 +182,6 @@ def bake_base_colors(mesh: Mesh, chosen_faces: np.ndarray, texels: int = TEXELS)
     return replace(mesh, materials=tuple(with_base_color(i, material) for i, material in enumerate(mesh.materials)))
 
 
-def _masks(mesh: Mesh, chosen_faces: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return the texels of each material that chosen faces can show."""
-    return tuple(
-        coverage(_corners(mesh, chosen_faces & (mesh.face_material == i)), _size(mesh, i), GUTTER_TEXELS) > 0
-        for i in range(len(mesh.materials))
-    )
-
-
 def _corners(mesh: Mesh, faces: np.ndarray) -> np.ndarray:
     """Return corners F×3×2 in texels of faces of one material."""
     index = mesh.face_material[faces][:1]
@@ -208,7 +201,9 @@ def _texel_warnings(mesh: Mesh, chosen_faces: np.ndarray, masks: tuple[np.ndarra
     """Return warnings about the texels that may change, with their shares of the surface."""
     a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
-    first_of_place, has_uv = _is_first_at_place(mesh), has_usable_uv(mesh)
+    # a front and a back with the same three corners in space, as some programs export them, show one place
+    first = np.unique(np.sort(position_numbers(mesh.vertices)[mesh.faces], axis=1), axis=0, return_index=True)[1]
+    first_of_place, has_uv = np.isin(np.arange(len(area)), first), has_usable_uv(mesh)
     changeable, repeated, palette, unnamed = np.zeros((4, len(area)))  # shares of each face
     for index, mask in enumerate(masks):
         faces = has_uv & (mesh.face_material == index)
@@ -240,11 +235,3 @@ def _texel_warnings(mesh: Mesh, chosen_faces: np.ndarray, masks: tuple[np.ndarra
     if (mesh.corner_color_linear[chosen_faces] != 1).any():
         warnings.append("vertex colors go on multiplying the texture: where they are dark, it stays dark")
     return warnings
-
-
-def _is_first_at_place(mesh: Mesh) -> np.ndarray:
-    """Return the faces for which no earlier face has the same three corners in space: a front and a back, as some
-    programs export, show one place.
-    """
-    first = np.unique(np.sort(position_numbers(mesh.vertices)[mesh.faces], axis=1), axis=0, return_index=True)[1]
-    return np.isin(np.arange(len(mesh.faces)), first)
