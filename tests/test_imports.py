@@ -29,7 +29,7 @@ MAY_IMPORT = {
     "calibrate": {"base", "sheets", "photo", "channel", "evidence"},
     "report": {"base"},
     "reprints": {
-        *("base", "sheets", "photo", "channel", "mesh", "scene", "render", "optimizer", "evidence", "report"),
+        *("base", "sheets", "channel", "scene", "render", "optimizer", "evidence", "report"),
     },
 }
 MAY_IMPORT |= {"app": set(MAY_IMPORT), "__init__": {*MAY_IMPORT, "app"}, "__main__": {"app"}}

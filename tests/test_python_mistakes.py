@@ -99,7 +99,7 @@ MISTAKES: dict[str, tuple[Callable[[], object], str]] = {
     "reprint: a fraction": (lambda: pp.reprint("a.pdf", RUN, 2.5, "photos"), "got 2.5"),
     "reprint: a printer": (lambda: pp.reprint("a.pdf", RUN, 2, "photos", "office"), r"write ReprintSetup\(...\)"),
     "reprint: a scale": (
-        lambda: pp.reprint("a.pdf", RUN, 2, "photos", pp.ReprintSetup(print_scale=0.97)),
+        lambda: pp.reprint("a.pdf", RUN, 2, "photos", pp.ReprintSetup(print_scale="97 %")),
         "print_scale of ReprintSetup",
     ),
     "verify: a dictionary": (lambda: verify(capture={"scan_dpi": 300}), r"write CaptureInfo\(...\)"),

@@ -1,4 +1,4 @@
-"""The command line `patchlab`: run studies, make charts and a gallery, harden images, print keys and figures."""
+"""The command line `patchlab`: run studies, make charts and a gallery, harden images, trace paths, print figures."""
 
 import re
 from pathlib import Path
@@ -194,8 +194,28 @@ def gallery(
     console.say(f"page: {page}")
 
 
+def trace(
+    pdf: Annotated[Path, typer.Argument(help="A sheet's PDF.")],
+    run: Annotated[Path, typer.Option(help="The run it was made from.")],
+    n: Annotated[int, typer.Option("--n", min=1, help="Photographs to take.")],
+    out: Annotated[Path, typer.Option(help="Folder for the photographs.")],
+    sessions: Annotated[int, typer.Option(min=1, help="Places to take them in.")] = 1,
+    trust: console.Trust = False,
+    overwrite: console.Overwrite = False,
+) -> None:
+    """Photograph a run's sheet as `patchproof reprint` does, by the path tracer Mitsuba 3 (slow)."""
+    from patchlab.validation.path_traced import photograph_traced
+    from patchproof.optimizer.run import load_run
+    from patchproof.reprints.reprint import ReprintSetup, reprint
+
+    setup = ReprintSetup(render=photograph_traced)
+    with progress_bar() as bar:
+        reprint(pdf, load_run(run, trust), n, out, setup, sessions=sessions, overwrite=overwrite, progress=bar)
+    console.say(f"{n} photographs: {out}")
+
+
 app.command(cls=StudyCommand)(console.as_command(study))
-for _verb in (charts, gallery, harden, table, keys):
+for _verb in (charts, gallery, harden, table, trace, keys):
     app.command()(console.as_command(_verb))
 app.callback()(console.version_option)
 

@@ -33,8 +33,8 @@ from .photo.rejection import PhotoRejected as PhotoRejected
 from .render.photograph import photograph as photograph
 from .render.stage import Stage as Stage
 from .render.stage import set_stage as set_stage
-from .reprints.mounted_sheet import ReprintSetup as ReprintSetup
 from .reprints.reprint import Reprint as Reprint
+from .reprints.reprint import ReprintSetup as ReprintSetup
 from .reprints.reprint import reprint as reprint
 from .reprints.run_sheet import sheet as sheet
 from .scene.conditions import Conditions as Conditions

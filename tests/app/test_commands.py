@@ -27,7 +27,7 @@ from patchproof.optimizer import run as run_module
 from patchproof.optimizer.promise import PromiseOptions
 from patchproof.optimizer.run import load_run
 from patchproof.optimizer.run import optimize as optimize_scene
-from patchproof.reprints.mounted_sheet import sheet_scene
+from patchproof.reprints.reprint import sheet_scene
 from patchproof.reprints.run_sheet import sheet_of_several
 from patchproof.scene.scene import load_scene
 from patchproof.sheets.manifest import load_manifest

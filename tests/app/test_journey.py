@@ -91,7 +91,7 @@ def test_a_page_without_a_design_needs_no_run(loaded):
 
 def test_a_flat_card_on_a_mesh_loads_no_other_kind_of_scene(loaded):
     found = loaded[1]["demo"]
-    others = {"bent_scene", "texture_scene", "unplaced_scene", "photo_scene", "image_scene"}
+    others = {"bent_scene", "texture_scene", "photo_scene", "image_scene"}
     others |= {"candidate_places"}
     assert not {f"patchproof.scene.{name}" for name in others} & found.names and "trimesh" not in found.names
     assert found.lines <= 21_800 and found.rooms >= {"optimizer", "scene", "mesh", "render", "reprints"}
@@ -190,7 +190,7 @@ def test_distance_and_angle_come_from_the_focal_length_in_exif(journey, report):
         if photo["status"] != "measured":
             continue
         drawn = truth[photo["file"]]["conditions"]
-        conditions = conditions_from_fields({k: np.array([v]) for k, v in drawn.items() if k != "print_scale"})
+        conditions = conditions_from_fields({k: np.array([v]) for k, v in drawn.items()})
         pose = scene.camera_from_world(conditions)[0] @ scene.placement.world_from_piece
         azimuth, _, distance = geometry.view_angles(pose, np.array(scene.placement.size_mm) / 2)
         assert photo["azimuth_deg"] == pytest.approx(azimuth, abs=2)
@@ -267,7 +267,7 @@ def test_control_photographs_test_the_effect(report, again):
 
 
 def test_a_smaller_print_looks_like_a_farther_one(journey, tmp_path):
-    arguments = ("--run", journey / "run", "--n", 1, "--out", tmp_path / "photos", "--print-scale", "0.9x0.9")
+    arguments = ("--run", journey / "run", "--n", 1, "--out", tmp_path / "photos", "--print-scale", 0.9)
     assert command("reprint", journey / "sheet.pdf", *arguments) == 0
     full, small = (
         json.loads((folder / "truth.json").read_text())["photo_0001.jpg"]

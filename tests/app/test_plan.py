@@ -37,7 +37,6 @@ from patchproof.photo.paper_light import PaperLight
 from patchproof.scene.bent_scene import placement_with_other_bend
 from patchproof.scene.conditions import draw
 from patchproof.scene.photo_scene import BasePhoto, PhotoScene
-from patchproof.scene.picture_scene import BasePicture
 from patchproof.scene.scene import build_scene, load_scene
 from patchproof.sheets.piece import lay_out_piece
 from test_conditions import SETTINGS
@@ -246,10 +245,7 @@ def photo_scene(tmp_path, blur_px: float, noise: float) -> PhotoScene:
     piece = lay_out_piece((60, 60), 12, "A" * 10, "design")
     light = PaperLight(np.array([[0.5, -0.2, 0, 0, 0, 0]] * 3), 0.0, noise)
     where = np.array([[1.0, 0, 50], [0, 1, 25], [0, 0, 1]])
-    photos = [
-        BasePhoto(str(i), BasePicture(np.full((150, 200, 3), 90 + i, np.uint8)), where, light, blur_px)
-        for i in range(2)
-    ]
+    photos = [BasePhoto(str(i), [np.full((150, 200, 3), 90 + i, np.uint8)], where, light, blur_px) for i in range(2)]
     return PhotoScene(validate_model(SceneSettings, tables, "test"), tmp_path, 0, "A" * 10, piece, tuple(photos))
 
 

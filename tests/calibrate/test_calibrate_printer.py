@@ -22,6 +22,7 @@ from inkjets import DRIVERS, draw_inkjet
 from patchproof.app import cli
 from patchproof.base.color import linear_from_srgb, srgb_from_linear
 from patchproof.base.errors import Refused
+from patchproof.base.output import image_pixels
 from patchproof.calibrate import chart as chart_module
 from patchproof.calibrate import icc
 from patchproof.calibrate.chart import calibrate_chart, combine_light, printer_of, prints_of, summary_lines
@@ -201,23 +202,24 @@ def shots():
     """A printer, and two photographs of its chart of 48 swatches."""
     printer, manifest = draw_inkjet(2), chart_manifest(48)
     page = printed_page(manifest, printer)
-    return printer, manifest, [photograph_page(page, seed) for seed in (1, 4)]
+    taken = (photograph_page(page, seed) for seed in (1, 4))
+    return printer, manifest, [(Photo(image_pixels(file), None), paper) for file, paper in taken]
 
 
 @pytest.fixture(scope="module")
 def readings(shots):
     """What is read in each of the photographs."""
-    return [read_chart(shot.photo, shots[1]) for shot in shots[2]]
+    return [read_chart(photo, shots[1]) for photo, _ in shots[2]]
 
 
 def test_swatches_are_read_relative_to_paper_under_uneven_light(shots, readings):
     printer, manifest, both = shots
     sent = np.array([swatch.srgb for swatch in manifest.chart])
-    for shot, read in zip(both, readings, strict=True):
+    for (_, paper), read in zip(both, readings, strict=True):
         assert np.isfinite(read.light).all()
         error = color_difference(srgb_from_linear(read.light), shown(printer, sent))
         assert error.mean() < 1.2 and error.max() < 4
-        np.testing.assert_allclose(read.paper, shot.paper, rtol=0.06)
+        np.testing.assert_allclose(read.paper, paper, rtol=0.06)
 
 
 def test_a_chart_page_is_rehearsed_without_a_printer(tmp_path):
@@ -240,17 +242,17 @@ def test_without_the_flat_field_the_same_photograph_would_be_far_off(shots, read
     """The guard that the test above can fail: light that falls off by a third is read as ink where it is not taken
     out.
     """
-    _, manifest, (shot, _) = shots
-    falling = np.linspace(1, 0.6, shot.photo.srgb.shape[1])[:, None]
-    darker = (srgb_from_linear(linear_from_srgb(shot.photo.srgb / 255) * falling) * 255 + 0.5).astype(np.uint8)
+    _, manifest, ((shot, _), _) = shots
+    falling = np.linspace(1, 0.6, shot.srgb.shape[1])[:, None]
+    darker = (srgb_from_linear(linear_from_srgb(shot.srgb / 255) * falling) * 255 + 0.5).astype(np.uint8)
     before, after = readings[0], read_chart(Photo(darker, None), manifest)
     error = color_difference(srgb_from_linear(after.light), srgb_from_linear(before.light))
     assert error.mean() < 0.5 and after.paper[1] < 0.9 * before.paper[1]
 
 
 def test_photographs_that_show_no_chart(shots):
-    _, manifest, (shot, _) = shots
-    small = cv2.resize(shot.photo.srgb, (800, 600), interpolation=cv2.INTER_AREA)
+    _, manifest, ((shot, _), _) = shots
+    small = cv2.resize(shot.srgb, (800, 600), interpolation=cv2.INTER_AREA)
     read_chart(Photo(small, None), manifest)
     with pytest.raises(PhotoRejected, match="too_few_markers"):
         read_chart(Photo(np.full_like(small, 90), None), manifest)
@@ -265,8 +267,8 @@ def test_photographs_that_show_no_chart(shots):
 def test_a_printer_is_calibrated_stored_and_loaded(shots, tmp_path, capsys):
     printer, manifest, both = shots
     (tmp_path / "chart.json").write_text(dump_manifest(manifest), encoding="utf-8")
-    for i, shot in enumerate(both):
-        Image.fromarray(shot.photo.srgb).save(tmp_path / f"{i}.png")
+    for i, (shot, _) in enumerate(both):
+        Image.fromarray(shot.srgb).save(tmp_path / f"{i}.png")
     (tmp_path / "bad.jpg").write_bytes(b"no picture")
     command = ["calibrate", "printer", "--sheet", str(tmp_path / "chart.json"), "--out", str(tmp_path / "mine.npz")]
     command += [*(str(tmp_path / name) for name in ("0.png", "1.png", "bad.jpg"))]
@@ -286,8 +288,8 @@ def test_a_printer_is_calibrated_stored_and_loaded(shots, tmp_path, capsys):
 
 
 def test_what_cannot_be_calibrated_is_refused_in_one_sentence(shots, tmp_path):
-    _, manifest, (shot, _) = shots
-    Image.fromarray(np.full_like(shot.photo.srgb, 90)).save(tmp_path / "none.png")
+    _, manifest, ((shot, _), _) = shots
+    Image.fromarray(np.full_like(shot.srgb, 90)).save(tmp_path / "none.png")
     with pytest.raises(Refused, match=r"chart can be read, got none of 1"):
         calibrate_chart([[tmp_path / "none.png"]], manifest, "x")
     with pytest.raises(Refused, match="with a chart"):

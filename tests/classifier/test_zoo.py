@@ -15,10 +15,11 @@ from safetensors.torch import save_file
 from small_networks import seeded
 
 import patchproof as pp
+from patchlab.validation.path_traced import photograph_traced
 from patchproof.app.begin.new import _model
 from patchproof.base.errors import Refused
 from patchproof.classifier import load_classifier, zoo
-from patchproof.reprints.mounted_sheet import ReprintSetup
+from patchproof.reprints.reprint import ReprintSetup
 
 pytestmark = pytest.mark.filterwarnings("ignore:the network")  # doubts: weights are noise
 
@@ -45,9 +46,8 @@ def judged(folder, model, label) -> tuple[pp.Run, pp.Report]:
         run = pp.optimize(pp.load_scene(folder / "scene.toml"), folder / "run", promise=pp.PromiseOptions(8))
     assert np.ptp(run.design) > 0  # gradients came through all of it
     pp.sheet(run, folder / "sheet.pdf")
-    how = ReprintSetup(
-        path_traced=find_spec("mitsuba") is not None
-    )  # by a renderer that is not ours where it is installed
+    # by a renderer that is not ours where it is installed
+    how = ReprintSetup(render=photograph_traced) if find_spec("mitsuba") else ReprintSetup()
     pp.reprint(folder / "sheet.pdf", run, 3, folder / "photos", how)
     report = pp.verify(folder / "photos", folder / "sheet.json", folder / "report", ledger_photos=0)
     assert report.summary.photos == 3 and report.summary.verdict in ("kept", "broken", "cannot_tell")

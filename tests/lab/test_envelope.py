@@ -88,8 +88,9 @@ def test_gap_moves_the_piece_along_its_normal_and_size_shrinks_it(world):
     off = scene_at(world.scene, {"gap": 30.0}).placement
     assert off.center_mm - flat.center_mm == pytest.approx(30 * flat.normal)
     assert off.vertices_mm - flat.vertices_mm == pytest.approx(np.tile(30 * flat.normal, (4, 1)))
-    small = scene_at(world.scene, {"size": 0.5, "gap": 30.0}).placement
-    assert np.ptp(small.vertices_mm, axis=0).max() == pytest.approx(flat.size_mm[0] / 2)
+    drawn = world.scene.draw("evaluate", 2)
+    small = conditions_at(world.scene, drawn, {"size": 0.5})
+    assert small.pose.printed_scale == pytest.approx(drawn.pose.printed_scale / 2)
 
 
 @pytest.mark.parametrize("quarters", [0.0, 1.0, 2.5, 4.0])

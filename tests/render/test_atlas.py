@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from patchproof.render.atlas import MAX_TAPS, atlas_layout, atlas_table, sample_atlas
+from patchproof.render.surfaces import MAX_TAPS, atlas_layout, atlas_table, sample_atlas
 from patchproof.render.texture import footprint, look_up, texel_layout, texel_table
 
 # Places in an atlas are float32 shares of its sides: of 1,100 texels a ten-thousandth of one.

@@ -30,7 +30,7 @@ from patchproof.optimizer.run import Run, load_run
 from patchproof.optimizer.subject import from_pixels
 from patchproof.render.photograph import photograph
 from patchproof.render.stage import set_stage
-from patchproof.reprints.mounted_sheet import MountedSheet, sent_pixels, take_photo
+from patchproof.reprints.reprint import MountedSheet, ReprintSetup, sent_pixels
 from patchproof.reprints.run_sheet import sheet as sheet_of
 from patchproof.scene.conditions import draw, with_values
 from patchproof.scene.patch_scene import PatchScene
@@ -135,12 +135,13 @@ def hang(world: PatchScene, manifest: Manifest) -> PatchScene:
 def shoot(world: PatchScene, pdf: Path | None, conditions, folder: Path) -> None:
     """photo_0.jpg ... of the world with the PDF's piece on the object, or with nothing."""
     folder.mkdir()
-    stage, piece = set_stage(world), None
+    stage, how, manifest, pixels = set_stage(world), ReprintSetup(control="bare"), None, None
     if pdf is not None:
-        manifest = load_manifest(pdf.with_suffix(".json"))
-        piece = MountedSheet(stage, manifest, sent_pixels(pdf, manifest, world), load_printer("office")).piece
+        manifest, how = load_manifest(pdf.with_suffix(".json")), ReprintSetup()
+        pixels = sent_pixels(pdf, manifest, world)
+    mounted = MountedSheet(stage, manifest, pixels, load_printer("office"), how)
     for i in range(len(conditions)):
-        (folder / f"photo_{i}.jpg").write_bytes(take_photo(stage, piece, conditions[i : i + 1]))
+        (folder / f"photo_{i}.jpg").write_bytes(mounted.photograph(conditions[i : i + 1]))
 
 
 def optimized(folder: Path, world: PatchScene, conditions, object_: str, patch: str, goal: str) -> Journey:

@@ -12,7 +12,7 @@ from patchproof.base.errors import Refused
 from patchproof.base.packaged import packaged_path
 from patchproof.channel.printer import carried_printer, load_printer, printer_of_sheet
 from patchproof.reprints import page_photos
-from patchproof.reprints.mounted_sheet import DEFAULT_SETUP
+from patchproof.reprints.reprint import DEFAULT_SETUP
 from patchproof.reprints.run_sheet import without_folders
 from patchproof.sheets.blank import blank_sheet
 
@@ -43,9 +43,9 @@ def test_of_a_blank_sheet_only_the_piece_is_photographed(tmp_path, monkeypatch):
     """Markers of its page would stand beside the print that hangs in its place: "several_sheets"."""
     sizes = []
 
-    def photograph(page: np.ndarray, seed: int) -> page_photos.Shot:
+    def photograph(page: np.ndarray, seed: int) -> tuple[bytes, np.ndarray]:
         sizes.append(page.shape[:2])
-        return page_photos.Shot(b"", np.ones(3))
+        return b"", np.ones(3)
 
     monkeypatch.setattr(page_photos, "PX_PER_MM", 2)
     monkeypatch.setattr(page_photos, "photograph_page", photograph)

@@ -18,7 +18,7 @@ from patchproof.evidence.verdict import (
     sessions_needed,
     sessions_to_show,
 )
-from patchproof.reprints.shot_plan import shot_sections
+from patchproof.reprints.run_sheet import shot_sections
 from test_verify_verdict import promise_of
 
 SETTINGS = SceneSettings.model_validate(

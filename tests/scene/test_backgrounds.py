@@ -193,22 +193,6 @@ def places():
     return [module.procedural_place(number) for number in range(0, 12, 2)]
 
 
-def test_textures_that_nobody_sees_are_drawn_as_if_they_were_made(monkeypatch, places):
-    """So that a place stays the same whatever shows in it: all that is random is drawn before a texture is made."""
-
-    def at_once(rng, px):
-        picture = patterns.draw_texture(rng, px)()
-        return lambda: picture
-
-    monkeypatch.setattr(module, "draw_texture", at_once)
-    assert all(np.array_equal(module.procedural_place(2 * i), place) for i, place in enumerate(places))
-    for seed in range(60):  # every pattern
-        rng = np.random.default_rng(seed)
-        later = patterns.draw_texture(rng, 32)
-        drawn = rng.bit_generator.state
-        assert np.array_equal(later(), later()) and rng.bit_generator.state == drawn
-
-
 def test_rays_that_pass_a_box_by_are_those_that_would_not_meet_it(monkeypatch, places):
     monkeypatch.setattr(module, "_candidate_rays", lambda aim, ends: np.arange(aim.shape[1]))
     assert all(np.array_equal(module.procedural_place(2 * i), place) for i, place in enumerate(places))

@@ -21,7 +21,6 @@ from patchproof.photo.paper_light import paper_light, quadratic_terms
 from patchproof.photo.rejection import PhotoRejected
 from patchproof.scene.conditions import with_values
 from patchproof.scene.photo_scene import measure_photo, photos_in
-from patchproof.scene.picture_scene import BasePicture
 from patchproof.scene.scene import build_scene
 from patchproof.sheets.blank import blank_sheet
 from patchproof.sheets.manifest import Manifest, dump_manifest
@@ -214,7 +213,7 @@ def test_picture_and_homography_move_alike(scene, size_px):
         x, y = apply_homography(photo.photo_from_piece, middle[None])[0]
         rows, columns = np.mgrid[: SIZE[1], : SIZE[0]] + 0.5
         picture[:] = 255 * np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / 2 / 5**2)[..., None]
-        dotted.append(replace(photo, picture=BasePicture(np.round(picture).astype(np.uint8))))
+        dotted.append(replace(photo, picture=[np.round(picture).astype(np.uint8)]))
     scene = replace(scene, photos=tuple(dotted))
     conditions = scene.draw("evaluate", 12)
     assert np.ptp(scene.picture_blur_and_noise(conditions)[0]) > 0.1 and np.ptp(conditions.pose.roll_deg) > 4
@@ -248,7 +247,7 @@ def test_photographs_of_another_size_and_shape_agree_in_their_square(world, tmp_
     found = apply_homography(seen.photo_from_piece, corners)
     assert np.abs(found - apply_homography(expected, corners)).max() < 0.1
     assert seen.blur_px == pytest.approx(blur, abs=0.3)
-    assert min(seen.picture.srgb.shape[:2]) == 480
+    assert min(seen.picture[0].shape[:2]) == 480
 
 
 def test_glare_and_shadow_do_not_move_the_light():

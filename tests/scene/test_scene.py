@@ -11,10 +11,9 @@ from conftest import SCENE
 from patchproof.base import geometry
 from patchproof.base.errors import Refused
 from patchproof.channel.printer import identity_printer
-from patchproof.render.designs import PrintedPiece
 from patchproof.render.photograph import expose, photograph
 from patchproof.render.pixels import PiecePicture
-from patchproof.render.stage import set_stage
+from patchproof.render.stage import PrintedPiece, set_stage
 from patchproof.render.views import render_views
 from patchproof.scene.conditions import with_values
 from patchproof.scene.interface import Scene

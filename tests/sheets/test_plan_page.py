@@ -11,8 +11,7 @@ from conftest import SCENE
 
 from patchproof.base.errors import Refused
 from patchproof.base.settings import load_scene_settings
-from patchproof.reprints.plan_view import draw_plan_view
-from patchproof.reprints.shot_plan import shot_sections
+from patchproof.reprints.run_sheet import draw_plan_view, shot_sections
 from patchproof.sheets.plan_page import PlacementPicture, PlanPage, edge_distances_mm, lay_out_plan, wrap_text
 from patchproof.sheets.template import load_template
 from test_benefit_shown import promise_with

@@ -41,7 +41,7 @@ from patchproof.render.photograph import photograph
 from patchproof.render.pixels import PiecePicture
 from patchproof.render.stage import Stage, set_stage
 from patchproof.report.tables import Drawing, Table
-from patchproof.reprints.mounted_sheet import MountedSheet, jpeg_of
+from patchproof.reprints.reprint import MountedSheet, jpeg_of
 from patchproof.scene.conditions import with_values
 from patchproof.scene.patch_scene import PatchScene, require_patch
 from patchproof.scene.scene import load_scene

@@ -37,7 +37,7 @@ from patchproof.optimizer.responses import responses
 from patchproof.optimizer.run import DRAFT_EFFORT, THOROUGH_EFFORT
 from patchproof.optimizer.run import optimize as optimize_scene
 from patchproof.report.tables import Drawing, Table
-from patchproof.scene.unplaced_scene import require_unplaced
+from patchproof.scene.patch_scene import require_unplaced
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -26,6 +26,7 @@ from patchlab.study.estimates import mean
 from patchlab.study.grid import CellValues, GridSettings, Names, by_values, cell_key, grid_cells, group_by, problem_of
 from patchlab.study.record import parse_hits, to_record
 from patchlab.study.study import Cell, Result, Study
+from patchlab.validation.path_traced import photograph_traced
 from patchproof.app.plan.errors import PRINTER, Setup, effect_terms, scene_terms
 from patchproof.base.errors import Refused
 from patchproof.base.intervals import Estimate
@@ -43,7 +44,6 @@ from patchproof.render.photograph import Appearance
 from patchproof.render.pixels import PiecePicture
 from patchproof.render.views import Views, relight_and_replace_background
 from patchproof.report.tables import Table
-from patchproof.reprints.path_traced import photograph_traced
 from patchproof.scene.conditions import Conditions, draw
 from patchproof.scene.conditions import without_effect as drawn_without
 

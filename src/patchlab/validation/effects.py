@@ -54,10 +54,10 @@ def _record_session(report: Any, control: str) -> dict[str, Any]:
 
 def tables(settings: EffectsSettings, results: Sequence[Result]) -> tuple[Table, ...]:
     """Tables of effects, by scene and in all, and of every session."""
-    about = f"{settings.sessions} sessions of {settings.photos} photographs of each run; the patch beside"
+    about = f"{settings.sessions} sessions of {settings.photos} photographs of each run; the patch beside "
+    about += settings.control
     head = ("scene", "sessions", "refused", "photographed effect", "estimated minus photographed", "interval held")
     effects = [(name, *_effect_row(group)) for name, group in (by_scene(results) | {"all": list(results)}).items()]
-    about = f"{about} {settings.control}"
     return Table("effects", "Effects estimated and photographed", head, tuple(effects), about), _session_table(results)
 
 
@@ -77,13 +77,13 @@ def _effect_row(group: Sequence[Result]) -> tuple:
 
 
 def _session_table(results: Sequence[Result]) -> Table:
-    rows, head = [], ("scene", "network", "seed", "session", "photographs", "agree", "estimated")
+    rows, measured = [], ("session", "photographs", "agree", "estimated", "low", "high", "photographed")
     for result in results:
         start = tuple(result.cell.values[name] for name in ("name", "network", "seed"))
         for number, session in enumerate(result.answers["sessions"], 1):
             estimated = session["estimated"][0] if session["estimated"] else (None,) * 3
             rows.append((*start, number, session["photos"], session["agree"], *estimated, session["photographed"]))
-    head = (*head, "low", "high", "photographed")
+    head = ("scene", "network", "seed", *measured)
     return Table("sessions", "Every session", head, tuple(rows), "effects are of the patch minus the control")
 
 

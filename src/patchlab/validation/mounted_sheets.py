@@ -3,18 +3,12 @@
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from patchproof.optimizer.run import Run
-from patchproof.render.stage import Stage, set_stage
-from patchproof.reprints.mounted_sheet import DEFAULT_SETUP, MountedSheet, sent_pixels
-from patchproof.reprints.run_sheet import content_of
+from patchproof.channel.printer import load_printer
+from patchproof.render.stage import Stage
+from patchproof.reprints.reprint import MountedSheet, sent_pixels
 from patchproof.sheets.content import SheetContent
 from patchproof.sheets.template import load_template
 from patchproof.sheets.write import write_sheet
-
-
-def mount_run_sheet(run: Run, control: str | None = None) -> MountedSheet:
-    """Mount the run's sheet, or a printed control's, without the page of instructions."""
-    return mount_content(set_stage(run.scene), content_of(run, None, control, run.folder)[0])
 
 
 def mount_content(stage: Stage, content: SheetContent) -> MountedSheet:
@@ -24,4 +18,4 @@ def mount_content(stage: Stage, content: SheetContent) -> MountedSheet:
         pdf = Path(folder) / "sheet.pdf"
         manifest = write_sheet(pdf, template, content)
         sent = sent_pixels(pdf, manifest, stage.scene)
-    return MountedSheet(stage, manifest, sent, DEFAULT_SETUP.printer_for(stage.scene))
+    return MountedSheet(stage, manifest, sent, load_printer(stage.scene.settings.printer.profile, stage.scene.base))

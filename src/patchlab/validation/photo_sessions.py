@@ -73,11 +73,11 @@ def take_photos(
     settings: PhotosSettings, cell: Cell, patch_run: "Run", folder: Path, control: str | None = None
 ) -> Path:
     """Photograph folder/sheet.pdf, or a control under the same conditions; returns the folder of sessions."""
-    from patchproof.reprints.mounted_sheet import ReprintSetup
-    from patchproof.reprints.reprint import reprint
+    from patchlab.validation.path_traced import photograph_traced
+    from patchproof.reprints.reprint import ReprintSetup, render_photo, reprint
 
     out, n = folder / ("photos" if control is None else control), settings.sessions * settings.photos
-    setup = ReprintSetup(path_traced=settings.path_traced, control=control)
+    setup = ReprintSetup(control=control, render=photograph_traced if settings.path_traced else render_photo)
     # another seed per cell: cells with the same draws would not be independent
     seed = zlib.crc32(cell.name.encode())
     reprint(folder / "sheet.pdf", patch_run, n, out, setup, sessions=settings.sessions, seed=seed)

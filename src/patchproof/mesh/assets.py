@@ -58,12 +58,11 @@ class Assets:
         name = name.strip()
         spellings = (name, name.replace("\\", "/"), urllib.parse.unquote(name))
         places = [place / each for place in (folder or self.path.parent, self.path.parent) for each in spellings]
-        return next((path for path in places if is_file(path) and self._may_open(path, is_picture)), None)
-
-    def _may_open(self, path: Path, is_picture: bool) -> bool:
-        real = path.resolve()
-        formats = Image.registered_extensions() if is_picture else {}
-        return formats.get(real.suffix.lower()) in IMAGE_FORMATS or real.is_relative_to(self.path.parent.resolve())
+        formats, inside = Image.registered_extensions() if is_picture else {}, self.path.parent.resolve()
+        for path, real in ((path, path.resolve()) for path in places if is_file(path)):
+            if formats.get(real.suffix.lower()) in IMAGE_FORMATS or real.is_relative_to(inside):
+                return path
+        return None
 
     def read(self, name: str, folder: Path | None = None, is_picture: bool = False) -> bytes:
         """Return the bytes of a named file or of a data URI; refused if there is no such file that may be opened."""

@@ -135,18 +135,13 @@ def _corner_arrays(part: MeshPart, face_normals: np.ndarray) -> tuple[np.ndarray
 def transform_part(part: MeshPart, transform: np.ndarray) -> MeshPart:
     """Return a part moved by `transform` 3×4; a mirror, which turns triangles inside out, reverses their corners."""
     rotation = transform[:, :3]
+    sign = -1 if np.linalg.det(rotation) < 0 else 1
+    # normals turn by the inverse transpose up to a factor, as cofactors, so that flattening works
+    cofactors = sign * np.cross(np.roll(rotation, -1, 0), np.roll(rotation, -2, 0))
     with np.errstate(invalid="ignore", over="ignore"):
         vertices = part.vertices @ rotation.T + transform[:, 3]
-        normals = None if part.normals is None else part.normals @ normal_transform(rotation).T
-    faces = part.faces[:, ::-1] if np.linalg.det(rotation) < 0 else part.faces
-    return replace(part, vertices=vertices, faces=faces, normals=normals)
-
-
-def normal_transform(rotation: np.ndarray) -> np.ndarray:
-    """Return the matrix for normals: the inverse transpose up to a factor, as cofactors, so that flattening works."""
-    a, b, c = rotation
-    cofactors = np.array([np.cross(b, c), np.cross(c, a), np.cross(a, b)])
-    return -cofactors if np.linalg.det(rotation) < 0 else cofactors
+        normals = None if part.normals is None else part.normals @ cofactors.T
+    return replace(part, vertices=vertices, faces=part.faces[:, ::sign], normals=normals)
 
 
 def position_numbers(vertices: np.ndarray) -> np.ndarray:

@@ -1,7 +1,7 @@
 """A printed patch as the subject of optimization: a design in its piece.
 
 In: a scene with a piece, and its printer. Out: `Patch`: the first design, the allowed designs, their penalty, and the
-pixels that go to the printer. `render.designs` draws the whole piece on paper.
+pixels that go to the printer. `render.stage` draws the whole piece on paper.
 """
 
 import math
@@ -18,8 +18,8 @@ from patchproof.base.errors import Refused
 from patchproof.base.output import image_bytes, write_atomically
 from patchproof.channel.printer import Printer
 from patchproof.optimizer.subject import DESIGN_FILE, as_pixels, build_pyramid, collapse_pyramid, total_variation
-from patchproof.render.designs import PrintedPiece
 from patchproof.render.pixels import PiecePicture
+from patchproof.render.stage import PrintedPiece
 from patchproof.scene.interface import PieceScene
 from patchproof.sheets.manifest import MAX_PRINTED_PX
 from patchproof.sheets.piece import control_design, whiten_marker_pixels

@@ -28,9 +28,8 @@ from patchproof.render.stage import Stage, set_stage
 from patchproof.render.views import cameras, near_mm, render_views
 from patchproof.scene.backgrounds import load_backgrounds
 from patchproof.scene.conditions import Conditions
-from patchproof.scene.patch_scene import PatchScene, PiecePosition
+from patchproof.scene.patch_scene import PatchScene, PiecePosition, UnplacedScene
 from patchproof.scene.placement import SurfaceFrame, patch_frame, side_frame
-from patchproof.scene.unplaced_scene import UnplacedScene
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

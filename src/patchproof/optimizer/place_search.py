@@ -34,8 +34,7 @@ from patchproof.render.pixels import Appearance
 from patchproof.scene.candidate_places import MIN_DISTANCE_SHARE, CandidatePlace, PlaceFinder
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.interface import Scene
-from patchproof.scene.patch_scene import PiecePosition
-from patchproof.scene.unplaced_scene import UnplacedScene, require_unplaced
+from patchproof.scene.patch_scene import PiecePosition, UnplacedScene, require_unplaced
 
 MAX_PASSES = 608  # pictures that go through a network; pictures with a gradient count twice
 SCREENED_PLACES, SCREEN_VIEWS = 24, 4  # 192 passes, and 4 for the bare object

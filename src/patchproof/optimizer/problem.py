@@ -27,7 +27,6 @@ from patchproof.optimizer.patch import Patch
 from patchproof.optimizer.subject import Loss, target_loss
 from patchproof.render.pixels import PHOTO_SAMPLING, Appearance, TextureSampling
 from patchproof.render.stage import Stage, set_stage
-from patchproof.render.surfaces import piece_surface
 from patchproof.render.views import Views, relight_and_replace_background, render_views
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.interface import Scene, require_piece
@@ -102,7 +101,7 @@ class Problem:
 
     def with_piece_at(self, scene: PatchScene) -> "Problem":
         """A copy with the piece where `scene` has it; the object's tensors are shared."""
-        stage = replace(self.stage, scene=scene, piece=piece_surface(scene, self.device))
+        stage = replace(self.stage, scene=scene)
         subject = Patch(scene, self.printer, scene.design_px(self.network_px), self.device)
         return replace(self, scene=scene, stage=stage, subject=subject)
 

@@ -193,7 +193,7 @@ def _choose_place(
     # only scenes that give no place import the search
     from patchproof.optimizer.place_files import read_place, save_place
     from patchproof.optimizer.place_search import choose_place
-    from patchproof.scene.unplaced_scene import require_unplaced
+    from patchproof.scene.patch_scene import require_unplaced
 
     scene = require_unplaced(scene)
     place = (read_place(out, scene) if resume else None) or choose_place(scene, **search_options)

@@ -22,8 +22,8 @@ from patchproof.base.output import image_bytes, write_atomically
 from patchproof.mesh.export import write_glb
 from patchproof.optimizer import subject
 from patchproof.optimizer.subject import as_pixels, from_pixels
-from patchproof.render.designs import LearnedTextures
 from patchproof.render.pixels import ObjectTextures
+from patchproof.render.stage import LearnedTextures
 from patchproof.scene.interface import Scene
 from patchproof.scene.texture_scene import Canvas
 from patchproof.sheets.piece import control_design

@@ -5,23 +5,32 @@ Out: N×3×H×W sRGB. The work has three parts that can be run alone: `render_vi
 composite; the only part through which gradients reach the design) and the camera (`expose`).
 """
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import torch
 from torch import Tensor
 
-from patchproof.base.color import linear_from_srgb, srgb_from_linear
+from patchproof.base.color import linear_from_srgb, photo_codes_from_srgb, srgb_from_linear
 from patchproof.base.errors import Refused
+from patchproof.base.settings import BackgroundSettings
 from patchproof.base.text import brief
 from patchproof.channel import camera as camera_model
 from patchproof.channel.camera import add_noise, develop, gaussian_blur, is_pointwise
+from patchproof.channel.effects import Light, Pose
 from patchproof.channel.printer import print_change, vary_print
 from patchproof.render.pixels import Appearance, ObjectTextures, PiecePicture
 from patchproof.render.stage import Stage
 from patchproof.render.surfaces import light_texels
 from patchproof.render.texture import look_up
-from patchproof.render.views import Views, render_views
+from patchproof.render.views import Views, relight, render_views
+from patchproof.scene.backgrounds import load_backgrounds
 from patchproof.scene.conditions import Conditions
+from patchproof.scene.mesh_scene import require_mesh
+from patchproof.scene.placement import SurfaceFrame
 
+DISTANCE_LENGTHS = 60.0  # of a plan's camera, over the object's length
 PAPER_BACK_LINEAR = 0.8  # reflectance of plain white card, for a piece seen from behind
 _PICTURE_GRAIN_SEED = 1 << 40  # added to the seed: the base photograph's grain is not that of the simulated camera
 
@@ -70,7 +79,7 @@ def shade(views: Views, appearance: Appearance) -> Tensor:
 
 def expose(views: Views, appearance: Appearance, jpeg: bool = True) -> Tensor:
     """Return the photographs of rendered views."""
-    camera, sensor, scale = views.stage.camera, views.conditions.sensor, _scale(views)
+    camera, sensor, scale = views.stage.scene.camera, views.conditions.sensor, _scale(views)
     has_distortion = camera is not None and camera.has_distortion
     has_blur_or_noise = appearance is not None and _picture_blur_and_noise(views) is not None
     is_local = views.reduced and is_pointwise(sensor, scale, jpeg)
@@ -144,3 +153,45 @@ def _smooth(views: Views, image: Tensor, by_code: bool) -> Tensor:
 def _as_pictures(views: Views, image: Tensor) -> Tensor:
     width, height = views.frame_px
     return image.view(len(views.conditions), height, width, -1).permute(0, 3, 1, 2)
+
+
+def plan_picture(
+    stage: Stage, frame: SurfaceFrame, half_mm: np.ndarray, side_px: int = 600, colors: np.ndarray | None = None
+) -> np.ndarray:
+    """Render a stage's object in even light on white, seen along a frame's normal, spanning ± half_mm: uint8 H×W×3,
+    `side_px` along the longer side. It is seen from a distance of 60 times the object's length, at which perspective
+    moves nothing by more than 1 % of the object's depth. `colors` (uint8 h×w×3) are laid over the scene's piece, and
+    shown without light.
+    """
+    scene = require_mesh(stage.scene)
+    distance = DISTANCE_LENGTHS * scene.length_mm
+    px_per_mm = side_px / (2 * half_mm.max())
+    width, height = (int(v) for v in np.maximum(np.rint(2 * half_mm * px_per_mm), 16))
+    fov = float(np.degrees(2 * np.arctan(half_mm.min() / distance)))
+    view = {"fov_deg": fov, "look_at": "object"}
+    settings = scene.settings.changed(view=view, camera={"photo_px": (width, height), "file": None})
+    white = load_backgrounds(BackgroundSettings(color=(1.0, 1.0, 1.0)), Path())
+    plain = replace(stage, scene=replace(scene, settings=settings, frame=frame, backgrounds=white, camera=None))
+    piece = None if colors is None else PiecePicture.of(torch.tensor(colors, dtype=torch.float32) / 255)
+    with torch.no_grad():
+        views = render_views(plain, piece, _frontal_conditions(distance, 0.55, 0.45), (width, height))
+        light = _pixel_rows(shade(views, None))
+        if piece is not None:
+            covered = views.on_piece.pixel[views.on_piece.share[:, 0] > 0]
+            if len(covered):
+                ambient = _frontal_conditions(distance, 1.0, 0.0)
+                light[covered] = _pixel_rows(shade(relight(views, ambient), piece))[covered]
+    picture = srgb_from_linear(light.clamp(0, 1)).reshape(height, width, 3).cpu().numpy()
+    return photo_codes_from_srgb(picture)
+
+
+def _pixel_rows(pictures: Tensor) -> Tensor:
+    """Reshape 1×3×H×W to H·W × 3."""
+    return pictures[0].permute(1, 2, 0).reshape(-1, 3)
+
+
+def _frontal_conditions(distance_mm: float, ambient: float, directional: float) -> Conditions:
+    """Conditions of one frontal view in ambient light and directional light from the upper left."""
+    direction = {"light_azimuth_deg": np.array([-30.0]), "light_elevation_deg": np.array([45.0])}
+    light = Light(ambient=np.array([ambient]), directional=np.array([directional]), **direction)
+    return Conditions(pose=Pose(distance_mm=np.array([distance_mm])), light=light)

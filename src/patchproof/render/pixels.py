@@ -12,9 +12,8 @@ import torch
 from torch import Tensor
 
 from patchproof.base.color import linear_from_srgb
-from patchproof.render.atlas import sample_atlas
 from patchproof.render.fragments import Fragments
-from patchproof.render.surfaces import ObjectSurface, PieceSurface
+from patchproof.render.surfaces import ObjectSurface, PieceSurface, sample_atlas
 from patchproof.render.texture import Footprint, footprint, texel_layout, texel_table
 
 MIN_SHARE = 1 / 512  # of a pixel: less changes no 8-bit value

@@ -257,9 +257,9 @@ def _render_flat(stage: Stage, piece: PiecePicture | None, conditions: Condition
 
 def lens_frame(stage: Stage, scene: MeshScene, size_px: tuple[int, int]) -> Frame:
     """Return the frame to render for pictures of `size_px`, with the margin that a calibrated lens needs."""
-    if stage.camera is None:
+    if stage.scene.camera is None:
         return Frame(size_px, scene.matrix_px(size_px), 0, 0, 0, 0)
-    return stage.camera.pinhole_frame(size_px)
+    return stage.scene.camera.pinhole_frame(size_px)
 
 
 def backgrounds(scene: MeshScene, conditions: Conditions, size_px: tuple[int, int], frame: Frame) -> np.ndarray:

@@ -1,1 +1,1 @@
-"""Simulate photographs of a run's page on its object, by our renderer or by path tracing, and of pages lying flat."""
+"""Simulate photographs of a run's page on its object, and of pages lying flat."""

@@ -6,8 +6,6 @@ clipping are those of `channel`.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 
 import cv2
@@ -17,14 +15,13 @@ import torch
 from patchproof.base import geometry
 from patchproof.base.color import linear_from_srgb, photo_codes_from_srgb
 from patchproof.base.geometry import MM_PER_INCH
-from patchproof.base.output import image_bytes, image_pixels, new_folder
+from patchproof.base.output import image_bytes, new_folder
 from patchproof.base.resample import index_homography
 from patchproof.base.settings import PrinterSettings
 from patchproof.channel.camera import develop
 from patchproof.channel.effects import Sensor
 from patchproof.channel.printer import load_printer, printer_output
-from patchproof.photo.read import Photo
-from patchproof.reprints.mounted_sheet import ReprintSetup
+from patchproof.reprints.reprint import ReprintSetup
 from patchproof.sheets.blank import BLANK
 from patchproof.sheets.pdf_raster import attached_manifests, page_count, rasterize_page
 
@@ -32,19 +29,6 @@ PrintFunction = Callable[[np.ndarray], np.ndarray]  # N×3 sRGB sent → N×3 li
 
 PX_PER_MM = 8
 PHOTO_PX = (1600, 1200)
-
-
-@dataclass(frozen=True)
-class Shot:
-    """A photograph's file, and the light (3,) of blank paper in the middle of the page at its sensor."""
-
-    file: bytes
-    paper: np.ndarray
-
-    @cached_property
-    def photo(self) -> Photo:
-        """The file's pixels, as a photograph that was read."""
-        return Photo(image_pixels(self.file), None)
 
 
 def page_light(page: np.ndarray, apply_printer: PrintFunction) -> np.ndarray:
@@ -72,14 +56,16 @@ def reprint_pages(
                 x, y, width, height = (round(PX_PER_MM * side) for side in manifest.cut_mm)
                 pixels = pixels[y : y + height, x : x + width]
             light = page_light(pixels, lambda colors: linear_from_srgb(printer_output(printer, colors)))
-            pages.append(cv2.resize(light, None, fx=how.print_scale[0], fy=how.print_scale[1]))
+            pages.append(cv2.resize(light, None, fx=how.print_scale, fy=how.print_scale))
         for i in range(n):
-            shot = photograph_page(pages[i % len(pages)], (seed or 0) + i)
-            (folder / f"photo_{i + 1:04d}.jpg").write_bytes(shot.file)
+            file, _ = photograph_page(pages[i % len(pages)], (seed or 0) + i)
+            (folder / f"photo_{i + 1:04d}.jpg").write_bytes(file)
 
 
-def photograph_page(page: np.ndarray, seed: int) -> Shot:
-    """Photograph a page that lies flat, from above within 25° to each side; the seed determines all conditions."""
+def photograph_page(page: np.ndarray, seed: int) -> tuple[bytes, np.ndarray]:
+    """Photograph a page that lies flat, from above within 25° to each side; the seed determines all conditions. Return
+    the file, and the light (3,) of blank paper in the middle of the page at its sensor.
+    """
     rng = np.random.default_rng([seed, 4])
     page_mm = np.array(page.shape[1::-1]) / PX_PER_MM
     distance = rng.uniform(1.2, 1.55) * page_mm.max()
@@ -98,7 +84,7 @@ def photograph_page(page: np.ndarray, seed: int) -> Shot:
     picture = torch.tensor(raw.transpose(2, 0, 1)[None], dtype=torch.float32)
     codes = develop(picture, sensor, 1.0, jpeg=False)[0].permute(1, 2, 0).numpy().astype(float)
     file = image_bytes(photo_codes_from_srgb(codes), "JPEG", {"quality": int(sensor.jpeg[0])})
-    return Shot(file, exposure * white_balance)
+    return file, exposure * white_balance
 
 
 def _uneven_light(shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:

@@ -2,7 +2,9 @@
 
 In: finished runs. Out: SHEET.pdf and SHEET.json, or one page with the designs of several runs and a manifest for each.
 The piece is the same on every template that has room for it, except for the ids of its markers. The last page of a
-template with `plan_page` says where the piece goes and how to photograph it. Pages without a run: see `sheets.blank`.
+template with `plan_page` says where the piece goes, and how many photographs to take, in how many places, from where
+and of which controls, so that the answers will not be `cannot_tell`: photographs of one session are alike, and a few in
+each of several places prove more than many in one. Pages without a run: see `sheets.blank`.
 """
 
 import os
@@ -11,13 +13,22 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from patchproof.base.geometry import rect_border, rect_corners
 from patchproof.base.output import check_file
+from patchproof.base.sessions import split_evenly
+from patchproof.base.settings import SceneSettings, background_summary
 from patchproof.base.validation import NETWORK_FILE
+from patchproof.evidence import verdict
+from patchproof.optimizer.promise import PROMISE_VIEWS
 from patchproof.optimizer.run import Run
-from patchproof.reprints.plan_view import draw_plan_view
-from patchproof.reprints.shot_plan import shot_sections
+from patchproof.render.photograph import plan_picture
+from patchproof.render.stage import set_stage
+from patchproof.report.words import promise_summary
 from patchproof.scene.interface import PieceScene, Scene, require_piece
 from patchproof.scene.patch_scene import PatchScene, require_patch
+from patchproof.scene.placement import patch_frame
 from patchproof.sheets.content import SheetContent
 from patchproof.sheets.manifest import Manifest, Promise
 from patchproof.sheets.piece import control_design, with_ids
@@ -25,6 +36,9 @@ from patchproof.sheets.plan_page import PlacementPicture, PlanPage, edge_distanc
 from patchproof.sheets.rects import size_text
 from patchproof.sheets.template import Template, load_template, page_template
 from patchproof.sheets.write import write_several, write_sheet
+
+_PLAN_MARGIN = 1.06  # of the object's extent
+SHOT_COUNTS = ((40, 1), (40, 2), (40, 4), (40, 8), (80, 8))  # photographs, sessions
 
 
 def sheet(
@@ -128,9 +142,10 @@ def plan_of(scene: PieceScene, template: Template, content: SheetContent) -> Pla
     if scene.HAS_OBJECT:
         patch, settings = require_patch(scene), scene.settings.patch
         picture = draw_plan_view(patch, template)
+        edges = ", ".join(f"{name} {mm:.0f} mm" for name, mm in edge_distances_mm(picture).items())
         facing = f"the object's {settings.side} side" if settings.at_mm is None else "the place where the piece goes"
         lines = [
-            f"Seen as you face {facing}. {_edge_distances(picture)}",
+            f"Seen as you face {facing}. From the piece's cut edge to the outermost edges of that side: {edges}.",
             f"The piece is {size_text(scene.piece.size_mm)} mm; {scene.placement_summary()['reason']}.",
         ]
         if not patch.placement.is_flat:
@@ -150,6 +165,100 @@ def plan_of(scene: PieceScene, template: Template, content: SheetContent) -> Pla
     return PlanPage(picture, tuple(sections)) if sections else None
 
 
-def _edge_distances(picture: PlacementPicture) -> str:
-    edges = ", ".join(f"{name} {mm:.0f} mm" for name, mm in edge_distances_mm(picture).items())
-    return f"From the piece's cut edge to the outermost edges of that side: {edges}."
+def draw_plan_view(scene: PatchScene, template: Template) -> PlacementPicture:
+    """Draw the object as seen from the piece's side, with the piece's outline and, in tiles, its seams."""
+    # cameras may count their angles from another side
+    scene = replace(scene, frame=patch_frame(scene.mesh, scene.settings.patch))
+    frame, placement = scene.frame, scene.placement
+    axes = np.stack([frame.right, -frame.up])  # millimeters right and down, from the middle of the object
+
+    def project(points: np.ndarray) -> np.ndarray:  # to the picture's plane
+        return np.asarray(points) @ axes.T
+
+    low, high = project(scene.mesh.vertices).min(0), project(scene.mesh.vertices).max(0)
+    outline = project(placement.world(rect_border((0, 0, *placement.size_mm), 16)))  # bent paper has bent edges
+    half = np.maximum(np.abs([low, high, outline.min(0), outline.max(0)]).max(0) * _PLAN_MARGIN, 1.0)
+    seams, names = [], []
+    tiles = []
+    if template.tiles is not None:
+        from patchproof.sheets.tiles import plan_tiles
+
+        tiles = plan_tiles(template, scene.piece)
+    for tile in tiles:
+        corners = project(placement.world(rect_corners(tile.part_mm)))
+        seams += [(tuple(corners[1]), tuple(corners[2])), (tuple(corners[2]), tuple(corners[3]))]
+        names.append((tuple(corners.mean(0)), tile.name))
+    return PlacementPicture(
+        picture=plan_picture(set_stage(scene), scene.frame, half),
+        picture_mm=(-half[0], -half[1], 2 * half[0], 2 * half[1]),
+        object_mm=(*low, *(high - low)),
+        outline_mm=tuple(map(tuple, outline)),
+        seams_mm=tuple(seams),
+        names_mm=tuple(names),
+    )
+
+
+def shot_sections(promise: Promise, settings: SceneSettings) -> tuple[tuple[str, tuple[str, ...]], ...]:
+    """Say how many photographs to take, and from where, as (heading, lines)."""
+    data = settings.model_dump()
+    summary = f"{promise_summary(promise, data)} Promise simulated {background_summary(data)}."
+    counts = (summary, *_count_lines(promise))
+    return (("How many photographs", counts), ("From where", _view_lines(settings)))
+
+
+def _count_lines(promise: Promise) -> tuple[str, ...]:
+    needed = verdict.photos_line(promise, (), promise.best_control)
+    promised = (
+        f"Promised: {promise.rate:.1%} recognized as {promise.target.label}, of {promise.n} views in "
+        f"{promise.sessions} sessions, each with a place, light, camera and print of its own."
+    )
+    if promise.answer == "does_not_help":
+        return promised, needed
+    proofs = (
+        f"A verdict asks the photographs to prove a rate of {verdict.required_rate(promise):.0%}. What they will show "
+        "if the promise holds (the chance that it is enough; the least gain that they show beside as many photographs "
+        f"of a control in the same places): {'; '.join(_proof(promise, *counts) for counts in SHOT_COUNTS)}."
+        f"{verdict.useless_note(promise)}"
+    )
+    short = promise.n < PROMISE_VIEWS and not promise.draft
+    more = (
+        f"A promise of {PROMISE_VIEWS} views (patchproof promise RUN --n {PROMISE_VIEWS}, then this page again) "
+        "knows better how much places differ, and often asks for fewer of them."
+    )
+    pairs = (
+        "Take each view twice, with the patch and with the control, under equal file names, each control in a folder "
+        "of its own: pairs tell more. A patch helps only if it beats every control that you photograph."
+    )
+    return promised, proofs, needed, *([more] if short else []), pairs
+
+
+def _proof(promise: Promise, photos: int, sessions: int) -> str:
+    """What so many photographs prove: the counts allowed for, the chance of `kept`, and the least gain they show."""
+    split, gain = split_evenly(photos, sessions), verdict.provable_gain(promise, sessions, photos // sessions)
+    low, high = promise.posterior.count_interval(split)
+    chance, shown = verdict.kept_chance(promise, split), "no gain" if gain is None else f"{gain:.0%}"
+    return f"{photos} in {verdict.places_text(sessions)}: {low} to {high} ({chance:.0%}; {shown})"
+
+
+def _view_lines(settings: SceneSettings) -> tuple[str, ...]:
+    if settings.object.mesh is None:
+        return ("As the scene's own photographs were taken: the same places, distances and light.",)
+    view, patch = settings.view, settings.patch
+    target = "object" if view.look_at == "object" else "piece"
+    light = "Light as it comes" if settings.light.ambient[0] < 1 else "Bright light"
+    front = "the place of the piece" if patch.at_mm is not None else f"the piece's side ({patch.side})"
+    if view.front != "patch":
+        front = f"the object's {view.front} side"
+    return (
+        f"Spread over all of these, not the best ones: {_degrees(view.azimuth_deg)} to the left (-) and right (+) of "
+        f"facing {front}, {_degrees(view.elevation_deg)} above it, "
+        f"{view.distance_mm[0] / 10:.0f} to {view.distance_mm[1] / 10:.0f} cm from the middle of the {target}, the "
+        f"camera turned by {_degrees(view.roll_deg)}.",
+        f"The {target} belongs in the middle of the picture, the whole piece in view; classifiers see the picture's "
+        "centered square.",
+        f"{light}, without flash, shine or filters; views outside of these ranges are not counted.",
+    )
+
+
+def _degrees(bounds: tuple[float, float]) -> str:
+    return f"{bounds[0]:g}° to {bounds[1]:g}°"

@@ -31,7 +31,7 @@ from patchproof.base.settings import BackgroundSettings
 from patchproof.base.validation import expand_path
 from patchproof.photo.read import list_images, read_photo
 from patchproof.photo.rejection import PhotoRejected
-from patchproof.scene.patterns import background, color, draw_texture
+from patchproof.scene.patterns import background, color, texture
 
 PLACE_PX = 256
 _SEED = 20
@@ -99,18 +99,18 @@ def _rays(rng: np.random.Generator, px: int) -> np.ndarray:
 def _draw_plane(rng, picture, depth, ray, rays, distance, axis) -> None:
     """Draw a surface square to an axis, at `distance` along the `rays` (indices), in front of farther things."""
     paint, textured = _paint(rng), rng.random() < 0.7
-    make = draw_texture(rng, _TEXTURE_PX) if textured else lambda: np.ones((1, 1, 3))
+    pattern = texture(rng, _TEXTURE_PX) if textured else np.ones((1, 1, 3))
     fineness = np.exp(rng.uniform(-1.5, 0.7))
     visible = (distance > 0) & (distance < depth[rays])
     if not visible.any():
         return
-    rays, distance, texture = rays[visible], distance[visible], make()
+    rays, distance = rays[visible], distance[visible]
     if textured:
-        texture = texture.mean(2, keepdims=True) * (1 - _COLOR_SHARE) + texture * _COLOR_SHARE
-    texels = ((0.3 + 0.7 * texture) * paint).astype(np.float32).reshape(-1, 3)
+        pattern = pattern.mean(2, keepdims=True) * (1 - _COLOR_SHARE) + pattern * _COLOR_SHARE
+    texels = ((0.3 + 0.7 * pattern) * paint).astype(np.float32).reshape(-1, 3)
     sides = (np.abs(ray[side, rays] * distance) for side in range(3) if side != axis)
-    row, column = ((across * len(texture) * fineness).astype(np.int64) % len(texture) for across in sides)
-    picture[rays] = texels[row * len(texture) + column]
+    row, column = ((across * len(pattern) * fineness).astype(np.int64) % len(pattern) for across in sides)
+    picture[rays] = texels[row * len(pattern) + column]
     depth[rays] = distance
 
 
@@ -187,8 +187,6 @@ class Backgrounds:
     pictures: tuple[np.ndarray | int | FileLevels, ...]
     of_stream: Mapping[str, _Split] = field(default_factory=dict)  # the pictures it may show; other streams show all
     notes: tuple[str, ...] = ()
-    # of pictures, added as they come into use, so that a small view does not read megapixels
-    _halvings: dict[int, list[np.ndarray]] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def choose_for_stream(self, stream: str, choice: np.ndarray) -> np.ndarray:
         """Turn numbers in [0, 1) that choose among a stream's pictures into numbers that choose among all pictures."""
@@ -199,11 +197,11 @@ class Backgrounds:
 
     def picture(self, choice: np.ndarray, photo_px: tuple[int, int], size_px: tuple[int, int]) -> np.ndarray:
         """Return the background of a view of `size_px`: the whole photograph or, if square, its centered square."""
-        levels = self.pictures[number := int(choice[0] * len(self.pictures))]
+        levels = self.pictures[int(choice[0] * len(self.pictures))]
         if isinstance(levels, int):
             levels = _place_levels(levels)
         elif isinstance(levels, np.ndarray):
-            levels = self._halvings.get(number) or self._halvings.setdefault(number, halving_pyramid(levels))
+            levels = halving_pyramid(levels)
         shapes = levels.shapes if isinstance(levels, FileLevels) else [level.shape[:2] for level in levels]
         height, width = shapes[0]
         # a crop with the photograph's aspect

@@ -19,7 +19,7 @@ from patchproof.base.geometry import camera_centers
 from patchproof.base.validation import Side
 from patchproof.mesh.surface_chart import SurfaceChart, piece_grid, surface_heights, triangles_near
 from patchproof.scene.bent_scene import placement_method
-from patchproof.scene.patch_scene import PiecePosition
+from patchproof.scene.patch_scene import PiecePosition, UnplacedScene
 from patchproof.scene.placement import (
     Placement,
     SurfaceFrame,
@@ -29,7 +29,6 @@ from patchproof.scene.placement import (
     spun_axes,
     surface_frame,
 )
-from patchproof.scene.unplaced_scene import UnplacedScene
 
 MIN_DISTANCE_SHARE = 0.5  # of the piece's shorter edge, between two candidates
 _POOL_DISTANCE_SHARE, _POOL = 0.25, 96  # between points to try, and their greatest number
@@ -57,8 +56,12 @@ class PlaceFinder:
 
     def candidates(self, most: int) -> tuple[CandidatePlace, ...]:
         """Return up to `most` places, one spin each, as far apart as their number allows; refused if there is none."""
-        sides = [spot for side in get_args(Side) if (spot := self._middle_of(side)) is not None]
-        candidates = sides + [spot for frame in self._frames_to_try if (spot := self._upright_first(frame)) is not None]
+        frames = ((side, self._frame_at(side)) for side in get_args(Side))
+        seen = ((side, f) for side, f in frames if self._facing(f.origin_mm[None], f.normal[None])[0] >= _FACING_SHARE)
+        # the middles of sides, where a piece hangs by default; elsewhere upright if that fits, else a quarter turned
+        sides = [spot for side, frame in seen if (spot := self._candidate(side, frame, 0.0))]
+        tries = ((self._candidate_near(frame, spin) for spin in self._spins[:2]) for frame in self._frames_to_try)
+        candidates = sides + [spot for spots in tries if (spot := next(filter(None, spots), None))]
         if not candidates:
             expected = f"a place for a piece of {self.size_mm[0]:.0f} × {self.size_mm[1]:.0f} mm that views face"
             remedy = "make it smaller, or let it bend"
@@ -85,22 +88,11 @@ class PlaceFinder:
         width, height = self.size_mm
         return (0.0, 45.0) if np.isclose(width, height) else (0.0, 90.0, 45.0, 135.0)
 
-    def _middle_of(self, side: Side) -> CandidatePlace | None:
-        """Return the middle of a side that views face, where a piece hangs by default, if it fits."""
-        frame = self._frame_at(side)
-        if self._facing(frame.origin_mm[None], frame.normal[None])[0] < _FACING_SHARE:
-            return None
-        return self._candidate(side, frame, 0.0)
-
     def _facing(self, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
         """Return M shares of the views that face the points M×3."""
         rays = (eye - points for eye in self._eyes)
         cosines = [(ray * normals).sum(1) / np.linalg.norm(ray, axis=1) for ray in rays]
         return (np.array(cosines) > _FACING_COSINE).mean(0)
-
-    def _upright_first(self, frame: SurfaceFrame) -> CandidatePlace | None:
-        """Return the piece near a frame's origin, upright if that fits, else a quarter turned."""
-        return next((spot for spin in self._spins[:2] if (spot := self._candidate_near(frame, spin)) is not None), None)
 
     def _candidate_near(self, frame: SurfaceFrame, spin_deg: float) -> CandidatePlace | None:
         """Return the piece near a frame's origin; None if it does not fit."""

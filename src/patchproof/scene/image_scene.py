@@ -32,7 +32,7 @@ from patchproof.photo.rejection import PhotoRejected
 from patchproof.scene import picture_scene
 from patchproof.scene.conditions import Conditions, Stream
 from patchproof.scene.interface import PX_PER_MODULE, READABLE_SHARE, SceneSource
-from patchproof.scene.picture_scene import BasePicture, PictureScene
+from patchproof.scene.picture_scene import PictureLevels, PictureScene
 from patchproof.sheets.markers import MARKER_MODULES
 from patchproof.sheets.page import refuse_larger_than_page
 from patchproof.sheets.piece import Piece, lay_out_piece, marker_size_mm
@@ -50,7 +50,7 @@ _ERASED_CELLS = 224  # random values per side of the centered square: one a pixe
 class ImageScene(PictureScene):
     """A scene whose base pictures are images of the target's class, in an order that their names decide."""
 
-    images: tuple[BasePicture, ...]
+    images: tuple[PictureLevels, ...]
 
     def description(self) -> str:
         """Return how many images there are."""
@@ -77,8 +77,9 @@ class ImageScene(PictureScene):
         """Return N×3×3 from piece millimeters to pixels."""
         to_size = picture_scene.size_from_photo(self.photo_px, size_px)
         side, photo, pose = min(self.photo_px), np.array(self.photo_px), conditions.pose
-        piece_mm, scales = np.array(self.piece.size_mm), px_per_mm(self.settings, self.piece, conditions)
-        matrices = []
+        # the piece's longer side takes the drawn share of the picture's shorter one
+        (low, high), piece_mm = self.settings.view.patch_share, np.array(self.piece.size_mm)
+        scales, matrices = low * (high / low) ** pose.background[:, 1] * side / piece_mm.max(), []
         for scale, roll, place in zip(scales, pose.roll_deg, pose.background[:, 2:4], strict=True):
             free_px = side - rotated_extent(piece_mm * scale, roll)
             middle = (photo - side) / 2 + side / 2 + (place - 0.5) * free_px
@@ -123,13 +124,6 @@ def build(source: SceneSource) -> ImageScene:
     return ImageScene(settings, base, source.seed, identity, piece, images, notes=tuple(warnings), inputs=inputs)
 
 
-def px_per_mm(settings: SceneSettings, piece: Piece, conditions: Conditions) -> np.ndarray:
-    """Return N scales at `photo_px`: the piece's longer side takes the drawn share of the picture's shorter one."""
-    low, high = settings.view.patch_share
-    shares = low * (high / low) ** conditions.pose.background[:, 1]
-    return shares * min(settings.camera.photo_px) / max(piece.size_mm)
-
-
 def largest_share(roll_deg: tuple[float, float]) -> float:
     """Return the largest `view.patch_share` that fits into the square at all angles, in whole thousandths."""
     widest = max(rotated_extent(np.ones(2), roll)[0] for roll in np.linspace(*roll_deg))  # of a turned square of side 1
@@ -141,25 +135,19 @@ def erase(picture: np.ndarray, seed: int) -> None:
     same box and values at every size, and in photograph and square.
     """
     rng = np.random.default_rng(seed)
-    box = _erased_box(rng)
+    left = top = wide = high = 1.0
+    while left + wide > 1 or top + high > 1:  # boxes that do not fit are drawn again, as in the paper
+        area, aspect = rng.uniform(*ERASED_AREA), rng.uniform(*ERASED_ASPECT)
+        high, wide = np.sqrt(area * aspect), np.sqrt(area / aspect)
+        left, top = rng.random(2)
     values = rng.integers(0, 256, (_ERASED_CELLS, _ERASED_CELLS, 3), np.uint8)
     height, width = picture.shape[:2]
     side = min(height, width)
     x, y = ((np.arange(n) + 0.5 - (n - side) / 2) / side for n in (width, height))
-    columns = np.flatnonzero((x >= box[0]) & (x < box[0] + box[2]))
-    rows = np.flatnonzero((y >= box[1]) & (y < box[1] + box[3]))
+    columns = np.flatnonzero((x >= left) & (x < left + wide))
+    rows = np.flatnonzero((y >= top) & (y < top + high))
     cell_x, cell_y = ((v * _ERASED_CELLS).astype(int) for v in (x[columns], y[rows]))
     picture[np.ix_(rows, columns)] = values[np.ix_(cell_y, cell_x)]
-
-
-def _erased_box(rng: np.random.Generator) -> tuple[float, float, float, float]:
-    """Return x, y, width, height in shares of the square; boxes that do not fit are drawn again, as in the paper."""
-    while True:
-        area, aspect = rng.uniform(*ERASED_AREA), rng.uniform(*ERASED_ASPECT)
-        height, width = np.sqrt(area * aspect), np.sqrt(area / aspect)
-        x, y = rng.random(2)
-        if x + width <= 1 and y + height <= 1:
-            return x, y, width, height
 
 
 def _files_of_class(settings: SceneSettings, base: Path) -> list[Path]:
@@ -195,7 +183,7 @@ def read_labels(table: Path, folder: Path) -> list[tuple[str, str]]:
     return [(row[0].strip(), ",".join(row[1:]).strip().casefold()) for row in rows]
 
 
-def _read_all(files: list[Path], photo_px: tuple[int, int]) -> tuple[tuple[BasePicture, ...], list[str], list[str]]:
+def _read_all(files: list[Path], photo_px: tuple[int, int]) -> tuple[tuple[PictureLevels, ...], list[str], list[str]]:
     """(pictures, names of unreadable files, what files declare and was left aside)."""
     images, unread, said = [], [], []
     for path in files:

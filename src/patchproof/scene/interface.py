@@ -21,7 +21,6 @@ from patchproof.base.geometry import apply_homography, local_scales
 from patchproof.base.settings import SceneSettings, identity_settings
 from patchproof.base.text import short_repr
 from patchproof.base.validation import texts_in
-from patchproof.channel.effects import ViewEffect
 from patchproof.scene.conditions import Conditions, Stream, draw
 from patchproof.sheets.piece import Piece, sheet_id
 
@@ -174,10 +173,6 @@ class Scene(ABC):
     def _laid_out(self) -> Self:
         """Return the scene with its piece laid out for its page and sheet id."""
         return self
-
-    def models(self, effect: ViewEffect) -> bool:
-        """True if an effect shows in the scene's photographs when its settings turn it on."""
-        return effect.keys[0].partition(".")[0] in self.EFFECT_TABLES
 
     def without(self, term: SceneTerm) -> Self | None:
         """Return the scene without one of its `TERMS`; None if it has nothing of it."""

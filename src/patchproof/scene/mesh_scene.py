@@ -1,7 +1,7 @@
 """A scene with a mesh and its background, ready to be photographed: the camera of every drawn view.
 
-By itself a `MeshScene` is the bare object. Other modules put a piece on it (`patch_scene`, `bent_scene`), search for
-the piece's place (`unplaced_scene`) or paint it (`texture_scene`).
+By itself a `MeshScene` is the bare object. Other modules put a piece on it (`patch_scene`, `bent_scene`) or paint it
+(`texture_scene`).
 """
 
 import hashlib
@@ -178,15 +178,11 @@ def camera_poses(scene: MeshScene, patch_mm: np.ndarray, pose: Pose) -> np.ndarr
     targets = center + pose.look_at_offset * scene.length_mm
     directions = geometry.orbit(pose.azimuth_deg, pose.elevation_deg, frame.normal, frame.up)
     eyes = targets + pose.distance_mm[:, None] * directions
-    _refuse_cameras_inside(scene.mesh, eyes)
-    return geometry.look_at(eyes, targets, pose.roll_deg, frame.up)
-
-
-def _refuse_cameras_inside(mesh: Mesh, eyes: np.ndarray) -> None:
-    low, high = mesh.ends_mm
+    low, high = scene.mesh.ends_mm
     clearance_mm = CLEARANCE_SHARE * float((high - low).max())
     inside = ((eyes > low - clearance_mm) & (eyes < high + clearance_mm)).all(1)
     if inside.any():
         size = " × ".join(f"{side_mm:.0f}" for side_mm in high - low)
         got = f"{inside.sum()} of {len(eyes)} views inside its bounding box or within {clearance_mm:.2g} mm of it"
         raise Refused(f"cameras outside the object ({size} mm)", got, "raise view.distance_mm")
+    return geometry.look_at(eyes, targets, pose.roll_deg, frame.up)

@@ -1,16 +1,18 @@
-"""A mesh with a piece on it, by itself a flat card (bent: see `bent_scene`).
+"""A mesh with a piece on it, by itself a flat card (bent: see `bent_scene`); or one whose piece has no place yet
+(`patch.place = "auto"`), for which the optimizer searches a place.
 
 In: settings. Out: a `PatchScene`, which knows its sheet id (a hash of settings and seed, fixed before optimizing), the
 layout of the printed piece (the design and its markers, whose size follows from the views) and the piece's placement.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, ClassVar, Self
 
 import numpy as np
 
 from patchproof.base import geometry
 from patchproof.base.errors import Refused
+from patchproof.base.settings import SceneSettings
 from patchproof.base.validation import Side
 from patchproof.scene import interface
 from patchproof.scene.conditions import Conditions
@@ -101,20 +103,37 @@ class PatchScene(PieceScene, MeshScene):
         light = conditions.light
         return light.ambient + light.directional * self.cosines(light.light_azimuth_deg, light.light_elevation_deg)
 
-    def with_print_scale(self, scale: tuple[float, float]) -> Self:
-        """Return the scene with its piece printed at `scale` (x, y) about its middle; its millimeters stay."""
-        placement, factors = self.placement, np.array(scale)
-        middle, scaling = np.array(placement.size_mm) / 2, np.eye(4)
-        scaling[[0, 1], [0, 1]] = factors
-        scaling[:2, 3] = middle - factors * middle
-        vertices = placement.world(middle + (placement.piece_mm - middle) * factors)
-        frame = placement.world_from_piece @ scaling
-        return replace(self, placement=replace(placement, vertices_mm=vertices, world_from_piece=frame))
+
+@dataclass(frozen=True)
+class UnplacedScene(MeshScene):
+    """An object whose piece has no place yet; by itself, the bare object."""
+
+    HAS_PLACE = False
+
+    def description(self) -> str:
+        """Describe the scene (see `Scene.description`)."""
+        return f'{super().description()} with patch.place = "auto"'
+
+    def settings_with_piece_at(self, position: PiecePosition, spin_deg: float) -> SceneSettings:
+        """Return the settings of a scene file that gives this place and keeps the views."""
+        keys = {"side": position} if isinstance(position, str) else {"at_mm": position}
+        patch = {"place": "given", "spin_deg": spin_deg} | keys
+        return self.settings.changed(patch=patch, view={"front": self.settings.patch.side})
+
+    def with_piece_at(self, position: PiecePosition, spin_deg: float) -> PatchScene:
+        """Return the scene with its piece at a place, its views unchanged; refused if the piece cannot hang there. It
+        equals the scene of a file that gives this place.
+        """
+        from patchproof.scene.bent_scene import BentScene
+
+        scene_type = BentScene if self.settings.patch.bend else PatchScene
+        return scene_type.from_bare(self._identified(self.settings_with_piece_at(position, spin_deg), self.known))
 
 
-def build(source: SceneSource) -> PatchScene:
-    """Build the scene of settings that give a flat card its place."""
-    return PatchScene.from_bare(load_bare(source))
+def build(source: SceneSource) -> PatchScene | UnplacedScene:
+    """Build the scene of settings that give a flat card its place, or that of `patch.place = "auto"`."""
+    bare = load_bare(source)
+    return UnplacedScene(**vars(bare)) if source.settings.patch.place == "auto" else PatchScene.from_bare(bare)
 
 
 def require_patch(scene: Scene, expected: str = "a scene with a patch on a mesh") -> PatchScene:
@@ -123,6 +142,14 @@ def require_patch(scene: Scene, expected: str = "a scene with a patch on a mesh"
         return scene
     refuse_without_place(scene)
     raise Refused(expected, scene.description(), 'name object.mesh, and leave patch.kind out or "patch"')
+
+
+def require_unplaced(scene: Scene) -> UnplacedScene:
+    """Return the scene as one whose piece has no place yet; refused for any other."""
+    if isinstance(scene, UnplacedScene):
+        return scene
+    remedy = "set it, or use the place that the scene has"
+    raise Refused('a scene with patch.place = "auto"', scene.description(), remedy)
 
 
 def _place_piece(scene: MeshScene, lay: PlacementMethod) -> tuple[Piece, Placement, float, tuple[str, ...]]:

@@ -7,34 +7,21 @@ roads, a network trained with plain walls and smooth clouds alone named half of 
 quarters. Source of the spectrum: Field, JOSA A 4 (1987) 2379.
 """
 
-from collections.abc import Callable
-
 import numpy as np
 
 from patchproof.base.color import codes_from_srgb
 
 _SQUARE_PX = 4  # squares whose corners are looked up first; with 8 textures took up to half as long again
-PictureMaker = Callable[[], np.ndarray]  # makes a picture whose random numbers are drawn; hidden ones are never made
 
 
 def texture(rng: np.random.Generator, px: int = 64) -> np.ndarray:
     """Return P×P×3 in [0, 1]: one of the patterns in random colors, with some natural unevenness."""
-    return draw_texture(rng, px)()
-
-
-def draw_texture(rng: np.random.Generator, px: int) -> PictureMaker:
-    """Draw all random numbers of a texture now, and return the function that makes it."""
     blend = _PATTERNS[int(rng.choice(len(_PATTERNS), p=_SHARES))](rng, px)
     first, second, uneven = color(rng), color(rng), rng.random() < 0.5
-    strength, field = (rng.uniform(0, 0.25), natural(rng, px)) if uneven else (0, None)
-
-    def make() -> np.ndarray:
-        picture = _mix(first, second, blend())
-        if field is not None:
-            picture += (strength * (field() - 0.5))[..., None]
-        return np.clip(picture, 0, 1, out=picture)
-
-    return make
+    picture = _mix(first, second, blend)
+    if uneven:
+        picture += (rng.uniform(0, 0.25) * (natural(rng, px) - 0.5))[..., None]
+    return np.clip(picture, 0, 1, out=picture)
 
 
 def background(rng: np.random.Generator, px: int = 128) -> np.ndarray:
@@ -70,47 +57,35 @@ def color(rng: np.random.Generator) -> np.ndarray:
     return strong.mean() + (strong - strong.mean()) * rng.uniform(0, 1) ** 1.5
 
 
-def natural(rng: np.random.Generator, px: int) -> PictureMaker:
+def natural(rng: np.random.Generator, px: int) -> np.ndarray:
     """Draw noise P×P in [0, 1] with amplitude 1/f^a and the mean and spread of a photograph."""
     stretch = np.exp(rng.normal(0, 0.4))  # grass and water have a direction
     noise, steepness = rng.normal(size=(px, px)), rng.uniform(0.5, 1.6)
-
-    def make() -> np.ndarray:
-        fy, fx = np.fft.fftfreq(px)[:, None], np.fft.rfftfreq(px)[None]
-        frequency = np.hypot(fy * stretch, fx / stretch)
-        frequency[0, 0] = np.inf
-        field = np.fft.irfft2(np.fft.rfft2(noise) / frequency**steepness, (px, px))
-        return np.clip(0.5 + 0.25 * field / field.std(), 0, 1)
-
-    return make
+    fy, fx = np.fft.fftfreq(px)[:, None], np.fft.rfftfreq(px)[None]
+    frequency = np.hypot(fy * stretch, fx / stretch)
+    frequency[0, 0] = np.inf
+    field = np.fft.irfft2(np.fft.rfft2(noise) / frequency**steepness, (px, px))
+    return np.clip(0.5 + 0.25 * field / field.std(), 0, 1)
 
 
-def _clouds(rng: np.random.Generator, px: int) -> PictureMaker:
+def _clouds(rng: np.random.Generator, px: int) -> np.ndarray:
     import cv2
 
     steepness, octaves = rng.uniform(0.4, 0.9), [rng.random((2 ** (octave + 1) + 1,) * 2) for octave in range(5)]
-
-    def make() -> np.ndarray:
-        total = np.zeros((px, px))
-        for octave, coarse in enumerate(octaves):
-            total += steepness**octave * cv2.resize(coarse, (px, px), interpolation=cv2.INTER_CUBIC)
-        return (total - total.min()) / max(np.ptp(total), 1e-9)
-
-    return make
+    total = np.zeros((px, px))
+    for octave, coarse in enumerate(octaves):
+        total += steepness**octave * cv2.resize(coarse, (px, px), interpolation=cv2.INTER_CUBIC)
+    return (total - total.min()) / max(np.ptp(total), 1e-9)
 
 
-def _cells(rng: np.random.Generator, px: int) -> PictureMaker:
+def _cells(rng: np.random.Generator, px: int) -> np.ndarray:
     """Draw gravel, leaves, a crowd: each pixel has the shade of the nearest of some points."""
     points = rng.random((int(np.exp(rng.uniform(np.log(8), np.log(800)))), 2)) * px
     shades, darkening = rng.random(len(points)), rng.uniform(0, 1)
-
-    def make() -> np.ndarray:
-        index = _nearest(points, px)
-        down, across = np.mgrid[:px, :px] - points.T[:, index]
-        distance = np.sqrt(down**2 + across**2)
-        return shades[index] * np.clip(1.2 - distance / max(distance.max(), 1e-9) * darkening, 0, 1)
-
-    return make
+    index = _nearest(points, px)
+    down, across = np.mgrid[:px, :px] - points.T[:, index]
+    distance = np.sqrt(down**2 + across**2)
+    return shades[index] * np.clip(1.2 - distance / max(distance.max(), 1e-9) * darkening, 0, 1)
 
 
 def _nearest(points: np.ndarray, px: int) -> np.ndarray:
@@ -128,51 +103,31 @@ def _nearest(points: np.ndarray, px: int) -> np.ndarray:
     return index
 
 
-def _bricks(rng: np.random.Generator, px: int) -> PictureMaker:
+def _bricks(rng: np.random.Generator, px: int) -> np.ndarray:
     """Draw rows of bricks or slabs, each of its own shade, with joints."""
     high, wide, shift = rng.uniform(4, 18), rng.uniform(6, 40), rng.choice([0.5, 0.0, 0.33])
     shade, strength, joints = rng.random((px, px)), rng.uniform(0.1, 0.8), rng.uniform(0.5, 2, 2)
-
-    def make() -> np.ndarray:
-        y, x = np.mgrid[:px, :px].astype(float)
-        row = np.floor(y / high)
-        x = x + row * wide * shift
-        joint = ((y % high) < joints[0]) | ((x % wide) < joints[1])
-        return np.where(joint, 1.0, (shade * strength)[row.astype(int), (x // wide).astype(int) % px])
-
-    return make
+    y, x = np.mgrid[:px, :px].astype(float)
+    row = np.floor(y / high)
+    x = x + row * wide * shift
+    joint = ((y % high) < joints[0]) | ((x % wide) < joints[1])
+    return np.where(joint, 1.0, (shade * strength)[row.astype(int), (x // wide).astype(int) % px])
 
 
-def _stripes(rng: np.random.Generator, px: int) -> PictureMaker:
+def _stripes(rng: np.random.Generator, px: int) -> np.ndarray:
     turn, waves, threshold = rng.uniform(0, np.pi), rng.uniform(1.5, 14), rng.uniform(-0.8, 0.8)
-
-    def make() -> np.ndarray:
-        y, x = np.mgrid[:px, :px] / px
-        return (np.sin(2 * np.pi * waves * (x * np.cos(turn) + y * np.sin(turn))) > threshold).astype(float)
-
-    return make
+    y, x = np.mgrid[:px, :px] / px
+    return (np.sin(2 * np.pi * waves * (x * np.cos(turn) + y * np.sin(turn))) > threshold).astype(float)
 
 
-def _checks(rng: np.random.Generator, px: int) -> PictureMaker:
+def _checks(rng: np.random.Generator, px: int) -> np.ndarray:
     waves = rng.uniform(1.5, 14)
-
-    def make() -> np.ndarray:
-        y, x = np.mgrid[:px, :px] / px * waves
-        return (np.floor(x) + np.floor(y)) % 2
-
-    return make
+    y, x = np.mgrid[:px, :px] / px * waves
+    return (np.floor(x) + np.floor(y)) % 2
 
 
-def _grain(rng: np.random.Generator, px: int) -> PictureMaker:
-    grain = rng.random((px, px))
-    return lambda: grain
-
-
-def _plain(rng: np.random.Generator, px: int) -> PictureMaker:
-    return lambda: np.zeros((px, px))
-
-
-_PATTERNS = (natural, _clouds, _cells, _bricks, _stripes, _checks, _grain, _plain)
+_PATTERNS = (natural, _clouds, _cells, _bricks, _stripes, _checks)
+_PATTERNS += (lambda rng, px: rng.random((px, px)), lambda rng, px: np.zeros((px, px)))  # grain, and none
 _SHARES = (0.25, 0.1, 0.15, 0.12, 0.1, 0.06, 0.07, 0.15)
 
 

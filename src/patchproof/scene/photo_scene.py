@@ -36,7 +36,7 @@ from patchproof.photo.rejection import PhotoRejected
 from patchproof.scene import picture_scene
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.interface import SceneSource, SceneTerm
-from patchproof.scene.picture_scene import BasePicture, PictureScene
+from patchproof.scene.picture_scene import PictureLevels, PictureScene
 from patchproof.sheets.blank import blank_piece
 from patchproof.sheets.manifest import Manifest, load_manifest
 from patchproof.sheets.markers import DICTIONARY
@@ -56,7 +56,7 @@ class BasePhoto:
     """A usable photograph: the homography to its pixels at the scene's `photo_px`, and measurements of its paper."""
 
     name: str
-    picture: BasePicture
+    picture: PictureLevels
     photo_from_piece: np.ndarray
     light: PaperLight
     blur_px: float
@@ -174,10 +174,10 @@ def measure_photo(path: Path, manifest: Manifest, piece: Piece, photo_px: tuple[
     scale = photo_from_srgb[0, 0]
     # enlarging adds the width of the picture's own pixels: 1/12 px², and the interpolation's 1/6 px²
     blur = float(np.sqrt((blur * scale) ** 2 + max(0.0, scale**2 - 1) / 4))
-    height, width = picture.srgb.shape[:2]
+    height, width = picture[0].shape[:2]
     picture_from_photo = np.linalg.inv(picture_scene.photo_from((width, height), photo_px))
     area, printed = (0.0, 0.0, *piece.size_mm), map(marker_rect, piece.markers)
-    light = paper_light(picture.srgb, picture_from_photo @ photo_from_piece, area, printed, blur)
+    light = paper_light(picture[0], picture_from_photo @ photo_from_piece, area, printed, blur)
     return BasePhoto(path.name, picture, photo_from_piece, light, blur, photo.said)
 
 

@@ -10,7 +10,6 @@ front of the piece (a hand, a handle); the new piece covers it.
 
 from abc import abstractmethod
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any
 
 import cv2
@@ -25,6 +24,8 @@ from patchproof.scene.interface import PX_PER_MODULE, READABLE_SHARE, PieceScene
 from patchproof.sheets.piece import Piece
 
 VIEWS_TRIED = 256  # for statistics over a scene's views
+# A picture, uint8 H×W×3 sRGB, no larger than its photograph, and its halvings: a small view does not read megapixels.
+PictureLevels = list[np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -84,19 +85,7 @@ class PictureScene(PieceScene):
         return (*self.notes, f"{measurable_text(share, 'plane')}: {self.piece.marker_mm:.1f} mm markers are too small")
 
 
-@dataclass(frozen=True)
-class BasePicture:
-    """A base picture, uint8 H×W×3 sRGB, no larger than the photograph that it becomes."""
-
-    srgb: np.ndarray
-
-    @cached_property
-    def levels(self) -> tuple[np.ndarray, ...]:
-        """The picture and its halvings, so that a small view does not read megapixels."""
-        return tuple(halving_pyramid(self.srgb))
-
-
-def picture_for(srgb: np.ndarray, photo_px: tuple[int, int]) -> tuple[BasePicture, np.ndarray]:
+def picture_for(srgb: np.ndarray, photo_px: tuple[int, int]) -> tuple[PictureLevels, np.ndarray]:
     """Return the picture, no larger than the photograph, and `photo_from_picture` 3×3 from pixels of `srgb`."""
     height, width = srgb.shape[:2]
     scale = min(photo_px) / min(width, height)
@@ -104,7 +93,7 @@ def picture_for(srgb: np.ndarray, photo_px: tuple[int, int]) -> tuple[BasePictur
     if scale < 1:
         size = (max(1, round(width * scale)), max(1, round(height * scale)))
         srgb = cv2.resize(srgb, size, interpolation=cv2.INTER_AREA)
-    return BasePicture(srgb), photo_from(size, photo_px) @ np.diag([size[0] / width, size[1] / height, 1.0])
+    return halving_pyramid(srgb), photo_from(size, photo_px) @ np.diag([size[0] / width, size[1] / height, 1.0])
 
 
 def photo_from(picture_px: tuple[int, int], photo_px: tuple[int, int]) -> np.ndarray:
@@ -137,15 +126,15 @@ def similarity_matrix(roll_deg: float, zoom: float, shift_px, about_px) -> np.nd
 
 
 def warp_picture(
-    picture: BasePicture, view_from_photo: np.ndarray, photo_px: tuple[int, int], size_px: tuple[int, int]
+    levels: PictureLevels, view_from_photo: np.ndarray, photo_px: tuple[int, int], size_px: tuple[int, int]
 ) -> np.ndarray:
     """Return the picture, uint8 H×W×3, transformed by `view_from_photo`, reduced by area, mirrored at its edge."""
     samples = 2 if min(size_px) < min(photo_px) else 1  # two per pixel each way prevent aliasing in a reduced picture
     size = (samples * size_px[0], samples * size_px[1])
-    height, width = picture.srgb.shape[:2]
+    height, width = levels[0].shape[:2]
     view_from_picture = size_from_photo(photo_px, size) @ view_from_photo @ photo_from((width, height), photo_px)
-    reduced = picture.levels[0]
-    for level in picture.levels[1:]:
+    reduced = levels[0]
+    for level in levels[1:]:
         # a level must not be coarser than the samples
         if abs(np.linalg.det(view_from_picture[:2, :2])) ** 0.5 * width / level.shape[1] > 1:
             break

@@ -11,7 +11,6 @@ on the assumption that a smaller piece fits where a larger one does, which only 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import get_args
 
 import numpy as np
 
@@ -27,8 +26,6 @@ LIFT_MM = 0.15  # the paper's own thickness, which also keeps it clear of the su
 # Assumed: a card that stands off the object by more than this share of its shorter edge casts a visible shadow.
 WARN_GAP_SHARE = 0.15
 WARN_OVERHANG_SHARE = 0.02
-_STEP_SHARE = 0.25  # of the piece's shorter side between places that are tried
-_TRIES_FLAT, _TRIES_BENT = 120, 6  # one takes about 5 and 200 ms
 _HALVINGS = 5  # to 3 % of the wanted piece
 
 _SIDES = {  # side: (up, normal); right is up × normal
@@ -250,31 +247,13 @@ def place_if_close(
 
 
 def placement_advice(mesh: Mesh, patch: PatchSettings, lay: PlacementMethod, least_mm: float) -> str:
-    """Suggest, as keys of a scene file, sizes and places at which a refused piece would lie well; empty if none was
-    found. Places are tried on the same side from the nearest on, then in the middles of the other sides.
-    """
+    """Suggest a size at which a refused piece would lie well, if there is one, and how to search for a place."""
     frame, (width, height) = patch_frame(mesh, patch), patch.size_mm
     largest = min(width, frame.extent_mm[0]), min(height, frame.extent_mm[1])
     fits = partial(place_if_close, mesh, frame, spin_deg=patch.spin_deg, lay=lay)
-    smaller, place = largest_fitting_size(largest, fits, least_mm), _nearest_place(mesh, patch, lay)
+    smaller = largest_fitting_size(largest, fits, least_mm)
     advice = "" if smaller is None else f"; {smaller[0]:g} × {smaller[1]:g} mm lies well there"
-    return advice if place is None else f"{advice}; {width:g} × {height:g} mm lies well with {place}"
-
-
-def _nearest_place(mesh: Mesh, patch: PatchSettings, lay: PlacementMethod) -> str | None:
-    """Return the nearest place where the piece lies well, as a key of a scene file."""
-    fits = partial(place_if_close, mesh, size_mm=patch.size_mm, spin_deg=patch.spin_deg, lay=lay)
-    middle = patch_frame(mesh, patch.changed(offset_mm=(0.0, 0.0)))
-    step = max(1.0, round(_STEP_SHARE * min(patch.size_mm)))
-    (across, along), wanted_mm = (int(extent // (2 * step)) for extent in middle.extent_mm), np.array(patch.offset_mm)
-    offsets = [(x * step, y * step) for x in range(-across, across + 1) for y in range(-along, along + 1)]
-    offsets.sort(key=lambda offset: (float(np.hypot(*(offset - wanted_mm))), offset))
-    for x, y in offsets[: _TRIES_BENT if patch.bend else _TRIES_FLAT]:
-        if fits(replace(middle, origin_mm=middle.origin_mm + x * middle.right + y * middle.up)):
-            return f"offset_mm = [{x:g}, {y:g}]"
-    sides = sorted(get_args(Side), key=lambda side: (side == patch.side, side[1] == "y"))  # top and bottom last
-    side = next((side for side in sides if fits(side_frame(mesh, side))), None)
-    return None if side is None else f'side = "{side}"'
+    return f'{advice}; place = "auto" searches for a place'
 
 
 def largest_fitting_size(

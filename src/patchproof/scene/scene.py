@@ -5,7 +5,7 @@ nothing of textures, bent paper, photographs or images.
 """
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
@@ -73,7 +73,9 @@ def _replace_objects(settings: Mapping[str, Any], base: Path) -> tuple[dict[str,
     for key, name in (("object", "photos"), ("object", "images"), ("background", "images")):
         table = tables.get(key)
         if isinstance(table, dict) and isinstance(table.get(name), list | tuple):
-            table[name] = str(_write_pictures(table[name], base).name)
+            digest = hashlib.sha256(b"".join(np.ascontiguousarray(picture).tobytes() for picture in table[name]))
+            folder = base.resolve() / f"pictures-{digest.hexdigest()[:12]}"  # named after their bytes
+            table[name] = write_pictures(table[name], folder).name
     thing, target = tables.get("object"), tables.get("target")
     if isinstance(thing, dict) and hasattr(thing.get("mesh"), "export"):
         mesh, thing["mesh"] = thing["mesh"], "python:mesh"
@@ -94,14 +96,6 @@ def _path_texts(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {key: _path_texts(each) for key, each in value.items()}
     return str(value) if isinstance(value, Path) else value
-
-
-def _write_pictures(pictures: Sequence[np.ndarray], base: Path) -> Path:
-    """Write pictures into a folder of `base` that is named after their bytes, and return it."""
-    digest = hashlib.sha256()
-    for picture in pictures:
-        digest.update(np.ascontiguousarray(picture).tobytes())
-    return write_pictures(pictures, base.resolve() / f"pictures-{digest.hexdigest()[:12]}")
 
 
 def build_scene(
@@ -135,6 +129,4 @@ def module_of(settings: SceneSettings) -> str:
         return "image_scene"
     if settings.patch.kind != "patch":
         return "texture_scene"
-    if settings.patch.place == "auto":
-        return "unplaced_scene"
-    return "bent_scene" if settings.patch.bend else "patch_scene"
+    return "bent_scene" if settings.patch.bend and settings.patch.place == "given" else "patch_scene"

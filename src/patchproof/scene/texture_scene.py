@@ -91,10 +91,16 @@ def texture_canvas(mesh: Mesh, patch: PatchSettings, base: Path, texels: int = T
             " unwrapped (xatlas) and keep their colors"
         )
     mesh = bake_base_colors(mesh, chosen_faces, texels)
-    masks = _masks(mesh, chosen_faces)
+    shown = (_corners(mesh, chosen_faces & (mesh.face_material == i)) for i in range(len(mesh.materials)))
+    masks = tuple(coverage(corners, _size(mesh, i), GUTTER_TEXELS) > 0 for i, corners in enumerate(shown))
     if patch.mask is not None:
         image = _read_mask(Path(expand_path(patch.mask, base)))
-        warnings += _size_warnings(image, masks)
+        height, width = image.shape
+        for texels_high, texels_wide in dict.fromkeys(m.shape for m in masks if m.any() and m.shape != image.shape):
+            warnings.append(
+                f"the mask of {width} × {height} pixels is laid over {texels_wide} × {texels_high} texels: a texel may"
+                " change where the mean of what lies over it is light"
+            )
         masks = tuple(mask & _stretch(image, mask.shape) for mask in masks)
     if not any(mask.any() for mask in masks):
         got = f"a mask that covers none of {np.count_nonzero(chosen_faces)} faces"
@@ -154,17 +160,6 @@ def _read_mask(path: Path) -> np.ndarray:
     return gray
 
 
-def _size_warnings(gray: np.ndarray, masks: tuple[np.ndarray, ...]) -> list[str]:
-    """Return a sentence if a mask is of another size than a texture that it is laid over."""
-    sizes = dict.fromkeys(f"{m.shape[1]} × {m.shape[0]}" for m in masks if m.any() and m.shape != gray.shape)
-    if not sizes:
-        return []
-    return [
-        f"the mask of {gray.shape[1]} × {gray.shape[0]} pixels is laid over {' and '.join(sizes)} texels: a texel may"
-        " change where the mean of what lies over it is light"
-    ]
-
-
 def _stretch(gray: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """Return where a mask, stretched over H×W texels (averaged if it is finer), is light."""
     from PIL import Image
@@ -187,14 +182,6 @@ def bake_base_colors(mesh: Mesh, chosen_faces: np.ndarray, texels: int = TEXELS)
     return replace(mesh, materials=tuple(with_base_color(i, material) for i, material in enumerate(mesh.materials)))
 
 
-def _masks(mesh: Mesh, chosen_faces: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return the texels of each material that chosen faces can show."""
-    return tuple(
-        coverage(_corners(mesh, chosen_faces & (mesh.face_material == i)), _size(mesh, i), GUTTER_TEXELS) > 0
-        for i in range(len(mesh.materials))
-    )
-
-
 def _corners(mesh: Mesh, faces: np.ndarray) -> np.ndarray:
     """Return corners F×3×2 in texels of faces of one material."""
     index = mesh.face_material[faces][:1]
@@ -214,7 +201,9 @@ def _texel_warnings(mesh: Mesh, chosen_faces: np.ndarray, masks: tuple[np.ndarra
     """Return warnings about the texels that may change, with their shares of the surface."""
     a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
-    first_of_place, has_uv = _is_first_at_place(mesh), has_usable_uv(mesh)
+    # a front and a back with the same three corners in space, as some programs export them, show one place
+    first = np.unique(np.sort(position_numbers(mesh.vertices)[mesh.faces], axis=1), axis=0, return_index=True)[1]
+    first_of_place, has_uv = np.isin(np.arange(len(area)), first), has_usable_uv(mesh)
     changeable, repeated, palette, unnamed = np.zeros((4, len(area)))  # shares of each face
     for index, mask in enumerate(masks):
         faces = has_uv & (mesh.face_material == index)
@@ -246,11 +235,3 @@ def _texel_warnings(mesh: Mesh, chosen_faces: np.ndarray, masks: tuple[np.ndarra
     if (mesh.corner_color_linear[chosen_faces] != 1).any():
         warnings.append("vertex colors go on multiplying the texture: where they are dark, it stays dark")
     return warnings
-
-
-def _is_first_at_place(mesh: Mesh) -> np.ndarray:
-    """Return the faces for which no earlier face has the same three corners in space: a front and a back, as some
-    programs export, show one place.
-    """
-    first = np.unique(np.sort(position_numbers(mesh.vertices)[mesh.faces], axis=1), axis=0, return_index=True)[1]
-    return np.isin(np.arange(len(mesh.faces)), first)

@@ -13,12 +13,12 @@ import torch
 
 import patchproof as pp
 from patchlab.results.rows import write_rows
+from patchlab.validation.path_traced import photograph_traced
 from patchproof.base.intervals import student_mean
 from patchproof.optimizer.loop import best_design
 from patchproof.optimizer.problem import set_problem
 from patchproof.optimizer.subject import from_pixels
 from patchproof.render.photograph import photograph
-from patchproof.reprints.path_traced import photograph_traced
 
 N, SEED = 60, 78
 NETWORK = "file:${PATCHPROOF_DATA}/models/mobilenet_v1_0.75_192.onnx"

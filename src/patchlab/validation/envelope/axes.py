@@ -75,7 +75,7 @@ AXES: dict[str, Axis] = {
     "mismatch": Axis("print mismatch", "× other printer", lambda scene: (0.0, 6.0), needs_mesh=False),
     "size": Axis("patch size", "× its own", lambda scene: (1.0, 0.1), ratio=True),
 }
-PAPER_AXES = ("size", "curl", "gap")  # axes that change the piece or its place on the object
+PAPER_AXES = ("curl", "gap")  # axes that change the piece or its place on the object
 
 
 def is_possible(scene: Scene, name: str) -> bool:
@@ -92,6 +92,8 @@ def conditions_at(scene: Scene, conditions: Conditions, point: SweepPoint) -> Co
             conditions = _tilt_cameras(conditions, value)
         elif axis == "darkness":
             conditions = with_values(conditions, exposure_ev=-value)
+        elif axis == "size":
+            conditions = with_values(conditions, printed_scale=value * conditions.pose.printed_scale)
         elif axis in _FIELD_OF_AXIS:
             conditions = with_values(conditions, **{_FIELD_OF_AXIS[axis]: value})
     return conditions
@@ -101,11 +103,10 @@ _FIELD_OF_AXIS = {"distance": "distance_mm", "blur": "blur_px", "noise": "noise"
 
 
 def scene_at(scene: Scene, point: SweepPoint) -> Scene:
-    """The scene with its piece printed smaller, moved off the surface, or curled, as the point says."""
+    """The scene with its piece moved off the surface, or curled, as the point says."""
     if not point.keys() & PAPER_AXES:
         return scene
-    size = point.get("size", 1.0)
-    scene = require_patch(scene).with_print_scale((size, size))
+    scene = require_patch(scene)
     placement = scene.placement
     if "curl" in point:
         placement = _curl_card(placement, point["curl"])

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from patchlab.study.record import corner_error_mm
 from patchlab.validation.envelope.axes import PAPER_AXES, conditions_at, scene_at
-from patchlab.validation.mounted_sheets import mount_run_sheet
+from patchlab.validation.mounted_sheets import mount_content
 from patchproof.base import geometry
 from patchproof.base.output import image_pixels
 from patchproof.channel.printer import Printer, load_printer
@@ -32,7 +32,8 @@ from patchproof.optimizer.subject import from_pixels
 from patchproof.render.photograph import Appearance, photograph
 from patchproof.render.pixels import PiecePicture
 from patchproof.render.stage import Stage, set_stage
-from patchproof.reprints.mounted_sheet import MountedSheet, jpeg_of
+from patchproof.reprints.reprint import MountedSheet, jpeg_of
+from patchproof.reprints.run_sheet import content_of
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.interface import Scene, require_piece
 from patchproof.scene.mesh_scene import require_mesh
@@ -74,11 +75,11 @@ def open_simulation(folder: Path, other_printer: str | None) -> Simulation:
     require_piece(run.scene, "name the run of a printed patch")
     profile = run.scene.settings.printer.profile
     other = other_printer or ("coated" if profile == "uncoated" else "uncoated")
-    sheet, printer = mount_run_sheet(run), load_printer(other, run.scene.base)
-    gray, surface = mount_run_sheet(run, "gray"), surface_of(sheet.manifest)
+    contents = (content_of(run, None, control, folder)[0] for control in (None, "gray"))
+    sheet, gray = (mount_content(set_stage(run.scene), content) for content in contents)
     problem = set_problem(run.scene)
     problem = replace(problem, classifiers=problem.classifiers[:1], indices=problem.indices[:1])
-    return Simulation(run, problem, sheet, gray, surface, printer)
+    return Simulation(run, problem, sheet, gray, surface_of(sheet.manifest), load_printer(other, run.scene.base))
 
 
 def piece_at(world: Simulation, axis: str, value: float, first_corner: int, gray: bool = False) -> PiecePicture:

@@ -26,8 +26,8 @@ from patchproof.mesh.load_mesh import load_mesh
 from patchproof.mesh.primitives import longest_mm
 from patchproof.scene.candidate_places import PlaceFinder
 from patchproof.scene.image_scene import read_labels
+from patchproof.scene.patch_scene import UnplacedScene
 from patchproof.scene.scene import build_scene
-from patchproof.scene.unplaced_scene import UnplacedScene
 from patchproof.sheets.manifest import load_manifest
 
 NEAR, FAR = 1.5, 2.7  # camera distances over the object's length: those of a default scene of 300 mm

@@ -31,11 +31,10 @@ from patchproof.render.stage import set_stage
 from patchproof.report.page import data_uri, jpeg, png, render_page
 from patchproof.scene.interface import Scene, fit_text, measurable_text, require_piece
 from patchproof.scene.mesh_scene import MeshScene
-from patchproof.scene.patch_scene import PatchScene
+from patchproof.scene.patch_scene import PatchScene, UnplacedScene
 from patchproof.scene.placement import gap_limit_mm
 from patchproof.scene.scene import build_scene
 from patchproof.scene.texture_scene import TextureScene
-from patchproof.scene.unplaced_scene import UnplacedScene
 
 PAGE = "preview.html"
 _FIRST_DEG = 30  # to the right of the front: shown before the slider is moved

@@ -19,9 +19,8 @@ from patchproof.base.geometry import UP, orbit, rect_border
 from patchproof.base.validation import Side
 from patchproof.classifier.network import Classifier
 from patchproof.optimizer.subject import as_pixels
-from patchproof.render.photograph import photograph
+from patchproof.render.photograph import photograph, plan_picture
 from patchproof.render.stage import Stage
-from patchproof.reprints.plan_view import plan_picture
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.interface import PieceScene
 from patchproof.scene.mesh_scene import MeshScene, require_mesh

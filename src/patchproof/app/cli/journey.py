@@ -160,25 +160,22 @@ def reprint(
     sessions: Annotated[int, Option(min=1, help="Places to take them in, each with its light, camera and folder.")] = 1,
     seed: Seed = None,
     printer: Annotated[str | None, Option(help="Another printer than the scene's: a name or a file.")] = None,
-    print_scale: Annotated[str, Option(help="Size of the print, 0.97 or 0.97x0.98 (x, y).")] = "1",
+    print_scale: Annotated[float, Option(min=0.01, help="Size of the print beside the sheet's.")] = 1.0,
     control: Annotated[PhotographedControl | None, Option(help="Photograph a control in place of the design.")] = None,
-    path_traced: Annotated[bool, Option("--path-traced", help="Render with Mitsuba 3 (slow).")] = False,
     jobs: Jobs = None,
     trust: Trust = False,
     overwrite: Overwrite = False,
 ) -> None:
     """Print the PDF in simulation, put it back on the object, and photograph it."""
     from patchproof.optimizer.run import load_run
-    from patchproof.reprints.mounted_sheet import ReprintSetup
     from patchproof.reprints.page_photos import reprint_pages
+    from patchproof.reprints.reprint import ReprintSetup
     from patchproof.reprints.reprint import reprint as reprint_sheet
 
-    scale = console.pair_of(print_scale, "--print-scale")
-    how = ReprintSetup(printer, scale, control, path_traced)
+    how = ReprintSetup(printer, print_scale, control)
     if run is None:
-        if control is not None or path_traced or sessions > 1:
-            only = "controls, sessions and path tracing are of a run's sheet; name the run"
-            raise BadParameter(only, param_hint="--run")
+        if control is not None or sessions > 1:
+            raise BadParameter("controls and sessions are of a run's sheet; name the run", param_hint="--run")
         reprint_pages(pdf, n, out, how, seed=seed, overwrite=overwrite)
         return say(f"{n} photographs: {out}")
     finished_run = load_run(run, trust)

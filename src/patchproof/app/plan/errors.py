@@ -16,14 +16,14 @@ from torch import Tensor
 
 from patchproof.base.output import image_bytes, image_pixels
 from patchproof.base.progress import Advance, no_advance
-from patchproof.channel.effects import EFFECT_BY_NAME, EFFECTS, ViewEffect
+from patchproof.channel.effects import EFFECTS, ViewEffect
 from patchproof.channel.printer import identity_printer
 from patchproof.classifier.network import center_square
 from patchproof.optimizer.problem import Problem
 from patchproof.optimizer.subject import as_pixels, from_pixels
 from patchproof.render.photograph import expose
 from patchproof.render.pixels import Appearance
-from patchproof.render.stage import Stage, set_stage
+from patchproof.render.stage import Stage
 from patchproof.render.views import Views, relight, render_views
 from patchproof.scene.conditions import Conditions, without_effect
 from patchproof.scene.interface import SceneTerm
@@ -61,7 +61,7 @@ def scene_terms(problem: Problem, design: Tensor, other_surface: Placement | Non
     """The terms that a problem's kind of scene has."""
     scene = problem.scene
     effects = [term for table in ("light", "printer", "camera") for term in effect_terms(table)]
-    terms = [term for term in effects if scene.models(EFFECT_BY_NAME[term.name])]
+    terms = [term for term in effects if term.key.partition(".")[0] in scene.EFFECT_TABLES]
     terms += [Term(p.name, p.key, partial(_without_part, part=p), True, p.needs_whole_photo) for p in scene.TERMS]
     if scene.HAS_PIECE:
         terms.append(Term(PRINTER, "printer.profile", partial(_without_printer, problem, design)))
@@ -100,8 +100,7 @@ def _without_part(setup: Setup, part: SceneTerm) -> Setup | None:
 
 def _on_surface(setup: Setup, placement: Placement) -> Setup:
     scene = replace(require_patch(setup.stage.scene), placement=placement)
-    piece = set_stage(scene, setup.stage.device).piece
-    return replace(setup, stage=replace(setup.stage, scene=scene, piece=piece))
+    return replace(setup, stage=replace(setup.stage, scene=scene))
 
 
 def measure_terms(

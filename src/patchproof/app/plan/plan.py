@@ -44,8 +44,8 @@ from patchproof.scene.interface import (
     measurable_text,
     require_piece,
 )
+from patchproof.scene.patch_scene import UnplacedScene
 from patchproof.scene.scene import load_scene
-from patchproof.scene.unplaced_scene import UnplacedScene
 from patchproof.sheets.markers import MARKER_MODULES
 from patchproof.sheets.piece import SMALLEST_MARKER_MM
 

@@ -4,15 +4,13 @@ In: a stage, the printed piece (or none) and one view's conditions. Out: a pictu
 Mitsuba adds the effects that our renderer leaves out: cast shadows with soft edges, light that is reflected between
 paper and object, and depth of field. Conditions do not have the size of light and lens: `draw_optics` draws them. Our
 own are the printer, the camera behind its lens (`channel.camera`), and the picture in the background, which lights
-nothing. Levels follow `channel.light`: a surface with nothing around it gets the same light.
-
-Left out on purpose: colored light, transparency, scenes made of pictures.
+nothing. Levels follow `channel.light`: a surface with nothing around it gets the same light. Left out on purpose:
+colored light, transparency, scenes made of pictures.
 
 Sources: Jakob et al., Mitsuba 3 renderer, 2022; Veach and Guibas, Optimally Combining Sampling Techniques for Monte
 Carlo Rendering, SIGGRAPH 1995, for why the surrounding light is sampled by the surface alone.
 """
 
-from dataclasses import dataclass
 from importlib import import_module
 from types import ModuleType
 
@@ -43,49 +41,35 @@ APERTURE_MM = (1.0, 6.0)  # from a phone's lens to a small camera's
 PASSES, PASS_SAMPLES = 2, 16  # paths per pixel; a pass at a time bounds memory: 2 GB at 2 megapixels
 MOST_BOUNCES = 4  # of a path, the light included: paper lit by what paper lights
 _SQUARE = 1e-4  # how far a pixel's sides may differ
-# Older versions end the whole process: they cannot compile Dr.Jit's minimum.
-_FIRST_LLVM = 17
+_FIRST_LLVM = 17  # older versions end the whole process: they cannot compile Dr.Jit's minimum
 _FAR = 20.0  # the directional light's distance in lengths of the object
 _SKY_PX = (64, 128)
 _SKY_WEIGHT = 1e-3  # share of light samples; Mitsuba refuses 0 if there is no other light
 
 
-@dataclass(frozen=True)
-class Optics:
-    """Sizes that conditions do not have: the directional light's radius as an angle, and the lens's diameter."""
-
-    light_radius_deg: float
-    aperture_mm: float
-
-
-def draw_optics(conditions: Conditions) -> Optics:
-    """Draw one view's light and lens evenly, by the view's noise seed."""
-    u = np.random.default_rng([int(conditions.sensor.noise_seed[0]), 1]).random(2)
-    ends = zip((LIGHT_RADIUS_DEG, APERTURE_MM), u, strict=True)
-    return Optics(*(float(low + (high - low) * share) for (low, high), share in ends))
+def draw_optics(conditions: Conditions) -> tuple[float, float]:
+    """Draw, by one view's noise seed, the directional light's radius in degrees and the lens's diameter in mm."""
+    rng = np.random.default_rng([int(conditions.sensor.noise_seed[0]), 1])
+    light_radius_deg, aperture_mm = rng.uniform(*np.transpose([LIGHT_RADIUS_DEG, APERTURE_MM])).tolist()
+    return light_radius_deg, aperture_mm
 
 
-def photograph_traced(
-    stage: Stage, piece: PiecePicture | None, conditions: Conditions, optics: Optics | None = None
-) -> Tensor:
-    """Photograph one view, without JPEG: 1×3×H×W sRGB; `piece=None` is the bare object."""
-    light = traced_light(stage, piece, conditions, draw_optics(conditions) if optics is None else optics)
-    if stage.camera is not None:
-        light = stage.camera.distort_pictures(light, stage.scene.settings.camera.photo_px)
-    return develop(light, conditions.sensor, 1.0, jpeg=False)
-
-
-def traced_light(stage: Stage, piece: PiecePicture | None, conditions: Conditions, optics: Optics) -> Tensor:
-    """Trace one view's linear light before lens distortion and sensor: 1×3×H×W, of the size of the lens's frame."""
-    scene, mi = _traceable(stage), mitsuba()
-    photo_px = scene.settings.camera.photo_px
-    frame = lens_frame(stage, scene, photo_px)
-    box = _box(scene, conditions, frame, optics.aperture_mm)
+def photograph_traced(stage: Stage, piece: PiecePicture | None, conditions: Conditions) -> Tensor:
+    """Photograph one view, without JPEG: 1×3×H×W sRGB; `piece=None` is the bare object. Refused if the scene has no
+    mesh, or a camera whose pixels are not square.
+    """
+    scene = require_mesh(stage.scene, "a scene with a mesh to trace paths in", "choose one with object.mesh")
+    (light_radius_deg, aperture_mm), photo_px = draw_optics(conditions), scene.photo_px
+    matrix = scene.matrix_px(photo_px)
+    if abs(matrix[0, 0] / matrix[1, 1] - 1) > _SQUARE:
+        raise Refused("a camera with square pixels", f"fx / fy = {matrix[0, 0] / matrix[1, 1]:.5f}", "set fy to fx")
+    mi, frame = mitsuba(), lens_frame(stage, scene, photo_px)
+    box = _box(scene, conditions, frame, aperture_mm)
     parts = {
         "type": "scene",
         "integrator": {"type": "path", "max_depth": MOST_BOUNCES, "hide_emitters": True},
-        "sensor": _sensor(mi, scene, conditions, frame, box, optics.aperture_mm),
-        **_lights(mi, scene, conditions.light, optics.light_radius_deg),
+        "sensor": _sensor(mi, scene, conditions, frame, box, aperture_mm),
+        **_lights(mi, scene, conditions.light, light_radius_deg),
         **{f"object{i}": part for i, part in enumerate(_object(mi, scene.mesh))},
     }
     if piece is not None:
@@ -99,7 +83,9 @@ def traced_light(stage: Stage, piece: PiecePicture | None, conditions: Condition
     inside = light[top : top + height, left : left + width]
     inside *= 1 - total[..., 3:].clip(0, 1)
     inside += total[..., :3] / PAPER_REFLECTANCE
-    return torch.tensor(light, dtype=torch.float32).permute(2, 0, 1)[None]
+    traced = torch.tensor(light, dtype=torch.float32).permute(2, 0, 1)[None]
+    traced = stage.scene.camera.distort_pictures(traced, photo_px) if stage.scene.camera else traced
+    return develop(traced, conditions.sensor, 1.0, jpeg=False)
 
 
 def mitsuba() -> ModuleType:
@@ -109,28 +95,16 @@ def mitsuba() -> ModuleType:
     except ImportError as error:
         raise Refused("Mitsuba 3 for path tracing", "none installed", "pip install 'patchproof[pathtrace]'") from error
     if mi.variant() is None:
-        try:
-            mi.set_variant("llvm_ad_rgb")
-            if drjit.detail.llvm_version()[0] < _FIRST_LLVM:
-                mi.set_variant("scalar_rgb")
-        except ImportError:  # raised by Dr.Jit if it finds no LLVM
+        mi.set_variant("llvm_ad_rgb", "scalar_rgb")  # the first that loads
+        if mi.variant().startswith("llvm") and drjit.detail.llvm_version()[0] < _FIRST_LLVM:
             mi.set_variant("scalar_rgb")
     if mi.variant().startswith("llvm"):
         drjit.set_thread_count(torch.get_num_threads())
     return mi
 
 
-def _traceable(stage: Stage) -> MeshScene:
-    """The stage's scene; refused if it has no mesh, or a camera whose pixels are not square."""
-    scene = require_mesh(stage.scene, "a scene with a mesh to trace paths in", "leave --path-traced out")
-    matrix = scene.matrix_px(scene.settings.camera.photo_px)
-    if abs(matrix[0, 0] / matrix[1, 1] - 1) > _SQUARE:
-        raise Refused("a camera with square pixels", f"fx / fy = {matrix[0, 0] / matrix[1, 1]:.5f}", "set fy to fx")
-    return scene
-
-
 def _box(scene: MeshScene, conditions: Conditions, frame: Frame, aperture_mm: float) -> tuple[int, int, int, int]:
-    """Bound the part of the frame that shows object and piece: left, top, width and height, each 1 at least."""
+    """Bound what shows object and piece (left, top, width, height, 1 at least): it is traced in a third of the time."""
     points = [scene.mesh.vertices, require_piece(scene).paper()[0]] if scene.HAS_PIECE else [scene.mesh.vertices]
     px = geometry.project(frame.matrix_px, scene.camera_from_world(conditions)[0], np.concatenate(points))
     if not np.isfinite(px).all():  # some of it lies behind the camera
@@ -155,22 +129,13 @@ def _sensor(mi: ModuleType, scene: MeshScene, conditions: Conditions, frame: Fra
     lens = {"type": "thinlens", "aperture_radius": aperture_mm / 2, "focus_distance": float(middle[2])}
     if aperture_mm == 0 or off.any():
         lens = {"type": "perspective"} | {f"principal_point_offset_{x}": float(off[i]) for i, x in enumerate("xy")}
-    return lens | {
-        "to_world": mi.ScalarTransform4f(np.linalg.inv(pose) @ np.diag([-1.0, -1.0, 1.0, 1.0])),
-        "fov": float(np.degrees(2 * np.arctan(width / 2 / matrix[0, 0]))),
-        "fov_axis": "x",
-        "near_clip": 1.0,
-        "far_clip": 1e6,
-        "film": {
-            "type": "hdrfilm",
-            "width": width,
-            "height": height,
-            **dict(zip(("crop_offset_x", "crop_offset_y", "crop_width", "crop_height"), box, strict=True)),
-            "pixel_format": "rgba",
-            "rfilter": {"type": "box"},  # a pixel averages over its own square
-        },
-        "sampler": {"type": "multijitter", "sample_count": PASS_SAMPLES},
-    }
+    film = {"type": "hdrfilm", "width": width, "height": height, "pixel_format": "rgba"}
+    film |= dict(zip(("crop_offset_x", "crop_offset_y", "crop_width", "crop_height"), box, strict=True))
+    film |= {"rfilter": {"type": "box"}}  # a pixel averages over its own square
+    to_world = mi.ScalarTransform4f(np.linalg.inv(pose) @ np.diag([-1.0, -1.0, 1.0, 1.0]))
+    lens |= {"to_world": to_world, "fov": float(np.degrees(2 * np.arctan(width / 2 / matrix[0, 0]))), "fov_axis": "x"}
+    lens |= {"near_clip": 1.0, "far_clip": 1e6, "film": film}
+    return lens | {"sampler": {"type": "multijitter", "sample_count": PASS_SAMPLES}}
 
 
 def _lights(mi: ModuleType, scene: MeshScene, light: Light, radius_deg: float) -> dict:
@@ -185,10 +150,9 @@ def _lights(mi: ModuleType, scene: MeshScene, light: Light, radius_deg: float) -
         frame, middle = scene.frame, scene.middle_mm
         toward = geometry.orbit(light.light_azimuth_deg, light.light_elevation_deg, frame.normal, frame.up)[0]
         far, angle = _FAR * scene.length_mm, np.radians(radius_deg)
-        up = np.eye(3)[np.abs(toward).argmin()]  # any that is not along the light
-        place = mi.ScalarTransform4f().look_at((middle + far * toward).tolist(), middle.tolist(), up.tolist())
         radiance = {"type": "rgb", "value": [float(light.directional[0] / np.sin(angle) ** 2)] * 3}
-        to_world = place @ mi.ScalarTransform4f().scale(float(far * np.tan(angle)))
+        place = np.linalg.inv(geometry.look_at(middle + far * toward, middle))
+        to_world = mi.ScalarTransform4f(place @ np.diag([*[far * np.tan(angle)] * 3, 1]))
         emitters["sun"] = {"type": "disk", "to_world": to_world, "emitter": {"type": "area", "radiance": radiance}}
     return emitters
 
@@ -196,42 +160,35 @@ def _lights(mi: ModuleType, scene: MeshScene, light: Light, radius_deg: float) -
 def _piece(mi: ModuleType, scene: MeshScene, picture: PiecePicture, conditions: Conditions):
     """The printed piece as large as it was printed, with plain paper on its back."""
     placement = require_patch(scene).placement
-    scale = geometry.scaling_about(scene.middle_mm, conditions.pose.printed_scale[0])
-    vertices = placement.vertices_mm @ scale[:3, :3].T + scale[:3, 3]
+    scale = conditions.pose.printed_scale[0]
+    vertices = scene.middle_mm + scale * (placement.vertices_mm - scene.middle_mm)
     change = torch.tensor(print_change(conditions.print)[0]).to(picture.srgb)
     light = vary_print(linear_from_srgb(picture.srgb), change).numpy()  # relative to white paper
-    front = _diffuse(_texture(mi, light, "clamp"))
-    back = _diffuse({"type": "rgb", "value": PAPER_BACK_LINEAR * PAPER_REFLECTANCE})
+    back = {"type": "rgb", "value": PAPER_BACK_LINEAR * PAPER_REFLECTANCE}
     uv = placement.piece_mm / np.array(placement.size_mm)
-    bsdf = {"type": "twosided", "front": front, "back": back}
-    return _mesh(mi, "piece", vertices, placement.faces, placement.normals, uv, bsdf)
+    colors = _texture(mi, light, "clamp"), back
+    return _mesh(mi, "piece", vertices, placement.faces, placement.normals, uv, colors)
 
 
 def _object(mi: ModuleType, mesh: Mesh) -> list:
     """One Mitsuba mesh per material; corners are not shared, since each has its normal and texture coordinates."""
     shapes = []
     for number, material in enumerate(mesh.materials):
-        faces = mesh.face_material == number
-        if not (count := int(faces.sum())):
+        faces = np.flatnonzero(mesh.face_material == number)
+        if not len(faces):
             continue
         colors = (mesh.corner_color_linear[faces] * np.array(material.base_color_linear)).reshape(-1, 3)
         color = {"type": "mesh_attribute", "name": "vertex_color"}
         if material.texture_srgb is not None:
             if np.ptp(colors, axis=0).max() > 1 / 255:
-                expected = "objects whose materials have a texture or colors of corners, not both"
-                raise Refused(expected, f"both in {material.name}", "bake the colors in")
+                raise Refused("materials with a texture or corner colors", f"both in {material.name}", "bake them")
             color = _texture(mi, LINEAR_FROM_CODE[material.texture_srgb] * colors[0], "repeat")
         corners = mesh.vertices[mesh.faces[faces]].reshape(-1, 3)
         normals, uv = mesh.corner_normal[faces].reshape(-1, 3), mesh.corner_uv[faces].reshape(-1, 2)
-        bsdf = {"type": "twosided", "both": _diffuse(color)}
         paint = (colors * PAPER_REFLECTANCE).clip(0, 1)
-        triangles = np.arange(3 * count).reshape(-1, 3)
-        shapes.append(_mesh(mi, f"object{number}", corners, triangles, normals, uv, bsdf, paint))
+        triangles = np.arange(3 * len(faces)).reshape(-1, 3)
+        shapes.append(_mesh(mi, f"object{number}", corners, triangles, normals, uv, (color, color), paint))
     return shapes
-
-
-def _diffuse(reflectance: dict) -> dict:
-    return {"type": "diffuse", "reflectance": reflectance}
 
 
 def _texture(mi: ModuleType, linear: np.ndarray, wrap: str) -> dict:
@@ -240,17 +197,21 @@ def _texture(mi: ModuleType, linear: np.ndarray, wrap: str) -> dict:
     return {"type": "bitmap", "bitmap": bitmap, "raw": True, "wrap_mode": wrap}
 
 
-def _mesh(mi: ModuleType, name: str, vertices, faces, normals, uv, bsdf: dict, colors: np.ndarray | None = None):
-    """Make a Mitsuba shape of triangles; `uv` (0, 0) is the top left, and v runs down."""
+def _mesh(
+    mi: ModuleType, name: str, vertices, faces, normals, uv, reflectances: tuple, colors: np.ndarray | None = None
+):
+    """Make a Mitsuba shape of triangles with these reflectances of front and back; `uv` (0, 0) is the top left, and v
+    runs down.
+    """
+    front, back = ({"type": "diffuse", "reflectance": each} for each in reflectances)
     props = mi.Properties()
-    props["bsdf"] = mi.load_dict(bsdf)
+    props["bsdf"] = mi.load_dict({"type": "twosided", "front": front, "back": back})
     mesh = mi.Mesh(name, len(vertices), len(faces), has_vertex_normals=True, has_vertex_texcoords=True, props=props)
     if colors is not None:
         mesh.add_attribute("vertex_color", 3, np.ravel(colors).astype(np.float32))
     parameters = mi.traverse(mesh)
-    parameters["vertex_positions"] = np.ravel(vertices).astype(np.float32)
-    parameters["vertex_normals"] = np.ravel(normals).astype(np.float32)
-    parameters["vertex_texcoords"] = np.ravel(uv).astype(np.float32)
+    for key, values in (("positions", vertices), ("normals", normals), ("texcoords", uv)):
+        parameters[f"vertex_{key}"] = np.ravel(values).astype(np.float32)
     parameters["faces"] = np.ravel(faces).astype(np.uint32)
     parameters.update()
     return mesh

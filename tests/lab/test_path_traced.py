@@ -9,20 +9,23 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from console import lab_command
 
+from patchlab.validation import path_traced
+from patchlab.validation.path_traced import draw_optics, photograph_traced
 from patchproof.base import geometry
 from patchproof.base.color import linear_from_srgb
 from patchproof.base.errors import Refused
+from patchproof.base.output import image_pixels
 from patchproof.render.photograph import photograph
 from patchproof.render.pixels import PiecePicture
 from patchproof.render.stage import set_stage
 from patchproof.render.views import lens_frame
-from patchproof.reprints import path_traced
-from patchproof.reprints.path_traced import Optics, draw_optics, photograph_traced
+from patchproof.reprints.reprint import MountedSheet, ReprintSetup
 from patchproof.scene.conditions import with_values
 from patchproof.scene.scene import load_scene
 
-PINHOLE = Optics(light_radius_deg=1.0, aperture_mm=0.0)
+PINHOLE = 1.0, 0.0  # the light's radius in degrees, the lens's diameter in mm
 
 
 @pytest.fixture
@@ -59,9 +62,9 @@ def test_light_and_lens_follow_from_the_view(scene):
     conditions = scene.draw("reprint", 3)
     drawn = [draw_optics(conditions[[i]]) for i in range(3)]
     assert drawn == [draw_optics(conditions[[i]]) for i in range(3)] and len(set(drawn)) == 3
-    for optics in drawn:
-        assert path_traced.LIGHT_RADIUS_DEG[0] <= optics.light_radius_deg <= path_traced.LIGHT_RADIUS_DEG[1]
-        assert path_traced.APERTURE_MM[0] <= optics.aperture_mm <= path_traced.APERTURE_MM[1]
+    for values in drawn:
+        for value, (low, high) in zip(values, (path_traced.LIGHT_RADIUS_DEG, path_traced.APERTURE_MM), strict=True):
+            assert low <= value <= high
 
 
 def test_refused_in_a_sentence(scene, monkeypatch):
@@ -83,12 +86,13 @@ def test_refused_in_a_sentence(scene, monkeypatch):
 def test_levels_are_ours_where_nothing_is_in_the_way(scene, lights, monkeypatch):
     pytest.importorskip("mitsuba")
     monkeypatch.setattr(path_traced, "PASSES", 1)
+    monkeypatch.setattr(path_traced, "draw_optics", lambda conditions: PINHOLE)
     conditions, stage = facing(scene, **lights), set_stage(scene)
     for name in ("dot_gain", "density", "chroma"):
         conditions = with_values(conditions, **{name: 0.0})
     piece = plain(scene, 0.5)
     ours = photograph(stage, piece, conditions, (200, 150), jpeg=False)[0].numpy()
-    traced = photograph_traced(stage, piece, conditions, PINHOLE)[0].numpy()
+    traced = photograph_traced(stage, piece, conditions)[0].numpy()
     bare = photograph(stage, None, conditions, (200, 150), jpeg=False)[0].numpy()
     middle = np.abs(ours - bare).max(0) > 0.01  # the piece
     assert middle.sum() > 500
@@ -98,10 +102,11 @@ def test_levels_are_ours_where_nothing_is_in_the_way(scene, lights, monkeypatch)
 def test_the_piece_lies_where_the_truth_has_it(scene, monkeypatch):
     pytest.importorskip("mitsuba")
     monkeypatch.setattr(path_traced, "PASSES", 2)
+    monkeypatch.setattr(path_traced, "draw_optics", lambda conditions: PINHOLE)
     conditions, stage = facing(scene, ambient=0.8, directional=0.0, azimuth_deg=35.0, roll_deg=10.0), set_stage(scene)
     srgb = torch.ones(64, 64, 3)
     srgb[8:20, 36:56] = 0.0  # a black field on white, off the middle in both axes
-    traced = photograph_traced(stage, PiecePicture.of(srgb), conditions, PINHOLE)
+    traced = photograph_traced(stage, PiecePicture.of(srgb), conditions)
     homography = scene.piece_homographies(conditions, (200, 150))[0]
     field_mm = geometry.rect_corners([36, 8, 20, 12]) * np.array(scene.piece.size_mm) / 64
     around_mm = geometry.rect_corners([32, 4, 28, 20]) * np.array(scene.piece.size_mm) / 64
@@ -116,3 +121,27 @@ def test_the_piece_lies_where_the_truth_has_it(scene, monkeypatch):
     true = np.array([moments["m10"], moments["m01"]]) / moments["m00"]
     assert np.abs(found - true).max() < 0.2  # light falls off a little towards the card's foot
     assert dark.sum() / white == pytest.approx(moments["m00"], rel=0.05)
+
+
+def test_a_mounted_sheet_is_photographed_by_the_renderer_that_is_given(scene):
+    seen = []
+
+    def render(stage, piece, conditions):
+        seen.append((stage.scene, piece))
+        return torch.full((1, 3, 8, 16), 0.5)
+
+    how = ReprintSetup(control="bare", render=render)
+    mounted = MountedSheet(set_stage(scene), None, None, None, how)
+    photo = image_pixels(mounted.photograph(facing(scene)))
+    assert photo.shape == (8, 16, 3) and np.abs(photo.astype(int) - 128).max() <= 1 and seen == [(scene, None)]
+
+
+def test_a_verb_photographs_a_sheet_by_path_tracing(monkeypatch, tmp_path, capsys):
+    taken = []
+    monkeypatch.setattr("patchproof.optimizer.run.load_run", lambda folder, trust: folder.name)
+    monkeypatch.setattr("patchproof.reprints.reprint.reprint", lambda *args, **options: taken.append((args, options)))
+    out = tmp_path / "photos"
+    assert lab_command("trace", "sheet.pdf", "--run", "run", "--n", 6, "--sessions", 2, "--out", out) == 0
+    ((pdf, run, n, folder, how), options) = taken[0]
+    assert (pdf.name, run, n, folder, how) == ("sheet.pdf", "run", 6, out, ReprintSetup(render=photograph_traced))
+    assert options["sessions"] == 2 and "6 photographs" in capsys.readouterr().out
