@@ -35,8 +35,7 @@ from patchproof.app.capture import app as app_module
 from patchproof.app.capture import serve
 from patchproof.app.capture.album import CONTROLS, MOST_BYTES, Album, UploadRefused
 from patchproof.app.capture.app import server_config
-from patchproof.app.capture.collection import PhotoCollection
-from patchproof.app.capture.state import answer_of, map_views, state_of
+from patchproof.app.capture.collection import PhotoCollection, answer_of, map_views, state_of
 from patchproof.app.verify import CaptureInfo, options_of
 from patchproof.app.verify import verify as verify_photos
 from patchproof.base import input

@@ -26,8 +26,7 @@ from starlette.routing import Route
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from patchproof.app.capture.album import MOST_BYTES, UploadRefused, refuse_size
-from patchproof.app.capture.collection import PhotoCollection
-from patchproof.app.capture.state import answer_of, state_of
+from patchproof.app.capture.collection import PhotoCollection, answer_of, state_of
 from patchproof.base.errors import Refused
 from patchproof.evidence.verdict import sessions_needed
 from patchproof.report.page import render_page
