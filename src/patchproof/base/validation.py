@@ -141,11 +141,6 @@ def summarize_names(names: Sequence[str]) -> str:
     return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
-def not_measured_lines(reasons: Mapping[str, str]) -> list[str]:
-    """'not measured: FIGURE (REASON)' for each figure."""
-    return [f"not measured: {figure} ({reason})" for figure, reason in reasons.items()]
-
-
 def within(low: float, high: float) -> AfterValidator:
     """A validator of a range: both ends must lie in [low, high]."""
     return AfterValidator(partial(_check_within, low, high))
