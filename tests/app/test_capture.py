@@ -31,11 +31,11 @@ from browser import Browser
 from synthetic_photos import make_manifest, noisy_design, photograph, save
 
 from patchproof.app.capture import album as album_module
-from patchproof.app.capture import app as app_module
 from patchproof.app.capture import serve
 from patchproof.app.capture.album import CONTROLS, MOST_BYTES, Album, UploadRefused
-from patchproof.app.capture.app import server_config
 from patchproof.app.capture.collection import PhotoCollection, answer_of, map_views, state_of
+from patchproof.app.capture.serve import server_config
+from patchproof.app.cli import journey
 from patchproof.app.verify import CaptureInfo, options_of
 from patchproof.app.verify import verify as verify_photos
 from patchproof.base import input
@@ -232,7 +232,7 @@ def test_only_the_token_opens_anything(client, tmp_path):
 
 def test_the_token_is_compared_whatever_of_it_is_right(client, monkeypatch):
     compared = []
-    monkeypatch.setattr(app_module.hmac, "compare_digest", lambda a, b: compared.append((a, b)) or a == b)
+    monkeypatch.setattr(serve.hmac, "compare_digest", lambda a, b: compared.append((a, b)) or a == b)
     client.get("state")
     client.ask("GET", "/nothing")
     assert compared == [(TOKEN.encode(), TOKEN.encode()), (b"nothing", TOKEN.encode())]
@@ -335,7 +335,7 @@ def test_200_megabytes_are_refused_before_they_are_read(tmp_path, sheet):
 
 
 def test_a_connection_that_is_lost_or_stalls_leaves_nothing_and_the_next_one_all(tmp_path, sheet, photos, monkeypatch):
-    monkeypatch.setattr(app_module, "STALLED_S", 1.0)
+    monkeypatch.setattr(serve, "STALLED_S", 1.0)
     folder = tmp_path / "photos"
     with gathered_in(folder, sheet) as gathered, listening(gathered) as address:
         client, whole = Client(address), ("Content-Length", str(len(photos[0])))
@@ -443,8 +443,9 @@ def test_sheets_without_a_promise_and_machines_without_the_libraries_are_refused
     with pytest.raises(Refused, match="Expected a sheet that promises something, got the design sheet TESTSHEET0"):
         serve.serve_capture(tmp_path / "plain.json", tmp_path / "photos")
     monkeypatch.setitem(sys.modules, "uvicorn", None)
+    monkeypatch.delitem(sys.modules, "patchproof.app.capture.serve")
     with pytest.raises(Refused, match=r"Starlette and uvicorn, got none: pip install 'patchproof\[capture\]'\."):
-        serve.serve_capture(sheet, tmp_path / "photos")
+        journey.capture(sheet, tmp_path / "photos")
     assert not (tmp_path / "photos").exists()
 
 
@@ -489,13 +490,13 @@ def test_a_phone_shows_the_answer_and_sends_again_what_a_lost_connection_cost(tm
 
 def test_silent_and_slow_connections_do_not_keep_the_owner_out(client, photos, monkeypatch):
     """80 of them, more than there are places; the oldest go first, and all in the end."""
-    monkeypatch.setattr(app_module, "TOKEN_SHOWN_S", 0.5)
+    monkeypatch.setattr(serve, "TOKEN_SHOWN_S", 0.5)
     place = urlsplit(client.address).hostname, urlsplit(client.address).port
     silent = [socket.create_connection(place) for _ in range(80)]
     silent[-1].sendall(b"GET /without-an-end")
     assert client.get("state").status == 200 and client.send(photos[0]).status == 200
     for number, each in enumerate(silent):
-        each.settimeout(0.001 if number > 80 - app_module.MOST_STRANGERS else 5)
+        each.settimeout(0.001 if number > 80 - serve.MOST_STRANGERS else 5)
         with closing(each), suppress(ConnectionError, TimeoutError):
             assert each.recv(1) == b"" or number == 0
     last = socket.create_connection(place)
@@ -505,7 +506,7 @@ def test_silent_and_slow_connections_do_not_keep_the_owner_out(client, photos, m
 
 
 def test_a_photograph_that_drips_in_is_given_up(client, photos, monkeypatch, tmp_path):
-    monkeypatch.setattr(app_module, "STALLED_S", 0.3)
+    monkeypatch.setattr(serve, "STALLED_S", 0.3)
     with closing(client.begin(("Content-Length", str(len(photos[0]))), body=photos[0][:20])) as connection:
         for byte in photos[0][20:30]:  # one each 0.05 s: never silent for 0.3 s
             with suppress(OSError):

@@ -17,7 +17,7 @@ from PIL import Image
 from patchproof.app import cli
 from patchproof.app.plan import errors
 from patchproof.app.plan.errors import Setup, measure_terms, scene_terms
-from patchproof.app.plan.plan import marker_plan, measure_cost, measured_lines, plan_geometry, resolution_plan
+from patchproof.app.plan.plan import measure_cost, measured_lines, needed_marker_mm, plan_geometry, resolution_plan
 from patchproof.base.errors import Refused
 from patchproof.base.settings import SceneSettings
 from patchproof.base.validation import validate_model
@@ -151,12 +151,11 @@ def test_the_marker_rule_by_hand(tmp_path):
     """7 modules of 2.5 px at the only scale there is; from far away none that fits is readable."""
     scene = scene_with(tmp_path, **STRAIGHT, view__distance_mm=[400, 400], camera__photo_px=[1600, 1200])
     away_mm = 400 - scene.placement.center_mm @ scene.frame.normal
-    markers = marker_plan(scene)
-    assert markers["needed_mm"] == pytest.approx(max(8, 7 * 2.5 * away_mm / 600), rel=0.03)
-    assert markers["printed_mm"] == pytest.approx(markers["needed_mm"], rel=0.03) and markers["unreadable_share"] == 0
+    needed_mm = needed_marker_mm(scene)
+    assert needed_mm == pytest.approx(max(8, 7 * 2.5 * away_mm / 600), rel=0.03)
+    assert scene.piece.marker_mm == pytest.approx(needed_mm, rel=0.03) and scene.unreadable_share == 0
     distant = scene_with(tmp_path, **STRAIGHT, view__distance_mm=[9000, 9000])
-    far = marker_plan(distant)
-    assert far["printed_mm"] < far["needed_mm"] / 2 and far["unreadable_share"] == 1
+    assert distant.piece.marker_mm < needed_marker_mm(distant) / 2 and distant.unreadable_share == 1
 
 
 def test_stronger_terms_leave_more_and_small_views_may_not_show_them(tmp_path):

@@ -11,6 +11,7 @@ from typer import Argument, BadParameter, Exit, Option
 from patchproof.app.cli import console
 from patchproof.app.cli.console import Cluster, Device, Jobs, Models, Overwrite, Resume, Seed, Trust, say, warn
 from patchproof.base.compute import Compute
+from patchproof.base.errors import Refused
 from patchproof.base.progress import progress_bar
 from patchproof.base.text import command_text
 
@@ -254,7 +255,11 @@ def capture(
 
     signal.signal(signal.SIGINT, signal.default_int_handler)  # it ends the server, and the verdict follows
     from patchproof.app.capture.album import CONTROLS_FOLDER
-    from patchproof.app.capture.serve import serve_capture
+
+    try:
+        from patchproof.app.capture.serve import serve_capture
+    except ImportError:
+        raise Refused("Starlette and uvicorn", "none", "pip install 'patchproof[capture]'") from None
     from patchproof.evidence.annotations import CORNERS_FILE
     from patchproof.report.words import verdict_lines
     from patchproof.sheets.manifest import load_manifest

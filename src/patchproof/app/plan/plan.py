@@ -67,7 +67,7 @@ def plan_geometry(scene_path: str | Path, *, progress: Progress = no_progress) -
     lines += ["surface", *_indented(filter(None, surface))]
     lines += ["resolution", *_indented(_resolution_lines(resolution_plan(problem)))]
     if isinstance(scene, PieceScene):
-        lines += ["markers", f"  {_marker_line(marker_plan(scene), fit['family'])}"]
+        lines += ["markers", f"  {_marker_line(scene, fit['family'])}"]
     return problem, lines
 
 
@@ -116,11 +116,10 @@ def resolution_plan(problem: Problem) -> PlanData:
     }
 
 
-def marker_plan(scene: PieceScene) -> dict[str, float]:
+def needed_marker_mm(scene: PieceScene) -> float:
     """Apply the rule for the markers' size (PX_PER_MODULE in READABLE_SHARE of the views) to this scene's views."""
     px_per_mm = float(np.quantile(scene.px_per_mm(scene.photo_px, shorter=True), 1 - READABLE_SHARE))
-    needed_mm = max(MARKER_MODULES * PX_PER_MODULE / px_per_mm, SMALLEST_MARKER_MM)
-    return {"needed_mm": needed_mm, "printed_mm": scene.piece.marker_mm, "unreadable_share": scene.unreadable_share}
+    return max(MARKER_MODULES * PX_PER_MODULE / px_per_mm, SMALLEST_MARKER_MM)
 
 
 def _draft(problem: Problem, progress: Progress) -> tuple[Tensor, PlanData]:
@@ -199,14 +198,14 @@ def _resolution_lines(views: PlanData) -> list[str]:
     ]
 
 
-def _marker_line(markers: PlanData, family: str) -> str:
-    needed, printed = markers["needed_mm"], markers["printed_mm"]
+def _marker_line(scene: PieceScene, family: str) -> str:
+    needed, printed = needed_marker_mm(scene), scene.piece.marker_mm
     if not printed:
         return "none: photographs are located by the design's corners"
     note = "" if printed > 0.95 * needed else " (all that page, object or blank allows)"
     return (
         f"needed {needed:.1f} mm ({PX_PER_MODULE:g} px per module at the {READABLE_SHARE:.0%} point of the views), "
-        f"printed {printed:.1f} mm{note}; {measurable_text(markers['unreadable_share'], family)}"
+        f"printed {printed:.1f} mm{note}; {measurable_text(scene.unreadable_share, family)}"
     )
 
 
