@@ -83,10 +83,10 @@ def ledger_bars(ledger: Mapping[str, Any]) -> list[tuple[str, float, float, str,
     rises = (ledger["photo"] > level) != (sum(each["share"] for each in ledger["shares"].values()) < 0)
     for step, each in ledger["shares"].items():
         sign, kind = 100 if rises else -100, "miss" if each["share"] > 0 else "hit"
-        change, ends = sign * each["share"] / 100, sorted(sign * end for end in each["interval"] or ())
-        text = f"{100 * change:+.1f}" + (" [{:+.1f}, {:+.1f}]".format(*ends) if ends else "")
-        rows.append((_STEPS.get(step, step), *sorted((level, level + change)), kind, text))
-        level += change
+        points = [round(sign * value, 1) + 0 for value in (each["share"], *(each["interval"] or ()))]  # + 0: no -0.0
+        text = f"{points[0]:+.1f}" + (" [{:+.1f}, {:+.1f}]".format(*sorted(points[1:])) if points[1:] else "")
+        rows.append((_STEPS.get(step, step), *sorted((level, level + sign * each["share"] / 100)), kind, text))
+        level += sign * each["share"] / 100
     return [*rows, ("photographs", 0.0, ledger["photo"], "seen", f"{100 * ledger['photo']:.0f} %")]
 
 

@@ -74,7 +74,7 @@ class PhotoCollection:
     def add(self, path: Path, photo: MeasuredPhoto) -> None:
         """Add a measured photograph of the album."""
         self._measured[path], self._photos = photo, None
-        self.album.remember(path, photo.entry.sha256)
+        self.album.by_sha256 |= {photo.entry.sha256: path} if photo.entry.sha256 else {}
 
     def wants_corners(self, path: Path) -> bool:
         """Tell whether a person may tap corners: of a print without markers, until the photograph is counted."""
