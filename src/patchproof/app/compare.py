@@ -132,20 +132,15 @@ def _tables(
     goal: Goal, networks: Sequence[str], by_design: Mapping[str, AnswersByKind], fresh: Mapping[str, AnswersByKind]
 ) -> list[Table]:
     """The best two under fresh conditions, and all designs; the first is the best."""
-    n = next(iter(fresh.values()))["design"].recognized.shape[1]
 
     def rows(answers: Mapping[str, AnswersByKind], names: Sequence[str]) -> tuple[tuple[Value, ...], ...]:
         return tuple(_row(goal, answers, name, network, i) for name in answers for i, network in enumerate(names))
 
-    title = "The best two, under conditions that had no say in choosing them"
-    about = f"{n} fresh conditions: these are the figures to quote."
-    chosen = (
-        f"{n} conditions, the same for all; differences are paired. The best is the best by the first network. That it "
-        "was chosen on these conditions flatters its rate and its lead."
-    )
+    title = "The best two, under conditions that had no say in choosing them: the figures to quote"
+    about = "Differences are paired. That the best by the first network was chosen here flatters its rate and its lead."
     return [
-        Table("fresh", title, _HEAD, rows(fresh, networks[:1]), about),
-        Table("designs", "All designs, under the same conditions", _HEAD, rows(by_design, networks), chosen),
+        Table("fresh", title, _HEAD, rows(fresh, networks[:1])),
+        Table("designs", "All designs, under the same conditions", _HEAD, rows(by_design, networks), about),
     ]
 
 

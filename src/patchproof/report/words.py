@@ -112,16 +112,12 @@ def promise_summary(promise: Any, settings: Mapping[str, Any], run: str = "RUN")
 
 
 def run_lines(run: Any) -> list[str]:
-    """Sum up a finished run, and say which command comes next."""
+    """Sum up a finished run, and say which command comes next if it helps; else the summary says what to do."""
     folder, settings = str(run.folder), run.scene.settings.model_dump()
     page = f"{run.folder.resolve().name}.json" if settings["sheet"]["template"] == NO_PAGE else "sheet.pdf"
-    following = command_text("sheet", folder, "--out", page)
-    if settings["patch"]["kind"] != "patch":
-        following = command_text("evaluate", folder)
-    if run.promise.answer == "cannot_tell":
-        following = run.promise.command(folder)
+    following = ("sheet", folder, "--out", page) if settings["patch"]["kind"] == "patch" else ("evaluate", folder)
     lines = promise_lines(run.promise, settings | {"imported": run.details.get("imported")}, folder)
-    return [*lines, f"run: {folder}", *([f"next: {following}"] if run.promise.answer != "does_not_help" else [])]
+    return [*lines, f"run: {folder}", *([f"next: {command_text(*following)}"] if run.promise.answer == "helps" else [])]
 
 
 def verdict_lines(report: Any) -> list[str]:
