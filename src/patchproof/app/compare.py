@@ -158,7 +158,7 @@ def _drawing(runs: Mapping[str, Run], answers: Mapping[str, AnswersByKind]) -> D
         grid = figure.subplots(len(runs), 2, squeeze=False, width_ratios=(1, 3), sharex="col")
         for axes, (name, run) in zip(grid, runs.items(), strict=True):
             estimates = {kind: rate(answer.recognized[0].tolist()) for kind, answer in answers[name].items()}
-            draw_rates(*axes, {kind: (e.value, (e.low, e.high)) for kind, e in estimates.items() if e}, run.design)
+            draw_rates(axes, {kind: (e.value, (e.low, e.high)) for kind, e in estimates.items() if e}, run.design)
             axes[1].set_title(name, fontsize=9, loc="left")
 
     about = "By the first network, under the conditions that all designs share."

@@ -41,13 +41,14 @@ def rates_figure(heading: str, rates: Rates, picture: np.ndarray | None = None) 
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(7, 0.4 * len(rates) + 1.6), layout="constrained")
-    draw_rates(*figure.subplots(1, 2, width_ratios=(1, 2)), rates, picture)
+    draw_rates(figure.subplots(1, 2, width_ratios=(1, 2)), rates, picture)
     figure.suptitle(printable(heading), fontsize=10)
     return figure
 
 
-def draw_rates(photo: Any, axes: Any, rates: Rates, picture: np.ndarray | None) -> None:
-    """Fill the axes `photo` with the picture, and `axes` with the bars of `rates_figure`."""
+def draw_rates(pair: Any, rates: Rates, picture: np.ndarray | None) -> None:
+    """Fill the first of two matplotlib axes with the picture, the second with the bars of `rates_figure`."""
+    photo, axes = pair
     photo.set_axis_off()
     if picture is not None:
         photo.imshow(picture, interpolation="nearest")

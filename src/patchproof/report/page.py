@@ -120,7 +120,7 @@ def _escape_undrawable(figure: "Figure") -> None:
         labels = [label.get_text() for label in axis.get_ticklabels()]
         if labels != list(map(shown, labels)):
             axis.set_ticklabels(map(shown, labels))
-    for text in figure.findobj(lambda artist: isinstance(artist, Text)):
+    for text in figure.findobj(Text):
         text.set(text=shown(text.get_text()))
 
 

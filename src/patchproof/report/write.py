@@ -85,8 +85,9 @@ def ledger_bars(ledger: Mapping[str, Any]) -> list[tuple[str, float, float, str,
         sign, kind = 100 if rises else -100, "miss" if each["share"] > 0 else "hit"
         points = [round(sign * value, 1) + 0 for value in (each["share"], *(each["interval"] or ()))]  # + 0: no -0.0
         text = f"{points[0]:+.1f}" + (" [{:+.1f}, {:+.1f}]".format(*sorted(points[1:])) if points[1:] else "")
-        rows.append((_STEPS.get(step, step), *sorted((level, level + sign * each["share"] / 100)), kind, text))
-        level += sign * each["share"] / 100
+        left, right = sorted((level, after := level + sign * each["share"] / 100))
+        rows.append((_STEPS.get(step) or step, left, right, kind, text))
+        level = after
     return [*rows, ("photographs", 0.0, ledger["photo"], "seen", f"{100 * ledger['photo']:.0f} %")]
 
 
