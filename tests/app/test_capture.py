@@ -441,6 +441,7 @@ def test_a_phone_shows_the_answer_and_sends_again_what_a_lost_connection_cost(tm
             said = browser.wait_for("document.querySelector('#answer').innerText")
             assert said.startswith("recognized as bright") and "session_01/photo_0001.jpg" in said
             assert browser.evaluate("document.querySelector('#answer img').naturalWidth") > 300
+            assert browser.evaluate("document.querySelector('#latest').innerText") == ""  # said once
             browser.call(
                 "Network.emulateNetworkConditions", offline=True, latency=0, downloadThroughput=0, uploadThroughput=0
             )

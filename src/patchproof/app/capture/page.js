@@ -5,7 +5,7 @@ const $ = id => document.getElementById(id);
 const mostBytes = Number(document.body.dataset.mostBytes);
 const queue = [], taps = new Map(), points = [], loupeZoom = 4;
 const shown = $("tap").querySelector("img"), handles = [...$("tap").querySelectorAll("button")];
-let sending = false, into = null, known = "", tapped;
+let sending = false, into = null, known = "", tapped, answered;
 
 function make(tag, text, kind) {
   const made = document.createElement(tag);
@@ -66,6 +66,7 @@ function lines(photo) {
 }
 
 function answer(photo, file) {
+  answered = photo.file;
   if (photo.tap) taps.set(photo.file, {file, preview: photo.picture});
   else taps.delete(photo.file);
   const parts = [lines(photo)];
@@ -123,7 +124,8 @@ function show(state) {
   const rows = state.sessions.map(one => row("td", one.name, `${one.judged} of ${state.each}`, one.recognized));
   const controls = state.controls.map(one => row("td", `control: ${one.name}`, one.photos, one.recognized));
   $("sessions").replaceChildren(row("th", "", "counted", "recognized"), ...rows, ...controls);
-  $("latest").replaceChildren(...state.latest.map(photo => { const item = make("li"); item.append(lines(photo)); return item; }));
+  const before = state.latest.filter(photo => photo.file !== answered);  // that one is shown above
+  $("latest").replaceChildren(...before.map(photo => { const item = make("li"); item.append(lines(photo)); return item; }));
 }
 
 function row(tag, ...cells) {
