@@ -217,7 +217,7 @@ def test_errors_are_one_tree_and_cross_processes():
         UploadRefused(404, "a", "b", "c"),
         pp.PhotoRejected("blurred", 1.0, 2.0, "hold still"),
         UnsupportedNetwork("a thing"),
-        TimeLimitExceeded(3.0),
+        TimeLimitExceeded("3 s"),
     ]
     for error in errors:
         again = pickle.loads(pickle.dumps(error))

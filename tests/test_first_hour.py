@@ -143,7 +143,6 @@ def typed_apart(line: str, folder: Path) -> tuple[int, str, float]:
 def test_a_first_hour_says_at_each_step_what_to_do_next(tmp_path, monkeypatch):
     monkeypatch.setattr("patchproof.optimizer.loop.SELECT_VIEWS", 8)  # what they cost is time
     monkeypatch.setattr("patchproof.optimizer.run.DRAFT_EFFORT", (24, 40))
-    monkeypatch.setattr("patchproof.app.begin.sides._STEP_DEG", 90)
     small = "[camera]\nphoto_px = [1040, 780]\n[background]\ncolor = [0.5, 0.5, 0.5]\n"
     said = {line: text for line, (text, _) in spent(tmp_path, typed_here, small).items()}
     asked, new, preview, optimize, sheet, _, refused, verify = said.values()

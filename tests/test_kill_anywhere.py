@@ -35,7 +35,7 @@ LATE = """
     pikepdf pypdfium2 reportlab.pdfgen.canvas segno safetensors.torch fuzz.readers test_optimize test_verify_run
     fake_networks toy_studies patchlab.study.study patchproof.report.write
     patchproof.app.verify patchproof.optimizer.run patchproof.reprints.run_sheet patchproof.reprints.reprint
-    patchproof.classifier.builtin patchproof.classifier.custom patchproof.report.plots"""
+    patchproof.classifier.builtin patchproof.classifier.custom patchproof.report.write"""
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs os.fork")

@@ -31,12 +31,11 @@ from browser import Browser
 from synthetic_photos import make_manifest, noisy_design, photograph, save
 
 from patchproof.app.capture import album as album_module
-from patchproof.app.capture import app as app_module
 from patchproof.app.capture import serve
 from patchproof.app.capture.album import CONTROLS, MOST_BYTES, Album, UploadRefused
-from patchproof.app.capture.app import server_config
-from patchproof.app.capture.collection import PhotoCollection
-from patchproof.app.capture.state import answer_of, map_views, state_of
+from patchproof.app.capture.collection import PhotoCollection, answer_of, state_of
+from patchproof.app.capture.serve import server_config
+from patchproof.app.cli import journey
 from patchproof.app.verify import CaptureInfo, options_of
 from patchproof.app.verify import verify as verify_photos
 from patchproof.base import input
@@ -44,9 +43,8 @@ from patchproof.base.errors import Refused
 from patchproof.base.workers import open_workers
 from patchproof.evidence.annotations import load_corners
 from patchproof.evidence.measure import MeasuredPhoto
-from patchproof.evidence.results import CameraPose, Geometry, PhotoEntry, Prediction
-from patchproof.evidence.verdict import sessions_needed
-from patchproof.sheets.manifest import ConditionClaim, Manifest, dump_manifest, load_manifest
+from patchproof.evidence.results import CameraPose, Prediction
+from patchproof.sheets.manifest import Manifest, dump_manifest, load_manifest
 from test_copies import seen
 from test_corners import CORNERS_PX, PX_FROM_MM, SIZE_PX
 from test_verify_run import NET, promise, shot
@@ -202,7 +200,6 @@ def test_two_tabs_send_a_walk_and_verify_says_what_the_page_said(tmp_path, sheet
         and summary.sessions_known_from == "folders"
     )
     assert state["controls"] == [{"name": "gray", "photos": 1, "recognized": 0}]
-    assert sum(map(sum, state["map"]["photos"])) + state["map"]["elsewhere"] == summary.judged
 
 
 def test_a_restart_goes_on_and_measures_nothing_twice(tmp_path, sheet, photos, monkeypatch):
@@ -233,7 +230,7 @@ def test_only_the_token_opens_anything(client, tmp_path):
 
 def test_the_token_is_compared_whatever_of_it_is_right(client, monkeypatch):
     compared = []
-    monkeypatch.setattr(app_module.hmac, "compare_digest", lambda a, b: compared.append((a, b)) or a == b)
+    monkeypatch.setattr(serve.hmac, "compare_digest", lambda a, b: compared.append((a, b)) or a == b)
     client.get("state")
     client.ask("GET", "/nothing")
     assert compared == [(TOKEN.encode(), TOKEN.encode()), (b"nothing", TOKEN.encode())]
@@ -336,7 +333,7 @@ def test_200_megabytes_are_refused_before_they_are_read(tmp_path, sheet):
 
 
 def test_a_connection_that_is_lost_or_stalls_leaves_nothing_and_the_next_one_all(tmp_path, sheet, photos, monkeypatch):
-    monkeypatch.setattr(app_module, "STALLED_S", 1.0)
+    monkeypatch.setattr(serve, "STALLED_S", 1.0)
     folder = tmp_path / "photos"
     with gathered_in(folder, sheet) as gathered, listening(gathered) as address:
         client, whole = Client(address), ("Content-Length", str(len(photos[0])))
@@ -361,32 +358,6 @@ def test_a_folder_with_anything_else_in_it_is_refused(tmp_path):
     (tmp_path / "letter.txt").write_text("mine")
     with pytest.raises(Refused, match=r"this command's own output only .* with letter.txt"):
         Album(tmp_path)
-
-
-def entry(azimuth_deg: float | None, px_per_mm: float) -> PhotoEntry:
-    geometry = Geometry(
-        residual_mm=0, px_per_mm=px_per_mm, tilt_deg=20, contrast=0.8, blur_px=1, corner_uncertainty_mm=0.1
-    )
-    pose = CameraPose(azimuth_uncertainty_deg=1, azimuth_deg=azimuth_deg)
-    return PhotoEntry(file="a", status="measured", photo_px=(1200, 900), geometry=geometry, pose=pose)
-
-
-def test_the_map_of_views_by_hand():
-    """Two conditions in three in the nearest third on the left, one far on the right; distances are 1 over scale."""
-    near_left, far_right = condition(-10.0, 4.0), condition(14.0, 1.0)
-    conditions = [ConditionClaim(**c) for c in (near_left, near_left, far_right)]
-    blind = ConditionClaim(**near_left | {"azimuth_deg": None})  # from behind: nobody can photograph that
-    shown = [entry(-9.0, 3.9), entry(-30.0, 6.0), entry(13.0, 1.35), entry(None, 2.0)]
-    views = map_views([*conditions, blind], shown, 12, 900.0, 90.0)
-    assert views is not None and views["columns"] == ["10° left to 2° right", "2–14° right"]
-    assert views["rows"] == ["20–40 %", "13–20 %", "10–13 %"] and views["of_picture"]
-    assert views["wanted"] == [[8, 0], [0, 0], [0, 4]]
-    assert views["photos"] == [[2, 0], [0, 1], [0, 0]] and views["elsewhere"] == 1 and views["next"] == (0, 0)
-    halved = map_views(conditions, [entry(-9.0, 7.8)], 12, 450.0, 90.0)  # photographs of twice the promised size
-    assert halved is not None and halved["photos"][0][0] == 1
-    full = map_views(conditions, [entry(-9.0, 3.9)] * 8 + [entry(13.0, 1.0)] * 4, 12, None, 90.0)
-    assert full is not None and full["next"] is None and full["rows"][0] == "2.0–4.0 px/mm"
-    assert map_views([blind], shown, 12, None, 90.0) is None
 
 
 def has_timer(_: object) -> None:
@@ -444,8 +415,9 @@ def test_sheets_without_a_promise_and_machines_without_the_libraries_are_refused
     with pytest.raises(Refused, match="Expected a sheet that promises something, got the design sheet TESTSHEET0"):
         serve.serve_capture(tmp_path / "plain.json", tmp_path / "photos")
     monkeypatch.setitem(sys.modules, "uvicorn", None)
+    monkeypatch.delitem(sys.modules, "patchproof.app.capture.serve")
     with pytest.raises(Refused, match=r"Starlette and uvicorn, got none: pip install 'patchproof\[capture\]'\."):
-        serve.serve_capture(sheet, tmp_path / "photos")
+        journey.capture(sheet, tmp_path / "photos")
     assert not (tmp_path / "photos").exists()
 
 
@@ -469,6 +441,7 @@ def test_a_phone_shows_the_answer_and_sends_again_what_a_lost_connection_cost(tm
             said = browser.wait_for("document.querySelector('#answer').innerText")
             assert said.startswith("recognized as bright") and "session_01/photo_0001.jpg" in said
             assert browser.evaluate("document.querySelector('#answer img').naturalWidth") > 300
+            assert browser.evaluate("document.querySelector('#latest').innerText") == ""  # said once
             browser.call(
                 "Network.emulateNetworkConditions", offline=True, latency=0, downloadThroughput=0, uploadThroughput=0
             )
@@ -490,13 +463,13 @@ def test_a_phone_shows_the_answer_and_sends_again_what_a_lost_connection_cost(tm
 
 def test_silent_and_slow_connections_do_not_keep_the_owner_out(client, photos, monkeypatch):
     """80 of them, more than there are places; the oldest go first, and all in the end."""
-    monkeypatch.setattr(app_module, "TOKEN_SHOWN_S", 0.5)
+    monkeypatch.setattr(serve, "TOKEN_SHOWN_S", 0.5)
     place = urlsplit(client.address).hostname, urlsplit(client.address).port
     silent = [socket.create_connection(place) for _ in range(80)]
     silent[-1].sendall(b"GET /without-an-end")
     assert client.get("state").status == 200 and client.send(photos[0]).status == 200
     for number, each in enumerate(silent):
-        each.settimeout(0.001 if number > 80 - app_module.MOST_STRANGERS else 5)
+        each.settimeout(0.001 if number > 80 - serve.MOST_STRANGERS else 5)
         with closing(each), suppress(ConnectionError, TimeoutError):
             assert each.recv(1) == b"" or number == 0
     last = socket.create_connection(place)
@@ -506,7 +479,7 @@ def test_silent_and_slow_connections_do_not_keep_the_owner_out(client, photos, m
 
 
 def test_a_photograph_that_drips_in_is_given_up(client, photos, monkeypatch, tmp_path):
-    monkeypatch.setattr(app_module, "STALLED_S", 0.3)
+    monkeypatch.setattr(serve, "STALLED_S", 0.3)
     with closing(client.begin(("Content-Length", str(len(photos[0]))), body=photos[0][:20])) as connection:
         for byte in photos[0][20:30]:  # one each 0.05 s: never silent for 0.3 s
             with suppress(OSError):
@@ -588,14 +561,14 @@ def test_400_photographs_are_answered_at_once_and_as_from_scratch(tmp_path, shee
     with gathered_in(tmp_path / "photos", sheet) as gathered, gathered_in(tmp_path / "other", sheet) as other:
         paths = [gathered.album.folder / "session_01" / f"photo_{number:04}.jpg" for number in range(1, 403)]
         gathered._measured |= {path: photo(path) for path in paths[:400]}
-        state_of(gathered, 3)
+        state_of(gathered)
         for path in paths[400:]:
             gathered.add(path, photo(path))
             start = time.process_time()
-            state, answer = state_of(gathered, 3), answer_of(gathered, path)
+            state, answer = state_of(gathered), answer_of(gathered, path)
             assert time.process_time() - start < 0.3
         other._measured, other.album = dict(gathered._measured), gathered.album
-        assert (state_of(other, 3), answer_of(other, paths[-1])) == (state, answer)
+        assert (state_of(other), answer_of(other, paths[-1])) == (state, answer)
         assert 300 < state["judged"] < state["photos"] == 402
 
 
@@ -650,7 +623,7 @@ def test_tapped_corners_are_measured_by_kept_and_taken_by_verify(tmp_path, bare)
         assert client.post(tapped(CORNERS_PX)).json["state"] == right["state"]  # what is counted stays as it is
     assert load_corners(file)["session_01/photo_0001.jpg"].numbers == pytest.approx((CORNERS_PX + 1).ravel(), abs=0.01)
     with gathered_in(folder, sheet) as gathered:  # after a restart, without measuring
-        assert json.loads(json.dumps(state_of(gathered, sessions_needed(gathered.manifest.promise)))) == right["state"]
+        assert json.loads(json.dumps(state_of(gathered))) == right["state"]
     options = {"models": [NET], "ledger_photos": 0, "capture": CaptureInfo(corners=file, find=True)}
     report = verify_photos(folder, sheet, tmp_path / "report", **options)
     assert report.summary.judged == 1 and report.photos[0].located == "corners"

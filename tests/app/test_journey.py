@@ -21,7 +21,7 @@ from patchproof.sheets.pdf_raster import attached_manifests, rasterize_page
 
 PHOTOS, SCAN_DPI = 6, 100
 # libraries of the demo and of `verify`, which a process of both imports once
-BOTH_LOAD = ("torch", "cv2", "scipy.stats", "scipy.optimize", "matplotlib.backends.backend_svg", "jinja2", "pydantic")
+BOTH_LOAD = ("torch", "cv2", "scipy.stats", "scipy.optimize", "matplotlib", "jinja2", "pydantic")
 
 
 @pytest.fixture(scope="module")

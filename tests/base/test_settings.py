@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from patchproof.base import packaged
-from patchproof.base.content_identity import content_identity
 from patchproof.base.errors import Refused
+from patchproof.base.fingerprint import content_identity
 from patchproof.base.goal import Goal
 from patchproof.base.packaged import packaged_path
 from patchproof.base.settings import SceneSettings, identity_settings, load_scene_settings

@@ -125,7 +125,7 @@ def test_its_names_are_no_files_and_need_no_trust(tmp_path):
 
 
 def test_the_demo_has_a_scene_for_it(tmp_path):
-    settings = load_scene_settings(demo_scene(tmp_path, "imagenet"))
+    settings = load_scene_settings(demo_scene(tmp_path, imagenet=True))
     assert (settings.object.mesh, settings.target.label, settings.target.models) == (
         *("primitive:carton", "carton"),
         ("imagenet",),

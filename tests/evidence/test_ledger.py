@@ -32,7 +32,7 @@ from patchproof.evidence.reproject import (
 from patchproof.evidence.surface import PromisedColors, piece_picture, promised_of, surface_of
 from patchproof.evidence.task import Options
 from patchproof.photo.quality import FrameLight, pattern_light
-from patchproof.report.plots import ledger_plot
+from patchproof.report.write import ledger_bars
 from patchproof.sheets.manifest import Manifest
 from test_verify_run import measured
 
@@ -259,8 +259,13 @@ def test_of_two_colors_print_and_light_are_one_step(tmp_path):
     found = gather_evidence(tmp_path, sheet(two_colors=True), Options([NET], identity_printer())).summary.ledger
     assert list(found.shares) == ["gamut", "print_light_and_camera", "blur_and_noise", "photo"]
     assert found.shares["print_light_and_camera"].share > 0.1
-    plot = ledger_plot(found.model_dump())
-    assert "print, light, camera" in plot and "not explained" in plot
+    bars = ledger_bars(found.model_dump())
+    assert [bar[0] for bar in bars[:3]] == ["ideal", "gamut", "print, light, camera"] and bars[-2][0] == "not explained"
+    share = found.shares["print_light_and_camera"].share
+    _, left, right, kind, text = bars[2]
+    assert right - left == pytest.approx(share) and kind == "miss" and text.startswith(f"{-100 * share:+.1f}")
+    last = bars[-2][1 if bars[-2][3] == "miss" else 2]  # where the last step ends
+    assert last == pytest.approx(found.photo) and bars[-1][2] == found.photo
 
 
 def test_no_ledger_where_none_was_asked_for(tmp_path):

@@ -268,7 +268,7 @@ def run_pictures(place: Place, number: int) -> Use:
 
 
 def checkpoint(place: Place, number: int) -> Use:
-    from patchproof.base.run_files import CHECKPOINT_FILE
+    from patchproof.base.output import CHECKPOINT_FILE
     from patchproof.optimizer.loop import load_checkpoint
 
     path = place.given / CHECKPOINT_FILE

@@ -15,7 +15,7 @@ from PIL import Image
 
 import patchproof as pp
 from patchproof.app.compare import _views_of
-from patchproof.app.plan.plan import geometry_lines, measured_lines, measured_plan, plan_geometry
+from patchproof.app.plan.plan import plan_geometry
 from patchproof.base.errors import Refused
 from patchproof.base.intervals import student_mean
 from patchproof.base.settings import SceneSettings
@@ -278,13 +278,11 @@ def test_the_picture_shows_the_places_and_the_chosen_outline(tmp_path):
     assert {*map(tuple, ranks), (230, 0, 90)} <= shown
 
 
-def test_plan_reports_the_search(tmp_path, monkeypatch, a_small_run):
-    monkeypatch.setattr("patchproof.app.plan.plan.SELECT_VIEWS", 8)
-    monkeypatch.setattr("patchproof.app.plan.plan.REPEATS", 1)
-    plan = measured_plan(*plan_geometry(scene_file(tmp_path)), views=2)
-    assert plan["surface"]["family"] == "card"
-    lines = [*geometry_lines(plan), *measured_lines(plan)]
-    assert f"chosen: at_mm = [{plan['place'].at[0]:g}" in lines[lines.index("place") + 1]
+def test_plan_reports_the_search(tmp_path, a_small_run):
+    problem, lines = plan_geometry(scene_file(tmp_path))
+    place = problem.scene.settings.patch
+    assert f"chosen: at_mm = [{place.at_mm[0]:g}" in lines[lines.index("place") + 1]
+    assert lines[lines.index("surface") + 1].startswith("  card")
 
 
 def test_the_middle_of_a_side_keeps_to_the_limits_of_other_places():

@@ -140,7 +140,7 @@ def test_the_page_says_what_the_report_says_and_escapes_it(shown):
     ):
         assert words in text
     assert "<b>bright" not in text and "Promise broken" not in text
-    assert text.count("<svg") == 3  # tilt, pixels per mm, ledger
+    assert "<svg" not in text and "where confidence is lost" in text.casefold()
 
 
 def test_an_answer_about_a_photograph_that_does_not_count_is_not_called_recognized(tmp_path):
@@ -272,9 +272,6 @@ def test_every_picture_has_words_of_its_own(tmp_path):
         tags = Alternatives()
         tags.feed(page.read_text())
         assert len(tags.texts) == len(set(tags.texts)) == count and all(tags.texts)
-    text = (tmp_path / "report.html").read_text()
-    named = re.findall(r'<div role="img" aria-label="([^"]+)"><svg', text)
-    assert len(named) == len(set(named)) == text.count("<svg") == 3
 
 
 def test_a_figure_for_a_phone_is_narrow_with_panels_one_below_the_other_and_whole_titles(tmp_path):

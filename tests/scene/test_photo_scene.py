@@ -11,9 +11,8 @@ import pytest
 from PIL import Image
 
 from patchproof.base.color import LINEAR_FROM_CODE, srgb_from_linear
-from patchproof.base.content_identity import content_identity
 from patchproof.base.errors import Refused
-from patchproof.base.fingerprint import files_sha256
+from patchproof.base.fingerprint import content_identity, files_sha256
 from patchproof.base.geometry import apply_homography, intrinsics, look_at, plane_homography, rect_corners
 from patchproof.base.packaged import packaged_path
 from patchproof.base.settings import SceneSettings

@@ -20,6 +20,7 @@ from patchproof.base.compute import Compute
 from patchproof.base.errors import Refused
 from patchproof.base.goal import Goal
 from patchproof.base.intervals import estimate_difference, rate
+from patchproof.base.notebook import draw_rates
 from patchproof.base.output import new_folder
 from patchproof.base.progress import Progress, no_progress
 from patchproof.base.validation import summarize_names
@@ -131,27 +132,15 @@ def _tables(
     goal: Goal, networks: Sequence[str], by_design: Mapping[str, AnswersByKind], fresh: Mapping[str, AnswersByKind]
 ) -> list[Table]:
     """The best two under fresh conditions, and all designs; the first is the best."""
-    n = next(iter(fresh.values()))["design"].recognized.shape[1]
 
     def rows(answers: Mapping[str, AnswersByKind], names: Sequence[str]) -> tuple[tuple[Value, ...], ...]:
         return tuple(_row(goal, answers, name, network, i) for name in answers for i, network in enumerate(names))
 
+    title = "The best two, under conditions that had no say in choosing them: the figures to quote"
+    about = "Differences are paired. That the best by the first network was chosen here flatters its rate and its lead."
     return [
-        Table(
-            "fresh",
-            "The best two, under conditions that had no say in choosing them",
-            _HEAD,
-            rows(fresh, networks[:1]),
-            f"{n} fresh conditions: these are the figures to quote.",
-        ),
-        Table(
-            "designs",
-            "All designs, under the same conditions",
-            _HEAD,
-            rows(by_design, networks),
-            f"{n} conditions, the same for all; differences are paired. The best is the best by the first network. "
-            "That it was chosen on these conditions flatters its rate and its lead.",
-        ),
+        Table("fresh", title, _HEAD, rows(fresh, networks[:1])),
+        Table("designs", "All designs, under the same conditions", _HEAD, rows(by_design, networks), about),
     ]
 
 
@@ -167,20 +156,10 @@ def _drawing(runs: Mapping[str, Run], answers: Mapping[str, AnswersByKind]) -> D
 
     def draw(figure: "Figure") -> None:
         grid = figure.subplots(len(runs), 2, squeeze=False, width_ratios=(1, 3), sharex="col")
-        for (picture, axes), (name, run) in zip(grid, runs.items(), strict=True):
-            picture.imshow(run.design, interpolation="nearest")
-            picture.set_axis_off()
-            kinds = list(answers[name])[::-1]
-            for height, kind in enumerate(kinds):
-                estimate = rate(answers[name][kind].recognized[0].tolist())
-                color = "#2457c5" if kind == "design" else "#b0713c"
-                if estimate is not None:
-                    axes.hlines(height, estimate.low, estimate.high, colors=color, linewidth=3, alpha=0.4)
-                    axes.plot(estimate.value, height, "o", color=color, markersize=4)
-            axes.set_yticks(range(len(kinds)), kinds, fontsize=7)
-            axes.set(xlim=(-0.01, 1.01), ylim=(-0.7, len(kinds) - 0.3))
-            axes.set_title(name, fontsize=9, loc="left")
-        grid[-1][1].set_xlabel("recognized by the first network")
+        for axes, (name, run) in zip(grid, runs.items(), strict=True):
+            estimates = {kind: rate(answer.recognized[0].tolist()) for kind, answer in answers[name].items()}
+            draw_rates(axes, {kind: (e.value, (e.low, e.high)) for kind, e in estimates.items() if e}, run.design)
+            axes[1].set_title(name, fontsize=9, loc="left")
 
-    about = "Bars are 95 % intervals of the rate under the conditions that all designs share."
+    about = "By the first network, under the conditions that all designs share."
     return Drawing("designs", "The designs, best first", draw, (4.8, 1.3 * len(runs) + 0.4), about)

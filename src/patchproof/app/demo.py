@@ -18,19 +18,17 @@ from patchproof.reprints.run_sheet import sheet
 PHOTOS, SESSIONS = 48, 12
 DEMO_FILES = ("scene.toml", "run", "sheet.pdf", "sheet.json", "photos", "report")
 
-SCENE, IMAGENET_SCENE = (
-    Path(__file__).with_name(f"{name}.toml").read_text(encoding="utf-8") for name in ("demo", "demo_imagenet")
-)
+SCENE = Path(__file__).with_name("demo.toml").read_text(encoding="utf-8")
 
 
 def run_demo(
-    out: Path, network: str = "builtin", *, jobs: int = 1, overwrite: bool = False, progress: Progress = no_progress
+    out: Path, imagenet: bool = False, *, jobs: int = 1, overwrite: bool = False, progress: Progress = no_progress
 ) -> list[str]:
-    """Run every step into the folder `out`, before that network; returns the summary's lines."""
+    """Run every step into the folder `out`, before the built-in network or `imagenet`; returns the summary's lines."""
     compute = Compute(jobs=jobs)
     with new_folder(out, DEMO_FILES, overwrite) as folder:
         pdf, photos, report = folder / "sheet.pdf", folder / "photos", folder / "report"
-        run = optimize(demo_scene(folder, network), folder / "run", compute=compute, progress=progress)
+        run = optimize(demo_scene(folder, imagenet), folder / "run", compute=compute, progress=progress)
         sheet(run, pdf)
         reprint(pdf, run, PHOTOS, photos, sessions=SESSIONS, compute=compute, progress=progress)
         judgment = verify(photos, folder / "sheet.json", report, compute=compute, progress=progress)
@@ -43,8 +41,8 @@ def run_demo(
     ]
 
 
-def demo_scene(folder: Path, network: str = "builtin") -> Path:
+def demo_scene(folder: Path, imagenet: bool = False) -> Path:
     """Write scene.toml into a folder and return its path."""
-    scene, text = folder / "scene.toml", IMAGENET_SCENE if network == "imagenet" else SCENE
-    scene.write_text(text.replace('"builtin"', f'"{network}"'), encoding="utf-8")
+    scene = folder / "scene.toml"
+    scene.write_text(Path(__file__).with_name("demo_imagenet.toml").read_text("utf-8") if imagenet else SCENE, "utf-8")
     return scene

@@ -220,9 +220,8 @@ def _check_out(out: Path, resume: bool, overwrite: bool, inputs: Sequence[object
         refuse_inputs_in(out, inputs)
         refuse_other_files(out, REPORT_FILES if has_journal else ())
         return
-    if has_journal and not overwrite and not is_file(out / "report.json"):
-        raise Refused("an empty or new folder", f"{out} with an unfinished verification", "add --resume or --overwrite")
-    check_folder(out, REPORT_FILES, overwrite, inputs=inputs)
+    unfinished = has_journal and not is_file(out / "report.json")
+    check_folder(out, REPORT_FILES, overwrite, unfinished, inputs)
 
 
 def _networks(manifest: Manifest, models: Sequence[str | Classifier] | None) -> tuple[str | Classifier, ...]:

@@ -51,11 +51,4 @@ class WorkerDied(Refused):
 
 
 class TimeLimitExceeded(PatchproofError):
-    """The work has reached its limit of `seconds` of processor time."""
-
-    def __init__(self, seconds: float):
-        super().__init__(f"more than {seconds:g} s of processor time")
-        self.seconds = seconds
-
-    def __reduce__(self):
-        return TimeLimitExceeded, (self.seconds,)
+    """The work has reached its limit of processor time, which the message states."""

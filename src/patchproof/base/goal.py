@@ -22,17 +22,15 @@ LEAST_GAIN = 0.10
 
 
 class Goal(StrEnum):
-    """The goal; `sign` is +1 if the target is to be recognized, -1 if that is to be prevented."""
+    """The goal: the target is to be recognized, or that is to be prevented."""
 
-    sign: int
-    assist = "assist", 1
-    deceive = "deceive", -1
+    assist = "assist"
+    deceive = "deceive"
 
-    def __new__(cls, word: str, sign: int):
-        """Make a member that equals its word."""
-        member = str.__new__(cls, word)
-        member._value_, member.sign = word, sign
-        return member
+    @property
+    def sign(self) -> int:
+        """The sign of a difference in rates that is a gain."""
+        return 1 if self is Goal.assist else -1
 
     @property
     def words(self) -> dict[GainWord, str]:

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from PIL.Image import Image
 
 TIME_LIMIT_S = 10.0  # of processor time: a photograph of 119 megapixels takes 4, one of 12 less than 1
+_LIMIT_TEXT = "more than {:g} s of processor time"
 _REPEAT_S = 0.5  # until the next interruption, in case a library swallows the first
 
 ReturnType = TypeVar("ReturnType")
@@ -153,7 +154,7 @@ def run_within_seconds(seconds: float, work: Callable[[], ReturnType]) -> Return
     except _Expired:
         armed.clear()  # the interruption may have come just before these two lines in the `finally` above
         signal.setitimer(signal.ITIMER_PROF, 0)
-        raise TimeLimitExceeded(seconds) from None
+        raise TimeLimitExceeded(_LIMIT_TEXT.format(seconds)) from None
     finally:
         signal.signal(signal.SIGPROF, previous_handler)
 
@@ -180,7 +181,7 @@ def run_in_child(work: Callable[[], ReturnType]) -> ReturnType:
         result, error = pickle.loads(stored)
     except (EOFError, pickle.UnpicklingError):
         if os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGPROF:
-            raise TimeLimitExceeded(TIME_LIMIT_S) from None
+            raise TimeLimitExceeded(_LIMIT_TEXT.format(TIME_LIMIT_S)) from None
         raise MemoryError("more memory than it may take") from None
     if error is not None:
         raise error

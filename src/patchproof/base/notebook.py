@@ -6,11 +6,11 @@ notebook's own calls only.
 
 import html
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from patchproof.base.output import base64_uri, image_bytes, rate_text
+from patchproof.base.output import data_uri, image_bytes, rate_text
 from patchproof.base.text import printable
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ def notebook_html(heading: str, rows: Mapping[str, str], rates: Rates, picture: 
     )
     image = ""
     if picture is not None:
-        uri = base64_uri(image_bytes(picture, "PNG"), "image/png")
+        uri = data_uri(image_bytes(picture, "PNG"))
         image = f'<img alt="design" src="{uri}" style="height:{_PICTURE_PX}px;image-rendering:pixelated">'
     return f"<div><b>{html.escape(printable(heading))}</b><table>{table}</table>{image}</div>"
 
@@ -41,7 +41,14 @@ def rates_figure(heading: str, rates: Rates, picture: np.ndarray | None = None) 
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(7, 0.4 * len(rates) + 1.6), layout="constrained")
-    photo, axes = figure.subplots(1, 2, width_ratios=(1, 2))
+    draw_rates(figure.subplots(1, 2, width_ratios=(1, 2)), rates, picture)
+    figure.suptitle(printable(heading), fontsize=10)
+    return figure
+
+
+def draw_rates(pair: Any, rates: Rates, picture: np.ndarray | None) -> None:
+    """Fill the first of two matplotlib axes with the picture, the second with the bars of `rates_figure`."""
+    photo, axes = pair
     photo.set_axis_off()
     if picture is not None:
         photo.imshow(picture, interpolation="nearest")
@@ -53,8 +60,6 @@ def rates_figure(heading: str, rates: Rates, picture: np.ndarray | None = None) 
     axes.set_yticks(range(len(names)), names)
     axes.invert_yaxis()
     axes.set(xlim=(0, 100), xlabel="recognized, % with 95 % interval")
-    figure.suptitle(printable(heading), fontsize=10)
-    return figure
 
 
 def _bar(number: int, rate: float, interval: tuple[float, float]) -> str:

@@ -22,6 +22,7 @@ from patchproof.base.errors import Refused
 from patchproof.base.folder_lock import LISTING_FILE, append_listing, list_file, listed_names, lock_folder
 from patchproof.base.input import is_file, is_folder
 
+RUN_FILE, CHECKPOINT_FILE = "run.json", "checkpoint.safetensors"  # that tell how far a run got
 _ANOTHER = "choose another --out"
 
 
@@ -96,6 +97,14 @@ def refuse_other_files(out: Path, file_names: tuple[str, ...]) -> None:
     if foreign:
         expected = f"a folder with this command's own output only ({', '.join(file_names) or 'none'})"
         raise Refused(expected, f"{out} with {foreign[0]}", _ANOTHER)
+
+
+def require_finished_run(folder: Path) -> None:
+    """Refuse a folder that holds no run, or an unfinished one."""
+    if not is_file(folder / RUN_FILE):
+        has_checkpoint = is_file(folder / CHECKPOINT_FILE)
+        do = "finish it with --resume" if has_checkpoint else "name the folder that optimize wrote"
+        raise Refused("a finished run", f"{'an unfinished one' if has_checkpoint else 'none'} at {folder}", do)
 
 
 def clear_folder(folder: Path, keep: Callable[[str], bool] = lambda name: False) -> None:
@@ -238,9 +247,10 @@ def write_pictures(pictures: Sequence[np.ndarray], folder: Path) -> Path:
     return folder
 
 
-def base64_uri(content: bytes, kind: str) -> str:
-    """Encode bytes of a media type (`kind`) as a data URI."""
-    return f"data:{kind};base64,{base64.b64encode(content).decode()}"
+def data_uri(content: bytes) -> str:
+    """Encode the bytes of a JPEG or PNG as a data URI for `<img src>`."""
+    kind = "png" if content.startswith(b"\x89PNG") else "jpeg"
+    return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
 
 
 def image_pixels(content: bytes) -> np.ndarray:

@@ -17,12 +17,11 @@ Advance = Callable[[int, int], None]
 """Called as `advance(done, total)`: a `Progress` whose stage is fixed, `partial(progress, "promise")`."""
 
 
-def no_progress(stage: str, done: int, total: int) -> None:
+def no_progress(*done: object) -> None:
     """Report nothing."""
 
 
-def no_advance(done: int, total: int) -> None:
-    """Report nothing within a stage."""
+no_advance = no_progress
 
 
 @contextmanager

@@ -5,7 +5,6 @@ refused with the nearest known one, a NaN or a reversed range with the value. `e
 """
 
 import difflib
-import math
 import os
 import re
 import tomllib
@@ -24,12 +23,6 @@ from patchproof.base.text import brief, short_repr
 MAX_TOML_BYTES = 1 << 16  # shipped files have 3 kB; the time for a key of many parts grows with their square
 
 
-def _finite(value: float) -> float:
-    if not math.isfinite(value):
-        raise ValueError("must be a finite number")
-    return value
-
-
 def check_ordered(pair: tuple[float, float]) -> tuple[float, float]:
     """Return the range (low, high) unchanged; a ValueError if low is above high."""
     if pair[0] > pair[1]:
@@ -37,7 +30,7 @@ def check_ordered(pair: tuple[float, float]) -> tuple[float, float]:
     return pair
 
 
-Finite = Annotated[float, AfterValidator(_finite)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[Finite, Field(gt=0)]
 NotNegative = Annotated[Finite, Field(ge=0)]
 Share = Annotated[Finite, Field(ge=0, le=1)]
@@ -139,11 +132,6 @@ def spelling_hint(word: str, known_words: Iterable[str]) -> str:
 def summarize_names(names: Sequence[str]) -> str:
     """The first three names, and the number of further ones: 'a, b, c and 4 more'."""
     return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
-
-
-def not_measured_lines(reasons: Mapping[str, str]) -> list[str]:
-    """'not measured: FIGURE (REASON)' for each figure."""
-    return [f"not measured: {figure} ({reason})" for figure, reason in reasons.items()]
 
 
 def within(low: float, high: float) -> AfterValidator:

@@ -24,8 +24,7 @@ from torch import Tensor
 from patchproof.base.errors import Refused
 from patchproof.base.fingerprint import refuse_other_inputs
 from patchproof.base.input import is_file
-from patchproof.base.output import write_atomically
-from patchproof.base.run_files import CHECKPOINT_FILE
+from patchproof.base.output import CHECKPOINT_FILE, write_atomically
 from patchproof.base.settings import OptimizeSettings
 from patchproof.base.validation import StrictModel
 from patchproof.optimizer.expectation import Answer, expectation, gradient_in_views, in_batches, training_views

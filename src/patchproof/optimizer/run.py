@@ -27,8 +27,8 @@ from patchproof.base.errors import Refused
 from patchproof.base.fingerprint import refuse_other_inputs
 from patchproof.base.folder_lock import lock_folder
 from patchproof.base.input import is_file, read_file, read_json, read_text
+from patchproof.base.output import CHECKPOINT_FILE, RUN_FILE, require_finished_run
 from patchproof.base.progress import Advance, Progress, no_progress
-from patchproof.base.run_files import CHECKPOINT_FILE, RUN_FILE, require_finished_run
 from patchproof.base.settings import SceneSettings, named_paths
 from patchproof.base.text import short_repr
 from patchproof.base.validation import refuse_untrusted, validate_model

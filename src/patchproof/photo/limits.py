@@ -29,7 +29,7 @@ def run_limited(work: Callable[Params, ReturnType], *args: Params.args, **kwargs
         return bounds.run_within_seconds(bounds.TIME_LIMIT_S, partial(work, *args, **kwargs))
     except TimeLimitExceeded as error:
         advice = f"it takes {error}: save it smaller, or leave it out"
-        raise PhotoRejected("too_costly", None, error.seconds, advice) from None
+        raise PhotoRejected("too_costly", None, bounds.TIME_LIMIT_S, advice) from None
 
 
 def find_squares(gray: np.ndarray, perimeter_px: float = 36, window_px: int = 13) -> np.ndarray:

@@ -17,7 +17,7 @@ import numpy as np
 
 from patchproof.base.input import is_file, read_file
 from patchproof.base.intervals import Estimate
-from patchproof.base.output import base64_uri, image_bytes, make_folder, write_atomically
+from patchproof.base.output import image_bytes, make_folder, write_atomically
 from patchproof.base.text import drawable, printable
 
 if TYPE_CHECKING:
@@ -27,7 +27,6 @@ DELTA_TOP = 20.0  # ΔE00 at the map's dark end; 2 is just visible side by side,
 PICTURE_KINDS = ("photo", "promised", "seen", "fitted", "delta_e00")
 _JPEG_QUALITY = 82
 _LONGEST_STEM = 220  # bytes; systems take 255, and kind and suffix come after it
-_PNG = b"\x89PNG"
 
 
 def render_page(template: str, folder: Path = Path(__file__).parent, **values: object) -> str:
@@ -97,11 +96,6 @@ def _path(folder: Path, file: str, kind: str) -> Path:
     return folder / f"{stem_of(file)}.{kind}.{'png' if kind == 'delta_e00' else 'jpg'}"
 
 
-def data_uri(content: bytes) -> str:
-    """Encode the bytes of a JPEG or PNG as a data URI for `<img src>`."""
-    return base64_uri(content, f"image/{'png' if content.startswith(_PNG) else 'jpeg'}")
-
-
 def delta_map(delta_e00: np.ndarray, longer_px: int = 192) -> np.ndarray:
     """Draw ΔE00 cells as uint8 RGBA squares: pale is 0, dark is `DELTA_TOP` or more, transparent is not measured."""
     import matplotlib
@@ -112,33 +106,22 @@ def delta_map(delta_e00: np.ndarray, longer_px: int = 192) -> np.ndarray:
     return np.repeat(np.repeat(colors, zoom, axis=0), zoom, axis=1)
 
 
-def _make_drawable(figure: "Figure") -> None:
-    """Let installed fonts stand in for characters that the figure's font lacks; those that no font has are escaped."""
+def _escape_undrawable(figure: "Figure") -> None:
+    """Escape the characters that the figures' font lacks."""
     from matplotlib import font_manager
     from matplotlib.text import Text
 
-    texts, fonts = figure.findobj(Text), ["DejaVu Sans"]
-    font = font_manager.get_font(font_manager.findfont(fonts[0]))
-    characters = {c for text in texts for c in text.get_text()} - {"\n"}
-    if not (lacking := {c for c in characters if printable(c) != c or not font.get_char_index(ord(c))}):
-        return
-    for entry in sorted(font_manager.fontManager.ttflist, key=lambda entry: entry.name):
-        with suppress(OSError, RuntimeError):  # a font that FreeType does not open
-            font = font_manager.get_font(entry.fname)
-            found = {c for c in lacking if printable(c) == c and font.get_char_index(ord(c))}
-            if found and font.scalable and not entry.name.startswith("Last Resort"):  # whose glyphs are boxes
-                fonts.append(entry.name)
-                lacking -= found
+    font = font_manager.get_font(font_manager.findfont("DejaVu Sans"))
 
     def shown(text: str) -> str:
-        return "\n".join(drawable(line, lambda c: c not in lacking) for line in text.split("\n"))
+        return "\n".join(drawable(line, lambda c: bool(font.get_char_index(ord(c)))) for line in text.split("\n"))
 
     for axis in (axis for axes in figure.axes for axis in (axes.xaxis, axes.yaxis)):
         labels = [label.get_text() for label in axis.get_ticklabels()]
         if labels != list(map(shown, labels)):
             axis.set_ticklabels(map(shown, labels))
-    for text in texts:
-        text.set(text=shown(text.get_text()), family=fonts)
+    for text in figure.findobj(Text):
+        text.set(text=shown(text.get_text()))
 
 
 def draw_figure(draw: "Callable[[Figure], None]", size_in: tuple[float, float], kind: str, **options: Any) -> bytes:
@@ -151,6 +134,6 @@ def draw_figure(draw: "Callable[[Figure], None]", size_in: tuple[float, float], 
     with matplotlib.rc_context(settings):
         figure, buffer = Figure(figsize=size_in, layout="constrained"), io.BytesIO()
         draw(figure)
-        _make_drawable(figure)
+        _escape_undrawable(figure)
         figure.savefig(buffer, format=kind, **options)
     return buffer.getvalue()

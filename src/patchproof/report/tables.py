@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 from patchproof.base.csv_file import csv_lines
 from patchproof.base.intervals import Estimate
-from patchproof.base.output import write_atomically
-from patchproof.report.page import data_uri, draw_figure, render_page, versions_of
+from patchproof.base.output import data_uri, write_atomically
+from patchproof.report.page import draw_figure, render_page, versions_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

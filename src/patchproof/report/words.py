@@ -12,7 +12,7 @@ from patchproof.base.goal import LEAST_GAIN, Goal, points_text
 from patchproof.base.output import rate_text
 from patchproof.base.settings import NO_PAGE, background_summary
 from patchproof.base.text import command_text
-from patchproof.base.validation import not_measured_lines, summarize_names
+from patchproof.base.validation import summarize_names
 
 VERDICTS = {"kept": "Promise kept", "broken": "Promise broken", "cannot_tell": "Promise neither broken nor proved"}
 _CONTROLS = {
@@ -112,16 +112,12 @@ def promise_summary(promise: Any, settings: Mapping[str, Any], run: str = "RUN")
 
 
 def run_lines(run: Any) -> list[str]:
-    """Sum up a finished run, and say which command comes next."""
+    """Sum up a finished run, and say which command comes next if it helps; else the summary says what to do."""
     folder, settings = str(run.folder), run.scene.settings.model_dump()
     page = f"{run.folder.resolve().name}.json" if settings["sheet"]["template"] == NO_PAGE else "sheet.pdf"
-    following = command_text("sheet", folder, "--out", page)
-    if settings["patch"]["kind"] != "patch":
-        following = command_text("evaluate", folder)
-    if run.promise.answer == "cannot_tell":
-        following = run.promise.command(folder)
+    following = ("sheet", folder, "--out", page) if settings["patch"]["kind"] == "patch" else ("evaluate", folder)
     lines = promise_lines(run.promise, settings | {"imported": run.details.get("imported")}, folder)
-    return [*lines, f"run: {folder}", *([f"next: {following}"] if run.promise.answer != "does_not_help" else [])]
+    return [*lines, f"run: {folder}", *([f"next: {command_text(*following)}"] if run.promise.answer == "helps" else [])]
 
 
 def verdict_lines(report: Any) -> list[str]:
@@ -151,7 +147,7 @@ def verdict_lines(report: Any) -> list[str]:
     if summary.ledger is not None and (culprit := summary.ledger.culprit) is not None:
         share = summary.ledger.shares[culprit].share
         lines.append(f"costs the most: {culprit.replace('_', ' ')} ({100 * share:.0f} points of confidence)")
-    lines += not_measured_lines(summary.not_measured)
+    lines += [f"not measured: {figure} ({reason})" for figure, reason in summary.not_measured.items()]
     rows = remarks([photo.model_dump() for photo in report.photos])
     lines += [f"  {code}: {count} ({files}): {advice}" for code, advice, count, files in rows]
     return lines + [f"  left out: {sentence}" for sentence in summary.left_out]

@@ -14,13 +14,17 @@ from typing import Any
 
 from patchproof.base.csv_file import csv_lines
 from patchproof.base.goal import points_text
-from patchproof.base.output import make_folder, write_atomically
+from patchproof.base.output import data_uri, make_folder, write_atomically
 from patchproof.report import words
-from patchproof.report.page import DELTA_TOP, data_uri, render_page, saved_pictures
-from patchproof.report.plots import ledger_plot, recognition_plot
+from patchproof.report.page import DELTA_TOP, render_page, saved_pictures
 
 _FIRST = ("file", "status", "code", "figure", "threshold", "advice")
-_PLOTS = (("tilt_deg", "tilt in degrees"), ("px_per_mm", "pixels per millimeter"))
+_STEPS = {  # of the gap ledger
+    "light_and_camera": "light, camera color",
+    "print_light_and_camera": "print, light, camera",
+    "blur_and_noise": "blur, noise",
+    "photo": "not explained",
+}
 
 
 def write_report(report: Mapping, manifest: Mapping, out_dir: str | Path) -> Path:
@@ -42,13 +46,7 @@ def report_html(report: Mapping, manifest: Mapping, encoded: Mapping[str, Mappin
     """Render the page's HTML; `encoded` are JPEG or PNG bytes by photo and kind."""
     promise, summary, photos = manifest.get("promise"), report["summary"], report["photos"]
     judged = [photo for photo in photos if photo["status"] != "rejected"]
-    plots, primary = [], None
-    if promise:
-        primary = promise["models"][0]["name"]
-        plots = [
-            (recognition_plot(judged, primary, name, label, promise["conditions"]), f"chart of recognition by {label}")
-            for name, label in _PLOTS
-        ]
+    primary = promise["models"][0]["name"] if promise else None
     pictures = {file: {kind: data_uri(data) for kind, data in kinds.items()} for file, kinds in encoded.items()}
     cards = [{"photo": photo, "pictures": pictures.get(photo["file"], {})} for photo in photos]
     return render_page(
@@ -64,8 +62,7 @@ def report_html(report: Mapping, manifest: Mapping, encoded: Mapping[str, Mappin
         looks=words.looks_sentence(summary),
         meaning=words.recognition_meaning(promise["models"][0], promise["target"]["label"]) if promise else "",
         verdict=words.VERDICTS[summary["verdict"]],
-        waterfall=ledger_plot(summary["ledger"]) if summary["ledger"] else "",
-        plots=[(svg, about) for svg, about in plots if svg],
+        steps=ledger_bars(summary["ledger"]) if summary["ledger"] else (),
         sized=any(photo["scale_x"] is not None for photo in photos),
         cards=cards,
         remarks=words.remarks(photos),
@@ -75,6 +72,23 @@ def report_html(report: Mapping, manifest: Mapping, encoded: Mapping[str, Mappin
         settings=json.dumps(manifest["settings"], indent=1, ensure_ascii=False),
         origin=report["origin"],
     )
+
+
+def ledger_bars(ledger: Mapping[str, Any]) -> list[tuple[str, float, float, str, str]]:
+    """The gap ledger as bars from the ideal picture's confidence to the photographs': (step, left and right end in
+    [0, 1], kind, the change in points with its 95 % interval). A positive share is a loss for the goal: for deceiving,
+    a gain in confidence.
+    """
+    level, rows = ledger["ideal"], [("ideal", 0.0, ledger["ideal"], "promised", f"{100 * ledger['ideal']:.0f} %")]
+    rises = (ledger["photo"] > level) != (sum(each["share"] for each in ledger["shares"].values()) < 0)
+    for step, each in ledger["shares"].items():
+        sign, kind = 100 if rises else -100, "miss" if each["share"] > 0 else "hit"
+        points = [round(sign * value, 1) + 0 for value in (each["share"], *(each["interval"] or ()))]  # + 0: no -0.0
+        text = f"{points[0]:+.1f}" + (" [{:+.1f}, {:+.1f}]".format(*sorted(points[1:])) if points[1:] else "")
+        left, right = sorted((level, after := level + sign * each["share"] / 100))
+        rows.append((_STEPS.get(step) or step, left, right, kind, text))
+        level = after
+    return [*rows, ("photographs", 0.0, ledger["photo"], "seen", f"{100 * ledger['photo']:.0f} %")]
 
 
 def _median_card(cards: Sequence[Mapping], model: str | None) -> Mapping | None:

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self, get_args
 import numpy as np
 
 from patchproof.base.errors import Refused
+from patchproof.base.fingerprint import content_identity
 from patchproof.base.geometry import apply_homography, local_scales
 from patchproof.base.settings import SceneSettings, identity_settings
 from patchproof.base.text import short_repr
@@ -288,8 +289,6 @@ def _sheet_id(settings: SceneSettings, base: Path, known: Mapping[str, str], see
     identity = identity_settings(settings)
     is_primitive = (settings.object.mesh or "").startswith("primitive:") and settings.background.images is None
     if not is_primitive or any("." in text or "/" in text for text in texts_in(identity)):  # a file's name
-        from patchproof.base.content_identity import content_identity
-
         identity = content_identity(settings, base)
     return sheet_id(identity | dict(known), seed)
 

@@ -42,6 +42,7 @@ _LARGEST_RATIO = 1.6  # of a piece's sides
 _PREFERENCE = 1.25  # weight of the area of a piece on the front, and of a flat one
 _TOP_WEIGHT = 0.5  # of the area of a piece on top, which few photographs show well
 _ENOUGH_AREA = 0.8  # of the largest wanted piece: for more than a flat card of that size, none is bent
+SIDE_NAMES: dict[Side, str] = {"+z": "front", "-z": "back", "-x": "left", "+x": "right", "+y": "top", "-y": "bottom"}
 _SIDES: tuple[Side, ...] = ("+z", "+x", "-x", "-z", "+y")
 
 

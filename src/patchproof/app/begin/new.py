@@ -12,8 +12,15 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
-from patchproof.app.begin.guess import UpAxis, guess_label, guess_length_mm, guess_piece, guess_up, other_axis
-from patchproof.app.begin.sides import SIDE_NAMES
+from patchproof.app.begin.guess import (
+    SIDE_NAMES,
+    UpAxis,
+    guess_label,
+    guess_length_mm,
+    guess_piece,
+    guess_up,
+    other_axis,
+)
 from patchproof.base.errors import Refused
 from patchproof.base.input import is_file, is_folder
 from patchproof.base.output import check_file, write_atomically

@@ -62,7 +62,7 @@ class Album:
         refuse_other_files(folder, _OWN)
         for path in folder.rglob(".photo_*.part"):  # of uploads that an earlier server did not finish
             path.unlink()
-        self._by_sha256: dict[str, Path] = {}
+        self.by_sha256: dict[str, Path] = {}  # the photographs, to recognize the same bytes when they are sent again
         if not self.sessions:
             make_folder(folder / "session_01")
 
@@ -78,11 +78,6 @@ class Album:
         controls = [self.folder / CONTROLS_FOLDER / name for name in CONTROLS]
         folders = [self.folder / name for name in self.sessions] + [path for path in controls if path.is_dir()]
         return [photo for folder in folders for photo in list_images(folder)]
-
-    def remember(self, photo: Path, sha256: str | None) -> None:
-        """Remember a photograph's SHA-256, to recognize the same bytes when they are sent again."""
-        if sha256 is not None:
-            self._by_sha256[sha256] = photo
 
     def new_session(self) -> str:
         """Begin a new session and return its name; the last one's if it is still empty."""
@@ -105,7 +100,7 @@ class Album:
         if number > MOST_PHOTOS:
             expected = f"at most {MOST_PHOTOS} photographs in a folder"
             raise UploadRefused(507, expected, f"photograph {number}", "start with a new folder")
-        return Incoming(folder / f"photo_{number:04d}", self._by_sha256)
+        return Incoming(folder / f"photo_{number:04d}", self.by_sha256)
 
 
 class Incoming:

@@ -1,22 +1,25 @@
-"""Measure the photographs of an album as they arrive, and report on all of them.
+"""Measure the photographs of an album as they arrive, and report on all of them, also as the page's content.
 
-In: an album, a manifest, the options of a verification. Out: a `Report`, as `verify` makes it of the same folder.
-Photographs are measured one at a time, in the single process of the workers, where limits of time and memory apply;
-finished ones are in the album's journal, so that a restart measures only new ones, tapped corners in `corners.csv`.
-Left out on purpose: the gap ledger and the estimated effect, which take longer than a person waits.
+In: an album, a manifest, the options of a verification. Out: a `Report`, as `verify` makes it of the same folder, and
+JSON values, in which every sentence about a photograph or the promise is the report's. Photographs are measured one at
+a time, in the single process of the workers, where limits of time and memory apply; finished ones are in the album's
+journal, so that a restart measures only new ones, tapped corners in `corners.csv`. Left out on purpose: the gap ledger
+and the estimated effect, which take longer than a person waits; from where to photograph, which the sheet's plan page
+says.
 """
 
 import re
 import signal
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from patchproof.app.capture.album import CONTROLS_FOLDER, Album
+from patchproof.app.capture.album import CONTROLS, CONTROLS_FOLDER, Album
 from patchproof.base.errors import Refused
 from patchproof.base.input import is_file
-from patchproof.base.output import write_atomically
+from patchproof.base.output import data_uri, write_atomically
 from patchproof.base.progress import Advance, no_advance
 from patchproof.base.workers import Workers
 from patchproof.evidence import annotations
@@ -27,12 +30,16 @@ from patchproof.evidence.gather import report_of
 from patchproof.evidence.grouping import BY_FOLDERS, Grouping, merge_folders
 from patchproof.evidence.journal import JOURNAL_FILE, Journal, settings_key
 from patchproof.evidence.measure import MeasuredPhoto
-from patchproof.evidence.results import Report
+from patchproof.evidence.results import PhotoEntry, Report
 from patchproof.evidence.task import Options, task_of
+from patchproof.evidence.verdict import PHOTOS_PER_SESSION
 from patchproof.photo.corners import DesignCorners
+from patchproof.report.page import jpeg
+from patchproof.report.words import VERDICTS, benefit_sentence, headline_of
 from patchproof.sheets.manifest import Manifest
 
 _CORNER_CODES = ("no_corners", "other_design", "several_sheets")  # of photographs in which a person may tap corners
+_LATEST_PHOTOS = 12  # that are listed with advice
 _TEN_NUMBERS = re.compile(r"(\d{1,6}(\.\d{1,20})?(,(?!$)|$)){10}")
 
 
@@ -51,11 +58,6 @@ class PhotoCollection:
         named = annotations.load_corners(file) if is_file(file) else {}  # by "FOLDER/NAME", and by shorter names
         self._corners = {name: np.reshape(each.numbers, (4, 2)) for name, each in named.items() if "/" in name}
 
-    @property
-    def side_px(self) -> float | None:
-        """Pixels of the promised photographs' shorter side; None if unknown."""
-        return self._task.ranges.side_px
-
     def measure(
         self,
         paths: Sequence[Path],
@@ -72,7 +74,7 @@ class PhotoCollection:
     def add(self, path: Path, photo: MeasuredPhoto) -> None:
         """Add a measured photograph of the album."""
         self._measured[path], self._photos = photo, None
-        self.album.remember(path, photo.entry.sha256)
+        self.album.by_sha256 |= {photo.entry.sha256: path} if photo.entry.sha256 else {}
 
     def wants_corners(self, path: Path) -> bool:
         """Tell whether a person may tap corners: of a print without markers, until the photograph is counted."""
@@ -148,3 +150,56 @@ def _name_of(path: Path) -> str:
 def prepare_worker(_: object) -> None:
     """Import the modules for measuring in the worker, and let it ignore interrupts: the server ends it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def state_of(collection: PhotoCollection) -> dict[str, Any]:
+    """Everything that the page shows, except for single answers."""
+    report = collection.report()
+    summary, data, promise = report.summary, report.summary.model_dump(), collection.promise
+    counts = {row["name"]: row for row in data["sessions"]}
+    rows = [counts.get(name, {"name": name, "judged": 0, "recognized": 0}) for name in collection.album.sessions]
+    names = sorted(collection.photos, key=lambda path: path.name)  # in the order of arrival
+    return {
+        "verdict": summary.verdict,
+        "headline": VERDICTS[summary.verdict],
+        "reason": summary.reason,
+        "effect": f"{headline_of(data)}. {benefit_sentence(data)}",
+        "photos": summary.photos,
+        "judged": summary.judged,
+        "sessions": rows,
+        "each": PHOTOS_PER_SESSION,
+        "plan": summary.next_step,
+        "controls": [{"name": each.name, "photos": each.n, "recognized": each.recognized} for each in report.controls],
+        "controls_known": [name for name in CONTROLS if name in promise.controls] or CONTROLS,
+        "latest": [answer_of(collection, path) for path in names[-_LATEST_PHOTOS:][::-1]],
+    }
+
+
+def answer_of(collection: PhotoCollection, path: Path, picture: np.ndarray | None = None) -> dict[str, Any]:
+    """The answer to one measured photograph, with advice; `picture` (uint8 H×W×3) is included as a data URI."""
+    photo, name = collection.photos[path], collection.promise.models[0].name
+    entry = photo.entry
+    prediction = entry.predictions.get(name) if photo.counted else None
+    answer = "not counted" if prediction is None else "recognized" if prediction.recognized else "not recognized"
+    return {
+        "file": f"{path.parent.name}/{path.name}",
+        "answer": answer,
+        "tap": collection.wants_corners(path),
+        "label": prediction and f"{prediction.label} {prediction.confidence:.0%}",
+        "code": entry.code,
+        "advice": "; ".join(filter(None, (entry.remark and entry.remark.advice, *entry.said))) or None,
+        "view": _view_words(entry),
+        "picture": None if picture is None else data_uri(jpeg(picture)),
+    }
+
+
+def _view_words(entry: PhotoEntry) -> str:
+    """Describe the view by distance, side and tilt, as far as they were measured."""
+    geometry, pose, parts = entry.geometry, entry.pose, []
+    if pose is not None and pose.distance_mm is not None:
+        parts.append(f"{pose.distance_mm / 1000:.2f} m")
+    if pose is not None and pose.azimuth_deg is not None:
+        parts.append(f"{abs(pose.azimuth_deg):.0f}° {'right' if pose.azimuth_deg > 0 else 'left'}")
+    if geometry is not None and geometry.tilt_deg is not None:
+        parts.append(f"tilt {geometry.tilt_deg:.0f}°")
+    return ", ".join(parts)

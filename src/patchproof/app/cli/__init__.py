@@ -6,11 +6,9 @@ code 1.
 
 import typer
 
-from patchproof.app.cli.begin import examples, keys, new, plan, preview
-from patchproof.app.cli.calibrate import camera, printer
+from patchproof.app.cli import journey
+from patchproof.app.cli.begin import camera, examples, keys, new, plan, preview, printer
 from patchproof.app.cli.console import as_command, run_command_line, version_option
-from patchproof.app.cli.designs import evaluate, import_picture
-from patchproof.app.cli.journey import capture, demo, optimize, promise, reprint, sheet, verify
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -19,10 +17,10 @@ app = typer.Typer(
 )
 _calibrate = typer.Typer(no_args_is_help=True, help="Models of a printer or a camera, from photographs and profiles.")
 
-for _verb in (demo, examples, new, preview, plan, optimize):
+for _verb in (journey.demo, examples, new, preview, plan, journey.optimize):
     app.command()(as_command(_verb))
-app.command("import")(as_command(import_picture))
-for _verb in (promise, evaluate, sheet, reprint, capture, verify):
+app.command("import")(as_command(journey.import_picture))
+for _verb in (journey.promise, journey.evaluate, journey.sheet, journey.reprint, journey.capture, journey.verify):
     app.command()(as_command(_verb))
 app.add_typer(_calibrate, name="calibrate")
 for _verb in (printer, camera):

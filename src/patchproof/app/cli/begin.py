@@ -1,17 +1,19 @@
-"""The verbs before anything is optimized: new, preview, plan, keys."""
+"""The verbs before anything is optimized: new, preview, plan, examples, keys; and `calibrate printer`, `camera`."""
 
 import shlex
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
-from typer import Argument, Exit, Option
+from typer import Argument, BadParameter, Exit, Option
 
-from patchproof.app.cli.console import Overwrite, names_of, say, warn
+from patchproof.app.cli.console import Overwrite, names_of, pair_of, say, warn
 from patchproof.base.errors import Refused
 from patchproof.base.progress import progress_bar
 from patchproof.base.text import command_text
 
+_NEXT = f"next: {command_text('optimize', 'scene.toml', '--out', 'run')}, with"
 SceneFile = Annotated[Path, Argument(help="The scene file (TOML).")]
 
 
@@ -51,29 +53,18 @@ def preview(
     say(f"next: {command_text('optimize', scene, '--out', 'run')} (--draft for a first look)")
 
 
-def plan(
-    scene: SceneFile,
-    out: Annotated[Path | None, Option(help="Write the plan as JSON, too.")] = None,
-    overwrite: Overwrite = False,
-) -> None:
+def plan(scene: SceneFile) -> None:
     """Show what is modeled, what is not, and why: first how the piece lies, then what is measured."""
-    from pydantic_core import to_json
+    from patchproof.app.plan.plan import measured_lines, plan_geometry
 
-    from patchproof.app.plan.plan import geometry_lines, measured_lines, measured_plan, plan_geometry
-    from patchproof.base.output import check_file, write_atomically
-
-    if out is not None:
-        check_file(out, overwrite)
     with progress_bar() as bar:
-        geometry, problem = plan_geometry(scene, progress=bar)
-    warn(geometry["warnings"])
-    say(*geometry_lines(geometry))
+        problem, lines = plan_geometry(scene, progress=bar)
+    warn(problem.scene.warnings)
+    say(*lines)
     sys.stdout.flush()  # what follows takes minutes
     with progress_bar() as bar:
-        full_plan = measured_plan(geometry, problem, progress=bar)
-    say(*measured_lines(full_plan))
-    if out is not None:
-        write_atomically(out, to_json(full_plan, indent=1) + b"\n")
+        lines = measured_lines(problem, progress=bar)
+    say(*lines)
 
 
 def examples(folder: Annotated[Path, Argument(help="The folder to copy them to, new or empty.")]) -> None:
@@ -100,3 +91,84 @@ def keys(
     from patchproof.app.keys import DOCUMENTS, codes_table, files_page, keys_page
 
     print(codes_table() if codes else files_page() if files else keys_page(DOCUMENTS, name), end="")
+
+
+def printer(
+    out: Annotated[Path, Option(help="NAME.npz; NAME.json is written beside it.")],
+    photos: Annotated[list[Path] | None, Argument(metavar="[PHOTO]...", help="A folder: of one print, place.")] = None,
+    icc: Annotated[Path | None, Option(help="An RGB or CMYK output profile.")] = None,
+    intent: Annotated[
+        Literal["relative", "perceptual"], Option(help="The profile's intent that the driver is set to.")
+    ] = "relative",
+    design: Annotated[
+        bool, Option("--design", help="They show a print of known pixels, that of --sheet; else a printed chart.")
+    ] = False,
+    corners: Annotated[Path | None, Option(help="CSV or COCO JSON with the design's four corners.")] = None,
+    find: Annotated[bool, Option("--find", help="Search for the design where no marker can be read.")] = False,
+    known: Annotated[
+        Literal["office", "coated", "uncoated"] | None, Option(help="For colors that the design lacks; else the best.")
+    ] = None,
+    sheet: Annotated[Path | None, Option(help="The manifest of the chart's page, or of the design.")] = None,
+    camera: Annotated[str | None, Option(help="The camera that took photographs of a design.")] = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """A printer from its ICC profile, or from photographs of its printed chart or of any design."""
+    from patchproof.base.output import check_file, write_files_atomically
+    from patchproof.channel.printer import load_printer, printer_contents
+
+    photos, lines, warnings = photos or [], [], ()
+    if (icc is None) != bool(photos):
+        raise BadParameter("give either --icc FILE or PHOTO...", param_hint="--icc / PHOTO...")
+    if not design and (corners or find or known or camera):
+        only = "--corners, --find, --camera and --known are for PHOTO... --design"
+        raise BadParameter(only, param_hint="--design")
+    if out.suffix.lower() not in {"", ".npz", ".json"}:
+        raise Refused("a printer file, NAME.npz", f"{out.name}", "choose another --out")
+    file = out.with_suffix(".npz")
+    for path in (file, out.with_suffix(".json")):
+        check_file(path, overwrite)
+    if icc is not None:
+        from patchproof.calibrate.icc import bake
+
+        made = bake(icc, file.stem, intent == "perceptual")
+    elif sheet is None:
+        raise BadParameter("name the JSON that was written beside the PDF", param_hint="--sheet")
+    else:
+        from patchproof.calibrate.chart import calibrate_chart, prints_of, summary_lines
+        from patchproof.sheets.manifest import load_manifest
+
+        groups, manifest = prints_of(photos), load_manifest(sheet)
+        with progress_bar() as bar:
+            if design:
+                from patchproof.calibrate.known_design import KNOWN_PRINTERS, calibrate_design
+                from patchproof.channel.cameras import load_optional_camera
+                from patchproof.evidence.annotations import load_corners
+                from patchproof.evidence.task import Options
+
+                named, names = load_corners(corners) if corners else {}, (known,) if known else KNOWN_PRINTERS
+                camera_file, advance = load_optional_camera(camera), partial(bar, "photographs")
+                options = Options((), load_printer(names[0]), camera_file, corners=named, find=find)
+                made, warnings = calibrate_design(groups, manifest, file.stem, options, names, advance)
+            else:
+                result = calibrate_chart(groups, manifest, file.stem, partial(bar, "chart"))
+                made, warnings, lines = result.printer, result.warnings, summary_lines(result)
+    write_files_atomically(printer_contents(made, file))
+    warn(warnings)
+    lines = lines or [f"{key}: {value}" for key, value in made.provenance.items() if not isinstance(value, list)]
+    say(*lines, f"written: {file}, {file.stem}.json", f'{_NEXT} profile = "{file}" in its [printer]')
+
+
+def camera(
+    photos: Annotated[Path, Argument(help="A folder of photographs of a board.")],
+    board: Annotated[str, Option(help="The board's template, or the BOARD.json beside its PDF.")] = "charuco_a4",
+    out: Annotated[Path, Option(help="The camera file.")] = Path("camera.json"),
+    ruler_mm: Annotated[str | None, Option(help="The printed rulers as measured, e.g. 97.1x97.3 (x, y).")] = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Focal length, middle and lens distortion of a camera."""
+    from patchproof.calibrate.camera import calibrate_camera, calibration_lines
+
+    ruler = None if ruler_mm is None else pair_of(ruler_mm, "--ruler-mm")
+    with progress_bar() as bar:
+        fitted_camera = calibrate_camera(photos, board, out, ruler_mm=ruler, overwrite=overwrite, progress=bar)
+    say(*calibration_lines(fitted_camera), f"camera: {out}", f'{_NEXT} file = "{out}" in its [camera]')

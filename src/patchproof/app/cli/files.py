@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from patchproof.base.errors import Refused
-from patchproof.base.run_files import require_finished_run
+from patchproof.base.output import require_finished_run
 from patchproof.base.settings import load_scene_settings, named_paths
 from patchproof.sheets.manifest import load_manifest
 

@@ -1,4 +1,4 @@
-"""The verbs from a scene to a verdict: demo, optimize, promise, sheet, reprint, capture, verify."""
+"""The verbs from a scene to a verdict: demo, optimize, import, promise, evaluate, sheet, reprint, capture, verify."""
 
 import signal
 import sys
@@ -11,6 +11,7 @@ from typer import Argument, BadParameter, Exit, Option
 from patchproof.app.cli import console
 from patchproof.app.cli.console import Cluster, Device, Jobs, Models, Overwrite, Resume, Seed, Trust, say, warn
 from patchproof.base.compute import Compute
+from patchproof.base.errors import Refused
 from patchproof.base.progress import progress_bar
 from patchproof.base.text import command_text
 
@@ -20,7 +21,6 @@ PhotographedControl = Literal["bare", "mean", "gray", "noise"]  # that can hang 
 
 def demo(
     out: Annotated[Path, Option(help="Folder for all of it.")] = Path("patchproof-demo"),
-    detector: Annotated[bool, Option("--detector", help="Before the built-in detector, not classifier.")] = False,
     imagenet: Annotated[bool, Option("--imagenet", help="Before a network of photographs.")] = False,
     open_report: Annotated[bool, Option("--open", help="Open the report in the browser at the end.")] = False,
     jobs: Jobs = None,
@@ -29,11 +29,8 @@ def demo(
     """The whole journey, offline, on a built-in object and network."""
     from patchproof.app.demo import run_demo
 
-    if detector and imagenet:
-        raise BadParameter("is a classifier; leave --detector out", param_hint="--imagenet")
-    network = "imagenet" if imagenet else "builtin-detector" if detector else "builtin"
     with progress_bar() as bar:
-        summary = run_demo(out, network, jobs=jobs or 1, overwrite=overwrite, progress=bar)
+        summary = run_demo(out, imagenet, jobs=jobs or 1, overwrite=overwrite, progress=bar)
     say(*summary)
     if open_report:
         webbrowser.open((out / "report" / "report.html").resolve().as_uri())
@@ -78,6 +75,63 @@ def optimize(
             say(*place_lines(place))
     say(*run_lines(run))
     raise Exit(1 if require is not None and run.promise.answer != require else 0)
+
+
+def import_picture(
+    picture: Annotated[Path, Argument(help="A picture file.")],
+    scene: Annotated[Path, Argument(help="The scene file (TOML).")],
+    out: Annotated[Path, Option(help="Folder for the run.")],
+    overwrite: Overwrite = False,
+    as_printed: Annotated[
+        str | None, Option(help="It is printed already, in this size in mm, such as 594x841: no page, no markers.")
+    ] = None,
+    promise: Annotated[int | None, Option(min=8, help="Views to promise from; of under 400: a draft.")] = None,
+    device: Device = "cpu",
+    seed: Seed = None,
+    jobs: Jobs = None,
+) -> None:
+    """Make a run of a picture that was made elsewhere: its promise, as of a design of ours."""
+    from patchproof.optimizer.imported_design import import_patch
+    from patchproof.optimizer.promise import PromiseOptions
+    from patchproof.report.words import imported_lines, run_lines
+    from patchproof.scene.scene import load_scene
+
+    with progress_bar() as bar:
+        loaded = load_scene(scene, seed)
+        warn(loaded.warnings)
+        options: dict[str, Any] = {"promise": PromiseOptions(promise), "compute": Compute(device, jobs or 1)}
+        size_mm = None if as_printed is None else console.pair_of(as_printed, "--as-printed")
+        run = import_patch(picture, loaded, out, as_printed=size_mm, **options, overwrite=overwrite, progress=bar)
+    say(*imported_lines(run.details["imported"]), *run_lines(run))
+
+
+def evaluate(
+    runs: Annotated[list[Path], Argument(metavar="RUN...", help="Finished runs; several are compared.")],
+    models: Models = None,
+    n: Annotated[int, Option(min=1, help="Fresh conditions.")] = 400,
+    out: Annotated[Path | None, Option(help="Folder for the table and the page of several runs.")] = None,
+    seed: Seed = None,
+    device: Device = "cpu",
+    jobs: Jobs = None,
+    trust: Trust = False,
+    overwrite: Overwrite = False,
+) -> None:
+    """Rates on fresh conditions, with controls, on any classifiers; of several runs side by side."""
+    from patchproof.app.compare import compare
+    from patchproof.optimizer.evaluate import evaluate as evaluate_run
+    from patchproof.report.words import evaluation_lines
+
+    if (out is None) != (len(runs) == 1):
+        raise BadParameter("is for several runs, and they need it; one has its own folder", param_hint="--out")
+    with progress_bar() as bar:
+        options: dict[str, Any] = {"models": console.names_of(models), "n": n, "seed": seed, "overwrite": overwrite}
+        options |= {"trust": trust, "compute": Compute(device, jobs or 1), "progress": bar}
+        if out is None:
+            result = evaluate_run(runs[0], **options)
+            say(*evaluation_lines(result.model_dump()), f"written: {runs[0] / 'evaluate.json'}")
+        else:
+            console.say_study(compare(runs, out, **options))
+            say(f"page: {out / 'designs.html'}")
 
 
 def promise(
@@ -198,7 +252,11 @@ def capture(
 
     signal.signal(signal.SIGINT, signal.default_int_handler)  # it ends the server, and the verdict follows
     from patchproof.app.capture.album import CONTROLS_FOLDER
-    from patchproof.app.capture.serve import serve_capture
+
+    try:
+        from patchproof.app.capture.serve import serve_capture
+    except ImportError:
+        raise Refused("Starlette and uvicorn", "none", "pip install 'patchproof[capture]'") from None
     from patchproof.evidence.annotations import CORNERS_FILE
     from patchproof.report.words import verdict_lines
     from patchproof.sheets.manifest import load_manifest

@@ -1,6 +1,6 @@
 """`plan`: which parts of a scene are modeled and which are not, each with the figure that decided it.
 
-In: a scene file. Out: the plan as plain data, and as lines: where the piece lies (after a search, if the scene asks for
+In: a scene file. Out: the plan as lines: where the piece lies (after a search, if the scene asks for
 one) and how a simpler or richer surface would differ, the pixels that views have for design and markers, the error of
 leaving out each term of light, camera and renderer, how many photographs prove a promise, and the cost of a step. All
 figures come from the code that optimizes. Terms are measured with a draft of a few steps, since a classifier that
@@ -13,6 +13,7 @@ Left out on purpose: deciding for the user. The plan says which terms can go; th
 import math
 import statistics
 import time
+from collections.abc import Iterable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -24,7 +25,6 @@ from torch import Tensor
 
 from patchproof.app.plan.errors import measure_terms
 from patchproof.base.progress import Advance, Progress, no_advance, no_progress
-from patchproof.base.validation import not_measured_lines
 from patchproof.evidence.verdict import photos_line
 from patchproof.optimizer.expectation import new_pose_share
 from patchproof.optimizer.loop import SELECT_VIEWS, start, steps
@@ -42,12 +42,12 @@ from patchproof.scene.interface import (
     PieceScene,
     fit_text,
     measurable_text,
-    require_piece,
 )
 from patchproof.scene.patch_scene import UnplacedScene
 from patchproof.scene.scene import load_scene
 from patchproof.sheets.markers import MARKER_MODULES
 from patchproof.sheets.piece import SMALLEST_MARKER_MM
+from patchproof.sheets.rects import size_text
 
 TERM_VIEWS, PROOF_VIEWS = 16, 40
 DRAFT_VIEWS = 120  # that the draft is trained on
@@ -55,60 +55,46 @@ REPEATS = 5  # of a step that is timed
 PlanData = dict[str, Any]
 
 
-def plan_geometry(scene_path: str | Path, *, progress: Progress = no_progress) -> tuple[PlanData, Problem]:
-    """Compute how the piece of a scene lies and how well views resolve it, in seconds unless a place is searched for;
-    also returns the problem to measure.
+def plan_geometry(scene_path: str | Path, *, progress: Progress = no_progress) -> tuple[Problem, list[str]]:
+    """Return the problem to measure, and lines on how the piece lies and how well views resolve it; takes seconds
+    unless a place is searched for.
     """
-    scene, place = load_scene(scene_path), None
+    scene, found = load_scene(scene_path), []
     if isinstance(scene, UnplacedScene):
         place = choose_place(scene, progress=progress)
-        scene = scene.with_piece_at(place.at, place.spin_deg)
-    problem, target = set_problem(scene), scene.settings.target
-    geometry = {
-        "scene": Path(scene_path).name,
-        "kind": scene.description(),
-        "target": f"{target.goal} {target.label}",
-        "models": [classifier.name for classifier in problem.classifiers],
-        "place": place,
-        # `other` says how the piece would lie with the opposite `patch.bend`
-        "surface": {**scene.placement_summary(), "other": placement_with_other_bend(scene)[1]},
-        "resolution": resolution_plan(problem),
-        "markers": marker_plan(require_piece(scene)) if scene.HAS_PIECE else None,
-        "warnings": scene.warnings,
-    }
-    return geometry, problem
+        scene, found = scene.with_piece_at(place.at, place.spin_deg), ["place", *_indented(place_lines(place))]
+    problem, target, fit = set_problem(scene), scene.settings.target, scene.placement_summary()
+    networks = ", ".join(classifier.name for classifier in problem.classifiers)
+    lies = fit_text(fit) if fit["family"] == "card" else fit["reason"]
+    surface = f"{fit['family']}, {size_text(fit['size_mm'])} mm: {lies}", placement_with_other_bend(scene)[1]
+    lines = [
+        f"{Path(scene_path).name}: {target.goal} {target.label}, {scene.description()}, seen by {networks}",
+        *found,
+    ]
+    lines += ["surface", *_indented(filter(None, surface))]
+    lines += ["resolution", *_indented(_resolution_lines(resolution_plan(problem)))]
+    if isinstance(scene, PieceScene):
+        lines += ["markers", f"  {_marker_line(scene, fit['family'])}"]
+    return problem, lines
 
 
-def measured_plan(
-    geometry: PlanData, problem: Problem, *, views: int = TERM_VIEWS, progress: Progress = no_progress
-) -> PlanData:
-    """Measure the rest of a plan: a draft of the design, the terms in so many views, and the cost of a step."""
-    scene = problem.scene
-    other, _ = placement_with_other_bend(scene)
-    design, draft = _draft(problem, progress)
-    conditions, surface = scene.draw("select", views), geometry["surface"]
+def measured_lines(problem: Problem, *, views: int = TERM_VIEWS, progress: Progress = no_progress) -> list[str]:
+    """Measure the rest of a plan, and return its lines: a draft of the design, the terms in so many views, how many
+    photographs prove a promise, and the cost of a step.
+    """
+    scene, (design, draft) = problem.scene, _draft(problem, progress)
+    conditions, other = scene.draw("select", views), placement_with_other_bend(scene)[0]
     terms = measure_terms(problem, design, conditions, SELECT_VIEWS, other, partial(progress, "terms"))
-    needed = ""
+    lines = _term_lines(terms, draft)
     if scene.HAS_PIECE:
-        sessions, advance = (
-            scene.draw("select", PROOF_VIEWS, per_session=VIEWS_PER_SESSION),
-            partial(progress, "photographs"),
-        )
+        sessions = scene.draw("select", PROOF_VIEWS, per_session=VIEWS_PER_SESSION)
+        advance = partial(progress, "photographs")
         promise = make_promise(problem, as_pixels(design), sessions, CONTROLS, advance, VIEWS_PER_SESSION)
-        needed = f"To prove a promise of such a draft: {photos_line(promise)}"
-    reasons = {
-        "terms that can go": terms["unknown"],
-        "the size of markers": "" if geometry["markers"] else "the scene has no printed piece",
-        "how the piece fits the object": "" if surface.get("gap_mm") is not None else surface["reason"],
-    }
-    return geometry | {
-        "draft": draft,
-        "terms": terms,
-        "photographs": needed,
-        "omitted": scene.OMITTED,
-        "cost": measure_cost(problem, design, partial(progress, "cost")),
-        "not_measured": {figure: reason for figure, reason in reasons.items() if reason},
-    }
+        lines += ["photographs, by the promise of this draft", f"  {photos_line(promise)}"]
+    cost = measure_cost(problem, design, partial(progress, "cost"))
+    views_text = f"{cost['views']} views of {cost['side_px']} px, {cost['threads']} threads"
+    lines += ["not modeled", *_indented(scene.OMITTED), f"cost of a step ({views_text}): {cost['ms']:.0f} ms"]
+    return lines + [f"  {name:38} {ms:7.0f} ms {ms / cost['ms']:6.1%}" for name, ms in cost["parts"].items()]
 
 
 def resolution_plan(problem: Problem) -> PlanData:
@@ -137,11 +123,10 @@ def resolution_plan(problem: Problem) -> PlanData:
     }
 
 
-def marker_plan(scene: PieceScene) -> dict[str, float]:
+def needed_marker_mm(scene: PieceScene) -> float:
     """Apply the rule for the markers' size (PX_PER_MODULE in READABLE_SHARE of the views) to this scene's views."""
     px_per_mm = float(np.quantile(scene.px_per_mm(scene.photo_px, shorter=True), 1 - READABLE_SHARE))
-    needed_mm = max(MARKER_MODULES * PX_PER_MODULE / px_per_mm, SMALLEST_MARKER_MM)
-    return {"needed_mm": needed_mm, "printed_mm": scene.piece.marker_mm, "unreadable_share": scene.unreadable_share}
+    return max(MARKER_MODULES * PX_PER_MODULE / px_per_mm, SMALLEST_MARKER_MM)
 
 
 def _draft(problem: Problem, progress: Progress) -> tuple[Tensor, PlanData]:
@@ -199,62 +184,36 @@ def _step_ms(problem: Problem, design: Tensor, conditions: Conditions) -> dict[s
     return dict(zip([*ends][1:], ms.tolist(), strict=True))
 
 
-def geometry_lines(plan: PlanData) -> list[str]:
-    """Format the part of a plan that is known before anything is measured."""
-    lines = [f"{plan['scene']}: {plan['target']}, {plan['kind']}, seen by {', '.join(plan['models'])}"]
-    if plan["place"] is not None:
-        lines += ["place", *(f"  {line}" for line in place_lines(plan["place"]))]
-    lines += ["surface", *_surface_lines(plan["surface"])]
-    lines += ["resolution", *_resolution_lines(plan["resolution"])]
-    if plan["markers"] is not None:
-        lines += ["markers", _marker_line(plan["markers"], plan["surface"]["family"])]
-    return lines
-
-
-def measured_lines(plan: PlanData) -> list[str]:
-    """Format the part of a plan that was measured."""
-    lines, cost = _term_lines(plan["terms"], plan["draft"]), plan["cost"]
-    lines += ["photographs", f"  {plan['photographs']}"] if plan["photographs"] else []
-    lines += ["not modeled", *(f"  {text}" for text in plan["omitted"])]
-    views = f"{cost['views']} views of {cost['side_px']} px, {cost['threads']} threads"
-    lines += [f"cost of a step ({views}): {cost['ms']:.0f} ms"]
-    lines += [f"  {name:38} {ms:7.0f} ms {ms / cost['ms']:6.1%}" for name, ms in cost["parts"].items()]
-    return lines + not_measured_lines(plan["not_measured"])
-
-
-def _surface_lines(surface: PlanData) -> list[str]:
-    width, height = surface["size_mm"]
-    lines = [f"  {surface['family']}, {width:.0f} × {height:.0f} mm: {surface['reason']}"]
-    lines += [f"  {fit_text(surface)}"] if surface.get("gap_mm") is not None else []
-    return lines + ([f"  {surface['other']}"] if surface["other"] else [])
+def _indented(lines: Iterable[str]) -> list[str]:
+    return [f"  {line}" for line in lines]
 
 
 def _resolution_lines(views: PlanData) -> list[str]:
     (far, near), (far_photo, near_photo) = views["px_per_mm_network"], views["px_per_mm_photo"]
     width, height = views["photo_px"]
     line = (
-        f"  {far:.2f} to {near:.2f} px/mm at the network's {views['network_px']} px, {far_photo:.2f} to "
+        f"{far:.2f} to {near:.2f} px/mm at the network's {views['network_px']} px, {far_photo:.2f} to "
         f"{near_photo:.2f} in photographs of {width} × {height} px (5 % and 95 % of the views)"
     )
     density = f"{views['texels_per_px']:.1f} per pixel along a side in the closest"
     if views["design_px"] is None:
-        return [line, f"  {views['texels']} texels may change, {density} view"]
+        return [line, f"{views['texels']} texels may change, {density} view"]
     return [
         line,
-        "  design {} × {} texels, ".format(*views["design_px"])
+        "design {} × {} texels, ".format(*views["design_px"])
         + f"{density} possible view ({views['closest_px_per_mm']:.2f} px/mm)",
-        "  printed as {} × {} px, ".format(*views["printed_px"]) + f"{views['printed_px_per_mm']:.1f} per mm",
+        "printed as {} × {} px, ".format(*views["printed_px"]) + f"{views['printed_px_per_mm']:.1f} per mm",
     ]
 
 
-def _marker_line(markers: PlanData, family: str) -> str:
-    needed, printed = markers["needed_mm"], markers["printed_mm"]
+def _marker_line(scene: PieceScene, family: str) -> str:
+    needed, printed = needed_marker_mm(scene), scene.piece.marker_mm
     if not printed:
-        return "  none: photographs are located by the design's corners"
+        return "none: photographs are located by the design's corners"
     note = "" if printed > 0.95 * needed else " (all that page, object or blank allows)"
     return (
-        f"  needed {needed:.1f} mm ({PX_PER_MODULE:g} px per module at the {READABLE_SHARE:.0%} point of the views), "
-        f"printed {printed:.1f} mm{note}; {measurable_text(markers['unreadable_share'], family)}"
+        f"needed {needed:.1f} mm ({PX_PER_MODULE:g} px per module at the {READABLE_SHARE:.0%} point of the views), "
+        f"printed {printed:.1f} mm{note}; {measurable_text(scene.unreadable_share, family)}"
     )
 
 
@@ -268,7 +227,8 @@ def _term_lines(terms: PlanData, draft: PlanData) -> list[str]:
     on = {name: error for name, error in terms["errors"].items() if error["verdict"] != "off"}
     off = [f"{name} ({error['key'] or 'no setting'})" for name, error in terms["errors"].items() if name not in on]
     lines += [_term_line(name, error) for name, error in on.items()]
-    return [*lines, *([f"  off: {', '.join(off)}"] if off else [])]
+    lines += [f"  off: {', '.join(off)}"] if off else []
+    return lines + ([f"  not measured: which can go ({terms['unknown']})"] if terms["unknown"] else [])
 
 
 def _term_line(name: str, error: PlanData) -> str:
