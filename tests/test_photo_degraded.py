@@ -22,10 +22,9 @@ from degraded_photos import KINDS, take
 
 from patchproof.base.geometry import rect_corners
 from patchproof.evidence import measure as measuring
-from patchproof.evidence.camera import pinhole_photo
-from patchproof.evidence.locate import LocatedSheet, locate_sheet
-from patchproof.evidence.ranges import promised_ranges
+from patchproof.evidence.locate import LocatedSheet, locate_sheet, pinhole_photo
 from patchproof.evidence.results import PhotoEntry
+from patchproof.evidence.task import promised_ranges
 from patchproof.photo.read import read_photo
 
 FIGURES = ("corners", "azimuth", "distance", "tilt")

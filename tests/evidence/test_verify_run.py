@@ -28,12 +28,11 @@ from patchproof.base.intervals import wilson
 from patchproof.channel.printer import identity_printer, load_printer
 from patchproof.classifier import Classifier
 from patchproof.evidence.appearance import _cross_fitted_cells, fit_cells
-from patchproof.evidence.camera import pinhole_photo
 from patchproof.evidence.gather import gather_evidence
+from patchproof.evidence.locate import pinhole_photo
 from patchproof.evidence.measure import measure
-from patchproof.evidence.ranges import promised_ranges
 from patchproof.evidence.surface import promised_of, surface_of
-from patchproof.evidence.task import Options
+from patchproof.evidence.task import Options, promised_ranges
 from patchproof.photo.quality import FrameLight, is_featureless
 from patchproof.photo.read import MORE_PAGES, Photo
 from patchproof.report.words import verdict_lines

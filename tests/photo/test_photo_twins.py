@@ -11,11 +11,11 @@ from synthetic_photos import PIECE_IDS, make_manifest, page_raster, photograph, 
 from patchproof.channel.printer import identity_printer
 from patchproof.classifier import center_square
 from patchproof.evidence import appearance, color_fit
-from patchproof.evidence.camera import pinhole_photo
 from patchproof.evidence.classify import squares_of
+from patchproof.evidence.locate import pinhole_photo
 from patchproof.evidence.measure import identify_sheet, measure
-from patchproof.evidence.ranges import promised_ranges
 from patchproof.evidence.surface import promised_of, surface_of
+from patchproof.evidence.task import promised_ranges
 from patchproof.photo import detect, edges, known_page, limits
 from patchproof.photo.detect import LINEAR_FLOAT32_FROM_CODE, find_markers, fit_marker_borders, luminance
 from patchproof.photo.edges import fit_borders

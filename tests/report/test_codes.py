@@ -9,8 +9,7 @@ from synthetic_photos import PIECE_IDS, make_manifest, view
 from patchproof.base.geometry import intrinsics
 from patchproof.evidence import measure
 from patchproof.evidence.appearance import MOST_NOISE
-from patchproof.evidence.camera import FOCAL_ERROR, PinholePhoto
-from patchproof.evidence.locate import LocatedSheet, camera_pose
+from patchproof.evidence.locate import FOCAL_ERROR, LocatedSheet, PinholePhoto, camera_pose
 from patchproof.evidence.results import Geometry, Scale
 from patchproof.evidence.surface import surface_of
 from patchproof.photo.detect import MarkersInView

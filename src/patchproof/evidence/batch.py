@@ -24,9 +24,9 @@ from patchproof.base.geometry import apply_homography, rect_corners
 from patchproof.base.input import open_lazily
 from patchproof.base.resample import downscaled_size, to_sixteenths
 from patchproof.base.workers import Workers, result_of
-from patchproof.evidence.camera import pinhole_photo
 from patchproof.evidence.classify import BoxEdges, Judges, box_in_square, square_of, squares_of
 from patchproof.evidence.journal import FinishedPhoto, Journal, file_sha256
+from patchproof.evidence.locate import pinhole_photo
 from patchproof.evidence.measure import MeasuredPhoto, measure
 from patchproof.evidence.reproject import PhotoSquare, photo_square
 from patchproof.evidence.results import PhotoEntry, Remark, Trace

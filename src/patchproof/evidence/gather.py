@@ -26,8 +26,15 @@ from patchproof.base.validation import summarize_names
 from patchproof.base.workers import open_workers
 from patchproof.evidence.batch import MAX_PICTURED_PHOTOS, PhotoItem, measure_all, reread_square
 from patchproof.evidence.classify import Judges, judges_of
-from patchproof.evidence.copies import COPY_CODE, reject_copies
-from patchproof.evidence.grouping import Grouping, control_keys, group_sessions, merge_folders, subfolders
+from patchproof.evidence.grouping import (
+    COPY_CODE,
+    Grouping,
+    control_keys,
+    group_sessions,
+    merge_folders,
+    reject_copies,
+    subfolders,
+)
 from patchproof.evidence.journal import Journal, settings_key
 from patchproof.evidence.ledger import estimate_effect, ledger_of
 from patchproof.evidence.measure import UNLOCATED_CODES, MeasuredPhoto

@@ -15,12 +15,19 @@ import numpy as np
 
 from patchproof.base.geometry import MM_PER_INCH, apply_homography, rect_corners
 from patchproof.evidence.appearance import MOST_CLIPPED, MOST_NOISE, appearance
-from patchproof.evidence.camera import PinholePhoto
 from patchproof.evidence.design_match import DesignMatch
-from patchproof.evidence.locate import MOST_SHIFT, LocatedSheet, camera_pose, geometry_of, locate_sheet, object_box
-from patchproof.evidence.ranges import PromisedRanges
+from patchproof.evidence.locate import (
+    MOST_SHIFT,
+    LocatedSheet,
+    PinholePhoto,
+    camera_pose,
+    geometry_of,
+    locate_sheet,
+    object_box,
+)
 from patchproof.evidence.results import Color, Geometry, PhotoEntry, Remark, Scale, Trace
 from patchproof.evidence.surface import PromisedColors, Surface
+from patchproof.evidence.task import PromisedRanges
 from patchproof.photo.detect import MarkersInView, find_markers, is_mirrored
 from patchproof.photo.known_page import complete_markers, find_sheet
 from patchproof.photo.page_code import read_page_code, refuse_other_page

@@ -11,11 +11,15 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from patchproof.base.goal import GainWord, Goal
+from patchproof.base.output import image_pixels
 from patchproof.base.validation import Finite, StrictModel
 from patchproof.photo.rejection import PhotoRejected
 
 if TYPE_CHECKING:
+    import numpy as np
     from matplotlib.figure import Figure
+
+    from patchproof.base.notebook import Rates
 
 Status = Literal["judged", "measured", "rejected"]
 VerdictWord = Literal["kept", "broken", "cannot_tell"]
@@ -323,11 +327,27 @@ class Report(StrictModel):
 
     def plot(self) -> "Figure":
         """Draw the rates as bars with their intervals beside a photograph, as a matplotlib figure."""
-        from patchproof.evidence.shown_report import report_figure
+        from patchproof.base.notebook import rates_figure
 
-        return report_figure(self)
+        return rates_figure(f"verdict: {self.summary.verdict}", *self._rates_and_photo())
 
     def _repr_html_(self) -> str:
-        from patchproof.evidence.shown_report import report_in_notebook
+        from patchproof.base.notebook import notebook_html
 
-        return report_in_notebook(self)
+        summary = self.summary
+        rows = {"photographs": f"{summary.photos}, judged {summary.judged}, measured {summary.measured}"}
+        if summary.prediction_interval is not None:
+            rows["expected"] = "{} to {} of {}".format(*summary.prediction_interval, summary.judged)
+        rows |= {name: text for name, text in (("reason", summary.reason), ("next", summary.next_step)) if text}
+        return notebook_html(f"verdict: {summary.verdict}", rows, *self._rates_and_photo())
+
+    def _rates_and_photo(self) -> "tuple[Rates, np.ndarray | None]":
+        """Rates with their intervals by name, the patch's first ({}: nothing was judged); the first kept picture."""
+        summary, worth, rates = self.summary, self.summary.worth, {}
+        if summary.rate is not None and summary.interval is not None:
+            rates[f"patch, {summary.judged} photographs"] = summary.rate, summary.interval
+            rates |= {f"{c.name}, {c.n} photographs": (c.recognized / c.n, c.interval) for c in self.controls if c.n}
+            if worth is not None and worth.source != "photographed":
+                rates[f"{worth.control}, {worth.source}"] = worth.control_rate, worth.control_interval
+        paths = [] if self.folder is None else sorted((self.folder / "pictures").glob("*.photo.jpg"))
+        return rates, image_pixels(paths[0].read_bytes()) if paths else None

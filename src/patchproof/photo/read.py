@@ -223,7 +223,7 @@ def _decode_pixels(image, path: Path, head: bytes, step: int) -> tuple[np.ndarra
 
             image = ImageChops.invert(image)  # Pillow takes the inks of every JPEG as Adobe's, which are inverted
         if image.mode[0] in "FI" or image.format == "TIFF" or (image.format == "PNG" and head[24] == 16):
-            from patchproof.photo.deep_codes import deep_codes
+            from patchproof.photo.color_space import deep_codes
 
             codes, space, assumed = deep_codes(image, path, space)
             said += assumed

@@ -22,9 +22,8 @@ from patchproof.base.workers import Workers
 from patchproof.evidence import annotations
 from patchproof.evidence.batch import PhotoItem, measure_all
 from patchproof.evidence.classify import judges_of
-from patchproof.evidence.copies import reject_copies
 from patchproof.evidence.gather import report_of
-from patchproof.evidence.grouping import BY_FOLDERS, Grouping, merge_folders
+from patchproof.evidence.grouping import BY_FOLDERS, Grouping, merge_folders, reject_copies
 from patchproof.evidence.journal import JOURNAL_FILE, Journal, settings_key
 from patchproof.evidence.measure import MeasuredPhoto
 from patchproof.evidence.results import Report

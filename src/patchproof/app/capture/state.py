@@ -15,8 +15,8 @@ import numpy as np
 
 from patchproof.app.capture.album import CONTROLS
 from patchproof.app.capture.collection import PhotoCollection
-from patchproof.evidence.ranges import figures_of
 from patchproof.evidence.results import PhotoEntry
+from patchproof.evidence.task import figures_of
 from patchproof.evidence.verdict import PHOTOS_PER_SESSION
 from patchproof.report.page import data_uri, jpeg
 from patchproof.report.words import VERDICTS, benefit_sentence, headline_of
