@@ -16,7 +16,6 @@ from patchproof.channel.print_colors import ShownColors, add_ink
 from patchproof.channel.printer import identity_printer, load_printer
 from patchproof.classifier import Classifier
 from patchproof.evidence.classify import square_of
-from patchproof.evidence.color_fit import invert_affine
 from patchproof.evidence.gather import gather_evidence
 from patchproof.evidence.ledger import _ledger, shapley
 from patchproof.evidence.print_fit import LEAST_CELLS, PhotographedDesign, cell_means, fit_print
@@ -176,8 +175,8 @@ def test_a_veil_is_no_lighter_than_the_darkest_place(darkest, ink, seen_ink):
     shot = PhotoSquare("a.jpg", square, np.eye(3), light, 0.3, 0.0, np.zeros((16, 16, 3)), 1.0)
     promised = PromisedColors(np.ones((1, 1, 3)), np.full(3, 0.02))
     fit = light_fit(shot, promised)
-    assert fit.apply(light.paper) == pytest.approx(np.ones(3))
-    assert fit.apply(light.ink) == pytest.approx(np.full(3, seen_ink), abs=1e-6)
+    assert fit.undo(light.paper) == pytest.approx(np.ones(3))
+    assert fit.undo(light.ink) == pytest.approx(np.full(3, seen_ink), abs=1e-6)
 
 
 @functools.cache
@@ -318,9 +317,8 @@ def test_a_piece_put_into_a_photograph_is_what_a_photograph_of_it_shows():
     shot = photo_square(
         "a", taken, np.array(geometry.homography_px_from_mm), geometry.blur_px, photo.light, surface, 240
     )
-    drawn, fit = piece_picture(surface, promised.design), light_fit(shot, promised)
-    shown = ShownColors(invert_affine(fit.matrix))
-    put = reprojected_squares(shot, {(): drawn}, surface.rect_mm, fit, shown, Reference(0.5, 0.3, 0.0))
+    drawn, shown = piece_picture(surface, promised.design), light_fit(shot, promised)
+    put = reprojected_squares(shot, {(): drawn}, surface.rect_mm, shown, shown, Reference(0.5, 0.3, 0.0))
     assert put[True, True] == pytest.approx(reprojected_square(shot, drawn, surface.rect_mm, shown), abs=1e-6)
     for on, expected in ((True, other), (False, promised_one)):
         off = np.abs(put[on, on] - square_of(expected)[0] / 255).mean()

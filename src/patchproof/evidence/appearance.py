@@ -16,7 +16,7 @@ import numpy as np
 
 from patchproof.base.color import ciede2000, lab_from_linear, photo_codes_from_srgb, srgb_from_linear
 from patchproof.base.geometry import apply_homography, rect_corners
-from patchproof.evidence.color_fit import ColorFit, affine12, white_black
+from patchproof.channel.print_colors import ShownColors, affine12, white_black
 from patchproof.evidence.design_match import DesignMatch, match_design
 from patchproof.evidence.results import Color, Geometry
 from patchproof.evidence.surface import PromisedColors, Surface
@@ -75,13 +75,13 @@ def appearance(
     usable &= ~glossy
     inner = np.s_[1:-1, 1:-1]
     share = float(clipped[inner].mean())
-    if fit.name == "white_black" and light.clipped > _MOST_CLIPPED_PAPER:
+    if fit.kind == "white_black" and light.clipped > _MOST_CLIPPED_PAPER:
         share = 1.0  # overexposed paper is no reference
     valid_delta = delta[usable] if share <= MOST_CLIPPED else delta[:0]
     pixels = cv2.contourArea(apply_homography(px_from_mm, rect_corners(surface.rect_mm)).astype(np.float32))
     noise = _noise_delta(linear[..., :3], photographed, fit, max(pixels / usable.size, 1.0))
     color = Color(
-        color_fit=fit.name,
+        color_fit=fit.kind,
         clipped_share=share,
         glossy_share=float(glossy[inner].mean()),
         noise_delta_e00=float(noise[usable].mean()) if usable.any() else None,
@@ -92,7 +92,7 @@ def appearance(
     if not with_pictures:
         return color, {}, match
     seen = resize_by_area(flat, rectified_px(surface.rect_mm, picture_per_mm))[..., :3]
-    lights = {"seen": seen, "fitted": fit.apply(seen), "promised": coarse_cells(design, seen.shape[:2], 0.0)}
+    lights = {"seen": seen, "fitted": fit.undo(seen), "promised": coarse_cells(design, seen.shape[:2], 0.0)}
     pictures = {kind: photo_codes_from_srgb(srgb_from_linear(linear)) for kind, linear in lights.items()}
     return color, pictures | {"delta_e00": np.where(usable, delta, np.nan).astype(np.float32)}, match
 
@@ -125,15 +125,15 @@ def noise_of(linear: np.ndarray) -> np.ndarray:
     return np.quantile(detail, 0.2, axis=0) / 0.2533 / 6  # a fifth of a normal variable is nearer to 0 than 0.2533 σ
 
 
-def _noise_delta(linear: np.ndarray, cells: np.ndarray, fit: ColorFit, pixels: float) -> np.ndarray:
+def _noise_delta(linear: np.ndarray, cells: np.ndarray, fit: ShownColors, pixels: float) -> np.ndarray:
     """ΔE00 (H×W) that noise of the photograph's light and errors of its codes make in cells of so many pixels."""
     of_code = np.maximum(2.4 / 1.055 * np.clip(cells, 0, 1) ** (1 - 1 / 2.4), 1 / 12.92) / 255  # light
     error = np.hypot(noise_of(linear) / np.sqrt(pixels), _CODE_ERROR * of_code)
     noisy = cells + error * np.random.default_rng(0).normal(size=cells.shape)
-    return ciede2000(lab_from_linear(fit.apply(cells)), lab_from_linear(fit.apply(noisy)))
+    return ciede2000(lab_from_linear(fit.undo(cells)), lab_from_linear(fit.undo(noisy)))
 
 
-def fit_cells(photographed: np.ndarray, promised: np.ndarray, light: FrameLight, ink: np.ndarray) -> ColorFit:
+def fit_cells(photographed: np.ndarray, promised: np.ndarray, light: FrameLight, ink: np.ndarray) -> ShownColors:
     """Fit a color map to N×3 cells, paper and ink; to paper and ink alone if the cells are too few or too alike."""
     anchors = max(len(photographed) // _CELLS_PER_ANCHOR, 1)  # the design's colors alone do not fix white and black
     ends_by_side = [[light.ink] * anchors, [light.paper] * anchors], [[ink] * anchors, [np.ones(3)] * anchors]
@@ -145,16 +145,16 @@ def fit_cells(photographed: np.ndarray, promised: np.ndarray, light: FrameLight,
 
 
 def _cross_fitted_cells(
-    cells: np.ndarray, expected: np.ndarray, usable: np.ndarray, fit: ColorFit, light: FrameLight, ink: np.ndarray
+    cells: np.ndarray, expected: np.ndarray, usable: np.ndarray, fit: ShownColors, light: FrameLight, ink: np.ndarray
 ) -> np.ndarray:
     """Map cells H×W×3, each by a fit to the other color of a checkerboard, so that no cell is judged by its own fit."""
-    fitted = fit.apply(cells)
-    if fit.name == "white_black":
+    fitted = fit.undo(cells)
+    if fit.kind == "white_black":
         return fitted
     black = np.indices(usable.shape).sum(0) % 2 == 0
     for half in (black, ~black):
         other_half = usable & ~half
-        fitted[half] = fit_cells(cells[other_half], expected[other_half], light, ink).apply(cells[half])
+        fitted[half] = fit_cells(cells[other_half], expected[other_half], light, ink).undo(cells[half])
     return fitted
 
 

@@ -20,10 +20,9 @@ import numpy as np
 from patchproof.base.color import lift_tone, srgb_from_linear
 from patchproof.base.geometry import apply_homography, rect_corners
 from patchproof.base.resample import index_homography
-from patchproof.channel.print_colors import ShownColors, add_ink, lower_light
+from patchproof.channel.print_colors import ShownColors, add_ink, lower_light, white_black
 from patchproof.evidence.appearance import fit_cells, noise_of
 from patchproof.evidence.classify import BoxEdges, square_of
-from patchproof.evidence.color_fit import ColorFit, invert_affine, white_black
 from patchproof.evidence.print_fit import PhotographedDesign, design_cells, fit_print
 from patchproof.evidence.surface import PromisedColors, Surface
 from patchproof.photo.detect import LINEAR_FLOAT32_FROM_CODE, luminance
@@ -114,7 +113,7 @@ def unmix_markers(
     return None if unmixed.agreement < _LEAST_AGREEMENT else (light, unmixed.blur_px)
 
 
-def light_fit(shot: PhotoSquare, promised: PromisedColors, tone: float = 0.0) -> ColorFit:
+def light_fit(shot: PhotoSquare, promised: PromisedColors, tone: float = 0.0) -> ShownColors:
     """Fit a photograph's light before its `tone` to media-relative light by paper white and a veil of stray light.
 
     A veil lightens all pixels alike: it is at most the darkest place's light, and at most what takes marker black to
@@ -135,35 +134,35 @@ def _light_before(shot: PhotoSquare, tone: float) -> np.ndarray:
 
 def fit_print_and_lights(
     shots: Sequence[PhotoSquare], promised: PromisedColors
-) -> tuple[Callable[[np.ndarray], np.ndarray] | None, list[ColorFit], list[ShownColors]]:
+) -> tuple[Callable[[np.ndarray], np.ndarray] | None, list[ShownColors], list[ShownColors]]:
     """Fit the print's map of promised light from several photographs, each one's light, for what surrounds the print,
     and what each makes of the print's light. If the colors are too few or too alike to fit a print, its map is None,
     and the last fits contain it.
     """
     fit = fit_print([PhotographedDesign(shot.cells, shot.blur_cells, shot.light) for shot in shots], promised)
     if fit is None:
-        lights = [ShownColors(invert_affine(design_fit(shot, promised).matrix)) for shot in shots]
+        lights = [design_fit(shot, promised) for shot in shots]
         return None, [light_fit(shot, promised) for shot in shots], lights
     ink, lights = fit
     undo = [light_fit(shot, promised, light.tone) for shot, light in zip(shots, lights, strict=True)]
     return partial(add_ink, ink=ink), undo, lights
 
 
-def design_fit(shot: PhotoSquare, promised: PromisedColors) -> ColorFit:
+def design_fit(shot: PhotoSquare, promised: PromisedColors) -> ShownColors:
     """Fit print, light and camera together to the design's coarse colors, or else to paper and ink alone."""
     height, width = shot.cells.shape[:2]
     expected = cv2.resize(promised.design, (width, height), interpolation=cv2.INTER_AREA).astype(float)
     inner = np.s_[1:-1, 1:-1]
     readable = np.isfinite(shot.cells[inner]).all(-1)
     fit = fit_cells(shot.cells[inner][readable], expected[inner][readable], shot.light, promised.ink)
-    return light_fit(shot, promised) if fit.name == "white_black" else fit
+    return light_fit(shot, promised) if fit.kind == "white_black" else fit
 
 
 def reprojected_squares(
     shot: PhotoSquare,
     looks: Mapping[Switches, np.ndarray],
     rect_mm: Rect,
-    undo: ColorFit,
+    undo: ShownColors,
     print_light: ShownColors,
     reference: Reference,
 ) -> dict[Switches, np.ndarray]:
@@ -178,7 +177,7 @@ def reprojected_squares(
     surroundings = {}
     for blur, picture in ((True, photo), (False, change_blur(photo, shot.blur_px, reference.blur_px, shot.noise))):
         surroundings[True, blur] = picture
-        surroundings[False, blur] = np.clip(reference.white * undo.apply(picture), 0, 1).astype(np.float32)
+        surroundings[False, blur] = np.clip(reference.white * undo.undo(picture), 0, 1).astype(np.float32)
     srgb = {key: _codes(picture, tone if key[0] else 0.0) for key, picture in surroundings.items()}
     promised_light = np.column_stack([np.eye(3) * reference.white, np.zeros(3)])
     lights = {True: print_light.matrix, False: promised_light}
