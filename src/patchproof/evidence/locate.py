@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from patchproof.base.geometry import apply_homography, fit_homography, intrinsics, plane_pose, rect_corners
+from patchproof.base.geometry import fit_homography, intrinsics, plane_pose, rect_corners
 from patchproof.channel.object_box import project_box
 from patchproof.evidence.classify import BoxEdges
 from patchproof.evidence.results import CameraPose, FocalSource, Geometry
@@ -26,10 +26,10 @@ from patchproof.photo.exif import EXIF_SPREAD
 from patchproof.photo.known_page import is_in_picture, shows_small_code
 from patchproof.photo.quality import FrameLight
 from patchproof.photo.read import Photo
-from patchproof.photo.rectify import PageFit, corner_uncertainty_mm, fit_page
+from patchproof.photo.rectify import PageFit, fit_page
 from patchproof.photo.registration import Registration, register
 from patchproof.photo.rejection import PhotoRejected
-from patchproof.photo.unroll import UnrolledSheet, unroll
+from patchproof.photo.unroll import LocatedSheet, flat_sheet, unroll
 
 if TYPE_CHECKING:
     from patchproof.channel.lens import Camera
@@ -97,40 +97,12 @@ def _undistort(srgb: np.ndarray, camera: "Camera", matrix: np.ndarray) -> np.nda
     return picture
 
 
-@dataclass(frozen=True)
-class LocatedSheet:
-    """The sheet in a photograph: a picture in which it is flat, the homography there, and how it was unrolled (None:
-    the picture is the photograph).
-    """
-
-    srgb: np.ndarray
-    fit: PageFit
-    unrolled: UnrolledSheet | None
-
-    def px(self, parameters: np.ndarray, mm: np.ndarray) -> np.ndarray:
-        """Project page points (N×2 mm) to pixels of the photograph, by the model's parameters."""
-        if self.unrolled is not None:
-            return self.unrolled.shape.project(parameters, mm)
-        return apply_homography(np.append(parameters, 1.0).reshape(3, 3), mm)
-
-    @property
-    def parameters(self) -> np.ndarray:
-        """Parameters of the model: for flat paper, eight of a homography."""
-        return self.unrolled.shape.parameters if self.unrolled else self.fit.px_from_mm.ravel()[:8]
-
-    @property
-    def covariance(self) -> np.ndarray:
-        """Covariance of the parameters."""
-        return self.unrolled.shape.covariance if self.unrolled else self.fit.covariance
-
-
 def locate_sheet(view: PinholePhoto, detected: MarkersInView, surface: Surface) -> LocatedSheet | None:
     """Locate the sheet by its markers; None if they fit no plane, cylinder or lens."""
     fit = _fit(detected, surface)
     if fit is None:
         return None
-    sheet = _unroll_piece(view, detected, surface)
-    return LocatedSheet(view.srgb, fit, None) if sheet is None else LocatedSheet(sheet.srgb, sheet.fit, sheet)
+    return _unroll_piece(view, detected, surface) or flat_sheet(view.srgb, fit, surface.rect_mm)
 
 
 def _fit(detected: MarkersInView, surface: Surface) -> PageFit | None:
@@ -154,7 +126,7 @@ def _fit(detected: MarkersInView, surface: Surface) -> PageFit | None:
     return fit if np.isfinite(fit.px_from_mm).all() and np.isfinite(fit.covariance).all() else None
 
 
-def _unroll_piece(view: PinholePhoto, detected: MarkersInView, surface: Surface) -> UnrolledSheet | None:
+def _unroll_piece(view: PinholePhoto, detected: MarkersInView, surface: Surface) -> LocatedSheet | None:
     """Flatten the piece, if its markers lie in no plane but fit a cylinder or a lens; else None."""
     corners = {i: b.corners_px for i, b in detected.markers.items() if b.fitted and i in surface.piece_ids}
     focal = () if view.matrix_px is None else (float(view.matrix_px[0, 0]), view.focal_spread)
@@ -174,7 +146,7 @@ def object_box(view: PinholePhoto, location: LocatedSheet, surface: Surface) -> 
     matrix = intrinsics(surface.fov_deg, size_px) if view.matrix_px is None else view.matrix_px
     around = np.array(surface.center_mm) + _TANGENT_MM * (rect_corners((-1, -1, 2, 2)))
     try:
-        pose = plane_pose(fit_homography(around, location.px(location.parameters, around)), matrix)
+        pose = plane_pose(fit_homography(around, location.shape.px(around)), matrix)
     except (np.linalg.LinAlgError, ValueError):
         return None
     side, left, top = min(size_px), *((size - min(size_px)) / 2 for size in size_px)
@@ -195,11 +167,10 @@ def geometry_of(
     """Measure the sheet's geometry; count the corners of the design in which its pixels were found, four if that is
     unknown; and give the share found of the cells with detail between the markers, with their number.
     """
-    fit, unrolled = location.fit, location.unrolled
-    px_per_mm, tilt_deg = sheet_pose.scale_and_tilt(location.px, location.parameters, surface.center_mm)
+    fit, shape, unrolled = location.fit, location.shape, location.unrolled
+    px_per_mm, tilt_deg = sheet_pose.scale_and_tilt(shape, surface.center_mm)
     shift, corners, found = None, 4, (1.0, 0)
-    uncertainty = unrolled.uncertainty_mm if unrolled else corner_uncertainty_mm(fit, surface.rect_mm)
-    uncertainty = float(np.hypot(uncertainty, _OUTLIER_FACTOR * fit.outlier_mm))
+    uncertainty = float(np.hypot(location.uncertainty_mm, _OUTLIER_FACTOR * fit.outlier_mm))
     # one page of a piece in tiles has none of the piece's markers, or some of them
     if colors is not None and surface.is_piece:
         cells = register(location.srgb, fit.px_from_mm, surface.rect_mm, colors.design, px_per_mm, blur)
@@ -209,17 +180,17 @@ def geometry_of(
         offset = _offset_mm(cells, free, surface)
         uncertainty = float(np.linalg.norm([uncertainty, _SURE_SIGMAS * corner_shift, offset]))
         shift = None if shift is None else max(shift, offset)
-    tilt_model = location.px, location.parameters, location.covariance, surface.center_mm, _turn_rad(location, surface)
+    middle, turn = surface.center_mm, _turn_rad(location, surface)
     distortion = None if unrolled else sheet_pose.distortion_of(fit, view.matrix_px, view.focal_spread)
     geometry = Geometry(
         residual_mm=fit.residual_mm,
         px_per_mm=px_per_mm,
         tilt_deg=tilt_deg,
-        tilt_uncertainty_deg=sheet_pose.tilt_uncertainty_deg(*tilt_model, distortion),
+        tilt_uncertainty_deg=sheet_pose.tilt_uncertainty_deg(shape, middle, turn, distortion),
         contrast=light.contrast,
         blur_px=blur,
         corner_uncertainty_mm=uncertainty,
-        curl_radius_mm=unrolled and unrolled.shape.radius_mm,
+        curl_radius_mm=shape.radius_mm,
         bend_mm=fit.bend_mm,
         design_shift_mm=shift,
         # no homography maps a page that was unrolled to the photograph
@@ -229,8 +200,7 @@ def geometry_of(
 
 
 def _turn_rad(location: LocatedSheet, surface: Surface) -> float:
-    bend = location.fit.bend_mm / min(surface.rect_mm[2:])
-    return sheet_pose.turn_rad(bend, location.unrolled and location.unrolled.shape)
+    return sheet_pose.turn_rad(location.fit.bend_mm / min(surface.rect_mm[2:]), location.shape)
 
 
 def _offset_mm(cells: Registration, free: np.ndarray, surface: Surface) -> float:
@@ -256,7 +226,7 @@ def _absent_markers(
     """
     absent: dict[int, bool] = {}
     for i in surface.piece_ids - detected.markers.keys():
-        quad = location.px(location.parameters, surface.corners_mm[i])
+        quad = location.shape.px(surface.corners_mm[i])
         if not shows_small_code(view.srgb, quad, i, surface.dictionary):
             absent[i] = not is_in_picture(quad, view.srgb)
     return absent
@@ -292,10 +262,7 @@ def camera_pose(view: PinholePhoto, location: LocatedSheet, surface: Surface) ->
     if view.matrix_px is None:
         return None, "cropped" if view.cropped else "unknown"
     camera = view.matrix_px, view.focal_spread, surface.center_mm, _turn_rad(location, surface), view.calibrated
-    if location.unrolled is None:
-        stance = sheet_pose.flat_sheet_position(location.fit, *camera)
-    else:
-        stance = sheet_pose.bent_sheet_position(location.unrolled.shape, *camera)
+    stance = sheet_pose.bent_sheet_position(location.shape, *camera)
     # perspective cannot tell a stretched print from a wrong focal length: a camera file is trusted, EXIF is not
     if stance.focal_agrees is False and not view.calibrated:
         return None, "contradicted"

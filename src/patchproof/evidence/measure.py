@@ -18,7 +18,6 @@ from patchproof.evidence.appearance import MOST_CLIPPED, MOST_NOISE, appearance
 from patchproof.evidence.design_match import DesignMatch
 from patchproof.evidence.locate import (
     MOST_SHIFT,
-    LocatedSheet,
     PinholePhoto,
     camera_pose,
     geometry_of,
@@ -35,6 +34,7 @@ from patchproof.photo.pose import UNCONFIRMED_DEG
 from patchproof.photo.quality import FrameLight, blur_px, frame_light
 from patchproof.photo.rectify import PageFit
 from patchproof.photo.rejection import PhotoRejected
+from patchproof.photo.unroll import LocatedSheet, flat_sheet
 
 if TYPE_CHECKING:
     from patchproof.photo.corners import DesignCorners
@@ -118,7 +118,8 @@ def measure(
         detected, surface = MarkersInView({}, (), ()), surface.without_markers
         placed = place_design(view.srgb, corners, surface.rect_mm, promised.design, promised.ink)
     entry = partial(PhotoEntry, file=name, photo_px=size_px, markers_found=len(detected.markers))
-    location = LocatedSheet(view.srgb, placed.fit, None) if placed else locate_sheet(view, detected, surface)
+    flat = placed and flat_sheet(view.srgb, placed.fit, surface.rect_mm)
+    location = flat or locate_sheet(view, detected, surface)
     if location is None:
         trouble = PhotoRejected("too_few_markers", len(detected.markers), 1, _DISTORTED_ADVICE)
         return MeasuredPhoto(entry(status="judged", remark=Remark.of(trouble)), True)
@@ -236,9 +237,9 @@ def _is_uncut(location: LocatedSheet, detected: MarkersInView, surface: Surface)
     if set(location.fit.inlier_ids) & surface.page_ids or not detected.markers.keys() & surface.piece_ids:
         return True
     x, y, w, h = surface.rect_mm
-    side_px = np.linalg.norm(np.diff(location.px(location.parameters, np.array([[x, y], [x + w, y + h]])), axis=0))
+    side_px = np.linalg.norm(np.diff(location.shape.px(np.array([[x, y], [x + w, y + h]])), axis=0))
     off_px = [
-        np.linalg.norm(detected.markers[i].corners_px - location.px(location.parameters, surface.corners_mm[i]), axis=1)
+        np.linalg.norm(detected.markers[i].corners_px - location.shape.px(surface.corners_mm[i]), axis=1)
         for i in sorted(detected.markers.keys() & surface.page_ids)
     ]
     return any(off.max() < _MOST_CURL * side_px for off in off_px)
