@@ -15,6 +15,7 @@ from patchproof.evidence.surface import surface_of
 from patchproof.photo.detect import MarkersInView
 from patchproof.photo.edges import Borders
 from patchproof.photo.rectify import PageFit, fit_page
+from patchproof.photo.unroll import flat_sheet
 from test_photo_rectify import marker_corners, noisy_corners
 from test_verify_run import measured, shot
 
