@@ -20,7 +20,7 @@ from functools import partial
 import numpy as np
 
 from patchproof.base.color import ciede2000, lab_from_srgb, linear_from_srgb, srgb_from_linear
-from patchproof.calibrate.ladder import Rung, compare_rungs, simplest_rung
+from patchproof.calibrate.ladder import Rung, choose_rung
 
 Colors = np.ndarray  # N×3 sRGB in [0, 1]
 ColorMap = Callable[[Colors], Colors]
@@ -81,8 +81,7 @@ def choose_map(kinds: Sequence[MapKind], sent: Colors, seen: Colors) -> MapChoic
         usable = [kind for kind in usable if kind.endpoints_only]
         folds = [np.flatnonzero(~ends if not ends.all() else ends)]
     errors = np.array([_held_out(kind, sent, seen, folds) for kind in usable])
-    rungs = compare_rungs([kind.name for kind in usable], errors)
-    chosen = simplest_rung(rungs)
+    chosen, rungs = choose_rung([kind.name for kind in usable], errors)
     left_out = tuple(kind.name for kind in kinds if kind not in usable)
     return MapChoice(rungs[chosen], usable[chosen].fit(sent, seen), rungs, len(sent), errors.shape[1], left_out, width)
 

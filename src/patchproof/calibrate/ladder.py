@@ -26,17 +26,14 @@ class Rung:
     standard_error: float
 
 
-def compare_rungs(names: Sequence[str], errors: np.ndarray) -> tuple[Rung, ...]:
-    """The rungs of errors models × items, at least one row of them finite; rows that are not finite had no fit."""
+def choose_rung(names: Sequence[str], errors: np.ndarray) -> tuple[int, tuple[Rung, ...]]:
+    """The number of the rung to use, and all, of errors models × items; rows that are not finite had no fit, but not
+    all.
+    """
     means = np.where(np.isfinite(errors).all(1), errors.mean(1), np.inf)
     worse = errors[np.isfinite(means)] - errors[means.argmin()]
     by, spread = np.full((2, len(means)), np.inf)
     by[np.isfinite(means)] = worse.mean(1)
     spread[np.isfinite(means)] = worse.std(1, ddof=1) / np.sqrt(worse.shape[1]) if worse.shape[1] > 1 else 0.0
-    rows = zip(names, means.tolist(), by.tolist(), spread.tolist(), strict=True)
-    return tuple(Rung(*row) for row in rows)
-
-
-def simplest_rung(rungs: Sequence[Rung]) -> int:
-    """The index of the rung to use."""
-    return next(i for i, rung in enumerate(rungs) if np.isfinite(rung.error) and rung.worse_by <= rung.standard_error)
+    rungs = tuple(map(Rung, names, means.tolist(), by.tolist(), spread.tolist()))
+    return int(np.argmax(np.isfinite(means) & (by <= spread))), rungs

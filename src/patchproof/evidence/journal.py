@@ -39,26 +39,20 @@ MAX_JOURNAL_BYTES = 128 << 20  # of 10,000 photographs
 LightLevel = Annotated[Finite, Field(ge=-4, le=4)]
 
 
-class _Light(StrictModel):
-    paper: tuple[LightLevel, LightLevel, LightLevel]
-    ink: tuple[LightLevel, LightLevel, LightLevel]
-    contrast: Finite
-    clipped: Share
-
-
 class FinishedPhoto(StrictModel):
     """A measured photograph without pixels; `pictures` says whether those for the page were made."""
 
     entry: PhotoEntry
     counted: bool
-    light: _Light | None
+    # paper, ink, contrast, clipped share
+    light: tuple[LightLevel, LightLevel, LightLevel, LightLevel, LightLevel, LightLevel, Finite, Share] | None
     pictures: bool
     trace: Trace | None = None
 
     @classmethod
     def of(cls, measured: MeasuredPhoto, pictures: bool) -> "FinishedPhoto":
         """Make it by way of JSON, so that a resumed run, which reads it, cannot differ."""
-        light = measured.light and {key: np.asarray(value).tolist() for key, value in vars(measured.light).items()}
+        light = measured.light and np.hstack([*vars(measured.light).values()]).tolist()
         entry, trace = measured.entry.model_dump(mode="json"), measured.trace and measured.trace.model_dump()
         values = {"entry": entry, "counted": measured.counted, "light": light, "pictures": pictures, "trace": trace}
         return cls.model_validate(values)
@@ -66,9 +60,8 @@ class FinishedPhoto(StrictModel):
     @property
     def photo(self) -> MeasuredPhoto:
         """The measured photograph."""
-        light = self.light
-        if light is not None:
-            light = FrameLight(np.array(light.paper), np.array(light.ink), light.contrast, light.clipped)
+        n = self.light
+        light = n and FrameLight(np.array(n[:3]), np.array(n[3:6]), n[6], n[7])
         return MeasuredPhoto(self.entry, self.counted, light=light, trace=self.trace)
 
 

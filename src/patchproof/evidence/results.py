@@ -109,13 +109,7 @@ class Remark(StrictModel):
 
 
 _PARTS = {"geometry": Geometry, "pose": CameraPose, "scale": Scale, "color": Color, "remark": Remark}
-# one photograph in report.json, in this order
-PHOTO_KEYS = """
-    file status sha256 photo_px code figure threshold advice located markers_found residual_mm px_per_mm scale_x scale_y
-    tilt_deg tilt_uncertainty_deg azimuth_deg azimuth_uncertainty_deg distance_mm
-    distance_uncertainty_mm focal contrast blur_px corner_uncertainty_mm bend_mm design_shift_mm
-    curl_radius_mm delta_e00_mean delta_e00_p95 color_fit clipped_share glossy_share homography_px_from_mm box
-    predictions""".split()
+_NOT_MEASURED = {key: None for kind in _PARTS.values() for key in kind.model_fields}
 
 
 class PhotoEntry(StrictModel):
@@ -164,9 +158,10 @@ class PhotoEntry(StrictModel):
 
     @model_serializer(mode="wrap")
     def _flatten(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        parts = serialize(self)
-        figures = parts | {key: value for name in _PARTS for key, value in (parts[name] or {}).items()}
-        return {key: figures.get(key) for key in PHOTO_KEYS} | ({"said": figures["said"]} if figures["said"] else {})
+        data, figures = serialize(self), dict(_NOT_MEASURED)
+        for name in _PARTS:
+            figures |= data.pop(name) or {}
+        return {key: value for key, value in data.items() if key != "said" or value} | figures
 
 
 class Trace(StrictModel):
