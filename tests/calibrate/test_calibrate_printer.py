@@ -24,8 +24,15 @@ from patchproof.base.color import linear_from_srgb, srgb_from_linear
 from patchproof.base.errors import Refused
 from patchproof.calibrate import chart as chart_module
 from patchproof.calibrate import icc
-from patchproof.calibrate.chart import calibrate_chart, combine_light, printer_of, prints_of, summary_lines
-from patchproof.calibrate.chart_photo import ChartPhoto, read_chart
+from patchproof.calibrate.chart import (
+    ChartPhoto,
+    calibrate_chart,
+    combine_light,
+    printer_of,
+    prints_of,
+    read_chart,
+    summary_lines,
+)
 from patchproof.calibrate.color_ladder import (
     MIN_WIDTH,
     average_repeats,
