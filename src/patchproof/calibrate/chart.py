@@ -54,6 +54,16 @@ _SEARCH_MM = 60.0  # bare paper is searched for within this distance of the char
 
 
 @dataclass(frozen=True)
+class ChartPhoto:
+    """`light` N×3 relative to paper, one row per swatch of the manifest's chart, NaN where it could not be read, and
+    the light of bare `paper` under the chart (1 = the camera's full white).
+    """
+
+    light: np.ndarray
+    paper: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
 class PrinterCalibration:
     """The printer, the choice of its model, and warnings about the photographs."""
 
@@ -191,16 +201,6 @@ def _read_all(
         expected = "photographs in which the chart can be read"
         raise Refused(expected, f"none of {len(numbered)}", f"see the first: {first}")
     return readings, warnings + summarize_said(said)
-
-
-@dataclass(frozen=True)
-class ChartPhoto:
-    """`light` N×3 relative to paper, one row per swatch of the manifest's chart, NaN where it could not be read, and
-    the light of bare `paper` under the chart (1 = the camera's full white).
-    """
-
-    light: np.ndarray
-    paper: tuple[float, float, float]
 
 
 def read_chart(photo: Photo, manifest: Manifest) -> ChartPhoto:

@@ -4,11 +4,11 @@ In: any still picture that Pillow reads as one of `IMAGE_FORMATS` (HEIC with the
 `PhotoRejected`, so that a bad file never stops a batch. `declarations` lists what files can declare: colors become
 sRGB, alpha is put on white, deeper channels become 8-bit. Pixels are converted in strips, since whole copies take twice
 the memory; above `WHOLE_PX` four pixels become one, since measuring takes up to 30 bytes each.
-JPEGs are decoded by OpenCV, strictly: what libjpeg warns of is damage, which it fills with gray or wrong blocks and says
-on stderr alone, so that is read meanwhile. It says only one thing of a file: where that is an odd header, what follows
+JPEGs are decoded by OpenCV, strictly: what libjpeg warns of is damage. It fills that with gray or wrong blocks and says
+so on stderr alone, which is read meanwhile. It says only one thing of a file: where that is an odd header, what follows
 is decoded again under a plain one. Zeroed bytes may decode without a warning: a run of them is damage if the code of
-zeros is not that of a flat block, where one scan holds all (chroma alone, or a progressive file, may be flat). Bytes that
-change within one block leave no trace.
+zeros is not that of a flat block, where one scan holds all (chroma alone, or a progressive file, may be flat). Bytes
+that change within one block leave no trace.
 Ignored on purpose: sidecar files, dates and places, what a camera's maker notes say of its lens.
 """
 
