@@ -21,10 +21,10 @@ import numpy as np
 from pydantic import Field
 
 from patchproof.base.errors import Refused
+from patchproof.base.geometry import Frame
 from patchproof.base.input import read_json
 from patchproof.base.packaged import named_path, packaged_path
 from patchproof.base.validation import Finite, Positive, StrictModel, validate_model
-from patchproof.channel.cameras import Frame
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -85,7 +85,7 @@ class Camera(StrictModel):
         """Return the frame that `distort_pictures` reads from; without distortion, the picture itself."""
         matrix = self.matrix_px(size_px)
         if not self.has_distortion:
-            return Frame(size_px, matrix, 0, 0, 0, 0)
+            return Frame(size_px, matrix)
         edge = self.undistort_points(_edge_px(size_px), size_px)
         # a bilinear sample between the centers of the outermost pixels reads no padding
         left, top = (max(0, math.ceil(0.5 - low)) for low in edge.min(0))

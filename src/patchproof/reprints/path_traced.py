@@ -23,8 +23,8 @@ from torch import Tensor
 from patchproof.base import geometry
 from patchproof.base.color import LINEAR_FROM_CODE, linear_from_srgb
 from patchproof.base.errors import Refused
+from patchproof.base.geometry import Frame
 from patchproof.channel.camera import develop
-from patchproof.channel.cameras import Frame
 from patchproof.channel.effects import Light
 from patchproof.channel.printer import print_change, vary_print
 from patchproof.mesh.mesh import Mesh
