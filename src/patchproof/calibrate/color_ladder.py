@@ -59,11 +59,12 @@ class MapChoice:
 
 def map_kinds(priors: Mapping[str, ColorMap]) -> tuple[MapKind, ...]:
     """All kinds, simplest first."""
+    best = lambda sent, seen: min(priors.values(), key=lambda prior: color_difference(prior(sent), seen).mean())  # noqa: E731
     return (
         MapKind("identity", lambda sent, seen: lambda colors: colors, 0, True),
         MapKind("white_black", fit_white_black, 2, True),
         MapKind("affine", fit_affine, 12),
-        MapKind("prior", partial(_best_prior, priors), 0, True),
+        MapKind("prior", best, 0, True),
         MapKind("prior+affine", partial(fit_prior_affine, priors), 12),
         MapKind("prior+affine+spline", partial(fit_prior_spline, priors), 24),
         MapKind("spline", fit_spline, 24),
@@ -75,7 +76,8 @@ def choose_map(kinds: Sequence[MapKind], sent: Colors, seen: Colors) -> MapChoic
     sent, seen = average_repeats(sent, seen)
     corners, width = np.isin(sent, (0.0, 1.0)).all(1), color_width(sent)
     usable = [kind for kind in kinds if len(sent) >= kind.min_colors and (kind.endpoints_only or width >= MIN_WIDTH)]
-    folds = _folds(np.flatnonzero(~corners))
+    shuffled = np.random.default_rng(0).permutation(np.flatnonzero(~corners))
+    folds = [fold for fold in np.array_split(shuffled, FOLDS) if len(fold)]
     if (~corners).sum() < MIN_HELD_OUT:
         ends = (sent == 1).all(1) | (sent.sum(1) == sent.sum(1).min())
         usable = [kind for kind in usable if kind.endpoints_only]
@@ -140,23 +142,12 @@ def fit_prior_spline(priors: Mapping[str, ColorMap], sent: Colors, seen: Colors)
     return lambda colors: start(colors) + residual_map(colors)
 
 
-def _best_prior(priors: Mapping[str, ColorMap], sent: Colors, seen: Colors) -> ColorMap:
-    """The prior that predicts these colors best."""
-    return min(priors.values(), key=lambda prior: color_difference(prior(sent), seen).mean())
-
-
 def _features(colors: Colors) -> np.ndarray:
     return np.hstack([colors, lab_from_srgb(colors) / _LAB_SCALE])
 
 
 def _with_ones(colors: Colors) -> np.ndarray:
     return np.column_stack([colors, np.ones(len(colors))])
-
-
-def _folds(held_out: np.ndarray) -> list[np.ndarray]:
-    """Indices of up to ten folds, shuffled by a fixed seed."""
-    mixed = np.random.default_rng(0).permutation(held_out)
-    return [fold for fold in np.array_split(mixed, FOLDS) if len(fold)]
 
 
 def _held_out(kind: MapKind, sent: Colors, seen: Colors, folds: list[np.ndarray]) -> np.ndarray:

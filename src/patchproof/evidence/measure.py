@@ -24,7 +24,7 @@ from patchproof.evidence.locate import (
     locate_sheet,
     object_box,
 )
-from patchproof.evidence.results import Color, Geometry, PhotoEntry, Remark, Scale, Trace
+from patchproof.evidence.results import Geometry, PhotoEntry, Remark, Scale, Trace
 from patchproof.evidence.surface import PromisedColors, Surface
 from patchproof.evidence.task import PromisedRanges
 from patchproof.photo.detect import MarkersInView, find_markers, is_mirrored
@@ -110,7 +110,12 @@ def measure(
         detected, surface = identify_sheet(view.srgb, surface)
     except PhotoRejected as rejection:
         if corners is None and find is not None and rejection.code in UNLOCATED_CODES:
-            corners, rejection = _search(view.srgb, find, surface, rejection)
+            from patchproof.photo.find_design import find_design
+
+            try:
+                corners = find_design(view.srgb, find, surface.rect_mm[2:])
+            except PhotoRejected as not_found:
+                rejection = not_found
         if corners is None or promised is None or rejection.code not in UNLOCATED_CODES:
             return MeasuredPhoto(PhotoEntry(file=name, status="rejected", remark=Remark.of(rejection)), False)
         from patchproof.photo.corners import place_design
@@ -163,28 +168,12 @@ def measure(
     if trouble is not None:
         entry = partial(entry, status="judged", remark=Remark.of(trouble))
     else:
-        remark = _print_check(page_check, scale, scan_dpi) or match.weak_ink or _noise_remark(color)
+        remark, noise = _print_check(page_check, scale, scan_dpi) or match.weak_ink, color and color.noise_delta_e00
+        if remark is None and noise is not None and noise > MOST_NOISE:
+            remark = Remark(code="noisy", figure=noise, threshold=MOST_NOISE, advice=_NOISY_ADVICE)
         scale = scale if scale is not None and _SCALE_RANGE[0] < _worst(scale) < _SCALE_RANGE[1] else None
         entry = partial(entry, status="measured", scale=scale, remark=remark)
     return MeasuredPhoto(entry(color=color), counted, pictures, light)
-
-
-def _noise_remark(color: Color | None) -> Remark | None:
-    if color is None or color.noise_delta_e00 is None or color.noise_delta_e00 <= MOST_NOISE:
-        return None
-    return Remark(code="noisy", figure=color.noise_delta_e00, threshold=MOST_NOISE, advice=_NOISY_ADVICE)
-
-
-def _search(
-    srgb: np.ndarray, design: np.ndarray, surface: Surface, rejection: PhotoRejected
-) -> "tuple[DesignCorners | None, PhotoRejected]":
-    """The design's corners by its pixels, and the reason for the search; or None and why they were not found."""
-    from patchproof.photo.find_design import find_design
-
-    try:
-        return find_design(srgb, design, surface.rect_mm[2:]), rejection
-    except PhotoRejected as not_found:
-        return None, not_found
 
 
 def identify_sheet(srgb: np.ndarray, surface: Surface) -> tuple[MarkersInView, Surface]:
@@ -195,9 +184,10 @@ def identify_sheet(srgb: np.ndarray, surface: Surface) -> tuple[MarkersInView, S
     marker_ids = surface.piece_ids or surface.page_ids
     if not marker_ids:
         raise PhotoRejected("no_corners", None, None, _NO_CORNERS_ADVICE)
-    if surface.pages:
-        pages = [frozenset(page.corners_mm) for page in surface.pages]
-        detected = find_markers(srgb, marker_ids, surface.all_ids, surface.dictionary, pages)
+    pages = [frozenset(page.corners_mm) for page in surface.pages]
+    if pages:
+        all_ids = frozenset(surface.corners_mm).union(*pages)
+        detected = find_markers(srgb, marker_ids, all_ids, surface.dictionary, pages)
     else:
         detected = find_sheet(srgb, marker_ids, surface.corners_mm, surface.dictionary)
     if not detected.markers:
@@ -217,17 +207,12 @@ def identify_sheet(srgb: np.ndarray, surface: Surface) -> tuple[MarkersInView, S
         raise PhotoRejected("several_sheets", extra_markers, 1, advice)
     if not surface.pages:
         return detected, surface
-    surface = _page_in_view(detected, surface)
+    hidden_ids = detected.markers.keys() - surface.corners_mm.keys()  # those that an assembled piece would hide
+    counts = [len(hidden_ids & page) for page in pages]
+    surface = surface.pages[int(np.argmax(counts))] if any(counts) else surface
     markers = {i: borders for i, borders in detected.markers.items() if i in surface.corners_mm}
     detected = MarkersInView(markers, detected.foreign, detected.doubled)
     return complete_markers(srgb, detected, surface.corners_mm, surface.dictionary), surface
-
-
-def _page_in_view(detected: MarkersInView, surface: Surface) -> Surface:
-    """The page of most markers that an assembled piece would hide; the assembled surface if there are none."""
-    hidden_ids = detected.markers.keys() - surface.corners_mm.keys()
-    counts = [len(hidden_ids & page.corners_mm.keys()) for page in surface.pages]
-    return surface.pages[int(np.argmax(counts))] if any(counts) else surface
 
 
 def _is_uncut(location: LocatedSheet, detected: MarkersInView, surface: Surface) -> bool:

@@ -60,11 +60,6 @@ class Surface:
         return x + w / 2, y + h / 2
 
     @property
-    def all_ids(self) -> frozenset[int]:
-        """Ids of the surface's markers and of its pages'."""
-        return frozenset(self.corners_mm).union(*(page.corners_mm for page in self.pages))
-
-    @property
     def page_ids(self) -> frozenset[int]:
         """Ids of the page's markers outside of the cut."""
         return frozenset(self.corners_mm) - self.piece_ids

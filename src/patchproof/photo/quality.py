@@ -102,7 +102,9 @@ def pattern_light(
     markers, lights = [], []
     for cells, corners in zip(marker_cells(dictionary, ids), (corners_mm[i] for i in ids), strict=True):
         module_px = local_scale(px_from_mm, corners.mean(0))[0] * np.linalg.norm(corners[1] - corners[0]) / len(cells)
-        points = apply_homography(px_from_mm, _centers_mm(corners, len(cells)))
+        rows, columns = (np.mgrid[: len(cells), : len(cells)].reshape(2, -1, 1) + 0.5) / len(cells)
+        centers_mm = corners[0] + columns * (corners[1] - corners[0]) + rows * (corners[3] - corners[0])
+        points = apply_homography(px_from_mm, centers_mm)
         usable = ((points > 1) & (points < [srgb.shape[1] - 1, srgb.shape[0] - 1])).all(1)
         values = sample(srgb, points)
         usable &= (values < CLIPPED_CODE).all(1)
@@ -132,13 +134,6 @@ def _regress(pattern: np.ndarray, light: np.ndarray) -> tuple[float, np.ndarray,
         error = np.linalg.norm(rows @ np.stack([ink, paper]) - light, axis=1)
         weight = np.sqrt(np.minimum(1, 1.345 * 1.4826 * np.median(error) / np.maximum(error, 1e-9)))
     return float(np.median(error)), paper, ink
-
-
-def _centers_mm(corners: np.ndarray, modules: int) -> np.ndarray:
-    """The centers of a marker's modules, row by row."""
-    across, down = (corners[1] - corners[0]) / modules, (corners[3] - corners[0]) / modules
-    rows, columns = np.mgrid[0:modules, 0:modules] + 0.5
-    return corners[0] + columns.reshape(-1, 1) * across + rows.reshape(-1, 1) * down
 
 
 def _blur_cells(cells: np.ndarray, sigma_modules: float) -> np.ndarray:

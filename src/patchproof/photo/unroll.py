@@ -85,24 +85,16 @@ def flat_sheet(srgb: np.ndarray, fit: PageFit, rect_mm) -> LocatedSheet:
     return LocatedSheet(srgb, fit, rectify.corner_uncertainty_mm(fit, rect_mm), shape, False)
 
 
-@dataclass(frozen=True)
-class ShapeFit:
-    """A shape and the corners that it was fitted to."""
-
-    flat: np.ndarray  # 3×3 homography of the uncorrected corners
-    mm: np.ndarray
-    px: np.ndarray  # corrected for bent borders
-    shape: Shape
-
-
 def fit_shape(
     corners_px: Quads,
     corners_mm: Quads,
     size_px: tuple[int, int],
     focal_px: float | None = None,
     focal_spread: float = UNKNOWN_FOCAL,
-) -> ShapeFit | None:
-    """Fit a cylinder or a lens to the corners in a picture of this size; None if a plane fits as well."""
+) -> tuple[Shape, np.ndarray, np.ndarray, np.ndarray] | None:
+    """Fit a cylinder or a lens to the corners in a picture of this size, and return it, the 3×3 homography of the
+    corners, and these in mm and in px, corrected for bent borders; None if a plane fits as well.
+    """
     ids, px, mm = rectify.common_corners(corners_px, corners_mm)
     if len(ids) < LEAST_MARKERS:
         return None
@@ -116,7 +108,7 @@ def fit_shape(
     # the borders were fitted as straight lines, which on strongly bent paper meet beside the corners
     shift = _chord_shift(best, mm)
     px, floor = px - shift, float(np.hypot(CORNER_NOISE_PX, _CORRECTION_ERROR * rms(shift)))
-    return ShapeFit(flat, mm, px, _best_shape(flat, mm, px, size_px, focal_px, focal_spread, floor))
+    return _best_shape(flat, mm, px, size_px, focal_px, focal_spread, floor), flat, mm, px
 
 
 def unroll(
@@ -134,7 +126,7 @@ def unroll(
     shape_fit = fit_shape(corners_px, corners_mm, (srgb.shape[1], srgb.shape[0]), focal_px, focal_spread)
     if shape_fit is None:
         return None
-    flat, mm, px, shape = shape_fit.flat, shape_fit.mm, shape_fit.px, shape_fit.shape
+    shape, flat, mm, px = shape_fit
     grid = rect_mm[:2] + np.multiply(rect_mm[2:], RECT_GRID)
     px_from_mm = fit_homography(grid, shape.px(grid))
     margin = np.linalg.norm(apply_homography(flat, mm) - px, axis=1).max()  # pixels move about that far
