@@ -151,7 +151,6 @@ def _with_ones(colors: Colors) -> np.ndarray:
 
 
 def _held_out(kind: MapKind, sent: Colors, seen: Colors, folds: list[np.ndarray]) -> np.ndarray:
-    """ΔE00 of each held-out color, fold by fold."""
     errors = []
     for fold in folds:
         train = np.setdiff1d(np.arange(len(sent)), fold)

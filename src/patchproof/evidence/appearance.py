@@ -136,11 +136,9 @@ def _noise_delta(linear: np.ndarray, cells: np.ndarray, fit: ShownColors, pixels
 def fit_cells(photographed: np.ndarray, promised: np.ndarray, light: FrameLight, ink: np.ndarray) -> ShownColors:
     """Fit a color map to N×3 cells, paper and ink; to paper and ink alone if the cells are too few or too alike."""
     anchors = max(len(photographed) // _CELLS_PER_ANCHOR, 1)  # the design's colors alone do not fix white and black
-    ends_by_side = [[light.ink] * anchors, [light.paper] * anchors], [[ink] * anchors, [np.ones(3)] * anchors]
-    if light.clipped > _MOST_CLIPPED_PAPER:  # overexposed paper is no reference
-        ends_by_side = [ends[:1] for ends in ends_by_side]
-    sides = zip((photographed, promised), ends_by_side, strict=True)
-    fit = affine12(*(np.concatenate([cells, *ends]) for cells, ends in sides))
+    count = anchors if light.clipped > _MOST_CLIPPED_PAPER else 2 * anchors  # overexposed paper is no reference
+    seen_ends, ends = (np.repeat(pair, anchors, 0)[:count] for pair in ([light.ink, light.paper], [ink, np.ones(3)]))
+    fit = affine12(np.concatenate([photographed, seen_ends]), np.concatenate([promised, ends]))
     return fit or white_black(light.paper, light.ink, ink)
 
 

@@ -152,7 +152,6 @@ def gather_evidence(
 
 
 def _spread(items: list, most: int) -> list:
-    """At most `most` of the items, evenly spread."""
     count = min(len(items), most)
     return [items[number * len(items) // count] for number in range(count)]
 
@@ -260,7 +259,6 @@ def _sessions(grouping: Grouping, photos: Sequence[MeasuredPhoto], hits: dict[st
 
 
 def _recognized(entries: Iterable[PhotoEntry], network: str) -> dict[str, bool]:
-    """The network's answers (recognized or not) by file."""
     return {entry.file: entry.predictions[network].recognized for entry in entries if entry.predictions}
 
 

@@ -16,14 +16,7 @@ import numpy as np
 from patchproof.base.geometry import MM_PER_INCH, apply_homography, rect_corners
 from patchproof.evidence.appearance import MOST_CLIPPED, MOST_NOISE, appearance
 from patchproof.evidence.design_match import DesignMatch
-from patchproof.evidence.locate import (
-    MOST_SHIFT,
-    PinholePhoto,
-    camera_pose,
-    geometry_of,
-    locate_sheet,
-    object_box,
-)
+from patchproof.evidence.locate import MOST_SHIFT, PinholePhoto, camera_pose, geometry_of, locate_sheet, object_box
 from patchproof.evidence.results import Geometry, PhotoEntry, Remark, Scale, Trace
 from patchproof.evidence.surface import PromisedColors, Surface
 from patchproof.evidence.task import PromisedRanges
@@ -293,7 +286,6 @@ def _scan_scale(px_from_mm: np.ndarray, surface: Surface, scan_dpi: float) -> Sc
 
 
 def _worst(scale: Scale) -> float:
-    """The side's scale that is farther from 1."""
     return max((scale.scale_x, scale.scale_y), key=lambda side: abs(np.log(side)))
 
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from patchproof.channel.lens import Camera
     from patchproof.channel.printer import Printer
     from patchproof.classifier import Classifier
-    from patchproof.evidence.annotations import DrawnBox, NamedCorners
+    from patchproof.evidence.annotations import Drawn
 
 LEDGER_PHOTOS = 24  # each costs 16 classifications; 24 leave intervals of some ± 5 points
 MARGIN = 0.10  # of the range's width
@@ -103,8 +103,8 @@ class Options:
     ruler_mm: tuple[float, float] | None = None
     controls: str | Path | None = None
     ledger_photos: int = LEDGER_PHOTOS
-    boxes: "Mapping[str, DrawnBox]" = field(default_factory=dict)
-    corners: "Mapping[str, NamedCorners]" = field(default_factory=dict)
+    boxes: "Mapping[str, Drawn]" = field(default_factory=dict)
+    corners: "Mapping[str, Drawn]" = field(default_factory=dict)
     find: bool = False
 
 

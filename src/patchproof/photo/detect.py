@@ -193,7 +193,6 @@ def search_level(srgb: np.ndarray, region: ImageRegion, level: Level, aruco, det
 
 
 def _scaled_size(srgb: np.ndarray, scale: float) -> tuple[int, int]:
-    """Width and height at another scale."""
     return max(1, round(srgb.shape[1] * scale)), max(1, round(srgb.shape[0] * scale))
 
 

@@ -207,6 +207,5 @@ def _disagreement(fit: PageFit, matrix_px: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def _tilt_deg(stretch: np.ndarray) -> np.ndarray:
-    """Tilts from derivatives N×2×2."""
     singular = np.linalg.svd(stretch, compute_uv=False)
     return np.degrees(np.arccos(np.clip(singular[:, 1] / singular[:, 0], 0, 1)))

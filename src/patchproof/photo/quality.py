@@ -76,7 +76,6 @@ def frame_light(srgb: np.ndarray, markers: Iterable[Borders]) -> FrameLight:
 
 
 def _fitted_or_all(markers: Iterable[Borders]) -> list[Borders]:
-    """The fitted markers, or all if none is fitted."""
     markers = list(markers)
     return [b for b in markers if b.fitted] or markers
 

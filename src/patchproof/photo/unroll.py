@@ -140,7 +140,6 @@ def unroll(
 
 
 def _best_shape(flat, mm, px, size, focal_px, focal_spread, floor_px=CORNER_NOISE_PX) -> Shape:
-    """The shape with the smaller residual."""
     paper = fit_cylinder(flat, mm, px, size, focal_px, focal_spread, floor_px)
     lens = fit_radial_lens(flat, mm, px, size)
     return lens if paper is None or lens.rms_px < paper.rms_px else paper
