@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from patchproof.base.geometry import MM_PER_INCH, apply_homography, rect_corners
-from patchproof.evidence.appearance import MOST_CLIPPED, MOST_NOISE, appearance
-from patchproof.evidence.design_match import DesignMatch
+from patchproof.evidence.appearance import MOST_CLIPPED, MOST_NOISE, DesignMatch, appearance
 from patchproof.evidence.locate import MOST_SHIFT, PinholePhoto, camera_pose, geometry_of, locate_sheet, object_box
 from patchproof.evidence.results import Geometry, PhotoEntry, Remark, Scale, Trace
 from patchproof.evidence.surface import PromisedColors, Surface

@@ -109,8 +109,8 @@ def unmix_markers(
     unmixed = pattern_light(srgb, px_from_mm, on_piece, surface.dictionary, blur_px) if on_piece else None
     if unmixed is None:
         return light, blur_px
-    light = replace(light, paper=unmixed.paper, ink=unmixed.ink)
-    return None if unmixed.agreement < _LEAST_AGREEMENT else (light, unmixed.blur_px)
+    paper, ink, blur_px, agreement = unmixed
+    return None if agreement < _LEAST_AGREEMENT else (replace(light, paper=paper, ink=ink), blur_px)
 
 
 def light_fit(shot: PhotoSquare, promised: PromisedColors, tone: float = 0.0) -> ShownColors:

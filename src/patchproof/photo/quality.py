@@ -80,23 +80,13 @@ def _fitted_or_all(markers: Iterable[Borders]) -> list[Borders]:
     return [b for b in markers if b.fitted] or markers
 
 
-@dataclass(frozen=True)
-class PatternLight:
-    """Linear light (3,) of paper and ink, and the Gaussian blur in pixels that fits the cells best.
-
-    `agreement` is the correlation of the cells' light with the printed cells, near 1 if the homography is right.
-    """
-
-    paper: np.ndarray
-    ink: np.ndarray
-    blur_px: float
-    agreement: float
-
-
 def pattern_light(
     srgb: np.ndarray, px_from_mm: np.ndarray, corners_mm: Mapping[int, np.ndarray], dictionary: str, blur_px: float
-) -> PatternLight | None:
-    """Fit paper, ink and blur to a uint8 photograph, given the blur from borders; None if it shows too few cells."""
+) -> tuple[np.ndarray, np.ndarray, float, float] | None:
+    """Fit light (3,) of paper and ink and the blur in pixels to a uint8 photograph, given the blur from borders; None
+    if it shows too few cells. Last comes the correlation of the cells' light with the printed cells, near 1 if the
+    homography is right.
+    """
     ids = sorted(corners_mm)
     markers, lights = [], []
     for cells, corners in zip(marker_cells(dictionary, ids), (corners_mm[i] for i in ids), strict=True):
@@ -121,7 +111,7 @@ def pattern_light(
     if not fits:
         return None
     _, paper, ink, blur, agreement = min(fits, key=lambda fit: fit[0])
-    return PatternLight(np.minimum(paper, 1.2), np.maximum(ink, 0), float(blur), agreement)
+    return np.minimum(paper, 1.2), np.maximum(ink, 0), float(blur), agreement
 
 
 def _regress(pattern: np.ndarray, light: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
