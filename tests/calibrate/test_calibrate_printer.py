@@ -33,7 +33,7 @@ from patchproof.calibrate.chart import (
     read_chart,
     summary_lines,
 )
-from patchproof.calibrate.color_ladder import (
+from patchproof.calibrate.ladder import (
     MIN_WIDTH,
     average_repeats,
     choose_map,

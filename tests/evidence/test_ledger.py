@@ -18,7 +18,6 @@ from patchproof.classifier import Classifier
 from patchproof.evidence.classify import square_of
 from patchproof.evidence.gather import gather_evidence
 from patchproof.evidence.ledger import _ledger, shapley
-from patchproof.evidence.print_fit import LEAST_CELLS, PhotographedDesign, cell_means, fit_print
 from patchproof.evidence.reproject import (
     PhotoSquare,
     Reference,
@@ -28,7 +27,16 @@ from patchproof.evidence.reproject import (
     reprojected_square,
     reprojected_squares,
 )
-from patchproof.evidence.surface import PromisedColors, piece_picture, promised_of, surface_of
+from patchproof.evidence.surface import (
+    LEAST_CELLS,
+    PhotographedDesign,
+    PromisedColors,
+    cell_means,
+    fit_print,
+    piece_picture,
+    promised_of,
+    surface_of,
+)
 from patchproof.evidence.task import Options
 from patchproof.photo.quality import FrameLight, pattern_light
 from patchproof.report.plots import ledger_plot

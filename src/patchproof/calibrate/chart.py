@@ -28,8 +28,7 @@ from patchproof.base.errors import Refused
 from patchproof.base.geometry import apply_homography, rect_corners
 from patchproof.base.input import hash_file, is_file, is_folder
 from patchproof.base.progress import Advance, no_advance
-from patchproof.calibrate import color_ladder
-from patchproof.calibrate.color_ladder import ColorMap, MapChoice, choose_map, color_difference, map_kinds
+from patchproof.calibrate.ladder import WELL_SPREAD_WIDTH, ColorMap, MapChoice, choose_map, color_difference, map_kinds
 from patchproof.channel.printer import Printer, load_printer, node_colors, printer_from_table, printer_output
 from patchproof.photo.detect import MarkersInView, is_mirrored
 from patchproof.photo.known_page import find_sheet
@@ -95,7 +94,7 @@ def calibrate_chart(
             if off is not None and off > MAX_PHOTO_DELTA_E00:
                 differs = f"{path.name} differs from the other photographs of its print by ΔE00 {off:.1f}"
                 warnings.append(f"{differs}: glare, or another print?")
-    if choice.width < color_ladder.WELL_SPREAD_WIDTH:
+    if choice.width < WELL_SPREAD_WIDTH:
         warnings.append(
             f"the {choice.colors} readable swatches hardly spread over the color cube ({choice.width:.2f} in their "
             f"thinnest direction, whole charts 0.3): errors are stated for colors like these, others are a guess"

@@ -33,9 +33,14 @@ from patchproof.evidence.annotations import corners_of_photo
 from patchproof.evidence.batch import PhotoItem, measure_all
 from patchproof.evidence.locate import pinhole_photo
 from patchproof.evidence.measure import MeasuredPhoto
-from patchproof.evidence.print_fit import LEAST_CELLS, PhotographedDesign, choose_photo_cells, design_cells
 from patchproof.evidence.reproject import unmix_markers
-from patchproof.evidence.surface import printed_colors
+from patchproof.evidence.surface import (
+    LEAST_CELLS,
+    PhotographedDesign,
+    choose_photo_cells,
+    design_cells,
+    printed_colors,
+)
 from patchproof.evidence.task import Options, Task, promised_ranges, task_of
 from patchproof.photo.read import read_photo
 from patchproof.photo.rectify import crop_around

@@ -80,7 +80,7 @@ class Pose(Draws):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Light(Draws):
-    """The light that falls on the object (see `channel.light`)."""
+    """The light that falls on the object (see `channel.camera`)."""
 
     ambient: np.ndarray = off()
     directional: np.ndarray = off()

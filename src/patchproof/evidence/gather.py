@@ -120,7 +120,7 @@ def gather_evidence(
             shots = [shot for shot in _spread(squares, options.ledger_photos) if shot is not None]
             entries = [photo.entry for photo in patch_photos if photo.entry.predictions]
             confidence = {entry.file: entry.predictions[name].target_confidence for entry in entries}
-            ledger = ledger_of(shots, manifest, task.surface, task.promised, judges, confidence)
+            ledger = ledger_of(shots, manifest, task, judges, confidence)
             pairs = zip(patch_photos, grouping.merged, strict=True)
             session = {photo.entry.file: number for photo, number in pairs if photo.counted}
             shots = [shot for shot in squares if shot is not None and shot.file in session]

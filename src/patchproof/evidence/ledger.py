@@ -50,6 +50,7 @@ from patchproof.evidence.reproject import (
 )
 from patchproof.evidence.results import EffectEstimate, Ledger, LedgerShare
 from patchproof.evidence.surface import DESIGN_PX, PromisedColors, Surface, piece_picture, printed_colors, with_markers
+from patchproof.evidence.task import Task
 from patchproof.evidence.verdict import compare_with_control
 from patchproof.sheets.manifest import Manifest
 from patchproof.sheets.piece import control_design
@@ -69,17 +70,13 @@ LEAST_AGREEMENT = 0.8  # share of the photographs
 
 
 def ledger_of(
-    shots: Sequence[PhotoSquare],
-    manifest: Manifest,
-    surface: Surface,
-    promised: PromisedColors,
-    judges: Judges,
-    confidence: Mapping[str, float],
+    shots: Sequence[PhotoSquare], manifest: Manifest, task: Task, judges: Judges, confidence: Mapping[str, float]
 ) -> Ledger | None:
     """Make the ledger of photographs, whose target confidences are `confidence` by file; None without shots, promise,
     design or conditions.
     """
-    if not shots or manifest.promise is None or manifest.design is None:
+    surface, promised = task.surface, task.promised
+    if not shots or manifest.promise is None or manifest.design is None or promised is None:
         return None
     conditions = manifest.promise.conditions
     claims = [(c.contrast, c.blur_px) for c in conditions if c.contrast is not None and c.blur_px is not None]

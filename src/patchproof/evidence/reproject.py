@@ -23,8 +23,7 @@ from patchproof.base.resample import index_homography
 from patchproof.channel.print_colors import ShownColors, add_ink, lower_light, white_black
 from patchproof.evidence.appearance import fit_cells, noise_of
 from patchproof.evidence.classify import BoxEdges, square_of
-from patchproof.evidence.print_fit import PhotographedDesign, design_cells, fit_print
-from patchproof.evidence.surface import PromisedColors, Surface
+from patchproof.evidence.surface import PhotographedDesign, PromisedColors, Surface, design_cells, fit_print
 from patchproof.photo.detect import LINEAR_FLOAT32_FROM_CODE, luminance
 from patchproof.photo.quality import FrameLight, pattern_light
 from patchproof.photo.rectify import region_around

@@ -21,8 +21,7 @@ from torch import Tensor
 
 from patchproof.base.color import LINEAR_FROM_CODE, lift_tone
 from patchproof.base.geometry import Frame, camera_centers
-from patchproof.channel.camera import encode_light, encode_light_by_table, gains
-from patchproof.channel.light import Lighting, irradiance, lighting_of
+from patchproof.channel.camera import Lighting, encode_light, encode_light_by_table, gains, irradiance, lighting_of
 from patchproof.render import pixels
 from patchproof.render.fragments import Cameras
 from patchproof.render.outlines import Outlines, find_outlines

@@ -41,7 +41,7 @@ class MeshScene(Scene):
     TERMS = (SceneTerm("lens distortion", "camera.file"),)
     OMITTED = (
         "cast shadows: a 10 mm ledge along the top of a 110 mm patch takes 4 % of its light, 9 % at the 95 % point",
-        "(computed for the default ranges, see channel/light); interreflection; "
+        "(computed for the default ranges, see channel/camera); interreflection; "
         "curl: paper is as flat or bent as stated",
     )
     EFFECT_TABLES = ("light", "camera")
