@@ -24,8 +24,8 @@ from patchproof.evidence.surface import printed_colors, surface_of
 from patchproof.evidence.task import promised_ranges
 from patchproof.optimizer.imported_design import import_patch
 from patchproof.optimizer.promise import PromiseOptions
-from patchproof.photo.corners import DesignCorners
 from patchproof.photo.read import Photo
+from patchproof.photo.registration import DesignCorners
 from patchproof.reprints.reprint import reprint
 from patchproof.reprints.run_sheet import sheet as sheet_of
 from patchproof.sheets.content import SheetContent

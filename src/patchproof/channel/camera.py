@@ -9,9 +9,9 @@ mm wide by a third when the light comes from 60 degrees, and nothing on itself. 
 differs by direction, and highlights on paper are left out, too: together they took 0.5 points [-0.1, 1.0] of the rates
 promised for glossy paper half a meter from a lamp, in 9 pairs of scene and network.
 
-Camera. In: N×3×H×W linear light and a `Sensor`. Out: N×3×H×W sRGB in [0, 1], differentiable. Order: blur (optics, focus,
-straight motion), exposure and white balance, shot and read noise, clipping, sRGB's curve, the photograph's own tone.
-The lens's distortion has its own module.
+Camera. In: N×3×H×W linear light and a `Sensor`. Out: N×3×H×W sRGB in [0, 1], differentiable. Order: blur (optics,
+focus, straight motion), exposure and white balance, shot and read noise, clipping, sRGB's curve, the photograph's own
+tone. The lens's distortion has its own module.
 
 Blur, motion, noise and JPEG are given for the photograph's full size. A picture rendered at `scale` times that size
 gets the part of them that remains after averaging: they shrink with `scale`, and effects below the threshold of

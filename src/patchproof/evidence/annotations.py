@@ -26,9 +26,9 @@ from patchproof.base.input import open_lazily, read_json
 from patchproof.base.text import printable
 from patchproof.base.validation import Finite, Positive, spelling_hint, summarize_names, validate_model
 from patchproof.evidence.classify import BoxEdges
-from patchproof.photo.corners import DesignCorners
 from patchproof.photo.limits import run_limited
 from patchproof.photo.read import allow_heic
+from patchproof.photo.registration import DesignCorners
 
 CORNERS_FILE = "corners.csv"
 CORNER_SIGMA_PX = 2.0  # of a corner that a person names

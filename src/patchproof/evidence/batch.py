@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from datetime import datetime
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -36,10 +35,8 @@ from patchproof.photo.exif import has_camera_shape
 from patchproof.photo.limits import run_limited
 from patchproof.photo.quality import is_featureless
 from patchproof.photo.read import read_photo
+from patchproof.photo.registration import DesignCorners
 from patchproof.photo.rejection import PhotoRejected
-
-if TYPE_CHECKING:
-    from patchproof.photo.corners import DesignCorners
 
 MAX_PICTURED_PHOTOS = 120  # photographs whose pictures are on the page; the rest is listed. Keeps it below some 15 MB
 _THUMBNAIL_PX = 560  # longer side: enough for a phone's width at twice its density, some 40 kB as JPEG
@@ -66,7 +63,7 @@ class PhotoItem:
     control: str | None = None
     with_pictures: bool = False
     box: BoxEdges | None = None
-    corners: "DesignCorners | None" = None
+    corners: DesignCorners | None = None
 
     @property
     def name(self) -> str:

@@ -9,7 +9,6 @@ views fail first and leaving them out would raise the rate.
 
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -25,11 +24,9 @@ from patchproof.photo.page_code import read_page_code, refuse_other_page
 from patchproof.photo.pose import UNCONFIRMED_DEG
 from patchproof.photo.quality import FrameLight, blur_px, frame_light
 from patchproof.photo.rectify import PageFit
+from patchproof.photo.registration import DesignCorners, place_design
 from patchproof.photo.rejection import PhotoRejected
 from patchproof.photo.unroll import LocatedSheet, flat_sheet
-
-if TYPE_CHECKING:
-    from patchproof.photo.corners import DesignCorners
 
 MOST_BLUR = 0.5  # modules of Gaussian sigma: beyond it, borders of neighboring cells merge
 SMALLEST_DESIGN_PX = 24.0  # shorter side: fewer pixels cannot tell a design from its mean color
@@ -91,7 +88,7 @@ def measure(
     ranges: PromisedRanges,
     scan_dpi: float | None = None,
     with_pictures: bool = True,
-    corners: "DesignCorners | None" = None,
+    corners: DesignCorners | None = None,
     find: np.ndarray | None = None,
 ) -> MeasuredPhoto:
     """Measure one readable photograph; color only if the sheet has `promised` colors. Where no marker can
@@ -110,8 +107,6 @@ def measure(
                 rejection = not_found
         if corners is None or promised is None or rejection.code not in UNLOCATED_CODES:
             return MeasuredPhoto(PhotoEntry(file=name, status="rejected", remark=Remark.of(rejection)), False)
-        from patchproof.photo.corners import place_design
-
         detected, surface = MarkersInView({}, (), ()), surface.without_markers
         placed = place_design(view.srgb, corners, surface.rect_mm, promised.design, promised.ink)
     entry = partial(PhotoEntry, file=name, photo_px=size_px, markers_found=len(detected.markers))

@@ -28,7 +28,7 @@ from patchproof.evidence.journal import JOURNAL_FILE, Journal, settings_key
 from patchproof.evidence.measure import MeasuredPhoto
 from patchproof.evidence.results import Report
 from patchproof.evidence.task import Options, task_of
-from patchproof.photo.corners import DesignCorners
+from patchproof.photo.registration import DesignCorners
 from patchproof.sheets.manifest import Manifest
 
 _CORNER_CODES = ("no_corners", "other_design", "several_sheets")  # of photographs in which a person may tap corners
