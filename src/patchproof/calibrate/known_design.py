@@ -168,9 +168,7 @@ def _errors(photos: Sequence[CellColors], ink: np.ndarray) -> list[float]:
 
 
 def _nearby(lab: np.ndarray, seen: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """ΔE00 N from CIELAB N×3 to the nearest of the seen light M×3; the mean of values M×3 of like colors, near 0 if
-    they are few.
-    """
+    """ΔE00 N from CIELAB N×3 to the nearest seen light M×3; like colors' mean of values M×3, near 0 if few."""
     from scipy.spatial import KDTree
 
     colors = lab_from_linear(seen)

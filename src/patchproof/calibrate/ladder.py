@@ -38,9 +38,7 @@ _LAB_SCALE = 60.0  # CIELAB units that count as much as the whole range of one s
 
 @dataclass(frozen=True)
 class Rung:
-    """A model's mean held-out error, its difference from the best model's error, and the standard error of that
-    difference; infinite where there was no fit.
-    """
+    """A model's mean held-out error, how much worse than the best it is, its standard error; inf: no fit."""
 
     name: str
     error: float
@@ -49,9 +47,7 @@ class Rung:
 
 
 def choose_rung(names: Sequence[str], errors: np.ndarray) -> tuple[int, tuple[Rung, ...]]:
-    """The number of the rung to use, and all, of errors models × items; rows that are not finite had no fit, but not
-    all.
-    """
+    """The number of the rung to use, and all, of errors models × items; rows that are not finite had no fit."""
     means = np.where(np.isfinite(errors).all(1), errors.mean(1), np.inf)
     worse = errors[np.isfinite(means)] - errors[means.argmin()]
     by, spread = np.full((2, len(means)), np.inf)

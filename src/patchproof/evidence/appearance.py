@@ -62,9 +62,7 @@ _UNTOLD_ADVICE = "too little of the design is resolved to tell it from another: 
 
 @dataclass(frozen=True)
 class DesignMatch:
-    """Correlation with the promised structure (None: there is none), trouble with an ink or, without structure, with
-    the design; an ink that is weak.
-    """
+    """Correlation with the promised structure (None: it has none), trouble with ink or design, a weak ink."""
 
     likeness: float | None = None
     trouble: PhotoRejected | None = None

@@ -76,9 +76,7 @@ class Grouping:
 
 
 def group_sessions(folder: str | Path, without: Path | None = None) -> Grouping:
-    """Group the photographs of a folder, or the one at a path, but not those of the folder `without`, which has those
-    of controls. Refused if there are none.
-    """
+    """Group the photographs of a folder or at a path, but those in the folder `without`; refused if there are none."""
     folder, excluded = Path(folder), None if without is None else without.resolve()
     folders = [p for p in subfolders(folder) if p.resolve() != excluded] if is_folder(folder) else []
     sessions = {printable(p.name): paths for p in folders if (paths := list_images(p))}
@@ -113,9 +111,7 @@ def _group_by_times(grouping: Grouping, photos: Sequence[MeasuredPhoto]) -> Grou
 
 
 def merge_folders(grouping: Grouping, photos: Sequence[MeasuredPhoto]) -> Grouping:
-    """Merge the folders that look like one session, or divide photographs without folders by cameras and times;
-    `photos` are those of the grouping's paths.
-    """
+    """Merge folders that look like one session, or divide `photos` without folders by cameras and times."""
     if grouping.known_from != BY_FOLDERS:
         return _group_by_times(grouping, photos)
     if len(grouping.names) < 2:

@@ -72,9 +72,7 @@ LEAST_AGREEMENT = 0.8  # share of the photographs
 def ledger_of(
     shots: Sequence[PhotoSquare], manifest: Manifest, task: Task, judges: Judges, confidence: Mapping[str, float]
 ) -> Ledger | None:
-    """Make the ledger of photographs, whose target confidences are `confidence` by file; None without shots, promise,
-    design or conditions.
-    """
+    """Make the ledger, of target `confidence` by file; None without shots, promise, design or conditions."""
     surface, promised = task.surface, task.promised
     if not shots or manifest.promise is None or manifest.design is None or promised is None:
         return None

@@ -220,9 +220,7 @@ def _is_uncut(location: LocatedSheet, detected: MarkersInView, surface: Surface)
 def _trouble(
     geometry: Geometry, fit: PageFit, detected: MarkersInView, surface: Surface, corners: int = 4
 ) -> PhotoRejected | None:
-    """Find the first reason why geometry or color cannot be trusted; None if they can. The design was recognized in
-    `corners` of its four corners.
-    """
+    """The first reason not to trust geometry or color, or None; the design was found in `corners` of its corners."""
     tilt, blur, residual = geometry.tilt_deg or 0.0, geometry.blur_px, geometry.residual_mm
     side_mm, uncertainty = min(surface.rect_mm[2:]), geometry.corner_uncertainty_mm
     modules_px = [b.module_px for b in detected.markers.values()]

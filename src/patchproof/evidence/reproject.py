@@ -101,9 +101,7 @@ def photo_square(
 def unmix_markers(
     srgb: np.ndarray, px_from_mm: np.ndarray, blur_px: float, light: FrameLight, surface: Surface
 ) -> tuple[FrameLight, float] | None:
-    """Read paper, ink and blur from all cells of the piece's markers, as far as it has any; None if they disagree with
-    the homography.
-    """
+    """Read paper, ink and blur from all cells of the piece's markers; None if they disagree with the homography."""
     on_piece = {i: surface.corners_mm[i] for i in surface.piece_ids}
     unmixed = pattern_light(srgb, px_from_mm, on_piece, surface.dictionary, blur_px) if on_piece else None
     if unmixed is None:
@@ -193,9 +191,7 @@ def reprojected_squares(
 
 
 def reprojected_square(shot: PhotoSquare, look: np.ndarray, rect_mm: Rect, light: ShownColors) -> np.ndarray:
-    """Render a piece of this look (media-relative light) into the square under the photograph's own blur and light:
-    float32 sRGB W×W×3.
-    """
+    """Render a piece of this look into the square under the photograph's blur and light: float32 sRGB W×W×3."""
     box, photo = _affected_part(shot, rect_mm), _light_before(shot, light.tone)
     layer = _blur(_layer(look, shot.px_from_mm, rect_mm, box), shot.blur_px)
     picture = shot.square.astype(np.float32) / 255

@@ -234,9 +234,7 @@ class EffectEstimate(StrictModel):
 
 
 class SessionCount(StrictModel):
-    """One session's judged photographs, and how many of them were recognized; `same_as` names the session that a folder
-    is part of (null: its own).
-    """
+    """One session's judged and recognized photographs; `same_as` names the session that a folder is part of."""
 
     name: str
     recognized: int
@@ -293,9 +291,7 @@ class Summary(StrictModel):
     not_measured: dict[str, str] = Field(default_factory=dict)  # reasons by figure
 
     def meets(self, required: Required) -> bool:
-        """True if the promise held; for "helps" the patch must also help, since a useless patch can keep a promise to
-        be useless.
-        """
+        """True if the promise held; "helps" asks for more: a useless patch can keep a promise to be useless."""
         helps = self.worth is not None and self.worth.word == "helps"
         return self.verdict == "kept" and (helps or required == "kept")
 

@@ -120,9 +120,7 @@ def surface_of(manifest: Manifest) -> Surface:
 
 
 def _assembled(manifest: Manifest) -> Surface:
-    """The surface of a piece glued together, in millimeters of the design's page, or without a design of the first
-    tile's.
-    """
+    """The surface of a piece glued together, in mm of the design's page, or without a design of the first tile's."""
     to_page = {tile.page: np.linalg.inv(manifest.page_from_design_page(tile.page)) for tile in manifest.tiles}
     cuts, corners = {tile.page: tile.cut_mm for tile in manifest.tiles}, _corners_by_page(manifest)
     piece, pages = {}, []
@@ -233,10 +231,7 @@ class PhotographedDesign:
 def fit_print(
     photos: Sequence[PhotographedDesign], promised: PromisedColors
 ) -> tuple[np.ndarray, list[ShownColors]] | None:
-    """Fit the print's ink, for `add_ink`, and each photograph's colors.
-
-    What all photographs share is print, but for the light on paper.
-    """
+    """Fit the print's ink, for `add_ink`, and each photograph's colors; what all share is print, but for paper."""
     read = choose_photo_cells(photos, promised)
     if read is None:
         return None
@@ -274,9 +269,7 @@ def _paper_of_cells(seen: np.ndarray, promised: np.ndarray, paper: np.ndarray) -
 
 
 def design_cells(srgb: np.ndarray, px_from_mm: np.ndarray, rect_mm: Rect, blur_px: float) -> tuple[np.ndarray, float]:
-    """Read the light of the cells h×w×3 at `rect_mm` in an uint8 photograph, NaN where clipped; and the photograph's
-    blur in cells.
-    """
+    """Read the light of cells h×w×3 at `rect_mm` in a uint8 photograph, NaN where clipped; and its blur in cells."""
     px_per_mm, side_mm = least_px_per_mm(px_from_mm, rect_mm), min(rect_mm[2:])
     cells_per_mm = float(np.clip(side_mm * px_per_mm / max(_LEAST_CELL_PX, 2 * blur_px), *_CELLS)) / side_mm
     cells = rectify(LINEAR_FLOAT32_FROM_CODE[srgb], px_from_mm, rect_mm, cells_per_mm).astype(float)

@@ -69,9 +69,7 @@ class MarkersInView:
 
 @dataclass(frozen=True)
 class Level:
-    """A level of the search: the scale of its pixels, the conversion of uint8 sRGB to the detector's uint8 gray, and
-    the reduced photograph, for scales below 1.
-    """
+    """A level of the search: its scale, the conversion of uint8 sRGB to gray, below scale 1 the reduced photograph."""
 
     scale: float
     to_gray: Callable[[np.ndarray], np.ndarray]
@@ -229,9 +227,7 @@ def detector_settings() -> cv2.aruco.DetectorParameters:
 def _detect(
     picture: np.ndarray, aruco, full_px: float, is_reduced: bool = False
 ) -> tuple[list[tuple[int, np.ndarray]], Ids]:
-    """Ids and corners in a gray picture, which is part of one whose longer side has `full_px` pixels; and the ids whose
-    codes some squares resemble in a mirror.
-    """
+    """Ids and corners in a gray picture, part of one `full_px` long; ids whose codes some squares resemble mirrored."""
     settings = detector_settings()
     if is_reduced or _is_large(picture):
         settings.adaptiveThreshWinSizeMin = settings.adaptiveThreshWinSizeMax = _REDUCED_WINDOW_PX

@@ -136,9 +136,7 @@ def scale_and_tilt(shape: Shape, point_mm) -> tuple[float, float]:
 
 
 def tilt_uncertainty_deg(shape: Shape, point_mm, turn: float = 0.0, distortion=None) -> float:
-    """The 95 % uncertainty of the tilt of `scale_and_tilt`, by the parameters' covariance, a `turn_rad` and a
-    `distortion_of`.
-    """
+    """The 95 % uncertainty of the tilt of `scale_and_tilt`, by covariance, a `turn_rad` and a `distortion_of`."""
     root, stretch = root_of_scaled(shape.covariance), _stretch(shape, shape.parameters, point_mm)
     sides = [[_stretch(shape, shape.parameters + sign * axis, point_mm) for axis in root.T] for sign in (1, -1)]
     by_axis = (np.array(sides[0]) - np.array(sides[1])) / 2
@@ -188,9 +186,7 @@ def _agreement(fit: PageFit, matrix_px: np.ndarray, focal_spread: float) -> tupl
 
 
 def _disagreement(fit: PageFit, matrix_px: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The errors (2,) of r1 · r2 = 0 and |r1| = |r2|, their covariance by the fit's, and their derivatives by the
-    focal length's logarithm.
-    """
+    """Errors (2,) of r1 · r2 = 0 and |r1| = |r2|, their covariance and derivatives by the focal length's logarithm."""
     entries = fit.px_from_mm.ravel()[:8]
 
     def errors(entries: np.ndarray, log_scale: float = 0.0) -> np.ndarray:

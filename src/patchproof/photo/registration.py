@@ -139,9 +139,7 @@ class PlacedDesign:
 def place_design(
     srgb: np.ndarray, corners: DesignCorners, rect_mm, design: np.ndarray, ink: np.ndarray
 ) -> PlacedDesign:
-    """Locate a design, whose promised linear light is H×W×3 over `rect_mm` of the page, in a uint8 photograph; `ink`
-    (3,) is the promised light of black.
-    """
+    """Locate a design, of promised light H×W×3 over `rect_mm` and black `ink` (3,), in a uint8 photograph."""
     corners_mm, middle_mm = rect_corners(rect_mm), (rect_mm[0] + rect_mm[2] / 2, rect_mm[1] + rect_mm[3] / 2)
     sigma_px = np.full(4, corners.sigma_px)
     fit = fit_points(corners_mm, corners.px, sigma_px)
@@ -185,9 +183,7 @@ def _blur_and_light(srgb, px_from_mm, rect_mm, design, ink) -> tuple[float, Fram
 
 
 def _gain_and_veil(printed: np.ndarray, seen: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """Fit seen ≈ veil + gain · printed by channel to N×3 pixels, with less weight on what lies over the design; the
-    mean absolute error comes first.
-    """
+    """Fit seen ≈ veil + gain · printed to N×3 pixels, robustly; the mean absolute error comes first."""
     known, weight = printed.std(0) >= _LEAST_SPREAD, np.ones(len(seen))
     gain, veil, error = np.ones(3), np.zeros(3), np.zeros(len(seen))
     for _ in range(4):
