@@ -32,10 +32,9 @@ from patchproof.base.validation import refuse_untrusted
 from patchproof.channel.printer import load_printer, printer_of_sheet
 from patchproof.classifier.load import load_classifier
 from patchproof.classifier.network import Classifier
-from patchproof.evidence.batch import MAX_PICTURED_PHOTOS
+from patchproof.evidence.batch import JOURNAL_FILE, MAX_PICTURED_PHOTOS, file_sha256
 from patchproof.evidence.classify import box_corners_px
 from patchproof.evidence.gather import gather_evidence
-from patchproof.evidence.journal import JOURNAL_FILE, file_sha256
 from patchproof.evidence.results import Origin, PhotoEntry, Report
 from patchproof.evidence.task import LEDGER_PHOTOS, Options
 from patchproof.evidence.verdict import Look

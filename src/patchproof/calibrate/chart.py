@@ -5,8 +5,7 @@ holds every rung of the ladder, every photograph and how much they disagree. Lig
 the photographs of a print (their median from three on), then over prints.
 
 The table is an *appearance* model: what this camera showed of this printer, decoded as sRGB. Tone curves of camera and
-printer are one product in a photograph, and nothing on the page separates them. It describes the paper under the light
-it was photographed in.
+printer are one product in a photograph, and nothing on the page separates them. It describes paper in that light.
 
 In one photograph the page is found by its markers and swatches are read in their unblurred cores, in linear light.
 Illumination differs from place to place, so `paper_light` fits a smooth surface to white paper around the chart and its

@@ -227,8 +227,7 @@ def find_in_photos(
 
 def box_of_photo(boxes: Mapping[str, Drawn], name: str, path: Path) -> BoxEdges | None:
     """Find the box of the photograph at `path` by its name, or else by the last part of it, in shares of the upright
-    photograph's sides; None if there is none, or the file cannot be read. Refused if it was drawn in a picture of
-    another shape.
+    photograph's sides; None if there is none, or the file cannot be read. Refused if drawn in one of another shape.
     """
     drawn = boxes.get(name, boxes.get(PurePosixPath(name).name))
     if drawn is None or drawn.size_px is None or (sizes := _sizes_of(path)) is None:

@@ -24,7 +24,7 @@ from patchproof.base.settings import background_summary
 from patchproof.base.text import printable
 from patchproof.base.validation import summarize_names
 from patchproof.base.workers import open_workers
-from patchproof.evidence.batch import MAX_PICTURED_PHOTOS, PhotoItem, measure_all, reread_square
+from patchproof.evidence.batch import MAX_PICTURED_PHOTOS, Journal, PhotoItem, measure_all, reread_square, settings_key
 from patchproof.evidence.classify import Judges, judges_of
 from patchproof.evidence.grouping import (
     COPY_CODE,
@@ -35,7 +35,6 @@ from patchproof.evidence.grouping import (
     reject_copies,
     subfolders,
 )
-from patchproof.evidence.journal import Journal, settings_key
 from patchproof.evidence.ledger import estimate_effect, ledger_of
 from patchproof.evidence.measure import UNLOCATED_CODES, MeasuredPhoto
 from patchproof.evidence.results import (
@@ -76,8 +75,7 @@ def gather_evidence(
     on_pictures: Callable[[str, Mapping[str, np.ndarray]], None] = lambda file, pictures: None,
     advance: Advance = no_advance,
 ) -> Report:
-    """Measure, classify and judge every picture in the folder (or the one picture) `photos`, whose subfolders are
-    sessions (see `grouping`).
+    """Measure, classify and judge every picture in the folder, or the one picture, `photos`; subfolders are sessions.
 
     Photographs are measured by the processes or the cluster of `compute`. The file `journal` records
     finished photographs; with `resume` those of an earlier run are not measured again. `look_at` tells the look from

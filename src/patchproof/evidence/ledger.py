@@ -24,8 +24,7 @@ The estimated effect: a control's pixels, as this print would have made them, ar
 its light and blur and classified. So is the design itself: if the network's answer then differs from its answer to the
 original photograph in more than 20 %, nothing is estimated; the photographs in which it differs are not compared, since
 there the rendering shows something else. Photographs of one session are alike. Left out on purpose: the bare object,
-whose surface behind the piece no photograph shows; shadows and glare on the piece, with which rendering the design back
-fails, too.
+whose surface behind the piece no photograph shows; shadows and glare on the piece, with which this fails, too.
 """
 
 from collections.abc import Mapping, Sequence

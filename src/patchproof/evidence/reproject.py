@@ -133,8 +133,7 @@ def fit_print_and_lights(
     shots: Sequence[PhotoSquare], promised: PromisedColors
 ) -> tuple[Callable[[np.ndarray], np.ndarray] | None, list[ShownColors], list[ShownColors]]:
     """Fit the print's map of promised light from several photographs, each one's light, for what surrounds the print,
-    and what each makes of the print's light. If the colors are too few or too alike to fit a print, its map is None,
-    and the last fits contain it.
+    and what each makes of the print's light. If the colors do not tell a print, its map is None, and the last hold it.
     """
     fit = fit_print([PhotographedDesign(shot.cells, shot.blur_cells, shot.light) for shot in shots], promised)
     if fit is None:
@@ -163,8 +162,7 @@ def reprojected_squares(
     print_light: ShownColors,
     reference: Reference,
 ) -> dict[Switches, np.ndarray]:
-    """Render the piece into the square with each effect on and off: float32 sRGB W×W×3 by the switches of (look, light,
-    blur).
+    """Render the piece into the square with each effect on and off: float32 sRGB W×W×3 by (look, light, blur).
 
     `looks` are the media-relative linear light of the piece at `rect_mm` by their own switches. `undo` takes
     photographed light before its tone to media-relative; `print_light` takes a look to the photograph's light.

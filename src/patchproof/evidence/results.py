@@ -224,8 +224,7 @@ class Control:
 
 class EffectEstimate(StrictModel):
     """The patch's effect as estimated by rendering controls into its photographs. With the design itself rendered into
-    them, a share `agree` got the original answer; only these are compared, and if they are too few, there are no
-    controls.
+    them, a share `agree` got the original answer; only these are compared; too few mean no controls.
     """
 
     photos: int

@@ -244,8 +244,7 @@ def _detect(
 
 def detect_markers(picture: np.ndarray, aruco, settings: cv2.aruco.DetectorParameters):
     """OpenCV's (corners, ids or None) of one uint8 gray picture, and the set of ids whose codes some squares resemble
-    in a mirror; raises `PhotoRejected("too_costly")` if it shows so many possible markers that the detector would not
-    end in time.
+    in a mirror; raises `PhotoRejected("too_costly")` if it shows more possible markers than there is time for.
 
     OpenCV compares a square with every code of the dictionary, which takes a millisecond: 20 s for a block design. So
     it gets a dictionary of the codes that any square resembles, or no picture if there is none.

@@ -84,8 +84,7 @@ def pattern_light(
     srgb: np.ndarray, px_from_mm: np.ndarray, corners_mm: Mapping[int, np.ndarray], dictionary: str, blur_px: float
 ) -> tuple[np.ndarray, np.ndarray, float, float] | None:
     """Fit light (3,) of paper and ink and the blur in pixels to a uint8 photograph, given the blur from borders; None
-    if it shows too few cells. Last comes the correlation of the cells' light with the printed cells, near 1 if the
-    homography is right.
+    if it shows too few cells. Last comes the correlation of light and print, near 1 if the homography is right.
     """
     ids = sorted(corners_mm)
     markers, lights = [], []

@@ -20,11 +20,10 @@ from patchproof.base.output import write_atomically
 from patchproof.base.progress import Advance, no_advance
 from patchproof.base.workers import Workers
 from patchproof.evidence import annotations
-from patchproof.evidence.batch import PhotoItem, measure_all
+from patchproof.evidence.batch import JOURNAL_FILE, Journal, PhotoItem, measure_all, settings_key
 from patchproof.evidence.classify import judges_of
 from patchproof.evidence.gather import report_of
 from patchproof.evidence.grouping import BY_FOLDERS, Grouping, merge_folders, reject_copies
-from patchproof.evidence.journal import JOURNAL_FILE, Journal, settings_key
 from patchproof.evidence.measure import MeasuredPhoto
 from patchproof.evidence.results import Report
 from patchproof.evidence.task import Options, task_of
