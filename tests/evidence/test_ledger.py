@@ -12,7 +12,7 @@ import torch
 from synthetic_photos import CONDITION, make_manifest, noisy_design, page_raster, photograph, save, view
 
 from patchproof.base.color import ciede2000, lab_from_linear, linear_from_srgb
-from patchproof.channel.print_colors import ShownColors, add_ink
+from patchproof.channel.print_colors import ShownColors, add_ink, fit_ink_and_photos
 from patchproof.channel.printer import identity_printer, load_printer
 from patchproof.classifier import Classifier
 from patchproof.evidence.classify import square_of
@@ -32,7 +32,7 @@ from patchproof.evidence.surface import (
     PhotographedDesign,
     PromisedColors,
     cell_means,
-    fit_print,
+    choose_photo_cells,
     piece_picture,
     promised_of,
     surface_of,
@@ -105,6 +105,14 @@ def cells_of_print(light: np.ndarray, seed: int) -> np.ndarray:
     """16×16 cells of a photograph's design, with noise."""
     cells = cv2.resize(light, (16, 16), interpolation=cv2.INTER_AREA)
     return cells + np.random.default_rng(seed).normal(0, 0.004, cells.shape)
+
+
+def fit_print(photos, promised: PromisedColors):
+    read = choose_photo_cells(photos, promised)
+    if read is None:
+        return None
+    ink, terms = fit_ink_and_photos(read, 3)
+    return ink, [ShownColors.of_terms(t) for t in terms]
 
 
 def fitted(cells, promised: np.ndarray, seen_ink, ink):

@@ -259,7 +259,6 @@ def _refuse_undetermined(fit: LensFit) -> None:
 
 
 def _is_usable(fit: LensFit, size_px: tuple[int, int]) -> bool:
-    """True if the lens can be undone all over the picture."""
     try:
         check_camera(_camera(fit, "trial", size_px, "", ""), "a trial")
     except Refused:

@@ -29,7 +29,7 @@ from patchproof.base.input import hash_file, is_file, is_folder
 from patchproof.base.progress import Advance, no_advance
 from patchproof.calibrate.ladder import WELL_SPREAD_WIDTH, ColorMap, MapChoice, choose_map, color_difference, map_kinds
 from patchproof.channel.printer import Printer, load_printer, node_colors, printer_from_table, printer_output
-from patchproof.photo.detect import MarkersInView, is_mirrored
+from patchproof.photo.detect import is_mirrored
 from patchproof.photo.known_page import find_sheet
 from patchproof.photo.limits import run_limited
 from patchproof.photo.paper_light import paper_light, quadratic_terms
@@ -213,8 +213,12 @@ def read_chart(photo: Photo, manifest: Manifest) -> ChartPhoto:
     light = np.full((len(manifest.chart), 3), np.nan)
     middles_mm = np.array([[x + w / 2, y + h / 2] for x, y, w, h in cores.values()])
     by_swatch = _paper_at(middles_mm, srgb, manifest, *page)
+    grid = (np.indices((_SAMPLES, _SAMPLES)).reshape(2, -1).T + 0.5) / _SAMPLES
     for (row, core), paper in zip(cores.items(), by_swatch, strict=True):
-        codes = _codes(srgb, px_from_mm, core)
+        # nearest pixels, not mixtures: the mean of their light is the light's mean, whatever the tone curve
+        px = np.floor(apply_homography(px_from_mm, core[:2] + np.multiply(core[2:], grid))).astype(int)
+        column, line = np.clip(px, 0, [srgb.shape[1] - 1, srgb.shape[0] - 1]).T
+        codes = srgb[line, column]
         if (codes >= CLIPPED_CODE).any(-1).mean() <= MAX_CLIPPED_SHARE:
             light[row] = LINEAR_FROM_CODE[codes].mean(0) / paper
     red, green, blue = np.median(by_swatch, 0).tolist()
@@ -231,21 +235,17 @@ def _find_page(srgb: np.ndarray, manifest: Manifest) -> tuple[np.ndarray, float]
     detected = find_sheet(srgb, corners_mm.keys(), corners_mm, dictionary)
     corners_px = detected.corners_px
     if not corners_px:
-        raise _no_sheet(srgb, detected, dictionary)
+        if is_mirrored(srgb, detected, dictionary):
+            raise PhotoRejected("mirrored", None, None, "the photo is mirrored: switch off the camera's mirror setting")
+        if detected.foreign:
+            advice = "these are the markers of another sheet or page: name that sheet's JSON, or leave the photo out"
+            raise PhotoRejected("wrong_sheet", len(detected.foreign), 0, advice)
+        raise PhotoRejected("too_few_markers", 0, 1, "no marker is readable: show the page sharp and well lit")
     beside = {i: px for i, px in corners_px.items() if not rect_contains(manifest.cut_mm, marker_rect(on_page[i]))}
     fit = fit_page(corners_px, corners_mm)
     if len(beside) > 1 and not set(beside) <= set(fit.inlier_ids):
         fit = fit_page(beside, corners_mm)
     return fit.px_from_mm, blur_px(detected.markers.values())
-
-
-def _no_sheet(srgb: np.ndarray, detected: MarkersInView, dictionary: str) -> PhotoRejected:
-    if is_mirrored(srgb, detected, dictionary):
-        return PhotoRejected("mirrored", None, None, "the photo is mirrored: switch off the camera's mirror setting")
-    if detected.foreign:
-        advice = "these are the markers of another sheet or page: name that sheet's JSON, or leave the photo out"
-        return PhotoRejected("wrong_sheet", len(detected.foreign), 0, advice)
-    return PhotoRejected("too_few_markers", 0, 1, "no marker is readable: show the page sharp and well lit")
 
 
 def _core(rect: RectMm, px_from_mm: np.ndarray, blur_px: float, shape) -> RectMm | None:
@@ -277,13 +277,3 @@ def _paper_at(points_mm, srgb: np.ndarray, manifest: Manifest, px_from_mm: np.nd
         advice = "the paper is overexposed, or its light too uneven: lower the exposure by one step, in even light"
         raise PhotoRejected("clipped", float(light.max()), float(full), advice)
     return light
-
-
-def _codes(srgb: np.ndarray, px_from_mm: np.ndarray, rect: RectMm) -> np.ndarray:
-    """uint8 N×3 of the pixels nearest to a grid in a rectangle of mm. Nearest pixels, not mixtures: the mean of their
-    light is the light's mean, whatever the tone curve.
-    """
-    step = (np.indices((_SAMPLES, _SAMPLES)).reshape(2, -1).T + 0.5) / _SAMPLES
-    px = np.floor(apply_homography(px_from_mm, rect[:2] + np.multiply(rect[2:], step))).astype(int)
-    column, line = np.clip(px, 0, [srgb.shape[1] - 1, srgb.shape[0] - 1]).T
-    return srgb[line, column]

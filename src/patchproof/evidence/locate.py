@@ -82,7 +82,6 @@ def _turn_clockwise(camera: "Camera") -> "Camera":
 
 
 def _undistort(srgb: np.ndarray, camera: "Camera", matrix: np.ndarray) -> np.ndarray:
-    """Resample a picture as a pinhole of the same matrix takes it."""
     if not camera.has_distortion:
         return srgb
     index = matrix.copy()

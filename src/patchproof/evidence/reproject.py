@@ -20,10 +20,10 @@ import numpy as np
 from patchproof.base.color import lift_tone, srgb_from_linear
 from patchproof.base.geometry import apply_homography, rect_corners
 from patchproof.base.resample import index_homography
-from patchproof.channel.print_colors import ShownColors, add_ink, lower_light, white_black
+from patchproof.channel.print_colors import ShownColors, add_ink, fit_ink_and_photos, lower_light, white_black
 from patchproof.evidence.appearance import fit_cells, noise_of
 from patchproof.evidence.classify import BoxEdges, square_of
-from patchproof.evidence.surface import PhotographedDesign, PromisedColors, Surface, design_cells, fit_print
+from patchproof.evidence.surface import PhotographedDesign, PromisedColors, Surface, choose_photo_cells, design_cells
 from patchproof.photo.detect import LINEAR_FLOAT32_FROM_CODE, luminance
 from patchproof.photo.quality import FrameLight, pattern_light
 from patchproof.photo.rectify import region_around
@@ -37,7 +37,7 @@ _LEAST_AGREEMENT = 0.6  # of marker cells with the print; correct homographies r
 _LEAST_NOISE = 0.004  # of linear light: code values and JPEG
 # share of a photograph that noise may bring below its veil, and the side in px of the square to average noise over
 _DARKEST_SHARE, _AVERAGE_PX = 0.002, 5
-_SUPERSAMPLE = 2
+_SUPERSAMPLE, _ROUNDS = 2, 3  # of pixels along a side; of fitting ink and photographs in turn
 
 
 @dataclass(frozen=True)
@@ -135,11 +135,12 @@ def fit_print_and_lights(
     """Fit the print's map of promised light from several photographs, each one's light, for what surrounds the print,
     and what each makes of the print's light. If the colors do not tell a print, its map is None, and the last hold it.
     """
-    fit = fit_print([PhotographedDesign(shot.cells, shot.blur_cells, shot.light) for shot in shots], promised)
-    if fit is None:
+    designs = [PhotographedDesign(shot.cells, shot.blur_cells, shot.light) for shot in shots]
+    if (read := choose_photo_cells(designs, promised)) is None:
         lights = [design_fit(shot, promised) for shot in shots]
         return None, [light_fit(shot, promised) for shot in shots], lights
-    ink, lights = fit
+    ink, terms = fit_ink_and_photos(read, _ROUNDS)
+    lights = [ShownColors.of_terms(t) for t in terms]
     undo = [light_fit(shot, promised, light.tone) for shot, light in zip(shots, lights, strict=True)]
     return partial(add_ink, ink=ink), undo, lights
 
@@ -202,7 +203,6 @@ def _codes(linear: np.ndarray, tone: float) -> np.ndarray:
 
 
 def _affected_part(shot: PhotoSquare, rect_mm: Rect) -> tuple[slice, slice]:
-    """The part of the square that a piece at `rect_mm` changes, with a margin for blur."""
     corners_px = apply_homography(shot.px_from_mm, rect_corners(rect_mm))
     return region_around(corners_px, 3 + int(4 * max(shot.blur_px, 2.0)), shot.square.shape)
 
@@ -251,7 +251,11 @@ def _layer(look: np.ndarray, px_from_mm: np.ndarray, rect_mm, box: tuple[slice, 
     x, y, w, h = rect_mm
     finer, top, left = _SUPERSAMPLE, box[0].start, box[1].start
     height, width = box[0].stop - top, box[1].stop - left
-    look = _reduce_to_pixels(look, px_from_mm, rect_mm)
+    # about a texel per supersampled pixel, so that warping does not alias
+    quad = apply_homography(px_from_mm, rect_corners(rect_mm))
+    sides = np.linalg.norm(np.roll(quad, -1, axis=0) - quad, axis=1).reshape(2, 2).max(0) * finer
+    wide, high = (min(n, max(2, int(np.ceil(s)))) for n, s in zip(look.shape[1::-1], sides, strict=True))
+    look = cv2.resize(look.astype(np.float32), (wide, high), interpolation=cv2.INTER_AREA)
     mm_from_texel = np.array([[w / look.shape[1], 0, x], [0, h / look.shape[0], y], [0, 0, 1.0]])
     to_fine = np.array([[finer, 0, -finer * left], [0, finer, -finer * top], [0, 0, 1]])
     matrix = index_homography(to_fine @ px_from_mm @ mm_from_texel)
@@ -262,15 +266,6 @@ def _layer(look: np.ndarray, px_from_mm: np.ndarray, rect_mm, box: tuple[slice, 
     share = (inside > 0.5).astype(np.float32)
     fine = (color * share[..., None], share)  # resized separately: four channels at once take twice as long
     return np.dstack([cv2.resize(part, (width, height), interpolation=cv2.INTER_AREA) for part in fine])
-
-
-def _reduce_to_pixels(look: np.ndarray, px_from_mm: np.ndarray, rect_mm) -> np.ndarray:
-    """Average a look to about a texel per supersampled pixel, so that warping it does not alias."""
-    quad = apply_homography(px_from_mm, rect_corners(rect_mm))
-    sides = np.linalg.norm(np.roll(quad, -1, axis=0) - quad, axis=1) * _SUPERSAMPLE
-    width, height = (max(2, int(np.ceil(side))) for side in sides.reshape(2, 2).max(0))
-    width, height = min(look.shape[1], width), min(look.shape[0], height)
-    return cv2.resize(look.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
 
 
 def _blur(layer: np.ndarray, sigma_px: float) -> np.ndarray:

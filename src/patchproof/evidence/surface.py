@@ -21,7 +21,7 @@ from patchproof.base.color import LUMINANCE, linear_from_srgb
 from patchproof.base.errors import Refused
 from patchproof.base.geometry import apply_homography, rect_corners
 from patchproof.base.resample import downscale
-from patchproof.channel.print_colors import CellColors, ShownColors, added_terms, choose_cells, fit_ink_and_photos
+from patchproof.channel.print_colors import CellColors, added_terms, choose_cells
 from patchproof.photo.detect import LINEAR_FLOAT32_FROM_CODE
 from patchproof.photo.quality import CLIPPED_CODE, FrameLight
 from patchproof.photo.rectify import least_px_per_mm, rectify, resize_by_area
@@ -37,7 +37,6 @@ _LARGEST_PIECE_PX = 1024  # of the piece as it is rendered into photographs
 LEAST_CELLS = 30  # of a photograph: three for each coefficient of a channel
 # Terms of cells that mix few colors have as few dimensions; of the sixth, the least share of the first's spread.
 _LEAST_COLORS, _LEAST_SPREAD = 6, 1e-3
-_ROUNDS = 3
 _CELLS = (16, 96)  # least and most along the design's shorter side
 _LEAST_CELL_PX = 2.0
 _PIXEL_BLUR_PX = 0.7  # of a pixel's own area and of interpolating between pixels
@@ -226,17 +225,6 @@ class PhotographedDesign:
     def readable(self) -> int:
         """The number of cells that were read, without the rim."""
         return int(np.isfinite(self.cells[1:-1, 1:-1]).all(-1).sum())
-
-
-def fit_print(
-    photos: Sequence[PhotographedDesign], promised: PromisedColors
-) -> tuple[np.ndarray, list[ShownColors]] | None:
-    """Fit the print's ink, for `add_ink`, and each photograph's colors; what all share is print, but for paper."""
-    read = choose_photo_cells(photos, promised)
-    if read is None:
-        return None
-    ink, terms = fit_ink_and_photos(read, _ROUNDS)
-    return ink, [ShownColors.of_terms(t) for t in terms]
 
 
 def choose_photo_cells(photos: Sequence[PhotographedDesign], promised: PromisedColors) -> list[CellColors] | None:

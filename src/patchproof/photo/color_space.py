@@ -100,7 +100,6 @@ def eight_bits(codes: np.ndarray) -> np.ndarray:
 
 @lru_cache(1)
 def _srgb_codes() -> np.ndarray:
-    """uint8 sRGB by linear light in 65,535 steps."""
     return codes_from_srgb(srgb_from_linear(np.arange(65536) / 65535))
 
 
