@@ -15,8 +15,7 @@ tone. The lens's distortion has its own module.
 
 Blur, motion, noise and JPEG are given for the photograph's full size. A picture rendered at `scale` times that size
 gets the part of them that remains after averaging: they shrink with `scale`, and effects below the threshold of
-visibility are skipped, because they would cost time and change nothing. At full size the photograph is stored as a real
-JPEG by the code that writes the file.
+visibility are skipped, because they would cost time and change nothing. At full size the writer makes a real JPEG.
 """
 
 from dataclasses import dataclass

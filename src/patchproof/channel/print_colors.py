@@ -7,12 +7,10 @@ by the channel's own formulas. The ink is linear in its coefficients, so a cell 
 colors' terms, and what cells do not determine stays the known printer's.
 
 Ink and photographs are told apart only as far as photographs differ: what all of them share (one phone's tone curve, a
-veil that is in every place) may be either. Paper stays paper: its light is a photograph's. Left out on purpose: light
-that changes within a photograph.
+veil in every place) may be either. Paper's light is a photograph's. Left out on purpose: light that changes in one.
 
 Where print and light need not be told apart, one map in light undoes both, so that a color difference measures what no
-such map explains: with eight usable colors a robust affine map (gains, channel mixing, a veil), else one per channel
-from paper and ink.
+such map explains: with eight usable colors a robust affine map, else one per channel from paper and ink.
 """
 
 from collections.abc import Sequence

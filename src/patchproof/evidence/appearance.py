@@ -70,8 +70,7 @@ class DesignMatch:
 
     def trouble_beside(self, trouble: PhotoRejected | None, found: float, detailed: int) -> PhotoRejected | None:
         """Return the photograph's other `trouble`, beside which only structure counts, or that the design cannot be
-        told. Raises `PhotoRejected` for another design or a missing ink. `found` is the share of the `detailed` cells
-        that were found near their places.
+        told. Raises `PhotoRejected` for another design or a missing ink. `found`: share of the `detailed` cells found.
         """
         # what covers markers may cover the design, and full white shows none
         if trouble is not None and trouble.code in ("too_few_markers", "clipped"):

@@ -150,8 +150,7 @@ def _references(
 ) -> list[Reference]:
     """Pair each photograph with one of the promise's conditions (contrast, blur_px), spread evenly over contrast.
 
-    The brightest photograph gets the brightest condition, and so on: with random pairs, the light share of a few
-    photographs would mostly be chance.
+    The brightest photograph gets the brightest condition, and so on: random pairs would make light's share chance.
     """
     claims = sorted(claims, key=lambda claim: claim[0])
     spread = ((np.arange(len(shots)) + 0.5) / len(shots) * len(claims)).astype(int)

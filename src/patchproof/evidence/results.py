@@ -204,8 +204,7 @@ class Ledger(StrictModel):
 @dataclass(frozen=True)
 class Control:
     """Photographs of one control, compared with those of the patch (null: nothing to compare). `difference` is patch
-    minus control over `sessions`, of the `rates` of both there; `pairs` is 0 if photographs are not paired, `advice`
-    says why nothing can be told.
+    minus control over `sessions`, of the `rates` of both; `pairs` is 0 without pairs, `advice` says what is missing.
     """
 
     name: str
