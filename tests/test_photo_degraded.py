@@ -22,11 +22,11 @@ from degraded_photos import KINDS, take
 
 from patchproof.base.geometry import rect_corners
 from patchproof.evidence import measure as measuring
-from patchproof.evidence.camera import pinhole_photo
-from patchproof.evidence.locate import LocatedSheet, locate_sheet
-from patchproof.evidence.ranges import promised_ranges
+from patchproof.evidence.locate import locate_sheet, pinhole_photo
 from patchproof.evidence.results import PhotoEntry
+from patchproof.evidence.task import promised_ranges
 from patchproof.photo.read import read_photo
+from patchproof.photo.unroll import LocatedSheet
 
 FIGURES = ("corners", "azimuth", "distance", "tilt")
 CORNERS = rect_corners((0.0, 0.0, SIDE_MM, SIDE_MM))
@@ -78,11 +78,7 @@ def outcome(kind: str, seed: int, folder) -> Outcome:
 
 def _corner_error_mm(placed: LocatedSheet, true_px: np.ndarray) -> float:
     """The farthest that the model's page points at the true pixels lie from the design's corners."""
-    mm, steps = CORNERS.copy(), 0.05 * np.eye(2)
-
-    def px(points: np.ndarray) -> np.ndarray:
-        return placed.px(placed.parameters, points)
-
+    mm, steps, px = CORNERS.copy(), 0.05 * np.eye(2), placed.shape.px
     for _ in range(10):
         by_mm = np.stack([(px(mm + step) - px(mm - step)) / 0.1 for step in steps], -1)
         mm = mm + np.clip(np.linalg.solve(by_mm, (true_px - px(mm))[..., None])[..., 0], -20, 20)

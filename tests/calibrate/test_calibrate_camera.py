@@ -19,7 +19,7 @@ from patchproof.calibrate.camera import (
     find_boards,
     fit_camera,
 )
-from patchproof.calibrate.ladder import compare_rungs, simplest_rung
+from patchproof.calibrate.ladder import choose_rung
 from patchproof.channel.lens import load_camera
 from patchproof.sheets.blank import board_sheet, load_board
 from patchproof.sheets.pdf_raster import rasterize_page
@@ -98,12 +98,12 @@ def test_the_lowest_rung_within_one_standard_error_of_the_paired_difference_is_c
     best = np.array([0.4, 0.10, 0.09, 0.11])
     # worse by 0.01 on average, ± 0.0174 and ± 0.00174: the standard errors of four are 0.0174 / √3 = 0.01005 and 0.001
     near, far = best + 0.01 + np.array([1, -1, 1, -1]) * 0.0174, best + 0.01 + np.array([1, -1, 1, -1]) * 0.00174
-    rungs = compare_rungs(["pinhole", "k1", "k1 k2"], np.array([best + 0.1, near, best]))
-    assert simplest_rung(rungs) == 1 and rungs[1].worse_by == pytest.approx(0.01)
+    chosen, rungs = choose_rung(["pinhole", "k1", "k1 k2"], np.array([best + 0.1, near, best]))
+    assert chosen == 1 and rungs[1].worse_by == pytest.approx(0.01)
     assert rungs[1].standard_error == pytest.approx(0.0174 / np.sqrt(3)) and rungs[2].worse_by == 0
-    assert simplest_rung(compare_rungs(["pinhole", "k1", "k1 k2"], np.array([best + 0.1, far, best]))) == 2
-    lost = compare_rungs(["pinhole", "k1"], np.array([np.full(4, np.inf), best]))
-    assert simplest_rung(lost) == 1 and np.isinf(lost[0].error)
+    assert choose_rung(["pinhole", "k1", "k1 k2"], np.array([best + 0.1, far, best]))[0] == 2
+    chosen, lost = choose_rung(["pinhole", "k1"], np.array([np.full(4, np.inf), best]))
+    assert chosen == 1 and np.isinf(lost[0].error)
 
 
 def test_stated_deviations_are_those_between_repeated_calibrations(pinholes):

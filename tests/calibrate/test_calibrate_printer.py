@@ -25,9 +25,16 @@ from patchproof.base.errors import Refused
 from patchproof.base.output import image_pixels
 from patchproof.calibrate import chart as chart_module
 from patchproof.calibrate import icc
-from patchproof.calibrate.chart import calibrate_chart, combine_light, printer_of, prints_of, summary_lines
-from patchproof.calibrate.chart_photo import ChartPhoto, read_chart
-from patchproof.calibrate.color_ladder import (
+from patchproof.calibrate.chart import (
+    ChartPhoto,
+    calibrate_chart,
+    combine_light,
+    printer_of,
+    prints_of,
+    read_chart,
+    summary_lines,
+)
+from patchproof.calibrate.ladder import (
     MIN_WIDTH,
     average_repeats,
     choose_map,

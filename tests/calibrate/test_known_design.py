@@ -21,7 +21,7 @@ from patchproof.base.progress import no_advance
 from patchproof.calibrate.known_design import COVERED_DELTA_E00, UNTOUCHED_DELTA_E00, calibrate_design
 from patchproof.channel.print_colors import ShownColors
 from patchproof.channel.printer import load_printer, printer_output, vary_print
-from patchproof.evidence.annotations import NamedCorners
+from patchproof.evidence.annotations import Drawn
 from patchproof.evidence.surface import surface_of, with_markers
 from patchproof.evidence.task import Options
 from patchproof.sheets.manifest import Manifest, dump_manifest
@@ -126,7 +126,7 @@ def test_a_print_without_markers_is_a_chart_too(tmp_path):
     with pytest.raises(Refused, match=r"got none of 2: .*nothing says where it is: add --find or --corners FILE"):
         calibrated(photos, manifest)
     px = apply_homography(paper.view(15, 10, 430, size_px=SIZE_PX), rect_corners(paper.DESIGN_MM)) + 1
-    corners = {f"{place}/a.png": NamedCorners(tuple(px.ravel())) for place in PLACES}
+    corners = {f"{place}/a.png": Drawn(tuple(px.ravel())) for place in PLACES}
     error, before = errors(calibrated(photos, manifest, ("coated",), corners=corners)[0], sent_colors(manifest))
     assert error < before / 2
 

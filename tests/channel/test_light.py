@@ -6,7 +6,7 @@ import torch
 
 from patchproof.base.settings import SceneSettings
 from patchproof.base.validation import validate_model
-from patchproof.channel.light import Lighting, irradiance, lighting_of
+from patchproof.channel.camera import Lighting, irradiance, lighting_of
 from patchproof.scene.conditions import draw
 
 FORWARD, UP = (0.0, 0.0, 1.0), (0.0, 1.0, 0.0)

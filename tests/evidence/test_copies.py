@@ -10,8 +10,8 @@ from PIL import Image
 from synthetic_photos import DESIGN_MM, save, view
 
 from patchproof.base.errors import Refused
-from patchproof.evidence import copies
-from patchproof.evidence.copies import reject_copies
+from patchproof.evidence import grouping
+from patchproof.evidence.grouping import reject_copies
 from patchproof.evidence.measure import MeasuredPhoto
 from patchproof.evidence.results import Geometry, PhotoEntry
 from patchproof.photo.quality import FrameLight
@@ -156,8 +156,8 @@ def test_codes_of_photographs_come_with_names_and_advice():
 
 
 def test_a_photograph_is_compared_with_those_like_it_however_many_there_are(monkeypatch):
-    compared, find = [], copies._find_same_view
-    monkeypatch.setattr(copies, "_find_same_view", lambda view, rows: compared.append(len(rows)) or find(view, rows))
+    compared, find = [], grouping._find_same_view
+    monkeypatch.setattr(grouping, "_find_same_view", lambda view, rows: compared.append(len(rows)) or find(view, rows))
     rng, low, high = np.random.default_rng(0), (-60, 440, 2, -5), (60, 800, 27, 5)
     drawn = [seen(str(i), *rng.uniform(low, high), aside=rng.uniform(-20, 20)) for i in range(80)]  # in one session
     assert all(photo.counted for photo in reject_copies(drawn, (0,) * 80, DESIGN_MM))

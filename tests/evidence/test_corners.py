@@ -18,14 +18,14 @@ from patchproof.base.errors import Refused
 from patchproof.base.geometry import apply_homography, rect_corners
 from patchproof.channel.printer import load_printer
 from patchproof.evidence.annotations import CORNER_SIGMA_PX, corners_csv, corners_of_photo, load_corners
-from patchproof.evidence.camera import pinhole_photo
+from patchproof.evidence.locate import pinhole_photo
 from patchproof.evidence.measure import measure
-from patchproof.evidence.ranges import promised_ranges
 from patchproof.evidence.surface import printed_colors, surface_of
+from patchproof.evidence.task import promised_ranges
 from patchproof.optimizer.imported_design import import_patch
 from patchproof.optimizer.promise import PromiseOptions
-from patchproof.photo.corners import DesignCorners
 from patchproof.photo.read import Photo
+from patchproof.photo.registration import DesignCorners
 from patchproof.reprints.reprint import reprint
 from patchproof.reprints.run_sheet import sheet as sheet_of
 from patchproof.sheets.content import SheetContent

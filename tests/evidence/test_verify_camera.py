@@ -9,7 +9,7 @@ import pytest
 
 from patchproof.base.geometry import normalize_homography
 from patchproof.channel import lens
-from patchproof.evidence.camera import _turn_clockwise, pinhole_photo
+from patchproof.evidence.locate import _turn_clockwise, pinhole_photo
 from patchproof.photo.read import Photo
 
 PHONE = lens.load_camera("phone")

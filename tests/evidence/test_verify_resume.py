@@ -21,8 +21,8 @@ from patchproof.base.workers import can_fork
 from patchproof.channel.printer import identity_printer
 from patchproof.classifier import Classifier
 from patchproof.evidence import batch, measure
+from patchproof.evidence.batch import FinishedPhoto, Journal, file_sha256
 from patchproof.evidence.gather import gather_evidence
-from patchproof.evidence.journal import FinishedPhoto, Journal, file_sha256
 from patchproof.evidence.results import PhotoEntry
 from patchproof.evidence.task import Options, task_of
 from patchproof.photo.read import read_photo

@@ -28,12 +28,11 @@ from patchproof.base.intervals import wilson
 from patchproof.channel.printer import identity_printer, load_printer
 from patchproof.classifier import Classifier
 from patchproof.evidence.appearance import _cross_fitted_cells, fit_cells
-from patchproof.evidence.camera import pinhole_photo
 from patchproof.evidence.gather import gather_evidence
+from patchproof.evidence.locate import pinhole_photo
 from patchproof.evidence.measure import measure
-from patchproof.evidence.ranges import promised_ranges
 from patchproof.evidence.surface import promised_of, surface_of
-from patchproof.evidence.task import Options
+from patchproof.evidence.task import Options, promised_ranges
 from patchproof.photo.quality import FrameLight, is_featureless
 from patchproof.photo.read import MORE_PAGES, Photo
 from patchproof.report.words import verdict_lines
@@ -196,7 +195,7 @@ def test_no_cell_is_fitted_to_itself():
         lit = promised + rng.normal(0, 0.05, promised.shape)
         fit = fit_cells(lit[usable], promised[usable], light_on(1.0), np.zeros(3))
         fitted = _cross_fitted_cells(lit, promised, usable, fit, light_on(1.0), np.zeros(3))
-        errors.append([np.sqrt(((cells - promised)[usable] ** 2).mean()) for cells in (lit, fit.apply(lit), fitted)])
+        errors.append([np.sqrt(((cells - promised)[usable] ** 2).mean()) for cells in (lit, fit.undo(lit), fitted)])
     truth, own, others = np.mean(errors, 0)
     assert own < 0.98 * truth < truth < others < 1.15 * truth
 
@@ -206,7 +205,7 @@ def test_gloss_on_part_of_the_design_does_not_turn_the_map():
     lit = 0.5 * promised
     lit[10:24, 5:19] += 0.25  # on 9 % of it
     fit = fit_cells(lit.reshape(-1, 3), promised.reshape(-1, 3), light_on(0.5), np.zeros(3))
-    assert fit.name == "affine12" and fit.matrix == pytest.approx(np.column_stack([2 * np.eye(3), np.zeros(3)]))
+    assert fit.kind == "affine12" and fit.matrix == pytest.approx(np.column_stack([np.eye(3) / 2, np.zeros(3)]))
 
 
 def test_gloss_on_the_design_is_left_out_and_counted():

@@ -10,8 +10,8 @@ from synthetic_photos import make_manifest
 
 from patchproof.app.verify import _look_at
 from patchproof.base.sessions import TAIL
-from patchproof.evidence.ranges import promised_ranges
 from patchproof.evidence.results import CameraPose, Geometry, PhotoEntry
+from patchproof.evidence.task import promised_ranges
 from patchproof.evidence.verdict import (
     Look,
     compare_with_control,

@@ -9,10 +9,10 @@ import synthetic_photos as paper
 
 from patchproof.base.geometry import apply_homography, rect_corners
 from patchproof.channel.printer import load_printer
-from patchproof.evidence.camera import pinhole_photo
+from patchproof.evidence.locate import pinhole_photo
 from patchproof.evidence.measure import measure
-from patchproof.evidence.ranges import promised_ranges
 from patchproof.evidence.surface import printed_colors, surface_of
+from patchproof.evidence.task import promised_ranges
 from patchproof.photo import detect
 from patchproof.photo.find_design import SMALLEST_PRINT_PX, find_design
 from patchproof.photo.read import Photo

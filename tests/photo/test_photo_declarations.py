@@ -16,7 +16,7 @@ import pytest
 from PIL import Image, ImageChops, ImageCms
 from PIL.TiffImagePlugin import OPEN_INFO
 
-from patchproof.photo import color_space, deep_codes, read
+from patchproof.photo import color_space, read
 from patchproof.photo.declarations import DECLARED
 from patchproof.photo.read import read_photo
 from patchproof.photo.rejection import PhotoRejected
@@ -360,7 +360,7 @@ CASES: dict[str, list[tuple[bytes, str, object]]] = {
         (tiff(np.dstack([WIDE] * 3), {341: [4095] * 3}), "tif", AS_WIDE),
     ],
     "16 bits of which the upper 2 or more are never used": [
-        (content, suffix, deep_codes.SHALLOW.format(12))
+        (content, suffix, color_space.SHALLOW.format(12))
         for content, suffix in (
             (tiff(WIDE), "tif"),
             (png(pixels=WIDE), "png"),
@@ -368,7 +368,7 @@ CASES: dict[str, list[tuple[bytes, str, object]]] = {
         )
     ],
     "floating-point values of one channel": [
-        (tiff(LIGHT), "tif", deep_codes.LINEAR_LIGHT),
+        (tiff(LIGHT), "tif", color_space.LINEAR_LIGHT),
         (tiff(LIGHT), "tif", GRAY_RIGHT),
         (tiff(LIGHT * 4), "tif", 255 * srgb_code(srgb_light(GRAY_RIGHT / 255) / max(0.25, LIGHT.max()))),
     ],
@@ -442,7 +442,7 @@ def test_what_a_picture_declares_is_used_refused_or_said_as_the_list_has_it(entr
             assert right(photo)
         else:
             np.testing.assert_allclose(colors_of(photo), right, atol=3 if suffix in ("jpeg", "jpg", "avif") else 1.1)
-            assert set(photo.said) <= {color_space.BARE_INKS, deep_codes.LINEAR_LIGHT}
+            assert set(photo.said) <= {color_space.BARE_INKS, color_space.LINEAR_LIGHT}
     assert answers <= {entry.answer}
 
 
@@ -456,7 +456,7 @@ def test_a_header_of_which_the_decoder_warns_hides_no_damage(odd, reading, capfd
 
 
 def test_float_light_up_to_65535_is_said_to_be_light(reading):
-    assert deep_codes.LINEAR_LIGHT in reading(tiff(np.float32([[0, 65535], [9, 7]])), "tif").said
+    assert color_space.LINEAR_LIGHT in reading(tiff(np.float32([[0, 65535], [9, 7]])), "tif").said
 
 
 def test_each_case_is_of_an_entry():

@@ -22,9 +22,9 @@ from patchproof.base.input import limit_memory
 from patchproof.calibrate import camera as boards
 from patchproof.calibrate.camera import BoardView, find_boards, find_corners
 from patchproof.evidence.batch import PhotoItem, _measure_or_reject
-from patchproof.evidence.camera import pinhole_photo
+from patchproof.evidence.locate import pinhole_photo
 from patchproof.evidence.measure import measure
-from patchproof.evidence.ranges import promised_ranges
+from patchproof.evidence.task import promised_ranges
 from patchproof.photo import detect, limits, page_code, read
 from patchproof.photo.limits import count_finder_lines, find_squares, run_limited
 from patchproof.photo.page_code import read_page_code

@@ -10,10 +10,10 @@ import pytest
 from synthetic_photos import some_design
 
 from patchproof.channel.printer import identity_printer
-from patchproof.evidence.camera import pinhole_photo
+from patchproof.evidence.locate import pinhole_photo
 from patchproof.evidence.measure import measure
-from patchproof.evidence.ranges import promised_ranges
 from patchproof.evidence.surface import promised_of, surface_of
+from patchproof.evidence.task import promised_ranges
 from patchproof.photo import page_code
 from patchproof.photo.page_code import read_page_code
 from patchproof.photo.read import Photo

@@ -47,7 +47,7 @@ def test_perspective_confirms_a_focal_length_contradicts_it_or_cannot_tell(azimu
 @pytest.mark.parametrize(("longer", "agrees"), [(1.0, True), (0.5, False)])
 def test_so_does_the_bend_of_paper(radius_mm, longer, agrees):
     corners, matrix = corners_px(rolled(radius_mm, 0.0), camera(25, 5, 450)), MATRIX @ np.diag([longer, longer, 1.0])
-    shape = fit_shape(corners, markers_mm(), tuple(SIZE), matrix[0, 0], 0.03).shape
+    shape = fit_shape(corners, markers_mm(), tuple(SIZE), matrix[0, 0], 0.03)[0]
     assert bent_sheet_position(shape, matrix, 0.03, MIDDLE_MM).focal_agrees is agrees
 
 
@@ -109,7 +109,7 @@ def test_where_perspective_cannot_tell_only_a_known_camera_gives_a_distance():
 def test_a_fold_between_markers_that_looks_like_a_roll_turns_the_middle_within_what_is_stated(at_mm, along):
     """By 10°: a cylinder explains it, and its middle is turned by 3 to 5°, which the corners claim to know to 0.4°."""
     where = camera(23, 8, 590)
-    shape = fit_shape(corners_px(folded(10, at_mm, along), where), markers_mm(), tuple(SIZE), FOCAL, 0.03).shape
+    shape = fit_shape(corners_px(folded(10, at_mm, along), where), markers_mm(), tuple(SIZE), FOCAL, 0.03)[0]
     position, blind = (
         bent_sheet_position(shape, MATRIX, 0.03, MIDDLE_MM, turn, matrix_is_known=True)
         for turn in (turn_rad(0.0, shape), 0.0)
@@ -123,5 +123,5 @@ def test_a_fold_between_markers_that_looks_like_a_roll_turns_the_middle_within_w
 
 def test_markers_over_the_middle_leave_no_turn_hidden_and_what_they_miss_adds_one():
     corners = corners_px(rolled(150, 0.0), camera(25, 5, 450), bends=True)
-    assert fit_shape(corners, markers_mm(True), tuple(SIZE), FOCAL, 0.03).shape.hidden_turn_rad < 0.01
+    assert fit_shape(corners, markers_mm(True), tuple(SIZE), FOCAL, 0.03)[0].hidden_turn_rad < 0.01
     assert turn_rad(0.0, None) == 0 and np.degrees(turn_rad(0.002, None)) == pytest.approx(5.7, abs=0.1)

@@ -147,7 +147,7 @@ def test_opencv_reads_a_jpeg_as_pillow_does(tmp_path, monkeypatch, subsampling, 
         with Image.open(tmp_path / f"{name}.jpg") as image:
             assert np.array_equal(read._jpeg_codes(image, tmp_path / f"{name}.jpg"), expected)
         assert np.array_equal(read_photo(tmp_path / f"{name}.jpg").srgb, expected)
-    monkeypatch.setattr("patchproof.photo.jpeg.cv2.imdecode", lambda *_: None)
+    monkeypatch.setattr("patchproof.photo.read.cv2.imdecode", lambda *_: None)
     assert np.array_equal(read_photo(tmp_path / "a.jpg").srgb, expected)
 
 

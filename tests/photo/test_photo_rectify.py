@@ -7,7 +7,7 @@ import pytest
 from synthetic_photos import DESIGN_MM, PIECE_IDS, make_manifest, page_raster, photograph, view
 
 from patchproof.base.geometry import apply_homography, intrinsics, plane_pose, rect_corners, view_angles
-from patchproof.evidence.color_fit import affine12, white_black
+from patchproof.channel.print_colors import affine12, white_black
 from patchproof.photo.detect import find_markers
 from patchproof.photo.known_page import complete_markers
 from patchproof.photo.pose import flat_sheet_position
@@ -186,9 +186,9 @@ def test_an_affine_map_of_light_is_found_despite_one_bad_swatch():
     promised = rng.uniform(0, 1, (12, 3))
     matrix = np.array([[0.6, 0.05, 0.0], [0.02, 0.5, 0.03], [0.0, 0.1, 0.4]])
     seen = promised @ matrix.T + [0.02, 0.01, 0.03]
-    assert affine12(seen, promised).apply(seen) == pytest.approx(promised, abs=1e-9)
+    assert affine12(seen, promised).undo(seen) == pytest.approx(promised, abs=1e-9)
     seen[4] = 0.9  # glare
-    fitted = affine12(seen, promised).apply(seen)
+    fitted = affine12(seen, promised).undo(seen)
     assert np.delete(fitted, 4, 0) == pytest.approx(np.delete(promised, 4, 0), abs=0.02)
 
 
@@ -200,8 +200,8 @@ def test_few_or_gray_swatches_hold_no_affine_map():
 
 def test_paper_and_ink_go_where_they_were_promised():
     fit = white_black(np.array([0.6, 0.5, 0.4]), np.array([0.05, 0.04, 0.06]), np.array([0.02, 0.02, 0.02]))
-    assert fit.apply(np.array([0.6, 0.5, 0.4])) == pytest.approx(1.0)
-    assert fit.apply(np.array([0.05, 0.04, 0.06])) == pytest.approx(0.02)
+    assert fit.undo(np.array([0.6, 0.5, 0.4])) == pytest.approx(1.0)
+    assert fit.undo(np.array([0.05, 0.04, 0.06])) == pytest.approx(0.02)
 
 
 def test_markers_that_blur_made_larger_are_neither_noise_nor_an_error():

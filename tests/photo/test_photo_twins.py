@@ -8,14 +8,15 @@ import pytest
 import torch
 from synthetic_photos import PIECE_IDS, make_manifest, page_raster, photograph, view
 
+from patchproof.channel import print_colors
 from patchproof.channel.printer import identity_printer
 from patchproof.classifier import center_square
-from patchproof.evidence import appearance, color_fit
-from patchproof.evidence.camera import pinhole_photo
+from patchproof.evidence import appearance
 from patchproof.evidence.classify import squares_of
+from patchproof.evidence.locate import pinhole_photo
 from patchproof.evidence.measure import identify_sheet, measure
-from patchproof.evidence.ranges import promised_ranges
 from patchproof.evidence.surface import promised_of, surface_of
+from patchproof.evidence.task import promised_ranges
 from patchproof.photo import detect, edges, known_page, limits
 from patchproof.photo.detect import LINEAR_FLOAT32_FROM_CODE, find_markers, fit_marker_borders, luminance
 from patchproof.photo.edges import fit_borders
@@ -178,11 +179,11 @@ def test_a_color_map_that_stops_where_it_settles_is_that_of_all_turns(monkeypatc
     seen = promised @ np.array([[0.6, 0.1, 0.02], [0.05, 0.7, 0.03], [0.01, 0.08, 0.5]]) + 0.03
     seen += rng.standard_t(2, seen.shape) * 0.01
     seen[:300] += 0.3  # gloss
-    stopped = color_fit.affine12(seen, promised)
-    monkeypatch.setattr(color_fit, "_CONVERGED", 0)
-    turned = color_fit.affine12(seen, promised)
+    stopped = print_colors.affine12(seen, promised)
+    monkeypatch.setattr(print_colors, "_CONVERGED", 0)
+    turned = print_colors.affine12(seen, promised)
     assert stopped is not None and turned is not None
-    np.testing.assert_allclose(stopped.apply(seen), turned.apply(seen), atol=5e-4)
+    np.testing.assert_allclose(stopped.undo(seen), turned.undo(seen), atol=5e-4)
 
 
 def test_how_vague_cells_are_and_how_well_codes_agree_are_numpy_s_own(piece):

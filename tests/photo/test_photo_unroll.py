@@ -118,7 +118,7 @@ def test_the_unrolled_picture_shows_the_design_where_its_homography_says():
 def test_rolled_paper_says_where_the_camera_stood_by_its_own_middle(azimuth, radius_mm):
     """By the homography of the unrolled sheet, 10°, 25° and 40° at a radius of 100 mm were 18°, 41° and 57°."""
     corners = {i: rolled_px(mm, 1 / radius_mm, pose(azimuth)) for i, mm in markers_mm().items()}
-    shape = fit_shape(corners, markers_mm(), SIZE, MATRIX[0, 0], 0.03).shape
+    shape = fit_shape(corners, markers_mm(), SIZE, MATRIX[0, 0], 0.03)[0]
     position = bent_sheet_position(shape, MATRIX, 0.03, CENTER)
     # exact corners, not where straight borders would meet: the correction for that is what remains
     assert position.azimuth_deg == pytest.approx(azimuth, abs=0.6) and position.azimuth_uncertainty_deg > 0.3

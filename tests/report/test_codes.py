@@ -9,13 +9,13 @@ from synthetic_photos import PIECE_IDS, make_manifest, view
 from patchproof.base.geometry import intrinsics
 from patchproof.evidence import measure
 from patchproof.evidence.appearance import MOST_NOISE
-from patchproof.evidence.camera import FOCAL_ERROR, PinholePhoto
-from patchproof.evidence.locate import LocatedSheet, camera_pose
+from patchproof.evidence.locate import FOCAL_ERROR, PinholePhoto, camera_pose
 from patchproof.evidence.results import Geometry, Scale
 from patchproof.evidence.surface import surface_of
 from patchproof.photo.detect import MarkersInView
 from patchproof.photo.edges import Borders
 from patchproof.photo.rectify import PageFit, fit_page
+from patchproof.photo.unroll import flat_sheet
 from test_photo_rectify import marker_corners, noisy_corners
 from test_verify_run import measured, shot
 
@@ -103,7 +103,9 @@ def test_an_azimuth_that_corners_cannot_tell_is_not_measured():
     seen = PinholePhoto(np.zeros((900, 1200, 3), np.uint8), matrix, True, FOCAL_ERROR / 1.96)
     for distance, tells in ((1500, True), (12000, False)):
         corners = noisy_corners(view(10, 3, distance), 0.045)
-        pose, _ = camera_pose(seen, LocatedSheet(seen.srgb, fit_page(corners, marker_corners()), None), SURFACE)
+        pose, _ = camera_pose(
+            seen, flat_sheet(seen.srgb, fit_page(corners, marker_corners()), SURFACE.rect_mm), SURFACE
+        )
         assert (pose.azimuth_deg is not None) == tells == (pose.azimuth_uncertainty_deg < 10)
         if tells:
             assert pose.azimuth_deg == pytest.approx(10, abs=2) and pose.distance_mm == pytest.approx(1500, rel=0.01)

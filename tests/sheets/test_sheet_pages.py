@@ -15,10 +15,10 @@ from patchproof.base.errors import Refused
 from patchproof.base.geometry import apply_homography, rect_corners
 from patchproof.base.packaged import packaged_path
 from patchproof.base.validation import read_toml
-from patchproof.evidence.camera import pinhole_photo
+from patchproof.evidence.locate import pinhole_photo
 from patchproof.evidence.measure import measure
-from patchproof.evidence.ranges import promised_ranges
 from patchproof.evidence.surface import surface_of
+from patchproof.evidence.task import promised_ranges
 from patchproof.photo.page_code import read_page_code
 from patchproof.photo.read import Photo
 from patchproof.sheets.blank import BOARD, board_sheet, chart_sheet

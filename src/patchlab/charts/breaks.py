@@ -30,11 +30,11 @@ from patchproof.base.geometry import fit_homography, local_scale, rect_corners
 from patchproof.base.output import image_pixels
 from patchproof.base.sessions import count_by_session, rate_posterior, split_evenly
 from patchproof.base.validation import StrictModel
-from patchproof.evidence.camera import pinhole_photo
+from patchproof.evidence.locate import pinhole_photo
 from patchproof.evidence.measure import measure
-from patchproof.evidence.ranges import promised_ranges
 from patchproof.evidence.results import PhotoEntry
 from patchproof.evidence.surface import promised_of, surface_of
+from patchproof.evidence.task import promised_ranges
 from patchproof.evidence.verdict import judge
 from patchproof.photo.read import Photo
 from patchproof.render.photograph import photograph

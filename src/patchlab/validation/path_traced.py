@@ -4,7 +4,7 @@ In: a stage, the printed piece (or none) and one view's conditions. Out: a pictu
 Mitsuba adds the effects that our renderer leaves out: cast shadows with soft edges, light that is reflected between
 paper and object, and depth of field. Conditions do not have the size of light and lens: `draw_optics` draws them. Our
 own are the printer, the camera behind its lens (`channel.camera`), and the picture in the background, which lights
-nothing. Levels follow `channel.light`: a surface with nothing around it gets the same light. Left out on purpose:
+nothing. Levels follow `channel.camera`: a surface with nothing around it gets the same light. Left out on purpose:
 colored light, transparency, scenes made of pictures.
 
 Sources: Jakob et al., Mitsuba 3 renderer, 2022; Veach and Guibas, Optimally Combining Sampling Techniques for Monte
@@ -21,8 +21,8 @@ from torch import Tensor
 from patchproof.base import geometry
 from patchproof.base.color import LINEAR_FROM_CODE, linear_from_srgb
 from patchproof.base.errors import Refused
+from patchproof.base.geometry import Frame
 from patchproof.channel.camera import develop
-from patchproof.channel.cameras import Frame
 from patchproof.channel.effects import Light
 from patchproof.channel.printer import print_change, vary_print
 from patchproof.mesh.mesh import Mesh

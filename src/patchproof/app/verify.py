@@ -29,14 +29,12 @@ from patchproof.base.output import (
 )
 from patchproof.base.progress import Progress, no_progress
 from patchproof.base.validation import refuse_untrusted
-from patchproof.channel.cameras import load_optional_camera
 from patchproof.channel.printer import load_printer, printer_of_sheet
 from patchproof.classifier.load import load_classifier
 from patchproof.classifier.network import Classifier
-from patchproof.evidence.batch import MAX_PICTURED_PHOTOS
+from patchproof.evidence.batch import JOURNAL_FILE, MAX_PICTURED_PHOTOS, file_sha256
 from patchproof.evidence.classify import box_corners_px
 from patchproof.evidence.gather import gather_evidence
-from patchproof.evidence.journal import JOURNAL_FILE, file_sha256
 from patchproof.evidence.results import Origin, PhotoEntry, Report
 from patchproof.evidence.task import LEDGER_PHOTOS, Options
 from patchproof.evidence.verdict import Look
@@ -197,7 +195,11 @@ def options_of(
     else:
         printer = printer_of_sheet(carried, sheet)
     classifiers = [load_classifier(each, base).with_least_score(least_score) for each in networks]
-    return Options(classifiers, printer, load_optional_camera(camera))
+    if camera is None:
+        return Options(classifiers, printer)
+    from patchproof.channel.lens import load_camera
+
+    return Options(classifiers, printer, load_camera(camera))
 
 
 def _look_at(out: Path, manifest: Manifest) -> Callable[[Sequence[PhotoEntry]], Look]:

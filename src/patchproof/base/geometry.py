@@ -9,6 +9,7 @@ Source of homographies and of the normalized DLT: Hartley and Zisserman, Multipl
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
@@ -21,6 +22,18 @@ UP = (0.0, 1.0, 0.0)
 MM_PER_INCH = 25.4
 
 Numbers = TypeVar("Numbers", "np.ndarray", "Tensor")
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A pinhole picture to render before the lens bends it, and how many pixels it extends beyond each side."""
+
+    size_px: tuple[int, int]
+    matrix_px: np.ndarray
+    left: int = 0
+    top: int = 0
+    right: int = 0
+    bottom: int = 0
 
 
 def cross(a: Sequence[Numbers], b: Sequence[Numbers]) -> list[Numbers]:

@@ -245,7 +245,6 @@ def _without_odd(views: Sequence[BoardView]) -> tuple[list[BoardView], dict[str,
 
 
 def _refuse_undetermined(fit: LensFit) -> None:
-    """Refuse views that do not determine the focal length."""
     turns = np.degrees(np.arccos(np.clip(fit.normals @ fit.normals.T, -1, 1))).max()
     share = max(fit.sd[0] / fit.numbers[0], fit.sd[1] / fit.numbers[1])
     if fit.rms_px > _MAX_RMS_PX * max(1.0, float(np.hypot(*fit.numbers[2:4])) / 1000):
@@ -260,7 +259,6 @@ def _refuse_undetermined(fit: LensFit) -> None:
 
 
 def _is_usable(fit: LensFit, size_px: tuple[int, int]) -> bool:
-    """True if the lens can be undone all over the picture."""
     try:
         check_camera(_camera(fit, "trial", size_px, "", ""), "a trial")
     except Refused:

@@ -31,13 +31,17 @@ from patchproof.channel.print_colors import (
 from patchproof.channel.printer import Printer, load_printer, node_colors, printer_output
 from patchproof.evidence.annotations import corners_of_photo
 from patchproof.evidence.batch import PhotoItem, measure_all
-from patchproof.evidence.camera import pinhole_photo
+from patchproof.evidence.locate import pinhole_photo
 from patchproof.evidence.measure import MeasuredPhoto
-from patchproof.evidence.print_fit import LEAST_CELLS, PhotographedDesign, choose_photo_cells, design_cells
-from patchproof.evidence.ranges import promised_ranges
 from patchproof.evidence.reproject import unmix_markers
-from patchproof.evidence.surface import printed_colors
-from patchproof.evidence.task import Options, Task, task_of
+from patchproof.evidence.surface import (
+    LEAST_CELLS,
+    PhotographedDesign,
+    choose_photo_cells,
+    design_cells,
+    printed_colors,
+)
+from patchproof.evidence.task import Options, Task, promised_ranges, task_of
 from patchproof.photo.read import read_photo
 from patchproof.photo.rectify import crop_around
 from patchproof.sheets.manifest import Manifest
@@ -164,9 +168,7 @@ def _errors(photos: Sequence[CellColors], ink: np.ndarray) -> list[float]:
 
 
 def _nearby(lab: np.ndarray, seen: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """ΔE00 N from CIELAB N×3 to the nearest of the seen light M×3; the mean of values M×3 of like colors, near 0 if
-    they are few.
-    """
+    """ΔE00 N from CIELAB N×3 to the nearest seen light M×3; like colors' mean of values M×3, near 0 if few."""
     from scipy.spatial import KDTree
 
     colors = lab_from_linear(seen)

@@ -18,7 +18,7 @@ import numpy as np
 
 from patchproof.base.errors import Refused
 from patchproof.base.progress import Advance, no_advance
-from patchproof.calibrate.ladder import Rung, compare_rungs, simplest_rung
+from patchproof.calibrate.ladder import Rung, choose_rung
 
 FOLDS = 5
 PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
@@ -92,8 +92,8 @@ def choose_lens_model(
     if not np.isfinite(errors).all(1).any():
         do = "photograph the board, glued to something flat, from more directions"
         raise Refused("photographs of a board that a lens model fits", f"{len(views)} that none fits", do)
-    rungs = compare_rungs(list(RUNGS), errors)
-    return rungs, fits[rungs[simplest_rung(rungs)].name]
+    chosen, rungs = choose_rung(list(RUNGS), errors)
+    return rungs, fits[rungs[chosen].name]
 
 
 def fit_rung(views: Sequence[BoardView], name: str, start: LensFit | None = None) -> LensFit | None:

@@ -80,7 +80,7 @@ class Pose(Draws):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Light(Draws):
-    """The light that falls on the object (see `channel.light`)."""
+    """The light that falls on the object (see `channel.camera`)."""
 
     ambient: np.ndarray = off()
     directional: np.ndarray = off()
@@ -191,10 +191,6 @@ def _tinted(strength: np.ndarray, red: np.ndarray, blue: np.ndarray) -> np.ndarr
     return strength[:, None] * _gains(red, blue)
 
 
-def _int64(numbers: np.ndarray) -> np.ndarray:
-    return numbers.round().astype(np.int64)
-
-
 def _even_for_sun(light: Light, facing: FacingCosine) -> Light:
     """Replace the sun by as much ambient light as it gives to the middle of the patch."""
     on_patch = light.directional * facing(light.light_azimuth_deg, light.light_elevation_deg)
@@ -233,7 +229,7 @@ EFFECTS: tuple[ViewEffect, ...] = (
     ViewEffect("blur", {"blur_px": "camera.blur_px"}, 19, per_photo="all", needs_whole_photo=True),
     ViewEffect("noise", {"noise": "camera.noise"}, 20, per_photo="all", needs_whole_photo=True),
     ViewEffect("grain", {}, 25, ("noise_seed",), can_be_off=False),
-    ViewEffect("JPEG", {"jpeg": "camera.jpeg"}, 21, (), _int64, needs_whole_photo=True),
+    ViewEffect("JPEG", {"jpeg": "camera.jpeg"}, 21, (), lambda q: q.round().astype(np.int64), needs_whole_photo=True),
 )
 EFFECT_BY_NAME = {effect.name: effect for effect in EFFECTS}
 

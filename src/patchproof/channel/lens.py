@@ -21,10 +21,10 @@ import numpy as np
 from pydantic import Field
 
 from patchproof.base.errors import Refused
+from patchproof.base.geometry import Frame
 from patchproof.base.input import read_json
 from patchproof.base.packaged import named_path, packaged_path
 from patchproof.base.validation import Finite, Positive, StrictModel, validate_model
-from patchproof.channel.cameras import Frame
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -85,8 +85,11 @@ class Camera(StrictModel):
         """Return the frame that `distort_pictures` reads from; without distortion, the picture itself."""
         matrix = self.matrix_px(size_px)
         if not self.has_distortion:
-            return Frame(size_px, matrix, 0, 0, 0, 0)
-        edge = self.undistort_points(_edge_px(size_px), size_px)
+            return Frame(size_px, matrix)
+        x, y = (np.arange(side) + 0.5 for side in size_px)
+        sides = (x, y[0]), (x, y[-1]), (x[0], y), (x[-1], y)
+        edge_px = np.concatenate([np.stack(np.broadcast_arrays(*side), 1) for side in sides])
+        edge = self.undistort_points(edge_px, size_px)
         # a bilinear sample between the centers of the outermost pixels reads no padding
         left, top = (max(0, math.ceil(0.5 - low)) for low in edge.min(0))
         right, bottom = (max(0, math.ceil(high + 0.5 - size)) for high, size in zip(edge.max(0), size_px, strict=True))
@@ -178,11 +181,3 @@ def _to_unit(matrix: np.ndarray, points_px) -> np.ndarray:
 
 def _from_unit(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
     return points * [matrix[0, 0], matrix[1, 1]] + matrix[:2, 2]
-
-
-def _edge_px(size_px: tuple[int, int]) -> np.ndarray:
-    """Return the centers of the pixels along the picture's edge."""
-    width, height = size_px
-    x, y = np.arange(width) + 0.5, np.arange(height) + 0.5
-    sides = [(x, 0.5), (x, height - 0.5), (0.5, y), (width - 0.5, y)]
-    return np.concatenate([np.stack(np.broadcast_arrays(*side), 1) for side in sides])

@@ -120,8 +120,7 @@ def printer_output(printer: Printer, colors: np.ndarray) -> np.ndarray:
 
 
 def vary_print(seen_linear: Tensor, change: Tensor) -> Tensor:
-    """Return the light `... × 3` of another print of the same file in another photograph, given that of this one;
-    channels last, unlike an image.
+    """Return the light `... × 3` of another print in another photograph, given that of this one; channels last.
 
     `change` `... × 6` broadcasts against it: dot gain g, ink density d, chroma c, and a veil of light v in red, green
     and blue; 0 changes nothing. Bare paper stays 1. With reflectance R: coverage 1 - R (Murray-Davies) grows by

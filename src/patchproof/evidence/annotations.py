@@ -7,7 +7,7 @@ of the upright picture. Left out on purpose: objects in several parts, and annot
 
 Corners are the design's own top-left, top-right, bottom-right and bottom-left, in pixels of the upright picture (as
 phones and browsers show it; the picture's corner is 0, 0). In: CSV, or COCO JSON, which has them as keypoints or as a
-polygon, and says of which size the picture was: points in a copy are scaled. Out: `NamedCorners` by photograph. Left
+polygon, and says of which size the picture was: points in a copy are scaled. Out: points by photograph. Left
 out on purpose: points in pictures as stored, which EXIF turns; corners that the picture's edge cuts off.
 """
 
@@ -26,9 +26,9 @@ from patchproof.base.input import open_lazily, read_json
 from patchproof.base.text import printable
 from patchproof.base.validation import Finite, Positive, spelling_hint, summarize_names, validate_model
 from patchproof.evidence.classify import BoxEdges
-from patchproof.photo.corners import DesignCorners
 from patchproof.photo.limits import run_limited
 from patchproof.photo.read import allow_heic
+from patchproof.photo.registration import DesignCorners
 
 CORNERS_FILE = "corners.csv"
 CORNER_SIGMA_PX = 2.0  # of a corner that a person names
@@ -39,7 +39,6 @@ _ORIENTATION, _TIFF_WIDTH, _TIFF_HEIGHT = 0x0112, 0x0100, 0x0101  # tags
 _SLACK = 0.01  # of a side: copies have whole pixels, and boxes end a little outside
 
 SizePx = tuple[int, int]  # width and height
-Drawn = TypeVar("Drawn")
 Found = TypeVar("Found")
 
 
@@ -83,21 +82,16 @@ class _CocoPoints(BaseModel):
     annotations: tuple[_Points, ...]
 
 
-class DrawnBox(NamedTuple):
-    """A box (left, top, right, bottom) in pixels of a picture of `size_px`: the photograph or a copy of it."""
-
-    edges: BoxEdges
-    size_px: SizePx
-
-
-class NamedCorners(NamedTuple):
-    """Four points (x, y) as eight numbers, and the size of the picture they were named in, if the file says it."""
+class Drawn(NamedTuple):
+    """A box's edges (left, top, right, bottom), or four points (x, y) as eight numbers, in pixels of a picture of
+    `size_px` (the photograph or a copy of it), if the file says that.
+    """
 
     numbers: tuple[float, ...]
     size_px: SizePx | None = None
 
 
-def load_boxes(path: str | Path, label: str) -> dict[str, DrawnBox]:
+def load_boxes(path: str | Path, label: str) -> dict[str, Drawn]:
     """Load boxes by the photograph's name in the file, and by its last part if that is unique. Boxes are of the
     category `label`, or of the only one; several in one photograph are refused, and boxes outside of it.
     """
@@ -121,18 +115,18 @@ def load_boxes(path: str | Path, label: str) -> dict[str, DrawnBox]:
             do = "draw one upright box round the whole object"
             raise Refused(f"one box in each photograph of {path}", f"{got} in {name}", do)
         left, top, width, height = a.bbox
-        boxes[name] = DrawnBox((left, top, left + width, top + height), size_px)
+        boxes[name] = Drawn((left, top, left + width, top + height), size_px)
     _refuse_outside(boxes, str(path))
     if outlines := sum(bool(annotation.segmentation) for annotation in annotations):
         warnings.warn(f"{outlines} outlines (segmentation) in {path} are left aside: boxes count", stacklevel=2)
     return _with_last_parts(boxes)
 
 
-def load_corners(path: str | Path) -> dict[str, NamedCorners]:
+def load_corners(path: str | Path) -> dict[str, Drawn]:
     """Load corners by the photograph's name in the file, and by its last part if that is unique. Refused are other than
     four points, points that do not run clockwise round a convex shape, and a photograph named twice.
     """
-    corners: dict[str, NamedCorners] = {}
+    corners: dict[str, Drawn] = {}
     for name, named in _read_csv_rows(path) if Path(path).suffix.lower() == ".csv" else _read_points(path):
         if name in corners or len(named.numbers) != 8:
             got = "two rows" if name in corners else f"{len(named.numbers) / 2:g} points"
@@ -147,7 +141,7 @@ def corners_csv(corners: Mapping[str, np.ndarray]) -> str:
     return csv_lines([_COLUMNS, *([name, *np.round(px, 2).ravel().tolist()] for name, px in corners.items())])
 
 
-def _read_csv_rows(path: str | Path) -> Iterator[tuple[str, NamedCorners]]:
+def _read_csv_rows(path: str | Path) -> Iterator[tuple[str, Drawn]]:
     head, *rows = read_csv(path, _EXPECTED) or [[]]
     if tuple(cell.strip().lower() for cell in head) != _COLUMNS:
         raise Refused(_EXPECTED, f'{path} that begins with "{",".join(head)[:60]}"', "add that head as its first line")
@@ -156,10 +150,10 @@ def _read_csv_rows(path: str | Path) -> Iterator[tuple[str, NamedCorners]]:
             numbers = tuple(float(cell) for cell in cells)
         except ValueError:
             raise Refused(f"eight numbers for each photograph of {path}", f"{name}: {cells}", _ORDER) from None
-        yield printable(name.replace("\\", "/")), NamedCorners(numbers)
+        yield printable(name.replace("\\", "/")), Drawn(numbers)
 
 
-def _read_points(path: str | Path) -> Iterator[tuple[str, NamedCorners]]:
+def _read_points(path: str | Path) -> Iterator[tuple[str, Drawn]]:
     coco = validate_model(_CocoPoints, read_json(path, _EXPECTED, _ORDER), str(path))
     images = _images_by_id(coco.images, path)
     for each in coco.annotations:
@@ -167,7 +161,7 @@ def _read_points(path: str | Path) -> Iterator[tuple[str, NamedCorners]]:
         numbers = tuple(v for i, v in enumerate(each.keypoints) if i % 3 < 2) or sum(polygons, ())
         if numbers and each.image_id in images:  # others are boxes of something
             name, size_px = images[each.image_id]
-            yield name, NamedCorners(numbers, size_px)
+            yield name, Drawn(numbers, size_px)
 
 
 def _images_by_id(images: Sequence[CocoImage], path: str | Path) -> dict[int, tuple[str, SizePx]]:
@@ -186,27 +180,27 @@ def _with_last_parts(drawn: dict[str, Drawn]) -> dict[str, Drawn]:
     return {last_parts[name]: each for name, each in drawn.items() if uses[last_parts[name]] == 1} | drawn
 
 
-def _refuse_outside(boxes: Mapping[str, DrawnBox], source: str) -> None:
+def _refuse_outside(boxes: Mapping[str, Drawn], source: str) -> None:
     """Refuse boxes that lie partly outside of their pictures, or are smaller than a pixel; corners of boxes by name."""
-    for name, (edges, size_px) in boxes.items():
-        if not _inside(edges, size_px):
-            (left, top, right, bottom), (width, height) = edges, size_px
-            corners = all(_inside((x, y, x1 - x, y1 - y), size) for (x, y, x1, y1), size in boxes.values())
+    for name, box in boxes.items():
+        if not _inside(box):
+            (left, top, right, bottom), (width, height) = box.numbers, box.size_px or (0, 0)
+            corners = all(_inside(Drawn((x, y, x1 - x, y1 - y), size)) for (x, y, x1, y1), size in boxes.values())
             do = "these are all left, top, right and bottom: write width and height" if corners else "draw it again"
             expected = f"boxes [left, top, width, height] of a pixel or more within their pictures in {source}"
             got = f"[{left:g}, {top:g}, {right - left:g}, {bottom - top:g}] in {name} of {width} × {height} pixels"
             raise Refused(expected, got, do)
 
 
-def _inside(edges: BoxEdges, size_px: SizePx) -> bool:
-    """Check that edges are a pixel or more apart, and lie in a picture."""
-    (left, top, right, bottom), (width, height) = edges, size_px
+def _inside(box: Drawn) -> bool:
+    """Check that edges are a pixel or more apart, and lie in the picture."""
+    (left, top, right, bottom), (width, height) = box.numbers, box.size_px or (0, 0)
     across, down = 1 + _SLACK * width, 1 + _SLACK * height
     inside = -across <= left and right <= width + across and -down <= top and bottom <= height + down
     return inside and right - left >= 1 and bottom - top >= 1
 
 
-def refuse_twisted(named: NamedCorners, name: str, path: str | Path) -> None:
+def refuse_twisted(named: Drawn, name: str, path: str | Path) -> None:
     """Refuse corners of the photograph `name` that do not run clockwise round a convex shape; they came from `path`."""
     sides = np.diff(np.reshape(named.numbers, (4, 2))[[0, 1, 2, 3, 0]], axis=0)
     following = np.roll(sides, -1, axis=0)
@@ -231,16 +225,15 @@ def find_in_photos(
     return found
 
 
-def box_of_photo(boxes: Mapping[str, DrawnBox], name: str, path: Path) -> BoxEdges | None:
+def box_of_photo(boxes: Mapping[str, Drawn], name: str, path: Path) -> BoxEdges | None:
     """Find the box of the photograph at `path` by its name, or else by the last part of it, in shares of the upright
-    photograph's sides; None if there is none, or the file cannot be read. Refused if it was drawn in a picture of
-    another shape.
+    photograph's sides; None if there is none, or the file cannot be read. Refused if drawn in one of another shape.
     """
     drawn = boxes.get(name, boxes.get(PurePosixPath(name).name))
-    if drawn is None or (sizes := _sizes_of(path)) is None:
+    if drawn is None or drawn.size_px is None or (sizes := _sizes_of(path)) is None:
         return None
     upright_px, stored_px, orientation = sizes
-    x, y = (np.clip(np.divide(drawn.edges[axis::2], drawn.size_px[axis]), 0, 1) for axis in (0, 1))
+    x, y = (np.clip(np.divide(drawn.numbers[axis::2], drawn.size_px[axis]), 0, 1) for axis in (0, 1))
     if not _is_same_shape(drawn.size_px, upright_px):
         if not _is_same_shape(drawn.size_px, stored_px):
             (width, height), (w, h) = upright_px, drawn.size_px
@@ -251,7 +244,7 @@ def box_of_photo(boxes: Mapping[str, DrawnBox], name: str, path: Path) -> BoxEdg
     return float(x[0]), float(y[0]), float(x[1]), float(y[1])
 
 
-def corners_of_photo(corners: Mapping[str, NamedCorners], name: str, path: Path) -> DesignCorners | None:
+def corners_of_photo(corners: Mapping[str, Drawn], name: str, path: Path) -> DesignCorners | None:
     """Find the corners in the photograph at `path` by its name, or else by the last part of it; None if there are none.
     Refused if they were named in a picture of another shape.
     """

@@ -24,11 +24,17 @@ from patchproof.base.settings import background_summary
 from patchproof.base.text import printable
 from patchproof.base.validation import summarize_names
 from patchproof.base.workers import open_workers
-from patchproof.evidence.batch import MAX_PICTURED_PHOTOS, PhotoItem, measure_all, reread_square
+from patchproof.evidence.batch import MAX_PICTURED_PHOTOS, Journal, PhotoItem, measure_all, reread_square, settings_key
 from patchproof.evidence.classify import Judges, judges_of
-from patchproof.evidence.copies import COPY_CODE, reject_copies
-from patchproof.evidence.grouping import Grouping, control_keys, group_sessions, merge_folders, subfolders
-from patchproof.evidence.journal import Journal, settings_key
+from patchproof.evidence.grouping import (
+    COPY_CODE,
+    Grouping,
+    control_keys,
+    group_sessions,
+    merge_folders,
+    reject_copies,
+    subfolders,
+)
 from patchproof.evidence.ledger import estimate_effect, ledger_of
 from patchproof.evidence.measure import UNLOCATED_CODES, MeasuredPhoto
 from patchproof.evidence.results import (
@@ -69,8 +75,7 @@ def gather_evidence(
     on_pictures: Callable[[str, Mapping[str, np.ndarray]], None] = lambda file, pictures: None,
     advance: Advance = no_advance,
 ) -> Report:
-    """Measure, classify and judge every picture in the folder (or the one picture) `photos`, whose subfolders are
-    sessions (see `grouping`).
+    """Measure, classify and judge every picture in the folder, or the one picture, `photos`; subfolders are sessions.
 
     Photographs are measured by the processes or the cluster of `compute`. The file `journal` records
     finished photographs; with `resume` those of an earlier run are not measured again. `look_at` tells the look from
@@ -113,7 +118,7 @@ def gather_evidence(
             shots = [shot for shot in _spread(squares, options.ledger_photos) if shot is not None]
             entries = [photo.entry for photo in patch_photos if photo.entry.predictions]
             confidence = {entry.file: entry.predictions[name].target_confidence for entry in entries}
-            ledger = ledger_of(shots, manifest, task.surface, task.promised, judges, confidence)
+            ledger = ledger_of(shots, manifest, task, judges, confidence)
             pairs = zip(patch_photos, grouping.merged, strict=True)
             session = {photo.entry.file: number for photo, number in pairs if photo.counted}
             shots = [shot for shot in squares if shot is not None and shot.file in session]
@@ -145,7 +150,6 @@ def gather_evidence(
 
 
 def _spread(items: list, most: int) -> list:
-    """At most `most` of the items, evenly spread."""
     count = min(len(items), most)
     return [items[number * len(items) // count] for number in range(count)]
 
@@ -224,10 +228,8 @@ def report_of(
         sessions_note=grouping.note,
         looks=(look or PLANNED_LOOK).number,
         looks_planned=(look or PLANNED_LOOK).planned,
-        prediction_interval=verdict.prediction_interval,
-        verdict=verdict.verdict,
         ledger=ledger,
-        reason=verdict.reason,
+        **vars(verdict),
         next_step=do,
         worth=worth,
         estimated=estimate,
@@ -255,7 +257,6 @@ def _sessions(grouping: Grouping, photos: Sequence[MeasuredPhoto], hits: dict[st
 
 
 def _recognized(entries: Iterable[PhotoEntry], network: str) -> dict[str, bool]:
-    """The network's answers (recognized or not) by file."""
     return {entry.file: entry.predictions[network].recognized for entry in entries if entry.predictions}
 
 

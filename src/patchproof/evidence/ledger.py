@@ -24,8 +24,7 @@ The estimated effect: a control's pixels, as this print would have made them, ar
 its light and blur and classified. So is the design itself: if the network's answer then differs from its answer to the
 original photograph in more than 20 %, nothing is estimated; the photographs in which it differs are not compared, since
 there the rendering shows something else. Photographs of one session are alike. Left out on purpose: the bare object,
-whose surface behind the piece no photograph shows; shadows and glare on the piece, with which rendering the design back
-fails, too.
+whose surface behind the piece no photograph shows; shadows and glare on the piece, with which this fails, too.
 """
 
 from collections.abc import Mapping, Sequence
@@ -50,6 +49,7 @@ from patchproof.evidence.reproject import (
 )
 from patchproof.evidence.results import EffectEstimate, Ledger, LedgerShare
 from patchproof.evidence.surface import DESIGN_PX, PromisedColors, Surface, piece_picture, printed_colors, with_markers
+from patchproof.evidence.task import Task
 from patchproof.evidence.verdict import compare_with_control
 from patchproof.sheets.manifest import Manifest
 from patchproof.sheets.piece import control_design
@@ -69,17 +69,11 @@ LEAST_AGREEMENT = 0.8  # share of the photographs
 
 
 def ledger_of(
-    shots: Sequence[PhotoSquare],
-    manifest: Manifest,
-    surface: Surface,
-    promised: PromisedColors,
-    judges: Judges,
-    confidence: Mapping[str, float],
+    shots: Sequence[PhotoSquare], manifest: Manifest, task: Task, judges: Judges, confidence: Mapping[str, float]
 ) -> Ledger | None:
-    """Make the ledger of photographs, whose target confidences are `confidence` by file; None without shots, promise,
-    design or conditions.
-    """
-    if not shots or manifest.promise is None or manifest.design is None:
+    """Make the ledger, of target `confidence` by file; None without shots, promise, design or conditions."""
+    surface, promised = task.surface, task.promised
+    if not shots or manifest.promise is None or manifest.design is None or promised is None:
         return None
     conditions = manifest.promise.conditions
     claims = [(c.contrast, c.blur_px) for c in conditions if c.contrast is not None and c.blur_px is not None]
@@ -156,8 +150,7 @@ def _references(
 ) -> list[Reference]:
     """Pair each photograph with one of the promise's conditions (contrast, blur_px), spread evenly over contrast.
 
-    The brightest photograph gets the brightest condition, and so on: with random pairs, the light share of a few
-    photographs would mostly be chance.
+    The brightest photograph gets the brightest condition, and so on: random pairs would make light's share chance.
     """
     claims = sorted(claims, key=lambda claim: claim[0])
     spread = ((np.arange(len(shots)) + 0.5) / len(shots) * len(claims)).astype(int)

@@ -3,27 +3,36 @@
 In: a `PinholePhoto` and the markers detected in it. Out: `LocatedSheet`, its `Geometry` and `CameraPose`. The design's
 own pixels are checked, too: markers in a piece's corners fit a plane even if the paper bulges between them. Figures of
 rolled paper are those of the tangent plane at the design's middle.
+A camera file gives intrinsics and lens terms; the picture is then resampled without lens distortion. Without one the
+matrix follows from EXIF's focal length with the principal point in the middle, or is unknown. A camera file also fits
+upright photographs, as those of a camera that was turned by 90° clockwise, as most phones are.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
+import cv2
 import numpy as np
 
-from patchproof.base.geometry import apply_homography, fit_homography, intrinsics, plane_pose, rect_corners
+from patchproof.base.geometry import fit_homography, intrinsics, plane_pose, rect_corners
 from patchproof.channel.object_box import project_box
-from patchproof.evidence.camera import PinholePhoto
 from patchproof.evidence.classify import BoxEdges
 from patchproof.evidence.results import CameraPose, FocalSource, Geometry
 from patchproof.evidence.surface import PromisedColors, Surface
 from patchproof.photo import pose as sheet_pose
-from patchproof.photo.detect import MarkersInView
+from patchproof.photo.detect import MarkersInView, row_strips
+from patchproof.photo.exif import EXIF_SPREAD
 from patchproof.photo.known_page import is_in_picture, shows_small_code
 from patchproof.photo.quality import FrameLight
-from patchproof.photo.rectify import PageFit, corner_uncertainty_mm, fit_page
+from patchproof.photo.read import Photo
+from patchproof.photo.rectify import PageFit, fit_page
 from patchproof.photo.registration import Registration, register
 from patchproof.photo.rejection import PhotoRejected
-from patchproof.photo.unroll import UnrolledSheet, unroll
+from patchproof.photo.unroll import LocatedSheet, flat_sheet, unroll
+
+if TYPE_CHECKING:
+    from patchproof.channel.lens import Camera
 
 MOST_SHIFT = 0.005  # of the design's shorter side: offset of its own pixels from where the markers put them
 _LEAST_CELLS = 3
@@ -36,33 +45,55 @@ _OUTLIER_FACTOR = 2.0  # the design's corner beside an outlier marker may lie of
 # 95 % errors beyond which a figure is "not measured": the azimuth's (beyond some 10° a view from the left cannot be
 # told from one from the right) beside what an unconfirmed focal length adds, and the distance's
 MOST_AZIMUTH_ERROR_DEG, MOST_DISTANCE_ERROR = 10.0, 0.2
+FOCAL_ERROR = 0.005  # relative, 95 %, of a camera file
 
 
 @dataclass(frozen=True)
-class LocatedSheet:
-    """The sheet in a photograph: a picture in which it is flat, the homography there, and how it was unrolled (None:
-    the picture is the photograph).
+class PinholePhoto:
+    """A photograph uint8 H×W×3 without lens distortion, its camera matrix (None: unknown), whether a camera file gave
+    it, the standard deviation of the focal length's logarithm, and whether EXIF's focal length is of an uncropped file.
     """
 
     srgb: np.ndarray
-    fit: PageFit
-    unrolled: UnrolledSheet | None
+    matrix_px: np.ndarray | None
+    calibrated: bool
+    focal_spread: float = EXIF_SPREAD
+    cropped: bool = False
 
-    def px(self, parameters: np.ndarray, mm: np.ndarray) -> np.ndarray:
-        """Project page points (N×2 mm) to pixels of the photograph, by the model's parameters."""
-        if self.unrolled is not None:
-            return self.unrolled.shape.project(parameters, mm)
-        return apply_homography(np.append(parameters, 1.0).reshape(3, 3), mm)
 
-    @property
-    def parameters(self) -> np.ndarray:
-        """Parameters of the model: for flat paper, eight of a homography."""
-        return self.unrolled.shape.parameters if self.unrolled else self.fit.px_from_mm.ravel()[:8]
+def pinhole_photo(photo: Photo, camera: "Camera | None") -> PinholePhoto:
+    """Remove the distortion by the camera file; use EXIF if there is no file, or if it is of another picture size."""
+    height, width = photo.srgb.shape[:2]
+    if camera is not None and width != height:
+        for candidate in (camera, _turn_clockwise(camera)):
+            if candidate.fits((width, height)):
+                matrix = candidate.matrix_px((width, height))
+                return PinholePhoto(_undistort(photo.srgb, candidate, matrix), matrix, True, FOCAL_ERROR / 1.96)
+    focal = photo.focal_px
+    matrix = None if focal is None else np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
+    return PinholePhoto(photo.srgb, matrix, False, photo.focal_spread, photo.focal_rejected)
 
-    @property
-    def covariance(self) -> np.ndarray:
-        """Covariance of the parameters."""
-        return self.unrolled.shape.covariance if self.unrolled else self.fit.covariance
+
+def _turn_clockwise(camera: "Camera") -> "Camera":
+    """Turn a camera's pictures by 90° clockwise: (x, y) becomes (height - y, x)."""
+    (width, height), cx, cy = camera.image_px, camera.cx, camera.cy
+    turned = camera.changed(image_px=(height, width), fx=camera.fy, fy=camera.fx, cx=height - cy, cy=cx)
+    return turned.changed(p1=camera.p2, p2=-camera.p1)
+
+
+def _undistort(srgb: np.ndarray, camera: "Camera", matrix: np.ndarray) -> np.ndarray:
+    if not camera.has_distortion:
+        return srgb
+    index = matrix.copy()
+    index[:2, 2] -= 0.5  # OpenCV counts from pixel centers
+    terms = np.array([camera.k1, camera.k2, camera.p1, camera.p2, camera.k3])
+    picture = np.empty_like(srgb)
+    for rows in row_strips(srgb):  # maps take 8 bytes a pixel: in strips they stay small
+        strip, strip_matrix = picture[rows], index - np.array([[0, 0, 0], [0, 0, rows.start], [0, 0, 0]])
+        size_px = strip.shape[1], strip.shape[0]
+        maps = cv2.initUndistortRectifyMap(index, terms, None, strip_matrix, size_px, cv2.CV_32FC1)
+        cv2.remap(srgb, *maps, cv2.INTER_CUBIC, strip, cv2.BORDER_REPLICATE)
+    return picture
 
 
 def locate_sheet(view: PinholePhoto, detected: MarkersInView, surface: Surface) -> LocatedSheet | None:
@@ -70,14 +101,11 @@ def locate_sheet(view: PinholePhoto, detected: MarkersInView, surface: Surface) 
     fit = _fit(detected, surface)
     if fit is None:
         return None
-    sheet = _unroll_piece(view, detected, surface)
-    return LocatedSheet(view.srgb, fit, None) if sheet is None else LocatedSheet(sheet.srgb, sheet.fit, sheet)
+    return _unroll_piece(view, detected, surface) or flat_sheet(view.srgb, fit, surface.rect_mm)
 
 
 def _fit(detected: MarkersInView, surface: Surface) -> PageFit | None:
-    """Fit the piece's homography, with the page's markers if they lie in the same plane; only markers of the piece
-    count as outliers.
-    """
+    """Fit the piece's homography, with the page's markers if in its plane; only the piece's count as outliers."""
     fitted = {i: b.corners_px for i, b in detected.markers.items() if b.fitted}
     corners = fitted or detected.corners_px
     on_piece = {i: c for i, c in corners.items() if i in surface.piece_ids}
@@ -95,7 +123,7 @@ def _fit(detected: MarkersInView, surface: Surface) -> PageFit | None:
     return fit if np.isfinite(fit.px_from_mm).all() and np.isfinite(fit.covariance).all() else None
 
 
-def _unroll_piece(view: PinholePhoto, detected: MarkersInView, surface: Surface) -> UnrolledSheet | None:
+def _unroll_piece(view: PinholePhoto, detected: MarkersInView, surface: Surface) -> LocatedSheet | None:
     """Flatten the piece, if its markers lie in no plane but fit a cylinder or a lens; else None."""
     corners = {i: b.corners_px for i, b in detected.markers.items() if b.fitted and i in surface.piece_ids}
     focal = () if view.matrix_px is None else (float(view.matrix_px[0, 0]), view.focal_spread)
@@ -115,7 +143,7 @@ def object_box(view: PinholePhoto, location: LocatedSheet, surface: Surface) -> 
     matrix = intrinsics(surface.fov_deg, size_px) if view.matrix_px is None else view.matrix_px
     around = np.array(surface.center_mm) + _TANGENT_MM * (rect_corners((-1, -1, 2, 2)))
     try:
-        pose = plane_pose(fit_homography(around, location.px(location.parameters, around)), matrix)
+        pose = plane_pose(fit_homography(around, location.shape.px(around)), matrix)
     except (np.linalg.LinAlgError, ValueError):
         return None
     side, left, top = min(size_px), *((size - min(size_px)) / 2 for size in size_px)
@@ -136,11 +164,10 @@ def geometry_of(
     """Measure the sheet's geometry; count the corners of the design in which its pixels were found, four if that is
     unknown; and give the share found of the cells with detail between the markers, with their number.
     """
-    fit, unrolled = location.fit, location.unrolled
-    px_per_mm, tilt_deg = sheet_pose.scale_and_tilt(location.px, location.parameters, surface.center_mm)
+    fit, shape, unrolled = location.fit, location.shape, location.unrolled
+    px_per_mm, tilt_deg = sheet_pose.scale_and_tilt(shape, surface.center_mm)
     shift, corners, found = None, 4, (1.0, 0)
-    uncertainty = unrolled.uncertainty_mm if unrolled else corner_uncertainty_mm(fit, surface.rect_mm)
-    uncertainty = float(np.hypot(uncertainty, _OUTLIER_FACTOR * fit.outlier_mm))
+    uncertainty = float(np.hypot(location.uncertainty_mm, _OUTLIER_FACTOR * fit.outlier_mm))
     # one page of a piece in tiles has none of the piece's markers, or some of them
     if colors is not None and surface.is_piece:
         cells = register(location.srgb, fit.px_from_mm, surface.rect_mm, colors.design, px_per_mm, blur)
@@ -150,17 +177,17 @@ def geometry_of(
         offset = _offset_mm(cells, free, surface)
         uncertainty = float(np.linalg.norm([uncertainty, _SURE_SIGMAS * corner_shift, offset]))
         shift = None if shift is None else max(shift, offset)
-    tilt_model = location.px, location.parameters, location.covariance, surface.center_mm, _turn_rad(location, surface)
+    middle, turn = surface.center_mm, _turn_rad(location, surface)
     distortion = None if unrolled else sheet_pose.distortion_of(fit, view.matrix_px, view.focal_spread)
     geometry = Geometry(
         residual_mm=fit.residual_mm,
         px_per_mm=px_per_mm,
         tilt_deg=tilt_deg,
-        tilt_uncertainty_deg=sheet_pose.tilt_uncertainty_deg(*tilt_model, distortion),
+        tilt_uncertainty_deg=sheet_pose.tilt_uncertainty_deg(shape, middle, turn, distortion),
         contrast=light.contrast,
         blur_px=blur,
         corner_uncertainty_mm=uncertainty,
-        curl_radius_mm=unrolled and unrolled.shape.radius_mm,
+        curl_radius_mm=shape.radius_mm,
         bend_mm=fit.bend_mm,
         design_shift_mm=shift,
         # no homography maps a page that was unrolled to the photograph
@@ -170,8 +197,7 @@ def geometry_of(
 
 
 def _turn_rad(location: LocatedSheet, surface: Surface) -> float:
-    bend = location.fit.bend_mm / min(surface.rect_mm[2:])
-    return sheet_pose.turn_rad(bend, location.unrolled and location.unrolled.shape)
+    return sheet_pose.turn_rad(location.fit.bend_mm / min(surface.rect_mm[2:]), location.shape)
 
 
 def _offset_mm(cells: Registration, free: np.ndarray, surface: Surface) -> float:
@@ -197,7 +223,7 @@ def _absent_markers(
     """
     absent: dict[int, bool] = {}
     for i in surface.piece_ids - detected.markers.keys():
-        quad = location.px(location.parameters, surface.corners_mm[i])
+        quad = location.shape.px(surface.corners_mm[i])
         if not shows_small_code(view.srgb, quad, i, surface.dictionary):
             absent[i] = not is_in_picture(quad, view.srgb)
     return absent
@@ -233,10 +259,7 @@ def camera_pose(view: PinholePhoto, location: LocatedSheet, surface: Surface) ->
     if view.matrix_px is None:
         return None, "cropped" if view.cropped else "unknown"
     camera = view.matrix_px, view.focal_spread, surface.center_mm, _turn_rad(location, surface), view.calibrated
-    if location.unrolled is None:
-        stance = sheet_pose.flat_sheet_position(location.fit, *camera)
-    else:
-        stance = sheet_pose.bent_sheet_position(location.unrolled.shape, *camera)
+    stance = sheet_pose.bent_sheet_position(location.shape, *camera)
     # perspective cannot tell a stretched print from a wrong focal length: a camera file is trusted, EXIF is not
     if stance.focal_agrees is False and not view.calibrated:
         return None, "contradicted"

@@ -9,28 +9,24 @@ views fail first and leaving them out would raise the rate.
 
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from patchproof.base.geometry import MM_PER_INCH, apply_homography, rect_corners
-from patchproof.evidence.appearance import MOST_CLIPPED, MOST_NOISE, appearance
-from patchproof.evidence.camera import PinholePhoto
-from patchproof.evidence.design_match import DesignMatch
-from patchproof.evidence.locate import MOST_SHIFT, LocatedSheet, camera_pose, geometry_of, locate_sheet, object_box
-from patchproof.evidence.ranges import PromisedRanges
-from patchproof.evidence.results import Color, Geometry, PhotoEntry, Remark, Scale, Trace
+from patchproof.evidence.appearance import MOST_CLIPPED, MOST_NOISE, DesignMatch, appearance
+from patchproof.evidence.locate import MOST_SHIFT, PinholePhoto, camera_pose, geometry_of, locate_sheet, object_box
+from patchproof.evidence.results import Geometry, PhotoEntry, Remark, Scale, Trace
 from patchproof.evidence.surface import PromisedColors, Surface
+from patchproof.evidence.task import PromisedRanges
 from patchproof.photo.detect import MarkersInView, find_markers, is_mirrored
 from patchproof.photo.known_page import complete_markers, find_sheet
 from patchproof.photo.page_code import read_page_code, refuse_other_page
 from patchproof.photo.pose import UNCONFIRMED_DEG
 from patchproof.photo.quality import FrameLight, blur_px, frame_light
 from patchproof.photo.rectify import PageFit
+from patchproof.photo.registration import DesignCorners, place_design
 from patchproof.photo.rejection import PhotoRejected
-
-if TYPE_CHECKING:
-    from patchproof.photo.corners import DesignCorners
+from patchproof.photo.unroll import LocatedSheet, flat_sheet
 
 MOST_BLUR = 0.5  # modules of Gaussian sigma: beyond it, borders of neighboring cells merge
 SMALLEST_DESIGN_PX = 24.0  # shorter side: fewer pixels cannot tell a design from its mean color
@@ -92,7 +88,7 @@ def measure(
     ranges: PromisedRanges,
     scan_dpi: float | None = None,
     with_pictures: bool = True,
-    corners: "DesignCorners | None" = None,
+    corners: DesignCorners | None = None,
     find: np.ndarray | None = None,
 ) -> MeasuredPhoto:
     """Measure one readable photograph; color only if the sheet has `promised` colors. Where no marker can
@@ -103,15 +99,19 @@ def measure(
         detected, surface = identify_sheet(view.srgb, surface)
     except PhotoRejected as rejection:
         if corners is None and find is not None and rejection.code in UNLOCATED_CODES:
-            corners, rejection = _search(view.srgb, find, surface, rejection)
+            from patchproof.photo.find_design import find_design
+
+            try:
+                corners = find_design(view.srgb, find, surface.rect_mm[2:])
+            except PhotoRejected as not_found:
+                rejection = not_found
         if corners is None or promised is None or rejection.code not in UNLOCATED_CODES:
             return MeasuredPhoto(PhotoEntry(file=name, status="rejected", remark=Remark.of(rejection)), False)
-        from patchproof.photo.corners import place_design
-
         detected, surface = MarkersInView({}, (), ()), surface.without_markers
         placed = place_design(view.srgb, corners, surface.rect_mm, promised.design, promised.ink)
     entry = partial(PhotoEntry, file=name, photo_px=size_px, markers_found=len(detected.markers))
-    location = LocatedSheet(view.srgb, placed.fit, None) if placed else locate_sheet(view, detected, surface)
+    flat = placed and flat_sheet(view.srgb, placed.fit, surface.rect_mm)
+    location = flat or locate_sheet(view, detected, surface)
     if location is None:
         trouble = PhotoRejected("too_few_markers", len(detected.markers), 1, _DISTORTED_ADVICE)
         return MeasuredPhoto(entry(status="judged", remark=Remark.of(trouble)), True)
@@ -155,28 +155,12 @@ def measure(
     if trouble is not None:
         entry = partial(entry, status="judged", remark=Remark.of(trouble))
     else:
-        remark = _print_check(page_check, scale, scan_dpi) or match.weak_ink or _noise_remark(color)
+        remark, noise = _print_check(page_check, scale, scan_dpi) or match.weak_ink, color and color.noise_delta_e00
+        if remark is None and noise is not None and noise > MOST_NOISE:
+            remark = Remark(code="noisy", figure=noise, threshold=MOST_NOISE, advice=_NOISY_ADVICE)
         scale = scale if scale is not None and _SCALE_RANGE[0] < _worst(scale) < _SCALE_RANGE[1] else None
         entry = partial(entry, status="measured", scale=scale, remark=remark)
     return MeasuredPhoto(entry(color=color), counted, pictures, light)
-
-
-def _noise_remark(color: Color | None) -> Remark | None:
-    if color is None or color.noise_delta_e00 is None or color.noise_delta_e00 <= MOST_NOISE:
-        return None
-    return Remark(code="noisy", figure=color.noise_delta_e00, threshold=MOST_NOISE, advice=_NOISY_ADVICE)
-
-
-def _search(
-    srgb: np.ndarray, design: np.ndarray, surface: Surface, rejection: PhotoRejected
-) -> "tuple[DesignCorners | None, PhotoRejected]":
-    """The design's corners by its pixels, and the reason for the search; or None and why they were not found."""
-    from patchproof.photo.find_design import find_design
-
-    try:
-        return find_design(srgb, design, surface.rect_mm[2:]), rejection
-    except PhotoRejected as not_found:
-        return None, not_found
 
 
 def identify_sheet(srgb: np.ndarray, surface: Surface) -> tuple[MarkersInView, Surface]:
@@ -187,9 +171,10 @@ def identify_sheet(srgb: np.ndarray, surface: Surface) -> tuple[MarkersInView, S
     marker_ids = surface.piece_ids or surface.page_ids
     if not marker_ids:
         raise PhotoRejected("no_corners", None, None, _NO_CORNERS_ADVICE)
-    if surface.pages:
-        pages = [frozenset(page.corners_mm) for page in surface.pages]
-        detected = find_markers(srgb, marker_ids, surface.all_ids, surface.dictionary, pages)
+    pages = [frozenset(page.corners_mm) for page in surface.pages]
+    if pages:
+        all_ids = frozenset(surface.corners_mm).union(*pages)
+        detected = find_markers(srgb, marker_ids, all_ids, surface.dictionary, pages)
     else:
         detected = find_sheet(srgb, marker_ids, surface.corners_mm, surface.dictionary)
     if not detected.markers:
@@ -209,17 +194,12 @@ def identify_sheet(srgb: np.ndarray, surface: Surface) -> tuple[MarkersInView, S
         raise PhotoRejected("several_sheets", extra_markers, 1, advice)
     if not surface.pages:
         return detected, surface
-    surface = _page_in_view(detected, surface)
+    hidden_ids = detected.markers.keys() - surface.corners_mm.keys()  # those that an assembled piece would hide
+    counts = [len(hidden_ids & page) for page in pages]
+    surface = surface.pages[int(np.argmax(counts))] if any(counts) else surface
     markers = {i: borders for i, borders in detected.markers.items() if i in surface.corners_mm}
     detected = MarkersInView(markers, detected.foreign, detected.doubled)
     return complete_markers(srgb, detected, surface.corners_mm, surface.dictionary), surface
-
-
-def _page_in_view(detected: MarkersInView, surface: Surface) -> Surface:
-    """The page of most markers that an assembled piece would hide; the assembled surface if there are none."""
-    hidden_ids = detected.markers.keys() - surface.corners_mm.keys()
-    counts = [len(hidden_ids & page.corners_mm.keys()) for page in surface.pages]
-    return surface.pages[int(np.argmax(counts))] if any(counts) else surface
 
 
 def _is_uncut(location: LocatedSheet, detected: MarkersInView, surface: Surface) -> bool:
@@ -229,9 +209,9 @@ def _is_uncut(location: LocatedSheet, detected: MarkersInView, surface: Surface)
     if set(location.fit.inlier_ids) & surface.page_ids or not detected.markers.keys() & surface.piece_ids:
         return True
     x, y, w, h = surface.rect_mm
-    side_px = np.linalg.norm(np.diff(location.px(location.parameters, np.array([[x, y], [x + w, y + h]])), axis=0))
+    side_px = np.linalg.norm(np.diff(location.shape.px(np.array([[x, y], [x + w, y + h]])), axis=0))
     off_px = [
-        np.linalg.norm(detected.markers[i].corners_px - location.px(location.parameters, surface.corners_mm[i]), axis=1)
+        np.linalg.norm(detected.markers[i].corners_px - location.shape.px(surface.corners_mm[i]), axis=1)
         for i in sorted(detected.markers.keys() & surface.page_ids)
     ]
     return any(off.max() < _MOST_CURL * side_px for off in off_px)
@@ -240,9 +220,7 @@ def _is_uncut(location: LocatedSheet, detected: MarkersInView, surface: Surface)
 def _trouble(
     geometry: Geometry, fit: PageFit, detected: MarkersInView, surface: Surface, corners: int = 4
 ) -> PhotoRejected | None:
-    """Find the first reason why geometry or color cannot be trusted; None if they can. The design was recognized in
-    `corners` of its four corners.
-    """
+    """The first reason not to trust geometry or color, or None; the design was found in `corners` of its corners."""
     tilt, blur, residual = geometry.tilt_deg or 0.0, geometry.blur_px, geometry.residual_mm
     side_mm, uncertainty = min(surface.rect_mm[2:]), geometry.corner_uncertainty_mm
     modules_px = [b.module_px for b in detected.markers.values()]
@@ -300,7 +278,6 @@ def _scan_scale(px_from_mm: np.ndarray, surface: Surface, scan_dpi: float) -> Sc
 
 
 def _worst(scale: Scale) -> float:
-    """The side's scale that is farther from 1."""
     return max((scale.scale_x, scale.scale_y), key=lambda side: abs(np.log(side)))
 
 

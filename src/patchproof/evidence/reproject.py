@@ -20,12 +20,10 @@ import numpy as np
 from patchproof.base.color import lift_tone, srgb_from_linear
 from patchproof.base.geometry import apply_homography, rect_corners
 from patchproof.base.resample import index_homography
-from patchproof.channel.print_colors import ShownColors, add_ink, lower_light
+from patchproof.channel.print_colors import ShownColors, add_ink, fit_ink_and_photos, lower_light, white_black
 from patchproof.evidence.appearance import fit_cells, noise_of
 from patchproof.evidence.classify import BoxEdges, square_of
-from patchproof.evidence.color_fit import ColorFit, invert_affine, white_black
-from patchproof.evidence.print_fit import PhotographedDesign, design_cells, fit_print
-from patchproof.evidence.surface import PromisedColors, Surface
+from patchproof.evidence.surface import PhotographedDesign, PromisedColors, Surface, choose_photo_cells, design_cells
 from patchproof.photo.detect import LINEAR_FLOAT32_FROM_CODE, luminance
 from patchproof.photo.quality import FrameLight, pattern_light
 from patchproof.photo.rectify import region_around
@@ -39,7 +37,7 @@ _LEAST_AGREEMENT = 0.6  # of marker cells with the print; correct homographies r
 _LEAST_NOISE = 0.004  # of linear light: code values and JPEG
 # share of a photograph that noise may bring below its veil, and the side in px of the square to average noise over
 _DARKEST_SHARE, _AVERAGE_PX = 0.002, 5
-_SUPERSAMPLE = 2
+_SUPERSAMPLE, _ROUNDS = 2, 3  # of pixels along a side; of fitting ink and photographs in turn
 
 
 @dataclass(frozen=True)
@@ -103,18 +101,16 @@ def photo_square(
 def unmix_markers(
     srgb: np.ndarray, px_from_mm: np.ndarray, blur_px: float, light: FrameLight, surface: Surface
 ) -> tuple[FrameLight, float] | None:
-    """Read paper, ink and blur from all cells of the piece's markers, as far as it has any; None if they disagree with
-    the homography.
-    """
+    """Read paper, ink and blur from all cells of the piece's markers; None if they disagree with the homography."""
     on_piece = {i: surface.corners_mm[i] for i in surface.piece_ids}
     unmixed = pattern_light(srgb, px_from_mm, on_piece, surface.dictionary, blur_px) if on_piece else None
     if unmixed is None:
         return light, blur_px
-    light = replace(light, paper=unmixed.paper, ink=unmixed.ink)
-    return None if unmixed.agreement < _LEAST_AGREEMENT else (light, unmixed.blur_px)
+    paper, ink, blur_px, agreement = unmixed
+    return None if agreement < _LEAST_AGREEMENT else (replace(light, paper=paper, ink=ink), blur_px)
 
 
-def light_fit(shot: PhotoSquare, promised: PromisedColors, tone: float = 0.0) -> ColorFit:
+def light_fit(shot: PhotoSquare, promised: PromisedColors, tone: float = 0.0) -> ShownColors:
     """Fit a photograph's light before its `tone` to media-relative light by paper white and a veil of stray light.
 
     A veil lightens all pixels alike: it is at most the darkest place's light, and at most what takes marker black to
@@ -135,40 +131,39 @@ def _light_before(shot: PhotoSquare, tone: float) -> np.ndarray:
 
 def fit_print_and_lights(
     shots: Sequence[PhotoSquare], promised: PromisedColors
-) -> tuple[Callable[[np.ndarray], np.ndarray] | None, list[ColorFit], list[ShownColors]]:
+) -> tuple[Callable[[np.ndarray], np.ndarray] | None, list[ShownColors], list[ShownColors]]:
     """Fit the print's map of promised light from several photographs, each one's light, for what surrounds the print,
-    and what each makes of the print's light. If the colors are too few or too alike to fit a print, its map is None,
-    and the last fits contain it.
+    and what each makes of the print's light. If the colors do not tell a print, its map is None, and the last hold it.
     """
-    fit = fit_print([PhotographedDesign(shot.cells, shot.blur_cells, shot.light) for shot in shots], promised)
-    if fit is None:
-        lights = [ShownColors(invert_affine(design_fit(shot, promised).matrix)) for shot in shots]
+    designs = [PhotographedDesign(shot.cells, shot.blur_cells, shot.light) for shot in shots]
+    if (read := choose_photo_cells(designs, promised)) is None:
+        lights = [design_fit(shot, promised) for shot in shots]
         return None, [light_fit(shot, promised) for shot in shots], lights
-    ink, lights = fit
+    ink, terms = fit_ink_and_photos(read, _ROUNDS)
+    lights = [ShownColors.of_terms(t) for t in terms]
     undo = [light_fit(shot, promised, light.tone) for shot, light in zip(shots, lights, strict=True)]
     return partial(add_ink, ink=ink), undo, lights
 
 
-def design_fit(shot: PhotoSquare, promised: PromisedColors) -> ColorFit:
+def design_fit(shot: PhotoSquare, promised: PromisedColors) -> ShownColors:
     """Fit print, light and camera together to the design's coarse colors, or else to paper and ink alone."""
     height, width = shot.cells.shape[:2]
     expected = cv2.resize(promised.design, (width, height), interpolation=cv2.INTER_AREA).astype(float)
     inner = np.s_[1:-1, 1:-1]
     readable = np.isfinite(shot.cells[inner]).all(-1)
     fit = fit_cells(shot.cells[inner][readable], expected[inner][readable], shot.light, promised.ink)
-    return light_fit(shot, promised) if fit.name == "white_black" else fit
+    return light_fit(shot, promised) if fit.kind == "white_black" else fit
 
 
 def reprojected_squares(
     shot: PhotoSquare,
     looks: Mapping[Switches, np.ndarray],
     rect_mm: Rect,
-    undo: ColorFit,
+    undo: ShownColors,
     print_light: ShownColors,
     reference: Reference,
 ) -> dict[Switches, np.ndarray]:
-    """Render the piece into the square with each effect on and off: float32 sRGB W×W×3 by the switches of (look, light,
-    blur).
+    """Render the piece into the square with each effect on and off: float32 sRGB W×W×3 by (look, light, blur).
 
     `looks` are the media-relative linear light of the piece at `rect_mm` by their own switches. `undo` takes
     photographed light before its tone to media-relative; `print_light` takes a look to the photograph's light.
@@ -178,7 +173,7 @@ def reprojected_squares(
     surroundings = {}
     for blur, picture in ((True, photo), (False, change_blur(photo, shot.blur_px, reference.blur_px, shot.noise))):
         surroundings[True, blur] = picture
-        surroundings[False, blur] = np.clip(reference.white * undo.apply(picture), 0, 1).astype(np.float32)
+        surroundings[False, blur] = np.clip(reference.white * undo.undo(picture), 0, 1).astype(np.float32)
     srgb = {key: _codes(picture, tone if key[0] else 0.0) for key, picture in surroundings.items()}
     promised_light = np.column_stack([np.eye(3) * reference.white, np.zeros(3)])
     lights = {True: print_light.matrix, False: promised_light}
@@ -195,9 +190,7 @@ def reprojected_squares(
 
 
 def reprojected_square(shot: PhotoSquare, look: np.ndarray, rect_mm: Rect, light: ShownColors) -> np.ndarray:
-    """Render a piece of this look (media-relative light) into the square under the photograph's own blur and light:
-    float32 sRGB W×W×3.
-    """
+    """Render a piece of this look into the square under the photograph's blur and light: float32 sRGB W×W×3."""
     box, photo = _affected_part(shot, rect_mm), _light_before(shot, light.tone)
     layer = _blur(_layer(look, shot.px_from_mm, rect_mm, box), shot.blur_px)
     picture = shot.square.astype(np.float32) / 255
@@ -210,7 +203,6 @@ def _codes(linear: np.ndarray, tone: float) -> np.ndarray:
 
 
 def _affected_part(shot: PhotoSquare, rect_mm: Rect) -> tuple[slice, slice]:
-    """The part of the square that a piece at `rect_mm` changes, with a margin for blur."""
     corners_px = apply_homography(shot.px_from_mm, rect_corners(rect_mm))
     return region_around(corners_px, 3 + int(4 * max(shot.blur_px, 2.0)), shot.square.shape)
 
@@ -259,7 +251,11 @@ def _layer(look: np.ndarray, px_from_mm: np.ndarray, rect_mm, box: tuple[slice, 
     x, y, w, h = rect_mm
     finer, top, left = _SUPERSAMPLE, box[0].start, box[1].start
     height, width = box[0].stop - top, box[1].stop - left
-    look = _reduce_to_pixels(look, px_from_mm, rect_mm)
+    # about a texel per supersampled pixel, so that warping does not alias
+    quad = apply_homography(px_from_mm, rect_corners(rect_mm))
+    sides = np.linalg.norm(np.roll(quad, -1, axis=0) - quad, axis=1).reshape(2, 2).max(0) * finer
+    wide, high = (min(n, max(2, int(np.ceil(s)))) for n, s in zip(look.shape[1::-1], sides, strict=True))
+    look = cv2.resize(look.astype(np.float32), (wide, high), interpolation=cv2.INTER_AREA)
     mm_from_texel = np.array([[w / look.shape[1], 0, x], [0, h / look.shape[0], y], [0, 0, 1.0]])
     to_fine = np.array([[finer, 0, -finer * left], [0, finer, -finer * top], [0, 0, 1]])
     matrix = index_homography(to_fine @ px_from_mm @ mm_from_texel)
@@ -270,15 +266,6 @@ def _layer(look: np.ndarray, px_from_mm: np.ndarray, rect_mm, box: tuple[slice, 
     share = (inside > 0.5).astype(np.float32)
     fine = (color * share[..., None], share)  # resized separately: four channels at once take twice as long
     return np.dstack([cv2.resize(part, (width, height), interpolation=cv2.INTER_AREA) for part in fine])
-
-
-def _reduce_to_pixels(look: np.ndarray, px_from_mm: np.ndarray, rect_mm) -> np.ndarray:
-    """Average a look to about a texel per supersampled pixel, so that warping it does not alias."""
-    quad = apply_homography(px_from_mm, rect_corners(rect_mm))
-    sides = np.linalg.norm(np.roll(quad, -1, axis=0) - quad, axis=1) * _SUPERSAMPLE
-    width, height = (max(2, int(np.ceil(side))) for side in sides.reshape(2, 2).max(0))
-    width, height = min(look.shape[1], width), min(look.shape[0], height)
-    return cv2.resize(look.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
 
 
 def _blur(layer: np.ndarray, sigma_px: float) -> np.ndarray:

@@ -11,11 +11,15 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from patchproof.base.goal import GainWord, Goal
+from patchproof.base.output import image_pixels
 from patchproof.base.validation import Finite, StrictModel
 from patchproof.photo.rejection import PhotoRejected
 
 if TYPE_CHECKING:
+    import numpy as np
     from matplotlib.figure import Figure
+
+    from patchproof.base.notebook import Rates
 
 Status = Literal["judged", "measured", "rejected"]
 VerdictWord = Literal["kept", "broken", "cannot_tell"]
@@ -105,13 +109,7 @@ class Remark(StrictModel):
 
 
 _PARTS = {"geometry": Geometry, "pose": CameraPose, "scale": Scale, "color": Color, "remark": Remark}
-# one photograph in report.json, in this order
-PHOTO_KEYS = """
-    file status sha256 photo_px code figure threshold advice located markers_found residual_mm px_per_mm scale_x scale_y
-    tilt_deg tilt_uncertainty_deg azimuth_deg azimuth_uncertainty_deg distance_mm
-    distance_uncertainty_mm focal contrast blur_px corner_uncertainty_mm bend_mm design_shift_mm
-    curl_radius_mm delta_e00_mean delta_e00_p95 color_fit clipped_share glossy_share homography_px_from_mm box
-    predictions""".split()
+_NOT_MEASURED = {key: None for kind in _PARTS.values() for key in kind.model_fields}
 
 
 class PhotoEntry(StrictModel):
@@ -160,9 +158,10 @@ class PhotoEntry(StrictModel):
 
     @model_serializer(mode="wrap")
     def _flatten(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        parts = serialize(self)
-        figures = parts | {key: value for name in _PARTS for key, value in (parts[name] or {}).items()}
-        return {key: figures.get(key) for key in PHOTO_KEYS} | ({"said": figures["said"]} if figures["said"] else {})
+        data, figures = serialize(self), dict(_NOT_MEASURED)
+        for name in _PARTS:
+            figures |= data.pop(name) or {}
+        return {key: value for key, value in data.items() if key != "said" or value} | figures
 
 
 class Trace(StrictModel):
@@ -205,8 +204,7 @@ class Ledger(StrictModel):
 @dataclass(frozen=True)
 class Control:
     """Photographs of one control, compared with those of the patch (null: nothing to compare). `difference` is patch
-    minus control over `sessions`, of the `rates` of both there; `pairs` is 0 if photographs are not paired, `advice`
-    says why nothing can be told.
+    minus control over `sessions`, of the `rates` of both; `pairs` is 0 without pairs, `advice` says what is missing.
     """
 
     name: str
@@ -225,8 +223,7 @@ class Control:
 
 class EffectEstimate(StrictModel):
     """The patch's effect as estimated by rendering controls into its photographs. With the design itself rendered into
-    them, a share `agree` got the original answer; only these are compared, and if they are too few, there are no
-    controls.
+    them, a share `agree` got the original answer; only these are compared; too few mean no controls.
     """
 
     photos: int
@@ -235,9 +232,7 @@ class EffectEstimate(StrictModel):
 
 
 class SessionCount(StrictModel):
-    """One session's judged photographs, and how many of them were recognized; `same_as` names the session that a folder
-    is part of (null: its own).
-    """
+    """One session's judged and recognized photographs; `same_as` names the session that a folder is part of."""
 
     name: str
     recognized: int
@@ -294,9 +289,7 @@ class Summary(StrictModel):
     not_measured: dict[str, str] = Field(default_factory=dict)  # reasons by figure
 
     def meets(self, required: Required) -> bool:
-        """True if the promise held; for "helps" the patch must also help, since a useless patch can keep a promise to
-        be useless.
-        """
+        """True if the promise held; "helps" asks for more: a useless patch can keep a promise to be useless."""
         helps = self.worth is not None and self.worth.word == "helps"
         return self.verdict == "kept" and (helps or required == "kept")
 
@@ -323,11 +316,27 @@ class Report(StrictModel):
 
     def plot(self) -> "Figure":
         """Draw the rates as bars with their intervals beside a photograph, as a matplotlib figure."""
-        from patchproof.evidence.shown_report import report_figure
+        from patchproof.base.notebook import rates_figure
 
-        return report_figure(self)
+        return rates_figure(f"verdict: {self.summary.verdict}", *self._rates_and_photo())
 
     def _repr_html_(self) -> str:
-        from patchproof.evidence.shown_report import report_in_notebook
+        from patchproof.base.notebook import notebook_html
 
-        return report_in_notebook(self)
+        summary = self.summary
+        rows = {"photographs": f"{summary.photos}, judged {summary.judged}, measured {summary.measured}"}
+        if summary.prediction_interval is not None:
+            rows["expected"] = "{} to {} of {}".format(*summary.prediction_interval, summary.judged)
+        rows |= {name: text for name, text in (("reason", summary.reason), ("next", summary.next_step)) if text}
+        return notebook_html(f"verdict: {summary.verdict}", rows, *self._rates_and_photo())
+
+    def _rates_and_photo(self) -> "tuple[Rates, np.ndarray | None]":
+        """Rates with their intervals by name, the patch's first ({}: nothing was judged); the first kept picture."""
+        summary, worth, rates = self.summary, self.summary.worth, {}
+        if summary.rate is not None and summary.interval is not None:
+            rates[f"patch, {summary.judged} photographs"] = summary.rate, summary.interval
+            rates |= {f"{c.name}, {c.n} photographs": (c.recognized / c.n, c.interval) for c in self.controls if c.n}
+            if worth is not None and worth.source != "photographed":
+                rates[f"{worth.control}, {worth.source}"] = worth.control_rate, worth.control_interval
+        paths = [] if self.folder is None else sorted((self.folder / "pictures").glob("*.photo.jpg"))
+        return rates, image_pixels(paths[0].read_bytes()) if paths else None

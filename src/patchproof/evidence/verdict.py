@@ -16,8 +16,7 @@ Whether the patch helps is another question: a patch that was promised to be use
 comparison answers it, that with the hardest control by the strongest evidence there is, which the headline, the page
 and `--require helps` all use. Photographed controls decide alone, if there are any. Else those decide that were
 rendered into the patch's own photographs, with the bare object as the promise simulated it, since the paper hides it.
-Else it is the promise's controls. The patch has to beat all that decide; which of the three answers it gives, says
-`base.goal`.
+Else it is the promise's controls. The patch has to beat all that decide; `base.goal` says which answer it gives.
 """
 
 from bisect import bisect_left

@@ -69,9 +69,7 @@ class MarkersInView:
 
 @dataclass(frozen=True)
 class Level:
-    """A level of the search: the scale of its pixels, the conversion of uint8 sRGB to the detector's uint8 gray, and
-    the reduced photograph, for scales below 1.
-    """
+    """A level of the search: its scale, the conversion of uint8 sRGB to gray, below scale 1 the reduced photograph."""
 
     scale: float
     to_gray: Callable[[np.ndarray], np.ndarray]
@@ -193,7 +191,6 @@ def search_level(srgb: np.ndarray, region: ImageRegion, level: Level, aruco, det
 
 
 def _scaled_size(srgb: np.ndarray, scale: float) -> tuple[int, int]:
-    """Width and height at another scale."""
     return max(1, round(srgb.shape[1] * scale)), max(1, round(srgb.shape[0] * scale))
 
 
@@ -230,9 +227,7 @@ def detector_settings() -> cv2.aruco.DetectorParameters:
 def _detect(
     picture: np.ndarray, aruco, full_px: float, is_reduced: bool = False
 ) -> tuple[list[tuple[int, np.ndarray]], Ids]:
-    """Ids and corners in a gray picture, which is part of one whose longer side has `full_px` pixels; and the ids whose
-    codes some squares resemble in a mirror.
-    """
+    """Ids and corners in a gray picture, part of one `full_px` long; ids whose codes some squares resemble mirrored."""
     settings = detector_settings()
     if is_reduced or _is_large(picture):
         settings.adaptiveThreshWinSizeMin = settings.adaptiveThreshWinSizeMax = _REDUCED_WINDOW_PX
@@ -249,8 +244,7 @@ def _detect(
 
 def detect_markers(picture: np.ndarray, aruco, settings: cv2.aruco.DetectorParameters):
     """OpenCV's (corners, ids or None) of one uint8 gray picture, and the set of ids whose codes some squares resemble
-    in a mirror; raises `PhotoRejected("too_costly")` if it shows so many possible markers that the detector would not
-    end in time.
+    in a mirror; raises `PhotoRejected("too_costly")` if it shows more possible markers than there is time for.
 
     OpenCV compares a square with every code of the dictionary, which takes a millisecond: 20 s for a block design. So
     it gets a dictionary of the codes that any square resembles, or no picture if there is none.

@@ -22,10 +22,10 @@ import numpy as np
 
 from patchproof.base.geometry import apply_homography, fit_homography, rect_corners
 from patchproof.base.resample import downscale, halving_pyramid, index_homography
-from patchproof.photo.corners import DesignCorners
 from patchproof.photo.detect import is_plausible_quad
 from patchproof.photo.known_page import is_in_picture
 from patchproof.photo.rectify import homography_jacobian
+from patchproof.photo.registration import DesignCorners
 from patchproof.photo.rejection import PhotoRejected
 
 SEARCHED_PX = 1600  # longer side of the picture in which places are proposed

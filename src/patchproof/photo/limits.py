@@ -33,9 +33,7 @@ def run_limited(work: Callable[Params, ReturnType], *args: Params.args, **kwargs
 
 
 def find_squares(gray: np.ndarray, perimeter_px: float = 36, window_px: int = 13) -> np.ndarray:
-    """Corners Q×4×2 px, clockwise, of the squares in uint8 H×W that a marker detector would examine with a threshold
-    of this window.
-    """
+    """Corners Q×4×2 px, clockwise, of the squares in uint8 H×W that a marker detector examines at this window."""
     dark = cv2.adaptiveThreshold(gray, 255, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY_INV, window_px, 3)
     if count_edges(dark) > _NOISE_EDGES:  # most outlines of noise are those of specks, too short for a square
         _, labels, stats, _ = cv2.connectedComponentsWithStats(dark)

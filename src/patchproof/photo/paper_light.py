@@ -40,9 +40,7 @@ class PaperLight:
 def paper_light(
     srgb: np.ndarray, px_from_mm: np.ndarray, area_mm: RectMm, printed: Iterable[RectMm], blur_px: float
 ) -> PaperLight:
-    """Measure the light on a rectangle of paper, white but for what is `printed`, in a uint8 photograph;
-    `PhotoRejected` if it shows too little white paper.
-    """
+    """Measure the light on paper, white but for what is `printed`; `PhotoRejected` if too little of it is white."""
     codes, mm = _white_pixels(srgb, px_from_mm, area_mm, printed, blur_px)
     if len(codes) < _MIN_PIXELS:
         raise PhotoRejected("too_small", len(codes), _MIN_PIXELS, "come closer: too little white paper is in view")

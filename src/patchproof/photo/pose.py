@@ -22,7 +22,7 @@ import numpy as np
 
 from patchproof.base.geometry import plane_pose, scaling_about, view_angles
 from patchproof.photo.rectify import PageFit, root_of, root_of_scaled
-from patchproof.photo.unroll import Project, Shape
+from patchproof.photo.unroll import Shape
 
 # one σ of errors that are no noise of corners: of |r1| = |r2|, printers' errors of proportion; of both equations, of
 # angles in radians and of lengths, paper that is not quite flat or round, and lenses
@@ -129,20 +129,16 @@ def _trusted_spread(focal_spread: float, own_spread: float, agrees: bool | None,
     return focal_spread if matrix_is_known or not agrees else max(focal_spread, own_spread)
 
 
-def scale_and_tilt(px: Project, parameters: np.ndarray, point_mm) -> tuple[float, float]:
-    """(px_per_mm, tilt_deg) of a page point for `px(parameters, mm)`; see `geometry.local_scale`."""
-    stretch = _stretch(px, parameters, point_mm)
+def scale_and_tilt(shape: Shape, point_mm) -> tuple[float, float]:
+    """(px_per_mm, tilt_deg) of a page point; see `geometry.local_scale`."""
+    stretch = _stretch(shape, shape.parameters, point_mm)
     return float(np.sqrt(abs(np.linalg.det(stretch)))), float(_tilt_deg(stretch[None])[0])
 
 
-def tilt_uncertainty_deg(
-    px: Project, parameters: np.ndarray, covariance: np.ndarray, point_mm, turn: float = 0.0, distortion=None
-) -> float:
-    """The 95 % uncertainty of the tilt of `scale_and_tilt`, by the parameters' covariance, a `turn_rad` and a
-    `distortion_of`.
-    """
-    root, stretch = root_of_scaled(covariance), _stretch(px, parameters, point_mm)
-    sides = [[_stretch(px, parameters + sign * axis, point_mm) for axis in root.T] for sign in (1, -1)]
+def tilt_uncertainty_deg(shape: Shape, point_mm, turn: float = 0.0, distortion=None) -> float:
+    """The 95 % uncertainty of the tilt of `scale_and_tilt`, by covariance, a `turn_rad` and a `distortion_of`."""
+    root, stretch = root_of_scaled(shape.covariance), _stretch(shape, shape.parameters, point_mm)
+    sides = [[_stretch(shape, shape.parameters + sign * axis, point_mm) for axis in root.T] for sign in (1, -1)]
     by_axis = (np.array(sides[0]) - np.array(sides[1])) / 2
     rng = np.random.default_rng(0)  # fixed, so that the same photo gives the same bytes
     draws = stretch + np.einsum("nk,kij->nij", rng.standard_normal((1000, len(by_axis))), by_axis)
@@ -153,10 +149,10 @@ def tilt_uncertainty_deg(
     return float(np.hypot(np.percentile(np.abs(errors), 95), 1.96 * np.degrees(turn)))
 
 
-def _stretch(px: Project, parameters: np.ndarray, point_mm) -> np.ndarray:
+def _stretch(shape: Shape, parameters: np.ndarray, point_mm) -> np.ndarray:
     """The derivative 2×2 of pixels by page millimeters, over a tenth of a millimeter."""
     step = 0.05 * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
-    right, left, below, above = px(parameters, np.asarray(point_mm, float) + step)
+    right, left, below, above = shape.project(parameters, np.asarray(point_mm, float) + step)
     return np.stack([right - left, below - above], 1) / 0.1
 
 
@@ -190,9 +186,7 @@ def _agreement(fit: PageFit, matrix_px: np.ndarray, focal_spread: float) -> tupl
 
 
 def _disagreement(fit: PageFit, matrix_px: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The errors (2,) of r1 · r2 = 0 and |r1| = |r2|, their covariance by the fit's, and their derivatives by the
-    focal length's logarithm.
-    """
+    """Errors (2,) of r1 · r2 = 0 and |r1| = |r2|, their covariance and derivatives by the focal length's logarithm."""
     entries = fit.px_from_mm.ravel()[:8]
 
     def errors(entries: np.ndarray, log_scale: float = 0.0) -> np.ndarray:
@@ -209,6 +203,5 @@ def _disagreement(fit: PageFit, matrix_px: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def _tilt_deg(stretch: np.ndarray) -> np.ndarray:
-    """Tilts from derivatives N×2×2."""
     singular = np.linalg.svd(stretch, compute_uv=False)
     return np.degrees(np.arccos(np.clip(singular[:, 1] / singular[:, 0], 0, 1)))

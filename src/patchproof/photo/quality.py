@@ -76,33 +76,23 @@ def frame_light(srgb: np.ndarray, markers: Iterable[Borders]) -> FrameLight:
 
 
 def _fitted_or_all(markers: Iterable[Borders]) -> list[Borders]:
-    """The fitted markers, or all if none is fitted."""
     markers = list(markers)
     return [b for b in markers if b.fitted] or markers
 
 
-@dataclass(frozen=True)
-class PatternLight:
-    """Linear light (3,) of paper and ink, and the Gaussian blur in pixels that fits the cells best.
-
-    `agreement` is the correlation of the cells' light with the printed cells, near 1 if the homography is right.
-    """
-
-    paper: np.ndarray
-    ink: np.ndarray
-    blur_px: float
-    agreement: float
-
-
 def pattern_light(
     srgb: np.ndarray, px_from_mm: np.ndarray, corners_mm: Mapping[int, np.ndarray], dictionary: str, blur_px: float
-) -> PatternLight | None:
-    """Fit paper, ink and blur to a uint8 photograph, given the blur from borders; None if it shows too few cells."""
+) -> tuple[np.ndarray, np.ndarray, float, float] | None:
+    """Fit light (3,) of paper and ink and the blur in pixels to a uint8 photograph, given the blur from borders; None
+    if it shows too few cells. Last comes the correlation of light and print, near 1 if the homography is right.
+    """
     ids = sorted(corners_mm)
     markers, lights = [], []
     for cells, corners in zip(marker_cells(dictionary, ids), (corners_mm[i] for i in ids), strict=True):
         module_px = local_scale(px_from_mm, corners.mean(0))[0] * np.linalg.norm(corners[1] - corners[0]) / len(cells)
-        points = apply_homography(px_from_mm, _centers_mm(corners, len(cells)))
+        rows, columns = (np.mgrid[: len(cells), : len(cells)].reshape(2, -1, 1) + 0.5) / len(cells)
+        centers_mm = corners[0] + columns * (corners[1] - corners[0]) + rows * (corners[3] - corners[0])
+        points = apply_homography(px_from_mm, centers_mm)
         usable = ((points > 1) & (points < [srgb.shape[1] - 1, srgb.shape[0] - 1])).all(1)
         values = sample(srgb, points)
         usable &= (values < CLIPPED_CODE).all(1)
@@ -120,7 +110,7 @@ def pattern_light(
     if not fits:
         return None
     _, paper, ink, blur, agreement = min(fits, key=lambda fit: fit[0])
-    return PatternLight(np.minimum(paper, 1.2), np.maximum(ink, 0), float(blur), agreement)
+    return np.minimum(paper, 1.2), np.maximum(ink, 0), float(blur), agreement
 
 
 def _regress(pattern: np.ndarray, light: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
@@ -132,13 +122,6 @@ def _regress(pattern: np.ndarray, light: np.ndarray) -> tuple[float, np.ndarray,
         error = np.linalg.norm(rows @ np.stack([ink, paper]) - light, axis=1)
         weight = np.sqrt(np.minimum(1, 1.345 * 1.4826 * np.median(error) / np.maximum(error, 1e-9)))
     return float(np.median(error)), paper, ink
-
-
-def _centers_mm(corners: np.ndarray, modules: int) -> np.ndarray:
-    """The centers of a marker's modules, row by row."""
-    across, down = (corners[1] - corners[0]) / modules, (corners[3] - corners[0]) / modules
-    rows, columns = np.mgrid[0:modules, 0:modules] + 0.5
-    return corners[0] + columns.reshape(-1, 1) * across + rows.reshape(-1, 1) * down
 
 
 def _blur_cells(cells: np.ndarray, sigma_modules: float) -> np.ndarray:

@@ -12,10 +12,7 @@ REJECTION_CODES = {
     "too_costly": ("the picture is larger than limits of size and time allow", "save it smaller"),
     "empty": ("the picture holds no pixels, or one color", "take it again"),
     "too_few_markers": ("too little of the piece can be read to know where it lies", "show all of it, sharp and lit"),
-    "blurred": (
-        "motion or focus merges neighboring cells of markers",
-        "hold still, focus on the piece, use more light",
-    ),
+    "blurred": ("motion or focus merges neighboring cells of markers", "hold still, focus on it, use more light"),
     "clipped": ("highlights are cut off, so colors cannot be compared", "expose one or two stops less"),
     "noisy": ("noise or darkness alone would change colors too much", "use more light, come closer"),
     "too_small": ("the piece has too few pixels for its corners or its cells", "come closer, use the full resolution"),

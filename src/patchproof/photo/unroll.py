@@ -1,6 +1,6 @@
 """Flatten curled paper or a lens's distortion in a photograph, if that explains the markers better than a plane.
 
-In: marker corners in pixels and page millimeters that fit no plane. Out: `UnrolledSheet`: a picture in which the sheet
+In: marker corners in pixels and page millimeters that fit no plane. Out: `LocatedSheet`: a picture in which the sheet
 is flat, with its homography, so that it can be measured like flat sheets. Two models are compared with the plane: paper
 on a cylinder of any radius and direction, seen by a pinhole camera (nine parameters, the focal length held near the
 file's within its uncertainty), and a plane seen through a lens with one radial term. A model is accepted if its
@@ -46,8 +46,8 @@ class Shape:
 
     `radius_mm` of the paper is positive if it bulges towards the camera, None for a lens. `tangent(parameters,
     point_mm, turn_rad)` is `camera_from_tangent` 4×4 of the paper's tangent plane at a point, turned about the rulings;
-    None for a lens, whose first eight parameters times `unit` are a homography. `hidden_turn_rad` is the turn of the
-    paper from its middle to the nearest marker. `bend_px` is the part of the residual that is no noise.
+    None for a lens and for flat paper, whose first eight parameters times `unit` are a homography. `hidden_turn_rad` is
+    the turn of the paper from its middle to the nearest marker, `bend_px` the part of the residual that is no noise.
     """
 
     project: Project
@@ -66,23 +66,23 @@ class Shape:
 
 
 @dataclass(frozen=True)
-class UnrolledSheet:
-    """A photograph `srgb` with the sheet flattened, the sheet's homography `fit` in it, and the original `shape`."""
+class LocatedSheet:
+    """A picture `srgb` in which the sheet is flat, its homography `fit` there, the uncertainty of its corners, and the
+    original `shape` in the photograph, which the picture is unless `unrolled`.
+    """
 
     srgb: np.ndarray
     fit: PageFit
     uncertainty_mm: float
     shape: Shape
+    unrolled: bool = True
 
 
-@dataclass(frozen=True)
-class ShapeFit:
-    """A shape and the corners that it was fitted to."""
-
-    flat: np.ndarray  # 3×3 homography of the uncorrected corners
-    mm: np.ndarray
-    px: np.ndarray  # corrected for bent borders
-    shape: Shape
+def flat_sheet(srgb: np.ndarray, fit: PageFit, rect_mm) -> LocatedSheet:
+    """The sheet in a photograph of flat paper, with the piece at `rect_mm`."""
+    project = lambda p, mm: apply_homography(np.append(p, 1.0).reshape(3, 3), mm)  # noqa: E731
+    shape = Shape(project, fit.px_from_mm.ravel()[:8], fit.covariance, 0.0, None, 0.0, unit=np.ones(8))
+    return LocatedSheet(srgb, fit, rectify.corner_uncertainty_mm(fit, rect_mm), shape, False)
 
 
 def fit_shape(
@@ -91,8 +91,10 @@ def fit_shape(
     size_px: tuple[int, int],
     focal_px: float | None = None,
     focal_spread: float = UNKNOWN_FOCAL,
-) -> ShapeFit | None:
-    """Fit a cylinder or a lens to the corners in a picture of this size; None if a plane fits as well."""
+) -> tuple[Shape, np.ndarray, np.ndarray, np.ndarray] | None:
+    """Fit a cylinder or a lens to the corners in a picture of this size, and return it, the 3×3 homography of the
+    corners, and these in mm and in px, corrected for bent borders; None if a plane fits as well.
+    """
     ids, px, mm = rectify.common_corners(corners_px, corners_mm)
     if len(ids) < LEAST_MARKERS:
         return None
@@ -106,7 +108,7 @@ def fit_shape(
     # the borders were fitted as straight lines, which on strongly bent paper meet beside the corners
     shift = _chord_shift(best, mm)
     px, floor = px - shift, float(np.hypot(CORNER_NOISE_PX, _CORRECTION_ERROR * rms(shift)))
-    return ShapeFit(flat, mm, px, _best_shape(flat, mm, px, size_px, focal_px, focal_spread, floor))
+    return _best_shape(flat, mm, px, size_px, focal_px, focal_spread, floor), flat, mm, px
 
 
 def unroll(
@@ -116,7 +118,7 @@ def unroll(
     rect_mm,
     focal_px: float | None = None,
     focal_spread: float = UNKNOWN_FOCAL,
-) -> UnrolledSheet | None:
+) -> LocatedSheet | None:
     """Flatten the piece (a rectangle x, y, width, height on the page) in the photograph; None if a plane fits as well.
 
     The uncertainty is that of the piece's corners; `focal_spread` is the spread of the focal length's logarithm.
@@ -124,7 +126,7 @@ def unroll(
     shape_fit = fit_shape(corners_px, corners_mm, (srgb.shape[1], srgb.shape[0]), focal_px, focal_spread)
     if shape_fit is None:
         return None
-    flat, mm, px, shape = shape_fit.flat, shape_fit.mm, shape_fit.px, shape_fit.shape
+    shape, flat, mm, px = shape_fit
     grid = rect_mm[:2] + np.multiply(rect_mm[2:], RECT_GRID)
     px_from_mm = fit_homography(grid, shape.px(grid))
     margin = np.linalg.norm(apply_homography(flat, mm) - px, axis=1).max()  # pixels move about that far
@@ -134,11 +136,10 @@ def unroll(
     residual = shape.px(mm) - px
     length = rectify.rms_length_mm(_mm_by_px(shape.px, mm), residual)
     fit = PageFit(px_from_mm, np.zeros((8, 8)), length, ids, rectify.bend_mm(shape.bend_px, residual, length))
-    return UnrolledSheet(picture, fit, _uncertainty_mm(shape, rect_corners(rect_mm)), shape)
+    return LocatedSheet(picture, fit, _uncertainty_mm(shape, rect_corners(rect_mm)), shape)
 
 
 def _best_shape(flat, mm, px, size, focal_px, focal_spread, floor_px=CORNER_NOISE_PX) -> Shape:
-    """The shape with the smaller residual."""
     paper = fit_cylinder(flat, mm, px, size, focal_px, focal_spread, floor_px)
     lens = fit_radial_lens(flat, mm, px, size)
     return lens if paper is None or lens.rms_px < paper.rms_px else paper

@@ -20,10 +20,8 @@ import torch
 from torch import Tensor
 
 from patchproof.base.color import LINEAR_FROM_CODE, lift_tone
-from patchproof.base.geometry import camera_centers
-from patchproof.channel.camera import encode_light, encode_light_by_table, gains
-from patchproof.channel.cameras import Frame
-from patchproof.channel.light import Lighting, irradiance, lighting_of
+from patchproof.base.geometry import Frame, camera_centers
+from patchproof.channel.camera import Lighting, encode_light, encode_light_by_table, gains, irradiance, lighting_of
 from patchproof.render import pixels
 from patchproof.render.fragments import Cameras
 from patchproof.render.outlines import Outlines, find_outlines
@@ -258,7 +256,7 @@ def _render_flat(stage: Stage, piece: PiecePicture | None, conditions: Condition
 def lens_frame(stage: Stage, scene: MeshScene, size_px: tuple[int, int]) -> Frame:
     """Return the frame to render for pictures of `size_px`, with the margin that a calibrated lens needs."""
     if stage.scene.camera is None:
-        return Frame(size_px, scene.matrix_px(size_px), 0, 0, 0, 0)
+        return Frame(size_px, scene.matrix_px(size_px))
     return stage.scene.camera.pinhole_frame(size_px)
 
 

@@ -15,7 +15,6 @@ from patchproof.base import geometry
 from patchproof.base.errors import Refused
 from patchproof.base.fingerprint import files_sha256
 from patchproof.base.validation import expand_path
-from patchproof.channel.cameras import load_optional_camera
 from patchproof.channel.effects import Pose
 from patchproof.channel.object_box import hull_points, project_box
 from patchproof.mesh.load_mesh import load_mesh
@@ -42,7 +41,7 @@ class MeshScene(Scene):
     TERMS = (SceneTerm("lens distortion", "camera.file"),)
     OMITTED = (
         "cast shadows: a 10 mm ledge along the top of a 110 mm patch takes 4 % of its light, 9 % at the 95 % point",
-        "(computed for the default ranges, see channel/light); interreflection; "
+        "(computed for the default ranges, see channel/camera); interreflection; "
         "curl: paper is as flat or bent as stated",
     )
     EFFECT_TABLES = ("light", "camera")
@@ -166,7 +165,11 @@ def load_bare(source: SceneSource) -> MeshScene:
     if pictures:
         inputs["background.images"] = files_sha256(pictures, whole=False)
     identity, frame = source.sheet_id(known), view_frame(mesh, settings)
-    lens = load_optional_camera(camera.file, base, camera.photo_px)
+    lens = None
+    if camera.file is not None:
+        from patchproof.channel.lens import load_camera  # most photographs are of cameras that nobody calibrated
+
+        lens = load_camera(camera.file, base, camera.photo_px)
     others: dict[str, Any] = {"notes": (*mesh.warnings, *backgrounds.notes), "known": known, "mesh_glb": mesh_glb}
     others |= {"inputs": inputs}
     return MeshScene(settings, base, source.seed, identity, mesh, frame, backgrounds, camera=lens, **others)

@@ -21,10 +21,10 @@ from patchlab.validation.mounted_sheets import mount_content
 from patchproof.base import geometry
 from patchproof.base.output import image_pixels
 from patchproof.channel.printer import Printer, load_printer
-from patchproof.evidence.camera import PinholePhoto
+from patchproof.evidence.locate import PinholePhoto
 from patchproof.evidence.measure import measure
-from patchproof.evidence.ranges import PromisedRanges
 from patchproof.evidence.surface import Surface, surface_of
+from patchproof.evidence.task import PromisedRanges
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.optimizer.responses import Responses, ask_networks, merge_responses, responses
 from patchproof.optimizer.run import Run, load_run

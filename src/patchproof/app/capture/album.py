@@ -17,7 +17,7 @@ from typing import Any
 from patchproof.base.errors import Refused
 from patchproof.base.output import make_folder, refuse_other_files
 from patchproof.evidence.annotations import CORNERS_FILE
-from patchproof.evidence.journal import JOURNAL_FILE
+from patchproof.evidence.batch import JOURNAL_FILE
 from patchproof.photo.read import list_images
 
 CONTROLS_FOLDER = "controls"

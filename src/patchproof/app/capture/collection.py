@@ -23,17 +23,15 @@ from patchproof.base.output import data_uri, write_atomically
 from patchproof.base.progress import Advance, no_advance
 from patchproof.base.workers import Workers
 from patchproof.evidence import annotations
-from patchproof.evidence.batch import PhotoItem, measure_all
+from patchproof.evidence.batch import JOURNAL_FILE, Journal, PhotoItem, measure_all, settings_key
 from patchproof.evidence.classify import judges_of
-from patchproof.evidence.copies import reject_copies
 from patchproof.evidence.gather import report_of
-from patchproof.evidence.grouping import BY_FOLDERS, Grouping, merge_folders
-from patchproof.evidence.journal import JOURNAL_FILE, Journal, settings_key
+from patchproof.evidence.grouping import BY_FOLDERS, Grouping, merge_folders, reject_copies
 from patchproof.evidence.measure import MeasuredPhoto
 from patchproof.evidence.results import PhotoEntry, Report
 from patchproof.evidence.task import Options, task_of
 from patchproof.evidence.verdict import PHOTOS_PER_SESSION
-from patchproof.photo.corners import DesignCorners
+from patchproof.photo.registration import DesignCorners
 from patchproof.report.page import jpeg
 from patchproof.report.words import VERDICTS, benefit_sentence, headline_of
 from patchproof.sheets.manifest import Manifest
@@ -91,7 +89,7 @@ class PhotoCollection:
         if path is None or not len(pairs) or (pairs > pairs[-1]).any():
             raise Refused("four corners inside of a photograph", f"{numbers} in {file}"[:160], "load the page again")
         size_px = int(pairs[-1, 0]), int(pairs[-1, 1])
-        named = annotations.NamedCorners(tuple(pairs[:4].ravel().tolist()), size_px)
+        named = annotations.Drawn(tuple(pairs[:4].ravel().tolist()), size_px)
         annotations.refuse_twisted(named, file, "the page")
         corners = annotations.corners_of_photo({file: named}, file, path)
         if self.wants_corners(path) and corners is not None:

@@ -141,12 +141,12 @@ def printer(
         with progress_bar() as bar:
             if design:
                 from patchproof.calibrate.known_design import KNOWN_PRINTERS, calibrate_design
-                from patchproof.channel.cameras import load_optional_camera
+                from patchproof.channel.lens import load_camera
                 from patchproof.evidence.annotations import load_corners
                 from patchproof.evidence.task import Options
 
                 named, names = load_corners(corners) if corners else {}, (known,) if known else KNOWN_PRINTERS
-                camera_file, advance = load_optional_camera(camera), partial(bar, "photographs")
+                camera_file, advance = load_camera(camera) if camera else None, partial(bar, "photographs")
                 options = Options((), load_printer(names[0]), camera_file, corners=named, find=find)
                 made, warnings = calibrate_design(groups, manifest, file.stem, options, names, advance)
             else:
