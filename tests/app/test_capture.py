@@ -33,7 +33,7 @@ from synthetic_photos import make_manifest, noisy_design, photograph, save
 from patchproof.app.capture import album as album_module
 from patchproof.app.capture import serve
 from patchproof.app.capture.album import CONTROLS, MOST_BYTES, Album, UploadRefused
-from patchproof.app.capture.collection import PhotoCollection, answer_of, state_of
+from patchproof.app.capture.collection import PhotoCollection, answer_of, map_views, state_of
 from patchproof.app.capture.serve import server_config
 from patchproof.app.cli import journey
 from patchproof.app.verify import CaptureInfo, options_of
@@ -43,8 +43,9 @@ from patchproof.base.errors import Refused
 from patchproof.base.workers import open_workers
 from patchproof.evidence.annotations import load_corners
 from patchproof.evidence.measure import MeasuredPhoto
-from patchproof.evidence.results import CameraPose, Prediction
-from patchproof.sheets.manifest import Manifest, dump_manifest, load_manifest
+from patchproof.evidence.results import CameraPose, Geometry, PhotoEntry, Prediction
+from patchproof.evidence.verdict import sessions_needed
+from patchproof.sheets.manifest import ConditionClaim, Manifest, dump_manifest, load_manifest
 from test_copies import seen
 from test_corners import CORNERS_PX, PX_FROM_MM, SIZE_PX
 from test_verify_run import NET, promise, shot
@@ -200,6 +201,7 @@ def test_two_tabs_send_a_walk_and_verify_says_what_the_page_said(tmp_path, sheet
         and summary.sessions_known_from == "folders"
     )
     assert state["controls"] == [{"name": "gray", "photos": 1, "recognized": 0}]
+    assert sum(map(sum, state["map"]["photos"])) + state["map"]["elsewhere"] == summary.judged
 
 
 def test_a_restart_goes_on_and_measures_nothing_twice(tmp_path, sheet, photos, monkeypatch):
@@ -358,6 +360,32 @@ def test_a_folder_with_anything_else_in_it_is_refused(tmp_path):
     (tmp_path / "letter.txt").write_text("mine")
     with pytest.raises(Refused, match=r"this command's own output only .* with letter.txt"):
         Album(tmp_path)
+
+
+def entry(azimuth_deg: float | None, px_per_mm: float) -> PhotoEntry:
+    geometry = Geometry(
+        residual_mm=0, px_per_mm=px_per_mm, tilt_deg=20, contrast=0.8, blur_px=1, corner_uncertainty_mm=0.1
+    )
+    pose = CameraPose(azimuth_uncertainty_deg=1, azimuth_deg=azimuth_deg)
+    return PhotoEntry(file="a", status="measured", photo_px=(1200, 900), geometry=geometry, pose=pose)
+
+
+def test_the_map_of_views_by_hand():
+    """Two conditions in three in the nearest third on the left, one far on the right; distances are 1 over scale."""
+    near_left, far_right = condition(-10.0, 4.0), condition(14.0, 1.0)
+    conditions = [ConditionClaim(**c) for c in (near_left, near_left, far_right)]
+    blind = ConditionClaim(**near_left | {"azimuth_deg": None})  # from behind: nobody can photograph that
+    shown = [entry(-9.0, 3.9), entry(-30.0, 6.0), entry(13.0, 1.35), entry(None, 2.0)]
+    views = map_views([*conditions, blind], shown, 12, 900.0, 90.0)
+    assert views is not None and views["columns"] == ["10° left to 2° right", "2–14° right"]
+    assert views["rows"] == ["20–40 %", "13–20 %", "10–13 %"] and views["of_picture"]
+    assert views["wanted"] == [[8, 0], [0, 0], [0, 4]]
+    assert views["photos"] == [[2, 0], [0, 1], [0, 0]] and views["elsewhere"] == 1 and views["next"] == (0, 0)
+    halved = map_views(conditions, [entry(-9.0, 7.8)], 12, 450.0, 90.0)  # photographs of twice the promised size
+    assert halved is not None and halved["photos"][0][0] == 1
+    full = map_views(conditions, [entry(-9.0, 3.9)] * 8 + [entry(13.0, 1.0)] * 4, 12, None, 90.0)
+    assert full is not None and full["next"] is None and full["rows"][0] == "2.0–4.0 px/mm"
+    assert map_views([blind], shown, 12, None, 90.0) is None
 
 
 def has_timer(_: object) -> None:
@@ -561,14 +589,14 @@ def test_400_photographs_are_answered_at_once_and_as_from_scratch(tmp_path, shee
     with gathered_in(tmp_path / "photos", sheet) as gathered, gathered_in(tmp_path / "other", sheet) as other:
         paths = [gathered.album.folder / "session_01" / f"photo_{number:04}.jpg" for number in range(1, 403)]
         gathered._measured |= {path: photo(path) for path in paths[:400]}
-        state_of(gathered)
+        state_of(gathered, 3)
         for path in paths[400:]:
             gathered.add(path, photo(path))
             start = time.process_time()
-            state, answer = state_of(gathered), answer_of(gathered, path)
+            state, answer = state_of(gathered, 3), answer_of(gathered, path)
             assert time.process_time() - start < 0.3
         other._measured, other.album = dict(gathered._measured), gathered.album
-        assert (state_of(other), answer_of(other, paths[-1])) == (state, answer)
+        assert (state_of(other, 3), answer_of(other, paths[-1])) == (state, answer)
         assert 300 < state["judged"] < state["photos"] == 402
 
 
@@ -623,7 +651,7 @@ def test_tapped_corners_are_measured_by_kept_and_taken_by_verify(tmp_path, bare)
         assert client.post(tapped(CORNERS_PX)).json["state"] == right["state"]  # what is counted stays as it is
     assert load_corners(file)["session_01/photo_0001.jpg"].numbers == pytest.approx((CORNERS_PX + 1).ravel(), abs=0.01)
     with gathered_in(folder, sheet) as gathered:  # after a restart, without measuring
-        assert json.loads(json.dumps(state_of(gathered))) == right["state"]
+        assert json.loads(json.dumps(state_of(gathered, sessions_needed(gathered.manifest.promise)))) == right["state"]
     options = {"models": [NET], "ledger_photos": 0, "capture": CaptureInfo(corners=file, find=True)}
     report = verify_photos(folder, sheet, tmp_path / "report", **options)
     assert report.summary.judged == 1 and report.photos[0].located == "corners"

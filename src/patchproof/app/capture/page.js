@@ -120,6 +120,7 @@ function show(state) {
   $("reason").textContent = state.reason;
   $("effect").textContent = state.photos ? state.effect : "";
   showPlaces(state);
+  showMap(state.map);
   $("plan").textContent = state.plan;
   const rows = state.sessions.map(one => row("td", one.name, `${one.judged} of ${state.each}`, one.recognized));
   const controls = state.controls.map(one => row("td", `control: ${one.name}`, one.photos, one.recognized));
@@ -145,6 +146,31 @@ function showPlaces(state) {
     chip.addEventListener("click", () => { into = name; showPlaces(state); });
     return chip;
   }));
+}
+
+function showMap(map) {
+  $("views").hidden = !map;
+  if (!map) return;
+  $("share").hidden = !map.of_picture;
+  const head = row("th", "", ...map.columns);
+  const rows = map.rows.map((name, i) => {
+    const line = make("tr");
+    line.append(make("th", name));
+    map.photos[i].forEach((photos, j) => {
+      const wanted = map.wanted[i][j], cell = make("td", wanted || photos ? `${photos} / ${wanted}` : "–");
+      if (photos >= wanted && wanted) cell.classList.add("full");
+      else if (photos) cell.classList.add("some");
+      if (map.next && map.next[0] === i && map.next[1] === j) cell.classList.add("next");
+      line.append(cell);
+    });
+    return line;
+  });
+  $("map").replaceChildren(head, ...rows);
+  const [i, j] = map.next || [];
+  const none = "Every view has the photographs that it needs.";
+  const unknown = map.elsewhere ? ` Of ${map.elsewhere} more it is not known from where they are.` : "";
+  const size = map.of_picture ? ", so near that the piece takes" : ", at";
+  $("next").textContent = (map.next ? `Next: ${map.columns[j]}${size} ${map.rows[i]}.` : none) + unknown;
 }
 
 async function refresh() {

@@ -41,6 +41,7 @@ from patchproof.base.folder_lock import lock_folder
 from patchproof.base.progress import Progress, no_progress
 from patchproof.base.workers import open_workers
 from patchproof.evidence.results import Report
+from patchproof.evidence.verdict import sessions_needed
 from patchproof.report.page import render_page
 from patchproof.sheets.manifest import load_manifest
 
@@ -124,7 +125,8 @@ class _Handlers:
     """The routes' handlers, and the state that they share."""
 
     def __init__(self, collection: PhotoCollection):
-        self._collection, self._state = collection, state_of(collection)
+        self._collection, self._planned_sessions = collection, sessions_needed(collection.promise)
+        self._state = state_of(collection, self._planned_sessions)
         self._one_at_a_time, self._receiving = anyio.Lock(), anyio.Semaphore(_MOST_UPLOADS)
 
     async def page(self, request: Request) -> Response:
@@ -146,7 +148,7 @@ class _Handlers:
         """Begin a new session."""
         async with self._one_at_a_time:
             name = self._collection.album.new_session()
-            self._state = await anyio.to_thread.run_sync(state_of, self._collection)
+            self._state = await anyio.to_thread.run_sync(state_of, self._collection, self._planned_sessions)
         return JSONResponse({"session": name, "state": self._state})
 
     async def photo(self, request: Request) -> Response:
@@ -185,7 +187,7 @@ class _Handlers:
     def _measure(self, path: Path) -> dict[str, Any]:
         collection, pictures = self._collection, []
         collection.measure([path], on_pictures=lambda file, kinds: pictures.append(kinds.get("photo")))
-        self._state = state_of(collection)
+        self._state = state_of(collection, self._planned_sessions)
         return {"photo": answer_of(collection, path, pictures[0] if pictures else None), "state": self._state}
 
 
