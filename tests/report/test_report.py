@@ -32,7 +32,7 @@ from patchproof.evidence.results import (
 from patchproof.report.page import delta_map, draw_figure, save_pictures
 from patchproof.report.tables import Drawing, Results, Table, write_results
 from patchproof.report.words import verdict_lines
-from patchproof.report.write import photos_csv, report_html, write_report
+from patchproof.report.write import photos_csv, rates_by_band, report_html, write_report
 from test_verify_run import promise
 
 
@@ -325,6 +325,21 @@ def test_what_was_not_measured_how_often_was_looked_and_which_folders_are_one_is
         {},
     )
     assert "Not measured: the scale of the print (no scan)." in page and note in page
+
+
+def test_recognition_is_split_by_tilt_and_size_beside_what_was_promised_there():
+    """Of 24 photographs the 8 most tilted fail; of the promised views between 16 and 23 degrees, two of eight."""
+    photos = [
+        {"tilt_deg": i, "px_per_mm": None, "predictions": {"net": {"recognized": i < 16}}} for i in reversed(range(24))
+    ]
+    promised = [{"tilt_deg": i, "px_per_mm": 1.0, "recognized": i not in (17, 18)} for i in range(30)]
+    bands = rates_by_band(photos, "net", promised)
+    assert [(name, here.value, there.value) for name, here, there in bands] == [
+        ("tilted 0 to 7°", 1, 1), ("tilted 8 to 15°", 1, 1), ("tilted 16 to 23°", 0, 0.75)
+    ]  # fmt: skip
+    assert all(here.n == there.n == 8 for _, here, there in bands)
+    assert rates_by_band(photos[:11], "net", promised) == [] == rates_by_band(photos, "other", promised)
+    assert [there for *_, there in rates_by_band(photos, "net", ())] == [None] * 3
 
 
 def test_networks_that_were_named_stand_below_the_promise_s_own():

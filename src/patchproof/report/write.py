@@ -14,11 +14,15 @@ from typing import Any
 
 from patchproof.base.csv_file import csv_lines
 from patchproof.base.goal import points_text
+from patchproof.base.intervals import Estimate, rate
 from patchproof.base.output import data_uri, make_folder, write_atomically
 from patchproof.report import words
 from patchproof.report.page import DELTA_TOP, render_page, saved_pictures
 
 _FIRST = ("file", "status", "code", "figure", "threshold", "advice")
+# figures of a photograph by which recognition is split, in a band's words
+_BANDS = {"tilt_deg": "tilted {:.0f} to {:.0f}°", "px_per_mm": "{:.2g} to {:.2g} pixels per mm"}
+_LEAST_BANDED = 12  # photographs, of which each band has a third
 _STEPS = {  # of the gap ledger
     "light_and_camera": "light, camera color",
     "print_light_and_camera": "print, light, camera",
@@ -63,6 +67,7 @@ def report_html(report: Mapping, manifest: Mapping, encoded: Mapping[str, Mappin
         meaning=words.recognition_meaning(promise["models"][0], promise["target"]["label"]) if promise else "",
         verdict=words.VERDICTS[summary["verdict"]],
         steps=ledger_bars(summary["ledger"]) if summary["ledger"] else (),
+        bands=rates_by_band(judged, primary, promise["conditions"]) if promise else (),
         sized=any(photo["scale_x"] is not None for photo in photos),
         cards=cards,
         remarks=words.remarks(photos),
@@ -89,6 +94,28 @@ def ledger_bars(ledger: Mapping[str, Any]) -> list[tuple[str, float, float, str,
         rows.append((_STEPS.get(step) or step, left, right, kind, text))
         level = after
     return [*rows, ("photographs", 0.0, ledger["photo"], "seen", f"{100 * ledger['photo']:.0f} %")]
+
+
+def rates_by_band(
+    photos: Sequence[Mapping], model: str | None, conditions: Sequence[Mapping]
+) -> list[tuple[str, Estimate, Estimate | None]]:
+    """Recognition in the lower, middle and upper third of photographs by tilt and by size: (band, rate in these
+    photographs, rate promised within the same ends; None without promised views there).
+    """
+    rows = []
+    for figure, text in _BANDS.items():
+        seen = [
+            (photo[figure], photo["predictions"][model]["recognized"])
+            for photo in photos
+            if photo[figure] is not None and model in photo["predictions"]
+        ]
+        seen.sort()
+        for third in range(3) if len(seen) >= _LEAST_BANDED else ():
+            some = seen[len(seen) * third // 3 : len(seen) * (third + 1) // 3]
+            (low, _), (high, _) = some[0], some[-1]
+            there = [each["recognized"] for each in conditions if low <= (each[figure] or -1) <= high]
+            rows.append((text.format(low, high), rate([hit for _, hit in some]), rate(there)))
+    return rows
 
 
 def _median_card(cards: Sequence[Mapping], model: str | None) -> Mapping | None:
