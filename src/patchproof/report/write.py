@@ -113,7 +113,9 @@ def rates_by_band(
         for third in range(3) if len(seen) >= _LEAST_BANDED else ():
             some = seen[len(seen) * third // 3 : len(seen) * (third + 1) // 3]
             (low, _), (high, _) = some[0], some[-1]
-            there = [each["recognized"] for each in conditions if low <= (each[figure] or -1) <= high]
+            there = [
+                each["recognized"] for each in conditions if each[figure] is not None and low <= each[figure] <= high
+            ]
             rows.append((text.format(low, high), rate([hit for _, hit in some]), rate(there)))
     return rows
 
