@@ -62,16 +62,14 @@ def load_mesh(path: str | Path, length_mm: float, up: Literal["y", "z"] = "z", m
 
 def _reduce_textures(parts: Sequence[MeshPart]) -> tuple[list[MeshPart], list[str]]:
     """Reduce textures to at most LARGEST_TEXTURE_PX a side; return the parts and warnings about larger textures."""
-    reduced_materials: dict[Material, Material] = {}
-    warnings = []
+    reduced, warnings = dict[Material, Material](), []
     for material in dict.fromkeys(part.material for part in parts):
         texture = material.texture_srgb
         if texture is not None and max(texture.shape[:2]) > LARGEST_TEXTURE_PX:
-            small = downscale(texture, LARGEST_TEXTURE_PX)
-            reduced_materials[material] = replace(material, texture_srgb=small)
+            reduced[material] = replace(material, texture_srgb=(small := downscale(texture, LARGEST_TEXTURE_PX)))
             old_size, new_size = (f"{pixels.shape[1]} × {pixels.shape[0]}" for pixels in (texture, small))
             warnings.append(f"the texture of {old_size} of {material.name} is reduced to {new_size}")
-    return [replace(part, material=reduced_materials.get(part.material, part.material)) for part in parts], warnings
+    return [replace(part, material=reduced.get(part.material, part.material)) for part in parts], warnings
 
 
 def read_parts(path: Path, world_from_file: np.ndarray) -> tuple[list[MeshPart], list[str], list[Path]]:

@@ -167,9 +167,9 @@ def load_bare(source: SceneSource) -> MeshScene:
         inputs["background.images"] = files_sha256(pictures, whole=False)
     identity, frame = source.sheet_id(known), view_frame(mesh, settings)
     lens = load_optional_camera(camera.file, base, camera.photo_px)
-    others: dict[str, Any] = {"notes": (*mesh.warnings, *backgrounds.notes), "known": known, "mesh_glb": mesh_glb}
-    others |= {"inputs": inputs}
-    return MeshScene(settings, base, source.seed, identity, mesh, frame, backgrounds, camera=lens, **others)
+    more: dict[str, Any] = {"known": known, "mesh_glb": mesh_glb, "inputs": inputs, "camera": lens}
+    more["notes"] = (*mesh.warnings, *backgrounds.notes)
+    return MeshScene(settings, base, source.seed, identity, mesh, frame, backgrounds, **more)
 
 
 def camera_poses(scene: MeshScene, patch_mm: np.ndarray, pose: Pose) -> np.ndarray:
