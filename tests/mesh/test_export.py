@@ -11,8 +11,7 @@ import pytest
 import trimesh
 
 from patchproof.base.settings import PatchSettings
-from patchproof.mesh.export import write_glb
-from patchproof.mesh.load_mesh import load_mesh
+from patchproof.mesh.load_mesh import load_mesh, write_glb
 from patchproof.scene.texture_scene import texture_canvas
 
 rng = np.random.default_rng(0)
@@ -101,7 +100,7 @@ def test_a_textured_object_survives_whole(data, tmp_path):
 
 BOTH = """
 import hashlib, sys, numpy as np
-from patchproof.mesh.export import write_glb
+from patchproof.mesh.load_mesh import write_glb
 from patchproof.mesh.load_mesh import load_mesh
 from patchproof.mesh.unwrap import unwrap
 truck, mug = load_mesh("primitive:box_truck", 300), load_mesh("primitive:mug", 300)

@@ -9,7 +9,7 @@ import trimesh
 from console import command
 from PIL import Image
 
-from patchproof.mesh.export import write_glb
+from patchproof.mesh.load_mesh import write_glb
 from patchproof.mesh.mesh import Material, MeshPart, mesh_from_parts
 from patchproof.optimizer import loop, run
 from patchproof.optimizer.evaluate import evaluate as evaluate_run

@@ -1,10 +1,15 @@
-"""Load a mesh by its name: a file, a procedural object (`primitives`), or a mesh given in Python.
+"""Load a mesh by its name: a file, a procedural object (`primitives`), or a mesh given in Python; write one as GLB.
 
 In: a path of an OBJ (with MTL), GLB, glTF, PLY or STL file, `primitive:NAME` or `python:NAME`, and the object's longest
 extent. Out: a `Mesh` in the scene's frame, with warnings about what is not shown as declared (`declarations`). Refused:
 a file that cannot be parsed, and a texture that it names but that is missing or broken. Textures larger than any
 photograph shows are reduced. A mesh in memory goes through GLB and the reader of files, so that it equals what its
 run's folder will hold.
+
+What is written, for other programs, is glTF 2.0, in meters as its specification wants (the mesh is in millimeters), y
+up, textures as lossless PNG inside, repeating. trimesh writes it; nothing in it depends on the time, so the same
+textures give the same bytes. Surfaces are matte and visible from both sides, as in the renderer here. Left out on
+purpose: lights and cameras. Material names are kept and may repeat; geometries are numbered.
 """
 
 import re
@@ -17,6 +22,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from patchproof.base.color import codes_from_srgb
 from patchproof.base.errors import Refused
 from patchproof.base.input import is_file, run_within_seconds
 from patchproof.base.resample import downscale
@@ -29,6 +35,7 @@ PYTHON_PREFIX = "python:"
 
 # Larger textures are reduced: 8192 × 8192 took 4 GB and 5 s to set up, more detail than any photograph shows.
 LARGEST_TEXTURE_PX = 4096
+_M_FROM_MM = 1e-3
 _Y_UP_FROM_Z_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 SECONDS = 40.0  # of processor time to read a mesh, and more for long files, of which text takes longest:
 _BYTES_PER_SECOND = 500_000
@@ -62,16 +69,14 @@ def load_mesh(path: str | Path, length_mm: float, up: Literal["y", "z"] = "z", m
 
 def _reduce_textures(parts: Sequence[MeshPart]) -> tuple[list[MeshPart], list[str]]:
     """Reduce textures to at most LARGEST_TEXTURE_PX a side; return the parts and warnings about larger textures."""
-    reduced_materials: dict[Material, Material] = {}
-    warnings = []
+    reduced, warnings = dict[Material, Material](), []
     for material in dict.fromkeys(part.material for part in parts):
         texture = material.texture_srgb
         if texture is not None and max(texture.shape[:2]) > LARGEST_TEXTURE_PX:
-            small = downscale(texture, LARGEST_TEXTURE_PX)
-            reduced_materials[material] = replace(material, texture_srgb=small)
+            reduced[material] = replace(material, texture_srgb=(small := downscale(texture, LARGEST_TEXTURE_PX)))
             old_size, new_size = (f"{pixels.shape[1]} × {pixels.shape[0]}" for pixels in (texture, small))
             warnings.append(f"the texture of {old_size} of {material.name} is reduced to {new_size}")
-    return [replace(part, material=reduced_materials.get(part.material, part.material)) for part in parts], warnings
+    return [replace(part, material=reduced.get(part.material, part.material)) for part in parts], warnings
 
 
 def read_parts(path: Path, world_from_file: np.ndarray) -> tuple[list[MeshPart], list[str], list[Path]]:
@@ -121,3 +126,40 @@ def read_stl(assets: "Assets") -> list[MeshPart]:
     else:
         raise ValueError("neither text nor of the size that it states")
     return [MeshPart(corners, np.arange(len(corners)).reshape(-1, 3), assets.gray())]
+
+
+def write_glb(mesh: Mesh, textures: Sequence[np.ndarray], path: str | Path) -> None:
+    """Write `mesh` with `textures` (uint8 H×W×3, one per material, in place of the material's own) to a .glb file.
+
+    Textures stand for the whole color: base colors are not written; corner colors other than 1 are, in 8 bits of light.
+    """
+    import trimesh
+    from trimesh.exchange.gltf import export_glb
+
+    scene = trimesh.Scene()
+    for index, (material, texture) in enumerate(zip(mesh.materials, textures, strict=True)):
+        faces = np.flatnonzero(mesh.face_material == index)
+        if len(faces):
+            scene.add_geometry(_geometry(mesh, faces, material.name, texture), geom_name=f"{index}_{material.name}")
+    Path(path).write_bytes(export_glb(scene, include_normals=True))
+
+
+def _geometry(mesh: Mesh, faces: np.ndarray, name: str, texture: np.ndarray):
+    """Return some faces as a trimesh with a matte texture, in which corners with equal values are one vertex."""
+    import trimesh
+    from PIL import Image
+    from trimesh.visual import TextureVisuals
+    from trimesh.visual.material import PBRMaterial
+
+    arrays = mesh.vertices[mesh.faces], mesh.corner_normal, mesh.corner_uv, mesh.corner_color_linear
+    corners = np.concatenate([array[faces].reshape(3 * len(faces), -1).astype(float) for array in arrays], axis=1)
+    corners, index = np.unique(corners, axis=0, return_inverse=True)
+    position, normal, uv, color = np.split(corners, [3, 6, 8], axis=1)
+    image = Image.fromarray(texture)
+    material = PBRMaterial(name=name, baseColorTexture=image, metallicFactor=0.0, roughnessFactor=1.0, doubleSided=True)
+    visual = TextureVisuals(uv=np.column_stack([uv[:, 0], 1 - uv[:, 1]]), material=material)
+    if np.any(color != 1):
+        # trimesh always writes bytes
+        visual.vertex_attributes["color"] = codes_from_srgb(np.insert(color, 3, 1.0, axis=1))
+    faces = index.reshape(-1, 3)
+    return trimesh.Trimesh(position * _M_FROM_MM, faces, vertex_normals=normal, visual=visual, process=False)

@@ -25,7 +25,7 @@ from patchproof.optimizer.place_search import Place
 from patchproof.render.photograph import shade
 from patchproof.render.raster import rasterize
 from patchproof.render.stage import Stage, set_stage
-from patchproof.render.views import cameras, near_mm, render_views
+from patchproof.render.views import NEAR_SHARE, cameras, render_views
 from patchproof.scene.backgrounds import load_backgrounds
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.patch_scene import PatchScene, PiecePosition, UnplacedScene
@@ -131,7 +131,7 @@ def _depth(stage: Stage, scene: PatchScene, pose: np.ndarray) -> np.ndarray:
     """H×W distances of the object from the camera along its axis, infinite beside the object."""
     surface, size = stage.object_surface, (_SIDE_PX, _SIDE_PX)
     frames = cameras(pose[None], scene.matrix_px(size)[None], size, stage)
-    fragments = rasterize(surface.vertices, surface.faces, frames, near_mm(scene))
+    fragments = rasterize(surface.vertices, surface.faces, frames, NEAR_SHARE * scene.length_mm)
     depth = np.full(_SIDE_PX * _SIDE_PX, np.inf)
     depth[fragments.pixel.numpy()] = fragments.depth.numpy()
     return depth.reshape(_SIDE_PX, _SIDE_PX)

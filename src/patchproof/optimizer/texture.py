@@ -19,7 +19,7 @@ from torch import Tensor
 
 from patchproof.base.errors import Refused
 from patchproof.base.output import image_bytes, write_atomically
-from patchproof.mesh.export import write_glb
+from patchproof.mesh.load_mesh import write_glb
 from patchproof.optimizer import subject
 from patchproof.optimizer.subject import as_pixels, from_pixels
 from patchproof.render.pixels import ObjectTextures

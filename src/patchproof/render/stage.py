@@ -84,21 +84,13 @@ class LearnedTextures:
 
     def textures(self, pixels: np.ndarray) -> tuple[np.ndarray, ...]:
         """Return whole uint8 textures with a design's pixels 1×M×3 in them."""
-        textures = tuple(original.copy() for original in self._textures_srgb8)
-        parts = np.split(pixels[0], np.cumsum(self._counts)[:-1])
-        for texture, mask, part in zip(textures, self.canvas.mask, parts, strict=True):
-            texture[mask] = part
-        return textures
+        design = torch.tensor(pixels, dtype=torch.float32, device=self.device).permute(2, 0, 1) / 255
+        return tuple((texture * 255).round().byte().cpu().numpy() for texture in self.filled(design))
 
     @cached_property
     def masks(self) -> tuple[Tensor, ...]:
         """Masks of each texture's changeable texels, bool H×W."""
         return tuple(torch.as_tensor(mask, device=self.device) for mask in self.canvas.mask)
-
-    @property
-    def _textures_srgb8(self) -> list[np.ndarray]:
-        # a canvas gives every material a texture
-        return [material.texture_srgb for material in self.canvas.mesh.materials if material.texture_srgb is not None]
 
     @cached_property
     def _counts(self) -> list[int]:
@@ -106,7 +98,8 @@ class LearnedTextures:
 
     @cached_property
     def _originals(self) -> tuple[Tensor, ...]:
-        return tuple(torch.tensor(t, dtype=torch.float32, device=self.device) / 255 for t in self._textures_srgb8)
+        textures = (material.texture_srgb for material in self.canvas.mesh.materials)  # each has one
+        return tuple(torch.tensor(t, dtype=torch.float32, device=self.device) / 255 for t in textures if t is not None)
 
 
 @dataclass(frozen=True)

@@ -160,7 +160,7 @@ def render_views(
     poses = scene.camera_from_world(conditions)
     light = _light(scene, stage.device, conditions)
     eye = torch.as_tensor(camera_centers(poses), device=stage.device)
-    matrices, near = np.broadcast_to(frame.matrix_px, (len(poses), 3, 3)), near_mm(scene)
+    matrices, near = np.broadcast_to(frame.matrix_px, (len(poses), 3, 3)), NEAR_SHARE * scene.length_mm
     view_cameras = cameras(poses, matrices, frame.size_px, stage)
     fragments = rasterize(surface.vertices, surface.faces, view_cameras, near)
     nearest = torch.full((math.prod(fragments.shape),), torch.inf, device=stage.device)
@@ -229,11 +229,6 @@ def cameras(poses: np.ndarray, matrices: np.ndarray, size_px: tuple[int, int], s
     """Return cameras N×4×4 with matrices N×3×3 on a stage's device."""
     poses_on, matrices_on = (torch.as_tensor(part.copy(), device=stage.device) for part in (poses, matrices))
     return Cameras(poses_on, matrices_on, size_px)
-
-
-def near_mm(scene: MeshScene) -> float:
-    """Return the distance from a camera within which everything is cut."""
-    return NEAR_SHARE * scene.length_mm
 
 
 def _light(scene: MeshScene, device: torch.device, conditions: Conditions) -> Lighting:

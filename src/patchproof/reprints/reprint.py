@@ -9,8 +9,7 @@ one or several sessions, each with its own place, light, camera and folder.
 """
 
 import json
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -124,7 +123,10 @@ class MountedSheet:
         values: dict[str, Any] = {name: values[0].tolist() for name, values in fields_of(conditions).items()}
         if self.piece is None or not self.scene.is_flat:
             return PhotoTruth(None, values)
-        return PhotoTruth(geometry.normalize_homography(self.px_from_page(conditions)), values)
+        x, y, *_ = self.manifest.cut_mm
+        px_from_piece = self.scene.piece_homographies(conditions, self.scene.photo_px)[0]
+        px_from_page = px_from_piece @ np.array([[1, 0, -x], [0, 1, -y], [0, 0, 1.0]])
+        return PhotoTruth(geometry.normalize_homography(px_from_page), values)
 
     def outlines(self, conditions: Conditions) -> dict[str, np.ndarray]:
         """Outlines N×2 in pixels of one view: corners of the object's box, if it has a mesh, and the piece's border, if
@@ -140,12 +142,6 @@ class MountedSheet:
             border = geometry.rect_border((0, 0, *scene.piece.size_mm), SIDE_POINTS)
             outlines[PATCH] = scene.piece_px(conditions, border)
         return outlines
-
-    def px_from_page(self, conditions: Conditions) -> np.ndarray:
-        """3×3 from page millimeters to undistorted pixels of one view; for bent paper by its tangent plane."""
-        x, y, *_ = self.manifest.cut_mm
-        piece_from_page = np.array([[1, 0, -x], [0, 1, -y], [0, 0, 1.0]])
-        return self.scene.piece_homographies(conditions, self.scene.photo_px)[0] @ piece_from_page
 
 
 def mount_sheet(pdf_path: str | Path, run: Run, how: ReprintSetup = DEFAULT_SETUP) -> MountedSheet:
@@ -236,7 +232,11 @@ def reprint(
     compute = compute.without("reprint", device=True, cluster=True)
     if not 1 <= sessions <= n:
         raise Refused(f"1 to {n} sessions of {n} photographs", f"{sessions}", "ask for fewer")
-    with _pdf_to_mount(pdf_path, run, how.control, Path(out)) as pdf:
+    with TemporaryDirectory() as temporary:
+        pdf = Path(pdf_path)
+        if how.control not in (None, "bare"):
+            template, pdf = sheet_scene(pdf, run)[1].settings.sheet.template, Path(temporary) / f"control{pdf.suffix}"
+            sheet_of(run, pdf, template=template, control=how.control)
         sheet = mount_sheet(pdf, run, how)
         each, done = -(-n // sessions), 0
         conditions = sheet.scene.draw("reprint", n, seed, per_session=each)
@@ -268,16 +268,3 @@ def reprint(
                 text = corners_csv({name: outline[::SIDE_POINTS] for name, outline in shown.items()})
                 (folder / CORNERS_FILE).write_text(text, encoding="utf-8")
     return Reprint(Path(out), truth)
-
-
-@contextmanager
-def _pdf_to_mount(pdf_path: str | Path, run: Run, control: str | None, out: Path) -> Iterator[str | Path]:
-    """Yield the PDF to mount: the given one, or a control's in a temporary folder."""
-    if control in (None, "bare"):
-        yield pdf_path
-        return
-    with TemporaryDirectory() as folder:
-        template = sheet_scene(pdf_path, run)[1].settings.sheet.template
-        path = Path(folder) / f"control{Path(pdf_path).suffix}"
-        sheet_of(run, path, template=template, control=control)
-        yield path

@@ -1,14 +1,13 @@
 """A mesh with a piece of paper that follows its surface (`patch.bend`): a flat card, or rolled round a cylinder.
 
 In: a mesh, the frame a card would have, size and spin. Out: a `Placement` whose middle lies where the frame's normal
-meets the surface, and the scene with it. Paper does not stretch: where a card does not lie close, it rolls round the
+meets the surface. Paper does not stretch: where a card does not lie close, it rolls round the
 cylinder that fits the surface under it best (least squares, five parameters), raised until it is clear of the surface
 everywhere; that height counts as gap. Left out on purpose: paper that is stretched over surfaces curved both ways,
 whose photographs nobody could unroll; cones, folds, cuts and darts.
 """
 
-from dataclasses import dataclass, replace
-from typing import ClassVar
+from dataclasses import replace
 
 import numpy as np
 
@@ -18,17 +17,17 @@ from patchproof.mesh import surface_chart
 from patchproof.mesh.mesh import Mesh
 from patchproof.mesh.surface_chart import SurfaceChart, piece_grid
 from patchproof.scene import placement
-from patchproof.scene.interface import SCALE_VIEWS, Scene, SceneSource
-from patchproof.scene.mesh_scene import MeshScene, camera_poses, load_bare
+from patchproof.scene.interface import SCALE_VIEWS, Scene
+from patchproof.scene.mesh_scene import MeshScene, camera_poses
 from patchproof.scene.patch_scene import PatchScene
 from patchproof.scene.placement import (
     GRID,
     LIFT_MM,
     Placement,
-    PlacementMethod,
     SurfaceFrame,
     patch_frame,
     piece_pose,
+    placement_method,
     spun_axes,
 )
 from patchproof.sheets.piece import Piece
@@ -40,11 +39,6 @@ OVERHANG_LIMIT = 0.1  # of the area: paper with nothing to stick to does not kee
 _REMEDY = "make the patch smaller, move it, or leave out bend"
 _FIT_GRID = 33  # heights are fitted on this many points along each edge
 PIECE_GRID = 33  # vertices of a bent piece along each edge; odd, so that one is the middle
-
-
-def placement_method(bend: bool) -> PlacementMethod:
-    """Return the method that places a piece on a surface: bent along it, or as a flat card."""
-    return place_bent if bend else placement.place_card
 
 
 def place_bent(mesh: Mesh, frame: SurfaceFrame, size_mm: tuple[float, float], spin_deg: float) -> Placement:
@@ -199,18 +193,6 @@ def _refuse_overhang(piece: Placement) -> None:
     if piece.overhang_share > OVERHANG_LIMIT:
         expected = f"a surface under at least {1 - OVERHANG_LIMIT:.0%} of a bent piece"
         raise Refused(expected, f"a surface under {1 - piece.overhang_share:.0%} of it", _REMEDY)
-
-
-@dataclass(frozen=True)
-class BentScene(PatchScene):
-    """An object with a piece that bends along its surface; on a flat surface, that is a card, too."""
-
-    LAY: ClassVar[PlacementMethod] = staticmethod(place_bent)
-
-
-def build(source: SceneSource) -> BentScene:
-    """Build the scene of settings that give a piece of bent paper its place."""
-    return BentScene.from_bare(load_bare(source))
 
 
 def placement_with_other_bend(scene: Scene) -> tuple[Placement | None, str | None]:

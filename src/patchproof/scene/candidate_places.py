@@ -18,7 +18,6 @@ from patchproof.base.errors import Refused
 from patchproof.base.geometry import camera_centers
 from patchproof.base.validation import Side
 from patchproof.mesh.surface_chart import SurfaceChart, piece_grid, surface_heights, triangles_near
-from patchproof.scene.bent_scene import placement_method
 from patchproof.scene.patch_scene import PiecePosition, UnplacedScene
 from patchproof.scene.placement import (
     Placement,
@@ -26,6 +25,7 @@ from patchproof.scene.placement import (
     gap_limit_mm,
     patch_frame,
     place_if_close,
+    placement_method,
     spun_axes,
     surface_frame,
 )

@@ -170,9 +170,9 @@ def load_bare(source: SceneSource) -> MeshScene:
         from patchproof.channel.lens import load_camera  # most photographs are of cameras that nobody calibrated
 
         lens = load_camera(camera.file, base, camera.photo_px)
-    others: dict[str, Any] = {"notes": (*mesh.warnings, *backgrounds.notes), "known": known, "mesh_glb": mesh_glb}
-    others |= {"inputs": inputs}
-    return MeshScene(settings, base, source.seed, identity, mesh, frame, backgrounds, camera=lens, **others)
+    more: dict[str, Any] = {"known": known, "mesh_glb": mesh_glb, "inputs": inputs, "camera": lens}
+    more["notes"] = (*mesh.warnings, *backgrounds.notes)
+    return MeshScene(settings, base, source.seed, identity, mesh, frame, backgrounds, **more)
 
 
 def camera_poses(scene: MeshScene, patch_mm: np.ndarray, pose: Pose) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""A mesh with a piece on it, by itself a flat card (bent: see `bent_scene`); or one whose piece has no place yet
+"""A mesh with a piece on it, a flat card or bent (see `bent_scene`); or one whose piece has no place yet
 (`patch.place = "auto"`), for which the optimizer searches a place.
 
 In: settings. Out: a `PatchScene`, which knows its sheet id (a hash of settings and seed, fixed before optimizing), the
@@ -6,7 +6,7 @@ layout of the printed piece (the design and its markers, whose size follows from
 """
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from patchproof.scene import interface
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.interface import SCALE_VIEWS, PieceScene, Scene, SceneSource, refuse_without_place
 from patchproof.scene.mesh_scene import MeshScene, camera_poses, load_bare
-from patchproof.scene.placement import Placement, PlacementMethod, patch_frame, place_card, placement_advice
+from patchproof.scene.placement import Placement, patch_frame, placement_advice, placement_method
 from patchproof.sheets.markers import MARKER_MODULES
 from patchproof.sheets.page import refuse_larger_than_page
 from patchproof.sheets.piece import Piece, lay_out_piece, marker_size_mm, smallest_piece_mm
@@ -34,12 +34,11 @@ class PatchScene(PieceScene, MeshScene):
     placement: Placement
     unreadable: float
     EFFECT_TABLES = ("light", "printer", "camera")
-    LAY: ClassVar[PlacementMethod] = staticmethod(place_card)  # how the piece lies on the surface
 
     @classmethod
     def from_bare(cls, bare: MeshScene) -> Self:
         """Return the bare object with its piece at the settings' place; refused if it cannot lie there."""
-        piece, placement, unreadable, notes = _place_piece(bare, cls.LAY)
+        piece, placement, unreadable, notes = _place_piece(bare)
         fields = {"piece": piece, "placement": placement, "unreadable": unreadable, "notes": notes}
         return cls(**vars(bare) | fields)
 
@@ -124,14 +123,11 @@ class UnplacedScene(MeshScene):
         """Return the scene with its piece at a place, its views unchanged; refused if the piece cannot hang there. It
         equals the scene of a file that gives this place.
         """
-        from patchproof.scene.bent_scene import BentScene
-
-        scene_type = BentScene if self.settings.patch.bend else PatchScene
-        return scene_type.from_bare(self._identified(self.settings_with_piece_at(position, spin_deg), self.known))
+        return PatchScene.from_bare(self._identified(self.settings_with_piece_at(position, spin_deg), self.known))
 
 
 def build(source: SceneSource) -> PatchScene | UnplacedScene:
-    """Build the scene of settings that give a flat card its place, or that of `patch.place = "auto"`."""
+    """Build the scene of settings that give a piece its place, or that of `patch.place = "auto"`."""
     bare = load_bare(source)
     return UnplacedScene(**vars(bare)) if source.settings.patch.place == "auto" else PatchScene.from_bare(bare)
 
@@ -152,9 +148,10 @@ def require_unplaced(scene: Scene) -> UnplacedScene:
     raise Refused('a scene with patch.place = "auto"', scene.description(), remedy)
 
 
-def _place_piece(scene: MeshScene, lay: PlacementMethod) -> tuple[Piece, Placement, float, tuple[str, ...]]:
+def _place_piece(scene: MeshScene) -> tuple[Piece, Placement, float, tuple[str, ...]]:
     """Return the piece, its markers as large as views need, its placement, the share of unreadable views, notes."""
     settings, mesh, patch = scene.settings, scene.mesh, scene.settings.patch
+    lay = placement_method(patch.bend)
     try:
         placement = lay(mesh, patch_frame(mesh, patch), patch.size_mm, patch.spin_deg)
     except Refused as refused:

@@ -109,6 +109,15 @@ class SurfaceFrame:
 PlacementMethod = Callable[[Mesh, SurfaceFrame, tuple[float, float], float], Placement]
 
 
+def placement_method(bend: bool) -> PlacementMethod:
+    """Return the method that places a piece on a surface: bent along it, or as a flat card."""
+    if not bend:
+        return place_card
+    from patchproof.scene.bent_scene import place_bent
+
+    return place_bent
+
+
 def patch_frame(mesh: Mesh, patch: PatchSettings) -> SurfaceFrame:
     """Return the frame of the patch's side, or of the surface point nearest to `at_mm`."""
     if patch.at_mm is None:

@@ -129,4 +129,4 @@ def module_of(settings: SceneSettings) -> str:
         return "image_scene"
     if settings.patch.kind != "patch":
         return "texture_scene"
-    return "bent_scene" if settings.patch.bend and settings.patch.place == "given" else "patch_scene"
+    return "patch_scene"

@@ -94,14 +94,18 @@ def texture_canvas(mesh: Mesh, patch: PatchSettings, base: Path, texels: int = T
     shown = (_corners(mesh, chosen_faces & (mesh.face_material == i)) for i in range(len(mesh.materials)))
     masks = tuple(coverage(corners, _size(mesh, i), GUTTER_TEXELS) > 0 for i, corners in enumerate(shown))
     if patch.mask is not None:
+        from PIL import Image
+
         image = _read_mask(Path(expand_path(patch.mask, base)))
-        height, width = image.shape
+        picture, (height, width) = Image.fromarray(image.astype(np.float32)), image.shape
         for texels_high, texels_wide in dict.fromkeys(m.shape for m in masks if m.any() and m.shape != image.shape):
             warnings.append(
                 f"the mask of {width} × {height} pixels is laid over {texels_wide} × {texels_high} texels: a texel may"
                 " change where the mean of what lies over it is light"
             )
-        masks = tuple(mask & _stretch(image, mask.shape) for mask in masks)
+        # stretched over the texels, averaged where it is finer
+        stretched = (np.asarray(picture.resize(mask.shape[::-1], Image.Resampling.BOX)) for mask in masks)
+        masks = tuple(mask & (gray >= 128) for mask, gray in zip(masks, stretched, strict=True))
     if not any(mask.any() for mask in masks):
         got = f"a mask that covers none of {np.count_nonzero(chosen_faces)} faces"
         raise Refused("a mask that covers a face", got, "compare it with the texture coordinates")
@@ -158,14 +162,6 @@ def _read_mask(path: Path) -> np.ndarray:
         got = f"no lighter gray than {gray.max():.0f} of 255 in {path.name}"
         raise Refused("a mask with white where the texture may change", got, "paint it white there")
     return gray
-
-
-def _stretch(gray: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return where a mask, stretched over H×W texels (averaged if it is finer), is light."""
-    from PIL import Image
-
-    image, (height, width) = Image.fromarray(gray.astype(np.float32)), shape
-    return np.asarray(image.resize((width, height), Image.Resampling.BOX)) >= 128
 
 
 def bake_base_colors(mesh: Mesh, chosen_faces: np.ndarray, texels: int = TEXELS) -> Mesh:

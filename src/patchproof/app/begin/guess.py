@@ -24,8 +24,7 @@ from patchproof.base.validation import Side
 from patchproof.classifier.labels import find_labels, folded, nearest_hint
 from patchproof.mesh.load_mesh import load_mesh
 from patchproof.mesh.mesh import Mesh
-from patchproof.scene.bent_scene import placement_method
-from patchproof.scene.placement import SurfaceFrame, largest_fitting_size, place_if_close, side_frame
+from patchproof.scene.placement import SurfaceFrame, largest_fitting_size, place_if_close, placement_method, side_frame
 from patchproof.sheets.piece import smallest_piece_mm
 
 _GLTF = (".glb", ".gltf")
