@@ -74,9 +74,9 @@ class Program(torch.nn.Module):
         if any(size not in (None, got) for size, got in zip(self.sizes, shape, strict=True)):
             raise ValueError(f"it takes {'×'.join(str(size or 'N') for size in self.sizes)}")
         with torch.inference_mode(False), torch.no_grad():
-            inputs = [*(weight.to("meta") for weight in self.buffers()), torch.empty(shape, device="meta")]
+            weights = [weight.to("meta") for weight in self.buffers()]
             with _WorkCount(shape[0]):
-                self._result(inputs)
+                self._result([*weights, torch.empty(shape, device="meta")])
         self.tested.add(shape)
 
     def _result(self, inputs: list[Tensor]) -> Any:
