@@ -60,6 +60,10 @@ def program(body: str, **weights) -> graph.Program:
     return read_onnx(made.SerializeToString(), lambda location: b"")[0]
 
 
+def names(network: graph.Program) -> list[str]:
+    return [getattr(step.compute, "__name__", "") for step in network.steps]
+
+
 def check_alike(network, truth, photos: torch.Tensor) -> None:
     """Answers and their squares' gradients; pictures stay as they were."""
     before = photos.clone()
@@ -80,24 +84,76 @@ def weights(*chosen: str) -> list[torch.Tensor]:
     return [torch.from_numpy(constants()[name]) for name in chosen]
 
 
-@pytest.mark.parametrize("limits", ["Zero, Two", "Zero, Later"])
-def test_limits_that_are_known_have_the_gradients_of_a_hardtanh(limits):
+def test_activations_write_over_what_nobody_else_has():
+    network = program("""
+        a = Conv<pads=[1,1,1,1]>(x, W) b = Clip(a, Zero, Two) c = Add(a, b) d = Relu(c)
+        e = Conv(x, W) f = Flatten(e) g = Relu(f) h = ReduceMean<keepdims=0>(g, [1])
+        i = Relu(x) j = ReduceMean<keepdims=0>(i, [1, 2, 3]) k = ReduceMean<keepdims=0>(d, [1, 2, 3])
+        l = Add(h, j) m = Add(k, l) y = Unsqueeze(m, [1])
+    """)
+    activations = [name for name in names(network) if "relu" in name or "hardtanh" in name]
+    # used twice; made by an addition for it alone; through a view; the pictures themselves
+    assert activations == ["hardtanh.default", "relu_.default", "relu.default", "relu.default"]
+    (kernel,) = weights("W")
+
+    def truth(photos):
+        first, view = F.conv2d(photos, kernel, padding=1), F.conv2d(photos, kernel).flatten(1)
+        means = F.relu(first + F.hardtanh(first, 0, 2)).mean((1, 2, 3)), F.relu(view).mean(1), F.relu(photos)
+        return (means[0] + means[1] + means[2].mean((1, 2, 3)))[:, None]
+
+    check_alike(network, truth, torch.randn(2, 3, 8, 8))
+
+
+def test_limits_in_place_have_the_gradients_of_limits_beside():
     kernel = weights("W")[0].round()
-    network = program(f"a = Conv(x, W) Later = ReduceMax<keepdims=0>(a) y = Clip(a, {limits})", W=kernel)
+    network = program("a = Conv(x, W) y = Clip(a, Zero, Two)", W=kernel)
+    assert names(network) == ["convolution.default", "_hardtanh_"]
     photos = torch.randint(-1, 2, (2, 3, 8, 8)).float()
     made = F.conv2d(photos, kernel)
     assert min(int((made == limit).sum()) for limit in (0, 2)) > 5, "many lie at the limits"
-    if "Later" in limits:
-        check_alike(network, lambda x: torch.clamp(made := F.conv2d(x, kernel), torch.tensor(0.0), made.max()), photos)
-    else:
-        check_alike(network, lambda x: F.hardtanh(F.conv2d(x, kernel), 0, 2), photos)
+    check_alike(network, lambda x: F.hardtanh(F.conv2d(x, kernel), 0, 2), photos)
 
 
-def test_more_zeros_on_one_side_are_a_convolution_s_too():
-    (kernel,) = weights("D")
-    network = program("y = Conv<pads=[2,3,2,2], strides=[1,2], group=3>(x, D)")
-    truth = lambda x: F.conv2d(F.pad(x, (3, 2, 2, 2)), kernel, None, [1, 2], 0, 1, 3)  # noqa: E731
+ASIDE = {  # paddings, and what else the convolution has; whether they lie within its weights
+    (0, 0, 1, 1): ("strides=[2,2], group=3", True),
+    (2, 3, 2, 2): ("group=3", True),
+    (3, 1, 2, 0): ("strides=[1,2], group=3", True),
+    (0, 0, 1, 1, 0): ("strides=[2,2]", False),  # of more colors
+    (0, 0, 1, 1, 1): ("dilations=[2,2], group=3", False),
+    (0, 0, 1, 2): ("group=3", False),  # two columns
+    (0, -1, 0, 0): ("group=3", False),  # less than there was
+}
+
+
+@pytest.mark.parametrize("sides", ASIDE)
+def test_more_zeros_on_one_side_are_zeros_in_small_weights(sides):
+    options, within = ASIDE[sides]
+    top, left, bottom, right = sides[:4]
+    name = "D" if "group" in options else "W"
+    network = program(f"y = Conv<pads=[{top},{left},{bottom},{right}], {options}>(x, {name})")
+    assert names(network) == ["constant_pad_nd.default"] * (not within) + ["convolution.default"]
+    (kernel,) = weights(name)
+    stride, dilation = ([2, 2] if "[2,2]" in options and word in options else [1, 1] for word in ("stri", "dila"))
+    stride = [1, 2] if "[1,2]" in options else stride
+    groups = 3 if name == "D" else 1
+
+    def truth(photos):
+        return F.conv2d(F.pad(photos, (left, right, top, bottom)), kernel, None, stride, 0, dilation, groups)
+
     check_alike(network, truth, torch.randn(2, 3, 8, 8))
+
+
+@pytest.mark.parametrize("second", ["D", "d", "e"])
+def test_weights_that_several_convolutions_share_stay_as_they_are(second):
+    """Also under other names."""
+    network = program(f"""d = Identity(D) e = Identity(D) a = Conv<pads=[0,0,1,1], group=3>(x, d)
+        b = Conv<pads=[0,0,1,1], group=3>(x, {second}) y = Add(a, b)""")
+    (kernel,) = weights("D")
+    check_alike(network, lambda x: 2 * F.conv2d(F.pad(x, (0, 1, 0, 1)), kernel, groups=3), torch.randn(2, 3, 8, 8))
+
+
+def test_even_zeros_are_a_convolutions_own():
+    assert names(program("y = Conv<pads=[2,1,2,1]>(x, W)")) == ["convolution.default"]
 
 
 @pytest.mark.parametrize(

@@ -3,20 +3,21 @@
 In: weights, numbered steps and the sizes of the input, as onnx_file.py reads them from a file. Out: a Program, N×3×S×S
 → N×K. Values have numbers and no names; the only functions called are the operators of the steps. Before pictures of a
 new shape are computed, the steps run once on tensors without memory, to refuse values of absurd size and wrong inputs.
-Left out on purpose: activations that overwrite their input, which made a step 1.03 times as fast.
+Activations overwrite their input where nothing else needs it.
 """
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils._python_dispatch import TorchDispatchMode
 
 from patchproof.networks.bounds import MAX_DIMENSIONS, quote
+from patchproof.networks.tensor_observer import TensorObserver
 
 _ATEN = torch.ops.aten
 MAX_VALUE = 1 << 30  # numbers in one value, for each picture: VGG's at the largest input_px
@@ -32,7 +33,8 @@ class ValueRef:
     number: int
 
 
-INPUT_DEVICE = ValueRef(-1)  # as an argument: the device that the pictures are on
+class InputDevice:
+    """As an argument, the class itself stands for the device that the pictures are on."""
 
 
 @dataclass(frozen=True)
@@ -41,10 +43,28 @@ class Step:
 
     compute: Callable[..., Any]
     arguments: list[Any]
+    keywords: dict[str, Any]
     results: list[int]
-    keywords: dict[str, Any] = field(default_factory=dict)
-    returns_sequence: bool = False  # of several tensors
-    last_uses: list[int] = field(default_factory=list)
+    returns_sequence: bool  # of several tensors
+    last_uses: list[int]
+
+
+def mark_last_uses(steps: list[Step], outputs: set[int]) -> None:
+    """Write into each step's `last_uses` the values that no later step needs."""
+    needed = set(outputs)
+    for step in reversed(steps):
+        used = {*step.results, *value_numbers(step.arguments), *value_numbers(step.keywords.values())}
+        step.last_uses.extend(used - needed)
+        needed |= used
+
+
+def value_numbers(arguments: Iterable[Any]) -> Iterator[int]:
+    """The numbers of the values that arguments refer to."""
+    for argument in arguments:
+        if type(argument) is ValueRef:
+            yield argument.number
+        elif type(argument) is list:
+            yield from value_numbers(argument)
 
 
 class Program(torch.nn.Module):
@@ -54,18 +74,13 @@ class Program(torch.nn.Module):
         super().__init__()
         for number, weight in enumerate(weights):
             self.register_buffer(f"w{number}", weight)
-        self.steps, self.output, self.sizes = steps, output, sizes
+        self.steps, self.output, self.sizes = _activate_in_place(steps), output, sizes
         self.tested: set[torch.Size] = set()
-        needed = {*range(INPUT_DEVICE.number, len(weights) + 1), output}
-        for step in reversed(steps):
-            used = {*step.results, *(each.number for each in step.arguments if type(each) is ValueRef)}
-            step.last_uses.extend(used - needed)
-            needed |= used
 
     def forward(self, photos: Tensor) -> Tensor:
         """N×3×S×S → N×K."""
         self.dry_run(photos.shape)
-        return self._result([*self.buffers(), photos])
+        return _compute(self.steps, [*self.buffers(), photos])[self.output]
 
     def dry_run(self, shape: torch.Size) -> None:
         """Refuse pictures of wrong size, and absurdly large values, before they exist."""
@@ -75,26 +90,73 @@ class Program(torch.nn.Module):
             raise ValueError(f"it takes {'×'.join(str(size or 'N') for size in self.sizes)}")
         with torch.inference_mode(False), torch.no_grad():
             weights = [weight.to("meta") for weight in self.buffers()]
-            with _WorkCount(shape[0]):
-                self._result([*weights, torch.empty(shape, device="meta")])
+            with TensorObserver(_WorkCount(shape[0]), _SHAPE_ONLY):
+                _compute(self.steps, [*weights, torch.empty(shape, device="meta")])
         self.tested.add(shape)
 
-    def _result(self, inputs: list[Tensor]) -> Any:
-        """The output computed from the weights and, at the end of `inputs`, pictures on the device to use."""
-        like = inputs[-1]
-        values = dict[int, Any](enumerate(inputs)) | {INPUT_DEVICE.number: like.device}
-        for step in self.steps:
-            arguments = [values[each.number] if type(each) is ValueRef else each for each in step.arguments]
-            if step.returns_sequence and like.is_meta:
-                tensors = [argument for argument in arguments if isinstance(argument, Tensor)]
-                if any(size > MAX_SPLIT for tensor in tensors for size in tensor.shape):
-                    raise ValueError("it splits a tensor of an absurd size")
-            results = step.compute(*arguments, **step.keywords)
-            for number, result in zip(step.results, results if step.returns_sequence else [results], strict=True):
-                values[number] = result
-            for number in step.last_uses:  # so that memory is reused while it is in the cache
-                del values[number]
-        return values[self.output]
+
+def _compute(steps: Sequence[Step], inputs: list[Tensor]) -> dict[int, Any]:
+    """The values by number that the steps leave of the inputs, the last of which are pictures on the device to use."""
+    values, like = dict[int, Any](enumerate(inputs)), inputs[-1]
+    for step in steps:
+        arguments = [_filled(argument, values, like) for argument in step.arguments]
+        keywords = {name: _filled(argument, values, like) for name, argument in step.keywords.items()}
+        if step.returns_sequence and like.is_meta:
+            tensors = [argument for argument in arguments if isinstance(argument, Tensor)]
+            if any(size > MAX_SPLIT for tensor in tensors for size in tensor.shape):
+                raise ValueError("it splits a tensor of an absurd size")
+        results = step.compute(*arguments, **keywords)
+        for number, result in zip(step.results, results if step.returns_sequence else [results], strict=True):
+            values[number] = result
+        for number in step.last_uses:  # so that memory is reused while it is in the cache
+            del values[number]
+    return values
+
+
+def _activate_in_place(steps: list[Step]) -> list[Step]:
+    """Let an activation overwrite its input where nothing else needs it: fresh memory took a tenth of the time of
+    MobileNetV2's answers (75 and 67 ms), and 3 % of its gradients'.
+    """
+    uses = Counter(number for step in steps for number in value_numbers([*step.arguments, *step.keywords.values()]))
+    free = {number for step in steps if step.compute in _ALLOCATING for number in step.results if uses[number] == 1}
+    return [
+        replace(step, compute=_IN_PLACE[step.compute])
+        if step.compute in _IN_PLACE
+        and free.issuperset(value_numbers(step.arguments[:1]))
+        and free & set(step.last_uses)
+        else step
+        for step in steps
+    ]
+
+
+class _Clamp(torch.autograd.Function):
+    """`hardtanh_` with a gradient that needs its result only; torch's own keeps a copy of the input."""
+
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, low: float, high: float) -> Tensor:
+        """Clamp the tensor in place."""
+        ctx.mark_dirty(values)
+        clamped = _ATEN.hardtanh_.default(values, low, high)
+        ctx.save_for_backward(clamped)
+        ctx.limits = low, high
+        return clamped
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:  # type: ignore[override]
+        """Pass the gradient where a value lies between the limits, where clamping changed nothing."""
+        (clamped,) = ctx.saved_tensors
+        return _ATEN.hardtanh_backward.default(gradient, clamped, *ctx.limits), None, None
+
+
+def _hardtanh_(values: Tensor, low: float = -1, high: float = 1) -> Tensor:
+    with_gradient = values.requires_grad and torch.is_grad_enabled()
+    return (_Clamp.apply if with_gradient else _ATEN.hardtanh_.default)(values, low, high)
+
+
+# operators whose gradient needs their result only, and in-place forms of them
+_IN_PLACE: dict[Any, Callable[..., Any]] = {_ATEN.relu.default: _ATEN.relu_.default, _ATEN.hardtanh.default: _hardtanh_}
+# operators that allocate their result and do not need it for their own gradient
+_ALLOCATING = {_ATEN.convolution.default, _ATEN.add.Tensor}
 
 
 def _shape_of_first(compute: Callable[..., Any]) -> Callable[..., Any]:
@@ -129,7 +191,7 @@ def _mean(values: Tensor, dims: list[int] | None, keep: bool = False, **_: Any) 
 # For tensors without memory torch computes these in Python and imports its compiler and SymPy: two seconds.
 _ELEMENTWISE = (
     *(operator.Tensor for operator in (_ATEN.add, _ATEN.sub, _ATEN.mul, _ATEN.div)),
-    *(operator.default for operator in (_ATEN.relu, _ATEN.hardtanh, _ATEN.hardswish)),
+    *(operator.default for operator in (_ATEN.relu, _ATEN.relu_, _ATEN.hardtanh, _ATEN.hardtanh_, _ATEN.hardswish)),
 )
 _POOLS = (_ATEN.max_pool2d_with_indices, _ATEN.avg_pool2d)
 _SHAPE_ONLY: dict[Callable[..., Any], Callable[..., Any]] = {
@@ -139,28 +201,24 @@ _SHAPE_ONLY: dict[Callable[..., Any], Callable[..., Any]] = {
 }
 
 
-class _WorkCount(TorchDispatchMode):
-    """A context for tensors without memory that refuses absurd work: a tensor's size, also inside an operator (einsum,
-    padding), an operator's sum of products, and the size of all tensors.
+def _filled(argument: Any, values: dict[int, Any], photos: Tensor) -> Any:
+    """The argument with values in place of their numbers."""
+    if type(argument) is ValueRef:
+        return values[argument.number]
+    if type(argument) is list:
+        return [_filled(item, values, photos) for item in argument]
+    return photos.device if argument is InputDevice else argument
+
+
+class _WorkCount:
+    """Refuses absurd work: a tensor's size, also inside an operator (einsum, padding), an operator's sum of products,
+    and the size of all tensors.
     """
 
     def __init__(self, pictures: int):
-        super().__init__()
         self.pictures, self.numbers = pictures, 0
 
-    @classmethod
-    def _should_skip_dynamo(cls) -> bool:
-        """Answer without torch's own check, which would import its compiler; nothing here is compiled."""
-        return False
-
-    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        results = _SHAPE_ONLY.get(func, func)(*args, **(kwargs or {}))
-        for value in results if isinstance(results, (list, tuple)) else [results]:
-            if isinstance(value, Tensor):
-                self._add(value, func, args)
-        return results
-
-    def _add(self, tensor: Tensor, operator: Any, arguments: Sequence[Any]) -> None:
+    def __call__(self, tensor: Tensor, operator: Any, arguments: tuple) -> None:
         if tensor.numel() > MAX_VALUE * self.pictures or tensor.dim() > MAX_DIMENSIONS:
             raise ValueError(f"it makes a tensor of an absurd size, {quote(tuple(tensor.shape))}")
         self.numbers += tensor.numel()
