@@ -24,7 +24,7 @@ MAY_IMPORT = {
     "render": {"base", "sheets", "channel", "mesh", "scene"},
     "networks": {"base"},
     "classifier": {"base", "networks"},
-    "optimizer": {"base", "sheets", "photo", "channel", "mesh", "scene", "render", "classifier"},
+    "optimizer": {"base", "sheets", "photo", "channel", "mesh", "scene", "render", "networks", "classifier"},
     "evidence": {"base", "sheets", "photo", "channel", "classifier"},
     "calibrate": {"base", "sheets", "photo", "channel", "evidence"},
     "report": {"base"},

@@ -27,7 +27,7 @@ from patchproof.channel.effects import (
 )
 from patchproof.optimizer.problem import set_problem
 from patchproof.render import photograph
-from patchproof.render.photograph import expose
+from patchproof.render.photograph import affected_windows, expose
 from patchproof.render.views import render_views
 from patchproof.scene.conditions import (
     Conditions,
@@ -214,3 +214,25 @@ def test_what_is_not_given_is_off_and_one_row_stands_for_all():
     assert all(values.tobytes() == again[name].tobytes() for name, values in fields_of(conditions).items())
     with pytest.raises(ValueError, match=r"fields of one record have \[2, 3\] rows"):
         Sensor(noise=np.zeros(2), blur_px=np.zeros(3))
+
+
+@pytest.mark.parametrize("effect", SWITCHED, ids=lambda effect: effect.name)
+def test_windows_hold_all_that_a_design_changes(problem, effect):
+    """Outside of them pictures are the same to the bit, whatever hangs there; they are no larger than it takes."""
+    conditions = problem.scene.draw("select", 6)
+    for other in SWITCHED:
+        if other not in (effect, EFFECT_BY_NAME["ambient light"]):
+            conditions = without_effect(conditions, other, lambda azimuth_deg, elevation_deg: np.ones(6)) or conditions
+    designs = [torch.full_like(problem.subject.start(), value) for value in (0.0, 1.0)]
+    black, white = (problem.subject.appearance(design) for design in designs)
+    views = render_views(problem.stage, black, conditions, (96, 96))
+    windows = affected_windows(views)
+    if effect.name == "JPEG":
+        assert windows is None
+        return
+    changed = (expose(views, black) != expose(views, white)).any(1)
+    for picture, (left, top, right, bottom) in zip(changed, windows.tolist(), strict=True):
+        rows, columns = (picture.any(axis).nonzero()[:, 0] for axis in (1, 0))
+        for found, first, end in ((rows, top, bottom), (columns, left, right)):
+            margins = int(found.min()) - first, end - 1 - int(found.max())
+            assert 0 <= min(margins) and max(margins) <= (12 if effect.name == "motion blur" else 8), margins

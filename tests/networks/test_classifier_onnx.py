@@ -18,6 +18,8 @@ from patchproof.classifier.builtin import load_builtin
 from patchproof.classifier.custom import classifier_of
 from patchproof.classifier.network_file import EXPORT_ADVICE, load_network
 from patchproof.evidence.gather import gather_evidence
+from patchproof.networks import batches
+from patchproof.networks.batches import Windows, tune_batches
 from patchproof.networks.bounds import UnsupportedNetwork
 from patchproof.networks.onnx_file import OPSETS, read_onnx
 from patchproof.networks.onnx_operators import FIXED_ATTRIBUTES, OPERATORS, REFUSED
@@ -109,6 +111,26 @@ def test_pictures_may_come_in_either_order(make, order, tmp_path):
     photos = torch.rand(5, 3, 16, 16).to(memory_format=order)
     for ours, theirs in zip(answered(network, photos), answered(truth, photos), strict=True):
         torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-5)
+
+
+def test_a_file_is_cut_where_its_module_is(tmp_path, monkeypatch):
+    """Gradients in windows are the whole network's there, and are computed there only."""
+    monkeypatch.setattr(batches, "CUT_COST", 0)  # the network is small
+    pictures = torch.rand(2, 3, 96, 96)
+    network, of_module = (
+        load_network(written(tmp_path, ResNet(), side=96)).network,
+        tune_batches(seeded(ResNet()), pictures),
+    )
+    assert tune_batches(network, pictures).cut and of_module.cut and network.cut.stride == of_module.cut.stride
+    px = np.array([[40, 30, 50, 44], [0, 0, 9, 9], [80, 85, 96, 96]])
+    photos, gradients = torch.rand(3, 3, 96, 96), []
+    for asked in (None, Windows(px)):
+        given = photos.clone().requires_grad_()
+        gradients.append(torch.autograd.grad(network(given, asked).square().sum(), given)[0])
+    whole, parts = gradients
+    for one, same, (left, top, right, bottom) in zip(parts, whole, px.tolist(), strict=True):
+        torch.testing.assert_close(one[:, top:bottom, left:right], same[:, top:bottom, left:right])
+    assert not torch.equal(parts, whole)
 
 
 def test_a_file_goes_from_a_scene_to_a_verdict(tmp_path):

@@ -20,7 +20,7 @@ from patchproof.base.errors import Refused
 from patchproof.optimizer.problem import FIGURE_SAMPLING, set_problem
 from patchproof.photo.detect import find_markers
 from patchproof.render import photograph as photograph_module
-from patchproof.render.photograph import expose, photograph, shade
+from patchproof.render.photograph import affected_windows, expose, photograph, shade
 from patchproof.render.pixels import PHOTO_SAMPLING, ObjectTextures, PiecePicture
 from patchproof.render.stage import set_stage
 from patchproof.render.texture import look_up, texel_table
@@ -192,6 +192,32 @@ def test_views_lit_anew_are_views_seen_anew(tmp_path):
             assert torch.equal(pictures, expose(render_views(stage, laid_out, anew, (96, 96)), shown))
             assert not torch.equal(pictures, before)
         assert torch.equal(expose(seen, shown), before)
+
+
+def test_the_back_of_a_piece_lies_in_its_window_too(tmp_path):
+    """A bare object has none: pictures with and without a piece are alike everywhere else."""
+    trimesh.creation.icosphere(2, 150).export(tmp_path / "ball.ply")
+    scene = scene_of(tmp_path, ("primitive:carton", "ball.ply"), ("_mm = 90", "_mm = 150"))
+    seen = render_views(
+        set_stage(scene), WHITE, posed(scene, 3, azimuth_deg=[110, 100, -60], distance_mm=900), (96, 96)
+    )
+    assert len(seen.on_piece.back_pixel)
+    differ = (expose(seen, WHITE) != expose(seen, None)).any(1)
+    assert differ.flatten(1).any(1).all()
+    for view, (left, top, right, bottom) in zip(differ, affected_windows(seen).tolist(), strict=True):
+        view[top:bottom, left:right] = False
+    assert not differ.any()
+
+
+def test_where_it_is_not_known_what_a_design_changes_there_are_no_windows(tmp_path):
+    lens = ("photo_px = [800, 600]", 'photo_px = [1600, 1200]\nfile = "phone"')
+    for scene, known in ((scene_of(tmp_path), True), (scene_of(tmp_path, lens), False)):
+        stage, drawn = set_stage(scene), posed(scene, 2, azimuth_deg=[0, 180])
+        assert affected_windows(render_views(stage, None, drawn, (96, 96))) is None, "textures change the object"
+        windows = affected_windows(render_views(stage, piece_of(scene), drawn, (96, 96)))
+        assert (windows is not None) == known
+        if known:
+            assert windows[1].tolist() == [0, 0, 1, 1], "from behind nothing is seen of it"
 
 
 def both_ways(monkeypatch, stage, shown, conditions, side):

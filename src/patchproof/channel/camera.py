@@ -57,8 +57,23 @@ def develop(linear: Tensor, sensor: Sensor, scale: float, jpeg: bool = True) -> 
 
 def is_pointwise(sensor: Sensor, scale: float, jpeg: bool) -> bool:
     """True if `develop` treats every pixel alone, so that a changed region can be developed without the rest."""
-    small = (sensor.blur_px, SMALLEST_BLUR_PX), (sensor.motion_px, SMALLEST_MOTION_PX), (sensor.noise, SMALLEST_NOISE)
-    return not _has_jpeg(sensor, scale, jpeg) and all((each * scale).max() < least for each, least in small)
+    return reach_px(sensor, scale, jpeg) == 0 and bool((sensor.noise * scale).max() < SMALLEST_NOISE)
+
+
+def reach_px(sensor: Sensor, scale: float, jpeg: bool = True) -> int | None:
+    """Return how many pixels far `develop` spreads light; None if JPEG spreads it within its blocks."""
+    if _has_jpeg(sensor, scale, jpeg):
+        return None
+    blur_px, motion_px = float(sensor.blur_px.max()) * scale, float(sensor.motion_px.max()) * scale
+    return _blur_reach(blur_px) + _motion_reach(motion_px)
+
+
+def _blur_reach(sigma_px: float) -> int:
+    return 0 if sigma_px < SMALLEST_BLUR_PX else int(3 * sigma_px + 0.5)
+
+
+def _motion_reach(length_px: float) -> int:
+    return 0 if length_px < SMALLEST_MOTION_PX else int(length_px / 2) + 1
 
 
 def _has_jpeg(sensor: Sensor, scale: float, jpeg: bool) -> bool:
@@ -90,9 +105,10 @@ def gaussian_blur(linear: Tensor, sigma_px: Tensor) -> Tensor:
     """Blur pictures by Gaussians, one sigma per picture; if all sigmas are too small to be seen, return the input."""
     from kornia.filters import get_gaussian_kernel1d
 
-    if (largest := float(sigma_px.max())) < SMALLEST_BLUR_PX:
+    reach = _blur_reach(float(sigma_px.max()))
+    if reach == 0:
         return linear
-    taps = 2 * int(3 * largest + 0.5) + 1
+    taps = 2 * reach + 1
     kernels = get_gaussian_kernel1d(taps, sigma_px.clamp_min(0.05)[:, None])  # 0.05 px leaves a picture unchanged
     kernels = torch.where(kernels > 1e-30, kernels, 0.0)  # numbers near the smallest took seven times as long
     return _filtered(linear, kernels[:, None], kernels[:, :, None])
@@ -103,7 +119,7 @@ def motion_blur(linear: Tensor, length_px: Tensor, angle_deg) -> Tensor:
 
     If all lengths are too short to be seen, return the input; length 0 leaves a picture unchanged.
     """
-    if float(length_px.max()) < SMALLEST_MOTION_PX:
+    if _motion_reach(float(length_px.max())) == 0:
         return linear
     return _filtered(linear, _streaks(length_px, torch.as_tensor(angle_deg).to(linear)))
 
@@ -127,7 +143,7 @@ def _streaks(length_px: Tensor, angle_deg: Tensor) -> Tensor:
 
     kornia's motion kernels have one odd length for the whole batch and jump from pixel to pixel when they are rotated.
     """
-    reach = int(float(length_px.max()) / 2) + 1
+    reach = _motion_reach(float(length_px.max()))
     pixels = torch.arange(-reach, reach + 1).to(length_px)
     steps = 8 * reach  # four or more per pixel
     along = length_px[:, None] * ((torch.arange(steps).to(length_px) + 0.5) / steps - 0.5)

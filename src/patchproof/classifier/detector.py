@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from patchproof.classifier.network import NO_BOX_LOGIT, Classifier, Odds, columns
+from patchproof.networks.batches import Windows
 
 MIN_IOU = 0.5  # as in PASCAL VOC's and COCO's AP50
 
@@ -48,13 +49,13 @@ class Detector(Classifier):
         """N bool: the object was found under one of these labels with a sufficient score."""
         return self.confidence(logits, indices) >= self.least_score
 
-    def square_logits(self, squares: Tensor, boxes: np.ndarray | None = None) -> Tensor:
+    def square_logits(self, squares: Tensor, boxes: np.ndarray | None = None, windows: Windows | None = None) -> Tensor:
         """N×K logits of the best candidates on the object; `boxes` N×4 are shares of the square."""
-        return self._on_object(self.network(squares), boxes).amax(1)
+        return self._on_object(self._call_network(squares, windows), boxes).amax(1)
 
     def target_box(self, square: Tensor, indices: Sequence[int], boxes: np.ndarray | None) -> tuple[float, ...] | None:
         """The surest box of the labels in `indices` on the object, in shares of the square; None if there is none."""
-        candidates = self.network(square)
+        candidates = self._call_network(square, None)
         score, best = self._on_object(candidates, boxes)[0, :, list(indices)].amax(1).max(0)
         return tuple((candidates[0, best, :4] / self.input_px).tolist()) if float(score) > NO_BOX_LOGIT else None
 

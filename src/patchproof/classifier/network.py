@@ -10,7 +10,7 @@ import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -19,6 +19,7 @@ from torch import Tensor
 from patchproof.base.errors import Refused
 from patchproof.base.fingerprint import value_sha256
 from patchproof.base.text import brief, short_repr
+from patchproof.networks.batches import BatchedNetwork, Windows
 
 NO_BOX_LOGIT = -20.0  # the logit where no candidate of a detector lies on the object: a score of 2e-9
 
@@ -59,15 +60,27 @@ class Classifier:
         """A copy with that `least_score`; the classifier itself if the score is None or it needs none."""
         return self if None in (least_score, self.least_score) else replace(self, least_score=least_score)
 
-    def logits(self, photos_srgb: Tensor, boxes: np.ndarray | None = None) -> Tensor:
+    def logits(
+        self,
+        photos_srgb: Tensor,
+        boxes: np.ndarray | None = None,
+        windows: np.ndarray | None = None,
+        cache: dict[Any, Any] | None = None,
+    ) -> Tensor:
         """N×K logits of the photographs' centered squares. Refused if any is not finite, since the largest of a row
         with NaN is the NaN and would pass for an answer.
 
         `boxes` N×4 are the object's boxes as shares of the square's side (left, top, right, bottom), for detectors.
+        With `windows`, N×4 pixels in that order, the gradient at the photographs may be 0 outside of them. With
+        `cache` as well, no gradient is computed: outside of the windows, the photographs equal the first ones that were
+        passed with this cache.
         """
         if not isinstance(photos_srgb, Tensor) or photos_srgb.dim() != 4 or photos_srgb.shape[1] != 3:
             raise Refused("photographs as a tensor N×3×H×W", brief(photos_srgb), "stack them, channels first")
-        logits = self.square_logits(center_square(photos_srgb, self.input_px), boxes)
+        squares, square_windows = center_square(photos_srgb, self.input_px), None
+        if windows is not None:
+            square_windows = Windows(_windows_in_square(windows, photos_srgb.shape[-2:], self.input_px), cache)
+        logits = self.square_logits(squares, boxes, square_windows)
         if not bool(torch.isfinite(logits).all()):
             do = "check its weights and its number format"
             raise Refused("finite logits", f"NaN or infinity from the network {self.name}", do)
@@ -94,8 +107,14 @@ class Classifier:
     def target_box(self, square: Tensor, indices: Sequence[int], boxes: np.ndarray | None) -> tuple[float, ...] | None:
         """The surest box of the labels in `indices` in one square, in shares of its side; None without boxes."""
 
-    def square_logits(self, squares: Tensor, boxes: np.ndarray | None = None) -> Tensor:
+    def square_logits(self, squares: Tensor, boxes: np.ndarray | None = None, windows: Windows | None = None) -> Tensor:
         """N×K logits of squares of the network's input size, not checked for NaN."""
+        return self._call_network(squares, windows)
+
+    def _call_network(self, squares: Tensor, windows: Windows | None) -> Tensor:
+        """The network's own output for squares N×3×S×S."""
+        if windows is not None and isinstance(self.network, BatchedNetwork):
+            return self.network(squares, windows)
         return self.network(squares)
 
 
@@ -124,6 +143,16 @@ def center_square(photos_srgb: Tensor, size_px: int) -> Tensor:
         return square
     size = (size_px, size_px)
     return torch.nn.functional.interpolate(square, size, mode="bilinear", align_corners=False, antialias=True)
+
+
+def _windows_in_square(windows: np.ndarray, photo_px: Sequence[int], size_px: int) -> np.ndarray:
+    """The pixels of centered squares that depend on those in windows of photographs, both N×4."""
+    side = min(photo_px)
+    corner, ratio = (np.array(photo_px[::-1]) - side) // 2, side / size_px
+    reach = 0 if side == size_px else max(ratio, 1)
+    first = np.floor((windows[:, :2] - corner - reach) / ratio)
+    last = np.ceil((windows[:, 2:] - corner + reach) / ratio)
+    return np.hstack([first, last]).clip(0, size_px).astype(int)
 
 
 def freeze(network: torch.nn.Module) -> torch.nn.Module:

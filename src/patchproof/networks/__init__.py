@@ -1,1 +1,1 @@
-"""Read files of networks without executing anything in them, and call networks in the fastest batches."""
+"""Read files of networks without executing anything in them, and rewrite networks so that they compute faster."""

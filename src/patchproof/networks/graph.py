@@ -1,9 +1,9 @@
 """A network's graph, computed one operator after the other.
 
-In: weights, numbered steps and the sizes of the input, as onnx_file.py reads them from a file. Out: a Program, N×3×S×S
-→ N×K. Values have numbers and no names; the only functions called are the operators of the steps. Before pictures of a
-new shape are computed, the steps run once on tensors without memory, to refuse values of absurd size and wrong inputs.
-Activations overwrite their input where nothing else needs it.
+In: weights, numbered steps and the sizes of the input, as onnx_file.py reads them from a file or tracing.py from a
+module. Out: a Program, N×3×S×S → N×K. Values have numbers and no names; the only functions called are the operators of
+the steps. Before pictures of a new shape are computed, a file's steps run once on tensors without memory, to refuse
+values of absurd size and wrong inputs. Activations overwrite their input where nothing else needs it.
 """
 
 import math
@@ -68,36 +68,50 @@ def value_numbers(arguments: Iterable[Any]) -> Iterator[int]:
 
 
 class Program(torch.nn.Module):
-    """A graph as a function of pictures; weights are buffers, so that they move with the module."""
+    """A graph as a function of pictures; weights are buffers, so that they move with the module. A program without
+    `sizes` comes from the user's own code, which needs no dry run.
+    """
 
-    def __init__(self, weights: list[Tensor], steps: list[Step], output: int, sizes: list[int | None]):
+    def __init__(self, weights: list[Tensor], steps: list[Step], output: int, sizes: list[int | None] | None):
         super().__init__()
         for number, weight in enumerate(weights):
             self.register_buffer(f"w{number}", weight)
         self.steps, self.output, self.sizes = _activate_in_place(steps), output, sizes
-        self.tested: set[torch.Size] = set()
+        self.photos = len(weights)  # the number of the pictures, after those of the weights
+        self.tested: set[tuple[torch.Size, int]] = set()
 
     def forward(self, photos: Tensor) -> Tensor:
         """N×3×S×S → N×K."""
-        self.dry_run(photos.shape)
-        return _compute(self.steps, [*self.buffers(), photos])[self.output]
+        return self.first(len(self.steps), photos)[self.output]
 
-    def dry_run(self, shape: torch.Size) -> None:
-        """Refuse pictures of wrong size, and absurdly large values, before they exist."""
-        if shape in self.tested:
+    def first(self, count: int, photos: Tensor) -> dict[int, Any]:
+        """The values that remain after the first `count` steps; short of all steps, pictures may have another size."""
+        self.dry_run(count, photos.shape)
+        values = self.values(self.photos, photos)
+        compute(self.steps[:count], values, photos)
+        return values
+
+    def values(self, number: int, value: Tensor) -> dict[int, Any]:
+        """The weights by number, and one value that was computed from pictures."""
+        return dict(enumerate(self.buffers())) | {number: value}
+
+    def dry_run(self, count: int, shape: torch.Size) -> None:
+        """Refuse pictures of wrong size, and absurdly large values in the first `count` steps, before they exist."""
+        if self.sizes is None or (shape, count) in self.tested:
             return
-        if any(size not in (None, got) for size, got in zip(self.sizes, shape, strict=True)):
+        differs = any(size not in (None, got) for size, got in zip(self.sizes, shape, strict=True))
+        if differs and count == len(self.steps):
             raise ValueError(f"it takes {'×'.join(str(size or 'N') for size in self.sizes)}")
         with torch.inference_mode(False), torch.no_grad():
             weights = [weight.to("meta") for weight in self.buffers()]
-            with TensorObserver(_WorkCount(shape[0]), _SHAPE_ONLY):
-                _compute(self.steps, [*weights, torch.empty(shape, device="meta")])
-        self.tested.add(shape)
+            photos = torch.empty(shape, device="meta")
+            with TensorObserver(_WorkCount(len(photos)), _SHAPE_ONLY):
+                compute(self.steps[:count], dict(enumerate([*weights, photos])), photos)
+        self.tested.add((shape, count))
 
 
-def _compute(steps: Sequence[Step], inputs: list[Tensor]) -> dict[int, Any]:
-    """The values by number that the steps leave of the inputs, the last of which are pictures on the device to use."""
-    values, like = dict[int, Any](enumerate(inputs)), inputs[-1]
+def compute(steps: Sequence[Step], values: dict[int, Any], like: Tensor) -> None:
+    """Add the steps' results to `values`, on the device of `like`; delete each value after its last use."""
     for step in steps:
         arguments = [_filled(argument, values, like) for argument in step.arguments]
         keywords = {name: _filled(argument, values, like) for name, argument in step.keywords.items()}
@@ -110,7 +124,6 @@ def _compute(steps: Sequence[Step], inputs: list[Tensor]) -> dict[int, Any]:
             values[number] = result
         for number in step.last_uses:  # so that memory is reused while it is in the cache
             del values[number]
-    return values
 
 
 def _activate_in_place(steps: list[Step]) -> list[Step]:

@@ -23,7 +23,7 @@ from torch import Tensor
 from patchproof.base.workers import fork_workers
 from patchproof.optimizer.problem import Problem
 from patchproof.optimizer.subject import as_pixels, from_pixels
-from patchproof.render.photograph import expose
+from patchproof.render.photograph import affected_windows, expose
 from patchproof.render.views import Views, split_views
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.interface import Scene
@@ -180,13 +180,15 @@ def gradient_in_views(problem: Problem, design: Tensor, views: Sequence[Views]) 
     return _mean_answer(problem, design, lambda printed: [_views_answer(problem, printed, each) for each in views])
 
 
-def score(problem: Problem, pictures: Tensor, conditions: Conditions) -> tuple[Tensor, Tensor]:
+def score(
+    problem: Problem, pictures: Tensor, conditions: Conditions, windows: np.ndarray | None = None
+) -> tuple[Tensor, Tensor]:
     """The mean loss, differentiable, and mean loss, confidence and rate in float64, over classifiers and pictures
-    N×3×H×W.
+    N×3×H×W. Outside of `windows`, N×4 pixels (left, top, right, bottom), the pictures' gradient is not needed.
     """
     losses, figures, boxes = [], [], problem.boxes(conditions)
     for classifier, indices in zip(problem.classifiers, problem.indices, strict=True):
-        logits = classifier.logits(pictures, boxes)
+        logits = classifier.logits(pictures, boxes, windows)
         losses.append(problem.losses(classifier, logits, indices).mean())
         told = classifier.confidence(logits.detach(), indices), classifier.recognized(logits.detach(), indices)
         figures.append(torch.stack([each.double().mean() for each in told]))
@@ -206,7 +208,7 @@ def _mean_answer(problem: Problem, design: Tensor, ask: Callable[[Tensor], Seque
         return sum(share * value for share, value in zip(shares, values, strict=True))
 
     print_gradient = torch.as_tensor(mean(answer.gradient for answer in answers), device=problem.device)
-    # differentiating a product, since torch imports SymPy for grad_outputs, for half a second
+    # differentiating a product, since torch imports SymPy for grad_outputs (networks/cuts.py)
     (gradient,) = torch.autograd.grad((printed * print_gradient).sum(), design)
     loss, confidence, rate = (mean(getattr(a, name) for a in answers) for name in ("loss", "confidence", "rate"))
     return Answer(views, loss, confidence, rate, gradient)
@@ -216,7 +218,7 @@ def _views_answer(problem: Problem, printed: Tensor, views: Views) -> Answer:
     """Photograph the print in these views, run the networks, and differentiate their mean loss."""
     printed = printed.detach().requires_grad_()
     photos = expose(views, problem.subject.appearance_of_print(printed))
-    loss, figures = score(problem, photos, views.conditions)
+    loss, figures = score(problem, photos, views.conditions, affected_windows(views))
     (gradient,) = torch.autograd.grad(loss, printed)
     mean_loss, confidence, rate = figures.tolist()
     return Answer(len(photos), mean_loss, confidence, rate, _to_send(gradient))

@@ -23,6 +23,7 @@ from patchproof.channel.printer import Printer, load_printer
 from patchproof.classifier.labels import find_labels
 from patchproof.classifier.load import load_classifier
 from patchproof.classifier.network import Classifier
+from patchproof.networks.batches import BatchedNetwork
 from patchproof.optimizer.patch import Patch
 from patchproof.optimizer.subject import Loss, target_loss
 from patchproof.render.pixels import PHOTO_SAMPLING, Appearance, TextureSampling
@@ -153,9 +154,13 @@ def set_problem(
 
         subject = Texture(scene, scene.object_canvas(), stage.device)
     jobs = jobs if stage.device.type == "cpu" else 1
-    if jobs > 1 and stage.object is not None:
+    if jobs > 1:
         with use_threads(1):  # before forking, on one thread like the forked processes, since two round differently
-            stage.object.texels(reduced=True, fixed=scene.HAS_PIECE)
+            if stage.object is not None:
+                stage.object.texels(reduced=True, fixed=scene.HAS_PIECE)
+            for network in (classifier.network for classifier in classifiers if scene.HAS_PIECE):
+                if isinstance(network, BatchedNetwork):
+                    _ = network.cut  # computed on access
     problem = Problem(scene, stage, printer, classifiers, indices, subject, loss, jobs)
     if not models:
         refuse_other_inputs(scene.recorded, problem.inputs, f"the run of sheet {scene.sheet_id}", settings.model_dump())

@@ -8,7 +8,7 @@ as many processes as the problem has; the responses do not depend on how many.
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain, zip_longest
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -17,7 +17,7 @@ from torch import Tensor
 from patchproof.base.progress import Advance, no_advance
 from patchproof.base.workers import fork_workers
 from patchproof.optimizer.problem import Problem
-from patchproof.render.photograph import Appearance, expose
+from patchproof.render.photograph import Appearance, affected_windows, expose
 from patchproof.render.views import split_views
 from patchproof.scene.conditions import Conditions
 
@@ -62,9 +62,10 @@ def responses(
         answers, drawn_conditions = [], conditions[np.concatenate([rows for rows, _ in task])]
         together = problem.see(first_appearance, drawn_conditions, side_px or problem.figure_px)
         for (_, shown), views in zip(task, split_views(together, [len(rows) for rows, _ in task]), strict=True):
-            boxes = problem.boxes(views.conditions)
-            photos = ((thing, expose(views, appearances[thing])) for thing in shown)
-            answers.append({thing: ask_networks(problem, pictures, boxes) for thing, pictures in photos})
+            boxes, cache = problem.boxes(views.conditions), {}
+            windows = affected_windows(views) if len(shown) > 1 else None
+            pictures = ((thing, expose(views, appearances[thing])) for thing in shown)
+            answers.append({thing: ask_networks(problem, photos, boxes, windows, cache) for thing, photos in pictures})
         return answers
 
     views_done = np.cumsum([sum(len(rows) for rows, _ in task) for task in tasks])
@@ -81,14 +82,20 @@ def in_chunks(conditions: Chunked) -> Iterator[Chunked]:
         yield conditions[first : first + CHUNK_VIEWS]
 
 
-def ask_networks(problem: Problem, pictures: Tensor, boxes: np.ndarray | None) -> Responses:
+def ask_networks(
+    problem: Problem,
+    pictures: Tensor,
+    boxes: np.ndarray | None,
+    windows: np.ndarray | None = None,
+    cache: dict[Any, Any] | None = None,
+) -> Responses:
     """Every network's responses to pictures N×3×H×W with the object in `boxes` (`Problem.boxes`). A network that is in
-    the problem twice, with other labels, runs once.
+    the problem twice, with other labels, runs once. Pictures that differ only in `windows` share the `cache`.
     """
     rows = []
     with torch.no_grad():
         networks = dict.fromkeys(problem.classifiers)
-        logits = {network: network.logits(pictures, boxes) for network in networks}
+        logits = {network: network.logits(pictures, boxes, windows, cache) for network in networks}
         for classifier, indices in zip(problem.classifiers, problem.indices, strict=True):
             k_logits = logits[classifier]
             recognized, confidence = classifier.recognized(k_logits, indices), classifier.confidence(k_logits, indices)

@@ -17,7 +17,7 @@ from patchproof.base.errors import Refused
 from patchproof.base.settings import BackgroundSettings
 from patchproof.base.text import brief
 from patchproof.channel import camera as camera_model
-from patchproof.channel.camera import add_noise, develop, gaussian_blur, is_pointwise
+from patchproof.channel.camera import add_noise, develop, gaussian_blur, is_pointwise, reach_px
 from patchproof.channel.effects import Light, Pose
 from patchproof.channel.printer import print_change, vary_print
 from patchproof.render.pixels import Appearance, ObjectTextures, PiecePicture
@@ -32,6 +32,7 @@ from patchproof.scene.placement import SurfaceFrame
 
 DISTANCE_LENGTHS = 60.0  # of a plan's camera, over the object's length
 PAPER_BACK_LINEAR = 0.8  # reflectance of plain white card, for a piece seen from behind
+_OUTLINE_REACH_PX = 1  # outlines mix neighboring pixels
 _PICTURE_GRAIN_SEED = 1 << 40  # added to the seed: the base photograph's grain is not that of the simulated camera
 
 
@@ -97,6 +98,20 @@ def expose(views: Views, appearance: Appearance, jpeg: bool = True) -> Tensor:
         light = _piece_light(views, appearance)
         image = _blend(image, piece.pixel, piece.share, views.encode(light, piece.view), False)
     return _smooth(views, image, by_code=False)
+
+
+def affected_windows(views: Views) -> np.ndarray | None:
+    """Return N×4 pixels (left, top, right, bottom) outside of which `expose` gives the same for every design in these
+    views. None if that is unknown: for textures, through a lens with distortion, and if photographs have blur of their
+    own.
+    """
+    camera, scale = views.stage.camera, _scale(views)
+    reach = reach_px(views.conditions.sensor, scale)
+    has_distortion = views.frame_px != views.size_px or (camera is not None and camera.has_distortion)
+    if views.piece is None or has_distortion or reach is None or _picture_blur_and_noise(views) is not None:
+        return None
+    width, height = views.size_px
+    return (views.piece.box_px + (reach + _OUTLINE_REACH_PX) * np.array([-1, -1, 1, 1])).clip(0, [width, height] * 2)
 
 
 def _blend(image: Tensor, pixel: Tensor, share: Tensor, value: Tensor, by_code: bool) -> Tensor:

@@ -8,6 +8,7 @@ along each of the piece's sides, that lies within the cut line.
 from dataclasses import dataclass
 from functools import cached_property
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -94,7 +95,8 @@ class ObjectPixels:
 @dataclass(frozen=True)
 class PiecePixels:
     """The pixels that the piece covers, each by its `share`. `white` is the light P×3 of the base picture's paper if a
-    scene is made of pictures, else None.
+    scene is made of pictures, else None. `box_px` N×4 (left, top, right, bottom) holds each view's pixels of both
+    sides.
     """
 
     pixel: Tensor
@@ -105,6 +107,7 @@ class PiecePixels:
     white: Tensor | None
     back_pixel: Tensor  # pixels that see its back
     back_share: Tensor
+    box_px: np.ndarray
 
     def part(self, views: range, pixels: int) -> "PiecePixels":
         """Return those of some views, of `pixels` pixels each, equal to those of these views alone."""
@@ -112,7 +115,8 @@ class PiecePixels:
         pixel, view = self.pixel[rows] - views.start * pixels, self.view[rows] - views.start
         texels, white = self.texels.part(rows.start, rows.stop), None if self.white is None else self.white[rows]
         front = (pixel, view, self.share[rows], texels, self.normal[rows], white)
-        return PiecePixels(*front, self.back_pixel[back] - views.start * pixels, self.back_share[back])
+        back_pixel, box_px = self.back_pixel[back] - views.start * pixels, self.box_px[views.start : views.stop]
+        return PiecePixels(*front, back_pixel, self.back_share[back], box_px)
 
 
 def _rows(pixel: Tensor, views: range, pixels: int) -> slice:
@@ -148,7 +152,17 @@ def piece_pixels(
     normal = torch.nn.functional.normalize(_interpolate(surface.corner_normal, visible), dim=-1)
     white = None if white_coefficients is None else _paper_light(white_coefficients[visible.view], 2 * mm / size - 1)
     front_share, back_share = (share.index_select(0, side)[:, None] for side in (front, back))
-    return PiecePixels(visible.pixel, visible.view, front_share, texels, normal, white, back_pixel, back_share)
+    box_px = _boxes(torch.cat([visible.pixel, back_pixel]), fragments.shape)
+    return PiecePixels(visible.pixel, visible.view, front_share, texels, normal, white, back_pixel, back_share, box_px)
+
+
+def _boxes(pixel: Tensor, shape: tuple[int, int, int]) -> np.ndarray:
+    """Return N×4 boxes (left, top, right, bottom) of each view's pixels; a view without any has one of no size."""
+    views, height, width = shape
+    xy, view = torch.stack([pixel % width, pixel // width % height], 1), pixel // (width * height)
+    row, size = view[:, None].expand(-1, 2), xy.new_tensor([width, height]).repeat(views, 1)
+    low, high = size.scatter_reduce(0, row, xy, "amin"), (size * 0).scatter_reduce(0, row, xy + 1, "amax")
+    return torch.cat([torch.minimum(low, high), high], 1).cpu().numpy()
 
 
 def object_pixels(

@@ -33,7 +33,7 @@ from patchproof.optimizer.place_search import choose_place, place_lines
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.optimizer.promise import CONTROLS, VIEWS_PER_SESSION, make_promise
 from patchproof.optimizer.subject import as_pixels, from_pixels
-from patchproof.render.photograph import expose
+from patchproof.render.photograph import affected_windows, expose
 from patchproof.scene.bent_scene import placement_with_other_bend
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.interface import (
@@ -168,9 +168,9 @@ def _step_ms(problem: Problem, design: Tensor, conditions: Conditions) -> dict[s
     ends["printer" if problem.scene.HAS_PIECE else "textures"] = time.perf_counter()
     pictures = expose(views, appearance)
     ends["light, piece and camera"] = time.perf_counter()
-    leaf, boxes = pictures.detach().requires_grad_(), problem.boxes(conditions)
+    leaf, boxes, windows = pictures.detach().requires_grad_(), problem.boxes(conditions), affected_windows(views)
     losses = [
-        problem.losses(classifier, classifier.logits(leaf, boxes), indices).mean()
+        problem.losses(classifier, classifier.logits(leaf, boxes, windows), indices).mean()
         for classifier, indices in zip(problem.classifiers, problem.indices, strict=True)
     ]
     loss = torch.stack(losses).mean()
