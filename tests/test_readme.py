@@ -297,16 +297,6 @@ def test_figures_of_imported_designs_are_the_stored_ones():
     assert f"{recognized} photograph of {judged}" in row
 
 
-def test_figures_of_a_network_s_forms_are_the_stored_ones():
-    rows = stored("forms/promises.json")["tables"]["promises"]["rows"]
-    for form, sessions in ("ONNX, `file:", rows[:4]), ("in memory, `module:", rows[8:]):
-        promised, held = 100 * sessions[0][6], sum(session[-2] for session in sessions)
-        judged, recognized = (sum(session[column] for session in sessions) for column in (8, 9))
-        (verdict,) = {session[-1] for session in sessions}
-        line = next(line for line in NOTEBOOK.read_text(encoding="utf-8").splitlines() if line.startswith(f"| {form}"))
-        assert line.endswith(f"{promised:.1f} % | {recognized} of {judged} | {held} of 4 | `{verdict}` |")
-
-
 def test_figures_of_families_are_the_stored_ones():
     tables, page = stored("families/transfer.json")["tables"], NOTEBOOK.read_text(encoding="utf-8").splitlines()
     matrix = tables["matrix"]["rows"]

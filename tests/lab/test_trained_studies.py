@@ -10,7 +10,6 @@ import pytest
 import torch
 
 from patchlab.paper import deceive, transfer
-from patchlab.paper.deceive import shuffle_cells
 from patchlab.study.estimates import mean
 from patchlab.study.grid import short_name
 from patchlab.study.record import Record
@@ -238,24 +237,6 @@ def test_fixed_views_keep_their_pose_and_change_their_light(tmp_path):
     assert len(set(views.light.directional)) == 12 and len(set(views.pose.distance_mm)) == 1
     still = views_from(problem, np.array([0.0, 90.0]))
     assert not still.light.directional.any() and not still.sensor.noise.any() and (still.light.ambient == 1).all()
-
-
-def test_shuffling_keeps_every_texel_and_moves_whole_cells(tmp_path):
-    written(tmp_path, "carton")
-    scene = load_scene(tmp_path / "texture.toml")
-    subject = set_problem(scene).subject
-    design = np.random.default_rng(1).integers(0, 256, (1, subject.start().shape[2], 3), np.uint8)
-    shuffled = shuffle_cells(subject, design)
-    assert np.array_equal(shuffled, shuffle_cells(subject, design)) and not np.array_equal(shuffled, design)
-    first, textures = 0, (subject.surface.textures(each) for each in (design, shuffled))
-    for mask, was, now in zip(scene.canvas.mask, *textures, strict=True):
-        count = int(mask.sum())
-        parts = [np.sort(one[0, first : first + count].view("u1,u1,u1").ravel()) for one in (design, shuffled)]
-        assert np.array_equal(*parts)
-        if mask.all() and mask.shape == (32, 32):  # cells of 2 × 2
-            cells = [one.reshape(16, 2, 16, 2, 3).swapaxes(1, 2).reshape(256, 12) for one in (was, now)]
-            assert np.array_equal(*(np.unique(one, axis=0) for one in cells))
-        first += count
 
 
 def test_a_changed_scene_file_is_another_cell_and_ways_are_checked_early(tmp_path):

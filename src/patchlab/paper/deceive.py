@@ -1,7 +1,7 @@
-"""Textures that hide an object from networks, beside gray, noise and shuffled controls.
+"""Textures that hide an object from networks, beside gray and noise.
 
 In: scenes that the networks read well, networks, seeds, and ways (by default a free texture and one within 8/255 of the
-original). Out: rates of the design, the original object and gray, noise and shuffled controls on the same conditions;
+original). Out: rates of the design, the original object and gray and noise on the same conditions;
 the design minus each control, paired; contact sheets. The controls are the point: often plain gray alone hides an
 object, and only the difference is due to training. Controls ignore the ε-ball.
 
@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from pydantic import Field
 
 from patchlab.study import trained_designs
@@ -24,12 +23,9 @@ from patchlab.study.study import Cell, Result, Study
 from patchlab.study.trained_designs import views_from_sides
 from patchproof.optimizer.loop import best_design
 from patchproof.optimizer.promise import pictures_with_controls
-from patchproof.optimizer.subject import from_pixels
-from patchproof.optimizer.texture import Texture
 from patchproof.report.tables import Drawing, Table
-from patchproof.sheets.piece import CELLS
 
-CONTROLS = ("bare", "gray", "noise", "shuffled")
+CONTROLS = ("bare", "gray", "noise")
 _SHOWN_KINDS = ("design", *CONTROLS)
 _SHEET_PX, _SHEET_VIEWS = 160, 4
 
@@ -53,30 +49,12 @@ def run(settings: DeceiveSettings, base: Path, cell: Cell) -> dict[str, Any]:
     """Train against one network, and show the design and its controls to all networks."""
     problem = trained_designs.trained_problem(settings, base, cell)
     design = best_design(trained_designs.with_trainers(problem, cell))
-    things = pictures_with_controls(problem, design, CONTROLS[:-1])
-    things["shuffled"] = problem.subject.appearance(from_pixels(shuffle_cells(problem.subject, design), problem.device))
+    things = pictures_with_controls(problem, design, CONTROLS)
     suffix, content = trained_designs.design_file(problem, design)
     sheet = views_from_sides(problem, _SHEET_VIEWS), _SHEET_PX
     return trained_designs.test_and_draw(problem, cell.name, things, settings.n, sheet) | {
         f"{cell.name}.{suffix}": content
     }
-
-
-def shuffle_cells(texture: Texture, pixels: np.ndarray) -> np.ndarray:
-    """Each texture's texels moved cell by cell, 16 along its shorter side; cells that a mask cuts push the next ones
-    along.
-    """
-    rng = np.random.default_rng(int(texture.scene.sheet_id, 36))
-    result, first = pixels.copy(), 0
-    for mask in texture.canvas.mask:
-        rows, columns = np.nonzero(mask)
-        cell = max(min(mask.shape) / CELLS, 1)
-        number = (rows / cell).astype(int) * mask.shape[1] + (columns / cell).astype(int)
-        place = rng.permutation(number.max(initial=0) + 1)[number]
-        part = result[0, first : first + len(rows)]
-        part[np.argsort(number, kind="stable")] = part[np.argsort(place, kind="stable")]
-        first += len(rows)
-    return result
 
 
 def tables(settings: DeceiveSettings, results: Sequence[Result]) -> list[Table]:
