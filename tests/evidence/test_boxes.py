@@ -122,7 +122,7 @@ def test_drawn_boxes_judge_as_the_sheet_s_own_do_which_are_where_the_object_is(j
         margin = (max(width, height) - min(width, height)) / 2
         x, y = (margin, 0) if width > height else (0, margin)  # a report knows what lies in the middle square
         inside = np.clip(box, (x, y, x, y), (width - x, height - y, width - x, height - y))
-        assert iou(torch.tensor(told[name].edges)[None, None], torch.tensor(inside)[None]) > 0.95, name
+        assert iou(torch.tensor(told[name].numbers)[None, None], torch.tensor(inside)[None]) > 0.95, name
 
 
 def test_boxes_elsewhere_take_the_object_away_from_design_and_bare_photographs_even_when_a_run_goes_on(journey):
