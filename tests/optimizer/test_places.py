@@ -139,7 +139,8 @@ def test_a_piece_that_fits_only_in_one_spot_finds_it():
     """A face hardly larger than the piece: points elsewhere on it move to where the piece does not overhang."""
     size = PlaceFinder(open_scene(**SHARP)).size_mm
     ground = PlaceFinder(open_scene(mesh=trimesh.creation.box((size[0] + 4, size[1] + 4, 300)), **SHARP))
-    moved = [ground._upright_first(frame) for frame in ground._frames_to_try]  # not middles of sides
+    frames, spins = ground._frames_to_try, ground._spins[:2]
+    moved = [ground._candidate_near(frame, spin) for frame in frames for spin in spins]  # not middles of sides
     assert [spot for spot in moved if spot is not None and np.abs(spot.at[:2]).max() < 4]
 
 
