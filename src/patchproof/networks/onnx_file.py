@@ -132,8 +132,8 @@ class _GraphReader:
 
     def __init__(self, graph: dict[str, Any], weights: _Weights, opset: int):
         self.graph, self.nodes, self.opset = graph, graph.get("node", []), opset
-        self.used = {name for node in self.nodes for name in node.get("input", [])}
-        self.used |= {output["name"] for output in graph["output"]}
+        self.uses = Counter(name for node in self.nodes for name in node.get("input", []))
+        self.uses.update(output["name"] for output in graph["output"])
         self.weights: list[Tensor] = []
         self.count = 0  # numbered values so far
         # values known to have four dimensions; of weights the last two
@@ -213,7 +213,7 @@ class _GraphReader:
             return []
         operator, attributes = find_operator(name, self.opset), self._attributes(node)
         count = len(outputs) if name == "Split" else RESULTS.get(name, 1)
-        if self.used & {*outputs[count:]} - {""}:
+        if self.uses.keys() & {*outputs[count:]} - {""}:
             raise UnsupportedNetwork(f"{len(outputs)} results of {name}, where only {count} can be used")
         outputs = outputs[:count]
         if name == "Split" and len(inputs) == 1:

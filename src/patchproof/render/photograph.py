@@ -105,7 +105,7 @@ def affected_windows(views: Views) -> np.ndarray | None:
     views. None if that is unknown: for textures, through a lens with distortion, and if photographs have blur of their
     own.
     """
-    camera, scale = views.stage.camera, _scale(views)
+    camera, scale = views.stage.scene.camera, _scale(views)
     reach = reach_px(views.conditions.sensor, scale)
     has_distortion = views.frame_px != views.size_px or (camera is not None and camera.has_distortion)
     if views.piece is None or has_distortion or reach is None or _picture_blur_and_noise(views) is not None:
