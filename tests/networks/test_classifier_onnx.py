@@ -22,7 +22,7 @@ from patchproof.networks import batches
 from patchproof.networks.batches import Windows, tune_batches
 from patchproof.networks.bounds import UnsupportedNetwork
 from patchproof.networks.onnx_file import OPSETS, read_onnx
-from patchproof.networks.onnx_operators import FIXED_ATTRIBUTES, OPERATORS, REFUSED
+from patchproof.networks.onnx_operators import FIXED_ATTRIBUTES, OPERATORS, REFUSED, Operator
 from patchproof.sheets.manifest import load_manifest
 from test_zoo import judged
 
@@ -394,6 +394,16 @@ def test_an_operator_is_onnxruntime_s(opset, body, shape, value):
     got = network(torch.from_numpy(pictures)).numpy().astype("d")
     assert list(got.shape) == shape
     assert (got.reshape(-1) * np.cos(np.arange(got.size))).sum() == pytest.approx(value, rel=1e-4, abs=1e-4)
+
+
+def test_operators_of_torch_s_own_take_part_in_what_is_saved():
+    body = """a = Conv<group=3, pads=[0,0,1,1]>(x, D) b = Clip(a, Zero, Two) c = Conv(b, W) d = Conv(b, W)
+        e = Add(c, d) y = Relu(e)"""
+    network, *_ = read_onnx(onnx_files.model(body).SerializeToString(), lambda location: b"")
+    names = [getattr(step.compute, "__name__", "") for step in network.steps]
+    assert names == ["convolution.default", "_hardtanh_", *["convolution.default"] * 2, "add.Tensor", "relu_.default"]
+    network, *_ = read_onnx(onnx_files.model("y = Conv(x, W, F)").SerializeToString(), lambda location: b"")
+    assert isinstance(network.steps[0].compute, Operator)  # which sends a short bias to the pictures' device
 
 
 def test_every_operator_of_the_table_is_tried():

@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 
 from patchproof.app.begin.new import new_scene
-from patchproof.base.compute import Compute
 from patchproof.base.output import data_uri, new_folder, write_atomically
 from patchproof.base.progress import Progress, no_progress
+from patchproof.base.workers import Compute
 from patchproof.optimizer.run import Run, optimize
 from patchproof.optimizer.subject import as_pixels
 from patchproof.render.photograph import photograph

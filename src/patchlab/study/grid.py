@@ -16,10 +16,11 @@ from typing import Annotated, Any, TypeVar
 from pydantic import Field, model_validator
 
 from patchlab.study.study import Cell, Result
-from patchproof.base.settings import SceneSettings
+from patchproof.base.settings import OptimizeSettings, SceneSettings
 from patchproof.base.validation import StrictModel, expand_path, read_toml, validate_model
 from patchproof.classifier.load import load_classifier
 from patchproof.classifier.network import Classifier
+from patchproof.optimizer.loop import SELECT_VIEWS, is_selection_step
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.scene.interface import Scene
 from patchproof.scene.scene import build_scene
@@ -110,6 +111,12 @@ def problem_of(base: Path, values: Mapping[str, Any]) -> Problem:
     """The problem of the scene and networks in a cell's values."""
     scene = scene_of(base, values)
     return set_problem(scene, models=[cached_network(name, scene.base) for name in network_names(base, values)])
+
+
+def views_per_network(settings: OptimizeSettings) -> int:
+    """The number of views that each network sees in training and selection."""
+    selections = sum(is_selection_step(settings, number) for number in range(1, settings.steps + 1))
+    return settings.steps * settings.views + selections * SELECT_VIEWS
 
 
 @lru_cache(maxsize=8)

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from patchproof.base.compute import Compute
 from patchproof.base.errors import Refused
 from patchproof.base.goal import Goal
 from patchproof.base.intervals import estimate_difference, rate
@@ -24,6 +23,7 @@ from patchproof.base.notebook import draw_rates
 from patchproof.base.output import new_folder
 from patchproof.base.progress import Progress, no_progress
 from patchproof.base.validation import summarize_names
+from patchproof.base.workers import Compute
 from patchproof.classifier.network import Classifier
 from patchproof.optimizer.evaluate import run_responses
 from patchproof.optimizer.promise import CONTROLS, PROMISE_VIEWS

@@ -7,9 +7,9 @@ dim, oblique and in cluttered places, so that the bare object and the controls a
 from pathlib import Path
 
 from patchproof.app.verify import verify
-from patchproof.base.compute import Compute
 from patchproof.base.output import new_folder
 from patchproof.base.progress import Progress, no_progress
+from patchproof.base.workers import Compute
 from patchproof.optimizer.run import optimize
 from patchproof.report.words import promise_lines, verdict_lines
 from patchproof.reprints.reprint import reprint

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from patchproof.base.compute import Compute
 from patchproof.base.errors import Refused
 from patchproof.base.folder_lock import lock_folder
 from patchproof.base.geometry import apply_homography, rect_corners
@@ -29,6 +28,7 @@ from patchproof.base.output import (
 )
 from patchproof.base.progress import Progress, no_progress
 from patchproof.base.validation import refuse_untrusted
+from patchproof.base.workers import Compute
 from patchproof.channel.printer import load_printer, printer_of_sheet
 from patchproof.classifier.load import load_classifier
 from patchproof.classifier.network import Classifier

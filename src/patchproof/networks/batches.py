@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from patchproof.networks.tensor_observer import TensorObserver
+from patchproof.networks.graph import TensorObserver
 
 if TYPE_CHECKING:
     from patchproof.networks.cuts import Cut

@@ -8,16 +8,16 @@ values of absurd size and wrong inputs. Activations overwrite their input where 
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from patchproof.networks.bounds import MAX_DIMENSIONS, quote
-from patchproof.networks.tensor_observer import TensorObserver
 
 _ATEN = torch.ops.aten
 MAX_VALUE = 1 << 30  # numbers in one value, for each picture: VGG's at the largest input_px
@@ -247,3 +247,28 @@ _TERMS: dict[Any, Callable[..., int]] = {
     **{operator.default: lambda _, kernel, *__: math.prod(kernel) for operator in _POOLS},
     _ATEN.convolution.default: lambda _, weight, *others: weight[:, 0].numel() if others[4] else weight[0].numel(),
 }
+
+
+class TensorObserver(TorchDispatchMode):
+    """A context that calls `look` with each tensor that an operator, or its stand-in from `instead`, creates, with the
+    operator and its arguments.
+    """
+
+    def __init__(
+        self, look: Callable[[Tensor, Any, tuple], None], instead: Mapping[Any, Callable[..., Any]] | None = None
+    ):
+        super().__init__()
+        self._look, self._instead = look, instead or {}
+
+    @classmethod
+    def _should_skip_dynamo(cls) -> bool:
+        """Answer without torch's own check, which would import its compiler; nothing here is compiled."""
+        return False
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        compute: Any = self._instead.get(func, func)
+        results = compute(*args, **(kwargs or {}))
+        for value in results if isinstance(results, (list, tuple)) else [results]:
+            if isinstance(value, Tensor):
+                self._look(value, func, args)
+        return results

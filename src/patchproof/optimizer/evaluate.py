@@ -9,7 +9,6 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from patchproof.base.compute import Compute
 from patchproof.base.errors import Refused
 from patchproof.base.folder_lock import lock_folder
 from patchproof.base.goal import Goal
@@ -17,6 +16,7 @@ from patchproof.base.input import is_file
 from patchproof.base.output import write_atomically
 from patchproof.base.progress import Advance, Progress, no_advance, no_progress
 from patchproof.base.validation import StrictModel
+from patchproof.base.workers import Compute
 from patchproof.classifier.network import Classifier
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.optimizer.promise import (
@@ -55,10 +55,6 @@ class Evaluation(StrictModel):
             claims = {name: each} | {f"{name}, {kind}": claim for kind, claim in each.controls.items()}
             rates |= {key: (claim.rate, claim.interval) for key, claim in claims.items()}
         return notebook_html(f"recognized in {self.n} fresh conditions", {}, rates)
-
-    def to_json(self) -> str:
-        """Return the text of evaluate.json."""
-        return self.model_dump_json(indent=1, exclude={"models": {"__all__": {"name"}}}) + "\n"
 
 
 def evaluate(
@@ -101,7 +97,8 @@ def evaluate(
     seed = run.scene.seed if seed is None else seed
     result = Evaluation(n=n, seed=seed, goal=run.promise.target.goal, models=evaluations)
     with lock_folder(folder):
-        write_atomically(folder / "evaluate.json", result.to_json())
+        text = result.model_dump_json(indent=1, exclude={"models": {"__all__": {"name"}}}) + "\n"
+        write_atomically(folder / "evaluate.json", text)
     return result
 
 

@@ -18,7 +18,6 @@ import cv2
 import numpy as np
 
 from patchproof.base.color import LINEAR_FROM_CODE, codes_from_srgb, srgb_from_linear
-from patchproof.base.compute import Compute
 from patchproof.base.errors import Refused
 from patchproof.base.geometry import MM_PER_INCH
 from patchproof.base.input import hash_file, is_file
@@ -27,6 +26,7 @@ from patchproof.base.progress import Progress, no_progress
 from patchproof.base.settings import NO_PAGE, named_paths
 from patchproof.base.text import printable
 from patchproof.base.validation import summarize_names
+from patchproof.base.workers import Compute
 from patchproof.classifier.network import Classifier
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.optimizer.promise import PromiseOptions

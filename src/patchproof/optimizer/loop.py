@@ -126,12 +126,6 @@ def _ends(settings: OptimizeSettings, number: int, views: int) -> bool:
     return done > before or number == settings.steps
 
 
-def views_per_network(settings: OptimizeSettings) -> int:
-    """The number of views that each network sees in training and selection."""
-    selections = sum(is_selection_step(settings, number) for number in range(1, settings.steps + 1))
-    return settings.steps * settings.views + selections * SELECT_VIEWS
-
-
 def _descend(problem: Problem, state: State, answer: Answer) -> TrainingStep:
     """One step down the gradient of the answer's loss and of the subject's penalty."""
     largest, gradient = float(answer.gradient.abs().max()), answer.gradient

@@ -18,12 +18,11 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from patchproof.base.compute import Compute
 from patchproof.base.errors import Refused
 from patchproof.base.intervals import Estimate, student_mean
 from patchproof.base.progress import Advance, Progress, no_progress
 from patchproof.base.validation import Side, StrictModel
-from patchproof.base.workers import fork_workers
+from patchproof.base.workers import Compute, fork_workers
 from patchproof.classifier.network import Classifier
 from patchproof.optimizer.expectation import gradient_in_views, training_views
 from patchproof.optimizer.loop import draft, start

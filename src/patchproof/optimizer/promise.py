@@ -116,7 +116,9 @@ def _responses_until_settled(
         if half_width is None or last == n:
             break
         claims = _paired_claims(by_kind, per_session)
-        settled = {kind for kind, claim in claims.items() if _is_settled(claim, half_width)}
+        # a difference is as precise as the rate has to be, or so far from 0 that an early look does no harm
+        halves = {kind: np.ptp(claim.difference_interval) / 2 for kind, claim in claims.items()}
+        settled = {k for k, half in halves.items() if half <= half_width or abs(claims[k].difference) >= SETTLED * half}
         unsettled = [kind for kind in unsettled if kind not in settled]
         places = _place_numbers(conditions[:last], per_session)
         counts = count_by_session(by_kind["design"].recognized[0], per_session, places)
@@ -136,12 +138,6 @@ def _paired_claims(by_kind: Mapping[str, Responses], per_session: int) -> dict[s
     design = by_kind["design"]
     paired = design.select(np.flatnonzero(_control_mask(design.recognized.shape[1], per_session)))
     return control_claims({**by_kind, "design": paired}, 0, min(CONTROL_VIEWS, per_session))
-
-
-def _is_settled(claim: ControlClaim, half_width: float) -> bool:
-    """True if a difference is as precise as the rate has to be, or so far from 0 that an early look does no harm."""
-    half = np.ptp(claim.difference_interval) / 2
-    return bool(half <= half_width or abs(claim.difference) >= SETTLED * half)
 
 
 def _look_positions(total: int, per_session: int) -> list[int]:

@@ -22,7 +22,6 @@ import torch
 from pydantic import BaseModel, Field
 
 from patchproof.base import output
-from patchproof.base.compute import Compute
 from patchproof.base.errors import Refused
 from patchproof.base.fingerprint import refuse_other_inputs
 from patchproof.base.folder_lock import lock_folder
@@ -33,6 +32,7 @@ from patchproof.base.settings import SceneSettings, named_paths
 from patchproof.base.text import short_repr
 from patchproof.base.validation import refuse_untrusted, validate_model
 from patchproof.base.version import __version__
+from patchproof.base.workers import Compute
 from patchproof.classifier.network import Classifier
 from patchproof.optimizer.expectation import last_pictures
 from patchproof.optimizer.loop import (
