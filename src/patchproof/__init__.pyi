@@ -6,11 +6,11 @@ from .app.verify import verify as verify
 from .base.errors import PatchproofError as PatchproofError
 from .base.errors import Refused as Refused
 from .base.goal import Goal as Goal
+from .base.progress import Compute as Compute
 from .base.progress import Progress as Progress
 from .base.progress import progress_bar as progress_bar
 from .base.settings import SceneSettings as SceneSettings
 from .base.version import __version__ as __version__
-from .base.workers import Compute as Compute
 from .channel.printer import Printer as Printer
 from .channel.printer import load_printer as load_printer
 from .classifier.custom import classifier_of as classifier_of

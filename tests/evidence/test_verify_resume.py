@@ -77,7 +77,7 @@ def test_a_kill_costs_what_was_in_work_and_not_the_report(folder, sheet, tmp_pat
     process.join()
     assert process.exitcode == -signal.SIGKILL
     assert len((out / "photos.jsonl").read_text().splitlines()) == 3 and not (out / "report.json").exists()
-    with pytest.raises(Refused, match="unfinished verification: add --resume"):
+    with pytest.raises(Refused, match="which is unfinished: continue with --resume"):
         verify(folder, sheet, out)
     with open(out / "photos.jsonl", "a") as file:
         file.write('{"file": "b3.jpg", "sha')  # a line that the kill cut short

@@ -24,7 +24,7 @@ from synthetic_photos import (
 from patchproof.base.color import ciede2000, lab_from_linear, linear_from_srgb, srgb_from_linear
 from patchproof.base.errors import Refused
 from patchproof.base.intervals import wilson
-from patchproof.base.workers import Compute
+from patchproof.base.progress import Compute
 from patchproof.channel.printer import identity_printer, load_printer
 from patchproof.classifier import Classifier
 from patchproof.evidence.appearance import _cross_fitted_cells, fit_cells

@@ -216,7 +216,7 @@ def test_a_2d_patch_has_its_size_in_the_networks_pixels_and_no_frame(scene_file,
     config = two_classes(tmp_path, scene_file)
     settings = validate_model(patch2d.Patch2dSettings, read_toml(config), "study.toml")
     (tmp_path / "work").mkdir()
-    classifier = patch2d.load_classifier("builtin", tmp_path)
+    classifier = patch2d.cached_network("builtin", tmp_path)
     one = ImageClass("mug")
     scene = class_scene(settings, tmp_path, one, classifier, 0, tmp_path / "work")
     side = classifier.input_px

@@ -19,9 +19,10 @@ from PIL import Image
 from patchproof.base.errors import Refused
 from patchproof.base.goal import Goal
 from patchproof.base.intervals import wilson
+from patchproof.base.progress import Compute
 from patchproof.base.settings import SceneSettings
 from patchproof.base.validation import validate_model
-from patchproof.base.workers import Compute, Workers, can_fork, use_threads
+from patchproof.base.workers import Workers, can_fork, use_threads
 from patchproof.classifier.network import Classifier
 from patchproof.optimizer import expectation, loop, run
 from patchproof.optimizer.evaluate import promise_run

@@ -31,7 +31,7 @@ STAY = {  # in every step, with their reason
     "expectation.py:_views_answer": "loss, confidence and rate of a batch, together, for the log",
     "camera.py:gains": "none: counted where it is computed, on the CPU",
     "printer.py:vary_print": "none: what it moves is there, from `_piece_light`",
-    "light.py:lighting_of": "a batch's light",
+    "camera.py:lighting_of": "a batch's light",
     "views.py:_sensor_on_device": "a batch's exposure, white balance and tone",
     "photograph.py:_piece_light": "a batch's print",
     "views.py:_look_up_codes": "a batch's backgrounds, exposed by table",

@@ -11,8 +11,7 @@ import numpy as np
 
 from patchproof.app.begin.new import new_scene
 from patchproof.base.output import data_uri, new_folder, write_atomically
-from patchproof.base.progress import Progress, no_progress
-from patchproof.base.workers import Compute
+from patchproof.base.progress import Compute, Progress, no_progress
 from patchproof.optimizer.run import Run, optimize
 from patchproof.optimizer.subject import as_pixels
 from patchproof.render.photograph import photograph

@@ -20,7 +20,7 @@ from patchproof.base.settings import OptimizeSettings, SceneSettings
 from patchproof.base.validation import StrictModel, expand_path, read_toml, validate_model
 from patchproof.classifier.load import load_classifier
 from patchproof.classifier.network import Classifier
-from patchproof.optimizer.loop import SELECT_VIEWS, is_selection_step
+from patchproof.optimizer import loop
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.scene.interface import Scene
 from patchproof.scene.scene import build_scene
@@ -115,8 +115,8 @@ def problem_of(base: Path, values: Mapping[str, Any]) -> Problem:
 
 def views_per_network(settings: OptimizeSettings) -> int:
     """The number of views that each network sees in training and selection."""
-    selections = sum(is_selection_step(settings, number) for number in range(1, settings.steps + 1))
-    return settings.steps * settings.views + selections * SELECT_VIEWS
+    selections = sum(loop.is_selection_step(settings, number) for number in range(1, settings.steps + 1))
+    return settings.steps * settings.views + selections * loop.SELECT_VIEWS
 
 
 @lru_cache(maxsize=8)

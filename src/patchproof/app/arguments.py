@@ -21,9 +21,10 @@ from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_
 import numpy as np
 
 from patchproof.base.errors import Refused
+from patchproof.base.progress import Compute
 from patchproof.base.text import brief
 from patchproof.base.validation import spelling_hint
-from patchproof.base.workers import Compute, share_cores
+from patchproof.base.workers import share_cores
 
 _LEAST = {"n": 1, "copies": 1, "sessions": 1, "steps": 1, "jobs": 1, "input_px": 8, "seed": 0, "ledger_photos": 0}
 _OPTIONS = ("Compute", "PromiseOptions", "CaptureInfo", "ReprintSetup")

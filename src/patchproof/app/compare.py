@@ -21,9 +21,8 @@ from patchproof.base.goal import Goal
 from patchproof.base.intervals import estimate_difference, rate
 from patchproof.base.notebook import draw_rates
 from patchproof.base.output import new_folder
-from patchproof.base.progress import Progress, no_progress
+from patchproof.base.progress import Compute, Progress, no_progress
 from patchproof.base.validation import summarize_names
-from patchproof.base.workers import Compute
 from patchproof.classifier.network import Classifier
 from patchproof.optimizer.evaluate import run_responses
 from patchproof.optimizer.promise import CONTROLS, PROMISE_VIEWS

@@ -8,8 +8,7 @@ from pathlib import Path
 
 from patchproof.app.verify import verify
 from patchproof.base.output import new_folder
-from patchproof.base.progress import Progress, no_progress
-from patchproof.base.workers import Compute
+from patchproof.base.progress import Compute, Progress, no_progress
 from patchproof.optimizer.run import optimize
 from patchproof.report.words import promise_lines, verdict_lines
 from patchproof.reprints.reprint import reprint

@@ -26,9 +26,8 @@ from patchproof.base.output import (
     write_atomically,
     write_pictures,
 )
-from patchproof.base.progress import Progress, no_progress
+from patchproof.base.progress import Compute, Progress, no_progress
 from patchproof.base.validation import refuse_untrusted
-from patchproof.base.workers import Compute
 from patchproof.channel.printer import load_printer, printer_of_sheet
 from patchproof.classifier.load import load_classifier
 from patchproof.classifier.network import Classifier

@@ -1,13 +1,17 @@
-"""Progress callbacks of long work.
+"""Long work: the device and processes that it runs on, and callbacks of its progress.
 
-In: nothing. Out: `progress_bar`; the type of the `progress` parameter of every long public function, and its default,
-which reports nothing. Functions below a public one take an `advance` callback, for the stage that their caller named.
+In: a user's choice. Out: `Compute`, whose fields a verb either uses or refuses by name; `progress_bar`; the type of the
+`progress` parameter of every long public function, and its default, which reports nothing. Functions below a public one
+take an `advance` callback, for the stage that their caller named.
 """
 
 import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
+
+from patchproof.base.errors import Refused
 
 LINE_EVERY_S = 30.0  # of progress, if standard error is not a terminal
 Progress = Callable[[str, int, int], None]
@@ -15,6 +19,29 @@ Progress = Callable[[str, int, int], None]
 
 Advance = Callable[[int, int], None]
 """Called as `advance(done, total)`: a `Progress` whose stage is fixed, `partial(progress, "promise")`."""
+
+
+@dataclass(frozen=True)
+class Compute:
+    """The device and processes that work runs on. Results do not depend on `jobs` if one job uses one thread, too.
+
+    Attributes:
+        device: torch device of scene and networks, "cpu" or "cuda"; photographs are judged on the CPU only.
+        jobs: processes on this machine that share the work, 1 or more.
+        cluster: address of a dask scheduler whose workers do the work in place of this machine's; None for no cluster.
+    """
+
+    device: str = "cpu"
+    jobs: int = 1
+    cluster: str | None = None
+
+    def without(self, verb: str, *, device: bool = False, cluster: bool = False) -> "Compute":
+        """Return this object; refused if it names a device or cluster that `verb`, by the keywords, cannot use."""
+        if device and self.device != "cpu":
+            raise Refused(f'device = "cpu" for {verb}', f'"{self.device}"', "leave device out of Compute")
+        if cluster and self.cluster is not None:
+            raise Refused(f"no cluster for {verb}", f'"{self.cluster}"', "use jobs, which share this machine")
+        return self
 
 
 def no_progress(*done: object) -> None:

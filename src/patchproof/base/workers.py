@@ -22,7 +22,6 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent import futures
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
 from contextlib import closing, contextmanager, nullcontext
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -36,29 +35,6 @@ MAX_TRIES = 3  # of an item whose worker dies each time
 MAX_QUEUED_ITEMS = 1000  # on a cluster at a time: enough to keep it busy, and for its scheduler to plan ahead
 _CONNECT_TIMEOUT_S = 10  # to a cluster's scheduler
 _QUOTA = Path("/sys/fs/cgroup/cpu.max")  # of a container: microseconds of processor time per period
-
-
-@dataclass(frozen=True)
-class Compute:
-    """The device and processes that work runs on. Results do not depend on `jobs` if one job uses one thread, too.
-
-    Attributes:
-        device: torch device of scene and networks, "cpu" or "cuda"; photographs are judged on the CPU only.
-        jobs: processes on this machine that share the work, 1 or more.
-        cluster: address of a dask scheduler whose workers do the work in place of this machine's; None for no cluster.
-    """
-
-    device: str = "cpu"
-    jobs: int = 1
-    cluster: str | None = None
-
-    def without(self, verb: str, *, device: bool = False, cluster: bool = False) -> "Compute":
-        """Return this object; refused if it names a device or cluster that `verb`, by the keywords, cannot use."""
-        if device and self.device != "cpu":
-            raise Refused(f'device = "cpu" for {verb}', f'"{self.device}"', "leave device out of Compute")
-        if cluster and self.cluster is not None:
-            raise Refused(f"no cluster for {verb}", f'"{self.cluster}"', "use jobs, which share this machine")
-        return self
 
 
 class Workers:

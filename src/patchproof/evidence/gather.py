@@ -18,11 +18,11 @@ import numpy as np
 from patchproof.base.errors import Refused
 from patchproof.base.input import is_folder
 from patchproof.base.intervals import wilson
-from patchproof.base.progress import Advance, no_advance
+from patchproof.base.progress import Advance, Compute, no_advance
 from patchproof.base.settings import background_summary
 from patchproof.base.text import printable
 from patchproof.base.validation import summarize_names
-from patchproof.base.workers import Compute, open_workers
+from patchproof.base.workers import open_workers
 from patchproof.evidence.batch import MAX_PICTURED_PHOTOS, Journal, PhotoItem, measure_all, reread_square, settings_key
 from patchproof.evidence.classify import Judges, judges_of
 from patchproof.evidence.grouping import (

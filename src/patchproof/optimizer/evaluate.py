@@ -14,9 +14,8 @@ from patchproof.base.folder_lock import lock_folder
 from patchproof.base.goal import Goal
 from patchproof.base.input import is_file
 from patchproof.base.output import write_atomically
-from patchproof.base.progress import Advance, Progress, no_advance, no_progress
+from patchproof.base.progress import Advance, Compute, Progress, no_advance, no_progress
 from patchproof.base.validation import StrictModel
-from patchproof.base.workers import Compute
 from patchproof.classifier.network import Classifier
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.optimizer.promise import (

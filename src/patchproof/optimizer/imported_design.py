@@ -22,11 +22,10 @@ from patchproof.base.errors import Refused
 from patchproof.base.geometry import MM_PER_INCH
 from patchproof.base.input import hash_file, is_file
 from patchproof.base.output import check_folder, new_folder
-from patchproof.base.progress import Progress, no_progress
+from patchproof.base.progress import Compute, Progress, no_progress
 from patchproof.base.settings import NO_PAGE, named_paths
 from patchproof.base.text import printable
 from patchproof.base.validation import summarize_names
-from patchproof.base.workers import Compute
 from patchproof.classifier.network import Classifier
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.optimizer.promise import PromiseOptions

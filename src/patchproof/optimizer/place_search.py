@@ -20,9 +20,9 @@ from pydantic import Field
 
 from patchproof.base.errors import Refused
 from patchproof.base.intervals import Estimate, student_mean
-from patchproof.base.progress import Advance, Progress, no_progress
+from patchproof.base.progress import Advance, Compute, Progress, no_progress
 from patchproof.base.validation import Side, StrictModel
-from patchproof.base.workers import Compute, fork_workers
+from patchproof.base.workers import fork_workers
 from patchproof.classifier.network import Classifier
 from patchproof.optimizer.expectation import gradient_in_views, training_views
 from patchproof.optimizer.loop import draft, start

@@ -27,12 +27,11 @@ from patchproof.base.fingerprint import refuse_other_inputs
 from patchproof.base.folder_lock import lock_folder
 from patchproof.base.input import is_file, read_file, read_json, read_text
 from patchproof.base.output import CHECKPOINT_FILE, RUN_FILE, require_finished_run
-from patchproof.base.progress import Advance, Progress, no_progress
+from patchproof.base.progress import Advance, Compute, Progress, no_progress
 from patchproof.base.settings import SceneSettings, named_paths
 from patchproof.base.text import short_repr
 from patchproof.base.validation import refuse_untrusted, validate_model
 from patchproof.base.version import __version__
-from patchproof.base.workers import Compute
 from patchproof.classifier.network import Classifier
 from patchproof.optimizer.expectation import last_pictures
 from patchproof.optimizer.loop import (

@@ -25,10 +25,10 @@ from patchproof.base.color import photo_codes_from_srgb
 from patchproof.base.errors import Refused
 from patchproof.base.geometry import MM_PER_INCH
 from patchproof.base.output import image_bytes, make_folder, new_folder
-from patchproof.base.progress import Progress, no_progress
+from patchproof.base.progress import Compute, Progress, no_progress
 from patchproof.base.settings import NO_PAGE
 from patchproof.base.text import short_repr
-from patchproof.base.workers import Compute, fork_workers, result_of
+from patchproof.base.workers import fork_workers, result_of
 from patchproof.channel.object_box import project_box
 from patchproof.channel.printer import Printer, load_printer
 from patchproof.optimizer.run import Run

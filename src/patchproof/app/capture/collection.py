@@ -29,9 +29,8 @@ from patchproof.evidence.classify import judges_of
 from patchproof.evidence.gather import report_of
 from patchproof.evidence.grouping import BY_FOLDERS, Grouping, merge_folders, reject_copies
 from patchproof.evidence.measure import MeasuredPhoto
-from patchproof.evidence.ranges import figures_of
 from patchproof.evidence.results import PhotoEntry, Report
-from patchproof.evidence.task import Options, task_of
+from patchproof.evidence.task import Options, figures_of, task_of
 from patchproof.evidence.verdict import PHOTOS_PER_SESSION
 from patchproof.photo.registration import DesignCorners
 from patchproof.report.page import jpeg

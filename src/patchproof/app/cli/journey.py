@@ -11,9 +11,8 @@ from typer import Argument, BadParameter, Exit, Option
 from patchproof.app.cli import console
 from patchproof.app.cli.console import Cluster, Device, Jobs, Models, Overwrite, Resume, Seed, Trust, say, warn
 from patchproof.base.errors import Refused
-from patchproof.base.progress import progress_bar
+from patchproof.base.progress import Compute, progress_bar
 from patchproof.base.text import command_text
-from patchproof.base.workers import Compute
 
 PrintableControl = Literal["mean", "gray", "noise", "blank"]  # that can be printed
 PhotographedControl = Literal["bare", "mean", "gray", "noise"]  # that can hang on the object in place of the design
