@@ -3,6 +3,7 @@
 import sys
 import types
 import warnings
+from dataclasses import replace
 
 import pytest
 import torch
@@ -10,7 +11,7 @@ from torch import nn
 
 from patchlab.training.fit import fold_batch_norm
 from patchproof.base.errors import Refused
-from patchproof.classifier import Classifier, load_classifier, zoo
+from patchproof.classifier import Classifier, load, load_classifier, zoo
 from patchproof.classifier.builtin import SmallNetwork
 from patchproof.classifier.check import check_network
 from patchproof.classifier.load import use_full_precision
@@ -89,6 +90,16 @@ def test_what_is_odd_about_a_network_stays_with_it():
     with pytest.warns(UserWarning, match="hardly tells pictures apart"):
         (note,) = load_classifier(classifier).notes
     assert "hardly tells pictures apart" in note
+
+
+def test_a_network_is_checked_once_as_long_as_nothing_about_it_changes(monkeypatch):
+    checked, taken = load_classifier(Classifier("it", None, 16, LABELS, GOOD)), []
+    monkeypatch.setattr(load, "check_network", lambda *given: taken.append(given))
+    assert load_classifier(checked) is checked and not taken
+    again = load_classifier(replace(checked, labels=LABELS[:-1]))
+    assert len(taken) == 1 and again.labels == LABELS[:-1] and load_classifier(again) is again
+    load_classifier(checked)  # the network is the same, the labels are not
+    assert len(taken) == 2
 
 
 @pytest.mark.parametrize("name", ["resnet50", "", "torch:x", "models/a.onnx", "http://x/y.pt2", "Builtin"])

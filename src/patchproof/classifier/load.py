@@ -70,7 +70,7 @@ def load_classifier(
 
         name = labeled_module(name, "python:network")
     if isinstance(name, Classifier):
-        return name if name.checked_on == str(device) else _prepare(name, device)
+        return _prepare(name, device)
     if not isinstance(name, str):
         got = f"an object of type {type(name).__name__}"
         raise Refused("a network's name, or a network in memory", got, "wrap it with classifier_of or detector_of")
@@ -96,15 +96,17 @@ def load_classifier(
 
 
 def _prepare(classifier: Classifier, device: torch.device | str, is_own: bool = False) -> Classifier:
-    """Freeze the classifier, check it, and choose the batches in which it computes fastest on the device. A network
-    from a file is refused if that takes too long or, on a CPU, too much memory: a few lines may ask for a lot.
+    """Freeze the classifier, check it unless that is done, and choose the fastest batches on the device. A network from
+    a file is refused if that takes too long or, on a CPU, too much memory: a few lines may ask for a lot.
     """
+    checked_as = classifier.KIND, str(device), classifier.input_px, classifier.labels
 
     def check_and_tune() -> Classifier:
         with warnings.catch_warnings(action="always", record=True) as said:
             check_network(classifier, device, is_own)
             pictures = smooth_pictures(classifier.input_px).to(device)
-            tuned = replace(classifier, network=tune_batches(classifier.network, pictures))
+            network = tune_batches(classifier.network, pictures)
+            tuned = replace(classifier, network=network)
             if classifier.name.startswith(("file:", "module:", "python:")):  # wrapped by others
                 from patchproof.classifier.wrapping import check_wrapping
 
@@ -112,11 +114,14 @@ def _prepare(classifier: Classifier, device: torch.device | str, is_own: bool = 
         notes = tuple(dict.fromkeys(str(each.message) for each in said))
         for note in notes:
             warnings.warn(note, stacklevel=4)
-        return replace(tuned, notes=notes, checked_on=str(device))
+        network.checked_as = checked_as
+        return replace(tuned, notes=notes)
 
     use_full_precision(device)
     if isinstance(classifier.network, torch.nn.Module):
         freeze(classifier.network).to(device)
+    if getattr(classifier.network, "checked_as", None) == checked_as:
+        return classifier
     if not classifier.name.startswith("file:"):
         return check_and_tune()
     threads, network = torch.get_num_threads(), classifier.network

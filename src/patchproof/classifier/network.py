@@ -42,7 +42,6 @@ class Classifier:
     network: Callable[[Tensor], Tensor]
     least_score: float | None = None  # from which a detector's boxes count; a classifier needs none
     notes: tuple[str, ...] = ()  # what is odd about it
-    checked_on: str = ""  # the device that `load_classifier` has checked it on
 
     KIND: ClassVar[str] = "classifier"
     LOOKS_AT_BOXES: ClassVar[bool] = False  # whether the object's box matters

@@ -59,6 +59,7 @@ class BatchedNetwork(torch.nn.Module):
         super().__init__()
         self.network, self.size, self.max_pictures, self.memory_format = network, size, size, torch.contiguous_format
         self.sample: Tensor | None = None  # on a CPU, two of the pictures given for tuning
+        self.checked_as: Any = None  # the kind, device, size and labels with which `load_classifier` has checked it
 
     def train(self, mode: bool = True) -> "BatchedNetwork":
         """Change nothing: networks stay in the mode they came in."""
