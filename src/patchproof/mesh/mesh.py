@@ -136,9 +136,9 @@ def transform_part(part: MeshPart, transform: np.ndarray) -> MeshPart:
     """Return a part moved by `transform` 3×4; a mirror, which turns triangles inside out, reverses their corners."""
     rotation = transform[:, :3]
     sign = -1 if np.linalg.det(rotation) < 0 else 1
-    # normals turn by the inverse transpose up to a factor, as cofactors, so that flattening works
-    cofactors = sign * np.cross(np.roll(rotation, -1, 0), np.roll(rotation, -2, 0))
     with np.errstate(invalid="ignore", over="ignore"):
+        # normals turn by the inverse transpose up to a factor, as cofactors, so that flattening works
+        cofactors = sign * np.cross(np.roll(rotation, -1, 0), np.roll(rotation, -2, 0))
         vertices = part.vertices @ rotation.T + transform[:, 3]
         normals = None if part.normals is None else part.normals @ cofactors.T
     return replace(part, vertices=vertices, faces=part.faces[:, ::sign], normals=normals)
