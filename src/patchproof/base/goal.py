@@ -8,7 +8,7 @@ promises, evaluations and photographs alike:
     does_not_help  it lies below `LEAST_GAIN`: a gain worth having is ruled out
     cannot_tell    it holds both
 
-mirrored for `deceive`. The loss of each goal is in `optimizer.goals`.
+mirrored for `deceive`. The loss of each goal is in `optimizer.subject`.
 """
 
 from collections.abc import Mapping

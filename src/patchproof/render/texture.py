@@ -29,7 +29,7 @@ class TexelLayout:
 
     Each level has one more row and column than its size, for bilinear taps that read beyond the last texel: the first
     ones again if textures repeat (`wrap`), else the last ones. Its rows follow each other, or lie `pitch` texels apart
-    if the table is one picture (atlas.py).
+    if the table is one picture (surfaces.py).
     """
 
     places: Tensor

@@ -160,9 +160,8 @@ def sheet_scene(pdf_path: str | Path, run: Run) -> tuple[Manifest, Scene]:
     scene = run.scene.with_template(manifests[0].settings.get("sheet", {}).get("template", default))
     manifest = next((each for each in manifests if each.sheet_id == scene.sheet_id), manifests[0])
     if is_manifest and (manifest.design is None or manifest.settings.get("sheet", {}).get("template") != NO_PAGE):
-        raise Refused(
-            "a PDF of a sheet, or the manifest of a print without a page", str(pdf_path), "name the PDF beside it"
-        )
+        expected = "a PDF of a sheet, or the manifest of a print without a page"
+        raise Refused(expected, str(pdf_path), "name the PDF beside it")
     if manifest.sheet_id != scene.sheet_id:
         expected, do = f"a sheet of this run ({scene.sheet_id})", "name the run that it was made from"
         raise Refused(expected, f"sheet {manifest.sheet_id}", do)
@@ -175,8 +174,7 @@ def sent_pixels(pdf_path: str | Path, manifest: Manifest, scene: Scene) -> Tenso
     """
     if Path(pdf_path).suffix == ".json" and manifest.design is not None:
         return torch.tensor(manifest.design.pixels()).permute(2, 0, 1)[None] / 255
-    finest = scene.closest_px_per_mm(scene.settings.camera.photo_px)
-    dpi = float(np.clip(OVERSAMPLING * finest * MM_PER_INCH, *DPI_RANGE))
+    dpi = float(np.clip(OVERSAMPLING * scene.closest_px_per_mm(scene.photo_px) * MM_PER_INCH, *DPI_RANGE))
     return torch.tensor(rasterize_piece(pdf_path, manifest, dpi)).permute(2, 0, 1)[None] / 255
 
 

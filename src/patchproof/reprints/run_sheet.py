@@ -178,8 +178,7 @@ def draw_plan_view(scene: PatchScene, template: Template) -> PlacementPicture:
     low, high = project(scene.mesh.vertices).min(0), project(scene.mesh.vertices).max(0)
     outline = project(placement.world(rect_border((0, 0, *placement.size_mm), 16)))  # bent paper has bent edges
     half = np.maximum(np.abs([low, high, outline.min(0), outline.max(0)]).max(0) * _PLAN_MARGIN, 1.0)
-    seams, names = [], []
-    tiles = []
+    seams, names, tiles = [], [], []
     if template.tiles is not None:
         from patchproof.sheets.tiles import plan_tiles
 

@@ -1,10 +1,10 @@
 """A mesh with a piece of paper that follows its surface (`patch.bend`): a flat card, or rolled round a cylinder.
 
 In: a mesh, the frame a card would have, size and spin. Out: a `Placement` whose middle lies where the frame's normal
-meets the surface. Paper does not stretch: where a card does not lie close, it rolls round the
-cylinder that fits the surface under it best (least squares, five parameters), raised until it is clear of the surface
-everywhere; that height counts as gap. Left out on purpose: paper that is stretched over surfaces curved both ways,
-whose photographs nobody could unroll; cones, folds, cuts and darts.
+meets the surface. Paper does not stretch: where a card does not lie close, it rolls round the cylinder that fits the
+surface under it best (least squares, five parameters), raised until it is clear of the surface everywhere; that height
+counts as gap. Left out on purpose: paper that is stretched over surfaces curved both ways, whose photographs nobody
+could unroll; cones, folds, cuts and darts.
 """
 
 from dataclasses import replace

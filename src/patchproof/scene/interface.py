@@ -1,10 +1,9 @@
 """The interface of scenes: what every scene offers, and what those with a printed piece offer in addition.
 
-A scene is a mesh with a piece on it (`PatchScene`), one whose piece has no place yet
-(`UnplacedScene`), one with a texture of its own that may change (`TextureScene`), or pictures: photographs of the
-object (`PhotoScene`) or a folder of images (`ImageScene`). Each has its own module, whose `build` makes it from a
-`SceneSource`; the module `scene` chooses it. Code that needs a piece calls `require_piece`, which refuses a scene
-without one. N is the number of conditions.
+A scene is a mesh with a piece on it (`PatchScene`), one whose piece has no place yet (`UnplacedScene`), one with a
+texture of its own that may change (`TextureScene`), or pictures: photographs of the object (`PhotoScene`) or a folder
+of images (`ImageScene`). A module's `build` makes each from a `SceneSource`; the module `scene` chooses it. Code that
+needs a piece calls `require_piece`, which refuses a scene without one. N is the number of conditions.
 """
 
 from abc import ABC, abstractmethod

@@ -39,8 +39,7 @@ class PatchScene(PieceScene, MeshScene):
     def from_bare(cls, bare: MeshScene) -> Self:
         """Return the bare object with its piece at the settings' place; refused if it cannot lie there."""
         piece, placement, unreadable, notes = _place_piece(bare)
-        fields = {"piece": piece, "placement": placement, "unreadable": unreadable, "notes": notes}
-        return cls(**vars(bare) | fields)
+        return cls(**vars(bare) | {"piece": piece, "placement": placement, "unreadable": unreadable, "notes": notes})
 
     def placement_summary(self) -> dict[str, Any]:
         """Implement `Scene.placement_summary`."""
@@ -144,8 +143,7 @@ def require_unplaced(scene: Scene) -> UnplacedScene:
     """Return the scene as one whose piece has no place yet; refused for any other."""
     if isinstance(scene, UnplacedScene):
         return scene
-    remedy = "set it, or use the place that the scene has"
-    raise Refused('a scene with patch.place = "auto"', scene.description(), remedy)
+    raise Refused('a scene with patch.place = "auto"', scene.description(), "set it, or use the place that it has")
 
 
 def _place_piece(scene: MeshScene) -> tuple[Piece, Placement, float, tuple[str, ...]]:

@@ -121,8 +121,7 @@ def _stripes(rng: np.random.Generator, px: int) -> np.ndarray:
 
 
 def _checks(rng: np.random.Generator, px: int) -> np.ndarray:
-    waves = rng.uniform(1.5, 14)
-    y, x = np.mgrid[:px, :px] / px * waves
+    y, x = np.mgrid[:px, :px] / px * rng.uniform(1.5, 14)
     return (np.floor(x) + np.floor(y)) % 2
 
 
