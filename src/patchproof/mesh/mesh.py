@@ -135,8 +135,8 @@ def _corner_arrays(part: MeshPart, face_normals: np.ndarray) -> tuple[np.ndarray
 def transform_part(part: MeshPart, transform: np.ndarray) -> MeshPart:
     """Return a part moved by `transform` 3×4; a mirror, which turns triangles inside out, reverses their corners."""
     rotation = transform[:, :3]
-    sign = -1 if np.linalg.det(rotation) < 0 else 1
     with np.errstate(invalid="ignore", over="ignore"):
+        sign = -1 if np.linalg.det(rotation) < 0 else 1
         # normals turn by the inverse transpose up to a factor, as cofactors, so that flattening works
         cofactors = sign * np.cross(np.roll(rotation, -1, 0), np.roll(rotation, -2, 0))
         vertices = part.vertices @ rotation.T + transform[:, 3]
