@@ -26,7 +26,7 @@ LEAST_COLORS = 8  # 12 numbers from 24 values; with fewer a single bad color spo
 _CONVERGED = 1e-3  # smaller changes of weights change no printed digit
 _MOST_CELLS = 600  # of a photograph enter the fit
 _EVEN_SHARE = 0.7  # of the cells
-_CELLS_PER_ANCHOR = 8  # paper and ink each enter once for so many: a design's colors do not fix white and black
+CELLS_PER_ANCHOR = 8  # paper and ink each enter once for so many: a design's colors do not fix white and black
 MAX_TONE = 0.2  # from 0.25 on a tone curve is not monotonic
 _INK_RIDGE = 3e-4  # of the mean square of a term
 _TERMS_RIDGE = 0.05  # of a photograph's terms, per squared unit: keeps what cells cannot tell near its start
@@ -118,7 +118,7 @@ def choose_cells(
     chosen = np.flatnonzero(inner)[uneven <= np.quantile(uneven, _EVEN_SHARE)] if uneven.size else np.zeros(0, int)
     if len(chosen) > _MOST_CELLS:
         chosen = np.random.default_rng(0).choice(chosen, _MOST_CELLS, replace=False)
-    means, anchors = means.reshape(-1, means.shape[-1])[chosen], max(len(chosen) // _CELLS_PER_ANCHOR, 1)
+    means, anchors = means.reshape(-1, means.shape[-1])[chosen], max(len(chosen) // CELLS_PER_ANCHOR, 1)
     anchors, ink = (0, paper) if ink is None else (anchors, ink)
     ends, seen_ends = np.repeat([np.ones(3), ink], anchors, 0), np.repeat([paper, seen_ink], anchors, 0)
     return CellColors(
@@ -192,7 +192,7 @@ def affine12(photographed: np.ndarray, promised: np.ndarray) -> ShownColors | No
 
 def white_black(paper: np.ndarray, ink: np.ndarray, promised_ink: np.ndarray) -> ShownColors:
     """The map per channel that takes 1 to photographed paper and `promised_ink` to photographed ink."""
-    gain = np.maximum(paper - ink, 1e-3) / (1 - promised_ink)
+    gain = np.maximum(paper - ink, 1e-3) / np.maximum(1 - promised_ink, 1e-3)  # a printer's file may say white ink
     return ShownColors(np.column_stack([np.diag(gain), ink - gain * promised_ink]), kind="white_black")
 
 

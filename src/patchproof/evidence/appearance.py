@@ -23,7 +23,7 @@ import numpy as np
 
 from patchproof.base.color import ciede2000, lab_from_linear, photo_codes_from_srgb, srgb_from_linear
 from patchproof.base.geometry import apply_homography, rect_corners
-from patchproof.channel.print_colors import ShownColors, affine12, white_black
+from patchproof.channel.print_colors import CELLS_PER_ANCHOR, ShownColors, affine12, white_black
 from patchproof.evidence.results import Color, Geometry, Remark
 from patchproof.evidence.surface import PromisedColors, Surface
 from patchproof.photo.detect import LINEAR_FLOAT32_FROM_CODE
@@ -38,7 +38,6 @@ _PICTURE_PX = 192
 _SAMPLES_PER_CELL = 8  # along a side, each the mean of the photograph's pixels there
 _STRIP_PX = 100_000  # 1.6 MB as light: caches hold it
 _LIGHT_TABLE = np.repeat(LINEAR_FLOAT32_FROM_CODE[None, :, None], 3, 2)
-_CELLS_PER_ANCHOR = 8  # paper and ink each enter the fit once for so many cells
 _GLOSS_LIGHT = 0.15  # linear light, paper = 1
 MOST_NOISE = 3.0  # ΔE00 that the photograph alone makes
 _CODE_ERROR = 0.8  # of a cell, by rounding and JPEG: from 2 to 5 stops too dark it explains what a right print measures
@@ -182,7 +181,7 @@ def _noise_delta(linear: np.ndarray, cells: np.ndarray, fit: ShownColors, pixels
 
 def fit_cells(photographed: np.ndarray, promised: np.ndarray, light: FrameLight, ink: np.ndarray) -> ShownColors:
     """Fit a color map to N×3 cells, paper and ink; to paper and ink alone if the cells are too few or too alike."""
-    anchors = max(len(photographed) // _CELLS_PER_ANCHOR, 1)  # the design's colors alone do not fix white and black
+    anchors = max(len(photographed) // CELLS_PER_ANCHOR, 1)  # the design's colors alone do not fix white and black
     count = anchors if light.clipped > _MOST_CLIPPED_PAPER else 2 * anchors  # overexposed paper is no reference
     seen_ends, ends = (np.repeat(pair, anchors, 0)[:count] for pair in ([light.ink, light.paper], [ink, np.ones(3)]))
     fit = affine12(np.concatenate([photographed, seen_ends]), np.concatenate([promised, ends]))

@@ -2,10 +2,10 @@
 
 In: a `PinholePhoto` and the markers detected in it. Out: `LocatedSheet`, its `Geometry` and `CameraPose`. The design's
 own pixels are checked, too: markers in a piece's corners fit a plane even if the paper bulges between them. Figures of
-rolled paper are those of the tangent plane at the design's middle.
-A camera file gives intrinsics and lens terms; the picture is then resampled without lens distortion. Without one the
-matrix follows from EXIF's focal length with the principal point in the middle, or is unknown. A camera file also fits
-upright photographs, as those of a camera that was turned by 90° clockwise, as most phones are.
+rolled paper are those of the tangent plane at the design's middle. A camera file gives intrinsics and lens terms; the
+picture is then resampled without lens distortion. Without one the matrix follows from EXIF's focal length with the
+principal point in the middle, or is unknown. A camera file also fits upright photographs, as those of a camera that was
+turned by 90° clockwise, as most phones are.
 """
 
 from collections.abc import Mapping

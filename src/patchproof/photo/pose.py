@@ -99,7 +99,7 @@ def flat_sheet_position(
 def bent_sheet_position(
     shape: Shape, matrix_px: np.ndarray, focal_spread: float, point_mm, turn: float = 0.0, matrix_is_known: bool = False
 ) -> CameraPosition:
-    """`flat_sheet_position` for paper that a cylinder or a lens explains, by the tangent plane at the point."""
+    """`flat_sheet_position` for any shape: for paper on a cylinder by the tangent plane at the point."""
     if shape.unit is not None:
         scale = np.append(shape.unit, 1.0)
         homography = np.append(shape.parameters[:8], 1.0) * scale

@@ -1,8 +1,7 @@
 """Render a page that needs no other file: HTML from a template, and pictures, difference maps and figures as bytes.
 
 In: a template and values, which are escaped; uint8 sRGB H×W×3, float cells, or functions that draw with matplotlib.
-Out: HTML, for which a missing value is an error; the bytes of files, and `data:` URIs. All reports share the map's
-scale, so that two can be compared.
+Out: HTML, for which a missing value is an error; the bytes of files. All reports share the map's scale.
 """
 
 import hashlib

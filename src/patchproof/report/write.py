@@ -21,7 +21,7 @@ from patchproof.report.page import DELTA_TOP, render_page, saved_pictures
 
 _FIRST = ("file", "status", "code", "figure", "threshold", "advice")
 # figures of a photograph by which recognition is split, in a band's words
-_BANDS = {"tilt_deg": "tilted {:.0f} to {:.0f}°", "px_per_mm": "{:.2g} to {:.2g} pixels per mm"}
+_BANDS = {"tilt_deg": "tilted {:.0f} to {:.0f}°", "px_per_mm": "{:.3g} to {:.3g} pixels per mm"}
 _LEAST_BANDED = 12  # photographs, of which each band has a third
 _STEPS = {  # of the gap ledger
     "light_and_camera": "light, camera color",

@@ -1,11 +1,11 @@
 """`plan`: which parts of a scene are modeled and which are not, each with the figure that decided it.
 
-In: a scene file. Out: the plan as lines: where the piece lies (after a search, if the scene asks for
-one) and how a simpler or richer surface would differ, the pixels that views have for design and markers, the error of
-leaving out each term of light, camera and renderer, how many photographs prove a promise, and the cost of a step. All
-figures come from the code that optimizes. Terms are measured with a draft of a few steps, since a classifier that
-ignores the design would miss none of them. What photographs can prove depends on how much sessions differ, which a
-small promise of the draft measures; the sheet's plan page says it of the design.
+In: a scene file. Out: the plan as lines: where the piece lies (after a search, if the scene asks for one) and how a
+simpler or richer surface would differ, the pixels that views have for design and markers, the error of leaving out each
+term of light, camera and renderer, how many photographs prove a promise, and the cost of a step. All figures come from
+the code that optimizes. Terms are measured with a draft of a few steps, since a classifier that ignores the design
+would miss none of them. What photographs can prove depends on how much sessions differ, which a small promise of the
+draft measures; the sheet's plan page says it of the design.
 
 Left out on purpose: deciding for the user. The plan says which terms can go; the scene file decides.
 """
@@ -67,11 +67,8 @@ def plan_geometry(scene_path: str | Path, *, progress: Progress = no_progress) -
     networks = ", ".join(classifier.name for classifier in problem.classifiers)
     lies = fit_text(fit) if fit["family"] == "card" else fit["reason"]
     surface = f"{fit['family']}, {size_text(fit['size_mm'])} mm: {lies}", placement_with_other_bend(scene)[1]
-    lines = [
-        f"{Path(scene_path).name}: {target.goal} {target.label}, {scene.description()}, seen by {networks}",
-        *found,
-    ]
-    lines += ["surface", *_indented(filter(None, surface))]
+    head = f"{Path(scene_path).name}: {target.goal} {target.label}, {scene.description()}, seen by {networks}"
+    lines = [head, *found, "surface", *_indented(filter(None, surface))]
     lines += ["resolution", *_indented(_resolution_lines(resolution_plan(problem)))]
     if isinstance(scene, PieceScene):
         lines += ["markers", f"  {_marker_line(scene, fit['family'])}"]
