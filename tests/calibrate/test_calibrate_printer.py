@@ -243,6 +243,9 @@ def test_a_chart_page_is_rehearsed_without_a_printer(tmp_path):
     assert read_well.sum() >= 40 and error.mean() < 1.5
     with pytest.raises(typer.BadParameter, match="of a run's sheet"):
         cli.app([*rehearsed, "--sessions", "2", "--out", str(tmp_path / "other")], standalone_mode=False)
+    for scale in ("inf", "nan", "0"):
+        with pytest.raises(typer.BadParameter, match="should be"):
+            cli.app([*rehearsed, "--print-scale", scale, "--out", str(tmp_path / "other")], standalone_mode=False)
 
 
 def test_without_the_flat_field_the_same_photograph_would_be_far_off(shots, readings):

@@ -202,6 +202,8 @@ def test_paper_and_ink_go_where_they_were_promised():
     fit = white_black(np.array([0.6, 0.5, 0.4]), np.array([0.05, 0.04, 0.06]), np.array([0.02, 0.02, 0.02]))
     assert fit.undo(np.array([0.6, 0.5, 0.4])) == pytest.approx(1.0)
     assert fit.undo(np.array([0.05, 0.04, 0.06])) == pytest.approx(0.02)
+    white = white_black(np.full(3, 0.6), np.full(3, 0.05), np.array([1.0, 0.02, 0.02]))  # as a printer's file may say
+    assert white.undo(np.full(3, 0.05)) == pytest.approx([1, 0.02, 0.02])
 
 
 def test_markers_that_blur_made_larger_are_neither_noise_nor_an_error():

@@ -213,7 +213,7 @@ def reprint(
     sessions: Annotated[int, Option(min=1, help="Places to take them in, each with its light, camera and folder.")] = 1,
     seed: Seed = None,
     printer: Annotated[str | None, Option(help="Another printer than the scene's: a name or a file.")] = None,
-    print_scale: Annotated[float, Option(min=0.01, max=10, help="Size of the print beside the sheet's.")] = 1.0,
+    print_scale: Annotated[float, Option(min=0.01, max=4, help="Size of the print beside the sheet's.")] = 1.0,
     control: Annotated[PhotographedControl | None, Option(help="Photograph a control in place of the design.")] = None,
     jobs: Jobs = None,
     trust: Trust = False,
