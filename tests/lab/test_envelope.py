@@ -60,7 +60,7 @@ def test_a_value_replaces_one_condition_and_leaves_the_others(drawn):
 
 @pytest.mark.parametrize("tilt_deg", [0.0, 35.0, 88.0])
 def test_tilt_is_the_angle_from_the_patch_s_axis_and_keeps_its_direction(world, drawn, tilt_deg):
-    moved, frame = conditions_at(world.scene, drawn, {"tilt": tilt_deg}), world.scene.frame
+    moved, frame = conditions_at(drawn, {"tilt": tilt_deg}), world.scene.frame
     before = geometry.orbit(drawn.pose.azimuth_deg, drawn.pose.elevation_deg, frame.normal, frame.up)
     after = geometry.orbit(moved.pose.azimuth_deg, moved.pose.elevation_deg, frame.normal, frame.up)
     assert np.degrees(np.arccos((after @ frame.normal).clip(-1, 1))) == pytest.approx(np.full(4, tilt_deg), abs=1e-5)
@@ -89,7 +89,7 @@ def test_gap_moves_the_piece_along_its_normal_and_size_shrinks_it(world):
     assert off.center_mm - flat.center_mm == pytest.approx(30 * flat.normal)
     assert off.vertices_mm - flat.vertices_mm == pytest.approx(np.tile(30 * flat.normal, (4, 1)))
     drawn = world.scene.draw("evaluate", 2)
-    small = conditions_at(world.scene, drawn, {"size": 0.5})
+    small = conditions_at(drawn, {"size": 0.5})
     assert small.pose.printed_scale == pytest.approx(drawn.pose.printed_scale / 2)
 
 

@@ -122,7 +122,7 @@ def _shoot(axis: str, values: Mapping[str, float], number: int) -> MeasuredShot:
     point["blur"] *= point["module_px"]
     point["darkness"] -= point.pop("brightness", 0)
     point["distance"] = scene.focal_px * scene.piece.module_mm / point.pop("module_px")
-    drawn = conditions_at(scene, scene.draw("reprint", 1, 0, number), point)
+    drawn = conditions_at(scene.draw("reprint", 1, 0, number), point)
     if axis == "cast":
         drawn = with_values(drawn, white_balance=drawn.sensor.white_balance * np.array([value, 1, 1 / value]) ** 0.5)
     piece = _piece_under_tape(value) if axis == "hidden" else sheet.piece

@@ -95,8 +95,11 @@ def mitsuba() -> ModuleType:
     except ImportError as error:
         raise Refused("Mitsuba 3 for path tracing", "none installed", "pip install 'patchproof[pathtrace]'") from error
     if mi.variant() is None:
-        mi.set_variant("llvm_ad_rgb", "scalar_rgb")  # the first that loads
-        if mi.variant().startswith("llvm") and drjit.detail.llvm_version()[0] < _FIRST_LLVM:
+        try:
+            mi.set_variant("llvm_ad_rgb")
+            if drjit.detail.llvm_version()[0] < _FIRST_LLVM:
+                mi.set_variant("scalar_rgb")
+        except ImportError:  # raised by Dr.Jit if it finds no LLVM
             mi.set_variant("scalar_rgb")
     if mi.variant().startswith("llvm"):
         drjit.set_thread_count(torch.get_num_threads())

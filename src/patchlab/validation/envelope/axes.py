@@ -85,7 +85,7 @@ def is_possible(scene: Scene, name: str) -> bool:
     return name != "curl" or require_patch(scene).placement.is_flat
 
 
-def conditions_at(scene: Scene, conditions: Conditions, point: SweepPoint) -> Conditions:
+def conditions_at(conditions: Conditions, point: SweepPoint) -> Conditions:
     """Conditions with camera and light at the point."""
     for axis, value in point.items():
         if axis == "tilt":

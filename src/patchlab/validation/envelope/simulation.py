@@ -122,7 +122,7 @@ def recognize_target(
         for first in range(min(4, len(conditions))):
             rows = np.arange(first, len(conditions), 4)
             design, gray = (piece_at(world, axis, value, first, is_gray) for is_gray in (False, True))
-            drawn, shown = conditions_at(world.scene, conditions[rows], {axis: value}), (design, None, gray)
+            drawn, shown = conditions_at(conditions[rows], {axis: value}), (design, None, gray)
             respond = _respond_to_files if axis == "jpeg" else responses
             for kind, answer in respond(problem, dict(zip(out, shown, strict=True)), drawn).items():
                 out[kind][i, rows] = answer.recognized[0]
@@ -147,7 +147,7 @@ def measure_photos(
     """P×N measurements of photographs, as `verify` makes them."""
     out: list[list[Measurement]] = []
     for value in values:
-        stage, drawn = _stage_at(world, axis, value), conditions_at(world.scene, conditions, {axis: value})
+        stage, drawn = _stage_at(world, axis, value), conditions_at(conditions, {axis: value})
         out.append([])
         for i in range(len(drawn)):
             piece, one = piece_at(world, axis, value, i % 4), drawn[[i]]
