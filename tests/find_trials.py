@@ -3,8 +3,9 @@
 `PATCHPROOF_DATA=DIR python tests/find_trials.py --prints 400 --without 500 --designs DIR --rows FILE` pastes prints of
 block designs, photographs and the pictures in --designs (optimized designs), as the printer `office` shows them, into
 photographs of DIR under other light, veil, tone, blur, noise and JPEG, 66 to 450 px wide; and looks for designs in
-pictures without them, every other one of which shows another print. FILE holds a JSON line for each; those that it has
-are not made again.
+pictures without them, every other one of which shows another print. With `--photographs FOLDER` the pictures without
+are its photographs instead, each once, as they are. FILE holds a JSON line for each; those that it has are not made
+again.
 """
 
 from __future__ import annotations
@@ -97,14 +98,17 @@ def photograph(design: np.ndarray | None, width_px: float, rng: np.random.Genera
     return np.ascontiguousarray(cv2.imdecode(file, 1)[:, :, ::-1]), corners
 
 
-def trial(number: int, shown: bool, designs: list[Path]) -> dict:
+def trial(number: int, shown: bool, designs: list[Path], real: list[Path]) -> dict:
     rng = np.random.default_rng([number, shown])
     kind, width_px = KINDS[number % len(KINDS)], float(np.exp(rng.uniform(np.log(66), np.log(450))))
     design, other = draw_design(kind, designs, rng), None
-    if not shown and number % 2:
-        other = draw_design(kind, designs, rng)
-        other = None if other is design else other
-    srgb, corners = photograph(design if shown else other, width_px, rng)
+    if real and not shown:
+        srgb, corners = np.ascontiguousarray(cv2.imread(str(real[number]))[:, :, ::-1]), np.zeros((4, 2))
+    else:
+        if not shown and number % 2:
+            other = draw_design(kind, designs, rng)
+            other = None if other is design else other
+        srgb, corners = photograph(design if shown else other, width_px, rng)
     found, said, start = None, None, time.process_time()
     try:
         found = find_design(srgb, design, (100.0, 100.0))
@@ -137,12 +141,17 @@ def main() -> None:
     parser.add_argument("--without", type=int, default=500)
     parser.add_argument("--designs", type=Path, required=True)
     parser.add_argument("--rows", type=Path, required=True)
+    parser.add_argument("--photographs", type=Path)
     asked = parser.parse_args()
     rows = [json.loads(line) for line in asked.rows.read_text().splitlines()] if asked.rows.is_file() else []
+    folder = sorted(asked.photographs.iterdir()) if asked.photographs else []
+    real = [path for path in folder if cv2.haveImageReader(str(path))]
+    without = min(asked.without, len(real)) if real else asked.without
+    real = [real[i * len(real) // without] for i in range(without)] if real else []
     done, designs = {(row["number"], row["shown"]) for row in rows}, sorted(asked.designs.glob("*.png"))
-    wanted = [(i, shown) for shown, n in ((True, asked.prints), (False, asked.without)) for i in range(n)]
+    wanted = [(i, shown) for shown, n in ((True, asked.prints), (False, without)) for i in range(n)]
     for number, shown in (each for each in wanted if each not in done):
-        rows.append(trial(number, shown, designs))
+        rows.append(trial(number, shown, designs, real))
         with asked.rows.open("a", encoding="utf-8") as file:
             file.write(json.dumps(rows[-1]) + "\n")
     print(*summary(rows), sep="\n")

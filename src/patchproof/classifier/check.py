@@ -21,19 +21,16 @@ MIN_VARIATION = 1e-6  # of the spread: even untrained networks vary more between
 USUAL_VARIATION = 1e-3  # trained networks vary by a tenth
 
 
-def check_network(classifier: Classifier, device: torch.device | str = "cpu", is_own: bool = False) -> None:
-    """Refuse a network whose answers or gradients cannot be trusted; warn of one that looks odd. What the outputs of
-    one of this package (`is_own`) mean is known.
-    """
+def check_network(classifier: Classifier, device: torch.device | str = "cpu") -> None:
+    """Refuse a network whose answers or gradients cannot be trusted; warn of one that looks odd."""
+    from patchproof.classifier.outputs import check_shape, check_values
+
     photos = smooth_pictures(classifier.input_px).to(device)
     name = f"the network {classifier.name}"
     try:
         with torch.no_grad():
             output = classifier.network(photos)
-            if not is_own:
-                from patchproof.classifier.outputs import check_shape
-
-                check_shape(output, classifier)
+            check_shape(output, classifier)
             batches = (photos.clone(), photos[1:2], photos.flip(1))
             again, alone, swapped = map(classifier.square_logits, batches)
     except (Refused, Warning):  # a warning where they are errors
@@ -45,10 +42,7 @@ def check_network(classifier: Classifier, device: torch.device | str = "cpu", is
     logits = output[..., 4:].amax(1) if classifier.LOOKS_AT_BOXES else output
     if not torch.isfinite(logits).all() or torch.isnan(output).any():
         raise Refused("finite logits", f"NaN or infinity from {name}", "check its weights and its number format")
-    if not is_own:
-        from patchproof.classifier.outputs import check_values
-
-        check_values(classifier, photos, output)
+    check_values(classifier, photos, output)
     if classifier.LOOKS_AT_BOXES and float(logits.max()) <= NO_BOX_LOGIT:
         warnings.warn(f"{name} finds nothing in smooth pictures: its gradients were not tested", stacklevel=2)
         return

@@ -96,14 +96,16 @@ def load_classifier(
 
 
 def _prepare(classifier: Classifier, device: torch.device | str, is_own: bool = False) -> Classifier:
-    """Freeze the classifier, check it unless that is done, and choose the fastest batches on the device. A network from
-    a file is refused if that takes too long or, on a CPU, too much memory: a few lines may ask for a lot.
+    """Freeze the classifier, check it unless that is done or it is this package's own, and choose the fastest batches
+    on the device. A network from a file is refused if that takes too long or, on a CPU, too much memory: a few lines
+    may ask for a lot.
     """
     checked_as = classifier.KIND, str(device), classifier.input_px, classifier.labels
 
     def check_and_tune() -> Classifier:
         with warnings.catch_warnings(action="always", record=True) as said:
-            check_network(classifier, device, is_own)
+            if not is_own:
+                check_network(classifier, device)
             pictures = smooth_pictures(classifier.input_px).to(device)
             network = tune_batches(classifier.network, pictures)
             tuned = replace(classifier, network=network)
