@@ -273,6 +273,14 @@ def test_every_picture_has_words_of_its_own(tmp_path):
         assert len(tags.texts) == len(set(tags.texts)) == count and all(tags.texts)
 
 
+def test_a_table_of_more_rows_than_one_reads_is_folded(tmp_path):
+    tables = [Table(f"of{rows}", "Every cell", ("name",), (("car",),) * rows) for rows in (40, 41)]
+    write_results(tmp_path, Results("study", "toy", "Toys.", "1 cell", {}, tables, (), {}, {}))
+    text = (tmp_path / "toy.html").read_text()
+    assert "<summary>41 rows, also in toy_of41.csv</summary>" in text and "40 rows" not in text
+    assert (tmp_path / "toy_of41.csv").is_file() and text.count("<details>") == text.count("</details>") == 2
+
+
 def test_a_figure_for_a_phone_is_narrow_with_panels_one_below_the_other_and_whole_titles(tmp_path):
     def draw(figure):
         for axes in figure.subplots(1, 3, width_ratios=(1, 2, 1)):
