@@ -34,15 +34,7 @@ from patchproof.base.validation import refuse_untrusted, validate_model
 from patchproof.base.version import __version__
 from patchproof.classifier.network import Classifier
 from patchproof.optimizer.expectation import last_pictures
-from patchproof.optimizer.loop import (
-    SELECT_AFTER,
-    State,
-    is_save_step,
-    load_checkpoint,
-    save_checkpoint,
-    start,
-    steps,
-)
+from patchproof.optimizer.loop import SELECT_AFTER, State, is_save_step, load_checkpoint, save_checkpoint, start, steps
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.optimizer.promise import PROMISE_VIEWS, VIEWS_PER_SESSION, PromiseOptions, make_promise
 from patchproof.optimizer.subject import (
