@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 DEFAULT, CEILING, CONTROLS = "default", "ceiling", ("bare", "gray")
+MAX_RIGHT_PX = 2.0  # of a corner that is found right
 # By method: the name in the chart. Efforts are whole runs with a promise; the others make a design alone.
 NAMES = {
     **{"draft": "--draft", DEFAULT: "default", "thorough": "--thorough", "sign": "signed steps", "flat": "2D patch"},
@@ -230,9 +231,6 @@ def _photo_table(settings: SpeedSettings, results: Sequence[Result]) -> Table:
     )
     head = ("detector", "photograph", "photographs a second", "corner error, px", "share right")
     return Table("photos", "Speed of finding a sheet against its error", head, tuple(rows), about)
-
-
-MAX_RIGHT_PX = 2.0
 
 
 def figures(settings: SpeedSettings, results: Sequence[Result]) -> tuple[Drawing, ...]:

@@ -146,7 +146,7 @@ def _printers(settings: RealPrintsSettings, every: Cells) -> dict[str, tuple[Pri
         else:
             others = np.setdiff1d(np.unique(some.photo), held)
             start = load_printer(_BASE)
-            printer = printer_of_ink("left-out", start, separate_ink(some.of(others), start)[0], {"source": "a study"})
+            printer = printer_of_ink("left-out", start, separate_ink(some.of(others), start), {"source": "a study"})
         found[group] = printer, held
     return found
 
@@ -159,7 +159,7 @@ def _colors(settings: RealPrintsSettings, every: Cells) -> Iterator[dict[str, An
     for printer, held in _printers(settings, every).values():
         for photo in held:
             seen = some.of(np.array([photo]))
-            best = fit_photo(seen, printer, unchanged)[1]
+            best = fit_photo(seen, printer, unchanged)
             distance = ciede2000(lab_from_linear(np.clip(best, 0, 1)), lab_from_linear(seen.light))
             light = linear_from_srgb(printer_output(printer, seen.code / 255))
             yield {
