@@ -106,6 +106,8 @@ def optimize(
 ) -> Run:
     """Optimize the patch of a scene, promise its rate, and write both into a folder.
 
+    Method: Pestana et al., section 3.
+
     Args:
         scene: a scene, or the path of a scene file.
         out: the run's folder, new or empty.
@@ -122,7 +124,7 @@ def optimize(
             (views).
 
     Raises:
-        Refused: for a scene, network or folder that cannot be used. Method: Pestana et al., section 3.
+        Refused: for a scene, network or folder that cannot be used.
 
     Examples:
         ```python
