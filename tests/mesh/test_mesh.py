@@ -151,6 +151,12 @@ def test_texture_pixels_and_wrapped_coordinates_with_v_down(tmp_path):
     assert mesh.materials[0].base_color_linear == (1, 1, 1) and mesh.warnings == ()
 
 
+def test_a_comment_behind_a_face_takes_no_texture_away(tmp_path):
+    file = textured_obj(tmp_path)
+    file.write_text(file.read_text().replace("3/3\n", "3/3 # see http://example.org/a-b\n"))
+    assert load_mesh(file, 4, "y").materials[0].texture_srgb is not None
+
+
 def test_gltf_coordinates_are_v_down_already_and_its_color_is_linear_to_the_last_digit(tmp_path):
     uv = np.float32([[0.25, 0.1], [1.5, 0.1], [0.25, 3]])
     materials = [{"name": "paint", "pbrMetallicRoughness": {"baseColorFactor": [0.0012, 0.3333, 1, 1]}}]

@@ -203,7 +203,7 @@ def _photographed(axis: str, key: str, values: tuple[float, ...], *methods: str,
 
 PROBES = (
     _photographed(
-        *("distance, px per module", "module_px", (5, 3.5, 2.5, 2, 1.7, 1.4, 1.2, 1, 0.8)), "markers", "rectification"
+        "distance, px per module", "module_px", (5, 3.5, 2.5, 2, 1.7, 1.4, 1.2, 1, 0.8), "markers", "rectification"
     ),
     _photographed("distance, px per module", "module_px", (5, 3.5, 2.5, 2, 1.7, 1.4, 1.2), "pose", tilt=50.0),
     _photographed("tilt, °", "tilt", (0, 30, 50, 60, 66, 72, 76, 80, 84), "markers", "rectification"),
@@ -290,8 +290,6 @@ def tables(settings: BreaksSettings, results: Sequence[Result]) -> tuple[Table, 
     every.sort(key=lambda row: _ORDER.index(row[0]))
     about = (
         f"good: {MIN_SHARE:.0%} of {settings.photos} photographs or {settings.draws} verdicts, {MIN_COVERAGE:.0%} of "
-    )
-    about += (
         f"{settings.draws} promises; silent: bad trials that nothing was said about, at the bad points that were tried"
     )
     points = Table("points", "Every point", ("method", "axis", "value", "good", "silent", "said"), tuple(every))

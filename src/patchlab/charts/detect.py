@@ -36,11 +36,11 @@ def find_fitted_corners(srgb: np.ndarray) -> MarkerCorners:
     return find_sheet(srgb, frozenset(corners_mm()), corners_mm(), DICTIONARY).corners_px
 
 
-def find_opencv_corners(srgb: np.ndarray, refinement: int, dictionary: str = DICTIONARY) -> dict[int, np.ndarray]:
+def find_opencv_corners(srgb: np.ndarray, refinement: int) -> dict[int, np.ndarray]:
     """Find corners by OpenCV's detector as it is, with one of its refinements."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = refinement
-    detector = cv2.aruco.ArucoDetector(aruco_dictionary(dictionary), parameters)
+    detector = cv2.aruco.ArucoDetector(aruco_dictionary(DICTIONARY), parameters)
     quads, ids, _ = detector.detectMarkers(cv2.cvtColor(srgb, cv2.COLOR_RGB2GRAY))
     found = [] if ids is None else zip(ids.ravel(), quads, strict=True)
     return {int(i): quad.reshape(4, 2) + 0.5 for i, quad in found if i in corners_mm()}

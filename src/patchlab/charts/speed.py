@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 DEFAULT, CEILING, CONTROLS = "default", "ceiling", ("bare", "gray")
+MAX_RIGHT_PX = 2.0  # of a corner that is found right
 # By method: the name in the chart. Efforts are whole runs with a promise; the others make a design alone.
 NAMES = {
     **{"draft": "--draft", DEFAULT: "default", "thorough": "--thorough", "sign": "signed steps", "flat": "2D patch"},
@@ -204,9 +205,8 @@ def tables(settings: SpeedSettings, results: Sequence[Result]) -> tuple[Table, .
     c = settings.ceiling
     line_about = f"{c.steps} steps, the best of {c.seeds} seeds at {c.places} places, chosen in other views"
     if line:
-        line_about += (
-            f"; beyond the default {100 * line.value:+.1f} points [{100 * line.low:.1f}, {100 * line.high:.1f}]"
-        )
+        line_about += f"; beyond the default {100 * line.value:+.1f} points"
+        line_about += f" [{100 * line.low:.1f}, {100 * line.high:.1f}]"
     return (
         Table("methods", "Seconds of a run against gain", ("method", "seconds", "gain", "front"), tuple(rows), about),
         Table("ceiling", "How far the default is from it", ("pair", "default", "ceiling", "beyond"), lines, line_about),
@@ -227,13 +227,10 @@ def _photo_table(settings: SpeedSettings, results: Sequence[Result]) -> Table:
             rows.append((result.cell.values["finder"], size, speed, off, float((worst < MAX_RIGHT_PX).mean())))
     about = (
         f"{settings.photos} photographs of flat paper with eight markers, tilt to 60°, blur to 1.2 px, JPEG 60 to 95; "
+        f"one core, decoding not counted; right: all four corners of the design within {MAX_RIGHT_PX:g} px"
     )
-    about += f"one core, decoding not counted; right: all four corners of the design within {MAX_RIGHT_PX:g} px"
     head = ("detector", "photograph", "photographs a second", "corner error, px", "share right")
     return Table("photos", "Speed of finding a sheet against its error", head, tuple(rows), about)
-
-
-MAX_RIGHT_PX = 2.0
 
 
 def figures(settings: SpeedSettings, results: Sequence[Result]) -> tuple[Drawing, ...]:

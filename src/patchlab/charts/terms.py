@@ -23,7 +23,7 @@ from patchlab.study.measure import call_in_turn, time_call
 from patchlab.study.record import hits_text, parse_hits
 from patchlab.study.study import Cell, Result, Study
 from patchlab.validation.ablation import simplify_problem
-from patchproof.app.plan.errors import PRINTER, Setup, scene_terms
+from patchproof.app.plan.errors import Setup, scene_terms
 from patchproof.base.sessions import count_by_session, rate_posterior
 from patchproof.optimizer.loop import best_design
 from patchproof.optimizer.problem import Problem
@@ -59,17 +59,18 @@ def run(settings: TermsSettings, base: Path, cell: Cell) -> dict[str, Any]:
     problem = grid.problem_of(base, cell.values)
     design = from_pixels(best_design(problem), problem.device)
     conditions = problem.scene.draw("promise", settings.n, per_session=VIEWS_PER_SESSION)
-    setup, worlds = Setup(problem.stage, problem.subject.appearance(design), problem.scene.draw("train", 64)), {}
+    setup = Setup(problem.stage, problem.subject.appearance(design), problem.scene.draw("train", 64))
+    worlds = {"": problem}
     for term in scene_terms(problem, design, None):
-        if term.modeled and term.key and (term.name == PRINTER or not term.needs_whole_photo or term.name != "JPEG"):
+        if term.modeled and term.key and (not term.needs_whole_photo or term.name != "JPEG"):
             if term.change(setup) is not None:
                 worlds[term.name] = simplify_problem(problem, term.name)
-    hits = {"": problem, **worlds}
-    hits = {name: _hits(world, design, conditions) for name, world in hits.items()}
+    hits = {name: _hits(world, design, conditions) for name, world in worlds.items()}
     views = problem.scene.draw("train", 4)
-    steps = {name: partial(_step, world, design, views) for name, world in {"": problem, **worlds}.items()}
-    timed = call_in_turn({name: partial(time_call, step) for name, step in steps.items()}, settings.rounds)
-    ratios = {n: [w[1] / a[1] for w, a in zip(timed[n], timed[""], strict=True)] for n in worlds}
+    steps = {name: partial(time_call, partial(_step, world, design, views)) for name, world in worlds.items()}
+    timed = call_in_turn(steps, settings.rounds)
+    whole = timed.pop("")
+    ratios = {name: [w[1] / a[1] for w, a in zip(each, whole, strict=True)] for name, each in timed.items()}
     return {"hits": hits, "ratios": ratios}
 
 
@@ -106,8 +107,6 @@ def tables(settings: TermsSettings, results: Sequence[Result]) -> tuple[Table, .
     half = [_half_width(result) for result in results]
     about = (
         f"{len(results)} pairs of object and network, {settings.n} views in sessions of {VIEWS_PER_SESSION}, the same "
-    )
-    about += (
         f"design; a promise's own interval reaches {100 * float(np.mean(half)):.1f} points to either side in the mean"
     )
     head = ("term", "pairs", "off by", "with sign", "most", "share of a step")

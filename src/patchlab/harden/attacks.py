@@ -50,35 +50,17 @@ def fgsm(network: Logits, pictures: Tensor, labels: Tensor, epsilon: float, loss
 
 
 def pgd(
-    network: Logits,
-    pictures: Tensor,
-    labels: Tensor,
-    epsilon: float,
-    loss: PictureLoss,
-    steps: int = PGD_STEPS,
-    step: float = PGD_STEP,
+    network: Logits, pictures: Tensor, labels: Tensor, epsilon: float, loss: PictureLoss, steps: int = PGD_STEPS
 ) -> Iterator[Tensor]:
     """Yield the pictures after each of `steps` PGD steps, which start at the pictures themselves."""
     x = pictures
     for _ in range(steps):
-        x = pgd_step(network, x, pictures, labels, epsilon, loss, step)
+        x = _moved(x, _gradient(network, x, labels, loss), pictures, epsilon, PGD_STEP)
         yield x
 
 
-def pgd_step(
-    network: Logits,
-    x: Tensor,
-    pictures: Tensor,
-    labels: Tensor,
-    epsilon: float,
-    loss: PictureLoss,
-    step: float = PGD_STEP,
-) -> Tensor:
-    """One PGD step: clip(Π(x + `step` ε sign ∇L)), Π the projection onto the ε-ball around the pictures."""
-    return _moved(x, _gradient(network, x, labels, loss), pictures, epsilon, step)
-
-
 def _moved(x: Tensor, gradient: Tensor, pictures: Tensor, epsilon: float, step: float) -> Tensor:
+    """One PGD step: clip(Π(x + `step` ε sign ∇L)), Π the projection onto the ε-ball around the pictures."""
     x = x.detach() + step * epsilon * gradient.sign()
     return torch.clamp(x, pictures - epsilon, pictures + epsilon).clamp(0, 1)
 

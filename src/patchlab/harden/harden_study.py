@@ -114,10 +114,8 @@ def run(settings: HardenSettings, base: Path, cell: Cell) -> dict[str, Any]:
     labels, pictures, files = [photo["label"] for photo in photos], originals, {}
     if photos and "variant" in values:
         names, how = values["variant"]["models"], (values["variant"]["method"], values["variant"]["epsilon"])
-        networks, truth = (
-            [cached_network(name, base) for name in names],
-            [_label_indices(name, base, labels) for name in names],
-        )
+        networks = [cached_network(name, base) for name in names]
+        truth = [_label_indices(name, base, labels) for name in names]
         steps = settings.steps, settings.step_size, settings.through
         pictures = harden(originals, truth, networks, *how, *steps)
         for photo, original, picture in zip(photos, originals, pictures, strict=True):

@@ -108,7 +108,7 @@ def _measure_map(problem: Problem, options: stress_map.MapSettings, seed: int) -
     worst = stress_map.worst_cells(hits, confidence, problem.scene.settings.target.goal)
     fresh = problem.scene.draw("evaluate", options.n * len(worst), seed + _FRESH_SEED_OFFSET)
     return {
-        "axes": stress_map.axes_values(axes),
+        "axes": {"names": [axis.name for axis in axes], "edges": [list(axis.edges) for axis in axes]},
         "hits": [[hits_text(place) for place in column] for column in hits],
         "alone": [[hits_text(place) for place in column] for column in alone],
         "confidence": confidence.mean(2).tolist(),
@@ -187,13 +187,10 @@ def find_worst_case(
             best = {name: fields_of(drawn)[name][row : row + 1] for name in names}
         course.append(best_loss)
     fresh = scene.draw("evaluate", settings.n, seed + _FRESH_SEED_OFFSET)
-    condition = {name: float(best[name][0]) for name in _varied_fields(scene.draw("select", 64, seed), names)}
+    drawn = fields_of(scene.draw("select", 64, seed))
+    varied = [name for name in names if drawn[name].ndim == 1 and np.ptp(drawn[name]) > 0]
+    condition = {name: float(best[name][0]) for name in varied}
     return best, {"condition": condition, "losses": course} | _measure_again(problem, with_values(fresh, **best), fresh)
-
-
-def _varied_fields(drawn: Conditions, names: Sequence[str]) -> list[str]:
-    fields = fields_of(drawn)
-    return [name for name in names if fields[name].ndim == 1 and np.ptp(fields[name]) > 0]
 
 
 def tables(settings: StressSettings, results: Sequence[Result]) -> tuple[Table, ...]:

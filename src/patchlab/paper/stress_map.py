@@ -88,11 +88,6 @@ def map_axes(settings: SceneSettings, options: MapSettings) -> tuple[MapAxis, Ma
     return axis(options.pose, options.pose_cells), axis(options.light, options.light_cells)
 
 
-def axes_values(axes: tuple[MapAxis, MapAxis]) -> dict[str, Any]:
-    """The axes as JSON values."""
-    return {"names": [axis.name for axis in axes], "edges": [list(axis.edges) for axis in axes]}
-
-
 def move_into_cell(conditions: Conditions, axes: tuple[MapAxis, MapAxis], place: MapCell) -> Conditions:
     """Conditions with pose and light moved into a cell, linearly from the whole range."""
     changed, fields = {}, fields_of(conditions)

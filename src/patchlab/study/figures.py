@@ -60,15 +60,13 @@ def number_grid(
     values: np.ndarray,
     texts: Sequence[Sequence[str]],
     framed: Sequence[tuple[int, int]] = (),
-    colors: str = "viridis",
-    limits: tuple[float, float] = (0.0, 1.0),
     fontsize: float = 7,
     empty: Sequence[tuple[int, int]] = (),
 ) -> "AxesImage":
     """Draw R×C colored cells with a text in each; `framed` cells and gray `empty` ones are (row, column)."""
     from matplotlib.patches import Rectangle
 
-    image = axes.imshow(values, cmap=colors, vmin=limits[0], vmax=limits[1], aspect="auto")
+    image = axes.imshow(values, cmap="viridis", vmin=0, vmax=1, aspect="auto")
     for row, column in empty:
         axes.add_patch(Rectangle((column - 0.5, row - 0.5), 1, 1, facecolor=EMPTY_COLOR))
     for (row, column), value in np.ndenumerate(values):

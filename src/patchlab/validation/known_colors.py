@@ -1,9 +1,9 @@
 """Separate a printer's inks from the light and camera of the photographs that show its known colors.
 
 In: cells of known color in photographs of several places, N×3 sRGB sent and N×3 light over white paper. Out: one map
-from the color sent to the light of the ink, and for each photograph what its place and camera did to that light: veil,
-gains, tone and chroma, by the channel's own formulas. The map is a quadratic in sRGB's code values after a known
-printer, which takes colors that were never printed from that printer.
+from the color sent to the light of the ink, as a printer, too; and the light that one photograph shows of an ink at
+best. What place and camera do to that light is veil, gains, tone and chroma, by the channel's own formulas. The map is
+a quadratic in sRGB's code values after a known printer, which takes colors that were never printed from that printer.
 
 Ink and photographs are told apart only as far as photographs differ: what all of them share (one phone's tone curve, a
 veil that is in every place) is in the map. Photographs of one place share their veil's color but not its strength, for
@@ -28,16 +28,6 @@ _CENTERED = 100.0  # of the mean terms' squared distance from there: what all ph
 _RIDGE = 0.05  # of the photographs' terms, per squared unit: keeps what cells cannot tell near its default
 _STEPS = 150
 _ROBUST_DELTA_E = 1.0  # CIELAB distances below count by their square
-
-
-@dataclass(frozen=True)
-class PhotoColors:
-    """One photograph's terms: veil (3,) and gains (3,) by channel, tone and chroma; 0 changes nothing, gains as log."""
-
-    veil: np.ndarray
-    log_gains: np.ndarray
-    tone: float
-    chroma: float
 
 
 @dataclass(frozen=True)
@@ -73,8 +63,8 @@ def photo_light(light: Tensor, terms: Tensor) -> Tensor:
     return linear_from_srgb(lift_tone(srgb_from_linear(seen.clamp(1e-6, 1)), tone))
 
 
-def separate_ink(cells: KnownColors, printer: Printer) -> tuple[Tensor, dict[int, PhotoColors]]:
-    """Fit the ink's quadratic 10×3 after `printer` and the terms of every photograph."""
+def separate_ink(cells: KnownColors, printer: Printer) -> Tensor:
+    """Fit the ink's quadratic 10×3 after `printer`, together with the terms of every photograph."""
     photos, index = np.unique(cells.photo, return_inverse=True)
     printed, seen = _printed(cells.code, printer), _tensor(cells.light).clamp(0, 1)
     ink, terms = torch.zeros(10, 3, dtype=torch.float64), torch.zeros(len(photos), 8, dtype=torch.float64)
@@ -92,19 +82,18 @@ def separate_ink(cells: KnownColors, printer: Printer) -> tuple[Tensor, dict[int
             _distance(predict(), seen) + _RIDGE * (terms**2).sum() + _CENTERED * ((terms.mean(0) - center) ** 2).sum()
         ),
     )
-    found = {int(photo): _photo_colors(row) for photo, row in zip(photos, terms.detach(), strict=True)}
-    return ink.detach(), found
+    return ink.detach()
 
 
-def fit_photo(cells: KnownColors, printer: Printer, ink: Tensor) -> tuple[PhotoColors, np.ndarray]:
-    """Fit one photograph's terms to its cells; returns the light N×3 that they predict, too."""
+def fit_photo(cells: KnownColors, printer: Printer, ink: Tensor) -> np.ndarray:
+    """Fit one photograph's terms to its cells, and return the light N×3 that they predict."""
     light, seen = ink_light(_printed(cells.code, printer), ink), _tensor(cells.light).clamp(0, 1)
     terms = torch.zeros(1, 8, dtype=torch.float64, requires_grad=True)
     _minimize(
         [terms], lambda: _distance(photo_light(light, terms.expand(len(light), 8)), seen) + 1e-3 * (terms**2).sum()
     )
     with torch.no_grad():
-        return _photo_colors(terms[0].detach()), photo_light(light, terms.expand(len(light), 8)).numpy()
+        return photo_light(light, terms.expand(len(light), 8)).numpy()
 
 
 def printer_of_ink(name: str, start: Printer, ink: Tensor, provenance: dict[str, Any]) -> Printer:
@@ -135,11 +124,6 @@ def _minimize(parameters: list[Tensor], loss: Callable[[], Tensor]) -> None:
         return value
 
     search.step(closure)
-
-
-def _photo_colors(terms: Tensor) -> PhotoColors:
-    values = terms.numpy()
-    return PhotoColors(values[:3], values[3:6], float(values[6]), float(values[7]))
 
 
 def _tensor(values: np.ndarray) -> Tensor:

@@ -127,7 +127,8 @@ def _measure_changes(network: Classifier, srgb: np.ndarray, pasted: np.ndarray) 
     by_half = np.array([[1, 0, _SHIFT_PX], [0, 1, 0]])
     beside = cv2.warpAffine(srgb, by_half, srgb.shape[1::-1], flags=cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE)
     with torch.inference_mode():
-        logs = [_log_probabilities(network, picture) for picture in (srgb, pasted, again, beside)]
+        logits = [network.logits(from_pixels(picture)[None]) for picture in (srgb, pasted, again, beside)]
+    logs = [torch.log_softmax(each.double(), 1)[0].numpy() for each in logits]
     before, best = logs[0], int(logs[0].argmax())
     found: dict[str, Any] = {"label": network.labels[best], "confidence": float(np.exp(before[best]))}
     for name, after in zip(_CHANGES, logs[1:], strict=True):
@@ -138,10 +139,6 @@ def _measure_changes(network: Classifier, srgb: np.ndarray, pasted: np.ndarray) 
             "log_rms": float(np.sqrt(((after - before) ** 2).mean())),
         }
     return found
-
-
-def _log_probabilities(network: Classifier, srgb: np.ndarray) -> np.ndarray:
-    return torch.log_softmax(network.logits(from_pixels(srgb)[None]).double(), 1)[0].numpy()
 
 
 def _compare_pictures(srgb: np.ndarray, pasted: np.ndarray, fit: BoardFit) -> bytes:

@@ -59,11 +59,7 @@ from patchproof.scene.interface import Scene
 
 Tables = Mapping[str, Mapping[str, Any]]
 FORMER: Tables = {
-    "printer": {
-        "profile": "coated",
-        "chroma": (0, 0),
-        "veil": (0, 0.004),
-    },
+    "printer": {"profile": "coated", "chroma": (0, 0), "veil": (0, 0.004)},
     "camera": {"tone": (0, 0)},
 }
 """Default conditions before real prints were measured; black that differed by ±0.004 is a veil of at most that."""
@@ -109,9 +105,8 @@ def load_cells(path: Path) -> Cells:
     with np.load(path, allow_pickle=False) as file:
         code, light, photo = file["code"], file["light"].astype(float), file["photo"].astype(int)
     if photo.max() >= len(rows):
-        raise Refused(
-            f"a row for each photograph in {table}", f"{len(rows)} rows, {photo.max() + 1} photographs", "add rows"
-        )
+        got = f"{len(rows)} rows, {photo.max() + 1} photographs"
+        raise Refused(f"a row for each photograph in {table}", got, "add rows")
     prints = tuple(row["print"] for row in rows)
     # a place of one maker's prints: another's has another phone
     places = tuple(f"{row['print'][:1]} {row['place']}" for row in rows)
@@ -151,7 +146,7 @@ def _printers(settings: RealPrintsSettings, every: Cells) -> dict[str, tuple[Pri
         else:
             others = np.setdiff1d(np.unique(some.photo), held)
             start = load_printer(_BASE)
-            printer = printer_of_ink("left-out", start, separate_ink(some.of(others), start)[0], {"source": "a study"})
+            printer = printer_of_ink("left-out", start, separate_ink(some.of(others), start), {"source": "a study"})
         found[group] = printer, held
     return found
 
@@ -164,7 +159,7 @@ def _colors(settings: RealPrintsSettings, every: Cells) -> Iterator[dict[str, An
     for printer, held in _printers(settings, every).values():
         for photo in held:
             seen = some.of(np.array([photo]))
-            best = fit_photo(seen, printer, unchanged)[1]
+            best = fit_photo(seen, printer, unchanged)
             distance = ciede2000(lab_from_linear(np.clip(best, 0, 1)), lab_from_linear(seen.light))
             light = linear_from_srgb(printer_output(printer, seen.code / 255))
             yield {
@@ -177,8 +172,8 @@ def _colors(settings: RealPrintsSettings, every: Cells) -> Iterator[dict[str, An
 
 def _share_within(light: torch.Tensor, seen: np.ndarray, draws: int) -> float:
     """The share of cells whose three channels lie between the least and the most that default conditions make."""
-    defaults, rng = SceneSettings.model_construct(printer=PrinterSettings(), camera=CameraSettings()), _rng(1)
-    drawn: dict[str, np.ndarray] = {}
+    defaults = SceneSettings.model_construct(printer=PrinterSettings(), camera=CameraSettings())
+    rng, drawn = np.random.default_rng(1), dict[str, np.ndarray]()
     for effect in map(EFFECT_BY_NAME.__getitem__, ("dot gain", "ink density", "chroma", "veil", "tone")):
         drawn |= effect.sample(defaults, rng.random((draws, len(effect.columns))), np.arange(draws))
     tone = torch.as_tensor(drawn.pop("tone"))
@@ -187,10 +182,6 @@ def _share_within(light: torch.Tensor, seen: np.ndarray, draws: int) -> float:
     shown = torch.stack([lift_tone(srgb_from_linear(m), t) for m, t in zip(made, tone, strict=True)]).numpy()
     codes = srgb_from_linear(seen)
     return float(((codes >= shown.min(0) - 1e-3) & (codes <= shown.max(0) + 1e-3)).all(1).mean())
-
-
-def _rng(seed: int) -> np.random.Generator:
-    return np.random.default_rng(seed)
 
 
 @dataclass(frozen=True)
@@ -270,7 +261,7 @@ def _twins(
     for number, twin in enumerate(twins):
         n = settings.sessions * settings.photos
         views = problem.scene.draw("reprint", (number + 1) * n, per_session=settings.photos)[number * n :]
-        effect, hits = _effect(problem, [twin.show(each, _rng(number)) for each in sent], views)
+        effect, hits = _effect(problem, [twin.show(each, np.random.default_rng(number)) for each in sent], views)
         found.append({"effect": effect, "sessions": count_by_session(hits, settings.photos)})
     return found
 

@@ -155,11 +155,11 @@ def _records(rng: np.random.Generator, sessions: int, each: int, timed: bool) ->
     return photos
 
 
-def _look_trials(settings: SessionTrialsSettings, rho: float, way: str, rng, most: int = 12) -> tuple[int, ...]:
+def _look_trials(settings: SessionTrialsSettings, rho: float, way: str, rng) -> tuple[int, ...]:
     """(trials, kept at the first look that says so, kept without a limit of looks): a look after each of up to 12
     sessions of 10 photographs; "watched" after each photograph.
     """
-    trials, kept, unlimited = 200, 0, 0
+    trials, most, kept, unlimited = 200, 12, 0, 0
     for _ in range(settings.promises):
         promise = draw_promise(settings.rate, settings.control, rho, rng)
         rates = _session_rates(rng, required_rate(promise), rho, (trials, most, 1))
@@ -170,14 +170,10 @@ def _look_trials(settings: SessionTrialsSettings, rho: float, way: str, rng, mos
             sizes = (10,) * (n // 10) + ((n % 10,) if n % 10 else ())
             limit = watched(sizes, promise) if way == "watched" else Look(len(sizes) if way == "each session" else 1)
             for i, look in enumerate((limit, Look())):
-                words = np.array([_is_kept(k, sizes, promise, look) for k in range(n + 1)])
+                words = np.array([judge(k, sizes, promise, look=look).verdict == "kept" for k in range(n + 1)])
                 found[i] |= words[counts[:, n - 1]]
         kept, unlimited = kept + int(found[0].sum()), unlimited + int(found[1].sum())
     return trials * settings.promises, kept, unlimited
-
-
-def _is_kept(recognized: int, sizes: tuple[int, ...], promise: Any, look: Look) -> bool:
-    return judge(recognized, sizes, promise, look=look).verdict == "kept"
 
 
 def _share(count: float, n: int) -> Estimate:

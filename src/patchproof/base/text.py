@@ -1,7 +1,7 @@
-"""Text that others wrote, such as names and labels, made fit for terminals, pages.
+"""Text that others wrote, such as names and labels, made fit for terminals and pages.
 
-Out: text without characters that move a cursor or turn the direction of reading; values and objects in a
-line, for notebooks and refusals.
+Out: text without characters that move a cursor or turn the direction of reading; values and objects in a line, for
+notebooks and refusals; a command as a shell takes it.
 """
 
 import shlex

@@ -187,10 +187,6 @@ def _gains(red: np.ndarray, blue: np.ndarray) -> np.ndarray:
     return np.exp(np.stack([red, np.zeros_like(red), blue], 1))
 
 
-def _tinted(strength: np.ndarray, red: np.ndarray, blue: np.ndarray) -> np.ndarray:
-    return strength[:, None] * _gains(red, blue)
-
-
 def _even_for_sun(light: Light, facing: FacingCosine) -> Light:
     """Replace the sun by as much ambient light as it gives to the middle of the patch."""
     on_patch = light.directional * facing(light.light_azimuth_deg, light.light_elevation_deg)
@@ -219,7 +215,7 @@ EFFECTS: tuple[ViewEffect, ...] = (
     ViewEffect("ambient light", {"ambient": "light.ambient"}, 7, replacement=_sun_alone),
     ViewEffect("dot gain", {"dot_gain": "printer.dot_gain"}, 22),
     ViewEffect("ink density", {"density": "printer.density"}, 23),
-    ViewEffect("veil", _VEIL, None, ("veil",), _tinted),
+    ViewEffect("veil", _VEIL, None, ("veil",), lambda strength, *tint: strength[:, None] * _gains(*tint)),
     ViewEffect("chroma", {"chroma": "printer.chroma"}, per_photo="all"),
     ViewEffect("print scale", {"printed_scale": "printer.scale"}, 48),
     ViewEffect("exposure", {"exposure_ev": "camera.exposure_ev"}, 16, per_photo="all"),

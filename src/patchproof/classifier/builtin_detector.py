@@ -13,7 +13,7 @@ from patchproof.classifier.builtin import WIDTHS, Backbone, conv, load_stored_ne
 from patchproof.classifier.detector import Detector
 
 INPUT_PX, CELL_PX = 128, 16
-HEAD_CHANNELS = 96  # channels
+HEAD_CHANNELS = 96
 MIN_LOG_SIDE, MAX_LOG_SIDE = -2.0, 2.5  # logarithms of distances in cells: 2 and 195 pixels
 
 

@@ -43,7 +43,7 @@ from patchproof.evidence.reproject import PhotoSquare, photo_square
 from patchproof.evidence.results import PhotoEntry, Remark, Trace
 from patchproof.evidence.surface import Surface
 from patchproof.evidence.task import Options, Task
-from patchproof.photo.exif import has_camera_shape
+from patchproof.photo.exif import EXIF_IFD, has_camera_shape
 from patchproof.photo.limits import MOST_BYTES, run_limited
 from patchproof.photo.quality import FrameLight, is_featureless
 from patchproof.photo.read import read_photo
@@ -53,7 +53,7 @@ from patchproof.sheets.manifest import Manifest
 
 MAX_PICTURED_PHOTOS = 120  # photographs whose pictures are on the page; the rest is listed. Keeps it below some 15 MB
 _THUMBNAIL_PX = 560  # longer side: enough for a phone's width at twice its density, some 40 kB as JPEG
-_EXIF_IFD, _TIME_TAG, _SERIAL_TAG, _MODEL_TAG = 0x8769, 0x9003, 0xA431, 0x0110
+_TIME_TAG, _SERIAL_TAG, _MODEL_TAG = 0x9003, 0xA431, 0x0110
 _DESIGN_COLOR, _MARKER_COLOR = (255, 64, 129), (0, 200, 140)
 _DIED_ADVICE = "measuring it ended its process each time, for want of memory: save it smaller"
 _EMPTY_ADVICE = "it shows one tone or noise and nothing else: take it again"
@@ -287,7 +287,7 @@ def time_and_camera(path: Path) -> tuple[float | None, str]:
     try:
         with warnings.catch_warnings(action="ignore"), open_lazily(path) as image:
             exif = image.getexif()
-            details = exif.get_ifd(_EXIF_IFD)
+            details = exif.get_ifd(EXIF_IFD)
         time = datetime.strptime(str(details.get(_TIME_TAG)).strip("\0 "), "%Y:%m:%d %H:%M:%S")
         camera = f"{exif.get(_MODEL_TAG) or ''} {details.get(_SERIAL_TAG) or ''}"
         return (time - datetime.min).total_seconds() / 60, " ".join(camera.split())[:40]

@@ -1,4 +1,4 @@
-"""What COCO JSON with the object's boxes can declare, and what `boxes` does with it."""
+"""What COCO JSON with the object's boxes can declare, and what `annotations` does with it."""
 
 from patchproof.base.declarations import Declaration
 

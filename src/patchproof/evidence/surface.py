@@ -24,7 +24,7 @@ from patchproof.base.resample import downscale
 from patchproof.channel.print_colors import CellColors, added_terms, choose_cells
 from patchproof.photo.detect import LINEAR_FLOAT32_FROM_CODE
 from patchproof.photo.quality import CLIPPED_CODE, FrameLight
-from patchproof.photo.rectify import least_px_per_mm, rectify, resize_by_area
+from patchproof.photo.rectify import least_px_per_mm, rectified_px, rectify, resize_by_area
 from patchproof.sheets.manifest import Manifest, Rect
 from patchproof.sheets.markers import DICTIONARY, MARKER_MODULES
 from patchproof.sheets.piece import Piece, marker_image, marker_rect, square_marker
@@ -190,9 +190,7 @@ def piece_picture(surface: Surface, design: np.ndarray) -> np.ndarray:
 
     Left out: inaccurate cuts, folds and anything that a print shop adds.
     """
-    _, _, w, h = surface.rect_mm
-    px_per_mm = _LARGEST_PIECE_PX / max(w, h)
-    size_px = max(1, round(w * px_per_mm)), max(1, round(h * px_per_mm))
+    size_px = rectified_px(surface.rect_mm, _LARGEST_PIECE_PX / max(surface.rect_mm[2:]))
     return cv2.resize(design.astype(np.float32), size_px, interpolation=cv2.INTER_AREA)
 
 

@@ -127,7 +127,7 @@ def read_obj(assets: Assets) -> list[MeshPart]:
     material, is_smooth = "", False
     for number, line in enumerate(logical_lines(assets.data), 1):
         key, rest = [*line.split(None, 1), "", ""][:2]
-        words = (rest.partition("#")[0] if "#" in rest else rest).split()
+        words = (plain := rest.partition("#")[0]).split()
         if key in rows:
             rows[key].extend([*map(float, words), *[0.0] * _WIDTHS[key]][: _WIDTHS[key]])
             widths |= {len(words)} if key == "v" else set()
@@ -137,7 +137,7 @@ def read_obj(assets: Assets) -> list[MeshPart]:
                 raise Refused("faces with at least three corners", got, "the file may be cut short, export it again")
             if "-" in rest:
                 words = [_absolute(word, rows) for word in words]
-            numbers, corners, lengths = groups[material, "/" in words[0] and "//" not in rest]
+            numbers, corners, lengths = groups[material, "/" in words[0] and "//" not in plain]
             corners.extend([numbers.setdefault(word, len(numbers)) for word in words])
             lengths.append(len(words))
         elif key == "usemtl":

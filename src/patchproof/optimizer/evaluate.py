@@ -14,7 +14,7 @@ from patchproof.base.folder_lock import lock_folder
 from patchproof.base.goal import Goal
 from patchproof.base.input import is_file
 from patchproof.base.output import write_atomically
-from patchproof.base.progress import Advance, Compute, Progress, no_advance, no_progress
+from patchproof.base.progress import Advance, Compute, Progress, no_progress
 from patchproof.base.validation import StrictModel
 from patchproof.classifier.network import Classifier
 from patchproof.optimizer.problem import Problem, set_problem
@@ -102,11 +102,7 @@ def evaluate(
 
 
 def run_responses(
-    run: Run,
-    conditions: Conditions,
-    models: Sequence[str | Classifier] | None = None,
-    compute: Compute = Compute(),
-    advance: Advance = no_advance,
+    run: Run, conditions: Conditions, models: Sequence[str | Classifier] | None, compute: Compute, advance: Advance
 ) -> tuple[Problem, dict[str, Responses]]:
     """A run's problem, with `models` in place of its networks, and the responses to its design and to each control."""
     problem = set_problem(run.scene, compute.device, models, jobs=compute.jobs)

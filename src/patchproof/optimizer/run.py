@@ -34,15 +34,7 @@ from patchproof.base.validation import refuse_untrusted, validate_model
 from patchproof.base.version import __version__
 from patchproof.classifier.network import Classifier
 from patchproof.optimizer.expectation import last_pictures
-from patchproof.optimizer.loop import (
-    SELECT_AFTER,
-    State,
-    is_save_step,
-    load_checkpoint,
-    save_checkpoint,
-    start,
-    steps,
-)
+from patchproof.optimizer.loop import SELECT_AFTER, State, is_save_step, load_checkpoint, save_checkpoint, start, steps
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.optimizer.promise import PROMISE_VIEWS, VIEWS_PER_SESSION, PromiseOptions, make_promise
 from patchproof.optimizer.subject import (
@@ -114,6 +106,8 @@ def optimize(
 ) -> Run:
     """Optimize the patch of a scene, promise its rate, and write both into a folder.
 
+    Method: Pestana et al., section 3.
+
     Args:
         scene: a scene, or the path of a scene file.
         out: the run's folder, new or empty.
@@ -130,7 +124,7 @@ def optimize(
             (views).
 
     Raises:
-        Refused: for a scene, network or folder that cannot be used. Method: Pestana et al., section 3.
+        Refused: for a scene, network or folder that cannot be used.
 
     Examples:
         ```python

@@ -86,11 +86,7 @@ def flat_sheet(srgb: np.ndarray, fit: PageFit, rect_mm) -> LocatedSheet:
 
 
 def fit_shape(
-    corners_px: Quads,
-    corners_mm: Quads,
-    size_px: tuple[int, int],
-    focal_px: float | None = None,
-    focal_spread: float = UNKNOWN_FOCAL,
+    corners_px: Quads, corners_mm: Quads, size_px: tuple[int, int], focal_px: float | None, focal_spread: float
 ) -> tuple[Shape, np.ndarray, np.ndarray, np.ndarray] | None:
     """Fit a cylinder or a lens to the corners in a picture of this size, and return it, the 3×3 homography of the
     corners, and these in mm and in px, corrected for bent borders; None if a plane fits as well.

@@ -2,7 +2,8 @@
 
 In: a stage, an appearance (the piece's picture, the object's textures, or None for the bare object) and conditions.
 Out: N×3×H×W sRGB. The work has three parts that can be run alone: `render_views` (see `views`), `shade` (light and
-composite; the only part through which gradients reach the design) and the camera (`expose`). A plan: `plan_picture`.
+composite; the only part through which gradients reach the design) and the camera (`expose`). Also: `plan_picture`, the
+bare object in even light, seen straight from one side.
 """
 
 from dataclasses import replace

@@ -62,8 +62,8 @@ class LearnedTextures:
     canvas: "Canvas"
     device: torch.device
 
-    def appearance(self, design: Tensor, kind: str = "design") -> ObjectTextures:
-        """Return the object's textures with the texels 3×1×M of a design; `kind` has no effect."""
+    def appearance(self, design: Tensor) -> ObjectTextures:
+        """Return the object's textures with the texels 3×1×M of a design."""
         return ObjectTextures(tuple(self.filled(design)))
 
     def filled(self, design: Tensor) -> list[Tensor]:

@@ -104,12 +104,11 @@ def rates_by_band(
     """
     rows = []
     for figure, text in _BANDS.items():
-        seen = [
+        seen = sorted(
             (photo[figure], photo["predictions"][model]["recognized"])
             for photo in photos
             if photo[figure] is not None and model in photo["predictions"]
-        ]
-        seen.sort()
+        )
         for third in range(3) if len(seen) >= _LEAST_BANDED else ():
             some = seen[len(seen) * third // 3 : len(seen) * (third + 1) // 3]
             (low, _), (high, _) = some[0], some[-1]

@@ -214,12 +214,11 @@ def _locate(srgb: np.ndarray, manifest: Manifest, side_mm: float) -> tuple[PageF
             raise PhotoRejected("wrong_sheet", len(detection.foreign), 0, "these are the markers of another sheet")
         raise PhotoRejected("too_few_markers", 0, 3, "no marker of the piece is readable")
     detection = complete_markers(srgb, detection, on_piece)
-    borders = [b for i, b in detection.markers.items() if b.fitted and i in on_piece]
+    borders = {i: b for i, b in detection.markers.items() if b.fitted and i in on_piece}
     if len(borders) < 3:
         raise PhotoRejected("too_few_markers", len(borders), 3, "show the whole piece, sharp and well lit")
-    corners = {i: b.corners_px for i, b in detection.markers.items() if b.fitted and i in on_piece}
-    fit, blur = fit_page(corners, on_piece), blur_px(borders)
-    if blur > _MAX_BLUR_MODULES * (module_px := float(np.median([b.module_px for b in borders]))):
+    fit, blur = fit_page({i: b.corners_px for i, b in borders.items()}, on_piece), blur_px(borders.values())
+    if blur > _MAX_BLUR_MODULES * (module_px := float(np.median([b.module_px for b in borders.values()]))):
         raise PhotoRejected("blurred", blur, _MAX_BLUR_MODULES * module_px, "hold still and focus on the sheet")
     if fit.residual_mm > _MAX_RESIDUAL_SHARE * side_mm:
         raise PhotoRejected("too_few_markers", len(fit.inlier_ids), len(on_piece), "press the sheet flat")

@@ -193,7 +193,7 @@ def answer_of(collection: PhotoCollection, path: Path, picture: np.ndarray | Non
     prediction = entry.predictions.get(name) if photo.counted else None
     answer = "not counted" if prediction is None else "recognized" if prediction.recognized else "not recognized"
     return {
-        "file": f"{path.parent.name}/{path.name}",
+        "file": _name_of(path),
         "answer": answer,
         "tap": collection.wants_corners(path),
         "label": prediction and f"{prediction.label} {prediction.confidence:.0%}",

@@ -60,8 +60,7 @@ class Term:
 def scene_terms(problem: Problem, design: Tensor, other_surface: Placement | None) -> tuple[Term, ...]:
     """The terms that a problem's kind of scene has."""
     scene = problem.scene
-    effects = [term for table in ("light", "printer", "camera") for term in effect_terms(table)]
-    terms = [term for term in effects if term.key.partition(".")[0] in scene.EFFECT_TABLES]
+    terms = [term for table in scene.EFFECT_TABLES for term in effect_terms(table)]
     terms += [Term(p.name, p.key, partial(_without_part, part=p), True, p.needs_whole_photo) for p in scene.TERMS]
     if scene.HAS_PIECE:
         terms.append(Term(PRINTER, "printer.profile", partial(_without_printer, problem, design)))

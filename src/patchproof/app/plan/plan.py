@@ -36,13 +36,7 @@ from patchproof.optimizer.subject import as_pixels, from_pixels
 from patchproof.render.photograph import affected_windows, expose
 from patchproof.scene.bent_scene import placement_with_other_bend
 from patchproof.scene.conditions import Conditions
-from patchproof.scene.interface import (
-    PX_PER_MODULE,
-    READABLE_SHARE,
-    PieceScene,
-    fit_text,
-    measurable_text,
-)
+from patchproof.scene.interface import PX_PER_MODULE, READABLE_SHARE, PieceScene, fit_text, measurable_text
 from patchproof.scene.patch_scene import UnplacedScene
 from patchproof.scene.scene import load_scene
 from patchproof.sheets.markers import MARKER_MODULES
