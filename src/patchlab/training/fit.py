@@ -165,7 +165,7 @@ def store_float16(network: nn.Module, path: Path) -> int:
 def export_onnx(network: nn.Module, path: Path, input_px: int) -> int:
     """Write the network as an ONNX file for batches of any size, and return the number of weights."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    photos, any_number = torch.rand(2, 3, input_px, input_px), {0: torch.export.Dim("n")}
+    photos, any_number = torch.rand(2, 3, input_px, input_px), {0: torch.export.Dim("n", max=99)}
     options: dict[str, Any] = {"dynamo": True, "external_data": False, "verbose": False}
     torch.onnx.export(network.eval(), (photos,), path, dynamic_shapes=(any_number,), **options)
     return sum(weights.numel() for weights in network.parameters())

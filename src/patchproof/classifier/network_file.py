@@ -30,7 +30,7 @@ from patchproof.networks.onnx_file import read_onnx
 MAX_BYTES = 4 << 30  # larger than any classifier tested
 EXPORT_ADVICE = (
     'export it with torch.onnx.export(network.eval(), (torch.rand(2, 3, S, S),), "NAME.onnx", '
-    'dynamic_shapes=({0: torch.export.Dim("n")},), dynamo=True), S pixels a side, and put NAME.json beside it'
+    'dynamic_shapes=({0: torch.export.Dim("n", max=99)},), dynamo=True), S pixels a side, and put NAME.json beside it'
 )
 
 

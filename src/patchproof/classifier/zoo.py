@@ -46,12 +46,12 @@ class Normalized(nn.Module):
     def __init__(self, network: nn.Module, mean: Sequence[float], std: Sequence[float]):
         super().__init__()
         self.network = network
-        self.mean = nn.Buffer(torch.tensor(mean).reshape(1, -1, 1, 1))
-        self.std = nn.Buffer(torch.tensor(std).reshape(1, -1, 1, 1))
+        self.rgb_mean = nn.Buffer(torch.tensor(mean).reshape(1, -1, 1, 1))
+        self.rgb_std = nn.Buffer(torch.tensor(std).reshape(1, -1, 1, 1))
 
     def forward(self, photos_srgb: Tensor) -> Tensor:
         """N×3×S×S sRGB in [0, 1] → N×K logits."""
-        return self.network((photos_srgb - self.mean) / self.std)
+        return self.network((photos_srgb - self.rgb_mean) / self.rgb_std)
 
 
 def load_torchvision(name: str) -> Classifier:

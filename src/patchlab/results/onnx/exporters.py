@@ -90,7 +90,7 @@ def measure(name: str, exporter: str) -> dict[str, Any]:
         path = Path(folder) / "net.onnx"
         any_number = {"input_names": ["x"], "dynamic_axes": {"x": {0: "n"}}, "dynamo": False}
         if exporter == "dynamo":
-            any_number = {"dynamic_shapes": ({0: torch.export.Dim("n")},), "dynamo": True}
+            any_number = {"dynamic_shapes": ({0: torch.export.Dim("n", max=99)},), "dynamo": True}
         try:
             torch.onnx.export(network, (photos,), str(path), **any_number)
         except Exception as error:  # the exporter may raise anything
