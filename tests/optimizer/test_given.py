@@ -13,6 +13,7 @@ from PIL import Image
 from pycocotools.coco import COCO
 from pypdfium2 import PdfDocument
 
+from patchproof.app import compare
 from patchproof.app.compare import compare as compare_runs
 from patchproof.base.errors import Refused
 from patchproof.base.geometry import apply_homography, rect_corners
@@ -282,6 +283,15 @@ def test_several_designs_are_compared_on_the_same_conditions(several, capsys):
     assert "data:image/png" in (out / "designs.html").read_text("utf-8")
     assert command("evaluate", *runs) == 2 and "--out" in capsys.readouterr().err
     assert command("evaluate", runs[0], "--out", out) == 2
+
+
+def test_runs_of_one_scene_in_two_folders_are_compared_unless_their_networks_are_other_files(tmp_path):
+    for folder in "ab":
+        import_patch(slopes(64, 64), scene_with(tmp_path / folder, **SMALL), tmp_path / folder / "run", **DRAFT)
+    assert compare_runs([tmp_path / folder / "run" for folder in "ab"], tmp_path / "out", n=4, trust=True).tables
+    here, there = (scene_with(tmp_path / folder, **SMALL, target__models=["file:net.onnx"]) for folder in "ab")
+    assert compare._views_of(here, True) != compare._views_of(there, True)
+    assert compare._views_of(here, False) == compare._views_of(there, False)
 
 
 def test_runs_that_are_not_seen_alike_are_not_compared(several, tmp_path):

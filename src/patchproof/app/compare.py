@@ -22,7 +22,7 @@ from patchproof.base.intervals import estimate_difference, rate
 from patchproof.base.notebook import draw_rates
 from patchproof.base.output import new_folder
 from patchproof.base.progress import Compute, Progress, no_progress
-from patchproof.base.validation import summarize_names
+from patchproof.base.validation import expand_path, summarize_names
 from patchproof.classifier.network import Classifier
 from patchproof.optimizer.evaluate import run_responses
 from patchproof.optimizer.promise import CONTROLS, PROMISE_VIEWS
@@ -112,14 +112,14 @@ def _load_runs(runs: Sequence[str | Path | Run], with_networks: bool, trust: boo
 
 
 def _views_of(scene: Scene, with_networks: bool) -> tuple[Any, ...]:
-    """Everything except the piece that views of the scene and the networks' answers depend on."""
+    """Everything except the piece that views of the scene and the networks' answers depend on; files by content."""
     require_piece(scene)
     settings = scene.settings.model_dump(mode="json", exclude={"patch", "optimize", "sheet"})
-    if not with_networks:
-        del settings["target"]["models"]
+    networks = [expand_path(name, scene.base.resolve()) for name in settings["target"].pop("models")]
+    files = {key: sha256 for key, sha256 in scene.inputs.items() if not key.startswith("patch.")}
     if isinstance(scene, MeshScene):  # a side and the patch in its middle are one front
         settings["view"]["front"] = np.round([scene.frame.normal, scene.frame.up], 6).tolist()
-    return settings, scene.base.resolve(), scene.mesh_glb
+    return settings, networks if with_networks else [], files, scene.mesh_glb
 
 
 def _goal_score(answers: Responses, goal: Goal) -> tuple[float, float]:
