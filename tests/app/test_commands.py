@@ -18,6 +18,7 @@ from safetensors import SafetensorError
 from safetensors import torch as safetensors_torch
 
 from patchlab.study.study import STUDIES, load_study, run_study
+from patchproof import __main__ as entry
 from patchproof.app.cli import console
 from patchproof.base.errors import Refused
 from patchproof.base.progress import progress_bar
@@ -186,3 +187,14 @@ def test_progress_in_a_file_is_a_line_now_and_then(monkeypatch, capsys):
             now[0] += 1
             bar("optimize", done, 100)
     assert capsys.readouterr().err.splitlines() == [f"optimize: {n} of 100" for n in (30, 60, 90, 100)]
+
+
+def test_threads_that_wait_give_their_core_away_unless_the_user_says_otherwise(monkeypatch):
+    monkeypatch.setattr(entry, "handle_interrupts", lambda: None)
+    monkeypatch.setattr("patchproof.app.cli.main", lambda: None)
+    monkeypatch.setenv("OMP_WAIT_POLICY", "ACTIVE")
+    entry.main()
+    assert os.environ["OMP_WAIT_POLICY"] == "ACTIVE"
+    monkeypatch.delenv("OMP_WAIT_POLICY")
+    entry.main()
+    assert os.environ["OMP_WAIT_POLICY"] == "PASSIVE"
