@@ -267,6 +267,10 @@ def test_finds_of_prints_without_markers_are_the_stored_ones():
     assert said + f"Their corners are off by at most {off:.2f} px in 95 %." in words(NOTEBOOK)
     empty = [row["said"] for row in rows if row["shown"] == "0"]
     assert f"In {len(empty)} pictures without the print" in words(NOTEBOOK) and set(empty) == {"no_corners"}
+    real = [row["said"] for row in rows_of("find/photographs.csv")]
+    bound = f"{wilson(0, len(real))[1]:.1%}".replace("%", " %")
+    assert set(real) == {"no_corners"}
+    assert f"In {len(real)} photographs of other things" in words(NOTEBOOK) and f"[0, {bound}]" in words(NOTEBOOK)
 
 
 def test_what_jagged_outlines_cost_is_the_stored_figure():
