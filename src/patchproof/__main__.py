@@ -8,7 +8,7 @@ from patchproof.app.interrupt import handle_interrupts
 def main() -> None:
     """Run the command line, which Ctrl-C ends even while it is being imported."""
     handle_interrupts()
-    # threads that wait for one another give their core away: beside another program `preview` took 10.2 s, now 2.6
+    # threads that wait for one another give their core away: beside another program `preview` took 9 to 11 s, now 2.5
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     from patchproof.app.cli import main
 

@@ -115,11 +115,12 @@ def _views_of(scene: Scene, with_networks: bool) -> tuple[Any, ...]:
     """Everything except the piece that views of the scene and the networks' answers depend on; files by content."""
     require_piece(scene)
     settings = scene.settings.model_dump(mode="json", exclude={"patch", "optimize", "sheet"})
-    networks = [expand_path(name, scene.base.resolve()) for name in settings["target"].pop("models")]
+    names = settings["target"].pop("models")
+    networks = [expand_path(name, scene.base.resolve()) for name in names] if with_networks else []
     files = {key: sha256 for key, sha256 in scene.inputs.items() if not key.startswith("patch.")}
     if isinstance(scene, MeshScene):  # a side and the patch in its middle are one front
         settings["view"]["front"] = np.round([scene.frame.normal, scene.frame.up], 6).tolist()
-    return settings, networks if with_networks else [], files, scene.mesh_glb
+    return settings, networks, files, scene.mesh_glb
 
 
 def _goal_score(answers: Responses, goal: Goal) -> tuple[float, float]:
