@@ -190,6 +190,9 @@ def test_who_cannot_tell_is_told_how_many_photographs_the_plan_asks_for():
     both = needs((6,), "kept", worth=worth)
     printed = f"{each} of its gray control (patchproof sheet RUN --control gray)"
     assert f"{printed} in each of {sessions_to_show(promise)} places" in both
+    small = promise_of(0.9, 0.6, correlation=0.1)
+    alone, shown = sessions_needed(small), sessions_to_show(small)
+    assert alone < shown and photos_line(small, (), "gray").endswith(f"The promise alone is proved in {alone} places.")
     lost = needs((6,), worth=worth, promise=USELESS)  # one sentence, and no "take more" beside it
     assert lost == "No 150 photographs are likely to show that it helps: make a design that gains more."
     draft = promise_beside(0.4, {"bare": (0.38, -0.2, 0.24)}).changed(draft=True)

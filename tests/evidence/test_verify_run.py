@@ -36,6 +36,7 @@ from patchproof.evidence.task import Options, promised_ranges
 from patchproof.photo.quality import FrameLight, is_featureless
 from patchproof.photo.read import MORE_PAGES, Photo
 from patchproof.report.words import verdict_lines
+from patchproof.sheets.markers import DICTIONARY, aruco_dictionary
 
 
 def promise(conditions=(CONDITION,)):
@@ -233,12 +234,19 @@ def test_where_a_design_has_too_few_colors_paper_and_ink_fix_the_color(design):
     assert color.color_fit == "white_black" and color.delta_e00_mean < 2.5
 
 
+def one_marker(marker_id):
+    picture = np.full((300, 400, 3), 230, np.uint8)
+    picture[100:170, 100:170] = cv2.aruco.generateImageMarker(aruco_dictionary(DICTIONARY), marker_id, 70)[..., None]
+    return picture
+
+
 @pytest.mark.parametrize(
     ("srgb", "status", "code"),
     [
         (lambda: np.full((300, 400, 3), 120, np.uint8), "rejected", "too_few_markers"),
         (lambda: np.ascontiguousarray(shot()[:, ::-1]), "rejected", "mirrored"),
         (lambda: shot(first_id=300), "rejected", "wrong_sheet"),
+        (lambda: one_marker(300), "rejected", "too_few_markers"),  # clutter, too, may resemble one of a thousand
         (lambda: np.concatenate([shot(), shot()], 1), "rejected", "several_sheets"),
         (lambda: np.concatenate([shot(), shot(first_id=300)], 1), "rejected", "several_sheets"),
         (lambda: shot(light=3.0), "judged", "clipped"),

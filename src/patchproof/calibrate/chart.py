@@ -237,7 +237,7 @@ def _find_page(srgb: np.ndarray, manifest: Manifest) -> tuple[np.ndarray, float]
     if not corners_px:
         if is_mirrored(srgb, detected, dictionary):
             raise PhotoRejected("mirrored", None, None, "the photo is mirrored: switch off the camera's mirror setting")
-        if detected.foreign:
+        if detected.another_sheet:
             advice = "these are the markers of another sheet or page: name that sheet's JSON, or leave the photo out"
             raise PhotoRejected("wrong_sheet", len(detected.foreign), 0, advice)
         raise PhotoRejected("too_few_markers", 0, 1, "no marker is readable: show the page sharp and well lit")

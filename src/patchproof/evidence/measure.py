@@ -182,13 +182,12 @@ def identify_sheet(srgb: np.ndarray, surface: Surface) -> tuple[MarkersInView, S
             advice = "the photo is mirrored: switch off the camera's mirror setting and save it again"
             raise PhotoRejected("mirrored", None, None, advice)
         label = read_page_code(srgb)
-        if detected.foreign or (label is not None and label != surface.label):
+        if detected.another_sheet or (label is not None and label != surface.label):
             which = "another sheet" if label is None else "sheet {} ({})".format(*label.split(":")[1:])
             advice = f"this shows {which}: name that sheet's JSON, or leave the photo out"
             raise PhotoRejected("wrong_sheet", len(detected.foreign), 0, advice)
         raise PhotoRejected("too_few_markers", 0, 1, "no marker is readable: show the whole patch, sharp and well lit")
-    # clutter may look like one of a thousand markers, but hardly like one of this sheet's
-    if len(detected.foreign) > 1 or detected.doubled:
+    if detected.another_sheet or detected.doubled:
         extra_markers = max(len(detected.foreign), len(detected.doubled))
         advice = "more than one sheet is in view: photograph one at a time"
         raise PhotoRejected("several_sheets", extra_markers, 1, advice)

@@ -208,7 +208,9 @@ def photos_line(
         f"Take at least {each} photographs{what} in each of {places}, with other light in each, and keep those of each "
         "place in a folder of their own."
     )
-    return needed + so_far + ("" if kept is not None else " The promise itself is too little above its best control.")
+    alone = f" The promise alone is proved in {places_text(kept)}." if control and kept and kept < sessions else ""
+    weak = " The promise itself is too little above its best control." if kept is None else ""
+    return needed + alone + so_far + weak
 
 
 def places_text(count: int) -> str:

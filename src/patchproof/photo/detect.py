@@ -66,6 +66,11 @@ class MarkersInView:
         """Corners 4×2 px by id."""
         return {marker_id: borders.corners_px for marker_id, borders in self.markers.items()}
 
+    @property
+    def another_sheet(self) -> bool:
+        """True if markers of another sheet are in view; one alone may be clutter (9 of 500 photographs without any)."""
+        return len(self.foreign) > 1
+
 
 @dataclass(frozen=True)
 class Level:

@@ -81,7 +81,7 @@ def find_sheet(srgb: np.ndarray, expected: Ids, corners_mm: Quads, dictionary: s
         detected = detect.fit_detections(srgb, detections, set(corners_mm), dictionary)
         view = complete_markers(srgb, detected, corners_mm, dictionary)
     view = replace(view, mirrored=frozenset(mirrored & corners_mm.keys()))
-    if view.doubled or len(view.foreign) > 1:
+    if view.doubled or view.another_sheet:
         return view
     fit = _fit(view.corners_px, corners_mm)
     agree = fit is not None and len(fit.inlier_ids) == len(view.markers)

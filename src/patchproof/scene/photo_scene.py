@@ -210,7 +210,7 @@ def _locate(srgb: np.ndarray, manifest: Manifest, side_mm: float) -> tuple[PageF
     on_piece = {i: c for i, c in markers.items() if (c >= [x, y]).all() and (c <= [x + w, y + h]).all()}
     detection = find_markers(srgb, frozenset(on_piece), frozenset(markers), DICTIONARY)
     if not detection.markers.keys() & on_piece.keys():
-        if detection.foreign:
+        if detection.another_sheet:
             raise PhotoRejected("wrong_sheet", len(detection.foreign), 0, "these are the markers of another sheet")
         raise PhotoRejected("too_few_markers", 0, 3, "no marker of the piece is readable")
     detection = complete_markers(srgb, detection, on_piece)
