@@ -50,7 +50,7 @@ DIGESTS = {
 }
 SWITCHED = [effect for effect in EFFECTS if effect.can_be_off]
 # Those without which a step takes fewer operations.
-SLOWS = {"motion blur", "blur", "noise", "JPEG"}
+SLOWS = {"mottle", "motion blur", "blur", "noise", "JPEG"}
 MADE_UP = ViewEffect("smell", {"smell": "light.ambient", "sweetness": (0.0, 1.0)})
 # Settings of light, print and camera that are no ranges of an effect.
 NO_RANGES = {"printer.profile", "camera.photo_px", "camera.file"}
@@ -125,7 +125,7 @@ def problem(tmp_path_factory):
     """A scene in which every effect is on and shows."""
     folder = tmp_path_factory.mktemp("scene")
     camera = {"blur_px": [2, 3], "noise": [0.05, 0.1], "motion_px": [5, 6], "photo_px": [160, 120]}
-    tables = {"printer": {"scale": [0.9, 0.95], "density": [0.1, 0.2]}, "camera": camera}
+    tables = {"printer": {"scale": [0.9, 0.95], "density": [0.1, 0.2], "mottle": [0.02, 0.04]}, "camera": camera}
     return set_problem(
         scene_with(folder, **{f"{t}__{k}": v for t, values in tables.items() for k, v in values.items()})
     )
@@ -165,7 +165,8 @@ def test_an_effect_that_is_switched_off_is_off_and_the_rest_of_its_table_stays(p
     others = {"ambient", "directional"} if effect.replacement else set()
     assert effect.fields[0] in moved <= {effect.fields[0]} | others
     less_count, plain = photographed(problem, less.conditions, setup.appearance)
-    assert (less_count < whole[0]) == (effect.name in SLOWS) and not torch.equal(whole[1], plain)
+    # sizes of prints change in how many groups their mottle is looked up
+    assert (less_count < whole[0] - 12) == (effect.name in SLOWS) and not torch.equal(whole[1], plain)
 
 
 def photographed(problem, conditions, shown) -> tuple[int, torch.Tensor]:

@@ -5,11 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from tolerances import FLOAT32
 
 from patchproof.app.plan.errors import Setup, scene_terms
+from patchproof.base.color import srgb_from_linear
 from patchproof.optimizer import loop
 from patchproof.optimizer.problem import set_problem
-from patchproof.render.photograph import expose
+from patchproof.render.photograph import expose, shade
+from patchproof.render.pixels import PiecePicture
+from patchproof.render.stage import set_stage
+from patchproof.render.views import render_views
 from patchproof.scene.conditions import with_values
 from patchproof.sheets.piece import marker_image
 from test_plan import scene_with
@@ -32,7 +37,8 @@ def test_a_print_of_another_size_covers_as_much_as_one_of_a_scene_made_for_it(tm
 
 
 def test_print_terms_let_gradients_pass(tmp_path):
-    scene = scene_with(tmp_path, printer__density=[0.1, 0.2], printer__scale=[0.9, 0.95])
+    prints = {"printer__density": [0.1, 0.2], "printer__scale": [0.9, 0.95], "printer__mottle": [0.02, 0.04]}
+    scene = scene_with(tmp_path, **prints)
     problem = set_problem(scene)
     design = torch.tensor(np.random.default_rng(4).random(tuple(problem.subject.start().shape)), dtype=torch.float32)
     design.requires_grad_()
@@ -45,8 +51,9 @@ def test_print_terms_let_gradients_pass(tmp_path):
 
 
 def test_the_plan_names_each_print_term_and_takes_it_out(tmp_path):
-    names = {"dot gain", "ink density", "veil", "chroma", "print scale"}
-    for tables, off in (({"printer__scale": [0.95, 1]}, set()), ({}, {"print scale"})):
+    names = {"dot gain", "ink density", "veil", "chroma", "mottle", "print scale"}
+    every = {"printer__scale": [0.95, 1], "printer__mottle": [0, 0.03]}
+    for tables, off in ((every, set()), ({}, {"mottle", "print scale"})):
         problem = set_problem(scene_with(tmp_path, **tables))
         shown = problem.subject.appearance(problem.subject.start())
         setup = Setup(problem.stage, shown, problem.scene.draw("select", 4))
@@ -65,3 +72,25 @@ def test_a_print_scale_range_reaches_the_promise_and_the_truth(tmp_path):
     usual = scene_with(tmp_path)
     half, full = (area(outline(s, s.draw("evaluate", 3), (300, 300))) for s in (scene, usual))
     np.testing.assert_allclose(half / full, 0.25, rtol=0.05)
+
+
+def test_mottle_is_as_strong_as_it_says_on_ink_and_is_not_on_paper(tmp_path):
+    scene = box_scene(tmp_path)
+    gray, white = (PiecePicture.of(torch.full((200, 200, 3), level)) for level in (0.5, 1.0))
+    plain = posed(scene, 3, ambient=1, directional=0, noise=0, blur_px=0, exposure_ev=0, jpeg=0)
+    uneven = with_values(plain, mottle=np.array([0.02, 0.02, 0.06]), mottle_seed=np.array([7, 7, 8]))
+    stage = set_stage(scene)
+
+    def shown(picture, conditions):
+        views = render_views(stage, picture, conditions, (1000, 1000))
+        seen, whole = shade(views, picture), views.on_piece.share[:, 0] > 0.99
+        rows = seen.permute(0, 2, 3, 1).reshape(-1, 3)[views.on_piece.pixel[whole]]
+        return [srgb_from_linear(rows[views.on_piece.view[whole] == view]) for view in range(3)]
+
+    shifts = [on - off for on, off in zip(shown(gray, uneven), shown(gray, plain), strict=True)]
+    rms = [float(shift.square().mean().sqrt()) for shift in shifts]
+    assert rms == pytest.approx([0.02, 0.02, 0.06], rel=0.08)  # cells are several pixels wide
+    assert torch.equal(shifts[0], shifts[1])  # one print of a session, twice
+    assert abs(np.corrcoef(shifts[0].ravel(), shifts[2].ravel())[0, 1]) < 0.05
+    pairs = zip(shown(white, uneven), shown(white, plain), strict=True)
+    assert max(float((on - off).abs().max()) for on, off in pairs) < FLOAT32

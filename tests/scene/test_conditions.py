@@ -78,7 +78,7 @@ def test_sobol_covers_a_range_more_evenly_than_independent_draws():
 EVERYTHING = SETTINGS.model_copy(
     update={
         "camera": SETTINGS.camera.model_copy(update={"motion_px": (0.0, 12.0)}),
-        "printer": SETTINGS.printer.model_copy(update={"scale": (0.95, 1)}),
+        "printer": SETTINGS.printer.model_copy(update={"scale": (0.95, 1), "mottle": (0.0, 0.05)}),
     }
 )
 

@@ -24,7 +24,7 @@ from patchproof.base.errors import Refused
 from patchproof.base.geometry import Frame
 from patchproof.channel.camera import develop
 from patchproof.channel.effects import Light
-from patchproof.channel.printer import print_change, vary_print
+from patchproof.channel.printer import mottle_pattern, mottled, print_change, vary_print
 from patchproof.mesh.mesh import Mesh
 from patchproof.render.photograph import PAPER_BACK_LINEAR
 from patchproof.render.pixels import PiecePicture
@@ -166,7 +166,9 @@ def _piece(mi: ModuleType, scene: MeshScene, picture: PiecePicture, conditions: 
     scale = conditions.pose.printed_scale[0]
     vertices = scene.middle_mm + scale * (placement.vertices_mm - scene.middle_mm)
     change = torch.tensor(print_change(conditions.print)[0]).to(picture.srgb)
-    light = vary_print(linear_from_srgb(picture.srgb), change).numpy()  # relative to white paper
+    pattern = mottle_pattern(picture.size_px, int(conditions.print.mottle_seed[0])) * conditions.print.mottle[0]
+    print_light = mottled(linear_from_srgb(picture.srgb), torch.tensor(pattern).to(picture.srgb))
+    light = vary_print(print_light, change).numpy()  # relative to white paper
     back = {"type": "rgb", "value": PAPER_BACK_LINEAR * PAPER_REFLECTANCE}
     uv = placement.piece_mm / np.array(placement.size_mm)
     colors = _texture(mi, light, "clamp"), back

@@ -122,11 +122,17 @@ def texts_in(value: Any) -> Iterator[str]:
         yield from texts_in(each)
 
 
-def spelling_hint(word: str, known_words: Iterable[str]) -> str:
-    """'did you mean "x"' for the most similar known word, else 'use one of: ...'."""
-    known_words = list(known_words)
-    similar = difflib.get_close_matches(word, known_words, 1, 0.5)
-    return f'did you mean "{similar[0]}"' if similar else f"use one of: {', '.join(known_words)}"
+def spelling_hint(word: str, known_words: Iterable[str], otherwise: str = "", most: int = 1) -> str:
+    """'did you mean "x"' for the known words most similar to a word, else `otherwise`, or 'use one of: ...'."""
+    known_words = {folded(each): each for each in known_words}
+    similar = difflib.get_close_matches(folded(word), known_words, most, 0.5 if most == 1 else 0.6)
+    found = " or ".join(f'"{known_words[each]}"' for each in similar)
+    return f"did you mean {found}" if found else otherwise or f"use one of: {', '.join(known_words.values())}"
+
+
+def folded(text: str) -> str:
+    """Fold case and underscores."""
+    return " ".join(text.casefold().replace("_", " ").split())
 
 
 def summarize_names(names: Sequence[str]) -> str:

@@ -96,6 +96,8 @@ class Print(Draws):
     density: np.ndarray = off()
     chroma: np.ndarray = off()
     veil: np.ndarray = off((0.0, 0.0, 0.0))  # N×3 red, green, blue
+    mottle: np.ndarray = off()  # rms in sRGB, from cell to cell (see `channel.printer.mottle_pattern`)
+    mottle_seed: np.ndarray = off(0)  # int64
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -205,6 +207,7 @@ _CROP: dict[str, tuple[float, float]] = dict.fromkeys(("picture", "size", "x", "
 _JITTER = dict.fromkeys("xyz", "view.look_at_jitter")
 _BALANCE: dict[str, str] = dict.fromkeys(("red", "blue"), "camera.white_balance")
 _VEIL: dict[str, str | tuple[float, float]] = {"strength": "printer.veil", "red": _VEIL_TINT, "blue": _VEIL_TINT}
+_MOTTLE: dict[str, str | tuple[float, float]] = {"mottle": "printer.mottle", "seed": (0.0, 2.0**31)}
 _SUN = {"light_azimuth_deg": "light.azimuth_deg", "light_elevation_deg": "light.elevation_deg"}
 _MOTION: dict[str, str | tuple[float, float]] = {"motion_px": "camera.motion_px", "motion_deg": (0.0, 180.0)}
 
@@ -217,6 +220,7 @@ EFFECTS: tuple[ViewEffect, ...] = (
     ViewEffect("ink density", {"density": "printer.density"}, 23),
     ViewEffect("veil", _VEIL, None, ("veil",), lambda strength, *tint: strength[:, None] * _gains(*tint)),
     ViewEffect("chroma", {"chroma": "printer.chroma"}, per_photo="all"),
+    ViewEffect("mottle", _MOTTLE, None, ("mottle", "mottle_seed"), lambda rms, seed: (rms, seed.astype(np.int64))),
     ViewEffect("print scale", {"printed_scale": "printer.scale"}, 48),
     ViewEffect("exposure", {"exposure_ev": "camera.exposure_ev"}, 16, per_photo="all"),
     ViewEffect("white balance", _BALANCE, 17, ("white_balance",), _gains),

@@ -4,8 +4,8 @@ In: sRGB as sent, N×3×H×W in [0, 1]. Out: sRGB as seen by an eye adapted to t
 so that light and camera are applied once, elsewhere. A second table holds how far each color is out of gamut (ΔE00 of
 the round trip). A printer is a name, two tables and their provenance; on disk NAME.npz and NAME.json. Out-of-gamut inks
 (offset cyan and green lie outside sRGB) are clipped to [0, 1] when the table is made: cameras that deliver sRGB clip
-them too. Print-to-print variation is a small function on top, `vary_print`. Left out on purpose: halftone dots (below
-what a camera resolves beyond 0.2 mm per pixel) and ink spread.
+them too. On top: how prints vary, `vary_print`, and how one is uneven, `mottled`. Left out on purpose: halftone dots
+(below what a camera resolves beyond 0.2 mm per pixel) and ink spread.
 """
 
 import base64
@@ -25,7 +25,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from patchproof.base.color import LUMINANCE, clamp_to_unit, lab_from_srgb
+from patchproof.base.color import LUMINANCE, clamp_to_unit, lab_from_srgb, linear_from_srgb, srgb_from_linear
 from patchproof.base.errors import Refused
 from patchproof.base.input import read_file, read_json
 from patchproof.base.packaged import named_path, packaged_path
@@ -36,6 +36,10 @@ from patchproof.channel.effects import Print
 # 8-bit values that exist, so that a table baked by an 8-bit engine is exact at its nodes: 0, 8, ..., 248, 255
 NODES_8BIT = (*range(0, 249, 8), 255)
 SIZE = len(NODES_8BIT)
+MOTTLE_CELLS = 50  # along the longer side: those of the stickers on which it was measured
+# The upper Cholesky factor of the correlations of red, green, blue (0.73, 0.45, 0.66; 25 photographs, 3 places)
+_MOTTLE_MIXING = np.linalg.cholesky(np.array([[1, 0.73, 0.45], [0.73, 1, 0.66], [0.45, 0.66, 1]])).T
+_MOTTLE_FADES = 0.1  # below white, in sRGB: there it was half as strong
 Method = Literal["measured", "icc", "assumed"]
 GAMUT_STEPS = 8  # the gamut table is stored in eighths of a ΔE00, up to 31.9
 
@@ -132,6 +136,19 @@ def vary_print(seen_linear: Tensor, change: Tensor) -> Tensor:
     light = light * light.clamp_min(1e-3) ** density  # the floor keeps the slope finite at black
     luminance = light @ light.new_tensor(LUMINANCE)[:, None]
     return clamp_to_unit(luminance.lerp(light, 1 + chroma).lerp(torch.ones_like(light), veil))
+
+
+def mottle_pattern(size_px: tuple[int, int], seed: int) -> np.ndarray:
+    """Return H×W×3 of rms 1 for a print `size_px` (width, height): a value for each of its cells and channels."""
+    cells = np.random.default_rng(seed).standard_normal((MOTTLE_CELLS, MOTTLE_CELLS, 3)) @ _MOTTLE_MIXING
+    rows, columns = (np.arange(n) * MOTTLE_CELLS // max(size_px) for n in reversed(size_px))
+    return cells[rows][:, columns]
+
+
+def mottled(seen_linear: Tensor, shift: Tensor) -> Tensor:
+    """Return the light `... × 3` of colors shifted in sRGB; bare paper stays 1, since only ink is uneven."""
+    codes = srgb_from_linear(seen_linear)
+    return linear_from_srgb(clamp_to_unit(codes + shift * ((1 - codes) / _MOTTLE_FADES).clamp(0, 1)))
 
 
 def print_change(variation: Print) -> np.ndarray:

@@ -5,10 +5,10 @@ an underscore is a space. The whole entry counts as a name too. A name that is i
 indices, an absent one with the nearest names.
 """
 
-import difflib
 from collections.abc import Sequence
 
 from patchproof.base.errors import Refused
+from patchproof.base.validation import folded, spelling_hint
 
 
 def find_labels(labels: Sequence[str], label: str | int, accept: Sequence[str | int] = ()) -> tuple[int, ...]:
@@ -30,20 +30,9 @@ def _find(labels: Sequence[str], label: str | int) -> int:
     raise Refused("a label that the network knows", f'"{label}"', nearest_hint(labels, label))
 
 
-def folded(text: str) -> str:
-    """Fold case and underscores."""
-    return " ".join(text.casefold().replace("_", " ").split())
-
-
 def nearest_hint(labels: Sequence[str], label: str) -> str:
     """Return advice with the labels nearest to a word."""
     names = list(dict.fromkeys(name.strip() for entry in labels for name in entry.split(",")))
     shown = ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
-    return nearest_names(label, names, f"use an index below {len(labels)} or one of its {len(labels)} labels ({shown})")
-
-
-def nearest_names(word: str, names: Sequence[str], otherwise: str) -> str:
-    """Advice about an unknown name: up to three similar names, or else the text `otherwise`."""
-    by_folded = {folded(name): name for name in names}
-    near = difflib.get_close_matches(folded(word), by_folded, 3, 0.6)
-    return "did you mean " + " or ".join(f'"{by_folded[name]}"' for name in near) if near else otherwise
+    otherwise = f"use an index below {len(labels)} or one of its {len(labels)} labels ({shown})"
+    return spelling_hint(label, names, otherwise, most=3)

@@ -31,10 +31,10 @@ from torch import Tensor, nn
 
 from patchproof.base.errors import Refused
 from patchproof.base.input import is_file
+from patchproof.base.validation import spelling_hint
 from patchproof.classifier.check import error_summary
 from patchproof.classifier.custom import MAX_DETECTIONS, classifier_of, detector_of
 from patchproof.classifier.detector import Detector
-from patchproof.classifier.labels import nearest_names
 from patchproof.classifier.network import Classifier
 from patchproof.classifier.network_file import Card, check_entries, network_bytes, read_card
 from patchproof.networks.bounds import quote
@@ -62,7 +62,7 @@ def load_torchvision(name: str) -> Classifier:
     name, local = _split_weights(name)
     names = models.list_models(module=models)  # segmentation, detection and video have modules of their own
     if name not in names:
-        do = nearest_names(name, names, "choose one of torchvision.models.list_models()")
+        do = spelling_hint(name, names, "choose one of torchvision.models.list_models()", most=3)
         raise Refused("a torchvision classifier or detector", f'"{name}"', do)
     weights = models.get_model_weights(name).DEFAULT
     view = weights.transforms()
@@ -97,7 +97,7 @@ def load_timm(name: str) -> Classifier:
     timm = import_library("timm", "timm")
     name, local = _split_weights(name)
     if not (timm.is_model(name) or (name.startswith("hf-hub:") and local is None)):
-        do = nearest_names(name, timm.list_models(), "choose one of timm.list_models()")
+        do = spelling_hint(name, timm.list_models(), "choose one of timm.list_models()", most=3)
         raise Refused("a timm model", f'"{name}"', do)
     if local is None:
         with _offline_if_unreachable():
@@ -219,7 +219,7 @@ def load_clip(name: str) -> Classifier:
         expected = "prompts, as clip:MODEL@WEIGHTS.safetensors with WEIGHTS.json or clip:MODEL/PRETRAINED@PROMPTS.json"
         raise Refused(expected, f'"clip:{name}"', 'write {"input_px": 224, "labels": ["a photo of a mug", ...]} there')
     if architecture not in open_clip.list_models():
-        do = nearest_names(architecture, open_clip.list_models(), "choose one of open_clip.list_models()")
+        do = spelling_hint(architecture, open_clip.list_models(), "choose one of open_clip.list_models()", most=3)
         raise Refused("a model of open_clip", f'"{architecture}"', do)
     card = read_card(path.with_suffix(".json"))
     if path.suffix == ".json":

@@ -209,7 +209,7 @@ def photos_line(
         "place in a folder of their own."
     )
     alone = f" The promise alone is proved in {places_text(kept)}." if control and kept and kept < sessions else ""
-    weak = " The promise itself is too little above its best control." if kept is None else ""
+    weak = " The promise itself is too little above its best control." * (kept is None)
     return needed + alone + so_far + weak
 
 

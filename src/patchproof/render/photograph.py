@@ -7,6 +7,7 @@ bare object in even light, seen straight from one side.
 """
 
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,7 @@ from patchproof.base.text import brief
 from patchproof.channel import camera as camera_model
 from patchproof.channel.camera import add_noise, develop, gaussian_blur, is_pointwise, reach_px
 from patchproof.channel.effects import Light, Pose
-from patchproof.channel.printer import print_change, vary_print
+from patchproof.channel.printer import mottle_pattern, mottled, print_change, vary_print
 from patchproof.render.pixels import Appearance, ObjectTextures, PiecePicture
 from patchproof.render.stage import Stage
 from patchproof.render.surfaces import light_texels
@@ -133,8 +134,20 @@ def _piece_light(views: Views, picture: PiecePicture) -> Tensor:
     reflectance = look_up(piece.texels, picture.codes if views.reduced else picture.light)
     if views.reduced:
         reflectance = linear_from_srgb(reflectance)
+    if variation.mottle.any():
+        reflectance = mottled(reflectance, _mottle(views, picture))
     change = torch.as_tensor(print_change(variation)).to(reflectance)
     return vary_print(reflectance, change.index_select(0, piece.view)) * views.piece_white
+
+
+def _mottle(views: Views, picture: PiecePicture) -> Tensor:
+    """Return what each print's mottle adds to the piece's pixels, P×3 in sRGB."""
+    piece, variation, shifts = views.on_piece, views.conditions.print, []
+    ends = torch.searchsorted(piece.view, torch.arange(len(variation) + 1, device=piece.view.device)).tolist()
+    for pixels, rms, seed in zip(pairwise(ends), variation.mottle, variation.mottle_seed, strict=True):
+        pattern = torch.as_tensor(rms * mottle_pattern(picture.size_px, int(seed))).to(picture.codes)
+        shifts.append(look_up(piece.texels.part(*pixels), PiecePicture.of(pattern).codes))
+    return torch.cat(shifts)
 
 
 def _paste_piece(views: Views, image: Tensor, light: Tensor, blur_px: np.ndarray, noise: np.ndarray) -> Tensor:

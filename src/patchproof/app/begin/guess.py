@@ -20,8 +20,8 @@ from typing import Literal
 import numpy as np
 
 from patchproof.base.errors import Refused
-from patchproof.base.validation import Side
-from patchproof.classifier.labels import find_labels, folded, nearest_hint
+from patchproof.base.validation import Side, folded
+from patchproof.classifier.labels import find_labels, nearest_hint
 from patchproof.mesh.load_mesh import load_mesh
 from patchproof.mesh.mesh import Mesh
 from patchproof.scene.placement import SurfaceFrame, largest_fitting_size, place_if_close, placement_method, side_frame
