@@ -15,6 +15,7 @@ from patchproof.base.errors import Refused
 from patchproof.channel.printer import load_printer, printer_output, vary_print
 from patchproof.render.pixels import PiecePicture
 
+PLACES = ("A desk", "B door")
 CODES = np.random.default_rng(0).integers(0, 256, (60, 3)).astype(np.uint8)
 
 
@@ -44,6 +45,17 @@ def test_conditions_hold_the_photographs_that_they_make_and_no_others(folder):
     assert within["print A-one"] > 0.9 and within["print B-two"] < 0.3
 
 
+def test_scatter_is_what_no_smooth_map_of_colors_explains(folder):
+    cells = dict(np.load(folder / "cells.npz"))
+    shift = 0.03 * np.random.default_rng(1).standard_normal((len(CODES), 3))
+    last = cells["photo"] == 2
+    cells["light"][last] = linear_from_srgb(np.clip(srgb_from_linear(cells["light"][last]) + shift, 0, 1))
+    np.savez(folder / "cells.npz", **cells)
+    (colors,) = run_study("real-prints", folder / "s.toml", folder / "out").tables
+    even, uneven = (next(row[3].value for row in colors.rows if row[0] == f"place {place}") for place in PLACES)
+    assert even < 0.015 and 0.018 < uneven < 0.035  # of 60 cells, 20 terms of a cubic take a part
+
+
 def test_photographs_without_a_row_are_refused(folder):
     (folder / "photographs.csv").write_text("print,place\nA-one,desk\n", encoding="utf-8")
     with pytest.raises(Refused, match="1 rows, 3 photographs"):
@@ -70,6 +82,8 @@ def test_figures_in_the_notebook_are_the_stored_ones():
     every = rows["colors"][0]
     assert f"| {100 * float(every['cells within the conditions']):.1f} % [" in page
     assert f"| {float(every['ΔE00 in the best conditions']):.2f} [" in page
+    name = "rms about a cubic, in sRGB"
+    assert "| {:.3f} [{:.3f}, {:.3f}] (".format(*(float(every[name + end]) for end in ("", "_low", "_high"))) in page
     for way, words in (("former", "{} % with the former default"), ("default", "{} % now")):
         biases = [float(row["bias of the effect"]) for row in rows["promises"] if row["conditions"] == way]
         assert words.format(" / ".join(f"{100 * bias:.0f}" for bias in biases)) in page

@@ -2,8 +2,9 @@
 
 In: cells of known color in photographs of prints (sRGB sent, light over white paper; an NPZ with `photographs.csv`
 beside it, which names print and place), and scenes with networks. Out: for each photograph the distance to the default
-printer in the best of its conditions, and the share of cells within what the conditions can make; for each scene and
-network, promises beside sessions of twins: the same design under the scene's views in the colors of one photograph.
+printer in the best of its conditions, the share of cells within what the conditions can make, and how far cells lie off
+a smooth map of colors (what `printer.mottle` is of); for each scene and network, promises beside sessions of twins: the
+same design under the scene's views in the colors of one photograph.
 A twin is a cubic from code to light through all cells of its photograph, and what the cubic leaves, cell by cell.
 
 With `left_out` the default printer is made again without the photographs of a place, or of a print, that it is held
@@ -167,6 +168,7 @@ def _colors(settings: RealPrintsSettings, every: Cells) -> Iterator[dict[str, An
                 "print": every.prints[photo],
                 "distance": float(np.median(distance)),
                 "within": _share_within(torch.as_tensor(light), seen.light, settings.draws),
+                "scatter": float(np.sqrt((Twin.of(every.known.of(np.array([photo]))).left ** 2).mean())),
             }
 
 
@@ -289,12 +291,15 @@ def tables(settings: RealPrintsSettings, results: Sequence[Result]) -> tuple[Tab
 
 def _color_tables(settings: RealPrintsSettings, photos: Sequence[Mapping[str, Any]]) -> Iterator[Table]:
     about = f"{len(photos)} photographs; left out of the default printer: {settings.left_out}"
-    head = ("photographs", "ΔE00 in the best conditions", "cells within the conditions")
+    head = ("photographs", "ΔE00 in the best conditions", "cells within the conditions", "rms about a cubic, in sRGB")
     groups = {"all": list(photos)}
     for key in ("place", "print"):
         for photo in photos:
             groups.setdefault(f"{key} {photo[key]}", []).append(photo)
-    rows = [(name, *(median([p[k] for p in some]) for k in ("distance", "within"))) for name, some in groups.items()]
+    rows = [
+        (name, *(median([p[k] for p in some]) for k in ("distance", "within", "scatter")))
+        for name, some in groups.items()
+    ]
     yield Table("colors", "Colors of the median photograph", head, tuple(rows), about)
 
 
