@@ -355,8 +355,13 @@ def test_decoded_boxes_of_an_untold_head_are_read_by_what_they_hold_and_said(wor
 
 def test_rows_of_detections_may_be_shares_and_in_another_order_are_refused():
     size, (rows,), truth = end_to_end()
-    with pytest.warns(UserWarning, match=r'head \{"name": "ultralytics", "unit": "share"\}'):
+    with pytest.warns(UserWarning, match=r'head \{"name": "ultralytics", "boxes": "xyxy", "unit": "share"\}'):
         assert_equal(decoded(size, [np.hstack([rows[:, :4] / size, rows[:, 4:]])]), truth)
+    sure, label = sigmoid(noise(60, 1)), np.arange(60)[:, None] % K
+    boxes = np.hstack([0.5 + np.tanh(noise(60, 2)) / 2, 0.1 + 0.3 * sigmoid(noise(60, 2))])  # RT-DETR's
+    with pytest.warns(UserWarning, match=r'head \{"name": "ultralytics", "unit": "share"\}'):
+        found = decoded(size, [np.hstack([boxes, sure, label])])
+    assert_equal(found, np.hstack([size * corners(boxes), sure * np.eye(K)[label[:, 0]]]))
     with pytest.raises(Refused, match=r"rows of a box, a score and a label's number, got N×5×6"):
         decoded(size, [rows[:, [5, 4, 0, 1, 2, 3]]])
 

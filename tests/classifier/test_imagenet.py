@@ -6,6 +6,7 @@ import csv
 import hashlib
 import io
 import json
+import math
 import re
 import sys
 import warnings
@@ -195,6 +196,14 @@ def test_a_network_wrapped_wrongly_is_told_what_fits_better(reference, words):
             return
     (warning,) = said
     assert "python:it may be wrapped wrongly" in str(warning.message) and str(warning.message).endswith(words)
+
+
+@pytest.mark.parametrize(("seconds", "tried"), [(1e-9, 2), (math.inf, 8 + 3)])
+def test_without_the_time_for_other_ranges_a_swap_is_tried_and_nothing_refused(reference, monkeypatch, seconds, tried):
+    calls = []
+    monkeypatch.setattr(wrapping, "remaining_seconds", lambda: seconds)
+    wrapping.check_wrapping(wrapped(reference, lambda x: calls.append(1) or x), "cpu")
+    assert len(calls) == tried
 
 
 def test_labels_moved_by_one_place_are_refused_and_shuffled_ones_warned_about(reference):

@@ -66,8 +66,9 @@ class HeadDecoder:
             do = f'write "head": {{"name": "{head.name}", "scores": "logits"}} into its JSON'
             raise Refused(f"scores in 0 to 1 from the head {head.name}", got, do)
         values = values * self.input_px if head.unit == "share" else values
-        if numbers is not None:  # with boxes as corners
-            return spread_labels(values, numbers[..., 0], scores[..., 0], self.labels)
+        if numbers is not None:  # YOLO's rows have corners in pixels, RT-DETR's centers and sizes in shares
+            boxes = values if head.unit == "pixels" or head.boxes == "xyxy" else _boxes(values, [], head)
+            return spread_labels(boxes, numbers[..., 0], scores[..., 0], self.labels)
         boxes = _boxes(values, [torch.as_tensor(each).to(values) for each in cells], head)
         return torch.cat([boxes, _logits(scores, objectness, head, self.labels)], -1)
 
@@ -169,7 +170,9 @@ def _fitted_values(decoder: HeadDecoder, head: Head, names: Sequence[str], outpu
         if numbers is not None:
             if not (0 <= float(scores.min()) and float(scores.max()) <= 1):
                 raise decoder.refusal("rows of a box, a score and a label's number", _shapes(outputs))
-            return head.model_copy(update=fits)
+            orders = (head.boxes, "xyxy")[: 1 + (unit[0] == "share")]
+            rows = [head.model_copy(update=fits | {"boxes": order}) for order in orders]
+            return min(rows, key=lambda each: _misfit(_boxes(values * unit[1], [], each), decoder.input_px))
         fits |= _fitted_scores(decoder, scores, objectness, outputs)
         rows = values[(values != 0).any(-1)]
         are_corners = len(rows) >= MANY_BOXES and float((rows[:, 2:] > rows[:, :2]).all(1).float().mean()) > 0.98

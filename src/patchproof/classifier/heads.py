@@ -81,7 +81,7 @@ _FLOOR = {**_FIVE, "center": 0, "floor": True}
 _FCOS = {**_FIVE, "formula": "distances", "exponent": 0.5}
 HEADS: dict[str, dict[str, Any]] = {
     "boxes": {},  # decoded: boxes in pixels, then logits
-    "ultralytics": {"boxes": "cxcywh", "scores": "probabilities"},  # YOLOv5 to 12 as exported, end to end, too
+    "ultralytics": {"boxes": "cxcywh", "scores": "probabilities"},  # YOLOv5 to 12 as exported; end to end, RT-DETR, too
     "detr": {"boxes": "cxcywh", "unit": "share", "background": "last"},
     "yolov2": {"formula": "grid", "scores": "softmax", **_YOLO2},
     "yolov3": {"formula": "grid", **_YOLO3},

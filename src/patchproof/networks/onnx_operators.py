@@ -148,10 +148,6 @@ def _of_rows(compute: Callable[..., Tensor]) -> Callable[..., Tensor]:
     return lambda x, /, *, axis=1: compute(x.reshape(math.prod(x.shape[:axis]), -1), -1).reshape(x.shape)
 
 
-def _shrink(x, /, *, lambd=0.5, bias=0.0):
-    return torch.where(x < -lambd, x + bias, torch.where(x > lambd, x - bias, 0.0))
-
-
 def _is_infinite(x, /, *, detect_negative=1, detect_positive=1):
     return (x.isposinf() & bool(detect_positive)) | (x.isneginf() & bool(detect_negative))
 
@@ -235,7 +231,7 @@ _TABLE: dict[str, Callable[..., Any]] = {
     "Selu": lambda x, /, *, alpha=1.67326319217681884765625, gamma=1.05070102214813232421875: gamma * F.elu(x, alpha),
     "LeakyRelu": lambda x, /, *, alpha=0.01: F.leaky_relu(x, alpha),
     "ThresholdedRelu": lambda x, /, *, alpha=1.0: torch.where(x > alpha, x, 0.0),
-    "Shrink": _shrink,
+    "Shrink": lambda x, /, *, lambd=0.5, bias=0.0: (x + bias).where(x < -lambd, (x - bias).where(x > lambd, 0.0)),
     "Swish": lambda x, /, *, alpha=1.0: x * (alpha * x).sigmoid(),
     "HardSigmoid": lambda x, /, *, alpha=0.2, beta=0.5: (alpha * x + beta).clamp(0, 1),
     "Gelu": lambda x, /, *, approximate="none": F.gelu(x, approximate=approximate),
