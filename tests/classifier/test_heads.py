@@ -7,6 +7,7 @@ import json
 import math
 import re
 import warnings
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -465,3 +466,10 @@ def test_both_shared_detectors_are_read_without_our_conversion(name, data, tmp_p
         whole = torch.cat(levels[::-1])
     torch.testing.assert_close(raw[:, :4], whole[:, :4], rtol=1e-4, atol=1e-3)
     torch.testing.assert_close(raw[:, 4:].sigmoid(), whole[:, 4:].sigmoid(), rtol=1e-4, atol=1e-6)
+
+
+def test_the_page_of_networks_tells_every_head():
+    page = (Path(__file__).parents[2] / ".readme" / "networks.md").read_text(encoding="utf-8")
+    table = "".join(line.split("|")[1] for line in page.splitlines() if line.startswith("| `"))
+    named = re.findall(r"`([\w-]+)`", table)
+    assert sorted(named) == sorted(HEADS)
