@@ -166,9 +166,11 @@ def _piece(mi: ModuleType, scene: MeshScene, picture: PiecePicture, conditions: 
     scale = conditions.pose.printed_scale[0]
     vertices = scene.middle_mm + scale * (placement.vertices_mm - scene.middle_mm)
     change = torch.tensor(print_change(conditions.print)[0]).to(picture.srgb)
-    pattern = mottle_pattern(picture.size_px, int(conditions.print.mottle_seed[0])) * conditions.print.mottle[0]
-    print_light = mottled(linear_from_srgb(picture.srgb), torch.tensor(pattern).to(picture.srgb))
-    light = vary_print(print_light, change).numpy()  # relative to white paper
+    printed = linear_from_srgb(picture.srgb)
+    if rms := float(conditions.print.mottle[0]):
+        pattern = rms * mottle_pattern(picture.size_px, int(conditions.print.mottle_seed[0]))
+        printed = mottled(printed, torch.tensor(pattern).to(printed))
+    light = vary_print(printed, change).numpy()  # relative to white paper
     back = {"type": "rgb", "value": PAPER_BACK_LINEAR * PAPER_REFLECTANCE}
     uv = placement.piece_mm / np.array(placement.size_mm)
     colors = _texture(mi, light, "clamp"), back
