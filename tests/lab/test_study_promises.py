@@ -25,7 +25,13 @@ def result(scene, *sessions, hits=320, n=400):
         "seed": 0,
     }
     found = {"promised": "1" * hits + "0" * (n - hits), "per_session": 1, "places": []}
-    found |= {"sessions": sessions, "verdict": "kept", "elsewhere": "1" * 79 + "0" * 21, "rendered": sessions}
+    found |= {
+        "gain": ("bare", 0.5, 0.3, 0.2, 0.4),
+        "sessions": sessions,
+        "verdict": "kept",
+        "elsewhere": "1" * 79 + "0" * 21,
+        "rendered": sessions,
+    }
     return Result(Cell(f"{scene}{sessions}", values), found, Path())
 
 
@@ -40,14 +46,15 @@ def test_shares_and_biases_by_hand():
     settings = promises.PromisesSettings(scenes=("a", "b"), networks=("builtin",))
     low = [result("a", (20, 40), (21, 40)), result("a", (22, 40))]  # promised too much
     fair = [result("b", *((hits, 40) for hits in (31, 32, 33)))]
-    held, each = promises.tables(settings, low + fair)
+    held, gains, each = promises.tables(settings, low + fair)
+    assert gains.rows[0][3:6] == (0.8, "bare", 0.5) and gains.rows[0][6].low == 0.2
     assert [(row[0], row[1].value, row[1].n) for row in held.rows] == [("a", 0, 3), ("b", 1, 3), ("all", 0.5, 6)]
     assert held.rows[0][6].value == pytest.approx((20.5 + 22) / 80 - 0.8) and held.rows[0][3] is None
     assert len(each.rows) == 6
     many = promises.tables(settings, [result("a", *((20 + i % 20, 40) for i in range(40)))])[0]
     assert many.rows[0][3] == pytest.approx(19 / 40, abs=0.01)
     settings = settings.model_copy(update={"elsewhere": 100, "rendered": 1})
-    of_photos, of_views, elsewhere, _ = promises.tables(
+    of_photos, of_views, elsewhere, *_ = promises.tables(
         settings, [result("a", (20, 40)), result("a", (20, 40), hits=280)]
     )
     assert of_photos.rows == of_views.rows

@@ -6,6 +6,7 @@ but no report is written.
 """
 
 import zlib
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -36,6 +37,7 @@ class SessionsSettings(grid.GridSettings, PhotosSettings):
     """Settings: a run for each scene, network, printer and seed, and sessions of photographs of each."""
 
     printers: grid.Names = ("coated",)  # printers of the designs, which optimizing knows
+    controls: grid.Names = ("bare",)  # what designs are compared with in their promises; all take most of their time
 
 
 def cells(settings: SessionsSettings, base: Path) -> list[Cell]:
@@ -51,7 +53,9 @@ def cells(settings: SessionsSettings, base: Path) -> list[Cell]:
     )
 
 
-def make_run_and_sheet(base: Path, cell: Cell, folder: Path, views: int | None = None) -> "Run":
+def make_run_and_sheet(
+    base: Path, cell: Cell, folder: Path, views: int | None = None, controls: Sequence[str] = ("bare",)
+) -> "Run":
     """Optimize or import the cell's design into folder/run, promise it by `views`, and write folder/sheet.pdf."""
     from patchproof.optimizer.imported_design import import_patch
     from patchproof.optimizer.run import optimize
@@ -59,8 +63,7 @@ def make_run_and_sheet(base: Path, cell: Cell, folder: Path, views: int | None =
 
     scene = grid.scene_of(base, cell.values)
     scene = replace(scene, settings=scene.settings.changed(target={"models": grid.network_names(base, cell.values)}))
-    # a page needs one control only, and all of them would take most of a promise's time
-    promise = PromiseOptions(views, controls=("bare",))
+    promise = PromiseOptions(views, controls=tuple(controls))
     if (picture := cell.values.get("picture")) is None:
         patch_run = optimize(scene, folder / "run", promise=promise)
     else:

@@ -1,7 +1,8 @@
 """Check that promised rates hold in independently rendered sessions.
 
 Many runs are promised, printed, photographed by another renderer, and verified.
-In: scene files, networks, printers, seeds. Out: for every combination the promised rate, and for each session of its
+In: scene files, networks, printers, seeds. Out: for every combination the promised rate and its gain over the best
+control, and for each session of its
 photographs (one print, one place, light and camera) the promise's interval of counts and the count seen; the share of
 intervals that held, their widths beside those of the best possible ones, each scene's bias, and the same for intervals
 that treat photographs as independent. Optionally sessions of views by our renderer, and the rate in many other places.
@@ -22,12 +23,12 @@ import numpy as np
 from pydantic import Field
 
 from patchlab.study.estimates import mean
-from patchlab.study.grid import Names, by_scene, short_name
+from patchlab.study.grid import Names, by_scene, cell_key, short_name
 from patchlab.study.record import hits_text, parse_hits
 from patchlab.study.study import Cell, Result, Study
 from patchlab.validation import photo_sessions
 from patchproof.base.errors import Refused
-from patchproof.base.intervals import rate
+from patchproof.base.intervals import Estimate, rate
 from patchproof.base.sessions import TAIL, RatePosterior, count_by_session, rate_posterior
 from patchproof.base.validation import spelling_hint
 from patchproof.optimizer.problem import set_problem
@@ -72,12 +73,14 @@ def run(settings: PromisesSettings, base: Path, cell: Cell) -> dict[str, Any]:
     """Promise, photograph and verify one combination."""
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        patch_run = photo_sessions.make_run_and_sheet(base, cell, folder)
+        patch_run = photo_sessions.make_run_and_sheet(base, cell, folder, controls=settings.controls)
         report = photo_sessions.verify_photos(
             photo_sessions.take_photos(settings, cell, patch_run, folder), folder, base, cell, ledger_photos=0
         )
     sessions = [(session.recognized, session.judged) for session in report.summary.sessions]
     answers = photo_sessions.record_promise(patch_run) | {"sessions": sessions, "verdict": report.summary.verdict}
+    claim = patch_run.promise.controls[best := patch_run.promise.best_control]
+    answers["gain"] = best, claim.rate, claim.difference, *claim.difference_interval
     return answers | _measure_views(settings, patch_run)
 
 
@@ -105,7 +108,7 @@ def tables(settings: PromisesSettings, results: Sequence[Result]) -> tuple[Table
         all_tables.append(_share_table("rendered", "Sessions of views in which promises held", about, results))
     if settings.elsewhere:
         all_tables.append(_elsewhere_table(settings, results))
-    return *all_tables, _session_table(results)
+    return *all_tables, _gain_table(results), _session_table(results)
 
 
 @dataclass(frozen=True)
@@ -195,6 +198,15 @@ def _session_table(results: Sequence[Result]) -> Table:
             what = (session.rate, session.posterior.correlation[0], session.judged, session.recognized)
             rows.append((*start, *what, *session.interval(), session.held(), result.answers["verdict"]))
     return Table("promises", "Every session", head, tuple(rows), "the verdict is that of all sessions of the run")
+
+
+def _gain_table(results: Sequence[Result]) -> Table:
+    rows = []
+    for result in results:
+        promised, (control, beside, *gain) = parse_hits(result.answers["promised"]), result.answers["gain"]
+        rows.append((*cell_key(result), sum(promised) / len(promised), control, beside, Estimate(*gain, len(promised))))
+    head = ("scene", "network", "seed", "promised", "best control", "its rate", "gain")
+    return Table("gains", "Gains over the best control", head, tuple(rows), "a lower rate is the gain where one hides")
 
 
 def _elsewhere_table(settings: PromisesSettings, results: Sequence[Result]) -> Table:
