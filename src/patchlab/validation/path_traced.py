@@ -24,7 +24,7 @@ from patchproof.base.errors import Refused
 from patchproof.base.geometry import Frame
 from patchproof.channel.camera import develop
 from patchproof.channel.effects import Light
-from patchproof.channel.printer import mottle_pattern, mottled, print_change, vary_print
+from patchproof.channel.printer import MOTTLE_CELLS, mottle_cells, mottled, print_change, vary_print
 from patchproof.mesh.mesh import Mesh
 from patchproof.render.photograph import PAPER_BACK_LINEAR
 from patchproof.render.pixels import PiecePicture
@@ -168,8 +168,9 @@ def _piece(mi: ModuleType, scene: MeshScene, picture: PiecePicture, conditions: 
     change = torch.tensor(print_change(conditions.print)[0]).to(picture.srgb)
     printed = linear_from_srgb(picture.srgb)
     if rms := float(conditions.print.mottle[0]):
-        pattern = rms * mottle_pattern(picture.size_px, int(conditions.print.mottle_seed[0]))
-        printed = mottled(printed, torch.tensor(pattern).to(printed))
+        cells = mottle_cells(int(conditions.print.mottle_seed[0])).reshape(MOTTLE_CELLS, MOTTLE_CELLS, 3)
+        rows, columns = (np.arange(n) * MOTTLE_CELLS // max(picture.size_px) for n in printed.shape[:2])
+        printed = mottled(printed, torch.tensor(rms * cells[rows][:, columns]).to(printed))
     light = vary_print(printed, change).numpy()  # relative to white paper
     back = {"type": "rgb", "value": PAPER_BACK_LINEAR * PAPER_REFLECTANCE}
     uv = placement.piece_mm / np.array(placement.size_mm)

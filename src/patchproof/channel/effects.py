@@ -96,7 +96,7 @@ class Print(Draws):
     density: np.ndarray = off()
     chroma: np.ndarray = off()
     veil: np.ndarray = off((0.0, 0.0, 0.0))  # N×3 red, green, blue
-    mottle: np.ndarray = off()  # rms in sRGB, from cell to cell (see `channel.printer.mottle_pattern`)
+    mottle: np.ndarray = off()  # rms in sRGB, from cell to cell (see `channel.printer.mottle_cells`)
     mottle_seed: np.ndarray = off(0)  # int64
 
 

@@ -138,11 +138,9 @@ def vary_print(seen_linear: Tensor, change: Tensor) -> Tensor:
     return clamp_to_unit(luminance.lerp(light, 1 + chroma).lerp(torch.ones_like(light), veil))
 
 
-def mottle_pattern(size_px: tuple[int, int], seed: int) -> np.ndarray:
-    """Return H×W×3 of rms 1 for a print `size_px` (width, height): a value for each of its cells and channels."""
-    cells = np.random.default_rng(seed).standard_normal((MOTTLE_CELLS, MOTTLE_CELLS, 3)) @ _MOTTLE_MIXING
-    rows, columns = (np.arange(n) * MOTTLE_CELLS // max(size_px) for n in reversed(size_px))
-    return cells[rows][:, columns]
+def mottle_cells(seed: int) -> np.ndarray:
+    """Return K×3 of rms 1: a value for each channel of a square print's cells, row by row."""
+    return np.random.default_rng(seed).standard_normal((MOTTLE_CELLS**2, 3)) @ _MOTTLE_MIXING
 
 
 def mottled(seen_linear: Tensor, shift: Tensor) -> Tensor:

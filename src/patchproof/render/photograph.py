@@ -7,7 +7,7 @@ bare object in even light, seen straight from one side.
 """
 
 from dataclasses import replace
-from itertools import pairwise
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -21,11 +21,11 @@ from patchproof.base.text import brief
 from patchproof.channel import camera as camera_model
 from patchproof.channel.camera import add_noise, develop, gaussian_blur, is_pointwise, reach_px
 from patchproof.channel.effects import Light, Pose
-from patchproof.channel.printer import mottle_pattern, mottled, print_change, vary_print
+from patchproof.channel.printer import MOTTLE_CELLS, mottle_cells, mottled, print_change, vary_print
 from patchproof.render.pixels import Appearance, ObjectTextures, PiecePicture
 from patchproof.render.stage import Stage
 from patchproof.render.surfaces import light_texels
-from patchproof.render.texture import look_up
+from patchproof.render.texture import look_up, texel_layout
 from patchproof.render.views import Views, relight, render_views
 from patchproof.scene.backgrounds import load_backgrounds
 from patchproof.scene.conditions import Conditions
@@ -142,12 +142,28 @@ def _piece_light(views: Views, picture: PiecePicture) -> Tensor:
 
 def _mottle(views: Views, picture: PiecePicture) -> Tensor:
     """Return what each print's mottle adds to the piece's pixels, P×3 in sRGB."""
-    piece, variation, shifts = views.on_piece, views.conditions.print, []
-    ends = torch.searchsorted(piece.view, torch.arange(len(variation) + 1, device=piece.view.device)).tolist()
-    for pixels, rms, seed in zip(pairwise(ends), variation.mottle, variation.mottle_seed, strict=True):
-        pattern = torch.as_tensor(rms * mottle_pattern(picture.size_px, int(seed))).to(picture.codes)
-        shifts.append(look_up(piece.texels.part(*pixels), PiecePicture.of(pattern).codes))
-    return torch.cat(shifts)
+    piece, variation = views.on_piece, views.conditions.print
+    cell, first = _cell_of_texel(picture.size_px).to(piece.view.device), piece.view[:, None] * MOTTLE_CELLS**2
+    groups = (
+        replace(group, texel=cell[group.texel.long()] + (first if group.fragment is None else first[group.fragment]))
+        for group in piece.texels.groups
+    )
+    prints = zip(variation.mottle, variation.mottle_seed, strict=True)
+    cells = np.concatenate([rms * mottle_cells(int(seed)) for rms, seed in prints])
+    return look_up(replace(piece.texels, groups=tuple(groups)), torch.as_tensor(cells).to(picture.codes))
+
+
+@lru_cache(maxsize=4)
+def _cell_of_texel(size_px: tuple[int, int]) -> Tensor:
+    """Return the cell of a print's mottle in which each texel of a picture's levels has its middle."""
+    parts, longer = [], max(size_px)
+    for *level_px, _ in texel_layout([size_px], wrap=False).places.tolist():
+        column, row = (
+            ((torch.arange(n + 1).clamp_max(n - 1) + 0.5) * MOTTLE_CELLS * side / (n * longer)).long()
+            for n, side in zip(level_px, size_px, strict=True)
+        )
+        parts.append((row[:, None] * MOTTLE_CELLS + column).flatten())
+    return torch.cat(parts)
 
 
 def _paste_piece(views: Views, image: Tensor, light: Tensor, blur_px: np.ndarray, noise: np.ndarray) -> Tensor:
