@@ -53,7 +53,7 @@ def test_print_terms_let_gradients_pass(tmp_path):
 def test_the_plan_names_each_print_term_and_takes_it_out(tmp_path):
     names = {"dot gain", "ink density", "veil", "chroma", "mottle", "print scale"}
     every = {"printer__scale": [0.95, 1], "printer__mottle": [0, 0.03]}
-    for tables, off in ((every, set()), ({}, {"mottle", "print scale"})):
+    for tables, off in ((every, set()), ({"printer__mottle": [0, 0]}, {"mottle", "print scale"})):
         problem = set_problem(scene_with(tmp_path, **tables))
         shown = problem.subject.appearance(problem.subject.start())
         setup = Setup(problem.stage, shown, problem.scene.draw("select", 4))
@@ -77,7 +77,7 @@ def test_a_print_scale_range_reaches_the_promise_and_the_truth(tmp_path):
 def test_mottle_is_as_strong_as_it_says_on_ink_and_is_not_on_paper(tmp_path):
     scene = box_scene(tmp_path)
     gray, white = (PiecePicture.of(torch.full((200, 200, 3), level)) for level in (0.5, 1.0))
-    plain = posed(scene, 3, ambient=1, directional=0, noise=0, blur_px=0, exposure_ev=0, jpeg=0)
+    plain = posed(scene, 3, ambient=1, directional=0, noise=0, blur_px=0, exposure_ev=0, jpeg=0, mottle=0)
     uneven = with_values(plain, mottle=np.array([0.02, 0.02, 0.06]), mottle_seed=np.array([7, 7, 8]))
     stage = set_stage(scene)
 

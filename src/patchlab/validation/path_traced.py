@@ -166,12 +166,12 @@ def _piece(mi: ModuleType, scene: MeshScene, picture: PiecePicture, conditions: 
     scale = conditions.pose.printed_scale[0]
     vertices = scene.middle_mm + scale * (placement.vertices_mm - scene.middle_mm)
     change = torch.tensor(print_change(conditions.print)[0]).to(picture.srgb)
-    printed = linear_from_srgb(picture.srgb)
+    printed = picture.srgb
     if rms := float(conditions.print.mottle[0]):
         cells = mottle_cells(int(conditions.print.mottle_seed[0])).reshape(MOTTLE_CELLS, MOTTLE_CELLS, 3)
         rows, columns = (np.arange(n) * MOTTLE_CELLS // max(picture.size_px) for n in printed.shape[:2])
         printed = mottled(printed, torch.tensor(rms * cells[rows][:, columns]).to(printed))
-    light = vary_print(printed, change).numpy()  # relative to white paper
+    light = vary_print(linear_from_srgb(printed), change).numpy()  # relative to white paper
     back = {"type": "rgb", "value": PAPER_BACK_LINEAR * PAPER_REFLECTANCE}
     uv = placement.piece_mm / np.array(placement.size_mm)
     colors = _texture(mi, light, "clamp"), back

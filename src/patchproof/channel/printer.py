@@ -25,7 +25,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from patchproof.base.color import LUMINANCE, clamp_to_unit, lab_from_srgb, linear_from_srgb, srgb_from_linear
+from patchproof.base.color import LUMINANCE, clamp_to_unit, lab_from_srgb
 from patchproof.base.errors import Refused
 from patchproof.base.input import read_file, read_json
 from patchproof.base.packaged import named_path, packaged_path
@@ -143,10 +143,9 @@ def mottle_cells(seed: int) -> np.ndarray:
     return np.random.default_rng(seed).standard_normal((MOTTLE_CELLS**2, 3)) @ _MOTTLE_MIXING
 
 
-def mottled(seen_linear: Tensor, shift: Tensor) -> Tensor:
-    """Return the light `... × 3` of colors shifted in sRGB; bare paper stays 1, since only ink is uneven."""
-    codes = srgb_from_linear(seen_linear)
-    return linear_from_srgb(clamp_to_unit(codes + shift * ((1 - codes) / _MOTTLE_FADES).clamp(0, 1)))
+def mottled(seen_srgb: Tensor, shift: Tensor) -> Tensor:
+    """Return the sRGB colors `... × 3` with their mottle; bare paper stays 1, since only ink is uneven."""
+    return clamp_to_unit(seen_srgb + shift * ((1 - seen_srgb) / _MOTTLE_FADES).clamp(0, 1))
 
 
 def print_change(variation: Print) -> np.ndarray:

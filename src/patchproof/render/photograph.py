@@ -131,11 +131,11 @@ def _blend(image: Tensor, pixel: Tensor, share: Tensor, value: Tensor, by_code: 
 def _piece_light(views: Views, picture: PiecePicture) -> Tensor:
     """Return the light P×3 that the piece's pixels send to the camera."""
     variation, piece = views.conditions.print, views.on_piece
-    reflectance = look_up(piece.texels, picture.codes if views.reduced else picture.light)
-    if views.reduced:
-        reflectance = linear_from_srgb(reflectance)
-    if variation.mottle.any():
-        reflectance = mottled(reflectance, _mottle(views, picture))
+    has_mottle = variation.mottle.any()
+    seen = look_up(piece.texels, picture.codes if views.reduced else picture.light)
+    if has_mottle:
+        seen = mottled(seen if views.reduced else srgb_from_linear(seen), _mottle(views, picture))
+    reflectance = linear_from_srgb(seen) if views.reduced or has_mottle else seen
     change = torch.as_tensor(print_change(variation)).to(reflectance)
     return vary_print(reflectance, change.index_select(0, piece.view)) * views.piece_white
 
@@ -143,7 +143,7 @@ def _piece_light(views: Views, picture: PiecePicture) -> Tensor:
 def _mottle(views: Views, picture: PiecePicture) -> Tensor:
     """Return what each print's mottle adds to the piece's pixels, P×3 in sRGB."""
     piece, variation = views.on_piece, views.conditions.print
-    cell, first = _cell_of_texel(picture.size_px).to(piece.view.device), piece.view[:, None] * MOTTLE_CELLS**2
+    cell, first = _cell_of_texel(picture.size_px, piece.view.device), piece.view[:, None] * MOTTLE_CELLS**2
     groups = (
         replace(group, texel=cell[group.texel.long()] + (first if group.fragment is None else first[group.fragment]))
         for group in piece.texels.groups
@@ -154,7 +154,7 @@ def _mottle(views: Views, picture: PiecePicture) -> Tensor:
 
 
 @lru_cache(maxsize=4)
-def _cell_of_texel(size_px: tuple[int, int]) -> Tensor:
+def _cell_of_texel(size_px: tuple[int, int], device: torch.device) -> Tensor:
     """Return the cell of a print's mottle in which each texel of a picture's levels has its middle."""
     parts, longer = [], max(size_px)
     for *level_px, _ in texel_layout([size_px], wrap=False).places.tolist():
@@ -163,7 +163,7 @@ def _cell_of_texel(size_px: tuple[int, int]) -> Tensor:
             for n, side in zip(level_px, size_px, strict=True)
         )
         parts.append((row[:, None] * MOTTLE_CELLS + column).flatten())
-    return torch.cat(parts)
+    return torch.cat(parts).to(device)
 
 
 def _paste_piece(views: Views, image: Tensor, light: Tensor, blur_px: np.ndarray, noise: np.ndarray) -> Tensor:

@@ -20,7 +20,7 @@ settings = {
 scene = pp.make_scene(settings)
 stage, views = pp.set_stage(scene), scene.draw("evaluate", 2)
 design, nudge = torch.full((3, 16, 16), 0.5, requires_grad=True), torch.zeros(3, 16, 16)
-nudge[1, 8, 8] = 0.02
+nudge[1] = 0.02  # all of green: one pixel moves the loss by as little as float32 rounds
 
 
 def total_loss(shown):
@@ -30,7 +30,7 @@ def total_loss(shown):
 
 (gradient,) = torch.autograd.grad(total_loss(design), design)
 difference = (total_loss(design + nudge) - total_loss(design - nudge)) / 0.04
-print(f"gradient {gradient[1, 8, 8]:.5f}, by finite differences {difference:.5f}")
+print(f"gradient {gradient[1].sum():.5f}, by finite differences {difference:.5f}")
 
 run = pp.optimize(scene, "network-run", loss=loss)
 pp.sheet(run, "network.pdf")
