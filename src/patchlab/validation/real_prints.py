@@ -39,6 +39,7 @@ from patchproof.base.settings import CameraSettings, PrinterSettings, SceneSetti
 from patchproof.base.validation import expand_path
 from patchproof.channel.effects import EFFECT_BY_NAME, Print
 from patchproof.channel.printer import (
+    MOTTLE_CELLS,
     Printer,
     identity_printer,
     load_printer,
@@ -60,15 +61,14 @@ from patchproof.scene.interface import Scene
 
 Tables = Mapping[str, Mapping[str, Any]]
 FORMER: Tables = {
-    "printer": {"profile": "coated", "chroma": (0, 0), "veil": (0, 0.004)},
+    "printer": {"profile": "coated", "chroma": (0, 0), "veil": (0, 0.004), "mottle": (0, 0)},
     "camera": {"tone": (0, 0)},
 }
 """Default conditions before real prints were measured; black that differed by ±0.004 is a veil of at most that."""
 _STILL: Tables = {
-    "printer": dict.fromkeys(("dot_gain", "density", "chroma", "veil"), (0, 0)),
+    "printer": dict.fromkeys(("dot_gain", "density", "chroma", "veil", "mottle"), (0, 0)),
     "camera": {"tone": (0, 0)},
 }
-_BLOCKS = 24  # along a piece's sides: each has what is left of one cell of a twin's photograph
 _CHUNK = 4  # views rendered at a time
 _BASE = "coated"  # the printer that an ink is told apart from
 
@@ -203,10 +203,10 @@ class Twin:
         return cls(cubic, seen - _cubic_terms(sent) @ cubic)
 
     def show(self, piece: PiecePicture, rng: np.random.Generator) -> PiecePicture:
-        """The piece in these colors, each block with what is left of some cell."""
+        """The piece in these colors, each of its cells with what is left of some cell of the photograph."""
         sent = piece.srgb.numpy()
-        left = self.left[rng.integers(0, len(self.left), (_BLOCKS, _BLOCKS))]
-        rows, columns = (np.arange(n) * _BLOCKS // n for n in sent.shape[:2])
+        left = self.left[rng.integers(0, len(self.left), (MOTTLE_CELLS, MOTTLE_CELLS))]
+        rows, columns = (np.arange(n) * MOTTLE_CELLS // n for n in sent.shape[:2])
         seen = (_cubic_terms(sent.reshape(-1, 3)) @ self.cubic).reshape(sent.shape) + left[rows][:, columns]
         return PiecePicture.of(torch.tensor(np.clip(seen, 0, 1), dtype=torch.float32))
 
@@ -221,11 +221,14 @@ def _hold_promises(settings: RealPrintsSettings, base: Path, cell: Cell, every: 
     scene, names = scene_of(base, cell.values), network_names(base, cell.values)
     answers: dict[str, Any] = {}
     with tempfile.TemporaryDirectory() as temporary:
-        conditions = {"former": [(_problem(scene, names, FORMER), list(range(len(every.places))))], "default": []}
+        ways = {"default": {}, "without mottle": {"mottle": (0, 0)}}
+        conditions = {"former": [(_problem(scene, names, FORMER), list(range(len(every.places))))]}
         for i, (printer, held) in enumerate(_printers(settings, every).values()):
             file = Path(temporary, f"printer{i}.npz")
             write_files_atomically(printer_contents(replace(printer, name=file.stem), file))
-            conditions["default"].append((_problem(scene, names, {"printer": {"profile": str(file)}}), held))
+            for way, changed in ways.items():
+                problem = _problem(scene, names, {"printer": {"profile": str(file), **changed}})
+                conditions.setdefault(way, []).append((problem, held))
         still = _problem(scene, names, _STILL)
         twins = [Twin.of(every.known.of(np.array([photo]))) for photo in range(len(every.places))]
         designs = {
@@ -238,7 +241,7 @@ def _hold_promises(settings: RealPrintsSettings, base: Path, cell: Cell, every: 
                 if by == "former" or way == "default"
             }
             answers[by] = {"promised": promised, "twins": _twins(settings, still, pixels, twins)}
-    return answers
+    return answers | {"places": every.places}
 
 
 def _problem(scene: Scene, names: Sequence[str], tables: Tables) -> Problem:
@@ -286,7 +289,10 @@ def tables(settings: RealPrintsSettings, results: Sequence[Result]) -> tuple[Tab
     """Colors by photograph; promises beside twins, by scene and network; designs on twins."""
     colors = [each for result in results for each in result.answers.get("photographs", ())]
     pairs = [result for result in results if "photographs" not in result.answers]
-    return (*_color_tables(settings, colors), *((_promise_table(pairs), _design_table(pairs)) if pairs else ()))
+    return (
+        *_color_tables(settings, colors),
+        *((_promise_table(pairs), _place_table(pairs), _design_table(pairs)) if pairs else ()),
+    )
 
 
 def _color_tables(settings: RealPrintsSettings, photos: Sequence[Mapping[str, Any]]) -> Iterator[Table]:
@@ -336,6 +342,20 @@ def _promise_table(pairs: Sequence[Result]) -> Table:
             rows.append((*cell_key(result), way, *figures))
     about = "the design by former conditions; shares of the twins' mean effect; twins of one print and place are alike"
     return Table("promises", "Promises beside twins", (*head, "sessions inside"), tuple(rows), about)
+
+
+def _place_table(pairs: Sequence[Result]) -> Table:
+    by_group: dict[tuple[str, str], list[np.ndarray]] = {}
+    for result in pairs:
+        for way, promised in result.answers["former"]["promised"].items():
+            biases = np.array(_of_twins(promised, result.answers["former"]["twins"]))
+            places = np.array([result.answers["places"][i] for held, _ in promised for i in held])
+            for place in ("all", *sorted(set(places))):
+                of_place = biases[(places == place) | (place == "all")].mean(0)
+                by_group.setdefault((way, place), []).append(of_place)
+    rows = [(*group, *map(mean, zip(*each, strict=True))) for group, each in by_group.items()]
+    head = ("conditions", "twins of", "bias of the effect", "bias of the rate", "sessions inside")
+    return Table("places", "Promises beside twins by place", head, tuple(rows), "means over scenes and seeds")
 
 
 def _design_table(pairs: Sequence[Result]) -> Table:
