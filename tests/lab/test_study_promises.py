@@ -26,7 +26,7 @@ def result(scene, *sessions, hits=320, n=400):
     }
     found = {"promised": "1" * hits + "0" * (n - hits), "per_session": 1, "places": []}
     found |= {
-        "gain": ("bare", 0.5, 0.3, 0.2, 0.4),
+        "gain": ("bare", 0.5, {"value": 0.3, "low": 0.2, "high": 0.4, "n": 100}),
         "sessions": sessions,
         "verdict": "kept",
         "elsewhere": "1" * 79 + "0" * 21,

@@ -14,7 +14,7 @@ Photographs are path-traced (`path_traced`), since our renderer's would share th
 
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -80,7 +80,7 @@ def run(settings: PromisesSettings, base: Path, cell: Cell) -> dict[str, Any]:
     sessions = [(session.recognized, session.judged) for session in report.summary.sessions]
     answers = photo_sessions.record_promise(patch_run) | {"sessions": sessions, "verdict": report.summary.verdict}
     claim = patch_run.promise.controls[best := patch_run.promise.best_control]
-    answers["gain"] = best, claim.rate, claim.difference, *claim.difference_interval
+    answers["gain"] = best, claim.rate, asdict(Estimate(claim.difference, *claim.difference_interval, claim.n))
     return answers | _measure_views(settings, patch_run)
 
 
@@ -203,8 +203,8 @@ def _session_table(results: Sequence[Result]) -> Table:
 def _gain_table(results: Sequence[Result]) -> Table:
     rows = []
     for result in results:
-        promised, (control, beside, *gain) = parse_hits(result.answers["promised"]), result.answers["gain"]
-        rows.append((*cell_key(result), sum(promised) / len(promised), control, beside, Estimate(*gain, len(promised))))
+        promised, (control, beside, gain) = parse_hits(result.answers["promised"]), result.answers["gain"]
+        rows.append((*cell_key(result), sum(promised) / len(promised), control, beside, Estimate(**gain)))
     head = ("scene", "network", "seed", "promised", "best control", "its rate", "gain")
     return Table("gains", "Gains over the best control", head, tuple(rows), "a lower rate is the gain where one hides")
 

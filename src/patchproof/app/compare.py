@@ -78,7 +78,11 @@ def compare(
             return run_responses(run, run.scene.draw("evaluate", n, seed, start), models, compute, advance)[1]
 
         by_design = {name: ask(name, 0) for name in loaded}
-        order = sorted(loaded, key=lambda name: _goal_score(by_design[name]["design"], target.goal))[::-1]
+
+        def means(name: str) -> tuple[float, float]:
+            return by_design[name]["design"].recognized[0].mean(), by_design[name]["design"].confidence[0].mean()
+
+        order = sorted(loaded, key=means, reverse=target.goal.sign > 0)
         by_design = {name: by_design[name] for name in order}
         fresh = {name: ask(name, n) for name in order[:2]}
         results = Results(
@@ -121,11 +125,6 @@ def _views_of(scene: Scene, with_networks: bool) -> tuple[Any, ...]:
     if isinstance(scene, MeshScene):  # a side and the patch in its middle are one front
         settings["view"]["front"] = np.round([scene.frame.normal, scene.frame.up], 6).tolist()
     return settings, networks, files, scene.mesh_glb
-
-
-def _goal_score(answers: Responses, goal: Goal) -> tuple[float, float]:
-    """Rank a design by the first network's rate, then by its confidence; larger is better for the goal."""
-    return goal.sign * float(answers.recognized[0].mean()), goal.sign * float(answers.confidence[0].mean())
 
 
 def _tables(

@@ -22,11 +22,13 @@ Else it is the promise's controls. The patch has to beat all that decide; `base.
 from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import groupby
+from operator import itemgetter
 
 import numpy as np
 
 from patchproof.base.intervals import rates_difference, wilson
-from patchproof.base.sessions import LEAST_SESSIONS, TAIL, HitsBySession, sessions_difference
+from patchproof.base.sessions import LEAST_SESSIONS, TAIL, sessions_difference
 from patchproof.evidence.results import Benefit, Control, ControlSource, EffectEstimate, VerdictWord
 from patchproof.sheets.manifest import Interval, Promise
 
@@ -232,22 +234,18 @@ def compare_with_control(patch: Answers, name: str, control: Answers, promise: P
         return replace(row, advice=f"no photograph of {'it' if patch else 'the patch'} could be judged")
     keys = sorted(patch.keys() & control.keys())
     paired = len(keys) >= max(LEAST_PAIRS, LEAST_PAIRED * len(patch), LEAST_PAIRED * len(control))
-    a, b = (_by_session(answers, keys if paired else sorted(answers)) for answers in (patch, control))
+    hits, rates = [], []
+    for answers in (patch, control):
+        by_session = groupby(keys if paired else sorted(answers), itemgetter(0))
+        hits.append({session: [answers[key] for key in group] for session, group in by_session})
+        counts = sum(map(sum, hits[-1].values())), list(map(len, hits[-1].values()))
+        rates.append((counts[0] / sum(counts[1]), promise.posterior.rate_given(*counts)))
+    (a, b), ((rate, ours), (control_rate, theirs)) = hits, rates
     difference, interval = sessions_difference(a, b, paired)
-    (rate, ours), (control_rate, theirs) = (_rate_of(hits, promise) for hits in (a, b))
     row = replace(row, interval=theirs, rates=(rate, control_rate), patch_interval=ours, difference=difference)
     count, pairs, shown = min(len(a), len(b)), len(keys) if paired else 0, promise.target.goal.gains(interval)[0] > 0
     row = replace(row, sessions=count, pairs=pairs, difference_interval=interval, shown=shown)
     return row if count >= LEAST_SESSIONS else replace(row, advice=ONE_SESSION_ADVICE)
-
-
-def _rate_of(hits: HitsBySession, promise: Promise) -> tuple[float, Interval]:
-    counts = sum(map(sum, hits.values())), [len(each) for each in hits.values()]
-    return counts[0] / sum(counts[1]), promise.posterior.rate_given(*counts)
-
-
-def _by_session(answers: Answers, keys: Sequence[PhotoKey]) -> dict[int, list[bool]]:
-    return {session: [answers[key] for key in keys if key[0] == session] for session, _ in keys}
 
 
 def benefit_of(

@@ -25,7 +25,7 @@ from patchproof.channel.printer import MOTTLE_CELLS, mottle_cells, mottled, prin
 from patchproof.render.pixels import Appearance, ObjectTextures, PiecePicture
 from patchproof.render.stage import Stage
 from patchproof.render.surfaces import light_texels
-from patchproof.render.texture import look_up, texel_layout
+from patchproof.render.texture import look_up, texel_table
 from patchproof.render.views import Views, relight, render_views
 from patchproof.scene.backgrounds import load_backgrounds
 from patchproof.scene.conditions import Conditions
@@ -156,14 +156,9 @@ def _mottle(views: Views, picture: PiecePicture) -> Tensor:
 @lru_cache(maxsize=4)
 def _cell_of_texel(size_px: tuple[int, int], device: torch.device) -> Tensor:
     """Return the cell of a print's mottle in which each texel of a picture's levels has its middle."""
-    parts, longer = [], max(size_px)
-    for *level_px, _ in texel_layout([size_px], wrap=False).places.tolist():
-        column, row = (
-            ((torch.arange(n + 1).clamp_max(n - 1) + 0.5) * MOTTLE_CELLS * side / (n * longer)).long()
-            for n, side in zip(level_px, size_px, strict=True)
-        )
-        parts.append((row[:, None] * MOTTLE_CELLS + column).flatten())
-    return torch.cat(parts).to(device)
+    across, down = ((torch.arange(n) + 0.5) * (MOTTLE_CELLS / max(size_px)) for n in size_px)
+    middle = texel_table([torch.stack(torch.meshgrid(down, across, indexing="ij"), -1)], wrap=False).long()
+    return (middle[:, 0] * MOTTLE_CELLS + middle[:, 1]).to(device)
 
 
 def _paste_piece(views: Views, image: Tensor, light: Tensor, blur_px: np.ndarray, noise: np.ndarray) -> Tensor:
