@@ -78,11 +78,9 @@ def compare(
             return run_responses(run, run.scene.draw("evaluate", n, seed, start), models, compute, advance)[1]
 
         by_design = {name: ask(name, 0) for name in loaded}
-
-        def means(name: str) -> tuple[float, float]:
-            return by_design[name]["design"].recognized[0].mean(), by_design[name]["design"].confidence[0].mean()
-
-        order = sorted(loaded, key=means, reverse=target.goal.sign > 0)
+        ours = ((name, each["design"]) for name, each in by_design.items())
+        means = {name: (each.recognized[0].mean(), each.confidence[0].mean()) for name, each in ours}
+        order = sorted(loaded, key=means.__getitem__)[:: -target.goal.sign]
         by_design = {name: by_design[name] for name in order}
         fresh = {name: ask(name, n) for name in order[:2]}
         results = Results(

@@ -148,10 +148,6 @@ def _of_rows(compute: Callable[..., Tensor]) -> Callable[..., Tensor]:
     return lambda x, /, *, axis=1: compute(x.reshape(math.prod(x.shape[:axis]), -1), -1).reshape(x.shape)
 
 
-def _is_infinite(x, /, *, detect_negative=1, detect_positive=1):
-    return (x.isposinf() & bool(detect_positive)) | (x.isneginf() & bool(detect_negative))
-
-
 def _extreme_place(compute: Callable[..., Tensor]) -> Callable[..., Tensor]:
     """The index of an extreme, the first or with `select_last_index` the last one."""
 
@@ -237,7 +233,9 @@ _TABLE: dict[str, Callable[..., Any]] = {
     "Gelu": lambda x, /, *, approximate="none": F.gelu(x, approximate=approximate),
     "Softmax": lambda x, /, *, axis=-1: x.softmax(axis),
     "LogSoftmax": lambda x, /, *, axis=-1: x.log_softmax(axis),
-    "IsInf": _is_infinite,
+    "IsInf": lambda x, /, *, detect_negative=1, detect_positive=1: (
+        (x.isposinf() & bool(detect_positive)) | (x.isneginf() & bool(detect_negative))
+    ),
     "Cast": lambda x, /, *, to: x.to(DTYPES[to]),
     # of two or more
     **_named(_BINARY, torch, _binary),
