@@ -20,6 +20,7 @@ import torch
 from PIL import Image
 from torch import nn
 
+import patchlab
 from patchproof.app.demo import demo_scene
 from patchproof.base.errors import Refused
 from patchproof.base.settings import load_scene_settings
@@ -286,3 +287,14 @@ def test_the_documented_python_networks_load_and_one_without_gradients_is_refuse
         Refused, match="a gradient from the logits to the pixels, got none from the network module:service"
     ):
         load_classifier("module:service.network", documented)
+
+
+def test_the_notebook_s_figures_of_wrapping_are_those_of_the_stored_trials():
+    """`python tests/wrapping_trials.py` made them."""
+    results = Path(patchlab.__file__).parent / "results"
+    trials = list(csv.DictReader((results / "wrapping" / "trials.csv").read_text("utf-8").splitlines()))
+    page = (results / "measured.md").read_text("utf-8")
+    for kind, words in (("wrong", "named rightly"), ("right", "right ones pass")):
+        hits = [trial["as it should be"] == "True" for trial in trials if trial["wrapped"] == kind]
+        assert f"{sum(hits)} of {len(hits)} {words}" in page
+    assert len({trial["network"] for trial in trials}) == 10
