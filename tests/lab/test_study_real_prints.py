@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from patchlab.study.estimates import mean
 from patchlab.study.study import run_study
 from patchlab.validation import real_prints
 from patchlab.validation.known_colors import KnownColors
@@ -75,7 +76,7 @@ def test_figures_in_the_notebook_are_the_stored_ones():
     results = Path(real_prints.__file__).parents[1] / "results"
     stored = {
         name: (results / "real_prints" / f"real-prints_{name}.csv").read_text("utf-8")
-        for name in ("colors", "promises")
+        for name in ("colors", "places", "designs")
     }
     rows = {name: list(csv.DictReader(text.splitlines())) for name, text in stored.items()}
     page = (results / "measured.md").read_text("utf-8")
@@ -84,6 +85,14 @@ def test_figures_in_the_notebook_are_the_stored_ones():
     assert f"| {float(every['ΔE00 in the best conditions']):.2f} [" in page
     name = "rms about a cubic, in sRGB"
     assert "| {:.3f} [{:.3f}, {:.3f}] (".format(*(float(every[name + end]) for end in ("", "_low", "_high"))) in page
-    for way, words in (("former", "{} % with the former default"), ("default", "{} % now")):
-        biases = [float(row["bias of the effect"]) for row in rows["promises"] if row["conditions"] == way]
-        assert words.format(" / ".join(f"{100 * bias:.0f}" for bias in biases)) in page
+    all_places = {row["conditions"]: row for row in rows["places"] if row["twins of"] == "all"}
+    former, default, plain = (
+        [100 * float(all_places[way][f"bias of the effect{end}"]) for end in ("", "_low", "_high")]
+        for way in ("former", "default", "without mottle")
+    )
+    said = "{:.1f} % [{:.1f}, {:.1f}] with the former default, {:.1f} % [{:.1f}, {:.1f}] now, {:.1f} % without mottle"
+    assert said.format(*former, *default, plain[0]) in page
+    rates = (100 * float(row["bias of the rate"]) for row in all_places.values())
+    assert "rate by {:.1f}, {:.1f} and {:.1f} points".format(*rates) in page
+    gains = mean([float(row["gain"]) for row in rows["designs"]])
+    assert f"{100 * gains.value:.1f} points in the mean [{100 * gains.low:.1f}, {100 * gains.high:.1f}]" in page

@@ -189,8 +189,8 @@ class PrinterSettings(StrictModel):
     density: Annotated[Range, within(-0.9, 3)] = (-0.05, 0.05)  # added ink, as a share of the ink's own
     chroma: Annotated[Range, within(-1, 1)] = (-0.3, 0.15)  # added by a photograph, as a share of the print's own
     veil: Annotated[ShareRange, within(0, 0.5)] = (0.0, 0.05)  # light of its place that a print mirrors; paper is 1
-    # As 25 photographs of four prints show. Beside their colors, effects on a logit promised to 4 pairs of scene and
-    # network with 0.02 to 0.045 were too large by 13 %, without it by 17 % (2 seeds; less in 8 of 8).
+    # As 25 photographs of four prints show it. Effects on a logit promised to four pairs of scene and network are too
+    # large by 10 % beside these photographs' colors, without it by 14 % (two seeds; less in 8 of 8).
     mottle: Annotated[ShareRange, within(0, 0.2)] = (0.02, 0.04)  # rms over a print's cells, in sRGB
     # Off: sheets ask for 100 % and are measured. 0.97 to 1.03 moved the demo's confidence by 0.01, 0.94 by 0.05.
     scale: Annotated[PositiveRange, within(0.5, 2)] = (1.0, 1.0)  # printed size over the intended one
