@@ -9,6 +9,7 @@ import os
 import re
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeVar, get_args
 
@@ -141,13 +142,13 @@ def summarize_names(names: Sequence[str]) -> str:
 
 def within(low: float, high: float) -> AfterValidator:
     """A validator of a range: both ends must lie in [low, high]."""
+    return AfterValidator(partial(_check_within, low, high))
 
-    def check(pair: tuple[float, float]) -> tuple[float, float]:
-        if low <= pair[0] and pair[1] <= high:
-            return pair
+
+def _check_within(low: float, high: float, pair: tuple[float, float]) -> tuple[float, float]:
+    if pair[0] < low or pair[1] > high:
         raise ValueError(f"must lie within [{low:g}, {high:g}]")
-
-    return AfterValidator(check)
+    return pair
 
 
 def _explain(model: type[BaseModel], error: ErrorDetails, source: str) -> Refused:
