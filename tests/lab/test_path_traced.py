@@ -99,6 +99,25 @@ def test_levels_are_ours_where_nothing_is_in_the_way(scene, lights, monkeypatch)
     assert abs(traced[:, middle].mean() - ours[:, middle].mean()) < 0.015  # the object shades it a little
 
 
+def test_mottle_is_that_of_our_views(scene, monkeypatch):
+    pytest.importorskip("mitsuba")
+    monkeypatch.setattr(path_traced, "PASSES", 1)
+    monkeypatch.setattr(path_traced, "draw_optics", lambda conditions: PINHOLE)
+    conditions, stage, piece = (
+        facing(scene, ambient=0.8, directional=0.0, noise=0.0),
+        set_stage(scene),
+        plain(scene, 0.5),
+    )
+    even, uneven = (with_values(conditions, mottle=rms, mottle_seed=3) for rms in (0.0, 0.1))
+    ours, traced = (
+        np.subtract(*(render(stage, piece, each)[0].numpy() for each in (uneven, even)))
+        for render in (lambda *seen: photograph(*seen, (200, 150), jpeg=False), photograph_traced)
+    )
+    shown = np.abs(ours).max(0) > 0
+    assert shown.sum() > 500 and np.corrcoef(ours[:, shown].ravel(), traced[:, shown].ravel())[0, 1] > 0.9
+    assert np.std(traced[:, shown]) == pytest.approx(np.std(ours[:, shown]), rel=0.15)
+
+
 def test_the_piece_lies_where_the_truth_has_it(scene, monkeypatch):
     pytest.importorskip("mitsuba")
     monkeypatch.setattr(path_traced, "PASSES", 2)
