@@ -100,3 +100,18 @@ def test_a_picture_made_elsewhere_takes_the_place_of_a_design(tmp_path, monkeypa
     (tmp_path / "b").mkdir()
     with pytest.raises(Refused, match='got "other": use one of: scene'):
         small_study("promises", tmp_path / "b", monkeypatch, 1, 'pictures = {other = ["red.png"]}\n')
+
+
+def test_gains_before_detectors_in_the_notebook_are_the_stored_ones():
+    results = Path(promises.__file__).parents[1] / "results"
+    tables = json.loads((results / "detector/coco/promises.json").read_text("utf-8"))["tables"]
+    page = " ".join((results / "measured.md").read_text("utf-8").split())
+    gains = [round(100 * row[6]["value"]) for row in tables["gains"]["rows"]]
+    pairs = [f"{first:+} and {second:+}" for first, second in zip(gains[::2], gains[1::2], strict=True)]
+    assert len(pairs) == 5 and all(pair in page for pair in pairs)
+    assert all(min(abs(row[6]["low"]), abs(row[6]["high"])) > 0.05 for row in tables["gains"]["rows"])
+    _, held, width, *_, bias = tables["held"]["rows"][-1]
+    assert f"{round(held['value'] * held['n'])} of {held['n']} sessions lay in their intervals" in page
+    figures = (100 * bias[end] for end in ("value", "low", "high"))
+    assert f"{100 * width:.0f} % of a session's photographs wide" in page
+    assert "showed {:.1f} points more than was promised [{:.1f}, {:.1f}] over the ten runs".format(*figures) in page
