@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 from PIL import Image
 
@@ -115,3 +116,26 @@ def test_gains_before_detectors_in_the_notebook_are_the_stored_ones():
     figures = (100 * bias[end] for end in ("value", "low", "high"))
     assert f"{100 * width:.0f} % of a session's photographs wide" in page
     assert "showed {:.1f} points more than was promised [{:.1f}, {:.1f}] over the ten runs".format(*figures) in page
+
+
+def test_promises_by_the_default_printer_in_the_notebook_are_the_stored_ones():
+    results = Path(promises.__file__).parents[1] / "results"
+    tables = json.loads((results / "promises/office.json").read_text("utf-8"))["tables"]
+    page = " ".join((results / "measured.md").read_text("utf-8").split())
+    _, held, width, *_, bias = tables["held"]["rows"][-1]
+    said = (
+        "{:.0f} of {} sessions lay in their intervals (100 % [89, 100]), which are {:.0f} % of a session's photographs"
+    )
+    assert said.format(held["value"] * held["n"], held["n"], 100 * width) in page
+    assert (
+        "showed {:.1f} points less than was promised [{:.1f}, {:.1f}]. The Brier".format(
+            -100 * bias["value"], 100 * bias["low"], 100 * bias["high"]
+        )
+        in page
+    )
+    head, rows = tables["promises"]["head"], tables["promises"]["rows"]
+    promised, judged, seen = (
+        np.array([row[head.index(name)] for row in rows], float) for name in ("promised", "judged", "recognized")
+    )
+    squares = seen * (1 - promised) ** 2 + (judged - seen) * promised**2
+    assert f"over the photographs is {squares.sum() / judged.sum():.3f} (0.163)" in page

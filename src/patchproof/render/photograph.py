@@ -143,11 +143,11 @@ def _piece_light(views: Views, picture: PiecePicture) -> Tensor:
 def _mottle(views: Views, picture: PiecePicture) -> Tensor:
     """Return what each print's mottle adds to the piece's pixels, P×3 in sRGB."""
     piece, variation = views.on_piece, views.conditions.print
-    cell, first = _cell_of_texel(picture.size_px, piece.view.device), piece.view[:, None] * MOTTLE_CELLS**2
-    groups = (
-        replace(group, texel=cell[group.texel.long()] + (first if group.fragment is None else first[group.fragment]))
-        for group in piece.texels.groups
-    )
+    cell, first = _cell_of_texel(picture.size_px, piece.view.device), (piece.view[:, None] * MOTTLE_CELLS**2).int()
+    groups = []
+    for group in piece.texels.groups:
+        texel = cell.index_select(0, group.texel.flatten()).view_as(group.texel)
+        groups.append(replace(group, texel=texel.add_(first if group.fragment is None else first[group.fragment])))
     prints = zip(variation.mottle, variation.mottle_seed, strict=True)
     cells = np.concatenate([rms * mottle_cells(int(seed)) for rms, seed in prints])
     return look_up(replace(piece.texels, groups=tuple(groups)), torch.as_tensor(cells).to(picture.codes))
@@ -158,7 +158,7 @@ def _cell_of_texel(size_px: tuple[int, int], device: torch.device) -> Tensor:
     """Return the cell of a print's mottle in which each texel of a picture's levels has its middle."""
     across, down = ((torch.arange(n) + 0.5) * (MOTTLE_CELLS / max(size_px)) for n in size_px)
     middle = texel_table([torch.stack(torch.meshgrid(down, across, indexing="ij"), -1)], wrap=False).long()
-    return (middle[:, 0] * MOTTLE_CELLS + middle[:, 1]).to(device)
+    return (middle[:, 0] * MOTTLE_CELLS + middle[:, 1]).int().to(device)
 
 
 def _paste_piece(views: Views, image: Tensor, light: Tensor, blur_px: np.ndarray, noise: np.ndarray) -> Tensor:
