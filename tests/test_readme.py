@@ -263,10 +263,12 @@ def test_finds_of_prints_without_markers_are_the_stored_ones():
     low, high = (100 * bound for bound in wilson(len(found), len(shown)))
     share = f"{len(found) / len(shown):.1%}".replace("%", " %")
     said = f"{len(found)} of {len(shown)} prints are found ({share} [{low:.1f}, {high:.1f}]), "
-    said += f"{len(shown) - len(found) - unsaid} say that they were not, {unsaid} is found elsewhere than it lies. "
+    said += f"{len(shown) - len(found) - unsaid} say that they were not, {unsaid} are found elsewhere than they lie. "
     assert said + f"Their corners are off by at most {off:.2f} px in 95 %." in words(NOTEBOOK)
     empty = [row["said"] for row in rows if row["shown"] == "0"]
-    assert f"In {len(empty)} pictures without the print" in words(NOTEBOOK) and set(empty) == {"no_corners"}
+    assert f"In {len(empty)} pictures of that time without the print" in words(NOTEBOOK) and set(empty) == {
+        "no_corners"
+    }
     real = [row["said"] for row in rows_of("find/photographs.csv")]
     bound = f"{wilson(0, len(real))[1]:.1%}".replace("%", " %")
     assert set(real) == {"no_corners"}
