@@ -37,7 +37,6 @@ class SessionsSettings(grid.GridSettings, PhotosSettings):
     """Settings: a run for each scene, network, printer and seed, and sessions of photographs of each."""
 
     printers: grid.Names = ("coated",)  # printers of the designs, which optimizing knows
-    controls: grid.Names = ("bare",)  # what designs are compared with in their promises; all take most of their time
 
 
 def cells(settings: SessionsSettings, base: Path) -> list[Cell]:

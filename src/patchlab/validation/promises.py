@@ -48,6 +48,7 @@ _MIN_SESSIONS = 20  # fewest sessions for which the best width is estimated
 class PromisesSettings(photo_sessions.SessionsSettings):
     """Settings of sessions, and views by our renderer without paper, also in places that the promise does not know."""
 
+    controls: Names = ("bare",)  # what designs are compared with in their promises; all four take most of their time
     rendered: Annotated[int, Field(ge=0, le=1000)] = 0  # sessions of as many views as photographs
     elsewhere: Annotated[int, Field(ge=0, le=100_000)] = 0  # views, each in a place of its own
     # By scene's name: pictures imported in place of optimized designs; if given, other scenes have no runs.
