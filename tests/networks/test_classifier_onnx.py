@@ -320,7 +320,7 @@ BODIES = [
     *(f'y = Pad<mode="{mode}">(x, [0, 0, 1, 2, 0, 1, 3, 9])' for mode in ("edge", "wrap")),
     'y = Pad<mode="reflect">(x, [0, 0, 1, 2, 0, 2, 3, 7])',
     'y = Pad<mode="edge">(x, [1, 2, 0, 3], , [2, 3])',
-    "s = Shape<start=1>(x) v = ConstantOfShape<value=float[1] {2.5}>(s) y = Add(x, v)",
+    *(f"s = Shape<start={n}>(x) v = ConstantOfShape<value=float[1] {{2.5}}>(s) y = Add(x, v)" for n in (1, 4)),
     "s = Shape(x) r = ReduceProd<keepdims=0>(s) y = Add(s, r)",
     *(
         f'y = Resize<mode="{mode}", coordinate_transformation_mode="{corners}", nearest_mode="floor">(x, , {factors})'
