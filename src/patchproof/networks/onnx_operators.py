@@ -309,7 +309,7 @@ _TABLE: dict[str, Callable[..., Any]] = {
     "Size": lambda x, /: torch.tensor(x.numel()),
     "Shape": lambda x, /, *, start=0, end=None: torch.tensor(x.shape[start:end], dtype=torch.int64),
     "Range": shapes.arange,
-    "ConstantOfShape": lambda shape, *, value=torch.zeros(1): value.reshape(()).expand(numbers(shape)),
+    "ConstantOfShape": lambda shape, *, value=0.0: torch.as_tensor(value).reshape(()).expand(numbers(shape)),
 }
 OPERATORS = {name: Operator(name, compute) for name, compute in _TABLE.items()}
 # operators that did something else before an opset
