@@ -40,8 +40,7 @@ _VOTE_SHARE, _VOTE_LOG_SIZE, _VOTE_RAD = 0.25, 0.4, 0.5  # matches that agree: o
 _LEAST_VOTES = 4
 _MOST_PLACES = 8  # of each source, refined
 _REFINED_PX = (24, 48, 128)  # of the design's longer side, from coarse to fine
-# Of the longer side: standard deviation of the mean that is subtracted, to tell designs apart and, less of it, to
-# measure corners, which light and tone move by what changes slowly; of 70 photographs 16 and 6 were off by over 1 px.
+# of the longer side: sigma of the mean that is subtracted; less for corners, which slow changes of light would move
 _SURROUNDINGS, _FINE_SURROUNDINGS = 1 / 6, 1 / 16
 _STEPS, _COLOR_STEPS, _MOST_SHIFT = 30, 10, 1 / 16
 _UNIT = np.array([[-1.0, -1], [1, -1], [1, 1], [-1, 1]])  # corners of a design in its own coordinates
