@@ -3,7 +3,8 @@
 `python tests/head_trials.py --photos DIR --rows FILE` (with torchvision, transformers, onnx) makes detectors with
 random weights, exports what their last layers give, reads the files by the name of the head, and holds the detections
 in each photograph of DIR against those of the package's own code: torchvision's after suppression, transformers' best
-100 by its processors. FILE holds a CSV row for each detector.
+100 by its processors. FILE holds a CSV row for each detector: how many detections are cut otherwise (rounding decides
+where boxes overlap and where a list ends), and how many of these are lost, not even a candidate.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ class Trial:
     head: str
     raw: nn.Module
     theirs: Callable[[Tensor], list[Detections]]
-    ours: Callable[[Tensor], Detections]
+    ours: Callable[[Tensor], tuple[Detections, Detections]]  # and all candidates before suppression
 
 
 class Raw(nn.Module):
@@ -99,11 +100,12 @@ def torchvision_trial(name: str, photos: Tensor) -> Trial:
     def theirs(x: Tensor) -> list[Detections]:
         return [(each["boxes"], each["scores"], each["labels"] - background) for each in model(list(x))]
 
-    def ours(rows: Tensor) -> Detections:
+    def ours(rows: Tensor) -> tuple[Detections, Detections]:
         boxes, scores = clip_boxes_to_image(rows[:, :4], (side, side)), rows[:, 4:].sigmoid()
         which, label = (scores > LEAST_SCORE).nonzero(as_tuple=True)
-        kept = batched_nms(boxes[which], scores[which, label], label, model.nms_thresh)[: model.detections_per_img]
-        return boxes[which[kept]], scores[which[kept], label[kept]], label[kept]
+        every = boxes[which], scores[which, label], label
+        kept = batched_nms(*every, model.nms_thresh)[: model.detections_per_img]
+        return (every[0][kept], every[1][kept], every[2][kept]), every
 
     return Trial(side, head, raw, theirs, ours)
 
@@ -123,26 +125,28 @@ def set_trial(name: str, photos: Tensor) -> Trial:
         sets = process.post_process_object_detection(found, threshold=0.0, target_sizes=len(x) * [2 * (SET_SIDE,)])
         return [(each["boxes"], each["scores"], each["labels"]) for each in sets]
 
-    def ours(rows: Tensor) -> Detections:
+    def ours(rows: Tensor) -> tuple[Detections, Detections]:
         boxes, scores = rows[:, :4], rows[:, 4:].sigmoid()
         if has_background:  # the best label of each box
-            return boxes, scores.amax(-1), scores.argmax(-1)
-        best = scores.flatten().topk(100)
-        return boxes[best.indices // LABELS], best.values, best.indices % LABELS
+            best = boxes, scores.amax(-1), scores.argmax(-1)
+            return best, best
+        order = scores.flatten().argsort(descending=True)[:200]
+        every = boxes[order // LABELS], scores.flatten()[order], order % LABELS
+        return (every[0][:100], every[1][:100], every[2][:100]), every
 
     return Trial(SET_SIDE, "detr", raw, theirs, ours)
 
 
-def compare(some: Detections, others: Detections) -> tuple[int, float, float]:
-    """How many of `some` lack one of `others` (same label, 0.01 of score, 1 px); the rest's largest differences."""
+def compare(some: Detections, others: Detections) -> tuple[Tensor, float, float]:
+    """Which of `some` lack one of `others` (same label, 0.01 of score, 1 px); the rest's largest differences."""
     boxes, scores = torch.cdist(some[0], others[0], float("inf")), (some[1][:, None] - others[1]).abs()
     far = (some[2][:, None] != others[2]) | (scores > 0.01) | (boxes > 1)
     if not far.numel():
-        return len(some[0]), 0.0, 0.0
+        return torch.ones(len(some[0]), dtype=torch.bool), 0.0, 0.0
     nearest = (boxes + 100 * scores).masked_fill(far, torch.inf).argmin(1, keepdim=True)
-    hit = ~far.gather(1, nearest)
-    largest = [float((each.gather(1, nearest) * hit).max()) for each in (boxes, scores)]
-    return int((~hit).sum()), largest[0], largest[1]
+    lacks = far.gather(1, nearest)
+    box_px, score = (float((each.gather(1, nearest) * ~lacks).max()) for each in (boxes, scores))
+    return lacks[:, 0], box_px, score
 
 
 def try_detector(name: str, pictures: list[Image.Image]) -> dict[str, object]:
@@ -163,12 +167,14 @@ def try_detector(name: str, pictures: list[Image.Image]) -> dict[str, object]:
             network = load_classifier(f"file:{file}").network
         for batch in photos.split(BATCH):
             for theirs, candidates in zip(trial.theirs(batch), network(batch), strict=True):
-                ours = trial.ours(candidates)
-                rows.append((len(theirs[0]), *compare(theirs, ours), compare(ours, theirs)[0]))
-    found, missed, box_px, score, more = np.array(rows).T
-    counts = {"detections": int(found.sum()), "not ours": int(missed.sum()), "ours only": int(more.sum())}
+                ours, every = trial.ours(candidates)
+                lacks, *off = compare(theirs, ours)
+                lost, *_ = compare((theirs[0][lacks], theirs[1][lacks], theirs[2][lacks]), every)
+                rows.append((len(lacks), lacks.sum(), lost.sum(), compare(ours, theirs)[0].sum(), *off))
+    found, missed, lost, more, box_px, score = np.array(rows, float).T
+    counts = {"detections": found.sum(), "cut otherwise": missed.sum(), "lost": lost.sum(), "ours only": more.sum()}
     largest = {"box off px": f"{box_px.max():.2g}", "score off": f"{score.max():.2g}"}
-    return {"detector": name, "photographs": len(photos), **counts, **largest}
+    return {"detector": name, "photographs": len(photos), **{key: int(each) for key, each in counts.items()}, **largest}
 
 
 @torch.no_grad()

@@ -322,7 +322,8 @@ RESULTS = {"TopK": 2, "LSTM": 3}  # how many, where there are several
 # operators of the standard that are left out, by the reason
 REFUSED = {
     "draws random numbers": "Bernoulli Multinomial RandomNormal RandomNormalLike RandomUniform RandomUniformLike",
-    "has results whose size depends on the pictures' content": "Compress NonMaxSuppression Unique",
+    "has results whose size depends on the pictures' content": "Compress Unique",
+    "is done here: export it before boxes are suppressed (nms=False)": "NonMaxSuppression",
     "runs parts of the file several times or not at all": "If Loop Scan SequenceMap",
     "rounds to a few bits, which has no gradient": "ConvInteger DequantizeLinear DynamicQuantizeLinear MatMulInteger "
     "QLinearConv QLinearMatMul QuantizeLinear",

@@ -294,9 +294,8 @@ class _SmallDesign:
         px_from_unit, best, hessian = fit_homography(_UNIT, quad), (-1.0, quad), np.eye(8)
         for _ in range(_COLOR_STEPS if mixes else _STEPS):
             index = index_homography(px_from_unit @ np.linalg.inv(self.index_from_unit))
-            flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-            seen = cv2.warpPerspective(srgb, index, self.size, None, flags, cv2.BORDER_REPLICATE)
-            seen = self._less_surroundings(seen)
+            how = None, cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, cv2.BORDER_REPLICATE
+            seen = self._less_surroundings(cv2.warpPerspective(srgb, index, self.size, *how))
             seen = (seen / np.maximum(seen.std((0, 1)), 0.5)).reshape(-1, 3)
             likeness = float((self.weight * (seen * self.colors[:, :3]).mean(0)).sum())
             if likeness > best[0] or mixes:
