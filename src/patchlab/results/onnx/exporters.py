@@ -49,6 +49,9 @@ def make(name: str) -> tuple[nn.Module, int]:
             with suppress(Exception):  # each architecture has words of its own
                 network = timm.create_model(architecture, num_classes=40, **sizes if library == "short" else {}).eval()
                 break
+        for weights in network.parameters():  # mixers begin with a last layer of zeros
+            if weights.ndim > 1 and not weights.any():
+                nn.init.normal_(weights, std=0.02)
         with suppress(Exception):  # of networks that take pictures of one size
             network(torch.rand(1, 3, 128, 128))
             return network, 128
