@@ -79,14 +79,6 @@ def settle(raw: nn.Module, photos: Tensor) -> None:
     raw.eval()
 
 
-def spread(model: nn.Module, logits: Tensor, count: int, mean: float) -> None:
-    """Scale the layers that give `count` logits an anchor."""
-    for layer in (each for each in model.modules() if isinstance(each, nn.Conv2d | nn.Linear)):
-        if len(layer.weight) % count == 0 and layer.bias is not None:
-            layer.weight.mul_(SPREAD / logits.std())
-            layer.bias.fill_(mean)
-
-
 def torchvision_trial(name: str, photos: Tensor) -> Trial:
     head, side, mean = TORCHVISION[name]
     background = int(name.startswith("ssd"))  # its number is 0
@@ -95,7 +87,11 @@ def torchvision_trial(name: str, photos: Tensor) -> Trial:
     model = getattr(detection, name)(weights=None, weights_backbone=None, **options).eval()
     raw = Raw(model, model.transform.image_mean, model.transform.image_std)
     settle(raw, photos)
-    spread(model, raw(photos)[0], LABELS + background, mean)
+    factor = SPREAD / raw(photos)[0].std()
+    for layer in (each for each in model.modules() if isinstance(each, nn.Conv2d)):
+        if len(layer.weight) % (LABELS + background) == 0 and layer.bias is not None:  # gives logits, of each anchor
+            layer.weight.mul_(factor)
+            layer.bias.fill_(mean)
 
     def theirs(x: Tensor) -> list[Detections]:
         return [(each["boxes"], each["scores"], each["labels"] - background) for each in model(list(x))]
@@ -115,9 +111,7 @@ def set_trial(name: str, photos: Tensor) -> Trial:
     config.use_pretrained_backbone = False
     raw = Raw(getattr(hf, f"{name}ForObjectDetection")(config).eval(), [0.485, 0.456, 0.406], [0.229, 0.224, 0.225])
     settle(raw, photos)
-    logits = raw(photos)[0]
-    spread(raw, logits, logits.shape[-1], 0.0)
-    has_background = logits.shape[-1] > LABELS
+    has_background = raw(photos)[0].shape[-1] > LABELS
     process = hf.DetrImageProcessor() if has_background else hf.ConditionalDetrImageProcessor()
 
     def theirs(x: Tensor) -> list[Detections]:
