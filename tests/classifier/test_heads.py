@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import itertools
 import json
 import math
@@ -466,6 +467,18 @@ def test_both_shared_detectors_are_read_without_our_conversion(name, data, tmp_p
         whole = torch.cat(levels[::-1])
     torch.testing.assert_close(raw[:, :4], whole[:, :4], rtol=1e-4, atol=1e-3)
     torch.testing.assert_close(raw[:, 4:].sigmoid(), whole[:, 4:].sigmoid(), rtol=1e-4, atol=1e-6)
+
+
+def test_the_notebook_s_figures_of_heads_are_those_of_the_stored_trials():
+    """`python tests/head_trials.py` made them."""
+    results = Path(__file__).parents[2] / "src/patchlab/results"
+    with (results / "detector" / "heads.csv").open(encoding="utf-8", newline="") as file:
+        trials = list(csv.DictReader(file))
+    found, otherwise, lost = (sum(int(row[key]) for row in trials) for key in ("detections", "cut otherwise", "lost"))
+    box_px, score = (max(float(row[key]) for row in trials) for key in ("box off px", "score off"))
+    said = f"{found:,} detections, of which {otherwise:,} are cut otherwise and {lost} is lost; others' boxes within "
+    assert said + f"{box_px:.2g} px, scores within {score:.2g}" in (results / "measured.md").read_text(encoding="utf-8")
+    assert len(trials) == 14 and {row["photographs"] for row in trials} == {"100"}
 
 
 def test_the_page_of_networks_tells_every_head():
