@@ -50,6 +50,7 @@ def log_axis(axes: "Axes", name: str, values: Sequence[float]) -> None:
 
 def label_points(figure: "Figure", axes: "Axes", points: Sequence[tuple[float, float, str, str]]) -> None:
     """Write a text beside each point (x, y, text, color), at the one of eight places where it hides least."""
+    from matplotlib.patheffects import withStroke
     from matplotlib.transforms import Bbox
 
     axes.grid(alpha=0.25)
@@ -61,7 +62,7 @@ def label_points(figure: "Figure", axes: "Axes", points: Sequence[tuple[float, f
     taken += [text.get_window_extent() for text in axes.texts]
     for x, y, words, color in points:
         text = axes.annotate(words, (x, y), (0, 0), textcoords="offset points", color=color, fontsize=9)
-        text.set_in_layout(False)
+        text.set(in_layout=False, path_effects=[withStroke(linewidth=2.5, foreground="white")])  # above lines
         places = [(right, up) for right in (1, -1, 0) for up in (0, 1, -1) if right or up]
 
         def box_at(place: tuple[int, int], text=text) -> Bbox:

@@ -138,7 +138,8 @@ def _run_ceiling(settings: SpeedSettings, base: Path, values: Mapping[str, Any])
     if place:
         patch = {"place": "auto", "offset_mm": (0, 0), "spin_deg": 0, "at_mm": None}
         unplaced = require_unplaced(grid.scene_of(base, grid.with_changes(dict(values), {"patch": patch})))
-        chosen = _best_places(str(base), values["file"], networks)[place - 1]
+        best = _best_places(str(base), values["file"], networks)
+        chosen = best[min(place, len(best)) - 1]  # a small surface has fewer
         scene = unplaced.with_piece_at(chosen.at, chosen.spin_deg)
     problem = set_problem(scene, models=networks)
     pixels = best_design(problem)
