@@ -502,6 +502,18 @@ def test_gains_of_the_readme_are_those_of_the_chart():
     )
 
 
+def test_figures_of_terms_are_those_of_the_chart():
+    rows = {row[0]: row[2:] for row in stored("charts/terms.json")["tables"]["terms"]["rows"]}
+    off = {name: f"{100 * row[0]['value']:.1f}" for name, row in rows.items()}
+    page = words(NOTEBOOK)
+    said = "only ambient light ({} points), the printer's colors ({}) and directional light ({}) move some promise"
+    assert said.format(*(off[name] for name in ("ambient light", "printer's colors", "directional light"))) in page
+    assert f"a veil {off['veil']}, chroma {off['chroma']}, exposure {off['exposure']}, all others less" in page
+    cost = [100 * rows["mottle"][3][end] for end in ("value", "low", "high")]
+    assert "mottle takes {:.1f} % [{:.1f}, {:.1f}]".format(*cost) in page
+    assert f"Mottle moves a promise by {off['mottle']} points" in page
+
+
 def test_figures_of_effects_are_the_stored_ones():
     page, effects = words(NOTEBOOK), rows_of("effects/effects_effects.csv")[-1]
     off = (100 * float(effects[f"estimated minus photographed{end}"]) for end in ("", "_low", "_high"))
