@@ -139,7 +139,7 @@ def _run_ceiling(settings: SpeedSettings, base: Path, values: Mapping[str, Any])
         patch = {"place": "auto", "offset_mm": (0, 0), "spin_deg": 0, "at_mm": None}
         unplaced = require_unplaced(grid.scene_of(base, grid.with_changes(dict(values), {"patch": patch})))
         best = _best_places(str(base), values["file"], networks)
-        chosen = best[min(place, len(best)) - 1]  # a small surface has fewer
+        chosen = best[min(place, len(best)) - 1]  # a small surface has fewer: its last again
         scene = unplaced.with_piece_at(chosen.at, chosen.spin_deg)
     problem = set_problem(scene, models=networks)
     pixels = best_design(problem)

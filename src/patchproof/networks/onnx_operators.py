@@ -323,7 +323,7 @@ RESULTS = {"TopK": 2, "LSTM": 3}  # how many, where there are several
 REFUSED = {
     "draws random numbers": "Bernoulli Multinomial RandomNormal RandomNormalLike RandomUniform RandomUniformLike",
     "has results whose size depends on the pictures' content": "Compress Unique",
-    "is done here: export it before boxes are suppressed (nms=False)": "NonMaxSuppression",
+    "is left to patchproof (nms=False where it is exported)": "NonMaxSuppression",
     "runs parts of the file several times or not at all": "If Loop Scan SequenceMap",
     "rounds to a few bits, which has no gradient": "ConvInteger DequantizeLinear DynamicQuantizeLinear MatMulInteger "
     "QLinearConv QLinearMatMul QuantizeLinear",
