@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import torch
 import toy_studies as toy
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from patchlab.study.study import Work, run_cells
 from patchproof.base import workers as processes
@@ -134,6 +135,21 @@ def test_a_share_begins_where_torch_and_opencv_already_have_threads():
     finally:
         torch.set_num_threads(before[0])
         cv2.setNumThreads(before[1])
+
+
+@forks
+def test_blas_of_numpy_computes_on_one_thread_in_this_process_and_in_the_others():
+    """Its threads spin: beside two workers they took a third of a verification's seconds."""
+
+    def threads(_=None) -> set[int]:
+        np.linalg.svd(np.eye(300))
+        return {library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"}
+
+    with threadpool_limits(2, user_api="blas"):
+        before = threads()
+        with fork_workers(threads, 2) as (crew, share):
+            assert threads() == {1} and crew.map(share, range(2)) == [{1}, {1}]
+        assert threads() == before == {2}
 
 
 def test_a_system_that_cannot_fork_works_here_on_as_many_threads(monkeypatch):

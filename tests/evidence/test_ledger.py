@@ -12,6 +12,7 @@ import torch
 from synthetic_photos import CONDITION, make_manifest, noisy_design, page_raster, photograph, save, view
 
 from patchproof.base.color import ciede2000, lab_from_linear, linear_from_srgb
+from patchproof.base.progress import Compute
 from patchproof.channel.print_colors import ShownColors, add_ink, fit_ink_and_photos
 from patchproof.channel.printer import identity_printer, load_printer
 from patchproof.classifier import Classifier
@@ -268,6 +269,16 @@ def test_known_culprits_are_named(tmp_path, change, culprit):
         assert abs(found.shares["photo"].share) < 0.5 * found.shares[culprit].share
 
 
+def test_processes_change_no_byte(tmp_path):
+    for i in range(PHOTOS):
+        homography = view(8 * i - 16, 5, 280, size_px=SIZE)
+        save(photograph(raster(False), homography, SIZE, blur_px=0.3, noise=0.002, seed=i), tmp_path / f"{i}.png")
+    options = Options([NET], identity_printer())
+    one, two = (gather_evidence(tmp_path, sheet(), options, compute=Compute(jobs=jobs)) for jobs in (1, 2))
+    assert one.summary.ledger is not None and one.summary.estimated is not None
+    assert one.model_dump_json() == two.model_dump_json()
+
+
 def test_of_two_colors_print_and_light_are_one_step(tmp_path):
     homography = view(5, 5, 280, size_px=SIZE)
     save(photograph(raster(True, True), homography, SIZE, blur_px=0.3, light=0.75), tmp_path / "a.png")
@@ -339,8 +350,8 @@ def test_a_piece_put_into_a_photograph_is_what_a_photograph_of_it_shows():
         "a", taken, np.array(geometry.homography_px_from_mm), geometry.blur_px, photo.light, surface, 240
     )
     drawn, shown = piece_picture(surface, promised.design), light_fit(shot, promised)
-    put = reprojected_squares(shot, {(): drawn}, surface.rect_mm, shown, shown, Reference(0.5, 0.3, 0.0))
-    assert put[True, True] == pytest.approx(reprojected_square(shot, drawn, surface.rect_mm, shown), abs=1e-6)
+    put = reprojected_squares(shot, {(): [drawn]}, surface.rect_mm, shown, shown, Reference(0.5, 0.3, 0.0))
+    assert put[True, True] == pytest.approx(reprojected_square(shot, [drawn], surface.rect_mm, shown), abs=1e-6)
     for on, expected in ((True, other), (False, promised_one)):
         off = np.abs(put[on, on] - square_of(expected)[0] / 255).mean()
         assert off < 0.009  # the print that was taken is 0.036 off and more

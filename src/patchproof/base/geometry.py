@@ -190,6 +190,12 @@ def rect_corners(rect) -> np.ndarray:
     return np.array([[x, y], [x + w, y], [x + w, y + h], [x, y + h]], float)
 
 
+def is_inside(points: np.ndarray, rect, grown: float = 0.0) -> np.ndarray:
+    """True for points N×2 in [x, y, width, height], grown on all sides."""
+    low, high = rect_corners(rect)[[0, 2]] + [[-grown], [grown]]
+    return ((points >= low) & (points <= high)).all(1)
+
+
 def rotated_extent(size, degrees: float) -> np.ndarray:
     """Width and height of the bounding box of a rectangle that is rotated by `degrees`."""
     c, s = abs(np.cos(np.radians(degrees))), abs(np.sin(np.radians(degrees)))

@@ -215,15 +215,17 @@ def result_of(future: Future) -> Any:
 
 @contextmanager
 def use_threads(count: int) -> Iterator[None]:
-    """Within the block torch and OpenCV compute on `count` threads."""
+    """Within the block torch, OpenCV and the BLAS of NumPy and SciPy compute on `count` threads."""
     import cv2
     import torch
+    from threadpoolctl import threadpool_limits
 
     counts = torch.get_num_threads(), cv2.getNumThreads()
     torch.set_num_threads(count)
     cv2.setNumThreads(count)
     try:
-        yield
+        with threadpool_limits(count, user_api="blas"):
+            yield
     finally:
         torch.set_num_threads(counts[0])
         cv2.setNumThreads(counts[1])

@@ -28,7 +28,7 @@ from patchproof.evidence.results import Color, Geometry, Remark
 from patchproof.evidence.surface import PromisedColors, Surface
 from patchproof.photo.detect import LINEAR_FLOAT32_FROM_CODE
 from patchproof.photo.quality import CLIPPED_CODE, FrameLight
-from patchproof.photo.rectify import crop_around, least_px_per_mm, oversample_flat, rectified_px, resize_by_area
+from patchproof.photo.rectify import coarsen, crop_around, least_px_per_mm, oversample_flat, rectified_px
 from patchproof.photo.rejection import PhotoRejected
 
 _CELLS = (6, 48)  # least and most along the design's shorter side
@@ -104,11 +104,11 @@ def appearance(
     px_from_mm = np.diag([1 / step, 1 / step, 1.0]) @ px_from_mm
     size = rectified_px(surface.rect_mm, cells_per_mm)
     flat = oversample_flat(linear, px_from_mm, surface.rect_mm, size)
-    *photographed, clipped = cv2.split(resize_by_area(flat, size))
+    *photographed, clipped = cv2.split(coarsen(flat, size[::-1], 0.0))
     photographed, clipped = np.dstack(photographed).astype(float), clipped > 0.05
     blur_mm = geometry.blur_px / geometry.px_per_mm
     design = promised.design
-    expected = coarse_cells(design, photographed.shape[:2], blur_mm * design.shape[1] / surface.rect_mm[2])
+    expected = coarsen(design, photographed.shape, blur_mm * design.shape[1] / surface.rect_mm[2]).astype(float)
     usable = ~clipped
     usable[[0, -1]] = usable[:, [0, -1]] = False
     middles_mm = (np.indices(usable.shape)[::-1].reshape(2, -1).T + 0.5) / cells_per_mm + surface.rect_mm[:2]
@@ -137,8 +137,8 @@ def appearance(
         color = color.changed(delta_e00_mean=float(valid_delta.mean()), delta_e00_p95=p95)
     if not with_pictures:
         return color, {}, match
-    seen = resize_by_area(flat, rectified_px(surface.rect_mm, picture_per_mm))[..., :3]
-    lights = {"seen": seen, "fitted": fit.undo(seen), "promised": coarse_cells(design, seen.shape[:2], 0.0)}
+    seen = coarsen(flat, rectified_px(surface.rect_mm, picture_per_mm)[::-1], 0.0)[..., :3]
+    lights = {"seen": seen, "fitted": fit.undo(seen), "promised": coarsen(design, seen.shape, 0.0)}
     pictures = {kind: photo_codes_from_srgb(srgb_from_linear(linear)) for kind, linear in lights.items()}
     return color, pictures | {"delta_e00": np.where(usable, delta, np.nan).astype(np.float32)}, match
 
@@ -219,13 +219,6 @@ def _cells_per_mm(surface: Surface, geometry: Geometry) -> float:
     cell_mm = max(cell_mm, 4 * geometry.corner_uncertainty_mm)
     side_mm = min(surface.rect_mm[2:])
     return float(np.clip(side_mm / cell_mm, *_CELLS)) / side_mm
-
-
-def coarse_cells(design: np.ndarray, shape: tuple[int, ...], blur_design_px: float) -> np.ndarray:
-    """Blur the promised light and average it to `shape` cells."""
-    if blur_design_px > 0.3:
-        design = cv2.GaussianBlur(design, (0, 0), float(blur_design_px), borderType=cv2.BORDER_REPLICATE)
-    return resize_by_area(design, (shape[1], shape[0])).astype(float)
 
 
 def match_design(seen: np.ndarray, promised: np.ndarray, usable: np.ndarray, light: FrameLight) -> DesignMatch:

@@ -36,6 +36,7 @@ from patchproof.evidence.grouping import (
 )
 from patchproof.evidence.ledger import estimate_effect, ledger_of
 from patchproof.evidence.measure import UNLOCATED_CODES, MeasuredPhoto
+from patchproof.evidence.reproject import read_print
 from patchproof.evidence.results import (
     EffectEstimate,
     Ledger,
@@ -113,16 +114,17 @@ def gather_evidence(
             originals = [number for number, photo in enumerate(patch_photos) if photo.entry.code != COPY_CODE]
             name, read_shot = judges.primary.name, partial(reread_square, task, judges.primary.input_px)
             numbers = _spread(originals, MOST_PHOTOS if options.ledger_photos else 0)
-            squares = list(workers.map(read_shot, [(paths[number], patch_photos[number]) for number in numbers]))
-            shots = [shot for shot in _spread(squares, options.ledger_photos) if shot is not None]
+            squares = workers.map(read_shot, [(paths[number], patch_photos[number]) for number in numbers])
+            shots = [shot for shot in squares if shot is not None]
             entries = [photo.entry for photo in patch_photos if photo.entry.predictions]
             confidence = {entry.file: entry.predictions[name].target_confidence for entry in entries}
-            ledger = ledger_of(shots, manifest, task, judges, confidence)
             pairs = zip(patch_photos, grouping.merged, strict=True)
             session = {photo.entry.file: number for photo, number in pairs if photo.counted}
-            shots = [shot for shot in squares if shot is not None and shot.file in session]
-            scene = task.surface, options.printer, judges
-            estimate = estimate_effect(shots, manifest, *scene, _recognized(entries, name), session)
+            found = read_print(shots, task.promised)
+            some = replace(found, shots=_spread(found.shots, options.ledger_photos))
+            ledger = ledger_of(some, manifest, task, judges, confidence, compute.jobs)
+            by_file = _recognized(entries, name), session
+            estimate = estimate_effect(found, manifest, task, options.printer, judges, *by_file, compute.jobs)
     if controls_folder:
         skipped = list_skipped_files(controls_folder, depth=2)
         left_out += [f"{printable(controls_folder.name)}: {text}" for text in skipped]

@@ -4,7 +4,7 @@ The gap ledger: how much confidence is lost in each step from the ideal picture 
 
     ideal → gamut → print → light and camera → blur and noise → photo
 
-In: `PhotoSquare`s of judged photographs, the manifest, the promise's primary network. Out: a `Ledger`: shares in
+In: a `PhotographedPrint` in judged photographs, the manifest, the promise's primary network. Out: a `Ledger`: shares in
 confidence (for a goal of deceiving, confidence gained), mean over photographs, with bootstrap intervals over
 photographs. Each photograph is classified with its piece re-projected under all combinations of four effects on or off
 (`reproject`), and each effect gets its mean cost over all orders of switching them on (Shapley, A Value for n-Person
@@ -28,6 +28,7 @@ whose surface behind the piece no photograph shows; shadows and glare on the pie
 """
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from itertools import product
 from math import factorial
 from typing import TYPE_CHECKING, Any
@@ -36,14 +37,16 @@ import numpy as np
 
 from patchproof.base.color import linear_from_srgb
 from patchproof.base.intervals import MIN_CLUSTERS, resampled_means
-from patchproof.base.resample import downscale
+from patchproof.base.resample import downscale, halving_pyramid
+from patchproof.base.workers import fork_workers
 from patchproof.channel.print_colors import ShownColors
-from patchproof.evidence.classify import BoxEdges, Judges, boxes_of, predict, squares_of
+from patchproof.evidence.classify import Judges, boxes_of, predict, squares_of
 from patchproof.evidence.reproject import (
+    PhotographedPrint,
     PhotoSquare,
+    Pyramid,
     Reference,
     Switches,
-    fit_print_and_lights,
     reprojected_square,
     reprojected_squares,
 )
@@ -69,25 +72,22 @@ LEAST_AGREEMENT = 0.8  # share of the photographs
 
 
 def ledger_of(
-    shots: Sequence[PhotoSquare], manifest: Manifest, task: Task, judges: Judges, confidence: Mapping[str, float]
+    found: PhotographedPrint, manifest: Manifest, task: Task, judges: Judges, confidence: Mapping[str, float], jobs: int
 ) -> Ledger | None:
-    """Make the ledger, of target `confidence` by file; None without shots, promise, design or conditions."""
-    surface, promised = task.surface, task.promised
+    """Make the ledger, of target `confidence` by file; None without photographs, promise, design or conditions."""
+    surface, promised, shots = task.surface, task.promised, found.shots
     if not shots or manifest.promise is None or manifest.design is None or promised is None:
         return None
     conditions = manifest.promise.conditions
     claims = [(c.contrast, c.blur_px) for c in conditions if c.contrast is not None and c.blur_px is not None]
     if not claims:
         return None
-    apply_print, undo, print_lights = fit_print_and_lights(shots, promised)
-    looks = _looks(manifest.design.pixels(), surface, promised, apply_print)
-    values = []
-    references = _references(claims, shots, manifest.settings.get("camera", {}), promised)
-    for shot, fit, print_light, reference in zip(shots, undo, print_lights, references, strict=True):
-        squares = reprojected_squares(shot, looks, surface.rect_mm, fit, print_light, reference)
-        values.append(_confidences(squares, judges, shot.box))
-    steps = (GAMUT, PRINT, LIGHT, BLUR) if apply_print is not None else (GAMUT, PRINT_AND_LIGHT, BLUR)
-    photo = np.array([confidence[shot.file] for shot in shots])
+    looks = _looks(manifest.design.pixels(), surface, promised, found.add)
+    references = _references(claims, [shot for shot, *_ in shots], manifest.settings.get("camera", {}), promised)
+    with fork_workers(partial(_confidences, looks, surface, judges), jobs) as (workers, confidences):
+        values = workers.map(confidences, [(*shot, ref) for shot, ref in zip(shots, references, strict=True)])
+    steps = (GAMUT, PRINT_AND_LIGHT, BLUR) if found.add is None else (GAMUT, PRINT, LIGHT, BLUR)
+    photo = np.array([confidence[shot.file] for shot, *_ in shots])
     return _ledger(steps, values, photo, manifest.promise.target.goal.sign)
 
 
@@ -135,14 +135,14 @@ def _culprit(names: Sequence[str], means: np.ndarray, resampled: np.ndarray | No
     return names[top] if clear and names[top] != PHOTO else None
 
 
-def _looks(pixels: np.ndarray, surface: Surface, promised: PromisedColors, apply_print) -> dict[Switches, np.ndarray]:
+def _looks(pixels: np.ndarray, surface: Surface, promised: PromisedColors, add_print) -> dict[Switches, Pyramid]:
     """The piece's light by (gamut, print), or by (gamut,) alone if the print's map is unknown."""
     design = downscale(linear_from_srgb(pixels / 255.0).astype(np.float32), DESIGN_PX)
     ideal = piece_picture(surface, with_markers(design, surface, np.zeros(3)))
-    looks = {False: ideal, True: piece_picture(surface, promised.design)}
-    if apply_print is None:
-        return {(gamut,): look for gamut, look in looks.items()}
-    return {(gamut, on): apply_print(look) if on else look for on in (False, True) for gamut, look in looks.items()}
+    looks: dict[Switches, np.ndarray] = {(False,): ideal, (True,): piece_picture(surface, promised.design)}
+    if add_print is not None:
+        looks = {(*key, on): add_print(look) if on else look for on in (False, True) for key, look in looks.items()}
+    return {key: halving_pyramid(look) for key, look in looks.items()}
 
 
 def _references(
@@ -165,13 +165,20 @@ def _references(
     return references
 
 
-def _confidences(squares: Mapping[Switches, np.ndarray], judges: Judges, box: BoxEdges | None) -> ConfidenceBySwitches:
-    """Target confidence by combination of effects, of squares with the object in `box`."""
+def _confidences(
+    looks: Mapping[Switches, Pyramid],
+    surface: Surface,
+    judges: Judges,
+    item: tuple[PhotoSquare, ShownColors, ShownColors, Reference],
+) -> ConfidenceBySwitches:
+    """Target confidence in a photograph by combination of effects."""
     import torch
 
     from patchproof.classifier import center_square
 
-    model, boxes = judges.primary, boxes_of(box, len(squares))
+    shot, undo, print_light, reference = item
+    squares = reprojected_squares(shot, looks, surface.rect_mm, undo, print_light, reference)
+    model, boxes = judges.primary, boxes_of(shot.box, len(squares))
     with torch.inference_mode():
         pictures = [torch.from_numpy(square.transpose(2, 0, 1))[None].float() for square in squares.values()]
         batch = torch.cat([center_square(picture, model.input_px) for picture in pictures])
@@ -180,44 +187,46 @@ def _confidences(squares: Mapping[Switches, np.ndarray], judges: Judges, box: Bo
 
 
 def estimate_effect(
-    shots: Sequence[PhotoSquare],
+    found: PhotographedPrint,
     manifest: Manifest,
-    surface: Surface,
+    task: Task,
     printer: "Printer",
     judges: Judges,
     recognized: Mapping[str, bool],
     session: Mapping[str, int],
+    jobs: int,
 ) -> EffectEstimate | None:
     """Compare the patch with each of `ESTIMATED_CONTROLS` in the same photographs; `recognized` is the network's answer
     to each original photograph by file, `session` its session's number. None for fewer than `LEAST_PHOTOS`, or for a
     sheet without a design and promise.
     """
-    if manifest.design is None or manifest.promise is None or len(shots) < LEAST_PHOTOS:
+    shots, surface = [(shot, light) for shot, _, light in found.shots], task.surface
+    if manifest.design is None or manifest.promise is None or task.promised is None or len(shots) < LEAST_PHOTOS:
         return None
-    pixels = manifest.design.pixels()
-    kinds = ("design", *ESTIMATED_CONTROLS)
-    looks = {kind: printed_colors(control_design(kind, pixels, ""), surface, printer) for kind in kinds}
-    apply_print, _, lights = fit_print_and_lights(shots, looks["design"])
+    pixels, looks = manifest.design.pixels(), {"design": task.promised}
+    for kind in ESTIMATED_CONTROLS:
+        looks[kind] = printed_colors(control_design(kind, pixels, ""), surface, printer)
     pictures = {kind: piece_picture(surface, look.design) for kind, look in looks.items()}
-    if apply_print is not None:
-        pictures = {kind: apply_print(picture) for kind, picture in pictures.items()}
-    answers = {
-        kind: [_recognized(shot, picture, surface, light, judges) for shot, light in zip(shots, lights, strict=True)]
-        for kind, picture in pictures.items()
-    }
-    files = [shot.file for shot in shots]
-    same = [i for i, file in enumerate(files) if recognized[file] == answers["design"][i]]
+    pyramids = {kind: halving_pyramid(found.add(look) if found.add else look) for kind, look in pictures.items()}
+    with fork_workers(partial(_recognized, pyramids, surface, judges), jobs) as (workers, recognized_in):
+        answers = workers.map(recognized_in, shots)
+    files = [shot.file for shot, _ in shots]
+    same = [i for i, file in enumerate(files) if recognized[file] == answers[i]["design"]]
     estimate = EffectEstimate(photos=len(files), agree=len(same) / len(files))
     if estimate.agree < LEAST_AGREEMENT:
         return estimate
-    by_kind = {kind: {(session[files[i]], files[i]): hits[i] for i in same} for kind, hits in answers.items()}
+    by_kind = {kind: {(session[files[i]], files[i]): answers[i][kind] for i in same} for kind in looks}
     rows = (compare_with_control(by_kind["design"], k, by_kind[k], manifest.promise) for k in ESTIMATED_CONTROLS)
     return estimate.changed(controls=tuple(rows))
 
 
-def _recognized(shot: PhotoSquare, look: np.ndarray, surface: Surface, light: ShownColors, judges: Judges) -> bool:
-    """Classify the photograph with a piece of this look by the primary network."""
-    codes = np.rint(255 * reprojected_square(shot, look, surface.rect_mm, light)).astype(np.uint8)
-    model = judges.primary
-    square = squares_of(codes, [model.input_px])[model.input_px]
-    return predict(model, judges.indices[model.name], square, shot.box).recognized
+def _recognized(
+    looks: Mapping[str, Pyramid], surface: Surface, judges: Judges, item: tuple[PhotoSquare, ShownColors]
+) -> dict[str, bool]:
+    """Classify a photograph with a piece of each look by the primary network."""
+    (shot, light), model, recognized = item, judges.primary, {}
+    for kind, look in looks.items():
+        codes = np.rint(255 * reprojected_square(shot, look, surface.rect_mm, light)).astype(np.uint8)
+        square = squares_of(codes, [model.input_px])[model.input_px]
+        recognized[kind] = predict(model, judges.indices[model.name], square, shot.box).recognized
+    return recognized

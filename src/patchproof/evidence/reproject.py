@@ -30,6 +30,7 @@ from patchproof.photo.rectify import region_around
 from patchproof.sheets.manifest import Rect
 
 Switches = tuple[bool, ...]  # which effects are on
+Pyramid = Sequence[np.ndarray]  # a picture of media-relative linear light, its half and so on
 MAX_OVERSAMPLING = 3  # times the network's input size; finer detail is averaged away before the network sees it
 _READ_SHARE_SQUARE = 1 / 16  # of noise at white, as the camera model has it
 _LEAST_BLUR_PX = 0.1
@@ -58,6 +59,17 @@ class PhotoSquare:
     scale: float
     box: BoxEdges | None = None
     blur_cells: float = 0.0
+
+
+@dataclass(frozen=True)
+class PhotographedPrint:
+    """One print in several photographs: `add` maps promised light to the print's, None if colors do not tell it; each
+    photograph comes with its light, to be undone around the print, and with what it makes of the print's light (of
+    promised light where there is no `add`).
+    """
+
+    add: Callable[[np.ndarray], np.ndarray] | None
+    shots: list[tuple[PhotoSquare, ShownColors, ShownColors]]
 
 
 @dataclass(frozen=True)
@@ -129,20 +141,15 @@ def _light_before(shot: PhotoSquare, tone: float) -> np.ndarray:
     return lower_light(LINEAR_FLOAT32_FROM_CODE, tone).astype(np.float32)[shot.square]
 
 
-def fit_print_and_lights(
-    shots: Sequence[PhotoSquare], promised: PromisedColors
-) -> tuple[Callable[[np.ndarray], np.ndarray] | None, list[ShownColors], list[ShownColors]]:
-    """Fit the print's map of promised light from several photographs, each one's light, for what surrounds the print,
-    and what each makes of the print's light. If the colors do not tell a print, its map is None, and the last hold it.
-    """
+def read_print(shots: Sequence[PhotoSquare], promised: PromisedColors) -> PhotographedPrint:
+    """Fit the print's map of promised light, and each photograph's light."""
     designs = [PhotographedDesign(shot.cells, shot.blur_cells, shot.light) for shot in shots]
     if (read := choose_photo_cells(designs, promised)) is None:
-        lights = [design_fit(shot, promised) for shot in shots]
-        return None, [light_fit(shot, promised) for shot in shots], lights
+        return PhotographedPrint(None, [(s, light_fit(s, promised), design_fit(s, promised)) for s in shots])
     ink, terms = fit_ink_and_photos(read, _ROUNDS)
     lights = [ShownColors.of_terms(t) for t in terms]
     undo = [light_fit(shot, promised, light.tone) for shot, light in zip(shots, lights, strict=True)]
-    return partial(add_ink, ink=ink), undo, lights
+    return PhotographedPrint(partial(add_ink, ink=ink), list(zip(shots, undo, lights, strict=True)))
 
 
 def design_fit(shot: PhotoSquare, promised: PromisedColors) -> ShownColors:
@@ -157,7 +164,7 @@ def design_fit(shot: PhotoSquare, promised: PromisedColors) -> ShownColors:
 
 def reprojected_squares(
     shot: PhotoSquare,
-    looks: Mapping[Switches, np.ndarray],
+    looks: Mapping[Switches, Pyramid],
     rect_mm: Rect,
     undo: ShownColors,
     print_light: ShownColors,
@@ -165,7 +172,7 @@ def reprojected_squares(
 ) -> dict[Switches, np.ndarray]:
     """Render the piece into the square with each effect on and off: float32 sRGB W×W×3 by (look, light, blur).
 
-    `looks` are the media-relative linear light of the piece at `rect_mm` by their own switches. `undo` takes
+    `looks` are the piece at `rect_mm` by their own switches. `undo` takes
     photographed light before its tone to media-relative; `print_light` takes a look to the photograph's light.
     """
     box = _affected_part(shot, rect_mm)
@@ -189,7 +196,7 @@ def reprojected_squares(
     return squares
 
 
-def reprojected_square(shot: PhotoSquare, look: np.ndarray, rect_mm: Rect, light: ShownColors) -> np.ndarray:
+def reprojected_square(shot: PhotoSquare, look: Pyramid, rect_mm: Rect, light: ShownColors) -> np.ndarray:
     """Render a piece of this look into the square under the photograph's blur and light: float32 sRGB W×W×3."""
     box, photo = _affected_part(shot, rect_mm), _light_before(shot, light.tone)
     layer = _blur(_layer(look, shot.px_from_mm, rect_mm, box), shot.blur_px)
@@ -246,7 +253,7 @@ def change_blur(linear: np.ndarray, from_px: float, to_px: float, noise: float) 
     return np.clip(filtered[margin:-margin, margin:-margin], 0, 1).astype(np.float32)
 
 
-def _layer(look: np.ndarray, px_from_mm: np.ndarray, rect_mm, box: tuple[slice, slice]) -> np.ndarray:
+def _layer(look: Pyramid, px_from_mm: np.ndarray, rect_mm, box: tuple[slice, slice]) -> np.ndarray:
     """Warp a look to the part `box` of a square, H×W×4: its light times its share of each pixel, and the share."""
     x, y, w, h = rect_mm
     finer, top, left = _SUPERSAMPLE, box[0].start, box[1].start
@@ -254,15 +261,16 @@ def _layer(look: np.ndarray, px_from_mm: np.ndarray, rect_mm, box: tuple[slice, 
     # about a texel per supersampled pixel, so that warping does not alias
     quad = apply_homography(px_from_mm, rect_corners(rect_mm))
     sides = np.linalg.norm(np.roll(quad, -1, axis=0) - quad, axis=1).reshape(2, 2).max(0) * finer
-    wide, high = (min(n, max(2, int(np.ceil(s)))) for n, s in zip(look.shape[1::-1], sides, strict=True))
-    look = cv2.resize(look.astype(np.float32), (wide, high), interpolation=cv2.INTER_AREA)
-    mm_from_texel = np.array([[w / look.shape[1], 0, x], [0, h / look.shape[0], y], [0, 0, 1.0]])
+    wide, high = (min(n, max(2, int(np.ceil(s)))) for n, s in zip(look[0].shape[1::-1], sides, strict=True))
+    level = [part for part in look if part.shape[1] >= wide and part.shape[0] >= high][-1]
+    texels = cv2.resize(level.astype(np.float32), (wide, high), interpolation=cv2.INTER_AREA)
+    mm_from_texel = np.array([[w / wide, 0, x], [0, h / high, y], [0, 0, 1.0]])
     to_fine = np.array([[finer, 0, -finer * left], [0, finer, -finer * top], [0, 0, 1]])
     matrix = index_homography(to_fine @ px_from_mm @ mm_from_texel)
     # the rim is repeated outside, so that interpolation does not darken it; the share cuts it off again
     size = (width * finer, height * finer)
-    color = cv2.warpPerspective(look, matrix, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    inside = cv2.warpPerspective(np.ones(look.shape[:2], np.float32), matrix, size, flags=cv2.INTER_LINEAR)
+    color = cv2.warpPerspective(texels, matrix, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    inside = cv2.warpPerspective(np.ones((high, wide), np.float32), matrix, size, flags=cv2.INTER_LINEAR)
     share = (inside > 0.5).astype(np.float32)
     fine = (color * share[..., None], share)  # resized separately: four channels at once take twice as long
     return np.dstack([cv2.resize(part, (width, height), interpolation=cv2.INTER_AREA) for part in fine])

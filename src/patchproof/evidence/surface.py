@@ -19,7 +19,7 @@ import numpy as np
 
 from patchproof.base.color import LUMINANCE, linear_from_srgb
 from patchproof.base.errors import Refused
-from patchproof.base.geometry import apply_homography, rect_corners
+from patchproof.base.geometry import apply_homography, is_inside, rect_corners
 from patchproof.base.resample import downscale
 from patchproof.channel.print_colors import CellColors, added_terms, choose_cells
 from patchproof.photo.detect import LINEAR_FLOAT32_FROM_CODE
@@ -114,7 +114,7 @@ def surface_of(manifest: Manifest) -> Surface:
     if manifest.tiles:
         return _assembled(manifest)
     corners = _corners_by_page(manifest)[page]
-    piece = frozenset(i for i, c in corners.items() if _inside(manifest.cut_mm, c))
+    piece = frozenset(i for i, c in corners.items() if is_inside(c, manifest.cut_mm).all())
     return _surface(manifest, corners, piece, manifest.cut_mm)
 
 
@@ -125,7 +125,7 @@ def _assembled(manifest: Manifest) -> Surface:
     piece, pages = {}, []
     for number, cut in cuts.items():
         page_corners = {i: apply_homography(to_page[number], c) for i, c in corners.get(number, {}).items()}
-        piece |= {i: page_corners[i] for i, c in corners.get(number, {}).items() if _inside(cut, c)}
+        piece |= {i: page_corners[i] for i, c in corners.get(number, {}).items() if is_inside(c, cut).all()}
         (x0, y0), _, (x1, y1), _ = apply_homography(to_page[number], rect_corners(cut)).tolist()
         pages.append(_surface(manifest, page_corners, frozenset(), (x0, y0, x1 - x0, y1 - y0)))
     for number in sorted(corners.keys() - cuts.keys()):  # the page with the chart
@@ -172,7 +172,7 @@ def printed_colors(pixels: np.ndarray, surface: Surface, printer: "Printer") -> 
 def with_markers(design: np.ndarray, surface: Surface, ink: np.ndarray) -> np.ndarray:
     """Draw the markers that lie on the piece over the design's linear light H×W×3; `ink` is their black."""
     on_piece = {i: surface.corners_mm[i] for i in sorted(surface.piece_ids)}
-    on_design = {i: corners for i, corners in on_piece.items() if _inside(surface.rect_mm, corners)}
+    on_design = {i: corners for i, corners in on_piece.items() if is_inside(corners, surface.rect_mm).all()}
     if not on_design:
         return design
     zoom = max(1, DESIGN_PX // max(design.shape))  # markers need more pixels than a small design has
@@ -201,11 +201,6 @@ def _corners_by_page(manifest: Manifest) -> dict[int, dict[int, np.ndarray]]:
         if marker.dictionary == manifest.markers[0].dictionary:
             pages.setdefault(marker.page, {})[marker.id] = np.array(marker.corners_mm)
     return pages
-
-
-def _inside(rect: Rect, points: np.ndarray) -> bool:
-    x, y, w, h = rect
-    return bool((points >= [x, y]).all() and (points <= [x + w, y + h]).all())
 
 
 @dataclass(frozen=True)

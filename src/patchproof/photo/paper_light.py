@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from patchproof.base.color import LINEAR_FROM_CODE
-from patchproof.base.geometry import apply_homography, local_scale, rect_corners
+from patchproof.base.geometry import apply_homography, is_inside, local_scale, rect_corners
 from patchproof.photo.quality import CLIPPED_CODE
 from patchproof.photo.rejection import PhotoRejected
 from patchproof.sheets.rects import RectMm
@@ -75,16 +75,10 @@ def _white_pixels(srgb, px_from_mm, area_mm, printed, blur_px: float) -> tuple[n
     scales = [local_scale(px_from_mm, corner) for corner in rect_corners(area_mm)]
     px_per_mm = min(mean * np.sqrt(np.cos(np.radians(tilt))) for mean, tilt in scales)
     margin_mm = (1 + 3 * blur_px) / max(px_per_mm, 1e-6)
-    white = _inside(mm, area_mm, -margin_mm - _CUT_SLACK_MM)
+    white = is_inside(mm, area_mm, -margin_mm - _CUT_SLACK_MM)
     for rect in printed:
-        white &= ~_inside(mm, rect, margin_mm)
+        white &= ~is_inside(mm, rect, margin_mm)
     return srgb[rows.ravel()[white], columns.ravel()[white]], mm[white]
-
-
-def _inside(mm: np.ndarray, rect, grown_mm: float) -> np.ndarray:
-    x, y, w, h = rect
-    low, high = np.array([x, y]) - grown_mm, np.array([x + w, y + h]) + grown_mm
-    return np.asarray(((mm > low) & (mm < high)).all(1))
 
 
 def _robust_fit(terms: np.ndarray, light: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

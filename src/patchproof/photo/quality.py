@@ -27,6 +27,7 @@ _MIN_DEVIATION_NOISES = 2.0  # in units of the deviation that pixel noise alone 
 _OVERSAMPLING = 8  # samples per module of the blurred pattern
 _MIN_SAMPLES = 30
 _BLUR_FACTORS = np.linspace(0.8, 1.5, 15)  # of the blur from borders, which is 10 % too low at half a module
+_LEAST_SPREAD = 0.02  # standard deviation of a channel's printed light that tells gain from veil
 
 
 @dataclass(frozen=True)
@@ -104,24 +105,28 @@ def pattern_light(
     fits = []
     for blur in blur_px * _BLUR_FACTORS:
         pattern = np.concatenate([_blur_cells(cells, blur / module)[usable] for cells, module, usable in markers])
-        if pattern.std() > 0.02:
+        if pattern.std() > _LEAST_SPREAD:
             agreement = float(np.corrcoef(pattern, light.mean(1))[0, 1])
-            fits.append((*_regress(pattern, light), blur, agreement))
+            fits.append((*gain_and_veil(np.repeat(pattern[:, None], 3, 1), light), blur, agreement))
     if not fits:
         return None
-    _, paper, ink, blur, agreement = min(fits, key=lambda fit: fit[0])
-    return np.minimum(paper, 1.2), np.maximum(ink, 0), float(blur), agreement
+    _, gain, ink, blur, agreement = min(fits, key=lambda fit: np.median(fit[0]))
+    return np.minimum(gain + ink, 1.2), np.maximum(ink, 0), float(blur), agreement
 
 
-def _regress(pattern: np.ndarray, light: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """Median error, paper and ink by robust regression, since a glare or a thumb may cover a marker."""
-    rows, weight, error = np.column_stack([1 - pattern, pattern]), np.ones(len(pattern)), np.zeros(len(pattern))
-    ink = paper = np.zeros(3)
+def gain_and_veil(printed: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Fit seen ≈ veil + gain · printed to N×3 pixels robustly, since glare may cover some; errors (N,) come first."""
+    known, weight = printed.std(0) >= _LEAST_SPREAD, np.ones(len(seen))
+    gain, veil, error = np.ones(3), np.zeros(3), np.zeros(len(seen))
     for _ in range(4):
-        ink, paper = np.linalg.lstsq(rows * weight[:, None], light * weight[:, None], rcond=None)[0]
-        error = np.linalg.norm(rows @ np.stack([ink, paper]) - light, axis=1)
-        weight = np.sqrt(np.minimum(1, 1.345 * 1.4826 * np.median(error) / np.maximum(error, 1e-9)))
-    return float(np.median(error)), paper, ink
+        total = weight.sum()
+        x, y = (weight @ values / total for values in (printed, seen))
+        slope = weight @ ((printed - x) * (seen - y)) / np.maximum(weight @ (printed - x) ** 2, 1e-9)
+        gain = np.where(known, np.maximum(slope, 1e-3), y / np.maximum(x, 1e-3))
+        veil = np.where(known, y - gain * x, 0.0)
+        error = np.linalg.norm(veil + gain * printed - seen, axis=1)
+        weight = np.minimum(1, 2 * np.median(error) / np.maximum(error, 1e-6))
+    return error, gain, veil
 
 
 def _blur_cells(cells: np.ndarray, sigma_modules: float) -> np.ndarray:

@@ -154,6 +154,13 @@ def resize_by_area(pixels: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     return cv2.resize(pixels, size, interpolation=interpolation)
 
 
+def coarsen(light: np.ndarray, shape: tuple[int, ...], blur_px: float) -> np.ndarray:
+    """Blur a design's light by so many of its pixels and average it to cells of `shape`."""
+    if blur_px > 0.3:
+        light = cv2.GaussianBlur(light, (0, 0), float(blur_px), borderType=cv2.BORDER_REPLICATE)
+    return resize_by_area(light, (shape[1], shape[0]))
+
+
 def least_px_per_mm(px_from_mm: np.ndarray, rect_mm) -> float:
     """The smallest number of pixels per millimeter, over the rectangle's corners and all directions."""
     return float(1 / max(np.linalg.norm(j, 2) for j in _mm_by_px(px_from_mm, rect_corners(rect_mm))))

@@ -24,8 +24,8 @@ import numpy as np
 from patchproof.base.color import LUMINANCE
 from patchproof.base.geometry import apply_homography, local_scale, rect_corners
 from patchproof.photo.detect import LINEAR_FLOAT32_FROM_CODE, luminance
-from patchproof.photo.quality import CLIPPED_CODE, FrameLight
-from patchproof.photo.rectify import PageFit, crop_around, fit_points, rectified_px, rectify, resize_by_area
+from patchproof.photo.quality import CLIPPED_CODE, FrameLight, gain_and_veil
+from patchproof.photo.rectify import PageFit, coarsen, crop_around, fit_points, rectify
 
 _CELLS = 8  # along the rectangle's shorter side
 _MAX_SIDE_PX = 256  # of the shorter side: shifts are found to a tenth of such a pixel
@@ -39,7 +39,6 @@ _LEAST_CELLS = 8  # with a place of their own, to correct corners
 _CELL_NOISE_PX = 0.05  # least standard deviation of a cell's place
 _LIGHT_SIDE_PX = 192  # of the design's shorter side, where blur and light are read
 _BLURS_PX = (0.0, 0.4, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0)
-_LEAST_SPREAD = 0.03  # standard deviation of a channel's promised light that tells gain from veil
 
 
 @dataclass(frozen=True)
@@ -64,7 +63,8 @@ def register(
     light = rectify(luminance(part)[..., None], to_part, rect_mm, scale)
     height, width = light.shape[:2]
     light = light.reshape(height, width)
-    printed = _printed(design @ np.array(LUMINANCE, np.float32), blur_px / px_per_mm / w, (width, height))
+    design = design @ np.array(LUMINANCE, np.float32)
+    printed = coarsen(design, (height, width), blur_px / px_per_mm / w * design.shape[1])
     size = max(8, round(min(width, height) / _CELLS))
     search = max(3, round(_SEARCH_SHARE * size))
     padded = cv2.copyMakeBorder(light, search, search, search, search, cv2.BORDER_REPLICATE)
@@ -79,12 +79,6 @@ def register(
             rows.append([left + size / 2, top + size / 2, dx - search, dy - search, sigma])
     table = np.array(rows).reshape(-1, 5) / scale
     return Registration(table[:, :2] + [x, y], table[:, 2:4], table[:, 4], size / scale)
-
-
-def _printed(design: np.ndarray, blur: float, size: tuple[int, int]) -> np.ndarray:
-    """The design's light as a photograph of this `blur`, a share of its width, shows it in so many pixels."""
-    sigma_px = float(blur * design.shape[1])
-    return resize_by_area(cv2.GaussianBlur(design, (0, 0), sigma_px) if sigma_px > 0.3 else design, size)
 
 
 def _cell_starts(length: int, size: int) -> np.ndarray:
@@ -175,23 +169,8 @@ def _blur_and_light(srgb, px_from_mm, rect_mm, design, ink) -> tuple[float, Fram
         return 0.0, FrameLight(white, white * ink, float(LUMINANCE @ (white - ink)), share)
     fits = []
     for blur in _BLURS_PX:
-        printed = _printed(design, blur / px_per_mm / rect_mm[2], rectified_px(rect_mm, scale))
-        fits.append((*_gain_and_veil(printed[inner][usable], seen[inner][..., :3][usable]), blur))
-    _, gain, veil, blur = min(fits, key=lambda fit: fit[0])
+        printed = coarsen(design, seen.shape, blur / px_per_mm / rect_mm[2] * design.shape[1])
+        fits.append((*gain_and_veil(printed[inner][usable], seen[inner][..., :3][usable]), blur))
+    _, gain, veil, blur = min(fits, key=lambda fit: fit[0].mean())
     paper, black = np.clip(gain + veil, 1e-3, 1.2), np.clip(veil + gain * ink, 0, 1.2)
     return blur, FrameLight(paper, black, float(np.dot(LUMINANCE, paper - black)), share)
-
-
-def _gain_and_veil(printed: np.ndarray, seen: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """Fit seen ≈ veil + gain · printed to N×3 pixels, robustly; the mean absolute error comes first."""
-    known, weight = printed.std(0) >= _LEAST_SPREAD, np.ones(len(seen))
-    gain, veil, error = np.ones(3), np.zeros(3), np.zeros(len(seen))
-    for _ in range(4):
-        total = weight.sum()
-        x, y = (weight @ values / total for values in (printed, seen))
-        slope = weight @ ((printed - x) * (seen - y)) / np.maximum(weight @ (printed - x) ** 2, 1e-9)
-        gain = np.where(known, np.maximum(slope, 1e-3), y / np.maximum(x, 1e-3))
-        veil = np.where(known, y - gain * x, 0.0)
-        error = np.abs(veil + gain * printed - seen).mean(1)
-        weight = np.minimum(1, 2 * np.median(error) / np.maximum(error, 1e-6))
-    return float(error.mean()), gain, veil

@@ -62,7 +62,7 @@ def jpeg(pixels: np.ndarray) -> bytes:
 
 def png(pixels: np.ndarray) -> bytes:
     """Encode uint8 sRGB, with or without alpha, as PNG, for flat colors."""
-    return image_bytes(pixels, "PNG", {"optimize": True})
+    return image_bytes(pixels, "PNG")  # optimized it takes 12 times as long, and is 2 % smaller
 
 
 def save_pictures(folder: Path, file: str, kinds: Mapping[str, np.ndarray]) -> None:
