@@ -32,7 +32,7 @@ from patchproof.base.progress import Advance, no_advance
 _Task = Callable[[Any], Any]
 _Item = tuple[int, Any]  # its number, and the item
 MAX_TRIES = 3  # of an item whose worker dies each time
-MAX_QUEUED_ITEMS = 1000  # on a cluster at a time: enough to keep it busy, and for its scheduler to plan ahead
+_LEAST_QUEUED = 16  # on a cluster at a time, or twice its threads: its scheduler holds the function with every item
 _CONNECT_TIMEOUT_S = 10  # to a cluster's scheduler
 _QUOTA = Path("/sys/fs/cgroup/cpu.max")  # of a container: microseconds of processor time per period
 
@@ -128,7 +128,8 @@ def open_workers(jobs: int = 1, cluster: str | None = None, spawn: bool = False)
     if jobs > 1:
         raise Refused("--jobs or --cluster", "both", "leave one out: a cluster has its own number of workers")
     with closing(_connect_client(cluster)) as client:
-        yield Workers(partial(client.get_executor, pure=False), MAX_QUEUED_ITEMS, True)
+        threads = sum(client.nthreads().values())
+        yield Workers(partial(client.get_executor, pure=False), max(_LEAST_QUEUED, 2 * threads), True)
 
 
 def _connect_client(address: str) -> Any:

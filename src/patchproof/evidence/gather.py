@@ -36,7 +36,7 @@ from patchproof.evidence.grouping import (
 )
 from patchproof.evidence.ledger import estimate_effect, ledger_of
 from patchproof.evidence.measure import UNLOCATED_CODES, MeasuredPhoto
-from patchproof.evidence.reproject import read_print
+from patchproof.evidence.reproject import PhotoSquare, read_print
 from patchproof.evidence.results import (
     EffectEstimate,
     Ledger,
@@ -109,22 +109,22 @@ def gather_evidence(
         results = measure_all(task, items, judges, workers, open_journal, on_pictures, advance)
         grouping = merge_folders(grouping, results[:count])
         patch_photos = reject_copies(results[:count], grouping.merged, task.surface.rect_mm)
-        ledger, estimate = None, None
+        squares: list[PhotoSquare | None] = []
         if judges and task.promised:
             originals = [number for number, photo in enumerate(patch_photos) if photo.entry.code != COPY_CODE]
-            name, read_shot = judges.primary.name, partial(reread_square, task, judges.primary.input_px)
             numbers = _spread(originals, MOST_PHOTOS if options.ledger_photos else 0)
-            squares = workers.map(read_shot, [(paths[number], patch_photos[number]) for number in numbers])
-            shots = [shot for shot in squares if shot is not None]
-            entries = [photo.entry for photo in patch_photos if photo.entry.predictions]
-            confidence = {entry.file: entry.predictions[name].target_confidence for entry in entries}
-            pairs = zip(patch_photos, grouping.merged, strict=True)
-            session = {photo.entry.file: number for photo, number in pairs if photo.counted}
-            found = read_print(shots, task.promised)
-            some = replace(found, shots=_spread(found.shots, options.ledger_photos))
-            ledger = ledger_of(some, manifest, task, judges, confidence, compute.jobs)
-            by_file = _recognized(entries, name), session
-            estimate = estimate_effect(found, manifest, task, options.printer, judges, *by_file, compute.jobs)
+            read_square = partial(reread_square, task, judges.primary.input_px)
+            squares = workers.map(read_square, [(paths[number], patch_photos[number]) for number in numbers])
+    ledger, estimate = None, None
+    if judges and task.promised:  # other processes, which hold the networks
+        name, entries = judges.primary.name, [photo.entry for photo in patch_photos if photo.entry.predictions]
+        confidence = {entry.file: entry.predictions[name].target_confidence for entry in entries}
+        session = {p.entry.file: number for p, number in zip(patch_photos, grouping.merged, strict=True) if p.counted}
+        found = read_print([square for square in squares if square is not None], task.promised)
+        some = replace(found, shots=_spread(found.shots, options.ledger_photos))
+        ledger = ledger_of(some, manifest, task, judges, confidence, compute.jobs)
+        by_file = _recognized(entries, name), session
+        estimate = estimate_effect(found, manifest, task, options.printer, judges, *by_file, compute.jobs)
     if controls_folder:
         skipped = list_skipped_files(controls_folder, depth=2)
         left_out += [f"{printable(controls_folder.name)}: {text}" for text in skipped]

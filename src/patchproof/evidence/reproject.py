@@ -147,9 +147,8 @@ def read_print(shots: Sequence[PhotoSquare], promised: PromisedColors) -> Photog
     if (read := choose_photo_cells(designs, promised)) is None:
         return PhotographedPrint(None, [(s, light_fit(s, promised), design_fit(s, promised)) for s in shots])
     ink, terms = fit_ink_and_photos(read, _ROUNDS)
-    lights = [ShownColors.of_terms(t) for t in terms]
-    undo = [light_fit(shot, promised, light.tone) for shot, light in zip(shots, lights, strict=True)]
-    return PhotographedPrint(partial(add_ink, ink=ink), list(zip(shots, undo, lights, strict=True)))
+    pairs = zip(shots, map(ShownColors.of_terms, terms), strict=True)
+    return PhotographedPrint(partial(add_ink, ink=ink), [(s, light_fit(s, promised, t.tone), t) for s, t in pairs])
 
 
 def design_fit(shot: PhotoSquare, promised: PromisedColors) -> ShownColors:
