@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import os
 import pickle
 import signal
@@ -217,9 +216,8 @@ def test_a_cluster_gives_the_same_also_when_workers_die(tmp_path):
         with open_workers(cluster=cluster.scheduler_address) as workers:
             assert workers.map(toy.double, range(8)) == [2 * i for i in range(8)]
             assert workers.map(toy.threads, range(3)) == [1, 1, 1]
-            taken = itertools.count()
-            next(workers.completed(toy.double, zip(range(500), taken)))  # a scheduler holds few items at a time
-            assert next(taken) < 20
+            next(workers.completed(toy.double, items := iter(range(500))))
+            assert next(items) < 20  # a scheduler holds few at a time
             with pytest.raises(Refused, match=r"^Expected a, got 7: c\.$"):
                 workers.map(toy.refuse, [7])
         run_cells(toy.STUDY, settings, tmp_path, tmp_path / "there", Work(cluster=cluster.scheduler_address))
