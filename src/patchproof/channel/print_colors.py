@@ -28,7 +28,7 @@ _MOST_CELLS = 600  # of a photograph enter the fit
 _EVEN_SHARE = 0.7  # of the cells
 CELLS_PER_ANCHOR = 8  # paper and ink each enter once for so many: a design's colors do not fix white and black
 MAX_TONE = 0.2  # from 0.25 on a tone curve is not monotonic
-_INK_RIDGE = 3e-4  # of the mean square of a term
+_INK_RIDGE = 0.03  # cells, as many as which it counts that a term is 0
 _TERMS_RIDGE = 0.05  # of a photograph's terms, per squared unit: keeps what cells cannot tell near its start
 _STEPS = 4  # of a photograph's fit in each round
 _LAB_NOISE = 1.0  # CIELAB distances below count by their square
@@ -205,7 +205,7 @@ def _fit_ink(
         miss = eye * np.linalg.norm(light - promised - rows @ ink, axis=1) / _LIGHT_NOISE
         weight = (share * eye**2 / np.sqrt(1 + miss**2))[:, None]
         square = (rows * weight).T @ rows
-        ridge = _INK_RIDGE * np.trace(square) / INK_TERMS * np.eye(INK_TERMS)
+        ridge = _INK_RIDGE / len(light) * np.trace(square) / INK_TERMS * np.eye(INK_TERMS)
         ink = np.linalg.solve(square + ridge, (rows * weight).T @ (light - promised))
     return ink
 
