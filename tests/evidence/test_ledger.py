@@ -141,7 +141,7 @@ def test_a_known_print_is_read_from_a_noisy_design(change, before, after):
 
 
 def test_noise_of_one_photograph_makes_no_other_print():
-    """What a print's terms are held with must fall with the cells: at a tenth for all the same it made 1.9 of it."""
+    """A prior of a tenth of the former weight, whatever the number of cells, read ΔE00 1.9 here."""
     sent, ink = noisy_design(0), shown_by("coated", INK)[0, 0]
     promised = shown_by("coated", sent)
     as_printed = fitted([cells_of_print(promised, 0, noise=0.03)], promised.astype(np.float32), ink, ink)
