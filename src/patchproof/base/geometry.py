@@ -190,9 +190,9 @@ def rect_corners(rect) -> np.ndarray:
     return np.array([[x, y], [x + w, y], [x + w, y + h], [x, y + h]], float)
 
 
-def is_inside(points: np.ndarray, rect, grown: float = 0.0) -> np.ndarray:
-    """True for points N×2 in [x, y, width, height], grown on all sides."""
-    low, high = rect_corners(rect)[[0, 2]] + [[-grown], [grown]]
+def is_inside(points: np.ndarray, rect) -> np.ndarray:
+    """True for points N×2 in [x, y, width, height]."""
+    low, high = rect_corners(rect)[[0, 2]]
     return ((points >= low) & (points <= high)).all(1)
 
 

@@ -104,7 +104,7 @@ def appearance(
     px_from_mm = np.diag([1 / step, 1 / step, 1.0]) @ px_from_mm
     size = rectified_px(surface.rect_mm, cells_per_mm)
     flat = oversample_flat(linear, px_from_mm, surface.rect_mm, size)
-    *photographed, clipped = cv2.split(coarsen(flat, size[::-1], 0.0))
+    *photographed, clipped = cv2.split(coarsen(flat, size[::-1]))
     photographed, clipped = np.dstack(photographed).astype(float), clipped > 0.05
     blur_mm = geometry.blur_px / geometry.px_per_mm
     design = promised.design
@@ -137,8 +137,8 @@ def appearance(
         color = color.changed(delta_e00_mean=float(valid_delta.mean()), delta_e00_p95=p95)
     if not with_pictures:
         return color, {}, match
-    seen = coarsen(flat, rectified_px(surface.rect_mm, picture_per_mm)[::-1], 0.0)[..., :3]
-    lights = {"seen": seen, "fitted": fit.undo(seen), "promised": coarsen(design, seen.shape, 0.0)}
+    seen = coarsen(flat, rectified_px(surface.rect_mm, picture_per_mm)[::-1])[..., :3]
+    lights = {"seen": seen, "fitted": fit.undo(seen), "promised": coarsen(design, seen.shape)}
     pictures = {kind: photo_codes_from_srgb(srgb_from_linear(linear)) for kind, linear in lights.items()}
     return color, pictures | {"delta_e00": np.where(usable, delta, np.nan).astype(np.float32)}, match
 

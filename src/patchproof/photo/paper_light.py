@@ -18,7 +18,7 @@ from patchproof.base.color import LINEAR_FROM_CODE
 from patchproof.base.geometry import apply_homography, is_inside, local_scale, rect_corners
 from patchproof.photo.quality import CLIPPED_CODE
 from patchproof.photo.rejection import PhotoRejected
-from patchproof.sheets.rects import RectMm
+from patchproof.sheets.rects import RectMm, grow_rect
 
 _CUT_SLACK_MM = 1.0  # scissors do not follow the line
 _MAX_CLIPPED = 0.5  # of the white paper
@@ -75,9 +75,9 @@ def _white_pixels(srgb, px_from_mm, area_mm, printed, blur_px: float) -> tuple[n
     scales = [local_scale(px_from_mm, corner) for corner in rect_corners(area_mm)]
     px_per_mm = min(mean * np.sqrt(np.cos(np.radians(tilt))) for mean, tilt in scales)
     margin_mm = (1 + 3 * blur_px) / max(px_per_mm, 1e-6)
-    white = is_inside(mm, area_mm, -margin_mm - _CUT_SLACK_MM)
+    white = is_inside(mm, grow_rect(area_mm, -margin_mm - _CUT_SLACK_MM))
     for rect in printed:
-        white &= ~is_inside(mm, rect, margin_mm)
+        white &= ~is_inside(mm, grow_rect(rect, margin_mm))
     return srgb[rows.ravel()[white], columns.ravel()[white]], mm[white]
 
 

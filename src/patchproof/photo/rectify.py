@@ -154,8 +154,8 @@ def resize_by_area(pixels: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     return cv2.resize(pixels, size, interpolation=interpolation)
 
 
-def coarsen(light: np.ndarray, shape: tuple[int, ...], blur_px: float) -> np.ndarray:
-    """Blur a design's light by so many of its pixels and average it to cells of `shape`."""
+def coarsen(light: np.ndarray, shape: tuple[int, ...], blur_px: float = 0.0) -> np.ndarray:
+    """Blur a picture's light by so many of its pixels and average it to cells of `shape`."""
     if blur_px > 0.3:
         light = cv2.GaussianBlur(light, (0, 0), float(blur_px), borderType=cv2.BORDER_REPLICATE)
     return resize_by_area(light, (shape[1], shape[0]))
