@@ -218,15 +218,8 @@ def tables(settings: StressSettings, results: Sequence[Result]) -> tuple[Table, 
 def _worst_rows(result: Result) -> Iterator[tuple]:
     def row(test: str, where: str, worst: str, usual: str, confidence: float | None) -> tuple:
         there, anywhere = parse_hits(worst), parse_hits(usual)
-        return (
-            *cell_key(result),
-            test,
-            where,
-            rate(there),
-            rate(anywhere),
-            estimate_difference(there, anywhere),
-            confidence,
-        )
+        rates = rate(there), rate(anywhere), estimate_difference(there, anywhere)
+        return *cell_key(result), test, where, *rates, confidence
 
     for test in ("pose", "light"):
         of_test = result.answers[test]

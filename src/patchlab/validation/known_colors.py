@@ -20,8 +20,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from patchproof.base.color import ciede2000, lab_from_linear, lift_tone, linear_from_srgb, srgb_from_linear
-from patchproof.channel.printer import Printer, node_colors, printer_from_table, vary_print
+from patchproof.base.color import lab_from_linear, lift_tone, linear_from_srgb, srgb_from_linear
+from patchproof.calibrate.chart import printer_of
+from patchproof.channel.printer import Printer, vary_print
 
 _CENTER = (0.025, 0.025, 0.025, 0.0, 0.0, 0.0, 0.0, -0.075)  # of the terms in the default conditions
 _CENTERED = 100.0  # of the mean terms' squared distance from there: what all photographs share is in the ink
@@ -98,11 +99,9 @@ def fit_photo(cells: KnownColors, printer: Printer, ink: Tensor) -> np.ndarray:
 
 def printer_of_ink(name: str, start: Printer, ink: Tensor, provenance: dict[str, Any]) -> Printer:
     """Return the printer of an ink after `start`; its white is paper."""
-    nodes = node_colors().reshape(-1, 3)
-    lut = srgb_from_linear(ink_light(_printed(nodes * 255, start), ink)).numpy().reshape(node_colors().shape)
-    lut = (lut / lut[-1, -1, -1]).clip(0, 1)
-    distance = ciede2000(*(lab_from_linear(linear_from_srgb(each)) for each in (lut, node_colors())))
-    return printer_from_table(name, "measured", lut, distance, provenance)
+    return printer_of(
+        name, lambda colors: srgb_from_linear(ink_light(_printed(255 * colors, start), ink)).numpy(), provenance
+    )
 
 
 def _printed(code: np.ndarray, printer: Printer) -> Tensor:

@@ -133,7 +133,6 @@ def _measure_changes(network: Classifier, srgb: np.ndarray, pasted: np.ndarray) 
     found: dict[str, Any] = {"label": network.labels[best], "confidence": float(np.exp(before[best]))}
     for name, after in zip(_CHANGES, logs[1:], strict=True):
         found[name] = {
-            "label": network.labels[int(after.argmax())],
             "changed": int(after.argmax()) != best,
             "confidence": float(np.exp(after[best]) - np.exp(before[best])),
             "log_rms": float(np.sqrt(((after - before) ** 2).mean())),
@@ -161,14 +160,8 @@ def _panel(picture: np.ndarray) -> np.ndarray:
 
 
 def tables(settings: RealSettings, results: Sequence[Result]) -> Sequence[Table]:
-    """Tables: medians by board, networks by board, every photograph, every answer, photographs left out."""
-    return (
-        _by_board(settings, results),
-        _by_network(settings, results),
-        _photographs(results),
-        _answers(results),
-        _left_out(results),
-    )
+    """Tables: medians by board, networks by board, every photograph, photographs left out."""
+    return _by_board(settings, results), _by_network(settings, results), _photographs(results), _left_out(results)
 
 
 def _used_results(results: Sequence[Result], board: str | None = None) -> list[Result]:
@@ -209,19 +202,6 @@ def _photographs(results: Sequence[Result]) -> Table:
     )
     head = ("board", "photograph", "markers", *_FIGURES.values(), "share of the board at full white")
     return Table("photographs", "Every photograph", head, rows)
-
-
-def _answers(results: Sequence[Result]) -> Table:
-    rows = []
-    for result in _used_results(results):
-        for network, answer in result.answers["networks"].items():
-            for change in _CHANGES:
-                moved = (answer[change][key] for key in ("label", "confidence", "log_rms"))
-                named = Path(network).stem, answer["label"], answer["confidence"]
-                rows.append((*_names(result), *named, change, *moved))
-    before, after = ("label", "confidence"), ("label then", "confidence moved", "log-p")
-    head = ("board", "photograph", "network", *before, "change", *after)
-    return Table("answers", "Every answer", head, tuple(rows), "log-p: RMS change of the labels' log-probabilities")
 
 
 def _left_out(results: Sequence[Result]) -> Table:

@@ -4,7 +4,7 @@ In: cells of known color in photographs of prints (sRGB sent, light over white p
 beside it, which names print and place), and scenes with networks. Out: for each photograph the distance to the default
 printer in the best of its conditions, the share of cells within what the conditions can make, and how far cells lie off
 a smooth map of colors (what `printer.mottle` is of); for each scene and network, promises beside sessions of twins: the
-same design under the scene's views in the colors of one photograph.
+same design under the scene's views in the colors of one photograph; and verify's print fit beside those colors.
 A twin is a cubic from code to light through all cells of its photograph, and what the cubic leaves, cell by cell.
 
 With `left_out` the default printer is made again without the photographs of a place, or of a print, that it is held
@@ -16,8 +16,9 @@ from __future__ import annotations
 
 import csv
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import combinations_with_replacement
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -38,6 +39,7 @@ from patchproof.base.sessions import count_by_session, rate_posterior
 from patchproof.base.settings import CameraSettings, PrinterSettings, SceneSettings
 from patchproof.base.validation import expand_path
 from patchproof.channel.effects import EFFECT_BY_NAME, Print
+from patchproof.channel.print_colors import ShownColors, add_ink, added_terms, choose_cells, fit_ink_and_photos
 from patchproof.channel.printer import (
     MOTTLE_CELLS,
     Printer,
@@ -48,6 +50,7 @@ from patchproof.channel.printer import (
     printer_output,
     vary_print,
 )
+from patchproof.evidence.surface import cell_means
 from patchproof.optimizer.loop import best_design
 from patchproof.optimizer.patch import Patch
 from patchproof.optimizer.problem import Problem, set_problem
@@ -71,6 +74,8 @@ _STILL: Tables = {
 }
 _CHUNK = 4  # views rendered at a time
 _BASE = "coated"  # the printer that an ink is told apart from
+_FIT_CELLS, _FIT_VIEWS = 48, 24  # of the design's sides for a print fit, which photographs resolve; that it is seen in
+_FITS = ("print fit", "quadratic", "default printer")
 
 
 class RealPrintsSettings(GridSettings):
@@ -93,6 +98,12 @@ class Cells:
     known: KnownColors
     places: tuple[str, ...]
     prints: tuple[str, ...]
+
+    @property
+    def twins(self) -> list[Twin]:
+        """The twin of each photograph."""
+        photos = [self.known.of(np.array([photo])) for photo in range(len(self.places))]
+        return [Twin.of(photo.code / 255, srgb_from_linear(photo.light)) for photo in photos]
 
     def groups(self, left_out: str) -> tuple[str, ...]:
         """The name of the group of each photograph that is left out together."""
@@ -154,7 +165,7 @@ def _printers(settings: RealPrintsSettings, every: Cells) -> dict[str, tuple[Pri
 
 def _colors(settings: RealPrintsSettings, every: Cells) -> Iterator[dict[str, Any]]:
     """Of each photograph: ΔE00 of its median cell in the best conditions, share of cells within what they can make."""
-    some = _some(settings, every.known)
+    some, twins = _some(settings, every.known), every.twins
     unchanged = torch.zeros(10, 3, dtype=torch.float64)
     unchanged[1:4] = torch.eye(3)
     for printer, held in _printers(settings, every).values():
@@ -168,7 +179,7 @@ def _colors(settings: RealPrintsSettings, every: Cells) -> Iterator[dict[str, An
                 "print": every.prints[photo],
                 "distance": float(np.median(distance)),
                 "within": _share_within(torch.as_tensor(light), seen.light, settings.draws),
-                "scatter": float(np.sqrt((Twin.of(every.known.of(np.array([photo]))).left ** 2).mean())),
+                "scatter": float(np.sqrt((twins[photo].left ** 2).mean())),
             }
 
 
@@ -188,32 +199,38 @@ def _share_within(light: torch.Tensor, seen: np.ndarray, draws: int) -> float:
 
 @dataclass(frozen=True)
 class Twin:
-    """Colors of one photograph: a cubic 20×3 from sRGB sent to sRGB seen, and what it leaves of each cell."""
+    """Colors of one photograph: a polynomial from sRGB sent to sRGB seen, and what it leaves of each cell."""
 
-    cubic: np.ndarray
+    degree: int
+    factors: np.ndarray
     left: np.ndarray
 
     @classmethod
-    def of(cls, known: KnownColors) -> Twin:
-        """The least-squares cubic through the cells of one photograph; paper is white."""
-        sent, seen = known.code / 255, srgb_from_linear(known.light)
+    def of(cls, sent: np.ndarray, seen: np.ndarray, degree: int = 3) -> Twin:
+        """The least-squares polynomial through the cells N×3 of one photograph; paper is white."""
         white = np.ones((len(sent) // 10, 3))
-        terms = _cubic_terms(np.concatenate([sent, white]))
-        cubic = np.linalg.lstsq(terms, np.concatenate([seen, white]), rcond=None)[0]
-        return cls(cubic, seen - _cubic_terms(sent) @ cubic)
+        terms = _power_terms(np.concatenate([sent, white]), degree)
+        factors = np.linalg.lstsq(terms, np.concatenate([seen, white]), rcond=None)[0]
+        return cls(degree, factors, seen - _power_terms(sent, degree) @ factors)
 
-    def show(self, piece: PiecePicture, rng: np.random.Generator) -> PiecePicture:
+    def colors(self, sent: np.ndarray) -> np.ndarray:
+        """The colors in place of these, H×W×3 sRGB, without what is left."""
+        return (_power_terms(sent.reshape(-1, 3), self.degree) @ self.factors).reshape(sent.shape)
+
+    def show(self, sent: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """The piece in these colors, each of its cells with what is left of some cell of the photograph."""
-        sent = piece.srgb.numpy()
         left = self.left[rng.integers(0, len(self.left), (MOTTLE_CELLS, MOTTLE_CELLS))]
         rows, columns = (np.arange(n) * MOTTLE_CELLS // n for n in sent.shape[:2])
-        seen = (_cubic_terms(sent.reshape(-1, 3)) @ self.cubic).reshape(sent.shape) + left[rows][:, columns]
-        return PiecePicture.of(torch.tensor(np.clip(seen, 0, 1), dtype=torch.float32))
+        return np.clip(self.colors(sent) + left[rows][:, columns], 0, 1)
 
 
-def _cubic_terms(sent: np.ndarray) -> np.ndarray:
-    powers = [np.prod(sent[:, list(each)], 1) for n in range(4) for each in combinations_with_replacement(range(3), n)]
-    return np.stack(powers, 1)
+def _power_terms(sent: np.ndarray, degree: int) -> np.ndarray:
+    each = (chosen for n in range(degree + 1) for chosen in combinations_with_replacement(range(3), n))
+    return np.stack([np.prod(sent[:, list(chosen)], 1) for chosen in each], 1)
+
+
+def _piece(srgb: np.ndarray) -> PiecePicture:
+    return PiecePicture.of(torch.tensor(np.clip(srgb, 0, 1), dtype=torch.float32))
 
 
 def _hold_promises(settings: RealPrintsSettings, base: Path, cell: Cell, every: Cells) -> dict[str, Any]:
@@ -223,16 +240,21 @@ def _hold_promises(settings: RealPrintsSettings, base: Path, cell: Cell, every: 
     with tempfile.TemporaryDirectory() as temporary:
         ways = {"default": {}, "without mottle": {"mottle": (0, 0)}}
         conditions = {"former": [(_problem(scene, names, FORMER), list(range(len(every.places))))]}
-        for i, (printer, held) in enumerate(_printers(settings, every).values()):
+        printers = _printers(settings, every).values()
+        for i, (printer, held) in enumerate(printers):
             file = Path(temporary, f"printer{i}.npz")
             write_files_atomically(printer_contents(replace(printer, name=file.stem), file))
             for way, changed in ways.items():
                 problem = _problem(scene, names, {"printer": {"profile": str(file), **changed}})
                 conditions.setdefault(way, []).append((problem, held))
-        still = _problem(scene, names, _STILL)
-        twins = [Twin.of(every.known.of(np.array([photo]))) for photo in range(len(every.places))]
+        still, twins = _problem(scene, names, _STILL), every.twins
+        plain = Patch(still.patch.scene, identity_printer(), still.patch.design_px, still.device)
         designs = {
             by: best_design(_problem(scene, names, tables)) for by, tables in (("former", FORMER), ("default", {}))
+        }
+        pieces = {
+            by: [plain.appearance(from_pixels(each)).srgb.numpy() for each in (pixels, np.full_like(pixels, 128))]
+            for by, pixels in designs.items()
         }
         for by, pixels in designs.items():
             promised = {
@@ -240,8 +262,9 @@ def _hold_promises(settings: RealPrintsSettings, base: Path, cell: Cell, every: 
                 for way, each in conditions.items()
                 if by == "former" or way == "default"
             }
-            answers[by] = {"promised": promised, "twins": _twins(settings, still, pixels, twins)}
-    return answers | {"places": every.places}
+            answers[by] = {"promised": promised, "twins": _twins(settings, still, pieces[by], twins)}
+    fits = sorted(_print_fits(still, pieces["default"][0].astype(float), every.places, twins, printers))
+    return answers | {"places": every.places, "print fits": [fit for _, fit in fits]}
 
 
 def _problem(scene: Scene, names: Sequence[str], tables: Tables) -> Problem:
@@ -252,29 +275,60 @@ def _promise(settings: RealPrintsSettings, problem: Problem, pixels: np.ndarray)
     """The effect beside gray on the target's logit, and the numbers recognized in each session."""
     conditions = problem.scene.draw("promise", settings.views, per_session=VIEWS_PER_SESSION)
     shown = [problem.patch.appearance(from_pixels(each)) for each in (pixels, np.full_like(pixels, 128))]
-    effect, hits = _effect(problem, shown, conditions)
-    return {"effect": effect, "sessions": count_by_session(hits, VIEWS_PER_SESSION)}
+    (own, gray), hits = _logits(problem, shown, conditions)
+    return {"effect": own - gray, "sessions": count_by_session(hits, VIEWS_PER_SESSION)}
 
 
 def _twins(
-    settings: RealPrintsSettings, problem: Problem, pixels: np.ndarray, twins: Sequence[Twin]
+    settings: RealPrintsSettings, problem: Problem, sent: Sequence[np.ndarray], twins: Sequence[Twin]
 ) -> list[dict[str, Any]]:
-    """The effect and the numbers recognized in sessions of each twin."""
-    plain = Patch(problem.patch.scene, identity_printer(), problem.patch.design_px, problem.device)
-    sent = [plain.appearance(from_pixels(each)) for each in (pixels, np.full_like(pixels, 128))]
+    """The effect of the first of two pieces and the numbers recognized in sessions of each twin."""
     found = []
     for number, twin in enumerate(twins):
         n = settings.sessions * settings.photos
         views = problem.scene.draw("reprint", (number + 1) * n, per_session=settings.photos)[number * n :]
-        effect, hits = _effect(problem, [twin.show(each, np.random.default_rng(number)) for each in sent], views)
-        found.append({"effect": effect, "sessions": count_by_session(hits, settings.photos)})
+        shown = [_piece(twin.show(each, np.random.default_rng(number))) for each in sent]
+        (own, gray), hits = _logits(problem, shown, views)
+        found.append({"effect": own - gray, "sessions": count_by_session(hits, settings.photos)})
     return found
 
 
+def _print_fits(
+    problem: Problem,
+    sent: np.ndarray,
+    places: Sequence[str],
+    twins: Sequence[Twin],
+    printers: Iterable[tuple[Printer, Sequence[int]]],
+) -> Iterator[tuple[int, list[float]]]:
+    """Each twin's number, and how far the logit of the piece H×W×3 lies above that in the twin's colors: in verify's
+    print fit to all photographs of a place, in a quadratic of the photograph's own, as the printer makes it.
+    """
+    views = problem.scene.draw("reprint", _FIT_VIEWS)
+    means = partial(cell_means, shape=(_FIT_CELLS, _FIT_CELLS), blur_cells=0.0)
+    for printer, held in printers:
+        light = linear_from_srgb(printer_output(printer, sent))
+        promised = means([*np.moveaxis(light, -1, 0), *added_terms(light)])
+        for place in {places[i] for i in held}:
+            photos = [i for i in held if places[i] == place]
+            seen = [
+                means(np.moveaxis(linear_from_srgb(twins[i].show(sent, np.random.default_rng(i))), -1, 0))
+                for i in photos
+            ]
+            ink, terms = fit_ink_and_photos(
+                [choose_cells(each, promised, np.ones(3), np.zeros(3), None) for each in seen]
+            )
+            for i, cells, found in zip(photos, seen, terms, strict=True):
+                fitted = srgb_from_linear(np.clip(ShownColors.of_terms(found).show(add_ink(light, ink)), 0, 1))
+                own = Twin.of(means(np.moveaxis(sent, -1, 0)).reshape(-1, 3), srgb_from_linear(cells).reshape(-1, 3), 2)
+                shown = twins[i].colors(sent), fitted, own.colors(sent), srgb_from_linear(light)
+                (true, *made), _ = _logits(problem, [_piece(each) for each in shown], views)
+                yield i, [each - true for each in made]
+
+
 @torch.no_grad()
-def _effect(problem: Problem, shown: Sequence[PiecePicture], conditions: Conditions) -> tuple[float, list[bool]]:
-    """The first picture's mean logit of the target over the second's, and where the first is recognized."""
-    classifier, indices, logits, hits = problem.classifiers[0], list(problem.indices[0]), [[], []], []
+def _logits(problem: Problem, shown: Sequence[PiecePicture], conditions: Conditions) -> tuple[list[float], list[bool]]:
+    """Each picture's mean logit of the target, and where the first is recognized."""
+    classifier, indices, logits, hits = problem.classifiers[0], list(problem.indices[0]), [[] for _ in shown], []
     for first in range(0, len(conditions), _CHUNK):
         views = problem.see(shown[0], conditions[first : first + _CHUNK], problem.figure_px)
         for i, picture in enumerate(shown):
@@ -282,7 +336,7 @@ def _effect(problem: Problem, shown: Sequence[PiecePicture], conditions: Conditi
             logits[i] += answer[:, indices].max(1).values.tolist()
             if i == 0:
                 hits += classifier.recognized(answer, indices).tolist()
-    return float(np.mean(logits[0]) - np.mean(logits[1])), hits
+    return [float(np.mean(each)) for each in logits], hits
 
 
 def tables(settings: RealPrintsSettings, results: Sequence[Result]) -> tuple[Table, ...]:
@@ -291,7 +345,7 @@ def tables(settings: RealPrintsSettings, results: Sequence[Result]) -> tuple[Tab
     pairs = [result for result in results if "photographs" not in result.answers]
     return (
         *_color_tables(settings, colors),
-        *((_promise_table(pairs), _place_table(pairs), _design_table(pairs)) if pairs else ()),
+        *((_promise_table(pairs), _place_table(pairs), _design_table(pairs), _fit_table(pairs)) if pairs else ()),
     )
 
 
@@ -366,6 +420,20 @@ def _design_table(pairs: Sequence[Result]) -> Table:
         rows.append((*cell_key(result), mean(former), mean(default), mean(gains)))
     head = ("scene", "network", "seed", "by former conditions", "by default conditions", "gain")
     return Table("designs", "Designs on twins", head, tuple(rows), "each twin counts as one; rates")
+
+
+def _fit_table(pairs: Sequence[Result]) -> Table:
+    rows = []
+    for result in pairs:
+        off, places = np.array(result.answers["print fits"]), np.array(result.answers["places"])
+        for place in ("all", *sorted(set(places))):
+            some = off[(places == place) | (place == "all")]
+            rows.append((*cell_key(result), place, *map(mean, some.T), *np.sqrt((some**2).mean(0)).tolist()))
+    head = ("scene", "network", "seed", "twins of", *_FITS, *(f"{name}, rms" for name in _FITS))
+    about = (
+        f"the default design's logit over that in a twin's colors; {_FIT_CELLS} × {_FIT_CELLS} cells of each photograph"
+    )
+    return Table("fits", "Print fits beside twins", head, tuple(rows), about)
 
 
 STUDY = Study("real-prints", RealPrintsSettings, cells, run, tables)
