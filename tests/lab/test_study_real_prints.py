@@ -10,11 +10,10 @@ import torch
 from patchlab.study.estimates import mean
 from patchlab.study.study import run_study
 from patchlab.validation import real_prints
-from patchlab.validation.known_colors import KnownColors
+from patchproof import load_scene
 from patchproof.base.color import lift_tone, linear_from_srgb, srgb_from_linear
 from patchproof.base.errors import Refused
 from patchproof.channel.printer import load_printer, printer_output, vary_print
-from patchproof.render.pixels import PiecePicture
 
 PLACES = ("A desk", "B door")
 CODES = np.random.default_rng(0).integers(0, 256, (60, 3)).astype(np.uint8)
@@ -65,9 +64,8 @@ def test_photographs_without_a_row_are_refused(folder):
 
 def test_a_twin_shows_the_colors_of_its_photograph():
     light = seen([0.02] * 3, -0.1, 0.03)
-    twin = real_prints.Twin.of(KnownColors(CODES, light, np.zeros(len(CODES), int)))
-    piece = PiecePicture.of(torch.tensor(CODES[:36].reshape(6, 6, 3) / 255, dtype=torch.float32))
-    shown = twin.show(piece, np.random.default_rng(0)).srgb.numpy().reshape(-1, 3)
+    twin = real_prints.Twin.of(CODES / 255, srgb_from_linear(light))
+    shown = twin.show(CODES[:36].reshape(6, 6, 3) / 255, np.random.default_rng(0)).reshape(-1, 3)
     error = np.abs(shown - srgb_from_linear(light[:36]))
     assert np.median(error) < 0.03 and np.abs(twin.left).max() > 0
 
@@ -96,3 +94,16 @@ def test_figures_in_the_notebook_are_the_stored_ones():
     assert "rate by {:.1f}, {:.1f} and {:.1f} points".format(*rates) in page
     gains = mean([float(row["gain"]) for row in rows["designs"]])
     assert f"{100 * gains.value:.1f} points in the mean [{100 * gains.low:.1f}, {100 * gains.high:.1f}]" in page
+
+
+def test_a_print_fit_shows_colors_that_our_conditions_make_and_a_printer_alone_does_not():
+    scene = Path(real_prints.__file__).parents[1] / "results/speed/truck.toml"
+    problem = real_prints._problem(load_scene(scene), ("builtin",), real_prints._STILL)
+    rng = np.random.default_rng(5)
+    sent = np.kron(rng.integers(0, 256, (12, 12, 3)), np.ones((16, 16, 1))) / 255
+    photos = [seen([0.02] * 3, -0.2, 0.05), seen([0.04, 0.04, 0.05], -0.3, 0.03)]
+    twins = [real_prints.Twin.of(CODES / 255, srgb_from_linear(photo)) for photo in photos]
+    printers = [(load_printer("office"), [1, 0])]
+    fits = dict(real_prints._print_fits(problem, sent, ("desk", "desk"), twins, printers))
+    fit, quadratic, alone = np.abs([fits[0], fits[1]]).max(0)
+    assert fit < 0.4 * alone and quadratic < 0.4 * alone and alone > 0.1

@@ -306,7 +306,7 @@ def _print_fits(
     views = problem.scene.draw("reprint", _FIT_VIEWS)
     means = partial(cell_means, shape=(_FIT_CELLS, _FIT_CELLS), blur_cells=0.0)
     for printer, held in printers:
-        light = linear_from_srgb(printer_output(printer, sent))
+        light = linear_from_srgb(printer_output(printer, sent.reshape(-1, 3))).reshape(sent.shape)
         promised = means([*np.moveaxis(light, -1, 0), *added_terms(light)])
         for place in {places[i] for i in held}:
             photos = [i for i in held if places[i] == place]
