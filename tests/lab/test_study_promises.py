@@ -120,22 +120,15 @@ def test_gains_before_detectors_in_the_notebook_are_the_stored_ones():
 
 def test_promises_by_the_default_printer_in_the_notebook_are_the_stored_ones():
     results = Path(promises.__file__).parents[1] / "results"
-    tables = json.loads((results / "promises/office.json").read_text("utf-8"))["tables"]
-    page = " ".join((results / "measured.md").read_text("utf-8").split())
-    _, held, width, *_, bias = tables["held"]["rows"][-1]
-    said = (
-        "{:.0f} of {} sessions lay in their intervals (100 % [89, 100]), which are {:.0f} % of a session's photographs"
-    )
-    assert said.format(held["value"] * held["n"], held["n"], 100 * width) in page
-    assert (
-        "showed {:.1f} points less than was promised [{:.1f}, {:.1f}]. The Brier".format(
-            -100 * bias["value"], 100 * bias["low"], 100 * bias["high"]
+    page = (results / "measured.md").read_text("utf-8")
+    for name in ("office", "again", "office_025", "former_025"):
+        tables = json.loads((results / f"promises/{name}.json").read_text("utf-8"))["tables"]
+        _, held, width, *_, bias = tables["held"]["rows"][-1]
+        head, rows = tables["promises"]["head"], tables["promises"]["rows"]
+        promised, judged, seen = (
+            np.array([row[head.index(name)] for row in rows], float) for name in ("promised", "judged", "recognized")
         )
-        in page
-    )
-    head, rows = tables["promises"]["head"], tables["promises"]["rows"]
-    promised, judged, seen = (
-        np.array([row[head.index(name)] for row in rows], float) for name in ("promised", "judged", "recognized")
-    )
-    squares = seen * (1 - promised) ** 2 + (judged - seen) * promised**2
-    assert f"over the photographs is {squares.sum() / judged.sum():.3f} (0.163)" in page
+        brier = (seen * (1 - promised) ** 2 + (judged - seen) * promised**2).sum() / judged.sum()
+        figures = f"{held['value'] * held['n']:.0f} of {held['n']} | {100 * width:.0f} % | "
+        figures += "{:+.1f} [{:.1f}, {:.1f}]".format(*(100 * bias[end] for end in ("value", "low", "high")))
+        assert f"(promises/{name}.toml), [figures](promises/{name}.json) | {figures} | {brier:.3f} |" in page
