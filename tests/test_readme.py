@@ -210,8 +210,9 @@ def test_promises_in_the_readme_are_those_by_the_default_conditions():
     count, n = round(sum(each["value"] * each["n"] for each in held)), sum(each["n"] for each in held)
     promised, seen = np.hstack([shown_by_run(name) for name in names])
     off = student_mean(100 * (seen - promised))
-    showed = f"{count} of {n} sessions that a path tracer photographed, {off.value:+.1f} points [{off.low:.1f}, {off.high:.1f}] beyond them"
-    assert len(seen) == 10 and showed in words(README)
+    said = f"{count} of {n} sessions that a path tracer photographed, "
+    said += f"{off.value:+.1f} points [{off.low:.1f}, {off.high:.1f}] beyond them"
+    assert len(seen) == 10 and said in words(README)
 
 
 def test_our_photographs_differ_from_the_path_tracers_as_it_is_said():
