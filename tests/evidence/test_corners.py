@@ -136,7 +136,8 @@ def test_corners_are_read_from_csv_and_coco(tmp_path):
     [
         ("a.jpg,0,0,9,0,9,9,0,9", "that begins with"),
         ("HEAD\na.jpg,0,0,9,0,9,9", "3 points of a.jpg"),
-        ("HEAD\na.jpg,0,0,9,0,9,nan,0,9", "not convex"),
+        ("HEAD\na.jpg,0,0,9,0,9,nan,0,9", "eight numbers"),
+        ("HEAD\na.jpg,0.1,0.1,0.4,0.1,0.4,0.5,0.1,0.5", "shares of the picture"),
         ("HEAD\na.jpg,0,0,9,0,x,9,0,9", "eight numbers"),
         ("HEAD\na.jpg,9,0,0,0,0,9,9,9", "mirrored"),
         ("HEAD\na.jpg,0,0,9,9,9,0,0,9", "not convex"),

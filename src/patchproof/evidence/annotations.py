@@ -147,10 +147,10 @@ def _read_csv_rows(path: str | Path) -> Iterator[tuple[str, Drawn]]:
         raise Refused(_EXPECTED, f'{path} that begins with "{",".join(head)[:60]}"', "add that head as its first line")
     for name, *cells in rows:
         try:
-            numbers = tuple(float(cell) for cell in cells)
+            numbers = tuple(np.asarray_chkfinite(cells, float).tolist())
         except ValueError:
             raise Refused(f"eight numbers for each photograph of {path}", f"{name}: {cells}", _ORDER) from None
-        yield printable(name.replace("\\", "/")), Drawn(numbers)
+        yield printable(name.strip().replace("\\", "/")), Drawn(numbers)
 
 
 def _read_points(path: str | Path) -> Iterator[tuple[str, Drawn]]:
@@ -207,8 +207,9 @@ def refuse_twisted(named: Drawn, name: str, path: str | Path) -> None:
     turns = sides[:, 0] * following[:, 1] - sides[:, 1] * following[:, 0]  # twice the area of each corner's triangle
     if not (turns > 1).all():
         got = "a photograph or order that is mirrored" if (turns < -1).all() else "a shape that is not convex"
+        got = "shares of the picture" if max(named.numbers) <= 1 else got
         got += f" ({', '.join(f'{number:g}' for number in named.numbers)} in {name})"
-        raise Refused(f"corners that run clockwise in {path}", got, _ORDER)
+        raise Refused(f"corners in pixels that run clockwise in {path}", got, _ORDER)
 
 
 def find_in_photos(
