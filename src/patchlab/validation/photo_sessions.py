@@ -17,6 +17,7 @@ from patchlab.study import grid
 from patchlab.study.record import hits_text, parse_hits
 from patchlab.study.study import Cell, Result
 from patchproof.base.sessions import RatePosterior, count_by_session, rate_posterior
+from patchproof.base.settings import PrinterSettings
 from patchproof.base.validation import StrictModel, expand_path
 from patchproof.optimizer.promise import PromiseOptions
 
@@ -36,7 +37,7 @@ class PhotosSettings(StrictModel):
 class SessionsSettings(grid.GridSettings, PhotosSettings):
     """Settings: a run for each scene, network, printer and seed, and sessions of photographs of each."""
 
-    printers: grid.Names = ("coated",)  # printers of the designs, which optimizing knows
+    printers: grid.Names = (PrinterSettings().profile,)  # printers of the designs, which optimizing knows
 
 
 def cells(settings: SessionsSettings, base: Path) -> list[Cell]:
