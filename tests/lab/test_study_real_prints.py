@@ -74,7 +74,7 @@ def test_figures_in_the_notebook_are_the_stored_ones():
     results = Path(real_prints.__file__).parents[1] / "results"
     stored = {
         name: (results / "real_prints" / f"real-prints_{name}.csv").read_text("utf-8")
-        for name in ("colors", "places", "designs")
+        for name in ("colors", "places", "designs", "fits")
     }
     rows = {name: list(csv.DictReader(text.splitlines())) for name, text in stored.items()}
     page = (results / "measured.md").read_text("utf-8")
@@ -94,6 +94,16 @@ def test_figures_in_the_notebook_are_the_stored_ones():
     assert "rate by {:.1f}, {:.1f} and {:.1f} points".format(*rates) in page
     gains = mean([float(row["gain"]) for row in rows["designs"]])
     assert f"{100 * gains.value:.1f} points in the mean [{100 * gains.low:.1f}, {100 * gains.high:.1f}]" in page
+    fits = [row for row in rows["fits"] if row["twins of"] == "all"]
+    fit, alone, rms, quadratic = (
+        [f"{float(row[key]):.2f}" for row in fits]
+        for key in ("print fit", "default printer", "print fit, rms", "quadratic, rms")
+    )
+    said = "bias {} and {} (traffic light), {} and {} (pickup), {} and {} (letter box), {} and {} (SUV)"
+    assert said.format(*fit) in page and f"{', '.join(alone[:-1])} and {alone[-1]}; rms" in page
+    assert f"rms {', '.join(rms)} beside {', '.join(quadratic)} of a quadratic" in page
+    no_larger = sum(float(row["print fit, rms"]) <= float(row["quadratic, rms"]) for row in fits)
+    assert f"no larger in {no_larger} of {len(fits)}" in page
 
 
 def test_a_print_fit_shows_colors_that_our_conditions_make_and_a_printer_alone_does_not():
