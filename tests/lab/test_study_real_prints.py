@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from patchlab.study.estimates import mean
-from patchlab.study.study import run_study
+from patchlab.study.study import Cell, Result, run_study
 from patchlab.validation import real_prints
 from patchproof import load_scene
 from patchproof.base.color import lift_tone, linear_from_srgb, srgb_from_linear
@@ -117,3 +117,11 @@ def test_a_print_fit_shows_colors_that_our_conditions_make_and_a_printer_alone_d
     fits = dict(real_prints._print_fits(problem, sent, ("desk", "desk"), twins, printers))
     fit, quadratic, alone = np.abs([fits[0], fits[1]]).max(0)
     assert fit < 0.2 * alone and quadratic < 0.2 * alone and alone > 0.1
+
+
+def test_figures_of_one_run_by_place_stand_without_an_interval():
+    promised = {"effect": 1.0, "sessions": [[3, 3, 3], [4, 4, 4]]}
+    twin = {"effect": 0.5, "sessions": [[2], [4]]}
+    answers = {"places": ["a", "a"], "former": {"promised": {"default": [([0, 1], promised)]}, "twins": [twin, twin]}}
+    table = real_prints._place_table([Result(Cell("run", {}), answers, Path())])
+    assert table.rows == (("default", "all", 1.0, 0.25, 1.0), ("default", "a", 1.0, 0.25, 1.0))

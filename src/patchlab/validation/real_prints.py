@@ -407,7 +407,8 @@ def _place_table(pairs: Sequence[Result]) -> Table:
             for place in ("all", *sorted(set(places))):
                 of_place = biases[(places == place) | (place == "all")].mean(0)
                 by_group.setdefault((way, place), []).append(of_place)
-    rows = [(*group, *map(mean, zip(*each, strict=True))) for group, each in by_group.items()]
+    # a single run's figures have no interval
+    rows = [(*group, *(mean(v) or v[0] for v in zip(*each, strict=True))) for group, each in by_group.items()]
     head = ("conditions", "twins of", "bias of the effect", "bias of the rate", "sessions inside")
     return Table("places", "Promises beside twins by place", head, tuple(rows), "means over scenes and seeds")
 
