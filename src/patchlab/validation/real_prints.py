@@ -34,6 +34,7 @@ from patchlab.validation.known_colors import KnownColors, fit_photo, printer_of_
 from patchproof.base.color import ciede2000, lab_from_linear, lift_tone, linear_from_srgb, srgb_from_linear
 from patchproof.base.errors import Refused
 from patchproof.base.input import read_file
+from patchproof.base.intervals import Estimate
 from patchproof.base.output import write_files_atomically
 from patchproof.base.sessions import count_by_session, rate_posterior
 from patchproof.base.settings import CameraSettings, PrinterSettings, SceneSettings
@@ -363,6 +364,11 @@ def _color_tables(settings: RealPrintsSettings, photos: Sequence[Mapping[str, An
     yield Table("colors", "Colors of the median photograph", head, tuple(rows), about)
 
 
+def _mean(values: Sequence[float]) -> Estimate | float:
+    """The mean; a single value has no interval."""
+    return mean(values) or values[0]
+
+
 def _rate(answer: Mapping[str, Any]) -> float:
     hits, photos = map(sum, answer["sessions"])
     return hits / photos
@@ -392,7 +398,7 @@ def _promise_table(pairs: Sequence[Result]) -> Table:
         for way, promised in answers["promised"].items():
             effect, bias, inside = zip(*_of_twins(promised, answers["twins"]), strict=True)
             promised_rate = float(np.mean([_rate(each) for _, each in promised]))
-            figures = promised_rate, mean(on_twins), mean(effect), mean(bias), mean(inside)
+            figures = promised_rate, *map(_mean, (on_twins, effect, bias, inside))
             rows.append((*cell_key(result), way, *figures))
     about = "the design by former conditions; shares of the twins' mean effect; twins of one print and place are alike"
     return Table("promises", "Promises beside twins", (*head, "sessions inside"), tuple(rows), about)
@@ -407,8 +413,7 @@ def _place_table(pairs: Sequence[Result]) -> Table:
             for place in ("all", *sorted(set(places))):
                 of_place = biases[(places == place) | (place == "all")].mean(0)
                 by_group.setdefault((way, place), []).append(of_place)
-    # a single run's figures have no interval
-    rows = [(*group, *(mean(v) or v[0] for v in zip(*each, strict=True))) for group, each in by_group.items()]
+    rows = [(*group, *map(_mean, zip(*each, strict=True))) for group, each in by_group.items()]
     head = ("conditions", "twins of", "bias of the effect", "bias of the rate", "sessions inside")
     return Table("places", "Promises beside twins by place", head, tuple(rows), "means over scenes and seeds")
 
@@ -418,7 +423,7 @@ def _design_table(pairs: Sequence[Result]) -> Table:
     for result in pairs:
         former, default = ([_rate(twin) for twin in result.answers[by]["twins"]] for by in ("former", "default"))
         gains = [new - old for new, old in zip(default, former, strict=True)]
-        rows.append((*cell_key(result), mean(former), mean(default), mean(gains)))
+        rows.append((*cell_key(result), *map(_mean, (former, default, gains))))
     head = ("scene", "network", "seed", "by former conditions", "by default conditions", "gain")
     return Table("designs", "Designs on twins", head, tuple(rows), "each twin counts as one; rates")
 
@@ -429,7 +434,7 @@ def _fit_table(pairs: Sequence[Result]) -> Table:
         off, places = np.array(result.answers["print fits"]), np.array(result.answers["places"])
         for place in ("all", *sorted(set(places))):
             some = off[(places == place) | (place == "all")]
-            rows.append((*cell_key(result), place, *map(mean, some.T), *np.sqrt((some**2).mean(0)).tolist()))
+            rows.append((*cell_key(result), place, *map(_mean, some.T.tolist()), *np.sqrt((some**2).mean(0)).tolist()))
     head = ("scene", "network", "seed", "twins of", *_FITS, *(f"{name}, rms" for name in _FITS))
     about = (
         f"the default design's logit over that in a twin's colors; {_FIT_CELLS} × {_FIT_CELLS} cells of each photograph"
