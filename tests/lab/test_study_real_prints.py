@@ -9,7 +9,7 @@ import torch
 
 from patchlab.study.estimates import mean
 from patchlab.study.study import Cell, Result, run_study
-from patchlab.validation import real_prints
+from patchlab.validation import real_prints, twins
 from patchproof import load_scene
 from patchproof.base.color import lift_tone, linear_from_srgb, srgb_from_linear
 from patchproof.base.errors import Refused
@@ -59,12 +59,12 @@ def test_scatter_is_what_no_smooth_map_of_colors_explains(folder):
 def test_photographs_without_a_row_are_refused(folder):
     (folder / "photographs.csv").write_text("print,place\nA-one,desk\n", encoding="utf-8")
     with pytest.raises(Refused, match="1 rows, 3 photographs"):
-        real_prints.load_cells(folder / "cells.npz")
+        twins.load_cells(folder / "cells.npz")
 
 
 def test_a_twin_shows_the_colors_of_its_photograph():
     light = seen([0.02] * 3, -0.1, 0.03)
-    twin = real_prints.Twin.of(CODES / 255, srgb_from_linear(light))
+    twin = twins.Twin.of(CODES / 255, srgb_from_linear(light))
     shown = twin.show(CODES[:36].reshape(6, 6, 3) / 255, np.random.default_rng(0)).reshape(-1, 3)
     error = np.abs(shown - srgb_from_linear(light[:36]))
     assert np.median(error) < 0.03 and np.abs(twin.left).max() > 0
@@ -112,9 +112,9 @@ def test_a_print_fit_shows_colors_that_our_conditions_make_and_a_printer_alone_d
     rng = np.random.default_rng(5)
     sent = np.kron(rng.integers(0, 256, (12, 12, 3)), np.ones((16, 16, 1))) / 255
     photos = [seen([0.02] * 3, -0.2, 0.05), seen([0.04, 0.04, 0.05], -0.3, 0.03)]
-    twins = [real_prints.Twin.of(CODES / 255, srgb_from_linear(photo)) for photo in photos]
+    made = [twins.Twin.of(CODES / 255, srgb_from_linear(photo)) for photo in photos]
     printers = [(load_printer("office"), [1, 0])]
-    fits = dict(real_prints._print_fits(problem, sent, ("desk", "desk"), twins, printers))
+    fits = dict(real_prints._print_fits(problem, sent, ("desk", "desk"), made, printers))
     fit, quadratic, alone = np.abs([fits[0], fits[1]]).max(0)
     assert fit < 0.2 * alone and quadratic < 0.2 * alone and alone > 0.1
 

@@ -1,8 +1,8 @@
 """Separate a printer's inks from the light and camera of the photographs that show its known colors.
 
 In: cells of known color in photographs of several places, N×3 sRGB sent and N×3 light over white paper. Out: one map
-from the color sent to the light of the ink, as a printer, too; and the light that one photograph shows of an ink at
-best. What place and camera do to that light is veil, gains, tone and chroma, by the channel's own formulas. The map is
+from the color sent to the light of the ink, as a printer, too; and the light that one photograph shows of a printer
+at best. What place and camera do to that light is veil, gains, tone and chroma, by the channel's own formulas. The map is
 a quadratic in sRGB's code values after a known printer, which takes colors that were never printed from that printer.
 
 Ink and photographs are told apart only as far as photographs differ: what all of them share (one phone's tone curve, a
@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -64,10 +63,10 @@ def photo_light(light: Tensor, terms: Tensor) -> Tensor:
     return linear_from_srgb(lift_tone(srgb_from_linear(seen.clamp(1e-6, 1)), tone))
 
 
-def separate_ink(cells: KnownColors, printer: Printer) -> Tensor:
-    """Fit the ink's quadratic 10×3 after `printer`, together with the terms of every photograph."""
+def fit_printer(cells: KnownColors, start: Printer) -> Printer:
+    """Fit the ink's quadratic 10×3 after `start`, with the terms of every photograph; white is the printer's paper."""
     photos, index = np.unique(cells.photo, return_inverse=True)
-    printed, seen = _printed(cells.code, printer), _tensor(cells.light).clamp(0, 1)
+    printed, seen = _printed(cells.code, start), _tensor(cells.light).clamp(0, 1)
     ink, terms = torch.zeros(10, 3, dtype=torch.float64), torch.zeros(len(photos), 8, dtype=torch.float64)
     ink[1:4] = torch.eye(3)
     ink.requires_grad_()
@@ -83,25 +82,19 @@ def separate_ink(cells: KnownColors, printer: Printer) -> Tensor:
             _distance(predict(), seen) + _RIDGE * (terms**2).sum() + _CENTERED * ((terms.mean(0) - center) ** 2).sum()
         ),
     )
-    return ink.detach()
+    light = lambda colors: srgb_from_linear(ink_light(_printed(255 * colors, start), ink.detach())).numpy()  # noqa: E731
+    return printer_of("left-out", light, {"source": "a study"})
 
 
-def fit_photo(cells: KnownColors, printer: Printer, ink: Tensor) -> np.ndarray:
+def fit_photo(cells: KnownColors, printer: Printer) -> np.ndarray:
     """Fit one photograph's terms to its cells, and return the light N×3 that they predict."""
-    light, seen = ink_light(_printed(cells.code, printer), ink), _tensor(cells.light).clamp(0, 1)
+    light, seen = linear_from_srgb(_printed(cells.code, printer)), _tensor(cells.light).clamp(0, 1)
     terms = torch.zeros(1, 8, dtype=torch.float64, requires_grad=True)
     _minimize(
         [terms], lambda: _distance(photo_light(light, terms.expand(len(light), 8)), seen) + 1e-3 * (terms**2).sum()
     )
     with torch.no_grad():
         return photo_light(light, terms.expand(len(light), 8)).numpy()
-
-
-def printer_of_ink(name: str, start: Printer, ink: Tensor, provenance: dict[str, Any]) -> Printer:
-    """Return the printer of an ink after `start`; its white is paper."""
-    return printer_of(
-        name, lambda colors: srgb_from_linear(ink_light(_printed(255 * colors, start), ink)).numpy(), provenance
-    )
 
 
 def _printed(code: np.ndarray, printer: Printer) -> Tensor:

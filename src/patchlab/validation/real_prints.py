@@ -5,7 +5,6 @@ beside it, which names print and place), and scenes with networks. Out: for each
 printer in the best of its conditions, the share of cells within what the conditions can make, and how far cells lie off
 a smooth map of colors (what `printer.mottle` is of); for each scene and network, promises beside sessions of twins: the
 same design under the scene's views in the colors of one photograph; and verify's print fit beside those colors.
-A twin is a cubic from code to light through all cells of its photograph, and what the cubic leaves, cell by cell.
 
 With `left_out` the default printer is made again without the photographs of a place, or of a print, that it is held
 against: for photographs that it was made from. `former` are the conditions that promises are compared with. Left out on
@@ -14,12 +13,9 @@ purpose: blur and light that changes over a print, which lie within the default 
 
 from __future__ import annotations
 
-import csv
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import partial
-from itertools import combinations_with_replacement
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -30,10 +26,9 @@ from pydantic import Field
 from patchlab.study.estimates import mean, median
 from patchlab.study.grid import GridSettings, PositiveInt, cell_key, grid_cells, network_names, scene_of
 from patchlab.study.study import Cell, Result, Study
-from patchlab.validation.known_colors import KnownColors, fit_photo, printer_of_ink, separate_ink
+from patchlab.validation.known_colors import KnownColors, fit_photo, fit_printer
+from patchlab.validation.twins import Cells, Twin, load_cells
 from patchproof.base.color import ciede2000, lab_from_linear, lift_tone, linear_from_srgb, srgb_from_linear
-from patchproof.base.errors import Refused
-from patchproof.base.input import read_file
 from patchproof.base.intervals import Estimate
 from patchproof.base.output import write_files_atomically
 from patchproof.base.sessions import count_by_session, rate_posterior
@@ -42,7 +37,6 @@ from patchproof.base.validation import expand_path
 from patchproof.channel.effects import EFFECT_BY_NAME, Print
 from patchproof.channel.print_colors import ShownColors, add_ink, added_terms, choose_cells, fit_ink_and_photos
 from patchproof.channel.printer import (
-    MOTTLE_CELLS,
     Printer,
     identity_printer,
     load_printer,
@@ -92,40 +86,6 @@ class RealPrintsSettings(GridSettings):
     photos: PositiveInt = 10  # of each session
 
 
-@dataclass(frozen=True)
-class Cells:
-    """Cells of photographs: N×3 uint8 sRGB sent, N×3 light over paper, each one's photograph; names of photographs."""
-
-    known: KnownColors
-    places: tuple[str, ...]
-    prints: tuple[str, ...]
-
-    @property
-    def twins(self) -> list[Twin]:
-        """The twin of each photograph."""
-        photos = [self.known.of(np.array([photo])) for photo in range(len(self.places))]
-        return [Twin.of(photo.code / 255, srgb_from_linear(photo.light)) for photo in photos]
-
-    def groups(self, left_out: str) -> tuple[str, ...]:
-        """The name of the group of each photograph that is left out together."""
-        return {"place": self.places, "print": self.prints}.get(left_out, ("",) * len(self.places))
-
-
-def load_cells(path: Path) -> Cells:
-    """Read cells of known color and, beside them, `photographs.csv` with the columns print and place."""
-    table = path.with_name("photographs.csv")
-    rows = list(csv.DictReader(read_file(table, "photographs of known colors").decode("utf-8-sig").splitlines()))
-    with np.load(path, allow_pickle=False) as file:
-        code, light, photo = file["code"], file["light"].astype(float), file["photo"].astype(int)
-    if photo.max() >= len(rows):
-        got = f"{len(rows)} rows, {photo.max() + 1} photographs"
-        raise Refused(f"a row for each photograph in {table}", got, "add rows")
-    prints = tuple(row["print"] for row in rows)
-    # a place of one maker's prints: another's has another phone
-    places = tuple(f"{row['print'][:1]} {row['place']}" for row in rows)
-    return Cells(KnownColors(code, np.clip(light, 0, 1), photo), places, prints)
-
-
 def cells(settings: RealPrintsSettings, base: Path) -> list[Cell]:
     """A cell for the colors, and one for each scene and network."""
     pairs = grid_cells(settings, base) if settings.scenes else []
@@ -158,8 +118,7 @@ def _printers(settings: RealPrintsSettings, every: Cells) -> dict[str, tuple[Pri
             printer = load_printer(PrinterSettings().profile)
         else:
             others = np.setdiff1d(np.unique(some.photo), held)
-            start = load_printer(_BASE)
-            printer = printer_of_ink("left-out", start, separate_ink(some.of(others), start), {"source": "a study"})
+            printer = fit_printer(some.of(others), load_printer(_BASE))
         found[group] = printer, held
     return found
 
@@ -167,12 +126,10 @@ def _printers(settings: RealPrintsSettings, every: Cells) -> dict[str, tuple[Pri
 def _colors(settings: RealPrintsSettings, every: Cells) -> Iterator[dict[str, Any]]:
     """Of each photograph: ΔE00 of its median cell in the best conditions, share of cells within what they can make."""
     some, twins = _some(settings, every.known), every.twins
-    unchanged = torch.zeros(10, 3, dtype=torch.float64)
-    unchanged[1:4] = torch.eye(3)
     for printer, held in _printers(settings, every).values():
         for photo in held:
             seen = some.of(np.array([photo]))
-            best = fit_photo(seen, printer, unchanged)
+            best = fit_photo(seen, printer)
             distance = ciede2000(lab_from_linear(np.clip(best, 0, 1)), lab_from_linear(seen.light))
             light = linear_from_srgb(printer_output(printer, seen.code / 255))
             yield {
@@ -196,38 +153,6 @@ def _share_within(light: torch.Tensor, seen: np.ndarray, draws: int) -> float:
     shown = torch.stack([lift_tone(srgb_from_linear(m), t) for m, t in zip(made, tone, strict=True)]).numpy()
     codes = srgb_from_linear(seen)
     return float(((codes >= shown.min(0) - 1e-3) & (codes <= shown.max(0) + 1e-3)).all(1).mean())
-
-
-@dataclass(frozen=True)
-class Twin:
-    """Colors of one photograph: a polynomial from sRGB sent to sRGB seen, and what it leaves of each cell."""
-
-    degree: int
-    factors: np.ndarray
-    left: np.ndarray
-
-    @classmethod
-    def of(cls, sent: np.ndarray, seen: np.ndarray, degree: int = 3) -> Twin:
-        """The least-squares polynomial through the cells N×3 of one photograph; paper is white."""
-        white = np.ones((len(sent) // 10, 3))
-        terms = _power_terms(np.concatenate([sent, white]), degree)
-        factors = np.linalg.lstsq(terms, np.concatenate([seen, white]), rcond=None)[0]
-        return cls(degree, factors, seen - _power_terms(sent, degree) @ factors)
-
-    def colors(self, sent: np.ndarray) -> np.ndarray:
-        """The colors in place of these, H×W×3 sRGB, without what is left."""
-        return (_power_terms(sent.reshape(-1, 3), self.degree) @ self.factors).reshape(sent.shape)
-
-    def show(self, sent: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """The piece in these colors, each of its cells with what is left of some cell of the photograph."""
-        left = self.left[rng.integers(0, len(self.left), (MOTTLE_CELLS, MOTTLE_CELLS))]
-        rows, columns = (np.arange(n) * MOTTLE_CELLS // n for n in sent.shape[:2])
-        return np.clip(self.colors(sent) + left[rows][:, columns], 0, 1)
-
-
-def _power_terms(sent: np.ndarray, degree: int) -> np.ndarray:
-    each = (chosen for n in range(degree + 1) for chosen in combinations_with_replacement(range(3), n))
-    return np.stack([np.prod(sent[:, list(chosen)], 1) for chosen in each], 1)
 
 
 def _piece(srgb: np.ndarray) -> PiecePicture:
@@ -305,23 +230,21 @@ def _print_fits(
     print fit to all photographs of a place, in a quadratic of the photograph's own, as the printer makes it.
     """
     views = problem.scene.draw("reprint", _FIT_VIEWS)
-    means = partial(cell_means, shape=(_FIT_CELLS, _FIT_CELLS), blur_cells=0.0)
+    means = lambda maps: cell_means(np.moveaxis(maps, -1, 0), (_FIT_CELLS, _FIT_CELLS), 0.0)  # noqa: E731
+    sent_cells = means(sent).reshape(-1, 3)
     for printer, held in printers:
         light = linear_from_srgb(printer_output(printer, sent.reshape(-1, 3))).reshape(sent.shape)
-        promised = means([*np.moveaxis(light, -1, 0), *added_terms(light)])
+        promised = means(np.dstack([light, np.moveaxis(added_terms(light), 0, -1)]))
         for place in {places[i] for i in held}:
             photos = [i for i in held if places[i] == place]
-            seen = [
-                means(np.moveaxis(linear_from_srgb(twins[i].show(sent, np.random.default_rng(i))), -1, 0))
-                for i in photos
-            ]
-            ink, terms = fit_ink_and_photos(
-                [choose_cells(each, promised, np.ones(3), np.zeros(3), None) for each in seen]
-            )
-            for i, cells, found in zip(photos, seen, terms, strict=True):
-                fitted = srgb_from_linear(np.clip(ShownColors.of_terms(found).show(add_ink(light, ink)), 0, 1))
-                own = Twin.of(means(np.moveaxis(sent, -1, 0)).reshape(-1, 3), srgb_from_linear(cells).reshape(-1, 3), 2)
-                shown = twins[i].colors(sent), fitted, own.colors(sent), srgb_from_linear(light)
+            seen = [means(linear_from_srgb(twins[i].show(sent, np.random.default_rng(i)))) for i in photos]
+            chosen = [choose_cells(each, promised, np.ones(3), np.zeros(3), None) for each in seen]
+            ink, terms = fit_ink_and_photos(chosen)
+            printed = add_ink(light, ink)
+            for i, cells, of_photo in zip(photos, seen, terms, strict=True):
+                fitted = srgb_from_linear(np.clip(ShownColors.of_terms(of_photo).show(printed), 0, 1))
+                quadratic = Twin.of(sent_cells, srgb_from_linear(cells).reshape(-1, 3), 2).colors(sent)
+                shown = twins[i].colors(sent), fitted, quadratic, srgb_from_linear(light)
                 (true, *made), _ = _logits(problem, [_piece(each) for each in shown], views)
                 yield i, [each - true for each in made]
 
