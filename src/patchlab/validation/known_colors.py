@@ -2,7 +2,7 @@
 
 In: cells of known color in photographs of several places, N×3 sRGB sent and N×3 light over white paper. Out: one map
 from the color sent to the light of the ink, as a printer, too; and the light that one photograph shows of a printer
-at best. What place and camera do to that light is veil, gains, tone and chroma, by the channel's own formulas. The map is
+at best. Place and camera make veil, gains, tone and chroma of that light, by the channel's own formulas. The map is
 a quadratic in sRGB's code values after a known printer, which takes colors that were never printed from that printer.
 
 Ink and photographs are told apart only as far as photographs differ: what all of them share (one phone's tone curve, a
