@@ -131,6 +131,11 @@ def test_corners_are_read_from_csv_and_coco(tmp_path):
         corners_of_photo(load_corners(coco(tmp_path / "t.json", CORNERS_PX, size=(360, 480))), "a.jpg", picture)
 
 
+def test_blanks_round_a_photographs_name_are_none_of_it(tmp_path):
+    (tmp_path / "c.csv").write_text("file, x1, y1, x2, y2, x3, y3, x4, y4\n a.jpg , 0, 0, 9, 0, 9, 9, 0, 9\n")
+    assert list(load_corners(tmp_path / "c.csv")) == ["a.jpg"]
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
