@@ -66,15 +66,16 @@ class ShownColors:
 
     @staticmethod
     def of_terms(terms: np.ndarray) -> "ShownColors":
-        """Colors by veil (3), log gains (3), tone and chroma; zeros change nothing."""
-        veil, gains, (tone, chroma) = terms[:3], np.exp(terms[3:6]), terms[6:]
+        """Colors by veil (3), log gains (3), tone and chroma; zeros change nothing. Of `B×8` terms they show `B×N×3`."""
+        veil, gains, tone, chroma = terms[..., :3], np.exp(terms[..., 3:6]), terms[..., 6:7, None], terms[..., 7:, None]
         mixing = (1 + chroma) * np.eye(3) - chroma * np.array(LUMINANCE)
-        return ShownColors(np.column_stack([(gains * (1 - veil))[:, None] * mixing, gains * veil]), float(tone))
+        matrix = np.concatenate([(gains * (1 - veil))[..., None] * mixing, (gains * veil)[..., None]], -1)
+        return ShownColors(matrix, float(tone[0, 0]) if terms.ndim == 1 else tone)
 
     def show(self, light: np.ndarray) -> np.ndarray:
         """Return the light `... × 3` that the photograph shows of a print's light."""
-        shown = light @ self.matrix[:, :3].T + self.matrix[:, 3]
-        return linear_from_srgb(lift_tone(srgb_from_linear(shown), self.tone)) if self.tone else shown
+        shown = light @ self.matrix[..., :3].swapaxes(-1, -2) + self.matrix[..., None, :, 3]
+        return linear_from_srgb(lift_tone(srgb_from_linear(shown), self.tone)) if np.any(self.tone) else shown
 
     def undo(self, seen: np.ndarray) -> np.ndarray:
         """Return the print's light `... × 3` of light in the photograph."""
@@ -224,7 +225,7 @@ def _fit_terms(light: np.ndarray, cells: CellColors, terms: np.ndarray, steps: i
     apart = miss(terms)
     best = cost(apart, terms)
     for _ in range(steps):
-        slopes = np.stack([(miss(terms + _PROBE * axis) - apart) / _PROBE for axis in np.eye(8)])
+        slopes = (miss(terms + _PROBE * np.eye(8)) - apart) / _PROBE
         weight = 1 / np.sqrt((apart**2).sum(1) + _LAB_NOISE**2)[:, None] / len(light)
         flat, weighted = slopes.reshape(8, -1), (slopes * weight).reshape(8, -1)
         square = weighted @ flat.T + 2 * _TERMS_RIDGE * np.eye(8)
