@@ -27,7 +27,7 @@ from patchproof.base.intervals import wilson
 from patchproof.base.progress import Compute
 from patchproof.channel.printer import identity_printer, load_printer
 from patchproof.classifier import Classifier
-from patchproof.evidence.appearance import _cross_fitted_cells, fit_cells
+from patchproof.evidence.appearance import _cross_fitted_cells, fit_cells, match_design
 from patchproof.evidence.gather import gather_evidence
 from patchproof.evidence.locate import pinhole_photo
 from patchproof.evidence.measure import measure
@@ -134,6 +134,15 @@ def test_a_design_of_one_color_is_told_from_others_by_structure_ink_and_color():
     page = page_raster(make_manifest(design=without_ink(0, gray)), True)
     photo = photograph(page, view(10, 5, 550, size_px=(800, 600)), (800, 600), blur_px=0.5, fine=2)
     assert measured(photo, manifest=make_manifest(design=gray)).entry.code == "wrong_ink"
+
+
+@pytest.mark.parametrize(("shown", "code"), [(0.23, None), (0.9, "other_design")])
+def test_a_plain_design_whose_small_markers_look_lighter_by_blur_is_no_other(shown, code):
+    """Their ink shows 0.24 of the paper's light, as under a veil; without one the design is a little light."""
+    paper, cells = np.full(3, 0.3), np.ones((40, 40, 3))
+    light = FrameLight(paper, 0.24 * paper, 0.23, 0.0)
+    trouble = match_design(shown * paper * cells, 0.13 * cells, cells[..., 0] > 0, light).trouble
+    assert (trouble and trouble.code) == code
 
 
 def coated(srgb: np.ndarray) -> np.ndarray:

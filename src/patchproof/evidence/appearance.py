@@ -227,9 +227,11 @@ def match_design(seen: np.ndarray, promised: np.ndarray, usable: np.ndarray, lig
         return DesignMatch(trouble=PhotoRejected("too_small", count, _LEAST_CELLS, _UNTOLD_ADVICE))
     paper = np.maximum(light.paper, 1e-3)
     veil = float(np.clip((light.ink / paper).min(), 0, 0.5))
-    seen, promised = np.sqrt(np.clip((seen / paper - veil) / (1 - veil), 0, 1.2)), np.sqrt(np.clip(promised, 0, 1))
+    shown, promised = np.clip(seen / paper, 0, 1.2), np.sqrt(np.clip(promised, 0, 1))
+    seen = np.sqrt(np.clip((shown - veil) / (1 - veil), 0, 1.2))
     y, x = (_less_surroundings(v, usable)[usable] for v in (seen, promised))
-    means = np.median(seen[usable], 0), promised[usable].mean(0)
+    # blur lightens the ink of small markers, which is no veil then: of a plain design's two colors the nearer counts
+    means = np.median(seen[usable], 0), np.sqrt(np.median(shown[usable], 0)), promised[usable].mean(0)
     structure_x, structure_y = (float(np.median(np.abs(v))) for v in (x, y))  # medians: blur spreads markers' light
     if structure_x < _LEAST_STRUCTURE:
         return DesignMatch(trouble=_plain_trouble(*means, structure_y))
@@ -249,7 +251,9 @@ def match_design(seen: np.ndarray, promised: np.ndarray, usable: np.ndarray, lig
     return DesignMatch(likeness, weak_ink=weak if contrast < WEAK_INK else None)
 
 
-def _plain_trouble(seen: np.ndarray, promised: np.ndarray, structure: float) -> PhotoRejected | None:
+def _plain_trouble(
+    seen: np.ndarray, veiled: np.ndarray, promised: np.ndarray, structure: float
+) -> PhotoRejected | None:
     """Compare square roots of light (3,) of a design without structure, and the structure that was seen."""
     if structure > _MOST_STRUCTURE:
         return PhotoRejected("other_design", structure, _MOST_STRUCTURE, _OTHER_ADVICE)
@@ -257,7 +261,7 @@ def _plain_trouble(seen: np.ndarray, promised: np.ndarray, structure: float) -> 
     contrast, ink = float(absorbed.min() / max(absorbed.max(), 1e-6)), _INKS[int(absorbed.argmin())]
     if contrast < _LEAST_PLAIN_INK and is_gray and promised.max() < 0.85:
         return PhotoRejected("wrong_ink", contrast, _LEAST_PLAIN_INK, _INK_ADVICE.format(ink))
-    delta = float(ciede2000(lab_from_linear(promised**2), lab_from_linear(seen**2)))
+    delta = min(float(ciede2000(*map(lab_from_linear, (promised**2, look**2)))) for look in (seen, veiled))
     return PhotoRejected("other_design", delta, _MOST_COLOR, _OTHER_ADVICE) if delta > _MOST_COLOR else None
 
 
