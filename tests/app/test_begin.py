@@ -213,7 +213,7 @@ def test_gltf_is_y_up_and_in_meters_by_its_standard(bottles):
     axis, _, doubt = guess_up(bottles / "bottle.glb")
     assert (axis, doubt) == ("y", None) and guess_length_mm(bottles / "bottle.glb") == 250
     axis, _, doubt = guess_up(bottles / "lying.glb")
-    assert axis == "y" and re.search(r'stands on 1\d% of its footprint so, with "z" on 7[789]%', doubt)
+    assert axis == "y" and re.search(r'covers 1\d% of its footprint, with "z" up 7[789]%', doubt)
 
 
 def test_a_habit_gives_way_to_how_the_object_stands(bottles):
@@ -257,7 +257,7 @@ def test_an_object_that_may_lie_is_turned_by_one_word(tmp_path):
     turned = load_scene(path)
     assert np.argmax(np.ptp(turned.mesh.vertices, axis=0)) == 1 and not _up_warning(turned, turned.settings)
     path.write_text(text, encoding="utf-8")
-    (warning,) = [each for each in preview_scene(path, tmp_path / "a").warnings if "may lie" in each]
+    (warning,) = [each for each in preview_scene(path, tmp_path / "a").warnings if "may be lying" in each]
     assert warning.endswith('write up = "z" in [object]')
     lines = new_scene(str(tmp_path / "lying.glb"), path, up="z", **bottle)
     assert lines[0] == 'up: "z", as given' and "# up" not in path.read_text(encoding="utf-8")

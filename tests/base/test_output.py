@@ -162,7 +162,7 @@ def test_links_in_place_of_temporary_folders_and_listings_lead_nowhere(out, tmp_
     assert everything(theirs) == {"a.txt": "theirs"} and not (tmp_path / "new").is_symlink()
     (out / LISTING_FILE).unlink()
     (out / LISTING_FILE).symlink_to(theirs / "a.txt")
-    with lock_folder(out), pytest.raises(Refused, match="which is none"):
+    with lock_folder(out), pytest.raises(Refused, match="which is not one"):
         write_atomically(out / "a.txt", "2")
     assert everything(theirs) == {"a.txt": "theirs"} and everything(out)["a.txt"] == "1"
 
@@ -200,9 +200,9 @@ def a_folder_with_files(path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "make", "sentence"),
     [
-        ("new", a_file, "a folder to write to, got .*new, which is none"),
-        ("new", a_link_to_nothing, "a folder to write to, got .*new, which is none"),
-        ("new", os.mkfifo, "a folder to write to, got .*new, which is none"),
+        ("new", a_file, "a folder to write to, got .*new, which is not a folder"),
+        ("new", a_link_to_nothing, "a folder to write to, got .*new, which is not a folder"),
+        ("new", os.mkfifo, "a folder to write to, got .*new, which is not a folder"),
         (".new.old", a_file, r"a folder that can be replaced, got .*\.new\.old"),
         (".new.old", a_folder_with_files, r"a folder that can be replaced, got .*\.new\.old .*not empty"),
         (".new.lock.part", os.mkfifo, r"a lock file of this program at .*\.new\.lock\.part, got something else"),

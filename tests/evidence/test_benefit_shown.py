@@ -82,7 +82,7 @@ def test_scripts_can_ask_for_more_than_a_useless_promise_that_held(exits, how, m
     monkeypatch.setattr("patchproof.app.cli.files.check_files", lambda arguments: None)
     done = CliRunner().invoke(app, ["verify", "photos", "--sheet", "a.json", "--out", str(tmp_path), *how])
     assert done.exit_code == exits and done.stdout.startswith("Does not help (controls simulated).")
-    assert ("--require helps asks for both" in done.stderr) == ("kept" in how)
+    assert ("--require helps needs both" in done.stderr) == ("kept" in how)
 
 
 @pytest.mark.parametrize(
@@ -201,11 +201,11 @@ def test_who_cannot_tell_is_told_how_many_photographs_the_plan_asks_for():
     assert "Take 10." in verdict_lines(report)
 
 
-def test_a_promise_that_asks_for_nothing_is_called_useless():
-    assert "useless: any photographs keep it" in judge(0, (10,) * 4, USELESS).reason
-    assert "useless" not in judge(36, (10,) * 4, HELPFUL).reason
+def test_a_promise_that_asks_for_nothing_says_so():
+    assert "asks for nothing: any photographs keep it" in judge(0, (10,) * 4, USELESS).reason
+    assert "asks for nothing" not in judge(36, (10,) * 4, HELPFUL).reason
     never = promise_with(0.97, 1.0, -0.09, 0.0, "deceive")
-    assert "useless" in judge(40, (10,) * 4, never).reason
+    assert "asks for nothing" in judge(40, (10,) * 4, never).reason
 
 
 def test_what_stood_behind_the_object_is_said_and_a_plain_color_loudly():

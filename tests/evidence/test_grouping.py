@@ -6,10 +6,10 @@ import pytest
 from PIL import Image
 
 from patchproof.base.errors import Refused
-from patchproof.evidence.batch import time_and_camera
 from patchproof.evidence.grouping import BY_FOLDERS, BY_GUESS, BY_TIMES, Grouping, group_sessions, merge_folders
 from patchproof.evidence.measure import MeasuredPhoto
 from patchproof.evidence.results import PhotoEntry, Trace
+from patchproof.photo.exif import time_and_camera
 
 
 def photo(path, taken=None, camera="A"):

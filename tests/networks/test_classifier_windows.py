@@ -46,7 +46,7 @@ def program(*lines, sizes=(None, 3, None, None)) -> Program:
         return ValueRef(len(weights)) if argument == "x" else argument
 
     steps = [
-        Step(compute, [value(argument) for argument in arguments], {}, [len(weights) + 1 + number], False, [])
+        Step(compute, [value(argument) for argument in arguments], {}, [len(weights) + 1 + number], False)
         for number, (compute, arguments) in enumerate(lines)
     ]
     output = len(weights) + len(steps)

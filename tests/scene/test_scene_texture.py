@@ -295,5 +295,5 @@ def test_doubts_about_real_meshes(data, name, says):
 def test_vertex_colors_over_a_texture_are_said():
     mesh = mesh_from_parts([square(0, colors=np.full((4, 3), 0.5))], 100)
     canvas = texture_canvas(mesh, WHOLE, HERE)
-    assert "vertex colors go on multiplying" in canvas.warnings[0]
+    assert "vertex colors still multiply" in canvas.warnings[0]
     assert (canvas.mesh.corner_color_linear == 0.5).all()

@@ -50,11 +50,8 @@ def run(settings: DeceiveSettings, base: Path, cell: Cell) -> dict[str, Any]:
     problem = trained_designs.trained_problem(settings, base, cell)
     design = best_design(trained_designs.with_trainers(problem, cell))
     things = pictures_with_controls(problem, design, CONTROLS)
-    suffix, content = trained_designs.design_file(problem, design)
     sheet = views_from_sides(problem, _SHEET_VIEWS), _SHEET_PX
-    return trained_designs.test_and_draw(problem, cell.name, things, settings.n, sheet) | {
-        f"{cell.name}.{suffix}": content
-    }
+    return trained_designs.answers_and_files(problem, cell.name, things, settings.n, sheet, design)
 
 
 def tables(settings: DeceiveSettings, results: Sequence[Result]) -> list[Table]:

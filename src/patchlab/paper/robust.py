@@ -58,14 +58,9 @@ def run(settings: RobustSettings, base: Path, cell: Cell) -> dict[str, Any]:
     design = best_design(trained_designs.with_trainers(problem, cell))
     pixels = (subject.start(), from_pixels(design, problem.device))
     things = {kind: subject.appearance(each) for kind, each in zip(_KINDS, pixels, strict=True)}
-    suffix, content = trained_designs.design_file(problem, design)
-    return {
-        **trained_designs.test_and_draw(
-            problem, cell.name, things, settings.n, (views_from_sides(problem, _SHEET_VIEWS), _SHEET_PX)
-        ),
-        "color": mean_color(problem, things["design"], _TURN_VIEWS, _SHEET_PX),
-        f"{cell.name}.{suffix}": content,
-    }
+    sheet = views_from_sides(problem, _SHEET_VIEWS), _SHEET_PX
+    answers = trained_designs.answers_and_files(problem, cell.name, things, settings.n, sheet, design)
+    return answers | {"color": mean_color(problem, things["design"], _TURN_VIEWS, _SHEET_PX)}
 
 
 DesignKey = tuple  # scene, way, class, trained on

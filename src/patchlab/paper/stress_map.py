@@ -145,7 +145,7 @@ def measure_map(
 def worst_cells(hits: np.ndarray, confidence: np.ndarray, goal: Goal = Goal.assist) -> list[MapCell]:
     """The worst tenth of a map's cells, at least one: by rate, then by mean confidence, then by index."""
     rate, sure = goal.sign * hits.mean(2).ravel(), goal.sign * confidence.mean(2).ravel()
-    order = np.lexsort((np.arange(rate.size), sure, rate))[: math.ceil(WORST_SHARE * rate.size)]
+    order = np.lexsort((sure, rate))[: math.ceil(WORST_SHARE * rate.size)]
     return [(int(i), int(j)) for i, j in zip(*np.unravel_index(order, hits.shape[:2]), strict=True)]
 
 

@@ -29,10 +29,9 @@ from patchlab.study.trained_designs import (
     ORIGINAL,
     NamePart,
     TrainedSettings,
-    design_file,
+    answers_and_files,
     gain_word,
     single_network_rows,
-    test_and_draw,
     tested_networks,
     trained_cells,
     trained_problem,
@@ -101,14 +100,13 @@ def run(settings: TransferSettings, base: Path, cell: Cell) -> dict[str, Any]:
         from patchlab.paper.vertex_colors import vertex_problem
 
         problem = vertex_problem(problem)
-    answers: dict[str, Any] = {}
     things: dict[str, Appearance] = {"design": None}
+    design = None
     if cell.values["trained"]:
         design = best_design(with_trainers(problem, cell))
         things = pictures_with_controls(problem, design, ())
-        suffix, content = design_file(problem, design)
-        answers[f"{cell.name}.{suffix}"] = content
-    answers |= test_and_draw(problem, cell.name, things, settings.n, (views_from_sides(problem, 3), _SHEET_PX))
+    sheet = views_from_sides(problem, 3), _SHEET_PX
+    answers = answers_and_files(problem, cell.name, things, settings.n, sheet, design)
     if problem.scene.HAS_OBJECT:
         fixed = views_in_drawn_light(problem, settings.lights)
         answers["views"] = to_record(responses(problem, things, fixed))

@@ -7,21 +7,16 @@ import time
 from collections.abc import Callable, Hashable, Mapping
 from typing import TypeVar
 
-from patchproof.base.progress import Advance, no_advance
-
 Name = TypeVar("Name", bound=Hashable)
 ReturnValue = TypeVar("ReturnValue")
 
 
-def call_in_turn(
-    calls: Mapping[Name, Callable[[], ReturnValue]], rounds: int, advance: Advance = no_advance
-) -> dict[Name, list[ReturnValue]]:
+def call_in_turn(calls: Mapping[Name, Callable[[], ReturnValue]], rounds: int) -> dict[Name, list[ReturnValue]]:
     """By name the results of each call in `rounds` rounds; every round makes all calls in turn; one before warms up."""
     answers: dict[Name, list[ReturnValue]] = {name: [] for name in calls}
-    for number in range(rounds + 1):
+    for _ in range(rounds + 1):
         for name, call in calls.items():
             answers[name].append(call())
-        advance(number + 1, rounds + 1)
     return {name: values[1:] for name, values in answers.items()}
 
 

@@ -24,10 +24,17 @@ from typing import Any
 from patchproof.base.errors import Refused
 from patchproof.base.folder_lock import lock_folder
 from patchproof.base.input import read_json
-from patchproof.base.output import check_folder, clear_folder, make_folder, refuse_other_files, write_atomically
+from patchproof.base.output import (
+    check_folder,
+    clear_folder,
+    make_folder,
+    refuse_other_files,
+    write_atomically,
+    write_json,
+)
 from patchproof.base.validation import StrictModel, read_toml, spelling_hint, validate_model
 from patchproof.base.workers import open_workers, result_of, use_threads
-from patchproof.report.tables import Drawing, Results, Table, write_json, write_results
+from patchproof.report.tables import Drawing, Results, Table, write_results
 
 # by name: the module with the STUDY; the first line of its docstring describes the study
 STUDIES: dict[str, str] = {

@@ -107,21 +107,26 @@ def with_trainers(problem: Problem, cell: Cell) -> Problem:
     return replace(problem, classifiers=classifiers, indices=indices)
 
 
-def test_and_draw(
-    problem: Problem, name: str, things: Mapping[str, Appearance], n: int, sheet: tuple[Conditions, int]
+def answers_and_files(
+    problem: Problem,
+    name: str,
+    things: Mapping[str, Appearance],
+    n: int,
+    sheet: tuple[Conditions, int],
+    design: np.ndarray | None,
 ) -> dict[str, Any]:
-    """Record all networks' answers to `things` in n unseen conditions; draw a contact sheet (views, side in px)."""
+    """All networks' answers to `things` in n unseen conditions, a contact sheet (views, side in px), a design's file:
+    a PNG, or the object with its new textures as GLB.
+    """
     answers = to_record(responses(problem, things, problem.scene.draw("evaluate", n)))
     pictures = [photographs(problem, each, *sheet) for each in things.values()]
-    return answers | {f"{name}.sheet.png": contact_sheet(pictures)}
-
-
-def design_file(problem: Problem, pixels: np.ndarray) -> tuple[str, bytes]:
-    """The suffix and the bytes of a design as a file: a PNG, or the object with its new textures as GLB."""
-    with TemporaryDirectory() as folder:
-        problem.subject.save(pixels, Path(folder))
-        path = Path(folder) / (DESIGN_FILE if problem.scene.HAS_PIECE else OBJECT_FILE)
-        return path.suffix[1:], path.read_bytes()
+    files = {f"{name}.sheet.png": contact_sheet(pictures)}
+    if design is not None:
+        with TemporaryDirectory() as folder:
+            problem.subject.save(design, Path(folder))
+            path = Path(folder) / (DESIGN_FILE if problem.scene.HAS_PIECE else OBJECT_FILE)
+            files[f"{name}{path.suffix}"] = path.read_bytes()
+    return answers | files
 
 
 def tested_networks(results: Sequence[Result]) -> list[str]:

@@ -38,7 +38,7 @@ def srgb_from_linear(linear: ArrayOrTensor) -> ArrayOrTensor:
 
 
 def lift_tone(codes, tone):
-    """Return code values after a phone's tone mapping: middle gray rises by `tone`, black and white stay."""
+    """Return codes in [0, 1] after a phone's tone mapping: code 0.5 rises by `tone` (at most 0.25), 0 and 1 stay."""
     rise = 4 * tone
     return codes * (1 + rise - rise * codes)  # codes + 4·tone·codes·(1 - codes)
 

@@ -20,7 +20,7 @@ def read_csv(path: str | Path, expected: str) -> list[list[str]]:
     try:
         rows = [row for row in csv.reader(io.StringIO(text, newline=""), skipinitialspace=True) if any(row)]
     except csv.Error as error:
-        raise Refused(expected, f"{path} that cannot be read ({error})", "mend it") from error
+        raise Refused(expected, f"{path} that cannot be read ({error})", "correct that file") from error
     for separator, name in ((";", "semicolons"), ("\t", "tabs")):
         if rows and all(separator in row[0] for row in rows):
             raise Refused(f"{expected}, separated by commas", f"{path} with {name}", "save it with commas")

@@ -61,7 +61,7 @@ def refuse_other_inputs(
                 value = value.get(part) if isinstance(value, Mapping) else None
             expected = f"the {key}{f' {value}' if isinstance(value, str) else ''} that {source} was made with"
             got = f"another (sha256 {inputs[key][:8]}...)" if key in inputs else "none"
-            raise Refused(f"{expected} (sha256 {sha256[:8]}...)", got, "put the former back, or optimize again")
+            raise Refused(f"{expected} (sha256 {sha256[:8]}...)", got, "restore the original file, or optimize again")
 
 
 def content_identity(settings: SceneSettings, base: Path) -> dict[str, Any]:

@@ -112,7 +112,7 @@ def append_listing(folder: Path, names: Iterable[str]) -> None:
     """Append names to a folder's listing; refused where something else lies in its place."""
     path = folder / LISTING_FILE
     if os.path.lexists(path) and (path.is_symlink() or not path.is_file()):
-        raise Refused(f"a file {LISTING_FILE} of this program", f"{path}, which is none", "remove it")
+        raise Refused(f"a file {LISTING_FILE} of this program", f"{path}, which is not one", "remove it")
     with open(path, "a", encoding="utf-8") as file:
         file.write(f"\n{json.dumps(list(names))}\n")  # begins a line of its own after one that a kill cut short
 

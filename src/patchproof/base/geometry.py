@@ -140,6 +140,13 @@ def fit_homography(source, target) -> np.ndarray:
     return normalize_homography(np.linalg.inv(to_b) @ homography @ to_a)
 
 
+def corner_turns(quad) -> np.ndarray:
+    """Twice the area of the triangle at each corner of a polygon N×2, positive where it turns clockwise (y down)."""
+    sides = np.roll(quad, -1, axis=0) - quad
+    following = np.roll(sides, -1, axis=0)
+    return sides[:, 0] * following[:, 1] - sides[:, 1] * following[:, 0]
+
+
 def local_scale(homography, point) -> tuple[float, float]:
     """(px_per_mm, tilt_deg) of a page→image homography at a page point, from the singular values of its derivative.
 

@@ -22,7 +22,7 @@ LEAST_GAIN = 0.10
 
 
 class Goal(StrEnum):
-    """The goal: the target is to be recognized, or that is to be prevented."""
+    """Whether the patch is to raise the rate at which the target is recognized, or to lower it."""
 
     assist = "assist"
     deceive = "deceive"

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 CONFIDENCE = 0.95
 MIN_CLUSTERS = 5
-_TAIL = (1 - CONFIDENCE) / 2
+TAIL = (1 - CONFIDENCE) / 2
 _Z = statistics.NormalDist().inv_cdf(0.5 + CONFIDENCE / 2)
 
 
@@ -53,7 +53,7 @@ def student_mean(values: "Sequence[float] | np.ndarray") -> Estimate:
     from scipy.special import stdtrit  # what scipy.stats.t.ppf calls, without a second of imports
 
     n, value = len(values), statistics.fmean(values)
-    half = float(stdtrit(n - 1, 1 - _TAIL)) * (statistics.stdev(map(float, values)) / math.sqrt(n))
+    half = float(stdtrit(n - 1, 1 - TAIL)) * (statistics.stdev(map(float, values)) / math.sqrt(n))
     return Estimate(value, value - half, value + half, n)
 
 

@@ -8,6 +8,7 @@ names all of its files can be overwritten: neither a mistyped path nor a receive
 import base64
 import errno
 import io
+import json
 import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -69,7 +70,7 @@ def check_folder(
     For an `unfinished` folder the refusal says how to continue.
     """
     if os.path.lexists(out) and not is_folder(out):
-        raise Refused("a folder to write to", f"{out}, which is none", _ANOTHER)
+        raise Refused("a folder to write to", f"{out}, which is not a folder", _ANOTHER)
     names = _files_in(out)
     if names and not overwrite:
         if unfinished:
@@ -86,7 +87,7 @@ def check_folder(
 
 def refuse_inputs_in(out: Path, inputs: Iterable[object]) -> None:
     """Refuse a file or folder that a command reads, if it is or lies in what the command writes."""
-    for path in inputs:  # objects in memory are none
+    for path in inputs:  # objects in memory have no path
         if isinstance(path, str | Path) and os.path.exists(path) and Path(path).resolve().is_relative_to(out.resolve()):
             raise Refused("inputs that lie outside of what is written", f"{path} in {out}", _ANOTHER)
 
@@ -188,6 +189,16 @@ def make_folder(path: Path) -> None:
 def write_atomically(path: Path, content: str | bytes | Callable[[Path], Any]) -> None:
     """Write `content`, or let it write, beside `path`, and move it there: readers see the complete old or new file."""
     _write_beside({path: path.with_name(f".{path.name}.part")}, {path: content})
+
+
+def json_text(data: Any) -> str:
+    """Data as the text of a JSON file; equal data give equal bytes, and NaN is refused."""
+    return json.dumps(data, indent=1, allow_nan=False) + "\n"
+
+
+def write_json(path: Path, data: Any) -> None:
+    """Write data as a JSON file, whole or not at all."""
+    write_atomically(path, json_text(data))
 
 
 def write_files_atomically(contents: Mapping[Path, bytes]) -> None:

@@ -7,8 +7,8 @@ new sessions will show, and the rates that are compatible with such counts.
 
 A session's own rate is Beta-distributed about the overall rate, so that its count is beta-binomial (Williams,
 Biometrics 31 (1975) 949-952, with the intraclass correlation ρ = 1 / (α + β + 1)). Both are uncertain: predictions are
-means over a grid of the posterior, with Jeffreys' prior of the rate and a flat prior of √ρ. Sessions of one photograph
-each tell nothing about ρ, which then is 0, as if every photograph were independent.
+means over a grid of the posterior, with Jeffreys' prior of the rate and a flat prior of √ρ. Of sessions of one
+photograph each ρ is taken for 0.
 Differences between photographs of a patch and of a control have an interval with the same model in normal form.
 Left out on purpose: a rate that depends on the pose, which all sessions share.
 """
@@ -20,11 +20,10 @@ from functools import lru_cache
 
 import numpy as np
 
-from patchproof.base.intervals import CONFIDENCE, independent_difference, paired_difference, student_mean
+from patchproof.base.intervals import TAIL, independent_difference, paired_difference, student_mean
 
 Hits = Sequence[bool] | np.ndarray
 HitsBySession = Mapping[int, Sequence[bool]]
-TAIL = (1 - CONFIDENCE) / 2
 LEAST_SESSIONS = 2  # one session cannot tell what a patch does from what its place does
 _RATES, _CORRELATIONS = 240, 36
 _MAX_CORRELATION = 0.95

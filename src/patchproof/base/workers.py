@@ -4,11 +4,10 @@ In: a function and items that can be pickled. Out: results, as they finish or in
 retry, not a result: all items in flight run again, those of local processes one at a time, so that only the item that
 kills its worker is given up.
 
-Other processes compute on one thread each, so that they do not compete for the cores; if this process uses one thread,
-too, results do not depend on where they were computed. Local processes are forked where that is safe: they start in
-milliseconds, and `fork_workers` shares with them all that this process has loaded. Elsewhere they are spawned and
-import all modules again, and work on shared data stays in this process. A cluster's machines need this package, and the
-same files at the same paths.
+Other processes compute on one thread each; if this process does, too, results do not depend on where they were
+computed. Local processes are forked where that is safe: they start in milliseconds, and `fork_workers` shares with them
+all that this process has loaded. Elsewhere they are spawned and import all modules again, and work on shared data stays
+in this process. A cluster's machines need this package, and the same files at the same paths.
 """
 
 import ctypes

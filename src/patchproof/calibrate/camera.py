@@ -10,7 +10,6 @@ differ are typed in. A photograph that stands out was moved or shows a bent boar
 Left out on purpose: fisheye lenses, and how flat the board is, which shows in the residuals only.
 """
 
-import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -23,13 +22,13 @@ import numpy as np
 
 from patchproof.base.color import photo_codes_from_srgb
 from patchproof.base.errors import Refused
-from patchproof.base.input import open_lazily
-from patchproof.base.output import check_file, write_atomically
+from patchproof.base.output import check_file, write_json
 from patchproof.base.progress import Advance, Progress, no_advance, no_progress
 from patchproof.calibrate.ladder import Rung
 from patchproof.calibrate.lens_ladder import PARAMETERS, BoardView, LensFit, choose_lens_model, fit_rung
 from patchproof.channel.lens import Camera, check_camera
 from patchproof.photo.detect import detect_markers, detector_settings, luminance
+from patchproof.photo.exif import camera_state
 from patchproof.photo.limits import run_limited
 from patchproof.photo.read import list_photos, read_photo
 from patchproof.photo.rejection import PhotoRejected
@@ -37,7 +36,6 @@ from patchproof.sheets.blank import Board, load_board
 from patchproof.sheets.markers import DICTIONARY, aruco_dictionary
 
 MIN_CORNERS = 12  # in one photograph: a pose has six unknowns, twelve corners give twenty-four numbers
-_STATE_TAGS = 0x010F, 0x0110, 0x0112  # maker, model, orientation
 MIN_PHOTOS = 6
 MIN_TURN_DEG = 10.0  # between the two boards that differ most; users are asked for tilts of 20 to 45°
 MAX_FOCAL_SHARE = 0.01  # one standard deviation of the focal length
@@ -81,7 +79,7 @@ def calibrate_camera(
     template = load_board(board)
     views, left_out, camera = find_boards(photos, template, ruler_mm, partial(progress, "find corners"))
     result = fit_camera(views, left_out, template, out.stem, camera, partial(progress, "lens models"))
-    write_atomically(out, json.dumps(result.camera.model_dump(), indent=1, allow_nan=False) + "\n")
+    write_json(out, result.camera.model_dump())
     return result
 
 
@@ -144,7 +142,7 @@ def find_boards(
         try:
             view, focal_px = run_limited(_read_view, path, board, positions_mm)
             views.append(view)
-            states.append((view.size_px, *_camera_tags(path), focal_px and round(focal_px)))
+            states.append((view.size_px, *camera_state(path), focal_px and round(focal_px)))
         except PhotoRejected as rejection:
             left_out[path.name] = rejection.advice
         advance(number, len(paths))
@@ -193,17 +191,6 @@ def find_corners(srgb: np.ndarray, board: Board) -> tuple[np.ndarray, np.ndarray
         return none
     # OpenCV 4 gives N×1 and N×1×2, OpenCV 5 gives N and N×2
     return np.asarray(ids).reshape(-1), np.asarray(corners, float).reshape(-1, 2) + 0.5, len(quads)
-
-
-def _camera_tags(path: Path) -> tuple[str, str]:
-    """(maker and model, orientation) as EXIF has them."""
-    try:
-        with open_lazily(path) as image:
-            exif = image.getexif()
-            make, model, orientation = (str(exif.get(tag, "")).strip("\0 ") for tag in _STATE_TAGS)
-            return f"{make} {model}".strip(), orientation
-    except Exception:  # the picture has been read; its tags are optional
-        return "", ""
 
 
 def _other_state(state, common) -> str:

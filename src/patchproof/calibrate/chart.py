@@ -7,10 +7,9 @@ the photographs of a print (their median from three on), then over prints.
 The table is an *appearance* model: what this camera showed of this printer, decoded as sRGB. Tone curves of camera and
 printer are one product in a photograph, and nothing on the page separates them. It describes paper in that light.
 
-In one photograph the page is found by its markers and swatches are read in their unblurred cores, in linear light.
-Illumination differs from place to place, so `paper_light` fits a smooth surface to white paper around the chart and its
-white swatches: dividing by it cancels gradients, vignetting, exposure and white balance at once. Text and lines on the
-paper are outliers of that surface.
+In one photograph the page is found by its markers and swatches are read in their unblurred cores, in linear light,
+over the smooth surface that `paper_light` fits to white paper around the chart and to white swatches: that cancels
+gradients, vignetting, exposure and white balance. Text and lines on the paper are outliers of that surface.
 Left out on purpose: lens distortion (a swatch's core is far from its border), and gloss: photograph it without shine.
 """
 
@@ -171,7 +170,7 @@ def summary_lines(calibration: PrinterCalibration) -> list[str]:
         lines.append(f"not tried, since swatches are too few or too much alike: {', '.join(choice.left_out)}")
     lines.append(f"held out: {choice.held_out} of {choice.colors} colors in turn")
     differ = f"prints differ from their mean by ΔE00 {provenance['delta_e00_of_prints']}"
-    lines.append(differ if provenance["delta_e00_of_prints"] else "how prints differ is not measured: there is one")
+    lines.append(differ if provenance["delta_e00_of_prints"] else "how prints differ is not measured: only one")
     if unreadable := provenance["swatches"]["unreadable"]:
         lines.append(f"swatches that no photograph shows well enough: {unreadable}")
     return lines

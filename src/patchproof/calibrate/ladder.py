@@ -5,12 +5,11 @@ standard error (Breiman's rule), and that is the standard error of the *paired* 
 items that are hard for every model say nothing about which one is better.
 
 Also: the ladder of maps from colors sent to colors seen, from identity to splines, with known printers as priors.
-Each map is tested on colors that it was not fitted to (ten folds; the corners of the RGB cube always stay in training,
-since predicting a color outside of those seen would be a guess), by ΔE00. Where there are too few colors to hold any
-out, or all are nearly gray, only maps that fit nothing or paper and black remain: held-out grays do not test other
-colors. The splines (Duchon 1977) see each color as sRGB and as CIELAB together: drivers work in either, and in one of
-them a printer is close to straight. With 48 swatches that reduced ΔE00 from 3.2 to 2.3 where the driver looks for
-nearest colors, and cost 0.2 where it only mixes inks.
+Each map is tested by ΔE00 on colors that it was not fitted to (ten folds; the corners of the RGB cube always stay in
+training, so that no color outside of those seen is predicted). Where colors are too few, or nearly gray, only maps
+remain that fit nothing or paper and black. The splines (Duchon 1977) see each color as sRGB and as CIELAB together:
+drivers work in either, and in one of them a printer is close to straight. With 48 swatches that reduced ΔE00 from 3.2
+to 2.3 where the driver looks for nearest colors, and cost 0.2 where it only mixes inks.
 
 Sources: Breiman, Friedman, Olshen, Stone, Classification and Regression Trees, 1984, 3.4.3 (the rule of one standard
 error); Hastie, Tibshirani, Friedman, The Elements of Statistical Learning, 2nd ed., 7.10 (cross-validation).

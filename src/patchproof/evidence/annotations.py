@@ -22,6 +22,7 @@ from pydantic import BaseModel, PositiveInt
 
 from patchproof.base.csv_file import csv_lines, read_csv
 from patchproof.base.errors import Refused
+from patchproof.base.geometry import corner_turns
 from patchproof.base.input import open_lazily, read_json
 from patchproof.base.text import printable
 from patchproof.base.validation import Finite, Positive, spelling_hint, summarize_names, validate_model
@@ -202,9 +203,7 @@ def _inside(box: Drawn) -> bool:
 
 def refuse_twisted(named: Drawn, name: str, path: str | Path) -> None:
     """Refuse corners of the photograph `name` that do not run clockwise round a convex shape; they came from `path`."""
-    sides = np.diff(np.reshape(named.numbers, (4, 2))[[0, 1, 2, 3, 0]], axis=0)
-    following = np.roll(sides, -1, axis=0)
-    turns = sides[:, 0] * following[:, 1] - sides[:, 1] * following[:, 0]  # twice the area of each corner's triangle
+    turns = corner_turns(np.reshape(named.numbers, (4, 2)))
     if not (turns > 1).all():
         got = "a photograph or order that is mirrored" if (turns < -1).all() else "a shape that is not convex"
         got = "shares of the picture" if max(named.numbers) <= 1 else got

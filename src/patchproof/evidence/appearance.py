@@ -4,9 +4,8 @@ In: a photograph, its homography, the promised linear light. Out: figures for th
 pictures; a `DesignMatch`. Both sides are averaged over the same coarse cells, and the promise is blurred as the photo
 is, so that resolution is not mistaken for color: a cell is at least two photo pixels, twice the blur and four times the
 corner uncertainty wide. Left out: the outermost ring of cells, into which blur mixes the surroundings of the piece;
-clipped cells, and cells with gloss (light added to all three channels in one place), which are counted. The color map
-is fitted to the design's cells, paper and ink; each cell is compared after a map that was fitted to other cells. What
-the photograph's noise and codes alone would make of a right print is measured, too.
+clipped cells, and cells with gloss (light added to all three channels in one place), which are counted. Each cell is
+compared after a color map fitted to other cells, paper and ink. What noise and codes make of a right print is measured.
 
 Whether it shows the sheet's design, cells tell as the square root of light over paper, less the mean of their
 surroundings: shadows, veils and a print's usual errors of color leave that structure, and another design lacks it. How
@@ -230,8 +229,7 @@ def match_design(seen: np.ndarray, promised: np.ndarray, usable: np.ndarray, lig
     shown, promised = np.clip(seen / paper, 0, 1.2), np.sqrt(np.clip(promised, 0, 1))
     seen = np.sqrt(np.clip((shown - veil) / (1 - veil), 0, 1.2))
     y, x = (_less_surroundings(v, usable)[usable] for v in (seen, promised))
-    # blur lightens the ink of small markers, which is no veil then: of a plain design's two colors the nearer counts
-    means = np.median(seen[usable], 0), np.sqrt(np.median(shown[usable], 0)), promised[usable].mean(0)
+    means = [np.median(each[usable], 0) for each in (seen, np.sqrt(shown))], promised[usable].mean(0)
     structure_x, structure_y = (float(np.median(np.abs(v))) for v in (x, y))  # medians: blur spreads markers' light
     if structure_x < _LEAST_STRUCTURE:
         return DesignMatch(trouble=_plain_trouble(*means, structure_y))
@@ -251,17 +249,17 @@ def match_design(seen: np.ndarray, promised: np.ndarray, usable: np.ndarray, lig
     return DesignMatch(likeness, weak_ink=weak if contrast < WEAK_INK else None)
 
 
-def _plain_trouble(
-    seen: np.ndarray, veiled: np.ndarray, promised: np.ndarray, structure: float
-) -> PhotoRejected | None:
-    """Compare square roots of light (3,) of a design without structure, and the structure that was seen."""
+def _plain_trouble(seen: list[np.ndarray], promised: np.ndarray, structure: float) -> PhotoRejected | None:
+    """Compare square roots of light (3,) of a design without structure, less the veil and with it, and what structure
+    was seen. The nearer one counts, since blur lightens the ink of small markers as a veil does.
+    """
     if structure > _MOST_STRUCTURE:
         return PhotoRejected("other_design", structure, _MOST_STRUCTURE, _OTHER_ADVICE)
-    absorbed, is_gray = (1 - seen) / np.maximum(1 - promised, 0.1), (1 - promised).min() > 0.6 * (1 - promised).max()
+    absorbed, is_gray = (1 - seen[0]) / np.maximum(1 - promised, 0.1), (1 - promised).min() > 0.6 * (1 - promised).max()
     contrast, ink = float(absorbed.min() / max(absorbed.max(), 1e-6)), _INKS[int(absorbed.argmin())]
     if contrast < _LEAST_PLAIN_INK and is_gray and promised.max() < 0.85:
         return PhotoRejected("wrong_ink", contrast, _LEAST_PLAIN_INK, _INK_ADVICE.format(ink))
-    delta = min(float(ciede2000(*map(lab_from_linear, (promised**2, look**2)))) for look in (seen, veiled))
+    delta = min(float(ciede2000(*map(lab_from_linear, (promised**2, look**2)))) for look in seen)
     return PhotoRejected("other_design", delta, _MOST_COLOR, _OTHER_ADVICE) if delta > _MOST_COLOR else None
 
 

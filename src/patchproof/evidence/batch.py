@@ -12,11 +12,9 @@ that a photograph is measured again if it, a network, the sheet or an option cha
 
 import io
 import json
-import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from datetime import datetime
 from functools import partial
 from pathlib import Path
 from typing import Annotated, TextIO
@@ -27,10 +25,10 @@ from numpy.typing import ArrayLike
 from pydantic import Field
 
 from patchproof.base.color import linear_from_srgb
-from patchproof.base.errors import Refused, TimeLimitExceeded, WorkerDied
+from patchproof.base.errors import Refused, WorkerDied
 from patchproof.base.fingerprint import value_sha256
 from patchproof.base.geometry import apply_homography, rect_corners
-from patchproof.base.input import MAX_JSON_BYTES, hash_file, is_file, open_lazily, read_file
+from patchproof.base.input import MAX_JSON_BYTES, hash_file, is_file, read_file
 from patchproof.base.output import make_folder, write_atomically
 from patchproof.base.resample import downscaled_size, to_sixteenths
 from patchproof.base.validation import Finite, Share, StrictModel, validate_model
@@ -43,7 +41,7 @@ from patchproof.evidence.reproject import PhotoSquare, photo_square
 from patchproof.evidence.results import PhotoEntry, Remark, Trace
 from patchproof.evidence.surface import Surface
 from patchproof.evidence.task import Options, Task
-from patchproof.photo.exif import EXIF_IFD, has_camera_shape
+from patchproof.photo.exif import has_camera_shape, time_and_camera
 from patchproof.photo.limits import MOST_BYTES, run_limited
 from patchproof.photo.quality import FrameLight, is_featureless
 from patchproof.photo.read import read_photo
@@ -53,7 +51,6 @@ from patchproof.sheets.manifest import Manifest
 
 MAX_PICTURED_PHOTOS = 120  # photographs whose pictures are on the page; the rest is listed. Keeps it below some 15 MB
 _THUMBNAIL_PX = 560  # longer side: enough for a phone's width at twice its density, some 40 kB as JPEG
-_TIME_TAG, _SERIAL_TAG, _MODEL_TAG = 0x9003, 0xA431, 0x0110
 _DESIGN_COLOR, _MARKER_COLOR = (255, 64, 129), (0, 200, 140)
 _DIED_ADVICE = "measuring it ended its process each time, for want of memory: save it smaller"
 _EMPTY_ADVICE = "it shows one tone or noise and nothing else: take it again"
@@ -280,21 +277,6 @@ def _trace(path: Path, srgb: np.ndarray) -> Trace:
     red, green, blue = map(float, small[frame].mean(0))
     minute, camera = time_and_camera(path)
     return Trace(minute=minute, camera=camera, frame=(red, green, blue))
-
-
-def time_and_camera(path: Path) -> tuple[float | None, str]:
-    """Time, in minutes since the year 1, and camera by the file's EXIF data; None if either is missing."""
-    try:
-        with warnings.catch_warnings(action="ignore"), open_lazily(path) as image:
-            exif = image.getexif()
-            details = exif.get_ifd(EXIF_IFD)
-        time = datetime.strptime(str(details.get(_TIME_TAG)).strip("\0 "), "%Y:%m:%d %H:%M:%S")
-        camera = f"{exif.get(_MODEL_TAG) or ''} {details.get(_SERIAL_TAG) or ''}"
-        return (time - datetime.min).total_seconds() / 60, " ".join(camera.split())[:40]
-    except TimeLimitExceeded:
-        raise
-    except Exception:  # of whatever a damaged file makes of its data
-        return None, ""
 
 
 def _thumbnail(srgb: np.ndarray, px_from_mm: ArrayLike | None, surface: Surface) -> np.ndarray:

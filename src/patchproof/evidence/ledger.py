@@ -1,14 +1,13 @@
 """Tell from photographs alone, by rendering into them, where confidence is lost and what controls would show.
 
-The gap ledger: how much confidence is lost in each step from the ideal picture to the photograph.
+The gap ledger: the confidence lost in each step from the ideal picture to the photograph.
 
     ideal → gamut → print → light and camera → blur and noise → photo
 
 In: a `PhotographedPrint` in judged photographs, the manifest, the promise's primary network. Out: a `Ledger`: shares in
-confidence (for a goal of deceiving, confidence gained), mean over photographs, with bootstrap intervals over
-photographs. Each photograph is classified with its piece re-projected under all combinations of four effects on or off
-(`reproject`), and each effect gets its mean cost over all orders of switching them on (Shapley, A Value for n-Person
-Games, 1953):
+confidence (for a goal of deceiving, confidence gained), mean over photographs, with bootstrap intervals. Each
+photograph is classified with its piece re-projected under all combinations of four effects on or off (`reproject`); an
+effect's share is its mean cost over all orders of switching them on (Shapley, A Value for n-Person Games, 1953):
 
     share_k = Σ_{S ∌ k} |S|! (n - |S| - 1)! / n! · (v(S) - v(S ∪ {k}))
 
@@ -21,10 +20,9 @@ share is print: a veil in all of them looks like lighter ink. Around the piece, 
 darkest place. If the design's colors are too few or too alike to fit the print, print and light are one step.
 
 The estimated effect: a control's pixels, as this print would have made them, are rendered into each photograph under
-its light and blur and classified. So is the design itself: if the network's answer then differs from its answer to the
-original photograph in more than 20 %, nothing is estimated; the photographs in which it differs are not compared, since
-there the rendering shows something else. Photographs of one session are alike. Left out on purpose: the bare object,
-whose surface behind the piece no photograph shows; shadows and glare on the piece, with which this fails, too.
+its light and blur and classified. So is the design itself: photographs in which that changes the network's answer are
+not compared, and if they are more than 20 %, nothing is estimated. Photographs of one session are alike. Left out on
+purpose: the bare object, whose surface behind the piece no photograph shows; shadows and glare on the piece.
 """
 
 from collections.abc import Mapping, Sequence

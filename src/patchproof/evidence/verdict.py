@@ -12,11 +12,10 @@ mirrored for `deceive`, where a rate too high breaks the promise. `kept` is prov
 or all in one place, can prove nothing. Looking again after each session until it fits would find `kept` falsely in 9 to
 18 % of trials: looks are counted, and the bound of those that were not planned is stricter (see `Look`).
 
-Whether the patch helps is another question: a patch that was promised to be useless, and is, keeps its promise. One
-comparison answers it, that with the hardest control by the strongest evidence there is, which the headline, the page
-and `--require helps` all use. Photographed controls decide alone, if there are any. Else those decide that were
-rendered into the patch's own photographs, with the bare object as the promise simulated it, since the paper hides it.
-Else it is the promise's controls. The patch has to beat all that decide; `base.goal` says which answer it gives.
+Whether the patch helps is another question: a patch that was promised to be useless, and is, keeps its promise. The
+headline, the page and `--require helps` answer it by one comparison, with the hardest control of the strongest kind:
+photographed controls, if there are any; else those rendered into the patch's own photographs, and the bare object as
+the promise simulated it, since the paper hides it; else the promise's controls. `base.goal` says which answer it gives.
 """
 
 from bisect import bisect_left
@@ -124,7 +123,7 @@ def required_rate(promise: Promise) -> float:
 def useless_note(promise: Promise) -> str:
     """Say that a promise asks for nothing, as one of 15 % over controls at 0 %; "" if it asks for something."""
     is_empty = (sign := promise.target.goal.sign) * required_rate(promise) <= min(sign, 0)
-    return " The promise is useless: any photographs keep it." * is_empty
+    return " This promise asks for nothing: any photographs keep it." * is_empty
 
 
 def kept_chance(promise: Promise, photos: Sequence[int]) -> float:

@@ -9,7 +9,7 @@ values of absurd size and wrong inputs. Activations overwrite their input where 
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -46,7 +46,7 @@ class Step:
     keywords: dict[str, Any]
     results: list[int]
     returns_sequence: bool  # of several tensors
-    last_uses: list[int]
+    last_uses: list[int] = field(default_factory=list)
 
 
 def mark_last_uses(steps: list[Step], outputs: set[int]) -> None:

@@ -161,14 +161,14 @@ class _GraphReader:
         steps: list[Step] = []
         if colors_last:  # as TensorFlow's are
             results = [self._new(inputs[0]["name"])]
-            steps.append(Step(torch.permute, [ValueRef(photos), (0, 2, 3, 1)], {}, results, False, []))
+            steps.append(Step(torch.permute, [ValueRef(photos), (0, 2, 3, 1)], {}, results, False))
         self.of_photos = {photos, self.count - 1}  # computed from pictures
         for node in self.nodes:
             steps.extend(self._steps(node))
         names = [place["name"] for place in self.graph["output"]]
         outputs = [self._known(name) for name in names]
         if join is not None and outputs:
-            steps.append(Step(functools.partial(join, names), outputs, {}, [self.count], False, []))
+            steps.append(Step(functools.partial(join, names), outputs, {}, [self.count], False))
             outputs = [ValueRef(self.count)]
         if len(outputs) != 1 or not isinstance(outputs[0], ValueRef):
             raise UnsupportedNetwork(f'{len(outputs)} outputs, not one (of a detector: write "kind": "detector")')
@@ -227,14 +227,14 @@ class _GraphReader:
             steps = self._aten_steps(calls, name, inputs[0], outputs[0])
         else:
             results = [self._new(word) for word in [*outputs, *[""] * (count - len(outputs))]]
-            steps = [Step(operator, [InputDevice, *inputs], attributes, results, name == "Split" or count > 1, [])]
+            steps = [Step(operator, [InputDevice, *inputs], attributes, results, name == "Split" or count > 1)]
         self.of_photos.update(number for step in steps for number in step.results if of_photos)
         return steps
 
     def _aten_steps(self, calls: AtenCalls, name: str, value: Any, output: str) -> list[Step]:
         steps, is_four = [], name == "Conv" or value.number in self.of_four
         for compute, others in calls:
-            steps.append(Step(compute, [value, *others], {}, [self.count], False, []))
+            steps.append(Step(compute, [value, *others], {}, [self.count], False))
             value, self.count = ValueRef(self.count), self.count + 1
         self._name(output, value)
         self.of_four |= {value.number: None} if is_four else {}

@@ -40,7 +40,7 @@ def _program(network: torch.nn.Module, nodes: list[Node]) -> Program:
             target = network.get_submodule(target)
         elif node.op == "call_method":
             target = getattr(torch.Tensor, target)
-        return Step(target, arguments, keywords, [numbers[node]], False, [])
+        return Step(target, arguments, keywords, [numbers[node]], False)
 
     steps, output_number = [step(node) for node in computed], _argument(output.args[0], numbers).number
     mark_last_uses(steps, {*range(len(weights) + 1), output_number})

@@ -5,7 +5,6 @@ from four directions across the scene's azimuths, each place as a small square f
 worst), the drafted ones with their rank, and the chosen piece's outline at its size; the title says so.
 """
 
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,15 +17,13 @@ from patchproof.base.color import photo_codes_from_srgb, srgb_from_linear
 from patchproof.base.errors import Refused
 from patchproof.base.input import is_file, read_json
 from patchproof.base.output import write_atomically
-from patchproof.base.settings import BackgroundSettings
 from patchproof.base.validation import validate_model
 from patchproof.channel.effects import Light, Pose
 from patchproof.optimizer.place_search import Place
-from patchproof.render.photograph import shade
+from patchproof.render.photograph import on_white, shade
 from patchproof.render.raster import rasterize
 from patchproof.render.stage import Stage, set_stage
 from patchproof.render.views import NEAR_SHARE, cameras, render_views
-from patchproof.scene.backgrounds import load_backgrounds
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.patch_scene import PatchScene, PiecePosition, UnplacedScene
 from patchproof.scene.placement import SurfaceFrame, patch_frame, side_frame
@@ -106,8 +103,6 @@ def _even_scene(scene: PatchScene) -> tuple[PatchScene, Conditions]:
     distance = sum(view.distance_mm) / 2
     half = float(np.linalg.norm(np.ptp(scene.mesh.vertices, axis=0))) / 2 * _MARGIN
     fov = float(np.degrees(2 * np.arctan(half / distance)))
-    settings = scene.settings.changed(view={"fov_deg": fov}, camera={"photo_px": (_SIDE_PX, _SIDE_PX), "file": None})
-    white = load_backgrounds(BackgroundSettings(color=(1.0, 1.0, 1.0)), Path())
     (low, high), ones = view.azimuth_deg, np.ones(_DIRECTIONS)
     pose = Pose(
         azimuth_deg=low + (high - low) * (np.arange(_DIRECTIONS) + 0.5) / _DIRECTIONS,
@@ -115,7 +110,7 @@ def _even_scene(scene: PatchScene) -> tuple[PatchScene, Conditions]:
         distance_mm=ones * distance,
     )
     light = Light(ambient=ones * 0.55, directional=ones * 0.45, light_elevation_deg=ones * 45)
-    return replace(scene, settings=settings, backgrounds=white, camera=None), Conditions(pose=pose, light=light)
+    return on_white(scene, (_SIDE_PX, _SIDE_PX), fov_deg=fov), Conditions(pose=pose, light=light)
 
 
 def _is_visible(project: Any, pose: np.ndarray, depth: np.ndarray, eye: np.ndarray, frame: SurfaceFrame) -> bool:

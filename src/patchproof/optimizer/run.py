@@ -214,7 +214,7 @@ def finish_run(
 
 def write_run(run: Run) -> Run:
     """Write a run's run.json, and return the run."""
-    output.write_atomically(run.folder / RUN_FILE, json.dumps(run.details, indent=1) + "\n")
+    output.write_json(run.folder / RUN_FILE, run.details)
     return run
 
 

@@ -5,8 +5,7 @@ A subject gives the first design, the allowed designs, their penalty and appeara
 design is a float tensor 3×h×w in [0, 1], its `pixels` are uint8 h×w×3.
 
 The gradient's pyramid moves large parts of a design as readily as single pixels: the optimizer scales its levels, means
-over blocks of 1, 2, 4 … pixels, each on its own, and adds them. The gradient of a pixel is mostly that of the few views
-it was drawn from; the mean over a block shares it with every view, so that color and large shapes, which count in small
+over blocks of 1, 2, 4 … pixels, each on its own, and adds them, so that color and large shapes, which count in small
 and blurred views, come first. Laplacian pyramid normalization of DeepDream (Mordvintsev et al., TensorFlow tutorial,
 2015) scales levels likewise, by their spread instead of Adam's.
 

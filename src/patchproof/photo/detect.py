@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 
 from patchproof.base.color import LINEAR_FROM_CODE, LUMINANCE
+from patchproof.base.geometry import corner_turns
 from patchproof.base.input import remaining_seconds
 from patchproof.photo.edges import Borders, fit_borders
 from patchproof.photo.limits import find_squares
@@ -135,11 +136,14 @@ def _is_large(picture: np.ndarray) -> bool:
 
 def is_plausible_quad(corners: np.ndarray) -> bool:
     """True if a flat square can look like this: convex, clockwise, no side more than 12 times another."""
-    sides = np.roll(corners, -1, axis=0) - corners
-    next_sides = np.roll(sides, -1, axis=0)
-    turns = sides[:, 0] * next_sides[:, 1] - sides[:, 1] * next_sides[:, 0]
-    lengths = np.linalg.norm(sides, axis=1)
-    return bool(np.isfinite(corners).all() and (turns > 0).all() and lengths.max() < 12 * lengths.min())
+    lengths = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)
+    convex = np.isfinite(corners).all() and (corner_turns(corners) > 0).all()
+    return bool(convex and lengths.max() < 12 * lengths.min())
+
+
+def side_px(quad: np.ndarray) -> float:
+    """The side in px of the square that has the area of corners 4×2 px."""
+    return float(np.sqrt(cv2.contourArea(quad.astype(np.float32))))
 
 
 def full_region(srgb: np.ndarray) -> ImageRegion:

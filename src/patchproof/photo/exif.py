@@ -1,4 +1,4 @@
-"""Read the focal length from a photograph's EXIF data, unless the picture was changed since it was taken.
+"""Read EXIF data: the focal length, unless the picture was changed since it was taken; its time and its camera.
 
 EXIF gives the 35 mm equivalent, by the diagonal: if a picture was cropped or zoomed digitally, neither that nor the
 principal point in the middle is true. So it is rejected if EXIF has another size than the picture or a digital zoom, or
@@ -10,16 +10,23 @@ larger spread. A crop that keeps the shape and updates EXIF leaves no trace; the
 import math
 import re
 import struct
-from collections.abc import Mapping
+import warnings
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from datetime import datetime
+from pathlib import Path
 from typing import Any
+
+from patchproof.base.errors import TimeLimitExceeded
+from patchproof.base.input import open_lazily
 
 _DIAGONAL_35MM = 43.2666  # mm, of the 36×24 mm frame that FocalLengthIn35mmFilm refers to
 EXIF_SPREAD = 0.03  # of its logarithm: rounding to whole millimeters at 26 mm (0.011), and tolerances of lenses
 LOOSE_SPREAD = 0.1
 _SENSOR_SHAPES, _CUT_SHAPES, _SAME_SHAPE = (4 / 3, 3 / 2), (16 / 9,), 0.01
 _EDITOR = re.compile(r"photoshop|lightroom|gimp|snapseed|darktable|affinity|paint|pixelmator|capture one|luminar", re.I)
-EXIF_IFD, _FOCAL_35MM, _WIDTH, _HEIGHT, _ZOOM, _SOFTWARE = 0x8769, 0xA405, 0xA002, 0xA003, 0xA404, 0x0131
+EXIF_IFD, _FOCAL_35MM, _WIDTH, _HEIGHT, _ZOOM = 0x8769, 0xA405, 0xA002, 0xA003, 0xA404
+_SOFTWARE, _MAKER, _MODEL, _ORIENTATION, _TIME, _SERIAL = 0x0131, 0x010F, 0x0110, 0x0112, 0x9003, 0xA431
 _COMMENT = 0x9286  # marks screenshots of phones and desktops of one maker
 _SCREEN = re.compile(r"screen.?shot", re.I)
 
@@ -60,6 +67,34 @@ def is_crop(image, name: str) -> bool:
     comment = details.get(_COMMENT, "")
     comment = comment.decode("latin-1").replace("\0", "") if isinstance(comment, bytes) else str(comment)
     return reshaped or bool(_SCREEN.search(name) or _SCREEN.search(comment))
+
+
+def time_and_camera(path: Path) -> tuple[float | None, str]:
+    """Time, in minutes since the year 1, and camera by the file's EXIF data; None if either is missing."""
+    time, model, serial = _words(path, (_TIME, _MODEL, _SERIAL))
+    with suppress(ValueError):
+        minutes = (datetime.strptime(time, "%Y:%m:%d %H:%M:%S") - datetime.min).total_seconds() / 60
+        return minutes, " ".join(f"{model} {serial}".split())[:40]
+    return None, ""
+
+
+def camera_state(path: Path) -> tuple[str, str]:
+    """(maker and model, orientation) by the file's EXIF data."""
+    make, model, orientation = _words(path, (_MAKER, _MODEL, _ORIENTATION))
+    return f"{make} {model}".strip(), orientation
+
+
+def _words(path: Path, tags: Sequence[int]) -> list[str]:
+    """The words of a file's EXIF tags, empty where there are none, or its data are damaged."""
+    try:
+        with warnings.catch_warnings(action="ignore"), open_lazily(path) as image:
+            exif = image.getexif()
+            details = exif.get_ifd(EXIF_IFD)
+            return [str(exif.get(tag) or details.get(tag) or "").strip("\0 ") for tag in tags]
+    except TimeLimitExceeded:
+        raise
+    except Exception:  # of whatever a damaged file makes of its data, which Pillow decodes when it is asked for
+        return [""] * len(tags)
 
 
 def has_camera_shape(size_px: tuple[int, int], also_px: tuple[int, int] | None) -> bool:

@@ -1,12 +1,11 @@
 """Find a print by its own design in a photograph: no markers, nobody who names corners.
 
 In: uint8 sRGB pixels, the design's pixels, its size on the page. Out: `DesignCorners` with their standard deviation, or
-a `PhotoRejected` with the deciding figure. Two sources propose places: SIFT features of the design, drawn at several
-sizes, whose matches vote for a place, size and angle (blocks look alike, so that a feature's own match is often wrong);
-and, where these fail, the correlation of a small design with the photograph over sizes, angles and slants, which
-smooth designs need. Each place is refined on intensities with their surroundings subtracted, per channel under gain
-and offset, since prints and phones change tone and color. A place is accepted by its correlation at the resolution of
-the photograph, in units of what chance gives a design of so much structure: other pictures fit smooth designs well.
+a `PhotoRejected` with the deciding figure. Two sources propose places: SIFT features of the design at several sizes,
+whose matches vote for a place, size and angle (single matches of blocks are often wrong); and, where these fail, as
+with smooth designs, the correlation of a small design with the photograph over sizes, angles and slants. Each place is
+refined on intensities less their surroundings, with gain and offset per channel. It is accepted by its correlation at
+the photograph's resolution, in units of what chance gives a design of so much structure.
 Left out on purpose: bent paper, prints smaller than `SMALLEST_PRINT_PX` in the picture of `SEARCHED_PX` that is
 searched, and smooth prints turned by more than 50 degrees, whose templates would double the time.
 
@@ -23,6 +22,7 @@ import numpy as np
 
 from patchproof.base.geometry import apply_homography, fit_homography, rect_corners
 from patchproof.base.resample import downscale, halving_pyramid, index_homography
+from patchproof.photo import detect
 from patchproof.photo.detect import is_plausible_quad
 from patchproof.photo.known_page import is_in_picture
 from patchproof.photo.rectify import homography_jacobian
@@ -93,7 +93,7 @@ def find_design(srgb: np.ndarray, design: np.ndarray, size_mm: tuple[float, floa
     if len(found) > 1:
         raise PhotoRejected("several_sheets", len(found), 1, _SEVERAL_ADVICE)
     scale = min(1.0, SEARCHED_PX / max(srgb.shape[:2]))
-    side_px = scale * float(np.sqrt(cv2.contourArea(found[0].corners_px.astype(np.float32))))
+    side_px = scale * detect.side_px(found[0].corners_px)
     side_px *= float(np.sqrt(min(size_mm) / max(size_mm)))
     if side_px < SMALLEST_PRINT_PX:
         raise PhotoRejected("too_small", side_px, SMALLEST_PRINT_PX, _SMALL_ADVICE)
@@ -241,7 +241,7 @@ class _Refiner:
         for longer_px in _REFINED_PX:
             if not is_plausible_quad(quad) or not is_in_picture(quad, self.srgb):
                 return None
-            side_px = float(np.sqrt(abs(cv2.contourArea(quad.astype(np.float32)))))
+            side_px = detect.side_px(quad)
             most = max(24, 2 * round(0.5 * side_px * np.sqrt(max(self.size_mm) / min(self.size_mm))))
             size = min(longer_px, most)
             level = int(np.clip(np.log2(max(side_px / size, 1)), 0, len(self.levels) - 1))

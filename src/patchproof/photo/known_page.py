@@ -95,10 +95,10 @@ def _findable(srgb, missing: Ids, view: MarkersInView, corners_mm, scale: float)
     if sum(b.fitted for b in view.markers.values()) >= 2:  # one marker predicts the others' places badly
         quads = _predict_corners(srgb, view, missing, corners_mm)
     if quads is not None:
-        missing = {i for i, quad in quads.items() if _side_px(quad) * scale < READABLE_PX}
+        missing = {i for i, quad in quads.items() if detect.side_px(quad) * scale < READABLE_PX}
     if quads is None or not missing:
         return missing, detect.full_region(srgb)
-    margin = 2 * max(_side_px(quads[i]) for i in missing)
+    margin = 2 * max(detect.side_px(quads[i]) for i in missing)
     return missing, region_around(np.concatenate([quads[i] for i in missing]), margin, srgb.shape)
 
 
@@ -143,7 +143,7 @@ def _predict_corners(srgb, view: MarkersInView, missing: Ids, corners_mm) -> dic
         return None
     quads = {i: apply_homography(fit.px_from_mm, corners_mm[i]) for i in missing}
     seen = {i: quad for i, quad in quads.items() if detect.is_plausible_quad(quad) and is_in_picture(quad, srgb)}
-    return {i: quad for i, quad in seen.items() if _side_px(quad) >= 10}
+    return {i: quad for i, quad in seen.items() if detect.side_px(quad) >= 10}
 
 
 def _fit(corners_px: Quads, corners_mm: Quads) -> PageFit | None:
@@ -161,12 +161,8 @@ def is_in_picture(quad: np.ndarray, srgb: np.ndarray) -> bool:
 def shows_small_code(srgb: np.ndarray, quad: np.ndarray, marker_id: int, dictionary: str) -> bool:
     """True if corners 4×2 px lie in the picture, are too small for borders to be fitted, and resemble a marker."""
     code = marker_cells(dictionary, [marker_id])[0]
-    is_small = is_in_picture(quad, srgb) and _side_px(quad) < READABLE_PX / 2
+    is_small = is_in_picture(quad, srgb) and detect.side_px(quad) < READABLE_PX / 2
     return is_small and _correlation(srgb, quad, code, _TRIAL_OFFSETS) > LEAST_CORRELATION
-
-
-def _side_px(quad: np.ndarray) -> float:
-    return float(np.sqrt(abs(cv2.contourArea(quad.astype(np.float32)))))
 
 
 def _correlation(srgb: np.ndarray, corners_px: np.ndarray, code: np.ndarray, offsets=((0.0, 0.0),)) -> float:
@@ -195,7 +191,7 @@ def find_second_print(
     if len(corners_px) < 2:
         return (), ()
     first = np.concatenate([corners_px[i] for i in sorted(corners_px)])
-    side = max(float(np.sqrt(cv2.contourArea(q.astype(np.float32)))) for q in corners_px.values())
+    side = max(map(detect.side_px, corners_px.values()))
     light, scale = _scaled_light(srgb, _FIRST_PX / max(side, 1.0))
     hull = cv2.convexHull((first * scale).astype(np.float32))
     middles = scale * first.reshape(-1, 4, 2).mean(1)

@@ -15,8 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from patchproof.base.color import LINEAR_FROM_CODE
-from patchproof.base.geometry import apply_homography, is_inside, local_scale, rect_corners
+from patchproof.base.geometry import apply_homography, is_inside, rect_corners
 from patchproof.photo.quality import CLIPPED_CODE
+from patchproof.photo.rectify import least_px_per_mm, region_around
 from patchproof.photo.rejection import PhotoRejected
 from patchproof.sheets.rects import RectMm, grow_rect
 
@@ -65,16 +66,12 @@ def quadratic_terms(mm: np.ndarray, size_mm: tuple[float, float]) -> np.ndarray:
 
 def _white_pixels(srgb, px_from_mm, area_mm, printed, blur_px: float) -> tuple[np.ndarray, np.ndarray]:
     """Return codes N×3 and millimeters N×2 of pixels that see nothing but white paper."""
-    corners_px = apply_homography(px_from_mm, rect_corners(area_mm))
-    limit = np.array([srgb.shape[1], srgb.shape[0]])
-    low = np.clip(np.floor(corners_px.min(0)).astype(int), 0, limit)
-    high = np.clip(np.ceil(corners_px.max(0)).astype(int), low, limit)
-    stride = max(1, int(np.sqrt(np.prod(high - low) / (4 * _MAX_PIXELS))))  # about a quarter of the box is clear paper
-    columns, rows = np.meshgrid(np.arange(low[0], high[0], stride), np.arange(low[1], high[1], stride))
+    y, x = region_around(apply_homography(px_from_mm, rect_corners(area_mm)), 0, srgb.shape)
+    pixels = (y.stop - y.start) * (x.stop - x.start)
+    stride = max(1, int(np.sqrt(pixels / (4 * _MAX_PIXELS))))  # about a quarter of the box is clear paper
+    columns, rows = np.meshgrid(*(np.arange(each.start, each.stop, stride) for each in (x, y)))
     mm = apply_homography(np.linalg.inv(px_from_mm), np.column_stack([columns.ravel(), rows.ravel()]) + 0.5)
-    scales = [local_scale(px_from_mm, corner) for corner in rect_corners(area_mm)]
-    px_per_mm = min(mean * np.sqrt(np.cos(np.radians(tilt))) for mean, tilt in scales)
-    margin_mm = (1 + 3 * blur_px) / max(px_per_mm, 1e-6)
+    margin_mm = (1 + 3 * blur_px) / max(least_px_per_mm(px_from_mm, area_mm), 1e-6)
     white = is_inside(mm, grow_rect(area_mm, -margin_mm - _CUT_SLACK_MM))
     for rect in printed:
         white &= ~is_inside(mm, grow_rect(rect, margin_mm))

@@ -9,9 +9,8 @@ tilt, which is never negative, from random draws.
 A page seen with the right matrix has px_from_mm ~ K [r1, r2, t]: r1 · r2 = 0 and |r1| = |r2|. A wrong focal length
 breaks both with sin² of the tilt, a wrong principal point (an off-center crop) likewise, so frontal views tell nothing.
 A crop, or software that straightens, may leave no trace in a file. So a focal length from EXIF is trusted only as far
-as perspective confirms it; otherwise the distance is unknown, and angles are as uncertain as these can make them.
-Rolled paper may turn anywhere between its markers, even at a fold, which makes the tangent of a middle far from them
-uncertain; paper that misses its markers by more than noise is uncertain, too.
+as perspective confirms it; otherwise the distance is unknown, and angles are as uncertain as these can make them. So
+are tangents of rolled paper far from its markers, between which it may turn, and paper that misses its markers.
 
 Source: Hartley and Zisserman, Multiple View Geometry, 2nd ed., 8.1.
 """

@@ -2,8 +2,8 @@
 
 Shifts. In: a photograph in which the sheet is flat, its homography, the linear light that was promised over a rectangle
 of the page. Out: `Registration`: for each cell of a grid that has texture its shift, by the peak of the normalized
-correlation of its luminance with the printed one, and the shift's uncertainty. The correlation does not depend on a
-cell's brightness and contrast, which print, light and camera change. A cell that is covered or glossy has no peak: NaN.
+correlation of its luminance with the printed one, and the shift's uncertainty. The correlation does not depend on
+brightness and contrast. A cell that is covered or glossy has no peak: NaN.
 
 Source of a peak's uncertainty: Lucas and Kanade, An Iterative Image Registration Technique, IJCAI 1981; but errors of a
 cell's light are not independent from pixel to pixel (other inks, a shadow), so they count as `_INDEPENDENT_ERRORS`.

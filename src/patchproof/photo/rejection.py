@@ -23,7 +23,7 @@ REJECTION_CODES = {
     "several_sheets": ("more than one print is in view", "photograph one at a time"),
     "mirrored": ("the picture is mirrored", "switch the camera's mirror setting off"),
     "curled": ("paper or design lie neither in a plane nor on rolled paper", "press it flat, glue it down"),
-    "cropped": ("a crop that was not told moved the picture's middle", "use the photograph as the camera wrote it"),
+    "cropped": ("an undeclared crop moved the picture's center", "use the photograph as the camera wrote it"),
     "copy": ("another file shows the same photograph", "leave one of them"),
     "other_design": ("what is printed between the markers is not this design", "name the sheet that was printed"),
     "wrong_ink": ("an ink is missing or another one", "print again with all inks"),

@@ -9,6 +9,7 @@ bare object in even light, seen straight from one side.
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -29,12 +30,13 @@ from patchproof.render.texture import look_up, texel_table
 from patchproof.render.views import Views, relight, render_views
 from patchproof.scene.backgrounds import load_backgrounds
 from patchproof.scene.conditions import Conditions
-from patchproof.scene.mesh_scene import require_mesh
+from patchproof.scene.mesh_scene import MeshScene, require_mesh
 from patchproof.scene.placement import SurfaceFrame
 
 DISTANCE_LENGTHS = 60.0  # of a plan's camera, over the object's length
 PAPER_BACK_LINEAR = 0.8  # reflectance of plain white card, for a piece seen from behind
 _OUTLINE_REACH_PX = 1  # outlines mix neighboring pixels
+MeshSceneType = TypeVar("MeshSceneType", bound=MeshScene)
 _PICTURE_GRAIN_SEED = 1 << 40  # added to the seed: the base photograph's grain is not that of the simulated camera
 
 
@@ -208,10 +210,7 @@ def plan_picture(
     px_per_mm = side_px / (2 * half_mm.max())
     width, height = (int(v) for v in np.maximum(np.rint(2 * half_mm * px_per_mm), 16))
     fov = float(np.degrees(2 * np.arctan(half_mm.min() / distance)))
-    view = {"fov_deg": fov, "look_at": "object"}
-    settings = scene.settings.changed(view=view, camera={"photo_px": (width, height), "file": None})
-    white = load_backgrounds(BackgroundSettings(color=(1.0, 1.0, 1.0)), Path())
-    plain = replace(stage, scene=replace(scene, settings=settings, frame=frame, backgrounds=white, camera=None))
+    plain = replace(stage, scene=replace(on_white(scene, (width, height), fov_deg=fov, look_at="object"), frame=frame))
     piece = None if colors is None else PiecePicture.of(torch.tensor(colors, dtype=torch.float32) / 255)
     with torch.no_grad():
         views = render_views(plain, piece, _frontal_conditions(distance, 0.55, 0.45), (width, height))
@@ -223,6 +222,13 @@ def plan_picture(
                 light[covered] = _pixel_rows(shade(relight(views, ambient), piece))[covered]
     picture = srgb_from_linear(light.clamp(0, 1)).reshape(height, width, 3).cpu().numpy()
     return photo_codes_from_srgb(picture)
+
+
+def on_white(scene: MeshSceneType, size_px: tuple[int, int], **view: Any) -> MeshSceneType:
+    """The scene before white, in pictures of (width, height) pixels by a camera without distortion."""
+    settings = scene.settings.changed(view=view, camera={"photo_px": size_px, "file": None})
+    white = load_backgrounds(BackgroundSettings(color=(1.0, 1.0, 1.0)), Path())
+    return replace(scene, settings=settings, backgrounds=white, camera=None)
 
 
 def _pixel_rows(pictures: Tensor) -> Tensor:

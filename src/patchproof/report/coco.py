@@ -7,12 +7,13 @@ purpose: occlusion, so that boxes include hidden parts.
 Source: Lin et al., Microsoft COCO, ECCV 2014, and its data format.
 """
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+
+from patchproof.base.output import json_text
 
 PATCH = "patch"
 _LEAST_PX = 1.0  # of a box's sides; smaller boxes are left out
@@ -49,7 +50,7 @@ def coco_json(photos: Sequence[LabeledPhoto], label: str, about: str) -> str:
         "annotations": annotations,
         "categories": [{"id": number, "name": name} for name, number in categories.items()],
     }
-    return json.dumps(data, indent=1, allow_nan=False) + "\n"
+    return json_text(data)
 
 
 def _annotation(outline: np.ndarray, size_px: tuple[int, int], with_polygon: bool) -> dict[str, Any] | None:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from patchproof.base.csv_file import csv_lines
 from patchproof.base.intervals import Estimate
-from patchproof.base.output import data_uri, write_atomically
+from patchproof.base.output import data_uri, write_atomically, write_json
 from patchproof.report.page import draw_figure, render_page, versions_of
 
 if TYPE_CHECKING:
@@ -116,11 +116,6 @@ def write_results(folder: Path, results: Results) -> None:
         "failed": results.failed,
     }
     write_json(folder / f"{results.name}.json", data)
-
-
-def write_json(path: Path, data: Mapping[str, Any]) -> None:
-    """Write data as a JSON file, whole or not at all."""
-    write_atomically(path, json.dumps(data, indent=1, allow_nan=False) + "\n")
 
 
 def csv_text(table: Table) -> str:

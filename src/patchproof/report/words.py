@@ -52,8 +52,8 @@ def looks_sentence(summary: Mapping[str, Any]) -> str:
     """Say how often these photographs were looked at, as far as it is known."""
     number, planned = summary["looks"], summary["looks_planned"]
     if planned > 1:
-        return f"looks: watched while taken, so one for each session: {number}, {planned} planned"
-    more = "; those in other folders are not known, and each one more asks for more proof"
+        return f"looks: the verdict is computed after each session, {number} so far, {planned} planned"
+    more = "; those in other folders are not known, and each further one needs stronger evidence"
     return f"looks: {number}, counted in the report's folder{more}"
 
 

@@ -15,7 +15,7 @@ from typing import Any
 from patchproof.base.csv_file import csv_lines
 from patchproof.base.goal import points_text
 from patchproof.base.intervals import Estimate, rate
-from patchproof.base.output import data_uri, make_folder, write_atomically
+from patchproof.base.output import data_uri, make_folder, write_atomically, write_json
 from patchproof.report import words
 from patchproof.report.page import DELTA_TOP, render_page, saved_pictures
 
@@ -40,7 +40,7 @@ def write_report(report: Mapping, manifest: Mapping, out_dir: str | Path) -> Pat
     out = Path(out_dir)
     make_folder(out)
     pictures = {photo["file"]: saved_pictures(out / "pictures", photo["file"]) for photo in report["photos"]}
-    write_atomically(out / "report.json", json.dumps(report, indent=1, allow_nan=False) + "\n")
+    write_json(out / "report.json", report)
     write_atomically(out / "report.csv", photos_csv(report["photos"]))
     write_atomically(out / "report.html", report_html(report, manifest, pictures))
     return out / "report.html"

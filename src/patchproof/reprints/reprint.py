@@ -212,7 +212,7 @@ def reprint(
     """Print a sheet in simulation, mount the piece on its object, and photograph it.
 
     Args:
-        pdf_path: the sheet's PDF, its manifest beside it.
+        pdf_path: the sheet's PDF with its manifest beside it, or NAME.json of a print without a page.
         run: the run that the sheet was made from.
         n: photographs in all, 1 or more.
         out: folder for the JPEG files, `truth.json` and `coco.json`; one folder a session inside, if there are several.

@@ -8,10 +8,9 @@ and a shift of the whole picture, and in exposure and white balance as a camera 
 A promise of such a scene covers these photographed places and lights and mild changes of them, because all streams draw
 from the same few photographs. It does not cover other viewpoints, backgrounds or lamps: photograph them, too.
 
-The paper alone gives the light, because a printed swatch's own reflectance depends on a printer that is not known here.
-Left out on purpose: shine on the piece (paper in glare counts as an outlier), veiling glare (black ink is as dark as
-the printer makes it), and whatever stood in front of the piece. Photographs that cannot be used are named with the code
-that a judged photograph would get.
+Light is read from paper alone, since the printer of the swatches is not known. Left out on purpose: shine on the piece
+(paper in glare counts as an outlier), veiling glare (black ink is as dark as the printer makes it), and whatever stood
+in front of the piece. Photographs that cannot be used get the code that a judged photograph would get.
 """
 
 from dataclasses import dataclass, replace
@@ -22,6 +21,7 @@ import numpy as np
 
 from patchproof.base.errors import Refused
 from patchproof.base.fingerprint import files_sha256
+from patchproof.base.geometry import is_inside
 from patchproof.base.input import is_file, is_folder
 from patchproof.base.settings import SceneSettings
 from patchproof.base.validation import expand_path
@@ -206,8 +206,7 @@ def _load_all(folder: Path, manifest: Manifest, piece: Piece, photo_px) -> tuple
 def _locate(srgb: np.ndarray, manifest: Manifest, side_mm: float) -> tuple[PageFit, float]:
     """Return where the sheet's piece lies in a photograph, and the blur of its markers' borders in px."""
     markers = {m.id: np.array(m.corners_mm) for m in manifest.markers}
-    x, y, w, h = manifest.cut_mm
-    on_piece = {i: c for i, c in markers.items() if (c >= [x, y]).all() and (c <= [x + w, y + h]).all()}
+    on_piece = {i: c for i, c in markers.items() if is_inside(c, manifest.cut_mm).all()}
     detection = find_markers(srgb, frozenset(on_piece), frozenset(markers), DICTIONARY)
     if not detection.markers.keys() & on_piece.keys():
         if detection.another_sheet:

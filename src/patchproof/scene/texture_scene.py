@@ -229,5 +229,5 @@ def _texel_warnings(mesh: Mesh, chosen_faces: np.ndarray, masks: tuple[np.ndarra
     if (share := float(area[~chosen_faces] @ unnamed[~chosen_faces]) / area.sum()) > 0.01:
         warnings.append(f"{share:.0%} of the surface changes too, although not named: it shows the same texels")
     if (mesh.corner_color_linear[chosen_faces] != 1).any():
-        warnings.append("vertex colors go on multiplying the texture: where they are dark, it stays dark")
+        warnings.append("vertex colors still multiply the texture: where they are dark, it stays dark")
     return warnings

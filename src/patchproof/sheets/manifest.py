@@ -7,7 +7,6 @@ SHA-256 over the raw RGB bytes, row by row.
 
 import base64
 import hashlib
-import json
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -16,8 +15,10 @@ import numpy as np
 from pydantic import Field, create_model, field_validator, model_validator
 
 from patchproof.base.errors import Refused
+from patchproof.base.geometry import corner_turns
 from patchproof.base.goal import GainWord, Goal, points_text
 from patchproof.base.input import open_image, read_json
+from patchproof.base.output import json_text
 from patchproof.base.sessions import RatePosterior, count_by_session, rate_posterior
 from patchproof.base.text import command_text
 from patchproof.base.validation import Finite, NotNegativeRange, Share, StrictModel, validate_model
@@ -74,10 +75,8 @@ class Marker(StrictModel):
     def _is_plausible(self) -> "Marker":
         if self.id >= int(self.dictionary.rpartition("_")[2]):
             raise ValueError(f"marker {self.id} is not in {self.dictionary}")
-        for i in range(4):  # twice the area of each corner's triangle, y down
-            (ax, ay), (bx, by), (cx, cy) = (self.corners_mm[(i + j) % 4] for j in range(3))
-            if (bx - ax) * (cy - by) - (by - ay) * (cx - bx) < _MIN_MARKER_MM**2:
-                raise ValueError(f"marker {self.id} must have clockwise corners and sides over {_MIN_MARKER_MM:g} mm")
+        if (corner_turns(np.array(self.corners_mm)) < _MIN_MARKER_MM**2).any():
+            raise ValueError(f"marker {self.id} must have clockwise corners and sides over {_MIN_MARKER_MM:g} mm")
         return self
 
 
@@ -297,7 +296,7 @@ def design_sha256(pixels: np.ndarray) -> str:
 
 def dump_manifest(manifest: Manifest) -> str:
     """Format a manifest as JSON; equal manifests give equal bytes."""
-    return json.dumps(manifest.model_dump(), indent=1, allow_nan=False) + "\n"
+    return json_text(manifest.model_dump())
 
 
 def load_manifest(path: str | Path) -> Manifest:

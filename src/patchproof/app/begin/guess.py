@@ -54,8 +54,8 @@ def guess_up(path: Path) -> tuple[UpAxis, str, str | None]:
     axis: UpAxis = "y" if kind in (*_GLTF, ".obj") else "z"
     doubt = lying_hint(load_mesh(path, 100.0, axis).vertices, axis)
     if doubt is not None and kind not in _GLTF:
-        return other_axis(axis), f"as it stands: {name} files say nothing", None
-    return axis, "glTF's standard" if kind in _GLTF else f"the habit of {name} files", doubt
+        return other_axis(axis), f"as it stands best: {name} files do not name the axis that is up", None
+    return axis, "glTF's standard" if kind in _GLTF else f"usual in {name} files", doubt
 
 
 def lying_hint(vertices: np.ndarray, up: UpAxis) -> str | None:
@@ -67,7 +67,7 @@ def lying_hint(vertices: np.ndarray, up: UpAxis) -> str | None:
     share, turned_share = footing(vertices), footing(turned)
     if share >= _LEAST_FOOTING or turned_share < max(_LEAST_FOOTING, _FOOTING_RATIO * share):
         return None
-    return f'it stands on {share:.0%} of its footprint so, with "{other_axis(up)}" on {turned_share:.0%}'
+    return f'this way up its base covers {share:.0%} of its footprint, with "{other_axis(up)}" up {turned_share:.0%}'
 
 
 def other_axis(up: UpAxis) -> UpAxis:

@@ -90,7 +90,7 @@ def _mesh_scene(
     if piece.side == "+y":
         azimuth, elevation = "of the camera to left and right of straight above", "from there toward the back"
     bend_comment = "paper follows the surface" if piece.bend else "a flat card lies close enough"
-    other_up = _line(f'# up = "{other_axis(up)}"', f"in its place if the preview shows it lying: {doubt}")
+    other_up = _line(f'# up = "{other_axis(up)}"', f"in its place if the preview shows it lying on its side: {doubt}")
     again = f"write the scene again with --up {other_axis(up)}: sides and sizes change with it"
     text = "\n".join(
         [
@@ -122,7 +122,7 @@ def _mesh_scene(
         ]
     )
     width, height = piece.size_mm
-    lying = f"; {doubt}: if the preview shows it lying, {again}" if doubt else ""
+    lying = f"; {doubt}: if the preview shows it lying on its side, {again}" if doubt else ""
     place = f"on its {SIDE_NAMES[piece.side]} ({piece.side})" if piece.side else "wherever the search finds"
     return text, [
         f'up: "{up}", {reason}{lying}',
@@ -141,11 +141,11 @@ def _folder_scene(folder: Path, base: Path, label: str | None, models) -> tuple[
         expected = "a CSV of labels among images, or a blank sheet's JSON in or beside the folder of photographs"
         raise Refused(expected, f"neither for {folder}", "put one there, or name a mesh")
     if not tables and len(manifests) > 1:
-        do = "lay the one that hangs there into the folder, the others elsewhere"
+        do = "keep the JSON of the blank on the object there, and move the others elsewhere"
         raise Refused("one blank sheet's JSON", ", ".join(path.name for path in manifests), do)
     if not tables:
         target = guess_label(_labels(models, base), label, folder.resolve().name)
-        sheet = _line(f"sheet = {_quoted(_path(manifests[0], base))}", "of the blank that hangs on the object there")
+        sheet = _line(f"sheet = {_quoted(_path(manifests[0], base))}", "of the blank on the object there")
         lines = ["[object]", f"photos = {_quoted(_path(folder, base))}", sheet, "", _line("[patch]", "as the blank's")]
         text = "\n".join([*_HEAD, *lines, "", *_target(target, models, base), ""])
         source = f"photographs: {folder}, with the blank of {manifests[0].name}"

@@ -116,7 +116,7 @@ def _up_warning(scene: Scene, settings: SceneSettings) -> tuple[str, ...]:
     up, name = settings.object.up, settings.object.mesh or ""
     if not isinstance(scene, MeshScene) or ":" in name or (doubt := lying_hint(scene.mesh.vertices, up)) is None:
         return ()
-    return (f'the object may lie: {doubt}. If it does, write up = "{other_axis(up)}" in [object]',)
+    return (f'the object may be lying on its side: {doubt}. If it is, write up = "{other_axis(up)}" in [object]',)
 
 
 def _unprintable(scene: Scene, network_px: int) -> str | None:

@@ -22,7 +22,7 @@ from patchproof.base.version import __version__
 Overwrite = Annotated[bool, Option("--overwrite", help="Replace this command's earlier output.")]
 Device = Annotated[str, Option(help="cpu or cuda.")]
 Seed = Annotated[int | None, Option(min=0, help="In place of the scene's own seed.")]
-Resume = Annotated[bool, Option("--resume", help="Go on where a run that was stopped left off.")]
+Resume = Annotated[bool, Option("--resume", help="Continue a stopped run.")]
 Jobs = Annotated[
     int | None, Option(min=1, help="Local processes, one for each free core; any number gives the same results.")
 ]
@@ -98,7 +98,7 @@ def _say_version(requested: bool) -> None:
 
 def version_option(
     version: Annotated[
-        bool, Option("--version", callback=_say_version, is_eager=True, help="Say the version and exit.")
+        bool, Option("--version", callback=_say_version, is_eager=True, help="Print the version and exit.")
     ] = False,
 ) -> None:
     """Options before the verb."""
@@ -122,7 +122,7 @@ def run_command_line(app: Typer) -> None:
         elif isinstance(error, MemoryError) or _NO_MEMORY.search(str(error)):
             sentence = "Expected enough memory, got none left: give it more, fewer --jobs, or smaller files."
         elif isinstance(error, OSError):
-            sentence = printable(f"Expected files that can be read and written, got {error}: mend that and try again.")
+            sentence = printable(f"Expected files that can be read and written, got {error}: fix that and try again.")
         else:
             raise
         print(sentence, file=sys.stderr)

@@ -20,7 +20,7 @@ PhotographedControl = Literal["bare", "mean", "gray", "noise"]  # that can hang 
 
 def demo(
     out: Annotated[Path, Option(help="Folder for all of it.")] = Path("patchproof-demo"),
-    imagenet: Annotated[bool, Option("--imagenet", help="Before a network of photographs.")] = False,
+    imagenet: Annotated[bool, Option("--imagenet", help="Use an ImageNet network.")] = False,
     open_report: Annotated[bool, Option("--open", help="Open the report in the browser at the end.")] = False,
     jobs: Jobs = None,
     overwrite: Overwrite = False,
@@ -146,7 +146,7 @@ def promise(
 
     with progress_bar() as bar:
         finished_run = promise_run(run, views=n, trust=trust, compute=Compute(device, jobs or 1), progress=bar)
-    say(*run_lines(finished_run), "A page that was written before has the former promise.")
+    say(*run_lines(finished_run), "Sheets made before hold the former promise: make them again.")
 
 
 def sheet(
@@ -158,8 +158,8 @@ def sheet(
     template: Annotated[str | None, Option(help="A template's name or file.")] = None,
     control: Annotated[PrintableControl | None, Option(help="The sheet of a control in place of the design's.")] = None,
     copies: Annotated[int, Option(min=1, max=1000, help="Pages of the same, for label rolls.")] = 1,
-    check: Annotated[bool, Option("--check", help="Say what a print shop needs to know.")] = False,
-    templates: Annotated[bool, Option("--list", help="Say which templates there are.")] = False,
+    check: Annotated[bool, Option("--check", help="Print instructions for a print shop.")] = False,
+    templates: Annotated[bool, Option("--list", help="List the templates.")] = False,
     trust: Trust = False,
     overwrite: Overwrite = False,
 ) -> None:
@@ -316,5 +316,5 @@ def verify(
         see = "Expected photographs that can be judged or measured, got none: see the codes in the report."
         print(see, file=sys.stderr)
     if require == "kept" and summary.meets("kept") and not summary.meets("helps"):
-        print("The promise held, and the patch is not shown to help: --require helps asks for both.", file=sys.stderr)
+        print("The promise is kept, but the patch is not shown to help: --require helps needs both.", file=sys.stderr)
     raise Exit(1 if nothing or (require is not None and not summary.meets(require)) else 0)

@@ -94,14 +94,13 @@ def resolution_plan(problem: Problem) -> PlanData:
     """
     scene, subject = problem.scene, problem.subject
     patch = subject if isinstance(subject, Patch) else None
-    network_px = max(classifier.input_px for classifier in problem.classifiers)
     network, photo = (
         np.quantile(scene.px_per_mm(size_px), [1 - READABLE_SHARE, READABLE_SHARE]).tolist()
-        for size_px in ((network_px, network_px), scene.photo_px)
+        for size_px in ((problem.network_px, problem.network_px), scene.photo_px)
     )
-    closest = scene.closest_px_per_mm((network_px, network_px))
+    closest = scene.closest_px_per_mm((problem.network_px, problem.network_px))
     return {
-        "network_px": network_px,
+        "network_px": problem.network_px,
         "photo_px": scene.photo_px,
         "px_per_mm_network": network,
         "px_per_mm_photo": photo,
@@ -211,9 +210,9 @@ def _marker_line(scene: PieceScene, family: str) -> str:
 def _term_lines(terms: PlanData, draft: PlanData) -> list[str]:
     lines = [
         f"error if not modeled ({terms['views']} views of a draft of {draft['steps']} steps, rate "
-        f"{draft['rate']:.0%}, before the first classifier)",
-        f"  {'':23} {'codes: mean':>11} {'95 %':>6}   {'confidence':<15}  (what adds up to less than "
-        f"{terms['threshold']:.3f} can go: selection cannot tell)",
+        f"{draft['rate']:.0%}, on the first classifier)",
+        f"  {'':23} {'codes: mean':>11} {'95 %':>6}   {'confidence':<15}  (terms that add up to less than "
+        f"{terms['threshold']:.3f} can be left out: they change no choice of a design)",
     ]
     on = {name: error for name, error in terms["errors"].items() if error["verdict"] != "off"}
     off = [f"{name} ({error['key'] or 'no setting'})" for name, error in terms["errors"].items() if name not in on]
@@ -223,9 +222,9 @@ def _term_lines(terms: PlanData, draft: PlanData) -> list[str]:
 
 
 def _term_line(name: str, error: PlanData) -> str:
-    words = {"missing": "missing in training", "left out": "rightly left out"}
+    words = {"missing": "missing in training", "left out": "left out, negligible"}
     verdict, key = words.get(error["verdict"], error["verdict"]), f" ({error['key']})" if error["key"] else ""
-    verdict = "matters little" if verdict == "can go" and not key else verdict
+    verdict = "negligible" if verdict == "can go" and not key else verdict
     unseen = "; training's views do not show it" if error.get("in_training") is False else ""
     codes = f"{error['codes_mean']:11.2f} {error['codes_p95']:6.1f}"
     return f"  {name:23} {codes}   {error['confidence']:.3f} ({error['bias']:+.3f})   {verdict}{key}{unseen}"
