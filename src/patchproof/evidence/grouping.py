@@ -4,7 +4,7 @@ In: the folder of the photographs; then the measured photographs with their `Tra
 known. Folders in the folder are sessions, but folders that look like one session are merged, with a sentence that says
 so, or that nothing is known of them: photographs of one camera within two minutes are one session, unless folders of
 several look clearly different; within half an hour, or where times are unknown, like light and background make one
-session: folders' means differ by no more than photographs within folders do. Without folders, times decide: another
+session: the means of what is joined so far differ by no more than photographs within folders do. Without folders, times decide: another
 camera, or a pause of half an hour, begins a new session. Without times all are one session: the cautious assumption,
 since photographs of one session count for less. Also: the sessions of controls.
 Copies count once: files with equal bytes, and in a session those in which light and the sheet's place differ by no more
@@ -126,19 +126,19 @@ def merge_folders(grouping: Grouping, photos: Sequence[MeasuredPhoto]) -> Groupi
     freedom = USUAL_WEIGHT + sum(len(each) - 1 for each in several)
     variance = (USUAL_WEIGHT * USUAL_SPREAD**2 + sum(len(each) * each.var(0) for each in several)) / freedom
     means = np.array([np.mean(look, 0) if look else np.full(len(variance), np.nan) for look in looks])
-    shares = partial(_distance_shares, means, np.array([len(look) for look in looks]), variance, freedom)
-    same_as, unknown, gaps = np.arange(len(looks)), set(), _minutes_apart(sorted(timed))
-    if gaps:
-        for (i, j), gap, share in zip(gaps, gaps.values(), shares(*np.transpose(list(gaps))), strict=True):
-            apart = share > APART and min(len(looks[i]), len(looks[j])) > 1
-            if (gap <= MOVE_MINUTES and not apart) or share <= ALIKE:
-                _join(same_as, [i, j])
-    for i in sorted(set(range(len(looks))) - {number for *_, number in timed}):
-        share = shares(i, np.arange(len(looks)))
-        share[i] = 0
-        unknown |= {i, *np.flatnonzero(np.isnan(share)).tolist()} if np.isnan(share).any() else set()
-        _join(same_as, share <= ALIKE)
-    same_as = same_as.tolist()
+    counts = np.array([len(look) for look in looks])
+    shares = partial(_distance_shares, variance, freedom)
+    same_as, near = np.arange(len(looks)), dict[int, set[int]]()
+    untimed = np.setdiff1d(same_as, [number for *_, number in timed])
+    for (i, j), gap in _minutes_apart(sorted(timed)).items():
+        near.setdefault(i, set()).add(j)
+        near.setdefault(j, set()).add(i)
+        few = min(counts[i], counts[j]) < 2
+        if gap <= MOVE_MINUTES and (few or shares(means[i], counts[i], means[j], counts[j]) <= APART):
+            _join(same_as, [i, j])
+    _join_alike(same_as, means, counts, shares, near, untimed)
+    unread = np.flatnonzero(counts == 0).tolist()
+    unknown, same_as = {*untimed.tolist(), *unread} if len(untimed) and unread else set(), same_as.tolist()
     names, groups, notes = [name or "(no folder)" for name in grouping.names], dict[int, list[str]](), []
     for name, number in zip(names, same_as, strict=True):
         groups.setdefault(number, []).append(name)
@@ -212,6 +212,30 @@ def _minutes_apart(timed: Sequence[tuple[str, float, int]]) -> dict[tuple[int, i
     return gaps
 
 
+def _join_alike(
+    same_as: np.ndarray, means: np.ndarray, counts: np.ndarray, shares: Any, near: Any, untimed: Any
+) -> None:
+    """Join each group to the earlier one that it is most like, if these are alike and `near` in time, or the time of a
+    folder is unknown. Means of whole groups are compared: chance would chain single folders of different sessions.
+    """
+    total, number = np.zeros_like(means), np.bincount(same_as, counts, len(counts))
+    np.add.at(total, same_as, np.nan_to_num(means) * counts[:, None])
+    free, first = np.zeros((2, len(counts)), bool)
+    free[same_as[untimed]] = True
+    for i in np.unique(same_as).tolist():
+        allowed = free | free[i]
+        allowed[[same_as[j] for folder in np.flatnonzero(same_as == i).tolist() for j in near.get(folder, ())]] = True
+        rows = np.flatnonzero(allowed & first & (number > 0))
+        share = shares(total[rows] / number[rows, None], number[rows], total[i] / max(number[i], 1), number[i])
+        if number[i] and share.min(initial=1.0) <= ALIKE:
+            group = rows[share.argmin()]
+            for values in (total, number, free):
+                values[group] += values[i]
+            _join(same_as, [group, i])
+        else:
+            first[i] = True
+
+
 def _join(same_as: np.ndarray, folders: list[int] | np.ndarray) -> None:
     """Make one session, named by its first folder, of all that these folders are part of."""
     numbers = same_as[folders]
@@ -228,16 +252,16 @@ def _look(photo: MeasuredPhoto) -> np.ndarray | None:
 
 
 def _distance_shares(
-    looks: np.ndarray, photos: np.ndarray, variance: np.ndarray, freedom: int, i: Any, j: Any
+    variance: np.ndarray, freedom: int, looks: np.ndarray, photos: Any, look: np.ndarray, count: Any
 ) -> np.ndarray:
-    """The shares of pairs of parts of one session that are more alike than folders `i` and `j`; NaN if unknown.
-    `looks` are the folders' means, of so many `photos`.
+    """The shares of pairs of parts of one session, of `photos` and `count`, that are more alike than those with the
+    mean `looks` and the one with the mean `look`.
     """
     from scipy.special import fdtr
 
-    with np.errstate(divide="ignore"):  # of folders without looks, which are NaN
-        noise = 1 / photos[i] + 1 / photos[j]
-    return fdtr(len(variance), freedom, ((looks[i] - looks[j]) ** 2 / variance).mean(-1) / noise)
+    with np.errstate(divide="ignore"):  # of folders without looks
+        noise = 1 / np.asarray(photos) + 1 / np.asarray(count)
+    return fdtr(len(variance), freedom, ((looks - look) ** 2 / variance).mean(-1) / noise)
 
 
 def reject_copies(photos: Sequence[MeasuredPhoto], session: Sequence[int], rect_mm: Rect) -> list[MeasuredPhoto]:
