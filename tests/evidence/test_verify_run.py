@@ -440,6 +440,17 @@ def test_controls_that_show_nothing_never_count_and_are_named(few, tmp_path):
     assert (control.recognized, control.n) == (0, 1)
 
 
+def test_the_patch_s_own_photographs_are_no_control(few, tmp_path):
+    (tmp_path / "mean").mkdir()
+    for name, as_name in (("a.JPG", "copied.jpg"), ("b0.jpg", "b0.jpg")):
+        (tmp_path / "mean" / as_name).write_bytes((few / name).read_bytes())
+    save(half_lit(20), tmp_path / "mean/own.jpg")
+    evidence = verified(few, controls=tmp_path)
+    (control,) = evidence.controls
+    assert control.n == 1
+    assert "mean/copied.jpg has the bytes of a.JPG, which counts once" in evidence.summary.left_out
+
+
 @pytest.mark.parametrize(("contrast", "nothing"), [(1, True), (3, False)])
 def test_two_tones_show_something_from_a_code_or_two_on(contrast, nothing):
     picture = np.full((240, 320, 3), 90, np.uint8)

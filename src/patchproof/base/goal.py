@@ -49,13 +49,13 @@ class Goal(StrEnum):
         return "does_not_help" if high < LEAST_GAIN else "helps" if low > 0 else "cannot_tell"
 
     def hardest(self, differences: Mapping[str, tuple[float, float]]) -> str:
-        """The control that decides: one that rules a gain out, else one that cannot tell, else that of the least gain;
-        of controls that are not beaten, the bare object.
+        """The control that decides: of those that rule a gain out, else of those that cannot tell, else of all, the one
+        with the least gain in the middle of its interval.
         """
 
-        def order(name: str) -> tuple[bool, bool, bool, tuple[float, float]]:
-            word, gains = self.answer(differences[name]), self.gains(differences[name])
-            return word != "does_not_help", word == "helps", word != "helps" and name != "bare", gains
+        def order(name: str) -> tuple[bool, bool, float]:
+            word = self.answer(differences[name])
+            return word != "does_not_help", word == "helps", sum(self.gains(differences[name]))
 
         return min(differences, key=order)
 

@@ -129,15 +129,16 @@ def gather_evidence(
         skipped = list_skipped_files(controls_folder, depth=2)
         left_out += [f"{printable(controls_folder.name)}: {text}" for text in skipped]
     left_out += summarize_said((item.name, result.entry.said) for item, result in zip(items, results, strict=True))
-    by_sha256: dict[str, dict[str, MeasuredPhoto]] = {}
+    controls: dict[str, list[MeasuredPhoto]] = {}
+    first_of = {photo.entry.sha256: photo.entry.file for photo in reversed(patch_photos)}  # a patch's are no control's
     for item, result in zip(items[count:], results[count:], strict=True):
-        name, entry = item.control or "", result.entry
-        first = by_sha256.setdefault(name, {}).setdefault(entry.sha256 or item.name, result).entry
-        if first is not entry:
-            left_out.append(f"{name}/{entry.file} has the bytes of {name}/{first.file}, which counts once")
-        elif entry.status == "rejected" and entry.remark is not None:
-            left_out.append(f"{name}/{entry.file} does not count: {entry.remark.advice}")
-    controls = {name: list(photos.values()) for name, photos in by_sha256.items()}
+        entry, file = result.entry, f"{item.control}/{result.entry.file}"
+        if (first := first_of.setdefault(entry.sha256 or file, file)) != file:
+            left_out.append(f"{file} has the bytes of {first}, which counts once")
+            continue
+        controls.setdefault(item.control or "", []).append(result)
+        if entry.status == "rejected" and entry.remark is not None:
+            left_out.append(f"{file} does not count: {entry.remark.advice}")
     look = look_at([photo.entry for photo in patch_photos])
     report = report_of(manifest, judges, patch_photos, grouping, controls, ledger, options.ruler_mm, look, estimate)
     missing = {}

@@ -4,9 +4,9 @@ In: the folder of the photographs; then the measured photographs with their `Tra
 known. Folders in the folder are sessions, but folders that look like one session are merged, with a sentence that says
 so, or that nothing is known of them: photographs of one camera within two minutes are one session, unless folders of
 several look clearly different; within half an hour, or where times are unknown, like light and background make one
-session: the means of what is joined so far differ by no more than photographs within folders do. Without folders, times decide: another
-camera, or a pause of half an hour, begins a new session. Without times all are one session: the cautious assumption,
-since photographs of one session count for less. Also: the sessions of controls.
+session: the means of what is joined so far differ by no more than photographs within folders do. Without folders, times
+decide: another camera, or a pause of half an hour, begins a new session. Without times all are one session: the
+cautious assumption, since photographs of one session count for less. Also: the sessions of controls.
 Copies count once: files with equal bytes, and in a session those in which light and the sheet's place differ by no more
 than between two shots of a hand-held camera: a centimeter in half a meter, a degree or two, an aim that is off by a
 hundredth of the picture, exposures that differ by a fourteenth of a stop.
@@ -228,7 +228,7 @@ def _join_alike(
         rows = np.flatnonzero(allowed & first & (number > 0))
         share = shares(total[rows] / number[rows, None], number[rows], total[i] / max(number[i], 1), number[i])
         if number[i] and share.min(initial=1.0) <= ALIKE:
-            group = rows[share.argmin()]
+            group = int(rows[share.argmin()])
             for values in (total, number, free):
                 values[group] += values[i]
             _join(same_as, [group, i])
