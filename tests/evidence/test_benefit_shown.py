@@ -127,7 +127,7 @@ def test_the_strongest_evidence_decides_alone_and_is_named():
         return benefit_of(40, 0.5, (0.35, 0.65), controls, promise, estimate)
 
     photographed = worth([beside("gray", 22), beside("bare", 18)], HELPFUL, rendered)
-    assert (photographed.control, photographed.word, photographed.source) == ("bare", "cannot_tell", "photographed")
+    assert (photographed.control, photographed.word, photographed.source) == ("gray", "cannot_tell", "photographed")
     assert worth([beside("bare", 4)], HARMFUL, rendered).word == "helps"
     unjudged = [Control("bare", 0, 0, (0, 1))]
     low = promise_with(0.9, 0.1, 0.7, 0.9)  # whose bare object the patch beats, so that the rendered mean decides

@@ -58,6 +58,15 @@ def test_markers_follow_from_the_views(tmp_path):
     assert any("can be measured: others show markers of 19.5 mm too small" in warning for warning in far.warnings)
 
 
+def test_views_that_cut_the_piece_off_are_said_to_be_unreadable(tmp_path):
+    text = SCENE.replace("[500, 900]", "[400, 450]")
+    whole, close = (scene_of(tmp_path, text.replace("[view]", f"[view]\nfov_deg = {fov}")) for fov in (40, 5))
+    assert whole.unreadable_share <= 0.05 and not any("beyond the edge" in each for each in whole.warnings)
+    assert close.unreadable_share > 0.9  # 5 degrees at 450 mm show 39 mm of the piece's 90
+    (warning,) = [each for each in close.warnings if "beyond the edge of the picture in" in each]
+    assert "100% of photographs: raise view.fov_deg" in warning
+
+
 def test_the_outer_markers_of_bent_paper_turn_away_before_its_middle_does():
     """Paper over 100° of a can: from 60° to a side its far markers face 110° away, its middle is seen."""
     can = trimesh.creation.cylinder(40, 120, sections=48)

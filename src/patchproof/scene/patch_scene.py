@@ -171,8 +171,13 @@ def _place_piece(scene: MeshScene) -> tuple[Piece, Placement, float, tuple[str, 
         # were readable, of 40 to 90 mm 26 of 168 where 21 to 100 % were.
         few = "few photographs of rolled paper under 100 mm can be measured: the others only count"
         notes += (few,) if min(patch.size_mm) < 100 else ()
-    unreadable = float((scales * piece.module_mm < interface.PX_PER_MODULE * 0.999).mean()) if piece.markers else 0.0
-    if unreadable > 1 - interface.READABLE_SHARE:
+    shown = _in_picture(scene, placement)
+    if shown.mean() < interface.READABLE_SHARE:
+        advice = "raise view.fov_deg or view.distance_mm, or lower view.look_at_jitter"
+        notes += (f"the piece lies beyond the edge of the picture in {1 - shown.mean():.0%} of photographs: {advice}",)
+    too_small = scales * piece.module_mm < interface.PX_PER_MODULE * 0.999
+    unreadable = float((too_small | ~shown).mean()) if piece.markers else 0.0
+    if piece.markers and too_small.mean() > 1 - interface.READABLE_SHARE:
         advice = "narrow view.azimuth_deg and view.elevation_deg, or make the piece smaller"
         if needed_mm > marker_mm + 0.05:
             advice = (
@@ -182,6 +187,14 @@ def _place_piece(scene: MeshScene) -> tuple[Piece, Placement, float, tuple[str, 
         measurable = interface.measurable_text(unreadable, placement.family)
         notes += (f"{measurable}: others show markers of {marker_mm:.1f} mm too small: {advice}",)
     return piece, placement, unreadable, notes
+
+
+def _in_picture(scene: MeshScene, placement: Placement) -> np.ndarray:
+    """True for each view that shows three of the piece's corners or more, without which no sheet can be measured."""
+    poses = camera_poses(scene, placement.center_mm, scene.draw("select", SCALE_VIEWS, 0).pose)
+    corners = placement.world(geometry.rect_corners((0, 0, *placement.size_mm)))
+    pixels = np.stack([geometry.project(scene.matrix_px(scene.photo_px), pose, corners) for pose in poses])
+    return ((pixels >= 0) & (pixels <= scene.photo_px)).all(2).sum(1) >= 3
 
 
 def _smallest_scales(scene: MeshScene, card: Placement) -> np.ndarray:
