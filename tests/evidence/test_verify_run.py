@@ -136,6 +136,18 @@ def test_a_design_of_one_color_is_told_from_others_by_structure_ink_and_color():
     assert measured(photo, manifest=make_manifest(design=gray)).entry.code == "wrong_ink"
 
 
+@pytest.mark.parametrize(
+    ("ink", "code"), [((190, 30, 40), None), ((40, 150, 60), "other_design"), ((30, 50, 160), "other_design")]
+)
+def test_a_logo_in_one_ink_on_white_is_told_from_itself_in_another_ink(ink, code):
+    logo = np.full((140, 140, 3), 255, np.uint8)
+    cv2.putText(logo, "GO", (12, 95), cv2.FONT_HERSHEY_SIMPLEX, 2.4, (0, 0, 0), 22)
+    as_printed = lambda color: np.where(logo < 128, np.uint8(color), logo)  # noqa: E731
+    page = page_raster(make_manifest(design=as_printed(ink)), True)
+    photo = photograph(page, view(10, 5, 550, size_px=(800, 600)), (800, 600), blur_px=0.5, fine=2)
+    assert measured(photo, manifest=make_manifest(design=as_printed((190, 30, 40)))).entry.code == code
+
+
 @pytest.mark.parametrize(("shown", "code"), [(0.23, None), (0.9, "other_design")])
 def test_a_plain_design_whose_small_markers_look_lighter_by_blur_is_no_other(shown, code):
     """Their ink shows 0.24 of the paper's light, as under a veil; without one the design is a little light."""

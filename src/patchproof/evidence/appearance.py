@@ -14,6 +14,7 @@ weakest had 0.32 of the strongest's, on prints without it 0.14. Left out on purp
 that only a composite black would show.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -45,7 +46,7 @@ LEAST_FOUND = 0.35  # of the cells with detail, in their places: other designs s
 LEAST_LIKENESS = 0.6  # correlation of structure
 LEAST_INK, WEAK_INK = 0.2, 0.3  # contrast: of the strongest ink's
 _LEAST_PLAIN_INK = 0.55  # the same of grays without structure, by the light absorbed: real prints have 0.65 and more
-_MOST_COLOR = 30.0  # ΔE00 without structure: real prints are off by 5 to 17
+_MOST_COLOR = 36.0  # ΔE00 of one color: 177 of real prints are off by 27 at most from `office`, by 35 from `coated`
 _LEAST_CELLS, _LEAST_DETAILED = 40, 6
 # of the square root of light: promised, and shown where none is: glare makes 0.04, other designs 0.09 and more
 _LEAST_STRUCTURE, _MOST_STRUCTURE = 0.01, 0.065
@@ -229,10 +230,10 @@ def match_design(seen: np.ndarray, promised: np.ndarray, usable: np.ndarray, lig
     shown, promised = np.clip(seen / paper, 0, 1.2), np.sqrt(np.clip(promised, 0, 1))
     seen = np.sqrt(np.clip((shown - veil) / (1 - veil), 0, 1.2))
     y, x = (_less_surroundings(v, usable)[usable] for v in (seen, promised))
-    means = [np.median(each[usable], 0) for each in (seen, np.sqrt(shown))], promised[usable].mean(0)
+    looks, promised = (seen[usable], np.sqrt(shown[usable])), promised[usable]
     structure_x, structure_y = (float(np.median(np.abs(v))) for v in (x, y))  # medians: blur spreads markers' light
     if structure_x < _LEAST_STRUCTURE:
-        return DesignMatch(trouble=_plain_trouble(*means, structure_y))
+        return DesignMatch(trouble=_plain_trouble(looks, promised, structure_y))
     gains = _robust_gains(x, y)
     likeness, diagonal = float(np.corrcoef((x @ gains).ravel(), y.ravel())[0, 1]), np.diag(gains)
     largest, second, _ = np.linalg.svd(gains, compute_uv=False)
@@ -241,18 +242,23 @@ def match_design(seen: np.ndarray, promised: np.ndarray, usable: np.ndarray, lig
     if not likeness >= LEAST_LIKENESS or diagonal.max() <= 0:  # a negative is another design
         return DesignMatch(likeness)
     own = np.linalg.svd(x, compute_uv=False)
-    if own[2] < _LEAST_COLORFUL * own[0]:  # a design in gray or two inks does not tell their contrasts apart
-        return DesignMatch(likeness, _plain_trouble(*means, 0.0))
+    if own[2] < _LEAST_COLORFUL * own[0]:  # a design in gray or two inks tells no contrasts: compare its two colors
+        centered = promised - promised.mean(0)
+        along = centered @ np.linalg.svd(centered, full_matrices=False)[2][0]
+        low, high = np.quantile(along, (0.02, 0.98)) @ [[0.75, 0.25], [0.25, 0.75]]
+        troubles = (_plain_trouble([c[end] for c in looks], promised[end], 0.0) for end in (along < low, along > high))
+        return DesignMatch(likeness, next(filter(None, troubles), None))
     if contrast < LEAST_INK:
         return DesignMatch(likeness, PhotoRejected("wrong_ink", contrast, LEAST_INK, _INK_ADVICE.format(ink)))
     weak = Remark(code="weak_ink", figure=contrast, threshold=WEAK_INK, advice=_WEAK_ADVICE.format(ink))
     return DesignMatch(likeness, weak_ink=weak if contrast < WEAK_INK else None)
 
 
-def _plain_trouble(seen: list[np.ndarray], promised: np.ndarray, structure: float) -> PhotoRejected | None:
-    """Compare square roots of light (3,) of a design without structure, less the veil and with it, and what structure
-    was seen. The nearer one counts, since blur lightens the ink of small markers as a veil does.
+def _plain_trouble(seen: Sequence[np.ndarray], promised: np.ndarray, structure: float) -> PhotoRejected | None:
+    """Compare square roots of light N×3 of cells of one color, less the veil and with it, and what structure was seen.
+    The nearer one counts, since blur lightens the ink of small markers as a veil does.
     """
+    seen, promised = [np.median(each, 0) for each in seen], promised.mean(0)
     if structure > _MOST_STRUCTURE:
         return PhotoRejected("other_design", structure, _MOST_STRUCTURE, _OTHER_ADVICE)
     absorbed, is_gray = (1 - seen[0]) / np.maximum(1 - promised, 0.1), (1 - promised).min() > 0.6 * (1 - promised).max()
