@@ -160,9 +160,11 @@ def test_what_is_not_four_corners_is_refused(tmp_path, text, message):
 
 @pytest.fixture(scope="module")
 def printed(tmp_path_factory):
-    """A print that exists, larger than its scene's page: run/, print.json, and photographs with corners.csv."""
+    """A print that exists, larger than its scene's page, on which the scene's own piece would not lie either: run/,
+    print.json, and photographs with corners.csv.
+    """
     folder = tmp_path_factory.mktemp("printed")
-    toml(folder / "scene.toml", camera__photo_px=[480, 360])
+    toml(folder / "scene.toml", camera__photo_px=[480, 360], patch__width_mm=900, patch__height_mm=900)
     run = import_patch(design_of(0), folder / "scene.toml", folder / "run", as_printed=(160, 160), promise=DRAFT)
     sheet_of(run, folder / "print.json")
     reprint(folder / "print.json", run, 4, folder / "photos", sessions=2)

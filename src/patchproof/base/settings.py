@@ -288,9 +288,15 @@ def background_summary(settings: Mapping[str, Any]) -> str:
     return "in synthetic rooms" if images is None else f"before pictures ({Path(images).name})"
 
 
-def load_scene_settings(path: str | Path) -> SceneSettings:
-    """Load a scene file's settings with `${VAR}` unexpanded, so that a run does not depend on where its files lie."""
-    return validate_model(SceneSettings, read_toml(path), str(path))
+def load_scene_settings(path: str | Path, **tables: Mapping[str, Any]) -> SceneSettings:
+    """Load a scene file's settings with `${VAR}` unexpanded, so that a run does not depend on where its files lie; keys
+    of `tables` go before the file's.
+    """
+    read = read_toml(path)
+    for name, keys in tables.items():
+        if keys and isinstance(table := read.setdefault(name, {}), dict):
+            table |= keys
+    return validate_model(SceneSettings, read, str(path))
 
 
 def identity_settings(settings: StrictModel) -> dict[str, Any]:

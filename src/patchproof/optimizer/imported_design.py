@@ -35,7 +35,6 @@ from patchproof.photo.detect import find_markers
 from patchproof.photo.read import read_photo
 from patchproof.photo.rejection import PhotoRejected
 from patchproof.scene.interface import PieceScene, Scene, require_piece
-from patchproof.scene.scene import build_scene
 from patchproof.sheets.manifest import design_sha256
 from patchproof.sheets.piece import Piece, marker_image
 
@@ -76,13 +75,12 @@ def import_patch(
     """
     out, compute = Path(out), compute.without("import_patch", cluster=True)
     check_folder(out, RUN_FILE_PATTERNS, overwrite, inputs=(picture, scene))
-    (file, sha256, pixels, said), scene = _read_picture(picture), resolve_scene(scene, seed)
-    if as_printed is not None:
-        patch, sheet = dict(zip(("width_mm", "height_mm"), as_printed, strict=True)), {"template": NO_PAGE}
-        settings = scene.settings.changed(patch=patch, sheet=sheet | {"markers": False})
-        built = build_scene(settings, scene.base, scene.seed, mesh_glb=scene.mesh_glb)
-        scene = replace(built, given_models=scene.given_models)
-    scene = require_piece(scene, _NO_TEXTURE)
+    file, sha256, pixels, said = _read_picture(picture)
+    tables: dict[str, dict[str, Any]] = {}
+    if as_printed is not None:  # in place of the scene's own piece, which need not fit
+        tables["patch"] = dict(zip(("width_mm", "height_mm"), as_printed, strict=True))
+        tables["sheet"] = {"template": NO_PAGE, "markers": False}
+    scene = require_piece(resolve_scene(scene, seed, **tables), _NO_TEXTURE)
     fitted, scene = fit_to_piece(pixels, scene), scene.for_design(sha256)
     problem = set_problem(scene, compute.device, models, jobs=compute.jobs)
     problem = replace(problem, subject=replace(problem.patch, design_px=fitted.shape[1::-1]))

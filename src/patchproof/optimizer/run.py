@@ -28,7 +28,7 @@ from patchproof.base.folder_lock import lock_folder
 from patchproof.base.input import is_file, read_file, read_json, read_text
 from patchproof.base.output import CHECKPOINT_FILE, RUN_FILE, require_finished_run
 from patchproof.base.progress import Advance, Compute, Progress, no_progress
-from patchproof.base.settings import SceneSettings, named_paths
+from patchproof.base.settings import SceneSettings, load_scene_settings, named_paths
 from patchproof.base.text import short_repr
 from patchproof.base.validation import refuse_untrusted, validate_model
 from patchproof.base.version import __version__
@@ -48,7 +48,7 @@ from patchproof.optimizer.subject import (
 )
 from patchproof.scene.interface import Scene
 from patchproof.scene.patch_scene import PatchScene
-from patchproof.scene.scene import build_scene, load_scene
+from patchproof.scene.scene import build_scene
 from patchproof.sheets.manifest import MAX_PRINTED_PX, Promise
 
 _LOG_FILE, _VIEWS_FILE = "steps.jsonl", "views.png"
@@ -168,13 +168,18 @@ def effort_of(
     return steps or limit(effort[0], scene.settings.optimize.steps), views or effort[1]
 
 
-def resolve_scene(scene: str | Path | Scene, seed: int | None) -> Scene:
-    """Return a scene, or load that of a file with `seed` in place of the file's; a scene in memory keeps its own."""
+def resolve_scene(scene: str | Path | Scene, seed: int | None, **tables: Mapping[str, Any]) -> Scene:
+    """Return a scene, or load that of a file with `seed` in place of the file's; a scene in memory keeps its own. Keys
+    of `tables` go before the scene's.
+    """
     if not isinstance(scene, Scene):
-        return load_scene(scene, seed)
+        return build_scene(load_scene_settings(scene, **tables), Path(scene).resolve().parent, seed)
     if seed not in (None, scene.seed):
         raise Refused(f"the seed of the scene in memory, {scene.seed}", f"{seed}", "leave seed out, or name a file")
-    return scene
+    if not tables:
+        return scene
+    built = build_scene(scene.settings.changed(**tables), scene.base, scene.seed, mesh_glb=scene.mesh_glb)
+    return replace(built, given_models=scene.given_models)
 
 
 def _choose_place(

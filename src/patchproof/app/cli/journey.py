@@ -93,14 +93,13 @@ def import_picture(
     from patchproof.optimizer.imported_design import import_patch
     from patchproof.optimizer.promise import PromiseOptions
     from patchproof.report.words import imported_lines, run_lines
-    from patchproof.scene.scene import load_scene
 
     with progress_bar() as bar:
-        loaded = load_scene(scene, seed)
-        warn(loaded.warnings)
         options: dict[str, Any] = {"promise": PromiseOptions(promise), "compute": Compute(device, jobs or 1)}
         size_mm = None if as_printed is None else console.pair_of(as_printed, "--as-printed")
-        run = import_patch(picture, loaded, out, as_printed=size_mm, **options, overwrite=overwrite, progress=bar)
+        options |= {"overwrite": overwrite, "progress": bar}
+        run = import_patch(picture, scene, out, as_printed=size_mm, seed=seed, **options)
+    warn(run.scene.warnings)
     say(*imported_lines(run.details["imported"]), *run_lines(run))
 
 
