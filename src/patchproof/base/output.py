@@ -65,9 +65,8 @@ def check_folder(
     unfinished: bool = False,
     inputs: Iterable[object] = (),
 ) -> None:
-    """Refuse a folder with files in it, unless they may be overwritten: such commands wrote them all, by the folder's
-    listing and by `file_names`, the patterns of names that this command writes, and none of its `inputs` is among them.
-    For an `unfinished` folder the refusal says how to continue.
+    """Refuse a folder with files in it, unless they may be overwritten: its listing and `file_names`, the patterns that
+    this command writes, cover them all, and no `inputs` are among them. If `unfinished`, say how to continue.
     """
     if os.path.lexists(out) and not is_folder(out):
         raise Refused("a folder to write to", f"{out}, which is not a folder", _ANOTHER)
@@ -243,9 +242,7 @@ def image_bytes(pixels: np.ndarray, kind: str, options: Mapping[str, Any] | None
 
 
 def write_pictures(pictures: Sequence[np.ndarray], folder: Path) -> Path:
-    """Write uint8 H×W×3 sRGB arrays as photo_0001.png and so on into a folder, in place of earlier ones; returns the
-    folder. Refused for an empty list, or an array of another type or shape.
-    """
+    """Replace a folder's pictures by uint8 H×W×3 sRGB arrays, photo_0001.png and so on; refuses none, or others."""
     if not len(pictures):
         raise Refused("a folder of photographs or arrays", "an empty list", "give one array or more")
     for number, array in enumerate(pictures):

@@ -52,9 +52,7 @@ _SEARCH_MM = 60.0  # bare paper is searched for within this distance of the char
 
 @dataclass(frozen=True)
 class ChartPhoto:
-    """`light` N×3 relative to paper, one row per swatch of the manifest's chart, NaN where it could not be read, and
-    the light of bare `paper` under the chart (1 = the camera's full white).
-    """
+    """Swatches' `light` N×3 relative to paper (NaN: unread), and that of bare `paper` (1 = the camera's full white)."""
 
     light: np.ndarray
     paper: tuple[float, float, float]
@@ -225,9 +223,7 @@ def read_chart(photo: Photo, manifest: Manifest) -> ChartPhoto:
 
 
 def _find_page(srgb: np.ndarray, manifest: Manifest) -> tuple[np.ndarray, float]:
-    """Find the chart's page by the markers beside the piece; the piece's own help where it is not cut out. Returns the
-    homography from millimeters to pixels, and the blur in pixels.
-    """
+    """Return the chart page's homography mm → px and blur in px, by markers beside the piece, and its own if uncut."""
     dictionary = manifest.markers[0].dictionary
     on_page = {marker.id: marker for marker in manifest.markers if marker.page == manifest.chart[0].page}
     corners_mm = {i: np.array(marker.corners_mm) for i, marker in on_page.items()}

@@ -39,9 +39,8 @@ _FARTHEST = np.array([0.5] * 3 + [2.0] * 3 + [MAX_TONE, 0.8])  # what terms may 
 
 @dataclass(frozen=True)
 class CellColors:
-    """Cells of one photograph: `promised` light N×3 of the known printer, its mean `terms` N×9, light as `seen` N×3.
-
-    `start` (8,) are the photograph's terms as far as they are known: veil and log gains by channel, tone, chroma.
+    """Cells of one photograph: `promised` light N×3 of the known printer, its mean `terms` N×9, light as `seen` N×3,
+    and `start` (8,), the photograph's terms as far as known: veil and log gains by channel, tone, chroma.
     """
 
     promised: np.ndarray
@@ -109,9 +108,7 @@ def add_ink(promised: np.ndarray, ink: np.ndarray) -> np.ndarray:
 def choose_cells(
     seen: np.ndarray, means: np.ndarray, paper: np.ndarray, seen_ink: np.ndarray, ink: np.ndarray | None
 ) -> CellColors:
-    """Choose cells of one photograph: `seen` h×w×3, NaN where unread, `means` h×w×12 of the promised light and of its
-    terms. Paper and marker ink, promised as `ink`, are added unless that is None.
-    """
+    """Choose cells of `seen` h×w×3 (NaN: unread) and their `means` h×w×12 (light, terms); add paper and any `ink`."""
     inner = np.zeros(seen.shape[:2], bool)  # blur mixes what lies around the print into the rim
     inner[1:-1, 1:-1] = np.isfinite(seen[1:-1, 1:-1]).all(-1)
     # errors of place and blur count less where neighbors are alike
@@ -131,9 +128,7 @@ def choose_cells(
 
 
 def fit_ink_and_photos(photos: Sequence[CellColors], rounds: int = 8) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Fit the print's ink 9×3 and each photograph's terms (8,), in turn. Terms that all photographs share are moved to
-    the ink, as far as its form can hold them.
-    """
+    """Fit the print's ink 9×3 and photographs' terms (8,) in turn; terms that all share move to the ink."""
     terms = [cells.start for cells in photos]
     promised, rows = (np.concatenate([getattr(cells, name) for cells in photos]) for name in ("promised", "terms"))
     ink = np.zeros((INK_TERMS, 3))
@@ -156,10 +151,8 @@ def fit_shown_colors(cells: CellColors, ink: np.ndarray) -> ShownColors:
 
 
 def affine12(photographed: np.ndarray, promised: np.ndarray) -> ShownColors | None:
-    """Fit a robust affine map to N×3 colors; None if they are too few or too similar to determine it.
-
-    It is fitted from promised to photographed colors: the promise is exact, and a glare on a color is then an outlier
-    of the dependent variable; as an outlier of the independent one it would pull the map towards itself.
+    """Fit a robust affine map to N×3 colors; None if they are too few or too similar to determine it. The promise is
+    exact, so a glare is an outlier of the dependent variable, which does not pull the map towards itself.
     """
     if len(photographed) < LEAST_COLORS:
         return None

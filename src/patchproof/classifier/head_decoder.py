@@ -1,9 +1,9 @@
 """Decode the outputs of detectors' usual heads into candidates: boxes in pixels, and logits.
 
-In: a network's outputs, of all levels or each: N×A×C, N×C×A, N×C×H×W, N×H×W×C, or anchors in a dimension of their
-own; and its head, or none: then shapes decide, and where boxes are decoded already what the first outputs hold, which
-a warning says. Out: candidates N×A×(4+K), differentiable.
-Left out on purpose: suppression (detector.py); clipping to the picture; masks, keypoints, boxes that are turned.
+In: a network's outputs, together or by level: N×A×C, N×C×A, N×C×H×W, N×H×W×C, or anchors in their own dimension; and
+its head. Without a head, shapes decide, and for boxes that are decoded already the first outputs, which a warning says.
+Out: candidates N×A×(4+K), differentiable. Left out on purpose: suppression (detector.py); clipping to the picture;
+masks, keypoints, rotated boxes.
 """
 
 import json
@@ -42,9 +42,7 @@ OutputLayout = tuple[OutputShape, tuple[str, ...], OutputShape]  # a table's ord
 
 @dataclass(eq=False)
 class HeadDecoder:
-    """Turns the outputs of a network for squares of `input_px` into candidates N×A×(4+K) of K = `labels`. A head that
-    is not given is guessed from the first outputs.
-    """
+    """Turns outputs for squares of `input_px` into candidates N×A×(4+`labels`); guesses a head that is not given."""
 
     network: str  # its name
     labels: int
@@ -143,9 +141,7 @@ def _guess(decoder: HeadDecoder, names: tuple[str, ...], shapes: Shapes) -> Head
 
 
 def _fitted_head(decoder: HeadDecoder, head: Head, names: Sequence[str], outputs: Sequence[Tensor]) -> Head:
-    """The guessed head, of decoded boxes with the order, unit and scores that the outputs fit best; said in a warning
-    unless it is what `Detector` takes.
-    """
+    """The guessed head, with the order, unit and scores of decoded boxes that fit best; warns if it is not `boxes`."""
     shapes, outputs = _shapes(outputs), [each.detach() for each in outputs]
     fitted = _fitted_values(decoder, head, names, outputs) if head.formula == "none" else head
     if fitted != head_of("boxes", "HEADS"):

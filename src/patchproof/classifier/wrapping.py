@@ -110,9 +110,7 @@ def _agreements(
 
 
 def _correlation(logits: Tensor, expected: Tensor) -> float:
-    """The mean over pictures of the correlation of two N×K logits, less their means over labels and pictures; -1 for
-    logits that are not finite.
-    """
+    """The mean correlation of N×K logits, less their means over labels and pictures; -1 if they are not finite."""
     first, second = (each - each.mean(1, keepdim=True) for each in (logits, expected))
     first, second = first - first.mean(0), second - second.mean(0)
     value = float(torch.nn.functional.cosine_similarity(first, second, dim=1).mean())

@@ -209,9 +209,7 @@ class Prompted(nn.Module):
 
 
 def load_clip(name: str) -> Classifier:
-    """The classifier of pictures and text that `name`, MODEL@FILE, stands for: a logit is the cosine between picture
-    and prompt, times the network's own scale. The text half of the network encodes the prompts once and is not kept.
-    """
+    """The classifier MODEL@FILE: its logits are cosines of picture and prompts, times the network's own scale."""
     open_clip = import_library("open_clip", "clip", "clip")
     model, _, file = name.rpartition("@")
     path, (architecture, _, published) = Path(file), model.partition("/")

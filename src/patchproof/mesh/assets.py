@@ -129,9 +129,7 @@ class Assets:
 def draw_out_textures(
     parts: Sequence[MeshPart], wraps: Mapping[Material, tuple[Wrap, Wrap]], assets: Assets
 ) -> list[MeshPart]:
-    """Return parts whose textures repeat, drawn out as far as their coordinates reach; `wraps` has (u, v) of the
-    materials whose textures do not.
-    """
+    """Return parts; textures that do not repeat in (u, v), by `wraps`, are drawn out as far as coordinates reach."""
     drawn = {id(part): part for part in parts}
     for material, modes in wraps.items():
         texture, scale, shift = material.texture_srgb, np.ones(2), np.zeros(2)

@@ -20,8 +20,8 @@ _CHUNK = 500_000  # line-triangle pairs held at a time, about 150 MB
 class SurfaceChart:
     """A cylinder beside the surface, with coordinates in millimeters: s across its axis, t along it, h outwards.
 
-    `axes` 3×3 are rows across, along, normal at the origin (right-handed); `curvature` 1/mm is that of the cylinder, 0
-    for a plane and negative where it bulges away from the normal. `right` is the piece's right in (s, t).
+    `axes` 3×3 has the rows across, along and normal at the origin (right-handed); `curvature` is 1/mm, 0 for a plane,
+    negative if it bulges away from the normal. `right` is the piece's right in (s, t).
     """
 
     origin_mm: np.ndarray
@@ -147,9 +147,7 @@ def _visits(chart: SurfaceChart, triangles: np.ndarray, size_mm, n: int):
 
 
 def _cast(points: np.ndarray, directions: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return how far along its direction each line meets its triangle, and whether it does. Edges belong to both sides
-    with a tolerance of 1e-6 of a triangle, which closes the cracks of float32 files.
-    """
+    """Return how far along its direction each line meets its triangle, and if it does, within 1e-6 of the edges."""
     a, edges = corners[:, 0], corners[:, 1:] - corners[:, :1]
     along, offsets, edge_b, edge_c = ([*vectors.T] for vectors in (directions, points - a, edges[:, 0], edges[:, 1]))
     p = cross(along, edge_c)

@@ -2,12 +2,12 @@
 
 In: uint8 sRGB pixels and the ids of the sheet. Out: `MarkersInView`: corners in photo pixels (centers at .5, clockwise
 from the code's top-left) with the blur of their borders, ids of the same dictionary that are not the sheet's, and ids
-found at two places. The detector gets linear light: in code values blurred paper spreads over ink, and at a blur of 0.3
-modules it read 5 of 48 markers where it read 45 in linear light. The pyramid starts below 1000 px and stops at the
-level where every expected id has been found; only if some are missing it tries code values, local contrast (CLAHE) in
-dark photos, and twice the size where less than 4 megapixels are searched; larger pictures get these two at half their
-size. Corners of all levels are then fitted in the full photograph (`edges`). If the page's millimeters are known,
-`known_page.find_sheet` needs fewer levels. Only OpenCV's class API is used, so 4.11 to 5.x will do.
+found at two places. The detector gets linear light: at a blur of 0.3 modules it read 45 of 48 markers in it, but 5 in
+code values, in which blurred paper spreads over ink. The pyramid starts below 1000 px and stops at the level where
+every expected id has been found. Only for missing ids it tries code values, in dark photos local contrast (CLAHE), both
+at half the size above 4 megapixels, and below that twice the size. Corners are then fitted in the full photograph
+(`edges`). With the page's millimeters, `known_page.find_sheet` needs fewer levels. Only OpenCV's class API (4.11 to
+5.x) is used.
 """
 
 from collections.abc import Callable, Iterator, Sequence, Set
@@ -53,9 +53,7 @@ Detections = dict[int, list[np.ndarray]]
 
 @dataclass(frozen=True)
 class MarkersInView:
-    """A sheet's markers by id; `foreign` ids of the same dictionary; `doubled` ids of the sheet found in two places;
-    `mirrored` ids of the sheet whose codes some squares resemble in a mirror.
-    """
+    """Markers by id; `foreign` ids of other sheets; ids of this one `doubled` (in two places) or `mirrored`."""
 
     markers: dict[int, Borders]
     foreign: tuple[int, ...]
@@ -175,9 +173,7 @@ def pyramid_levels(srgb: np.ndarray, region: ImageRegion) -> Iterator[Level]:
 
 
 def search_level(srgb: np.ndarray, region: ImageRegion, level: Level, aruco, detections: Detections) -> Ids:
-    """Search a region of the photograph at one level; corners, in full pixels, are added to `detections` by id. Returns
-    the ids whose codes some squares resemble in a mirror.
-    """
+    """Search a region at one level, add corners (full pixels) to `detections`, and return ids that look mirrored."""
     part = srgb[region]
     height, width = part.shape[:2]
     if width * height * level.scale**2 > LARGEST_LEVEL_PX:
@@ -253,10 +249,8 @@ def _detect(
 
 def detect_markers(picture: np.ndarray, aruco, settings: cv2.aruco.DetectorParameters):
     """OpenCV's (corners, ids or None) of one uint8 gray picture, and the set of ids whose codes some squares resemble
-    in a mirror; raises `PhotoRejected("too_costly")` if it shows more possible markers than there is time for.
-
-    OpenCV compares a square with every code of the dictionary, which takes a millisecond: 20 s for a block design. So
-    it gets a dictionary of the codes that any square resembles, or no picture if there is none.
+    in a mirror. Raises `PhotoRejected("too_costly")` if it shows more possible markers than there is time for. OpenCV
+    gets only codes that some square resembles: comparing one with a whole dictionary takes a millisecond.
     """
     max_squares = int(min(MOST_SQUARES, remaining_seconds() / _SQUARE_S))
     windows = range(settings.adaptiveThreshWinSizeMin, settings.adaptiveThreshWinSizeMax + 1, _WINDOW_STEP_PX)
@@ -276,9 +270,7 @@ def detect_markers(picture: np.ndarray, aruco, settings: cv2.aruco.DetectorParam
 
 
 def _similar_ids(picture: np.ndarray, quads: np.ndarray, aruco) -> tuple[list[int], list[int]]:
-    """Ids whose codes resemble what a gray picture shows within corners Q×4×2, or within the squares round their middle
-    that the detector tries, too; and ids that are resembled in a mirror.
-    """
+    """Return ids whose codes a gray picture resembles within corners Q×4×2 or their insets, and mirrored ones."""
     size = aruco.markerSize
     side, codes = size + 2, marker_codes(aruco.bytesList.tobytes(), size)
     cells = (np.indices((side, side))[::-1].reshape(2, -1).T + 0.5) / side - 0.5

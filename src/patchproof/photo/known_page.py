@@ -1,14 +1,13 @@
 """Find all markers of a known page: those that the detector finds, and others at the places that these predict.
 
 In: the photograph and the place of every marker on the page. Out: `MarkersInView`. After each level of the detector a
-homography from the markers found so far predicts the corners of the missing ones; where the cells resemble the printed
-ones, borders are fitted from there, and a marker counts if these lie near the prediction and its cells match. This
-needs no contours, so it works for small, blurred or partly covered markers, and it avoids the finer levels, which cost
-most; they search only where markers are still missing. Prediction never identifies a sheet by itself.
+homography from the markers found so far predicts the corners of the missing ones. Where the cells resemble the printed
+ones, borders are fitted from there; a marker counts if they lie near the prediction and its cells match. This needs no
+contours, so it works for small, blurred or partly covered markers, and it saves finer levels, which cost most.
+Prediction never identifies a sheet by itself.
 
-A second print of the sheet may be too far away for its markers to be read: dark squares are compared with the known
-codes, and count where two or three lie as on the sheet. A marker is seen so from 8 px across on in sharp pictures, from
-10 px on at a blur of 0.9 px, where it is read from 14 px on.
+A second print may be too far away for its markers to be read: dark squares are compared with the known codes, and count
+where two or three lie as on the sheet. That takes markers of 8 px (10 px at a blur of 0.9 px; reading takes 14).
 """
 
 from collections.abc import Iterator
@@ -50,10 +49,9 @@ Match = tuple[int, float, np.ndarray]
 
 
 def find_sheet(srgb: np.ndarray, expected: Ids, corners_mm: Quads, dictionary: str = DICTIONARY) -> MarkersInView:
-    """Find the markers of `corners_mm` (page mm by id) in a uint8 photograph.
-
-    The search ends when each of `expected` is found, out of the picture or covered, unless a finer level could decide
-    about a single foreign marker. Prints beside the first one are sought last.
+    """Find the markers of `corners_mm` (page mm by id) in a uint8 photograph, then those of prints beside the first
+    one. The search ends when each of `expected` is found, out of the picture or covered, unless a finer level could
+    decide about a single foreign marker.
     """
     aruco = aruco_dictionary(dictionary)
     detections: Detections = {}
@@ -185,8 +183,8 @@ def _correlation(srgb: np.ndarray, corners_px: np.ndarray, code: np.ndarray, off
 def find_second_print(
     srgb: np.ndarray, corners_px: Quads, corners_mm: Quads, dictionary: str, agree: bool
 ) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Ids of markers beside `corners_px` (outside of all of them if these `agree` that they are of one print) and no
-    larger: the two or three that show a second print of the sheet, and those that are read and not in `corners_mm`.
+    """Ids of markers beside `corners_px` and no larger: those that show a second print, and those of other sheets. If
+    `agree`, the markers found are of one print, and only what lies outside of them all counts.
     """
     if len(corners_px) < 2:
         return (), ()

@@ -1,16 +1,16 @@
 """Estimate the camera's position as seen from a point of a flat or rolled sheet, with its uncertainty.
 
-In: a homography or a `Shape` with its covariance, a pinhole matrix whose focal length is known to `focal_spread` of its
-logarithm (one standard deviation). Out: `CameraPosition`, with the answer whether the sheet's own perspective agrees
+In: a homography or a `Shape` with its covariance, and a pinhole matrix, the logarithm of whose focal length has the
+standard deviation `focal_spread`. Out: `CameraPosition`, with the answer whether the sheet's own perspective agrees
 with the matrix. A small or distant sheet looks almost the same from either side of its normal: the azimuth's sign is
 lost first. Spreads follow from shifts by one standard deviation along each axis of the parameters' covariance; that of
 tilt, which is never negative, from random draws.
 
-A page seen with the right matrix has px_from_mm ~ K [r1, r2, t]: r1 · r2 = 0 and |r1| = |r2|. A wrong focal length
-breaks both with sin² of the tilt, a wrong principal point (an off-center crop) likewise, so frontal views tell nothing.
-A crop, or software that straightens, may leave no trace in a file. So a focal length from EXIF is trusted only as far
-as perspective confirms it; otherwise the distance is unknown, and angles are as uncertain as these can make them. So
-are tangents of rolled paper far from its markers, between which it may turn, and paper that misses its markers.
+A page seen with the right matrix has px_from_mm ~ K [r1, r2, t]: r1 · r2 = 0 and |r1| = |r2|. A wrong focal length or
+principal point (an off-center crop) breaks both with sin² of the tilt, so frontal views tell nothing. Crops and
+software that straightens may leave no trace in a file, so a focal length from EXIF is trusted only as far as
+perspective confirms it; otherwise the distance is unknown, and angles are as uncertain as these can make them. Angles
+are also less certain for rolled paper that may turn between its markers, and for paper that misses its markers.
 
 Source: Hartley and Zisserman, Multiple View Geometry, 2nd ed., 8.1.
 """
@@ -45,9 +45,7 @@ _TURN_PER_BEND = 50.0
 
 @dataclass(frozen=True)
 class CameraPosition:
-    """The camera's azimuth and distance, each with its 95 % uncertainty (infinite: unknown). `focal_agrees` is True or
-    False if perspective confirms or contradicts the focal length, None if it cannot tell.
-    """
+    """Azimuth and distance with 95 % uncertainties (inf: unknown); `focal_agrees`: None if perspective cannot tell."""
 
     azimuth_deg: float
     azimuth_uncertainty_deg: float
@@ -64,8 +62,8 @@ def turn_rad(bend: float, shape: Shape | None) -> float:
 
 
 def distortion_of(fit: PageFit, matrix_px: np.ndarray | None, focal_spread: float) -> tuple[np.ndarray, np.ndarray]:
-    """Estimate shear and stretch (the logarithm of x over y) of a print or picture by a flat sheet's perspective: mean
-    (2,) and covariance 2×2; without a matrix they are what prints usually have.
+    """Return a print's or picture's shear and log stretch (x over y), mean (2,) and covariance 2×2, as a flat sheet's
+    perspective shows them; without a matrix those of usual prints.
     """
     expected, paper = _TILT_STRETCH**2 * np.eye(2), _PAPER**2 * np.eye(2)
     if matrix_px is None:
@@ -78,9 +76,7 @@ def distortion_of(fit: PageFit, matrix_px: np.ndarray | None, focal_spread: floa
 def flat_sheet_position(
     fit: PageFit, matrix_px: np.ndarray, focal_spread: float, point_mm, turn: float = 0.0, matrix_is_known: bool = False
 ) -> CameraPosition:
-    """The position of the camera before flat paper. `turn` is its `turn_rad`; `matrix_is_known` states that the matrix
-    is that of this picture, so that it needs no confirmation by perspective.
-    """
+    """The camera's position before flat paper whose middle may turn by `turn`. A known matrix needs no confirmation."""
     agrees, own_spread = _agreement(fit, matrix_px, focal_spread)
     entries = np.append(fit.px_from_mm.ravel()[:8], 0.0)
     root = np.pad(root_of(fit.covariance), (0, 1))
@@ -171,9 +167,7 @@ def _scale_focal(matrix_px: np.ndarray, log_scale: float) -> np.ndarray:
 
 
 def _agreement(fit: PageFit, matrix_px: np.ndarray, focal_spread: float) -> tuple[bool | None, float]:
-    """(True or False if r1 and r2 confirm or contradict the focal length within their uncertainty, None if they cannot
-    tell; the spread of its logarithm from perspective alone, one standard deviation).
-    """
+    """Return if r1 and r2 confirm the focal length (None: they cannot tell), and the spread of its log by them."""
     error, covariance, by_focal = _disagreement(fit, matrix_px)
     covariance += np.diag([_PAPER**2, _PRINT_STRETCH**2 + _PAPER**2])
     # an off-center principal point changes r1 and r2, too, and may cancel a wrong focal length: confirming takes more

@@ -1,13 +1,13 @@
 """Fit the homography of a flat sheet to marker corners, with its uncertainty, and rectify parts of the page.
 
 In: corners in pixels and in page millimeters, by marker id. Out: `PageFit`. Least median of squares finds the corners
-that agree (it breaks down if half of them are wrong), Gauss-Newton on their reprojection error gives the homography and
-its covariance. Blur and sharpening make all markers of a photograph a little larger or smaller; that is no noise, so
-with three markers or more their corners' mean outward shift is subtracted first. The uncertainty is the 95 % point of
-the *largest* of the design's corner errors, drawn from that covariance. Few corners tell little about their noise, so
-intervals get wider (Student's t); a single marker fits any noise exactly, and gets a large assumed noise. Curved paper,
-motion and lenses rotate, stretch and shear whole markers. Noise does that only as much as it twists them: the excess
-over the twist is called bend, and the design's corners miss by several times as much.
+that agree (it breaks down if half of them are wrong); Gauss-Newton on the reprojection error gives the homography and
+its covariance. Blur and sharpening make all markers of a photograph a little larger or smaller: with three markers or
+more, their corners' mean outward shift is subtracted first. The uncertainty is the 95 % point of the *largest* of the
+design's corner errors, drawn from that covariance. It is wider with few corners (Student's t); the noise of a single
+marker, which fits exactly, is assumed to be large. Curved paper, motion and lenses rotate, stretch and shear whole
+markers, noise also twists them: what exceeds the noise of the twist is called bend, and the design's corners miss by
+several times as much.
 
 Source: Hartley and Zisserman, Multiple View Geometry, 2nd ed., 4.2 (reprojection error), 5.2 (covariance).
 """
@@ -68,9 +68,7 @@ def fit_page(corners_px: Quads, corners_mm: Quads) -> PageFit:
 
 
 def fit_points(mm: np.ndarray, px: np.ndarray, sigma_px: np.ndarray, start: np.ndarray | None = None) -> PageFit:
-    """Fit the homography page mm → photo px to N ≥ 4 points N×2 with standard deviations N of a coordinate. With more
-    than four, those off by more than three deviations from the fit begun at `start` lose their weight.
-    """
+    """Fit the homography mm → px to N ≥ 4 points N×2 with deviations `sigma_px` N; outliers beyond 3 σ count less."""
     homography, weight = fit_homography(mm, px) if start is None else start, np.ones(len(mm))
     root = np.repeat(1 / sigma_px, 2)
     for _ in range(_ROUNDS if len(mm) > 4 else 1):
@@ -119,9 +117,8 @@ def covariance_of(jacobian: np.ndarray, noise_px: float, rcond: float = 1e-15) -
 
 
 def rectify(pixels: np.ndarray, px_from_mm: np.ndarray, rect_mm, px_per_mm: float) -> np.ndarray:
-    """Rectify a rectangle of the page at `px_per_mm`, averaged over area to avoid moiré.
-
-    `pixels` is H×W×C, uint8 or float32 (pass linear light to measure); outside of the photo border pixels are repeated.
+    """Rectify a rectangle of the page at `px_per_mm`, averaged over area to avoid moiré. `pixels` is H×W×C, uint8 or
+    float32 (pass linear light to measure); beyond the photo its border pixels are repeated.
     """
     size = rectified_px(rect_mm, px_per_mm)
     return resize_by_area(oversample_flat(pixels, px_from_mm, rect_mm, size), size)
@@ -261,11 +258,12 @@ def _page_fit(homography, mm, px, inlier, ids) -> PageFit:
 def noise_and_bend(
     residual: np.ndarray, markers: np.ndarray, freedom: int, floor_px: float = CORNER_NOISE_PX
 ) -> tuple[float, float]:
-    """(noise for uncertainties, bend), both px per coordinate, from residuals N×2 and those of complete markers M×4×2.
+    """Return (noise for uncertainties, bend), px per coordinate, from residuals N×2 and those of complete markers
+    M×4×2.
 
-    The bend is the part of the residual that is no noise. Noise is estimated from the alternating sum of a marker's
-    corners, its twist, which smooth deformations do not change; with less than three complete markers all that exceeds
-    the noise of sharp corners counts as bend.
+    Noise is estimated from markers' twists (the alternating sums of their corners), which smooth deformations do not
+    change; the rest of the residual is bend. With less than three complete markers, all beyond the noise of sharp
+    corners is.
     """
     variance = float((residual**2).sum()) / freedom
     noise = max(floor_px, np.sqrt(variance) * stdtrit(freedom, 0.975) / stdtrit(np.inf, 0.975))

@@ -2,16 +2,13 @@
 
 In: the object's edges, cameras, and the depth at each pixel. Out: `Outlines`, which mix finished pictures. If a visible
 edge passes between the centers of two neighboring pixels, each takes as much of the other's color as the edge cuts off
-it, exactly for a straight edge (after Laine et al., Modular primitives for high-performance differentiable rendering,
-2020, who move the border between two pixels along their centers alone, and search edges from the pixels; here each edge
-is walked, so that faces smaller than a pixel work as well). No part of a picture, the piece included, needs a second
-sample. Edges are found once per mesh: those that show in every view (rims, and creases or changes of color between
-faces of which one has no texture) and those that show when one of their faces is turned away, which the planes of both
-tell. Corners at one position are one.
+it, exactly for a straight edge. This extends Laine et al., Modular primitives for high-performance differentiable
+rendering, 2020: each edge is walked, so that faces smaller than a pixel work as well. No pixel needs a second sample.
+Edges are found once per mesh: those that show in every view (rims, and creases or changes of color between faces of
+which one has no texture) and those that show when one of their faces is turned away. Corners at one position are one.
 
-Left out on purpose: things thinner than a pixel that no pixel center sees; creases between two textured faces. A
-texture continues smoothly across most of them, and mixing neighboring pixels would only blur it: a textured car was
-farther from 3×3 samples with them.
+Left out on purpose: things thinner than a pixel that no pixel center sees; creases between two textured faces, because
+textures continue smoothly across most of them (a textured car was farther from 3×3 samples with them).
 """
 
 from dataclasses import dataclass
@@ -91,9 +88,7 @@ def _has_jump(mesh: Mesh, one: np.ndarray, other: np.ndarray, same_way: np.ndarr
 
 @dataclass(frozen=True)
 class Outlines:
-    """U pixels at outlines: each keeps `remaining` U×1 of its color; `share` S×1 of the colors at `source` goes to the
-    pixels numbered `target` among the U.
-    """
+    """U pixels keep `remaining` U×1 of their color; number `target` gets `share` S×1 of the color of `source`."""
 
     pixel: Tensor
     remaining: Tensor
@@ -145,9 +140,7 @@ class _Mix(torch.autograd.Function):
 def find_outlines(
     edges: Edges, vertices: Tensor, cameras: Cameras, eye_mm: Tensor, depth_mm: Tensor, covered: Tensor, near_mm: float
 ) -> Outlines:
-    """Find the outlines of N views from `eye_mm` N×3, whose pixels N·H·W see `depth_mm` far (infinity: no object).
-    There are none between two pixels that only the piece covers (`covered`).
-    """
+    """Find the outlines of N views from `eye_mm` N×3 at depths N·H·W, except between pixels `covered` by the piece."""
     views_at_once = max(1, CHUNK // max(len(vertices), len(edges.ends), len(edges.planes)))
     sides: list[list[tuple[Tensor, ...]]] = [[], []]
     for view in range(0, len(cameras), views_at_once):
@@ -179,9 +172,7 @@ def find_outlines(
 
 
 def _cut_off(distance: Tensor, slope: Tensor) -> Tensor:
-    """Return the share of a pixel beyond an edge that passes its center at this distance, from 0 to 1 along the axis
-    that it crosses more directly, and moves by `slope`, up to 1, along the other.
-    """
+    """Return a pixel's share beyond an edge at `distance` (0 to 1) from its center, with `slope` (0 to 1)."""
     reach = ((1 + slope) / 2 - distance).clamp_min(0)
     return torch.where(reach < slope, reach * reach / (2 * slope), (0.5 - distance).clamp_min(0))
 
@@ -189,9 +180,7 @@ def _cut_off(distance: Tensor, slope: Tensor) -> Tensor:
 def _visible_ends(
     edges: Edges, vertices: Tensor, cameras: Cameras, eye_mm: Tensor, near_mm: float
 ) -> tuple[tuple[Tensor, Tensor], Tensor, Tensor]:
-    """Return (x px, y px, 1/mm) 3×S of both ends of edges that may show, cut at the near plane; the views they are in;
-    and which of them only crease a surface there.
-    """
+    """Return (x px, y px, 1/mm) 3×S of both ends of edges that may show, their views, and which are only creases."""
     x, y, z, offset = edges.planes.T
     # written out, because the rounding of a matrix product depends on its size
     front = eye_mm[:, :1] * x + eye_mm[:, 1:2] * y + eye_mm[:, 2:] * z + offset > 0

@@ -21,8 +21,8 @@ _LEAST_PX = 1.0  # of a box's sides; smaller boxes are left out
 
 @dataclass(frozen=True, eq=False)
 class LabeledPhoto:
-    """A photograph: its file, (width, height), and outlines N×2 in its pixels by category; those with NaN (a part is
-    behind the camera) are left out; and how the patch was located.
+    """A photograph: its file, (width, height), `outlines` N×2 px by category (those with NaN, partly behind the camera,
+    are left out), and how the patch was located.
     """
 
     file: str

@@ -66,8 +66,7 @@ def png(pixels: np.ndarray) -> bytes:
 
 
 def save_pictures(folder: Path, file: str, kinds: Mapping[str, np.ndarray]) -> None:
-    """Write a photograph's pictures by kind as FILE.KIND.jpg into `folder`, in place of earlier ones; its `delta_e00`
-    cells (NaN = not measured) as the .png of a map.
+    """Replace a photograph's FILE.KIND.jpg pictures in `folder`; cells `delta_e00` (NaN: not measured) are a PNG map.
     """
     make_folder(folder)
     for kind in PICTURE_KINDS:
@@ -83,9 +82,7 @@ def saved_pictures(folder: Path, file: str) -> dict[str, bytes]:
 
 
 def stem_of(file: str) -> str:
-    """The stem of a photograph's picture files: its name, which may contain its session's folder, encoded; a long one
-    is shortened and gets a hash.
-    """
+    """The stem of a photograph's picture files: its encoded name with folder; a long one is cut and gets a hash."""
     stem = file.replace("/", "%2F")
     is_long = len(stem.encode()) > _LONGEST_STEM
     return f"{stem[:40]}-{hashlib.sha256(stem.encode()).hexdigest()[:16]}" if is_long else stem

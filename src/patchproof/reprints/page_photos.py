@@ -45,7 +45,7 @@ def reprint_pages(
 ) -> None:
     """Write n photographs of the pages of a PDF, in turn, lying flat: for pages that belong to no run, such as blank
     ones, charts and boards. `how` names their printer (None: coated) and the print's scale. Of a blank sheet only the
-    piece is photographed, since the rest is cut off: its markers would stand beside the later print's.
+    piece is photographed, since the rest is cut off.
     """
     printer = load_printer(how.printer or PrinterSettings().profile)
     with new_folder(out, ("photo_*.jpg",), overwrite, (pdf,)) as folder:
@@ -63,9 +63,7 @@ def reprint_pages(
 
 
 def photograph_page(page: np.ndarray, seed: int) -> tuple[bytes, np.ndarray]:
-    """Photograph a page that lies flat, from above within 25° to each side; the seed determines all conditions. Return
-    the file, and the light (3,) of blank paper in the middle of the page at its sensor.
-    """
+    """Photograph a flat page from within 25° by `seed`. Return the file, and the light (3,) of blank paper in it."""
     rng = np.random.default_rng([seed, 4])
     page_mm = np.array(page.shape[1::-1]) / PX_PER_MM
     distance = rng.uniform(1.2, 1.55) * page_mm.max()

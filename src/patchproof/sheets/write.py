@@ -37,8 +37,8 @@ def write_sheet(
     plan: PlanPage | None = None,
     copies: int = 1,
 ) -> Manifest:
-    """Write SHEET.pdf and SHEET.json beside it. `plan` becomes the last page; `copies` repeats the page with the piece,
-    and is refused for a template with tiles, which has a page for each tile. Without a template only SHEET.json is.
+    """Write SHEET.pdf and SHEET.json beside it, without a template only SHEET.json. `plan` becomes the last page;
+    `copies` repeats the page with the piece, and is refused for a template with tiles.
     """
     if template is None:
         if Path(pdf_path).suffix != ".json":
@@ -69,9 +69,7 @@ def write_sheet(
 def write_several(
     pdf_path: str | Path, template: Template, designs: Sequence[SheetContent], plans: Sequence[PlanPage | None] = ()
 ) -> list[Manifest]:
-    """Write a page with at least two designs and a manifest for each; `plans`, in the order of the designs, become
-    further pages. Refused if two designs belong to the same sheet.
-    """
+    """Write a page of several designs, `plans` behind it, and a manifest for each; refuses a sheet's design twice."""
     pdf_path = check_pdf_path(pdf_path)
     if template.tiles is not None:
         raise Refused("a template of one page for several designs", "one with tiles", "make a sheet of each")

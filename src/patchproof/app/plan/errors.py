@@ -45,9 +45,8 @@ class Setup:
 
 @dataclass(frozen=True)
 class Term:
-    """A term of the model: the settings key that governs it, and `change`, which takes it out of a setup, or returns
-    None if it is off. A term that is not `modeled` is added by `change`. One that `needs_whole_photo` shows fully in
-    whole photographs only.
+    """A term of the model and its settings key. `change` takes it out of a setup, or adds it if it is not `modeled`,
+    and returns None if it is off. A term that `needs_whole_photo` shows fully in whole photographs only.
     """
 
     name: str
@@ -165,9 +164,7 @@ def _confidence(problem: Problem, pictures: Tensor, boxes: np.ndarray | None) ->
 
 
 def _squares(problem: Problem, side_px: int, base: Setup, setups: list[Setup]) -> Tensor:
-    """Render the views of the base setup, then of each other one, as the primary classifier gets them:
-    (1 + len(setups))×N×3×S×S.
-    """
+    """Render the views of base and other setups for the primary classifier: (1 + len(setups))×N×3×S×S."""
     size_px, stack = (side_px, side_px), []
     for rows in _chunks(len(base.conditions), side_px):
         base_conditions, pictures = base.conditions[rows], []
