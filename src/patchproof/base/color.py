@@ -43,7 +43,9 @@ def lift_tone(codes, tone):
 
 
 def clamp_to_unit(values):
-    """Clip to [0, 1] with gradient 1 at 0 and 1: `torch.clamp` has 0 there, and black or white could never change."""
+    """Clip to [0, 1] with gradient 1 at 0 and 1. `torch.clamp` has gradient 0 there since 2.14, and a fully black or
+    white pixel could never change again.
+    """
     xp = _library(values)
     if xp is np or values.requires_grad:
         return xp.where(values < 0, 0.0, xp.where(values > 1, 1.0, values))

@@ -63,7 +63,9 @@ def refuse_other_inputs(
 
 
 def content_identity(settings: SceneSettings, base: Path) -> dict[str, Any]:
-    """The scene's settings with hashes of content (of folders: files' names and sizes) in place of files' names."""
+    """The identity of a scene's settings: a hash of content stands for each file's name (of a folder: the names and
+    sizes of its files), so that draws do not depend on how a path is spelled.
+    """
     identity, printer, file = identity_settings(settings), settings.printer.profile, settings.camera.file
     contents = {key: [path] for key, path in named_paths(settings, base).items()}
     contents |= {} if file is None else {"camera.file": [base / file]}

@@ -242,7 +242,9 @@ def image_bytes(pixels: np.ndarray, kind: str, options: Mapping[str, Any] | None
 
 
 def write_pictures(pictures: Sequence[np.ndarray], folder: Path) -> Path:
-    """Replace a folder's pictures by uint8 H×W×3 sRGB arrays, photo_0001.png and so on; refuses none, or others."""
+    """Write uint8 H×W×3 sRGB arrays as photo_0001.png and so on into a folder, in place of earlier ones; returns the
+    folder. Refused for an empty list, or an array of another type or shape.
+    """
     if not len(pictures):
         raise Refused("a folder of photographs or arrays", "an empty list", "give one array or more")
     for number, array in enumerate(pictures):

@@ -49,8 +49,8 @@ class StrictModel(BaseModel):
     __repr__ = short_repr
 
     def changed(self, **values: Any) -> Self:
-        """A copy with some values replaced and checked; a dictionary replaces keys of a table: `optimize={"steps":
-        10}`.
+        """A copy with some values replaced, checked as a file is. A dictionary replaces single keys of a table, as in
+        `scene.changed(optimize={"steps": 10})`.
         """
         tables = {name: getattr(self, name) for name in type(self).model_fields}
         for name, value in values.items():

@@ -3,11 +3,10 @@
 In: photographs and a board. Out: `CameraCalibration`, and NAME.json in the form of calibration/cameras. All views come
 from one camera in one state: the picture size, orientation and focal length that most photographs share, because a
 phone may switch lenses between two photographs. Corners are saddle points, symmetric under half a turn, so neither blur
-nor the tone curve shifts them. Photographs that cannot determine a camera are refused: too few of them, boards that all
-face the same way (a plane's picture then hardly depends on the focal length), a focal length known to no better than 1
-%. The print's proportions matter, not its size: rulers that differ are typed in. A photograph that stands out was moved
-or shows a bent board. Left out on purpose: fisheye lenses, and how flat the board is, which shows in the residuals
-only.
+nor the tone curve shifts them. Photographs that cannot determine a camera are refused: too few, boards that all face
+the same way (a plane's picture then hardly depends on the focal length), a focal length known to no better than 1 %.
+The print's proportions matter, not its size: rulers that differ are typed in. A photograph that stands out was moved or
+shows a bent board. Left out on purpose: fisheye lenses; how flat the board is, which only the residuals show.
 """
 
 from collections import Counter
@@ -132,7 +131,9 @@ def calibration_lines(result: CameraCalibration) -> list[str]:
 def find_boards(
     photos: str | Path, board: Board, ruler_mm: tuple[float, float] | None = None, advance: Advance = no_advance
 ) -> tuple[list[BoardView], dict[str, str], str]:
-    """Return a folder's (views, reasons by names of photographs left out, camera's name); `ruler_mm` is as measured."""
+    """Read a folder's photographs: (views, reasons by the names of photographs left out, the camera's name). `ruler_mm`
+    are the printed rulers (x, y) as measured.
+    """
     paths, views, left_out, states = list_photos(photos), [], {}, []
     positions_mm = corner_positions_mm(board, ruler_mm)
     for number, path in enumerate(paths, 1):

@@ -51,7 +51,9 @@ class BoardView:
 
 @dataclass(frozen=True)
 class LensFit:
-    """One rung fitted to some views: `numbers` and deviations `sd` as in PARAMETERS, poses, and residuals N×2 px."""
+    """One rung fitted to some views: `numbers` and standard deviations `sd` as in PARAMETERS, and each view's pose
+    (rotation and translation vectors) and residuals N×2 px.
+    """
 
     rung: str
     numbers: np.ndarray

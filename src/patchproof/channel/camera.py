@@ -11,9 +11,8 @@ Camera. In: N×3×H×W linear light and a `Sensor`. Out: N×3×H×W sRGB in [0, 
 focus, straight motion), exposure and white balance, shot and read noise, clipping, sRGB's curve, the photograph's own
 tone. The lens's distortion has its own module.
 
-Blur, motion, noise and JPEG are given for the photograph's full size. In a picture of `scale` times that size they
-shrink with `scale`, as they do by averaging, and are skipped where invisible. At full size the writer makes a real
-JPEG.
+Blur, motion, noise and JPEG are given for the photograph's full size. A picture of `scale` times that size averages
+pixels, so they are multiplied by `scale`, and skipped where invisible. At full size the writer makes a real JPEG.
 """
 
 from dataclasses import dataclass
@@ -118,7 +117,9 @@ def motion_blur(linear: Tensor, length_px: Tensor, angle_deg) -> Tensor:
 
 
 def _filtered(pictures: Tensor, *kernels: Tensor) -> Tensor:
-    """Correlate N×C×H×W with kernels N×h×w, edges repeated: kornia's `filter2d` in a seventh of its time."""
+    """Correlate pictures N×C×H×W with kernels N×h×w of odd sides in turn, edges repeated: the same bits as kornia's
+    `filter2d`, in a seventh of its time at 1600 × 1200 px.
+    """
     count, channels, *_ = pictures.shape
     below, right = (sum(kernel.shape[axis] // 2 for kernel in kernels) for axis in (1, 2))
     padded = torch.nn.functional.pad(pictures.contiguous(), (right, right, below, below), mode="replicate")

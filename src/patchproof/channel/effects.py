@@ -6,7 +6,7 @@ place.
 
 A record's fields are arrays of one row per view in physical units. A field that is not given is off (no blur, white
 paper), and a single row stands for all views. `EFFECTS` says for each effect how the scene's settings and numbers in
-[0, 1] become its fields; its first field is its strength, and at the record's default the effect is off. `plan` and the
+[0, 1) become its fields; its first field is its strength, and at the record's default the effect is off. `plan` and the
 ablation study switch effects off by this table alone.
 
 A new effect takes a range in `settings`, a field and a row here, its formula in `channel`, and the place in `render`
@@ -64,7 +64,9 @@ def off(value: Any = 0.0) -> Any:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Pose(Draws):
-    """Values that need a new rasterization: angles relative to the scene's front, offsets in object lengths."""
+    """The values for which a view must be rasterized again: camera, background, and the size of the print. Angles are
+    relative to the scene's front, offsets are shares of the object's length.
+    """
 
     azimuth_deg: np.ndarray = off()
     elevation_deg: np.ndarray = off()

@@ -108,7 +108,9 @@ def add_ink(promised: np.ndarray, ink: np.ndarray) -> np.ndarray:
 def choose_cells(
     seen: np.ndarray, means: np.ndarray, paper: np.ndarray, seen_ink: np.ndarray, ink: np.ndarray | None
 ) -> CellColors:
-    """Choose cells of `seen` h×w×3 (NaN: unread) and their `means` h×w×12 (light, terms); add paper and any `ink`."""
+    """Choose cells of one photograph from `seen` h×w×3 (NaN: unread) and `means` h×w×12 of the promised light and its
+    terms. Paper and marker ink, promised as `ink`, are added unless `ink` is None.
+    """
     inner = np.zeros(seen.shape[:2], bool)  # blur mixes what lies around the print into the rim
     inner[1:-1, 1:-1] = np.isfinite(seen[1:-1, 1:-1]).all(-1)
     # errors of place and blur count less where neighbors are alike
@@ -151,8 +153,9 @@ def fit_shown_colors(cells: CellColors, ink: np.ndarray) -> ShownColors:
 
 
 def affine12(photographed: np.ndarray, promised: np.ndarray) -> ShownColors | None:
-    """Fit a robust affine map to N×3 colors; None if they are too few or too similar to determine it. The promise is
-    exact, so a glare is an outlier of the dependent variable, which does not pull the map towards itself.
+    """Fit a robust affine map to N×3 colors; None if they are too few or too similar to determine it. It maps promised
+    to photographed colors: the promise is exact, and glare on a color, an outlier of the dependent variable, does not
+    pull the map towards itself.
     """
     if len(photographed) < LEAST_COLORS:
         return None

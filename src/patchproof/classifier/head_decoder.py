@@ -1,9 +1,9 @@
 """Decode the outputs of detectors' usual heads into candidates: boxes in pixels, and logits.
 
 In: a network's outputs, together or by level: N×A×C, N×C×A, N×C×H×W, N×H×W×C, or anchors in their own dimension; and
-its head. Without a head, shapes decide, and for boxes that are decoded already the first outputs, which a warning says.
-Out: candidates N×A×(4+K), differentiable. Left out on purpose: suppression (detector.py); clipping to the picture;
-masks, keypoints, rotated boxes.
+its head. Without a head the outputs' shapes decide, and the first outputs' values on boxes that are decoded already; a
+warning says how. Out: candidates N×A×(4+K), differentiable. Left out on purpose: suppression (detector.py); clipping to
+the picture; masks, keypoints, rotated boxes.
 """
 
 import json
@@ -141,7 +141,9 @@ def _guess(decoder: HeadDecoder, names: tuple[str, ...], shapes: Shapes) -> Head
 
 
 def _fitted_head(decoder: HeadDecoder, head: Head, names: Sequence[str], outputs: Sequence[Tensor]) -> Head:
-    """The guessed head, with the order, unit and scores of decoded boxes that fit best; warns if it is not `boxes`."""
+    """The guessed head; for decoded boxes with the order, unit and scores that fit the outputs best. Warns unless it is
+    the head that `Detector` takes.
+    """
     shapes, outputs = _shapes(outputs), [each.detach() for each in outputs]
     fitted = _fitted_values(decoder, head, names, outputs) if head.formula == "none" else head
     if fitted != head_of("boxes", "HEADS"):

@@ -209,7 +209,7 @@ class Prompted(nn.Module):
 
 
 def load_clip(name: str) -> Classifier:
-    """The classifier MODEL@FILE: its logits are cosines of picture and prompts, times the network's own scale."""
+    """The CLIP network `MODEL@FILE`: logits are cosines of picture and prompts, times the network's own scale."""
     open_clip = import_library("open_clip", "clip", "clip")
     model, _, file = name.rpartition("@")
     path, (architecture, _, published) = Path(file), model.partition("/")

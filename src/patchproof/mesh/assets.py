@@ -129,7 +129,9 @@ class Assets:
 def draw_out_textures(
     parts: Sequence[MeshPart], wraps: Mapping[Material, tuple[Wrap, Wrap]], assets: Assets
 ) -> list[MeshPart]:
-    """Return parts; textures that do not repeat in (u, v), by `wraps`, are drawn out as far as coordinates reach."""
+    """Return parts whose textures all repeat: those that do not, by their (u, v) in `wraps`, are extended as far as
+    their coordinates reach.
+    """
     drawn = {id(part): part for part in parts}
     for material, modes in wraps.items():
         texture, scale, shift = material.texture_srgb, np.ones(2), np.zeros(2)

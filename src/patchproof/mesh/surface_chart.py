@@ -147,7 +147,9 @@ def _visits(chart: SurfaceChart, triangles: np.ndarray, size_mm, n: int):
 
 
 def _cast(points: np.ndarray, directions: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return how far along its direction each line meets its triangle, and if it does, within 1e-6 of the edges."""
+    """Return how far along its direction each line meets its triangle, and whether it does. Edges belong to both sides
+    with a tolerance of 1e-6 of a triangle, which closes the cracks of float32 files.
+    """
     a, edges = corners[:, 0], corners[:, 1:] - corners[:, :1]
     along, offsets, edge_b, edge_c = ([*vectors.T] for vectors in (directions, points - a, edges[:, 0], edges[:, 1]))
     p = cross(along, edge_c)

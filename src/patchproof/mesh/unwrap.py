@@ -27,9 +27,10 @@ _ATTEMPTS = 3
 
 
 def coverage(corners: np.ndarray, size: tuple[int, int], grow: float = 0.0) -> np.ndarray:
-    """Count the faces that cover each texel of a (width, height) texture: int32 H×W. Textures repeat; `corners` are
-    F×3×2 texels. With `grow` = 0 a face covers the texel centers in it, of two faces that share an edge only one; else
-    those within `grow` of it in x and y: 0.5 gives every texel that it touches, 1.5 all that a bilinear look-up reads.
+    """Count the faces that cover each texel of a (width, height) texture, which repeats: int32 H×W. `corners` are F×3×2
+    in texels. With `grow` = 0 a face covers a texel if its center lies in the face (on a common edge: in one of the
+    two), else if its center is within `grow` of the face in both x and y: 0.5 gives every texel that the face touches,
+    1.5 all that a bilinear look-up reads.
     """
     width, height = size
     steps = np.zeros((height, width + 1), np.int32)  # +1 where a run of texels starts, -1 where it has ended

@@ -170,7 +170,9 @@ def _cuts(program: Program, pictures: Tensor) -> list[Cut]:
 
 
 def _is_correct(network: Callable[[Tensor], Tensor], cut: Cut, pictures: Tensor) -> bool:
-    """True if gradients and changed answers equal the whole network's in two windows, near opposite corners."""
+    """True if gradients, and answers to pictures that differ there, equal the whole network's in two windows near
+    opposite corners.
+    """
     size_px, side = pictures.shape[-1], pictures.shape[-1] // 8
     starts = np.array([[0, 1], [size_px - side - 1, size_px - side]])
     windows = np.hstack([starts, starts + side])

@@ -222,7 +222,9 @@ def _losses(problem: Problem, appearance: Appearance, conditions: Conditions) ->
 
 
 def _finalists(trials: Sequence[_ScreenedPlace], edge_mm: float) -> list[_ScreenedPlace]:
-    """The best places at least a whole piece apart, since screening may be wrong about a region; then closer ones."""
+    """The best places, at least a whole piece from each other, since screening may be wrong about a part of the object;
+    where these are too few, closer ones are added.
+    """
     far_apart, close = _thin_out(trials, edge_mm), _thin_out(trials, MIN_DISTANCE_SHARE * edge_mm)
     return [*far_apart, *(trial for trial in close if trial not in far_apart)][:DRAFTED_PLACES]
 

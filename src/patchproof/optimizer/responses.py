@@ -47,8 +47,8 @@ def responses(
     control_mask: np.ndarray | None = None,
     advance: Advance = no_advance,
 ) -> dict[Thing, Responses]:
-    """Show each thing under every condition to every network, in squares of `side_px` (default: `figure_px`). Things
-    but the first are shown only in `control_mask`. `advance` gets the number of views done and their total.
+    """Show each thing under every condition to every network, in squares of `side_px` (default: `figure_px`). A
+    `control_mask` selects the conditions for things after the first. `advance` gets the views done and their total.
     """
     things, first_appearance = list(appearances), next((a for a in appearances.values() if a is not None), None)
     mask = np.ones(len(conditions), bool) if control_mask is None else control_mask

@@ -180,7 +180,7 @@ def resolve_scene(scene: str | Path | Scene, seed: int | None) -> Scene:
 def _choose_place(
     scene: Scene, out: Path, resume: bool, search_options: Mapping[str, Any]
 ) -> tuple[PatchScene, Callable[[], None], Mapping[str, str]]:
-    """Return the scene with its chosen place, a function that saves the place, and fingerprints of what was tried."""
+    """Return the scene with its chosen place, a function that saves the place, and the search's input fingerprints."""
     # only scenes that give no place import the search
     from patchproof.optimizer.place_files import read_place, save_place
     from patchproof.optimizer.place_search import choose_place

@@ -2,12 +2,12 @@
 
 In: uint8 sRGB pixels and the ids of the sheet. Out: `MarkersInView`: corners in photo pixels (centers at .5, clockwise
 from the code's top-left) with the blur of their borders, ids of the same dictionary that are not the sheet's, and ids
-found at two places. The detector gets linear light: at a blur of 0.3 modules it read 45 of 48 markers in it, but 5 in
-code values, in which blurred paper spreads over ink. The pyramid starts below 1000 px and stops at the level where
-every expected id has been found. Only for missing ids it tries code values, in dark photos local contrast (CLAHE), both
-at half the size above 4 megapixels, and below that twice the size. Corners are then fitted in the full photograph
-(`edges`). With the page's millimeters, `known_page.find_sheet` needs fewer levels. Only OpenCV's class API (4.11 to
-5.x) is used.
+found at two places. The detector gets linear light, because blurred paper spreads over ink in code values: at a blur of
+0.3 modules it read 45 of 48 markers in linear light, and 5 in code values. The pyramid starts below 1000 px and stops
+at the level where every expected id has been found. Only if some are missing, it tries code values and, in dark photos,
+local contrast (CLAHE), both at half the size above 4 megapixels; smaller pictures are also tried at twice their size.
+Corners are then fitted in the full photograph (`edges`). `known_page.find_sheet` knows the page's millimeters and needs
+fewer levels. Only OpenCV's class API (4.11 to 5.x) is used.
 """
 
 from collections.abc import Callable, Iterator, Sequence, Set
@@ -53,7 +53,9 @@ Detections = dict[int, list[np.ndarray]]
 
 @dataclass(frozen=True)
 class MarkersInView:
-    """Markers by id; `foreign` ids of other sheets; ids of this one `doubled` (in two places) or `mirrored`."""
+    """A sheet's markers by id; `foreign` ids of the same dictionary; `doubled` ids of the sheet found in two places;
+    `mirrored` ids of the sheet whose codes some squares resemble in a mirror.
+    """
 
     markers: dict[int, Borders]
     foreign: tuple[int, ...]
@@ -250,7 +252,8 @@ def _detect(
 def detect_markers(picture: np.ndarray, aruco, settings: cv2.aruco.DetectorParameters):
     """OpenCV's (corners, ids or None) of one uint8 gray picture, and the set of ids whose codes some squares resemble
     in a mirror. Raises `PhotoRejected("too_costly")` if it shows more possible markers than there is time for. OpenCV
-    gets only codes that some square resembles: comparing one with a whole dictionary takes a millisecond.
+    gets only the codes that some square resembles, because comparing a square with a whole dictionary takes a
+    millisecond, or 20 s for a block design.
     """
     max_squares = int(min(MOST_SQUARES, remaining_seconds() / _SQUARE_S))
     windows = range(settings.adaptiveThreshWinSizeMin, settings.adaptiveThreshWinSizeMax + 1, _WINDOW_STEP_PX)
@@ -270,7 +273,9 @@ def detect_markers(picture: np.ndarray, aruco, settings: cv2.aruco.DetectorParam
 
 
 def _similar_ids(picture: np.ndarray, quads: np.ndarray, aruco) -> tuple[list[int], list[int]]:
-    """Return ids whose codes a gray picture resembles within corners Q×4×2 or their insets, and mirrored ones."""
+    """Return ids whose codes a gray picture resembles within corners Q×4×2, or within the smaller squares in them that
+    the detector tries, too; and ids that are resembled in a mirror.
+    """
     size = aruco.markerSize
     side, codes = size + 2, marker_codes(aruco.bytesList.tobytes(), size)
     cells = (np.indices((side, side))[::-1].reshape(2, -1).T + 0.5) / side - 0.5

@@ -7,7 +7,8 @@ contours, so it works for small, blurred or partly covered markers, and it saves
 Prediction never identifies a sheet by itself.
 
 A second print may be too far away for its markers to be read: dark squares are compared with the known codes, and count
-where two or three lie as on the sheet. That takes markers of 8 px (10 px at a blur of 0.9 px; reading takes 14).
+where two or three lie as on the sheet. That works from 8 px across on; at a blur of 0.9 px it works from 10 px on, and
+reading from 14.
 """
 
 from collections.abc import Iterator

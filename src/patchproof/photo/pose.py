@@ -45,7 +45,9 @@ _TURN_PER_BEND = 50.0
 
 @dataclass(frozen=True)
 class CameraPosition:
-    """Azimuth and distance with 95 % uncertainties (inf: unknown); `focal_agrees`: None if perspective cannot tell."""
+    """The camera's azimuth and distance, each with its 95 % uncertainty (infinite: unknown). `focal_agrees` says if
+    perspective confirms the focal length; None if it cannot tell.
+    """
 
     azimuth_deg: float
     azimuth_uncertainty_deg: float
@@ -76,7 +78,7 @@ def distortion_of(fit: PageFit, matrix_px: np.ndarray | None, focal_spread: floa
 def flat_sheet_position(
     fit: PageFit, matrix_px: np.ndarray, focal_spread: float, point_mm, turn: float = 0.0, matrix_is_known: bool = False
 ) -> CameraPosition:
-    """The camera's position before flat paper whose middle may turn by `turn`. A known matrix needs no confirmation."""
+    """The camera's position before flat paper; `turn` is its `turn_rad`. A known matrix needs no confirmation."""
     agrees, own_spread = _agreement(fit, matrix_px, focal_spread)
     entries = np.append(fit.px_from_mm.ravel()[:8], 0.0)
     root = np.pad(root_of(fit.covariance), (0, 1))
@@ -167,7 +169,9 @@ def _scale_focal(matrix_px: np.ndarray, log_scale: float) -> np.ndarray:
 
 
 def _agreement(fit: PageFit, matrix_px: np.ndarray, focal_spread: float) -> tuple[bool | None, float]:
-    """Return if r1 and r2 confirm the focal length (None: they cannot tell), and the spread of its log by them."""
+    """Return True or False if r1 and r2 confirm or contradict the focal length, None if they cannot tell, and the
+    standard deviation of its logarithm from perspective alone.
+    """
     error, covariance, by_focal = _disagreement(fit, matrix_px)
     covariance += np.diag([_PAPER**2, _PRINT_STRETCH**2 + _PAPER**2])
     # an off-center principal point changes r1 and r2, too, and may cancel a wrong focal length: confirming takes more

@@ -6,8 +6,8 @@ its covariance. Blur and sharpening make all markers of a photograph a little la
 more, their corners' mean outward shift is subtracted first. The uncertainty is the 95 % point of the *largest* of the
 design's corner errors, drawn from that covariance. It is wider with few corners (Student's t); the noise of a single
 marker, which fits exactly, is assumed to be large. Curved paper, motion and lenses rotate, stretch and shear whole
-markers, noise also twists them: what exceeds the noise of the twist is called bend, and the design's corners miss by
-several times as much.
+markers; noise twists them as well. Deformation beyond the noise that the twist shows is called bend, and the design's
+corners miss by several times as much.
 
 Source: Hartley and Zisserman, Multiple View Geometry, 2nd ed., 4.2 (reprojection error), 5.2 (covariance).
 """
@@ -68,7 +68,9 @@ def fit_page(corners_px: Quads, corners_mm: Quads) -> PageFit:
 
 
 def fit_points(mm: np.ndarray, px: np.ndarray, sigma_px: np.ndarray, start: np.ndarray | None = None) -> PageFit:
-    """Fit the homography mm → px to N ≥ 4 points N×2 with deviations `sigma_px` N; outliers beyond 3 σ count less."""
+    """Fit the homography mm → px to N ≥ 4 points N×2, beginning at `start` if given; `sigma_px` N are standard
+    deviations of a coordinate. Of more than four points, those off by more than three deviations lose weight.
+    """
     homography, weight = fit_homography(mm, px) if start is None else start, np.ones(len(mm))
     root = np.repeat(1 / sigma_px, 2)
     for _ in range(_ROUNDS if len(mm) > 4 else 1):
@@ -100,8 +102,8 @@ def corner_uncertainty_mm(fit: PageFit, rect_mm) -> float:
 
 
 def largest_shift_mm(root: np.ndarray, px_by_parameter: np.ndarray, mm_by_px: np.ndarray) -> float:
-    """The 95 % point of the largest error of C points, from 1000 draws of P parameters with covariance root · rootᵀ, by
-    the derivatives P×2C and C×2×2.
+    """The 95 % point of the largest error of C points, in 1000 draws of P parameters with covariance root · rootᵀ.
+    `px_by_parameter` P×2C and `mm_by_px` C×2×2 are derivatives.
     """
     # a fixed generator: the same photo must give the same bytes
     draws = np.random.default_rng(0).standard_normal((1000, len(root))) @ root.T
@@ -258,12 +260,11 @@ def _page_fit(homography, mm, px, inlier, ids) -> PageFit:
 def noise_and_bend(
     residual: np.ndarray, markers: np.ndarray, freedom: int, floor_px: float = CORNER_NOISE_PX
 ) -> tuple[float, float]:
-    """Return (noise for uncertainties, bend), px per coordinate, from residuals N×2 and those of complete markers
+    """Return (noise for uncertainties, bend), px per coordinate, from residuals N×2 and complete markers' residuals
     M×4×2.
 
     Noise is estimated from markers' twists (the alternating sums of their corners), which smooth deformations do not
-    change; the rest of the residual is bend. With less than three complete markers, all beyond the noise of sharp
-    corners is.
+    change; the rest is bend. Below three complete markers, all beyond the noise of sharp corners counts as bend.
     """
     variance = float((residual**2).sum()) / freedom
     noise = max(floor_px, np.sqrt(variance) * stdtrit(freedom, 0.975) / stdtrit(np.inf, 0.975))

@@ -88,7 +88,9 @@ def _has_jump(mesh: Mesh, one: np.ndarray, other: np.ndarray, same_way: np.ndarr
 
 @dataclass(frozen=True)
 class Outlines:
-    """U pixels keep `remaining` U×1 of their color; number `target` gets `share` S×1 of the color of `source`."""
+    """U pixels at outlines: each keeps `remaining` U×1 of its color, and pixel number `target` S among them gets
+    `share` S×1 of the color at `source` S.
+    """
 
     pixel: Tensor
     remaining: Tensor
@@ -140,7 +142,9 @@ class _Mix(torch.autograd.Function):
 def find_outlines(
     edges: Edges, vertices: Tensor, cameras: Cameras, eye_mm: Tensor, depth_mm: Tensor, covered: Tensor, near_mm: float
 ) -> Outlines:
-    """Find the outlines of N views from `eye_mm` N×3 at depths N·H·W, except between pixels `covered` by the piece."""
+    """Find the outlines of N views from `eye_mm` N×3, whose pixels N·H·W see `depth_mm` far (infinity: no object).
+    There are none between two pixels that only the piece covers (`covered`).
+    """
     views_at_once = max(1, CHUNK // max(len(vertices), len(edges.ends), len(edges.planes)))
     sides: list[list[tuple[Tensor, ...]]] = [[], []]
     for view in range(0, len(cameras), views_at_once):
@@ -172,7 +176,9 @@ def find_outlines(
 
 
 def _cut_off(distance: Tensor, slope: Tensor) -> Tensor:
-    """Return a pixel's share beyond an edge at `distance` (0 to 1) from its center, with `slope` (0 to 1)."""
+    """Return the share of a pixel beyond an edge that passes its center at this distance, from 0 to 1 along the axis
+    that it crosses more directly, and moves by `slope`, up to 1, along the other.
+    """
     reach = ((1 + slope) / 2 - distance).clamp_min(0)
     return torch.where(reach < slope, reach * reach / (2 * slope), (0.5 - distance).clamp_min(0))
 

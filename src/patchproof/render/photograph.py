@@ -47,11 +47,11 @@ def photograph(
     size_px: tuple[int, int],
     jpeg: bool = True,
 ) -> Tensor:
-    """Return N×3×H×W sRGB pictures of `size_px`; `shown=None` is the bare object. A square size gives the centered
-    square.
+    """Return N×3×H×W sRGB pictures of `size_px`; `shown=None` is the bare object.
 
     `shown` may also be a design: uint8 pixels h×w×3, or a float tensor in [0, 1] (3×h×w of any grid for a piece, 3×1×M
-    for textures), in which the pictures are differentiable. For `jpeg` see `channel.camera.develop`.
+    for textures), in which the pictures are differentiable. A square size gives the photograph's centered square.
+    `jpeg` is that of `develop`.
     """
     if min(size_px) < 1:
         raise Refused("size_px of 1 pixel at least", f"{size_px}", "give (width, height)")

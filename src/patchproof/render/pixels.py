@@ -22,7 +22,7 @@ MIN_SHARE = 1 / 512  # of a pixel: less changes no 8-bit value
 
 @dataclass(frozen=True)
 class TextureSampling:
-    """Pixels cover `side` of their width, with `taps` (on a piece `piece_taps`) on a footprint's shorter side."""
+    """Each pixel covers `side` of its width, with `taps` (pieces: `piece_taps`) on its footprint's shorter side."""
 
     taps: int
     side: float

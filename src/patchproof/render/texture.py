@@ -149,7 +149,9 @@ def footprint(
 
 
 def tap_grids(across: Tensor, down: Tensor, levels: Tensor, taps: int) -> tuple[Tensor, tuple[Tensor, Tensor] | None]:
-    """Return footprints' mip levels and taps across and down (None: one tap); sizes are in the finest texels."""
+    """Return the mip level for each of P footprints, and the numbers of taps across and down; None for a single tap.
+    `across` and `down` are the footprints' sizes in texels of the finest level.
+    """
     max_taps = 2 * taps if taps > 1 else 1
     level = _levels(torch.minimum(across, down), torch.maximum(across, down), taps, max_taps).minimum(levels - 1)
     if max_taps == 1:
@@ -195,7 +197,7 @@ def _taps(
     blocks: bool,
 ) -> tuple[Tensor, Tensor]:
     """Return texels and weights G×(4·rows·columns) of a grid of taps round `center` G×2, in texels of one level. A tap
-    between points is bilinear; on blocks it is the mean over its cell, exactly where both are parallel.
+    between points is bilinear. On blocks it is the mean over its cell, exactly if cell and blocks are parallel.
     """
     step_x, step_y = step_x / columns, step_y / rows
     position = center[:, :, None, None] + step_x[:, :, None, None] * tap_offsets(columns, center.device)

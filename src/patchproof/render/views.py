@@ -147,7 +147,9 @@ def render_views(
     size_px: tuple[int, int],
     look: TextureSampling = pixels.PHOTO_SAMPLING,
 ) -> Views:
-    """Render the views of `conditions`, with a piece if `appearance` is one: any picture of its size fits there."""
+    """Render the views of `conditions`: the object and, if `appearance` is a piece, that piece, in which any picture of
+    the same size can be shown later.
+    """
     piece = appearance if isinstance(appearance, PiecePicture) else None
     if not stage.scene.HAS_OBJECT:
         return _render_flat(stage, piece, conditions, size_px)

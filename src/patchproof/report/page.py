@@ -66,8 +66,7 @@ def png(pixels: np.ndarray) -> bytes:
 
 
 def save_pictures(folder: Path, file: str, kinds: Mapping[str, np.ndarray]) -> None:
-    """Replace a photograph's FILE.KIND.jpg pictures in `folder`; cells `delta_e00` (NaN: not measured) are a PNG map.
-    """
+    """Replace a photograph's pictures FILE.KIND.jpg in `folder`; `delta_e00` cells (NaN: not measured) become a PNG."""
     make_folder(folder)
     for kind in PICTURE_KINDS:
         _path(folder, file, kind).unlink(missing_ok=True)

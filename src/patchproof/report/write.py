@@ -78,8 +78,8 @@ def report_html(report: Mapping, manifest: Mapping, encoded: Mapping[str, Mappin
 
 
 def ledger_bars(ledger: Mapping[str, Any]) -> list[tuple[str, float, float, str, str]]:
-    """The gap ledger as bars from the ideal picture's confidence to the photographs': (step, left and right end in [0,
-    1], kind, change in points with its 95 % interval). A positive share is a loss for the goal.
+    """The gap ledger as bars from the ideal picture's confidence to the photographs': (step, left and right end within
+    0 to 1, kind, change in points with its 95 % interval). A positive share is a loss for the goal.
     """
     level, rows = ledger["ideal"], [("ideal", 0.0, ledger["ideal"], "promised", f"{100 * ledger['ideal']:.0f} %")]
     rises = (ledger["photo"] > level) != (sum(each["share"] for each in ledger["shares"].values()) < 0)

@@ -63,7 +63,9 @@ def reprint_pages(
 
 
 def photograph_page(page: np.ndarray, seed: int) -> tuple[bytes, np.ndarray]:
-    """Photograph a flat page from within 25° by `seed`. Return the file, and the light (3,) of blank paper in it."""
+    """Photograph a page that lies flat, from above within 25° to each side; the seed determines all conditions. Return
+    the file, and the light (3,) of blank paper in the middle of the page at its sensor.
+    """
     rng = np.random.default_rng([seed, 4])
     page_mm = np.array(page.shape[1::-1]) / PX_PER_MM
     distance = rng.uniform(1.2, 1.55) * page_mm.max()

@@ -128,7 +128,9 @@ def largest_share(roll_deg: tuple[float, float]) -> float:
 
 
 def erase(picture: np.ndarray, seed: int) -> None:
-    """Random Erasing in place: a box of a picture's centered square gets random values, equal at every size."""
+    """Apply Random Erasing to a uint8 H×W×3 picture in place: a box of its centered square takes random values, the
+    same box and values at every size, in photograph and square.
+    """
     rng = np.random.default_rng(seed)
     left = top = wide = high = 1.0
     while left + wide > 1 or top + high > 1:  # boxes that do not fit are drawn again, as in the paper

@@ -37,6 +37,8 @@ def board_squares(rows: int, columns: int, white: bool) -> list[tuple[int, int]]
 
 
 def marker_corner(square: tuple[int, int], side: float, marker: float, board: PointMm = (0.0, 0.0)) -> PointMm:
-    """Top-left corner of the marker of side `marker` in `square` (row, column, of `side`) of a board at `board`."""
+    """Top-left corner (x, y) of the marker in a square (row, column), on a board with its top-left corner at `board`;
+    `side` and `marker` are the sides of squares and markers.
+    """
     inset, (x, y), (row, column) = (side - marker) / 2, board, square
     return x + column * side + inset, y + row * side + inset

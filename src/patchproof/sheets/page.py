@@ -104,7 +104,7 @@ def lay_out_parts(
     words: dict[str, str],
     extra_parts: Sequence[PageParts] = (),
 ) -> PageLayout:
-    """Lay out a page: pieces at top-left corners, markers with these `ids`, `words` for placeholders in texts."""
+    """Lay out a page of (piece, top-left corner) pairs; `ids` are its own markers', `words` fill text placeholders."""
     size, corners_mm = template.marker.size_mm, template.marker.corners_mm if ids else ()
     page_markers = [square_marker(i, corner, size) for i, corner in zip(ids, corners_mm, strict=True)]
     page_mm, margin_mm = template.page_mm, template.margin_mm

@@ -5,8 +5,8 @@ around it (its quiet zone), and lies a millimeter inside the cut line, to allow 
 the corners and, on a piece that bends or is long, along its sides. They cover the design: `marker_image` gives their
 pixels and colors, exactly (the mean *light* of each pixel's area), since everything is an axis-aligned rectangle.
 
-Marker ids and the sheet id are derived from SHA-256, so they are the same on every machine. The sheet id does not
-depend on the design, because the piece is rendered with its marker ids while the design is optimized.
+Marker ids and the sheet id are derived from SHA-256, so they are the same on every machine and in every version. The
+sheet id does not depend on the design, because the piece is rendered with its marker ids during optimization.
 """
 
 import hashlib
@@ -109,7 +109,7 @@ def smallest_piece_mm(marker_mm: float = SMALLEST_MARKER_MM) -> int:
 def lay_out_piece(
     piece_mm: tuple[float, float], marker_mm: float, sheet_id: str, kind: str, bends: bool = False
 ) -> Piece:
-    """Lay out a piece with markers in corners and along long or bent sides; `marker_mm` = 0 gives none."""
+    """Lay out a piece with markers in its corners and along long or bent sides; `marker_mm` = 0 means none."""
     if not marker_mm:
         return Piece(piece_mm, (), 0.0)
     module = marker_mm / MARKER_MODULES

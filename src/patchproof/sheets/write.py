@@ -69,7 +69,9 @@ def write_sheet(
 def write_several(
     pdf_path: str | Path, template: Template, designs: Sequence[SheetContent], plans: Sequence[PlanPage | None] = ()
 ) -> list[Manifest]:
-    """Write a page of several designs, `plans` behind it, and a manifest for each; refuses a sheet's design twice."""
+    """Write a page with at least two designs and a manifest for each; `plans`, in the order of the designs, become
+    further pages. Refused if two designs belong to the same sheet.
+    """
     pdf_path = check_pdf_path(pdf_path)
     if template.tiles is not None:
         raise Refused("a template of one page for several designs", "one with tiles", "make a sheet of each")

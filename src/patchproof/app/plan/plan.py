@@ -50,7 +50,9 @@ PlanData = dict[str, Any]
 
 
 def plan_geometry(scene_path: str | Path, *, progress: Progress = no_progress) -> tuple[Problem, list[str]]:
-    """Return the problem, and lines on how the piece lies and is resolved; takes seconds if no place is searched."""
+    """Return the problem to measure, and lines on how the piece lies and how well views resolve it. Takes seconds, plus
+    the time of any search for a place.
+    """
     scene, found = load_scene(scene_path), []
     if isinstance(scene, UnplacedScene):
         place = choose_place(scene, progress=progress)
@@ -68,7 +70,9 @@ def plan_geometry(scene_path: str | Path, *, progress: Progress = no_progress) -
 
 
 def measured_lines(problem: Problem, *, views: int = TERM_VIEWS, progress: Progress = no_progress) -> list[str]:
-    """Measure and return a plan's other lines: a draft, terms, photographs that prove a promise, cost of a step."""
+    """Measure the rest of a plan and return its lines: a draft of the design, the model's terms in `views` views, how
+    many photographs prove a promise, and the cost of a step.
+    """
     scene, (design, draft) = problem.scene, _draft(problem, progress)
     conditions, other = scene.draw("select", views), placement_with_other_bend(scene)[0]
     terms = measure_terms(problem, design, conditions, SELECT_VIEWS, other, partial(progress, "terms"))
