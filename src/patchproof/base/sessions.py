@@ -221,7 +221,7 @@ def _blocks(rows: int, columns: int) -> list[slice]:
 
 
 def _beta_binomial(n: int, alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:
-    """The chances P×(n + 1) of 0 to n by the ratios of successive ones; SciPy takes 17 times as long at n = 100."""
+    """The chances P×(n + 1) of 0 to n by ratios of successive ones; SciPy takes 17 times as long at n = 100."""
     k, log = np.arange(n), np.zeros((len(alpha), n + 1))
     ratios = (n - k) / (k + 1) * (alpha[:, None] + k) / (beta[:, None] + n - 1 - k)
     np.cumsum(np.log(ratios), axis=1, out=log[:, 1:])

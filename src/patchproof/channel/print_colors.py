@@ -65,7 +65,7 @@ class ShownColors:
 
     @staticmethod
     def of_terms(terms: np.ndarray) -> "ShownColors":
-        """Colors by veil (3), log gains (3), tone and chroma; zeros change nothing. `B×8` terms show `B×N×3`."""
+        """Return the colors of `terms`: veil (3), log gains (3), tone, chroma; 0 has no effect. `B×8` show `B×N×3`."""
         veil, gains, tone, chroma = terms[..., :3], np.exp(terms[..., 3:6]), terms[..., 6:7, None], terms[..., 7:, None]
         mixing = (1 + chroma) * np.eye(3) - chroma * np.array(LUMINANCE)
         matrix = np.concatenate([(gains * (1 - veil))[..., None] * mixing, (gains * veil)[..., None]], -1)
@@ -82,7 +82,7 @@ class ShownColors:
 
 
 def lower_light(light: np.ndarray, tone: float) -> np.ndarray:
-    """Return light before a photograph's tone."""
+    """Return light as it was before a photograph's tone (`lift_tone`) was applied."""
     if not tone:
         return light
     codes, slope = srgb_from_linear(light), 1 + 4 * tone
@@ -188,7 +188,7 @@ def affine12(photographed: np.ndarray, promised: np.ndarray) -> ShownColors | No
 
 
 def white_black(paper: np.ndarray, ink: np.ndarray, promised_ink: np.ndarray) -> ShownColors:
-    """The map per channel that takes 1 to photographed paper and `promised_ink` to photographed ink."""
+    """Return the map per channel from paper (1) and `promised_ink` to photographed paper and ink."""
     gain = np.maximum(paper - ink, 1e-3) / np.maximum(1 - promised_ink, 1e-3)  # a printer's file may say white ink
     return ShownColors(np.column_stack([np.diag(gain), ink - gain * promised_ink]), kind="white_black")
 

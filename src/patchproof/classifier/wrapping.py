@@ -97,7 +97,7 @@ def _compare(classifier: Classifier, device: torch.device | str, matched: np.nda
 def _agreements(
     classifier: Classifier, pictures: Tensor, matched: np.ndarray, expected: Tensor, name: str
 ) -> dict[tuple[str, int], float]:
-    """The agreement after one change of the pictures, by its name and the move of the labels."""
+    """Return the agreement after one change of the pictures for each move of the labels: by (change, move)."""
     changed = _RANGES[name.removesuffix(_SWAPPED).removesuffix(" and ")](pictures)
     with torch.no_grad():
         logits = classifier.square_logits(changed.flip(1) if name.endswith(_SWAPPED) else changed).cpu().double()

@@ -45,7 +45,7 @@ class Windows:
 
 
 def numbers_saved(numbers: float, share: float, answers_alone: bool = False) -> float:
-    """How many of `numbers` per picture need not be computed, in rectangles of that share of the picture."""
+    """Return how many of `numbers` per picture rectangles of this share of the picture save."""
     return numbers * ((1 if answers_alone else GRADIENT_GAIN) - share) - CUT_COST
 
 

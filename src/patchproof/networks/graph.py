@@ -169,7 +169,7 @@ _ALLOCATING = {_ATEN.convolution.default, _ATEN.add.Tensor}
 
 
 def _shape_of_first(compute: Callable[..., Any]) -> Callable[..., Any]:
-    """`compute` without computing, where the result has the shape of the first argument."""
+    """Wrap `compute`: on tensors without memory it computes nothing if the result has the first argument's shape."""
 
     def result_shape(first: Any, *others: Any, **keywords: Any) -> Any:
         tensors = [first, *(other for other in others if isinstance(other, Tensor))]

@@ -225,5 +225,5 @@ def _views_answer(problem: Problem, printed: Tensor, views: Views) -> Answer:
 
 
 def _to_send(tensor: Tensor) -> np.ndarray | Tensor:
-    """What processes exchange: on a CPU an array; a GPU's only process leaves everything where it is."""
+    """Return a tensor as processes exchange it: an array on a CPU; a GPU has one process and exchanges nothing."""
     return tensor.numpy() if tensor.device.type == "cpu" else tensor

@@ -69,7 +69,7 @@ class Run:
 
     folder: Path
     scene: Scene
-    design: np.ndarray  # uint8 h×w×3; of a texture run 1×M×3, as in `optimize.texture.Texture`
+    design: np.ndarray  # uint8 h×w×3; of a texture run 1×M×3, as in `optimizer.texture.Texture`
     promise: Promise
     details: dict[str, Any]
     SHOWN: ClassVar[tuple[str, ...]] = ("folder", "scene.settings.target.label", "design", "promise")
@@ -161,7 +161,7 @@ def optimize(
 def effort_of(
     scene: Scene, draft: bool, thorough: bool, steps: int | None, views: int | None
 ) -> tuple[int, int | None]:
-    """Return steps and promised views, if not given: of a draft no more steps than the scene's, else no fewer."""
+    """Return (steps, promised views), given or default: a draft has no more steps than the scene, others no fewer."""
     if draft and thorough:
         raise Refused("a draft or a thorough run", "both", "leave one out")
     limit, effort = (min, DRAFT_EFFORT) if draft else (max, THOROUGH_EFFORT if thorough else (1, None))
@@ -169,7 +169,7 @@ def effort_of(
 
 
 def resolve_scene(scene: str | Path | Scene, seed: int | None) -> Scene:
-    """Return a scene, or load that of a file with `seed` in place of the file's; a scene in memory keeps its own."""
+    """Return a scene in memory, which keeps its seed, or load that of a file with `seed` in place of the file's."""
     if not isinstance(scene, Scene):
         return load_scene(scene, seed)
     if seed not in (None, scene.seed):

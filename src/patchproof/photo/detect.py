@@ -37,7 +37,7 @@ DARK_CODE = 70  # median code value below which local contrast helps; in bright 
 # and samples 10 px farther.
 _MARGIN_PX, _MARGIN_SHARE = 16.0, 0.2
 SMALLEST_MARKER_PX = 9.0  # side at its level: 7 modules of 1.3 px are the smallest that has been read
-# Of a side: the detector also tries squares inside, as of a marker in a quiet zone or shadow; one had 0.55
+# Shares of a side: the detector also tries squares inside a square, which may be a quiet zone or shadow (one: 0.55).
 _INSETS = (1.0, 0.93, 0.86, 0.79, 0.72, 0.66, 0.6, 0.54)
 _LEAST_CONTRAST_CODES, _MOST_BORDER_ERRORS = 6, 0.4  # of a square that can be a marker
 # A reduced picture is searched with one window of the detector's threshold, a full one with all three, which takes

@@ -26,16 +26,15 @@ from patchproof.photo.rectify import PageFit, Quads, fit_page, region_around
 from patchproof.photo.rejection import PhotoRejected
 from patchproof.sheets.markers import DICTIONARY, aruco_dictionary, marker_cells
 
-# of the light with the printed cells; wrong codes of the dictionary stay below 0.6, blur lowers it to 0.8
+# Of the light with the printed cells: blur lowers it to 0.8, and other codes of the dictionary stay below 0.6.
 LEAST_CORRELATION = 0.7
-# at one of the offsets (in modules) about the predicted place, which is at most half a module off: with less, borders
-# are not fitted, because that costs most
+# Borders, which cost most, are fitted only from here on, at one of the offsets (in modules) about the predicted place.
 _MIN_TRIAL_CORRELATION = 0.5
 _TRIAL_OFFSETS = tuple((x, y) for x in (-0.4, 0.0, 0.4) for y in (-0.4, 0.0, 0.4))
-# px of a marker's side, 4 per module: the detector reads 0.99 of these, so one that is missing must be covered
+# A marker's side in px, 4 a module: the detector reads 99 % of such markers, so one that is missing must be covered.
 READABLE_PX = 28.0
 _LEAST_MARKERS = 3  # with less, flat paper cannot be told from bent
-# The picture is scaled until the first print's markers are as large; those of one four times as far away are 17 px then
+# The picture is scaled until the first print's markers have this side; those of one four times as far have 17 px then.
 _FIRST_PX, _MOST_SCALE, _MOST_PIXELS = 70.0, 2.0, 4_500_000
 _LEAST_PX, _LARGEST_SHARE, _MOST_SQUARES = 9.0, 1.2, 300  # sides of squares there; of the first print's markers
 _OFFSETS = np.array([(x, y) for x in (-0.5, 0.0, 0.5) for y in (-0.5, 0.0, 0.5)])  # in modules
@@ -234,7 +233,7 @@ def find_small_markers(srgb: np.ndarray, read: Quads, corners_mm: Quads, diction
 
 
 def _groups(matches: list[Match], corners_mm: Quads) -> Iterator[dict[int, np.ndarray]]:
-    """Corners by id of markers that lie as on the sheet: three, then two that resemble their codes more."""
+    """Yield groups (corners by id) that lie as on the sheet: of three markers, then of two with better correlations."""
     for count, least in _LEAST_LIKENESS.items():
         for group in combinations([match for match in matches if match[1] > least], count):
             quads = {marker_id: quad for marker_id, _, quad in group}
@@ -290,7 +289,7 @@ def _matches(light: np.ndarray, quads: list[np.ndarray], ids: list[int], diction
 
 
 def _normalized(values: np.ndarray, count: int) -> np.ndarray:
-    """Rows of `count` values whose products are correlations."""
+    """Return rows of `count` values with mean 0 and length 1, whose inner products are correlations."""
     rows = values.reshape(-1, count)
     rows = rows - rows.mean(1, keepdims=True)
     return rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-6)

@@ -23,11 +23,11 @@ from patchproof.base.geometry import plane_pose, scaling_about, view_angles
 from patchproof.photo.rectify import PageFit, root_of, root_of_scaled
 from patchproof.photo.unroll import Shape
 
-# one σ of errors that are no noise of corners: of |r1| = |r2|, printers' errors of proportion; of both equations, of
-# angles in radians and of lengths, paper that is not quite flat or round, and lenses
+# One σ of errors beyond corner noise: printers' errors of proportion, in |r1| = |r2|; errors of lenses and of paper that
+# is not quite flat or round, in both equations, in angles (rad) and in lengths.
 _PRINT_STRETCH, _PAPER = 0.015, 0.003
-# one σ of the stretch that tilts allow for where perspective cannot tell: prints stretched by up to 5 % and pictures
-# squeezed by up to 12 % then stay within three times what is stated, at half the width that 0.015 gives
+# One σ of stretch in a tilt's uncertainty if perspective cannot tell: with prints stretched by up to 5 % or pictures
+# squeezed by up to 12 %, errors stay within three times the stated value, which is half as wide as with 0.015.
 _TILT_STRETCH = 0.008
 _MAX_CHI2 = 9.2  # 99 % of two degrees of freedom
 _MAX_SIGMAS = 2.6
@@ -36,10 +36,10 @@ _MAX_CONFIRMING_SPREAD = 0.1  # of the focal length's logarithm: perspective wit
 # from up to 50° leaves azimuths up to 44° off and tilts up to 46°, three times this, and no trace in 281 of 1,500 drawn
 # pictures, all of which look nearly frontal. Crops, anywhere in a picture, turn the azimuth by up to 16.4°.
 UNCONFIRMED_DEG = 15.5
-# one σ, as a share of the turn between the middle and the nearest marker: 95 % are 0.43 of it. A fold right beside the
-# middle turns it by as much as the sheet turns to one side: 1.28 of it, with markers a tenth as wide in the corners
+# One σ as a share of the turn between the middle and the nearest marker (95 %: 0.43 of it). At worst, with a fold right
+# beside the middle and markers a tenth as wide as the sheet in its corners, the middle is turned by 1.28 of it.
 _HIDDEN_TURN = 0.22
-# one σ in radians per bend (a share of the side, beyond noise): waves half a side long, seen under 20° or less
+# One σ in radians per bend (share of the side beyond noise), for waves half a side long seen at a tilt of 20° or less.
 _TURN_PER_BEND = 50.0
 
 

@@ -34,7 +34,7 @@ from patchproof.render.texture import (
 )
 from patchproof.scene.interface import PieceScene
 
-# A share of the piece's sides: half a pixel, the need, down to pieces of 7 pixels, or of 25 pixels at 75° of tilt.
+# Share of the piece's sides: the half pixel that is needed, for pieces of 7 pixels or more (25 pixels at 75° of tilt).
 MARGIN_SHARE = 0.1
 
 
