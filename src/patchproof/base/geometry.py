@@ -2,8 +2,8 @@
 
 Frames. World: millimeters, right-handed, y up, origin at the center of the object's bounding box. Camera: x right, y
 down, z forward. Page and piece: millimeters, x right, y down. Image: pixels, pixel centers at .5. `camera_from_world`
-is 4×4, and `camera_from_world @ [X, 1]` is the point in camera coordinates; such names read from right to left.
-Left out on purpose: lens distortion. It is applied only where a camera file has it.
+is 4×4, and `camera_from_world @ [X, 1]` is the point in camera coordinates; such names read from right to left. Left
+out on purpose: lens distortion, which is applied only where a camera file has it.
 
 Source of homographies and of the normalized DLT: Hartley and Zisserman, Multiple View Geometry, 2nd ed., 4.1 and 8.1.
 """

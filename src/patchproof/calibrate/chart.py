@@ -4,13 +4,13 @@ In: photographs of one or several prints of a page with a chart, and its manifes
 holds every rung of the ladder, every photograph and how much they disagree. Light relative to paper is averaged over
 the photographs of a print (their median from three on), then over prints.
 
-The table is an *appearance* model: what this camera showed of this printer, decoded as sRGB. Tone curves of camera and
-printer are one product in a photograph, and nothing on the page separates them. It describes paper in that light.
+The table is an *appearance* model: what this camera showed of this printer in that light, decoded as sRGB. A photograph
+shows the product of the tone curves of camera and printer, and nothing on the page separates them.
 
-In one photograph the page is found by its markers and swatches are read in their unblurred cores, in linear light,
-over the smooth surface that `paper_light` fits to white paper around the chart and to white swatches: that cancels
-gradients, vignetting, exposure and white balance. Text and lines on the paper are outliers of that surface.
-Left out on purpose: lens distortion (a swatch's core is far from its border), and gloss: photograph it without shine.
+The page is found by its markers, and swatches are read in their unblurred cores, in linear light, over the smooth
+surface that `paper_light` fits to white paper around the chart and to white swatches: that cancels gradients,
+vignetting, exposure and white balance. Text and lines on the paper are outliers of that surface. Left out on purpose:
+lens distortion (a swatch's core is far from its border), and gloss: photograph without shine.
 """
 
 from collections.abc import Mapping, Sequence

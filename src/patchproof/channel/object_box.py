@@ -1,8 +1,8 @@
 """The box around the object in a picture, with which a detector's boxes are compared.
 
 In: the object's outermost points and a camera. Out: (left, top, right, bottom) in pixels, clipped to the picture. The
-whole object counts, including what a piece or another of its parts hides: the box does not depend on the design. Left
-out on purpose: things that stand in front of the object.
+whole object counts, including hidden parts: the box does not depend on the design. Left out on purpose: things that
+stand in front of the object.
 """
 
 from contextlib import suppress

@@ -1,13 +1,13 @@
 """Separate a printer's inks from the light and camera of the photographs that show its known colors.
 
-In: cells of photographs, each with the light that a known printer would have made of it, and its light as seen; where
-cells lie and how they were found does not matter. Out: the print's ink, a quadratic in code values that is added to the
-known printer's light, and for each photograph what its place and camera did to that light: veil, gains, tone, chroma,
-by the channel's own formulas. The ink is linear in its coefficients, so a cell of many colors has the mean of its
-colors' terms, and what cells do not determine stays the known printer's.
+In: cells of photographs, wherever they lie, each with the light that a known printer would have made of it, and its
+light as seen. Out: the print's ink, a quadratic in code values that is added to the known printer's light, and for each
+photograph what its place and camera did to that light: veil, gains, tone, chroma, by the channel's own formulas. The
+ink is linear in its coefficients, so a cell of many colors has the mean of its colors' terms. What cells do not
+determine stays as the known printer has it.
 
 Ink and photographs are told apart only as far as photographs differ: what all of them share (one phone's tone curve, a
-veil in every place) may be either. Paper's light is a photograph's. Left out on purpose: light that changes in one.
+veil in every place) may be either. Left out on purpose: light that changes within a photograph.
 
 Where print and light need not be told apart, one map in light undoes both, so that a color difference measures what no
 such map explains: with eight usable colors a robust affine map, else one per channel from paper and ink.

@@ -1,12 +1,12 @@
-"""Say that a network was wrapped wrongly, and how it answers better, from what it says of twelve pictures.
+"""Warn of a network that was wrapped wrongly, by its answers to twelve pictures.
 
 In: a classifier or detector that shares labels' names with one whose wrapping is known (`_references`). Out: a warning,
-or a refusal where it is certain, if it agrees better with that one once its pictures have another range or order of
-colors, or its labels are moved by one place. Agreement is the correlation of logits, less their means over labels and
-over pictures, on the pictures of `wrapping.jpg`: renders of our primitives and our own patterns, chosen with three
-classifiers from 52, so that they agree by at least 0.05 less after any of these changes; three others by 0.02 less.
-Logits of COCO's labels by two detectors are stored in `wrapping.json`, which says where they come from.
-Left out on purpose: other label sets, and ImageNet's where `imagenet` is not installed.
+or a refusal where it is certain, if the two agree better once the pictures have another range or order of colors, or
+labels are moved by one place. Agreement is the correlation of logits, less their means over labels and over pictures,
+on the pictures of `wrapping.jpg`: renders of our primitives and our own patterns, chosen with three classifiers from
+52, so that they agree by at least 0.05 less after any of these changes; three others by 0.02 less. Logits of COCO's
+labels by two detectors are stored in `wrapping.json`, which says where they come from. Left out on purpose: other label
+sets, and ImageNet's where `imagenet` is not installed.
 """
 
 import json

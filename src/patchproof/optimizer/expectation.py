@@ -183,7 +183,7 @@ def gradient_in_views(problem: Problem, design: Tensor, views: Sequence[Views]) 
 def score(
     problem: Problem, pictures: Tensor, conditions: Conditions, windows: np.ndarray | None = None
 ) -> tuple[Tensor, Tensor]:
-    """The mean loss, differentiable, and mean loss, confidence and rate in float64, over classifiers and pictures
+    """The mean loss, differentiable, and (loss, confidence, rate) in float64, all means over classifiers and pictures
     N×3×H×W. Outside of `windows`, N×4 pixels (left, top, right, bottom), the pictures' gradient is not needed.
     """
     losses, figures, boxes = [], [], problem.boxes(conditions)

@@ -7,8 +7,8 @@ file's within its uncertainty), and a plane seen through a lens with one radial 
 residual is less than half of the plane's; a photograph with too much residual beyond noise is still rejected as
 `curled`. Left out on purpose: cones, folds and dents.
 
-Source of the cylinder: paper bends without stretching, so a sheet with straight rulings that are parallel is one
-(do Carmo, Differential Geometry of Curves and Surfaces, 5-8).
+Source of the cylinder: do Carmo, Differential Geometry of Curves and Surfaces, 5-8 (a sheet that bends without
+stretching, and whose straight rulings are parallel, is a cylinder).
 """
 
 from collections.abc import Callable
@@ -262,8 +262,8 @@ def _starts(flat, mm, px, camera, center, half_mm) -> list[tuple[float, float]]:
     """Starts of the fit: bends, in radians over half the sheet, and their directions.
 
     Slightly bent paper deviates from its plane by a quadratic form of the position, which shifts pixels in proportion:
-    one linear fit gives form and homography. A cylinder's form has one eigenvalue 0; that of noise is a start, too, and
-    so is the first one with its sign reversed, because a distant camera hardly tells the two apart.
+    one linear fit gives form and homography. A cylinder's form has one eigenvalue that is not 0. Noise may exceed it,
+    so both give starts; the larger one also with its sign reversed, which a distant camera hardly tells apart.
     """
     from_center = mm - center
     base = np.column_stack([from_center, np.zeros(len(mm))])

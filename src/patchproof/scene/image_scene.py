@@ -4,10 +4,8 @@ In: a folder of images and a CSV of file names and labels. Out: `ImageScene`. On
 used: an assistive patch helps them, a deceptive one hides them. The whole printed piece lies inside the centered
 square, turned by `view.roll_deg`, as large as `view.patch_share` says. In training, a random box of the picture below
 it may be erased, so that the patch does not depend on one feature. White paper is sRGB white, and nothing else is
-modeled: the promise holds for a patch pasted into such images, not for a print in the world.
-
-Training and selection see one half of the images; promise, reprint and evaluation the other. A single image is used for
-all.
+modeled: the promise holds for a patch pasted into such images, not for a print in the world. Training and selection see
+one half of the images; promise, reprint and evaluation the other. A single image is used for all.
 
 Sources: Brown et al., Adversarial Patch, 2017 (here also with the assistive goal); Zhong et al., Random Erasing Data
 Augmentation, AAAI 2020, algorithm 1.

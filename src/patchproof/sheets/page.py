@@ -1,11 +1,10 @@
 """Lay out one page: pieces, chart, rulers, QR code, page markers and texts, without overlaps.
 
-In: a template and pieces. Out: a `PageLayout`, which `pdf` draws and `write` states in the manifest.
-The chart's colors are the 8 corners of the RGB cube, an 8-step gray ramp (6 between black and white), 6 duplicates,
-whose readings are averaged, and a low-discrepancy sample of the cube, all multiples of 1/255, so that every printer
-driver gets the same numbers. Their places are shuffled in a fixed order, so that a gradient of light across the page is
-not mistaken for a color. Left out on purpose: automatic arrangement. The template places everything; only pieces are
-centered in their zone.
+In: a template and pieces. Out: a `PageLayout`, which `pdf` draws and `write` states in the manifest. The chart's colors
+are the 8 corners of the RGB cube, an 8-step gray ramp (6 between black and white), 6 duplicates, whose readings are
+averaged, and a low-discrepancy sample of the cube, all multiples of 1/255, so that every printer driver gets the same
+numbers. They are shuffled in a fixed order, so that a gradient of light across the page is not mistaken for a color.
+Left out on purpose: automatic arrangement. The template places everything; only pieces are centered in their zone.
 """
 
 import math

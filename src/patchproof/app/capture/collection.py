@@ -2,10 +2,11 @@
 
 In: an album, a manifest, the options of a verification. Out: a `Report`, as `verify` makes it of the same folder, and
 JSON values, in which every sentence about a photograph or the promise is the report's. Photographs are measured one at
-a time, in the single process of the workers, where limits of time and memory apply; finished ones are in the album's
-journal, so that a restart measures only new ones, tapped corners in `corners.csv`. On the map of views, cells are equal
-steps of azimuth and of distance (1 over pixels per millimeter), and need photographs in proportion to their shares of
-the conditions. Left out on purpose: the gap ledger and the estimated effect, which take longer than a person waits.
+a time, in the single process of the workers, where limits of time and memory apply. Finished ones are in the album's
+journal and tapped corners in `corners.csv`, so that a restart measures only new ones. Cells of the map of views are
+equal steps of azimuth and of distance (1 over pixels per millimeter), and need photographs in proportion to their
+shares of the conditions. Left out on purpose: the gap ledger and the estimated effect, which take longer than a person
+waits.
 """
 
 import re

@@ -112,12 +112,13 @@ def measure_terms(
     """Measure the errors of all terms over `conditions`, as plain data: `views`, the base setup's mean `confidence`,
     the `threshold`, the `errors` by term, and why no verdict is known (`unknown`, empty if they are).
 
-    An error has `codes_mean` and `codes_p95` (absolute differences of 8-bit code values), `confidence` (the mean
-    absolute change of the target's), and `bias` (the mean change, of leaving the term out or of adding a missing one);
-    `in_training` says if training's smaller views show a term that needs whole photographs. The verdict is off, keep
-    or can go; missing or left out, of what is not modeled; unknown if no term changes the confidence. Terms can go as
-    long as their changes, added up from the smallest on, stay under the threshold, the standard error of the mean
-    confidence over `selection_views` views: a smaller change decides no choice of a design.
+    An error has `codes_mean` and `codes_p95` (absolute differences of 8-bit code values), and of the target's
+    confidence the mean absolute change (`confidence`) and the mean change (`bias`), by leaving the term out or by
+    adding a missing one. `in_training` says if training's smaller views show a term that needs whole photographs.
+    Verdicts of modeled terms are off, keep or can go; of others missing or left out; of all unknown if no term changes
+    the confidence. Terms can go as long as the sum of their changes, from the smallest on, stays under the threshold,
+    the standard error of the mean confidence over `selection_views` views: a smaller change decides no choice of a
+    design.
     """
     base = Setup(problem.stage, problem.subject.appearance(design), conditions)
     terms, boxes, views = scene_terms(problem, design, other_surface), problem.boxes(conditions), len(conditions)

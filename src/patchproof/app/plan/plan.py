@@ -3,9 +3,9 @@
 In: a scene file. Out: the plan as lines: where the piece lies (after a search, if the scene asks for one) and how a
 simpler or richer surface would differ, the pixels that views have for design and markers, the error of leaving out each
 term of light, camera and renderer, how many photographs prove a promise, and the cost of a step. All figures come from
-the code that optimizes. Terms are measured with a draft of a few steps, since a classifier that ignores the design
-would miss none of them. What photographs can prove depends on how much sessions differ, which a small promise of the
-draft measures; the sheet's plan page says it of the design.
+the code that optimizes. Terms are measured with a draft of a few steps, since leaving one out changes nothing for a
+classifier that ignores the design. A small promise of the draft shows how much sessions differ, and hence what
+photographs can prove; the sheet's plan page states that for the final design.
 
 Left out on purpose: deciding for the user. The plan says which terms can go; the scene file decides.
 """
