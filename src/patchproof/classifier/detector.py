@@ -4,8 +4,8 @@ In: what a network finds in the photographs' centered squares: candidate boxes w
 overlapping ones are suppressed. Out: per photograph and label the logit of the best candidate on the object
 (intersection over union of at least `MIN_IOU` with its box), so that rates, losses, controls and promises are defined
 as for classifiers: the object is recognized where that score reaches `least_score`, and confidence is the score. Where
-the object's box is not known, any candidate counts. Left out on purpose: suppression, which leaves an object's best
-candidate.
+the object's box is not known, any candidate counts. Left out on purpose: suppression, which keeps the best candidate of
+an object, the only one that counts here.
 """
 
 from collections.abc import Callable, Sequence  # noqa: F401 (Callable: of the annotations of the inherited __init__)

@@ -97,7 +97,7 @@ def load_classifier(
 
 def _prepare(classifier: Classifier, device: torch.device | str, is_own: bool = False) -> Classifier:
     """Freeze a classifier, check it unless that is done or it is our own, and choose its fastest batches. A network
-    from a file is refused if that takes too long or, on a CPU, too much memory: a few lines may ask for a lot.
+    from a file is refused if that takes too long or, on a CPU, too much memory: a small file may ask for a lot.
     """
     checked_as = classifier.KIND, str(device), classifier.input_px, classifier.labels
 

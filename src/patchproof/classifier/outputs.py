@@ -47,7 +47,7 @@ def check_shape(output: Any, classifier: Classifier) -> None:
 
 
 def check_values(classifier: Classifier, photos: Tensor, output: Tensor) -> None:
-    """Refuse boxes that are none, and scores 3×K or 3×A×K that are probabilities, percent or 8-bit numbers."""
+    """Refuse boxes that are not corners in pixels, and scores 3×K or 3×A×K that are probabilities, percent or 8-bit."""
     if classifier.LOOKS_AT_BOXES:
         _check_boxes(classifier, output)
     scores = output[..., 4:] if classifier.LOOKS_AT_BOXES else output

@@ -68,7 +68,7 @@ def value_numbers(arguments: Iterable[Any]) -> Iterator[int]:
 
 
 class Program(torch.nn.Module):
-    """A graph as a function of pictures; weights are buffers. Without `sizes`, as of the user's code, no dry run."""
+    """A graph as a function of pictures, with weights as buffers. Without `sizes` (a user's code) it is not dry-run."""
 
     def __init__(self, weights: list[Tensor], steps: list[Step], output: int, sizes: list[int | None] | None):
         super().__init__()

@@ -23,8 +23,8 @@ from patchproof.base.geometry import plane_pose, scaling_about, view_angles
 from patchproof.photo.rectify import PageFit, root_of, root_of_scaled
 from patchproof.photo.unroll import Shape
 
-# One σ of errors beyond corner noise: printers' errors of proportion, in |r1| = |r2|; errors of lenses and of paper that
-# is not quite flat or round, in both equations, in angles (rad) and in lengths.
+# One σ of errors beyond corner noise: printers' errors of proportion, in |r1| = |r2|; errors of lenses and of paper
+# that is not quite flat or round, in both equations, in angles (rad) and in lengths.
 _PRINT_STRETCH, _PAPER = 0.015, 0.003
 # One σ of stretch in a tilt's uncertainty if perspective cannot tell: with prints stretched by up to 5 % or pictures
 # squeezed by up to 12 %, errors stay within three times the stated value, which is half as wide as with 0.015.

@@ -41,7 +41,7 @@ class FrameLight:
 
 
 def is_featureless(srgb: np.ndarray) -> bool:
-    """True if a uint8 picture H×W×3 is one tone or noise, by means of 8 × 8 cells and differences of neighbors."""
+    """True if a uint8 picture H×W×3 is one tone or noise: its 8 × 8 cells' mean colors differ no more than by noise."""
     means = cv2.resize(srgb, (_CELLS, _CELLS), interpolation=cv2.INTER_AREA).reshape(-1, 3)
     steps = np.diff(srgb[:: max(1, len(srgb) // 200)].astype(np.int16), axis=1).astype(float)
     noise = np.sqrt((steps**2).mean() / 2) if steps.size else 0.0

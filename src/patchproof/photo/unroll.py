@@ -199,7 +199,7 @@ def fit_cylinder(flat, mm, px, size, focal_px, focal_spread=UNKNOWN_FOCAL, floor
     focal = focal_px or _TYPICAL_FOCAL * np.hypot(*size)
 
     def project(p, points):
-        # p, or each of its rows: rotation vector, page center in the camera (mm), log focal / guess, bend, its direction
+        # p or each of its rows: rotation vector, page center in the camera (mm), log focal / guess, bend, its direction
         rotation = np.swapaxes(Rotation.from_rotvec(p[..., :3]).as_matrix(), -1, -2)
         camera = in_space(p, points)[0] @ rotation + p[..., None, 3:6]
         return focal * np.exp(p[..., 6, None, None]) * camera[..., :2] / np.maximum(camera[..., 2:], 1e-3) + middle
