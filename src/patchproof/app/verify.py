@@ -200,7 +200,9 @@ def options_of(
 
 
 def _look_at(out: Path, manifest: Manifest) -> Callable[[Sequence[PhotoEntry]], Look]:
-    """Return a function that gives a look's number: the last report's for the same photographs, else one more."""
+    """Return a function that numbers this look at photographs: as the report of this sheet in `out` does if its
+    photographs were the same, one more if they were others, 1 without such a report.
+    """
     try:
         report = read_json(out / "report.json", "a report", "verify again")
         number, hashes = int(report["summary"]["looks"]), {photo["sha256"] for photo in report["photos"]}

@@ -177,7 +177,7 @@ def plane_pose(homography, matrix_px) -> np.ndarray:
 
 
 def view_angles(camera_from_plane, point) -> tuple[float, float, float]:
-    """(azimuth_deg, elevation_deg, distance_mm) of the camera from a page point; right and above are positive."""
+    """(azimuth_deg, elevation_deg, distance_mm) of the camera from a page point; positive right of and above it."""
     rotation, translation = camera_from_plane[:3, :3], camera_from_plane[:3, 3]
     x, y, z = -rotation.T @ translation - np.array([point[0], point[1], 0.0])
     distance = float(np.sqrt(x * x + y * y + z * z))

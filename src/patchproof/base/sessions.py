@@ -112,7 +112,9 @@ def _chances_of(posterior: RatePosterior, photos: tuple[int, ...]) -> np.ndarray
 
 
 def count_by_session(hits: Hits, per_session: int, places: Sequence[int] = ()) -> tuple[list[int], list[int]]:
-    """Count (recognized, photographs) in sessions of `per_session` successive ones; those of one place are joined."""
+    """Count (recognized, photographs) in sessions of `per_session` successive photographs; the last may have fewer.
+    Sessions with the same number in `places` count as one, because sessions differ mostly by their place.
+    """
     sessions, by_place = _split(hits, per_session), dict[int, list[bool]]()
     for place, session in zip(places or range(len(sessions)), sessions, strict=True):
         by_place.setdefault(place, []).extend(map(bool, session))

@@ -223,7 +223,9 @@ def read_chart(photo: Photo, manifest: Manifest) -> ChartPhoto:
 
 
 def _find_page(srgb: np.ndarray, manifest: Manifest) -> tuple[np.ndarray, float]:
-    """Return the chart page's homography mm → px and blur in px, by markers beside the piece, and its own if uncut."""
+    """Return the homography mm → px of the chart's page, and the blur in px: by the markers beside the piece, and by
+    the piece's own as well if it is not cut out.
+    """
     dictionary = manifest.markers[0].dictionary
     on_page = {marker.id: marker for marker in manifest.markers if marker.page == manifest.chart[0].page}
     corners_mm = {i: np.array(marker.corners_mm) for i, marker in on_page.items()}

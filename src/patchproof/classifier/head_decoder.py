@@ -88,7 +88,7 @@ class HeadDecoder:
 
 
 def spread_labels(boxes: Tensor, labels: Tensor, scores: Tensor, count: int) -> Tensor:
-    """Return candidates N×M×(4+`count`) of boxes N×M×4 with one label each; labels from `count` on score nowhere."""
+    """Return candidates N×M×(4+`count`) of boxes N×M×4 with one label each, which is ignored beyond 0..count-1."""
     score = scores.clamp(1e-6, 1 - 1e-6).logit().masked_fill((labels < 0) | (labels >= count), NO_BOX_LOGIT)[..., None]
     logits = scores.new_full((*scores.shape, count), NO_BOX_LOGIT)
     return torch.cat([boxes, logits.scatter(-1, labels.long().clamp(0, count - 1)[..., None], score)], -1)

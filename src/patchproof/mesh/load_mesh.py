@@ -76,7 +76,9 @@ def _reduce_textures(parts: Sequence[MeshPart]) -> tuple[list[MeshPart], list[st
 
 
 def read_parts(path: Path, world_from_file: np.ndarray) -> tuple[list[MeshPart], list[str], list[Path]]:
-    """Read all placed geometries with faces, turned by `world_from_file` 3×3; also warnings, and the files read."""
+    """Read every placed geometry with faces, turned by `world_from_file` 3×3. Returns the parts, warnings, and the
+    files that were read.
+    """
     if not is_file(path) or not path.stat().st_size:  # some files of the system are empty, and never end
         raise Refused("a mesh file", f"no file at {path}, or an empty one", "check the path")
     kind = FORMATS.get(path.suffix.lower())

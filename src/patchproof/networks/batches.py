@@ -45,7 +45,7 @@ class Windows:
 
 
 def numbers_saved(numbers: float, share: float, answers_alone: bool = False) -> float:
-    """Return how many of `numbers` per picture rectangles of this share of the picture save."""
+    """Return how many of a picture's `numbers` are saved by rectangles that cover this share of it."""
     return numbers * ((1 if answers_alone else GRADIENT_GAIN) - share) - CUT_COST
 
 

@@ -131,7 +131,9 @@ def set_problem(
     loss: Loss | None = None,
     jobs: int = 1,
 ) -> Problem:
-    """The problem of a scene; `models` and `loss` replace its own. On a CPU, `jobs` processes share its views."""
+    """The problem of a scene; `models` replaces the scene's classifiers, `loss` that of its goal. On a CPU, `jobs`
+    processes share its views.
+    """
     check_device(device)
     settings = scene.settings
     names, least_score = models or scene.networks, settings.target.least_score

@@ -78,7 +78,9 @@ def distortion_of(fit: PageFit, matrix_px: np.ndarray | None, focal_spread: floa
 def flat_sheet_position(
     fit: PageFit, matrix_px: np.ndarray, focal_spread: float, point_mm, turn: float = 0.0, matrix_is_known: bool = False
 ) -> CameraPosition:
-    """The camera's position before flat paper; `turn` is its `turn_rad`. A known matrix needs no confirmation."""
+    """The camera's position before flat paper; `turn` is that of `turn_rad`. With `matrix_is_known` the matrix is that
+    of this picture and needs no confirmation by perspective.
+    """
     agrees, own_spread = _agreement(fit, matrix_px, focal_spread)
     entries = np.append(fit.px_from_mm.ravel()[:8], 0.0)
     root = np.pad(root_of(fit.covariance), (0, 1))

@@ -103,7 +103,9 @@ def lay_out_parts(
     words: dict[str, str],
     extra_parts: Sequence[PageParts] = (),
 ) -> PageLayout:
-    """Lay out a page of (piece, top-left corner) pairs; `ids` are its own markers', `words` fill text placeholders."""
+    """Lay out a page with any number of (piece, top-left corner); `ids` are those of the page's own markers (none for a
+    page without markers), `words` the values of the placeholders in the template's text.
+    """
     size, corners_mm = template.marker.size_mm, template.marker.corners_mm if ids else ()
     page_markers = [square_marker(i, corner, size) for i, corner in zip(ids, corners_mm, strict=True)]
     page_mm, margin_mm = template.page_mm, template.margin_mm

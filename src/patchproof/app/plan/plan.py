@@ -145,7 +145,7 @@ def measure_cost(problem: Problem, design: Tensor, advance: Advance = no_advance
 
 
 def _step_ms(problem: Problem, design: Tensor, conditions: Conditions) -> dict[str, float]:
-    """Time each part of one step in milliseconds, in order; views of one pose share its rasterization."""
+    """Time each part of one step in milliseconds, in the loop's order; views of one pose share its rasterization."""
     design = design.clone().requires_grad_()
     appearance, ends = problem.subject.appearance(design.detach()), {"": time.perf_counter()}
     views = problem.see(appearance, conditions, problem.training_px)
