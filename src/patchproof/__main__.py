@@ -11,7 +11,7 @@ def main() -> None:
     """Run the command line, which Ctrl-C ends even while it is being imported."""
     handle_interrupts()
     atexit.register(gc.freeze)  # at the end Python looks through all objects that are not frozen: .3 s with torch's
-    # threads that wait for one another give their core away: beside another program `preview` took 9 to 11 s, now 2.5
+    # waiting threads leave their core to other programs: beside one, `preview` takes 2.5 s instead of 9 to 11
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     from patchproof.app.cli import main
 

@@ -43,7 +43,7 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def checked(function: Function, name: str) -> Function:
-    """The public function `name` of the package with checked arguments; what it refuses is said in Python's words."""
+    """The public function `name` with checked arguments; its refusals name keywords, not command-line options."""
     signature = inspect.signature(function)
     parameters = signature.parameters
 
@@ -86,13 +86,13 @@ def _free_cores(values: dict[str, Any], name: str) -> Iterator[None]:
 
 
 def _python_words(text: str) -> str:
-    """The sentence of a command line with keywords in place of its options."""
+    """Replace the command-line options in a sentence by Python keywords."""
     text = re.sub(r"--(overwrite|resume|trust)\b", r"\1=True", text)
     return re.sub(r"--([a-z][a-z-]+)", lambda match: match[1].replace("-", "_"), text)
 
 
 def _resolved(hint: Any, module: str, value: Any) -> Any:
-    """An annotation; a quoted one names what its module does not load, and is read where the value needs it."""
+    """Return an annotation; a quoted one, of types its module does not import, is evaluated if the value needs it."""
     if not isinstance(hint, str):
         return hint
     if value is None or ("str" in hint and isinstance(value, str | Path)):
@@ -102,7 +102,7 @@ def _resolved(hint: Any, module: str, value: Any) -> Any:
 
 
 def _checked_value(value: Any, hint: Any, key: str, owner: str) -> Any:
-    """The value of an argument, or field of options; refused if it does not fit, or is below the key's least number."""
+    """Return an argument's value; refused if it does not fit its annotation or is below the least number of its key."""
     if isinstance(value, np.generic) and not isinstance(value, str):
         value = value.item()
     if (misfit := _misfit(value, hint)) is not None:
@@ -120,7 +120,7 @@ def _checked_value(value: Any, hint: Any, key: str, owner: str) -> Any:
 
 
 def _misfit(value: Any, hint: Any) -> str | None:
-    """What does not fit an annotation, in words; None if all does."""
+    """Describe the part of a value that does not fit an annotation; None if all of it fits."""
     origin, parts = get_origin(hint) or hint, get_args(hint)
     kind = getattr(origin, "__name__", "")
     if origin in (Union, types.UnionType):

@@ -18,7 +18,7 @@ STOP_AFTER_S = 0.5
 
 
 def handle_interrupts() -> None:
-    """Set up this process, before anything else is imported."""
+    """Install the handlers in this process; call it before anything else is imported."""
     receiver, sender = socket.socketpair()
     sender.setblocking(False)
     signal.set_wakeup_fd(sender.fileno(), warn_on_full_buffer=False)  # written to even while Python waits for a library

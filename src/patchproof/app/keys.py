@@ -2,8 +2,7 @@
 
 In: the settings classes; the readers' own lists of declarations. Out: per table a row per key: type and range, unit,
 default, meaning; a table for each kind of input. The meaning is the comment at the end of the field's last line or,
-without one, the comment above the field, so that it is written only once, in the code. What is in no list is not read:
-such as sidecar files, or the comments in a file.
+without one, the comment above the field. What is in no list is not read, such as sidecar files or comments in a file.
 """
 
 import ast

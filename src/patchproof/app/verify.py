@@ -159,9 +159,7 @@ def verify(
 
 
 def _boxes(report: Report, manifest: Manifest, camera: "Camera | None") -> str:
-    """Write the photographs as COCO JSON, with the piece's outline where it is flat and not rejected, and for detectors
-    the part of the object's box in the centered square, if it is known.
-    """
+    """Write the photographs as COCO JSON: outlines of pieces that are flat and not rejected, and known object boxes."""
     corners, photos = rect_corners(manifest.cut_mm), []
     bends = camera is not None and camera.has_distortion  # then places are those in the undistorted picture
     label = "object" if manifest.promise is None else manifest.promise.target.label
@@ -202,8 +200,8 @@ def options_of(
 
 
 def _look_at(out: Path, manifest: Manifest) -> Callable[[Sequence[PhotoEntry]], Look]:
-    """Tell the number of a look from its photographs: that of the report of this sheet in `out` for the same ones, one
-    more for others, 1 without such a report.
+    """Return a function that numbers this look at photographs: as the report of this sheet in `out` does if its
+    photographs were the same, one more if they were others, 1 without such a report.
     """
     try:
         report = read_json(out / "report.json", "a report", "verify again")

@@ -2,8 +2,7 @@
 
 In and out: numpy arrays or torch tensors with the channels in the *last* axis (`... × 3`), or of any shape where a
 function works per value. `*_srgb` is display-encoded in [0, 1], `*_linear` is light relative to sRGB white. CIELAB is
-D65, 2°. The same code serves both libraries, so that the loss in training and the figure in the report share one
-formula.
+D65, 2°. Training and report share one formula, whichever library they use.
 
 Sources: IEC 61966-2-1 (sRGB); CIE 15:2004 (CIELAB); Sharma, Wu, Dalal, Color Res. Appl. 30 (2005) 21-30 (CIEDE2000).
 """
@@ -44,8 +43,8 @@ def lift_tone(codes, tone):
 
 
 def clamp_to_unit(values):
-    """Clip values to [0, 1] with a gradient of 1 at 0 and 1 themselves. `torch.clamp` has gradient 0 there since 2.14,
-    and a fully black or white pixel could never change again.
+    """Clip to [0, 1] with gradient 1 at 0 and 1. `torch.clamp` has gradient 0 there since 2.14, and a fully black or
+    white pixel could never change again.
     """
     xp = _library(values)
     if xp is np or values.requires_grad:

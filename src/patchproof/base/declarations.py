@@ -1,7 +1,7 @@
-"""The lists that readers of files keep: what a format can declare, and what the reader does with it.
+"""What files can declare, and what their readers do with each declaration.
 
-`DECLARED` is that of settings and text files; other readers' lists stand in `declarations.py` of their rooms. From all
-of them `patchproof keys --files` makes one page, and for each entry the tests hold a file.
+`DECLARED` is the list of settings and text files; other readers have theirs in the `declarations.py` of their packages.
+`patchproof keys --files` prints all of them, and the tests hold a file for each entry.
 """
 
 from typing import Literal, NamedTuple

@@ -51,9 +51,7 @@ def value_sha256(value: Any) -> str:
 def refuse_other_inputs(
     recorded: Mapping[str, str], inputs: Mapping[str, str], source: str | Path, settings: Mapping[str, Any]
 ) -> None:
-    """Refuse inputs, by the key of the settings that names them, whose fingerprints differ from those that `source`
-    recorded of itself.
-    """
+    """Refuse inputs, by settings key, whose fingerprints differ from those that `source` recorded of itself."""
     for key, sha256 in recorded.items():
         if inputs.get(key) != sha256:
             value: Any = settings
@@ -65,8 +63,8 @@ def refuse_other_inputs(
 
 
 def content_identity(settings: SceneSettings, base: Path) -> dict[str, Any]:
-    """The identity of a scene's settings with a hash of the content of each file in place of its name: a draw does not
-    depend on how a path is spelled. Of a folder the names and sizes of its files are hashed.
+    """The identity of a scene's settings: a hash of content stands for each file's name (of a folder: the names and
+    sizes of its files), so that draws do not depend on how a path is spelled.
     """
     identity, printer, file = identity_settings(settings), settings.printer.profile, settings.camera.file
     contents = {key: [path] for key, path in named_paths(settings, base).items()}

@@ -31,8 +31,8 @@ def lock_folder(folder: str | Path) -> Iterator[None]:
     there; refused if another command is in it.
 
     Put it around all from the first look at the folder to the last file, as `new_folder` does itself. Different folders
-    may be locked within each other. The lock is a hidden file beside the folder (`.NAME.lock.part`), so that the folder
-    may be missing or be replaced; a file that a killed process left behind locks nothing.
+    may be locked within each other. The lock is a hidden file beside the folder, which may be missing or be replaced
+    (`.NAME.lock.part`); one that a killed process left behind locks nothing.
     """
     try:
         real = Path(folder).resolve()

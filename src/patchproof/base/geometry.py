@@ -2,8 +2,8 @@
 
 Frames. World: millimeters, right-handed, y up, origin at the center of the object's bounding box. Camera: x right, y
 down, z forward. Page and piece: millimeters, x right, y down. Image: pixels, pixel centers at .5. `camera_from_world`
-is 4×4, and `camera_from_world @ [X, 1]` is the point in camera coordinates; such names read from right to left.
-Left out on purpose: lens distortion. It is applied only where a camera file has it.
+is 4×4, and `camera_from_world @ [X, 1]` is the point in camera coordinates; such names read from right to left. Left
+out on purpose: lens distortion, which is applied only where a camera file has it.
 
 Source of homographies and of the normalized DLT: Hartley and Zisserman, Multiple View Geometry, 2nd ed., 4.1 and 8.1.
 """
@@ -47,9 +47,7 @@ def dot(a: Sequence[Numbers], b: Sequence[Numbers]) -> Numbers:
 
 
 def orbit(azimuth_deg: ArrayLike, elevation_deg: ArrayLike, forward: ArrayLike, up: ArrayLike = UP) -> np.ndarray:
-    """Unit direction (3,) from the object to a camera, N×3 for arrays of angles. Azimuth turns about `up` from
-    `forward`; positive is to the right of a viewer who faces the side.
-    """
+    """Unit direction (3,) or N×3 to a camera; azimuth is positive to the right of a viewer who faces the side."""
     forward, up = _unit(forward), _unit(up)
     right = np.cross(up, forward)  # the viewer who faces the side has this on the right hand
     azimuth, elevation = np.radians(azimuth_deg)[..., None], np.radians(elevation_deg)[..., None]
@@ -148,9 +146,8 @@ def corner_turns(quad) -> np.ndarray:
 
 
 def local_scale(homography, point) -> tuple[float, float]:
-    """(px_per_mm, tilt_deg) of a page→image homography at a page point, from the singular values of its derivative.
-
-    px_per_mm is their geometric mean; tilt is arccos of their ratio: exact for a distant camera, else approximate.
+    """(px_per_mm, tilt_deg) of a page→image homography at a page point, by its derivative's singular values: their
+    geometric mean, and arccos of their ratio, which is the tilt exactly for a distant camera.
     """
     px_per_mm, tilt_deg = local_scales(np.asarray(homography)[None], point)[0].tolist()
     return px_per_mm, tilt_deg
@@ -180,10 +177,7 @@ def plane_pose(homography, matrix_px) -> np.ndarray:
 
 
 def view_angles(camera_from_plane, point) -> tuple[float, float, float]:
-    """(azimuth_deg, elevation_deg, distance_mm) of the camera, seen from a page point.
-
-    Azimuth is positive where the camera is to the right of the page's normal, elevation where it is above.
-    """
+    """(azimuth_deg, elevation_deg, distance_mm) of the camera from a page point; positive right of and above it."""
     rotation, translation = camera_from_plane[:3, :3], camera_from_plane[:3, 3]
     x, y, z = -rotation.T @ translation - np.array([point[0], point[1], 0.0])
     distance = float(np.sqrt(x * x + y * y + z * z))

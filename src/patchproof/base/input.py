@@ -160,8 +160,8 @@ def run_within_seconds(seconds: float, work: Callable[[], ReturnType]) -> Return
 
 
 def run_in_child(work: Callable[[], ReturnType]) -> ReturnType:
-    """Call `work` in a forked process and return its result; raises `TimeLimitExceeded` after `TIME_LIMIT_S`, and a
-    MemoryError beyond `MAX_CHILD_BYTES` or if the process dies. On systems other than Linux it runs in this process.
+    """Call `work` in a forked process (in this one except on Linux) and return its result. Raises `TimeLimitExceeded`
+    after `TIME_LIMIT_S`, MemoryError beyond `MAX_CHILD_BYTES` or if the process dies.
     """
     if sys.platform != "linux":
         return run_within_seconds(TIME_LIMIT_S, work)

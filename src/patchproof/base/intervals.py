@@ -1,10 +1,9 @@
 """Confidence intervals of rates, of means, and of differences between rates.
 
-In: counts and figures. Out: intervals and `Estimate`s for tables, at 95 %.
-A rate from n images gets Wilson's interval; `sessions` predicts what photographs of new sessions will show.
-Differences on the same conditions are paired (Newcombe 1998b, method 10); those on different conditions follow Newcombe
-1998a, method 10.
-Left out on purpose: corrections for repeated looks at the data. `optimizer.promise` looks in a way that needs none.
+In: counts and figures. Out: intervals and `Estimate`s for tables, at 95 %. A rate from n images gets Wilson's interval;
+`sessions` predicts what photographs of new sessions will show. Differences on the same conditions are paired (Newcombe
+1998b, method 10), others follow Newcombe 1998a, method 10. Left out on purpose: corrections for repeated looks at the
+data, which `optimizer.promise` does not need.
 
 Sources: Wilson, JASA 22 (1927); Newcombe, Statistics in Medicine 17 (1998) 873-890 (independent) and 2635-2650
 (paired).

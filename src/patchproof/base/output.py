@@ -65,9 +65,8 @@ def check_folder(
     unfinished: bool = False,
     inputs: Iterable[object] = (),
 ) -> None:
-    """Refuse a folder with files in it, unless they may be overwritten: such commands wrote them all, by the folder's
-    listing and by `file_names`, the patterns of names that this command writes, and none of its `inputs` is among them.
-    For an `unfinished` folder the refusal says how to continue.
+    """Refuse a folder with files in it, unless they may be overwritten: its listing and `file_names`, the patterns that
+    this command writes, cover them all, and no `inputs` are among them. If `unfinished`, say how to continue.
     """
     if os.path.lexists(out) and not is_folder(out):
         raise Refused("a folder to write to", f"{out}, which is not a folder", _ANOTHER)
@@ -86,14 +85,14 @@ def check_folder(
 
 
 def refuse_inputs_in(out: Path, inputs: Iterable[object]) -> None:
-    """Refuse a file or folder that a command reads, if it is or lies in what the command writes."""
+    """Refuse inputs of a command that are, or lie in, what it writes."""
     for path in inputs:  # objects in memory have no path
         if isinstance(path, str | Path) and os.path.exists(path) and Path(path).resolve().is_relative_to(out.resolve()):
             raise Refused("inputs that lie outside of what is written", f"{path} in {out}", _ANOTHER)
 
 
 def refuse_other_files(out: Path, file_names: tuple[str, ...]) -> None:
-    """Refuse to continue a folder that has files beside those of the patterns, or a link within it."""
+    """Refuse to continue a folder that contains links, or files that match none of the patterns."""
     foreign = [n for n in _files_in(out) if not _matches(n, file_names) or (out / n).is_symlink()]
     if foreign:
         expected = f"a folder with this command's own output only ({', '.join(file_names) or 'none'})"
@@ -124,7 +123,7 @@ def clear_folder(folder: Path, keep: Callable[[str], bool] = lambda name: False)
 
 
 def _remove_listed(folder: Path) -> None:
-    """Remove the listed files of a folder that was replaced; a link alone, not what it leads to."""
+    """Remove the listed files of a folder that was replaced; of a link only the link, not its target."""
     if folder.is_symlink():
         folder.unlink()
     clear_folder(folder)
@@ -202,7 +201,7 @@ def write_json(path: Path, data: Any) -> None:
 
 
 def write_files_atomically(contents: Mapping[Path, bytes]) -> None:
-    """Write several files beside their places, in folders that are made, then move all: a full disk leaves the old."""
+    """Write several files beside their places, making folders, and then move all: a full disk leaves the old files."""
     for path in contents:
         with suppress(OSError):  # writing says why
             path.parent.mkdir(parents=True, exist_ok=True)

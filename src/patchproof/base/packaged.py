@@ -20,8 +20,8 @@ def packaged_path(folder: Literal["calibration", "print_templates"], *parts: str
 def named_path(
     name_or_file: str | Path, base: Path | None, what: str, folder: Path, suffixes: Sequence[str], others=()
 ) -> Path:
-    """The path of a shipped file in `folder` by its name, or any path relative to `base`, of one of the suffixes or in
-    a folder; a name that is unknown is refused with the nearest one, `others` among them.
+    """The path of a shipped file by its name, or any path with one of the suffixes or in a folder, relative to `base`;
+    an unknown name is refused with the nearest one, `others` among them.
     """
     path = Path(name_or_file)
     if path.suffix.lower() in suffixes or len(path.parts) > 1:

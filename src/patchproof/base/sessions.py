@@ -1,16 +1,15 @@
 """Recognition rates from photographs taken in sessions, and predictions for new sessions.
 
 Photographs of one session share a print, a lamp, a camera and a place, so they are correlated and carry less evidence
-than as many independent ones. In: how many photographs of each session were recognized. Out: a `RatePosterior` of the
-rate and of the correlation of two photographs of a session; from it the rate's interval, the counts that photographs of
-new sessions will show, and the rates that are compatible with such counts.
+than independent ones. In: how many photographs of each session were recognized. Out: a `RatePosterior` of the rate and
+of the correlation of two photographs of a session; from it the rate's interval, the counts that photographs of new
+sessions will show, and the rates that are compatible with such counts.
 
 A session's own rate is Beta-distributed about the overall rate, so that its count is beta-binomial (Williams,
-Biometrics 31 (1975) 949-952, with the intraclass correlation ρ = 1 / (α + β + 1)). Both are uncertain: predictions are
-means over a grid of the posterior, with Jeffreys' prior of the rate and a flat prior of √ρ. Of sessions of one
-photograph each ρ is taken for 0.
-Differences between photographs of a patch and of a control have an interval with the same model in normal form.
-Left out on purpose: a rate that depends on the pose, which all sessions share.
+Biometrics 31 (1975) 949-952, with the intraclass correlation ρ = 1 / (α + β + 1)). Predictions are means over a grid of
+the posterior, with Jeffreys' prior of the rate and a flat prior of √ρ. If all sessions have one photograph, ρ is taken
+as 0. Differences between a patch and a control have an interval with the same model in normal form. Left out on
+purpose: a rate that depends on the pose, which all sessions share.
 """
 
 from collections import Counter
@@ -63,8 +62,8 @@ class RatePosterior:
         return int(np.searchsorted(cumulative, TAIL)), int(np.searchsorted(cumulative, 1 - TAIL))
 
     def least_rate(self, recognized: int, photos: Sequence[int], tail: float) -> float:
-        """The smallest rate at which `recognized` photographs or more are recognized with a chance of `tail`; the
-        observed count itself counts half (mid-p). Sessions differ as much as the posterior says.
+        """The smallest rate at which `recognized` photographs or more have a chance of `tail`; the observed count
+        itself counts half (mid-p). Sessions differ as much as the posterior says.
         """
         return _least_rates(*self._marginal(), tuple(sorted(photos)), tail)[recognized]
 
@@ -113,8 +112,8 @@ def _chances_of(posterior: RatePosterior, photos: tuple[int, ...]) -> np.ndarray
 
 
 def count_by_session(hits: Hits, per_session: int, places: Sequence[int] = ()) -> tuple[list[int], list[int]]:
-    """(recognized, photographs) of sessions of `per_session` successive photographs; the last may have fewer. Sessions
-    with the same number in `places` count as one, because sessions differ mostly by their place.
+    """Count (recognized, photographs) in sessions of `per_session` successive photographs; the last may have fewer.
+    Sessions with the same number in `places` count as one, because sessions differ mostly by their place.
     """
     sessions, by_place = _split(hits, per_session), dict[int, list[bool]]()
     for place, session in zip(places or range(len(sessions)), sessions, strict=True):
@@ -224,7 +223,7 @@ def _blocks(rows: int, columns: int) -> list[slice]:
 
 
 def _beta_binomial(n: int, alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:
-    """The chances P×(n + 1) of 0 to n by the ratios of successive ones; SciPy takes 17 times as long at n = 100."""
+    """The chances P×(n + 1) of 0 to n by ratios of successive ones; SciPy takes 17 times as long at n = 100."""
     k, log = np.arange(n), np.zeros((len(alpha), n + 1))
     ratios = (n - k) / (k + 1) * (alpha[:, None] + k) / (beta[:, None] + n - 1 - k)
     np.cumsum(np.log(ratios), axis=1, out=log[:, 1:])

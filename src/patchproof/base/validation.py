@@ -49,7 +49,7 @@ class StrictModel(BaseModel):
     __repr__ = short_repr
 
     def changed(self, **values: Any) -> Self:
-        """A copy with some values replaced, checked as a file is. A dictionary replaces single keys of a table:
+        """A copy with some values replaced, checked as a file is. A dictionary replaces single keys of a table, as in
         `scene.changed(optimize={"steps": 10})`.
         """
         tables = {name: getattr(self, name) for name in type(self).model_fields}
@@ -100,8 +100,8 @@ def expand_path(text: str, base: Path) -> str:
 
 
 def refuse_untrusted(source: str | Path, networks: Iterable[str] = (), settings: Any = ()) -> None:
-    """Refuse what a file that others may have made would have run, downloaded or read of the environment: networks but
-    for files and built-in ones, and `${VAR}` in them or in any text of its `settings` (tables, lists, text).
+    """Refuse what a file of somebody else would have run, downloaded or read of the environment: networks but for files
+    and built-in ones, and `${VAR}` in them or in any text of its `settings` (tables, lists, text).
     """
     do = "add --trust if you trust where it is from, or name the networks yourself"
     for name in networks:

@@ -1,13 +1,13 @@
 """Run independent work in this process, in local processes, or on a Dask cluster, as one `concurrent.futures.Executor`.
 
 In: a function and items that can be pickled. Out: results, as they finish or in order. The death of a worker costs a
-retry, not a result: all items in flight run again, those of local processes one at a time, so that only the item that
-kills its worker is given up.
+retry, not a result: all items in flight run again, locally one at a time, so that only the item that kills its worker
+is given up.
 
 Other processes compute on one thread each; if this process does, too, results do not depend on where they were
-computed. Local processes are forked where that is safe: they start in milliseconds, and `fork_workers` shares with them
-all that this process has loaded. Elsewhere they are spawned and import all modules again, and work on shared data stays
-in this process. A cluster's machines need this package, and the same files at the same paths.
+computed. Local processes are forked where that is safe: they start in milliseconds, and `fork_workers` shares all
+loaded data with them. Elsewhere they are spawned and import all modules again, and work on shared data stays in this
+process. A cluster's machines need this package, and the same files at the same paths.
 """
 
 import ctypes
@@ -37,9 +37,7 @@ _QUOTA = Path("/sys/fs/cgroup/cpu.max")  # of a container: microseconds of proce
 
 
 class Workers:
-    """An executor that can be restarted; made and closed by `open_workers`. With `one_thread` each task limits its own
-    threads, for workers that were not started here.
-    """
+    """A restartable executor, opened and closed by `open_workers`. With `one_thread` tasks limit their own threads."""
 
     def __init__(self, start: Callable[[], Executor], in_flight: int, one_thread: bool = False, executors: int = 1):
         self._start, self._in_flight, self._one_thread = start, in_flight, one_thread
@@ -113,9 +111,8 @@ class Workers:
 @contextmanager
 def open_workers(jobs: int = 1, cluster: str | None = None, spawn: bool = False) -> Iterator[Workers]:
     """Open `jobs` local processes, or the Dask cluster whose scheduler is at `cluster`. One job runs in this process,
-    on all of its threads; with `spawn` every job gets a spawned process.
-
-    Where processes are spawned, a script that calls this needs the `if __name__ == "__main__"` guard.
+    on all of its threads; with `spawn` every job gets a spawned process, and the calling script needs a `__main__`
+    guard.
     """
     if cluster is None:
         forks = can_fork() and not spawn
@@ -147,12 +144,12 @@ def _connect_client(address: str) -> Any:
 
 @contextmanager
 def fork_workers(function: _Task, jobs: int, in_turn: bool = False) -> Iterator[tuple[Workers, _Task]]:
-    """Fork `jobs` processes that hold `function` and all that it refers to in their memory; yields the workers and the
-    callable to give them in its place. Only items and results are sent.
+    """Fork `jobs` processes that share `function` and all that it refers to. Yields the workers and the callable to
+    give them in its place, so that only items and results are sent.
 
-    One job runs in this process, as does work within a forked worker; a system that cannot fork (`can_fork`) runs it
-    here on `jobs` threads. With `in_turn` every call deals its items to the processes in rotation from the first on, so
-    that each finds what it cached for an earlier one; otherwise the first free process takes the next item.
+    One job runs in this process, as does work within a forked worker; a system that cannot fork uses `jobs` threads
+    here. With `in_turn` every call deals its items to the processes in the same rotation, so that each finds what it
+    cached for an earlier one; otherwise the first free process takes the next item.
     """
     in_process = jobs == 1 or _function is not None
     if in_process or not can_fork():
@@ -187,8 +184,8 @@ def available_cores() -> int:
 
 @contextmanager
 def share_cores(jobs: int | None, device: str = "cpu", cluster: str | None = None) -> Iterator[int]:
-    """Yield `jobs`, by default one for each free core, and compute on one thread within the block, if processes can be
-    forked; with a GPU, a cluster, or processes that would have to import everything, one with this process's threads.
+    """Yield `jobs`: by default one for each free core, but a single one with a GPU, with a cluster, or if processes
+    cannot be forked. Where they can be, for work on the CPU, compute on one thread within the block.
     """
     import multiprocessing
 
@@ -256,9 +253,7 @@ def _process_pool(jobs: int, forks: bool, function: _Task | None = None) -> Exec
 
 
 class _QuietProcessPool(futures.ProcessPoolExecutor):
-    """A pool without Python's warning of a fork with other threads. Those of torch and OpenCV have ended or are idle by
-    then (`use_threads`); a child that needs them would wait forever.
-    """
+    """A pool without Python's warning of forks with threads, since torch's and OpenCV's are idle (`use_threads`)."""
 
     def submit(self, fn, /, *args, **kwargs) -> Future:
         with warnings.catch_warnings():

@@ -1,13 +1,12 @@
 """Calibrate a camera from photographs of a board: choose photographs and lens model, write a file that scenes can read.
 
 In: photographs and a board. Out: `CameraCalibration`, and NAME.json in the form of calibration/cameras. All views come
-from one camera in one state: the picture size, orientation and focal length that most photographs share; otherwise a
-phone that switched lenses between two photographs would be calibrated as the mean of both. Corners are saddle points,
-symmetric under half a turn, so neither blur nor the tone curve shifts them. Photographs that cannot determine a camera
-are refused: too few of them, boards that all face the same way (a plane's picture then hardly depends on the focal
-length), a focal length known to no better than 1 %. The print's size does not matter, its proportions do: rulers that
-differ are typed in. A photograph that stands out was moved or shows a bent board.
-Left out on purpose: fisheye lenses, and how flat the board is, which shows in the residuals only.
+from one camera in one state: the picture size, orientation and focal length that most photographs share, because a
+phone may switch lenses between two photographs. Corners are saddle points, symmetric under half a turn, so neither blur
+nor the tone curve shifts them. Photographs that cannot determine a camera are refused: too few, boards that all face
+the same way (a plane's picture then hardly depends on the focal length), a focal length known to no better than 1 %.
+The print's proportions matter, not its size: rulers that differ are typed in. A photograph that stands out was moved or
+shows a bent board. Left out on purpose: fisheye lenses; how flat the board is, which only the residuals show.
 """
 
 from collections import Counter
@@ -132,9 +131,8 @@ def calibration_lines(result: CameraCalibration) -> list[str]:
 def find_boards(
     photos: str | Path, board: Board, ruler_mm: tuple[float, float] | None = None, advance: Advance = no_advance
 ) -> tuple[list[BoardView], dict[str, str], str]:
-    """Read a folder's photographs: (views, reasons by the names of photographs left out, the camera's name).
-
-    `ruler_mm` are the printed rulers (x, y) as measured.
+    """Read a folder's photographs: (views, reasons by the names of photographs left out, the camera's name). `ruler_mm`
+    are the printed rulers (x, y) as measured.
     """
     paths, views, left_out, states = list_photos(photos), [], {}, []
     positions_mm = corner_positions_mm(board, ruler_mm)
@@ -173,9 +171,8 @@ def _read_view(path: Path, board: Board, positions_mm: np.ndarray) -> tuple[Boar
 
 
 def find_corners(srgb: np.ndarray, board: Board) -> tuple[np.ndarray, np.ndarray, int]:
-    """Find the board's inner corners in a picture: (ids N, pixels N×2, number of markers).
-
-    Markers are searched for in linear light, where blurred paper does not grow over ink; corners need no such care.
+    """Find the board's inner corners in a picture: (ids N, pixels N×2, number of markers). Markers are searched for in
+    linear light, where blurred paper does not grow over ink; corners need no such care.
     """
     dictionary = aruco_dictionary(DICTIONARY)
     light = photo_codes_from_srgb(luminance(srgb))

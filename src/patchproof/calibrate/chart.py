@@ -4,13 +4,13 @@ In: photographs of one or several prints of a page with a chart, and its manifes
 holds every rung of the ladder, every photograph and how much they disagree. Light relative to paper is averaged over
 the photographs of a print (their median from three on), then over prints.
 
-The table is an *appearance* model: what this camera showed of this printer, decoded as sRGB. Tone curves of camera and
-printer are one product in a photograph, and nothing on the page separates them. It describes paper in that light.
+The table is an *appearance* model: what this camera showed of this printer in that light, decoded as sRGB. A photograph
+shows the product of the tone curves of camera and printer, and nothing on the page separates them.
 
-In one photograph the page is found by its markers and swatches are read in their unblurred cores, in linear light,
-over the smooth surface that `paper_light` fits to white paper around the chart and to white swatches: that cancels
-gradients, vignetting, exposure and white balance. Text and lines on the paper are outliers of that surface.
-Left out on purpose: lens distortion (a swatch's core is far from its border), and gloss: photograph it without shine.
+The page is found by its markers, and swatches are read in their unblurred cores, in linear light, over the smooth
+surface that `paper_light` fits to white paper around the chart and to white swatches: that cancels gradients,
+vignetting, exposure and white balance. Text and lines on the paper are outliers of that surface. Left out on purpose:
+lens distortion (a swatch's core is far from its border), and gloss: photograph without shine.
 """
 
 from collections.abc import Mapping, Sequence
@@ -52,9 +52,7 @@ _SEARCH_MM = 60.0  # bare paper is searched for within this distance of the char
 
 @dataclass(frozen=True)
 class ChartPhoto:
-    """`light` N×3 relative to paper, one row per swatch of the manifest's chart, NaN where it could not be read, and
-    the light of bare `paper` under the chart (1 = the camera's full white).
-    """
+    """Swatches' `light` N×3 relative to paper (NaN: unread), and that of bare `paper` (1 = the camera's full white)."""
 
     light: np.ndarray
     paper: tuple[float, float, float]
@@ -225,8 +223,8 @@ def read_chart(photo: Photo, manifest: Manifest) -> ChartPhoto:
 
 
 def _find_page(srgb: np.ndarray, manifest: Manifest) -> tuple[np.ndarray, float]:
-    """Find the chart's page by the markers beside the piece; the piece's own help where it is not cut out. Returns the
-    homography from millimeters to pixels, and the blur in pixels.
+    """Return the homography mm → px of the chart's page, and the blur in px: by the markers beside the piece, and by
+    the piece's own as well if it is not cut out.
     """
     dictionary = manifest.markers[0].dictionary
     on_page = {marker.id: marker for marker in manifest.markers if marker.page == manifest.chart[0].page}

@@ -1,15 +1,15 @@
 """Choose from a ladder of models the simplest one whose held-out error is no worse than the best one's.
 
 In: each model's error on every item while that item was held out, simplest model first. No worse means within one
-standard error (Breiman's rule), and that is the standard error of the *paired* difference from the best, item by item:
-items that are hard for every model say nothing about which one is better.
+standard error (Breiman's rule) of the *paired* difference from the best, item by item: items that are hard for every
+model say nothing about which one is better.
 
-Also: the ladder of maps from colors sent to colors seen, from identity to splines, with known printers as priors.
-Each map is tested by ΔE00 on colors that it was not fitted to (ten folds; the corners of the RGB cube always stay in
-training, so that no color outside of those seen is predicted). Where colors are too few, or nearly gray, only maps
-remain that fit nothing or paper and black. The splines (Duchon 1977) see each color as sRGB and as CIELAB together:
-drivers work in either, and in one of them a printer is close to straight. With 48 swatches that reduced ΔE00 from 3.2
-to 2.3 where the driver looks for nearest colors, and cost 0.2 where it only mixes inks.
+Also: the ladder of maps from colors sent to colors seen, from identity to splines, with known printers as priors. Each
+map is tested by ΔE00 on colors that it was not fitted to (ten folds; the corners of the RGB cube always stay in
+training, so that no color outside of those seen is predicted). Too few or nearly gray colors leave only maps that fit
+nothing, or paper and black. The splines (Duchon 1977) see each color as sRGB and as CIELAB together: drivers work in
+either, and in one of them a printer is close to straight. With 48 swatches that reduced ΔE00 from 3.2 to 2.3 where the
+driver looks for nearest colors, and cost 0.2 where it only mixes inks.
 
 Sources: Breiman, Friedman, Olshen, Stone, Classification and Regression Trees, 1984, 3.4.3 (the rule of one standard
 error); Hastie, Tibshirani, Friedman, The Elements of Statistical Learning, 2nd ed., 7.10 (cross-validation).

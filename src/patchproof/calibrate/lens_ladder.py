@@ -2,10 +2,10 @@
 
 In: corners of several photographs. Out: every rung's error on photographs that it was not fitted to, the rung that
 `ladder` chooses, and its fit to all. The rungs are pinhole, k1, k1 k2, those with tangential terms p1 p2, and with k3
-on top: a term that helps no more than chance is left out. For a held-out photograph only its pose, six numbers, is
-fitted. Of 25 simulated cameras without distortion 24 stay at the pinhole, of 25 with k1 alone 19 at k1.
-OpenCV fits (Zhang's method); the standard deviations are its own or those between the folds, whichever are larger:
-photographs share a bent board, and corners of one photograph are not independent.
+as well: a term that helps no more than chance is left out. For a held-out photograph only its pose, six numbers, is
+fitted. Of 25 simulated cameras without distortion 24 stay at the pinhole, of 25 with k1 alone 19 at k1. OpenCV fits
+(Zhang's method). Standard deviations are the larger of its own and of those between the folds, because photographs
+share a bent board, and corners of one photograph are not independent.
 
 Source: Zhang, A Flexible New Technique for Camera Calibration, PAMI 2000.
 """

@@ -1,19 +1,18 @@
 """Light on surfaces, and the camera: linear light at the lens becomes a display-encoded picture.
 
 Light is even ambient light and one directional light per view (Lambert), in units in which 1 shows white paper as sRGB
-white at exposure 0. All light is white: the camera has the white balance.
-Left out on purpose: interreflection and cast shadows (computed for the default ranges, a ledge 10 mm high along the top
-of a patch 110 mm wide takes 4 % of its light in the mean view, 9 % at the 95 % point); a lamp's fall-off, ambient light
-that differs by direction, and highlights on paper, which together took 0.5 points [-0.1, 1.0] of the rates promised for
-glossy paper half a meter from a lamp, in 9 pairs of scene and network.
+white at exposure 0. All light is white: the camera has the white balance. Left out on purpose: interreflection and cast
+shadows (for the default ranges, a ledge 10 mm high along the top of a patch 110 mm wide takes 4 % of its light in the
+mean view, 9 % at the 95 % point); a lamp's fall-off, ambient light that differs by direction, and highlights on paper,
+which together took 0.5 points [-0.1, 1.0] of promised rates on glossy paper half a meter from a lamp (9 pairs of scene
+and network).
 
 Camera. In: N×3×H×W linear light and a `Sensor`. Out: N×3×H×W sRGB in [0, 1], differentiable. Order: blur (optics,
 focus, straight motion), exposure and white balance, shot and read noise, clipping, sRGB's curve, the photograph's own
 tone. The lens's distortion has its own module.
 
-Blur, motion, noise and JPEG are given for the photograph's full size. A picture rendered at `scale` times that size
-gets the part of them that remains after averaging: they shrink with `scale`, and effects below the threshold of
-visibility are skipped, because they would cost time and change nothing. At full size the writer makes a real JPEG.
+Blur, motion, noise and JPEG are given for the photograph's full size. A picture of `scale` times that size averages
+pixels, so they are multiplied by `scale`, and skipped where invisible. At full size the writer makes a real JPEG.
 """
 
 from dataclasses import dataclass
@@ -40,9 +39,8 @@ _TABLE_STEPS = 1 << 18  # of light in `encode_light_by_table`
 
 
 def develop(linear: Tensor, sensor: Sensor, scale: float, jpeg: bool = True) -> Tensor:
-    """Return the pictures that a camera makes of linear light, one row of `sensor` per picture.
-
-    `scale` is the pictures' size divided by the photograph's. `jpeg=False` leaves JPEG to the writer of a real file.
+    """Return the pictures that a camera makes of linear light, one row of `sensor` per picture. `scale` is their size
+    divided by the photograph's. `jpeg=False` leaves JPEG to the writer of a real file.
     """
     tensor = partial(torch.as_tensor, dtype=linear.dtype, device=linear.device)
     light = gaussian_blur(linear, tensor(sensor.blur_px * scale))
@@ -112,18 +110,15 @@ def gaussian_blur(linear: Tensor, sigma_px: Tensor) -> Tensor:
 
 
 def motion_blur(linear: Tensor, length_px: Tensor, angle_deg) -> Tensor:
-    """Blur pictures by an even, straight motion, with one length and angle (counter-clockwise from x) per picture.
-
-    If all lengths are too short to be seen, return the input; length 0 leaves a picture unchanged.
-    """
+    """Blur pictures by even, straight motion, with a length and an angle (counter-clockwise from x) for each."""
     if _motion_reach(float(length_px.max())) == 0:
         return linear
     return _filtered(linear, _streaks(length_px, torch.as_tensor(angle_deg).to(linear)))
 
 
 def _filtered(pictures: Tensor, *kernels: Tensor) -> Tensor:
-    """Correlate pictures N×C×H×W with kernels N×h×w of odd sides, one after the other, edges repeated: the same bits as
-    kornia's `filter2d`. In this memory order a photograph of 1600 × 1200 px takes a seventh of its time.
+    """Correlate pictures N×C×H×W with kernels N×h×w of odd sides in turn, edges repeated: the same bits as kornia's
+    `filter2d`, in a seventh of its time at 1600 × 1200 px.
     """
     count, channels, *_ = pictures.shape
     below, right = (sum(kernel.shape[axis] // 2 for kernel in kernels) for axis in (1, 2))
@@ -136,10 +131,7 @@ def _filtered(pictures: Tensor, *kernels: Tensor) -> Tensor:
 
 
 def _streaks(length_px: Tensor, angle_deg: Tensor) -> Tensor:
-    """Return N×k×k motion kernels of sum 1: points along a line, each shared out bilinearly between four pixels.
-
-    kornia's motion kernels have one odd length for the whole batch and jump from pixel to pixel when they are rotated.
-    """
+    """Return N×k×k motion kernels of sum 1: points along a line, each shared out bilinearly between four pixels."""
     reach = _motion_reach(float(length_px.max()))
     pixels = torch.arange(-reach, reach + 1).to(length_px)
     steps = 8 * reach  # four or more per pixel

@@ -1,8 +1,8 @@
 """The effects by which views differ: four records of drawn values, and one table of the effects that fill them.
 
-The print, its paper, the light, the camera and its lens, and the place are the same for all photographs of a session;
-each photograph has its own camera position, exposure, blur, noise, and position within the place. A session here is
-what one person does in one go with one print.
+Print, paper, light, camera, lens and place are the same for all photographs of a session, which is what one person does
+in one go with one print; each photograph has its own camera position, exposure, blur, noise, and position within the
+place.
 
 A record's fields are arrays of one row per view in physical units. A field that is not given is off (no blur, white
 paper), and a single row stands for all views. `EFFECTS` says for each effect how the scene's settings and numbers in
@@ -10,7 +10,7 @@ paper), and a single row stands for all views. `EFFECTS` says for each effect ho
 ablation study switch effects off by this table alone.
 
 A new effect takes a range in `settings`, a field and a row here, its formula in `channel`, and the place in `render`
-that applies it. It draws from a generator keyed by its name, so that all other effects' draws stay as they were.
+that applies it. Its generator is keyed by its name, so that other effects' draws do not change.
 """
 
 from collections.abc import Callable, Mapping
@@ -120,14 +120,14 @@ RECORD_OF = {part.name: record for record, kind in RECORDS.items() for part in f
 
 @dataclass(frozen=True)
 class ViewEffect:
-    """One effect by which views differ. `columns` are the numbers it draws, each with its range or with the setting
-    "table.name" that holds the range. They fill the fields of the same names, or `transform` turns them into the fields
-    `targets`. `first` is the position of its columns in the sequence that the oldest effects share (some columns of
-    that sequence are unused); None for an effect with a generator of its own.
+    """One effect by which views differ. `columns` are the numbers it draws, each with its range or the setting
+    "table.name" that holds it. They fill the fields of the same names, or `transform` turns them into the fields
+    `targets`. `first` is their position in the sequence that the oldest effects share; None for an effect with its own
+    generator.
 
-    `per_photo` names the columns that are drawn for every photograph ("all", or by name); the others are drawn once a
-    session. `can_be_off` is False for an effect that every picture has. `replacement` makes the light that stands in
-    when this light is left out. An effect that `needs_whole_photo` cannot be seen in reduced pictures as it is.
+    `per_photo` names the columns that are drawn for every photograph (or "all"); others are drawn once a session.
+    `can_be_off` is False for an effect that every picture has. `replacement` makes the light that stands in when this
+    light is left out. An effect that `needs_whole_photo` cannot be seen in reduced pictures as it is.
     """
 
     name: str

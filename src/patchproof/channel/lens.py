@@ -98,7 +98,6 @@ class Camera(StrictModel):
 
     def distort_pictures(self, pictures: "Tensor", size_px: tuple[int, int]) -> "Tensor":
         """Bend pinhole pictures N×C×H×W of `pinhole_frame(...).size_px` as the lens does, to pictures of `size_px`.
-
         Differentiable. The input should be linear light, which is what passes through a lens.
         """
         import torch
@@ -125,8 +124,8 @@ def load_camera(name_or_file: str | Path, base: Path | None = None, photo_px: tu
 
 
 def check_camera(camera: Camera, where: str) -> None:
-    """Refuse a principal point outside the picture, and distortion that cannot be undone. Where undistorting closes,
-    neighbors keep their order and stay within twice their distance, so that no direction is seen twice.
+    """Refuse a principal point outside the picture, and distortion that cannot be undone: points that are undistorted
+    and distorted again must return, so that no direction is seen twice.
     """
     width, height = camera.image_px
     if not (0 < camera.cx < width and 0 < camera.cy < height):

@@ -1,8 +1,8 @@
 """The box around the object in a picture, with which a detector's boxes are compared.
 
 In: the object's outermost points and a camera. Out: (left, top, right, bottom) in pixels, clipped to the picture. The
-whole object counts, including what a piece or another of its parts hides: the box does not depend on the design. Left
-out on purpose: things that stand in front of the object.
+whole object counts, including hidden parts: the box does not depend on the design. Left out on purpose: things that
+stand in front of the object.
 """
 
 from contextlib import suppress
@@ -19,8 +19,8 @@ MOST_POINTS = 500  # the box around this many points of a ball is 0.3 % too smal
 
 
 def hull_points(vertices_mm: np.ndarray) -> np.ndarray:
-    """Return the vertices P×3 of a mesh's convex hull, which suffice for its box in any view. Of a hull with more than
-    `MOST_POINTS` vertices, return those that lie farthest out in that many evenly spread directions.
+    """Return the vertices P×3 of a mesh's convex hull, which suffice for its box in any view. Of more than
+    `MOST_POINTS`, return those farthest out in that many evenly spread directions.
     """
     from scipy.spatial import ConvexHull, QhullError
 
@@ -42,8 +42,8 @@ def project_box(
     size_px: tuple[int, int],
     camera: "Camera | None" = None,
 ) -> np.ndarray:
-    """Return the box (4,) around world points P×3 in a picture of `size_px`, seen through a calibrated lens if one is
-    given. Points behind the camera do not count; the box is all zeros if no point is in the picture.
+    """Return the box (4,) around world points P×3 in a picture of `size_px`, through a calibrated lens if given. Points
+    behind the camera do not count; all zeros if no point is in the picture.
     """
     points_px = project(matrix_px, camera_from_world, points_mm)
     points_px = points_px[np.isfinite(points_px[:, 0])]

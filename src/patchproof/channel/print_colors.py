@@ -1,13 +1,13 @@
 """Separate a printer's inks from the light and camera of the photographs that show its known colors.
 
-In: cells of photographs, each with the light that a known printer would have made of it, and its light as seen; where
-cells lie and how they were found does not matter. Out: the print's ink, a quadratic in code values that is added to the
-known printer's light, and for each photograph what its place and camera did to that light: veil, gains, tone, chroma,
-by the channel's own formulas. The ink is linear in its coefficients, so a cell of many colors has the mean of its
-colors' terms, and what cells do not determine stays the known printer's.
+In: cells of photographs, wherever they lie, each with the light that a known printer would have made of it, and its
+light as seen. Out: the print's ink, a quadratic in code values that is added to the known printer's light, and for each
+photograph what its place and camera did to that light: veil, gains, tone, chroma, by the channel's own formulas. The
+ink is linear in its coefficients, so a cell of many colors has the mean of its colors' terms. What cells do not
+determine stays as the known printer has it.
 
 Ink and photographs are told apart only as far as photographs differ: what all of them share (one phone's tone curve, a
-veil in every place) may be either. Paper's light is a photograph's. Left out on purpose: light that changes in one.
+veil in every place) may be either. Left out on purpose: light that changes within a photograph.
 
 Where print and light need not be told apart, one map in light undoes both, so that a color difference measures what no
 such map explains: with eight usable colors a robust affine map, else one per channel from paper and ink.
@@ -39,9 +39,8 @@ _FARTHEST = np.array([0.5] * 3 + [2.0] * 3 + [MAX_TONE, 0.8])  # what terms may 
 
 @dataclass(frozen=True)
 class CellColors:
-    """Cells of one photograph: `promised` light N×3 of the known printer, its mean `terms` N×9, light as `seen` N×3.
-
-    `start` (8,) are the photograph's terms as far as they are known: veil and log gains by channel, tone, chroma.
+    """Cells of one photograph: `promised` light N×3 of the known printer, its mean `terms` N×9, light as `seen` N×3,
+    and `start` (8,), the photograph's terms as far as known: veil and log gains by channel, tone, chroma.
     """
 
     promised: np.ndarray
@@ -66,7 +65,7 @@ class ShownColors:
 
     @staticmethod
     def of_terms(terms: np.ndarray) -> "ShownColors":
-        """Colors by veil (3), log gains (3), tone and chroma; zeros change nothing. `B×8` terms show `B×N×3`."""
+        """Return the colors of `terms`: veil (3), log gains (3), tone, chroma; 0 has no effect. `B×8` show `B×N×3`."""
         veil, gains, tone, chroma = terms[..., :3], np.exp(terms[..., 3:6]), terms[..., 6:7, None], terms[..., 7:, None]
         mixing = (1 + chroma) * np.eye(3) - chroma * np.array(LUMINANCE)
         matrix = np.concatenate([(gains * (1 - veil))[..., None] * mixing, (gains * veil)[..., None]], -1)
@@ -83,7 +82,7 @@ class ShownColors:
 
 
 def lower_light(light: np.ndarray, tone: float) -> np.ndarray:
-    """Return light before a photograph's tone."""
+    """Return light as it was before a photograph's tone (`lift_tone`) was applied."""
     if not tone:
         return light
     codes, slope = srgb_from_linear(light), 1 + 4 * tone
@@ -109,8 +108,8 @@ def add_ink(promised: np.ndarray, ink: np.ndarray) -> np.ndarray:
 def choose_cells(
     seen: np.ndarray, means: np.ndarray, paper: np.ndarray, seen_ink: np.ndarray, ink: np.ndarray | None
 ) -> CellColors:
-    """Choose cells of one photograph: `seen` h×w×3, NaN where unread, `means` h×w×12 of the promised light and of its
-    terms. Paper and marker ink, promised as `ink`, are added unless that is None.
+    """Choose cells of one photograph from `seen` h×w×3 (NaN: unread) and `means` h×w×12 of the promised light and its
+    terms. Paper and marker ink, promised as `ink`, are added unless `ink` is None.
     """
     inner = np.zeros(seen.shape[:2], bool)  # blur mixes what lies around the print into the rim
     inner[1:-1, 1:-1] = np.isfinite(seen[1:-1, 1:-1]).all(-1)
@@ -131,9 +130,7 @@ def choose_cells(
 
 
 def fit_ink_and_photos(photos: Sequence[CellColors], rounds: int = 8) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Fit the print's ink 9×3 and each photograph's terms (8,), in turn. Terms that all photographs share are moved to
-    the ink, as far as its form can hold them.
-    """
+    """Fit the print's ink 9×3 and photographs' terms (8,) in turn; terms that all share move to the ink."""
     terms = [cells.start for cells in photos]
     promised, rows = (np.concatenate([getattr(cells, name) for cells in photos]) for name in ("promised", "terms"))
     ink = np.zeros((INK_TERMS, 3))
@@ -156,10 +153,9 @@ def fit_shown_colors(cells: CellColors, ink: np.ndarray) -> ShownColors:
 
 
 def affine12(photographed: np.ndarray, promised: np.ndarray) -> ShownColors | None:
-    """Fit a robust affine map to N×3 colors; None if they are too few or too similar to determine it.
-
-    It is fitted from promised to photographed colors: the promise is exact, and a glare on a color is then an outlier
-    of the dependent variable; as an outlier of the independent one it would pull the map towards itself.
+    """Fit a robust affine map to N×3 colors; None if they are too few or too similar to determine it. It maps promised
+    to photographed colors: the promise is exact, and glare on a color, an outlier of the dependent variable, does not
+    pull the map towards itself.
     """
     if len(photographed) < LEAST_COLORS:
         return None
@@ -192,7 +188,7 @@ def affine12(photographed: np.ndarray, promised: np.ndarray) -> ShownColors | No
 
 
 def white_black(paper: np.ndarray, ink: np.ndarray, promised_ink: np.ndarray) -> ShownColors:
-    """The map per channel that takes 1 to photographed paper and `promised_ink` to photographed ink."""
+    """Return the map per channel from paper (1) and `promised_ink` to photographed paper and ink."""
     gain = np.maximum(paper - ink, 1e-3) / np.maximum(1 - promised_ink, 1e-3)  # a printer's file may say white ink
     return ShownColors(np.column_stack([np.diag(gain), ink - gain * promised_ink]), kind="white_black")
 

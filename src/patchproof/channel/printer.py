@@ -1,11 +1,11 @@
 """The printer: a table from the sRGB colors that are sent to the colors seen on paper, differentiable.
 
 In: sRGB as sent, N×3×H×W in [0, 1]. Out: sRGB as seen by an eye adapted to the paper (media-relative: bare paper is 1),
-so that light and camera are applied once, elsewhere. A second table holds how far each color is out of gamut (ΔE00 of
-the round trip). A printer is a name, two tables and their provenance; on disk NAME.npz and NAME.json. Out-of-gamut inks
-(offset cyan and green lie outside sRGB) are clipped to [0, 1] when the table is made: cameras that deliver sRGB clip
-them too. On top: how prints vary, `vary_print`, and how one is uneven, `mottled`. Left out on purpose: halftone dots
-(below what a camera resolves beyond 0.2 mm per pixel) and ink spread.
+since light and camera are applied elsewhere. A second table holds how far each color is out of gamut (ΔE00 of the round
+trip). A printer is a name, two tables and their provenance; on disk NAME.npz and NAME.json. Inks outside of sRGB
+(offset cyan and green) are clipped to [0, 1] in the table, as in cameras that deliver sRGB. `vary_print` models how
+prints vary, `mottled` how one is uneven. Left out on purpose: halftone dots (below what a camera resolves beyond 0.2 mm
+per pixel) and ink spread.
 """
 
 import base64
@@ -226,10 +226,8 @@ def _array(archive: zipfile.ZipFile, name: str, shape: tuple[int, ...], kinds: t
 
 
 def _bordered(table: Tensor) -> Tensor:
-    """Return 1×C×35×35×35: the table with one layer of linear continuation on all sides.
-
-    grid_sample's gradient is zero on the outermost nodes, where pure black and white lie: a saturated pixel would never
-    move again. With one more layer the border is out of reach.
+    """Return 1×C×35×35×35: the table with one layer of linear continuation on all sides, because grid_sample's gradient
+    is zero on the outermost nodes: pure black or white pixels would never move again.
     """
     bordered = np.pad(table.numpy(), [(1, 1)] * 3 + [(0, 0)], mode="reflect", reflect_type="odd")
     return torch.from_numpy(bordered).permute(3, 0, 1, 2)[None].contiguous()

@@ -1,11 +1,11 @@
 """A detector with the interface of a classifier: photographs and the object's box in, logits out.
 
 In: what a network finds in the photographs' centered squares: candidate boxes with a score for each label, before
-overlapping ones are suppressed. Out: per photograph and label the logit of the best candidate that lies on the object
+overlapping ones are suppressed. Out: per photograph and label the logit of the best candidate on the object
 (intersection over union of at least `MIN_IOU` with its box), so that rates, losses, controls and promises are defined
-for detectors as for classifiers: the object is recognized where that score reaches `least_score`, and confidence is the
-score. Where the object's box is not known, any candidate in the square counts.
-Left out on purpose: suppression. It leaves the best candidate of an object, which alone decides here.
+as for classifiers: the object is recognized where that score reaches `least_score`, and confidence is the score. Where
+the object's box is not known, any candidate counts. Left out on purpose: suppression, which keeps the best candidate of
+an object, the only one that counts here.
 """
 
 from collections.abc import Callable, Sequence  # noqa: F401 (Callable: of the annotations of the inherited __init__)

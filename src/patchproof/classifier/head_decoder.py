@@ -1,9 +1,9 @@
 """Decode the outputs of detectors' usual heads into candidates: boxes in pixels, and logits.
 
-In: a network's outputs, of all levels or each: N×A×C, N×C×A, N×C×H×W, N×H×W×C, or anchors in a dimension of their
-own; and its head, or none: then shapes decide, and where boxes are decoded already what the first outputs hold, which
-a warning says. Out: candidates N×A×(4+K), differentiable.
-Left out on purpose: suppression (detector.py); clipping to the picture; masks, keypoints, boxes that are turned.
+In: a network's outputs, together or by level: N×A×C, N×C×A, N×C×H×W, N×H×W×C, or anchors in their own dimension; and
+its head. Without a head the outputs' shapes decide, and the first outputs' values on boxes that are decoded already; a
+warning says how. Out: candidates N×A×(4+K), differentiable. Left out on purpose: suppression (detector.py); clipping to
+the picture; masks, keypoints, rotated boxes.
 """
 
 import json
@@ -42,9 +42,7 @@ OutputLayout = tuple[OutputShape, tuple[str, ...], OutputShape]  # a table's ord
 
 @dataclass(eq=False)
 class HeadDecoder:
-    """Turns the outputs of a network for squares of `input_px` into candidates N×A×(4+K) of K = `labels`. A head that
-    is not given is guessed from the first outputs.
-    """
+    """Turns outputs for squares of `input_px` into candidates N×A×(4+`labels`); guesses a head that is not given."""
 
     network: str  # its name
     labels: int
@@ -90,7 +88,7 @@ class HeadDecoder:
 
 
 def spread_labels(boxes: Tensor, labels: Tensor, scores: Tensor, count: int) -> Tensor:
-    """Candidates N×M×(4+`count`) from boxes N×M×4 of one label each; where that is not in 0 to `count`, of none."""
+    """Return candidates N×M×(4+`count`) of boxes N×M×4 with one label each, which is ignored beyond 0..count-1."""
     score = scores.clamp(1e-6, 1 - 1e-6).logit().masked_fill((labels < 0) | (labels >= count), NO_BOX_LOGIT)[..., None]
     logits = scores.new_full((*scores.shape, count), NO_BOX_LOGIT)
     return torch.cat([boxes, logits.scatter(-1, labels.long().clamp(0, count - 1)[..., None], score)], -1)
@@ -143,8 +141,8 @@ def _guess(decoder: HeadDecoder, names: tuple[str, ...], shapes: Shapes) -> Head
 
 
 def _fitted_head(decoder: HeadDecoder, head: Head, names: Sequence[str], outputs: Sequence[Tensor]) -> Head:
-    """The guessed head, of decoded boxes with the order, unit and scores that the outputs fit best; said in a warning
-    unless it is what `Detector` takes.
+    """The guessed head; for decoded boxes with the order, unit and scores that fit the outputs best. Warns unless it is
+    the head that `Detector` takes.
     """
     shapes, outputs = _shapes(outputs), [each.detach() for each in outputs]
     fitted = _fitted_values(decoder, head, names, outputs) if head.formula == "none" else head
@@ -157,7 +155,7 @@ def _fitted_head(decoder: HeadDecoder, head: Head, names: Sequence[str], outputs
 
 
 def _fitted_values(decoder: HeadDecoder, head: Head, names: Sequence[str], outputs: Sequence[Tensor]) -> Head:
-    """A head of decoded boxes with what makes them corners inside of the square; the head itself if nothing does."""
+    """Return the head with the columns, unit and order in which its decoded boxes fit the square, or else unchanged."""
     tried: list[tuple[float, Head]] = []
     for columns in (head.columns, ("scores", "boxes"))[: 1 + (len(outputs) == 1)]:
         try:
@@ -186,7 +184,7 @@ def _fitted_values(decoder: HeadDecoder, head: Head, names: Sequence[str], outpu
 def _fitted_scores(
     decoder: HeadDecoder, scores: Tensor, objectness: Tensor | None, outputs: Sequence[Tensor]
 ) -> dict[str, str]:
-    """What scores N×A×C are, and where a background's stand, which are the largest mostly."""
+    """Tell if scores N×A×C are logits or probabilities, and if a background's (mostly the largest) is first or last."""
     joined = scores if objectness is None else torch.cat([objectness, scores], -1)
     is_share = bool(((joined > -1e-3) & (joined < 1 + 1e-3)).all())
     adds_up = is_share and bool(((joined.sum(-1) - 1).abs() < 1e-2).all())
@@ -216,7 +214,7 @@ def _misfit(boxes: Tensor, input_px: int) -> float:
 
 
 def centers_range(boxes: Tensor) -> Tensor:
-    """(x, y) from which on, and up to which, 90 % of the centers of boxes M×4 lie: 2×2."""
+    """Return the 5 % and 95 % points (x, y) of the centers of boxes M×4, as 2×2."""
     centers = boxes[:: 1 + len(boxes) // 100_000].unflatten(-1, (2, 2)).mean(-2)
     return torch.quantile(centers, torch.tensor([0.05, 0.95]).to(centers), 0)
 
@@ -228,7 +226,7 @@ def runs_down_columns(boxes: Tensor) -> bool:
 
 
 def _layouts(decoder: HeadDecoder, head: Head, names: Sequence[str], shapes: Shapes) -> list[OutputLayout]:
-    """Each output's layout: the one that its shape allows; of several, what no other output holds, or its name says."""
+    """Each output's layout: the one that its shape allows; of several, the one that others lack or its name states."""
     options = [_options(head, decoder.labels, shape, len(shapes)) for shape in shapes]
     if not all(options):
         raise decoder.refusal(f"outputs of the head {head.name} for {decoder.labels} labels", shapes)

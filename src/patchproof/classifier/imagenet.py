@@ -127,8 +127,8 @@ class _Block(nn.Module):
 
 
 class _Convolution(nn.Module):
-    """A convolution with its normalization folded in. TensorFlow pads less in front than behind where the stride is 2:
-    here evenly, with a row and a column of zeros before the weights.
+    """A convolution with its normalization folded in. TensorFlow pads less in front where the stride is 2: here evenly,
+    with zeros before the weights.
     """
 
     def __init__(self, tensors: dict[str, Tensor], name: str, norm: str, side_px: int, stride: int = 1):

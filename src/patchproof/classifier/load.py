@@ -96,9 +96,8 @@ def load_classifier(
 
 
 def _prepare(classifier: Classifier, device: torch.device | str, is_own: bool = False) -> Classifier:
-    """Freeze the classifier, check it unless that is done or it is this package's own, and choose the fastest batches
-    on the device. A network from a file is refused if that takes too long or, on a CPU, too much memory: a few lines
-    may ask for a lot.
+    """Freeze a classifier, check it unless that is done or it is our own, and choose its fastest batches. A network
+    from a file is refused if that takes too long or, on a CPU, too much memory: a small file may ask for a lot.
     """
     checked_as = classifier.KIND, str(device), classifier.input_px, classifier.labels
 
@@ -138,8 +137,6 @@ def _prepare(classifier: Classifier, device: torch.device | str, is_own: bool = 
 
 
 def use_full_precision(device: torch.device | str) -> None:
-    """Let cuDNN convolve in float32 on a GPU, so that networks answer there as on a CPU: its own default, TF32, keeps
-    10 bits of 23, with which a MobileNetV2's gradient at a design was off by 9 %.
-    """
+    """Let cuDNN convolve in float32, as on a CPU: with TF32, its default, a MobileNetV2's gradient was off by 9 %."""
     if torch.device(device).type == "cuda":
         torch.backends.cudnn.allow_tf32 = False

@@ -66,13 +66,12 @@ class Classifier:
         windows: np.ndarray | None = None,
         cache: dict[Any, Any] | None = None,
     ) -> Tensor:
-        """N×K logits of the photographs' centered squares. Refused if any is not finite, since the largest of a row
-        with NaN is the NaN and would pass for an answer.
+        """N×K logits of the photographs' centered squares; refused if any is not finite.
 
         `boxes` N×4 are the object's boxes as shares of the square's side (left, top, right, bottom), for detectors.
-        With `windows`, N×4 pixels in that order, the gradient at the photographs may be 0 outside of them. With
-        `cache` as well, no gradient is computed: outside of the windows, the photographs equal the first ones that were
-        passed with this cache.
+        With `windows`, N×4 pixels in that order, the gradient at the photographs may be 0 outside of them. With `cache`
+        as well there is no gradient, and outside of the windows photographs equal the first ones passed with this
+        cache.
         """
         if not isinstance(photos_srgb, Tensor) or photos_srgb.dim() != 4 or photos_srgb.shape[1] != 3:
             raise Refused("photographs as a tensor N×3×H×W", brief(photos_srgb), "stack them, channels first")
@@ -129,10 +128,8 @@ def _on_device(indices: tuple[int, ...], device: torch.device) -> Tensor:
 
 
 def center_square(photos_srgb: Tensor, size_px: int) -> Tensor:
-    """N×3×H×W in any range → N×3×S×S, unchanged where it has that size; an odd pixel is lost on the right or below.
-
-    Antialiased bilinear resampling, as Pillow does it: each output pixel averages its whole footprint, so a large
-    photograph does not alias; differentiable, so that gradients reach the patch.
+    """N×3×H×W in any range → N×3×S×S, unchanged where it has that size; an odd pixel is lost on the right or below. It
+    is resampled bilinearly with antialiasing, as in Pillow, and differentiably.
     """
     height, width = photos_srgb.shape[-2:]
     side = min(height, width)

@@ -1,5 +1,4 @@
-"""Find by a network's outputs that they are no logits, or that a detector's boxes are not (left, top, right, bottom) in
-pixels of its square.
+"""Find by a network's outputs that they are no logits, or no boxes (left, top, right, bottom) in pixels of the square.
 
 In: a classifier, the check's pictures, and its outputs for them. Out: nothing; refused where the outputs can be nothing
 else, a warning where they look like it. A Sigmoid or Softmax is known by its name where autograd shows it at the end,
@@ -48,9 +47,7 @@ def check_shape(output: Any, classifier: Classifier) -> None:
 
 
 def check_values(classifier: Classifier, photos: Tensor, output: Tensor) -> None:
-    """Refuse scores, 3×K or a detector's 3×A×K, that can only be probabilities, percent or 8-bit numbers, and boxes
-    that are none.
-    """
+    """Refuse boxes that are not corners in pixels, and scores 3×K or 3×A×K that are probabilities, percent or 8-bit."""
     if classifier.LOOKS_AT_BOXES:
         _check_boxes(classifier, output)
     scores = output[..., 4:] if classifier.LOOKS_AT_BOXES else output

@@ -1,12 +1,12 @@
-"""Say that a network was wrapped wrongly, and how it answers better, from what it says of twelve pictures.
+"""Warn of a network that was wrapped wrongly, by its answers to twelve pictures.
 
 In: a classifier or detector that shares labels' names with one whose wrapping is known (`_references`). Out: a warning,
-or a refusal where it is certain, if it agrees better with that one once its pictures have another range or order of
-colors, or its labels are moved by one place. Agreement is the correlation of logits, less their means over labels and
-over pictures, on the pictures of `wrapping.jpg`: renders of our primitives and our own patterns, chosen with three
-classifiers from 52, so that they agree by at least 0.05 less after any of these changes; three others by 0.02 less.
-Logits of COCO's labels by two detectors are stored in `wrapping.json`, which says where they come from.
-Left out on purpose: other label sets, and ImageNet's where `imagenet` is not installed.
+or a refusal where it is certain, if the two agree better once the pictures have another range or order of colors, or
+labels are moved by one place. Agreement is the correlation of logits, less their means over labels and over pictures,
+on the pictures of `wrapping.jpg`: renders of our primitives and our own patterns, chosen with three classifiers from
+52, so that they agree by at least 0.05 less after any of these changes; three others by 0.02 less. Logits of COCO's
+labels by two detectors are stored in `wrapping.json`, which says where they come from. Left out on purpose: other label
+sets, and ImageNet's where `imagenet` is not installed.
 """
 
 import json
@@ -97,7 +97,7 @@ def _compare(classifier: Classifier, device: torch.device | str, matched: np.nda
 def _agreements(
     classifier: Classifier, pictures: Tensor, matched: np.ndarray, expected: Tensor, name: str
 ) -> dict[tuple[str, int], float]:
-    """The agreement after one change of the pictures, by its name and the move of the labels."""
+    """Return the agreement after one change of the pictures for each move of the labels: by (change, move)."""
     changed = _RANGES[name.removesuffix(_SWAPPED).removesuffix(" and ")](pictures)
     with torch.no_grad():
         logits = classifier.square_logits(changed.flip(1) if name.endswith(_SWAPPED) else changed).cpu().double()
@@ -110,9 +110,7 @@ def _agreements(
 
 
 def _correlation(logits: Tensor, expected: Tensor) -> float:
-    """The mean over pictures of the correlation of two N×K logits, less their means over labels and pictures; -1 for
-    logits that are not finite.
-    """
+    """The mean correlation of N×K logits, less their means over labels and pictures; -1 if they are not finite."""
     first, second = (each - each.mean(1, keepdim=True) for each in (logits, expected))
     first, second = first - first.mean(0), second - second.mean(0)
     value = float(torch.nn.functional.cosine_similarity(first, second, dim=1).mean())

@@ -1,13 +1,12 @@
 """`torchvision:NAME`, `timm:NAME`, `clip:MODEL@FILE`: published networks with their published weights, or a file's.
 
-The weights are downloaded by these libraries, and only because the scene file names the model; `timm:hf-hub:ORG/NAME`
-is a model of the Hugging Face hub. With `NAME@FILE.safetensors` the weights are read from the file as numbers, never as
-a pickle; for a network trained with other labels, FILE.json beside it holds them and the input size. Input size, labels
-and normalization are the library's own; the latter is put inside the network.
-A CLIP model is one that open_clip knows, with its weights in FILE.safetensors, or MODEL/PRETRAINED with the weights
-published under that name and prompts in FILE.json; either way FILE.json is a network's card, whose labels are prompts.
-Left out on purpose: the libraries' resize-then-crop, here every network sees the whole centered square; means over
-several prompts of a label (write the one that counts); networks that write captions.
+These libraries download the weights, and only because the scene file names the model; `timm:hf-hub:ORG/NAME` is a model
+of the Hugging Face hub. With `NAME@FILE.safetensors` the weights are read from the file as numbers, never as a pickle;
+for a network trained with other labels, FILE.json beside it holds them and the input size. Input size, labels and
+normalization are the library's own; normalization is put inside the network. A CLIP model is one that open_clip knows,
+with its weights in FILE.safetensors, or MODEL/PRETRAINED with the weights published under that name; either way
+FILE.json is the network's card, whose labels are prompts. Left out on purpose: the libraries' resize-then-crop, since
+every network here sees the whole centered square; means over several prompts of a label; networks that write captions.
 
 Source: Radford et al., Learning Transferable Visual Models From Natural Language Supervision, ICML 2021, section 3.1.
 """
@@ -209,9 +208,7 @@ class Prompted(nn.Module):
 
 
 def load_clip(name: str) -> Classifier:
-    """The classifier of pictures and text that `name`, MODEL@FILE, stands for: a logit is the cosine between picture
-    and prompt, times the network's own scale. The text half of the network encodes the prompts once and is not kept.
-    """
+    """The CLIP network `MODEL@FILE`: logits are cosines of picture and prompts, times the network's own scale."""
     open_clip = import_library("open_clip", "clip", "clip")
     model, _, file = name.rpartition("@")
     path, (architecture, _, published) = Path(file), model.partition("/")

@@ -97,7 +97,7 @@ class Assets:
         return self._textures[data, base, gain]
 
     def has_room(self, texels: int) -> bool:
-        """Take so many texels of those that a mesh may have; False if there are fewer."""
+        """Reserve texels of the number that a mesh may have; False if fewer remain."""
         has_room = texels <= self._free_texels
         self._free_texels -= texels if has_room else 0
         return has_room
@@ -108,7 +108,7 @@ class Assets:
         return GRAY
 
     def finite_uv(self, uv: np.ndarray) -> np.ndarray:
-        """Return texture coordinates V×2 with 0 in place of what is not a number, and a warning."""
+        """Return texture coordinates V×2 with NaN and infinity replaced by 0, which is warned of."""
         finite = np.all(np.abs(uv) < 1e30, axis=1)  # float32 holds it
         if not finite.all():
             self.say(f"{np.count_nonzero(~finite)} texture coordinates are not numbers and are taken as 0")
@@ -129,8 +129,8 @@ class Assets:
 def draw_out_textures(
     parts: Sequence[MeshPart], wraps: Mapping[Material, tuple[Wrap, Wrap]], assets: Assets
 ) -> list[MeshPart]:
-    """Return parts whose textures repeat, drawn out as far as their coordinates reach; `wraps` has (u, v) of the
-    materials whose textures do not.
+    """Return parts whose textures all repeat: those that do not, by their (u, v) in `wraps`, are extended as far as
+    their coordinates reach.
     """
     drawn = {id(part): part for part in parts}
     for material, modes in wraps.items():

@@ -2,14 +2,12 @@
 
 In: a path of an OBJ (with MTL), GLB, glTF, PLY or STL file, `primitive:NAME` or `python:NAME`, and the object's longest
 extent. Out: a `Mesh` in the scene's frame, with warnings about what is not shown as declared (`declarations`). Refused:
-a file that cannot be parsed, and a texture that it names but that is missing or broken. Textures larger than any
-photograph shows are reduced. A mesh in memory goes through GLB and the reader of files, so that it equals what its
-run's folder will hold.
+a file that cannot be parsed, and a missing or broken texture. Textures larger than any photograph shows are reduced. A
+mesh in memory goes through GLB, so that it equals what its run's folder will hold.
 
-What is written, for other programs, is glTF 2.0, in meters as its specification wants (the mesh is in millimeters), y
-up, textures as lossless PNG inside, repeating. trimesh writes it; nothing in it depends on the time, so the same
-textures give the same bytes. Surfaces are matte and visible from both sides, as in the renderer here. Left out on
-purpose: lights and cameras. Material names are kept and may repeat; geometries are numbered.
+For other programs, trimesh writes glTF 2.0: in meters as its specification wants, y up, textures as lossless PNG
+inside, repeating. The same textures give the same bytes. Surfaces are matte and visible from both sides, as in the
+renderer here. Material names may repeat; geometries are numbered. Left out on purpose: lights and cameras.
 """
 
 import re
@@ -44,11 +42,9 @@ _FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute
 
 
 def load_mesh(path: str | Path, length_mm: float, up: Literal["y", "z"] = "z", mesh_glb: bytes | None = None) -> Mesh:
-    """Load the mesh of a file, of `primitive:NAME`, or of the GLB given for `python:NAME`, with its longest extent
-    `length_mm`.
-
-    `up = "z"` turns (x, y, z) into (x, z, -y); primitives are y up already. Refused if nothing can be drawn or a
-    texture that the file names is missing.
+    """Load a file, `primitive:NAME` or the GLB given for `python:NAME` as a mesh with the longest extent `length_mm`.
+    `up = "z"` turns (x, y, z) into (x, z, -y), except for primitives, which are y up. Refused if nothing can be drawn
+    or a texture is missing.
     """
     if str(path).startswith("primitive:"):
         from patchproof.mesh import primitives
@@ -80,8 +76,8 @@ def _reduce_textures(parts: Sequence[MeshPart]) -> tuple[list[MeshPart], list[st
 
 
 def read_parts(path: Path, world_from_file: np.ndarray) -> tuple[list[MeshPart], list[str], list[Path]]:
-    """Read every placed geometry with faces, its vertices and normals turned by `world_from_file` 3×3; warnings; and
-    the files that were read.
+    """Read every placed geometry with faces, turned by `world_from_file` 3×3. Returns the parts, warnings, and the
+    files that were read.
     """
     if not is_file(path) or not path.stat().st_size:  # some files of the system are empty, and never end
         raise Refused("a mesh file", f"no file at {path}, or an empty one", "check the path")
@@ -111,9 +107,7 @@ def read_parts(path: Path, world_from_file: np.ndarray) -> tuple[list[MeshPart],
 
 
 def read_stl(assets: "Assets") -> list[MeshPart]:
-    """Read an STL file, text or binary, as one part; several solids are one object, and colors are left out, which
-    programs write in different ways.
-    """
+    """Read an STL file, text or binary, as one part without its colors, which programs write in different ways."""
     data = assets.data
     if len(data) >= 84 and len(data) == 84 + _FACET.itemsize * int.from_bytes(data[80:84], "little"):
         facets = np.frombuffer(data, _FACET, offset=84)
@@ -129,9 +123,8 @@ def read_stl(assets: "Assets") -> list[MeshPart]:
 
 
 def write_glb(mesh: Mesh, textures: Sequence[np.ndarray], path: str | Path) -> None:
-    """Write `mesh` with `textures` (uint8 H×W×3, one per material, in place of the material's own) to a .glb file.
-
-    Textures stand for the whole color: base colors are not written; corner colors other than 1 are, in 8 bits of light.
+    """Write `mesh` with `textures` (uint8 H×W×3, one per material) to a .glb file. They stand for the whole color, so
+    base colors are not written; corner colors other than 1 are, in 8 bits of light.
     """
     import trimesh
     from trimesh.exchange.gltf import export_glb

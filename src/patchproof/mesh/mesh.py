@@ -61,9 +61,8 @@ class Mesh:
 
 
 def mesh_from_parts(parts: Sequence[MeshPart], length_mm: float, warnings: Sequence[str] = ()) -> Mesh:
-    """Join several parts into one centered mesh with the longest extent `length_mm`; parts may share a Material object.
-
-    Faces with NaN or infinite corners and faces without area are left out with a warning; refused if none remains.
+    """Join parts, which may share materials, into one centered mesh with the longest extent `length_mm`. Faces with NaN
+    or infinite corners or without area are left out with a warning; refused if none remains.
     """
     vertices, faces, owner = _join(parts)
     finite = np.all(np.isfinite(vertices), axis=1)

@@ -24,9 +24,7 @@ _RGBA = ("red", "green", "blue", "alpha")
 
 
 class _Element:
-    """One kind of element: its properties (name, numpy's types of values and of a list's length, "" if it is none), and
-    the values of each: an array, or arrays of unequal lengths.
-    """
+    """One kind of element: properties (name, numpy types of values and of a list's length, or ""), and their values."""
 
     def __init__(self, count: int):
         self.count, self.properties, self.values = count, list[tuple[str, str, str]](), dict[str, Any]()

@@ -92,7 +92,7 @@ def translate_part(part: MeshPart, offset: Sequence[float]) -> MeshPart:
 
 
 def rotate_part(part: MeshPart, axis: int, degrees: float) -> MeshPart:
-    """Return the part, turned about the world's axis 0 (x), 1 or 2, counter-clockwise seen from its tip."""
+    """Return the part, rotated about the world's x, y or z (`axis` 0, 1, 2), counter-clockwise seen from its tip."""
     c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     matrix = np.eye(3)
     i, j = (axis + 1) % 3, (axis + 2) % 3

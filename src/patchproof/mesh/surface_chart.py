@@ -20,8 +20,8 @@ _CHUNK = 500_000  # line-triangle pairs held at a time, about 150 MB
 class SurfaceChart:
     """A cylinder beside the surface, with coordinates in millimeters: s across its axis, t along it, h outwards.
 
-    `axes` 3×3 are rows across, along, normal at the origin (right-handed); `curvature` 1/mm is that of the cylinder, 0
-    for a plane and negative where it bulges away from the normal. `right` is the piece's right in (s, t).
+    `axes` 3×3 has the rows across, along and normal at the origin (right-handed); `curvature` is 1/mm, 0 for a plane,
+    negative if it bulges away from the normal. `right` is the piece's right in (s, t).
     """
 
     origin_mm: np.ndarray

@@ -1,11 +1,11 @@
 """Texture coordinates for faces that have none: every face gets its own area in one new texture.
 
 In: a mesh and the faces to unwrap. Out: the same mesh, faces in the same order, with those faces on a new material
-whose texture starts as their present appearance (base color, vertex colors, the texel they pointed at). From here on a
-vertex texture and a UV texture are the same thing: texels, at the resolution that is asked for instead of the mesh's.
-xatlas cuts and packs (charts at even density, 2 texels apart); the texels between charts take the nearest chart's
-color, so that mip levels mix in no foreign colors. The same mesh gives the same bytes. Most meshes take seconds; a
-rough scan of 80,000 faces took 80. Left out on purpose: seams placed by hand, and one atlas over several textures.
+whose texture starts as their present appearance (base color, vertex colors, the texel they pointed at), at any
+resolution. xatlas cuts and packs (charts at even density, 2 texels apart); the texels between charts take the nearest
+chart's color, so that mip levels mix in no foreign colors. The same mesh gives the same bytes. Most meshes take
+seconds; a rough scan of 80,000 faces took 80. Left out on purpose: seams placed by hand, and one atlas over several
+textures.
 """
 
 from collections.abc import Iterator
@@ -27,10 +27,10 @@ _ATTEMPTS = 3
 
 
 def coverage(corners: np.ndarray, size: tuple[int, int], grow: float = 0.0) -> np.ndarray:
-    """Count the faces, of F, that cover each texel of a (width, height) texture: int32 H×W; wraps count. `corners` are
-    F×3×2 in texels. With `grow` = 0 a texel counts if its center lies in the face, and two faces that share an edge
-    never count it twice; else if its center is within `grow` of the face in both x and y: 0.5 gives every texel that
-    the face touches, 1.5 one more, which is all that a bilinear look-up reads.
+    """Count the faces that cover each texel of a (width, height) texture, which repeats: int32 H×W. `corners` are F×3×2
+    in texels. With `grow` = 0 a face covers a texel if its center lies in the face (on a common edge: in one of the
+    two), else if its center is within `grow` of the face in both x and y: 0.5 gives every texel that the face touches,
+    1.5 all that a bilinear look-up reads.
     """
     width, height = size
     steps = np.zeros((height, width + 1), np.int32)  # +1 where a run of texels starts, -1 where it has ended
@@ -100,10 +100,8 @@ def _center_at_or_after(x: np.ndarray) -> np.ndarray:
 
 
 def has_usable_uv(mesh: Mesh) -> np.ndarray:
-    """Return which faces F have texture coordinates to paint on.
-
-    All three corners at (0, 0) is what a mesh without coordinates gets; NaN or absurdly far ones mean nothing. Vertex
-    colors without a texture need a new texture, whatever their coordinates.
+    """Return which faces F have texture coordinates to paint on. All three corners at (0, 0) mean none, as do NaN and
+    absurdly far ones; vertex colors without a texture need a new texture anyway.
     """
     uv = mesh.corner_uv
     with np.errstate(invalid="ignore"):
@@ -113,9 +111,8 @@ def has_usable_uv(mesh: Mesh) -> np.ndarray:
 
 
 def unwrap(mesh: Mesh, faces: np.ndarray, texels: int) -> Mesh:
-    """Put the chosen `faces` (bool F) on a material of their own, whose texture is about `texels` wide and high.
-
-    Their corner colors are 1 afterwards: the texture holds everything. Materials left without faces are dropped.
+    """Put the chosen `faces` (bool F) on a new material with a texture about `texels` wide and high, which holds their
+    whole color: corner colors are 1 afterwards. Materials left without faces are dropped.
     """
     uv, size = _make_atlas(mesh.vertices, mesh.faces[faces], texels)
     owners = np.unique(mesh.face_material[faces])
@@ -174,11 +171,11 @@ def _pack(points: np.ndarray, faces: np.ndarray, group: np.ndarray, texels: int)
 
 
 def _direction_groups(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Return the groups of faces that xatlas must get as separate meshes: 0, or on fine smooth surfaces 1 to 27, by the
-    direction of a face's normal.
+    """Return the groups of faces that xatlas must get as separate meshes: 0, or 1 to 27 by normal on fine smooth
+    surfaces.
 
-    xatlas joins neighbors whose normals are within 0.8 degrees into one flat chart, however far that leads: a finely
-    divided sphere becomes one chart without a rim, on which it crashes. Cut by direction, no group turns that far.
+    xatlas joins neighbors whose normals are within 0.8 degrees into one flat chart, however far that leads, and crashes
+    on a chart without a rim, such as a finely divided sphere. Cut by direction, no group turns that far.
     """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components

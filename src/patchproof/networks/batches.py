@@ -1,12 +1,11 @@
 """Call a network in batches that it accepts and in the memory order that is fastest for it.
 
 In: a network for N×3×S×S. Out: the same logits for any N, on a CPU in about half the time. Two things cost that time
-(medians of 6 forward and backward passes of 16 pictures on one core, torch 2.13, November 2026): the system hands out
-and clears a tensor of over 32 MiB as fresh memory each time, which took a third of MobileNetV2's time; and convolutions
-want the colors of a pixel side by side ("channels last"), another third. The share of the plain call's time that
-remains is 0.45 with MobileNetV2 at 224 px, 0.60 with SqueezeNet 1.1, 0.72 with MobileNetV1 0.75 at 192 px; small inputs
-are faster in one batch and stay so. Where pictures change or gradients are needed in windows only, large networks are
-computed there only (cuts.py).
+(16 pictures forward and backward, one core, torch 2.13): the system hands out and clears a tensor of over 32 MiB as
+fresh memory each time, a third of MobileNetV2's time; and convolutions want the colors of a pixel side by side
+("channels last"), another third. The share of the plain call's time that remains is 0.45 with MobileNetV2 at 224 px,
+0.60 with SqueezeNet 1.1, 0.72 with MobileNetV1 0.75 at 192 px; small inputs are faster in one batch and stay so. Large
+networks are computed only in windows where pictures change or need gradients (cuts.py).
 """
 
 from collections.abc import Callable
@@ -33,8 +32,8 @@ CPU_BATCH_PIXELS = 4 * 224**2  # 2 to 8 pictures of 224 px cost the same each, 1
 
 @dataclass(frozen=True)
 class Windows:
-    """Where pictures of some views may differ, N×4 pixels (left, top, right, bottom). With `cache`, no gradient is
-    needed: the network's intermediate values for the first pictures are stored in it and reused for all later ones.
+    """Where views may differ, N×4 pixels (left, top, right, bottom). With `cache`, no gradient is needed: the network's
+    values for the first pictures are stored in it and reused for all later ones.
     """
 
     px: np.ndarray
@@ -46,7 +45,7 @@ class Windows:
 
 
 def numbers_saved(numbers: float, share: float, answers_alone: bool = False) -> float:
-    """How many of `numbers` per picture need not be computed, in rectangles of that share of the picture."""
+    """Return how many of a picture's `numbers` are saved by rectangles that cover this share of it."""
     return numbers * ((1 if answers_alone else GRADIENT_GAIN) - share) - CUT_COST
 
 
@@ -94,9 +93,8 @@ class BatchedNetwork(torch.nn.Module):
 
 
 def tune_batches(network: Callable[[Tensor], Tensor], pictures: Tensor) -> BatchedNetwork:
-    """Wrap `network` so that batch size and memory order suit the device; tried with `pictures` N×3×S×S.
-
-    A network that reshapes its input may fail in "channels last" order; such a network keeps the usual order.
+    """Wrap `network` with the batch size and memory order for the device, tried with `pictures` N×3×S×S. A network that
+    fails in "channels last" order, as by reshaping its input, keeps the usual one.
     """
     batches = network if isinstance(network, BatchedNetwork) else BatchedNetwork(network)
     if pictures.device.type == "cpu":

@@ -1,14 +1,13 @@
-"""Compute only where pictures may change: a piece covers a tenth of a picture, and the first, largest layers of a
-network see little more than what lies around it.
+"""Compute only where pictures may change: a piece covers a tenth of a picture, and a network's first, largest layers
+see little more than what lies around it.
 
 In: a network's steps, pictures, and one window per picture; outside of its window, either the pixels' gradient is not
 needed or the picture equals an earlier one. Out: the same answers, and inside the windows the same gradient. For
 gradients, the first steps are computed without a graph, and on the way back once more with one, on rectangles large
 enough that nothing a window reaches sees their edges; for answers alone, on rectangles of all pictures of some views
-but the first. The steps where a cut is possible are found by trying: NaN in a pixel shows how far it reaches, whatever
-the steps are, and a cut counts if it gives the gradient and the answers of the whole network.
-Left out on purpose: further cuts, each computed again by itself, which gained nothing more; GPUs, where small pictures
-take as long as large ones; networks that torch.fx cannot follow.
+but the first. Possible cuts are found by trying: NaN in a pixel shows how far it reaches, and a cut counts if it gives
+the gradient and the answers of the whole network. Left out on purpose: further cuts, which gained nothing more; GPUs,
+where small pictures take as long as large ones; networks that torch.fx cannot follow.
 """
 
 from collections.abc import Callable
@@ -32,8 +31,8 @@ GRADIENT_TOLERANCE, ANSWER_TOLERANCE = 1e-3, 1e-5  # as shares of the largest; k
 @dataclass(frozen=True)
 class Cut:
     """A split of a program after its first `steps`, where `value` is the only value still needed. It has 1/`stride` of
-    the picture's sides; its j-th row and column see pixels from j·`stride` + `low` to j·`stride` + `high`. The first
-    steps compute `numbers` numbers for each picture.
+    the picture's sides; row and column j see pixels j·`stride` + `low` to j·`stride` + `high`. The first steps compute
+    `numbers` numbers for each picture.
     """
 
     program: Program
@@ -171,8 +170,8 @@ def _cuts(program: Program, pictures: Tensor) -> list[Cut]:
 
 
 def _is_correct(network: Callable[[Tensor], Tensor], cut: Cut, pictures: Tensor) -> bool:
-    """True if gradients, and answers to pictures that differ there, equal the whole network's in two windows, near
-    opposite corners: a rectangle there has two of its edges in the picture and two at the picture's border.
+    """True if gradients, and answers to pictures that differ there, equal the whole network's in two windows near
+    opposite corners.
     """
     size_px, side = pictures.shape[-1], pictures.shape[-1] // 8
     starts = np.array([[0, 1], [size_px - side - 1, size_px - side]])

@@ -1,10 +1,10 @@
 """`file:NAME.onnx`: read an untrusted ONNX file without the library onnx.
 
-In: its bytes, and a function that reads the files where exporters put large weights, by a weight's "location". Out: a
-Program of numbered steps (graph.py), how many pictures it takes, and the file's metadata; anything unsupported raises
-UnsupportedNetwork, and so does every field and attribute that nothing here takes. Nothing of the file is executed.
-Left out on purpose: subgraphs (If, Loop), functions of the file, operators of other domains, sparse and quantized
-weights, opsets before 7, which onnx.version_converter converts to newer ones.
+In: its bytes, and a function that reads the files of large weights by a weight's "location". Out: a Program of numbered
+steps (graph.py), how many pictures it takes, and the file's metadata. Anything unsupported, every unknown field and
+attribute included, raises UnsupportedNetwork. Nothing of the file is executed. Left out on purpose: subgraphs (If,
+Loop), functions of the file, operators of other domains, sparse and quantized weights, opsets before 7, which
+onnx.version_converter converts to newer ones.
 
 Source: github.com/onnx/onnx, onnx.proto (IR version 13).
 """
@@ -284,9 +284,9 @@ def _aten_calls(
     name: str, inputs: Sequence[Any], attributes: dict[str, Any], of_four: Mapping[int | None, Any], own: list[Tensor]
 ) -> AtenCalls:
     """The ATen operators that a node's first input passes through one after the other, so that activations behind them
-    can be computed in place; none where onnx_operators.py has to compute the node. Without them MobileNetV2 took 1.46
-    times as long for its answers and 1.85 times with gradients (torch 2.13, one core, November 2026). `of_four` holds
-    the numbers of weights and pictures N×C×H×W, with H×W of weights; `own` has the weights if this node alone uses its.
+    can be computed in place; none where onnx_operators.py has to compute the node. Without them MobileNetV2's answers
+    took 1.46 times as long, its gradients 1.85 times (torch 2.13, one core). `of_four` holds the numbers of weights and
+    pictures N×C×H×W, with H×W of weights; `own` has the weights if this node alone uses its.
     """
     numbers = [item.number if type(item) is ValueRef else None for item in inputs]
     weight = numbers[1] if name == "Conv" else None

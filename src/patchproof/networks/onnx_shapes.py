@@ -82,7 +82,7 @@ _REDUCTIONS = {"add": "sum", "mul": "prod", "max": "amax", "min": "amin"}  # of 
 
 
 def scatter_elements(x, indices, updates, /, *, axis=0, reduction="none"):
-    """Put each update at its index along `axis`, or combine it with what is there."""
+    """Write each update at its index along `axis`, or combine it with the present value."""
     positions = torch.where(indices < 0, indices + x.shape[axis], indices)
     if reduction == "none":
         return x.scatter(axis, positions, updates)
@@ -90,7 +90,7 @@ def scatter_elements(x, indices, updates, /, *, axis=0, reduction="none"):
 
 
 def scatter_nd(x, indices, updates, /, *, reduction="none"):
-    """Put `updates` in the places that `indices` name, or combine them with what is there."""
+    """Write `updates` at the positions that `indices` name, or combine them with the present values."""
     places = tuple(indices.unbind(-1))
     if reduction in ("none", "add"):
         return x.index_put(places, updates, accumulate=reduction == "add")
@@ -111,7 +111,7 @@ def one_hot(indices, /, depth, values, *, axis=-1, device):
 
 
 def non_zero(x, /):
-    """The places of numbers other than zero, of few numbers that follow from sizes."""
+    """Return the positions of numbers other than zero, for short lists that follow from sizes."""
     if x.device.type != "cpu" or x.numel() > MAX_SIZES:
         raise ValueError("places of numbers that are not zero, which depend on the pictures' content")
     return x.nonzero().T

@@ -1,10 +1,8 @@
-"""ONNX operators that slide a window over pictures or resize them, written with torch; see onnx_operators.py for the
-rules.
+"""ONNX operators that slide a window over pictures or resize them, in torch; the rules are in onnx_operators.py.
 
 In: data N×C×sizes of one to three dimensions (Resize: any), and attributes as ONNX writes them. Out: tensors. torch's
 own padding is used where it is the same: alike at both ends, and in pools at most half a window. Resize multiplies each
-axis by a matrix, new × old, whose rows hold what one new number takes from the old ones; torch's own interpolation,
-which is faster, is used where it is the same.
+axis by a matrix, new × old; torch's own interpolation, which is faster, is used where it is the same.
 
 Sources: onnx.ai/onnx/operators/onnx__Resize.html, opsets 10 to 19; R. Keys, 1981, for the cubic kernel.
 """
@@ -240,8 +238,8 @@ _ROUNDED: dict[str, Callable[[Tensor], Tensor]] = {
 
 
 def _matrix(places: Tensor, size: int, mode: str, a: float, shrunk: float, excludes_outside: bool) -> Tensor:
-    """New × old shares: a triangle or Keys' cubic kernel around each place, wider by 1 / `shrunk`; what lies outside
-    is the border's, or nobody's.
+    """Return new × old shares: a triangle or Keys' cubic kernel around each place, wider by 1 / `shrunk`. Shares
+    outside are the border's, or dropped if `excludes_outside`.
     """
     reach = math.ceil({"linear": 1, "cubic": 2}[mode] / shrunk)
     indices = places.floor()[:, None] + torch.arange(1 - reach, reach + 1, device=places.device)

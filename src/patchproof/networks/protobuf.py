@@ -24,8 +24,8 @@ Schema = dict[int, tuple[str, Any, bool]]
 
 
 def read_schemas(text: str) -> dict[str, Schema]:
-    """Schemas by name from "NAME: NUMBERS FIELD KIND; ...." A * behind a kind marks fields that may be repeated; kinds
-    are those above or messages that come before. Skipped fields change nothing: names, comments, exporters' versions.
+    """Schemas by name from "NAME: NUMBERS FIELD KIND; ...." A * behind a kind, one of those above or an earlier
+    message, marks repeated fields. Skipped fields change nothing: names, comments, exporters' versions.
     """
     schemas: dict[str, Schema] = {}
     for message in text.strip().split(".")[:-1]:

@@ -183,7 +183,7 @@ def gradient_in_views(problem: Problem, design: Tensor, views: Sequence[Views]) 
 def score(
     problem: Problem, pictures: Tensor, conditions: Conditions, windows: np.ndarray | None = None
 ) -> tuple[Tensor, Tensor]:
-    """The mean loss, differentiable, and mean loss, confidence and rate in float64, over classifiers and pictures
+    """The mean loss, differentiable, and (loss, confidence, rate) in float64, all means over classifiers and pictures
     N×3×H×W. Outside of `windows`, N×4 pixels (left, top, right, bottom), the pictures' gradient is not needed.
     """
     losses, figures, boxes = [], [], problem.boxes(conditions)
@@ -225,5 +225,5 @@ def _views_answer(problem: Problem, printed: Tensor, views: Views) -> Answer:
 
 
 def _to_send(tensor: Tensor) -> np.ndarray | Tensor:
-    """What processes exchange: on a CPU an array; a GPU's only process leaves everything where it is."""
+    """Return a tensor as processes exchange it: an array on a CPU; a GPU has one process and exchanges nothing."""
     return tensor.numpy() if tensor.device.type == "cpu" else tensor

@@ -53,9 +53,7 @@ class State:
 
 @dataclass(frozen=True)
 class TrainingStep:
-    """The result of one step. Rates and confidence are over this step's training views; `select_*` only where the
-    design was tried on the selection set.
-    """
+    """One step's results over its training views; `select_*` only where the design was tried on the selection set."""
 
     state: State
     loss: float

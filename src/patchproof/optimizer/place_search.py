@@ -2,9 +2,9 @@
 
 In: an `UnplacedScene` and its networks. Out: `Place`. Places all over the surface (see `scene.candidate_places`) are
 compared in the same views, those of `patch.side`, in three stages. Screening: the loss of a gray design at each place,
-and the decrease that its gradient predicts. Turns: the same for other spins of the few best. Drafts: the best get a few
-steps of the real loop, and held-out views decide. Screening and drafts use draws of the train stream, the decision
-those of the select stream; the promise's are never used. A scene and seed always give the same place.
+and the decrease that its gradient predicts. Turns: the same for other spins at the few best places. Drafts: the best
+get a few steps of the real loop, and held-out views decide. Screening and drafts use draws of the train stream, the
+decision those of the select stream; the promise's are never used. A scene and seed always give the same place.
 
 Left out on purpose: whether the runner-up would win with more steps or another seed. The interval covers the views
 alone, and it is slightly optimistic, since the best of a few is selected.

@@ -131,8 +131,8 @@ def set_problem(
     loss: Loss | None = None,
     jobs: int = 1,
 ) -> Problem:
-    """The problem of a scene; `models` replaces the scene's classifiers, `loss` that of its goal. `jobs` processes
-    share its views on a CPU, one does on a GPU.
+    """The problem of a scene; `models` replaces the scene's classifiers, `loss` that of its goal. On a CPU, `jobs`
+    processes share its views.
     """
     check_device(device)
     settings = scene.settings

@@ -47,9 +47,8 @@ def responses(
     control_mask: np.ndarray | None = None,
     advance: Advance = no_advance,
 ) -> dict[Thing, Responses]:
-    """Show each thing under every condition to every network, in square views of `side_px` (default: the problem's
-    `figure_px`). With `control_mask`, all but the first thing are shown only under conditions in the mask. `advance`
-    is called with the number of views done and their total.
+    """Show each thing under every condition to every network, in squares of `side_px` (default: `figure_px`). A
+    `control_mask` selects the conditions for things after the first. `advance` gets the views done and their total.
     """
     things, first_appearance = list(appearances), next((a for a in appearances.values() if a is not None), None)
     mask = np.ones(len(conditions), bool) if control_mask is None else control_mask
@@ -89,8 +88,8 @@ def ask_networks(
     windows: np.ndarray | None = None,
     cache: dict[Any, Any] | None = None,
 ) -> Responses:
-    """Every network's responses to pictures N×3×H×W with the object in `boxes` (`Problem.boxes`). A network that is in
-    the problem twice, with other labels, runs once. Pictures that differ only in `windows` share the `cache`.
+    """Return networks' responses to pictures N×3×H×W with the object in `boxes`. A network that is in the problem
+    twice, with other labels, runs once. Pictures that differ only in `windows` share the `cache`.
     """
     rows = []
     with torch.no_grad():

@@ -1,9 +1,9 @@
-"""A run's folder: the results of an optimization, written so that a kill at any moment loses 120 views at most.
+"""The folder of an optimization run, written so that a kill at any moment loses at most 120 views of work.
 
-In: a scene file. Out: RUN/ with `design.png`, `run.json` (settings, versions, seeds, threads, promise), `steps.jsonl`
-(one flushed line per step), `views.png` and `checkpoint.safetensors`; where the place was searched also `place.json`
-and `place.png`, while run.json holds the place as if the scene had given it. Nothing in the folder depends on the time
-of day: a seed always gives the same bytes on one machine with one thread count and device.
+In: a scene file. Out: RUN/ with `design.png`, `run.json` (settings with the place that was found, versions, seeds,
+threads, promise), `steps.jsonl` (one flushed line per step), `views.png` and `checkpoint.safetensors`; after a search
+for the place also `place.json` and `place.png`. Nothing depends on the time of day: on one machine, thread count and
+device, a seed always gives the same bytes.
 """
 
 import json
@@ -57,8 +57,8 @@ _MESH_FILE = "given.glb"  # the mesh of a scene that was made in Python
 _STEP_FILES = (CHECKPOINT_FILE, _LOG_FILE, RUN_FILE, _VIEWS_FILE, _MESH_FILE, "place.*")
 RUN_FILE_PATTERNS = (*_STEP_FILES, DESIGN_FILE, OBJECT_FILE, TEXTURE_FILES, MASK_FILE, "evaluate.json")
 
-# (steps, promised views) of a first look, whose interval is some four times as wide, and of a print that counts, with
-# three times the default's steps and an interval half as wide (`patchlab charts speed`).
+# (steps, promised views). A draft's interval is about four times as wide as the default's; a thorough run takes three
+# times the steps, and its interval is half as wide (`patchlab charts speed`).
 DRAFT_EFFORT, THOROUGH_EFFORT = (40, 40), (720, 1600)
 MIN_DESIGN_CHANGE = 1.5 / 255  # a design that moved by less is printed as its start
 
@@ -69,7 +69,7 @@ class Run:
 
     folder: Path
     scene: Scene
-    design: np.ndarray  # uint8 h×w×3; of a texture run 1×M×3, as in `optimize.texture.Texture`
+    design: np.ndarray  # uint8 h×w×3; of a texture run 1×M×3, as in `optimizer.texture.Texture`
     promise: Promise
     details: dict[str, Any]
     SHOWN: ClassVar[tuple[str, ...]] = ("folder", "scene.settings.target.label", "design", "promise")
@@ -161,7 +161,7 @@ def optimize(
 def effort_of(
     scene: Scene, draft: bool, thorough: bool, steps: int | None, views: int | None
 ) -> tuple[int, int | None]:
-    """Return steps and promised views, if not given: of a draft no more steps than the scene's, else no fewer."""
+    """Return (steps, promised views), given or default: a draft has no more steps than the scene, others no fewer."""
     if draft and thorough:
         raise Refused("a draft or a thorough run", "both", "leave one out")
     limit, effort = (min, DRAFT_EFFORT) if draft else (max, THOROUGH_EFFORT if thorough else (1, None))
@@ -169,8 +169,8 @@ def effort_of(
 
 
 def resolve_scene(scene: str | Path | Scene, seed: int | None, **tables: Mapping[str, Any]) -> Scene:
-    """Return a scene, or load that of a file with `seed` in place of the file's; a scene in memory keeps its own. Keys
-    of `tables` go before the scene's.
+    """Return a scene in memory, which keeps its seed, or load that of a file with `seed` in place of the file's. Keys
+    of `tables` replace the scene's.
     """
     if not isinstance(scene, Scene):
         return build_scene(load_scene_settings(scene, **tables), Path(scene).resolve().parent, seed)
@@ -185,9 +185,7 @@ def resolve_scene(scene: str | Path | Scene, seed: int | None, **tables: Mapping
 def _choose_place(
     scene: Scene, out: Path, resume: bool, search_options: Mapping[str, Any]
 ) -> tuple[PatchScene, Callable[[], None], Mapping[str, str]]:
-    """The scene with the piece at the place that a search chooses or chose, a function that saves the place, and the
-    fingerprints of what was searched.
-    """
+    """Return the scene with its chosen place, a function that saves the place, and the search's input fingerprints."""
     # only scenes that give no place import the search
     from patchproof.optimizer.place_files import read_place, save_place
     from patchproof.optimizer.place_search import choose_place
@@ -224,10 +222,8 @@ def write_run(run: Run) -> Run:
 
 
 def load_run(folder: str | Path, trust: bool = False, named: Iterable[str] = ()) -> Run:
-    """Load a finished run; refused if the folder holds none, or an unfinished one.
-
-    A run may be from somebody else. Without `trust`, paths with `${VAR}` are refused, and its networks will not be
-    loaded if they are code (`module:`) or downloads, unless they are all `named`.
+    """Load a finished run; refused if it is missing or unfinished. A run may be somebody else's: without `trust`, paths
+    with `${VAR}` are refused, and so are networks that are code or downloads, unless all networks are `named`.
     """
     folder = Path(folder)
     require_finished_run(folder)

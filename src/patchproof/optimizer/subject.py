@@ -1,13 +1,13 @@
-"""What the subjects of optimization share: the design of a printed piece (`patch.Patch`), the object's own texture
-(`texture.Texture`). A scene loads the one it needs.
+"""The common part of subjects of optimization: a printed design (`patch.Patch`), the object's texture
+(`texture.Texture`).
 
 A subject gives the first design, the allowed designs, their penalty and appearance, and the files that a run stores. A
 design is a float tensor 3×h×w in [0, 1], its `pixels` are uint8 h×w×3.
 
-The gradient's pyramid moves large parts of a design as readily as single pixels: the optimizer scales its levels, means
-over blocks of 1, 2, 4 … pixels, each on its own, and adds them, so that color and large shapes, which count in small
-and blurred views, come first. Laplacian pyramid normalization of DeepDream (Mordvintsev et al., TensorFlow tutorial,
-2015) scales levels likewise, by their spread instead of Adam's.
+The gradient's pyramid moves large parts of a design as readily as single pixels: the optimizer scales each of its
+levels, means over blocks of 1, 2, 4 … pixels, on its own, and adds them, so that color and large shapes, which count in
+small and blurred views, come first. Laplacian pyramid normalization of DeepDream (Mordvintsev et al., TensorFlow
+tutorial, 2015) scales levels likewise, by their spread instead of Adam's.
 
 The loss is the cross-entropy of the *summed* probability of all accepted labels, the quantity that is reported as
 confidence; for `deceive`, of its complement. The paper's printed update Θ + α∇L raises the loss (Pestana et al.,
@@ -69,10 +69,7 @@ def side_by_side(pictures: Tensor, captions: Sequence[str]) -> np.ndarray:
 
 
 def build_pyramid(gradient: Tensor, mask: Tensor | None = None) -> tuple[Tensor, ...]:
-    """C×H×W → C×⌈H/2ˡ⌉×⌈W/2ˡ⌉ for l = 0, 1, …: means over the pixels of a block that lie in picture and mask.
-
-    `mask` is H×W, 1 where the picture may change; the gradient is 0 elsewhere.
-    """
+    """C×H×W → C×⌈H/2ˡ⌉×⌈W/2ˡ⌉, l = 0, 1, …: means over a block's pixels in picture and `mask` (H×W; 1: may change)."""
     weights = None if mask is None else mask[None, None].to(gradient)
     pooled = []
     for level in range(1, level_count(gradient.shape[1:])):

@@ -1,10 +1,10 @@
 """Convert a picture's colors to sRGB from the color space that its file declares.
 
-A profile is known by what it does to colors, never by its name. A PNG's cICP precedes its profile, that its sRGB chunk,
-that cHRM and gAMA; elsewhere a profile precedes nclx and EXIF. ColorSpace 65535 means any other space: it is Adobe RGB
-with interoperability R03 alone, since some phones write it over sRGB. Colors outside of sRGB are clipped.
-Of more than 8 bits, 16-bit RGB is decoded by OpenCV, since Pillow keeps 8; floating-point values are linear light. A
-maximum of 10, 12 or 14 bits in TIFF's tags is the depth; other maxima are statistics.
+A profile is recognized by what it does to colors, never by its name. In a PNG, cICP precedes the profile, the profile
+the sRGB chunk, and that cHRM and gAMA; elsewhere the profile precedes nclx and EXIF. ColorSpace 65535 means any other
+space: it is read as Adobe RGB only with interoperability R03, since some phones write it over sRGB. Colors outside of
+sRGB are clipped. Of more than 8 bits, 16-bit RGB is decoded by OpenCV, since Pillow keeps 8; floating-point values are
+linear light. A maximum of 10, 12 or 14 bits in TIFF's tags is the depth; other maxima are statistics.
 """
 
 import io

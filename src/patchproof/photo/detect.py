@@ -2,12 +2,12 @@
 
 In: uint8 sRGB pixels and the ids of the sheet. Out: `MarkersInView`: corners in photo pixels (centers at .5, clockwise
 from the code's top-left) with the blur of their borders, ids of the same dictionary that are not the sheet's, and ids
-found at two places. The detector gets linear light: in code values blurred paper spreads over ink, and at a blur of 0.3
-modules it read 5 of 48 markers where it read 45 in linear light. The pyramid starts below 1000 px and stops at the
-level where every expected id has been found; only if some are missing it tries code values, local contrast (CLAHE) in
-dark photos, and twice the size where less than 4 megapixels are searched; larger pictures get these two at half their
-size. Corners of all levels are then fitted in the full photograph (`edges`). If the page's millimeters are known,
-`known_page.find_sheet` needs fewer levels. Only OpenCV's class API is used, so 4.11 to 5.x will do.
+found at two places. The detector gets linear light, because blurred paper spreads over ink in code values: at a blur of
+0.3 modules it read 45 of 48 markers in linear light, and 5 in code values. The pyramid starts below 1000 px and stops
+at the level where every expected id has been found. Only if some are missing, it tries code values and, in dark photos,
+local contrast (CLAHE), both at half the size above 4 megapixels; smaller pictures are also tried at twice their size.
+Corners are then fitted in the full photograph (`edges`). `known_page.find_sheet` knows the page's millimeters and needs
+fewer levels. Only OpenCV's class API (4.11 to 5.x) is used.
 """
 
 from collections.abc import Callable, Iterator, Sequence, Set
@@ -37,7 +37,7 @@ DARK_CODE = 70  # median code value below which local contrast helps; in bright 
 # and samples 10 px farther.
 _MARGIN_PX, _MARGIN_SHARE = 16.0, 0.2
 SMALLEST_MARKER_PX = 9.0  # side at its level: 7 modules of 1.3 px are the smallest that has been read
-# Of a side: the detector also tries squares inside, as of a marker in a quiet zone or shadow; one had 0.55
+# Shares of a side: the detector also tries squares inside a square, which may be a quiet zone or shadow (one: 0.55).
 _INSETS = (1.0, 0.93, 0.86, 0.79, 0.72, 0.66, 0.6, 0.54)
 _LEAST_CONTRAST_CODES, _MOST_BORDER_ERRORS = 6, 0.4  # of a square that can be a marker
 # A reduced picture is searched with one window of the detector's threshold, a full one with all three, which takes
@@ -175,9 +175,7 @@ def pyramid_levels(srgb: np.ndarray, region: ImageRegion) -> Iterator[Level]:
 
 
 def search_level(srgb: np.ndarray, region: ImageRegion, level: Level, aruco, detections: Detections) -> Ids:
-    """Search a region of the photograph at one level; corners, in full pixels, are added to `detections` by id. Returns
-    the ids whose codes some squares resemble in a mirror.
-    """
+    """Search a region at one level, add corners (full pixels) to `detections`, and return ids that look mirrored."""
     part = srgb[region]
     height, width = part.shape[:2]
     if width * height * level.scale**2 > LARGEST_LEVEL_PX:
@@ -253,10 +251,9 @@ def _detect(
 
 def detect_markers(picture: np.ndarray, aruco, settings: cv2.aruco.DetectorParameters):
     """OpenCV's (corners, ids or None) of one uint8 gray picture, and the set of ids whose codes some squares resemble
-    in a mirror; raises `PhotoRejected("too_costly")` if it shows more possible markers than there is time for.
-
-    OpenCV compares a square with every code of the dictionary, which takes a millisecond: 20 s for a block design. So
-    it gets a dictionary of the codes that any square resembles, or no picture if there is none.
+    in a mirror. Raises `PhotoRejected("too_costly")` if it shows more possible markers than there is time for. OpenCV
+    gets only the codes that some square resembles, because comparing a square with a whole dictionary takes a
+    millisecond, or 20 s for a block design.
     """
     max_squares = int(min(MOST_SQUARES, remaining_seconds() / _SQUARE_S))
     windows = range(settings.adaptiveThreshWinSizeMin, settings.adaptiveThreshWinSizeMax + 1, _WINDOW_STEP_PX)
@@ -276,8 +273,8 @@ def detect_markers(picture: np.ndarray, aruco, settings: cv2.aruco.DetectorParam
 
 
 def _similar_ids(picture: np.ndarray, quads: np.ndarray, aruco) -> tuple[list[int], list[int]]:
-    """Ids whose codes resemble what a gray picture shows within corners Q×4×2, or within the squares round their middle
-    that the detector tries, too; and ids that are resembled in a mirror.
+    """Return ids whose codes a gray picture resembles within corners Q×4×2, or within the smaller squares in them that
+    the detector tries, too; and ids that are resembled in a mirror.
     """
     size = aruco.markerSize
     side, codes = size + 2, marker_codes(aruco.bytesList.tobytes(), size)

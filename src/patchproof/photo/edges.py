@@ -22,8 +22,8 @@ ALONG, ACROSS = 24, 19  # samples per border: 24 stretches of 19
 BORDER_SHARE = 0.87  # of a border that is sampled: nearer to its ends the next border's blur mixes in
 # range of samples in modules: inwards the printed cells are known, outwards only one module of paper
 INWARD_MODULES, OUTWARD_MODULES = 1.0, 0.6
-# range in units of the fitted blur, to either side: beyond it the light is flat, and samples a pixel apart would move a
-# sharp border by 0.1 px
+# Range to either side in units of the fitted blur, at least in px. The light is flat beyond it, where samples a pixel
+# apart would move a sharp border by 0.1 px.
 RANGE_SIGMAS, LEAST_RANGE_PX = 4.0, 2.5
 # blur that sampling adds: a pixel's own width (1/12 px²) and bilinear interpolation (mean over phases 1/6 px²)
 _SAMPLING_VARIANCE = 1 / 12 + 1 / 6

@@ -1,14 +1,14 @@
 """Find all markers of a known page: those that the detector finds, and others at the places that these predict.
 
 In: the photograph and the place of every marker on the page. Out: `MarkersInView`. After each level of the detector a
-homography from the markers found so far predicts the corners of the missing ones; where the cells resemble the printed
-ones, borders are fitted from there, and a marker counts if these lie near the prediction and its cells match. This
-needs no contours, so it works for small, blurred or partly covered markers, and it avoids the finer levels, which cost
-most; they search only where markers are still missing. Prediction never identifies a sheet by itself.
+homography from the markers found so far predicts the corners of the missing ones. Where the cells resemble the printed
+ones, borders are fitted from there; a marker counts if they lie near the prediction and its cells match. This needs no
+contours, so it works for small, blurred or partly covered markers, and it saves finer levels, which cost most.
+Prediction never identifies a sheet by itself.
 
-A second print of the sheet may be too far away for its markers to be read: dark squares are compared with the known
-codes, and count where two or three lie as on the sheet. A marker is seen so from 8 px across on in sharp pictures, from
-10 px on at a blur of 0.9 px, where it is read from 14 px on.
+A second print may be too far away for its markers to be read: dark squares are compared with the known codes, and count
+where two or three lie as on the sheet. That works from 8 px across on; at a blur of 0.9 px it works from 10 px on, and
+reading from 14.
 """
 
 from collections.abc import Iterator
@@ -26,16 +26,15 @@ from patchproof.photo.rectify import PageFit, Quads, fit_page, region_around
 from patchproof.photo.rejection import PhotoRejected
 from patchproof.sheets.markers import DICTIONARY, aruco_dictionary, marker_cells
 
-# of the light with the printed cells; wrong codes of the dictionary stay below 0.6, blur lowers it to 0.8
+# Of the light with the printed cells: blur lowers it to 0.8, and other codes of the dictionary stay below 0.6.
 LEAST_CORRELATION = 0.7
-# at one of the offsets (in modules) about the predicted place, which is at most half a module off: with less, borders
-# are not fitted, because that costs most
+# Borders, which cost most, are fitted only from here on, at one of the offsets (in modules) about the predicted place.
 _MIN_TRIAL_CORRELATION = 0.5
 _TRIAL_OFFSETS = tuple((x, y) for x in (-0.4, 0.0, 0.4) for y in (-0.4, 0.0, 0.4))
-# px of a marker's side, 4 per module: the detector reads 0.99 of these, so one that is missing must be covered
+# A marker's side in px, 4 a module: the detector reads 99 % of such markers, so one that is missing must be covered.
 READABLE_PX = 28.0
 _LEAST_MARKERS = 3  # with less, flat paper cannot be told from bent
-# The picture is scaled until the first print's markers are as large; those of one four times as far away are 17 px then
+# The picture is scaled until the first print's markers have this side; those of one four times as far have 17 px then.
 _FIRST_PX, _MOST_SCALE, _MOST_PIXELS = 70.0, 2.0, 4_500_000
 _LEAST_PX, _LARGEST_SHARE, _MOST_SQUARES = 9.0, 1.2, 300  # sides of squares there; of the first print's markers
 _OFFSETS = np.array([(x, y) for x in (-0.5, 0.0, 0.5) for y in (-0.5, 0.0, 0.5)])  # in modules
@@ -50,10 +49,9 @@ Match = tuple[int, float, np.ndarray]
 
 
 def find_sheet(srgb: np.ndarray, expected: Ids, corners_mm: Quads, dictionary: str = DICTIONARY) -> MarkersInView:
-    """Find the markers of `corners_mm` (page mm by id) in a uint8 photograph.
-
-    The search ends when each of `expected` is found, out of the picture or covered, unless a finer level could decide
-    about a single foreign marker. Prints beside the first one are sought last.
+    """Find the markers of `corners_mm` (page mm by id) in a uint8 photograph, then those of prints beside the first
+    one. The search ends when each of `expected` is found, out of the picture or covered, unless a finer level could
+    decide about a single foreign marker.
     """
     aruco = aruco_dictionary(dictionary)
     detections: Detections = {}
@@ -185,8 +183,8 @@ def _correlation(srgb: np.ndarray, corners_px: np.ndarray, code: np.ndarray, off
 def find_second_print(
     srgb: np.ndarray, corners_px: Quads, corners_mm: Quads, dictionary: str, agree: bool
 ) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Ids of markers beside `corners_px` (outside of all of them if these `agree` that they are of one print) and no
-    larger: the two or three that show a second print of the sheet, and those that are read and not in `corners_mm`.
+    """Ids of markers beside `corners_px` and no larger: those that show a second print, and those of other sheets. If
+    `agree`, the markers found are of one print, and only what lies outside of them all counts.
     """
     if len(corners_px) < 2:
         return (), ()
@@ -235,7 +233,7 @@ def find_small_markers(srgb: np.ndarray, read: Quads, corners_mm: Quads, diction
 
 
 def _groups(matches: list[Match], corners_mm: Quads) -> Iterator[dict[int, np.ndarray]]:
-    """Corners by id of markers that lie as on the sheet: three, then two that resemble their codes more."""
+    """Yield groups (corners by id) that lie as on the sheet: of three markers, then of two with better correlations."""
     for count, least in _LEAST_LIKENESS.items():
         for group in combinations([match for match in matches if match[1] > least], count):
             quads = {marker_id: quad for marker_id, _, quad in group}
@@ -291,7 +289,7 @@ def _matches(light: np.ndarray, quads: list[np.ndarray], ids: list[int], diction
 
 
 def _normalized(values: np.ndarray, count: int) -> np.ndarray:
-    """Rows of `count` values whose products are correlations."""
+    """Return rows of `count` values with mean 0 and length 1, whose inner products are correlations."""
     rows = values.reshape(-1, count)
     rows = rows - rows.mean(1, keepdims=True)
     return rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-6)

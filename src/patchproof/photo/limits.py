@@ -1,7 +1,7 @@
 """Limit the work on a photograph to ten seconds of processor time.
 
-A call into a library cannot be interrupted (`input.run_within_seconds`), so calls that a picture could make endless are
-avoided if `find_squares` or `count_finder_lines` count too many.
+Calls into a library cannot be interrupted (`input.run_within_seconds`), so those that some pictures would make endless
+are skipped if `find_squares` or `count_finder_lines` count too many.
 """
 
 from collections.abc import Callable

@@ -2,11 +2,10 @@
 
 In: a photograph, the homography and blur of a page, a rectangle of it, and what is printed there. Out: `PaperLight`:
 per channel a quadratic in the rectangle of the linear light that white paper shows, the unexplained remainder, and the
-paper's grain. Pixels count if they lie on white paper, far enough from ink and the rectangle's edge that blur brings
-nothing over; clipped pixels do not. The
-fit is robust: least median of squares finds the light that most of the paper agrees on, and Tukey's weights ignore a
-highlight or a shadow's edge. A quadratic, because a lamp's fall-off over a flat piece is smooth: for a bare lamp twice
-the piece's size above its middle the error is within 1 %, above its edge within 4 %.
+paper's grain. Pixels count if they are not clipped and lie on white paper, far enough from ink and the rectangle's edge
+that blur brings nothing over. The fit is robust: least median of squares finds the light that most of the paper agrees
+on, and Tukey's weights ignore a highlight or a shadow's edge. A lamp's fall-off over a flat piece is smooth: for a bare
+lamp twice the piece's size above its middle the quadratic's error is within 1 %, above its edge within 4 %.
 """
 
 from collections.abc import Iterable
@@ -92,9 +91,8 @@ def _robust_fit(terms: np.ndarray, light: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def _start(terms: np.ndarray, light: np.ndarray) -> np.ndarray:
-    """Return six coefficients of least median error among fits to a few pixels each, robust to a third of bad pixels.
-
-    Of 500 dozens drawn from pixels of which a third are bad, four are expected to be all good.
+    """Return six coefficients of least median error among 500 fits to 12 random pixels each; if a third of the pixels
+    are bad, four of these fits are expected to have none.
     """
     rng = np.random.default_rng(0)  # fixed: the same photograph must give the same bytes
     dozens = rng.integers(0, len(light), (500, 12))
@@ -105,8 +103,7 @@ def _start(terms: np.ndarray, light: np.ndarray) -> np.ndarray:
 
 def _noise(residual: np.ndarray, white: np.ndarray) -> float:
     """Return the standard deviation at white of residuals N×3 (without outliers) around `white`, less that of rounding.
-
-    Shot noise has a variance in proportion to the light (EMVA 1288), hence the division.
+    The variance of shot noise is proportional to the light (EMVA 1288), hence the division.
     """
     step = np.interp(white, LINEAR_FROM_CODE[:-1], np.diff(LINEAR_FROM_CODE))
     variance = (residual**2).mean(0) - step**2 / 12

@@ -1,16 +1,16 @@
 """Estimate the camera's position as seen from a point of a flat or rolled sheet, with its uncertainty.
 
-In: a homography or a `Shape` with its covariance, a pinhole matrix whose focal length is known to `focal_spread` of its
-logarithm (one standard deviation). Out: `CameraPosition`, with the answer whether the sheet's own perspective agrees
+In: a homography or a `Shape` with its covariance, and a pinhole matrix, the logarithm of whose focal length has the
+standard deviation `focal_spread`. Out: `CameraPosition`, with the answer whether the sheet's own perspective agrees
 with the matrix. A small or distant sheet looks almost the same from either side of its normal: the azimuth's sign is
 lost first. Spreads follow from shifts by one standard deviation along each axis of the parameters' covariance; that of
 tilt, which is never negative, from random draws.
 
-A page seen with the right matrix has px_from_mm ~ K [r1, r2, t]: r1 · r2 = 0 and |r1| = |r2|. A wrong focal length
-breaks both with sin² of the tilt, a wrong principal point (an off-center crop) likewise, so frontal views tell nothing.
-A crop, or software that straightens, may leave no trace in a file. So a focal length from EXIF is trusted only as far
-as perspective confirms it; otherwise the distance is unknown, and angles are as uncertain as these can make them. So
-are tangents of rolled paper far from its markers, between which it may turn, and paper that misses its markers.
+A page seen with the right matrix has px_from_mm ~ K [r1, r2, t]: r1 · r2 = 0 and |r1| = |r2|. A wrong focal length or
+principal point (an off-center crop) breaks both with sin² of the tilt, so frontal views tell nothing. Crops and
+software that straightens may leave no trace in a file, so a focal length from EXIF is trusted only as far as
+perspective confirms it; otherwise the distance is unknown, and angles are as uncertain as these can make them. Angles
+are also less certain for rolled paper that may turn between its markers, and for paper that misses its markers.
 
 Source: Hartley and Zisserman, Multiple View Geometry, 2nd ed., 8.1.
 """
@@ -23,11 +23,11 @@ from patchproof.base.geometry import plane_pose, scaling_about, view_angles
 from patchproof.photo.rectify import PageFit, root_of, root_of_scaled
 from patchproof.photo.unroll import Shape
 
-# one σ of errors that are no noise of corners: of |r1| = |r2|, printers' errors of proportion; of both equations, of
-# angles in radians and of lengths, paper that is not quite flat or round, and lenses
+# One σ of errors beyond corner noise: printers' errors of proportion, in |r1| = |r2|; errors of lenses and of paper
+# that is not quite flat or round, in both equations, in angles (rad) and in lengths.
 _PRINT_STRETCH, _PAPER = 0.015, 0.003
-# one σ of the stretch that tilts allow for where perspective cannot tell: prints stretched by up to 5 % and pictures
-# squeezed by up to 12 % then stay within three times what is stated, at half the width that 0.015 gives
+# One σ of stretch in a tilt's uncertainty if perspective cannot tell: with prints stretched by up to 5 % or pictures
+# squeezed by up to 12 %, errors stay within three times the stated value, which is half as wide as with 0.015.
 _TILT_STRETCH = 0.008
 _MAX_CHI2 = 9.2  # 99 % of two degrees of freedom
 _MAX_SIGMAS = 2.6
@@ -36,17 +36,17 @@ _MAX_CONFIRMING_SPREAD = 0.1  # of the focal length's logarithm: perspective wit
 # from up to 50° leaves azimuths up to 44° off and tilts up to 46°, three times this, and no trace in 281 of 1,500 drawn
 # pictures, all of which look nearly frontal. Crops, anywhere in a picture, turn the azimuth by up to 16.4°.
 UNCONFIRMED_DEG = 15.5
-# one σ, as a share of the turn between the middle and the nearest marker: 95 % are 0.43 of it. A fold right beside the
-# middle turns it by as much as the sheet turns to one side: 1.28 of it, with markers a tenth as wide in the corners
+# One σ as a share of the turn between the middle and the nearest marker (95 %: 0.43 of it). At worst, with a fold right
+# beside the middle and markers a tenth as wide as the sheet in its corners, the middle is turned by 1.28 of it.
 _HIDDEN_TURN = 0.22
-# one σ in radians per bend (a share of the side, beyond noise): waves half a side long, seen under 20° or less
+# One σ in radians per bend (share of the side beyond noise), for waves half a side long seen at a tilt of 20° or less.
 _TURN_PER_BEND = 50.0
 
 
 @dataclass(frozen=True)
 class CameraPosition:
-    """The camera's azimuth and distance, each with its 95 % uncertainty (infinite: unknown). `focal_agrees` is True or
-    False if perspective confirms or contradicts the focal length, None if it cannot tell.
+    """The camera's azimuth and distance, each with its 95 % uncertainty (infinite: unknown). `focal_agrees` says if
+    perspective confirms the focal length; None if it cannot tell.
     """
 
     azimuth_deg: float
@@ -64,8 +64,8 @@ def turn_rad(bend: float, shape: Shape | None) -> float:
 
 
 def distortion_of(fit: PageFit, matrix_px: np.ndarray | None, focal_spread: float) -> tuple[np.ndarray, np.ndarray]:
-    """Estimate shear and stretch (the logarithm of x over y) of a print or picture by a flat sheet's perspective: mean
-    (2,) and covariance 2×2; without a matrix they are what prints usually have.
+    """Return a print's or picture's shear and log stretch (x over y), mean (2,) and covariance 2×2, as a flat sheet's
+    perspective shows them; without a matrix those of usual prints.
     """
     expected, paper = _TILT_STRETCH**2 * np.eye(2), _PAPER**2 * np.eye(2)
     if matrix_px is None:
@@ -78,8 +78,8 @@ def distortion_of(fit: PageFit, matrix_px: np.ndarray | None, focal_spread: floa
 def flat_sheet_position(
     fit: PageFit, matrix_px: np.ndarray, focal_spread: float, point_mm, turn: float = 0.0, matrix_is_known: bool = False
 ) -> CameraPosition:
-    """The position of the camera before flat paper. `turn` is its `turn_rad`; `matrix_is_known` states that the matrix
-    is that of this picture, so that it needs no confirmation by perspective.
+    """The camera's position before flat paper; `turn` is that of `turn_rad`. With `matrix_is_known` the matrix is that
+    of this picture and needs no confirmation by perspective.
     """
     agrees, own_spread = _agreement(fit, matrix_px, focal_spread)
     entries = np.append(fit.px_from_mm.ravel()[:8], 0.0)
@@ -171,8 +171,8 @@ def _scale_focal(matrix_px: np.ndarray, log_scale: float) -> np.ndarray:
 
 
 def _agreement(fit: PageFit, matrix_px: np.ndarray, focal_spread: float) -> tuple[bool | None, float]:
-    """(True or False if r1 and r2 confirm or contradict the focal length within their uncertainty, None if they cannot
-    tell; the spread of its logarithm from perspective alone, one standard deviation).
+    """Return True or False if r1 and r2 confirm or contradict the focal length, None if they cannot tell, and the
+    standard deviation of its logarithm from perspective alone.
     """
     error, covariance, by_focal = _disagreement(fit, matrix_px)
     covariance += np.diag([_PAPER**2, _PRINT_STRETCH**2 + _PAPER**2])

@@ -41,9 +41,7 @@ class FrameLight:
 
 
 def is_featureless(srgb: np.ndarray) -> bool:
-    """True if a uint8 picture H×W×3 is one tone or noise, by the mean colors of its 8 × 8 cells. Noise is estimated
-    from neighboring pixels, which are similar in pictures of real things.
-    """
+    """True if a uint8 picture H×W×3 is one tone or noise: its 8 × 8 cells' mean colors differ no more than by noise."""
     means = cv2.resize(srgb, (_CELLS, _CELLS), interpolation=cv2.INTER_AREA).reshape(-1, 3)
     steps = np.diff(srgb[:: max(1, len(srgb) // 200)].astype(np.int16), axis=1).astype(float)
     noise = np.sqrt((steps**2).mean() / 2) if steps.size else 0.0
@@ -84,8 +82,8 @@ def _fitted_or_all(markers: Iterable[Borders]) -> list[Borders]:
 def pattern_light(
     srgb: np.ndarray, px_from_mm: np.ndarray, corners_mm: Mapping[int, np.ndarray], dictionary: str, blur_px: float
 ) -> tuple[np.ndarray, np.ndarray, float, float] | None:
-    """Fit light (3,) of paper and ink and the blur in pixels to a uint8 photograph, given the blur from borders; None
-    if it shows too few cells. Last comes the correlation of light and print, near 1 if the homography is right.
+    """Fit the light (3,) of paper and ink and the blur in px, given that of borders, to a uint8 photograph; None if it
+    shows too few cells. Last comes the correlation of light and print, near 1 if the homography is right.
     """
     ids = sorted(corners_mm)
     markers, lights = [], []

@@ -1,13 +1,13 @@
 """Fit the homography of a flat sheet to marker corners, with its uncertainty, and rectify parts of the page.
 
 In: corners in pixels and in page millimeters, by marker id. Out: `PageFit`. Least median of squares finds the corners
-that agree (it breaks down if half of them are wrong), Gauss-Newton on their reprojection error gives the homography and
-its covariance. Blur and sharpening make all markers of a photograph a little larger or smaller; that is no noise, so
-with three markers or more their corners' mean outward shift is subtracted first. The uncertainty is the 95 % point of
-the *largest* of the design's corner errors, drawn from that covariance. Few corners tell little about their noise, so
-intervals get wider (Student's t); a single marker fits any noise exactly, and gets a large assumed noise. Curved paper,
-motion and lenses rotate, stretch and shear whole markers. Noise does that only as much as it twists them: the excess
-over the twist is called bend, and the design's corners miss by several times as much.
+that agree (it breaks down if half of them are wrong); Gauss-Newton on the reprojection error gives the homography and
+its covariance. Blur and sharpening make all markers of a photograph a little larger or smaller: with three markers or
+more, their corners' mean outward shift is subtracted first. The uncertainty is the 95 % point of the *largest* of the
+design's corner errors, drawn from that covariance. It is wider with few corners (Student's t); the noise of a single
+marker, which fits exactly, is assumed to be large. Curved paper, motion and lenses rotate, stretch and shear whole
+markers; noise twists them as well. Deformation beyond the noise that the twist shows is called bend, and the design's
+corners miss by several times as much.
 
 Source: Hartley and Zisserman, Multiple View Geometry, 2nd ed., 4.2 (reprojection error), 5.2 (covariance).
 """
@@ -68,8 +68,8 @@ def fit_page(corners_px: Quads, corners_mm: Quads) -> PageFit:
 
 
 def fit_points(mm: np.ndarray, px: np.ndarray, sigma_px: np.ndarray, start: np.ndarray | None = None) -> PageFit:
-    """Fit the homography page mm → photo px to N ≥ 4 points N×2 with standard deviations N of a coordinate. With more
-    than four, those off by more than three deviations from the fit begun at `start` lose their weight.
+    """Fit the homography mm → px to N ≥ 4 points N×2, beginning at `start` if given; `sigma_px` N are standard
+    deviations of a coordinate. Of more than four points, those off by more than three deviations lose weight.
     """
     homography, weight = fit_homography(mm, px) if start is None else start, np.ones(len(mm))
     root = np.repeat(1 / sigma_px, 2)
@@ -102,8 +102,8 @@ def corner_uncertainty_mm(fit: PageFit, rect_mm) -> float:
 
 
 def largest_shift_mm(root: np.ndarray, px_by_parameter: np.ndarray, mm_by_px: np.ndarray) -> float:
-    """The 95 % point of the largest error of C points, from 1000 draws of P parameters with covariance root · rootᵀ, by
-    the derivatives P×2C and C×2×2.
+    """The 95 % point of the largest error of C points, in 1000 draws of P parameters with covariance root · rootᵀ.
+    `px_by_parameter` P×2C and `mm_by_px` C×2×2 are derivatives.
     """
     # a fixed generator: the same photo must give the same bytes
     draws = np.random.default_rng(0).standard_normal((1000, len(root))) @ root.T
@@ -119,9 +119,8 @@ def covariance_of(jacobian: np.ndarray, noise_px: float, rcond: float = 1e-15) -
 
 
 def rectify(pixels: np.ndarray, px_from_mm: np.ndarray, rect_mm, px_per_mm: float) -> np.ndarray:
-    """Rectify a rectangle of the page at `px_per_mm`, averaged over area to avoid moiré.
-
-    `pixels` is H×W×C, uint8 or float32 (pass linear light to measure); outside of the photo border pixels are repeated.
+    """Rectify a rectangle of the page at `px_per_mm`, averaged over area to avoid moiré. `pixels` is H×W×C, uint8 or
+    float32 (pass linear light to measure); beyond the photo its border pixels are repeated.
     """
     size = rectified_px(rect_mm, px_per_mm)
     return resize_by_area(oversample_flat(pixels, px_from_mm, rect_mm, size), size)
@@ -261,11 +260,11 @@ def _page_fit(homography, mm, px, inlier, ids) -> PageFit:
 def noise_and_bend(
     residual: np.ndarray, markers: np.ndarray, freedom: int, floor_px: float = CORNER_NOISE_PX
 ) -> tuple[float, float]:
-    """(noise for uncertainties, bend), both px per coordinate, from residuals N×2 and those of complete markers M×4×2.
+    """Return (noise for uncertainties, bend), px per coordinate, from residuals N×2 and complete markers' residuals
+    M×4×2.
 
-    The bend is the part of the residual that is no noise. Noise is estimated from the alternating sum of a marker's
-    corners, its twist, which smooth deformations do not change; with less than three complete markers all that exceeds
-    the noise of sharp corners counts as bend.
+    Noise is estimated from markers' twists (the alternating sums of their corners), which smooth deformations do not
+    change; the rest is bend. Below three complete markers, all beyond the noise of sharp corners counts as bend.
     """
     variance = float((residual**2).sum()) / freedom
     noise = max(floor_px, np.sqrt(variance) * stdtrit(freedom, 0.975) / stdtrit(np.inf, 0.975))

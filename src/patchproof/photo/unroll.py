@@ -7,8 +7,8 @@ file's within its uncertainty), and a plane seen through a lens with one radial 
 residual is less than half of the plane's; a photograph with too much residual beyond noise is still rejected as
 `curled`. Left out on purpose: cones, folds and dents.
 
-Source of the cylinder: paper bends without stretching, so a sheet with straight rulings that are parallel is one
-(do Carmo, Differential Geometry of Curves and Surfaces, 5-8).
+Source of the cylinder: do Carmo, Differential Geometry of Curves and Surfaces, 5-8 (a sheet that bends without
+stretching, and whose straight rulings are parallel, is a cylinder).
 """
 
 from collections.abc import Callable
@@ -42,12 +42,12 @@ Tangent = Callable[[np.ndarray, np.ndarray, float], np.ndarray]
 
 @dataclass(frozen=True)
 class Shape:
-    """A fitted model: `project(parameters, mm)`, and the parameters with their covariance.
+    """A fitted model of the sheet: `project(parameters, mm)`, and the parameters with their covariance.
 
-    `radius_mm` of the paper is positive if it bulges towards the camera, None for a lens. `tangent(parameters,
-    point_mm, turn_rad)` is `camera_from_tangent` 4×4 of the paper's tangent plane at a point, turned about the rulings;
-    None for a lens and for flat paper, whose first eight parameters times `unit` are a homography. `hidden_turn_rad` is
-    the turn of the paper from its middle to the nearest marker, `bend_px` the part of the residual that is no noise.
+    `radius_mm` is positive if paper bulges towards the camera, None for a lens. `tangent(parameters, point_mm,
+    turn_rad)` is the 4×4 `camera_from_tangent` of rolled paper at a point, turned about the rulings, else None; of flat
+    paper the first eight parameters times `unit` are a homography. `hidden_turn_rad` is the paper's turn from its
+    middle to the nearest marker, `bend_px` the part of the residual that is no noise.
     """
 
     project: Project
@@ -67,8 +67,8 @@ class Shape:
 
 @dataclass(frozen=True)
 class LocatedSheet:
-    """A picture `srgb` in which the sheet is flat, its homography `fit` there, the uncertainty of its corners, and the
-    original `shape` in the photograph, which the picture is unless `unrolled`.
+    """A picture in which the sheet is flat, with its homography `fit` there and the uncertainty of its corners; `shape`
+    is that of the sheet in the photograph, which is the same picture unless `unrolled`.
     """
 
     srgb: np.ndarray
@@ -88,8 +88,8 @@ def flat_sheet(srgb: np.ndarray, fit: PageFit, rect_mm) -> LocatedSheet:
 def fit_shape(
     corners_px: Quads, corners_mm: Quads, size_px: tuple[int, int], focal_px: float | None, focal_spread: float
 ) -> tuple[Shape, np.ndarray, np.ndarray, np.ndarray] | None:
-    """Fit a cylinder or a lens to the corners in a picture of this size, and return it, the 3×3 homography of the
-    corners, and these in mm and in px, corrected for bent borders; None if a plane fits as well.
+    """Fit a cylinder or a lens to the corners in a picture of this size; None if a plane fits as well. Returns the
+    shape, the corners' 3×3 homography, and the corners in mm and in px, corrected for bent borders.
     """
     ids, px, mm = rectify.common_corners(corners_px, corners_mm)
     if len(ids) < LEAST_MARKERS:
@@ -115,9 +115,8 @@ def unroll(
     focal_px: float | None = None,
     focal_spread: float = UNKNOWN_FOCAL,
 ) -> LocatedSheet | None:
-    """Flatten the piece (a rectangle x, y, width, height on the page) in the photograph; None if a plane fits as well.
-
-    The uncertainty is that of the piece's corners; `focal_spread` is the spread of the focal length's logarithm.
+    """Flatten the piece (x, y, width, height on the page) in the photograph; None if a plane fits as well.
+    `focal_spread` is the spread of the focal length's logarithm.
     """
     shape_fit = fit_shape(corners_px, corners_mm, (srgb.shape[1], srgb.shape[0]), focal_px, focal_spread)
     if shape_fit is None:
@@ -200,8 +199,7 @@ def fit_cylinder(flat, mm, px, size, focal_px, focal_spread=UNKNOWN_FOCAL, floor
     focal = focal_px or _TYPICAL_FOCAL * np.hypot(*size)
 
     def project(p, points):
-        # p: rotation vector, the page center in the camera (mm), log of focal / guess, bend, direction of the bend; or
-        # several of these, one in a row
+        # p or each of its rows: rotation vector, page center in the camera (mm), log focal / guess, bend, its direction
         rotation = np.swapaxes(Rotation.from_rotvec(p[..., :3]).as_matrix(), -1, -2)
         camera = in_space(p, points)[0] @ rotation + p[..., None, 3:6]
         return focal * np.exp(p[..., 6, None, None]) * camera[..., :2] / np.maximum(camera[..., 2:], 1e-3) + middle
@@ -264,8 +262,8 @@ def _starts(flat, mm, px, camera, center, half_mm) -> list[tuple[float, float]]:
     """Starts of the fit: bends, in radians over half the sheet, and their directions.
 
     Slightly bent paper deviates from its plane by a quadratic form of the position, which shifts pixels in proportion:
-    one linear fit gives form and homography. A cylinder's form has one eigenvalue 0; that of noise is a start, too, and
-    so is the first one with its sign reversed, because a distant camera hardly tells the two apart.
+    one linear fit gives form and homography. A cylinder's form has one eigenvalue that is not 0. Noise may exceed it,
+    so both give starts; the larger one also with its sign reversed, which a distant camera hardly tells apart.
     """
     from_center = mm - center
     base = np.column_stack([from_center, np.zeros(len(mm))])

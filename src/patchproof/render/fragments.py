@@ -14,9 +14,7 @@ GUARD_PX = 1 << 16  # faces are cut here, so that products of coordinates stay b
 
 @dataclass(frozen=True)
 class Cameras:
-    """N pinhole cameras: `camera_from_world` N×4×4 and `matrix_px` N×3×3, float64, for pictures of `size_px` (width,
-    height).
-    """
+    """N pinhole cameras (float64): `camera_from_world` N×4×4, `matrix_px` N×3×3; `size_px` is (width, height)."""
 
     camera_from_world: Tensor
     matrix_px: Tensor

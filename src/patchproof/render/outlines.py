@@ -2,16 +2,13 @@
 
 In: the object's edges, cameras, and the depth at each pixel. Out: `Outlines`, which mix finished pictures. If a visible
 edge passes between the centers of two neighboring pixels, each takes as much of the other's color as the edge cuts off
-it, exactly for a straight edge (after Laine et al., Modular primitives for high-performance differentiable rendering,
-2020, who move the border between two pixels along their centers alone, and search edges from the pixels; here each edge
-is walked, so that faces smaller than a pixel work as well). No part of a picture, the piece included, needs a second
-sample. Edges are found once per mesh: those that show in every view (rims, and creases or changes of color between
-faces of which one has no texture) and those that show when one of their faces is turned away, which the planes of both
-tell. Corners at one position are one.
+it, exactly for a straight edge. This extends Laine et al., Modular primitives for high-performance differentiable
+rendering, 2020: each edge is walked, so that faces smaller than a pixel work as well. No pixel needs a second sample.
+Edges are found once per mesh: those that show in every view (rims, and creases or changes of color between faces of
+which one has no texture) and those that show when one of their faces is turned away. Corners at one position are one.
 
-Left out on purpose: things thinner than a pixel that no pixel center sees; creases between two textured faces. A
-texture continues smoothly across most of them, and mixing neighboring pixels would only blur it: a textured car was
-farther from 3×3 samples with them.
+Left out on purpose: things thinner than a pixel that no pixel center sees; creases between two textured faces, because
+textures continue smoothly across most of them (a textured car was farther from 3×3 samples with them).
 """
 
 from dataclasses import dataclass
@@ -91,8 +88,8 @@ def _has_jump(mesh: Mesh, one: np.ndarray, other: np.ndarray, same_way: np.ndarr
 
 @dataclass(frozen=True)
 class Outlines:
-    """U pixels at outlines: each keeps `remaining` U×1 of its color; `share` S×1 of the colors at `source` goes to the
-    pixels numbered `target` among the U.
+    """U pixels at outlines: each keeps `remaining` U×1 of its color, and pixel number `target` S among them gets
+    `share` S×1 of the color at `source` S.
     """
 
     pixel: Tensor
@@ -189,9 +186,7 @@ def _cut_off(distance: Tensor, slope: Tensor) -> Tensor:
 def _visible_ends(
     edges: Edges, vertices: Tensor, cameras: Cameras, eye_mm: Tensor, near_mm: float
 ) -> tuple[tuple[Tensor, Tensor], Tensor, Tensor]:
-    """Return (x px, y px, 1/mm) 3×S of both ends of edges that may show, cut at the near plane; the views they are in;
-    and which of them only crease a surface there.
-    """
+    """Return (x px, y px, 1/mm) 3×S of both ends of edges that may show, their views, and which are only creases."""
     x, y, z, offset = edges.planes.T
     # written out, because the rounding of a matrix product depends on its size
     front = eye_mm[:, :1] * x + eye_mm[:, 1:2] * y + eye_mm[:, 2:] * z + offset > 0

@@ -49,9 +49,9 @@ def photograph(
 ) -> Tensor:
     """Return N×3×H×W sRGB pictures of `size_px`; `shown=None` is the bare object.
 
-    `shown` may also be a design: a float tensor in [0, 1] (3×h×w of any grid for a piece, 3×1×M for textures), in which
-    the pictures are differentiable, or its uint8 pixels h×w×3. A square size gives the photograph's centered square.
-    `jpeg` has the meaning that it has in `channel.camera.develop`.
+    `shown` may also be a design: uint8 pixels h×w×3, or a float tensor in [0, 1] (3×h×w of any grid for a piece, 3×1×M
+    for textures), in which the pictures are differentiable. A square size gives the photograph's centered square.
+    `jpeg` is that of `develop`.
     """
     if min(size_px) < 1:
         raise Refused("size_px of 1 pixel at least", f"{size_px}", "give (width, height)")
@@ -105,9 +105,8 @@ def expose(views: Views, appearance: Appearance, jpeg: bool = True) -> Tensor:
 
 
 def affected_windows(views: Views) -> np.ndarray | None:
-    """Return N×4 pixels (left, top, right, bottom) outside of which `expose` gives the same for every design in these
-    views. None if that is unknown: for textures, through a lens with distortion, and if photographs have blur of their
-    own.
+    """Return N×4 pixels (left, top, right, bottom) outside of which `expose` gives the same for every design. None if
+    that is unknown: for textures, through a lens with distortion, and if photographs have blur of their own.
     """
     camera, scale = views.stage.scene.camera, _scale(views)
     reach = reach_px(views.conditions.sensor, scale)
@@ -200,10 +199,9 @@ def _as_pictures(views: Views, image: Tensor) -> Tensor:
 def plan_picture(
     stage: Stage, frame: SurfaceFrame, half_mm: np.ndarray, side_px: int = 600, colors: np.ndarray | None = None
 ) -> np.ndarray:
-    """Render a stage's object in even light on white, seen along a frame's normal, spanning ± half_mm: uint8 H×W×3,
-    `side_px` along the longer side. It is seen from a distance of 60 times the object's length, at which perspective
-    moves nothing by more than 1 % of the object's depth. `colors` (uint8 h×w×3) are laid over the scene's piece, and
-    shown without light.
+    """Render a stage's object in even light on white, along a frame's normal, spanning ± half_mm: uint8 H×W×3,
+    `side_px` along the longer side. At its distance of 60 lengths, perspective moves nothing by more than 1 % of the
+    object's depth. `colors` (uint8 h×w×3) are laid over the scene's piece, without light.
     """
     scene = require_mesh(stage.scene)
     distance = DISTANCE_LENGTHS * scene.length_mm

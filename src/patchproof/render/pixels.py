@@ -22,9 +22,7 @@ MIN_SHARE = 1 / 512  # of a pixel: less changes no 8-bit value
 
 @dataclass(frozen=True)
 class TextureSampling:
-    """Settings of texture sampling: each pixel covers `side` of its own width and height, with `taps` along its
-    footprint's shorter side on the object, and with `piece_taps` on the printed piece.
-    """
+    """Each pixel covers `side` of its width, with `taps` (pieces: `piece_taps`) on its footprint's shorter side."""
 
     taps: int
     side: float
@@ -39,9 +37,7 @@ PHOTO_SAMPLING = TextureSampling(taps=4, side=1.0, piece_taps=8)
 
 @dataclass(frozen=True)
 class PiecePicture:
-    """The whole piece of `size_px` (width, height) as it looks on paper, up to the cut line: the sRGB texels T×3 of all
-    levels, averaged as code values, which is how a reduced photograph shows them.
-    """
+    """The printed piece up to the cut line: sRGB texels T×3 of all levels, averaged as code values."""
 
     codes: Tensor
     size_px: tuple[int, int]
@@ -94,9 +90,8 @@ class ObjectPixels:
 
 @dataclass(frozen=True)
 class PiecePixels:
-    """The pixels that the piece covers, each by its `share`. `white` is the light P×3 of the base picture's paper if a
-    scene is made of pictures, else None. `box_px` N×4 (left, top, right, bottom) holds each view's pixels of both
-    sides.
+    """The pixels that the piece covers, each by its `share`. `white` P×3 is the light of the base picture's paper, None
+    without pictures; `box_px` N×4 (left, top, right, bottom) bounds each view's pixels of both sides.
     """
 
     pixel: Tensor
@@ -168,9 +163,7 @@ def _boxes(pixel: Tensor, shape: tuple[int, int, int]) -> np.ndarray:
 def object_pixels(
     surface: ObjectSurface, fragments: Fragments, look: TextureSampling, fixed: Tensor | None
 ) -> ObjectPixels:
-    """Return the object's fragments; `fixed` textures (`ObjectSurface.texels`) are looked up in their color at once.
-    Faces seen from behind have their normal reversed.
-    """
+    """Return the object's pixels, with normals towards the viewer; `fixed` textures are looked up at once."""
     values, (uv_dx, uv_dy) = _interpolate(surface.corners, fragments), _slopes(surface.corner_uv, fragments)
     material = surface.material.index_select(0, fragments.face)
     normals = torch.nn.functional.normalize(values[:, 5:8], dim=-1) * torch.where(fragments.front, 1.0, -1.0)[:, None]

@@ -4,14 +4,13 @@ In: faces in world millimeters and a batch of pinhole cameras. Out: `Fragments`,
 perspective-correct barycentrics, camera depth and the derivatives for texture filtering. Visibility is hard and carries
 no gradient: shape is never optimized.
 
-Triangles are split into two trapezoids, those into row spans, spans into fragments, and depth is resolved by one
-integer maximum per pixel, so that work grows with the covered area. Coverage is exact: corners are snapped to 1/256
-pixel, and a span reaches from its left edge's first pixel center to that of its right edge, each found from integers
-that float64 holds exactly and in one canonical direction of the edge. Hence two triangles that share an edge never both
-take a pixel and never leave one out; a center on an edge belongs to the face on its right or, on level edges, below it
-(the top-left rule of Pineda, 1988). Depth and barycentrics come from the unsnapped face in 2D homogeneous form (Olano
-and Greer, 1997), which stays well-defined for faces that reach behind the camera; such faces are cut at the near plane,
-not dropped. If depths are equal to 24 bits, the lower face index wins. Left out on purpose: transparency.
+Triangles are split into trapezoids, row spans and fragments, and depth is resolved by one integer maximum per pixel, so
+that work grows with the covered area. Coverage is exact: corners are snapped to 1/256 pixel, and the ends of spans are
+computed from integers that float64 holds exactly, in one canonical direction of each edge. Hence two triangles that
+share an edge never both take a pixel and never leave one out; a center on an edge belongs to the face on its right or,
+on level edges, below it (the top-left rule of Pineda, 1988). Depth and barycentrics come from the unsnapped face in 2D
+homogeneous form (Olano and Greer, 1997), which holds behind the camera, too; faces are cut at the near plane, not
+dropped. If depths are equal to 24 bits, the lower face index wins. Left out on purpose: transparency.
 """
 
 import math
@@ -148,11 +147,9 @@ def _extent(a: Tensor, b: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _planes(corners: list[list[Tensor]], near: float) -> tuple[list[list[Tensor]], Tensor]:
-    """Return planes e with e · (x, y, 1) = b/z for the second and third barycentric b and for their sum 1, and the
-    signed volume, negative from outside.
-
-    A face whose horizon passes within 1/25 pixel of it is seen edge-on: snapping may turn it over, and its planes are
-    useless. It is drawn flat at its mean 1/z.
+    """Return planes e with e · (x, y, 1) = b/z for the second and third barycentric b and for b = 1, and the signed
+    volume, negative from outside. A face whose horizon passes within 1/25 pixel is seen edge-on, and snapping may turn
+    it over: it is drawn flat at its mean 1/z.
     """
     a, b, c = corners
     total = cross([q - p for p, q in zip(a, b, strict=True)], [q - p for p, q in zip(a, c, strict=True)])
@@ -181,10 +178,7 @@ def _trapezoids(corners: list[Tensor], height: int) -> list[Tensor]:
 
 
 def _edge(upper: tuple[Tensor, Tensor], lower: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-    """Return (n, k, d): in row y the first pixel center right of the edge, or on it, is pixel ceil((n + k y) / d).
-
-    All are integers below 2^53, so that the float64 quotient has the right ceiling.
-    """
+    """Return integers (n, k, d) < 2^53: row y's first center right of or on the edge is pixel ceil((n + k y) / d)."""
     (ax, ay), (bx, by) = upper, lower
     dx, dy, half = bx - ax, by - ay, SUBPIXELS // 2
     return ((ax - half) * dy - dx * (ay - half)).double(), (dx * SUBPIXELS).double(), (dy * SUBPIXELS).double()

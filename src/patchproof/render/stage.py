@@ -130,7 +130,7 @@ class Stage:
 
     @cached_property
     def piece_surface(self) -> PieceSurface:
-        """The piece's surface; refused if nothing hangs on the object."""
+        """The piece's surface; refused for a scene without a piece."""
         return piece_surface(require_piece(self.scene), self.device)
 
 

@@ -2,10 +2,9 @@
 
 In: a mesh, or a scene with a piece; per fragment the arguments of `texture.footprint`. Out: tensors on a device, and
 the P×3 that fragments see. The piece reaches a margin beyond its cut line, so that pixels cut by its edge are found and
-can show their share of it. Fixed textures need no lists of texels, unlike those that are optimized: all mip levels lie
-in one picture (an atlas), each with a margin that continues the texture and is wider than footprints reach, so that
-taps need not be wrapped and the library's own look-up takes all of them: in half of the time in views, in three
-quarters in photographs.
+show their share of it. All mip levels of fixed textures lie in one picture (an atlas), each with a margin that
+continues the texture farther than footprints reach. So torch's own look-up can take all taps, which takes half of the
+time in views and three quarters in photographs.
 """
 
 from collections.abc import Sequence
@@ -35,7 +34,7 @@ from patchproof.render.texture import (
 )
 from patchproof.scene.interface import PieceScene
 
-# A share of the piece's sides: half a pixel, the need, down to pieces of 7 pixels, or of 25 pixels at 75° of tilt.
+# Share of the piece's sides: the half pixel that is needed, for pieces of 7 pixels or more (25 pixels at 75° of tilt).
 MARGIN_SHARE = 0.1
 
 
@@ -52,9 +51,7 @@ class PieceSurface:
 
 @dataclass(frozen=True)
 class ObjectSurface:
-    """The object: faces over `vertices`, and per face corner F×3×8 the values to interpolate: uv, color (vertex color
-    times base color, linear) and normal.
-    """
+    """The object's faces; `corners` F×3×8: uv, color (vertex times base color, linear) and normal to interpolate."""
 
     vertices: Tensor
     faces: Tensor
@@ -146,9 +143,7 @@ _MARGIN = 10
 
 
 def atlas_layout(sizes: Sequence[tuple[int, int]], device: torch.device | str = "cpu") -> TexelLayout:
-    """Return the layout for textures of (width, height) sizes: the finest level on the left, the others below each
-    other on its right, and textures on shelves, the highest first.
-    """
+    """Lay out textures of (width, height) on shelves, the highest first, coarser levels to the right of the finest."""
     chains = [[(max(w >> k, 1), max(h >> k, 1)) for k in range(max(w, h).bit_length())] for w, h in sizes]
     blocks = [_block(chain) for chain in chains]
     pitch = max(*(width for width, _ in blocks), int(sum(width * height for width, height in blocks) ** 0.5))
@@ -190,9 +185,7 @@ def atlas_table(textures: Sequence[Tensor], layout: TexelLayout) -> Tensor:
 def sample_atlas(
     layout: TexelLayout, texels: Tensor, texture: Tensor, uv: Tensor, uv_dx: Tensor, uv_dy: Tensor, taps: int
 ) -> Tensor:
-    """Return the P×3 that fragments see in an atlas. The arguments are those of `texture.footprint`, with `taps` up to
-    MAX_TAPS. A single tap is looked up by its texels' numbers, which takes as long.
-    """
+    """Return the P×3 that fragments see in an atlas; arguments as in `texture.footprint`, `taps` at most MAX_TAPS."""
     assert layout.pitch is not None and taps <= MAX_TAPS
     if taps == 1:
         return look_up(footprint(layout, texture, uv, uv_dx, uv_dy, taps), texels)

@@ -1,14 +1,13 @@
-"""Textures with mip levels: the texels that each fragment looks at (`Footprint`) and their color (`look_up`).
+"""Textures with mip levels: find the texels that each fragment sees (`footprint`), and their color (`look_up`).
 
-In: textures H×W×3 and, per fragment, uv (textures, v down from the top-left) with its screen derivatives. Out: P×3. A
-footprint depends on the view alone, so one footprint serves every content that the texture takes while it is optimized;
-`look_up` is the only step that backpropagates, and its gradient reaches each texel that was seen and no other.
+In: textures H×W×3 and, per fragment, uv (in textures, v down from the top-left) with its screen derivatives. Out: P×3.
+A footprint depends on the view alone and serves every content of the texture. Only `look_up` backpropagates, and its
+gradient reaches exactly the texels that were seen.
 
-A pixel sees the mean over its footprint, the parallelogram that its sides span on the texture. `footprint` takes it
-over a grid of bilinear taps no more than a texel apart, with a number along each side that grows with its length, so
-that work grows with the texels seen. Mip levels of exact box averages limit the number. The usual trilinear look-up
-along the longer side (Feline, McCormack et al., 1999) left an optimized design 20 to 30 dB from 16×16 samples per
-pixel, this one 33 to 57. Left out on purpose: weights other than the pixel's own square.
+A pixel sees the mean over its footprint, the parallelogram that its sides span on the texture. `footprint` samples it
+with a grid of bilinear taps at most a texel apart, on a mip level (exact box averages) coarse enough to limit their
+number. Trilinear look-ups along the longer side (Feline, McCormack et al., 1999) left an optimized design 20 to 30 dB
+from 16×16 samples per pixel, this grid 33 to 57. Left out on purpose: filters other than the pixel's own square.
 """
 
 from collections.abc import Iterator
@@ -25,11 +24,10 @@ from torch.nn import functional as F
 class TexelLayout:
     """The positions of the mip levels of K textures in one T×3 table of texels.
 
-    `places` (K·L)×3 has each level's width, height and first texel; `levels` K has how many of the L a texture has.
-
-    Each level has one more row and column than its size, for bilinear taps that read beyond the last texel: the first
-    ones again if textures repeat (`wrap`), else the last ones. Its rows follow each other, or lie `pitch` texels apart
-    if the table is one picture (surfaces.py).
+    `places` (K·L)×3 holds each level's width, height and first texel; `levels` K, how many of the L a texture has. A
+    level is stored with one more row and column, for bilinear taps beyond its last texel: copies of the first ones if
+    textures repeat (`wrap`), else of the last. Its rows follow each other, or lie `pitch` texels apart in one picture
+    (surfaces.py).
     """
 
     places: Tensor
@@ -116,7 +114,6 @@ def _half_rows(level: Tensor) -> Tensor:
     """Return half the rows (rounded down, at least one), each the average of exactly the rows that it covers.
 
     Of 2m + 1 rows, row i of m covers two and 1/m; weights of Guthe and Heckbert, Non-Power-of-Two Mipmapping (2005).
-    Averages over whole rows instead would stretch a texture by up to half a row at either end.
     """
     rows = len(level)
     if rows == 1:
@@ -131,12 +128,9 @@ def _half_rows(level: Tensor) -> Tensor:
 def footprint(
     layout: TexelLayout, texture: Tensor, uv: Tensor, uv_dx: Tensor, uv_dy: Tensor, taps: int, blocks: bool = False
 ) -> Footprint:
-    """Return the footprint of P fragments of `texture` (P, index into the layout); `uv_dx`, `uv_dy` P×2: uv change per
-    pixel.
-
-    There are at most `taps` along the footprint's shorter side and twice as many along the longer one; if `taps` is 1,
-    a single tap for up to two texels, which is as far as it reaches. Texels are points to interpolate between, or
-    `blocks` of one color, as printed pixels are.
+    """Return the footprint of P fragments on `texture` (P, index into the layout); `uv_dx`, `uv_dy` P×2 are uv per
+    pixel. There are at most `taps` along its shorter side and twice as many along the longer one; with `taps` = 1 there
+    is one. Texels are points to interpolate between, or `blocks` of one color, like printed pixels.
     """
     size, _ = layout.place(texture, 0)
     spans = _length(uv_dx * size), _length(uv_dy * size)
@@ -156,7 +150,7 @@ def footprint(
 
 def tap_grids(across: Tensor, down: Tensor, levels: Tensor, taps: int) -> tuple[Tensor, tuple[Tensor, Tensor] | None]:
     """Return the mip level for each of P footprints, and the numbers of taps across and down; None for a single tap.
-    `across` and `down` are the footprints' sizes in texels of the finest of their texture's `levels`.
+    `across` and `down` are the footprints' sizes in texels of the finest level.
     """
     max_taps = 2 * taps if taps > 1 else 1
     level = _levels(torch.minimum(across, down), torch.maximum(across, down), taps, max_taps).minimum(levels - 1)
@@ -168,9 +162,7 @@ def tap_grids(across: Tensor, down: Tensor, levels: Tensor, taps: int) -> tuple[
 
 
 def group_by_grid(across: Tensor, down: Tensor) -> tuple[Tensor, list[tuple[int, int, int, int]]]:
-    """Sort footprints by their grids, keeping the order within a grid. Return that order and, for each grid, its
-    columns and rows, and the first index and the end of its footprints in that order.
-    """
+    """Sort footprints by grid, stably. Return that order, and each grid's (columns, rows, first, end) in it."""
     base = 1 << 7
     sorted_keys, order = (across * base + down).sort(stable=True)
     keys, sizes = sorted_keys.unique_consecutive(return_counts=True)
@@ -204,10 +196,8 @@ def _taps(
     layout: TexelLayout,
     blocks: bool,
 ) -> tuple[Tensor, Tensor]:
-    """Return texels and weights G×(4·rows·columns) of a grid of taps round `center` G×2, in texels of one level.
-
-    Between points, a tap is bilinear. Of blocks it takes the mean over its own cell of the grid: exactly, if cell and
-    blocks are parallel, else over the upright box of the same extent (root of summed squares).
+    """Return texels and weights G×(4·rows·columns) of a grid of taps round `center` G×2, in texels of one level. A tap
+    between points is bilinear. On blocks it is the mean over its cell, exactly if cell and blocks are parallel.
     """
     step_x, step_y = step_x / columns, step_y / rows
     position = center[:, :, None, None] + step_x[:, :, None, None] * tap_offsets(columns, center.device)
@@ -251,9 +241,7 @@ def look_up(footprint: Footprint, texels: Tensor) -> Tensor:
 
 
 class _LookUp(torch.autograd.Function):
-    """A weighted gather. The library's own backward of this sum took six times longer, adding rows of three instead of
-    one channel at a time four times (2 cores, 45k × 64).
-    """
+    """A weighted gather. Its backward adds channel by channel: torch's took six times as long (2 cores, 45k × 64)."""
 
     @staticmethod
     def forward(ctx, texels: Tensor, footprint: Footprint) -> Tensor:

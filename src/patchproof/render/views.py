@@ -54,9 +54,9 @@ class Views:
     def reduced(self) -> bool:
         """True if these views stand for larger photographs that were reduced.
 
-        A sensor averages light, but reducing a photograph averages its code values, and a fine pattern of strong colors
-        is darker that way. Textures of smaller pictures are therefore averaged as code values: at twice a network's
-        size, 40 photographs had 0.04 less confidence than promised that way, 0.09 when light was averaged.
+        Reducing a photograph averages its code values, which darkens fine patterns of strong colors. Textures of
+        smaller pictures are averaged likewise: at twice a network's size, 40 photographs had 0.04 less confidence than
+        promised, and 0.09 less when light was averaged.
         """
         return _reduced(self.stage, self.size_px)
 
@@ -80,9 +80,7 @@ class Views:
         return self._behind if self.object is None else self.object_light()
 
     def object_light(self, texels: Tensor | None = None) -> Tensor:
-        """Return the light of the bare object with these texels in place of its own; differentiable. Only views that
-        were rendered for textures can show others.
-        """
+        """The bare object's light, differentiable; other `texels` need views that were rendered for textures."""
         return self._behind.index_copy(0, self.on_object.pixel, self._object_color(texels))
 
     def _object_color(self, texels: Tensor | None = None) -> Tensor:
@@ -149,8 +147,8 @@ def render_views(
     size_px: tuple[int, int],
     look: TextureSampling = pixels.PHOTO_SAMPLING,
 ) -> Views:
-    """Render the views of `conditions`, with nothing on the object unless `appearance` is a piece. Any picture of the
-    same size can be shown in them; the object behind it is rendered, too.
+    """Render the views of `conditions`: the object and, if `appearance` is a piece, that piece, in which any picture of
+    the same size can be shown later.
     """
     piece = appearance if isinstance(appearance, PiecePicture) else None
     if not stage.scene.HAS_OBJECT:

@@ -2,9 +2,8 @@
 
 In: per photograph its size and outlines by category. Out: the text of a `coco.json`: images by file name, relative to
 the folder of photographs, categories, boxes [x, y, width, height] in pixels of the upright picture (corners at 0),
-clipped at its borders. The patch's outline becomes a polygon, too; of the object only the box is known. Left out on
-purpose: occlusion, so that boxes include hidden parts.
-Source: Lin et al., Microsoft COCO, ECCV 2014, and its data format.
+clipped at its borders. The patch's outline is also a polygon; of the object only the box is known. Left out on purpose:
+occlusion, so that boxes include hidden parts. Source: Lin et al., Microsoft COCO, ECCV 2014, and its data format.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,8 +20,8 @@ _LEAST_PX = 1.0  # of a box's sides; smaller boxes are left out
 
 @dataclass(frozen=True, eq=False)
 class LabeledPhoto:
-    """A photograph: its file, (width, height), and outlines N×2 in its pixels by category; those with NaN (a part is
-    behind the camera) are left out; and how the patch was located.
+    """A photograph: its file, (width, height), `outlines` N×2 px by category (those with NaN, partly behind the camera,
+    are left out), and how the patch was located.
     """
 
     file: str

@@ -66,9 +66,7 @@ def png(pixels: np.ndarray) -> bytes:
 
 
 def save_pictures(folder: Path, file: str, kinds: Mapping[str, np.ndarray]) -> None:
-    """Write a photograph's pictures by kind as FILE.KIND.jpg into `folder`, in place of earlier ones; its `delta_e00`
-    cells (NaN = not measured) as the .png of a map.
-    """
+    """Replace a photograph's pictures FILE.KIND.jpg in `folder`; `delta_e00` cells (NaN: not measured) become a PNG."""
     make_folder(folder)
     for kind in PICTURE_KINDS:
         _path(folder, file, kind).unlink(missing_ok=True)
@@ -83,9 +81,7 @@ def saved_pictures(folder: Path, file: str) -> dict[str, bytes]:
 
 
 def stem_of(file: str) -> str:
-    """The stem of a photograph's picture files: its name, which may contain its session's folder, encoded; a long one
-    is shortened and gets a hash.
-    """
+    """The stem of a photograph's picture files: its encoded name with folder; a long one is cut and gets a hash."""
     stem = file.replace("/", "%2F")
     is_long = len(stem.encode()) > _LONGEST_STEM
     return f"{stem[:40]}-{hashlib.sha256(stem.encode()).hexdigest()[:16]}" if is_long else stem

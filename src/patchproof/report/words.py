@@ -58,9 +58,7 @@ def looks_sentence(summary: Mapping[str, Any]) -> str:
 
 
 def remarks(photos: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, int, str]]:
-    """Group photographs by code and advice: (code, advice, their number, the first names), the most frequent first,
-    then by code.
-    """
+    """Group photographs: (code, advice, their number, first names), the most frequent first, then by code."""
     groups: dict[tuple[str, str], list[str]] = {}
     for photo in photos:
         if photo["code"]:
@@ -80,8 +78,8 @@ def recognition_meaning(model: Mapping[str, Any], label: str) -> str:
 
 
 def promise_lines(promise: Any, settings: Mapping[str, Any], run: str = "RUN") -> list[str]:
-    """Sum up a promise: whether the design helps and what to do about it, the rate, the background of its views, and
-    the difference to each control. `settings` are the scene's as plain data, `run` is the run's folder.
+    """Sum up a promise: whether the design helps and what to do about it, the rate, the background of its views, the
+    difference to each control. `settings` are the scene's as plain data, `run` is the run's folder.
     """
     (low, high), target, (first, *more_models) = promise.interval, promise.target, promise.models
     meaning, background = recognition_meaning(first.model_dump(), target.label), background_summary(settings)

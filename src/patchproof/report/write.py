@@ -32,10 +32,8 @@ _STEPS = {  # of the gap ledger
 
 
 def write_report(report: Mapping, manifest: Mapping, out_dir: str | Path) -> Path:
-    """Write report.json, report.csv and report.html into `out_dir`; returns the page's path.
-
-    `report` and `manifest` are `model_dump()`s. Pictures are those of `page.save_pictures` in `out_dir`/pictures:
-    `photo`, `seen`, `fitted`, `promised` and `delta_e00`.
+    """Write report.json, report.csv and report.html into `out_dir`; returns the page's path. `report` and `manifest`
+    are `model_dump()`s; pictures are those of `page.save_pictures` in `out_dir`/pictures.
     """
     out = Path(out_dir)
     make_folder(out)
@@ -80,9 +78,8 @@ def report_html(report: Mapping, manifest: Mapping, encoded: Mapping[str, Mappin
 
 
 def ledger_bars(ledger: Mapping[str, Any]) -> list[tuple[str, float, float, str, str]]:
-    """The gap ledger as bars from the ideal picture's confidence to the photographs': (step, left and right end in
-    [0, 1], kind, the change in points with its 95 % interval). A positive share is a loss for the goal: for deceiving,
-    a gain in confidence.
+    """The gap ledger as bars from the ideal picture's confidence to the photographs': (step, left and right end within
+    0 to 1, kind, change in points with its 95 % interval). A positive share is a loss for the goal.
     """
     level, rows = ledger["ideal"], [("ideal", 0.0, ledger["ideal"], "promised", f"{100 * ledger['ideal']:.0f} %")]
     rises = (ledger["photo"] > level) != (sum(each["share"] for each in ledger["shares"].values()) < 0)
@@ -99,9 +96,7 @@ def ledger_bars(ledger: Mapping[str, Any]) -> list[tuple[str, float, float, str,
 def rates_by_band(
     photos: Sequence[Mapping], model: str | None, conditions: Sequence[Mapping]
 ) -> list[tuple[str, Estimate, Estimate | None]]:
-    """Recognition in the lower, middle and upper third of photographs by tilt and by size: (band, rate in these
-    photographs, rate promised within the same ends; None without promised views there).
-    """
+    """Return (band, rate, rate promised within it or None) for thirds of photographs by tilt and by size."""
     rows = []
     for figure, text in _BANDS.items():
         seen = sorted(

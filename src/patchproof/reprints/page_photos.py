@@ -45,7 +45,7 @@ def reprint_pages(
 ) -> None:
     """Write n photographs of the pages of a PDF, in turn, lying flat: for pages that belong to no run, such as blank
     ones, charts and boards. `how` names their printer (None: coated) and the print's scale. Of a blank sheet only the
-    piece is photographed, since the rest is cut off: its markers would stand beside the later print's.
+    piece is photographed, since the rest is cut off.
     """
     printer = load_printer(how.printer or PrinterSettings().profile)
     with new_folder(out, ("photo_*.jpg",), overwrite, (pdf,)) as folder:

@@ -137,7 +137,7 @@ def _candidate_rays(ahead: np.ndarray, ends: np.ndarray) -> np.ndarray:
 
 
 class _Split(NamedTuple):
-    """One purpose's `files` pictures from `first` on; procedural places after them; the share of views with files."""
+    """One purpose's pictures: `files` from number `first` on, then procedural `rooms`; `share` of views with files."""
 
     first: int
     files: int
@@ -182,7 +182,7 @@ def _decoded(file: FileLevels) -> list[np.ndarray]:
 
 @dataclass(frozen=True)
 class Backgrounds:
-    """Pictures as files, uint8 H×W×3 or numbers of procedural places; a single 1×1 picture behind a plain scene."""
+    """Background pictures: files, uint8 H×W×3, or numbers of procedural places; one 1×1 picture for a plain color."""
 
     pictures: tuple[np.ndarray | int | FileLevels, ...]
     of_stream: Mapping[str, _Split] = field(default_factory=dict)  # the pictures it may show; other streams show all

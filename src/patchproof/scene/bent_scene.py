@@ -42,8 +42,8 @@ PIECE_GRID = 33  # vertices of a bent piece along each edge; odd, so that one is
 
 
 def place_bent(mesh: Mesh, frame: SurfaceFrame, size_mm: tuple[float, float], spin_deg: float) -> Placement:
-    """Place a piece of `size_mm` along the surface, its middle where the frame's normal meets it and its up along the
-    frame's; spin turns it clockwise as one faces it. Refused with a reason if paper cannot follow the surface.
+    """Place a piece along the surface where the frame's normal meets it, its up along the frame's; spin turns it
+    clockwise as one faces it. Refused with a reason if paper cannot follow the surface.
     """
     triangles, axes = mesh.vertices[mesh.faces], np.stack([frame.right, frame.up, frame.normal])
     frame = replace(frame, origin_mm=surface_chart.surface_point(triangles, frame.origin_mm, axes))
@@ -102,9 +102,8 @@ def _sample_surface(chart: SurfaceChart, near: np.ndarray, size_mm) -> tuple[np.
 
 
 def _fit_tangent(near: np.ndarray, frame: SurfaceFrame, size_mm) -> tuple[SurfaceFrame, np.ndarray]:
-    """Return the frame turned to the surface at its origin, and the curvature matrix 2×2 there along right and up
-    (positive where the surface bulges outwards), from a quadratic fitted to the inner half of the surface under the
-    piece.
+    """Return the frame turned to the surface at its origin, and the surface's 2×2 curvature there along right and up
+    (positive if it bulges outwards), from a quadratic fit to the inner half under the piece.
     """
     curvatures = np.zeros((2, 2))
     for _ in range(2):
@@ -196,9 +195,8 @@ def _refuse_overhang(piece: Placement) -> None:
 
 
 def placement_with_other_bend(scene: Scene) -> tuple[Placement | None, str | None]:
-    """Return (the piece's placement with `patch.bend` the other way round, a sentence that compares it).
-
-    The placement is None if it is refused or would be the same card; both are None if there is no surface to lie on.
+    """Return the piece's placement with `patch.bend` the other way round, and a sentence that compares it. No placement
+    if it is refused or would be the same card; None for both if there is no surface to lie on.
     """
     if not isinstance(scene, PatchScene):
         return None, None

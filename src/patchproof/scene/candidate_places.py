@@ -2,9 +2,8 @@
 
 In: an `UnplacedScene`. Out: `CandidatePlace`s for `UnplacedScene.with_piece_at`. Points are sampled evenly over the
 surface (the same for the same seed) and left out if hardly any view faces them. From each, the piece is moved until one
-level part of the surface lies under it, and placed there as a piece with a given place is. A piece that is refused,
-overhangs or stands off too far is no candidate. Left out on purpose: objects in front of a place. The networks will
-tell.
+level part of the surface lies under it, and placed there as at a given place. A piece that is refused, overhangs or
+stands off too far is no candidate. Left out on purpose: objects in front of a place, which the networks will show.
 """
 
 from collections.abc import Sequence

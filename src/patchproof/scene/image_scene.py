@@ -4,10 +4,8 @@ In: a folder of images and a CSV of file names and labels. Out: `ImageScene`. On
 used: an assistive patch helps them, a deceptive one hides them. The whole printed piece lies inside the centered
 square, turned by `view.roll_deg`, as large as `view.patch_share` says. In training, a random box of the picture below
 it may be erased, so that the patch does not depend on one feature. White paper is sRGB white, and nothing else is
-modeled: the promise holds for a patch pasted into such images, not for a print in the world.
-
-Training and selection see one half of the images; promise, reprint and evaluation the other. A single image is used for
-all.
+modeled: the promise holds for a patch pasted into such images, not for a print in the world. Training and selection see
+one half of the images; promise, reprint and evaluation the other. A single image is used for all.
 
 Sources: Brown et al., Adversarial Patch, 2017 (here also with the assistive goal); Zhong et al., Random Erasing Data
 Augmentation, AAAI 2020, algorithm 1.
@@ -60,9 +58,7 @@ class ImageScene(PictureScene):
         return replace(self, piece=_piece(self.settings, self.sheet_id))
 
     def draw(self, stream: Stream, n: int, seed: int | None = None, start: int = 0, per_session: int = 1) -> Conditions:
-        """Draw from one of the scene's streams. `background[:, 0]` stays in that stream's half of the images, and
-        `background[:, 4]` is 1, which erases nothing, in all streams but training.
-        """
+        """Draw from a stream, from its half of the images (`background[:, 0]`); only training erases (`[:, 4]` < 1)."""
         conditions = super().draw(stream, n, seed, start, per_session)
         background = conditions.pose.background.copy()
         if len(self.images) >= MIN_IMAGES_TO_SPLIT:
@@ -103,10 +99,9 @@ class ImageScene(PictureScene):
 
 
 def build(source: SceneSource) -> ImageScene:
-    """Build the scene of a folder of images and their labels; warn about images that cannot be read.
-
-    An image counts as the target's if its label in the CSV, or one of the comma-separated names in it, equals the
-    target's name, its index, or a label in `target.accept`; case does not matter.
+    """Build the scene of a folder of images and their labels; warn about images that cannot be read. An image is the
+    target's if its CSV label, or one of the comma-separated names in it, equals the target's name, its index, or a
+    label in `target.accept`, ignoring case.
     """
     settings, base = source.settings, source.base
     picture_scene.refuse_bending(settings)
@@ -132,7 +127,7 @@ def largest_share(roll_deg: tuple[float, float]) -> float:
 
 def erase(picture: np.ndarray, seed: int) -> None:
     """Apply Random Erasing to a uint8 H×W×3 picture in place: a box of its centered square takes random values, the
-    same box and values at every size, and in photograph and square.
+    same box and values at every size, in photograph and square.
     """
     rng = np.random.default_rng(seed)
     left = top = wide = high = 1.0

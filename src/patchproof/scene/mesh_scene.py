@@ -1,7 +1,6 @@
 """A scene with a mesh and its background, ready to be photographed: the camera of every drawn view.
 
-By itself a `MeshScene` is the bare object. Other modules put a piece on it (`patch_scene`, `bent_scene`) or paint it
-(`texture_scene`).
+By itself a `MeshScene` is the bare object; `patch_scene` and `bent_scene` put a piece on it, `texture_scene` paints it.
 """
 
 import hashlib

@@ -147,7 +147,7 @@ def _mix(first: np.ndarray, second: np.ndarray, blend: np.ndarray) -> np.ndarray
 
 
 def _half_plane(rng: np.random.Generator, px: int) -> np.ndarray:
-    """Return one side of a line, level as often as not: floor and wall, road and sky."""
+    """Return the mask P×P of one side of a random line, level in half of the cases: floor and wall, road and sky."""
     y, x = np.mgrid[:px, :px] / px
     angle = np.pi / 2 if rng.random() < 0.5 else rng.uniform(0, 2 * np.pi)
     return (x - rng.random()) * np.cos(angle) + (y - rng.random()) * np.sin(angle) > 0

@@ -135,10 +135,8 @@ class PhotoScene(PictureScene):
 
 
 def build(source: SceneSource) -> PhotoScene:
-    """Build the scene of a folder of photographs. Unusable ones are warned about; fewer than six usable ones are
-    refused.
-
-    The scene's settings have the blank's `width_mm` and `height_mm`, also if the file gave none.
+    """Build the scene of a folder of photographs, with `width_mm` and `height_mm` of the blank. Unusable photographs
+    are warned about; fewer than six usable ones are refused.
     """
     settings, base = source.settings, source.base
     picture_scene.refuse_bending(settings)

@@ -1,5 +1,4 @@
-"""The common part of scenes made of pictures: photographs of an object (`photo_scene`) and folders of images
-(`image_scene`).
+"""What scenes made of pictures share: photographs of an object (`photo_scene`) and folders of images (`image_scene`).
 
 They have no mesh. A view is a base picture transformed onto the scene's photograph, and a homography that says where
 the piece lies in it. Pictures of any size become `photo_px` so that their *centered squares* agree, because classifiers

@@ -1,12 +1,12 @@
-"""A scene in which the object's own texture is optimized, whole or under a mask; nothing hangs on it.
+"""A scene in which the object's own texture is optimized, whole or under a mask; no piece is put on it.
 
 In: a mesh and the `[patch]` table of kind "texture" (everything) or "masked" (an image over UV space, material names,
 or a file of face numbers). Out: a scene with a `Canvas`: textures, the texels that may change, the mesh that shows
-them. Each material carries one texture that is its whole color: base colors are multiplied in (to 8-bit rounding the
-object looks as before), so that a texel reaches every color that paint can have. Faces without texture coordinates are
-unwrapped first (see `unwrap`). Warnings tell of texels that show at several places, palettes, vertex colors that go on
-multiplying, and faces that change although nobody named them. Left out on purpose: improving poor texture coordinates;
-textures keep their own sizes.
+them. Each material gets one texture that is its whole color: base colors are multiplied in (to 8-bit rounding the
+object looks as before), so that texels reach every color that paint can have. Faces without texture coordinates are
+unwrapped first (see `unwrap`). Warnings tell of texels that show at several places, palettes, vertex colors that still
+multiply, and faces that change although nobody named them. Left out on purpose: improving texture coordinates; resizing
+textures.
 """
 
 from dataclasses import dataclass, replace
@@ -70,9 +70,9 @@ def build(source: SceneSource) -> TextureScene:
 def texture_canvas(mesh: Mesh, patch: PatchSettings, base: Path, texels: int = TEXELS) -> Canvas:
     """Return the canvas of `mesh` for patch kinds "texture" and "masked"; files are relative to `base`.
 
-    `texels` is the side of new textures. A mask image is stretched over the UV square of each material, gray 128 and
-    lighter may change; it cannot reach faces without texture coordinates. Face numbers are those of `mesh.faces`. A
-    face may change together with a rim of GUTTER_TEXELS around it.
+    `texels` is the side of new textures. A mask image is stretched over each material's UV square; where gray is 128 or
+    lighter, faces with texture coordinates may change. Face numbers are those of `mesh.faces`. A face may change
+    together with a rim of GUTTER_TEXELS around it.
     """
     chosen_faces, has_uv = np.ones(len(mesh.faces), bool), has_usable_uv(mesh)
     if patch.materials or patch.faces is not None:

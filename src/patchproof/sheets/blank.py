@@ -1,13 +1,13 @@
 """Make pages without a design, before there is a run: a blank piece with markers only, a color chart, a ChArUco board.
 
-In: a template. Out: a PDF and its JSON; the sheet id is a hash of the template, so equal templates give equal pages.
-A template with a [blank] table has a piece with markers only: photographs of it on the object show where a design of
-the same size will lie and the light on it, which is all that a photographed scene needs. `blank_piece` reads the piece
-back from the manifest's cut line and markers. A template without a zone for a piece is a chart, printed to calibrate a
+In: a template. Out: a PDF and its JSON; the sheet id is a hash of the template, so equal templates give equal pages. A
+template with a [blank] table has a piece with markers only: photographs of it on the object show where a design of the
+same size will lie and the light on it, which is all that a photographed scene needs. `blank_piece` reads the piece back
+from the manifest's cut line and markers. A template without a zone for a piece is a chart, printed to calibrate a
 printer; nothing is cut out of it, and its `cut_mm` is the part that has to be in photographs. A template with a [board]
 table is for calibrating a camera: black squares alternate with white ones that hold the markers 0, 1, 2... of the
-project's dictionary, the pattern of OpenCV's CharucoBoard since 4.6, so that other tools can read it. The manifest
-holds the markers exactly, and `load_board` reads the rest of the pattern back.
+project's dictionary, as in OpenCV's CharucoBoard since 4.6, so that other tools can read it. The manifest holds the
+markers exactly, and `load_board` reads the rest of the pattern back.
 """
 
 from dataclasses import dataclass

@@ -29,8 +29,8 @@ _ARROW_MM = 0.9  # width of the arrow and the space after it
 
 @dataclass(frozen=True, eq=False)
 class SheetContent:
-    """A piece and its design. `design_srgb8` is uint8 H×W×3, or None for white paper; pixels that belong to the
-    markers become white. `kind` is "design", or the name of a control.
+    """A piece and its design: uint8 H×W×3, which becomes white at markers, or None for white paper. `kind` is "design",
+    or the name of a control.
     """
 
     piece: Piece
@@ -85,9 +85,7 @@ class SheetContent:
 
 
 def page_manifest(page: PageLayout, template: AnyTemplate | None, cut_mm: RectMm, **fields: Any) -> Manifest:
-    """The manifest of a page without a design; `fields` are its sheet_id, kind and settings. Without a template the
-    print's own sides are the rulers.
-    """
+    """The manifest of a page without a design; without a template the print's own sides are the rulers."""
     return Manifest(
         version=2,
         page_mm=page.page_mm,

@@ -1,11 +1,10 @@
 """Lay out one page: pieces, chart, rulers, QR code, page markers and texts, without overlaps.
 
-In: a template and pieces. Out: a `PageLayout`, which `pdf` draws and `write` states in the manifest.
-The chart's colors are the 8 corners of the RGB cube, an 8-step gray ramp (6 between black and white), 6 duplicates,
-whose readings are averaged, and a low-discrepancy sample of the cube, all multiples of 1/255, so that every printer
-driver gets the same numbers. Their places are shuffled in a fixed order, so that a gradient of light across the page is
-not mistaken for a color. Left out on purpose: automatic arrangement. The template places everything; only pieces are
-centered in their zone.
+In: a template and pieces. Out: a `PageLayout`, which `pdf` draws and `write` states in the manifest. The chart's colors
+are the 8 corners of the RGB cube, an 8-step gray ramp (6 between black and white), 6 duplicates, whose readings are
+averaged, and a low-discrepancy sample of the cube, all multiples of 1/255, so that every printer driver gets the same
+numbers. They are shuffled in a fixed order, so that a gradient of light across the page is not mistaken for a color.
+Left out on purpose: automatic arrangement. The template places everything; only pieces are centered in their zone.
 """
 
 import math
@@ -48,11 +47,8 @@ def chart_colors(count: int) -> list[Srgb]:
 
 
 def sobol(count: int) -> np.ndarray:
-    """The first `count` points (count×3) of Sobol's sequence in the unit cube, exact below 2^32 points.
-
-    Each point differs from the previous one by the direction numbers of the lowest zero bit of its number (Antonov and
-    Saleev, 1979); these are Joe and Kuo's (2008) for the first three dimensions. scipy.stats.qmc has the same sequence,
-    but imports all of scipy.stats.
+    """The first `count` points (count×3) of Sobol's sequence in the unit cube, exact below 2^32 points (Antonov and
+    Saleev, 1979; direction numbers of Joe and Kuo, 2008). scipy.stats.qmc has it, too, but imports all of scipy.stats.
     """
     first, second, third = [1, 1], [1, 3], [1, 3]
     while len(first) < _BITS:
@@ -107,8 +103,8 @@ def lay_out_parts(
     words: dict[str, str],
     extra_parts: Sequence[PageParts] = (),
 ) -> PageLayout:
-    """Lay out a page with any number of (piece, top-left corner); `ids` are those of the page's own markers (none for
-    a page without markers), `words` the values of the placeholders in the template's text.
+    """Lay out a page with any number of (piece, top-left corner); `ids` are those of the page's own markers (none for a
+    page without markers), `words` the values of the placeholders in the template's text.
     """
     size, corners_mm = template.marker.size_mm, template.marker.corners_mm if ids else ()
     page_markers = [square_marker(i, corner, size) for i, corner in zip(ids, corners_mm, strict=True)]
@@ -211,9 +207,7 @@ def _fill_placeholders(line: TextLine, words: dict[str, str]) -> TextLine:
 
 
 def refuse_larger_than_page(template: Template | None, piece: Piece) -> None:
-    """Refuse a piece of which no sheet can be made: too large, with more markers than there are ids, or in tiles
-    without any. Without a page it may have any size from `MIN_PRINT_MM` to `MAX_PRINT_MM`.
-    """
+    """Refuse a piece of an impossible size, with more markers than there are ids, or without any in tiles."""
     if template is None:
         if not MIN_PRINT_MM <= min(piece.size_mm) <= max(piece.size_mm) <= MAX_PRINT_MM:
             expected = f"a print of {MIN_PRINT_MM:g} mm to {MAX_PRINT_MM / 1000:g} m along each side"

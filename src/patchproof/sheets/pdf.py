@@ -132,9 +132,7 @@ def _fill_rects(canvas: "Canvas", rects: Any, srgb: Srgb, height: float) -> None
 
 
 def pages_pdf(pages: Sequence[PdfPage], title: str, attachments: dict[str, str]) -> bytes:
-    """Make the PDF of pages of any sizes, with the texts of `attachments` (by file name) attached. pikepdf adds the
-    color spaces, attachments and minimal metadata, which reportlab cannot write.
-    """
+    """Make a PDF of pages with `attachments` (texts by file name). pikepdf adds what reportlab cannot write."""
     import pikepdf
     from pikepdf import Array, Name
 

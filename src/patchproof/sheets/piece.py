@@ -1,14 +1,12 @@
 """The piece that is cut out and put on the object: its markers, and the design everywhere else.
 
-Millimeters from the top-left corner of the cut line, x right, y down. A marker is 7 modules wide, with a module of
-white around it (its quiet zone), and lies a millimeter inside the cut line, to allow for imprecise cutting. Markers sit
-in the four corners and, on a piece that bends or is long, along its sides. They cover the design: `marker_image` gives
-the pixels of a design that belong to markers, and their colors. It is exact, since everything is an axis-aligned
-rectangle: each pixel has the mean *light* of its area.
+Millimeters from the top-left corner of the cut line, x right, y down. A marker is 7 modules wide, has a module of white
+around it (its quiet zone), and lies a millimeter inside the cut line, to allow for imprecise cutting. Markers sit in
+the corners and, on a piece that bends or is long, along its sides. They cover the design: `marker_image` gives their
+pixels and colors, exactly (the mean *light* of each pixel's area), since everything is an axis-aligned rectangle.
 
 Marker ids and the sheet id are derived from SHA-256, so they are the same on every machine and in every version. The
-sheet id is fixed before optimizing and does not depend on the design, because the piece is rendered with its marker
-ids.
+sheet id does not depend on the design, because the piece is rendered with its marker ids during optimization.
 """
 
 import hashlib
@@ -92,8 +90,8 @@ def hash_order(text: str, count: int) -> tuple[int, ...]:
 
 
 def marker_size_mm(needed_mm: float, piece_mm: tuple[float, float]) -> float:
-    """The side of the markers to print: `needed_mm` (but at least 8 mm), or the largest multiple of 0.1 mm that leaves
-    the design its share; refused for a piece too small for 8 mm markers.
+    """The side of the markers to print: `needed_mm`, but at least 8 mm and at most the largest multiple of 0.1 mm that
+    leaves the design its share. Refused for a piece too small for 8 mm markers.
     """
     wanted, min_side = max(needed_mm, SMALLEST_MARKER_MM), _corner_mm(SMALLEST_MARKER_MM) / MAX_CORNER_SHARE
     if min(piece_mm) < min_side:
@@ -111,9 +109,7 @@ def smallest_piece_mm(marker_mm: float = SMALLEST_MARKER_MM) -> int:
 def lay_out_piece(
     piece_mm: tuple[float, float], marker_mm: float, sheet_id: str, kind: str, bends: bool = False
 ) -> Piece:
-    """Lay out a piece with a marker in each corner, and along sides that are long or bent; without any if `marker_mm`
-    is 0.
-    """
+    """Lay out a piece with markers in its corners and along long or bent sides; `marker_mm` = 0 means none."""
     if not marker_mm:
         return Piece(piece_mm, (), 0.0)
     module = marker_mm / MARKER_MODULES
@@ -194,10 +190,8 @@ def black_runs(dark: np.ndarray, corner_mm: PointMm, module_mm: float) -> list[R
 
 
 def marker_image(piece: Piece, design_px: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """The markers in a design of (width, height) pixels: float32 sRGB H×W×3, white elsewhere; and bool H×W, True for
-    the pixels that belong to them: all that touch `reserved_mm`, so that quiet zones are at least a module wide.
-
-    A pixel is the mean light of its area, in sRGB: an exact box filter, since markers consist of disjoint rectangles.
+    """The markers in a design of (width, height) pixels: float32 sRGB H×W×3, white elsewhere, each pixel the exact mean
+    light of its area; and bool H×W, True for pixels that touch `reserved_mm`.
     """
     (width, height), scale = design_px, np.array(design_px) / piece.size_mm  # px per mm, along x and y
     coverage, reserved = np.zeros((height, width)), np.zeros((height, width), bool)
@@ -219,8 +213,7 @@ def whiten_marker_pixels(design: np.ndarray, piece: Piece) -> np.ndarray:
 
 
 def control_design(kind: str, design: np.ndarray, sheet_id: str, piece: Piece | None = None) -> np.ndarray:
-    """The pixels that a control sheet prints in place of a uint8 H×W×3 design of the same size; those of a piece's
-    markers are white.
+    """The pixels that a control sheet prints in place of a uint8 H×W×3 design; those of a piece's markers are white.
 
     "mean": its mean color, averaged in light; "gray": sRGB 128; "noise": random cells, 16 along the shorter side;
     "blank": white paper; "design": the design.

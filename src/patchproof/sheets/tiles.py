@@ -139,7 +139,7 @@ def _tile_page(template: Template, grid: TileGrid, content: SheetContent, tile: 
 
 
 def _within(window: RectMm, labels: PageParts) -> PageParts:
-    """The piece's texts within the window; seams never cut one, since they never cut a marker with its white."""
+    """The piece's texts within the window. Seams cut no text, since texts lie in markers' white, which seams avoid."""
     lines = (line for line in labels.lines if rect_contains(window, (*line.ends_mm[:2], 0.0, 0.0)))
     texts = (text for text, box in zip(labels.texts, labels.boxes, strict=True) if rect_contains(window, box.rect_mm))
     return PageParts(tuple(lines), tuple(texts))

@@ -4,10 +4,10 @@ In: a piece with its design and promise, or several, and a template. Out: files 
 attached to the PDF, with the same bytes. All are first written beside their places and then moved there, so that a full
 disk or a crash leaves the old files. A page of several designs has SHEET_1.json, SHEET_2.json... in their order, an id
 of its own and one QR code for all designs, since a code that lists three or more is too fine to be read at 150 dpi.
-Pieces keep the marker ids with which they were promised. These are 1000 ids ordered by hash, so two sheets may share
-one; the page's own markers avoid all of them. A design's manifest lists the other designs' markers with those of the
-page if their id is unique on it, so that a photograph of the uncut page can be recognized.
-Left out on purpose: asking before overwriting, which the command line does.
+Pieces keep the marker ids with which they were promised, of 1000 ordered by hash, so two sheets may share one; the
+page's own markers avoid all of them. A design's manifest lists the other markers on the page, too, if their ids are
+unique on it, so that a photograph of the uncut page can be recognized. Left out on purpose: asking before overwriting,
+which the command line does.
 """
 
 import hashlib
@@ -37,8 +37,8 @@ def write_sheet(
     plan: PlanPage | None = None,
     copies: int = 1,
 ) -> Manifest:
-    """Write SHEET.pdf and SHEET.json beside it. `plan` becomes the last page; `copies` repeats the page with the piece,
-    and is refused for a template with tiles, which has a page for each tile. Without a template only SHEET.json is.
+    """Write SHEET.pdf and SHEET.json beside it, without a template only SHEET.json. `plan` becomes the last page;
+    `copies` repeats the page with the piece, and is refused for a template with tiles.
     """
     if template is None:
         if Path(pdf_path).suffix != ".json":

@@ -51,9 +51,8 @@ def new_scene(
     models: Sequence[str] | None = None,
     overwrite: bool = False,
 ) -> list[str]:
-    """Write the scene file `out` for a mesh or a folder; returns lines with the guesses and warnings. `length_mm` and
-    `up` replace those of the mesh's file. Without `models`, `imagenet` where it is installed, but `builtin` for
-    a primitive.
+    """Write the scene file `out` for a mesh or a folder; returns lines with guesses and warnings. `length_mm` and `up`
+    replace the file's. Default `models`: `builtin` for a primitive, else `imagenet` if installed.
     """
     out = Path(out)
     if models is None:  # the built-in network knows primitives and nothing else

@@ -88,7 +88,7 @@ class Album:
         return last
 
     def incoming(self, into: str) -> "Incoming":
-        """Prepare for one more photograph in the session, or of the control, of that name."""
+        """Prepare to receive a photograph for the session or control of that name."""
         folder = self.folder / (CONTROLS_FOLDER if into in CONTROLS else "") / into
         if into in CONTROLS:
             make_folder(folder)

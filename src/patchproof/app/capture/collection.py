@@ -2,10 +2,11 @@
 
 In: an album, a manifest, the options of a verification. Out: a `Report`, as `verify` makes it of the same folder, and
 JSON values, in which every sentence about a photograph or the promise is the report's. Photographs are measured one at
-a time, in the single process of the workers, where limits of time and memory apply; finished ones are in the album's
-journal, so that a restart measures only new ones, tapped corners in `corners.csv`. On the map of views, cells are equal
-steps of azimuth and of distance (1 over pixels per millimeter), and need photographs in proportion to their shares of
-the conditions. Left out on purpose: the gap ledger and the estimated effect, which take longer than a person waits.
+a time, in the single process of the workers, where limits of time and memory apply. Finished ones are in the album's
+journal and tapped corners in `corners.csv`, so that a restart measures only new ones. Cells of the map of views are
+equal steps of azimuth and of distance (1 over pixels per millimeter), and need photographs in proportion to their
+shares of the conditions. Left out on purpose: the gap ledger and the estimated effect, which take longer than a person
+waits.
 """
 
 import re
@@ -90,8 +91,8 @@ class PhotoCollection:
         return able and (named or photo.entry.code in _CORNER_CODES)
 
     def name_corners(self, file: str, numbers: str) -> Path:
-        """Keep the corners that a person tapped in a picture of the photograph `file`, which is then to be measured
-        again, and return its path; `numbers` are "x1,y1,...,x4,y4,width,height". Nothing changes where none are wanted.
+        """Keep the corners that a person tapped in photograph `file`, "x1,y1,...,x4,y4,width,height", and return its
+        path. It is then measured again; nothing changes where no corners are wanted.
         """
         path = next((path for path in self._measured if _name_of(path) == file), None)
         pairs = np.array(numbers.split(",") if _TEN_NUMBERS.fullmatch(numbers) else [], float).reshape(-1, 2)
@@ -225,10 +226,9 @@ def map_views(
 ) -> dict[str, Any] | None:
     """Map counted photographs, of which `wanted` are needed in total; None if the conditions have no views.
 
-    Columns run in degrees from left to right, rows from near to far (the share of a picture's shorter `side_px` that
-    the piece takes, or else pixels per millimeter); `next` is the (row, column) that lacks the most photographs,
-    `elsewhere` counts those whose view is unknown. Photographs beyond the edges, which the promise's margin allows,
-    count in the outermost cells.
+    Columns run in degrees from left to right, rows from near to far (the piece's share of a picture's shorter
+    `side_px`, or else pixels per millimeter); `next` is the (row, column) that lacks the most photographs, `elsewhere`
+    counts those of unknown view. Photographs beyond the edges count in the outermost cells.
     """
     views = np.array([(c.azimuth_deg, c.px_per_mm) for c in conditions if c.azimuth_deg is not None and c.px_per_mm])
     if not len(views):

@@ -45,9 +45,8 @@ class Setup:
 
 @dataclass(frozen=True)
 class Term:
-    """A term of the model: the settings key that governs it, and `change`, which takes it out of a setup, or returns
-    None if it is off. A term that is not `modeled` is added by `change`. One that `needs_whole_photo` shows fully in
-    whole photographs only.
+    """A term of the model and its settings key. `change` takes it out of a setup, or adds it if it is not `modeled`,
+    and returns None if it is off. A term that `needs_whole_photo` shows fully in whole photographs only.
     """
 
     name: str
@@ -113,12 +112,13 @@ def measure_terms(
     """Measure the errors of all terms over `conditions`, as plain data: `views`, the base setup's mean `confidence`,
     the `threshold`, the `errors` by term, and why no verdict is known (`unknown`, empty if they are).
 
-    An error has `codes_mean` and `codes_p95` (absolute differences of 8-bit code values), `confidence` (the mean
-    absolute change of the target's), and `bias` (the mean change, of leaving the term out or of adding a missing one);
-    `in_training` says if training's smaller views show a term that needs whole photographs. The verdict is off, keep
-    or can go; missing or left out, of what is not modeled; unknown if no term changes the confidence. Terms can go as
-    long as their changes, added up from the smallest on, stay under the threshold, the standard error of the mean
-    confidence over `selection_views` views: a smaller change decides no choice of a design.
+    An error has `codes_mean` and `codes_p95` (absolute differences of 8-bit code values), and of the target's
+    confidence the mean absolute change (`confidence`) and the mean change (`bias`), by leaving the term out or by
+    adding a missing one. `in_training` says if training's smaller views show a term that needs whole photographs.
+    Verdicts of modeled terms are off, keep or can go; of others missing or left out; of all unknown if no term changes
+    the confidence. Terms can go as long as the sum of their changes, from the smallest on, stays under the threshold,
+    the standard error of the mean confidence over `selection_views` views: a smaller change decides no choice of a
+    design.
     """
     base = Setup(problem.stage, problem.subject.appearance(design), conditions)
     terms, boxes, views = scene_terms(problem, design, other_surface), problem.boxes(conditions), len(conditions)
@@ -165,9 +165,7 @@ def _confidence(problem: Problem, pictures: Tensor, boxes: np.ndarray | None) ->
 
 
 def _squares(problem: Problem, side_px: int, base: Setup, setups: list[Setup]) -> Tensor:
-    """Render the views of the base setup, then of each other one, as the primary classifier gets them:
-    (1 + len(setups))×N×3×S×S.
-    """
+    """Render the views of base and other setups for the primary classifier: (1 + len(setups))×N×3×S×S."""
     size_px, stack = (side_px, side_px), []
     for rows in _chunks(len(base.conditions), side_px):
         base_conditions, pictures = base.conditions[rows], []

@@ -3,9 +3,9 @@
 In: a scene file. Out: the plan as lines: where the piece lies (after a search, if the scene asks for one) and how a
 simpler or richer surface would differ, the pixels that views have for design and markers, the error of leaving out each
 term of light, camera and renderer, how many photographs prove a promise, and the cost of a step. All figures come from
-the code that optimizes. Terms are measured with a draft of a few steps, since a classifier that ignores the design
-would miss none of them. What photographs can prove depends on how much sessions differ, which a small promise of the
-draft measures; the sheet's plan page says it of the design.
+the code that optimizes. Terms are measured with a draft of a few steps, since leaving one out changes nothing for a
+classifier that ignores the design. A small promise of the draft shows how much sessions differ, and hence what
+photographs can prove; the sheet's plan page states that for the final design.
 
 Left out on purpose: deciding for the user. The plan says which terms can go; the scene file decides.
 """
@@ -50,8 +50,8 @@ PlanData = dict[str, Any]
 
 
 def plan_geometry(scene_path: str | Path, *, progress: Progress = no_progress) -> tuple[Problem, list[str]]:
-    """Return the problem to measure, and lines on how the piece lies and how well views resolve it; takes seconds
-    unless a place is searched for.
+    """Return the problem to measure, and lines on how the piece lies and how well views resolve it. Takes seconds, plus
+    the time of any search for a place.
     """
     scene, found = load_scene(scene_path), []
     if isinstance(scene, UnplacedScene):
@@ -70,8 +70,8 @@ def plan_geometry(scene_path: str | Path, *, progress: Progress = no_progress) -
 
 
 def measured_lines(problem: Problem, *, views: int = TERM_VIEWS, progress: Progress = no_progress) -> list[str]:
-    """Measure the rest of a plan, and return its lines: a draft of the design, the terms in so many views, how many
-    photographs prove a promise, and the cost of a step.
+    """Measure the rest of a plan and return its lines: a draft of the design, the model's terms in `views` views, how
+    many photographs prove a promise, and the cost of a step.
     """
     scene, (design, draft) = problem.scene, _draft(problem, progress)
     conditions, other = scene.draw("select", views), placement_with_other_bend(scene)[0]
@@ -89,8 +89,8 @@ def measured_lines(problem: Problem, *, views: int = TERM_VIEWS, progress: Progr
 
 
 def resolution_plan(problem: Problem) -> PlanData:
-    """Compute how finely views and print resolve the design: pixels per millimeter at the 5 % and 95 % points of the
-    views, in the closest view that the settings allow, and in print. Textures keep their own sizes (None).
+    """Compute how finely views and print resolve the design: px/mm at the 5 % and 95 % points of the views, in the
+    closest view that the settings allow, and in print (None for textures).
     """
     scene, subject = problem.scene, problem.subject
     patch = subject if isinstance(subject, Patch) else None
@@ -133,9 +133,7 @@ def _draft(problem: Problem, progress: Progress) -> tuple[Tensor, PlanData]:
 
 
 def measure_cost(problem: Problem, design: Tensor, advance: Advance = no_advance) -> PlanData:
-    """Time steps that show `design` on this machine, with all classifiers of the problem: the median milliseconds of
-    each part over a few steps' views, after a warm-up.
-    """
+    """Time each part of steps that show `design` here, with all classifiers: median milliseconds after a warm-up."""
     views, rows = problem.scene.settings.optimize.views, []
     problem.see(None, problem.scene.draw("train", views), 16)  # loads the background pictures, which a run does once
     for number in range(REPEATS + 1):  # the first one warms up
@@ -147,9 +145,7 @@ def measure_cost(problem: Problem, design: Tensor, advance: Advance = no_advance
 
 
 def _step_ms(problem: Problem, design: Tensor, conditions: Conditions) -> dict[str, float]:
-    """Time each part of one step in milliseconds, in the order of the loop, in which views of one pose share its
-    rasterization.
-    """
+    """Time each part of one step in milliseconds, in the loop's order; views of one pose share its rasterization."""
     design = design.clone().requires_grad_()
     appearance, ends = problem.subject.appearance(design.detach()), {"": time.perf_counter()}
     views = problem.see(appearance, conditions, problem.training_px)
