@@ -1,5 +1,6 @@
 """The study of trials by sessions: a trial of each kind, and its tables."""
 
+import csv
 from pathlib import Path
 
 import numpy as np
@@ -26,3 +27,24 @@ def test_controls_are_counted_and_tables_show_shares():
     assert controls[:5] == (0.1, 4, 0.95, 0.05, "pairs") and controls[5].value == 1
     assert folders[:3] == (0.1, "true", "yes") and folders[3].value == 0.5 and folders[-1] == 6
     assert looks[2].value == 0.02 and looks[2].n == 200
+
+
+def test_what_dealt_folders_prove_in_the_notebook_is_what_is_stored():
+    results = Path(session_trials.__file__).parents[1] / "results"
+    page = " ".join((results / "measured.md").read_text("utf-8").split())
+    rows = list(csv.DictReader((results / "sessions/session-trials_folders.csv").read_text("utf-8").splitlines()))
+    dealt = [row for row in rows if row["dealt"] != "true"]
+
+    def kept(name):
+        of_each = ([row for row in dealt if row["correlation"] == rho] for rho in ("0.0", "0.1", "0.2", "0.3"))
+        return " / ".join(str(round(sum(100 * float(row[name]) for row in rows))) for rows in of_each)
+
+    assert f"{kept('kept')} of 600 ({kept('kept as dealt')})" in page
+    found = [
+        np.mean([float(row["sessions found"]) for row in rows if (row["dealt"], row["times"]) == (how, "no")])
+        for how in ("true", "one each", "runs of 3")
+    ]
+    assert (
+        "found as {:.2f}, three that are dealt into 60 and 20 folders without times as {:.1f} and {:.1f}".format(*found)
+        in page
+    )
