@@ -127,8 +127,9 @@ def test_a_print_without_markers_is_a_chart_too(tmp_path):
         calibrated(photos, manifest)
     px = apply_homography(paper.view(15, 10, 430, size_px=SIZE_PX), rect_corners(paper.DESIGN_MM)) + 1
     corners = {f"{place}/a.png": Drawn(tuple(px.ravel())) for place in PLACES}
-    error, before = errors(calibrated(photos, manifest, ("coated",), corners=corners)[0], sent_colors(manifest))
-    assert error < before / 2
+    printer, warnings = calibrated(photos, manifest, ("coated",), corners=corners)
+    error, before = errors(printer, sent_colors(manifest))
+    assert error < before / 2 and "photograph a print with markers or with white" in warnings[-1]
 
 
 def test_photographs_that_do_not_show_paper_between_the_markers_cells_are_refused(tmp_path):

@@ -52,6 +52,10 @@ COVERED_DELTA_E00, UNTOUCHED_DELTA_E00 = 10.0, 15.0  # from a seen color; betwee
 _SHARED_VEIL = 0.03  # assumed to be in every place, for a figure
 _LEAST_MODULE_PX = 1.75  # of markers: of paper beside 1.4 px, ink took a third of the light
 _LAB_BIN, _NEIGHBORS = 3.0, 16  # like colors are one; of the nearest in CIELAB the nearest in ΔE00 are taken
+_NO_PAPER = (
+    "neither markers nor a cell within ΔE00 {:.0f} of white show the paper's light: grays may be off by ΔE00 10 to 16, "
+    "whatever the uncertainty says; photograph a print with markers or with white in its design"
+)
 _LIKE_DELTA_E00, _LIKE_CELLS = 4.0, 4.0  # averages of what is left: their reach, and cells that count for half
 
 
@@ -107,6 +111,9 @@ def calibrate_design(
     black, gray = ciede2000(*(lab_from_linear(add_ink(ends, each)) for each in (ink, veiled)))
 
     seen = np.concatenate([c.promised for c in photos])
+    from_paper = ciede2000(lab_from_linear(np.clip(seen, 0, 1)), lab_from_linear(np.ones(3)))
+    if not any(design.anchored for design in designs) and from_paper.min() > COVERED_DELTA_E00:
+        warnings.append(_NO_PAPER.format(from_paper.min()))
     light = np.concatenate([ShownColors.of_terms(t).undo(c.seen) for c, t in zip(photos, terms, strict=True)])
     rest = srgb_from_linear(np.clip(light, 0, 1)) - srgb_from_linear(add_ink(seen, ink))
     codes = printer_output(prior, node_colors().reshape(-1, 3))
