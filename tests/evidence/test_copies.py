@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -60,6 +61,20 @@ def test_two_shots_of_a_hand_held_camera_are_one_and_another_view_is_none(same, 
         assert both[1].entry.code == (None if counted else "copy")
     elsewhere = reject_copies([first, seen("b", **same)], (0, 1), DESIGN_MM)  # in another place and its light
     assert elsewhere[1].counted
+
+
+def test_a_copy_turned_by_90_degrees_is_one():
+    first = seen("a", roll=20.0, aside=40.0)
+    for turns in (1, 2, 3):
+        size_px = SIZE[::-1] if turns % 2 else SIZE
+        center, turned_center = np.array(SIZE) / 2, np.array(size_px) / 2
+        turn = np.linalg.matrix_power([[0, -1], [1, 0]], turns)
+        matrix = np.eye(3)
+        matrix[:2, :2], matrix[:2, 2] = turn, turned_center - turn @ center
+        homography = matrix @ first.entry.geometry.homography_px_from_mm
+        geometry = first.entry.geometry.changed(homography_px_from_mm=homography.tolist())
+        copy = replace(first, entry=first.entry.changed(file="b", photo_px=size_px, geometry=geometry))
+        assert reject_copies([first, copy], (0, 0), DESIGN_MM)[1].entry.code == "copy"
 
 
 def test_rolled_paper_is_known_by_its_figures_and_equal_bytes_wherever_they_lie():

@@ -303,7 +303,11 @@ def _view(photo: MeasuredPhoto, session: int, rect_mm: Rect) -> np.ndarray | Non
     tilt = np.nan if geometry.tilt_deg is None else np.cos(np.radians(geometry.tilt_deg)) / TILT_TOLERANCE
     corners = np.full((4, 2), np.nan)  # unknown on rolled paper
     if geometry.homography_px_from_mm is not None:
-        corners = apply_homography(np.array(geometry.homography_px_from_mm), rect_corners(rect_mm)) / max(size_px)
+        corners = apply_homography(np.array(geometry.homography_px_from_mm), rect_corners(rect_mm))
+        corners = (corners - np.array(size_px) / 2) / max(size_px)
+        across = corners[1] + corners[2] - corners[0] - corners[3]
+        quarter_turns = round(float(np.arctan2(across[1], across[0]) / (np.pi / 2)))  # a turned copy is a copy
+        corners = corners @ np.linalg.matrix_power([[0, -1], [1, 0]], quarter_turns % 4)
     middle = corners.mean(0)
     side = geometry.px_per_mm * max(rect_mm[2:]) / max(size_px)
     shape = (corners - middle) / side / SHAPE_TOLERANCE
