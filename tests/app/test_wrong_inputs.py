@@ -130,3 +130,10 @@ def test_a_missing_mesh_is_named_and_no_label_is_asked_for(lines, capsys):
 
 def test_hints_quote_what_a_shell_would_split():
     assert command_text("sheet", Path("my run"), "--out", "a.pdf") == "patchproof sheet 'my run' --out a.pdf"
+
+
+@pytest.mark.parametrize("verb", ["optimize", "evaluate", "reprint"])
+def test_seeds_beyond_32_bits_are_refused_by_their_option(verb, tmp_path, capsys):
+    path = tmp_path / "any"
+    assert command(verb, path, "--out", path, "--seed", 10**20) == 2
+    assert "less than or equal to 4294967295" in capsys.readouterr().err

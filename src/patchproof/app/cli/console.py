@@ -21,7 +21,7 @@ from patchproof.base.version import __version__
 
 Overwrite = Annotated[bool, Option("--overwrite", help="Replace this command's earlier output.")]
 Device = Annotated[str, Option(help="cpu or cuda.")]
-Seed = Annotated[int | None, Option(min=0, help="In place of the scene's own seed.")]
+Seed = Annotated[int | None, Option(min=0, max=2**32 - 1, help="In place of the scene's own seed.")]
 Resume = Annotated[bool, Option("--resume", help="Continue a stopped run.")]
 Jobs = Annotated[
     int | None, Option(min=1, help="Local processes, one for each free core; any number gives the same results.")
