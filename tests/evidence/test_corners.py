@@ -158,6 +158,26 @@ def test_what_is_not_four_corners_is_refused(tmp_path, text, message):
         load_corners(coco(tmp_path / "p.json", CORNERS_PX, segmentation=[[0, 0, 9, 0, 9]]))
 
 
+UNLABELED = [v for x, y in CORNERS_PX.tolist()[:3] for v in (x, y, 2)] + [0, 0, 0]
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        None,
+        {"segmentation": {"counts": [3, 5], "size": [480, 360]}},
+        {"image_id": 7},
+        {"keypoints": UNLABELED},
+        {"keypoints": [0] * 12},
+    ],
+)
+def test_a_file_without_any_corners_is_refused(tmp_path, more):
+    path = tmp_path / "c.csv"
+    path.write_text(corners_csv({})) if more is None else coco(path := tmp_path / "c.json", CORNERS_PX, **more)
+    with pytest.raises(Refused, match=r"corners of the design in .*c\.(csv|json), got none of any photograph: name"):
+        load_corners(path)
+
+
 @pytest.fixture(scope="module")
 def printed(tmp_path_factory):
     """A print that exists, larger than its scene's page: run/, print.json, and photographs with corners.csv."""
@@ -185,6 +205,7 @@ def test_a_print_that_exists_is_promised_photographed_and_judged(printed):
     report = judged(folder, folder / "some.csv", "report")
     assert [photo.status for photo in report.photos] == ["measured"] * 3 + ["rejected"]
     assert report.photos[3].code == "no_corners" and report.summary.judged == 3
+    assert "FILE does not name this photograph: add it there" in report.photos[3].remark.advice
     assert any("corners of 2 other" in line or "corners of 1 other" in line for line in report.summary.left_out)
     assert "3 photographs were located by the design alone" in "".join(report.summary.not_measured.values())
     data = json.loads((folder / "report" / "coco.json").read_text())
