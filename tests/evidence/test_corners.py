@@ -224,6 +224,24 @@ def test_the_one_file_of_a_print_without_a_page_is_named_once(printed, tmp_path,
     assert capsys.readouterr().out.splitlines()[-1] == f"sheet {run.scene.sheet_id} (design): {out}"
 
 
+def test_what_needs_a_page_is_refused_for_a_print_without_one(printed, tmp_path, capsys):
+    (folder, run), out = printed, tmp_path / "print.json"
+    sheet_of(run, tmp_path / "there.json")
+    picture, scene = folder / "run" / "design.png", folder / "scene.toml"
+    for words, code, said in (
+        (["sheet", run.folder, "--out", out, "--check"], 1, "Expected a page for --check and --copies, got"),
+        (["sheet", run.folder, "--out", out, "--copies", 3], 1, "a print without one: leave them out"),
+        (["sheet", run.folder, run.folder, "--out", out], 1, "a page for a sheet together, got prints without one"),
+        (["reprint", tmp_path / "there.json", "--n", 1, "--out", out], 2, "prints without a page need --run RUN"),
+        (["import", picture, scene, "--out", tmp_path / "o", "--as-printed", "120x120mm"], 2, "mm, without the unit"),
+    ):
+        assert command(*words) == code
+        assert said in " ".join(capsys.readouterr().err.replace("│", " ").split()), words
+    with pytest.raises(Refused, match=r"a page to repeat, got a print without one: leave copies out\.$"):
+        sheet_of(run, out, copies=3)
+    assert [path.name for path in tmp_path.iterdir()] == ["there.json"]
+
+
 def test_corners_outside_of_the_picture_are_said(printed):
     folder = printed[0]
     head, first, *_ = (folder / "photos" / "corners.csv").read_text().splitlines()

@@ -167,6 +167,6 @@ def pair_of(text: str, option: str) -> tuple[float, float]:
         if not (0 < x < float("inf") and 0 < y < float("inf")):
             raise ValueError
     except ValueError:
-        needed = "takes one or two positive numbers, such as 0.97 or 0.97x0.98"
+        needed = "takes one or two numbers in mm, without the unit, such as 120 or 97.1x97.3"
         raise BadParameter(needed, param_hint=option) from None
     return x, y
