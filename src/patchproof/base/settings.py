@@ -144,12 +144,12 @@ class ViewSettings(StrictModel):
 
     look_at: Literal["object", "patch"] = "object"  # the camera looks at the middle of this
     look_at_jitter: Share = 0.05  # largest miss of that middle, as a share of the object's length
-    front: Literal["patch"] | Side = "patch"  # the patch or side that cameras and lights at azimuth 0 face
+    front: Literal["patch", Side] = "patch"  # the patch or side that cameras and lights at azimuth 0 face
     azimuth_deg: Range = (-60.0, 60.0)  # of the camera about the vertical
     elevation_deg: Annotated[Range, within(-89, 89)] = (2.0, 27.0)  # of the camera above the horizontal
     distance_mm: PositiveRange = (440.0, 800.0)  # from the camera's center to what it looks at
     roll_deg: Range = (-5.0, 5.0)  # of the camera about its axis
-    fov_deg: Annotated[Positive, Field(lt=170)] = 50.0  # field of view across the picture's shorter side
+    fov_deg: Annotated[Finite, Field(ge=1, lt=170)] = 50.0  # field of view across the picture's shorter side
     zoom: PositiveRange = (0.9, 1.1)  # of a photographed scene's pictures about their middle
     patch_share: ShareRange = (0.1, 0.3)  # the piece's longer side over a picture's shorter side, in folders of images
 
@@ -271,6 +271,8 @@ class SceneSettings(StrictModel):
             raise ValueError(message)
         if self.patch.kind == "patch" and self.object.photos is None and self.patch.width_mm is None:
             raise ValueError("add patch.width_mm and patch.height_mm")
+        if not any((*self.light.ambient, *self.light.directional)):
+            raise ValueError("raise light.ambient or light.directional: every picture would be black")
         if self.object.photos is not None and not self.sheet.markers:
             raise ValueError(
                 "leave out sheet.markers with object.photos: the print has the markers of their blank sheet"
