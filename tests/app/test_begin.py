@@ -307,6 +307,17 @@ def test_the_largest_piece_is_found_between_those_that_fit():
     assert largest_fitting_size((100, 50), lambda size: True, 20) == (100, 50)
     assert largest_fitting_size((100, 50), lambda size: False, 20) is None
     assert largest_fitting_size((100, 50), lambda size: True, 51) is None
+    assert largest_fitting_size((100, 0), lambda size: True, 20) is None
+
+
+@pytest.mark.parametrize(("up", "side"), [("y", "+z"), ("z", "+y")])
+def test_a_sign_of_one_quad_gets_its_piece_on_its_face(up, side, tmp_path):
+    (tmp_path / "sign.obj").write_text("v -3 -2 0\nv 3 -2 0\nv 3 2 0\nv -3 2 0\nf 1 2 3 4\n")
+    new_scene(str(tmp_path / "sign.obj"), tmp_path / "scene.toml", label="street sign", length_mm=600, up=up)
+    scene = load_scene(tmp_path / "scene.toml")
+    assert (scene.settings.patch.side, scene.placement.family) == (side, "card")
+    with pytest.raises(Refused, match=r"the object's side \(.*\b0\b.* mm\), got .* choose a larger side"):
+        make_scene(scene.settings.changed(patch={"side": "+x"}), base=tmp_path)
 
 
 def test_a_new_scene_loads_and_says_what_was_guessed(bottles, standing):

@@ -128,5 +128,18 @@ def test_a_missing_mesh_is_named_and_no_label_is_asked_for(lines, capsys):
     assert command(*line) == 1 and f"no file at {line[-1]}: check the path" in capsys.readouterr().err
 
 
+def test_a_pdf_in_place_of_its_manifest_is_told_so(tmp_path, capsys):
+    (tmp_path / "sheet.pdf").write_bytes(b"%PDF-1.7\n%\xbf\xf7\n")
+    assert command("verify", tmp_path, "--sheet", tmp_path / "sheet.pdf", "--out", tmp_path / "o") == 1
+    assert "sheet.pdf, a PDF: name the JSON that was written beside the PDF." in capsys.readouterr().err
+
+
 def test_hints_quote_what_a_shell_would_split():
     assert command_text("sheet", Path("my run"), "--out", "a.pdf") == "patchproof sheet 'my run' --out a.pdf"
+
+
+@pytest.mark.parametrize("verb", ["optimize", "evaluate", "reprint"])
+def test_seeds_beyond_32_bits_are_refused_by_their_option(verb, tmp_path, capsys):
+    path = tmp_path / "any"
+    assert command(verb, path, "--out", path, "--seed", 10**20) == 2
+    assert "less than or equal to 4294967295" in capsys.readouterr().err

@@ -128,6 +128,7 @@ def test_lengths_are_finite_positive_numbers(tmp_path, value):
         "[view]\nelevation_deg = [0, 90]",
         "[view]\ndistance_mm = [0, 100]",
         "[view]\nfov_deg = 170",
+        "[view]\nfov_deg = 0.0001",
         "[view]\nlook_at = 'sky'",
         "[light]\nambient = [-0.1, 0.5]",
         "[camera]\nphoto_px = [16, 1200]",
@@ -142,6 +143,9 @@ def test_lengths_are_finite_positive_numbers(tmp_path, value):
         "[optimize]\nviews = 0",
         "[view]\npatch_share = [0.1, 1.2]",
         "[optimize]\nsteps = 0",
+        "[optimize]\nseed = -1",
+        "[optimize]\nseed = 4294967296",
+        "[optimize]\nseed = 99999999999999999999",
         "[optimize]\nsteps = 1.5",
         "[optimize]\noptimizer = 'sgd'",
     ],
@@ -156,6 +160,17 @@ def test_a_reversed_range_says_both_ends(tmp_path):
     assert "[low, high] with low <= high, not [60, -60]" in refusal(
         scene(tmp_path, extra="[view]\nazimuth_deg = [60, -60]\n")
     )
+
+
+def test_a_side_that_is_none_is_told_which_there_are(tmp_path):
+    text = refusal(scene(tmp_path, extra='[view]\nfront = "top"\n'))
+    assert 'a usable "view.front" in' in text and "'patch', '+x', '-x', '+y', '-y', '+z' or '-z'" in text
+
+
+def test_a_scene_without_any_light_is_refused(tmp_path):
+    dark = "[light]\nambient = [0, {}]\ndirectional = [0, 0]\n"
+    assert "raise light.ambient or light.directional: every" in refusal(scene(tmp_path, extra=dark.format(0)))
+    assert load_scene_settings(scene(tmp_path, extra=dark.format(0.1))).light.ambient == (0, 0.1)
 
 
 def test_no_models_are_refused(tmp_path):

@@ -266,6 +266,28 @@ def test_own_code_that_is_not_as_said_is_refused(name, sentence, tmp_path, monke
         load_classifier(f"module:{name}", tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("said", "sentence"),
+    [
+        ({"labels": {"dog": 1, "cat": 0}}, r"got {'dog': 1, 'cat': 0} in python:network: list them in the order of"),
+        ({"labels": {"dog", "cat"}}, "labels, a list of 2 or more names, got {"),
+        ({"labels": {"dog": 1, "cat": 0}.keys()}, r"got dict_keys\(\['dog', 'cat'\]\)"),
+        ({"labels": ["dog"]}, r"a list of 2 or more names, got \['dog'\]"),
+        ({"labels": [], "kind": "detector"}, r"a list of 1 or more names, got \[\]"),
+        ({"labels": {0: "dog"}, "kind": "detector"}, "a list of 1 or more names, got {0: 'dog'}"),
+        ({"input_px": 0}, "input_px, a whole number from 8 to 4096, got 0 in python:network"),
+        ({"input_px": 100_000}, "from 8 to 4096, got 100000"),
+        ({"input_px": True}, "from 8 to 4096, got True"),
+    ],
+)
+def test_a_network_in_memory_says_its_size_and_its_labels_in_order(said, sentence):
+    module = torch.nn.Sequential(torch.nn.Flatten())
+    for name, value in {"input_px": 16, "labels": LABELS, **said}.items():
+        setattr(module, name, value)
+    with pytest.raises(Refused, match=sentence):
+        load_classifier(module)
+
+
 # ------------------------------------------------------------------------------------------------ the built-in network
 
 

@@ -158,6 +158,26 @@ def test_what_is_not_four_corners_is_refused(tmp_path, text, message):
         load_corners(coco(tmp_path / "p.json", CORNERS_PX, segmentation=[[0, 0, 9, 0, 9]]))
 
 
+UNLABELED = [v for x, y in CORNERS_PX.tolist()[:3] for v in (x, y, 2)] + [0, 0, 0]
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        None,
+        {"segmentation": {"counts": [3, 5], "size": [480, 360]}},
+        {"image_id": 7},
+        {"keypoints": UNLABELED},
+        {"keypoints": [0] * 12},
+    ],
+)
+def test_a_file_without_any_corners_is_refused(tmp_path, more):
+    path = tmp_path / "c.csv"
+    path.write_text(corners_csv({})) if more is None else coco(path := tmp_path / "c.json", CORNERS_PX, **more)
+    with pytest.raises(Refused, match=r"corners of the design in .*c\.(csv|json), got none of any photograph: name"):
+        load_corners(path)
+
+
 @pytest.fixture(scope="module")
 def printed(tmp_path_factory):
     """A print that exists, larger than its scene's page, on which the scene's own piece would not lie either: run/,
@@ -187,6 +207,7 @@ def test_a_print_that_exists_is_promised_photographed_and_judged(printed):
     report = judged(folder, folder / "some.csv", "report")
     assert [photo.status for photo in report.photos] == ["measured"] * 3 + ["rejected"]
     assert report.photos[3].code == "no_corners" and report.summary.judged == 3
+    assert "FILE does not name this photograph: add it there" in report.photos[3].remark.advice
     assert any("corners of 2 other" in line or "corners of 1 other" in line for line in report.summary.left_out)
     assert "3 photographs were located by the design alone" in "".join(report.summary.not_measured.values())
     data = json.loads((folder / "report" / "coco.json").read_text())
@@ -203,6 +224,24 @@ def test_the_one_file_of_a_print_without_a_page_is_named_once(printed, tmp_path,
     (_, run), out = printed, tmp_path / "print.json"
     assert command("sheet", run.folder, "--out", out) == 0
     assert capsys.readouterr().out.splitlines()[-1] == f"sheet {run.scene.sheet_id} (design): {out}"
+
+
+def test_what_needs_a_page_is_refused_for_a_print_without_one(printed, tmp_path, capsys):
+    (folder, run), out = printed, tmp_path / "print.json"
+    sheet_of(run, tmp_path / "there.json")
+    picture, scene = folder / "run" / "design.png", folder / "scene.toml"
+    for words, code, said in (
+        (["sheet", run.folder, "--out", out, "--check"], 1, "Expected a page for --check and --copies, got"),
+        (["sheet", run.folder, "--out", out, "--copies", 3], 1, "a print without one: leave them out"),
+        (["sheet", run.folder, run.folder, "--out", out], 1, "a page for a sheet together, got prints without one"),
+        (["reprint", tmp_path / "there.json", "--n", 1, "--out", out], 2, "prints without a page need --run RUN"),
+        (["import", picture, scene, "--out", tmp_path / "o", "--as-printed", "120x120mm"], 2, "mm, without the unit"),
+    ):
+        assert command(*words) == code
+        assert said in " ".join(capsys.readouterr().err.replace("│", " ").split()), words
+    with pytest.raises(Refused, match=r"a page to repeat, got a print without one: leave copies out\.$"):
+        sheet_of(run, out, copies=3)
+    assert [path.name for path in tmp_path.iterdir()] == ["there.json"]
 
 
 def test_corners_outside_of_the_picture_are_said(printed):

@@ -28,6 +28,7 @@ from patchproof.base.progress import Compute
 from patchproof.channel.printer import identity_printer, load_printer
 from patchproof.classifier import Classifier
 from patchproof.evidence.appearance import _cross_fitted_cells, fit_cells, match_design
+from patchproof.evidence.classify import judges_of
 from patchproof.evidence.gather import gather_evidence
 from patchproof.evidence.locate import pinhole_photo
 from patchproof.evidence.measure import measure
@@ -494,3 +495,31 @@ def test_folders_and_judges_that_will_not_do_are_refused_in_a_sentence(tmp_path)
     for model, words in ((other, "the promise's own network net"), (retrained, "got SHA-256 cdcdcdcdcdcd")):
         with pytest.raises(Refused, match=words):
             gather_evidence(tmp_path, make_manifest(promise()), Options([model], identity_printer()))
+
+
+@pytest.mark.parametrize(
+    ("label", "accept", "indices", "labels", "refused"),
+    [
+        ("Street_Sign", (), (1,), ("mug", "street sign, post", "cup"), None),
+        ("mug", ("cup",), (0, 2), ("mug", "sign", "cup"), None),
+        (1, ("cup",), (1, 2), ("mug", "sign", "cup"), None),
+        ("mug", (), (0,), ("cup", "mug"), r'mug as label 0 of net, as promised, got "cup": give it back'),
+        ("mug", ("cup",), (0, 1), ("mug", "sign"), r'mug or cup as label 0 or 1 of net, .* got "mug" or "sign"'),
+        ("mug", ("cup",), (0, 2), ("mug", "sign", "rug"), r'got "mug" or "rug"'),
+        ("mug", (), (5,), ("mug", "sign"), "mug as label 5 of net, as promised, got none"),
+        (1, (), (0,), ("mug", "sign"), '1 as label 0 of net, as promised, got "mug"'),
+    ],
+)
+def test_the_labels_of_the_promised_network_stay_at_their_indices(label, accept, indices, labels, refused):
+    promised = promise()
+    promised["target"] |= {"label": str(label), "indices": indices}
+    settings = {"target": {"label": label, "accept": accept}}
+    manifest = make_manifest(promised).changed(settings=settings)
+    network = Classifier("net", "ab" * 32, 32, labels, brightness)
+    other = Classifier("other", None, 32, ("cup", "sign", "street sign", "mug"), brightness)
+    if refused is None:
+        found = judges_of([network, other], manifest)
+        assert found is not None and found.indices["net"] == indices
+        return
+    with pytest.raises(Refused, match=refused):
+        judges_of([network], manifest)

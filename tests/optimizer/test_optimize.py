@@ -506,7 +506,7 @@ def test_texels_are_to_the_byte_those_of_one_thread_before_processes_share_views
     assert (on_two - alone).abs().max() < 1e-6, "two threads round otherwise, by no more"
 
 
-def test_a_draft_gets_the_promise_that_it_would_have_had(tmp_path, few_views):
+def test_a_draft_gets_the_promise_that_it_would_have_had(tmp_path, few_views, monkeypatch):
     scene = toml(tmp_path / "scene.toml")
     optimize_scene(scene, tmp_path / "whole")
     draft = optimize_scene(scene, tmp_path / "draft", promise=PromiseOptions(views=8))
@@ -518,6 +518,14 @@ def test_a_draft_gets_the_promise_that_it_would_have_had(tmp_path, few_views):
         promise_run(tmp_path / "draft", views=4, trust=True)
     with pytest.raises(Refused, match="a finished run, got none"):
         promise_run(tmp_path / "nothing")
+    more = promise_run(tmp_path / "draft", views=promised.promise.n + 4, trust=True).promise
+    stored = (tmp_path / "draft" / "run.json").read_bytes()
+    with pytest.raises(Refused, match=rf"{more.n} views or more, as the promise has now, got 8: ask for {more.n}"):
+        promise_run(tmp_path / "draft", views=8, trust=True)
+    monkeypatch.setattr("os.access", lambda *_: False)
+    with pytest.raises(Refused, match=r"written to, got .*draft: allow that, or use a copy of the run\.$"):
+        promise_run(tmp_path / "draft", trust=True)
+    assert (tmp_path / "draft" / "run.json").read_bytes() == stored
 
 
 def test_runs_are_not_overwritten_unasked_nor_resumed_with_another_seed(tmp_path, few_views):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import math
 import subprocess
 import sys
@@ -131,6 +132,18 @@ def test_a_text_file_a_cut_file_and_a_missing_one_are_unreadable(tmp_path):
         with pytest.raises(PhotoRejected) as caught:
             read_photo(tmp_path / name)
         assert caught.value.code == "unreadable" and caught.value.advice
+
+
+def test_a_photograph_that_may_not_be_read_says_so(tmp_path, monkeypatch):
+    def refuse(path):
+        raise PermissionError(errno.EACCES, "Permission denied", str(path))
+
+    (tmp_path / "a.jpg").touch()
+    monkeypatch.setattr(read, "open_lazily", refuse)
+    with pytest.raises(PhotoRejected) as caught:
+        read_photo(tmp_path / "a.jpg")
+    said = "a.jpg cannot be read (Permission denied): allow that, or copy it again"
+    assert (caught.value.code, caught.value.advice) == ("unreadable", said)
 
 
 @pytest.mark.parametrize("subsampling", ["4:4:4", "4:2:2", "4:2:0"])

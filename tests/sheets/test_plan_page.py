@@ -55,6 +55,13 @@ def test_edges_of_a_piece_on_a_box(tmp_path, spin):
         assert (inked[-1] + 1 - inked[0]) / px_per_mm == pytest.approx(length, rel=0.01, abs=1 / px_per_mm)
 
 
+def test_a_long_thin_side_has_a_plan_of_few_pixels(tmp_path):
+    trimesh.creation.box((1000, 50, 50)).export(tmp_path / "bar.ply")
+    text = SCENE.replace("primitive:carton", "bar.ply").replace("length_mm = 300", "length_mm = 1000")
+    text = text.replace("= 90", "= 45").replace("[500, 900]", "[600, 900]")
+    assert draw_plan_view(scene_of(tmp_path, text), A4).picture.shape == (30, 600, 3)
+
+
 def test_edges_of_a_real_mesh_add_up_to_what_another_reader_measures(tmp_path, data):
     path = data / "meshes" / "gz_suv.glb"
     extents = trimesh.load(path, force="mesh").extents

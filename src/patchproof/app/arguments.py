@@ -102,7 +102,7 @@ def _resolved(hint: Any, module: str, value: Any) -> Any:
 
 
 def _checked_value(value: Any, hint: Any, key: str, owner: str) -> Any:
-    """Return an argument's value; refused if it does not fit its annotation or is below the least number of its key."""
+    """Return an argument's value; refused if it does not fit its annotation or is out of the range of its key."""
     if isinstance(value, np.generic) and not isinstance(value, str):
         value = value.item()
     if (misfit := _misfit(value, hint)) is not None:
@@ -111,8 +111,9 @@ def _checked_value(value: Any, hint: Any, key: str, owner: str) -> Any:
         if isinstance(value, str) and re.search(r"\b(Sequence|tuple)\[str", wanted):
             advice = f'write a list: ["{value}"]'
         raise Refused(f"{key} of {owner} as {wanted}", misfit, advice)
-    if key in _LEAST and isinstance(value, int) and value < _LEAST[key]:
-        raise Refused(f"{key} of {owner} of {_LEAST[key]} or more", f"{value}", "give a larger one")
+    if key in _LEAST and isinstance(value, int) and not _LEAST[key] <= value < 2**32:
+        expected = f"{key} of {owner} of {_LEAST[key]} or more (below 2**32)"
+        raise Refused(expected, f"{value}", "give a number in that range")
     if (kind := type(value).__name__) in _OPTIONS:
         fields = {name: (getattr(value, name), part) for name, part in get_type_hints(type(value)).items()}
         return type(value)(**{name: _checked_value(field, part, name, kind) for name, (field, part) in fields.items()})

@@ -170,9 +170,9 @@ def _range(checks: tuple[Any, ...]) -> str:
     low = max(((value, name == "gt") for name, value in bounds if name in ("ge", "gt")), default=None)
     high = min(((value, name == "le") for name, value in bounds if name in ("le", "lt")), default=None)
     if low and high and (low[1], high[1]) == (False, True):
-        return f", {low[0]:g} to {high[0]:g}"
-    above = f", {'>' if low[1] else '≥'} {low[0]:g}" if low else ""
-    return above + (f", {'≤' if high[1] else '<'} {high[0]:g}" if high else "")
+        return f", {low[0]:.10g} to {high[0]:.10g}"
+    above = f", {'>' if low[1] else '≥'} {low[0]:.10g}" if low else ""
+    return above + (f", {'≤' if high[1] else '<'} {high[0]:.10g}" if high else "")
 
 
 def _bounds(checks: tuple[Any, ...]) -> list[tuple[str, Any]]:

@@ -17,6 +17,7 @@ from patchproof.base.validation import (
     NotNegativeRange,
     Positive,
     PositiveRange,
+    RandomSeed,
     Range,
     Share,
     ShareRange,
@@ -143,12 +144,12 @@ class ViewSettings(StrictModel):
 
     look_at: Literal["object", "patch"] = "object"  # the camera looks at the middle of this
     look_at_jitter: Share = 0.05  # largest miss of that middle, as a share of the object's length
-    front: Literal["patch"] | Side = "patch"  # the patch or side that cameras and lights at azimuth 0 face
+    front: Literal["patch", Side] = "patch"  # the patch or side that cameras and lights at azimuth 0 face
     azimuth_deg: Range = (-60.0, 60.0)  # of the camera about the vertical
     elevation_deg: Annotated[Range, within(-89, 89)] = (2.0, 27.0)  # of the camera above the horizontal
     distance_mm: PositiveRange = (440.0, 800.0)  # from the camera's center to what it looks at
     roll_deg: Range = (-5.0, 5.0)  # of the camera about its axis
-    fov_deg: Annotated[Positive, Field(lt=170)] = 50.0  # field of view across the picture's shorter side
+    fov_deg: Annotated[Finite, Field(ge=1, lt=170)] = 50.0  # field of view across the picture's shorter side
     zoom: PositiveRange = (0.9, 1.1)  # of a photographed scene's pictures about their middle
     patch_share: ShareRange = (0.1, 0.3)  # the piece's longer side over a picture's shorter side, in folders of images
 
@@ -225,7 +226,7 @@ class OptimizeSettings(StrictModel):
     # As many cores as there are batches share a step; with 1 and 4, one core takes 1.5 and 0.7 times as long for a view
     # (built-in network), 1.2 and 0.9 times (MobileNetV2). The number of cores changes no byte, this does.
     views_per_batch: Annotated[int, Field(ge=1)] = 2  # conditions of a step that one process renders together
-    seed: Annotated[int, Field(ge=0)] = 0  # of all random draws
+    seed: RandomSeed = 0  # of all random draws
     optimizer: Literal["adam", "sign"] = "adam"  # Adam, or the signed steps of FGSM and PGD
     # With 0.0075, 0.015, 0.03 and 0.05 designs of six pairs of object and network were recognized in 73, 74, 71 and
     # 69 % of unseen views; a step that decays over the run did no better.
@@ -270,6 +271,8 @@ class SceneSettings(StrictModel):
             raise ValueError(message)
         if self.patch.kind == "patch" and self.object.photos is None and self.patch.width_mm is None:
             raise ValueError("add patch.width_mm and patch.height_mm")
+        if not any((*self.light.ambient, *self.light.directional)):
+            raise ValueError("raise light.ambient or light.directional: every picture would be black")
         if self.object.photos is not None and not self.sheet.markers:
             raise ValueError(
                 "leave out sheet.markers with object.photos: the print has the markers of their blank sheet"

@@ -33,6 +33,7 @@ def check_ordered(pair: tuple[float, float]) -> tuple[float, float]:
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[Finite, Field(gt=0)]
 NotNegative = Annotated[Finite, Field(ge=0)]
+RandomSeed = Annotated[int, Field(ge=0, le=2**32 - 1)]
 Share = Annotated[Finite, Field(ge=0, le=1)]
 Range = Annotated[tuple[Finite, Finite], AfterValidator(check_ordered)]
 ShareRange = Annotated[tuple[Share, Share], AfterValidator(check_ordered)]

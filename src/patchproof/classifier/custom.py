@@ -8,7 +8,7 @@ N×3×S×S sRGB in [0, 1], its normalization inside, and returns N×K logits; on
 
 import importlib
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence, Set
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ from patchproof.base.errors import Refused
 from patchproof.classifier.detector import Detector
 from patchproof.classifier.head_decoder import HeadDecoder, spread_labels
 from patchproof.classifier.heads import head_of
-from patchproof.classifier.network import NO_BOX_LOGIT, Classifier, weights_sha256
+from patchproof.classifier.network import INPUT_PX, NO_BOX_LOGIT, Classifier, weights_sha256
 
 MAX_DETECTIONS = 1000  # boxes in a picture, for networks that find any number of them
 
@@ -38,9 +38,8 @@ def load_custom(dotted: str, base: Path) -> Classifier:
 
 def labeled_module(module: object, name: str) -> Classifier:
     """The Classifier of a torch module that has its `input_px` and `labels` as attributes; anything else is refused."""
-    input_px, labels = getattr(module, "input_px", None), getattr(module, "labels", ())
-    has_labels = bool(labels) and not isinstance(labels, str)
-    if not isinstance(module, torch.nn.Module) or not isinstance(input_px, int) or not has_labels:
+    input_px, labels = getattr(module, "input_px", None), getattr(module, "labels", None)
+    if not isinstance(module, torch.nn.Module) or input_px is None or labels is None:
         do = "give it input_px (an int) and labels (a list of names), or wrap it with classifier_of"
         got = f"an object of type {type(module).__name__}"
         raise Refused(f"a torch.nn.Module with input_px and labels as {name}", got, do)
@@ -65,8 +64,7 @@ def classifier_of(
     Raises:
         Refused: for what cannot be called with a batch of pictures.
     """
-    _check_callable(network)
-    labels = tuple(map(str, labels))
+    labels = _checked_labels(network, input_px, labels, name, 2)
     return Classifier(name, weights_sha256(network), input_px, labels, _in_evaluation_mode(network))
 
 
@@ -78,16 +76,22 @@ def detector_of(
     picture a dictionary of `boxes` M×4, `labels` M and `scores` M, as torchvision has them. Best before suppression and
     with low scores among them: only what is found can be made surer.
     """
-    _check_callable(network)
+    labels = _checked_labels(network, input_px, labels, name, 1)
     decoder = HeadDecoder(name, len(labels), input_px, head_of(head, name) if isinstance(head, str | dict) else None)
     candidates = AsCandidates(_in_evaluation_mode(network), decoder)
-    return Detector(name, weights_sha256(network), input_px, tuple(map(str, labels)), candidates)
+    return Detector(name, weights_sha256(network), input_px, labels, candidates)
 
 
-def _check_callable(network: object) -> None:
-    """Refuse an ExportedProgram, a path, a list of weights, and anything else that cannot be called."""
+def _checked_labels(network: object, input_px: object, labels: Any, name: str, least: int) -> tuple[str, ...]:
+    """Labels in order, `least` at least; refused is what cannot be called: an ExportedProgram, a list of weights."""
     if callable(network) and not isinstance(network, type | torch.export.ExportedProgram):
-        return
+        if type(input_px) is not int or input_px not in INPUT_PX:
+            raise Refused("input_px, a whole number from 8 to 4096", f"{input_px!r} in {name}", "give its side in px")
+        names = () if isinstance(labels, str | Mapping | Set) else tuple(map(str, labels))
+        if len(names) < least:
+            expected = f"labels, a list of {least} or more names"
+            raise Refused(expected, f"{str(labels)[:60]} in {name}", "list them in the order of its outputs")
+        return names
     exported = isinstance(network, torch.export.ExportedProgram)
     do = "call its .module() first" if exported else "give the module itself, or load a file with load_classifier"
     got = "an ExportedProgram" if exported else f"an object of type {type(network).__name__}"

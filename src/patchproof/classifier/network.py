@@ -21,6 +21,7 @@ from patchproof.base.fingerprint import value_sha256
 from patchproof.base.text import brief, short_repr
 from patchproof.networks.batches import BatchedNetwork, Windows
 
+INPUT_PX = range(8, 4097)  # sides of the squares that networks may take
 NO_BOX_LOGIT = -20.0  # the logit where no candidate of a detector lies on the object: a score of 2e-9
 
 

@@ -22,7 +22,7 @@ from patchproof.base.validation import summarize_names
 from patchproof.classifier.detector import Detector
 from patchproof.classifier.head_decoder import HeadDecoder
 from patchproof.classifier.heads import Head, head_of
-from patchproof.classifier.network import Classifier
+from patchproof.classifier.network import INPUT_PX, Classifier
 from patchproof.networks.batches import BatchedNetwork
 from patchproof.networks.bounds import UnsupportedNetwork, quote
 from patchproof.networks.onnx_file import read_onnx
@@ -129,7 +129,7 @@ def read_card(path: Path) -> Card:
     if isinstance(labels, str):
         advice = "put the list of labels there"
         labels = read_json(path.parent / Path(labels).name, "a JSON file", advice, advice)
-    if type(input_px) is not int or not 8 <= input_px <= 4096:
+    if type(input_px) is not int or input_px not in INPUT_PX:
         raise Refused("input_px, a whole number of pixels from 8 to 4096", f"{input_px!r} in {path}", do)
     if not isinstance(labels, list) or len(labels) < 2 or {*map(type, labels)} != {str}:
         raise Refused("labels, a list of two or more names", f"{str(labels)[:60]} in {path}", do)

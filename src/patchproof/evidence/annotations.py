@@ -125,7 +125,7 @@ def load_boxes(path: str | Path, label: str) -> dict[str, Drawn]:
 
 def load_corners(path: str | Path) -> dict[str, Drawn]:
     """Load corners by the photograph's name in the file, and by its last part if that is unique. Refused are other than
-    four points, points that do not run clockwise round a convex shape, and a photograph named twice.
+    four points, points that do not run clockwise round a convex shape, a photograph named twice, and none at all.
     """
     corners: dict[str, Drawn] = {}
     for name, named in _read_csv_rows(path) if Path(path).suffix.lower() == ".csv" else _read_points(path):
@@ -134,6 +134,8 @@ def load_corners(path: str | Path) -> dict[str, Drawn]:
             raise Refused(f"four points in each photograph of {path}", f"{got} of {name}", _ORDER)
         refuse_twisted(named, name, path)
         corners[name] = named
+    if not corners:
+        raise Refused(f"corners of the design in {path}", "none of any photograph", _ORDER)
     return _with_last_parts(corners)
 
 
@@ -160,7 +162,7 @@ def _read_points(path: str | Path) -> Iterator[tuple[str, Drawn]]:
     for each in coco.annotations:
         polygons = each.segmentation if isinstance(each.segmentation, tuple) else ()
         numbers = tuple(v for i, v in enumerate(each.keypoints) if i % 3 < 2) or sum(polygons, ())
-        if numbers and each.image_id in images:  # others are boxes of something
+        if numbers and all(each.keypoints[2::3]) and each.image_id in images:  # else boxes, or unlabeled: v = 0
             name, size_px = images[each.image_id]
             yield name, Drawn(numbers, size_px)
 

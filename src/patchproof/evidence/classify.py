@@ -40,7 +40,7 @@ class Judges:
 
 def judges_of(models: "Sequence[Classifier]", manifest: Manifest) -> Judges | None:
     """Combine the networks with the sheet's target; None if the sheet has no promise. Refused are networks without the
-    promise's own one, and another file under its name.
+    promise's own one, and another file, or other labels, under its name.
     """
     if manifest.promise is None:
         return None
@@ -130,14 +130,24 @@ def _strip_weights(side: int, size: int) -> list[tuple[slice, csr_array]]:
 
 
 def target_indices(model: "Classifier", promise: Promise, settings: Mapping[str, Any]) -> tuple[int, ...]:
-    """Indices of the labels that count as recognized; for the promise's primary network, the promise's own."""
+    """Indices of the labels that count as recognized; refused where the primary network's are not those promised."""
     from patchproof.classifier import find_labels
 
-    target = promise.target
-    if model.name == promise.models[0].name and max(target.indices) < len(model.labels):
-        return target.indices
-    target_settings = settings.get("target", {})
-    return find_labels(model.labels, target_settings.get("label", target.label), target_settings.get("accept", ()))
+    target, told = promise.target, settings.get("target") or {}
+    label, accept = told.get("label", target.label), told.get("accept", ())
+    label = label if str(label) == target.label else target.label  # an index is text there
+    is_primary, indices = model.name == promise.models[0].name, ()
+    try:
+        indices = find_labels(model.labels, label, accept)
+    except Refused:
+        if not is_primary:
+            raise
+    if is_primary and indices != target.indices:
+        names, places = (" or ".join(map(str, each)) for each in ((label, *accept), target.indices))
+        expected = f"{names} as label {places} of {model.name}, as promised"
+        got = " or ".join(f'"{model.labels[i]}"' if i < len(model.labels) else "none" for i in target.indices)
+        raise Refused(expected, got, "give it back the labels it had, or make the sheet again")
+    return indices
 
 
 def predict(model: "Classifier", indices: tuple[int, ...], square: np.ndarray, box: BoxEdges | None) -> Prediction:

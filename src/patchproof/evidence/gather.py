@@ -107,6 +107,11 @@ def gather_evidence(
     journal_file = closing(Journal(journal, settings_key(manifest, options), resume)) if journal else nullcontext()
     with journal_file as open_journal, open_workers(compute.jobs, compute.cluster) as workers:
         results = measure_all(task, items, judges, workers, open_journal, on_pictures, advance)
+        if options.corners and not options.find:
+            advice = "--corners FILE does not name this photograph: add it there, or add --find"
+            for number, (item, result) in enumerate(zip(items, results, strict=True)):
+                if item.corners is None and result.entry.code == "no_corners":
+                    results[number] = replace(result, entry=result.entry.changed(remark={"advice": advice}))
         grouping = merge_folders(grouping, results[:count])
         patch_photos = reject_copies(results[:count], grouping.merged, task.surface.rect_mm)
         squares: list[PhotoSquare | None] = []

@@ -4,6 +4,7 @@ In: a run. Out: RUN/evaluate.json with, per network, rate, confidence and paired
 come from the evaluate stream, which neither training nor the promise uses.
 """
 
+import os
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -12,7 +13,7 @@ from pathlib import Path
 from patchproof.base.errors import Refused
 from patchproof.base.folder_lock import lock_folder
 from patchproof.base.goal import Goal
-from patchproof.base.input import is_file
+from patchproof.base.input import is_file, is_folder
 from patchproof.base.output import write_atomically
 from patchproof.base.progress import Advance, Compute, Progress, no_progress
 from patchproof.base.validation import StrictModel
@@ -120,11 +121,15 @@ def promise_run(
 ) -> Run:
     """Promise the rate of a finished run's design again, from `views` views and with the run's own controls; the run is
     the same to the byte as if `optimize` had been given these views. A sheet keeps its promise until it is written
-    again. For `trust` see `load_run`.
+    again. Fewer views than the run's promise has are refused. For `trust` see `load_run`.
     """
     compute, options = compute.without("promise", cluster=True), PromiseOptions(views)
+    if is_folder(run_folder) and not os.access(run_folder, os.W_OK):
+        raise Refused("a run's folder that can be written to", f"{run_folder}", "allow that, or use a copy of the run")
     with lock_folder(run_folder):
         run = load_run(run_folder, trust)
+        if (n := views or PROMISE_VIEWS) < (present := run.promise.n):
+            raise Refused(f"{present} views or more, as the promise has now", f"{n}", f"ask for {present} or more")
         options = replace(options, controls=tuple(run.promise.controls))
         problem = set_problem(run.scene, compute.device, jobs=compute.jobs)
         promise = promise_of(problem, run.design, options, partial(progress, "promise"))

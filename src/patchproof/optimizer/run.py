@@ -15,11 +15,11 @@ from dataclasses import dataclass, replace
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from pydantic import BaseModel, Field
+from pydantic import BaseModel
 
 from patchproof.base import output
 from patchproof.base.errors import Refused
@@ -30,7 +30,7 @@ from patchproof.base.output import CHECKPOINT_FILE, RUN_FILE, require_finished_r
 from patchproof.base.progress import Advance, Compute, Progress, no_progress
 from patchproof.base.settings import SceneSettings, load_scene_settings, named_paths
 from patchproof.base.text import short_repr
-from patchproof.base.validation import refuse_untrusted, validate_model
+from patchproof.base.validation import RandomSeed, refuse_untrusted, validate_model
 from patchproof.base.version import __version__
 from patchproof.classifier.network import Classifier
 from patchproof.optimizer.expectation import last_pictures
@@ -267,7 +267,7 @@ class _Record(BaseModel):
     settings: SceneSettings
     promise: Promise
     scene_folder: str
-    seed: Annotated[int, Field(ge=0)]
+    seed: RandomSeed
     sheet_id: str
     printer: dict[str, Any]
     inputs: dict[str, str] = {}

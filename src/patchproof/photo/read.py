@@ -95,6 +95,8 @@ def read_photo(path: str | Path) -> Photo:
             advice = "the file is gone: copy it again"
         elif kind == "UnidentifiedImageError":
             advice = f"{path.name} is not a picture of a known kind: save it as JPEG or PNG"
+        elif isinstance(error, OSError) and error.errno:
+            advice = f"{path.name} cannot be read ({error.strerror}): allow that, or copy it again"
         raise PhotoRejected("unreadable", None, None, advice) from error
 
 

@@ -224,9 +224,10 @@ def plan_picture(
 
 def on_white(scene: MeshSceneType, size_px: tuple[int, int], **view: Any) -> MeshSceneType:
     """The scene before white, in pictures of (width, height) pixels by a camera without distortion."""
-    settings = scene.settings.changed(view=view, camera={"photo_px": size_px, "file": None})
+    changes, settings = {"view": view, "camera": {"photo_px": size_px, "file": None}}, scene.settings
+    tables = {name: getattr(settings, name).model_copy(update=each) for name, each in changes.items()}
     white = load_backgrounds(BackgroundSettings(color=(1.0, 1.0, 1.0)), Path())
-    return replace(scene, settings=settings, backgrounds=white, camera=None)
+    return replace(scene, settings=settings.model_copy(update=tables), backgrounds=white, camera=None)
 
 
 def _pixel_rows(pictures: Tensor) -> Tensor:

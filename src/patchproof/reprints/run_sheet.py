@@ -15,10 +15,11 @@ from typing import Any
 
 import numpy as np
 
+from patchproof.base.errors import Refused
 from patchproof.base.geometry import rect_border, rect_corners
 from patchproof.base.output import check_file
 from patchproof.base.sessions import split_evenly
-from patchproof.base.settings import SceneSettings, background_summary
+from patchproof.base.settings import NO_PAGE, SceneSettings, background_summary
 from patchproof.base.validation import NETWORK_FILE
 from patchproof.evidence import verdict
 from patchproof.optimizer.promise import PROMISE_VIEWS
@@ -79,7 +80,8 @@ def sheet_of_several(
     """Write one page with the designs of several runs, and a manifest for each; on the first run's template unless
     another is named.
     """
-    name = template or runs[0].scene.settings.sheet.template
+    if (name := template or runs[0].scene.settings.sheet.template) == NO_PAGE:
+        raise Refused("a page for a sheet together", "prints without one", "write each by itself, or add --template")
     page, contents = load_template(name), [content_of(run, name, control, Path(pdf_path).parent) for run in runs]
     plans = [plan_of(scene, page, content) for content, scene in contents] if page.plan_page else []
     return write_several(pdf_path, page, [content for content, _ in contents], plans)

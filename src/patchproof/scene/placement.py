@@ -269,7 +269,7 @@ def largest_fitting_size(
     size_mm: tuple[float, float], fits: Callable[[tuple[float, float]], object], least_mm: float
 ) -> tuple[float, float] | None:
     """Return the largest piece of this shape that fits, in whole millimeters; None if `least_mm` does not."""
-    low, high = least_mm / min(size_mm), 1.0
+    low, high = least_mm / max(min(size_mm), 1e-9), 1.0  # a flat mesh has sides of no extent
     if low > 1 or not fits(_scaled(size_mm, low)):
         return None
     if fits(_scaled(size_mm, high)):

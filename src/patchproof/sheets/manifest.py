@@ -302,5 +302,7 @@ def dump_manifest(manifest: Manifest) -> str:
 def load_manifest(path: str | Path) -> Manifest:
     """Load a SHEET.json; refused if it is missing, damaged, or not a manifest."""
     missing = "name the JSON that was written beside the PDF"
+    if Path(path).suffix.lower() == ".pdf":
+        raise Refused("a manifest (SHEET.json)", f"{path}, a PDF", missing)
     data = read_json(path, "a manifest (SHEET.json)", "make the sheet again", missing)
     return validate_model(Manifest, data, str(path))

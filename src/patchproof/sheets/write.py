@@ -44,6 +44,8 @@ def write_sheet(
         if Path(pdf_path).suffix != ".json":
             expected = "a file name that ends in .json, since this print has no page"
             raise Refused(expected, f'"{pdf_path}"', "name it PRINT.json, or a template for a page")
+        if copies > 1:
+            raise Refused("a page to repeat", "a print without one", "leave copies out")
         size_mm = content.piece.size_mm
         manifest = content.manifest(PageLayout(size_mm), None, (0.0, 0.0, *size_mm))
         write_atomically(Path(pdf_path), dump_manifest(manifest))

@@ -21,7 +21,7 @@ from patchproof.base.version import __version__
 
 Overwrite = Annotated[bool, Option("--overwrite", help="Replace this command's earlier output.")]
 Device = Annotated[str, Option(help="cpu or cuda.")]
-Seed = Annotated[int | None, Option(min=0, help="In place of the scene's own seed.")]
+Seed = Annotated[int | None, Option(min=0, max=2**32 - 1, help="In place of the scene's own seed.")]
 Resume = Annotated[bool, Option("--resume", help="Continue a stopped run.")]
 Jobs = Annotated[
     int | None, Option(min=1, help="Local processes, one for each free core; any number gives the same results.")
@@ -167,6 +167,6 @@ def pair_of(text: str, option: str) -> tuple[float, float]:
         if not (0 < x < float("inf") and 0 < y < float("inf")):
             raise ValueError
     except ValueError:
-        needed = "takes one or two positive numbers, such as 0.97 or 0.97x0.98"
+        needed = "takes one or two numbers in mm, without the unit, such as 120 or 97.1x97.3"
         raise BadParameter(needed, param_hint=option) from None
     return x, y

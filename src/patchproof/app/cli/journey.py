@@ -164,7 +164,7 @@ def sheet(
 ) -> None:
     """Write the page: design, markers, chart and rulers at true size."""
     from patchproof.base.output import check_file
-    from patchproof.base.settings import background_summary
+    from patchproof.base.settings import NO_PAGE, background_summary
     from patchproof.sheets.blank import blank_page
     from patchproof.sheets.print_advice import SHOP_ADVICE, sheet_advice
     from patchproof.sheets.template import template_summaries
@@ -188,6 +188,8 @@ def sheet(
         from patchproof.reprints.run_sheet import sheet_of_several
 
         loaded, content = [load_run(folder, trust) for folder in runs], {"template": template, "control": control}
+        if (check or copies > 1) and (template or loaded[0].scene.settings.sheet.template) == NO_PAGE:
+            raise Refused("a page for --check and --copies", f"{runs[0]}, a print without one", "leave them out")
         if len(runs) > 1:
             manifests = sheet_of_several(loaded, out, **content)
         else:
@@ -226,8 +228,8 @@ def reprint(
 
     how = ReprintSetup(printer, print_scale, control)
     if run is None:
-        if control is not None or sessions > 1:
-            raise BadParameter("controls and sessions are of a run's sheet; name the run", param_hint="--run")
+        if control is not None or sessions > 1 or pdf.suffix == ".json":
+            raise BadParameter("controls, sessions and prints without a page need --run RUN", param_hint="--run")
         reprint_pages(pdf, n, out, how, seed=seed, overwrite=overwrite)
         return say(f"{n} photographs: {out}")
     finished_run = load_run(run, trust)
