@@ -212,7 +212,7 @@ def test_promises_in_the_readme_are_those_by_the_default_conditions():
     off = student_mean(100 * (seen - promised))
     said = f"{count} of {n} sessions that a path tracer photographed, "
     said += f"{off.value:+.1f} points [{off.low:.1f}, {off.high:.1f}] beyond them"
-    assert len(seen) == 10 and said in words(README)
+    assert len(seen) == 20 and said in words(README)
 
 
 def test_our_photographs_differ_from_the_path_tracers_as_it_is_said():
