@@ -15,7 +15,7 @@ from patchproof.evidence.measure import measure
 from patchproof.evidence.surface import printed_colors, surface_of
 from patchproof.evidence.task import promised_ranges
 from patchproof.photo import detect
-from patchproof.photo.find_design import SMALLEST_PRINT_PX, find_design
+from patchproof.photo.find_design import SMALLEST_PRINT_PX, find_design, refuse_other_order
 from patchproof.photo.read import Photo
 from patchproof.photo.rejection import PhotoRejected
 from patchproof.sheets.markers import aruco_dictionary
@@ -114,6 +114,17 @@ def test_a_mirrored_sign_is_none_that_lies_upside_down(side_px):
     assert rejection_of(mirrored, sign()).code == "mirrored"
     disc = np.ascontiguousarray(sign(lettered=False)[:, ::-1])
     assert find_design(photograph((disc, expected)), disc[:, ::-1].copy(), (100.0, 100.0)).located == "found"
+
+
+@pytest.mark.parametrize("turn", [1, 2, 3])
+def test_corners_named_in_another_order_are_refused_unless_the_design_looks_alike_when_turned(turn):
+    for design in (sign(), blocks(6), smooth(2)):
+        srgb, named = photograph((design, corners(150))), corners(150) + 2.0
+        refuse_other_order(srgb, design, (100.0, 100.0), named)
+        with pytest.raises(PhotoRejected, match="named in another order"):
+            refuse_other_order(srgb, design, (100.0, 100.0), np.roll(named, turn, 0))
+    disc = sign(lettered=False)
+    refuse_other_order(photograph((disc, corners(150))), disc, (100.0, 100.0), np.roll(corners(150), turn, 0))
 
 
 def test_a_print_that_was_found_is_measured_like_one_whose_corners_were_named():

@@ -55,6 +55,9 @@ _NOT_FOUND_ADVICE = (
 )
 _SMALL_ADVICE = "the design is too small to be found with certainty: come closer"
 _MIRRORED_ADVICE = "the photo is mirrored: switch off the camera's mirror setting and save it again"
+_ORDER_ADVICE = (
+    "its corners are named in another order: begin with the design's own top left corner, then go round clockwise"
+)
 _SEVERAL_ADVICE = "more than one print of the design is in view: photograph one at a time"
 
 
@@ -102,6 +105,13 @@ def find_design(srgb: np.ndarray, design: np.ndarray, size_mm: tuple[float, floa
     if side_px < SMALLEST_PRINT_PX:
         raise PhotoRejected("too_small", side_px, SMALLEST_PRINT_PX, _SMALL_ADVICE)
     return DesignCorners(place.corners_px, place.sigma_px, "found")
+
+
+def refuse_other_order(srgb: np.ndarray, design: np.ndarray, size_mm: tuple[float, float], corners_px: np.ndarray):
+    """Raise `PhotoRejected` if the design fits clearly better with another corner 4×2 px first, or mirrored."""
+    place, turn = _best_turn(srgb, design, size_mm, corners_px)
+    if turn:
+        raise PhotoRejected("no_corners", place.likeness, LEAST_LIKENESS, _ORDER_ADVICE)
 
 
 def _best_turn(
