@@ -15,7 +15,7 @@ from patchproof.evidence.measure import measure
 from patchproof.evidence.surface import printed_colors, surface_of
 from patchproof.evidence.task import promised_ranges
 from patchproof.photo import detect
-from patchproof.photo.find_design import SMALLEST_PRINT_PX, find_design
+from patchproof.photo.find_design import SMALLEST_PRINT_PX, find_design, refuse_other_order
 from patchproof.photo.read import Photo
 from patchproof.photo.rejection import PhotoRejected
 from patchproof.sheets.markers import aruco_dictionary
@@ -32,6 +32,14 @@ def blocks(seed: int) -> np.ndarray:
 def smooth(seed: int) -> np.ndarray:
     rng = np.random.default_rng(seed)
     return cv2.resize(rng.integers(0, 256, (8, 8, 3), np.uint8), (64, 64), interpolation=cv2.INTER_CUBIC)
+
+
+def sign(lettered: bool = True) -> np.ndarray:
+    """A red disc on white; its letters look nearly alike when turned and mirrored."""
+    design = cv2.circle(np.full((200, 200, 3), 255, np.uint8), (199, 199), 120, (220, 30, 40), -1, shift=1)
+    if lettered:
+        cv2.putText(design, "GO", (63, 116), cv2.FONT_HERSHEY_SIMPLEX, 1.5, (255, 255, 255), 8)
+    return design
 
 
 def photograph(*prints: tuple[np.ndarray, np.ndarray], seed: int = 0) -> np.ndarray:
@@ -95,6 +103,28 @@ def test_other_designs_mirrored_ones_and_two_prints_are_rejected_by_name():
     assert rejection_of(photograph((blocks(4)[:, ::-1], corners(140))), blocks(4)).code == "mirrored"
     two = photograph((blocks(4), corners(110, (110, 170))), (blocks(4), corners(110, (330, 180))))
     assert rejection_of(two, blocks(4)).code == "several_sheets"
+
+
+@pytest.mark.parametrize("side_px", [160, 110])
+def test_a_mirrored_sign_is_none_that_lies_upside_down(side_px):
+    expected = corners(side_px)
+    found = find_design(photograph((sign(), expected)), sign(), (100.0, 100.0))
+    assert np.abs(found.px - expected).max() < 1
+    mirrored = photograph((sign()[:, ::-1], corners(side_px)))
+    assert rejection_of(mirrored, sign()).code == "mirrored"
+    disc = np.ascontiguousarray(sign(lettered=False)[:, ::-1])
+    assert find_design(photograph((disc, expected)), disc[:, ::-1].copy(), (100.0, 100.0)).located == "found"
+
+
+@pytest.mark.parametrize("turn", [1, 2, 3])
+def test_corners_named_in_another_order_are_refused_unless_the_design_looks_alike_when_turned(turn):
+    for design in (sign(), blocks(6), smooth(2)):
+        srgb, named = photograph((design, corners(150))), corners(150) + 2.0
+        refuse_other_order(srgb, design, (100.0, 100.0), named)
+        with pytest.raises(PhotoRejected, match="named in another order"):
+            refuse_other_order(srgb, design, (100.0, 100.0), np.roll(named, turn, 0))
+    disc = sign(lettered=False)
+    refuse_other_order(photograph((disc, corners(150))), disc, (100.0, 100.0), np.roll(corners(150), turn, 0))
 
 
 def test_a_print_that_was_found_is_measured_like_one_whose_corners_were_named():

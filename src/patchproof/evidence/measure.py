@@ -12,6 +12,7 @@ from functools import partial
 
 import numpy as np
 
+from patchproof.base.color import photo_codes_from_srgb, srgb_from_linear
 from patchproof.base.geometry import MM_PER_INCH, apply_homography, rect_corners
 from patchproof.evidence.appearance import MOST_CLIPPED, MOST_NOISE, DesignMatch, appearance
 from patchproof.evidence.locate import MOST_SHIFT, PinholePhoto, camera_pose, geometry_of, locate_sheet, object_box
@@ -98,13 +99,17 @@ def measure(
     try:
         detected, surface = identify_sheet(view.srgb, surface)
     except PhotoRejected as rejection:
-        if corners is None and find is not None and rejection.code in UNLOCATED_CODES:
-            from patchproof.photo.find_design import find_design
+        if (corners or find is not None) and promised is not None and rejection.code in UNLOCATED_CODES:
+            from patchproof.photo.find_design import find_design, refuse_other_order
 
             try:
-                corners = find_design(view.srgb, find, surface.rect_mm[2:])
+                if corners is None and find is not None:
+                    corners = find_design(view.srgb, find, surface.rect_mm[2:])
+                elif corners is not None:
+                    design = photo_codes_from_srgb(srgb_from_linear(promised.design))
+                    refuse_other_order(view.srgb, design, surface.rect_mm[2:], corners.px)
             except PhotoRejected as not_found:
-                rejection = not_found
+                rejection, corners = not_found, None
         if corners is None or promised is None or rejection.code not in UNLOCATED_CODES:
             return MeasuredPhoto(PhotoEntry(file=name, status="rejected", remark=Remark.of(rejection)), False)
         detected, surface = MarkersInView({}, (), ()), surface.without_markers

@@ -33,6 +33,9 @@ SEARCHED_PX = 1600  # longer side of the picture in which places are proposed
 SMALLEST_PRINT_PX = 60.0  # of the design's shorter side there
 # of 110 photographs without the print, half of them of other prints of its kind, none had both over 0.6 and 5.6
 LEAST_LIKENESS, LEAST_SIGNIFICANCE = 0.6, 7.0
+# of significance: how much better a mirrored design fits, or one begun at another corner; where it also differs from
+# the design itself by this share of its variance
+_MIRRORED_BY, _TURNED_BY, _LEAST_DIFFERENCE = 0.25, 2.0, 0.005
 _FEATURE_SIZES_PX = (64, 128, 256, 512)  # of the drawn design's longer side
 _NEIGHBORS = 3  # photograph's features that may be a feature of the design
 _MOST_MATCHES = 2000
@@ -52,6 +55,9 @@ _NOT_FOUND_ADVICE = (
 )
 _SMALL_ADVICE = "the design is too small to be found with certainty: come closer"
 _MIRRORED_ADVICE = "the photo is mirrored: switch off the camera's mirror setting and save it again"
+_ORDER_ADVICE = (
+    "its corners are named in another order: begin with the design's own top left corner, then go round clockwise"
+)
 _SEVERAL_ADVICE = "more than one print of the design is in view: photograph one at a time"
 
 
@@ -92,12 +98,49 @@ def find_design(srgb: np.ndarray, design: np.ndarray, size_mm: tuple[float, floa
         raise PhotoRejected("no_corners", best, LEAST_LIKENESS, _NOT_FOUND_ADVICE)
     if len(found) > 1:
         raise PhotoRejected("several_sheets", len(found), 1, _SEVERAL_ADVICE)
-    scale = min(1.0, SEARCHED_PX / max(srgb.shape[:2]))
-    side_px = scale * detect.side_px(found[0].corners_px)
+    place, _ = _best_turn(srgb, design, size_mm, found[0].corners_px)
+    place = place if place.significance > found[0].significance + _TURNED_BY else found[0]
+    side_px = min(1.0, SEARCHED_PX / max(srgb.shape[:2])) * detect.side_px(place.corners_px)
     side_px *= float(np.sqrt(min(size_mm) / max(size_mm)))
     if side_px < SMALLEST_PRINT_PX:
         raise PhotoRejected("too_small", side_px, SMALLEST_PRINT_PX, _SMALL_ADVICE)
-    return DesignCorners(found[0].corners_px, found[0].sigma_px, "found")
+    return DesignCorners(place.corners_px, place.sigma_px, "found")
+
+
+def refuse_other_order(srgb: np.ndarray, design: np.ndarray, size_mm: tuple[float, float], corners_px: np.ndarray):
+    """Raise `PhotoRejected` if the design fits clearly better with another corner 4×2 px first, or mirrored."""
+    place, turn = _best_turn(srgb, design, size_mm, corners_px)
+    if turn:
+        raise PhotoRejected("no_corners", place.likeness, LEAST_LIKENESS, _ORDER_ADVICE)
+
+
+def _best_turn(
+    srgb: np.ndarray, design: np.ndarray, size_mm: tuple[float, float], corners_px: np.ndarray
+) -> tuple[FoundPlace, int]:
+    """The place that fits best of those refined with each of the corners 4×2 px first, and the first one's index; 0
+    unless another fits clearly better. Raises `PhotoRejected` if the mirrored design does. Turns and mirror images that
+    look like the design itself do not count.
+    """
+    mirror = np.ascontiguousarray(design[:, ::-1])
+    own, mirrored = (
+        [refiner.refine(np.roll(corners_px, -turn, 0)) for turn in range(4)]
+        for refiner in (_Refiner(srgb, design, size_mm), _Refiner(srgb, mirror, size_mm))
+    )
+    nowhere = FoundPlace(corners_px, 0.0, 0.0, np.inf)
+    own, mirrored = ([place if place and place.accepted else nowhere for place in places] for places in (own, mirrored))
+    sure, sure_mirrored = (np.array([place.significance for place in places]) for places in (own, mirrored))
+    if sure_mirrored.max() > sure.max() + _MIRRORED_BY and all(_differences(mirror, design)):
+        raise PhotoRejected("mirrored", None, None, _MIRRORED_ADVICE)
+    turn = int(sure.argmax())
+    turn = turn if sure[turn] > sure[0] + _TURNED_BY and _differences(design, design)[turn] else 0
+    return own[turn], turn
+
+
+def _differences(design: np.ndarray, other: np.ndarray) -> list[bool]:
+    """For each of the four turns of a design, whether it differs clearly from another one."""
+    design, other = (cv2.resize(each, (64, 64), interpolation=cv2.INTER_AREA).astype(float) for each in (design, other))
+    least = _LEAST_DIFFERENCE * other.var((0, 1)).mean()
+    return [bool(((np.rot90(design, turn) - other) ** 2).mean() > least) for turn in range(4)]
 
 
 def find_places(
@@ -307,7 +350,7 @@ class _SmallDesign:
             error = np.clip(seen - self.colors @ mixture, -1.5, 1.5) * self.weight
             slopes = np.einsum("nft,fc->nct", self.by_term, mixture.astype(np.float32))
             hessian = np.einsum("nct,ncs,c->ts", slopes, slopes, self.weight, optimize=True)
-            hessian += 1e-7 * np.trace(hessian) * np.eye(8)
+            hessian += (1e-7 * np.trace(hessian) + 1e-9) * np.eye(8)  # a plain design has no slopes
             step = np.linalg.solve(hessian, slopes.reshape(-1, 8).T @ error.ravel())
             a, b, c, d, e, f, g, h = np.clip(step, -0.2, 0.2)
             px_from_unit = px_from_unit @ np.linalg.inv([[1 + a, b, c], [d, 1 + e, f], [g, h, 1]])
