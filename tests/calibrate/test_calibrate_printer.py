@@ -241,7 +241,7 @@ def test_a_chart_page_is_rehearsed_without_a_printer(tmp_path):
     read_well = np.isfinite(read.light).all(1)
     error = color_difference(srgb_from_linear(read.light), srgb_from_linear(light[:-1] / light[-1]))[read_well]
     assert read_well.sum() >= 40 and error.mean() < 1.5
-    with pytest.raises(typer.BadParameter, match="of a run's sheet"):
+    with pytest.raises(typer.BadParameter, match="need --run RUN"):
         cli.app([*rehearsed, "--sessions", "2", "--out", str(tmp_path / "other")], standalone_mode=False)
     for scale in ("inf", "nan", "0"):
         with pytest.raises(typer.BadParameter, match="should be"):
