@@ -14,6 +14,7 @@ from PIL import Image
 from pypdfium2 import PdfDocument
 
 from patchproof.app.verify import CaptureInfo, verify
+from patchproof.base.color import linear_from_srgb
 from patchproof.base.errors import Refused
 from patchproof.base.geometry import apply_homography, rect_corners
 from patchproof.channel.printer import load_printer
@@ -80,6 +81,26 @@ def test_corners_that_are_off_are_corrected_by_the_design(photo, off_px):
     assert error_px < 0.7 and error_px / entry.geometry.px_per_mm < entry.geometry.corner_uncertainty_mm
     assert 0.4 < entry.geometry.blur_px < 1.5
     assert entry.geometry.contrast == pytest.approx(0.8, rel=0.1), "of light 0.8 on paper, read from the design"
+
+
+def test_cells_of_a_smooth_design_in_other_colors_move_no_exact_corners():
+    """The promise's printer shows these colors otherwise, which shifts what is similar by several pixels."""
+    codes = np.random.default_rng(3).integers(0, 256, (4, 4, 3), np.uint8)
+    design = np.asarray(Image.fromarray(codes).resize((140, 140), Image.Resampling.BICUBIC))
+    page = np.full((2000, 1750, 3), 0.2, np.float32)
+    page[600:, 350:] = linear_from_srgb(design / 255.0).repeat(10, 0).repeat(10, 1)
+    seen = paper.photograph(page, PX_FROM_MM, SIZE_PX, blur_px=0.8, noise=0.004, fine=2)
+    entry = entry_of(seen, CORNERS_PX, design)
+    found = apply_homography(np.array(entry.geometry.homography_px_from_mm), rect_corners(paper.DESIGN_MM))
+    assert np.linalg.norm(found - CORNERS_PX, axis=1).max() < 1
+    assert entry.code != "curled"
+
+
+def test_what_is_said_of_a_print_without_markers_names_none(photo):
+    shifted = photo.copy()
+    shifted[:180] = np.roll(shifted[:180], 5, 1)
+    for entry in (entry_of(shifted, CORNERS_PX, sigma_px=0.1), entry_of(photo, CORNERS_PX, design_of(5))):
+        assert entry.code in ("curled", "other_design") and "marker" not in entry.remark.advice
 
 
 @pytest.mark.parametrize("wrong", ["far off", "another corner first", "another design", "one color"])

@@ -51,6 +51,7 @@ _SQUARELY_ADVICE = "look at the patch more squarely: so far from the side its ce
 _FEW_MARKERS_ADVICE = "show more of the piece: its markers fix where it lies"
 _FEW_AGREE_ADVICE = "too few markers agree to tell flat paper from bent: show all of the piece"
 _NOT_FLAT_ADVICE = "the markers lie neither in a plane nor on rolled paper: press the sheet flat and show all of it"
+_NOT_FLAT_PRINT_ADVICE = "the design does not lie as a flat print would: press it flat, and name its corners exactly"
 _NOT_ROLLED_ADVICE = (
     "the markers do not lie as on paper that is rolled in one direction: show all of the piece from nearer to the "
     "middle of its bend, and glue down what stands off the surface"
@@ -244,7 +245,9 @@ def _trouble(
     cosine = float(np.cos(np.radians(tilt)))
     closer_advice = _SQUARELY_ADVICE if side_px >= SMALLEST_DESIGN_PX * cosine**0.5 else _COME_CLOSER_ADVICE
     uncertain_advice = _SQUARELY_ADVICE if uncertainty * cosine <= most_uncertainty else _COME_CLOSER_ADVICE
-    bent_advice = _NOT_ROLLED_ADVICE if surface.bent else _NOT_FLAT_ADVICE
+    bent_advice, shifted_advice = _NOT_ROLLED_ADVICE if surface.bent else _NOT_FLAT_ADVICE, _SHIFTED_ADVICE
+    if not surface.corners_mm:
+        bent_advice = shifted_advice = _NOT_FLAT_PRINT_ADVICE
     for fails, code, figure, limit, advice in (
         (tilt > MOST_TILT_DEG, "tilted", tilt, MOST_TILT_DEG, "look at the patch less from the side"),
         (blur > most_blur, "blurred", blur, most_blur, "hold still, tap to focus on the patch, or use more light"),
@@ -253,7 +256,7 @@ def _trouble(
         (bent, "curled", residual, most_residual, bent_advice),
         (bend > most_bend, "curled", bend, most_bend, bent_advice),
         (fit.outlier_mm > MOST_OUTLIER * side_mm, "curled", fit.outlier_mm, MOST_OUTLIER * side_mm, bent_advice),
-        (shift > most_shift, "curled", shift, most_shift, _SHIFTED_ADVICE),
+        (shift > most_shift, "curled", shift, most_shift, shifted_advice),
         (uncertain and 0 < markers < 3, "too_few_markers", markers, 3, _FEW_MARKERS_ADVICE),
         (uncertain, "too_small", uncertainty, most_uncertainty, uncertain_advice),
         (corners < 4, "too_few_markers", corners, 4, _HIDDEN_ADVICE),

@@ -10,9 +10,10 @@ cell's light are not independent from pixel to pixel (other inks, a shadow), so 
 
 A print without markers is located by its design's corners, named by a person or found by a search. They are a start:
 the design's cells are registered round it, and all of them together with the corners give the homography, so that
-corners may be off by 5 % of the design's side. Where too few cells have detail the corners alone give it. Without white
-paper and black ink of markers, light is a gain and a veil per channel that take the promised cells to the photographed
-ones. A channel without contrast leaves its veil unknown, which is taken as none.
+corners may be off by 5 % of the design's side. The corners alone give it where too few cells have detail, and where the
+cells disagree among each other and contradict the corners by little more. Without white paper and black ink of markers,
+light is a gain and a veil per channel that take the promised cells to the photographed ones. A channel without contrast
+leaves its veil unknown, which is taken as none.
 """
 
 from dataclasses import dataclass
@@ -37,6 +38,9 @@ _INDEPENDENT_ERRORS = 16
 _ROUNDS, _CONVERGED_PX = 3, 0.1  # of registration: cells are found within 5 % of the shorter side
 _LEAST_CELLS = 8  # with a place of their own, to correct corners
 _CELL_NOISE_PX = 0.05  # least standard deviation of a cell's place
+# Other colors than promised shift a smooth design's cells by up to 8 times what they state. Cells whose median error is
+# over one stated deviation, and over half of the corners' own, do not move corners by less than 2.5 times that error.
+_DOUBTFUL_CELLS, _DOUBTFUL_SHARE, _DOUBTFUL_REACH = 1.0, 0.5, 2.5
 _LIGHT_SIDE_PX = 192  # of the design's shorter side, where blur and light are read
 _BLURS_PX = (0.0, 0.4, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0)
 
@@ -136,7 +140,8 @@ def place_design(
     """Locate a design, of promised light H×W×3 over `rect_mm` and black `ink` (3,), in a uint8 photograph."""
     corners_mm, middle_mm = rect_corners(rect_mm), (rect_mm[0] + rect_mm[2] / 2, rect_mm[1] + rect_mm[3] / 2)
     sigma_px = np.full(4, corners.sigma_px)
-    fit = fit_points(corners_mm, corners.px, sigma_px)
+    fit = named = fit_points(corners_mm, corners.px, sigma_px)
+    mm = px = sigmas = np.zeros(0)
     for _ in range(_ROUNDS):
         px_per_mm = local_scale(fit.px_from_mm, middle_mm)[0]
         cells = register(srgb, fit.px_from_mm, rect_mm, design, px_per_mm, 1.0)
@@ -150,6 +155,11 @@ def place_design(
         moved = apply_homography(fit.px_from_mm, corners_mm) - apply_homography(before.px_from_mm, corners_mm)
         if np.abs(moved).max() < _CONVERGED_PX:
             break
+    if len(mm) > 4:
+        off_px = np.linalg.norm(apply_homography(fit.px_from_mm, mm) - px, axis=1)
+        error_px, errors = (float(np.median(off[4:])) for off in (off_px, off_px / sigmas))
+        least_px = max(_DOUBTFUL_SHARE * corners.sigma_px, float(np.sqrt(np.mean(off_px[:4] ** 2))) / _DOUBTFUL_REACH)
+        fit = named if errors > _DOUBTFUL_CELLS and error_px > least_px else fit
     return PlacedDesign(fit, *_blur_and_light(srgb, fit.px_from_mm, rect_mm, design, ink))
 
 

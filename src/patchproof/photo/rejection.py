@@ -25,7 +25,7 @@ REJECTION_CODES = {
     "curled": ("paper or design lie neither in a plane nor on rolled paper", "press it flat, glue it down"),
     "cropped": ("an undeclared crop moved the picture's center", "use the photograph as the camera wrote it"),
     "copy": ("another file shows the same photograph", "leave one of them"),
-    "other_design": ("what is printed between the markers is not this design", "name the sheet that was printed"),
+    "other_design": ("what is printed is not this design", "name the sheet that was printed"),
     "wrong_ink": ("an ink is missing or another one", "print again with all inks"),
     "no_corners": ("a print without markers was not found", "add --find or --corners"),
 }
