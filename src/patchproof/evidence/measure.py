@@ -245,9 +245,8 @@ def _trouble(
     cosine = float(np.cos(np.radians(tilt)))
     closer_advice = _SQUARELY_ADVICE if side_px >= SMALLEST_DESIGN_PX * cosine**0.5 else _COME_CLOSER_ADVICE
     uncertain_advice = _SQUARELY_ADVICE if uncertainty * cosine <= most_uncertainty else _COME_CLOSER_ADVICE
-    bent_advice, shifted_advice = _NOT_ROLLED_ADVICE if surface.bent else _NOT_FLAT_ADVICE, _SHIFTED_ADVICE
-    if not surface.corners_mm:
-        bent_advice = shifted_advice = _NOT_FLAT_PRINT_ADVICE
+    advices = _NOT_ROLLED_ADVICE if surface.bent else _NOT_FLAT_ADVICE, _SHIFTED_ADVICE
+    bent_advice, shifted_advice = advices if surface.corners_mm else 2 * (_NOT_FLAT_PRINT_ADVICE,)
     for fails, code, figure, limit, advice in (
         (tilt > MOST_TILT_DEG, "tilted", tilt, MOST_TILT_DEG, "look at the patch less from the side"),
         (blur > most_blur, "blurred", blur, most_blur, "hold still, tap to focus on the patch, or use more light"),

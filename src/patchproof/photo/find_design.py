@@ -33,8 +33,7 @@ SEARCHED_PX = 1600  # longer side of the picture in which places are proposed
 SMALLEST_PRINT_PX = 60.0  # of the design's shorter side there
 # of 110 photographs without the print, half of them of other prints of its kind, none had both over 0.6 and 5.6
 LEAST_LIKENESS, LEAST_SIGNIFICANCE = 0.6, 7.0
-# of significance: how much better a mirrored design fits, or one begun at another corner; where it also differs from
-# the design itself by this share of its variance
+# of significance, by which a mirrored or turned design fits better; of variance, by which it differs from the design
 _MIRRORED_BY, _TURNED_BY, _LEAST_DIFFERENCE = 0.25, 2.0, 0.005
 _FEATURE_SIZES_PX = (64, 128, 256, 512)  # of the drawn design's longer side
 _NEIGHBORS = 3  # photograph's features that may be a feature of the design
@@ -55,9 +54,7 @@ _NOT_FOUND_ADVICE = (
 )
 _SMALL_ADVICE = "the design is too small to be found with certainty: come closer"
 _MIRRORED_ADVICE = "the photo is mirrored: switch off the camera's mirror setting and save it again"
-_ORDER_ADVICE = (
-    "its corners are named in another order: begin with the design's own top left corner, then go round clockwise"
-)
+_ORDER_ADVICE = "its corners are named in another order: begin with the design's own top left one, then clockwise"
 _SEVERAL_ADVICE = "more than one print of the design is in view: photograph one at a time"
 
 
@@ -114,33 +111,22 @@ def refuse_other_order(srgb: np.ndarray, design: np.ndarray, size_mm: tuple[floa
         raise PhotoRejected("no_corners", place.likeness, LEAST_LIKENESS, _ORDER_ADVICE)
 
 
-def _best_turn(
-    srgb: np.ndarray, design: np.ndarray, size_mm: tuple[float, float], corners_px: np.ndarray
-) -> tuple[FoundPlace, int]:
-    """The place that fits best of those refined with each of the corners 4×2 px first, and the first one's index; 0
-    unless another fits clearly better. Raises `PhotoRejected` if the mirrored design does. Turns and mirror images that
-    look like the design itself do not count.
+def _best_turn(srgb: np.ndarray, design: np.ndarray, size_mm, corners_px: np.ndarray) -> tuple[FoundPlace, int]:
+    """The place refined from corners 4×2 px with the first, or another that fits clearly better, as the design's first;
+    and its index. Raises `PhotoRejected` if the mirrored design fits better. Images like the design itself don't count.
     """
-    mirror = np.ascontiguousarray(design[:, ::-1])
-    own, mirrored = (
-        [refiner.refine(np.roll(corners_px, -turn, 0)) for turn in range(4)]
-        for refiner in (_Refiner(srgb, design, size_mm), _Refiner(srgb, mirror, size_mm))
-    )
-    nowhere = FoundPlace(corners_px, 0.0, 0.0, np.inf)
-    own, mirrored = ([place if place and place.accepted else nowhere for place in places] for places in (own, mirrored))
-    sure, sure_mirrored = (np.array([place.significance for place in places]) for places in (own, mirrored))
-    if sure_mirrored.max() > sure.max() + _MIRRORED_BY and all(_differences(mirror, design)):
+    mirror, nowhere = np.ascontiguousarray(design[:, ::-1]), FoundPlace(corners_px, 0.0, 0.0, np.inf)
+    refiners, turned = (_Refiner(srgb, each, size_mm) for each in (design, mirror)), range(4)
+    places = [[each.refine(np.roll(corners_px, -turn, 0)) or nowhere for turn in turned] for each in refiners]
+    own, mirrored = (np.array([place.significance * place.accepted for place in each]) for each in places)
+    small = [cv2.resize(each, (64, 64), interpolation=cv2.INTER_AREA).astype(float) for each in (design, mirror)]
+    least = _LEAST_DIFFERENCE * small[0].var((0, 1)).mean()
+    differ = [[((np.rot90(each, turn) - small[0]) ** 2).mean() > least for turn in turned] for each in small]
+    if mirrored.max() > own.max() + _MIRRORED_BY and all(differ[1]):
         raise PhotoRejected("mirrored", None, None, _MIRRORED_ADVICE)
-    turn = int(sure.argmax())
-    turn = turn if sure[turn] > sure[0] + _TURNED_BY and _differences(design, design)[turn] else 0
-    return own[turn], turn
-
-
-def _differences(design: np.ndarray, other: np.ndarray) -> list[bool]:
-    """For each of the four turns of a design, whether it differs clearly from another one."""
-    design, other = (cv2.resize(each, (64, 64), interpolation=cv2.INTER_AREA).astype(float) for each in (design, other))
-    least = _LEAST_DIFFERENCE * other.var((0, 1)).mean()
-    return [bool(((np.rot90(design, turn) - other) ** 2).mean() > least) for turn in range(4)]
+    turn = int(own.argmax())
+    turn = turn if own[turn] > own[0] + _TURNED_BY and differ[0][turn] else 0
+    return places[0][turn], turn
 
 
 def find_places(

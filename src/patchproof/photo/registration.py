@@ -38,8 +38,8 @@ _INDEPENDENT_ERRORS = 16
 _ROUNDS, _CONVERGED_PX = 3, 0.1  # of registration: cells are found within 5 % of the shorter side
 _LEAST_CELLS = 8  # with a place of their own, to correct corners
 _CELL_NOISE_PX = 0.05  # least standard deviation of a cell's place
-# Other colors than promised shift a smooth design's cells by up to 8 times what they state. Cells whose median error is
-# over one stated deviation, and over half of the corners' own, do not move corners by less than 2.5 times that error.
+# cells off by over a stated deviation, in the median, and over half of the corners' (other colors than promised shift
+# smooth designs) move no corners by less than 2.5 times that
 _DOUBTFUL_CELLS, _DOUBTFUL_SHARE, _DOUBTFUL_REACH = 1.0, 0.5, 2.5
 _LIGHT_SIDE_PX = 192  # of the design's shorter side, where blur and light are read
 _BLURS_PX = (0.0, 0.4, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0)
@@ -139,9 +139,8 @@ def place_design(
 ) -> PlacedDesign:
     """Locate a design, of promised light H×W×3 over `rect_mm` and black `ink` (3,), in a uint8 photograph."""
     corners_mm, middle_mm = rect_corners(rect_mm), (rect_mm[0] + rect_mm[2] / 2, rect_mm[1] + rect_mm[3] / 2)
-    sigma_px = np.full(4, corners.sigma_px)
-    fit = named = fit_points(corners_mm, corners.px, sigma_px)
-    mm = px = sigmas = np.zeros(0)
+    mm, px, sigmas = corners_mm, corners.px, np.full(4, corners.sigma_px)
+    fit = named = fit_points(mm, px, sigmas)
     for _ in range(_ROUNDS):
         px_per_mm = local_scale(fit.px_from_mm, middle_mm)[0]
         cells = register(srgb, fit.px_from_mm, rect_mm, design, px_per_mm, 1.0)
@@ -150,7 +149,7 @@ def place_design(
             break
         cells_px = apply_homography(fit.px_from_mm, (cells.middle_mm + cells.shift_mm)[sure])
         mm, px = np.concatenate([corners_mm, cells.middle_mm[sure]]), np.concatenate([corners.px, cells_px])
-        sigmas = np.concatenate([sigma_px, np.hypot(cells.sigma_mm[sure] * px_per_mm, _CELL_NOISE_PX)])
+        sigmas = np.concatenate([sigmas[:4], np.hypot(cells.sigma_mm[sure] * px_per_mm, _CELL_NOISE_PX)])
         fit, before = fit_points(mm, px, sigmas, fit.px_from_mm), fit
         moved = apply_homography(fit.px_from_mm, corners_mm) - apply_homography(before.px_from_mm, corners_mm)
         if np.abs(moved).max() < _CONVERGED_PX:
