@@ -35,6 +35,7 @@ SMALLEST_PRINT_PX = 60.0  # of the design's shorter side there
 LEAST_LIKENESS, LEAST_SIGNIFICANCE = 0.6, 7.0
 # of significance, by which a mirrored or turned design fits better; of variance, by which it differs from the design
 _MIRRORED_BY, _TURNED_BY, _LEAST_DIFFERENCE = 0.25, 2.0, 0.005
+_LEAST_LEAD = 0.1  # of significance, over the same place with another corner first or mirrored
 _FEATURE_SIZES_PX = (64, 128, 256, 512)  # of the drawn design's longer side
 _NEIGHBORS = 3  # photograph's features that may be a feature of the design
 _MOST_MATCHES = 2000
@@ -54,6 +55,7 @@ _NOT_FOUND_ADVICE = (
 )
 _SMALL_ADVICE = "the design is too small to be found with certainty: come closer"
 _MIRRORED_ADVICE = "the photo is mirrored: switch off the camera's mirror setting and save it again"
+_UNDIRECTED_ADVICE = "what was found fits as well when it is turned: show all of the design, or name its corners"
 _ORDER_ADVICE = "its corners are named in another order: begin with the design's own top left one, then clockwise"
 _SEVERAL_ADVICE = "more than one print of the design is in view: photograph one at a time"
 
@@ -95,7 +97,9 @@ def find_design(srgb: np.ndarray, design: np.ndarray, size_mm: tuple[float, floa
         raise PhotoRejected("no_corners", best, LEAST_LIKENESS, _NOT_FOUND_ADVICE)
     if len(found) > 1:
         raise PhotoRejected("several_sheets", len(found), 1, _SEVERAL_ADVICE)
-    place, _ = _best_turn(srgb, design, size_mm, found[0].corners_px)
+    place, _, lead = _best_turn(srgb, design, size_mm, found[0].corners_px)
+    if lead < _LEAST_LEAD:
+        raise PhotoRejected("no_corners", place.likeness, LEAST_LIKENESS, _UNDIRECTED_ADVICE)
     place = place if place.significance > found[0].significance + _TURNED_BY else found[0]
     side_px = min(1.0, SEARCHED_PX / max(srgb.shape[:2])) * detect.side_px(place.corners_px)
     side_px *= float(np.sqrt(min(size_mm) / max(size_mm)))
@@ -106,14 +110,15 @@ def find_design(srgb: np.ndarray, design: np.ndarray, size_mm: tuple[float, floa
 
 def refuse_other_order(srgb: np.ndarray, design: np.ndarray, size_mm: tuple[float, float], corners_px: np.ndarray):
     """Raise `PhotoRejected` if the design fits clearly better with another corner 4×2 px first, or mirrored."""
-    place, turn = _best_turn(srgb, design, size_mm, corners_px)
+    place, turn, _ = _best_turn(srgb, design, size_mm, corners_px)
     if turn:
         raise PhotoRejected("no_corners", place.likeness, LEAST_LIKENESS, _ORDER_ADVICE)
 
 
-def _best_turn(srgb: np.ndarray, design: np.ndarray, size_mm, corners_px: np.ndarray) -> tuple[FoundPlace, int]:
+def _best_turn(srgb: np.ndarray, design: np.ndarray, size_mm, corners_px: np.ndarray) -> tuple[FoundPlace, int, float]:
     """The place refined from corners 4×2 px with the first, or another that fits clearly better, as the design's first;
-    and its index. Raises `PhotoRejected` if the mirrored design fits better. Images like the design itself don't count.
+    its index; and its lead over others. Raises `PhotoRejected` if the mirrored design fits better. Images like the
+    design itself don't count.
     """
     mirror, nowhere = np.ascontiguousarray(design[:, ::-1]), FoundPlace(corners_px, 0.0, 0.0, np.inf)
     refiners, turned = (_Refiner(srgb, each, size_mm) for each in (design, mirror)), range(4)
@@ -124,9 +129,11 @@ def _best_turn(srgb: np.ndarray, design: np.ndarray, size_mm, corners_px: np.nda
     differ = [[((np.rot90(each, turn) - small[0]) ** 2).mean() > least for turn in turned] for each in small]
     if mirrored.max() > own.max() + _MIRRORED_BY and all(differ[1]):
         raise PhotoRejected("mirrored", None, None, _MIRRORED_ADVICE)
+    lead = float(own[0] - max((*own[differ[0]], *mirrored[differ[1]]), default=-np.inf))
     turn = int(own.argmax())
-    turn = turn if own[turn] > own[0] + _TURNED_BY and differ[0][turn] else 0
-    return places[0][turn], turn
+    if own[turn] > own[0] + _TURNED_BY and differ[0][turn]:
+        return places[0][turn], turn, np.inf
+    return places[0][0], 0, lead
 
 
 def find_places(
