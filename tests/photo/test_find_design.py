@@ -116,6 +116,13 @@ def test_a_mirrored_sign_is_none_that_lies_upside_down(side_px):
     assert find_design(photograph((disc, expected)), disc[:, ::-1].copy(), (100.0, 100.0)).located == "found"
 
 
+def test_a_part_of_a_sign_or_its_negative_is_not_taken_for_the_whole():
+    whole = photograph((sign(), corners(160)))
+    assert find_design(whole, sign(), (100.0, 100.0)).located == "found"
+    assert rejection_of(photograph((sign(), corners(620))), sign()).code == "no_corners"  # in a picture of 460 × 360 px
+    assert rejection_of(photograph((255 - sign(), corners(160))), sign()).code in ("no_corners", "several_sheets")
+
+
 @pytest.mark.parametrize("turn", [1, 2, 3])
 def test_corners_named_in_another_order_are_refused_unless_the_design_looks_alike_when_turned(turn):
     for design in (sign(), blocks(6), smooth(2)):
