@@ -105,33 +105,30 @@ def test_other_designs_mirrored_ones_and_two_prints_are_rejected_by_name():
     assert rejection_of(two, blocks(4)).code == "several_sheets"
 
 
-@pytest.mark.parametrize("side_px", [160, 110])
-def test_a_mirrored_sign_is_none_that_lies_upside_down(side_px):
-    expected = corners(side_px)
+def test_a_mirrored_sign_is_none_that_lies_upside_down():
+    expected = corners(110)
     found = find_design(photograph((sign(), expected)), sign(), (100.0, 100.0))
     assert np.abs(found.px - expected).max() < 1
-    mirrored = photograph((sign()[:, ::-1], corners(side_px)))
+    mirrored = photograph((sign()[:, ::-1], expected))
     assert rejection_of(mirrored, sign()).code == "mirrored"
-    disc = np.ascontiguousarray(sign(lettered=False)[:, ::-1])
-    assert find_design(photograph((disc, expected)), disc[:, ::-1].copy(), (100.0, 100.0)).located == "found"
 
 
 def test_a_part_of_a_sign_or_its_negative_is_not_taken_for_the_whole():
-    whole = photograph((sign(), corners(160)))
-    assert find_design(whole, sign(), (100.0, 100.0)).located == "found"
     assert rejection_of(photograph((sign(), corners(620))), sign()).code == "no_corners"  # in a picture of 460 × 360 px
     assert rejection_of(photograph((255 - sign(), corners(160))), sign()).code in ("no_corners", "several_sheets")
 
 
-@pytest.mark.parametrize("turn", [1, 2, 3])
-def test_corners_named_in_another_order_are_refused_unless_the_design_looks_alike_when_turned(turn):
-    for design in (sign(), blocks(6), smooth(2)):
-        srgb, named = photograph((design, corners(150))), corners(150) + 2.0
-        refuse_other_order(srgb, design, (100.0, 100.0), named)
-        with pytest.raises(PhotoRejected, match="named in another order"):
-            refuse_other_order(srgb, design, (100.0, 100.0), np.roll(named, turn, 0))
+@pytest.mark.parametrize(("design", "turn"), [(sign(), 1), (blocks(6), 2), (smooth(2), 3)])
+def test_corners_named_in_another_order_are_refused_unless_the_design_looks_alike_when_turned(design, turn):
+    srgb, named = photograph((design, corners(150))), corners(150) + 2.0
+    refuse_other_order(srgb, design, (100.0, 100.0), named)
+    with pytest.raises(PhotoRejected, match="named in another order"):
+        refuse_other_order(srgb, design, (100.0, 100.0), np.roll(named, turn, 0))
+
+
+def test_corners_of_a_disc_may_be_named_in_any_order():
     disc = sign(lettered=False)
-    refuse_other_order(photograph((disc, corners(150))), disc, (100.0, 100.0), np.roll(corners(150), turn, 0))
+    refuse_other_order(photograph((disc, corners(150))), disc, (100.0, 100.0), np.roll(corners(150), 1, 0))
 
 
 def test_a_print_that_was_found_is_measured_like_one_whose_corners_were_named():
