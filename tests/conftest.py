@@ -22,7 +22,7 @@ keep_freed_memory()
 sys.path += [str(folder) for folder in sorted(Path(__file__).parent.iterdir()) if folder.is_dir()]
 
 LONG = (  # of the files' names
-    *("types", "readme", "journey", "optimize", "first_hour", "kill_anywhere"),
+    *("types", "readme", "journey", "optimize", "first_hour", "kill_anywhere", "find_design"),
     *("flat_journey", "ledger", "verify_run", "photo_degraded", "sheet_pages", "calibrate_printer", "begin", "workers"),
 )
 
