@@ -43,6 +43,7 @@ _VOTE_SHARE, _VOTE_LOG_SIZE, _VOTE_RAD = 0.25, 0.4, 0.5  # matches that agree: o
 _LEAST_VOTES = 4
 _MOST_PLACES = 8  # of each source, refined
 _REFINED_PX = (24, 48, 128)  # of the design's longer side, from coarse to fine
+_HOPELESS = 0.25  # likeness at a coarse size, which finer ones do not raise to `LEAST_LIKENESS`
 # of the longer side: sigma of the mean that is subtracted; less for corners, which slow changes of light would move
 _SURROUNDINGS, _FINE_SURROUNDINGS = 1 / 6, 1 / 16
 _STEPS, _COLOR_STEPS, _MOST_SHIFT = 30, 10, 1 / 16
@@ -100,7 +101,8 @@ def find_design(srgb: np.ndarray, design: np.ndarray, size_mm: tuple[float, floa
     place, _, lead = _best_turn(srgb, design, size_mm, found[0].corners_px)
     if lead < _LEAST_LEAD:
         raise PhotoRejected("no_corners", place.likeness, LEAST_LIKENESS, _UNDIRECTED_ADVICE)
-    place = place if place.significance > found[0].significance + _TURNED_BY else found[0]
+    turned = place.significance > found[0].significance + _TURNED_BY
+    place = (turned and _Refiner(srgb, design, size_mm).refine(place.corners_px)) or found[0]
     side_px = min(1.0, SEARCHED_PX / max(srgb.shape[:2])) * detect.side_px(place.corners_px)
     side_px *= float(np.sqrt(min(size_mm) / max(size_mm)))
     if side_px < SMALLEST_PRINT_PX:
@@ -122,7 +124,7 @@ def _best_turn(srgb: np.ndarray, design: np.ndarray, size_mm, corners_px: np.nda
     """
     mirror, nowhere = np.ascontiguousarray(design[:, ::-1]), FoundPlace(corners_px, 0.0, 0.0, np.inf)
     refiners, turned = (_Refiner(srgb, each, size_mm) for each in (design, mirror)), range(4)
-    places = [[each.refine(np.roll(corners_px, -turn, 0)) or nowhere for turn in turned] for each in refiners]
+    places = [[each.refine(np.roll(corners_px, -turn, 0), False) or nowhere for turn in turned] for each in refiners]
     own, mirrored = (np.array([place.significance * place.accepted for place in each]) for each in places)
     small = [cv2.resize(each, (64, 64), interpolation=cv2.INTER_AREA).astype(float) for each in (design, mirror)]
     least = _LEAST_DIFFERENCE * small[0].var((0, 1)).mean()
@@ -271,8 +273,10 @@ class _Refiner:
         self.srgb, self.size_mm = srgb, size_mm
         self.template = cache(lambda px, surroundings: _SmallDesign(_draw(design, size_mm, px), surroundings))
 
-    def refine(self, quad: np.ndarray) -> FoundPlace | None:
-        """The refined place; None if it is none that a camera can see."""
+    def refine(self, quad: np.ndarray, closely: bool = True) -> FoundPlace | None:
+        """The refined place, or None if it is none that a camera can see. To compare directions it need not be done
+        `closely`: without mixed colors, and no further where the design is not like the picture.
+        """
         place = None
         for longer_px in _REFINED_PX:
             if not is_plausible_quad(quad) or not is_in_picture(quad, self.srgb):
@@ -283,7 +287,7 @@ class _Refiner:
             level = int(np.clip(np.log2(max(side_px / size, 1)), 0, len(self.levels) - 1))
             scale, template = self.srgb.shape[1] / self.levels[level].shape[1], self.template(size, _SURROUNDINGS)
             refined, likeness, sigma = template.align(self.levels[level], quad / scale)
-            if size in (most, _REFINED_PX[-1]) and likeness > LEAST_LIKENESS:
+            if closely and size in (most, _REFINED_PX[-1]) and likeness > LEAST_LIKENESS:
                 mixed = self.template(size, _FINE_SURROUNDINGS).align(self.levels[level], refined, mixes=True)
                 # where a part of a design is plain, mixtures of colors imitate shifts
                 if np.abs(mixed[0] - refined).max() * scale < _MOST_SHIFT * side_px:
@@ -291,7 +295,7 @@ class _Refiner:
             quad = refined * scale
             significance = float(np.arctanh(np.clip(likeness, -0.999, 0.999)) * np.sqrt(template.freedom))
             place = FoundPlace(quad, likeness, significance, sigma * scale)
-            if size == most:
+            if size == most or (not closely and likeness < _HOPELESS):
                 break
         return place if is_plausible_quad(quad) and is_in_picture(quad, self.srgb) else None
 
