@@ -21,7 +21,7 @@ from torch import Tensor
 
 from patchproof.base.color import lab_from_linear, lift_tone, linear_from_srgb, srgb_from_linear
 from patchproof.calibrate.chart import printer_of
-from patchproof.channel.printer import Printer, vary_print
+from patchproof.channel.printer import Printer, printer_output, vary_print
 
 _CENTER = (0.025, 0.025, 0.025, 0.0, 0.0, 0.0, 0.0, -0.075)  # of the terms in the default conditions
 _CENTERED = 100.0  # of the mean terms' squared distance from there: what all photographs share is in the ink
@@ -98,7 +98,7 @@ def fit_photo(cells: KnownColors, printer: Printer) -> np.ndarray:
 
 
 def _printed(code: np.ndarray, printer: Printer) -> Tensor:
-    return printer.apply(_tensor(code / 255).T[None, :, :, None])[0, :, :, 0].T.contiguous()
+    return _tensor(printer_output(printer, code / 255))
 
 
 def _distance(light: Tensor, seen: Tensor) -> Tensor:

@@ -18,8 +18,8 @@ def check_files(arguments: Mapping[str, Any]) -> None:
     """Refuse the first of a command's arguments whose file is missing, and settings and manifests that are wrong."""
     if not (thing := arguments.get("thing", "primitive:")).startswith("primitive:"):
         require_path("a mesh file, primitive:NAME or a folder of pictures", thing)
-    if isinstance(path := arguments.get("scene"), Path):  # the size of a print goes before the file's
-        _check_scene(path, {"width_mm": 100, "height_mm": 100} if arguments.get("as_printed") else {})
+    if isinstance(path := arguments.get("scene"), Path) and not arguments.get("as_printed"):  # else without its patch
+        _check_scene(path)
     for name, value in arguments.items():
         for path in value if isinstance(value, list) else [value]:
             if isinstance(path, Path) and name in _CHECKS:
@@ -32,8 +32,8 @@ def require_path(expected: str, path: str | Path) -> None:
         raise Refused(expected, f"no file at {path}", "check the path")
 
 
-def _check_scene(path: Path, patch: Mapping[str, Any]) -> None:
-    settings, base = load_scene_settings(path, patch=patch), path.resolve().parent
+def _check_scene(path: Path) -> None:
+    settings, base = load_scene_settings(path), path.resolve().parent
     paths = named_paths(settings, base)
     if Path(settings.printer.profile).suffix in (".npz", ".json"):
         paths["printer.profile"] = base / settings.printer.profile
