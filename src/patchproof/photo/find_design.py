@@ -15,7 +15,7 @@ MAGSAC++, CVPR 2020; Baker and Matthews, Lucas-Kanade 20 Years On, IJCV 2004 (in
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 
 import cv2
 import numpy as np
@@ -83,26 +83,38 @@ class FoundPlace:
         return any(cv2.pointPolygonTest(a.astype(np.float32), b.mean(0).tolist(), False) > 0 for a, b in pairs)
 
 
+class _Searched:
+    """A photograph, smaller copies of it, and its features: read once for all designs that are looked for."""
+
+    def __init__(self, srgb: np.ndarray):
+        self.srgb, self.levels, self.small = srgb, halving_pyramid(srgb), downscale(srgb, SEARCHED_PX)
+
+    @cached_property
+    def features(self) -> tuple[np.ndarray, np.ndarray]:
+        return _features(cv2.cvtColor(self.small, cv2.COLOR_RGB2GRAY))
+
+
 def find_design(srgb: np.ndarray, design: np.ndarray, size_mm: tuple[float, float]) -> DesignCorners:
     """Find the one print of a design (uint8 H×W×3, `size_mm` wide and high) in a uint8 photograph.
 
     Raises `PhotoRejected`: "no_corners" without a print, "too_small", "several_sheets", "mirrored".
     """
-    places = find_places(srgb, design, size_mm)
+    photo = _Searched(srgb)
+    places = _find_places(photo, design, size_mm)
     found = [place for place in places if place.accepted]
     if not found:
-        mirrored = find_places(srgb, np.ascontiguousarray(design[:, ::-1]), size_mm, by_templates=False)
+        mirrored = _find_places(photo, np.ascontiguousarray(design[:, ::-1]), size_mm, by_templates=False)
         if any(place.accepted for place in mirrored):
             raise PhotoRejected("mirrored", None, None, _MIRRORED_ADVICE)
         best = max((place.likeness for place in places), default=0.0)
         raise PhotoRejected("no_corners", best, LEAST_LIKENESS, _NOT_FOUND_ADVICE)
     if len(found) > 1:
         raise PhotoRejected("several_sheets", len(found), 1, _SEVERAL_ADVICE)
-    place, _, lead = _best_turn(srgb, design, size_mm, found[0].corners_px)
+    place, _, lead = _best_turn(photo, design, size_mm, found[0].corners_px)
     if lead < _LEAST_LEAD:
         raise PhotoRejected("no_corners", place.likeness, LEAST_LIKENESS, _UNDIRECTED_ADVICE)
     turned = place.significance > found[0].significance + _TURNED_BY
-    place = (turned and _Refiner(srgb, design, size_mm).refine(place.corners_px)) or found[0]
+    place = (turned and _Refiner(photo, design, size_mm).refine(place.corners_px)) or found[0]
     side_px = min(1.0, SEARCHED_PX / max(srgb.shape[:2])) * detect.side_px(place.corners_px)
     side_px *= float(np.sqrt(min(size_mm) / max(size_mm)))
     if side_px < SMALLEST_PRINT_PX:
@@ -112,18 +124,18 @@ def find_design(srgb: np.ndarray, design: np.ndarray, size_mm: tuple[float, floa
 
 def refuse_other_order(srgb: np.ndarray, design: np.ndarray, size_mm: tuple[float, float], corners_px: np.ndarray):
     """Raise `PhotoRejected` if the design fits clearly better with another corner 4×2 px first, or mirrored."""
-    place, turn, _ = _best_turn(srgb, design, size_mm, corners_px)
+    place, turn, _ = _best_turn(_Searched(srgb), design, size_mm, corners_px)
     if turn:
         raise PhotoRejected("no_corners", place.likeness, LEAST_LIKENESS, _ORDER_ADVICE)
 
 
-def _best_turn(srgb: np.ndarray, design: np.ndarray, size_mm, corners_px: np.ndarray) -> tuple[FoundPlace, int, float]:
+def _best_turn(photo: _Searched, design: np.ndarray, size_mm, corners_px) -> tuple[FoundPlace, int, float]:
     """The place refined from corners 4×2 px with the first, or another that fits clearly better, as the design's first;
     its index; and its lead over others. Raises `PhotoRejected` if the mirrored design fits better. Images like the
     design itself don't count.
     """
     mirror, nowhere = np.ascontiguousarray(design[:, ::-1]), FoundPlace(corners_px, 0.0, 0.0, np.inf)
-    refiners, turned = (_Refiner(srgb, each, size_mm) for each in (design, mirror)), range(4)
+    refiners, turned = (_Refiner(photo, each, size_mm) for each in (design, mirror)), range(4)
     places = [[each.refine(np.roll(corners_px, -turn, 0), False) or nowhere for turn in turned] for each in refiners]
     own, mirrored = (np.array([place.significance * place.accepted for place in each]) for each in places)
     small = [cv2.resize(each, (64, 64), interpolation=cv2.INTER_AREA).astype(float) for each in (design, mirror)]
@@ -138,16 +150,13 @@ def _best_turn(srgb: np.ndarray, design: np.ndarray, size_mm, corners_px: np.nda
     return places[0][0], 0, lead
 
 
-def find_places(
-    srgb: np.ndarray, design: np.ndarray, size_mm: tuple[float, float], by_templates: bool = True
-) -> list[FoundPlace]:
+def _find_places(photo: _Searched, design: np.ndarray, size_mm, by_templates: bool = True) -> list[FoundPlace]:
     """Places of a design in a photograph that do not overlap, the most significant first, accepted or not."""
-    searched = downscale(srgb, SEARCHED_PX)
-    scale = np.array(srgb.shape[1::-1]) / searched.shape[1::-1]
-    refiner = _Refiner(srgb, design, size_mm)
-    places = _distinct(map(refiner.refine, (quad * scale for quad in _places_by_features(searched, design, size_mm))))
+    scale = np.array(photo.srgb.shape[1::-1]) / photo.small.shape[1::-1]
+    refiner = _Refiner(photo, design, size_mm)
+    places = _distinct(map(refiner.refine, (quad * scale for quad in _places_by_features(photo, design, size_mm))))
     if by_templates and not (places and places[0].accepted):
-        by_template = (quad * scale for quad in _places_by_templates(searched, design, size_mm))
+        by_template = (quad * scale for quad in _places_by_templates(photo.small, design, size_mm))
         places = _distinct([*places, *map(refiner.refine, by_template)])
     return places
 
@@ -177,9 +186,9 @@ def _features(gray: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.array(table), np.sqrt(descriptors / np.maximum(descriptors.sum(1, keepdims=True), 1e-6))
 
 
-def _places_by_features(srgb: np.ndarray, design: np.ndarray, size_mm: tuple[float, float]) -> Iterator[np.ndarray]:
+def _places_by_features(photo: _Searched, design: np.ndarray, size_mm: tuple[float, float]) -> Iterator[np.ndarray]:
     """Yield corners 4×2 px, those of most agreeing matches first."""
-    seen, seen_descriptors = _features(cv2.cvtColor(srgb, cv2.COLOR_RGB2GRAY))
+    seen, seen_descriptors = photo.features
     if len(seen) < 8:
         return
     source, target, angles, sizes, quality = [], [], [], [], []
@@ -266,16 +275,15 @@ def _places_by_templates(srgb: np.ndarray, design: np.ndarray, size_mm: tuple[fl
 
 
 class _Refiner:
-    """Refine places of a design on intensities; holds the photograph's pyramid and the design at each size."""
+    """Refine places of a design on intensities; holds the design at each size."""
 
-    def __init__(self, srgb: np.ndarray, design: np.ndarray, size_mm: tuple[float, float]):
-        self.levels = halving_pyramid(srgb)
-        self.srgb, self.size_mm = srgb, size_mm
+    def __init__(self, photo: _Searched, design: np.ndarray, size_mm: tuple[float, float]):
+        self.srgb, self.levels, self.size_mm = photo.srgb, photo.levels, size_mm
         self.template = cache(lambda px, surroundings: _SmallDesign(_draw(design, size_mm, px), surroundings))
 
     def refine(self, quad: np.ndarray, closely: bool = True) -> FoundPlace | None:
         """The refined place, or None if it is none that a camera can see. To compare directions it need not be done
-        `closely`: without mixed colors, and no further where the design is not like the picture.
+        `closely`: without mixed colors.
         """
         place = None
         for longer_px in _REFINED_PX:
@@ -295,7 +303,7 @@ class _Refiner:
             quad = refined * scale
             significance = float(np.arctanh(np.clip(likeness, -0.999, 0.999)) * np.sqrt(template.freedom))
             place = FoundPlace(quad, likeness, significance, sigma * scale)
-            if size == most or (not closely and likeness < _HOPELESS):
+            if size == most or likeness < _HOPELESS:
                 break
         return place if is_plausible_quad(quad) and is_in_picture(quad, self.srgb) else None
 
@@ -319,8 +327,10 @@ class _SmallDesign:
         self.index_from_unit = np.array([[half[0], 0, half[0]], [0, half[1], half[1]], [0, 0, 1.0]])
         units = np.stack(np.meshgrid(*((np.arange(n) + 0.5) / n * 2 - 1 for n in self.size)), -1).reshape(-1, 2)
         by_unit = np.stack([*np.gradient(colors, axis=(1, 0))], -1).reshape(-1, 6, 2) * half
-        self.by_term = (by_unit @ homography_jacobian(np.eye(3), units).reshape(-1, 2, 8)).astype(np.float32)
-        self.colors = colors.reshape(-1, 6)
+        by_term = (by_unit @ homography_jacobian(np.eye(3), units).reshape(-1, 2, 8)).astype(np.float32)
+        self.colors, self.by_term = colors.reshape(-1, 6), by_term.reshape(-1, 8)
+        pairs = by_term.reshape(-1, 48).T @ by_term.reshape(-1, 48)
+        self.curvature = pairs.reshape(6, 8, 6, 8).transpose(0, 2, 1, 3).astype(float)  # for each pair of colors 8×8
 
     def _less_surroundings(self, codes: np.ndarray) -> np.ndarray:
         codes = cv2.GaussianBlur(codes.astype(np.float32), (0, 0), 0.8)
@@ -345,10 +355,9 @@ class _SmallDesign:
                 ridge = 1e-3 * len(seen) * np.eye(6)
                 mixture = np.linalg.solve(self.colors.T @ self.colors + ridge, self.colors.T @ seen)
             error = np.clip(seen - self.colors @ mixture, -1.5, 1.5) * self.weight
-            slopes = np.einsum("nft,fc->nct", self.by_term, mixture.astype(np.float32))
-            hessian = np.einsum("nct,ncs,c->ts", slopes, slopes, self.weight, optimize=True)
+            hessian = np.tensordot(mixture * self.weight @ mixture.T, self.curvature)
             hessian += (1e-7 * np.trace(hessian) + 1e-9) * np.eye(8)  # a plain design has no slopes
-            step = np.linalg.solve(hessian, slopes.reshape(-1, 8).T @ error.ravel())
+            step = np.linalg.solve(hessian, self.by_term.T @ (error @ mixture.T).astype(np.float32).ravel())
             a, b, c, d, e, f, g, h = np.clip(step, -0.2, 0.2)
             px_from_unit = px_from_unit @ np.linalg.inv([[1 + a, b, c], [d, 1 + e, f], [g, h, 1]])
             if np.abs(step).max() < 2e-4 or not np.isfinite(px_from_unit).all():
