@@ -36,10 +36,11 @@ class SurfaceChart:
 
     def local(self, points_mm: np.ndarray) -> np.ndarray:
         """Return the (s, t, h) of world points ...×3; s lies within half a turn of the origin."""
-        x, t, z = np.moveaxis((points_mm - self.origin_mm) @ self.axes.T, -1, 0)
+        local = ((points_mm - self.origin_mm).reshape(-1, 3) @ self.axes.T).reshape(points_mm.shape)
         k = self.curvature
         if k == 0:
-            return np.stack([x, t, z], -1)
+            return local
+        x, t, z = np.moveaxis(local, -1, 0)
         # h + k h²/2 = k (x² + z²)/2 + z =: f, solved so that it holds for k → 0
         f = k * (x**2 + z**2) / 2 + z
         h = 2 * f / (1 + np.sqrt(np.maximum(1 + 2 * k * f, 0)))
@@ -78,14 +79,14 @@ def surface_heights(
 ) -> np.ndarray:
     """Return the highest surface h within `window` over n·n points of the piece; NaN where there is none."""
     points, normals = chart.cartesian(*(piece_grid(size_mm, n) @ chart.turn).T)
-    corners = (triangles - chart.origin_mm) @ chart.axes.T
     triangle, low, across, cells = _visits(chart, triangles, size_mm, n)
+    corners = (triangles[triangle] - chart.origin_mm) @ chart.axes.T
     highest = np.full(n * n, -np.inf)
     for part in np.array_split(np.arange(len(triangle)), max(1, int(cells.sum() // _CHUNK))):
         k = np.arange(cells[part].sum()) - np.repeat(np.cumsum(cells[part]) - cells[part], cells[part])
         row = np.repeat(part, cells[part])
         index = (low[row, 1] + k // across[row]) * n + low[row, 0] + k % across[row]
-        h, hit = _cast(points[index], normals[index], corners[triangle[row]])
+        h, hit = _cast(points[index], normals[index], corners[row])
         # a hit beyond the axis belongs to the far side
         hit &= (h >= window[0]) & (h <= window[1]) & (1 + chart.curvature * h > 0)
         np.maximum.at(highest, index[hit], h[hit])
@@ -94,8 +95,14 @@ def surface_heights(
 
 def triangles_near(triangles: np.ndarray, center_mm: np.ndarray, reach_mm: float) -> np.ndarray:
     """Return the triangles whose box comes within `reach_mm` of a point along each axis."""
-    low, high = triangles.min(1) - center_mm, triangles.max(1) - center_mm
-    return triangles[((low <= reach_mm) & (high >= -reach_mm)).all(1)]
+    low, high = boxes(triangles)
+    return triangles[((low <= center_mm + reach_mm) & (high >= center_mm - reach_mm)).all(1)]
+
+
+def boxes(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the lowest and the highest coordinates F×D of triangles F×3×D; in a tenth of the time of `min(1)`."""
+    a, b, c = triangles.swapaxes(0, 1)
+    return np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
 
 
 def edge_points(triangles: np.ndarray, step_mm: float) -> np.ndarray:
@@ -110,7 +117,8 @@ def edge_points(triangles: np.ndarray, step_mm: float) -> np.ndarray:
 def surface_point(triangles: np.ndarray, origin_mm: np.ndarray, axes: np.ndarray) -> np.ndarray:
     """Return where the line through `origin_mm` along the last of `axes` first meets triangles; refused if never."""
     corners = (triangles - origin_mm) @ axes.T
-    near = corners[((corners.min(1) <= 0) & (corners.max(1) >= 0))[:, :2].all(1)]
+    low, high = boxes(corners[..., :2])
+    near = corners[((low <= 0) & (high >= 0)).all(1)]
     h, hit = _cast(np.zeros((1, 3)), np.array([[0.0, 0, 1]]), near)
     if not hit.any():
         raise Refused("a patch that lies on the object", "no surface under its middle", "change offset_mm or at_mm")
@@ -128,20 +136,21 @@ def _visits(chart: SurfaceChart, triangles: np.ndarray, size_mm, n: int):
         surrounds_axis = np.ptp(local[..., 0], axis=1) > around / 2
         local[surrounds_axis, :2, 0] = [-around, around]
         shifts = [-around, 0.0, around]
-    box = np.stack([local.min(1), local.max(1)], 1)  # F×2×2: low and high (s, t)
-    middle, half = box.mean(1), np.ptp(box, axis=1) / 2 + 1e-9
+    low, high = boxes(local)
+    middle, half = (low + high) / 2, (high - low) / 2 + 1e-9
     step = np.array(size_mm) / (n - 1)
     rows = []
     for shift in shifts:
-        center = (middle + np.array([shift, 0])) @ chart.turn.T * [1, -1] + np.array(size_mm) / 2
-        reach = half @ np.abs(chart.turn).T
+        # a triangle around the axis covers all of the circumference without a shift
+        moved = middle + np.array([shift, 0])
+        near = (np.abs(moved) <= half + np.hypot(*size_mm) / 2).all(1) & ~(surrounds_axis & bool(shift))
+        owner = np.flatnonzero(near)
+        center = moved[owner] @ chart.turn.T * [1, -1] + np.array(size_mm) / 2
+        reach = half[owner] @ np.abs(chart.turn).T
         low = np.clip(np.ceil((center - reach) / step), 0, n).astype(np.int64)
         high = np.clip(np.floor((center + reach) / step), -1, n - 1).astype(np.int64)
         visits = (low <= high).all(1)
-        if shift:  # a triangle around the axis covers all of the circumference without a shift
-            visits &= ~surrounds_axis
-        owner = np.flatnonzero(visits)
-        rows.append((owner, low[owner], (high - low + 1)[owner]))
+        rows.append((owner[visits], low[visits], (high - low + 1)[visits]))
     owner, low, counts = (np.concatenate(column) for column in zip(*rows, strict=True))
     return owner, low, counts[:, 0], counts.prod(1)
 

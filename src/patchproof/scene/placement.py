@@ -19,7 +19,7 @@ from patchproof.base.geometry import rotated_extent
 from patchproof.base.settings import PatchSettings, SceneSettings
 from patchproof.base.validation import Side
 from patchproof.mesh.mesh import Mesh
-from patchproof.mesh.surface_chart import SurfaceChart, grid_faces, surface_heights
+from patchproof.mesh.surface_chart import SurfaceChart, boxes, grid_faces, surface_heights
 
 GRID = 65  # heights are sampled on this many points along each edge of the card
 LIFT_MM = 0.15  # the paper's own thickness, which also keeps it clear of the surface in the z-buffer
@@ -234,7 +234,8 @@ def _nearest_surface(mesh: Mesh, point: np.ndarray) -> tuple[np.ndarray, np.ndar
 
     triangles = mesh.vertices[mesh.faces]
     # a triangle whose box is farther away than another's corner is not the nearest
-    outside = np.maximum(np.maximum(triangles.min(1) - point, point - triangles.max(1)), 0)
+    low, high = boxes(triangles)
+    outside = np.maximum(np.maximum(low - point, point - high), 0)
     nearest_corner = ((triangles - point) ** 2).sum(-1).min()
     triangles = triangles[(outside**2).sum(-1) <= nearest_corner]
     points = closest_point(triangles, np.broadcast_to(point, (len(triangles), 3)))
