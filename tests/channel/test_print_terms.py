@@ -81,8 +81,8 @@ def test_mottle_is_as_strong_as_it_says_on_ink_and_is_not_on_paper(tmp_path):
     uneven = with_values(plain, mottle=np.array([0.02, 0.02, 0.06]), mottle_seed=np.array([7, 7, 8]))
     stage = set_stage(scene)
 
-    def shown(picture, conditions):
-        views = render_views(stage, picture, conditions, (1000, 1000))
+    def shown(picture, conditions, side_px=1000):
+        views = render_views(stage, picture, conditions, (side_px, side_px))
         seen, whole = shade(views, picture), views.on_piece.share[:, 0] > 0.99
         rows = seen.permute(0, 2, 3, 1).reshape(-1, 3)[views.on_piece.pixel[whole]]
         return [srgb_from_linear(rows[views.on_piece.view[whole] == view]) for view in range(3)]
@@ -92,5 +92,5 @@ def test_mottle_is_as_strong_as_it_says_on_ink_and_is_not_on_paper(tmp_path):
     assert rms == pytest.approx([0.02, 0.02, 0.06], rel=0.08)  # cells are several pixels wide
     assert torch.equal(shifts[0], shifts[1])  # one print of a session, twice
     assert abs(np.corrcoef(shifts[0].ravel(), shifts[2].ravel())[0, 1]) < 0.05
-    pairs = zip(shown(white, uneven), shown(white, plain), strict=True)
+    pairs = zip(shown(white, uneven, 300), shown(white, plain, 300), strict=True)
     assert max(float((on - off).abs().max()) for on, off in pairs) < FLOAT32

@@ -230,8 +230,9 @@ def test_crops_are_opencv_s(two_stage):
     np.testing.assert_allclose(two_stage.crops(photo, box)[0].permute(1, 2, 0), theirs, atol=0.04)
 
 
-def test_detectors_carry_a_run_from_scene_to_verdict(tmp_path, two_stage, monkeypatch):
+def test_detectors_carry_a_run_from_scene_to_verdict(tmp_path, shipped, two_stage, monkeypatch):
     monkeypatch.setattr("patchproof.optimizer.loop.SELECT_VIEWS", 2)
+    monkeypatch.setattr(two_stage, "PROPOSALS", 2)  # each is cut out and named: most of the time
     names = ["builtin-detector", "module:two_stage.rcnn"]
     scene = pp.make_scene(
         {
@@ -262,8 +263,8 @@ def test_detectors_carry_a_run_from_scene_to_verdict(tmp_path, two_stage, monkey
     shown = re.findall(r"([^<>]*) <span[^<]*</span><br>(?:not )?recognized", page)
     assert shown and set(shown) == {"box truck"}
     truth = scene.boxes(scene.draw("reprint", 2))
-    for name in names:
-        network = load_classifier(name, WEIGHTS_FOLDER).with_least_score(0.4)
+    for name, loaded in zip(names, (shipped, two_stage.rcnn()), strict=True):
+        network = loaded.with_least_score(0.4)
         for photo, box in zip(report.photos, truth, strict=True):
             answer = photo.predictions[name]
             pixels = torch.tensor(np.asarray(Image.open(tmp_path / "photos" / photo.file).convert("RGB")))

@@ -143,11 +143,13 @@ def test_listing_the_studies_imports_none_of_them():
 
 def test_a_kill_in_the_middle_and_more_workers_change_no_byte(tmp_path):
     whole, killed = tmp_path / "whole", tmp_path / "killed"
-    settings = toy.ToySettings(numbers=tuple(range(20, 32)), pause_s=0.2)
+    settings = toy.ToySettings(numbers=tuple(range(20, 32)))
     run_cells(toy.STUDY, settings, BASE, whole, Work(jobs=2))
     code = (
         f"import sys; sys.path.insert(0, {str(BASE)!r})\n"
-        "import toy_studies as toy\nfrom pathlib import Path\nfrom patchlab.study.study import run_cells\n"
+        "import time\nfrom pathlib import Path\nfrom types import SimpleNamespace\n"
+        "import toy_studies as toy\nfrom patchlab.study.study import run_cells\n"
+        "toy.time = SimpleNamespace(sleep=lambda _, wait=time.sleep: wait(0.2))\n"  # only here: time for a kill
         f"settings = toy.ToySettings.model_validate_json({settings.model_dump_json()!r})\n"
         f"run_cells(toy.STUDY, settings, Path({str(BASE)!r}), {str(killed)!r})"
     )

@@ -24,7 +24,7 @@ from patchproof.base.settings import SceneSettings
 from patchproof.base.validation import validate_model
 from patchproof.base.workers import Workers, can_fork, use_threads
 from patchproof.classifier.network import Classifier
-from patchproof.optimizer import expectation, loop, run
+from patchproof.optimizer import expectation, loop, place_files, run
 from patchproof.optimizer.evaluate import promise_run
 from patchproof.optimizer.loop import start, steps, take_step
 from patchproof.optimizer.problem import set_problem
@@ -381,6 +381,7 @@ def test_the_number_of_processes_changes_no_byte(tmp_path, few_views, a_small_se
     of the five poses a process keeps.
     """
     monkeypatch.setattr(expectation, "MIN_POSES", 5)
+    monkeypatch.setattr(place_files, "_SIDE_PX", 64)  # the picture of the places is not compared
     scene = toml(tmp_path / "scene.toml", optimize__steps=2, optimize__views=5, patch__place="auto")
     files = ("design.png", "steps.jsonl", "views.png", "place.json", "run.json")
     with use_threads(1):

@@ -259,7 +259,8 @@ def test_a_run_keeps_its_place_and_neither_loads_nor_resumes_by_searching(tmp_pa
         pp.optimize(scene_file(tmp_path), out, resume=True)
 
 
-def test_the_picture_shows_the_places_and_the_chosen_outline(tmp_path):
+def test_the_picture_shows_the_places_and_the_chosen_outline(tmp_path, monkeypatch):
+    monkeypatch.setattr(place_files, "_SIDE_PX", 128)
     scene = open_scene()
     spots = PlaceFinder(scene).candidates(3)
     candidates = tuple(place_search.Candidate(at=spot.at, spin_deg=0, gray=0, outlook=0) for spot in spots)

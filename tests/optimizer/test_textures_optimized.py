@@ -22,6 +22,7 @@ from patchproof.render.photograph import photograph
 from patchproof.render.stage import set_stage
 from patchproof.scene.conditions import with_values
 from patchproof.scene.scene import load_scene
+from patchproof.scene.texture_scene import texture_canvas
 
 SCENE = """
 [object]
@@ -220,7 +221,8 @@ def test_the_object_in_the_file_is_the_object_that_was_optimized(tmp_path):
     assert float((read_back - plain).abs().mean()) > 0.005
 
 
-def test_a_mesh_of_colored_vertices_is_unwrapped_and_optimized(tmp_path):
+def test_a_mesh_of_colored_vertices_is_unwrapped_and_optimized(tmp_path, monkeypatch):
+    monkeypatch.setattr(texture_canvas, "__defaults__", (256,))  # texels of the side of a new texture
     box = trimesh.creation.box((300, 200, 200))
     colors = np.random.default_rng(0).integers(0, 256, (len(box.vertices), 3), np.uint8)
     trimesh.Trimesh(box.vertices, box.faces, vertex_colors=colors, process=False).export(tmp_path / "colored.ply")

@@ -137,7 +137,7 @@ def transform_part(part: MeshPart, transform: np.ndarray) -> MeshPart:
     with np.errstate(invalid="ignore", over="ignore"):
         sign = -1 if np.linalg.det(rotation) < 0 else 1
         # normals turn by the inverse transpose up to a factor, as cofactors, so that flattening works
-        cofactors = sign * np.cross(np.roll(rotation, -1, 0), np.roll(rotation, -2, 0))
+        cofactors = sign * np.cross(rotation[[1, 2, 0]], rotation[[2, 0, 1]])
         vertices = part.vertices @ rotation.T + transform[:, 3]
         normals = None if part.normals is None else part.normals @ cofactors.T
     return replace(part, vertices=vertices, faces=part.faces[:, ::sign], normals=normals)
