@@ -340,17 +340,16 @@ class _SmallDesign:
             likeness = float((self.weight * (seen * self.colors[:, :3]).mean(0)).sum())
             if likeness > best[0] or mixes:
                 best = likeness, apply_homography(px_from_unit, _UNIT)
-            mixture = np.eye(6, 3) * max(likeness, 0.3)
+            mixture, slopes = np.eye(6, 3) * (gain := max(likeness, 0.3)), self.by_term[:, :3] * np.float32(gain)
             if mixes:
                 ridge = 1e-3 * len(seen) * np.eye(6)
                 mixture = np.linalg.solve(self.colors.T @ self.colors + ridge, self.colors.T @ seen)
+                slopes = np.einsum("nft,fc->nct", self.by_term, mixture.astype(np.float32))
             error = np.clip(seen - self.colors @ mixture, -1.5, 1.5) * self.weight
-            slopes = np.einsum("nft,fc->nct", self.by_term, mixture.astype(np.float32))
             hessian = np.einsum("nct,ncs,c->ts", slopes, slopes, self.weight, optimize=True)
             hessian += (1e-7 * np.trace(hessian) + 1e-9) * np.eye(8)  # a plain design has no slopes
             step = np.linalg.solve(hessian, slopes.reshape(-1, 8).T @ error.ravel())
-            a, b, c, d, e, f, g, h = np.clip(step, -0.2, 0.2)
-            px_from_unit = px_from_unit @ np.linalg.inv([[1 + a, b, c], [d, 1 + e, f], [g, h, 1]])
+            px_from_unit = px_from_unit @ np.linalg.inv(np.eye(3) + np.r_[np.clip(step, -0.2, 0.2), 0].reshape(3, 3))
             if np.abs(step).max() < 2e-4 or not np.isfinite(px_from_unit).all():
                 break
         likeness, corners = best
