@@ -50,7 +50,7 @@ def here(tmp_path_factory):
     toml = blocks("toml")[0]
     # fewer steps and smaller photographs than a user would take
     (folder / "scene.toml").write_text(
-        toml + "\n[optimize]\nsteps = 3\nviews = 2\n[camera]\nphoto_px = [1040, 780]\n", encoding="utf-8"
+        toml + "\n[optimize]\nsteps = 3\nviews = 2\n[camera]\nphoto_px = [800, 600]\n", encoding="utf-8"
     )
     return folder
 

@@ -52,7 +52,7 @@ from test_verify_run import NET, promise, shot
 
 pytestmark = pytest.mark.filterwarnings("ignore:the network net:UserWarning")  # it sees no color
 TOKEN = "a-token-that-is-nobodys-own"
-SHOTS = 8
+SHOTS = 6
 
 
 def condition(azimuth_deg: float, px_per_mm: float) -> dict:

@@ -31,7 +31,7 @@ def loaded(tmp_path_factory):
     """
     folder = tmp_path_factory.mktemp("journey")
     constants = {
-        "patchproof.app.demo.SCENE": SCENE.replace("[800, 600]", "[1040, 780]"),
+        "patchproof.app.demo.SCENE": SCENE.replace("[800, 600]", "[920, 690]"),
         "patchproof.app.demo.PHOTOS": PHOTOS,
         "patchproof.app.demo.SESSIONS": 1,
         "patchproof.optimizer.run.PROMISE_VIEWS": 24,  # few: what they cost is time

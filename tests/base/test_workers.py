@@ -5,8 +5,6 @@ from __future__ import annotations
 import os
 import pickle
 import signal
-import subprocess
-import sys
 import time
 from concurrent.futures import Future
 
@@ -142,7 +140,7 @@ def test_blas_of_numpy_computes_on_one_thread_in_this_process_and_in_the_others(
     """Its threads spin: beside two workers they took a third of a verification's seconds."""
 
     def threads(_=None) -> set[int]:
-        np.linalg.svd(np.eye(300))
+        np.linalg.svd(np.eye(100))
         return {library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"}
 
     with threadpool_limits(2, user_api="blas"):
@@ -164,18 +162,23 @@ def test_a_system_that_cannot_fork_works_here_on_as_many_threads(monkeypatch):
 
 @forks
 def test_children_end_when_their_parent_is_killed(tmp_path):
-    code = (
-        "import os, sys, time\nfrom patchproof.base.workers import fork_workers\n"
-        "def f(i):\n    open(sys.argv[1] + '/' + str(os.getpid()), 'w').close()\n    time.sleep(60)\n"
-        "with fork_workers(f, 2) as (crew, share):\n    crew.map(share, range(2))\n"
-    )
-    parent = subprocess.Popen([sys.executable, "-c", code, str(tmp_path)])
+
+    def work() -> None:
+        with fork_workers(lambda i: (tmp_path / str(os.getpid())).touch() or time.sleep(60), 2) as (crew, share):
+            crew.map(share, range(2))
+
+    parent = os.fork()
+    if parent == 0:
+        try:
+            work()
+        finally:
+            os._exit(1)
     until = time.monotonic() + 60
     while len(children := [int(path.name) for path in tmp_path.iterdir()]) < 2:
         assert time.monotonic() < until
         time.sleep(0.05)
-    parent.kill()
-    parent.wait()
+    os.kill(parent, signal.SIGKILL)
+    os.waitpid(parent, 0)
     while any(alive(child) for child in children):
         assert time.monotonic() < until
         time.sleep(0.1)

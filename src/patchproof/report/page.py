@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 DELTA_TOP = 20.0  # ΔE00 at the map's dark end; 2 is just visible side by side, 20 another color
 PICTURE_KINDS = ("photo", "promised", "seen", "fitted", "delta_e00")
+_ENVIRONMENTS: dict[Path, Any] = {}  # by folder: each compiles its templates once
 _JPEG_QUALITY = 82
 _LONGEST_STEM = 220  # bytes; systems take 255, and kind and suffix come after it
 
@@ -33,8 +34,8 @@ def render_page(template: str, folder: Path = Path(__file__).parent, **values: o
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     options = {"trim_blocks": True, "lstrip_blocks": True, "undefined": StrictUndefined, "finalize": _printable_lines}
-    environment = Environment(autoescape=True, **options)
-    environment.loader = FileSystemLoader(folder)
+    new_environment = Environment(autoescape=True, loader=FileSystemLoader(folder), **options)
+    environment = _ENVIRONMENTS.setdefault(folder, new_environment)
     environment.filters["percent"] = lambda share: "–" if share is None else f"{100 * share:.0f} %"
     environment.filters["figure"] = lambda value, digits=2: "not measured" if value is None else f"{value:.{digits}f}"
     environment.tests["figure"] = lambda value: isinstance(value, (int, float, Estimate)) or value is None
