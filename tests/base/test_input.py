@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import signal
 import sys
 import time
 
@@ -14,6 +15,7 @@ from patchproof.base import input as bounds
 from patchproof.base.errors import Refused, TimeLimitExceeded
 from patchproof.base.input import file_size, hash_file, open_image, read_file, read_json, run_in_child
 from patchproof.base.validation import read_toml
+from test_workers import alive
 
 needs_linux = pytest.mark.skipif(sys.platform != "linux", reason="processes that are forked and limited")
 
@@ -79,3 +81,34 @@ def test_work_in_a_child_ends_in_time_in_memory_and_with_its_own_result_or_error
     with pytest.raises(MemoryError, match="than it may take"):
         run_in_child(lambda: os._exit(3))
     assert len(run_in_child(lambda: bytes(5_000_000))) == 5_000_000
+
+
+@needs_linux
+def test_a_child_with_much_to_say_ends_when_its_parent_is_killed(tmp_path):
+    """Its answer is more than a pipe holds, and nobody reads it."""
+
+    def work() -> bytes:
+        (tmp_path / f"{os.getpid()}").touch()
+        parent = os.getppid()
+        while os.getppid() == parent:
+            time.sleep(0.01)
+        return bytes(5_000_000)
+
+    parent = os.fork()
+    if parent == 0:
+        run_in_child(work)
+        os._exit(0)
+    until = time.monotonic() + 60
+    while not (children := list(tmp_path.iterdir())):
+        assert time.monotonic() < until
+        time.sleep(0.01)
+    os.kill(parent, signal.SIGKILL)
+    os.waitpid(parent, 0)
+    child = int(children[0].name)
+    try:
+        while alive(child):
+            assert time.monotonic() < until
+            time.sleep(0.05)
+    finally:
+        if alive(child):
+            os.kill(child, signal.SIGKILL)

@@ -169,6 +169,7 @@ def run_in_child(work: Callable[[], ReturnType]) -> ReturnType:
     with warnings.catch_warnings(action="ignore"):  # of a fork with other threads: the child uses none of their locks
         child = os.fork()  # multiprocessing allows none in the workers of a cluster
     if child == 0:
+        os.close(receiver)  # a child that had it, too, would wait for ever to write to a parent that was killed
         _send_result(work, sender)
     os.close(sender)
     try:

@@ -35,7 +35,7 @@ from patchproof.photo.paper_light import paper_light, quadratic_terms
 from patchproof.photo.quality import CLIPPED_CODE, blur_px
 from patchproof.photo.read import Photo, list_images, read_photo, summarize_said
 from patchproof.photo.rectify import fit_page
-from patchproof.photo.rejection import PhotoRejected
+from patchproof.photo.rejection import MIRRORED_ADVICE, PhotoRejected
 from patchproof.sheets.manifest import Manifest
 from patchproof.sheets.piece import marker_rect
 from patchproof.sheets.rects import RectMm, rect_contains
@@ -233,7 +233,7 @@ def _find_page(srgb: np.ndarray, manifest: Manifest) -> tuple[np.ndarray, float]
     corners_px = detected.corners_px
     if not corners_px:
         if is_mirrored(srgb, detected, dictionary):
-            raise PhotoRejected("mirrored", None, None, "the photo is mirrored: switch off the camera's mirror setting")
+            raise PhotoRejected("mirrored", None, None, MIRRORED_ADVICE)
         if detected.another_sheet:
             advice = "these are the markers of another sheet or page: name that sheet's JSON, or leave the photo out"
             raise PhotoRejected("wrong_sheet", len(detected.foreign), 0, advice)

@@ -26,7 +26,7 @@ from patchproof.photo.pose import UNCONFIRMED_DEG
 from patchproof.photo.quality import FrameLight, blur_px, frame_light
 from patchproof.photo.rectify import PageFit
 from patchproof.photo.registration import DesignCorners, place_design
-from patchproof.photo.rejection import PhotoRejected
+from patchproof.photo.rejection import MIRRORED_ADVICE, PhotoRejected
 from patchproof.photo.unroll import LocatedSheet, flat_sheet
 
 MOST_BLUR = 0.5  # modules of Gaussian sigma: beyond it, borders of neighboring cells merge
@@ -185,8 +185,7 @@ def identify_sheet(srgb: np.ndarray, surface: Surface) -> tuple[MarkersInView, S
         detected = find_sheet(srgb, marker_ids, surface.corners_mm, surface.dictionary)
     if not detected.markers:
         if is_mirrored(srgb, detected, surface.dictionary):
-            advice = "the photo is mirrored: switch off the camera's mirror setting and save it again"
-            raise PhotoRejected("mirrored", None, None, advice)
+            raise PhotoRejected("mirrored", None, None, MIRRORED_ADVICE)
         label = read_page_code(srgb)
         if detected.another_sheet or (label is not None and label != surface.label):
             which = "another sheet" if label is None else "sheet {} ({})".format(*label.split(":")[1:])

@@ -87,7 +87,6 @@ def evaluate(
     if is_file(folder / "evaluate.json") and not overwrite:
         do = "add --overwrite, or rename it to keep it"
         raise Refused("a run that was not evaluated yet", f"{folder / 'evaluate.json'}, which exists", do)
-    _require_writable(folder)
     run = load_run(folder, trust)
     conditions, advance = run.scene.draw("evaluate", n, seed), partial(progress, "evaluate")
     problem, by_kind = run_responses(run, conditions, models, compute, advance)
@@ -101,11 +100,6 @@ def evaluate(
         text = result.model_dump_json(indent=1, exclude={"models": {"__all__": {"name"}}}) + "\n"
         write_atomically(folder / "evaluate.json", text)
     return result
-
-
-def _require_writable(run_folder: str | Path) -> None:
-    if is_folder(run_folder) and not os.access(run_folder, os.W_OK):
-        raise Refused("a run's folder that can be written to", f"{run_folder}", "allow that, or use a copy of the run")
 
 
 def run_responses(
@@ -130,7 +124,8 @@ def promise_run(
     again. Fewer views than the run's promise has are refused. For `trust` see `load_run`.
     """
     compute, options = compute.without("promise", cluster=True), PromiseOptions(views)
-    _require_writable(run_folder)
+    if is_folder(run_folder) and not os.access(run_folder, os.W_OK):
+        raise Refused("a run's folder that can be written to", f"{run_folder}", "allow that, or use a copy of the run")
     with lock_folder(run_folder):
         run = load_run(run_folder, trust)
         if (n := views or PROMISE_VIEWS) < (present := run.promise.n):

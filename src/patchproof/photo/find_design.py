@@ -27,7 +27,7 @@ from patchproof.photo.detect import is_plausible_quad
 from patchproof.photo.known_page import is_in_picture
 from patchproof.photo.rectify import homography_jacobian
 from patchproof.photo.registration import DesignCorners
-from patchproof.photo.rejection import PhotoRejected
+from patchproof.photo.rejection import MIRRORED_ADVICE, PhotoRejected
 
 SEARCHED_PX = 1600  # longer side of the picture in which places are proposed
 SMALLEST_PRINT_PX = 60.0  # of the design's shorter side there
@@ -55,7 +55,6 @@ _NOT_FOUND_ADVICE = (
     "its corners, in --corners FILE or with a finger on the page of capture"
 )
 _SMALL_ADVICE = "the design is too small to be found with certainty: come closer"
-_MIRRORED_ADVICE = "the photo is mirrored: switch off the camera's mirror setting and save it again"
 _UNDIRECTED_ADVICE = "what was found fits as well when it is turned: show all of the design, or name its corners"
 _ORDER_ADVICE = "its corners are named in another order: begin with the design's own top left one, then clockwise"
 _SEVERAL_ADVICE = "more than one print of the design is in view: photograph one at a time"
@@ -105,7 +104,7 @@ def find_design(srgb: np.ndarray, design: np.ndarray, size_mm: tuple[float, floa
     if not found:
         mirrored = _find_places(photo, np.ascontiguousarray(design[:, ::-1]), size_mm, by_templates=False)
         if any(place.accepted for place in mirrored):
-            raise PhotoRejected("mirrored", None, None, _MIRRORED_ADVICE)
+            raise PhotoRejected("mirrored", None, None, MIRRORED_ADVICE)
         best = max((place.likeness for place in places), default=0.0)
         raise PhotoRejected("no_corners", best, LEAST_LIKENESS, _NOT_FOUND_ADVICE)
     if len(found) > 1:
@@ -142,7 +141,7 @@ def _best_turn(photo: _Searched, design: np.ndarray, size_mm, corners_px) -> tup
     least = _LEAST_DIFFERENCE * small[0].var((0, 1)).mean()
     differ = [[((np.rot90(each, turn) - small[0]) ** 2).mean() > least for turn in turned] for each in small]
     if mirrored.max() > own.max() + _MIRRORED_BY and all(differ[1]):
-        raise PhotoRejected("mirrored", None, None, _MIRRORED_ADVICE)
+        raise PhotoRejected("mirrored", None, None, MIRRORED_ADVICE)
     lead = float(own[0] - max((*own[differ[0]], *mirrored[differ[1]]), default=-np.inf))
     turn = int(own.argmax())
     if own[turn] > own[0] + _TURNED_BY and differ[0][turn]:

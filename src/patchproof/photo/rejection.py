@@ -29,6 +29,7 @@ REJECTION_CODES = {
     "wrong_ink": ("an ink is missing or another one", "print again with all inks"),
     "no_corners": ("a print without markers was not found", "add --find or --corners"),
 }
+MIRRORED_ADVICE = "the photo is mirrored: switch off the camera's mirror setting and save it again"
 
 
 class PhotoRejected(PatchproofError, ValueError):

@@ -8,6 +8,7 @@ import hashlib
 import io
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,26 +21,31 @@ from patchproof.base.output import image_bytes, make_folder, write_atomically
 from patchproof.base.text import drawable, printable
 
 if TYPE_CHECKING:
+    from jinja2 import Environment
     from matplotlib.figure import Figure
 
 DELTA_TOP = 20.0  # ΔE00 at the map's dark end; 2 is just visible side by side, 20 another color
 PICTURE_KINDS = ("photo", "promised", "seen", "fitted", "delta_e00")
-_ENVIRONMENTS: dict[Path, Any] = {}  # by folder: each compiles its templates once
 _JPEG_QUALITY = 82
 _LONGEST_STEM = 220  # bytes; systems take 255, and kind and suffix come after it
 
 
 def render_page(template: str, folder: Path = Path(__file__).parent, **values: object) -> str:
     """Render a template of `folder` (by default this room's) with its values."""
+    return _environment(folder).get_template(template).render(values)
+
+
+@cache
+def _environment(folder: Path) -> "Environment":
+    """The templates of a folder, each compiled once."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     options = {"trim_blocks": True, "lstrip_blocks": True, "undefined": StrictUndefined, "finalize": _printable_lines}
-    new_environment = Environment(autoescape=True, loader=FileSystemLoader(folder), **options)
-    environment = _ENVIRONMENTS.setdefault(folder, new_environment)
+    environment = Environment(autoescape=True, loader=FileSystemLoader(folder), **options)
     environment.filters["percent"] = lambda share: "–" if share is None else f"{100 * share:.0f} %"
     environment.filters["figure"] = lambda value, digits=2: "not measured" if value is None else f"{value:.{digits}f}"
     environment.tests["figure"] = lambda value: isinstance(value, (int, float, Estimate)) or value is None
-    return environment.get_template(template).render(values)
+    return environment
 
 
 def _printable_lines(value: object) -> object:
