@@ -6,17 +6,10 @@ import os
 import sys
 from pathlib import Path
 
-import cv2
 import pytest
-import torch
-
-from patchproof.base.workers import keep_freed_memory
 
 # the tests run side by side, a process per core, and so do the programs that they start
-torch.set_num_threads(1)
-cv2.setNumThreads(1)
 os.environ["OMP_NUM_THREADS"] = "1"
-keep_freed_memory()
 
 # tests of one room take helpers from those of another
 sys.path += [str(folder) for folder in sorted(Path(__file__).parent.iterdir()) if folder.is_dir()]
@@ -25,6 +18,19 @@ LONG = (  # of the files' names
     *("types", "readme", "journey", "optimize", "first_hour", "kill_anywhere", "find_design"),
     *("flat_journey", "ledger", "verify_run", "photo_degraded", "sheet_pages", "calibrate_printer", "begin", "workers"),
 )
+
+
+def pytest_configure(config):
+    """Compute on one thread; a process that only hands tests to others loads no libraries."""
+    if hasattr(config, "workerinput") or not config.getoption("numprocesses", 0):
+        import cv2
+        import torch
+
+        from patchproof.base.workers import keep_freed_memory
+
+        torch.set_num_threads(1)
+        cv2.setNumThreads(1)
+        keep_freed_memory()
 
 
 def pytest_collection_modifyitems(items):
@@ -62,6 +68,8 @@ def a_small_search(monkeypatch):
 @pytest.fixture(scope="session")
 def torchvision():
     """torchvision; one that was built for CUDA lacks, beside a CPU torch, operators that no classifier needs."""
+    import torch
+
     library = torch.library.Library("torchvision", "FRAGMENT")
     try:
         import torchvision

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 
@@ -18,11 +19,16 @@ from patchproof.base.validation import StrictModel
 from patchproof.sheets.template import QrCode
 
 ROOT = Path(__file__).resolve().parents[2]
-EVERY = {**DOCUMENTS, **documents()}
+
+
+@cache
+def every() -> dict[str, tuple]:
+    """All documents, with the laboratory's."""
+    return {**DOCUMENTS, **documents()}
 
 
 def models() -> set[type[StrictModel]]:
-    return {model for _, settings in EVERY.values() for _, model in tables(settings)}
+    return {model for _, settings in every().values() for _, model in tables(settings)}
 
 
 @pytest.fixture(scope="module")
@@ -66,11 +72,11 @@ def test_every_settings_class_is_on_the_page():
 
 def test_meanings_stand_beside_fields_or_above_them():
     assert meanings(QrCode)["size_mm"] == "its side, without the quiet zone"
-    scene = EVERY["scene"][1]
+    scene = every()["scene"][1]
     view, camera = scene.model_fields["view"].annotation, scene.model_fields["camera"].annotation
     assert meanings(view)["roll_deg"] == "of the camera about its axis"
     assert meanings(camera)["photo_px"] == "Width and height of a whole photograph."  # above
-    inherited = meanings(EVERY["transfer"][1])
+    inherited = meanings(every()["transfer"][1])
     assert inherited["networks"] == "networks to train on and to test" and "lights" in inherited
 
 

@@ -247,27 +247,28 @@ def raster(faded: bool, two_colors: bool = False) -> np.ndarray:
     return page.astype(np.float32)
 
 
-def evidence(folder, faded=False, light=0.75, **look):
+def take(folder, faded=False, light=0.75, **look):
     for i in range(PHOTOS):
         homography = view(8 * i - 16, 5, 280, size_px=SIZE)  # nearer to each other they are one
         taken = dict(blur_px=0.3, noise=0.002, jpeg=95, light=light, seed=i) | look
         save(photograph(raster(faded), homography, SIZE, **taken), folder / f"{i}.png")
-    with pytest.MonkeyPatch.context() as patch:  # what controls would have cost is not asked here
-        patch.setattr("patchproof.evidence.gather.estimate_effect", lambda *_: None)
-        return gather_evidence(folder, sheet(), Options([NET], identity_printer()))
 
 
 @pytest.mark.parametrize(
     ("change", "culprit"),
     [
-        ({}, None),
         ({"faded": True}, "print"),
         ({"blur_px": 1.6}, "blur_and_noise"),
         ({"light": np.array([0.05, 0.05, 0.35])}, "light_and_camera"),
     ],
 )
-def test_known_culprits_are_named(tmp_path, change, culprit):
-    found = evidence(tmp_path, **change).summary.ledger
+def test_known_culprits_are_named(tmp_path, monkeypatch, change, culprit):
+    monkeypatch.setattr("patchproof.evidence.gather.estimate_effect", lambda *_: None)  # not asked here
+    take(tmp_path, **change)
+    check_ledger(gather_evidence(tmp_path, sheet(), Options([NET], identity_printer())).summary.ledger, culprit)
+
+
+def check_ledger(found, culprit):
     assert found.culprit == culprit, found
     whole = found.ideal - found.photo
     assert sum(share.share for share in found.shares.values()) == pytest.approx(whole, abs=1e-9)
@@ -277,13 +278,12 @@ def test_known_culprits_are_named(tmp_path, change, culprit):
         assert abs(found.shares["photo"].share) < 0.5 * found.shares[culprit].share
 
 
-def test_processes_change_no_byte(tmp_path):
-    for i in range(PHOTOS):
-        homography = view(8 * i - 16, 5, 280, size_px=SIZE)
-        save(photograph(raster(False), homography, SIZE, blur_px=0.3, noise=0.002, seed=i), tmp_path / f"{i}.png")
+def test_photographs_as_promised_have_no_culprit_and_processes_change_no_byte(tmp_path):
+    take(tmp_path)
     options = Options([NET], identity_printer())
     one, two = (gather_evidence(tmp_path, sheet(), options, compute=Compute(jobs=jobs)) for jobs in (1, 2))
-    assert one.summary.ledger is not None and one.summary.estimated is not None
+    check_ledger(one.summary.ledger, None)
+    assert one.summary.estimated is not None
     assert one.model_dump_json() == two.model_dump_json()
 
 

@@ -216,10 +216,10 @@ def _places_by_features(photo: _Searched, design: np.ndarray, size_mm: tuple[flo
     arm = (shape / 2 - source) * np.exp(size)[:, None]
     cosine, sine = np.cos(angle), np.sin(angle)
     middle = target + np.column_stack([cosine * arm[:, 0] - sine * arm[:, 1], sine * arm[:, 0] + cosine * arm[:, 1]])
-    apart = np.hypot(*(middle[:, None] - middle).astype(np.float32).transpose(2, 0, 1))
-    agree = apart < _VOTE_SHARE * np.exp(np.minimum(size[:, None], size)).astype(np.float32)
-    agree &= np.abs(size[:, None] - size) < _VOTE_LOG_SIZE
-    agree &= np.cos(angle[:, None] - angle) > np.cos(_VOTE_RAD)
+    x, y, log, c, s = np.column_stack([middle, size, cosine, sine]).astype(np.float32).T
+    agree = np.hypot(x[:, None] - x, y[:, None] - y) < _VOTE_SHARE * np.exp(np.minimum(log[:, None], log))
+    agree &= np.abs(log[:, None] - log) < _VOTE_LOG_SIZE
+    agree &= c[:, None] * c + s[:, None] * s > np.cos(_VOTE_RAD)
     for _ in range(_MOST_PLACES):
         votes = agree.sum(1)
         leader = int(votes.argmax())
@@ -317,7 +317,7 @@ class _SmallDesign:
     def __init__(self, drawn: np.ndarray, surroundings: float):
         self.size, self.surroundings_px = (drawn.shape[1], drawn.shape[0]), surroundings * max(drawn.shape[:2])
         codes = self._less_surroundings(drawn)
-        self.weight = codes.std((0, 1)) / max(float(codes.std((0, 1)).sum()), 1e-6)
+        self.weight = (codes.std((0, 1)) / max(float(codes.std((0, 1)).sum()), 1e-6)).astype(np.float32)
         squares = self._less_surroundings(drawn.astype(np.float32) ** 2 / 255)
         colors = np.concatenate([part / np.maximum(part.std((0, 1)), 1e-3) for part in (codes, squares)], 2)
         power = np.abs(np.fft.fft2((colors[..., :3] * self.weight).sum(2))) ** 2
@@ -353,10 +353,11 @@ class _SmallDesign:
             if mixes:
                 ridge = 1e-3 * len(seen) * np.eye(6)
                 mixture = np.linalg.solve(self.colors.T @ self.colors + ridge, self.colors.T @ seen)
+            mixture = mixture.astype(np.float32)
             error = np.clip(seen - self.colors @ mixture, -1.5, 1.5) * self.weight
             hessian = np.tensordot(mixture * self.weight @ mixture.T, self.curvature)
             hessian += (1e-7 * np.trace(hessian) + 1e-9) * np.eye(8)  # a plain design has no slopes
-            step = np.linalg.solve(hessian, self.by_term.T @ (error @ mixture.T).astype(np.float32).ravel())
+            step = np.linalg.solve(hessian, self.by_term.T @ (error @ mixture.T).ravel())
             a, b, c, d, e, f, g, h = np.clip(step, -0.2, 0.2)
             px_from_unit = px_from_unit @ np.linalg.inv([[1 + a, b, c], [d, 1 + e, f], [g, h, 1]])
             if np.abs(step).max() < 2e-4 or not np.isfinite(px_from_unit).all():
