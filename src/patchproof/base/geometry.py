@@ -78,17 +78,16 @@ def intrinsics(fov_deg: float, size_px: tuple[int, int]) -> np.ndarray:
 
 
 def project(matrix_px, camera_from_world, points_mm) -> np.ndarray:
-    """Project world points N×3 to pixels N×2; points behind the camera give NaN."""
-    points = np.asarray(points_mm, float)
-    camera = transform_points(camera_from_world, points)
-    camera = np.where(camera[:, 2:] > 0, camera, np.nan)
+    """Project world points N×3 to pixels ...×N×2 of cameras ...×4×4; points behind a camera give NaN."""
+    camera = transform_points(camera_from_world, points_mm)
+    camera = np.where(camera[..., 2:] > 0, camera, np.nan)
     image = camera @ np.asarray(matrix_px).T
-    return image[:, :2] / image[:, 2:]
+    return image[..., :2] / image[..., 2:]
 
 
 def transform_points(matrix, points_mm) -> np.ndarray:
-    """Transform points N×3 by a rigid or affine matrix 4×4."""
-    return np.asarray(points_mm, float) @ matrix[:3, :3].T + matrix[:3, 3]
+    """Transform points N×3 by rigid or affine matrices ...×4×4."""
+    return np.asarray(points_mm, float) @ matrix[..., :3, :3].swapaxes(-1, -2) + matrix[..., None, :3, 3]
 
 
 def camera_centers(poses) -> np.ndarray:

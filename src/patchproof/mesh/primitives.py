@@ -5,6 +5,8 @@ parts that may run into one another, each with its own color and with texture co
 texture can be put on. An object with a flat side broad enough for a card shows it to +x; fronts look to +z.
 """
 
+from functools import lru_cache
+
 import numpy as np
 
 from patchproof.base.errors import Refused
@@ -20,9 +22,8 @@ def primitive_names() -> tuple[str, ...]:
 
 def build(name: str, seed: int = 0) -> Mesh:
     """Make one object; the same name and seed give the same arrays."""
-    object_parts = parts(name, seed)
-    vertices = np.concatenate([part.vertices for part in object_parts])
-    return mesh_from_parts(object_parts, float(np.ptp(vertices, axis=0).max()))
+    solids = parts(name, seed)
+    return mesh_from_parts(solids, float(np.ptp(np.concatenate([part.vertices for part in solids]), axis=0).max()))
 
 
 def longest_mm(name: str) -> float:
@@ -30,6 +31,7 @@ def longest_mm(name: str) -> float:
     return float(round(np.ptp(build(name).vertices, axis=0).max()))
 
 
+@lru_cache(maxsize=16)
 def parts(name: str, seed: int = 0) -> list[MeshPart]:
     """Return one object's closed parts in millimeters, on y = 0; every face has three vertices of its own."""
     if name not in _OBJECTS:

@@ -138,13 +138,11 @@ def _visits(chart: SurfaceChart, triangles: np.ndarray, size_mm, n: int):
         shifts = [-around, 0.0, around]
     low, high = boxes(local)
     middle, half = (low + high) / 2, (high - low) / 2 + 1e-9
-    step = np.array(size_mm) / (n - 1)
-    rows = []
+    step, radius, rows = np.array(size_mm) / (n - 1), np.hypot(*size_mm) / 2, []
     for shift in shifts:
         # a triangle around the axis covers all of the circumference without a shift
         moved = middle + np.array([shift, 0])
-        near = (np.abs(moved) <= half + np.hypot(*size_mm) / 2).all(1) & ~(surrounds_axis & bool(shift))
-        owner = np.flatnonzero(near)
+        owner = np.flatnonzero((np.abs(moved) <= half + radius).all(1) & ~(surrounds_axis & bool(shift)))
         center = moved[owner] @ chart.turn.T * [1, -1] + np.array(size_mm) / 2
         reach = half[owner] @ np.abs(chart.turn).T
         low = np.clip(np.ceil((center - reach) / step), 0, n).astype(np.int64)

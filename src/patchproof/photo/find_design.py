@@ -349,11 +349,10 @@ class _SmallDesign:
             likeness = float((self.weight * (seen * self.colors[:, :3]).mean(0)).sum())
             if likeness > best[0] or mixes:
                 best = likeness, apply_homography(px_from_unit, _UNIT)
-            mixture = np.eye(6, 3) * max(likeness, 0.3)
+            mixture = np.eye(6, 3, dtype=np.float32) * max(likeness, 0.3)
             if mixes:
                 ridge = 1e-3 * len(seen) * np.eye(6)
-                mixture = np.linalg.solve(self.colors.T @ self.colors + ridge, self.colors.T @ seen)
-            mixture = mixture.astype(np.float32)
+                mixture = np.linalg.solve(self.colors.T @ self.colors + ridge, self.colors.T @ seen).astype(np.float32)
             error = np.clip(seen - self.colors @ mixture, -1.5, 1.5) * self.weight
             hessian = np.tensordot(mixture * self.weight @ mixture.T, self.curvature)
             hessian += (1e-7 * np.trace(hessian) + 1e-9) * np.eye(8)  # a plain design has no slopes

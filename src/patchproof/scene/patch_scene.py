@@ -193,7 +193,7 @@ def _in_picture(scene: MeshScene, placement: Placement) -> np.ndarray:
     """True for each view that shows three of the piece's corners or more, without which no sheet can be measured."""
     poses = camera_poses(scene, placement.center_mm, scene.draw("select", SCALE_VIEWS, 0).pose)
     corners = placement.world(geometry.rect_corners((0, 0, *placement.size_mm)))
-    pixels = np.stack([geometry.project(scene.matrix_px(scene.photo_px), pose, corners) for pose in poses])
+    pixels = geometry.project(scene.matrix_px(scene.photo_px), poses, corners)
     return ((pixels >= 0) & (pixels <= scene.photo_px)).all(2).sum(1) >= 3
 
 
