@@ -32,11 +32,11 @@ def longest_mm(name: str) -> float:
 
 
 @lru_cache(maxsize=16)
-def parts(name: str, seed: int = 0) -> list[MeshPart]:
+def parts(name: str, seed: int = 0) -> tuple[MeshPart, ...]:
     """Return one object's closed parts in millimeters, on y = 0; every face has three vertices of its own."""
     if name not in _OBJECTS:
         raise Refused("the name of a primitive", f'"{name}"', spelling_hint(name, _OBJECTS))
-    return _OBJECTS[name](np.random.default_rng([primitive_names().index(name), seed]))
+    return tuple(_OBJECTS[name](np.random.default_rng([primitive_names().index(name), seed])))
 
 
 WHITE, BLACK, STEEL, WOOD = (0.92, 0.92, 0.9), (0.1, 0.1, 0.11), (0.66, 0.67, 0.7), (0.65, 0.46, 0.28)

@@ -37,8 +37,7 @@ class SurfaceChart:
     def local(self, points_mm: np.ndarray) -> np.ndarray:
         """Return the (s, t, h) of world points ...×3; s lies within half a turn of the origin."""
         local = ((points_mm - self.origin_mm).reshape(-1, 3) @ self.axes.T).reshape(points_mm.shape)
-        k = self.curvature
-        if k == 0:
+        if (k := self.curvature) == 0:
             return local
         x, t, z = np.moveaxis(local, -1, 0)
         # h + k h²/2 = k (x² + z²)/2 + z =: f, solved so that it holds for k → 0
@@ -100,7 +99,7 @@ def triangles_near(triangles: np.ndarray, center_mm: np.ndarray, reach_mm: float
 
 
 def boxes(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lowest and the highest coordinates F×D of triangles F×3×D; in a tenth of the time of `min(1)`."""
+    """Return the lowest and the highest coordinates F×D of triangles F×3×D, twice as fast as `min(1)` does."""
     a, b, c = triangles.swapaxes(0, 1)
     return np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
 

@@ -43,7 +43,7 @@ _VOTE_SHARE, _VOTE_LOG_SIZE, _VOTE_RAD = 0.25, 0.4, 0.5  # matches that agree: o
 _LEAST_VOTES = 4
 _MOST_PLACES = 8  # of each source, refined
 _REFINED_PX = (24, 48, 128)  # of the design's longer side, from coarse to fine
-_HOPELESS = 0.25  # likeness at a coarse size, which finer ones do not raise to `LEAST_LIKENESS`
+_HOPELESS = 0.25  # likeness at a coarse size: of 127 places that were accepted none had less than 0.59
 # of the longer side: sigma of the mean that is subtracted; less for corners, which slow changes of light would move
 _SURROUNDINGS, _FINE_SURROUNDINGS = 1 / 6, 1 / 16
 _STEPS, _COLOR_STEPS, _MOST_SHIFT = 30, 10, 1 / 16
@@ -83,10 +83,10 @@ class FoundPlace:
 
 
 class _Searched:
-    """A photograph, smaller copies of it, and its features: read once for all designs that are looked for."""
+    """Copies of a photograph, itself the first, and its features: read once for all designs that are looked for."""
 
     def __init__(self, srgb: np.ndarray):
-        self.srgb, self.levels, self.small = srgb, halving_pyramid(srgb), downscale(srgb, SEARCHED_PX)
+        self.levels, self.small = halving_pyramid(srgb), downscale(srgb, SEARCHED_PX)
 
     @cached_property
     def features(self) -> tuple[np.ndarray, np.ndarray]:
@@ -98,22 +98,22 @@ def find_design(srgb: np.ndarray, design: np.ndarray, size_mm: tuple[float, floa
 
     Raises `PhotoRejected`: "no_corners" without a print, "too_small", "several_sheets", "mirrored".
     """
-    photo = _Searched(srgb)
-    places = _find_places(photo, design, size_mm)
+    refiners = _refiners(srgb, design, size_mm)
+    places = _find_places(refiners[0])
     found = [place for place in places if place.accepted]
     if not found:
-        mirrored = _find_places(photo, np.ascontiguousarray(design[:, ::-1]), size_mm, by_templates=False)
+        mirrored = _find_places(refiners[1], by_templates=False)
         if any(place.accepted for place in mirrored):
             raise PhotoRejected("mirrored", None, None, MIRRORED_ADVICE)
         best = max((place.likeness for place in places), default=0.0)
         raise PhotoRejected("no_corners", best, LEAST_LIKENESS, _NOT_FOUND_ADVICE)
     if len(found) > 1:
         raise PhotoRejected("several_sheets", len(found), 1, _SEVERAL_ADVICE)
-    place, _, lead = _best_turn(photo, design, size_mm, found[0].corners_px)
+    place, _, lead = _best_turn(refiners, found[0].corners_px)
     if lead < _LEAST_LEAD:
         raise PhotoRejected("no_corners", place.likeness, LEAST_LIKENESS, _UNDIRECTED_ADVICE)
     turned = place.significance > found[0].significance + _TURNED_BY
-    place = (turned and _Refiner(photo, design, size_mm).refine(place.corners_px)) or found[0]
+    place = (turned and refiners[0].refine(place.corners_px)) or found[0]
     side_px = min(1.0, SEARCHED_PX / max(srgb.shape[:2])) * detect.side_px(place.corners_px)
     side_px *= float(np.sqrt(min(size_mm) / max(size_mm)))
     if side_px < SMALLEST_PRINT_PX:
@@ -123,21 +123,26 @@ def find_design(srgb: np.ndarray, design: np.ndarray, size_mm: tuple[float, floa
 
 def refuse_other_order(srgb: np.ndarray, design: np.ndarray, size_mm: tuple[float, float], corners_px: np.ndarray):
     """Raise `PhotoRejected` if the design fits clearly better with another corner 4×2 px first, or mirrored."""
-    place, turn, _ = _best_turn(_Searched(srgb), design, size_mm, corners_px)
+    place, turn, _ = _best_turn(_refiners(srgb, design, size_mm), corners_px)
     if turn:
         raise PhotoRejected("no_corners", place.likeness, LEAST_LIKENESS, _ORDER_ADVICE)
 
 
-def _best_turn(photo: _Searched, design: np.ndarray, size_mm, corners_px) -> tuple[FoundPlace, int, float]:
+def _refiners(srgb: np.ndarray, design: np.ndarray, size_mm: tuple[float, float]) -> list["_Refiner"]:
+    """Refiners of a design and of its mirror image, which share what is read of the photograph."""
+    photo = _Searched(srgb)
+    return [_Refiner(photo, each, size_mm) for each in (design, np.ascontiguousarray(design[:, ::-1]))]
+
+
+def _best_turn(refiners: list["_Refiner"], corners_px: np.ndarray) -> tuple[FoundPlace, int, float]:
     """The place refined from corners 4×2 px with the first, or another that fits clearly better, as the design's first;
     its index; and its lead over others. Raises `PhotoRejected` if the mirrored design fits better. Images like the
     design itself don't count.
     """
-    mirror, nowhere = np.ascontiguousarray(design[:, ::-1]), FoundPlace(corners_px, 0.0, 0.0, np.inf)
-    refiners, turned = (_Refiner(photo, each, size_mm) for each in (design, mirror)), range(4)
+    nowhere, turned = FoundPlace(corners_px, 0.0, 0.0, np.inf), range(4)
     places = [[each.refine(np.roll(corners_px, -turn, 0), False) or nowhere for turn in turned] for each in refiners]
     own, mirrored = (np.array([place.significance * place.accepted for place in each]) for each in places)
-    small = [cv2.resize(each, (64, 64), interpolation=cv2.INTER_AREA).astype(float) for each in (design, mirror)]
+    small = [cv2.resize(each.design, (64, 64), interpolation=cv2.INTER_AREA).astype(float) for each in refiners]
     least = _LEAST_DIFFERENCE * small[0].var((0, 1)).mean()
     differ = [[((np.rot90(each, turn) - small[0]) ** 2).mean() > least for turn in turned] for each in small]
     if mirrored.max() > own.max() + _MIRRORED_BY and all(differ[1]):
@@ -149,13 +154,13 @@ def _best_turn(photo: _Searched, design: np.ndarray, size_mm, corners_px) -> tup
     return places[0][0], 0, lead
 
 
-def _find_places(photo: _Searched, design: np.ndarray, size_mm, by_templates: bool = True) -> list[FoundPlace]:
+def _find_places(refiner: "_Refiner", by_templates: bool = True) -> list[FoundPlace]:
     """Places of a design in a photograph that do not overlap, the most significant first, accepted or not."""
-    scale = np.array(photo.srgb.shape[1::-1]) / photo.small.shape[1::-1]
-    refiner = _Refiner(photo, design, size_mm)
-    places = _distinct(map(refiner.refine, (quad * scale for quad in _places_by_features(photo, design, size_mm))))
+    photo, sought = refiner.photo, (refiner.design, refiner.size_mm)
+    scale = np.array(photo.levels[0].shape[1::-1]) / photo.small.shape[1::-1]
+    places = _distinct(map(refiner.refine, (quad * scale for quad in _places_by_features(photo, *sought))))
     if by_templates and not (places and places[0].accepted):
-        by_template = (quad * scale for quad in _places_by_templates(photo.small, design, size_mm))
+        by_template = (quad * scale for quad in _places_by_templates(photo.small, *sought))
         places = _distinct([*places, *map(refiner.refine, by_template)])
     return places
 
@@ -277,25 +282,25 @@ class _Refiner:
     """Refine places of a design on intensities; holds the design at each size."""
 
     def __init__(self, photo: _Searched, design: np.ndarray, size_mm: tuple[float, float]):
-        self.srgb, self.levels, self.size_mm = photo.srgb, photo.levels, size_mm
+        self.photo, self.design, self.size_mm = photo, design, size_mm
         self.template = cache(lambda px, surroundings: _SmallDesign(_draw(design, size_mm, px), surroundings))
 
     def refine(self, quad: np.ndarray, closely: bool = True) -> FoundPlace | None:
         """The refined place, or None if it is none that a camera can see. To compare directions it need not be done
         `closely`: without mixed colors.
         """
-        place = None
+        place, levels = None, self.photo.levels
         for longer_px in _REFINED_PX:
-            if not is_plausible_quad(quad) or not is_in_picture(quad, self.srgb):
+            if not is_plausible_quad(quad) or not is_in_picture(quad, levels[0]):
                 return None
             side_px = detect.side_px(quad)
             most = max(24, 2 * round(0.5 * side_px * np.sqrt(max(self.size_mm) / min(self.size_mm))))
             size = min(longer_px, most)
-            level = int(np.clip(np.log2(max(side_px / size, 1)), 0, len(self.levels) - 1))
-            scale, template = self.srgb.shape[1] / self.levels[level].shape[1], self.template(size, _SURROUNDINGS)
-            refined, likeness, sigma = template.align(self.levels[level], quad / scale)
+            pixels = levels[int(np.clip(np.log2(max(side_px / size, 1)), 0, len(levels) - 1))]
+            scale, template = levels[0].shape[1] / pixels.shape[1], self.template(size, _SURROUNDINGS)
+            refined, likeness, sigma = template.align(pixels, quad / scale)
             if closely and size in (most, _REFINED_PX[-1]) and likeness > LEAST_LIKENESS:
-                mixed = self.template(size, _FINE_SURROUNDINGS).align(self.levels[level], refined, mixes=True)
+                mixed = self.template(size, _FINE_SURROUNDINGS).align(pixels, refined, mixes=True)
                 # where a part of a design is plain, mixtures of colors imitate shifts
                 if np.abs(mixed[0] - refined).max() * scale < _MOST_SHIFT * side_px:
                     refined, _, sigma = mixed
@@ -304,7 +309,7 @@ class _Refiner:
             place = FoundPlace(quad, likeness, significance, sigma * scale)
             if size == most or likeness < _HOPELESS:
                 break
-        return place if is_plausible_quad(quad) and is_in_picture(quad, self.srgb) else None
+        return place if is_plausible_quad(quad) and is_in_picture(quad, levels[0]) else None
 
 
 class _SmallDesign:

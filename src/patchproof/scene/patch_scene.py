@@ -154,7 +154,8 @@ def _place_piece(scene: MeshScene) -> tuple[Piece, Placement, float, tuple[str, 
         placement = lay(mesh, patch_frame(mesh, patch), patch.size_mm, patch.spin_deg)
     except Refused as refused:
         raise refused.with_advice(placement_advice(mesh, patch, lay, smallest_piece_mm())) from refused
-    scales = _smallest_scales(scene, placement)
+    poses = camera_poses(scene, placement.center_mm, scene.draw("select", SCALE_VIEWS, 0).pose)
+    scales = _smallest_scales(scene, placement, poses)
     if not (facing := scales[scales > 0]).size:
         got = f"{SCALE_VIEWS} views from behind it"
         raise Refused("views from which the patch can be seen", got, "turn azimuth_deg towards the patch")
@@ -171,7 +172,7 @@ def _place_piece(scene: MeshScene) -> tuple[Piece, Placement, float, tuple[str, 
         # were readable, of 40 to 90 mm 26 of 168 where 21 to 100 % were.
         few = "few photographs of rolled paper under 100 mm can be measured: the others only count"
         notes += (few,) if min(patch.size_mm) < 100 else ()
-    shown = _in_picture(scene, placement)
+    shown = _in_picture(scene, placement, poses)
     if shown.mean() < interface.READABLE_SHARE:
         advice = "raise view.fov_deg or view.distance_mm, or lower view.look_at_jitter"
         notes += (f"the piece lies beyond the edge of the picture in {1 - shown.mean():.0%} of photographs: {advice}",)
@@ -189,20 +190,16 @@ def _place_piece(scene: MeshScene) -> tuple[Piece, Placement, float, tuple[str, 
     return piece, placement, unreadable, notes
 
 
-def _in_picture(scene: MeshScene, placement: Placement) -> np.ndarray:
+def _in_picture(scene: MeshScene, placement: Placement, poses: np.ndarray) -> np.ndarray:
     """True for each view that shows three of the piece's corners or more, without which no sheet can be measured."""
-    poses = camera_poses(scene, placement.center_mm, scene.draw("select", SCALE_VIEWS, 0).pose)
     corners = placement.world(geometry.rect_corners((0, 0, *placement.size_mm)))
     pixels = geometry.project(scene.matrix_px(scene.photo_px), poses, corners)
     return ((pixels >= 0) & (pixels <= scene.photo_px)).all(2).sum(1) >= 3
 
 
-def _smallest_scales(scene: MeshScene, card: Placement) -> np.ndarray:
+def _smallest_scales(scene: MeshScene, card: Placement, poses: np.ndarray) -> np.ndarray:
     """Return px per mm at the card's middle, along the foreshortened direction, in each view; 0 from behind."""
-    conditions = scene.draw("select", SCALE_VIEWS, 0)
-    center_mm, matrix = card.center_mm, scene.matrix_px(scene.photo_px)
-    poses = camera_poses(scene, center_mm, conditions.pose)
-    faces = (geometry.camera_centers(poses) - center_mm) @ card.normal > 0
-    planes = geometry.plane_homography(matrix, poses, card.world_from_piece)
+    faces = (geometry.camera_centers(poses) - card.center_mm) @ card.normal > 0
+    planes = geometry.plane_homography(scene.matrix_px(scene.photo_px), poses, card.world_from_piece)
     mean, tilt_deg = geometry.local_scales(planes, np.array(card.size_mm) / 2).T
     return np.where(faces, mean * np.sqrt(np.cos(np.radians(tilt_deg))), 0.0)
