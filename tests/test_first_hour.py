@@ -153,8 +153,14 @@ def test_a_first_hour_says_at_each_step_what_to_do_next(tmp_path, monkeypatch):
     assert "next: patchproof sheet run --out sheet.pdf" in optimize and "sheet.json" in sheet
     assert f"or name the networks yourself (--models '{MODEL}')" in refused
     assert "Helps (controls rendered into these photographs)" in verify and "verdict: kept" in verify
-    assert "photographs: 15, judged 13, measured 11" in verify  # two are overexposed
-    for named in ("copy: 2", "cropped: 1", "IMG_0007.MOV", "IMG_0008.CR2", "thumbnails"):
+    assert "photographs: 15, judged 12, measured 10" in verify  # two are overexposed
+    for named in (
+        "copy: 2",
+        "copy: 1 (session_03/Screenshot 2026-11-22.png): it shows what session_03/",
+        "IMG_0007.MOV",
+        "IMG_0008.CR2",
+        "thumbnails",
+    ):
         assert named in verify, named
     assert not any(word in verify for word in ("notes.txt", ".DS_Store", "._photo.jpg"))
 

@@ -50,7 +50,9 @@ def seen(name, azimuth=10.0, distance=550.0, elevation=5.0, roll=0.0, light=0.8,
         ({"elevation": 6.0}, {"azimuth": -10.0}),  # as much from the other side
         ({"distance": 559.0}, {"distance": 565.0}),
         ({"light": 0.83}, {"light": 0.85}),
-        ({"aside": 7.9}, {"aside": 8.1}),  # a hundredth of 800 px
+        ({"aside": 7.9, "roll": 0.3}, {"aside": 8.1, "roll": 0.3}),  # a hundredth of 800 px
+        ({"aside": 40.0, "roll": 0.2}, {"aside": 40.0, "roll": 0.3}),  # a crop, and a camera that was held elsewhere
+        ({"aside": 40.0}, {"aside": 40.0, "distance": 553.0}),
     ],
 )
 def test_two_shots_of_a_hand_held_camera_are_one_and_another_view_is_none(same, other):
@@ -103,6 +105,7 @@ def test_copies_of_one_photograph_prove_nothing_and_are_named(tmp_path):
         shutil.copy(photos / "a.jpg", photos / f"b{i}.jpg")
     Image.open(photos / "a.jpg").save(photos / "c.jpg", quality=70)  # saved anew
     save(shot()[:, 100:700], photos / "d.jpg")  # a square: no other shape
+    Image.fromarray(shot()[15:585, 40:760]).save(photos / "h.jpg", quality=70)
     save(shot(25, 500)[:, 200:], photos / "Screenshot_1.jpg")
     for name in ("e.mp4", "f.DNG", "a.mov"):  # the last is the first photograph's second of video
         (photos / name).write_bytes(b"x")
@@ -116,14 +119,15 @@ def test_copies_of_one_photograph_prove_nothing_and_are_named(tmp_path):
     report = verified(photos, controls=controls)
     codes = {photo.file: photo.code for photo in report.photos}
     assert codes["a.jpg"] is None and {codes[f"b{i}.jpg"] for i in range(10)} == {codes["c.jpg"]} == {"copy"}
-    assert codes["Screenshot_1.jpg"] == "cropped" and codes["d.jpg"] is None
+    assert codes["d.jpg"] == codes["h.jpg"] == "copy"
+    assert codes["Screenshot_1.jpg"] == "cropped"
     summary = report.summary
-    assert (summary.photos, summary.judged, summary.verdict) == (14, 3, "cannot_tell")
+    assert (summary.photos, summary.judged, summary.verdict) == (15, 2, "cannot_tell")
     assert report.controls[0].n == 1
     lines = "\n".join(verdict_lines(report))
     for words in (
         "copy: 10 (b0.jpg, b1.jpg, b2.jpg and 7 more): its bytes are those of a.jpg",
-        "copy: 1 (c.jpg): it shows what a.jpg shows",
+        "copy: 3 (c.jpg, d.jpg, h.jpg): it shows what a.jpg shows",
         "cropped: 1 (Screenshot_1.jpg): it is a crop or a screenshot",
         "take still photographs): e.mp4",
         "save them as JPEG): f.DNG",
@@ -133,7 +137,7 @@ def test_copies_of_one_photograph_prove_nothing_and_are_named(tmp_path):
         assert words in lines
     assert "a.mov" not in lines
     table = photos_csv(report.model_dump(mode="json")["photos"])
-    assert table.count(",copy,") == 11 and '"its bytes are those of a.jpg' in table
+    assert table.count(",copy,") == 13 and '"its bytes are those of a.jpg' in table
 
 
 @pytest.mark.parametrize(
@@ -171,8 +175,8 @@ def test_codes_of_photographs_come_with_names_and_advice():
 
 
 def test_a_photograph_is_compared_with_those_like_it_however_many_there_are(monkeypatch):
-    compared, find = [], grouping._find_same_view
-    monkeypatch.setattr(grouping, "_find_same_view", lambda view, rows: compared.append(len(rows)) or find(view, rows))
+    compared, find = [], grouping._is_repeated
+    monkeypatch.setattr(grouping, "_is_repeated", lambda view, rows: compared.append(len(rows)) or find(view, rows))
     rng, low, high = np.random.default_rng(0), (-60, 440, 2, -5), (60, 800, 27, 5)
     drawn = [seen(str(i), *rng.uniform(low, high), aside=rng.uniform(-20, 20)) for i in range(80)]  # in one session
     assert all(photo.counted for photo in reject_copies(drawn, (0,) * 80, DESIGN_MM))

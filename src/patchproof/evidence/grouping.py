@@ -9,20 +9,21 @@ decide: another camera, or a pause of half an hour, begins a new session. Withou
 cautious assumption, since photographs of one session count for less. Also: the sessions of controls.
 Copies count once: files with equal bytes, and in a session those in which light and the sheet's place differ by no more
 than between two shots of a hand-held camera: a centimeter in half a meter, a degree or two, an aim that is off by a
-hundredth of the picture, exposures that differ by a fourteenth of a stop.
+hundredth of the picture, exposures that differ by a fourteenth of a stop. A crop that keeps its pixels is a copy, too.
 Left out on purpose: dividing folders, which are somebody's word; copies without a readable sheet that differ in bytes.
 """
 
+import math
 from bisect import bisect, insort
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
 from functools import partial
-from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from patchproof.base.geometry import apply_homography, rect_corners
 from patchproof.base.input import is_folder
@@ -49,7 +50,11 @@ SCALE_TOLERANCE, TILT_TOLERANCE = 0.02, 0.02  # relative of pixels per mm, absol
 LIGHT_TOLERANCE = 0.05  # relative, of the light of white paper
 AIM_TOLERANCE = 0.01  # of the picture's longer side
 SHAPE_TOLERANCE = 0.01  # of the design's longer side: offset of its corners about its middle
-_FIGURES = 16  # of a view: session, scale, tilt, light in three colors, the middle's place, the shape of four corners
+CROP_TOLERANCE = 0.2  # of those of scale and shape, in which a photograph and its crop are equal but for noise
+# Figures of a view: place of the middle and scale in the picture, pixels per mm, shape of four corners, session, tilt,
+# light in three colors. A crop changes the first three.
+_FIGURES, _IN_PICTURE, _OF_CROPS, _ANYWHERE = 17, slice(3), slice(3, 12), slice(4, None)
+_UNKNOWN = 1e9  # in place of an unknown figure, which is like other unknown ones
 
 
 @dataclass(frozen=True)
@@ -265,29 +270,31 @@ def _distance_shares(
 
 
 def reject_copies(photos: Sequence[MeasuredPhoto], session: Sequence[int], rect_mm: Rect) -> list[MeasuredPhoto]:
-    """Reject every photograph that repeats an earlier one; the design lies at `rect_mm` of the page."""
+    """Reject every photograph that repeats a larger or an earlier one; the design lies at `rect_mm` of the page."""
+    seen = [_view(photo, number, rect_mm) for photo, number in zip(photos, session, strict=True)]
+    rows = [row for row, view in enumerate(seen) if view is not None]
+    views = np.array([seen[row] for row in rows]).reshape(-1, _FIGURES)
+    # so that a view is compared with those near it alone
+    tree = KDTree(np.nan_to_num(views[:, _ANYWHERE], nan=_UNKNOWN)) if rows else None
     first_by_sha256: dict[str, PhotoEntry] = {}
-    rows_by_cell: dict[tuple[float, ...], list[int]] = {}  # so that a view is compared with those near it alone
-    originals, results = np.empty((len(photos), _FIGURES)), []
-    for row, (photo, number) in enumerate(zip(photos, session, strict=True)):
-        entry, view = photo.entry, _view(photo, number, rect_mm)
+    first_by_row: dict[int, PhotoEntry] = {}
+    results = list(photos)
+    for row in sorted(range(len(photos)), key=lambda row: -math.prod(photos[row].entry.photo_px or (0,))):
+        entry, view = photos[row].entry, seen[row]
         first = None if entry.sha256 is None else first_by_sha256.get(entry.sha256)
         advice = "its bytes are those of {}, which counts once: leave it out"
-        if first is None and view is not None:
-            own_cell, *cells = _cells_near(view)
-            rows = sorted(row for cell in (own_cell, *cells) for row in rows_by_cell.get(cell, ()))
-            same = _find_same_view(view, originals[rows])
-            first = None if same is None else photos[rows[same]].entry
+        if first is None:
+            first = first_by_row.get(row)
             advice = "it shows what {} shows, from there and in its light, and counts once: take another view"
-            if first is None:
-                originals[row] = view
-                rows_by_cell.setdefault(own_cell, []).append(row)
         if first is None:
             first_by_sha256 |= {} if entry.sha256 is None else {entry.sha256: entry}
+            if tree is not None and view is not None:
+                near = tree.query_ball_point(np.nan_to_num(view[_ANYWHERE], nan=_UNKNOWN), 1, p=np.inf)
+                for index in np.array(near)[_is_repeated(view, views[near])]:
+                    first_by_row.setdefault(rows[index], entry)
         else:
             remark = Remark(code=COPY_CODE, advice=advice.format(first.file))
-            photo = replace(photo, entry=entry.changed(status="rejected", remark=remark), counted=False)
-        results.append(photo)
+            results[row] = replace(photos[row], entry=entry.changed(status="rejected", remark=remark), counted=False)
     return results
 
 
@@ -299,7 +306,7 @@ def _view(photo: MeasuredPhoto, session: int, rect_mm: Rect) -> np.ndarray | Non
     if not photo.counted or geometry is None or photo.light is None or size_px is None:
         return None
     light = np.log(np.maximum(photo.light.paper, 1e-3)) / LIGHT_TOLERANCE
-    scale = np.log(geometry.px_per_mm / max(size_px)) / SCALE_TOLERANCE
+    scales = np.log(geometry.px_per_mm / np.array([max(size_px), 1])) / SCALE_TOLERANCE
     tilt = np.nan if geometry.tilt_deg is None else np.cos(np.radians(geometry.tilt_deg)) / TILT_TOLERANCE
     corners = np.full((4, 2), np.nan)  # unknown on rolled paper
     if geometry.homography_px_from_mm is not None:
@@ -311,18 +318,11 @@ def _view(photo: MeasuredPhoto, session: int, rect_mm: Rect) -> np.ndarray | Non
     middle = corners.mean(0)
     side = geometry.px_per_mm * max(rect_mm[2:]) / max(size_px)
     shape = (corners - middle) / side / SHAPE_TOLERANCE
-    return np.array([2 * session, scale, tilt, *light, *(middle / AIM_TOLERANCE), *shape.ravel()])
+    return np.array([*(middle / AIM_TOLERANCE), *scales, *shape.ravel(), 2 * session, tilt, *light])
 
 
-def _cells_near(view: np.ndarray) -> Iterator[tuple[float, ...]]:
-    """The cells of session, scale and the middle's place where views like this one may lie; its own is the first."""
-    own = np.floor(np.nan_to_num(view[[1, 6, 7]]) / 1.01)  # a cell is wider than a tolerance
-    return ((float(view[0]), *(own + offset).tolist()) for offset in product((0, -1, 1), repeat=3))
-
-
-def _find_same_view(view: np.ndarray, others: np.ndarray) -> int | None:
-    """The first row of `others` that knows the same figures, none of which differs by more than its tolerance."""
-    unknown = np.isnan(view)
-    alike = (np.isnan(others) == unknown) & ((np.abs(others - view) <= 1) | unknown)
-    rows = np.flatnonzero(alike.all(1))
-    return int(rows[0]) if len(rows) else None
+def _is_repeated(view: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Whether each of the views N×F, alike but for their place in the picture, is this one again or a crop of it."""
+    off = np.abs(others - view)
+    moved, crop = off[:, _IN_PICTURE] > 1, off[:, _OF_CROPS] <= CROP_TOLERANCE
+    return np.logical_not(np.any(moved, 1)) | np.all(crop, 1)

@@ -94,11 +94,11 @@ def surface_heights(
 
 def triangles_near(triangles: np.ndarray, center_mm: np.ndarray, reach_mm: float) -> np.ndarray:
     """Return the triangles whose box comes within `reach_mm` of a point along each axis."""
-    low, high = boxes(triangles)
+    low, high = _boxes(triangles)
     return triangles[((low <= center_mm + reach_mm) & (high >= center_mm - reach_mm)).all(1)]
 
 
-def boxes(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _boxes(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the lowest and the highest coordinates F×D of triangles F×3×D, twice as fast as `min(1)` does."""
     a, b, c = triangles.swapaxes(0, 1)
     return np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
@@ -116,7 +116,7 @@ def edge_points(triangles: np.ndarray, step_mm: float) -> np.ndarray:
 def surface_point(triangles: np.ndarray, origin_mm: np.ndarray, axes: np.ndarray) -> np.ndarray:
     """Return where the line through `origin_mm` along the last of `axes` first meets triangles; refused if never."""
     corners = (triangles - origin_mm) @ axes.T
-    low, high = boxes(corners[..., :2])
+    low, high = _boxes(corners[..., :2])
     near = corners[((low <= 0) & (high >= 0)).all(1)]
     h, hit = _cast(np.zeros((1, 3)), np.array([[0.0, 0, 1]]), near)
     if not hit.any():
@@ -135,7 +135,7 @@ def _visits(chart: SurfaceChart, triangles: np.ndarray, size_mm, n: int):
         surrounds_axis = np.ptp(local[..., 0], axis=1) > around / 2
         local[surrounds_axis, :2, 0] = [-around, around]
         shifts = [-around, 0.0, around]
-    low, high = boxes(local)
+    low, high = _boxes(local)
     middle, half = (low + high) / 2, (high - low) / 2 + 1e-9
     step, radius, rows = np.array(size_mm) / (n - 1), np.hypot(*size_mm) / 2, []
     for shift in shifts:

@@ -6,7 +6,7 @@ level part of the surface lies under it, and placed there as at a given place. A
 stands off too far is no candidate. Left out on purpose: objects in front of a place, which the networks will show.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import get_args
@@ -55,20 +55,32 @@ class PlaceFinder:
 
     def candidates(self, most: int) -> tuple[CandidatePlace, ...]:
         """Return up to `most` places, one spin each, as far apart as their number allows; refused if there is none."""
-        frames = ((side, self._frame_at(side)) for side in get_args(Side))
-        seen = ((side, f) for side, f in frames if self._facing(f.origin_mm[None], f.normal[None])[0] >= _FACING_SHARE)
-        # the middles of sides, where a piece hangs by default; elsewhere upright if that fits, else a quarter turned
-        sides = [spot for side, frame in seen if (spot := self._candidate(side, frame, 0.0))]
-        tries = ((self._candidate_near(frame, spin) for spin in self._spins[:2]) for frame in self._frames_to_try)
-        candidates = sides + [spot for spots in tries if (spot := next(filter(None, spots), None))]
-        if not candidates:
+        candidates = list(self.places())
+        middles = np.array([spot.placement.center_mm for spot in candidates])
+        normals = np.array([spot.placement.normal for spot in candidates])
+        first = range(max(len(self._sides), 1))
+        indices = _spread(middles, normals, min(self.size_mm), MIN_DISTANCE_SHARE, most, first)
+        return tuple(candidates[i] for i in indices)
+
+    def places(self) -> Iterator[CandidatePlace]:
+        """Find places, one spin each: those in the middles of sides first; refused at the end if there was none."""
+        yield from self._sides
+        found = bool(self._sides)
+        for frame in self._frames_to_try:  # upright if that fits, else a quarter turned
+            if spot := next(filter(None, (self._candidate_near(frame, spin) for spin in self._spins[:2])), None):
+                found = True
+                yield spot
+        if not found:
             expected = f"a place for a piece of {self.size_mm[0]:.0f} × {self.size_mm[1]:.0f} mm that views face"
             remedy = "make it smaller, or let it bend"
             raise Refused(expected, f"{len(self._frames_to_try)} places at which it does not fit", remedy)
-        middles = np.array([spot.placement.center_mm for spot in candidates])
-        normals = np.array([spot.placement.normal for spot in candidates])
-        indices = _spread(middles, normals, min(self.size_mm), MIN_DISTANCE_SHARE, most, range(max(len(sides), 1)))
-        return tuple(candidates[i] for i in indices)
+
+    @cached_property
+    def _sides(self) -> list[CandidatePlace]:
+        """The middles of sides, where a piece hangs by default."""
+        frames = ((side, self._frame_at(side)) for side in get_args(Side))
+        seen = ((side, f) for side, f in frames if self._facing(f.origin_mm[None], f.normal[None])[0] >= _FACING_SHARE)
+        return [spot for side, frame in seen if (spot := self._candidate(side, frame, 0.0))]
 
     def other_spins(self, spot: CandidatePlace) -> tuple[CandidatePlace, ...]:
         """Return about the same place with the other spins that fit there."""

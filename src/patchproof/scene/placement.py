@@ -19,7 +19,7 @@ from patchproof.base.geometry import rotated_extent
 from patchproof.base.settings import PatchSettings, SceneSettings
 from patchproof.base.validation import Side
 from patchproof.mesh.mesh import Mesh
-from patchproof.mesh.surface_chart import SurfaceChart, boxes, grid_faces, surface_heights
+from patchproof.mesh.surface_chart import SurfaceChart, grid_faces, surface_heights, triangles_near
 
 GRID = 65  # heights are sampled on this many points along each edge of the card
 LIFT_MM = 0.15  # the paper's own thickness, which also keeps it clear of the surface in the z-buffer
@@ -232,12 +232,9 @@ def _nearest_surface(mesh: Mesh, point: np.ndarray) -> tuple[np.ndarray, np.ndar
     """Return the surface point nearest to `point` and its face's unit normal."""
     from trimesh.triangles import closest_point, normals
 
-    triangles = mesh.vertices[mesh.faces]
-    # a triangle whose box is farther away than another's corner is not the nearest
-    low, high = boxes(triangles)
-    outside = np.maximum(np.maximum(low - point, point - high), 0)
-    nearest_corner = ((triangles - point) ** 2).sum(-1).min()
-    triangles = triangles[(outside**2).sum(-1) <= nearest_corner]
+    # the nearest triangle is no farther away than the nearest corner
+    reach_mm = float(np.linalg.norm(mesh.vertices - point, axis=1).min())
+    triangles = triangles_near(mesh.vertices[mesh.faces], point, reach_mm * (1 + 1e-6))
     points = closest_point(triangles, np.broadcast_to(point, (len(triangles), 3)))
     nearest = int(np.argmin(((points - point) ** 2).sum(1)))
     return points[nearest], normals(triangles[nearest : nearest + 1])[0][0]

@@ -68,7 +68,7 @@ def new_scene(
         text, lines = _folder_scene(Path(thing), base, label, models)
     scene = build_scene(validate_model(SceneSettings, tomllib.loads(text), "the new scene"), base)
     if isinstance(scene, UnplacedScene):
-        PlaceFinder(scene).candidates(1)  # refuses an object without any place for the piece
+        next(PlaceFinder(scene).places())  # refuses an object without any place for the piece
     write_atomically(out, text)
     return [*lines, *(f"warning: {warning}" for warning in scene.warnings)]
 
