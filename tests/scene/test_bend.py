@@ -11,7 +11,7 @@ from patchproof.base.errors import Refused
 from patchproof.base.settings import PatchSettings
 from patchproof.mesh.load_mesh import load_mesh
 from patchproof.mesh.mesh import Material, MeshPart, mesh_from_parts
-from patchproof.mesh.surface_chart import SurfaceChart, edge_points, piece_grid, surface_heights, triangles_near
+from patchproof.mesh.surface_chart import SurfaceChart, edge_points, piece_grid, surface_heights
 from patchproof.scene.bent_scene import GAP_LIMIT, place_bent
 from patchproof.scene.placement import LIFT_MM, patch_frame
 
@@ -257,7 +257,8 @@ def _highest_over(mesh, piece) -> float:
     """How far the object reaches through the paper at most, in mm, looking out of 300 random points of it."""
     rng = np.random.default_rng(0)
     corners = piece.vertices_mm[piece.faces]
-    triangles = triangles_near(mesh.vertices[mesh.faces], piece.center_mm, float(np.hypot(*piece.size_mm)) / 2 + 3)
+    distances = np.linalg.norm(mesh.vertices - piece.center_mm, axis=1)
+    triangles = mesh.triangles_near(distances, float(np.hypot(*piece.size_mm)) / 2 + 10)
     low, high = triangles.min(1) - 3, triangles.max(1) + 3
     worst = -np.inf
     for face in rng.integers(len(corners), size=300):

@@ -59,6 +59,18 @@ class Mesh:
         """The lowest and highest corner of the bounding box."""
         return self.vertices.min(0), self.vertices.max(0)
 
+    def triangles_near(self, vertex_mm: np.ndarray, reach_mm: float) -> np.ndarray:
+        """Return triangles F×3×3 in their order, without those that cannot come within a reach of a thing that lies
+        `vertex_mm` V from each vertex.
+        """
+        near = vertex_mm <= reach_mm + self._longest_edge_mm
+        return self.vertices[self.faces[near[self.faces].any(1)]]
+
+    @cached_property
+    def _longest_edge_mm(self) -> float:
+        a, b, c = (self.vertices[corner] for corner in self.faces.T)
+        return max(float(np.linalg.norm(edge, axis=1).max()) for edge in (b - a, c - b, a - c))
+
 
 def mesh_from_parts(parts: Sequence[MeshPart], length_mm: float, warnings: Sequence[str] = ()) -> Mesh:
     """Join parts, which may share materials, into one centered mesh with the longest extent `length_mm`. Faces with NaN

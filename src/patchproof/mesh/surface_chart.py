@@ -92,12 +92,6 @@ def surface_heights(
     return np.where(np.isfinite(highest), highest, np.nan)
 
 
-def triangles_near(triangles: np.ndarray, center_mm: np.ndarray, reach_mm: float) -> np.ndarray:
-    """Return the triangles whose box comes within `reach_mm` of a point along each axis."""
-    low, high = _boxes(triangles)
-    return triangles[((low <= center_mm + reach_mm) & (high >= center_mm - reach_mm)).all(1)]
-
-
 def _boxes(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the lowest and the highest coordinates F×D of triangles F×3×D, twice as fast as `min(1)` does."""
     a, b, c = triangles.swapaxes(0, 1)

@@ -25,6 +25,7 @@ from patchproof.scene.placement import (
     LIFT_MM,
     Placement,
     SurfaceFrame,
+    beside_mm,
     patch_frame,
     piece_pose,
     placement_method,
@@ -45,10 +46,10 @@ def place_bent(mesh: Mesh, frame: SurfaceFrame, size_mm: tuple[float, float], sp
     """Place a piece along the surface where the frame's normal meets it, its up along the frame's; spin turns it
     clockwise as one faces it. Refused with a reason if paper cannot follow the surface.
     """
-    triangles, axes = mesh.vertices[mesh.faces], np.stack([frame.right, frame.up, frame.normal])
+    triangles, axes = mesh.triangles_near(beside_mm(mesh, frame), 0.0), np.stack([frame.right, frame.up, frame.normal])
     frame = replace(frame, origin_mm=surface_chart.surface_point(triangles, frame.origin_mm, axes))
     # paper ends half a diagonal from its middle; a surface farther than that from its chart is not under it
-    near = surface_chart.triangles_near(triangles, frame.origin_mm, float(np.hypot(*size_mm)))
+    near = mesh.triangles_near(np.abs(mesh.vertices - frame.origin_mm).max(1), float(np.hypot(*size_mm)))
     tangent, curvatures = _fit_tangent(near, frame, size_mm)
     card = placement.lay_card(near, tangent, size_mm, spin_deg, _reach(size_mm))
     if card.gap_mean_mm <= CLOSE_SHARE * min(size_mm):

@@ -16,7 +16,7 @@ import numpy as np
 from patchproof.base.errors import Refused
 from patchproof.base.geometry import camera_centers
 from patchproof.base.validation import Side
-from patchproof.mesh.surface_chart import SurfaceChart, piece_grid, surface_heights, triangles_near
+from patchproof.mesh.surface_chart import SurfaceChart, piece_grid, surface_heights
 from patchproof.scene.patch_scene import PiecePosition, UnplacedScene
 from patchproof.scene.placement import (
     Placement,
@@ -127,7 +127,7 @@ class PlaceFinder:
         """Move the frame's origin until the surface under the piece is as high as its middle; None if that fails."""
         right, up = spun_axes(frame, spin_deg)
         reach = float(np.hypot(*self.size_mm)) / 2
-        near = triangles_near(self._triangles, frame.origin_mm, 2 * reach)
+        near = self.scene.mesh.triangles_near(np.abs(self.scene.mesh.vertices - frame.origin_mm).max(1), 2 * reach)
         points, middle = piece_grid(self.size_mm, _NET), _NET**2 // 2
         origin = frame.origin_mm
         for _ in range(_MOVES):

@@ -19,7 +19,7 @@ from patchproof.base.geometry import rotated_extent
 from patchproof.base.settings import PatchSettings, SceneSettings
 from patchproof.base.validation import Side
 from patchproof.mesh.mesh import Mesh
-from patchproof.mesh.surface_chart import SurfaceChart, grid_faces, surface_heights, triangles_near
+from patchproof.mesh.surface_chart import SurfaceChart, grid_faces, surface_heights
 
 GRID = 65  # heights are sampled on this many points along each edge of the card
 LIFT_MM = 0.15  # the paper's own thickness, which also keeps it clear of the surface in the z-buffer
@@ -162,7 +162,13 @@ def place_card(mesh: Mesh, frame: SurfaceFrame, size_mm: tuple[float, float], sp
     it. Refused if it is larger than the object's side.
     """
     refuse_larger_than_side(size_mm, spin_deg, frame.extent_mm)
-    return lay_card(mesh.vertices[mesh.faces], frame, size_mm, spin_deg)
+    triangles = mesh.triangles_near(beside_mm(mesh, frame), float(np.hypot(*size_mm)) / 2)
+    return lay_card(triangles, frame, size_mm, spin_deg)
+
+
+def beside_mm(mesh: Mesh, frame: SurfaceFrame) -> np.ndarray:
+    """Return how far each vertex V lies from the line through the frame's origin along its normal."""
+    return np.hypot(*((mesh.vertices - frame.origin_mm) @ np.stack([frame.right, frame.up], 1)).T)
 
 
 def lay_card(
@@ -232,9 +238,8 @@ def _nearest_surface(mesh: Mesh, point: np.ndarray) -> tuple[np.ndarray, np.ndar
     """Return the surface point nearest to `point` and its face's unit normal."""
     from trimesh.triangles import closest_point, normals
 
-    # the nearest triangle is no farther away than the nearest corner
-    reach_mm = float(np.linalg.norm(mesh.vertices - point, axis=1).min())
-    triangles = triangles_near(mesh.vertices[mesh.faces], point, reach_mm * (1 + 1e-6))
+    distances = np.linalg.norm(mesh.vertices - point, axis=1)
+    triangles = mesh.triangles_near(distances, float(distances.min()))  # none is nearer than the nearest corner's
     points = closest_point(triangles, np.broadcast_to(point, (len(triangles), 3)))
     nearest = int(np.argmin(((points - point) ** 2).sum(1)))
     return points[nearest], normals(triangles[nearest : nearest + 1])[0][0]
