@@ -37,17 +37,9 @@ from patchproof.optimizer.expectation import last_pictures
 from patchproof.optimizer.loop import SELECT_AFTER, State, is_save_step, load_checkpoint, save_checkpoint, start, steps
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.optimizer.promise import PROMISE_VIEWS, VIEWS_PER_SESSION, PromiseOptions, make_promise
-from patchproof.optimizer.subject import (
-    DESIGN_FILE,
-    MASK_FILE,
-    OBJECT_FILE,
-    TEXTURE_FILES,
-    Loss,
-    read_png,
-    side_by_side,
-)
+from patchproof.optimizer.subject import DESIGN_FILE, DESIGN_FILES, Loss, read_png, side_by_side
 from patchproof.scene.interface import Scene
-from patchproof.scene.patch_scene import PatchScene
+from patchproof.scene.patch_scene import PatchScene, require_unplaced
 from patchproof.scene.scene import build_scene
 from patchproof.sheets.manifest import MAX_PRINTED_PX, Promise
 
@@ -55,7 +47,7 @@ _LOG_FILE, _VIEWS_FILE = "steps.jsonl", "views.png"
 _MAX_LINE_BYTES = 4096  # of the log
 _MESH_FILE = "given.glb"  # the mesh of a scene that was made in Python
 _STEP_FILES = (CHECKPOINT_FILE, _LOG_FILE, RUN_FILE, _VIEWS_FILE, _MESH_FILE, "place.*")
-RUN_FILE_PATTERNS = (*_STEP_FILES, DESIGN_FILE, OBJECT_FILE, TEXTURE_FILES, MASK_FILE, "evaluate.json")
+RUN_FILE_PATTERNS = (*_STEP_FILES, *DESIGN_FILES, "evaluate.json")
 
 # (steps, promised views). A draft's interval is about four times as wide as the default's; a thorough run takes three
 # times the steps, and its interval is half as wide (`patchlab charts speed`).
@@ -189,7 +181,6 @@ def _choose_place(
     # only scenes that give no place import the search
     from patchproof.optimizer.place_files import read_place, save_place
     from patchproof.optimizer.place_search import choose_place
-    from patchproof.scene.patch_scene import require_unplaced
 
     scene = require_unplaced(scene)
     place = (read_place(out, scene) if resume else None) or choose_place(scene, **search_options)

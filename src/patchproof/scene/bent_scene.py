@@ -20,16 +20,7 @@ from patchproof.scene import placement
 from patchproof.scene.interface import SCALE_VIEWS, Scene
 from patchproof.scene.mesh_scene import MeshScene, camera_poses
 from patchproof.scene.patch_scene import PatchScene
-from patchproof.scene.placement import (
-    GRID,
-    LIFT_MM,
-    Placement,
-    SurfaceFrame,
-    patch_frame,
-    piece_pose,
-    placement_method,
-    spun_axes,
-)
+from patchproof.scene.placement import GRID, LIFT_MM, Placement, SurfaceFrame, patch_frame, placement_method, spun_axes
 from patchproof.sheets.piece import Piece
 
 CLOSE_SHARE = 0.01  # a card is accepted up to this mean gap, as a share of the shorter edge: 0.6 mm on 60 mm
@@ -179,7 +170,7 @@ def _roll(chart: SurfaceChart, near: np.ndarray, size_mm) -> Placement:
         faces=surface_chart.grid_faces(PIECE_GRID, PIECE_GRID),
         piece_mm=piece_grid(size_mm, PIECE_GRID) * [1, -1] + half,
         normals=chart.cartesian(s, t)[1] @ chart.axes,
-        world_from_piece=piece_pose(right, up, chart.axes[2], origin_mm, size_mm),
+        world_from_piece=placement.piece_pose(right, up, chart.axes[2], origin_mm, size_mm),
         gap_mm=float(np.nanmax(gaps)),
         gap_mean_mm=gap_mean_mm,
         gaps_mm=gaps.reshape(GRID, GRID),

@@ -155,7 +155,7 @@ def square_marker(id_: int, corner_mm: PointMm, size_mm: float) -> PieceMarker:
     return PieceMarker(id_, ((x, y), (x + side, y), (x + side, y + side), (x, y + side)))
 
 
-def move_marker(marker: PieceMarker, shift_mm: PointMm) -> PieceMarker:
+def move_marker(marker: PieceMarker | Marker, shift_mm: PointMm) -> PieceMarker:
     """A copy of the marker, shifted."""
     a, b, c, d = ((round(x + shift_mm[0], 6), round(y + shift_mm[1], 6)) for x, y in marker.corners_mm)
     return PieceMarker(marker.id, (a, b, c, d))
