@@ -225,8 +225,7 @@ def _networks(manifest: Manifest, models: Sequence[str | Classifier] | None) -> 
         got = f"the {manifest.kind} sheet {manifest.sheet_id}"
         raise Refused("a sheet that promises something", got, "name --models")
     promised = tuple(model.name for model in manifest.promise.models)
-    names = dict.fromkeys((promised[0], *(named or promised)))
-    return tuple(named.get(name, name) for name in names)
+    return tuple(named.get(name, name) for name in dict.fromkeys((promised[0], *(named or promised))))
 
 
 def _by_name(models: Sequence[str | Classifier] | None) -> dict[str, str | Classifier]:

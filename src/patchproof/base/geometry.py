@@ -51,8 +51,7 @@ def orbit(azimuth_deg: ArrayLike, elevation_deg: ArrayLike, forward: ArrayLike, 
     forward, up = _unit(forward), _unit(up)
     right = np.cross(up, forward)  # the viewer who faces the side has this on the right hand
     azimuth, elevation = np.radians(azimuth_deg)[..., None], np.radians(elevation_deg)[..., None]
-    level = np.cos(azimuth) * forward + np.sin(azimuth) * right
-    return np.cos(elevation) * level + np.sin(elevation) * up
+    return np.cos(elevation) * (np.cos(azimuth) * forward + np.sin(azimuth) * right) + np.sin(elevation) * up
 
 
 def look_at(eye_mm: ArrayLike, target_mm: ArrayLike, roll_deg: ArrayLike = 0.0, up: ArrayLike = UP) -> np.ndarray:
@@ -97,16 +96,15 @@ def camera_centers(poses) -> np.ndarray:
 
 def plane_homography(matrix_px, camera_from_world, world_from_plane) -> np.ndarray:
     """(N×)3×3 homography from plane millimeters to pixels; `world_from_plane` 4×4 has the plane's axes and origin."""
-    pose = camera_from_world @ world_from_plane
-    return normalize_homography(matrix_px @ pose[..., :3, [0, 1, 3]])
+    return normalize_homography(matrix_px @ (camera_from_world @ world_from_plane)[..., :3, [0, 1, 3]])
 
 
-def scaling_about(middle, scale: float) -> np.ndarray:
-    """Matrix (D+1)×(D+1) that scales about `middle` (D values)."""
-    middle = np.asarray(middle, float)
-    matrix = np.eye(len(middle) + 1)
-    matrix[:-1, :-1] *= scale
-    matrix[:-1, -1] = (1 - scale) * middle
+def scaling_about(middle, scale) -> np.ndarray:
+    """Matrices ...×(D+1)×(D+1) that scale by `scale` (...) about `middle` (D values)."""
+    middle, scale = np.asarray(middle, float), np.asarray(scale, float)[..., None]
+    matrix = np.tile(np.eye(len(middle) + 1), (*scale.shape[:-1], 1, 1))
+    matrix[..., :-1, :-1] *= scale[..., None]
+    matrix[..., :-1, -1] = (1 - scale) * middle
     return matrix
 
 

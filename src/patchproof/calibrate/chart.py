@@ -205,8 +205,7 @@ def read_chart(photo: Photo, manifest: Manifest) -> ChartPhoto:
     found = {row: _core(swatch.rect_mm, *page, srgb.shape) for row, swatch in enumerate(manifest.chart)}
     cores = {row: core for row, core in found.items() if core is not None}
     if not cores:
-        advice = "come closer to the chart, hold still and show all of it"
-        raise PhotoRejected("too_small", 0, 1, advice)
+        raise PhotoRejected("too_small", 0, 1, "come closer to the chart, hold still and show all of it")
     light = np.full((len(manifest.chart), 3), np.nan)
     middles_mm = np.array([[x + w / 2, y + h / 2] for x, y, w, h in cores.values()])
     by_swatch = _paper_at(middles_mm, srgb, manifest, *page)

@@ -148,8 +148,7 @@ def _sampling_grid(camera: Camera, size_px: tuple[int, int]) -> np.ndarray:
     width, height = size_px
     frame = camera.pinhole_frame(size_px)
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    pixels = np.stack([x.ravel(), y.ravel()], 1)
-    source = camera.undistort_points(pixels, size_px) + np.array([frame.left, frame.top])
+    source = camera.undistort_points(np.stack([x.ravel(), y.ravel()], 1), size_px) + np.array([frame.left, frame.top])
     return (2 * source / frame.size_px - 1).reshape(1, height, width, 2)
 
 

@@ -104,8 +104,7 @@ def added_terms(promised: np.ndarray) -> np.ndarray:
 
 def add_ink(promised: np.ndarray, ink: np.ndarray) -> np.ndarray:
     """Return the light of a print in this ink, `... × 3` of the same type, from the known printer's light."""
-    terms = added_terms(promised)
-    added = ink.T.astype(promised.dtype) @ terms.reshape(INK_TERMS, -1)
+    added = ink.T.astype(promised.dtype) @ added_terms(promised).reshape(INK_TERMS, -1)
     return np.clip(promised + added.T.reshape(promised.shape), 0, 1)
 
 

@@ -277,8 +277,7 @@ def _run_steps(problem: Problem, state: State, out: Path, advance: Advance) -> n
         for step in steps(problem, state):
             state, names = step.state, ["loss", "confidence", "rate", "gradient"]
             names += [] if step.select_loss is None else ["select_loss", "select_rate"]
-            line = {"step": state.number} | {name: getattr(step, name) for name in names}
-            log.write(json.dumps(line) + "\n")
+            log.write(json.dumps({"step": state.number} | {name: getattr(step, name) for name in names}) + "\n")
             log.flush()
             if is_save_step(settings, state.number):
                 save_checkpoint(state, problem, out)

@@ -86,8 +86,7 @@ def rgb_space(
             light = np.where(light < 0.081, light / 4.5, ((light + 0.099) / 1.099) ** (1 / 0.45))
         else:
             light = linear_from_srgb(light) if curve is None else light**curve
-        table = 65535 * light.astype(np.float32)
-        linear = cv2.transform(np.take(table, codes), matrix.astype(np.float32))
+        linear = cv2.transform(np.take(65535 * light.astype(np.float32), codes), matrix.astype(np.float32))
         return np.take(_srgb_codes(), np.clip(linear + 0.5, 0, 65535).astype(np.uint16))
 
     return _unless_srgb(ColorSpace("RGB", to_srgb))

@@ -100,8 +100,7 @@ def bent_sheet_position(
 ) -> CameraPosition:
     """`flat_sheet_position` for any shape: for paper on a cylinder by the tangent plane at the point."""
     if shape.unit is not None:
-        scale = np.append(shape.unit, 1.0)
-        homography = np.append(shape.parameters[:8], 1.0) * scale
+        homography = np.append(shape.parameters[:8] * shape.unit, 1.0)
         covariance = shape.covariance[:8, :8] * np.outer(shape.unit, shape.unit)
         fit = PageFit(homography.reshape(3, 3), covariance, 0.0, ())
         return flat_sheet_position(fit, matrix_px, focal_spread, point_mm, turn, matrix_is_known)

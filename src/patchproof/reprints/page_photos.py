@@ -83,8 +83,7 @@ def photograph_page(page: np.ndarray, seed: int) -> tuple[bytes, np.ndarray]:
     sensor = Sensor(exposure_ev=exposure_ev, white_balance=white_balance[None], noise_seed=noise_seed, **drawn)
     picture = torch.tensor(raw.transpose(2, 0, 1)[None], dtype=torch.float32)
     codes = develop(picture, sensor, 1.0, jpeg=False)[0].permute(1, 2, 0).numpy().astype(float)
-    file = image_bytes(photo_codes_from_srgb(codes), "JPEG", {"quality": int(sensor.jpeg[0])})
-    return file, exposure * white_balance
+    return image_bytes(photo_codes_from_srgb(codes), "JPEG", {"quality": int(sensor.jpeg[0])}), exposure * white_balance
 
 
 def _uneven_light(shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:

@@ -92,8 +92,7 @@ def _rays(rng: np.random.Generator, px: int) -> np.ndarray:
     half, pitch, roll = np.tan(np.radians(rng.uniform(20, 35))), *np.radians(rng.normal(0, (12, 2)))
     y, x = (0.5 - (np.mgrid[:px, :px].reshape(2, -1) + 0.5) / px) * 2 * half
     x, y = -x * np.cos(roll) - y * np.sin(roll), -x * np.sin(roll) + y * np.cos(roll)
-    rays = np.stack([x, y * np.cos(pitch) + np.sin(pitch), np.cos(pitch) - y * np.sin(pitch)])
-    return rays.astype(np.float32)
+    return np.stack([x, y * np.cos(pitch) + np.sin(pitch), np.cos(pitch) - y * np.sin(pitch)]).astype(np.float32)
 
 
 def _draw_plane(rng, picture, depth, ray, rays, distance, axis) -> None:

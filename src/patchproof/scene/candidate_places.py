@@ -162,8 +162,7 @@ class PlaceFinder:
         if not len(points):
             return ()
         first = int(np.linalg.norm(points - self.scene.frame.origin_mm, axis=1).argmin())
-        edge_mm = min(self.size_mm)
-        indices = _spread(points, normals, edge_mm, _POOL_DISTANCE_SHARE, _POOL, [first])
+        indices = _spread(points, normals, min(self.size_mm), _POOL_DISTANCE_SHARE, _POOL, [first])
         return tuple(placement.surface_frame(self.scene.mesh, points[i], normals[i]) for i in indices)
 
 

@@ -263,8 +263,7 @@ class PieceScene(Scene):
 
     def scales_and_tilts(self, conditions: Conditions, size_px: tuple[int, int]) -> np.ndarray:
         """Return N×2: pixels per millimeter at the piece's middle, and its tilt in degrees."""
-        middle = np.array(self.piece.size_mm) / 2
-        return local_scales(self.piece_homographies(conditions, size_px), middle)
+        return local_scales(self.piece_homographies(conditions, size_px), np.array(self.piece.size_mm) / 2)
 
     def design_px(self, network_px: int) -> tuple[int, int]:
         """Return (width, height) of the design in multiples of 8, one texel per pixel of the closest view at the

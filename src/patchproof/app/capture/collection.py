@@ -135,8 +135,7 @@ class PhotoCollection:
     def _grouping(self) -> Grouping:
         paths = sorted(path for path in self._measured if self.control_of(path) is None)
         names = {name: number for number, name in enumerate(sorted({path.parent.name for path in paths}))}
-        numbers = tuple(names[path.parent.name] for path in paths)
-        grouping = Grouping(tuple(paths), numbers, tuple(names), BY_FOLDERS)
+        grouping = Grouping(tuple(paths), tuple(names[path.parent.name] for path in paths), tuple(names), BY_FOLDERS)
         return merge_folders(grouping, [self._measured[path] for path in paths])
 
     def close(self) -> None:
