@@ -33,8 +33,8 @@ from patchproof.base.text import short_repr
 from patchproof.base.validation import RandomSeed, refuse_untrusted, validate_model
 from patchproof.base.version import __version__
 from patchproof.classifier.network import Classifier
+from patchproof.optimizer import loop
 from patchproof.optimizer.expectation import last_pictures
-from patchproof.optimizer.loop import SELECT_AFTER, State, is_save_step, load_checkpoint, save_checkpoint, start, steps
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.optimizer.promise import PROMISE_VIEWS, VIEWS_PER_SESSION, PromiseOptions, make_promise
 from patchproof.optimizer.subject import DESIGN_FILE, DESIGN_FILES, Loss, read_png, side_by_side
@@ -145,7 +145,7 @@ def optimize(
         output.make_folder(out)
         if save_place is not None:
             save_place()
-        state = load_checkpoint(out, problem) if resume else start(problem)
+        state = loop.load_checkpoint(out, problem) if resume else loop.start(problem)
         design = _run_steps(problem, state, out, partial(progress, "optimize"))
         return finish_run(problem, design, out, promise, progress)
 
@@ -265,7 +265,7 @@ class _Record(BaseModel):
     imported: _Imported | None = None
 
 
-def _run_steps(problem: Problem, state: State, out: Path, advance: Advance) -> np.ndarray:
+def _run_steps(problem: Problem, state: loop.State, out: Path, advance: Advance) -> np.ndarray:
     """Run the remaining steps, writing log, checkpoint and views; the best design's pixels."""
     settings, largest_gradient, path = problem.scene.settings.optimize, None, out / _LOG_FILE
     # without the lines after the step from which the run resumes
@@ -274,16 +274,16 @@ def _run_steps(problem: Problem, state: State, out: Path, advance: Advance) -> n
         lines = [log.readline(_MAX_LINE_BYTES) for _ in range(count)]
     output.write_atomically(path, b"".join(lines))
     with open(path, "a", encoding="utf-8") as log:
-        for step in steps(problem, state):
+        for step in loop.steps(problem, state):
             state, names = step.state, ["loss", "confidence", "rate", "gradient"]
             names += [] if step.select_loss is None else ["select_loss", "select_rate"]
             log.write(json.dumps({"step": state.number} | {name: getattr(step, name) for name in names}) + "\n")
             log.flush()
-            if is_save_step(settings, state.number):
-                save_checkpoint(state, problem, out)
+            if loop.ends_interval(settings, state.number, loop.SAVE_AFTER):
+                loop.save_checkpoint(state, problem, out)
             largest_gradient = max(step.gradient, largest_gradient or 0.0)
             advance(state.number, settings.steps)
-    _warn_if_unchanged(float((state.best - start(problem).design).abs().max()), largest_gradient)
+    _warn_if_unchanged(float((state.best - loop.start(problem).design).abs().max()), largest_gradient)
     pictures = last_pictures(problem, state.best)
     labeled = side_by_side(pictures, _answers(problem, pictures))
     output.write_atomically(out / _VIEWS_FILE, output.image_bytes(labeled, "PNG"))
@@ -334,6 +334,6 @@ def _details(problem: Problem, promise: Promise, out: Path) -> dict[str, Any]:
         "inputs": problem.inputs,
         "placement": scene.record(),
         "warnings": [*scene.warnings, *(note for network in problem.classifiers for note in network.notes)],
-        "select_after_views": SELECT_AFTER,
+        "select_after_views": loop.SELECT_AFTER,
         "promise": promise.model_dump(mode="json"),
     }

@@ -57,9 +57,8 @@ def blur_px(markers: Iterable[Borders]) -> float:
 def frame_light(srgb: np.ndarray, markers: Iterable[Borders]) -> FrameLight:
     """Measure paper and ink at the borders of at least one marker in a uint8 sRGB photograph."""
     markers = _fitted_or_all(markers)
-    corners = np.stack([b.corners_px for b in markers])
     module = np.array([b.module_px for b in markers])[:, None, None, None]
-    middle, half, normal = border_frame(corners)
+    middle, half, normal = border_frame(np.stack([b.corners_px for b in markers]))
     s = np.linspace(-0.8, 0.8, _ALONG)[:, None]
     border = middle[:, :, None] + s * half[:, :, None]
     outside, inside = (sample(srgb, border + sign * 0.5 * module * normal[:, :, None]) for sign in (1, -1))

@@ -201,9 +201,8 @@ def relight(views: Views, conditions: Conditions) -> Views:
 
 def relight_and_replace_background(views: Views, conditions: Conditions) -> Views:
     """Return the views under the conditions' light, print, camera and backgrounds; poses stay."""
-    old_background = views.conditions.pose.background
     views = relight(views, conditions)
-    if np.array_equal(old_background, conditions.pose.background):
+    if np.array_equal(views.conditions.pose.background, conditions.pose.background):
         return views
     pose = replace(views.conditions.pose, background=conditions.pose.background)
     conditions, scene = replace(conditions, pose=pose), require_mesh(views.stage.scene)

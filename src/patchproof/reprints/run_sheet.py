@@ -203,8 +203,7 @@ def shot_sections(promise: Promise, settings: SceneSettings) -> tuple[tuple[str,
     """Say how many photographs to take, and from where, as (heading, lines)."""
     data = settings.model_dump()
     summary = f"{promise_summary(promise, data)} Promise simulated {background_summary(data)}."
-    counts = (summary, *_count_lines(promise))
-    return (("How many photographs", counts), ("From where", _view_lines(settings)))
+    return (("How many photographs", (summary, *_count_lines(promise))), ("From where", _view_lines(settings)))
 
 
 def _count_lines(promise: Promise) -> tuple[str, ...]:

@@ -121,9 +121,8 @@ def guess_label(labels: Sequence[str], words: str | None, path: str) -> str | in
         except Refused:
             continue
     known = ": " + ", ".join(f'"{label}"' for label in labels) if len(labels) <= _MOST_LISTED_LABELS else ""
-    do = f"add --label with what it is to be recognized as{known}"
     got = f'"{" ".join(parts)}", which no label of the network is'
-    raise Refused("a file that is called what it shows", got, do)
+    raise Refused("a file that is called what it shows", got, f"add --label with what it is to be recognized as{known}")
 
 
 def _scene_label(labels: Sequence[str], index: int) -> str | int:

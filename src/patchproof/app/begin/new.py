@@ -72,9 +72,8 @@ def _mesh_scene(
     """The scene file's text for a mesh, and lines with the guesses."""
     target = guess_label(_labels(models, base), label, thing)
     path, primitive, source = Path(thing), thing.startswith("primitive:"), "as given"
-    up, reason, doubt = (
-        ("y", "primitives are", None) if primitive else (axis, source, None) if axis else guess.guess_up(path)
-    )
+    stated = ("y", "primitives are", None) if primitive else (axis, source, None) if axis else None
+    up, reason, doubt = stated or guess.guess_up(path)
     if length_mm is None:
         source = "the primitive's own" if primitive else "by the file's units, meters: measure it"
         length_mm = longest_mm(thing.partition(":")[2]) if primitive else guess.guess_length_mm(path)

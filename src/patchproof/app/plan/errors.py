@@ -167,9 +167,7 @@ def _confidence(problem: Problem, pictures: Tensor, boxes: np.ndarray | None) ->
 def _squares(problem: Problem, side_px: int, base: Setup, setups: list[Setup]) -> Tensor:
     """Render the views of base and other setups for the primary classifier: (1 + len(setups))×N×3×S×S."""
     size_px, stack = (side_px, side_px), []
-    count = max(1, (1 << 21) // side_px**2)  # views at a time: about 300 MB of pictures and intermediate tensors
-    for first in range(0, len(base.conditions), count):
-        rows = slice(first, first + count)
+    for rows in _chunks(len(base.conditions), side_px):
         base_conditions, pictures = base.conditions[rows], []
         base_views = render_views(base.stage, base.appearance, base_conditions, size_px)
         scale = base_conditions.pose.printed_scale
@@ -191,3 +189,9 @@ def _pictures(problem: Problem, views: Views, appearance: Appearance) -> Tensor:
         files = [image_bytes(as_pixels(p), "JPEG", {"quality": int(q)}) for p, q in zip(pictures, quality, strict=True)]
         pictures = torch.stack([from_pixels(image_pixels(file), pictures.device) for file in files])
     return center_square(pictures, problem.classifiers[0].input_px)
+
+
+def _chunks(views: int, side_px: int) -> list[slice]:
+    """Split the views into slices that are rendered at a time, in about 300 MB of pictures and intermediate tensors."""
+    count = max(1, (1 << 21) // side_px**2)
+    return [slice(first, first + count) for first in range(0, views, count)]
