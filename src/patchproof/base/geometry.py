@@ -142,22 +142,16 @@ def corner_turns(quad) -> np.ndarray:
     return sides[:, 0] * following[:, 1] - sides[:, 1] * following[:, 0]
 
 
-def local_scale(homography, point) -> tuple[float, float]:
-    """(px_per_mm, tilt_deg) of a page→image homography at a page point, by its derivative's singular values: their
-    geometric mean, and arccos of their ratio, which is the tilt exactly for a distant camera.
+def local_scale(homography, point) -> np.ndarray:
+    """(px_per_mm, tilt_deg), ...×2, of page→image homographies ...×3×3 at a page point, by its derivative's singular
+    values: their geometric mean, and arccos of their ratio, which is the tilt exactly for a distant camera.
     """
-    px_per_mm, tilt_deg = local_scales(np.asarray(homography)[None], point)[0].tolist()
-    return px_per_mm, tilt_deg
-
-
-def local_scales(homographies: np.ndarray, point) -> np.ndarray:
-    """`local_scale` of homographies N×3×3, as N×2."""
-    x, y = point
-    image = homographies @ np.array([x, y, 1.0])
-    pixel, w = image[:, :2] / image[:, 2:], image[:, 2, None, None]
-    jacobians = (homographies[:, :2, :2] - pixel[:, :, None] * homographies[:, None, 2, :2]) / w
-    large, small = np.linalg.svd(jacobians, compute_uv=False).T
-    return np.stack([np.sqrt(large * small), np.degrees(np.arccos(np.clip(small / large, 0, 1)))], 1)
+    homography = np.asarray(homography)
+    image = homography @ np.array([*point, 1.0])
+    pixel, w = image[..., :2] / image[..., 2:], image[..., 2, None, None]
+    jacobian = (homography[..., :2, :2] - pixel[..., None] * homography[..., None, 2, :2]) / w
+    large, small = np.moveaxis(np.linalg.svd(jacobian, compute_uv=False), -1, 0)
+    return np.stack([np.sqrt(large * small), np.degrees(np.arccos(np.clip(small / large, 0, 1)))], -1)
 
 
 def plane_pose(homography, matrix_px) -> np.ndarray:
@@ -175,8 +169,7 @@ def plane_pose(homography, matrix_px) -> np.ndarray:
 
 def view_angles(camera_from_plane, point) -> tuple[float, float, float]:
     """(azimuth_deg, elevation_deg, distance_mm) of the camera from a page point; positive right of and above it."""
-    rotation, translation = camera_from_plane[:3, :3], camera_from_plane[:3, 3]
-    x, y, z = -rotation.T @ translation - np.array([point[0], point[1], 0.0])
+    x, y, z = -camera_from_plane[:3, :3].T @ camera_from_plane[:3, 3] - np.array([point[0], point[1], 0.0])
     distance = float(np.sqrt(x * x + y * y + z * z))
     # plane z points into the paper (x right, y down, right-handed)
     return float(np.degrees(np.arctan2(x, -z))), float(np.degrees(np.arcsin(-y / distance))), distance

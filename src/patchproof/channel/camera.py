@@ -60,8 +60,7 @@ def reach_px(sensor: Sensor, scale: float, jpeg: bool = True) -> int | None:
     """Return how many pixels far `develop` spreads light; None if JPEG spreads it within its blocks."""
     if _has_jpeg(sensor, scale, jpeg):
         return None
-    blur_px, motion_px = float(sensor.blur_px.max()) * scale, float(sensor.motion_px.max()) * scale
-    return _blur_reach(blur_px) + _motion_reach(motion_px)
+    return _blur_reach(float(sensor.blur_px.max()) * scale) + _motion_reach(float(sensor.motion_px.max()) * scale)
 
 
 def _blur_reach(sigma_px: float) -> int:

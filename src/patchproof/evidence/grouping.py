@@ -14,7 +14,7 @@ Left out on purpose: dividing folders, which are somebody's word; copies without
 """
 
 from bisect import bisect, insort
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
 from functools import partial
@@ -269,7 +269,9 @@ def reject_copies(photos: Sequence[MeasuredPhoto], session: Sequence[int], rect_
         first = None if entry.sha256 is None else first_by_sha256.get(entry.sha256)
         advice = "its bytes are those of {}, which counts once: leave it out"
         if first is None and view is not None:
-            own_cell, *cells = _cells_near(view)
+            # the cells of session, scale and the middle's place where views like this one may lie; its own is the first
+            own = np.floor(np.nan_to_num(view[[1, 6, 7]]) / 1.01)  # a cell is wider than a tolerance
+            own_cell, *cells = ((float(view[0]), *(own + offset).tolist()) for offset in product((0, -1, 1), repeat=3))
             rows = sorted(row for cell in (own_cell, *cells) for row in rows_by_cell.get(cell, ()))
             same = _find_same_view(view, originals[rows])
             first = None if same is None else photos[rows[same]].entry
@@ -307,12 +309,6 @@ def _view(photo: MeasuredPhoto, session: int, rect_mm: Rect) -> np.ndarray | Non
     side = geometry.px_per_mm * max(rect_mm[2:]) / max(size_px)
     shape = (corners - middle) / side / SHAPE_TOLERANCE
     return np.array([2 * session, scale, tilt, *light, *(middle / AIM_TOLERANCE), *shape.ravel()])
-
-
-def _cells_near(view: np.ndarray) -> Iterator[tuple[float, ...]]:
-    """The cells of session, scale and the middle's place where views like this one may lie; its own is the first."""
-    own = np.floor(np.nan_to_num(view[[1, 6, 7]]) / 1.01)  # a cell is wider than a tolerance
-    return ((float(view[0]), *(own + offset).tolist()) for offset in product((0, -1, 1), repeat=3))
 
 
 def _find_same_view(view: np.ndarray, others: np.ndarray) -> int | None:

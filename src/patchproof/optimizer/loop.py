@@ -117,8 +117,8 @@ def _descend(problem: Problem, state: State, answer: Answer) -> TrainingStep:
     if isinstance(penalty, Tensor):
         gradient = gradient + torch.autograd.grad(penalty, design)[0]
         penalty = float(penalty.detach())
-    updated, loss = _update(problem, state, gradient), answer.loss + penalty
-    return TrainingStep(updated, loss, answer.confidence, answer.rate, largest)
+    updated = _update(problem, state, gradient)
+    return TrainingStep(updated, answer.loss + penalty, answer.confidence, answer.rate, largest)
 
 
 def _update(problem: Problem, state: State, gradient: Tensor) -> State:

@@ -146,8 +146,7 @@ def _space_of_profile(profile: bytes, mode: str) -> tuple[ColorSpace | None, tup
     def to_srgb(codes: np.ndarray) -> np.ndarray:
         # deep gray has three channels, which are equal
         part = eight_bits(codes[..., 0] if own_mode == "L" and codes.ndim == 3 else codes)
-        size, content = part.shape[1::-1], np.ascontiguousarray(part)
-        image = Image.frombuffer(own_mode, size, content, "raw", own_mode, 0, 1)
+        image = Image.frombuffer(own_mode, part.shape[1::-1], np.ascontiguousarray(part), "raw", own_mode, 0, 1)
         return np.asarray(ImageCms.applyTransform(image, transform))
 
     return _unless_srgb(ColorSpace(own_mode, to_srgb)), ()

@@ -228,8 +228,8 @@ def load_backgrounds(settings: BackgroundSettings, base: Path) -> Backgrounds:
     if settings.images is not None and files in ([], [path := Path(expand_path(settings.images, base))]):
         if files:
             return Backgrounds((FileLevels(path),))
-        got, remedy = f"no picture in {path}", "put some there or give a color"
-        raise Refused("a folder of pictures (background.images)", got, remedy)
+        do = "put some there or give a color"
+        raise Refused("a folder of pictures (background.images)", f"no picture in {path}", do)
     return _split_by_purpose(files)
 
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from patchproof.base.errors import Refused
 from patchproof.base.fingerprint import content_identity
-from patchproof.base.geometry import apply_homography, local_scales
+from patchproof.base.geometry import apply_homography, local_scale
 from patchproof.base.settings import SceneSettings, identity_settings
 from patchproof.base.text import short_repr
 from patchproof.base.validation import texts_in
@@ -263,7 +263,7 @@ class PieceScene(Scene):
 
     def scales_and_tilts(self, conditions: Conditions, size_px: tuple[int, int]) -> np.ndarray:
         """Return N×2: pixels per millimeter at the piece's middle, and its tilt in degrees."""
-        return local_scales(self.piece_homographies(conditions, size_px), np.array(self.piece.size_mm) / 2)
+        return local_scale(self.piece_homographies(conditions, size_px), np.array(self.piece.size_mm) / 2)
 
     def design_px(self, network_px: int) -> tuple[int, int]:
         """Return (width, height) of the design in multiples of 8, one texel per pixel of the closest view at the

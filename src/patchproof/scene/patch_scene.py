@@ -201,5 +201,5 @@ def _smallest_scales(scene: MeshScene, card: Placement, poses: np.ndarray) -> np
     """Return px per mm at the card's middle, along the foreshortened direction, in each view; 0 from behind."""
     faces = (geometry.camera_centers(poses) - card.center_mm) @ card.normal > 0
     planes = geometry.plane_homography(scene.matrix_px(scene.photo_px), poses, card.world_from_piece)
-    mean, tilt_deg = geometry.local_scales(planes, np.array(card.size_mm) / 2).T
+    mean, tilt_deg = geometry.local_scale(planes, np.array(card.size_mm) / 2).T
     return np.where(faces, mean * np.sqrt(np.cos(np.radians(tilt_deg))), 0.0)
