@@ -134,8 +134,7 @@ def printer_of(name: str, predict: ColorMap, provenance: Mapping[str, Any]) -> P
     """The table of a fitted map, scaled per channel so that white is bare paper."""
     nodes = node_colors()
     light = linear_from_srgb(np.clip(predict(nodes.reshape(-1, 3)), 0, 1.2))
-    white = np.maximum(light[-1], 0.1)
-    lut = srgb_from_linear(np.clip(light / white, 0, 1)).reshape(nodes.shape)
+    lut = srgb_from_linear(np.clip(light / np.maximum(light[-1], 0.1), 0, 1)).reshape(nodes.shape)
     gamut = color_difference(nodes.reshape(-1, 3), lut.reshape(-1, 3)).reshape(nodes.shape[:3])
     return printer_from_table(name, "measured", lut, gamut, dict(provenance))
 

@@ -148,8 +148,7 @@ def add_noise(linear: Tensor, noise: Tensor, seeds) -> Tensor:
     # drawn on the CPU for every device, so that a GPU gets the same noise
     generators = (torch.Generator().manual_seed(int(seed)) for seed in seeds)
     grain = torch.stack([torch.randn(linear.shape[1:], generator=generator) for generator in generators]).to(linear)
-    deviation = noise[:, None, None, None] * (linear.detach().clamp_min(0) + READ_SHARE**2).sqrt()
-    return linear + deviation * grain
+    return linear + noise[:, None, None, None] * (linear.detach().clamp_min(0) + READ_SHARE**2).sqrt() * grain
 
 
 def compress_jpeg(picture: Tensor, quality: Tensor) -> Tensor:

@@ -102,11 +102,11 @@ def gather_evidence(
         found = read_print([square for square in squares if square is not None], task.promised)
         some = replace(found, shots=_spread(found.shots, options.ledger_photos))
         ledger = ledger_of(some, manifest, task, judges, confidence, compute.jobs)
-        by_file = _recognized(entries, name), session
-        estimate = estimate_effect(found, manifest, task, options.printer, judges, *by_file, compute.jobs)
+        answers = _recognized(entries, name)
+        estimate = estimate_effect(found, manifest, task, options.printer, judges, answers, session, compute.jobs)
     if controls_folder:
-        skipped = list_skipped_files(controls_folder, depth=2)
-        left_out += [f"{printable(controls_folder.name)}: {text}" for text in skipped]
+        control_name = printable(controls_folder.name)
+        left_out += [f"{control_name}: {text}" for text in list_skipped_files(controls_folder, depth=2)]
     left_out += summarize_said((item.name, result.entry.said) for item, result in zip(items, results, strict=True))
     controls: dict[str, list[MeasuredPhoto]] = {}
     first_of = {photo.entry.sha256: photo.entry.file for photo in reversed(patch_photos)}  # a patch's are no control's

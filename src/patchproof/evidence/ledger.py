@@ -120,8 +120,7 @@ def _culprit(names: Sequence[str], means: np.ndarray, resampled: np.ndarray | No
         return None
     rivals = [i for i, name in enumerate(names) if name != GAMUT]
     top = max(rivals, key=lambda i: means[i])
-    rest = [i for i in rivals if i != top]
-    lead = np.minimum(resampled[:, top] - resampled[:, rest].max(1), resampled[:, top])
+    lead = np.minimum(resampled[:, top] - resampled[:, [i for i in rivals if i != top]].max(1), resampled[:, top])
     clear = np.quantile(lead, 0.025) > 0 and means[top] >= LEAST_SHARE
     return names[top] if clear and names[top] != PHOTO else None
 

@@ -99,9 +99,7 @@ def _undistort(srgb: np.ndarray, camera: "Camera", matrix: np.ndarray) -> np.nda
 def locate_sheet(view: PinholePhoto, detected: MarkersInView, surface: Surface) -> LocatedSheet | None:
     """Locate the sheet by its markers; None if they fit no plane, cylinder or lens."""
     fit = _fit(detected, surface)
-    if fit is None:
-        return None
-    return _unroll_piece(view, detected, surface) or flat_sheet(view.srgb, fit, surface.rect_mm)
+    return fit and (_unroll_piece(view, detected, surface) or flat_sheet(view.srgb, fit, surface.rect_mm))
 
 
 def _fit(detected: MarkersInView, surface: Surface) -> PageFit | None:

@@ -74,8 +74,7 @@ def _bottle(rng) -> list[MeshPart]:
     body = lathe(side, "body", glass)
     low, high = h * rng.uniform(0.1, 0.18), h * rng.uniform(0.38, 0.46)
     band = lathe([(0, low), (r + 0.4, low), (r + 0.4, high), (0, high)], "label", _paint(rng))
-    lid = lathe([(0, h - cap), (neck + 1.5, h - cap), (neck + 1.5, h), (0, h)], "cap", _paint(rng))
-    return [body, band, lid]
+    return [body, band, lathe([(0, h - cap), (neck + 1.5, h - cap), (neck + 1.5, h), (0, h)], "cap", _paint(rng))]
 
 
 def _traffic_cone(rng) -> list[MeshPart]:

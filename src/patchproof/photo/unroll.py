@@ -169,8 +169,7 @@ def _uncertainty_mm(shape: Shape, corners: np.ndarray) -> float:
 
 def _mm_by_px(project: Callable[[np.ndarray], np.ndarray], mm: np.ndarray) -> np.ndarray:
     """Derivatives N×2×2 of page millimeters by pixels, by central differences over a tenth of a millimeter."""
-    columns = [(project(mm + step) - project(mm - step)) / 0.1 for step in 0.05 * np.eye(2)]
-    return np.linalg.inv(np.stack(columns, -1))
+    return np.linalg.inv(np.stack([(project(mm + step) - project(mm - step)) / 0.1 for step in 0.05 * np.eye(2)], -1))
 
 
 def _flatten(srgb, project, px_from_mm, rect_mm, margin_px: float) -> np.ndarray:
@@ -228,8 +227,7 @@ def fit_cylinder(flat, mm, px, size, focal_px, focal_spread=UNKNOWN_FOCAL, floor
     prior = CORNER_NOISE_PX / (UNKNOWN_FOCAL if focal_px is None else focal_spread)
 
     def residuals(p):
-        errors = (project(p, mm) - px).reshape(*p.shape[:-1], -1)
-        return np.concatenate([errors, prior * p[..., 6:7]], -1)
+        return np.concatenate([(project(p, mm) - px).reshape(*p.shape[:-1], -1), prior * p[..., 6:7]], -1)
 
     def jacobian(p):
         steps = _STEP * np.where(p == 0, 1, np.abs(p))

@@ -68,8 +68,7 @@ class LearnedTextures:
 
     def filled(self, design: Tensor) -> list[Tensor]:
         """Return the textures with a design's texels, H×W×3 per material."""
-        parts = design[:, 0].T.split(self._counts)
-        rows = zip(self._originals, self.masks, parts, strict=True)
+        rows = zip(self._originals, self.masks, design[:, 0].T.split(self._counts), strict=True)
         return [original.masked_scatter(mask[..., None], part) for original, mask, part in rows]
 
     def images(self, design: Tensor) -> list[Tensor]:

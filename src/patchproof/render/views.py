@@ -108,8 +108,7 @@ class Views:
         """The bare object, its outlines jagged, in a camera without blur and noise, N·H·W × 3 sRGB."""
         # the background has 256 codes per view and channel, which are exposed as a table
         gain, tone = self._sensor_values.double().split([3, 1], 1)
-        light = torch.tensor(LINEAR_FROM_CODE)[:, None] * gain[:, None]
-        codes = lift_tone(encode_light(light), tone[:, None])
+        codes = lift_tone(encode_light(torch.tensor(LINEAR_FROM_CODE)[:, None] * gain[:, None]), tone[:, None])
         image = _look_up_codes(self.background, codes.numpy(), self.stage.device)
         if self.object is None:
             return image

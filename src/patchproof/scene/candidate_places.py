@@ -150,8 +150,7 @@ class PlaceFinder:
         face = np.searchsorted(np.cumsum(doubled) / doubled.sum(), share).clip(max=len(doubled) - 1)
         u, v = rng.random((2, count, 1))
         u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
-        points = a[face] + u * (b - a)[face] + v * (c - a)[face]
-        return points, (cross / doubled[:, None])[face]
+        return a[face] + u * (b - a)[face] + v * (c - a)[face], (cross / doubled[:, None])[face]
 
     @cached_property
     def _frames_to_try(self) -> tuple[SurfaceFrame, ...]:

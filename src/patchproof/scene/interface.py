@@ -150,9 +150,8 @@ class Scene(ABC):
 
     def with_template(self, name: str) -> Self:
         """Return the scene for a page of another template, with that page's sheet id and, if any, piece."""
-        if name == self.settings.sheet.template:
-            return self
-        return self._identified(self.settings.changed(sheet={"template": name}), self.known)
+        is_same = name == self.settings.sheet.template
+        return self if is_same else self._identified(self.settings.changed(sheet={"template": name}), self.known)
 
     def with_steps(self, steps: int | None) -> Self:
         """Return the scene with another number of optimizer steps; the scene itself for None and its own."""

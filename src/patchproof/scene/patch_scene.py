@@ -181,10 +181,8 @@ def _place_piece(scene: MeshScene) -> tuple[Piece, Placement, float, tuple[str, 
     if piece.markers and too_small.mean() > 1 - interface.READABLE_SHARE:
         advice = "narrow view.azimuth_deg and view.elevation_deg, or make the piece smaller"
         if needed_mm > marker_mm + 0.05:
-            advice = (
-                f"view.distance_mm and camera.photo_px ask for {needed_mm:.1f} mm, and those for a piece of "
-                f"{smallest_piece_mm(needed_mm)} mm or more; come nearer, or take larger photographs"
-            )
+            advice = f"view.distance_mm and camera.photo_px ask for {needed_mm:.1f} mm, and those for a piece of "
+            advice += f"{smallest_piece_mm(needed_mm)} mm or more; come nearer, or take larger photographs"
         measurable = interface.measurable_text(unreadable, placement.family)
         notes += (f"{measurable}: others show markers of {marker_mm:.1f} mm too small: {advice}",)
     return piece, placement, unreadable, notes

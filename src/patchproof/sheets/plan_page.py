@@ -103,8 +103,7 @@ def _drawing(placement: PlacementPicture, area: RectMm):
     across, down = (x0, min(xs), max(xs), x0 + w0), (y0, min(ys), max(ys), y0 + h0)
     for more_lines, more_labels in (_chain_above(across, to_page, rect), _chain_beside(down, to_page, rect)):
         lines, labels = lines + more_lines, labels + more_labels
-    box = Box("picture of the object", (x, y, w, ABOVE_MM + scale * high))
-    return lines, labels, ((rect, placement.picture),), box
+    return lines, labels, ((rect, placement.picture),), Box("picture of the object", (x, y, w, ABOVE_MM + scale * high))
 
 
 def edge_distances_mm(placement: PlacementPicture) -> dict[str, float]:
