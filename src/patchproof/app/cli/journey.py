@@ -231,9 +231,10 @@ def reprint(
             raise BadParameter("controls, sessions and prints without a page need --run RUN", param_hint="--run")
         reprint_pages(pdf, n, out, how, seed=seed, overwrite=overwrite)
         return say(f"{n} photographs: {out}")
+    finished_run = load_run(run, trust)
     with progress_bar() as bar:
         options: dict[str, Any] = {"sessions": sessions, "seed": seed, "overwrite": overwrite, "progress": bar}
-        taken = reprint_sheet(pdf, load_run(run, trust), n, out, how, compute=Compute(jobs=jobs or 1), **options)
+        taken = reprint_sheet(pdf, finished_run, n, out, how, compute=Compute(jobs=jobs or 1), **options)
     say(f"{len(taken.photos)} photographs: {out}")
 
 
