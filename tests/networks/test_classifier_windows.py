@@ -9,13 +9,13 @@ import pytest
 import torch
 from small_networks import ConvNeXt, ResNet, ViT, seeded
 
+from patchlab.study.trained_designs import best_design
 from patchproof.classifier.builtin import load_builtin
 from patchproof.classifier.custom import classifier_of
 from patchproof.classifier.network import Classifier, _windows_in_square, center_square
 from patchproof.networks import batches, cuts
 from patchproof.networks.batches import Windows, tune_batches
 from patchproof.networks.graph import Program, Step, ValueRef, mark_last_uses
-from patchproof.optimizer.loop import best_design
 from patchproof.optimizer.problem import set_problem
 from patchproof.optimizer.promise import CONTROLS, pictures_with_controls
 from patchproof.optimizer.responses import responses

@@ -27,11 +27,11 @@ from torch.nn import functional as F
 
 from patchlab.paper.patch3d import design_shares
 from patchlab.study.grid import views_per_network
+from patchlab.study.trained_designs import best_design
 from patchlab.validation.ablation import simplify_problem
 from patchproof.app.plan.errors import scene_terms
 from patchproof.base.errors import Refused
 from patchproof.classifier.network import Classifier
-from patchproof.optimizer.loop import best_design
 from patchproof.optimizer.problem import Problem
 from patchproof.optimizer.responses import in_chunks
 from patchproof.render.photograph import expose

@@ -26,10 +26,10 @@ from patchlab.study.estimates import cluster_mean, mean, median
 from patchlab.study.measure import time_call
 from patchlab.study.record import hits_text, parse_hits
 from patchlab.study.study import Cell, Result, Study
+from patchlab.study.trained_designs import best_design
 from patchproof.base.goal import Goal
 from patchproof.base.intervals import Estimate
 from patchproof.base.validation import StrictModel
-from patchproof.optimizer.loop import best_design
 from patchproof.optimizer.place_search import Candidate, choose_place
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.optimizer.promise import VIEWS_PER_SESSION, PromiseOptions, pictures_with_controls

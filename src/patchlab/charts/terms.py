@@ -22,10 +22,10 @@ from patchlab.study.estimates import cluster_mean, mean, median
 from patchlab.study.measure import call_in_turn, time_call
 from patchlab.study.record import hits_text, parse_hits
 from patchlab.study.study import Cell, Result, Study
+from patchlab.study.trained_designs import best_design
 from patchlab.validation.ablation import simplify_problem
 from patchproof.app.plan.errors import Setup, scene_terms
 from patchproof.base.sessions import count_by_session, rate_posterior
-from patchproof.optimizer.loop import best_design
 from patchproof.optimizer.problem import Problem
 from patchproof.optimizer.promise import VIEWS_PER_SESSION
 from patchproof.optimizer.responses import responses

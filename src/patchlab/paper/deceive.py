@@ -20,8 +20,7 @@ from patchlab.study.figures import picture_sheet
 from patchlab.study.grid import by_values, group_by, short_name
 from patchlab.study.record import Record
 from patchlab.study.study import Cell, Result, Study
-from patchlab.study.trained_designs import views_from_sides
-from patchproof.optimizer.loop import best_design
+from patchlab.study.trained_designs import best_design, views_from_sides
 from patchproof.optimizer.promise import pictures_with_controls
 from patchproof.report.tables import Drawing, Table
 

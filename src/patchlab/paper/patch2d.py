@@ -40,13 +40,13 @@ from patchlab.study.grid import (
 )
 from patchlab.study.record import parse_hits, to_record
 from patchlab.study.study import Cell, Result, Study
+from patchlab.study.trained_designs import best_design
 from patchproof.base.errors import Refused
 from patchproof.base.intervals import estimate_difference, rate
 from patchproof.base.validation import expand_path, spelling_hint
 from patchproof.channel.printer import load_printer
 from patchproof.classifier.labels import find_labels
 from patchproof.classifier.network import Classifier
-from patchproof.optimizer.loop import best_design
 from patchproof.optimizer.patch import Patch
 from patchproof.optimizer.problem import Problem
 from patchproof.optimizer.responses import responses

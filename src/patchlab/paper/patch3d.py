@@ -32,12 +32,11 @@ from patchlab.study.figures import contact_sheet, enlarge_design, photographs, p
 from patchlab.study.grid import views_per_network
 from patchlab.study.record import Record, parse_hits, to_record
 from patchlab.study.study import Cell, Result, Study
-from patchlab.study.trained_designs import views_in_drawn_light
+from patchlab.study.trained_designs import best_design, views_in_drawn_light
 from patchproof.base.errors import Refused
 from patchproof.base.intervals import estimate_difference, rate
 from patchproof.base.settings import ObjectSettings, PatchSettings, SceneSettings, ViewSettings
 from patchproof.base.validation import Range, Share
-from patchproof.optimizer.loop import best_design
 from patchproof.optimizer.patch import Patch
 from patchproof.optimizer.problem import Problem
 from patchproof.optimizer.promise import pictures_with_controls

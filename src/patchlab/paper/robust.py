@@ -19,9 +19,8 @@ from patchlab.study.figures import picture_sheet
 from patchlab.study.grid import by_values, group_by, short_name
 from patchlab.study.record import Record
 from patchlab.study.study import Cell, Result, Study
-from patchlab.study.trained_designs import mean_color, views_from_sides
+from patchlab.study.trained_designs import best_design, mean_color, views_from_sides
 from patchproof.base.color import linear_from_srgb, srgb_from_linear
-from patchproof.optimizer.loop import best_design
 from patchproof.optimizer.subject import from_pixels
 from patchproof.report.tables import Drawing, Table
 

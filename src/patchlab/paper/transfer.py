@@ -30,6 +30,7 @@ from patchlab.study.trained_designs import (
     NamePart,
     TrainedSettings,
     answers_and_files,
+    best_design,
     gain_word,
     single_network_rows,
     tested_networks,
@@ -40,7 +41,6 @@ from patchlab.study.trained_designs import (
     with_trainers,
 )
 from patchproof.base.intervals import rate
-from patchproof.optimizer.loop import best_design
 from patchproof.optimizer.promise import pictures_with_controls
 from patchproof.optimizer.responses import responses
 from patchproof.render.photograph import Appearance

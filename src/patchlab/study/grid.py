@@ -115,7 +115,8 @@ def problem_of(base: Path, values: Mapping[str, Any]) -> Problem:
 
 def views_per_network(settings: OptimizeSettings) -> int:
     """The number of views that each network sees in training and selection."""
-    selections = sum(loop.is_selection_step(settings, number) for number in range(1, settings.steps + 1))
+    steps = range(1, settings.steps + 1)
+    selections = sum(loop.ends_interval(settings, number, loop.SELECT_AFTER) for number in steps)
     return settings.steps * settings.views + selections * loop.SELECT_VIEWS
 
 

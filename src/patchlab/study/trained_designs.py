@@ -33,6 +33,7 @@ from patchproof.base.intervals import Estimate
 from patchproof.base.resample import downscale
 from patchproof.channel.effects import EFFECT_BY_NAME, Light, Pose, Sensor
 from patchproof.mesh.mesh import Material
+from patchproof.optimizer import loop
 from patchproof.optimizer.problem import Problem
 from patchproof.optimizer.responses import responses
 from patchproof.optimizer.subject import DESIGN_FILE, OBJECT_FILE
@@ -105,6 +106,14 @@ def with_trainers(problem: Problem, cell: Cell) -> Problem:
     numbers = [cell.values["networks"].index(name) for name in cell.values["trained"]]
     classifiers, indices = (tuple(each[i] for i in numbers) for each in (problem.classifiers, problem.indices))
     return replace(problem, classifiers=classifiers, indices=indices)
+
+
+def best_design(problem: Problem) -> np.ndarray:
+    """Run the whole loop; the pixels of the design that was best on the selection set."""
+    state = loop.start(problem)
+    for step in loop.steps(problem, state):
+        state = step.state
+    return problem.subject.pixels(state.best)
 
 
 def answers_and_files(

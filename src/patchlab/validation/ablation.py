@@ -26,6 +26,7 @@ from patchlab.study.estimates import mean
 from patchlab.study.grid import CellValues, GridSettings, Names, by_values, cell_key, grid_cells, group_by, problem_of
 from patchlab.study.record import parse_hits, to_record
 from patchlab.study.study import Cell, Result, Study
+from patchlab.study.trained_designs import best_design
 from patchlab.validation.path_traced import photograph_traced
 from patchproof.app.plan.errors import PRINTER, Setup, effect_terms, scene_terms
 from patchproof.base.errors import Refused
@@ -35,7 +36,6 @@ from patchproof.base.settings import SceneSettings
 from patchproof.base.validation import validate_model
 from patchproof.channel.effects import EFFECT_BY_NAME
 from patchproof.channel.printer import identity_printer
-from patchproof.optimizer.loop import best_design
 from patchproof.optimizer.problem import Problem
 from patchproof.optimizer.promise import VIEWS_PER_SESSION
 from patchproof.optimizer.responses import ask_networks, merge_responses, responses

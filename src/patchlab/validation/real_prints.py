@@ -26,6 +26,7 @@ from pydantic import Field
 from patchlab.study.estimates import mean, median
 from patchlab.study.grid import GridSettings, PositiveInt, cell_key, grid_cells, network_names, scene_of
 from patchlab.study.study import Cell, Result, Study
+from patchlab.study.trained_designs import best_design
 from patchlab.validation.known_colors import KnownColors, fit_photo, fit_printer
 from patchlab.validation.twins import Cells, Twin, load_cells
 from patchproof.base.color import ciede2000, lab_from_linear, lift_tone, linear_from_srgb, srgb_from_linear
@@ -46,7 +47,6 @@ from patchproof.channel.printer import (
     vary_print,
 )
 from patchproof.evidence.surface import cell_means
-from patchproof.optimizer.loop import best_design
 from patchproof.optimizer.patch import Patch
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.optimizer.promise import VIEWS_PER_SESSION

@@ -67,8 +67,7 @@ def checked(function: Function, name: str) -> Function:
             with _free_cores(values, name) if "compute" in parameters else nullcontext():
                 return function(*bound.args, **bound.kwargs)
         except Refused as refused:
-            parts = refused.__reduce__()[1]
-            raise type(refused)(*map(_python_words, parts)) from refused.__cause__
+            raise type(refused)(*map(_python_words, refused.__reduce__()[1])) from refused.__cause__
 
     call.__module__, call.__qualname__ = "patchproof", name  # where pickle finds it
     return call  # pyright: ignore[reportReturnType]

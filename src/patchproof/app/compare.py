@@ -68,8 +68,7 @@ def compare(
     compute, loaded = compute.without("compare", cluster=True), _load_runs(runs, models is None, trust)
     scene = next(iter(loaded.values())).scene
     target = scene.settings.target
-    judges = models or target.models
-    names = tuple(each.name if isinstance(each, Classifier) else each for each in judges)
+    names = tuple(each.name if isinstance(each, Classifier) else each for each in models or target.models)
     seed = scene.seed if seed is None else seed
     with new_folder(out, COMPARISON_FILES, overwrite, runs) as folder:
 

@@ -14,18 +14,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from patchproof.base import output
 from patchproof.base.errors import Refused
 from patchproof.base.folder_lock import lock_folder
 from patchproof.base.geometry import apply_homography, rect_corners
 from patchproof.base.input import is_file, read_json
-from patchproof.base.output import (
-    check_folder,
-    clear_folder,
-    refuse_inputs_in,
-    refuse_other_files,
-    write_atomically,
-    write_pictures,
-)
 from patchproof.base.progress import Compute, Progress, no_progress
 from patchproof.base.validation import refuse_untrusted
 from patchproof.channel.printer import load_printer, printer_of_sheet
@@ -137,9 +130,9 @@ def verify(
 
             options = replace(options, corners=load_corners(capture.corners))
         if not resume:
-            clear_folder(out)
+            output.clear_folder(out)
         if not isinstance(photos, str | Path):
-            photos = write_pictures(photos, out / _PHOTOS)
+            photos = output.write_pictures(photos, out / _PHOTOS)
         on_pictures, advance = partial(save_pictures, out / "pictures"), partial(progress, "verify")
         how: dict[str, Any] = {"on_pictures": on_pictures, "advance": advance, "look_at": look_at}
         how |= {"compute": compute, "journal": out / JOURNAL_FILE, "resume": resume}
@@ -152,9 +145,9 @@ def verify(
         report = report.changed(origin=origin, folder=out)
         stems = {stem_of(photo.file) for photo in report.photos[:MAX_PICTURED_PHOTOS]}
         # but for pictures of photographs that this report does not show
-        clear_folder(out, lambda name: not name.startswith("pictures/") or name[9:].rsplit(".", 2)[0] in stems)
+        output.clear_folder(out, lambda name: not name.startswith("pictures/") or name[9:].rsplit(".", 2)[0] in stems)
         write_report(report.model_dump(mode="json"), manifest.model_dump(mode="json"), out)
-        write_atomically(out / "coco.json", _boxes(report, manifest, options.camera))
+        output.write_atomically(out / "coco.json", _boxes(report, manifest, options.camera))
     return report
 
 
@@ -216,11 +209,11 @@ def _check_out(out: Path, resume: bool, overwrite: bool, inputs: Sequence[object
     """Refuse a folder with files, unless they are of a verification that is resumed or overwritten."""
     has_journal = is_file(out / JOURNAL_FILE)
     if resume:
-        refuse_inputs_in(out, inputs)
-        refuse_other_files(out, REPORT_FILES if has_journal else ())
+        output.refuse_inputs_in(out, inputs)
+        output.refuse_other_files(out, REPORT_FILES if has_journal else ())
         return
     unfinished = has_journal and not is_file(out / "report.json")
-    check_folder(out, REPORT_FILES, overwrite, unfinished, inputs)
+    output.check_folder(out, REPORT_FILES, overwrite, unfinished, inputs)
 
 
 def _networks(manifest: Manifest, models: Sequence[str | Classifier] | None) -> tuple[str | Classifier, ...]:
@@ -232,8 +225,7 @@ def _networks(manifest: Manifest, models: Sequence[str | Classifier] | None) -> 
         got = f"the {manifest.kind} sheet {manifest.sheet_id}"
         raise Refused("a sheet that promises something", got, "name --models")
     promised = tuple(model.name for model in manifest.promise.models)
-    names = dict.fromkeys((promised[0], *(named or promised)))
-    return tuple(named.get(name, name) for name in names)
+    return tuple(named.get(name, name) for name in dict.fromkeys((promised[0], *(named or promised))))
 
 
 def _by_name(models: Sequence[str | Classifier] | None) -> dict[str, str | Classifier]:

@@ -51,8 +51,7 @@ def orbit(azimuth_deg: ArrayLike, elevation_deg: ArrayLike, forward: ArrayLike, 
     forward, up = _unit(forward), _unit(up)
     right = np.cross(up, forward)  # the viewer who faces the side has this on the right hand
     azimuth, elevation = np.radians(azimuth_deg)[..., None], np.radians(elevation_deg)[..., None]
-    level = np.cos(azimuth) * forward + np.sin(azimuth) * right
-    return np.cos(elevation) * level + np.sin(elevation) * up
+    return np.cos(elevation) * (np.cos(azimuth) * forward + np.sin(azimuth) * right) + np.sin(elevation) * up
 
 
 def look_at(eye_mm: ArrayLike, target_mm: ArrayLike, roll_deg: ArrayLike = 0.0, up: ArrayLike = UP) -> np.ndarray:
@@ -97,16 +96,15 @@ def camera_centers(poses) -> np.ndarray:
 
 def plane_homography(matrix_px, camera_from_world, world_from_plane) -> np.ndarray:
     """(N×)3×3 homography from plane millimeters to pixels; `world_from_plane` 4×4 has the plane's axes and origin."""
-    pose = camera_from_world @ world_from_plane
-    return normalize_homography(matrix_px @ pose[..., :3, [0, 1, 3]])
+    return normalize_homography(matrix_px @ (camera_from_world @ world_from_plane)[..., :3, [0, 1, 3]])
 
 
-def scaling_about(middle, scale: float) -> np.ndarray:
-    """Matrix (D+1)×(D+1) that scales about `middle` (D values)."""
-    middle = np.asarray(middle, float)
-    matrix = np.eye(len(middle) + 1)
-    matrix[:-1, :-1] *= scale
-    matrix[:-1, -1] = (1 - scale) * middle
+def scaling_about(middle, scale) -> np.ndarray:
+    """Matrices ...×(D+1)×(D+1) that scale by `scale` (...) about `middle` (D values)."""
+    middle, scale = np.asarray(middle, float), np.asarray(scale, float)[..., None]
+    matrix = np.tile(np.eye(len(middle) + 1), (*scale.shape[:-1], 1, 1))
+    matrix[..., :-1, :-1] *= scale[..., None]
+    matrix[..., :-1, -1] = (1 - scale) * middle
     return matrix
 
 
@@ -144,22 +142,16 @@ def corner_turns(quad) -> np.ndarray:
     return sides[:, 0] * following[:, 1] - sides[:, 1] * following[:, 0]
 
 
-def local_scale(homography, point) -> tuple[float, float]:
-    """(px_per_mm, tilt_deg) of a page→image homography at a page point, by its derivative's singular values: their
-    geometric mean, and arccos of their ratio, which is the tilt exactly for a distant camera.
+def local_scale(homography, point) -> np.ndarray:
+    """(px_per_mm, tilt_deg), ...×2, of page→image homographies ...×3×3 at a page point, by its derivative's singular
+    values: their geometric mean, and arccos of their ratio, which is the tilt exactly for a distant camera.
     """
-    px_per_mm, tilt_deg = local_scales(np.asarray(homography)[None], point)[0].tolist()
-    return px_per_mm, tilt_deg
-
-
-def local_scales(homographies: np.ndarray, point) -> np.ndarray:
-    """`local_scale` of homographies N×3×3, as N×2."""
-    x, y = point
-    image = homographies @ np.array([x, y, 1.0])
-    pixel, w = image[:, :2] / image[:, 2:], image[:, 2, None, None]
-    jacobians = (homographies[:, :2, :2] - pixel[:, :, None] * homographies[:, None, 2, :2]) / w
-    large, small = np.linalg.svd(jacobians, compute_uv=False).T
-    return np.stack([np.sqrt(large * small), np.degrees(np.arccos(np.clip(small / large, 0, 1)))], 1)
+    homography = np.asarray(homography)
+    image = homography @ np.array([*point, 1.0])
+    pixel, w = image[..., :2] / image[..., 2:], image[..., 2, None, None]
+    jacobian = (homography[..., :2, :2] - pixel[..., None] * homography[..., None, 2, :2]) / w
+    large, small = np.moveaxis(np.linalg.svd(jacobian, compute_uv=False), -1, 0)
+    return np.stack([np.sqrt(large * small), np.degrees(np.arccos(np.clip(small / large, 0, 1)))], -1)
 
 
 def plane_pose(homography, matrix_px) -> np.ndarray:
@@ -177,8 +169,7 @@ def plane_pose(homography, matrix_px) -> np.ndarray:
 
 def view_angles(camera_from_plane, point) -> tuple[float, float, float]:
     """(azimuth_deg, elevation_deg, distance_mm) of the camera from a page point; positive right of and above it."""
-    rotation, translation = camera_from_plane[:3, :3], camera_from_plane[:3, 3]
-    x, y, z = -rotation.T @ translation - np.array([point[0], point[1], 0.0])
+    x, y, z = -camera_from_plane[:3, :3].T @ camera_from_plane[:3, 3] - np.array([point[0], point[1], 0.0])
     distance = float(np.sqrt(x * x + y * y + z * z))
     # plane z points into the paper (x right, y down, right-handed)
     return float(np.degrees(np.arctan2(x, -z))), float(np.degrees(np.arcsin(-y / distance))), distance

@@ -274,9 +274,8 @@ class SceneSettings(StrictModel):
         if not any((*self.light.ambient, *self.light.directional)):
             raise ValueError("raise light.ambient or light.directional: every picture would be black")
         if self.object.photos is not None and not self.sheet.markers:
-            raise ValueError(
-                "leave out sheet.markers with object.photos: the print has the markers of their blank sheet"
-            )
+            do = "leave out sheet.markers with object.photos"
+            raise ValueError(f"{do}: the print has the markers of their blank sheet")
         return self
 
 

@@ -56,8 +56,7 @@ def short_repr(self: Any) -> str:
     kind, parts = type(self), []
     for name in getattr(kind, "SHOWN", None) or getattr(kind, "__dataclass_fields__", None) or kind.model_fields:
         value = attrgetter(name)(self)
-        text = brief(value() if isinstance(value, MethodType) else value)
-        parts.append(f"{name.rpartition('.')[2]}={text}")
+        parts.append(f"{name.rpartition('.')[2]}={brief(value() if isinstance(value, MethodType) else value)}")
     return f"{kind.__name__}({', '.join(parts)})"
 
 

@@ -175,8 +175,7 @@ def find_corners(srgb: np.ndarray, board: Board) -> tuple[np.ndarray, np.ndarray
     linear light, where blurred paper does not grow over ink; corners need no such care.
     """
     dictionary = aruco_dictionary(DICTIONARY)
-    light = photo_codes_from_srgb(luminance(srgb))
-    quads, names, _ = detect_markers(light, dictionary, detector_settings())
+    quads, names, _ = detect_markers(photo_codes_from_srgb(luminance(srgb)), dictionary, detector_settings())
     none = np.zeros(0, int), np.zeros((0, 2)), len(quads)
     if names is None:
         return none

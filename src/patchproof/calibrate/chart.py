@@ -134,8 +134,7 @@ def printer_of(name: str, predict: ColorMap, provenance: Mapping[str, Any]) -> P
     """The table of a fitted map, scaled per channel so that white is bare paper."""
     nodes = node_colors()
     light = linear_from_srgb(np.clip(predict(nodes.reshape(-1, 3)), 0, 1.2))
-    white = np.maximum(light[-1], 0.1)
-    lut = srgb_from_linear(np.clip(light / white, 0, 1)).reshape(nodes.shape)
+    lut = srgb_from_linear(np.clip(light / np.maximum(light[-1], 0.1), 0, 1)).reshape(nodes.shape)
     gamut = color_difference(nodes.reshape(-1, 3), lut.reshape(-1, 3)).reshape(nodes.shape[:3])
     return printer_from_table(name, "measured", lut, gamut, dict(provenance))
 
@@ -205,8 +204,7 @@ def read_chart(photo: Photo, manifest: Manifest) -> ChartPhoto:
     found = {row: _core(swatch.rect_mm, *page, srgb.shape) for row, swatch in enumerate(manifest.chart)}
     cores = {row: core for row, core in found.items() if core is not None}
     if not cores:
-        advice = "come closer to the chart, hold still and show all of it"
-        raise PhotoRejected("too_small", 0, 1, advice)
+        raise PhotoRejected("too_small", 0, 1, "come closer to the chart, hold still and show all of it")
     light = np.full((len(manifest.chart), 3), np.nan)
     middles_mm = np.array([[x + w / 2, y + h / 2] for x, y, w, h in cores.values()])
     by_swatch = _paper_at(middles_mm, srgb, manifest, *page)

@@ -103,7 +103,6 @@ def _chain(data: bytes, file_name: str, perceptual: bool) -> tuple[Callable[[np.
 def _table_error(printer: Printer, show: Callable[[np.ndarray], np.ndarray]) -> dict[str, float]:
     """ΔE00 between the interpolated table and the chain itself on random colors."""
     sent = np.random.default_rng(0).integers(0, 256, (_CHECKED_COLORS, 3), dtype=np.uint8)
-    exact = lab_from_srgb(show(sent) / 255)
-    error = ciede2000(exact, lab_from_srgb(printer_output(printer, sent / 255)))
+    error = ciede2000(lab_from_srgb(show(sent) / 255), lab_from_srgb(printer_output(printer, sent / 255)))
     figures = {"mean": error.mean(), "p95": np.percentile(error, 95), "max": error.max()}
     return {"colors": _CHECKED_COLORS, **{key: round(float(value), 3) for key, value in figures.items()}}

@@ -20,14 +20,7 @@ from patchproof.base.progress import Advance
 from patchproof.base.text import printable
 from patchproof.base.workers import open_workers
 from patchproof.calibrate.chart import PRIORS, printer_of
-from patchproof.channel.print_colors import (
-    INK_TERMS,
-    CellColors,
-    ShownColors,
-    add_ink,
-    fit_ink_and_photos,
-    fit_shown_colors,
-)
+from patchproof.channel.print_colors import INK_TERMS, CellColors, ShownColors, add_ink, fit_ink_and_photos
 from patchproof.channel.printer import Printer, load_printer, node_colors, printer_output
 from patchproof.evidence.annotations import corners_of_photo
 from patchproof.evidence.batch import PhotoItem, measure_all
@@ -168,7 +161,7 @@ def _errors(photos: Sequence[CellColors], ink: np.ndarray) -> list[float]:
     """Median ΔE00 of each photograph's cells, relative to paper, in its own best light."""
     errors = []
     for cells in photos:
-        pair = fit_shown_colors(cells, ink).show(cells.ink_light(ink)), cells.seen
+        pair = cells.shown_in(ink).show(cells.ink_light(ink)), cells.seen
         lab = (lab_from_linear(np.clip(light / np.exp(cells.start[3:6]), 1e-6, 1)) for light in pair)
         errors.append(float(np.median(ciede2000(*lab))))
     return errors

@@ -60,8 +60,7 @@ def reach_px(sensor: Sensor, scale: float, jpeg: bool = True) -> int | None:
     """Return how many pixels far `develop` spreads light; None if JPEG spreads it within its blocks."""
     if _has_jpeg(sensor, scale, jpeg):
         return None
-    blur_px, motion_px = float(sensor.blur_px.max()) * scale, float(sensor.motion_px.max()) * scale
-    return _blur_reach(blur_px) + _motion_reach(motion_px)
+    return _blur_reach(float(sensor.blur_px.max()) * scale) + _motion_reach(float(sensor.motion_px.max()) * scale)
 
 
 def _blur_reach(sigma_px: float) -> int:
@@ -149,8 +148,7 @@ def add_noise(linear: Tensor, noise: Tensor, seeds) -> Tensor:
     # drawn on the CPU for every device, so that a GPU gets the same noise
     generators = (torch.Generator().manual_seed(int(seed)) for seed in seeds)
     grain = torch.stack([torch.randn(linear.shape[1:], generator=generator) for generator in generators]).to(linear)
-    deviation = noise[:, None, None, None] * (linear.detach().clamp_min(0) + READ_SHARE**2).sqrt()
-    return linear + deviation * grain
+    return linear + noise[:, None, None, None] * (linear.detach().clamp_min(0) + READ_SHARE**2).sqrt() * grain
 
 
 def compress_jpeg(picture: Tensor, quality: Tensor) -> Tensor:

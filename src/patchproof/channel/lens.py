@@ -130,8 +130,7 @@ def check_camera(camera: Camera, where: str) -> None:
     width, height = camera.image_px
     if not (0 < camera.cx < width and 0 < camera.cy < height):
         expected = f"a principal point inside the picture of {width} × {height} px in {where}"
-        got = f"({camera.cx:g}, {camera.cy:g})"
-        raise Refused(expected, got, "give cx, cy and image_px in the same pixels")
+        raise Refused(expected, f"({camera.cx:g}, {camera.cy:g})", "give cx, cy and image_px in the same pixels")
     x, y = np.meshgrid(*(np.linspace(0.5, side - 0.5, 65) for side in camera.image_px))
     points = _to_unit(camera.matrix_px(camera.image_px), np.stack([x.ravel(), y.ravel()], 1))
     with np.errstate(over="ignore", invalid="ignore"):
@@ -148,8 +147,7 @@ def _sampling_grid(camera: Camera, size_px: tuple[int, int]) -> np.ndarray:
     width, height = size_px
     frame = camera.pinhole_frame(size_px)
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    pixels = np.stack([x.ravel(), y.ravel()], 1)
-    source = camera.undistort_points(pixels, size_px) + np.array([frame.left, frame.top])
+    source = camera.undistort_points(np.stack([x.ravel(), y.ravel()], 1), size_px) + np.array([frame.left, frame.top])
     return (2 * source / frame.size_px - 1).reshape(1, height, width, 2)
 
 

@@ -52,6 +52,5 @@ def project_box(
         points_px = camera.distort_points(np.clip(points_px, -half_size, 3 * half_size), size_px)
     if not len(points_px):
         return np.zeros(4)
-    low, high = points_px.min(0), points_px.max(0)
-    box = np.concatenate([np.clip(low, 0, size_px), np.clip(high, 0, size_px)])
+    box = np.concatenate([np.clip(points_px.min(0), 0, size_px), np.clip(points_px.max(0), 0, size_px)])
     return box if (box[2:] > box[:2]).all() else np.zeros(4)

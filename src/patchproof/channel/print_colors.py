@@ -52,6 +52,10 @@ class CellColors:
         """Return the cells' light N×3 in this ink."""
         return np.clip(self.promised + self.terms @ ink, 0, 1)
 
+    def shown_in(self, ink: np.ndarray) -> "ShownColors":
+        """Fit the photograph's colors to its cells in a known ink."""
+        return ShownColors.of_terms(_fit_terms(self.ink_light(ink), self, self.start, 3 * _STEPS))
+
 
 @dataclass(frozen=True)
 class ShownColors:
@@ -100,8 +104,7 @@ def added_terms(promised: np.ndarray) -> np.ndarray:
 
 def add_ink(promised: np.ndarray, ink: np.ndarray) -> np.ndarray:
     """Return the light of a print in this ink, `... × 3` of the same type, from the known printer's light."""
-    terms = added_terms(promised)
-    added = ink.T.astype(promised.dtype) @ terms.reshape(INK_TERMS, -1)
+    added = ink.T.astype(promised.dtype) @ added_terms(promised).reshape(INK_TERMS, -1)
     return np.clip(promised + added.T.reshape(promised.shape), 0, 1)
 
 
@@ -145,11 +148,6 @@ def fit_ink_and_photos(photos: Sequence[CellColors], rounds: int = 8) -> tuple[n
         light = [cells.ink_light(ink) for cells in photos]
         terms = [_fit_terms(*pair, t) for pair, t in zip(zip(light, photos, strict=True), terms, strict=True)]
     return ink, terms
-
-
-def fit_shown_colors(cells: CellColors, ink: np.ndarray) -> ShownColors:
-    """Fit one photograph's colors to its cells in a known ink."""
-    return ShownColors.of_terms(_fit_terms(cells.ink_light(ink), cells, cells.start, 3 * _STEPS))
 
 
 def affine12(photographed: np.ndarray, promised: np.ndarray) -> ShownColors | None:

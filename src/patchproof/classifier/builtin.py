@@ -29,8 +29,7 @@ class Backbone(nn.Module):
 
     def __init__(self, batch_norm: bool):
         super().__init__()
-        before = (3, *WIDTHS)
-        self.halve = nn.ModuleList(conv(a, b, 2, batch_norm) for a, b in zip(before, WIDTHS, strict=False))
+        self.halve = nn.ModuleList(conv(a, b, 2, batch_norm) for a, b in zip((3, *WIDTHS), WIDTHS, strict=False))
         self.refine = nn.ModuleList(conv(width, width, 1, batch_norm) for width in WIDTHS[1:])
 
     def features(self, photos_srgb: Tensor) -> list[Tensor]:

@@ -29,8 +29,7 @@ class SmallDetector(Backbone):
 
     def forward(self, photos_srgb: Tensor) -> Tensor:
         """N×3×128×128 sRGB in [0, 1] → a candidate for each of 64 cells, N×64×(4+K)."""
-        sizes = self.features(photos_srgb)[-2:]
-        fine, coarse = (join(size) for join, size in zip(self.join, sizes, strict=True))
+        fine, coarse = (join(size) for join, size in zip(self.join, self.features(photos_srgb)[-2:], strict=True))
         x = torch.relu(fine + nn.functional.interpolate(coarse, scale_factor=2.0))
         for layer in self.head:
             x = x + torch.relu(layer(x))

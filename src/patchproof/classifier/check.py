@@ -31,8 +31,7 @@ def check_network(classifier: Classifier, device: torch.device | str = "cpu") ->
         with torch.no_grad():
             output = classifier.network(photos)
             check_shape(output, classifier)
-            batches = (photos.clone(), photos[1:2], photos.flip(1))
-            again, alone, swapped = map(classifier.square_logits, batches)
+            again, alone, swapped = map(classifier.square_logits, (photos.clone(), photos[1:2], photos.flip(1)))
     except (Refused, Warning):  # a warning where they are errors
         raise
     except Exception as error:  # the network is the user's program and may raise anything

@@ -189,8 +189,7 @@ def _fitted_scores(
     is_share = bool(((joined > -1e-3) & (joined < 1 + 1e-3)).all())
     adds_up = is_share and bool(((joined.sum(-1) - 1).abs() < 1e-2).all())
     if scores.shape[-1] > decoder.labels or (objectness is not None and adds_up):
-        means = joined.mean((0, 1))
-        where = "first" if int(means.argmax()) == 0 else "last"
+        where = "first" if int(joined.mean((0, 1)).argmax()) == 0 else "last"
         return {"scores": "probabilities" if adds_up else "logits", "background": where}
     if objectness is not None and not is_share and len(outputs) == 1:
         do = 'write "head": {"name": "ultralytics", "scores": "logits"} into its JSON if it is an objectness, or '

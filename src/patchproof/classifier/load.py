@@ -90,8 +90,7 @@ def load_classifier(
     from patchproof.classifier.network_file import EXPORT_ADVICE
 
     names = "builtin, builtin-detector, imagenet, torchvision:NAME, timm:NAME, clip:NAME@FILE, file:NAME.onnx"
-    words = {".onnx": f'write "file:{name}"', ".pt2": EXPORT_ADVICE}
-    do = words.get(Path(name).suffix, "write one of these")
+    do = {".onnx": f'write "file:{name}"', ".pt2": EXPORT_ADVICE}.get(Path(name).suffix, "write one of these")
     raise Refused(f"a model named {names} or module:package.factory", f'"{name}"', do)
 
 
@@ -105,8 +104,7 @@ def _prepare(classifier: Classifier, device: torch.device | str, is_own: bool = 
         with warnings.catch_warnings(action="always", record=True) as said:
             if not is_own:
                 check_network(classifier, device)
-            pictures = smooth_pictures(classifier.input_px).to(device)
-            network = tune_batches(classifier.network, pictures)
+            network = tune_batches(classifier.network, smooth_pictures(classifier.input_px).to(device))
             tuned = replace(classifier, network=network)
             if classifier.name.startswith(("file:", "module:", "python:")):  # wrapped by others
                 from patchproof.classifier.wrapping import check_wrapping

@@ -113,9 +113,8 @@ def _check_boxes(classifier: Classifier, candidates: Tensor) -> None:
     share = float((size <= 0).any(1).double().mean())
     seen = f"{share:.0%} with right <= left or bottom <= top"
     if share > 0.5:
-        both = bool((size < 0).all())
         do = 'write "head": {"name": "boxes", "boxes": "cxcywh"} (or "xywh") into its JSON, or "ultralytics"'
-        do = "put the upper left corner first" if both else do
+        do = "put the upper left corner first" if bool((size < 0).all()) else do
         raise Refused(expected, f"{seen} from {name} ({first})", do)
     if share > 0.02:
         warnings.warn(f"{name} gives boxes, {seen}: are they (center, size)?", stacklevel=3)

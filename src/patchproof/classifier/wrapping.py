@@ -133,8 +133,7 @@ def _pictures() -> Tensor:
     with Image.open(Path(__file__).with_name("wrapping.jpg")) as sheet:
         pixels = torch.from_numpy(np.asarray(sheet.convert("RGB")).copy()).float() / 255
     side = pixels.shape[0] // _ROWS
-    grid = pixels.reshape(_ROWS, side, _COLUMNS, side, 3)
-    return grid.permute(0, 2, 4, 1, 3).reshape(-1, 3, side, side)
+    return pixels.reshape(_ROWS, side, _COLUMNS, side, 3).permute(0, 2, 4, 1, 3).reshape(-1, 3, side, side)
 
 
 @cache

@@ -153,8 +153,7 @@ def read_weights(path: Path) -> LocalWeights:
     except (SafetensorError, KeyError, ValueError, RuntimeError) as error:
         got = f"{path} that cannot be read ({error_summary(error)})"
         raise Refused("weights in safetensors", got, "save it again") from error
-    header = json.loads(stored[8 : 8 + int.from_bytes(stored[:8], "little")])
-    declared = header.get("__metadata__", {})
+    declared = json.loads(stored[8 : 8 + int.from_bytes(stored[:8], "little")]).get("__metadata__", {})
     if declared.get("format", "pt") != "pt":  # of other libraries, whose weights lie in another order
         got = f"format = {quote(declared['format'])} in {path}"
         raise Refused("weights of PyTorch", got, "convert them with the library that wrote them")

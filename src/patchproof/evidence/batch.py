@@ -264,8 +264,7 @@ def _measure(task: Task, item: PhotoItem) -> MeasuredPhoto:
     if task.scan_dpi and not measured.counted and any(abs(dpi / task.scan_dpi - 1) > 0.01 for dpi in photo.dpi if dpi):
         said += (_OTHER_DPI.format(*photo.dpi, task.scan_dpi),)
     entry = entry.changed(box=box or entry.box, said=said)
-    trace = _trace(item.path, photo.srgb)
-    return replace(measured, entry=entry, pictures=pictures, squares=squares, trace=trace)
+    return replace(measured, entry=entry, pictures=pictures, squares=squares, trace=_trace(item.path, photo.srgb))
 
 
 def _trace(path: Path, srgb: np.ndarray) -> Trace:

@@ -23,43 +23,17 @@ from patchproof.base.settings import background_summary
 from patchproof.base.text import printable
 from patchproof.base.validation import summarize_names
 from patchproof.base.workers import open_workers
+from patchproof.evidence import verdict
 from patchproof.evidence.batch import MAX_PICTURED_PHOTOS, Journal, PhotoItem, measure_all, reread_square, settings_key
 from patchproof.evidence.classify import Judges, judges_of
-from patchproof.evidence.grouping import (
-    COPY_CODE,
-    Grouping,
-    control_keys,
-    group_sessions,
-    merge_folders,
-    reject_copies,
-    subfolders,
-)
+from patchproof.evidence.grouping import COPY_CODE, Grouping, control_keys, group_sessions, merge_folders, reject_copies
 from patchproof.evidence.ledger import estimate_effect, ledger_of
 from patchproof.evidence.measure import UNLOCATED_CODES, MeasuredPhoto
 from patchproof.evidence.reproject import PhotoSquare, read_print
-from patchproof.evidence.results import (
-    EffectEstimate,
-    Ledger,
-    ModelRate,
-    PhotoEntry,
-    Report,
-    Scale,
-    SessionCount,
-    Summary,
-)
+from patchproof.evidence.results import EffectEstimate, Ledger, ModelRate, PhotoEntry, Report, SessionCount, Summary
 from patchproof.evidence.task import Options, task_of
-from patchproof.evidence.verdict import (
-    MOST_PHOTOS,
-    PLANNED_LOOK,
-    Look,
-    Verdict,
-    benefit_of,
-    compare_with_control,
-    judge,
-    still_needed,
-    watched,
-)
-from patchproof.photo.read import list_images, list_skipped_files, summarize_said
+from patchproof.evidence.verdict import MOST_PHOTOS, PLANNED_LOOK, Look, Verdict
+from patchproof.photo.read import list_images, list_skipped_files, subfolders, summarize_said
 from patchproof.sheets.manifest import Manifest
 
 
@@ -128,11 +102,11 @@ def gather_evidence(
         found = read_print([square for square in squares if square is not None], task.promised)
         some = replace(found, shots=_spread(found.shots, options.ledger_photos))
         ledger = ledger_of(some, manifest, task, judges, confidence, compute.jobs)
-        by_file = _recognized(entries, name), session
-        estimate = estimate_effect(found, manifest, task, options.printer, judges, *by_file, compute.jobs)
+        answers = _recognized(entries, name)
+        estimate = estimate_effect(found, manifest, task, options.printer, judges, answers, session, compute.jobs)
     if controls_folder:
-        skipped = list_skipped_files(controls_folder, depth=2)
-        left_out += [f"{printable(controls_folder.name)}: {text}" for text in skipped]
+        control_name = printable(controls_folder.name)
+        left_out += [f"{control_name}: {text}" for text in list_skipped_files(controls_folder, depth=2)]
     left_out += summarize_said((item.name, result.entry.said) for item, result in zip(items, results, strict=True))
     controls: dict[str, list[MeasuredPhoto]] = {}
     first_of = {photo.entry.sha256: photo.entry.file for photo in reversed(patch_photos)}  # a patch's are no control's
@@ -202,7 +176,7 @@ def report_of(
     Without a `look` the photographs were watched while they were taken.
     """
     entries, counted = [photo.entry for photo in photos], [photo.entry for photo in photos if photo.counted]
-    verdict = Verdict("cannot_tell", None, "The sheet promises nothing.")
+    judgment = Verdict("cannot_tell", None, "The sheet promises nothing.")
     comparisons, rates, rate, interval, sessions, do, worth = [], {}, _rate({}), None, (), "", None
     if judges and manifest.promise:
         promise, primary = manifest.promise, judges.primary.name
@@ -212,18 +186,18 @@ def report_of(
         sessions = _sessions(grouping, photos, recognized)
         numbers = dict(zip((entry.file for entry in entries), grouping.merged, strict=True))
         counts = sum(recognized.values()), list(Counter(numbers[file] for file in recognized).values())
-        look = look or watched(counts[1], promise)
-        verdict = judge(*counts, promise, without_markers, look)
+        look = look or verdict.watched(counts[1], promise)
+        judgment = verdict.judge(*counts, promise, without_markers, look)
         if recognized:
             interval = promise.posterior.rate_given(*counts)
         answers = {(numbers[file], file): answer for file, answer in recognized.items()}
         for name, control in controls.items():
             keys, hits = control_keys(grouping, photos, control), _recognized((p.entry for p in control), primary)
             hits_by_key = {keys[file]: hit for file, hit in hits.items()}
-            comparisons.append(compare_with_control(answers, name, hits_by_key, promise))
+            comparisons.append(verdict.compare_with_control(answers, name, hits_by_key, promise))
         if rate.rate is not None and interval is not None:
-            worth = benefit_of(len(recognized), rate.rate, interval, comparisons, promise, estimate)
-        do = still_needed(promise, counts[1], without_markers, verdict.verdict, worth)
+            worth = verdict.benefit_of(len(recognized), rate.rate, interval, comparisons, promise, estimate)
+        do = verdict.still_needed(promise, counts[1], without_markers, judgment.verdict, worth)
     summary = Summary(
         photos=len(entries),
         judged=len(counted),
@@ -236,7 +210,7 @@ def report_of(
         looks=(look or PLANNED_LOOK).number,
         looks_planned=(look or PLANNED_LOOK).planned,
         ledger=ledger,
-        **vars(verdict),
+        **vars(judgment),
         next_step=do,
         worth=worth,
         estimated=estimate,
@@ -246,8 +220,7 @@ def report_of(
     )
     if ruler_mm is not None:
         x, y = np.divide(ruler_mm, manifest.ruler_mm).tolist()
-        scale = Scale(scale_x=x, scale_y=y)
-        entries = [entry if entry.scale else entry.changed(scale=scale) for entry in entries]
+        entries = [entry if entry.scale else entry.changed(scale={"scale_x": x, "scale_y": y}) for entry in entries]
     return Report(sheet_id=manifest.sheet_id, photos=tuple(entries), summary=summary, controls=tuple(comparisons))
 
 

@@ -32,7 +32,7 @@ from patchproof.base.validation import summarize_names
 from patchproof.evidence.measure import MeasuredPhoto
 from patchproof.evidence.results import PhotoEntry, Remark, Trace
 from patchproof.evidence.verdict import PhotoKey
-from patchproof.photo.read import list_images, list_photos
+from patchproof.photo.read import list_images, list_photos, subfolders
 from patchproof.sheets.manifest import Rect
 
 PAUSE_MINUTES, MOVE_MINUTES = 30.0, 2.0
@@ -92,11 +92,6 @@ def group_sessions(folder: str | Path, without: Path | None = None) -> Grouping:
         sessions = {"": loose} | sessions
     pairs = [(path, number) for number, paths in enumerate(sessions.values()) for path in paths]
     return Grouping(tuple(p for p, _ in pairs), tuple(n for _, n in pairs), tuple(sessions), BY_FOLDERS)
-
-
-def subfolders(folder: Path) -> list[Path]:
-    """The folders in a folder by name, without hidden ones."""
-    return sorted(p for p in folder.iterdir() if p.is_dir() and not p.name.startswith("."))
 
 
 def _group_by_times(grouping: Grouping, photos: Sequence[MeasuredPhoto]) -> Grouping:

@@ -38,16 +38,9 @@ from patchproof.base.intervals import MIN_CLUSTERS, resampled_means
 from patchproof.base.resample import downscale, halving_pyramid
 from patchproof.base.workers import fork_workers
 from patchproof.channel.print_colors import ShownColors
+from patchproof.evidence import reproject
 from patchproof.evidence.classify import Judges, boxes_of, predict, squares_of
-from patchproof.evidence.reproject import (
-    PhotographedPrint,
-    PhotoSquare,
-    Pyramid,
-    Reference,
-    Switches,
-    reprojected_square,
-    reprojected_squares,
-)
+from patchproof.evidence.reproject import PhotographedPrint, PhotoSquare, Pyramid, Reference, Switches
 from patchproof.evidence.results import EffectEstimate, Ledger, LedgerShare
 from patchproof.evidence.surface import DESIGN_PX, PromisedColors, Surface, piece_picture, printed_colors, with_markers
 from patchproof.evidence.task import Task
@@ -127,8 +120,7 @@ def _culprit(names: Sequence[str], means: np.ndarray, resampled: np.ndarray | No
         return None
     rivals = [i for i, name in enumerate(names) if name != GAMUT]
     top = max(rivals, key=lambda i: means[i])
-    rest = [i for i in rivals if i != top]
-    lead = np.minimum(resampled[:, top] - resampled[:, rest].max(1), resampled[:, top])
+    lead = np.minimum(resampled[:, top] - resampled[:, [i for i in rivals if i != top]].max(1), resampled[:, top])
     clear = np.quantile(lead, 0.025) > 0 and means[top] >= LEAST_SHARE
     return names[top] if clear and names[top] != PHOTO else None
 
@@ -175,7 +167,7 @@ def _confidences(
     from patchproof.classifier import center_square
 
     shot, undo, print_light, reference = item
-    squares = reprojected_squares(shot, looks, surface.rect_mm, undo, print_light, reference)
+    squares = reproject.reprojected_squares(shot, looks, surface.rect_mm, undo, print_light, reference)
     model, boxes = judges.primary, boxes_of(shot.box, len(squares))
     with torch.inference_mode():
         pictures = [torch.from_numpy(square.transpose(2, 0, 1))[None].float() for square in squares.values()]
@@ -224,7 +216,7 @@ def _recognized(
     """Classify a photograph with a piece of each look by the primary network."""
     (shot, light), model, recognized = item, judges.primary, {}
     for kind, look in looks.items():
-        codes = np.rint(255 * reprojected_square(shot, look, surface.rect_mm, light)).astype(np.uint8)
+        codes = np.rint(255 * reproject.reprojected_square(shot, look, surface.rect_mm, light)).astype(np.uint8)
         square = squares_of(codes, [model.input_px])[model.input_px]
         recognized[kind] = predict(model, judges.indices[model.name], square, shot.box).recognized
     return recognized

@@ -99,15 +99,12 @@ def _undistort(srgb: np.ndarray, camera: "Camera", matrix: np.ndarray) -> np.nda
 def locate_sheet(view: PinholePhoto, detected: MarkersInView, surface: Surface) -> LocatedSheet | None:
     """Locate the sheet by its markers; None if they fit no plane, cylinder or lens."""
     fit = _fit(detected, surface)
-    if fit is None:
-        return None
-    return _unroll_piece(view, detected, surface) or flat_sheet(view.srgb, fit, surface.rect_mm)
+    return fit and (_unroll_piece(view, detected, surface) or flat_sheet(view.srgb, fit, surface.rect_mm))
 
 
 def _fit(detected: MarkersInView, surface: Surface) -> PageFit | None:
     """Fit the piece's homography, with the page's markers if in its plane; only the piece's count as outliers."""
-    fitted = {i: b.corners_px for i, b in detected.markers.items() if b.fitted}
-    corners = fitted or detected.corners_px
+    corners = {i: b.corners_px for i, b in detected.markers.items() if b.fitted} or detected.corners_px
     on_piece = {i: c for i, c in corners.items() if i in surface.piece_ids}
     try:
         fit = fit_page(on_piece or corners, surface.corners_mm)

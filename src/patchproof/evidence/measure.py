@@ -193,9 +193,8 @@ def identify_sheet(srgb: np.ndarray, surface: Surface) -> tuple[MarkersInView, S
             raise PhotoRejected("wrong_sheet", len(detected.foreign), 0, advice)
         raise PhotoRejected("too_few_markers", 0, 1, "no marker is readable: show the whole patch, sharp and well lit")
     if detected.another_sheet or detected.doubled:
-        extra_markers = max(len(detected.foreign), len(detected.doubled))
         advice = "more than one sheet is in view: photograph one at a time"
-        raise PhotoRejected("several_sheets", extra_markers, 1, advice)
+        raise PhotoRejected("several_sheets", max(len(detected.foreign), len(detected.doubled)), 1, advice)
     if not surface.pages:
         return detected, surface
     hidden_ids = detected.markers.keys() - surface.corners_mm.keys()  # those that an assembled piece would hide

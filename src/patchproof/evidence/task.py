@@ -125,12 +125,10 @@ class Task:
 def task_of(manifest: Manifest, options: Options, judges: Judges | None) -> Task:
     """Make the task of a verification; without `judges` photographs are not classified."""
     surface = surface_of(manifest)
-    promised = promised_of(manifest, surface, options.printer)
-    photo_px, conditions = manifest.settings.get("camera", {}).get("photo_px"), ()
-    if manifest.promise is not None:
-        conditions = manifest.promise.conditions
+    photo_px = manifest.settings.get("camera", {}).get("photo_px")
+    conditions = () if manifest.promise is None else manifest.promise.conditions
     ranges = promised_ranges(conditions, float(min(photo_px)) if photo_px else None)
     sizes = tuple(sorted({model.input_px for model in judges.models})) if judges else ()
     camera = options.scan_dpi, options.camera, photo_px and tuple(photo_px)
     find = manifest.design.pixels() if options.find and manifest.design else None
-    return Task(surface, promised, ranges, sizes, *camera, find)
+    return Task(surface, promised_of(manifest, surface, options.printer), ranges, sizes, *camera, find)

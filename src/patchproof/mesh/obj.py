@@ -154,9 +154,8 @@ def read_obj(assets: Assets) -> list[MeshPart]:
         assets.say("smoothing groups are left out: faces without normals are drawn flat")
     if widths - {3, 6, 7} or len(widths) > 1:
         assets.say("weights of vertices, and colors of only some vertices, are left out")
-    if undefined := [
-        name for name in dict.fromkeys(name for name, _ in groups) if name and name not in library.entries
-    ]:
+    names = dict.fromkeys(name for name, _ in groups)
+    if undefined := [name for name in names if name and name not in library.entries]:
         assets.say(f"no MTL file defines {summarize_names(undefined)}")
     # row 0 is for corners without a number
     tables = [np.insert(np.reshape(rows[key], (-1, width)), 0, np.nan, axis=0) for key, width in _WIDTHS.items()]

@@ -74,8 +74,7 @@ def _bottle(rng) -> list[MeshPart]:
     body = lathe(side, "body", glass)
     low, high = h * rng.uniform(0.1, 0.18), h * rng.uniform(0.38, 0.46)
     band = lathe([(0, low), (r + 0.4, low), (r + 0.4, high), (0, high)], "label", _paint(rng))
-    lid = lathe([(0, h - cap), (neck + 1.5, h - cap), (neck + 1.5, h), (0, h)], "cap", _paint(rng))
-    return [body, band, lid]
+    return [body, band, lathe([(0, h - cap), (neck + 1.5, h - cap), (neck + 1.5, h), (0, h)], "cap", _paint(rng))]
 
 
 def _traffic_cone(rng) -> list[MeshPart]:
@@ -101,8 +100,7 @@ def _street_sign(rng) -> list[MeshPart]:
     # corners, first corner's angle, reach of a corner in halves of the size
     shapes = ((3, 90, 1.25), (3, -90, 1.25), (4, 45, 1.41), (4, 0, 1.2), (8, 22.5, 1.08), (32, 0, 1.0))
     sides, turn, reach = shapes[rng.choice(6, p=(0.1, 0.1, 0.2, 0.15, 0.25, 0.2))]
-    colors = (*PAINTS[:4], WHITE)
-    face = _paint(rng, colors)
+    face = _paint(rng, (*PAINTS[:4], WHITE))
 
     def plate(scale: float, x0: float, x1: float, name: str, srgb) -> MeshPart:
         angle = np.radians(turn) + np.arange(sides) * 2 * np.pi / sides
@@ -173,9 +171,8 @@ def _table_lamp(rng) -> list[MeshPart]:
     cover = _paint(rng, ((0.93, 0.88, 0.75), (0.95, 0.93, 0.9), (0.8, 0.3, 0.25), (0.35, 0.5, 0.6)))
     stem = [(10 + belly * np.sin(np.pi * t) ** 2, h * (0.06 + 0.45 * t)) for t in np.linspace(0, 1, 9)]
     side = [(0, 0), (foot, 0), (foot, h * 0.025), (foot * 0.4, h * 0.05), *stem, (9, h * 0.9), (0, h * 0.9)]
-    base = lathe(side, "base", metal)
     profile = [(0, h - 6), (top - 4, h - 6), (shade - 4, low), (shade, low), (top, h), (0, h)]
-    return [base, lathe(profile, "shade", cover)]
+    return [lathe(side, "base", metal), lathe(profile, "shade", cover)]
 
 
 def _carton(rng) -> list[MeshPart]:

@@ -130,8 +130,7 @@ def _corner_normals(corners: np.ndarray) -> np.ndarray:
 
 def _planar_uv(corners: np.ndarray) -> np.ndarray:
     """Return F×3×2: faces see the texture along the axis nearest to their normal, upright, once per part."""
-    low, extent = corners.min((0, 1)), np.ptp(corners, axis=(0, 1))
-    x, y, z = np.moveaxis((corners - low) / extent, 2, 0)
+    x, y, z = np.moveaxis((corners - corners.min((0, 1))) / np.ptp(corners, axis=(0, 1)), 2, 0)
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     axis = np.abs(normal).argmax(1)
     sign = np.take_along_axis(normal, axis[:, None], 1) > 0

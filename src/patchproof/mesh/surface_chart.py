@@ -47,8 +47,7 @@ class SurfaceChart:
 
     def cartesian(self, s: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return points ...×3 at height 0 and unit normals, both along `axes` from the origin."""
-        k = self.curvature
-        angle = k * np.asarray(s, float)
+        angle = self.curvature * np.asarray(s, float)
         normal = np.stack([np.sin(angle), np.zeros_like(angle), np.cos(angle)], -1)
         # sin(k s)/k and (cos(k s) - 1)/k
         x, z = s * np.sinc(angle / np.pi), -np.sin(angle / 2) * s * np.sinc(angle / 2 / np.pi)

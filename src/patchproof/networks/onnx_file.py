@@ -26,7 +26,7 @@ from patchproof.networks.bounds import UnsupportedNetwork, checked_integer, quot
 from patchproof.networks.graph import InputDevice, Program, Step, ValueRef, mark_last_uses
 from patchproof.networks.onnx_operators import DTYPES, RESULTS, find_operator
 from patchproof.networks.onnx_shapes import MAX_SIZES
-from patchproof.networks.protobuf import read_message, read_schemas
+from patchproof.networks.protobuf import MessageReader, read_schemas
 
 _ATEN = torch.ops.aten
 AtenCalls = list[tuple[Callable[..., Any], list[Any]]]  # operators, each with its arguments after the first
@@ -68,7 +68,7 @@ def read_onnx(
     that a location names, each at most once. With `join`, called with the outputs' names and values, the network gives
     its result, and may have several outputs.
     """
-    model = read_message(stored, _SCHEMAS["model"])
+    model = MessageReader().message(memoryview(stored), _SCHEMAS["model"])
     versions = [opset.get("version", 0) for opset in model.get("opset", []) if opset.get("domain", "") in _STANDARD]
     if len(versions) != 1 or not OPSETS[0] <= versions[0] <= OPSETS[1]:
         raise UnsupportedNetwork(f"opset {quote(versions)[1:-1]}, not one from {OPSETS[0]} to {OPSETS[1]}")

@@ -104,8 +104,7 @@ def one_hot(indices, /, depth, values, *, axis=-1, device):
     """The second one of `values` at each index along a new axis, the first one elsewhere."""
     count = int(numbers(depth)[0])
     indices = indices if count <= MAX_SIZES else indices.to(device)
-    places = torch.arange(count, device=indices.device)
-    hot = torch.where(indices < 0, indices + count, indices)[..., None] == places
+    hot = torch.where(indices < 0, indices + count, indices)[..., None] == torch.arange(count, device=indices.device)
     off, on = values.to(indices.device).unbind()
     return torch.where(hot, on, off).movedim(-1, axis)
 

@@ -151,8 +151,7 @@ def col2im(x, /, image_shape, block_shape, *, dilations=None, pads=None, strides
     sizes, block = numbers(image_shape), tuple(numbers(block_shape))
     top, left, bottom, right = pads or [0] * 4
     sides = (sizes[0] + top + bottom, sizes[1] + left + right)
-    whole = F.fold(x, sides, block, dilations or 1, 0, strides or 1)
-    return pad_sides(whole, [(-top, -bottom), (-left, -right)])
+    return pad_sides(F.fold(x, sides, block, dilations or 1, 0, strides or 1), [(-top, -bottom), (-left, -right)])
 
 
 def upsample(x, /, scales, *, mode="nearest"):

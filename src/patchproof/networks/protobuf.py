@@ -39,18 +39,14 @@ def read_schemas(text: str) -> dict[str, Schema]:
     return schemas
 
 
-def read_message(stored: bytes, schema: Schema) -> dict[str, Any]:
-    """The fields of a message by name; repeated fields are lists, absent fields have no entry."""
-    return _MessageReader().message(memoryview(stored), schema)
-
-
-class _MessageReader:
+class MessageReader:
     """Reads nested messages and counts the fields of all of them."""
 
     def __init__(self):
         self.count = 0
 
     def message(self, data: memoryview, schema: Schema) -> dict[str, Any]:
+        """The fields of a message by name; repeated fields are lists, absent fields have no entry."""
         table: dict[str, Any] = {}
         for number, content in self._fields(data):
             if number not in schema:

@@ -18,15 +18,9 @@ from patchproof.base.output import write_atomically
 from patchproof.base.progress import Advance, Compute, Progress, no_progress
 from patchproof.base.validation import StrictModel
 from patchproof.classifier.network import Classifier
+from patchproof.optimizer import promise as promises
 from patchproof.optimizer.problem import Problem, set_problem
-from patchproof.optimizer.promise import (
-    CONTROLS,
-    PROMISE_VIEWS,
-    PromiseOptions,
-    control_claims,
-    model_claims,
-    pictures_with_controls,
-)
+from patchproof.optimizer.promise import PROMISE_VIEWS, PromiseOptions
 from patchproof.optimizer.responses import Responses, responses
 from patchproof.optimizer.run import Run, load_run, promise_of, write_run
 from patchproof.scene.conditions import Conditions
@@ -91,8 +85,8 @@ def evaluate(
     conditions, advance = run.scene.draw("evaluate", n, seed), partial(progress, "evaluate")
     problem, by_kind = run_responses(run, conditions, models, compute, advance)
     evaluations = {
-        claim.name: ModelEvaluation(**claim.model_dump(), controls=control_claims(by_kind, i))
-        for i, claim in enumerate(model_claims(problem, by_kind["design"]))
+        claim.name: ModelEvaluation(**claim.model_dump(), controls=promises.control_claims(by_kind, i))
+        for i, claim in enumerate(promises.model_claims(problem, by_kind["design"]))
     }
     seed = run.scene.seed if seed is None else seed
     result = Evaluation(n=n, seed=seed, goal=run.promise.target.goal, models=evaluations)
@@ -107,7 +101,7 @@ def run_responses(
 ) -> tuple[Problem, dict[str, Responses]]:
     """A run's problem, with `models` in place of its networks, and the responses to its design and to each control."""
     problem = set_problem(run.scene, compute.device, models, jobs=compute.jobs)
-    appearances = pictures_with_controls(problem, run.design, CONTROLS)
+    appearances = promises.pictures_with_controls(problem, run.design, promises.CONTROLS)
     return problem, responses(problem, appearances, conditions, advance=advance)
 
 

@@ -140,8 +140,7 @@ class Expectation:
 
     def selection(self, design: Tensor) -> tuple[float, float]:
         """Mean loss and rate of a design in the selection views, rounded to the 8-bit pixels that go to the printer."""
-        pixels = from_pixels(as_pixels(design), self._problem.device)
-        texels = _to_send(self._problem.subject.print_design(pixels))
+        texels = _to_send(self._problem.subject.print_design(from_pixels(as_pixels(design), self._problem.device)))
         answers = self._ask([_Job(texels, first) for first in range(0, self._selection_views, SELECT_CHUNK)])
         loss, rate = (sum(values) / len(values) for values in zip(*answers, strict=True))
         return loss, rate

@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 import torch
 from pydantic import Field
 from torch import Tensor
@@ -71,7 +70,7 @@ def steps(problem: Problem, state: State | None = None) -> Iterator[TrainingStep
     with expectation(problem, problem.scene.draw("select", SELECT_VIEWS)) as expected:
         while state.number < settings.steps:
             step = _descend(problem, state, expected.gradient(state.design, state.number))
-            if is_selection_step(settings, step.state.number):
+            if ends_interval(settings, step.state.number, SELECT_AFTER):
                 loss, rate = expected.selection(step.state.design)
                 if loss < step.state.best_loss:
                     step = replace(step, state=replace(step.state, best=step.state.design, best_loss=loss))
@@ -101,25 +100,8 @@ def draft(problem: Problem, conditions: Conditions, views: int) -> Tensor:
     return state.design
 
 
-def best_design(problem: Problem) -> np.ndarray:
-    """Run the whole loop; the pixels of the design that was best on the selection set."""
-    state = start(problem)
-    for step in steps(problem, state):
-        state = step.state
-    return problem.subject.pixels(state.best)
-
-
-def is_selection_step(settings: OptimizeSettings, number: int) -> bool:
-    """True if the design is tried on the selection set after step `number`, counted from 1."""
-    return _ends(settings, number, SELECT_AFTER)
-
-
-def is_save_step(settings: OptimizeSettings, number: int) -> bool:
-    """True if the state after step `number` should be saved."""
-    return _ends(settings, number, SAVE_AFTER)
-
-
-def _ends(settings: OptimizeSettings, number: int, views: int) -> bool:
+def ends_interval(settings: OptimizeSettings, number: int, views: int) -> bool:
+    """True if step `number`, counted from 1, is the last one or the first after another `views` training views."""
     done, before = (n * settings.views // views for n in (number, number - 1))
     return done > before or number == settings.steps
 
@@ -135,8 +117,8 @@ def _descend(problem: Problem, state: State, answer: Answer) -> TrainingStep:
     if isinstance(penalty, Tensor):
         gradient = gradient + torch.autograd.grad(penalty, design)[0]
         penalty = float(penalty.detach())
-    updated, loss = _update(problem, state, gradient), answer.loss + penalty
-    return TrainingStep(updated, loss, answer.confidence, answer.rate, largest)
+    updated = _update(problem, state, gradient)
+    return TrainingStep(updated, answer.loss + penalty, answer.confidence, answer.rate, largest)
 
 
 def _update(problem: Problem, state: State, gradient: Tensor) -> State:

@@ -50,8 +50,7 @@ def read_place(folder: Path, scene: UnplacedScene | None = None) -> Place | None
     path = folder / _RECORD_FILE
     if not is_file(path):
         return None
-    record = read_json(path, "the record of a search", "start in another folder")
-    place = validate_model(Place, record, str(path))
+    place = validate_model(Place, read_json(path, "the record of a search", "start in another folder"), str(path))
     if scene is not None and place.sheet_id != scene.sheet_id:
         do = "resume with the same scene file and seed, or start in another folder"
         got = f"a place of sheet {place.sheet_id} in {folder}, not {scene.sheet_id}"

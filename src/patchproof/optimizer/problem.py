@@ -102,9 +102,8 @@ class Problem:
 
     def with_piece_at(self, scene: PatchScene) -> "Problem":
         """A copy with the piece where `scene` has it; the object's tensors are shared."""
-        stage = replace(self.stage, scene=scene)
         subject = Patch(scene, self.printer, scene.design_px(self.network_px), self.device)
-        return replace(self, scene=scene, stage=stage, subject=subject)
+        return replace(self, scene=scene, stage=replace(self.stage, scene=scene), subject=subject)
 
     @property
     def patch(self) -> Patch:

@@ -107,8 +107,7 @@ def _responses_until_settled(
     """The responses to the design, and to each control until its difference is settled (never without `half_width`)."""
     by_kind: dict[str, Responses] = {}
     unsettled, n = list(appearances), len(conditions)
-    looks = [0, n] if half_width is None else _look_positions(n, per_session)
-    for first, last in pairwise(looks):
+    for first, last in pairwise([0, n] if half_width is None else _look_positions(n, per_session)):
         shown, mask = {kind: appearances[kind] for kind in unsettled}, _control_mask(last - first, per_session)
         part = conditions[first:last]
         answers = responses(problem, shown, part, None, mask, lambda done, _, first=first: advance(first + done, n))

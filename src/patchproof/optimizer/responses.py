@@ -105,10 +105,6 @@ def ask_networks(
 
 def merge_responses(parts: Sequence[Mapping[Thing, Responses]]) -> dict[Thing, Responses]:
     """Join the responses to chunks of the conditions into those to all conditions."""
-    return {thing: _concatenate_responses([part[thing] for part in parts if thing in part]) for thing in parts[0]}
-
-
-def _concatenate_responses(parts: Sequence[Responses]) -> Responses:
-    """Join responses along the conditions."""
     names = ("recognized", "confidence", "loss")
-    return Responses(*(np.concatenate([getattr(part, name) for part in parts], -1) for name in names))
+    joined = lambda thing, name: np.concatenate([getattr(p[thing], name) for p in parts if thing in p], -1)  # noqa: E731
+    return {thing: Responses(*(joined(thing, name) for name in names)) for thing in parts[0]}

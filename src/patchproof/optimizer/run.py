@@ -33,21 +33,13 @@ from patchproof.base.text import short_repr
 from patchproof.base.validation import RandomSeed, refuse_untrusted, validate_model
 from patchproof.base.version import __version__
 from patchproof.classifier.network import Classifier
+from patchproof.optimizer import loop
 from patchproof.optimizer.expectation import last_pictures
-from patchproof.optimizer.loop import SELECT_AFTER, State, is_save_step, load_checkpoint, save_checkpoint, start, steps
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.optimizer.promise import PROMISE_VIEWS, VIEWS_PER_SESSION, PromiseOptions, make_promise
-from patchproof.optimizer.subject import (
-    DESIGN_FILE,
-    MASK_FILE,
-    OBJECT_FILE,
-    TEXTURE_FILES,
-    Loss,
-    read_png,
-    side_by_side,
-)
+from patchproof.optimizer.subject import DESIGN_FILE, DESIGN_FILES, Loss, read_png, side_by_side
 from patchproof.scene.interface import Scene
-from patchproof.scene.patch_scene import PatchScene
+from patchproof.scene.patch_scene import PatchScene, require_unplaced
 from patchproof.scene.scene import build_scene
 from patchproof.sheets.manifest import MAX_PRINTED_PX, Promise
 
@@ -55,7 +47,7 @@ _LOG_FILE, _VIEWS_FILE = "steps.jsonl", "views.png"
 _MAX_LINE_BYTES = 4096  # of the log
 _MESH_FILE = "given.glb"  # the mesh of a scene that was made in Python
 _STEP_FILES = (CHECKPOINT_FILE, _LOG_FILE, RUN_FILE, _VIEWS_FILE, _MESH_FILE, "place.*")
-RUN_FILE_PATTERNS = (*_STEP_FILES, DESIGN_FILE, OBJECT_FILE, TEXTURE_FILES, MASK_FILE, "evaluate.json")
+RUN_FILE_PATTERNS = (*_STEP_FILES, *DESIGN_FILES, "evaluate.json")
 
 # (steps, promised views). A draft's interval is about four times as wide as the default's; a thorough run takes three
 # times the steps, and its interval is half as wide (`patchlab charts speed`).
@@ -153,7 +145,7 @@ def optimize(
         output.make_folder(out)
         if save_place is not None:
             save_place()
-        state = load_checkpoint(out, problem) if resume else start(problem)
+        state = loop.load_checkpoint(out, problem) if resume else loop.start(problem)
         design = _run_steps(problem, state, out, partial(progress, "optimize"))
         return finish_run(problem, design, out, promise, progress)
 
@@ -189,7 +181,6 @@ def _choose_place(
     # only scenes that give no place import the search
     from patchproof.optimizer.place_files import read_place, save_place
     from patchproof.optimizer.place_search import choose_place
-    from patchproof.scene.patch_scene import require_unplaced
 
     scene = require_unplaced(scene)
     place = (read_place(out, scene) if resume else None) or choose_place(scene, **search_options)
@@ -274,7 +265,7 @@ class _Record(BaseModel):
     imported: _Imported | None = None
 
 
-def _run_steps(problem: Problem, state: State, out: Path, advance: Advance) -> np.ndarray:
+def _run_steps(problem: Problem, state: loop.State, out: Path, advance: Advance) -> np.ndarray:
     """Run the remaining steps, writing log, checkpoint and views; the best design's pixels."""
     settings, largest_gradient, path = problem.scene.settings.optimize, None, out / _LOG_FILE
     # without the lines after the step from which the run resumes
@@ -283,17 +274,16 @@ def _run_steps(problem: Problem, state: State, out: Path, advance: Advance) -> n
         lines = [log.readline(_MAX_LINE_BYTES) for _ in range(count)]
     output.write_atomically(path, b"".join(lines))
     with open(path, "a", encoding="utf-8") as log:
-        for step in steps(problem, state):
+        for step in loop.steps(problem, state):
             state, names = step.state, ["loss", "confidence", "rate", "gradient"]
             names += [] if step.select_loss is None else ["select_loss", "select_rate"]
-            line = {"step": state.number} | {name: getattr(step, name) for name in names}
-            log.write(json.dumps(line) + "\n")
+            log.write(json.dumps({"step": state.number} | {name: getattr(step, name) for name in names}) + "\n")
             log.flush()
-            if is_save_step(settings, state.number):
-                save_checkpoint(state, problem, out)
+            if loop.ends_interval(settings, state.number, loop.SAVE_AFTER):
+                loop.save_checkpoint(state, problem, out)
             largest_gradient = max(step.gradient, largest_gradient or 0.0)
             advance(state.number, settings.steps)
-    _warn_if_unchanged(float((state.best - start(problem).design).abs().max()), largest_gradient)
+    _warn_if_unchanged(float((state.best - loop.start(problem).design).abs().max()), largest_gradient)
     pictures = last_pictures(problem, state.best)
     labeled = side_by_side(pictures, _answers(problem, pictures))
     output.write_atomically(out / _VIEWS_FILE, output.image_bytes(labeled, "PNG"))
@@ -344,6 +334,6 @@ def _details(problem: Problem, promise: Promise, out: Path) -> dict[str, Any]:
         "inputs": problem.inputs,
         "placement": scene.record(),
         "warnings": [*scene.warnings, *(note for network in problem.classifiers for note in network.notes)],
-        "select_after_views": SELECT_AFTER,
+        "select_after_views": loop.SELECT_AFTER,
         "promise": promise.model_dump(mode="json"),
     }

@@ -30,6 +30,7 @@ from patchproof.base.input import open_image
 from patchproof.classifier.network import Odds
 
 DESIGN_FILE, OBJECT_FILE, TEXTURE_FILES, MASK_FILE = "design.png", "object.glb", "texture_*.png", "mask.png"
+DESIGN_FILES = DESIGN_FILE, OBJECT_FILE, TEXTURE_FILES, MASK_FILE
 MIN_COARSEST_BLOCKS = 8  # blocks along the shorter side of the coarsest level
 _COLUMNS, _CAPTION_PX = 4, 13  # of pictures side by side
 Loss = Callable[[Tensor, Sequence[int]], Tensor]  # (logits N×K, label indices) -> N losses to descend on

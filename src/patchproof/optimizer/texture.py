@@ -58,10 +58,9 @@ class Texture:
 
     def combine_levels(self, updates: Sequence[Tensor]) -> Tensor:
         """Combine the updates of the pyramids' levels into one update of the design."""
-        parts, remaining = [], iter(updates)
-        for mask in self.surface.masks:
-            levels = list(islice(remaining, subject.level_count(mask.shape)))
-            parts.append(subject.collapse_pyramid(levels)[:, mask])
+        remaining, masks = iter(updates), self.surface.masks
+        levels = [list(islice(remaining, subject.level_count(mask.shape))) for mask in masks]
+        parts = [subject.collapse_pyramid(each)[:, mask] for each, mask in zip(levels, masks, strict=True)]
         return torch.cat(parts, 1)[:, None]
 
     def penalty(self, design: Tensor) -> Tensor | float:

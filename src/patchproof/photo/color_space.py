@@ -86,8 +86,7 @@ def rgb_space(
             light = np.where(light < 0.081, light / 4.5, ((light + 0.099) / 1.099) ** (1 / 0.45))
         else:
             light = linear_from_srgb(light) if curve is None else light**curve
-        table = 65535 * light.astype(np.float32)
-        linear = cv2.transform(np.take(table, codes), matrix.astype(np.float32))
+        linear = cv2.transform(np.take(65535 * light.astype(np.float32), codes), matrix.astype(np.float32))
         return np.take(_srgb_codes(), np.clip(linear + 0.5, 0, 65535).astype(np.uint16))
 
     return _unless_srgb(ColorSpace("RGB", to_srgb))
@@ -147,8 +146,7 @@ def _space_of_profile(profile: bytes, mode: str) -> tuple[ColorSpace | None, tup
     def to_srgb(codes: np.ndarray) -> np.ndarray:
         # deep gray has three channels, which are equal
         part = eight_bits(codes[..., 0] if own_mode == "L" and codes.ndim == 3 else codes)
-        size, content = part.shape[1::-1], np.ascontiguousarray(part)
-        image = Image.frombuffer(own_mode, size, content, "raw", own_mode, 0, 1)
+        image = Image.frombuffer(own_mode, part.shape[1::-1], np.ascontiguousarray(part), "raw", own_mode, 0, 1)
         return np.asarray(ImageCms.applyTransform(image, transform))
 
     return _unless_srgb(ColorSpace(own_mode, to_srgb)), ()

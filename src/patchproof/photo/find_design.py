@@ -263,8 +263,7 @@ def _places_by_templates(srgb: np.ndarray, design: np.ndarray, size_mm: tuple[fl
                 if size[0] >= small.shape[1] or size[1] >= small.shape[0]:
                     continue
                 template = cv2.resize(drawn, size, interpolation=cv2.INTER_AREA)
-                likeness = cv2.matchTemplate(turned, template, cv2.TM_CCOEFF_NORMED)
-                _, peak, _, (x, y) = cv2.minMaxLoc(likeness)
+                _, peak, _, (x, y) = cv2.minMaxLoc(cv2.matchTemplate(turned, template, cv2.TM_CCOEFF_NORMED))
                 quad = rect_corners((x, y, *size)) - middle
                 angle = np.radians(turn)
                 back = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])

@@ -100,10 +100,8 @@ def bent_sheet_position(
 ) -> CameraPosition:
     """`flat_sheet_position` for any shape: for paper on a cylinder by the tangent plane at the point."""
     if shape.unit is not None:
-        scale = np.append(shape.unit, 1.0)
-        homography = np.append(shape.parameters[:8], 1.0) * scale
-        covariance = shape.covariance[:8, :8] * np.outer(shape.unit, shape.unit)
-        fit = PageFit(homography.reshape(3, 3), covariance, 0.0, ())
+        homography = np.append(shape.parameters[:8] * shape.unit, 1.0)
+        fit = PageFit(homography.reshape(3, 3), shape.covariance[:8, :8] * np.outer(shape.unit, shape.unit), 0.0, ())
         return flat_sheet_position(fit, matrix_px, focal_spread, point_mm, turn, matrix_is_known)
     tangent = shape.tangent
     assert tangent is not None  # a shape has either `unit` or `tangent`
@@ -115,9 +113,8 @@ def bent_sheet_position(
     can_tell = spread < 0.7 * focal_spread or abs(error) > focal_spread
     agrees = abs(error) <= _MAX_SIGMAS * focal_spread if can_tell else None
     # the fitted bend determines the focal length only if the paper is a true cylinder
-    trusted_spread = _trusted_spread(focal_spread, spread, agrees, matrix_is_known)
+    added_variance = max(0.0, _trusted_spread(focal_spread, spread, agrees, matrix_is_known) ** 2 - spread**2)
     by_focal = shape.covariance[6] / spread**2
-    added_variance = max(0.0, trusted_spread**2 - spread**2)
     root = np.pad(root_of_scaled(shape.covariance + added_variance * np.outer(by_focal, by_focal)), (0, 1))
     root[9, 9] = turn
     return _position(figures, np.append(shape.parameters, 0.0), root, agrees, matrix_is_known)

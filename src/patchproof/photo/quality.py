@@ -57,11 +57,9 @@ def blur_px(markers: Iterable[Borders]) -> float:
 def frame_light(srgb: np.ndarray, markers: Iterable[Borders]) -> FrameLight:
     """Measure paper and ink at the borders of at least one marker in a uint8 sRGB photograph."""
     markers = _fitted_or_all(markers)
-    corners = np.stack([b.corners_px for b in markers])
     module = np.array([b.module_px for b in markers])[:, None, None, None]
-    middle, half, normal = border_frame(corners)
-    s = np.linspace(-0.8, 0.8, _ALONG)[:, None]
-    border = middle[:, :, None] + s * half[:, :, None]
+    middle, half, normal = border_frame(np.stack([b.corners_px for b in markers]))
+    border = middle[:, :, None] + np.linspace(-0.8, 0.8, _ALONG)[:, None] * half[:, :, None]
     outside, inside = (sample(srgb, border + sign * 0.5 * module * normal[:, :, None]) for sign in (1, -1))
     clipped = float((outside >= CLIPPED_CODE).any(-1).mean())
     light_out, light_in = (np.median(linear_from_srgb(v / 255.0), axis=(0, 1, 2)) for v in (outside, inside))

@@ -173,6 +173,11 @@ def list_images(folder: Path) -> list[Path]:
     return sorted((p for p in files if p.suffix.lower() in SUFFIXES), key=lambda p: p.name)
 
 
+def subfolders(folder: Path) -> list[Path]:
+    """The folders in a folder by name, without hidden ones."""
+    return sorted(p for p in folder.iterdir() if p.is_dir() and not p.name.startswith("."))
+
+
 def list_skipped_files(folder: Path, without: Path | None = None, depth: int = 1) -> list[str]:
     """Name the files under a folder, except in `without`, that people may have meant as photographs, a phrase for each
     kind: videos and raw files without a picture of the same name, and pictures in folders deeper than `depth`.

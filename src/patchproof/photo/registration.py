@@ -142,7 +142,7 @@ def place_design(
     mm, px, sigmas = corners_mm, corners.px, np.full(4, corners.sigma_px)
     fit = named = fit_points(mm, px, sigmas)
     for _ in range(_ROUNDS):
-        px_per_mm = local_scale(fit.px_from_mm, middle_mm)[0]
+        px_per_mm = float(local_scale(fit.px_from_mm, middle_mm)[0])
         cells = register(srgb, fit.px_from_mm, rect_mm, design, px_per_mm, 1.0)
         sure = cells.sigma_mm < cells.size_mm / 4  # False where NaN
         if sure.sum() < _LEAST_CELLS:
@@ -165,7 +165,7 @@ def place_design(
 def _blur_and_light(srgb, px_from_mm, rect_mm, design, ink) -> tuple[float, FrameLight]:
     """Fit the blur in pixels of the photograph, and gain and veil of each channel, to the design's pixels."""
     middle_mm = rect_mm[0] + rect_mm[2] / 2, rect_mm[1] + rect_mm[3] / 2
-    px_per_mm = local_scale(px_from_mm, middle_mm)[0]
+    px_per_mm = float(local_scale(px_from_mm, middle_mm)[0])
     scale = min(px_per_mm, _LIGHT_SIDE_PX / min(rect_mm[2:]))
     part, to_part = crop_around(srgb, px_from_mm, rect_corners(rect_mm), 4)
     clipped = (part.max(-1, keepdims=True) >= CLIPPED_CODE).astype(np.float32)

@@ -19,7 +19,7 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from patchproof.base.geometry import apply_homography, fit_homography, plane_pose, rect_corners
+from patchproof.base.geometry import apply_homography, fit_homography, is_inside, plane_pose, rect_corners
 from patchproof.photo import rectify
 from patchproof.photo.detect import row_strips
 from patchproof.photo.edges import BORDER_SHARE, RECT_GRID, border_frame, intersect_borders
@@ -169,21 +169,18 @@ def _uncertainty_mm(shape: Shape, corners: np.ndarray) -> float:
 
 def _mm_by_px(project: Callable[[np.ndarray], np.ndarray], mm: np.ndarray) -> np.ndarray:
     """Derivatives N×2×2 of page millimeters by pixels, by central differences over a tenth of a millimeter."""
-    steps = 0.05 * np.eye(2)
-    columns = [(project(mm + step) - project(mm - step)) / 0.1 for step in steps]
-    return np.linalg.inv(np.stack(columns, -1))
+    return np.linalg.inv(np.stack([(project(mm + step) - project(mm - step)) / 0.1 for step in 0.05 * np.eye(2)], -1))
 
 
 def _flatten(srgb, project, px_from_mm, rect_mm, margin_px: float) -> np.ndarray:
     """The photograph with the rectangle of the page resampled as if the sheet were flat."""
     rows, columns = rectify.region_around(apply_homography(px_from_mm, rect_corners(rect_mm)), margin_px, srgb.shape)
-    left, top, width, height = rect_mm
     picture = srgb.copy()
     for strip in row_strips(srgb[rows]):  # in strips, because coordinates of a whole large picture take gigabytes
         region = slice(rows.start + strip.start, min(rows.start + strip.stop, rows.stop)), columns
         y, x = np.mgrid[region] + 0.5
         mm = apply_homography(np.linalg.inv(px_from_mm), np.column_stack([x.ravel(), y.ravel()]))
-        inside = ((mm >= [left, top]) & (mm <= [left + width, top + height])).all(1)
+        inside = is_inside(mm, rect_mm)
         mask = inside.reshape(x.shape)
         source = np.full((*x.shape, 2), -1, np.float32)
         source[mask] = project(mm[inside]) - 0.5
@@ -230,8 +227,7 @@ def fit_cylinder(flat, mm, px, size, focal_px, focal_spread=UNKNOWN_FOCAL, floor
     prior = CORNER_NOISE_PX / (UNKNOWN_FOCAL if focal_px is None else focal_spread)
 
     def residuals(p):
-        errors = (project(p, mm) - px).reshape(*p.shape[:-1], -1)
-        return np.concatenate([errors, prior * p[..., 6:7]], -1)
+        return np.concatenate([(project(p, mm) - px).reshape(*p.shape[:-1], -1), prior * p[..., 6:7]], -1)
 
     def jacobian(p):
         steps = _STEP * np.where(p == 0, 1, np.abs(p))
@@ -296,8 +292,7 @@ def fit_radial_lens(flat, mm, px, size) -> Shape:
 
     unit = np.maximum(np.abs(flat.ravel()[:8]), 1e-9)
     start = np.append(flat.ravel()[:8] / unit, 0.0)
-    residuals = lambda p: (project(p, mm) - px).ravel()  # noqa: E731
-    fit = least_squares(residuals, start, max_nfev=40, method="lm")
+    fit = least_squares(lambda p: (project(p, mm) - px).ravel(), start, max_nfev=40, method="lm")
     return replace(_shape(project, fit, mm, px, None, CORNER_NOISE_PX), unit=unit)
 
 

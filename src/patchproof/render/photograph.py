@@ -218,8 +218,7 @@ def plan_picture(
             if len(covered):
                 ambient = _frontal_conditions(distance, 1.0, 0.0)
                 light[covered] = _pixel_rows(shade(relight(views, ambient), piece))[covered]
-    picture = srgb_from_linear(light.clamp(0, 1)).reshape(height, width, 3).cpu().numpy()
-    return photo_codes_from_srgb(picture)
+    return photo_codes_from_srgb(srgb_from_linear(light.clamp(0, 1)).reshape(height, width, 3).cpu().numpy())
 
 
 def on_white(scene: MeshSceneType, size_px: tuple[int, int], **view: Any) -> MeshSceneType:

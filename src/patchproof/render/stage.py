@@ -68,8 +68,7 @@ class LearnedTextures:
 
     def filled(self, design: Tensor) -> list[Tensor]:
         """Return the textures with a design's texels, H×W×3 per material."""
-        parts = design[:, 0].T.split(self._counts)
-        rows = zip(self._originals, self.masks, parts, strict=True)
+        rows = zip(self._originals, self.masks, design[:, 0].T.split(self._counts), strict=True)
         return [original.masked_scatter(mask[..., None], part) for original, mask, part in rows]
 
     def images(self, design: Tensor) -> list[Tensor]:
@@ -79,8 +78,7 @@ class LearnedTextures:
 
     def texels(self, textures: Sequence[np.ndarray]) -> np.ndarray:
         """Return the changeable texels of uint8 textures as uint8 1×M×3."""
-        masks = self.canvas.mask
-        return np.concatenate([texture[mask] for texture, mask in zip(textures, masks, strict=True)])[None]
+        return np.concatenate([texture[mask] for texture, mask in zip(textures, self.canvas.mask, strict=True)])[None]
 
     def textures(self, pixels: np.ndarray) -> tuple[np.ndarray, ...]:
         """Return whole uint8 textures with a design's pixels 1×M×3 in them."""
@@ -137,5 +135,4 @@ class Stage:
 def set_stage(scene: Scene, device: torch.device | str = "cpu") -> Stage:
     """Move a scene's mesh, textures and piece to a device, "cpu" or "cuda"; torch raises RuntimeError without it."""
     device = torch.device(device)
-    surface = object_surface(require_mesh(scene).mesh, device) if scene.HAS_OBJECT else None
-    return Stage(scene, device, surface)
+    return Stage(scene, device, object_surface(require_mesh(scene).mesh, device) if scene.HAS_OBJECT else None)

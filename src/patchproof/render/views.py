@@ -108,13 +108,11 @@ class Views:
         """The bare object, its outlines jagged, in a camera without blur and noise, N·H·W × 3 sRGB."""
         # the background has 256 codes per view and channel, which are exposed as a table
         gain, tone = self._sensor_values.double().split([3, 1], 1)
-        light = torch.tensor(LINEAR_FROM_CODE)[:, None] * gain[:, None]
-        codes = lift_tone(encode_light(light), tone[:, None])
+        codes = lift_tone(encode_light(torch.tensor(LINEAR_FROM_CODE)[:, None] * gain[:, None]), tone[:, None])
         image = _look_up_codes(self.background, codes.numpy(), self.stage.device)
         if self.object is None:
             return image
-        view = self.object.view
-        gain, tone = self._sensor_on_device.index_select(0, view).split([3, 1], 1)
+        gain, tone = self._sensor_on_device.index_select(0, self.object.view).split([3, 1], 1)
         color = encode_light_by_table(self._object_color() * gain)
         return image.index_copy_(0, self.object.pixel, lift_tone(color, tone))
 
@@ -156,7 +154,7 @@ def render_views(
     scene, surface = require_mesh(stage.scene), stage.object_surface
     frame = lens_frame(stage, scene, size_px)
     poses = scene.camera_from_world(conditions)
-    light = _light(scene, stage.device, conditions)
+    light = lighting_of(conditions.light, scene.frame.normal, scene.frame.up, stage.device)
     eye = torch.as_tensor(camera_centers(poses), device=stage.device)
     matrices, near = np.broadcast_to(frame.matrix_px, (len(poses), 3, 3)), NEAR_SHARE * scene.length_mm
     view_cameras = cameras(poses, matrices, frame.size_px, stage)
@@ -195,15 +193,15 @@ def relight(views: Views, conditions: Conditions) -> Views:
     """Return the views under other light, with another print and camera; poses and backgrounds stay."""
     conditions, light = replace(conditions, pose=views.conditions.pose), views.light
     if light is not None:
-        light = _light(require_mesh(views.stage.scene), views.stage.device, conditions)
+        frame = require_mesh(views.stage.scene).frame
+        light = lighting_of(conditions.light, frame.normal, frame.up, views.stage.device)
     return replace(views, conditions=conditions, light=light)
 
 
 def relight_and_replace_background(views: Views, conditions: Conditions) -> Views:
     """Return the views under the conditions' light, print, camera and backgrounds; poses stay."""
-    old_background = views.conditions.pose.background
     views = relight(views, conditions)
-    if np.array_equal(old_background, conditions.pose.background):
+    if np.array_equal(views.conditions.pose.background, conditions.pose.background):
         return views
     pose = replace(views.conditions.pose, background=conditions.pose.background)
     conditions, scene = replace(conditions, pose=pose), require_mesh(views.stage.scene)
@@ -227,10 +225,6 @@ def cameras(poses: np.ndarray, matrices: np.ndarray, size_px: tuple[int, int], s
     """Return cameras N×4×4 with matrices N×3×3 on a stage's device."""
     poses_on, matrices_on = (torch.as_tensor(part.copy(), device=stage.device) for part in (poses, matrices))
     return Cameras(poses_on, matrices_on, size_px)
-
-
-def _light(scene: MeshScene, device: torch.device, conditions: Conditions) -> Lighting:
-    return lighting_of(conditions.light, scene.frame.normal, scene.frame.up, device)
 
 
 def _render_flat(stage: Stage, piece: PiecePicture | None, conditions: Conditions, size_px: tuple[int, int]) -> Views:

@@ -76,15 +76,18 @@ def photograph_page(page: np.ndarray, seed: int) -> tuple[bytes, np.ndarray]:
     px_from_mm = geometry.plane_homography(geometry.intrinsics(50, PHOTO_PX), pose, flat)
     light, white_balance = _uneven_light(page.shape, rng), 1 + rng.uniform(-0.15, 0.15, 3)
     exposure = rng.uniform(0.5, 0.85) / (light.max() * white_balance.max())
-    raw = _warp_page(page * light[..., None], px_from_mm)
+    # the page on a gray table, averaged over a pixel, which is sampled once
+    page_px_per_px = PX_PER_MM / np.sqrt(np.linalg.det((px_from_mm / px_from_mm[2, 2])[:2, :2]))
+    blurred = cv2.GaussianBlur(page * light[..., None], (0, 0), 0.35 * float(page_px_per_px))
+    matrix = index_homography(px_from_mm @ np.diag([1 / PX_PER_MM, 1 / PX_PER_MM, 1]))
+    raw = cv2.warpPerspective(blurred, matrix, PHOTO_PX, flags=cv2.INTER_LINEAR, borderValue=(0.3, 0.28, 0.25))
     ranges = {"blur_px": (0, 1), "noise": (0, 0.01), "jpeg": (60, 95)}
     drawn = {name: np.array([rng.uniform(*ends)]) for name, ends in ranges.items()}
     exposure_ev, noise_seed = np.array([np.log2(exposure)]), np.array([seed])
     sensor = Sensor(exposure_ev=exposure_ev, white_balance=white_balance[None], noise_seed=noise_seed, **drawn)
     picture = torch.tensor(raw.transpose(2, 0, 1)[None], dtype=torch.float32)
     codes = develop(picture, sensor, 1.0, jpeg=False)[0].permute(1, 2, 0).numpy().astype(float)
-    file = image_bytes(photo_codes_from_srgb(codes), "JPEG", {"quality": int(sensor.jpeg[0])})
-    return file, exposure * white_balance
+    return image_bytes(photo_codes_from_srgb(codes), "JPEG", {"quality": int(sensor.jpeg[0])}), exposure * white_balance
 
 
 def _uneven_light(shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
@@ -92,11 +95,3 @@ def _uneven_light(shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarra
     y, x = np.mgrid[-1 : 1 : shape[0] * 1j, -1 : 1 : shape[1] * 1j]
     turn, fall = rng.uniform(0, 2 * np.pi), rng.uniform(1 / 6, 1 / 3)
     return (1 + fall * (np.cos(turn) * x + np.sin(turn) * y) / 2**0.5).astype(np.float32)
-
-
-def _warp_page(page: np.ndarray, px_from_mm: np.ndarray) -> np.ndarray:
-    """Warp a page to the picture, on a gray table, averaged over pixels."""
-    page_px_per_px = PX_PER_MM / np.sqrt(np.linalg.det((px_from_mm / px_from_mm[2, 2])[:2, :2]))
-    blurred = cv2.GaussianBlur(page, (0, 0), 0.35 * float(page_px_per_px))  # over a pixel, which is sampled once
-    matrix = index_homography(px_from_mm @ np.diag([1 / PX_PER_MM, 1 / PX_PER_MM, 1]))
-    return cv2.warpPerspective(blurred, matrix, PHOTO_PX, flags=cv2.INTER_LINEAR, borderValue=(0.3, 0.28, 0.25))

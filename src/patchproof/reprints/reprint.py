@@ -135,8 +135,7 @@ class MountedSheet:
         if isinstance(scene, PatchScene):
             pose, size_px = scene.camera_from_world(conditions)[0], scene.photo_px
             left, top, *end = project_box(scene.outermost_mm, pose, scene.matrix_px(size_px), size_px, scene.camera)
-            box = geometry.rect_corners((left, top, end[0] - left, end[1] - top))
-            outlines[str(scene.settings.target.label)] = box
+            outlines[str(scene.settings.target.label)] = geometry.rect_corners((left, top, end[0] - left, end[1] - top))
         if self.piece is not None and scene.facing(conditions)[0]:
             border = geometry.rect_border((0, 0, *scene.piece.size_mm), SIDE_POINTS)
             outlines[PATCH] = scene.piece_px(conditions, border)

@@ -36,6 +36,7 @@ from patchproof.sheets.piece import control_design, with_ids
 from patchproof.sheets.plan_page import PlacementPicture, PlanPage, edge_distances_mm
 from patchproof.sheets.rects import size_text
 from patchproof.sheets.template import Template, load_template, page_template
+from patchproof.sheets.tiles import plan_tiles
 from patchproof.sheets.write import write_several, write_sheet
 
 _PLAN_MARGIN = 1.06  # of the object's extent
@@ -180,12 +181,8 @@ def draw_plan_view(scene: PatchScene, template: Template) -> PlacementPicture:
     low, high = project(scene.mesh.vertices).min(0), project(scene.mesh.vertices).max(0)
     outline = project(placement.world(rect_border((0, 0, *placement.size_mm), 16)))  # bent paper has bent edges
     half = np.maximum(np.abs([low, high, outline.min(0), outline.max(0)]).max(0) * _PLAN_MARGIN, 1.0)
-    seams, names, tiles = [], [], []
-    if template.tiles is not None:
-        from patchproof.sheets.tiles import plan_tiles
-
-        tiles = plan_tiles(template, scene.piece)
-    for tile in tiles:
+    seams, names = [], []
+    for tile in plan_tiles(template, scene.piece):
         corners = project(placement.world(rect_corners(tile.part_mm)))
         seams += [(tuple(corners[1]), tuple(corners[2])), (tuple(corners[2]), tuple(corners[3]))]
         names.append((tuple(corners.mean(0)), tile.name))
@@ -203,8 +200,7 @@ def shot_sections(promise: Promise, settings: SceneSettings) -> tuple[tuple[str,
     """Say how many photographs to take, and from where, as (heading, lines)."""
     data = settings.model_dump()
     summary = f"{promise_summary(promise, data)} Promise simulated {background_summary(data)}."
-    counts = (summary, *_count_lines(promise))
-    return (("How many photographs", counts), ("From where", _view_lines(settings)))
+    return (("How many photographs", (summary, *_count_lines(promise))), ("From where", _view_lines(settings)))
 
 
 def _count_lines(promise: Promise) -> tuple[str, ...]:

@@ -92,8 +92,7 @@ def _rays(rng: np.random.Generator, px: int) -> np.ndarray:
     half, pitch, roll = np.tan(np.radians(rng.uniform(20, 35))), *np.radians(rng.normal(0, (12, 2)))
     y, x = (0.5 - (np.mgrid[:px, :px].reshape(2, -1) + 0.5) / px) * 2 * half
     x, y = -x * np.cos(roll) - y * np.sin(roll), -x * np.sin(roll) + y * np.cos(roll)
-    rays = np.stack([x, y * np.cos(pitch) + np.sin(pitch), np.cos(pitch) - y * np.sin(pitch)])
-    return rays.astype(np.float32)
+    return np.stack([x, y * np.cos(pitch) + np.sin(pitch), np.cos(pitch) - y * np.sin(pitch)]).astype(np.float32)
 
 
 def _draw_plane(rng, picture, depth, ray, rays, distance, axis) -> None:
@@ -229,8 +228,8 @@ def load_backgrounds(settings: BackgroundSettings, base: Path) -> Backgrounds:
     if settings.images is not None and files in ([], [path := Path(expand_path(settings.images, base))]):
         if files:
             return Backgrounds((FileLevels(path),))
-        got, remedy = f"no picture in {path}", "put some there or give a color"
-        raise Refused("a folder of pictures (background.images)", got, remedy)
+        do = "put some there or give a color"
+        raise Refused("a folder of pictures (background.images)", f"no picture in {path}", do)
     return _split_by_purpose(files)
 
 

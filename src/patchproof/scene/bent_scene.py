@@ -20,17 +20,7 @@ from patchproof.scene import placement
 from patchproof.scene.interface import SCALE_VIEWS, Scene
 from patchproof.scene.mesh_scene import MeshScene, camera_poses
 from patchproof.scene.patch_scene import PatchScene
-from patchproof.scene.placement import (
-    GRID,
-    LIFT_MM,
-    Placement,
-    SurfaceFrame,
-    beside_mm,
-    patch_frame,
-    piece_pose,
-    placement_method,
-    spun_axes,
-)
+from patchproof.scene.placement import GRID, LIFT_MM, Placement, SurfaceFrame, patch_frame, placement_method, spun_axes
 from patchproof.sheets.piece import Piece
 
 CLOSE_SHARE = 0.01  # a card is accepted up to this mean gap, as a share of the shorter edge: 0.6 mm on 60 mm
@@ -46,7 +36,10 @@ def place_bent(mesh: Mesh, frame: SurfaceFrame, size_mm: tuple[float, float], sp
     """Place a piece along the surface where the frame's normal meets it, its up along the frame's; spin turns it
     clockwise as one faces it. Refused with a reason if paper cannot follow the surface.
     """
-    triangles, axes = mesh.triangles_near(beside_mm(mesh, frame), 0.0), np.stack([frame.right, frame.up, frame.normal])
+    triangles, axes = (
+        mesh.triangles_near(placement.beside_mm(mesh, frame), 0.0),
+        np.stack([frame.right, frame.up, frame.normal]),
+    )
     frame = replace(frame, origin_mm=surface_chart.surface_point(triangles, frame.origin_mm, axes))
     # paper ends half a diagonal from its middle; a surface farther than that from its chart is not under it
     near = mesh.triangles_near(np.abs(mesh.vertices - frame.origin_mm).max(1), float(np.hypot(*size_mm)))
@@ -180,7 +173,7 @@ def _roll(chart: SurfaceChart, near: np.ndarray, size_mm) -> Placement:
         faces=surface_chart.grid_faces(PIECE_GRID, PIECE_GRID),
         piece_mm=piece_grid(size_mm, PIECE_GRID) * [1, -1] + half,
         normals=chart.cartesian(s, t)[1] @ chart.axes,
-        world_from_piece=piece_pose(right, up, chart.axes[2], origin_mm, size_mm),
+        world_from_piece=placement.piece_pose(right, up, chart.axes[2], origin_mm, size_mm),
         gap_mm=float(np.nanmax(gaps)),
         gap_mean_mm=gap_mean_mm,
         gaps_mm=gaps.reshape(GRID, GRID),

@@ -17,17 +17,9 @@ from patchproof.base.errors import Refused
 from patchproof.base.geometry import camera_centers
 from patchproof.base.validation import Side
 from patchproof.mesh.surface_chart import SurfaceChart, piece_grid, surface_heights
+from patchproof.scene import placement
 from patchproof.scene.patch_scene import PiecePosition, UnplacedScene
-from patchproof.scene.placement import (
-    Placement,
-    SurfaceFrame,
-    gap_limit_mm,
-    patch_frame,
-    place_if_close,
-    placement_method,
-    spun_axes,
-    surface_frame,
-)
+from patchproof.scene.placement import Placement, SurfaceFrame, spun_axes
 
 MIN_DISTANCE_SHARE = 0.5  # of the piece's shorter edge, between two candidates
 _POOL_DISTANCE_SHARE, _POOL = 0.25, 96  # between points to try, and their greatest number
@@ -119,8 +111,8 @@ class PlaceFinder:
 
     def _candidate(self, at: PiecePosition, frame: SurfaceFrame, spin_deg: float) -> CandidatePlace | None:
         """Return the piece at a frame; None if it stands off or overhangs."""
-        lay = placement_method(self.scene.settings.patch.bend)
-        piece = place_if_close(self.scene.mesh, frame, self.size_mm, spin_deg, lay)
+        lay = placement.placement_method(self.scene.settings.patch.bend)
+        piece = placement.place_if_close(self.scene.mesh, frame, self.size_mm, spin_deg, lay)
         return None if piece is None else CandidatePlace(at, spin_deg, piece)
 
     def _move_to_level(self, frame: SurfaceFrame, spin_deg: float) -> np.ndarray | None:
@@ -133,7 +125,7 @@ class PlaceFinder:
         for _ in range(_MOVES):
             chart = SurfaceChart(origin, np.stack([right, up, frame.normal]), 0.0, np.array([1.0, 0.0]))
             surface = surface_heights(chart, near, self.size_mm, _NET, (-reach, reach))
-            level = np.abs(surface - surface[middle]) <= gap_limit_mm(self.size_mm)
+            level = np.abs(surface - surface[middle]) <= placement.gap_limit_mm(self.size_mm)
             lies_under = np.isfinite(surface) if self.scene.settings.patch.bend else level
             if lies_under.mean() >= 1 - _COARSE_OVERHANG:
                 return origin + surface[middle] * frame.normal
@@ -146,7 +138,7 @@ class PlaceFinder:
 
     def _frame_at(self, position: PiecePosition) -> SurfaceFrame:
         """Return the frame of a piece at a position."""
-        return patch_frame(self.scene.mesh, self.scene.settings_with_piece_at(position, 0.0).patch)
+        return placement.patch_frame(self.scene.mesh, self.scene.settings_with_piece_at(position, 0.0).patch)
 
     @cached_property
     def _eyes(self) -> np.ndarray:
@@ -170,8 +162,7 @@ class PlaceFinder:
         face = np.searchsorted(np.cumsum(doubled) / doubled.sum(), share).clip(max=len(doubled) - 1)
         u, v = rng.random((2, count, 1))
         u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
-        points = a[face] + u * (b - a)[face] + v * (c - a)[face]
-        return points, (cross / doubled[:, None])[face]
+        return a[face] + u * (b - a)[face] + v * (c - a)[face], (cross / doubled[:, None])[face]
 
     @cached_property
     def _frames_to_try(self) -> tuple[SurfaceFrame, ...]:
@@ -182,9 +173,8 @@ class PlaceFinder:
         if not len(points):
             return ()
         first = int(np.linalg.norm(points - self.scene.frame.origin_mm, axis=1).argmin())
-        edge_mm = min(self.size_mm)
-        indices = _spread(points, normals, edge_mm, _POOL_DISTANCE_SHARE, _POOL, [first])
-        return tuple(surface_frame(self.scene.mesh, points[i], normals[i]) for i in indices)
+        indices = _spread(points, normals, min(self.size_mm), _POOL_DISTANCE_SHARE, _POOL, [first])
+        return tuple(placement.surface_frame(self.scene.mesh, points[i], normals[i]) for i in indices)
 
 
 def _spread(

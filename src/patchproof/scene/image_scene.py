@@ -202,8 +202,7 @@ def _piece(settings: SceneSettings, identity: str) -> Piece:
     largest = largest_share(settings.view.roll_deg)
     if high > largest:
         expected = "a piece that fits into the picture's centered square at the largest view.patch_share"
-        got = f"{high:g}, which is {high / largest:.0%} of what fits"
-        raise Refused(expected, got, f"lower it to {largest:g}")
+        raise Refused(expected, f"{high:g}, which is {high / largest:.0%} of what fits", f"lower it to {largest:g}")
     smallest = low * (high / low) ** (1 - READABLE_SHARE)
     needed_mm = MARKER_MODULES * PX_PER_MODULE * max(size_mm) / (smallest * min(settings.camera.photo_px))
     marker_mm = marker_size_mm(needed_mm, size_mm) if settings.sheet.markers else 0.0

@@ -17,7 +17,7 @@ import numpy as np
 
 from patchproof.base.errors import Refused
 from patchproof.base.fingerprint import content_identity
-from patchproof.base.geometry import apply_homography, local_scales
+from patchproof.base.geometry import apply_homography, local_scale
 from patchproof.base.settings import SceneSettings, identity_settings
 from patchproof.base.text import short_repr
 from patchproof.base.validation import texts_in
@@ -150,9 +150,8 @@ class Scene(ABC):
 
     def with_template(self, name: str) -> Self:
         """Return the scene for a page of another template, with that page's sheet id and, if any, piece."""
-        if name == self.settings.sheet.template:
-            return self
-        return self._identified(self.settings.changed(sheet={"template": name}), self.known)
+        is_same = name == self.settings.sheet.template
+        return self if is_same else self._identified(self.settings.changed(sheet={"template": name}), self.known)
 
     def with_steps(self, steps: int | None) -> Self:
         """Return the scene with another number of optimizer steps; the scene itself for None and its own."""
@@ -263,8 +262,7 @@ class PieceScene(Scene):
 
     def scales_and_tilts(self, conditions: Conditions, size_px: tuple[int, int]) -> np.ndarray:
         """Return N×2: pixels per millimeter at the piece's middle, and its tilt in degrees."""
-        middle = np.array(self.piece.size_mm) / 2
-        return local_scales(self.piece_homographies(conditions, size_px), middle)
+        return local_scale(self.piece_homographies(conditions, size_px), np.array(self.piece.size_mm) / 2)
 
     def design_px(self, network_px: int) -> tuple[int, int]:
         """Return (width, height) of the design in multiples of 8, one texel per pixel of the closest view at the

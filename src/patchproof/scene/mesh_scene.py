@@ -99,8 +99,7 @@ class MeshScene(Scene):
 
     def printed_from_sheet(self, conditions: Conditions) -> np.ndarray:
         """Return N×4×4 scalings about the piece's middle by the print's scale, which keep a card in its plane."""
-        middle_mm = self.middle_mm
-        return np.stack([geometry.scaling_about(middle_mm, scale) for scale in conditions.pose.printed_scale])
+        return geometry.scaling_about(self.middle_mm, conditions.pose.printed_scale)
 
     def matrix_px(self, size_px: tuple[int, int]) -> np.ndarray:
         """Return the 3×3 pinhole matrix of the scene's camera for a picture of this size."""

@@ -181,10 +181,8 @@ def _place_piece(scene: MeshScene) -> tuple[Piece, Placement, float, tuple[str, 
     if piece.markers and too_small.mean() > 1 - interface.READABLE_SHARE:
         advice = "narrow view.azimuth_deg and view.elevation_deg, or make the piece smaller"
         if needed_mm > marker_mm + 0.05:
-            advice = (
-                f"view.distance_mm and camera.photo_px ask for {needed_mm:.1f} mm, and those for a piece of "
-                f"{smallest_piece_mm(needed_mm)} mm or more; come nearer, or take larger photographs"
-            )
+            advice = f"view.distance_mm and camera.photo_px ask for {needed_mm:.1f} mm, and those for a piece of "
+            advice += f"{smallest_piece_mm(needed_mm)} mm or more; come nearer, or take larger photographs"
         measurable = interface.measurable_text(unreadable, placement.family)
         notes += (f"{measurable}: others show markers of {marker_mm:.1f} mm too small: {advice}",)
     return piece, placement, unreadable, notes
@@ -201,5 +199,5 @@ def _smallest_scales(scene: MeshScene, card: Placement, poses: np.ndarray) -> np
     """Return px per mm at the card's middle, along the foreshortened direction, in each view; 0 from behind."""
     faces = (geometry.camera_centers(poses) - card.center_mm) @ card.normal > 0
     planes = geometry.plane_homography(scene.matrix_px(scene.photo_px), poses, card.world_from_piece)
-    mean, tilt_deg = geometry.local_scales(planes, np.array(card.size_mm) / 2).T
+    mean, tilt_deg = geometry.local_scale(planes, np.array(card.size_mm) / 2).T
     return np.where(faces, mean * np.sqrt(np.cos(np.radians(tilt_deg))), 0.0)

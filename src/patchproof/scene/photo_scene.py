@@ -99,9 +99,8 @@ class PhotoScene(PictureScene):
     def piece_homographies(self, conditions: Conditions, size_px: tuple[int, int]) -> np.ndarray:
         """Return N×3×3 from piece millimeters to pixels."""
         to_size = picture_scene.size_from_photo(self.photo_px, size_px)
-        matrices = self._view_from_photo(conditions)
         printed = picture_scene.print_scalings(self.piece, conditions)
-        views = zip(matrices, self._chosen_photos(conditions), printed, strict=True)
+        views = zip(self._view_from_photo(conditions), self._chosen_photos(conditions), printed, strict=True)
         return np.stack([to_size @ matrix @ photo.photo_from_piece @ scale for matrix, photo, scale in views])
 
     def pictures(self, conditions: Conditions, size_px: tuple[int, int]) -> np.ndarray:

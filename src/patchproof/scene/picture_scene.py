@@ -111,8 +111,7 @@ def size_from_photo(photo_px: tuple[int, int], size_px: tuple[int, int]) -> np.n
 
 def print_scalings(piece: Piece, conditions: Conditions) -> np.ndarray:
     """Return N×3×3 from the sheet's millimeters to those of a print of another size about the same middle."""
-    middle = np.array(piece.size_mm) / 2
-    return np.stack([scaling_about(middle, scale) for scale in conditions.pose.printed_scale])
+    return scaling_about(np.array(piece.size_mm) / 2, conditions.pose.printed_scale)
 
 
 def similarity_matrix(roll_deg: float, zoom: float, shift_px, about_px) -> np.ndarray:

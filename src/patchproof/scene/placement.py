@@ -124,8 +124,7 @@ def patch_frame(mesh: Mesh, patch: PatchSettings) -> SurfaceFrame:
         frame = side_frame(mesh, patch.side)
     else:
         frame = surface_frame(mesh, *_nearest_surface(mesh, np.array(patch.at_mm, float)))
-    origin = frame.origin_mm + patch.offset_mm[0] * frame.right + patch.offset_mm[1] * frame.up
-    return replace(frame, origin_mm=origin)
+    return replace(frame, origin_mm=frame.origin_mm + patch.offset_mm[0] * frame.right + patch.offset_mm[1] * frame.up)
 
 
 def view_frame(mesh: Mesh, settings: SceneSettings) -> SurfaceFrame:
@@ -225,8 +224,7 @@ def refuse_larger_than_side(size_mm: tuple[float, float], spin_deg: float, exten
     across, along = rotated_extent(size_mm, spin_deg)
     if across > 1.005 * extent_mm[0] or along > 1.005 * extent_mm[1]:
         expected = f"a piece no larger than the object's side ({extent_mm[0]:.0f} × {extent_mm[1]:.0f} mm)"
-        got = f"{across:.0f} × {along:.0f} mm"
-        raise Refused(expected, got, "make the patch smaller or choose a larger side")
+        raise Refused(expected, f"{across:.0f} × {along:.0f} mm", "make the patch smaller or choose a larger side")
 
 
 def gap_limit_mm(size_mm) -> float:

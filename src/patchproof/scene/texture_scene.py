@@ -129,9 +129,8 @@ def select_faces(mesh: Mesh, materials: tuple[str, ...], faces: str | None, base
 
 def _read_faces(path: Path, count: int) -> np.ndarray:
     """Return which of `count` faces a text file names: per line a number or a range a-b with both ends; # comments."""
-    text = read_text(path, "a file of face numbers")
     chosen_faces = np.zeros(count, bool)
-    for number, line in enumerate(text.splitlines(), 1):
+    for number, line in enumerate(read_text(path, "a file of face numbers").splitlines(), 1):
         words = line.partition("#")[0].split("-")
         if not "".join(words).strip() and len(words) == 1:
             continue

@@ -20,16 +20,7 @@ from patchproof.sheets.layout import Box, PageLayout
 from patchproof.sheets.manifest import Manifest, load_manifest
 from patchproof.sheets.markers import DICTIONARY, MARKER_MODULES, board_squares, marker_corner
 from patchproof.sheets.page import add_template_parts, lay_out_parts
-from patchproof.sheets.piece import (
-    Piece,
-    PieceMarker,
-    lay_out_piece,
-    marker_ids,
-    marker_rect,
-    move_marker,
-    page_id,
-    square_marker,
-)
+from patchproof.sheets.piece import Piece, lay_out_piece, marker_ids, marker_rect, move_marker, page_id, square_marker
 from patchproof.sheets.rects import RectMm, rect_contains
 from patchproof.sheets.template import BoardGrid, BoardTemplate, Template, load_template, template_data, template_names
 from patchproof.sheets.write import write_page, write_sheet
@@ -88,7 +79,7 @@ def blank_piece(manifest: Manifest) -> Piece:
         got = f'a manifest of kind "{manifest.kind}"'
         raise Refused("the manifest of a blank sheet", got, "name the JSON beside BLANK.pdf")
     x, y, width, height = manifest.cut_mm
-    markers = [PieceMarker(m.id, m.corners_mm) for m in manifest.markers if m.page == 1]
+    markers = [marker for marker in manifest.markers if marker.page == 1]
     inside = [move_marker(m, (-x, -y)) for m in markers if rect_contains(manifest.cut_mm, marker_rect(m))]
     if not inside:
         raise Refused("markers within the blank sheet's cut line", "none", "name the JSON beside BLANK.pdf")

@@ -76,12 +76,11 @@ class SheetContent:
     def manifest(self, page: PageLayout, template: Template | None, cut_mm: RectMm, design_page: int = 1) -> Manifest:
         """The manifest of the page, with the design within the cut line."""
         fields = {"sheet_id": self.sheet_id, "kind": self.kind, "settings": self.settings}
-        manifest = page_manifest(page, template, cut_mm, **fields)
         design, pixels = None, self.design_srgb8
         if pixels is not None:
             sha256, size_px, png = design_sha256(pixels), pixels.shape[1::-1], png_base64(pixels)
             design = Design(sha256=sha256, rect_mm=cut_mm, size_px=size_px, page=design_page, png=png)
-        return manifest.changed(design=design, promise=self.promise)
+        return page_manifest(page, template, cut_mm, **fields).changed(design=design, promise=self.promise)
 
 
 def page_manifest(page: PageLayout, template: AnyTemplate | None, cut_mm: RectMm, **fields: Any) -> Manifest:

@@ -266,9 +266,8 @@ class Manifest(StrictModel):
         if self.design is not None and self.design.rect_mm != self.cut_mm:
             raise ValueError("make the sheet again: design.rect_mm is not cut_mm, and a design fills its piece")
         if not self.markers and self.settings.get("sheet", {}).get("markers", True):
-            raise ValueError(
-                "make the sheet again: it has no markers, and sheet.markers = false is not in its settings"
-            )
+            why = "it has no markers, and sheet.markers = false is not in its settings"
+            raise ValueError(f"make the sheet again: {why}")
         return self
 
     @property

@@ -41,9 +41,8 @@ QR_QUIET_MODULES = 4  # white on each side of a QR code (ISO/IEC 18004)
 def chart_colors(count: int) -> list[Srgb]:
     """`count` sRGB colors: the fixed ones, then Sobol's sequence (unscrambled, without its first point)."""
     fixed = [*CORNERS, *GRAYS, *DUPLICATES]
-    points = sobol(max(count - len(fixed), 0) + 1)[1:]
-    samples = [(r, g, b) for r, g, b in (np.rint(points * 255) / 255).tolist()]
-    return (fixed + samples)[:count]
+    points = np.rint(sobol(max(count - len(fixed), 0) + 1)[1:] * 255) / 255
+    return [*fixed, *((r, g, b) for r, g, b in points.tolist())][:count]
 
 
 def sobol(count: int) -> np.ndarray:
@@ -55,8 +54,7 @@ def sobol(count: int) -> np.ndarray:
         first.append(1)
         second.append(second[-1] << 1 ^ second[-1])  # polynomial x + 1
         third.append(third[-1] << 1 ^ third[-2] << 2 ^ third[-2])  # polynomial x² + x + 1
-    shifts = np.arange(_BITS - 1, -1, -1)[:, None]
-    directions = np.array([first, second, third]).T << shifts
+    directions = np.array([first, second, third]).T << np.arange(_BITS - 1, -1, -1)[:, None]
     lowest_zeros = [(~number & number + 1).bit_length() - 1 for number in range(count - 1)]
     return np.bitwise_xor.accumulate(np.concatenate([np.zeros((1, 3), int), directions[lowest_zeros]])) / 2**_BITS
 

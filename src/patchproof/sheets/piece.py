@@ -155,7 +155,7 @@ def square_marker(id_: int, corner_mm: PointMm, size_mm: float) -> PieceMarker:
     return PieceMarker(id_, ((x, y), (x + side, y), (x + side, y + side), (x, y + side)))
 
 
-def move_marker(marker: PieceMarker, shift_mm: PointMm) -> PieceMarker:
+def move_marker(marker: PieceMarker | Marker, shift_mm: PointMm) -> PieceMarker:
     """A copy of the marker, shifted."""
     a, b, c, d = ((round(x + shift_mm[0], 6), round(y + shift_mm[1], 6)) for x, y in marker.corners_mm)
     return PieceMarker(marker.id, (a, b, c, d))
@@ -202,8 +202,7 @@ def marker_image(piece: Piece, design_px: tuple[int, int]) -> tuple[np.ndarray, 
         x0, y0 = (max(math.floor(v * s + 1e-6), 0) for v, s in zip((x, y), scale, strict=True))
         x1, y1 = (math.ceil(v * s - 1e-6) for v, s in zip((x + w, y + h), scale, strict=True))
         reserved[y0:y1, x0:x1] = True
-    gray = srgb_from_linear(np.clip(1 - coverage, 0, 1)).astype(np.float32)
-    return np.repeat(gray[..., None], 3, 2), reserved
+    return np.repeat(srgb_from_linear(np.clip(1 - coverage, 0, 1)).astype(np.float32)[..., None], 3, 2), reserved
 
 
 def whiten_marker_pixels(design: np.ndarray, piece: Piece) -> np.ndarray:
@@ -241,9 +240,8 @@ def _noise_cells(height: int, width: int, sheet_id: str) -> np.ndarray:
     rows, columns = math.ceil(height / cell - 1e-9), math.ceil(width / cell - 1e-9)
     # SHAKE gives any number of uniform bytes, the same in every version of every library
     data = hashlib.shake_256(f"{sheet_id}:noise".encode()).digest(rows * columns * 3)
-    cells = np.frombuffer(data, np.uint8).reshape(rows, columns, 3)
     y, x = (np.arange(height) / cell).astype(int), (np.arange(width) / cell).astype(int)
-    return cells[y[:, None], x]
+    return np.frombuffer(data, np.uint8).reshape(rows, columns, 3)[y[:, None], x]
 
 
 def _add_coverage(coverage: np.ndarray, box: tuple[float, float, float, float]) -> None:

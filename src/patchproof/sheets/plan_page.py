@@ -47,8 +47,8 @@ def lay_out_plan(plan: PlanPage, template: Template, sheet_id: str) -> PdfPage:
     texts.append(TextLine(at_mm=(margin + 39, margin + 5.4), size_mm=2.7, text=f"plan of sheet {sheet_id}", gray=0.35))
     lines, labels, boxes, pictures, top = [], [], [], (), margin + 10.0
     if plan.placement is not None:
-        drawing = _drawing(plan.placement, (margin, top, width - 2 * margin, PICTURE_SHARE * height))
-        lines, labels, pictures, box = drawing
+        drawing_mm = margin, top, width - 2 * margin, PICTURE_SHARE * height
+        lines, labels, pictures, box = _drawing(plan.placement, drawing_mm)
         boxes.append(box)
         top = box.rect_mm[1] + box.rect_mm[3] + 3.0
     for heading, paragraphs in plan.sections:
@@ -103,8 +103,7 @@ def _drawing(placement: PlacementPicture, area: RectMm):
     across, down = (x0, min(xs), max(xs), x0 + w0), (y0, min(ys), max(ys), y0 + h0)
     for more_lines, more_labels in (_chain_above(across, to_page, rect), _chain_beside(down, to_page, rect)):
         lines, labels = lines + more_lines, labels + more_labels
-    box = (x, y, w, ABOVE_MM + scale * high)
-    return lines, labels, ((rect, placement.picture),), Box("picture of the object", box)
+    return lines, labels, ((rect, placement.picture),), Box("picture of the object", (x, y, w, ABOVE_MM + scale * high))
 
 
 def edge_distances_mm(placement: PlacementPicture) -> dict[str, float]:

@@ -105,8 +105,7 @@ def tile_pages(template: Template, grid: TileGrid, content: SheetContent) -> tup
         entries.append(Tile(page=number, page_from_design_mm=shift, cut_mm=tile.page_rect_mm))
     for number, page in enumerate((first, *layouts), FIRST_TILE_PAGE - 1):
         markers += [manifest_marker(marker, number) for marker in page.markers]
-    cut_mm = shift_rect(piece_rect, tiles[0].page_from_piece_mm)
-    manifest = content.manifest(first, template, cut_mm, FIRST_TILE_PAGE)
+    manifest = content.manifest(first, template, shift_rect(piece_rect, tiles[0].page_from_piece_mm), FIRST_TILE_PAGE)
     return pages, manifest.changed(markers=tuple(markers), tiles=tuple(entries))
 
 

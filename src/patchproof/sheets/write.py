@@ -99,8 +99,7 @@ def write_several(
         if plan is not None:
             pages.append(lay_out_plan(plan, template, designs[i].sheet_id))
             manifests[i] = manifests[i].changed(plan_page=len(pages))
-    paths = manifest_paths(pdf_path, len(designs))
-    save_sheets(pdf_path, pages, dict(zip(paths, manifests, strict=True)))
+    save_sheets(pdf_path, pages, dict(zip(manifest_paths(pdf_path, len(designs)), manifests, strict=True)))
     return manifests
 
 

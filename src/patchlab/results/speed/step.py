@@ -86,9 +86,8 @@ def measured(name: str, scene: str, processes: int) -> dict:
     def steps() -> float:
         torch.set_num_threads(1)
         timed = [time_call(partial(next, running), perf_counter) for _ in range(STEPS)]
-        return statistics.mean(
-            ms for step, ms in timed if not loop.is_selection_step(scene.settings.optimize, step.state.number)
-        )
+        selects = lambda step: loop.ends_interval(scene.settings.optimize, step.state.number, loop.SELECT_AFTER)  # noqa: E731
+        return statistics.mean(ms for step, ms in timed if not selects(step))
 
     rounds = call_in_turn({"pass": passes, "step": steps}, ROUNDS - 1)
     running.close()

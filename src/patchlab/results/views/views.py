@@ -14,9 +14,9 @@ import torch
 
 import patchproof as pp
 from patchlab.results.rows import write_rows
+from patchlab.study.trained_designs import best_design
 from patchlab.validation.path_traced import photograph_traced
 from patchproof.base.intervals import student_mean
-from patchproof.optimizer.loop import best_design
 from patchproof.optimizer.problem import set_problem
 from patchproof.optimizer.responses import responses
 from patchproof.optimizer.subject import from_pixels

@@ -22,7 +22,7 @@ import numpy as np
 from patchproof.base.errors import Refused
 from patchproof.base.validation import Side, folded
 from patchproof.classifier.labels import find_labels, nearest_hint
-from patchproof.mesh.load_mesh import load_mesh
+from patchproof.mesh.load_mesh import load_mesh, read_parts
 from patchproof.mesh.mesh import Mesh
 from patchproof.scene.placement import SurfaceFrame, largest_fitting_size, place_if_close, placement_method, side_frame
 from patchproof.sheets.piece import smallest_piece_mm
@@ -103,8 +103,6 @@ def guess_length_mm(path: Path) -> float:
 
 def file_length(path: Path) -> float:
     """The longest extent in the file's own unit."""
-    from patchproof.mesh.load_mesh import read_parts
-
     parts, *_ = read_parts(path, np.eye(3))
     corners = np.concatenate([part.vertices[part.faces].reshape(-1, 3) for part in parts])
     corners = corners[np.isfinite(corners).all(1)]
@@ -123,9 +121,8 @@ def guess_label(labels: Sequence[str], words: str | None, path: str) -> str | in
         except Refused:
             continue
     known = ": " + ", ".join(f'"{label}"' for label in labels) if len(labels) <= _MOST_LISTED_LABELS else ""
-    do = f"add --label with what it is to be recognized as{known}"
     got = f'"{" ".join(parts)}", which no label of the network is'
-    raise Refused("a file that is called what it shows", got, do)
+    raise Refused("a file that is called what it shows", got, f"add --label with what it is to be recognized as{known}")
 
 
 def _scene_label(labels: Sequence[str], index: int) -> str | int:
@@ -199,6 +196,5 @@ def _find_words(labels: Sequence[str], text: str, whole: bool = False) -> int:
         if matches:
             shown = ", ".join(f'"{labels[i].split(",")[0]}"' for i in matches[:6])
             more = ", ..." if len(matches) > 6 else ""
-            got = f'"{text}", which is in {len(matches)} labels'
-            raise Refused("words of one label", got, f"choose {shown}{more}")
+            raise Refused("words of one label", f'"{text}", which is in {len(matches)} labels', f"choose {shown}{more}")
     raise Refused("a label that the network knows", f'"{text}"', nearest_hint(labels, text))

@@ -12,15 +12,8 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
-from patchproof.app.begin.guess import (
-    SIDE_NAMES,
-    UpAxis,
-    guess_label,
-    guess_length_mm,
-    guess_piece,
-    guess_up,
-    other_axis,
-)
+from patchproof.app.begin import guess
+from patchproof.app.begin.guess import SIDE_NAMES, UpAxis, guess_label, other_axis
 from patchproof.base.errors import Refused
 from patchproof.base.input import is_file, is_folder
 from patchproof.base.output import check_file, write_atomically
@@ -79,11 +72,12 @@ def _mesh_scene(
     """The scene file's text for a mesh, and lines with the guesses."""
     target = guess_label(_labels(models, base), label, thing)
     path, primitive, source = Path(thing), thing.startswith("primitive:"), "as given"
-    up, reason, doubt = ("y", "primitives are", None) if primitive else (axis, source, None) if axis else guess_up(path)
+    stated = ("y", "primitives are", None) if primitive else (axis, source, None) if axis else None
+    up, reason, doubt = stated or guess.guess_up(path)
     if length_mm is None:
         source = "the primitive's own" if primitive else "by the file's units, meters: measure it"
-        length_mm = longest_mm(thing.partition(":")[2]) if primitive else guess_length_mm(path)
-    piece = guess_piece(load_mesh(thing, length_mm, up), length_mm)
+        length_mm = longest_mm(thing.partition(":")[2]) if primitive else guess.guess_length_mm(path)
+    piece = guess.guess_piece(load_mesh(thing, length_mm, up), length_mm)
     near, far = (float(f"{times * length_mm:.2g}") for times in (NEAR, FAR))
     azimuth, elevation = "of the camera about the vertical; 0 faces the piece", "above the horizontal"
     if piece.side == "+y":

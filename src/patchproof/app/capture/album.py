@@ -93,8 +93,7 @@ class Album:
         if into in CONTROLS:
             make_folder(folder)
         if into not in (*CONTROLS, *self.sessions) or folder.resolve() != folder:
-            got = f'"{into[:40]}"'
-            raise UploadRefused(404, "a session or a control of this folder", got, "load the page again")
+            raise UploadRefused(404, "a session or a control of this folder", f'"{into[:40]}"', "load the page again")
         names = (match for path in self.folder.rglob("*photo_*") if (match := _NUMBERED.match(path.name)))
         number = 1 + max((int(match[1]) for match in names), default=0)
         if number > MOST_PHOTOS:

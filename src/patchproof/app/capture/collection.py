@@ -98,8 +98,7 @@ class PhotoCollection:
         pairs = np.array(numbers.split(",") if _TEN_NUMBERS.fullmatch(numbers) else [], float).reshape(-1, 2)
         if path is None or not len(pairs) or (pairs > pairs[-1]).any():
             raise Refused("four corners inside of a photograph", f"{numbers} in {file}"[:160], "load the page again")
-        size_px = int(pairs[-1, 0]), int(pairs[-1, 1])
-        named = annotations.Drawn(tuple(pairs[:4].ravel().tolist()), size_px)
+        named = annotations.Drawn(tuple(pairs[:4].ravel().tolist()), (int(pairs[-1, 0]), int(pairs[-1, 1])))
         annotations.refuse_twisted(named, file, "the page")
         corners = annotations.corners_of_photo({file: named}, file, path)
         if self.wants_corners(path) and corners is not None:
@@ -135,8 +134,7 @@ class PhotoCollection:
     def _grouping(self) -> Grouping:
         paths = sorted(path for path in self._measured if self.control_of(path) is None)
         names = {name: number for number, name in enumerate(sorted({path.parent.name for path in paths}))}
-        numbers = tuple(names[path.parent.name] for path in paths)
-        grouping = Grouping(tuple(paths), numbers, tuple(names), BY_FOLDERS)
+        grouping = Grouping(tuple(paths), tuple(names[path.parent.name] for path in paths), tuple(names), BY_FOLDERS)
         return merge_folders(grouping, [self._measured[path] for path in paths])
 
     def close(self) -> None:

@@ -31,8 +31,7 @@ def new(
     """Write a commented scene for an object, photographs of it, or a folder of images."""
     from patchproof.app.begin.new import new_scene
 
-    network_names = names_of(models)
-    lines = new_scene(thing, out, label=label, length_mm=length_mm, up=up, models=network_names, overwrite=overwrite)
+    lines = new_scene(thing, out, label=label, length_mm=length_mm, up=up, models=names_of(models), overwrite=overwrite)
     say(*lines, f"scene: {out}", f"next: {command_text('preview', out)}")
 
 
@@ -120,8 +119,7 @@ def printer(
     if (icc is None) != bool(photos):
         raise BadParameter("give either --icc FILE or PHOTO...", param_hint="--icc / PHOTO...")
     if not design and (corners or find or known or camera):
-        only = "--corners, --find, --camera and --known are for PHOTO... --design"
-        raise BadParameter(only, param_hint="--design")
+        raise BadParameter("--corners, --find, --camera and --known are for PHOTO... --design", param_hint="--design")
     if out.suffix.lower() not in {"", ".npz", ".json"}:
         raise Refused("a printer file, NAME.npz", f"{out.name}", "choose another --out")
     file = out.with_suffix(".npz")

@@ -56,8 +56,7 @@ def as_command(verb: Callable[..., None]) -> Callable[..., None]:
             keep_freed_memory()
             if "jobs" not in arguments:
                 return verb(**arguments)
-            device, cluster = arguments.get("device", "cpu"), arguments.get("cluster")
-            with share_cores(arguments["jobs"], device, cluster) as jobs:
+            with share_cores(arguments["jobs"], arguments.get("device", "cpu"), arguments.get("cluster")) as jobs:
                 verb(**arguments | {"jobs": jobs})
         except KeyboardInterrupt:
             say_stopped()

@@ -184,16 +184,15 @@ def sheet(
         manifests = [blank_page(out, template=template, control=control)]
     else:
         from patchproof.optimizer.run import load_run
-        from patchproof.reprints.run_sheet import sheet as sheet_of
-        from patchproof.reprints.run_sheet import sheet_of_several
+        from patchproof.reprints import run_sheet
 
         loaded, content = [load_run(folder, trust) for folder in runs], {"template": template, "control": control}
         if (check or copies > 1) and (template or loaded[0].scene.settings.sheet.template) == NO_PAGE:
             raise Refused("a page for --check and --copies", f"{runs[0]}, a print without one", "leave them out")
         if len(runs) > 1:
-            manifests = sheet_of_several(loaded, out, **content)
+            manifests = run_sheet.sheet_of_several(loaded, out, **content)
         else:
-            manifests = [sheet_of(loaded[0], out, **content, copies=copies, overwrite=overwrite)]
+            manifests = [run_sheet.sheet(loaded[0], out, **content, copies=copies, overwrite=overwrite)]
     for manifest, path in zip(manifests, paths, strict=True):
         if manifest.promise is not None:
             from patchproof.report.words import promise_summary

@@ -177,10 +177,8 @@ def _indented(lines: Iterable[str]) -> list[str]:
 def _resolution_lines(views: PlanData) -> list[str]:
     (far, near), (far_photo, near_photo) = views["px_per_mm_network"], views["px_per_mm_photo"]
     width, height = views["photo_px"]
-    line = (
-        f"{far:.2f} to {near:.2f} px/mm at the network's {views['network_px']} px, {far_photo:.2f} to "
-        f"{near_photo:.2f} in photographs of {width} × {height} px (5 % and 95 % of the views)"
-    )
+    line = f"{far:.2f} to {near:.2f} px/mm at the network's {views['network_px']} px, {far_photo:.2f} to "
+    line += f"{near_photo:.2f} in photographs of {width} × {height} px (5 % and 95 % of the views)"
     density = f"{views['texels_per_px']:.1f} per pixel along a side in the closest"
     if views["design_px"] is None:
         return [line, f"{views['texels']} texels may change, {density} view"]
