@@ -359,7 +359,8 @@ def test_a_piece_put_into_a_photograph_is_what_a_photograph_of_it_shows():
     )
     drawn, shown = piece_picture(surface, promised.design), light_fit(shot, promised)
     put = reprojected_squares(shot, {(): [drawn]}, surface.rect_mm, shown, shown, Reference(0.5, 0.3, 0.0))
-    assert put[True, True] == pytest.approx(reprojected_square(shot, [drawn], surface.rect_mm, shown), abs=1e-6)
+    as_taken = reprojected_square(shot, [drawn], surface.rect_mm, shown)
+    np.testing.assert_allclose(put[True, True], as_taken, rtol=0, atol=1e-6)
     for on, expected in ((True, other), (False, promised_one)):
         off = np.abs(put[on, on] - square_of(expected)[0] / 255).mean()
         assert off < 0.009  # the print that was taken is 0.036 off and more

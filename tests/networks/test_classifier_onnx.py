@@ -467,9 +467,9 @@ def test_what_torch_computes_otherwise_is_refused(body, sentence):
 
 def standard_attributes() -> set[tuple[str, str]]:
     """Operators of the table with each attribute that the standard lists for them in the opsets that are read."""
-    found = set()
+    found, schemas = set(), defs.get_all_schemas_with_history()
     for name in OPERATORS:
-        versions = [each for each in defs.get_all_schemas_with_history() if each.name == name and not each.domain]
+        versions = [each for each in schemas if each.name == name and not each.domain]
         first = max((each.since_version for each in versions if each.since_version <= OPSETS[0]), default=0)
         found |= {(name, word) for each in versions if each.since_version >= first for word in each.attributes}
     return found

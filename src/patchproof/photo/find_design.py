@@ -15,7 +15,7 @@ MAGSAC++, CVPR 2020; Baker and Matthews, Lucas-Kanade 20 Years On, IJCV 2004 (in
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cache, cached_property, lru_cache
 
 import cv2
 import numpy as np
@@ -190,43 +190,44 @@ def _features(gray: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.array(table), np.sqrt(descriptors / np.maximum(descriptors.sum(1, keepdims=True), 1e-6))
 
 
+@lru_cache(maxsize=2)  # a design and its mirror image are looked for in one photograph after the other
+def _design_features(pixels: bytes, shape: tuple[int, ...], size_mm: tuple[float, float]) -> list:
+    """Features of a design at each size that has any, positions and diameters as shares of its longer side."""
+    design, found, margin = np.frombuffer(pixels, np.uint8).reshape(shape), [], 8
+    for longer_px in _FEATURE_SIZES_PX:
+        drawn = cv2.cvtColor(_draw(design, size_mm, longer_px), cv2.COLOR_RGB2GRAY)
+        own, descriptors = _features(np.pad(drawn, margin, mode="edge"))
+        found.append(((own - (margin, margin, 0, 0)) / (longer_px, longer_px, longer_px, 1), descriptors))
+    return [each for each in found if len(each[0])]
+
+
 def _places_by_features(photo: _Searched, design: np.ndarray, size_mm: tuple[float, float]) -> Iterator[np.ndarray]:
     """Yield corners 4×2 px, those of most agreeing matches first."""
     seen, seen_descriptors = photo.features
-    if len(seen) < 8:
+    features = _design_features(design.tobytes(), design.shape, size_mm)
+    if len(seen) < 8 or not features:
         return
-    source, target, angles, sizes, quality = [], [], [], [], []
-    matcher = cv2.BFMatcher(cv2.NORM_L2)
-    for longer_px in _FEATURE_SIZES_PX:
-        drawn = cv2.cvtColor(_draw(design, size_mm, longer_px), cv2.COLOR_RGB2GRAY)
-        margin = 8
-        own, own_descriptors = _features(np.pad(drawn, margin, mode="edge"))
-        if not len(own):
-            continue
+    parts, matcher = [], cv2.BFMatcher(cv2.NORM_L2)
+    for own, own_descriptors in features:
         pairs = matcher.knnMatch(own_descriptors, seen_descriptors, _NEIGHBORS)
-        mean = float(np.mean([pair[0].distance for pair in pairs]))
-        for pair in pairs:
-            for match in pair:
-                a, b = own[match.queryIdx], seen[match.trainIdx]
-                source.append((a[:2] - margin) / longer_px)
-                target.append(b[:2])
-                angles.append(b[3] - a[3])
-                sizes.append(np.log(b[2] / a[2] * longer_px))
-                quality.append(match.distance / min(pair[-1].distance + 1e-6, mean))
+        index, distance = np.array([[(m.trainIdx, m.distance) for m in pair] for pair in pairs]).transpose(2, 0, 1)
+        quality = distance / np.minimum(distance[:, -1:] + 1e-6, distance[:, 0].mean())
+        a, b = own.repeat(_NEIGHBORS, 0), seen[index.ravel().astype(int)]
+        parts.append((a[:, :2], b[:, :2], b[:, 3] - a[:, 3], np.log(b[:, 2] / a[:, 2]), quality.ravel()))
+    source, target, angle, size, quality = map(np.concatenate, zip(*parts, strict=True))
     best = np.argsort(quality, kind="stable")[:_MOST_MATCHES]
-    if not len(best):
-        return
-    source, target, angle, size = (np.array(v)[best] for v in (source, target, angles, sizes))
+    source, target, angle, size = (each[best] for each in (source, target, angle, size))
     shape = np.array(size_mm) / max(size_mm)
     arm = (shape / 2 - source) * np.exp(size)[:, None]
     cosine, sine = np.cos(angle), np.sin(angle)
     middle = target + np.column_stack([cosine * arm[:, 0] - sine * arm[:, 1], sine * arm[:, 0] + cosine * arm[:, 1]])
     x, y, log, c, s = np.column_stack([middle, size, cosine, sine]).astype(np.float32).T
-    agree = np.hypot(x[:, None] - x, y[:, None] - y) < _VOTE_SHARE * np.exp(np.minimum(log[:, None], log))
+    near = (_VOTE_SHARE * np.exp(log)) ** 2
+    agree = (x[:, None] - x) ** 2 + (y[:, None] - y) ** 2 < np.minimum(near[:, None], near)
     agree &= np.abs(log[:, None] - log) < _VOTE_LOG_SIZE
     agree &= c[:, None] * c + s[:, None] * s > np.cos(_VOTE_RAD)
     for _ in range(_MOST_PLACES):
-        votes = agree.sum(1)
+        votes = cv2.reduce(agree.view(np.uint8), 1, cv2.REDUCE_SUM, dtype=cv2.CV_32S).ravel()
         leader = int(votes.argmax())
         if votes[leader] < _LEAST_VOTES:
             return
@@ -319,54 +320,63 @@ class _SmallDesign:
     """
 
     def __init__(self, drawn: np.ndarray, surroundings: float):
-        self.size, self.surroundings_px = (drawn.shape[1], drawn.shape[0]), surroundings * max(drawn.shape[:2])
-        codes = self._less_surroundings(drawn)
-        self.weight = (codes.std((0, 1)) / max(float(codes.std((0, 1)).sum()), 1e-6)).astype(np.float32)
-        squares = self._less_surroundings(drawn.astype(np.float32) ** 2 / 255)
-        colors = np.concatenate([part / np.maximum(part.std((0, 1)), 1e-3) for part in (codes, squares)], 2)
-        power = np.abs(np.fft.fft2((colors[..., :3] * self.weight).sum(2))) ** 2
+        self.size, sigma_px = (drawn.shape[1], drawn.shape[0]), surroundings * max(drawn.shape[:2])
+        blur = {"kernelX": np.ones(1), "kernelY": cv2.getGaussianKernel(2 * round(4 * sigma_px) + 1, sigma_px)}
+        eyes, edges = (np.eye(side, dtype=np.float32) for side in drawn.shape[:2]), cv2.BORDER_REPLICATE
+        self.means = [cv2.sepFilter2D(eye, -1, **blur, borderType=edges) for eye in eyes]  # matrices that blur columns
+        codes, deviation = self._less_surroundings(drawn, 1e-3)
+        self.weight = deviation / max(float(deviation.sum()), 1e-6)
+        squares, _ = self._less_surroundings(drawn.astype(np.float32) ** 2 / 255, 1e-3)
+        self.colors, self.weighted = np.concatenate([codes, squares]), codes * self.weight
+        colors = self.colors.reshape(6, *drawn.shape[:2])
+        power = np.abs(np.fft.fft2(self.weighted.sum(0).reshape(colors.shape[1:]))) ** 2
         self.freedom = float(power.sum() ** 2 / max((power**2).sum(), 1e-12))  # independent pixels, as it were
         half = np.array(self.size) / 2
         self.index_from_unit = np.array([[half[0], 0, half[0]], [0, half[1], half[1]], [0, 0, 1.0]])
         units = np.stack(np.meshgrid(*((np.arange(n) + 0.5) / n * 2 - 1 for n in self.size)), -1).reshape(-1, 2)
-        by_unit = np.stack([*np.gradient(colors, axis=(1, 0))], -1).reshape(-1, 6, 2) * half
-        by_term = (by_unit @ homography_jacobian(np.eye(3), units).reshape(-1, 2, 8)).astype(np.float32)
-        self.colors, self.by_term = colors.reshape(-1, 6), by_term.reshape(-1, 8)
-        pairs = by_term.reshape(-1, 48).T @ by_term.reshape(-1, 48)
+        by_x, by_y = (homography_jacobian(np.eye(3), units).reshape(-1, 2, 8) * half[:, None]).transpose(1, 2, 0)
+        along_y, along_x = (slope.reshape(6, 1, -1) for slope in np.gradient(colors, axis=(1, 2)))
+        self.by_term = along_x * by_x.astype(np.float32, order="C")  # 6 colors × 8 terms × pixels
+        self.by_term += along_y * by_y.astype(np.float32, order="C")
+        pairs = self.by_term.reshape(48, -1) @ self.by_term.reshape(48, -1).T
         self.curvature = pairs.reshape(6, 8, 6, 8).transpose(0, 2, 1, 3).astype(float)  # for each pair of colors 8×8
 
-    def _less_surroundings(self, codes: np.ndarray) -> np.ndarray:
-        codes = cv2.GaussianBlur(codes.astype(np.float32), (0, 0), 0.8)
-        codes -= cv2.GaussianBlur(codes, (0, 0), self.surroundings_px, borderType=cv2.BORDER_REPLICATE)
-        return codes - codes.mean((0, 1))
+    def _less_surroundings(self, codes: np.ndarray, least: float) -> tuple[np.ndarray, np.ndarray]:
+        """3×N codes with mean 0 in units of their deviation, if that is `least` or more, and the deviation 3×1."""
+        planes = np.array(cv2.split(cv2.GaussianBlur(codes.astype(np.float32), (0, 0), 0.8)))
+        planes = (planes - self.means[0] @ planes @ self.means[1].T).reshape(3, -1)
+        planes -= planes.mean(1, keepdims=True)
+        deviation = np.sqrt((planes**2).mean(1, keepdims=True))
+        return planes / np.maximum(deviation, least), deviation
 
     def align(self, srgb: np.ndarray, quad: np.ndarray, mixes: bool = False) -> tuple[np.ndarray, float, float]:
         """Refine corners 4×2 px in a picture, if `mixes` with mixed colors; with the correlation of the channels there
         and the standard deviation of a corner's coordinate.
         """
         px_from_unit, best, hessian = fit_homography(_UNIT, quad), (-1.0, quad), np.eye(8)
+        used = 6 if mixes else 3
+        colors, by_term, curvature = self.colors[:used], self.by_term[:used], self.curvature[:used, :used]
         for _ in range(_COLOR_STEPS if mixes else _STEPS):
             index = index_homography(px_from_unit @ np.linalg.inv(self.index_from_unit))
             how = None, cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, cv2.BORDER_REPLICATE
-            seen = self._less_surroundings(cv2.warpPerspective(srgb, index, self.size, *how))
-            seen = (seen / np.maximum(seen.std((0, 1)), 0.5)).reshape(-1, 3)
-            likeness = float((self.weight * (seen * self.colors[:, :3]).mean(0)).sum())
+            seen, _ = self._less_surroundings(cv2.warpPerspective(srgb, index, self.size, *how), 0.5)
+            likeness = float(np.vdot(self.weighted, seen)) / seen.shape[1]
             if likeness > best[0] or mixes:
                 best = likeness, apply_homography(px_from_unit, _UNIT)
-            mixture = np.eye(6, 3, dtype=np.float32) * max(likeness, 0.3)
+            mixture = np.eye(3, dtype=np.float32) * max(likeness, 0.3)
             if mixes:
-                ridge = 1e-3 * len(seen) * np.eye(6)
-                mixture = np.linalg.solve(self.colors.T @ self.colors + ridge, self.colors.T @ seen).astype(np.float32)
-            error = np.clip(seen - self.colors @ mixture, -1.5, 1.5) * self.weight
-            hessian = np.tensordot(mixture * self.weight @ mixture.T, self.curvature)
+                ridge = 1e-3 * seen.shape[1] * np.eye(6)
+                mixture = np.linalg.solve(colors @ colors.T + ridge, colors @ seen.T).astype(np.float32)
+            error = np.clip(seen - mixture.T @ colors, -1.5, 1.5) * self.weight
+            hessian = np.tensordot(mixture * self.weight.T @ mixture.T, curvature)
             hessian += (1e-7 * np.trace(hessian) + 1e-9) * np.eye(8)  # a plain design has no slopes
-            step = np.linalg.solve(hessian, self.by_term.T @ (error @ mixture.T).ravel())
+            step = np.linalg.solve(hessian, (by_term @ (mixture @ error)[..., None]).sum(0)[:, 0])
             a, b, c, d, e, f, g, h = np.clip(step, -0.2, 0.2)
             px_from_unit = px_from_unit @ np.linalg.inv([[1 + a, b, c], [d, 1 + e, f], [g, h, 1]])
             if np.abs(step).max() < 2e-4 or not np.isfinite(px_from_unit).all():
                 break
         likeness, corners = best
-        variance = max(1 - likeness**2, 0.0) * len(self.colors) / max(self.freedom, 1.0)
+        variance = max(1 - likeness**2, 0.0) * self.colors.shape[1] / max(self.freedom, 1.0)
         return corners, likeness, _corner_sigma(px_from_unit, np.linalg.inv(hessian) * variance)
 
 
