@@ -100,7 +100,7 @@ def printed(
     page = np.where(reserved[..., None], image, page)
     with torch.inference_mode():  # another printer than the promise has
         page = load_printer("uncoated").apply(torch.tensor(page.transpose(2, 0, 1)[None], dtype=torch.float32))
-    return linear_from_srgb(page[0].numpy().transpose(1, 2, 0).astype(float))
+    return linear_from_srgb(page[0].numpy().transpose(1, 2, 0))
 
 
 def flat(points: np.ndarray) -> np.ndarray:

@@ -134,6 +134,11 @@ def view(azimuth_deg=0.0, elevation_deg=0.0, distance_mm=500.0, roll_deg=0.0, si
     return plane_homography(intrinsics(fov_deg, size_px), look_at(eye, [0, 0, 0], roll_deg), world_from_page)
 
 
+@functools.lru_cache(maxsize=2)  # most photographs of a test have one seed and size
+def _grain(seed: int, shape: tuple[int, ...]) -> np.ndarray:
+    return np.random.default_rng(seed).standard_normal(shape)
+
+
 def photograph(page, px_from_mm, size_px=(1200, 900), blur_px=0.0, noise=0.0, light=0.8, jpeg=None, seed=0, fine=3):
     """uint8 sRGB photo: `fine`² samples per pixel, Gaussian blur, light and noise in linear light, JPEG if asked."""
     width, height = size_px
@@ -149,7 +154,7 @@ def photograph(page, px_from_mm, size_px=(1200, 900), blur_px=0.0, noise=0.0, li
     if blur_px > 0:
         linear = cv2.GaussianBlur(linear, (0, 0), blur_px)
     if noise:
-        linear = linear + (np.random.default_rng(seed).standard_normal(linear.shape) * noise).astype(np.float32)
+        linear = linear + (_grain(seed, linear.shape) * noise).astype(np.float32)
     srgb = np.clip(srgb_from_linear(np.clip(linear, 0, 1)) * 255 + 0.5, 0, 255).astype(np.uint8)
     if jpeg is None:
         return srgb
