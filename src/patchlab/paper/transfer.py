@@ -20,26 +20,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pydantic import Field, model_validator
 
+from patchlab.study import trained_designs
 from patchlab.study.estimates import mean
 from patchlab.study.figures import number_grid, picture_sheet
 from patchlab.study.grid import Names, PositiveInt, by_values, group_by, short_name
 from patchlab.study.record import Record, to_record
 from patchlab.study.study import Cell, Result, Study
-from patchlab.study.trained_designs import (
-    ORIGINAL,
-    NamePart,
-    TrainedSettings,
-    answers_and_files,
-    best_design,
-    gain_word,
-    single_network_rows,
-    tested_networks,
-    trained_cells,
-    trained_problem,
-    views_from_sides,
-    views_in_drawn_light,
-    with_trainers,
-)
+from patchlab.study.trained_designs import ORIGINAL, NamePart, gain_word, views_from_sides, views_in_drawn_light
 from patchproof.base.intervals import rate
 from patchproof.optimizer.promise import pictures_with_controls
 from patchproof.optimizer.responses import responses
@@ -53,7 +40,7 @@ _ALL_ROW, _WITHOUT_PREFIX = "all", "without_"
 _SHEET_PX = 224
 
 
-class TransferSettings(TrainedSettings):
+class TransferSettings(trained_designs.TrainedSettings):
     """Settings of a study of trained designs with ensembles and families of networks."""
 
     ensembles: bool = True  # also train on all networks but one, each in turn, and on all
@@ -88,14 +75,14 @@ def cells(settings: TransferSettings, base: Path) -> list[Cell]:
                 if len(rest) > 1:  # a single network is a row already
                     ensembles[_WITHOUT_PREFIX + family] = rest
             ensembles[_ALL_ROW] = networks
-        return {ORIGINAL: (), **single_network_rows(networks), **ensembles}
+        return {ORIGINAL: (), **trained_designs.single_network_rows(networks), **ensembles}
 
-    return trained_cells(settings, base, rows)
+    return trained_designs.trained_cells(settings, base, rows)
 
 
 def run(settings: TransferSettings, base: Path, cell: Cell) -> dict[str, Any]:
     """Train if the cell names training networks, then test on all."""
-    problem = trained_problem(settings, base, cell)
+    problem = trained_designs.trained_problem(settings, base, cell)
     if cell.values["way"] in settings.vertex_colors:
         from patchlab.paper.vertex_colors import vertex_problem
 
@@ -103,10 +90,10 @@ def run(settings: TransferSettings, base: Path, cell: Cell) -> dict[str, Any]:
     things: dict[str, Appearance] = {"design": None}
     design = None
     if cell.values["trained"]:
-        design = best_design(with_trainers(problem, cell))
+        design = trained_designs.best_design(trained_designs.with_trainers(problem, cell))
         things = pictures_with_controls(problem, design, ())
     sheet = views_from_sides(problem, 3), _SHEET_PX
-    answers = answers_and_files(problem, cell.name, things, settings.n, sheet, design)
+    answers = trained_designs.answers_and_files(problem, cell.name, things, settings.n, sheet, design)
     if problem.scene.HAS_OBJECT:
         fixed = views_in_drawn_light(problem, settings.lights)
         answers["views"] = to_record(responses(problem, things, fixed))
@@ -135,7 +122,7 @@ def _matrix(settings: TransferSettings, groups: ResultsByRow) -> Table:
         original = Record(by_row.get(ORIGINAL, ()), "design")
         for row, of_row in by_row.items():
             record = Record(of_row, "design")
-            for network in tested_networks(of_row):
+            for network in trained_designs.tested_networks(of_row):
                 (level, sure), (gain, surer) = record.level(network), record.gain(original, network)
                 trained = network in of_row[0].cell.values["trained"]
                 start = (*key, row, short_name(network))
@@ -175,7 +162,7 @@ def _gain_table(
     untrained = (result for result in results if not result.cell.values["trained"])
     originals = {group_of(result): Record([result], "design") for result in untrained}
     figures: dict[tuple, dict[tuple, list[tuple[float, float]]]] = {}
-    for result, network in product(results, tested_networks(results)):
+    for result, network in product(results, trained_designs.tested_networks(results)):
         trained, group = result.cell.values["trained"], group_of(result)
         if trained and group in originals:
             start = (group[0], trainer(result), tester(network), "yes" if network in trained else "no")
@@ -195,7 +182,7 @@ def _left_out_tables(settings: TransferSettings, results: Sequence[Result], grou
     rows = []
     for key, by_row in groups.items():
         original = Record(by_row.get(ORIGINAL, ()), "design")
-        for network in tested_networks(results):
+        for network in trained_designs.tested_networks(results):
             if (without := by_row.get(_WITHOUT_PREFIX + settings.family_of(network))) is None:
                 continue
             record = Record(without, "design")
@@ -227,7 +214,7 @@ def _view_tables(settings: TransferSettings, groups: ResultsByRow) -> list[Table
     for key, by_row in groups.items():
         for row, of_row in by_row.items():
             trained = of_row[0].cell.values["trained"]
-            for network in tested_networks(of_row) if trained and "views" in of_row[0].answers else ():
+            for network in trained_designs.tested_networks(of_row) if trained and "views" in of_row[0].answers else ():
                 records = (Record(some, "design", "views") for some in (by_row.get(ORIGINAL, ()), of_row))
                 before, after = (np.reshape(record.hits(network), (-1, 3, settings.lights)) for record in records)
                 for i, azimuth in enumerate(of_row[0].answers["azimuths"]):
@@ -240,7 +227,7 @@ def _view_tables(settings: TransferSettings, groups: ResultsByRow) -> list[Table
 
 def figures(settings: TransferSettings, results: Sequence[Result]) -> list[Drawing]:
     """A heat map and a contact sheet of designs per scene and way."""
-    networks, drawings = tested_networks(results), []
+    networks, drawings = trained_designs.tested_networks(results), []
     for (scene, way), by_row in _rows(results).items():
         drawings += [
             Drawing(

@@ -86,8 +86,8 @@ def measured(name: str, scene: str, processes: int) -> dict:
     def steps() -> float:
         torch.set_num_threads(1)
         timed = [time_call(partial(next, running), perf_counter) for _ in range(STEPS)]
-        selects = lambda step: loop.ends_interval(scene.settings.optimize, step.state.number, loop.SELECT_AFTER)  # noqa: E731
-        return statistics.mean(ms for step, ms in timed if not selects(step))
+        selects = [loop.ends_interval(asked.optimize, step.state.number, loop.SELECT_AFTER) for step, _ in timed]
+        return statistics.mean(ms for (_, ms), select in zip(timed, selects, strict=True) if not select)
 
     rounds = call_in_turn({"pass": passes, "step": steps}, ROUNDS - 1)
     running.close()
