@@ -167,6 +167,13 @@ def test_the_piece_is_the_blank_s_with_ids_of_its_own(world, scene):
     assert sheet_id(known, 0) == scene.sheet_id != sheet_id(known, 1)
 
 
+def test_hidden_files_and_folders_hold_no_photographs(tmp_path):
+    for name in ("b.jpg", "._b.jpg", ".thumbnails/b.jpg", "session_01/a.jpg", "session_01/._a.jpg", "notes.txt"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(b"")
+    assert photos_in(tmp_path) == [tmp_path / "b.jpg", tmp_path / "session_01" / "a.jpg"]
+
+
 def test_another_template_is_the_scene_made_for_it(world, scene):
     made = build_scene(settings_of(world, sheet={"template": "letter"}), world.folder, 0)
     changed = scene.with_template("letter")

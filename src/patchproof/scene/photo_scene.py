@@ -22,7 +22,7 @@ import numpy as np
 from patchproof.base.errors import Refused
 from patchproof.base.fingerprint import files_sha256
 from patchproof.base.geometry import is_inside
-from patchproof.base.input import is_file, is_folder
+from patchproof.base.input import is_folder
 from patchproof.base.settings import SceneSettings
 from patchproof.base.validation import expand_path
 from patchproof.photo.detect import find_markers
@@ -30,7 +30,7 @@ from patchproof.photo.known_page import complete_markers
 from patchproof.photo.limits import run_limited
 from patchproof.photo.paper_light import PaperLight, paper_light
 from patchproof.photo.quality import blur_px
-from patchproof.photo.read import SUFFIXES, read_photo, summarize_said
+from patchproof.photo.read import list_images, read_photo, subfolders, summarize_said
 from patchproof.photo.rectify import PageFit, corner_uncertainty_mm, fit_page
 from patchproof.photo.rejection import PhotoRejected
 from patchproof.scene import picture_scene
@@ -180,8 +180,8 @@ def measure_photo(path: Path, manifest: Manifest, piece: Piece, photo_px: tuple[
 
 def photos_in(folder: Path) -> list[Path]:
     """List a folder's photographs and those of the folders in it, which hold sessions as for `verify`."""
-    inside = (*folder.iterdir(), *folder.glob("*/*")) if is_folder(folder) else ()
-    return sorted(path for path in inside if path.suffix.lower() in SUFFIXES and is_file(path))
+    folders = (folder, *subfolders(folder)) if is_folder(folder) else ()
+    return sorted(path for each in folders for path in list_images(each))
 
 
 def _load_all(folder: Path, manifest: Manifest, piece: Piece, photo_px) -> tuple[tuple[BasePhoto, ...], dict[str, str]]:
