@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -127,6 +128,20 @@ def test_hidden_files_are_no_backgrounds(tmp_path):
     (tmp_path / "places" / "._001.png").write_bytes(b"what another system keeps beside 001.png")
     pictures = load_backgrounds(BackgroundSettings(images="places"), tmp_path).pictures
     assert sum(isinstance(picture, FileLevels) for picture in pictures) == 3
+
+
+def test_pictures_of_all_suffixes_are_backgrounds_or_are_named(tmp_path, monkeypatch):
+    folder_of(tmp_path, 2)
+    for suffix in ("gif", "jpe"):
+        Image.fromarray(np.full((8, 8, 3), 90, np.uint8)).save(tmp_path / "places" / f"a.{suffix}")
+    settings = BackgroundSettings(images="places")
+    backgrounds = load_backgrounds(settings, tmp_path)
+    files = [picture for picture in backgrounds.pictures if isinstance(picture, FileLevels)]
+    assert len(files) == 4 and all(abs(int(file[0].mean()) - 90) < 3 for file in files if file.path.stem == "a")
+    monkeypatch.setitem(sys.modules, "pillow_heif", None)
+    (tmp_path / "places" / "b.heic").write_bytes(b"x")
+    with pytest.raises(Refused, match=r"b.heic that cannot be read .*pip install 'patchproof\[heic\]'"):
+        load_backgrounds(settings, tmp_path)
 
 
 def test_a_background_is_read_as_a_photograph_is(tmp_path):

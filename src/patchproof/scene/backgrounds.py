@@ -14,7 +14,8 @@ are blurred. Every other place is one of the flat backgrounds of `patterns`, wit
 """
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -29,7 +30,7 @@ from patchproof.base.input import is_file, is_folder, open_image
 from patchproof.base.resample import halving_pyramid, index_homography
 from patchproof.base.settings import BackgroundSettings
 from patchproof.base.validation import expand_path
-from patchproof.photo.read import list_images, read_photo
+from patchproof.photo.read import allow_heic, list_images, read_photo
 from patchproof.photo.rejection import PhotoRejected
 from patchproof.scene.patterns import background, color, texture
 
@@ -51,7 +52,6 @@ VIEWS_PER_FILE = 50  # other purposes see a file in one of this many views: a ra
 # the purposes of files in the order of a hash of their names, repeated
 _SPLIT_PATTERN = ("train", "promise", "evaluate", "select", "train", "promise", "train", "evaluate", "promise", "train")
 CACHED_FILE_BYTES = 1 << 28  # of halvings: a view of 224 px needs 2 MB of one
-_SUFFIXES = {".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff"}
 
 
 def procedural_place(number: int) -> np.ndarray:
@@ -149,6 +149,8 @@ class FileLevels:
 
     def __init__(self, path: Path):
         self.path = path
+        with _refuse_unreadable(path):
+            allow_heic(path)
         with open_image(path, "a background picture", "remove or replace it"):
             pass  # what is no picture is refused before anything is computed
 
@@ -172,10 +174,16 @@ _place_levels = lru_cache(192)(lambda number: halving_pyramid(procedural_place(n
 @lru_cache(maxsize=1)
 def _decoded(file: FileLevels) -> list[np.ndarray]:
     """All levels of the file that was decoded last."""
-    try:
+    with _refuse_unreadable(file.path):
         return halving_pyramid(read_photo(file.path).srgb)
+
+
+@contextmanager
+def _refuse_unreadable(path: Path) -> Iterator[None]:
+    try:
+        yield
     except PhotoRejected as rejection:
-        got = f"{file.path.name} that cannot be read ({rejection.advice})"
+        got = f"{path.name} that cannot be read ({rejection.advice})"
         raise Refused("a background picture", got, "remove or replace it") from rejection
 
 
@@ -238,8 +246,7 @@ def background_files(settings: BackgroundSettings, base: Path) -> list[Path]:
     if settings.images is None:
         return []
     path = Path(expand_path(settings.images, base))
-    paths = [path] if is_file(path) else list_images(path) if is_folder(path) else []
-    return [p for p in paths if p == path or p.suffix.lower() in _SUFFIXES]
+    return [path] if is_file(path) else list_images(path) if is_folder(path) else []
 
 
 def _split_by_purpose(files: Sequence[Path]) -> Backgrounds:
