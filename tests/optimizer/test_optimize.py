@@ -25,7 +25,7 @@ from patchproof.base.validation import validate_model
 from patchproof.base.workers import Workers, can_fork, use_threads
 from patchproof.classifier.network import Classifier
 from patchproof.optimizer import expectation, loop, place_files, run
-from patchproof.optimizer.evaluate import promise_run
+from patchproof.optimizer.evaluate import evaluate, promise_run
 from patchproof.optimizer.loop import start, steps, take_step
 from patchproof.optimizer.problem import set_problem
 from patchproof.optimizer.promise import CONTROLS, PromiseOptions, make_promise
@@ -517,15 +517,19 @@ def test_a_draft_gets_the_promise_that_it_would_have_had(tmp_path, few_views, mo
     assert load_run(tmp_path / "draft").promise == promised.promise
     with pytest.raises(Refused, match="a promise of 8 views"):
         promise_run(tmp_path / "draft", views=4, trust=True)
-    with pytest.raises(Refused, match="a finished run, got none"):
-        promise_run(tmp_path / "nothing")
+    for use in (promise_run, evaluate):
+        with pytest.raises(Refused, match="a finished run, got none"):
+            use(tmp_path / "missing" / "nothing")
+    assert not (tmp_path / "missing").exists()
     more = promise_run(tmp_path / "draft", views=promised.promise.n + 4, trust=True).promise
     stored = (tmp_path / "draft" / "run.json").read_bytes()
     with pytest.raises(Refused, match=rf"{more.n} views or more, as the promise has now, got 8: ask for {more.n}"):
         promise_run(tmp_path / "draft", views=8, trust=True)
     monkeypatch.setattr("os.access", lambda *_: False)
-    with pytest.raises(Refused, match=r"written to, got .*draft: allow that, or use a copy of the run\.$"):
-        promise_run(tmp_path / "draft", trust=True)
+    monkeypatch.setattr("patchproof.optimizer.evaluate.load_run", lambda *_: pytest.fail("before that"))
+    for use in (promise_run, evaluate):
+        with pytest.raises(Refused, match=r"written to, got .*draft: allow that, or use a copy of the run\.$"):
+            use(tmp_path / "draft", trust=True)
     assert (tmp_path / "draft" / "run.json").read_bytes() == stored
 
 

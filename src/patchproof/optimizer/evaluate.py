@@ -5,7 +5,8 @@ come from the evaluate stream, which neither training nor the promise uses.
 """
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -13,8 +14,8 @@ from pathlib import Path
 from patchproof.base.errors import Refused
 from patchproof.base.folder_lock import lock_folder
 from patchproof.base.goal import Goal
-from patchproof.base.input import is_file, is_folder
-from patchproof.base.output import write_atomically
+from patchproof.base.input import is_file
+from patchproof.base.output import require_finished_run, write_atomically
 from patchproof.base.progress import Advance, Compute, Progress, no_progress
 from patchproof.base.validation import StrictModel
 from patchproof.classifier.network import Classifier
@@ -78,22 +79,32 @@ def evaluate(
         Refused: for a folder without a finished run, or one that was evaluated before.
     """
     folder, compute = Path(run_folder), compute.without("evaluate", cluster=True)
-    if is_file(folder / "evaluate.json") and not overwrite:
-        do = "add --overwrite, or rename it to keep it"
-        raise Refused("a run that was not evaluated yet", f"{folder / 'evaluate.json'}, which exists", do)
-    run = load_run(folder, trust)
-    conditions, advance = run.scene.draw("evaluate", n, seed), partial(progress, "evaluate")
-    problem, by_kind = run_responses(run, conditions, models, compute, advance)
-    evaluations = {
-        claim.name: ModelEvaluation(**claim.model_dump(), controls=promises.control_claims(by_kind, i))
-        for i, claim in enumerate(promises.model_claims(problem, by_kind["design"]))
-    }
-    seed = run.scene.seed if seed is None else seed
-    result = Evaluation(n=n, seed=seed, goal=run.promise.target.goal, models=evaluations)
-    with lock_folder(folder):
+    with _locked_run(folder):
+        if is_file(folder / "evaluate.json") and not overwrite:
+            do = "add --overwrite, or rename it to keep it"
+            raise Refused("a run that was not evaluated yet", f"{folder / 'evaluate.json'}, which exists", do)
+        run = load_run(folder, trust)
+        conditions, advance = run.scene.draw("evaluate", n, seed), partial(progress, "evaluate")
+        problem, by_kind = run_responses(run, conditions, models, compute, advance)
+        evaluations = {
+            claim.name: ModelEvaluation(**claim.model_dump(), controls=promises.control_claims(by_kind, i))
+            for i, claim in enumerate(promises.model_claims(problem, by_kind["design"]))
+        }
+        seed = run.scene.seed if seed is None else seed
+        result = Evaluation(n=n, seed=seed, goal=run.promise.target.goal, models=evaluations)
         text = result.model_dump_json(indent=1, exclude={"models": {"__all__": {"name"}}}) + "\n"
         write_atomically(folder / "evaluate.json", text)
     return result
+
+
+@contextmanager
+def _locked_run(folder: Path) -> Iterator[None]:
+    """Lock a run's folder; refused before anything is computed if it cannot be written to."""
+    require_finished_run(folder)
+    if not os.access(folder, os.W_OK):
+        raise Refused("a run's folder that can be written to", f"{folder}", "allow that, or use a copy of the run")
+    with lock_folder(folder):
+        yield
 
 
 def run_responses(
@@ -118,9 +129,7 @@ def promise_run(
     again. Fewer views than the run's promise has are refused. For `trust` see `load_run`.
     """
     compute, options = compute.without("promise", cluster=True), PromiseOptions(views)
-    if is_folder(run_folder) and not os.access(run_folder, os.W_OK):
-        raise Refused("a run's folder that can be written to", f"{run_folder}", "allow that, or use a copy of the run")
-    with lock_folder(run_folder):
+    with _locked_run(Path(run_folder)):
         run = load_run(run_folder, trust)
         if (n := views or PROMISE_VIEWS) < (present := run.promise.n):
             raise Refused(f"{present} views or more, as the promise has now", f"{n}", f"ask for {present} or more")
