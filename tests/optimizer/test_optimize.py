@@ -17,6 +17,7 @@ import trimesh
 from PIL import Image
 
 from patchproof.base.errors import Refused
+from patchproof.base.folder_lock import lock_folder
 from patchproof.base.goal import Goal
 from patchproof.base.intervals import wilson
 from patchproof.base.progress import Compute
@@ -525,6 +526,8 @@ def test_a_draft_gets_the_promise_that_it_would_have_had(tmp_path, few_views, mo
     stored = (tmp_path / "draft" / "run.json").read_bytes()
     with pytest.raises(Refused, match=rf"{more.n} views or more, as the promise has now, got 8: ask for {more.n}"):
         promise_run(tmp_path / "draft", views=8, trust=True)
+    with lock_folder(tmp_path / "draft"), pytest.raises(Refused, match="no other command writes into"):
+        evaluate(tmp_path / "draft", trust=True)
     monkeypatch.setattr("os.access", lambda *_: False)
     monkeypatch.setattr("patchproof.optimizer.evaluate.load_run", lambda *_: pytest.fail("before that"))
     for use in (promise_run, evaluate):

@@ -268,14 +268,15 @@ def reject_copies(photos: Sequence[MeasuredPhoto], session: Sequence[int], rect_
     """Reject every photograph that repeats a larger or an earlier one; the design lies at `rect_mm` of the page."""
     seen = [_view(photo, number, rect_mm) for photo, number in zip(photos, session, strict=True)]
     rows = [row for row, view in enumerate(seen) if view is not None]
+    index_of = {row: index for index, row in enumerate(rows)}
     views = np.array([seen[row] for row in rows]).reshape(-1, _FIGURES)
-    # so that a view is compared with those near it alone
-    tree = KDTree(np.nan_to_num(views[:, _ANYWHERE], nan=_UNKNOWN)) if rows else None
+    anywhere = np.nan_to_num(views[:, _ANYWHERE], nan=_UNKNOWN)
+    tree = KDTree(anywhere)  # so that a view is compared with those near it alone
     first_by_sha256: dict[str, PhotoEntry] = {}
     first_by_row: dict[int, PhotoEntry] = {}
     results = list(photos)
     for row in sorted(range(len(photos)), key=lambda row: -math.prod(photos[row].entry.photo_px or (0,))):
-        entry, view = photos[row].entry, seen[row]
+        entry = photos[row].entry
         first = None if entry.sha256 is None else first_by_sha256.get(entry.sha256)
         advice = "its bytes are those of {}, which counts once: leave it out"
         if first is None:
@@ -283,10 +284,10 @@ def reject_copies(photos: Sequence[MeasuredPhoto], session: Sequence[int], rect_
             advice = "it shows what {} shows, from there and in its light, and counts once: take another view"
         if first is None:
             first_by_sha256 |= {} if entry.sha256 is None else {entry.sha256: entry}
-            if tree is not None and view is not None:
-                near = tree.query_ball_point(np.nan_to_num(view[_ANYWHERE], nan=_UNKNOWN), 1, p=np.inf)
-                for index in np.array(near)[_is_repeated(view, views[near])]:
-                    first_by_row.setdefault(rows[index], entry)
+            if (index := index_of.get(row)) is not None:
+                near = np.array(tree.query_ball_point(anywhere[index], 1, p=np.inf))
+                for same in near[_is_repeated(views[index], views[near])]:
+                    first_by_row.setdefault(rows[same], entry)
         else:
             remark = Remark(code=COPY_CODE, advice=advice.format(first.file))
             results[row] = replace(photos[row], entry=entry.changed(status="rejected", remark=remark), counted=False)
