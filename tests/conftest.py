@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import sys
 from pathlib import Path
@@ -15,7 +16,7 @@ os.environ["OMP_NUM_THREADS"] = "1"
 sys.path += [str(folder) for folder in sorted(Path(__file__).parent.iterdir()) if folder.is_dir()]
 
 LONG = (  # of the files' names
-    *("types", "readme", "journey", "optimize", "first_hour", "kill_anywhere", "find_design"),
+    *("readme", "journey", "optimize", "first_hour", "kill_anywhere", "find_design"),
     *("flat_journey", "ledger", "verify_run", "photo_degraded", "sheet_pages", "calibrate_printer", "begin", "workers"),
 )
 
@@ -31,6 +32,13 @@ def pytest_configure(config):
         torch.set_num_threads(1)
         cv2.setNumThreads(1)
         keep_freed_memory()
+        gc.disable()  # until all test files are imported: nothing of them is garbage
+
+
+def pytest_collection_finish():
+    """From here on garbage is looked for among what tests make: with torch's objects a look takes .4 s."""
+    gc.freeze()
+    gc.enable()
 
 
 def pytest_collection_modifyitems(items):

@@ -282,3 +282,8 @@ def test_a_draft_in_python_is_that_of_the_command_line(tmp_path, monkeypatch):
         assert torch.get_num_threads() == 2
     assert (run.scene.settings.optimize.steps, run.promise.n, run.promise.draft) == (2, 8, True)
     assert seen == [(1, 2)] and pickle.loads(pickle.dumps(pp.optimize)) is pp.optimize
+
+
+def test_the_users_script_that_types_are_checked_with_uses_every_public_name():
+    script = Path(__file__).with_name("user_script.py").read_text(encoding="utf-8")
+    assert not {name for name in pp.__all__ if f"pp.{name}" not in script}

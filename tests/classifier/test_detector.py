@@ -233,6 +233,7 @@ def test_crops_are_opencv_s(two_stage):
 def test_detectors_carry_a_run_from_scene_to_verdict(tmp_path, shipped, two_stage, monkeypatch):
     monkeypatch.setattr("patchproof.optimizer.loop.SELECT_VIEWS", 2)
     monkeypatch.setattr(two_stage, "PROPOSALS", 2)  # each is cut out and named: most of the time
+    monkeypatch.setattr("patchproof.classifier.wrapping.MOST_WEIGHTS", 0)  # no other ranges of colors are tried
     names = ["builtin-detector", "module:two_stage.rcnn"]
     scene = pp.make_scene(
         {

@@ -46,7 +46,7 @@ class _GltfReader:
 
     def parts(self) -> list[MeshPart]:
         """Return each primitive with triangles, once for every place."""
-        parts, faces = [], 0  # counted, so that neither a million places nor a shared list of vertices takes minutes
+        placed, faces = [], 0  # counted first, so that neither a million places nor a shared list takes minutes
         for node, world in self.shown_nodes():
             if "skin" in node:
                 self.assets.say("skins are left out: meshes are drawn as they were modeled, without a pose")
@@ -63,9 +63,13 @@ class _GltfReader:
                     got = f"{faces} in {self.assets.path.name}, counted as often as they are placed"
                     raise Refused(f"a mesh of at most {most / 1e6:.3g} million faces", got, "export a coarser one")
                 if len(triangles):
-                    part = self.part(primitive, triangles, node.get("weights", mesh.get("weights", ())))
-                    local = (_local({name: rows[i] for name, rows in instances.items()}) for i in range(count))
-                    parts += [transform_part(part, (world @ place)[:3]) for place in local]
+                    weights = node.get("weights", mesh.get("weights", ()))
+                    placed.append(((primitive, triangles, weights), world, instances, count))
+        parts = []
+        for what, world, instances, count in placed:
+            part = self.part(*what)
+            local = (_local({name: rows[i] for name, rows in instances.items()}) for i in range(count))
+            parts += [transform_part(part, (world @ place)[:3]) for place in local]
         return parts
 
     def shown_nodes(self) -> list[tuple[Entry, np.ndarray]]:

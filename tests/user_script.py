@@ -1,27 +1,16 @@
-"""What a user's editor knows of the package: no error in a script that is right, and every mistake in a wrong one.
+"""A user's script, which is not run: `basedpyright` finds no error in what is right, and one in each marked mistake."""
 
-That the package has no type error itself is checked by `basedpyright`, as CONTRIBUTING and CI have it.
-"""
+# pyright: reportUnnecessaryTypeIgnoreComment=error
 
-from __future__ import annotations
-
-import json
-import subprocess
-from pathlib import Path
-
-import pytest
-
-import patchproof
-
-ROOT = Path(__file__).parents[1]
-
-RIGHT = """
 import numpy as np
 import torch
+
 import patchproof as pp
+
 
 def progress(stage: str, done: int, total: int) -> None:
     print(pp.__version__, stage, done, total)
+
 
 report_progress: pp.Progress = progress
 compute, promise = pp.Compute(jobs=2), pp.PromiseOptions(views=40, controls=("bare",))
@@ -37,7 +26,7 @@ place: pp.Place = pp.choose_place(made, models=[pp.load_classifier("file:net.onn
 try:
     run: pp.Run = pp.optimize(scene, "run", promise=promise, compute=compute, progress=report_progress)
 except pp.Refused as error:
-    raise SystemExit(str(error))
+    raise SystemExit(str(error)) from error
 except pp.PatchproofError:
     raise
 run = pp.import_patch(np.zeros((64, 64, 3), np.uint8), scene, "imported", models=[classifier, detector])
@@ -58,38 +47,8 @@ report: pp.Report = pp.verify("photos", "sheet.json", "report", capture=pp.Captu
 verdict: str = report.summary.verdict
 goal: pp.Goal = scene.settings.target.goal
 rejected: type[pp.PhotoRejected] = pp.PhotoRejected
-"""
-WRONG = """
-import patchproof as pp
 
-scene = pp.load_scene(7)
-pictures = pp.photograph(pp.set_stage(scene), None, scene.draw("evaluate", 4), 96)
-rate: str = pp.optimize(scene, "run").promise.rate
-"""
-
-
-@pytest.fixture(scope="module")
-def errors(tmp_path_factory) -> dict[str, list[int]]:
-    """The lines that the checker calls wrong in two users' scripts, in one run."""
-    folder = tmp_path_factory.mktemp("types")
-    for name, text in (("right.py", RIGHT), ("wrong.py", WRONG)):
-        (folder / name).write_text(text)
-    settings = {"include": [str(folder)], "extraPaths": [str(ROOT / "src")], "typeCheckingMode": "standard"}
-    (folder / "pyrightconfig.json").write_text(json.dumps(settings))
-    command = ["basedpyright", "--outputjson", "-p", str(folder)]
-    checked = json.loads(subprocess.run(command, capture_output=True, text=True, check=False).stdout)
-    assert checked["summary"]["filesAnalyzed"] == 2
-    found: dict[str, list[int]] = {"right.py": [], "wrong.py": []}
-    for error in checked["generalDiagnostics"]:
-        if error["severity"] == "error":
-            found[Path(error["file"]).name].append(error["range"]["start"]["line"] + 1)
-    return found
-
-
-def test_a_users_script_is_understood(errors):
-    assert errors["right.py"] == []
-    assert not {name for name in patchproof.__all__ if f"pp.{name}" not in RIGHT}
-
-
-def test_three_mistakes_are_three_errors(errors):
-    assert errors["wrong.py"] == [4, 5, 6]
+# three mistakes
+scene = pp.load_scene(7)  # pyright: ignore[reportArgumentType]
+pictures = pp.photograph(pp.set_stage(scene), None, conditions, 96)  # pyright: ignore[reportArgumentType]
+wrong_rate: str = pp.optimize(scene, "run").promise.rate  # pyright: ignore[reportAssignmentType]
