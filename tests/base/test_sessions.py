@@ -100,13 +100,15 @@ def test_sessions_are_cut_in_order_and_dealt_evenly():
 
 
 def test_chances_of_many_photographs_are_computed_in_blocks_that_do_not_grow(monkeypatch):
-    few, sizes, chances = alone(7, 9), [], sessions._chances
+    few, sizes, transforms = alone(7, 9), [], sessions._transforms
     whole = few.chances((4,) * 30), few.least_rate(70, (4,) * 30, TAIL)
     monkeypatch.setattr(sessions, "_BLOCK_NUMBERS", 1 << 13)
-    monkeypatch.setattr(sessions, "_chances", lambda *given: (sizes.append((c := chances(*given)).size), c)[1])
+    monkeypatch.setattr(
+        sessions, "_transforms", lambda *given: (sizes.append(2 * (t := transforms(*given)).size), t)[1]
+    )
     sessions._chances_of.cache_clear()
     sessions._least_rates.cache_clear()
     assert few.chances((4,) * 30) == pytest.approx(whole[0], abs=1e-15)
-    assert few.least_rate(70, (4,) * 30, TAIL) == whole[1]
+    assert few.least_rate(70, (4,) * 30, TAIL) == pytest.approx(whole[1], abs=1e-12)
     sessions._least_rates((0.1, 0.2), (0.5, 0.5), (5,) * 100, TAIL)
     assert max(sizes) < 1.1 * (1 << 13)

@@ -16,6 +16,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
@@ -104,9 +105,10 @@ def _rate_posterior(recognized: tuple[int, ...], photos: tuple[int, ...]) -> Rat
 @lru_cache(maxsize=32)
 def _chances_of(posterior: RatePosterior, photos: tuple[int, ...]) -> np.ndarray:
     """`RatePosterior.chances`, cached because many counts are judged by the same chances."""
-    parts = _blocks(len(posterior.rates), sum(photos))
-    rows = (posterior.weights[p] @ _chances(posterior.rates[p], posterior.correlations[p], photos) for p in parts)
-    chances = np.sum(list(rows), axis=0)
+    rates, correlations, weights = posterior.rates, posterior.correlations, posterior.weights
+    parts = _blocks(len(rates), sum(photos))
+    means = [weights[p] @ _transforms(rates[p], correlations[p], photos) for p in parts]
+    chances = _chances(np.sum(means, axis=0), photos)
     chances.flags.writeable = False
     return chances
 
@@ -204,16 +206,21 @@ def _shapes(rate: np.ndarray, correlation: np.ndarray) -> tuple[np.ndarray, np.n
     return rate * strength, (1 - rate) * strength
 
 
-def _chances(rates: np.ndarray, correlations: np.ndarray, photos: Sequence[int]) -> np.ndarray:
-    """The chances P×(n + 1) of every count at P points; the sum over sessions is a product of Fourier transforms."""
+def _transforms(rates: np.ndarray, correlations: np.ndarray, photos: Sequence[int]) -> np.ndarray:
+    """The Fourier transforms P×F of the chances of every count at P points; sessions, whose counts add, multiply."""
     from scipy.fft import next_fast_len
 
     alpha, beta = _shapes(rates, correlations)
-    counts, transform = sum(photos) + 1, np.ones(1)
-    length = next_fast_len(counts, real=True)  # a transform of 151, a prime, takes five times as long as one of 160
+    half: Any = next_fast_len(sum(photos) // 2 + 1, real=True)  # no prime, which takes five times as long
+    transforms = np.ones(1)
     for n, sessions in Counter(photos).items():
-        transform = transform * np.fft.rfft(_beta_binomial(n, alpha, beta), length) ** sessions
-    return np.clip(np.fft.irfft(transform, length)[:, :counts], 0, 1)
+        transforms = transforms * np.fft.rfft(_beta_binomial(n, alpha, beta), 2 * half) ** sessions
+    return transforms
+
+
+def _chances(transforms: np.ndarray, photos: Sequence[int]) -> np.ndarray:
+    """The chances ...×(n + 1) of every count by `_transforms`; means of transforms give means of chances."""
+    return np.clip(np.fft.irfft(transforms)[..., : sum(photos) + 1], 0, 1)
 
 
 def _blocks(rows: int, columns: int) -> list[slice]:
@@ -239,9 +246,9 @@ def _least_rates(
     rates, rows = _grid()[0], []
     for part in _blocks(len(rates), len(correlations) * sum(photos)):
         rate, correlation = (each.ravel() for each in np.meshgrid(rates[part], correlations, indexing="ij"))
-        chances = _chances(rate, correlation, photos).reshape(-1, len(correlations), sum(photos) + 1)
-        rows.append(np.einsum("rcn,c->rn", chances, np.array(weights)))
-    chances = np.concatenate(rows)
+        transforms = _transforms(rate, correlation, photos).reshape(len(rates[part]), len(correlations), -1)
+        rows.append(np.array(weights) @ transforms)
+    chances = _chances(np.concatenate(rows), photos)
     at_least = chances[:, ::-1].cumsum(1)[:, ::-1] - chances / 2
     return tuple(float(np.interp(tail, tails, rates, left=0.0, right=1.0)) for tails in at_least.T)
 
