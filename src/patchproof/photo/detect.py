@@ -293,8 +293,8 @@ def _similar_ids(picture: np.ndarray, quads: np.ndarray, aruco) -> tuple[list[in
     cells = (2 * bits[:, ~is_border] - np.float32(1)).reshape(-1, size, size)
 
     def resembled(cells: np.ndarray) -> list[int]:
-        wrong = size * size - cells.reshape(-1, size * size) @ codes
-        likely = (wrong <= 2 * (aruco.maxCorrectionBits + 1)).any(0)
+        agreement = (cells.reshape(-1, size * size) @ codes).max(0, initial=-size * size)
+        likely = size * size - agreement <= 2 * (aruco.maxCorrectionBits + 1)
         return np.unique(np.flatnonzero(likely) % len(aruco.bytesList)).tolist()
 
     return resembled(cells), resembled(cells[:, :, ::-1])
