@@ -64,10 +64,10 @@ class _GltfReader:
                     raise Refused(f"a mesh of at most {most / 1e6:.3g} million faces", got, "export a coarser one")
                 if len(triangles):
                     weights = node.get("weights", mesh.get("weights", ()))
-                    placed.append(((primitive, triangles, weights), world, instances, count))
+                    placed.append((primitive, triangles, weights, world, instances, count))
         parts = []
-        for what, world, instances, count in placed:
-            part = self.part(*what)
+        for primitive, triangles, weights, world, instances, count in placed:
+            part = self.part(primitive, triangles, weights)
             local = (_local({name: rows[i] for name, rows in instances.items()}) for i in range(count))
             parts += [transform_part(part, (world @ place)[:3]) for place in local]
         return parts
