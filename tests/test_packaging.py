@@ -1,4 +1,4 @@
-"""What a wheel carries; that an installed one finds it is tried by `.ci/distributions` and the README's main command."""
+"""What a wheel carries; that an installed one finds it is tried by `.ci/distributions`."""
 
 from __future__ import annotations
 

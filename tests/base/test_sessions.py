@@ -50,6 +50,18 @@ def test_chances_of_a_session_are_the_librarys(rate, correlation, photos):
     np.testing.assert_allclose(posterior.chances([photos]), expected, atol=1e-8)
 
 
+def test_the_least_rate_is_the_librarys_mean_over_correlations_as_they_weigh():
+    shares = {0.02: 0.8, 0.6: 0.2}
+    posterior = RatePosterior(np.full(2, 0.5), np.array([*shares]), np.array([*shares.values()]))
+    rate, reached = posterior.least_rate(6, (5, 3), TAIL), 0.0
+    for correlation, share in shares.items():
+        strength = 1 / correlation - 1
+        alone = (betabinom.pmf(np.arange(n + 1), n, rate * strength, (1 - rate) * strength) for n in (5, 3))
+        chances = np.convolve(*alone)
+        reached += share * (chances[6:].sum() - chances[6] / 2)
+    assert reached == pytest.approx(TAIL, rel=0.01)  # between rates of a grid
+
+
 def test_one_session_allows_for_more_than_the_same_photographs_in_many():
     posterior = rate_posterior(drawn(np.random.default_rng(0), 0.8, 0.15, 6, 100), [6] * 100)
     widths = [np.ptp(posterior.count_interval(split_evenly(40, sessions))) for sessions in (1, 2, 4, 8, 40)]

@@ -480,7 +480,7 @@ def test_textures_have_a_limit_together(tmp_path, monkeypatch):
 
 def test_places_and_shared_vertices_count(tmp_path, monkeypatch):
     monkeypatch.setattr("patchproof.mesh.gltf.MOST_FACES", 1_000_000)  # a twentieth, which fewer places reach
-    for count in (300, 2_000):  # of a square, placed or with a list of vertices of which it has four
+    for count in (300, 2_000):  # of a square, placed, with a list of vertices of which it has four, or repeated
         file = GltfFile(nodes=[{"mesh": 0}] * count, scenes=[{"nodes": list(range(count))}])
         file.square()
         shared = GltfFile()
@@ -488,7 +488,11 @@ def test_places_and_shared_vertices_count(tmp_path, monkeypatch):
         shared.tree["bufferViews"][points]["byteLength"] = 12 * 100_000
         primitive = {"attributes": {"POSITION": points}, "indices": shared.add(np.uint8([[0], [1], [99]]))}
         shared.tree["meshes"] = [{"primitives": [primitive] * count}]
-        for each in (file, shared):
+        repeated = GltfFile()
+        repeated.square()
+        attributes = {"TRANSLATION": repeated.add(np.zeros((count, 3), np.float32))}
+        repeated.tree["nodes"][0] |= {"extensions": {"EXT_mesh_gpu_instancing": {"attributes": attributes}}}
+        for each in (file, shared, repeated):
             path = each.write(tmp_path / "a.gltf")
             if count == 2_000:
                 refused(path, "million faces", "counted as often as they are placed")
