@@ -13,15 +13,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 from console import command
+from PIL import Image
 from test_imports import MAY_IMPORT
 
 from patchlab.study.record import parse_hits
 from patchlab.study.study import load_study
+from patchproof.base.fingerprint import value_sha256
 from patchproof.base.intervals import student_mean, wilson
 from patchproof.base.settings import SceneSettings
 from patchproof.base.validation import read_toml, validate_model
 from patchproof.optimizer.problem import FIGURE_SAMPLING, FIGURE_SCALE
 from patchproof.optimizer.run import load_run
+from patchproof.scene.scene import load_scene
 
 ROOT = Path(__file__).resolve().parents[1]
 README, NOTEBOOK, CONTRIBUTING = (
@@ -115,6 +118,18 @@ def stored(name: str) -> dict:
     return json.loads((NOTEBOOK.parent / name).read_text(encoding="utf-8"))
 
 
+def check_picture(picture: str, figures: str):
+    with Image.open(NOTEBOOK.parent / picture) as image:
+        assert image.info["Comment"] == value_sha256(stored(figures)), "draw it again"
+
+
+@pytest.mark.parametrize("name", ["journey", "report"])
+def test_pictures_show_the_demo_of_today(name):
+    """Each says in its comment which sheet it shows; an id follows from the scene and its seed."""
+    with Image.open(ROOT / ".readme" / f"{name}.png") as image:
+        assert image.info["Comment"] == load_scene(PACKAGE / "app" / "demo.toml").sheet_id
+
+
 def interval(value: float, low: float, high: float) -> str:
     """In points or %, as the notebook writes them."""
     return f"{100 * value:+.1f} [{100 * low:.1f}, {100 * high:.1f}]".replace("+0.0", "0.0").replace("-0.0", "0.0")
@@ -147,6 +162,7 @@ def test_other_networks_are_as_good_as_their_cards_say():
 
 
 def test_figures_of_the_promises_are_the_stored_ones():
+    check_picture("promises.png", "promises/promises.json")
     (_, held, width, _, alone, alone_width, _) = stored("promises/promises.json")["tables"]["held"]["rows"][-1]
     count, old = (f"{round(row['value'] * row['n'])} of {row['n']}" for row in (held, alone))
     share = f"{held['value']:.0%} [{100 * held['low']:.0f}, {100 * held['high']:.0f}]".replace("%", " %")
@@ -617,8 +633,9 @@ def test_figures_of_hardened_renders_are_the_stored_ones(name, network, stored_a
 
 @pytest.mark.parametrize("name", ["speed", "breaks", "terms"])
 def test_charts_say_of_themselves_what_is_stored(name):
-    """The notebook quotes each chart's own line, and its picture is in the README."""
+    """The notebook quotes each chart's own line, and its picture, drawn from the same values, is in the README."""
     first = next(iter(stored(f"charts/{name}.json")["tables"].values()))
+    check_picture(f"charts/{name}_chart.png", f"charts/{name}.json")
     assert first["about"] in words(NOTEBOOK) and f"results/charts/{name}_chart.png" in README.read_text("utf-8")
 
 

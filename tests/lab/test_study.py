@@ -14,11 +14,13 @@ from pathlib import Path
 
 import pytest
 import toy_studies as toy
+from PIL import Image
 
 import patchlab
 from patchlab.study import study
 from patchlab.study.study import Work, load_study, run_cells, run_study
 from patchproof.base.errors import Refused
+from patchproof.base.fingerprint import value_sha256
 
 BASE = Path(__file__).parents[1]
 
@@ -43,6 +45,8 @@ def test_a_study_leaves_json_csv_figures_and_a_page(tmp_path):
     # Wilson's interval of 4 of 4: low = 4 / (4 + 1.96²)
     assert rows[2][:3] == ["n2", "4", "1.0"] and float(rows[2][3]) == pytest.approx(0.5101, abs=1e-4)
     data = json.loads((tmp_path / "toy.json").read_text())
+    with Image.open(tmp_path / "toy_squares.png") as picture:
+        assert picture.info["Comment"] == value_sha256(data), "says which figures it shows"
     assert data["cells"]["n3"]["found"] == {"square": 9, "parts": [1, 2], "n3.txt": "files/n3.txt"}
     assert (tmp_path / "files/n3.txt").read_text() == "3"
     page = (tmp_path / "toy.html").read_text()

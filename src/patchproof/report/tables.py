@@ -1,8 +1,8 @@
 """Tables and figures of comparisons, studies and charts, written to files or as lines for a terminal.
 
 In: rows of plain values and `Estimate`s, drawings for matplotlib, failures, and the settings to repeat it. Out:
-NAME.json, a CSV per table with numbers in full, a PNG per figure, and one self-contained HTML page, each written whole;
-or lines. The same input gives the same bytes.
+NAME.json, a CSV per table with numbers in full, a PNG per figure, whose comment holds the digest of that JSON's values,
+and one self-contained HTML page, each written whole; or lines. The same input gives the same bytes.
 """
 
 import json
@@ -14,6 +14,7 @@ from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
 from patchproof.base.csv_file import csv_lines
+from patchproof.base.fingerprint import value_sha256
 from patchproof.base.intervals import Estimate
 from patchproof.base.output import data_uri, write_atomically, write_json
 from patchproof.report.page import draw_figure, render_page, versions_of
@@ -89,9 +90,17 @@ class Results:
 def write_results(folder: Path, results: Results) -> None:
     """Write the page, its JSON, tables as CSV and figures as PNG into the folder."""
     versions = versions_of(_LIBRARIES)
+    data = {
+        results.kind: results.name,
+        "settings": results.settings,
+        "versions": versions,
+        "tables": {table.name: asdict(table) for table in results.tables},
+        **results.more,
+        "failed": results.failed,
+    }
+    mark = {"Software": None, "Comment": value_sha256(data)}  # without date or version of the library
     pictures, narrow = (
-        # without date or version
-        [draw_figure(figure.draw, figure.size_in, "png", dpi=130, metadata={"Software": None}) for figure in figures]
+        [draw_figure(figure.draw, figure.size_in, "png", dpi=130, metadata=mark) for figure in figures]
         for figures in (results.figures, [figure.for_phone() for figure in results.figures])
     )
     for table in results.tables:
@@ -107,14 +116,6 @@ def write_results(folder: Path, results: Results) -> None:
         cell_text=cell_text,
     )
     write_atomically(folder / f"{results.name}.html", text)
-    data = {
-        results.kind: results.name,
-        "settings": results.settings,
-        "versions": versions,
-        "tables": {table.name: asdict(table) for table in results.tables},
-        **results.more,
-        "failed": results.failed,
-    }
     write_json(folder / f"{results.name}.json", data)
 
 
