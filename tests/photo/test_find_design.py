@@ -17,7 +17,8 @@ from patchproof.evidence.measure import measure
 from patchproof.evidence.surface import printed_colors, surface_of
 from patchproof.evidence.task import promised_ranges
 from patchproof.photo import detect
-from patchproof.photo.find_design import SMALLEST_PRINT_PX, find_design, refuse_other_order
+from patchproof.photo.design_places import SMALLEST_PRINT_PX
+from patchproof.photo.find_design import find_design, refuse_other_order
 from patchproof.photo.read import Photo
 from patchproof.photo.rejection import PhotoRejected
 from patchproof.sheets.markers import aruco_dictionary

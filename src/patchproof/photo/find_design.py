@@ -1,55 +1,50 @@
 """Find a print by its own design in a photograph: no markers, nobody who names corners.
 
 In: uint8 sRGB pixels, the design's pixels, its size on the page. Out: `DesignCorners` with their standard deviation, or
-a `PhotoRejected` with the deciding figure. Two sources propose places: SIFT features of the design at several sizes,
-whose matches vote for a place, size and angle (single matches of blocks are often wrong); and, where these fail, as
-with smooth designs, the correlation of a small design with the photograph over sizes, angles and slants. Each place is
-refined on intensities less their surroundings, with gain and offset per channel. It is accepted by its correlation at
-the photograph's resolution, in units of what chance gives a design of so much structure.
-Left out on purpose: bent paper, prints smaller than `SMALLEST_PRINT_PX` in the picture of `SEARCHED_PX` that is
-searched, and smooth prints turned by more than 50 degrees, whose templates would double the time.
+a `PhotoRejected` with the deciding figure. Each proposed place is refined on intensities less their surroundings, with
+gain and offset per channel. It is accepted by its correlation at the photograph's resolution, in units of what chance
+gives a design of so much structure. Left out on purpose: bent paper, and what is not proposed (see `design_places`).
 
-Sources: Lowe, Distinctive Image Features from Scale-Invariant Keypoints, IJCV 2004 (features, votes); Barath et al.,
-MAGSAC++, CVPR 2020; Baker and Matthews, Lucas-Kanade 20 Years On, IJCV 2004 (inverse compositional refinement).
+Source: Baker and Matthews, Lucas-Kanade 20 Years On, IJCV 2004 (inverse compositional refinement).
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import cache, cached_property, lru_cache
+from functools import cache
 
 import cv2
 import numpy as np
 
-from patchproof.base.geometry import apply_homography, fit_homography, rect_corners
-from patchproof.base.resample import downscale, halving_pyramid, index_homography
+from patchproof.base.geometry import apply_homography, fit_homography
+from patchproof.base.resample import index_homography
 from patchproof.photo import detect
+from patchproof.photo.design_places import (
+    SEARCHED_PX,
+    SMALLEST_PRINT_PX,
+    SearchedPhoto,
+    draw_design,
+    places_by_features,
+    places_by_templates,
+)
 from patchproof.photo.detect import is_plausible_quad
 from patchproof.photo.known_page import is_in_picture
 from patchproof.photo.rectify import homography_jacobian
 from patchproof.photo.registration import DesignCorners
 from patchproof.photo.rejection import MIRRORED_ADVICE, PhotoRejected
 
-SEARCHED_PX = 1600  # longer side of the picture in which places are proposed
-SMALLEST_PRINT_PX = 60.0  # of the design's shorter side there
 # of 110 photographs without the print, half of them of other prints of its kind, none had both over 0.6 and 5.6
 LEAST_LIKENESS, LEAST_SIGNIFICANCE = 0.6, 7.0
 # of significance, by which a mirrored or turned design fits better; of variance, by which it differs from the design
 _MIRRORED_BY, _TURNED_BY, _LEAST_DIFFERENCE = 0.25, 2.0, 0.005
 _LEAST_LEAD = 0.1  # of significance, over the same place with another corner first or mirrored
-_FEATURE_SIZES_PX = (64, 128, 256, 512)  # of the drawn design's longer side
-_NEIGHBORS = 3  # photograph's features that may be a feature of the design
-_MOST_MATCHES = 2000
-_VOTE_SHARE, _VOTE_LOG_SIZE, _VOTE_RAD = 0.25, 0.4, 0.5  # matches that agree: of the print's side, size, angle
-_LEAST_VOTES = 4
-_MOST_PLACES = 8  # of each source, refined
 _REFINED_PX = (24, 48, 128)  # of the design's longer side, from coarse to fine
-_HOPELESS = 0.25  # likeness at a coarse size: of 127 places that were accepted none had less than 0.59
+# likeness at a coarse size, of 127 places that were accepted 0.59 at least, and 0.36 in 152 after so many steps
+_HOPELESS, _HOPELESS_STEPS = 0.25, 8
+_PATIENCE = 6  # steps without a better one: answers and corners are those without a limit, to 0.01 px in 60 prints
 # of the longer side: sigma of the mean that is subtracted; less for corners, which slow changes of light would move
 _SURROUNDINGS, _FINE_SURROUNDINGS = 1 / 6, 1 / 16
 _STEPS, _COLOR_STEPS, _MOST_SHIFT = 30, 10, 1 / 16
 _UNIT = np.array([[-1.0, -1], [1, -1], [1, 1], [-1, 1]])  # corners of a design in its own coordinates
-_TEMPLATE_PX, _TEMPLATE_STEP = 24, 1.2
-_TURNS_DEG, _SLANTS = (0, -15, 15, -30, 30, -45, 45), (1.0, 0.75, 0.55)
 _NOT_FOUND_ADVICE = (
     "the design was not found: show all of it, flat and sharp, on a twentieth of the picture's width or more, or name "
     "its corners, in --corners FILE or with a finger on the page of capture"
@@ -80,17 +75,6 @@ class FoundPlace:
         """True if the middle of either lies in the other."""
         pairs = (self.corners_px, other.corners_px), (other.corners_px, self.corners_px)
         return any(cv2.pointPolygonTest(a.astype(np.float32), b.mean(0).tolist(), False) > 0 for a, b in pairs)
-
-
-class _Searched:
-    """Copies of a photograph, itself the first, and its features: read once for all designs that are looked for."""
-
-    def __init__(self, srgb: np.ndarray):
-        self.levels, self.small = halving_pyramid(srgb), downscale(srgb, SEARCHED_PX)
-
-    @cached_property
-    def features(self) -> tuple[np.ndarray, np.ndarray]:
-        return _features(cv2.cvtColor(self.small, cv2.COLOR_RGB2GRAY))
 
 
 def find_design(srgb: np.ndarray, design: np.ndarray, size_mm: tuple[float, float]) -> DesignCorners:
@@ -130,7 +114,7 @@ def refuse_other_order(srgb: np.ndarray, design: np.ndarray, size_mm: tuple[floa
 
 def _refiners(srgb: np.ndarray, design: np.ndarray, size_mm: tuple[float, float]) -> list["_Refiner"]:
     """Refiners of a design and of its mirror image, which share what is read of the photograph."""
-    photo = _Searched(srgb)
+    photo = SearchedPhoto(srgb)
     return [_Refiner(photo, each, size_mm) for each in (design, np.ascontiguousarray(design[:, ::-1]))]
 
 
@@ -158,9 +142,9 @@ def _find_places(refiner: "_Refiner", by_templates: bool = True) -> list[FoundPl
     """Places of a design in a photograph that do not overlap, the most significant first, accepted or not."""
     photo, sought = refiner.photo, (refiner.design, refiner.size_mm)
     scale = np.array(photo.levels[0].shape[1::-1]) / photo.small.shape[1::-1]
-    places = _distinct(map(refiner.refine, (quad * scale for quad in _places_by_features(photo, *sought))))
+    places = _distinct(map(refiner.refine, (quad * scale for quad in places_by_features(photo, *sought))))
     if by_templates and not (places and places[0].accepted):
-        by_template = (quad * scale for quad in _places_by_templates(photo.small, *sought))
+        by_template = (quad * scale for quad in places_by_templates(photo.small, *sought))
         places = _distinct([*places, *map(refiner.refine, by_template)])
     return places
 
@@ -173,117 +157,12 @@ def _distinct(places: Iterable[FoundPlace | None]) -> list[FoundPlace]:
     return kept
 
 
-def _draw(design: np.ndarray, size_mm: tuple[float, float], longer_px: float) -> np.ndarray:
-    """The design in its printed shape with a longer side of `longer_px`; pixels are squares, as printers print them."""
-    width, height = (max(4, round(longer_px * side / max(size_mm))) for side in size_mm)
-    zoom = max(1, -(-2 * max(width, height) // min(design.shape[:2])))
-    large = design if min(design.shape[:2]) >= 2 * max(width, height) else design.repeat(zoom, 0).repeat(zoom, 1)
-    return cv2.resize(large, (width, height), interpolation=cv2.INTER_AREA)
-
-
-def _features(gray: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """SIFT features N×4 (x, y with centers at .5, diameter, angle in radians) and descriptors N×128 (root of L1)."""
-    points, descriptors = cv2.SIFT.create(nfeatures=6000, contrastThreshold=0.02).detectAndCompute(gray, None)
-    if descriptors is None:
-        return np.zeros((0, 4)), np.zeros((0, 128), np.float32)
-    table = [(p.pt[0] + 0.5, p.pt[1] + 0.5, p.size, np.radians(p.angle)) for p in points]
-    return np.array(table), np.sqrt(descriptors / np.maximum(descriptors.sum(1, keepdims=True), 1e-6))
-
-
-@lru_cache(maxsize=2)  # a design and its mirror image are looked for in one photograph after the other
-def _design_features(pixels: bytes, shape: tuple[int, ...], size_mm: tuple[float, float]) -> list:
-    """Features of a design at each size that has any, positions and diameters as shares of its longer side."""
-    design, found, margin = np.frombuffer(pixels, np.uint8).reshape(shape), [], 8
-    for longer_px in _FEATURE_SIZES_PX:
-        drawn = cv2.cvtColor(_draw(design, size_mm, longer_px), cv2.COLOR_RGB2GRAY)
-        own, descriptors = _features(np.pad(drawn, margin, mode="edge"))
-        found.append(((own - (margin, margin, 0, 0)) / (longer_px, longer_px, longer_px, 1), descriptors))
-    return [each for each in found if len(each[0])]
-
-
-def _places_by_features(photo: _Searched, design: np.ndarray, size_mm: tuple[float, float]) -> Iterator[np.ndarray]:
-    """Yield corners 4×2 px, those of most agreeing matches first."""
-    seen, seen_descriptors = photo.features
-    features = _design_features(design.tobytes(), design.shape, size_mm)
-    if len(seen) < 8 or not features:
-        return
-    parts, matcher = [], cv2.BFMatcher(cv2.NORM_L2)
-    for own, own_descriptors in features:
-        pairs = matcher.knnMatch(own_descriptors, seen_descriptors, _NEIGHBORS)
-        index, distance = np.array([[(m.trainIdx, m.distance) for m in pair] for pair in pairs]).transpose(2, 0, 1)
-        quality = distance / np.minimum(distance[:, -1:] + 1e-6, distance[:, 0].mean())
-        a, b = own.repeat(_NEIGHBORS, 0), seen[index.ravel().astype(int)]
-        parts.append((a[:, :2], b[:, :2], b[:, 3] - a[:, 3], np.log(b[:, 2] / a[:, 2]), quality.ravel()))
-    source, target, angle, size, quality = map(np.concatenate, zip(*parts, strict=True))
-    best = np.argsort(quality, kind="stable")[:_MOST_MATCHES]
-    source, target, angle, size = (each[best] for each in (source, target, angle, size))
-    shape = np.array(size_mm) / max(size_mm)
-    arm = (shape / 2 - source) * np.exp(size)[:, None]
-    cosine, sine = np.cos(angle), np.sin(angle)
-    middle = target + np.column_stack([cosine * arm[:, 0] - sine * arm[:, 1], sine * arm[:, 0] + cosine * arm[:, 1]])
-    x, y, log, c, s = np.column_stack([middle, size, cosine, sine]).astype(np.float32).T
-    near = (_VOTE_SHARE * np.exp(log)) ** 2
-    agree = (x[:, None] - x) ** 2 + (y[:, None] - y) ** 2 < np.minimum(near[:, None], near)
-    agree &= np.abs(log[:, None] - log) < _VOTE_LOG_SIZE
-    agree &= c[:, None] * c + s[:, None] * s > np.cos(_VOTE_RAD)
-    for _ in range(_MOST_PLACES):
-        votes = cv2.reduce(agree.view(np.uint8), 1, cv2.REDUCE_SUM, dtype=cv2.CV_32S).ravel()
-        leader = int(votes.argmax())
-        if votes[leader] < _LEAST_VOTES:
-            return
-        members = np.flatnonzero(agree[leader])
-        agree[:, members] = False
-        agree[members] = False
-        middle_size = np.exp(np.median(size[members]))
-        pairs, most_px = (source[members], target[members]), float(max(2.0, 0.02 * middle_size))
-        homography, _ = cv2.findHomography(*pairs, cv2.USAC_MAGSAC, most_px, maxIters=2000)
-        corners = rect_corners((0, 0, *shape))
-        quad = None if homography is None else apply_homography(homography, corners)
-        if quad is not None and is_plausible_quad(quad):
-            yield quad
-        turn = np.median(cosine[members]), np.median(sine[members])
-        matrix = middle_size * np.array([[turn[0], turn[1]], [-turn[1], turn[0]]])
-        yield (corners - shape / 2) @ matrix + np.median(middle[members], 0)
-
-
-def _places_by_templates(srgb: np.ndarray, design: np.ndarray, size_mm: tuple[float, float]) -> list[np.ndarray]:
-    """Corners 4×2 px where a small design correlates best with the picture, over sizes, angles and slants."""
-    found: list[tuple[float, np.ndarray]] = []
-    height, width = srgb.shape[:2]
-    longer_px = SMALLEST_PRINT_PX * 0.8 * max(size_mm) / min(size_mm)
-    drawn = _draw(design, size_mm, 4 * _TEMPLATE_PX)
-    while longer_px < 0.95 * max(height, width):
-        scale = _TEMPLATE_PX / longer_px
-        small = cv2.resize(srgb, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-        middle = np.array(small.shape[1::-1]) / 2
-        for turn in _TURNS_DEG:
-            matrix = cv2.getRotationMatrix2D(tuple(middle - 0.5), turn, 1.0)
-            turned = cv2.warpAffine(small, matrix, small.shape[1::-1], borderMode=cv2.BORDER_REPLICATE)
-            for slant in _SLANTS:
-                size = max(6, round(drawn.shape[1] / 4 * slant)), max(6, round(drawn.shape[0] / 4))
-                if size[0] >= small.shape[1] or size[1] >= small.shape[0]:
-                    continue
-                template = cv2.resize(drawn, size, interpolation=cv2.INTER_AREA)
-                _, peak, _, (x, y) = cv2.minMaxLoc(cv2.matchTemplate(turned, template, cv2.TM_CCOEFF_NORMED))
-                quad = rect_corners((x, y, *size)) - middle
-                angle = np.radians(turn)
-                back = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
-                found.append((float(peak), (quad @ back + middle) / scale))
-        longer_px *= _TEMPLATE_STEP
-    kept: list[np.ndarray] = []
-    for _, quad in sorted(found, key=lambda pair: -pair[0]):
-        side = np.ptp(quad, axis=0).max()
-        if all(np.abs(quad - other).max() > 0.25 * side for other in kept):
-            kept.append(quad)
-    return kept[:_MOST_PLACES]
-
-
 class _Refiner:
     """Refine places of a design on intensities; holds the design at each size."""
 
-    def __init__(self, photo: _Searched, design: np.ndarray, size_mm: tuple[float, float]):
+    def __init__(self, photo: SearchedPhoto, design: np.ndarray, size_mm: tuple[float, float]):
         self.photo, self.design, self.size_mm = photo, design, size_mm
-        self.template = cache(lambda px, surroundings: _SmallDesign(_draw(design, size_mm, px), surroundings))
+        self.template = cache(lambda px, surroundings: _SmallDesign(draw_design(design, size_mm, px), surroundings))
 
     def refine(self, quad: np.ndarray, closely: bool = True) -> FoundPlace | None:
         """The refined place, or None if it is none that a camera can see. To compare directions it need not be done
@@ -354,15 +233,17 @@ class _SmallDesign:
         and the standard deviation of a corner's coordinate.
         """
         px_from_unit, best, hessian = fit_homography(_UNIT, quad), (-1.0, quad), np.eye(8)
-        used = 6 if mixes else 3
+        used, best_number = 6 if mixes else 3, 0
         colors, by_term, curvature = self.colors[:used], self.by_term[:used], self.curvature[:used, :used]
-        for _ in range(_COLOR_STEPS if mixes else _STEPS):
+        for number in range(_COLOR_STEPS if mixes else _STEPS):
+            if number > best_number + _PATIENCE or (number == _HOPELESS_STEPS and best[0] < _HOPELESS):
+                break
             index = index_homography(px_from_unit @ np.linalg.inv(self.index_from_unit))
             how = None, cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, cv2.BORDER_REPLICATE
             seen, _ = self._less_surroundings(cv2.warpPerspective(srgb, index, self.size, *how), 0.5)
             likeness = float(np.vdot(self.weighted, seen)) / seen.shape[1]
             if likeness > best[0] or mixes:
-                best = likeness, apply_homography(px_from_unit, _UNIT)
+                best, best_number = (likeness, apply_homography(px_from_unit, _UNIT)), number
             mixture = np.eye(3, dtype=np.float32) * max(likeness, 0.3)
             if mixes:
                 ridge = 1e-3 * seen.shape[1] * np.eye(6)
