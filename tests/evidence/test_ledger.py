@@ -44,7 +44,7 @@ from patchproof.report.write import ledger_bars
 from patchproof.sheets.manifest import Manifest
 from test_verify_run import measured
 
-SIZE, PHOTOS = (640, 480), 5
+SIZE, PHOTOS = (480, 360), 5
 
 
 def test_shapley_splits_what_players_do_together_evenly_and_sums_to_the_whole():
@@ -310,8 +310,8 @@ def test_no_ledger_where_none_was_asked_for(tmp_path):
 
 @pytest.mark.parametrize(("sigma", "tolerance"), [(0.5, 0.01), (3.0, 0.03)])
 def test_paper_and_ink_are_found_through_blur(sigma, tolerance):
-    surface, homography = surface_of(sheet()), view(5, 5, 400, size_px=SIZE)
-    srgb = photograph(raster(False), homography, SIZE, blur_px=sigma, light=0.75, fine=2)
+    surface, homography = surface_of(sheet()), view(5, 5, 400, size_px=(640, 480))
+    srgb = photograph(raster(False), homography, (640, 480), blur_px=sigma, light=0.75, fine=2)
     on_piece = {i: surface.corners_mm[i] for i in surface.piece_ids}
     paper, ink, blur, agreement = pattern_light(srgb, homography, on_piece, surface.dictionary, 0.9 * sigma)
     assert paper == pytest.approx(0.75, abs=tolerance + 0.02) and ink == pytest.approx(0, abs=tolerance)
