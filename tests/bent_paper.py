@@ -92,20 +92,27 @@ def printed(
     if x or y:
         single, place = (np.roll(a, (y, x), (0, 1)) for a in marker_image(first, (size, size)))
         image, reserved = np.where(place[..., None], single, image), reserved | place
-    page = cv2.resize(codes / 255.0, (size, size), interpolation=cv2.INTER_NEAREST)
+    page = codes / 255.0
     if moved is not None:
+        page = cv2.resize(page, (size, size), interpolation=cv2.INTER_NEAREST)
         middle = np.array([[PAGE_PER_MM, 0, size / 2 - 0.5], [0, PAGE_PER_MM, size / 2 - 0.5], [0, 0, 1.0]])
         matrix = middle @ np.vstack([moved, [0, 0, 1]]) @ np.linalg.inv(middle)
         page = cv2.warpAffine(page, matrix[:2], (size, size), flags=cv2.INTER_LINEAR, borderValue=(1, 1, 1))
-    page = np.where(reserved[..., None], image, page)
-    with torch.inference_mode():  # another printer than the promise has
-        page = load_printer("uncoated").apply(torch.tensor(page.transpose(2, 0, 1)[None], dtype=torch.float32))
+    light = cv2.resize(_printed_light(page), (size, size), interpolation=cv2.INTER_NEAREST)
+    light[reserved] = _printed_light(image[reserved][None])[0]
+    return light
+
+
+def _printed_light(srgb: np.ndarray) -> np.ndarray:
+    """Linear light H×W×3 that another printer than the promise's makes of sRGB."""
+    with torch.inference_mode():
+        page = load_printer("uncoated").apply(torch.tensor(srgb.transpose(2, 0, 1)[None], dtype=torch.float32))
     return linear_from_srgb(page[0].numpy().transpose(1, 2, 0))
 
 
 def flat(points: np.ndarray) -> np.ndarray:
     """Flat paper."""
-    return np.column_stack([points, np.zeros(len(points))])
+    return np.vstack([points.T, np.zeros(len(points))]).T
 
 
 def bent(slope: Callable[[np.ndarray], np.ndarray], direction_rad: float) -> Place:
@@ -117,9 +124,9 @@ def bent(slope: Callable[[np.ndarray], np.ndarray], direction_rad: float) -> Pla
     turn = np.array([[np.cos(direction_rad), -np.sin(direction_rad)], [np.sin(direction_rad), np.cos(direction_rad)]])
 
     def place(points: np.ndarray) -> np.ndarray:
-        along, rulings = (points @ turn).T
-        xy = np.column_stack([np.interp(along, ways, across), rulings]) @ turn.T
-        return np.column_stack([xy, np.interp(along, ways, depth)])
+        along, rulings = turn.T @ points.T
+        xy = turn @ [np.interp(along, ways, across), rulings]
+        return np.vstack([xy, np.interp(along, ways, depth)]).T
 
     return place
 
