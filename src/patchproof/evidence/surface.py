@@ -176,12 +176,13 @@ def with_markers(design: np.ndarray, surface: Surface, ink: np.ndarray) -> np.nd
     if not on_design:
         return design
     zoom = max(1, DESIGN_PX // max(design.shape))  # markers need more pixels than a small design has
-    design = design.repeat(zoom, 0).repeat(zoom, 1)
+    design = design.repeat(zoom, 0).repeat(zoom, 1)  # a copy
     x, y, *size_mm = surface.rect_mm
     markers = tuple(square_marker(i, tuple(c[0] - (x, y)), float(c[1, 0] - c[0, 0])) for i, c in on_design.items())
     piece = Piece((size_mm[0], size_mm[1]), markers, marker_rect(markers[0])[2] / MARKER_MODULES)
     image, reserved = marker_image(piece, (design.shape[1], design.shape[0]))
-    return np.where(reserved[..., None], (ink + linear_from_srgb(image) * (1 - ink)).astype(np.float32), design)
+    design[reserved] = (ink + linear_from_srgb(image[reserved]) * (1 - ink)).astype(np.float32)
+    return design
 
 
 def piece_picture(surface: Surface, design: np.ndarray) -> np.ndarray:
