@@ -32,7 +32,7 @@ from patchproof.sheets.piece import marker_image
 from test_optimize import scene_with, toml
 
 RNG = np.random.default_rng(0)
-SMALL = {"camera__photo_px": [96, 96]}
+SMALL = {"camera__photo_px": [64, 64]}
 DRAFT = {"promise": PromiseOptions(views=8, controls=("bare",))}
 
 
@@ -184,11 +184,12 @@ def test_pictures_are_read_like_photographs(tmp_path, kind):
 
 def test_gamut_is_the_printers_own_table(tmp_path):
     picture = np.full((64, 64, 3), (0, 255, 0), np.uint8)
-    record = import_patch(picture, scene_with(tmp_path, **SMALL), tmp_path / "run", **DRAFT).details
+    large = {"camera__photo_px": [96, 96]}  # photographs that show the whole picture
+    record = import_patch(picture, scene_with(tmp_path, **large), tmp_path / "run", **DRAFT).details
     green = float(load_printer("office").gamut[0, -1, 0])
     assert green > 2 and record["imported"]["out_of_gamut"] == 1
     assert record["imported"]["delta_e00"] == pytest.approx(green, abs=0.01)
-    exact = scene_with(tmp_path, **SMALL, printer__profile="identity")
+    exact = scene_with(tmp_path, **large, printer__profile="identity")
     record = import_patch(picture, exact, tmp_path / "exact", **DRAFT).details["imported"]
     assert record["out_of_gamut"] == record["delta_e00"] == 0
     assert not list(record["notes"])

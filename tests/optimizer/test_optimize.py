@@ -62,7 +62,7 @@ def toml(path, **changes):
     """A scene file of few steps and small photographs: for tests of files, not of figures."""
     lines = []
     data = {key: dict(value) for key, value in SCENE.items()}
-    data["camera"] = {"photo_px": [96, 96]}
+    data["camera"] = {"photo_px": [64, 64]}
     data["optimize"] |= {"steps": 4, "views": 2}
     for key, value in changes.items():
         table, name = key.split("__")

@@ -42,7 +42,7 @@ distance_mm = [600, 800]
 [background]
 color = [0.5, 0.5, 0.5]
 [camera]
-photo_px = [96, 96]
+photo_px = [64, 64]
 [optimize]
 steps = 4
 views = 2
