@@ -25,6 +25,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from patchproof.optimizer.promise import PromiseOptions
 
@@ -32,11 +33,12 @@ CHANGES = {"os.rename", "os.remove", "os.mkdir", "os.rmdir"}
 JOBS = ("optimize", "verify", "sheet", "reprint", "study")
 IN_THE_SUITE = len(JOBS)
 LATE = """
-    kornia.enhance kornia.filters matplotlib.figure matplotlib.backends.backend_agg scipy.stats.qmc scipy.spatial jinja2
-    pikepdf pypdfium2 reportlab.pdfgen.canvas segno safetensors.torch fuzz.readers test_optimize test_verify_run
-    fake_networks toy_studies patchlab.study.study patchproof.report.write
-    patchproof.app.verify patchproof.optimizer.run patchproof.reprints.run_sheet patchproof.reprints.reprint
-    patchproof.classifier.builtin patchproof.classifier.custom patchproof.report.write"""
+    patchproof.mesh.primitives patchproof.networks.tracing torch.onnx reportlab.lib.fonts kornia.enhance
+    kornia.filters matplotlib.figure matplotlib.backends.backend_agg scipy.stats.qmc scipy.spatial jinja2 pikepdf
+    pypdfium2 reportlab.pdfgen.canvas segno safetensors.torch fuzz.readers test_optimize test_verify_run fake_networks
+    toy_studies patchlab.study.study patchproof.report.write patchproof.app.verify patchproof.optimizer.run
+    patchproof.reprints.run_sheet patchproof.reprints.reprint patchproof.classifier.builtin
+    patchproof.classifier.custom patchproof.report.write"""
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs os.fork")
@@ -204,6 +206,7 @@ def kills(base: Path, count: int, seed: int = 0, job: str | None = None) -> Iter
         warnings.simplefilter("ignore")
         for module in LATE.split():  # once, and not in every fork
             importlib.import_module(module)
+        Image.init()
         gc.freeze()  # a fork that collected garbage would copy what it looks through, in 0.2 s
         assert forked(lambda: prepare(base)) == 0
         lines = [killed(base, job, rng) for job in jobs]

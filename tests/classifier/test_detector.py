@@ -261,7 +261,7 @@ def test_detectors_carry_a_run_from_scene_to_verdict(tmp_path, shipped, two_stag
     assert page.count('aria-label="the object') == 3  # with the photograph of the first screen
     found = sum(entry.predictions[names[0]].target_box is not None for entry in report.photos)
     assert found <= page.count('aria-label="the target') <= found + 1
-    shown = re.findall(r"([^<>]*) <span[^<]*</span><br>(?:not )?recognized", page)
+    shown = re.findall(r">([^<>]*) <span[^<]*</span><br>(?:not )?recognized", page)
     assert shown and set(shown) == {"box truck"}
     truth = scene.boxes(scene.draw("reprint", 2))
     for name, loaded in zip(names, (shipped, two_stage.rcnn()), strict=True):
