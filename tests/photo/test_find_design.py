@@ -18,7 +18,7 @@ from patchproof.evidence.surface import printed_colors, surface_of
 from patchproof.evidence.task import promised_ranges
 from patchproof.photo import detect
 from patchproof.photo.design_places import SMALLEST_PRINT_PX
-from patchproof.photo.find_design import find_design, refuse_other_order
+from patchproof.photo.find_design import _refiners, find_design, refuse_other_order
 from patchproof.photo.read import Photo
 from patchproof.photo.rejection import PhotoRejected
 from patchproof.sheets.markers import aruco_dictionary
@@ -88,6 +88,14 @@ def test_a_design_is_found_to_a_pixel(design, side_px):
     assert found.located == "found"
     off_px = np.abs(found.px - expected)
     assert off_px.max() < 1 and off_px.max() < 4 * found.sigma_px
+
+
+def test_a_proposal_an_eighth_of_the_side_off_is_refined_and_not_given_up():
+    expected, around = corners(150), np.arange(8) * np.pi / 4
+    refiner, _ = _refiners(photograph((blocks(2), expected)), blocks(2), (100.0, 100.0))
+    for proposed in expected + 150 / 8 * np.column_stack([np.cos(around), np.sin(around)])[:, None]:
+        place = refiner.refine(proposed)
+        assert place is not None and place.accepted and np.abs(place.corners_px - expected).max() < 1
 
 
 @pytest.mark.parametrize("number", [439, 448])
