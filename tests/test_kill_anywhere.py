@@ -36,7 +36,7 @@ LATE = """
     patchproof.mesh.primitives patchproof.networks.tracing torch.onnx reportlab.lib.fonts kornia.enhance
     kornia.filters matplotlib.figure matplotlib.backends.backend_agg scipy.stats.qmc scipy.spatial jinja2 pikepdf
     pypdfium2 reportlab.pdfgen.canvas segno safetensors.torch fuzz.readers test_optimize test_verify_run fake_networks
-    toy_studies patchlab.study.study patchproof.report.write patchproof.app.verify patchproof.optimizer.run
+    toy_studies patchlab.study.study patchproof.app.verify patchproof.optimizer.run
     patchproof.reprints.run_sheet patchproof.reprints.reprint patchproof.classifier.builtin
     patchproof.classifier.custom patchproof.report.write"""
 

@@ -127,7 +127,8 @@ def check_picture(picture: str, figures: str):
 def test_pictures_show_the_demo_of_today(name):
     """Each says in its comment which sheet it shows; an id follows from the scene and its seed."""
     with Image.open(ROOT / ".readme" / f"{name}.png") as image:
-        assert image.info["Comment"] == load_scene(PACKAGE / "app" / "demo.toml").sheet_id
+        remedy = "take it again from the demo, with its sheet's id as the PNG's comment"
+        assert image.info["Comment"] == load_scene(PACKAGE / "app" / "demo.toml").sheet_id, remedy
 
 
 def interval(value: float, low: float, high: float) -> str:

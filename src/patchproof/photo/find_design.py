@@ -211,7 +211,7 @@ class _SmallDesign:
         power = np.abs(np.fft.fft2(self.weighted.sum(0).reshape(colors.shape[1:]))) ** 2
         self.freedom = float(power.sum() ** 2 / max((power**2).sum(), 1e-12))  # independent pixels, as it were
         half = np.array(self.size) / 2
-        self.index_from_unit = np.array([[half[0], 0, half[0]], [0, half[1], half[1]], [0, 0, 1.0]])
+        self.unit_from_index = np.linalg.inv([[half[0], 0, half[0]], [0, half[1], half[1]], [0, 0, 1.0]])
         units = np.stack(np.meshgrid(*((np.arange(n) + 0.5) / n * 2 - 1 for n in self.size)), -1).reshape(-1, 2)
         by_x, by_y = (homography_jacobian(np.eye(3), units).reshape(-1, 2, 8) * half[:, None]).transpose(1, 2, 0)
         along_y, along_x = (slope.reshape(6, 1, -1) for slope in np.gradient(colors, axis=(1, 2)))
@@ -238,7 +238,7 @@ class _SmallDesign:
         for number in range(_COLOR_STEPS if mixes else _STEPS):
             if number > best_number + _PATIENCE or (number == _HOPELESS_STEPS and best[0] < _HOPELESS):
                 break
-            index = index_homography(px_from_unit @ np.linalg.inv(self.index_from_unit))
+            index = index_homography(px_from_unit @ self.unit_from_index)
             how = None, cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, cv2.BORDER_REPLICATE
             seen, _ = self._less_surroundings(cv2.warpPerspective(srgb, index, self.size, *how), 0.5)
             likeness = float(np.vdot(self.weighted, seen)) / seen.shape[1]
