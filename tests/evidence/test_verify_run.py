@@ -457,11 +457,14 @@ def test_the_patch_s_own_photographs_are_no_control(few, tmp_path):
     (tmp_path / "mean").mkdir()
     for name, as_name in (("a.JPG", "copied.jpg"), ("b0.jpg", "b0.jpg")):
         (tmp_path / "mean" / as_name).write_bytes((few / name).read_bytes())
+    Image.open(few / "b0.jpg").resize((640, 480)).save(tmp_path / "mean/sent.jpg", quality=60)  # as messengers do
     save(half_lit(20), tmp_path / "mean/own.jpg")
     evidence = verified(few, controls=tmp_path)
     (control,) = evidence.controls
     assert control.n == 1
-    assert "mean/copied.jpg has the bytes of a.JPG, which counts once" in evidence.summary.left_out
+    said = evidence.summary.left_out
+    assert "mean/copied.jpg has the bytes of a.JPG, which counts once" in said
+    assert any("mean/sent.jpg does not count: it shows the patch, not the control" in sentence for sentence in said)
 
 
 @pytest.mark.parametrize(("contrast", "nothing"), [(1, True), (3, False)])

@@ -3,7 +3,7 @@
 In: `PhotoItem`s, a `Task` (all that a photograph is measured against), the networks, open workers. Out: a
 `MeasuredPhoto` for each, in their order, without pictures and squares. A file that cannot be read or measured, or that
 ends its process each time, becomes a rejected entry, and the batch continues. Photographs of controls are only
-classified, since a bare object carries no marker; one that shows a single tone or noise is rejected.
+classified, since a bare object carries no marker; one that shows the patch, or a single tone or noise, is rejected.
 
 The journal has one flushed line per finished photograph, so that a kill loses only those in work, and a key that stands
 for everything a result depends on besides the photograph itself. Lines of other keys and broken lines are dropped, so
@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Annotated, TextIO
 
@@ -30,7 +31,7 @@ from patchproof.base.fingerprint import value_sha256
 from patchproof.base.geometry import apply_homography, rect_corners
 from patchproof.base.input import MAX_JSON_BYTES, hash_file, is_file, read_file
 from patchproof.base.output import make_folder, write_atomically
-from patchproof.base.resample import downscaled_size, to_sixteenths
+from patchproof.base.resample import downscale, downscaled_size, to_sixteenths
 from patchproof.base.validation import Finite, Share, StrictModel, validate_model
 from patchproof.base.version import __version__
 from patchproof.base.workers import Workers, result_of
@@ -41,6 +42,7 @@ from patchproof.evidence.reproject import PhotoSquare, photo_square
 from patchproof.evidence.results import PhotoEntry, Remark, Trace
 from patchproof.evidence.surface import Surface
 from patchproof.evidence.task import Options, Task
+from patchproof.photo import detect
 from patchproof.photo.exif import has_camera_shape, time_and_camera
 from patchproof.photo.limits import MOST_BYTES, run_limited
 from patchproof.photo.quality import FrameLight, is_featureless
@@ -48,12 +50,15 @@ from patchproof.photo.read import read_photo
 from patchproof.photo.registration import DesignCorners
 from patchproof.photo.rejection import PhotoRejected
 from patchproof.sheets.manifest import Manifest
+from patchproof.sheets.markers import aruco_dictionary
 
 MAX_PICTURED_PHOTOS = 120  # photographs whose pictures are on the page; the rest is listed. Keeps it below some 15 MB
 _THUMBNAIL_PX = 560  # longer side: enough for a phone's width at twice its density, some 40 kB as JPEG
 _DESIGN_COLOR, _MARKER_COLOR = (255, 64, 129), (0, 200, 140)
 _DIED_ADVICE = "measuring it ended its process each time, for want of memory: save it smaller"
 _EMPTY_ADVICE = "it shows one tone or noise and nothing else: take it again"
+_CONTROL_PX, _PATCH_MARKERS = 2400, 2  # longer side in which a control is searched for the patch; markers that prove it
+_PATCH_ADVICE = "it shows the patch, not the control: put it among the patch's photographs"
 _CROP_ADVICE = "it is a crop or a screenshot by its shape, its name or EXIF: it counts, but use the camera's own file"
 _MOST_OUTSIDE = 0.01  # of the picture's longer side, for corners on its edge
 _OUTSIDE_ADVICE = "its corners lie outside of it: name pixels of the upright picture, which has {} × {}"
@@ -241,6 +246,8 @@ def _measure(task: Task, item: PhotoItem) -> MeasuredPhoto:
     if item.control is not None:
         if is_featureless(square_of(photo.srgb)[0]):
             raise PhotoRejected("empty", None, None, _EMPTY_ADVICE)
+        if (markers := _patch_markers(photo.srgb, task.surface)) >= _PATCH_MARKERS:
+            raise PhotoRejected("wrong_sheet", markers, 0, _PATCH_ADVICE)
         entry = PhotoEntry(file=item.file, status="judged", box=box, said=photo.said)
         return MeasuredPhoto(entry, True, squares=squares, trace=_trace(item.path, photo.srgb))
     view = pinhole_photo(photo, task.camera)
@@ -265,6 +272,17 @@ def _measure(task: Task, item: PhotoItem) -> MeasuredPhoto:
         said += (_OTHER_DPI.format(*photo.dpi, task.scan_dpi),)
     entry = entry.changed(box=box or entry.box, said=said)
     return replace(measured, entry=entry, pictures=pictures, squares=squares, trace=_trace(item.path, photo.srgb))
+
+
+def _patch_markers(srgb: np.ndarray, surface: Surface) -> int:
+    """The number of the patch's markers in a control's photograph, whose own sheet has others: a coarse search, since a
+    full one takes a second where there are none.
+    """
+    detections, small = dict[int, list[np.ndarray]](), downscale(srgb, _CONTROL_PX)
+    region, dictionary = detect.full_region(small), aruco_dictionary(surface.dictionary)
+    for level in islice(detect.pyramid_levels(small, region), 2):
+        detect.search_level(small, region, level, dictionary, detections)
+    return len(detections.keys() & surface.piece_ids)
 
 
 def _trace(path: Path, srgb: np.ndarray) -> Trace:
