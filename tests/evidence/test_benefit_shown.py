@@ -194,7 +194,7 @@ def test_who_cannot_tell_is_told_how_many_photographs_the_plan_asks_for():
     alone, shown = sessions_needed(small), sessions_to_show(small)
     assert alone < shown and photos_line(small, (), "gray").endswith(f"The promise alone is proved in {alone} places.")
     lost = needs((6,), worth=worth, promise=USELESS)  # one sentence, and no "take more" beside it
-    assert lost == "No 150 photographs are likely to show that it helps: make a design that gains more."
+    assert lost == "Even 150 photographs are unlikely to show that it helps: make a design that gains more."
     draft = promise_beside(0.4, {"bare": (0.38, -0.2, 0.24)}).changed(draft=True)
     assert "promise it again first (patchproof promise RUN), or" in needs((6,), worth=worth, promise=draft)
     report = some_report().changed(summary=some_report().summary.changed(next_step="Take 10."))

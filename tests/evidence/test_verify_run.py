@@ -38,6 +38,7 @@ from patchproof.photo.quality import FrameLight, is_featureless
 from patchproof.photo.read import MORE_PAGES, Photo
 from patchproof.report.words import verdict_lines
 from patchproof.sheets.markers import DICTIONARY, aruco_dictionary
+from patchproof.sheets.piece import marker_ids
 
 
 def promise(conditions=(CONDITION,)):
@@ -464,7 +465,25 @@ def test_the_patch_s_own_photographs_are_no_control(few, tmp_path):
     assert control.n == 1
     said = evidence.summary.left_out
     assert "mean/copied.jpg has the bytes of a.JPG, which counts once" in said
-    assert any("mean/sent.jpg does not count: it shows the patch, not the control" in sentence for sentence in said)
+    assert any("mean/sent.jpg does not count: it shows the patch, not the control mean" in each for each in said)
+
+
+def test_a_control_s_sheet_under_another_control_s_name_does_not_count(few, tmp_path):
+    """In `mine`, a name of the user's own, it does."""
+    manifest = make_manifest()
+    piece_ids = sorted(surface_of(manifest).piece_ids)
+    ids = dict(zip(piece_ids, marker_ids(manifest.sheet_id, "gray", len(piece_ids)), strict=True))
+    markers = tuple(marker.changed(id=ids.get(marker.id, marker.id)) for marker in manifest.markers)
+    page = page_raster(manifest.changed(markers=markers), True)
+    for number, name in enumerate(("gray", "mean", "bare", "mine")):
+        (tmp_path / name).mkdir()
+        homography = view(10 + number, 5, 550, size_px=(800, 600))
+        save(photograph(page, homography, (800, 600), blur_px=0.5), tmp_path / name / "a.jpg")
+        save(half_lit(20 + number), tmp_path / name / "b.jpg")
+    evidence = verified(few, controls=tmp_path)
+    assert {control.name: control.n for control in evidence.controls} == {"gray": 2, "mean": 1, "bare": 1, "mine": 2}
+    said = "\n".join(evidence.summary.left_out)
+    assert all(f"it shows the control gray, not the control {name}" in said for name in ("mean", "bare"))
 
 
 @pytest.mark.parametrize(("contrast", "nothing"), [(1, True), (3, False)])

@@ -73,5 +73,6 @@ def test_more_places_show_smaller_gains_and_one_place_or_a_small_gain_shows_none
     assert sessions_to_show(promise_of(0.1, 0.8, goal="deceive")) <= 4
     said = shot_sections(promise_of(0.5, 0.5), SETTINGS)[0][1]
     assert (
-        said[-2].startswith("No 150 photographs are likely to show that it helps") and "Take at least" not in said[-2]
+        said[-2].startswith("Even 150 photographs are unlikely to show that it helps")
+        and "Take at least" not in said[-2]
     )

@@ -31,7 +31,7 @@ def load_custom(dotted: str, base: Path) -> Classifier:
     name, factory = f"module:{dotted}", _factory(dotted, base)
     try:
         network = factory()
-    except Exception as error:  # the user's code may raise anything
+    except (Exception, SystemExit) as error:  # the user's code may raise anything
         raise Refused(f"a network from {name}", f"{type(error).__name__} ({error})", "fix the factory") from error
     return network if isinstance(network, Classifier) else labeled_module(network, name)
 
@@ -136,7 +136,7 @@ def _factory(dotted: str, base: Path):
     sys.path.append(str(base.resolve()))  # last, so that nothing beside the scene shadows an installed package
     try:
         module = importlib.import_module(module_name)
-    except Exception as error:  # SyntaxError and the like in the user's module too
+    except (Exception, SystemExit) as error:  # SyntaxError and the like in the user's module too
         do = "install it, or put it beside the scene file"
         raise Refused(f"the module {module_name} of module:{dotted}", f"an import that fails ({error})", do) from error
     finally:

@@ -57,8 +57,10 @@ _THUMBNAIL_PX = 560  # longer side: enough for a phone's width at twice its dens
 _DESIGN_COLOR, _MARKER_COLOR = (255, 64, 129), (0, 200, 140)
 _DIED_ADVICE = "measuring it ended its process each time, for want of memory: save it smaller"
 _EMPTY_ADVICE = "it shows one tone or noise and nothing else: take it again"
-_CONTROL_PX, _PATCH_MARKERS = 2400, 2  # longer side in which a control is searched for the patch; markers that prove it
-_PATCH_ADVICE = "it shows the patch, not the control: put it among the patch's photographs"
+# longer side in which a control is searched for sheets, coarsely, as a full search takes a second where there are none;
+# markers that prove a sheet
+_CONTROL_PX, _PROVING_MARKERS = 2400, 2
+_OTHER_SHEET_ADVICE = "it shows the {}, not the control {}: put it where it belongs"
 _CROP_ADVICE = "it is a crop or a screenshot by its shape, its name or EXIF: it counts, but use the camera's own file"
 _MOST_OUTSIDE = 0.01  # of the picture's longer side, for corners on its edge
 _OUTSIDE_ADVICE = "its corners lie outside of it: name pixels of the upright picture, which has {} × {}"
@@ -246,8 +248,7 @@ def _measure(task: Task, item: PhotoItem) -> MeasuredPhoto:
     if item.control is not None:
         if is_featureless(square_of(photo.srgb)[0]):
             raise PhotoRejected("empty", None, None, _EMPTY_ADVICE)
-        if (markers := _patch_markers(photo.srgb, task.surface)) >= _PATCH_MARKERS:
-            raise PhotoRejected("wrong_sheet", markers, 0, _PATCH_ADVICE)
+        _refuse_other_sheet(photo.srgb, task, item.control)
         entry = PhotoEntry(file=item.file, status="judged", box=box, said=photo.said)
         return MeasuredPhoto(entry, True, squares=squares, trace=_trace(item.path, photo.srgb))
     view = pinhole_photo(photo, task.camera)
@@ -274,15 +275,19 @@ def _measure(task: Task, item: PhotoItem) -> MeasuredPhoto:
     return replace(measured, entry=entry, pictures=pictures, squares=squares, trace=_trace(item.path, photo.srgb))
 
 
-def _patch_markers(srgb: np.ndarray, surface: Surface) -> int:
-    """The number of the patch's markers in a control's photograph, whose own sheet has others: a coarse search, since a
-    full one takes a second where there are none.
+def _refuse_other_sheet(srgb: np.ndarray, task: Task, control: str) -> None:
+    """Raise `PhotoRejected` if a control's photograph shows the patch, or the sheet of a control of another name. Under
+    names of the user's own only the patch is refused.
     """
     detections, small = dict[int, list[np.ndarray]](), downscale(srgb, _CONTROL_PX)
-    region, dictionary = detect.full_region(small), aruco_dictionary(surface.dictionary)
+    region, dictionary = detect.full_region(small), aruco_dictionary(task.surface.dictionary)
     for level in islice(detect.pyramid_levels(small, region), 2):
         detect.search_level(small, region, level, dictionary, detections)
-    return len(detections.keys() & surface.piece_ids)
+    for kind, ids in task.ids_by_kind.items():
+        markers, known = len(detections.keys() & ids), control in (*task.ids_by_kind, "bare")
+        if markers >= _PROVING_MARKERS and kind != control and (known or kind == "design"):
+            shown = "patch" if kind == "design" else f"control {kind}"
+            raise PhotoRejected("wrong_sheet", markers, 0, _OTHER_SHEET_ADVICE.format(shown, control))
 
 
 def _trace(path: Path, srgb: np.ndarray) -> Trace:

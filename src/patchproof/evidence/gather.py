@@ -8,7 +8,7 @@ journal, finished photographs survive a kill.
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import closing, nullcontext
+from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from pathlib import Path, PurePosixPath
@@ -78,8 +78,11 @@ def gather_evidence(
             known = {name for file, path in sources[:count] for name in (file, path.name)}
             if unused := [name for name in options.corners if PurePosixPath(name).name not in known]:
                 left_out.append(f"corners of {len(unused)} other photographs ({summarize_names(unused)})")
-    journal_file = closing(Journal(journal, settings_key(manifest, options), resume)) if journal else nullcontext()
-    with journal_file as open_journal, open_workers(compute.jobs, compute.cluster) as workers:
+    # workers first: a cluster that is not there leaves no journal
+    with open_workers(compute.jobs, compute.cluster) as workers, ExitStack() as stack:
+        open_journal = Journal(journal, settings_key(manifest, options), resume) if journal else None
+        if open_journal is not None:
+            stack.callback(open_journal.close)
         results = measure_all(task, items, judges, workers, open_journal, on_pictures, advance)
         if options.corners and not options.find:
             advice = "--corners FILE does not name this photograph: add it there, or add --find"

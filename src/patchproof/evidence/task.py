@@ -16,6 +16,7 @@ from patchproof.evidence.results import PhotoEntry
 from patchproof.evidence.surface import PromisedColors, Surface, promised_of, surface_of
 from patchproof.photo.rejection import PhotoRejected
 from patchproof.sheets.manifest import ConditionClaim, Manifest
+from patchproof.sheets.piece import SHEET_KINDS, marker_ids
 
 if TYPE_CHECKING:
     from patchproof.channel.lens import Camera
@@ -120,6 +121,7 @@ class Task:
     camera: "Camera | None"
     photo_px: tuple[int, int] | None  # of the promised photographs
     find: np.ndarray | None = None  # the design's pixels, to be searched for
+    ids_by_kind: dict[str, frozenset[int]] = field(default_factory=dict)  # of markers, of the sheet and its controls
 
 
 def task_of(manifest: Manifest, options: Options, judges: Judges | None) -> Task:
@@ -131,4 +133,6 @@ def task_of(manifest: Manifest, options: Options, judges: Judges | None) -> Task
     sizes = tuple(sorted({model.input_px for model in judges.models})) if judges else ()
     camera = options.scan_dpi, options.camera, photo_px and tuple(photo_px)
     find = manifest.design.pixels() if options.find and manifest.design else None
-    return Task(surface, promised_of(manifest, surface, options.printer), ranges, sizes, *camera, find)
+    ids = {kind: frozenset(marker_ids(manifest.sheet_id, kind, len(surface.piece_ids))) for kind in SHEET_KINDS}
+    ids["design"] = surface.piece_ids
+    return Task(surface, promised_of(manifest, surface, options.printer), ranges, sizes, *camera, find, ids)

@@ -194,7 +194,7 @@ def photos_line(
         proves = f"show that it {promise.target.goal.words['helps']}" if control else "prove this promise"
         unsure = control and promise.controls and promise.answer == "cannot_tell"
         first = f"promise it again first ({promise.command()}), or " if unsure else ""
-        return f"No {MOST_PHOTOS} photographs are likely to {proves}: {first}make a design that gains more."
+        return f"Even {MOST_PHOTOS} photographs are unlikely to {proves}: {first}make a design that gains more."
     sessions, each = max(kept or 0, shown), PHOTOS_PER_SESSION
     places, total, what = places_text(sessions), each * sessions, ""
     if control:

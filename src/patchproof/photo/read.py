@@ -187,12 +187,11 @@ def list_skipped_files(folder: Path, without: Path | None = None, depth: int = 1
         inside = Path(parent).relative_to(folder)
         paths = [Path(name) for name in sorted(files) if not name.startswith(".")]
         stems = {path.stem for path in paths if path.suffix.lower() in SUFFIXES}
+        folders[:] = sorted(f for f in folders if not f.startswith(".") and Path(parent, f).resolve() != without)
         if len(inside.parts) > depth:
-            folders.clear()
             if stems:
                 skipped.append((printable(str(inside)), [_TOO_DEEP]))
             continue
-        folders[:] = sorted(f for f in folders if not f.startswith(".") and Path(parent, f).resolve() != without)
         for path in paths:
             if path.stem not in stems and (kind := _SKIPPED_KINDS.get(path.suffix.lower())):
                 skipped.append((printable(str(inside / path)), [kind]))

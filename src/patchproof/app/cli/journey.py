@@ -107,7 +107,7 @@ def evaluate(
     runs: Annotated[list[Path], Argument(metavar="RUN...", help="Finished runs; several are compared.")],
     models: Models = None,
     n: Annotated[int, Option(min=1, help="Fresh conditions.")] = 400,
-    out: Annotated[Path | None, Option(help="Folder for the table and the page of several runs.")] = None,
+    out: Annotated[Path | None, Option(help="Folder for the table and the page; needed for several runs.")] = None,
     seed: Seed = None,
     device: Device = "cpu",
     jobs: Jobs = None,
@@ -120,7 +120,8 @@ def evaluate(
     from patchproof.report.words import evaluation_lines
 
     if (out is None) != (len(runs) == 1):
-        raise BadParameter("is for several runs, and they need it; one has its own folder", param_hint="--out")
+        do = "leave it out: one run has its own folder" if out else "several runs need a folder for their page"
+        raise BadParameter(do, param_hint="--out")
     with progress_bar() as bar:
         options: dict[str, Any] = {"models": console.names_of(models), "n": n, "seed": seed, "overwrite": overwrite}
         options |= {"trust": trust, "compute": Compute(device, jobs or 1), "progress": bar}
